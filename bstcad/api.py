@@ -172,7 +172,7 @@ class Design:
     def _named_solid(self, trim: Any, holes: Sequence[Any], body: Any, walls: tuple[float, float]) -> Any:
         """The solid of these arguments with the names of its faces; walls: draft and bevel."""
         from bstcad.cad import mounting
-        from bstcad.cad.trimming import named_solid
+        from bstcad.cad.solid import named_solid
         from bstcad.cad.walls import Draft
 
         with commands.refusals():

@@ -24,8 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from bstcad.cad import mesh as meshes
-from bstcad.cad import mesh_files
-from bstcad.cad.mesh_files import SILVER, Label
+from bstcad.cad.mesh import SILVER, Label
 from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL
@@ -208,8 +207,8 @@ def write_geometry(design: Made, folder: Path, submit: Submit = here) -> None:
         written.append(submit(work, lens, mount, (folder / PART).absolute(), *stated))
     asked = scene.output.mesh_tolerance is not None
     _, mesh = meshes.fitting(lens, scene.mesh_tolerance, meshes.ASKED if asked else None)
-    mesh_files.write_stl(mesh, folder / "lens.stl")
-    mesh_files.write_3mf(mesh, folder / "lens.3mf", label(scene))
+    meshes.write_stl(mesh, folder / "lens.stl")
+    meshes.write_3mf(mesh, folder / "lens.3mf", label(scene))
     _write_scene(design, folder)
     try:
         for step in written:

@@ -18,7 +18,7 @@ import skimage.io
 
 import bstcad
 from bstcad import cli, commands
-from bstcad.cad.mass_properties import exact_volume
+from bstcad.optics.quadrature import exact_volume
 from bstcad.runs.processes import Ending
 from bstcad.scene.scene import load
 from bstcad.sweep import batch

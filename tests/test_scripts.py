@@ -14,8 +14,8 @@ import skimage
 
 import bstcad
 import bstcad.cad.plugin
-from bstcad.cad.mass_properties import exact_volume
 from bstcad.optics.measure import Effort
+from bstcad.optics.quadrature import exact_volume
 from tests.cad.test_trimming import occ_volume
 from tests.conftest import draws_nothing, verify_with
 

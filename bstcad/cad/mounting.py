@@ -25,9 +25,8 @@ from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Shape
 
 from bstcad.cad import solid_properties, step_writing, walls
 from bstcad.cad.patches import back_patch, front_patch
-from bstcad.cad.solid import SLIM, Loop, NamedSolid, check_thickness, face_inside, solid_of
-from bstcad.cad.trimming import cap, cut_loops, named_solid, rim_points
-from bstcad.cad.walls import UPRIGHT, Draft, Named
+from bstcad.cad.solid import NamedSolid, cap, check_thickness, cut_loops, named_solid, rim_points
+from bstcad.cad.walls import SLIM, UPRIGHT, Draft, Loop, Named, face_inside, solid_of
 from bstcad.cad.wires import Piece, shape_in
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import Plane, sag
@@ -182,7 +181,7 @@ class _Opening:
         tops = [walls.on(lens.back, loop) for loop in self.loops]
         inner = [walls.on(lens.front, hole) for hole in holes]
         top, plane = walls.on(Plane(upper - self.z), rim), Plane(lower - self.z)
-        faces = [(cap(lens.back, back_patch(lens), tops, along=True), "back")]
+        faces = [(cap(back_patch(lens), tops, along=True), "back")]
         faces += walls.over(rim, tops[0], top, outward=False) if over else walls.over(rim, top, tops[0])
         if under is None:  # the lower plane is the front's: one face
             below = [rail.against() for rail in inner]
@@ -194,7 +193,7 @@ class _Opening:
             else:
                 leaning, low = walls.down(lens.front, self.loops, bottom, above=plane, draft=self.draft)
                 faces += leaning
-            faces.append((cap(lens.front, front_patch(lens), [low, *inner], along=False), "front"))
+            faces.append((cap(front_patch(lens), [low, *inner], along=False), "front"))
             below = [bottom.along()]
         for hole, low, high in zip(holes, inner, tops[1:], strict=True):
             faces += walls.over(hole, low, high, "hole")

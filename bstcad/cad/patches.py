@@ -1,8 +1,8 @@
-"""The faces of a lens as OCC patches: a surface, its borders in space, and the same borders in its (u, v) plane.
+"""Arrays to OCC and back, and the optical faces of a lens as OCC surfaces: nothing is refitted.
 
-The back's poles are the design's control points and its knots the design's knots; nothing is refitted.  The one curve
-that no B-spline of low degree can be exactly is the rim of a round lens, in space: its image in (u, v) is an exact
-circle, and the space curve follows it to within `RIM`.
+Each face is on the one kind of surface that is exactly the face; the back's poles are the design's control points and
+its knots the design's knots.  Every array that OCC needs (TColgp, TColStd) is built here and nowhere else, because
+OCC 8 moves those names.
 """
 
 from __future__ import annotations
@@ -12,69 +12,30 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from OCP.Geom import Geom_Circle, Geom_Curve, Geom_Line, Geom_Plane, Geom_SphericalSurface, Geom_Surface
-from OCP.Geom2d import Geom2d_Circle, Geom2d_Curve, Geom2d_Line
-from OCP.gp import gp_Ax2, gp_Ax2d, gp_Ax3, gp_Dir, gp_Dir2d, gp_Pnt, gp_Pnt2d
-from scipy.interpolate import make_interp_spline
+from OCP.Geom import Geom_BSplineCurve, Geom_BSplineSurface, Geom_Plane, Geom_SphericalSurface, Geom_Surface
+from OCP.Geom2d import Geom2d_BSplineCurve
+from OCP.gp import gp_Ax3, gp_Dir, gp_Pnt, gp_Pnt2d
+from OCP.TColgp import TColgp_Array1OfPnt, TColgp_Array1OfPnt2d, TColgp_Array2OfPnt
+from OCP.TColStd import TColStd_Array1OfInteger, TColStd_Array1OfReal, TColStd_Array2OfReal
 
-from bstcad.cad import nurbs, wires
 from bstcad.optics.bspline import BSplineSurface, knots, parameter
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
-from bstcad.optics.quadrature import rim_breaks
-from bstcad.optics.surfaces import Conic, Sphere, sag
+from bstcad.optics.surfaces import Conic
 
 WIDER = 1.02  # times as wide as the outline needs: the rim touches no border of the patch
-RIM = 1e-8  # mm; how far the space curve of a round rim may leave the exact rim
 PARABOLA = 1e-10  # mm; a sphere that departs from its parabola by less is written as that parabola
-SIDES = ("x0", "x1", "y0", "y1")  # borders of a rectangle, named by the coordinate that is constant and its end
 
 Image = Callable[[np.ndarray, np.ndarray], np.ndarray]  # (x, y) in mm -> (…, 2) in the parameter plane of a patch
 
 
 @dataclass(frozen=True)
-class Border:
-    """One border of a patch: towards +y (x0, x1), towards +x (y0, y1), or once around from +x by way of +y (rim)."""
-
-    curve: Geom_Curve
-    start: float  # parameter at the first point
-    end: float
-    uv: Geom2d_Curve | None  # the same points, same parameter, in the patch's plane; planes need none
-    around: Geom2d_Curve | None = None  # a rim's image (angle, z) on the cylinder of a round lens's side
-
-
-@dataclass(frozen=True)
 class Patch:
-    """A surface and the borders that cut a face out of it."""
+    """The surface of an optical face."""
 
     surface: Geom_Surface
     outward: bool  # does the surface's own normal, ∂u x ∂v, point out of the lens?
-    borders: dict[str, Border]  # SIDES, or "rim"
-    uv: Image | None = None  # None: the surface is a plane, on which OCC needs no images
-
-
-def _line_2d(u: float, v: float, direction: tuple[float, float]) -> Geom2d_Line:
-    return Geom2d_Line(gp_Pnt2d(u, v), gp_Dir2d(*direction))
-
-
-def _front_rim(z: float, radius: float, uv: Geom2d_Curve | None) -> Border:
-    """A circle around the axis, which the cylinder of the side sees as the line z."""
-    circle = Geom_Circle(gp_Ax2(gp_Pnt(0, 0, z), gp_Dir(0, 0, 1), gp_Dir(1, 0, 0)), radius)
-    return Border(circle, 0.0, 2 * np.pi, uv, _line_2d(0, z, (1, 0)))
-
-
-def _circle_2d(u: float, v: float, radius: float) -> Geom2d_Circle:
-    return Geom2d_Circle(gp_Ax2d(gp_Pnt2d(u, v), gp_Dir2d(1, 0)), radius)
-
-
-def _quintic(points: Callable[[np.ndarray], np.ndarray], start: float, end: float) -> tuple[np.ndarray, np.ndarray]:
-    """(poles, full knots) of the quintic through 257 points of an analytic arc; a whole turn of it is good to 1e-12."""
-    t = np.linspace(start, end, 257)
-    spline = make_interp_spline(t, points(t), k=5)
-    return spline.c, spline.t
-
-
-# ---- B-spline patches ------------------------------------------------------------------------------------------------
+    uv: Image | None = None  # None: the surface is a plane, on which OCC needs no images of edges
 
 
 def back_patch(lens: Lens) -> Patch:
@@ -83,19 +44,10 @@ def back_patch(lens: Lens) -> Patch:
 
 
 def _net_patch(face: BSplineSurface, outline: Outline, outward: bool) -> Patch:
-    """Inside a rectangle the whole net, whose borders are its own boundary curves on the same knots."""
-    net, full = face.control_points(), knots(face.m)
-    end = full[-1]
-    surface = nurbs.bspline_surface(net, full, full)
     if outline.is_round:
-        return Patch(surface, outward, {"rim": _net_rim(face, outline.radius)}, of_net(face))
-    borders = {
-        "x0": Border(nurbs.bspline_curve(net[0], full), 0.0, end, _line_2d(0, 0, (0, 1))),
-        "x1": Border(nurbs.bspline_curve(net[-1], full), 0.0, end, _line_2d(end, 0, (0, 1))),
-        "y0": Border(nurbs.bspline_curve(net[:, 0], full), 0.0, end, _line_2d(0, 0, (1, 0))),
-        "y1": Border(nurbs.bspline_curve(net[:, -1], full), 0.0, end, _line_2d(0, end, (1, 0))),
-    }
-    return Patch(surface, outward, borders, of_net(face))
+        _check_round(face, outline.radius)
+    full = knots(face.m)
+    return Patch(bspline_surface(face.control_points(), full, full), outward, of_net(face))
 
 
 def of_net(face: BSplineSurface) -> Image:
@@ -123,30 +75,8 @@ def _check_round(surface: BSplineSurface, radius: float) -> None:
         )
 
 
-def _net_rim(surface: BSplineSurface, radius: float) -> Border:
-    """The rim of a round net: an exact circle in (u, v), a piecewise cubic within RIM in space and on the cylinder.
-
-    The cubic has the rim's own points and tangents at its breaks: those at the knot lines of the net, and more between
-    two of them as RIM requires.
-    """
-    _check_round(surface, radius)
-
-    def points(theta: np.ndarray) -> np.ndarray:
-        x, y = radius * np.cos(theta), radius * np.sin(theta)
-        return np.column_stack([x, y, sag(surface, x, y), theta])
-
-    poles, full = wires.fitted(points, rim_breaks(surface, radius), RIM)
-    dx = surface.pitch[0]
-    u, v = -surface.x[0] / dx - 0.5, -surface.y[0] / dx - 0.5  # the axis, from x(t) = x0 + dx (t + 1/2)
-    around = nurbs.bspline_curve_2d(poles[:, [3, 2]], full)
-    return Border(nurbs.bspline_curve(poles[:, :3], full), 0.0, 2 * np.pi, _circle_2d(u, v, radius / dx), around)
-
-
-# ---- the front -------------------------------------------------------------------------------------------------------
-
-
 def front_patch(lens: Lens) -> Patch:
-    """The front cut by the outline, on the one kind of OCC surface that is exactly that; its normal may point inwards.
+    """The front on the one kind of OCC surface that is exactly that; its normal may point inwards.
 
     A sphere whose centre lies 10⁵ mm away would lose its digits: it is written as the parabola z0 + c r²/2, from which
     it departs by c³ r⁴/8 < PARABOLA.
@@ -155,7 +85,7 @@ def front_patch(lens: Lens) -> Patch:
     if front.is_net:
         return _net_patch(front, outline, outward=False)
     if front.level:
-        return _plane_patch(front.z, outline)
+        return Patch(Geom_Plane(gp_Ax3(gp_Pnt(0, 0, front.z), gp_Dir(0, 0, -1), gp_Dir(1, 0, 0))), True)
     c, r = front.curvature, float(np.hypot(*outline.farthest))
     if front.kind != "sphere":
         return _conic_patch(front, outline)
@@ -165,56 +95,22 @@ def front_patch(lens: Lens) -> Patch:
         )
     if abs(c) ** 3 * r**4 / 8 < PARABOLA:
         return _conic_patch(Conic(front.z, c, -1.0), outline)
-    return _sphere_patch(front.z, c, outline)
+    return _sphere_patch(front.z, c)
 
 
-def _plane_patch(z: float, outline: Outline) -> Patch:
-    """z = z0, its normal towards -z."""
-    plane = Geom_Plane(gp_Ax3(gp_Pnt(0, 0, z), gp_Dir(0, 0, -1), gp_Dir(1, 0, 0)))
-    if outline.is_round:
-        return Patch(plane, True, {"rim": _front_rim(z, outline.radius, None)})
-    a, b = outline.half_extent
-    borders = {}
-    for k, sense in enumerate((-1, 1)):
-        borders[f"x{k}"] = Border(Geom_Line(gp_Pnt(sense * a, 0, z), gp_Dir(0, 1, 0)), -b, b, None)
-        borders[f"y{k}"] = Border(Geom_Line(gp_Pnt(0, sense * b, z), gp_Dir(1, 0, 0)), -a, a, None)
-    return Patch(plane, True, borders)
-
-
-def _sphere_patch(z: float, c: float, outline: Outline) -> Patch:
+def _sphere_patch(z: float, c: float) -> Patch:
     """The sphere with its polar axis along ±x and u = pi at the vertex: no pole (x = ±R) and no seam on the patch.
 
     With s = sign(c): x = s R sin v, y = -R cos v sin u, z - z_centre = s R cos v cos u; normal away from the centre.
     """
-    s, R, centre = np.sign(c), 1 / abs(c), z + 1 / c
+    s, R = np.sign(c), 1 / abs(c)
 
     def uv(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         v = np.arcsin(s * x / R)
         return np.stack([np.pi + np.arcsin(y / (R * np.cos(v))), v], axis=-1)
 
-    polar, to_centre = gp_Dir(s, 0, 0), gp_Dir(0, 0, s)
-    surface = Geom_SphericalSurface(gp_Ax3(gp_Pnt(0, 0, centre), polar, to_centre), R)
-    outward = bool(c > 0)
-    if outline.is_round:
-        r = outline.radius
-        image = nurbs.bspline_curve_2d(*_quintic(lambda t: uv(r * np.cos(t), r * np.sin(t)), 0.0, 2 * np.pi))
-        return Patch(surface, outward, {"rim": _front_rim(float(sag(Sphere(z, c), r, 0.0)), r, image)}, uv)
-
-    def parallel(x: float, b: float) -> Border:  # the plane x = const: v = const, and the arc's angle is u
-        (start, v), (end, _) = uv(np.full(2, x), np.array([-b, b]))
-        arc = Geom_Circle(gp_Ax2(gp_Pnt(x, 0, centre), polar, to_centre), R * np.cos(v))
-        return Border(arc, start, end, _line_2d(0, v, (1, 0)))
-
-    def meridian(y: float, a: float) -> Border:  # the plane y = const; the arc's angle is 0 at -x, pi/2 at the vertex
-        r = np.sqrt(R * R - y * y)
-        start, end = np.pi / 2 + np.arcsin(np.array([-a, a]) / r)
-        arc = Geom_Circle(gp_Ax2(gp_Pnt(0, y, centre), gp_Dir(0, -s, 0), gp_Dir(-1, 0, 0)), r)
-        image = _quintic(lambda t: uv(-r * np.cos(t), np.full_like(t, y)), start, end)
-        return Border(arc, start, end, nurbs.bspline_curve_2d(*image))
-
-    a, b = outline.half_extent
-    borders = {"x0": parallel(-a, b), "x1": parallel(a, b), "y0": meridian(-b, a), "y1": meridian(b, a)}
-    return Patch(surface, outward, borders, uv)
+    axes = gp_Ax3(gp_Pnt(0, 0, z + 1 / c), gp_Dir(s, 0, 0), gp_Dir(0, 0, s))
+    return Patch(Geom_SphericalSurface(axes, R), bool(c > 0), uv)
 
 
 def conic_net(front: Conic, a: float, b: float) -> tuple[np.ndarray, np.ndarray]:
@@ -235,7 +131,7 @@ def conic_net(front: Conic, a: float, b: float) -> tuple[np.ndarray, np.ndarray]
 
 
 def _conic_patch(front: Conic, outline: Outline) -> Patch:
-    """A rational patch; in its plane (see `conic_net`) a round rim is a circle, and a straight side an arc."""
+    """A rational patch; in its plane (see `conic_net`) circles about the axis are circles, straight sides arcs."""
     bend = (1 + front.conic_constant) * front.curvature**2  # K
     a, b = outline.half_extent
 
@@ -252,18 +148,91 @@ def _conic_patch(front: Conic, outline: Outline) -> Patch:
         )
     half_u, half_v = WIDER * ends
     net, weights = conic_net(front, half_u, half_v)
-    surface = nurbs.bspline_surface(net, np.repeat([-half_u, half_u], 3), np.repeat([-half_v, half_v], 3), weights)
-    if outline.is_round:
-        [radius, _] = uv(a, 0.0)
-        return Patch(surface, False, {"rim": _front_rim(float(sag(front, a, 0.0)), a, _circle_2d(0, 0, radius))}, uv)
+    surface = bspline_surface(net, np.repeat([-half_u, half_u], 3), np.repeat([-half_v, half_v], 3), weights)
+    return Patch(surface, False, uv)
 
-    def border(side: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], end: float) -> Border:
-        space = _quintic(lambda t: np.stack([*side(t), sag(front, *side(t))], axis=-1), -end, end)
-        image = _quintic(lambda t: uv(*side(t)), -end, end)
-        return Border(nurbs.bspline_curve(*space), -end, end, nurbs.bspline_curve_2d(*image))
 
-    borders = {}
-    for k, sense in enumerate((-1, 1)):
-        borders[f"x{k}"] = border(lambda t, x=sense * a: (np.full_like(t, x), t), b)
-        borders[f"y{k}"] = border(lambda t, y=sense * b: (t, np.full_like(t, y)), a)
-    return Patch(surface, False, borders, uv)
+# ---- arrays ----------------------------------------------------------------------------------------------------------
+
+
+def _reals(values: np.ndarray) -> TColStd_Array1OfReal:
+    array = TColStd_Array1OfReal(1, len(values))
+    for i, value in enumerate(values, start=1):
+        array.SetValue(i, float(value))
+    return array
+
+
+def _real_table(values: np.ndarray) -> TColStd_Array2OfReal:
+    m, n = values.shape
+    array = TColStd_Array2OfReal(1, m, 1, n)
+    for i, row in enumerate(values.tolist(), start=1):
+        for j, value in enumerate(row, start=1):
+            array.SetValue(i, j, value)
+    return array
+
+
+def _knot_arrays(full: np.ndarray) -> tuple[TColStd_Array1OfReal, TColStd_Array1OfInteger]:
+    """A full knot vector as OCC wants it: distinct values and their multiplicities."""
+    values, counts = np.unique(full, return_counts=True)
+    multiplicities = TColStd_Array1OfInteger(1, len(counts))
+    for i, count in enumerate(counts.tolist(), start=1):
+        multiplicities.SetValue(i, count)
+    return _reals(values), multiplicities
+
+
+def bspline_surface(
+    net: np.ndarray, knots_u: np.ndarray, knots_v: np.ndarray, weights: np.ndarray | None = None
+) -> Geom_BSplineSurface:
+    """The B-spline surface of a control net (m, n, 3) in mm and two full knot vectors; rational by weights (m, n)."""
+    m, n = net.shape[:2]
+    poles, pole = TColgp_Array2OfPnt(1, m, 1, n), gp_Pnt()
+    place, put = pole.SetCoord, poles.SetValue
+    for i, row in enumerate(net.tolist(), start=1):
+        for j, (x, y, z) in enumerate(row, start=1):
+            place(x, y, z)
+            put(i, j, pole)  # copies it
+    u, count_u = _knot_arrays(knots_u)
+    v, count_v = _knot_arrays(knots_v)
+    degree_u, degree_v = len(knots_u) - m - 1, len(knots_v) - n - 1
+    if weights is None:
+        return Geom_BSplineSurface(poles, u, v, count_u, count_v, degree_u, degree_v)
+    return Geom_BSplineSurface(poles, _real_table(weights), u, v, count_u, count_v, degree_u, degree_v)
+
+
+def bspline_curve(poles: np.ndarray, full_knots: np.ndarray) -> Geom_BSplineCurve:
+    """The B-spline curve of control points (n, 3) in mm and a full knot vector."""
+    array = TColgp_Array1OfPnt(1, len(poles))
+    for i, xyz in enumerate(poles.tolist(), start=1):
+        array.SetValue(i, gp_Pnt(*xyz))
+    return Geom_BSplineCurve(array, *_knot_arrays(full_knots), len(full_knots) - len(poles) - 1)
+
+
+def bspline_curve_2d(poles: np.ndarray, full_knots: np.ndarray) -> Geom2d_BSplineCurve:
+    """The B-spline curve of control points (n, 2) in the parameter plane of a face."""
+    array = TColgp_Array1OfPnt2d(1, len(poles))
+    for i, uv in enumerate(poles.tolist(), start=1):
+        array.SetValue(i, gp_Pnt2d(*uv))
+    return Geom2d_BSplineCurve(array, *_knot_arrays(full_knots), len(full_knots) - len(poles) - 1)
+
+
+def net_of(surface: Geom_BSplineSurface) -> np.ndarray:
+    """Control points (m, n, 3) in mm of an OCC B-spline surface, u along the first axis."""
+    pole = surface.Poles().Value
+    m, n = surface.NbUPoles(), surface.NbVPoles()
+    places = (pole(i, j).Coord() for i in range(1, m + 1) for j in range(1, n + 1))
+    return np.fromiter(places, np.dtype((float, 3)), m * n).reshape(m, n, 3)
+
+
+def weights_of(surface: Geom_BSplineSurface) -> np.ndarray:
+    """The weights (m, n) of an OCC B-spline surface, all 1 if it is not rational."""
+    m, n = surface.NbUPoles(), surface.NbVPoles()
+    return np.array([[surface.Weight(i, j) for j in range(1, n + 1)] for i in range(1, m + 1)])
+
+
+def knots_of(surface: Geom_BSplineSurface) -> tuple[np.ndarray, np.ndarray]:
+    """The full knot vectors in u and in v of an OCC B-spline surface."""
+    u, v = surface.UKnotSequence(), surface.VKnotSequence()
+    return (
+        np.array([u.Value(i) for i in range(u.Lower(), u.Upper() + 1)]),
+        np.array([v.Value(i) for i in range(v.Lower(), v.Upper() + 1)]),
+    )

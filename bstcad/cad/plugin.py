@@ -13,7 +13,7 @@ import cadquery
 
 from bstcad.cad import mounting
 from bstcad.cad.mounting import Placed
-from bstcad.cad.trimming import trimmed_solid
+from bstcad.cad.solid import lens_solid
 
 
 def lens(
@@ -23,7 +23,7 @@ def lens(
 
     design: a bstcad.Design or a bstcad.Lens; trim, holes: see Design.solid.
     """
-    solid = trimmed_solid(getattr(design, "lens", design), trim, holes)
+    solid = lens_solid(getattr(design, "lens", design), trim, holes)
     return self.eachpoint(lambda place: solid.moved(place))
 
 

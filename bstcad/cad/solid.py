@@ -1,50 +1,46 @@
-"""The lens as one valid solid: each edge is built once and shared by the two faces that meet in it.
+"""A lens as one valid solid: two caps, which lie on its exact faces, and walls over closed wires between them.
 
-No boolean and no sewing: both would loosen the edges, and with a large net they take minutes.
+The wires are the lens's own outline, or any other inside it, and holes.  Each edge is built once and shared by the two
+faces that meet in it, in space and in the (u, v) planes of these faces.  No boolean and no sewing: both loosen the
+edges or refit the faces, and a boolean with a net of 513 x 513 takes half a minute.
 """
 
 from __future__ import annotations
 
+import cmath
+import math
+import numbers
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 from OCP.BRep import BRep_Builder
-from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeEdge, BRepBuilderAPI_MakeVertex
-from OCP.BRepCheck import BRepCheck_Analyzer
-from OCP.Geom import Geom_CylindricalSurface, Geom_Plane, Geom_Surface
-from OCP.Geom2d import Geom2d_Line
-from OCP.gp import gp_Ax3, gp_Dir, gp_Dir2d, gp_Pnt, gp_Pnt2d
-from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shell, TopoDS_Solid, TopoDS_Vertex, TopoDS_Wire
+from OCP.Geom2d import Geom2d_Circle, Geom2d_Curve
+from OCP.gp import gp_Ax2d, gp_Dir2d, gp_Pnt2d
+from OCP.TopoDS import TopoDS_Face, TopoDS_Solid
 
-from bstcad.cad.patches import SIDES, Border, Patch, back_patch, front_patch
+from bstcad.cad import patches, walls, wires
+from bstcad.cad.patches import Patch, back_patch, front_patch
+from bstcad.cad.walls import RIM, SLIM, TOLERANCE, UPRIGHT, Draft, Named, Rail, face_inside, solid_of
+from bstcad.cad.wires import Curve, Piece
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
-from bstcad.optics.surfaces import sag
+from bstcad.optics.surfaces import Plane, sag
+from bstcad.scene.mount import parting
 
 if TYPE_CHECKING:
     import cadquery
 
-TOLERANCE = 1e-7  # mm, of every face, edge and vertex
-SLIM = 1e-3  # mm
 SPARE = 4  # control points a side beyond a round rim: two spans, and two more until x(u) is linear
-CAPS = ("back", "front")  # names of the first two faces of a lens
-
-# A loop lists its edges and whether each is walked along its own direction, counterclockwise seen from outside.
-# Corners are named by the ends of x and y: "01" is (-x, +y).
-TOP_LOOP = (("y0", True), ("x1", True), ("y1", False), ("x0", False))
-BOTTOM_LOOP = (("x0", True), ("y1", True), ("x1", False), ("y0", False))
-ENDS = {"x0": ("00", "01"), "x1": ("10", "11"), "y0": ("00", "10"), "y1": ("01", "11")}
-SIDE_LOOPS = {  # (front edge forward?, rising corner, back edge forward?, falling corner)
-    "y0": (True, "10", False, "00"),
-    "x1": (True, "11", False, "10"),
-    "y1": (False, "01", True, "11"),
-    "x0": (False, "00", True, "01"),
-}
-NORMALS = {"x0": (-1, 0, 0), "x1": (1, 0, 0), "y0": (0, -1, 0), "y1": (0, 1, 0)}
-
-Loop = list[tuple[TopoDS_Edge, bool]]
+PLACES = 8  # points along a piece of the rim, a cell of the back's net
+EXACT = 1e-12  # of an image's size: one that leaves a line or a circle by less is that
+SAMPLES = 65  # points of an image that are compared with a line and a circle
+INVALID = (
+    "lens: front, back and walls bound no valid solid; check that the back lies above the front, and move wires apart "
+    "or make them simpler"
+)
 
 
 class NamedSolid(NamedTuple):
@@ -54,11 +50,43 @@ class NamedSolid(NamedTuple):
     faces: tuple[str, ...]  # "back", "front", "rim", "bevel", "hole" or "flange"
 
 
-def lens_solid(lens: Lens) -> cadquery.Solid:
-    """The lens as cadquery's solid, its faces oriented outwards; ValueError where no valid one exists."""
+def lens_solid(
+    lens: Lens, trim: cadquery.Wire | None = None, holes: Sequence = (), draft: Draft = UPRIGHT
+) -> cadquery.Solid:
+    """The lens inside `trim` (None: its own outline), less `holes`, as cadquery's solid, its faces oriented outwards.
+
+    trim: a closed plane wire, used by its x and y; holes: such wires, or (x, y, diameter) in mm.  Walls stand along z,
+    but those around the lens as `draft` says, from a plane on that lies scene.mount.LAND below the back's rim.
+    ValueError in one sentence if a wire is open, crosses itself or another, or leaves the lens, or walls would meet, or
+    no valid solid exists.
+    """
+    return named_solid(lens, trim, holes, draft).solid
+
+
+def named_solid(
+    lens: Lens, trim: cadquery.Wire | None = None, holes: Sequence = (), draft: Draft = UPRIGHT
+) -> NamedSolid:
+    """That solid, and the name of each of its faces, in their order: "back", "front", then "rim", "bevel", "hole"."""
     import cadquery
 
-    return cadquery.Solid(lens_shape(lens))
+    solid, names = lens_shape(lens, cut_loops(lens, trim, holes), draft)
+    return NamedSolid(cadquery.Solid(solid), names)
+
+
+def lens_shape(
+    lens: Lens, loops: Sequence[list[Piece]] | None = None, draft: Draft = UPRIGHT
+) -> tuple[TopoDS_Solid, tuple[str, ...]]:
+    """The same without cadquery, whose import takes a second; loops: see `cut_loops` (None: the lens's own outline)."""
+    lens, loops = lens.plain(), loops or [wires.of_outline(lens.outline)]
+    check_thickness(lens)
+    back, front = back_patch(lens), front_patch(lens)
+    tops, inner = [walls.on(lens.back, loop) for loop in loops], [walls.on(lens.front, loop) for loop in loops[1:]]
+    named, low = _around(lens, loops, tops[0], draft)
+    for each in zip(loops[1:], inner, tops[1:], strict=True):
+        named += walls.over(*each, "hole")
+    caps = [(cap(back, tops, along=True), "back"), (cap(front, [low, *inner], along=False), "front")]
+    faces, names = zip(*caps, *named, strict=True)
+    return solid_of(faces, INVALID), names
 
 
 def coarse_copy(lens: Lens, m: int) -> Lens:
@@ -76,19 +104,6 @@ def coarse_copy(lens: Lens, m: int) -> Lens:
     x, y = np.meshgrid(*(np.clip(np.linspace(-end, end, m), *span) for end, span in spans), indexing="ij")
     heights = torch.from_numpy(sag(lens.back, x, y) - lens.back.z)
     return replace(lens, back=BSplineSurface(lens.back.z, heights, *((-end, end) for end in ends)))
-
-
-def face_names(lens: Lens) -> tuple[str, ...]:
-    """The names of the faces of `lens_solid`, in its order."""
-    return (*CAPS, *["rim"] * (1 if lens.outline.is_round else len(SIDES)))
-
-
-def lens_shape(lens: Lens) -> TopoDS_Solid:
-    """The same without cadquery, whose import takes a second."""
-    check_thickness(lens)
-    build = _round_faces if lens.outline.is_round else _rectangle_faces
-    fault = "lens: front, back and outline bound no valid solid; check that the back lies above the front"
-    return solid_of(build(lens, back_patch(lens), front_patch(lens)), fault)
 
 
 def check_thickness(lens: Lens) -> None:
@@ -114,95 +129,110 @@ def check_thickness(lens: Lens) -> None:
         )
 
 
-def vertex(x: float, y: float, z: float) -> TopoDS_Vertex:
-    """At a place (mm)."""
-    return BRepBuilderAPI_MakeVertex(gp_Pnt(float(x), float(y), float(z))).Vertex()
+# ---- the wires -----------------------------------------------------------------------------------------------------
 
 
-def _edge(border: Border, start: TopoDS_Vertex, end: TopoDS_Vertex) -> TopoDS_Edge:
-    return BRepBuilderAPI_MakeEdge(border.curve, start, end, float(border.start), float(border.end)).Edge()
+def cut_loops(lens: Lens, trim: cadquery.Wire | None, holes: Sequence) -> list[list[Piece]]:
+    """The rim counterclockwise, then the holes clockwise, so that the lens lies on their left.
+
+    ValueError if they cut no lens out.
+    """
+    loops = [wires.of_outline(lens.outline) if trim is None else _of_wire("trim", trim)]
+    loops += [_hole(f"hole {k}", hole) for k, hole in enumerate(holes, start=1)]
+    shape = wires.polygon(*loops)
+    x, y = np.array(shape.exterior.coords).T
+    outside = ~lens.outline.contains(*(torch.from_numpy(p * (1 - 1e-9)) for p in (x, y))).numpy()
+    if outside.any():
+        raise ValueError(
+            f"trim: the wire leaves the lens at ({x[outside][0]:.4g}, {y[outside][0]:.4g}) mm; draw it inside"
+        )
+    if fault := wires.fault(shape):
+        reason, place = fault
+        raise ValueError(
+            f"trim or holes: {reason} near {place}; draw each wire simple, and the holes inside the rim and apart"
+        )
+    turned = [shape.exterior.is_ccw, *(not hole.is_ccw for hole in shape.interiors)]
+    return [loop if right else wires.reversed_loop(loop) for loop, right in zip(loops, turned, strict=True)]
 
 
-def straight(start: TopoDS_Vertex, end: TopoDS_Vertex) -> TopoDS_Edge:
-    """The edge from one vertex to another, its parameter the length from the first (mm)."""
-    return BRepBuilderAPI_MakeEdge(start, end).Edge()
+def _of_wire(name: str, wire: cadquery.Wire) -> list[Piece]:
+    try:
+        return wires.of_wire(wire)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
 
 
-def face_inside(surface: Geom_Surface, outward: bool, *loops: Loop) -> TopoDS_Face:
-    """The face inside a loop that runs counterclockwise seen from outside, less holes, whose loops run clockwise."""
-    builder, face = BRep_Builder(), TopoDS_Face()
-    builder.MakeFace(face, surface, TOLERANCE)
-    for loop in loops:
-        wire = TopoDS_Wire()
-        builder.MakeWire(wire)
-        for edge, forward in loop:
-            builder.Add(wire, edge if forward else edge.Reversed())
-        wire.Closed(True)
-        builder.Add(face, wire if outward else wire.Reversed())
-    return face if outward else TopoDS.Face_s(face.Reversed())
+def _hole(name: str, hole: cadquery.Wire | Sequence[float]) -> list[Piece]:
+    if not isinstance(hole, Sequence):
+        return _of_wire(name, hole)
+    if len(hole) != 3 or not all(isinstance(each, numbers.Real) and math.isfinite(each) for each in hole):
+        raise ValueError(f"{name}: {hole} is not (x, y, diameter); give three numbers in mm, or a closed wire")
+    x, y, diameter = map(float, hole)
+    if not diameter > 0:
+        raise ValueError(f"{name}: a diameter of {diameter:g} mm; give one above zero")
+    return wires.circle(x, y, diameter / 2)
 
 
-def _patch_face(patch: Patch, edges: dict[str, TopoDS_Edge], loop: tuple[tuple[str, bool], ...]) -> TopoDS_Face:
-    face = face_inside(patch.surface, patch.outward, [(edges[name], forward) for name, forward in loop])
-    for name, border in patch.borders.items():
-        if border.uv is not None:
-            BRep_Builder().UpdateEdge(edges[name], border.uv, face, TOLERANCE)
+# ---- caps and walls ------------------------------------------------------------------------------------------------
+
+
+def cap(patch: Patch, rails: Sequence[Rail], along: bool) -> TopoDS_Face:
+    """The back or the front inside the first rail and outside the others; along: seen from outside they follow it."""
+    loops = [rail.along() if along else rail.against() for rail in rails]
+    face = face_inside(patch.surface, patch.outward, *loops)
+    for rail in rails if patch.uv is not None else ():
+        for curve, edge in zip(rail.curves, rail.edges, strict=True):
+            BRep_Builder().UpdateEdge(edge, image(patch, curve), face, TOLERANCE)
     return face
 
 
-def solid_of(built: list[TopoDS_Face], fault: str) -> TopoDS_Solid:
-    """The solid that faces bound which share their edges and look outwards; ValueError(fault) if it is not valid."""
-    builder, shell, solid = BRep_Builder(), TopoDS_Shell(), TopoDS_Solid()
-    builder.MakeShell(shell)
-    for face in built:
-        builder.Add(shell, face)
-    shell.Closed(True)
-    builder.MakeSolid(solid)
-    builder.Add(solid, shell)
-    if not BRepCheck_Analyzer(solid).IsValid():
-        raise ValueError(fault)
-    return solid
+def image(patch: Patch, curve: Curve) -> Geom2d_Curve:
+    """The curve in the patch's parameter plane, by the same parameter: a line or a circle where it is one."""
+    piece, cubic = curve.piece, curve.knots is not None and len(curve.knots) == len(curve.poles) + 4
+    t = np.unique(curve.knots) if cubic else np.linspace(0.0, piece.end, SAMPLES)
+
+    def points(t: np.ndarray) -> np.ndarray:
+        return patch.uv(*piece.points(t).T)
+
+    found = points(t)
+    near = EXACT * np.ptp(found, axis=0).max()
+    ends, share = found[[0, -1]], t[:, None] / piece.end
+    if np.abs(ends[0] + share * (ends[1] - ends[0]) - found).max() <= near:
+        return patches.bspline_curve_2d(ends, np.array([0.0, 0.0, piece.end, piece.end]))
+    if piece.turn > 0:  # u + iv = centre + arm exp(it)?
+        start, end = ends @ (1, 1j)
+        arm = (end - start) / (cmath.exp(1j * piece.end) - 1)
+        centre = start - arm
+        if np.abs(centre + arm * np.exp(1j * t) - found @ (1, 1j)).max() <= near:
+            axis = gp_Ax2d(gp_Pnt2d(centre.real, centre.imag), gp_Dir2d(arm.real, arm.imag))
+            return Geom2d_Circle(axis, abs(arm))
+    here, there = (np.diff(each, axis=0) for each in (piece.points(t), found))
+    scale = np.linalg.norm(there, axis=1).max() / np.linalg.norm(here, axis=1).max()
+    return patches.bspline_curve_2d(*wires.fitted(points, t, RIM * scale, smooth=not cubic))
 
 
-def _rectangle_faces(lens: Lens, back: Patch, front: Patch) -> list[TopoDS_Face]:
-    """Back, front and four planar sides: 6 faces, 12 edges, 8 vertices."""
-    a, b = lens.outline.half_extent
-    net = lens.back.control_points()
-    at = {"00": (-a, -b), "01": (-a, b), "10": (a, -b), "11": (a, b)}
-    corner = {"00": net[0, 0], "01": net[0, -1], "10": net[-1, 0], "11": net[-1, -1]}
-    top = {name: vertex(*xyz) for name, xyz in corner.items()}
-    bottom = {name: vertex(*xy, sag(lens.front, *xy)) for name, xy in at.items()}
-    rising = {name: straight(bottom[name], top[name]) for name in at}
-    top_edges = {s: _edge(back.borders[s], *(top[end] for end in ENDS[s])) for s in SIDES}
-    bottom_edges = {s: _edge(front.borders[s], *(bottom[end] for end in ENDS[s])) for s in SIDES}
-
-    def side(name: str) -> TopoDS_Face:
-        front_forward, up, back_forward, down = SIDE_LOOPS[name]
-        nx, ny, _ = NORMALS[name]
-        plane = Geom_Plane(gp_Ax3(gp_Pnt(nx * a, ny * b, 0), gp_Dir(nx, ny, 0)))
-        edges = (bottom_edges[name], front_forward), (rising[up], True)
-        return face_inside(plane, True, [*edges, (top_edges[name], back_forward), (rising[down], False)])
-
-    caps = [_patch_face(back, top_edges, TOP_LOOP), _patch_face(front, bottom_edges, BOTTOM_LOOP)]
-    return caps + [side(name) for name in SIDES]
+def _around(lens: Lens, loops: list[list[Piece]], top: Rail, draft: Draft) -> tuple[list[Named], Rail]:
+    """The walls over the rim, the first loop, from the back's edge down to the front, and their edge there."""
+    if not draft.angle:
+        return walls.down(lens.front, loops, top, above=lens.back, draft=draft)
+    plane = Plane(_parting(lens, loops[0]))
+    line = walls.on(plane, loops[0])
+    leaning, low = walls.down(lens.front, loops, line, above=plane, draft=draft)
+    return walls.over(loops[0], line, top) + leaning, low
 
 
-def _round_faces(lens: Lens, back: Patch, front: Patch) -> list[TopoDS_Face]:
-    """Back, front and one cylinder with a seam at y = 0: 3 faces, 3 edges, 2 vertices."""
-    radius = lens.outline.radius
-    rim, rim_front = back.borders["rim"], front.borders["rim"]
-    z_front, z_back = rim_front.curve.Value(0.0).Z(), rim.curve.Value(0.0).Z()
-    low, high = vertex(radius, 0, z_front), vertex(radius, 0, z_back)
-    top, bottom, seam = _edge(rim, high, high), _edge(rim_front, low, low), straight(low, high)
+def _parting(lens: Lens, rim: Sequence[Piece]) -> float:
+    """z of the plane from which walls lean (mm): below the back's rim, and above the front's."""
+    x, y = rim_points(lens, rim)
+    low, high = sag(lens.back, x, y).min(), sag(lens.front, x, y).max()
+    if not low - high > SLIM:
+        raise ValueError(
+            f"draft: the back's rim comes down to z = {low:.4g} mm, and the front's rises to {high:.4g} mm, so that no "
+            "plane between them divides the wall; leave it out, or make the lens thicker at its edge"
+        )
+    return parting(lens.back, lens.front, x, y)
 
-    side = Geom_CylindricalSurface(gp_Ax3(gp_Pnt(0, 0, 0), gp_Dir(0, 0, 1), gp_Dir(1, 0, 0)), radius)
-    cylinder = face_inside(side, True, [(bottom, True), (seam, True), (top, False), (seam, False)])
-    builder, turn = BRep_Builder(), 2 * np.pi
-    builder.UpdateEdge(bottom, rim_front.around, cylinder, TOLERANCE)
-    builder.UpdateEdge(top, rim.around, cylinder, TOLERANCE)
-    up = gp_Dir2d(0, 1)  # the seam's own parameter runs from 0 at the front
-    builder.UpdateEdge(
-        seam, Geom2d_Line(gp_Pnt2d(turn, z_front), up), Geom2d_Line(gp_Pnt2d(0, z_front), up), cylinder, TOLERANCE
-    )
-    caps = [_patch_face(back, {"rim": top}, (("rim", True),)), _patch_face(front, {"rim": bottom}, (("rim", False),))]
-    return [*caps, cylinder]
+
+def rim_points(lens: Lens, rim: Sequence[Piece]) -> np.ndarray:
+    """x and y (2, n) of points along a rim (mm), several in each cell of the back's net."""
+    return np.concatenate([piece.points(np.linspace(0.0, piece.end, PLACES * lens.back.m)) for piece in rim]).T

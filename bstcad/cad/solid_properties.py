@@ -26,10 +26,9 @@ from OCP.TopExp import TopExp_Explorer
 from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shape
 
 from bstcad.cad import step_reading
-from bstcad.cad.mass_properties import MassProperties
 from bstcad.cad.step_reading import StepLens, parts_of
 from bstcad.optics import quadrature
-from bstcad.optics.quadrature import EDGE_PARTS, LEVEL, POINTS, Border, Sums
+from bstcad.optics.quadrature import EDGE_PARTS, LEVEL, POINTS, Border, MassProperties, Sums
 
 if TYPE_CHECKING:
     import cadquery

@@ -31,7 +31,7 @@ from OCP.TopExp import TopExp
 from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Shape, TopoDS_Solid
 from OCP.TopTools import TopTools_IndexedMapOfShape
 
-from bstcad.cad import nurbs, patches
+from bstcad.cad import patches
 from bstcad.optics.bspline import SMALLEST_NET, BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle, Rounded
@@ -141,7 +141,7 @@ def _lens_in(solid: TopoDS_Solid) -> StepLens:
     if len(backs) != 1 or len(nets) > 2:
         raise ValueError(f"{len(nets)} B-spline faces; a lens has one, or two that face away from each other")
     [(back_face, back)], fronts = backs, [face for face in nets if face is not backs[0]]
-    net = nurbs.net_of(back.BSpline())
+    net = patches.net_of(back.BSpline())
     middle = (net[0, 0, :2] + net[-1, -1, :2]) / 2
     if not np.abs(middle).max() <= AXIAL:
         raise ValueError(f"the net of the back is centred at {middle} mm; centre the lens on the axis")
@@ -183,12 +183,12 @@ def _uniform_net(surface: BRepAdaptor_Surface) -> BSplineSurface:
             f"the freeform face is of degree {degrees[0]} x {degrees[1]} on a net of {m} x {n}; "
             "bstcad reads plain squares of degree 2 x 2"
         )
-    for axis, full in zip("xy", nurbs.knots_of(patch), strict=True):
+    for axis, full in zip("xy", patches.knots_of(patch), strict=True):
         off = np.abs(full - knots(m))
         if off.max() > 1e-12 * m:
             worst = f"{knots(m)[off.argmax()]:g} is {full[off.argmax()]:.15g}"
             raise ValueError(f"knots in {axis} are not 0 … {m - 2} ({worst}); give a file written by bstcad")
-    net = nurbs.net_of(patch)
+    net = patches.net_of(patch)
     found = BSplineSurface.from_control_points(net)
     off = np.abs(net - found.control_points())[..., :2].max(axis=-1)
     if not off.max() <= UNIFORM:
@@ -202,14 +202,10 @@ def _uniform_net(surface: BRepAdaptor_Surface) -> BSplineSurface:
 
 def _looks_up(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> bool:
     """Does a face look towards +z, out of the lens, in the middle of its parameters?"""
-    first, last = (
-        (surface.FirstUParameter(), surface.FirstVParameter()),
-        (surface.LastUParameter(), surface.LastVParameter()),
-    )
-    u, v = ((low + high) / 2 for low, high in zip(first, last, strict=True))
+    u = (surface.FirstUParameter() + surface.LastUParameter()) / 2
+    v = (surface.FirstVParameter() + surface.LastVParameter()) / 2
     [[_, along_u, along_v]] = points_and_tangents(surface, [u], [v])
-    up = along_u[0] * along_v[1] - along_u[1] * along_v[0] > 0
-    return up != (face.Orientation() == TopAbs_Orientation.TopAbs_REVERSED)
+    return (np.cross(along_u, along_v)[2] > 0) != (face.Orientation() == TopAbs_Orientation.TopAbs_REVERSED)
 
 
 def _across_the_axis(rest: Sequence[Face]) -> Face:
@@ -248,7 +244,7 @@ def _conic(patch: Geom_BSplineSurface) -> Sphere | Conic:
     K = (1 + k) c², and z0 + c/2 Q / w and z0 - c/2 Q / w are their heights.  The parabola that a flat sphere is written
     as reads as that sphere.
     """
-    net, weights = nurbs.net_of(patch), nurbs.weights_of(patch)
+    net, weights = patches.net_of(patch), patches.weights_of(patch)
     if net.shape != (3, 3, 3) or (patch.UDegree(), patch.VDegree()) != (2, 2):
         raise ValueError("the front is a freeform patch; give a file written by bstcad")
     weights = weights / ((weights[0, 0] + weights[1, 1]) / 2)

@@ -60,11 +60,11 @@ from OCP.XCAFDimTolObjects import XCAFDimTolObjects_GeomToleranceObject
 from OCP.XCAFDimTolObjects import XCAFDimTolObjects_GeomToleranceType as Tolerance
 from OCP.XCAFDoc import XCAFDoc_ColorSurf, XCAFDoc_DocumentTool, XCAFDoc_GeomTolerance
 
-from bstcad.cad import mass_properties
-from bstcad.cad.mass_properties import MassProperties
-from bstcad.cad.solid import face_names, lens_shape
+from bstcad.cad.solid import lens_shape
 from bstcad.cad.step_reading import parts_of, silence
+from bstcad.optics import quadrature
 from bstcad.optics.lens import Lens
+from bstcad.optics.quadrature import MassProperties
 from bstcad.scene.mount import GLASS, METAL, Part
 
 if TYPE_CHECKING:
@@ -91,8 +91,8 @@ def write_lens(lens: Lens, path: str | Path, name: str, part: Part | None = None
     part: the file states its facts; None: a colour.  ValueError if the lens's faces bound no solid.
     """
     part = part or Part(colour=METAL if lens.reflects else GLASS)
-    shape = lens_shape(lens)
-    write(shape, path, name, part, faces=face_names(lens), properties=mass_properties.of_lens(lens))
+    shape, faces = lens_shape(lens)
+    write(shape, path, name, part, faces=faces, properties=quadrature.of_lens(lens))
 
 
 def encode(

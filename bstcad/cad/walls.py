@@ -2,7 +2,7 @@
 
 An upright wall is a plane, a cylinder or the extrusion of a cubic; a wall with draft a plane, a cone or ruled, and so
 is a bevel.  Each edge is built once, for the faces on both its sides, and has the parameter of its piece of the rim
-(level lines: their length), in space and in the parameter planes of these faces.
+(level lines: their length; the border of a net: its knots), in space and in the parameter planes of these faces.
 
 Walls with draft begin on a parting line, the rim itself at one height, and lean inwards as they go down to the front.
 Where the rim has shrunk evenly by o, its point p has moved to p + o m, m the inward normal; on a straight side m
@@ -17,8 +17,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.lib.stride_tricks import sliding_window_view
 from OCP.BRep import BRep_Builder
-from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeEdge
+from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeEdge, BRepBuilderAPI_MakeVertex
+from OCP.BRepCheck import BRepCheck_Analyzer
 from OCP.Geom import (
     Geom_Circle,
     Geom_ConicalSurface,
@@ -29,21 +31,61 @@ from OCP.Geom import (
 )
 from OCP.Geom2d import Geom2d_BSplineCurve
 from OCP.gp import gp_Ax2, gp_Ax3, gp_Dir, gp_Pnt
-from OCP.TopoDS import TopoDS_Edge, TopoDS_Face, TopoDS_Vertex
+from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shell, TopoDS_Solid, TopoDS_Vertex, TopoDS_Wire
+from scipy.interpolate import BSpline
 
-from bstcad.cad import nurbs, wires
-from bstcad.cad.patches import RIM
-from bstcad.cad.solid import SLIM, TOLERANCE, Loop, face_inside, straight, vertex
+from bstcad.cad import patches, wires
 from bstcad.cad.wires import Curve, Piece
+from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
 from bstcad.optics.surfaces import Plane, Surface, sag
 from bstcad.scene.mount import MOST_DRAFT, STEEPEST
 
+TOLERANCE = 1e-7  # mm, of every face, edge and vertex
+RIM = 1e-8  # mm; how far an edge may leave the exact one
+SLIM = 1e-3  # mm
 SMOOTH = 1e-7  # rad; pieces that turn by less from one to the next join smoothly
 SHARPEST = 0.05  # 1 + cos of the turn at a corner: a mitre is at most 6.3 times as long as the offset
 STEPS, EXACT = 50, 1e-13  # of Newton's method, and mm below which a step is none
 SAMPLES = 129  # points of a piece at which its wall is checked
 
 Named = tuple[TopoDS_Face, str]  # a face and its name: "back", "front", "rim", "bevel" or "hole"
+Loop = list[tuple[TopoDS_Edge, bool]]  # edges and whether each is walked along its own direction
+
+
+# ---- faces and solids ----------------------------------------------------------------------------------------------
+
+
+def face_inside(surface: Geom_Surface, outward: bool, *loops: Loop) -> TopoDS_Face:
+    """The face inside a loop that runs counterclockwise seen from outside, less holes, whose loops run clockwise."""
+    builder, face = BRep_Builder(), TopoDS_Face()
+    builder.MakeFace(face, surface, TOLERANCE)
+    for loop in loops:
+        wire = TopoDS_Wire()
+        builder.MakeWire(wire)
+        for edge, forward in loop:
+            builder.Add(wire, edge if forward else edge.Reversed())
+        wire.Closed(True)
+        builder.Add(face, wire if outward else wire.Reversed())
+    return face if outward else TopoDS.Face_s(face.Reversed())
+
+
+def solid_of(built: Sequence[TopoDS_Face], fault: str) -> TopoDS_Solid:
+    """The solid that faces bound which share their edges and look outwards; ValueError(fault) if it is not valid."""
+    builder, shell, solid = BRep_Builder(), TopoDS_Shell(), TopoDS_Solid()
+    builder.MakeShell(shell)
+    for face in built:
+        builder.Add(shell, face)
+    shell.Closed(True)
+    builder.MakeSolid(solid)
+    builder.Add(solid, shell)
+    if not BRepCheck_Analyzer(solid).IsValid():
+        raise ValueError(fault)
+    return solid
+
+
+def _straight(start: TopoDS_Vertex, end: TopoDS_Vertex) -> TopoDS_Edge:
+    """The edge from one vertex to another, its parameter the length from the first (mm)."""
+    return BRepBuilderAPI_MakeEdge(start, end).Edge()
 
 
 # ---- rails ---------------------------------------------------------------------------------------------------------
@@ -60,7 +102,7 @@ class Rail:
     @classmethod
     def of(cls, curves: Sequence[Curve]) -> Rail:
         """Along curves that follow each other."""
-        corners = tuple(vertex(*curve.poles[0]) for curve in curves)
+        corners = tuple(BRepBuilderAPI_MakeVertex(gp_Pnt(*curve.poles[0].tolist())).Vertex() for curve in curves)
         ends = corners[1:] + corners[:1]
         edges = tuple(_edge(*each) for each in zip(curves, corners, ends, strict=True))
         return cls(tuple(curves), edges, corners)
@@ -77,10 +119,10 @@ class Rail:
 def _edge(curve: Curve, start: TopoDS_Vertex, end: TopoDS_Vertex) -> TopoDS_Edge:
     piece = curve.piece
     if curve.knots is not None:
-        spline = nurbs.bspline_curve(curve.poles, curve.knots)
+        spline = patches.bspline_curve(curve.poles, curve.knots)
         return BRepBuilderAPI_MakeEdge(spline, start, end, 0.0, piece.end).Edge()
     if piece.straight:
-        return straight(start, end)
+        return _straight(start, end)
     (x, y, z), (x0, y0) = curve.poles[0].tolist(), piece.centre
     axes = gp_Ax2(gp_Pnt(x0, y0, z), gp_Dir(0, 0, piece.turn), gp_Dir(x - x0, y - y0, 0))
     return BRepBuilderAPI_MakeEdge(Geom_Circle(axes, math.hypot(x - x0, y - y0)), start, end, 0.0, piece.end).Edge()
@@ -92,7 +134,7 @@ def on(surface: Surface, loop: Sequence[Piece]) -> Rail:
 
 
 def _curve_on(surface: Surface, piece: Piece) -> Curve:
-    """A line, an arc, or a cubic within RIM."""
+    """A line, an arc or the border of a net, exactly; or a spline within RIM."""
 
     def points(t: np.ndarray) -> np.ndarray:
         x, y = piece.points(t).T
@@ -100,7 +142,22 @@ def _curve_on(surface: Surface, piece: Piece) -> Curve:
 
     if _level_on(surface, piece):
         return Curve(piece, points(np.array([0.0, piece.end])))
-    return Curve(piece, *wires.fitted(points, wires.breaks(surface, piece), RIM))
+    if surface.is_net and piece.straight and (border := _border(surface, piece)) is not None:
+        return border
+    smooth = not surface.is_net and (piece.straight or piece.centre is not None)
+    return Curve(piece, *wires.fitted(points, wires.breaks(surface, piece), RIM, smooth))
+
+
+def _border(net: BSplineSurface, piece: Piece) -> Curve | None:
+    """The border of a net that a straight piece runs along from end to end, on the same knots; None: it does not."""
+    poles, full = net.control_points(), knots(net.m)
+    sides = [side[::step] for side in (poles[0], poles[-1], poles[:, 0], poles[:, -1]) for step in (1, -1)]
+    ends = piece.points(np.array([0.0, piece.end]))
+    side = next((side for side in sides if np.abs(side[[0, -1], :2] - ends).max() <= RIM), None)
+    if side is None:
+        return None
+    along = BSpline(full, side[:, :2], DEGREE)
+    return Curve(replace(piece, points=along, end=float(full[-1])), side, full)
 
 
 def _level_on(surface: Surface, piece: Piece) -> bool:
@@ -124,15 +181,16 @@ class Sheet:
 
     def curve(self, poles: tuple[np.ndarray, np.ndarray, np.ndarray], knots: np.ndarray) -> Geom2d_BSplineCurve | None:
         """The image of a curve of these poles (t, z, share of the height)."""
-        return None if self.image is None else nurbs.bspline_curve_2d(self.image(*poles), knots)
+        return None if self.image is None else patches.bspline_curve_2d(self.image(*poles), knots)
 
     def along(self, curve: Curve, up: float) -> Geom2d_BSplineCurve | None:
         """The image of a curve that is its lower edge (up 0) or its upper edge (1)."""
         end = curve.piece.end
         if curve.knots is None:
             knots, t = np.array([0.0, 0.0, end, end]), np.array([0.0, end])
-        else:  # the poles of t itself are the means of three knots
-            knots, t = curve.knots, (curve.knots[1:-3] + curve.knots[2:-2] + curve.knots[3:-1]) / 3
+        else:  # the poles of t itself are the means of as many knots as the degree
+            knots = curve.knots
+            t = sliding_window_view(knots[1:-1], len(knots) - len(curve.poles) - 1).mean(axis=1)
         return self.curve((t, curve.poles[:, 2], np.full(len(t), up)), knots)
 
 
@@ -141,7 +199,7 @@ def _upright(piece: Piece) -> Sheet:
     if piece.straight or piece.centre is not None:
         return _flat_or_round(piece, (*piece.at(0.0), 0.0), 0.0)
     curve = _curve_on(Plane(0.0), piece)
-    base = nurbs.bspline_curve(curve.poles, curve.knots)
+    base = patches.bspline_curve(curve.poles, curve.knots)
     return Sheet(Geom_SurfaceOfLinearExtrusion(base, gp_Dir(0, 0, 1)), True, lambda t, z, _: np.stack([t, z], axis=-1))
 
 
@@ -174,13 +232,13 @@ def _drafted(piece: Piece, low: Curve, high: Curve, tangent: float) -> Sheet:
 def _ruled(low: Curve, high: Curve) -> Sheet:
     """The surface of straight lines between two cubics of the same knots."""
     net, ends = np.stack([low.poles, high.poles], axis=1), np.array([0.0, 0.0, 1.0, 1.0])
-    return Sheet(nurbs.bspline_surface(net, low.knots, ends), True, lambda t, _, up: np.stack([t, up], axis=-1))
+    return Sheet(patches.bspline_surface(net, low.knots, ends), True, lambda t, _, up: np.stack([t, up], axis=-1))
 
 
 def _between(sheets: Sequence[Sheet], low: Rail, high: Rail, outward: bool = True) -> list[TopoDS_Face]:
     """The walls from one rail up to another; outward: they look away from the lens."""
     builder, walls = BRep_Builder(), []
-    rising = [straight(start, end) for start, end in zip(low.corners, high.corners, strict=True)]
+    rising = [_straight(start, end) for start, end in zip(low.corners, high.corners, strict=True)]
     for k, sheet in enumerate(sheets):
         after, curves = (k + 1) % len(sheets), (low.curves[k], high.curves[k])
         loop = [(low.edges[k], True), (rising[after], True), (high.edges[k], False), (rising[k], False)]

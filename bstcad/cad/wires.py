@@ -13,7 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from OCP.BRepAdaptor import BRepAdaptor_Curve
 from OCP.GeomAbs import GeomAbs_CurveType as Kind
 from OCP.TopAbs import TopAbs_Orientation
-from scipy.interpolate import BSpline
+from scipy.interpolate import BSpline, make_interp_spline
 
 from bstcad.optics.outlines import Outline
 from bstcad.optics.surfaces import Surface
@@ -26,6 +26,7 @@ NEAR = 1e-6  # mm; wires nearer to each other than this touch
 SIDES = 400  # of the polygon by which a loop is checked
 COARSEST = 64  # parts of a piece, at least
 FINEST, HALVINGS = 1 << 14, 4  # parts of a cubic at most; or each of its first parts halved so often
+SMOOTH_PARTS = 256  # of a quintic, which follows half a circle on a sphere or conic to 1e-12 mm
 CLOSE = 1e-7  # of a piece: two breaks nearer than that are merged
 ONE_SIDED = np.array([-25, 48, -36, 16, -3]) / 12  # of five values a step apart: the slope at the first, to h⁴ f⁽⁵⁾ / 5
 BISECTIONS = 50
@@ -190,7 +191,7 @@ def fault(shape: shapely.Polygon) -> tuple[str, str] | None:
 
 @dataclass(frozen=True)
 class Curve:
-    """A curve in space over a piece: a cubic in the piece's t, or a level line or arc."""
+    """A curve in space over a piece, by the piece's t: a spline, or a level line or arc."""
 
     piece: Piece
     poles: np.ndarray  # (n, 3) mm; of a line or an arc: both its ends
@@ -224,12 +225,19 @@ def _crossings(surface: Surface, piece: Piece) -> np.ndarray:
     return np.concatenate(crossings)
 
 
-def fitted(points: Points, t: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """(poles (n, k), full knots) of a cubic with the points and tangents of points(t), within the tolerance.
+def fitted(points: Points, t: np.ndarray, tolerance: float, smooth: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """(poles (n, k), full knots) of a spline with the points (and tangents) of points(t), within the tolerance.
 
-    It begins with the breaks t, and halves each part that is further off at its middle or quarters: the error of a
-    smooth part falls with the fourth power of its length, down to rounding.
+    smooth: of an analytic curve, by a quintic if that suffices.  Else a cubic: it begins with the breaks t and halves
+    each part that is further off at its middle or quarters: the error of a smooth part falls with the fourth power of
+    its length, down to rounding.
     """
+    if smooth:
+        even = np.linspace(t[0], t[-1], 2 * SMOOTH_PARTS + 1)
+        values = points(even)
+        spline = make_interp_spline(even[::2], values[::2], k=5)
+        if np.abs(spline(even) - values).max() <= tolerance:
+            return spline.c, spline.t
     most, near = max(FINEST, len(t) << HALVINGS), tolerance / 2  # between those three points a part may be further off
     while True:
         quarters = np.append((t[:-1, None] + np.diff(t)[:, None] * np.arange(4) / 4).ravel(), t[-1])

@@ -172,7 +172,7 @@ def _title_block(paper: Paper, sheet: Sheet, scale: str) -> None:
     room = right - left - 3.6
     paper.text(left + 1.8, TABLE - 5.6, scene.name, 4.2, room=room, weight="bold")
     for k, line in enumerate(wrapped(scene.title or f"freeform {scene.optic}", SMALL, room, 2)):
-        paper.text(left + 1.8, TABLE - 10.2 - 3.3 * k, line, SMALL)
+        paper.text(left + 1.8, TABLE - 10.2 - 3.3 * k, line, SMALL, room=room)
     cells = (
         (("Part no.", part.number), ("Drawn by", part.author), ("Organisation", part.organisation)),
         (("Date", part.date), ("Scale", scale), ("Unit", "mm"), ("Sheet", "1/1"), ("Projection", " ")),
@@ -234,7 +234,7 @@ def _beside(paper: Paper, rows: Rows, y: float, pitch: float) -> float:
             break
         paper.text(start, y, name, NOTES, room=16.4, color=GREY)
         for line in lines:
-            paper.text(start + 17.0, y, line, NOTES)
+            paper.text(start + 17.0, y, line, NOTES, room=end - start - 17.0)
             y -= pitch
         y -= 0.5
     return y

@@ -86,16 +86,13 @@ def png(figure: Figure) -> bytes:
 def _encode(figure: Figure, dpi: float) -> bytes:
     """PNG bytes at `dpi` without alpha; with a palette where so few colours occur that it cannot be told apart."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from PIL import Image
+    from PIL import Image, ImageOps
 
     figure.set_dpi(dpi)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()  # once: a tight box by matplotlib would draw everything twice
-    pixels = np.asarray(canvas.buffer_rgba())[..., :3]
-    inked, pad = (pixels < 255).any(-1), round(MARGIN * dpi)
-    rows, columns = (np.flatnonzero(inked.any(axis)) for axis in (1, 0))
-    top, left = max(rows[0] - pad, 0), max(columns[0] - pad, 0)
-    picture = Image.fromarray(np.ascontiguousarray(pixels[top : rows[-1] + pad + 1, left : columns[-1] + pad + 1]))
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    picture = ImageOps.expand(picture.crop(ImageOps.invert(picture).getbbox()), round(MARGIN * dpi), "white")
     small = io.BytesIO()
     if picture.getcolors(FEW_COLOURS) is not None:
         picture = picture.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)

@@ -19,7 +19,7 @@ from xml.etree import ElementTree
 import numpy as np
 import torch
 
-from bstcad.cad.mesh_files import UNNAMED, Label, preview_files
+from bstcad.cad.mesh import UNNAMED, Label, preview_files
 from bstcad.optics.bspline import BSplineSurface, basis_matrix
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline

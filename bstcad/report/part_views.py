@@ -24,7 +24,7 @@ from scipy.optimize import brentq
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import Surface, sag
-from bstcad.report.drawing import BLUE, GLASS, GREY, STYLE, VERMILION
+from bstcad.report.drawing import BLUE, GLASS, GREY, STYLE, VERMILION, round_up
 from bstcad.report.exports import across, pitch_radius
 from bstcad.report.units import mm, number
 from bstcad.scene.mount import Flange, Mount
@@ -42,6 +42,7 @@ TAIL = 4.5  # mm of a dimension line beyond the measured length
 LETTERS, NOTES, NUMBERS = 2.5, 2.1, 1.9  # mm: letters of dimensions, of leaders and notes, of heights on contours
 CHAIN = (0, (14, 2.5, 2, 2.5))  # of a centre line, in its widths
 FAMILY = STYLE["font.family"]
+SMALLER = 0.8  # times their size texts are where they have little room
 UNKNOWN = "\u25a1"  # a box, for a letter that the font lacks
 MAP_POINTS, SECTION_POINTS = 241, 401  # of the map of heights, each way; along each face of a section
 LEVELS = 18  # contour lines at most
@@ -167,18 +168,18 @@ def width_of(text: str, size: float, bold: bool = False) -> float:
     return text_to_path.get_text_width_height_descent(text, font, False)[0] if text else 0.0
 
 
-def fitted(text: str, size: float, room: float, bold: bool = False, least: float = 0.8) -> tuple[str, float]:
-    """(text, size) for a room of that width (mm): down to `least` of its size, then cut at its end."""
-    size = max(least * size, min(size, size * room / max(width_of(text, size, bold), 1e-9)))
-    if width_of(text, size, bold) <= room * (1 + 1e-9):
-        return text, size
-    while text and width_of(f"{text}\u2026", size, bold) > room:
-        text = text[:-1]
-    return f"{text.rstrip()}\u2026", size
+def fitted(text: str, size: float, room: float, bold: bool = False) -> tuple[str, float]:
+    """(text, size) for a room of that width (mm): down to SMALLER of its size, then cut at its end."""
+    size *= max(SMALLER, min(1.0, room / max(width_of(text, size, bold), 1e-9)))
+    if width_of(text, size, bold) > room * (1 + 1e-9):
+        while text and width_of(f"{text}\u2026", size, bold) > room:
+            text = text[:-1]
+        text = f"{text.rstrip()}\u2026"
+    return text, size
 
 
 def wrapped(text: str, size: float, room: float, most: int) -> list[str]:
-    """The text in at most `most` lines of that width (mm), broken between words; the last line is cut."""
+    """The text in at most `most` lines of that width (mm), broken between words; the last line is cut where printed."""
     lines = [""]
     for word in drawable(text).split():
         longer = f"{lines[-1]} {word}".strip()
@@ -186,7 +187,7 @@ def wrapped(text: str, size: float, room: float, most: int) -> list[str]:
             lines[-1] = longer
         else:
             lines.append(word)
-    return [fitted(line, size, room, least=1.0)[0] for line in lines]
+    return lines
 
 
 def closed(outline: Outline) -> np.ndarray:
@@ -435,17 +436,11 @@ def _around(paper: Paper, views: Views, flange: Flange, at: Placed) -> None:
         for ahead in (diameter / 2 + 1.5 / at.scale) * np.stack([RIGHT, UP]):
             paper.line(at([(x, y) - ahead, (x, y) + ahead]), color=GREY, zorder=1.5)
 
-    def leader(holes: list[tuple[float, float, float]], right: int, up: int) -> tuple[Point, Point]:
-        """(tip, shelf) of the shortest leader from one of the holes to a corner."""
-        tips = [at((x + right * d / 2 * 0.5**0.5, y + up * d / 2 * 0.5**0.5)) for x, y, d in holes]
-        pairs = [(tip, (at.x + right * max(right * (tip[0] - at.x), 6.5), over if up > 0 else under)) for tip in tips]
-        return min(pairs, key=lambda pair: math.dist(*pair))
-
-    free = list(CALLS)
-    for text, holes in list(kinds_of_holes(views.mount))[: len(CALLS)]:
-        corner = min(free, key=lambda corner, holes=holes: math.dist(*leader(holes, *corner)))
-        free.remove(corner)
-        paper.leader(*leader(holes, *corner), text, corner[0])
+    for (text, holes), (right, up) in zip(kinds_of_holes(views.mount), CALLS, strict=False):
+        x, y, diameter = max(holes, key=lambda hole, corner=(right, up): np.dot(hole[:2], corner))
+        tip = at((x, y) + 0.5**0.5 * diameter / 2 * np.array([right, up]))
+        shelf = at.x + right * max(right * (tip[0] - at.x), 6.5), over if up > 0 else under
+        paper.leader(tip, shelf, text, right)
 
 
 def kinds_of_holes(mount: Mount) -> Iterator[tuple[str, list[tuple[float, float, float]]]]:
@@ -468,40 +463,20 @@ def _contours(paper: Paper, views: Views, at: Placed) -> str:
     low, high = float(np.nanmin(z)), float(np.nanmax(z))
     if not high - low > 1e-9 * max(1.0, abs(low), abs(high)):
         return ""
-    decade = 10.0 ** np.floor(np.log10((high - low) / LEVELS))
-    step = float(next(k * decade for k in (1, 2, 5, 10) if (high - low) / (k * decade) <= LEVELS))
+    step = round_up((high - low) / LEVELS)
     levels = step * np.arange(np.ceil(low / step), np.floor(high / step) + 1)
     decimals = max(0, -int(np.floor(np.log10(step) + 1e-9)))
     on_paper = at.x + at.scale * x, at.y + at.scale * y
     drawn = paper.axes.contour(*on_paper, z, levels, colors=BLUE, linewidths=0.55, zorder=2)
-    taken: list[np.ndarray] = []
-    for level, lines in zip(levels, drawn.allsegs, strict=True):
-        _height(paper, f"{level:.{decimals}f}", lines, views, at=at, taken=taken)
+    size, ground = NUMBERS / POINT, {"facecolor": "white", "edgecolor": "none", "pad": 0.4}
+    edges = [edge for edge in (views.rim, views.used) if edge is not None]
+    for label in paper.axes.clabel(drawn, fmt=f"%.{decimals}f", fontsize=size, inline=False, zorder=3):
+        off = np.abs(np.subtract(label.get_position(), (at.x, at.y)))
+        clear = [*off, np.hypot(*off) - AXES, *(at.scale * abs(edge.depth(*off / at.scale)) for edge in edges)]
+        if min(clear) < width_of(label.get_text(), NUMBERS) / 2 + 0.5:  # it would cover an axis, the frame or an edge
+            label.remove()
+        label.set_bbox(ground)
     return f"{number(step)} mm" if step >= 1e-3 else f"{number(1e3 * step)} \u00b5m"
-
-
-def _height(
-    paper: Paper, text: str, lines: Sequence[np.ndarray], views: Views, *, at: Placed, taken: list[np.ndarray]
-) -> None:
-    """Write its height on a contour where that is clear of rim, axes, frame and all heights in `taken` (paper, mm)."""
-    lines = [line for line in lines if len(line) > 4]
-    if not lines:
-        return
-    spots = np.concatenate([line[2:-2:2] for line in lines])
-    ahead = np.concatenate([line[4::2] for line in lines]) - spots
-    off, room = np.abs(spots - (at.x, at.y)), width_of(text, NUMBERS)
-    clear = np.min([
-        *(at.scale * np.abs(edge.depth(*off.T / at.scale)) for edge in (views.rim, views.used) if edge is not None),
-        off.min(1), np.hypot(*off.T) - AXES - 3, *(0.5 * np.hypot(*(spots - other).T) for other in taken),
-    ], axis=0)  # fmt: skip
-    best = int(np.argmax(np.minimum(clear, 3 * room)))
-    if clear[best] <= room / 2 + 1.0:
-        return
-    taken.append(spots[best])
-    turn = (np.degrees(np.arctan2(*ahead[best][::-1])) + 90) % 180 - 90
-    ground = {"facecolor": "white", "edgecolor": "none", "pad": 0.4}
-    style = {"rotation": turn, "ha": "center", "va": "center", "color": BLUE, "bbox": ground, "zorder": 3}
-    paper.text(*spots[best], text, NUMBERS, **style)
 
 
 # --- the sections -----------------------------------------------------------------------------------------------------
@@ -527,7 +502,7 @@ def _section(paper: Paper, views: Views, which: int, scale: float, *, left: floa
     turned = {"rotation": 90, "rotation_mode": "anchor", "ha": "center"}
     for beside, names in zip((left - 1.6, right + 1.6 + 0.8 * LETTERS), views.names, strict=True):
         name = next((name for name in names if width_of(name, LETTERS) <= room), names[-1])
-        paper.text(beside, middle + room / 2 + 1, *fitted(name, LETTERS, room, least=0.5), **turned)
+        paper.text(beside, middle + room / 2 + 1, name, room=room, **turned)
     inside = left - 16 <= at.x <= right + 3
     _frame(paper, (at.x if inside else left - 15.5, middle), ("z", "yx"[which]), min(AXES, reach))
     if which == 1:

@@ -22,10 +22,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.analysis.shape import FLATTEST, describe, heights, survey, thickness_range
-from bstcad.cad.mass_properties import exact_volume
 from bstcad.optics.bspline import DEGREE
 from bstcad.optics.lens import Lens
 from bstcad.optics.media import density
+from bstcad.optics.quadrature import exact_volume
 from bstcad.optics.surfaces import sag
 from bstcad.report.units import Rows, mm, tables
 from bstcad.scene.mount import as_cut

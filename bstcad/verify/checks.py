@@ -18,8 +18,8 @@ import numpy as np
 
 from bstcad.analysis.light import Blur, blur, margins, mount_losses
 from bstcad.analysis.shape import describe, survey
-from bstcad.cad import mass_properties, mesh_files
 from bstcad.cad import mesh as meshes
+from bstcad.optics import quadrature
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Leak, Screen, leak
 from bstcad.optics.lens import Lens
@@ -143,10 +143,10 @@ def verify(
     part_job = "bstcad.verify.step_checks.check_part", folder.absolute(), nominal.lens, mount, nominal.part
     of_part = mount and submit(*part_job)
     text = part21.read_lens(path)  # its sentences say more than OCC's
-    mesh = mesh_files.read_stl(folder / "lens.stl")
+    mesh = meshes.read_stl(folder / "lens.stl")
     sealed = Check.true("STL watertight, winding consistent", meshes.is_closed(mesh))
     lens = _result(lens, path)
-    whole = replace(mass_properties.of_lens(lens), volume=mass_properties.exact_volume(lens))  # not as it was stated
+    whole = replace(quadrature.of_lens(lens), volume=quadrature.exact_volume(lens))  # not as it was stated
     lit, of_aperture, why = (lens, (), "") if mount is None else _as_made(seen, lens, nominal, folder)
     known(lit)
     light = measure(lit, nominal.channels, nominal.screen, nominal.target, effort, nominal.ghost, nominal.draw)

@@ -17,13 +17,13 @@ import pytest
 from scipy.ndimage import binary_dilation
 
 from bstcad.cad import step_reading, step_writing
-from bstcad.cad.mass_properties import of_lens
 from bstcad.cad.solid import lens_solid
 from bstcad.judges import batoid, comparison, mitsuba
 from bstcad.optics.bspline import DEGREE, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Fresnel, Losses
 from bstcad.optics.measure import tubes_picture
+from bstcad.optics.quadrature import of_lens
 from bstcad.optics.trace import follow_ghost, ghost_light, launch, to_first_free, to_plane, trace
 from bstcad.pipeline import design
 from bstcad.report import exports

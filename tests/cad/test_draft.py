@@ -9,8 +9,8 @@ import pytest
 
 from bstcad.cad import step_writing
 from bstcad.cad.mounting import Placed, mounted, wire
+from bstcad.cad.solid import lens_solid, named_solid
 from bstcad.cad.solid_properties import of_solid
-from bstcad.cad.trimming import named_solid, trimmed_solid
 from bstcad.cad.walls import Draft
 from bstcad.optics.outlines import Circle
 from bstcad.optics.surfaces import Sphere, sag
@@ -95,9 +95,9 @@ def test_it_is_a_closed_solid_whose_walls_lean_by_the_draft(front, rim, tmp_path
 @pytest.mark.parametrize("rim", RIMS)
 def test_its_volume_is_that_of_slices(rim, lean):
     lens, wired = plate("plane"), wire(RIMS[rim])
-    solid = trimmed_solid(lens, wired, draft=lean)
+    solid = lens_solid(lens, wired, draft=lean)
     z = parting(solid) if lean.angle else 3.0
-    wanted = of_solid(trimmed_solid(lens, wired)).volume - taken(RIMS[rim], lean, z)
+    wanted = of_solid(lens_solid(lens, wired)).volume - taken(RIMS[rim], lean, z)
     assert occ_volume(solid) == pytest.approx(wanted, rel=1e-6)
     assert of_solid(solid).volume == pytest.approx(wanted, rel=1e-7)
 
@@ -106,13 +106,13 @@ def test_it_leans_from_below_the_lowest_place_of_the_back_s_rim():
     lens = plate("plane")
     turn = np.linspace(0, 2 * np.pi, 100_001)
     lowest = sag(lens.back, 3.5 * np.cos(turn), 3.5 * np.sin(turn)).min()
-    assert parting(trimmed_solid(lens, wire(RIMS["circle"]), draft=LEAN)) == pytest.approx(lowest - LAND, abs=1e-3)
+    assert parting(lens_solid(lens, wire(RIMS["circle"]), draft=LEAN)) == pytest.approx(lowest - LAND, abs=1e-3)
 
 
 def test_a_circle_with_a_turned_front_has_cones_and_circles():
     """The wall of 4 degrees, the bevel of 45: exactly, by what the file says they are."""
     lens = plate("convex")
-    found = trimmed_solid(lens, wire(RIMS["circle"]), draft=LEAN)
+    found = lens_solid(lens, wire(RIMS["circle"]), draft=LEAN)
     cones = [face for face in found.Faces() if face.geomType() == "CONE"]
     angles = sorted(face._geomAdaptor().Cone().SemiAngle() for face in cones)
     assert angles == pytest.approx(np.radians([4.0, 4.0, 45.0, 45.0]), abs=1e-12)
@@ -154,7 +154,7 @@ def test_below_a_flange_it_leans_from_the_flange_on(lean):
     part = mounted(body, [Placed(lens, wire(RIMS["rounded"]), draft=lean)])
     assert part.solid.isValid() and worst_gap(part.solid, 41) < 1e-7 and Counter(part.faces)["bevel"] == 8
     opening = cq.Face.makeFromWires(ROUNDED).Area() * 1.0  # mm thick
-    whole = of_solid(trimmed_solid(lens, ROUNDED)).volume + body.val().Volume() - opening
+    whole = of_solid(lens_solid(lens, ROUNDED)).volume + body.val().Volume() - opening
     assert occ_volume(part.solid) == pytest.approx(whole - taken(RIMS["rounded"], lean, 2.0), rel=1e-6)
     with pytest.raises(ValueError, match="lens: draft and bevel are of its own walls, below the flange"):
         mounted(disc(-1.0, 3.0), [Placed(lens, draft=Draft(1.0))])
@@ -180,7 +180,7 @@ STEEP = replace(plate(), front=Sphere(-4.0, 0.24), back=waves(half=(4.0, 4.0)), 
 def test_walls_that_cannot_lean_are_refused_in_one_sentence(lens, rim, holes, lean, words):
     rim = wire(rim) if isinstance(rim, Round | Box) else rim
     with pytest.raises(ValueError, match=words) as refused:
-        trimmed_solid(lens, rim, holes, lean)
+        lens_solid(lens, rim, holes, lean)
     assert "\n" not in str(refused.value)
 
 

@@ -9,15 +9,14 @@ import torch
 from OCP.BRepGProp import BRepGProp
 from OCP.GProp import GProp_GProps
 
-from bstcad.cad.mass_properties import MassProperties, exact_volume, of_lens
 from bstcad.cad.mounting import Placed, mounted, wire
-from bstcad.cad.solid import lens_solid
+from bstcad.cad.solid import lens_solid, named_solid
 from bstcad.cad.solid_properties import of_solid
-from bstcad.cad.trimming import named_solid
 from bstcad.cad.walls import Draft
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.quadrature import MassProperties, exact_volume, of_lens
 from bstcad.optics.surfaces import Conic, Plane, Sphere
 from bstcad.scene.mount import Box
 from tests.cad.test_mounting import disc

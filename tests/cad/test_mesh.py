@@ -11,12 +11,12 @@ import pytest
 import torch
 import trimesh
 
-from bstcad.cad import mesh, mesh_files
-from bstcad.cad.mass_properties import exact_volume
+from bstcad.cad import mesh
 from bstcad.cad.mesh import Mesh, chordal_error, is_closed, lens_mesh, volume_and_area
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.quadrature import exact_volume
 from bstcad.optics.surfaces import Plane, Sphere
 from tests.cad.facets import deviation
 
@@ -74,8 +74,8 @@ def test_facets_of_the_file_lie_as_near_as_was_asked_wherever_one_looks(make_len
     lens = make_lens(front, outline, m=9)
     for asked in (1e-2, 1e-3, 1e-4):  # mm
         cells, made = mesh.fitting(lens, asked)
-        mesh_files.write_stl(made, tmp_path / "lens.stl")
-        again = mesh_files.read_stl(tmp_path / "lens.stl")
+        mesh.write_stl(made, tmp_path / "lens.stl")
+        again = mesh.read_stl(tmp_path / "lens.stl")
         assert is_closed(again)
         found = deviation(again, lens, 500_000)
         assert found <= asked and (found > 0.5 * asked or cells == mesh.COARSEST)
@@ -129,8 +129,8 @@ def test_the_chordal_error_of_a_sphere_is_the_sagitta_and_of_a_round_wall_that_o
 @OUTLINES
 def test_stl_comes_back_closed(make_lens, tmp_path, outline):
     made = lens_mesh(make_lens(Sphere(8.0, 0.02), outline), 48)
-    mesh_files.write_stl(made, tmp_path / "lens.stl")
-    again = mesh_files.read_stl(tmp_path / "lens.stl")
+    mesh.write_stl(made, tmp_path / "lens.stl")
+    again = mesh.read_stl(tmp_path / "lens.stl")
     assert is_closed(again)
     assert (len(again.vertices), len(again.faces)) == (len(made.vertices), len(made.faces))
     volume = volume_and_area(made)[0]
@@ -169,25 +169,25 @@ def test_closed_is_each_edge_walked_once_each_way(faces, closed):
 
 def test_a_damaged_stl_is_refused(make_lens, tmp_path):
     path = tmp_path / "lens.stl"
-    mesh_files.write_stl(lens_mesh(make_lens(m=9), 16), path)
+    mesh.write_stl(lens_mesh(make_lens(m=9), 16), path)
     data = path.read_bytes()
     for damaged in (b"", data[:-1], data + b"x", data[:84]):
         path.write_bytes(damaged)
         with pytest.raises(ValueError, match="no binary STL"):
-            mesh_files.read_stl(path)
+            mesh.read_stl(path)
     path.write_bytes(data[:100] + np.float32(np.nan).tobytes() + data[104:])
     with pytest.raises(ValueError, match="not finite"):
-        mesh_files.read_stl(path)
+        mesh.read_stl(path)
     with pytest.raises(ValueError, match="cannot be read"):
-        mesh_files.read_stl(tmp_path / "gone.stl")
+        mesh.read_stl(tmp_path / "gone.stl")
 
 
 def test_a_3mf_states_millimetres_the_mesh_a_name_and_a_colour_and_is_the_same_twice(make_lens, tmp_path, monkeypatch):
     made = lens_mesh(make_lens(), 16)
-    label = mesh_files.Label('a "name" <1>', "Title & <b>", "N-BK7 'x'", remark="A remark.")
-    mesh_files.write_3mf(made, tmp_path / "one.3mf", label)
+    label = mesh.Label('a "name" <1>', "Title & <b>", "N-BK7 'x'", remark="A remark.")
+    mesh.write_3mf(made, tmp_path / "one.3mf", label)
     monkeypatch.setattr("time.time", lambda: 2e9)
-    mesh_files.write_3mf(made, tmp_path / "two.3mf", label)
+    mesh.write_3mf(made, tmp_path / "two.3mf", label)
     assert (tmp_path / "one.3mf").read_bytes() == (tmp_path / "two.3mf").read_bytes()
     with zipfile.ZipFile(tmp_path / "one.3mf") as package:
         assert set(package.namelist()) == {"[Content_Types].xml", "_rels/.rels", "3D/3dmodel.model"}
@@ -201,8 +201,8 @@ def test_a_3mf_states_millimetres_the_mesh_a_name_and_a_colour_and_is_the_same_t
     said = {entry.get("name"): entry.text for entry in model.iter(f"{core}metadata")}
     assert said == {"Title": "Title & <b>", "Description": "A remark.", "Application": "bstcad"}
     [material], [thing], [item] = (list(model.iter(f"{core}{tag}")) for tag in ("basematerials", "object", "item"))
-    assert material[0].attrib == {"name": "N-BK7 'x'", "displaycolor": mesh_files.CLEAR}
-    assert re.fullmatch("#[0-9A-F]{8}", mesh_files.CLEAR) and re.fullmatch("#[0-9A-F]{8}", mesh_files.SILVER)
+    assert material[0].attrib == {"name": "N-BK7 'x'", "displaycolor": mesh.CLEAR}
+    assert re.fullmatch("#[0-9A-F]{8}", mesh.CLEAR) and re.fullmatch("#[0-9A-F]{8}", mesh.SILVER)
     assert (thing.get("name"), thing.get("pid"), thing.get("pindex")) == ('a "name" <1>', material.get("id"), "0")
     assert item.get("objectid") == thing.get("id") != material.get("id")
     again = trimesh.load(tmp_path / "one.3mf", force="mesh")

@@ -7,9 +7,9 @@ import cadquery as cq
 import numpy as np
 import pytest
 
-from bstcad.cad import nurbs, step_writing
-from bstcad.cad.mass_properties import exact_volume
+from bstcad.cad import patches, step_writing
 from bstcad.cad.mounting import Placed, body, mounted
+from bstcad.optics.quadrature import exact_volume
 from bstcad.scene.mount import Box, Flange, Round
 from bstcad.step_text import part21
 from tests.cad.test_trimming import FRONTS, occ_volume, plate, stadium, uses, worst_gap
@@ -44,7 +44,7 @@ def test_it_is_one_closed_solid_of_the_volume_of_both(front, low, high):
     check(part)
     assert occ_volume(part.solid) == pytest.approx(exact_volume(lens) + ring(low, high), rel=2e-6)
     assert Counter(part.faces) == {"back": 1, "front": 1, "rim": 8, "flange": 3}
-    net = nurbs.net_of(part.solid.Faces()[part.faces.index("back")]._geomAdaptor())
+    net = patches.net_of(part.solid.Faces()[part.faces.index("back")]._geomAdaptor())
     assert (net == lens.back.control_points()).all()  # the design's own
 
 

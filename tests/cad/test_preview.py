@@ -10,12 +10,11 @@ import pytest
 import torch
 import trimesh
 
-from bstcad.cad import mesh_files
-from bstcad.cad.mass_properties import exact_volume
-from bstcad.cad.mesh import Mesh, chordal_error
-from bstcad.cad.mesh_files import SILVER, Label
+from bstcad.cad import mesh
+from bstcad.cad.mesh import SILVER, Label, Mesh, chordal_error
 from bstcad.cad.solid import coarse_copy, lens_solid
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.quadrature import exact_volume
 from bstcad.optics.surfaces import Plane, Sphere, sag
 from tests.cad.test_trimming import plate, waves
 
@@ -25,10 +24,10 @@ LENSES = [(Plane(8.0), Rectangle(24.0, 20.0)), (Sphere(8.0, -0.03), Circle(12.0)
 @pytest.mark.parametrize("front, outline", LENSES, ids=["plate", "round"])
 def test_the_preview_is_the_lens_in_metres_with_y_up(make_lens, front, outline):
     lens = make_lens(front, outline, m=65)
-    found = dict(mesh_files.preview_files(lens, Label("L 1", "<T> & Co", "PMMA", SILVER)))
+    found = dict(mesh.preview_files(lens, Label("L 1", "<T> & Co", "PMMA", SILVER)))
     scene = trimesh.load(io.BytesIO(found["preview.glb"]), file_type="glb")
     [(name, solid)] = scene.geometry.items()
-    assert name == "L 1" and 15_000 < len(solid.faces) <= mesh_files.PREVIEW and len(found["preview.glb"]) < 1_000_000
+    assert name == "L 1" and 15_000 < len(solid.faces) <= mesh.PREVIEW and len(found["preview.glb"]) < 1_000_000
     x, y, z = 1e3 * solid.vertices.T
     normal_x, normal_y, normal_z = solid.vertex_normals.T
     own, normals = np.stack([x, -z, y], 1), np.stack([normal_x, -normal_z, normal_y], 1)
@@ -49,7 +48,7 @@ def test_the_preview_is_the_lens_in_metres_with_y_up(make_lens, front, outline):
         model = ElementTree.fromstring(package.read("3D/3dmodel.model"))
     said = {entry.get("name"): entry.text for entry in model if entry.tag.endswith("metadata")}
     assert said["Title"] == "<T> & Co" and f"{off:.2g} mm" in said["Description"]
-    assert dict(mesh_files.preview_files(lens, Label())) == dict(mesh_files.preview_files(lens, Label()))
+    assert dict(mesh.preview_files(lens, Label())) == dict(mesh.preview_files(lens, Label()))
 
 
 @pytest.mark.parametrize("outline, half", [(Rectangle(10.0, 8.0), (5.0, 4.0)), (Circle(3.5), (4.0, 4.0))])

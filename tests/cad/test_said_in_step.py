@@ -8,12 +8,13 @@ from dataclasses import replace
 import pytest
 
 from bstcad.cad import step_reading, step_writing
-from bstcad.cad.mass_properties import of_lens
-from bstcad.cad.solid import face_names, lens_solid
+from bstcad.cad.solid import lens_solid
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.quadrature import of_lens
 from bstcad.scene.mount import GLASS, Part
 from bstcad.step_text import part21
 from bstcad.verify.text_checks import of_part
+from tests.cad.conftest import encoded
 from tests.cad.said_in_step import read
 
 PART = Part(
@@ -27,11 +28,14 @@ def lens(request, make_lens):
     return make_lens(outline=request.param, m=9)
 
 
+def walls_of(lens):
+    return ["rim"] * (2 if isinstance(lens.outline, Circle) else 4)
+
+
 def test_all_that_is_said_comes_back(lens, tmp_path):
     step_writing.write_lens(lens, tmp_path / "lens.step", "lens", PART)
     said, wanted = read(tmp_path / "lens.step"), of_lens(lens)
-    walls = ["rim"] * (1 if isinstance(lens.outline, Circle) else 4)
-    assert (said.name, said.faces) == ("lens", ["back", "front", *walls])
+    assert (said.name, said.faces) == ("lens", ["back", "front", *walls_of(lens)])
     assert (said.colour, said.material, said.density) == ("#10a0ff40", "PMMA", pytest.approx(1.19, rel=1e-12))
     assert (said.area, said.volume) == pytest.approx((wanted.area, wanted.volume), rel=1e-13)
     assert said.centroid == pytest.approx(wanted.centroid, abs=1e-13)
@@ -46,7 +50,7 @@ def entity(text, number):
 
 def test_the_text_has_each_measure_in_its_unit(lens):
     """OCC's own text has 0.005 of a metre here, and g³ cm²; its reader may undo what its writer does."""
-    text = step_writing.encode(lens_solid(lens), "lens", PART, face_names(lens), of_lens(lens)).decode()
+    text = encoded(lens, PART).decode()
     [(measure, aspect)] = re.findall(r"SURFACE_PROFILE_TOLERANCE\('','',#(\d+),#(\d+)\)", text)
     stated = r"LENGTH_MEASURE_WITH_UNIT\(LENGTH_MEASURE\((.*)\),#(\d+)\)"
     value, unit = re.fullmatch(stated, entity(text, measure)).groups()
@@ -67,7 +71,7 @@ def test_the_text_has_each_measure_in_its_unit(lens):
 
 
 def test_number_and_names_stand_in_product_and_header(lens):
-    text = step_writing.encode(lens_solid(lens), "lens", PART, face_names(lens)).decode()
+    text = encoded(lens, PART).decode()
     assert text.isascii() and re.search(r"PRODUCT\('LE-017','lens',", text)
     header = re.sub(r"\s", "", text[: text.index("ENDSEC")])
     assert r"('\X2\00C4\X0\nneO''Hara'),('A\X2\005C\X0\B')" in header
@@ -109,19 +113,18 @@ def test_the_front_has_a_profile_of_its_own(lens, tmp_path):
     step_writing.write_lens(lens, tmp_path / "lens.step", "lens", PART)
     [absent] = [check for check in of_part(part21.read(tmp_path / "lens.step"), part) if check.limit is None]
     assert absent.name == "STEP text: states profile tolerance of the front"
-    faces = ["flange" if name == "front" else name for name in face_names(lens)]  # a plane front is one with a flange
-    text = step_writing.encode(lens_solid(lens), "lens", part, faces).decode()
+    faces = ["back", "flange", *walls_of(lens)]  # a plane front is one with a flange
+    text = encoded(lens, part, faces=faces).decode()
     assert text.count("SURFACE_PROFILE_TOLERANCE") == 1
 
 
 def test_the_same_lens_is_the_same_file(lens, monkeypatch):
     """But for the date in its header, which SOURCE_DATE_EPOCH fixes."""
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
-    solid = lens_solid(lens), "lens", PART, face_names(lens), of_lens(lens)
-    first, between, second = (step_writing.encode(*given) for given in (solid, (solid[0], "other"), solid))
+    first, _, second = (encoded(lens, part, name) for part, name in ((PART, "lens"), (Part(), "other"), (PART, "lens")))
     assert first == second and b"'1970-01-02T00:00:00'" in first
     monkeypatch.delenv("SOURCE_DATE_EPOCH")
-    now = step_writing.encode(*solid)
+    now = encoded(lens, PART)
     assert now != first and now.partition(b"DATA;")[2] == first.partition(b"DATA;")[2]
 
 

@@ -16,11 +16,11 @@ from OCP.TopoDS import TopoDS
 from OCP.TopTools import TopTools_IndexedMapOfShape
 
 from bstcad.cad import step_writing
-from bstcad.cad.mass_properties import exact_volume
-from bstcad.cad.trimming import trimmed_solid
+from bstcad.cad.solid import lens_solid
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.quadrature import exact_volume
 from bstcad.optics.surfaces import Conic, Plane, Sphere, sag
 from bstcad.step_text import part21
 
@@ -99,7 +99,7 @@ def occ_volume(solid, to=1e-6):
 @pytest.mark.parametrize("front", FRONTS)
 def test_it_is_a_closed_solid_whose_edges_lie_on_all_they_bound(front, tmp_path):
     lens = plate(front)
-    solid = trimmed_solid(lens, stadium(), [*HOLES, cq.Workplane("XY").center(-1, 0).rect(0.6, 0.9).wires().val()])
+    solid = lens_solid(lens, stadium(), [*HOLES, cq.Workplane("XY").center(-1, 0).rect(0.6, 0.9).wires().val()])
     assert solid.isValid() and Counter(map(tuple, map(sorted, uses(solid).values()))) == {
         (False, True): 3 * (4 + 3 * 2 + 4)  # front, back and rising: of the rim, of circles in halves, of the window
     }
@@ -118,7 +118,7 @@ def test_its_volume_is_that_of_calculus(front):
     """To which a wall that looked inwards would add instead of taking away."""
     lens = plate(front)
     disc = cq.Workplane("XY").circle(3.5).wires().val()
-    solid = trimmed_solid(lens, disc, HOLES)
+    solid = lens_solid(lens, disc, HOLES)
     wanted = volume_under(lens, 0.0, 0.0, 3.5) - sum(volume_under(lens, x, y, d / 2) for x, y, d in HOLES)
     assert occ_volume(solid) == pytest.approx(wanted, rel=2e-6)
 
@@ -128,14 +128,14 @@ def test_without_wires_it_is_the_lens_itself():
     own = {"rectangle": rectangle(10, 8), "circle": cq.Workplane("XY").circle(3.0).wires().val()}
     for lens in (plate("convex"), replace(plate("convex"), outline=Circle(3.0), back=waves(half=(4.0, 4.0)))):
         for trim in (None, own[lens.outline.shape]):
-            assert occ_volume(trimmed_solid(lens, trim)) == pytest.approx(exact_volume(lens), rel=2e-6)
+            assert occ_volume(lens_solid(lens, trim)) == pytest.approx(exact_volume(lens), rel=2e-6)
 
 
 def test_a_wire_of_one_closed_edge():
     """An ellipse of the half axes 3 and 2 mm, whose area says how much of a plate it cuts out."""
     flat = replace(plate(), back=replace(waves(), heights=torch.zeros(17, 17, dtype=torch.float64)))
     ellipse = cq.Workplane("XY").ellipse(3, 2).wires().val()
-    solid = trimmed_solid(flat, ellipse, [cq.Workplane("XY").ellipse(0.5, 0.4).wires().val()])
+    solid = lens_solid(flat, ellipse, [cq.Workplane("XY").ellipse(0.5, 0.4).wires().val()])
     assert solid.isValid() and worst_gap(solid) < 1e-7
     assert occ_volume(solid) == pytest.approx(np.pi * (6 - 0.2) * 4.0, rel=1e-8)
 
@@ -143,10 +143,10 @@ def test_a_wire_of_one_closed_edge():
 def test_the_direction_of_a_wire_does_not_matter():
     lens, wire = plate(), stadium()
     back = cq.Wire(TopoDS.Wire_s(wire.wrapped.Reversed()))
-    assert trimmed_solid(lens, back).Volume() == pytest.approx(trimmed_solid(lens, wire).Volume(), rel=1e-12)
+    assert lens_solid(lens, back).Volume() == pytest.approx(lens_solid(lens, wire).Volume(), rel=1e-12)
     hole = cq.Wire.makeCircle(0.4, cq.Vector(1, 1, 7), cq.Vector(0, 0, -1))
-    assert trimmed_solid(lens, wire, [hole]).Volume() == pytest.approx(
-        trimmed_solid(lens, wire, [(1.0, 1.0, 0.8)]).Volume(), rel=1e-12
+    assert lens_solid(lens, wire, [hole]).Volume() == pytest.approx(
+        lens_solid(lens, wire, [(1.0, 1.0, 0.8)]).Volume(), rel=1e-12
     )
 
 
@@ -160,9 +160,9 @@ def polygon(*places):
 
 def test_a_wire_may_come_as_a_closed_edge_or_a_workplane_and_a_hole_as_a_list():
     wire = cq.Workplane("XY").circle(2.0)
-    volumes = [trimmed_solid(plate(), trim, [[0.5, 0.0, 1.0]]).Volume() for trim in (
+    volumes = [lens_solid(plate(), trim, [[0.5, 0.0, 1.0]]).Volume() for trim in (
         wire, wire.val(), cq.Edge.makeCircle(2.0))]  # fmt: skip
-    assert volumes == pytest.approx([occ_volume(trimmed_solid(plate(), wire.val(), [(0.5, 0.0, 1.0)]))] * 3, rel=1e-4)
+    assert volumes == pytest.approx([occ_volume(lens_solid(plate(), wire.val(), [(0.5, 0.0, 1.0)]))] * 3, rel=1e-4)
 
 
 FAULT, OPEN, NO_WIRE = "trim or holes: {} near .*; draw each", "a wire is open", "where one closed wire is needed"
@@ -199,5 +199,5 @@ PLATE = rectangle(6, 5)
 )  # fmt: skip
 def test_what_cannot_be_cut_is_one_sentence(trim, holes, words):
     with pytest.raises(ValueError, match=words) as refused:
-        trimmed_solid(plate(), trim, holes)
+        lens_solid(plate(), trim, holes)
     assert "\n" not in str(refused.value)

@@ -16,7 +16,7 @@ import torch
 
 import bstcad
 from bstcad import cli
-from bstcad.cad.mesh_files import Label
+from bstcad.cad.mesh import Label
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle

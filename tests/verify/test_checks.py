@@ -14,7 +14,7 @@ import torch
 from bstcad import cli
 from bstcad.analysis import shape
 from bstcad.cad import mesh as meshes
-from bstcad.cad import mesh_files, step_writing
+from bstcad.cad import step_writing
 from bstcad.folder import read_nominal
 from bstcad.optics import measure
 from bstcad.optics.bspline import BSplineSurface
@@ -260,7 +260,7 @@ def test_a_net_of_another_size_fails_and_stays_reportable(folder, nominal):
 
 
 def triangles(path):
-    return np.frombuffer(path.read_bytes(), mesh_files.STL_TRIANGLE, offset=84).copy()
+    return np.frombuffer(path.read_bytes(), meshes.STL_TRIANGLE, offset=84).copy()
 
 
 def rewrite(path, found):
@@ -323,7 +323,7 @@ def test_a_mesh_too_coarse_fails_unless_nobody_asked_for_a_finer_one_than_there_
     folder, nominal, monkeypatch, most, asked, fails
 ):
     monkeypatch.setattr(meshes, "MOST", most)
-    mesh = mesh_files.read_stl(folder / "lens.stl")
+    mesh = meshes.read_stl(folder / "lens.stl")
     found = checks._facets(mesh, nominal.lens, 1e9, replace(nominal, mesh_tolerance=1e-9, mesh_asked=asked))
     [chord] = [check for check in found if check.name == CHORD]
     assert chord.value > 1e-6 and chord.passed is not fails

@@ -8,12 +8,12 @@ from dataclasses import replace
 import pytest
 
 from bstcad.cad import step_writing
-from bstcad.cad.mass_properties import of_lens
-from bstcad.cad.solid import face_names, lens_solid
+from bstcad.cad.solid import lens_solid
+from bstcad.optics.quadrature import of_lens
 from bstcad.scene.mount import Part
 from bstcad.step_text import part21
 from bstcad.verify.text_checks import measures, of_part
-from tests.cad.conftest import make_lens
+from tests.cad.conftest import encoded, make_lens
 
 __all__ = ["make_lens"]
 PART = Part(author="Änne O'Hara", material="PMMA", density=1.19, surface_profile=0.005)
@@ -27,7 +27,7 @@ def lens(make_lens):
 
 @pytest.fixture
 def text(lens):
-    return step_writing.encode(lens_solid(lens), "lens", PART, face_names(lens), of_lens(lens)).decode()
+    return encoded(lens, PART).decode()
 
 
 def checked(text, lens, part=PART):
@@ -107,9 +107,7 @@ def test_what_is_not_stated_is_told_and_not_failed(lens):
     ]  # fmt: skip
     assert all(check.passed and check.value is False and check.limit is None for check in checks)
     assert len(checked(bare, lens, Part())) == 1  # and what nobody asked for is not missed
-    older = step_writing.encode(
-        lens_solid(lens), "lens", replace(PART, surface_profile=None, schema="AP214"), face_names(lens), of_lens(lens)
-    ).decode()
+    older = encoded(lens, replace(PART, surface_profile=None, schema="AP214")).decode()
     assert [check.name for check in checked(older, lens) if check.limit is None] == [SAID + "states profile tolerance"]
 
 
@@ -137,5 +135,5 @@ END-ISO"""
 
 def test_a_name_that_looks_like_a_statement_is_none(lens):
     sly = "a'; #1 = PROPERTY_DEFINITION('geometric validation property','volume',#4); lens"
-    text = step_writing.encode(lens_solid(lens), sly, PART, face_names(lens), of_lens(lens)).decode()
+    text = encoded(lens, PART, sly).decode()
     assert len(part21.parse(text).properties.volumes) == 1 and all(check.passed for check in checked(text, lens))
