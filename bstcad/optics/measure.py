@@ -31,7 +31,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.channels import Channel, places, points, weighted_sum
-from bstcad.optics.irradiance import Screen, efficiency, rrmsd, tent
+from bstcad.optics.irradiance import Leak, Screen, efficiency, leak, rrmsd, tent
 from bstcad.optics.kernels.compiling import fused_whole
 from bstcad.optics.kernels.reductions import dot, total
 from bstcad.optics.lens import Lens
@@ -90,7 +90,6 @@ class Light:
     """The light of all channels behind a lens."""
 
     picture: np.ndarray = field(repr=False)  # (rows, columns), row 0 = y max, with the target's sum: for people
-    mean: np.ndarray = field(repr=False)  # the same as the rays have it, not smoothed
     rrmsd: float  # without bias (Wang et al. 2023, Eq. 15); NaN: no light falls on the screen
     standard_error: float  # of the RRMSD
     rays: int  # in all
@@ -99,6 +98,7 @@ class Light:
     picture_off: float = math.nan  # `picture` against the lens's own, as RRMSD has it
     witness: Witness | None = None  # None: of a source of some size, of losses, or where none was asked for
     ghost: np.ndarray | None = field(default=None, repr=False)  # the part of the picture that is one; None: left out
+    leak: Leak | None = None  # of the rays' mean picture, not smoothed; None: the target is dark nowhere
 
     @property
     def efficiency(self) -> float:
@@ -128,16 +128,16 @@ def measure(
     seen = SEEN * effort.accuracy / FULL.accuracy
     rays = _enough(lens, draw or (lambda count, seed: channels), screen, wanted, effort, stray, seen)
     if not rays.boxes:
-        return Light(np.zeros(screen.shape), np.zeros(screen.shape), math.nan, math.inf, rays.count, rays.flux)
+        return Light(np.zeros(screen.shape), math.nan, math.inf, rays.count, rays.flux)
     (value, error), (tent, _) = _value(rays, wanted), apart(rays.tents, wanted)
     shown, off = _shown(rays.boxes, wanted)
     lenses = [c.through(lens) for c in channels]
     simple = draw is None and all(seen.losses is None and fused_whole(seen.interfaces) for seen in lenses)
     return Light(
-        shown.numpy(), (sum(rays.boxes) / SETS).numpy(), value, error, rays.count,
-        rays.flux, math.sqrt(max(tent, 0.0)), off,
-        _witness(lens, channels, screen, wanted, rays, stray) if effort.witness and simple else None,
-        stray and (stray.picture.cpu() * (total(wanted) / rays.on_screen)).numpy(),
+        shown.numpy(), value, error, rays.count, rays.flux, tent=math.sqrt(max(tent, 0.0)), picture_off=off,
+        witness=_witness(lens, channels, screen, wanted, rays, stray) if effort.witness and simple else None,
+        ghost=stray and (stray.picture.cpu() * (total(wanted) / rays.on_screen)).numpy(),
+        leak=leak((sum(rays.boxes) / SETS).numpy(), wanted.numpy()),
     )  # fmt: skip
 
 

@@ -23,7 +23,7 @@ from bstcad.report.prescription import prescription
 from bstcad.report.record import LEFT_OUT, Contents, LeftOut, Line, Making
 from bstcad.report.units import Rows, paragraphs, percent, tables
 from bstcad.scene.scene import Scene
-from bstcad.verify.checks import CUT, DEFAULT_RRMSD_LIMIT, Verification
+from bstcad.verify.checks import CUT, DEFAULT_RRMSD_LIMIT, Proof
 from bstcad.verify.verdict import verdict
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ OUTLIERS = 0.01  # of the points of a made part: more outliers are worth a sente
 
 
 def contents_of(
-    scene: Scene, lens: Lens, target: np.ndarray, proof: Verification, *, making: Making,
+    scene: Scene, lens: Lens, target: np.ndarray, proof: Proof, *, making: Making,
     circumstances: Mapping[str, Any], estimates: tuple[LeftOut, ...], diagnosis: Mapping[str, Any],
 ) -> Contents:  # fmt: skip
     """The contents of report.json.
@@ -47,7 +47,7 @@ def contents_of(
     precede.  estimates: of the effects that are left out.  diagnosis: convergence, remaining_error, limits and bounds.
     """
     known = {key: value for key, value in vars(making).items() if value is not None}
-    dark = proof.leak
+    light, dark = proof.light, proof.light.leak
     contents = Contents(
         **{**circumstances, **known},
         **diagnosis,
@@ -55,12 +55,12 @@ def contents_of(
         title=scene.title,
         verdict=verdict(proof.passed, ()),
         passed=proof.passed,
-        rrmsd=proof.rrmsd,
-        rrmsd_tent=proof.rrmsd_tent,
-        rrmsd_noise=proof.rrmsd_noise,
-        light_on_target=proof.flux["on target"],
-        efficiency=proof.efficiency,
-        flux=proof.flux,
+        rrmsd=light.rrmsd,
+        rrmsd_tent=light.tent,
+        rrmsd_noise=light.standard_error,
+        light_on_target=light.flux["on target"],
+        efficiency=light.efficiency,
+        flux=light.flux,
         prescription=prescription(scene, lens, proof.shape),
         checks=proof.checks,
         effects={
@@ -72,8 +72,8 @@ def contents_of(
         contrast=dark and dark.contrast,
         optic=scene.optic,
         quality=scene.tailoring.quality,
-        rrmsd_asked=proof.rrmsd_asked,
-        rays_traced=proof.rays,
+        rrmsd_asked=scene.accept.rrmsd,
+        rays_traced=light.rays,
         shape=proof.shape,
         stability=proof.stability,
         blur=proof.blur,
@@ -81,7 +81,7 @@ def contents_of(
         lines=tuple(Line(line.wavelength, line.share, rrmsd(target, line.picture)) for line in proof.lines),
         estimates=estimates,
     )
-    return _remarked(contents, *remarks(contents, scene, target, proof.irradiance))
+    return _remarked(contents, *remarks(contents, scene, target, light.picture))
 
 
 def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:
@@ -105,7 +105,7 @@ def _remarked(contents: Contents, *more: str) -> Contents:
     return replace(contents, given_up=given_up, verdict=verdict(contents.passed, given_up))
 
 
-def _finest_detail(scene: Scene, proof: Verification, estimates: tuple[LeftOut, ...]) -> FinestDetail | None:
+def _finest_detail(scene: Scene, proof: Proof, estimates: tuple[LeftOut, ...]) -> FinestDetail | None:
     """The detail that the source allows: of the scene's size, or of the size that the estimates assume of a point."""
     screen = scene.target.screen
     if proof.blur:

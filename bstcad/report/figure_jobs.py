@@ -40,7 +40,7 @@ from bstcad.report.rendering import LightPath
 from bstcad.report.units import number, turned
 from bstcad.scene.picture import to_srgb
 from bstcad.scene.scene import Scene
-from bstcad.verify.checks import Verification
+from bstcad.verify.checks import Proof
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -84,7 +84,7 @@ class Pictures:
         way = self._scene.source.central, lens, self._scene.target.screen
         self._begin(draw_lens, *way, self._view)
 
-    def light(self, target: np.ndarray, proof: Verification) -> None:
+    def light(self, target: np.ndarray, proof: Proof) -> None:
         """Begin the pictures of the irradiance, of the ghost in it and of its lines."""
         self._begin(draw_light, target, proof, self._view)
 
@@ -99,12 +99,12 @@ class Pictures:
 
     def judges(self, judged: Sequence[Compared]) -> None:
         """Begin the pictures by other programs."""
-        if drawn := [judge for judge in judged if not judge.declined]:
+        if drawn := [each for each in judged if not each.judge.declined]:
             self._begin(light_figures.draw_judges, drawn, self._view)
 
-    def part(self, made: MadePart, proof: Verification) -> None:
+    def part(self, made: MadePart, proof: Proof) -> None:
         """Begin the pictures of a made part."""
-        self._begin(light_figures.draw_part, made, proof.irradiance, self._view)
+        self._begin(light_figures.draw_part, made, proof.light.picture, self._view)
 
     def result(self) -> dict[str, bytes | None]:
         """PNG bytes by name; None for the 3-D picture on a machine that cannot draw it.
@@ -152,15 +152,15 @@ def draw_lens(source: Source, lens: Lens, screen: Screen, view: View) -> Pngs:
     }
 
 
-def draw_light(target: np.ndarray, proof: Verification, view: View) -> Pngs:
+def draw_light(target: np.ndarray, proof: Proof, view: View) -> Pngs:
     """The pictures of the light; one of the ghost and of lines if the proof has any."""
-    found = proof.irradiance
+    found = proof.light.picture
     pictures = {
         "irradiance": light_figures.irradiance_triptych(target, found, view),
         "cross_section": light_figures.cross_section(target, found, view),
     }
-    if proof.ghost is not None:
-        pictures["ghost"] = light_figures.ghost_picture(target, proof.ghost, view)
+    if proof.light.ghost is not None:
+        pictures["ghost"] = light_figures.ghost_picture(target, proof.light.ghost, view)
     if proof.lines:
         pictures["lines"] = light_figures.lines_apart(target, found, proof.lines, view)
     return {name: png(picture) for name, picture in pictures.items()}

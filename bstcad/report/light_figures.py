@@ -338,23 +338,21 @@ def _lobe(wavelength: float, weight: float, centre: float, below: float, above: 
 
 def draw_judges(judges: Sequence[Compared], view: View) -> dict[str, bytes]:
     """The pictures by other programs as PNG bytes by name."""
-    return {f"judge_{judge.name}": png(side_by_side(judge, view)) for judge in judges}
+    return {f"judge_{each.judge.name}": png(side_by_side(each, view)) for each in judges}
 
 
 @styled
-def side_by_side(judge: Compared, view: View) -> Figure:
+def side_by_side(found: Compared, view: View) -> Figure:
     """Target, bstcad's picture, the judge's and the signed difference of these two, in % of the mean lit irradiance."""
-    unit = lit_mean(judge.target)
-    error = 100.0 * (judge.theirs - judge.ours) / unit
+    unit, name = lit_mean(found.target), found.judge.name
+    error = 100.0 * (found.theirs - found.ours) / unit
     figure = new_figure(11.0, 0.7 + 2.2 * view.proportion, layout="compressed")
     panels = figure.subplots(1, 4, sharey=True)
-    top = max(brightest(judge.target, picture) for picture in (judge.ours, judge.theirs)) / unit
-    _grey(panels[0], judge.target / unit, view, top=top, title="Target")
-    for axes, name, picture in zip(panels[1:3], ("bstcad", judge.name), (judge.ours, judge.theirs), strict=True):
-        shown = _grey(
-            axes, picture / unit, view, top=top, title=f"By {name} (RRMSD {rrmsd(judge.target, picture):.3g})"
-        )
-    signed = _signed(panels[3], error, view, most=_largest(error, 0.0), title=f"{judge.name} − bstcad")
+    top = max(brightest(found.target, picture) for picture in (found.ours, found.theirs)) / unit
+    _grey(panels[0], found.target / unit, view, top=top, title="Target")
+    for axes, by, picture in zip(panels[1:3], ("bstcad", name), (found.ours, found.theirs), strict=True):
+        shown = _grey(axes, picture / unit, view, top=top, title=f"By {by} (RRMSD {rrmsd(found.target, picture):.3g})")
+    signed = _signed(panels[3], error, view, most=_largest(error, 0.0), title=f"{name} − bstcad")
     panels[0].set_ylabel("y (mm)")
     figure.colorbar(shown, ax=panels[:3], label=MEAN_LIT, fraction=0.04, pad=0.015)
     figure.colorbar(signed, ax=panels[3], label=PERCENT_LIT, fraction=0.08, pad=0.03, extend="both")

@@ -19,6 +19,7 @@ from pydantic import ConfigDict, FailFast, Field, TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
 from bstcad.analysis.light import Blur, FinestDetail
+from bstcad.judges.comparison import Judge
 from bstcad.report.prescription import Order
 from bstcad.report.units import DIGITS, number, percent
 from bstcad.runs import files
@@ -124,32 +125,6 @@ class LeftOut:
     detail: str = ""  # the assumption of the estimate, or why nothing is known
     simulate_by: str = ""  # the line of a scene file that has it simulated; nothing: bstcad does not
     assumed: bool = False  # is its size an example which neither the scene nor nature states?
-
-
-@dataclass(frozen=True)
-class Judge:
-    """Another program's picture of the lens beside bstcad's (judges.comparison); None, from `by` on: it declined."""
-
-    name: str
-    version: str
-    declined: str = ""  # why it could not serve
-    by: str | None = None  # its integrator, where it has a choice
-    rays: int | None = None
-    pixels: tuple[int, int] | None = None  # columns, rows
-    losses: str | None = None  # of the light in both pictures: "none" or "Fresnel"
-    rrmsd: Rrmsd | None = None  # of its picture against the target
-    rrmsd_ours: Rrmsd | None = None  # of bstcad's, of the same light on the same pixels
-    difference: Size | None = None  # of the two pictures, as a part of the target
-    noise: Size | None = None  # of that difference
-    over_noise: Size | None = None
-    limit: Size | None = None
-    agrees: bool | None = None
-    on_target: Share | None = None  # part of the source's light, by the judge
-    on_target_ours: Share | None = None
-    heights_off: Size | None = None  # mm, RMS: its faces against those of the file
-    slopes_off: Size | None = None  # rad, RMS
-    moved_by: Size | None = None  # pixels, by which that moves light
-    seconds: Seconds | None = None
 
 
 @dataclass(frozen=True)

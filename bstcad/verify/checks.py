@@ -21,7 +21,7 @@ from bstcad.analysis.shape import describe, survey
 from bstcad.cad import mass_properties, mesh_files
 from bstcad.cad import mesh as meshes
 from bstcad.optics.channels import Channel
-from bstcad.optics.irradiance import Leak, Screen, leak
+from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import (
     FAINT,
@@ -93,25 +93,16 @@ class Nominal:
 
 
 @dataclass(frozen=True)
-class Verification:
+class Proof:
     """The outcome of the proof of a design's files."""
 
     checks: tuple[Check, ...]
-    irradiance: np.ndarray  # (rows, columns) box pixels, scaled to the target's sum
     lens: Lens  # as re-read from lens.step; with a mount that of part.step, with its clear apertures
-    rrmsd: float
-    rrmsd_asked: float | None  # accept.rrmsd
-    rrmsd_tent: float
-    rrmsd_noise: float
-    efficiency: float
-    flux: dict[str, float]  # where the source's light goes; the lines sum to 1
-    rays: int
+    light: Light  # that it throws on the target
     shape: dict[str, float | None]  # of the lens within the mount's rim; volume: of lens.step
     stability: dict[str, float | int | None]
     blur: Blur | None = None  # by the source's size; None: it is a point, or a beam of parallel light
-    ghost: np.ndarray | None = None  # the part of `irradiance` that was reflected twice in the lens; None: left out
     lines: tuple[Line, ...] = ()  # of a spectrum, each by itself
-    leak: Leak | None = None  # of the rays' picture; None: the target is dark nowhere
     at_bounds: dict[str, float] | None = None  # share of the back that is at each bound on it, by key; None: no bounds
 
     @property
@@ -126,7 +117,7 @@ def verify(
     submit: Submit = here,
     known: Callable[[Lens], None] = lambda lens: None,
     effort: Effort | None = None,
-) -> Verification:
+) -> Proof:
     """Check lens.step and lens.stl in `folder` against the design; ValueError if one of them cannot be read at all.
 
     With bstcad.runs.processes.submit OCC reads the STEP file in its own process, while this one reads its text and the
@@ -157,7 +148,6 @@ def verify(
     shape = describe(cut, effort.places) | {"volume": whole.volume}
     stability = _stability(lit, nominal, light, shape)
     machined, at_bounds = of_bounds(cut, nominal.blank, shape)
-    dark = leak(light.mean, nominal.target)
     margin = math.nan if stability["tir_margin_deg"] is None else stability["tir_margin_deg"]
     checks = (
         *text_checks.of_lens(text, nominal.lens),
@@ -172,29 +162,16 @@ def verify(
         *_facets(mesh, lens, shape["volume"], nominal),
         _picture(nominal.stored_target, nominal.target),
         *_because(why, _of_light(light, nominal.accept, "meets the mirror" if lens.reflects else "enters the lens")),
-        *([] if dark is None else [Check.at_most(DARK, dark.share, nominal.accept.leak)]),
+        *([] if light.leak is None else [Check.at_most(DARK, light.leak.share, nominal.accept.leak)]),
         *([] if lens.reflects else [Check.at_least(TOTAL_REFLECTION, margin, None, "deg")]),
         Check.at_most("values that are not finite", stability["non_finite"], 0),
     )
-    return Verification(
-        checks=checks,
-        irradiance=light.picture,
-        lens=lit,
-        rrmsd=light.rrmsd,
-        rrmsd_asked=nominal.accept.rrmsd,
-        rrmsd_tent=light.tent,
-        rrmsd_noise=light.standard_error,
-        efficiency=light.efficiency,
-        flux=light.flux,
-        rays=light.rays,
-        shape=shape,
-        stability=stability,
+    return Proof(
+        checks, lit, light, shape, stability=stability,
         blur=blur(nominal.channels, lit, nominal.screen, nominal.target),
-        ghost=light.ghost,
         lines=lines_apart(lit, nominal.channels, nominal.screen, nominal.target, max(LINE_TUBES, tubes_of(lit))),
-        leak=dark,
         at_bounds=at_bounds or None,
-    )
+    )  # fmt: skip
 
 
 def _as_made(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> tuple[Lens, Sequence[Check], str]:

@@ -105,14 +105,15 @@ def test_other_programs_agree(template, tmp_path):
     target, channels = lens.scene.target, lens.scene.judging_channels()
     for name in comparison.JUDGES:
         found = comparison.compare(name, lens.lens, channels, target.screen, target.irradiance(), rays=MANY)
-        assert bool(found.declined) is ((template, name) in DECLINED)
-        if found.declined:
-            print(f"\n{template}, {name}: {found.declined}", end="")
+        judge = found.judge
+        assert bool(judge.declined) is ((template, name) in DECLINED)
+        if judge.declined:
+            print(f"\n{template}, {name}: {judge.declined}", end="")
             continue
         print(
-            f"\n{template}, {name}: RRMSD {found.rrmsd:.4f}, by bstcad {found.rrmsd_ours:.4f}, apart "
-            f"{found.difference:.4f}, noise {found.noise:.4f}, over it {found.over_noise:.3f}; light on the target "
-            f"{found.on_target:.5f}, by bstcad {found.on_target_ours:.5f}; {found.seconds:.0f} s",
+            f"\n{template}, {name}: RRMSD {judge.rrmsd:.4f}, by bstcad {judge.rrmsd_ours:.4f}, apart "
+            f"{judge.difference:.4f}, noise {judge.noise:.4f}, over it {judge.over_noise:.3f}; light on the target "
+            f"{judge.on_target:.5f}, by bstcad {judge.on_target_ours:.5f}; {judge.seconds:.0f} s",
             end="",
         )
         assert all(check.passed for check in found.checks)
@@ -292,17 +293,18 @@ def test_the_irradiance_with_fresnels_losses_is_mitsubas(lens):
     channels = lens.scene.channels()
     found = comparison.compare("mitsuba", lens.lens, channels, screen, target, rays=PHOTONS)
     lossless = tubes_picture(lens.lens, channels, comparison.coarse(screen), TUBES).numpy()
-    theirs = found.theirs / found.theirs.sum() * found.on_target
-    without = np.linalg.norm(theirs - lossless) / np.linalg.norm(lossless) / found.noise
+    judge = found.judge
+    theirs = found.theirs / found.theirs.sum() * judge.on_target
+    without = np.linalg.norm(theirs - lossless) / np.linalg.norm(lossless) / judge.noise
     print(
-        f"\n{found.rays / 1e6:.0f} M photons, noise {found.noise:.2%} of the picture: difference over that noise "
-        f"{found.over_noise:.3f}, without Fresnel {without:.2f}; flux {found.on_target:.5f} there, "
-        f"{found.on_target_ours:.5f} here",
+        f"\n{judge.rays / 1e6:.0f} M photons, noise {judge.noise:.2%} of the picture: difference over that noise "
+        f"{judge.over_noise:.3f}, without Fresnel {without:.2f}; flux {judge.on_target:.5f} there, "
+        f"{judge.on_target_ours:.5f} here",
         end="",
     )
-    assert found.over_noise <= 1.1  # of two thousand pixels or more: 1 within a few hundredths
+    assert judge.over_noise <= 1.1  # of two thousand pixels or more: 1 within a few hundredths
     assert without > 3  # so a wrong loss is seen
-    assert found.on_target == pytest.approx(found.on_target_ours, rel=1e-3)
+    assert judge.on_target == pytest.approx(judge.on_target_ours, rel=1e-3)
 
 
 def test_the_ghost_is_mitsubas(through_a_sphere):

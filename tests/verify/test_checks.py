@@ -62,8 +62,8 @@ def replace_model(model, **changes):
     return model.model_copy(update=changes)
 
 
-def failing(verification):
-    return {check.name for check in verification.checks if not check.passed}
+def failing(proof):
+    return {check.name for check in proof.checks if not check.passed}
 
 
 TEXT, FORM = "STEP text: ", "form: "
@@ -91,7 +91,8 @@ LEDGER = "flux ledger: distance of its sum from 1"
 
 def numbers(proof):
     """All that a report takes from a proof."""
-    figures = (proof.rrmsd, proof.rrmsd_tent, proof.rrmsd_noise, proof.efficiency, proof.flux)
+    light = proof.light
+    figures = (light.rrmsd, light.tent, light.standard_error, light.efficiency, light.flux)
     return [*figures, proof.shape, proof.stability, *map(vars, proof.checks)]
 
 
@@ -100,10 +101,11 @@ def test_the_written_files_pass_every_check(folder, nominal):
     assert failing(proof) == set() and proof.passed is True
     names = [check.name for check in proof.checks]
     assert len(set(names)) == len(names)
-    assert proof.irradiance.shape == (12, 16) and proof.irradiance.sum() == pytest.approx(nominal.target.sum())
-    assert proof.rrmsd == pytest.approx(0.08, rel=0.1)  # the 8 % of the target, beside which the lens's own is small
-    assert 5 * proof.rrmsd_noise < proof.rrmsd
-    assert sum(proof.flux.values()) == pytest.approx(1.0, abs=1e-12)
+    light = proof.light
+    assert light.picture.shape == (12, 16) and light.picture.sum() == pytest.approx(nominal.target.sum())
+    assert light.rrmsd == pytest.approx(0.08, rel=0.1)  # the 8 % of the target, beside which the lens's own is small
+    assert 5 * light.standard_error < light.rrmsd
+    assert sum(light.flux.values()) == pytest.approx(1.0, abs=1e-12)
     net = proof.lens.back.control_points() - nominal.lens.back.control_points()
     assert np.abs(net).max() < 1e-11 and proof.lens.outline == nominal.lens.outline
     json.dumps(numbers(proof), allow_nan=False)
@@ -397,7 +399,7 @@ def test_a_scene_that_asks_for_nothing_is_held_to_stated_defaults(folder, nomina
     target = nominal.target * (1 + 0.3 * board)
     poor = replace(nothing, target=target, stored_target=target)
     proof = checks.verify(folder, poor)
-    assert 0.25 < proof.rrmsd < 0.5 and failing(proof) == {RRMSD + UNASKED}
+    assert 0.25 < proof.light.rrmsd < 0.5 and failing(proof) == {RRMSD + UNASKED}
     assert failing(checks.verify(folder, other_limits(poor, rrmsd=0.5))) == set()
 
 
