@@ -111,8 +111,8 @@ class Tailored:
         lens, knobs = self.scene.lens, self.scene.tailoring.resolved(self.scene.lens.back.control_points)
         if knobs.method == "adam" or not lens.front.free:
             return self.scene
-        found = lens.front.found(self.lens.front)
-        return self.scene.model_copy(update={"lens": lens.model_copy(update={"front": found})})
+        front = lens.front.designed(self.lens.front)
+        return self.scene.model_copy(update={"lens": lens.model_copy(update={"front": front})})
 
 
 def design(

@@ -19,7 +19,15 @@ from bstcad.optics.measure import IMAGE_PLACES, detail_width, extended, images
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays, TargetPlane
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import clear_window, from_first_free, launch_strips, to_first_free, to_plane, trace, window
+from bstcad.optics.trace import (
+    clear_window,
+    from_first_net,
+    launch_strips,
+    to_first_net,
+    to_plane,
+    trace,
+    window,
+)
 
 
 def _at_interfaces(rays: Rays, lens: Lens) -> list[Rays]:
@@ -196,7 +204,7 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
         last = through.interfaces[-1]
         critical = math.inf if last.law.reverses else math.degrees(math.asin(min(1.0 / last.law.eta, 1.0)))
         for rays in launch_strips(channel.source, through, n, seed):
-            coming = to_first_free(rays, through)
+            coming = to_first_net(rays, through)
             met, z_x, z_y = intersect(last.surface, coming, last.outline, last.status_if_missed)
             dx, dy, dz = met.direction
             along = met.sense * (dz - dx * z_x - dy * z_y)
@@ -206,7 +214,7 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
                 cosine = (along / torch.sqrt(1 + z_x * z_x + z_y * z_y))[meets].clamp(-1.0, 1.0)
                 margin = min(margin, critical - float(torch.rad2deg(torch.arccos(cosine)).max()))
                 slope = min(slope, float(along.abs()[meets].min()))
-            landed = from_first_free(coming, through, screen.plane)
+            landed = from_first_net(coming, through, screen.plane)
             wrong += int((~torch.isfinite(landed.position)).any(0)[landed.alive].sum())
     return Margins(None if math.isinf(margin) else margin, None if math.isinf(slope) else slope, wrong)
 

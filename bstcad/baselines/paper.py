@@ -25,7 +25,6 @@ from bstcad.tailoring import slope_map
 from bstcad.tailoring.merit import TentMerit, landing
 from bstcad.tailoring.minimise import AdamState, Best, Reached, adam, minimise
 from bstcad.tailoring.run import Parameters, Step, Task
-from bstcad.tailoring.slope_fit import refined
 from bstcad.transport.bfm import Step as TransportStep
 from bstcad.transport.mapping import Mapping
 
@@ -59,7 +58,7 @@ def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Step]
     else:
         lens, mapping = state.lens.applied(lens), state.mapping
     for level in range(state.level if state else 0, len(knobs.levels)):
-        lens = refined(lens, knobs.levels[level])
+        lens = lens.refined(knobs.levels[level])
         begun, best = Parameters.of(lens), Best()
         for reached in _on_level(task, lens, mapping, area, state):
             best, leave, done, total = reached.best, None, level * each, each * len(knobs.levels)
@@ -74,7 +73,7 @@ def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Step]
                 skipped=reached.skipped,
             )
         lens, state = _improved(lens, best, task.free, knobs.levels[level]), None
-    yield Step(partial(refined, lens, knobs.levels[-1]), mapping=mapping)
+    yield Step(partial(lens.refined, knobs.levels[-1]), mapping=mapping)
 
 
 def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: Level | None) -> Iterator[Reached]:
@@ -101,7 +100,7 @@ def _improved(lens: Lens, best: Best, free: tuple[str, ...], m: int) -> Lens:
     if best.parameters:  # else not one value was finite
         heights, *shape = best.parameters
         lens = with_parameters(lens, [heights, *map(float, shape)], free)
-    return refined(lens, m)
+    return lens.refined(m)
 
 
 def transport(task: Task, lens: Lens) -> Mapping:

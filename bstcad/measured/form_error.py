@@ -21,7 +21,7 @@ from scipy.special import eval_jacobi
 
 from bstcad.analysis.shape import least_squares
 from bstcad.measured.alignment import Alignment, Face, Pose, root_mean_square, sampled
-from bstcad.optics.bspline import BSplineSurface, basis_matrix, prolongation
+from bstcad.optics.bspline import BSplineSurface, basis_matrix
 from bstcad.optics.lens import Lens
 
 DEGREE = 2  # of the polynomial
@@ -63,7 +63,7 @@ class Form:
     def on(self, surface: BSplineSurface) -> BSplineSurface:
         """`surface` with this form error, by least squares on the finer of both nets."""
         enough = self.rest.m <= surface.m
-        finer = surface if enough else _refined(surface, max(self.rest.m, min(REFINED * surface.m, NETS[1])))
+        finer = surface if enough else surface.refined(max(self.rest.m, min(REFINED * surface.m, NETS[1])))
         u = np.linspace(0, finer.m - 1, 4 * finer.m)
         rows = basis_matrix(u, finer.m)
         solve = splu((rows.T @ rows).tocsc()).solve
@@ -236,14 +236,6 @@ def _bands(frequency: np.ndarray) -> tuple[np.ndarray, int]:
     found = np.floor(QUARTER * np.log2(np.maximum(frequency, least) / least)).astype(int)
     _, packed = np.unique(found, return_inverse=True)
     return packed.reshape(frequency.shape), int(packed.max()) + 1
-
-
-def _refined(surface: BSplineSurface, m: int) -> BSplineSurface:
-    """The same surface on m x m control points, to rounding in all but its end spans."""
-    if surface.m == m:
-        return surface
-    carry = prolongation(surface.m, m)
-    return replace(surface, heights=torch.from_numpy(carry @ surface.heights.numpy() @ carry.T))
 
 
 # --- figures of a deviation -------------------------------------------------------------------------------------------

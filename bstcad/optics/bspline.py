@@ -212,6 +212,16 @@ class BSplineSurface(Surface):
         net[..., 2] = self.z + self.heights.detach().cpu().numpy().astype(np.float64)
         return net
 
+    def refined(self, m: int) -> BSplineSurface:
+        """The same surface on m x m control points, by least squares along each axis."""
+        if m == self.m:
+            return self
+        carry = scipy.sparse.csr_array(
+            prolongation(self.m, m)
+        )  # sparse only in name: its products are sums in a fixed order
+        coarse = self.heights.detach().cpu().double().numpy()
+        return replace(self, heights=torch.from_numpy(carry @ (carry @ coarse.T).T).to(self.heights))
+
     def sags(self, outline: Outline) -> tuple[float, float]:
         """Lowest and highest of the heights that the surface inside the outline depends on (mm), and of zero."""
         (pitch_x, pitch_y), net = self.pitch, self.control_points()

@@ -122,7 +122,7 @@ class Hit:
 def cross(rays: Rays, interface: Interface) -> Hit:
     """Rays to an interface and behind it: those that meet its surface inside the outline, turned by its law."""
     at, z_x, z_y = intersect(interface.surface, rays, interface.outline, interface.status_if_missed)
-    hit = turn(at, z_x, z_y, interface.law, level=interface.surface.level)
+    hit = deflect(at, z_x, z_y, interface.law, level=interface.surface.level)
     if not interface.losses:
         return hit
     return replace(hit, rays=dimmed(hit.rays, hit.cos_in, hit.cos_out, _path(rays, hit.rays), interface.losses))
@@ -150,7 +150,7 @@ def _path(before: Rays, behind: Rays) -> Tensor:
     return torch.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
 
 
-def turn(at: Rays, z_x: Tensor, z_y: Tensor, law: Law, level: bool = False) -> Hit:
+def deflect(at: Rays, z_x: Tensor, z_y: Tensor, law: Law, level: bool = False) -> Hit:
     """Rays on a surface of these slopes, behind it.  level: the surface is a plane z = const, and its slopes zero."""
     if at.axial and level:  # normal incidence
         one = torch.ones_like(z_x)

@@ -38,7 +38,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import in_pairs
-from bstcad.optics.trace import Ghost, Simulation, from_first_free, simulate_all
+from bstcad.optics.trace import Ghost, Simulation, from_first_net, simulate_all
 from bstcad.optics.tubes import SHEET, area_of, corners, middle, picture, rays_to
 
 SETS = 8  # of rays, independent of each other: the jackknife then knows a standard error to a quarter of it
@@ -434,7 +434,7 @@ def _through(channel: Channel, lens: Lens, screen: Screen, x: Tensor, y: Tensor)
     """The light of one channel through the places between the points (x, y) (mm) of the back face."""
     seen = channel.through(lens)
     p, q, coming = rays_to(channel.source, seen, x, y)
-    landed = from_first_free(coming, replace(seen.unbounded(), losses=None), screen.plane)
+    landed = from_first_net(coming, replace(seen.unbounded(), losses=None), screen.plane)
     alive = landed.alive
     whole = alive[1:, 1:] & alive[1:, :-1] & alive[:-1, 1:] & alive[:-1, :-1]
     inside = seen.number_of_back == 0 or seen.apertures[0].contains(middle(p), middle(q))

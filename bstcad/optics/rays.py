@@ -142,7 +142,7 @@ class TiltedPlane:
         grown = (self.centre[2] - eye) / (p_z - eye)
         return grown * p_x, grown * p_y
 
-    def found(self, q_x: Array, q_y: Array, eye: float) -> tuple[Array, Array]:
+    def from_seen(self, q_x: Array, q_y: Array, eye: float) -> tuple[Array, Array]:
         """The places of the plane that are `seen` there."""
         (e_x, e_y, n), (c_x, c_y, c_z) = self.axes, self.centre
         throw = c_z - eye

@@ -1,7 +1,7 @@
 """The trace: rays along the interfaces of a lens to a plane, differentiable in every parameter; and sums of many rays.
 
-The part of the way before the first freeform interface stays as it is while a lens is tailored: `to_first_free`
-follows it once, and `from_first_free` the rest of it as often as the nets change.
+The part of the way before the first freeform interface stays as it is while a lens is tailored: `to_first_net`
+follows it once, and `from_first_net` the rest of it as often as the nets change.
 
 A simulation traces stratified rays a strip at a time, so that memory does not grow with their number.
 
@@ -75,29 +75,29 @@ def to_plane(rays: Rays, plane: TargetPlane) -> Rays:
     return replace(rays, position=rays.position + path * rays.direction, status=status)
 
 
-def to_first_free(rays: Rays, lens: Lens) -> Rays:
+def to_first_net(rays: Rays, lens: Lens) -> Rays:
     """Rays from the source on their way to the first freeform interface; of a lens with one net that is the back."""
     return across(rays, lens.interfaces[: lens.freeform[0]])
 
 
-def at_first_free(coming: Rays, lens: Lens) -> Hit:
-    """The crossing of the first freeform interface by rays on their way to it (`to_first_free`)."""
+def at_first_net(coming: Rays, lens: Lens) -> Hit:
+    """The crossing of the first freeform interface by rays on their way to it (`to_first_net`)."""
     return cross(coming, lens.interfaces[lens.freeform[0]])
 
 
-def from_first_free(coming: Rays, lens: Lens, plane: TargetPlane) -> Landed:
+def from_first_net(coming: Rays, lens: Lens, plane: TargetPlane) -> Landed:
     """From the first freeform interface on, across all that follow, to the plane."""
     return through(coming, lens.interfaces[lens.freeform[0] :], plane)
 
 
-def from_first_free_plain(coming: Rays, lens: Lens, plane: TargetPlane) -> Landed:
-    """`from_first_free` in plain torch."""
+def from_first_net_plain(coming: Rays, lens: Lens, plane: TargetPlane) -> Landed:
+    """`from_first_net` in plain torch."""
     return land(across(coming, lens.interfaces[lens.freeform[0] :]), plane)
 
 
 def trace(rays: Rays, lens: Lens, plane: TargetPlane) -> Landed:
     """From the source along all interfaces of the lens to the plane."""
-    return from_first_free(to_first_free(rays, lens), lens, plane)
+    return from_first_net(to_first_net(rays, lens), lens, plane)
 
 
 def gets_through(rays: Rays, lens: Lens) -> Tensor:

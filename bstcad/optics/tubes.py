@@ -24,7 +24,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed, Rays, Status, TargetPlane
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import across, from_first_free, gets_through
+from bstcad.optics.trace import across, from_first_net, gets_through
 
 ALL = slice(None)
 SHEET = 256  # tubes a side of the sheet through which finer ones are interpolated
@@ -48,7 +48,7 @@ class Tubes:
 
     def landing(self, lens: Lens, plane: TargetPlane) -> Landed:
         """Where the corners meet the plane; the outline counts in the flux, so that no corner is lost to it."""
-        return from_first_free(self.coming, lens.unbounded(), plane)
+        return from_first_net(self.coming, lens.unbounded(), plane)
 
     def collect(self, corners: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
         """(picture, outside): flux that falls into each pixel, row 0 = y max; and Σ flux · (pixels beyond the border)².

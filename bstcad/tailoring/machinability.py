@@ -225,6 +225,6 @@ def _bent(lens: Lens, bounds: Bounds) -> Lens:
         return found.mean_square, [variable.adjoint(found.gradient)], found.worst
 
     for reached in minimise(in_c, lbfgs([torch.zeros_like(back.heights)], REPAIR), REPAIR):
-        if reached.best.rrmsd <= -SPARE:  # in_c has the worst excess in its place
+        if reached.best.figure <= -SPARE:
             break
     return _with_heights(lens, back.heights + variable.heights(reached.best.parameters[0]))

@@ -26,8 +26,16 @@ from bstcad.scene.quality import COARSEST_GRID
 from bstcad.tailoring.machinability import moved_clear
 from bstcad.tailoring.merit import landing
 from bstcad.tailoring.run import Parameters, Step, Task
-from bstcad.tailoring.slope_fit import Fit, refined, tailor_to_aim
-from bstcad.tailoring.slope_map import SlopeMap, aim_points, back_grid, follow, lit_window, map_to_target, slope_map
+from bstcad.tailoring.slope_fit import Fit, tailor_to_aim
+from bstcad.tailoring.slope_map import (
+    SlopeMap,
+    aim_points,
+    face_grid,
+    lit_window,
+    map_to_target,
+    slope_map,
+    sloped,
+)
 from bstcad.transport.bfm import Step as TransportStep
 from bstcad.transport.mapping import Mapping
 
@@ -62,7 +70,7 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[S
     """Stage 1 from a blank lens, or further from a state: its rounds, and the other way where they come to little."""
     lens = task.heaviest.through(lens)
     if state is None and task.free:
-        coarse = refined(lens, task.knobs.levels[0])
+        coarse = lens.refined(task.knobs.levels[0])
         found = shaped_front(
             task.heaviest.source, coarse, task.target, task.screen, task.free, task.rim_sags,
             iterations=task.knobs.transport_iterations,
@@ -100,7 +108,7 @@ def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> It
             lens, wanted = _round(task, lens, wanted, turn)
             lens = moved_clear(lens, z, task.least, task.bounds)  # the next round reckons with where the back is now
         yield Step(
-            partial(refined, lens, knobs.levels[-1]),
+            partial(lens.refined, knobs.levels[-1]),
             SlopeRound(turn + 1, Parameters.of(lens), wanted),
             wanted.mapping,
             wanted.places,
@@ -117,7 +125,7 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[
     def progress(s: TransportStep) -> None:
         task.progress("stage 1", turn, knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
 
-    lens = refined(lens, m)
+    lens = lens.refined(m)
     window = lit_window(source, lens)
     wanted = slope_map(
         source, lens, window, task.target, task.screen, coarse, wanted,
@@ -125,8 +133,8 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[
     )  # fmt: skip
     side = min(2 * m, knobs.rays)
     parts = math.ceil(side / LIT)
-    grid = back_grid(source, lens, window, math.ceil(side / parts))
-    return follow(lens, wanted, grid, *(FINE if left <= 2 else COARSE), parts), wanted
+    grid = face_grid(source, lens, window, math.ceil(side / parts))
+    return sloped(lens, wanted, grid, *(FINE if left <= 2 else COARSE), parts), wanted
 
 
 def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
@@ -139,7 +147,7 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
     knobs, z = task.knobs, lens.back.z
     for turn in range(AIMS):
         n, m = (COARSEST_GRID, knobs.levels[0]) if turn < AIMS - 1 else (knobs.transport_grid, knobs.levels[-1])
-        lens = refined(lens, m)
+        lens = lens.refined(m)
         rays, wanted, mapping = aimed_rays(
             task.heaviest.source, lens, task.target, task.screen, n, aimed(m, knobs.rays), knobs.transport_iterations
         )

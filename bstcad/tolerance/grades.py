@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from bstcad.optics.lens import Lens
 from bstcad.scene.errors import SceneError
-from bstcad.scene.quality import FORM, NONE, RIPPLE, Tolerance, said_of
+from bstcad.scene.quality import FORM, NONE, RIPPLE, Tolerance, settings_of
 from bstcad.tolerance.perturbations import Kind, Perturbation, Setup, form_error, kinds, ripple
 
 USUAL = "diamond-turned"
@@ -84,7 +84,7 @@ def whole_table(table: Sequence[Tolerance], grade: str | None = None) -> tuple[T
 
 def start_of(table: Sequence[Tolerance]) -> str:
     """Grade of all errors that a whole table does not name; "none": they are zero."""
-    return said_of([entry for entry in table if entry.name is None], "")["grade"]
+    return settings_of([entry for entry in table if entry.name is None], "")["grade"]
 
 
 def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None = None) -> tuple[Perturbation, ...]:
@@ -95,13 +95,13 @@ def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None
     """
     found = []
     for kind in kinds(setup, material).values():
-        told = said_of(table, kind.name)
+        told = settings_of(table, kind.name)
         if told.get("grade") != NONE:
             size = told["limit"] if "limit" in told else limit(kind, GRADES[told["grade"]], setup)
             found.append(Perturbation(kind, size, told.get("distribution", "normal"), told.get("cost", 1.0)))
     found += _of_faces(setup.lens, table)
     for k, entry in enumerate(table[1:]):
-        none = entry.name and said_of(table, entry.name).get("grade") == NONE
+        none = entry.name and settings_of(table, entry.name).get("grade") == NONE
         if entry.name and not none and not any(entry.covers(error.kind.name) for error in found):
             raise SceneError(
                 f"tolerance[{k}].name: {entry.name!r} changes nothing here, or the scene does not say by how much "
@@ -115,7 +115,7 @@ def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None
 def _of_faces(lens: Lens, table: Sequence[Tolerance]) -> Iterator[Perturbation]:
     """Form errors and ripple; of the front if the table names it: that takes twice as long to trace."""
     for name in (*FORM, *RIPPLE):
-        told, by_name = said_of(table, name), any(entry.name == name for entry in table)
+        told, by_name = settings_of(table, name), any(entry.name == name for entry in table)
         if told.get("grade") == NONE or (name.startswith("front") and (lens.reflects or not by_name)):
             continue
         grade, cost = GRADES[told.get("grade", USUAL)], told.get("cost", 1.0)

@@ -24,7 +24,7 @@ from bstcad.optics.bspline import DEGREE, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Fresnel, Losses
 from bstcad.optics.measure import tubes_picture
-from bstcad.optics.trace import follow_ghost, ghost_light, launch, to_first_free, to_plane, trace
+from bstcad.optics.trace import follow_ghost, ghost_light, launch, to_first_net, to_plane, trace
 from bstcad.pipeline import design
 from bstcad.report import exports
 from bstcad.scene.new_scene import templates
@@ -156,7 +156,7 @@ def bundle_of(written):
     """Rays over all of the light that meet the back where batoid's grid of it is exact."""
     source, lens = written.scene.channels()[0].source, written.lens
     rays = launch(source, lens, RAYS, seed=3)
-    x, y, _ = to_first_free(rays, lens).position  # on the front: the rays lie further in on the back, or little further
+    x, y, _ = to_first_net(rays, lens).position  # on the front: the rays lie further in on the back, or little further
     ours = trace(rays, lens, written.scene.target.z)
     (_, right), (_, high) = lens.back.x, lens.back.y
     kept = ours.alive & (x.abs() < EXACT * right) & (y.abs() < EXACT * high)

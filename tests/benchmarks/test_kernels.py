@@ -17,7 +17,7 @@ import torch
 from bstcad.optics import bspline, tubes
 from bstcad.optics.irradiance import Screen, collect, collect_plain, landed_flux
 from bstcad.optics.kernels import compiling, forward
-from bstcad.optics.trace import from_first_free, from_first_free_plain, launch, to_first_free, trace, window
+from bstcad.optics.trace import from_first_net, from_first_net_plain, launch, to_first_net, trace, window
 from bstcad.scene import scene
 from bstcad.transport.bfm import Poisson
 from bstcad.transport.density import threads, threads_for
@@ -47,8 +47,8 @@ def with_gradient(call, leaf):
 def test_the_fused_kernels_against_plain_torch(name):
     wanted = scene.load(f"templates/{name}.toml")
     lens = lens_of(wanted, 257)
-    rays = to_first_free(launch(wanted.source, lens, 1024, 0), lens)
-    landed = from_first_free(rays, lens, 1000.0)
+    rays = to_first_net(launch(wanted.source, lens, 1024, 0), lens)
+    landed = from_first_net(rays, lens, 1000.0)
     screen = Screen(1000.0, wanted.target.x, wanted.target.y, 512)
     u, v = torch.rand((2, 1 << 20), dtype=torch.float64) * 256
     sheet = tubes.launch_tubes(wanted.source, lens, 256)
@@ -63,9 +63,9 @@ def test_the_fused_kernels_against_plain_torch(name):
             lambda: bspline.evaluate_plain(lens.back.heights, u, v),
             n,
         ),
-        "from_first_free": (
-            lambda: from_first_free(rays, lens, 1000.0),
-            lambda: from_first_free_plain(rays, lens, 1000.0),
+        "from_first_net": (
+            lambda: from_first_net(rays, lens, 1000.0),
+            lambda: from_first_net_plain(rays, lens, 1000.0),
             rays.flux.numel(),
         ),
         "collect (rays)": (

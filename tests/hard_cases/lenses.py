@@ -30,9 +30,9 @@ def tracing(engine: str) -> Iterator[Callable[[Rays, Lens, float], Landed]]:
     """From the glass to the screen: plain torch; plain torch on the fused spline; the fused back face."""
     if engine == "plain":
         with mock.patch.object(compiling, "ENABLED", False):
-            yield trace.from_first_free_plain
+            yield trace.from_first_net_plain
     else:
-        yield {"mixed": trace.from_first_free_plain, "fused": trace.from_first_free}[engine]
+        yield {"mixed": trace.from_first_net_plain, "fused": trace.from_first_net}[engine]
 
 
 def examples(count: int) -> settings:

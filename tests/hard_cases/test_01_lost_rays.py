@@ -61,7 +61,7 @@ def traced(rays: Rays, engine: str):
     lens = lens_of(replace(wavy(dtype), heights=heights), Sphere(15.0, curvature))
     place, way = (t.detach().clone().requires_grad_() for t in (rays.position, rays.direction))
     with tracing(engine) as through_back:
-        landed = through_back(trace.to_first_free(replace(rays, position=place, direction=way), lens), lens, Z)
+        landed = through_back(trace.to_first_net(replace(rays, position=place, direction=way), lens), lens, Z)
     merit = torch.where(landed.alive, landed.position.square().sum(0), 0.0).sum()
     return landed, *torch.autograd.grad(merit, (heights, curvature, place, way))
 

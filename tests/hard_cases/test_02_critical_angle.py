@@ -18,7 +18,7 @@ import torch
 
 from bstcad.optics import tubes
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.interfaces import SKIMMING, Refract, turn
+from bstcad.optics.interfaces import SKIMMING, Refract, deflect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.outlines import Circle
 from bstcad.optics.rays import Rays, Status
@@ -62,7 +62,7 @@ def cosine_squared(way: torch.Tensor) -> Decimal:
 @pytest.mark.parametrize("offset", OFFSETS)
 def test_flag_and_direction(offset, dtype, holds):
     rays, slopes, way = meeting(CRITICAL + offset, dtype)
-    after = turn(rays, *slopes, Refract(N, 1.0)).rays
+    after = deflect(rays, *slopes, Refract(N, 1.0)).rays
     truth = cosine_squared(way)
     assert after.status[0] in (Status.ALIVE, Status.TOTAL_REFLECTION)
     if abs(truth) > 4 * eps(dtype):  # cos² is a difference of numbers of order 1: two products and a difference
@@ -82,9 +82,9 @@ def test_flag_and_direction(offset, dtype, holds):
 def test_the_gradient_is_the_derivative_up_to_its_cap(offset, dtype, holds):
     """∂ cos θ' / ∂ cos θ on a level face; all other derivatives follow from it by the chain rule."""
     rays, slopes, way = meeting(CRITICAL + offset, dtype)
-    after = turn(rays, *slopes, Refract(N, 1.0)).rays
+    after = deflect(rays, *slopes, Refract(N, 1.0)).rays
     g_way, g_slopes = torch.autograd.grad(after.direction[2].sum(), (way, slopes), materialize_grads=True)
-    everything = [*torch.autograd.grad(turn(rays, *slopes, Refract(N, 1.0)).rays.direction.sum(), (way, slopes),
+    everything = [*torch.autograd.grad(deflect(rays, *slopes, Refract(N, 1.0)).rays.direction.sum(), (way, slopes),
                                        materialize_grads=True), g_way, g_slopes]  # fmt: skip
     assert all(torch.isfinite(g).all() for g in everything)
     cap = N * N / SKIMMING
@@ -106,7 +106,7 @@ def test_the_gradient_is_not_lost_below_the_angle(distance, holds):
     angle, step, found = CRITICAL - distance, 1e-3 * distance, []
     for at in (angle, angle + step, angle - step):
         rays, slopes, way = meeting(at, torch.float64)
-        found.append((way, turn(rays, *slopes, Refract(N, 1.0)).rays.direction[2].sum()))
+        found.append((way, deflect(rays, *slopes, Refract(N, 1.0)).rays.direction[2].sum()))
     (way, cosine), (_, ahead), (_, behind) = found
     slope = float(torch.autograd.grad(cosine, way)[0][2]) * -math.sin(angle)
     # a root's third derivative over its first: (step / distance)² / 8; cos² known to 2e-16, divided by the step

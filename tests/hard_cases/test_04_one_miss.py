@@ -34,7 +34,7 @@ WAYS = {  # of the ray that misses, in the glass
 def twenty_thousand(lens, dtype=torch.float64) -> Rays:
     """In the glass: 142² rays, all of which get through."""
     x, y = (p.reshape(-1) for p in sampling.stratified(Rectangle(13.0, 13.0), 142, 0, dtype))
-    return trace.to_first_free(Point().rays(x, y, 15.0, 1.0), lens)
+    return trace.to_first_net(Point().rays(x, y, 15.0, 1.0), lens)
 
 
 def with_miss(rays: Rays, way) -> Rays:

@@ -78,9 +78,7 @@ def test_no_curvature_is_the_plane_to_the_bit(source, dtype):
         found = []
         for engine in ("plain", "mixed", "fused"):
             with tracing(engine) as through_back:
-                found.append(
-                    through_back(trace.to_first_free(source.rays(x, y, 15.0, 1.0), lens), lens, 300.0).position
-                )
+                found.append(through_back(trace.to_first_net(source.rays(x, y, 15.0, 1.0), lens), lens, 300.0).position)
         if dtype == torch.float64:
             found.append(forward.land(source, lens, 300.0, x, y).position)
         landed[name] = found

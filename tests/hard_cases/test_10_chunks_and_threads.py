@@ -33,15 +33,15 @@ from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.trace import (
     Simulation,
-    from_first_free,
+    from_first_net,
     launch,
     simulate,
     simulate_plain,
-    to_first_free,
+    to_first_net,
 )
 from bstcad.scene.scene import load
 from bstcad.tailoring.merit import SobolevVariable, TentMerit, TubeMerit
-from bstcad.tailoring.slope_fit import Fit, fit_slopes, refine
+from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.transport.density import Density
 from tests.conftest import DISK, SMALL
 
@@ -96,7 +96,7 @@ def tubes_merit(held: Lens, sheet: tubes.Tubes) -> torch.Tensor:
 
 def rays_merit(held: Lens, rays) -> torch.Tensor:
     merit = TentMerit.of((Channel(SOURCE, held.index),), SCREEN, target(), 0.03)
-    return merit((from_first_free(to_first_free(rays, held), held, SCREEN.z),))[0]
+    return merit((from_first_net(to_first_net(rays, held), held, SCREEN.z),))[0]
 
 
 def image_and_gradient(dtype=torch.float64) -> dict[str, torch.Tensor]:
@@ -117,7 +117,7 @@ def everything(dtype=torch.float64) -> dict[str, torch.Tensor]:
         "a Gaussian beam": torch.stack([s.irradiance(x, y, 15.0) for s in (beam, replace(SOURCE, **GAUSSIAN))]),
         "corners of a disc": torch.stack(tubes.corners(Circle(9.0), 300)),
         "variable of stage 2": SobolevVariable.of(back, torch.ones((back.m, back.m))).heights(back.heights),
-        "a finer net": refine(back, 257).heights,
+        "a finer net": back.refined(257).heights,
         "a density": torch.from_numpy(Density.from_picture(target().numpy(), 150, width=3.0, height=2.0).values),
     }
 

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bstcad.optics import bspline, trace
-from bstcad.optics.interfaces import Refract, intersect, turn
+from bstcad.optics.interfaces import Refract, deflect, intersect
 from bstcad.optics.irradiance import LEDGER, Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
@@ -223,7 +223,7 @@ def test_a_hit_lies_on_its_face_and_ahead(source, depth, curvature, ripple, seed
         assert bool((path[there] >= 0).all()) and bool(lens.outline.contains(*at.position[:2])[there].all())
         beside = torch.linalg.cross(places(at) - places(rays), rays.direction.expand_as(at.position), dim=0)
         assert largest(beside[:, there]) <= 64 * 20 * EPS
-        rays = turn(at, z_x, z_y, Refract(*eta)).rays
+        rays = deflect(at, z_x, z_y, Refract(*eta)).rays
 
 
 @given(DEPTH, CURVATURE, SEEDS, st.sampled_from(["x", "y"]))

@@ -15,7 +15,7 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import axes
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import to_first_free, window
+from bstcad.optics.trace import to_first_net, window
 
 Z = 15.0
 DISC, SQUARE = Circle(12.0), Rectangle(24.0, 10.0)
@@ -122,7 +122,7 @@ def test_no_ray_from_outside_the_window_enters_the_lens(place, front, outline):
 def none_enters_from_outside_the_window(source, lens):
     area = window(source, lens)
     x, y = sampling.stratified(Rectangle(3 * area.width, 3 * area.height), 120, 0)
-    entered = to_first_free(source.rays(x, y, Z, 1.0), lens).alive
+    entered = to_first_net(source.rays(x, y, Z, 1.0), lens).alive
     inside = (x.abs() <= area.width / 2) & (y.abs() <= area.height / 2)
     assert int((entered & inside).sum()) > 10
     assert not (entered & ~inside).any()

@@ -15,7 +15,7 @@ from bstcad.optics.quadrature import integral
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere, sag
-from bstcad.optics.trace import to_first_free
+from bstcad.optics.trace import to_first_net
 
 getcontext().prec = 50
 CURVATURES = (0.0, 1e-9, -1e-9, 1 / 50_000, -1 / 50_000, 0.01, -0.01, 1 / 30)
@@ -109,7 +109,7 @@ def behind(front, source=BEAM):
     """Rays in the glass behind a front at z = 15."""
     x, y = places(reach=6.0)
     back = BSplineSurface(60.0, torch.zeros((5, 5), dtype=torch.float64), (-10.0, 10.0), (-10.0, 10.0))
-    rays = to_first_free(source.rays(x, y, front.z, 1.0), Lens(front, back, SQUARE, N))
+    rays = to_first_net(source.rays(x, y, front.z, 1.0), Lens(front, back, SQUARE, N))
     assert rays.alive.all()
     return rays
 

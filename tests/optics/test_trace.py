@@ -8,7 +8,7 @@ import torch
 
 from bstcad.optics import sampling, trace
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.interfaces import Refract, intersect, turn
+from bstcad.optics.interfaces import Refract, deflect, intersect
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Rays, Status
@@ -76,7 +76,7 @@ def normal(z_x, z_y):
 @pytest.mark.parametrize(("n_in", "n_out"), [(1.0, N), (N, 1.0), (1.0, 3.0), (1.5, 1.5)])
 def test_snell_on_cross_products(n_in, n_out):
     before, z_x, z_y = random_incidence()
-    after = turn(before, z_x, z_y, Refract(n_in, n_out)).rays
+    after = deflect(before, z_x, z_y, Refract(n_in, n_out)).rays
     ok, big_n = after.alive, normal(z_x, z_y)
     assert int(ok.sum()) > 100
     tangential = torch.linalg.cross(before.direction, big_n, dim=0)
@@ -93,9 +93,9 @@ def test_snell_on_cross_products(n_in, n_out):
 def test_snell_backwards_returns_the_ray():
     """The reversed ray, seen in a mirror z -> -z, meets the mirrored face and leaves as the reversed original."""
     before, z_x, z_y = random_incidence()
-    after = turn(before, z_x, z_y, Refract(1.0, N)).rays
+    after = deflect(before, z_x, z_y, Refract(1.0, N)).rays
     mirror = torch.tensor([[-1.0], [-1.0], [1.0]], dtype=torch.float64)
-    back = turn(replace(after, direction=after.direction * mirror), -z_x, -z_y, Refract(N, 1.0)).rays
+    back = deflect(replace(after, direction=after.direction * mirror), -z_x, -z_y, Refract(N, 1.0)).rays
     # nearly grazing rays lose digits in the root
     assert back.alive.all()
     torch.testing.assert_close(back.direction * mirror, before.direction, rtol=0, atol=1e-11)
@@ -109,7 +109,7 @@ def test_at_the_critical_angle(offset):
     slope = torch.zeros(1, dtype=torch.float64, requires_grad=True)
     d = torch.tensor([math.sin(angle), 0.0, math.cos(angle)], dtype=torch.float64).requires_grad_()
     bundle = replace(rays([[0.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]]), direction=d[:, None])
-    after = turn(bundle, slope, torch.zeros_like(slope), Refract(N, 1.0)).rays
+    after = deflect(bundle, slope, torch.zeros_like(slope), Refract(N, 1.0)).rays
     if offset:
         assert bool(after.status[0] == Status.TOTAL_REFLECTION) is (offset > 0)
     assert float(after.direction.detach().norm()) == pytest.approx(1, abs=1e-12)
@@ -161,7 +161,7 @@ def test_a_ray_that_does_not_meet_the_surface_ahead_is_lost_for_its_reason(surfa
             assert torch.isfinite(at.position).all()
 
 
-@pytest.mark.parametrize("form", [trace.from_first_free, trace.from_first_free_plain])
+@pytest.mark.parametrize("form", [trace.from_first_net, trace.from_first_net_plain])
 def test_a_ray_that_turns_back_does_not_land(form):
     """60° from the axis in glass, the back face tilted by 20°: it leaves at 74.6° from the normal, 94.6° from the axis,
     and moves away from the screen; its line meets the screen's plane only behind it."""
@@ -170,7 +170,7 @@ def test_a_ray_that_turns_back_does_not_land(form):
     leaving = rays([[-3.0, 0.0, 19.0]], [[math.sin(math.radians(60)), 0.0, math.cos(math.radians(60))]])
     lens = Lens(Plane(15.0), back, SQUARE, 1.5)
     at_back, z_x, z_y = heading(leaving, back)
-    turned = turn(at_back, z_x, z_y, Refract(1.5, 1.0)).rays.direction[:, 0].tolist()
+    turned = deflect(at_back, z_x, z_y, Refract(1.5, 1.0)).rays.direction[:, 0].tolist()
     leaves = math.degrees(math.asin(1.5 * math.sin(math.radians(40))))
     assert math.degrees(math.acos(turned[2])) == pytest.approx(20 + leaves)
     assert not form(leaving, lens, 1000.0).alive.any()
@@ -183,7 +183,7 @@ def test_axial_closed_form_is_the_newton_answer():
     for front in (Plane(8.0), Sphere(8.0, -0.03)):
         lens = Lens(front, wavy(), SQUARE, N)
         closed, newton = (
-            trace.from_first_free_plain(trace.to_first_free(b, lens), lens, 1000.0) for b in (bundle, searched)
+            trace.from_first_net_plain(trace.to_first_net(b, lens), lens, 1000.0) for b in (bundle, searched)
         )
         assert torch.equal(closed.status, newton.status) and 0 < int(closed.alive.sum()) < 900
         there = closed.alive
@@ -197,8 +197,8 @@ def test_a_plane_parallel_plate_shifts_and_does_not_turn():
     """Lateral shift t sin θ (1 - cos θ / (n cos θ')), the textbook's."""
     bundle, thickness = from_point(half=6.0), 5.0
     lens = Lens(Plane(15.0), flat(15.0 + thickness), SQUARE, N)
-    at_back, z_x, z_y = heading(trace.to_first_free(bundle, lens), lens.back)
-    out = turn(at_back, z_x, z_y, Refract(N, 1.0)).rays
+    at_back, z_x, z_y = heading(trace.to_first_net(bundle, lens), lens.back)
+    out = deflect(at_back, z_x, z_y, Refract(N, 1.0)).rays
     assert out.alive.all()
     torch.testing.assert_close(out.direction, bundle.direction, rtol=0, atol=1e-14)
     sine = bundle.direction[:2].norm(dim=0)
@@ -286,7 +286,7 @@ def landing_and_gradients(bundle):
     back, c = wavy(depth=2.0), torch.tensor(-0.02, dtype=torch.float64, requires_grad=True)
     heights = back.heights.clone().requires_grad_()
     lens = Lens(Sphere(15.0, c), replace(back, heights=heights), SQUARE, N)
-    landed = trace.from_first_free_plain(trace.to_first_free(bundle, lens), lens, 200.0)
+    landed = trace.from_first_net_plain(trace.to_first_net(bundle, lens), lens, 200.0)
     merit = torch.where(landed.alive, landed.position.square().sum(0), 0.0)
     return landed, torch.autograd.grad(merit.sum(), (heights, c, bundle.direction))
 

@@ -15,7 +15,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle, Rounded
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import simulate, to_first_free
+from bstcad.optics.trace import simulate, to_first_net
 from bstcad.scene import scene
 
 SHAPE = (7, 9)
@@ -179,7 +179,7 @@ def test_rays_meet_the_back_where_they_are_sent(name):
     lens = lens_of(front, outline)
     x, y = tubes.corners(Rectangle(14.0, 12.0), 300)
     p, q, at_back = tubes.rays_to(source, lens, x, y)
-    entered = to_first_free(source.rays(p, q, lens.front.z, 1.0), lens.unbounded())
+    entered = to_first_net(source.rays(p, q, lens.front.z, 1.0), lens.unbounded())
     hit, _, _ = intersect(lens.back, entered, EVERYWHERE, 2)
     assert bool(at_back.alive.all())
     torch.testing.assert_close(hit.position, at_back.position, rtol=0, atol=3e-7)

@@ -12,7 +12,6 @@ from bstcad.scene import scene
 from bstcad.tailoring import stage1, stage2
 from bstcad.tailoring.merit import TubeMerit
 from bstcad.tailoring.run import Driver, Step, Task
-from bstcad.tailoring.slope_fit import refine
 
 SMALL = {
     "lens.back.control_points": "17",
@@ -210,7 +209,7 @@ def test_stage_1_finds_the_front_curvature_and_the_back_together():
     assert mapping.transport.mass_error[-1] < 0.02
     found = simulate(task.heaviest.source, tailored, task.screen, 300, 0)
     assert found.efficiency > 0.98
-    assert task.rrmsd(tailored) < 0.5 * task.rrmsd(replace(lens, back=refine(lens.back, 17)))
+    assert task.rrmsd(tailored) < 0.5 * task.rrmsd(replace(lens, back=lens.back.refined(17)))
 
 
 def test_the_paper_lowers_both_of_its_merits():

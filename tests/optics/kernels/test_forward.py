@@ -95,11 +95,11 @@ SCENES = {  # source, lens, the fates of rays through a window larger than the l
 @pytest.mark.parametrize("plane", [400.0, TiltedPlane((3.0, 2.0, 400.0), (20.0, -10.0), 5.0)], ids=["level", "tilted"])
 @pytest.mark.parametrize("name", SCENES)
 def test_each_ray_ends_as_in_the_plain_form(name, plane):
-    """Against `to_first_free` and `from_first_free_plain`: not another fused kernel; all fates occur."""
+    """Against `to_first_net` and `from_first_net_plain`: not another fused kernel; all fates occur."""
     source, lens, fates = SCENES[name]
     x, y = (p.reshape(-1) for p in sampling.stratified(Rectangle(23.0, 23.0), 150, 0))  # not a multiple of a block
     rays = source.rays(x, y, lens.entrance.z, 1.0)
-    plain = trace.from_first_free_plain(trace.to_first_free(rays, lens), lens, plane)
+    plain = trace.from_first_net_plain(trace.to_first_net(rays, lens), lens, plane)
     found = land(source, lens, plane, x, y)
     rtol = 1e-13 if source.tilted else 1e-14  # exp(-80) of a number whose last digits differ
     torch.testing.assert_close(found.flux, plain.flux, rtol=rtol, atol=0)  # zeros are zeros
