@@ -15,7 +15,7 @@ from bstcad.optics.channels import Channel, points
 from bstcad.optics.interfaces import cross, intersect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import IMAGE_PLACES, detail_width, extended, images
+from bstcad.optics.measure import IMAGE_PLACES, detail_width, images
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays, TargetPlane
 from bstcad.optics.sources import Source
@@ -242,7 +242,7 @@ def blur(
     channels: Sequence[Channel], lens: Lens, screen: Screen, target: np.ndarray, n: int = IMAGE_PLACES
 ) -> Blur | None:
     """The blur by a source whose points are the channels, at its first line; None for a point source."""
-    if not extended(channels):
+    if points(channels) == 1:
         return None
     found = images(channels, lens, screen, n)
     width = found.width()

@@ -111,10 +111,9 @@ class Interface:
 
 @dataclass(frozen=True)
 class Hit:
-    """Rays that have crossed an interface; slopes and cosines hold for those still alive."""
+    """Rays that have crossed an interface; the cosines hold for those still alive."""
 
     rays: Rays  # on the surface, with their new directions
-    slopes: tuple[Tensor, Tensor]  # ∂z/∂x and ∂z/∂y of the surface there
     cos_in: Tensor  # of the angle of incidence
     cos_out: Tensor  # of the angle of refraction or reflection
 
@@ -155,8 +154,8 @@ def deflect(at: Rays, z_x: Tensor, z_y: Tensor, law: Law, level: bool = False) -
     if at.axial and level:  # normal incidence
         one = torch.ones_like(z_x)
         if not law.reverses:
-            return Hit(at, (z_x, z_y), one, one)
-        return Hit(replace(at, direction=-at.direction, sense=-at.sense), (z_x, z_y), one, one)
+            return Hit(at, one, one)
+        return Hit(replace(at, direction=-at.direction, sense=-at.sense), one, one)
     norm = torch.rsqrt(1 + z_x * z_x + z_y * z_y)
     dx, dy, dz = torch.where(at.alive, at.direction, torch.ones_like(at.direction))
     along = dz - dx * z_x - dy * z_y
@@ -167,7 +166,7 @@ def deflect(at: Rays, z_x: Tensor, z_y: Tensor, law: Law, level: bool = False) -
     status = at.lose(stopped, law.status_if_blocked)
     direction = torch.where(status == Status.ALIVE, direction, at.direction.detach())
     sense = -at.sense if law.reverses else at.sense
-    return Hit(replace(at, direction=direction, status=status, axial=False, sense=sense), (z_x, z_y), cos_in, cos_out)
+    return Hit(replace(at, direction=direction, status=status, axial=False, sense=sense), cos_in, cos_out)
 
 
 def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) -> tuple[Rays, Tensor, Tensor]:

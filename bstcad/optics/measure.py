@@ -39,7 +39,7 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import in_pairs
 from bstcad.optics.trace import Ghost, Simulation, from_first_net, simulate_all
-from bstcad.optics.tubes import SHEET, area_of, corners, middle, picture, rays_to
+from bstcad.optics.tubes import SHEET, area_of, arriving, corners, middle, picture, rays_to
 
 SETS = 8  # of rays, independent of each other: the jackknife then knows a standard error to a quarter of it
 FEWEST = 5  # times fewer rays a side in the first sets, which tell how many are needed
@@ -435,15 +435,8 @@ def _through(channel: Channel, lens: Lens, screen: Screen, x: Tensor, y: Tensor)
     seen = channel.through(lens)
     p, q, coming = rays_to(channel.source, seen, x, y)
     landed = from_first_net(coming, replace(seen.unbounded(), losses=None), screen.plane)
-    alive = landed.alive
-    whole = alive[1:, 1:] & alive[1:, :-1] & alive[:-1, 1:] & alive[:-1, :-1]
     inside = seen.number_of_back == 0 or seen.apertures[0].contains(middle(p), middle(q))
     flux = channel.weight * channel.source.irradiance(middle(p), middle(q), seen.entrance.z) * area_of(p, q)
-    flux = torch.where(whole & inside, flux, torch.zeros_like(flux)).double()
+    flux = arriving(torch.where(inside, flux, torch.zeros_like(flux)), landed).double()
     at = torch.stack([middle(c) for c in landed.position])
     return Landed(at.reshape(2, -1), flux.reshape(-1), landed.status[1:, 1:].reshape(-1))
-
-
-def extended(channels: Sequence[Channel]) -> bool:
-    """Are these points of a source of some size?"""
-    return any(places(channels))

@@ -173,11 +173,6 @@ class Collimated(Emitter):
         """(outline, centre in mm) of the light on the plane z, None where it has no edge: the aperture."""
         return self.aperture, self.shift(z)
 
-    def unbounded(self, x: Tensor, y: Tensor, z: float) -> Collimated:
-        """A source with the same rays through the points (x, y) (mm) of the plane z, in all of which it has light."""
-        size = (4 * float(p.abs().max()) + 2 * abs(s) for p, s in zip((x, y), self.shift(z), strict=True))
-        return Collimated(Rectangle(*size), z=self.z, centre=self.centre, tilt=self.tilt)
-
     def rays(self, x: Tensor, y: Tensor, z: float, area: float) -> Rays:
         """Rays through (x, y) of the plane z, starting on a plane before it (`start`)."""
         start = self.start(z)
@@ -358,10 +353,6 @@ class Point(Emitter):
         if self.profile != "uniform" or self.half_angle >= 89 or self.tilted:
             return None, centre
         return Circle(abs(z - self.position[2]) * math.tan(math.radians(self.half_angle))), centre
-
-    def unbounded(self, x: Tensor, y: Tensor, z: float) -> Point:
-        """A source with the same rays through the points (x, y) (mm) of the plane z, in all of which it has light."""
-        return Point(self.position)
 
     def rays(self, x: Tensor, y: Tensor, z: float, area: float) -> Rays:
         """Rays from the point through (x, y) of the plane z."""

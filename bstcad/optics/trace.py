@@ -22,7 +22,7 @@ from torch import Tensor
 
 from bstcad.optics import irradiance, sampling
 from bstcad.optics.channels import Channel, places, weighted_sum
-from bstcad.optics.interfaces import Hit, Interface, Loss, Reflect, Refract, cross, intersect
+from bstcad.optics.interfaces import Interface, Loss, Reflect, Refract, cross, intersect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import crossing, forward
 from bstcad.optics.kernels.compiling import fused, fused_whole
@@ -78,11 +78,6 @@ def to_plane(rays: Rays, plane: TargetPlane) -> Rays:
 def to_first_net(rays: Rays, lens: Lens) -> Rays:
     """Rays from the source on their way to the first freeform interface; of a lens with one net that is the back."""
     return across(rays, lens.interfaces[: lens.freeform[0]])
-
-
-def at_first_net(coming: Rays, lens: Lens) -> Hit:
-    """The crossing of the first freeform interface by rays on their way to it (`to_first_net`)."""
-    return cross(coming, lens.interfaces[lens.freeform[0]])
 
 
 def from_first_net(coming: Rays, lens: Lens, plane: TargetPlane) -> Landed:

@@ -186,7 +186,7 @@ def order_of(
         datum=DATUMS.get(mount.datum if mount else "") or _origin(lens, front + shape["centre_thickness"]),
         origin=mount.origin(front) if mount else 0.0,
         freeform=("back", "front") if lens.front.is_net else ("back",),
-        optical=("back",) if lens.reflects else ("back", "front"),
+        optical=tuple(reversed(lens.optical_faces)),
         tool_radius=min(radii, default=None),
         back_profile=stated.surface_profile,
         front_profile=stated.front_profile,

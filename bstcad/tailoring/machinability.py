@@ -113,9 +113,9 @@ def excess(lens: Lens, bounds: Bounds) -> Excess:
     """
     back = lens.back.to(torch.float64)
     square, worst, gradient = 0.0, -MARGIN, torch.zeros_like(back.heights)
-    for spans, over in _near(back, lens.outline, bounds):
+    for spans, held, bound, quantity in _near(back, lens.outline, bounds):
         leaf = spans.heights.detach().requires_grad_()
-        relative = over(replace(spans, heights=leaf).jet(QUARTERS))
+        relative = torch.where(held, quantity(replace(spans, heights=leaf).jet(QUARTERS)) / bound - 1, -MARGIN)
         squared = total(torch.relu(relative + MARGIN) ** 2)
         gradient += spans.scattered(*torch.autograd.grad(squared, leaf))
         square, worst = square + float(squared.detach()), max(worst, float(relative.detach().max()))
@@ -127,9 +127,11 @@ def excess(lens: Lens, bounds: Bounds) -> Excess:
     return Excess(square, gradient.to(lens.back.heights), worst)
 
 
-def _near(back: BSplineSurface, outline: Outline, bounds: Bounds) -> Iterator[tuple[Spans, Callable[[Jet], Tensor]]]:
-    """The spans that may come near a bound, some at a time, and the function of their jet that says by how much."""
-    for bound, most, found in (
+def _near(
+    back: BSplineSurface, outline: Outline, bounds: Bounds
+) -> Iterator[tuple[Spans, Tensor, float, Callable[[Jet], Tensor]]]:
+    """Spans that may come near a bound, some at a time: which places the outline holds, the bound, its quantity."""
+    for bound, most, quantity in (
         (bounds.concave, partial(curvature_bounds, back, 1.0), lambda jet: jet.curvatures[0]),
         (bounds.convex, partial(curvature_bounds, back, -1.0), lambda jet: -jet.curvatures[1]),
         (bounds.slope, partial(slope_bounds, back), lambda jet: jet.slope),
@@ -138,13 +140,7 @@ def _near(back: BSplineSurface, outline: Outline, bounds: Bounds) -> Iterator[tu
             continue
         near = torch.nonzero(most() > (1 - MARGIN) * bound)
         for i, j in (part.T for part in near.split(SPANS) if len(part)):
-            held = reached_by(back, outline, i, j, QUARTERS)
-            yield Spans.of(back, i, j), partial(_relative, held, bound, found)
-
-
-def _relative(held: Tensor, bound: float, found: Callable[[Jet], Tensor], jet: Jet) -> Tensor:
-    """Excess over a bound as a part of it, where the outline holds the place."""
-    return torch.where(held, found(jet) / bound - 1, -MARGIN)
+            yield Spans.of(back, i, j), reached_by(back, outline, i, j, QUARTERS), bound, quantity
 
 
 def _of_thickness(lens: Lens, bounds: Bounds) -> tuple[float, Tensor, float]:

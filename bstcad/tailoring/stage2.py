@@ -19,8 +19,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bstcad.optics.channels import points
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import a_side, extended, images, rrmsd_by_tubes
+from bstcad.optics.measure import a_side, images, rrmsd_by_tubes
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.machinability import excess, weight
@@ -159,7 +160,7 @@ def _pull(task: Task, lens: Lens) -> float:
     Within w of the border some light falls outside whatever the lens does, and to be pulled in would blur the edge.
     """
     overshoot = task.knobs.overshoot
-    if not extended(task.channels):
+    if points(task.channels) == 1:
         return overshoot
     return overshoot / (1 + images(task.channels, lens, task.screen, SEEN).width() ** 2)
 

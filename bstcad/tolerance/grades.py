@@ -116,7 +116,8 @@ def _of_faces(lens: Lens, table: Sequence[Tolerance]) -> Iterator[Perturbation]:
     """Form errors and ripple; of the front if the table names it: that takes twice as long to trace."""
     for name in (*FORM, *RIPPLE):
         told, by_name = settings_of(table, name), any(entry.name == name for entry in table)
-        if told.get("grade") == NONE or (name.startswith("front") and (lens.reflects or not by_name)):
+        face = name.partition(".")[0]
+        if told.get("grade") == NONE or face not in lens.optical_faces or not (by_name or face == "back"):
             continue
         grade, cost = GRADES[told.get("grade", USUAL)], told.get("cost", 1.0)
         try:
@@ -125,7 +126,7 @@ def _of_faces(lens: Lens, table: Sequence[Tolerance]) -> Iterator[Perturbation]:
                 yield Perturbation(kind, told.get("limit", grade.ripple), told.get("distribution", "normal"), cost)
                 continue
             length = told.get("correlation_length", grade.form_length * 2 * min(lens.outline.half_extent))
-            size, face = told.get("limit", grade.form) / math.sqrt(MODES), name.partition(".")[0]
+            size = told.get("limit", grade.form) / math.sqrt(MODES)
             for seed in range(MODES):
                 yield Perturbation(form_error(lens, length, seed, face), size, "field", cost)
         except ValueError as error:  # finer than the net

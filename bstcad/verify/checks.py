@@ -192,7 +192,7 @@ def _as_made(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> tuple[
         where = "a wall of its opening stands in the way; make the flange thinner, or put it where it meets the lens"
         name = "part.step: light that meets the flange"
         checks.append(Check.at_most(name, found.on_flange, MAX_ON_FLANGE, where=where))
-    why = f"the mount leaves {_words(lens.apertures[1])} of the back and cuts away {100 * found.cut:.3g} % of the light"
+    why = f"the mount leaves {lens.apertures[1].words} of the back and cuts away {100 * found.cut:.3g} % of the light"
     return lens, checks, why if found.cut > CUT_EXCUSE else ""
 
 
@@ -208,17 +208,9 @@ def _because(why: str, checks: Sequence[Check]) -> list[Check]:
 def _aperture(name: str, found: Outline, designed: Outline) -> Check:
     """The largest distance between the rim of a face's clear aperture and that of the designed one."""
     off = max(float(np.abs(a.depth(*b.places())).max()) for a, b in ((found, designed), (designed, found)))
-    where = f"the part has {_words(found)}, the lens was tailored for {_words(designed)}; generate the design again"
+    where = f"the part has {found.words}, the lens was tailored for {designed.words}; generate the design again"
     name = f"part.step: clear aperture of the {name}, from the mount's"
     return Check.at_most(name, off, APERTURE_DIFFERENCE, unit="mm", where=where)
-
-
-def _words(aperture: Outline) -> str:
-    if aperture.is_round:
-        return f"\u00d8{2 * aperture.radius:.6g} mm"
-    corner = getattr(aperture, "corner_radius", 0.0)
-    size = f"{aperture.width:.6g} x {aperture.height:.6g} mm"
-    return f"{size} with corners of {corner:.4g} mm" if corner else size
 
 
 def _stability(lens: Lens, nominal: Nominal, light: Light, shape: dict) -> dict[str, float | int | None]:

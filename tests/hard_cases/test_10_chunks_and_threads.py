@@ -22,6 +22,7 @@ import torch
 
 from bstcad import folder as folders
 from bstcad import pipeline
+from bstcad.baselines.paper import TentMerit
 from bstcad.optics import sampling, tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
@@ -40,7 +41,7 @@ from bstcad.optics.trace import (
     to_first_net,
 )
 from bstcad.scene.scene import load
-from bstcad.tailoring.merit import SobolevVariable, TentMerit, TubeMerit
+from bstcad.tailoring.merit import SobolevVariable, TubeMerit
 from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.transport.density import Density
 from tests.conftest import DISK, SMALL

@@ -12,13 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Rays, Status, TiltedPlane, axes, coordinates, tilt_of
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import at_first_net, to_first_net, to_plane, trace
+from bstcad.optics.trace import to_first_net, to_plane, trace
 from bstcad.optics.tubes import launch_tubes, picture
 from bstcad.tailoring.merit import TubeMerit
 
@@ -73,7 +74,7 @@ def test_rays_land_on_the_plane(light, z):
     coming, lens = bundle(light)
     lens = replace(lens, front=lens.front.moved(z), back=replace(lens.back, z=lens.back.z + z))
     plane = TiltedPlane((30.0, -5.0, 300.0 + z), TILT)
-    leaving = at_first_net(replace(coming, z=coming.z + z), lens).rays
+    leaving = cross(replace(coming, z=coming.z + z), lens.interfaces[1]).rays
     landed = to_plane(leaving, plane)
     x, y, height = landed.position[0] - 30.0, landed.position[1] + 5.0, landed.above(300.0 + z)
     n = plane.axes[2]

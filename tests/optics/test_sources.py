@@ -212,14 +212,6 @@ def test_window_of_a_tilted_cone_holds_it_and_no_more(place, tilt):
         assert float(p[lit].abs().max()) <= size / 2
 
 
-def test_unbounded_sources_have_the_same_rays_and_light_everywhere():
-    x, y = sampling.grid(Rectangle(70.0, 90.0), 5)
-    for source in SOURCES:
-        everywhere = source.unbounded(x, y, Z)
-        assert (everywhere.irradiance(x, y, Z) > 0).all()
-        torch.testing.assert_close(everywhere.rays(x, y, Z, 1.0).direction, source.rays(x, y, Z, 1.0).direction)
-
-
 @pytest.mark.parametrize(
     ("wavelength", "main"),
     [

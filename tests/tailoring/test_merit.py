@@ -5,11 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from bstcad.baselines.paper import TentMerit
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.rays import Landed
 from bstcad.optics.tubes import Tubes
-from bstcad.tailoring.merit import TentMerit, TubeMerit
+from bstcad.tailoring.merit import TubeMerit
 
 SCREEN = Screen(100.0, (0.0, 8.0), (0.0, 8.0), 8)
 ONE = (Channel(None, 1.5),)
