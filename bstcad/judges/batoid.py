@@ -90,15 +90,15 @@ def through(lens: Lens, known: Sequence[Placed], rays: Rays) -> Any:
     """Rays of ours from the source behind the lens, as batoid's; `known`: its surfaces."""
     import batoid
 
-    found, outside = vector(rays), [_outside(interface.outline) for interface in lens.interfaces]
+    theirs, outside = vector(rays), [_outside(interface.outline) for interface in lens.interfaces]
     air, glass = batoid.ConstMedium(1.0), batoid.ConstMedium(lens.index)
     if lens.reflects:
-        batoid.reflect(known[0].surface, found, known[0].frame)
-        return batoid.obscure(outside[0], found)
+        batoid.reflect(known[0].surface, theirs, known[0].frame)
+        return batoid.obscure(outside[0], theirs)
     for (before, behind), at, beyond in zip(((air, glass), (glass, air)), known, outside, strict=True):
-        batoid.refract(at.surface, found, before, behind, coordSys=at.frame)
-        batoid.obscure(beyond, found)
-    return found
+        batoid.refract(at.surface, theirs, before, behind, coordSys=at.frame)
+        batoid.obscure(beyond, theirs)
+    return theirs
 
 
 def cannot(lens: Lens, channels: Sequence[Channel]) -> str:
@@ -131,8 +131,8 @@ def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, se
 
 def binned(x: np.ndarray, y: np.ndarray, flux: np.ndarray, screen: Screen) -> np.ndarray:
     """(rows, columns) flux that falls into each pixel, by numpy's histogram; row 0 = y max."""
-    found, _, _ = np.histogram2d(y, x, bins=screen.shape, range=(screen.y, screen.x), weights=flux)
-    return found[::-1]
+    image, _, _ = np.histogram2d(y, x, bins=screen.shape, range=(screen.y, screen.x), weights=flux)
+    return image[::-1]
 
 
 def _longer(line: np.ndarray) -> np.ndarray:

@@ -92,13 +92,13 @@ def against(
     progress: Callable[[str, int, int, str], None],
 ) -> tuple[Compared, ...]:  # fmt: skip
     """Each judge's picture beside bstcad's, one after the other."""
-    found = []
+    compared = []
     for number, name in enumerate(names):
         progress("judges", number, len(names), name)
-        found.append(compare(name, lens, channels, screen, target=target, rays=RAYS, seed=seed))
+        compared.append(compare(name, lens, channels, screen, target=target, rays=RAYS, seed=seed))
     if names:
         progress("judges", len(names), len(names), "")
-    return tuple(found)
+    return tuple(compared)
 
 
 def compare(
@@ -129,7 +129,7 @@ def compare(
         Check.at_most(f"irradiance by {name} against bstcad's, over the noise", over_noise, limit),
         Check.at_most(flux, abs(on_target - on_target_ours), FLUX),
     )
-    found = Judge(
+    outcome = Judge(
         name,
         version,
         by=traced.by,
@@ -150,7 +150,7 @@ def compare(
         moved_by=traced.error.shift(lens, raster) * max(raster.per_mm),
         seconds=seconds,
     )
-    return Compared(found, checks, target, ours.picture, theirs=theirs)
+    return Compared(outcome, checks, target, ours.picture, theirs=theirs)
 
 
 def _difference(one: np.ndarray, other: np.ndarray, target: np.ndarray) -> float:

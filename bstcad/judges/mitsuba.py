@@ -208,16 +208,16 @@ def lamps(channels: Sequence[Channel], lens: Lens, folder: Path) -> dict[str, En
     """The sources of channels as entries of Mitsuba's scene; each sends the flux of its channel's weight."""
     first, slide = channels[0].source, {}
     if first.kind == "collimated":
-        found = [_plate(c.source, c.weight, lens, folder / f"lamp{k}.ply") for k, c in enumerate(channels)]
+        sources = [_plate(c.source, c.weight, lens, folder / f"lamp{k}.ply") for k, c in enumerate(channels)]
     elif first.profile == "uniform" and first.half_angle < 89:
-        found = [_spot(c.source, c.weight, lens) for c in channels]
+        sources = [_spot(c.source, c.weight, lens) for c in channels]
     else:
         half = ROOM * max(_half(c.source, lens) for c in channels)
-        found, slide = (
+        sources, slide = (
             [_projector(c.source, c.weight, lens, half) for c in channels],
             {"slide": _slide(first, lens, half)},
         )
-    return slide | {f"lamp{k}": lamp for k, lamp in enumerate(found)}
+    return slide | {f"lamp{k}": lamp for k, lamp in enumerate(sources)}
 
 
 def _plate(source: Collimated, weight: float, lens: Lens, path: Path) -> Entry:

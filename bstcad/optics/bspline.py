@@ -319,8 +319,8 @@ class Spans:
 
     def _weights(self, index: Tensor, s: Sequence[float]) -> list[list[Tensor]]:
         """[derivative][basis function]: (places, n)."""
-        found = [weights(index, self.m, place) for place in s]
-        return [[torch.stack([w[order][k] for w in found]).to(self.heights) for k in range(3)] for order in range(3)]
+        each = [weights(index, self.m, place) for place in s]
+        return [[torch.stack([w[order][k] for w in each]).to(self.heights) for k in range(3)] for order in range(3)]
 
     def scattered(self, gradient: Tensor) -> Tensor:
         """(m, m) the transpose of taking `heights`: no control point is added to twice at a time, in any order."""

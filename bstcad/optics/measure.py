@@ -153,8 +153,8 @@ def rrmsd_by_rays(
 def rrmsd_by_tubes(lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, n: int) -> float:
     """RRMSD of the picture by n x n tubes a channel: no noise, but the bias of tubes; NaN where no light falls."""
     wanted = torch.from_numpy(np.asarray(target, dtype=np.float64))
-    found = tubes_picture(lens, channels, screen, n).cpu()
-    return float(rrmsd(found, wanted)) if total(found) > 0 else math.nan
+    flux = tubes_picture(lens, channels, screen, n).cpu()
+    return float(rrmsd(flux, wanted)) if total(flux) > 0 else math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,8 +226,8 @@ def _shown(pictures: Sequence[Tensor], wanted: Tensor) -> tuple[Tensor, float]:
     pairs = [(one, other, (whole - one - other) / (SETS - 2)) for one, other in zip(*[iter(pictures)] * 2, strict=True)]
 
     def smooth(mean: Tensor, width: float) -> Tensor:
-        found = torch.from_numpy(gaussian_filter(mean.numpy(), width, mode="nearest")) if width else mean
-        return found * (total(wanted) / total(found))
+        smoothed = torch.from_numpy(gaussian_filter(mean.numpy(), width, mode="nearest")) if width else mean
+        return smoothed * (total(wanted) / total(smoothed))
 
     def off(width: float) -> float:
         near = [(smooth(mean, width), one, other) for one, other, mean in pairs]
@@ -235,9 +235,9 @@ def _shown(pictures: Sequence[Tensor], wanted: Tensor) -> tuple[Tensor, float]:
 
     least, best = math.inf, 0.0
     for width in SMOOTHED:  # wider kernels take less noise and more detail: there is one minimum
-        if (found := off(width)) > least:
+        if (square := off(width)) > least:
             break
-        least, best = found, width
+        least, best = square, width
     return smooth(whole / SETS, best), math.sqrt(max(least, 0.0))
 
 
@@ -278,17 +278,17 @@ def _enough(
 
 def _traced(lens, draw: Draw, screen: Screen, wanted: Tensor, side: int, seed: int, ghost) -> _Rays:
     """SETS sets of rays, of about side x side each."""
-    found = []
+    sets = []
     count = min(max(side**2 // A_POINT, FEW_POINTS), MANY_POINTS)
     for i in range(SETS):
         channels = draw(count, seed + i)
         n = max(1, round(a_side(channels) * side))
-        found.append(simulated(lens, channels, screen, n, seed + i))
-    flux = {line: math.fsum(part.flux[line] for part in found) / SETS for line in found[0].flux}
+        sets.append(simulated(lens, channels, screen, n, seed + i))
+    flux = {line: math.fsum(part.flux[line] for part in sets) / SETS for line in sets[0].flux}
     if ghost is not None:
         flux |= {line: flux.get(line, 0.0) + more for line, more in ghost.flux.items()}
-    count = sum(part.rays for part in found)
-    boxes, tents = ([_joined(getattr(part, kind), ghost) for part in found] for kind in ("box", "tent"))
+    count = sum(part.rays for part in sets)
+    boxes, tents = ([_joined(getattr(part, kind), ghost) for part in sets] for kind in ("box", "tent"))
     on_screen = math.fsum(float(total(box)) for box in boxes) / SETS
     if not all(float(total(box)) > 0 for box in boxes):
         return _Rays((), (), flux, count, 0.0)
@@ -300,11 +300,11 @@ def _traced(lens, draw: Draw, screen: Screen, wanted: Tensor, side: int, seed: i
 def _witness(lens, channels, screen: Screen, wanted: Tensor, rays: _Rays, ghost: Ghost | None) -> Witness:
     """The witness by `tubes_of` the lens."""
     n = tubes_of(lens)
-    found = _joined(tubes_picture(lens, channels, screen, n), ghost)
-    if not total(found) > 0:
+    seen = _joined(tubes_picture(lens, channels, screen, n), ghost)
+    if not total(seen) > 0:
         return Witness(math.nan, math.inf)
-    found = found * (total(wanted) / total(found))
-    return Witness(float(rrmsd(found, wanted)), math.sqrt(max(apart(rays.boxes, found)[0], 0.0)))
+    seen = seen * (total(wanted) / total(seen))
+    return Witness(float(rrmsd(seen, wanted)), math.sqrt(max(apart(rays.boxes, seen)[0], 0.0)))
 
 
 def tubes_of(lens: Lens) -> int:
@@ -342,13 +342,13 @@ def lines_apart(
         lines.setdefault(channel.source.wavelength, []).append(channel)
     if len(lines) < 2:
         return ()
-    wanted, found = torch.from_numpy(np.asarray(target, dtype=np.float64)), []
+    wanted, parts = torch.from_numpy(np.asarray(target, dtype=np.float64)), []
     for wavelength, members in sorted(lines.items()):
         picture = tubes_picture(lens, members, screen, n).cpu()
         if total(picture) > 0:
             picture = picture * (total(wanted) / total(picture))
-        found.append(Line(wavelength, math.fsum(channel.weight for channel in members), picture.numpy()))
-    return tuple(found)
+        parts.append(Line(wavelength, math.fsum(channel.weight for channel in members), picture.numpy()))
+    return tuple(parts)
 
 
 def simulated(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, seed: int) -> Simulation:
@@ -391,8 +391,8 @@ class Images:
         sides = [2 * r + 1 for r in reach]
         own = Screen(0.0, (-sides[0] / 2, sides[0] / 2), (-sides[1] / 2, sides[1] / 2), tuple(sides))
         position = self.offset * torch.tensor([1.0, -1.0]).view(2, 1, 1)  # rows count downwards
-        found = tent(Landed(position, self.flux, torch.zeros(self.flux.shape, dtype=torch.uint8)), own)
-        return (found / found.sum()).numpy()
+        image = tent(Landed(position, self.flux, torch.zeros(self.flux.shape, dtype=torch.uint8)), own)
+        return (image / image.sum()).numpy()
 
     def deviation(self, target: np.ndarray) -> float:
         """RRMSD of a target (rows, columns) convolved with the mean image, against the target itself."""

@@ -217,8 +217,8 @@ def _bent(lens: Lens, bounds: Bounds) -> Lens:
     variable = SobolevVariable.of(back, torch.ones_like(back.heights))
 
     def in_c(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
-        found = excess(_with_heights(lens, back.heights + variable.heights(parameters[0].detach())), bounds)
-        return found.mean_square, [variable.adjoint(found.gradient)], found.worst
+        over = excess(_with_heights(lens, back.heights + variable.heights(parameters[0].detach())), bounds)
+        return over.mean_square, [variable.adjoint(over.gradient)], over.worst
 
     for reached in minimise(in_c, lbfgs([torch.zeros_like(back.heights)], REPAIR), REPAIR):
         if reached.best.figure <= -SPARE:

@@ -138,8 +138,8 @@ def local_weight(source: Source, lens: Lens, target: np.ndarray, screen: Screen,
     column, row = (p.cpu().double().numpy() for p in screen.pixel(*landed.position))
     seen = landed.alive.cpu().numpy() & (column > 0) & (column < screen.columns) & (row > 0) & (row < screen.rows)
     picture = gaussian_filter(target / target.mean(), BLUR)
-    found = map_coordinates(picture, [row - 0.5, column - 0.5], order=1, mode="nearest")
-    logarithm = np.where(seen, np.log(np.maximum(found, MOST**-4)), 0.0)
+    irradiance = map_coordinates(picture, [row - 0.5, column - 0.5], order=1, mode="nearest")
+    logarithm = np.where(seen, np.log(np.maximum(irradiance, MOST**-4)), 0.0)
     return torch.from_numpy(np.clip(np.exp(-0.5 * gaussian_filter(logarithm, SMOOTH)), 1 / MOST, MOST))
 
 

@@ -71,21 +71,21 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[S
     lens = task.heaviest.through(lens)
     if state is None and task.free:
         coarse = lens.refined(task.knobs.levels[0])
-        found = shaped_front(
+        shaped = shaped_front(
             task.heaviest.source, coarse, task.target, task.screen, task.free, task.rim_sags,
             iterations=task.knobs.transport_iterations,
         )  # fmt: skip
-        lens = lens.with_front(found.front)
+        lens = lens.with_front(shaped.front)
     for last in follow_slopes(task, lens, state):
         yield last
-    found, judged = last.lens, task.rrmsd(last.lens)
+    first, judged = last.lens, task.rrmsd(last.lens)
     yield replace(last, state=None, judged=judged)
     if not doubtful(judged, last.state):
         return
-    other, mapping = follow_aims(task, lens.with_front(found.front))
+    other, mapping = follow_aims(task, lens.with_front(first.front))
     value = task.rrmsd(other)
     better = value < np.nan_to_num(judged, nan=np.inf)  # NaN: no light on the target
-    if better and task.used(other) >= KEPT_LIGHT * task.used(found):
+    if better and task.used(other) >= KEPT_LIGHT * task.used(first):
         yield Step(lambda: other, mapping=mapping, judged=value)
 
 
@@ -214,12 +214,12 @@ def _with(lens: Lens, **values: float) -> Lens:
 
 def _along(name: str, merit: Merit, lens: Lens, bounds: Range, tolerance: float) -> Lens:
     """The lens with the best value of one parameter by a bounded scalar search (Brent), its own value included."""
-    found = scipy.optimize.minimize_scalar(
+    search = scipy.optimize.minimize_scalar(
         lambda value: merit(_with(lens, **{name: float(value)})), bounds=bounds, method="bounded",
         options={"maxiter": EVALUATIONS, "xatol": tolerance},
     )  # fmt: skip
     start = float(lens.front.parameters()[name])
-    best = float(found.x) if found.fun < merit(_with(lens, **{name: start})) else start
+    best = float(search.x) if search.fun < merit(_with(lens, **{name: start})) else start
     return _with(lens, **{name: best})
 
 
@@ -238,10 +238,10 @@ def _together(merit: Merit, lens: Lens, rim_sags: Range) -> Lens:
     low, high = _curvatures(lens, rim_sags)
     step = (high - low) / 16 * (1 if c + (high - low) / 16 <= high else -1)
     simplex = np.array([[c, k], [c + step, k], [c, k - 1.0]])
-    found = scipy.optimize.minimize(
+    search = scipy.optimize.minimize(
         at, simplex[0], method="Nelder-Mead", options={"initial_simplex": simplex, "maxfev": BOTH, "xatol": 1e-5}
     )
-    best = found.x if found.fun < math.inf else simplex[0]
+    best = search.x if search.fun < math.inf else simplex[0]
     return _with(lens, curvature=float(best[0]), conic_constant=float(best[1]))
 
 

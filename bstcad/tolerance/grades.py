@@ -93,23 +93,23 @@ def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None
     Errors that the lens's net is too coarse for are left out, unless the table names them.  Raises SceneError, in a
     sentence, for tables of errors that do not exist.
     """
-    found = []
+    errors = []
     for kind in kinds(setup, material).values():
         told = settings_of(table, kind.name)
         if told.get("grade") != NONE:
             size = told["limit"] if "limit" in told else limit(kind, GRADES[told["grade"]], setup)
-            found.append(Perturbation(kind, size, told.get("distribution", "normal"), told.get("cost", 1.0)))
-    found += _of_faces(setup.lens, table)
+            errors.append(Perturbation(kind, size, told.get("distribution", "normal"), told.get("cost", 1.0)))
+    errors += _of_faces(setup.lens, table)
     for k, entry in enumerate(table[1:]):
         none = entry.name and settings_of(table, entry.name).get("grade") == NONE
-        if entry.name and not none and not any(entry.covers(error.kind.name) for error in found):
+        if entry.name and not none and not any(entry.covers(error.kind.name) for error in errors):
             raise SceneError(
                 f"tolerance[{k}].name: {entry.name!r} changes nothing here, or the scene does not say by how much "
                 "(a lens.material does, of temperature and wavelength); remove that table"
             )
-    if not found:
+    if not errors:
         raise SceneError('tolerance: nothing can be off; give a grade other than "none", or name errors with a limit')
-    return tuple(found)
+    return tuple(errors)
 
 
 def _of_faces(lens: Lens, table: Sequence[Tolerance]) -> Iterator[Perturbation]:

@@ -186,14 +186,14 @@ def _as_made(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> tuple[
     except ValueError as error:
         lens = replace(bare, clear=designed.clear)
         checks = [Check.true("part.step: clear apertures can be measured", False, str(error))]
-    found = mount_losses(lens, nominal.channels, None if flange is None else (flange.z, flange.z + flange.thickness))
-    checks.append(Check.at_most(CUT, found.cut, None))
+    losses = mount_losses(lens, nominal.channels, None if flange is None else (flange.z, flange.z + flange.thickness))
+    checks.append(Check.at_most(CUT, losses.cut, None))
     if flange is not None:
         where = "a wall of its opening stands in the way; make the flange thinner, or put it where it meets the lens"
         name = "part.step: light that meets the flange"
-        checks.append(Check.at_most(name, found.on_flange, MAX_ON_FLANGE, where=where))
-    why = f"the mount leaves {lens.apertures[1].words} of the back and cuts away {100 * found.cut:.3g} % of the light"
-    return lens, checks, why if found.cut > CUT_EXCUSE else ""
+        checks.append(Check.at_most(name, losses.on_flange, MAX_ON_FLANGE, where=where))
+    why = f"the mount leaves {lens.apertures[1].words} of the back and cuts away {100 * losses.cut:.3g} % of the light"
+    return lens, checks, why if losses.cut > CUT_EXCUSE else ""
 
 
 def _because(why: str, checks: Sequence[Check]) -> list[Check]:
@@ -205,10 +205,10 @@ def _because(why: str, checks: Sequence[Check]) -> list[Check]:
     ]
 
 
-def _aperture(name: str, found: Outline, designed: Outline) -> Check:
+def _aperture(name: str, measured: Outline, designed: Outline) -> Check:
     """The largest distance between the rim of a face's clear aperture and that of the designed one."""
-    off = max(float(np.abs(a.depth(*b.places())).max()) for a, b in ((found, designed), (designed, found)))
-    where = f"the part has {found.words}, the lens was tailored for {designed.words}; generate the design again"
+    off = max(float(np.abs(a.depth(*b.places())).max()) for a, b in ((measured, designed), (designed, measured)))
+    where = f"the part has {measured.words}, the lens was tailored for {designed.words}; generate the design again"
     name = f"part.step: clear aperture of the {name}, from the mount's"
     return Check.at_most(name, off, APERTURE_DIFFERENCE, unit="mm", where=where)
 
@@ -263,13 +263,13 @@ def of_bounds(
     checks, at_bounds = [], {}
     radius, degrees, kind = asked.tool_radius, asked.max_slope, "convex" if asked.mould else "concave"
     if radius is not None or degrees is not None:
-        found = survey(lens, **{kind: radius}, slope=degrees)
+        bending = survey(lens, **{kind: radius}, slope=degrees)
         if radius is not None:
-            met = getattr(found, kind)
+            met = getattr(bending, kind)
             checks.append(Check.at_least(f"smallest {kind} radius{GRID}", met.largest, radius, "mm", met.where))
             at_bounds["tool_radius"] = met.at_bound
         if degrees is not None:
-            met = found.slope
+            met = bending.slope
             checks.append(Check.at_most(f"steepest slope{GRID}", met.largest, degrees, "deg", met.where))
             at_bounds["max_slope"] = met.at_bound
     for name, judge, key, limit in (
