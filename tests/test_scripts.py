@@ -11,9 +11,9 @@ import skimage
 
 import bstcad
 import bstcad.cad.plugin
-from bstcad.cad.mass_properties import exact_volume
 from tests.cad.test_trimming import occ_volume
 from tests.conftest import draws_nothing, quick_effort, verify_with
+from tests.exact_volume import exact_volume
 
 TEMPLATES = Path(__file__).parent.parent / "templates"
 

@@ -28,12 +28,6 @@ class MassProperties:
         return cls(total.area, total.volume, (c_x, c_y, z + c_z))
 
 
-def exact_volume(lens: Lens) -> float:
-    """V = ∫∫ (back - front) dx dy over the outline (mm³), to about 1e-13 of itself, without Gauss points on the net."""
-    back, front = (quadrature.integral(f, lens.outline) + f.z * lens.outline.area for f in (lens.back, lens.front))
-    return back - front
-
-
 def of_lens(lens: Lens) -> MassProperties:
     """Of a bare lens, from its own surfaces, to about 1e-9."""
     lens, total = lens.plain(), Sums()

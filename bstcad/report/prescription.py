@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.analysis.shape import FLATTEST, describe, heights, survey, thickness_range
-from bstcad.cad.mass_properties import exact_volume
+from bstcad.cad import mass_properties
 from bstcad.optics.bspline import DEGREE
 from bstcad.optics.lens import Lens
 from bstcad.optics.media import density
@@ -249,7 +249,7 @@ def _corners(lens: Lens, whole: WholePart | None) -> tuple[Place, Place]:
 def _volume(lens: Lens, whole: WholePart | None) -> float | None:
     """Of a part (mm³); None: it has faces that nothing here integrates."""
     if whole is None:
-        return exact_volume(lens)
+        return mass_properties.of_lens(lens).volume
     return None if whole.properties is None else whole.properties.volume
 
 

@@ -137,7 +137,7 @@ def verify(
     mesh = mesh_files.read_stl(folder / "lens.stl")
     sealed = Check.true("STL watertight, winding consistent", meshes.is_closed(mesh))
     lens = _result(lens, path)
-    whole = replace(mass_properties.of_lens(lens), volume=mass_properties.exact_volume(lens))  # not as it was stated
+    whole = mass_properties.of_lens(lens)  # not as it was stated
     lit, of_aperture, why = (lens, (), "") if mount is None else _as_made(seen, lens, nominal, folder)
     known(lit)
     light = measure(lit, nominal.channels, nominal.screen, nominal.target, effort, nominal.ghost, nominal.draw)

@@ -12,7 +12,6 @@ import torch
 from OCP.BRepAdaptor import BRepAdaptor_Curve
 
 from bstcad.cad import mass_properties, mounting, solid_properties, step_writing
-from bstcad.cad.mass_properties import exact_volume
 from bstcad.cad.mesh import lens_mesh, volume_and_area
 from bstcad.cad.trimming import trimmed_solid
 from bstcad.optics.bspline import BSplineSurface
@@ -22,6 +21,7 @@ from bstcad.optics.surfaces import Sphere, sag
 from bstcad.scene.mount import Flange, Mount, Round, Screws
 from bstcad.step_text import part21
 from tests.cad.test_trimming import occ_volume, stadium, uses, worst_gap
+from tests.exact_volume import exact_volume
 
 pytestmark = pytest.mark.bench
 M, RADIUS = 513, 12.0  # control points a side; mm

@@ -9,7 +9,7 @@ import torch
 from OCP.BRepGProp import BRepGProp
 from OCP.GProp import GProp_GProps
 
-from bstcad.cad.mass_properties import MassProperties, exact_volume, of_lens
+from bstcad.cad.mass_properties import MassProperties, of_lens
 from bstcad.cad.mounting import Placed, mounted, wire
 from bstcad.cad.solid import lens_solid
 from bstcad.cad.solid_properties import of_solid
@@ -22,6 +22,7 @@ from bstcad.optics.surfaces import Conic, Plane, Sphere
 from bstcad.scene.mount import Box
 from tests.cad.test_mounting import disc
 from tests.cad.test_trimming import plate, stadium
+from tests.exact_volume import exact_volume
 
 R, EDGE = 30.0, 4.0  # mm
 ROUNDED = Box(shape="rectangle", width=8.0, height=6.0, corner_radius=1.2)

@@ -11,7 +11,6 @@ import torch
 from OCP.ShapeAnalysis import ShapeAnalysis_ShapeTolerance
 
 from bstcad.cad import nurbs, patches, step_reading, step_writing
-from bstcad.cad.mass_properties import exact_volume
 from bstcad.cad.patches import conic_net, front_patch
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.bspline import BSplineSurface
@@ -20,6 +19,7 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Conic, Plane, Sphere, sag
 from bstcad.step_text import part21
 from tests.cad.test_trimming import occ_volume
+from tests.exact_volume import exact_volume
 
 OUTLINES = {"rectangle": Rectangle(24.0, 20.0), "circle": Circle(12.0)}
 CONICS = {

@@ -25,7 +25,6 @@ from OCP.StlAPI import StlAPI_Writer
 from bstcad.analysis.shape import describe
 from bstcad.cad import mesh as meshes
 from bstcad.cad import mesh_files, step_reading, step_writing
-from bstcad.cad.mass_properties import exact_volume
 from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
@@ -33,6 +32,7 @@ from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.scene.scene import MESH
 from bstcad.step_text import part21
 from bstcad.verify import checks, step_checks
+from tests.exact_volume import exact_volume
 
 SLOPE, EDGE = 64.0, 0.05  # degrees, before the ripple; mm
 
