@@ -38,7 +38,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import in_pairs
-from bstcad.optics.trace import Ghost, Simulation, from_first_net, simulate_all
+from bstcad.optics.trace import Ghost, Simulation, from_first_net, simulate
 from bstcad.optics.tubes import SHEET, area_of, arriving, corners, middle, picture, rays_to
 
 SETS = 8  # of rays, independent of each other: the jackknife then knows a standard error to a quarter of it
@@ -354,7 +354,7 @@ def lines_apart(
 def simulated(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, seed: int) -> Simulation:
     """The picture and the ledger by n x n stratified rays a channel; other ones at each point of an extended source."""
     pairs = zip(channels, places(channels), strict=True)
-    return simulate_all([(c.weight, c.source, c.through(lens), seed + SETS * k) for c, k in pairs], screen, n)
+    return simulate([(c.weight, c.source, c.through(lens), seed + SETS * k) for c, k in pairs], screen, n)
 
 
 def _joined(picture: Tensor, ghost: Ghost | None) -> Tensor:

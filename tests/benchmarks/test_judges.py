@@ -24,7 +24,7 @@ from bstcad.optics.bspline import DEGREE, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Fresnel, Losses
 from bstcad.optics.measure import tubes_picture
-from bstcad.optics.trace import follow_ghost, ghost_light, launch, to_first_net, to_plane, trace
+from bstcad.optics.trace import follow_ghost, ghost_light, to_first_net, to_plane, trace
 from bstcad.pipeline import design
 from bstcad.report import exports
 from bstcad.scene.new_scene import templates
@@ -32,6 +32,7 @@ from bstcad.scene.scene import Scene, load
 from tests.benchmarks.cold import TEMPLATES
 from tests.cad.test_trimming import plate
 from tests.report.test_exports import read_zemax
+from tests.tracing import launch
 
 pytestmark = pytest.mark.bench
 

@@ -17,10 +17,11 @@ import torch
 from bstcad.optics import bspline, tubes
 from bstcad.optics.irradiance import Screen, collect, collect_plain, landed_flux
 from bstcad.optics.kernels import compiling, forward
-from bstcad.optics.trace import from_first_net, from_first_net_plain, launch, to_first_net, trace, window
+from bstcad.optics.trace import from_first_net, to_first_net, trace, window
 from bstcad.scene import scene
 from bstcad.transport.bfm import Poisson
 from bstcad.transport.density import threads, threads_for
+from tests.tracing import from_first_net_plain, launch
 
 pytestmark = pytest.mark.bench
 

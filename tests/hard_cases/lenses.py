@@ -17,6 +17,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Rays
 from bstcad.optics.surfaces import Plane, Sphere
+from tests.tracing import from_first_net_plain
 
 N = 1.488
 SQUARE = Rectangle(20.0, 20.0)
@@ -30,9 +31,9 @@ def tracing(engine: str) -> Iterator[Callable[[Rays, Lens, float], Landed]]:
     """From the glass to the screen: plain torch; plain torch on the fused spline; the fused back face."""
     if engine == "plain":
         with mock.patch.object(compiling, "ENABLED", False):
-            yield trace.from_first_net_plain
+            yield from_first_net_plain
     else:
-        yield {"mixed": trace.from_first_net_plain, "fused": trace.from_first_net}[engine]
+        yield {"mixed": from_first_net_plain, "fused": trace.from_first_net}[engine]
 
 
 def examples(count: int) -> settings:

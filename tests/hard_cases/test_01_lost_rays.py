@@ -13,7 +13,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad.optics import sampling, trace, tubes
+from bstcad.optics import trace, tubes
 from bstcad.optics.irradiance import Screen, collect
 from bstcad.optics.kernels import forward
 from bstcad.optics.outlines import Rectangle
@@ -21,6 +21,7 @@ from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Sphere
 from tests.hard_cases.lenses import DTYPES, ENGINES, bundle, lens_of, tracing, uniform, wavy
+from tests.tracing import stratified
 
 NAN, INF = float("nan"), float("inf")
 BAD = {  # a ray before the lens, and what becomes of it
@@ -39,7 +40,7 @@ Z = 200.0
 
 def good(dtype) -> Rays:
     """143 rays: an odd number, so that one more leaves each of two threads what it had."""
-    x, y = (p.reshape(-1)[:143] for p in sampling.stratified(Rectangle(12.0, 12.0), 12, 0, dtype))
+    x, y = (p.reshape(-1)[:143] for p in stratified(Rectangle(12.0, 12.0), 12, 0, dtype))
     return Point().rays(x, y, 15.0, 1.0)
 
 
@@ -100,7 +101,7 @@ def test_all_others_land_and_pull_as_without_it(bad, engine, dtype, holds):
 def test_the_forward_kernel_lets_no_ray_change_another(beside):
     """Outside the lens, out at a side, beyond the beam, not a number: the others of its block land where they did."""
     lens, source = lens_of(wavy(depth=2.0)), Point()
-    x, y = (p.reshape(-1) for p in sampling.stratified(Rectangle(12.0, 12.0), 30, 0))
+    x, y = (p.reshape(-1) for p in stratified(Rectangle(12.0, 12.0), 30, 0))
     whole = forward.land(source, lens, Z, x, y)
     x[300], y[300] = beside
     found, others = forward.land(source, lens, Z, x, y), torch.arange(900) != 300

@@ -24,7 +24,6 @@ from bstcad.optics.outlines import Circle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Plane
-from bstcad.optics.trace import simulate
 from tests.hard_cases import exact
 from tests.hard_cases.lenses import (
     DTYPES,
@@ -39,6 +38,7 @@ from tests.hard_cases.lenses import (
     uniform,
     wavy,
 )  # fmt: skip
+from tests.tracing import simulated
 
 OFFSETS = [s * 10.0**-k for k in range(2, 9) for s in (1, -1)] + [0.0]
 CRITICAL = math.asin(1 / N)
@@ -181,7 +181,7 @@ def test_tubes_across_the_angle(n, dtype, holds):
     back = wavy(dtype, m=33, depth=5.0, ripple=0.0)
     lens = lens_of(replace(back, heights=back.heights.requires_grad_()), Plane(15.0), Circle(9.0), 1.6)
     source, screen = Point(profile="uniform", half_angle=30.0), Screen(60.0, (-1e9, 1e9), (-1e9, 1e9), 8)
-    told = simulate(source, lens, screen, 400, 0).flux
+    told = simulated(source, lens, screen, 400, 0).flux
     leaves = told["on target"] + told["off target"]
     assert told["total internal reflection"] > 0.02
     sheet = tubes.launch_tubes(source, lens, n)

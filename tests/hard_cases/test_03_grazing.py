@@ -39,6 +39,7 @@ from tests.hard_cases.lenses import (
     uniform,
     wavy,
 )
+from tests.tracing import from_first_net_plain
 
 OFFSETS = [s * 10.0**-k for k in range(1, 13) for s in (1, -1)] + [0.0]
 WIDE = Rectangle(60.0, 60.0)
@@ -111,7 +112,7 @@ def test_along_the_axis_at_the_equator(curvature, dtype, holds):
     holds(f"turn near the equator, times the cosine, {NAMES[dtype]}", largest(off * cosine), 8 * eps(dtype))
     if dtype == torch.float64:
         found = forward.land(Collimated(Circle(30.0)), lens, 300.0, radius, torch.zeros_like(radius))
-        plain = trace.from_first_net_plain(inside, lens, 300.0)
+        plain = from_first_net_plain(inside, lens, 300.0)
         assert torch.equal(found.status, plain.status)
 
 

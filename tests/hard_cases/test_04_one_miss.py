@@ -13,12 +13,13 @@ from unittest import mock
 import pytest
 import torch
 
-from bstcad.optics import sampling, trace
+from bstcad.optics import trace
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Point
 from tests.hard_cases.lenses import DTYPES, ENGINES, landing_gradient, lens_of, tracing, wavy
+from tests.tracing import stratified
 
 MISS = 7000
 Z = 1000.0
@@ -33,7 +34,7 @@ WAYS = {  # of the ray that misses, in the glass
 
 def twenty_thousand(lens, dtype=torch.float64) -> Rays:
     """In the glass: 142² rays, all of which get through."""
-    x, y = (p.reshape(-1) for p in sampling.stratified(Rectangle(13.0, 13.0), 142, 0, dtype))
+    x, y = (p.reshape(-1) for p in stratified(Rectangle(13.0, 13.0), 142, 0, dtype))
     return trace.to_first_net(Point().rays(x, y, 15.0, 1.0), lens)
 
 

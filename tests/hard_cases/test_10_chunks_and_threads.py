@@ -32,19 +32,13 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
-from bstcad.optics.trace import (
-    Simulation,
-    from_first_net,
-    launch,
-    simulate,
-    simulate_plain,
-    to_first_net,
-)
+from bstcad.optics.trace import Simulation, from_first_net, to_first_net
 from bstcad.scene.scene import load
 from bstcad.tailoring.merit import SobolevVariable, TubeMerit
 from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.transport.density import Density
 from tests.conftest import DISK, SMALL
+from tests.tracing import launch, simulated, simulated_plain
 
 ROOT = Path(__file__).parent.parent.parent
 SOURCE = Point(position=(1.0, -2.0, 0.0), profile="uniform", half_angle=35.0)
@@ -102,7 +96,7 @@ def rays_merit(held: Lens, rays) -> torch.Tensor:
 
 def image_and_gradient(dtype=torch.float64) -> dict[str, torch.Tensor]:
     """All that the kernels stand behind."""
-    return by_rays(simulate(SOURCE, lens(dtype), SCREEN, RAYS, 0)) | merits(dtype)
+    return by_rays(simulated(SOURCE, lens(dtype), SCREEN, RAYS, 0)) | merits(dtype)
 
 
 def everything(dtype=torch.float64) -> dict[str, torch.Tensor]:
@@ -165,7 +159,7 @@ def test_strips_and_bands(holds, monkeypatch, strip, band):
     for portion, rows in ((sampling.STRIP, tubes.BAND), (strip, band)):
         monkeypatch.setattr(sampling, "STRIP", portion)
         monkeypatch.setattr(tubes, "BAND", rows)
-        found = by_rays(simulate_plain(SOURCE, lens(), SCREEN, RAYS, 0))
+        found = by_rays(simulated_plain(SOURCE, lens(), SCREEN, RAYS, 0))
         found |= {"image, tubes": tubes.picture(SOURCE, lens(), SCREEN, TUBES)}
         for name, image in found.items():
             figure = "other bands of tubes: image" if name == "image, tubes" else f"other strips: {name}"

@@ -27,13 +27,13 @@ from bstcad.optics.measure import Effort, Light, measure
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
-from bstcad.optics.trace import simulate, simulate_plain
 from bstcad.report import report as reports
 from bstcad.report.record import of_json, plain
 from bstcad.report.units import number
 from bstcad.scene.scene import Accept
 from bstcad.verify import checks
 from bstcad.verify.verdict import verdict
+from tests.tracing import simulated, simulated_plain
 
 APERTURE = Rectangle(20.0, 18.0)
 SOURCE = Collimated(APERTURE, profile="gaussian", radius_1e2=11.0)
@@ -78,8 +78,8 @@ def slope(errors: list[float], numbers: list[int]) -> float:
 
 @pytest.mark.parametrize("dtype", (torch.float32, torch.float64), ids=str)
 @pytest.mark.parametrize(("name", "rays", "form", "power"), [
-    ("random", by_random, None, -1 / 2), ("stratified", by_strata, simulate, -3 / 4),
-    ("stratified", by_strata, simulate_plain, -3 / 4),
+    ("random", by_random, None, -1 / 2), ("stratified", by_strata, simulated, -3 / 4),
+    ("stratified", by_strata, simulated_plain, -3 / 4),
 ], ids=("random", "stratified", "stratified, plain"))  # fmt: skip
 def test_the_error_of_rays_falls_with_its_power(holds, name, rays, form, power, dtype):
     """Over 576 pixels and 4 seeds an RRMSD is sure to 1.5 %, and the slope over a factor 64 to 0.005: four times that.
@@ -103,7 +103,7 @@ def test_the_error_of_tubes_falls_as_their_number(holds):
         found = {n + k: float(rrmsd(tubes.picture(SOURCE, plate(), SCREEN, n + k), wanted)) for k in more}
         errors.append(np.mean([(error * (m / n) ** 2) ** 2 for m, error in found.items()]) ** 0.5)
     holds("slope of the error of ray tubes, above -1", slope(errors, [n * n for n in sides]) + 1, 0.1)
-    strata = float(rrmsd(simulate(SOURCE, plate(), SCREEN, 512, 0).box, wanted))
+    strata = float(rrmsd(simulated(SOURCE, plate(), SCREEN, 512, 0).box, wanted))
     holds("error of 512² ray tubes over that of 512² stratified rays", errors[-1] / strata, 0.1)
 
 
@@ -174,5 +174,5 @@ def test_the_figure_has_no_noise_in_its_mean(holds):
     squared = np.array([light.rrmsd**2 for light in found])
     off = abs(squared.mean() - true**2) / (squared.std(ddof=1) / math.sqrt(len(found)))
     holds("mean of the squared RRMSD off the true one, over its standard error", off, 3.0)
-    single = rrmsd(simulate(SOURCE, plate(), SCREEN, 192, 0).box, target)
+    single = rrmsd(simulated(SOURCE, plate(), SCREEN, 192, 0).box, target)
     assert float(single) > 1.02 * true  # which the square of a set by itself would have stated

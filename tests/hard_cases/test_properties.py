@@ -23,9 +23,9 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Status
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
-from bstcad.optics.trace import simulate, simulate_plain
 from bstcad.scene.scene import SceneError, load
 from tests.hard_cases.lenses import SQUARE, N, eps, examples, largest, places, uniform, wavy
+from tests.tracing import simulated, simulated_plain
 
 EPS = eps(torch.float64)
 FORMS = (bspline.evaluate, bspline.evaluate_plain)
@@ -196,7 +196,7 @@ def test_all_light_is_accounted_for(source, depth, curvature, outline, z, seed):
     lens = lens_with(depth, curvature, outline)
     half = 0.3 * z
     screen = Screen(z, (-half, half), (-0.7 * half, half), 24)
-    told = [form(source, lens, screen, 48, seed % 1000) for form in (simulate, simulate_plain)]
+    told = [form(source, lens, screen, 48, seed % 1000) for form in (simulated, simulated_plain)]
     for found in told:
         assert sum(found.flux.values()) == pytest.approx(1.0, abs=1e-12)
         assert set(found.flux) == {"on target", "off target", *LEDGER}

@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import Interface, Reflect, Refract, cross
 from bstcad.optics.irradiance import Screen
@@ -16,8 +15,9 @@ from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.rays import Rays, Status, TiltedPlane
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
-from bstcad.optics.trace import across, land, simulate, through, to_first_net, trace
+from bstcad.optics.trace import across, land, through, to_first_net, trace
 from bstcad.optics.tubes import launch_tubes
+from tests.tracing import simulated, stratified
 
 N = 1.5
 
@@ -64,7 +64,7 @@ def net(z, size, seed=1):
 
 
 def rays_of(source, lens, n=40, size=16.0):
-    x, y = sampling.stratified(Rectangle(size, size), n, 0)
+    x, y = stratified(Rectangle(size, size), n, 0)
     return source.rays(x, y, lens.entrance.z, 1.0)
 
 
@@ -92,7 +92,7 @@ def test_a_system_is_simulated_as_its_rays_and_its_tubes_are_traced():
     lens = replace(Lens(Sphere(0.0, 0.01), net(6.0, 0.2), SQUARE, N), before=WINDOW, behind=FOLD)
     screen = Screen(10.0, (-40.0, 40.0), (-40.0, 40.0), 8)
     source = Point((1.0, -2.0, -60.0), profile="uniform", half_angle=7.0)
-    rays, tubes = simulate(source, lens, screen, 300, 0), launch_tubes(source, lens, 120).picture(lens, screen)
+    rays, tubes = simulated(source, lens, screen, 300, 0), launch_tubes(source, lens, 120).picture(lens, screen)
     assert sum(rays.flux.values()) == pytest.approx(1, abs=1e-12) and rays.flux["on target"] > 0.9
     assert float(tubes.sum()) == pytest.approx(rays.flux["on target"], rel=1e-3)
     torch.testing.assert_close(tubes, rays.box, rtol=0.05, atol=1e-4)

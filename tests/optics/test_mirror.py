@@ -15,15 +15,9 @@ from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
-from bstcad.optics.trace import (
-    from_first_net,
-    from_first_net_plain,
-    simulate,
-    to_first_net,
-    to_plane,
-    trace,
-)
+from bstcad.optics.trace import from_first_net, to_first_net, to_plane, trace
 from bstcad.optics.tubes import launch_tubes, picture, rays_to
+from tests.tracing import from_first_net_plain, simulated
 
 M, HALF, Z = 41, 10.0, 5.0
 SQUARE = Rectangle(2 * HALF, 2 * HALF)
@@ -128,7 +122,7 @@ def test_light_downwards_is_light_upwards_seen_in_a_mirror(law, surface):
 def test_tubes_hold_the_light_that_rays_carry(light):
     """By the fused picture and by the corners, traced one by one; the screen takes all of it."""
     scene = LIGHTS[light], mirror(bumpy()), Screen(120.0, (-900.0, 900.0), (-900.0, 900.0), 8)
-    rays = simulate(*scene, 800, 1)
+    rays = simulated(*scene, 800, 1)
     for found in (picture(*scene, 160), launch_tubes(*scene[:2], 160).picture(*scene[1:])):
         assert float(found.sum()) == pytest.approx(rays.flux["on target"], rel=2e-3)
 

@@ -14,6 +14,7 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
+from tests.tracing import from_first_net_plain, stratified
 
 SQUARE = Rectangle(20.0, 20.0)
 N = 1.488
@@ -40,7 +41,7 @@ def rays(position, direction):
 
 
 def from_point(n=40, half=9.0, z=15.0, source=None, dtype=torch.float64):
-    x, y = sampling.stratified(Rectangle(2 * half, 2 * half), n, 0, dtype)
+    x, y = stratified(Rectangle(2 * half, 2 * half), n, 0, dtype)
     return (source or Point()).rays(x, y, z, 1.0)
 
 
@@ -161,7 +162,7 @@ def test_a_ray_that_does_not_meet_the_surface_ahead_is_lost_for_its_reason(surfa
             assert torch.isfinite(at.position).all()
 
 
-@pytest.mark.parametrize("form", [trace.from_first_net, trace.from_first_net_plain])
+@pytest.mark.parametrize("form", [trace.from_first_net, from_first_net_plain])
 def test_a_ray_that_turns_back_does_not_land(form):
     """60° from the axis in glass, the back face tilted by 20°: it leaves at 74.6° from the normal, 94.6° from the axis,
     and moves away from the screen; its line meets the screen's plane only behind it."""
@@ -177,14 +178,12 @@ def test_a_ray_that_turns_back_does_not_land(form):
 
 
 def test_axial_closed_form_is_the_newton_answer():
-    x, y = sampling.stratified(Rectangle(22.0, 22.0), 30, 0)
+    x, y = stratified(Rectangle(22.0, 22.0), 30, 0)
     bundle = Collimated(Circle(12.0)).rays(x, y, 8.0, 1.0)
     searched = replace(bundle, axial=False)
     for front in (Plane(8.0), Sphere(8.0, -0.03)):
         lens = Lens(front, wavy(), SQUARE, N)
-        closed, newton = (
-            trace.from_first_net_plain(trace.to_first_net(b, lens), lens, 1000.0) for b in (bundle, searched)
-        )
+        closed, newton = (from_first_net_plain(trace.to_first_net(b, lens), lens, 1000.0) for b in (bundle, searched))
         assert torch.equal(closed.status, newton.status) and 0 < int(closed.alive.sum()) < 900
         there = closed.alive
         torch.testing.assert_close(closed.position[:, there], newton.position[:, there], rtol=0, atol=1e-9)
@@ -262,7 +261,7 @@ def test_gradient_in_curvature_net_and_start_is_finite_differences(kind, curvatu
         lens = Lens(Sphere(15.0, curvature), replace(start, heights=heights), SQUARE, N)
         return trace.trace(source.rays(x, y, 15.0, 1.0), lens, 60.0).position
 
-    x, y = (a.reshape(-1).requires_grad_() for a in sampling.stratified(Rectangle(12.0, 12.0), 2, 0))
+    x, y = (a.reshape(-1).requires_grad_() for a in stratified(Rectangle(12.0, 12.0), 2, 0))
     c = torch.tensor(curvature, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(landing, (start.heights.clone().requires_grad_(), c, x, y), fast_mode=True)
 
@@ -286,7 +285,7 @@ def landing_and_gradients(bundle):
     back, c = wavy(depth=2.0), torch.tensor(-0.02, dtype=torch.float64, requires_grad=True)
     heights = back.heights.clone().requires_grad_()
     lens = Lens(Sphere(15.0, c), replace(back, heights=heights), SQUARE, N)
-    landed = trace.from_first_net_plain(trace.to_first_net(bundle, lens), lens, 200.0)
+    landed = from_first_net_plain(trace.to_first_net(bundle, lens), lens, 200.0)
     merit = torch.where(landed.alive, landed.position.square().sum(0), 0.0)
     return landed, torch.autograd.grad(merit.sum(), (heights, c, bundle.direction))
 
@@ -296,7 +295,7 @@ def test_one_bad_ray_changes_no_bit_of_the_others(bad):
     """Double where, everywhere.  Beside the good rays once the bad one, once a harmless one that was lost before:
     the same number of terms, so the sums too must agree to the bit."""
     place, way, reason = BAD[bad]
-    x, y = (a.reshape(-1) for a in sampling.stratified(Rectangle(12.0, 12.0), 12, 0))
+    x, y = (a.reshape(-1) for a in stratified(Rectangle(12.0, 12.0), 12, 0))
     good, n = Point().rays(x, y, 15.0, 1.0), x.numel()
     lost = replace(Point().rays(x[:1], y[:1], 15.0, 1.0), status=torch.ones(1, dtype=torch.uint8))
     alone, g_alone = landing_and_gradients(beside(good, lost))

@@ -15,8 +15,9 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle, Rounded
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import simulate, to_first_net
+from bstcad.optics.trace import to_first_net
 from bstcad.scene import scene
+from tests.tracing import simulated
 
 SHAPE = (7, 9)
 
@@ -168,7 +169,7 @@ def test_tubes_hold_the_light_that_rays_find_behind_the_lens(name):
     screen = Screen(100.0, (-60.0, 60.0), (-60.0, 45.0), (12, 9))
     sheet = tubes.launch_tubes(source, lens, 200)
     found = sheet.picture(lens, screen)
-    rays = simulate(source, lens, screen, 1000, 0)
+    rays = simulated(source, lens, screen, 1000, 0)
     assert float(found.sum()) == pytest.approx(rays.flux["on target"], rel=3e-3)
     assert float(rrmsd(found, rays.box)) < 0.01
 

@@ -23,6 +23,7 @@ from bstcad.tailoring.slope_fit import (
     tailor_to_aim,
     wanted_slopes,
 )
+from tests.tracing import stratified
 
 SQUARE = Rectangle(20.0, 20.0)
 
@@ -77,7 +78,7 @@ def test_an_aim_that_no_face_can_reach_turns_the_ray_as_far_as_one_can(index, re
 @pytest.mark.parametrize("fit", [Fit(bending=0.0, steps=60), Fit(bending=0.0, steps=60, degree=3)])
 def test_a_surface_comes_back_from_its_slopes(fit):
     true = surface(17, 0.7)
-    x, y = (p.reshape(-1) for p in sampling.stratified(SQUARE, 40, 0))
+    x, y = (p.reshape(-1) for p in stratified(SQUARE, 40, 0))
     _, z_x, z_y = true.sag_and_slope(x, y)
     found = fit_slopes(surface(17), x, y, z_x, z_y, torch.ones_like(x), fit)
     off = found.from_vertex().heights - true.from_vertex().heights
@@ -86,7 +87,7 @@ def test_a_surface_comes_back_from_its_slopes(fit):
 
 def test_a_polynomial_goes_on_where_no_ray_falls():
     """Slopes of a paraboloid, known in a disc only: the fit finds the corners too."""
-    x, y = (p.reshape(-1) for p in sampling.stratified(SQUARE, 60, 0))
+    x, y = (p.reshape(-1) for p in stratified(SQUARE, 60, 0))
     inside = (x * x + y * y < 81.0).to(x)
     found = fit_slopes(surface(17), x, y, 0.3 + 0.02 * x, 0.01 * y, inside, Fit(bending=1e-2, steps=40, degree=3))
     corner = torch.tensor([9.5], dtype=torch.float64)

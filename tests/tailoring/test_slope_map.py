@@ -12,10 +12,10 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import simulate
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit
 from bstcad.tailoring.slope_map import _corners_of, face_grid, lit_window, slope_map, sloped
+from tests.tracing import simulated
 
 SQUARE = Rectangle(20.0, 20.0)
 CASES = {
@@ -48,7 +48,7 @@ def slope_error(name, cells):
     """
     source, _, screen = CASES[name]
     screen, true = replace(screen, pixels=(cells, 3 * cells // 4)), known_lens(name)
-    made = simulate(source, true, screen, 16 * cells, 0)
+    made = simulated(source, true, screen, 16 * cells, 0)
     assert made.efficiency > 0.999
     lens = replace(true, back=replace(true.back, heights=torch.zeros_like(true.back.heights)))
     wanted = None
@@ -84,7 +84,7 @@ def test_the_grid_is_met_and_carries_the_flux(name):
     cell = window.width / 200
     assert float((x[1:, 0] - x[:-1, 0] - cell).abs().max()) < 1e-7  # mm
     assert float((grid.at_face.above(0.0) - lens.back.sag_and_slope(x, y)[0]).abs().max()) < 1e-8
-    through = simulate(source, lens, Screen(21.0, (-1e4, 1e4), (-1e4, 1e4), 8), 500, 0).flux
+    through = simulated(source, lens, Screen(21.0, (-1e4, 1e4), (-1e4, 1e4), 8), 500, 0).flux
     flux = float(grid.density.sum()) * window.area / 200**2
     assert flux == pytest.approx(through["on target"] + through["off target"], rel=1.5e-2)  # rim cells
 

@@ -407,13 +407,13 @@ def test_a_scene_that_asks_for_nothing_is_held_to_stated_defaults(folder, nomina
 
 
 def test_light_that_is_unaccounted_for_fails(folder, nominal, monkeypatch):
-    simulate_all = measure.simulate_all
+    simulate = measure.simulate
 
     def leaky(*arguments):
-        found = simulate_all(*arguments)
+        found = simulate(*arguments)
         return replace(found, flux=found.flux | {"missed the lens": found.flux["missed the lens"] - 1e-9})
 
-    monkeypatch.setattr(measure, "simulate_all", leaky)
+    monkeypatch.setattr(measure, "simulate", leaky)
     assert failing(checks.verify(folder, nominal)) == {LEDGER}
 
 
@@ -432,27 +432,27 @@ def test_an_rrmsd_below_what_the_rays_resolve_fails(folder, nominal):
 
 def test_rays_that_do_not_see_what_the_tubes_see_fail(folder, nominal, monkeypatch):
     """A third of the light moved by a pixel: the rays' figure is of another lens than the tubes'."""
-    simulate_all = measure.simulate_all
+    simulate = measure.simulate
 
     def moved(*arguments):
-        found = simulate_all(*arguments)
+        found = simulate(*arguments)
         return replace(found, box=found.box + 0.33 * (found.box.roll(1, 0) - found.box))
 
     effort = replace(FEW, rays=512)
     assert AGREE not in failing(checks.verify(folder, nominal, effort=effort))
-    monkeypatch.setattr(measure, "simulate_all", moved)
+    monkeypatch.setattr(measure, "simulate", moved)
     assert AGREE in failing(checks.verify(folder, nominal, effort=effort))
 
 
 def test_the_rays_are_none_that_tailoring_saw(folder, nominal, monkeypatch):
     """Each set has a seed of its own; stages 1 and 2 use seed and seed + 1."""
-    seeds, simulate_all = [], measure.simulate_all
+    seeds, simulate = [], measure.simulate
 
     def heard(lights, *rest):
         seeds.extend(seed for *_, seed in lights)
-        return simulate_all(lights, *rest)
+        return simulate(lights, *rest)
 
-    monkeypatch.setattr(measure, "simulate_all", heard)
+    monkeypatch.setattr(measure, "simulate", heard)
     checks.verify(folder, nominal)
     assert len(set(seeds)) == measure.SETS and min(seeds) > nominal.seed + 1000
 
