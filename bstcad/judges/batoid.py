@@ -76,12 +76,8 @@ def land(rays: Any, screen: Screen) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     """(x, y, arrived): where batoid's rays, which it moves on, meet the screen (mm, on its plane)."""
     import batoid
 
-    if screen.tilt is None:
-        x, y, frame = 0.0, 0.0, _frame((0.0, 0.0, screen.z))
-    else:
-        x, y, z = screen.plane.centre
-        frame = _frame((x, y, z), np.column_stack(axes(screen.tilt)))
-    batoid.intersect(batoid.Plane(), rays, frame)
+    x, y, _ = screen.middle
+    batoid.intersect(batoid.Plane(), rays, _frame(screen.middle, np.column_stack(axes(screen.tilt or (0.0, 0.0)))))
     arrived = ~rays.failed & ~rays.vignetted & np.isfinite(rays.x) & np.isfinite(rays.y) & (rays.vz > 0)
     return rays.x + x, rays.y + y, arrived
 

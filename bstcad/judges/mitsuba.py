@@ -165,7 +165,7 @@ def _scene(bench: dict[str, Entry], channels: Sequence[Channel], lens: Lens, *, 
 
 def _camera(screen: Screen, top: float) -> Entry:
     """A pinhole before the middle of the screen, nearer than the lens, whose highest point is at z = top (mm)."""
-    middle, (_, up, normal) = _middle(screen), axes(screen.tilt or (0.0, 0.0))
+    middle, (_, up, normal) = screen.middle, axes(screen.tilt or (0.0, 0.0))
     across = screen.x[1] - screen.x[0]
     away = min(across / 2, (screen.z - top) / 2)
     film = {
@@ -181,14 +181,10 @@ def _camera(screen: Screen, top: float) -> Entry:
 
 def _wall(screen: Screen) -> Entry:
     """The screen, twice as large as the picture, so that the camera sees nothing else."""
-    middle, (_, up, normal) = _middle(screen), axes(screen.tilt or (0.0, 0.0))
+    middle, (_, up, normal) = screen.middle, axes(screen.tilt or (0.0, 0.0))
     facing = _look_at(middle, [m - n for m, n in zip(middle, normal, strict=True)], up)
     size = max(high - low for low, high in (screen.x, screen.y))
     return {"type": "rectangle", "bsdf": _matt(WHITE), "to_world": facing.scale(size)}
-
-
-def _middle(screen: Screen) -> tuple[float, float, float]:
-    return sum(screen.x) / 2, sum(screen.y) / 2, screen.z
 
 
 def _matt(reflectance: float) -> Entry:
