@@ -137,7 +137,7 @@ class _Grid:
 
     @classmethod
     def of(cls, coming: Rays, aim: Tensor, z: float) -> _Grid:
-        """The grid of rays on their way to the face; a lost one may be anything finite."""
+        """The grid of rays on their way to the face; a lost ray may be anything finite."""
         alive = coming.alive
         straight = torch.tensor([0.0, 0.0, coming.sense]).to(aim).view(3, 1, 1)
         direction = torch.where(alive, coming.direction, straight)
@@ -180,7 +180,7 @@ def _outwards(grid: _Grid, position: Tensor, reached: Tensor, plane: TargetPlane
         rays = grid[both, :]
         tangent, meets = rays.meet(position, normal)  # the explicit rule
         mean = (normal + rays.normals(tangent, plane, law)) / 2
-        position, meets_again = rays.meet(position, mean)  # the trapezoidal one
+        position, meets_again = rays.meet(position, mean)  # the trapezoidal rule
         normal = rays.normals(position, plane, law)
         reached = reached & rays.alive & meets & meets_again
         points[:, both], all_reached[both] = position, reached

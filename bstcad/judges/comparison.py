@@ -78,7 +78,7 @@ class Compared:
 
 
 def chosen(names: Sequence[str]) -> tuple[str, ...]:
-    """Judges by their names; SceneError for an unknown one, MachineError for one that is not installed."""
+    """Judges by their names; SceneError for an unknown one, MachineError where its program is not installed."""
     for name in names:
         if name not in JUDGES:
             raise SceneError(f"--against {name}: is no judge; {nearest(name, list(JUDGES), 'known are')}")
@@ -165,7 +165,7 @@ def _effective_pixels(noise: np.ndarray) -> float:
 
 
 def _scaled(picture: np.ndarray, total: float) -> np.ndarray:
-    """The picture with that sum; NaN, which no check passes, of one that is dark."""
+    """The picture with that sum; NaN, which no check passes, of a dark picture."""
     return picture * (total / float(picture.sum())) if picture.sum() > 0 else np.full_like(picture, math.nan)
 
 

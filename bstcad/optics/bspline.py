@@ -105,7 +105,7 @@ def evaluate_plain(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tenso
 
 
 def evaluate(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """`evaluate_plain`, by a fused kernel where one serves these tensors (same values to rounding)."""
+    """`evaluate_plain`, by the fused kernel where it takes these tensors (same values to rounding)."""
     if fused(heights, u, v):
         return spline.BSplineSag.apply(heights, *torch.broadcast_tensors(u, v))
     return evaluate_plain(heights, u, v)
@@ -175,7 +175,7 @@ class BSplineSurface(Surface):
 
     @property
     def detail(self) -> float:
-        """Length over which it is one smooth piece (mm): a knot span."""
+        """Width of its smooth pieces (mm): a knot span."""
         return min(self.pitch)
 
     def from_vertex(self) -> BSplineSurface:

@@ -93,7 +93,7 @@ class Lens:
 
     @property
     def last_freeform(self) -> Interface:
-        """The last freeform interface: the one that follows a transport map in stage 1."""
+        """The last freeform interface, which follows a transport map in stage 1."""
         return self.interfaces[self.freeform[-1]]
 
     def with_front(self, front: Surface) -> Lens:

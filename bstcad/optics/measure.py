@@ -97,7 +97,7 @@ class Light:
     tent: float = math.nan  # RRMSD by linear binning
     picture_off: float = math.nan  # `picture` against the lens's own, as RRMSD has it
     witness: Witness | None = None  # None: of a source of some size, of losses, or where none was asked for
-    ghost: np.ndarray | None = field(default=None, repr=False)  # the part of the picture that is one; None: left out
+    ghost: np.ndarray | None = field(default=None, repr=False)  # the part of the picture by a ghost; None: left out
     leak: Leak | None = None  # of the rays' mean picture, not smoothed; None: the target is dark nowhere
 
     @property

@@ -151,11 +151,11 @@ class TiltedPlane:
         return c_x + _dot(e_x, off), c_y + _dot(e_y, off)
 
 
-TargetPlane = float | TiltedPlane  # a level one is its z (mm)
+TargetPlane = float | TiltedPlane  # a level plane is its z (mm)
 
 
 def middle(plane: TargetPlane) -> float:
-    """z (mm) of a level plane; of a tilted one that of its point C."""
+    """z (mm) of a level plane, or of the point C of a tilted plane."""
     return plane.centre[2] if isinstance(plane, TiltedPlane) else plane
 
 

@@ -46,7 +46,7 @@ class Emitter:
 
     @property
     def main_wavelength(self) -> float:
-        """The heaviest line (nm); of several as heavy, the middle one."""
+        """The heaviest line (nm), or the middle of several as heavy."""
         if isinstance(self.wavelength, int | float):
             return self.wavelength
         most = max(weight for _, weight in self.wavelength)

@@ -158,7 +158,7 @@ Lights = Sequence[tuple[float, Source, Lens, int]]  # (weight, source, lens as t
 
 @torch.no_grad()
 def simulate(lights: Lights, screen: Screen, n: int) -> Simulation:
-    """The weighted sum of lights, of n x n stratified rays each; by a fused kernel where one serves.
+    """The weighted sum of lights, of n x n stratified rays each; by the fused kernel where it knows all interfaces.
 
     Kernel and plain form trace the same rays, and agree to rounding.
     """

@@ -48,7 +48,7 @@ SPARE = 1e-3  # of a bound, kept for the digits of a file and for places in betw
 # bound to 50 mm where it would take 20, ends at 0.015 by 1000 throughout, and at 0.0033 by 10.)
 WEIGHTS, ALONE = (1000.0, 100.0, 10.0), 100.0
 REPAIR = 100  # evaluations of the penalty alone, at most
-HALVINGS = 10  # of the way from a back that exceeds the bounds to one that keeps to them
+HALVINGS = 10  # of the way from a back that exceeds the bounds to a back that keeps to them
 
 
 @torch.no_grad()

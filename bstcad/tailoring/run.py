@@ -77,9 +77,9 @@ class Task:
     channels: tuple[Channel, ...]  # the light
     screen: Screen
     target: np.ndarray  # (rows, columns), row 0 = y max, sum 1
-    knobs: Tailoring  # every one set
+    knobs: Tailoring  # with every key set
     least: float = 0.0  # thickness of the glass everywhere (mm)
-    free: tuple[str, ...] = ()  # the parameters of the front that are to be found
+    free: tuple[str, ...] = ()  # the parameters of the front that tailoring searches for
     rim_sags: tuple[float, float] = (-math.inf, math.inf)  # that such a front may have (mm)
     progress: Progress = silent  # told of the progress within a step
     grown: tuple[tuple[Channel, ...], ...] = ()  # points of the source, as it grows to its size; () of a point

@@ -52,10 +52,10 @@ TARGET_FLOOR = 1e-3  # of the mean: flux that the map may spend on black parts
 
 @dataclass(frozen=True)
 class FaceGrid:
-    """Cell centres of a rectangle of the back face, and the light that meets it there."""
+    """Cell centres of a rectangle of the last freeform face, and the light that meets it there."""
 
     window: Rectangle  # in x and y, centred (mm)
-    at_face: Rays  # (3, n, n): position on the back face, direction before it
+    at_face: Rays  # (3, n, n): position on the face, direction before it
     density: Tensor  # (n, n) flux per mm² of the x-y plane
 
     @property
@@ -66,7 +66,7 @@ class FaceGrid:
 
 @torch.no_grad()
 def face_grid(source: Source, lens: Lens, window: Rectangle, n: int) -> FaceGrid:
-    """The ray that meets the back face at each of n x n points.
+    """The ray that meets the last freeform face at each of n x n points.
 
     Its flux density is the source's on the vertex plane of the first surface times |∂q/∂b|, q where the ray crosses
     that plane, less the losses at the faces and in the glass, with the present back.
@@ -86,7 +86,7 @@ def face_grid(source: Source, lens: Lens, window: Rectangle, n: int) -> FaceGrid
 
 
 def lit_window(source: Source, lens: Lens, n: int = 128) -> Rectangle:
-    """The rectangle of the back face that light meets, with two cells to spare; SceneError if none is found."""
+    """The rectangle of the last freeform face that light meets, with two cells to spare; SceneError if none does."""
     half_x, half_y = lens.last_freeform.outline.half_extent
     grid = face_grid(source, lens, Rectangle(2 * half_x, 2 * half_y), n)
     lit = grid.density > 0

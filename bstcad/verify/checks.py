@@ -78,7 +78,7 @@ class Nominal:
     seed: int
     stored_target: np.ndarray  # as design.npz has it
     mesh_tolerance: float = 1e-3  # mm; how far the facets of the mesh may lie from the lens
-    mesh_asked: bool = True  # by the scene; else a mesh of as many triangles as one may have is as fine as it gets
+    mesh_asked: bool = True  # by the scene; else the mesh with the most triangles is fine enough
     ghost: GhostLight | None = None  # how light reflected twice in the lens is followed; None: it is left out
     mount: Mount | None = None  # how the lens is held in part.step; None: there is none
     blank: LensBlank | None = None  # with the bounds on its back, if there are any
@@ -332,5 +332,5 @@ def _of_light(light: Light, accept: Accept, meets: str = "enters the lens") -> l
 
 
 def _asked(name: str, value: float, limit: float | None, default: float) -> tuple[str, float, float]:
-    """Name, value and limit of a check by the scene's limit; without one by the default, and the name says so."""
+    """Name, value and limit of a check by the scene's limit; without it by the default, and the name says so."""
     return (name + UNASKED, value, default) if limit is None else (name, value, limit)
