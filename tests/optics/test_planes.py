@@ -74,7 +74,7 @@ def test_rays_land_on_the_plane(light, z):
     coming, lens = bundle(light)
     lens = replace(lens, front=lens.front.moved(z), back=replace(lens.back, z=lens.back.z + z))
     plane = TiltedPlane((30.0, -5.0, 300.0 + z), TILT)
-    leaving = cross(replace(coming, z=coming.z + z), lens.interfaces[1]).rays
+    leaving = cross(replace(coming, z=coming.z + z), lens.last_freeform).rays
     landed = to_plane(leaving, plane)
     x, y, height = landed.position[0] - 30.0, landed.position[1] + 5.0, landed.above(300.0 + z)
     n = plane.axes[2]
