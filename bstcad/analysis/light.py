@@ -19,15 +19,7 @@ from bstcad.optics.measure import IMAGE_PLACES, detail_width, images
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays, TargetPlane
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import (
-    clear_window,
-    from_first_net,
-    launch_strips,
-    to_first_net,
-    to_plane,
-    trace,
-    window,
-)
+from bstcad.optics.trace import clear_window, from_first_net, launch_strips, to_first_net, to_plane, trace, window
 
 
 def _at_interfaces(rays: Rays, lens: Lens) -> list[Rays]:

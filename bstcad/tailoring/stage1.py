@@ -27,15 +27,7 @@ from bstcad.tailoring.machinability import moved_clear
 from bstcad.tailoring.merit import landing
 from bstcad.tailoring.run import Parameters, Step, Task
 from bstcad.tailoring.slope_fit import Fit, tailor_to_aim
-from bstcad.tailoring.slope_map import (
-    SlopeMap,
-    aim_points,
-    face_grid,
-    lit_window,
-    map_to_target,
-    slope_map,
-    sloped,
-)
+from bstcad.tailoring.slope_map import SlopeMap, aim_points, face_grid, lit_window, map_to_target, slope_map, sloped
 from bstcad.transport.bfm import Step as TransportStep
 from bstcad.transport.mapping import Mapping
 

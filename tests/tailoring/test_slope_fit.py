@@ -15,14 +15,7 @@ from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import to_first_net, trace
 from bstcad.tailoring.merit import landing
-from bstcad.tailoring.slope_fit import (
-    STEEPEST,
-    Fit,
-    fit_slopes,
-    largest_deflection,
-    tailor_to_aim,
-    wanted_slopes,
-)
+from bstcad.tailoring.slope_fit import STEEPEST, Fit, fit_slopes, largest_deflection, tailor_to_aim, wanted_slopes
 from tests.tracing import stratified
 
 SQUARE = Rectangle(20.0, 20.0)
