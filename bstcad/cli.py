@@ -318,8 +318,8 @@ def new(
     written = new_scene.new_scene(
         name, Path(), picture=picture, light=light, size=size, distance=distance, template=template
     )
-    if written.said:
-        print(written.said)
+    if written.sentences:
+        print(written.sentences)
     print(f"{written.path} is written; next: bstcad generate {written.path}")
     return 0
 

@@ -32,7 +32,7 @@ from bstcad.measured.cloud import Cloud
 from bstcad.measured.form_error import map_files
 from bstcad.measured.made_part import MadePart
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import FULL, Effort
+from bstcad.optics.measure import FULL, Effort, Light
 from bstcad.pipeline import Saved, design, purpose
 from bstcad.report import data_sheet, exports, prescription, record, rendering, report, tolerances
 from bstcad.report.data_sheet import Sheet
@@ -51,7 +51,7 @@ from bstcad.scene.scene import Scene
 from bstcad.sweep.estimates import diagnosis, left_out
 from bstcad.tailoring.run import Progress, silent
 from bstcad.verify import checks, text_checks
-from bstcad.verify.checks import Nominal, Verification
+from bstcad.verify.checks import Nominal, Proof
 from bstcad.verify.verdict import verdict
 
 BEHIND, LEAST = 2.0, 0.5  # seconds of a run with a time limit: behind the last rays; at least for rays
@@ -129,21 +129,21 @@ def write(
     ):
         made, proof = _written_and_proved(made, building, drawn, progress=progress, effort=effort, limit=limit)
         proven = time.perf_counter()
-        folders.write_design(made, proof.irradiance, building)
+        folders.write_design(made, proof.light.picture, building)
         exports.export(
             made.lens, made.scene.output.export, building, label=folders.label(made.scene), mount=made.scene.mount
         )
         order = _order(made, proof.shape, building)
-        drawn.sheet(_sheet(made, proof, proof.irradiance, order))
+        drawn.sheet(_sheet(made, proof, proof.light, proof.light.picture, order=order))
         progress("report", 0, 1, "")
-        estimates = left_out(made.scene, proof.lens, proof.irradiance)  # while the pictures are drawn
+        estimates = left_out(made.scene, proof.lens, proof.light.picture)  # while the pictures are drawn
         drawn.result()
         made = replace(made, making=made.making.followed_by(Stage("report", time.perf_counter() - proven)))
         contents = replace(_contents(made, proof, estimates), order=order)
         drawn.begin(draw_convergence, contents)
         _write_report(made, proof.lens, contents, building, drawn=drawn, sheet=drawn.data_sheet())
         progress("report", 1, 1, "")
-    return Report(contents, proof.irradiance)
+    return Report(contents, proof.light.picture)
 
 
 def prove(made: Made, *, progress: Progress = silent, effort: Effort | None = None) -> Report:
@@ -152,12 +152,12 @@ def prove(made: Made, *, progress: Progress = silent, effort: Effort | None = No
     with _nothing_left_running(), tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         drawn = NoPictures(made.scene, processes.submit)
         made, proof = _written_and_proved(made, Path(place), drawn, progress=progress, effort=effort)
-    return Report(_contents(made, proof, left_out(made.scene, proof.lens, proof.irradiance)), proof.irradiance)
+    return Report(_contents(made, proof, left_out(made.scene, proof.lens, proof.light.picture)), proof.light.picture)
 
 
 def _written_and_proved(
     made: Made, place: Path, drawn: Pictures, *, progress: Progress, effort: Effort | None, limit: float | None = None
-) -> tuple[Made, Verification]:
+) -> tuple[Made, Proof]:
     """Write the geometry and prove it; the design with these two stages, and its proof.  limit: see `write`."""
     began = time.perf_counter()
     progress("write", 0, 1, "STEP, STL, 3MF")
@@ -172,18 +172,18 @@ def _written_and_proved(
     nominal = folders.nominal(made.scene, made.lens, made.target)
     proof = _proof(made, nominal, place, drawn, effort=effort, progress=progress)
     verified = time.perf_counter()
-    last = Stage("write", written - began), Stage("verify", verified - written, proof.rrmsd)
+    last = Stage("write", written - began), Stage("verify", verified - written, proof.light.rrmsd)
     return replace(made, making=made.making.followed_by(*last)), proof
 
 
 def _proof(
     made: Made, nominal: Nominal, folder: Path, drawn: Pictures, *, effort: Effort | None, progress: Progress
-) -> Verification:
+) -> Proof:
     """The proof of the files in a folder, with the pictures of its light begun."""
     progress("verify", 0, 1, "from the written files")
     proof = checks.verify(folder, nominal, processes.submit, drawn.lens, effort=effort)
     drawn.begin(draw_light, made.target, proof)
-    progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
+    progress("verify", 1, 1, f"RRMSD {proof.light.rrmsd:.4f}")
     return proof
 
 
@@ -257,19 +257,19 @@ def verify(
                 progress=progress,
             )  # fmt: skip
             drawn.begin(draw_judges, judged)
-            proof = replace(proof, checks=(*proof.checks, *(check for judge in judged for check in judge.checks)))
+            proof = replace(proof, checks=(*proof.checks, *(check for each in judged for check in each.checks)))
             order = _order(made, proof.shape, path)
-            contents = _contents(made, proof, left_out(made.scene, proof.lens, proof.irradiance))
-            contents = replace(contents, order=order, judges=tuple(judge.facts for judge in judged))
+            contents = _contents(made, proof, left_out(made.scene, proof.lens, proof.light.picture))
+            contents = replace(contents, order=order, judges=tuple(each.judge for each in judged))
             if place is None:
-                drawn.sheet(_sheet(made, proof, proof.irradiance, order))
+                drawn.sheet(_sheet(made, proof, proof.light, proof.light.picture, order=order))
             drawn.begin(draw_convergence, contents)
             write = partial(
                 _write_report, made, proof.lens, studied=tolerances.of_folder(path, made.scene.optic), drawn=drawn
             )
             if cloud is not None:
                 part = _made_part(cloud, proof, nominal, effort=effort, progress=progress)
-                drawn.begin(draw_part, part, proof.irradiance)
+                drawn.begin(draw_part, part, proof.light.picture)
                 own = Path() if place is not None else Path("measured") / _name_of(cloud, path)
                 write(with_part(contents, part), amended / own, sheet=None)
                 for name, data in map_files(part.deviation).items():
@@ -278,7 +278,7 @@ def verify(
             if place is None:
                 write(contents, amended, sheet=drawn.data_sheet())
             progress("report", 1, 1, "")
-    return Report(contents, proof.irradiance, part)
+    return Report(contents, proof.light.picture, part)
 
 
 def examine(path: Path) -> Examined:
@@ -303,9 +303,7 @@ def _read(folder: Path) -> tuple[Made, Nominal]:
     return Made(scene, nominal.lens, nominal.target, making, transport=sent), nominal
 
 
-def _made_part(
-    cloud: Cloud, proof: Verification, nominal: Nominal, *, effort: Effort | None, progress: Progress
-) -> MadePart:
+def _made_part(cloud: Cloud, proof: Proof, nominal: Nominal, *, effort: Effort | None, progress: Progress) -> MadePart:
     """The made part that was measured as `cloud`."""
     progress("made part", 0, 1, "from its cloud")
     with refusals():
@@ -330,12 +328,12 @@ def _name_of(cloud: Cloud, folder: Path) -> str:
 # --- the report -------------------------------------------------------------------------------------------------------
 
 
-def _contents(made: Made, proof: Verification, estimates: tuple[LeftOut, ...]) -> Contents:
+def _contents(made: Made, proof: Proof, estimates: tuple[LeftOut, ...]) -> Contents:
     """The contents of report.json; estimates: of the effects that are left out."""
     scene, blurred = made.scene, proof.blur.rrmsd if proof.blur else 0.0
     diagnosed = diagnosis(
-        scene, made.making, proof.lens, picture=proof.irradiance, target=made.target, rrmsd=proof.rrmsd,
-        efficiency=proof.efficiency, blurred=blurred, at_bounds=proof.at_bounds,
+        scene, made.making, proof.lens, picture=proof.light.picture, target=made.target, rrmsd=proof.light.rrmsd,
+        efficiency=proof.light.efficiency, blurred=blurred, at_bounds=proof.at_bounds,
     )  # fmt: skip
     return contents_of(
         scene, made.lens, made.target, proof, making=made.making, circumstances=circumstances(made.device),
@@ -353,11 +351,13 @@ def _order(made: Made, shape: Mapping[str, Any], folder: Path) -> Order:
     return prescription.order_of(made.scene, made.lens, shape, folder, found=found)
 
 
-def _sheet(made: Made, worth: Verification | Contents, irradiance: np.ndarray, order: Order) -> Sheet:
-    """The data sheet of a design."""
+def _sheet(
+    made: Made, proof: Proof | Contents, light: Light | Contents, irradiance: np.ndarray, *, order: Order
+) -> Sheet:
+    """The data sheet of a design, by its proof or by its report."""
     return Sheet(
-        scene=made.scene, designed=made.lens, shape=worth.shape, order=order, target=made.target, irradiance=irradiance,
-        rrmsd=worth.rrmsd, light_on_target=worth.flux["on target"], passed=worth.passed, version=bstcad.__version__,
+        scene=made.scene, designed=made.lens, shape=proof.shape, order=order, target=made.target, irradiance=irradiance,
+        rrmsd=light.rrmsd, light_on_target=light.flux["on target"], passed=proof.passed, version=bstcad.__version__,
     )  # fmt: skip
 
 
@@ -427,7 +427,8 @@ def _sheet_again(made: Made, folder: Path) -> Sheet:
         known = record.read(folder / "report.json")
     if known.shape is None or not (folder / "lens.step").is_file():
         raise SceneError(f"{folder}: its report or lens.step is gone or damaged; bstcad verify, or generate, writes it")
-    return _sheet(made, known, folders.read_irradiance(folder, made.scene), _order(made, known.shape, folder))
+    irradiance, order = folders.read_irradiance(folder, made.scene), _order(made, known.shape, folder)
+    return _sheet(made, known, known, irradiance, order=order)
 
 
 def show(folder: Path, png: Path | None) -> None:

@@ -113,7 +113,7 @@ def resolved(scene: Scene, lens: Lens) -> Scene:
     """
     if scene.tailoring.resolved(lens.back.m).method == "adam":
         return scene
-    blank = scene.lens.model_copy(update={"front": scene.lens.front.found(lens.front)})
+    blank = scene.lens.model_copy(update={"front": scene.lens.front.designed(lens.front)})
     return scene.model_copy(update={"lens": blank})
 
 

@@ -139,7 +139,7 @@ def quick_effort():
 
 
 def proofs(patch):
-    """The list of all proofs (verify.checks.Verification) from now on."""
+    """The list of all proofs (verify.checks.Proof) from now on."""
     from bstcad.verify import checks
 
     verify, kept = checks.verify, []

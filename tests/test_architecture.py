@@ -199,9 +199,7 @@ def test_nothing_that_is_read_is_run():
 # Where a product is no dense one that BLAS divides among threads as it likes, and why.
 PRODUCTS = {
     "optics/bspline.py": "of sparse matrices",
-    "optics/quadrature.py": "by a sparse matrix",
     "optics/motion.py": "of 3 x 3 numbers; nothing that tailors a lens moves",
-    "tailoring/slope_fit.py": "by a sparse matrix",
     "tailoring/merit.py": "on a GPU",
     "transport/density.py": "by a sparse matrix",
     "tolerance/study.py": "by numpy's own loops, which einsum takes unless it optimises",

@@ -10,9 +10,9 @@ from bstcad import pipeline
 from bstcad.analysis.shape import describe
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.irradiance import Screen, rrmsd
-from bstcad.optics.trace import simulate
 from bstcad.scene import scene
 from bstcad.scene.errors import SceneError
+from tests.tracing import simulated
 
 SMALL = {
     "target.pixels": "48", "lens.back.control_points": "33", "tailoring.rays": "256", "tailoring.transport_grid": "64",
@@ -36,7 +36,7 @@ def judged(design):
     """(RRMSD by box pixels, efficiency) by rays of another seed."""
     target = design.scene.target
     screen = Screen(target.z, target.x, target.y, target.columns_rows)
-    found = simulate(design.scene.source, design.lens, screen, 500, 77)
+    found = simulated(design.scene.source, design.lens, screen, 500, 77)
     return float(rrmsd(found.box, torch.from_numpy(design.target))), found.efficiency
 
 

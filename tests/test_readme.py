@@ -18,13 +18,13 @@ import skimage.io
 
 import bstcad
 from bstcad import cli, commands
-from bstcad.optics.quadrature import exact_volume
 from bstcad.runs.processes import Ending
 from bstcad.scene.scene import load
 from bstcad.sweep import batch
 from bstcad.sweep import tradeoff as sweeping
 from bstcad.tolerance import tolerancing as tolerances
 from tests.conftest import draws_nothing, quick_effort, verify_with
+from tests.exact_volume import exact_volume
 from tests.sweep.conftest import Synthetic
 
 ROOT = Path(__file__).parent.parent

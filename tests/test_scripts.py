@@ -15,9 +15,9 @@ import skimage
 import bstcad
 import bstcad.cad.plugin
 from bstcad.optics.measure import Effort
-from bstcad.optics.quadrature import exact_volume
 from tests.cad.test_trimming import occ_volume
 from tests.conftest import draws_nothing, verify_with
+from tests.exact_volume import exact_volume
 
 TEMPLATES = Path(__file__).parent.parent / "templates"
 

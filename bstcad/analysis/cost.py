@@ -18,9 +18,9 @@ import torch
 from scipy.fft import dctn
 
 from bstcad.optics.channels import Channel
+from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.trace import at_first_free
 from bstcad.optics.tubes import area_of, collect, launch_tubes
 
 # --- the end of the convergence curve ---------------------------------------------------------------------------------
@@ -226,7 +226,7 @@ def control_cells(channel: Channel, lens: Lens, screen: Screen, target: np.ndarr
     """By ray tubes, each of which carries the part of the net that it crosses; channel: of a point, or parallel."""
     lens = channel.through(lens)
     tubes = launch_tubes(channel.source, lens, TUBES)
-    x, y = at_first_free(tubes.coming, lens).rays.position[:2]
+    x, y = cross(tubes.coming, lens.interfaces[lens.freeform[0]]).rays.position[:2]
     pitch_x, pitch_y = lens.back.pitch
     cells = area_of(x, y).double() / (pitch_x * pitch_y)
     landed = tubes.landing(lens, screen.plane)

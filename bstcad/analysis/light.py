@@ -15,11 +15,11 @@ from bstcad.optics.channels import Channel, points
 from bstcad.optics.interfaces import cross, intersect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import IMAGE_PLACES, detail_width, extended, images
+from bstcad.optics.measure import IMAGE_PLACES, detail_width, images
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays, TargetPlane
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import clear_window, from_first_free, launch_strips, to_first_free, to_plane, trace, window
+from bstcad.optics.trace import clear_window, from_first_net, launch_strips, to_first_net, to_plane, trace, window
 
 
 def _at_interfaces(rays: Rays, lens: Lens) -> list[Rays]:
@@ -196,7 +196,7 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
         last = through.interfaces[-1]
         critical = math.inf if last.law.reverses else math.degrees(math.asin(min(1.0 / last.law.eta, 1.0)))
         for rays in launch_strips(channel.source, through, n, seed):
-            coming = to_first_free(rays, through)
+            coming = to_first_net(rays, through)
             met, z_x, z_y = intersect(last.surface, coming, last.outline, last.status_if_missed)
             dx, dy, dz = met.direction
             along = met.sense * (dz - dx * z_x - dy * z_y)
@@ -206,7 +206,7 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
                 cosine = (along / torch.sqrt(1 + z_x * z_x + z_y * z_y))[meets].clamp(-1.0, 1.0)
                 margin = min(margin, critical - float(torch.rad2deg(torch.arccos(cosine)).max()))
                 slope = min(slope, float(along.abs()[meets].min()))
-            landed = from_first_free(coming, through, screen.plane)
+            landed = from_first_net(coming, through, screen.plane)
             wrong += int((~torch.isfinite(landed.position)).any(0)[landed.alive].sum())
     return Margins(None if math.isinf(margin) else margin, None if math.isinf(slope) else slope, wrong)
 
@@ -234,7 +234,7 @@ def blur(
     channels: Sequence[Channel], lens: Lens, screen: Screen, target: np.ndarray, n: int = IMAGE_PLACES
 ) -> Blur | None:
     """The blur by a source whose points are the channels, at its first line; None for a point source."""
-    if not extended(channels):
+    if points(channels) == 1:
         return None
     found = images(channels, lens, screen, n)
     width = found.width()

@@ -30,12 +30,12 @@ from bstcad.optics.bspline import BSplineSurface, evaluate, net_gradient
 from bstcad.optics.interfaces import ALONG, Law
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays, TargetPlane
-from bstcad.optics.trace import clear_window, to_first_free
+from bstcad.optics.trace import clear_window, to_first_net
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring import slope_map
 from bstcad.tailoring.machinability import moved_clear
 from bstcad.tailoring.run import Step, Task
-from bstcad.tailoring.slope_fit import conjugate_gradients, monomials, refine, wanted_slopes, with_polynomial
+from bstcad.tailoring.slope_fit import conjugate_gradients, monomials, wanted_slopes, with_polynomial
 from bstcad.transport.mapping import Mapping
 
 STARTS = 3  # initial points tried, each as far along +z as the front needs by the points of the one before
@@ -53,7 +53,7 @@ class Points:
     """Where the back is on each ray of a grid."""
 
     position: Tensor  # (3, n, n) mm; the third counts from the plane of the initial point
-    found: Tensor  # (n, n) bool; False: the ray is lost before the back, or one before it on the way was
+    reached: Tensor  # (n, n) bool; False: the ray is lost before the back, or one before it on the way was
 
 
 def steps(task: Task, lens: Lens, state: None = None) -> Iterator[Step]:
@@ -77,11 +77,11 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
     source, exact, z = task.heaviest.source, lens.plain(), lens.back.z
     area, n = clear_window(source, exact), knobs.rays // 2 * 2 + 1  # odd: one ray is through the middle
     x, y = sampling.grid(area, n)
-    coming = to_first_free(source.rays(x, y, exact.entrance.z, area.area / n**2), exact)
+    coming = to_first_net(source.rays(x, y, exact.entrance.z, area.area / n**2), exact)
     aim = slope_map.aim_points(mapping, exact, task.screen, x, y)
     for _ in range(STARTS):
         start = exact.back.z
-        points = march(coming, aim, plane, exact.last_free.law, start, first)
+        points = march(coming, aim, plane, exact.last_freeform.law, start, first)
         back = fitted(exact.back, points, lit(points, coming, exact), knobs.levels)
         exact = moved_clear(exact.with_back(back), z, task.least)
         if exact.back.z == start:
@@ -91,7 +91,7 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
 
 def lit(points: Points, coming: Rays, lens: Lens) -> Tensor:
     """True for points that light meets inside the clear aperture."""
-    return points.found & (coming.flux > 0) & lens.apertures[1].contains(*points.position[:2])
+    return points.reached & (coming.flux > 0) & lens.apertures[1].contains(*points.position[:2])
 
 
 @torch.no_grad()
@@ -115,10 +115,10 @@ def march(coming: Rays, aim: Tensor, plane: TargetPlane, law: Law, z: float, fir
     torch.set_num_threads(1)  # a step of the march has so few numbers that a second thread only makes the first wait
     try:
         along = _outwards(line, begin.origin, begin.alive, plane, law)
-        across = _outwards(grid.turned(), _swapped(along.position), _swapped(along.found), plane, law)
+        across = _outwards(grid.turned(), _swapped(along.position), _swapped(along.reached), plane, law)
     finally:
         torch.set_num_threads(threads)
-    return across if first == "y" else Points(_swapped(across.position), _swapped(across.found))
+    return across if first == "y" else Points(_swapped(across.position), _swapped(across.reached))
 
 
 def _swapped(t: Tensor) -> Tensor:
@@ -137,7 +137,7 @@ class _Grid:
 
     @classmethod
     def of(cls, coming: Rays, aim: Tensor, z: float) -> _Grid:
-        """The grid of rays on their way to the face; a lost one may be anything finite."""
+        """The grid of rays on their way to the face; a lost ray may be anything finite."""
         alive = coming.alive
         straight = torch.tensor([0.0, 0.0, coming.sense]).to(aim).view(3, 1, 1)
         direction = torch.where(alive, coming.direction, straight)
@@ -169,22 +169,22 @@ class _Grid:
         return torch.where(ok, self.origin + path * self.direction, point), ok
 
 
-def _outwards(grid: _Grid, position: Tensor, found: Tensor, plane: TargetPlane, law: Law) -> Points:
-    """Lines of points, both ways from that on the middle ray of each: position (3, 1, lines) mm, found (1, lines)."""
+def _outwards(grid: _Grid, position: Tensor, reached: Tensor, plane: TargetPlane, law: Law) -> Points:
+    """Lines of points, both ways from that on the middle ray of each: position (3, 1, lines) mm, reached (1, lines)."""
     middle = grid.alive.shape[0] // 2
-    points, all_found = torch.zeros_like(grid.origin), torch.zeros_like(grid.alive)
-    points[:, [middle]], all_found[[middle]] = position, found
+    points, all_reached = torch.zeros_like(grid.origin), torch.zeros_like(grid.alive)
+    points[:, [middle]], all_reached[[middle]] = position, reached
     normal = grid[[middle], :].normals(position, plane, law)
     for k in range(1, middle + 1):
         both = [middle - k, middle + k]
         rays = grid[both, :]
         tangent, meets = rays.meet(position, normal)  # the explicit rule
         mean = (normal + rays.normals(tangent, plane, law)) / 2
-        position, meets_again = rays.meet(position, mean)  # the trapezoidal one
+        position, meets_again = rays.meet(position, mean)  # the trapezoidal rule
         normal = rays.normals(position, plane, law)
-        found = found & rays.alive & meets & meets_again
-        points[:, both], all_found[both] = position, found
-    return Points(points, all_found)
+        reached = reached & rays.alive & meets & meets_again
+        points[:, both], all_reached[both] = position, reached
+    return Points(points, all_reached)
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
@@ -199,14 +199,14 @@ def fitted(surface: BSplineSurface, points: Points, used: Tensor, levels: tuple[
     """
     nets = levels if len(levels) > 1 else 2 * levels
     ways = (STIFF, *(BETWEEN for _ in nets[1:-1]), FINE)
-    surface, n = refine(surface, nets[0]), used.shape[-1]
+    surface, n = surface.refined(nets[0]), used.shape[-1]
     surface = replace(surface, heights=torch.zeros_like(surface.heights))
     for m, (bending, count, degree) in zip(nets, ways, strict=True):
         every = 1 if bending == FINE[0] else max(1, n // (DENSE * m))
         some = used[::every, ::every]
         x, y, z = (p[::every, ::every][some] for p in points.position)
         cells = (m * every / n) ** 2  # of the net, a point
-        surface = fit_heights(refine(surface, m), x, y, z, bending / cells, count, degree)
+        surface = fit_heights(surface.refined(m), x, y, z, bending / cells, count, degree)
     return surface
 
 

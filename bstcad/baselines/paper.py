@@ -16,16 +16,17 @@ import torch
 from torch import Tensor
 
 from bstcad.optics import sampling
-from bstcad.optics.channels import Channel
+from bstcad.optics.channels import Channel, weighted_sum
+from bstcad.optics.irradiance import Screen, collect, landed_flux
+from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Rays
 from bstcad.optics.trace import clear_window, trace
 from bstcad.tailoring import slope_map
-from bstcad.tailoring.merit import TentMerit, landing
+from bstcad.tailoring.merit import landing
 from bstcad.tailoring.minimise import AdamState, Best, Reached, adam, minimise
 from bstcad.tailoring.run import Parameters, Step, Task
-from bstcad.tailoring.slope_fit import refined
 from bstcad.transport.bfm import Step as TransportStep
 from bstcad.transport.mapping import Mapping
 
@@ -59,7 +60,7 @@ def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Step]
     else:
         lens, mapping = state.lens.applied(lens), state.mapping
     for level in range(state.level if state else 0, len(knobs.levels)):
-        lens = refined(lens, knobs.levels[level])
+        lens = lens.refined(knobs.levels[level])
         begun, best = Parameters.of(lens), Best()
         for reached in _on_level(task, lens, mapping, area, state):
             best, leave, done, total = reached.best, None, level * each, each * len(knobs.levels)
@@ -74,7 +75,7 @@ def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Step]
                 skipped=reached.skipped,
             )
         lens, state = _improved(lens, best, task.free, knobs.levels[level]), None
-    yield Step(partial(refined, lens, knobs.levels[-1]), mapping=mapping)
+    yield Step(partial(lens.refined, knobs.levels[-1]), mapping=mapping)
 
 
 def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: Level | None) -> Iterator[Reached]:
@@ -101,7 +102,7 @@ def _improved(lens: Lens, best: Best, free: tuple[str, ...], m: int) -> Lens:
     if best.parameters:  # else not one value was finite
         heights, *shape = best.parameters
         lens = with_parameters(lens, [heights, *map(float, shape)], free)
-    return refined(lens, m)
+    return lens.refined(m)
 
 
 def transport(task: Task, lens: Lens) -> Mapping:
@@ -114,6 +115,40 @@ def transport(task: Task, lens: Lens) -> Mapping:
     return slope_map.map_to_target(
         task.heaviest.source, lens, task.target, task.screen, knobs.transport_grid, knobs.transport_iterations, progress
     )
+
+
+def as_seen_by_tent(target: Tensor) -> Tensor:
+    """A picture whose light lies evenly in each pixel, after tent binning: [1, 6, 1] / 8 along both axes.
+
+    Comparing with this instead of the sharp picture lets a perfect lens have merit zero.
+    """
+    for _ in range(2):  # each turn takes one axis and swaps the two
+        target = torch.nn.functional.pad(target, (1, 1))
+        target = ((target[:, :-2] + 6 * target[:, 1:-1] + target[:, 2:]) / 8).T
+    return target.contiguous()
+
+
+@dataclass(frozen=True)
+class TentMerit:
+    """RRMSD² of rays by tent binning (Wang et al. 2023, Eq. 15), plus TubeMerit's pull; summed over channels."""
+
+    channels: tuple[Channel, ...]
+    screen: Screen
+    target: Tensor  # (rows, columns) as seen by the tent, its flux summing to 1 before that
+    overshoot: float
+
+    @classmethod
+    def of(cls, channels: tuple[Channel, ...], screen: Screen, target: Tensor, overshoot: float) -> TentMerit:
+        """The merit for a sharp target picture."""
+        return cls(channels, screen, as_seen_by_tent(target / total(target)), overshoot)
+
+    def __call__(self, landed: tuple[Landed, ...]) -> tuple[Tensor, Tensor]:
+        """(merit, RRMSD against the target as the tent sees it) of the landed rays of each channel."""
+        flux = weighted_sum(self.channels, (total(landed_flux(rays).double()) for rays in landed))
+        images, beyond = zip(*(collect(rays, self.screen) for rays in landed), strict=True)
+        image, outside = weighted_sum(self.channels, images), weighted_sum(self.channels, beyond)
+        rrmsd2 = total((image / flux - self.target) ** 2) / total(self.target**2)
+        return rrmsd2 + self.overshoot * outside / flux, rrmsd2.detach().sqrt()
 
 
 @dataclass(frozen=True)
@@ -162,12 +197,6 @@ def random_bundles(channels: tuple[Channel, ...], lens: Lens, count: int, seed: 
     return tuple(map(bundle, channels))
 
 
-def landing_of(merit: TentMerit, bundles: tuple[Rays, ...], lens: Lens) -> tuple[Landed, ...]:
-    """Where the rays of each channel meet the screen."""
-    pairs = zip(merit.channels, bundles, strict=True)
-    return tuple(trace(rays, channel.through(lens), merit.screen.plane) for channel, rays in pairs)
-
-
 def with_parameters(lens: Lens, parameters: list[Any], free: tuple[str, ...] = ()) -> Lens:
     """The lens with these heights, and behind them the free parameters of the front in this order."""
     heights, *shape = parameters
@@ -182,7 +211,8 @@ def tailor_to_irradiance(
 
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
         leaf = parameters[0].detach().clone().requires_grad_()
-        square, rrmsd = merit(landing_of(merit, next(bundles), with_parameters(lens, [leaf])))
+        tried, pairs = with_parameters(lens, [leaf]), zip(merit.channels, next(bundles), strict=True)
+        square, rrmsd = merit(tuple(trace(rays, channel.through(tried), merit.screen.plane) for channel, rays in pairs))
         (gradient,) = torch.autograd.grad(square.sqrt(), leaf)
         return float(square.detach().sqrt()), [gradient], float(rrmsd)
 

@@ -76,12 +76,8 @@ def land(rays: Any, screen: Screen) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     """(x, y, arrived): where batoid's rays, which it moves on, meet the screen (mm, on its plane)."""
     import batoid
 
-    if screen.tilt is None:
-        x, y, frame = 0.0, 0.0, _frame((0.0, 0.0, screen.z))
-    else:
-        x, y, z = screen.plane.centre
-        frame = _frame((x, y, z), np.column_stack(axes(screen.tilt)))
-    batoid.intersect(batoid.Plane(), rays, frame)
+    x, y, _ = screen.middle
+    batoid.intersect(batoid.Plane(), rays, _frame(screen.middle, np.column_stack(axes(screen.tilt or (0.0, 0.0)))))
     arrived = ~rays.failed & ~rays.vignetted & np.isfinite(rays.x) & np.isfinite(rays.y) & (rays.vz > 0)
     return rays.x + x, rays.y + y, arrived
 
@@ -90,15 +86,15 @@ def through(lens: Lens, known: Sequence[Placed], rays: Rays) -> Any:
     """Rays of ours from the source behind the lens, as batoid's; `known`: its surfaces."""
     import batoid
 
-    found, outside = vector(rays), [_outside(interface.outline) for interface in lens.interfaces]
+    theirs, outside = vector(rays), [_outside(interface.outline) for interface in lens.interfaces]
     air, glass = batoid.ConstMedium(1.0), batoid.ConstMedium(lens.index)
     if lens.reflects:
-        batoid.reflect(known[0].surface, found, known[0].frame)
-        return batoid.obscure(outside[0], found)
+        batoid.reflect(known[0].surface, theirs, known[0].frame)
+        return batoid.obscure(outside[0], theirs)
     for (before, behind), at, beyond in zip(((air, glass), (glass, air)), known, outside, strict=True):
-        batoid.refract(at.surface, found, before, behind, coordSys=at.frame)
-        batoid.obscure(beyond, found)
-    return found
+        batoid.refract(at.surface, theirs, before, behind, coordSys=at.frame)
+        batoid.obscure(beyond, theirs)
+    return theirs
 
 
 def cannot(lens: Lens, channels: Sequence[Channel]) -> str:
@@ -131,8 +127,8 @@ def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, se
 
 def binned(x: np.ndarray, y: np.ndarray, flux: np.ndarray, screen: Screen) -> np.ndarray:
     """(rows, columns) flux that falls into each pixel, by numpy's histogram; row 0 = y max."""
-    found, _, _ = np.histogram2d(y, x, bins=screen.shape, range=(screen.y, screen.x), weights=flux)
-    return found[::-1]
+    image, _, _ = np.histogram2d(y, x, bins=screen.shape, range=(screen.y, screen.x), weights=flux)
+    return image[::-1]
 
 
 def _longer(line: np.ndarray) -> np.ndarray:

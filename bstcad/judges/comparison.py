@@ -16,8 +16,7 @@ import importlib.util
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -36,63 +35,50 @@ OTHER = 500_009  # added to the seed of the judge's rays
 AGREE = 1.5  # pictures differ by no more than this times their noise
 EXACT = 1e-9  # of the target
 FLUX = 0.005  # of the source's light; a uniform loss would not change the picture
-PICTURES = {"target", "ours", "theirs"}
+
+
+@dataclass(frozen=True)
+class Judge:
+    """A judge's picture beside bstcad's, as report.json has it; differences relative to the target, like RRMSD.
+
+    None, from `by` on: it declined.
+    """
+
+    name: str
+    version: str
+    declined: str = ""  # why it cannot trace this light
+    by: str | None = None  # the program's variant, if it has several
+    rays: int | None = None
+    pixels: tuple[int, int] | None = None  # columns, rows
+    losses: str | None = None  # of light in both pictures: "none" or "Fresnel"
+    rrmsd: float | None = None  # of its picture against the target
+    rrmsd_ours: float | None = None  # of bstcad's, of the same light on the same pixels
+    difference: float | None = None  # of the two pictures
+    noise: float | None = None  # of the difference: of both programs' rays
+    over_noise: float | None = None  # the difference in units of its noise: about 1 where both are right
+    limit: float | None = None  # of that
+    agrees: bool | None = None
+    on_target: float | None = None  # share of the source's light on the target, by the judge
+    on_target_ours: float | None = None
+    heights_off: float | None = None  # mm, RMS: its faces against those of the lens
+    slopes_off: float | None = None  # rad, RMS
+    moved_by: float | None = None  # pixels, shift of light by that
+    seconds: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """A judge's picture against bstcad's; differences relative to the target, like RRMSD."""
+    """A judge with the checks of picture and flux, and its pictures; of a judge that declined there are none."""
 
-    name: str
-    version: str
-    declined: str = ""  # why it cannot trace this light; then the rest is unknown
-    by: str = ""  # the program's variant
-    rays: int = 0
-    pixels: tuple[int, int] = (0, 0)  # columns, rows
-    losses: str = ""  # of light in both pictures
-    rrmsd: float = math.nan  # of its picture against the target
-    rrmsd_ours: float = math.nan  # of bstcad's, of the same light on the same pixels
-    difference: float = math.nan  # of the two pictures
-    noise: float = math.nan  # of the difference: of both programs' rays
-    limit: float = math.nan  # of the difference over the noise
-    on_target: float = math.nan  # share of the source's light on the target, by the judge
-    on_target_ours: float = math.nan
-    heights_off: float = math.nan  # mm, RMS: its faces against those of the lens
-    slopes_off: float = math.nan  # rad, RMS
-    moved_by: float = math.nan  # pixels, shift of light by that
-    seconds: float = 0.0
+    judge: Judge
+    checks: tuple[Check, ...] = ()
     target: np.ndarray | None = field(default=None, repr=False)
     ours: np.ndarray | None = field(default=None, repr=False)
     theirs: np.ndarray | None = field(default=None, repr=False)  # (rows, columns), all of the target's sum
 
-    @property
-    def over_noise(self) -> float:
-        """The difference in units of its noise: about 1 where both are right."""
-        return self.difference / max(self.noise, EXACT)
-
-    @property
-    def facts(self) -> dict[str, Any]:
-        """Its entry in report.json, without pictures."""
-        if self.declined:
-            return {key: getattr(self, key) for key in ("name", "version", "declined")}
-        agrees = all(check.passed for check in self.checks)
-        told = {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name not in PICTURES}
-        return told | {"over_noise": self.over_noise, "agrees": agrees}
-
-    @property
-    def checks(self) -> tuple[Check, ...]:
-        """Of picture and flux; none of a judge that declined."""
-        if self.declined:
-            return ()
-        flux = abs(self.on_target - self.on_target_ours)
-        return (
-            Check.at_most(f"irradiance by {self.name} against bstcad's, over the noise", self.over_noise, self.limit),
-            Check.at_most(f"light on the target by {self.name} against the ledger's, of the source's", flux, FLUX),
-        )
-
 
 def chosen(names: Sequence[str]) -> tuple[str, ...]:
-    """Judges by their names; SceneError for an unknown one, MachineError for one that is not installed."""
+    """Judges by their names; SceneError for an unknown one, MachineError where its program is not installed."""
     for name in names:
         if name not in JUDGES:
             raise SceneError(f"--against {name}: is no judge; {nearest(name, list(JUDGES), 'known are')}")
@@ -106,13 +92,13 @@ def against(
     progress: Callable[[str, int, int, str], None],
 ) -> tuple[Compared, ...]:  # fmt: skip
     """Each judge's picture beside bstcad's, one after the other."""
-    found = []
+    compared = []
     for number, name in enumerate(names):
         progress("judges", number, len(names), name)
-        found.append(compare(name, lens, channels, screen, target=target, rays=RAYS, seed=seed))
+        compared.append(compare(name, lens, channels, screen, target=target, rays=RAYS, seed=seed))
     if names:
         progress("judges", len(names), len(names), "")
-    return tuple(found)
+    return tuple(compared)
 
 
 def compare(
@@ -126,7 +112,7 @@ def compare(
     began, judge = time.perf_counter(), importlib.import_module(JUDGES[name])
     version = importlib.metadata.version(name)
     if declined := judge.cannot(lens, channels):
-        return Compared(name, version, declined)
+        return Compared(Judge(name, version, declined))
     raster = coarse(screen)
     target, light = resampled(target, raster.shape), judge.light(lens, channels)
     traced = judge.trace(lens, light, raster, rays=rays, seed=seed)
@@ -134,7 +120,16 @@ def compare(
     ours = measure(lens, light, raster, target, effort=replace(OURS, seed=seed + OTHER))
     total = float(target.sum())
     theirs, first, second = (_scaled(picture, total) for picture in (traced.picture, *traced.halves))
-    return Compared(
+    difference = _difference(theirs, ours.picture, target)
+    noise = math.hypot(_difference(first, second, target) / 2, ours.picture_off)
+    over_noise, limit = difference / max(noise, EXACT), AGREE * (1 + 3 / math.sqrt(_effective_pixels(first - second)))
+    on_target, on_target_ours = float(traced.picture.sum()), ours.flux.get("on target", 0.0)
+    flux = f"light on the target by {name} against the ledger's, of the source's"
+    checks = (
+        Check.at_most(f"irradiance by {name} against bstcad's, over the noise", over_noise, limit),
+        Check.at_most(flux, abs(on_target - on_target_ours), FLUX),
+    )
+    outcome = Judge(
         name,
         version,
         by=traced.by,
@@ -143,19 +138,19 @@ def compare(
         losses="Fresnel" if any(channel.losses for channel in light) else "none",
         rrmsd=_difference(theirs, target, target),
         rrmsd_ours=ours.rrmsd,
-        difference=_difference(theirs, ours.picture, target),
-        noise=math.hypot(_difference(first, second, target) / 2, ours.picture_off),
-        limit=AGREE * (1 + 3 / math.sqrt(_effective_pixels(first - second))),
-        on_target=float(traced.picture.sum()),
-        on_target_ours=ours.flux.get("on target", 0.0),
+        difference=difference,
+        noise=noise,
+        over_noise=over_noise,
+        limit=limit,
+        agrees=all(check.passed for check in checks),
+        on_target=on_target,
+        on_target_ours=on_target_ours,
         heights_off=traced.error.height,
         slopes_off=traced.error.slope,
         moved_by=traced.error.shift(lens, raster) * max(raster.per_mm),
         seconds=seconds,
-        target=target,
-        ours=ours.picture,
-        theirs=theirs,
     )
+    return Compared(outcome, checks, target, ours.picture, theirs=theirs)
 
 
 def _difference(one: np.ndarray, other: np.ndarray, target: np.ndarray) -> float:
@@ -170,7 +165,7 @@ def _effective_pixels(noise: np.ndarray) -> float:
 
 
 def _scaled(picture: np.ndarray, total: float) -> np.ndarray:
-    """The picture with that sum; NaN, which no check passes, of one that is dark."""
+    """The picture with that sum; NaN, which no check passes, of a dark picture."""
     return picture * (total / float(picture.sum())) if picture.sum() > 0 else np.full_like(picture, math.nan)
 
 

@@ -144,9 +144,8 @@ class FaceError:
     slope: float  # rad, RMS angle between normals
 
     def shift(self, lens: Lens, screen: Screen) -> float:
-        """Shift of light on the screen (mm): a face turns light by |n - 1| times its angle, a mirror by twice that."""
-        turns = 2.0 if lens.reflects else abs(lens.index - 1)
-        return self.slope * turns * abs(screen.z - lens.back.z)
+        """Shift of light on the screen (mm)."""
+        return self.slope * lens.deflection * abs(screen.z - lens.back.z)
 
     @classmethod
     def worst(cls, errors: Iterable[FaceError]) -> FaceError:

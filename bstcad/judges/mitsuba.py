@@ -165,7 +165,7 @@ def _scene(bench: dict[str, Entry], channels: Sequence[Channel], lens: Lens, *, 
 
 def _camera(screen: Screen, top: float) -> Entry:
     """A pinhole before the middle of the screen, nearer than the lens, whose highest point is at z = top (mm)."""
-    middle, (_, up, normal) = _middle(screen), axes(screen.tilt or (0.0, 0.0))
+    middle, (_, up, normal) = screen.middle, axes(screen.tilt or (0.0, 0.0))
     across = screen.x[1] - screen.x[0]
     away = min(across / 2, (screen.z - top) / 2)
     film = {
@@ -181,14 +181,10 @@ def _camera(screen: Screen, top: float) -> Entry:
 
 def _wall(screen: Screen) -> Entry:
     """The screen, twice as large as the picture, so that the camera sees nothing else."""
-    middle, (_, up, normal) = _middle(screen), axes(screen.tilt or (0.0, 0.0))
+    middle, (_, up, normal) = screen.middle, axes(screen.tilt or (0.0, 0.0))
     facing = _look_at(middle, [m - n for m, n in zip(middle, normal, strict=True)], up)
     size = max(high - low for low, high in (screen.x, screen.y))
     return {"type": "rectangle", "bsdf": _matt(WHITE), "to_world": facing.scale(size)}
-
-
-def _middle(screen: Screen) -> tuple[float, float, float]:
-    return sum(screen.x) / 2, sum(screen.y) / 2, screen.z
 
 
 def _matt(reflectance: float) -> Entry:
@@ -208,16 +204,16 @@ def lamps(channels: Sequence[Channel], lens: Lens, folder: Path) -> dict[str, En
     """The sources of channels as entries of Mitsuba's scene; each sends the flux of its channel's weight."""
     first, slide = channels[0].source, {}
     if first.kind == "collimated":
-        found = [_plate(c.source, c.weight, lens, folder / f"lamp{k}.ply") for k, c in enumerate(channels)]
+        sources = [_plate(c.source, c.weight, lens, folder / f"lamp{k}.ply") for k, c in enumerate(channels)]
     elif first.profile == "uniform" and first.half_angle < 89:
-        found = [_spot(c.source, c.weight, lens) for c in channels]
+        sources = [_spot(c.source, c.weight, lens) for c in channels]
     else:
         half = ROOM * max(_half(c.source, lens) for c in channels)
-        found, slide = (
+        sources, slide = (
             [_projector(c.source, c.weight, lens, half) for c in channels],
             {"slide": _slide(first, lens, half)},
         )
-    return slide | {f"lamp{k}": lamp for k, lamp in enumerate(found)}
+    return slide | {f"lamp{k}": lamp for k, lamp in enumerate(sources)}
 
 
 def _plate(source: Collimated, weight: float, lens: Lens, path: Path) -> Entry:

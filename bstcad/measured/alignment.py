@@ -265,16 +265,16 @@ def isolated(
 
     asked: (n,) points to be judged; the others are neighbours only.  noise: over the face, if it is known.
     """
-    found, which = np.zeros(len(points), dtype=bool), np.flatnonzero(asked)
+    outliers, which = np.zeros(len(points), dtype=bool), np.flatnonzero(asked)
     if len(points) <= NEIGHBOURS or not len(which):
-        return found, noise or 0.0
+        return outliers, noise or 0.0
     tree = cKDTree(points[:, :2])
     parts = (_beside(tree, distances, which[k : k + AT_A_TIME]) for k in range(0, len(which), AT_A_TIME))
     off, spread, together = map(np.concatenate, zip(*parts, strict=True))
     if noise is None:
         noise = MAD * float(np.median(np.abs(off)))
-    found[which] = (np.abs(off) > FAR * np.maximum(spread, noise) + FINEST) & (together < TOGETHER)
-    return found, noise
+    outliers[which] = (np.abs(off) > FAR * np.maximum(spread, noise) + FINEST) & (together < TOGETHER)
+    return outliers, noise
 
 
 def _beside(tree: cKDTree, distances: np.ndarray, part: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -285,17 +285,17 @@ def _beside(tree: cKDTree, distances: np.ndarray, part: np.ndarray) -> tuple[np.
     places = tree.data[part]
     _, near = tree.query(places, NEIGHBOURS + 1)
     near = near[:, 1:]  # without the point itself
-    found = distances[near]
+    nearby = distances[near]
     across = tree.data[near] - places[:, None]
     size = np.abs(across).max(axis=(1, 2))[:, None, None] + FINEST
-    columns = np.concatenate([np.ones_like(found)[..., None], across / size], axis=2)
-    left = found - np.median(found, axis=1)[:, None]
+    columns = np.concatenate([np.ones_like(nearby)[..., None], across / size], axis=2)
+    left = nearby - np.median(nearby, axis=1)[:, None]
     for _ in range(ROUNDS):
         spread = MAD * np.median(np.abs(left), axis=1)[:, None] + FINEST
         weighted = columns / (1 + (left / (CAUCHY * spread)) ** 2)[..., None]
         normal = np.einsum("nki,nkj->nij", weighted, columns) + 1e-6 * np.eye(3)  # neighbours may lie on a line
-        plane = np.linalg.solve(normal, np.einsum("nki,nk->ni", weighted, found)[..., None])
-        left = found - (columns @ plane)[..., 0]
+        plane = np.linalg.solve(normal, np.einsum("nki,nk->ni", weighted, nearby)[..., None])
+        left = nearby - (columns @ plane)[..., 0]
     off = distances[part] - plane[:, 0, 0]  # the plane where the point stands
     with_it = np.abs(left - off[:, None]) < np.abs(off)[:, None] / 2
     return off, MAD * np.median(np.abs(left), axis=1), with_it.sum(axis=1)
@@ -329,12 +329,12 @@ def exchanged_axes(face: Face, cloud: np.ndarray, kept: float) -> tuple[np.ndarr
     sample, fitting = _sample(cloud)[:: SAMPLE // FEW], []
     for matrix, words in sorted(_exchanges(), key=_changes):
         turned = sample @ matrix.T
-        pose, found = _best(face, turned, [np.zeros(2), _middle(turned)], FEW_STEPS)
-        if found < BETTER * kept:
-            fitting.append((found, round(np.linalg.norm(pose.angles)), matrix, words))  # in whole degrees
+        pose, distance = _best(face, turned, [np.zeros(2), _middle(turned)], FEW_STEPS)
+        if distance < BETTER * kept:
+            fitting.append((distance, round(np.linalg.norm(pose.angles)), matrix, words))  # in whole degrees
     if not fitting:
         return None
-    least = min(found for found, *_ in fitting) / BETTER
+    least = min(distance for distance, *_ in fitting) / BETTER
     # of exchanges that fit alike, the least turned: a swap of axes is also a mirror image that is turned
     _, _, matrix, words = min((fit for fit in fitting if fit[0] <= least), key=lambda fit: fit[1])
     return matrix, words

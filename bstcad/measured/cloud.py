@@ -192,11 +192,11 @@ def _vertices(data: bytes, ending: str) -> np.ndarray:
     import trimesh
 
     try:
-        found = trimesh.load(io.BytesIO(data), file_type=ending[1:], process=False)
-        points = np.asarray(found.vertices, dtype=np.float64)
+        mesh = trimesh.load(io.BytesIO(data), file_type=ending[1:], process=False)
+        points = np.asarray(mesh.vertices, dtype=np.float64)
     except Exception as error:  # trimesh raises whatever a damaged file leads to
-        said = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
-        raise ValueError(f"is no {ending[1:].upper()} file that can be read ({said[:80]}); write it again") from None
+        fault = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+        raise ValueError(f"is no {ending[1:].upper()} file that can be read ({fault[:80]}); write it again") from None
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError("holds no points; export the vertices of the measured face")
     return np.unique(points, axis=0)

@@ -21,7 +21,7 @@ from scipy.special import eval_jacobi
 
 from bstcad.analysis.shape import least_squares
 from bstcad.measured.alignment import Alignment, Face, Pose, root_mean_square, sampled
-from bstcad.optics.bspline import BSplineSurface, basis_matrix, prolongation
+from bstcad.optics.bspline import BSplineSurface, basis_matrix
 from bstcad.optics.lens import Lens
 
 DEGREE = 2  # of the polynomial
@@ -63,7 +63,7 @@ class Form:
     def on(self, surface: BSplineSurface) -> BSplineSurface:
         """`surface` with this form error, by least squares on the finer of both nets."""
         enough = self.rest.m <= surface.m
-        finer = surface if enough else _refined(surface, max(self.rest.m, min(REFINED * surface.m, NETS[1])))
+        finer = surface if enough else surface.refined(max(self.rest.m, min(REFINED * surface.m, NETS[1])))
         u = np.linspace(0, finer.m - 1, 4 * finer.m)
         rows = basis_matrix(u, finer.m)
         solve = splu((rows.T @ rows).tocsc()).solve
@@ -137,7 +137,7 @@ def _field(
     level = np.bincount(band.ravel(), (1 / per_mode).ravel(), bands) / modes
     quiet = QUIET**2 * float(off @ off) / n + 1e-24
     noise2, variance = 0.25 * float(off @ off) / n + quiet, np.full((m, m), float(off @ off) / n)
-    motion, amplitude, found = np.zeros(motions.shape[1]), np.zeros((m, m)), None
+    motion, amplitude, energies = np.zeros(motions.shape[1]), np.zeros((m, m)), None
 
     def posterior(values: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
         return _mean(gram, rows.T @ values, variance, noise2=noise2, per_mode=per_mode, start=start)
@@ -151,10 +151,10 @@ def _field(
         left = still - rows @ _heights(amplitude)
         shrunk = 1 + noise2 / (per_mode * variance)  # true amplitude over its posterior mean
         energy = np.bincount(band.ravel(), ((shrunk * amplitude) ** 2 * per_mode / noise2).ravel(), bands) / modes
-        found = energy if found is None else (found + energy) / 2
+        energies = energy if energies is None else (energies + energy) / 2
         free = max(n - float((1 / shrunk).sum()), 0.05 * n)
         noise2 = float(np.sqrt(noise2 * max(float(left @ left) / free, quiet)))
-        variance = _variances(found, modes, level * noise2)[band]
+        variance = _variances(energies, modes, level * noise2)[band]
     amplitude = posterior(off - motions @ motion, amplitude)
     spread = 1 / (per_mode / noise2 + 1 / variance)
     return _heights(amplitude).reshape(m, m), np.sqrt(spread), float(np.sqrt(noise2)), motion
@@ -168,17 +168,17 @@ def _motion(motions: np.ndarray, off: np.ndarray, alone: np.ndarray, *, noise2: 
     return directions[:, sure] @ (directions[:, sure].T @ (alone.T @ off) / noise2 / size[sure])
 
 
-def _variances(found: np.ndarray, modes: np.ndarray, noise: np.ndarray) -> np.ndarray:
+def _variances(energy: np.ndarray, modes: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Variance of the form in each band, from its energy over the noise's there.
 
     Bands below the noise continue the last bands above it as a power of the frequency, as polished and turned faces do,
     but not above the limit of detection.
     """
     least = SURE * np.sqrt(2 / modes)
-    sure = found > 1 + least
-    variance = np.where(sure, np.maximum(found - 1, 0.0), SILENT) * noise
+    sure = energy > 1 + least
+    variance = np.where(sure, np.maximum(energy - 1, 0.0), SILENT) * noise
     last = np.flatnonzero(sure)[-FOLLOWED:]
-    beyond = np.arange(len(found)) > (last[-1] if len(last) else len(found))
+    beyond = np.arange(len(energy)) > (last[-1] if len(last) else len(energy))
     if len(last) == FOLLOWED and beyond.any():
         slope, _ = np.polyfit(last, np.log(variance[last]), 1)
         onward = np.exp(np.minimum(slope, 0.0) * (np.flatnonzero(beyond) - last.mean()) + np.log(variance[last]).mean())
@@ -211,8 +211,8 @@ def _mean(
     operator = LinearOperator((m * m, m * m), matvec=product, dtype=np.float64)
     right = (root * scipy.fft.dctn(seen.reshape(m, m), norm="ortho") / noise2).ravel()
     guess = None if start is None else (start / root).ravel()
-    found, _ = cg(operator, right, guess, rtol=ENOUGH, maxiter=STEPS)
-    return root * found.reshape(m, m)
+    scaled_mean, _ = cg(operator, right, guess, rtol=ENOUGH, maxiter=STEPS)
+    return root * scaled_mean.reshape(m, m)
 
 
 def _rows(u: np.ndarray, v: np.ndarray, m: int) -> scipy.sparse.csr_array:
@@ -233,17 +233,9 @@ def _gram_symbol(m: int) -> np.ndarray:
 def _bands(frequency: np.ndarray) -> tuple[np.ndarray, int]:
     """(band of each cosine, number of bands): quarters of octaves, without empty ones."""
     least = frequency[frequency > 0].min()
-    found = np.floor(QUARTER * np.log2(np.maximum(frequency, least) / least)).astype(int)
-    _, packed = np.unique(found, return_inverse=True)
+    quarters = np.floor(QUARTER * np.log2(np.maximum(frequency, least) / least)).astype(int)
+    _, packed = np.unique(quarters, return_inverse=True)
     return packed.reshape(frequency.shape), int(packed.max()) + 1
-
-
-def _refined(surface: BSplineSurface, m: int) -> BSplineSurface:
-    """The same surface on m x m control points, to rounding in all but its end spans."""
-    if surface.m == m:
-        return surface
-    carry = prolongation(surface.m, m)
-    return replace(surface, heights=torch.from_numpy(carry @ surface.heights.numpy() @ carry.T))
 
 
 # --- figures of a deviation -------------------------------------------------------------------------------------------
@@ -282,11 +274,11 @@ class Deviation:
     form: np.ndarray = field(repr=False)  # (rows y, columns x) of the fitted form, NaN outside the outline
 
 
-def map_files(found: Deviation) -> dict[str, bytes]:
+def map_files(made: Deviation) -> dict[str, bytes]:
     """The deviation map as files by name: x, y and deviation (rows y, columns x) in mm, NaN outside the outline."""
-    packed, (x, y) = io.BytesIO(), (part.ravel() for part in np.meshgrid(found.x, found.y))
-    np.savez_compressed(packed, x=found.x, y=found.y, deviation=found.form)
-    rows = "\n".join(map("{:.6f},{:.6f},{:.9g}".format, x, y, found.form.ravel()))
+    packed, (x, y) = io.BytesIO(), (part.ravel() for part in np.meshgrid(made.x, made.y))
+    np.savez_compressed(packed, x=made.x, y=made.y, deviation=made.form)
+    rows = "\n".join(map("{:.6f},{:.6f},{:.9g}".format, x, y, made.form.ravel()))
     return dict(zip(MAP, (packed.getvalue(), f"x [mm],y [mm],deviation [mm]\n{rows}\n".encode()), strict=True))
 
 
@@ -300,15 +292,15 @@ def deviation(lens: Lens, alignment: Alignment, form: Form) -> Deviation:
     cosine = 1 / np.sqrt(1 + z_x**2 + z_y**2)  # of the normal against z
     off, half = form.at(x, y), min(form.rest.pitch) / 4
     off_x, off_y = ((form.at(x + a, y + b) - form.at(x - a, y - b)) / (2 * half) for a, b in ((half, 0.0), (0.0, half)))
-    found = np.full(inside.shape, np.nan)
-    found[inside] = along_normal = cosine * off
+    form_map = np.full(inside.shape, np.nan)
+    form_map[inside] = along_normal = cosine * off
     worst_x, worst_y, _ = alignment.points[np.argmax(np.abs(alignment.distances))]
     return Deviation(
         pv=float(np.ptp(alignment.distances)), pvr=robust_pv(alignment.points, alignment.distances), rms=alignment.rms,
         form_pv=float(np.ptp(along_normal)), form_rms=root_mean_square(along_normal),
         slope_rms=float(np.sqrt(np.mean(off_x**2 + off_y**2))), noise=form.noise,
         worst=(float(worst_x), float(worst_y)),
-        bands=_octaves(form, x, y, np.stack([off, off_x, off_y])), x=axes[0], y=axes[1], form=found,
+        bands=_octaves(form, x, y, np.stack([off, off_x, off_y])), x=axes[0], y=axes[1], form=form_map,
     )  # fmt: skip
 
 
@@ -392,11 +384,11 @@ def _chebyshev(columns: np.ndarray, distances: np.ndarray) -> tuple[np.ndarray, 
     unit = max(float(np.abs(distances).max()), 1e-12)
     size = np.abs(columns).max(axis=0)
     scaled, ones = columns / size, np.ones((len(columns), 1))
-    found = linprog(
+    optimum = linprog(
         np.append(np.zeros(columns.shape[1]), 1.0),
         A_ub=np.block([[scaled, -ones], [-scaled, -ones]]),
         b_ub=np.concatenate([-distances, distances]) / unit,
         bounds=[(None, None)] * columns.shape[1] + [(0, None)],
         method="highs",
     )
-    return found.x[:-1] / size * unit, float(found.x[-1]) * unit
+    return optimum.x[:-1] / size * unit, float(optimum.x[-1]) * unit

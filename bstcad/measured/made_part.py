@@ -53,7 +53,7 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
     except ValueError as error:
         raise ValueError(f"{cloud.path}: {error}") from None
     form = fitted(face, placed)
-    found = deviation(lens, placed, form)
+    deviates = deviation(lens, placed, form)
     light, high = _light(lens, form, nominal, replace(nominal.effort(effort), witness=False))
     scale, uncertainty = aligning.scale(face, placed)
     x, y, _ = placed.pose.shift
@@ -82,8 +82,8 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
         "rrmsd_predicted": light.rrmsd if math.isfinite(light.rrmsd) else None,
         "rrmsd_high": high if math.isfinite(high) else None,
     }
-    facts = _facts(face, placed, found, cloud) | {"scale": scale, "passed": all(check.passed for check in checks)}
-    return MadePart(checks, facts | predicted, found, irradiance=light.picture, outliers=placed.outliers)
+    facts = _facts(face, placed, deviates, cloud) | {"scale": scale, "passed": all(check.passed for check in checks)}
+    return MadePart(checks, facts | predicted, deviates, irradiance=light.picture, outliers=placed.outliers)
 
 
 def _aligned(face: Face, points: np.ndarray) -> tuple[Alignment, str]:
@@ -148,9 +148,9 @@ def _light(lens: Lens, form: Form, nominal: Nominal, effort: Effort) -> tuple[Li
     )
 
 
-def _facts(face: Face, placed: Alignment, found: Deviation, cloud: Cloud) -> dict[str, Any]:
+def _facts(face: Face, placed: Alignment, deviates: Deviation, cloud: Cloud) -> dict[str, Any]:
     """The entries of `measured` in report.json; lengths in mm, angles in degrees, slopes in rad."""
-    figures = {key: value for key, value in asdict(found).items() if key not in ("x", "y", "form", "worst")}
+    figures = {key: value for key, value in asdict(deviates).items() if key not in ("x", "y", "form", "worst")}
     apart, (width, pose) = face.distance(placed.outliers)[0], minimum_zone(face, placed)
     return {
         "cloud": cloud.path.name,
@@ -167,7 +167,7 @@ def _facts(face: Face, placed: Alignment, found: Deviation, cloud: Cloud) -> dic
         "alignment": _removed(placed.pose) | {"undetermined": list(placed.undetermined)},
         "minimum_zone": {"width": width, **_removed(pose)},
         **figures,
-        "worst_at": list(found.worst),
+        "worst_at": list(deviates.worst),
     }
 
 

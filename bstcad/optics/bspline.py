@@ -105,7 +105,7 @@ def evaluate_plain(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tenso
 
 
 def evaluate(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """`evaluate_plain`, by a fused kernel where one serves these tensors (same values to rounding)."""
+    """`evaluate_plain`, by the fused kernel where it takes these tensors (same values to rounding)."""
     if fused(heights, u, v):
         return spline.BSplineSag.apply(heights, *torch.broadcast_tensors(u, v))
     return evaluate_plain(heights, u, v)
@@ -175,7 +175,7 @@ class BSplineSurface(Surface):
 
     @property
     def detail(self) -> float:
-        """Length over which it is one smooth piece (mm): a knot span."""
+        """Width of its smooth pieces (mm): a knot span."""
         return min(self.pitch)
 
     def from_vertex(self) -> BSplineSurface:
@@ -211,6 +211,16 @@ class BSplineSurface(Surface):
         net[..., 1] = np.linspace(*self.y, self.m)[None, :]
         net[..., 2] = self.z + self.heights.detach().cpu().numpy().astype(np.float64)
         return net
+
+    def refined(self, m: int) -> BSplineSurface:
+        """The same surface on m x m control points, by least squares along each axis."""
+        if m == self.m:
+            return self
+        carry = scipy.sparse.csr_array(
+            prolongation(self.m, m)
+        )  # sparse only in name: its products are sums in a fixed order
+        coarse = self.heights.detach().cpu().double().numpy()
+        return replace(self, heights=torch.from_numpy(carry @ (carry @ coarse.T).T).to(self.heights))
 
     def sags(self, outline: Outline) -> tuple[float, float]:
         """Lowest and highest of the heights that the surface inside the outline depends on (mm), and of zero."""
@@ -309,8 +319,8 @@ class Spans:
 
     def _weights(self, index: Tensor, s: Sequence[float]) -> list[list[Tensor]]:
         """[derivative][basis function]: (places, n)."""
-        found = [weights(index, self.m, place) for place in s]
-        return [[torch.stack([w[order][k] for w in found]).to(self.heights) for k in range(3)] for order in range(3)]
+        each = [weights(index, self.m, place) for place in s]
+        return [[torch.stack([w[order][k] for w in each]).to(self.heights) for k in range(3)] for order in range(3)]
 
     def scattered(self, gradient: Tensor) -> Tensor:
         """(m, m) the transpose of taking `heights`: no control point is added to twice at a time, in any order."""

@@ -66,12 +66,12 @@ def drawn_channels(source: Source, index: Callable[[float], float], points: int,
 
 def _elements(source: Source, index: Callable[[float], float], places_of: Callable) -> tuple[Channel, ...]:
     """The light of each line shared evenly among points of the extent: places_of the line's share and its number."""
-    found = []
+    elements = []
     for number, (nm, share) in enumerate(source.lines):
         places, n = places_of(share, number), index(nm)
         lights = (replace(source.element(x, y), wavelength=nm) for x, y in places)
-        found += [Channel(light, n, share / len(places)) for light in lights]
-    return tuple(found)
+        elements += [Channel(light, n, share / len(places)) for light in lights]
+    return tuple(elements)
 
 
 def merged(channels: Sequence[Channel]) -> tuple[Channel, ...]:

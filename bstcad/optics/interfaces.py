@@ -111,10 +111,9 @@ class Interface:
 
 @dataclass(frozen=True)
 class Hit:
-    """Rays that have crossed an interface; slopes and cosines hold for those still alive."""
+    """Rays that have crossed an interface; the cosines hold for those still alive."""
 
     rays: Rays  # on the surface, with their new directions
-    slopes: tuple[Tensor, Tensor]  # ∂z/∂x and ∂z/∂y of the surface there
     cos_in: Tensor  # of the angle of incidence
     cos_out: Tensor  # of the angle of refraction or reflection
 
@@ -122,7 +121,7 @@ class Hit:
 def cross(rays: Rays, interface: Interface) -> Hit:
     """Rays to an interface and behind it: those that meet its surface inside the outline, turned by its law."""
     at, z_x, z_y = intersect(interface.surface, rays, interface.outline, interface.status_if_missed)
-    hit = turn(at, z_x, z_y, interface.law, level=interface.surface.level)
+    hit = deflect(at, z_x, z_y, interface.law, level=interface.surface.level)
     if not interface.losses:
         return hit
     return replace(hit, rays=dimmed(hit.rays, hit.cos_in, hit.cos_out, _path(rays, hit.rays), interface.losses))
@@ -150,13 +149,13 @@ def _path(before: Rays, behind: Rays) -> Tensor:
     return torch.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
 
 
-def turn(at: Rays, z_x: Tensor, z_y: Tensor, law: Law, level: bool = False) -> Hit:
+def deflect(at: Rays, z_x: Tensor, z_y: Tensor, law: Law, level: bool = False) -> Hit:
     """Rays on a surface of these slopes, behind it.  level: the surface is a plane z = const, and its slopes zero."""
     if at.axial and level:  # normal incidence
         one = torch.ones_like(z_x)
         if not law.reverses:
-            return Hit(at, (z_x, z_y), one, one)
-        return Hit(replace(at, direction=-at.direction, sense=-at.sense), (z_x, z_y), one, one)
+            return Hit(at, one, one)
+        return Hit(replace(at, direction=-at.direction, sense=-at.sense), one, one)
     norm = torch.rsqrt(1 + z_x * z_x + z_y * z_y)
     dx, dy, dz = torch.where(at.alive, at.direction, torch.ones_like(at.direction))
     along = dz - dx * z_x - dy * z_y
@@ -167,7 +166,7 @@ def turn(at: Rays, z_x: Tensor, z_y: Tensor, law: Law, level: bool = False) -> H
     status = at.lose(stopped, law.status_if_blocked)
     direction = torch.where(status == Status.ALIVE, direction, at.direction.detach())
     sense = -at.sense if law.reverses else at.sense
-    return Hit(replace(at, direction=direction, status=status, axial=False, sense=sense), (z_x, z_y), cos_in, cos_out)
+    return Hit(replace(at, direction=direction, status=status, axial=False, sense=sense), cos_in, cos_out)
 
 
 def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) -> tuple[Rays, Tensor, Tensor]:
@@ -186,12 +185,12 @@ def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) ->
         status = rays.lose(~(surface.reaches(x, y) & outline.contains(x, y)), missed)
         return replace(rays, position=torch.stack([x, y, h]), z=surface.z, status=status), z_x, z_y
 
-    start, s, found = _plane_and_root(surface, rays)
+    start, s, meets = _plane_and_root(surface, rays)
     # double where: a ray without a root takes no step, and whatever it is, none of it reaches the others' gradients
-    x, y, z = torch.where(found, start + s * rays.direction, torch.zeros_like(start))
+    x, y, z = torch.where(meets, start + s * rays.direction, torch.zeros_like(start))
     h, z_x, z_y = surface.relative_sag_and_slope(x, y)
     dx, dy, dz = rays.direction.detach()
-    ok = found & ((dz - z_x.detach() * dx - z_y.detach() * dy).abs() > ALONG)
+    ok = meets & ((dz - z_x.detach() * dx - z_y.detach() * dy).abs() > ALONG)
     rise_x, rise_y = slopes_beyond(surface, x, y, z_x, z_y) if surface.is_net else (z_x, z_y)
     slope = dz - rise_x.detach() * dx - rise_y.detach() * dy
     step = torch.where(ok, z - h, torch.zeros_like(h)) / torch.where(ok, slope, torch.ones_like(slope))
@@ -204,18 +203,18 @@ def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) ->
 
 
 def _plane_and_root(surface: Surface, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
-    """(where the rays cross the base plane (3, …), path s from there to the surface, found); no gradient in s."""
+    """(where the rays cross the base plane (3, …), path s from there to the surface, meets); no gradient in s."""
     dz = rays.direction[2]
     way = -rays.above(surface.z) / torch.where(dz.abs() > 1e-12, dz, torch.full_like(dz, 1e-12))
     start = torch.stack([*(rays.position[:2] + way * rays.direction[:2]), torch.zeros_like(dz)])
     with torch.no_grad():
         if surface.is_net:
             known = net_bounds(surface, dz.dtype, rays.sense)
-            s, found = first_root(surface, start, way, rays, known)
+            s, meets = first_root(surface, start, way, rays, known)
         else:
-            s, found = surface.crossing(start[0], start[1], rays.direction, rays.sense)
-            found = found & (way + s >= 0)  # only the forward root counts
-    return start, s, found
+            s, meets = surface.crossing(start[0], start[1], rays.direction, rays.sense)
+            meets = meets & (way + s >= 0)  # only the forward root counts
+    return start, s, meets
 
 
 class NetBounds(NamedTuple):
@@ -242,13 +241,13 @@ def net_bounds(surface: BSplineSurface, dtype: torch.dtype, sense: int = 1) -> N
 def first_root(
     surface: BSplineSurface, start: Tensor, way: Tensor, rays: Rays, known: NetBounds
 ) -> tuple[Tensor, Tensor]:
-    """(s, found): path of live rays to the surface from where they cross its plane, `start` (3, …) mm; forward only.
+    """(s, meets): path of live rays to the surface from where they cross its plane, `start` (3, …) mm; forward only.
 
     They come to it by `way` mm of path.  Those that are steep to the surface must begin in the glass.
     """
     dx, dy, dz = rays.direction
     steep = rays.alive & ~((dz if rays.sense > 0 else -dz) > known.steepest_x * dx.abs() + known.steepest_y * dy.abs())
-    s, found = _newton(surface, start, rays.direction, torch.zeros_like(dz), rays.alive & ~steep, known.tolerance)
+    s, meets = _newton(surface, start, rays.direction, torch.zeros_like(dz), rays.alive & ~steep, known.tolerance)
     if bool(steep.any()):
         few = steep.nonzero(as_tuple=True)
         before, direction = _only(rays.position, few), _only(rays.direction, few)
@@ -258,8 +257,8 @@ def first_root(
         if bool(arrived.any()):
             root, met = _newton(surface, _only(start, few), direction, below, arrived, known.tolerance)
             s[few] = root
-            found[few] = met & ((root - below).abs() <= known.near / FLATTEST)  # else it runs along the face
-    return s, found & (way + s >= -known.tolerance)  # a ray may begin on the face, as near as rounding allows
+            meets[few] = met & ((root - below).abs() <= known.near / FLATTEST)  # else it runs along the face
+    return s, meets & (way + s >= -known.tolerance)  # a ray may begin on the face, as near as rounding allows
 
 
 def _only(vectors: Tensor, few: tuple[Tensor, ...]) -> Tensor:
@@ -271,22 +270,22 @@ def _newton(
     surface: BSplineSurface, start: Tensor, direction: Tensor, s: Tensor, wanted: Tensor, tolerance: float,
     steps: int = NEWTON_STEPS,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """(s*, found) for the rays `wanted`, from the paths s beyond the plane; the stop is |F| in mm, per ray."""
+    """(s*, meets) for the rays `wanted`, from the paths s beyond the plane; the stop is |F| in mm, per ray."""
     dx, dy, dz = direction
-    found = torch.zeros_like(wanted)
+    meets = torch.zeros_like(wanted)
     for step in range(steps):
         x, y = start[0] + s * dx, start[1] + s * dy
         h, z_x, z_y = surface.relative_sag_and_slope(x, y)
         residual = s * dz - h
-        found = wanted & (residual.abs() <= tolerance)
-        searching = wanted & ~found
+        meets = wanted & (residual.abs() <= tolerance)
+        searching = wanted & ~meets
         left = int(searching.sum())
         if left == 0:
             break
         if 2 * left < s.numel():  # few go on: alone, so that one ray without a root does not hold up all others
             few = searching.nonzero(as_tuple=True)
             at = (_only(start, few), _only(direction, few), s[few], wanted[few])
-            s[few], found[few] = _newton(surface, *at, tolerance, steps - step)
+            s[few], meets[few] = _newton(surface, *at, tolerance, steps - step)
             break
         if step + NEWTON_STEPS - steps >= QUICK:
             z_x, z_y = slopes_beyond(surface, x, y, z_x, z_y)
@@ -294,7 +293,7 @@ def _newton(
         floor = torch.where(slope < 0, -FLATTEST, FLATTEST).to(slope.dtype)  # keeps the sign
         slope = torch.where(slope.abs() > FLATTEST, slope, floor)
         s = s - torch.where(searching, residual, torch.zeros_like(s)) / slope
-    return s, found
+    return s, meets
 
 
 def slopes_beyond(surface: BSplineSurface, x: Tensor, y: Tensor, z_x: Tensor, z_y: Tensor) -> tuple[Tensor, Tensor]:

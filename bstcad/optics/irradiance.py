@@ -25,9 +25,9 @@ DARK = 1e-6  # of the brightest pixel of a target; a pixel that wants no more wa
 
 @dataclass(frozen=True)
 class Screen:
-    """A rectangle of the plane z, or of one that is turned about its middle, divided into columns x rows of pixels."""
+    """A rectangle of the plane z, or of a plane turned about its middle, divided into columns x rows of pixels."""
 
-    z: float  # mm; of a tilted one that of its middle
+    z: float  # mm; of a tilted screen at its middle
     x: tuple[float, float]  # mm, on the plane
     y: tuple[float, float]  # mm, on the plane
     pixels: int | tuple[int, int]  # along both sides, or (columns, rows)

@@ -41,7 +41,7 @@ class Lens:
     clear: tuple[Outline, Outline] | None = None  # of front and back, outside which light is lost; None: the outline
     before: tuple[Interface, ...] = ()  # that light crosses before the solid, such as a window
     behind: tuple[Interface, ...] = ()  # and behind it, such as a fold mirror
-    free: tuple[int, ...] | None = None  # see `freeform`; None: the back alone
+    shaped: tuple[int, ...] | None = None  # the interfaces that tailoring shapes; None: the back alone
 
     @property
     def interfaces(self) -> tuple[Interface, ...]:
@@ -66,7 +66,7 @@ class Lens:
         return {"back": self.back} if self.reflects else {"front": self.front, "back": self.back}
 
     @property
-    def turn(self) -> float:
+    def deflection(self) -> float:
         """The angle by which its back turns light, over the angle by which the back leans, both small."""
         return 2.0 if self.reflects else abs(self.index - 1)
 
@@ -83,7 +83,7 @@ class Lens:
     @property
     def freeform(self) -> tuple[int, ...]:
         """Which of the interfaces are nets that tailoring shapes, in the order of the light."""
-        return (self.number_of_back,) if self.free is None else self.free
+        return (self.number_of_back,) if self.shaped is None else self.shaped
 
     @property
     def nets(self) -> tuple[BSplineSurface, ...]:
@@ -92,8 +92,8 @@ class Lens:
         return tuple(interfaces[k].surface for k in self.freeform)
 
     @property
-    def last_free(self) -> Interface:
-        """The last freeform interface: the one that follows a transport map in stage 1."""
+    def last_freeform(self) -> Interface:
+        """The last freeform interface, which follows a transport map in stage 1."""
         return self.interfaces[self.freeform[-1]]
 
     def with_front(self, front: Surface) -> Lens:
@@ -114,6 +114,10 @@ class Lens:
         for k, net in zip(self.freeform, nets, strict=True):
             lens = lens._with_surface(k, net)
         return lens
+
+    def refined(self, m: int) -> Lens:
+        """The same lens with m x m control points in each of its `nets`."""
+        return self.with_nets(net.refined(m) for net in self.nets)
 
     def with_heights(self, heights: Iterable[Tensor]) -> Lens:
         """The lens whose `nets` have other heights (mm)."""

@@ -31,15 +31,15 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.channels import Channel, places, points, weighted_sum
-from bstcad.optics.irradiance import Screen, efficiency, rrmsd, tent
+from bstcad.optics.irradiance import Leak, Screen, efficiency, leak, rrmsd, tent
 from bstcad.optics.kernels.compiling import fused_whole
 from bstcad.optics.kernels.reductions import dot, total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import in_pairs
-from bstcad.optics.trace import Ghost, Simulation, from_first_free, simulate_all
-from bstcad.optics.tubes import SHEET, area_of, corners, middle, picture, rays_to
+from bstcad.optics.trace import Ghost, Simulation, from_first_net, simulate
+from bstcad.optics.tubes import SHEET, area_of, arriving, corners, middle, picture, rays_to
 
 SETS = 8  # of rays, independent of each other: the jackknife then knows a standard error to a quarter of it
 FEWEST = 5  # times fewer rays a side in the first sets, which tell how many are needed
@@ -90,7 +90,6 @@ class Light:
     """The light of all channels behind a lens."""
 
     picture: np.ndarray = field(repr=False)  # (rows, columns), row 0 = y max, with the target's sum: for people
-    mean: np.ndarray = field(repr=False)  # the same as the rays have it, not smoothed
     rrmsd: float  # without bias (Wang et al. 2023, Eq. 15); NaN: no light falls on the screen
     standard_error: float  # of the RRMSD
     rays: int  # in all
@@ -98,7 +97,8 @@ class Light:
     tent: float = math.nan  # RRMSD by linear binning
     picture_off: float = math.nan  # `picture` against the lens's own, as RRMSD has it
     witness: Witness | None = None  # None: of a source of some size, of losses, or where none was asked for
-    ghost: np.ndarray | None = field(default=None, repr=False)  # the part of the picture that is one; None: left out
+    ghost: np.ndarray | None = field(default=None, repr=False)  # the part of the picture by a ghost; None: left out
+    leak: Leak | None = None  # of the rays' mean picture, not smoothed; None: the target is dark nowhere
 
     @property
     def efficiency(self) -> float:
@@ -128,16 +128,16 @@ def measure(
     seen = SEEN * effort.accuracy / FULL.accuracy
     rays = _enough(lens, draw or (lambda count, seed: channels), screen, wanted, effort, stray, seen)
     if not rays.boxes:
-        return Light(np.zeros(screen.shape), np.zeros(screen.shape), math.nan, math.inf, rays.count, rays.flux)
+        return Light(np.zeros(screen.shape), math.nan, math.inf, rays.count, rays.flux)
     (value, error), (tent, _) = _value(rays, wanted), apart(rays.tents, wanted)
     shown, off = _shown(rays.boxes, wanted)
     lenses = [c.through(lens) for c in channels]
     simple = draw is None and all(seen.losses is None and fused_whole(seen.interfaces) for seen in lenses)
     return Light(
-        shown.numpy(), (sum(rays.boxes) / SETS).numpy(), value, error, rays.count,
-        rays.flux, math.sqrt(max(tent, 0.0)), off,
-        _witness(lens, channels, screen, wanted, rays, stray) if effort.witness and simple else None,
-        stray and (stray.picture.cpu() * (total(wanted) / rays.on_screen)).numpy(),
+        shown.numpy(), value, error, rays.count, rays.flux, tent=math.sqrt(max(tent, 0.0)), picture_off=off,
+        witness=_witness(lens, channels, screen, wanted, rays, stray) if effort.witness and simple else None,
+        ghost=stray and (stray.picture.cpu() * (total(wanted) / rays.on_screen)).numpy(),
+        leak=leak((sum(rays.boxes) / SETS).numpy(), wanted.numpy()),
     )  # fmt: skip
 
 
@@ -153,8 +153,8 @@ def rrmsd_by_rays(
 def rrmsd_by_tubes(lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, n: int) -> float:
     """RRMSD of the picture by n x n tubes a channel: no noise, but the bias of tubes; NaN where no light falls."""
     wanted = torch.from_numpy(np.asarray(target, dtype=np.float64))
-    found = tubes_picture(lens, channels, screen, n).cpu()
-    return float(rrmsd(found, wanted)) if total(found) > 0 else math.nan
+    flux = tubes_picture(lens, channels, screen, n).cpu()
+    return float(rrmsd(flux, wanted)) if total(flux) > 0 else math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,8 +226,8 @@ def _shown(pictures: Sequence[Tensor], wanted: Tensor) -> tuple[Tensor, float]:
     pairs = [(one, other, (whole - one - other) / (SETS - 2)) for one, other in zip(*[iter(pictures)] * 2, strict=True)]
 
     def smooth(mean: Tensor, width: float) -> Tensor:
-        found = torch.from_numpy(gaussian_filter(mean.numpy(), width, mode="nearest")) if width else mean
-        return found * (total(wanted) / total(found))
+        smoothed = torch.from_numpy(gaussian_filter(mean.numpy(), width, mode="nearest")) if width else mean
+        return smoothed * (total(wanted) / total(smoothed))
 
     def off(width: float) -> float:
         near = [(smooth(mean, width), one, other) for one, other, mean in pairs]
@@ -235,9 +235,9 @@ def _shown(pictures: Sequence[Tensor], wanted: Tensor) -> tuple[Tensor, float]:
 
     least, best = math.inf, 0.0
     for width in SMOOTHED:  # wider kernels take less noise and more detail: there is one minimum
-        if (found := off(width)) > least:
+        if (square := off(width)) > least:
             break
-        least, best = found, width
+        least, best = square, width
     return smooth(whole / SETS, best), math.sqrt(max(least, 0.0))
 
 
@@ -278,17 +278,17 @@ def _enough(
 
 def _traced(lens, draw: Draw, screen: Screen, wanted: Tensor, side: int, seed: int, ghost) -> _Rays:
     """SETS sets of rays, of about side x side each."""
-    found = []
+    sets = []
     count = min(max(side**2 // A_POINT, FEW_POINTS), MANY_POINTS)
     for i in range(SETS):
         channels = draw(count, seed + i)
         n = max(1, round(a_side(channels) * side))
-        found.append(simulated(lens, channels, screen, n, seed + i))
-    flux = {line: math.fsum(part.flux[line] for part in found) / SETS for line in found[0].flux}
+        sets.append(simulated(lens, channels, screen, n, seed + i))
+    flux = {line: math.fsum(part.flux[line] for part in sets) / SETS for line in sets[0].flux}
     if ghost is not None:
         flux |= {line: flux.get(line, 0.0) + more for line, more in ghost.flux.items()}
-    count = sum(part.rays for part in found)
-    boxes, tents = ([_joined(getattr(part, kind), ghost) for part in found] for kind in ("box", "tent"))
+    count = sum(part.rays for part in sets)
+    boxes, tents = ([_joined(getattr(part, kind), ghost) for part in sets] for kind in ("box", "tent"))
     on_screen = math.fsum(float(total(box)) for box in boxes) / SETS
     if not all(float(total(box)) > 0 for box in boxes):
         return _Rays((), (), flux, count, 0.0)
@@ -300,11 +300,11 @@ def _traced(lens, draw: Draw, screen: Screen, wanted: Tensor, side: int, seed: i
 def _witness(lens, channels, screen: Screen, wanted: Tensor, rays: _Rays, ghost: Ghost | None) -> Witness:
     """The witness by `tubes_of` the lens."""
     n = tubes_of(lens)
-    found = _joined(tubes_picture(lens, channels, screen, n), ghost)
-    if not total(found) > 0:
+    seen = _joined(tubes_picture(lens, channels, screen, n), ghost)
+    if not total(seen) > 0:
         return Witness(math.nan, math.inf)
-    found = found * (total(wanted) / total(found))
-    return Witness(float(rrmsd(found, wanted)), math.sqrt(max(apart(rays.boxes, found)[0], 0.0)))
+    seen = seen * (total(wanted) / total(seen))
+    return Witness(float(rrmsd(seen, wanted)), math.sqrt(max(apart(rays.boxes, seen)[0], 0.0)))
 
 
 def tubes_of(lens: Lens) -> int:
@@ -342,19 +342,19 @@ def lines_apart(
         lines.setdefault(channel.source.wavelength, []).append(channel)
     if len(lines) < 2:
         return ()
-    wanted, found = torch.from_numpy(np.asarray(target, dtype=np.float64)), []
+    wanted, parts = torch.from_numpy(np.asarray(target, dtype=np.float64)), []
     for wavelength, members in sorted(lines.items()):
         picture = tubes_picture(lens, members, screen, n).cpu()
         if total(picture) > 0:
             picture = picture * (total(wanted) / total(picture))
-        found.append(Line(wavelength, math.fsum(channel.weight for channel in members), picture.numpy()))
-    return tuple(found)
+        parts.append(Line(wavelength, math.fsum(channel.weight for channel in members), picture.numpy()))
+    return tuple(parts)
 
 
 def simulated(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, seed: int) -> Simulation:
     """The picture and the ledger by n x n stratified rays a channel; other ones at each point of an extended source."""
     pairs = zip(channels, places(channels), strict=True)
-    return simulate_all([(c.weight, c.source, c.through(lens), seed + SETS * k) for c, k in pairs], screen, n)
+    return simulate([(c.weight, c.source, c.through(lens), seed + SETS * k) for c, k in pairs], screen, n)
 
 
 def _joined(picture: Tensor, ghost: Ghost | None) -> Tensor:
@@ -391,8 +391,8 @@ class Images:
         sides = [2 * r + 1 for r in reach]
         own = Screen(0.0, (-sides[0] / 2, sides[0] / 2), (-sides[1] / 2, sides[1] / 2), tuple(sides))
         position = self.offset * torch.tensor([1.0, -1.0]).view(2, 1, 1)  # rows count downwards
-        found = tent(Landed(position, self.flux, torch.zeros(self.flux.shape, dtype=torch.uint8)), own)
-        return (found / found.sum()).numpy()
+        image = tent(Landed(position, self.flux, torch.zeros(self.flux.shape, dtype=torch.uint8)), own)
+        return (image / image.sum()).numpy()
 
     def deviation(self, target: np.ndarray) -> float:
         """RRMSD of a target (rows, columns) convolved with the mean image, against the target itself."""
@@ -434,16 +434,9 @@ def _through(channel: Channel, lens: Lens, screen: Screen, x: Tensor, y: Tensor)
     """The light of one channel through the places between the points (x, y) (mm) of the back face."""
     seen = channel.through(lens)
     p, q, coming = rays_to(channel.source, seen, x, y)
-    landed = from_first_free(coming, replace(seen.unbounded(), losses=None), screen.plane)
-    alive = landed.alive
-    whole = alive[1:, 1:] & alive[1:, :-1] & alive[:-1, 1:] & alive[:-1, :-1]
+    landed = from_first_net(coming, replace(seen.unbounded(), losses=None), screen.plane)
     inside = seen.number_of_back == 0 or seen.apertures[0].contains(middle(p), middle(q))
     flux = channel.weight * channel.source.irradiance(middle(p), middle(q), seen.entrance.z) * area_of(p, q)
-    flux = torch.where(whole & inside, flux, torch.zeros_like(flux)).double()
+    flux = arriving(torch.where(inside, flux, torch.zeros_like(flux)), landed).double()
     at = torch.stack([middle(c) for c in landed.position])
     return Landed(at.reshape(2, -1), flux.reshape(-1), landed.status[1:, 1:].reshape(-1))
-
-
-def extended(channels: Sequence[Channel]) -> bool:
-    """Are these points of a source of some size?"""
-    return any(places(channels))

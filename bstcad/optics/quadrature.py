@@ -1,7 +1,6 @@
-"""Area, volume and centroid of a lens, and the integrals over its faces and walls that they are made of.
+"""Integrals over any face inside any border, which area, volume and centroid are made of.
 
-The volume twice, to prove each other: ∫∫ h of a B-spline surface from its control points, to rounding (1e-13 of
-itself), and the sums of any face inside any border by Green's theorem, to some 1e-9.
+By Green's theorem, to some 1e-9; the tests hold them to the exact integral of a control net.
 """
 
 from __future__ import annotations
@@ -13,10 +12,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
-from bstcad.optics.surfaces import Surface, sag
+from bstcad.optics.surfaces import Surface
 
 SPANS = 128  # a coarser net's spans are divided so that an axis has as many parts at least
 POINTS = 3  # Gauss points in each part of a chord or of an edge …
@@ -28,86 +27,6 @@ FINE = 400  # … 2 in those of a net with as many control points a side: they h
 EDGE_PARTS = 256  # of the curve of an edge, at least
 
 gauss_rule = functools.cache(np.polynomial.legendre.leggauss)  # points and weights from -1 to 1, by their number
-
-
-def exact_volume(lens: Lens) -> float:
-    """V = ∫∫ (back - front) dx dy over the outline (mm³), to about 1e-13 of itself, without Gauss points on the net."""
-    back, front = (integral(f, lens.outline) + f.z * lens.outline.area for f in (lens.back, lens.front))
-    return back - front
-
-
-def integral(face: Surface, outline: Outline) -> float:
-    """∫∫ (z - z0) dx dy over the outline (mm³); a net ends at the sides of a rectangle.
-
-    Of a surface of revolution over a disc of radius a, with the sag h at its rim, pi h (3 a² - (1 + k) h²) / 6; over a
-    rectangle by 96 x 96 Gauss points, exact to rounding up to a half diagonal of 0.95 R.
-    """
-    if face.is_net:
-        if outline.is_round:
-            return _over_disc(face, outline.radius)
-        across, along = (_weights(face.m, pitch) for pitch in face.pitch)  # Σ_i Σ_j w_i w_j h_ij
-        return float((across[:, None] * _heights(face) * along).sum())
-    face, (a, b) = face.plain().moved(0.0), outline.half_extent
-    if outline.is_round:
-        h = sag(face, a, 0.0)
-        return float(np.pi * h * (3 * a * a - (1 + face.conic_constant) * h * h) / 6)
-    point, weight = gauss_rule(SMOOTH)
-    h = sag(face, a * point[:, None], b * point[None, :])
-    return float(a * b * (weight[:, None] * h * weight).sum())
-
-
-def _heights(surface: BSplineSurface) -> np.ndarray:
-    return surface.plain().heights.numpy()
-
-
-def _weights(m: int, pitch: float) -> np.ndarray:
-    """∫ B_i dx (m,) in mm, x(t) = pitch Σ j B_j(t): a cubic in each span, so two Gauss points are exact."""
-    from scipy.interpolate import BSpline
-
-    point, weight = np.polynomial.legendre.leggauss(2)
-    t = (np.arange(m - 2)[:, None] + (point + 1) / 2).ravel()
-    position = BSpline(knots(m), pitch * np.arange(m), DEGREE)
-    dx = position(t, 1) * np.tile(weight / 2, m - 2)
-    return BSpline.design_matrix(t, knots(m), DEGREE).T @ dx
-
-
-def rim_breaks(surface: BSplineSurface, radius: float) -> np.ndarray:
-    """Angles from 0 to 2 pi, ascending, between which the rim of a round lens crosses no knot line of the surface.
-
-    At most 2 pi / 256 apart.
-    """
-    angles = [np.linspace(0, 2 * np.pi, 257)]
-    for (first, _), pitch, quarter in zip((surface.x, surface.y), surface.pitch, (0.0, np.pi / 2), strict=True):
-        lines = first + pitch * (np.arange(1, surface.m - 2) + 0.5)  # x(t) = first + pitch (t + 1/2) inside
-        turn = np.arccos(lines[np.abs(lines) < radius] / radius)
-        angles += [quarter + turn, quarter - turn]
-    theta = np.sort(np.concatenate(angles) % (2 * np.pi))
-    theta = theta[np.concatenate([[True], np.diff(theta) > 1e-9])]  # rad; two crossings in one point count once
-    return np.append(theta[theta < 2 * np.pi - 1e-9], 2 * np.pi)
-
-
-def _over_disc(surface: BSplineSurface, radius: float) -> float:
-    """∫∫ h dx dy of the heights over a disc (mm³), by Green: ∮ F dy with ∂F/∂x = h, along the rim.
-
-    F is a spline of degree 3 x 2 in the linear part of the net; between two knot lines F dy/dθ is analytic, and eight
-    Gauss points an arc of less than 1.5 degrees leave nothing but rounding.
-    """
-    from scipy.interpolate import BSpline, NdBSpline
-
-    full, (dx, dy) = knots(surface.m), surface.pitch
-    antiderivative = BSpline(full, _heights(surface), DEGREE).antiderivative()
-    spline = NdBSpline((antiderivative.t, full), antiderivative.c[: surface.m + 1], (DEGREE + 1, DEGREE))
-    point, weight = np.polynomial.legendre.leggauss(8)
-    breaks = rim_breaks(surface, radius)
-    half = np.diff(breaks) / 2
-    theta = (breaks[:-1] + half)[:, None] + half[:, None] * point
-    t = (radius * np.cos(theta) - surface.x[0]) / dx - 0.5  # x(t) = first + pitch (t + 1/2)
-    s = (radius * np.sin(theta) - surface.y[0]) / dy - 0.5
-    f = dx * spline(np.stack([t, s], axis=-1)) * radius * np.cos(theta)
-    return float((half[:, None] * f * weight).sum())
-
-
-# ---- over any face inside any border ---------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -167,6 +86,21 @@ def _at(face: Surface, raised: float, x: np.ndarray, y: np.ndarray, weight: np.n
 
 def _moment(cone: np.ndarray, *r: np.ndarray) -> np.ndarray:
     return np.array([(cone * axis).sum() for axis in r]) / 4
+
+
+def rim_breaks(surface: BSplineSurface, radius: float) -> np.ndarray:
+    """Angles from 0 to 2 pi, ascending, between which the rim of a round lens crosses no knot line of the surface.
+
+    At most 2 pi / 256 apart.
+    """
+    angles = [np.linspace(0, 2 * np.pi, 257)]
+    for (first, _), pitch, quarter in zip((surface.x, surface.y), surface.pitch, (0.0, np.pi / 2), strict=True):
+        lines = first + pitch * (np.arange(1, surface.m - 2) + 0.5)  # x(t) = first + pitch (t + 1/2) inside
+        turn = np.arccos(lines[np.abs(lines) < radius] / radius)
+        angles += [quarter + turn, quarter - turn]
+    theta = np.sort(np.concatenate(angles) % (2 * np.pi))
+    theta = theta[np.concatenate([[True], np.diff(theta) > 1e-9])]  # rad; two crossings in one point count once
+    return np.append(theta[theta < 2 * np.pi - 1e-9], 2 * np.pi)
 
 
 def gauss_points(breaks: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

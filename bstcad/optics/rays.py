@@ -142,7 +142,7 @@ class TiltedPlane:
         grown = (self.centre[2] - eye) / (p_z - eye)
         return grown * p_x, grown * p_y
 
-    def found(self, q_x: Array, q_y: Array, eye: float) -> tuple[Array, Array]:
+    def from_seen(self, q_x: Array, q_y: Array, eye: float) -> tuple[Array, Array]:
         """The places of the plane that are `seen` there."""
         (e_x, e_y, n), (c_x, c_y, c_z) = self.axes, self.centre
         throw = c_z - eye
@@ -151,11 +151,11 @@ class TiltedPlane:
         return c_x + _dot(e_x, off), c_y + _dot(e_y, off)
 
 
-TargetPlane = float | TiltedPlane  # a level one is its z (mm)
+TargetPlane = float | TiltedPlane  # a level plane is its z (mm)
 
 
 def middle(plane: TargetPlane) -> float:
-    """z (mm) of a level plane; of a tilted one that of its point C."""
+    """z (mm) of a level plane, or of the point C of a tilted plane."""
     return plane.centre[2] if isinstance(plane, TiltedPlane) else plane
 
 

@@ -33,16 +33,10 @@ def grid(window: Rectangle, n: int, dtype: torch.dtype = torch.float64) -> tuple
     return x.contiguous(), y.contiguous()
 
 
-def stratified(window: Rectangle, n: int, seed: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
-    """One random point in each of n x n equal cells, each (n, n); neighbours in memory are neighbours in the lens."""
-    x, y = zip(*stratified_strips(window, n, seed, dtype), strict=True)
-    return torch.cat(x), torch.cat(y)
-
-
 def stratified_strips(
     window: Rectangle, n: int, seed: int, dtype: torch.dtype = torch.float64
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """The points of `stratified`, some rows of cells at a time, so that any number of them fits in memory and cache."""
+    """A random point in each of n x n equal cells, some rows of them at a time: any number fits memory and cache."""
     rows = max(1, STRIP // n)
     for first in range(0, n, rows):
         i = np.arange(first, min(first + rows, n))[:, None]

@@ -46,7 +46,7 @@ class Emitter:
 
     @property
     def main_wavelength(self) -> float:
-        """The heaviest line (nm); of several as heavy, the middle one."""
+        """The heaviest line (nm), or the middle of several as heavy."""
         if isinstance(self.wavelength, int | float):
             return self.wavelength
         most = max(weight for _, weight in self.wavelength)
@@ -172,11 +172,6 @@ class Collimated(Emitter):
     def spot(self, z: float) -> tuple[Outline | None, tuple[float, float]]:
         """(outline, centre in mm) of the light on the plane z, None where it has no edge: the aperture."""
         return self.aperture, self.shift(z)
-
-    def unbounded(self, x: Tensor, y: Tensor, z: float) -> Collimated:
-        """A source with the same rays through the points (x, y) (mm) of the plane z, in all of which it has light."""
-        size = (4 * float(p.abs().max()) + 2 * abs(s) for p, s in zip((x, y), self.shift(z), strict=True))
-        return Collimated(Rectangle(*size), z=self.z, centre=self.centre, tilt=self.tilt)
 
     def rays(self, x: Tensor, y: Tensor, z: float, area: float) -> Rays:
         """Rays through (x, y) of the plane z, starting on a plane before it (`start`)."""
@@ -358,10 +353,6 @@ class Point(Emitter):
         if self.profile != "uniform" or self.half_angle >= 89 or self.tilted:
             return None, centre
         return Circle(abs(z - self.position[2]) * math.tan(math.radians(self.half_angle))), centre
-
-    def unbounded(self, x: Tensor, y: Tensor, z: float) -> Point:
-        """A source with the same rays through the points (x, y) (mm) of the plane z, in all of which it has light."""
-        return Point(self.position)
 
     def rays(self, x: Tensor, y: Tensor, z: float, area: float) -> Rays:
         """Rays from the point through (x, y) of the plane z."""

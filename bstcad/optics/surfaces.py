@@ -29,7 +29,7 @@ class Surface(ABC):
     level = False  # is it z = const, so that light along the axis meets it head on?
     curvature: float | Tensor | None  # at the vertex (1/mm), positive towards +z; None: it is no surface of revolution
     conic_constant: float | Tensor | None
-    detail = math.inf  # length (mm) over which it is one smooth piece
+    detail = math.inf  # width (mm) of its smooth pieces
 
     @abstractmethod
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,7 +1,7 @@
 """The trace: rays along the interfaces of a lens to a plane, differentiable in every parameter; and sums of many rays.
 
-The part of the way before the first freeform interface stays as it is while a lens is tailored: `to_first_free`
-follows it once, and `from_first_free` the rest of it as often as the nets change.
+The part of the way before the first freeform interface stays as it is while a lens is tailored: `to_first_net`
+follows it once, and `from_first_net` the rest of it as often as the nets change.
 
 A simulation traces stratified rays a strip at a time, so that memory does not grow with their number.
 
@@ -22,7 +22,7 @@ from torch import Tensor
 
 from bstcad.optics import irradiance, sampling
 from bstcad.optics.channels import Channel, places, weighted_sum
-from bstcad.optics.interfaces import Hit, Interface, Loss, Reflect, Refract, cross, intersect
+from bstcad.optics.interfaces import Interface, Loss, Reflect, Refract, cross, intersect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import crossing, forward
 from bstcad.optics.kernels.compiling import fused, fused_whole
@@ -75,29 +75,19 @@ def to_plane(rays: Rays, plane: TargetPlane) -> Rays:
     return replace(rays, position=rays.position + path * rays.direction, status=status)
 
 
-def to_first_free(rays: Rays, lens: Lens) -> Rays:
+def to_first_net(rays: Rays, lens: Lens) -> Rays:
     """Rays from the source on their way to the first freeform interface; of a lens with one net that is the back."""
     return across(rays, lens.interfaces[: lens.freeform[0]])
 
 
-def at_first_free(coming: Rays, lens: Lens) -> Hit:
-    """The crossing of the first freeform interface by rays on their way to it (`to_first_free`)."""
-    return cross(coming, lens.interfaces[lens.freeform[0]])
-
-
-def from_first_free(coming: Rays, lens: Lens, plane: TargetPlane) -> Landed:
+def from_first_net(coming: Rays, lens: Lens, plane: TargetPlane) -> Landed:
     """From the first freeform interface on, across all that follow, to the plane."""
     return through(coming, lens.interfaces[lens.freeform[0] :], plane)
 
 
-def from_first_free_plain(coming: Rays, lens: Lens, plane: TargetPlane) -> Landed:
-    """`from_first_free` in plain torch."""
-    return land(across(coming, lens.interfaces[lens.freeform[0] :]), plane)
-
-
 def trace(rays: Rays, lens: Lens, plane: TargetPlane) -> Landed:
     """From the source along all interfaces of the lens to the plane."""
-    return from_first_free(to_first_free(rays, lens), lens, plane)
+    return from_first_net(to_first_net(rays, lens), lens, plane)
 
 
 def gets_through(rays: Rays, lens: Lens) -> Tensor:
@@ -134,14 +124,6 @@ def clear_window(source: Source, lens: Lens, n: int = 256) -> Rectangle:
     return Rectangle(2 * half_x, 2 * half_y)
 
 
-def launch(source: Source, lens: Lens, n: int, seed: int, area: Rectangle | None = None) -> Rays:
-    """The rays of `launch_strips` in one bundle, (3, rays), neighbours beside each other."""
-    strips = list(launch_strips(source, lens, n, seed, area))
-    position, direction = (torch.cat([getattr(s, name) for s in strips], dim=1) for name in ("position", "direction"))
-    flux, status = (torch.cat([getattr(s, name) for s in strips]) for name in ("flux", "status"))
-    return replace(strips[0], position=position, direction=direction, flux=flux, status=status)
-
-
 def launch_strips(source: Source, lens: Lens, n: int, seed: int, area: Rectangle | None = None) -> Iterator[Rays]:
     """n x n stratified rays over `area` (default: the whole window), a strip of it at a time.
 
@@ -174,31 +156,21 @@ class Simulation:
 Lights = Sequence[tuple[float, Source, Lens, int]]  # (weight, source, lens as this light meets it, seed) of each
 
 
-def simulate(source: Source, lens: Lens, screen: Screen, n: int, seed: int) -> Simulation:
-    """The light of n x n stratified rays from the source through the lens on the screen."""
-    return simulate_all([(1.0, source, lens, seed)], screen, n)
-
-
 @torch.no_grad()
-def simulate_all(lights: Lights, screen: Screen, n: int) -> Simulation:
-    """The weighted sum of lights, of n x n stratified rays each; by a fused kernel where one serves.
+def simulate(lights: Lights, screen: Screen, n: int) -> Simulation:
+    """The weighted sum of lights, of n x n stratified rays each; by the fused kernel where it knows all interfaces.
 
     Kernel and plain form trace the same rays, and agree to rounding.
     """
     if all(fused_whole(lens.interfaces) for _, _, lens, _ in lights):
         whole = [(*light, window(light[1], light[2])) for light in lights]
         return _of_all_light(*forward.simulate(whole, screen, n))
-    return simulate_all_plain(lights, screen, n)
-
-
-def simulate_plain(source: Source, lens: Lens, screen: Screen, n: int, seed: int) -> Simulation:
-    """`simulate` in plain torch."""
-    return simulate_all_plain([(1.0, source, lens, seed)], screen, n)
+    return simulate_plain(lights, screen, n)
 
 
 @torch.no_grad()
-def simulate_all_plain(lights: Lights, screen: Screen, n: int) -> Simulation:
-    """`simulate_all` in plain torch, a strip of the window at a time."""
+def simulate_plain(lights: Lights, screen: Screen, n: int) -> Simulation:
+    """`simulate` in plain torch, a strip of the window at a time."""
     box = torch.zeros(screen.shape, dtype=torch.float64, device=lights[0][2].like.device)
     tent, flux, count = torch.zeros_like(box), {}, 0
     for weight, source, lens, seed in lights:

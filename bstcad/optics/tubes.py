@@ -24,7 +24,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed, Rays, Status, TargetPlane
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import across, from_first_free, gets_through
+from bstcad.optics.trace import across, from_first_net, gets_through
 
 ALL = slice(None)
 SHEET = 256  # tubes a side of the sheet through which finer ones are interpolated
@@ -48,7 +48,7 @@ class Tubes:
 
     def landing(self, lens: Lens, plane: TargetPlane) -> Landed:
         """Where the corners meet the plane; the outline counts in the flux, so that no corner is lost to it."""
-        return from_first_free(self.coming, lens.unbounded(), plane)
+        return from_first_net(self.coming, lens.unbounded(), plane)
 
     def collect(self, corners: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
         """(picture, outside): flux that falls into each pixel, row 0 = y max; and Σ flux · (pixels beyond the border)².
@@ -96,30 +96,8 @@ def picture(
     for first in range(0, n, BAND):
         band = sheet.rows(slice(first, min(first + BAND, n) + 1))
         x, y = (p + INWARDS * (middle - p) for p, middle in zip(band, sheet.middle, strict=True))
-        whole = whole + _picture(source, lens, screen, x, y, sheet.cut)
+        whole = whole + _tubes(source, lens, x, y, sheet.cut).picture(lens, screen)
     return whole.clamp(min=0)  # a black pixel may be off by rounding
-
-
-def _picture(source: Source, lens: Lens, screen: Screen, x: Tensor, y: Tensor, cut: bool) -> Tensor:
-    """The picture of one band, by the fused forward trace where there is one."""
-    if lens.losses is not None or not fused_whole(lens.interfaces):
-        return _tubes(source, lens, x, y, cut).picture(lens, screen)
-
-    def land(source: Source, lens: Lens, at: tuple[Tensor, Tensor]) -> Landed:
-        return forward.land(source, lens, screen.plane, *at)
-
-    points = x.reshape(-1), y.reshape(-1)
-    landed, lit = land(source, lens.grown(1 + INWARDS) if cut else lens.unbounded(), points), None
-    lost = ~(landed.alive & (landed.flux > 0))  # a ray without flux may end anyhow
-    if bool(lost.any()):
-        if cut:
-            lit = (landed.flux > 0) & (landed.status != int(Status.MISSED_FRONT))
-        again = land(source.unbounded(x, y, lens.entrance.z), lens.unbounded(), tuple(p[lost] for p in points))
-        landed.position[:, lost], landed.status[lost] = again.position, again.status
-    landed = Landed(landed.position.view(2, *x.shape), landed.flux.view(x.shape), landed.status.view(x.shape))
-    lit = None if lit is None else lit.view(x.shape)
-    flux = _density(source, lens, x, y, lit) * area_of(x, y)
-    return collect(screen.pixels_of(landed.position), arriving(flux, landed), screen.shape)[0]
 
 
 @dataclass(frozen=True)

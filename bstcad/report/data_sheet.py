@@ -25,7 +25,7 @@ from bstcad.report.part_views import NOTES, THICK, THIN, Paper, kinds_of_holes, 
 from bstcad.report.prescription import PART, Order, prescription
 from bstcad.report.units import Rows, mm, rounded_up, tables
 from bstcad.scene.mount import Mount, as_cut
-from bstcad.scene.quality import said_of
+from bstcad.scene.quality import settings_of
 from bstcad.scene.scene import Scene
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class Sheet:
             mount=self.mount, light=defaultdict(lambda: None, self.record["source"]), passed=self.passed,
             rrmsd=self.rrmsd, light_on_target=self.light_on_target, across=across, walls=wall_words,
             apertures=[_aperture(patch, self.lens.outline) for patch in self.apertures], kinds_of_holes=kinds_of_holes,
-            limits={face: said_of(self.scene.tolerance, f"{face}.form").get("limit") for face in ("front", "back")},
+            limits={face: settings_of(self.scene.tolerance, f"{face}.form").get("limit") for face in ("front", "back")},
         )  # fmt: skip
 
 

@@ -41,7 +41,7 @@ from bstcad.report.rendering import LightPath
 from bstcad.report.units import number, turned
 from bstcad.scene.picture import to_srgb
 from bstcad.scene.scene import Scene
-from bstcad.verify.checks import Verification
+from bstcad.verify.checks import Proof
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -128,15 +128,15 @@ def draw_lens(source: Source, lens: Lens, screen: Screen, view: View) -> Pngs:
     }
 
 
-def draw_light(target: np.ndarray, proof: Verification, view: View) -> Pngs:
+def draw_light(target: np.ndarray, proof: Proof, view: View) -> Pngs:
     """The pictures of the light; one of the ghost and of lines if the proof has any."""
-    found = proof.irradiance
+    found = proof.light.picture
     pictures = {
         "irradiance": light_figures.irradiance_triptych(target, found, view),
         "cross_section": light_figures.cross_section(target, found, view),
     }
-    if proof.ghost is not None:
-        pictures["ghost"] = light_figures.ghost_picture(target, proof.ghost, view)
+    if proof.light.ghost is not None:
+        pictures["ghost"] = light_figures.ghost_picture(target, proof.light.ghost, view)
     if proof.lines:
         pictures["lines"] = light_figures.lines_apart(target, found, proof.lines, view)
     return {name: png(picture) for name, picture in pictures.items()}

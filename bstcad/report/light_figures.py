@@ -354,18 +354,19 @@ def _lobe(wavelength: float, weight: float, centre: float, below: float, above: 
 
 def draw_judges(judges: Sequence[Compared], view: View) -> dict[str, bytes]:
     """The pictures by other programs, as far as they served, as PNG bytes by name."""
-    return {f"judge_{judge.name}": png(judged_picture(judge, view)) for judge in judges if not judge.declined}
+    return {f"judge_{each.judge.name}": png(judged_picture(each, view)) for each in judges if not each.judge.declined}
 
 
 @styled
-def judged_picture(judge: Compared, view: View) -> Figure:
+def judged_picture(compared: Compared, view: View) -> Figure:
     """Target, bstcad's picture, the judge's and the signed difference of these two, in % of the mean lit irradiance."""
-    pictures = {"Target": judge.target} | {
-        f"By {name} (RRMSD {rrmsd(judge.target, picture):.3g})": picture
-        for name, picture in (("bstcad", judge.ours), (judge.name, judge.theirs))
+    name = compared.judge.name
+    pictures = {"Target": compared.target} | {
+        f"By {by} (RRMSD {rrmsd(compared.target, picture):.3g})": picture
+        for by, picture in (("bstcad", compared.ours), (name, compared.theirs))
     }
     height = 0.7 + 2.2 * view.proportion
-    figure, _ = _side_by_side(pictures, f"{judge.name} − bstcad", view, height=height, spot=0.0)
+    figure, _ = _side_by_side(pictures, f"{name} − bstcad", view, height=height, spot=0.0)
     view.note(figure)
     return figure
 

@@ -22,10 +22,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.analysis.shape import FLATTEST, describe, heights, survey, thickness_range
+from bstcad.optics import quadrature
 from bstcad.optics.bspline import DEGREE
 from bstcad.optics.lens import Lens
 from bstcad.optics.media import density
-from bstcad.optics.quadrature import exact_volume
 from bstcad.optics.surfaces import sag
 from bstcad.report.units import Rows, mm, tables
 from bstcad.scene.mount import as_cut
@@ -182,7 +182,7 @@ def order_of(
         datum=DATUMS.get(mount.datum if mount else "") or _origin(lens, front + shape["centre_thickness"]),
         origin=mount.origin(front) if mount else 0.0,
         freeform=("back", "front") if lens.front.is_net else ("back",),
-        optical=("back",) if lens.reflects else ("back", "front"),
+        optical=tuple(reversed(lens.optical_faces)),
         tool_radius=min(radii, default=None),
         back_profile=stated.surface_profile,
         front_profile=stated.front_profile,
@@ -248,7 +248,7 @@ def _corners(lens: Lens, whole: WholePart | None) -> tuple[Place, Place]:
 def _volume(lens: Lens, whole: WholePart | None) -> float | None:
     """Of a part (mm³); None: it has faces that nothing here integrates."""
     if whole is None:
-        return exact_volume(lens)
+        return quadrature.of_lens(lens).volume
     return None if whole.properties is None else whole.properties.volume
 
 

@@ -23,6 +23,7 @@ from pydantic_core import to_jsonable_python
 from typing_extensions import TypedDict
 
 from bstcad.analysis.light import Blur, FinestDetail, finest_detail
+from bstcad.judges.comparison import Judge
 from bstcad.measured.form_error import MAP
 from bstcad.measured.made_part import MadePart
 from bstcad.optics.lens import Lens
@@ -31,7 +32,7 @@ from bstcad.report.prescription import Order, prescription
 from bstcad.report.units import DIGITS, Rows, number, paragraphs, percent, tables
 from bstcad.runs import files
 from bstcad.scene.scene import Scene
-from bstcad.verify.checks import CUT, DEFAULT_RRMSD_LIMIT, Verification
+from bstcad.verify.checks import CUT, DEFAULT_RRMSD_LIMIT, Proof
 from bstcad.verify.verdict import Check, verdict
 
 if TYPE_CHECKING:
@@ -194,7 +195,7 @@ class Contents:
     # the bounds on the back: asked {key of [lens]: value}, at (part of the back that is at each), rrmsd and rrmsd_freed
     # (of the design, and of the same tailored on without them, by the same tubes); None: none is asked
     bounds: Mapping[str, Any] | None = None
-    judges: tuple[Mapping[str, Any], ...] = ()  # by --against, as judges.comparison.Compared.facts has them
+    judges: tuple[Judge, ...] = ()  # by --against
     # a made part by its cloud, as measured.made_part has it: points, alignment, pv, rms, rrmsd_predicted, passed …
     measured: Mapping[str, Any] | None = None
     order: Order | None = None  # for a machine shop
@@ -231,14 +232,9 @@ class Examined:
 
 # --- put together from a design, its proof and its diagnosis ----------------------------------------------------------
 
-PROVED = (  # entries of report.json that the proof has by the same names
-    "passed", "rrmsd", "rrmsd_tent", "rrmsd_noise", "efficiency", "flux", "checks", "rrmsd_asked", "shape", "stability",
-    "blur",
-)  # fmt: skip
-
 
 def contents_of(
-    scene: Scene, lens: Lens, target: np.ndarray, proof: Verification, *, making: Making,
+    scene: Scene, lens: Lens, target: np.ndarray, proof: Proof, *, making: Making,
     circumstances: Mapping[str, Any], estimates: tuple[LeftOut, ...], diagnosis: Mapping[str, Any],
 ) -> Contents:  # fmt: skip
     """The contents of report.json.
@@ -247,15 +243,21 @@ def contents_of(
     precede.  estimates: of the effects that are left out.  diagnosis: convergence, remaining_error, limits and bounds.
     """
     known = {key: value for key, value in vars(making).items() if value is not None}
-    dark = proof.leak
+    light, dark = proof.light, proof.light.leak
     contents = Contents(
         **{**circumstances, **known},
-        **{key: getattr(proof, key) for key in PROVED},
         **diagnosis,
         name=scene.name,
         title=scene.title,
         verdict=verdict(proof.passed, ()),
-        light_on_target=proof.flux["on target"],
+        passed=proof.passed,
+        rrmsd=light.rrmsd,
+        rrmsd_tent=light.tent,
+        rrmsd_noise=light.standard_error,
+        light_on_target=light.flux["on target"],
+        efficiency=light.efficiency,
+        flux=light.flux,
+        checks=proof.checks,
         prescription=prescription(scene, lens, proof.shape),
         effects={
             "simulated": tuple(what for what, _ in simulated(scene)),
@@ -266,12 +268,16 @@ def contents_of(
         contrast=dark and dark.contrast,
         optic=scene.optic,
         quality=scene.tailoring.quality,
-        rays_traced=proof.rays,
+        rrmsd_asked=scene.accept.rrmsd,
+        rays_traced=light.rays,
+        shape=proof.shape,
+        stability=proof.stability,
+        blur=proof.blur,
         finest_detail=_finest_detail(scene, proof, estimates),
         lines=tuple(Line(line.wavelength, line.share, rrmsd(target, line.picture)) for line in proof.lines),
         estimates=estimates,
     )
-    return _remarked(contents, *remarks(contents, scene, target, proof.irradiance))
+    return _remarked(contents, *remarks(contents, scene, target, light.picture))
 
 
 def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:
@@ -295,7 +301,7 @@ def _remarked(contents: Contents, *more: str) -> Contents:
     return replace(contents, given_up=given_up, verdict=verdict(contents.passed, given_up))
 
 
-def _finest_detail(scene: Scene, proof: Verification, estimates: tuple[LeftOut, ...]) -> FinestDetail | None:
+def _finest_detail(scene: Scene, proof: Proof, estimates: tuple[LeftOut, ...]) -> FinestDetail | None:
     """The detail that the source allows: of the scene's size, or of the size that the estimates assume of a point."""
     screen = scene.target.screen
     if proof.blur:

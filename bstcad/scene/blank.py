@@ -138,7 +138,7 @@ class _Front:
         names = tuple(self.surface.parameters()) if self.optimise else ()
         return names if self.optimise is True else tuple(name for name in names if name in self.optimise)
 
-    def found(self, surface: Surface) -> Self:
+    def designed(self, surface: Surface) -> Self:
         """The same front with the parameters of this surface, and nothing left to find."""
         return replace(self, **surface.plain().parameters(), optimise=False) if self.free else self
 

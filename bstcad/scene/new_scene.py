@@ -162,7 +162,7 @@ class Written:
     """A new scene file."""
 
     path: Path
-    said: str = ""  # sentences on the light and on the detail that it leaves; "" of a template
+    sentences: str = ""  # on the light and on the detail that it leaves; "" of a template
 
 
 def new_scene(

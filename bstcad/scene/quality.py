@@ -140,7 +140,7 @@ class Tolerance(Record):
         return self.model_dump(exclude={"name"}, exclude_none=True)
 
 
-def said_of(tables: Sequence[Tolerance], error: str) -> dict[str, Any]:
+def settings_of(tables: Sequence[Tolerance], error: str) -> dict[str, Any]:
     """The keys that all tables give of an error; of a grade and a limit the later."""
     merged: dict[str, Any] = {}
     for stated in (table.stated for table in tables if table.covers(error)):

@@ -27,7 +27,7 @@ from bstcad.scene.effects import Absorption, Effect, Fresnel, losses, named, ref
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.machinability import BOUNDED, UNBOUNDED, moved_clear
 from bstcad.tailoring.slope_fit import Fit
-from bstcad.tailoring.slope_map import back_grid, follow, lit_window, slope_map
+from bstcad.tailoring.slope_map import face_grid, lit_window, slope_map, sloped
 from bstcad.tailoring.stage2 import FEW
 
 # --- a coarse lens ----------------------------------------------------------------------------------------------------
@@ -59,8 +59,8 @@ def coarse_lens(scene: Scene) -> Lens:
         wanted = slope_map(
             channel.source, lens, window, picture, screen=screen, n=CELLS, previous=wanted, iterations=STEPS
         )
-        grid = back_grid(channel.source, lens, window, 2 * NET)
-        lens = follow(lens, wanted, grid, Fit(bending=1e-2, steps=20, degree=3), unlit=0.0)
+        grid = face_grid(channel.source, lens, window, 2 * NET)
+        lens = sloped(lens, wanted, grid, Fit(bending=1e-2, steps=20, degree=3), unlit=0.0)
         lens = moved_clear(lens, z, scene.lens.min_thickness)
     return lens
 

@@ -48,7 +48,7 @@ SPARE = 1e-3  # of a bound, kept for the digits of a file and for places in betw
 # bound to 50 mm where it would take 20, ends at 0.015 by 1000 throughout, and at 0.0033 by 10.)
 WEIGHTS, ALONE = (1000.0, 100.0, 10.0), 100.0
 REPAIR = 100  # evaluations of the penalty alone, at most
-HALVINGS = 10  # of the way from a back that exceeds the bounds to one that keeps to them
+HALVINGS = 10  # of the way from a back that exceeds the bounds to a back that keeps to them
 
 
 @torch.no_grad()
@@ -113,9 +113,9 @@ def excess(lens: Lens, bounds: Bounds) -> Excess:
     """
     back = lens.back.to(torch.float64)
     square, worst, gradient = 0.0, -MARGIN, torch.zeros_like(back.heights)
-    for spans, over in _near(back, lens.outline, bounds):
+    for spans, held, bound, quantity in _near(back, lens.outline, bounds):
         leaf = spans.heights.detach().requires_grad_()
-        relative = over(replace(spans, heights=leaf).jet(QUARTERS))
+        relative = torch.where(held, quantity(replace(spans, heights=leaf).jet(QUARTERS)) / bound - 1, -MARGIN)
         squared = total(torch.relu(relative + MARGIN) ** 2)
         gradient += spans.scattered(*torch.autograd.grad(squared, leaf))
         square, worst = square + float(squared.detach()), max(worst, float(relative.detach().max()))
@@ -127,9 +127,11 @@ def excess(lens: Lens, bounds: Bounds) -> Excess:
     return Excess(square, gradient.to(lens.back.heights), worst)
 
 
-def _near(back: BSplineSurface, outline: Outline, bounds: Bounds) -> Iterator[tuple[Spans, Callable[[Jet], Tensor]]]:
-    """The spans that may come near a bound, some at a time, and the function of their jet that says by how much."""
-    for bound, most, found in (
+def _near(
+    back: BSplineSurface, outline: Outline, bounds: Bounds
+) -> Iterator[tuple[Spans, Tensor, float, Callable[[Jet], Tensor]]]:
+    """Spans that may come near a bound, some at a time: which places the outline holds, the bound, its quantity."""
+    for bound, most, quantity in (
         (bounds.concave, partial(curvature_bounds, back, 1.0), lambda jet: jet.curvatures[0]),
         (bounds.convex, partial(curvature_bounds, back, -1.0), lambda jet: -jet.curvatures[1]),
         (bounds.slope, partial(slope_bounds, back), lambda jet: jet.slope),
@@ -138,13 +140,7 @@ def _near(back: BSplineSurface, outline: Outline, bounds: Bounds) -> Iterator[tu
             continue
         near = torch.nonzero(most() > (1 - MARGIN) * bound)
         for i, j in (part.T for part in near.split(SPANS) if len(part)):
-            held = reached_by(back, outline, i, j, QUARTERS)
-            yield Spans.of(back, i, j), partial(_relative, held, bound, found)
-
-
-def _relative(held: Tensor, bound: float, found: Callable[[Jet], Tensor], jet: Jet) -> Tensor:
-    """Excess over a bound as a part of it, where the outline holds the place."""
-    return torch.where(held, found(jet) / bound - 1, -MARGIN)
+            yield Spans.of(back, i, j), reached_by(back, outline, i, j, QUARTERS), bound, quantity
 
 
 def _of_thickness(lens: Lens, bounds: Bounds) -> tuple[float, Tensor, float]:
@@ -221,10 +217,10 @@ def _bent(lens: Lens, bounds: Bounds) -> Lens:
     variable = SobolevVariable.of(back, torch.ones_like(back.heights))
 
     def in_c(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
-        found = excess(_with_heights(lens, back.heights + variable.heights(parameters[0].detach())), bounds)
-        return found.mean_square, [variable.adjoint(found.gradient)], found.worst
+        over = excess(_with_heights(lens, back.heights + variable.heights(parameters[0].detach())), bounds)
+        return over.mean_square, [variable.adjoint(over.gradient)], over.worst
 
     for reached in minimise(in_c, lbfgs([torch.zeros_like(back.heights)], REPAIR), REPAIR):
-        if reached.best.rrmsd <= -SPARE:  # in_c has the worst excess in its place
+        if reached.best.figure <= -SPARE:
             break
     return _with_heights(lens, back.heights + variable.heights(reached.best.parameters[0]))

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel, weighted_sum
-from bstcad.optics.irradiance import Screen, collect, landed_flux
+from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.reductions import elementary, total
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Landed
@@ -93,40 +93,6 @@ class TubeMerit:
         return off + self.overshoot * outside / left + lost, (total((seen - self.target) ** 2) / size).sqrt()
 
 
-def as_seen_by_tent(target: Tensor) -> Tensor:
-    """A picture whose light lies evenly in each pixel, after tent binning: [1, 6, 1] / 8 along both axes.
-
-    Comparing with this instead of the sharp picture lets a perfect lens have merit zero.
-    """
-    for _ in range(2):  # each turn takes one axis and swaps the two
-        target = torch.nn.functional.pad(target, (1, 1))
-        target = ((target[:, :-2] + 6 * target[:, 1:-1] + target[:, 2:]) / 8).T
-    return target.contiguous()
-
-
-@dataclass(frozen=True)
-class TentMerit:
-    """RRMSD² of rays by tent binning (Wang et al. 2023, Eq. 15), plus the pull of `TubeMerit`; summed over channels."""
-
-    channels: tuple[Channel, ...]
-    screen: Screen
-    target: Tensor  # (rows, columns) as seen by the tent, its flux summing to 1 before that
-    overshoot: float
-
-    @classmethod
-    def of(cls, channels: tuple[Channel, ...], screen: Screen, target: Tensor, overshoot: float) -> TentMerit:
-        """The merit for a sharp target picture."""
-        return cls(channels, screen, as_seen_by_tent(target / total(target)), overshoot)
-
-    def __call__(self, landed: tuple[Landed, ...]) -> tuple[Tensor, Tensor]:
-        """(merit, RRMSD against the target as the tent sees it) of the landed rays of each channel."""
-        flux = weighted_sum(self.channels, (total(landed_flux(rays).double()) for rays in landed))
-        images, beyond = zip(*(collect(rays, self.screen) for rays in landed), strict=True)
-        image, outside = weighted_sum(self.channels, images), weighted_sum(self.channels, beyond)
-        rrmsd2 = total((image / flux - self.target) ** 2) / total(self.target**2)
-        return rrmsd2 + self.overshoot * outside / flux, rrmsd2.detach().sqrt()
-
-
 @dataclass(frozen=True)
 class SobolevVariable:
     """Heights h (m, m) in mm as a function of c (m, m): h = p C^T (λ^-EXPONENT · C (w c) C^T) C.
@@ -172,8 +138,8 @@ def local_weight(source: Source, lens: Lens, target: np.ndarray, screen: Screen,
     column, row = (p.cpu().double().numpy() for p in screen.pixel(*landed.position))
     seen = landed.alive.cpu().numpy() & (column > 0) & (column < screen.columns) & (row > 0) & (row < screen.rows)
     picture = gaussian_filter(target / target.mean(), BLUR)
-    found = map_coordinates(picture, [row - 0.5, column - 0.5], order=1, mode="nearest")
-    logarithm = np.where(seen, np.log(np.maximum(found, MOST**-4)), 0.0)
+    irradiance = map_coordinates(picture, [row - 0.5, column - 0.5], order=1, mode="nearest")
+    logarithm = np.where(seen, np.log(np.maximum(irradiance, MOST**-4)), 0.0)
     return torch.from_numpy(np.clip(np.exp(-0.5 * gaussian_filter(logarithm, SMOOTH)), 1 / MOST, MOST))
 
 

@@ -1,8 +1,8 @@
 """Minimisers: a method queries values of the merit, so that whoever evaluates may as well stop.
 
-A problem maps a list of parameter tensors to (merit, gradients, RRMSD).  A method (`adam`, `lbfgs`) is a generator that
-yields a `Query` and is sent its `Evaluation`.  `minimise` brings the two together and says after each evaluation where
-the minimisation stands; nothing has to be done to end it there.
+A problem maps a list of parameter tensors to (merit, gradients, a figure such as RRMSD).  A method (`adam`, `lbfgs`)
+is a generator that yields a `Query` and is sent its `Evaluation`.  `minimise` brings the two together and says after
+each evaluation where the minimisation stands; nothing has to be done to end it there.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ class Best:
     """The best of the evaluations so far."""
 
     merit: float = math.inf
-    rrmsd: float = math.nan
-    latest: float = math.nan  # RRMSD of the last evaluation
+    figure: float = math.nan  # of it, as the problem tells it beside the merit: RRMSD, or the worst excess
+    latest: float = math.nan  # figure of the last evaluation
     parameters: tuple[Tensor, ...] = ()  # none while not one value was finite
     evaluations: int = 0
     skipped: int = 0  # of them, because merit or gradient was not finite
@@ -74,14 +74,15 @@ def minimise(problem: Problem, method: Method, evaluations: int, best: Best = Be
         return
     query, reason = next(method), ""
     while not reason:
-        merit, gradients, rrmsd = problem(query.parameters)
+        merit, gradients, figure = problem(query.parameters)
         skipped = best.skipped
         if not math.isfinite(merit) or not all(bool(torch.isfinite(g).all()) for g in gradients):
             merit, gradients, skipped = math.inf, [torch.zeros_like(p) for p in query.parameters], skipped + 1
-        lowest, at, seen = best.merit, best.parameters, best.rrmsd
+        lowest, at, lowest_figure = best.merit, best.parameters, best.figure
         if merit < lowest:
-            lowest, at, seen = merit, tuple(p.detach().clone() for p in query.parameters), rrmsd
-        useless, best = skipped > best.skipped, Best(lowest, seen, rrmsd, at, best.evaluations + 1, skipped)
+            lowest, at, lowest_figure = merit, tuple(p.detach().clone() for p in query.parameters), figure
+        useless = skipped > best.skipped
+        best = Best(lowest, lowest_figure, figure, at, best.evaluations + 1, skipped)
         try:
             query, reason = method.send(Evaluation(merit, gradients, best)), ""
         except StopIteration as end:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from bstcad.optics.channels import Channel, places
+from bstcad.optics.channels import Channel, points
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, measure, rrmsd_by_rays
@@ -77,9 +77,9 @@ class Task:
     channels: tuple[Channel, ...]  # the light
     screen: Screen
     target: np.ndarray  # (rows, columns), row 0 = y max, sum 1
-    knobs: Tailoring  # every one set
+    knobs: Tailoring  # with every key set
     least: float = 0.0  # thickness of the glass everywhere (mm)
-    free: tuple[str, ...] = ()  # the parameters of the front that are to be found
+    free: tuple[str, ...] = ()  # the parameters of the front that tailoring searches for
     rim_sags: tuple[float, float] = (-math.inf, math.inf)  # that such a front may have (mm)
     progress: Progress = silent  # told of the progress within a step
     grown: tuple[tuple[Channel, ...], ...] = ()  # points of the source, as it grows to its size; () of a point
@@ -101,10 +101,10 @@ class Task:
 
         (In all of the cell: with many coarse sheets a lens is better than with half as many fine ones.)
         """
-        points = max(places(self.channels)) + 1
-        if points == 1:
+        count = points(self.channels)
+        if count == 1:
             return self.knobs.rays
-        return max(round(self.knobs.rays / points**0.5), math.ceil(2**0.5 * self.knobs.levels[-1]))
+        return max(round(self.knobs.rays / count**0.5), math.ceil(2**0.5 * self.knobs.levels[-1]))
 
     def rrmsd(self, lens: Lens) -> float:
         """RRMSD by rays on the CPU, without the bias of the tubes that tailor the lens."""

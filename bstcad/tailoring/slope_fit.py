@@ -12,10 +12,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from scipy.sparse import csr_array
 from torch import Tensor
 
-from bstcad.optics.bspline import BSplineSurface, evaluate, net_gradient, prolongation
+from bstcad.optics.bspline import BSplineSurface, evaluate, net_gradient
 from bstcad.optics.interfaces import Law, intersect
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
@@ -37,41 +36,21 @@ class Fit:
     degree: int = 0  # of a polynomial that is fitted first and goes on smoothly where no ray falls
 
 
-def refine(surface: BSplineSurface, m: int) -> BSplineSurface:
-    """The same surface on m x m control points, by least squares along each axis."""
-    if m == surface.m:
-        return surface
-    carry = csr_array(prolongation(surface.m, m))  # sparse only in name: its products are sums in a fixed order
-    coarse = surface.heights.detach().cpu().double().numpy()
-    return replace(surface, heights=torch.from_numpy(carry @ (carry @ coarse.T).T).to(surface.heights))
-
-
-def refined(lens: Lens, m: int) -> Lens:
-    """The same lens with m x m control points in each of its nets."""
-    return lens.with_nets(refine(net, m) for net in lens.nets)
-
-
-def on_vertex(surface: BSplineSurface) -> BSplineSurface:
-    """The surface shifted along z so that it crosses the axis at its plane z0 (slopes do not fix the height)."""
-    zero = torch.zeros(1, dtype=surface.heights.dtype, device=surface.heights.device)
-    return replace(surface, heights=surface.heights - surface.relative_sag_and_slope(zero, zero)[0])
-
-
-def wanted_slopes(at_back: Rays, aim: Tensor, plane: TargetPlane, law: Law) -> tuple[Tensor, Tensor]:
+def wanted_slopes(at_face: Rays, aim: Tensor, plane: TargetPlane, law: Law) -> tuple[Tensor, Tensor]:
     """(∂z/∂x, ∂z/∂y) that send each ray towards aim (2, …) mm on the plane.
 
     Both laws say that η d - d' is parallel to the normal (-z_x, -z_y, 1), d and d' the directions before the face and
     behind it.  Where no face can do that, the slope turns the ray towards the same side, as far as a ray that leaves at
     GRAZING, and is no steeper than STEEPEST.
     """
-    out = way_to(at_back, aim, plane)
-    d, out = at_back.direction, out / torch.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
+    out = way_to(at_face, aim, plane)
+    d, out = at_face.direction, out / torch.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
     along = d[0] * out[0] + d[1] * out[1] + d[2] * out[2]
     least = -1.0 if law.reverses else math.cos(largest_deflection(law.eta))
     across = out - along * d
     across = across / torch.sqrt(across[0] ** 2 + across[1] ** 2 + across[2] ** 2).clamp(min=1e-12)
     out = torch.where(along < least, least * d + math.sqrt(1 - least * least) * across, out)
-    normal = at_back.sense * (law.eta * d - out)
+    normal = at_face.sense * (law.eta * d - out)
     height = torch.maximum(normal[2], torch.sqrt(normal[0] ** 2 + normal[1] ** 2) / STEEPEST)
     return -normal[0] / height, -normal[1] / height
 
@@ -186,11 +165,11 @@ def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, plane: TargetPlane, repea
     """
     coming = across(rays, lens.interfaces[: lens.freeform[-1]])
     for _ in range(repeats):
-        face = lens.last_free
+        face = lens.last_freeform
         at_face, _, _ = intersect(face.surface, coming, face.outline, face.status_if_missed)
         lit = at_face.alive & (at_face.flux > 0)
         z_x, z_y = (torch.where(lit, s, torch.zeros_like(s)) for s in wanted_slopes(at_face, aim, plane, face.law))
         x, y, _ = at_face.position
         flat = (t.reshape(-1) for t in (x, y, z_x, z_y, lit.to(x)))
-        lens = lens.with_last_net(on_vertex(fit_slopes(face.surface, *flat)))
+        lens = lens.with_last_net(fit_slopes(face.surface, *flat).from_vertex().moved(face.surface.z))
     return lens

@@ -39,7 +39,7 @@ from bstcad.optics.sources import Source
 from bstcad.optics.trace import across, clear_window, gets_through
 from bstcad.optics.tubes import rays_to
 from bstcad.scene.errors import SceneError
-from bstcad.tailoring.slope_fit import Fit, fit_slopes, on_vertex, wanted_slopes
+from bstcad.tailoring.slope_fit import Fit, fit_slopes, wanted_slopes
 from bstcad.transport.bfm import Step
 from bstcad.transport.density import Density, spread
 from bstcad.transport.mapping import Frame, Mapping, TransportMap, nodes, solve
@@ -51,11 +51,11 @@ TARGET_FLOOR = 1e-3  # of the mean: flux that the map may spend on black parts
 
 
 @dataclass(frozen=True)
-class BackGrid:
-    """Cell centres of a rectangle of the back face, and the light that meets it there."""
+class FaceGrid:
+    """Cell centres of a rectangle of the last freeform face, and the light that meets it there."""
 
     window: Rectangle  # in x and y, centred (mm)
-    at_back: Rays  # (3, n, n): position on the back face, direction before it
+    at_face: Rays  # (3, n, n): position on the face, direction before it
     density: Tensor  # (n, n) flux per mm² of the x-y plane
 
     @property
@@ -65,36 +65,36 @@ class BackGrid:
 
 
 @torch.no_grad()
-def back_grid(source: Source, lens: Lens, window: Rectangle, n: int) -> BackGrid:
-    """The ray that meets the back face at each of n x n points.
+def face_grid(source: Source, lens: Lens, window: Rectangle, n: int) -> FaceGrid:
+    """The ray that meets the last freeform face at each of n x n points.
 
     Its flux density is the source's on the vertex plane of the first surface times |∂q/∂b|, q where the ray crosses
     that plane, less the losses at the faces and in the glass, with the present back.
     """
     x, y = (t.to(lens.like.device) for t in sampling.grid(window, n))
     number = lens.freeform[-1]
-    q_x, q_y, at_back = rays_to(source, lens, x, y, number)
+    q_x, q_y, at_face = rays_to(source, lens, x, y, number)
     coming = across(source.rays(q_x, q_y, lens.entrance.z, 1.0), lens.interfaces[:number])
     steps = (window.width / n, window.height / n)
     xx, xy = torch.gradient(q_x, spacing=steps)
     yx, yy = torch.gradient(q_y, spacing=steps)
-    through = lens.last_free.outline.contains(x, y) & coming.alive & at_back.alive
+    through = lens.last_freeform.outline.contains(x, y) & coming.alive & at_face.alive
     lossless = lens.losses is None
-    density = source.irradiance(q_x, q_y, lens.entrance.z) if lossless else cross(coming, lens.last_free).rays.flux
+    density = source.irradiance(q_x, q_y, lens.entrance.z) if lossless else cross(coming, lens.last_freeform).rays.flux
     density = density * (xx * yy - xy * yx).abs() * through
-    return BackGrid(window, at_back, density)
+    return FaceGrid(window, at_face, density)
 
 
 def lit_window(source: Source, lens: Lens, n: int = 128) -> Rectangle:
-    """The rectangle of the back face that light meets, with two cells to spare; SceneError if none is found."""
-    half_x, half_y = lens.last_free.outline.half_extent
-    grid = back_grid(source, lens, Rectangle(2 * half_x, 2 * half_y), n)
+    """The rectangle of the last freeform face that light meets, with two cells to spare; SceneError if none does."""
+    half_x, half_y = lens.last_freeform.outline.half_extent
+    grid = face_grid(source, lens, Rectangle(2 * half_x, 2 * half_y), n)
     lit = grid.density > 0
     if not bool(lit.any()):
         raise SceneError(
             "source: no ray from it to the back face was found; move it away from the front, or the back nearer to it"
         )
-    x, y, _ = grid.at_back.position
+    x, y, _ = grid.at_face.position
     reach = ((float(p.abs()[lit].max()) + 2.5 * 2 * half / n, half) for p, half in ((x, half_x), (y, half_y)))
     return Rectangle(*(2 * min(r, half) for r, half in reach))
 
@@ -125,13 +125,13 @@ def slope_map(
     window: `lit_window` of the lens.
     """
     side = max(window.width, window.height)
-    grid = back_grid(source, lens, Rectangle(side, side), n * SUBCELLS)
+    grid = face_grid(source, lens, Rectangle(side, side), n * SUBCELLS)
     rho = grid.density.cpu().double().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3))
     k = _insensitive(grid, lens, screen)
     t_x, t_y = pixel_corners(screen)
     b_x, b_y = previous.places if previous else (np.zeros_like(t_x), np.zeros_like(t_y))
     y_x, y_y = _needed(grid, lens, screen.plane, (b_x, b_y), (t_x, t_y))
-    sign = -1.0 if lens.last_free.law.reverses else 1.0
+    sign = -1.0 if lens.last_freeform.law.reverses else 1.0
     y_x, y_y = sign * (y_x + k * b_x), sign * (y_y + k * b_y)
     sigma, frame = spread_density(picture, (y_x, y_y), n)
     mapping = solve(Density.from_values(rho), sigma, Frame((0.0, 0.0), side), frame, **solver)
@@ -147,7 +147,7 @@ def _moved(picture: np.ndarray, before: tuple[np.ndarray, np.ndarray], now: tupl
     return float(np.sqrt(np.mean(x * x + y * y)))
 
 
-def follow(lens: Lens, wanted: SlopeMap, grid: BackGrid, fit: Fit, unlit: float, parts: int = 1) -> Lens:
+def sloped(lens: Lens, wanted: SlopeMap, grid: FaceGrid, fit: Fit, unlit: float, parts: int = 1) -> Lens:
     """The lens whose last net has the wanted slopes where light meets it, by least squares; it keeps its vertex.
 
     Where no light falls the slopes it has now are wanted with the weight `unlit`; zero leaves that part to the bending.
@@ -160,15 +160,15 @@ def follow(lens: Lens, wanted: SlopeMap, grid: BackGrid, fit: Fit, unlit: float,
     _, now_x, now_y = net.relative_sag_and_slope(x, y)
     z_x, z_y = (torch.where(lit, s, now) for s, now in zip(wanted.slopes(x, y), (now_x, now_y), strict=True))
     weight = torch.where(lit, 1.0, unlit).to(x)
-    return lens.with_last_net(on_vertex(fit_slopes(net, x, y, z_x, z_y, weight, fit)))
+    return lens.with_last_net(fit_slopes(net, x, y, z_x, z_y, weight, fit).from_vertex().moved(net.z))
 
 
-def _insensitive(grid: BackGrid, lens: Lens, screen: Screen) -> float:
+def _insensitive(grid: FaceGrid, lens: Lens, screen: Screen) -> float:
     """k (1/mm): minus the mean of ∂p/∂b for the middle of the target, by a linear fit over the lit part."""
     middle = [sum(ends) / 2 for ends in (screen.x, screen.y)]
-    x, y, _ = grid.at_back.position
+    x, y, _ = grid.at_face.position
     aim = torch.stack([torch.full_like(x, m) for m in middle])
-    p = wanted_slopes(grid.at_back, aim, screen.plane, lens.last_free.law)
+    p = wanted_slopes(grid.at_face, aim, screen.plane, lens.last_freeform.law)
     weight = grid.density / total(grid.density)
     moment = spread = 0.0
     for slope, place in zip(p, (x, y), strict=True):
@@ -178,7 +178,7 @@ def _insensitive(grid: BackGrid, lens: Lens, screen: Screen) -> float:
     return -moment / spread
 
 
-def _needed(grid: BackGrid, lens: Lens, plane: TargetPlane, b: tuple, t: tuple) -> tuple[np.ndarray, np.ndarray]:
+def _needed(grid: FaceGrid, lens: Lens, plane: TargetPlane, b: tuple, t: tuple) -> tuple[np.ndarray, np.ndarray]:
     """p(b, t): the slopes that send the light at b (mm) to t (mm) on the plane; direction and sag bilinear at b."""
     sizes = (grid.window.width, grid.window.height)
     where = [(np.asarray(p) / size + 0.5) * grid.n - 0.5 for p, size in zip(b, sizes, strict=True)]
@@ -186,12 +186,12 @@ def _needed(grid: BackGrid, lens: Lens, plane: TargetPlane, b: tuple, t: tuple) 
     def at(values: Tensor) -> Tensor:
         return torch.from_numpy(map_coordinates(values.cpu().double().numpy(), where, order=1, mode="nearest"))
 
-    position = torch.stack([torch.from_numpy(b[0]), torch.from_numpy(b[1]), at(grid.at_back.position[2])])
-    d_x, d_y, d_z = (at(d) for d in grid.at_back.direction)
+    position = torch.stack([torch.from_numpy(b[0]), torch.from_numpy(b[1]), at(grid.at_face.position[2])])
+    d_x, d_y, d_z = (at(d) for d in grid.at_face.direction)
     direction = torch.stack([d_x, d_y, d_z]) / torch.sqrt(d_x * d_x + d_y * d_y + d_z * d_z)
-    rays = replace(grid.at_back, position=position, direction=direction)
+    rays = replace(grid.at_face, position=position, direction=direction)
     aim = torch.stack([torch.from_numpy(t[0]), torch.from_numpy(t[1])])
-    p = wanted_slopes(rays, aim, plane, lens.last_free.law)
+    p = wanted_slopes(rays, aim, plane, lens.last_freeform.law)
     return p[0].numpy(), p[1].numpy()
 
 
@@ -274,5 +274,5 @@ def aim_points(mapping: Mapping, lens: Lens, screen: Screen, x: Tensor, y: Tenso
     """(2, …) the points on the screen (mm) to which the map sends the points (x, y) (mm)."""
     sent = mapping(x.detach().cpu().double().numpy(), y.detach().cpu().double().numpy())
     if screen.is_tilted:
-        sent = screen.plane.found(*sent, lens.front.z)
+        sent = screen.plane.from_seen(*sent, lens.front.z)
     return torch.stack([torch.from_numpy(np.ascontiguousarray(s)) for s in sent]).to(x)

@@ -26,8 +26,8 @@ from bstcad.scene.scene import INSIDE
 from bstcad.tailoring.machinability import moved_clear
 from bstcad.tailoring.merit import landing
 from bstcad.tailoring.run import Parameters, Step, Task
-from bstcad.tailoring.slope_fit import Fit, refined, tailor_to_aim
-from bstcad.tailoring.slope_map import SlopeMap, aim_points, back_grid, follow, lit_window, map_to_target, slope_map
+from bstcad.tailoring.slope_fit import Fit, tailor_to_aim
+from bstcad.tailoring.slope_map import SlopeMap, aim_points, face_grid, lit_window, map_to_target, slope_map, sloped
 from bstcad.transport.bfm import Step as TransportStep
 from bstcad.transport.mapping import Mapping
 
@@ -62,22 +62,22 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[S
     """Stage 1 from a blank lens, or further from a state: its rounds, and the other way where they come to little."""
     lens = task.heaviest.through(lens)
     if state is None and task.free:
-        coarse = refined(lens, task.knobs.levels[0])
-        found = shaped_front(
+        coarse = lens.refined(task.knobs.levels[0])
+        shaped = shaped_front(
             task.heaviest.source, coarse, task.target, task.screen, task.free, task.rim_sags,
             iterations=task.knobs.transport_iterations,
         )  # fmt: skip
-        lens = lens.with_front(found.front)
+        lens = lens.with_front(shaped.front)
     for last in follow_slopes(task, lens, state):
         yield last
-    found, judged = last.lens, task.rrmsd(last.lens)
+    first, judged = last.lens, task.rrmsd(last.lens)
     yield replace(last, state=None, judged=judged)
     if not doubtful(judged, last.state):
         return
-    other, mapping = follow_aims(task, lens.with_front(found.front))
+    other, mapping = follow_aims(task, lens.with_front(first.front))
     value = task.rrmsd(other)
     better = value < np.nan_to_num(judged, nan=np.inf)  # NaN: no light on the target
-    if better and task.used(other) >= KEPT_LIGHT * task.used(found):
+    if better and task.used(other) >= KEPT_LIGHT * task.used(first):
         yield Step(lambda: other, mapping=mapping, judged=value)
 
 
@@ -100,7 +100,7 @@ def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> It
             lens, wanted = _round(task, lens, wanted, turn)
             lens = moved_clear(lens, z, task.least, task.bounds)  # the next round reckons with where the back is now
         yield Step(
-            partial(refined, lens, knobs.levels[-1]),
+            partial(lens.refined, knobs.levels[-1]),
             SlopeRound(turn + 1, Parameters.of(lens), wanted),
             wanted.mapping,
             wanted.places,
@@ -117,7 +117,7 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[
     def progress(s: TransportStep) -> None:
         task.progress("stage 1", turn, knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
 
-    lens = refined(lens, m)
+    lens = lens.refined(m)
     window = lit_window(source, lens)
     wanted = slope_map(
         source, lens, window, task.target, task.screen, coarse, wanted,
@@ -125,8 +125,8 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[
     )  # fmt: skip
     side = min(2 * m, knobs.rays)
     parts = math.ceil(side / LIT)
-    grid = back_grid(source, lens, window, math.ceil(side / parts))
-    return follow(lens, wanted, grid, *(FINE if left <= 2 else COARSE), parts), wanted
+    grid = face_grid(source, lens, window, math.ceil(side / parts))
+    return sloped(lens, wanted, grid, *(FINE if left <= 2 else COARSE), parts), wanted
 
 
 def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
@@ -139,7 +139,7 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
     knobs, z = task.knobs, lens.back.z
     for turn in range(AIMS):
         n, m = (COARSEST_GRID, knobs.levels[0]) if turn < AIMS - 1 else (knobs.transport_grid, knobs.levels[-1])
-        lens = refined(lens, m)
+        lens = lens.refined(m)
         rays, wanted, mapping = aimed_rays(
             task.heaviest.source, lens, task.target, task.screen, n, aimed(m, knobs.rays), knobs.transport_iterations
         )
@@ -206,12 +206,12 @@ def _with(lens: Lens, **values: float) -> Lens:
 
 def _along(name: str, merit: Merit, lens: Lens, bounds: Range, tolerance: float) -> Lens:
     """The lens with the best value of one parameter by a bounded scalar search (Brent), its own value included."""
-    found = scipy.optimize.minimize_scalar(
+    search = scipy.optimize.minimize_scalar(
         lambda value: merit(_with(lens, **{name: float(value)})), bounds=bounds, method="bounded",
         options={"maxiter": EVALUATIONS, "xatol": tolerance},
     )  # fmt: skip
     start = float(lens.front.parameters()[name])
-    best = float(found.x) if found.fun < merit(_with(lens, **{name: start})) else start
+    best = float(search.x) if search.fun < merit(_with(lens, **{name: start})) else start
     return _with(lens, **{name: best})
 
 
@@ -230,10 +230,10 @@ def _together(merit: Merit, lens: Lens, rim_sags: Range) -> Lens:
     low, high = _curvatures(lens, rim_sags)
     step = (high - low) / 16 * (1 if c + (high - low) / 16 <= high else -1)
     simplex = np.array([[c, k], [c + step, k], [c, k - 1.0]])
-    found = scipy.optimize.minimize(
+    search = scipy.optimize.minimize(
         at, simplex[0], method="Nelder-Mead", options={"initial_simplex": simplex, "maxfev": BOTH, "xatol": 1e-5}
     )
-    best = found.x if found.fun < math.inf else simplex[0]
+    best = search.x if search.fun < math.inf else simplex[0]
     return _with(lens, curvature=float(best[0]), conic_constant=float(best[1]))
 
 

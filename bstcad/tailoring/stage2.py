@@ -19,15 +19,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bstcad.optics.channels import points
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import a_side, extended, images, rrmsd_by_tubes
+from bstcad.optics.measure import a_side, images, rrmsd_by_tubes
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.machinability import excess, weight
 from bstcad.tailoring.merit import SobolevVariable, TubeMerit, local_weight
 from bstcad.tailoring.minimise import Best, Reached, Search, lbfgs, minimise
 from bstcad.tailoring.run import EVALUATED, Parameters, Step, Task
-from bstcad.tailoring.slope_fit import refine
 
 ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))  # (tubes a side, evaluations), as shares of the knobs
 # The same where even the last round has fewer than DENSE tubes a control cell each way.  The first ones then bend the
@@ -65,8 +65,8 @@ class Place:
 
     round: int
     done: int  # evaluations before this search
-    last: int  # how many there will have been at the end of this round
-    goal: float  # RRMSD by its own tubes at which it asks whether the accuracy is reached
+    round_end: int  # evaluations at the end of this round
+    goal_by_tubes: float  # RRMSD by its own tubes at which it asks whether the accuracy is reached
     sheet_from: Parameters  # of the lens that the tubes were launched for
     search_from: Parameters  # of the lens that this search started from
 
@@ -85,7 +85,7 @@ def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Iterator[S
 
     The error is large at first, and few tubes resolve it as well as many; the last round corrects the finer errors.
     """
-    return follow(tuple(Round(task, *round) for round in sheets(task.knobs)), lens, state)
+    return run_rounds(tuple(Round(task, *round) for round in sheets(task.knobs)), lens, state)
 
 
 def sheets(knobs: Tailoring) -> Iterator[tuple[int, int]]:
@@ -98,7 +98,7 @@ def sheets(knobs: Tailoring) -> Iterator[tuple[int, int]]:
         yield max(round(tubes * knobs.rays), least), round(share * knobs.stage2_iterations)
 
 
-def follow(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = None) -> Iterator[Step]:
+def run_rounds(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = None) -> Iterator[Step]:
     """A stage, one round after the other, or on from a state of it.
 
     Ends when the evaluations are spent, on a plateau of the last round, or when its light reaches the accuracy asked
@@ -113,13 +113,13 @@ def follow(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = None)
         now, bound_weight = rounds[number], weight(number, len(rounds))
         task, part = now.task, now.name
         if state is None:
-            place = replace(place, round=number, last=place.done + now.evaluations, sheet_from=Parameters.of(lens))
-        if place.last <= place.done:
+            place = replace(place, round=number, round_end=place.done + now.evaluations, sheet_from=Parameters.of(lens))
+        if place.round_end <= place.done:
             continue
         target = torch.from_numpy(task.target).to(lens.like.device)
         launched = place.sheet_from.applied(lens)
         merit = TubeMerit.of(task.channels, launched, now.tubes, task.screen, target, _pull(task, launched))
-        while place.done < place.last:
+        while place.done < place.round_end:
             if state is None:
                 place = replace(place, search_from=Parameters.of(lens))
             begun = place.search_from.applied(lens)
@@ -131,7 +131,7 @@ def follow(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = None)
             place, reason = replace(place, done=place.done + reached.best.evaluations), reached.reason
             if reason == "accuracy" and (judged := task.rrmsd(lens)) > accuracy:
                 # the tubes flatter a little: ask more of them
-                place = replace(place, goal=place.goal * accuracy / judged)
+                place = replace(place, goal_by_tubes=place.goal_by_tubes * accuracy / judged)
                 reason = "evaluations"  # so it will have been, if none are left
             elif reason != "evaluations":
                 break
@@ -150,7 +150,7 @@ def rrmsd_without_bounds(task: Task, lens: Lens) -> float:
     knobs = task.knobs.model_copy(update={"accuracy": None})
     free = replace(task, bounds=None, grown=(), knobs=knobs)
     evaluations = max(FEWEST, round(UNBOUNDED_SHARE * knobs.stage2_iterations))
-    *_, last = follow((Round(free, task.tubes, evaluations),), lens)
+    *_, last = run_rounds((Round(free, task.tubes, evaluations),), lens)
     return task.rrmsd(last.lens)
 
 
@@ -160,7 +160,7 @@ def _pull(task: Task, lens: Lens) -> float:
     Within w of the border some light falls outside whatever the lens does, and to be pulled in would blur the edge.
     """
     overshoot = task.knobs.overshoot
-    if not extended(task.channels):
+    if points(task.channels) == 1:
         return overshoot
     return overshoot / (1 + images(task.channels, lens, task.screen, SEEN).width() ** 2)
 
@@ -172,16 +172,16 @@ def _search(
 
     total: evaluations of all rounds; bound_weight: weight of the penalty on exceeding the bounds of the back.
     """
-    task, evaluations = now.task, place.last - place.done
+    task, evaluations = now.task, place.round_end - place.done
     variables, work = variables_of(task, lens), 0.0  # the first step also sets this up: its time is not known
     for reached in search(lens, Problem(lens, merit, task.bounds, bound_weight), variables, evaluations, state):
         best, reason = reached.best, reached.reason
         step = Step(partial(improved, lens, variables, best), work=work, skipped=reached.skipped)
         if not reached.skipped:
             done = min(place.done + best.evaluations, total)  # a line search may run over a little
-            progress = (now.stage, done, total, f"RRMSD {best.rrmsd:.4f}")
-            step = replace(step, rrmsd=best.rrmsd, progress=progress)
-            reason = "accuracy" if best.rrmsd <= place.goal else reason
+            progress = (now.stage, done, total, f"RRMSD {best.figure:.4f}")
+            step = replace(step, rrmsd=best.figure, progress=progress)
+            reason = "accuracy" if best.figure <= place.goal_by_tubes else reason
         if reached.state is not None and not reason:
             step = replace(step, state=TubeSearch(place, best, reached.state))
         yield replace(reached, reason=reason), step
@@ -276,7 +276,7 @@ def with_stage3(stage2: Stage2, task: Task, lens: Lens, state: Any = None) -> It
                 last = replace(last, judged=whole.rrmsd(last.lens))
             yield replace(last, reason="")
         lens, state = last.lens, None
-    for step in follow(stage3_rounds(task), lens, state and state.grown):
+    for step in run_rounds(stage3_rounds(task), lens, state and state.grown):
         yield replace(step, state=step.state and Grown(step.state))
 
 
@@ -306,7 +306,7 @@ def compare_precisions(task: Task, lens: Lens) -> Comparison:
 
     Rounding decides where a line search ends; the two may part by more than rounding and be equally good.
     """
-    lens = lens.with_nets(refine(net, min(net.m, NET)) for net in lens.nets)
+    lens = lens.with_nets(net.refined(min(net.m, NET)) for net in lens.nets)
     (merit, gradient, single), (exact, wanted, double) = (
         _tried(task, lens.to(d)) for d in (torch.float32, torch.float64)
     )

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from bstcad.optics.lens import Lens
 from bstcad.scene.errors import SceneError
-from bstcad.scene.quality import FORM, NONE, RIPPLE, Tolerance, said_of
+from bstcad.scene.quality import FORM, NONE, RIPPLE, Tolerance, settings_of
 from bstcad.tolerance.perturbations import Kind, Perturbation, Setup, form_error, kinds, ripple
 
 USUAL = "diamond-turned"
@@ -84,7 +84,7 @@ def whole_table(table: Sequence[Tolerance], grade: str | None = None) -> tuple[T
 
 def start_of(table: Sequence[Tolerance]) -> str:
     """Grade of all errors that a whole table does not name; "none": they are zero."""
-    return said_of([entry for entry in table if entry.name is None], "")["grade"]
+    return settings_of([entry for entry in table if entry.name is None], "")["grade"]
 
 
 def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None = None) -> tuple[Perturbation, ...]:
@@ -93,30 +93,31 @@ def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None
     Errors that the lens's net is too coarse for are left out, unless the table names them.  Raises SceneError, in a
     sentence, for tables of errors that do not exist.
     """
-    found = []
+    errors = []
     for kind in kinds(setup, material).values():
-        told = said_of(table, kind.name)
+        told = settings_of(table, kind.name)
         if told.get("grade") != NONE:
             size = told["limit"] if "limit" in told else limit(kind, GRADES[told["grade"]], setup)
-            found.append(Perturbation(kind, size, told.get("distribution", "normal"), told.get("cost", 1.0)))
-    found += _of_faces(setup.lens, table)
+            errors.append(Perturbation(kind, size, told.get("distribution", "normal"), told.get("cost", 1.0)))
+    errors += _of_faces(setup.lens, table)
     for k, entry in enumerate(table[1:]):
-        none = entry.name and said_of(table, entry.name).get("grade") == NONE
-        if entry.name and not none and not any(entry.covers(error.kind.name) for error in found):
+        none = entry.name and settings_of(table, entry.name).get("grade") == NONE
+        if entry.name and not none and not any(entry.covers(error.kind.name) for error in errors):
             raise SceneError(
                 f"tolerance[{k}].name: {entry.name!r} changes nothing here, or the scene does not say by how much "
                 "(a lens.material does, of temperature and wavelength); remove that table"
             )
-    if not found:
+    if not errors:
         raise SceneError('tolerance: nothing can be off; give a grade other than "none", or name errors with a limit')
-    return tuple(found)
+    return tuple(errors)
 
 
 def _of_faces(lens: Lens, table: Sequence[Tolerance]) -> Iterator[Perturbation]:
     """Form errors and ripple; of the front if the table names it: that takes twice as long to trace."""
     for name in (*FORM, *RIPPLE):
-        told, by_name = said_of(table, name), any(entry.name == name for entry in table)
-        if told.get("grade") == NONE or (name.startswith("front") and (lens.reflects or not by_name)):
+        told, by_name = settings_of(table, name), any(entry.name == name for entry in table)
+        face = name.partition(".")[0]
+        if told.get("grade") == NONE or face not in lens.optical_faces or not (by_name or face == "back"):
             continue
         grade, cost = GRADES[told.get("grade", USUAL)], told.get("cost", 1.0)
         try:
@@ -125,7 +126,7 @@ def _of_faces(lens: Lens, table: Sequence[Tolerance]) -> Iterator[Perturbation]:
                 yield Perturbation(kind, told.get("limit", grade.ripple), told.get("distribution", "normal"), cost)
                 continue
             length = told.get("correlation_length", grade.form_length * 2 * min(lens.outline.half_extent))
-            size, face = told.get("limit", grade.form) / math.sqrt(MODES), name.partition(".")[0]
+            size = told.get("limit", grade.form) / math.sqrt(MODES)
             for seed in range(MODES):
                 yield Perturbation(form_error(lens, length, seed, face), size, "field", cost)
         except ValueError as error:  # finer than the net

@@ -154,17 +154,18 @@ def model(pictures: Pictures, progress: Progress = lambda *told: None, spread: S
     total, done = 1 + 2 * n + sum(map(len, nodes)), count(1)
 
     def traced(amounts: Sequence[np.ndarray]) -> Iterator[np.ndarray]:
-        for found in spread(Pictures.of, pictures, [z * sigmas for z in amounts]):
+        for picture in spread(Pictures.of, pictures, [z * sigmas for z in amounts]):
             progress("sensitivity", next(done), total, "")
-            yield found
+            yield picture
 
-    found = traced([np.zeros(n), *(way * STEP * e for e in np.eye(n) for way in (1, -1))])
-    nominal = next(found)
-    first = np.stack([(up - next(found)) / (2 * STEP) for up in found])
+    straight = traced([np.zeros(n), *(way * STEP * e for e in np.eye(n) for way in (1, -1))])
+    nominal = next(straight)
+    first = np.stack([(up - next(straight)) / (2 * STEP) for up in straight])
     strength, directions = main_axes(gram(first))
     nodes = nodes[: int(np.sum(strength[:BENT] >= WEAK**2 * strength[0]))]
     bent = [
-        found - nominal for found in traced([xi * directions[:, k] for k, along in enumerate(nodes) for xi in along])
+        picture - nominal
+        for picture in traced([xi * directions[:, k] for k, along in enumerate(nodes) for xi in along])
     ]
     every = np.concatenate([np.stack([nominal, *bent]), product(directions.T[len(nodes) :], first)])
     return Model(sigmas, first, directions, nodes=tuple(nodes), gram=gram(every))
@@ -178,11 +179,11 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def gram(rows: np.ndarray) -> np.ndarray:
     """(n, n) products of all pairs of rows (n, long)."""
     vectors = [torch.from_numpy(np.ascontiguousarray(row)) for row in rows]
-    found = np.empty((len(vectors), len(vectors)))
+    products = np.empty((len(vectors), len(vectors)))
     for i, a in enumerate(vectors):
         for j, b in enumerate(vectors[: i + 1]):
-            found[i, j] = found[j, i] = dot(a, b)
-    return found
+            products[i, j] = products[j, i] = dot(a, b)
+    return products
 
 
 def main_axes(symmetric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -21,7 +21,7 @@ from bstcad.analysis.shape import describe, survey
 from bstcad.cad import mesh as meshes
 from bstcad.optics import quadrature
 from bstcad.optics.channels import Channel
-from bstcad.optics.irradiance import Leak, Screen, leak
+from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import (
     FAINT,
@@ -78,7 +78,7 @@ class Nominal:
     seed: int
     stored_target: np.ndarray  # as design.npz has it
     mesh_tolerance: float = 1e-3  # mm; how far the facets of the mesh may lie from the lens
-    mesh_asked: bool = True  # by the scene; else a mesh of as many triangles as one may have is as fine as it gets
+    mesh_asked: bool = True  # by the scene; else the mesh with the most triangles is fine enough
     ghost: GhostLight | None = None  # how light reflected twice in the lens is followed; None: it is left out
     mount: Mount | None = None  # how the lens is held in part.step; None: there is none
     blank: LensBlank | None = None  # with the bounds on its back, if there are any
@@ -93,25 +93,16 @@ class Nominal:
 
 
 @dataclass(frozen=True)
-class Verification:
+class Proof:
     """The outcome of the proof of a design's files."""
 
     checks: tuple[Check, ...]
-    irradiance: np.ndarray  # (rows, columns) box pixels, scaled to the target's sum
     lens: Lens  # as re-read from lens.step; with a mount that of part.step, with its clear apertures
-    rrmsd: float
-    rrmsd_asked: float | None  # accept.rrmsd
-    rrmsd_tent: float
-    rrmsd_noise: float
-    efficiency: float
-    flux: dict[str, float]  # where the source's light goes; the lines sum to 1
-    rays: int
+    light: Light  # that it throws on the target
     shape: dict[str, float | None]  # of the lens within the mount's rim; volume: of lens.step
     stability: dict[str, float | int | None]
     blur: Blur | None = None  # by the source's size; None: it is a point, or a beam of parallel light
-    ghost: np.ndarray | None = None  # the part of `irradiance` that was reflected twice in the lens; None: left out
     lines: tuple[Line, ...] = ()  # of a spectrum, each by itself
-    leak: Leak | None = None  # of the rays' picture; None: the target is dark nowhere
     at_bounds: dict[str, float] | None = None  # share of the back that is at each bound on it, by key; None: no bounds
 
     @property
@@ -126,7 +117,7 @@ def verify(
     submit: Submit = here,
     known: Callable[[Lens], None] = lambda lens: None,
     effort: Effort | None = None,
-) -> Verification:
+) -> Proof:
     """Check lens.step and lens.stl in `folder` against the design; ValueError if one of them cannot be read at all.
 
     With bstcad.runs.processes.submit OCC reads the STEP file in its own process, while this one reads its text and the
@@ -146,7 +137,7 @@ def verify(
     mesh = meshes.read_stl(folder / "lens.stl")
     sealed = Check.true("STL watertight, winding consistent", meshes.is_closed(mesh))
     lens = _result(lens, path)
-    whole = replace(quadrature.of_lens(lens), volume=quadrature.exact_volume(lens))  # not as it was stated
+    whole = quadrature.of_lens(lens)  # not as it was stated
     lit, of_aperture, why = (lens, (), "") if mount is None else _as_made(seen, lens, nominal, folder)
     known(lit)
     light = measure(lit, nominal.channels, nominal.screen, nominal.target, effort, nominal.ghost, nominal.draw)
@@ -157,7 +148,6 @@ def verify(
     shape = describe(cut, effort.places) | {"volume": whole.volume}
     stability = _stability(lit, nominal, light, shape)
     machined, at_bounds = of_bounds(cut, nominal.blank, shape)
-    dark = leak(light.mean, nominal.target)
     margin = math.nan if stability["tir_margin_deg"] is None else stability["tir_margin_deg"]
     checks = (
         *text_checks.of_lens(text, nominal.lens),
@@ -172,29 +162,16 @@ def verify(
         *_facets(mesh, lens, shape["volume"], nominal),
         _picture(nominal.stored_target, nominal.target),
         *_because(why, _of_light(light, nominal.accept, "meets the mirror" if lens.reflects else "enters the lens")),
-        *([] if dark is None else [Check.at_most(DARK, dark.share, nominal.accept.leak)]),
+        *([] if light.leak is None else [Check.at_most(DARK, light.leak.share, nominal.accept.leak)]),
         *([] if lens.reflects else [Check.at_least(TOTAL_REFLECTION, margin, None, "deg")]),
         Check.at_most("values that are not finite", stability["non_finite"], 0),
     )
-    return Verification(
-        checks=checks,
-        irradiance=light.picture,
-        lens=lit,
-        rrmsd=light.rrmsd,
-        rrmsd_asked=nominal.accept.rrmsd,
-        rrmsd_tent=light.tent,
-        rrmsd_noise=light.standard_error,
-        efficiency=light.efficiency,
-        flux=light.flux,
-        rays=light.rays,
-        shape=shape,
-        stability=stability,
+    return Proof(
+        checks, lit, light, shape, stability=stability,
         blur=blur(nominal.channels, lit, nominal.screen, nominal.target),
-        ghost=light.ghost,
         lines=lines_apart(lit, nominal.channels, nominal.screen, nominal.target, max(LINE_TUBES, tubes_of(lit))),
-        leak=dark,
         at_bounds=at_bounds or None,
-    )
+    )  # fmt: skip
 
 
 def _as_made(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> tuple[Lens, Sequence[Check], str]:
@@ -209,14 +186,14 @@ def _as_made(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> tuple[
     except ValueError as error:
         lens = replace(bare, clear=designed.clear)
         checks = [Check.true("part.step: clear apertures can be measured", False, str(error))]
-    found = mount_losses(lens, nominal.channels, None if flange is None else (flange.z, flange.z + flange.thickness))
-    checks.append(Check.at_most(CUT, found.cut, None))
+    losses = mount_losses(lens, nominal.channels, None if flange is None else (flange.z, flange.z + flange.thickness))
+    checks.append(Check.at_most(CUT, losses.cut, None))
     if flange is not None:
         where = "a wall of its opening stands in the way; make the flange thinner, or put it where it meets the lens"
         name = "part.step: light that meets the flange"
-        checks.append(Check.at_most(name, found.on_flange, MAX_ON_FLANGE, where=where))
-    why = f"the mount leaves {_words(lens.apertures[1])} of the back and cuts away {100 * found.cut:.3g} % of the light"
-    return lens, checks, why if found.cut > CUT_EXCUSE else ""
+        checks.append(Check.at_most(name, losses.on_flange, MAX_ON_FLANGE, where=where))
+    why = f"the mount leaves {lens.apertures[1].words} of the back and cuts away {100 * losses.cut:.3g} % of the light"
+    return lens, checks, why if losses.cut > CUT_EXCUSE else ""
 
 
 def _because(why: str, checks: Sequence[Check]) -> list[Check]:
@@ -228,20 +205,12 @@ def _because(why: str, checks: Sequence[Check]) -> list[Check]:
     ]
 
 
-def _aperture(name: str, found: Outline, designed: Outline) -> Check:
+def _aperture(name: str, measured: Outline, designed: Outline) -> Check:
     """The largest distance between the rim of a face's clear aperture and that of the designed one."""
-    off = max(float(np.abs(a.depth(*b.places())).max()) for a, b in ((found, designed), (designed, found)))
-    where = f"the part has {_words(found)}, the lens was tailored for {_words(designed)}; generate the design again"
+    off = max(float(np.abs(a.depth(*b.places())).max()) for a, b in ((measured, designed), (designed, measured)))
+    where = f"the part has {measured.words}, the lens was tailored for {designed.words}; generate the design again"
     name = f"part.step: clear aperture of the {name}, from the mount's"
     return Check.at_most(name, off, APERTURE_DIFFERENCE, unit="mm", where=where)
-
-
-def _words(aperture: Outline) -> str:
-    if aperture.is_round:
-        return f"\u00d8{2 * aperture.radius:.6g} mm"
-    corner = getattr(aperture, "corner_radius", 0.0)
-    size = f"{aperture.width:.6g} x {aperture.height:.6g} mm"
-    return f"{size} with corners of {corner:.4g} mm" if corner else size
 
 
 def _stability(lens: Lens, nominal: Nominal, light: Light, shape: dict) -> dict[str, float | int | None]:
@@ -294,13 +263,13 @@ def of_bounds(
     checks, at_bounds = [], {}
     radius, degrees, kind = asked.tool_radius, asked.max_slope, "convex" if asked.mould else "concave"
     if radius is not None or degrees is not None:
-        found = survey(lens, **{kind: radius}, slope=degrees)
+        bending = survey(lens, **{kind: radius}, slope=degrees)
         if radius is not None:
-            met = getattr(found, kind)
+            met = getattr(bending, kind)
             checks.append(Check.at_least(f"smallest {kind} radius{GRID}", met.largest, radius, "mm", met.where))
             at_bounds["tool_radius"] = met.at_bound
         if degrees is not None:
-            met = found.slope
+            met = bending.slope
             checks.append(Check.at_most(f"steepest slope{GRID}", met.largest, degrees, "deg", met.where))
             at_bounds["max_slope"] = met.at_bound
     for name, judge, key, limit in (
@@ -363,5 +332,5 @@ def _of_light(light: Light, accept: Accept, meets: str = "enters the lens") -> l
 
 
 def _asked(name: str, value: float, limit: float | None, default: float) -> tuple[str, float, float]:
-    """Name, value and limit of a check by the scene's limit; without one by the default, and the name says so."""
+    """Name, value and limit of a check by the scene's limit; without it by the default, and the name says so."""
     return (name + UNASKED, value, default) if limit is None else (name, value, limit)

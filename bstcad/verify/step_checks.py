@@ -103,24 +103,24 @@ def examine(path: Path) -> tuple[list[Check], Lens, WholePart | None]:
     There is no design to compare it with: the checks are whether its two readers, its text and its faces agree.
     """
     text, reread = part21.read_lens(path), step_reading.read(path)
-    found = step_reading.lens(reread, index=1.5)
+    lens_read = step_reading.lens(reread, index=1.5)
     properties = solid_properties.of_solid(reread.shape)
     checks = [
-        *text_checks.structure(text, found.back.m),
+        *text_checks.structure(text, lens_read.back.m),
         *_sound(reread.shape),
-        *_edges(reread, found, bare=reread.edge is None),
+        *_edges(reread, lens_read, bare=reread.edge is None),
         net_check("STEP text against OCC: control points", text.surface.control_points, reread.control_points),
     ]
     if text.front is not None:
         name = "STEP text against OCC: control points of the front"
         checks.append(net_check(name, text.front.control_points, reread.front.control_points()))
-    checks.append(Check.at_least("smallest thickness", thickness_range(found, reread.edge)[0], 0.0, "mm"))
+    checks.append(Check.at_least("smallest thickness", thickness_range(lens_read, reread.edge)[0], 0.0, "mm"))
     if properties is None:  # it has faces that no lens and no mount has
         checks.append(Check("STEP text: what it states can be held to its faces", False, None, "", True))
     else:
         checks += text_checks.measures(text.properties, properties, reread.outline)
     checks += text_checks.density(text.properties)
-    return checks, found, solid_properties.whole_part(reread, properties)
+    return checks, lens_read, solid_properties.whole_part(reread, properties)
 
 
 def _sound(solid: Any, of_part: bool = False) -> Iterator[Check]:
@@ -141,10 +141,10 @@ def _form(reread: StepLens, back: BSplineSurface, tolerance: float, count: int) 
     """Distances (mm) and angles between normals (rad) of the back at `count` Sobol points, evaluated by OCC."""
     points = torch.quasirandom.SobolEngine(2, scramble=True, seed=1).draw(count, dtype=torch.float64)
     x, y = (low + p * (high - low) for p, (low, high) in zip(points.T, (back.x, back.y), strict=True))
-    found, normals = step_reading.sample(reread, x.numpy(), y.numpy())
-    z, z_x, z_y = back.sag_and_slope(*(torch.from_numpy(found[:, i].copy()) for i in (0, 1)))
+    sampled, normals = step_reading.sample(reread, x.numpy(), y.numpy())
+    z, z_x, z_y = back.sag_and_slope(*(torch.from_numpy(sampled[:, i].copy()) for i in (0, 1)))
     wanted = torch.nn.functional.normalize(torch.stack([-z_x, -z_y, torch.ones_like(z)], dim=1), dim=1).numpy()
-    off = np.abs(found - torch.stack([x, y, z], dim=1).numpy()).max(axis=1)
+    off = np.abs(sampled - torch.stack([x, y, z], dim=1).numpy()).max(axis=1)
     turned = np.linalg.norm(normals - wanted, axis=1)
     for name, error, limit, unit in (
         ("form: re-read back face against the optimised one", off, tolerance, "mm"),
@@ -154,18 +154,18 @@ def _form(reread: StepLens, back: BSplineSurface, tolerance: float, count: int) 
         yield Check.at_most(name, float(error[k]), limit, unit, where=f"at ({x[k]:.4g}, {y[k]:.4g}) mm")
 
 
-def _front(found: Surface, lens: Lens, tolerance: float) -> Iterator[Check]:
+def _front(reread: Surface, lens: Lens, tolerance: float) -> Iterator[Check]:
     """The re-read front against the designed one."""
     wanted, difference = lens.front, "difference from the designed one"
-    yield Check.at_most(f"form: vertex of the front, {difference}", abs(found.z - wanted.z), tolerance, "mm")
+    yield Check.at_most(f"form: vertex of the front, {difference}", abs(reread.z - wanted.z), tolerance, "mm")
     if wanted.is_net:
-        net = found.control_points() if found.is_net else np.empty(0)
+        net = reread.control_points() if reread.is_net else np.empty(0)
         yield net_check(f"form: control points of the front, {difference}", net, wanted.control_points())
         return
-    off = math.inf if found.is_net else abs(found.curvature - wanted.curvature)
+    off = math.inf if reread.is_net else abs(reread.curvature - wanted.curvature)
     yield Check.at_most(f"form: curvature of the front, {difference}", float(off), CURVATURE, "1/mm")
     if wanted.conic_constant:
-        apart = math.inf if found.is_net else abs(found.conic_constant - wanted.conic_constant)
+        apart = math.inf if reread.is_net else abs(reread.conic_constant - wanted.conic_constant)
         sag = apart * abs(wanted.curvature) ** 3 * math.hypot(*lens.outline.farthest) ** 4 / 8
         name = f"form: sag at the rim by the front's conic constant, {difference}"
         yield Check.at_most(name, float(sag), FLAT, "mm")
@@ -219,9 +219,9 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
     )
 
 
-def _edges_moved(name: str, wanted: Any, found: Any) -> Check:
+def _edges_moved(name: str, wanted: Any, reread: Any) -> Check:
     """The largest distance (mm) between an edge of one solid and those of the other."""
-    there, here = (step_reading.along_edges(solid) for solid in (wanted, found))
+    there, here = (step_reading.along_edges(solid) for solid in (wanted, reread))
     missing, strange = cKDTree(here).query(there)[0], cKDTree(there).query(here)[0]
     worst, places = max((missing, there), (strange, here), key=lambda pair: pair[0].max())
     where = "edge at ({:.4g}, {:.4g}, {:.4g}) mm".format(*places[worst.argmax()])

@@ -10,13 +10,13 @@ from bstcad.baselines import integration
 from bstcad.baselines.integration import FINE, fit_heights, march
 from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.interfaces import Reflect, Refract, intersect, turn
+from bstcad.optics.interfaces import Reflect, Refract, deflect, intersect
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Status, TiltedPlane, coordinates
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
-from bstcad.optics.trace import to_first_free, to_plane
+from bstcad.optics.trace import to_first_net, to_plane
 from bstcad.scene import scene
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring import stage1
@@ -46,12 +46,12 @@ class Known:
         if self.front is None:
             return self.source.rays(x, y, self.face.z, 1.0)
         flat = BSplineSurface(self.face.z, torch.zeros((5, 5), dtype=torch.float64), (-9.0, 9.0), (-9.0, 9.0))
-        return to_first_free(self.source.rays(x, y, self.front.z, 1.0), Lens(self.front, flat, WIDE, self.law.n_in))
+        return to_first_net(self.source.rays(x, y, self.front.z, 1.0), Lens(self.front, flat, WIDE, self.law.n_in))
 
     def aims(self, coming):
         """Where the face sends them (2, n, n) mm, and where they meet it."""
         at, z_x, z_y = intersect(self.face, coming, WIDE, Status.VIGNETTED)
-        landed = to_plane(turn(at, z_x, z_y, self.law).rays, self.plane)
+        landed = to_plane(deflect(at, z_x, z_y, self.law).rays, self.plane)
         assert landed.alive.all()
         return coordinates(landed, self.plane), at
 
@@ -62,7 +62,7 @@ class Known:
         middle = at.above(0.0)[n // 2, n // 2].item()
         points = march(coming, aim, self.plane, self.law, middle, first)
         x, y, z = points.position
-        assert points.found.all()
+        assert points.reached.all()
         return float((z + middle - self.face.sag_and_slope(x, y)[0]).abs().max())
 
 
@@ -115,7 +115,7 @@ def test_lost_rays_end_their_lines_and_change_no_other_point():
     holed = march(broken, aim, known.plane, LENS, 20.0)
     wanted = torch.ones((n, n), dtype=torch.bool)
     wanted[:4, :] = wanted[20, 25:] = False
-    assert torch.equal(holed.found, wanted) and torch.isfinite(holed.position).all()
+    assert torch.equal(holed.reached, wanted) and torch.isfinite(holed.position).all()
     assert torch.equal(holed.position[:, wanted], whole.position[:, wanted])
 
 

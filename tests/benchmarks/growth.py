@@ -35,7 +35,7 @@ from bstcad.optics.sampling import grid
 from bstcad.pipeline import design
 from bstcad.scene.scene import Scene, load
 from bstcad.tailoring.merit import SobolevVariable, TubeMerit
-from bstcad.tailoring.slope_fit import Fit, fit_slopes, refine
+from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.tailoring.stage2 import Problem
 from bstcad.transport import Density, solve
 from bstcad.verify import checks
@@ -137,7 +137,7 @@ def _design() -> tuple[Scene, Lens]:
 def lens_of(m: int) -> Lens:
     """The same lens on m x m control points."""
     lens = _design()[1]
-    return replace(lens, back=refine(lens.back, m))
+    return replace(lens, back=lens.back.refined(m))
 
 
 def _scene(m: int, pixels: int) -> Scene:
@@ -150,7 +150,7 @@ def _transport(n: int) -> Work:
 
 
 def _slope_fit(m: int) -> Work:
-    flat = refine(_design()[1].back, m)
+    flat = _design()[1].back.refined(m)
     x, y = (p.reshape(-1) for p in grid(_design()[1].outline, 2 * m))
     _, z_x, z_y = flat.relative_sag_and_slope(x, y)
     start = replace(flat, heights=torch.zeros_like(flat.heights))

@@ -18,9 +18,10 @@ import torch
 from bstcad.optics import bspline, tubes
 from bstcad.optics.irradiance import Screen, collect, collect_plain, landed_flux
 from bstcad.optics.kernels import compiling, forward
-from bstcad.optics.trace import from_first_free, from_first_free_plain, launch, to_first_free, trace, window
+from bstcad.optics.trace import from_first_net, to_first_net, trace, window
 from bstcad.scene import scene
 from tests.benchmarks.growth import SERIES, exponent, last_step, measured
+from tests.tracing import from_first_net_plain, launch
 
 pytestmark = pytest.mark.bench
 NAMES = {f"{series.stage}, {series.driver}": series for series in SERIES}
@@ -92,8 +93,8 @@ def test_the_fused_kernels_are_faster_than_plain_torch(name):
     """Medians are printed; what is asserted are ratios."""
     wanted = scene.load(f"templates/{name}.toml")
     lens = lens_of(wanted, 257)
-    rays = to_first_free(launch(wanted.source, lens, 1024, 0), lens)
-    landed = from_first_free(rays, lens, 1000.0)
+    rays = to_first_net(launch(wanted.source, lens, 1024, 0), lens)
+    landed = from_first_net(rays, lens, 1000.0)
     screen = Screen(1000.0, wanted.target.x, wanted.target.y, 512)
     u, v = torch.rand((2, 1 << 20), dtype=torch.float64) * 256
     sheet = tubes.launch_tubes(wanted.source, lens, 256)
@@ -109,9 +110,9 @@ def test_the_fused_kernels_are_faster_than_plain_torch(name):
             lambda: bspline.evaluate_plain(lens.back.heights, u, v),
             n,
         ),
-        "from_first_free": (
-            lambda: from_first_free(rays, lens, 1000.0),
-            lambda: from_first_free_plain(rays, lens, 1000.0),
+        "from_first_net": (
+            lambda: from_first_net(rays, lens, 1000.0),
+            lambda: from_first_net_plain(rays, lens, 1000.0),
             rays.flux.numel(),
         ),
         "forward.land": (

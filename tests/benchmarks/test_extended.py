@@ -107,7 +107,7 @@ def test_direct_optimisation_against_doing_nothing_and_against_feedback(diameter
     before, floor = judge(scene, point)
     began = time.process_time()
     rounds = stage2.stage3_rounds(task)
-    direct = driven(task.whole, stage2.follow(rounds, point))
+    direct = driven(task.whole, stage2.run_rounds(rounds, point))
     seconds = time.process_time() - began
     after, noise = judge(scene, direct)
     print(

@@ -24,7 +24,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Fresnel, Losses
 from bstcad.optics.measure import tubes_picture
 from bstcad.optics.quadrature import of_lens
-from bstcad.optics.trace import follow_ghost, ghost_light, launch, to_first_free, to_plane, trace
+from bstcad.optics.trace import follow_ghost, ghost_light, to_first_net, to_plane, trace
 from bstcad.pipeline import design
 from bstcad.report import exports
 from bstcad.scene.new_scene import templates
@@ -32,6 +32,7 @@ from bstcad.scene.scene import Scene, load
 from tests.benchmarks.cold import TEMPLATES
 from tests.cad.test_trimming import plate
 from tests.report.test_exports import read_zemax
+from tests.tracing import launch
 
 pytestmark = pytest.mark.bench
 
@@ -105,14 +106,15 @@ def test_other_programs_agree(template, tmp_path):
     target, channels = lens.scene.target, lens.scene.judging_channels()
     for name in comparison.JUDGES:
         found = comparison.compare(name, lens.lens, channels, target.screen, target.irradiance(), rays=MANY)
-        assert bool(found.declined) is ((template, name) in DECLINED)
-        if found.declined:
-            print(f"\n{template}, {name}: {found.declined}", end="")
+        judge = found.judge
+        assert bool(judge.declined) is ((template, name) in DECLINED)
+        if judge.declined:
+            print(f"\n{template}, {name}: {judge.declined}", end="")
             continue
         print(
-            f"\n{template}, {name}: RRMSD {found.rrmsd:.4f}, by bstcad {found.rrmsd_ours:.4f}, apart "
-            f"{found.difference:.4f}, noise {found.noise:.4f}, over it {found.over_noise:.3f}; light on the target "
-            f"{found.on_target:.5f}, by bstcad {found.on_target_ours:.5f}; {found.seconds:.0f} s",
+            f"\n{template}, {name}: RRMSD {judge.rrmsd:.4f}, by bstcad {judge.rrmsd_ours:.4f}, apart "
+            f"{judge.difference:.4f}, noise {judge.noise:.4f}, over it {judge.over_noise:.3f}; light on the target "
+            f"{judge.on_target:.5f}, by bstcad {judge.on_target_ours:.5f}; {judge.seconds:.0f} s",
             end="",
         )
         assert all(check.passed for check in found.checks)
@@ -155,7 +157,7 @@ def bundle_of(written):
     """Rays over all of the light that meet the back where batoid's grid of it is exact."""
     source, lens = written.scene.channels()[0].source, written.lens
     rays = launch(source, lens, RAYS, seed=3)
-    x, y, _ = to_first_free(rays, lens).position  # on the front: the rays lie further in on the back, or little further
+    x, y, _ = to_first_net(rays, lens).position  # on the front: the rays lie further in on the back, or little further
     ours = trace(rays, lens, written.scene.target.z)
     (_, right), (_, high) = lens.back.x, lens.back.y
     kept = ours.alive & (x.abs() < EXACT * right) & (y.abs() < EXACT * high)
@@ -268,17 +270,18 @@ def test_the_irradiance_with_fresnels_losses_is_mitsubas(lens):
     channels = lens.scene.channels()
     found = comparison.compare("mitsuba", lens.lens, channels, screen, target, rays=PHOTONS)
     lossless = tubes_picture(lens.lens, channels, comparison.coarse(screen), TUBES).numpy()
-    theirs = found.theirs / found.theirs.sum() * found.on_target
-    without = np.linalg.norm(theirs - lossless) / np.linalg.norm(lossless) / found.noise
+    judge = found.judge
+    theirs = found.theirs / found.theirs.sum() * judge.on_target
+    without = np.linalg.norm(theirs - lossless) / np.linalg.norm(lossless) / judge.noise
     print(
-        f"\n{found.rays / 1e6:.0f} M photons, noise {found.noise:.2%} of the picture: difference over that noise "
-        f"{found.over_noise:.3f}, without Fresnel {without:.2f}; flux {found.on_target:.5f} there, "
-        f"{found.on_target_ours:.5f} here",
+        f"\n{judge.rays / 1e6:.0f} M photons, noise {judge.noise:.2%} of the picture: difference over that noise "
+        f"{judge.over_noise:.3f}, without Fresnel {without:.2f}; flux {judge.on_target:.5f} there, "
+        f"{judge.on_target_ours:.5f} here",
         end="",
     )
-    assert found.over_noise <= 1.1  # of two thousand pixels or more: 1 within a few hundredths
+    assert judge.over_noise <= 1.1  # of two thousand pixels or more: 1 within a few hundredths
     assert without > 3  # so a wrong loss is seen
-    assert found.on_target == pytest.approx(found.on_target_ours, rel=1e-3)
+    assert judge.on_target == pytest.approx(judge.on_target_ours, rel=1e-3)
 
 
 def test_the_ghost_is_mitsubas(through_a_sphere):

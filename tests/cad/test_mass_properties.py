@@ -16,11 +16,12 @@ from bstcad.cad.walls import Draft
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.quadrature import MassProperties, exact_volume, of_lens
+from bstcad.optics.quadrature import MassProperties, of_lens
 from bstcad.optics.surfaces import Conic, Plane, Sphere
 from bstcad.scene.mount import Box
 from tests.cad.test_mounting import disc
 from tests.cad.test_trimming import plate, stadium
+from tests.exact_volume import exact_volume
 
 R, EDGE = 30.0, 4.0  # mm
 ROUNDED = Box(shape="rectangle", width=8.0, height=6.0, corner_radius=1.2)

@@ -16,9 +16,9 @@ from bstcad.cad.mesh import Mesh, chordal_error, is_closed, lens_mesh, volume_an
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.quadrature import exact_volume
 from bstcad.optics.surfaces import Plane, Sphere
 from tests.cad.facets import deviation
+from tests.exact_volume import exact_volume
 
 RECTANGLE, CIRCLE = Rectangle(24.0, 20.0), Circle(12.0)
 OUTLINES = pytest.mark.parametrize("outline", [RECTANGLE, CIRCLE], ids=lambda o: o.shape)

@@ -9,10 +9,10 @@ import pytest
 
 from bstcad.cad import patches, step_writing
 from bstcad.cad.mounting import Placed, body, mounted
-from bstcad.optics.quadrature import exact_volume
 from bstcad.scene.mount import Box, Flange, Round
 from bstcad.step_text import part21
 from tests.cad.test_trimming import FRONTS, occ_volume, plate, stadium, uses, worst_gap
+from tests.exact_volume import exact_volume
 
 RADIUS = 10.0  # mm, of the plates around the lens, which is 10 x 8 mm
 AT = (1.0, -2.0, 0.5)  # mm

@@ -14,9 +14,9 @@ from bstcad.cad import mesh
 from bstcad.cad.mesh import SILVER, Label, Mesh, chordal_error
 from bstcad.cad.solid import coarse_copy, lens_solid
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.quadrature import exact_volume
 from bstcad.optics.surfaces import Plane, Sphere, sag
 from tests.cad.test_trimming import plate, waves
+from tests.exact_volume import exact_volume
 
 LENSES = [(Plane(8.0), Rectangle(24.0, 20.0)), (Sphere(8.0, -0.03), Circle(12.0))]
 

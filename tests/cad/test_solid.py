@@ -18,10 +18,10 @@ from bstcad.cad.solid import image, lens_solid
 from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.quadrature import exact_volume
 from bstcad.optics.surfaces import Conic, Plane, Sphere, sag
 from bstcad.step_text import part21
 from tests.cad.test_trimming import occ_volume
+from tests.exact_volume import exact_volume
 
 OUTLINES = {"rectangle": Rectangle(24.0, 20.0), "circle": Circle(12.0)}
 CONICS = {

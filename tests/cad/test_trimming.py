@@ -20,9 +20,9 @@ from bstcad.cad.solid import lens_solid
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.quadrature import exact_volume
 from bstcad.optics.surfaces import Conic, Plane, Sphere, sag
 from bstcad.step_text import part21
+from tests.exact_volume import exact_volume
 
 HOLES = [(2.0, 1.5, 0.8), (-2.2, 1.0, 0.5), (0.3, -2.0, 1.1)]  # x, y, diameter (mm)
 

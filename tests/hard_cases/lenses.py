@@ -17,6 +17,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Rays
 from bstcad.optics.surfaces import Plane, Sphere
+from tests.tracing import from_first_net_plain
 
 N = 1.488
 SQUARE = Rectangle(20.0, 20.0)
@@ -30,16 +31,16 @@ def tracing(engine: str) -> Iterator[Callable[[Rays, Lens, float], Landed]]:
     """From the glass to the screen: plain torch; plain torch on the fused spline; the fused back face."""
     if engine == "plain":
         with mock.patch.object(compiling, "ENABLED", False):
-            yield trace.from_first_free_plain
+            yield from_first_net_plain
     else:
-        yield {"mixed": trace.from_first_free_plain, "fused": trace.from_first_free}[engine]
+        yield {"mixed": from_first_net_plain, "fused": trace.from_first_net}[engine]
 
 
 def engines(source, lens: Lens, x, y, z: float) -> Iterator[tuple[str, Landed]]:
     """(name, landed) by every way to trace."""
     for engine in ("plain", "mixed", "fused"):
         with tracing(engine) as through_back:
-            yield engine, through_back(trace.to_first_free(source.rays(x, y, lens.front.z, 1.0), lens), lens, z)
+            yield engine, through_back(trace.to_first_net(source.rays(x, y, lens.front.z, 1.0), lens), lens, z)
     if x.dtype == torch.float64:
         yield "forward", forward.land(source, lens, z, x, y)
 

@@ -27,6 +27,7 @@ from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Sphere
 from tests.hard_cases.lenses import DTYPES, ENGINES, bundle, lens_of, tracing, uniform, wavy
+from tests.tracing import stratified
 
 NAN, INF = float("nan"), float("inf")
 BAD = {  # a ray before the lens, and what becomes of it
@@ -45,7 +46,7 @@ Z = 200.0
 
 def good(dtype) -> Rays:
     """143 rays: an odd number, so that one more leaves each of two threads what it had."""
-    x, y = (p.reshape(-1)[:143] for p in sampling.stratified(Rectangle(12.0, 12.0), 12, 0, dtype))
+    x, y = (p.reshape(-1)[:143] for p in stratified(Rectangle(12.0, 12.0), 12, 0, dtype))
     return Point().rays(x, y, 15.0, 1.0)
 
 
@@ -67,7 +68,7 @@ def traced(rays: Rays, engine: str):
     lens = lens_of(replace(wavy(dtype), heights=heights), Sphere(15.0, curvature))
     place, way = (t.detach().clone().requires_grad_() for t in (rays.position, rays.direction))
     with tracing(engine) as through_back:
-        landed = through_back(trace.to_first_free(replace(rays, position=place, direction=way), lens), lens, Z)
+        landed = through_back(trace.to_first_net(replace(rays, position=place, direction=way), lens), lens, Z)
     merit = torch.where(landed.alive, landed.position.square().sum(0), 0.0).sum()
     return landed, *torch.autograd.grad(merit, (heights, curvature, place, way))
 
@@ -99,7 +100,7 @@ def test_all_others_land_and_pull_as_without_it(bad, engine, dtype):
 def test_the_forward_kernel_lets_no_ray_change_another(beside):
     """Outside the lens, out at a side, beyond the beam, not a number: the others of its block land where they did."""
     lens, source = lens_of(wavy(depth=2.0)), Point()
-    x, y = (p.reshape(-1) for p in sampling.stratified(Rectangle(12.0, 12.0), 30, 0))
+    x, y = (p.reshape(-1) for p in stratified(Rectangle(12.0, 12.0), 30, 0))
     whole = forward.land(source, lens, Z, x, y)
     x[300], y[300] = beside
     found, others = forward.land(source, lens, Z, x, y), torch.arange(900) != 300
@@ -151,7 +152,7 @@ def test_the_surface_is_not_evaluated_for_20_164_rays_because_of_one(way, dtype,
     """Places at which sag and slopes are asked for, which no busy machine changes: at most a hundredth more."""
     lens = lens_of(wavy(dtype))
     x, y = (p.reshape(-1) for p in sampling.stratified(Rectangle(13.0, 13.0), 142, 0, dtype))
-    rays = trace.to_first_free(Point().rays(x, y, 15.0, 1.0), lens)
+    rays = trace.to_first_net(Point().rays(x, y, 15.0, 1.0), lens)
     direction, asked, evaluate = rays.direction.clone(), [], BSplineSurface.relative_sag_and_slope
     direction[:, 7000] = torch.nn.functional.normalize(torch.tensor(way, dtype=torch.float64), dim=0)
 

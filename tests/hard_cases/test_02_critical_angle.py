@@ -18,13 +18,12 @@ import torch
 
 from bstcad.optics import tubes
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.interfaces import SKIMMING, Refract, turn
+from bstcad.optics.interfaces import SKIMMING, Refract, deflect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.outlines import Circle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Plane
-from bstcad.optics.trace import simulate
 from tests.hard_cases import exact
 from tests.hard_cases.lenses import (
     DTYPES,
@@ -39,6 +38,7 @@ from tests.hard_cases.lenses import (
     uniform,
     wavy,
 )  # fmt: skip
+from tests.tracing import simulated
 
 OFFSETS = [s * 10.0**-k for k in range(2, 9) for s in (1, -1)] + [0.0]
 CRITICAL = math.asin(1 / N)
@@ -62,7 +62,7 @@ def cosine_squared(way: torch.Tensor) -> Decimal:
 @pytest.mark.parametrize("offset", OFFSETS)
 def test_flag_and_direction(offset, dtype, holds):
     rays, slopes, way = meeting(CRITICAL + offset, dtype)
-    after = turn(rays, *slopes, Refract(N, 1.0)).rays
+    after = deflect(rays, *slopes, Refract(N, 1.0)).rays
     truth = cosine_squared(way)
     assert after.status[0] in (Status.ALIVE, Status.TOTAL_REFLECTION)
     if abs(truth) > 4 * eps(dtype):  # cos² is a difference of numbers of order 1: two products and a difference
@@ -82,9 +82,9 @@ def test_flag_and_direction(offset, dtype, holds):
 def test_the_gradient_is_the_derivative_up_to_its_cap(offset, dtype, holds):
     """∂ cos θ' / ∂ cos θ on a level face; all other derivatives follow from it by the chain rule."""
     rays, slopes, way = meeting(CRITICAL + offset, dtype)
-    after = turn(rays, *slopes, Refract(N, 1.0)).rays
+    after = deflect(rays, *slopes, Refract(N, 1.0)).rays
     g_way, g_slopes = torch.autograd.grad(after.direction[2].sum(), (way, slopes), materialize_grads=True)
-    everything = [*torch.autograd.grad(turn(rays, *slopes, Refract(N, 1.0)).rays.direction.sum(), (way, slopes),
+    everything = [*torch.autograd.grad(deflect(rays, *slopes, Refract(N, 1.0)).rays.direction.sum(), (way, slopes),
                                        materialize_grads=True), g_way, g_slopes]  # fmt: skip
     assert all(torch.isfinite(g).all() for g in everything)
     cap = N * N / SKIMMING
@@ -165,7 +165,7 @@ def test_tubes_across_the_angle(dtype, holds):
     back = wavy(dtype, m=33, depth=5.0, ripple=0.0)
     lens = lens_of(replace(back, heights=back.heights.requires_grad_()), Plane(15.0), Circle(9.0), 1.6)
     n, source, screen = 61, Point(profile="uniform", half_angle=30.0), Screen(60.0, (-1e9, 1e9), (-1e9, 1e9), 8)
-    told = simulate(source, lens, screen, 400, 0).flux
+    told = simulated(source, lens, screen, 400, 0).flux
     leaves = told["on target"] + told["off target"]
     assert told["total internal reflection"] > 0.02
     sheet = tubes.launch_tubes(source, lens, n)

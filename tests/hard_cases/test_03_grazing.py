@@ -16,7 +16,7 @@ import torch
 
 from bstcad.optics import trace
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.interfaces import Refract, intersect, turn
+from bstcad.optics.interfaces import Refract, deflect, intersect
 from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
@@ -39,6 +39,7 @@ from tests.hard_cases.lenses import (
     uniform,
     wavy,
 )
+from tests.tracing import from_first_net_plain
 
 OFFSETS = [s * 10.0**-k for k in range(1, 13) for s in (1, -1)] + [0.0]
 WIDE = Rectangle(60.0, 60.0)
@@ -83,7 +84,7 @@ def test_a_ray_beside_a_ball_hits_or_passes(offset, degrees, dtype, holds):
     error = abs(math.hypot(x, y, z - 15.0 - R) - R)
     # cos² is a difference; a path is known to its square root, and the hit leaves the ball by cos times that
     holds(f"hit from the ball it grazes, {NAMES[dtype]}", error, 16 * R * eps(dtype), "mm")
-    inside = turn(at, z_x, z_y, Refract(1.0, N)).rays
+    inside = deflect(at, z_x, z_y, Refract(1.0, N)).rays
     normal = torch.stack([-z_x, -z_y, torch.ones_like(z_x)])
     before, behind = ((b.direction * normal).sum(0) for b in (at, inside))
     assert before > 0 or inside.status.tolist() == [int(Status.TOTAL_REFLECTION)]
@@ -98,7 +99,7 @@ def test_along_the_axis_at_the_equator(curvature, dtype, holds):
     radius = torch.tensor([10.0 * (1 + offset) for offset in OFFSETS], dtype=torch.float64).to(dtype)
     lens = Lens(Sphere(15.0, curvature), wavy(dtype, z=40.0), WIDE, N)
     rays = Collimated(Circle(30.0)).rays(radius, torch.zeros_like(radius), 0.0, 1.0)
-    inside = trace.to_first_free(rays, lens)
+    inside = trace.to_first_net(rays, lens)
     c = float(torch.tensor(curvature, dtype=dtype))
     left = 1 - (c * radius.double()) ** 2  # cos² of incidence
     assert torch.equal(inside.alive[left > 2 * EQUATOR], torch.ones(int((left > 2 * EQUATOR).sum()), dtype=torch.bool))
@@ -111,7 +112,7 @@ def test_along_the_axis_at_the_equator(curvature, dtype, holds):
     holds(f"turn near the equator, times the cosine, {NAMES[dtype]}", largest(off * cosine), 8 * eps(dtype))
     if dtype == torch.float64:
         found = forward.land(Collimated(Circle(30.0)), lens, 300.0, radius, torch.zeros_like(radius))
-        plain = trace.from_first_free_plain(inside, lens, 300.0)
+        plain = from_first_net_plain(inside, lens, 300.0)
         assert torch.equal(found.status, plain.status)
 
 
@@ -175,5 +176,5 @@ def test_rays_that_graze_the_waves_of_a_spline(dtype, holds):
     flat = dz - p * dx - q * dy < 0.07  # 1.4 ln(1 mm / 1e-4 mm) / 200 steps, F' being 1.4 at most: all of it reflected
     # the steps pass a crest that the ray clears by some micrometres, and do not pass one that it touches
     assert (flat | (dz < 0.011) | (crest[missed] > -0.02)).all()
-    inside = turn(at, z_x, z_y, Refract(N, 1.0)).rays
+    inside = deflect(at, z_x, z_y, Refract(N, 1.0)).rays
     assert (inside.status[at.alive & (cosine < 0.5)] == int(Status.TOTAL_REFLECTION)).all()  # light leaves up to 42°

@@ -28,11 +28,11 @@ from bstcad.cad import step_reading, step_writing
 from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
-from bstcad.optics.quadrature import exact_volume
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.scene.scene import MESH
 from bstcad.step_text import part21
 from bstcad.verify import checks, step_checks
+from tests.exact_volume import exact_volume
 
 SLOPE, EDGE = 64.0, 0.05  # degrees, before the ripple; mm
 

@@ -38,6 +38,7 @@ from tests.hard_cases.lenses import (
     tracing,
     uniform,
 )  # fmt: skip
+from tests.tracing import from_first_net_plain
 
 HALF = 10.0
 
@@ -105,8 +106,8 @@ def test_the_forward_kernel_chooses_it_too():
     source, lens = Point((1.0, 0.5, 12.0)), Lens(Plane(15.0), waves(2.5, 12.0), SQUARE, N)
     x, y = uniform((2, 3000), 5, -9.9, 9.9)
     rays = source.rays(x, y, 15.0, 1.0)
-    in_glass = trace.to_first_free(rays, lens)
-    plain = trace.from_first_free_plain(in_glass, lens, 200.0)
+    in_glass = trace.to_first_net(rays, lens)
+    plain = from_first_net_plain(in_glass, lens, 200.0)
     found = forward.land(source, lens, 200.0, x, y)
     assert torch.equal(found.status, plain.status)
     lands = plain.alive

@@ -21,7 +21,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
-from bstcad.optics.trace import to_first_free
+from bstcad.optics.trace import to_first_net
 from tests.hard_cases.lenses import DTYPES, NAMES, eps, largest, tracing, uniform
 
 NETS = (5, 6, 7, 33, 513, 2049)
@@ -142,7 +142,7 @@ def test_the_forward_kernel_at_knots_and_corners():
     source = Collimated(Rectangle(3 * half, 3 * half))
     found = forward.land(source, lens, 120.0, x, y)
     with tracing("plain") as through_back:
-        plain = through_back(to_first_free(source.rays(x, y, 8.0, 1.0), lens), lens, 120.0)
+        plain = through_back(to_first_net(source.rays(x, y, 8.0, 1.0), lens), lens, 120.0)
     lit = plain.flux > 0
     assert torch.equal(found.status[lit], plain.status[lit]) and int(plain.alive.sum()) > 300
     both = plain.alive & lit

@@ -20,9 +20,9 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
-from bstcad.optics.trace import simulate
 from tests.hard_cases import exact
 from tests.hard_cases.lenses import DTYPES, NAMES, engines, eps, lens_of, uniform, wavy
+from tests.tracing import simulated
 
 THROWS = (0.1, 1.0, 100.0, 1e3, 1e5, 1e7)
 SHIFTS = (0.0, 1e6, -1e6)
@@ -104,7 +104,7 @@ def test_a_shift_changes_no_bit(throw, kind, dtype):
         z = lens.back.z + throw
         found = [landed.position for _, landed in engines(source, lens, x, y, z)]
         screen = Screen(z, (-0.6 * throw - 8, 0.7 * throw + 8), (-0.5 * throw - 8, 0.5 * throw + 8), 16)
-        told = simulate(source, lens, screen, 64, 0)
+        told = simulated(source, lens, screen, 64, 0)
         sheet = tubes.launch_tubes(source, lens, 12)
         picture = tubes.picture(source, lens, screen, 12)
         results.append([*found, told.box, told.tent, sheet.flux, sheet.landing(lens, z).position, picture])

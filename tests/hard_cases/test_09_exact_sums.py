@@ -20,7 +20,7 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
-from bstcad.optics.trace import simulate
+from tests.tracing import simulated
 
 HITS = 20_000_000
 SINGLE = 1 << 16  # of them one by one, behind one ray that carries all the others: its flux is above 2^24
@@ -54,7 +54,7 @@ def test_a_traced_pixel_counts_twenty_million_rays(holds, dtype):
     heights = torch.zeros((5, 5), dtype=dtype)
     lens = Lens(Plane(5.0), BSplineSurface(8.0, heights, (-10.0, 10.0), (-10.0, 10.0)), Rectangle(20.0, 20.0), 1.5)
     n = 4473
-    found = simulate(Collimated(Rectangle(18.0, 18.0)), lens, SCREEN, n, 0)
+    found = simulated(Collimated(Rectangle(18.0, 18.0)), lens, SCREEN, n, 0)
     assert found.rays == n * n > HITS and float(found.box.sum()) == float(found.box[2, 2])
     bound = n * n / reductions.PARTS * ROUND
     holds("2e7 hits in one pixel, traced: flux", abs(float(found.box[2, 2]) - 1), bound, "of it")
@@ -122,7 +122,7 @@ def test_a_control_point_feels_every_ray_that_lands(holds, dtype, compiled):
     start = torch.tensor([0.0, 0.0, -1.0], dtype=dtype)[:, None].expand(3, g.numel())
     axis = torch.tensor([0.0, 0.0, 1.0], dtype=dtype)[:, None].expand(3, g.numel())
     rays = Rays(start, axis, torch.ones(1, dtype=dtype).expand(g.shape), torch.zeros(g.shape, dtype=torch.uint8))
-    landed = trace.from_first_free(rays, lens, 64.0)
+    landed = trace.from_first_net(rays, lens, 64.0)
     (found,) = torch.autograd.grad(landed.position[0], heights, g)
     slope = torch.tensor([-0.5, 0.0, 0.5], dtype=torch.float64)
     weight = torch.tensor([0.125, 0.75, 0.125], dtype=torch.float64)

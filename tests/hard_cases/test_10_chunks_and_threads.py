@@ -21,6 +21,7 @@ import pytest
 import torch
 
 from bstcad import pipeline
+from bstcad.baselines.paper import TentMerit
 from bstcad.optics import sampling, tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
@@ -30,19 +31,13 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
-from bstcad.optics.trace import (
-    Simulation,
-    from_first_free,
-    launch,
-    simulate,
-    simulate_plain,
-    to_first_free,
-)
+from bstcad.optics.trace import Simulation, from_first_net, to_first_net
 from bstcad.scene.scene import load
-from bstcad.tailoring.merit import SobolevVariable, TentMerit, TubeMerit
-from bstcad.tailoring.slope_fit import Fit, fit_slopes, refine
+from bstcad.tailoring.merit import SobolevVariable, TubeMerit
+from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.transport.density import Density
 from tests.conftest import DISK, SMALL
+from tests.tracing import launch, simulated, simulated_plain
 
 ROOT = Path(__file__).parent.parent.parent
 SOURCE = Point(position=(1.0, -2.0, 0.0), profile="uniform", half_angle=35.0)
@@ -79,10 +74,10 @@ def image_and_gradient(dtype=torch.float64) -> dict[str, torch.Tensor]:
     rays, sheet = launch(SOURCE, held, RAYS, 1), tubes.launch_tubes(SOURCE, held, TUBES)
     light = (Channel(SOURCE, held.index),)
     by_tubes, by_tents = TubeMerit(light, (sheet,), SCREEN, target(), 0.03), TentMerit.of(light, SCREEN, target(), 0.03)
-    found = by_rays(simulate(SOURCE, held, SCREEN, RAYS, 0))
+    found = by_rays(simulated(SOURCE, held, SCREEN, RAYS, 0))
     for name, merit in (
         ("tubes", lambda bent: by_tubes(by_tubes.landing(bent))[0]),
-        ("rays", lambda bent: by_tents((from_first_free(to_first_free(rays, bent), bent, SCREEN.z),))[0]),
+        ("rays", lambda bent: by_tents((from_first_net(to_first_net(rays, bent), bent, SCREEN.z),))[0]),
     ):
         heights = held.back.heights.clone().requires_grad_()
         value = merit(held.with_heights([heights]))
@@ -104,7 +99,7 @@ def everything(dtype=torch.float64) -> dict[str, torch.Tensor]:
         "a Gaussian beam": torch.stack([s.irradiance(x, y, 15.0) for s in (beam, replace(SOURCE, **GAUSSIAN))]),
         "corners of a disc": torch.stack(tubes.corners(Circle(9.0), 300)),
         "variable of stage 2": SobolevVariable.of(back, torch.ones((back.m, back.m))).heights(back.heights),
-        "a finer net": refine(back, 257).heights,
+        "a finer net": back.refined(257).heights,
         "a density": torch.from_numpy(Density.from_picture(target().numpy(), 150, width=3.0, height=2.0).values),
     }
 
@@ -150,7 +145,7 @@ def test_strips_and_bands(holds, monkeypatch, strip, band):
     for portion, rows in ((sampling.STRIP, tubes.BAND), (strip, band)):
         monkeypatch.setattr(sampling, "STRIP", portion)
         monkeypatch.setattr(tubes, "BAND", rows)
-        found = by_rays(simulate_plain(SOURCE, lens(), SCREEN, RAYS, 0))
+        found = by_rays(simulated_plain(SOURCE, lens(), SCREEN, RAYS, 0))
         found |= {"image, tubes": tubes.picture(SOURCE, lens(), SCREEN, TUBES)}
         for name, image in found.items():
             figure = "other bands of tubes: image" if name == "image, tubes" else f"other strips: {name}"

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics import irradiance, sampling, trace, tubes
+from bstcad.optics import irradiance, trace, tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import compiling
@@ -22,7 +22,7 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Status
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Sphere
-from bstcad.optics.trace import launch, simulate, simulate_plain
+from tests.tracing import from_first_net_plain, launch, simulated, simulated_plain, stratified
 
 SOURCE = Point(position=(1.0, -2.0, 3.0), profile="gaussian", half_angle_1e2=30.0)
 LINES = {  # of the ledger, and the fates that end in it
@@ -40,7 +40,7 @@ SMALL = Screen(
 )  # fmt: skip
 RAYS = 400  # each way
 PRECISION = pytest.mark.parametrize("dtype", (torch.float32, torch.float64), ids=str)
-FORMS = pytest.mark.parametrize("form", (simulate, simulate_plain))
+FORMS = pytest.mark.parametrize("form", (simulated, simulated_plain))
 
 
 def lens(dtype=torch.float64) -> Lens:
@@ -65,7 +65,7 @@ def border(picture: torch.Tensor) -> torch.Tensor:
 def traced(dtype) -> Landed:
     """Every ray of `simulate` with its fate, by the plain form."""
     held = lens(dtype)
-    return trace.from_first_free_plain(trace.to_first_free(launch(SOURCE, held, RAYS, 0), held), held, SMALL.z)
+    return from_first_net_plain(trace.to_first_net(launch(SOURCE, held, RAYS, 0), held), held, SMALL.z)
 
 
 def counted(rays: Landed, screen: Screen) -> dict[str, float]:
@@ -114,7 +114,7 @@ def test_the_ledger_of_a_simulation(holds, form):
 PICTURES = {
     "rays, box": lambda screen, form: form(SOURCE, lens(), screen, RAYS, 0).box,
     "rays, tent": lambda screen, form: form(SOURCE, lens(), screen, RAYS, 0).tent,
-    "tubes": lambda screen, form: tubes.picture(SOURCE, lens(), screen, 300 if form is simulate else 100),
+    "tubes": lambda screen, form: tubes.picture(SOURCE, lens(), screen, 300 if form is simulated else 100),
 }
 
 
@@ -122,7 +122,7 @@ PICTURES = {
 @pytest.mark.parametrize("light", PICTURES)
 def test_nothing_is_piled_on_the_border(holds, monkeypatch, light, form):
     """The same rays in the same pixels; tubes are cut at the border, which leaves rounding of a few tubes' flux."""
-    monkeypatch.setattr(compiling, "ENABLED", form is simulate)
+    monkeypatch.setattr(compiling, "ENABLED", form is simulated)
     small, large = (PICTURES[light](screen, form) for screen in (SMALL, LARGE))
     assert float(large.sum()) > 1.1 * float(small.sum())  # light does leave the small screen
     piled = (border(small) - border(cut(large))).abs().max()
@@ -133,7 +133,7 @@ def test_nothing_is_piled_on_the_border(holds, monkeypatch, light, form):
 @PRECISION
 def test_light_that_left_pulls_at_no_pixel(dtype):
     """The gradient of any pixel in a ray beyond the border is zero; the pull on such light is a sum of its own."""
-    x, y = (p.reshape(-1) for p in sampling.stratified(Rectangle(900.0, 900.0), 60, 1, dtype))
+    x, y = (p.reshape(-1) for p in stratified(Rectangle(900.0, 900.0), 60, 1, dtype))
     position = torch.stack([x, y]).requires_grad_()
     rays = Landed(position, torch.ones_like(x), torch.zeros(x.shape, dtype=torch.uint8))
     column, row = SMALL.pixel(x, y)

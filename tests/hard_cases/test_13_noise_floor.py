@@ -23,9 +23,9 @@ from bstcad.optics.measure import Effort, Light, measure
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
-from bstcad.optics.trace import simulate, simulate_plain
 from bstcad.scene.scene import Accept
 from bstcad.verify import checks
+from tests.tracing import simulated, simulated_plain
 
 APERTURE = Rectangle(20.0, 18.0)
 SOURCE = Collimated(APERTURE, profile="gaussian", radius_1e2=11.0)
@@ -70,8 +70,8 @@ def slope(errors: list[float], numbers: list[int]) -> float:
 
 @pytest.mark.parametrize("dtype", (torch.float32, torch.float64), ids=str)
 @pytest.mark.parametrize(("name", "rays", "form", "power"), [
-    ("random", by_random, None, -1 / 2), ("stratified", by_strata, simulate, -3 / 4),
-    ("stratified", by_strata, simulate_plain, -3 / 4),
+    ("random", by_random, None, -1 / 2), ("stratified", by_strata, simulated, -3 / 4),
+    ("stratified", by_strata, simulated_plain, -3 / 4),
 ], ids=("random", "stratified", "stratified, plain"))  # fmt: skip
 def test_the_error_of_rays_falls_with_its_power(holds, name, rays, form, power, dtype):
     """Over 576 pixels and 4 seeds an RRMSD is sure to 1.5 %, and the slope over a factor 64 to 0.005: four times that.

@@ -14,17 +14,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bstcad.optics import trace
-from bstcad.optics.interfaces import Refract, intersect, turn
+from bstcad.optics.interfaces import Refract, deflect, intersect
 from bstcad.optics.irradiance import LEDGER, Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Status
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
-from bstcad.optics.trace import simulate, simulate_plain
 from bstcad.scene.scene import load
 from tests.conftest import DISK
 from tests.hard_cases.lenses import SQUARE, N, eps, examples, largest, places, uniform, wavy
+from tests.tracing import simulated, simulated_plain
 
 EPS = eps(torch.float64)
 SEEDS = st.integers(0, 2**31)
@@ -83,7 +83,7 @@ def test_all_light_is_accounted_for(source, depth, curvature, outline, z, seed):
     lens = lens_with(depth, curvature, outline)
     half = 0.3 * z
     screen = Screen(z, (-half, half), (-0.7 * half, half), 24)
-    told = [form(source, lens, screen, 48, seed % 1000) for form in (simulate, simulate_plain)]
+    told = [form(source, lens, screen, 48, seed % 1000) for form in (simulated, simulated_plain)]
     for found in told:
         assert sum(found.flux.values()) == pytest.approx(1.0, abs=1e-12)
         assert set(found.flux) == {"on target", "off target", *LEDGER}
@@ -110,7 +110,7 @@ def test_a_hit_lies_on_its_face_and_ahead(source, depth, curvature, ripple, seed
         assert bool((path[there] >= 0).all()) and bool(lens.outline.contains(*at.position[:2])[there].all())
         beside = torch.linalg.cross(places(at) - places(rays), rays.direction.expand_as(at.position), dim=0)
         assert largest(beside[:, there]) <= 64 * 20 * EPS
-        rays = turn(at, z_x, z_y, Refract(*eta)).rays
+        rays = deflect(at, z_x, z_y, Refract(*eta)).rays
 
 
 @given(DEPTH, CURVATURE, SEEDS, st.sampled_from(["x", "y"]))

@@ -56,11 +56,11 @@ class TestStandIn:
 
     def test_a_judge_of_the_same_light_agrees_within_its_noise(self, judge):
         found = compared("numpy")
-        facts = found.facts
-        assert facts["agrees"] and (facts["rays"], facts["pixels"], facts["losses"]) == (1 << 18, (48, 32), "none")
-        assert found.over_noise == pytest.approx(1.0, abs=0.3) and facts["rrmsd"] > facts["rrmsd_ours"]
-        assert found.moved_by == pytest.approx(1e-5 * 0.49 * 380.0 * 0.8, rel=1e-3)  # slope, n - 1, mm, pixels a mm
-        assert facts.keys().isdisjoint(comparison.PICTURES) and found.theirs.sum() == pytest.approx(found.target.sum())
+        facts = found.judge
+        assert facts.agrees and (facts.rays, facts.pixels, facts.losses) == (1 << 18, (48, 32), "none")
+        assert facts.over_noise == pytest.approx(1.0, abs=0.3) and facts.rrmsd > facts.rrmsd_ours
+        assert facts.moved_by == pytest.approx(1e-5 * 0.49 * 380.0 * 0.8, rel=1e-3)  # slope, n - 1, mm, pixels a mm
+        assert found.theirs.sum() == pytest.approx(found.target.sum())
 
     @pytest.mark.parametrize(
         ("wrong", "wanted"),
@@ -77,13 +77,12 @@ class TestStandIn:
 
         judge.trace = trace
         found = compared("numpy", rays=1 << 20)
-        assert passed(found) == wanted and found.facts["agrees"] is False
+        assert passed(found) == wanted and found.judge.agrees is False
 
     def test_a_judge_that_declines_says_why_and_has_no_checks(self, judge):
         judge.cannot = lambda *a: "it is too dark"
         found = compared("numpy")
-        assert found.checks == () and found.facts.keys() == {"name", "version", "declined"}
-        assert found.declined == "it is too dark"
+        assert found.checks == () and found.judge.rays is None and found.judge.declined == "it is too dark"
 
     def test_each_judge_is_asked_in_turn(self, judge, monkeypatch):
         told, (glass, source, screen) = [], CASES["a beam"]
@@ -97,7 +96,7 @@ class TestStandIn:
             0,
             lambda *a: told.append(a),
         )
-        assert [judge.rays for judge in found] == [1 << 12]
+        assert [each.judge.rays for each in found] == [1 << 12]
         assert told == [("judges", 0, 1, "numpy"), ("judges", 1, 1, "")]
 
 
@@ -105,8 +104,8 @@ class TestStandIn:
 @pytest.mark.parametrize("case", CASES)
 def test_batoid_traces_the_light_of_ray_tubes(case):
     found = compared("batoid", case)
-    assert passed(found) == [True, True] and found.noise < 0.05 and found.moved_by < 0.01
-    assert found.on_target == pytest.approx(found.on_target_ours, abs=1e-3)
+    assert passed(found) == [True, True] and found.judge.noise < 0.05 and found.judge.moved_by < 0.01
+    assert found.judge.on_target == pytest.approx(found.judge.on_target_ours, abs=1e-3)
 
 
 @with_others
@@ -132,8 +131,8 @@ def test_a_wrong_lens_fails(monkeypatch, wrong):
 @pytest.mark.parametrize("case", list(CASES)[1:])
 def test_mitsuba_traces_the_light_of_ray_tubes(case):
     found = compared("mitsuba", case)
-    assert passed(found) == [True, True] and found.noise < 0.1 and found.moved_by < 0.05
-    assert (found.losses == "none") is (case == "a mirror")
+    assert passed(found) == [True, True] and found.judge.noise < 0.1 and found.judge.moved_by < 0.05
+    assert (found.judge.losses == "none") is (case == "a mirror")
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import Interface, Reflect, Refract, cross
 from bstcad.optics.irradiance import Screen
@@ -16,8 +15,9 @@ from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.rays import Rays, Status, TiltedPlane
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
-from bstcad.optics.trace import across, land, simulate, through, to_first_free, trace
+from bstcad.optics.trace import across, land, through, to_first_net, trace
 from bstcad.optics.tubes import launch_tubes
+from tests.tracing import simulated, stratified
 
 N = 1.5
 
@@ -64,7 +64,7 @@ def net(z, size, seed=1):
 
 
 def rays_of(source, lens, n=40, size=16.0):
-    x, y = sampling.stratified(Rectangle(size, size), n, 0)
+    x, y = stratified(Rectangle(size, size), n, 0)
     return source.rays(x, y, lens.entrance.z, 1.0)
 
 
@@ -92,7 +92,7 @@ def test_a_system_is_simulated_as_its_rays_and_its_tubes_are_traced():
     lens = replace(Lens(Sphere(0.0, 0.01), net(6.0, 0.2), SQUARE, N), before=WINDOW, behind=FOLD)
     screen = Screen(10.0, (-40.0, 40.0), (-40.0, 40.0), 8)
     source = Point((1.0, -2.0, -60.0), profile="uniform", half_angle=7.0)
-    rays, tubes = simulate(source, lens, screen, 300, 0), launch_tubes(source, lens, 120).picture(lens, screen)
+    rays, tubes = simulated(source, lens, screen, 300, 0), launch_tubes(source, lens, 120).picture(lens, screen)
     assert sum(rays.flux.values()) == pytest.approx(1, abs=1e-12) and rays.flux["on target"] > 0.9
     assert float(tubes.sum()) == pytest.approx(rays.flux["on target"], rel=1e-3)
     torch.testing.assert_close(tubes, rays.box, rtol=0.05, atol=1e-4)
@@ -102,16 +102,16 @@ def test_a_system_is_simulated_as_its_rays_and_its_tubes_are_traced():
 
 
 LOSSES = Losses(Fresnel(587.6), Absorption(0.01))
-TWO = Lens(net(0.0, 0.4, 2), net(6.0, 0.5), SQUARE, N, free=(0, 1))
+TWO = Lens(net(0.0, 0.4, 2), net(6.0, 0.5), SQUARE, N, shaped=(0, 1))
 MIRROR = replace(FOLD[0], surface=replace(net(60.0, 0.5, 3), x=(-40.0, 40.0), y=(-40.0, 40.0)))
 SYSTEMS = {
     "lens": TWO,
     "lossy lens": replace(TWO, losses=LOSSES),
-    "with a window": replace(TWO, before=WINDOW, free=(2, 3)),
+    "with a window": replace(TWO, before=WINDOW, shaped=(2, 3)),
     "with a fold mirror": replace(TWO, behind=FOLD),
-    "freeform fold mirror": replace(TWO, behind=(MIRROR,), free=(0, 1, 2)),
+    "freeform fold mirror": replace(TWO, behind=(MIRROR,), shaped=(0, 1, 2)),
     "a plate between them": replace(
-        TWO, behind=(*(replace(i, surface=i.surface.moved(i.surface.z + 30.0)) for i in WINDOW), MIRROR), free=(0, 4)
+        TWO, behind=(*(replace(i, surface=i.surface.moved(i.surface.z + 30.0)) for i in WINDOW), MIRROR), shaped=(0, 4)
     ),
 }  # fmt: skip
 PLANES = {"level": 15.0, "tilted": TiltedPlane((3.0, 2.0, 15.0), (20.0, -10.0), 5.0)}
@@ -133,7 +133,7 @@ def test_the_gradient_through_several_nets_is_that_of_plain_torch(name, plane):
     for form in (through, plainly):
         heights = [surface.heights.clone().requires_grad_() for surface in lens.nets]
         moved = lens.with_heights(heights)
-        landed = form(to_first_free(rays, moved), moved.interfaces[moved.freeform[0] :], goal)
+        landed = form(to_first_net(rays, moved), moved.interfaces[moved.freeform[0] :], goal)
         value = torch.where(landed.alive, (landed.position * weight).sum(0) + landed.flux, 0.0).sum()
         found.append((landed, torch.autograd.grad(value, heights)))
     (fused, ours), (plain, wanted) = found
@@ -163,7 +163,7 @@ def test_beyond_a_net_the_gradient_is_that_of_its_rim():
 
     def value(share, form):
         moved = lens.with_heights((lens.front.heights + share * way[:, None] * way, lens.back.heights))
-        return (form(to_first_free(rays, moved), moved.interfaces, 120.0).position ** 2).mean()
+        return (form(to_first_net(rays, moved), moved.interfaces, 120.0).position ** 2).mean()
 
     for form in (through, plainly):
         at, step = torch.zeros((), dtype=torch.float64, requires_grad=True), 1e-5
@@ -176,7 +176,7 @@ def test_tubes_wait_before_the_first_free_interface():
     lens, screen = SYSTEMS["freeform fold mirror"], Screen(15.0, (-60.0, 60.0), (-60.0, 60.0), 12)
     pictures = []
     for free in ((0, 1, 2), (1,), (2,)):
-        seen = replace(lens, free=free)
+        seen = replace(lens, shaped=free)
         pictures.append(launch_tubes(SOURCE, seen, 40).picture(seen, screen))
     assert float(pictures[0].sum()) > 0.01
     for picture in pictures[1:]:

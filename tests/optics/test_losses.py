@@ -19,10 +19,10 @@ from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.rays import Status
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import simulate
 from bstcad.tailoring.merit import TubeMerit
 from bstcad.tailoring.stage2 import Problem
 from tests.hard_cases.lenses import bundle
+from tests.tracing import simulated
 
 N = 1.5168
 WAVELENGTH = 587.6
@@ -61,7 +61,7 @@ SOURCES = (Collimated(Circle(4.0)), Point((0.2, -0.1, 0.0), profile="lambertian"
 
 @pytest.mark.parametrize("source", SOURCES, ids=("collimated", "point"))
 def test_the_ledger_closes_over_reflected_absorbed_and_transmitted_light(source):
-    found = simulate(source, wavy(), SCREEN, 200, 0)
+    found = simulated(source, wavy(), SCREEN, 200, 0)
     assert sum(found.flux.values()) == pytest.approx(1.0, abs=1e-12)
     assert found.flux[effects.REFLECTED] > 0 and found.flux[effects.ABSORBED] > 0
 

@@ -8,15 +8,16 @@ import pytest
 import torch
 
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.interfaces import Interface, Reflect, Refract, cross, turn
+from bstcad.optics.interfaces import Interface, Reflect, Refract, cross, deflect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
-from bstcad.optics.trace import from_first_free, from_first_free_plain, simulate, to_first_free, to_plane, trace
+from bstcad.optics.trace import from_first_net, to_first_net, to_plane, trace
 from bstcad.optics.tubes import launch_tubes, picture, rays_to
+from tests.tracing import from_first_net_plain, simulated
 
 M, HALF, Z = 41, 10.0, 5.0
 SQUARE = Rectangle(2 * HALF, 2 * HALF)
@@ -64,7 +65,7 @@ def test_a_paraboloid_gathers_parallel_light_in_its_focus():
     x = torch.linspace(-8.5, 8.5, 35, dtype=torch.float64)
     x, y = (p.reshape(-1) for p in torch.meshgrid(x, x, indexing="ij"))
     rays = Collimated(Circle(20.0), z=200.0).rays(x, y, Z, 1.0)
-    for land in (from_first_free, from_first_free_plain):
+    for land in (from_first_net, from_first_net_plain):
         found = land(rays, mirror(paraboloid(c)), Z + 1 / (2 * c))
         assert found.alive.all() and float(found.position.abs().max()) < 1e-9
 
@@ -86,7 +87,7 @@ def test_an_ellipsoid_takes_light_from_one_focus_to_the_other(conic_constant):
 def test_reflection_keeps_the_angle_and_the_plane_of_incidence(sense):
     slopes = torch.tensor(0.3, dtype=torch.float64), torch.tensor(-0.2, dtype=torch.float64)
     rays = beam((0.2, -0.4, 1.0 * sense), sense)
-    hit = turn(rays, *(s.expand(7) for s in slopes), Reflect())
+    hit = deflect(rays, *(s.expand(7) for s in slopes), Reflect())
     normal = torch.tensor([-0.3, 0.2, 1.0], dtype=torch.float64)
     normal = normal / normal.norm()
     before, after = rays.direction[:, 0], hit.rays.direction[:, 0]
@@ -121,7 +122,7 @@ def test_light_downwards_is_light_upwards_seen_in_a_mirror(law, surface):
 def test_tubes_hold_the_light_that_rays_carry(light):
     """By the fused picture and by the corners, traced one by one; the screen takes all of it."""
     scene = LIGHTS[light], mirror(bumpy()), Screen(120.0, (-900.0, 900.0), (-900.0, 900.0), 8)
-    rays = simulate(*scene, 800, 1)
+    rays = simulated(*scene, 800, 1)
     for found in (picture(*scene, 160), launch_tubes(*scene[:2], 160).picture(*scene[1:])):
         assert float(found.sum()) == pytest.approx(rays.flux["on target"], rel=2e-3)
 
@@ -142,4 +143,4 @@ def test_light_from_below_does_not_pass_for_light_from_above():
     rays = beam((0.0, 0.1, 1.0), 1)
     wrong = trace(Rays(rays.position, rays.direction, rays.flux, rays.status, sense=-1), mirror(bumpy()), 120.0)
     assert not wrong.alive.any()
-    assert to_first_free(rays, mirror(bumpy())) is rays  # nothing stands before a mirror
+    assert to_first_net(rays, mirror(bumpy())) is rays  # nothing stands before a mirror

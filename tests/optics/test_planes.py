@@ -12,13 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Rays, Status, TiltedPlane, axes, coordinates, tilt_of
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import at_first_free, to_first_free, to_plane, trace
+from bstcad.optics.trace import to_first_net, to_plane, trace
 from bstcad.optics.tubes import launch_tubes, picture
 from bstcad.tailoring.merit import TubeMerit
 
@@ -49,7 +50,7 @@ def bundle(light, n=41, reach=11.0, dtype=torch.float64):
     source, reflects = LIGHTS[light]
     lens = optic(bumpy(dtype=dtype), reflects)
     x = torch.linspace(-reach, reach, n, dtype=dtype)
-    return to_first_free(source.rays(*torch.meshgrid(x, x, indexing="ij"), lens.entrance.z, 1.0), lens), lens
+    return to_first_net(source.rays(*torch.meshgrid(x, x, indexing="ij"), lens.entrance.z, 1.0), lens), lens
 
 
 @pytest.mark.parametrize("tilt", [(30.0, 0.0), (0.0, 30.0), TILT, (-80.0, 75.0)])
@@ -73,7 +74,7 @@ def test_rays_land_on_the_plane(light, z):
     coming, lens = bundle(light)
     lens = replace(lens, front=lens.front.moved(z), back=replace(lens.back, z=lens.back.z + z))
     plane = TiltedPlane((30.0, -5.0, 300.0 + z), TILT)
-    leaving = at_first_free(replace(coming, z=coming.z + z), lens).rays
+    leaving = cross(replace(coming, z=coming.z + z), lens.last_freeform).rays
     landed = to_plane(leaving, plane)
     x, y, height = landed.position[0] - 30.0, landed.position[1] + 5.0, landed.above(300.0 + z)
     n = plane.axes[2]
@@ -96,7 +97,7 @@ def test_a_place_is_seen_where_the_line_to_it_meets_the_level_plane(eye):
     assert q_x / (300.0 - eye) == pytest.approx(p_x / (p_z - eye)) and q_y / (300.0 - eye) == pytest.approx(
         p_y / (p_z - eye)
     )
-    assert np.stack(plane.found(q_x, q_y, eye)) == pytest.approx(np.stack([x, y]), abs=1e-10)
+    assert np.stack(plane.from_seen(q_x, q_y, eye)) == pytest.approx(np.stack([x, y]), abs=1e-10)
     assert plane.seen(30.0, -5.0, eye) == pytest.approx((30.0, -5.0))  # the middle stays
 
 

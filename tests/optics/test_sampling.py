@@ -6,6 +6,7 @@ import torch
 
 from bstcad.optics import sampling
 from bstcad.optics.outlines import Rectangle
+from tests.tracing import stratified
 
 WINDOW = Rectangle(24.0, 10.0)
 
@@ -27,7 +28,7 @@ def test_grid_has_the_centres_x_along_the_first_axis(dtype):
 
 def test_stratified_has_exactly_one_point_a_cell_in_its_place():
     n = 50
-    x, y = sampling.stratified(WINDOW, n, 3)
+    x, y = stratified(WINDOW, n, 3)
     assert (cell(x, y, n, n) == 1).all()
     gx, gy = sampling.grid(WINDOW, n)
     # point (i, j) lies in cell (i, j): neighbours in memory are neighbours in the lens

@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics import irradiance, sampling
+from bstcad.optics import irradiance
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import clear_window, launch, simulate, trace, window
+from bstcad.optics.trace import clear_window, trace, window
+from tests.tracing import launch, simulated, stratified
 
 SQUARE = Rectangle(20.0, 20.0)
 
@@ -47,7 +48,7 @@ EXPECTED = torch.as_tensor(covered(SCREEN, 6.5) / (math.pi * 6.5**2))
 
 def test_a_disc_beam_through_a_plate_lands_as_the_disc():
     """Pixel by pixel, in absolute flux: the beam is cut by two sides of the screen and fills whole pixels and parts."""
-    result = simulate(DISC, plate(), SCREEN, 600, seed=0)
+    result = simulated(DISC, plate(), SCREEN, 600, seed=0)
     assert float(EXPECTED.sum()) < 0.999  # some of it falls beside the screen
     assert float((result.box - EXPECTED).abs().max()) < 0.03 * float(EXPECTED.max())
     assert float(irradiance.rrmsd(result.box, EXPECTED)) < 8e-3
@@ -59,7 +60,7 @@ def test_flux_through_the_lens_is_the_sources():
     """A Lambertian point, a plane front: what crosses the square outline is the view factor of a centred square,
     (4 / π) X / sqrt(1 + X²) atan(X / sqrt(1 + X²)), X = half side over distance (each quarter a standard factor)."""
     lens = bowl(depth=0.0, front=Plane(15.0))
-    result = simulate(Point(), lens, Screen(100.0, (-500.0, 500.0), (-500.0, 500.0), 8), 400, seed=0)
+    result = simulated(Point(), lens, Screen(100.0, (-500.0, 500.0), (-500.0, 500.0), 8), 400, seed=0)
     ratio = 10.0 / 15.0
     slant = math.sqrt(1 + ratio**2)
     share = 4 / math.pi * ratio / slant * math.atan(ratio / slant)
@@ -72,7 +73,7 @@ def test_the_clear_window_loses_no_light_that_gets_through(source):
     whole, clear = window(source, lens), clear_window(source, lens)
     assert clear.width <= whole.width and clear.height <= whole.height
     all_rays = trace(launch(source, lens, 150, 0), lens, 100.0)
-    x, y = (p.reshape(-1) for p in sampling.stratified(whole, 150, 0))
+    x, y = (p.reshape(-1) for p in stratified(whole, 150, 0))
     lit = source.irradiance(x, y, 15.0) > 0
     beyond = (x[lit].abs() > clear.width / 2) | (y[lit].abs() > clear.height / 2)
     assert not (all_rays.alive & beyond).any()

@@ -15,7 +15,8 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import axes
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import to_first_free, window
+from bstcad.optics.trace import to_first_net, window
+from tests.tracing import stratified
 
 Z = 15.0
 DISC, SQUARE = Circle(12.0), Rectangle(24.0, 10.0)
@@ -90,7 +91,7 @@ SOURCES = [
 @pytest.mark.parametrize("dtype", (torch.float32, torch.float64))
 @pytest.mark.parametrize("source", SOURCES, ids=str)
 def test_rays_pass_the_points_they_were_asked_for(source, dtype):
-    x, y = sampling.stratified(Rectangle(20.0, 8.0), 8, 0, dtype)
+    x, y = stratified(Rectangle(20.0, 8.0), 8, 0, dtype)
     rays = source.rays(x, y, Z, 0.3)
     eps = torch.finfo(dtype).eps
     assert rays.position.shape == rays.direction.shape == (3, 8, 8) and rays.position.dtype == dtype
@@ -121,8 +122,8 @@ def test_no_ray_from_outside_the_window_enters_the_lens(place, front, outline):
 
 def none_enters_from_outside_the_window(source, lens):
     area = window(source, lens)
-    x, y = sampling.stratified(Rectangle(3 * area.width, 3 * area.height), 120, 0)
-    entered = to_first_free(source.rays(x, y, Z, 1.0), lens).alive
+    x, y = stratified(Rectangle(3 * area.width, 3 * area.height), 120, 0)
+    entered = to_first_net(source.rays(x, y, Z, 1.0), lens).alive
     inside = (x.abs() <= area.width / 2) & (y.abs() <= area.height / 2)
     assert int((entered & inside).sum()) > 10
     assert not (entered & ~inside).any()
@@ -210,14 +211,6 @@ def test_window_of_a_tilted_cone_holds_it_and_no_more(place, tilt):
         reach = float((p[lit] - middle).abs().max())
         assert size == 250.0 or size / 2 == pytest.approx(reach + abs(middle), abs=0.3)
         assert float(p[lit].abs().max()) <= size / 2
-
-
-def test_unbounded_sources_have_the_same_rays_and_light_everywhere():
-    x, y = sampling.grid(Rectangle(70.0, 90.0), 5)
-    for source in SOURCES:
-        everywhere = source.unbounded(x, y, Z)
-        assert (everywhere.irradiance(x, y, Z) > 0).all()
-        torch.testing.assert_close(everywhere.rays(x, y, Z, 1.0).direction, source.rays(x, y, Z, 1.0).direction)
 
 
 @pytest.mark.parametrize(

@@ -8,12 +8,13 @@ import torch
 
 from bstcad.optics import sampling, trace
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.interfaces import Refract, intersect, turn
+from bstcad.optics.interfaces import Refract, deflect, intersect
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
+from tests.tracing import from_first_net_plain, stratified
 
 SQUARE = Rectangle(20.0, 20.0)
 N = 1.488
@@ -40,7 +41,7 @@ def rays(position, direction):
 
 
 def from_point(n=40, half=9.0, z=15.0, source=None, dtype=torch.float64):
-    x, y = sampling.stratified(Rectangle(2 * half, 2 * half), n, 0, dtype)
+    x, y = stratified(Rectangle(2 * half, 2 * half), n, 0, dtype)
     return (source or Point()).rays(x, y, z, 1.0)
 
 
@@ -76,7 +77,7 @@ def normal(z_x, z_y):
 @pytest.mark.parametrize(("n_in", "n_out"), [(1.0, N), (N, 1.0), (1.0, 3.0), (1.5, 1.5)])
 def test_snell_on_cross_products(n_in, n_out):
     before, z_x, z_y = random_incidence()
-    after = turn(before, z_x, z_y, Refract(n_in, n_out)).rays
+    after = deflect(before, z_x, z_y, Refract(n_in, n_out)).rays
     ok, big_n = after.alive, normal(z_x, z_y)
     assert int(ok.sum()) > 100
     tangential = torch.linalg.cross(before.direction, big_n, dim=0)
@@ -93,9 +94,9 @@ def test_snell_on_cross_products(n_in, n_out):
 def test_snell_backwards_returns_the_ray():
     """The reversed ray, seen in a mirror z -> -z, meets the mirrored face and leaves as the reversed original."""
     before, z_x, z_y = random_incidence()
-    after = turn(before, z_x, z_y, Refract(1.0, N)).rays
+    after = deflect(before, z_x, z_y, Refract(1.0, N)).rays
     mirror = torch.tensor([[-1.0], [-1.0], [1.0]], dtype=torch.float64)
-    back = turn(replace(after, direction=after.direction * mirror), -z_x, -z_y, Refract(N, 1.0)).rays
+    back = deflect(replace(after, direction=after.direction * mirror), -z_x, -z_y, Refract(N, 1.0)).rays
     # nearly grazing rays lose digits in the root
     assert back.alive.all()
     torch.testing.assert_close(back.direction * mirror, before.direction, rtol=0, atol=1e-11)
@@ -116,7 +117,7 @@ def test_hits_lie_on_the_surface():
         assert float(off_line.norm(dim=0).max()) < 1e-13
 
 
-@pytest.mark.parametrize("form", [trace.from_first_free, trace.from_first_free_plain])
+@pytest.mark.parametrize("form", [trace.from_first_net, trace.from_first_net_plain])
 def test_a_ray_that_turns_back_does_not_land(form):
     """60° from the axis in glass, the back face tilted by 20°: it leaves at 74.6° from the normal, 94.6° from the axis,
     and moves away from the screen; its line meets the screen's plane only behind it."""
@@ -125,21 +126,19 @@ def test_a_ray_that_turns_back_does_not_land(form):
     leaving = rays([[-3.0, 0.0, 19.0]], [[math.sin(math.radians(60)), 0.0, math.cos(math.radians(60))]])
     lens = Lens(Plane(15.0), back, SQUARE, 1.5)
     at_back, z_x, z_y = heading(leaving, back)
-    turned = turn(at_back, z_x, z_y, Refract(1.5, 1.0)).rays.direction[:, 0].tolist()
+    turned = deflect(at_back, z_x, z_y, Refract(1.5, 1.0)).rays.direction[:, 0].tolist()
     leaves = math.degrees(math.asin(1.5 * math.sin(math.radians(40))))
     assert math.degrees(math.acos(turned[2])) == pytest.approx(20 + leaves)
     assert not form(leaving, lens, 1000.0).alive.any()
 
 
 def test_axial_closed_form_is_the_newton_answer():
-    x, y = sampling.stratified(Rectangle(22.0, 22.0), 30, 0)
+    x, y = stratified(Rectangle(22.0, 22.0), 30, 0)
     bundle = Collimated(Circle(12.0)).rays(x, y, 8.0, 1.0)
     searched = replace(bundle, axial=False)
     for front in (Plane(8.0), Sphere(8.0, -0.03)):
         lens = Lens(front, wavy(), SQUARE, N)
-        closed, newton = (
-            trace.from_first_free_plain(trace.to_first_free(b, lens), lens, 1000.0) for b in (bundle, searched)
-        )
+        closed, newton = (from_first_net_plain(trace.to_first_net(b, lens), lens, 1000.0) for b in (bundle, searched))
         assert torch.equal(closed.status, newton.status) and 0 < int(closed.alive.sum()) < 900
         there = closed.alive
         torch.testing.assert_close(closed.position[:, there], newton.position[:, there], rtol=0, atol=1e-9)
@@ -152,8 +151,8 @@ def test_a_plane_parallel_plate_shifts_and_does_not_turn():
     """Lateral shift t sin θ (1 - cos θ / (n cos θ')), the textbook's."""
     bundle, thickness = from_point(half=6.0), 5.0
     lens = Lens(Plane(15.0), flat(15.0 + thickness), SQUARE, N)
-    at_back, z_x, z_y = heading(trace.to_first_free(bundle, lens), lens.back)
-    out = turn(at_back, z_x, z_y, Refract(N, 1.0)).rays
+    at_back, z_x, z_y = heading(trace.to_first_net(bundle, lens), lens.back)
+    out = deflect(at_back, z_x, z_y, Refract(N, 1.0)).rays
     assert out.alive.all()
     torch.testing.assert_close(out.direction, bundle.direction, rtol=0, atol=1e-14)
     sine = bundle.direction[:2].norm(dim=0)
@@ -214,6 +213,6 @@ def test_gradient_in_curvature_net_and_start_is_finite_differences(kind, curvatu
         lens = Lens(Sphere(15.0, curvature), replace(start, heights=heights), SQUARE, N)
         return trace.trace(source.rays(x, y, 15.0, 1.0), lens, 60.0).position
 
-    x, y = (a.reshape(-1).requires_grad_() for a in sampling.stratified(Rectangle(12.0, 12.0), 2, 0))
+    x, y = (a.reshape(-1).requires_grad_() for a in stratified(Rectangle(12.0, 12.0), 2, 0))
     c = torch.tensor(curvature, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(landing, (start.heights.clone().requires_grad_(), c, x, y), fast_mode=True)

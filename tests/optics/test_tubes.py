@@ -13,7 +13,8 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle, Rounded
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import simulate, to_first_free
+from bstcad.optics.trace import to_first_net
+from tests.tracing import simulated
 
 SHAPE = (7, 9)
 
@@ -153,7 +154,7 @@ def test_tubes_hold_the_light_that_rays_find_behind_the_lens(name):
     screen = Screen(100.0, (-60.0, 60.0), (-60.0, 45.0), (12, 9))
     sheet = tubes.launch_tubes(source, lens, 200)
     found = sheet.picture(lens, screen)
-    rays = simulate(source, lens, screen, 1000, 0)
+    rays = simulated(source, lens, screen, 1000, 0)
     assert float(found.sum()) == pytest.approx(rays.flux["on target"], rel=3e-3)
     assert float(rrmsd(found, rays.box)) < 0.01
 
@@ -164,7 +165,7 @@ def test_rays_meet_the_back_where_they_are_sent(name):
     lens = lens_of(front, outline)
     x, y = tubes.corners(Rectangle(14.0, 12.0), 300)
     p, q, at_back = tubes.rays_to(source, lens, x, y)
-    entered = to_first_free(source.rays(p, q, lens.front.z, 1.0), lens.unbounded())
+    entered = to_first_net(source.rays(p, q, lens.front.z, 1.0), lens.unbounded())
     hit, _, _ = intersect(lens.back, entered, EVERYWHERE, 2)
     assert bool(at_back.alive.all())
     torch.testing.assert_close(hit.position, at_back.position, rtol=0, atol=3e-7)

@@ -25,7 +25,6 @@ from bstcad.analysis.shape import describe
 from bstcad.cad import mounting
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
-from bstcad.optics.quadrature import exact_volume
 from bstcad.report import data_sheet, part_views
 from bstcad.report.data_sheet import Sheet
 from bstcad.report.drawing import GLASS
@@ -35,6 +34,7 @@ from bstcad.report.units import mm
 from bstcad.scene.mount import Box, Flange, Mount, Round, Screws
 from bstcad.scene.scene import load
 from tests.conftest import DISK
+from tests.exact_volume import exact_volume
 
 LONG = "\u041b\u0456\u043d\u0437\u0430 \u00ab\u0388\u03bb\u03bb\u03b7\u03bd\u00bb \u65e5\u672c $x^2$ " + 12 * "and on "
 SCENES = {

@@ -105,9 +105,9 @@ def test_what_tailoring_may_change_is_named(front, free, tmp_path):
 
 
 def test_a_found_front_leaves_nothing_free():
-    front = ConicFront(15.0, 0.0, 0.0, optimise=True).found(Conic(15.0, torch.tensor(0.01), torch.tensor(-2.0)))
+    front = ConicFront(15.0, 0.0, 0.0, optimise=True).designed(Conic(15.0, torch.tensor(0.01), torch.tensor(-2.0)))
     assert front == ConicFront(15.0, pytest.approx(0.01), -2.0) and front.free == ()
-    assert SphereFront(15.0, 0.02).found(Sphere(15.0, 0.03)) == SphereFront(15.0, 0.02)
+    assert SphereFront(15.0, 0.02).designed(Sphere(15.0, 0.03)) == SphereFront(15.0, 0.02)
 
 
 def spoilt(place, value):

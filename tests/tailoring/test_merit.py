@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from bstcad.baselines.paper import TentMerit
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
@@ -17,7 +18,7 @@ from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
 from bstcad.optics.tubes import Tubes
 from bstcad.tailoring import merit
-from bstcad.tailoring.merit import SobolevVariable, Spectrum, TentMerit, TubeMerit, local_weight
+from bstcad.tailoring.merit import SobolevVariable, Spectrum, TubeMerit, local_weight
 
 SCREEN = Screen(100.0, (0.0, 8.0), (0.0, 8.0), 8)
 ONE = (Channel(None, 1.5),)

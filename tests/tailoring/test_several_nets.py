@@ -37,10 +37,10 @@ def picture():
 
 
 FRONTS = {  # a lens, and the light that meets it
-    "front, a net behind it": (Lens(net(0.0), net(8.0, 0.05), SQUARE, N, free=(0,)), BEAM),
-    "both": (Lens(net(0.0), net(8.0), SQUARE, N, free=(0, 1)), BEAM),
+    "front, a net behind it": (Lens(net(0.0), net(8.0, 0.05), SQUARE, N, shaped=(0,)), BEAM),
+    "both": (Lens(net(0.0), net(8.0), SQUARE, N, shaped=(0, 1)), BEAM),
     "both, a point": (
-        Lens(net(0.0), net(8.0), SQUARE, N, free=(0, 1)), Point((0.5, 0.0, -600.0)),
+        Lens(net(0.0), net(8.0), SQUARE, N, shaped=(0, 1)), Point((0.5, 0.0, -600.0)),
     ),
 }  # fmt: skip
 
@@ -73,7 +73,7 @@ def test_the_merit_of_any_nets_falls_strongly(name):
     assert len(variables) == len(lens.freeform)
     *_, last = search(lens, problem, variables, EVALUATIONS)
     found = improved(lens, variables, last.best)
-    assert last.best.merit < begun[0] / 50 and last.best.rrmsd < begun[2] / 6
+    assert last.best.merit < begun[0] / 50 and last.best.figure < begun[2] / 6
     for k, interface in enumerate(found.interfaces):  # what is not free stays
         assert (interface.surface is lens.interfaces[k].surface) == (k not in lens.freeform)
     assert problem([n.heights for n in found.nets])[0] == pytest.approx(last.best.merit, rel=1e-9)
@@ -95,7 +95,7 @@ def lens_of(front):
 
 def test_every_free_net_has_its_entry():
     net = lens_of(Plane(15.0)).back
-    lens = replace(lens_of(replace(net, z=15.0)), free=(0, 1))
+    lens = replace(lens_of(replace(net, z=15.0)), shaped=(0, 1))
     shaped = lens.with_heights((torch.rand((9, 9), dtype=torch.float64), torch.rand((17, 17), dtype=torch.float64)))
     kept = Parameters.of(shaped)
     assert [entry.z for entry in kept.nets] == [15.0, 20.0] and kept.front == {}

@@ -7,24 +7,16 @@ import torch
 
 from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.interfaces import Refract, intersect, turn
+from bstcad.optics.interfaces import Refract, deflect, intersect
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Status, TiltedPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import to_first_free, trace
+from bstcad.optics.trace import to_first_net, trace
 from bstcad.tailoring.merit import landing
-from bstcad.tailoring.slope_fit import (
-    STEEPEST,
-    Fit,
-    fit_slopes,
-    largest_deflection,
-    on_vertex,
-    refine,
-    tailor_to_aim,
-    wanted_slopes,
-)
+from bstcad.tailoring.slope_fit import STEEPEST, Fit, fit_slopes, largest_deflection, tailor_to_aim, wanted_slopes
+from tests.tracing import stratified
 
 SQUARE = Rectangle(20.0, 20.0)
 
@@ -49,9 +41,9 @@ def test_wanted_slopes_are_snells_law_inverted(source, front, plane):
     x, y = sampling.grid(Rectangle(11.0, 11.0), 15)
     rays = source.rays(x, y, front.z, 1.0)
     landed = trace(rays, lens, plane)
-    at_back, z_x, z_y = intersect(lens.back, to_first_free(rays, lens), SQUARE, Status.VIGNETTED)
+    at_face, z_x, z_y = intersect(lens.back, to_first_net(rays, lens), SQUARE, Status.VIGNETTED)
     assert landed.alive.all()
-    wanted = wanted_slopes(at_back, landed.position, plane, Refract(1.488, 1.0))
+    wanted = wanted_slopes(at_face, landed.position, plane, Refract(1.488, 1.0))
     for found, slope in zip(wanted, (z_x, z_y), strict=True):
         torch.testing.assert_close(found, slope, rtol=0, atol=1e-10)  # Newton's stop on the sag
 
@@ -62,13 +54,13 @@ def test_an_aim_that_no_face_can_reach_turns_the_ray_as_far_as_one_can(index, re
     """Never reflected, never steeper than it may be, towards the aim, and as far as it goes where that is the limit."""
     x, y = torch.meshgrid(*[torch.linspace(-3.0, 3.0, 7, dtype=torch.float64)] * 2, indexing="ij")
     lens = Lens(Plane(8.0), surface(5), SQUARE, index)
-    in_glass = to_first_free(Collimated(Circle(8.0)).rays(x, y, 8.0, 1.0), lens)
-    at_back, _, _ = intersect(lens.back, in_glass, SQUARE, Status.VIGNETTED)
+    in_glass = to_first_net(Collimated(Circle(8.0)).rays(x, y, 8.0, 1.0), lens)
+    at_face, _, _ = intersect(lens.back, in_glass, SQUARE, Status.VIGNETTED)
     aim = torch.stack([torch.full_like(x, reach), torch.full_like(x, -0.2 * reach)])
-    z_x, z_y = wanted_slopes(at_back, aim, 500.0, Refract(index, 1.0))
+    z_x, z_y = wanted_slopes(at_face, aim, 500.0, Refract(index, 1.0))
     steepness = torch.sqrt(z_x**2 + z_y**2)
-    out = turn(at_back, z_x, z_y, Refract(index, 1.0)).rays
-    turned = torch.acos((out.direction * at_back.direction).sum(0))
+    out = deflect(at_face, z_x, z_y, Refract(index, 1.0)).rays
+    turned = torch.acos((out.direction * at_face.direction).sum(0))
     asked = math.atan(math.hypot(reach, 0.2 * reach) / 480.0)
     assert out.alive.all() and float(steepness.max()) <= STEEPEST * (1 + 1e-12)
     assert (out.direction[0] > 0).all() and (out.direction[1] < 0).all()
@@ -79,16 +71,16 @@ def test_an_aim_that_no_face_can_reach_turns_the_ray_as_far_as_one_can(index, re
 @pytest.mark.parametrize("fit", [Fit(bending=0.0, steps=60), Fit(bending=0.0, steps=60, degree=3)])
 def test_a_surface_comes_back_from_its_slopes(fit):
     true = surface(17, 0.7)
-    x, y = (p.reshape(-1) for p in sampling.stratified(SQUARE, 40, 0))
+    x, y = (p.reshape(-1) for p in stratified(SQUARE, 40, 0))
     _, z_x, z_y = true.sag_and_slope(x, y)
     found = fit_slopes(surface(17), x, y, z_x, z_y, torch.ones_like(x), fit)
-    off = on_vertex(found).heights - on_vertex(true).heights
+    off = found.from_vertex().heights - true.from_vertex().heights
     assert float(off.abs().max()) < 1e-8  # mm
 
 
 def test_a_polynomial_goes_on_where_no_ray_falls():
     """Slopes of a paraboloid, known in a disc only: the fit finds the corners too."""
-    x, y = (p.reshape(-1) for p in sampling.stratified(SQUARE, 60, 0))
+    x, y = (p.reshape(-1) for p in stratified(SQUARE, 60, 0))
     inside = (x * x + y * y < 81.0).to(x)
     found = fit_slopes(surface(17), x, y, 0.3 + 0.02 * x, 0.01 * y, inside, Fit(bending=1e-2, steps=40, degree=3))
     corner = torch.tensor([9.5], dtype=torch.float64)
@@ -98,7 +90,7 @@ def test_a_polynomial_goes_on_where_no_ray_falls():
 
 def test_refine_keeps_the_surface():
     coarse = surface(33, 0.4)
-    fine = refine(coarse, 65)
+    fine = coarse.refined(65)
     x, y = sampling.grid(SQUARE, 50)
     for a, b, bound in zip(coarse.sag_and_slope(x, y), fine.sag_and_slope(x, y), (2e-5, 1e-3, 1e-3), strict=True):
         assert float((a - b).abs().max()) < bound  # mm, slope: the nets are not nested

@@ -12,10 +12,10 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import simulate
 from bstcad.scene.errors import SceneError
-from bstcad.tailoring.slope_fit import Fit, on_vertex
-from bstcad.tailoring.slope_map import _corners_of, back_grid, follow, lit_window, slope_map
+from bstcad.tailoring.slope_fit import Fit
+from bstcad.tailoring.slope_map import _corners_of, face_grid, lit_window, slope_map, sloped
+from tests.tracing import simulated
 
 SQUARE = Rectangle(20.0, 20.0)
 CASES = {
@@ -36,7 +36,9 @@ def known_lens(name):
         h = 0.33 * x + 0.3 * y + 0.005 * (x**2 + y**2) + 0.02 * torch.sin(0.5 * x) * torch.cos(0.4 * y)
     else:
         h = 0.0 * x * y + 0.05 * torch.sin(0.4 * x) * torch.cos(0.3 * y)
-    return Lens(CASES[name][1], on_vertex(BSplineSurface(20.0, h, (-10.0, 10.0), (-10.0, 10.0))), SQUARE, 1.488)
+    return Lens(
+        CASES[name][1], BSplineSurface(20.0, h, (-10.0, 10.0), (-10.0, 10.0)).from_vertex().moved(20.0), SQUARE, 1.488
+    )
 
 
 def slope_error(name, cells):
@@ -46,16 +48,16 @@ def slope_error(name, cells):
     """
     source, _, screen = CASES[name]
     screen, true = replace(screen, pixels=(cells, 3 * cells // 4)), known_lens(name)
-    made = simulate(source, true, screen, 16 * cells, 0)
+    made = simulated(source, true, screen, 16 * cells, 0)
     assert made.efficiency > 0.999
     lens = replace(true, back=replace(true.back, heights=torch.zeros_like(true.back.heights)))
     wanted = None
     for _ in range(6):
         window = lit_window(source, lens)
         wanted = slope_map(source, lens, window, made.box.numpy(), screen, cells, wanted, iterations=40)
-        grid = back_grid(source, lens, window, 66)
-        lens = follow(lens, wanted, grid, Fit(), 0.0)
-    x, y, _ = grid.at_back.position
+        grid = face_grid(source, lens, window, 66)
+        lens = sloped(lens, wanted, grid, Fit(), 0.0)
+    x, y, _ = grid.at_face.position
     inner = torch.maximum(x.abs(), y.abs()) < 0.4 * grid.window.width
     x, y = x[inner], y[inner]
     found, expected = (torch.stack(back.sag_and_slope(x, y)[1:]) for back in (lens.back, true.back))
@@ -77,12 +79,12 @@ def test_the_grid_is_met_and_carries_the_flux(name):
     source, front, _ = CASES[name]
     lens = known_lens(name)
     window = lit_window(source, lens)
-    grid = back_grid(source, lens, window, 200)
-    x, y, _ = grid.at_back.position
+    grid = face_grid(source, lens, window, 200)
+    x, y, _ = grid.at_face.position
     cell = window.width / 200
     assert float((x[1:, 0] - x[:-1, 0] - cell).abs().max()) < 1e-7  # mm
-    assert float((grid.at_back.above(0.0) - lens.back.sag_and_slope(x, y)[0]).abs().max()) < 1e-8
-    through = simulate(source, lens, Screen(21.0, (-1e4, 1e4), (-1e4, 1e4), 8), 500, 0).flux
+    assert float((grid.at_face.above(0.0) - lens.back.sag_and_slope(x, y)[0]).abs().max()) < 1e-8
+    through = simulated(source, lens, Screen(21.0, (-1e4, 1e4), (-1e4, 1e4), 8), 500, 0).flux
     flux = float(grid.density.sum()) * window.area / 200**2
     assert flux == pytest.approx(through["on target"] + through["off target"], rel=1.5e-2)  # rim cells
 

@@ -8,12 +8,11 @@ import pytest
 import torch
 
 from bstcad.baselines import paper
-from bstcad.optics.trace import simulate
 from bstcad.scene import scene
 from bstcad.tailoring import stage1, stage2
 from bstcad.tailoring.merit import TubeMerit
 from bstcad.tailoring.run import Driver, Step, Task
-from bstcad.tailoring.slope_fit import refine
+from tests.tracing import simulated
 
 SMALL = {
     "lens.back.control_points": "17",
@@ -196,9 +195,9 @@ def test_stage_1_finds_the_front_curvature_and_the_back_together():
     tailored, mapping = last.lens, last.mapping
     assert tailored.front.curvature != 0.0
     assert mapping.transport.mass_error[-1] < 0.02
-    found = simulate(task.heaviest.source, tailored, task.screen, 300, 0)
+    found = simulated(task.heaviest.source, tailored, task.screen, 300, 0)
     assert found.efficiency > 0.98
-    assert task.rrmsd(tailored) < 0.5 * task.rrmsd(replace(lens, back=refine(lens.back, 17)))
+    assert task.rrmsd(tailored) < 0.5 * task.rrmsd(replace(lens, back=lens.back.refined(17)))
 
 
 def test_the_paper_lowers_both_of_its_merits():

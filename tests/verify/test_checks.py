@@ -62,8 +62,8 @@ def replace_model(model, **changes):
     return model.model_copy(update=changes)
 
 
-def failing(verification):
-    return {check.name for check in verification.checks if not check.passed}
+def failing(proof):
+    return {check.name for check in proof.checks if not check.passed}
 
 
 TEXT, FORM = "STEP text: ", "form: "
@@ -91,7 +91,8 @@ LEDGER = "flux ledger: distance of its sum from 1"
 
 def numbers(proof):
     """All that a report takes from a proof."""
-    figures = (proof.rrmsd, proof.rrmsd_tent, proof.rrmsd_noise, proof.efficiency, proof.flux)
+    light = proof.light
+    figures = (light.rrmsd, light.tent, light.standard_error, light.efficiency, light.flux)
     return [*figures, proof.shape, proof.stability, *map(vars, proof.checks)]
 
 
@@ -100,10 +101,11 @@ def test_the_written_files_pass_every_check(folder, nominal):
     assert failing(proof) == set() and proof.passed is True
     names = [check.name for check in proof.checks]
     assert len(set(names)) == len(names)
-    assert proof.irradiance.shape == (12, 16) and proof.irradiance.sum() == pytest.approx(nominal.target.sum())
-    assert proof.rrmsd == pytest.approx(0.08, rel=0.1)  # the 8 % of the target, beside which the lens's own is small
-    assert 5 * proof.rrmsd_noise < proof.rrmsd
-    assert sum(proof.flux.values()) == pytest.approx(1.0, abs=1e-12)
+    light = proof.light
+    assert light.picture.shape == (12, 16) and light.picture.sum() == pytest.approx(nominal.target.sum())
+    assert light.rrmsd == pytest.approx(0.08, rel=0.1)  # the 8 % of the target, beside which the lens's own is small
+    assert 5 * light.standard_error < light.rrmsd
+    assert sum(light.flux.values()) == pytest.approx(1.0, abs=1e-12)
     net = proof.lens.back.control_points() - nominal.lens.back.control_points()
     assert np.abs(net).max() < 1e-11 and proof.lens.outline == nominal.lens.outline
     json.dumps(numbers(proof), allow_nan=False)
@@ -397,7 +399,7 @@ def test_a_scene_that_asks_for_nothing_is_held_to_stated_defaults(folder, nomina
     target = nominal.target * (1 + 0.3 * board)
     poor = replace(nothing, target=target, stored_target=target)
     proof = checks.verify(folder, poor)
-    assert 0.25 < proof.rrmsd < 0.5 and failing(proof) == {RRMSD + UNASKED}
+    assert 0.25 < proof.light.rrmsd < 0.5 and failing(proof) == {RRMSD + UNASKED}
     assert failing(checks.verify(folder, other_limits(poor, rrmsd=0.5))) == set()
 
 
@@ -405,13 +407,13 @@ def test_a_scene_that_asks_for_nothing_is_held_to_stated_defaults(folder, nomina
 
 
 def test_light_that_is_unaccounted_for_fails(folder, nominal, monkeypatch):
-    simulate_all = measure.simulate_all
+    simulate = measure.simulate
 
     def leaky(*arguments):
-        found = simulate_all(*arguments)
+        found = simulate(*arguments)
         return replace(found, flux=found.flux | {"missed the lens": found.flux["missed the lens"] - 1e-9})
 
-    monkeypatch.setattr(measure, "simulate_all", leaky)
+    monkeypatch.setattr(measure, "simulate", leaky)
     assert failing(checks.verify(folder, nominal)) == {LEDGER}
 
 
@@ -430,27 +432,27 @@ def test_an_rrmsd_below_what_the_rays_resolve_fails(folder, nominal):
 
 def test_rays_that_do_not_see_what_the_tubes_see_fail(folder, nominal, monkeypatch):
     """A third of the light moved by a pixel: the rays' figure is of another lens than the tubes'."""
-    simulate_all = measure.simulate_all
+    simulate = measure.simulate
 
     def moved(*arguments):
-        found = simulate_all(*arguments)
+        found = simulate(*arguments)
         return replace(found, box=found.box + 0.33 * (found.box.roll(1, 0) - found.box))
 
     effort = replace(FEW, rays=512)
     assert AGREE not in failing(checks.verify(folder, nominal, effort=effort))
-    monkeypatch.setattr(measure, "simulate_all", moved)
+    monkeypatch.setattr(measure, "simulate", moved)
     assert AGREE in failing(checks.verify(folder, nominal, effort=effort))
 
 
 def test_the_rays_are_none_that_tailoring_saw(folder, nominal, monkeypatch):
     """Each set has a seed of its own; stages 1 and 2 use seed and seed + 1."""
-    seeds, simulate_all = [], measure.simulate_all
+    seeds, simulate = [], measure.simulate
 
     def heard(lights, *rest):
         seeds.extend(seed for *_, seed in lights)
-        return simulate_all(lights, *rest)
+        return simulate(lights, *rest)
 
-    monkeypatch.setattr(measure, "simulate_all", heard)
+    monkeypatch.setattr(measure, "simulate", heard)
     checks.verify(folder, nominal)
     assert len(set(seeds)) == measure.SETS and min(seeds) > nominal.seed + 1000
 

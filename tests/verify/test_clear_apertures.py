@@ -75,7 +75,7 @@ def test_the_light_is_that_of_rays_through_the_faces_of_the_part(design, name, t
         light = measure(found, [Channel(source, lens.index)], screen, np.ones(screen.shape), Effort(512, accuracy=0))
         seen = independent(source, lens, around, screen)
         assert light.flux["on target"] == pytest.approx(seen.sum(), rel=1.5e-3)
-        picture, seen = light.mean / light.mean.sum(), seen / seen.sum()
+        picture, seen = light.picture / light.picture.sum(), seen / seen.sum()
         assert np.abs(picture - seen).max() < 0.015 * seen.max()
     assert wide == bool(mount.draft)  # of parallel light the front's edge takes the most
 
@@ -182,7 +182,7 @@ def cut(tmp_path_factory):
 
 def test_a_lens_is_tailored_for_what_the_mount_leaves_of_it(cut):
     scene, folder, contents, proof = cut
-    assert proof.passed and proof.rrmsd < 0.03
+    assert proof.passed and proof.light.rrmsd < 0.03
     assert proof.lens.clear == (Circle(4.5), Circle(4.5))
     assert any("The mount cuts away" in sentence for sentence in contents.given_up)
     assert bstcad.open(folder).lens.clear == (Circle(4.5), Circle(4.5))
@@ -214,7 +214,7 @@ def test_a_part_with_another_rim_is_judged_by_its_own_light_and_fails_by_name(cu
         draws_nothing(patch)
         proof = commands.verify(copy, effort=quick_effort())
     failed = {check.name: check.where for check in proof.checks if not check.passed}
-    assert proof.flux["on target"] < 0.8 * before.flux["on target"] and proof.rrmsd > 0.2
+    assert proof.flux["on target"] < 0.8 * before.light.flux["on target"] and proof.rrmsd > 0.2
     assert (
         "\u00d87.5 mm, the lens was tailored for \u00d89 mm"
         in failed["part.step: clear aperture of the back, from the mount's"]
@@ -241,7 +241,7 @@ def test_a_mirror_cut_to_a_circle_gets_the_light_of_the_cone_that_its_rim_leaves
     rim, _, _ = lens.back.sag_and_slope(20 * turn.cos(), 20 * turn.sin())
     caps = 1 - (120 - rim) / ((120 - rim) ** 2 + 20**2).sqrt()
     met = float(caps.mean()) / (1 - math.cos(math.radians(16)))
-    assert proof.flux["missed the lens"] == pytest.approx(1 - met, abs=2e-4)
+    assert proof.light.flux["missed the lens"] == pytest.approx(1 - met, abs=2e-4)
     failed = [check.name for check in proof.checks if not check.passed]
     assert all(name.startswith("RRMSD") for name in failed)  # of few control points
     assert proof.lens.clear[1] == Circle(20.0)

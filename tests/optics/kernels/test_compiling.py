@@ -16,8 +16,8 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Sphere
-from bstcad.optics.trace import simulate
 from bstcad.optics.tubes import launch_tubes
+from tests.tracing import simulated
 
 
 @pytest.fixture
@@ -90,7 +90,7 @@ def lens(cliff):
 def seen(cliff):
     """What comes out of all kernels that know constants of the plain form."""
     now = lens(cliff)
-    box = simulate(SOURCE, now, SCREEN, 64, 0).box
+    box = simulated(SOURCE, now, SCREEN, 64, 0).box
     tubes = launch_tubes(SOURCE, now, 32)
     heights = now.back.heights.clone().requires_grad_()
     landed = tubes.landing(replace(now, back=replace(now.back, heights=heights)), SCREEN.z)

@@ -15,6 +15,7 @@ from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from tests.optics.kernels.arrays import DTYPES, close, uniform
 from tests.optics.test_mirror import LIGHTS, bumpy, mirror
+from tests.tracing import from_first_net_plain, stratified
 
 
 def deep(m=17, dtype=torch.float64, depth=4.0):
@@ -39,11 +40,11 @@ SCENES = {  # a source, a front, an outline; every Status that rays through a wi
 def test_landings_and_their_gradient(scene, dtype):
     source, front, outline, fates = SCENES[scene]
     lens = Lens(front, deep(dtype=dtype), outline, 1.6)
-    x, y = sampling.stratified(Rectangle(23.0, 23.0), 90, 0, dtype)
-    in_glass = trace.to_first_free(source.rays(x, y, 15.0, 1.0), lens)
+    x, y = stratified(Rectangle(23.0, 23.0), 90, 0, dtype)
+    in_glass = trace.to_first_net(source.rays(x, y, 15.0, 1.0), lens)
     z, weight = 400.0, uniform(2 * x.numel(), 1).view(2, *x.shape)
     results = []
-    for form, kind in ((trace.from_first_free, dtype), (trace.from_first_free_plain, torch.float64)):
+    for form, kind in ((trace.from_first_net, dtype), (from_first_net_plain, torch.float64)):
         heights = lens.back.heights.detach().to(kind).requires_grad_()
         bundle = replace(in_glass, position=in_glass.position.to(kind), direction=in_glass.direction.to(kind))
         landed = form(bundle, replace(lens, back=replace(lens.back, heights=heights)), z)
@@ -79,10 +80,10 @@ NETS = {  # a lens, and the rays on their way to its net
 def test_the_gradient_in_the_rays_is_that_of_the_plain_form(name, plane):
     """Positions and directions before the face, landings and flux behind it; lost rays have none."""
     lens, source = NETS[name]
-    x, y = sampling.stratified(Rectangle(23.0, 23.0), 60, 0)
-    coming = trace.to_first_free(source.rays(x, y, lens.entrance.z, 1.0), lens)
+    x, y = stratified(Rectangle(23.0, 23.0), 60, 0)
+    coming = trace.to_first_net(source.rays(x, y, lens.entrance.z, 1.0), lens)
     weight, gradients, landings = uniform(2 * x.numel(), 1).view(2, *x.shape), [], []
-    for form in (trace.from_first_free, trace.from_first_free_plain):
+    for form in (trace.from_first_net, from_first_net_plain):
         leaves = [t.detach().clone().requires_grad_() for t in (lens.back.heights, coming.position, coming.direction)]
         moved = replace(lens, back=replace(lens.back, heights=leaves[0]))
         landed = form(replace(coming, position=leaves[1], direction=leaves[2]), moved, PLANES[plane])
@@ -102,11 +103,11 @@ def test_the_gradient_in_the_rays_is_that_of_the_plain_form(name, plane):
 def test_the_gradient_in_the_rays_is_finite_differences():
     """The kernel's adjoint against the kernel's values."""
     lens = Lens(Sphere(15.0, -0.02), deep(m=7, depth=1.0), Rectangle(20.0, 20.0), 1.5)
-    x, y = sampling.stratified(Rectangle(12.0, 12.0), 5, 0)
-    coming = trace.to_first_free(Point().rays(x, y, 15.0, 1.0), lens)
+    x, y = stratified(Rectangle(12.0, 12.0), 5, 0)
+    coming = trace.to_first_net(Point().rays(x, y, 15.0, 1.0), lens)
 
     def landing(position, direction):
-        return trace.from_first_free(replace(coming, position=position, direction=direction), lens, 60.0).position
+        return trace.from_first_net(replace(coming, position=position, direction=direction), lens, 60.0).position
 
     leaves = tuple(t.detach().clone().requires_grad_() for t in (coming.position, coming.direction))
     assert torch.autograd.gradcheck(landing, leaves, fast_mode=True)
@@ -116,21 +117,21 @@ def test_the_gradient_in_the_rays_is_finite_differences():
 def test_the_gradient_in_the_front_goes_through_the_fused_back(dtype):
     x, y = sampling.grid(Rectangle(10.0, 10.0), 8, dtype)
     gradients = []
-    for form in (trace.from_first_free, trace.from_first_free_plain):
+    for form in (trace.from_first_net, from_first_net_plain):
         c = torch.tensor(-0.02, dtype=dtype, requires_grad=True)
         lens = Lens(Sphere(15.0, c), deep(dtype=dtype), Rectangle(20.0, 20.0), 1.5)
-        landed = form(trace.to_first_free(Point().rays(x, y, 15.0, 1.0), lens), lens, 400.0)
+        landed = form(trace.to_first_net(Point().rays(x, y, 15.0, 1.0), lens), lens, 400.0)
         merit = torch.where(landed.alive, landed.position.square().sum(0), 0.0).sum()
         gradients.append(float(torch.autograd.grad(merit, c)[0]))
     assert gradients[0] != 0.0 and gradients[0] == pytest.approx(gradients[1], rel=1e3 * torch.finfo(dtype).eps)
 
 
-@pytest.mark.parametrize("form", [trace.from_first_free, trace.from_first_free_plain])
+@pytest.mark.parametrize("form", [trace.from_first_net, from_first_net_plain])
 def test_a_ray_of_no_number_is_lost_alone(form):
     """An index made from it must not be out of range: on a GPU that would end the whole process."""
     lens = Lens(Plane(15.0), deep(), Rectangle(20.0, 20.0), 1.5)
     x, y = sampling.grid(Rectangle(10.0, 10.0), 4)
-    in_glass = trace.to_first_free(Point().rays(x, y, 15.0, 1.0), lens)
+    in_glass = trace.to_first_net(Point().rays(x, y, 15.0, 1.0), lens)
     direction = in_glass.direction.clone()
     direction[:, 2, 1] = torch.nan
     landed = form(replace(in_glass, direction=direction), lens, 400.0)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics import irradiance, sampling, trace
+from bstcad.optics import irradiance, trace
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import forward
@@ -19,8 +19,9 @@ from bstcad.optics.outlines import Circle, Rectangle, Rounded
 from bstcad.optics.rays import Landed, TiltedPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
-from bstcad.optics.trace import simulate, simulate_all, simulate_all_plain, simulate_plain, window
+from bstcad.optics.trace import simulate, simulate_plain, window
 from tests.optics.test_mirror import LIGHTS, bumpy, mirror
+from tests.tracing import from_first_net_plain, simulated, simulated_plain, stratified
 
 SQUARE = Rectangle(20.0, 20.0)
 
@@ -95,11 +96,11 @@ SCENES = {  # source, lens, the fates of rays through a window larger than the l
 @pytest.mark.parametrize("plane", [400.0, TiltedPlane((3.0, 2.0, 400.0), (20.0, -10.0), 5.0)], ids=["level", "tilted"])
 @pytest.mark.parametrize("name", SCENES)
 def test_each_ray_ends_as_in_the_plain_form(name, plane):
-    """Against `to_first_free` and `from_first_free_plain`: not another fused kernel; all fates occur."""
+    """Against `to_first_net` and `from_first_net_plain`: not another fused kernel; all fates occur."""
     source, lens, fates = SCENES[name]
-    x, y = (p.reshape(-1) for p in sampling.stratified(Rectangle(23.0, 23.0), 150, 0))  # not a multiple of a block
+    x, y = (p.reshape(-1) for p in stratified(Rectangle(23.0, 23.0), 150, 0))  # not a multiple of a block
     rays = source.rays(x, y, lens.entrance.z, 1.0)
-    plain = trace.from_first_free_plain(trace.to_first_free(rays, lens), lens, plane)
+    plain = from_first_net_plain(trace.to_first_net(rays, lens), lens, plane)
     found = land(source, lens, plane, x, y)
     rtol = 1e-13 if source.tilted else 1e-14  # exp(-80) of a number whose last digits differ
     torch.testing.assert_close(found.flux, plain.flux, rtol=rtol, atol=0)  # zeros are zeros
@@ -122,8 +123,8 @@ def test_the_simulation_is_the_plain_one(name, dtype=torch.float32):
     """Pictures, ledger and count; the float32 net is the same net in both, only plain arithmetic on it is coarser."""
     source, lens, fates = SCENES[name]
     lens = replace(lens, back=lens.back.to(torch.float32))
-    found = simulate(source, replace(lens, back=lens.back.to(dtype)), SCREEN, 300, seed=5)
-    plain = simulate_plain(source, replace(lens, back=lens.back.to(torch.float64)), SCREEN, 300, seed=5)
+    found = simulated(source, replace(lens, back=lens.back.to(dtype)), SCREEN, 300, seed=5)
+    plain = simulated_plain(source, replace(lens, back=lens.back.to(torch.float64)), SCREEN, 300, seed=5)
     assert found.rays == plain.rays > 3000
     # the same rays in the same pixels: sums of numbers of the order of the whole flux, in another order
     for one, other in ((found.box, plain.box), (found.tent, plain.tent)):
@@ -139,7 +140,7 @@ def test_the_simulation_with_losses_is_the_plain_one(name):
     source, lens, _ = SCENES[name]
     metal = 1.2 + 6.0j if lens.reflects else None
     lens = replace(lens, losses=Losses(Fresnel(550.0, metal=metal), None if lens.reflects else Absorption(0.01)))
-    found, plain = simulate(source, lens, SCREEN, 300, seed=5), simulate_plain(source, lens, SCREEN, 300, seed=5)
+    found, plain = simulated(source, lens, SCREEN, 300, seed=5), simulated_plain(source, lens, SCREEN, 300, seed=5)
     assert found.rays == plain.rays and list(found.flux) == list(plain.flux)
     assert found.flux == pytest.approx(plain.flux, abs=1e-7)
     assert sum(found.flux.values()) == pytest.approx(1, abs=1e-12)
@@ -150,8 +151,8 @@ def test_the_simulation_with_losses_is_the_plain_one(name):
 def test_a_sum_of_lights_is_the_sum_of_their_simulations():
     """Each light has its own weight and seed; one call of the kernel traces all of them."""
     lit = [(0.3, *SCENES["point, bent away"][:2], 3), (0.7, *SCENES["point, sphere"][:2], 4)]
-    found, plain = simulate_all(lit, SCREEN, 120), simulate_all_plain(lit, SCREEN, 120)
-    parts = [simulate(source, lens, SCREEN, 120, seed) for _, source, lens, seed in lit]
+    found, plain = simulate(lit, SCREEN, 120), simulate_plain(lit, SCREEN, 120)
+    parts = [simulated(source, lens, SCREEN, 120, seed) for _, source, lens, seed in lit]
     for one, other in ((found.box, plain.box), (found.tent, plain.tent)):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-12)
     assert found.flux == pytest.approx(plain.flux, abs=1e-12)
@@ -166,8 +167,8 @@ def test_every_cell_is_traced_once(n):
     """Rows shorter than a block, of just one and of a block and a bit."""
     source, lens, _ = SCENES["point, bent away"]
     wide = Collimated(Rectangle(15.0, 15.0))
-    assert simulate(wide, lens, SCREEN, n, 0).rays == n * n
-    found, plain = simulate(source, lens, SCREEN, n, 2), simulate_plain(source, lens, SCREEN, n, 2)
+    assert simulated(wide, lens, SCREEN, n, 0).rays == n * n
+    found, plain = simulated(source, lens, SCREEN, n, 2), simulated_plain(source, lens, SCREEN, n, 2)
     assert found.rays == plain.rays and found.flux == pytest.approx(plain.flux, abs=1e-13)
     torch.testing.assert_close(found.tent, plain.tent, rtol=0, atol=1e-13)
 
@@ -197,11 +198,11 @@ def test_light_on_the_border_of_the_screen_and_of_pixels():
 
 def test_memory_does_not_grow_with_the_rays():
     source, lens, _ = SCENES["point, plane"]
-    simulate(source, lens, SCREEN, 10, 0)
+    simulated(source, lens, SCREEN, 10, 0)
     peaks = []
     for n in (100, 1000):  # 1 000 000 rays would be 8 MB a number
         tracemalloc.start()
-        simulate(source, lens, SCREEN, n, 0)
+        simulated(source, lens, SCREEN, n, 0)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < 1.5 * peaks[0] < 1e6
@@ -216,7 +217,7 @@ def test_what_the_kernel_takes(monkeypatch):
     window = replace(lens.interfaces[0], surface=Plane(1.0))
     assert not fused_whole(freeform.interfaces) and not fused_whole(replace(lens, before=(window,)).interfaces)
     monkeypatch.setattr(forward, "simulate", None)
-    assert simulate(source, freeform, SCREEN, 50, 0).rays == 2500  # by the plain form
+    assert simulated(source, freeform, SCREEN, 50, 0).rays == 2500  # by the plain form
 
 
 @dataclass(frozen=True)
@@ -235,8 +236,8 @@ def test_a_new_kind_of_front_is_traced_by_its_own_equation():
     """Not by the kernel, to which it would be a conic of the same curvature."""
     lens = replace(SCENES["collimated, plane"][1], front=Asphere(10.0, 0.01))
     beam = Collimated(Circle(8.0))
-    traced, plain = (run(beam, lens, SCREEN, 40, 0).box for run in (simulate, simulate_plain))
-    sphere = simulate(beam, lens.with_front(Sphere(10.0, 0.01)), SCREEN, 40, 0).box
+    traced, plain = (run(beam, lens, SCREEN, 40, 0).box for run in (simulated, simulated_plain))
+    sphere = simulated(beam, lens.with_front(Sphere(10.0, 0.01)), SCREEN, 40, 0).box
     assert torch.equal(traced, plain) and (traced - sphere).abs().sum() > 0.1 * sphere.sum()
 
 
@@ -250,7 +251,7 @@ def test_it_is_compiled_once():
             for front in (Plane(15), Sphere(15, torch.tensor(0.01, dtype=dtype)), Sphere(15, 0)):
                 lens = Lens(front, back, Circle(radius), 2)
                 for source in (Point(position=(0, 0, 0)), Collimated(Circle(radius)), Point(**CONE)):
-                    simulate(source, lens, Screen(400, (-300, 500), (-400, 350), 40), 4, seed)
+                    simulated(source, lens, Screen(400, (-300, 500), (-400, 350), 40), 4, seed)
                     before = before or len(compiled.signatures)
     assert len(compiled.signatures) == before
 
@@ -259,9 +260,9 @@ def test_the_window_is_the_launching_one():
     """A source beside the axis: rays counted are those the plain form launches over `window`."""
     source, lens, _ = SCENES["point, sphere"]
     area = window(source, lens)
-    x, y = (p.reshape(-1) for p in sampling.stratified(area, 100, 3))
+    x, y = (p.reshape(-1) for p in stratified(area, 100, 3))
     landed = land(source, lens, SCREEN.z, x, y)
     share = float(landed.flux.sum()) * area.area / 100**2
-    assert sum(simulate(source, lens, SCREEN, 100, 3).flux.values()) == pytest.approx(1, abs=1e-12)
+    assert sum(simulated(source, lens, SCREEN, 100, 3).flux.values()) == pytest.approx(1, abs=1e-12)
     missed = float(landed.flux[landed.status == 1].sum()) * area.area / 100**2 + 1 - share
-    assert simulate(source, lens, SCREEN, 100, 3).flux["missed the lens"] == pytest.approx(missed, rel=1e-12)
+    assert simulated(source, lens, SCREEN, 100, 3).flux["missed the lens"] == pytest.approx(missed, rel=1e-12)

@@ -1,0 +1,45 @@
+"""Short ways to rays that tests take and the package does not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from bstcad.optics import sampling
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Rectangle
+from bstcad.optics.rays import Landed, Rays, TargetPlane
+from bstcad.optics.sources import Source
+from bstcad.optics.trace import Simulation, across, land, launch_strips, simulate, simulate_plain
+
+
+def stratified(window: Rectangle, n: int, seed: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
+    """One random point in each of n x n equal cells, each (n, n); neighbours in memory are neighbours in the lens."""
+    x, y = zip(*sampling.stratified_strips(window, n, seed, dtype), strict=True)
+    return torch.cat(x), torch.cat(y)
+
+
+def launch(source: Source, lens: Lens, n: int, seed: int, area: Rectangle | None = None) -> Rays:
+    """The rays of `launch_strips` in one bundle, (3, rays), neighbours beside each other."""
+    strips = list(launch_strips(source, lens, n, seed, area))
+    position, direction = (torch.cat([getattr(s, name) for s in strips], dim=1) for name in ("position", "direction"))
+    flux, status = (torch.cat([getattr(s, name) for s in strips]) for name in ("flux", "status"))
+    return replace(strips[0], position=position, direction=direction, flux=flux, status=status)
+
+
+def from_first_net_plain(coming: Rays, lens: Lens, plane: TargetPlane) -> Landed:
+    """`trace.from_first_net` in plain torch."""
+    return land(across(coming, lens.interfaces[lens.freeform[0] :]), plane)
+
+
+def simulated(source: Source, lens: Lens, screen: Screen, n: int, seed: int) -> Simulation:
+    """The light of n x n stratified rays of one source on the screen."""
+    return simulate([(1.0, source, lens, seed)], screen, n)
+
+
+def simulated_plain(source: Source, lens: Lens, screen: Screen, n: int, seed: int) -> Simulation:
+    """`simulated` in plain torch."""
+    return simulate_plain([(1.0, source, lens, seed)], screen, n)
