@@ -271,6 +271,7 @@ def limits(
     singles: tuple[float, float] | None = None,
     anew: bool = False,
     blurred: float = 0.0,
+    finer_tubes: float = 1.0,
 ) -> tuple[Limit, ...]:
     """Estimates for a design of this RRMSD, the largest gain first; a step without figures is left out.
 
@@ -282,10 +283,11 @@ def limits(
     rays each time.  grown: RRMSD after each size of an extended source: a third, two thirds, all of it.  singles: RRMSD
     by float32, in which it was tailored, and by float64, after a few evaluations; None: it was by float64.  anew: would
     more evaluations be shared out anew, instead of going on where they ended?  blurred: RRMSD of the target blurred by
-    the source's image, below which only a smaller source leads.
+    the source's image, below which only a smaller source leads.  finer_tubes: tubes a side that come with twice the
+    control points, over those now; they mend their part of the error, too.
     """
     seen = 1.0 if own is None else min(own / rrmsd, 1.0)
-    found = [_control_points(rrmsd, cells)]
+    found = [_control_points(rrmsd, cells, seen ** min(2 * math.log2(finer_tubes), 1.0))]
     if curve is not None and curve.power is not None:
         left = seen * curve.doubled ** (HALF if anew else 1.0)  # of the error that the tubes see; the rest stays
         found.append(Limit("evaluations", math.hypot(left, math.sqrt(1 - seen**2)), {"power": curve.power}))
@@ -306,9 +308,9 @@ def limits(
     return tuple(sorted(found, key=lambda limit: limit.rrmsd))
 
 
-def _control_points(rrmsd: float, cells: ControlCells) -> Limit:
-    """The error falls with the least error by the cells, as far as that is a part of it."""
+def _control_points(rrmsd: float, cells: ControlCells, by_tubes: float) -> Limit:
+    """The error falls with the least error by the cells, as far as that is a part of it, and by the factor of tubes."""
     floor, finer = cells.floor(), cells.floor(2.0)
     gain = min(floor / rrmsd, 1.0) * (1 - finer / floor) if floor > 0 else 0.0
     figures = {"floor": floor, "finer": finer, "median": cells.median, "scarce": cells.scarce}
-    return Limit("control points", 1 - gain, figures)
+    return Limit("control points", (1 - gain) * by_tubes, figures)

@@ -189,7 +189,8 @@ def diagnosis(
     blurred: RRMSD of the target blurred by the source's size; 0 for a point.
     at_bounds: share of the back that is at each bound.
     """
-    knobs, screen = scene.tailoring.resolved(scene.lens.back.control_points), scene.target.screen
+    net, screen = scene.lens.back.control_points, scene.target.screen
+    knobs, finer = scene.tailoring.resolved(net), scene.tailoring.resolved(2 * net - 1)
     sizes = [k for k, stage in enumerate(making.stages) if stage.name.startswith(SIZES)]
     curve = ending(
         [(point.seconds, point.rrmsd) for point in making.history],
@@ -208,6 +209,7 @@ def diagnosis(
         singles=None if twins is None else (twins["rrmsd_float32"], twins["rrmsd_float64"]),
         anew=ours and knobs.stage2_iterations < FEW,
         blurred=blurred,
+        finer_tubes=finer.rays / knobs.rays,
     )
     if knobs.method == "integration":  # its map limits it, and no knob does
         found = ()

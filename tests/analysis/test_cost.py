@@ -181,6 +181,12 @@ class TestLimits:
     def test_where_the_cells_leave_all_of_the_error_it_falls_as_they_do(self, rrmsd, left):
         assert self.left(rrmsd, self.SCARCE) == {"control points": pytest.approx(left)}
 
+    @pytest.mark.parametrize(("finer_tubes", "by_tubes"), [(1.0, 1.0), (2**0.25, 0.8), (2**0.5, 0.64), (2.0, 0.64)])
+    def test_a_finer_net_has_the_gain_of_the_tubes_that_come_with_it(self, finer_tubes, by_tubes):
+        """Twice the tubes, by a factor of 2^(1/2) a side, let them see all of the error."""
+        left = self.left(0.09, self.SCARCE, own=0.64 * 0.09, finer_tubes=finer_tubes)
+        assert left["control points"] == pytest.approx(by_tubes / 3)
+
     def test_evaluations_make_smaller_only_what_the_tubes_see(self):
         assert self.left(0.1, self.PLENTY, 1.0, own=0.1)["evaluations"] == pytest.approx(0.5)
         half_seen = self.left(0.1, self.PLENTY, 1.0, own=0.06)["evaluations"]
