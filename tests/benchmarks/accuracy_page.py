@@ -306,7 +306,7 @@ def figure(recorded: Mapping[str, Any], scene: str) -> Any:
     sweep.shown = [*ends, *sweep.presets, *points, *papers]
     sweep.best = sorted(sweep.front, key=lambda run: run.seconds)
     sweep.knobs = [knob for knob in sweep.knobs if len(knob.places) > 1]
-    sweep.history = [Named(seconds=seconds, rrmsd=rrmsd) for seconds, rrmsd in sweep.history]
+    sweep.history = [{"seconds": seconds, "rrmsd": rrmsd} for seconds, rrmsd in sweep.history]
     drawn = new_figure(WIDTH, HEIGHT)
     axes = drawn.subplots()
     plane(axes, sweep)

@@ -12,6 +12,7 @@ import signal
 import threading
 import time
 
+import distributed
 import pytest
 
 from bstcad import commands
@@ -21,7 +22,7 @@ from bstcad.sweep import batch as batches
 from bstcad.sweep.batch import Wanted
 from bstcad.tolerance import study, tolerancing
 from tests.benchmarks.cold import TEMPLATES
-from tests.sweep.test_cold_run import children_of, lose_one
+from tests.sweep.test_cold_run import runs_under_way, wait_until
 
 pytestmark = pytest.mark.bench
 LETTERS = TEMPLATES / "thu.toml"
@@ -109,11 +110,21 @@ def losing(kills, lose):
     killer.join()
 
 
+def lose_one(address, keep):
+    """Kill the first worker process that is at work, in the middle of it, and say which."""
+    with distributed.Client(address, set_as_default=False) as client:
+        pids = client.run(os.getpid)
+        wait_until(lambda: any(client.processing().values()), 60)
+        busy = next(worker for worker, tasks in client.processing().items() if tasks)
+        time.sleep(0.3)
+        os.kill(pids[busy], signal.SIGKILL)
+        keep.append(busy)
+
+
 def kill_one(keep):
     """Kill a process that designs, in the middle of it, and say which."""
-    until = time.monotonic() + 60
-    while not (found := children_of(os.getpid())) and time.monotonic() < until:
-        time.sleep(0.05)
+    wait_until(lambda: runs_under_way(os.getpid()), 60)
     time.sleep(2.0)
-    os.kill(found[0], signal.SIGKILL)
-    keep.append(found[0])
+    [found, *_] = runs_under_way(os.getpid())
+    found.kill()
+    keep.append(found.pid)

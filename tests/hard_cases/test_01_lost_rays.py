@@ -18,7 +18,7 @@ from unittest import mock
 import pytest
 import torch
 
-from bstcad.optics import sampling, trace, tubes
+from bstcad.optics import trace, tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen, collect
 from bstcad.optics.kernels import forward
@@ -151,7 +151,7 @@ def test_a_lost_ray_lights_no_pixel(dtype):
 def test_the_surface_is_not_evaluated_for_20_164_rays_because_of_one(way, dtype, holds):
     """Places at which sag and slopes are asked for, which no busy machine changes: at most a hundredth more."""
     lens = lens_of(wavy(dtype))
-    x, y = (p.reshape(-1) for p in sampling.stratified(Rectangle(13.0, 13.0), 142, 0, dtype))
+    x, y = (p.reshape(-1) for p in stratified(Rectangle(13.0, 13.0), 142, 0, dtype))
     rays = trace.to_first_net(Point().rays(x, y, 15.0, 1.0), lens)
     direction, asked, evaluate = rays.direction.clone(), [], BSplineSurface.relative_sag_and_slope
     direction[:, 7000] = torch.nn.functional.normalize(torch.tensor(way, dtype=torch.float64), dim=0)

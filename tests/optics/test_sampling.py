@@ -62,7 +62,7 @@ def test_the_jitter_is_uniform_and_independent():
         assert abs(np.corrcoef(a.reshape(-1), b.reshape(-1))[0, 1]) < 5 / n, name
 
 
-DRAWS = {"stratified": (sampling.stratified, 16), "random": (sampling.random, 256)}
+DRAWS = {"stratified": (stratified, 16), "random": (sampling.random, 256)}
 
 
 @pytest.mark.parametrize("name", DRAWS)

@@ -117,7 +117,7 @@ def test_hits_lie_on_the_surface():
         assert float(off_line.norm(dim=0).max()) < 1e-13
 
 
-@pytest.mark.parametrize("form", [trace.from_first_net, trace.from_first_net_plain])
+@pytest.mark.parametrize("form", [trace.from_first_net, from_first_net_plain])
 def test_a_ray_that_turns_back_does_not_land(form):
     """60° from the axis in glass, the back face tilted by 20°: it leaves at 74.6° from the normal, 94.6° from the axis,
     and moves away from the screen; its line meets the screen's plane only behind it."""

@@ -148,14 +148,6 @@ def turned_edge(text):
     return re.sub(r"(ORIENTED_EDGE\('',\*,\*,#\d+,)\.T\.", r"\1.F.", text, count=1)
 
 
-def long_arc(text):
-    """A rim of the front runs from corner to corner the other way around its circle, a metre outside the lens."""
-    circles = set(re.findall(r"(#\d+) = CIRCLE", text))
-    along = {name: first for name, first in re.findall(r"(#\d+) = SURFACE_CURVE\('',(#\d+)", text)}
-    arcs = [e for e in re.findall(r"(EDGE_CURVE\('',#\d+,#\d+,(#\d+),)\.T\.", text) if along[e[1]] in circles]
-    return text.replace(f"{arcs[1][0]}.T.", f"{arcs[1][0]}.F.")
-
-
 def moved_path(text, by):
     """A pole of a rim's path in the parameters (rad) of the sphere; the rim in space stays."""
     pole = re.compile(r"(?<=CARTESIAN_POINT\('',\()3\.1\d+(?=,[-+.E\d]+\)\))")  # an angle of pi
@@ -169,7 +161,6 @@ STEP = {  # what is changed: (how, the checks that see it)
     "a knot by 1e-13": (lambda t: moved_knot(t, 1e-13), {KNOTS}),
     "a corner by 1 nm": (lambda t: moved_vertex(t, 1e-6), {GAPS, ON_WALL}),
     "an edge turned around": (turned_edge, {EDGES}),
-    "a rim the long way around": (long_arc, {ON_WALL, ON_FACES}),
     "a rim's path on its face by 2e-6 rad": (lambda t: moved_path(t, 2e-6), {ON_FACES}),
     "the front by 10 nm": (lambda t: moved_sphere(t, 1e-5), {VERTEX, GAPS, ON_FACES, VERTICES, VOLUME_SAID}),
 }
