@@ -190,6 +190,8 @@ def errors(found: Tolerances) -> list[dict[str, Any]]:
 def _error(items: Sequence[Sensitivity], loosest: Mapping[str, float]) -> dict[str, Any]:
     first, part, change = items[0], *(math.fsum(getattr(i, key) for i in items) for key in ("share", "rrmsd_change"))
     words, loose = first.words.partition(" (draw")[0], [loosest[item.name] for item in items if item.name in loosest]
+    widest = WIDEST * math.hypot(*(item.limit for item in items))  # which the search does not exceed
+    at_least = "≥ " if math.isclose(math.hypot(*loose), widest) else ""
     return {
         "words": words[:1].upper() + words[1:],
         "width": amount(math.hypot(*(item.limit for item in items)), first.unit),
@@ -197,7 +199,7 @@ def _error(items: Sequence[Sensitivity], loosest: Mapping[str, float]) -> dict[s
         "change": f"{'+' if change > 0 else ''}{about(change)}",
         "share": percent(part),
         "part": part,
-        "loosest": amount(math.hypot(*loose), first.unit) if loose else "",
+        "loosest": at_least + amount(math.hypot(*loose), first.unit) if loose else "",
     }
 
 
