@@ -7,7 +7,7 @@ knots, they are off by 1e-5.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -35,9 +35,11 @@ if TYPE_CHECKING:
 
 Point = tuple[float, float, float]
 
-STRAIGHT = {Kind.GeomAbs_Plane, Kind.GeomAbs_Cylinder, Kind.GeomAbs_Cone, Kind.GeomAbs_SurfaceOfExtrusion}  # along v
-ROUND = {Kind.GeomAbs_Sphere, Kind.GeomAbs_Torus, Kind.GeomAbs_BSplineSurface}
-STRAIGHT_POINTS, ROUND_POINTS = 4, 32  # Gauss points along v: over half a turn 32 leave only rounding
+ALONG_V = {  # Gauss points along v by the kind of a face, which leave only rounding: straight, up to a turn, a patch
+    Kind.GeomAbs_Plane: 4, Kind.GeomAbs_Cylinder: 4, Kind.GeomAbs_Cone: 4, Kind.GeomAbs_SurfaceOfExtrusion: 4,
+    Kind.GeomAbs_Sphere: 12, Kind.GeomAbs_Torus: 12, Kind.GeomAbs_BSplineSurface: 32,
+}  # fmt: skip
+ARC_PARTS, ARC_POINTS = 8, 12  # of an edge that is a line or an arc on a smooth face: they leave only rounding
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,7 @@ def _of_face(face: TopoDS_Face, z_ref: float) -> Sums:
     if step_reading.is_freeform(surface):
         net = step_reading.freeform_surface(face)
         return quadrature.of_face(net, Border(*_joined(_along(edge) for edge in _edges(face))), net.z - z_ref)
-    if surface.GetType() not in STRAIGHT | ROUND:
+    if surface.GetType() not in ALONG_V:
         raise ValueError("a face is of a kind that is not known here; write it again")
     return _in_parameters(face, surface, z_ref)
 
@@ -89,7 +91,7 @@ def _in_parameters(face: TopoDS_Face, surface: BRepAdaptor_Surface, z_ref: float
     A face that OCC has reversed has its border reversed, too, which turns n.
     """
     u, v, du = (each[:, None] for each in _joined(_image(edge, face) for edge in _edges(face)))
-    point, weight = quadrature.gauss_rule(STRAIGHT_POINTS if surface.GetType() in STRAIGHT else ROUND_POINTS)
+    point, weight = quadrature.gauss_rule(ALONG_V[surface.GetType()])
     half = (v - BRepTools.UVBounds_s(face)[2]) / 2
     u, along, weight = np.broadcast_arrays(u, v + half * (point - 1), -du * half * weight)
     found = step_reading.points_and_tangents(surface, u.ravel().tolist(), along.ravel().tolist())
@@ -114,7 +116,7 @@ def _joined(parts: Iterator[tuple[np.ndarray, ...]]) -> list[np.ndarray]:
 def _along(edge: TopoDS_Edge) -> tuple[np.ndarray, ...]:
     """x, y and weights of dx and dy of Gauss points along an edge in space."""
     curve = BRepAdaptor_Curve(edge)
-    t, weight = _gauss_points(edge, curve)
+    t, weight = _gauss_points(edge, [curve], over_net=True)
     x, y, _, dx, dy, _ = _evaluated(curve, t, gp_Pnt(), gp_Vec())
     return x, y, weight * dx, weight * dy
 
@@ -123,7 +125,7 @@ def _image(edge: TopoDS_Edge, face: TopoDS_Face) -> tuple[np.ndarray, ...]:
     """u, v and weights of du of Gauss points along an edge in the parameters of its face, where u changes."""
     curve = BRepAdaptor_Curve2d(edge, face)
     curves = [curve] if BRep_Tool.Degenerated_s(edge) else [curve, BRepAdaptor_Curve(edge)]
-    t, weight = _gauss_points(edge, *curves)
+    t, weight = _gauss_points(edge, curves)
     u, v, du, dv = _evaluated(curve, t, gp_Pnt2d(), gp_Vec2d())
     moves = np.abs(du) > LEVEL * np.hypot(du, dv)
     return u[moves], v[moves], (weight * du)[moves]
@@ -140,7 +142,9 @@ def _evaluated(
     return np.array(rows).T
 
 
-def _gauss_points(edge: TopoDS_Edge, *curves: BRepAdaptor_Curve | BRepAdaptor_Curve2d) -> tuple[np.ndarray, np.ndarray]:
+def _gauss_points(
+    edge: TopoDS_Edge, curves: Sequence[BRepAdaptor_Curve | BRepAdaptor_Curve2d], over_net: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
     """Parameters and weights in the sense of an edge, in parts that meet no knot of its curves."""
     first, last = curves[0].FirstParameter(), curves[0].LastParameter()
     knots = {first, last}
@@ -148,5 +152,6 @@ def _gauss_points(edge: TopoDS_Edge, *curves: BRepAdaptor_Curve | BRepAdaptor_Cu
         if curve.GetType() == GeomAbs_CurveType.GeomAbs_BSplineCurve:
             spline = curve.BSpline()
             knots.update(k for k in map(spline.Knot, range(1, spline.NbKnots() + 1)) if first < k < last)
-    t, weight = quadrature.gauss_points(quadrature.divided(np.array(sorted(knots)), EDGE_PARTS), POINTS)
+    parts, points = (EDGE_PARTS, POINTS) if over_net or len(knots) > 2 else (ARC_PARTS, ARC_POINTS)
+    t, weight = quadrature.gauss_points(quadrature.divided(np.array(sorted(knots)), parts), points)
     return t, -weight if edge.Orientation() == TopAbs_Orientation.TopAbs_REVERSED else weight

@@ -135,7 +135,7 @@ def processor():
 CHANGES = ("exchange", "exchange", "number", "statement", "cut", *["digit"] * 5)
 
 
-@pytest.mark.parametrize("count", [12, pytest.param(300, marks=pytest.mark.bench)])
+@pytest.mark.parametrize("count", [8, pytest.param(300, marks=pytest.mark.bench)])
 def test_a_damaged_step_file_fails_is_refused_or_is_the_same_solid(folder, others, holds, count):
     """Most by an exchange within one kind of entity, some cut; and files of other things altogether."""
     path, alone = folder / "lens.step", folder.parent / "alone.step"

@@ -84,7 +84,7 @@ def test_in_the_middle_it_flushes_a_checkpoint_and_resume_goes_on(number, scene,
     assert sorted(path.name for path in tmp_path.iterdir()) == ["lens", "small.toml"]
 
 
-@pytest.mark.parametrize("seconds", [0.3, 2.0])
+@pytest.mark.parametrize("seconds", [0.3, pytest.param(2.0, marks=pytest.mark.bench)])
 def test_at_the_beginning_it_leaves_nothing(seconds, scene, tmp_path):
     running = generate(scene, tmp_path / "lens", "--set", "lens.back.control_points=513")
     time.sleep(seconds)
