@@ -123,9 +123,9 @@ def write(
     processes.begin()
     with (
         folders.kept_until_written(made, folder),
+        folders.replacing(folder) as building,
         _nothing_left_running(),
         (drawing or Pictures)(made.scene, processes.submit) as drawn,
-        folders.replacing(folder) as building,
     ):
         made, proof = _written_and_proved(made, building, drawn, progress=progress, effort=effort, limit=limit)
         proven = time.perf_counter()
@@ -149,7 +149,7 @@ def write(
 def prove(made: Made, *, progress: Progress = silent, effort: Effort | None = None) -> Report:
     """Prove a design by temporary files."""
     processes.begin()
-    with _nothing_left_running(), tempfile.TemporaryDirectory(prefix="bstcad-") as place:
+    with tempfile.TemporaryDirectory(prefix="bstcad-") as place, _nothing_left_running():
         drawn = NoPictures(made.scene, processes.submit)
         made, proof = _written_and_proved(made, Path(place), drawn, progress=progress, effort=effort)
     return Report(_contents(made, proof, left_out(made.scene, proof.lens, proof.light.picture)), proof.light.picture)
