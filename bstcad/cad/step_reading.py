@@ -154,7 +154,7 @@ def _lens_in(solid: TopoDS_Solid) -> StepLens:
         outline = _around(edge)
     front = freeform_surface(chosen[0]) if fronts else _front(*chosen)
     faces = chosen[0], back_face
-    return StepLens(solid, net, _uniform_net(back), front=front, outline=outline, edge=edge, faces=faces)
+    return StepLens(solid, net, _uniform_net(back, net), front=front, outline=outline, edge=edge, faces=faces)
 
 
 def is_freeform(surface: BRepAdaptor_Surface) -> bool:
@@ -171,11 +171,12 @@ def freeform_surface(face: TopoDS_Face) -> BSplineSurface:
 
     ValueError if its net is none of bstcad's.
     """
-    return _uniform_net(BRepAdaptor_Surface(face)).from_vertex()
+    surface = BRepAdaptor_Surface(face)
+    return _uniform_net(surface, patches.net_of(surface.BSpline())).from_vertex()
 
 
-def _uniform_net(surface: BRepAdaptor_Surface) -> BSplineSurface:
-    """ValueError unless it is a plain square of degree 2 x 2 on uniform knots, uniform in x and y."""
+def _uniform_net(surface: BRepAdaptor_Surface, net: np.ndarray) -> BSplineSurface:
+    """ValueError unless its net is a plain square of degree 2 x 2 on uniform knots, uniform in x and y."""
     patch = surface.BSpline()
     (m, n), degrees = (patch.NbUPoles(), patch.NbVPoles()), (patch.UDegree(), patch.VDegree())
     if degrees != (2, 2) or m != n or m < SMALLEST_NET or patch.IsURational() or patch.IsVRational():
@@ -188,7 +189,6 @@ def _uniform_net(surface: BRepAdaptor_Surface) -> BSplineSurface:
         if off.max() > 1e-12 * m:
             worst = f"{knots(m)[off.argmax()]:g} is {full[off.argmax()]:.15g}"
             raise ValueError(f"knots in {axis} are not 0 … {m - 2} ({worst}); give a file written by bstcad")
-    net = patches.net_of(patch)
     found = BSplineSurface.from_control_points(net)
     off = np.abs(net - found.control_points())[..., :2].max(axis=-1)
     if not off.max() <= UNIFORM:
