@@ -78,10 +78,10 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
     area, n = clear_window(source, exact), knobs.rays // 2 * 2 + 1  # odd: one ray is through the middle
     x, y = sampling.grid(area, n)
     coming = to_first_net(source.rays(x, y, exact.entrance.z, area.area / n**2), exact)
-    aim = slope_map.aim_points(mapping, exact, task.screen, x, y)
+    aim = slope_map.aim_points(mapping, exact, task.screen, x=x, y=y)
     for _ in range(STARTS):
         start = exact.back.z
-        points = march(coming, aim, plane, exact.last_freeform.law, start, first)
+        points = march(coming, aim, plane, law=exact.last_freeform.law, z=start, first=first)
         back = fitted(exact.back, points, lit(points, coming, exact), knobs.levels)
         exact = moved_clear(exact.with_back(back), z, task.least)
         if exact.back.z == start:
@@ -114,8 +114,8 @@ def march(coming: Rays, aim: Tensor, plane: TargetPlane, law: Law, z: float, fir
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # a step of the march has so few numbers that a second thread only makes the first wait
     try:
-        along = _outwards(line, begin.origin, begin.alive, plane, law)
-        across = _outwards(grid.turned(), _swapped(along.position), _swapped(along.reached), plane, law)
+        along = _outwards(line, begin.origin, begin.alive, plane=plane, law=law)
+        across = _outwards(grid.turned(), _swapped(along.position), _swapped(along.reached), plane=plane, law=law)
     finally:
         torch.set_num_threads(threads)
     return across if first == "y" else Points(_swapped(across.position), _swapped(across.reached))
@@ -144,7 +144,7 @@ class _Grid:
         origin = coming.position - coming.above(z) / direction[2] * direction
         origin = torch.where(alive, origin, torch.zeros_like(origin))
         origin[2] = 0.0
-        return cls(origin, direction, aim, alive, replace(coming, z=z))
+        return cls(origin, direction, aim, alive=alive, rays=replace(coming, z=z))
 
     def __getitem__(self, where: tuple) -> _Grid:
         """Some of them."""
@@ -206,7 +206,7 @@ def fitted(surface: BSplineSurface, points: Points, used: Tensor, levels: tuple[
         some = used[::every, ::every]
         x, y, z = (p[::every, ::every][some] for p in points.position)
         cells = (m * every / n) ** 2  # of the net, a point
-        surface = fit_heights(surface.refined(m), x, y, z, bending / cells, count, degree)
+        surface = fit_heights(surface.refined(m), x, y, z=z, bending=bending / cells, count=count, degree=degree)
     return surface
 
 
@@ -227,7 +227,7 @@ def fit_heights(
     h = surface.heights
     if degree:
         terms = [torch.ones_like(h), *monomials(surface, degree)]
-        h = with_polynomial(h, terms, lambda h: evaluate(h, u, v)[:1], (z,), torch.ones_like(z))
+        h = with_polynomial(h, terms, lambda h: evaluate(h, u, v)[:1], wanted=(z,), weight=torch.ones_like(z))
     residual = normal_equations(z - evaluate(h, u, v)[0]) - bending * bent(h)
     return replace(
         surface,

@@ -62,11 +62,11 @@ def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Step]
     for level in range(state.level if state else 0, len(knobs.levels)):
         lens = lens.refined(knobs.levels[level])
         begun, best = Parameters.of(lens), Best()
-        for reached in _on_level(task, lens, mapping, area, state):
+        for reached in _on_level(task, lens, mapping, area=area, state=state):
             best, leave, done, total = reached.best, None, level * each, each * len(knobs.levels)
             text = f"landing error {best.merit**0.5:.3f} mm RMS"
             if reached.state is not None:
-                leave = Level(level, mapping, begun, best, reached.state)
+                leave = Level(level, mapping, begun, best=best, search=reached.state)
             yield Step(
                 partial(_improved, lens, best, task.free, knobs.levels[-1]),
                 leave,
@@ -83,7 +83,7 @@ def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: 
     n = min(task.knobs.rays, RAYS_PER_CONTROL_POINT * lens.back.m)
     x, y = (t.to(lens.like) for t in sampling.grid(area, n))
     rays = task.heaviest.source.rays(x, y, lens.entrance.z, area.area / n**2)
-    aim, shape = slope_map.aim_points(mapping, lens, task.screen, x, y), lens.front.parameters()
+    aim, shape = slope_map.aim_points(mapping, lens, task.screen, x=x, y=y), lens.front.parameters()
     start = [lens.back.heights, *(torch.as_tensor(shape[name]).to(lens.back.heights) for name in task.free)]
     nearest = min(RATES, key=lambda m: abs(m - lens.back.m))
 
@@ -113,7 +113,13 @@ def transport(task: Task, lens: Lens) -> Mapping:
         task.progress("transport", s.iteration, knobs.transport_iterations, f"mass error {s.mass_error:.4f}")
 
     return slope_map.map_to_target(
-        task.heaviest.source, lens, task.target, task.screen, knobs.transport_grid, knobs.transport_iterations, progress
+        task.heaviest.source,
+        lens,
+        task.target,
+        screen=task.screen,
+        n=knobs.transport_grid,
+        iterations=knobs.transport_iterations,
+        progress=progress,
     )
 
 
@@ -169,7 +175,7 @@ def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[S
     bundles = (random_bundles(task.channels, start, knobs.rays**2, seed) for seed in seeds)
     if state is None:
         yield Step(lambda: lens)
-    for reached in tailor_to_irradiance(start, bundles, merit, knobs.stage2_iterations, state):
+    for reached in tailor_to_irradiance(start, bundles, merit, steps=knobs.stage2_iterations, state=state):
         best = reached.best
         text = f"RRMSD {best.latest:.4f}"
         lens = with_parameters(start, [reached.parameters[0]])

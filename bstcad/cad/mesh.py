@@ -238,7 +238,9 @@ def _numbers(surface: Surface) -> tuple[FaceNumbers, np.ndarray]:
     if not face.is_net:
         c = float(face.curvature)
         bend = (1 + float(face.conic_constant)) * c * c
-        return FaceNumbers(float(face.z), c, bend, EQUATOR, 0.0, 0.0, 0.0, 0.0, per_detail), np.zeros((0, 0))
+        return FaceNumbers(
+            float(face.z), c, bend, equator=EQUATOR, x=0.0, y=0.0, per_x=0.0, per_y=0.0, per_detail=per_detail
+        ), np.zeros((0, 0))
     corner, per_mm = (float(face.x[0]), float(face.y[0])), (1 / pitch for pitch in face.pitch)
     numbers = FaceNumbers(float(face.z), 0.0, 0.0, EQUATOR, *corner, *per_mm, per_detail)
     return numbers, face.heights.contiguous().numpy()

@@ -108,7 +108,7 @@ def _arc(centre: tuple[float, float], radius: float, start: float, *, span: floa
         angle = start + turn * t
         return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
-    return Piece(lambda t: centre + radius * outwards(t), lambda t: -turn * outwards(t), span, centre, turn)
+    return Piece(lambda t: centre + radius * outwards(t), lambda t: -turn * outwards(t), span, centre=centre, turn=turn)
 
 
 def _pieces(edge: cadquery.Edge) -> list[Piece]:

@@ -257,7 +257,7 @@ class Jet:
     @property
     def curvatures(self) -> tuple[Tensor, Tensor]:
         """(most concave, least concave) principal curvature (1/mm)."""
-        return principal(self.z_x, self.z_y, self.z_xx, self.z_xy, self.z_yy)
+        return principal(self.z_x, self.z_y, z_xx=self.z_xx, z_xy=self.z_xy, z_yy=self.z_yy)
 
 
 def principal(z_x: Tensor, z_y: Tensor, z_xx: Tensor, z_xy: Tensor, z_yy: Tensor) -> tuple[Tensor, Tensor]:
@@ -301,7 +301,7 @@ class Spans:
         """These spans of a surface."""
         corner, net = i * surface.m + j, surface.heights.reshape(-1)
         heights = torch.stack([net[corner + (a * surface.m + b)] for a in range(3) for b in range(3)])
-        return cls(surface.m, surface.pitch, i, j, heights)
+        return cls(surface.m, surface.pitch, i=i, j=j, heights=heights)
 
     def jet(self, s: Sequence[float]) -> Jet:
         """At the places s x s of each; differentiable in the heights."""
@@ -312,9 +312,9 @@ class Spans:
         return Jet(
             _mean(along_y[0], first) / pitch_x,
             _mean(along_y[1], value) / pitch_y,
-            _mean(along_y[0], second) / pitch_x**2,
-            _mean(along_y[1], first) / (pitch_x * pitch_y),
-            _mean(along_y[2], value) / pitch_y**2,
+            z_xx=_mean(along_y[0], second) / pitch_x**2,
+            z_xy=_mean(along_y[1], first) / (pitch_x * pitch_y),
+            z_yy=_mean(along_y[2], value) / pitch_y**2,
         )
 
     def _weights(self, index: Tensor, s: Sequence[float]) -> list[list[Tensor]]:

@@ -124,7 +124,9 @@ def cross(rays: Rays, interface: Interface) -> Hit:
     hit = deflect(at, z_x, z_y, interface.law, level=interface.surface.level)
     if not interface.losses:
         return hit
-    return replace(hit, rays=dimmed(hit.rays, hit.cos_in, hit.cos_out, _path(rays, hit.rays), interface.losses))
+    return replace(
+        hit, rays=dimmed(hit.rays, hit.cos_in, hit.cos_out, path=_path(rays, hit.rays), losses=interface.losses)
+    )
 
 
 def dimmed(rays: Rays, cos_in: Tensor, cos_out: Tensor, path: Tensor, losses: Sequence[Loss]) -> Rays:
@@ -191,7 +193,7 @@ def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) ->
     h, z_x, z_y = surface.relative_sag_and_slope(x, y)
     dx, dy, dz = rays.direction.detach()
     ok = meets & ((dz - z_x.detach() * dx - z_y.detach() * dy).abs() > ALONG)
-    rise_x, rise_y = slopes_beyond(surface, x, y, z_x, z_y) if surface.is_net else (z_x, z_y)
+    rise_x, rise_y = slopes_beyond(surface, x, y, z_x=z_x, z_y=z_y) if surface.is_net else (z_x, z_y)
     slope = dz - rise_x.detach() * dx - rise_y.detach() * dy
     step = torch.where(ok, z - h, torch.zeros_like(h)) / torch.where(ok, slope, torch.ones_like(slope))
     before = torch.stack([*rays.position[:2], rays.above(surface.z)])
@@ -210,7 +212,7 @@ def _plane_and_root(surface: Surface, rays: Rays) -> tuple[Tensor, Tensor, Tenso
     with torch.no_grad():
         if surface.is_net:
             known = net_bounds(surface, dz.dtype, rays.sense)
-            s, meets = first_root(surface, start, way, rays, known)
+            s, meets = first_root(surface, start, way, rays=rays, known=known)
         else:
             s, meets = surface.crossing(start[0], start[1], rays.direction, rays.sense)
             meets = meets & (way + s >= 0)  # only the forward root counts
@@ -234,7 +236,7 @@ def net_bounds(surface: BSplineSurface, dtype: torch.dtype, sense: int = 1) -> N
     lowest = float(h.min()) if sense > 0 else -float(h.max())
     return NetBounds(
         float(h.diff(dim=0).abs().max()) / pitch_x, float(h.diff(dim=1).abs().max()) / pitch_y, lowest,
-        64 * half * torch.finfo(dtype).eps, NEAR * half,
+        tolerance=64 * half * torch.finfo(dtype).eps, near=NEAR * half,
     )  # fmt: skip
 
 
@@ -247,15 +249,19 @@ def first_root(
     """
     dx, dy, dz = rays.direction
     steep = rays.alive & ~((dz if rays.sense > 0 else -dz) > known.steepest_x * dx.abs() + known.steepest_y * dy.abs())
-    s, meets = _newton(surface, start, rays.direction, torch.zeros_like(dz), rays.alive & ~steep, known.tolerance)
+    s, meets = _newton(
+        surface, start, rays.direction, s=torch.zeros_like(dz), wanted=rays.alive & ~steep, tolerance=known.tolerance
+    )
     if bool(steep.any()):
         few = steep.nonzero(as_tuple=True)
         before, direction = _only(rays.position, few), _only(rays.direction, few)
         before[2] += rays.z - surface.z
-        below, arrived = _approach(surface, before, direction, known, rays.sense)
+        below, arrived = _approach(surface, before, direction, known=known, sense=rays.sense)
         below, arrived = below - way[few], arrived & (direction[2].abs() > LEVEL)
         if bool(arrived.any()):
-            root, met = _newton(surface, _only(start, few), direction, below, arrived, known.tolerance)
+            root, met = _newton(
+                surface, _only(start, few), direction, s=below, wanted=arrived, tolerance=known.tolerance
+            )
             s[few] = root
             meets[few] = met & ((root - below).abs() <= known.near / FLATTEST)  # else it runs along the face
     return s, meets & (way + s >= -known.tolerance)  # a ray may begin on the face, as near as rounding allows
@@ -288,7 +294,7 @@ def _newton(
             s[few], meets[few] = _newton(surface, *at, tolerance, steps - step)
             break
         if step + NEWTON_STEPS - steps >= QUICK:
-            z_x, z_y = slopes_beyond(surface, x, y, z_x, z_y)
+            z_x, z_y = slopes_beyond(surface, x, y, z_x=z_x, z_y=z_y)
         slope = dz - z_x * dx - z_y * dy
         floor = torch.where(slope < 0, -FLATTEST, FLATTEST).to(slope.dtype)  # keeps the sign
         slope = torch.where(slope.abs() > FLATTEST, slope, floor)

@@ -143,7 +143,7 @@ class Fresnel:
         law = interface.law
         if law.reverses:
             return MetalReflection(self.metal, self.polarisation)
-        return Transmission(law.n_in, law.n_out, self.wavelength, self.polarisation, self.coating)
+        return Transmission(law.n_in, law.n_out, self.wavelength, polarisation=self.polarisation, coating=self.coating)
 
 
 @dataclass(frozen=True)

@@ -126,16 +126,19 @@ def measure(
     wanted = torch.from_numpy(np.asarray(target, dtype=np.float64))
     stray = ghost and ghost(lens, channels, screen, round(a_side(channels) * effort.rays / GHOSTS), effort.seed)
     seen = SEEN * effort.accuracy / FULL.accuracy
-    rays = _enough(lens, draw or (lambda count, seed: channels), screen, wanted, effort, stray, seen)
+    rays = _enough(
+        lens, draw or (lambda count, seed: channels), screen, wanted=wanted, effort=effort, ghost=stray, seen=seen
+    )
     if not rays.boxes:
-        return Light(np.zeros(screen.shape), math.nan, math.inf, rays.count, rays.flux)
+        return Light(np.zeros(screen.shape), math.nan, math.inf, rays=rays.count, flux=rays.flux)
     (value, error), (tent, _) = _value(rays, wanted), apart(rays.tents, wanted)
     shown, off = _shown(rays.boxes, wanted)
     lenses = [c.through(lens) for c in channels]
     simple = draw is None and all(seen.losses is None and fused_whole(seen.interfaces) for seen in lenses)
+    witnessed = effort.witness and simple
     return Light(
-        shown.numpy(), value, error, rays.count, rays.flux, tent=math.sqrt(max(tent, 0.0)), picture_off=off,
-        witness=_witness(lens, channels, screen, wanted, rays, stray) if effort.witness and simple else None,
+        shown.numpy(), value, error, rays=rays.count, flux=rays.flux, tent=math.sqrt(max(tent, 0.0)), picture_off=off,
+        witness=_witness(lens, channels, screen, wanted=wanted, rays=rays, ghost=stray) if witnessed else None,
         ghost=stray and (stray.picture.cpu() * (total(wanted) / rays.on_screen)).numpy(),
         leak=leak((sum(rays.boxes) / SETS).numpy(), wanted.numpy()),
     )  # fmt: skip
@@ -146,7 +149,7 @@ def rrmsd_by_rays(
 ) -> float:
     """`Light.rrmsd` alone; NaN where no light falls."""
     wanted = torch.from_numpy(np.asarray(target, dtype=np.float64))
-    rays = _enough(lens, lambda count, seed: channels, screen, wanted, effort, None)
+    rays = _enough(lens, lambda count, seed: channels, screen, wanted=wanted, effort=effort, ghost=None)
     return _value(rays, wanted)[0] if rays.boxes else math.nan
 
 
@@ -178,8 +181,8 @@ class _Rays:
 
         return _Rays(
             tuple(map(mean, self.boxes, other.boxes)), tuple(map(mean, self.tents, other.tents)),
-            {line: mean(part, other.flux[line]) for line, part in self.flux.items()}, self.count + other.count,
-            mean(self.on_screen, other.on_screen), weight,
+            {line: mean(part, other.flux[line]) for line, part in self.flux.items()}, count=self.count + other.count,
+            on_screen=mean(self.on_screen, other.on_screen), weight=weight,
         )  # fmt: skip
 
 
@@ -255,7 +258,7 @@ def _enough(
     first = side
     while True:
         start = time.perf_counter()
-        more = _traced(lens, draw, screen, wanted, side, effort.seed, ghost)
+        more = _traced(lens, draw, screen, wanted=wanted, side=side, seed=effort.seed, ghost=ghost)
         if not more.boxes:
             return more
         rays = more if rays is None else rays.joined(more)
@@ -283,7 +286,7 @@ def _traced(lens, draw: Draw, screen: Screen, wanted: Tensor, side: int, seed: i
     for i in range(SETS):
         channels = draw(count, seed + i)
         n = max(1, round(a_side(channels) * side))
-        sets.append(simulated(lens, channels, screen, n, seed + i))
+        sets.append(simulated(lens, channels, screen, n=n, seed=seed + i))
     flux = {line: math.fsum(part.flux[line] for part in sets) / SETS for line in sets[0].flux}
     if ghost is not None:
         flux |= {line: flux.get(line, 0.0) + more for line, more in ghost.flux.items()}
@@ -291,10 +294,10 @@ def _traced(lens, draw: Draw, screen: Screen, wanted: Tensor, side: int, seed: i
     boxes, tents = ([_joined(getattr(part, kind), ghost) for part in sets] for kind in ("box", "tent"))
     on_screen = math.fsum(float(total(box)) for box in boxes) / SETS
     if not all(float(total(box)) > 0 for box in boxes):
-        return _Rays((), (), flux, count, 0.0)
+        return _Rays((), (), flux, count=count, on_screen=0.0)
     whole = total(wanted)
     boxes, tents = (tuple(p * (whole / total(p)) for p in pictures) for pictures in (boxes, tents))
-    return _Rays(boxes, tents, flux, count, on_screen, float(side) ** 3)
+    return _Rays(boxes, tents, flux, count=count, on_screen=on_screen, weight=float(side) ** 3)
 
 
 def _witness(lens, channels, screen: Screen, wanted: Tensor, rays: _Rays, ghost: Ghost | None) -> Witness:
@@ -320,7 +323,7 @@ def tubes_picture(
 ) -> Tensor:
     """(rows, columns) flux that falls into each pixel, by n x n tubes a channel (`tubes.picture`); all light is 1."""
     few = FEW if over_the_back else SHEET
-    pictures = (picture(c.source, c.through(lens), screen, n, few, over_the_back) for c in channels)
+    pictures = (picture(c.source, c.through(lens), screen, n, few=few, over_the_back=over_the_back) for c in channels)
     return weighted_sum(channels, pictures)
 
 
@@ -422,7 +425,7 @@ def images(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int = IMA
     first = channels[0]
     channels = [c for c in channels if (c.source.wavelength, c.index) == (first.source.wavelength, first.index)]
     x, y = corners(lens.apertures[1], n)
-    landed = [_through(channel, lens, screen, x, y) for channel in channels]
+    landed = [_through(channel, lens, screen, x=x, y=y) for channel in channels]
     position, flux = (torch.stack([getattr(each, name) for each in landed], dim=-2) for name in ("position", "flux"))
     lit = flux.sum(0) > 0
     flux, share = flux[:, lit], flux[:, lit] / flux[:, lit].sum(0)

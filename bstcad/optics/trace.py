@@ -242,7 +242,7 @@ def ghost_light(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int,
     """The ghost of all channels on a screen, by n x n stratified rays a channel, GHOST_RAYS at most."""
     n = min(n, GHOST_RAYS)
     parts = [
-        _ghost_of_channel(c, c.through(lens), screen, n, seed + k)
+        _ghost_of_channel(c, c.through(lens), screen, n=n, seed=seed + k)
         for c, k in zip(channels, places(channels), strict=True)
     ]
     flux = {line: weighted_sum(channels, (part.flux[line] for part in parts)) for line in parts[0].flux}

@@ -91,12 +91,12 @@ def picture(
     over_the_back: spread them there even where the lens cuts nothing, so that pictures of lenses that differ little err
     alike, whether they cut the beam or just do not.
     """
-    sheet = _sheet(source, lens, n, few, over_the_back)
+    sheet = _sheet(source, lens, n, few=few, over_the_back=over_the_back)
     whole = torch.zeros(screen.shape, dtype=torch.float64, device=lens.like.device)
     for first in range(0, n, BAND):
         band = sheet.rows(slice(first, min(first + BAND, n) + 1))
         x, y = (p + INWARDS * (middle - p) for p, middle in zip(band, sheet.middle, strict=True))
-        whole = whole + _tubes(source, lens, x, y, sheet.cut).picture(lens, screen)
+        whole = whole + _tubes(source, lens, x=x, y=y, cut=sheet.cut).picture(lens, screen)
     return whole.clamp(min=0)  # a black pixel may be off by rounding
 
 
@@ -124,7 +124,7 @@ def _tubes(source: Source, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes
             inside = inside & edges[k].outline.contains(*ways[-1].position[:2])
     if cut:
         lit = inside & ways[back].alive
-    return Tubes(ways[first], _density(source, lens, x, y, lit) * area)
+    return Tubes(ways[first], _density(source, lens, x=x, y=y, lit=lit) * area)
 
 
 def _density(source: Source, lens: Lens, x: Tensor, y: Tensor, lit: Tensor | None) -> Tensor:
@@ -200,7 +200,8 @@ def _partly_lit(source: Source, lens: Lens, x: tuple[Tensor, ...], y: tuple[Tens
 def _getting_through(source: Source, lens: Lens, x: Tensor, y: Tensor) -> Tensor:
     """Flux density (n,) (1/mm²) at points of the first vertex's plane (n,), zero where the lens cuts the light."""
     if lens.losses is None and fused_whole(lens.interfaces):
-        landed = forward.land(source, lens, lens.back.z + 1.0, x.double(), y.double())  # a plane behind it, whichever
+        behind = lens.back.z + 1.0  # a plane behind the lens, whichever
+        landed = forward.land(source, lens, behind, x=x.double(), y=y.double())
         return landed.flux * ((landed.status != int(Status.MISSED_FRONT)) & (landed.status != int(Status.VIGNETTED)))
     return source.irradiance(x, y, lens.entrance.z) * gets_through(source.rays(x, y, lens.entrance.z, 1.0), lens)
 
@@ -263,7 +264,7 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor, number: int | None
     n = x.shape[0]
     if n > 2 * COARSE and not arrive(x[:1, :1], y[:1, :1], z[:1, :1]).axial:  # along the axis x and y are the answer
         some = torch.linspace(0, n - 1, COARSE).round().long()
-        c_p, c_q, _ = rays_to(source, lens, x[some][:, some], y[some][:, some], number)
+        c_p, c_q, _ = rays_to(source, lens, x=x[some][:, some], y=y[some][:, some], number=number)
         inverse = [_between(some, n, t) for t in jacobian(c_p, c_q, z[some][:, some])]
         p, q = (_between(some, n, t) for t in (c_p, c_q))
     for _ in range(REVERSE_STEPS):

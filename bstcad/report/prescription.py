@@ -255,7 +255,13 @@ def _volume(lens: Lens, whole: WholePart | None) -> float | None:
 def _origin(lens: Lens, vertex: float, bare: bool = True) -> str:
     """The position of axis and front, seen from the point (0, 0, 0) of the file; vertex: z of the back's."""
     front = lens.front.z
-    axis = "on the axis of the lens" + " (the middle of its outline)" * bare
+    axis = f"on the axis of the {'mirror' if lens.reflects else 'lens'}" + " (the middle of its outline)" * bare
+    if lens.reflects:  # its light comes from above
+        if vertex < 0:
+            return f"{axis}, {mm(-vertex)} mm before the vertex of the mirror, on the light's side"
+        rear = "the vertex of the rear"
+        between = f"{mm(abs(front))} mm {'behind' if front > 0 else 'in front of'} {rear}" if front else f"at {rear}"
+        return f"{axis}, {between}"
     if front > 0:
         return f"{axis}, {mm(front)} mm before the vertex of the front, on the light's side"
     if front == 0:

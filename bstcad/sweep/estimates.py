@@ -95,7 +95,9 @@ def left_out(scene: Scene, lens: Lens, picture: np.ndarray) -> tuple[LeftOut, ..
 
     picture: (rows, columns) flux in each pixel, of the target or as the lens throws it.
     """
-    reference = Reference.of(lens, _central(scene), scene.target.screen, picture, scene.lens.back.control_points)
+    reference = Reference.of(
+        lens, _central(scene), scene.target.screen, picture=picture, control_points=scene.lens.back.control_points
+    )
     found = list(_mirror(scene, reference) if lens.reflects else _lens(scene, reference))
     found += _size(scene, reference)
     found.append(_entry("diffraction", reference.diffraction(), "of the whole aperture"))

@@ -140,7 +140,7 @@ def _near(
             continue
         near = torch.nonzero(most() > (1 - MARGIN) * bound)
         for i, j in (part.T for part in near.split(SPANS) if len(part)):
-            yield Spans.of(back, i, j), reached_by(back, outline, i, j, QUARTERS), bound, quantity
+            yield Spans.of(back, i, j), reached_by(back, outline, i=i, j=j, s=QUARTERS), bound, quantity
 
 
 def _of_thickness(lens: Lens, bounds: Bounds) -> tuple[float, Tensor, float]:

@@ -66,7 +66,7 @@ class TubeMerit:
     ) -> TubeMerit:
         """The merit by sheets of n x n tubes launched for `lens`; the target may have any sum."""
         sheets = tuple(launch_tubes(channel.source, channel.through(lens), n) for channel in channels)
-        return cls(channels, sheets, screen, target / total(target), overshoot)
+        return cls(channels, sheets, screen, target=target / total(target), overshoot=overshoot)
 
     @property
     def tubes(self) -> int:
@@ -132,7 +132,7 @@ def local_weight(source: Source, lens: Lens, target: np.ndarray, screen: Screen,
     net, onwards = lens.interfaces[number].surface, lens.unbounded().interfaces[number:]
     places = (torch.linspace(low, high, net.m, dtype=torch.float64) for low, high in (net.x, net.y))
     x, y = torch.meshgrid(*places, indexing="ij")
-    _, _, at_net = rays_to(source, lens, x, y, number)
+    _, _, at_net = rays_to(source, lens, x=x, y=y, number=number)
     with torch.no_grad():
         landed = through(at_net, onwards, screen.plane)
     column, row = (p.cpu().double().numpy() for p in screen.pixel(*landed.position))

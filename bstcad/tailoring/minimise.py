@@ -82,15 +82,15 @@ def minimise(problem: Problem, method: Method, evaluations: int, best: Best = Be
         if merit < lowest:
             lowest, at, lowest_figure = merit, tuple(p.detach().clone() for p in query.parameters), figure
         useless = skipped > best.skipped
-        best = Best(lowest, lowest_figure, figure, at, best.evaluations + 1, skipped)
+        best = Best(lowest, lowest_figure, figure, parameters=at, evaluations=best.evaluations + 1, skipped=skipped)
         try:
             query, reason = method.send(Evaluation(merit, gradients, best)), ""
         except StopIteration as end:
-            yield Reached(best, None, None, useless, end.value)
+            yield Reached(best, None, None, skipped=useless, reason=end.value)
             return
         if best.evaluations >= evaluations:
             reason = "evaluations"
-        yield Reached(best, query.parameters, None if reason else query.state, useless, reason)
+        yield Reached(best, query.parameters, None if reason else query.state, skipped=useless, reason=reason)
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,8 @@ def adam(start: list[Tensor], rates: list[float], steps: int, state: AdamState |
         moments = [optimiser.state[p] for p in parameters if optimiser.state[p]]
         mean, square = (tuple(m[name].clone() for m in moments) for name in ("exp_avg", "exp_avg_sq"))
         taken = int(moments[0]["step"]) if moments else 0
-        state = AdamState(step, taken, tuple(p.clone() for p in parameters), mean, square)  # it works in place
+        held = tuple(p.clone() for p in parameters)  # Adam works in place
+        state = AdamState(step, taken, held, mean=mean, square=square)
         evaluation = yield Query(list(state.parameters), state)
         if math.isfinite(evaluation.merit):
             for p, g in zip(parameters, evaluation.gradients, strict=True):
@@ -200,7 +201,7 @@ def _step(at: Callable[[Tensor], Values], search: Search) -> Generator[Query, Ev
     change, turn = trial.step * way, trial.gradient - g
     if (curvature := dot(change, turn)) > 1e-10 * math.sqrt(dot(change, change) * dot(turn, turn)):
         pairs = (*pairs, (change, turn, curvature))[-MEMORY:]
-    return Search(x + change, trial.value, trial.gradient, pairs, search.steps + 1, search.before)
+    return Search(x + change, trial.value, trial.gradient, pairs=pairs, steps=search.steps + 1, before=search.before)
 
 
 def _inverse_hessian_times(g: Tensor, pairs: Sequence[tuple[Tensor, Tensor, float]]) -> Tensor:

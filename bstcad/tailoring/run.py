@@ -111,11 +111,11 @@ class Task:
         effort = ASKED
         if self.knobs.accuracy is None and self.bounds is None:
             effort = replace(BETWEEN, rays=round(BETWEEN.rays * (self.target.size / PIXELS**2) ** (1 / 3)))
-        return rrmsd_by_rays(lens.plain(), self.channels, self.screen, self.target, effort)
+        return rrmsd_by_rays(lens.plain(), self.channels, self.screen, target=self.target, effort=effort)
 
     def used(self, lens: Lens) -> float:
         """Part of the light that enters the lens which falls on the target."""
-        return measure(lens.plain(), self.channels, self.screen, self.target, COUNTED).used
+        return measure(lens.plain(), self.channels, self.screen, target=self.target, effort=COUNTED).used
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,7 @@ def fit_slopes(
         return spectrum.adjoint(g)
 
     if fit.degree:
-        start = with_polynomial(start, monomials(surface, fit.degree), slopes, (z_x, z_y), weight)
+        start = with_polynomial(start, monomials(surface, fit.degree), slopes, wanted=(z_x, z_y), weight=weight)
 
     now_x, now_y = slopes(start)
     c = conjugate_gradients(

@@ -73,7 +73,7 @@ def face_grid(source: Source, lens: Lens, window: Rectangle, n: int) -> FaceGrid
     """
     x, y = (t.to(lens.like.device) for t in sampling.grid(window, n))
     number = lens.freeform[-1]
-    q_x, q_y, at_face = rays_to(source, lens, x, y, number)
+    q_x, q_y, at_face = rays_to(source, lens, x=x, y=y, number=number)
     coming = across(source.rays(q_x, q_y, lens.entrance.z, 1.0), lens.interfaces[:number])
     steps = (window.width / n, window.height / n)
     xx, xy = torch.gradient(q_x, spacing=steps)
@@ -130,14 +130,14 @@ def slope_map(
     k = _insensitive(grid, lens, screen)
     t_x, t_y = pixel_corners(screen)
     b_x, b_y = previous.places if previous else (np.zeros_like(t_x), np.zeros_like(t_y))
-    y_x, y_y = _needed(grid, lens, screen.plane, (b_x, b_y), (t_x, t_y))
+    y_x, y_y = _needed(grid, lens, screen.plane, b=(b_x, b_y), t=(t_x, t_y))
     sign = -1.0 if lens.last_freeform.law.reverses else 1.0
     y_x, y_y = sign * (y_x + k * b_x), sign * (y_y + k * b_y)
     sigma, frame = spread_density(picture, (y_x, y_y), n)
     mapping = solve(Density.from_values(rho), sigma, Frame((0.0, 0.0), side), frame, **solver)
     places = mapping.inverse(y_x, y_y)
     moved = _moved(picture, (b_x, b_y), places) / (side / 2) if previous else math.nan
-    return SlopeMap(mapping, k, sign, places, moved)
+    return SlopeMap(mapping, k, sign, places=places, moved=moved)
 
 
 def _moved(picture: np.ndarray, before: tuple[np.ndarray, np.ndarray], now: tuple[np.ndarray, np.ndarray]) -> float:
@@ -160,7 +160,9 @@ def sloped(lens: Lens, wanted: SlopeMap, grid: FaceGrid, fit: Fit, unlit: float,
     _, now_x, now_y = net.relative_sag_and_slope(x, y)
     z_x, z_y = (torch.where(lit, s, now) for s, now in zip(wanted.slopes(x, y), (now_x, now_y), strict=True))
     weight = torch.where(lit, 1.0, unlit).to(x)
-    return lens.with_last_net(fit_slopes(net, x, y, z_x, z_y, weight, fit).from_vertex().moved(net.z))
+    return lens.with_last_net(
+        fit_slopes(net, x, y, z_x=z_x, z_y=z_y, weight=weight, fit=fit).from_vertex().moved(net.z)
+    )
 
 
 def _insensitive(grid: FaceGrid, lens: Lens, screen: Screen) -> float:
@@ -217,7 +219,7 @@ def spread_density(picture: np.ndarray, corners: tuple[np.ndarray, np.ndarray], 
     flux = np.ascontiguousarray(picture[::-1].T)  # row 0 is y max
     parts = tuple(max(1, round(SUBPIXELS * n / pixels)) for pixels in flux.shape)
     x, y = (np.ascontiguousarray(n * c) for c in frame.to_unit(*corners))
-    return Density.from_values(spread(flux, x, y, n, parts), floor=FLOOR), frame
+    return Density.from_values(spread(flux, x, y, n=n, parts=parts), floor=FLOOR), frame
 
 
 def _corners_of(picture: np.ndarray) -> np.ndarray:

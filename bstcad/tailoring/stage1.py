@@ -64,7 +64,7 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[S
     if state is None and task.free:
         coarse = lens.refined(task.knobs.levels[0])
         shaped = shaped_front(
-            task.heaviest.source, coarse, task.target, task.screen, task.free, task.rim_sags,
+            task.heaviest.source, coarse, task.target, screen=task.screen, free=task.free, rim_sags=task.rim_sags,
             iterations=task.knobs.transport_iterations,
         )  # fmt: skip
         lens = lens.with_front(shaped.front)
@@ -102,9 +102,9 @@ def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> It
         yield Step(
             partial(lens.refined, knobs.levels[-1]),
             SlopeRound(turn + 1, Parameters.of(lens), wanted),
-            wanted.mapping,
-            wanted.places,
-            ("stage 1", turn + 1, knobs.rounds, ""),
+            mapping=wanted.mapping,
+            places=wanted.places,
+            progress=("stage 1", turn + 1, knobs.rounds, ""),
         )
 
 
@@ -120,7 +120,7 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[
     lens = lens.refined(m)
     window = lit_window(source, lens)
     wanted = slope_map(
-        source, lens, window, task.target, task.screen, coarse, wanted,
+        source, lens, window, picture=task.target, screen=task.screen, n=coarse, previous=wanted,
         iterations=knobs.transport_iterations, progress=progress,
     )  # fmt: skip
     side = min(2 * m, knobs.rays)
@@ -141,7 +141,13 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
         n, m = (COARSEST_GRID, knobs.levels[0]) if turn < AIMS - 1 else (knobs.transport_grid, knobs.levels[-1])
         lens = lens.refined(m)
         rays, wanted, mapping = aimed_rays(
-            task.heaviest.source, lens, task.target, task.screen, n, aimed(m, knobs.rays), knobs.transport_iterations
+            task.heaviest.source,
+            lens,
+            task.target,
+            screen=task.screen,
+            n=n,
+            side=aimed(m, knobs.rays),
+            iterations=knobs.transport_iterations,
         )
         lens = moved_clear(tailor_to_aim(lens, rays, wanted, task.screen.plane), z, task.least, task.bounds)
     return lens, mapping
@@ -156,11 +162,11 @@ def aimed_rays(
     source: Source, lens: Lens, target: np.ndarray, screen: Screen, n: int, side: int, iterations: int
 ) -> tuple[Rays, Tensor, Mapping]:
     """Rays that cover the front, `side` each way, and the aim of each (mm) by a map on n x n cells."""
-    mapping = map_to_target(source, lens, target, screen, n, iterations, lambda _: None)
+    mapping = map_to_target(source, lens, target, screen=screen, n=n, iterations=iterations, progress=lambda _: None)
     area = clear_window(source, lens)
     x, y = (t.to(lens.like) for t in sampling.grid(area, side))
     rays = source.rays(x, y, lens.entrance.z, area.area / side**2)
-    return rays, aim_points(mapping, lens, screen, x, y), mapping
+    return rays, aim_points(mapping, lens, screen, x=x, y=y), mapping
 
 
 def shaped_front(
@@ -172,11 +178,13 @@ def shaped_front(
     Its merit is theirs for stage 1, the mean squared miss of the aim points, with the best back for each front, on the
     net that the lens has; n, iterations: cells a side and steps of the map, repeats: fits of the slopes for each front.
     """
-    rays, wanted, _ = aimed_rays(source, lens, target, screen, n, 2 * lens.back.m, iterations)
+    rays, wanted, _ = aimed_rays(source, lens, target, screen=screen, n=n, side=2 * lens.back.m, iterations=iterations)
     plane = screen.plane
 
     def miss(tried: Lens) -> float:
-        return float(landing(trace(rays, tailor_to_aim(tried, rays, wanted, plane, repeats), plane), wanted))
+        return float(
+            landing(trace(rays, tailor_to_aim(tried, rays, wanted, plane=plane, repeats=repeats), plane), wanted)
+        )
 
     return lens.with_front(best_front(miss, lens, free, rim_sags).front)
 
@@ -189,14 +197,14 @@ def best_front(merit: Merit, lens: Lens, free: tuple[str, ...], rim_sags: Range 
     """
     if "curvature" in free:
         own = float(lens.front.curvature)
-        lens = _along("curvature", merit, lens, _curvatures(lens, rim_sags, own), 1e-4)
+        lens = _along("curvature", merit, lens, bounds=_curvatures(lens, rim_sags, own), tolerance=1e-4)
     if "conic_constant" in free and lens.front.curvature:
         if "curvature" in free:
             return _together(merit, lens, rim_sags)
         own = float(lens.front.conic_constant)
         low, high = _conic_constants(lens, rim_sags)
         low, high = min(low, own), max(high, own)
-        lens = _along("conic_constant", merit, lens, (low, high), 1e-3 * (high - low))
+        lens = _along("conic_constant", merit, lens, bounds=(low, high), tolerance=1e-3 * (high - low))
     return lens
 
 

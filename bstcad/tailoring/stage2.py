@@ -105,7 +105,8 @@ def run_rounds(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = N
     for, as `Task.rrmsd` finds it with other and more tubes.
     """
     accuracy = rounds[0].task.knobs.accuracy
-    place = state.place if state else Place(0, 0, 0, accuracy or 0.0, Parameters.of(lens), Parameters.of(lens))
+    begin = Parameters.of(lens)
+    place = state.place if state else Place(0, 0, 0, accuracy or 0.0, sheet_from=begin, search_from=begin)
     total = sum(each.evaluations for each in rounds)
     if state is None:
         yield Step(lambda: lens)
@@ -118,7 +119,9 @@ def run_rounds(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = N
             continue
         target = torch.from_numpy(task.target).to(lens.like.device)
         launched = place.sheet_from.applied(lens)
-        merit = TubeMerit.of(task.channels, launched, now.tubes, task.screen, target, _pull(task, launched))
+        merit = TubeMerit.of(
+            task.channels, launched, now.tubes, screen=task.screen, target=target, overshoot=_pull(task, launched)
+        )
         while place.done < place.round_end:
             if state is None:
                 place = replace(place, search_from=Parameters.of(lens))
@@ -174,7 +177,9 @@ def _search(
     """
     task, evaluations = now.task, place.round_end - place.done
     variables, work = variables_of(task, lens), 0.0  # the first step also sets this up: its time is not known
-    for reached in search(lens, Problem(lens, merit, task.bounds, bound_weight), variables, evaluations, state):
+    for reached in search(
+        lens, Problem(lens, merit, task.bounds, bound_weight), variables, evaluations=evaluations, state=state
+    ):
         best, reason = reached.best, reached.reason
         step = Step(partial(improved, lens, variables, best), work=work, skipped=reached.skipped)
         if not reached.skipped:
@@ -219,7 +224,9 @@ def variables_of(task: Task, lens: Lens) -> tuple[SobolevVariable, ...]:
     """The variable of each freeform interface, for the light of the task."""
     light = task.heaviest
     seen = light.through(lens)
-    weights = (local_weight(light.source, seen, task.target, task.screen, number) for number in lens.freeform)
+    weights = (
+        local_weight(light.source, seen, task.target, screen=task.screen, number=number) for number in lens.freeform
+    )
     return tuple(map(SobolevVariable.of, lens.nets, weights))
 
 
@@ -311,7 +318,7 @@ def compare_precisions(task: Task, lens: Lens) -> Comparison:
         _tried(task, lens.to(d)) for d in (torch.float32, torch.float64)
     )
     n = round(a_side(task.channels) * (TUBES + 1))
-    rrmsd = [rrmsd_by_tubes(end, task.channels, task.screen, task.target, n) for end in (single, double)]
+    rrmsd = [rrmsd_by_tubes(end, task.channels, task.screen, target=task.target, n=n) for end in (single, double)]
     pairs = zip(single.nets, double.nets, strict=True)
     return Comparison(
         control_points=max(net.m for net in lens.nets),
@@ -327,7 +334,7 @@ def compare_precisions(task: Task, lens: Lens) -> Comparison:
 def _tried(task: Task, lens: Lens) -> tuple[float, Tensor, Lens]:
     """(merit and gradient at the start, the lens after COMPARED evaluations in its own precision, in float64)."""
     target, n = torch.from_numpy(task.target).to(lens.like.device), min(TUBES, task.knobs.rays)
-    merit = TubeMerit.of(task.channels, lens, n, task.screen, target, task.knobs.overshoot)
+    merit = TubeMerit.of(task.channels, lens, n, screen=task.screen, target=target, overshoot=task.knobs.overshoot)
     problem, variables = Problem(lens, merit), variables_of(task, lens)
     value, gradients, _ = problem([net.heights for net in lens.nets])
     *_, last = search(lens, problem, variables, COMPARED)

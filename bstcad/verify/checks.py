@@ -140,7 +140,9 @@ def verify(
     whole = quadrature.of_lens(lens)  # not as it was stated
     lit, of_aperture, why = (lens, (), "") if mount is None else _as_made(seen, lens, nominal, folder)
     known(lit)
-    light = measure(lit, nominal.channels, nominal.screen, nominal.target, effort, nominal.ghost, nominal.draw)
+    light = measure(
+        lit, nominal.channels, nominal.screen, nominal.target, effort=effort, ghost=nominal.ghost, draw=nominal.draw
+    )
     if not light.rrmsd >= 0:
         name = "lens.step" if mount is None else "part.step"
         raise ValueError(f"{name}: none of its light falls on the target; write it again, or check scene.toml")
@@ -169,7 +171,9 @@ def verify(
     return Proof(
         checks, lit, light, shape, stability=stability,
         blur=blur(nominal.channels, lit, nominal.screen, nominal.target),
-        lines=lines_apart(lit, nominal.channels, nominal.screen, nominal.target, max(LINE_TUBES, tubes_of(lit))),
+        lines=lines_apart(
+            lit, nominal.channels, nominal.screen, target=nominal.target, n=max(LINE_TUBES, tubes_of(lit))
+        ),
         at_bounds=at_bounds or None,
     )  # fmt: skip
 
@@ -266,11 +270,13 @@ def of_bounds(
         bending = survey(lens, **{kind: radius}, slope=degrees)
         if radius is not None:
             met = getattr(bending, kind)
-            checks.append(Check.at_least(f"smallest {kind} radius{GRID}", met.largest, radius, "mm", met.where))
+            checks.append(
+                Check.at_least(f"smallest {kind} radius{GRID}", met.largest, radius, unit="mm", where=met.where)
+            )
             at_bounds["tool_radius"] = met.at_bound
         if degrees is not None:
             met = bending.slope
-            checks.append(Check.at_most(f"steepest slope{GRID}", met.largest, degrees, "deg", met.where))
+            checks.append(Check.at_most(f"steepest slope{GRID}", met.largest, degrees, unit="deg", where=met.where))
             at_bounds["max_slope"] = met.at_bound
     for name, judge, key, limit in (
         ("smallest thickness", Check.at_least, "thickness_min", asked.min_thickness),
@@ -310,7 +316,7 @@ def _facets(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> l
     return [
         Check.at_most("STL: volume against the solid's, relative", off, area * tolerance / volume),
         Check.at_most("STL: vertices off the solid's faces", off_faces, VERTEX_ROUNDING * size, "mm"),
-        Check.at_most("STL: chordal error", error, limit, "mm", most),
+        Check.at_most("STL: chordal error", error, limit, unit="mm", where=most),
     ]
 
 

@@ -116,7 +116,7 @@ def examine(path: Path) -> tuple[list[Check], Lens, WholePart | None]:
         checks.append(net_check(name, text.front.control_points, reread.front.control_points()))
     checks.append(Check.at_least("smallest thickness", thickness_range(lens_read, reread.edge)[0], 0.0, "mm"))
     if properties is None:  # it has faces that no lens and no mount has
-        checks.append(Check("STEP text: what it states can be held to its faces", False, None, "", True))
+        checks.append(Check("STEP text: what it states can be held to its faces", False, None, unit="", passed=True))
     else:
         checks += text_checks.measures(text.properties, properties, reread.outline)
     checks += text_checks.density(text.properties)
@@ -132,9 +132,9 @@ def _sound(solid: Any, of_part: bool = False) -> Iterator[Check]:
 def _edges(reread: StepLens, lens: Lens, bare: bool = True) -> Iterator[Check]:
     """bare: it is to be a lens and no more; the edges of a flange, or of walls that lean, lie elsewhere."""
     (faces, on_face), (wall, on_wall) = step_reading.edges_off(reread.shape, lens)
-    yield Check.at_most("solid: edges off the faces they bound", faces, BRIDGED, "mm", on_face)
+    yield Check.at_most("solid: edges off the faces they bound", faces, BRIDGED, unit="mm", where=on_face)
     if bare:
-        yield Check.at_most("solid: edges off the wall of the lens", wall, BRIDGED, "mm", on_wall)
+        yield Check.at_most("solid: edges off the wall of the lens", wall, BRIDGED, unit="mm", where=on_wall)
 
 
 def _form(reread: StepLens, back: BSplineSurface, tolerance: float, count: int) -> Iterator[Check]:
@@ -225,4 +225,4 @@ def _edges_moved(name: str, wanted: Any, reread: Any) -> Check:
     missing, strange = cKDTree(here).query(there)[0], cKDTree(there).query(here)[0]
     worst, places = max((missing, there), (strange, here), key=lambda pair: pair[0].max())
     where = "edge at ({:.4g}, {:.4g}, {:.4g}) mm".format(*places[worst.argmax()])
-    return Check.at_most(name, float(worst.max()), MOVED, "mm", where)
+    return Check.at_most(name, float(worst.max()), MOVED, unit="mm", where=where)

@@ -73,7 +73,7 @@ def _open_edge(text: StepText) -> str:
 def net_check(name: str, read: np.ndarray, designed: np.ndarray) -> Check:
     """The control points (m, m, 3) that a file holds against the designed ones (mm)."""
     off, where = _off_by(read, designed, "control point")
-    return Check.at_most(name, off, NET, "mm", where)
+    return Check.at_most(name, off, NET, unit="mm", where=where)
 
 
 def _off_by(read: np.ndarray, designed: np.ndarray, name: str) -> tuple[float, str]:
@@ -100,18 +100,20 @@ def measures(
         if values := all_stated[quantity]:
             own = getattr(shape, quantity)
             off, where = _worst([(value,) for value in values], (own,), "its faces give", unit)
-            yield Check.at_most(f"{name}: stated {quantity} against the faces', relative", off / own, AGREE, "", where)
+            yield Check.at_most(
+                f"{name}: stated {quantity} against the faces', relative", off / own, AGREE, unit="", where=where
+            )
     if stated.centroids:
         off, where = _worst(stated.centroids, shape.centroid, "its faces give", "mm")
         size = 2 * math.hypot(*outline.half_extent)
-        yield Check.at_most(f"{name}: stated centroid against the faces'", off, AGREE * size, "mm", where)
+        yield Check.at_most(f"{name}: stated centroid against the faces'", off, AGREE * size, unit="mm", where=where)
     yield from _absent(name, all_stated)
 
 
 def density(stated: ValidationProperties) -> Iterator[Check]:
     """The density (g/cm³) of a file by itself, as often as it is stated: it has to be a number above zero."""
     for value in stated.densities:
-        yield Check(DENSITY, value if value > 0 else None, None, "g/cm³", value > 0)
+        yield Check(DENSITY, value if value > 0 else None, None, unit="g/cm³", passed=value > 0)
 
 
 def of_part(text: StepText, part: Part, name: str = TEXT) -> Iterator[Check]:
@@ -130,7 +132,7 @@ def of_part(text: StepText, part: Part, name: str = TEXT) -> Iterator[Check]:
             yield Check.true(f"{name}: {quantity} is the scene's", False, difference)
         elif values:
             off, where = _worst([(value,) for value in values], (asked,), "the scene", unit)
-            yield Check.at_most(f"{name}: {quantity}, difference from the scene's", off, DIGITS, unit, where)
+            yield Check.at_most(f"{name}: {quantity}, difference from the scene's", off, DIGITS, unit=unit, where=where)
     if backs:
         strange = {each.surface for each in backs} - {"", back}
         where = f"it is of the surface #{min(strange)}, the back is #{back}" if strange else ""
@@ -164,4 +166,4 @@ def _words(values: Numbers, unit: str) -> str:
 def _absent(name: str, stated: dict[str, Sequence]) -> Iterator[Check]:
     """Which statements the file lacks."""
     if missing := [quantity for quantity, values in stated.items() if not values]:
-        yield Check(f"{name}: states {', '.join(missing)}", False, None, "", True)
+        yield Check(f"{name}: states {', '.join(missing)}", False, None, unit="", passed=True)

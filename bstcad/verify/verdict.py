@@ -23,24 +23,26 @@ class Check:
     @classmethod
     def at_most(cls, name: str, value: float, limit: float | None, unit: str = "", where: str = "") -> Check:
         """Passes if value <= limit; a value that is not finite fails."""
-        return cls._judged(name, value, limit, unit, limit is None or bool(value <= limit), where)
+        return cls._judged(name, value, limit, unit=unit, passed=limit is None or bool(value <= limit), where=where)
 
     @classmethod
     def at_least(cls, name: str, value: float, limit: float | None, unit: str = "", where: str = "") -> Check:
         """Passes if value >= limit; a value that is not finite fails."""
-        return cls._judged(name, value, limit, unit, limit is None or bool(value >= limit), where)
+        return cls._judged(name, value, limit, unit=unit, passed=limit is None or bool(value >= limit), where=where)
 
     @classmethod
     def _judged(cls, name: str, value: float, limit: float | None, unit: str, passed: bool, where: str) -> Check:
         """A value that is not finite was not measured: the file holds nothing of the kind."""
         finite = math.isfinite(value)
         passed &= finite
-        return cls(name, float(value) if finite else None, limit, unit, passed, "" if passed else where)
+        return cls(
+            name, float(value) if finite else None, limit, unit=unit, passed=passed, where="" if passed else where
+        )
 
     @classmethod
     def true(cls, name: str, value: bool, where: str = "") -> Check:
         """Passes if it is so."""
-        return cls(name, bool(value), True, "", bool(value), "" if value else where)
+        return cls(name, bool(value), True, unit="", passed=bool(value), where="" if value else where)
 
 
 def verdict(passed: bool, given_up: Sequence[str]) -> str:

@@ -38,6 +38,12 @@ DRAFT, STANDARD, BOTH, ALL = ("draft",), ("standard",), ("draft", "standard"), (
 NET, PIXELS = "lens.back.control_points", "target.pixels"
 X, Y, Z, TEXT, OUTLINE, SAMPLE = (f"target.{key}" for key in ("x", "y", "z", "text", "outline", "sample"))
 
+
+def square(half: float) -> dict[str, tuple[float, float]]:
+    """A target from -half to half mm in x and in y."""
+    return {X: (-half, half), Y: (-half, half)}
+
+
 FIT = (
     Case("thu", "thu", ALL),
     Case("portrait", "portrait", ALL),
@@ -70,8 +76,7 @@ FIT = (
     Case("handwriting", "thu", DRAFT, "text", {X: (-200.0, 200.0)}),
     Case("clock", "portrait", STANDARD, "clock", {NET: 257, PIXELS: 256, Z: 1500.0}),
     Case("cell", "caustic_portrait", STANDARD, "cell", {NET: 129, PIXELS: 256, Z: 500.0}),
-    Case("glow", "thu", DRAFT, "glow", {NET: 129, PIXELS: 256, Z: 350.0, X: (-100.0, 100.0),
-                                        Y: (-100.0, 100.0)}),
+    Case("glow", "thu", DRAFT, "glow", {NET: 129, PIXELS: 256, Z: 350.0, **square(100.0)}),
     Case("retina", "off_axis", DRAFT, "retina", {NET: 1025, Z: 2000.0, X: (100.0, 900.0),
                                                  Y: (100.0, 900.0)}),
     Case("horse", "caustic_letters", STANDARD, "horse", {NET: 385, PIXELS: 384, Z: 310.0}),
@@ -97,8 +102,7 @@ FIT = (
     Case("chess", "off_axis", STANDARD, "checkerboard", {NET: 257, PIXELS: 192, Z: 900.0}),
     Case("logo", "portrait", DRAFT, "logo", {NET: 257, PIXELS: 320, Z: 900.0}),
     Case("islands", "caustic_letters", DRAFT, "islands", {NET: 257, PIXELS: 256, Z: 900.0}),
-    Case("sign", "disk", DRAFT, "", {PIXELS: 512, OUTLINE: None, TEXT: "EXIT", Z: 1800.0, X: (-500.0, 500.0),
-                                     Y: (-500.0, 500.0)}),
+    Case("sign", "disk", DRAFT, "", {PIXELS: 512, OUTLINE: None, TEXT: "EXIT", Z: 1800.0, **square(500.0)}),
     Case("year", "thu", STANDARD, "", {NET: 257, PIXELS: 256, TEXT: "1905", Z: 3000.0}),
     Case("poem", "caustic_portrait", DRAFT, "", {NET: 1025, SAMPLE: None, Z: 350.0, TEXT: "more\nlight\non paper"}),
     Case("motorcycle", "off_axis", STANDARD, "motorcycle", {PIXELS: 448, Z: 1300.0, X: (0.0, 450.0),
@@ -107,9 +111,8 @@ FIT = (
     Case("emblem", "thu", STANDARD, "emblem", {NET: 129, PIXELS: 192, Z: 2400.0}),
     Case("contours", "caustic_portrait", ("fine",), "contours", {NET: 385, PIXELS: 256, Z: 380.0}),
     Case("sheen", "portrait", STANDARD, "sheen", {NET: 129, PIXELS: 128, Z: 800.0}),
-    Case("studio", "disk", STANDARD, "", {NET: 257, PIXELS: 320, OUTLINE: None, TEXT: "ON\nAIR", Z: 2200.0, X: (-600.0,
-                                          600.0),
-                                          Y: (-600.0, 600.0)}),
+    Case("studio", "disk", STANDARD, "", {NET: 257, PIXELS: 320, OUTLINE: None, Z: 2200.0,
+                                          TEXT: "ON\nAIR", **square(600.0)}),
     Case("relief", "disk", DRAFT, "relief", {NET: 513, PIXELS: 384, OUTLINE: None, Z: 700.0}),
     Case("matrix-code", "caustic_letters", DRAFT, "matrix code", {NET: 1025, Z: 280.0}),
     Case("bar-code", "portrait", DRAFT, "bar code", {NET: 385, PIXELS: 320, Z: 1200.0}),
@@ -126,9 +129,8 @@ FIT = (
     Case("swirl", "off_axis", DRAFT, "swirl", {NET: 385, PIXELS: 320, Z: 1250.0}),
     Case("question", "thu", DRAFT, "", {NET: 385, PIXELS: 448, TEXT: "Q7&", Z: 1200.0}),
     Case("zebra", "caustic_letters", STANDARD, "", {NET: 129, PIXELS: 256, TEXT: "zebra", Z: 250.0}),
-    Case("no-five", "disk", STANDARD, "", {NET: 385, PIXELS: 448, OUTLINE: None, TEXT: "No 5", Z: 1600.0, X: (-450.0,
-                                           450.0),
-                                           Y: (-450.0, 450.0)}),
+    Case("no-five", "disk", STANDARD, "", {NET: 385, PIXELS: 448, OUTLINE: None,
+                                           TEXT: "No 5", Z: 1600.0, **square(450.0)}),
     Case("far-portrait", "portrait", DRAFT, "", {NET: 1025, Z: 1150.0}),
     Case("petals-by-net", "caustic_portrait", DRAFT, "petals", {NET: 1025, PIXELS: 384, Z: 260.0}),
     Case("blobs-aside", "off_axis", STANDARD, "blobs", {NET: 257, PIXELS: 384, Z: 1100.0}),
@@ -172,9 +174,8 @@ KEPT_OUT = (
     Case("julia", "thu", DRAFT, "julia", {NET: 1025, PIXELS: 512, Z: 1050.0}),
     Case("hearts", "caustic_portrait", ("fine",), "hearts", {NET: 257, PIXELS: 320, Z: 290.0}),
     Case("distress", "portrait", STANDARD, "", {NET: 129, PIXELS: 256, SAMPLE: None, TEXT: "SOS", Z: 1000.0}),
-    Case("quarter-wave", "disk", DRAFT, "", {NET: 257, PIXELS: 384, OUTLINE: None, TEXT: "λ/4", Z: 1400.0, X: (-350.0,
-                                             350.0),
-                                             Y: (-350.0, 350.0)}),
+    Case("quarter-wave", "disk", DRAFT, "", {NET: 257, PIXELS: 384, OUTLINE: None,
+                                             TEXT: "λ/4", Z: 1400.0, **square(350.0)}),
 )  # fmt: skip
 
 CASES = {"fit": FIT, "kept out": KEPT_OUT}

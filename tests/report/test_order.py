@@ -55,6 +55,16 @@ def test_what_is_not_stated_is_said_and_a_mirror_s_rear_is_no_optical_face(tmp_p
     assert "Profile tolerance, front" not in rows
 
 
+@pytest.mark.parametrize(("z", "place"), [
+    (3.0, "3 mm behind the vertex of the rear"), (0.0, "at the vertex of the rear"),
+    (-2.0, "2 mm in front of the vertex of the rear"),
+    (-9.0, "4 mm before the vertex of the mirror, on the light's side"),
+])  # fmt: skip
+def test_the_origin_of_a_mirror_is_seen_from_its_own_faces(z, place):
+    mirror = replace(plate(Plane(z), z + 5.0), reflects=True)
+    assert order._origin(mirror, z + 5.0) == f"on the axis of the mirror (the middle of its outline), {place}"
+
+
 def test_a_concave_front_bounds_the_tool_and_a_part_that_could_not_be_built_is_told(tmp_path):
     scene = scene_of("round, concave").changed({"lens.front.curvature": -0.06, "mount": {"datum": "front"}})
     said = sent(scene, tmp_path)

@@ -365,7 +365,7 @@ def _across(rays: Rays, interface: Interface, plane: TargetPlane | None) -> tupl
     left = replace(rays, status=status.view(shape))
     if lossy:
         cos_in, path = cos_in.view(shape), path.view(shape)
-        left = dimmed(left, cos_in, interface.law.turned(cos_in)[1], path, interface.losses)
+        left = dimmed(left, cos_in, interface.law.turned(cos_in)[1], path=path, losses=interface.losses)
     return out.view(len(out), *shape), left
 
 
