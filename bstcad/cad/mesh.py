@@ -4,7 +4,7 @@ Every vertex lies on the lens; the faces share the nodes of the rim, so the mesh
 as fine as its tolerance requires, by measurement: the chordal error falls with the square of the node spacing.
 
 Files: STL, which states no unit, 3MF, which states millimetres, and previews for web pages and slicers.  For two
-million triangles trimesh takes 2 s of CPU to write STL (this file 0.3), 8 s to read it (3), and lib3mf 2.3 s to write
+million triangles trimesh takes 2 s of CPU to write STL (this file 0.3), 8 s to read it (1), and lib3mf 2.3 s to write
 3MF (2.5, but equal bytes each time).
 """
 
@@ -389,18 +389,39 @@ def read_stl(path: str | Path) -> Mesh:
     corners = np.frombuffer(data, STL_TRIANGLE, offset=84)["corners"].reshape(-1, 3)
     if not np.isfinite(corners).all():
         raise ValueError(f"{path.name}: a corner is not finite; write it again")
-    first, same = _welded(corners)
+    corners = np.ascontiguousarray(corners) + np.float32(0)  # -0 becomes 0
+    first, same = _welded(corners.view(np.uint32))
     return Mesh(corners[first].astype(np.float64), same.reshape(-1, 3))
 
 
-def _welded(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(first corner of each group of equal ones, group of each corner) of corners (n, 3); in its order."""
-    order = np.lexsort(corners.T)  # equal ones stay in their order
-    begins = np.append(True, (np.diff(corners[order], axis=0) != 0).any(axis=1))
-    first, same = order[begins], np.empty(len(order), np.int32)
-    rank = np.argsort(np.argsort(first)).astype(np.int32)
-    same[order] = rank[np.cumsum(begins) - 1]
-    return np.sort(first), same
+@njit(cache=True, nogil=True)
+def _welded(bits):
+    """(first corner of each group of equal ones, group of each corner) of float32 corners (n, 3) as uint32, by hash.
+
+    For two million triangles 0.4 s; numpy's lexsort takes 1.9 s.
+    """
+    size = 1 << 16
+    while size < 1.25 * len(bits):
+        size *= 2
+    table, first, same = np.full(size, -1, np.int32), np.empty(len(bits), np.int32), np.empty(len(bits), np.int32)
+    count = 0
+    for k in range(len(bits)):
+        x, y, z = bits[k, 0], bits[k, 1], bits[k, 2]
+        key = np.uint64(x) * np.uint64(0x9E3779B97F4A7C15)  # odd factors of no structure
+        key += np.uint64(y) * np.uint64(0xC2B2AE3D27D4EB4F) + np.uint64(z) * np.uint64(0xD6E8FEB86659FD93)
+        slot = np.int64((key ^ (key >> np.uint64(32))) & np.uint64(size - 1))
+        while True:
+            group = table[slot]
+            if group < 0:
+                group = table[slot] = count
+                first[count] = k
+                count += 1
+            other = first[group]
+            if bits[other, 0] == x and bits[other, 1] == y and bits[other, 2] == z:
+                break
+            slot = (slot + 1) & (size - 1)
+        same[k] = group
+    return first[:count].copy(), same
 
 
 # ---- 3MF -----------------------------------------------------------------------------------------------------------
