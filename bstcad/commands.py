@@ -14,7 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor
+from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -163,14 +163,17 @@ def _written_and_proved(
     progress("write", 0, 1, "STEP, STL, 3MF")
     drawn.solid(made.lens)  # as designed, so that it can be drawn while OCC writes and reads the file
     with refusals(f"{made.scene.name}: "):  # the tailored faces bound no solid: nothing that a shop could open
-        folders.write_geometry(made, place, processes.submit)
-    progress("write", 1, 1, "")
-    written = time.perf_counter()
-    if limit is not None:
-        effort, left = effort or FULL, limit - BEHIND - made.making.seconds_total - (written - began)
-        effort = replace(effort, seconds=min(effort.seconds, max(left, LEAST)))
-    nominal = folders.nominal(made.scene, made.lens, made.target)
-    proof = _proof(made, nominal, place, drawn, effort=effort, progress=progress)
+        write_3mf = folders.write_geometry(made, place, processes.submit)
+    with ThreadPoolExecutor(1) as beside:
+        mesh = beside.submit(write_3mf)
+        progress("write", 1, 1, "")
+        written = time.perf_counter()
+        if limit is not None:
+            effort, left = effort or FULL, limit - BEHIND - made.making.seconds_total - (written - began)
+            effort = replace(effort, seconds=min(effort.seconds, max(left, LEAST)))
+        nominal = folders.nominal(made.scene, made.lens, made.target)
+        proof = _proof(made, nominal, place, drawn, effort=effort, progress=progress)
+        mesh.result()
     verified = time.perf_counter()
     last = Stage("write", written - began), Stage("verify", verified - written, proof.light.rrmsd)
     return replace(made, making=made.making.followed_by(*last)), proof

@@ -16,9 +16,10 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -194,9 +195,10 @@ def hash_of(contents: Mapping[str, bytes]) -> str:
     return digest.hexdigest()
 
 
-def write_geometry(design: Made, folder: Path, submit: Submit = here) -> None:
-    """Write lens.step, lens.stl, lens.3mf, part.step of a mount, and the scene with the files that it names.
+def write_geometry(design: Made, folder: Path, submit: Submit = here) -> Callable[[], None]:
+    """Write lens.step, lens.stl, part.step of a mount, and the scene with the files that it names.
 
+    Returns the function that writes lens.3mf: no proof reads that file, so that a thread can write it meanwhile.
     submit: bstcad.runs.processes.submit has the second process write STEP, while this one writes meshes.
     """
     scene, lens = design.scene, design.lens
@@ -208,13 +210,13 @@ def write_geometry(design: Made, folder: Path, submit: Submit = here) -> None:
     asked = scene.output.mesh_tolerance is not None
     _, mesh = meshes.fitting(lens, scene.mesh_tolerance, meshes.ASKED if asked else None)
     meshes.write_stl(mesh, folder / "lens.stl")
-    meshes.write_3mf(mesh, folder / "lens.3mf", label(scene))
     _write_scene(design, folder)
     try:
         for step in written:
             step.result()
     except BrokenExecutor as error:
         raise MachineError("OCC broke down over this solid, or its memory ran out; free some and try again") from error
+    return partial(meshes.write_3mf, mesh, folder / "lens.3mf", label(scene))
 
 
 def label(scene: scenes.Scene) -> Label:

@@ -180,7 +180,7 @@ def _writing(m: int) -> Work:
 
     def write() -> None:
         with tempfile.TemporaryDirectory() as place:
-            write_geometry(made, Path(place))
+            write_geometry(made, Path(place))()
 
     return write
 
