@@ -303,9 +303,10 @@ def figure(recorded: Mapping[str, Any], scene: str) -> Any:
     papers = [*(preset for preset in sweep.presets if preset.name == "paper"), *([_named(paper)] if paper else [])][:1]
     sweep.presets = [preset for preset in sweep.presets if preset.name != "paper"]
     ends = [Named(seconds=s, rrmsd=e) for s, e in zip(sweep.range.seconds, sweep.range.rrmsd, strict=True)]
-    sweep.shown = [*ends, *sweep.presets, *points, *papers]
     sweep.best = sorted(sweep.front, key=lambda run: run.seconds)
     sweep.knobs = [knob for knob in sweep.knobs if len(knob.places) > 1]
+    tried = [place for knob in sweep.knobs for place in knob.places]
+    sweep.shown = [*ends, *sweep.presets, *points, *papers, *tried]
     sweep.history = [{"seconds": seconds, "rrmsd": rrmsd} for seconds, rrmsd in sweep.history]
     drawn = new_figure(WIDTH, HEIGHT)
     axes = drawn.subplots()
