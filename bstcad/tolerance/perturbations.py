@@ -14,8 +14,9 @@ from typing import Literal
 
 import numpy as np
 import torch
+from scipy import fft
 from scipy.linalg import solve_banded
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import fourier_gaussian
 from scipy.stats import norm
 
 from bstcad.optics.bspline import BSplineSurface, basis_matrix
@@ -335,7 +336,8 @@ def random_field(surface: BSplineSurface, correlation_length: float, seed: int, 
     cells = [correlation_length / 2 / pitch for pitch in surface.pitch]
     margin = [int(np.ceil(4 * c)) for c in cells]
     shape = [surface.m + 2 * k for k in margin]  # without an effect of borders
-    noise = gaussian_filter(np.random.default_rng(seed).standard_normal(shape), cells, truncate=4.0)
+    noise = fft.rfftn(np.random.default_rng(seed).standard_normal(shape))
+    noise = fft.irfftn(fourier_gaussian(noise, cells, n=shape[-1]), shape)  # 20 times as fast as gaussian_filter
     return _of_rms_one(noise[margin[0] : margin[0] + surface.m, margin[1] : margin[1] + surface.m], where)
 
 

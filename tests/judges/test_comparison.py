@@ -52,6 +52,7 @@ class TestStandIn:
         found = SimpleNamespace(cannot=lambda *a: "", light=lambda glass, channels: tuple(channels), trace=trace)
         monkeypatch.setitem(sys.modules, "stand_in", found)
         monkeypatch.setitem(comparison.JUDGES, "numpy", "stand_in")
+        monkeypatch.setattr(comparison, "OURS", replace(comparison.OURS, rays=512))
         return found
 
     def test_a_judge_of_the_same_light_agrees_within_its_noise(self, judge):

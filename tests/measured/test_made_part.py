@@ -16,6 +16,7 @@ from bstcad.measured import cloud as clouds
 from bstcad.measured import made_part
 from bstcad.measured.alignment import Face, aligned, first_pose
 from bstcad.optics.measure import measure
+from bstcad.report.figure_jobs import NoPictures
 from bstcad.verify import checks
 from tests.conftest import pictures, quick_effort
 from tests.measured.synthetic import SHIFT, TURN, cloud, dirty, points, with_form_error
@@ -171,12 +172,12 @@ def test_the_report_has_a_made_part_where_one_was_asked_for(small_design, nomina
     assert report["verdict"] == "passed with remarks" and "are outliers" in report["given_up"][-1]
     assert "The made part" in page and (folder / "figures" / "made_part.png").stat().st_size > 10_000
     saved(tmp_path / "two" / "cloud.csv", 1.002 * cloud(nominal.lens, 5000, 1e-5))
-    assert not commands.verify(folder, measured=tmp_path / "two" / "cloud.csv").passed
-    assert commands.verify(folder).measured is None
+    assert not commands.verify(folder, measured=tmp_path / "two" / "cloud.csv", drawing=NoPictures).passed
+    assert commands.verify(folder, drawing=NoPictures).measured is None
     assert "The made part" not in (folder / "report.html").read_text()
     ours = [json.loads((folder / "measured" / name / "report.json").read_text()) for name in ("cloud", "cloud-2")]
     assert [each["measured"]["passed"] for each in ours] == [True, False]  # the later verification erased neither
-    again = commands.verify(folder, measured=tmp_path / "cloud.csv").facts["measured"]
+    again = commands.verify(folder, measured=tmp_path / "cloud.csv", drawing=NoPictures).facts["measured"]
     assert {path.name for path in (folder / "measured").iterdir()} == {"cloud", "cloud-2"}
     assert again["deviation_map"] == ["measured/cloud/deviation.npz", "measured/cloud/deviation.csv"]
     assert all((folder / name).is_file() for name in again["deviation_map"])
