@@ -145,7 +145,7 @@ def dimmed(rays: Rays, cos_in: Tensor, cos_out: Tensor, path: Tensor, losses: Se
 
 
 def _path(before: Rays, behind: Rays) -> Tensor:
-    """The path of rays from one place to another (mm); 1 for lost rays."""
+    """The path of rays from one place to another (mm); √3 for lost rays."""
     here = torch.stack([*behind.position[:2], behind.above(before.z)])
     way = torch.where(behind.alive, here - before.position, torch.ones_like(here))  # no root of zero: no gradient
     return torch.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])

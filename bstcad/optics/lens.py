@@ -29,7 +29,7 @@ class Lens:
 
     A lens refracts: light travels along +z, enters through the front and leaves through the back.  A mirror reflects
     at its back: light comes from above, along -z, and leaves along +z; its front is the rear of the plate, and dark.
-    Whoever follows light walks `interfaces`; whoever shapes surfaces goes by `freeform`.
+    Whoever follows light walks `interfaces`; whoever searches surfaces goes by `freeform`.
     """
 
     front: Surface
@@ -67,7 +67,7 @@ class Lens:
 
     @property
     def deflection(self) -> float:
-        """The angle by which its back turns light, over the angle by which the back leans, both small."""
+        """The angle by which its back deflects a ray, over the slope angle of the back, both small."""
         return 2.0 if self.reflects else abs(self.index - 1)
 
     @property

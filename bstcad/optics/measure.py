@@ -38,7 +38,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import in_pairs
-from bstcad.optics.trace import Ghost, Simulation, from_first_net, simulate
+from bstcad.optics.trace import Ghost, Simulation, simulate, through
 from bstcad.optics.tubes import SHEET, area_of, arriving, corners, middle, picture, rays_to
 
 SETS = 8  # of rays, independent of each other: the jackknife then knows a standard error to a quarter of it
@@ -96,7 +96,7 @@ class Light:
     flux: dict[str, float]  # the ledger: where the source's light goes; the lines sum to 1
     tent: float = math.nan  # RRMSD by linear binning
     picture_off: float = math.nan  # `picture` against the lens's own, as RRMSD has it
-    witness: Witness | None = None  # None: of a source of some size, of losses, or where none was asked for
+    witness: Witness | None = None  # None: of a source of some size, with losses, without a kernel, or unasked
     ghost: np.ndarray | None = field(default=None, repr=False)  # the part of the picture by a ghost; None: left out
     leak: Leak | None = None  # of the rays' mean picture, not smoothed; None: the target is dark nowhere
 
@@ -247,9 +247,9 @@ def _shown(pictures: Sequence[Tensor], wanted: Tensor) -> tuple[Tensor, float]:
 def _enough(
     lens, draw: Draw, screen: Screen, wanted: Tensor, effort: Effort, ghost: Ghost | None, seen: float = math.inf
 ) -> _Rays:
-    """Rays until the standard error has come down to `effort.accuracy`, at most `effort.rays` a side,
+    """More rays, at most `effort.rays` a side, until the standard error is `effort.accuracy` of the RRMSD.
 
-    and the noise of the mean picture, which falls as n^-3/2, to `seen` times the RRMSD.
+    The noise of the mean picture, which falls as n^-3/2, has to come down to `seen` times the RRMSD, too.
     The error falls as n^-3 with n rays a side where noise times noise rules (the variance of a pixel of n² stratified
     rays falls as n^-3; measured: n^-2.9), and as n^-3/2 where the lens's own error times noise does.
     """
@@ -437,7 +437,8 @@ def _through(channel: Channel, lens: Lens, screen: Screen, x: Tensor, y: Tensor)
     """The light of one channel through the places between the points (x, y) (mm) of the back face."""
     seen = channel.through(lens)
     p, q, coming = rays_to(channel.source, seen, x, y)
-    landed = from_first_net(coming, replace(seen.unbounded(), losses=None), screen.plane)
+    behind = replace(seen.unbounded(), losses=None).interfaces[seen.number_of_back :]
+    landed = through(coming, behind, screen.plane)
     inside = seen.number_of_back == 0 or seen.apertures[0].contains(middle(p), middle(q))
     flux = channel.weight * channel.source.irradiance(middle(p), middle(q), seen.entrance.z) * area_of(p, q)
     flux = arriving(torch.where(inside, flux, torch.zeros_like(flux)), landed).double()

@@ -16,7 +16,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.rays import Vector, axes, clocked, clocking_of, tilt_of
 from bstcad.optics.sources import Collimated, Point, Source
 
-FAR = 4.0  # widths of its aperture that parallel light without a plane of its own is told before the lens
+FAR = 4.0  # widths of its aperture by which a beam without a plane z of its own gets that plane before the lens
 
 
 @dataclass(frozen=True, eq=False)

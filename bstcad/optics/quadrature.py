@@ -117,7 +117,7 @@ def divided(breaks: np.ndarray, parts: int) -> np.ndarray:
 
 
 def outline_border(outline: Outline, face: Surface) -> Border:
-    """The border of an outline, in parts that meet no knot line of a face."""
+    """The border of a circle or of a box (its corners sharp), in parts that meet no knot line of a face."""
     net = face.is_net
     count = _points(face) if net else POINTS
     if outline.is_round:

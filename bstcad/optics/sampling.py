@@ -1,6 +1,6 @@
 """The start of rays: points in a rectangle, by grid, stratified (jittered) or at random.
 
-Each function gives (x, y) in mm over `window` (centred on the axis); every point stands for window.area / n of it.
+Each function gives (x, y) in mm over `window` (centred on the axis); every point stands for the same area.
 `in_pairs` is for sources that are more than a point: few points over an outline, each as good as another; `rim` is of
 the outline itself.
 
@@ -48,7 +48,7 @@ def stratified_strips(
 
 
 def key(seed: int) -> int:
-    """A number of 64 bits that neighbouring seeds do not share a bit pattern in."""
+    """A hash of the seed, 64 bits; those of neighbouring seeds have nothing in common."""
     return int(_mix(np.array([(seed + STRIDE) % (1 << 64)], dtype=np.uint64))[0])
 
 
@@ -92,7 +92,7 @@ def in_pairs(outline: Outline, pairs: int, draw: int = 0) -> list[tuple[float, f
 def scattered(outline: Outline, count: int, seed: int) -> list[tuple[float, float]]:
     """Points (x, y) over an outline, each spread evenly over all of it from seed to seed: their sums have no bias.
 
-    A golden lattice of `count` points, a = (k + 1/2) / count and b = k φ, moved by two random numbers modulo 1
+    A golden lattice of `count` points, a = k / count and b = k φ, moved by two random numbers modulo 1
     (Cranley and Patterson 1976); on a disc r² = a, ψ = 2 π b.
     """
     (move_a,), (move_b,) = jitter(key(seed), np.zeros(1, np.int64))

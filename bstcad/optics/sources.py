@@ -194,7 +194,7 @@ class Collimated(Emitter):
     def start(self, z: float) -> float:
         """The plane the rays start from (mm) for a front whose vertex is on the plane z.
 
-        A front that they can meet r from the axis reaches at most r towards them: it is no more than a half sphere.
+        A front that they can meet r from the axis, no more than a half sphere, reaches at most r towards them.
         Tilted rays come nearer to the axis on the way to the plane, and start further off.
         """
         if self.z is not None:

@@ -1,6 +1,6 @@
 """Surfaces of revolution z(r): plane, sphere, conic.  The docstring of a surface is its equation.
 
-Every surface, the B-spline too (bspline.py), answers the questions of `Surface`, so that nobody asks which it is:
+Every surface, the B-spline too (bspline.py), answers the questions of `Surface`, so that tracing asks for no class:
 a plane is a surface of curvature zero, a sphere a conic of conic constant zero.
 """
 
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from bstcad.optics.outlines import STRICT, Outline
 
-EQUATOR = 1e-6  # cos² of the slope's angle (1 - (1 + k) c² r²) from which on a surface is too steep over (x, y)
+EQUATOR = 1e-6  # of 1 - (1 + k) c² r², for a sphere cos² of its slope's angle: below it a surface is too steep
 
 
 class Surface(ABC):
@@ -46,7 +46,7 @@ class Surface(ABC):
 
     @abstractmethod
     def sags(self, outline: Outline) -> tuple[float, float]:
-        """Heights over the plane z (mm) between which, and zero, it stays inside the outline."""
+        """The lowest and the highest height (mm) over the plane z inside the outline, zero included."""
 
     def parameters(self) -> dict[str, float | Tensor]:
         """The shape parameters that tailoring may change, by name, without the place z."""

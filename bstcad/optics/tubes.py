@@ -36,7 +36,7 @@ COARSE = 129  # points a side of the grid on which the rays to given points are 
 REVERSE_STEPS = 30  # at most, to find those rays
 ARRIVED = 1e-8  # of the grid's extent: distance from its point at which a ray is found
 DIFFERENCE = 1e-6  # of the grid's extent: step of the difference quotients
-SINGULAR = 0.1  # of the divisor of an update, over the square of the step: below it the update would tell nothing
+SINGULAR = 0.1  # Broyden's update is skipped where its divisor is less than this times the square of the step
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from bstcad.optics.rays import Rays, TargetPlane, way_to
 from bstcad.optics.trace import across
 from bstcad.tailoring.merit import Spectrum
 
-GRAZING = math.radians(85)  # from the normal, in air; a quarter of a degree from the critical angle in PMMA
+GRAZING = math.radians(85)  # from the normal, in air; 0.2° from the critical angle in PMMA
 INDEPENDENT = 1e-12  # of a monomial's squared slopes: less than that is rounding
 STEEPEST = math.tan(math.radians(70))  # slope; no tool reaches a steeper one, which makes the lens as thick as wide
 

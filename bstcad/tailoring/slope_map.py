@@ -45,7 +45,7 @@ from bstcad.transport.density import Density, spread
 from bstcad.transport.mapping import Frame, Mapping, TransportMap, nodes, solve
 
 SUBCELLS = 2  # of a transport cell each way, on the source side: rims inside a cell
-SUBPIXELS = 8  # of a transport cell each way, on the target side, but one of a pixel: some stretch over several cells
+SUBPIXELS = 8  # parts of a pixel in each transport cell, each way; at least one a pixel, where it spans several cells
 FLOOR = 1e-3  # of the mean slope density: flux that may be spent on black parts
 TARGET_FLOOR = 1e-3  # of the mean: flux that the map may spend on black parts
 
@@ -230,7 +230,7 @@ def _corners_of(picture: np.ndarray) -> np.ndarray:
 
 @torch.no_grad()
 def source_density(source: Source, lens: Lens, n: int) -> tuple[Density, Frame]:
-    """The flux that gets through both faces, on n x n cells of a square in the plane of the front's vertex."""
+    """The flux that gets through both faces, on n x n cells of a square in the plane of the first vertex."""
     area = clear_window(source, lens)
     side = max(area.width, area.height)
     x, y = (t.to(lens.like.device) for t in sampling.grid(Rectangle(side, side), n * SUBCELLS))

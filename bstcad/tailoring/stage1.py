@@ -37,8 +37,8 @@ FINE = (Fit(), 1e-2)  # there it holds on to the coarse face
 # the target moved by more than this share of the back face.  (Found: at most 0.016 where more rounds gain nothing.)
 RETRY_ABOVE, UNSETTLED = 0.25, 0.025
 LIT = 1026  # cells a side, at most, each of which is asked whether light meets it: each costs the search for a ray
-KEPT_LIGHT = 0.9  # of the light on the target, that the other way must leave there to be taken
-AIMS = 5  # rounds of it
+KEPT_LIGHT = 0.9  # of the light on the target, which the lens fitted to aims must keep to be taken
+AIMS = 5  # rounds of `follow_aims`
 EVALUATIONS = 8  # of the merit, in the search for one number of a front
 BOTH = 40  # evaluations for the curvature and the conic constant together
 STEEPEST = 0.5  # sine of the angle of a front's slope at the rim
@@ -251,7 +251,8 @@ def _rim(lens: Lens) -> float:
 
 
 def _curvatures(lens: Lens, rim_sags: Range, *own: float) -> Range:
-    """The range of curvatures (1/mm) at which the front is possible with its own conic constant k; it holds `own`.
+    """The range of curvatures (1/mm) at which the front is possible with its own conic constant k, `own` among
+    them where they are possible.
 
     Its slope at r has the sine S where c = S / (r sqrt(1 + k S²)).
     """

@@ -102,7 +102,7 @@ def run_rounds(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = N
     """A stage, one round after the other, or on from a state of it.
 
     Ends when the evaluations are spent, on a plateau of the last round, or when its light reaches the accuracy asked
-    for, as `Task.rrmsd` finds it with other and more tubes.
+    for, as `Task.rrmsd` finds it by rays.
     """
     accuracy = rounds[0].task.knobs.accuracy
     begin = Parameters.of(lens)

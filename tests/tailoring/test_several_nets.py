@@ -11,6 +11,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
+from bstcad.optics.measure import images
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane
@@ -45,12 +46,27 @@ FRONTS = {  # a lens, and the light that meets it
 }  # fmt: skip
 
 
+MOVED = {Collimated: {"tilt": (1.0, 0.0)}, Point: {"position": (1.5, 0.0, -600.0)}}  # another point of the source
+
+
 def problem_of(name):
     lens, source = FRONTS[name]
     knobs = Tailoring(rays=96, levels=(M,), stage2_iterations=EVALUATIONS, overshoot=0.03)
     task = Task((Channel(source, N),), SCREEN, picture(), knobs)
     merit = TubeMerit.of(task.channels, lens, 96, SCREEN, torch.from_numpy(task.target), 0.03)
     return task, lens, Problem(lens, merit)
+
+
+@pytest.mark.parametrize("name", FRONTS)
+def test_what_is_searched_changes_no_image_of_a_source(name):
+    """Seen through places of the back, whichever nets are free."""
+    lens, source = FRONTS[name]
+    lens = replace(lens, front=net(0.0, 0.1))
+    free, back = (
+        images((Channel(source, N, 0.5), Channel(replace(source, **MOVED[type(source)]), N, 0.5)), each, SCREEN, 9)
+        for each in (lens, replace(lens, shaped=(1,)))
+    )
+    assert free.width() > 0 and free.width() == back.width()
 
 
 @pytest.mark.parametrize("name", FRONTS)

@@ -94,14 +94,14 @@ class Faces(NamedTuple):
     reflects: int  # 1: the net is a mirror
     curvature: float  # of the front (1/mm)
     conic_constant: float  # of the front
-    index: float  # in the denser medium over that behind the net, the law's η
+    index: float  # before the net over that behind it, the law's η
     front_x: float  # outlines.Limits of the front's clear aperture (mm, mm, mm²)
     front_y: float
     front_r2: float
     limit_x: float  # and of the back's
     limit_y: float
     limit_r2: float
-    gap: float  # from the first vertex to the plane the net's heights are measured from (mm)
+    gap: float  # from the plane where the rays begin to the plane the net's heights are measured from (mm)
     m: int  # control points a side
     x: float  # the net's corner (mm)
     y: float
