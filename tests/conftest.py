@@ -65,7 +65,10 @@ class Spent:
 def pytest_sessionfinish(session):
     if session.config.getoption("--record-durations") and not hasattr(session.config, "workerinput"):
         spent = session.config.stash[SPENT]
-        known = {file: s for file, s in json.loads(DURATIONS.read_text()).items() if file not in spent}
+        known = json.loads(DURATIONS.read_text())
+        known = {
+            file: s for file, s in known.items() if file not in spent and Path(session.config.rootpath, file).exists()
+        }
         known |= {file: round(seconds, 1) for file, seconds in spent.items() if seconds > 1}
         DURATIONS.write_text(json.dumps(dict(sorted(known.items())), indent=1) + "\n")
 
