@@ -20,7 +20,7 @@ from bstcad.optics.surfaces import Surface
 SPANS = 128  # a coarser net's spans are divided so that an axis has as many parts at least
 POINTS = 3  # Gauss points in each part of a chord or of an edge …
 SMOOTH = 96  # Gauss points of a chord over a smooth face; up to a half diagonal of 0.95 R they leave only rounding
-END_PARTS = 8  # at least, of a net's end spans, where x(t) is quadratic and h(x) no polynomial
+END_PARTS = 12  # at least, of a net's end spans, where x(t) is quadratic and h(x) no polynomial: volumes to 1e-12
 STRIP = 512  # border points at a time
 LEVEL = 1e-14  # of a length: a border that goes no further in x adds nothing
 FINE = 400  # … 2 in those of a net with as many control points a side: they hold the area of such a lens to 1e-9
