@@ -51,8 +51,8 @@ class TubeMerit:
     """RRMSD² of the light that falls into each pixel, exact for ray tubes, plus a pull on light outside the target.
 
     Pixels give no gradient to light that has left the target; the pull is `overshoot` (1 / pixel²) times the mean
-    square of its distance from the border in pixels.  Light that
-    is lost on the way adds its share.  Picture, pull and loss are sums over the channels of the light.
+    square of its distance from the border in pixels.  Light lost on the way
+    adds its share.  Picture, pull and loss are sums over the channels of the light.
     """
 
     channels: tuple[Channel, ...]
