@@ -42,14 +42,16 @@ def test_it_comes_through(name, tmp_path, monkeypatch):
     pictures.mkdir()
     scene = load(*overrides(name, pictures, {**ROUGH, **hard.rough}))
     draws_nothing(monkeypatch)
-    report = commands.generate(scene, folder, device="cpu", effort=Effort(512)).facts
+    effort = Effort(max(512, hard.sizes.get("target.pixels", 0)))  # enough rays to resolve the RRMSD of its pixels
+    report = commands.generate(scene, folder, device="cpu", effort=effort).facts
     said = report["given_up"]
     sure = [sentence for sentence in said if not any(words in sentence for words in (*hard.perhaps, LEFT_OUT))]
     changes = [entry["rrmsd_change"] or 0.0 for entry in report["estimates"]]
     outweighs = sum(change > min(report["rrmsd"], report["rrmsd_asked"] or DEFAULT_RRMSD_LIMIT) for change in changes)
     assert sum(LEFT_OUT in sentence for sentence in said) == outweighs
     failed = {check["name"] for check in report["checks"] if not check["passed"]}
-    assert all(name.startswith("RRMSD, box pixels") for name in failed) and report["passed"] is not bool(failed)
+    assert not [name for name in failed if not name.startswith("RRMSD, box pixels")]
+    assert report["passed"] is not bool(failed)
     assert report["rrmsd"] <= hard.rrmsd and report["efficiency"] >= hard.efficiency
     assert report["shape"]["thickness_min"] >= scene.lens.min_thickness
     assert report["skipped_steps"] == 0
