@@ -39,6 +39,10 @@ STARTED = time.perf_counter()  # heavy libraries load after it: their time is th
 INTERRUPTED, BROKEN = 130, 70  # exit codes: Ctrl-C; a fault of bstcad itself
 NOTHING_KEPT = "there was no lens yet, and nothing is kept"
 OFTEN, SELDOM = 1.0, 30.0  # seconds between two lines of progress of a sweep: on a terminal, in a file
+SITES = (
+    Path(__file__).parent / "site",
+    Path(__file__).parent.parent / "docs" / "_build" / "html",
+)  # of a wheel, of sources
 EXPORTS = "sag, points, zemax, turning, dxf, svg, preview, datasheet"  # bstcad.report.exports.ALL, which loads torch
 NO_MEMORY = (  # Python, torch, the system and the loader of libraries each say it in their own way
     "not enough memory", "out of memory", "bad_alloc", "cannot allocate memory", "can't allocate memory",
@@ -248,13 +252,21 @@ Budget = option(
     "is not begun, one that takes longer is ended a tenth beyond; the first one is run to its end.",
 )  # fmt: skip
 Scenes = argument(list[str], "SCENES...", "Scene files (TOML), or patterns such as 'scenes/*.toml'.")
+Topic = argument(
+    str | None, "TOPIC", "A check or a remark, as reports name them: check-rrmsd (default: the first page)."
+)
 KeyName = argument(str | None, "KEY", "A key or a table, such as lens.tool_radius (default: all).")
+
+
+def examples(*lines: str) -> str:
+    """The end of a command's help: command lines to copy."""
+    return "\n\n".join(("Examples:", *(f"  bstcad {line}" for line in lines)))
 
 
 # --- designing --------------------------------------------------------------------------------------------------------
 
 
-@app.command()
+@app.command(epilog=examples("generate templates/thu.toml", "generate my-lens.toml --quality draft -o outputs/rough"))
 def generate(
     scene: SceneFile, output: Output = None, settings: Settings = None, quality: Quality = None,
     device: Device = "auto", resume: Resume = False, verbose: Verbose = False,
@@ -277,7 +289,7 @@ def generate(
     raise Stopped(" with the best so far; the same command with --resume goes on from there")
 
 
-@app.command()
+@app.command(epilog=examples("plan templates/thu.toml", "plan my-lens.toml --json"))
 def plan(scene: SceneFile, settings: Settings = None, as_json: AsJson = False) -> int:
     """List the effects that are simulated and left out, with their changes; then predict time, error and memory."""
     with loading():
@@ -299,7 +311,7 @@ def plan(scene: SceneFile, settings: Settings = None, as_json: AsJson = False) -
     return 0
 
 
-@app.command()
+@app.command(epilog=examples("new my-lens --picture photo.jpg --size 80 --distance 400", "new lamp --template led"))
 def new(
     name: Name = None, picture: Picture = None, light: Light = None, size: Size = None, distance: Distance = None,
     template: Template = None, listed: Listed = False,
@@ -327,7 +339,11 @@ def new(
 # --- a finished design ------------------------------------------------------------------------------------------------
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "verify outputs/thu --against batoid,mitsuba", "verify outputs/thu --measured cloud.csv -o serial-17"
+    )
+)
 def verify(
     path: Written, measured: Measured = None, output: PartReport = None, against: Against = None,
     verbose: Verbose = False,
@@ -340,7 +356,7 @@ def verify(
     return conclude(getattr(found, "contents", found), output or path, verbose)
 
 
-@app.command()
+@app.command(epilog=examples("tolerance outputs/thu --yield 90", "tolerance outputs/thu --grade precise --trial 17"))
 def tolerance(
     folder: Folder, grade: Grade = None, wanted: Yield = None, seed: Seed = 0, trial: Trial = None,
     workers: Workers = None, scheduler: Scheduler = None,
@@ -367,7 +383,7 @@ def tolerance(
     return 0
 
 
-@app.command()
+@app.command(epilog=examples("export outputs/thu --as zemax,dxf", "export outputs/thu --as points --points 1001"))
 def export(folder: Folder, kinds: Kinds = None, points: Points = None) -> int:
     """Write a lens for the shop: tables, Zemax's grid sag, a cloud for turning, the outline, previews, the sheet."""
     if kinds is None:
@@ -376,7 +392,7 @@ def export(folder: Folder, kinds: Kinds = None, points: Points = None) -> int:
     return 0
 
 
-@app.command()
+@app.command(epilog=examples("show outputs/thu", "show outputs/thu --png light.png"))
 def show(folder: Folder, png: Png = None) -> int:
     """Show a lens at work: rays coloured by their flux, and the screen with its picture."""
     if png is not None and (png.suffix.lower() != ".png" or png.is_dir()):
@@ -394,7 +410,11 @@ def show(folder: Folder, png: Png = None) -> int:
 # --- many designs -----------------------------------------------------------------------------------------------------
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "tradeoff templates/thu.toml --budget 600", "tradeoff templates/thu.toml --quality draft --budget 120"
+    )
+)
 def tradeoff(
     scene: SceneFile, budget: Budget = 600.0, output: Output = None, settings: Settings = None, quality: Quality = None,
     scheduler: Scheduler = None,
@@ -420,7 +440,11 @@ def tradeoff(
     return 0 if table.lenses else 1
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "batch templates/disk.toml 'scenes/*.toml' -o outputs/many", "batch scenes/*.toml --quality draft --workers 2"
+    )
+)
 def batch(
     scenes: Scenes, output: Output = None, settings: Settings = None, quality: Quality = None, workers: Workers = None,
     scheduler: Scheduler = None, verbose: Verbose = False,
@@ -482,7 +506,7 @@ def _wanted(path: Path, settings: list[str] | None, quality: str | None) -> Want
 # --- keys of a scene --------------------------------------------------------------------------------------------------
 
 
-@app.command()
+@app.command(epilog=examples("keys lens.tool_radius", "keys source"))
 def keys(key: KeyName = None) -> int:
     """Print keys of a scene with unit, range, default and meaning."""
     from bstcad.scene.errors import nearest
@@ -509,7 +533,7 @@ def keys(key: KeyName = None) -> int:
     return 0
 
 
-@app.command()
+@app.command(epilog=examples("schema > scene.schema.json", "schema | less"))
 def schema() -> int:
     """Print the JSON schema of a scene, by which editors complete and check its keys.
 
@@ -518,6 +542,34 @@ def schema() -> int:
     from bstcad.scene.schema import FILE
 
     print(FILE.read_text(encoding="utf-8"), end="")
+    return 0
+
+
+# --- documentation ----------------------------------------------------------------------------------------------------
+
+
+@app.command(epilog=examples("docs", "docs check-rrmsd"))
+def docs(topic: Topic = None) -> int:
+    """Open the documentation, complete without a network; of a check or a remark print its section."""
+    from bstcad.report import explained
+
+    page, topics = "index.html", {name.partition("#")[2]: name for name in explained.sections()}
+    if topic is not None and topic not in topics:
+        from bstcad.scene.errors import nearest
+
+        raise InputError(f"{topic}: no check or remark is named so; {nearest(topic, list(topics), 'known are')}")
+    if topic is not None:
+        print(explained.section(topics[topic]))
+        page = "reference/" + topics[topic].replace("#", ".html#")
+    site = next((place for place in SITES if (place / "index.html").is_file()), None)
+    if site is None:
+        print("bstcad: this copy of bstcad came without pages; make docs builds them from its sources", file=sys.stderr)
+        return 0 if topic else 2
+    print(f"Documentation: {site / page}")
+    if topic is None and sys.stdout.isatty():
+        import webbrowser
+
+        webbrowser.open((site / page).as_uri())
     return 0
 
 

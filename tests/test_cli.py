@@ -295,3 +295,26 @@ def test_a_sweep_has_its_folder_budget_and_settings(monkeypatch, tmp_path, capsy
     stops[0].add_note("3 runs are kept in mine; the same command goes on from there")
     assert cli.run(["tradeoff", THU]) == 130
     assert "stopped; 3 runs are kept in mine" in capsys.readouterr().err
+
+
+def test_each_command_ends_its_help_with_two_examples(capsys):
+    for command in cli.app.registered_commands:
+        name = command.name or command.callback.__name__
+        assert cli.run([name, "--help"]) == 0
+        *_, first, second = (line.strip() for line in capsys.readouterr().out.splitlines() if line.strip())
+        assert first.startswith(f"bstcad {name}") and second.startswith(f"bstcad {name}")
+
+
+def test_docs_explains_a_check_and_names_its_page(capsys, monkeypatch, tmp_path):
+    (tmp_path / "index.html").write_text("built")
+    monkeypatch.setattr(cli, "SITES", (tmp_path / "none", tmp_path))
+    assert cli.run(["docs", "check-rrmsd"]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("### ") and "accept.rrmsd" in out
+    assert out.endswith(f"Documentation: {tmp_path / 'reference/checks.html#check-rrmsd'}\n")
+    assert cli.run(["docs"]) == 0
+    assert capsys.readouterr().out == f"Documentation: {tmp_path / 'index.html'}\n"
+    monkeypatch.setattr(cli, "SITES", (tmp_path / "none",))
+    assert cli.run(["docs"]) == 2 and "make docs builds" in capsys.readouterr().err
+    assert cli.run(["docs", "check-rmsd"]) == 2
+    assert capsys.readouterr().err.strip().endswith("did you mean 'check-rrmsd'?")

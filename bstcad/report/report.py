@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bstcad.analysis.cost import WORTH
+from bstcad.report import explained
 from bstcad.report.prescription import WAYS, order_rows
 from bstcad.report.record import LEFT_OUT, Contents, Examined, LeftOut, bounds, changes
 from bstcad.report.units import Rows, about, bound, environment, paragraphs, quantity, tables
@@ -116,12 +117,14 @@ def first_figures(report: Contents | Examined) -> list[Figure]:
 def write_html(
     report: Contents, figures: Mapping[str, bytes | None], path: str | Path, *, scene: str = "",
     prescription: Mapping[str, Rows] | None = None, solid: str = "", tolerances: str = "",
+    sections: Sequence[tuple[str, str]] = (),
 ) -> None:  # fmt: skip
     """Write report.html, one file: pictures (PNG bytes by name) and styles inside, nothing fetched.
 
     A picture that is None or absent is left out; for the lens a sentence says so.  scene: the resolved TOML text.
     prescription: as bstcad.report.prescription puts it in words.  solid: as bstcad.report.rendering tells the lens,
     for a reader to turn it; none: a page without any script.  tolerances: as bstcad.report.tolerances has them.
+    sections: (heading, HTML) of a script of the user.
     """
     from markupsafe import Markup
 
@@ -152,6 +155,9 @@ def write_html(
             scene=scene,
             tolerances=Markup(f"{BEGIN}\n{tolerances}{END}\n"),  # a page of this program
             solid=Markup(solid),  # numbers and names of ours
+            sections=[
+                (heading, Markup(text)) for heading, text in sections
+            ],  # the page's policy allows no script in it
             viewer=Markup(viewer),
             policy=f"{POLICY}; script-src {allowed}; base-uri 'none'",
         )
@@ -184,7 +190,8 @@ def summary(report: Contents | Examined, verbose: bool = False) -> Group:
     from rich.text import Text
 
     lines = [Text.assemble((report.verdict.upper(), BADGES[report.verdict][2]), f": {report.title or report.name}")]
-    lines += [Text(f"Remark: {sentence}") for sentence in (*report.given_up, *doubts(report))]
+    remarks = (*report.given_up, *doubts(report))
+    lines += [Text.assemble(f"Remark: {sentence}", named(sentence)) for sentence in remarks]
     figures = first_figures(report)
     wide = max((len(name) for name, _, _ in figures), default=0)
     lines += [Text(f"{name:{wide}}  {value}{remark and f' ({remark})'}") for name, value, remark in figures]
@@ -192,6 +199,8 @@ def summary(report: Contents | Examined, verbose: bool = False) -> Group:
     passed = sum(check.passed for check in report.checks)
     lines += check_lines(report.checks, verbose)
     lines.append(Text(f"{passed} checks passed{'' if verbose else '; --verbose lists them'}."))
+    if remarks or verbose or passed < len(report.checks):
+        lines.append(Text("bstcad docs NAME explains the check or the remark of that [NAME].", "dim"))
     return Group(*lines)
 
 
@@ -201,9 +210,16 @@ def check_lines(checks: Sequence[Check], verbose: bool, of: str = "") -> Iterato
 
     for check in sorted(checks, key=lambda check: check.passed):
         if not check.passed:
-            yield Text.assemble(("FAIL", "bold red"), f" {of}{check_line(check)}")
+            yield Text.assemble(("FAIL", "bold red"), f" {of}{check_line(check)}", named(check.name))
         elif verbose:
-            yield Text(f"{'stated' if check.limit is None else 'pass'} {of}{check_line(check)}")
+            judged = "stated" if check.limit is None else "pass"
+            yield Text.assemble(f"{judged} {of}{check_line(check)}", named(check.name))
+
+
+def named(text: str) -> tuple[str, str]:
+    """The name by which `bstcad docs` explains a check or a remark, and its style; nothing where it explains none."""
+    name = explained.topic(text)
+    return name and f" [{name}]", "dim"
 
 
 # --- terminal: a plan -------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bstcad.report.explained import topic
 from bstcad.verify.verdict import Check
 
 if TYPE_CHECKING:
@@ -160,7 +161,7 @@ def environment() -> Environment:
         undefined=jinja2.StrictUndefined,
     )  # fmt: skip
     filters = (about, amount, bound, duration, exact, interval, mm, number, percent, quantity, rounded_up)
-    found.filters |= {f.__name__: f for f in (*filters, stated, turned)}
+    found.filters |= {f.__name__: f for f in (*filters, stated, topic, turned)}
     found.globals["exact"] = exact
     return found
 

@@ -223,16 +223,20 @@ class TestSummary:
         assert short.startswith("PASSED: Letters\n") and short.endswith("\n3 checks passed; --verbose lists them.\n")
         assert not any(check["name"] + ":" in short for check in REPORT["checks"])
         assert "\npass form of the STEP: 0.3 nm, limit ≤ 1 nm\n" in long and "FAIL" not in long
-        assert long.count("\npass ") == 3 and long.endswith("\n3 checks passed.\n")
+        assert long.count("\npass ") == 3 and "\n3 checks passed.\nbstcad docs NAME explains" in long
 
     def test_a_failed_check_is_shown_once_with_value_limit_and_place_after_the_first_figures(self):
         report = failing() | {"given_up": ["The lens is thick."]}
         report["checks"][2] |= {"where": "at [red](1, 2) mm", "name": "[/] thinnest place"}
         lines = printed(report).splitlines()
-        verdict, remark, *figures, failed, passed = lines
+        verdict, remark, *figures, failed, passed, explained = lines
         assert (verdict, remark) == ("FAILED: Letters", "Remark: The lens is thick.")
         assert failed == "FAIL [/] thinnest place (at [red](1, 2) mm): 0.7 mm, limit ≥ 1 mm"
-        assert passed.startswith("2 checks passed") and any(line.startswith("RRMSD, re-read STEP") for line in figures)
+        assert (
+            explained.startswith("bstcad docs NAME")
+            and passed.startswith("2 checks passed")
+            and any(line.startswith("RRMSD, re-read STEP") for line in figures)
+        )
 
     def test_terminal_and_page_show_the_same_first_figures(self, tmp_path):
         outline = {"width": 16.0, "height": 12.5, "shape": "rectangle"}
