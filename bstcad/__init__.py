@@ -25,14 +25,16 @@ _HOMES = {
     "Target": "scene.target",
     **dict.fromkeys(("Collimated", "Point"), "optics.sources"),
     **dict.fromkeys(("Circle", "Rectangle"), "optics.outlines"),
-    **dict.fromkeys(("Plane", "Sphere", "Conic"), "optics.surfaces"),
+    **dict.fromkeys(("Surface", "Plane", "Sphere", "Conic"), "optics.surfaces"),
     **dict.fromkeys(("Interface", "Refract", "Reflect", "cross"), "optics.interfaces"),
-    **dict.fromkeys(("measure", "Effort", "Light"), "optics.measure"),
+    **dict.fromkeys(("measure", "Effort", "Light", "RayTubes"), "optics.measure"),
+    "trace": "optics.trace",
     "Lens": "optics.lens",
     "BSplineSurface": "optics.bspline",
     "Channel": "optics.channels",
     "Screen": "optics.irradiance",
     "Tailoring": "scene.quality",
+    "Check": "verify.verdict",
     "SceneError": "scene.errors",
 }
 __all__ = [*sorted(_HOMES), "__version__"]

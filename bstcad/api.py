@@ -13,13 +13,14 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image
 
 from bstcad import commands, pipeline
 from bstcad import folder as folders
@@ -29,8 +30,8 @@ from bstcad.optics.measure import Effort, tubes_picture
 from bstcad.optics.surfaces import Surface
 from bstcad.report import record
 from bstcad.report.drawing import png
-from bstcad.report.light_figures import View, irradiance_triptych
-from bstcad.report.record import BY_HAND, Making, Report
+from bstcad.report.light_figures import View, irradiance_triptych, tones
+from bstcad.report.record import BY_HAND, Contents, Making, Report
 from bstcad.report.units import number, quantity
 from bstcad.runs import files
 from bstcad.runs import progress as progresses
@@ -38,23 +39,32 @@ from bstcad.scene.blank import FEWEST_ROUND
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene, load
 from bstcad.transport.mapping import TransportMap
+from bstcad.verify.checks import Proof
+from bstcad.verify.verdict import Check
 
+OwnCheck = Callable[[Proof, Path], Iterable[Check]]
+OwnSection = Callable[[Contents], tuple[str, str]]
 SAME = 1e-9  # of an index, and of the net's width
 GLANCE = 521  # ray tubes a side of a picture that is only looked at
 
 
-def design(scene: Scene | str | os.PathLike[str], *, progress: bool = True, device: str = "auto") -> Design:
+def design(
+    scene: Scene | str | os.PathLike[str], *, progress: bool = True, device: str = "auto",
+    merit: Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None = None,
+) -> Design:  # fmt: skip
     """The lens for a scene, or for the scene file of that path.  SceneError names the fault of a scene.
 
     progress: a bar, in a terminal or a notebook; elsewhere there is none.  device: "auto" (which is "cpu"), "cpu" or
-    "cuda": a GPU, on which nobody has measured yet that it is right and faster.
+    "cuda": a GPU, on which nobody has measured yet that it is right and faster.  merit: a function of the picture and
+    the target, tensors (rows, columns) of the light that leaves the lens, whose value stage 2 makes least in place of
+    RRMSD²; it has to be of that size, and differentiable.  What the proof states stays RRMSD.
     """
     began = time.perf_counter()
     scene = scene.changed({}) if isinstance(scene, Scene) else load(scene)
     for warning in scene.warnings():
         warnings.warn(warning, stacklevel=2)
     with progresses.shown(progress) as shown:
-        return Design(pipeline.design(scene, device=device, progress=shown, began=began))
+        return Design(pipeline.design(scene, device=device, progress=shown, began=began, merit=merit))
 
 
 def open(folder: str | os.PathLike[str]) -> Design:
@@ -211,39 +221,50 @@ class Design:
         """
         return commands.export(self._own_folder(), kinds, points)
 
-    def write(self, folder: str | os.PathLike[str], *, progress: bool = True, effort: Effort | None = None) -> Report:
+    def write(
+        self, folder: str | os.PathLike[str], *, progress: bool = True, effort: Effort | None = None,
+        checks: Sequence[OwnCheck] = (), sections: Sequence[OwnSection] = (),
+    ) -> Report:  # fmt: skip
         """Write the whole folder that `bstcad generate` writes, proved from its files, in the place of an earlier one.
 
-        SceneError if the folder holds anything but a design.
+        checks: functions of the proof (bstcad.verify.checks.Proof: lens, light, shape …) and of the folder, each giving
+        bstcad.Check records that join the verdict.  sections: functions of the report's record, each giving a heading
+        and HTML for report.html.  SceneError if the folder holds anything but a design.
         """
         folder = Path(folder).expanduser()
         files.check_free(folder)
         folder.parent.mkdir(parents=True, exist_ok=True)
         with files.held(folder), progresses.shown(progress) as shown:
             limit = self.scene.tailoring.max_time if self.report is None else None  # else its time was long ago
-            self.report = commands.write(self._made, folder, progress=shown, effort=effort, limit=limit)
+            additions = commands.Additions(checks, sections)
+            self.report = commands.write(
+                self._made, folder, progress=shown, effort=effort, limit=limit, additions=additions
+            )
         self.folder = folder.resolve()
         return self.report
 
     def verify(
         self, *, measured: str | os.PathLike[str] | None = None, folder: str | os.PathLike[str] | None = None,
-        against: Sequence[str] = (), progress: bool = True, effort: Effort | None = None,
+        against: Sequence[Any] = (), progress: bool = True, effort: Effort | None = None,
+        checks: Sequence[OwnCheck] = (), sections: Sequence[OwnSection] = (),
     ) -> Report:  # fmt: skip
         """Prove the design from its files, whose report is written anew; from temporary ones if it has none.
 
         measured: a file of points of a made part (CSV, PLY or STL; mm), which is judged too, see Report.measured.
         folder: for its report, figures and deviation map alone; the design's own files stay as they are.  against:
-        programs not written here that trace it too, "batoid" and "mitsuba".  All want a design that was written.
+        programs not written here that trace it too, "batoid" and "mitsuba", or a judge of one's own
+        (bstcad.judges.comparison.OwnJudge).  All want a design that was written.  checks, sections: as in `write`.
         """
+        additions = commands.Additions(checks, sections)
         with progresses.shown(progress) as shown:
             if self._has_files() or measured or folder or against:
                 self.report = commands.verify(
                     self._own_folder(), against=[against] if isinstance(against, str) else against,
                     measured=measured and Path(measured).expanduser(), place=folder and Path(folder).expanduser(),
-                    progress=shown, effort=effort,
+                    progress=shown, effort=effort, additions=additions,
                 )  # fmt: skip
             else:
-                self.report = commands.prove(self._made, progress=shown, effort=effort)
+                self.report = commands.prove(self._made, progress=shown, effort=effort, additions=additions)
         return self.report
 
     def tolerance(
@@ -265,6 +286,17 @@ class Design:
     def show(self, png: str | os.PathLike[str] | None = None) -> None:
         """Draw the lens at work, rays and screen with it: to a PNG file, or in a window until it is closed."""
         commands.show(self._own_folder(), None if png is None else Path(png).expanduser())
+
+    def picture(self, png: str | os.PathLike[str] | None = None) -> np.ndarray:
+        """The light on the target as an eye sees it from the scene's side: grey tones (rows, columns), uint8, sRGB.
+
+        A pixel of the target is a pixel of the picture, white the end of the report's scale.  As verified, or else by a
+        glance with few ray tubes.  png: a file to write it to as well.
+        """
+        grey = np.ascontiguousarray(View.of(self.scene).picture(tones(self._irradiance(), self.target)))
+        if png is not None:
+            Image.fromarray(grey).save(Path(png).expanduser(), format="png")
+        return grey
 
     def _has_files(self) -> bool:
         return self.folder is not None and (self.folder / "lens.step").exists()  # else the design alone was kept
@@ -345,6 +377,7 @@ def _fitting(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
             _check_same(f"extent of its net along {axis} (mm)", own, theirs)
     if not same_front(lens.front, front):
         scene = scene.changed({"lens.front": lens.front})
+        lens = lens.with_front(scene.lens.front.surface)  # of a surface of one's own the net that stands for it
     return scene, replace(lens, back=replace(lens.back, x=net.x, y=net.y), index=scene.index)
 
 

@@ -13,9 +13,9 @@ import re
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -52,11 +52,22 @@ from bstcad.sweep.estimates import diagnosis, left_out
 from bstcad.tailoring.run import Progress, silent
 from bstcad.verify import checks, text_checks
 from bstcad.verify.checks import Nominal, Proof
-from bstcad.verify.verdict import verdict
+from bstcad.verify.verdict import Check, verdict
 
 BEHIND, LEAST = 2.0, 0.5  # seconds of a run with a time limit: behind the last rays; at least for rays
 
 Drawing = Callable[..., Pictures]  # from (scene, submit): NoPictures for a folder without figures
+
+
+@dataclass(frozen=True)
+class Additions:
+    """Checks and sections of the report that a script adds to those of bstcad."""
+
+    checks: Sequence[Callable[[Proof, Path], Iterable[Check]]] = ()  # of a proof and the folder that holds the files
+    sections: Sequence[Callable[[Contents], tuple[str, str]]] = ()  # (heading, HTML without scripts) of report.html
+
+
+NO_ADDITIONS = Additions()
 
 
 # --- generate ---------------------------------------------------------------------------------------------------------
@@ -112,7 +123,7 @@ def place_for(folder: Path, stopped: str) -> Path:
 
 def write(
     made: Made, folder: Path, *, progress: Progress = silent, effort: Effort | None = None, limit: float | None = None,
-    drawing: Drawing | None = None,
+    drawing: Drawing | None = None, additions: Additions = NO_ADDITIONS,
 ) -> Report:  # fmt: skip
     """Write a design to `folder`, in the place of an earlier one, and prove it from the written files.
 
@@ -127,7 +138,9 @@ def write(
         _nothing_left_running(),
         (drawing or Pictures)(made.scene, processes.submit) as drawn,
     ):
-        made, proof = _written_and_proved(made, building, drawn, progress=progress, effort=effort, limit=limit)
+        made, proof = _written_and_proved(
+            made, building, drawn, additions, progress=progress, effort=effort, limit=limit
+        )
         proven = time.perf_counter()
         folders.write_design(made, proof.light.picture, building)
         exports.export(
@@ -141,23 +154,27 @@ def write(
         made = replace(made, making=made.making.followed_by(Stage("report", time.perf_counter() - proven)))
         contents = replace(_contents(made, proof, estimates), order=order)
         drawn.begin(draw_convergence, contents)
-        _write_report(made, proof.lens, contents, building, drawn=drawn, sheet=drawn.data_sheet())
+        sheet = drawn.data_sheet()
+        _write_report(made, proof.lens, contents, building, drawn=drawn, sheet=sheet, sections=additions.sections)
         progress("report", 1, 1, "")
     return Report(contents, proof.light.picture)
 
 
-def prove(made: Made, *, progress: Progress = silent, effort: Effort | None = None) -> Report:
+def prove(
+    made: Made, *, progress: Progress = silent, effort: Effort | None = None, additions: Additions = NO_ADDITIONS
+) -> Report:
     """Prove a design by temporary files."""
     processes.begin()
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place, _nothing_left_running():
         drawn = NoPictures(made.scene, processes.submit)
-        made, proof = _written_and_proved(made, Path(place), drawn, progress=progress, effort=effort)
+        made, proof = _written_and_proved(made, Path(place), drawn, additions, progress=progress, effort=effort)
     return Report(_contents(made, proof, left_out(made.scene, proof.lens, proof.light.picture)), proof.light.picture)
 
 
 def _written_and_proved(
-    made: Made, place: Path, drawn: Pictures, *, progress: Progress, effort: Effort | None, limit: float | None = None
-) -> tuple[Made, Proof]:
+    made: Made, place: Path, drawn: Pictures, additions: Additions, *, progress: Progress, effort: Effort | None,
+    limit: float | None = None,
+) -> tuple[Made, Proof]:  # fmt: skip
     """Write the geometry and prove it; the design with these two stages, and its proof.  limit: see `write`."""
     began = time.perf_counter()
     progress("write", 0, 1, "STEP, STL, 3MF")
@@ -172,7 +189,7 @@ def _written_and_proved(
             effort, left = effort or FULL, limit - BEHIND - made.making.seconds_total - (written - began)
             effort = replace(effort, seconds=min(effort.seconds, max(left, LEAST)))
         nominal = folders.nominal(made.scene, made.lens, made.target)
-        proof = _proof(made, nominal, place, drawn, effort=effort, progress=progress)
+        proof = _proof(made, nominal, place, drawn, additions=additions, effort=effort, progress=progress)
         mesh.result()
     verified = time.perf_counter()
     last = Stage("write", written - began), Stage("verify", verified - written, proof.light.rrmsd)
@@ -180,11 +197,14 @@ def _written_and_proved(
 
 
 def _proof(
-    made: Made, nominal: Nominal, folder: Path, drawn: Pictures, *, effort: Effort | None, progress: Progress
-) -> Proof:
+    made: Made, nominal: Nominal, folder: Path, drawn: Pictures, *, additions: Additions, effort: Effort | None,
+    progress: Progress,
+) -> Proof:  # fmt: skip
     """The proof of the files in a folder, with the pictures of its light begun."""
     progress("verify", 0, 1, "from the written files")
     proof = checks.verify(folder, nominal, processes.submit, drawn.lens, effort=effort)
+    added = (check for of_script in additions.checks for check in of_script(proof, folder))
+    proof = replace(proof, checks=(*proof.checks, *added))
     drawn.begin(draw_light, made.target, proof)
     progress("verify", 1, 1, f"RRMSD {proof.light.rrmsd:.4f}")
     return proof
@@ -230,12 +250,14 @@ def refusals(where: str = "") -> Iterator[None]:
 
 
 def verify(
-    path: Path, *, against: Sequence[str] = (), measured: Path | None = None, progress: Progress = silent,
+    path: Path, *, against: Sequence[Any] = (), measured: Path | None = None, progress: Progress = silent,
     effort: Effort | None = None, place: Path | None = None, drawing: Drawing | None = None,
+    additions: Additions = NO_ADDITIONS,
 ) -> Report | Examined:  # fmt: skip
     """Prove a design again from the files of its folder, and write its report anew; or look at one STEP file alone.
 
-    against: programs not written here that are to trace it too, by their names (judges.comparison.JUDGES).
+    against: programs not written here that are to trace it too, by their names (judges.comparison.JUDGES), or objects
+    that have the three functions of a judge.
     measured: a cloud of points of a made part, which is then judged too.  Its report goes to `place`, and the design's
     folder stays as it is; or into that folder, and also to its measured/CLOUD, which no later verification touches but
     one of the same cloud.
@@ -253,7 +275,7 @@ def verify(
             cloud, part = measured and clouds.load(measured, nominal.lens.apertures[1]), None
         with (drawing or Pictures)(made.scene, processes.submit) as drawn:
             with refusals(f"{path}: "):
-                proof = _proof(made, nominal, path, drawn, effort=effort, progress=progress)
+                proof = _proof(made, nominal, path, drawn, additions=additions, effort=effort, progress=progress)
             drawn.solid(proof.lens)
             judged = comparison.against(
                 against, proof.lens, nominal.channels, nominal.screen, target=nominal.target, seed=nominal.seed,
@@ -268,8 +290,9 @@ def verify(
                 drawn.sheet(_sheet(made, proof, proof.light, proof.light.picture, order=order))
             drawn.begin(draw_convergence, contents)
             write = partial(
-                _write_report, made, proof.lens, studied=tolerances.of_folder(path, made.scene.optic), drawn=drawn
-            )
+                _write_report, made, proof.lens, studied=tolerances.of_folder(path, made.scene.optic), drawn=drawn,
+                sections=additions.sections,
+            )  # fmt: skip
             if cloud is not None:
                 part = _made_part(cloud, proof, nominal, effort=effort, progress=progress)
                 drawn.begin(draw_part, part, proof.light.picture)
@@ -365,8 +388,9 @@ def _sheet(
 
 
 def _write_report(
-    made: Made, lens: Lens, contents: Contents, folder: Path, *, drawn: Pictures, sheet: bytes | None, studied: str = ""
-) -> None:
+    made: Made, lens: Lens, contents: Contents, folder: Path, *, drawn: Pictures, sheet: bytes | None,
+    studied: str = "", sections: Sequence[Callable[[Contents], tuple[str, str]]] = (),
+) -> None:  # fmt: skip
     """The report as JSON, HTML and JUnit's XML, prescription.txt, figures/ and datasheet.pdf.
 
     lens: as it was read back.  studied: the page's section on tolerances.  sheet: the PDF.
@@ -380,7 +404,7 @@ def _write_report(
     report.write_html(
         contents, pictures, folder / "report.html", scene=prescription.scene_text(made.scene, made.lens),
         solid=rendering.turnable(as_cut(lens, made.scene.mount)), tolerances=studied,
-        prescription=prescription.sections(prescribed),
+        prescription=prescription.sections(prescribed), sections=[of_script(contents) for of_script in sections],
     )  # fmt: skip
     if sheet is not None:
         files.put(folder / SHEET, sheet)

@@ -64,12 +64,14 @@ class Saved:
 def design(
     scene: Scene, *, device: str = "auto", progress: Progress = silent, began: float | None = None,
     save: Callable[[Saved], None] = forget, start: Saved | None = None, interrupted: Callable[[], bool] = never,
+    merit: Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None = None,
 ) -> Made:  # fmt: skip
     """From a scene to a tailored lens: transport map, stage 1, stage 2; stage 3 for a source of some size.
 
     tailoring.max_time is counted from `began` (time.perf_counter(), default now) and leaves time for writing and proof.
     `save` is called now and then with a state; given as `start`, the design goes on from there and ends the same.
     Once `interrupted` says so, tailoring ends with the best so far; KeyboardInterrupt if there is no lens yet.
+    merit: of a picture and the target, what stages 2 and 3 make least; None: RRMSD².
     """
     began = time.perf_counter() if began is None else began
     torch.manual_seed(scene.tailoring.seed)
@@ -82,6 +84,7 @@ def design(
     task = Task(
         scene.with_source_scaled(0.0).channels(), screen, target.irradiance(), knobs, least=scene.lens.min_thickness,
         free=scene.lens.front.free, rim_sags=scene.rim_sags, progress=progress, grown=grown, bounds=scene.lens.bounds,
+        merit=merit,
     )  # fmt: skip
     limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve(scene) + JUDGING}
     record = Record() if start is None else start.record

@@ -81,7 +81,7 @@ class TestDesign:
     def test_plumbing_is_not_in_the_signature(self):
         import inspect
 
-        assert list(inspect.signature(bstcad.design).parameters) == ["scene", "progress", "device"]
+        assert list(inspect.signature(bstcad.design).parameters) == ["scene", "progress", "device", "merit"]
 
 
 def bumped(lens, by=2e-4):

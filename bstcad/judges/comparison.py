@@ -17,6 +17,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -44,11 +45,11 @@ class Judge:
     None, from `by` on: it declined.
     """
 
-    name: str
-    version: str
+    name: str  # of the program
+    version: str  # of the program
     declined: str = ""  # why it cannot trace this light
     by: str | None = None  # the program's variant, if it has several
-    rays: int | None = None
+    rays: int | None = None  # in both halves
     pixels: tuple[int, int] | None = None  # columns, rows
     losses: str | None = None  # of light in both pictures: "none" or "Fresnel"
     rrmsd: float | None = None  # of its picture against the target
@@ -57,13 +58,13 @@ class Judge:
     noise: float | None = None  # of the difference: of both programs' rays
     over_noise: float | None = None  # the difference in units of its noise: about 1 where both are right
     limit: float | None = None  # of that
-    agrees: bool | None = None
+    agrees: bool | None = None  # do all of its checks pass?
     on_target: float | None = None  # share of the source's light on the target, by the judge
-    on_target_ours: float | None = None
+    on_target_ours: float | None = None  # the same by bstcad's ledger
     heights_off: float | None = None  # mm, RMS: its faces against those of the lens
     slopes_off: float | None = None  # rad, RMS
     moved_by: float | None = None  # pixels, shift of light by that
-    seconds: float | None = None
+    seconds: float | None = None  # of the judge
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,9 +78,27 @@ class Compared:
     theirs: np.ndarray | None = field(default=None, repr=False)  # (rows, columns), all of the target's sum
 
 
-def chosen(names: Sequence[str]) -> tuple[str, ...]:
+class OwnJudge(Protocol):
+    """A judge that a script hands in: the functions of a judge's module, its name and its version."""
+
+    name: str
+    version: str
+
+    def cannot(self, lens: Lens, channels: Sequence[Channel]) -> str:
+        """Why it cannot trace this light, in a sentence; "": it can."""
+
+    def light(self, lens: Lens, channels: Sequence[Channel]) -> Sequence[Channel]:
+        """The channels with the losses that it simulates."""
+
+    def trace(self, lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int) -> Any:
+        """The picture on a screen of square pixels by that many rays, as faces.Traced."""
+
+
+def chosen(names: Sequence[str | OwnJudge]) -> tuple[str | OwnJudge, ...]:
     """Judges by their names; SceneError for an unknown one, MachineError where its program is not installed."""
     for name in names:
+        if not isinstance(name, str):
+            continue
         if name not in JUDGES:
             raise SceneError(f"--against {name}: is no judge; {nearest(name, list(JUDGES), 'known are')}")
         if importlib.util.find_spec(name) is None:
@@ -88,13 +107,13 @@ def chosen(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def against(
-    names: Sequence[str], lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, seed: int,
-    progress: Callable[[str, int, int, str], None],
+    names: Sequence[str | OwnJudge], lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray,
+    seed: int, progress: Callable[[str, int, int, str], None],
 ) -> tuple[Compared, ...]:  # fmt: skip
     """Each judge's picture beside bstcad's, one after the other."""
     compared = []
     for number, name in enumerate(names):
-        progress("judges", number, len(names), name)
+        progress("judges", number, len(names), getattr(name, "name", name))
         compared.append(compare(name, lens, channels, screen, target=target, rays=RAYS, seed=seed))
     if names:
         progress("judges", len(names), len(names), "")
@@ -102,15 +121,15 @@ def against(
 
 
 def compare(
-    name: str, lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, *, rays: int,
+    given: str | OwnJudge, lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, *, rays: int,
     seed: int = 0,
 ) -> Compared:  # fmt: skip
     """A judge's picture of the light that `lens` throws on `screen`, beside bstcad's.
 
     rays: of the judge in all.  seed: of them.  target: (rows, columns) of any sum, row 0 = y max.
     """
-    began, judge = time.perf_counter(), importlib.import_module(JUDGES[name])
-    version = importlib.metadata.version(name)
+    began = time.perf_counter()
+    judge, name, version = _known(given)
     if declined := judge.cannot(lens, channels):
         return Compared(Judge(name, version, declined))
     raster = coarse(screen)
@@ -151,6 +170,13 @@ def compare(
         seconds=seconds,
     )
     return Compared(outcome, checks, target, ours.picture, theirs=theirs)
+
+
+def _known(given: str | OwnJudge) -> tuple[Any, str, str]:
+    """(functions, name, version) of a judge."""
+    if isinstance(given, str):
+        return importlib.import_module(JUDGES[given]), given, importlib.metadata.version(given)
+    return given, given.name, given.version
 
 
 def _difference(one: np.ndarray, other: np.ndarray, target: np.ndarray) -> float:

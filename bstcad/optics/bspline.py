@@ -143,11 +143,16 @@ def prolongation(coarse: int, fine: int) -> np.ndarray:
     u = np.linspace(0.0, 1.0, 8 * (fine - 2) + 1)
     on_fine = basis_matrix(u * (fine - 1), fine)
     on_coarse = basis_matrix(u * (coarse - 1), coarse)
-    normal = on_fine.T @ on_fine  # banded; a dense solver's rounding depends on its number of threads
-    bands = np.zeros((DEGREE + 1, fine))
+    return _least_squares(on_fine, (on_fine.T @ on_coarse).toarray())
+
+
+def _least_squares(basis: scipy.sparse.csr_matrix, projected: np.ndarray) -> np.ndarray:
+    """The solution c of B^T B c = projected, B the basis at some points, (points, m)."""
+    normal, m = basis.T @ basis, basis.shape[1]  # banded; a dense solver's rounding depends on its number of threads
+    bands = np.zeros((DEGREE + 1, m))
     for k in range(DEGREE + 1):
         bands[DEGREE - k, k:] = normal.diagonal(k)
-    return scipy.linalg.solveh_banded(bands, (on_fine.T @ on_coarse).toarray())
+    return scipy.linalg.solveh_banded(bands, projected)
 
 
 @dataclass(frozen=True)
@@ -172,6 +177,20 @@ class BSplineSurface(Surface):
         z = float(net[..., 2].mean()) if z is None else z
         x, y = ((float(net[0, 0, i]), float(net[-1, -1, i])) for i in (0, 1))
         return cls(z, torch.from_numpy(net[..., 2] - z), x, y)
+
+    @classmethod
+    def fitted(cls, surface: Surface, x: tuple[float, float], y: tuple[float, float], m: int) -> BSplineSurface:
+        """The net of m x m control points over x and y (mm) nearest to a surface, by least squares along each axis.
+
+        B^T B H C^T C = B^T Z C: Z are the surface's heights at four points a span each way, B and C the basis along
+        x and y.
+        """
+        u = np.linspace(0.0, 1.0, 4 * (m - 2) + 1)
+        basis = basis_matrix(u * (m - 1), m)
+        along = (torch.from_numpy(low + (high - low) * u) for low, high in (x, y))
+        heights = surface.plain().relative_sag_and_slope(*torch.meshgrid(*along, indexing="ij"))[0].numpy()
+        in_x = _least_squares(basis, basis.T @ heights)
+        return cls(surface.z, torch.from_numpy(_least_squares(basis, basis.T @ in_x.T).T.copy()), x, y)
 
     @property
     def detail(self) -> float:

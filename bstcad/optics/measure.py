@@ -39,7 +39,7 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import in_pairs
 from bstcad.optics.trace import Ghost, Simulation, simulate, through
-from bstcad.optics.tubes import SHEET, area_of, arriving, corners, middle, picture, rays_to
+from bstcad.optics.tubes import SHEET, Tubes, area_of, arriving, corners, launch_tubes, middle, picture, rays_to
 
 SETS = 8  # of rays, independent of each other: the jackknife then knows a standard error to a quarter of it
 FEWEST = 5  # times fewer rays a side in the first sets, which tell how many are needed
@@ -316,6 +316,28 @@ def tubes_of(lens: Lens) -> int:
     A little more than two: lines of the net and corners of tubes do not coincide.
     """
     return max(*(2 * net.m + 5 for net in lens.nets), LEAST)
+
+
+@dataclass(frozen=True)
+class RayTubes:
+    """The light of some channels as ray tubes on their way to the first net, launched once for lenses that are alike.
+
+    A tube carries the light between four neighbouring rays; its picture is differentiable in the heights of all nets.
+    """
+
+    channels: tuple[Channel, ...]
+    sheets: tuple[Tubes, ...]  # one a channel
+
+    @classmethod
+    def launched(cls, lens: Lens, channels: Sequence[Channel], n: int | None = None) -> RayTubes:
+        """n x n tubes a channel (default: two a control point) that hold all light which gets through a lens."""
+        n = n or tubes_of(lens)
+        return cls(tuple(channels), tuple(launch_tubes(c.source, c.through(lens), n) for c in channels))
+
+    def picture(self, lens: Lens, screen: Screen) -> Tensor:
+        """(rows, columns) flux that falls into each pixel, row 0 = y max; all light is 1."""
+        pairs = zip(self.channels, self.sheets, strict=True)
+        return weighted_sum(self.channels, (sheet.picture(c.through(lens), screen) for c, sheet in pairs))
 
 
 def tubes_picture(

@@ -83,11 +83,17 @@ class Collimated(Emitter):
     aperture: Annotated[Outline, Key("Outline of the beam.", example={"shape": "circle", "radius": 12.0})]
     wavelength: WavelengthKey = 587.6
     profile: Annotated[Literal["uniform", "gaussian"], Key("Irradiance over the aperture.")] = "uniform"
-    radius_1e2: Annotated[float | None, Key("Radius of 1/e^2 of a gaussian profile's peak.", "mm", 1e-3, 1e6)] = None
+    radius_1e2: Annotated[
+        float | None, Key("Radius of 1/e^2 of a gaussian profile's peak.", "mm", 1e-3, 1e6, example=8.0)
+    ] = None
     # None: the plane of the lens's first vertex; rays start before it, at 0 or in front of a lens that reaches there
-    z: Annotated[float | None, Key("Plane of the aperture, where rays start.", "mm", -1e8, 1e8)] = None
-    centre: Annotated[tuple[float, float] | None, Key("Middle of aperture and profile.", "mm", -1e8, 1e8)] = None
-    tilt: Annotated[tuple[float, float] | None, Key("Tilt about x and y.", "degrees", -180.0, 180.0)] = None
+    z: Annotated[float | None, Key("Plane of the aperture, where rays start.", "mm", -1e8, 1e8, example=0.0)] = None
+    centre: Annotated[
+        tuple[float, float] | None, Key("Middle of aperture and profile.", "mm", -1e8, 1e8, example=[2.0, 0.0])
+    ] = None
+    tilt: Annotated[
+        tuple[float, float] | None, Key("Tilt about x and y.", "degrees", -180.0, 180.0, example=[0.0, 10.0])
+    ] = None
     divergence: Annotated[float | None, Key("Full angle of the cone of directions.", "degrees", 0.0, 179.0)] = None
     real_divergence: Annotated[
         float | None, Key("Full angle of the real lamp; estimates only.", "degrees", 0.0, 179.0)
@@ -229,9 +235,15 @@ class Point(Emitter):
     ] = None
     half_angle: Annotated[float | None, Key("Angle at which a uniform profile ends.", "degrees", 1e-3, 90.0)] = None
     diameter: Annotated[float | None, Key("Diameter of a disc that shines, simulated.", "mm", 0.0, 1e6)] = None
-    width: Annotated[float | None, Key("Width of a rectangle that shines, along its own x.", "mm", 0.0, 1e6)] = None
-    height: Annotated[float | None, Key("Height of a rectangle that shines, along its own y.", "mm", 0.0, 1e6)] = None
-    tilt: Annotated[tuple[float, float] | None, Key("Tilt about x and y.", "degrees", -180.0, 180.0)] = None
+    width: Annotated[
+        float | None, Key("Width of a rectangle that shines, along its own x.", "mm", 0.0, 1e6, example=1.0)
+    ] = None
+    height: Annotated[
+        float | None, Key("Height of a rectangle that shines, along its own y.", "mm", 0.0, 1e6, example=1.0)
+    ] = None
+    tilt: Annotated[
+        tuple[float, float] | None, Key("Tilt about x and y.", "degrees", -180.0, 180.0, example=[0.0, 10.0])
+    ] = None
     real_diameter: Annotated[float | None, Key("Diameter of the real lamp; estimates only.", "mm", 0.0, 1e6)] = None
     kind: Annotated[Literal["point"], Key("A point, or with a size a disc or rectangle of points.")] = "point"
 

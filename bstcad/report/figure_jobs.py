@@ -39,7 +39,6 @@ from bstcad.report.light_figures import View, plain_ticks
 from bstcad.report.record import Contents, Point, Stage
 from bstcad.report.rendering import LightPath
 from bstcad.report.units import number, turned
-from bstcad.scene.picture import to_srgb
 from bstcad.scene.scene import Scene
 from bstcad.verify.checks import Proof
 
@@ -296,7 +295,6 @@ def light_path_of(scene: Scene, lens: Lens, target: np.ndarray, irradiance: np.n
     if not len(rays):
         return None
     mesh = meshes.lens_mesh(lens, SHOWN_CELLS)
-    tones = to_srgb(np.clip(irradiance / light_figures.brightest(target, irradiance), 0.0, 1.0))
     width, height = (number(high - low) for low, high in (screen.x, screen.y))
     of = "of the middle of the source" if scene.source.extent is not None else "of the source"
     return LightPath(
@@ -305,7 +303,7 @@ def light_path_of(scene: Scene, lens: Lens, target: np.ndarray, irradiance: np.n
         rays=rays,
         flux=MILLIONTHS * flux,
         screen=corners(screen),
-        picture=np.rint(255 * np.clip(tones, 0.0, 1.0)).astype(np.uint8),
+        picture=light_figures.tones(irradiance, target),
         lamp=rays[:1, 0] if np.ptp(rays[:, 0], axis=0).max() < 1e-6 else np.empty((0, 3)),
         seen_along=1 if scene.target.seen_from == "lens" else -1,
         mirror=lens.reflects,

@@ -117,6 +117,12 @@ def brightest(target: np.ndarray, irradiance: np.ndarray) -> float:
     return HEADROOM * max(most, glare, float(np.percentile(irradiance, RARE)))
 
 
+def tones(irradiance: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Irradiance as bytes (rows, columns) that a screen has to be sent, white at the scale's end."""
+    light = to_srgb(np.clip(irradiance / brightest(target, irradiance), 0.0, 1.0))
+    return np.rint(255 * np.clip(light, 0.0, 1.0)).astype(np.uint8)
+
+
 # --- parts of every figure --------------------------------------------------------------------------------------------
 
 

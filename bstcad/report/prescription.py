@@ -139,7 +139,7 @@ class Order:
     low: Place  # least x, y and z
     high: Place  # largest x, y and z
     volume: float | None  # mm³; None: of faces that nothing here integrates
-    material: str | None
+    material: str | None  # in words
     density: float | None  # g/cm³
     datum: str  # where z = 0 lies, in words
     origin: float  # z of the file's origin in the scene's frame
@@ -147,7 +147,7 @@ class Order:
     optical: tuple[str, ...]  # names of the faces that light meets
     tool_radius: float | None  # smallest concave radius of the optical faces; None: none of them is concave
     back_profile: float | None  # width of the tolerance zone of a face's profile (ISO 1101)
-    front_profile: float | None
+    front_profile: float | None  # the same of the front (mm)
     thickness_tolerance: float | None  # ± of the centre thickness
     roughness: float | None  # Ra of the optical faces, at most (nm)
     coating: str | None  # of the optical faces

@@ -70,8 +70,8 @@ Record = TypeVar("Record")
 class Stage:
     """One stage of the design."""
 
-    name: str
-    seconds: Seconds
+    name: str  # such as stage 2
+    seconds: Seconds  # wall time
     rrmsd: Rrmsd | None = None  # after it
     cpu_seconds: Seconds | None = None  # of all processors; None: another process had a part in it, or unknown
 
@@ -81,7 +81,7 @@ class Point:
     """One point of the convergence curve."""
 
     seconds: Seconds  # since the start
-    rrmsd: Rrmsd
+    rrmsd: Rrmsd  # by the tubes of the stage
 
 
 class PrecisionTest(TypedDict):
@@ -92,7 +92,7 @@ class PrecisionTest(TypedDict):
     gradient: Size  # relative difference of its norm
     evaluations: int  # of each precision
     rrmsd_float64: Rrmsd  # after them
-    rrmsd_float32: Rrmsd
+    rrmsd_float32: Rrmsd  # after as many evaluations
     heights: Size  # mm; largest difference of a control point
 
 
@@ -134,8 +134,8 @@ class LeftOut:
 
     kind: str  # a word of LEFT_OUT
     flux_change: float | None  # of 1
-    rrmsd_change: float | None
-    blur_pixels: float | None
+    rrmsd_change: float | None  # absolute
+    blur_pixels: float | None  # full width on the target
     detail: str = ""  # the assumption of the estimate, or why nothing is known
     simulate_by: str = ""  # the line of a scene file that has it simulated; nothing: bstcad does not
     assumed: bool = False  # is its size an example which neither the scene nor nature states?
@@ -147,9 +147,9 @@ class Contents:
 
     __pydantic_config__ = STRICT
 
-    name: str
-    title: str
-    verdict: Literal["passed", "passed with remarks", "failed"]
+    name: str  # of the design and of its folder
+    title: str  # of the scene
+    verdict: Literal["passed", "passed with remarks", "failed"]  # see passed and given_up
     passed: bool  # every check
     rrmsd: Rrmsd  # of the irradiance against the target, by the flux into each pixel
     rrmsd_tent: Rrmsd | None  # by linear binning
@@ -158,26 +158,27 @@ class Contents:
     efficiency: Share  # flux on the target over flux that leaves the back face
     flux: Mapping[str, Share]  # where the source's flux goes; sums to 1
     prescription: Mapping[str, Any]  # every surface as it was designed
-    seconds_total: Seconds
-    stages: Annotated[tuple[Stage, ...], Field(max_length=100), FailFast()]
-    history: Annotated[tuple[Point, ...], Field(max_length=1_000_000), FailFast()]
-    checks: Annotated[tuple[Check, ...], Field(max_length=1000), FailFast()]
+    seconds_total: Seconds  # from the command to the verified lens
+    stages: Annotated[tuple[Stage, ...], Field(max_length=100), FailFast()]  # in their order
+    history: Annotated[tuple[Point, ...], Field(max_length=1_000_000), FailFast()]  # the convergence curve
+    checks: Annotated[tuple[Check, ...], Field(max_length=1000), FailFast()]  # in their order in the report
     effects: Mapping[str, tuple[str, ...]]  # simulated, left_out
-    machine: Mapping[str, Scalar]
-    versions: Mapping[str, str]
-    seed: int
+    machine: Mapping[str, Scalar]  # processors, memory, threads, device
+    versions: Mapping[str, str]  # of the libraries, by name
+    seed: int  # of every random choice
     version: str | None = None  # of bstcad, which wrote it
     leak: Share | None = None  # of the light on the target, on its dark pixels (optics.irradiance.Leak); None: no dark
     contrast: Size | None = None  # mean irradiance of the lit pixels over that of the dark ones; None: or without leak
-    optic: Literal["lens", "mirror"] = "lens"
-    quality: str | None = None
-    transport: Mapping[str, Scalar] | None = None
-    skipped_steps: Annotated[int, Field(ge=0)] | None = None
-    stopped: str | None = None
+    optic: Literal["lens", "mirror"] = "lens"  # the kind of the design
+    quality: str | None = None  # tailoring.quality
+    transport: Mapping[str, Scalar] | None = None  # grid, iterations, mass error, reason to stop
+    skipped_steps: Annotated[int, Field(ge=0)] | None = None  # steps left out since their gradient was not finite
+    stopped: str | None = None  # the reason why tailoring ended
     twins: PrecisionTest | None = None  # None: there was no time for it
     rrmsd_asked: Size | None = None  # None: the scene asks for none
-    rays_traced: int | None = None
+    rays_traced: int | None = None  # by the proof, in all
     shape: Mapping[str, float | None] | None = None  # thickness, radii (mm), slope (degrees), volume (mm³) …
+    # margins: to total reflection (degrees), of Newton's method, largest curvature (1/mm), values that are not finite
     stability: Mapping[str, float | int | None] | None = None
     blur: Blur | None = None  # by the source's size; None: it has no size
     finest_detail: FinestDetail | None = None  # how wide a point of the picture becomes

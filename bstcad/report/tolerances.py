@@ -44,21 +44,21 @@ Disagreement = TypedDict("Disagreement", {"median": Size, "95 %": Size})  # rela
 class Grade:
     """The grade from which the widths of the errors start."""
 
-    name: str
-    words: str
+    name: str  # moulded, diamond-turned or precise
+    words: str  # what the grade stands for
 
 
 @dataclass(frozen=True)
 class Sensitivity:
     """One error of how the lens is made, mounted or lit."""
 
-    name: str
-    words: str
-    unit: str
+    name: str  # of the error, such as lens.tilt_x
+    words: str  # the error in words
+    unit: str  # of limit and sigma
     limit: Width  # ±, in its unit
-    distribution: Literal["normal", "uniform", "field"]
-    cost: Width
-    sigma: Width
+    distribution: Literal["normal", "uniform", "field"]  # of the error within its limit
+    cost: Width  # of holding the limit, beside the others' 1
+    sigma: Width  # standard deviation
     rrmsd_change: float  # by one sigma
     share: Share  # of the mean square that all errors add to the picture
 
@@ -67,8 +67,8 @@ class Sensitivity:
 class Trial:
     """A fully traced trial."""
 
-    number: Annotated[int, Field(ge=0)]
-    rrmsd: Size
+    number: Annotated[int, Field(ge=0)]  # for --trial
+    rrmsd: Size  # of that lens
     amounts: Mapping[str, float]  # of each error, in the unit of its kind
 
 
@@ -76,7 +76,7 @@ class Trial:
 class Inverse:
     """The loosest tolerances that keep a yield."""
 
-    wanted: Share
+    wanted: Share  # the yield asked for
     passed: Annotated[Yield, Field(alias="yield")]  # by trials of its own
     limits: Mapping[str, Width]  # ± by error
 
@@ -87,21 +87,21 @@ class Tolerances:
 
     __pydantic_config__ = STRICT
 
-    name: str
+    name: str  # of the design
     version: str  # of bstcad
-    grade: Grade
-    seed: Annotated[int, Field(ge=0)]
+    grade: Grade  # of all tolerances that the scene does not state
+    seed: Annotated[int, Field(ge=0)]  # of the trials
     tubes: Count  # a side, a channel
-    limit: Rrmsd
+    limit: Rrmsd  # the RRMSD at which a lens passes
     rrmsd: Rrmsd  # of the design
     trials: Count  # by the model of superposed pictures
     full_trials: Count  # of them by full traces
-    passed: Annotated[Yield, Field(alias="yield")]
-    passed_full: Annotated[Yield, Field(alias="yield_full")]
+    passed: Annotated[Yield, Field(alias="yield")]  # the yield by superposed pictures
+    passed_full: Annotated[Yield, Field(alias="yield_full")]  # the yield of the lenses that were traced in full
     passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]  # of the full trials, with the screen adjusted
-    rrmsd_trials: Spread
-    rrmsd_full: Spread
-    rrmsd_adjusted: Spread
+    rrmsd_trials: Spread  # of the trials by superposed pictures
+    rrmsd_full: Spread  # of the trials traced in full
+    rrmsd_adjusted: Spread  # of the trials after the screen was shifted and focused
     model_off: Disagreement  # of the model and the full traces
     sensitivities: Annotated[tuple[Sensitivity, ...], Field(max_length=1000)]  # the worst first
     worst: Annotated[tuple[Trial, ...], Field(max_length=100)]  # of the fully traced trials

@@ -37,6 +37,8 @@ NET_REMEDY = "give the folder of a design, its design.npz or its lens.step"
 UNIFORM = 1e-9  # mm; a net further from uniform in x and y is not one of ours
 ROUNDING = 1e-12  # mm; a net whose vertex is so near to zero is measured from there already
 LARGEST_NET = 2049  # control points a side
+FITTED = 1e-6  # mm; how far the net that stands for a surface of one's own may lie from it, as accept.form has it
+FITS = (129, 257, 513, 1025)  # control points a side of such a net, tried in turn
 FEWEST_ROUND = 6  # of a round lens: with 5 its net, two spans past the rim each way, has no extent
 
 Outlined = Annotated[Rectangle | Circle, Field(discriminator="shape")]
@@ -233,14 +235,40 @@ FRONTS = {  # by their kind: the surface of optics, and the record
 }  # fmt: skip
 
 
-def as_front(value: Any) -> Any:
-    """The front of a scene that is a surface of optics; any other value stays as it is."""
+def as_front(value: Any, outline: Outline | None = None) -> Any:
+    """The front of a scene that is a surface of optics; any other value stays as it is.
+
+    outline: of the lens, for a surface of another kind than a scene has: it becomes a net within FITTED.
+    """
     if not hasattr(value, "relative_sag_and_slope"):
         return value
     if value.is_net:
         return GivenFront(value.z + value.moved(0.0).from_vertex().z, GivenNet.of(value))
-    _, front = FRONTS[value.kind]
-    return front(value.z, **value.parameters())
+    if value.kind in FRONTS:
+        _, front = FRONTS[value.kind]
+        return front(value.z, **value.parameters())
+    if outline is None:
+        raise ValueError(f"a scene has no {value.kind}; give it by scene.changed, which fits a net to it")
+    return as_front(fitted(value, outline))
+
+
+def fitted(surface: Surface, outline: Outline) -> BSplineSurface:
+    """The net of least size that lies within FITTED of a surface inside the outline; SceneError if there is none."""
+    from bstcad.optics.bspline import BSplineSurface
+
+    for m in FITS:
+        half_x, half_y = net_extent(outline, m)
+        net = BSplineSurface.fitted(surface, (-half_x, half_x), (-half_y, half_y), m)
+        along = (torch.linspace(-half, half, 2 * m + 1, dtype=torch.float64) for half in outline.half_extent)
+        x, y = torch.meshgrid(*along, indexing="ij")
+        inside = outline.contains(x, y)
+        off = (net.sag_and_slope(x, y)[0] - surface.plain().sag_and_slope(x, y)[0])[inside].abs().max()
+        if off <= FITTED:
+            return net
+    raise SceneError(
+        f"lens.front: {FITS[-1]} x {FITS[-1]} control points come within {float(off):.2g} mm of the {surface.kind}, "
+        f"and {FITTED:g} mm are allowed; give a smoother surface, finite to ±{half_x:g} mm in x and ±{half_y:g} mm in y"
+    )
 
 
 def net_extent(outline: Outline, m: int) -> tuple[float, float]:
@@ -299,7 +327,7 @@ class LensBlank(Record):
     tool_radius: Annotated[
         float | None, Key("Least radius of the back's valleys, where a tool fits in.", "mm", 1e-6, 1e9)
     ] = None
-    mould: Annotated[bool, Key("The tool cuts a mould: tool_radius bounds the ridges.")] = False
+    mould: Annotated[bool, Key("The tool cuts a mould: tool_radius bounds the ridges.", example=True)] = False
     max_slope: Annotated[float | None, Key("Steepest angle of the back against z = const.", "degrees", 1e-3, 89.0)] = (
         None
     )

@@ -41,9 +41,9 @@ class Part:
     organisation: Annotated[str | None, Key("Organisation of the author.")] = None
     material: Annotated[str | None, Key("Material in words; lens.material if absent.")] = None
     density: Annotated[float | None, Key("Density; that of lens.material if absent.", "g/cm³", 1e-3, 30.0)] = None
-    colour: Annotated[str | None, Key('"#rrggbb", or "#rrggbbaa" with the opacity; pale blue or grey if absent.')] = (
-        None
-    )
+    colour: Annotated[
+        str | None, Key('"#rrggbb", or "#rrggbbaa" with the opacity; pale blue or grey if absent.', example="#9ed3f580")
+    ] = None
     surface_profile: Annotated[float | None, Key("Full tolerance zone of the back's profile.", "mm", 1e-6, 10.0)] = None
     front_profile: Annotated[float | None, Key("Full tolerance zone of the front's profile.", "mm", 1e-6, 10.0)] = None
     roughness: Annotated[float | None, Key("Greatest Ra of the optical faces.", "nm", 0.01, 1e5)] = None
@@ -52,7 +52,9 @@ class Part:
         None
     )
     date: Annotated[str | None, Key("Date of the drawing, ISO 8601.")] = None
-    schema: Annotated[Literal["AP242", "AP214"], Key("Schema of lens.step; AP214 for older programs.")] = "AP242"
+    schema: Annotated[
+        Literal["AP242", "AP214"], Key("Schema of lens.step; AP214 for older programs.", example="AP214")
+    ] = "AP242"
 
     __pydantic_config__ = STRICT
 
@@ -111,7 +113,7 @@ class Box(Record):
     shape: Annotated[Literal["rectangle"], Key("A rectangle about the axis.")]
     width: Annotated[float, Key("Extent along x.", "mm", *LENGTHS, example=12.0)]
     height: Annotated[float, Key("Extent along y.", "mm", *LENGTHS, example=12.0)]
-    corner_radius: Annotated[float, Key("Radius of the corners; 0 is sharp.", "mm", 0.0, 1e5)] = 0.0
+    corner_radius: Annotated[float, Key("Radius of the corners; 0 is sharp.", "mm", 0.0, 1e5, example=3.0)] = 0.0
 
     @property
     def outline(self) -> Rectangle:

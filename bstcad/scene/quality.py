@@ -38,20 +38,39 @@ class Tailoring(Record):
     seed: Annotated[int, Key("Seed of every random choice.", "", 0, 2**63 - 1)] = 0
     method: Annotated[
         Literal["least-squares", "adam", "integration"] | None,
-        Key("Stage 1: slope maps, the paper's procedure, or point-by-point integration without a stage 2."),
+        Key(
+            "Stage 1: slope maps, the paper's procedure, or point-by-point integration without a stage 2.",
+            example="least-squares",
+        ),
     ] = None
-    levels: Annotated[tuple[int, ...] | None, Key("Control points a side, coarse to fine.", "", 5, 2049)] = None
-    transport_grid: Annotated[int | None, Key("Cells a side of the transport problem.", "", 16, 2049)] = None
-    transport_iterations: Annotated[int | None, Key("Iterations of the transport problem.", "", 1, 100_000)] = None
+    levels: Annotated[
+        tuple[int, ...] | None, Key("Control points a side, coarse to fine.", "", 5, 2049, example=[129, 257])
+    ] = None
+    transport_grid: Annotated[int | None, Key("Cells a side of the transport problem.", "", 16, 2049, example=512)] = (
+        None
+    )
+    transport_iterations: Annotated[
+        int | None, Key("Iterations of the transport problem.", "", 1, 100_000, example=100)
+    ] = None
     rays: Annotated[int | None, Key("Rays or ray tubes along one side of the light.", "", 16, 16_384)] = None
-    stage1_iterations: Annotated[int | None, Key("Steps a level of the method adam.", "", 0, 1_000_000)] = None
-    rounds: Annotated[int | None, Key("Rounds of transport map and slope fit in stage 1.", "", 1, 100)] = None
-    stage2_iterations: Annotated[int | None, Key("Iterations of stage 2.", "", 0, 1_000_000)] = None
-    overshoot: Annotated[float | None, Key("Weight of light outside the target, a pixel^2.", "", 0.0, 1e3)] = None
+    stage1_iterations: Annotated[
+        int | None, Key("Steps a level of the method adam.", "", 0, 1_000_000, example=300)
+    ] = None
+    rounds: Annotated[int | None, Key("Rounds of transport map and slope fit in stage 1.", "", 1, 100, example=5)] = (
+        None
+    )
+    stage2_iterations: Annotated[int | None, Key("Iterations of stage 2.", "", 0, 1_000_000, example=120)] = None
+    overshoot: Annotated[
+        float | None, Key("Weight of light outside the target, a pixel^2.", "", 0.0, 1e3, example=0.03)
+    ] = None
     source_points: Annotated[int | None, Key("Points that stand for an extended source.", "", 2, 4096)] = None
-    precision: Annotated[Literal["float32", "float64"] | None, Key("Numbers that tailoring works with.")] = None
-    accuracy: Annotated[float | None, Key("RRMSD at which tailoring ends.", "", 1e-6, 10.0)] = None
-    max_time: Annotated[float | None, Key("Time from command to report; stage 1 runs whole.", "s", 1.0, 1e7)] = None
+    precision: Annotated[
+        Literal["float32", "float64"] | None, Key("Numbers that tailoring works with.", example="float64")
+    ] = None
+    accuracy: Annotated[float | None, Key("RRMSD at which tailoring ends.", "", 1e-6, 10.0, example=0.05)] = None
+    max_time: Annotated[
+        float | None, Key("Time from command to report; stage 1 runs whole.", "s", 1.0, 1e7, example=60.0)
+    ] = None
 
     def resolved(self, control_points: int) -> Tailoring:
         """The same with every knob set.
@@ -127,8 +146,10 @@ class Tolerance(Record):
     ] = None
     cost: Annotated[float | None, Key("Cost of holding the limit, relative to the other errors.", "", 1e-6, 1e6)] = None
     correlation_length: Annotated[float | None, Key("Correlation length of a form error.", "mm", 1e-3, 1e4)] = None
-    period: Annotated[float | None, Key("Period of a ripple.", "mm", 1e-3, 1e4)] = None
-    pattern: Annotated[Literal["raster", "spiral"] | None, Key("Marks of the tool that make the ripple.")] = None
+    period: Annotated[float | None, Key("Period of a ripple.", "mm", 1e-3, 1e4, example=0.02)] = None
+    pattern: Annotated[
+        Literal["raster", "spiral"] | None, Key("Marks of the tool that make the ripple.", example="spiral")
+    ] = None
 
     def covers(self, error: str) -> bool:
         """Is it of this error?"""

@@ -77,7 +77,7 @@ class Accept(Record):
     rrmsd: Annotated[float | None, Key("Greatest RRMSD of the irradiance; 0.25 if absent.", "", 1e-6, 10.0)] = None
     form: Annotated[float, Key("Greatest distance of lens.step from the tailored surface.", "mm", 1e-12, 1.0)] = 1e-6
     efficiency: Annotated[
-        float | None, Key("Least share on the target of the light that leaves the back.", "", 0.0, 1.0)
+        float | None, Key("Least share on the target of the light that leaves the back.", "", 0.0, 1.0, example=0.9)
     ] = None
     light_on_target: Annotated[
         float | None, Key("Least share on the target of the light in the lens; 0.5 if absent.", "", 0.0, 1.0)
@@ -257,11 +257,15 @@ class Scene(Record):
 
         A value is of Python's own types: a number, a text, a list, a record (bstcad.Sphere(8.0, 0.01)), for
         target.image an array of irradiance; None takes the key out.  Of alternatives (text, image, …) the one given
-        replaces the others; a path is relative to the working folder.  Raises SceneError.
+        replaces the others; a path is relative to the working folder.  lens.front may be a bstcad.Surface of one's own:
+        the scene holds a net within 1e-6 mm of it, inside the outline.  Raises SceneError.
         """
         pictures: dict[str, Picture] = {}
         data = _from_python(self, "", pictures)
+        outline = changes.get("lens.outline", self.lens.outline)
         for key, value in changes.items():
+            if key == "lens.front":
+                value = as_front(value, outline)
             _override(data, key, _from_python(value, key, pictures), key)
         return _validated(data, Path("."), pictures)
 
@@ -577,8 +581,6 @@ def _from_python(value: Any, key: str, pictures: dict[str, Picture]) -> Any:
     """
     if hasattr(value, "__array__") and np.ndim(value) and key == "target.image":
         value = picture.from_array(np.asarray(value))
-    if key == "lens.front":
-        value = as_front(value)
     if isinstance(value, Picture | GivenNet):
         name = f"\0{len(pictures)}"
         pictures[name] = value

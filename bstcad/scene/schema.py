@@ -10,7 +10,7 @@ import functools
 import json
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -91,7 +91,10 @@ def of_model(model: type[BaseModel]) -> dict[str, Any]:
         if isinstance(union.get("default"), dict):
             del union["default"]
     circle = tables["Circle"]  # of which a file may give the diameter (scene.py)
-    circle["properties"]["diameter"] = circle["properties"]["radius"] | {"description": "Diameter, in place of radius."}
+    circle["properties"]["diameter"] = circle["properties"]["radius"] | {
+        "description": "Diameter, in place of radius.",
+        "examples": [24.0],
+    }
     circle["required"].remove("radius")
     circle["oneOf"] = [{"required": ["radius"]}, {"required": ["diameter"]}]
     for table in (made, *tables.values()):
@@ -144,6 +147,7 @@ class Row:
     default: str
     meaning: str
     kinds: tuple[str, ...] = ()  # of the table that has the key; (): of every kind
+    example: Any = field(default=None, compare=False)  # None: the key's record has none
 
 
 def rows(record: Node | None = None, table: str = "") -> list[Row]:
@@ -153,7 +157,8 @@ def rows(record: Node | None = None, table: str = "") -> list[Row]:
         inner, key = records(node), f"{table}.{name}".lstrip(".")
         if inner and node.get("type") == "array":
             key += "[]"
-        found.append(Row(key, node["unit"], span(node), meaning=node["description"], default=_default(record, name)))
+        told = {"meaning": node["description"], "default": _default(record, name)}
+        found.append(Row(key, node["unit"], span(node), **told, example=next(iter(node.get("examples", ())), None)))
         found += _union(inner, key)
     return found
 

@@ -51,15 +51,21 @@ class Target(Record):
     tilt: Annotated[Tilt, Key("Tilt about x, then about y.", "degrees", -89.0, 89.0)] = None
     pixels: Annotated[Pixels, Key("Pixels along the longer side, or [columns, rows].", "", FEWEST, 4096, example=512)]
     text: Annotated[str | None, Key("The picture as letters.")] = None
-    image: Annotated[PictureFile | None, Key("The picture as a file, relative to the scene file.")] = None
+    image: Annotated[
+        PictureFile | None, Key("The picture as a file, relative to the scene file.", example="photo.jpg")
+    ] = None
     sample: Annotated[Literal[picture.SAMPLES] | None, Key("The picture as one of scikit-image's.")] = None
     uniform: Annotated[Literal[True] | None, Key("No picture: the same irradiance everywhere.")] = None
-    gamma: Annotated[float | None, Key("Irradiance = number ^ gamma; the file's own if absent.", "", 0.1, 10.0)] = None
-    invert: Annotated[bool, Key("Dark for light.")] = False
+    gamma: Annotated[
+        float | None, Key("Irradiance = number ^ gamma; the file's own if absent.", "", 0.1, 10.0, example=1.0)
+    ] = None
+    invert: Annotated[bool, Key("Dark for light.", example=True)] = False
     seen_from: Annotated[Literal["lens", "behind"], Key("Side from which the picture is unmirrored.")] = "lens"
     rotate: Annotated[Literal[0, 90, 180, 270], Key("Turn counterclockwise.", "degrees")] = 0
     mirror: Annotated[bool, Key("Left for right, after the turn.")] = False
-    fit: Annotated[Literal["crop", "pad", "stretch"], Key("Fit of a picture of other proportions.")] = "crop"
+    fit: Annotated[Literal["crop", "pad", "stretch"], Key("Fit of a picture of other proportions.", example="pad")] = (
+        "crop"
+    )
     outline: Annotated[Outlined | None, Key("Light falls only inside this outline, which is centred.")] = None
 
     def complaints(self) -> Iterator[str]:

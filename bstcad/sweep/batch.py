@@ -53,8 +53,8 @@ class Row(Stored):
     scene: str  # the file, as the user named it
     name: str = ""  # of the scene and of the design's folder
     status: str = STOPPED  # its verdict (verify.verdict.VERDICTS), REFUSED, BROKEN or STOPPED
-    rrmsd: float | None = None
-    rrmsd_noise: float | None = None
+    rrmsd: float | None = None  # of the report
+    rrmsd_noise: float | None = None  # its standard error
     leak: float | None = None  # share of the light on the target that falls where the target is dark
     light_on_target: float | None = None  # share of the light of the source
     checks_failed: tuple[str, ...] = ()  # by name

@@ -262,16 +262,16 @@ class Run(Stored):
     rrmsd_noise: float | None = None  # standard error of that
     rays: int | None = None  # of the reference
     rrmsd_reported: float | None = None  # by its own proof, on its own pixels
-    rrmsd_noise_reported: float | None = None
+    rrmsd_noise_reported: float | None = None  # its standard error
     passed: bool | None = None  # every check of the proof
     net: str = ""  # SHA-256 of the control net: equal nets are equal lenses to the last bit
     stages: tuple[dict[str, Any], ...] = ()  # name, seconds, rrmsd after it; None: not judged
     on_front: bool = False  # of the sweep
     # not in tradeoff.json
     allowed_seconds: float | None = None  # after which it was ended; None: it ended by itself
-    history: tuple[HistoryPoint, ...] = ()
-    machine: dict[str, Any] = {}
-    versions: dict[str, str] = {}
+    history: tuple[HistoryPoint, ...] = ()  # the convergence curve of the run
+    machine: dict[str, Any] = {}  # that ran it
+    versions: dict[str, str] = {}  # of the libraries, by name
     version: str = ""  # of bstcad, with a hash of its sources
 
     @property

@@ -48,20 +48,20 @@ KEPT = {"allowed_seconds", "history", "machine", "versions", "version"}  # of a 
 class Place(Stored):
     """A point of a knob over its seeds: medians, and the range of the error."""
 
-    label: str
-    settings: StoredSettings
+    label: str  # in words
+    settings: StoredSettings  # of the run
     seconds: float | None  # None: seconds do not compare
-    rrmsd: float
-    lowest: float
-    highest: float
-    seeds: int
+    rrmsd: float  # by the judge, the median over the seeds
+    lowest: float  # RRMSD over the seeds
+    highest: float  # RRMSD over the seeds
+    seeds: int  # how many were run
 
 
 class TableKnob(Stored):
     """A knob, and its points that were run."""
 
-    key: str
-    title: str
+    key: str  # of the scene
+    title: str  # in words
     places: tuple[Place, ...]  # from little work to much
 
 
@@ -69,42 +69,42 @@ class Calibration(Stored):
     """Seconds of the calibration kernel over the sweep."""
 
     seconds: float | None  # median
-    lowest: float | None
-    highest: float | None
+    lowest: float | None  # of its range
+    highest: float | None  # of its range
     what: str = (
         "merit and gradient of 1024² ray tubes through a fixed lens of 257² control points, 512² pixels; the least of "
         "three, in the process of the sweep, before each run"
-    )
+    )  # in words
 
 
 class Preset(Stored):
     """A quality preset that was run."""
 
-    name: str
-    seconds: float | None
-    rrmsd: float
+    name: str  # draft, standard or fine
+    seconds: float | None  # of its run
+    rrmsd: float  # by the judge
 
 
 class Table(Stored):
     """All results of a sweep."""
 
-    name: str
-    title: str
+    name: str  # of the scene
+    title: str  # of the scene
     base: dict[str, Any]  # the scene as it stands: quality, control_points, pixels, knobs (tailoring as resolved)
-    budget_seconds: float
-    spent_seconds: float
+    budget_seconds: float  # asked for
+    spent_seconds: float  # by all runs
     errors_alone: bool  # every lens is from another machine: there are no seconds and no front
     version: str  # of bstcad
     sources: str  # version of bstcad with a hash of its sources
-    machine: dict[str, Any]
-    versions: dict[str, str]
+    machine: dict[str, Any]  # on which the seconds were measured
+    versions: dict[str, str]  # of the libraries, by name
     reference: dict[str, Any]  # the judge of all runs: rays (the numbers that it took, the least first), what, in words
-    calibration: Calibration
+    calibration: Calibration  # of the machine's pace
     runs: tuple[Run, ...]  # the most important first, without the entries KEPT
-    knobs: tuple[TableKnob, ...]
+    knobs: tuple[TableKnob, ...]  # that were turned
     front: tuple[StoredSettings, ...]  # of the runs that no other beats, the quickest first
     front_halving: float | None  # factor on the time that halves the error along the front
-    presets: tuple[Preset, ...]
+    presets: tuple[Preset, ...]  # the qualities, each as a run
     seeds: dict[str, bool | None]  # by method: did another seed give another lens?  null: not measured
     history: tuple[HistoryPoint, ...]  # of the base's run, by its own tubes
 

@@ -14,6 +14,7 @@ dark parts takes.  Δ is diagonal in the cosine transform of the net.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -60,14 +61,16 @@ class TubeMerit:
     screen: Screen
     target: Tensor  # (rows, columns), sum 1
     overshoot: float
+    own: Callable[[Tensor, Tensor], Tensor] | None = None  # of picture and target, in place of RRMSD²
 
     @classmethod
     def of(
-        cls, channels: tuple[Channel, ...], lens: Lens, n: int, screen: Screen, target: Tensor, overshoot: float
-    ) -> TubeMerit:
+        cls, channels: tuple[Channel, ...], lens: Lens, n: int, screen: Screen, target: Tensor, overshoot: float,
+        own: Callable[[Tensor, Tensor], Tensor] | None = None,
+    ) -> TubeMerit:  # fmt: skip
         """The merit by sheets of n x n tubes launched for `lens`; the target may have any sum."""
         sheets = tuple(launch_tubes(channel.source, channel.through(lens), n) for channel in channels)
-        return cls(channels, sheets, screen, target=target / total(target), overshoot=overshoot)
+        return cls(channels, sheets, screen, target=target / total(target), overshoot=overshoot, own=own)
 
     @property
     def tubes(self) -> int:
@@ -87,7 +90,10 @@ class TubeMerit:
         left = weighted_sum(self.channels, (total(sheet.carried(corners)) for sheet, corners in pairs))
         images, beyond = zip(*(sheet.collect(corners, self.screen) for sheet, corners in pairs), strict=True)
         image, outside = weighted_sum(self.channels, images), weighted_sum(self.channels, beyond)
-        off = total((image / left - self.target) ** 2) / size
+        if self.own is None:
+            off = total((image / left - self.target) ** 2) / size
+        else:
+            off = self.own(image / left, self.target)
         arrived = weighted_sum(self.channels, (total(arriving(sheet.flux, corners)) for sheet, corners in pairs))
         lost = 1 - arrived / flux  # total reflection has no gradient, but must not be a gain
         seen = image.detach() / total(image.detach())

@@ -84,6 +84,8 @@ class Task:
     progress: Progress = silent  # told of the progress within a step
     grown: tuple[tuple[Channel, ...], ...] = ()  # points of the source, as it grows to its size; () of a point
     bounds: Bounds | None = None  # on the back; None: it may have any shape
+    # of a picture (rows, columns) and the target, both of sum 1 or less, what stage 2 makes least; None: RRMSD²
+    merit: Callable[[Tensor, Tensor], Tensor] | None = None
 
     @property
     def heaviest(self) -> Channel:

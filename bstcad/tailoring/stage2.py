@@ -120,8 +120,9 @@ def run_rounds(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = N
         target = torch.from_numpy(task.target).to(lens.like.device)
         launched = place.sheet_from.applied(lens)
         merit = TubeMerit.of(
-            task.channels, launched, now.tubes, screen=task.screen, target=target, overshoot=_pull(task, launched)
-        )
+            task.channels, launched, now.tubes, screen=task.screen, target=target, overshoot=_pull(task, launched),
+            own=task.merit,
+        )  # fmt: skip
         while place.done < place.round_end:
             if state is None:
                 place = replace(place, search_from=Parameters.of(lens))
@@ -334,7 +335,9 @@ def compare_precisions(task: Task, lens: Lens) -> Comparison:
 def _tried(task: Task, lens: Lens) -> tuple[float, Tensor, Lens]:
     """(merit and gradient at the start, the lens after COMPARED evaluations in its own precision, in float64)."""
     target, n = torch.from_numpy(task.target).to(lens.like.device), min(TUBES, task.knobs.rays)
-    merit = TubeMerit.of(task.channels, lens, n, screen=task.screen, target=target, overshoot=task.knobs.overshoot)
+    merit = TubeMerit.of(
+        task.channels, lens, n, screen=task.screen, target=target, overshoot=task.knobs.overshoot, own=task.merit
+    )
     problem, variables = Problem(lens, merit), variables_of(task, lens)
     value, gradients, _ = problem([net.heights for net in lens.nets])
     *_, last = search(lens, problem, variables, COMPARED)

@@ -13,11 +13,11 @@ VERDICTS = ("passed", "passed with remarks", "failed")
 class Check:
     """One line of the verdict."""
 
-    name: str
+    name: str  # as checks.md explains it
     value: float | bool | None  # None: could not be measured
     limit: float | bool | None  # None: stated, not judged
-    unit: str
-    passed: bool
+    unit: str  # of value and limit; empty: a pure number
+    passed: bool  # does the value keep the limit?
     where: str = ""  # of a check that failed, the place: "control point (12, 40)", counted from 0, x or u first
 
     @classmethod

@@ -1,0 +1,167 @@
+"""A surface, a merit, checks, sections and a judge of a script's own, without a change of the package."""
+
+import json
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+
+import bstcad
+from bstcad.judges.faces import Traced
+from bstcad.optics.outlines import Rectangle
+from bstcad.optics.surfaces import sag
+from tests.conftest import draws_nothing, quick_effort
+
+OUTLINE = Rectangle(16.0, 16.0)
+
+
+@dataclass(frozen=True)
+class Asphere(bstcad.Surface):
+    """z = z0 + c r² / (1 + sqrt(1 - c² r²)) + a4 r⁴ + a6 r⁶, r² = x² + y² (mm)."""
+
+    z: float
+    curvature: float
+    a4: float
+    a6: float
+    kind: str = "asphere"
+    conic_constant = None
+
+    def relative_sag_and_slope(self, x, y):
+        r2 = x * x + y * y
+        root = torch.sqrt(1 - self.curvature**2 * r2)
+        over_r = self.curvature / root + r2 * (4 * self.a4 + 6 * self.a6 * r2)
+        return self.curvature * r2 / (1 + root) + r2 * r2 * (self.a4 + self.a6 * r2), over_r * x, over_r * y
+
+    def sags(self, outline):
+        rim = float(self.relative_sag_and_slope(*(torch.tensor(p) for p in outline.farthest))[0])
+        return min(rim, 0.0), max(rim, 0.0)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A disc by 33 x 33 control points, to a 48 x 48 picture."""
+    changes = {"lens.back.control_points": 33, "target.pixels": 48, "tailoring.quality": "draft", "tailoring.rays": 192}
+    return bstcad.load("templates/disk.toml").changed(changes)
+
+
+@pytest.fixture(scope="module")
+def design(scene, tmp_path_factory):
+    """Its design, written."""
+    with pytest.MonkeyPatch.context() as patch:
+        draws_nothing(patch)
+        design = bstcad.design(scene, progress=False)
+        design.write(tmp_path_factory.mktemp("own") / "disk", progress=False, effort=quick_effort())
+    return design
+
+
+def test_an_aspheric_front_of_order_six_becomes_an_exact_face(scene, tmp_path, monkeypatch):
+    draws_nothing(monkeypatch)
+    front = Asphere(15.0, -0.0005, 2e-7, -1e-10)
+    design = bstcad.design(scene.changed({"lens.front": front}), progress=False)
+    x, y = np.meshgrid(np.linspace(-8, 8, 400), np.linspace(-8, 8, 400))
+    assert np.abs(sag(design.lens.front, x, y) - sag(front, x, y)).max() <= 1e-6  # mm
+    report = design.write(tmp_path / "asphere", progress=False, effort=quick_effort())
+    form = {check.name: check for check in report.checks if check.name.startswith("form")}
+    assert len(form) >= 2 and all(check.passed for check in form.values())
+    again = bstcad.open(tmp_path / "asphere")  # without the class
+    assert torch.equal(again.lens.front.heights, design.lens.front.heights)
+
+
+def test_a_surface_that_no_net_comes_near_is_refused(scene):
+    rough = Asphere(15.0, 0.0, 0.5, 0.0)
+    with pytest.raises(bstcad.SceneError, match="control points come within .* mm of the asphere, and 1e-06 mm are"):
+        scene.changed({"lens.front": rough})
+
+
+def test_a_merit_of_its_own_is_made_less_than_by_rrmsd(scene):
+    def relative(picture, target):
+        weight = 1 / (target + 0.1 * target.mean())
+        return (weight * (picture - target) ** 2).sum() / (weight * target**2).sum()
+
+    designs = [bstcad.design(scene, merit=merit, progress=False) for merit in (None, relative)]
+    merits = []
+    for made in designs:
+        channels, screen = made.scene.channels(), made.scene.target.screen
+        picture = bstcad.RayTubes.launched(made.lens, channels, 192).picture(made.lens, screen)
+        merits.append(float(relative(picture / picture.sum(), torch.from_numpy(made.target))))
+    assert merits[1] < merits[0]
+
+
+def test_checks_and_sections_of_a_script_join_verdict_and_page(design, monkeypatch):
+    draws_nothing(monkeypatch)
+
+    def weight(proof, folder):
+        assert (folder / "lens.step").is_file()
+        yield bstcad.Check.at_most("weight", proof.shape["volume"] * 1.19e-3, 1e-6, "g")
+
+    def budget(report):
+        return "Light budget", f"<p id='budget'>{report.light_on_target:.3f}</p>"
+
+    report = design.verify(checks=[weight], sections=[budget], progress=False, effort=quick_effort())
+    assert not report.passed and [check.name for check in report.checks if not check.passed] == ["weight"]
+    page = (design.folder / "report.html").read_text(encoding="utf-8")
+    assert f"<h2>Light budget</h2>\n<p id='budget'>{report.light_on_target:.3f}</p>" in page
+    assert json.loads((design.folder / "report.json").read_text())["verdict"] == "failed"
+    assert design.verify(progress=False, effort=quick_effort()).passed
+
+
+class Own:
+    """A judge that traces by bstcad itself; `wrong` is a fault that the comparison has to find."""
+
+    name, version = "our own", "1"
+
+    def __init__(self, wrong):
+        self.wrong = wrong
+
+    def cannot(self, lens, channels):
+        return ""
+
+    def light(self, lens, channels):
+        return channels
+
+    def trace(self, lens, channels, screen, rays, seed):
+        halves = []
+        for half in (0, 1):
+            effort = bstcad.Effort(rays=256, seed=seed + 1000 * half, accuracy=0.0, witness=False)
+            light = bstcad.measure(lens, channels, screen, np.ones(screen.shape) / np.prod(screen.shape), effort)
+            picture = light.picture * light.flux["on target"] / light.picture.sum()
+            halves.append(np.fliplr(picture) * np.linspace(0.5, 1.5, screen.columns) if self.wrong else picture)
+        error = type("Error", (), {"height": 0.0, "slope": 0.0, "shift": lambda self, lens, raster: 0.0})()
+        return Traced(np.stack(halves), 16 * 256**2, error)
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_a_judge_of_a_script_is_heard(design, wrong, monkeypatch):
+    draws_nothing(monkeypatch)
+    report = design.verify(against=[Own(wrong)], progress=False, effort=quick_effort())
+    [judge] = report.judges
+    assert judge.name == "our own" and judge.agrees is (not wrong) and report.passed is (not wrong)
+
+
+def test_the_picture_of_tubes_has_the_gradient_of_its_differences(design):
+    lens, channels, screen = design.lens, design.scene.channels(), design.scene.target.screen
+    target = torch.from_numpy(design.target)
+    tubes = bstcad.RayTubes.launched(lens, channels, 96)
+
+    def merit(heights):
+        picture = tubes.picture(lens.with_heights([heights]), screen)
+        return (picture / picture.sum() - target).square().sum() / target.square().sum()
+
+    heights = lens.back.heights.clone().requires_grad_()
+    merit(heights).backward()
+    along = torch.zeros_like(lens.back.heights)  # rays on the rim, where the net ends, have a derivative to each side
+    inner = (slice(4, -4), slice(4, -4))
+    along[inner] = torch.randn(along[inner].shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    step = 1e-7  # mm
+    with torch.no_grad():
+        difference = (merit(heights + step * along) - merit(heights - step * along)) / (2 * step)
+    assert float((heights.grad * along).sum()) == pytest.approx(float(difference), rel=1e-5)
+
+
+def test_the_picture_is_upright_for_the_side_that_the_scene_names(design):
+    seen = design.picture()
+    behind = bstcad.Design(replace(design._made, scene=design.scene.changed({"target.seen_from": "behind"})))
+    assert seen.dtype == np.uint8 and seen.shape == design.target.shape
+    glance = bstcad.Design(design._made).picture()
+    assert np.array_equal(behind.picture(), glance[:, ::-1])
