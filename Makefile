@@ -9,6 +9,8 @@
 # make prediction   what is predicted and what is found, an hour and a half, into docs/prediction.md
 # make effects what each effect costs, into docs/effects.md
 # make stability   the hard cases, those of make bench too, and what they measured, into docs/stability.md
+# make docs    the documentation, into docs/_build/html: its tutorials and gallery run, some five minutes
+# make wheel   the documentation, and with it the wheel and the source distribution, into dist
 # make lint    ruff and mypy
 #
 # torch for Linux may bring CUDA along (gigabytes); where an index of CPU builds is at hand, name it in PIP_EXTRA_INDEX_URL.
@@ -18,7 +20,7 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: lens test coverage bench accuracy prediction effects stability lint
+.PHONY: lens test coverage bench accuracy prediction effects stability docs wheel lint
 
 lens: $(READY)
 	$(BIN)/python generate_lens.py templates/thu.toml
@@ -49,6 +51,17 @@ effects: $(READY)
 stability: $(READY)
 	$(BIN)/python -m pytest -q tests/hard_cases -m 'not slow' --stability docs/stability.md
 	$(BIN)/python -m tests.hard_cases.designs docs/stability.md
+
+docs: $(READY)
+	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[dev,docs]'
+	$(BIN)/python -m sphinx -W --keep-going -q -d docs/_build/doctrees docs docs/_build/html
+	@echo "Documentation: docs/_build/html/index.html"
+
+wheel: docs
+	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[dev,docs,release]'
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist .
+	$(BIN)/python -m twine check --strict dist/*
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -1,0 +1,39 @@
+"""Pictures of the gallery: each PNG that a block of a script wrote below outputs/, with its light first."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+from sphinx_gallery.scrapers import figure_rst
+
+WIDEST, NARROWEST = 1280, 480  # pixels of a picture in the page
+SHOWN = ("wall", "light", "irradiance", "lens", "part")  # names of the pictures that the page shows, in this order
+
+
+def pictures(block: Any, variables: dict[str, Any], configuration: dict[str, Any]) -> str:
+    """The pictures that the block wrote, as reStructuredText; sphinx-gallery calls it after each block."""
+    script = Path(variables["src_file"])
+    shown = variables["example_globals"].setdefault("_shown", set())
+    new = [
+        path for name in SHOWN for path in sorted((script.parent / "outputs" / script.stem).rglob(f"{name}.png"))
+        if path not in shown
+    ]  # fmt: skip
+    paths = []
+    for path in new:
+        shown.add(path)
+        paths.append(next(variables["image_path_iterator"]))
+        _fit(Image.open(path)).save(paths[-1], optimize=True)
+    return figure_rst(paths, configuration["src_dir"]) if paths else ""
+
+
+def _fit(picture: Image.Image) -> Image.Image:
+    """A picture as wide as a page takes it, in 256 colours; the pixels of a target stay squares."""
+    times = -(-NARROWEST // picture.width)
+    if times > 1:
+        return picture.resize((times * picture.width, times * picture.height), Image.Resampling.NEAREST)
+    if picture.width > WIDEST:
+        size = WIDEST, round(picture.height * WIDEST / picture.width)
+        picture = picture.convert("RGB").resize(size, Image.Resampling.LANCZOS)
+    return picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)

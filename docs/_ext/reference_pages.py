@@ -1,0 +1,207 @@
+"""The generated pages of docs/reference: keys of a scene by the schema, commands by typer, JSON files by records."""
+
+from __future__ import annotations
+
+import ast
+import io
+import re
+import tokenize
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+PAGES = ROOT / "docs" / "reference"
+RECORDS = {  # of each JSON file: the module's file and its records, the file's own record first
+    "report.json": [
+        ("report/record.py", ["Contents", "Stage", "Point", "PrecisionTest", "Line", "LeftOut"]),
+        ("verify/verdict.py", ["Check"]),
+        ("analysis/light.py", ["Blur", "FinestDetail"]),
+        ("judges/comparison.py", ["Judge"]),
+        ("report/prescription.py", ["Order"]),
+    ],
+    "tolerance.json": [("report/tolerances.py", ["Tolerances", "Grade", "Sensitivity", "Trial", "Inverse"])],
+    "batch.json": [("sweep/batch.py", ["Batch", "Row"])],
+    "tradeoff.json": [
+        ("sweep/results.py", ["Table", "TableKnob", "Calibration", "Preset", "Place"]),
+        ("sweep/cold_run.py", ["Run", "HistoryPoint"]),
+    ],
+}
+
+
+# ---- keys of a scene -------------------------------------------------------------------------------------------------
+
+
+def scene_keys() -> str:
+    """The page of all keys: a section a table, a row a key."""
+    from bstcad.scene.schema import rows, toml
+
+    examples, tables = examples_of_keys(), {}
+    for row in rows():
+        table = row.key.partition(".")[0]
+        tables.setdefault(table, []).append(row)
+    page = [
+        "# Keys of a scene",
+        "",
+        "A scene is a TOML file: lengths in mm, angles in degrees, wavelengths in nm. The rows are those of",
+        "`bstcad keys` and come from the schema that checks a scene. `[]` marks a list of tables, such as",
+        "`[[effects]]`. A kind before a meaning says which kind of table has the key.",
+        "",
+    ]
+    for table, keys in tables.items():
+        page += [f"(keys-{table.rstrip('[]')})=", f"## `{table}`" if len(keys) > 1 else f"## `{table}` (text)", ""]
+        page += ["| key | unit | range | default | example | meaning |", "|---|---|---|---|---|---|"]
+        for row in keys:
+            meaning = f"{', '.join(row.kinds)}: {row.meaning}".removeprefix(": ")
+            name = row.key.replace("[]", "")
+            example = examples.get((name, row.kinds), examples.get((name, ())))
+            shown = "" if row.range in ("table", "tables") or example is None else code(toml(example))
+            cells = f"`{row.key}`", row.unit, row.range, code(row.default), shown, meaning
+            page.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+        page.append("")
+    return "\n".join(page)
+
+
+def code(text: str) -> str:
+    """Text as code; nothing stays nothing."""
+    return f"`{text}`" if text else ""
+
+
+def examples_of_keys() -> dict[tuple[str, tuple[str, ...]], Any]:
+    """A value of each key that scenes of the templates and of the pages give, else the schema's example."""
+    from bstcad.scene.schema import rows
+
+    scenes = [tomllib.loads(path.read_text(encoding="utf-8")) for path in sorted((ROOT / "templates").glob("*.toml"))]
+    for page in sorted((ROOT / "docs").glob("*/*.md")):
+        for text in re.findall(r"^```toml\n(.*?)^```", page.read_text(encoding="utf-8"), re.S | re.M):
+            scenes.append(tomllib.loads(text))
+    examples = {}
+    for scene in scenes:
+        for key, value, kind in given(scene):
+            examples.setdefault((key, ()), value)
+            examples.setdefault((key, (kind,)), value)
+    for row in rows():
+        if row.example is not None:
+            examples.setdefault((row.key.replace("[]", ""), ()), row.example)
+    return examples
+
+
+def given(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any, str]]:
+    """(dotted key, value, kind of its table) of all values of a TOML table."""
+    kind = str(table.get("kind", table.get("shape", "")))
+    for name, value in table.items():
+        key = f"{prefix}.{name}".lstrip(".")
+        inner = [value] if isinstance(value, dict) else value if isinstance(value, list) else []
+        tables = [part for part in inner if isinstance(part, dict)]
+        for part in tables:
+            yield from given(part, key)
+        if not tables:
+            yield key, value, kind
+
+
+# ---- command line ----------------------------------------------------------------------------------------------------
+
+
+def command_line() -> str:
+    """The page of the commands, by typer from the program itself."""
+    import click
+    import typer
+    from typer.cli import get_docs_for_click
+
+    from bstcad.cli import app
+
+    group = typer.main.get_command(app)
+    page = get_docs_for_click(obj=group, ctx=click.Context(group, info_name="bstcad"), name="bstcad")
+    page = page.replace("# `bstcad`", "# Command line", 1).replace("```console", "```text")
+    exits = (
+        "Exit codes: 0, every check passed; 1, the lens is written, but a check failed; 2, the input is wrong; 70, a\n"
+        "fault of bstcad; 129, 130, 143, ended by SIGHUP, Ctrl-C, SIGTERM.\n\n"
+    )
+    return page.replace("## `bstcad generate`", exits + "## `bstcad generate`", 1)
+
+
+# ---- JSON files ------------------------------------------------------------------------------------------------------
+
+
+def json_files() -> str:
+    """The page of report.json and the other JSON files: a table a record, from its fields and their comments."""
+    page = [
+        "# JSON files",
+        "",
+        "Programs read these files; each is written from, and read back into, the records below. `None` is `null`;",
+        "lengths are in mm, angles in degrees, times in s, shares are parts of 1, if the meaning names no other unit.",
+    ]
+    for name, files in RECORDS.items():
+        page += ["", f"## {name}", ""]
+        for file, records in files:
+            source = (ROOT / "bstcad" / file).read_text(encoding="utf-8")
+            for record in records:
+                page += record_table(source, record)
+    return "\n".join(page) + "\n"
+
+
+def record_table(source: str, name: str) -> list[str]:
+    """A record as a section of the page: its docstring, and of each field the type and the comment."""
+    [record] = [node for node in ast.parse(source).body if isinstance(node, ast.ClassDef) and node.name == name]
+    comments = {
+        token.start[0]: token.string.lstrip("# ")
+        for token in tokenize.generate_tokens(io.StringIO(source).readline)
+        if token.type == tokenize.COMMENT
+    }
+    lines = source.splitlines()
+    rows = []
+    for field in record.body:
+        if not isinstance(field, ast.AnnAssign) or ast.unparse(field.target).startswith("_"):
+            continue
+        above, first = [], field.lineno - 1
+        while lines[first - 1].strip().startswith("#"):
+            above.insert(0, comments[first])
+            first -= 1
+        meaning = " ".join([*above, comments.get(field.end_lineno, "")]).strip()
+        annotation = ast.unparse(field.annotation)
+        alias, kind = re.search(r"alias='(\w+)'", annotation), readable(annotation)
+        rows.append(f"| `{alias[1] if alias else field.target.id}` | {cell(kind)} | {cell(meaning)} |")
+    said = " ".join((ast.get_docstring(record) or "").partition("\n\n")[0].split())
+    return [f"### {name}", "", said, "", "| key | type | meaning |", "|---|---|---|", *rows, ""]
+
+
+def readable(kind: str) -> str:
+    """An annotation without its validators."""
+    kind = re.sub(r"Annotated\[(.*?), (?:Field|FailFast|Len|BeforeValidator|PlainSerializer)\(.*\)\]", r"\1", kind)
+    return kind.replace("tuple[", "list[").replace(", ...]", "]").replace("Mapping[", "table[")
+
+
+def cell(text: str) -> str:
+    """Text of a table's cell, in which markdown marks nothing."""
+    return re.sub(r"([|\\*_<>\[\]`])", r"\\\1", text)
+
+
+def write(page: str, text: str) -> None:
+    """Write a page, if it changes."""
+    path = PAGES / page
+    if not path.exists() or path.read_text(encoding="utf-8") != text:
+        path.write_text(text, encoding="utf-8")
+
+
+def make(app: Any = None) -> None:
+    """Write the generated pages."""
+    for page, text in (
+        ("scene-keys.md", scene_keys()), ("command-line.md", command_line()), ("json-files.md", json_files())
+    ):  # fmt: skip
+        write(page, text)
+
+
+def plain_text(app: Any, what: str, name: str, of: Any, options: Any, lines: list[str]) -> None:
+    """Docstrings are plain text: in reStructuredText, *, | and a _ behind a word would be marks, `names` no code."""
+    text = re.sub(r"(?<!`)`([^`\n]+)`(?!`)", r"``\1``", "\n".join(lines))
+    parts = re.split(r"(``[^`]+``)", text)
+    parts[::2] = [re.sub(r"([*|]|_\b)", r"\\\1", part) for part in parts[::2]]
+    lines[:] = "".join(parts).split("\n")
+
+
+def setup(app: Any) -> dict[str, bool]:
+    """Sphinx calls it."""
+    app.connect("builder-inited", make)
+    app.connect("autodoc-process-docstring", plain_text, priority=100)
+    return {"parallel_read_safe": True}

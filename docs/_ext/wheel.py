@@ -1,0 +1,16 @@
+"""Puts the documentation into a wheel as bstcad/site, for `bstcad docs`, if it has been built."""
+
+from pathlib import Path
+from typing import Any
+
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+
+
+class Documentation(BuildHookInterface):
+    """Includes docs/_build/html, if `make docs` has built it."""
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        """Before the wheel is put together; an editable install finds the pages where they were built."""
+        site = Path(self.root) / "docs" / "_build" / "html"
+        if version == "standard" and (site / "index.html").is_file():
+            build_data["force_include"][str(site)] = "bstcad/site"

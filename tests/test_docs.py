@@ -1,0 +1,187 @@
+"""Every command and code block of README, tutorials and how-to guides runs, page by page, on templates made small."""
+
+import re
+import runpy
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import skimage.data
+import skimage.io
+import tomli_w
+
+import bstcad
+from bstcad import cli, commands
+from bstcad.optics.surfaces import sag
+from bstcad.runs.processes import Ending
+from bstcad.scene.scene import load
+from bstcad.sweep import batch
+from bstcad.sweep import tradeoff as sweeping
+from bstcad.tolerance import tolerancing
+from tests.conftest import draws_nothing, quick_effort, verify_with
+from tests.sweep.conftest import Synthetic
+
+ROOT = Path(__file__).parent.parent
+sys.path.append(str(ROOT / "docs" / "_ext"))
+from code_blocks import blocks  # noqa: E402
+
+PAGES = [
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").glob("tutorials/*.md")),
+    *sorted((ROOT / "docs").glob("how-to/*.md")),
+]
+RUN = [page for page in PAGES if any(block.kind != "toml" for block in blocks(page))]
+FENCES = re.compile(r"^```(\S+)", re.M)
+
+
+def name_of(page):
+    """A page as tests name it."""
+    return str(page.relative_to(ROOT))
+
+
+def make_small(scene, path):
+    """A scene file, or a script, with as few control points and pixels as make a lens."""
+    text = scene.read_text(encoding="utf-8")
+    text = re.sub(r"control_points = \d+", "control_points = 33", text)
+    text = re.sub(r"pixels = \d+", "pixels = 48", text)
+    text = re.sub(r"source_points = \d+", "source_points = 4", text)
+    text = re.sub(r"rrmsd = [\d.]+", "rrmsd = 0.3", text)
+    few = "" if scene.name == "thu.toml" else "\nrays = 192"  # `bstcad plan` knows no scenes with knobs of their own
+    if "quality = " in text:
+        text = re.sub(r'quality = "\w+"(.*\nrays = \d+)?', f'quality = "draft"{few}', text)
+    elif path.suffix == ".toml":
+        text += f'\n[tailoring]\nquality = "draft"{few}\n'
+    path.write_text(text, encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory):
+    """A folder with small templates, a photograph, two finished designs and measured points of the first."""
+    place = tmp_path_factory.mktemp("pages")
+    (place / "templates").mkdir()
+    for path in (ROOT / "templates").iterdir():
+        if path.suffix in (".toml", ".py"):
+            make_small(path, place / "templates" / path.name)
+    skimage.io.imsave(place / "photo.jpg", skimage.data.astronaut()[::4, 32:480:4])  # upright: 112 x 128 pixels
+    with pytest.MonkeyPatch.context() as patch:
+        draws_nothing(patch)
+        for name in ("disk", "thu"):
+            scene = load(place / "templates" / f"{name}.toml")
+            commands.generate(scene, place / "outputs" / name, device="cpu", effort=quick_effort())
+    back = bstcad.open(place / "outputs/disk").lens.back
+    x, y = np.meshgrid(np.linspace(-7.9, 7.9, 120), np.linspace(-7.9, 7.9, 120))
+    cloud = np.stack([x, y, sag(back, x, y)], axis=-1).reshape(-1, 3)
+    np.savetxt(place / "cloud.csv", cloud, delimiter=",")
+    return place
+
+
+@pytest.fixture
+def workplace(prepared, tmp_path, monkeypatch):
+    """A copy of it to work in: few tubes and rays, no pictures, and runs of a sweep by formulas, which take no time."""
+    place = shutil.copytree(prepared, tmp_path / "work")
+    monkeypatch.chdir(place)
+    draws_nothing(monkeypatch)
+    monkeypatch.setattr("bstcad.report.rendering.draw", lambda path, picture: bool(picture.write_bytes(b"drawn")))
+    verify_with(monkeypatch, quick_effort())
+    monkeypatch.setattr(commands, "FULL", quick_effort())  # of a scene with a limit of time
+    sweep = sweeping.tradeoff
+    monkeypatch.setattr(
+        sweeping, "tradeoff",
+        lambda scene, *given, **more: sweep(scene, *given, **more | {"machines": Synthetic(scene)}),
+    )  # fmt: skip
+    few = partial(tolerancing.tolerance, tubes=129, trials=200, full=4)
+    monkeypatch.setattr(tolerancing, "tolerance", few)
+    monkeypatch.setattr(batch, "design", copied)
+    return place
+
+
+def copied(contents, folder, variables, tick):
+    """A design of a batch, which has processes of its own otherwise."""
+    shutil.copytree("outputs/disk", folder)
+    return Ending(0, 1.0, 1.0, "")
+
+
+def run_command(words):
+    """A command of a page, in this process."""
+    program, *arguments = words
+    if program == "make":  # the targets exist; running them here would run this test again
+        done = subprocess.run(["make", "-n", *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+    elif program == "bstcad":
+        assert cli.run(arguments) == 0, shlex.join(words)
+        if arguments[0] == "new":
+            path = Path(f"{arguments[1]}.toml")
+            make_small(path, path)
+    else:
+        assert program == "python", shlex.join(words)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys, "argv", arguments)
+            runpy.run_path(arguments[0], run_name="__main__")
+
+
+@pytest.mark.parametrize("page", RUN, ids=name_of)
+def test_its_blocks_run_one_after_the_other(page, workplace):
+    for block in blocks(page):
+        if block.kind == "sh":
+            for words in block.commands:
+                run_command(words)
+        elif block.kind == "python":
+            exec(compile(block.text, f"{page.name}:{block.line}", "exec"), {"__name__": "page"})
+
+
+def merged(base, given):
+    """The tables of a scene with those of a page in them; a table of another kind or shape takes the place of one."""
+    if not (isinstance(base, dict) and isinstance(given, dict)) or any(
+        key in given and given[key] != base.get(key) for key in ("kind", "shape")
+    ):
+        return given
+    return base | {key: merged(base.get(key), value) for key, value in given.items()}
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if "```toml" in page.read_text("utf-8")], ids=name_of)
+def test_its_tables_are_those_of_a_scene(page, tmp_path):
+    for block in (block for block in blocks(page) if block.kind == "toml"):
+        base, path = ROOT / "templates" / block.onto, tmp_path / "scene.toml"
+        tables = merged(tomllib.loads(base.read_text(encoding="utf-8")), tomllib.loads(block.text))
+        path.write_text(tomli_w.dumps(tables), encoding="utf-8")
+        skimage.io.imsave(tmp_path / "photo.jpg", skimage.data.astronaut()[::4, 32:480:4])
+        assert load(path) != load(base), f"{page.name}:{block.line}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_its_blocks_are_of_kinds_that_are_run_or_output(page):
+    kinds = set(FENCES.findall(page.read_text(encoding="utf-8")))
+    assert {kind for kind in kinds if not kind.startswith("{")} <= {"sh", "python", "toml", "text"}
+
+
+def test_every_key_of_a_scene_has_an_example():
+    """In the page of keys: from the templates, from the pages, or from the key's own record."""
+    from reference_pages import examples_of_keys
+
+    from bstcad.scene.schema import rows
+
+    known = {key for key, _ in examples_of_keys()}
+    assert [
+        row.key for row in rows() if not row.range.startswith("table") and row.key.replace("[]", "") not in known
+    ] == []
+
+
+def test_every_field_of_a_json_file_has_a_meaning():
+    from reference_pages import json_files
+
+    rows = re.findall(r"^\| `(\w+)` \| .*? \| (.*) \|$", json_files(), re.M)
+    assert len(rows) > 100 and [name for name, meaning in rows if not meaning] == []
+
+
+def test_the_site_is_complete_without_a_network():
+    """Pages name no address from which a browser would fetch; those of links are no fetch."""
+    for path in (*(ROOT / "docs").rglob("*.md"), ROOT / "docs" / "conf.py", *(ROOT / "docs" / "_static").iterdir()):
+        if "_build" not in path.parts and "_made" not in path.parts:
+            text = path.read_text(encoding="utf-8")
+            assert not re.search(r"!\[[^\]]*\]\(https?:|src=.https?:|@import|url\(.?https?:", text), path
