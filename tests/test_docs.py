@@ -37,6 +37,7 @@ PAGES = [
     *sorted((ROOT / "docs").glob("how-to/*.md")),
 ]
 RUN = [page for page in PAGES if any(block.kind != "toml" for block in blocks(page))]
+LONG = {"measured-part", "time-and-accuracy", "tolerances"}  # ten seconds and more: make bench runs their blocks
 FENCES = re.compile(r"^```(\S+)", re.M)
 
 
@@ -125,7 +126,9 @@ def run_command(words):
             runpy.run_path(arguments[0], run_name="__main__")
 
 
-@pytest.mark.parametrize("page", RUN, ids=name_of)
+@pytest.mark.parametrize(
+    "page", [pytest.param(page, marks=[pytest.mark.bench] * (page.stem in LONG)) for page in RUN], ids=name_of
+)
 def test_its_blocks_run_one_after_the_other(page, workplace):
     for block in blocks(page):
         if block.kind == "sh":
