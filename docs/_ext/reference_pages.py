@@ -39,7 +39,7 @@ def scene_keys() -> str:
 
     examples, tables = examples_of_keys(), {}
     for row in rows():
-        table = row.key.partition(".")[0]
+        table = row.key.partition(".")[0] if row.range in ("table", "tables") or "." in row.key else "name and title"
         tables.setdefault(table, []).append(row)
     page = [
         "# Keys of a scene",
@@ -50,7 +50,11 @@ def scene_keys() -> str:
         "",
     ]
     for table, keys in tables.items():
-        page += [f"(keys-{table.rstrip('[]')})=", f"## `{table}`" if len(keys) > 1 else f"## `{table}` (text)", ""]
+        page += [
+            f"(keys-{table.rstrip('[]').partition(' ')[0]})=",
+            f"## `{table}`" if " " not in table else "## Name and title",
+            "",
+        ]
         page += ["| key | unit | range | default | example | meaning |", "|---|---|---|---|---|---|"]
         for row in keys:
             meaning = f"{', '.join(row.kinds)}: {row.meaning}".removeprefix(": ")

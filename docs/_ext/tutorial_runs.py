@@ -17,7 +17,7 @@ MADE = DOCS / "_made"
 
 def make(app: Any) -> None:
     """Run each tutorial in a folder of its own, docs/_made/NAME, beside the templates and a photograph."""
-    for page in sorted((DOCS / "tutorials").glob("*.md")):
+    for page in sorted(set((DOCS / "tutorials").glob("*.md")) - {DOCS / "tutorials" / "index.md"}):
         folder = MADE / page.stem
         shutil.copytree(DOCS.parent / "templates", folder / "templates", dirs_exist_ok=True)
         skimage.io.imsave(folder / "photo.jpg", skimage.data.astronaut()[:512, 32:480])
