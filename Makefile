@@ -60,7 +60,7 @@ docs: $(READY)
 wheel: docs
 	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[dev,docs,release]'
 	rm -rf dist
-	$(BIN)/python -m build --outdir dist .
+	$(BIN)/python -m build --sdist --wheel --outdir dist .
 	$(BIN)/python -m twine check --strict dist/*
 
 lint: $(READY)
