@@ -43,6 +43,7 @@ ENOUGH = 1e-4  # of the mean flux of a cell, smoothed: a field is unknown where 
 STILL = 1e-6  # pixels; smaller shifts count as none
 DARK = 0.01  # of the mean of a picture: darker pixels are not lit
 BLUNT = 1.3  # pixels along a side that a cell lights where edges are half as sharp; measured on the templates' designs
+SHARPEST = 0.75  # of a jump between pixels, at an edge that cells much smaller than a pixel make; measured there, too
 MOST = 1 << 19  # pixels; of larger pictures some rows are sampled
 MARGIN = 4  # dark pixels around a picture; the ringing of a spline ends within them
 AIRY = 0.376  # standard deviation of the Gaussian as wide at half its height as the image of a point, in λ L / D
@@ -196,12 +197,12 @@ class Spline:
 
     Light that is even within each pixel, and jumps between pixels, changes in proportion to a small shift; light as
     smooth as a cubic spline changes with the square of a small blur.  A lens whose control cells light less than a
-    pixel each makes such jumps; a lens whose cells light several makes none: `sharp` is the weight of the jumps.
+    pixel each makes most of such a jump; a lens whose cells light several makes none: `sharp` is the jumps' weight.
     """
 
     padded: np.ndarray  # (rows, columns) the picture in a dark margin
     coefficients: np.ndarray  # of the spline through the padded picture
-    sharp: float  # 1 / (1 + (grain / BLUNT)⁴), grain the pixels along a side that a cell lights
+    sharp: float  # SHARPEST / (1 + (grain / BLUNT)⁴), grain the pixels along a side that a cell lights
     chosen: slice  # the sampled rows: all rows, or of large pictures every k-th
 
     @classmethod
@@ -209,7 +210,7 @@ class Spline:
         """The spline through the middles of the pixels."""
         padded, step = np.pad(picture, MARGIN), math.ceil(picture.size / MOST)
         coefficients = scipy.ndimage.spline_filter(padded, 3)
-        return cls(padded, coefficients, 1 / (1 + (grain / BLUNT) ** 4), slice(step // 2, None, step))
+        return cls(padded, coefficients, SHARPEST / (1 + (grain / BLUNT) ** 4), slice(step // 2, None, step))
 
     def rows(self, picture: np.ndarray) -> np.ndarray:
         """The sampled rows of a picture."""
