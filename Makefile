@@ -6,6 +6,8 @@
 # make accuracy   what accuracy costs in time on the full-size scenes: records what is missing or of another version, and
 #              writes docs/accuracy.md and its figures; with ONLY="thu-* mitsuba" records these (python -m
 #              tests.benchmarks.accuracy --list tells their names), with ONLY= writes alone
+# make published   published results beside ours on the same scenes, each judged by an independent Monte Carlo, into
+#              docs/published.md; ONLY= as above, and SUN_PICTURE= the path of diffinytrace's examples/img1.jpg
 # make prediction   what is predicted and what is found, an hour and a half, into docs/prediction.md
 # make effects what each effect costs, into docs/effects.md
 # make stability   the hard cases, those of make bench too, and what they measured, into docs/stability.md
@@ -20,7 +22,7 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: lens test coverage bench accuracy prediction effects stability docs wheel lint
+.PHONY: lens test coverage bench accuracy published prediction effects stability docs wheel lint
 
 lens: $(READY)
 	$(BIN)/python generate_lens.py templates/thu.toml
@@ -41,6 +43,11 @@ bench: $(READY)
 accuracy: $(READY)
 	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[dev,judges]'
 	$(BIN)/python -m tests.benchmarks.accuracy $(if $(filter undefined,$(origin ONLY)),,--only $(foreach name,$(ONLY),'$(name)'))
+
+published: $(READY)
+	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[dev,judges]'
+	$(BIN)/python -m tests.benchmarks.published $(if $(filter undefined,$(origin ONLY)),,--only $(ONLY)) \
+	    $(if $(SUN_PICTURE),--sun-picture '$(SUN_PICTURE)')
 
 prediction: $(READY)
 	$(BIN)/python -m tests.benchmarks.prediction_figure
