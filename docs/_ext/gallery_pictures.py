@@ -8,7 +8,7 @@ from typing import Any
 from PIL import Image
 from sphinx_gallery.scrapers import figure_rst
 
-WIDEST, NARROWEST = 1280, 480  # pixels of a picture in the page
+WIDEST, NARROWEST = 1000, 480  # pixels of a picture in the page
 SHOWN = ("wall", "light", "irradiance", "lens", "part")  # names of the pictures that the page shows, in this order
 
 
@@ -24,11 +24,11 @@ def pictures(block: Any, variables: dict[str, Any], configuration: dict[str, Any
     for path in new:
         shown.add(path)
         paths.append(next(variables["image_path_iterator"]))
-        _fit(Image.open(path)).save(paths[-1], optimize=True)
+        fitting(Image.open(path)).save(paths[-1], optimize=True)
     return figure_rst(paths, configuration["src_dir"]) if paths else ""
 
 
-def _fit(picture: Image.Image) -> Image.Image:
+def fitting(picture: Image.Image) -> Image.Image:
     """A picture as wide as a page takes it, in 256 colours; the pixels of a target stay squares."""
     times = -(-NARROWEST // picture.width)
     if times > 1:
