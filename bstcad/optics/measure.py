@@ -334,10 +334,15 @@ class RayTubes:
         n = n or tubes_of(lens)
         return cls(tuple(channels), tuple(launch_tubes(c.source, c.through(lens), n) for c in channels))
 
+    def landing(self, lens: Lens, screen: Screen) -> tuple[Landed, ...]:
+        """Where the corners of each sheet meet the screen."""
+        pairs = zip(self.channels, self.sheets, strict=True)
+        return tuple(sheet.landing(channel.through(lens), screen.plane) for channel, sheet in pairs)
+
     def picture(self, lens: Lens, screen: Screen) -> Tensor:
         """(rows, columns) flux that falls into each pixel, row 0 = y max; all light is 1."""
-        pairs = zip(self.channels, self.sheets, strict=True)
-        return weighted_sum(self.channels, (sheet.picture(c.through(lens), screen) for c, sheet in pairs))
+        pairs = zip(self.sheets, self.landing(lens, screen), strict=True)
+        return weighted_sum(self.channels, (sheet.collect(corners, screen)[0] for sheet, corners in pairs))
 
 
 def tubes_picture(

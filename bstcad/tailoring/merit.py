@@ -29,10 +29,11 @@ from bstcad.optics.channels import Channel, weighted_sum
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.reductions import elementary, total
 from bstcad.optics.lens import Lens
+from bstcad.optics.measure import RayTubes
 from bstcad.optics.rays import Landed
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import through
-from bstcad.optics.tubes import Tubes, arriving, launch_tubes, rays_to
+from bstcad.optics.tubes import arriving, rays_to
 
 EXPONENT = 0.5  # of the Laplacian
 BLUR = 1.0  # pixels; irradiance for the weight
@@ -56,8 +57,7 @@ class TubeMerit:
     adds its share.  Picture, pull and loss are sums over the channels of the light.
     """
 
-    channels: tuple[Channel, ...]
-    sheets: tuple[Tubes, ...]  # one a channel
+    light: RayTubes
     screen: Screen
     target: Tensor  # (rows, columns), sum 1
     overshoot: float
@@ -69,32 +69,32 @@ class TubeMerit:
         own: Callable[[Tensor, Tensor], Tensor] | None = None,
     ) -> TubeMerit:  # fmt: skip
         """The merit by sheets of n x n tubes launched for `lens`; the target may have any sum."""
-        sheets = tuple(launch_tubes(channel.source, channel.through(lens), n) for channel in channels)
-        return cls(channels, sheets, screen, target=target / total(target), overshoot=overshoot, own=own)
+        light = RayTubes.launched(lens, channels, n)
+        return cls(light, screen, target=target / total(target), overshoot=overshoot, own=own)
 
     @property
     def tubes(self) -> int:
         """The number of tubes in an evaluation."""
-        return sum(sheet.flux.numel() for sheet in self.sheets)
+        return sum(sheet.flux.numel() for sheet in self.light.sheets)
 
     def landing(self, lens: Lens) -> tuple[Landed, ...]:
         """Where the corners of each sheet meet the screen."""
-        pairs = zip(self.channels, self.sheets, strict=True)
-        return tuple(sheet.landing(channel.through(lens), self.screen.plane) for channel, sheet in pairs)
+        return self.light.landing(lens, self.screen)
 
     def __call__(self, landed: tuple[Landed, ...]) -> tuple[Tensor, Tensor]:
         """(merit, RRMSD of the light on the screen) of the landed corners of each sheet."""
-        pairs = list(zip(self.sheets, landed, strict=True))
-        flux, size = weighted_sum(self.channels, (total(sheet.flux) for sheet in self.sheets)), total(self.target**2)
+        channels, sheets = self.light.channels, self.light.sheets
+        pairs = list(zip(sheets, landed, strict=True))
+        flux, size = weighted_sum(channels, (total(sheet.flux) for sheet in sheets)), total(self.target**2)
         # left of it by faces and glass: darker everywhere is no worse
-        left = weighted_sum(self.channels, (total(sheet.carried(corners)) for sheet, corners in pairs))
+        left = weighted_sum(channels, (total(sheet.carried(corners)) for sheet, corners in pairs))
         images, beyond = zip(*(sheet.collect(corners, self.screen) for sheet, corners in pairs), strict=True)
-        image, outside = weighted_sum(self.channels, images), weighted_sum(self.channels, beyond)
+        image, outside = weighted_sum(channels, images), weighted_sum(channels, beyond)
         if self.own is None:
             off = total((image / left - self.target) ** 2) / size
         else:
             off = self.own(image / left, self.target)
-        arrived = weighted_sum(self.channels, (total(arriving(sheet.flux, corners)) for sheet, corners in pairs))
+        arrived = weighted_sum(channels, (total(arriving(sheet.flux, corners)) for sheet, corners in pairs))
         lost = 1 - arrived / flux  # total reflection has no gradient, but must not be a gain
         seen = image.detach() / total(image.detach())
         return off + self.overshoot * outside / left + lost, (total((seen - self.target) ** 2) / size).sqrt()

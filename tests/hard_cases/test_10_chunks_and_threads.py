@@ -28,6 +28,7 @@ from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import compiling
 from bstcad.optics.lens import Lens
+from bstcad.optics.measure import RayTubes
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
@@ -73,7 +74,8 @@ def image_and_gradient(dtype=torch.float64) -> dict[str, torch.Tensor]:
     held = lens(dtype)
     rays, sheet = launch(SOURCE, held, RAYS, 1), tubes.launch_tubes(SOURCE, held, TUBES)
     light = (Channel(SOURCE, held.index),)
-    by_tubes, by_tents = TubeMerit(light, (sheet,), SCREEN, target(), 0.03), TentMerit.of(light, SCREEN, target(), 0.03)
+    by_tubes = TubeMerit(RayTubes(light, (sheet,)), SCREEN, target(), 0.03)
+    by_tents = TentMerit.of(light, SCREEN, target(), 0.03)
     found = by_rays(simulated(SOURCE, held, SCREEN, RAYS, 0))
     for name, merit in (
         ("tubes", lambda bent: by_tubes(by_tubes.landing(bent))[0]),

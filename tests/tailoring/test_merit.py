@@ -12,6 +12,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
+from bstcad.optics.measure import RayTubes
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed
 from bstcad.optics.sources import Collimated
@@ -54,11 +55,11 @@ def test_tubes_that_fill_the_pixels_have_merit_zero():
     target = torch.rand((8, 8), generator=torch.Generator().manual_seed(0), dtype=torch.float64) + 0.1
     target /= target.sum()
     flux = target.flip(0).T.repeat_interleave(3, 0).repeat_interleave(3, 1) / 9  # x first, y upwards
-    merit, rrmsd = TubeMerit(ONE, (Tubes(None, flux),), SCREEN, target, 0.03)((sheet(24),))
+    merit, rrmsd = TubeMerit(RayTubes(ONE, (Tubes(None, flux),)), SCREEN, target, 0.03)((sheet(24),))
     assert float(merit) < 1e-24 and float(rrmsd) < 1e-12
     chequered = 1 + 0.1 * (-1.0) ** torch.stack(torch.meshgrid(torch.arange(8), torch.arange(8), indexing="ij")).sum(0)
     other = target * chequered / (target * chequered).sum()
-    _, rrmsd = TubeMerit(ONE, (Tubes(None, flux),), SCREEN, other, 0.03)((sheet(24),))
+    _, rrmsd = TubeMerit(RayTubes(ONE, (Tubes(None, flux),)), SCREEN, other, 0.03)((sheet(24),))
     assert float(rrmsd) == pytest.approx(float((target - other).norm() / other.norm()), rel=1e-9)
 
 
@@ -83,7 +84,7 @@ def test_the_gradient_of_the_tubes_is_that_of_finite_differences():
     target = torch.rand((8, 8), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     corners = sheet(9, 1, 0.6)
     flux = torch.rand((9, 9), generator=torch.Generator().manual_seed(4), dtype=torch.float64)
-    merit = TubeMerit(ONE, (Tubes(None, flux),), SCREEN, target / target.sum(), 0.03)
+    merit = TubeMerit(RayTubes(ONE, (Tubes(None, flux),)), SCREEN, target / target.sum(), 0.03)
     leaf = corners.position.clone().requires_grad_()
     assert torch.autograd.gradcheck(lambda p: merit((replace(corners, position=p),))[0], (leaf,), eps=1e-7, atol=1e-5)
 

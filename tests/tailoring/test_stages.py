@@ -139,7 +139,7 @@ def test_light_that_is_lost_is_no_gain():
     [corners] = merit.landing(lens)
     status = corners.status.clone()
     status[:30] = 3
-    lost = float(merit.sheets[0].flux[:30].sum() / merit.sheets[0].flux.sum())
+    lost = float(merit.light.sheets[0].flux[:30].sum() / merit.light.sheets[0].flux.sum())
     assert float(merit((replace(corners, status=status),))[0]) > float(merit((corners,))[0]) + lost
 
 
