@@ -34,6 +34,7 @@ _HOMES = {
     "Channel": "optics.channels",
     "Screen": "optics.irradiance",
     "Tailoring": "scene.quality",
+    "effect": "scene.effects",
     "Check": "verify.verdict",
     "SceneError": "scene.errors",
 }

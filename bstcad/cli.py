@@ -562,9 +562,11 @@ def docs(topic: Topic = None) -> int:
         print(explained.section(topics[topic]))
         page = "reference/" + topics[topic].replace("#", ".html#")
     site = next((place for place in SITES if (place / "index.html").is_file()), None)
+    if site is None and topic is not None:
+        return 0
     if site is None:
         print("bstcad: this copy of bstcad came without pages; make docs builds them from its sources", file=sys.stderr)
-        return 0 if topic else 2
+        return 2
     print(f"Documentation: {site / page}")
     if topic is None and sys.stdout.isatty():
         import webbrowser

@@ -373,7 +373,7 @@ def test_a_start_is_light(start):
 PUBLIC = """
     design open mounted Design Report Scene load LensBlank Back Accept Target Collimated Point Circle Rectangle
     Plane Sphere Conic Interface Refract Reflect cross measure Effort Light Lens BSplineSurface Channel Screen Tailoring
-    SceneError Check RayTubes Surface trace __version__
+    SceneError Check RayTubes Surface trace effect __version__
 """
 
 

@@ -1,6 +1,9 @@
-"""A surface, a merit, checks, sections and a judge of a script's own, without a change of the package."""
+"""A surface, a merit, an effect, checks, sections and a judge of a script's own, without a change of the package."""
 
 import json
+import os
+import subprocess
+import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -165,3 +168,102 @@ def test_the_picture_is_upright_for_the_side_that_the_scene_names(design):
     assert seen.dtype == np.uint8 and seen.shape == design.target.shape
     glance = bstcad.Design(design._made).picture()
     assert np.array_equal(behind.picture(), glance[:, ::-1])
+
+
+@dataclass(frozen=True)
+class Dust:
+    """exp(-cover / cos θ) goes on at each face."""
+
+    wavelength: float
+    cover: float = 0.02
+
+    def share(self, cos_in, cos_out, path):
+        return torch.exp(-self.cover / cos_in)
+
+
+@dataclass(frozen=True)
+class Haze:
+    """Absorption, written once more: exp(-a s) in the glass."""
+
+    wavelength: float
+    in_glass = True
+
+    def share(self, cos_in, cos_out, path):
+        return torch.exp(-0.01 * path)
+
+
+def with_effects(scene, *effects):
+    return scene.changed({"effects": list(effects)})
+
+
+def test_an_effect_of_a_script_is_that_of_the_package_with_the_same_law(scene):
+    """Absorption by a script's loss and by bstcad's: one picture, one ledger, one gradient through the ray tubes."""
+    lens = scene.flat_lens(33)
+    pictures, gradients = [], []
+    for named in (bstcad.effect("haze", Haze), {"kind": "absorption", "coefficient": 0.01}):
+        lossy = with_effects(scene, named)
+        heights = lens.back.heights.clone().requires_grad_()
+        tubes = bstcad.RayTubes.launched(lens, lossy.channels(), 96)
+        picture = tubes.picture(replace(lens, back=replace(lens.back, heights=heights)), lossy.target.screen)
+        gradients += torch.autograd.grad((picture * torch.from_numpy(scene.target.irradiance())).sum(), heights)
+        pictures.append(bstcad.measure(lens, lossy.channels(), lossy.target.screen, lossy.target.irradiance()))
+    own, absorbed = pictures
+    assert own.flux["taken by haze"] == pytest.approx(absorbed.flux["absorbed in the glass"], rel=1e-9)
+    assert own.flux["taken by haze"] > 0.01 * absorbed.flux["on target"]
+    assert np.allclose(own.picture, absorbed.picture, rtol=1e-9, atol=1e-15)
+    assert gradients[0].abs().max() > 0
+    assert torch.allclose(*gradients, rtol=1e-9, atol=1e-9 * float(gradients[1].abs().max()))
+
+
+def test_a_design_with_an_effect_of_a_script_is_proved_with_it_and_opened_by_its_name(scene, tmp_path, monkeypatch):
+    draws_nothing(monkeypatch)
+    design = bstcad.design(with_effects(scene, bstcad.effect("dust", Dust)), progress=False)
+    report = design.write(tmp_path / "dusty", progress=False, effort=quick_effort())
+    assert report.passed, report
+    taken, through = report.flux["taken by dust"], report.flux["on target"] + report.flux["off target"]
+    two_faces = 1 - np.exp(-2 * 0.02)
+    assert two_faces < taken / (through + taken) < 1.3 * two_faces  # at a slant, and from light that the sides take
+    assert sum(report.flux.values()) == pytest.approx(1, abs=1e-12)
+    assert 'name = "dust"' in (tmp_path / "dusty" / "scene.toml").read_text()
+    assert bstcad.open(tmp_path / "dusty").scene.effects == design.scene.effects
+
+
+def test_an_effect_that_nobody_knows_or_that_is_named_twice_is_refused_in_a_sentence(scene):
+    unknown = {"kind": "own", "name": "fog"}
+    with pytest.raises(bstcad.SceneError, match="no effect is called 'fog' here"):
+        with_effects(scene, unknown)
+    twice = bstcad.effect("dust", Dust)
+    with pytest.raises(bstcad.SceneError, match="'dust' is named twice"):
+        with_effects(scene, twice, twice)
+
+
+def test_a_share_that_is_no_tensor_is_named(scene):
+    class Half:
+        def __init__(self, wavelength):
+            pass
+
+        def share(self, cos_in, cos_out, path):
+            return 0.5
+
+    half = with_effects(scene, bstcad.effect("half", Half))
+    with pytest.raises(ValueError, match=r"effect 'half': share\(\) gives float, not a tensor like cos_in"):
+        bstcad.measure(scene.flat_lens(33), half.channels(), half.target.screen, half.target.irradiance())
+
+
+def test_an_installed_package_brings_an_effect_along(scene, tmp_path):
+    """By its entry point, when the scene file is read in another process."""
+    (tmp_path / "dusty_lenses.py").write_text(
+        "class Dust:\n    def __init__(self, nm): pass\n    def share(self, cos_in, cos_out, path): return cos_in\n"
+    )
+    facts = tmp_path / "dusty_lenses-1.dist-info"
+    facts.mkdir()
+    (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: dusty-lenses\nVersion: 1\n")
+    (facts / "entry_points.txt").write_text("[bstcad.effects]\nspray = dusty_lenses:Dust\n")
+    path = tmp_path / "scene.toml"
+    path.write_text(scene.toml().replace("effects = []", 'effects = [{ kind = "own", name = "spray" }]'))
+    script = "import sys, bstcad; c, = bstcad.load(sys.argv[1]).channels(); print(c.losses.own[0].line)"
+    told = subprocess.run(
+        [sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), os.getcwd()])},
+    )  # fmt: skip
+    assert told.stdout.strip() == "taken by spray"

@@ -92,7 +92,8 @@ class Loss(Protocol):
     """A loss of a ray's flux at an interface, or on the way to it (losses.py)."""
 
     line: str  # of the ledger, under which that part is counted
-    in_glass: bool  # exp(-coefficient · path) of the way to the interface; else it follows from the angle there alone
+    in_glass: bool  # it acts on the way to the interface; else at the interface
+    fused: bool  # the kernels know it: exp(-coefficient · path) in the glass, at the interface the angle alone
 
     def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
         """The part that goes on, from the cosines of incidence and refraction and the path before the face (mm)."""

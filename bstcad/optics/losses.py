@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -92,7 +92,7 @@ class Transmission:
     polarisation: Polarisation = "none"
     coating: Coating | None = None
 
-    line, in_glass = REFLECTED, False
+    line, in_glass, fused = REFLECTED, False, True
 
     def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
         """T at the angles of incidence and refraction."""
@@ -109,7 +109,7 @@ class MetalReflection:
     index: complex  # n + ik of the metal
     polarisation: Polarisation = "none"
 
-    line, in_glass = BY_THE_MIRROR, False
+    line, in_glass, fused = BY_THE_MIRROR, False, True
 
     def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
         """R at the angle of incidence."""
@@ -122,11 +122,40 @@ class Absorption:
 
     coefficient: float  # a (1/mm)
 
-    line, in_glass = ABSORBED, True
+    line, in_glass, fused = ABSORBED, True, True
 
     def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
         """exp(-a s)."""
         return elementary(torch.exp, -self.coefficient * path)
+
+
+@dataclass(frozen=True)
+class Own:
+    """A loss by a script or a package (scene.effects.effect), which no kernel knows."""
+
+    name: str
+    wavelength: float  # nm
+    loss: Any = field(compare=False)  # with share(cos_in, cos_out, path); of one name and wavelength there is one
+
+    fused = False
+
+    @property
+    def line(self) -> str:
+        """Its line of the ledger."""
+        return f"taken by {self.name}"
+
+    @property
+    def in_glass(self) -> bool:
+        """Does it act in the glass alone?"""
+        return bool(getattr(self.loss, "in_glass", False))
+
+    def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
+        """Its own share; ValueError, by name, where it is no tensor like the cosines."""
+        share = self.loss.share(cos_in, cos_out, path)
+        if not (isinstance(share, Tensor) and share.shape == cos_in.shape):
+            given = f"a tensor of shape {tuple(share.shape)}" if isinstance(share, Tensor) else type(share).__name__
+            raise ValueError(f"effect {self.name!r}: share() gives {given}, not a tensor like cos_in")
+        return share
 
 
 @dataclass(frozen=True)
@@ -152,6 +181,7 @@ class Losses:
 
     fresnel: Fresnel | None = None
     absorption: Absorption | None = None
+    own: tuple[Own, ...] = ()
 
     def on(self, interfaces: Sequence[Interface]) -> tuple[Interface, ...]:
         """The interfaces of a lens with the losses at each, and in the glass on the way to it."""
@@ -159,7 +189,8 @@ class Losses:
 
     def _at(self, k: int, interface: Interface) -> tuple[Loss, ...]:
         inside = (self.absorption,) if self.absorption and k > 0 else ()  # behind the first interface is glass
-        return (*inside, *((self.fresnel.of(interface),) if self.fresnel else ()))
+        own = (loss for loss in self.own if k > 0 or not loss.in_glass)
+        return (*inside, *own, *((self.fresnel.of(interface),) if self.fresnel else ()))  # a ghost takes the last
 
 
 def _amplitudes(n_in: float, n_out: float, cos_in: Tensor, cos_out: Tensor) -> tuple[Tensor, Tensor]:

@@ -203,7 +203,7 @@ class Reflection:
     through: Loss  # T
     law: Refract  # of the light that goes through
 
-    line, in_glass = "transmitted", False  # of no ledger: light that goes through is no part of the ghost
+    line, in_glass, fused = "transmitted", False, True  # of no ledger: light that goes through is no part of the ghost
 
     def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
         """R at the angle of incidence."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated, Literal
+from collections.abc import Callable, Iterator
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 
 from bstcad.optics import media
 from bstcad.optics.key import Key
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
     from bstcad.optics.measure import GhostLight
 
 METAL = "Al"  # of a mirror, unless a scene names another
+PACKAGES = "bstcad.effects"  # group of entry points by which an installed package brings effects along
+Makes = Callable[[float], Any]  # the loss (optics.interfaces.Loss) of light of a wavelength (nm)
+_KNOWN: dict[str, Makes] = {}  # by the names that `effect` was given
 
 
 class Coating(Record):
@@ -57,7 +61,43 @@ class Ghost(Record):
     kind: Annotated[Literal["ghost"], Key("Light reflected twice inside the lens, in verification.")]
 
 
-Effect = Annotated[Fresnel | Absorption | Ghost, Field(discriminator="kind")]
+class Own(Record):
+    """A loss of flux by a script or an installed package, in tailoring and in verification; see `effect`."""
+
+    kind: Annotated[Literal["own"], Key("A loss of flux by a script or an installed package.")]
+    name: Annotated[str, Key("Name under which the script or the package has it.", example="dust")]
+    _makes: Makes | None = PrivateAttr(None)  # travels with the record to other processes
+
+    def model_post_init(self, context: Any) -> None:
+        """Look the name up."""
+        self._makes = _KNOWN.get(self.name) or _installed(self.name)
+
+    def of(self, wavelength: float) -> Any:
+        """The loss of light of a wavelength (nm)."""
+        assert self._makes is not None  # else `complaints` refused the scene
+        return self._makes(wavelength)
+
+
+def effect(name: str, makes: Makes) -> Own:
+    """An effect of one's own for scene.changed({"effects": [...]}): a loss of flux at faces or in the glass.
+
+    makes(wavelength in nm) gives an object with share(cos_in, cos_out, path): the part of each ray's flux that goes on,
+    a tensor like the cosines of incidence and of refraction (or reflection) and the path before the face in mm, and
+    differentiable in them.  It acts at each face that light goes through or is reflected by; with the attribute
+    in_glass = True on the way through the glass alone.  The ledger counts the rest as "taken by NAME".  The scene file
+    holds the name: a script that opens such a design calls `effect` first, and an installed package declares an entry
+    point NAME = "module:makes" of the group "bstcad.effects" instead.
+    """
+    _KNOWN[name] = makes
+    return Own(kind="own", name=name)
+
+
+def _installed(name: str) -> Makes | None:
+    """What an installed package has under a name."""
+    return next((found.load() for found in entry_points(group=PACKAGES, name=name)), None)
+
+
+Effect = Annotated[Fresnel | Absorption | Ghost | Own, Field(discriminator="kind")]
 Effects = tuple[Effect, ...]
 
 
@@ -65,8 +105,13 @@ def complaints(effects: Effects, lens: LensBlank) -> Iterator[str]:
     """Effects that are named twice, that the lens or the mirror does not have, or of which no data are known."""
     for k, effect in enumerate(effects):
         key, mirror = f"effects[{k}]", lens.back.reflect
-        if any(effect.kind == other.kind for other in effects[:k]):
-            yield f"{key}: {effect.kind!r} is named twice; remove one of the two tables"
+        if any(_name(effect) == _name(other) for other in effects[:k]):
+            yield f"{key}: {_name(effect)!r} is named twice; remove one of the two tables"
+        if isinstance(effect, Own) and effect._makes is None:
+            yield (
+                f"{key}.name: no effect is called {effect.name!r} here; let the script that has it call "
+                f"bstcad.effect({effect.name!r}, …) first, or install its package"
+            )
         if mirror and effect.kind in ("absorption", "ghost"):
             yield f"{key}: light does not enter a mirror (back.reflect), so it has no {effect.kind}; remove the table"
         if mirror and getattr(effect, "coating", None) is not None:
@@ -75,6 +120,10 @@ def complaints(effects: Effects, lens: LensBlank) -> Iterator[str]:
             yield f"{key}.metal: is for a mirror (lens.back.reflect); remove it"
         if effect.kind == "absorption" and effect.coefficient is None and lens.material is None:
             yield f"{key}.coefficient: missing, and lens.index names no material; add it in 1/mm, or give lens.material"
+
+
+def _name(effect: Effect) -> str:
+    return effect.name if isinstance(effect, Own) else effect.kind
 
 
 def named(effects: Effects, kind: type) -> Record | None:
@@ -103,7 +152,8 @@ def losses(effects: Effects, lens: LensBlank, wavelength: float) -> Losses | Non
     Raises ValueError, in one sentence, where the material's data do not say enough.
     """
     fresnel, absorption = reflection_of(effects), named(effects, Absorption)
-    if fresnel is None and absorption is None:
+    others = [effect for effect in effects if isinstance(effect, Own)]
+    if fresnel is None and absorption is None and not others:
         return None
     from bstcad.optics import losses as physics
 
@@ -117,4 +167,5 @@ def losses(effects: Effects, lens: LensBlank, wavelength: float) -> Losses | Non
         absorbed = physics.Absorption(
             media.absorption_coefficient(lens.material, wavelength) if given is None else given
         )
-    return physics.Losses(reflection, absorbed)
+    own = tuple(physics.Own(other.name, wavelength, other.of(wavelength)) for other in others)
+    return physics.Losses(reflection, absorbed, own)

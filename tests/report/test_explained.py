@@ -199,7 +199,7 @@ REMARKS = [
      "triangles than a file should have; lens.step is exact.", "facets"),
     ("Tailoring ended when its time was up, before it had gained all it could.", "time-up"),
     ("Tailoring was stopped by hand, before it had gained all it could; --resume goes on with it.", "interrupted"),
-    ("3 steps were left out because their gradient was not finite.", "skipped-steps"),
+    ("Steps left out because their gradient was not finite: 3.", "skipped-steps"),
     ("3.0 % of the measured points are outliers and were left out: dust, glints or slips of the instrument. Clean the "
      "part and measure it again to be sure.", "outliers"),
     ("No RRMSD was asked (accept.rrmsd); any up to 0.25 passes.", "no-rrmsd-asked"),

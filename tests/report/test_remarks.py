@@ -61,7 +61,7 @@ SENTENCES = [  # changes of the facts, of the scene; what the sentences hold, ea
     ({"shape.slope_max_deg": 75.0}, {}, ["as steep as 75°"]),
     ({"stopped": "time"}, {}, ["ended when its time was up"]),
     ({"stopped": "interrupt"}, {}, ["stopped by hand"]),
-    ({"skipped_steps": 3}, {}, ["3 steps were left out because their gradient was not finite."]),
+    ({"skipped_steps": 3}, {}, ["Steps left out because their gradient was not finite: 3."]),
     ({"seconds_total": 26.8}, TIMED, ["The time limit of 20.0 s was missed by 6.8 s: "]),
     ({"seconds_total": 19.9}, TIMED, []),
     ({"seconds_total": 1000.0}, {}, []),

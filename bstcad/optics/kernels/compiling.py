@@ -64,4 +64,5 @@ def fused(*tensors: Tensor) -> bool:
 def fused_whole(interfaces: Sequence[Any]) -> bool:
     """Does one kernel (forward.py) trace rays across all of these Interfaces: a mirror, or a front and a net?"""
     given = [(KINDS.get(interface.surface.kind), interface.law.reverses) for interface in interfaces]
-    return given in WHOLE and fused(interfaces[-1].surface.heights)
+    known = all(loss.fused for interface in interfaces for loss in interface.losses)
+    return given in WHOLE and known and fused(interfaces[-1].surface.heights)
