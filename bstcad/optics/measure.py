@@ -301,8 +301,8 @@ def _traced(lens, draw: Draw, screen: Screen, wanted: Tensor, side: int, seed: i
 
 
 def _witness(lens, channels, screen: Screen, wanted: Tensor, rays: _Rays, ghost: Ghost | None) -> Witness:
-    """The witness by `tubes_of` the lens."""
-    n = tubes_of(lens)
+    """The witness by `tubes_of` the lens, on these pixels."""
+    n = tubes_of(lens, max(screen.shape))
     seen = _joined(tubes_picture(lens, channels, screen, n), ghost)
     if not total(seen) > 0:
         return Witness(math.nan, math.inf)
@@ -310,12 +310,13 @@ def _witness(lens, channels, screen: Screen, wanted: Tensor, rays: _Rays, ghost:
     return Witness(float(rrmsd(seen, wanted)), math.sqrt(max(apart(rays.boxes, seen)[0], 0.0)))
 
 
-def tubes_of(lens: Lens) -> int:
+def tubes_of(lens: Lens, pixels: int = 0) -> int:
     """Tubes a side that follow the nets: two a control point, or more where they have few.
 
-    A little more than two: lines of the net and corners of tubes do not coincide.
+    Where a cell of the net lights more than a pixel, its light changes from pixel to pixel: two tubes a pixel, four a
+    cell at most.  A little more than two: lines of the net and corners of tubes do not coincide.
     """
-    return max(*(2 * net.m + 5 for net in lens.nets), LEAST)
+    return max(*(2 * max(net.m, min(pixels, 2 * net.m)) + 5 for net in lens.nets), LEAST)
 
 
 @dataclass(frozen=True)
