@@ -170,7 +170,11 @@ def test_the_report_has_a_made_part_where_one_was_asked_for(small_design, nomina
     assert [check["name"] for check in written["checks"] if check["name"].startswith(PART)]
     assert "outliers (2.0 % of the points near the face) stand alone" in " ".join(page.split())
     assert report["verdict"] == "passed with remarks" and "are outliers" in report["given_up"][-1]
-    assert "The made part" in page and (folder / "figures" / "made_part.png").stat().st_size > 10_000
+    assert (
+        "RRMSD, made part" in page
+        and "The made part" in page
+        and (folder / "figures" / "made_part.png").stat().st_size > 10_000
+    )
     saved(tmp_path / "two" / "cloud.csv", 1.002 * cloud(nominal.lens, 5000, 1e-5))
     assert not commands.verify(folder, measured=tmp_path / "two" / "cloud.csv", drawing=NoPictures).passed
     assert commands.verify(folder, drawing=NoPictures).measured is None
