@@ -39,7 +39,7 @@ class Part:
     number: Annotated[str | None, Key("Number of the part; the scene's name if absent.")] = None
     author: Annotated[str | None, Key("Author of the file.")] = None
     organisation: Annotated[str | None, Key("Organisation of the author.")] = None
-    material: Annotated[str | None, Key("Material in words; lens.material if absent.")] = None
+    material: Annotated[str | None, Key("Material as the drawing names it; lens.material if absent.")] = None
     density: Annotated[float | None, Key("Density; that of lens.material if absent.", "g/cm³", 1e-3, 30.0)] = None
     colour: Annotated[
         str | None, Key('"#rrggbb", or "#rrggbbaa" with the opacity; pale blue or grey if absent.', example="#9ed3f580")
@@ -61,7 +61,7 @@ class Part:
     def of(self, lens: LensBlank) -> Part:
         """The same, completed by the lens: its material with the density, a colour."""
         known: dict[str, str | float | None] = {"colour": METAL if lens.back.reflect else GLASS}
-        if lens.material is not None and self.material is None:
+        if lens.material is not None:
             its = medium(lens.material)
             known |= {"material": its.name, "density": its.density}
         return replace(self, **{name: value for name, value in known.items() if getattr(self, name) is None})

@@ -50,7 +50,9 @@ class Target(Record):
     y: Annotated[tuple[float, float], Key("Ends of the target along y.", "mm", *COORDINATES, example=[-200.0, 200.0])]
     tilt: Annotated[Tilt, Key("Tilt about x, then about y.", "degrees", -89.0, 89.0)] = None
     pixels: Annotated[Pixels, Key("Pixels along the longer side, or [columns, rows].", "", FEWEST, 4096, example=512)]
-    text: Annotated[str | None, Key("The picture as letters.")] = None
+    text: Annotated[
+        str | None, Key("The picture as letters, centred, over 84 % of the width or 80 % of the height.")
+    ] = None
     image: Annotated[
         PictureFile | None, Key("The picture as a file, relative to the scene file.", example="photo.jpg")
     ] = None

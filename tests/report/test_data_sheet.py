@@ -210,7 +210,8 @@ def test_the_sheet_is_of_the_part_and_not_of_the_lens_before_it_was_cut():
     holes = {"4 \u00d7 \u00d82.2 on \u00d826", "2 \u00d7 \u00d81.5", "\u00d82"}
     walls = {"draft 1\u00b0, 0.1 \u00d7 45\u00b0", "draft 2\u00b0, 0.2 \u00d7 45\u00b0"}
     assert holes | walls | {"R3", "lens \u00d814", "26", "24", "1.5", "the flange's lower face"} <= set(words)
-    assert "z = 484 mm" in words and "z = \u22121 mm" in words  # screen and front, from the flange's lower face
+    assert "z = 484 mm in part.step" in words  # the screen, from the flange's lower face …
+    assert "z = \u22121 mm" in words  # … and the front
 
 
 def held(mount):

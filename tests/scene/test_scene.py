@@ -464,7 +464,7 @@ def test_a_tilted_plane_passes_the_lens_by_so_much(outline, tilt):
     (DISK, {"lens.material": "other/Optorez1330/Sultanova"},  # nobody has said its density
      Part(material="other/Optorez1330/Sultanova", colour=GLASS)),
     (DISK, {"lens.index": 1.5}, Part(colour=GLASS)),
-    (DISK, {"part.material": "PMMA, cast"}, Part(material="PMMA, cast", colour=GLASS)),
+    (DISK, {"part.material": "PMMA, cast"}, Part(material="PMMA, cast", density=1.19, colour=GLASS)),
     (MIRROR, {"part.material": "Al 6061", "part.density": 2.7}, Part(material="Al 6061", density=2.7, colour=METAL)),
 ])  # fmt: skip
 def test_a_part_is_of_the_lens_s_material_unless_the_scene_says_another(path, changes, part):
