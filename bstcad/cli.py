@@ -559,7 +559,7 @@ def docs(topic: Topic = None) -> int:
 
         raise InputError(f"{topic}: no check or remark is named so; {nearest(topic, list(topics), 'known are')}")
     if topic is not None:
-        print(explained.section(topics[topic]))
+        print(explained.read_in_a_terminal(topics[topic]))
         page = "reference/" + topics[topic].replace("#", ".html#")
     site = next((place for place in SITES if (place / "index.html").is_file()), None)
     if site is None and topic is not None:

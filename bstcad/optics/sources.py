@@ -231,9 +231,17 @@ class Point(Emitter):
         "lambertian"
     )
     half_angle_1e2: Annotated[
-        float | None, Key("Angle of 1/e^2 of a gaussian profile's peak.", "degrees", 1e-3, 89.0)
+        float | None,
+        Key(
+            "Angle from the axis at which a gaussian's irradiance on a plane is 1/e^2 of its peak.",
+            "degrees",
+            1e-3,
+            89.0,
+        ),
     ] = None
-    half_angle: Annotated[float | None, Key("Angle at which a uniform profile ends.", "degrees", 1e-3, 90.0)] = None
+    half_angle: Annotated[
+        float | None, Key("Angle from the axis at which a uniform profile ends.", "degrees", 1e-3, 90.0)
+    ] = None
     diameter: Annotated[float | None, Key("Diameter of a disc that shines, simulated.", "mm", 0.0, 1e6)] = None
     width: Annotated[
         float | None, Key("Width of a rectangle that shines, along its own x.", "mm", 0.0, 1e6, example=1.0)

@@ -14,6 +14,7 @@ from typing import NamedTuple
 PAGES = ("checks", "remarks")  # files beside this one, without ".md"
 ANY = "…"
 SECTION = re.compile(r"^\(([\w-]+)\)=\n+(### .+?)(?=\n+^(?:\([\w-]+\)=$|#{1,2} )|\s*\Z)", re.M | re.S)
+LINK = re.compile(r"\[([^]]+)\]\((?:\w+\.md)?#([\w-]+)\)")
 PATTERNS = re.compile(r"^(?:Names|Sentences): (.+?)(?:\n\n|\Z)", re.M | re.S)
 
 
@@ -52,6 +53,11 @@ def topic(text: str) -> str:
 def section(page: str) -> str:
     """The markdown of a section by its page and label, from its heading on; KeyError if there is none."""
     return sections()[page].text
+
+
+def read_in_a_terminal(page: str) -> str:
+    """A section whose links to other sections are names for `bstcad docs`: "[check](checks.md#check-rrmsd)"."""
+    return LINK.sub(r"\1 (bstcad docs \2)", section(page))
 
 
 def _page(name: str) -> str:

@@ -16,7 +16,7 @@ from bstcad.analysis.cost import WORTH
 from bstcad.report import explained
 from bstcad.report.prescription import WAYS, order_rows
 from bstcad.report.record import LEFT_OUT, Contents, Examined, LeftOut, bounds, changes
-from bstcad.report.units import Rows, about, bound, environment, paragraphs, quantity, tables
+from bstcad.report.units import Rows, about, bound, environment, number, paragraphs, quantity, tables
 from bstcad.runs import files
 from bstcad.verify.verdict import Check
 
@@ -41,6 +41,11 @@ ESTIMATED = (
     "Estimated on a coarse lens; most figures are good to a factor of two. RRMSD: what the effect alone gives a {} "
     "that is perfect without it; that of a real one changes by less. Blur: diameter of the spot that a point of the "
     "picture becomes. ?: not known."
+)
+IMAGE = (
+    "Through each place of the {optic} the source throws an image of itself, {width} mm ({pixels} pixels) wide on the "
+    "target. The target blurred by this image has an RRMSD of {rrmsd}; a {optic} comes below that as far as it "
+    "sharpens coarser detail beforehand."
 )
 INTERVALS = (
     "In brackets what nine of ten designs keep to. Seconds: from the command to its end, with nothing else running."
@@ -241,6 +246,9 @@ def plan_effects(plan: Mapping[str, Any], title: str, optic: str) -> Group:
         if entry.simulate_by:
             remedies.add_row(Text(f"  {LEFT_OUT[entry.kind]}"), Text(entry.simulate_by))
     lines = [Text(title, "bold"), simulated, left_out, Text(ESTIMATED.format(optic))]
+    if plan["blur"] is not None:
+        image = {key: number(value) for key, value in plan["blur"].items()}
+        lines += [Text(), Text(IMAGE.format(**image, optic=optic))]
     if remedies.row_count:
         lines += [Text(), Text("To have it simulated, write in the scene:"), remedies]
     return Group(*lines)

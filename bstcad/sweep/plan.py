@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from bstcad.analysis.cost import ControlCells, control_cells, limits
+from bstcad.analysis.light import blur
 from bstcad.optics.lens import Lens
 from bstcad.pipeline import check_thickness, reached
 from bstcad.report.record import simulated
@@ -44,15 +45,20 @@ Interval = tuple[float, float, float]  # low, likely, high
 def plan(
     scene: Scene, text: str = "", keys: Sequence[str] = (), units: Callable[[], Units] = measured_units
 ) -> Iterator[dict[str, Any]]:
-    """The entries of `plan --json`: first simulated and left_out, the latter by change of the RRMSD; then predictions.
+    """The entries of `plan --json`: first simulated, left_out by change of the RRMSD, blur; then the predictions.
+
+    blur: width (mm, and pixels) of the image that a source of some size throws through the coarse lens, and the RRMSD
+    of the target convolved with this image; None: the source has no size.
 
     text: of the scene file, whose lines are named.  keys: that the command line gives instead.  units: measures the
     units of this machine.
     """
     at, lens = toml_positions(text), coarse_lens(scene)
     asked = [{"what": what, "key": key, **_asked(key, at, keys)} for what, key in simulated(scene)]
-    estimates = left_out(scene, lens, scene.target.irradiance())
-    yield {"simulated": asked, "left_out": [asdict(estimate) for estimate in estimates]}
+    target = scene.target.irradiance()
+    estimates, image = left_out(scene, lens, target), blur(scene.channels(), lens, scene.target.screen, target)
+    left = [asdict(estimate) for estimate in estimates]
+    yield {"simulated": asked, "left_out": left, "blur": image and rounded(asdict(image), 3)}
     yield rounded(outlook(scene, lens, units), 3)
 
 

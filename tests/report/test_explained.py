@@ -163,8 +163,8 @@ REMARKS = [
     ("The accuracy of 0.02 that was asked is not reached: the RRMSD is 0.03.", "accuracy"),
     ("The RRMSD is 0.234 where 0.1 was asked.", "rrmsd"),
     ("The source is too large for the picture: the finest detail on the target is 46 mm wide (source.divergence = 0.53 "
-     "degrees), and the picture with no finer detail has an RRMSD of 0.54 where 0.1 is allowed; at 250 mm instead of "
-     "5\u202f000 mm it is 2.4 mm.", "source-too-large"),
+     "degrees), and the picture with no finer detail has an RRMSD of 0.54 where 0.1 is allowed; with the target "
+     "250 mm instead of 5\u202f000 mm from the lens it is 2.4 mm.", "source-too-large"),
     ("The back was tailored within bounds (lens.tool_radius = 0.5 mm, lens.max_slope = 36 degrees); 1.2 % of it is "
      "within 3 % of lens.tool_radius and 10.0 % of it is within 3 % of lens.max_slope. With them the design comes to "
      "an RRMSD of 0.03; freed of them, it comes to 0.02 in an eighth of its evaluations more. So much of their cost "
@@ -192,8 +192,8 @@ REMARKS = [
     ("Some light meets the back 0.5° beyond the critical angle, and is reflected.", "beyond-critical-angle"),
     ("Some light meets the back only 1.25° short of total internal reflection: where the face is made steeper by as "
      "much, that light is lost.", "near-total-reflection"),
-    ("The darkest parts are lifted: where less than 1 % of the mean irradiance was asked there is 20.0 % of it, 10.0 % "
-     "of the light in all.", "lifted"),
+    ("The darkest parts are lifted: pixels that ask for less than 1 % of the mean irradiance get 20.0 % of it, and in "
+     "all 10.0 % of the light on the target more than they ask for.", "lifted"),
     ("The back is as steep as 75°: hardly a tool reaches that.", "steep"),
     ("The facets of lens.stl and lens.3mf lie within 1.75 µm of the lens, not within 1 µm: that would take more "
      "triangles than a file should have; lens.step is exact.", "facets"),

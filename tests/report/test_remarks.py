@@ -84,8 +84,8 @@ SENTENCES = [  # changes of the facts, of the scene; what the sentences hold, ea
     (effects(replace(ASSUMED, rrmsd_change=0.006, assumed=False)), {}, []),
     (BLURRED | {"rrmsd": 0.5}, {}, ["The RRMSD is 0.5", (
         "The source is too large for the picture: the finest detail on the target is 46 mm wide (source.divergence = "
-        "0.53 degrees), and the picture with no finer detail has an RRMSD of 0.54 where 0.1 is allowed; at 250 mm "
-        "instead of 5\u202f000 mm it is 2.4 mm.")]),
+        "0.53 degrees), and the picture with no finer detail has an RRMSD of 0.54 where 0.1 is allowed; with the "
+        "target 250 mm instead of 5\u202f000 mm from the lens it is 2.4 mm.")]),
     (BLURRED, {}, []),  # tailoring made up for it
 ]  # fmt: skip
 
@@ -151,7 +151,7 @@ def test_dark_parts_that_are_lit_are_measured_and_not_left_dark(scene):
     target[:, 4:] = 1 / 32
     assert said(scene, target=target) == []
     [sentence] = said(scene, target=target, found=np.where(target > 0, 0.9 / 32, 0.1 / 32))
-    assert "there is 20.0 % of it, 10.0 % of the light in all" in sentence
+    assert "get 20.0 % of it, and in all 10.0 % of the light on the target more" in sentence
 
 
 def test_the_report_of_a_design_says_it(small_design):

@@ -90,7 +90,7 @@ SAID = [  # changes of REPORT: words of the page; do they stand on the terminal,
     ({"rrmsd": 0.0099}, "not resolved: standard error 0.002", True),  # less than five standard errors
     ({"flux": GONE}, "missed the lens 46.9 %, sides 18.5 %, beside the target 0.80 %", True),
     ({"leak": 0.012, "contrast": 85.0}, "lit pixels are 85 times as bright", True),
-    ({"finest_detail": DETAIL}, "0.53 degrees; with the target at 250 mm instead of 600 mm: 2.4 mm", True),
+    ({"finest_detail": DETAIL}, "0.53 degrees; with the target 250 mm instead of 600 mm from the lens: 2.4 mm", True),
     ({"finest_detail": DETAIL | ALONE | {"assumed": True}}, "0.53 degrees, which the scene does not state", True),
     ({"finest_detail": DETAIL | {"source_image": 0.1}}, "by the pixels; the source's image is 0.1 mm wide (so", True),
     ({"shape": SHAPE}, "smallest convex radius none", True),

@@ -108,7 +108,7 @@ class TestLight:
         assert plate.blurred(scene.changed(disc)) == pytest.approx(math.sqrt(0.0676 * 5.55 * 2 / 30), rel=0.08)
         blurred = new_scene.Plate.of("sun", 80, 150).blurred(scene)
         assert scene.accept.rrmsd == math.ceil(110 * blurred) / 100 < new_scene.MOST_RRMSD
-        assert f"blurred by the source, it is off by {blurred:.2g}" in text and "too coarse" not in text
+        assert f"blurred by the source: {blurred:.2g} (bstcad plan states it)" in text and "too coarse" not in text
 
     @pytest.mark.parametrize(("arguments", "made", "sentence"), [
         ([], {"source.kind": "collimated", "source.extent": None, "source.profile": "gaussian", "source.radius_1e2": 40,

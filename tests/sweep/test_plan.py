@@ -1,6 +1,7 @@
 """The plan of a scene: effects by the lines that ask for them, predictions, refusals, and the record of the fit."""
 
 import json
+import re
 from functools import cache
 from pathlib import Path
 
@@ -223,13 +224,35 @@ def test_every_template_has_a_plan(path):
     assert any(entry["rrmsd_change"] for entry in found["left_out"])
 
 
+def test_the_image_of_a_chip_is_stated_before_the_design():
+    """w = d L / (l + t / n): a chip d at l before a plate of the thickness t, a target L behind it, near the axis."""
+    path = TEMPLATES / "led.toml"
+    near = {"target.x": [-150.0, 150.0], "target.y": [-150.0, 150.0], "lens.outline.radius": 5.0}
+    scene = load(path, near)
+    found = next(plan(scene, path.read_text(encoding="utf-8")))["blur"]
+    d, before, thick, behind = 1.0, 14.0, 10.0, 1000.0 - 24.0
+    assert found["width"] == pytest.approx(d * behind / (before + thick / scene.index), rel=0.1)
+    assert found["pixels"] == pytest.approx(found["width"] / (300.0 / 120), rel=0.01)
+    small = next(plan(load(path, near | {"source.diameter": 0.5})))["blur"]
+    assert small["width"] == pytest.approx(found["width"] / 2, rel=0.05) and small["rrmsd"] < found["rrmsd"]
+
+
 class TestCommand:
+    def test_the_image_of_a_chip_is_a_sentence(self, capsys):
+        assert cli.run(["plan", str(TEMPLATES / "led.toml"), "--set", "target.pixels=48"]) == 0
+        sentence = " ".join(capsys.readouterr().out.split())
+        assert re.search(r"throws an image of itself, [\d.]+ mm \([\d.]+ pixels\) wide on the target", sentence)
+
     def test_what_is_not_predicted_is_said(self, capsys):
         few = ["plan", str(THU), "--set", "target.pixels=48"]
         assert cli.run([*few, "--json"]) == 0
         out, err = capsys.readouterr()
         found = json.loads(out)
-        assert set(found) == {"predicted", "not_predicted", "finer", "notes", "simulated", "left_out"} and err == ""
+        assert (
+            set(found) == {"predicted", "not_predicted", "finer", "notes", "simulated", "left_out", "blur"}
+            and err == ""
+        )
+        assert found["blur"] is None  # of a beam of no size
         assert found["predicted"] is None and "target.pixels from 128 to 512" in found["not_predicted"]
         assert cli.run(few) == 0
         out, _ = capsys.readouterr()
