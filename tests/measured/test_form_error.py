@@ -84,13 +84,15 @@ class TestForm:
     NOISE = 1e-5  # mm
 
     @pytest.fixture(scope="class")
-    def made(self, lens):
+    @classmethod
+    def made(cls, lens):
         return with_form_error(lens, 5e-4, 3.0)
 
     @pytest.fixture(scope="class")
-    def placed(self, lens, made):
+    @classmethod
+    def placed(cls, lens, made):
         face, given = Face.of(lens), points(made, 8000)
-        given[:, 2] += np.random.default_rng(3).normal(0.0, self.NOISE, len(given))
+        given[:, 2] += np.random.default_rng(3).normal(0.0, cls.NOISE, len(given))
         return face, aligned(face, given, unmoved(face))
 
     def test_the_spline_is_the_form_error_on_any_net(self, lens, made, placed):
