@@ -618,11 +618,17 @@ def note(error: BaseException) -> str:
     return "; ".join(getattr(error, "__notes__", ()))
 
 
+def _command(error: BaseException) -> str:
+    """The command whose arguments typer refused."""
+    context = getattr(error, "ctx", None)
+    return f"bstcad {context.info_name}" if context and context.parent else "bstcad"
+
+
 def sentence_of(error: BaseException) -> str | None:
     """The sentence for a user whose input is wrong; None if the error is not about the input."""
     if hasattr(error, "format_message"):  # typer's own: an unknown option, a missing argument
         text = error.format_message().splitlines()[0].rstrip(".").replace(". Did", "; did")
-        return text[:1].lower() + text[1:] + ("" if text.endswith("?") else "; see bstcad --help")
+        return text[:1].lower() + text[1:] + ("" if text.endswith("?") else f"; see {_command(error)} --help")
     if isinstance(error, SentenceError):
         return str(error)
     by_words = isinstance(error, RuntimeError | ImportError) and any(words in str(error).lower() for words in NO_MEMORY)

@@ -13,7 +13,7 @@ import bstcad
 project, author, copyright = "bstcad", "the authors of bstcad", "the authors of bstcad"
 version = release = bstcad.__version__
 extensions = [
-    "myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton", "sphinx_design",
+    "myst_parser", "sphinx.ext.autodoc", "sphinx_copybutton", "sphinx_design",
     "sphinx_gallery.gen_gallery", "reference_pages", "tutorial_runs",
 ]  # fmt: skip
 exclude_patterns = ["_build", "_made", "gallery-scripts", "**/*.ipynb"]
@@ -27,6 +27,7 @@ html_theme_options = {"navigation_with_keys": True}
 myst_enable_extensions = ["colon_fence", "attrs_inline"]
 myst_heading_anchors = 4
 python_use_unqualified_type_names = True
+maximum_signature_line_length = 110
 autodoc_typehints = "signature"
 autodoc_member_order = "bysource"
 autoclass_content = "class"

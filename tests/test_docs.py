@@ -9,6 +9,7 @@ import sys
 import tomllib
 from functools import partial
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -188,3 +189,20 @@ def test_the_site_is_complete_without_a_network():
         if "_build" not in path.parts and "_made" not in path.parts:
             text = path.read_text(encoding="utf-8")
             assert not re.search(r"!\[[^\]]*\]\(https?:|src=.https?:|@import|url\(.?https?:", text), path
+
+
+def test_the_guide_to_tolerances_names_every_error():
+    from bstcad.scene.quality import Name
+
+    text = (ROOT / "docs" / "how-to" / "tolerances.md").read_text(encoding="utf-8")
+    families = {name.removesuffix("_x").removesuffix("_y") for name in get_args(Name)}
+    assert families - set(re.findall(r"[`\"]([\w.]+)[`\"]", text)) == set()
+
+
+def test_the_guide_to_checks_names_all_that_a_proof_tells_of_the_shape():
+    from bstcad.analysis.shape import describe
+
+    text = (ROOT / "docs" / "how-to" / "extend.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`(\w+)`", text))
+    lens = load(ROOT / "templates" / "disk.toml").flat_lens(9)
+    assert {"volume", *describe(lens, grid=33)} - named == set()

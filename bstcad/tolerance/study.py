@@ -37,7 +37,8 @@ from threadpoolctl import threadpool_limits
 
 from bstcad.optics.kernels.reductions import dot
 from bstcad.report.tolerances import WIDEST, Sensitivity
-from bstcad.tolerance.perturbations import Perturbation, Setup, draws, perturbed, trials
+from bstcad.tolerance.grades import GRADES, USUAL, limit
+from bstcad.tolerance.perturbations import Perturbation, Setup, draws, kinds, perturbed, trials
 
 Progress = Callable[[str, int, int, str], None]
 # Calls work(shared, item) of each item, somewhere: the results, in the order of the items.
@@ -124,8 +125,9 @@ class Model:
         return float(np.sqrt(self.gram[0, 0]))
 
     def rrmsds(self, amounts: np.ndarray) -> np.ndarray:
-        """RRMSD (…) of amounts (…, n)."""
-        phi = self._weights(product(amounts / self.sigmas, self.directions))
+        """RRMSD (…) of amounts (…, k), of the first k perturbations; the others are zero."""
+        k = amounts.shape[-1]
+        phi = self._weights(product(amounts / self.sigmas[:k], self.directions[:k]))
         return np.sqrt(np.maximum(np.sum(product(phi, self.gram) * phi, axis=-1), 0.0))
 
     def _weights(self, along: np.ndarray) -> np.ndarray:
@@ -199,6 +201,7 @@ LINEAR, FULL = 10_000, 200  # trials by the model, and of them by full traces
 WORST = 5  # trials that are shown
 ADJUSTED = {f"screen.{way}" for way in ("decentre_x", "decentre_y", "axial", "tilt_x", "tilt_y", "clocking")}
 REACH = 8.0  # standard deviations over which the screen can be adjusted
+ADJUSTABLE = 10.0  # limit of an adjustment that is no error of the study, over that of the usual grade
 NEARBY = 1e-4  # standard deviations: step of the difference quotients
 OTHER = 7919  # added to the seed, for independent trials
 
@@ -210,7 +213,7 @@ class Study:
     """Result of a Monte Carlo of a setup."""
 
     perturbations: tuple[Perturbation, ...]
-    model: Model
+    model: Model  # of the perturbations, followed by the adjustments of the screen that are not among them
     sensitivities: tuple[Sensitivity, ...]  # the worst first
     limit: float  # RRMSD
     seed: int
@@ -245,15 +248,16 @@ def study(
     rrmsd: of the design, by independent rays.  Tubes have an error, the same in every trial: its square is taken off
     each RRMSD², so that the trials compare with the design's own figure.
     """
-    superposed = model(pictures, progress, spread)
-    off = superposed.rrmsd**2 - rrmsd**2
     perturbations = pictures.perturbations
+    with_adjustments = (*perturbations, *adjustments(pictures.setup, perturbations))
+    superposed = model(replace(pictures, perturbations=with_adjustments), progress, spread)
+    off = superposed.rrmsd**2 - rrmsd**2
     amounts = trials(perturbations, seed, range(linear))
     traced = []
     for k, rrmsd_of_it in enumerate(spread(Pictures.rrmsd, pictures, amounts[:full]), 1):
         traced.append(rrmsd_of_it)
         progress("trials", k, min(full, linear), f"RRMSD {rrmsd_of_it:.4f}")
-    adjusted = [adjust(superposed, perturbations, amounts[k]) for k in range(len(traced))]
+    adjusted = [adjust(superposed, with_adjustments, amounts[k]) for k in range(len(traced))]
     return Study(
         perturbations, superposed, _sensitivities(superposed, perturbations, off), limit=limit, seed=seed, rrmsd=rrmsd,
         linear=_less(superposed.rrmsds(amounts), off), full=_less(np.array(traced), off),
@@ -268,9 +272,10 @@ def _less(rrmsds: np.ndarray, off: float) -> np.ndarray:
 
 def _sensitivities(superposed: Model, perturbations: Sequence[Perturbation], off: float) -> tuple[Sensitivity, ...]:
     """Effect of one standard deviation of each error alone, as the mean of both signs; the worst first."""
-    sigmas = np.diag(superposed.sigmas)
+    n = len(perturbations)
+    sigmas = np.diag(superposed.sigmas[:n])
     either = (_less(superposed.rrmsds(sigmas), off) + _less(superposed.rrmsds(-sigmas), off)) / 2
-    added = np.sum(superposed.first**2, axis=1)
+    added = np.sum(superposed.first[:n] ** 2, axis=1)
     changes, shares = either - _less(np.array([superposed.rrmsd]), off), added / added.sum()
     each = [
         Sensitivity(
@@ -282,11 +287,20 @@ def _sensitivities(superposed: Model, perturbations: Sequence[Perturbation], off
     return tuple(sorted(each, key=lambda s: s.rrmsd_change, reverse=True))
 
 
+def adjustments(setup: Setup, errors: Sequence[Perturbation]) -> tuple[Perturbation, ...]:
+    """Shift, focus, tilt and clocking of the screen, as far as they are not among the errors."""
+    named, usual = {error.kind.name for error in errors}, GRADES[USUAL]
+    missing = [kind for name, kind in kinds(setup).items() if name in ADJUSTED - named]
+    return tuple(Perturbation(kind, ADJUSTABLE * limit(kind, usual, setup)) for kind in missing)
+
+
 def adjust(superposed: Model, perturbations: Sequence[Perturbation], amounts: np.ndarray) -> float:
-    """RRMSD by the model with the screen where it is least: shift, focus, tilt and clocking."""
+    """RRMSD by the model with the screen where it is least: shift, focus, tilt and clocking.
+
+    perturbations: those of the model.  amounts (k,): of the first k.
+    """
     free = [k for k, p in enumerate(perturbations) if p.kind.name in ADJUSTED]
-    if not free:
-        return float(superposed.rrmsds(amounts))
+    amounts = np.pad(amounts, (0, len(perturbations) - len(amounts)))
 
     def moved(steps: np.ndarray) -> np.ndarray:
         tried = np.broadcast_to(amounts, (*steps.shape[:-1], len(amounts))).copy()
@@ -313,7 +327,7 @@ def loosest(study: Study, wanted: float) -> tuple[tuple[Perturbation, ...], Yiel
     the model.
     """
     perturbations = study.perturbations
-    added = np.maximum(np.sum(study.model.first**2, axis=1), 1e-30)
+    added = np.maximum(np.sum(study.model.first[: len(perturbations)] ** 2, axis=1), 1e-30)
     shape = np.cbrt(np.array([p.cost for p in perturbations]) / added)
     shape /= np.exp(np.mean(np.log(shape)))
     off = study.model.rrmsd**2 - study.rrmsd**2

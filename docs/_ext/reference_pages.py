@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import io
 import re
 import tokenize
 import tomllib
+import typing
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -204,8 +206,21 @@ def plain_text(app: Any, what: str, name: str, of: Any, options: Any, lines: lis
     lines[:] = "".join(parts).split("\n")
 
 
+def short_signature(app: Any, what: str, name: str, item: Any, options: Any, signature: str, returns: str) -> Any:
+    """The signature of a class without the unit, range and meaning of each parameter (autodoc-process-signature)."""
+    if what != "class" or not signature:
+        return None
+    from sphinx.util.inspect import stringify_signature
+
+    types, own = typing.get_type_hints(item), inspect.signature(item)
+    plain = [p.replace(annotation=types.get(p.name, p.annotation)) for p in own.parameters.values()]
+    plain = own.replace(parameters=plain, return_annotation=own.empty)
+    return stringify_signature(plain, unqualified_typehints=True), returns
+
+
 def setup(app: Any) -> dict[str, bool]:
     """Sphinx calls it."""
     app.connect("builder-inited", make)
     app.connect("autodoc-process-docstring", plain_text, priority=100)
+    app.connect("autodoc-process-signature", short_signature)
     return {"parallel_read_safe": True}

@@ -42,7 +42,8 @@ def make() -> None:
     """Run each tutorial in a folder of its own, docs/_made/NAME, beside the templates and a photograph."""
     for page in sorted(set((DOCS / "tutorials").glob("*.md")) - {DOCS / "tutorials" / "index.md"}):
         folder = MADE / page.stem
-        shutil.copytree(DOCS.parent / "templates", folder / "templates", dirs_exist_ok=True)
+        shutil.rmtree(folder, ignore_errors=True)  # of the build before: `bstcad new` overwrites no scene
+        shutil.copytree(DOCS.parent / "templates", folder / "templates")
         skimage.io.imsave(folder / "photo.jpg", skimage.data.astronaut()[:512, 32:480])
         logging.getLogger(__name__).info("running %s", page.name)
         code_blocks.run(page, folder)

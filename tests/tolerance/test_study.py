@@ -102,6 +102,21 @@ def test_adjusting_the_screen_never_makes_it_worse(found):
     assert found.share(found.adjusted)[1] >= found.share(found.linear[:FULL])[1]
 
 
+def test_the_screen_can_be_adjusted_where_it_is_no_error(pictures):
+    """A lens off its axis shifts the picture, and the screen follows it; the errors' own figures have no part of it."""
+    decentres = tuple(p for p in pictures.perturbations if p.kind.name.startswith("lens.decentre"))
+    few = replace(pictures, perturbations=tuple(replace(p, limit=0.05) for p in decentres), tubes=129)
+    nominal = few.rrmsd(np.zeros(2))
+    found = study.study(few, 1.02 * nominal, 3, nominal, linear=100, full=10)
+    raised = found.linear[:10] > 1.05 * nominal
+    assert raised.sum() > 3
+    assert (found.adjusted[raised] - nominal < 0.5 * (found.linear[:10][raised] - nominal)).all()
+    assert {s.name for s in found.sensitivities} == {"lens.decentre_x", "lens.decentre_y"}
+    assert sum(s.share for s in found.sensitivities) == pytest.approx(1.0)
+    loose, _ = study.loosest(found, 0.8)
+    assert len(loose) == 2
+
+
 def rows(n=7, length=50_001):
     found = np.random.default_rng(5).standard_normal((n, length))
     found[3] = found[2] + 1e-6 * found[3]  # nearly alike: one axis of hardly any strength
