@@ -370,8 +370,8 @@ def tolerance(
 
     if trial is not None:
         path = folder / f"trial-{trial}.step"
-        for name, amount in tolerancing.write_trial(folder, trial, path, grade=grade, seed=seed).items():
-            print(f"{name:20} {amount:.6g}")
+        for kind, amount in tolerancing.write_trial(folder, trial, path, grade=grade, seed=seed):
+            print(f"{kind.name:20} {amount:.6g} {kind.unit}".rstrip())
         print(f"Files: {path}")
         return 0
     with progress.watch(Console(stderr=True)) as watched:

@@ -44,7 +44,7 @@ Disagreement = TypedDict("Disagreement", {"median": Size, "95 %": Size})  # rela
 class Grade:
     """The grade from which the widths of the errors start."""
 
-    name: str  # moulded, diamond-turned or precise
+    name: str  # moulded, diamond-turned or precise; none: only errors that the scene names
     words: str  # what the grade stands for
 
 
@@ -52,11 +52,14 @@ class Grade:
 class Sensitivity:
     """One error of how the lens is made, mounted or lit."""
 
-    name: str  # of the error, such as lens.tilt_x
+    # of the error, such as lens.tilt_x; form is three fields, such as back.form_0, back.form_1 and back.form_2, which
+    # the report shows as the root of the sum of their squares
+    name: str
     words: str  # the error in words
     unit: str  # of limit and sigma
-    limit: Width  # ±, in its unit
-    distribution: Literal["normal", "uniform", "field"]  # of the error within its limit
+    limit: Width  # ±, in its unit; of each field of a form error its standard deviation, the stated limit over √3
+    # normal and uniform: within the limit; field: a random field of normal amount, without a bound
+    distribution: Literal["normal", "uniform", "field"]
     cost: Width  # of holding the limit, beside the others' 1
     sigma: Width  # standard deviation
     rrmsd_change: float  # by one sigma
@@ -74,11 +77,11 @@ class Trial:
 
 @dataclass(frozen=True)
 class Inverse:
-    """The loosest tolerances that keep a yield."""
+    """The loosest tolerances that bring about a wanted yield, by superposed pictures."""
 
     wanted: Share  # the yield asked for
     passed: Annotated[Yield, Field(alias="yield")]  # by trials of its own
-    limits: Mapping[str, Width]  # ± by error
+    limits: Mapping[str, Width]  # of each error, as the limit of a sensitivity
 
 
 @dataclass(frozen=True)
@@ -101,7 +104,7 @@ class Tolerances:
     passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]  # of the full trials, with the screen adjusted
     rrmsd_trials: Spread  # of the trials by superposed pictures
     rrmsd_full: Spread  # of the trials traced in full
-    rrmsd_adjusted: Spread  # of the trials after the screen was shifted and focused
+    rrmsd_adjusted: Spread  # of the full trials, with the screen shifted, focused, tilted and turned to fit
     model_off: Disagreement  # of the model and the full traces
     sensitivities: Annotated[tuple[Sensitivity, ...], Field(max_length=1000)]  # the worst first
     worst: Annotated[tuple[Trial, ...], Field(max_length=100)]  # of the fully traced trials

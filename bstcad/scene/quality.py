@@ -139,7 +139,7 @@ class Tolerance(Record):
     ] = None
     limit: Annotated[
         float | None,
-        Key("Limit (+-) in the error's unit; of form and ripple the RMS.", "", 1e-12, 1e4),
+        Key("Limit (+-) in the error's unit; of ripple the most RMS, of form the RMS over all lenses.", "", 1e-12, 1e4),
     ] = None
     distribution: Annotated[
         Literal["normal", "uniform"] | None, Key("normal is cut at the limit, two standard deviations.")

@@ -20,7 +20,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.tolerance import study as studies
 from bstcad.tolerance.grades import GRADES, perturbations, start_of, whole_table
-from bstcad.tolerance.perturbations import Setup, perturbed, trials
+from bstcad.tolerance.perturbations import Kind, Setup, perturbed, trials
 from bstcad.tolerance.study import Pictures, Progress, Spread, Study, here
 from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, Nominal
 
@@ -72,14 +72,16 @@ def tolerance(
     return record
 
 
-def write_trial(folder: Path, number: int, path: Path, *, grade: str | None = None, seed: int = 0) -> dict[str, float]:
-    """The lens of one trial as a STEP file, in its own frame; its amounts by name, decentres and tilts among them."""
+def write_trial(
+    folder: Path, number: int, path: Path, *, grade: str | None = None, seed: int = 0
+) -> tuple[tuple[Kind, float], ...]:  # fmt: skip
+    """The lens of one trial as a STEP file, in its own frame; its amounts by kind, decentres and tilts among them."""
     scene, nominal = read_nominal(folder)
     pictures = _pictures(scene, nominal, grade, TUBES)
     [amounts] = trials(pictures.perturbations, seed, [number])
     lens = perturbed(pictures.setup, pictures.perturbations, amounts).lens
     step_writing.write_lens(lens, path, f"{scene.name}, trial {number}")
-    return {p.kind.name: float(a) for p, a in zip(pictures.perturbations, amounts, strict=True)}
+    return tuple((p.kind, float(a)) for p, a in zip(pictures.perturbations, amounts, strict=True))
 
 
 def _pictures(scene: Scene, nominal: Nominal, grade: str | None, tubes: int) -> Pictures:

@@ -122,7 +122,8 @@ def command_line() -> str:
     page = page.replace("# `bstcad`", "# Command line", 1).replace("```console", "```text")
     exits = (
         "Exit codes: 0, every check passed; 1, the lens is written, but a check failed; 2, the input is wrong; 70, a\n"
-        "fault of bstcad; 129, 130, 143, ended by SIGHUP, Ctrl-C, SIGTERM.\n\n"
+        "fault of bstcad; 129, 130, 143, ended by SIGHUP, Ctrl-C, SIGTERM. `bstcad tolerance` exits with 0 at\n"
+        "any yield, also below the yield that `--yield` asks for.\n\n"
     )
     return page.replace("## `bstcad generate`", exits + "## `bstcad generate`", 1)
 

@@ -91,7 +91,7 @@ def test_a_form_error_of_the_front_moves_light_and_is_made(small_design, setup, 
     monkeypatch.setattr(tolerancing, "read_nominal", lambda folder: (scene, read))
     path = small_design.folder / "trial.step"
     try:
-        amounts = tolerancing.write_trial(small_design.folder, 1, path)
+        amounts = {kind.name: amount for kind, amount in tolerancing.write_trial(small_design.folder, 1, path)}
         made = step_reading.lens(step_reading.read(path), 1.5)
     finally:
         path.unlink(missing_ok=True)

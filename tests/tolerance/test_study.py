@@ -159,7 +159,7 @@ def studied(small_design, tmp_path_factory):
     return folder, said.getvalue()
 
 
-def test_the_command_writes_what_it_found_and_a_trial_as_a_part(small_design, studied):
+def test_the_command_writes_what_it_found_and_a_trial_as_a_part(small_design, studied, capsys):
     folder, said = studied
     assert "Yield, RRMSD up to" in said and "of 10 full traces" in said and "loosest" in said
     facts = json.loads((folder / "tolerance.json").read_text())
@@ -169,6 +169,8 @@ def test_the_command_writes_what_it_found_and_a_trial_as_a_part(small_design, st
     changes = [item["rrmsd_change"] for item in facts["sensitivities"]]
     assert changes == sorted(changes, reverse=True)
     assert cli.run(["tolerance", str(folder), "--trial", "4", "--grade", "moulded"]) == 0
+    lines = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
+    assert lines["lens.tilt_x"].endswith(" deg") and lines["lens.thickness"].endswith(" mm")
     made = step_reading.read(folder / "trial-4.step")
     _, nominal = read_nominal(folder)
     assert 0 < np.abs(made.control_points - nominal.lens.back.control_points()).max() < 1.0
