@@ -5,6 +5,10 @@ A lens of one's own optimiser
 The picture that a lens throws is differentiable in the heights of its control points. Twenty lines of torch turn an
 evenly lit disc into a disc that is brighter on the right: L-BFGS in the cosine transform of the heights, in which
 coarse and fine waves count alike.
+
+Tubes are cut at the outline of the lens that they are launched for. As the back moves along the axis other light meets
+its rim, so that the tubes of the lens before the fit end at an RRMSD of 0.08 where rays find 0.125. A second round
+launches the tubes again, for the lens of the first round.
 """
 
 from pathlib import Path
@@ -24,7 +28,6 @@ m = lens.back.m
 cosine = torch.from_numpy(scipy.fft.dct(np.eye(m), axis=0, norm="ortho"))  # rows: the cosines along an axis of the net
 waves = 2 - 2 * torch.cos(torch.pi * torch.arange(m, dtype=torch.float64) / m)
 scale = (waves[:, None] + waves).clamp(min=waves[1]) ** -0.5
-tubes = bstcad.RayTubes.launched(lens, channels, 128)  # a side; of all light that gets through the lens
 amplitudes = torch.zeros(m, m, dtype=torch.float64, requires_grad=True)
 
 
@@ -37,12 +40,15 @@ def merit():
     picture = tubes.picture(shaped(), screen)  # (rows, columns), differentiable in the heights
     value = (picture / picture.sum() - target).square().sum() / target.square().sum()
     value.backward()
-    history.append(float(value) ** 0.5)
-    return value
+    history.append(value.item() ** 0.5)
+    return value.detach()
 
 
-history, optimiser = [], torch.optim.LBFGS([amplitudes], max_iter=25, line_search_fn="strong_wolfe")
-optimiser.step(merit)
+history = []
+for _ in range(2):
+    tubes = bstcad.RayTubes.launched(shaped(), channels, 128)  # a side; of all light that gets through the lens
+    optimiser = torch.optim.LBFGS([amplitudes], max_iter=25, line_search_fn="strong_wolfe")
+    optimiser.step(merit)
 print(f"RRMSD {history[0]:.3f} before, {history[-1]:.3f} after {len(history)} evaluations")
 
 # %%
