@@ -23,7 +23,7 @@ SIZE = 80.0  # mm, of a plate
 SLIM = 10.0  # a plate is so many times as wide as thick …
 LEAST = 3.0  # … but at least so thick (mm)
 RANGES = {"size": (1.0, 10_000.0), "distance": (1.0, 1e7)}  # mm
-OVER_BLUR = 1.1  # times the RRMSD of the blurred picture: a draft of few steps comes so near
+OVER_BLUR = 1.1  # times the RRMSD of the blurred picture: standard quality ends well below that, a draft hardly
 FEWEST_RRMSD, MOST_RRMSD = 0.05, 0.25  # the limit that is written; the latter passes where a scene asks for none
 
 TEMPLATE = Path(__file__).with_name("plate.toml.j2")
