@@ -33,7 +33,7 @@ from bstcad.scene.mount import parting
 if TYPE_CHECKING:
     import cadquery
 
-SPARE = 4  # control points a side beyond a round rim: two spans, and two more until x(u) is linear
+SPARE = 4  # control points a side beyond the rim: two spans, and two more until x(u) is linear
 PLACES = 8  # points along a piece of the rim, a cell of the back's net
 EXACT = 1e-12  # of an image's size: one that leaves a line or a circle by less is that
 SAMPLES = 65  # points of an image that are compared with a line and a circle
@@ -98,8 +98,9 @@ def coarse_copy(lens: Lens, m: int) -> Lens:
     lens = lens.plain()
     if m >= lens.back.m:
         return lens
-    stretch = (m - 1) / (m - 1 - 2 * SPARE) if lens.outline.is_round else 1.0
-    ends = [stretch * half for half in lens.outline.half_extent]
+    stretch = (m - 1) / (m - 1 - 2 * SPARE)
+    reach = (max(-low, high) for low, high in (lens.back.x, lens.back.y))
+    ends = [half if end <= half else stretch * half for half, end in zip(lens.outline.half_extent, reach, strict=True)]
     spans = zip(ends, (lens.back.x, lens.back.y), strict=True)
     x, y = np.meshgrid(*(np.clip(np.linspace(-end, end, m), *span) for end, span in spans), indexing="ij")
     heights = torch.from_numpy(sag(lens.back, x, y) - lens.back.z)

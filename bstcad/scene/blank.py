@@ -223,9 +223,11 @@ class GivenFront(_Front):
         return self.file
 
     def complaints(self, outline: Outline) -> Iterator[str]:
-        """It is that of a lens of another outline."""
-        for name, ends, half in zip("xy", (self.file.x, self.file.y), net_extent(outline, self.file.m), strict=True):
-            if max(abs(ends[0] + half), abs(ends[1] - half)) > UNIFORM:
+        """It is that of a lens of another outline; a net may also end at the sides of a rectangle."""
+        own, sides = net_extent(outline, self.file.m), outline.half_extent
+        for name, ends, half, side in zip("xy", (self.file.x, self.file.y), own, sides, strict=True):
+            known = (half,) if outline.is_round else (half, side)
+            if min(max(abs(ends[0] + end), abs(ends[1] - end)) for end in known) > UNIFORM:
                 covers = f"{name} = {ends[0]:g} to {ends[1]:g} mm, and not {-half:g} to {half:g} mm"
                 yield f"file: its net covers {covers}; give a design of the same outline"
 
@@ -272,11 +274,13 @@ def fitted(surface: Surface, outline: Outline) -> BSplineSurface:
 
 
 def net_extent(outline: Outline, m: int) -> tuple[float, float]:
-    """Half the width of a net of m x m control points in x and y (mm); of a round lens it reaches two spans beyond.
+    """Half the width of a net of m x m control points in x and y (mm): it reaches two spans past the rim of the lens.
 
-    There x(t) is linear all over the lens.
+    So x(t) is linear all over the lens.  In the end spans x(t) is quadratic, and the slope z'(t) / x'(t) a Möbius
+    function of t, whose derivative grows eightfold inwards across 1.5 control points, whatever the heights: the light's
+    rim would be too bright, and dark beside it.  A net of 5 has no spans to spare.
     """
-    reach = (m - 1) / (m - 5) if outline.is_round and m > 5 else 1.0
+    reach = (m - 1) / (m - 5) if m > 5 else 1.0
     half_x, half_y = outline.half_extent
     return reach * half_x, reach * half_y
 

@@ -11,11 +11,11 @@ from bstcad.optics.key import Key
 from bstcad.scene.blank import LensBlank
 from bstcad.scene.schema import Record
 
-COMMON = {"method": "least-squares", "transport_iterations": 40, "stage1_iterations": 1000, "rounds": 5}
+COMMON = {"method": "least-squares", "transport_iterations": 40, "stage1_iterations": 1000, "rounds": 10}
 OURS = COMMON | {"overshoot": 0.03, "precision": "float64"}
 # The knobs of each quality; a knob set in the scene goes before.
 PRESETS: dict[str, dict[str, Any]] = {
-    "draft": OURS | {"transport_grid": 256, "rays": 512, "rounds": 4, "stage2_iterations": 8, "source_points": 16},
+    "draft": OURS | {"transport_grid": 256, "rays": 512, "stage2_iterations": 8, "source_points": 16},
     "standard": OURS | {"transport_grid": 512, "rays": 1536, "stage2_iterations": 98, "source_points": 64},
     "fine": OURS | {"transport_grid": 512, "rays": 2048, "stage2_iterations": 300, "source_points": 128},
     "paper": COMMON  # the procedure of Wang et al. 2023: Adam, no penalty
@@ -56,9 +56,9 @@ class Tailoring(Record):
     stage1_iterations: Annotated[
         int | None, Key("Steps a level of the method adam.", "", 0, 1_000_000, example=300)
     ] = None
-    rounds: Annotated[int | None, Key("Rounds of transport map and slope fit in stage 1.", "", 1, 100, example=5)] = (
-        None
-    )
+    rounds: Annotated[
+        int | None, Key("The most rounds of transport map and slope fit in stage 1.", "", 1, 100, example=10)
+    ] = None
     stage2_iterations: Annotated[int | None, Key("Iterations of stage 2.", "", 0, 1_000_000, example=120)] = None
     overshoot: Annotated[
         float | None, Key("Weight of light outside the target, a pixel^2.", "", 0.0, 1e3, example=0.03)

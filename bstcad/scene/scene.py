@@ -195,10 +195,10 @@ class Scene(Record):
         return -plane.height((0.0, 0.0, highest)) - self.lens.outline.reach(*plane.axes[2][:2])
 
     def flat_lens(self, m: int, dtype: torch.dtype = torch.float64, device: str | torch.device = "cpu") -> Lens:
-        """The lens before tailoring, its back a flat net of m x m control points."""
+        """The lens before tailoring, its back a flat net of m x m control points as wide as the scene's own net."""
         from bstcad.optics.bspline import BSplineSurface  # loads numba, which a scene alone does not need
 
-        half_x, half_y = net_extent(self.lens.outline, m)
+        half_x, half_y = net_extent(self.lens.outline, self.lens.back.control_points)
         heights = torch.zeros((m, m), dtype=dtype, device=device)
         back = BSplineSurface(self.lens.back.z, heights, (-half_x, half_x), (-half_y, half_y))
         front = self.lens.front.surface.to(heights.dtype, device)

@@ -3,15 +3,16 @@
 Wang et al. 2023 carry source points to target points; that map is a gradient only in the paraxial limit, and off axis
 the part of it that no surface can follow is lost in stage 1.  Here the same transport problem is posed in the
 coordinates in which a surface *is* a gradient.  A ray that meets the back face at b and shall reach the target point t
-needs the slope p(b, t) that the law of its interface gives in closed form.  With a constant k chosen so that
+needs the slope p(b, t) that the law of its interface gives in closed form.  With m the centroid of the target's light,
 
-    y = σ (p(b, t) + k b)
+    y = σ (p(b, t) - ∇g(b)),    ∇g(b) ≈ p(b, m)
 
-hardly depends on b for a fixed t, the optimal map b -> y is ∇φ of a convex φ, so the slopes σ y - k b are those of a
-surface.  σ = 1 where light refracts.  A mirror turns light the other way than its slope: there σ = -1, so that the rays
-of neighbouring places do not cross on their way.  The remaining dependence on b enters through the b that the previous
-round assigned to each t; at the fixed point the surface solves the Monge-Ampère problem of this very system, off axis,
-near field and behind a curved front alike.
+hardly depends on b for a fixed t; g is nearly the surface that gathers all light in m.  The optimal map b -> y is ∇φ of
+a convex φ, so that σ y + ∇g are slopes of a surface.  σ = 1 where light refracts.  A mirror turns light the other way
+than its slope: there σ = -1, so that the rays of neighbouring places do not cross on their way.  The remaining
+dependence on b, of the order of t - m, enters through the b that the previous round assigned to each t; at the fixed
+point the surface solves the Monge-Ampère problem of this very system, off axis, near field and behind a curved front
+alike, whatever g is.
 
 Beside it stands their own map, from the front's vertex plane to the target, and with it the aim of each ray: stage 1
 falls back on it, and the baselines follow it.
@@ -29,9 +30,9 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from bstcad.optics import sampling
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, TargetPlane
@@ -47,6 +48,9 @@ from bstcad.transport.mapping import Frame, Mapping, TransportMap, nodes, solve
 SUBCELLS = 2  # of a transport cell each way, on the source side: rims inside a cell
 SUBPIXELS = 8  # parts of a pixel in each transport cell, each way; at least one a pixel, where it spans several cells
 FLOOR = 1e-3  # of the mean slope density: flux that may be spent on black parts
+GATHERING, SAMPLES = 33, 96  # control points a side of g, and about as many places each way that it is fitted to
+REACH = (GATHERING - 1) / (GATHERING - 5)  # of g over the window: its end spans lie beyond
+GATHERED = Fit(bending=1e-3, steps=40, degree=5)
 TARGET_FLOOR = 1e-3  # of the mean: flux that the map may spend on black parts
 
 
@@ -101,19 +105,21 @@ def lit_window(source: Source, lens: Lens, n: int = 128) -> Rectangle:
 
 @dataclass(frozen=True)
 class SlopeMap:
-    """b -> y = ∇φ(b) by transport; the wanted slope at b is σ y - k b."""
+    """b -> y = ∇φ(b) by transport; the wanted slope at b is σ y + ∇g(b)."""
 
     mapping: Mapping  # back-face points (mm) -> y (dimensionless)
-    k: float  # 1/mm
+    gathering: BSplineSurface  # g
     sign: float  # σ
     places: tuple[np.ndarray, np.ndarray]  # b (mm) for each corner of the target's pixels, (columns + 1, rows + 1)
     moved: float  # RMS change of those of the lit pixels since the round before / half of the window; NaN: no round
 
     def slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """(∂z/∂x, ∂z/∂y) wanted at points of the back face (mm)."""
+        """(∂z/∂x, ∂z/∂y) wanted at points (n,) of the back face (mm)."""
         sent = self.mapping(x.cpu().double().numpy(), y.cpu().double().numpy())
-        y_x, y_y = (torch.from_numpy(np.ascontiguousarray(s)).to(x) for s in sent)
-        return self.sign * y_x - self.k * x, self.sign * y_y - self.k * y
+        beyond = (torch.from_numpy(np.ascontiguousarray(s)).to(x) for s in sent)
+        _, *gathering = self.gathering.relative_sag_and_slope(x, y)
+        g_x, g_y = (self.sign * s + g for s, g in zip(beyond, gathering, strict=True))
+        return g_x, g_y
 
 
 def slope_map(
@@ -127,17 +133,18 @@ def slope_map(
     side = max(window.width, window.height)
     grid = face_grid(source, lens, Rectangle(side, side), n * SUBCELLS)
     rho = grid.density.cpu().double().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3))
-    k = _insensitive(grid, lens, screen)
     t_x, t_y = pixel_corners(screen)
     b_x, b_y = previous.places if previous else (np.zeros_like(t_x), np.zeros_like(t_y))
-    y_x, y_y = _needed(grid, lens, screen.plane, b=(b_x, b_y), t=(t_x, t_y))
     sign = -1.0 if lens.last_freeform.law.reverses else 1.0
-    y_x, y_y = sign * (y_x + k * b_x), sign * (y_y + k * b_y)
+    net = gathering(grid, lens, screen.plane, centroid(picture, screen))
+    needed = _needed(grid, lens, screen.plane, b=(b_x, b_y), t=(t_x, t_y))
+    _, *g = net.relative_sag_and_slope(*(torch.from_numpy(p) for p in (b_x, b_y)))
+    y_x, y_y = (sign * (p - own.numpy()) for p, own in zip(needed, g, strict=True))
     sigma, frame = spread_density(picture, (y_x, y_y), n)
     mapping = solve(Density.from_values(rho), sigma, Frame((0.0, 0.0), side), frame, **solver)
     places = mapping.inverse(y_x, y_y)
     moved = _moved(picture, (b_x, b_y), places) / (side / 2) if previous else math.nan
-    return SlopeMap(mapping, k, sign, places=places, moved=moved)
+    return SlopeMap(mapping, net, sign, places=places, moved=moved)
 
 
 def _moved(picture: np.ndarray, before: tuple[np.ndarray, np.ndarray], now: tuple[np.ndarray, np.ndarray]) -> float:
@@ -165,19 +172,30 @@ def sloped(lens: Lens, wanted: SlopeMap, grid: FaceGrid, fit: Fit, unlit: float,
     )
 
 
-def _insensitive(grid: FaceGrid, lens: Lens, screen: Screen) -> float:
-    """k (1/mm): minus the mean of ∂p/∂b for the middle of the target, by a linear fit over the lit part."""
-    middle = [sum(ends) / 2 for ends in (screen.x, screen.y)]
-    x, y, _ = grid.at_face.position
+def centroid(picture: np.ndarray, screen: Screen) -> tuple[float, float]:
+    """The centroid (mm) of the light of a picture, row 0 = y max."""
+    sums = picture.sum(0), picture.sum(1)[::-1]
+    share_x, share_y = (float(((np.arange(len(s)) + 0.5) * s).sum() / s.sum()) / len(s) for s in sums)
+    (left, right), (low, high) = screen.x, screen.y
+    return left + share_x * (right - left), low + share_y * (high - low)
+
+
+def gathering(grid: FaceGrid, lens: Lens, plane: TargetPlane, middle: tuple[float, float]) -> BSplineSurface:
+    """g: the net of GATHERING points a side whose slopes come nearest to p(b, m) over the lit part of a grid.
+
+    With the sag frozen p(b, m) is a gradient but for a curl of the order ∂p/∂z x y; ∇g is one.
+    """
+    step = max(1, grid.n // SAMPLES)
+    thin = (slice(step // 2, None, step), slice(step // 2, None, step))
+    faces = replace(grid.at_face, **{k: getattr(grid.at_face, k)[(..., *thin)] for k in ("position", "direction")})
+    x, y, _ = (p.double() for p in faces.position)
     aim = torch.stack([torch.full_like(x, m) for m in middle])
-    p = wanted_slopes(grid.at_face, aim, screen.plane, lens.last_freeform.law)
-    weight = grid.density / total(grid.density)
-    moment = spread = 0.0
-    for slope, place in zip(p, (x, y), strict=True):
-        place = place - total(weight * place)
-        moment += float(total(weight * slope * place))
-        spread += float(total(weight * place * place))
-    return -moment / spread
+    z_x, z_y = wanted_slopes(faces, aim.to(faces.position), plane, lens.last_freeform.law)
+    half_x, half_y = (REACH * size / 2 for size in (grid.window.width, grid.window.height))
+    flat = torch.zeros((GATHERING, GATHERING), dtype=x.dtype, device=x.device)
+    net = BSplineSurface(0.0, flat, (-half_x, half_x), (-half_y, half_y))
+    lit = (grid.density[thin] > 0).to(x)
+    return fit_slopes(net, *(p.reshape(-1).to(x) for p in (x, y, z_x, z_y)), weight=lit.reshape(-1), fit=GATHERED)
 
 
 def _needed(grid: FaceGrid, lens: Lens, plane: TargetPlane, b: tuple, t: tuple) -> tuple[np.ndarray, np.ndarray]:

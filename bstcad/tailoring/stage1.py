@@ -33,9 +33,11 @@ from bstcad.transport.mapping import Mapping
 
 COARSE = (Fit(bending=1e-2, steps=40, degree=3), 0.0)  # stiff: it also extrapolates into unlit areas
 FINE = (Fit(), 1e-2)  # there it holds on to the coarse face
+FINE_ROUNDS = 2  # the last ones, on half of the transport's grid and on all of it
 # The other way is tried from this RRMSD on, and where the map has not settled: where in the last round the places of
 # the target moved by more than this share of the back face.  (Found: at most 0.016 where more rounds gain nothing.)
 RETRY_ABOVE, UNSETTLED = 0.25, 0.025
+SETTLED = 0.01  # of the same share: the coarse rounds end where the places moved by less
 LIT = 1026  # cells a side, at most, each of which is asked whether light meets it: each costs the search for a ray
 KEPT_LIGHT = 0.9  # of the light on the target, which the lens fitted to aims must keep to be taken
 AIMS = 5  # rounds of `follow_aims`
@@ -89,22 +91,24 @@ def doubtful(judged: float, state: SlopeRound) -> bool:
 def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[Step]:
     """Rounds of transport map (back face to slopes) and slope fit, each from the sag and the map of the round before.
 
-    All but the last two work on coarse grids and nets, where they cost next to nothing.
+    All but the last two work on coarse grids and nets, where they cost next to nothing; they end once they are settled.
     """
     knobs = task.knobs
     wanted, done, z = None, 0, lens.back.z  # z: where the back was to be (mm)
     if state is not None:
         lens, wanted, done = state.lens.applied(lens), state.wanted, state.round
-    for turn in range(min(done, knobs.rounds - 1), knobs.rounds):
+    turn = min(done, knobs.rounds - 1)
+    while turn < knobs.rounds:
         if turn >= done:
             lens, wanted = _round(task, lens, wanted, turn)
             lens = moved_clear(lens, z, task.least, task.bounds)  # the next round reckons with where the back is now
+        turn = max(turn + 1, knobs.rounds - FINE_ROUNDS if wanted.moved <= SETTLED else 0)
         yield Step(
             partial(lens.refined, knobs.levels[-1]),
-            SlopeRound(turn + 1, Parameters.of(lens), wanted),
+            SlopeRound(turn, Parameters.of(lens), wanted),
             mapping=wanted.mapping,
             places=wanted.places,
-            progress=("stage 1", turn + 1, knobs.rounds, ""),
+            progress=("stage 1", turn, knobs.rounds, ""),
         )
 
 
@@ -112,7 +116,7 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[
     """One round: the lens, and the map that it follows."""
     knobs, source, left = task.knobs, task.heaviest.source, task.knobs.rounds - turn
     coarse = max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left - 1, 2))
-    m = knobs.levels[max(-left, -len(knobs.levels))] if left <= 2 else knobs.levels[0]
+    m = knobs.levels[max(-left, -len(knobs.levels))] if left <= FINE_ROUNDS else knobs.levels[0]
 
     def progress(s: TransportStep) -> None:
         task.progress("stage 1", turn, knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
@@ -126,7 +130,7 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[
     side = min(2 * m, knobs.rays)
     parts = math.ceil(side / LIT)
     grid = face_grid(source, lens, window, math.ceil(side / parts))
-    return sloped(lens, wanted, grid, *(FINE if left <= 2 else COARSE), parts), wanted
+    return sloped(lens, wanted, grid, *(FINE if left <= FINE_ROUNDS else COARSE), parts), wanted
 
 
 def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:

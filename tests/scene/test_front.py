@@ -139,12 +139,30 @@ def test_a_damaged_design_is_refused(earlier, how):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("outline", [Rectangle(16.0, 12.0), Circle(8.0), Rectangle(16.1, 16.0)])
+@pytest.mark.parametrize("outline", [Rectangle(16.0, 12.0), Circle(8.5), Rectangle(16.1, 16.0)])
 def test_a_face_of_another_outline_is_refused(outline):
     with pytest.raises(SceneError, match=r"^lens\.front\.file: its net covers [xy] = .*; give a design of the same"):
         load(DISK).changed({"lens.front": a_face(outline, z=15.0)})
     round_lens, face = load(DISK, {"lens.outline": "{shape='circle',diameter=16}"}), a_face(Circle(8.0), z=15.0)
     assert round_lens.changed({"lens.front": face}).lens.front.given.m == face.m
+
+
+def test_a_net_follows_a_bowl_to_the_rim_where_it_reaches_past_it():
+    """z = c x² / 2: x(t) is linear inside the outline, so that h_i = c (x_i² - p² / 4) / 2 are exact; no heights are so
+    for a net that ends at the rim."""
+    m, c = 17, 0.05
+    half = net_extent(Rectangle(16.0, 12.0), m)[0]
+    x = torch.linspace(-8.0, 8.0, 201, dtype=torch.float64)
+
+    def slope(heights, half):
+        net = BSplineSurface(0.0, torch.as_tensor(heights)[:, None].expand(m, m), (-half, half), (-half, half))
+        return net.sag_and_slope(x, 0 * x)[1].numpy()
+
+    along, pitch = np.linspace(-half, half, m), 2 * half / (m - 1)
+    assert np.abs(slope(c * (along**2 - pitch**2 / 4) / 2, half) - c * x.numpy()).max() < 1e-14
+    slopes = np.stack([slope(unit, 8.0) for unit in np.eye(m)], axis=1)  # of each height alone
+    best = np.linalg.lstsq(slopes, c * x.numpy(), rcond=None)[0]
+    assert np.abs(slopes @ best - c * x.numpy()).max() > 0.1 * c  # 0.1 mm of its place
 
 
 def test_a_front_that_comes_too_near_to_the_back_is_refused():

