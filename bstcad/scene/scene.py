@@ -31,6 +31,7 @@ from bstcad.optics.key import Key
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import TiltedPlane
+from bstcad.optics.sides import Sides, both
 from bstcad.optics.sources import Collimated, Point, Source
 from bstcad.runs import files
 from bstcad.scene import effects, mount, picture
@@ -155,7 +156,7 @@ class Scene(Record):
 
     def warnings(self) -> tuple[str, ...]:
         """Sentences on settings that are possible but perhaps not meant."""
-        doubts = [*_metres(self.target, self.lens)]
+        doubts = [*_metres(self.target, self.lens), *self.lens.doubts()]
         if isinstance(self.source, Collimated):
             key = "mount.rim" if self.mount and self.mount.rim else "lens.outline"
             doubts += _beam(self.source.aperture, self.rim, key)
@@ -194,12 +195,12 @@ class Scene(Record):
         plane = TiltedPlane(self.target.screen.middle, self.target.tilt or (0.0, 0.0))
         return -plane.height((0.0, 0.0, highest)) - self.lens.outline.reach(*plane.axes[2][:2])
 
-    def flat_lens(self, m: int, dtype: torch.dtype = torch.float64, device: str | torch.device = "cpu") -> Lens:
-        """The lens before tailoring, its back a flat net of m x m control points."""
+    def flat_lens(self, net: Sides, dtype: torch.dtype = torch.float64, device: str | torch.device = "cpu") -> Lens:
+        """The lens before tailoring, its back a flat net of so many control points a side, or along x and along y."""
         from bstcad.optics.bspline import BSplineSurface  # loads numba, which a scene alone does not need
 
-        half_x, half_y = net_extent(self.lens.outline, m)
-        heights = torch.zeros((m, m), dtype=dtype, device=device)
+        half_x, half_y = net_extent(self.lens.outline, net)
+        heights = torch.zeros(both(net), dtype=dtype, device=device)
         back = BSplineSurface(self.lens.back.z, heights, (-half_x, half_x), (-half_y, half_y))
         front = self.lens.front.surface.to(heights.dtype, device)
         return self.as_mounted(Lens(front, back, self.lens.outline, self.index, reflects=self.lens.back.reflect))
@@ -214,7 +215,7 @@ class Scene(Record):
         points: of an extended source, shared out among its lines (default: tailoring.source_points); draw: which ones.
         """
         if points is None:
-            points = self.tailoring.resolved(self.lens.back.control_points).source_points
+            points = self.tailoring.resolved(self.lens.back.net).source_points
         return self._with_losses(channels_of(self.source, self.lens.index_at, points, draw))
 
     def judging_channels(self) -> tuple[Channel, ...]:
@@ -272,7 +273,7 @@ class Scene(Record):
     def toml(self) -> str:
         """The scene as a file that loads to an equal scene; an image is named by the basename of its copy."""
         unused = set() if self.source.extent else {"source_points"}
-        knobs = self.tailoring.resolved(self.lens.back.control_points)
+        knobs = self.tailoring.resolved(self.lens.back.net)
         knobs = knobs.model_dump(exclude={"quality", "seed"} | unused)
         settings = ", ".join(f"{key} {value}" for key, value in knobs.items())
         optic = "a mirror" if self.lens.back.reflect else f"refractive index {self.index:.6g}"
