@@ -39,6 +39,7 @@ from bstcad.runs import progress as progresses
 from bstcad.scene.blank import FEWEST_ROUND
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene, load
+from bstcad.sweep.net_choice import with_net
 from bstcad.transport.mapping import TransportMap
 from bstcad.verify.checks import Proof
 from bstcad.verify.verdict import Check
@@ -64,7 +65,10 @@ def design(
     scene = scene.changed({}) if isinstance(scene, Scene) else load(scene)
     for warning in scene.warnings():
         warnings.warn(warning, stacklevel=2)
+    scene, choice = with_net(scene)
     with progresses.shown(progress) as shown:
+        if choice is not None:
+            shown("control points", 1, 1, choice.line)
         return Design(pipeline.design(scene, device=device, progress=shown, began=began, merit=merit))
 
 

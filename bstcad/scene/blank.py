@@ -301,13 +301,19 @@ class Back(Record):
     kind: Annotated[Literal["bspline"], Key("The freeform face that bstcad finds.")] = "bspline"
     z: Annotated[float, Key("Place of the flat face before tailoring.", "mm", *COORDINATES, example=20.0)]
     control_points: Annotated[
-        OneOrTwo, Key("Control points of the net along each side, or [along x, along y].", "", 5, 2049, example=257)
-    ]
+        OneOrTwo | None,
+        Key("Control points of the net along each side, or [along x, along y]; chosen if absent.", "", 5, 2049,
+            example=257),
+    ] = None
     reflect: Annotated[bool, Key("A mirror: light comes along -z and goes back along +z.")] = False
 
     @property
     def net(self) -> Sides:
-        """Control points a side, or along x and along y if these differ."""
+        """Control points a side, or along x and along y if these differ; SceneError where they are left out."""
+        if self.control_points is None:
+            raise SceneError(
+                "lens.back.control_points: left out, and nothing has chosen it yet; use bstcad.design, or give a number"
+            )
         return plain(self.control_points)
 
 
@@ -392,6 +398,8 @@ class LensBlank(Record):
 
     def doubts(self) -> Iterator[str]:
         """Oblong cells: along their longer side the net carries less detail than it could with as many points."""
+        if self.back.control_points is None:
+            return
         (width, height), (m, n) = self.cells, both(self.back.net)
         if max(width, height) <= OBLONG * min(width, height):
             return
@@ -410,7 +418,8 @@ class LensBlank(Record):
             yield f"lens: light does not enter a mirror (back.reflect), so it has no {given[0]}; remove it"
         if not self.back.reflect and len(given) != 1:
             yield 'lens: needs exactly one of material and index; give for example material = "PMMA"'
-        (m, n), points = both(self.back.net), "lens.back.control_points"
+        m, n = both(self.back.control_points or FEWEST_ROUND)
+        points = "lens.back.control_points"
         if self.outline.is_round and m != n:
             yield f"{points}: a round lens takes a square net, not one of {m} x {n}; give one number"
         if self.outline.is_round and m < FEWEST_ROUND:

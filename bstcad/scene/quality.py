@@ -8,7 +8,7 @@ from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 from bstcad.optics.key import Key
-from bstcad.optics.sides import Sides, both, coarser, side
+from bstcad.optics.sides import FEWEST, Sides, both, coarser, side
 from bstcad.scene.blank import LensBlank
 from bstcad.scene.schema import OneOrTwo, Record
 
@@ -75,6 +75,11 @@ class Tailoring(Record):
     ] = None
 
     @property
+    def points_of_source(self) -> int:
+        """That stand for an extended source, whatever the net."""
+        return self.source_points or PRESETS[self.quality]["source_points"]
+
+    @property
     def side(self) -> int:
         """Control points a side of the square net of as many as the finest of `levels` has; of a resolved one."""
         return side(self.levels[-1])
@@ -99,7 +104,8 @@ class Tailoring(Record):
 
     def complaints(self, lens: LensBlank) -> Iterator[str]:
         """Levels that do not lead to the net, and keys that the method cannot keep to."""
-        net, levels = lens.back.net, self.levels
+        levels, stated = self.levels, lens.back.control_points is not None
+        net = lens.back.net if stated else (levels or (FEWEST,))[-1]
         most = max(both(net))
         if levels is not None and levels[-1:] not in ((net,), (most,)):
             yield f"tailoring.levels: must end with the back's control_points, {most}; add it at the end"

@@ -215,7 +215,7 @@ class Scene(Record):
         points: of an extended source, shared out among its lines (default: tailoring.source_points); draw: which ones.
         """
         if points is None:
-            points = self.tailoring.resolved(self.lens.back.net).source_points
+            points = self.tailoring.points_of_source
         return self._with_losses(channels_of(self.source, self.lens.index_at, points, draw))
 
     def judging_channels(self) -> tuple[Channel, ...]:
@@ -273,12 +273,12 @@ class Scene(Record):
     def toml(self) -> str:
         """The scene as a file that loads to an equal scene; an image is named by the basename of its copy."""
         unused = set() if self.source.extent else {"source_points"}
-        knobs = self.tailoring.resolved(self.lens.back.net)
-        knobs = knobs.model_dump(exclude={"quality", "seed"} | unused)
-        settings = ", ".join(f"{key} {value}" for key, value in knobs.items())
         optic = "a mirror" if self.lens.back.reflect else f"refractive index {self.index:.6g}"
-        comment = f"# {optic}; quality {self.tailoring.quality}: {settings}\n"
-        return comment + tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
+        comment = f"# {optic}; quality {self.tailoring.quality}"
+        if self.lens.back.control_points is not None:  # by which they are set
+            knobs = self.tailoring.resolved(self.lens.back.net).model_dump(exclude={"quality", "seed"} | unused)
+            comment += ": " + ", ".join(f"{key} {value}" for key, value in knobs.items())
+        return f"{comment}\n" + tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
 
 
 # ---- complaints of several tables: a sentence with a remedy each -----------------------------------------------------

@@ -42,6 +42,7 @@ from bstcad.sweep.cold_run import (
     as_text,
     settings,
 )
+from bstcad.sweep.net_choice import with_net
 from bstcad.sweep.plan import amounts, fitted, seconds
 from bstcad.sweep.results import Calibration, Place, Preset, Table, TableKnob, front, halving
 
@@ -237,7 +238,8 @@ def tradeoff(
     calls of progress while its text stays.  The two tables are written after each run, so that they are there however
     a sweep ends.
     """
-    base = scene.changed({"tailoring.accuracy": None, "tailoring.max_time": None})  # which end a design early
+    scene = scene.changed({"tailoring.accuracy": None, "tailoring.max_time": None})  # which end a design early
+    base, _ = with_net(scene)
     contents = scene_files(base)
     check_free(folder, contents)
     folder.parent.mkdir(parents=True, exist_ok=True)
