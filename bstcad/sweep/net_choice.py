@@ -40,7 +40,7 @@ ROOM = 0.8  # of the machine's memory, that a design may take
 TWO_CORES = Units(tubes=0.1, serial=0.01)  # seconds: of a machine of pace 1
 TUBES = 256  # a side, by which the light is followed
 FLOOR, RIM = 0.7, 3.0  # RRMSD of the least error by the cells (ControlCells.floor), and of one control point a side
-BY_QUALITY = {"draft": (1.6, 0.02), "standard": (1.0, 0.006), "fine": (0.9, 0.003)}  # times that, and what is left
+BY_QUALITY = {"draft": (1.4, 0.002), "standard": (1.0, 0.006), "fine": (0.9, 0.003)}  # times that, and what is left
 UNDONE = 0.5  # of the blur by a source of some size, that stage 3 leaves
 SEAM = 7.0  # pixels; a valley of the tool's radius that moves light by less within a cell is narrower than it need be
 ENOUGH = 9.0  # cells a pixel; more shape nothing that a pixel shows
