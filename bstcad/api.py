@@ -27,6 +27,7 @@ from bstcad import folder as folders
 from bstcad.folder import Made, same_front
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, tubes_picture
+from bstcad.optics.sides import both, in_words, plain
 from bstcad.optics.surfaces import Surface
 from bstcad.report import record
 from bstcad.report.drawing import png
@@ -38,6 +39,7 @@ from bstcad.runs import progress as progresses
 from bstcad.scene.blank import FEWEST_ROUND
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene, load
+from bstcad.sweep.net_choice import with_net
 from bstcad.transport.mapping import TransportMap
 from bstcad.verify.checks import Proof
 from bstcad.verify.verdict import Check
@@ -63,7 +65,10 @@ def design(
     scene = scene.changed({}) if isinstance(scene, Scene) else load(scene)
     for warning in scene.warnings():
         warnings.warn(warning, stacklevel=2)
+    scene, choice = with_net(scene)
     with progresses.shown(progress) as shown:
+        if choice is not None:
+            shown("control points", 1, 1, choice.line)
         return Design(pipeline.design(scene, device=device, progress=shown, began=began, merit=merit))
 
 
@@ -98,7 +103,7 @@ class Design:
 
     @property
     def lens(self) -> Lens:
-        """Both faces, the outline and the index; lens.back.control_points() is (m, m, 3) in mm."""
+        """Both faces, the outline and the index; lens.back.control_points() is (m, n, 3) in mm."""
         return self._made.lens
 
     @property
@@ -131,20 +136,21 @@ class Design:
     def with_heights(self, heights: Any) -> Design:
         """The same for a lens that differs in its back alone, by its control heights (mm).
 
-        heights: (m, m), a numpy array or a tensor, x along the first axis, y along the second, in the order of
+        heights: (m, n), a numpy array or a tensor, x along the first axis, y along the second, in the order of
         lens.back.heights and, as these, relative to z = lens.back.z: of heights in space subtract lens.back.z first.
         """
         try:
             found = np.asarray(heights.detach().cpu() if isinstance(heights, torch.Tensor) else heights)
-            if found.dtype.kind not in "fiu" or found.ndim != 2 or found.shape[0] != found.shape[1]:
+            if found.dtype.kind not in "fiu" or found.ndim != 2:
                 raise ValueError
         except (TypeError, ValueError):  # of lists that are no array, too
             given = getattr(heights, "shape", type(heights).__name__)
             given = f"numbers of shape {tuple(given)}" if isinstance(given, tuple) else given
             raise SceneError(
-                f"with_heights: takes (m, m) real numbers in mm, such as lens.back.heights, not {given}"
+                f"with_heights: takes (m, n) real numbers in mm, such as lens.back.heights, not {given}"
             ) from None
-        net = self.scene.flat_lens(max(found.shape[0], FEWEST_ROUND)).back
+        m, n = (max(count, FEWEST_ROUND) for count in found.shape)
+        net = self.scene.flat_lens((m, n)).back
         back = replace(net, z=self.lens.back.z, heights=torch.from_numpy(found.astype(np.float64)))
         return self.with_lens(replace(self.lens, back=back))
 
@@ -193,7 +199,7 @@ class Design:
     def preview(self, control_points: int = 33) -> Any:
         """A coarse copy of the solid that viewers show at once: CQ-editor's show_object, a notebook's cell.
 
-        A cadquery.Solid whose back has so many control points a side: to look at, never to make.
+        A cadquery.Solid whose back has so many control points along its longer side: to look at, never to make.
         """
         from bstcad.cad.solid import coarse_copy, lens_solid
 
@@ -330,7 +336,7 @@ class Design:
         glass = self.scene.lens.material or "glass"
         return (
             f"{across} of {glass} (index {lens.index:.5g}), {quantity(thick, 'mm')} thick on the axis, "
-            f"{lens.back.m} x {lens.back.m} control points"
+            f"{in_words(lens.back.shape)} control points"
         )
 
     def _worth(self) -> str:
@@ -360,8 +366,8 @@ def _fitting(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
         given = type(lens.back if isinstance(lens, Lens) else lens).__name__
         raise SceneError(f"with_lens: takes a bstcad.Lens whose back is a bstcad.BSplineSurface, not {given}")
     lens, shape = replace(lens.plain(), losses=None, clear=None), tuple(lens.back.heights.shape)
-    if len(shape) != 2 or shape[0] != shape[1]:
-        raise SceneError(f"with_lens: its back has heights of shape {shape}; give as many along x as along y, (m, m)")
+    if len(shape) != 2:
+        raise SceneError(f"with_lens: its back has heights of shape {shape}; give m along x and n along y, (m, n)")
     if not bool(torch.isfinite(lens.back.heights).all()) or not math.isfinite(lens.back.z):
         raise SceneError("with_lens: heights of its back are not finite; give numbers in mm")
     kinds = {True: "a mirror", False: "a lens"}
@@ -369,9 +375,9 @@ def _fitting(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
     _check_same("kind", kinds[lens.reflects], kinds[scene.lens.back.reflect])
     if not (lens.reflects or math.isclose(lens.index, scene.index, rel_tol=SAME)):
         _check_same("index", lens.index, scene.index)
-    if lens.back.m != scene.lens.back.control_points:
-        scene = scene.changed({"lens.back.control_points": lens.back.m, "tailoring.levels": None})
-    net = scene.flat_lens(lens.back.m).back
+    if lens.back.shape != both(scene.lens.back.net):
+        scene = scene.changed({"lens.back.control_points": plain(lens.back.shape), "tailoring.levels": None})
+    net = scene.flat_lens(lens.back.shape).back
     for axis, own, theirs in (("x", lens.back.x, net.x), ("y", lens.back.y, net.y)):
         if not np.allclose(own, theirs, rtol=0, atol=SAME * (theirs[1] - theirs[0])):
             _check_same(f"extent of its net along {axis} (mm)", own, theirs)

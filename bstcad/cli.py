@@ -16,6 +16,7 @@ import sys
 import time
 import traceback
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from bstcad.report.record import Contents, Examined
     from bstcad.scene.scene import Scene
     from bstcad.sweep.batch import Wanted
+    from bstcad.sweep.net_choice import Choice
 
 STARTED = time.perf_counter()  # heavy libraries load after it: their time is the command's
 INTERRUPTED, BROKEN = 130, 70  # exit codes: Ctrl-C; a fault of bstcad itself
@@ -170,6 +172,16 @@ def warn(scene: Scene, where: str = "") -> None:
         print(f"bstcad: warning: {where}{warning}", file=sys.stderr)
 
 
+def with_net_said(scene: Scene) -> tuple[Scene, Choice | None]:
+    """The scene with its net; of a net that is chosen, which one and what others would give, on stderr, too."""
+    from bstcad.sweep.net_choice import with_net
+
+    scene, choice = with_net(scene)
+    if choice is not None:
+        print(f"bstcad: {choice.line}", file=sys.stderr, flush=True)
+    return scene, choice
+
+
 def words(names: str | None) -> list[str]:
     """Names with commas between."""
     return [] if names is None else [name.strip() for name in names.split(",")]
@@ -279,6 +291,7 @@ def generate(
     files.check_free(folder)
     commands = engine()
     warn(wanted)
+    wanted, _ = with_net_said(wanted)
     with progress.watch(Console(stderr=True)) as watched:
         report = commands.generate(wanted, folder, device=device, progress=watched, began=STARTED, resume=resume)
     if report.stopped != "interrupt":
@@ -298,11 +311,13 @@ def plan(scene: SceneFile, settings: Settings = None, as_json: AsJson = False) -
         from bstcad.sweep.plan import plan as planned
 
     warn(wanted)
+    wanted, choice = with_net_said(wanted)
     given = wanted, scene.read_text(encoding="utf-8-sig"), [setting.partition("=")[0] for setting in settings or []]
     parts = planned(*given)
     effects = next(parts)
     if as_json:
-        print(json.dumps(next(parts) | effects, ensure_ascii=False, indent=2))
+        net = {"control_points": asdict(choice)} if choice else {}
+        print(json.dumps(next(parts) | effects | net, ensure_ascii=False, indent=2))
         return 0
     console = Console()
     console.print(reports.plan_effects(effects, wanted.title or wanted.name, wanted.optic))

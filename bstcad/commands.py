@@ -49,6 +49,7 @@ from bstcad.runs.files import MachineError, SceneError
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
 from bstcad.sweep.estimates import diagnosis, left_out
+from bstcad.sweep.net_choice import with_net
 from bstcad.tailoring.run import Progress, silent
 from bstcad.verify import checks, text_checks
 from bstcad.verify.checks import Nominal, Proof
@@ -84,6 +85,9 @@ def generate(
     After a Ctrl-C meanwhile the best lens so far is written, never over an earlier design: see `place_for`.
     effort: of the proof; None: all that it may need.  drawing: of its figures; None: Pictures.
     """
+    scene, choice = with_net(scene)
+    if choice is not None:
+        progress("control points", 1, 1, choice.line)
     path, say = files.beside(folder, "checkpoint"), lambda text: progress("checkpoint", 0, 0, text)
     keeper = Keeper(path, purpose(scene, device), say, kind=Saved)
     processes.begin()

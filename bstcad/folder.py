@@ -29,6 +29,7 @@ from bstcad.cad.mesh import SILVER, Label
 from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL
+from bstcad.optics.sides import both
 from bstcad.optics.surfaces import Surface
 from bstcad.report.prescription import scene_text
 from bstcad.report.record import Making
@@ -240,12 +241,12 @@ def write_design(design: Made, irradiance: np.ndarray | None, folder: Path) -> N
     transport_back or transport_entrance (c, r, 2), x and y (mm) where the light for them passes the back, or the
     plane of the first vertex.
     """
-    m, front, sent = design.lens.back.m, design.lens.front, design.transport
+    (m, n), front, sent = design.lens.back.shape, design.lens.front, design.transport
     np.savez_compressed(
         folder / DESIGN,
         control_points=design.lens.back.control_points(),
         knots_x=knots(m),
-        knots_y=knots(m),
+        knots_y=knots(n),
         degree=DEGREE,
         **({"front_curvature": 0.0} | _numbers(front)),
         **({"front_control_points": front.control_points()} if front.is_net else {}),
@@ -317,8 +318,8 @@ def _holds(kept: Path, design: Made) -> bool:
 def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
     """Scene and nominal design of a folder; SceneError if design.npz or scene.toml is missing or damaged."""
     scene = scenes.load(folder / SCENE)
-    m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
-    shapes = {"control_points": (m, m, 3), "target": (rows, columns), "front_curvature": ()}
+    columns, rows = scene.target.columns_rows
+    shapes = {"control_points": (*both(scene.lens.back.net), 3), "target": (rows, columns), "front_curvature": ()}
     found = _arrays(folder, shapes | dict.fromkeys(_numbers(scene.lens.front.surface), ()), scene)
     if not found["target"].sum() > 0:
         raise SceneError(f"{folder / DESIGN}: the target is all black; {AGAIN}")
@@ -349,10 +350,10 @@ def read_transport(folder: Path, scene: scenes.Scene) -> TransportMap | None:
 def _arrays(folder: Path, shapes: Mapping[str, tuple[int, ...]], scene: scenes.Scene) -> dict[str, np.ndarray]:
     """Arrays of finite numbers out of the design.npz of a scene."""
     path, (columns, rows), given = folder / DESIGN, scene.target.columns_rows, scene.lens.front.given
-    m = math.hypot(scene.lens.back.control_points, given.m if given else 0)  # of both nets together
+    points = math.prod(both(scene.lens.back.net)) + (math.prod(given.shape) if given else 0)  # of both nets together
     try:
         found = files.arrays(
-            path, shapes, 25 * m * m + 17 * columns * rows + 3_000_000
+            path, shapes, 25 * points + 17 * columns * rows + 3_000_000
         )  # with the arrays that are not read
     except Exception as error:  # numpy, zipfile, zlib and tokenize each raise their own for a damaged file
         raise SceneError(f"{path}: cannot be read ({files.first_line(error)}); {AGAIN}") from None
@@ -368,7 +369,7 @@ def _numbers(front: Surface) -> dict[str, float]:
 
 
 def _lens(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
-    """The designed lens, to the last bit, from its control net (m, m, 3) in mm and the numbers of its front."""
+    """The designed lens, to the last bit, from its control net (m, n, 3) in mm and the numbers of its front."""
     net, z = found["control_points"], scene.lens.back.z
     if not np.array_equal(z + (net[..., 2] - z), net[..., 2]):  # where the two differ much in size a bit would be lost
         z = 0.0

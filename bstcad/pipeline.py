@@ -16,6 +16,7 @@ from bstcad.analysis.shape import thickness_range
 from bstcad.baselines import integration, paper
 from bstcad.folder import Made
 from bstcad.optics.lens import Lens
+from bstcad.optics.sides import both
 from bstcad.report.record import Making, Point
 from bstcad.report.record import Stage as StageRecord
 from bstcad.scene.errors import SceneError
@@ -77,7 +78,7 @@ def design(
     torch.manual_seed(scene.tailoring.seed)
     device = device_for(device)
     target = scene.target
-    knobs = scene.tailoring.resolved(scene.lens.back.control_points)
+    knobs = scene.tailoring.resolved(scene.lens.back.net)
     screen = target.screen
     sizes = stage2.SIZES if scene.source.extent and knobs.method != "integration" else ()  # that knows points alone
     grown = tuple(scene.with_source_scaled(share).channels() for share, _ in sizes)
@@ -89,7 +90,8 @@ def design(
     limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve(scene) + JUDGING}
     record = Record() if start is None else start.record
     driver = Driver(progress, began, **limits, interrupted=interrupted, save=save, record=record)
-    lens = scene.flat_lens(knobs.levels[0], dtype=getattr(torch, knobs.precision), device=device)
+    precision = getattr(torch, knobs.precision)
+    lens = scene.flat_lens(knobs.levels[0], dtype=precision, device=device, as_wide_as=knobs.levels[-1])
     if start is None:
         driver.end("loading")  # the libraries, the scene and the files it names
     followed = (
@@ -114,7 +116,7 @@ def resolved(scene: Scene, lens: Lens) -> Scene:
 
     The paper's procedure finds front and back together; its scene stays as it is.
     """
-    if scene.tailoring.resolved(lens.back.m).method == "adam":
+    if scene.tailoring.resolved(lens.back.shape).method == "adam":
         return scene
     blank = scene.lens.model_copy(update={"front": scene.lens.front.designed(lens.front)})
     return scene.model_copy(update={"lens": blank})
@@ -206,7 +208,7 @@ def device_for(asked: str) -> str:
 
 def reserve(scene: Scene) -> float:
     """Seconds that writing, proving and reporting will take on two cores."""
-    pixels, net = math.prod(scene.target.columns_rows) / 512**2, (scene.lens.back.control_points / 513) ** 2
+    pixels, net = math.prod(scene.target.columns_rows) / 512**2, math.prod(both(scene.lens.back.net)) / 513**2
     return FIXED + PER_NET * net + PER_PICTURE * pixels
 
 

@@ -70,7 +70,7 @@ class Reference:
     pixel: np.ndarray  # (2, n, n) (column, row) where the light from these points lands
     flux: np.ndarray  # (n, n) its flux; zero where no light lands
     through: np.ndarray  # (n, n) share of the flux that the channel's own losses leave
-    control_points: int  # a side of the finished lens; it bounds the sharpness of the light
+    control_points: int  # of the finished lens, in all; they bound the sharpness of the light
 
     @classmethod
     @torch.no_grad()
@@ -79,7 +79,7 @@ class Reference:
     ) -> Reference:
         """Light from PLACES x PLACES points of the lit part of the last face.
 
-        control_points: of the finished lens, if `lens` is a coarser one.
+        control_points: of the finished lens, in all, if `lens` is a coarser one.
         """
         window = Rectangle(*(2 * half for half in lens.apertures[1].half_extent))
         for few in (32, PLACES):  # the first grid finds the lit part
@@ -94,7 +94,7 @@ class Reference:
             lens, channel, screen, np.asarray(picture, float), places=(x, y),
             pixel=screen.pixels_of(landed.position).numpy(),
             flux=torch.where(lit, density, torch.zeros_like(density)).numpy(),
-            through=_share(landed), control_points=control_points or lens.back.m,
+            through=_share(landed), control_points=control_points or lens.back.heights.numel(),
         )  # fmt: skip
 
     @cached_property
@@ -152,7 +152,7 @@ class Reference:
     def _grain(self) -> float:
         """Pixels, along a side, that the light of a control cell falls on: the finest that the lens can shape."""
         (left, right), (low, high) = self.lens.back.x, self.lens.back.y
-        cells = self._lit_area() / ((right - left) * (high - low)) * (self.control_points - 1) ** 2
+        cells = self._lit_area() / ((right - left) * (high - low)) * (math.sqrt(self.control_points) - 1) ** 2
         return math.sqrt((self.picture > DARK * self.picture.mean()).sum() / max(cells, 1.0))
 
     def _lit_area(self) -> float:

@@ -105,17 +105,18 @@ def slope_octaves(back: BSplineSurface) -> np.ndarray:
     """Slope energy of the control net by octaves of frequency, coarse to fine (mm², squared steps); ripple is last.
 
     Σ λ |ĥ|² over the cosine transform ĥ of the net without its best cubic polynomial (a tilt has no even
-    continuation), λ the Laplacian; octave k holds the frequencies whose larger index lies in (m / 2^(k+1), m / 2^k].
+    continuation), λ the Laplacian; octave k holds the frequencies whose larger index lies in (m / 2^(k+1), m / 2^k],
+    m the control points along the longer side and an index along the shorter one counted up to m, too.
     """
-    m = back.m
-    u = np.linspace(-1, 1, m)
-    columns = np.stack([np.outer(u**i, u**j).ravel() for i in range(4) for j in range(4 - i)], axis=1)
+    m = max(back.shape)
+    u, v = (np.linspace(-1, 1, count) for count in back.shape)
+    columns = np.stack([np.outer(u**i, v**j).ravel() for i in range(4) for j in range(4 - i)], axis=1)
     h = back.heights.detach().cpu().double().numpy().ravel()
     h = h - columns @ least_squares(columns, h)
-    axis = 2 - 2 * np.cos(np.pi * np.arange(m) / m)
-    energy = (axis[:, None] + axis) * scipy.fft.dctn(h.reshape(m, m), norm="ortho") ** 2
+    along_x, along_y = (2 - 2 * np.cos(np.pi * np.arange(count) / count) for count in back.shape)
+    energy = (along_x[:, None] + along_y) * scipy.fft.dctn(h.reshape(back.shape), norm="ortho") ** 2
     energy[energy < (ROUNDING * (abs(back.z) + np.abs(h).max())) ** 2] = 0.0
-    larger = np.maximum(*np.indices((m, m)))
+    larger = np.maximum(*(index * (m / count) for index, count in zip(np.indices(back.shape), back.shape, strict=True)))
     borders = [m / 2**k for k in range(int(np.log2(m)), -1, -1)]
     return np.array([energy[(larger > a) & (larger <= b)].sum() for a, b in zip(borders, borders[1:], strict=False)])
 
@@ -189,14 +190,16 @@ def survey(lens: Lens, concave: float | None = None, convex: float | None = None
 
 
 def _grid(back: BSplineSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(x, y) (m - 2, places) mm of QUARTERS of each span, and the weights for spline.largest_bending."""
-    span, shape = torch.arange(back.m - 2), (back.m - 2, len(QUARTERS))
-    x, y = (at.reshape(shape[::-1]).T.contiguous().numpy() for at in span_places(back, span, span, QUARTERS))
-    by_quarter = [torch.stack([torch.stack(order) for order in weights(span, back.m, s)]) for s in QUARTERS]
-    of_unit = torch.stack(by_quarter).permute(3, 0, 1, 2)  # by span, quarter, derivative, control point
-    scales = (torch.tensor([1.0, 1 / pitch, 1 / pitch**2], dtype=torch.float64)[:, None] for pitch in back.pitch)
-    along_x, along_y = ((of_unit * scale).reshape(*shape, 9).contiguous().numpy() for scale in scales)
-    return x, y, along_x, along_y
+    """(x, y) (spans, places) mm of QUARTERS of each span, and the weights for spline.largest_bending."""
+    spans = [torch.arange(count - 2) for count in back.shape]
+    x, y = (at.reshape(len(QUARTERS), -1).T.contiguous().numpy() for at in span_places(back, *spans, QUARTERS))
+    scaled = []
+    for span, count, pitch in zip(spans, back.shape, back.pitch, strict=True):
+        by_quarter = [torch.stack([torch.stack(order) for order in weights(span, count, s)]) for s in QUARTERS]
+        of_unit = torch.stack(by_quarter).permute(3, 0, 1, 2)  # by span, quarter, derivative, control point
+        scale = torch.tensor([1.0, 1 / pitch, 1 / pitch**2], dtype=torch.float64)[:, None]
+        scaled.append((of_unit * scale).reshape(len(span), len(QUARTERS), 9).contiguous().numpy())
+    return x, y, *scaled
 
 
 def _radius(bend: Extreme) -> Extreme:

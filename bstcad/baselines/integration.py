@@ -17,6 +17,7 @@ points by the net.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -30,6 +31,7 @@ from bstcad.optics.bspline import BSplineSurface, evaluate, net_gradient
 from bstcad.optics.interfaces import ALONG, Law
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays, TargetPlane
+from bstcad.optics.sides import Sides, both
 from bstcad.optics.trace import clear_window, to_first_net
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring import slope_map
@@ -192,7 +194,7 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def fitted(surface: BSplineSurface, points: Points, used: Tensor, levels: tuple[int, ...]) -> BSplineSurface:
+def fitted(surface: BSplineSurface, points: Points, used: Tensor, levels: tuple[Sides, ...]) -> BSplineSurface:
     """Least squares: min Σ |h(x, y) - z|² over the points used, (n, n) bool, on one net after another.
 
     Each net starts from the surface of the net before, the first from a plane; only the last uses all points.
@@ -201,12 +203,13 @@ def fitted(surface: BSplineSurface, points: Points, used: Tensor, levels: tuple[
     ways = (STIFF, *(BETWEEN for _ in nets[1:-1]), FINE)
     surface, n = surface.refined(nets[0]), used.shape[-1]
     surface = replace(surface, heights=torch.zeros_like(surface.heights))
-    for m, (bending, count, degree) in zip(nets, ways, strict=True):
+    for net, (bending, count, degree) in zip(nets, ways, strict=True):
+        m = max(both(net))
         every = 1 if bending == FINE[0] else max(1, n // (DENSE * m))
         some = used[::every, ::every]
         x, y, z = (p[::every, ::every][some] for p in points.position)
-        cells = (m * every / n) ** 2  # of the net, a point
-        surface = fit_heights(surface.refined(m), x, y, z=z, bending=bending / cells, count=count, degree=degree)
+        cells = math.prod(points * every / n for points in both(net))  # of the net, a point
+        surface = fit_heights(surface.refined(net), x, y, z=z, bending=bending / cells, count=count, degree=degree)
     return surface
 
 

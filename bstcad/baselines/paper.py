@@ -22,6 +22,7 @@ from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Rays
+from bstcad.optics.sides import Sides
 from bstcad.optics.trace import clear_window, trace
 from bstcad.tailoring import slope_map
 from bstcad.tailoring.merit import landing
@@ -80,12 +81,12 @@ def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Step]
 
 def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: Level | None) -> Iterator[Reached]:
     """Stage 1 on the net of `lens`, or on from a state: min Σ |P_t - P|² by the heights and the free front."""
-    n = min(task.knobs.rays, RAYS_PER_CONTROL_POINT * lens.back.m)
+    n = min(task.knobs.rays, RAYS_PER_CONTROL_POINT * max(lens.back.shape))
     x, y = (t.to(lens.like) for t in sampling.grid(area, n))
     rays = task.heaviest.source.rays(x, y, lens.entrance.z, area.area / n**2)
     aim, shape = slope_map.aim_points(mapping, lens, task.screen, x=x, y=y), lens.front.parameters()
     start = [lens.back.heights, *(torch.as_tensor(shape[name]).to(lens.back.heights) for name in task.free)]
-    nearest = min(RATES, key=lambda m: abs(m - lens.back.m))
+    nearest = min(RATES, key=lambda m: abs(m - max(lens.back.shape)))
 
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
         leaves = [p.detach().clone().requires_grad_() for p in parameters]
@@ -97,12 +98,12 @@ def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: 
     return minimise(problem, method, steps, state.best if state else Best())
 
 
-def _improved(lens: Lens, best: Best, free: tuple[str, ...], m: int) -> Lens:
-    """The best lens that a level from `lens` has come to, on m x m control points."""
+def _improved(lens: Lens, best: Best, free: tuple[str, ...], net: Sides) -> Lens:
+    """The best lens that a level from `lens` has come to, on a net of so many control points."""
     if best.parameters:  # else not one value was finite
         heights, *shape = best.parameters
         lens = with_parameters(lens, [heights, *map(float, shape)], free)
-    return lens.refined(m)
+    return lens.refined(net)
 
 
 def transport(task: Task, lens: Lens) -> Mapping:

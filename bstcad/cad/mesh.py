@@ -281,12 +281,12 @@ def _basis(u, m):
 @njit(inline="always")
 def _sag(face, net, x, y):
     """z (mm) of a face; net (0, 0): it is a surface of revolution."""
-    m = net.shape[0]
+    m, n = net.shape
     if m == 0:
         r2 = x * x + y * y
         return face.z + face.curvature * r2 / (1.0 + math.sqrt(max(1.0 - face.bend * r2, face.equator)))
     i, a0, a1, a2 = _basis(min(max((x - face.x) * face.per_x, 0.0), m - 1.0), m)
-    j, b0, b1, b2 = _basis(min(max((y - face.y) * face.per_y, 0.0), m - 1.0), m)
+    j, b0, b1, b2 = _basis(min(max((y - face.y) * face.per_y, 0.0), n - 1.0), n)
     h0 = b0 * net[i, j] + b1 * net[i, j + 1] + b2 * net[i, j + 2]
     h1 = b0 * net[i + 1, j] + b1 * net[i + 1, j + 1] + b2 * net[i + 1, j + 2]
     h2 = b0 * net[i + 2, j] + b1 * net[i + 2, j + 1] + b2 * net[i + 2, j + 2]

@@ -46,17 +46,16 @@ def back_patch(lens: Lens) -> Patch:
 def _net_patch(face: BSplineSurface, outline: Outline, outward: bool) -> Patch:
     if outline.is_round:
         _check_round(face, outline.radius)
-    full = knots(face.m)
-    return Patch(bspline_surface(face.control_points(), full, full), outward, of_net(face))
+    return Patch(bspline_surface(face.control_points(), *map(knots, face.shape)), outward, of_net(face))
 
 
 def of_net(face: BSplineSurface) -> Image:
     """(x, y) in mm to (u, v) of a net."""
 
     def uv(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        ends = zip((x, y), (face.x, face.y), face.pitch, strict=True)
-        across = (np.clip((p - low) / pitch, 0.0, face.m - 1.0) for p, (low, _), pitch in ends)
-        return np.stack([parameter(torch.from_numpy(p), face.m).numpy() for p in across], axis=-1)
+        ends = zip((x, y), (face.x, face.y), face.pitch, face.shape, strict=True)
+        across = ((np.clip((p - low) / pitch, 0.0, m - 1.0), m) for p, (low, _), pitch, m in ends)
+        return np.stack([parameter(torch.from_numpy(p), m).numpy() for p, m in across], axis=-1)
 
     return uv
 

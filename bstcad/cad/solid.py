@@ -27,6 +27,7 @@ from bstcad.cad.walls import RIM, SLIM, TOLERANCE, UPRIGHT, Draft, Named, Rail, 
 from bstcad.cad.wires import Curve, Piece
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
+from bstcad.optics.sides import both, coarser
 from bstcad.optics.surfaces import Plane, sag
 from bstcad.scene.mount import parting
 
@@ -90,19 +91,19 @@ def lens_shape(
 
 
 def coarse_copy(lens: Lens, m: int) -> Lens:
-    """The lens with a back of m x m control points, for viewers, which turn a face into triangles before they show it.
+    """The lens with a back of m control points along its longer side, for viewers, which triangulate faces first.
 
     Each is as high as the back itself at its (x, y).  This follows relief wider than a few cells of the coarse net, and
     smooths the rest (de Boor 1978, Schoenberg's operator); the copy does not steer light as the lens does.
     """
     lens = lens.plain()
-    if m >= lens.back.m:
+    if m >= max(lens.back.shape):
         return lens
     stretch = (m - 1) / (m - 1 - 2 * SPARE)
     reach = (max(-low, high) for low, high in (lens.back.x, lens.back.y))
     ends = [half if end <= half else stretch * half for half, end in zip(lens.outline.half_extent, reach, strict=True)]
-    spans = zip(ends, (lens.back.x, lens.back.y), strict=True)
-    x, y = np.meshgrid(*(np.clip(np.linspace(-end, end, m), *span) for end, span in spans), indexing="ij")
+    spans = zip(ends, both(coarser(lens.back.shape, m)), (lens.back.x, lens.back.y), strict=True)
+    x, y = np.meshgrid(*(np.clip(np.linspace(-end, end, k), *span) for end, k, span in spans), indexing="ij")
     heights = torch.from_numpy(sag(lens.back, x, y) - lens.back.z)
     return replace(lens, back=BSplineSurface(lens.back.z, heights, *((-end, end) for end in ends)))
 
@@ -117,8 +118,10 @@ def check_thickness(lens: Lens) -> None:
     if lens.back.z + lowest - (lens.front.z + highest) > SLIM:
         return
     a, b = lens.outline.half_extent
-    n = 3 * (lens.back.m - 2) + 1
-    axes = (torch.linspace(-end, end, n, dtype=torch.float64) for end in (a, b))
+    axes = (
+        torch.linspace(-end, end, 3 * (count - 2) + 1, dtype=torch.float64)
+        for end, count in zip((a, b), lens.back.shape, strict=True)
+    )
     x, y = torch.meshgrid(*axes, indexing="ij")
     inside = lens.outline.contains(x, y)
     x, y = x[inside].numpy(), y[inside].numpy()
@@ -236,4 +239,4 @@ def _parting(lens: Lens, rim: Sequence[Piece]) -> float:
 
 def rim_points(lens: Lens, rim: Sequence[Piece]) -> np.ndarray:
     """x and y (2, n) of points along a rim (mm), several in each cell of the back's net."""
-    return np.concatenate([piece.points(np.linspace(0.0, piece.end, PLACES * lens.back.m)) for piece in rim]).T
+    return np.concatenate([piece.points(np.linspace(0.0, piece.end, PLACES * max(lens.back.shape))) for piece in rim]).T

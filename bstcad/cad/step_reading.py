@@ -52,7 +52,7 @@ class StepLens:
     """A lens as one STEP file holds it; lengths in mm."""
 
     shape: TopoDS_Solid
-    control_points: np.ndarray  # (m, m, 3) of the back, x along the first axis, as OCC has them
+    control_points: np.ndarray  # (m, n, 3) of the back, x along the first axis, as OCC has them
     back: BSplineSurface
     front: Surface
     outline: Outline  # of the walls of a lens and no more; of others how far the edge of the back reaches
@@ -176,23 +176,23 @@ def freeform_surface(face: TopoDS_Face) -> BSplineSurface:
 
 
 def _uniform_net(surface: BRepAdaptor_Surface, net: np.ndarray) -> BSplineSurface:
-    """ValueError unless its net is a plain square of degree 2 x 2 on uniform knots, uniform in x and y."""
+    """ValueError unless its net is plain, of degree 2 x 2 on uniform knots, uniform in x and y."""
     patch = surface.BSpline()
     (m, n), degrees = (patch.NbUPoles(), patch.NbVPoles()), (patch.UDegree(), patch.VDegree())
-    if degrees != (2, 2) or m != n or m < SMALLEST_NET or patch.IsURational() or patch.IsVRational():
+    if degrees != (2, 2) or min(m, n) < SMALLEST_NET or patch.IsURational() or patch.IsVRational():
         raise ValueError(
             f"the freeform face is of degree {degrees[0]} x {degrees[1]} on a net of {m} x {n}; "
-            "bstcad reads plain squares of degree 2 x 2"
+            "bstcad reads plain nets of degree 2 x 2"
         )
-    for axis, full in zip("xy", patches.knots_of(patch), strict=True):
-        off = np.abs(full - knots(m))
-        if off.max() > 1e-12 * m:
-            worst = f"{knots(m)[off.argmax()]:g} is {full[off.argmax()]:.15g}"
-            raise ValueError(f"knots in {axis} are not 0 … {m - 2} ({worst}); give a file written by bstcad")
+    for axis, full, count in zip("xy", patches.knots_of(patch), (m, n), strict=True):
+        off = np.abs(full - knots(count))
+        if off.max() > 1e-12 * count:
+            worst = f"{knots(count)[off.argmax()]:g} is {full[off.argmax()]:.15g}"
+            raise ValueError(f"knots in {axis} are not 0 … {count - 2} ({worst}); give a file written by bstcad")
     found = BSplineSurface.from_control_points(net)
     off = np.abs(net - found.control_points())[..., :2].max(axis=-1)
     if not off.max() <= UNIFORM:
-        i, j = divmod(int(off.argmax()), m)
+        i, j = divmod(int(off.argmax()), n)
         raise ValueError(
             f"control points {off.max():.1e} mm off a uniform grid, the worst at ({i}, {j}); "
             "give a file written by bstcad"
@@ -365,7 +365,7 @@ def along_edges(solid: TopoDS_Shape) -> np.ndarray:
 
 def edges_off(shape: TopoDS_Shape, lens: Lens) -> tuple[tuple[float, str], tuple[float, str]]:
     """Largest distance (mm) of an edge from a face it bounds, and from the wall of the lens, each with its place."""
-    spans = max(lens.back.m - 2, math.ceil(2 * max(lens.outline.half_extent) / lens.front.detail))
+    spans = max(max(lens.back.shape) - 2, math.ceil(2 * max(lens.outline.half_extent) / lens.front.detail))
     share = np.linspace(0.0, 1.0, SPAN_POINTS * spans + 1)
     from_faces, from_wall = [], []
     for face in map(TopoDS.Face_s, parts_of(shape, TopAbs_FACE)):

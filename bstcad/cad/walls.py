@@ -150,12 +150,13 @@ def _curve_on(surface: Surface, piece: Piece) -> Curve:
 
 def _border(net: BSplineSurface, piece: Piece) -> Curve | None:
     """The border of a net that a straight piece runs along from end to end, on the same knots; None: it does not."""
-    poles, full = net.control_points(), knots(net.m)
+    poles = net.control_points()
     sides = [side[::step] for side in (poles[0], poles[-1], poles[:, 0], poles[:, -1]) for step in (1, -1)]
     ends = piece.points(np.array([0.0, piece.end]))
     side = next((side for side in sides if np.abs(side[[0, -1], :2] - ends).max() <= RIM), None)
     if side is None:
         return None
+    full = knots(len(side))
     along = BSpline(full, side[:, :2], DEGREE)
     return Curve(replace(piece, points=along, end=float(full[-1])), side, full)
 

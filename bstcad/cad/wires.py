@@ -210,7 +210,7 @@ def breaks(surface: Surface, *pieces: Piece) -> np.ndarray:
 
 def _crossings(surface: Surface, piece: Piece) -> np.ndarray:
     """Parameters at which a piece crosses a knot line of a net, by bisection of all crossings at once."""
-    t, crossings = np.linspace(0.0, piece.end, max(surface.m, COARSEST) * 8 + 1), [np.empty(0)]
+    t, crossings = np.linspace(0.0, piece.end, max(*surface.shape, COARSEST) * 8 + 1), [np.empty(0)]
     places = piece.points(t)
     for axis, ((first, _), pitch) in enumerate(zip((surface.x, surface.y), surface.pitch, strict=True)):
         cell = np.floor((places[:, axis] - first) / pitch - 0.5)  # knots stand at first + pitch (k + 1/2)

@@ -62,15 +62,19 @@ class Form:
 
     def on(self, surface: BSplineSurface) -> BSplineSurface:
         """`surface` with this form error, by least squares on the finer of both nets."""
-        enough = self.rest.m <= surface.m
-        finer = surface if enough else surface.refined(max(self.rest.m, min(REFINED * surface.m, NETS[1])))
-        u = np.linspace(0, finer.m - 1, 4 * finer.m)
-        rows = basis_matrix(u, finer.m)
-        solve = splu((rows.T @ rows).tocsc()).solve
-        x, y = (low + u / (finer.m - 1) * (high - low) for low, high in (finer.x, finer.y))
+        sides = [
+            own if rest <= own else max(rest, min(REFINED * own, NETS[1]))
+            for rest, own in zip(self.rest.shape, surface.shape, strict=True)
+        ]
+        finer = surface.refined((sides[0], sides[1]))
+        along = [np.linspace(0, count - 1, 4 * count) for count in finer.shape]
+        in_x, in_y = (basis_matrix(u, count) for u, count in zip(along, finer.shape, strict=True))
+        over_x, over_y = (splu((rows.T @ rows).tocsc()).solve for rows in (in_x, in_y))
+        ends = zip(along, finer.shape, (finer.x, finer.y), strict=True)
+        x, y = (low + u / (count - 1) * (high - low) for u, count, (low, high) in ends)
         strips = (np.meshgrid(part, y, indexing="ij") for part in np.array_split(x, STRIPS))
         values = np.concatenate([self.at(x.ravel(), y.ravel()).reshape(x.shape) for x, y in strips])
-        own = solve(rows.T @ solve(rows.T @ values.T).T)
+        own = over_x(in_x.T @ over_y(in_y.T @ values.T).T)
         return replace(finer, heights=finer.heights + torch.from_numpy(own))
 
     def drawn(self, draw: np.ndarray, sign: float = 1.0) -> Form:
@@ -111,7 +115,7 @@ def fitted(face: Face, alignment: Alignment) -> Form:
 
 def frequencies(net: BSplineSurface) -> np.ndarray:
     """(m, m) spatial frequency (1/mm) of each cosine of a net."""
-    half = [np.arange(net.m) / (2 * net.m * pitch) for pitch in net.pitch]
+    half = [np.arange(count) / (2 * count * pitch) for count, pitch in zip(net.shape, net.pitch, strict=True)]
     return np.hypot(half[0][:, None], half[1][None, :])
 
 
@@ -129,7 +133,7 @@ def _field(
     motions: (n, k) changes by the motions of the alignment, without polynomials.  Their amounts follow by generalised
     least squares: the field leaves V⁻¹ off σ² of off, V the covariance of field and noise together.
     """
-    m, n = net.m, len(off)
+    (m, _), n = net.shape, len(off)  # a square net of its own
     gram = (rows.T @ rows).tocsr()
     band, bands = _bands(frequencies(net))
     modes = np.bincount(band.ravel(), minlength=bands)

@@ -5,10 +5,11 @@ Only the heights z of the control points are free.  Because they are uniform in 
 Nine products a point.
 Source: Wang et al. 2023, "B-spline freeform surface tailoring for prescribed irradiance", Eqs. 2 and 6-13.
 
-The basis is written in u = (m - 1) (x - x_min) / (x_max - x_min), the distance along the net in control-point spacings,
-0 <= u <= m - 1.  Slope and curvature are exact in each knot span, up to the knots on either side of it: in span (i, j)
-the surface is one biquadratic piece of nine control points, s in [0, 1] is the place within it, and second derivatives
-jump at the knots, so that bounds on them look at each span by itself.
+A net has m control points along x and n along y.  The basis is written in u = (m - 1) (x - x_min) / (x_max - x_min),
+the distance along the net in control-point spacings, 0 <= u <= m - 1, and likewise in v along y.  Slope and curvature
+are exact in each knot span, up to the knots on either side of it: in span (i, j) the surface is one biquadratic piece
+of nine control points, s in [0, 1] is the place within it, and second derivatives jump at the knots, so that bounds on
+them look at each span by itself.
 """
 
 from __future__ import annotations
@@ -27,10 +28,11 @@ from torch import Tensor
 from bstcad.optics.kernels import spline
 from bstcad.optics.kernels.compiling import fused
 from bstcad.optics.outlines import Outline, inside
+from bstcad.optics.sides import FEWEST, Sides, both, side
 from bstcad.optics.surfaces import Surface
 
 DEGREE = 2  # order 3
-SMALLEST_NET = 5  # control points a side: two end spans and one inner span
+SMALLEST_NET = FEWEST  # control points a side: two end spans and one inner span
 SPANS = 1 << 14  # looked at together: their numbers stay in the cache
 QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of a span, along x and along y, where bounds on the back are held to it and
 # where figures of it are taken: a grid four times finer than the net, with both sides of each knot
@@ -89,15 +91,15 @@ def basis(u: Tensor, m: int) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], tup
 
 def evaluate_plain(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """(h, ∂h/∂u, ∂h/∂v) of Σ_i Σ_j B_i(u) B_j(v) h_ij: the nine non-zero products (Wang et al. 2023, Eqs. 2 and 6)."""
-    m = heights.shape[0]
+    m, n = heights.shape
     ku, wu, du = basis(u, m)
-    kv, wv, dv = basis(v, m)
-    corner = ku * m + kv
+    kv, wv, dv = basis(v, n)
+    corner = ku * n + kv
     net = heights.reshape(-1).double()  # so that the adjoint sums in float64: float32 sums stop growing at 2^24 rays
     h = h_u = h_v = torch.zeros_like(u)
     for i in range(3):
         for j in range(3):
-            p = net[corner + (i * m + j)].to(heights.dtype)
+            p = net[corner + (i * n + j)].to(heights.dtype)
             h = h + wu[i] * wv[j] * p
             h_u = h_u + du[i] * wv[j] * p
             h_v = h_v + wu[i] * dv[j] * p
@@ -112,7 +114,7 @@ def evaluate(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Ten
 
 
 def net_gradient(heights: Tensor, u: Tensor, v: Tensor, seeds: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-    """(m, m) the adjoint of `evaluate`: gradient in the heights of Σ g h + g_u ∂h/∂u + g_v ∂h/∂v, seeds (g, g_u, g_v).
+    """(m, n) the adjoint of `evaluate`: gradient in the heights of Σ g h + g_u ∂h/∂u + g_v ∂h/∂v, seeds (g, g_u, g_v).
 
     It is the same for all heights; the argument gives the net's size, type and device.
     """
@@ -163,7 +165,7 @@ class BSplineSurface(Surface):
     """
 
     z: float  # z0, the plane the heights are measured from (mm)
-    heights: Tensor  # (m, m) mm, x along the first axis
+    heights: Tensor  # (m, n) mm, x along the first axis
     x: tuple[float, float]  # extent of the net in x: first and last control point (mm)
     y: tuple[float, float]  # extent of the net in y (mm)
     kind: Literal["bspline"] = "bspline"
@@ -173,7 +175,7 @@ class BSplineSurface(Surface):
 
     @classmethod
     def from_control_points(cls, net: np.ndarray, z: float | None = None) -> BSplineSurface:
-        """The surface of a control net (m, m, 3) in mm, heights measured from z or else from the mean of the net."""
+        """The surface of a control net (m, n, 3) in mm, heights measured from z or else from the mean of the net."""
         z = float(net[..., 2].mean()) if z is None else z
         x, y = ((float(net[0, 0, i]), float(net[-1, -1, i])) for i in (0, 1))
         return cls(z, torch.from_numpy(net[..., 2] - z), x, y)
@@ -204,19 +206,31 @@ class BSplineSurface(Surface):
         return replace(self, z=self.z + vertex, heights=self.heights - vertex)
 
     @property
+    def shape(self) -> tuple[int, int]:
+        """(m, n): numbers of control points along x and along y."""
+        m, n = self.heights.shape
+        return m, n
+
+    @property
     def m(self) -> int:
-        """Number of control points along each axis."""
-        return self.heights.shape[0]
+        """Control points along x; of a square net along y, too."""
+        return self.shape[0]
+
+    @property
+    def side(self) -> int:
+        """Control points a side of the square net of as many."""
+        return side(self.shape)
 
     @property
     def pitch(self) -> tuple[float, float]:
         """Spacing of the control points in x and in y (mm)."""
-        return (self.x[1] - self.x[0]) / (self.m - 1), (self.y[1] - self.y[0]) / (self.m - 1)
+        m, n = self.shape
+        return (self.x[1] - self.x[0]) / (m - 1), (self.y[1] - self.y[0]) / (n - 1)
 
     def along_net(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """(u, v) of points (mm), in control-point spacings; a point beyond the net is moved to its rim."""
-        pitch_x, pitch_y = self.pitch
-        return ((x - self.x[0]) / pitch_x).clamp(0, self.m - 1), ((y - self.y[0]) / pitch_y).clamp(0, self.m - 1)
+        (m, n), (pitch_x, pitch_y) = self.shape, self.pitch
+        return ((x - self.x[0]) / pitch_x).clamp(0, m - 1), ((y - self.y[0]) / pitch_y).clamp(0, n - 1)
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; a point beyond the net is moved to its rim."""
@@ -224,22 +238,24 @@ class BSplineSurface(Surface):
         return h, h_u / self.pitch[0], h_v / self.pitch[1]
 
     def control_points(self) -> np.ndarray:
-        """The control net (m, m, 3) in mm, float64, x along the first axis."""
-        net = np.empty((self.m, self.m, 3))
-        net[..., 0] = np.linspace(*self.x, self.m)[:, None]
-        net[..., 1] = np.linspace(*self.y, self.m)[None, :]
+        """The control net (m, n, 3) in mm, float64, x along the first axis."""
+        m, n = self.shape
+        net = np.empty((m, n, 3))
+        net[..., 0] = np.linspace(*self.x, m)[:, None]
+        net[..., 1] = np.linspace(*self.y, n)[None, :]
         net[..., 2] = self.z + self.heights.detach().cpu().numpy().astype(np.float64)
         return net
 
-    def refined(self, m: int) -> BSplineSurface:
-        """The same surface on m x m control points, by least squares along each axis."""
-        if m == self.m:
+    def refined(self, sides: Sides) -> BSplineSurface:
+        """The same surface on so many control points a side, or along x and along y; by least squares along each."""
+        if both(sides) == self.shape:
             return self
-        carry = scipy.sparse.csr_array(
-            prolongation(self.m, m)
-        )  # sparse only in name: its products are sums in a fixed order
+        axes = list(zip(self.shape, both(sides), strict=True))
+        # sparse only in name: their products are sums in a fixed order
+        carry = {axis: scipy.sparse.csr_array(prolongation(*axis)) for axis in set(axes)}
+        in_x, in_y = (carry[axis] for axis in axes)
         coarse = self.heights.detach().cpu().double().numpy()
-        return replace(self, heights=torch.from_numpy(carry @ (carry @ coarse.T).T).to(self.heights))
+        return replace(self, heights=torch.from_numpy(in_x @ (in_y @ coarse.T).T).to(self.heights))
 
     def sags(self, outline: Outline) -> tuple[float, float]:
         """Lowest and highest of the heights that the surface inside the outline depends on (mm), and of zero."""
@@ -309,7 +325,7 @@ def weights(span: Tensor, m: int, s: float) -> tuple[tuple[Tensor, Tensor, Tenso
 class Spans:
     """Some knot spans of a net."""
 
-    m: int  # control points a side of the net
+    shape: tuple[int, int]  # control points of the net along x and along y
     pitch: tuple[float, float]  # mm
     i: Tensor  # (n,) int64, along x
     j: Tensor  # along y
@@ -318,14 +334,17 @@ class Spans:
     @classmethod
     def of(cls, surface: BSplineSurface, i: Tensor, j: Tensor) -> Spans:
         """These spans of a surface."""
-        corner, net = i * surface.m + j, surface.heights.reshape(-1)
-        heights = torch.stack([net[corner + (a * surface.m + b)] for a in range(3) for b in range(3)])
-        return cls(surface.m, surface.pitch, i=i, j=j, heights=heights)
+        (_, n), net = surface.shape, surface.heights.reshape(-1)
+        corner = i * n + j
+        heights = torch.stack([net[corner + (a * n + b)] for a in range(3) for b in range(3)])
+        return cls(surface.shape, surface.pitch, i=i, j=j, heights=heights)
 
     def jet(self, s: Sequence[float]) -> Jet:
         """At the places s x s of each; differentiable in the heights."""
         pitch_x, pitch_y = self.pitch
-        along_x, along_y = (self._weights(index, s) for index in (self.i, self.j))
+        along_x, along_y = (
+            self._weights(index, count, s) for index, count in zip((self.i, self.j), self.shape, strict=True)
+        )
         value, first, second = ([_mean(w, self.heights[b::3]) for b in range(3)] for w in along_x)
         value, first, second = ([row[:, None] for row in rows] for rows in (value, first, second))
         return Jet(
@@ -336,18 +355,19 @@ class Spans:
             z_yy=_mean(along_y[2], value) / pitch_y**2,
         )
 
-    def _weights(self, index: Tensor, s: Sequence[float]) -> list[list[Tensor]]:
-        """[derivative][basis function]: (places, n)."""
-        each = [weights(index, self.m, place) for place in s]
+    def _weights(self, index: Tensor, count: int, s: Sequence[float]) -> list[list[Tensor]]:
+        """[derivative][basis function]: (places, spans), of a basis of `count`."""
+        each = [weights(index, count, place) for place in s]
         return [[torch.stack([w[order][k] for w in each]).to(self.heights) for k in range(3)] for order in range(3)]
 
     def scattered(self, gradient: Tensor) -> Tensor:
-        """(m, m) the transpose of taking `heights`: no control point is added to twice at a time, in any order."""
-        net, corner = torch.zeros(self.m * self.m).to(gradient), self.i * self.m + self.j
+        """(m, n) the transpose of taking `heights`: no control point is added to twice at a time, in any order."""
+        m, n = self.shape
+        net, corner = torch.zeros(m * n).to(gradient), self.i * n + self.j
         for k, part in enumerate(gradient):
-            at = corner + (k // 3 * self.m + k % 3)
+            at = corner + (k // 3 * n + k % 3)
             net[at] += part
-        return net.view(self.m, self.m)
+        return net.view(m, n)
 
 
 def _mean(w: Sequence[Tensor], values: Sequence[Tensor]) -> Tensor:
@@ -357,7 +377,7 @@ def _mean(w: Sequence[Tensor], values: Sequence[Tensor]) -> Tensor:
 def span_places(surface: BSplineSurface, i: Tensor, j: Tensor, s: Sequence[float]) -> tuple[Tensor, Tensor]:
     """x and y (mm) of the same places, (k, 1, spans) and (1, k, spans)."""
     at = torch.tensor(list(s), dtype=torch.float64, device=i.device)[:, None]
-    u, v = (position(index + at, surface.m) for index in (i, j))
+    u, v = (position(index + at, count) for index, count in zip((i, j), surface.shape, strict=True))
     pitch_x, pitch_y = surface.pitch
     return (surface.x[0] + pitch_x * u)[:, None], (surface.y[0] + pitch_y * v)[None]
 
@@ -369,7 +389,7 @@ def reached_by(surface: BSplineSurface, outline: Outline, i: Tensor, j: Tensor, 
 
 
 def curvature_bounds(surface: BSplineSurface, sign: float) -> Tensor:
-    """(m - 2, m - 2) an upper bound of the principal curvatures of sign · z in each span (1/mm), where it is positive.
+    """(m - 2, n - 2) an upper bound of the principal curvatures of sign · z in each span (1/mm), where it is positive.
 
     Second derivatives are means of differences of the control points, in an end span of 1/4 to 2 times those.  A
     principal curvature is at most the eigenvalue of the Hessian, where that is positive, and the eigenvalue grows with
@@ -386,13 +406,13 @@ def curvature_bounds(surface: BSplineSurface, sign: float) -> Tensor:
 
 
 def slope_bounds(surface: BSplineSurface) -> Tensor:
-    """(m - 2, m - 2) an upper bound of |∇z| in each span; slopes are means of differences of the control points."""
+    """(m - 2, n - 2) an upper bound of |∇z| in each span; slopes are means of differences of the control points."""
     d_x, d_y = (d.abs() for d in _differences(surface))
     return torch.sqrt(_most(_most(d_x, 0, 2), 1, 3) ** 2 + _most(_most(d_y, 0, 3), 1, 2) ** 2)
 
 
 def _differences(surface: BSplineSurface) -> tuple[Tensor, Tensor]:
-    """Differences of neighbouring heights over their distance along x, (m - 1, m), and along y, (m, m - 1)."""
+    """Differences of neighbouring heights over their distance along x, (m - 1, n), and along y, (m, n - 1)."""
     h, (pitch_x, pitch_y) = surface.heights.detach(), surface.pitch
     return (h[1:] - h[:-1]) / pitch_x, (h[:, 1:] - h[:, :-1]) / pitch_y
 

@@ -13,6 +13,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import Interface, Reflect, Refract
 from bstcad.optics.outlines import EVERYWHERE, Outline
 from bstcad.optics.rays import Status
+from bstcad.optics.sides import Sides
 from bstcad.optics.surfaces import Surface
 
 
@@ -115,9 +116,9 @@ class Lens:
             lens = lens._with_surface(k, net)
         return lens
 
-    def refined(self, m: int) -> Lens:
-        """The same lens with m x m control points in each of its `nets`."""
-        return self.with_nets(net.refined(m) for net in self.nets)
+    def refined(self, sides: Sides) -> Lens:
+        """The same lens with so many control points a side, or along x and along y, in each of its `nets`."""
+        return self.with_nets(net.refined(sides) for net in self.nets)
 
     def with_heights(self, heights: Iterable[Tensor]) -> Lens:
         """The lens whose `nets` have other heights (mm)."""

@@ -316,7 +316,7 @@ def tubes_of(lens: Lens, pixels: int = 0) -> int:
     Where a cell of the net lights more than a pixel, its light changes from pixel to pixel: two tubes a pixel, four a
     cell at most.  A little more than two: lines of the net and corners of tubes do not coincide.
     """
-    return max(*(2 * max(net.m, min(pixels, 2 * net.m)) + 5 for net in lens.nets), LEAST)
+    return max(*(2 * max(net.side, min(pixels, 2 * net.side)) + 5 for net in lens.nets), LEAST)
 
 
 @dataclass(frozen=True)

@@ -94,8 +94,9 @@ def rim_breaks(surface: BSplineSurface, radius: float) -> np.ndarray:
     At most 2 pi / 256 apart.
     """
     angles = [np.linspace(0, 2 * np.pi, 257)]
-    for (first, _), pitch, quarter in zip((surface.x, surface.y), surface.pitch, (0.0, np.pi / 2), strict=True):
-        lines = first + pitch * (np.arange(1, surface.m - 2) + 0.5)  # x(t) = first + pitch (t + 1/2) inside
+    axes = zip((surface.x, surface.y), surface.pitch, surface.shape, (0.0, np.pi / 2), strict=True)
+    for (first, _), pitch, m, quarter in axes:
+        lines = first + pitch * (np.arange(1, m - 2) + 0.5)  # x(t) = first + pitch (t + 1/2) inside
         turn = np.arccos(lines[np.abs(lines) < radius] / radius)
         angles += [quarter + turn, quarter - turn]
     theta = np.sort(np.concatenate(angles) % (2 * np.pi))
@@ -159,13 +160,13 @@ def _chord_ends(face: Surface, y: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _points(face: BSplineSurface) -> int:
-    return POINTS if face.m < FINE else 2
+    return POINTS if min(face.shape) < FINE else 2
 
 
 def _smooth_parts(face: BSplineSurface, axis: int, parts: int) -> np.ndarray:
     """Breaks (mm) along an axis of a net, between which heights are nearly polynomial: knot lines and more."""
     (first, last), pitch = (face.x, face.y)[axis], face.pitch[axis]
-    lines = np.concatenate([[first], first + pitch * (np.arange(1, face.m - 2) + 0.5), [last]])
+    lines = np.concatenate([[first], first + pitch * (np.arange(1, face.shape[axis] - 2) + 0.5), [last]])
     ends = [np.linspace(*pair, END_PARTS + 1) for pair in (lines[:2], lines[-2:])]
     return np.unique(np.concatenate([divided(lines, parts), *ends]))
 

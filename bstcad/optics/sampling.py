@@ -19,6 +19,7 @@ from torch import Tensor
 
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.outlines import Outline, Rectangle
+from bstcad.optics.sides import Sides, both
 
 STRIP = 1 << 18  # points a strip, about
 STRIDE = 0x9E3779B97F4A7C15  # 2^64 over the golden ratio
@@ -26,10 +27,10 @@ MIX_1, MIX_2 = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
 GOLDEN, TURN = 0.6180339887498949, 0.7548776662466927  # 1/g of g² = g + 1 and of g³ = g + 1
 
 
-def grid(window: Rectangle, n: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
-    """Centres of n x n equal cells, each (n, n), x along the first axis."""
-    centres = (torch.arange(n, dtype=dtype) + 0.5) / n - 0.5
-    x, y = torch.meshgrid(centres * window.width, centres * window.height, indexing="ij")
+def grid(window: Rectangle, sides: Sides, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
+    """Centres of equal cells, so many a side or along x and along y, each (along x, along y)."""
+    along_x, along_y = ((torch.arange(n, dtype=dtype) + 0.5) / n - 0.5 for n in both(sides))
+    x, y = torch.meshgrid(along_x * window.width, along_y * window.height, indexing="ij")
     return x.contiguous(), y.contiguous()
 
 

@@ -1,6 +1,6 @@
 """Ray tubes: a sheet of rays whose quads carry the light between them, cut exactly at the pixel borders.
 
-The corners of a grid of (n, n) tubes are traced to the screen.  A tube of flux F lands on two triangles with F / 2
+The corners of a grid of tubes are traced to the screen.  A tube of flux F lands on two triangles with F / 2
 each, spread evenly over their areas, and each pixel takes the part that falls into it.  The picture has no noise: its
 error is that of the linear interpolation between the corners and falls as the square of their distance.  It is
 differentiable in the landing points, whereas the counting of rays in a pixel is not.
@@ -23,6 +23,7 @@ from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed, Rays, Status, TargetPlane
+from bstcad.optics.sides import Sides, both, spread
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import across, from_first_net, gets_through
 
@@ -43,8 +44,8 @@ SINGULAR = 0.1  # Broyden's update is skipped where its divisor is less than thi
 class Tubes:
     """The light on its way to the first freeform interface, as tubes between neighbouring rays."""
 
-    coming: Rays  # (3, n + 1, n + 1) the corners; the flux of a corner is the share that faces and glass leave of it
-    flux: Tensor  # (n, n) launched in each tube, as a fraction of the source's
+    coming: Rays  # (3, rows + 1, columns + 1) the corners; their flux is the share that faces and glass leave
+    flux: Tensor  # (rows, columns) launched in each tube, as a fraction of the source's
 
     def landing(self, lens: Lens, plane: TargetPlane) -> Landed:
         """Where the corners meet the plane; the outline counts in the flux, so that no corner is lost to it."""
@@ -58,11 +59,11 @@ class Tubes:
         return collect(screen.pixels_of(corners.position.double()), self.whole(corners), screen.shape)
 
     def carried(self, corners: Landed) -> Tensor:
-        """(n, n) flux that faces and glass leave each tube, whether it arrives or not."""
+        """(rows, columns) flux that faces and glass leave each tube, whether it arrives or not."""
         return self.flux * middle(corners.flux) if corners.taken else self.flux
 
     def whole(self, corners: Landed) -> Tensor:
-        """(n, n) flux that arrives: of tubes whose corners all arrive, zero of the others."""
+        """(rows, columns) flux that arrives: of tubes whose corners all arrive, zero of the others."""
         return arriving(self.carried(corners), corners)
 
     def picture(self, lens: Lens, screen: Screen) -> Tensor:
@@ -74,6 +75,8 @@ class Tubes:
 def launch_tubes(source: Source, lens: Lens, n: int) -> Tubes:
     """n x n tubes that hold all the light which gets through both faces of the lens.
 
+    Across a net of another number of control points along x than along y there are about as many, in the proportion of
+    its spans under the light.
     The sheet is spread over the beam's cross-section if all of that gets through, else over the back face: its rim is
     the rim of the light.  A tube in which only part of the light gets through carries that part, spread over all of it.
     """
@@ -85,7 +88,7 @@ def launch_tubes(source: Source, lens: Lens, n: int) -> Tubes:
 def picture(
     source: Source, lens: Lens, screen: Screen, n: int, few: int = SHEET, over_the_back: bool = False
 ) -> Tensor:
-    """(rows, columns) flux that falls into each pixel by n x n tubes, band by band: memory does not grow with n².
+    """(rows, columns) flux in each pixel by n x n tubes (`launch_tubes`), band by band: memory does not grow with n².
 
     few: tubes a side of the sheet through which finer ones are interpolated, where the lens cuts the beam.
     over_the_back: spread them there even where the lens cuts nothing, so that pictures of lenses that differ little err
@@ -93,8 +96,8 @@ def picture(
     """
     sheet = _sheet(source, lens, n, few=few, over_the_back=over_the_back)
     whole = torch.zeros(screen.shape, dtype=torch.float64, device=lens.like.device)
-    for first in range(0, n, BAND):
-        band = sheet.rows(slice(first, min(first + BAND, n) + 1))
+    for first in range(0, sheet.count, BAND):
+        band = sheet.rows(slice(first, min(first + BAND, sheet.count) + 1))
         x, y = (p + INWARDS * (middle - p) for p, middle in zip(band, sheet.middle, strict=True))
         whole = whole + _tubes(source, lens, x=x, y=y, cut=sheet.cut).picture(lens, screen)
     return whole.clamp(min=0)  # a black pixel may be off by rounding
@@ -102,9 +105,10 @@ def picture(
 
 @dataclass(frozen=True)
 class _Sheet:
-    """Where the corners of (n, n) tubes cross the vertex plane of the first surface."""
+    """Where the corners of tubes cross the vertex plane of the first surface."""
 
     rows: Callable[[slice], tuple[Tensor, Tensor]]  # (x, y) of some rows of them (mm)
+    count: int  # rows of tubes, along x
     middle: tuple[float, float]  # of all (mm)
     cut: bool  # does the lens cut the beam?
 
@@ -150,8 +154,10 @@ def _over_the_beam(source: Source, lens: Lens, n: int) -> _Sheet | None:
     spot, centre = source.spot(z)
     if spot is None:
         return None
-    ends = (slice(0, 1), ALL), (slice(n, None), ALL), (ALL, slice(0, 1)), (ALL, slice(n, None))
-    sides = zip(*(corners(spot, n, *end) for end in ends), strict=True)
+    count = _proportioned(lens, spot, n)
+    n_x, n_y = both(count)
+    ends = (slice(0, 1), ALL), (slice(n_x, None), ALL), (ALL, slice(0, 1)), (ALL, slice(n_y, None))
+    sides = zip(*(corners(spot, count, *end) for end in ends), strict=True)
     rim = (
         at + (1 - INWARDS) * torch.cat([p.reshape(-1) for p in side]) for side, at in zip(sides, centre, strict=True)
     )
@@ -160,10 +166,10 @@ def _over_the_beam(source: Source, lens: Lens, n: int) -> _Sheet | None:
         return None
 
     def rows(band: slice) -> tuple[Tensor, Tensor]:
-        x, y = corners(spot, n, band)
+        x, y = corners(spot, count, band)
         return x + centre[0], y + centre[1]
 
-    return _Sheet(rows, centre, cut=False)
+    return _Sheet(rows, n_x, centre, cut=False)
 
 
 def _over_the_back(source: Source, lens: Lens, n: int, few: int) -> _Sheet:
@@ -173,14 +179,24 @@ def _over_the_back(source: Source, lens: Lens, n: int, few: int) -> _Sheet:
     """
     from scipy.interpolate import RectBivariateSpline  # with much else, which a plan has no use for
 
-    few = min(n, few)
-    x, y, _ = rays_to(source, lens, *corners(lens.apertures[1], few))
+    n_x, n_y = both(_proportioned(lens, lens.apertures[1], n))
+    few_x, few_y = min(n_x, few), min(n_y, few)
+    x, y, _ = rays_to(source, lens, *corners(lens.apertures[1], (few_x, few_y)))
     middle = tuple(float(total(p) / p.numel()) for p in (x, y))
-    if few == n:
-        return _Sheet(lambda band: (x[band], y[band]), middle, cut=True)
-    places, fine = np.linspace(0, 1, few + 1), np.linspace(0, 1, n + 1)
-    through = [RectBivariateSpline(places, places, p.cpu().numpy(), s=0) for p in (x, y)]
-    return _Sheet(lambda band: tuple(torch.from_numpy(p(fine[band], fine)) for p in through), middle, cut=True)
+    if (few_x, few_y) == (n_x, n_y):
+        return _Sheet(lambda band: (x[band], y[band]), n_x, middle, cut=True)
+    places = [np.linspace(0, 1, k + 1) for k in (few_x, few_y)]
+    fine_x, fine_y = (np.linspace(0, 1, k + 1) for k in (n_x, n_y))
+    through = [RectBivariateSpline(*places, p.cpu().numpy(), s=0) for p in (x, y)]
+    return _Sheet(lambda band: tuple(torch.from_numpy(p(fine_x[band], fine_y)) for p in through), n_x, middle, cut=True)
+
+
+def _proportioned(lens: Lens, light: Outline, n: int) -> Sides:
+    """n a side; over an oblong net about n² in the proportion of the spans of it that an outline holds each way."""
+    net = lens.nets[-1]
+    if net.shape[0] == net.shape[1]:
+        return n
+    return spread(n, *(half / pitch for half, pitch in zip(light.half_extent, net.pitch, strict=True)))
 
 
 def _quads(p: Tensor, where: Tensor) -> tuple[Tensor, ...]:
@@ -206,10 +222,10 @@ def _getting_through(source: Source, lens: Lens, x: Tensor, y: Tensor) -> Tensor
     return source.irradiance(x, y, lens.entrance.z) * gets_through(source.rays(x, y, lens.entrance.z, 1.0), lens)
 
 
-def corners(shape: Outline, n: int, rows: slice = ALL, columns: slice = ALL) -> tuple[Tensor, Tensor]:
-    """(n + 1)² points that cover a shape to its rim, neighbours beside each other; x along the first axis (mm)."""
-    unit = torch.linspace(-1, 1, n + 1, dtype=torch.float64)
-    return shape.map_square(*torch.meshgrid(unit[rows], unit[columns], indexing="ij"))
+def corners(shape: Outline, sides: Sides, rows: slice = ALL, columns: slice = ALL) -> tuple[Tensor, Tensor]:
+    """The corners of so many tubes, which cover a shape to its rim; x along the first axis (mm)."""
+    along_x, along_y = (torch.linspace(-1, 1, n + 1, dtype=torch.float64) for n in both(sides))
+    return shape.map_square(*torch.meshgrid(along_x[rows], along_y[columns], indexing="ij"))
 
 
 def arriving(flux: Tensor, corners: Landed) -> Tensor:
@@ -229,7 +245,7 @@ def area_of(x: Tensor, y: Tensor) -> Tensor:
 
 @torch.no_grad()
 def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor, number: int | None = None) -> tuple[Tensor, Tensor, Rays]:
-    """The rays that meet an interface of the lens at the points (x, y) (n, n) mm.
+    """The rays that meet an interface of the lens at the points (x, y) (rows, columns) mm.
 
     Returns where they cross the vertex plane of the first surface (mm), and the rays at the interface, before they
     cross it.  number: of the interface; None: the back.  The points are neighbours on a grid.
@@ -261,12 +277,13 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor, number: int | None
         return [yy / det, -xy / det, -yx / det, xx / det]
 
     p, q, inverse, last = x, y, None, None
-    n = x.shape[0]
-    if n > 2 * COARSE and not arrive(x[:1, :1], y[:1, :1], z[:1, :1]).axial:  # along the axis x and y are the answer
-        some = torch.linspace(0, n - 1, COARSE).round().long()
-        c_p, c_q, _ = rays_to(source, lens, x=x[some][:, some], y=y[some][:, some], number=number)
-        inverse = [_between(some, n, t) for t in jacobian(c_p, c_q, z[some][:, some])]
-        p, q = (_between(some, n, t) for t in (c_p, c_q))
+    # along the axis x and y are the answer
+    if max(x.shape) > 2 * COARSE and not arrive(x[:1, :1], y[:1, :1], z[:1, :1]).axial:
+        some = tuple(torch.linspace(0, n - 1, min(n, COARSE)).round().long() for n in x.shape)
+        few = torch.meshgrid(*some, indexing="ij")
+        c_p, c_q, _ = rays_to(source, lens, x=x[few], y=y[few], number=number)
+        inverse = [_between(some, x.shape, t) for t in jacobian(c_p, c_q, z[few])]
+        p, q = (_between(some, x.shape, t) for t in (c_p, c_q))
     for _ in range(REVERSE_STEPS):
         hit = arrive(p, q, z)
         off_x, off_y = x - hit.position[0], y - hit.position[1]
@@ -299,13 +316,13 @@ def _improved(inverse: list[Tensor], step: tuple[Tensor, Tensor], moved: tuple[T
     return [xx + off_x * row_x, xy + off_x * row_y, yx + off_y * row_x, yy + off_y * row_y]
 
 
-def _between(some: Tensor, n: int, t: Tensor) -> Tensor:
-    """(n, n) linear interpolation along both axes of t (k, k), given in the rows and columns `some` of n."""
-    rows = torch.arange(n)
-    right = torch.searchsorted(some, rows, right=True).clamp(1, len(some) - 1)
-    share = ((rows - some[right - 1]).double() / (some[right] - some[right - 1])).to(t)
-    right = right.to(t.device)
-    for _ in range(2):  # each turn takes one axis and swaps the two
+def _between(some: tuple[Tensor, Tensor], shape: tuple[int, ...], t: Tensor) -> Tensor:
+    """(rows, columns) linear interpolation along both axes of t, given in `some` rows and columns."""
+    for known, n in zip(some, shape, strict=True):  # each turn takes one axis and swaps the two
+        wanted = torch.arange(n)
+        right = torch.searchsorted(known, wanted, right=True).clamp(1, len(known) - 1)
+        share = ((wanted - known[right - 1]).double() / (known[right] - known[right - 1])).to(t)
+        right = right.to(t.device)
         t = (torch.lerp(t[right - 1], t[right], share[:, None])).T
     return t.contiguous()
 

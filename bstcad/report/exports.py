@@ -64,14 +64,14 @@ def export(
 ) -> list[Path]:  # fmt: skip
     """Write the files of these kinds, but SHEET, to the folder, each whole or not at all; their paths.
 
-    points: along the wider side of grids, by default as many as the net of the back has; label: name of meshes and of a
-    part; mount: drawings show the part that it makes; None: the lens's outline.
+    points: along the wider side of grids, by default as many as the net of the back has; label: name of meshes and
+    of a part; mount: drawings show the part that it makes; None: the lens's outline.
     ValueError names the kind or number that is not possible.
     """
     for kind in kinds:
         if kind not in ALL:
             raise ValueError(f"'{kind}' is nothing that can be exported; give one of {', '.join(ALL)}")
-    points = lens.back.m if points is None else points
+    points = max(lens.back.shape) if points is None else points
     if not FEWEST <= points <= MOST:
         raise ValueError(f"{points} points a side are not possible; give {FEWEST} to {MOST}")
     lens, written = lens.plain(), []
@@ -171,12 +171,12 @@ def on_grid(face: BSplineSurface, x: np.ndarray, y: np.ndarray) -> tuple[np.ndar
     derivative is the same product with derivatives of one or both bases.
     """
     bases = []
-    for at, (low, _), pitch in zip((x, y), (face.x, face.y), face.pitch, strict=True):
-        u = np.clip((at - low) / pitch, 0.0, face.m - 1.0)
-        bases.append((basis_matrix(u, face.m), basis_matrix(u, face.m, derivative=1) / pitch))
+    for at, (low, _), pitch, m in zip((x, y), (face.x, face.y), face.pitch, face.shape, strict=True):
+        u = np.clip((at - low) / pitch, 0.0, m - 1.0)
+        bases.append((basis_matrix(u, m), basis_matrix(u, m, derivative=1) / pitch))
     (b_x, d_x), (b_y, d_y) = bases
     heights = face.plain().heights.numpy()
-    along, across = b_x @ heights, d_x @ heights  # (len(x), m)
+    along, across = b_x @ heights, d_x @ heights  # (len(x), n)
     return face.z + (b_y @ along.T).T, (b_y @ across.T).T, (d_y @ along.T).T, (d_y @ across.T).T
 
 

@@ -56,7 +56,7 @@ Place = tuple[float, float, float]
 
 def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str, Any]:
     """Of `lens` as it was designed for `scene`; shape: of bstcad.analysis.shape, and the volume."""
-    front, material, m = lens.front, scene.lens.material, lens.back.m
+    front, material = lens.front, scene.lens.material
     curvature = None if front.is_net else float(front.curvature)
     constant, heavy = front.parameters().get("conic_constant"), density(material) if material else None
     return {
@@ -71,9 +71,9 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "back": _face("bspline", vertex(lens)),
         "reflects": lens.reflects,  # is it a mirror, whose back is the face that light meets?
         "net": {
-            "control_points": (m, m),  # along x and y
+            "control_points": lens.back.shape,  # along x and y
             "degree": DEGREE,
-            "knots": f"0, 0, 0, 1, 2, …, {m - 3}, {m - 2}, {m - 2}, {m - 2}",  # in either direction
+            "knots": _knots(lens.back.shape),
             "x": lens.back.x,  # between which the net lies; beyond the rim of a round lens
             "y": lens.back.y,
         },
@@ -85,6 +85,12 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "source": _known(asdict(scene.source)),
         "target": _known(scene.target.model_dump(mode="json")),
     }
+
+
+def _knots(shape: tuple[int, int]) -> str:
+    """The knots in either direction, or along x and along y where these differ."""
+    each = [f"0, 0, 0, 1, 2, …, {m - 3}, {m - 2}, {m - 2}, {m - 2}" for m in shape]
+    return each[0] if each[0] == each[1] else f"{each[0]} along x; {each[1]} along y"
 
 
 def _face(kind: str, z: float, curvature: float | None = None, constant: float | None = None) -> dict[str, Any]:

@@ -100,11 +100,11 @@ def names(path: Path) -> list[str]:
 
 
 def net(path: Path, most: int) -> np.ndarray:
-    """control_points (m, m, 3) as float64 from an .npz archive, m at most `most`; raises as `arrays` does."""
+    """control_points (m, n, 3) as float64 from an .npz archive, m, n at most `most`; raises as `arrays` does."""
     with zipfile.ZipFile(io.BytesIO(contents(path, LARGEST))) as archive:
         with archive.open("control_points.npy") as file:
-            (m, *_), _ = _header(file, "control_points")
-        return _array(archive, "control_points", (min(m, most), min(m, most), 3))
+            (m, n, *_), _ = _header(file, "control_points")
+        return _array(archive, "control_points", (min(m, most), min(n, most), 3))
 
 
 def _array(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...]) -> np.ndarray:

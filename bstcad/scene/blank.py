@@ -17,10 +17,11 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag
 from bstcad.optics.key import Key
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
+from bstcad.optics.sides import Sides, both, plain
 from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface
 from bstcad.runs import files
 from bstcad.scene.errors import SceneError
-from bstcad.scene.schema import COORDINATES, LENGTHS, Record, from_file
+from bstcad.scene.schema import COORDINATES, LENGTHS, OneOrTwo, Record, from_file
 from bstcad.step_text import part21
 
 if TYPE_CHECKING:  # which loads numba
@@ -39,6 +40,7 @@ ROUNDING = 1e-12  # mm; a net whose vertex is so near to zero is measured from t
 LARGEST_NET = 2049  # control points a side
 FITTED = 1e-6  # mm; how far the net that stands for a surface of one's own may lie from it, as accept.form has it
 FITS = (129, 257, 513, 1025)  # control points a side of such a net, tried in turn
+OBLONG = 1.5  # a cell of the net longer than so many times its width is doubted
 FEWEST_ROUND = 6  # of a round lens: with 5 its net, two spans past the rim each way, has no extent
 
 Outlined = Annotated[Rectangle | Circle, Field(discriminator="shape")]
@@ -51,10 +53,10 @@ Outlined = Annotated[Rectangle | Circle, Field(discriminator="shape")]
 class GivenNet:
     """A B-spline surface with its vertex at z = 0; the scene keeps it whole, so that a design can be repeated."""
 
-    m: int  # control points a side
+    shape: tuple[int, int]  # control points along x and along y
     x: tuple[float, float]  # extent (mm)
     y: tuple[float, float]
-    data: bytes = field(repr=False)  # heights (m, m) over the vertex (mm), x along the first axis, as float64
+    data: bytes = field(repr=False)  # heights (m, n) over the vertex (mm), x along the first axis, as float64
 
     @classmethod
     def of(cls, surface: BSplineSurface) -> GivenNet:
@@ -62,17 +64,17 @@ class GivenNet:
         resting = surface.plain().moved(0.0)
         vertex = resting.from_vertex()
         heights = (vertex if abs(vertex.z) > ROUNDING else resting).heights
-        return cls(surface.m, tuple(surface.x), tuple(surface.y), heights.numpy().astype("<f8").tobytes())
+        return cls(surface.shape, tuple(surface.x), tuple(surface.y), heights.numpy().astype("<f8").tobytes())
 
     def surface(self, z: float) -> BSplineSurface:
         """The surface with its vertex at z (mm)."""
         from bstcad.optics.bspline import BSplineSurface
 
-        heights = np.frombuffer(self.data, "<f8").reshape(self.m, self.m).astype(np.float64)
+        heights = np.frombuffer(self.data, "<f8").reshape(self.shape).astype(np.float64)
         return BSplineSurface(z, torch.from_numpy(heights), self.x, self.y)
 
     def archive(self) -> bytes:
-        """An .npz file that `read_net` reads as this net: control_points (m, m, 3) in mm."""
+        """An .npz file that `read_net` reads as this net: control_points (m, n, 3) in mm."""
         file = io.BytesIO()
         np.savez_compressed(file, control_points=self.surface(0.0).control_points())
         return file.getvalue()
@@ -90,10 +92,10 @@ def read_net(path: Path) -> GivenNet:
         net = _net_of_step(path) if path.suffix.lower() in (".step", ".stp") else files.net(path, LARGEST_NET)
     except Exception as error:  # numpy, zipfile, zlib and tokenize each raise their own for a damaged file
         raise SceneError(f"lens.front.file: {name} cannot be read ({files.first_line(error)}); {NET_REMEDY}") from None
-    m = len(net)
-    ends = ((net[0, 0, i], net[-1, -1, i]) for i in (0, 1))
-    uniform = np.stack(np.meshgrid(*(np.linspace(*end, m) for end in ends), indexing="ij"), axis=-1)
-    if m < SMALLEST_NET or not np.isfinite(net).all() or not np.abs(net[..., :2] - uniform).max() <= UNIFORM:
+    shape = net.shape[:2]
+    axes = (np.linspace(net[0, 0, i], net[-1, -1, i], count) for i, count in enumerate(shape))
+    uniform = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    if min(shape) < SMALLEST_NET or not np.isfinite(net).all() or not np.abs(net[..., :2] - uniform).max() <= UNIFORM:
         raise SceneError(f"lens.front.file: {name} holds no net of a design; {NET_REMEDY}")
     return GivenNet.of(BSplineSurface.from_control_points(net, 0.0))
 
@@ -102,10 +104,11 @@ def _net_of_step(path: Path) -> np.ndarray:
     from bstcad.optics.bspline import knots
 
     text = part21.read(path)
-    surface, m = text.surface, len(text.surface.control_points)
-    if text.unit != "millimetre" or surface.control_points.shape != (m, m, 3):
-        raise ValueError(f"no plain square net in millimetres, but {surface.control_points.shape[:2]} in {text.unit}")
-    if surface.degrees != (2, 2) or not all(np.array_equal(full, knots(m)) for full in surface.full_knots):
+    surface, shape = text.surface, text.surface.control_points.shape[:2]
+    if text.unit != "millimetre":
+        raise ValueError(f"its lengths are in {text.unit}, not in millimetres")
+    ours = (np.array_equal(full, knots(m)) for full, m in zip(surface.full_knots, shape, strict=True))
+    if surface.degrees != (2, 2) or not all(ours):
         raise ValueError("its freeform face has other knots than bstcad's")
     return surface.control_points
 
@@ -224,7 +227,7 @@ class GivenFront(_Front):
 
     def complaints(self, outline: Outline) -> Iterator[str]:
         """It is that of a lens of another outline; a net may also end at the sides of a rectangle."""
-        own, sides = net_extent(outline, self.file.m), outline.half_extent
+        own, sides = net_extent(outline, self.file.shape), outline.half_extent
         for name, ends, half, side in zip("xy", (self.file.x, self.file.y), own, sides, strict=True):
             known = (half,) if outline.is_round else (half, side)
             if min(max(abs(ends[0] + end), abs(ends[1] - end)) for end in known) > UNIFORM:
@@ -273,16 +276,16 @@ def fitted(surface: Surface, outline: Outline) -> BSplineSurface:
     )
 
 
-def net_extent(outline: Outline, m: int) -> tuple[float, float]:
-    """Half the width of a net of m x m control points in x and y (mm): it reaches two spans past the rim of the lens.
+def net_extent(outline: Outline, net: Sides) -> tuple[float, float]:
+    """Half the width of a net in x and y (mm): it reaches two spans past the rim of the lens.
 
     So x(t) is linear all over the lens.  In the end spans x(t) is quadratic, and the slope z'(t) / x'(t) a Möbius
     function of t, whose derivative grows eightfold inwards across 1.5 control points, whatever the heights: the light's
     rim would be too bright, and dark beside it.  A net of 5 has no spans to spare.
     """
-    reach = (m - 1) / (m - 5) if m > 5 else 1.0
-    half_x, half_y = outline.half_extent
-    return reach * half_x, reach * half_y
+    reach = ((m - 1) / (m - 5) if m > 5 else 1.0 for m in both(net))
+    half_x, half_y = (share * half for share, half in zip(reach, outline.half_extent, strict=True))
+    return half_x, half_y
 
 
 Front = Annotated[
@@ -299,8 +302,21 @@ class Back(Record):
 
     kind: Annotated[Literal["bspline"], Key("The freeform face that bstcad finds.")] = "bspline"
     z: Annotated[float, Key("Place of the flat face before tailoring.", "mm", *COORDINATES, example=20.0)]
-    control_points: Annotated[int, Key("Control points of the net along each side.", "", 5, 2049, example=257)]
+    control_points: Annotated[
+        OneOrTwo | None,
+        Key("Control points of the net along each side, or [along x, along y]; chosen if absent.", "", 5, 2049,
+            example=257),
+    ] = None
     reflect: Annotated[bool, Key("A mirror: light comes along -z and goes back along +z.")] = False
+
+    @property
+    def net(self) -> Sides:
+        """Control points a side, or along x and along y if these differ; SceneError where they are left out."""
+        if self.control_points is None:
+            raise SceneError(
+                "lens.back.control_points: left out, and nothing has chosen it yet; use bstcad.design, or give a number"
+            )
+        return plain(self.control_points)
 
 
 @dataclass(frozen=True)
@@ -375,6 +391,28 @@ class LensBlank(Record):
         """Lowest and highest sag of the front inside the outline (mm), and zero."""
         return self.front.surface.sags(self.outline)
 
+    @property
+    def cells(self) -> tuple[float, float]:
+        """Width and height of a cell of the net (mm)."""
+        half_x, half_y = net_extent(self.outline, self.back.net)
+        m, n = both(self.back.net)
+        return 2 * half_x / (m - 1), 2 * half_y / (n - 1)
+
+    def doubts(self) -> Iterator[str]:
+        """Oblong cells: along their longer side the net carries less detail than it could with as many points."""
+        if self.back.control_points is None:
+            return
+        (width, height), (m, n) = self.cells, both(self.back.net)
+        if max(width, height) <= OBLONG * min(width, height):
+            return
+        even = math.sqrt(width * height)
+        better = [round((points - 1) * side / even) + 1 for points, side in ((m, width), (n, height))]
+        if min(better) >= FEWEST_ROUND and max(better) <= LARGEST_NET:
+            yield (
+                f"lens.back.control_points: cells of {width:.3g} x {height:.3g} mm; {better} makes them square with as "
+                "many points"
+            )
+
     def complaints(self) -> Iterator[str]:
         """Everything that is wrong with the table by itself."""
         given = [name for name in ("material", "index") if getattr(self, name) is not None]
@@ -382,9 +420,13 @@ class LensBlank(Record):
             yield f"lens: light does not enter a mirror (back.reflect), so it has no {given[0]}; remove it"
         if not self.back.reflect and len(given) != 1:
             yield 'lens: needs exactly one of material and index; give for example material = "PMMA"'
-        if self.outline.is_round and self.back.control_points < FEWEST_ROUND:
-            few = f"{self.back.control_points} are too few for a round lens, whose net reaches two spans beyond its rim"
-            yield f"lens.back.control_points: {few}; give {FEWEST_ROUND} or more"
+        m, n = both(self.back.control_points or FEWEST_ROUND)
+        points = "lens.back.control_points"
+        if self.outline.is_round and m != n:
+            yield f"{points}: a round lens takes a square net, not one of {m} x {n}; give one number"
+        if self.outline.is_round and m < FEWEST_ROUND:
+            few = f"{m} are too few for a round lens, whose net reaches two spans beyond its rim"
+            yield f"{points}: {few}; give {FEWEST_ROUND} or more"
         yield from (f"lens.front.{complaint}" for complaint in self.front.complaints(self.outline))
         (falls, rises), least, most = self.front_sags, self.min_thickness, self.max_thickness
         highest = "thinnest place" if self.front.surface.is_net else "rim"

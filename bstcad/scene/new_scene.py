@@ -38,7 +38,6 @@ class Light:
     name: str  # the word of the option --light
     of: str
     header: str  # which light that is; {before}: mm before the plate
-    points: int = 257  # control points a side
     pixels: int = 256
     size: float = 0.0  # mm of a lamp, degrees of parallel light; 0: the picture is as sharp as its pixels
     square: bool = False  # a chip; else a disc

@@ -8,8 +8,9 @@ from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 from bstcad.optics.key import Key
+from bstcad.optics.sides import FEWEST, Sides, both, coarser, side
 from bstcad.scene.blank import LensBlank
-from bstcad.scene.schema import Record
+from bstcad.scene.schema import OneOrTwo, Record
 
 COMMON = {"method": "least-squares", "transport_iterations": 40, "stage1_iterations": 1000, "rounds": 10}
 OURS = COMMON | {"overshoot": 0.03, "precision": "float64"}
@@ -44,7 +45,8 @@ class Tailoring(Record):
         ),
     ] = None
     levels: Annotated[
-        tuple[int, ...] | None, Key("Control points a side, coarse to fine.", "", 5, 2049, example=[129, 257])
+        tuple[OneOrTwo, ...] | None,
+        Key("Nets, coarse to fine: control points along the longer side, or [x, y].", "", 5, 2049, example=[129, 257]),
     ] = None
     transport_grid: Annotated[int | None, Key("Cells a side of the transport problem.", "", 16, 2049, example=512)] = (
         None
@@ -72,29 +74,44 @@ class Tailoring(Record):
         float | None, Key("Time from command to report; stage 1 runs whole.", "s", 1.0, 1e7, example=60.0)
     ] = None
 
-    def resolved(self, control_points: int) -> Tailoring:
-        """The same with every knob set.
+    @property
+    def points_of_source(self) -> int:
+        """That stand for an extended source, whatever the net."""
+        return self.source_points or PRESETS[self.quality]["source_points"]
 
+    @property
+    def side(self) -> int:
+        """Control points a side of the square net of as many as the finest of `levels` has; of a resolved one."""
+        return side(self.levels[-1])
+
+    def resolved(self, net: Sides) -> Tailoring:
+        """The same with every knob set, for a net of so many control points a side, or along x and along y.
+
+        Levels of an oblong net are pairs, with cells of the shape that the net's have.
         If not given: at least two rays a control cell each way (a draft: in all), at most two cells of the transport.
         """
-        preset = dict(PRESETS[self.quality], levels=coarse_to_fine(control_points))
+        levels = tuple(level if isinstance(level, tuple) else coarser(net, level) for level in self.levels or ())
+        preset = dict(PRESETS[self.quality], levels=levels or coarse_to_fine(net))
         # fewer than two each way leave a checkerboard that no ray sees; a draft's few steps do not get that far
         each_way = 2**0.5 if self.quality == "draft" else 2
-        preset["rays"] = max(preset["rays"], math.ceil(each_way * control_points))
+        preset["rays"] = max(preset["rays"], math.ceil(each_way * side(net)))
         if (self.method or preset["method"]) == "integration":
             preset["stage2_iterations"] = 0
         if self.quality != "paper":  # no net follows a finer map, which folds in corners
-            preset["transport_grid"] = min(preset["transport_grid"], max(2 * (control_points - 1), COARSEST_GRID))
-        return Tailoring.model_validate(preset | self.model_dump(exclude_none=True))
+            preset["transport_grid"] = min(preset["transport_grid"], max(2 * (max(both(net)) - 1), COARSEST_GRID))
+        given = self.model_dump(exclude_none=True, exclude={"levels"})
+        return Tailoring.model_validate(preset | given)
 
     def complaints(self, lens: LensBlank) -> Iterator[str]:
         """Levels that do not lead to the net, and keys that the method cannot keep to."""
-        m, levels = lens.back.control_points, self.levels
-        if levels is not None and levels[-1:] != (m,):
-            yield f"tailoring.levels: must end with the back's control_points, {m}; add it at the end"
-        if any(coarse >= fine for coarse, fine in pairwise(levels or ())):
+        levels, stated = self.levels, lens.back.control_points is not None
+        net = lens.back.net if stated else (levels or (FEWEST,))[-1]
+        most = max(both(net))
+        if levels is not None and levels[-1:] not in ((net,), (most,)):
+            yield f"tailoring.levels: must end with the back's control_points, {most}; add it at the end"
+        if any(max(both(coarse)) >= max(both(fine)) for coarse, fine in pairwise(levels or ())):
             yield f"tailoring.levels: {list(levels)} does not grow; list the nets from coarse to fine"
-        who, other = WHOLE.get(self.resolved(m).method, ("", ""))
+        who, other = WHOLE.get(self.resolved(net).method, ("", ""))
         for name in ("accuracy", "max_time"):
             if who and getattr(self, name) is not None:
                 yield f"tailoring.{name}: {who} runs to its end; remove it or choose another {other}"
@@ -107,9 +124,10 @@ class Tailoring(Record):
             yield f"tailoring.stage2_iterations: {who} is followed by no stage 2; remove it or choose another {other}"
 
 
-def coarse_to_fine(control_points: int) -> tuple[int, ...]:
-    """Nets of 33, 129 and 513 control points as far as they are clearly coarser, then the net itself."""
-    return (*(m for m in (33, 129, 513) if 1.5 * m < control_points), control_points)
+def coarse_to_fine(net: Sides) -> tuple[Sides, ...]:
+    """Nets of 33, 129 and 513 control points (along the longer side) as far as clearly coarser, then the net itself."""
+    most = max(both(net))
+    return (*(coarser(net, m) for m in (33, 129, 513) if 1.5 * m < most), net)
 
 
 # ---- [[tolerance]]: none by default; a later table goes before an earlier one ---------------------------------------

@@ -31,6 +31,7 @@ from bstcad.optics.key import Key
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import TiltedPlane
+from bstcad.optics.sides import Sides, both
 from bstcad.optics.sources import Collimated, Point, Source
 from bstcad.runs import files
 from bstcad.scene import effects, mount, picture
@@ -155,7 +156,7 @@ class Scene(Record):
 
     def warnings(self) -> tuple[str, ...]:
         """Sentences on settings that are possible but perhaps not meant."""
-        doubts = [*_metres(self.target, self.lens)]
+        doubts = [*_metres(self.target, self.lens), *self.lens.doubts()]
         if isinstance(self.source, Collimated):
             key = "mount.rim" if self.mount and self.mount.rim else "lens.outline"
             doubts += _beam(self.source.aperture, self.rim, key)
@@ -194,12 +195,18 @@ class Scene(Record):
         plane = TiltedPlane(self.target.screen.middle, self.target.tilt or (0.0, 0.0))
         return -plane.height((0.0, 0.0, highest)) - self.lens.outline.reach(*plane.axes[2][:2])
 
-    def flat_lens(self, m: int, dtype: torch.dtype = torch.float64, device: str | torch.device = "cpu") -> Lens:
-        """The lens before tailoring, its back a flat net of m x m control points as wide as the scene's own net."""
+    def flat_lens(
+        self, net: Sides, dtype: torch.dtype = torch.float64, device: str | torch.device = "cpu",
+        as_wide_as: Sides | None = None,
+    ) -> Lens:  # fmt: skip
+        """The lens before tailoring, its back a flat net of so many control points a side, or along x and along y.
+
+        as_wide_as: the net that it is the first level of, whose spare spans past the rim it has (default: itself).
+        """
         from bstcad.optics.bspline import BSplineSurface  # loads numba, which a scene alone does not need
 
-        half_x, half_y = net_extent(self.lens.outline, self.lens.back.control_points)
-        heights = torch.zeros((m, m), dtype=dtype, device=device)
+        half_x, half_y = net_extent(self.lens.outline, as_wide_as or net)
+        heights = torch.zeros(both(net), dtype=dtype, device=device)
         back = BSplineSurface(self.lens.back.z, heights, (-half_x, half_x), (-half_y, half_y))
         front = self.lens.front.surface.to(heights.dtype, device)
         return self.as_mounted(Lens(front, back, self.lens.outline, self.index, reflects=self.lens.back.reflect))
@@ -214,7 +221,7 @@ class Scene(Record):
         points: of an extended source, shared out among its lines (default: tailoring.source_points); draw: which ones.
         """
         if points is None:
-            points = self.tailoring.resolved(self.lens.back.control_points).source_points
+            points = self.tailoring.points_of_source
         return self._with_losses(channels_of(self.source, self.lens.index_at, points, draw))
 
     def judging_channels(self) -> tuple[Channel, ...]:
@@ -272,12 +279,12 @@ class Scene(Record):
     def toml(self) -> str:
         """The scene as a file that loads to an equal scene; an image is named by the basename of its copy."""
         unused = set() if self.source.extent else {"source_points"}
-        knobs = self.tailoring.resolved(self.lens.back.control_points)
-        knobs = knobs.model_dump(exclude={"quality", "seed"} | unused)
-        settings = ", ".join(f"{key} {value}" for key, value in knobs.items())
         optic = "a mirror" if self.lens.back.reflect else f"refractive index {self.index:.6g}"
-        comment = f"# {optic}; quality {self.tailoring.quality}: {settings}\n"
-        return comment + tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
+        comment = f"# {optic}; quality {self.tailoring.quality}"
+        if self.lens.back.control_points is not None:  # by which they are set
+            knobs = self.tailoring.resolved(self.lens.back.net).model_dump(exclude={"quality", "seed"} | unused)
+            comment += ": " + ", ".join(f"{key} {value}" for key, value in knobs.items())
+        return f"{comment}\n" + tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
 
 
 # ---- complaints of several tables: a sentence with a remedy each -----------------------------------------------------

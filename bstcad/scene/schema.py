@@ -14,7 +14,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationInfo, WithJsonSchema
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    PlainSerializer,
+    Tag,
+    ValidationInfo,
+    WithJsonSchema,
+)
 from pydantic.json_schema import GenerateJsonSchema
 
 FILE = Path(__file__).with_name("schema.json")
@@ -23,6 +32,11 @@ ESCAPES = "\0\a\b\f\n\r\t\v\x1b"  # that "C:\new\ten.png" holds once it is read 
 LENGTHS, COORDINATES = (1e-3, 1e6), (-1e8, 1e8)  # mm
 
 Node = Mapping[str, Any]
+# A number, or one along x and one along y; told apart by their form, so that a sentence speaks of the form meant.
+OneOrTwo = Annotated[
+    Annotated[int, Tag("number")] | Annotated[tuple[int, int], Tag("pair")],
+    Discriminator(lambda given: "pair" if isinstance(given, list | tuple) else "number"),
+]
 
 
 class Record(BaseModel):
@@ -207,4 +221,4 @@ def toml(value: Any) -> str:
     """A value as a scene file has it, in one line."""
     if isinstance(value, dict):
         return f"{{ {', '.join(f'{key} = {toml(part)}' for key, part in value.items())} }}"
-    return f"[{', '.join(map(toml, value))}]" if isinstance(value, list) else json.dumps(value)
+    return f"[{', '.join(map(toml, value))}]" if isinstance(value, list | tuple) else json.dumps(value)

@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 import torch
-from pydantic import AfterValidator, BeforeValidator, Discriminator, Tag
+from pydantic import AfterValidator, BeforeValidator
 from scipy.sparse import csr_array
 
 from bstcad.optics.irradiance import Screen
@@ -23,18 +23,13 @@ from bstcad.scene import picture
 from bstcad.scene.blank import Outlined
 from bstcad.scene.errors import SceneError
 from bstcad.scene.picture import Box, strips
-from bstcad.scene.schema import COORDINATES, Record, from_file
+from bstcad.scene.schema import COORDINATES, OneOrTwo, Record, from_file
 
 FEWEST = 8  # pixels along a side, unless asked for fewer (which the range of `pixels` refuses)
 NARROWEST = 1e-3  # mm; a target's side, as an outline's
 PICTURES = ("text", "image", "sample", "uniform")  # a target has exactly one
 
 
-# Told apart by their form, so that a sentence speaks of the form that was meant.
-Pixels = Annotated[
-    Annotated[int, Tag("number")] | Annotated[tuple[int, int], Tag("pair")],
-    Discriminator(lambda given: "pair" if isinstance(given, list | tuple) else "number"),
-]
 PictureFile = Annotated[
     from_file(picture.Picture, picture.read_picture, lambda found: found.name, "image = 'photo.png'"),
     BeforeValidator(lambda given: picture.from_array(given) if isinstance(given, np.ndarray) else given),
@@ -49,7 +44,7 @@ class Target(Record):
     x: Annotated[tuple[float, float], Key("Ends of the target along x.", "mm", *COORDINATES, example=[-200.0, 200.0])]
     y: Annotated[tuple[float, float], Key("Ends of the target along y.", "mm", *COORDINATES, example=[-200.0, 200.0])]
     tilt: Annotated[Tilt, Key("Tilt about x, then about y.", "degrees", -89.0, 89.0)] = None
-    pixels: Annotated[Pixels, Key("Pixels along the longer side, or [columns, rows].", "", FEWEST, 4096, example=512)]
+    pixels: Annotated[OneOrTwo, Key("Pixels along the longer side, or [columns, rows].", "", FEWEST, 4096, example=512)]
     text: Annotated[
         str | None, Key("The picture as letters, centred, over 84 % of the width or 80 % of the height.")
     ] = None

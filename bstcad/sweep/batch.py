@@ -31,6 +31,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene, load
 from bstcad.sweep import cold_run
 from bstcad.sweep.cold_run import LocalPool, Stored, unpacked
+from bstcad.sweep.net_choice import with_net
 from bstcad.sweep.plan import fitted, memory_gb
 from bstcad.verify.verdict import VERDICTS, Check
 
@@ -148,7 +149,7 @@ def batch(
         rows = list(_outset(wanted, folder, earlier))
         names = {row.name for row in rows if row.status != REFUSED}
         others = [row for row in earlier if row.finished and row.name not in names]
-        left = {k: wanted[k].scene for k, row in enumerate(rows) if row.status == STOPPED}
+        left = {k: with_net(wanted[k].scene)[0] for k, row in enumerate(rows) if row.status == STOPPED}
         if left:
             most = fitted()["within"]["memory_gb"] * max(memory_gb(s, fitted()["memory"]) for s in left.values())
             at_a_time = min(environment.cores() // CORES, int(psutil.virtual_memory().available / 1e9 / most))

@@ -21,10 +21,12 @@ from bstcad.analysis.neglected_effects import Change, Reference
 from bstcad.optics import media
 from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
+from bstcad.optics.sides import both, scaled
 from bstcad.report.record import LeftOut, Making
 from bstcad.report.units import about, number, two_digits
 from bstcad.scene.effects import Absorption, Effect, Fresnel, losses, named, reflection_of
 from bstcad.scene.scene import Scene
+from bstcad.scene.schema import toml
 from bstcad.tailoring.machinability import BOUNDED, UNBOUNDED, moved_clear
 from bstcad.tailoring.slope_fit import Fit
 from bstcad.tailoring.slope_map import face_grid, lit_window, slope_map, sloped
@@ -96,7 +98,7 @@ def left_out(scene: Scene, lens: Lens, picture: np.ndarray) -> tuple[LeftOut, ..
     picture: (rows, columns) flux in each pixel, of the target or as the lens throws it.
     """
     reference = Reference.of(
-        lens, _central(scene), scene.target.screen, picture=picture, control_points=scene.lens.back.control_points
+        lens, _central(scene), scene.target.screen, picture=picture, control_points=math.prod(both(scene.lens.back.net))
     )
     found = list(_mirror(scene, reference) if lens.reflects else _lens(scene, reference))
     found += _size(scene, reference)
@@ -191,8 +193,8 @@ def diagnosis(
     blurred: RRMSD of the target blurred by the source's size; 0 for a point.
     at_bounds: share of the back that is at each bound.
     """
-    net, screen = scene.lens.back.control_points, scene.target.screen
-    knobs, finer = scene.tailoring.resolved(net), scene.tailoring.resolved(2 * net - 1)
+    net, screen = scene.lens.back.net, scene.target.screen
+    knobs, finer = scene.tailoring.resolved(net), scene.tailoring.resolved(scaled(net, 2))
     sizes = [k for k, stage in enumerate(making.stages) if stage.name.startswith(SIZES)]
     curve = ending(
         [(point.seconds, point.rrmsd) for point in making.history],
@@ -254,10 +256,10 @@ REMEDIES = {
 
 def because(limit: Limit, scene: Scene) -> str:
     """Why it limits, and behind the last semicolon one step of it in the scene, and the RRMSD after that."""
-    net, figures = scene.lens.back.control_points, limit.figures
+    net, figures = scene.lens.back.net, limit.figures
     knobs = scene.tailoring.resolved(net)
     told = {name: (about if name in ("scarce", "median") else number)(value) for name, value in figures.items()}
-    told |= {"net": 2 * net - 1, "evaluations": 2 * knobs.stage2_iterations, "points": 2 * knobs.source_points}
+    told |= {"net": toml(scaled(net, 2)), "evaluations": 2 * knobs.stage2_iterations, "points": 2 * knobs.source_points}
     told |= {"rays": math.ceil(2**0.5 * knobs.rays), "falls": "has come to rest"}
     if figures.get("power", 0.0) >= RESTS:
         told["falls"] = f"still falls, as time to the power of {about(-figures['power'])}"

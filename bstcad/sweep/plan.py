@@ -23,6 +23,7 @@ import numpy as np
 from bstcad.analysis.cost import ControlCells, control_cells, limits
 from bstcad.analysis.light import blur
 from bstcad.optics.lens import Lens
+from bstcad.optics.sides import both, coarser, scaled
 from bstcad.pipeline import check_thickness, reached
 from bstcad.report.record import simulated
 from bstcad.scene.errors import SceneError, line_of, toml_positions
@@ -113,8 +114,8 @@ KINDS = {
 
 def amounts(scene: Scene, other_way: bool = False) -> dict[str, float]:
     """The amounts of KINDS in a design; other_way: does its stage 1 try the other way?"""
-    m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
-    knobs, net, pixels = scene.tailoring.resolved(m), (m / NET) ** 2, columns * rows / PIXELS**2
+    (columns, rows), knobs = scene.target.columns_rows, scene.tailoring.resolved(scene.lens.back.net)
+    m, net, pixels = max(both(scene.lens.back.net)), (knobs.side / NET) ** 2, columns * rows / PIXELS**2
     spread = len(scene.channels()) ** 0.5
     point = scene.source.kind == "point"
     judged = JUDGED * pixels ** (2 / 3)  # rays as run.BETWEEN has them
@@ -125,14 +126,14 @@ def amounts(scene: Scene, other_way: bool = False) -> dict[str, float]:
     grids = [knobs.transport_grid]  # cells a side of the transport in each round; Wang et al.'s is one map
     if slopes:
         grids = [max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left, 2)) for left in range(knobs.rounds)]
-    fitted = min(2 * knobs.levels[-1], knobs.rays)
+    fitted = min(2 * knobs.side, knobs.rays)
     found = sum((SUBCELLS * grid / TUBES) ** 2 for grid in grids) + (fitted / TUBES) ** 2
     return {
         "start": 1.0,
         "pixels": pixels,
         "rounds": knobs.rounds if slopes else 0.0,
         "transport": sum((grid / CELLS) ** 2 for grid in grids) * knobs.transport_iterations / ITERATIONS,
-        "slope fit": sum((level / NET) ** 2 for level in knobs.levels[-2:]) if slopes else 0.0,
+        "slope fit": sum(math.prod(both(level)) / NET**2 for level in knobs.levels[-2:]) if slopes else 0.0,
         "front": 1.0 if scene.lens.front.free else 0.0,
         "other way": (aimed(m, knobs.rays) / TUBES) ** 2 if other_way else 0.0,
         "rays found": found if point else 0.0,
@@ -145,7 +146,7 @@ def amounts(scene: Scene, other_way: bool = False) -> dict[str, float]:
         "writing": 1.0,
         "net written": net,
         "rays": (ROUGHLY if knobs.quality == "draft" else RAYS) * (2.0 if point else 1.0),
-        "tubes": ((2 * m + 5) / TUBES) ** 2 if scene.source.extent is None else 0.0,
+        "tubes": ((2 * knobs.side + 5) / TUBES) ** 2 if scene.source.extent is None else 0.0,
         "net read": net,
         "report": 1.0,
         "pictures": pixels,
@@ -160,11 +161,11 @@ def seconds(work: Mapping[str, float], prices: Mapping[str, float], unit: Units)
 
 def memory_amounts(scene: Scene) -> dict[str, float]:
     """The amounts that take memory; their prices are GB."""
-    m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
-    corners = (scene.tailoring.resolved(m).rays / TUBES) ** 2
+    (columns, rows), knobs = scene.target.columns_rows, scene.tailoring.resolved(scene.lens.back.net)
+    corners = (knobs.rays / TUBES) ** 2
     roots = corners if scene.source.kind == "point" else 0.0
     pixels = columns * rows / PIXELS**2
-    return {"libraries": 1.0, "corners": corners, "roots": roots, "net": (m / NET) ** 2, "pixels": pixels}
+    return {"libraries": 1.0, "corners": corners, "roots": roots, "net": (knobs.side / NET) ** 2, "pixels": pixels}
 
 
 def memory_gb(scene: Scene, prices: Mapping[str, float]) -> float:
@@ -214,7 +215,8 @@ def _pilot(scene: Scene, lens: Lens, quality: str) -> Pilot:
         small.channels(), target.screen, target.irradiance(), knobs, least=small.lens.min_thickness,
         rim_sags=small.rim_sags,
     )  # fmt: skip
-    first = list(stage1.steps(task, replace(small.flat_lens(knobs.levels[0]), front=lens.front)))
+    flat = small.flat_lens(knobs.levels[0], as_wide_as=knobs.levels[-1])
+    first = list(stage1.steps(task, replace(flat, front=lens.front)))
     *_, state = (step.state for step in first if step.state is not None)
     judged = [step.judged for step in first if step.judged is not None]
     reached(first[-1].lens, judged[-1])
@@ -226,13 +228,14 @@ def _pilot(scene: Scene, lens: Lens, quality: str) -> Pilot:
 
 def _small(scene: Scene, quality: str) -> tuple[Scene, float, Tailoring]:
     """The scene of a pilot, the pixels a side of the scene over those of the pilot, and the pilot's knobs."""
-    m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
+    own, (columns, rows) = scene.lens.back.net, scene.target.columns_rows
+    m = max(both(own))
     pixels, net, tubes = SIZES[quality]
     fewest, most = ((m - 1) / (points - 1) for points in (FEWEST_POINTS, net))
     factor = max(min(max(max(columns, rows) / pixels, most), fewest), 1.0)
-    less = {"lens.back.control_points": round((m - 1) / factor) + 1, "tailoring.levels": None}
+    less = {"lens.back.control_points": coarser(own, round((m - 1) / factor) + 1), "tailoring.levels": None}
     small = scene.changed(less | {"target.pixels": [max(round(n / factor), FEWEST) for n in (columns, rows)]})
-    whole, knobs = (Tailoring(quality=quality).resolved(each.lens.back.control_points) for each in (scene, small))
+    whole, knobs = (Tailoring(quality=quality).resolved(each.lens.back.net) for each in (scene, small))
     cells = int(np.clip(round(whole.transport_grid / factor), *PILOT_CELLS))
     rays = min(round(whole.rays / factor), tubes)
     return small, factor, knobs.model_copy(update={"rays": rays, "transport_grid": cells})
@@ -251,8 +254,9 @@ def _cells(scene: Scene, lens: Lens) -> ControlCells:
     """Of a net of as many control points as the scene has, by the way that light takes through a pilot's lens."""
     light = max(scene.channels(), key=lambda channel: channel.weight)
     few = control_cells(light, lens.plain(), scene.target.screen, scene.target.irradiance())
-    finer = (scene.lens.back.control_points - 2) / (lens.back.m - 2)
-    return replace(few, a_pixel=finer**2 * few.a_pixel)
+    pairs = zip(both(scene.lens.back.net), lens.back.shape, strict=True)
+    finer = math.prod((many - 2) / (known - 2) for many, known in pairs)
+    return replace(few, a_pixel=finer * few.a_pixel)
 
 
 # --- predictions ------------------------------------------------------------------------------------------------------
@@ -271,7 +275,7 @@ def complaint(scene: Scene) -> str:
 
 def _bounds(scene: Scene) -> Iterator[tuple[Any, str, str]]:
     """(does the scene lie outside of the fit?, the scenes of the fit, this scene)"""
-    m, (columns, rows), front = scene.lens.back.control_points, scene.target.columns_rows, scene.lens.front.kind
+    net, (columns, rows), front = scene.lens.back.net, scene.target.columns_rows, scene.lens.front.kind
     integrated = scene.tailoring.method == "integration"
     yield integrated, "tailored lenses", 'tailoring.method = "integration" tailors none'
     yield scene.lens.back.reflect, "lenses", "lens.back.reflect = true makes a mirror"
@@ -285,13 +289,13 @@ def _bounds(scene: Scene) -> Iterator[tuple[Any, str, str]]:
     kinds = " and ".join(effect.kind for effect in scene.effects)
     yield kinds, "designs without effects", f"the scene asks for {kinds}"
     for key, value, (least, most) in (
-        ("lens.back.control_points", m, FIT_NETS),
+        ("lens.back.control_points", max(both(net)), FIT_NETS),
         ("target.pixels", max(columns, rows), FIT_PIXELS),
     ):
         yield not least <= value <= most, f"{key} from {least} to {most}", f"here there are {value}"
     oblong = not 1 / ASPECT <= columns / rows <= ASPECT
     yield oblong, "targets of nearly equal sides", f"this one has {columns} x {rows} pixels"
-    preset = Tailoring(quality=scene.tailoring.quality).resolved(m)
+    preset = Tailoring(quality=scene.tailoring.quality).resolved(net)
     for key, value in sorted(scene.tailoring.model_dump(exclude=ENDS, exclude_none=True).items()):
         yield value != getattr(preset, key), "the qualities as they are", f"tailoring.{key} is set"
 
@@ -315,14 +319,14 @@ def outlook(scene: Scene, lens: Lens, units: Callable[[], Units]) -> dict[str, A
 
     predicted = each(scene, likely)
     found |= {"predicted": predicted, "notes": list(_ends_early(scene, predicted))}
-    m = 2 * scene.lens.back.control_points - 1
-    if m <= FIT_NETS[1]:
-        finer = scene.changed({"lens.back.control_points": m, "tailoring.levels": None})
+    net = scaled(scene.lens.back.net, 2)
+    if max(both(net)) <= FIT_NETS[1]:
+        finer = scene.changed({"lens.back.control_points": net, "tailoring.levels": None})
         cells = _cells(scene, small["standard"].lens)
         for quality, value in likely.items():  # as reports of designs estimate it
             gains = {limit.by: limit.rrmsd for limit in limits(value, cells)}
             likely[quality] = value * max(gains["control points"], GAINED)
-        found["finer"] = {"control_points": m, "predicted": each(finer, likely)}
+        found["finer"] = {"control_points": net, "predicted": each(finer, likely)}
     return found
 
 

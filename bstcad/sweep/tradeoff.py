@@ -21,6 +21,7 @@ from pathlib import Path
 
 import bstcad
 from bstcad.folder import SCENE, scene_files
+from bstcad.optics.sides import Sides, both, scaled
 from bstcad.runs import environment, files
 from bstcad.runs.cluster import Answer, Machines
 from bstcad.runs.progress import Report, Throttled
@@ -41,6 +42,7 @@ from bstcad.sweep.cold_run import (
     as_text,
     settings,
 )
+from bstcad.sweep.net_choice import with_net
 from bstcad.sweep.plan import amounts, fitted, seconds
 from bstcad.sweep.results import Calibration, Place, Preset, Table, TableKnob, front, halving
 
@@ -81,7 +83,7 @@ def words(point: Settings) -> str:
 
 def knobs(scene: Scene) -> tuple[Knob, ...]:
     """All knobs of a scene, the most important first."""
-    own = scene.lens.back.control_points
+    own = scene.lens.back.net
     known = scene.tailoring.resolved(own)
     adam = known.method == "adam"
 
@@ -89,13 +91,13 @@ def knobs(scene: Scene) -> tuple[Knob, ...]:
         value = getattr(known, name)
         return _numbers(f"tailoring.{name}", value, (round(share * value) for share in of), limits)
 
-    nets = (round(share * (own - 1)) + 1 for share in (1 / 4, HALF, 1, 2, 4))
+    nets = {own, *filter(_possible, (scaled(own, share) for share in (1 / 4, HALF, 1, 2, 4)))}
     every = (
         Knob("quality", "Quality presets", _choices("tailoring.quality", scene.tailoring.quality, PRESETS)),
         Knob("evaluations", "Evaluations of stage 2", shares("stage2_iterations", (1 / 8, 1 / 4, HALF, 1, 2, 4))),
         Knob("tubes", "Rays a side" if adam else "Ray tubes a side",
              shares("rays", (1 / 4, HALF, ROOT, 1, 1 / ROOT, 2))),
-        Knob("control_points", "Control points a side", _numbers(NET_KEY, own, nets, NETS)),
+        Knob("control_points", "Control points a side", _choices(NET_KEY, own, sorted(nets))),
         Knob("adam", "Adam on control points, by rays", _adam(known.quality == "paper")),
         Knob("precision", "Precision", _choices("tailoring.precision", known.precision, ("float32", "float64"))),
         Knob("pixels", "Pixels tailored to", _pixels(*scene.target.columns_rows)),
@@ -117,6 +119,11 @@ def _choices(key: str, own: Value, values: Iterable[Value]) -> Points:
 
 def _numbers(key: str, own: int, values: Iterable[int], limits: tuple[int, int] = COUNTS) -> Points:
     return _choices(key, own, sorted({own, *(value for value in values if limits[0] <= value <= limits[1])}))
+
+
+def _possible(net: Sides) -> bool:
+    """Is the net among those that are tried?"""
+    return NETS[0] <= max(both(net)) <= NETS[1]
 
 
 def _pixels(columns: int, rows: int) -> Points:
@@ -143,10 +150,10 @@ def _together(*turned: tuple[str, int, Sequence[float]]) -> Points:
     points = {}
     for shares in zip(*(shares for _, _, shares in turned), strict=True):
         values = {
-            key: own if share == 1 else max(1, round(share * (own - (key == NET_KEY))) + (key == NET_KEY))
+            key: own if share == 1 else scaled(own, share) if key == NET_KEY else max(1, round(share * own))
             for (key, own, _), share in zip(turned, shares, strict=True)
         }
-        if NETS[0] <= values.get(NET_KEY, NETS[0]) <= NETS[1]:
+        if NET_KEY not in values or _possible(values[NET_KEY]):
             changed = {key: values[key] for key, own, _ in turned if values[key] != own}
             points[" × ".join(map(str, values.values()))] = settings(changed)
     return points
@@ -231,7 +238,8 @@ def tradeoff(
     calls of progress while its text stays.  The two tables are written after each run, so that they are there however
     a sweep ends.
     """
-    base = scene.changed({"tailoring.accuracy": None, "tailoring.max_time": None})  # which end a design early
+    scene = scene.changed({"tailoring.accuracy": None, "tailoring.max_time": None})  # which end a design early
+    base, _ = with_net(scene)
     contents = scene_files(base)
     check_free(folder, contents)
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -386,7 +394,7 @@ def table(
     scene: Scene, knobs: Sequence[Knob], runs: Sequence[Run], waiting: Sequence[Run] = (), *, budget: float = math.inf
 ) -> Table:
     """The results of the runs of a scene that have ended, and of those that wait, both by their importance."""
-    own, best = scene.lens.back.control_points, front(runs)
+    own, best = scene.lens.back.net, front(runs)
     timed = {run.settings: run for run in runs if run.comparable}
     shown = timed or {run.settings: run for run in runs if run.done}
     of_all = shown.get(()) or next(iter(shown.values()), None)  # whose machine stands for all

@@ -102,7 +102,7 @@ class Excess:
     """The excess of a back over bounds."""
 
     mean_square: float  # over the places, relative to the bounds and from MARGIN before them on
-    gradient: Tensor  # (m, m) of that in the heights (1/mm)
+    gradient: Tensor  # (m, n) of that in the heights (1/mm)
     worst: float  # largest excess, relative to its bound; negative: there is none
 
 
@@ -119,7 +119,7 @@ def excess(lens: Lens, bounds: Bounds) -> Excess:
         squared = total(torch.relu(relative + MARGIN) ** 2)
         gradient += spans.scattered(*torch.autograd.grad(squared, leaf))
         square, worst = square + float(squared.detach()), max(worst, float(relative.detach().max()))
-    count = (len(QUARTERS) * (back.m - 2)) ** 2
+    count = math.prod(len(QUARTERS) * (points - 2) for points in back.shape)
     square, gradient = square / count, gradient / count
     if bounds.thickest is not None:
         squared, own, thick = _of_thickness(lens.with_back(back), bounds)

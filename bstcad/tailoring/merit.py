@@ -102,20 +102,20 @@ class TubeMerit:
 
 @dataclass(frozen=True)
 class SobolevVariable:
-    """Heights h (m, m) in mm as a function of c (m, m): h = p C^T (λ^-EXPONENT · C (w c) C^T) C.
+    """Heights h (m, n) in mm as a function of c (m, n): h = p C^T (λ^-EXPONENT · C (w c) C^T) C.
 
-    C is the orthonormal cosine transform; λ_ij = 4 - 2 cos(π i / m) - 2 cos(π j / m) is the Laplacian on the
-    net, zero for the piston; p the pitch in mm.
+    C is the orthonormal cosine transform; λ_ij = 4 - 2 cos(π i / m) - 2 cos(π j / n) is the Laplacian on the
+    net, zero for the piston; p the (mean) pitch in mm.
     """
 
-    weight: Tensor  # (m, m) w, a local step size
-    scale: Tensor  # (m, m) p λ^-EXPONENT
+    weight: Tensor  # (m, n) w, a local step size
+    scale: Tensor  # (m, n) p λ^-EXPONENT
 
     @classmethod
     def of(cls, surface: BSplineSurface, weight: Tensor) -> SobolevVariable:
         """For the net of a surface."""
-        axis = laplacian(surface.m)
-        energy = axis[:, None] + axis
+        x, y = map(laplacian, surface.shape)
+        energy = x[:, None] + y
         # by numpy, in one thread: torch rounds a power in another way where a thread's share ends
         power = torch.from_numpy(np.power(torch.where(energy > 0, energy, math.inf).numpy(), -EXPONENT))
         scale = math.sqrt(math.prod(surface.pitch)) * power
@@ -137,7 +137,8 @@ def local_weight(source: Source, lens: Lens, target: np.ndarray, screen: Screen,
     """
     number = lens.number_of_back if number is None else number
     net, onwards = lens.interfaces[number].surface, lens.unbounded().interfaces[number:]
-    places = (torch.linspace(low, high, net.m, dtype=torch.float64) for low, high in (net.x, net.y))
+    ends = zip((net.x, net.y), net.shape, strict=True)
+    places = (torch.linspace(low, high, count, dtype=torch.float64) for (low, high), count in ends)
     x, y = torch.meshgrid(*places, indexing="ij")
     _, _, at_net = rays_to(source, lens, x=x, y=y, number=number)
     with torch.no_grad():
@@ -152,17 +153,17 @@ def local_weight(source: Source, lens: Lens, target: np.ndarray, screen: Screen,
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Heights h (m, m) of a net as a function of the Sobolev variable c: h = C^T (c · scale) C; Σ c² is mean |∇h|²."""
+    """Heights h (m, n) of a net as a function of the Sobolev variable c: h = C^T (c · scale) C; Σ c² is mean |∇h|²."""
 
-    energy: Tensor  # (m, m) slope energy of each cosine (1/mm²), zero for the piston
-    scale: Tensor  # (m, m) m / sqrt(energy), zero for the piston
+    energy: Tensor  # (m, n) slope energy of each cosine (1/mm²), zero for the piston
+    scale: Tensor  # (m, n) sqrt(m n / energy), zero for the piston
 
     @classmethod
     def of(cls, surface: BSplineSurface) -> Spectrum:
         """For the net of a surface."""
-        x, y = (laplacian(surface.m) / pitch**2 for pitch in surface.pitch)
+        x, y = (laplacian(count) / pitch**2 for count, pitch in zip(surface.shape, surface.pitch, strict=True))
         energy = x[:, None] + y
-        scale = surface.m * torch.where(energy > 0, energy, math.inf) ** -0.5
+        scale = math.sqrt(energy.numel()) * torch.where(energy > 0, energy, math.inf) ** -0.5
         return cls(energy.to(surface.heights), scale.to(surface.heights))
 
     def heights(self, c: Tensor) -> Tensor:
@@ -183,16 +184,16 @@ def cosine(t: Tensor) -> Tensor:
     """The orthonormal cosine transform (type II) along both axes."""
     if t.device.type == "cpu":
         return torch.from_numpy(scipy.fft.dctn(t.numpy(), norm="ortho", workers=torch.get_num_threads()))
-    c = _matrix(t.shape[0]).to(t)
-    return c @ t @ c.T
+    x, y = (_matrix(count).to(t) for count in t.shape)
+    return x @ t @ y.T
 
 
 def inverse_cosine(t: Tensor) -> Tensor:
     """The inverse of `cosine`, which is its transpose."""
     if t.device.type == "cpu":
         return torch.from_numpy(scipy.fft.idctn(t.numpy(), norm="ortho", workers=torch.get_num_threads()))
-    c = _matrix(t.shape[0]).to(t)
-    return c.T @ t @ c
+    x, y = (_matrix(count).to(t) for count in t.shape)
+    return x.T @ t @ y
 
 
 @lru_cache(maxsize=4)

@@ -29,7 +29,7 @@ class NetParameters:
     """The plane and the heights of one freeform interface."""
 
     z: float  # the plane that its heights are measured from (mm)
-    heights: Tensor  # (m, m) mm
+    heights: Tensor  # (m, n) mm
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Task:
         count = points(self.channels)
         if count == 1:
             return self.knobs.rays
-        return max(round(self.knobs.rays / count**0.5), math.ceil(2**0.5 * self.knobs.levels[-1]))
+        return max(round(self.knobs.rays / count**0.5), math.ceil(2**0.5 * self.knobs.side))
 
     def rrmsd(self, lens: Lens) -> float:
         """RRMSD by rays on the CPU, without the bias of the tubes that tailor the lens."""

@@ -153,9 +153,9 @@ def with_polynomial(
 
 def monomials(surface: BSplineSurface, degree: int) -> list[Tensor]:
     """Heights of (nearly) x^i y^j, 1 <= i + j <= degree, x and y from -1 to 1 across the net."""
-    line = torch.linspace(-1.0, 1.0, surface.m).to(surface.heights)
+    x, y = (torch.linspace(-1.0, 1.0, count).to(surface.heights) for count in surface.shape)
     powers = ((i, j) for i in range(degree + 1) for j in range(degree + 1 - i) if i + j > 0)
-    return [line[:, None] ** i * line[None, :] ** j for i, j in powers]
+    return [x[:, None] ** i * y[None, :] ** j for i, j in powers]
 
 
 def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, plane: TargetPlane, repeats: int = 3) -> Lens:

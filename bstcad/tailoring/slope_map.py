@@ -36,6 +36,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, TargetPlane
+from bstcad.optics.sides import Sides, both
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import across, clear_window, gets_through
 from bstcad.optics.tubes import rays_to
@@ -59,27 +60,28 @@ class FaceGrid:
     """Cell centres of a rectangle of the last freeform face, and the light that meets it there."""
 
     window: Rectangle  # in x and y, centred (mm)
-    at_face: Rays  # (3, n, n): position on the face, direction before it
-    density: Tensor  # (n, n) flux per mm² of the x-y plane
+    at_face: Rays  # (3, m, n): position on the face, direction before it
+    density: Tensor  # (m, n) flux per mm² of the x-y plane
 
     @property
-    def n(self) -> int:
-        """Cells each way."""
-        return self.density.shape[0]
+    def shape(self) -> tuple[int, int]:
+        """Cells along x and along y."""
+        m, n = self.density.shape
+        return m, n
 
 
 @torch.no_grad()
-def face_grid(source: Source, lens: Lens, window: Rectangle, n: int) -> FaceGrid:
-    """The ray that meets the last freeform face at each of n x n points.
+def face_grid(source: Source, lens: Lens, window: Rectangle, cells: Sides) -> FaceGrid:
+    """The ray that meets the last freeform face in the middle of each cell, so many a side or along x and along y.
 
     Its flux density is the source's on the vertex plane of the first surface times |∂q/∂b|, q where the ray crosses
     that plane, less the losses at the faces and in the glass, with the present back.
     """
-    x, y = (t.to(lens.like.device) for t in sampling.grid(window, n))
+    x, y = (t.to(lens.like.device) for t in sampling.grid(window, cells))
     number = lens.freeform[-1]
     q_x, q_y, at_face = rays_to(source, lens, x=x, y=y, number=number)
     coming = across(source.rays(q_x, q_y, lens.entrance.z, 1.0), lens.interfaces[:number])
-    steps = (window.width / n, window.height / n)
+    steps = tuple(side / n for side, n in zip((window.width, window.height), both(cells), strict=True))
     xx, xy = torch.gradient(q_x, spacing=steps)
     yx, yy = torch.gradient(q_y, spacing=steps)
     through = lens.last_freeform.outline.contains(x, y) & coming.alive & at_face.alive
@@ -160,7 +162,8 @@ def sloped(lens: Lens, wanted: SlopeMap, grid: FaceGrid, fit: Fit, unlit: float,
     Where no light falls the slopes it has now are wanted with the weight `unlit`; zero leaves that part to the bending.
     parts: places at which slopes are wanted in each cell of the grid, each way.
     """
-    places = sampling.grid(grid.window, parts * grid.n)
+    m, n = grid.shape
+    places = sampling.grid(grid.window, (parts * m, parts * n))
     x, y = (p.to(grid.density.device).reshape(-1) for p in places)
     lit = (grid.density > 0).repeat_interleave(parts, 0).repeat_interleave(parts, 1).reshape(-1)
     net = lens.nets[-1]
@@ -185,8 +188,7 @@ def gathering(grid: FaceGrid, lens: Lens, plane: TargetPlane, middle: tuple[floa
 
     With the sag frozen p(b, m) is a gradient but for a curl of the order ∂p/∂z x y; ∇g is one.
     """
-    step = max(1, grid.n // SAMPLES)
-    thin = (slice(step // 2, None, step), slice(step // 2, None, step))
+    thin = tuple(slice(step // 2, None, step) for step in (max(1, n // SAMPLES) for n in grid.shape))
     faces = replace(grid.at_face, **{k: getattr(grid.at_face, k)[(..., *thin)] for k in ("position", "direction")})
     x, y, _ = (p.double() for p in faces.position)
     aim = torch.stack([torch.full_like(x, m) for m in middle])
@@ -201,7 +203,7 @@ def gathering(grid: FaceGrid, lens: Lens, plane: TargetPlane, middle: tuple[floa
 def _needed(grid: FaceGrid, lens: Lens, plane: TargetPlane, b: tuple, t: tuple) -> tuple[np.ndarray, np.ndarray]:
     """p(b, t): the slopes that send the light at b (mm) to t (mm) on the plane; direction and sag bilinear at b."""
     sizes = (grid.window.width, grid.window.height)
-    where = [(np.asarray(p) / size + 0.5) * grid.n - 0.5 for p, size in zip(b, sizes, strict=True)]
+    where = [(np.asarray(p) / size + 0.5) * n - 0.5 for p, size, n in zip(b, sizes, grid.shape, strict=True)]
 
     def at(values: Tensor) -> Tensor:
         return torch.from_numpy(map_coordinates(values.cpu().double().numpy(), where, order=1, mode="nearest"))

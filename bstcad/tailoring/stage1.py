@@ -18,6 +18,7 @@ from bstcad.optics import sampling
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays
+from bstcad.optics.sides import both
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import clear_window, trace
 from bstcad.scene.blank import CONIC_CONSTANTS
@@ -127,9 +128,9 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[
         source, lens, window, picture=task.target, screen=task.screen, n=coarse, previous=wanted,
         iterations=knobs.transport_iterations, progress=progress,
     )  # fmt: skip
-    side = min(2 * m, knobs.rays)
-    parts = math.ceil(side / LIT)
-    grid = face_grid(source, lens, window, math.ceil(side / parts))
+    sides = [min(2 * points, knobs.rays) for points in both(m)]
+    parts = math.ceil(max(sides) / LIT)
+    grid = face_grid(source, lens, window, (math.ceil(sides[0] / parts), math.ceil(sides[1] / parts)))
     return sloped(lens, wanted, grid, *(FINE if left <= FINE_ROUNDS else COARSE), parts), wanted
 
 
@@ -150,7 +151,7 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
             task.target,
             screen=task.screen,
             n=n,
-            side=aimed(m, knobs.rays),
+            side=aimed(max(both(m)), knobs.rays),
             iterations=knobs.transport_iterations,
         )
         lens = moved_clear(tailor_to_aim(lens, rays, wanted, task.screen.plane), z, task.least, task.bounds)
@@ -158,7 +159,7 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
 
 
 def aimed(m: int, rays: int) -> int:
-    """Rays a side for a net of m x m; more than two a control cell each way, since many may leave through the sides."""
+    """Rays a side for m control points; more than two a control cell, since many may leave through the sides."""
     return min(3 * m, max(2 * m, rays))
 
 
@@ -182,8 +183,8 @@ def shaped_front(
     Its merit is theirs for stage 1, the mean squared miss of the aim points, with the best back for each front, on the
     net that the lens has; n, iterations: cells a side and steps of the map, repeats: fits of the slopes for each front.
     """
-    rays, wanted, _ = aimed_rays(source, lens, target, screen=screen, n=n, side=2 * lens.back.m, iterations=iterations)
-    plane = screen.plane
+    side, plane = 2 * max(lens.back.shape), screen.plane
+    rays, wanted, _ = aimed_rays(source, lens, target, screen=screen, n=n, side=side, iterations=iterations)
 
     def miss(tried: Lens) -> float:
         return float(

@@ -22,6 +22,7 @@ from torch import Tensor
 from bstcad.optics.channels import points
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import a_side, images, rrmsd_by_tubes
+from bstcad.optics.sides import coarser
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.machinability import excess, weight
@@ -37,7 +38,7 @@ SPARSE, DENSE = ((1 / 2, 0.40), (3 / 4, 0.35), (1.0, 0.25)), 2.5
 UNBOUNDED_SHARE, FEWEST = 1 / 8, 8  # of the evaluations, and the least number, without the bounds on the back
 SEEN = 16  # places a side of the lens through which a source's images are looked at
 FEW = 30  # evaluations: fewer make one round, since each has its own start to pay for
-NET = 65  # control points a side, at most: the comparison shall cost a fraction of a second
+NET = 65  # control points along the longer side, at most: the comparison shall cost a fraction of a second
 TUBES = 128  # a side
 COMPARED = 6  # evaluations in each precision
 SIZES = ((1 / 3, 1 / 6), (2 / 3, 1 / 6), (1.0, 2 / 3))  # (of the source, evaluations), as shares of all
@@ -90,10 +91,10 @@ def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Iterator[S
 
 def sheets(knobs: Tailoring) -> Iterator[tuple[int, int]]:
     """(tubes a side, evaluations) of each round; no fewer tubes than control points: they could not tell them apart."""
-    shares = ROUNDS if knobs.rays >= DENSE * knobs.levels[-1] else SPARSE
+    shares = ROUNDS if knobs.rays >= DENSE * knobs.side else SPARSE
     if knobs.stage2_iterations < FEW:
         shares = ((1.0, 1.0),)
-    least = min(knobs.rays, knobs.levels[-1])
+    least = min(knobs.rays, knobs.side)
     for tubes, share in shares:
         yield max(round(tubes * knobs.rays), least), round(share * knobs.stage2_iterations)
 
@@ -300,7 +301,7 @@ def stage3_rounds(task: Task) -> tuple[Round, ...]:
 class Comparison:
     """How two twins of a lens part, tailored in float32 and in float64."""
 
-    control_points: int  # a side
+    control_points: int  # along the longer side
     merit: float  # relative difference before the first step
     gradient: float  # the same, of its norm
     evaluations: int  # of each
@@ -314,7 +315,7 @@ def compare_precisions(task: Task, lens: Lens) -> Comparison:
 
     Rounding decides where a line search ends; the two may part by more than rounding and be equally good.
     """
-    lens = lens.with_nets(net.refined(min(net.m, NET)) for net in lens.nets)
+    lens = lens.with_nets(net.refined(coarser(net.shape, NET)) for net in lens.nets)
     (merit, gradient, single), (exact, wanted, double) = (
         _tried(task, lens.to(d)) for d in (torch.float32, torch.float64)
     )
@@ -322,7 +323,7 @@ def compare_precisions(task: Task, lens: Lens) -> Comparison:
     rrmsd = [rrmsd_by_tubes(end, task.channels, task.screen, target=task.target, n=n) for end in (single, double)]
     pairs = zip(single.nets, double.nets, strict=True)
     return Comparison(
-        control_points=max(net.m for net in lens.nets),
+        control_points=max(max(net.shape) for net in lens.nets),
         merit=abs(merit / exact - 1),
         gradient=float((gradient - wanted).norm() / wanted.norm()),
         evaluations=COMPARED,

@@ -28,6 +28,7 @@ from bstcad.optics.media import refractive_index
 from bstcad.optics.motion import Motion, moved_screen, moved_source, turns_alike
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Vector
+from bstcad.optics.sides import in_words
 from bstcad.optics.sources import Source
 from bstcad.optics.surfaces import Sphere, Surface
 
@@ -232,7 +233,7 @@ def _front_power(setup: Setup, by: float) -> Setup:
     """A front whose rim stands higher by so much (mm): c + 2 by / R², R the farthest from the axis."""
     front, rim2 = setup.lens.front, sum(p * p for p in setup.lens.outline.farthest)
     if front.is_net:
-        x, y = (np.linspace(*side, front.m) for side in (front.x, front.y))
+        x, y = (np.linspace(*side, m) for side, m in zip((front.x, front.y), front.shape, strict=True))
         bent = _higher(front, by * (x[:, None] ** 2 + y[None, :] ** 2) / rim2)
     else:
         curvature = front.curvature + 2 * by / rim2
@@ -319,7 +320,7 @@ def ripple(lens: Lens, period: float, pattern: Literal["raster", "spiral"]) -> K
     period (mm).  ValueError if the net is too coarse for it.
     """
     _resolved(lens.back, period, "a ripple's period")
-    x, y = (np.linspace(*side, lens.back.m) for side in (lens.back.x, lens.back.y))
+    x, y = (np.linspace(*side, m) for side, m in zip((lens.back.x, lens.back.y), lens.back.shape, strict=True))
     s = np.broadcast_to(x[:, None], (len(x), len(y))) if pattern == "raster" else np.hypot(x[:, None], y[None, :])
     field = _of_rms_one(np.sin(2 * np.pi * s / period), inside(lens.outline, lens.back))
     words = f"{pattern} ripple of the back, period {period:g} mm"
@@ -327,7 +328,7 @@ def ripple(lens: Lens, period: float, pattern: Literal["raster", "spiral"]) -> K
 
 
 def random_field(surface: BSplineSurface, correlation_length: float, seed: int, where: np.ndarray) -> np.ndarray:
-    """(m, m) a Gaussian random field of RMS 1 and mean 0 over `where`, of covariance exp(-(r / correlation_length)²).
+    """(m, n) a Gaussian random field of RMS 1 and mean 0 over `where`, of covariance exp(-(r / correlation_length)²).
 
     White noise drawn with the seed, smoothed by a Gaussian of standard deviation correlation_length (mm) / 2; the
     covariance is wider by √2.  ValueError if the net is too coarse for it.
@@ -335,14 +336,15 @@ def random_field(surface: BSplineSurface, correlation_length: float, seed: int, 
     _resolved(surface, correlation_length, "a correlation length")
     cells = [correlation_length / 2 / pitch for pitch in surface.pitch]
     margin = [int(np.ceil(4 * c)) for c in cells]
-    shape = [surface.m + 2 * k for k in margin]  # without an effect of borders
+    shape = [m + 2 * k for m, k in zip(surface.shape, margin, strict=True)]  # without an effect of borders
     noise = fft.rfftn(np.random.default_rng(seed).standard_normal(shape))
     noise = fft.irfftn(fourier_gaussian(noise, cells, n=shape[-1]), shape)  # 20 times as fast as gaussian_filter
-    return _of_rms_one(noise[margin[0] : margin[0] + surface.m, margin[1] : margin[1] + surface.m], where)
+    inner = tuple(slice(k, k + m) for k, m in zip(margin, surface.shape, strict=True))
+    return _of_rms_one(noise[inner], where)
 
 
 def inside(outline: Outline, net: BSplineSurface) -> np.ndarray:
-    """(m, m) True for control points of a face inside the outline."""
+    """(m, n) True for control points of a face inside the outline."""
     return outline.contains(*_points(net)).numpy()
 
 
@@ -380,8 +382,9 @@ def _higher(net: BSplineSurface, heights: np.ndarray) -> BSplineSurface:
 
 
 def _points(net: BSplineSurface) -> tuple[torch.Tensor, torch.Tensor]:
-    """(m, m) x and y of the control points (mm)."""
-    x, y = (torch.linspace(*side, net.m, dtype=torch.float64) for side in (net.x, net.y))
+    """(m, n) x and y of the control points (mm)."""
+    ends = zip((net.x, net.y), net.shape, strict=True)
+    x, y = (torch.linspace(*side, m, dtype=torch.float64) for side, m in ends)
     return torch.meshgrid(x, y, indexing="ij")
 
 
@@ -389,7 +392,7 @@ def _resolved(surface: BSplineSurface, length: float, words: str) -> None:
     least = SMOOTH * max(surface.pitch)
     if length < least:
         raise ValueError(
-            f"{words} of {length:g} mm is too fine for {surface.m} x {surface.m} control points, which carry "
+            f"{words} of {length:g} mm is too fine for {in_words(surface.shape)} control points, which carry "
             f"{least:.3g} mm and more; give a longer one, or a lens of more control points"
         )
 

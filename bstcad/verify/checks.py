@@ -159,7 +159,7 @@ def verify(
         *(_result(of_part, folder / "part.step", lambda: submit(*part_job)) if of_part else ()),
         *of_aperture,
         *machined,
-        _ripple(shape, lens.back.m),
+        _ripple(shape, max(lens.back.shape)),
         sealed,
         *_facets(mesh, lens, shape["volume"], nominal),
         _picture(nominal.stored_target, nominal.target),

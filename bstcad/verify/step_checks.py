@@ -106,7 +106,7 @@ def examine(path: Path) -> tuple[list[Check], Lens, WholePart | None]:
     lens_read = step_reading.lens(reread, index=1.5)
     properties = solid_properties.of_solid(reread.shape)
     checks = [
-        *text_checks.structure(text, lens_read.back.m),
+        *text_checks.structure(text, lens_read.back.shape),
         *_sound(reread.shape),
         *_edges(reread, lens_read, bare=reread.edge is None),
         net_check("STEP text against OCC: control points", text.surface.control_points, reread.control_points),
@@ -210,7 +210,7 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
         stated = text_checks.measures(text.properties, properties, lens.outline, PART)
     edges = f"{PART}: edges against the mount's"
     return (
-        *text_checks.structure(text, lens.back.m, PART),
+        *text_checks.structure(text, lens.back.shape, PART),
         net_check(f"{PART}: control points", text.surface.control_points, net),
         *_sound(solid, of_part=True),
         Check.true(edges, False, why) if wanted is None else _edges_moved(edges, wanted, solid),

@@ -30,7 +30,7 @@ Numbers = tuple[float, ...]
 
 def of_lens(text: StepText, lens: Lens) -> list[Check]:
     """The STEP file as text, held to the design."""
-    checks = structure(text, lens.back.m)
+    checks = structure(text, lens.back.shape)
     checks.append(net_check(f"{TEXT}: control points", text.surface.control_points, lens.back.control_points()))
     if text.front is not None and lens.front.is_net:
         name = f"{TEXT}: control points of the front"
@@ -38,15 +38,18 @@ def of_lens(text: StepText, lens: Lens) -> list[Check]:
     return checks
 
 
-def structure(text: StepText, m: int, name: str = TEXT) -> list[Check]:
-    """Structure of the STEP file: solids, unit, edges, and the form and knots of its freeform faces."""
-    faces = [(text.surface, m)] + ([(text.front, len(text.front.control_points))] if text.front else [])
-    plain = all(_is_plain(surface, points) for surface, points in faces)
+def structure(text: StepText, shape: tuple[int, int], name: str = TEXT) -> list[Check]:
+    """Structure of the STEP file: solids, unit, edges, and the form and knots of its freeform faces.
+
+    shape: numbers of control points of the back along x and along y.
+    """
+    faces = [(text.surface, shape)] + ([(text.front, text.front.control_points.shape[:2])] if text.front else [])
+    plain = all(_is_plain(surface, sides) for surface, sides in faces)
     degrees = ", ".join(f"degree {surface.degrees[0]} x {surface.degrees[1]}" for surface, _ in faces)
     moved, knot = max(
         (_off_by(full, knots(points), "")[0], _off_by(values, np.arange(points - 1.0), f"in {axis}: knot")[1])
-        for surface, points in faces
-        for axis, full, values in zip("uv", surface.full_knots, surface.knots, strict=True)
+        for surface, sides in faces
+        for axis, full, values, points in zip("uv", surface.full_knots, surface.knots, sides, strict=True)
     )
     units = f"{text.solids} solids, lengths in {text.unit}"
     return [
@@ -57,10 +60,10 @@ def structure(text: StepText, m: int, name: str = TEXT) -> list[Check]:
     ]
 
 
-def _is_plain(surface: FreeformSurface, m: int) -> bool:
+def _is_plain(surface: FreeformSurface, shape: tuple[int, int]) -> bool:
     """Is it an open surface of degree 2 x 2 with simple inner knots?"""
-    ones = np.array([3, *[1] * (m - 3), 3])
-    simple = all(np.array_equal(counts, ones) for counts in surface.multiplicities)
+    pairs = zip(surface.multiplicities, shape, strict=True)
+    simple = all(np.array_equal(counts, [3, *[1] * (points - 3), 3]) for counts, points in pairs)
     return surface.degrees == (2, 2) and simple and not (any(surface.closed) or surface.self_intersecting)
 
 
@@ -71,7 +74,7 @@ def _open_edge(text: StepText) -> str:
 
 
 def net_check(name: str, read: np.ndarray, designed: np.ndarray) -> Check:
-    """The control points (m, m, 3) that a file holds against the designed ones (mm)."""
+    """The control points (m, n, 3) that a file holds against the designed ones (mm)."""
     off, where = _off_by(read, designed, "control point")
     return Check.at_most(name, off, NET, unit="mm", where=where)
 

@@ -144,7 +144,7 @@ def test_a_face_of_another_outline_is_refused(outline):
     with pytest.raises(SceneError, match=r"^lens\.front\.file: its net covers [xy] = .*; give a design of the same"):
         load(DISK).changed({"lens.front": a_face(outline, z=15.0)})
     round_lens, face = load(DISK, {"lens.outline": "{shape='circle',diameter=16}"}), a_face(Circle(8.0), z=15.0)
-    assert round_lens.changed({"lens.front": face}).lens.front.given.m == face.m
+    assert round_lens.changed({"lens.front": face}).lens.front.given.shape == face.shape
 
 
 def test_a_net_follows_a_bowl_to_the_rim_where_it_reaches_past_it():

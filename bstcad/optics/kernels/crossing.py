@@ -134,16 +134,16 @@ def _store_directions(count, work, first, direction, out):
 @njit(error_model="numpy", fastmath={"contract"})
 def _meet_again(net, faces, path, first, count, work):
     """Place, slopes and second derivatives of the sag where the rays met the face."""
-    last = faces.m - 1.0
+    last_u, last_v = faces.m - 1.0, faces.n - 1.0
     for r in range(count):
         x, y = work[X + r] + path[first + r] * work[DX + r], work[Y + r] + path[first + r] * work[DY + r]
         work[X + r], work[Y + r] = x, y
-        work[U + r] = min(max((x - faces.x) * faces.per_x, 0.0), last)
-        work[V + r] = min(max((y - faces.y) * faces.per_y, 0.0), last)
+        work[U + r] = min(max((x - faces.x) * faces.per_x, 0.0), last_u)
+        work[V + r] = min(max((y - faces.y) * faces.per_y, 0.0), last_v)
     for r in range(count):
         if work[FATE + r] != 0.0:
             work[U + r] = work[V + r] = 0.0
-        h, p, q, hxx, hxy, hyy = curved(net, faces.m, work[U + r], work[V + r])
+        h, p, q, hxx, hxy, hyy = curved(net, faces.m, faces.n, work[U + r], work[V + r])
         work[SAG + r], work[SLOPE_X + r], work[SLOPE_Y + r] = h, p * faces.per_x, q * faces.per_y
         work[H_XX + r], work[H_XY + r] = hxx * faces.per_x * faces.per_x, hxy * faces.per_x * faces.per_y
         work[H_YY + r] = hyy * faces.per_y * faces.per_y
@@ -230,7 +230,7 @@ def _chain(faces, tilted, lands, count, work, path, d_rays, first):
         else:
             t, k, alive = path[first + r], first + r, work[FATE + r] == 0.0
             # beyond the net sag and slopes stay those of its rim: they do not change across it
-            in_x, in_y = 0.0 < work[U + r] < faces.m - 1.0, 0.0 < work[V + r] < faces.m - 1.0
+            in_x, in_y = 0.0 < work[U + r] < faces.m - 1.0, 0.0 < work[V + r] < faces.n - 1.0
             by_x = work[H_XX + r] * g_p + work[H_XY + r] * g_q if in_x else 0.0
             by_y = work[H_XY + r] * g_p + work[H_YY + r] * g_q if in_y else 0.0
             rise_x, rise_y = p if in_x else 0.0, q if in_y else 0.0
@@ -262,7 +262,7 @@ def _load_gradient(lands, g, more, first, count, work):
 def _cross_adjoint(
     net, faces, tilted, lands, position, direction, status, path, g, more, d_rays, first, last, own, touched
 ):
-    """Adds to `own` (m, m) the gradient in the net of Σ g · out of the rays first … last - 1 (see reductions.py).
+    """Adds to `own` (m, n) the gradient in the net of Σ g · out of the rays first … last - 1 (see reductions.py).
 
     g: like `out` of `_cross`.  more (2, n): the gradients in path and cosine of incidence, or (2, 0) if there are none.
     d_rays: None, or (6, n) for the gradient in positions and directions.

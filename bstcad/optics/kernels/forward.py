@@ -79,22 +79,22 @@ def reflect(turned, count, work):
 @njit(error_model="numpy")
 def first_root(net, faces, x, y, z, dx, dy, dz):
     """(s, found): path of a ray steep to the net to its first crossing (see interfaces.py); z from its plane."""
-    last, flattest = faces.m - 1.0, faces.rules.flattest
+    last_u, last_v, flattest = faces.m - 1.0, faces.n - 1.0, faces.rules.flattest
     u, v, u_s, v_s = (x - faces.x) * faces.per_x, (y - faces.y) * faces.per_y, dx * faces.per_x, dy * faces.per_y
     rate = abs(dz) + faces.steepest_x * abs(dx) + faces.steepest_y * abs(dy)
     s = below = 0.0
     arrived = False
     for step in range(int(faces.rules.approach_steps + faces.rules.newton_steps)):
         a, b = u + s * u_s, v + s * v_s
-        h, h_u, h_v = sag(net, faces.m, min(max(a, 0.0), last), min(max(b, 0.0), last))
+        h, h_u, h_v = sag(net, faces.m, faces.n, min(max(a, 0.0), last_u), min(max(b, 0.0), last_v))
         residual, slope = z + s * dz - h, dz - h_u * u_s - h_v * v_s
         if arrived:
             if abs(residual) <= faces.tolerance:
                 return s, abs(s - below) <= faces.near / flattest
             s -= residual / (slope if abs(slope) > flattest else (-flattest if slope < 0.0 else flattest))
             continue
-        gone = (a > last and u_s > 0.0) or (a < 0.0 and u_s < 0.0) or (z + s * dz < faces.lowest and dz <= 0.0)
-        gone |= (b > last and v_s > 0.0) or (b < 0.0 and v_s < 0.0)
+        gone = (a > last_u and u_s > 0.0) or (a < 0.0 and u_s < 0.0) or (z + s * dz < faces.lowest and dz <= 0.0)
+        gone |= (b > last_v and v_s > 0.0) or (b < 0.0 and v_s < 0.0)
         if gone or step >= faces.rules.approach_steps or (step == 0 and not residual < 0.0):
             break
         arrived, below = residual >= -faces.near, s
@@ -135,7 +135,7 @@ def search(net, faces, count, work, active):
 
     `work` ends with s after a ray's last step, and with sag and slopes (in u and v) before it.
     """
-    last, flattest = faces.m - 1.0, faces.rules.flattest
+    last_u, last_v, flattest = faces.m - 1.0, faces.n - 1.0, faces.rules.flattest
     searching = 0
     for r in range(count):
         active[searching] = r
@@ -146,10 +146,10 @@ def search(net, faces, count, work, active):
             r = active[a]
             s, u_s, v_s, dz = work[S + r], work[U_S + r], work[V_S + r], work[DZ + r]
             u, v = work[U + r] + s * u_s, work[V + r] + s * v_s
-            out_u, out_v = not 0.0 <= u <= last, not 0.0 <= v <= last
+            out_u, out_v = not 0.0 <= u <= last_u, not 0.0 <= v <= last_v
             if out_u or out_v:
-                u, v = min(max(u, 0.0), last), min(max(v, 0.0), last)
-            h, h_u, h_v = sag(net, faces.m, u, v)
+                u, v = min(max(u, 0.0), last_u), min(max(v, 0.0), last_v)
+            h, h_u, h_v = sag(net, faces.m, faces.n, u, v)
             residual, slope = s * dz - h, dz - h_u * u_s - h_v * v_s
             if out_u or out_v:  # beyond the net the sag goes on level across the rim
                 slope += (h_u * u_s if out_u else 0.0) + (h_v * v_s if out_v else 0.0)

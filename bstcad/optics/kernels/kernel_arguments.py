@@ -102,7 +102,8 @@ class Faces(NamedTuple):
     limit_y: float
     limit_r2: float
     gap: float  # from the plane where the rays begin to the plane the net's heights are measured from (mm)
-    m: int  # control points a side
+    m: int  # control points along x
+    n: int  # and along y
     x: float  # the net's corner (mm)
     y: float
     per_x: float  # control points per mm
@@ -211,7 +212,7 @@ def faces(
     face = _floats([*bent, law.eta, *limits, sense * (surface.z - start)])
     net = _floats([*net, *known, sense * (throw - surface.z)])
     fates = [Status.MISSED_FRONT, interface.status_if_missed, law.status_if_blocked, Status.TURNED_BACK]
-    numbers = Faces(int(law.reverses), *face, surface.m, *net, rules(), Fates(*_floats(fates)))
+    numbers = Faces(int(law.reverses), *face, *surface.shape, *net, rules(), Fates(*_floats(fates)))
     return numbers, _tilted(plane, sense, -sense if law.reverses else sense)
 
 

@@ -65,19 +65,19 @@ def bend(u, m):
 
 
 @njit(inline="always")
-def sag(net, m, u, v):
-    """(h, ∂h/∂u, ∂h/∂v) as sums over differences of neighbouring heights; net is flat (see bspline.evaluate)."""
+def sag(net, m, n, u, v):
+    """(h, ∂h/∂u, ∂h/∂v) as sums over differences of neighbouring heights; net (m, n) is flat (bspline.evaluate)."""
     i, a0, a2, p0, p2 = basis(u, m)
-    j, b0, b2, q0, q2 = basis(v, m)
-    at = np.uint64(i * m + j)  # unsigned: no test for an index from the end
+    j, b0, b2, q0, q2 = basis(v, n)
+    at = np.uint64(i * n + j)  # unsigned: no test for an index from the end
     middle = net[at + np.uint64(1)]
     low, high = middle - net[at], net[at + np.uint64(2)] - middle
     f0, g0 = middle - b0 * low + b2 * high, q0 * low + q2 * high
-    at += np.uint64(m)
+    at += np.uint64(n)
     middle = net[at + np.uint64(1)]
     low, high = middle - net[at], net[at + np.uint64(2)] - middle
     f1, g1 = middle - b0 * low + b2 * high, q0 * low + q2 * high
-    at += np.uint64(m)
+    at += np.uint64(n)
     middle = net[at + np.uint64(1)]
     low, high = middle - net[at], net[at + np.uint64(2)] - middle
     f2, g2 = middle - b0 * low + b2 * high, q0 * low + q2 * high
@@ -86,20 +86,20 @@ def sag(net, m, u, v):
 
 
 @njit(inline="always")
-def curved(net, m, u, v):
+def curved(net, m, n, u, v):
     """(h, ∂h/∂u, ∂h/∂v, ∂²h/∂u², ∂²h/∂u∂v, ∂²h/∂v²), as `sag`."""
     i, a0, a2, p0, p2 = basis(u, m)
-    j, b0, b2, q0, q2 = basis(v, m)
-    c_u, c_v = bend(u, m), bend(v, m)
-    at = np.uint64(i * m + j)
+    j, b0, b2, q0, q2 = basis(v, n)
+    c_u, c_v = bend(u, m), bend(v, n)
+    at = np.uint64(i * n + j)
     middle = net[at + np.uint64(1)]
     low, high = middle - net[at], net[at + np.uint64(2)] - middle
     f0, g0, k0 = middle - b0 * low + b2 * high, q0 * low + q2 * high, high - low
-    at += np.uint64(m)
+    at += np.uint64(n)
     middle = net[at + np.uint64(1)]
     low, high = middle - net[at], net[at + np.uint64(2)] - middle
     f1, g1, k1 = middle - b0 * low + b2 * high, q0 * low + q2 * high, high - low
-    at += np.uint64(m)
+    at += np.uint64(n)
     middle = net[at + np.uint64(1)]
     low, high = middle - net[at], net[at + np.uint64(2)] - middle
     f2, g2, k2 = middle - b0 * low + b2 * high, q0 * low + q2 * high, high - low
@@ -112,10 +112,10 @@ def curved(net, m, u, v):
 
 @njit(inline="always")
 def scatter(own, touched, u, v, g, g_u, g_v):
-    """The transpose of `sag`: adds a point's gradients to its nine control points; own (m, m), see reductions.py."""
-    m = own.shape[0]
+    """The transpose of `sag`: adds a point's gradients to its nine control points; own (m, n), see reductions.py."""
+    m, n = own.shape
     i, a0, a2, p0, p2 = basis(u, m)
-    j, b0, b2, q0, q2 = basis(v, m)
+    j, b0, b2, q0, q2 = basis(v, n)
     b1, q1 = 1.0 - b0 - b2, q0 - q2
     reductions.clear(own, touched, i, i + 3)
     flat, tilt = a0 * g - p0 * g_u, a0 * g_v
@@ -144,16 +144,16 @@ def beyond2(x, y, limit_x, limit_y):
 
 
 @compiled(parallel=True)
-def _evaluate(net, m, u, v, h, h_u, h_v):
-    n = u.size
-    for c in prange((n + CHUNK - 1) // CHUNK):
-        for r in range(c * CHUNK, min(n, (c + 1) * CHUNK)):
-            h[r], h_u[r], h_v[r] = sag(net, m, float(u[r]), float(v[r]))
+def _evaluate(net, m, n, u, v, h, h_u, h_v):
+    count = u.size
+    for c in prange((count + CHUNK - 1) // CHUNK):
+        for r in range(c * CHUNK, min(count, (c + 1) * CHUNK)):
+            h[r], h_u[r], h_v[r] = sag(net, m, n, float(u[r]), float(v[r]))
 
 
 @compiled(parallel=True)
 def _adjoint_in_net(u, v, g, g_u, g_v, d_net, touched):
-    """d_net (parts, m, m) in float64: each part's own sum, so no two threads write one cell (see reductions.py)."""
+    """d_net (parts, m, n) in float64: each part's own sum, so no two threads write one cell (see reductions.py)."""
     n = u.size
     count = d_net.shape[0]
     share = (n + count - 1) // count
@@ -164,17 +164,17 @@ def _adjoint_in_net(u, v, g, g_u, g_v, d_net, touched):
 
 
 @compiled(parallel=True)
-def _adjoint_in_places(net, m, u, v, g, g_u, g_v, d_u, d_v):
-    n = u.size
-    for c in prange((n + CHUNK - 1) // CHUNK):
-        for r in range(c * CHUNK, min(n, (c + 1) * CHUNK)):
-            _, zu, zv, zuu, zuv, zvv = curved(net, m, float(u[r]), float(v[r]))
+def _adjoint_in_places(net, m, n, u, v, g, g_u, g_v, d_u, d_v):
+    count = u.size
+    for c in prange((count + CHUNK - 1) // CHUNK):
+        for r in range(c * CHUNK, min(count, (c + 1) * CHUNK)):
+            _, zu, zv, zuu, zuv, zvv = curved(net, m, n, float(u[r]), float(v[r]))
             d_u[r] = float(g[r]) * zu + float(g_u[r]) * zuu + float(g_v[r]) * zuv
             d_v[r] = float(g[r]) * zv + float(g_u[r]) * zuv + float(g_v[r]) * zvv
 
 
 def net_gradient(heights: Tensor, u: Tensor, v: Tensor, seeds: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-    """(m, m) the gradient in the heights of Σ g h + g_u ∂h/∂u + g_v ∂h/∂v at (u, v), the seeds (g, g_u, g_v) held."""
+    """(m, n) the gradient in the heights of Σ g h + g_u ∂h/∂u + g_v ∂h/∂v at (u, v), the seeds (g, g_u, g_v) held."""
     d_net, touched = reductions.buffers(reductions.parts(u.numel()), *heights.shape)
     _adjoint_in_net(_flat(u), _flat(v), *map(_flat, seeds), d_net, touched)
     return torch.from_numpy(reductions.merged(d_net, touched)).to(heights.dtype)
@@ -187,7 +187,7 @@ class BSplineSag(torch.autograd.Function):
     def forward(ctx, heights: Tensor, u: Tensor, v: Tensor):  # noqa: D102
         ctx.save_for_backward(heights, u, v)
         out = [torch.empty(u.shape, dtype=u.dtype) for _ in range(3)]
-        _evaluate(net_of(heights), heights.shape[0], _flat(u), _flat(v), *(o.view(-1).numpy() for o in out))
+        _evaluate(net_of(heights), *heights.shape, _flat(u), _flat(v), *(o.view(-1).numpy() for o in out))
         return tuple(out)
 
     @staticmethod
@@ -200,7 +200,7 @@ class BSplineSag(torch.autograd.Function):
             d_heights = net_gradient(heights, u, v, (g, g_u, g_v))
         if any(ctx.needs_input_grad[1:]):
             d_u, d_v = (torch.empty(u.shape, dtype=u.dtype) for _ in range(2))
-            _adjoint_in_places(net_of(heights), heights.shape[0], *along, *(d.view(-1).numpy() for d in (d_u, d_v)))
+            _adjoint_in_places(net_of(heights), *heights.shape, *along, *(d.view(-1).numpy() for d in (d_u, d_v)))
         return d_heights, d_u, d_v
 
 
@@ -214,9 +214,9 @@ def largest_bending(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """(largest, its place as its index along x and along y, how many are at the bound), (3,), (3, 2), (3,), of KINDS.
 
-    net: (m, m) heights (mm).  along: (m - 2, places, 9) weights of a span's three control points in value, first (1/mm)
-    and second derivative (1/mm²), along x and along y.  at: (m - 2, places) x and y (mm).  limits: Outline.limits.
-    Places outside them do not count; a curvature is below 0 where no place bends that way.
+    net: (m, n) heights (mm).  along: (m - 2, places, 9) weights of a span's three control points in value, first (1/mm)
+    and second derivative (1/mm²) along x, and (n - 2, places, 9) along y.  at: (spans, places) x, and y (mm).
+    limits: Outline.limits.  Places outside them do not count; a curvature is below 0 where no place bends that way.
     """
     spans = len(net) - 2
     ends = [spans * part // PARTS for part in range(PARTS + 1)]
@@ -248,7 +248,7 @@ def _across(net, a, i, j):
 @compiled(error_model="numpy")
 def _largest(net, along_x, along_y, x, y, limits, bounds, first, last, found, place, count):
     """The figures of spans first … last - 1 along x, slopes squared."""
-    spans, places = y.shape
+    spans, places = y.shape  # of a line of spans along y
     reach_x, reach_y, reach2 = limits
     for i in range(first, last):
         for p in range(places):

@@ -1,0 +1,201 @@
+"""How many control points the net of a back gets where the scene states none.
+
+Where the light of k cells of the net falls on a pixel, the lens has k numbers to shape it with.  A pixel asks for a
+flux, and the source's flux density where its light crosses the back tells the area of the back that sends it: scarce
+light, which many such cells would have to carry, has few.  What of a picture is finer than its cells can make, and how
+the cells resolve edges and rims, give the RRMSD of a net; amounts of work (plan.py) give its seconds and memory.
+
+The smallest net is chosen beyond which no larger one gains a quarter, of those that memory, tailoring.max_time and the
+tool's radius allow.  tests/benchmarks/test_net_choice.py holds it to designs with every net.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import psutil
+import torch
+from scipy.ndimage import gaussian_filter
+
+from bstcad.analysis.cost import TILE, ControlCells
+from bstcad.analysis.light import blur
+from bstcad.optics.interfaces import cross
+from bstcad.optics.lens import Lens
+from bstcad.optics.sides import Sides, coarser, in_words, side, spread
+from bstcad.optics.tubes import area_of, collect, launch_tubes
+from bstcad.report.units import duration, number, two_digits
+from bstcad.scene.blank import LARGEST_NET
+from bstcad.scene.scene import Scene
+from bstcad.sweep.cold_run import Units
+from bstcad.sweep.estimates import coarse_lens
+from bstcad.sweep.plan import amounts, fitted, memory_gb, seconds
+
+KEY = "lens.back.control_points"
+SQUARE = (65, 129, 257, 513, 1025)  # control points a side of the nets that are tried, or as many in square cells
+NEARLY = 1.25  # as wide as high: a plate no more oblong than that gets a square net
+GAIN = 1.25  # times less RRMSD, for which a larger net is worth its time
+ROOM = 0.8  # of the machine's memory, that a design may take
+TWO_CORES = Units(tubes=0.1, serial=0.01)  # seconds: of a machine of pace 1
+TUBES = 256  # a side, by which the light is followed
+FLOOR, RIM = 0.7, 3.0  # RRMSD of the least error by the cells (ControlCells.floor), and of one control point a side
+BY_QUALITY = {"draft": (1.4, 0.002), "standard": (1.0, 0.006), "fine": (0.9, 0.003)}  # times that, and what is left
+UNDONE = 0.5  # of the blur by a source of some size, that stage 3 leaves
+SEAM = 7.0  # pixels; a valley of the tool's radius that moves light by less within a cell is narrower than it need be
+ENOUGH = 9.0  # cells a pixel; more shape nothing that a pixel shows
+DIM = 1e-3  # of the mean flux; tiles of less are taken for the mean
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """What a net would come to."""
+
+    net: Sides
+    rrmsd: float
+    seconds: float  # on two cores of pace 1
+    memory_gb: float
+    moved: float = math.inf  # pixels, see `moved`
+
+    @property
+    def words(self) -> str:
+        """"RRMSD about 0.02 in 42 s"."""
+        return f"an RRMSD of about {number(two_digits(self.rrmsd))} in {duration(self.seconds)}"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The net that is chosen, among all that are possible from coarse to fine."""
+
+    possible: tuple[Candidate, ...]
+    number: int  # of the chosen one
+    limit: str = ""  # what keeps it from being larger, beside its worth; "": nothing
+
+    @property
+    def net(self) -> Sides:
+        """Control points a side, or along x and along y."""
+        return self.possible[self.number].net
+
+    @property
+    def line(self) -> str:
+        """What is chosen, and what more and fewer would give; one line."""
+        chosen, around = self.possible[self.number], []
+        for step, word in ((1, "more"), (-1, "fewer")):
+            if 0 <= self.number + step < len(self.possible):
+                other = self.possible[self.number + step]
+                around.append(f"{word}, {in_words(other.net)}, {other.words}")
+        tail = f"; {self.limit}" if self.limit else ""
+        return f"{in_words(chosen.net)} control points are chosen, for {'; '.join([chosen.words, *around])}{tail}"
+
+
+def with_net(scene: Scene) -> tuple[Scene, Choice | None]:
+    """The scene with the net that is chosen for it; a scene that states one as it is, and None.
+
+    SceneError if no light reaches the back.
+    """
+    if scene.lens.back.control_points is not None:
+        return scene, None
+    levels = scene.tailoring.levels
+    if levels is not None:  # they say it
+        return scene.changed({KEY: levels[-1]}), None
+    choice = chosen(scene)
+    return scene.changed({KEY: choice.net}), choice
+
+
+def chosen(scene: Scene) -> Choice:
+    """The choice for a scene without a net."""
+    tried = [scene.changed({KEY: net}) for net in nets(scene)]
+    lens, screen, target = coarse_lens(tried[0]), scene.target.screen, scene.target.irradiance()
+    light, image = cells_of_a_mm2(tried[0], lens), blur(tried[0].channels(), lens, screen, target)
+    blurred = image.rrmsd if image is not None else 0.0
+    candidates = [
+        Candidate(
+            each.lens.back.net, rrmsd(light, each, blurred), seconds(amounts(each), fitted()["prices"], TWO_CORES),
+            memory_gb(each, fitted()["memory"]), moved=moved(each),
+        )
+        for k, each in enumerate(tried)
+        if k == 0 or light.a_pixel.sum() / math.prod(each.lens.cells) <= ENOUGH * target.size
+    ]  # fmt: skip
+    possible, limit = _possible(scene, candidates)
+    least = min(each.rrmsd for each in possible)
+    first = next(k for k, each in enumerate(possible) if each.rrmsd <= GAIN * least)
+    return Choice(possible, first, limit if first == len(possible) - 1 else "")
+
+
+def _possible(scene: Scene, candidates: list[Candidate]) -> tuple[tuple[Candidate, ...], str]:
+    """Those that tool, time and memory allow, the coarsest in any case; and which of them leaves larger ones out."""
+    most, room, radius = scene.tailoring.max_time, ROOM * psutil.virtual_memory().total / 1e9, scene.lens.tool_radius
+    bounds = (
+        (f"lens.tool_radius = {radius} has no use for more", lambda each: each.moved >= SEAM),
+        (f"tailoring.max_time = {most} leaves no time for more", lambda each: most is None or each.seconds <= most),
+        ("the memory of this machine is too little for more", lambda each: each.memory_gb <= room),
+    )
+    limit = ""
+    for reason, fits in bounds:
+        fewer = [each for each in candidates if fits(each)] or candidates[:1]
+        candidates, limit = fewer, reason if len(fewer) < len(candidates) else limit
+    return tuple(candidates), limit
+
+
+def moved(scene: Scene) -> float:
+    """Pixels by which the tightest valley that the tool makes moves light on the target within a cell; inf: any.
+
+    p L (n - 1) / R of a cell of pitch p behind a throw L (mm); a mirror turns light by twice its slope.  Where light
+    has to part, a seam is as wide as the tool makes it, and much finer cells do not narrow it.
+    """
+    radius, target = scene.lens.tool_radius, scene.target
+    if radius is None:
+        return math.inf
+    turn = 2.0 if scene.lens.back.reflect else scene.index - 1
+    throw = abs(target.z - scene.lens.back.z) * turn / radius
+    return throw * math.sqrt(math.prod(scene.lens.cells)) * math.sqrt(math.prod(target.screen.per_mm))
+
+
+def nets(scene: Scene) -> list[Sides]:
+    """The nets that are tried, from coarse to fine: of an oblong lens with square cells."""
+    half_x, half_y = scene.lens.outline.half_extent
+    if max(half_x, half_y) <= NEARLY * min(half_x, half_y):
+        return list(SQUARE)
+    return [coarser(spread(points, half_x, half_y), LARGEST_NET) for points in SQUARE]
+
+
+@torch.no_grad()
+def cells_of_a_mm2(scene: Scene, lens: Lens) -> ControlCells:
+    """The area (mm²) of the back that lights each pixel, by the flux that the target wants there: cells of 1 mm².
+
+    lens: a coarse one for the scene, whose light tells what flux density the light for each part of the target has as
+    it crosses the back.
+    """
+    light = max(scene.with_source_scaled(0.0).channels(), key=lambda channel: channel.weight)
+    lens, screen, target = light.through(lens), scene.target.screen, scene.target.irradiance()
+    tiles = replace(screen, pixels=tuple(-(-n // TILE) for n in screen.pixels))
+    tubes = launch_tubes(light.source, lens, TUBES)
+    x, y = cross(tubes.coming, lens.interfaces[lens.freeform[0]]).rays.position[:2]
+    landed = tubes.landing(lens, screen.plane)
+    flux, corners = tubes.whole(landed), tiles.pixels_of(landed.position.double())
+    area = torch.where(flux > 0, area_of(x, y).double(), torch.zeros_like(flux))
+    area, flux = (
+        gaussian_filter(collect(corners, carried, tiles.shape)[0].cpu().numpy().clip(0), 1.0, mode="nearest")
+        for carried in (area, flux)
+    )
+    mean = area.sum() / flux.sum() if flux.sum() > 0 else 0.0
+    per_flux = np.where(flux > DIM * flux.mean(), area / np.maximum(flux, 1e-300), mean)  # mm² of a unit of flux
+    whole = float(flux.sum())
+    rows, columns = target.shape
+    over_pixels = np.kron(per_flux, np.ones((TILE, TILE)))[:rows, :columns]
+    return ControlCells(whole * target * over_pixels, target)
+
+
+def rrmsd(light: ControlCells, scene: Scene, blurred: float = 0.0) -> float:
+    """RRMSD of a scene with its net, roughly: detail that its cells cannot make, rims that its spans blur, the rest.
+
+    blurred: RRMSD of the target blurred by the source's size.  Found by designs of half the size; of standard quality
+    half of them keep to 1.14 times this, nine of ten to 1.7 times.
+    """
+    factor, rest = BY_QUALITY.get(scene.tailoring.quality, BY_QUALITY["standard"])
+    width, height = scene.lens.cells
+    finer, half = 1 / math.sqrt(width * height), TILE // 2
+    between = replace(light, a_pixel=light.a_pixel[half:, half:], target=light.target[half:, half:])  # other tiles
+    floor = math.sqrt((light.floor(finer) ** 2 + between.floor(finer) ** 2) / 2)
+    by_net = factor * (FLOOR * floor + RIM / side(scene.lens.back.net)) + rest
+    return math.hypot(by_net, UNDONE * blurred)

@@ -1,0 +1,124 @@
+"""The net of a scene that states none: cells where light is needed, limits that hold, one line that says it."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+import bstcad
+from bstcad import commands
+from bstcad.cli import run
+from bstcad.scene.errors import SceneError
+from bstcad.sweep import net_choice
+from bstcad.sweep.estimates import coarse_lens
+from bstcad.sweep.net_choice import cells_of_a_mm2, chosen, rrmsd, with_net
+from tests.conftest import SMALL, draws_nothing, quick_effort
+
+FREE = {"lens.back.control_points": None, "tailoring.levels": None}
+PLATE = bstcad.load("templates/caustic_portrait.toml").changed(FREE)
+
+
+def sides(scene):
+    return [each.net for each in chosen(scene).possible]
+
+
+def test_a_net_that_is_stated_stays_and_levels_state_it_too():
+    stated = PLATE.changed({"lens.back.control_points": 77})
+    assert with_net(stated) == (stated, None)
+    by_levels, choice = with_net(PLATE.changed({"tailoring.levels": [33, 150]}))
+    assert by_levels.lens.back.control_points == 150 and choice is None
+
+
+def test_it_is_among_those_that_are_tried_and_the_least_that_is_worth_it():
+    choice = chosen(PLATE)
+    errors = [each.rrmsd for each in choice.possible]
+    assert errors == sorted(errors, reverse=True)
+    assert errors[choice.number] <= net_choice.GAIN * errors[-1]
+    assert all(error > net_choice.GAIN * errors[-1] for error in errors[: choice.number])
+    assert with_net(PLATE)[0].lens.back.net == choice.net
+
+
+def test_a_picture_of_fewer_pixels_gets_a_coarser_net():
+    assert [max(sides(PLATE.changed({"target.pixels": pixels}))) for pixels in (64, 128, 512)] == [129, 257, 1025]
+
+
+def test_time_memory_and_the_tool_bound_it(monkeypatch):
+    free = chosen(PLATE)
+    timely = chosen(PLATE.changed({"tailoring.max_time": 25.0}))
+    assert timely.net < free.net and "tailoring.max_time = 25" in timely.line
+    assert all(each.seconds <= 25 for each in timely.possible)
+    letters = bstcad.load("templates/machinable_letters.toml").changed(FREE | {"lens.tool_radius": None})
+    blunt = chosen(letters.changed({"lens.tool_radius": 3.0}))
+    assert (chosen(letters).net, blunt.net) == (513, 257) and "lens.tool_radius = 3.0" in blunt.line
+    scarce = type("Memory", (), {"total": 3e9})
+    monkeypatch.setattr(net_choice.psutil, "virtual_memory", lambda: scarce)
+    assert chosen(PLATE).net < free.net and "memory" in chosen(PLATE).line
+
+
+def test_an_oblong_plate_gets_square_cells():
+    wide = PLATE.changed({
+        "lens.outline": {"shape": "rectangle", "width": 100.0, "height": 25.0}, "target.y": [-12.5, 12.5],
+        "source.aperture": {"shape": "rectangle", "width": 100.0, "height": 25.0}, "target.pixels": [512, 128],
+    })  # fmt: skip
+    scene, choice = with_net(wide)
+    width, height = scene.lens.cells
+    assert width == pytest.approx(height, rel=0.02) and not any("cells" in doubt for doubt in scene.warnings())
+    assert " x " in choice.line.partition(" control")[0]
+
+
+def test_cells_are_those_of_the_light_that_a_pixel_asks_for():
+    """Of an even beam a pixel's light comes from its share of the lens; of a Gaussian beam dim light is wide."""
+    light = cells_of_a_mm2(PLATE, coarse_lens(PLATE))
+    assert light.a_pixel.sum() == pytest.approx(100.0 * 100.0, rel=0.01)
+    np.testing.assert_allclose(light.a_pixel, 1e4 * light.target, rtol=0.1, atol=1e-4)
+    point = bstcad.load("templates/portrait.toml").changed(FREE | {"target.image": np.ones((64, 64))})
+    area = cells_of_a_mm2(point, coarse_lens(point)).a_pixel
+    middle, corner = area[240:272, 240:272].mean(), area[:32, :32].mean()
+    assert corner > 3 * middle  # exp(-2 r² / w²): the rim of the lens has an eighth of the middle's flux density
+
+
+def test_fine_detail_asks_for_more_cells():
+    def error(picture):
+        scene = PLATE.changed({"target.image": picture, "target.pixels": 128, "target.gamma": 1.0})
+        return rrmsd(cells_of_a_mm2(scene, coarse_lens(scene)), scene.changed({"lens.back.control_points": 65}))
+
+    y, x = np.mgrid[:128, :128]
+    smooth, fine = (1.2 + np.cos(2 * math.pi * (x + y) / period) for period in (64, 6))
+    assert error(smooth) < error(np.where(x < 64, 1.2, fine)) < error(fine)
+
+
+def test_what_a_source_blurs_asks_for_no_finer_net():
+    sun = bstcad.load("templates/sun_caustic.toml").changed(FREE)
+    assert max(sides(sun)) > chosen(sun).net
+
+
+def test_a_scene_without_a_net_is_a_scene_and_asks_for_a_choice_where_one_is_needed():
+    assert bstcad.load("templates/caustic_portrait.toml").changed(FREE) == PLATE
+    assert "control_points" not in PLATE.toml() and PLATE.channels()
+    with pytest.raises(SceneError, match=r"lens\.back\.control_points: left out, and nothing has chosen it yet"):
+        _ = PLATE.lens.back.net
+
+
+def test_a_design_states_its_net_and_says_it_first(tmp_path, monkeypatch):
+    draws_nothing(monkeypatch)
+    monkeypatch.setattr(net_choice, "SQUARE", (17, 33))
+    scene = bstcad.load("templates/disk.toml").changed(SMALL | FREE)
+    said = []
+    commands.generate(scene, tmp_path / "small", effort=quick_effort(), progress=lambda *told: said.append(told))
+    assert said[0][0] == "control points" and "control points are chosen" in said[0][3]
+    made = bstcad.open(tmp_path / "small")
+    net = made.scene.lens.back.control_points
+    assert net in ((20, 15), (38, 29)) and made.lens.back.shape == net  # 8 x 6 mm
+    assert "control_points" in (tmp_path / "small" / "scene.toml").read_text()
+
+
+def test_plan_says_it(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("bstcad.sweep.plan.outlook", lambda *given: {"predicted": None})
+    path = tmp_path / "scene.toml"
+    path.write_text(PLATE.changed({"target.pixels": 64, "target.sample": "camera"}).toml())
+    assert run(["plan", str(path), "--json"]) == 0
+    out, err = capsys.readouterr()
+    told = json.loads(out)["control_points"]
+    assert told["possible"][told["number"]]["net"] == 129
+    assert err.count("\n") == 1 and "129 control points are chosen" in err and "fewer, 65" in err
