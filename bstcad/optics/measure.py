@@ -452,13 +452,23 @@ def images(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int = IMA
     """Images of the source whose points are the channels of the first line, through n x n lit places of the back."""
     first = channels[0]
     channels = [c for c in channels if (c.source.wavelength, c.index) == (first.source.wavelength, first.index)]
+    pixel, flux = seen_through(channels, lens, screen, n)
+    lit = flux.sum(0) > 0
+    flux, share = flux[:, lit], flux[:, lit] / flux[:, lit].sum(0)
+    pixel = torch.where(flux > 0, pixel[..., lit], torch.zeros_like(share))
+    return Images(pixel - (pixel * share).sum(1, keepdim=True), flux)
+
+
+@torch.no_grad()
+def seen_through(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int) -> tuple[Tensor, Tensor]:
+    """(pixel (2, channels, places), flux (channels, places)) of the light of each channel through n x n places of the back.
+
+    pixel: where it lands, column and row; no number where no light gets through, and the flux is zero.
+    """
     x, y = corners(lens.apertures[1], n)
     landed = [_through(channel, lens, screen, x=x, y=y) for channel in channels]
     position, flux = (torch.stack([getattr(each, name) for each in landed], dim=-2) for name in ("position", "flux"))
-    lit = flux.sum(0) > 0
-    flux, share = flux[:, lit], flux[:, lit] / flux[:, lit].sum(0)
-    pixel = screen.pixels_of(torch.where(flux > 0, position[..., lit], torch.zeros_like(share)))
-    return Images(pixel - (pixel * share).sum(1, keepdim=True), flux)
+    return screen.pixels_of(position), flux
 
 
 def _through(channel: Channel, lens: Lens, screen: Screen, x: Tensor, y: Tensor) -> Landed:

@@ -201,7 +201,8 @@ def diagnosis(
     )
     light = max(scene.with_source_scaled(0.0).channels(), key=lambda channel: channel.weight)
     ours, twins = knobs.method == "least-squares", making.twins if knobs.precision == "float32" else None
-    grown = [making.stages[k].rrmsd for k in sizes]
+    judged_sizes = [making.stages[k].rrmsd for k in sizes]
+    grown = [*judged_sizes[:2], *judged_sizes[3:]] if len(judged_sizes) == 4 else judged_sizes  # the whole source twice
     found = limits(
         rrmsd,
         control_cells(light, lens, screen, target),
