@@ -27,7 +27,7 @@ WHOLE = {  # methods that run to their end and know no bounds, and the key by wh
     "integration": ("point-by-point integration", "tailoring.method"),
 }
 COARSEST_GRID = 64  # cells a side of the transport in stage 1's first rounds: so many cost next to nothing
-JUDGE_POINTS = 128  # of an extended source in the pictures and margins of a verification, not in its RRMSD
+JUDGE_POINTS = 32  # of an extended source in the pictures and margins of a verification, not in its RRMSD
 JUDGE_DRAW = 1 << 12  # the number of their draw; each further line of a spectrum takes the next number
 
 

@@ -10,6 +10,7 @@ by its image (source_image.py); first of a small source, then of a larger one, a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -40,6 +41,7 @@ FEW = 30  # evaluations: fewer make one round, since each has its own start to p
 NET = 65  # control points a side, at most: the comparison shall cost a fraction of a second
 TUBES = 128  # a side
 COMPARED = 6  # evaluations in each precision
+A_CELL = 1.6  # tubes a control cell a side for a source of some size, at least
 SIZES = ((1 / 3, 1 / 6), (2 / 3, 1 / 6), (1.0, 1 / 3), (1.0, 1 / 3))  # (of the source, evaluations), as shares
 
 
@@ -301,10 +303,10 @@ def with_stage3(before: Stage2 | None, task: Task, lens: Lens, state: Any = None
 def stage3_rounds(task: Task) -> tuple[Round, ...]:
     """Two for the whole source, between which the light that its images leave out is measured anew; one a smaller size.
 
-    Two tubes a control cell a side, or two a pixel: what is finer the source's image blurs.
+    As many tubes a side as tell control points apart and as pixels: what is finer the source's image blurs.
     """
     total = task.knobs.stage2_iterations
-    tubes = min(task.knobs.rays, max(2 * task.knobs.levels[-1], *task.screen.shape))
+    tubes = min(task.knobs.rays, max(math.ceil(A_CELL * task.knobs.levels[-1]), *task.screen.shape))
     lights = (replace(task, channels=channels, grown=(), spreads=()) for channels in task.grown)
     return tuple(
         Round(light, tubes, round(share * total), "stage 3", spread)
