@@ -501,9 +501,9 @@ def images(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int = IMA
 
 @torch.no_grad()
 def seen_through(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int) -> tuple[Tensor, Tensor]:
-    """(pixel (2, channels, places), flux (channels, places)) of the light of each channel through n x n places of the back.
+    """(pixel (2, channels, places), flux (channels, places)) of each channel's light through n x n places of the back.
 
-    pixel: where it lands, column and row; no number where no light gets through, and the flux is zero.
+    pixel: where it lands, column and row; of no meaning where no light gets through, and the flux is zero.
     """
     x, y = corners(lens.apertures[1], n)
     landed = [_through(channel, lens, screen, x=x, y=y) for channel in channels]

@@ -42,6 +42,7 @@ NODES = 5  # a side, from border to border of the screen, between which images a
 PLACES = 32  # a side of the back, through which they are looked for
 APART = 0.7  # of the source's half width and height: distance of the 3 x 3 points whose light is traced
 PAIRS = 256  # of points that make a smooth image
+FINER = 5  # an odd number
 SIDE = 1448  # rays a side of each of the two sets that tell what the images leave out
 POINTS = 256  # of the source in each set
 SMOOTH = 0.15  # of the image's reach in pixels: standard deviation by which that picture is smoothed
@@ -92,13 +93,13 @@ class _Blurred(torch.autograd.Function):
     """B of a picture, differentiable in it."""
 
     @staticmethod
-    def forward(ctx: Any, light: Tensor, blur: Blur) -> Tensor:  # noqa: D102
+    def forward(ctx: Any, light: Tensor, blur: Blur) -> Tensor:
         ctx.blur = blur
         return torch.from_numpy(blur.forward(light.detach().cpu().numpy()).copy()).to(light.device)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, g: Tensor):  # noqa: D102
+    def backward(ctx: Any, g: Tensor):
         return torch.from_numpy(ctx.blur.adjoint(g.cpu().numpy())).to(g.device), None
 
 
@@ -165,20 +166,26 @@ def blurs(spread: Spread, lens: Lens, screen: Screen) -> tuple[Blur, ...]:
 def _blur(images: Sequence[tuple[Tensor, Tensor]], screen: Screen, border: int) -> Blur:
     """From the dots of each node: offset (2, dots) in pixels, share (dots,) of the middle's flux density.
 
-    Dots are shared among the nearest pixels by tents, whose own blur, sinc² along each axis, is divided out again.
+    Each dot is shared by a tent among parts of a pixel, FINER a side, whose own blur does not count.
     """
     hats = tuple(_hats(side, border) for side in screen.shape)
     side = 2 * border + 1
     size = tuple(scipy.fft.next_fast_len(hat.shape[1] + side, real=True) for hat in hats)
-    own = Screen(0.0, (-side / 2, side / 2), (-side / 2, side / 2), side)
-    kernels = np.zeros((len(images), *size))
-    for kernel, (offset, share) in zip(kernels, images, strict=True):
+    own = Screen(0.0, (-side / 2, side / 2), (-side / 2, side / 2), FINER * side)
+    spectra = np.zeros((len(images), size[0], size[1] // 2 + 1), dtype=complex)
+    for spectrum, (offset, share) in zip(spectra, images, strict=True):
         down = offset * torch.tensor([[1.0], [-1.0]])  # rows count downwards
         dots = Landed(down.contiguous(), share / share.numel(), torch.zeros(share.shape, dtype=torch.uint8))
-        kernel[:side, :side] = tent(dots, own).numpy()
-    waves = scipy.fft.rfft2(np.roll(kernels, (-border, -border), (1, 2)))
-    waves /= np.sinc(scipy.fft.fftfreq(size[0]))[:, None] ** 2 * np.sinc(scipy.fft.rfftfreq(size[1])) ** 2
-    return Blur(border, hats, waves.reshape(NODES, NODES, *waves.shape[1:]), size)
+        waves = scipy.fft.rfft(_about_zero(tent(dots, own).numpy(), FINER * size[1], axis=1))
+        waves = scipy.fft.fft(_about_zero(waves[:, : spectrum.shape[1]], FINER * size[0], axis=0), axis=0)
+        spectrum[:] = waves[np.arange(size[0]) - size[0] * (np.arange(size[0]) >= (size[0] + 1) // 2)]
+    return Blur(border, hats, spectra.reshape(NODES, NODES, *spectra.shape[1:]), size)
+
+
+def _about_zero(values: np.ndarray, n: int, axis: int) -> np.ndarray:
+    """An odd number of values along an axis, with zeros to n behind them, turned so that the middle one is first."""
+    odd = values.shape[axis]
+    return np.roll(np.pad(values, [(0, n - odd if k == axis else 0) for k in (0, 1)]), -(odd // 2), axis)
 
 
 def _hats(side: int, border: int) -> np.ndarray:

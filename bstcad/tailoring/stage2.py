@@ -41,8 +41,9 @@ FEW = 30  # evaluations: fewer make one round, since each has its own start to p
 NET = 65  # control points a side, at most: the comparison shall cost a fraction of a second
 TUBES = 128  # a side
 COMPARED = 6  # evaluations in each precision
-A_CELL = 1.6  # tubes a control cell a side for a source of some size, at least
-SIZES = ((1 / 3, 1 / 6), (2 / 3, 1 / 6), (1.0, 1 / 3), (1.0, 1 / 3))  # (of the source, evaluations), as shares
+# (of the source, evaluations), as shares of all; what its images leave out is measured anew in each round
+SIZES = ((1 / 3, 1 / 8), (2 / 3, 1 / 8), (1.0, 1 / 4), (1.0, 1 / 4), (1.0, 1 / 4))
+A_CELL, A_PIXEL = 2.0, 1.1  # tubes a control cell and a pixel a side, at least: what is finer the source's image blurs
 
 
 @dataclass(frozen=True)
@@ -182,8 +183,9 @@ def _pull(task: Task, lens: Lens) -> float:
 
 
 def _search(
-    now: Round, lens: Lens, merit: TubeMerit | BlurredMerit, place: Place, *, total: int, bound_weight: float, state: TubeSearch | None
-) -> Iterator[tuple[Reached, Step]]:
+    now: Round, lens: Lens, merit: TubeMerit | BlurredMerit, place: Place, *, total: int, bound_weight: float,
+    state: TubeSearch | None,
+) -> Iterator[tuple[Reached, Step]]:  # fmt: skip
     """One run of the minimiser from `lens`, or on from a saved state; it also ends when the goal is reached.
 
     total: evaluations of all rounds; bound_weight: weight of the penalty on exceeding the bounds of the back.
@@ -301,17 +303,21 @@ def with_stage3(before: Stage2 | None, task: Task, lens: Lens, state: Any = None
 
 
 def stage3_rounds(task: Task) -> tuple[Round, ...]:
-    """Two for the whole source, between which the light that its images leave out is measured anew; one a smaller size.
-
-    As many tubes a side as tell control points apart and as pixels: what is finer the source's image blurs.
-    """
-    total = task.knobs.stage2_iterations
-    tubes = min(task.knobs.rays, max(math.ceil(A_CELL * task.knobs.levels[-1]), *task.screen.shape))
+    """One for each of SIZES."""
     lights = (replace(task, channels=channels, grown=(), spreads=()) for channels in task.grown)
+    counts = blurred_sheets(task.knobs, max(task.screen.shape))
     return tuple(
-        Round(light, tubes, round(share * total), "stage 3", spread)
-        for light, spread, (_, share) in zip(lights, task.spreads, SIZES, strict=True)
+        Round(light, tubes, evaluations, stage="stage 3", spread=spread)
+        for light, spread, (tubes, evaluations) in zip(lights, task.spreads, counts, strict=True)
     )
+
+
+def blurred_sheets(knobs: Tailoring, pixels: int) -> Iterator[tuple[int, int]]:
+    """(tubes a side, evaluations) of each round for a source of some size; pixels: along the longer side."""
+    total = knobs.stage2_iterations * (2 if knobs.stage2_iterations < FEW else 1)  # each is cheap, and all have a start
+    tubes = min(knobs.rays, math.ceil(max(A_CELL * knobs.levels[-1], A_PIXEL * pixels)))
+    for _, share in SIZES:
+        yield tubes, round(share * total)
 
 
 @dataclass(frozen=True)
