@@ -149,11 +149,12 @@ def measure(
 
 
 def rrmsd_by_rays(
-    lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, effort: Effort = FULL
-) -> float:
+    lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, effort: Effort = FULL,
+    draw: Draw | None = None,
+) -> float:  # fmt: skip
     """`Light.rrmsd` alone; NaN where no light falls."""
     wanted = torch.from_numpy(np.asarray(target, dtype=np.float64))
-    rays = _enough(lens, lambda count, seed: channels, screen, wanted=wanted, effort=effort, ghost=None)
+    rays = _enough(lens, draw or (lambda count, seed: channels), screen, wanted=wanted, effort=effort, ghost=None)
     return _value(rays, wanted)[0] if rays.boxes else math.nan
 
 

@@ -64,7 +64,7 @@ class Tailoring(Record):
         float | None, Key("Weight of light outside the target, a pixel^2.", "", 0.0, 1e3, example=0.03)
     ] = None
     source_points: Annotated[
-        int | None, Key("Points that stand for an extended source between stages.", "", 2, 4096)
+        int | None, Key("Points that tell how wide an extended source's image is.", "", 2, 4096)
     ] = None
     precision: Annotated[
         Literal["float32", "float64"] | None, Key("Numbers that tailoring works with.", example="float64")

@@ -104,7 +104,8 @@ class Task:
         effort = ASKED
         if self.knobs.accuracy is None and self.bounds is None:
             effort = replace(BETWEEN, rays=round(BETWEEN.rays * (self.target.size / PIXELS**2) ** (1 / 3)))
-        return rrmsd_by_rays(lens.plain(), self.channels, self.screen, target=self.target, effort=effort)
+        draw = self.spreads[-1].draw if self.spreads and not self.grown else None  # not of its middle alone
+        return rrmsd_by_rays(lens.plain(), self.channels, self.screen, target=self.target, effort=effort, draw=draw)
 
     def used(self, lens: Lens) -> float:
         """Part of the light that enters the lens which falls on the target."""

@@ -304,7 +304,10 @@ def with_stage3(before: Stage2 | None, task: Task, lens: Lens, state: Any = None
 
 def stage3_rounds(task: Task) -> tuple[Round, ...]:
     """One for each of SIZES."""
-    lights = (replace(task, channels=channels, grown=(), spreads=()) for channels in task.grown)
+    lights = (
+        replace(task, channels=channels, grown=(), spreads=(spread,))
+        for channels, spread in zip(task.grown, task.spreads, strict=True)
+    )
     counts = blurred_sheets(task.knobs, max(task.screen.shape))
     return tuple(
         Round(light, tubes, evaluations, stage="stage 3", spread=spread)
