@@ -24,6 +24,7 @@ from bstcad.scene.scene import Scene
 from bstcad.tailoring import slope_map, stage1, stage2
 from bstcad.tailoring.machinability import BOUNDED, UNBOUNDED, kept, moved_clear
 from bstcad.tailoring.run import JUDGING, Driver, Parameters, Progress, Record, Task, forget, never, silent
+from bstcad.tailoring.source_image import Spread
 from bstcad.tailoring.stage2 import Comparison, compare_precisions
 from bstcad.transport.mapping import Mapping, TransportMap
 
@@ -67,7 +68,7 @@ def design(
     save: Callable[[Saved], None] = forget, start: Saved | None = None, interrupted: Callable[[], bool] = never,
     merit: Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None = None,
 ) -> Made:  # fmt: skip
-    """From a scene to a tailored lens: transport map, stage 1, stage 2; stage 3 for a source of some size.
+    """From a scene to a tailored lens: transport map, stage 1, stage 2, or stage 3 for a source of some size.
 
     tailoring.max_time is counted from `began` (time.perf_counter(), default now) and leaves time for writing and proof.
     `save` is called now and then with a state; given as `start`, the design goes on from there and ends the same.
@@ -81,11 +82,12 @@ def design(
     knobs = scene.tailoring.resolved(scene.lens.back.net)
     screen = target.screen
     sizes = stage2.SIZES if scene.source.extent and knobs.method != "integration" else ()  # that knows points alone
-    grown = tuple(scene.with_source_scaled(share).channels() for share, _ in sizes)
+    light, scaled = scene.with_source_scaled(0.0).channels(), [scene.with_source_scaled(share) for share, _ in sizes]
+    grown = tuple(each.channels() for each in scaled)
     task = Task(
-        scene.with_source_scaled(0.0).channels(), screen, target.irradiance(), knobs, least=scene.lens.min_thickness,
+        light, screen, target.irradiance(), knobs, least=scene.lens.min_thickness,
         free=scene.lens.front.free, rim_sags=scene.rim_sags, progress=progress, grown=grown, bounds=scene.lens.bounds,
-        merit=merit,
+        spreads=tuple(Spread(each.source, light, each.draw) for each in scaled), merit=merit,
     )  # fmt: skip
     limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve(scene) + JUDGING}
     record = Record() if start is None else start.record
@@ -174,7 +176,8 @@ def _stage2(task: Task, driver: Driver, lens: Lens, followed: Followed, state: S
     *_, stage = PROCEDURES[task.knobs.method]
     name, steps = "stage 2", stage(task, lens, state)
     if task.grown:
-        name, steps = "stage 3", stage2.with_stage3(stage, task, lens, state)
+        before = stage if task.knobs.method == "adam" else None  # the paper's procedure knows points alone
+        name, steps = "stage 3", stage2.with_stage3(before, task, lens, state)
 
     def saved(state: Stage2State) -> Saved:
         return Saved(driver.record, None, followed, state)
@@ -185,7 +188,7 @@ def _stage2(task: Task, driver: Driver, lens: Lens, followed: Followed, state: S
         lens = kept(lens, task.bounds)
         driver.end(BOUNDED, task.whole.rrmsd(lens))
         if not driver.hurry:
-            driver.aside(UNBOUNDED, stage2.rrmsd_without_bounds(task.whole, lens))
+            driver.aside(UNBOUNDED, stage2.rrmsd_without_bounds(task, lens))
     total = task.knobs.stage2_iterations
     driver.progress(name, total, total, driver.stopped)
     if driver.stopped != "interrupt":

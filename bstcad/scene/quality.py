@@ -28,7 +28,7 @@ WHOLE = {  # methods that run to their end and know no bounds, and the key by wh
     "integration": ("point-by-point integration", "tailoring.method"),
 }
 COARSEST_GRID = 64  # cells a side of the transport in stage 1's first rounds: so many cost next to nothing
-JUDGE_POINTS = 128  # of an extended source in the pictures and margins of a verification, not in its RRMSD
+JUDGE_POINTS = 32  # of an extended source in the pictures and margins of a verification, not in its RRMSD
 JUDGE_DRAW = 1 << 12  # the number of their draw; each further line of a spectrum takes the next number
 
 
@@ -65,7 +65,9 @@ class Tailoring(Record):
     overshoot: Annotated[
         float | None, Key("Weight of light outside the target, a pixel^2.", "", 0.0, 1e3, example=0.03)
     ] = None
-    source_points: Annotated[int | None, Key("Points that stand for an extended source.", "", 2, 4096)] = None
+    source_points: Annotated[
+        int | None, Key("Points that tell how wide an extended source's image is.", "", 2, 4096)
+    ] = None
     precision: Annotated[
         Literal["float32", "float64"] | None, Key("Numbers that tailoring works with.", example="float64")
     ] = None

@@ -31,6 +31,7 @@ from bstcad.tailoring.machinability import BOUNDED, UNBOUNDED, moved_clear
 from bstcad.tailoring.slope_fit import Fit
 from bstcad.tailoring.slope_map import face_grid, lit_window, slope_map, sloped
 from bstcad.tailoring.stage2 import FEW
+from bstcad.tailoring.stage2 import SIZES as SHARES
 
 # --- a coarse lens ----------------------------------------------------------------------------------------------------
 
@@ -199,16 +200,17 @@ def diagnosis(
     curve = ending(
         [(point.seconds, point.rrmsd) for point in making.history],
         [(stage.seconds, stage.rrmsd) for stage in making.stages],
-        since=math.fsum(stage.seconds for stage in making.stages[: max(sizes, default=0)]),  # of the whole source
+        since=math.fsum(stage.seconds for stage in making.stages[: max(sizes[2:], default=0)]),  # of the whole source
     )
     light = max(scene.with_source_scaled(0.0).channels(), key=lambda channel: channel.weight)
     ours, twins = knobs.method == "least-squares", making.twins if knobs.precision == "float32" else None
     grown = [making.stages[k].rrmsd for k in sizes]
+    grown = [*grown[:2], *grown[-1:]] if len(grown) == len(SHARES) else []  # the last rounds are of the whole source
     found = limits(
         rrmsd,
         control_cells(light, lens, screen, target),
         curve=curve,
-        own=curve.rrmsd if curve is not None and ours else None,
+        own=curve.rrmsd if curve is not None and ours and not sizes else None,  # images of a source are no tubes
         grown=[value for value in grown if value is not None and math.isfinite(value)],
         singles=None if twins is None else (twins["rrmsd_float32"], twins["rrmsd_float64"]),
         anew=ours and knobs.stage2_iterations < FEW,
@@ -240,10 +242,6 @@ REMEDIES = {
         "lens.back.control_points = {net}",
     ),
     "tubes": ("the tubes that tailored it see an RRMSD of {own}, independent rays {finer}", "tailoring.rays = {rays}"),
-    "tubes of a source": (
-        "the tubes and source points that tailored it see an RRMSD of {own}, rays from other points {finer}",
-        "tailoring.source_points = {points}",
-    ),
     "source size": (
         "with a third, two thirds and all of the source's size there was an RRMSD of {third}, {two thirds} and {whole}",
         "a source of half the size, or the target at half the distance,",
@@ -259,12 +257,11 @@ def because(limit: Limit, scene: Scene) -> str:
     net, figures = scene.lens.back.net, limit.figures
     knobs = scene.tailoring.resolved(net)
     told = {name: (about if name in ("scarce", "median") else number)(value) for name, value in figures.items()}
-    told |= {"net": toml(scaled(net, 2)), "evaluations": 2 * knobs.stage2_iterations, "points": 2 * knobs.source_points}
+    told |= {"net": toml(scaled(net, 2)), "evaluations": 2 * knobs.stage2_iterations}
     told |= {"rays": math.ceil(2**0.5 * knobs.rays), "falls": "has come to rest"}
     if figures.get("power", 0.0) >= RESTS:
         told["falls"] = f"still falls, as time to the power of {about(-figures['power'])}"
-    extended = limit.by == "tubes" and scene.source.extent is not None
-    why, step = (text.format_map(told) for text in REMEDIES["tubes of a source" if extended else limit.by])
+    why, step = (text.format_map(told) for text in REMEDIES[limit.by])
     if "blurred" in figures:
         why += f"; the source's size alone blurs the target to an RRMSD of {number(figures['blurred'])}"
     left = two_digits(limit.rrmsd)

@@ -37,7 +37,7 @@ from bstcad.tailoring import stage1, stage2
 from bstcad.tailoring.run import EVALUATED, Task
 from bstcad.tailoring.slope_map import SUBCELLS
 from bstcad.tailoring.stage1 import aimed
-from bstcad.tailoring.stage2 import sheets
+from bstcad.tailoring.stage2 import blurred_sheets, sheets
 
 FITTED = Path(__file__).with_name("fitted.json")
 Interval = tuple[float, float, float]  # low, likely, high
@@ -116,11 +116,13 @@ def amounts(scene: Scene, other_way: bool = False) -> dict[str, float]:
     """The amounts of KINDS in a design; other_way: does its stage 1 try the other way?"""
     (columns, rows), knobs = scene.target.columns_rows, scene.tailoring.resolved(scene.lens.back.net)
     m, net, pixels = max(both(scene.lens.back.net)), (knobs.side / NET) ** 2, columns * rows / PIXELS**2
-    spread = len(scene.channels()) ** 0.5
+    wide = scene.source.extent is not None  # tailored by one sheet a line
+    spread = len(scene.with_source_scaled(0.0).channels()) if wide else len(scene.channels()) ** 0.5
     point = scene.source.kind == "point"
     judged = JUDGED * pixels ** (2 / 3)  # rays as run.BETWEEN has them
     adam, slopes = knobs.method == "adam", knobs.method == "least-squares"
-    rounds = [] if adam else [(tubes / TUBES, evaluations) for tubes, evaluations in sheets(knobs)]
+    counts = blurred_sheets(knobs, max(columns, rows)) if wide else sheets(knobs)
+    rounds = [] if adam else [(tubes / TUBES, evaluations) for tubes, evaluations in counts]
     traced = spread * sum(tubes**2 * count for tubes, count in rounds)
     steps = knobs.stage1_iterations * len(knobs.levels) + knobs.stage2_iterations
     grids = [knobs.transport_grid]  # cells a side of the transport in each round; Wang et al.'s is one map

@@ -15,12 +15,13 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from bstcad.optics.channels import Channel, points
+from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, measure, rrmsd_by_rays
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
+from bstcad.tailoring.source_image import Spread
 from bstcad.transport.mapping import Mapping
 
 
@@ -84,6 +85,7 @@ class Task:
     progress: Progress = silent  # told of the progress within a step
     grown: tuple[tuple[Channel, ...], ...] = ()  # points of the source, as it grows to its size; () of a point
     bounds: Bounds | None = None  # on the back; None: it may have any shape
+    spreads: tuple[Spread, ...] = ()  # the same source in each of these sizes, about its middle
     # of a picture (rows, columns) and the target, both of sum 1 or less, what stage 2 makes least; None: RRMSD²
     merit: Callable[[Tensor, Tensor], Tensor] | None = None
 
@@ -97,23 +99,13 @@ class Task:
         """The same task with the light of the whole source."""
         return replace(self, channels=self.grown[-1], grown=()) if self.grown else self
 
-    @property
-    def tubes(self) -> int:
-        """Along a side of the sheet of each channel: as many in all as for a point, but two a control cell at least.
-
-        (In all of the cell: with many coarse sheets a lens is better than with half as many fine ones.)
-        """
-        count = points(self.channels)
-        if count == 1:
-            return self.knobs.rays
-        return max(round(self.knobs.rays / count**0.5), math.ceil(2**0.5 * self.knobs.side))
-
     def rrmsd(self, lens: Lens) -> float:
         """RRMSD by rays on the CPU, without the bias of the tubes that tailor the lens."""
         effort = ASKED
         if self.knobs.accuracy is None and self.bounds is None:
             effort = replace(BETWEEN, rays=round(BETWEEN.rays * (self.target.size / PIXELS**2) ** (1 / 3)))
-        return rrmsd_by_rays(lens.plain(), self.channels, self.screen, target=self.target, effort=effort)
+        draw = self.spreads[-1].draw if self.spreads and not self.grown else None  # not of its middle alone
+        return rrmsd_by_rays(lens.plain(), self.channels, self.screen, target=self.target, effort=effort, draw=draw)
 
     def used(self, lens: Lens) -> float:
         """Part of the light that enters the lens which falls on the target."""

@@ -4,13 +4,13 @@ Each evaluation traces the same corners of a sheet of tubes, so that the merit i
 on it is a gain for the lens.  In the Sobolev variable (merit.py) L-BFGS needs some hundred evaluations where Adam on
 raw control points needs thousands.
 
-Stage 3 is for a source of some size.  The lens for a point throws the target blurred by the source's image
-(analysis/blur.py); stage 3 goes on from it with fixed points of the source as channels: first of a small source, then
-of a larger one, at last of the source as it is.
+Stage 3 is for a source of some size, in place of stage 2: the same search by the light of the source's middle, blurred
+by its image (source_image.py); first of a small source, then of a larger one, at last of the source as it is.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -29,6 +29,7 @@ from bstcad.tailoring.machinability import excess, weight
 from bstcad.tailoring.merit import SobolevVariable, TubeMerit, local_weight
 from bstcad.tailoring.minimise import Best, Reached, Search, lbfgs, minimise
 from bstcad.tailoring.run import EVALUATED, Parameters, Step, Task
+from bstcad.tailoring.source_image import BlurredMerit, Spread
 
 ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))  # (tubes a side, evaluations), as shares of the knobs
 # The same where even the last round has fewer than DENSE tubes a control cell each way.  The first ones then bend the
@@ -41,7 +42,9 @@ FEW = 30  # evaluations: fewer make one round, since each has its own start to p
 NET = 65  # control points along the longer side, at most: the comparison shall cost a fraction of a second
 TUBES = 128  # a side
 COMPARED = 6  # evaluations in each precision
-SIZES = ((1 / 3, 1 / 6), (2 / 3, 1 / 6), (1.0, 2 / 3))  # (of the source, evaluations), as shares of all
+# (of the source, evaluations), as shares of all; what its images leave out is measured anew in each round
+SIZES = ((1 / 3, 1 / 8), (2 / 3, 1 / 8), (1.0, 1 / 4), (1.0, 1 / 4), (1.0, 1 / 4))
+A_CELL, A_PIXEL = 2.0, 1.1  # tubes a control cell and a pixel a side, at least: what is finer the source's image blurs
 
 
 @dataclass(frozen=True)
@@ -52,12 +55,26 @@ class Round:
     tubes: int  # a side of the sheet of each channel
     evaluations: int
     stage: str = "stage 2"  # of which it is a part
+    spread: Spread | None = None  # of a source of some size, whose points the task's channels are
 
     @property
     def name(self) -> str:
         """For the list of times."""
-        sheets = len(self.task.channels)
+        sheets = len(self.task.channels if self.spread is None else self.spread.centre)
         return f"{self.stage}, {self.tubes}² tubes" if sheets == 1 else f"{self.stage}, {sheets} × {self.tubes}² tubes"
+
+    def merit(self, lens: Lens) -> TubeMerit | BlurredMerit:
+        """By tubes launched for a lens."""
+        task = self.task
+        target, pull = torch.from_numpy(task.target).to(lens.like.device), _pull(task, lens)
+        if self.spread is not None:
+            return BlurredMerit.of(
+                self.spread, lens, self.tubes, screen=task.screen, target=target, overshoot=pull,
+                seed=task.knobs.seed, own=task.merit,
+            )  # fmt: skip
+        return TubeMerit.of(
+            task.channels, lens, self.tubes, screen=task.screen, target=target, overshoot=pull, own=task.merit
+        )
 
 
 @dataclass(frozen=True)
@@ -118,12 +135,7 @@ def run_rounds(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = N
             place = replace(place, round=number, round_end=place.done + now.evaluations, sheet_from=Parameters.of(lens))
         if place.round_end <= place.done:
             continue
-        target = torch.from_numpy(task.target).to(lens.like.device)
-        launched = place.sheet_from.applied(lens)
-        merit = TubeMerit.of(
-            task.channels, launched, now.tubes, screen=task.screen, target=target, overshoot=_pull(task, launched),
-            own=task.merit,
-        )  # fmt: skip
+        merit = now.merit(place.sheet_from.applied(lens))
         while place.done < place.round_end:
             if state is None:
                 place = replace(place, search_from=Parameters.of(lens))
@@ -153,10 +165,11 @@ def run_rounds(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = N
 def rrmsd_without_bounds(task: Task, lens: Lens) -> float:
     """RRMSD of the lens after a few evaluations more without the bounds on its back."""
     knobs = task.knobs.model_copy(update={"accuracy": None})
-    free = replace(task, bounds=None, grown=(), knobs=knobs)
+    free = replace(task, bounds=None, knobs=knobs)
     evaluations = max(FEWEST, round(UNBOUNDED_SHARE * knobs.stage2_iterations))
-    *_, last = run_rounds((Round(free, task.tubes, evaluations),), lens)
-    return task.rrmsd(last.lens)
+    whole = stage3_rounds(free)[-1] if task.grown else Round(free, knobs.rays, evaluations)
+    *_, last = run_rounds((replace(whole, evaluations=evaluations),), lens)
+    return task.whole.rrmsd(last.lens)
 
 
 def _pull(task: Task, lens: Lens) -> float:
@@ -171,8 +184,9 @@ def _pull(task: Task, lens: Lens) -> float:
 
 
 def _search(
-    now: Round, lens: Lens, merit: TubeMerit, place: Place, *, total: int, bound_weight: float, state: TubeSearch | None
-) -> Iterator[tuple[Reached, Step]]:
+    now: Round, lens: Lens, merit: TubeMerit | BlurredMerit, place: Place, *, total: int, bound_weight: float,
+    state: TubeSearch | None,
+) -> Iterator[tuple[Reached, Step]]:  # fmt: skip
     """One run of the minimiser from `lens`, or on from a saved state; it also ends when the goal is reached.
 
     total: evaluations of all rounds; bound_weight: weight of the penalty on exceeding the bounds of the back.
@@ -204,7 +218,7 @@ class Problem:
     """
 
     lens: Lens
-    merit: TubeMerit
+    merit: TubeMerit | BlurredMerit
     bounds: Bounds | None = None  # on the back; the excess over them adds to the merit
     bound_weight: float = 0.0  # of the excess
 
@@ -273,13 +287,13 @@ class Grown:
     grown: TubeSearch
 
 
-def with_stage3(stage2: Stage2, task: Task, lens: Lens, state: Any = None) -> Iterator[Step]:
-    """Stage 2 for the source's middle, then stage 3; or on from a state of either.
+def with_stage3(before: Stage2 | None, task: Task, lens: Lens, state: Any = None) -> Iterator[Step]:
+    """Stage 3, or on from a state of it; before it a stage 2 for the source's middle, unless that is None.
 
     The lens after stage 2 is judged by the light of the whole source.
     """
-    if not isinstance(state, Grown):
-        for last in stage2(task, lens, state):
+    if before is not None and not isinstance(state, Grown):
+        for last in before(task, lens, state):
             if last.ends:
                 whole = task.whole
                 last = replace(last, judged=whole.rrmsd(last.lens))
@@ -290,11 +304,24 @@ def with_stage3(stage2: Stage2, task: Task, lens: Lens, state: Any = None) -> It
 
 
 def stage3_rounds(task: Task) -> tuple[Round, ...]:
-    """One for each size of the source."""
-    total = task.knobs.stage2_iterations
-    lights = (replace(task, channels=channels, grown=()) for channels in task.grown)
-    pairs = zip(lights, SIZES, strict=True)
-    return tuple(Round(light, light.tubes, round(share * total), "stage 3") for light, (_, share) in pairs)
+    """One for each of SIZES."""
+    lights = (
+        replace(task, channels=channels, grown=(), spreads=(spread,))
+        for channels, spread in zip(task.grown, task.spreads, strict=True)
+    )
+    counts = blurred_sheets(task.knobs, max(task.screen.shape))
+    return tuple(
+        Round(light, tubes, evaluations, stage="stage 3", spread=spread)
+        for light, spread, (tubes, evaluations) in zip(lights, task.spreads, counts, strict=True)
+    )
+
+
+def blurred_sheets(knobs: Tailoring, pixels: int) -> Iterator[tuple[int, int]]:
+    """(tubes a side, evaluations) of each round for a source of some size; pixels: along the longer side."""
+    total = knobs.stage2_iterations * (2 if knobs.stage2_iterations < FEW else 1)  # each is cheap, and all have a start
+    tubes = min(knobs.rays, math.ceil(max(A_CELL * knobs.levels[-1], A_PIXEL * pixels)))
+    for _, share in SIZES:
+        yield tubes, round(share * total)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from bstcad.optics.measure import a_side, images, measure, tubes_picture
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage1, stage2
 from bstcad.tailoring.run import Driver, Task
+from bstcad.tailoring.source_image import Spread
 from tests.benchmarks.cold import TEMPLATES
 
 pytestmark = pytest.mark.bench
@@ -34,10 +35,12 @@ ROUND = 30  # evaluations of stage 2 a round of feedback, from the lens of the r
 def task_of(scene):
     """The task of a scene as `pipeline.design` has it, and the blank."""
     knobs = scene.tailoring.resolved(scene.lens.back.control_points)
-    grown = tuple(scene.with_source_scaled(share).channels() for share, _ in stage2.SIZES)
-    target = scene.target
+    scaled, target = [scene.with_source_scaled(share) for share, _ in stage2.SIZES], scene.target
     light, least = scene.with_source_scaled(0.0).channels(), scene.lens.min_thickness
-    task = Task(light, target.screen, target.irradiance(), knobs, least, grown=grown)
+    task = Task(
+        light, target.screen, target.irradiance(), knobs, least, grown=tuple(each.channels() for each in scaled),
+        spreads=tuple(Spread(each.source, light, each.draw) for each in scaled),
+    )  # fmt: skip
     return task, scene.flat_lens(knobs.levels[0])
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 
@@ -13,6 +11,7 @@ from bstcad.pipeline import design
 from bstcad.scene.quality import JUDGE_DRAW
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage2
+from bstcad.tailoring.source_image import Spread
 from tests.conftest import DISK, SMALL
 
 TINY = SMALL | {
@@ -45,15 +44,14 @@ def test_the_size_of_the_source_is_made_up_for(compensated):
     assert rrmsd < 0.7 * judged(found.scene, point.lens)
 
 
-def test_it_tells_what_the_size_costs_and_what_is_won_back(compensated):
-    """What stage 2 comes to is judged by the light of the whole source, too."""
+def test_it_tells_what_each_size_costs(compensated):
+    """In place of stage 2; the rays between the stages see what points of no tailoring see."""
     found, rrmsd = compensated
     stages = [stage for stage in found.making.stages if stage.name.startswith("stage ")]
     assert [stage.name for stage in stages] == [
-        "stage 1", "stage 2, 64² tubes", *["stage 3, 12 × 47² tubes"] * 3,
+        "stage 1", *["stage 3, 64² tubes"] * 5,
     ]  # fmt: skip
-    first, point, *_, last = (stage.rrmsd for stage in stages)
-    assert last < 0.75 * point
+    *_, last = (stage.rrmsd for stage in stages)
     assert rrmsd == pytest.approx(last, rel=0.5)
 
 
@@ -77,20 +75,22 @@ def test_the_source_grows_to_its_size():
     assert scene.with_source_scaled(1.0).channels() == whole
 
 
-def task_of(scene, grown):
-    """The task of a scene as `pipeline.design` has it, with other light in stage 3, and the blank."""
+def task_of(scene):
+    """The task of a scene as `pipeline.design` has it."""
     knobs, wanted = scene.tailoring.resolved(33), scene.target
-    light = scene.with_source_scaled(0.0).channels()
-    task = pipeline.Task(light, wanted.screen, wanted.irradiance(), knobs, grown=grown(light))
-    return task, scene.flat_lens(knobs.levels[0])
+    light, scaled = scene.with_source_scaled(0.0).channels(), [scene.with_source_scaled(s) for s, _ in stage2.SIZES]
+    return pipeline.Task(
+        light, wanted.screen, wanted.irradiance(), knobs, grown=tuple(each.channels() for each in scaled),
+        spreads=tuple(Spread(each.source, light, each.draw) for each in scaled),
+    )  # fmt: skip
 
 
-def test_tubes_are_shared_out_among_the_points_but_never_too_few():
+def test_no_more_tubes_than_the_net_and_the_pixels_ask_for():
     scene = load(DISK, WIDE | {"tailoring.rays": 1000})
-    task, _ = task_of(scene, lambda light: (scene.channels(16),) * 3)
-    assert task.tubes == 1000 and task.whole.tubes == 250
-    assert task.whole.whole.channels == task.whole.channels
-    assert replace(task.whole, knobs=task.knobs.model_copy(update={"rays": 100})).tubes == 47  # two a control cell
+    [number] = {each.tubes for each in stage2.stage3_rounds(task_of(scene))}
+    assert number == 66  # 33 control points, 32 pixels
+    few = load(DISK, WIDE | {"tailoring.rays": 40})
+    assert {each.tubes for each in stage2.stage3_rounds(task_of(few))} == {40}
 
 
 @pytest.fixture(scope="module")

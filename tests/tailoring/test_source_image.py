@@ -1,0 +1,155 @@
+"""The light of a source's middle, blurred by its images: against rays from all its points, and against the point."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.channels import channels_of, drawn_channels
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.kernels.reductions import total
+from bstcad.optics.lens import Lens
+from bstcad.optics.measure import RayTubes, apart, simulated
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Sphere
+from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.source_image import BlurredMerit, Images, Spread, _biquadratic, blurs, bordered
+from bstcad.tailoring.stage2 import Problem
+
+INDEX, SIZE = 1.5, 2.4
+SCREEN = Screen(150.0, (-38.0, 36.0), (-36.0, 36.0), (50, 48))  # wider than the light, whose rim is sharp
+CHIP = Point((1.0, 0.0, -40.0), profile="lambertian", width=SIZE, height=1.0)
+SOURCES = {
+    "disc": Point((1.0, 0.0, -40.0), profile="lambertian", diameter=SIZE),
+    "chip": CHIP,
+    "line": replace(CHIP, height=None),
+    "tilted": replace(CHIP, tilt=(0.0, 8.0)),
+    "sun": Collimated(Circle(8.0), divergence=2.5),
+}
+
+
+def lens():
+    u = torch.linspace(-1, 1, 25, dtype=torch.float64)
+    heights = -0.3 * (u[:, None] ** 2 + u**2) + 0.02 * torch.cos(4 * u)[:, None] * torch.sin(3 * u)
+    back = BSplineSurface(6.0, heights, (-10.0, 10.0), (-10.0, 10.0))
+    return Lens(Sphere(1.0, 0.005), back, Circle(9.0), INDEX)
+
+
+def spread(source):
+    light = channels_of(source.central, lambda nm: INDEX, 1)
+    return Spread(source, light, lambda points, seed: drawn_channels(source, lambda nm: INDEX, points, seed))
+
+
+def target():
+    return torch.from_numpy(np.random.default_rng(0).uniform(0.5, 1.5, SCREEN.shape))
+
+
+def merit(source, n=60, seed=1):
+    return BlurredMerit.of(spread(source), lens(), n, screen=SCREEN, target=target(), overshoot=0.03, seed=seed)
+
+
+def by_rays(source, sets=6):
+    """Independent pictures of sum 1, each from other points of the source."""
+    seen = spread(source)
+    boxes = [simulated(lens(), seen.draw(128, seed), SCREEN, n=50, seed=seed).box for seed in range(sets)]
+    return [box / total(box) for box in boxes]
+
+
+def off(pictures, other):
+    """RRMSD of a picture from that of independent ones, without their noise."""
+    return math.sqrt(max(apart(pictures, other / total(other))[0], 0.0))
+
+
+def of_point(source):
+    light = channels_of(source.central, lambda nm: INDEX, 1)
+    return RayTubes.launched(lens(), light, 60).picture(lens(), SCREEN)
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_the_blurred_light_is_the_sum_over_the_points(name):
+    """By images alone, against rays from many points: a quarter at most of what the source's size changes."""
+    source = SOURCES[name]
+    rays, by_images = by_rays(source), merit(source)
+    with torch.no_grad():
+        found = by_images.picture(by_images.landing(lens()))[0]
+    assert off(rays, found) < 0.25 * off(rays, of_point(source))
+
+
+def test_a_source_of_next_to_no_size_is_a_point():
+    """Its merit, too, but for light beyond the border, which here is on the wider screen that light is blurred from."""
+    tiny = replace(SOURCES["disc"], diameter=1e-6)
+    ours = merit(tiny)
+    ours = replace(ours, left_out=None, overshoot=0.0)
+    light = channels_of(tiny.central, lambda nm: INDEX, 1)
+    plain = TubeMerit.of(light, lens(), 60, screen=SCREEN, target=target(), overshoot=0.0)
+    one, two = (each(each.landing(lens())) for each in (ours, plain))
+    for mine, other in zip(one, two, strict=True):
+        assert float(mine) == pytest.approx(float(other), rel=1e-3)  # tents of a fifth of a pixel
+
+
+def test_flux_is_kept():
+    """A blur moves light; what leaves a screen that holds all of it is nothing."""
+    wide = bordered(SCREEN, 60)
+    spreading = spread(SOURCES["disc"])
+    [blur] = blurs(spreading, lens(), wide)
+    light = RayTubes.launched(lens(), spreading.centre, 60).picture(lens(), bordered(wide, blur.border)).numpy()
+    share = Images.of(SOURCES["disc"], spreading.centre[0], lens(), wide).share
+    assert blur.forward(light).sum() / light.sum() == pytest.approx(float(share.mean()), rel=0.02)
+
+
+def test_the_adjoint_is_the_transpose():
+    [blur] = blurs(spread(SOURCES["chip"]), lens(), SCREEN)
+    generator = np.random.default_rng(1)
+    light = generator.normal(size=tuple(side + 2 * blur.border for side in SCREEN.shape))
+    g = generator.normal(size=SCREEN.shape)
+    assert (blur.forward(light) * g).sum() == pytest.approx((light * blur.adjoint(g)).sum(), rel=1e-12)
+
+
+def test_the_gradient_is_that_of_differences():
+    problem, heights = Problem(lens(), merit(SOURCES["disc"], n=50)), lens().back.heights
+    _, [gradient], _ = problem([heights])
+    way = 1e-6 * torch.from_numpy(np.random.default_rng(2).normal(size=heights.shape))
+    ahead, behind = (problem([heights + sign * way])[0] for sign in (1, -1))
+    assert (ahead - behind) / 2 == pytest.approx(float(total(gradient * way)), rel=1e-3)
+
+
+def test_what_the_images_leave_out_is_measured_by_rays():
+    """Images of half the size leave out more; with what rays measured the picture is that of all points again."""
+    source = SOURCES["disc"]
+    rays, half = by_rays(source), merit(replace(source, diameter=SIZE / 2))
+    with torch.no_grad():
+        found = half.picture(half.landing(lens()))[0]
+    mended = found + half.measured(spread(source).draw, lens(), 3)
+    assert off(rays, mended) < 0.5 * off(rays, found)
+
+
+def test_nine_points_make_every_biquadratic():
+    points = [(0.3, -0.9), (-0.5, 0.1), (0.0, 1.0)]
+
+    def form(u, v):
+        return 1 + 2 * u - v + 0.5 * u * v + 3 * u * u * v - u * u * v * v
+
+    nine = torch.tensor([form(i * 0.7, j * 0.7) for j in (-1, 0, 1) for i in (-1, 0, 1)], dtype=torch.float64)
+    found = (nine[:, None] * _biquadratic(points)).sum(0)
+    assert found.tolist() == pytest.approx([form(*p) for p in points])
+
+
+def test_light_that_no_place_shows_is_not_blurred():
+    """Nothing gets through: the images are those of a point."""
+    nowhere = replace(SOURCES["disc"], position=(500.0, 0.0, 5.9))
+    offset, share = Images.of(nowhere, spread(nowhere).centre[0], lens(), SCREEN).nearest(0.0, 0.0)
+    assert not offset.any() and bool((share == 1).all())
+
+
+def test_a_rectangle_of_light_casts_a_rectangle():
+    """Free space would be a pinhole: the images of the chip's corners stand apart as its sides do."""
+    seen = Images.of(CHIP, spread(CHIP).centre[0], lens(), SCREEN)
+    nine = seen.offset.mean(-1)
+    wide, high = float((nine[0, 5] - nine[0, 3]).abs()), float((nine[1, 7] - nine[1, 1]).abs())
+    assert wide / high == pytest.approx(SIZE, rel=0.1) and Rectangle(SIZE, 1.0) == CHIP.extent
