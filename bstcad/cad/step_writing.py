@@ -87,14 +87,17 @@ def write(
         file.writelines(encoded(shape, name, part, faces=faces, properties=properties))
 
 
-def write_lens(lens: Lens, path: str | Path, name: str, part: Part | None = None) -> None:
+def write_lens(
+    lens: Lens, path: str | Path, name: str, part: Part | None = None, properties: MassProperties | None = None
+) -> None:
     """Write the exact solid of the lens with names of its faces, area, volume and centroid.
 
-    part: the file states its facts; None: a colour.  ValueError if the lens's faces bound no solid.
+    part: the file states its facts; None: a colour.  properties: those of the lens, where they are known already.
+    ValueError if the lens's faces bound no solid.
     """
     part = part or Part(colour=METAL if lens.reflects else GLASS)
     shape, faces = lens_shape(lens)
-    write(shape, path, name, part, faces=faces, properties=quadrature.of_lens(lens))
+    write(shape, path, name, part, faces=faces, properties=properties or quadrature.of_lens(lens))
 
 
 def encode(

@@ -5,9 +5,11 @@ import re
 import numpy as np
 import pytest
 
+from bstcad import folder
 from bstcad.cad import patches, step_reading, step_writing
 from bstcad.optics.bspline import knots
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.scene.scene import load
 from bstcad.step_text import part21
 
 M = 67  # control points a side: more than patches.FEW in all
@@ -63,3 +65,11 @@ def test_the_re_read_net_is_that_of_both_readers(make_lens, tmp_path):
     lens, path = make_lens(outline=Rectangle(18.0, 14.0), m=M), tmp_path / "lens.step"
     step_writing.write_lens(lens, path, "lens")
     assert np.array_equal(step_reading.read(path).control_points, part21.read_lens(path).surface.control_points)
+
+
+@pytest.mark.parametrize("m", [67, 129, 257])
+def test_the_size_said_before_is_that_of_the_file(tmp_path, m):
+    scene = load("templates/thu.toml", {"lens.back.control_points": m})
+    step_writing.write_lens(scene.flat_lens(m), tmp_path / "lens.step", scene.name)
+    assert folder.step_size(scene) == pytest.approx((tmp_path / "lens.step").stat().st_size, rel=0.03)
+    assert f"{m // 2 + 1} would" in folder.said_of_sizes(scene)
