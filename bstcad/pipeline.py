@@ -101,7 +101,7 @@ def design(
         if start and start.followed
         else _stage1(scene, task, driver, lens, state=start and start.first, compare=not later)
     )
-    after_stage1 = followed.lens.applied(lens)
+    after_stage1, stages = followed.lens.applied(lens), len(driver.record.stages)
     lens = scene.as_mounted(after_stage1)  # the walls end elsewhere than below a flat back
     if start and start.lens:
         lens, stopped = start.lens.applied(lens), start.stopped
@@ -113,7 +113,8 @@ def design(
     making = _making(followed, driver.record, stopped)
     return Made(
         resolved(scene, lens), scene.as_mounted(lens), task.target, making, device=device,
-        transport=followed.transport, compared=partial(_compared, making, task, after_stage1) if later else None,
+        transport=followed.transport,
+        compared=partial(_compared, making, task, after_stage1, stages) if later else None,
     )  # fmt: skip
 
 
@@ -128,11 +129,13 @@ def resolved(scene: Scene, lens: Lens) -> Scene:
     return scene.model_copy(update={"lens": blank})
 
 
-def _compared(making: Making, task: Task, lens: Lens) -> Making:
-    """The record with float32 beside float64, for the lens of stage 1."""
-    began = time.perf_counter()
+def _compared(making: Making, task: Task, lens: Lens, before: int) -> Making:
+    """The record with float32 beside float64, for the lens of stage 1, behind so many stages."""
+    began, cpu = time.perf_counter(), time.process_time()
     twins = asdict(compare_precisions(task, lens))
-    return replace(making, twins=twins).followed_by(StageRecord(COMPARED, time.perf_counter() - began))
+    stage = StageRecord(COMPARED, time.perf_counter() - began, cpu_seconds=time.process_time() - cpu)
+    stages = (*making.stages[:before], stage, *making.stages[before:])
+    return replace(making, twins=twins, stages=stages, seconds_total=making.seconds_total + stage.seconds)
 
 
 def _making(followed: Followed, went: Record, stopped: str) -> Making:
