@@ -5,7 +5,7 @@ its knots the design's knots.  Every array that OCC needs (TColgp, TColStd) is b
 OCC 8 moves those names.
 
 Large nets go to OCC and back as the bytes of its own binary files (BinTools), all poles at once and to the last bit:
-one by one, the poles of 2049 x 2049 control points take 6 s on their way in and 4 s on their way out.
+one by one, the poles of 2049 x 2049 control points take 6 s on their way in, and nearly as much on their way out.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The points of a STEP file, taken out of its text by one pass over its bytes.
 
-Nearly all entities of a lens are control points.  By regular expressions those of 2049 x 2049 cost 16 s and seven
-times the memory of the file; this pass takes a tenth of a second for each 100 MB, and leaves the number strings to
-numpy and the rest of the file, a few MB and the references of the net, to the expressions of part21.py.
+Nearly all entities of a lens are control points.  With regular expressions for them, too, a file of 513 x 513 points
+takes 0.95 s of CPU, with this pass 0.34 s.  The number strings are left to numpy, and the rest of the file, statements
+of the solid and the references of the net, to the expressions of part21.py.
 """
 
 from __future__ import annotations
