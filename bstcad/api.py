@@ -69,7 +69,7 @@ def design(
     with progresses.shown(progress) as shown:
         if choice is not None:
             shown("control points", 1, 1, choice.line)
-        return Design(pipeline.design(scene, device=device, progress=shown, began=began, merit=merit))
+        return Design(pipeline.design(scene, device=device, progress=shown, began=began, merit=merit, later=True))
 
 
 def open(folder: str | os.PathLike[str]) -> Design:
@@ -243,6 +243,7 @@ class Design:
         with files.held(folder), progresses.shown(progress) as shown:
             limit = self.scene.tailoring.max_time if self.report is None else None  # else its time was long ago
             additions = commands.Additions(checks, sections)
+            self._made = self._made.told()
             self.report = commands.write(
                 self._made, folder, progress=shown, effort=effort, limit=limit, additions=additions
             )
@@ -270,6 +271,7 @@ class Design:
                     progress=shown, effort=effort, additions=additions,
                 )  # fmt: skip
             else:
+                self._made = self._made.told()
                 self.report = commands.prove(self._made, progress=shown, effort=effort, additions=additions)
         return self.report
 

@@ -292,6 +292,8 @@ def generate(
     commands = engine()
     warn(wanted)
     wanted, _ = with_net_said(wanted)
+    if commands.folders.step_size(wanted) >= commands.folders.LARGE:
+        print(f"bstcad: {commands.folders.said_of_sizes(wanted)}", file=sys.stderr)
     with progress.watch(Console(stderr=True)) as watched:
         report = commands.generate(wanted, folder, device=device, progress=watched, began=STARTED, resume=resume)
     if report.stopped != "interrupt":
@@ -307,6 +309,7 @@ def plan(scene: SceneFile, settings: Settings = None, as_json: AsJson = False) -
     """List the effects that are simulated and left out, with their changes; then predict time, error and memory."""
     with loading():
         wanted = load_scene(scene, settings)
+        from bstcad import folder as folders
         from bstcad.report import report as reports
         from bstcad.sweep.plan import plan as planned
 
@@ -317,12 +320,14 @@ def plan(scene: SceneFile, settings: Settings = None, as_json: AsJson = False) -
     effects = next(parts)
     if as_json:
         net = {"control_points": asdict(choice)} if choice else {}
-        print(json.dumps(next(parts) | effects | net, ensure_ascii=False, indent=2))
+        sizes = {"files": {"lens.step": round(folders.step_size(wanted))}}
+        print(json.dumps(next(parts) | effects | net | sizes, ensure_ascii=False, indent=2))
         return 0
     console = Console()
     console.print(reports.plan_effects(effects, wanted.title or wanted.name, wanted.optic))
     print("predicting seconds, RRMSD and memory …", file=sys.stderr, flush=True)
     console.print(reports.plan_predictions(next(parts)))
+    console.print(f"Files: {folders.said_of_sizes(wanted)}.")
     return 0
 
 

@@ -42,6 +42,7 @@ from bstcad.report.prescription import SHEET, Order
 from bstcad.report.record import Contents, Examined, LeftOut, Report, Stage, contents_of, with_part
 from bstcad.report.rendering import LightPath
 from bstcad.report.tolerances import Tolerances
+from bstcad.report.units import prepare
 from bstcad.runs import cluster, files, processes, signals
 from bstcad.runs.checkpoint import Keeper
 from bstcad.runs.environment import circumstances
@@ -180,13 +181,14 @@ def _written_and_proved(
     limit: float | None = None,
 ) -> tuple[Made, Proof]:  # fmt: skip
     """Write the geometry and prove it; the design with these two stages, and its proof.  limit: see `write`."""
+    made = made.told()
     began = time.perf_counter()
     progress("write", 0, 1, "STEP, STL, 3MF")
     drawn.solid(made.lens)  # as designed, so that it can be drawn while OCC writes and reads the file
     with refusals(f"{made.scene.name}: "):  # the tailored faces bound no solid: nothing that a shop could open
         write_3mf = folders.write_geometry(made, place, processes.submit)
     with ThreadPoolExecutor(1) as beside:
-        mesh = beside.submit(write_3mf)
+        meanwhile = [beside.submit(work) for work in (write_3mf, prepare)]
         progress("write", 1, 1, "")
         written = time.perf_counter()
         if limit is not None:
@@ -194,7 +196,8 @@ def _written_and_proved(
             effort = replace(effort, seconds=min(effort.seconds, max(left, LEAST)))
         nominal = folders.nominal(made.scene, made.lens, made.target)
         proof = _proof(made, nominal, place, drawn, additions=additions, effort=effort, progress=progress)
-        mesh.result()
+        for work in meanwhile:
+            work.result()
     verified = time.perf_counter()
     last = Stage("write", written - began), Stage("verify", verified - written, proof.light.rrmsd)
     return replace(made, making=made.making.followed_by(*last)), proof

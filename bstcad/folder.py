@@ -18,7 +18,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -26,10 +26,11 @@ import numpy as np
 
 from bstcad.cad import mesh as meshes
 from bstcad.cad.mesh import SILVER, Label
+from bstcad.optics import quadrature
 from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL
-from bstcad.optics.sides import both
+from bstcad.optics.sides import Sides, both, scaled
 from bstcad.optics.surfaces import Surface
 from bstcad.report.prescription import scene_text
 from bstcad.report.record import Making
@@ -57,6 +58,12 @@ class Made:
     making: Making = Making()  # stages, history and machine, for the report
     device: str = "cpu"  # of the design
     transport: TransportMap | None = None  # the map of stage 1; None for a lens of the user's own, or if not known
+    # what `making` is with float32 beside float64, which only a report tells; None: it has it, or nothing is to be told
+    compared: Callable[[], Making] | None = None
+
+    def told(self) -> Made:
+        """The same with all that a report tells."""
+        return self if self.compared is None else replace(self, making=self.compared(), compared=None)
 
     def is_lens_of(self, other: Made) -> bool:
         """Is it the same lens, to the last bit, for the same light and picture?"""
@@ -73,6 +80,38 @@ def same_front(one: Surface, other: Surface) -> bool:
     both = [{"z": front.z, **front.parameters()} for front in (one.plain(), other.plain())]
     same = one.kind == other.kind and both[0].keys() == both[1].keys()
     return same and all(np.array_equal(both[0][key], both[1][key]) for key in both[0])
+
+
+# --- sizes said before ------------------------------------------------------------------------------------------------
+
+LARGE = 100e6  # bytes of lens.step from which on they are said before a design
+STATEMENT = len("# = CARTESIAN_POINT('',(,,));\n") + len("#,")  # besides numbers; and the reference to it
+REST = 45_000, 560  # bytes of the other statements, and of those along the rim for each control point of a side
+
+
+def step_size(scene: scenes.Scene, net: Sides | None = None) -> float:
+    """Bytes of lens.step, to a few per cent: one statement and one reference a control point, 16 to 18 digits a number.
+
+    net: control points a side, or along x and along y; None: those of the scene.
+    """
+    m, n = both(net or scene.lens.back.net)
+    half = scene.lens.outline.half_extent
+    digits = [np.mean([len(f"{x:.14f}") for x in np.linspace(-end, end, 101)]) for end in half]
+    digits.append(len(f"{scene.lens.back.z:.14f}"))
+    nets = 1 + (scene.lens.front.given is not None)
+    return nets * (m * n * (STATEMENT + 2 * len(str(m * n)) + math.fsum(digits)) + REST[1] * (m + n) / 2) + REST[0]
+
+
+def said_of_sizes(scene: scenes.Scene) -> str:
+    """How large lens.step will be, and with half as many control points a side."""
+    net = scene.lens.back.net
+    fewer = scaled(net, 0.5)
+    here, half = (f"{step_size(scene, points) / 1e6:.3g} MB" for points in (net, fewer))
+    m, n = both(net)
+    return (
+        f"lens.step will take about {here} for {m} x {n} control points; lens.back.control_points = "
+        f"{list(fewer) if isinstance(fewer, tuple) else fewer} would take {half}"
+    )
 
 
 # --- in place of an earlier folder ------------------------------------------------------------------------------------
@@ -204,7 +243,8 @@ def write_geometry(design: Made, folder: Path, submit: Submit = here) -> Callabl
     """
     scene, lens = design.scene, design.lens
     stated = scene.name, scene.part.of(scene.lens)
-    written = [submit("bstcad.cad.step_writing.write_lens", lens, (folder / "lens.step").absolute(), *stated)]
+    sums = quadrature.of_lens(lens)  # here, where its kernels are loaded
+    written = [submit("bstcad.cad.step_writing.write_lens", lens, (folder / "lens.step").absolute(), *stated, sums)]
     if mount := scene.mount:
         work = "bstcad.cad.mounting.write_if_it_fits"
         written.append(submit(work, lens, mount, (folder / PART).absolute(), *stated))

@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -36,6 +37,7 @@ PROCEDURES = {  # tailoring.method: (name of the first stage, the first stage, s
 Stage1State = stage1.SlopeRound | paper.Level
 Stage2State = stage2.TubeSearch | paper.RaySearch | stage2.Grown
 DEVICES = ("auto", "cpu", "cuda")
+COMPARED = "float32 beside float64"  # the name of that stage
 # Seconds that writing, proving and reporting take on two cores; PER_NET of 513 x 513 control points, PER_PICTURE of
 # 512 x 512 pixels.
 FIXED, PER_NET, PER_PICTURE = 4.0, 5.0, 3.0
@@ -66,7 +68,7 @@ class Saved:
 def design(
     scene: Scene, *, device: str = "auto", progress: Progress = silent, began: float | None = None,
     save: Callable[[Saved], None] = forget, start: Saved | None = None, interrupted: Callable[[], bool] = never,
-    merit: Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None = None,
+    merit: Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None = None, later: bool = False,
 ) -> Made:  # fmt: skip
     """From a scene to a tailored lens: transport map, stage 1, stage 2, or stage 3 for a source of some size.
 
@@ -74,12 +76,14 @@ def design(
     `save` is called now and then with a state; given as `start`, the design goes on from there and ends the same.
     Once `interrupted` says so, tailoring ends with the best so far; KeyboardInterrupt if there is no lens yet.
     merit: of a picture and the target, what stages 2 and 3 make least; None: RRMSD².
+    later: float32 is compared with float64 when a report asks for it (`Made.told`), and not where none is made.
     """
     began = time.perf_counter() if began is None else began
     torch.manual_seed(scene.tailoring.seed)
     device = device_for(device)
     target = scene.target
     knobs = scene.tailoring.resolved(scene.lens.back.net)
+    later = later and knobs.max_time is None
     screen = target.screen
     sizes = stage2.SIZES if scene.source.extent and knobs.method != "integration" else ()  # that knows points alone
     light, scaled = scene.with_source_scaled(0.0).channels(), [scene.with_source_scaled(share) for share, _ in sizes]
@@ -97,9 +101,12 @@ def design(
     if start is None:
         driver.end("loading")  # the libraries, the scene and the files it names
     followed = (
-        start.followed if start and start.followed else _stage1(scene, task, driver, lens, state=start and start.first)
+        start.followed
+        if start and start.followed
+        else _stage1(scene, task, driver, lens, state=start and start.first, compare=not later)
     )
-    lens = scene.as_mounted(followed.lens.applied(lens))  # the walls end elsewhere than below a flat back
+    after_stage1, stages = followed.lens.applied(lens), len(driver.record.stages)
+    lens = scene.as_mounted(after_stage1)  # the walls end elsewhere than below a flat back
     if start and start.lens:
         lens, stopped = start.lens.applied(lens), start.stopped
     else:
@@ -107,9 +114,11 @@ def design(
     lens = replace(lens.plain(), index=scene.index, losses=None)
     if not scene.lens.front.free:  # as it was given: tailoring may have worked with less digits of it
         lens = replace(lens, front=scene.lens.front.surface)
+    making = _making(followed, driver.record, stopped)
     return Made(
-        resolved(scene, lens), scene.as_mounted(lens), task.target, _making(followed, driver.record, stopped),
-        device=device, transport=followed.transport,
+        resolved(scene, lens), scene.as_mounted(lens), task.target, making, device=device,
+        transport=followed.transport,
+        compared=partial(_compared, making, task, after_stage1, stages) if later else None,
     )  # fmt: skip
 
 
@@ -122,6 +131,15 @@ def resolved(scene: Scene, lens: Lens) -> Scene:
         return scene
     blank = scene.lens.model_copy(update={"front": scene.lens.front.designed(lens.front)})
     return scene.model_copy(update={"lens": blank})
+
+
+def _compared(making: Making, task: Task, lens: Lens, before: int) -> Making:
+    """The record with float32 beside float64, for the lens of stage 1, behind so many stages."""
+    began, cpu = time.perf_counter(), time.process_time()
+    twins = asdict(compare_precisions(task, lens))
+    stage = StageRecord(COMPARED, time.perf_counter() - began, cpu_seconds=time.process_time() - cpu)
+    stages = (*making.stages[:before], stage, *making.stages[before:])
+    return replace(making, twins=twins, stages=stages, seconds_total=making.seconds_total + stage.seconds)
 
 
 def _making(followed: Followed, went: Record, stopped: str) -> Making:
@@ -143,8 +161,10 @@ def _making(followed: Followed, went: Record, stopped: str) -> Making:
     )
 
 
-def _stage1(scene: Scene, task: Task, driver: Driver, lens: Lens, state: Stage1State | None) -> Followed:
-    """Stage 1 from the blank, or further from a state, and the comparison of precisions behind it."""
+def _stage1(
+    scene: Scene, task: Task, driver: Driver, lens: Lens, state: Stage1State | None, compare: bool
+) -> Followed:  # fmt: skip
+    """Stage 1 from the blank, or further from a state, and if asked the comparison of precisions behind it."""
     if driver.wish and state is None:
         raise KeyboardInterrupt  # there is nothing to show
     name, stage, _ = PROCEDURES[task.knobs.method]
@@ -159,9 +179,9 @@ def _stage1(scene: Scene, task: Task, driver: Driver, lens: Lens, state: Stage1S
         check_thickness(lens, scene)
         driver.end(f"{BOUNDED}, after stage 1", possible(scene, task.rrmsd(lens)))
     precision = None
-    if not driver.hurry:
+    if compare and not driver.hurry:
         precision = compare_precisions(task, lens)
-        driver.end("float32 beside float64")
+        driver.end(COMPARED)
     if last.places is None:
         transport = slope_map.sent_from_entrance(last.mapping, lens, task.screen)
     else:

@@ -67,6 +67,18 @@ def test_nothing_in_it_is_random():
     assert torch.equal(other.lens.back.heights, one.lens.back.heights)
 
 
+def test_float32_is_compared_when_a_report_asks_for_it():
+    """The lens is the same, and what the report tells in the end, too."""
+    few = {"tailoring.rays": "64", "tailoring.rounds": "2", "tailoring.stage2_iterations": "3"}
+    now, later = (pipeline.design(small("disk", **few), later=later) for later in (False, True))
+    assert torch.equal(later.lens.back.heights, now.lens.back.heights)
+    assert later.making.twins is None and pipeline.COMPARED not in [stage.name for stage in later.making.stages]
+    told = later.told()
+    assert told.making.twins == now.making.twins
+    assert [stage.name for stage in told.making.stages] == [stage.name for stage in now.making.stages]
+    assert told.told() is told and now.told() is now
+
+
 def test_float32_comes_close_to_float64():
     value, _ = judged(pipeline.design(small("disk", **{"tailoring.precision": "float32"})))
     assert value == pytest.approx(judged(designed("disk")[0])[0], rel=0.3)

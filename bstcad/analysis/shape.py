@@ -98,7 +98,7 @@ def inside(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
     axes = (torch.linspace(-half, half, n, dtype=torch.float64) for half in outline.half_extent)
     x, y = torch.meshgrid(*axes, indexing="ij")
     held = outline.contains(x, y)
-    return x[held], y[held]
+    return (x.reshape(-1), y.reshape(-1)) if bool(held.all()) else (x[held], y[held])
 
 
 def slope_octaves(back: BSplineSurface) -> np.ndarray:

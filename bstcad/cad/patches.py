@@ -3,20 +3,28 @@
 Each face is on the one kind of surface that is exactly the face; the back's poles are the design's control points and
 its knots the design's knots.  Every array that OCC needs (TColgp, TColStd) is built here and nowhere else, because
 OCC 8 moves those names.
+
+Large nets go to OCC and back as the bytes of its own binary files (BinTools), all poles at once and to the last bit:
+one by one, the poles of 2049 x 2049 control points take 6 s on their way in, and nearly as much on their way out.
 """
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from io import BytesIO
 
 import numpy as np
 import torch
+from OCP.BinTools import BinTools
+from OCP.BRep import BRep_Builder, BRep_Tool
 from OCP.Geom import Geom_BSplineCurve, Geom_BSplineSurface, Geom_Plane, Geom_SphericalSurface, Geom_Surface
 from OCP.Geom2d import Geom2d_BSplineCurve
 from OCP.gp import gp_Ax3, gp_Dir, gp_Pnt, gp_Pnt2d
 from OCP.TColgp import TColgp_Array1OfPnt, TColgp_Array1OfPnt2d, TColgp_Array2OfPnt
 from OCP.TColStd import TColStd_Array1OfInteger, TColStd_Array1OfReal, TColStd_Array2OfReal
+from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Shape
 
 from bstcad.optics.bspline import BSplineSurface, knots, parameter
 from bstcad.optics.lens import Lens
@@ -184,12 +192,12 @@ def bspline_surface(
 ) -> Geom_BSplineSurface:
     """The B-spline surface of a control net (m, n, 3) in mm and two full knot vectors; rational by weights (m, n)."""
     m, n = net.shape[:2]
-    poles, pole = TColgp_Array2OfPnt(1, m, 1, n), gp_Pnt()
-    place, put = pole.SetCoord, poles.SetValue
+    if weights is None and m * n > FEW:
+        return _surface_of(record(net, knots_u, knots_v))
+    poles = TColgp_Array2OfPnt(1, m, 1, n)
     for i, row in enumerate(net.tolist(), start=1):
-        for j, (x, y, z) in enumerate(row, start=1):
-            place(x, y, z)
-            put(i, j, pole)  # copies it
+        for j, xyz in enumerate(row, start=1):
+            poles.SetValue(i, j, gp_Pnt(*xyz))
     u, count_u = _knot_arrays(knots_u)
     v, count_v = _knot_arrays(knots_v)
     degree_u, degree_v = len(knots_u) - m - 1, len(knots_v) - n - 1
@@ -216,8 +224,10 @@ def bspline_curve_2d(poles: np.ndarray, full_knots: np.ndarray) -> Geom2d_BSplin
 
 def net_of(surface: Geom_BSplineSurface) -> np.ndarray:
     """Control points (m, n, 3) in mm of an OCC B-spline surface, u along the first axis."""
-    pole = surface.Poles().Value
     m, n = surface.NbUPoles(), surface.NbVPoles()
+    if m * n > FEW and not (surface.IsURational() or surface.IsVRational()):
+        return np.frombuffer(dumped(_face_on(surface)), "<f8", m * n * 3, BEFORE + HEAD.size).reshape(m, n, 3).copy()
+    pole = surface.Poles().Value
     places = (pole(i, j).Coord() for i in range(1, m + 1) for j in range(1, n + 1))
     return np.fromiter(places, np.dtype((float, 3)), m * n).reshape(m, n, 3)
 
@@ -235,3 +245,53 @@ def knots_of(surface: Geom_BSplineSurface) -> tuple[np.ndarray, np.ndarray]:
         np.array([u.Value(i) for i in range(u.Lower(), u.Upper() + 1)]),
         np.array([v.Value(i) for i in range(v.Lower(), v.Upper() + 1)]),
     )
+
+
+# ---- nets as bytes of OCC's binary files -----------------------------------------------------------------------------
+
+FEW = 4096  # control points that are handed over one by one
+# A surface without weights: its kind (9 a B-spline), is it rational or periodic (4), degrees, poles, knots in u and v;
+# then the poles, v changing fastest, and each knot with its multiplicity.
+HEAD = struct.Struct("<B4B2H4i")
+KIND = 9
+KNOT = np.dtype([("value", "<f8"), ("count", "<i4")])
+
+
+def dumped(shape: TopoDS_Shape) -> bytes:
+    """A shape as a binary file of OCC."""
+    stream = BytesIO()
+    BinTools.Write_s(shape, stream)
+    return stream.getvalue()
+
+
+def read_back(data: bytes) -> TopoDS_Shape:
+    """The shape of such a file."""
+    shape = TopoDS_Shape()
+    BinTools.Read_s(shape, BytesIO(data))
+    return shape
+
+
+def record(net: np.ndarray, *full_knots: np.ndarray) -> bytes:
+    """A B-spline surface of a control net (m, n, 3) in mm and two full knot vectors, as such a file has it."""
+    distinct = [np.unique(knots, return_counts=True) for knots in full_knots]
+    degrees = (len(knots) - m - 1 for knots, m in zip(full_knots, net.shape, strict=False))
+    head = HEAD.pack(KIND, 0, 0, 0, 0, *degrees, *net.shape[:2], *(len(values) for values, _ in distinct))
+    ends = [np.rec.fromarrays(each, KNOT).tobytes() for each in distinct]
+    return b"".join([head, np.ascontiguousarray(net, "<f8").tobytes(), *ends])
+
+
+def _face_on(surface: Geom_Surface) -> TopoDS_Face:
+    """The whole of a surface as a face without edges."""
+    face = TopoDS_Face()
+    BRep_Builder().MakeFace(face, surface, 1e-7)
+    return face
+
+
+def _surface_of(own: bytes) -> Geom_BSplineSurface:
+    """The surface of a record: a small one gives way to it in a file."""
+    return BRep_Tool.Surface_s(TopoDS.Face_s(read_back(_FILE.replace(record(*_SMALL), own, 1))))
+
+
+_SMALL = (np.zeros((2, 2, 3)), *[np.array([0.0, 0.0, 1.0, 1.0])] * 2)  # net and knots
+_FILE = dumped(_face_on(bspline_surface(*_SMALL)))
+BEFORE = _FILE.index(record(*_SMALL))  # bytes of a file of one face before its surface

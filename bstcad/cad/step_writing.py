@@ -60,6 +60,7 @@ from OCP.XCAFDimTolObjects import XCAFDimTolObjects_GeomToleranceObject
 from OCP.XCAFDimTolObjects import XCAFDimTolObjects_GeomToleranceType as Tolerance
 from OCP.XCAFDoc import XCAFDoc_ColorSurf, XCAFDoc_DocumentTool, XCAFDoc_GeomTolerance
 
+from bstcad.cad import step_nets
 from bstcad.cad.solid import lens_shape
 from bstcad.cad.step_reading import parts_of, silence
 from bstcad.optics import quadrature
@@ -82,24 +83,36 @@ def write(
     properties: MassProperties | None = None,
 ) -> None:  # fmt: skip
     """Write the shape (cadquery's or OCC's) as STEP in mm: see `encode`."""
-    Path(path).write_bytes(encode(shape, name, part, faces=faces, properties=properties))
+    with Path(path).open("wb") as file:
+        file.writelines(encoded(shape, name, part, faces=faces, properties=properties))
 
 
-def write_lens(lens: Lens, path: str | Path, name: str, part: Part | None = None) -> None:
+def write_lens(
+    lens: Lens, path: str | Path, name: str, part: Part | None = None, properties: MassProperties | None = None
+) -> None:
     """Write the exact solid of the lens with names of its faces, area, volume and centroid.
 
-    part: the file states its facts; None: a colour.  ValueError if the lens's faces bound no solid.
+    part: the file states its facts; None: a colour.  properties: those of the lens, where they are known already.
+    ValueError if the lens's faces bound no solid.
     """
     part = part or Part(colour=METAL if lens.reflects else GLASS)
     shape, faces = lens_shape(lens)
-    write(shape, path, name, part, faces=faces, properties=quadrature.of_lens(lens))
+    write(shape, path, name, part, faces=faces, properties=properties or quadrature.of_lens(lens))
 
 
 def encode(
     shape: cadquery.Shape | TopoDS_Shape, name: str, part: Part = NOTHING, faces: Sequence[str] = (),
     properties: MassProperties | None = None,
 ) -> bytes:  # fmt: skip
-    """The text of the STEP file of a shape, one product called `name`.
+    """The text of the STEP file of a shape, see `encoded`."""
+    return b"".join(encoded(shape, name, part, faces=faces, properties=properties))
+
+
+def encoded(
+    shape: cadquery.Shape | TopoDS_Shape, name: str, part: Part = NOTHING, faces: Sequence[str] = (),
+    properties: MassProperties | None = None,
+) -> Iterator[bytes]:  # fmt: skip
+    """The text of the STEP file of a shape, one product called `name`, in parts.
 
     part: its number, author, colour and material, and the tolerances of its faces "back" and "front".
     faces: the names of all faces, in the order of shape.Faces(); () names none.
@@ -107,7 +120,8 @@ def encode(
     """
     writer = STEPCAFControl_Writer()  # OCC's variables exist only once a writer does
     with _settings(schema=SCHEMAS[part.schema]), silence():
-        document = _document(getattr(shape, "wrapped", shape), part, faces)
+        shape, nets = step_nets.with_stand_ins(getattr(shape, "wrapped", shape))
+        document = _document(shape, part, faces)
         if not writer.Transfer(document, STEPControl_AsIs):
             raise ValueError(f"{name}: OCC cannot express this shape in STEP; check that the solid is valid")
     control = writer.ChangeWriter()
@@ -116,13 +130,14 @@ def encode(
     if properties is not None:
         _add_properties(model, properties)
     _label(model, name, part)
+    stand_ins = step_nets.stand_ins_of(model, len(nets))
     text, stream = StepData_StepWriter(model), BytesIO()
     reals = text.FloatWriter()  # as OCC sets it, zeros are suppressed, and with them digits: -13.71428571428
-    reals.SetFormat("%.16E")
-    reals.SetFormatForRange("%.14f", 0.1, 1e3)
+    reals.SetFormat(step_nets.SCIENTIFIC)
+    reals.SetFormatForRange(step_nets.FIXED, step_nets.LEAST, step_nets.MOST)
     text.SendModel(control.WS().Protocol())
     text.Print(stream)
-    return stream.getvalue()
+    return step_nets.filled_in(stream.getvalue(), stand_ins, nets)
 
 
 @contextmanager

@@ -222,7 +222,7 @@ EVERYWHERE = Circle(math.inf)  # an outline that loses no ray
 def inside(limits: Limits, x: Tensor, y: Tensor, beyond: float = 0.0) -> Tensor:
     """True where (x, y) (mm) lies inside the outline of these limits, on its rim or `beyond` mm outside it."""
     a, b, r2 = limits
-    x, y = (x.abs() - a).clamp(min=0), (y.abs() - b).clamp(min=0)
-    if beyond:
-        return (x * x + y * y).sqrt() <= math.sqrt(r2) + beyond
-    return x * x + y * y <= r2
+    with torch.no_grad():  # in place: it is asked of every ray
+        x, y = x.abs().sub_(a).clamp_(min=0), y.abs().sub_(b).clamp_(min=0)
+        square = x.mul_(x) + y.mul_(y)
+    return square.sqrt() <= math.sqrt(r2) + beyond if beyond else square <= r2

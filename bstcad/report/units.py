@@ -172,6 +172,13 @@ def _plain_text() -> Environment:
     return environment().overlay(autoescape=False)
 
 
+def prepare() -> None:
+    """Compile all templates, in a thread that has the time: while this one waits for OCC to read a file."""
+    for templates in (environment(), _plain_text()):
+        for name in templates.list_templates(extensions=["j2"]):
+            templates.get_template(name)
+
+
 def tables(template: str, **values: Any) -> dict[str, Rows]:
     """The tables that a template writes, by their headings: a line "# heading" before each, then "name | value" rows.
 

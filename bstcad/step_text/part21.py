@@ -153,11 +153,11 @@ def read(path: str | Path) -> StepText:
     """The STEP file at `path`; ValueError if it is missing, truncated or not one lens."""
     path = Path(path)
     try:
-        text = files.contents(path, MAX_BYTES).decode("latin-1")  # Part 21 is ASCII; latin-1 never fails
+        data = files.contents(path, MAX_BYTES)
     except ValueError as error:
         raise ValueError(f"{path.name}: cannot be read ({error}); give the path of a STEP file") from error
     try:
-        return parse(text)
+        return parse(data)
     except ValueError as error:
         raise ValueError(one_line(f"{path.name}: read as text: {error}")) from error
 
@@ -174,10 +174,10 @@ def read_lens(path: str | Path) -> StepText:
     return text
 
 
-def parse(text: str) -> StepText:
+def parse(text: bytes | str) -> StepText:
     """The text of a STEP file of a lens; ValueError in one sentence if it is none."""
     try:
-        return _parse(text)
+        return _parse(text.encode("latin-1", "replace") if isinstance(text, str) else text)
     except ValueError as error:
         raise ValueError(one_line(error)) from error
     except UNREADABLE as error:
@@ -185,13 +185,16 @@ def parse(text: str) -> StepText:
         raise ValueError(one_line(_damaged(f"of its entities {fault}"))) from error
 
 
-def _parse(text: str) -> StepText:
-    if not text.lstrip().startswith("ISO-10303-21;"):
+def _parse(text: bytes) -> StepText:
+    from bstcad.step_text import points  # with numba, which a scene without a STEP file need not load
+
+    if not text.lstrip().startswith(b"ISO-10303-21;"):
         raise ValueError("not a STEP file (it does not begin with ISO-10303-21); export the lens as STEP")
-    if "END-ISO-10303-21;" not in text[-200:]:
+    if b"END-ISO-10303-21;" not in text[-200:]:
         raise ValueError("the file is truncated (no END-ISO-10303-21 at its end); write or copy it again")
-    data, strings = _bare(text)
-    entities = _entities(data, strings)
+    rest, *taken = points.taken_out(text)
+    data, strings = _bare(rest.decode("latin-1"))  # Part 21 is ASCII; latin-1 never fails
+    entities = _entities(data, strings, *taken)
     lengths, angles = (_units(kind, entities) for kind in ("LENGTH", "PLANE_ANGLE"))
     if len(lengths) != 1:
         raise ValueError(f"{len(lengths)} units of length ({', '.join(lengths)}); export it in millimetres only")
@@ -227,7 +230,10 @@ def _bare(text: str) -> tuple[str, list[str]]:
     return data.encode("latin-1", "replace").translate(None, BLANKS).decode("latin-1"), strings
 
 
-def _entities(data: str, strings: Sequence[str]) -> Entities:
+def _entities(data: str, strings: Sequence[str], numbers: np.ndarray, xyz: np.ndarray) -> Entities:
+    """numbers, xyz: of the points that are taken out of the data."""
+    from bstcad.step_text import points
+
     start, end = data.find("DATA;"), data.rfind("ENDSEC;")
     if not 0 <= start < end:
         raise _damaged("it has no DATA section")
@@ -237,13 +243,15 @@ def _entities(data: str, strings: Sequence[str]) -> Entities:
     hits = [STATEMENT.fullmatch(each) for each in texts]
     if tail or not hits or None in hits:
         raise _damaged("a statement is no entity")
-    known = {*names, *(hit[1] for hit in hits)}
-    if len(known) != len(names) + len(hits):
+    numbers = np.concatenate([numbers, np.fromstring(",".join(names), dtype=np.int64, sep=",")])
+    xyz = np.concatenate([xyz, np.fromstring(",".join(values), dtype=np.float64, sep=",").reshape(-1, 3)])
+    known = np.sort(np.concatenate([numbers, np.array([hit[1] for hit in hits], dtype=np.int64)]))
+    if not (np.diff(known) > 0).all():
         raise _damaged("two entities share a number")
-    if missing := set(re.findall(r"#(\d+)", rest)) - known:
-        raise _damaged(f"entity #{min(missing)} is missing")
-    numbers = np.fromstring(",".join(names), dtype=np.int64, sep=",")
-    xyz = np.fromstring(",".join(values), dtype=np.float64, sep=",").reshape(-1, 3)
+    named = points.references(rest.encode("latin-1"))
+    missing = named[known[np.searchsorted(known, named).clip(max=len(known) - 1)] != named]
+    if len(missing):
+        raise _damaged(f"entity #{missing.min()} is missing")
     if not np.isfinite(xyz).all():
         raise ValueError("a CARTESIAN_POINT is not finite; write the file again")
     if np.abs(xyz).max(initial=0.0) > MAX_COORDINATE:

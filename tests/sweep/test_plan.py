@@ -249,7 +249,7 @@ class TestCommand:
         out, err = capsys.readouterr()
         found = json.loads(out)
         assert (
-            set(found) == {"predicted", "not_predicted", "finer", "notes", "simulated", "left_out", "blur"}
+            set(found) == {"predicted", "not_predicted", "finer", "notes", "simulated", "left_out", "blur", "files"}
             and err == ""
         )
         assert found["blur"] is None  # of a beam of no size

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -65,6 +66,22 @@ def _dot(a, b, sums):
         sums[c] = part
 
 
+def add(a: Tensor, factor: float, b: Tensor) -> None:
+    """a += factor b, in place and without gradient: rounded as torch rounds a product and then a sum, in one pass."""
+    if a.device.type != "cpu":
+        a += factor * b
+        return
+    own = a.numpy()
+    _add(own, own.dtype.type(factor), b.detach().numpy())
+
+
+@compiled(parallel=True)
+def _add(a, factor, b):
+    for c in prange(PARTS):
+        for k in range(c * a.size // PARTS, (c + 1) * a.size // PARTS):
+            a[k] += factor * b[k]
+
+
 @njit(inline="always")
 def clear(own, touched, first, last):
     """Make rows first … last - 1 of a part ready to be added to; touched (2,): the rows that are, none at first."""
@@ -104,11 +121,18 @@ def on_threads(work: Callable[..., None], tasks: Sequence[tuple[Any, ...]]) -> N
 
     Python's threads: such kernels hold no lock, and without numba's own they compile in half the time.
     """
-    if len(tasks) == 1:
-        work(*tasks[0])
+    threads = torch.get_num_threads()
+    if len(tasks) == 1 or threads == 1:
+        for task in tasks:
+            work(*task)
         return
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        list(pool.map(lambda task: work(*task), tasks))
+    list(_pool(threads).map(lambda task: work(*task), tasks))
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """Threads that stay: to start them anew takes longer than the work on a draft's few rays."""
+    return ThreadPoolExecutor(threads)
 
 
 def buffers(count: int, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
