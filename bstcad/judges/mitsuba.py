@@ -205,7 +205,7 @@ def lamps(channels: Sequence[Channel], lens: Lens, folder: Path) -> dict[str, En
     first, slide = channels[0].source, {}
     if first.kind == "collimated":
         sources = [_plate(c.source, c.weight, lens, folder / f"lamp{k}.ply") for k, c in enumerate(channels)]
-    elif first.profile == "uniform" and first.half_angle < 89:
+    elif first.profile == "uniform" and first.is_cone:
         sources = [_spot(c.source, c.weight, lens) for c in channels]
     else:
         half = ROOM * max(_half(c.source, lens) for c in channels)

@@ -68,7 +68,9 @@ PROFILES = {  # the width that a profile of the irradiance needs, by the kind of
     ("collimated", "gaussian"): "radius_1e2",
     ("point", "gaussian"): "half_angle_1e2",
     ("point", "uniform"): "half_angle",
+    ("point", "lambertian"): "half_angle",
 }
+UNBOUNDED = ("point", "lambertian")  # the profile that does without: it lights the half space
 
 
 class Accept(Record):
@@ -285,8 +287,9 @@ class Scene(Record):
 
 def _of_source(source: Source, lens: LensBlank) -> Iterator[str]:
     """Complaints about the profile, the spectrum and the size of a source before this lens."""
-    width = PROFILES.get((source.kind, source.profile))
-    if width and getattr(source, width) is None:
+    profile = source.kind, source.profile
+    width = PROFILES.get(profile)
+    if width and profile != UNBOUNDED and getattr(source, width) is None:
         unit = "mm" if width == "radius_1e2" else "degrees"
         yield f"source.{width}: missing, and a {source.profile} profile needs it; add it in {unit}"
     for other in PROFILES.values():
