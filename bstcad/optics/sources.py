@@ -328,9 +328,10 @@ class Point(Emitter):
     def _tilted_irradiance(self, x: Tensor, y: Tensor, distance: float, axis: Vector) -> Tensor:
         """E of a tilted source at (x, y) from its foot on a plane at the distance D; c = n · (x, y, D) = d cos θ.
 
-        E = I(θ) D / d³, and nothing where c <= 0.  lambertian: I = cos θ / (π sin² θ_max), E = D c / (π sin² θ_max d⁴),
-        uniform: I constant, both where cos θ >= cos θ_max.  gaussian: on its own planes E ∝ exp(-2 tan² θ / t²), t = tan(half_angle_1e2), so
-        I = 2 / (π t²) exp(-2 tan² θ / t²) / cos³ θ, and E = 2 D / (π t² c³) exp(-2 (d² - c²) / (t² c²)).
+        E = I(θ) D / d³, and nothing where c <= 0.  lambertian: I = cos θ / (π sin² θ_max), E = D c / (π sin² θ_max d⁴);
+        uniform: I constant, both where cos θ >= cos θ_max.  gaussian: on its own planes E ∝ exp(-2 tan² θ / t²),
+        t = tan(half_angle_1e2), so I = 2 / (π t²) exp(-2 tan² θ / t²) / cos³ θ, and
+        E = 2 D / (π t² c³) exp(-2 (d² - c²) / (t² c²)).
         """
         d2 = x * x + y * y + distance**2
         c = axis[0] * x + axis[1] * y + axis[2] * distance
