@@ -78,7 +78,7 @@ class Made:
 def same_front(one: Surface, other: Surface) -> bool:
     """The same surface, to the last bit?"""
     both = [{"z": front.z, **front.parameters()} for front in (one.plain(), other.plain())]
-    same = one.kind == other.kind and both[0].keys() == both[1].keys()
+    same = (one.kind, one.outline) == (other.kind, other.outline) and both[0].keys() == both[1].keys()
     return same and all(np.array_equal(both[0][key], both[1][key]) for key in both[0])
 
 

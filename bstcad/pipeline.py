@@ -10,21 +10,25 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 
 import bstcad
 from bstcad.analysis.shape import thickness_range
+from bstcad.analysis.steepness import Steepness, needed
 from bstcad.baselines import integration, paper
 from bstcad.folder import Made
+from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.sides import both
+from bstcad.optics.sources import Source
 from bstcad.report.record import Making, Point
 from bstcad.report.record import Stage as StageRecord
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import slope_map, stage1, stage2
 from bstcad.tailoring.machinability import BOUNDED, UNBOUNDED, kept, moved_clear
-from bstcad.tailoring.run import JUDGING, Driver, Parameters, Progress, Record, Task, forget, never, silent
+from bstcad.tailoring.run import JUDGING, Driver, Parameters, Progress, Record, Step, Task, forget, never, silent
 from bstcad.tailoring.source_image import Spread
 from bstcad.tailoring.stage2 import Comparison, compare_precisions
 from bstcad.transport.mapping import Mapping, TransportMap
@@ -114,7 +118,8 @@ def design(
     lens = replace(lens.plain(), index=scene.index, losses=None)
     if not scene.lens.front.free:  # as it was given: tailoring may have worked with less digits of it
         lens = replace(lens, front=scene.lens.front.surface)
-    making = _making(followed, driver.record, stopped)
+    steep = steepness(task.heaviest.source, lens, screen, task.target, sent=followed.transport)
+    making = _making(followed, driver.record, stopped, steep)
     return Made(
         resolved(scene, lens), scene.as_mounted(lens), task.target, making, device=device,
         transport=followed.transport,
@@ -142,7 +147,13 @@ def _compared(making: Making, task: Task, lens: Lens, before: int) -> Making:
     return replace(making, twins=twins, stages=stages, seconds_total=making.seconds_total + stage.seconds)
 
 
-def _making(followed: Followed, went: Record, stopped: str) -> Making:
+def steepness(source: Source, lens: Lens, screen: Screen, target: np.ndarray, sent: TransportMap) -> Steepness:
+    """The slope that the light of a target needs of the back, by the map of stage 1."""
+    at_back = sent.plane == "back"
+    return needed(source, lens, screen, target, x=sent.x, y=sent.y, places=sent.source, at_back=at_back)
+
+
+def _making(followed: Followed, went: Record, stopped: str, steep: Steepness) -> Making:
     """The record of a tailoring for the report."""
     solved = followed.mapping.transport
     return Making(
@@ -154,6 +165,8 @@ def _making(followed: Followed, went: Record, stopped: str) -> Making:
             "iterations": solved.iterations,
             "mass_error": solved.mass_error[-1],
             "stopped": solved.reason,
+            "steep_share": steep.share,
+            "steepest_deg": steep.steepest,
         },
         skipped_steps=went.skipped,
         stopped=stopped,
@@ -182,11 +195,14 @@ def _stage1(
     if compare and not driver.hurry:
         precision = compare_precisions(task, lens)
         driver.end(COMPARED)
+    return Followed(Parameters.of(lens), last.mapping, transport_of(last, lens, task.screen), precision)
+
+
+def transport_of(last: Step, lens: Lens, screen: Screen) -> TransportMap:
+    """The map that a last step of stage 1 followed, inverted."""
     if last.places is None:
-        transport = slope_map.sent_from_entrance(last.mapping, lens, task.screen)
-    else:
-        transport = slope_map.sent_from(last.places, task.screen)
-    return Followed(Parameters.of(lens), last.mapping, transport, precision)
+        return slope_map.sent_from_entrance(last.mapping, lens, screen)
+    return slope_map.sent_from(last.places, screen)
 
 
 def _stage2(task: Task, driver: Driver, lens: Lens, followed: Followed, state: Stage2State | None) -> tuple[Lens, str]:

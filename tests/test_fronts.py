@@ -14,8 +14,10 @@ import bstcad
 from bstcad import commands, pipeline
 from bstcad.cad import step_reading
 from bstcad.folder import read_nominal
+from bstcad.optics.outlines import Circle
 from bstcad.optics.surfaces import sag
 from bstcad.scene.scene import load
+from bstcad.tolerance import perturbations
 from bstcad.verify import step_checks
 from tests.conftest import draws_nothing, quick_effort
 
@@ -41,7 +43,60 @@ def conic(small_scene, tmp_path_factory):
     return made(small_scene.changed({"lens.front": front}), tmp_path_factory.mktemp("fronts") / "conic")
 
 
-@pytest.mark.parametrize("name", ["behind_another", "conic"])
+DOME = {  # all light of the cone enters a dome about the source, which is narrower than the lens
+    "source.position": [0.0, 0.0, 0.0],
+    "source.half_angle": 40.0,
+    "lens.outline": {"shape": "circle", "diameter": 32.0},
+    "lens.front": {"kind": "sphere", "z": 12.0, "curvature": -1 / 12, "outline": {"shape": "circle", "diameter": 17.0}},
+    "lens.back.z": 18.0,
+    "target.x": [-450.0, 450.0],
+    "target.y": [-450.0, 450.0],
+    "target.pixels": 32,
+    "target.outline": {"shape": "circle", "radius": 390.0},
+    "output.mesh_tolerance": 0.01,
+}
+
+
+@pytest.fixture(scope="module")
+def dome(small_scene, tmp_path_factory):
+    """The small lens with a dome over the source, narrower than the lens."""
+    return made(small_scene.changed(DOME), tmp_path_factory.mktemp("fronts") / "dome")
+
+
+def test_all_light_goes_through_the_dome_and_lands(dome):
+    flux = dome.report["flux"]
+    assert flux["on target"] > 0.99 and flux["vignetted by the underside"] < 1e-6
+    assert sum(flux.values()) == pytest.approx(1, abs=1e-9)
+    assert dome.report["prescription"]["front"]["outline"] == {"radius": 8.5, "shape": "circle"}
+    level = dome.report["prescription"]["front"]["around"]
+    assert level == pytest.approx((12**2 - 8.5**2) ** 0.5, abs=1e-12)
+    text = (dome.folder / "prescription.txt").read_text()
+    assert "outline of its own" in text and f"z = {level!r} mm" in text
+
+
+def test_the_dome_is_in_the_scene_and_in_the_step_file_of_its_design(dome):
+    scene, nominal = read_nominal(dome.folder)
+    assert scene == dome.scene and nominal.lens.front == dome.scene.lens.front.surface
+    assert step_reading.read(dome.folder / "lens.step").front.outline == Circle(8.5)
+    again = bstcad.open(dome.folder)
+    assert again.solid().isValid()
+
+
+def test_tolerances_of_a_domed_lens_move_its_dome(dome):
+    """Its form alone changes by a net in its place, which keeps the outline; a larger lens has a larger one."""
+    _, nominal = read_nominal(dome.folder)
+    setup = perturbations.Setup(nominal.lens, nominal.channels, nominal.screen)
+    rough = perturbations.form_error(nominal.lens, 4.0, 0, "front").apply(setup, 0.0).lens
+    assert rough.front.is_net and rough.apertures == nominal.lens.apertures
+    x = torch.linspace(-8, 8, 101, dtype=torch.float64)
+    off = rough.front.sag_and_slope(x, 0 * x)[0] - nominal.lens.front.sag_and_slope(x, 0 * x)[0]
+    assert float(off.abs().max()) < 1e-5
+    larger = setup.with_lens_scaled(1.01).lens
+    assert larger.front.outline == Circle(8.5 * 1.01) == larger.apertures[0]
+    assert larger.front.curvature == pytest.approx(-1 / 12 / 1.01)
+
+
+@pytest.mark.parametrize("name", ["behind_another", "conic", "dome"])
 def test_the_design_passes_its_checks(name, request):
     report = request.getfixturevalue(name).report
     assert [check["name"] for check in report["checks"] if not check["passed"]] == []

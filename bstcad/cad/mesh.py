@@ -63,7 +63,9 @@ def lens_mesh(lens: Lens, cells: int) -> Mesh:
     grid = np.arange(x.size, dtype=np.int32).reshape(x.shape)
     border, z = rim(grid), sag(lens.back, x, y)
     back = np.stack([x, y, z], axis=-1).reshape(-1, 3)
-    if _flat(lens):  # one fan of triangles covers a plane
+    if lens.front.outline is not None:
+        front, front_rim, front_faces = _recessed(lens.front, back[border], grid)
+    elif _flat(lens):  # one fan of triangles covers a plane
         front = np.vstack([back[border], [0.0, 0.0, 0.0]])
         front[:, 2] = lens.front.z
         front_rim = x.size + np.arange(len(border))
@@ -77,6 +79,23 @@ def lens_mesh(lens: Lens, cells: int) -> Mesh:
     back_faces = _triangles(grid, _rising(lens.outline, lens.back, (x, y, z)))
     triangles = np.concatenate([back_faces, front_faces, _wall(front_rim, border)])
     return Mesh(np.concatenate([back, front]), triangles.astype(np.int32, copy=False))
+
+
+def _recessed(front: Surface, around: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(vertices, those below the lens's rim, triangles) of a front with an outline of its own and the plane around it.
+
+    around: the rim of the lens (k, 3); its grid has as many nodes along the rim of the front, and the plane lies
+    between the two.  Numbers of vertices go on from those of the grid.
+    """
+    x, y = nodes(front.outline, len(grid) - 1)
+    z = sag(front.optical, x, y)
+    border = rim(grid)
+    z[np.unravel_index(border, grid.shape)] = front.around.z
+    dome, plane = np.stack([x, y, z], axis=-1).reshape(-1, 3), around.copy()
+    plane[:, 2] = front.around.z
+    outer, inner = 2 * grid.size + np.arange(len(border)), border + grid.size
+    triangles = _triangles(grid + grid.size, _rising(front.outline, front.optical, (x, y, z)))[:, ::-1]
+    return np.vstack([dome, plane]), outer, np.concatenate([triangles, _wall(inner, outer)])
 
 
 def nodes(outline: Outline, cells: int) -> tuple[np.ndarray, np.ndarray]:
@@ -180,7 +199,9 @@ def reach(lens: Lens) -> float:
 def finest(lens: Lens, most: int | None = None) -> int:
     """Cells each way of the finest grid of `most` triangles (default MOST), two a cell on a face that is not plane."""
     faces, most = 2 if _flat(lens) else 4, MOST if most is None else most
-    wall = 12  # triangles a cell of the grid's side: four rows of two along the wall, four of a fan over a plane front
+    # triangles a cell of the grid's side: four rows of two along the wall, four of a fan over a plane front, or four
+    # rows of two in the plane around a front
+    wall = 16 if lens.front.outline is not None else 12
     return int((math.sqrt(wall**2 + 4 * faces * most) - wall) / (2 * faces)) // 2 * 2
 
 
@@ -238,11 +259,13 @@ def _numbers(surface: Surface) -> tuple[FaceNumbers, np.ndarray]:
     if not face.is_net:
         c = float(face.curvature)
         bend = (1 + float(face.conic_constant)) * c * c
+        ends2 = face.outline.radius**2 if face.outline else math.inf
         return FaceNumbers(
-            float(face.z), c, bend, equator=EQUATOR, x=0.0, y=0.0, per_x=0.0, per_y=0.0, per_detail=per_detail
-        ), np.zeros((0, 0))
+            float(face.z), c, bend, equator=EQUATOR, x=0.0, y=0.0, per_x=0.0, per_y=0.0, per_detail=per_detail,
+            ends2=ends2,
+        ), np.zeros((0, 0))  # fmt: skip
     corner, per_mm = (float(face.x[0]), float(face.y[0])), (1 / pitch for pitch in face.pitch)
-    numbers = FaceNumbers(float(face.z), 0.0, 0.0, EQUATOR, *corner, *per_mm, per_detail)
+    numbers = FaceNumbers(float(face.z), 0.0, 0.0, EQUATOR, *corner, *per_mm, per_detail, math.inf)
     return numbers, face.heights.contiguous().numpy()
 
 
@@ -261,6 +284,7 @@ class FaceNumbers(NamedTuple):
     per_x: float  # control points per mm
     per_y: float
     per_detail: float  # smooth parts per mm: 1 / Surface.detail
+    ends2: float  # r² (mm²) from which on it is a plane: of Surface.outline
 
 
 @njit(inline="always")
@@ -283,7 +307,7 @@ def _sag(face, net, x, y):
     """z (mm) of a face; net (0, 0): it is a surface of revolution."""
     m, n = net.shape
     if m == 0:
-        r2 = x * x + y * y
+        r2 = min(x * x + y * y, face.ends2)
         return face.z + face.curvature * r2 / (1.0 + math.sqrt(max(1.0 - face.bend * r2, face.equator)))
     i, a0, a1, a2 = _basis(min(max((x - face.x) * face.per_x, 0.0), m - 1.0), m)
     j, b0, b1, b2 = _basis(min(max((y - face.y) * face.per_y, 0.0), n - 1.0), n)
@@ -518,12 +542,14 @@ def _glb(mesh: Mesh, lens: Lens, label: Label, off: float) -> bytes:
     across = np.cross(b - a, c - a)
     across /= np.linalg.norm(across, axis=1)[:, None]
     wall = np.abs(across[:, 2]) <= UPRIGHT
+    if lens.front.outline is not None:  # the plane around it meets it in an edge
+        wall |= across[:, 2] <= UPRIGHT - 1
     vertices, normals = [mesh.vertices[mesh.faces[wall]].reshape(-1, 3)], [across[wall].repeat(3, axis=0)]
     faces, count = [np.arange(3 * wall.sum()).reshape(-1, 3)], 3 * wall.sum()
     for face, sense in ((lens.back, 1), (lens.front, -1)):
-        used, renumbered = np.unique(mesh.faces[sense * across[:, 2] > UPRIGHT], return_inverse=True)
+        used, renumbered = np.unique(mesh.faces[(sense * across[:, 2] > UPRIGHT) & ~wall], return_inverse=True)
         vertices.append(mesh.vertices[used])
-        normals.append(sense * _upwards(face, vertices[-1]))
+        normals.append(sense * _upwards(face.optical, vertices[-1]))
         faces.append(renumbered.reshape(-1, 3) + count)
         count += len(used)
     red, green, blue, opacity = (int(label.colour[k : k + 2], 16) for k in (1, 3, 5, 7))

@@ -24,8 +24,17 @@ from OCP.TopLoc import TopLoc_Location
 from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Shape
 
 from bstcad.cad import solid_properties, step_writing, walls
-from bstcad.cad.patches import back_patch, front_patch
-from bstcad.cad.solid import NamedSolid, cap, check_thickness, cut_loops, named_solid, rim_points
+from bstcad.cad.patches import back_patch
+from bstcad.cad.solid import (
+    NamedSolid,
+    cap,
+    check_thickness,
+    cut_loops,
+    dome_cap,
+    front_caps,
+    named_solid,
+    rim_points,
+)
 from bstcad.cad.walls import SLIM, UPRIGHT, Draft, Loop, Named, face_inside, solid_of
 from bstcad.cad.wires import Piece, shape_in
 from bstcad.optics.lens import Lens
@@ -179,21 +188,25 @@ class _Opening:
                 "mm, leaves none; leave them out, or move it up"
             )
         tops = [walls.on(lens.back, loop) for loop in self.loops]
-        inner = [walls.on(lens.front, hole) for hole in holes]
+        inner = [walls.on(lens.front.around, hole) for hole in holes]
         top, plane = walls.on(Plane(upper - self.z), rim), Plane(lower - self.z)
         faces = [(cap(back_patch(lens), tops, along=True), "back")]
         faces += walls.over(rim, tops[0], top, outward=False) if over else walls.over(rim, top, tops[0])
         if under is None:  # the lower plane is the front's: one face
             below = [rail.against() for rail in inner]
+            if lens.front.outline is not None:
+                dome, edge = dome_cap(lens)
+                faces.append(dome)
+                below.append(edge.along())
         else:
             bottom = walls.on(plane, rim)
             if under:
-                low = walls.on(lens.front, rim)
+                low = walls.on(lens.front.around, rim)
                 faces += walls.over(rim, bottom, low, outward=False)
             else:
-                leaning, low = walls.down(lens.front, self.loops, bottom, above=plane, draft=self.draft)
+                leaning, low = walls.down(lens.front.around, self.loops, bottom, above=plane, draft=self.draft)
                 faces += leaning
-            faces.append((cap(front_patch(lens), [low, *inner], along=False), "front"))
+            faces += front_caps(lens, [low, *inner])
             below = [bottom.along()]
         for hole, low, high in zip(holes, inner, tops[1:], strict=True):
             faces += walls.over(hole, low, high, "hole")
@@ -212,7 +225,8 @@ def fit(lens: Lens, rim: Sequence[Piece], planes: tuple[float, float], name: str
     """
     lower, upper = planes
     high, low = (sag(face, *rim_points(lens, rim)) for face in (lens.back, lens.front))
-    flat = lens.front.sags(lens.outline) == (0.0, 0.0) and abs(lower - lens.front.z) < NEAR
+    below = lens.front.around
+    flat = below.sags(lens.outline) == (0.0, 0.0) and abs(lower - below.z) < NEAR
     for side, z, face, heights in (("upper", upper, "back", high), ("lower", lower, "front", low)):
         cuts = np.abs(z - heights).min() < SLIM or heights.min() <= z <= heights.max()
         if cuts and not (flat and face == "front"):

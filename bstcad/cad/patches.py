@@ -88,11 +88,11 @@ def front_patch(lens: Lens) -> Patch:
     A sphere whose centre lies 10⁵ mm away would lose its digits: it is written as the parabola z0 + c r²/2, from which
     it departs by c³ r⁴/8 < PARABOLA.
     """
-    front, outline = lens.front.plain(), lens.outline
+    front, outline = lens.front.plain().optical, lens.front.outline or lens.outline
     if front.is_net:
         return _net_patch(front, outline, outward=False)
     if front.level:
-        return Patch(Geom_Plane(gp_Ax3(gp_Pnt(0, 0, front.z), gp_Dir(0, 0, -1), gp_Dir(1, 0, 0))), True)
+        return level_patch(front.z)
     c, r = front.curvature, float(np.hypot(*outline.farthest))
     if front.kind != "sphere":
         return _conic_patch(front, outline)
@@ -103,6 +103,11 @@ def front_patch(lens: Lens) -> Patch:
     if abs(c) ** 3 * r**4 / 8 < PARABOLA:
         return _conic_patch(Conic(front.z, c, -1.0), outline)
     return _sphere_patch(front.z, c)
+
+
+def level_patch(z: float) -> Patch:
+    """The plane z, seen from below."""
+    return Patch(Geom_Plane(gp_Ax3(gp_Pnt(0, 0, z), gp_Dir(0, 0, -1), gp_Dir(1, 0, 0))), True)
 
 
 def _sphere_patch(z: float, c: float) -> Patch:

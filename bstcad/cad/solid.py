@@ -22,7 +22,7 @@ from OCP.gp import gp_Ax2d, gp_Dir2d, gp_Pnt2d
 from OCP.TopoDS import TopoDS_Face, TopoDS_Solid
 
 from bstcad.cad import patches, walls, wires
-from bstcad.cad.patches import Patch, back_patch, front_patch
+from bstcad.cad.patches import Patch, back_patch, front_patch, level_patch
 from bstcad.cad.walls import RIM, SLIM, TOLERANCE, UPRIGHT, Draft, Named, Rail, face_inside, solid_of
 from bstcad.cad.wires import Curve, Piece
 from bstcad.optics.bspline import BSplineSurface
@@ -48,7 +48,7 @@ class NamedSolid(NamedTuple):
     """A solid and the names of its faces, in its own order."""
 
     solid: cadquery.Solid
-    faces: tuple[str, ...]  # "back", "front", "rim", "bevel", "hole" or "flange"
+    faces: tuple[str, ...]  # "back", "front", "underside", "rim", "bevel", "hole" or "flange"
 
 
 def lens_solid(
@@ -67,7 +67,7 @@ def lens_solid(
 def named_solid(
     lens: Lens, trim: cadquery.Wire | None = None, holes: Sequence = (), draft: Draft = UPRIGHT
 ) -> NamedSolid:
-    """That solid, and the name of each of its faces, in their order: "back", "front", then "rim", "bevel", "hole"."""
+    """That solid, and the name of each of its faces, in their order: "back", "front", then the others."""
     import cadquery
 
     solid, names = lens_shape(lens, cut_loops(lens, trim, holes), draft)
@@ -80,12 +80,12 @@ def lens_shape(
     """The same without cadquery, whose import takes a second; loops: see `cut_loops` (None: the lens's own outline)."""
     lens, loops = lens.plain(), loops or [wires.of_outline(lens.outline)]
     check_thickness(lens)
-    back, front = back_patch(lens), front_patch(lens)
-    tops, inner = [walls.on(lens.back, loop) for loop in loops], [walls.on(lens.front, loop) for loop in loops[1:]]
+    back, below = back_patch(lens), lens.front.around
+    tops, inner = [walls.on(lens.back, loop) for loop in loops], [walls.on(below, loop) for loop in loops[1:]]
     named, low = _around(lens, loops, tops[0], draft)
     for each in zip(loops[1:], inner, tops[1:], strict=True):
         named += walls.over(*each, "hole")
-    caps = [(cap(back, tops, along=True), "back"), (cap(front, [low, *inner], along=False), "front")]
+    caps = [(cap(back, tops, along=True), "back"), *front_caps(lens, [low, *inner])]
     faces, names = zip(*caps, *named, strict=True)
     return solid_of(faces, INVALID), names
 
@@ -155,6 +155,10 @@ def cut_loops(lens: Lens, trim: cadquery.Wire | None, holes: Sequence) -> list[l
         raise ValueError(
             f"trim or holes: {reason} near {place}; draw each wire simple, and the holes inside the rim and apart"
         )
+    if (dome := lens.front.outline) and not shape.contains(wires.polygon(wires.of_outline(dome))):
+        raise ValueError(
+            f"trim or holes: a wire crosses the front, {dome.words}, or lies inside it; draw it in the plane around it"
+        )
     turned = [shape.exterior.is_ccw, *(not hole.is_ccw for hole in shape.interiors)]
     return [loop if right else wires.reversed_loop(loop) for loop, right in zip(loops, turned, strict=True)]
 
@@ -190,6 +194,22 @@ def cap(patch: Patch, rails: Sequence[Rail], along: bool) -> TopoDS_Face:
     return face
 
 
+def front_caps(lens: Lens, rails: Sequence[Rail]) -> list[Named]:
+    """The faces of the front inside the first rail and outside the others: itself, or with it the plane around it."""
+    if lens.front.outline is None:
+        return [(cap(front_patch(lens), rails, along=False), "front")]
+    dome, rim = dome_cap(lens)
+    plane = level_patch(lens.front.around.z)
+    around = face_inside(plane.surface, plane.outward, *(rail.against() for rail in rails), rim.along())
+    return [dome, (around, "underside")]
+
+
+def dome_cap(lens: Lens) -> tuple[Named, Rail]:
+    """The optical part of a front with an outline of its own, and its rim, counterclockwise."""
+    rim = walls.on(lens.front.optical, wires.of_outline(lens.front.outline))
+    return (cap(front_patch(lens), [rim], along=False), "front"), rim
+
+
 def image(patch: Patch, curve: Curve) -> Geom2d_Curve:
     """The curve in the patch's parameter plane, by the same parameter: a line or a circle where it is one."""
     piece, cubic = curve.piece, curve.knots is not None and len(curve.knots) == len(curve.poles) + 4
@@ -218,10 +238,10 @@ def image(patch: Patch, curve: Curve) -> Geom2d_Curve:
 def _around(lens: Lens, loops: list[list[Piece]], top: Rail, draft: Draft) -> tuple[list[Named], Rail]:
     """The walls over the rim, the first loop, from the back's edge down to the front, and their edge there."""
     if not draft.angle:
-        return walls.down(lens.front, loops, top, above=lens.back, draft=draft)
+        return walls.down(lens.front.around, loops, top, above=lens.back, draft=draft)
     plane = Plane(_parting(lens, loops[0]))
     line = walls.on(plane, loops[0])
-    leaning, low = walls.down(lens.front, loops, line, above=plane, draft=draft)
+    leaning, low = walls.down(lens.front.around, loops, line, above=plane, draft=draft)
     return walls.over(loops[0], line, top) + leaning, low
 
 

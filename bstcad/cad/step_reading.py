@@ -35,11 +35,12 @@ from bstcad.cad import patches
 from bstcad.optics.bspline import SMALLEST_NET, BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle, Rounded
-from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface, sag
+from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Surface, sag
 
 UNIFORM = 1e-9  # mm; a net further from uniform in x and y is not one of ours
 AXIAL = 1e-9  # mm or rad; a wall further off does not belong to an outline about the axis
 ROUND = 1e-6  # mm; the edge of a round back follows its circle more closely
+LEVEL = 1e-7  # mm; a plane further off does not go on around a front
 DIGITS = 9  # of a clear aperture in mm: finer ones are rounding of the file's coordinates
 EDGE_POINTS = 129  # on each edge of a face
 SPAN_POINTS = 4  # points a knot span: one pole of a curve moves three spans
@@ -62,7 +63,8 @@ class StepLens:
     @property
     def clear(self) -> tuple[Outline, Outline]:
         """The clear apertures of front and back, by the edges of these faces; see `clear_apertures`."""
-        return clear_apertures(*map(outer_edge, self.faces))
+        front, back = clear_apertures(*map(outer_edge, self.faces))
+        return self.front.outline or front, back
 
 
 @contextmanager
@@ -147,12 +149,15 @@ def _lens_in(solid: TopoDS_Solid) -> StepLens:
         raise ValueError(f"the net of the back is centred at {middle} mm; centre the lens on the axis")
     rest = [face for face in faces if face not in nets]
     chosen = fronts[0] if fronts else _across_the_axis(rest)
-    walls = [surface for face, surface in rest if face is not chosen[0]]
-    outline, edge = _outline_of(walls), None
+    front = freeform_surface(chosen[0]) if fronts else _front(*chosen)
+    others = [face for face in rest if face[0] is not chosen[0]]
+    if not fronts and (own := _own_outline(front, chosen[0], others)):
+        front = Recess(front, own)
+        others = [face for face in others if not _is_level(face[1], front.around.z)]
+    outline, edge = _outline_of([surface for _, surface in others]), None
     if outline is None:
         edge = outer_edge(back_face)
         outline = _around(edge)
-    front = freeform_surface(chosen[0]) if fronts else _front(*chosen)
     faces = chosen[0], back_face
     return StepLens(solid, net, _uniform_net(back, net), front=front, outline=outline, edge=edge, faces=faces)
 
@@ -222,6 +227,26 @@ def _across_the_axis(rest: Sequence[Face]) -> Face:
     if not (curved or level):
         raise ValueError("no plane, sphere or flat patch faces the light; give a file written by bstcad")
     return (curved or level)[0]
+
+
+def _own_outline(front: Surface, face: TopoDS_Face, others: Sequence[Face]) -> Circle | None:
+    """The outline of a curved front that ends in a plane z = const, which goes on around it; None: it ends on walls."""
+    if front.level:
+        return None
+    edge = _around(outer_edge(face))
+    if not edge.is_round:
+        return None
+    rim = Circle(round(edge.radius, DIGITS))
+    z = Recess(front, rim).around.z
+    return rim if any(_is_level(surface, z) and not _looks_up(other, surface) for other, surface in others) else None
+
+
+def _is_level(surface: BRepAdaptor_Surface, z: float) -> bool:
+    """Is it the plane z (mm)?"""
+    if surface.GetType() != Kind.GeomAbs_Plane:
+        return False
+    plane = surface.Plane()
+    return abs(plane.Axis().Direction().Z()) > 1 - AXIAL and abs(plane.Location().Z() - z) <= LEVEL
 
 
 def _front(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> Surface:
@@ -394,5 +419,8 @@ def _worst(distance: np.ndarray, points: np.ndarray) -> tuple[float, str]:
 def _off_wall(points: np.ndarray, lens: Lens) -> np.ndarray:
     """Distance of each point from the wall of the lens between its faces."""
     x, y, z = points.T
-    beyond = np.maximum(z - sag(lens.back, x, y), sag(lens.front, x, y) - z)
-    return np.maximum(np.abs(lens.outline.depth(x, y)), beyond)
+    beyond = np.maximum(z - sag(lens.back, x, y), sag(lens.front.around, x, y) - z)
+    off = np.maximum(np.abs(lens.outline.depth(x, y)), beyond)
+    if (dome := lens.front.outline) is None:
+        return off
+    return np.minimum(off, np.hypot(dome.depth(x, y), z - lens.front.around.z))  # or of the edge around the front

@@ -122,7 +122,8 @@ def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, se
                 launched += flux.sum()
                 count += len(x)
             picture += channel.weight / max(launched, 1.0) * landed  # cells on a beam's rim count in or out
-    return Traced(halves, count, FaceError.worst(surface.error(lens.outline) for surface in known))
+    faces_of = zip(known, lens.interfaces, strict=True)
+    return Traced(halves, count, FaceError.worst(face.error(interface.outline) for face, interface in faces_of))
 
 
 def binned(x: np.ndarray, y: np.ndarray, flux: np.ndarray, screen: Screen) -> np.ndarray:

@@ -123,10 +123,11 @@ def _bench(lens: Lens, screen: Screen, folder: Path) -> tuple[dict[str, Entry], 
     upper, error = _fine_enough(back, above, lens, screen, up=True)
     meshes = {"back": upper}
     if not lens.reflects:
-        front = faces.face(lens.front, lens.outline)
+        front, level = faces.face(lens.front, below), faces.face(lens.front.around, lens.outline)
         meshes["front"], of_front = _fine_enough(front, below, lens, screen, up=False)
         error = FaceError.worst((error, of_front))
-        meshes |= {"wall": faces.wall(front, back, lens.apertures), "plate": faces.plate(front, below)}
+        foot = (front, below) if lens.front.outline is None else (level, above)
+        meshes |= {"wall": faces.wall(foot[0], back, (foot[1], above)), "plate": faces.plate(front, below)}
     entries = {name: _ply(mesh, folder / f"{name}.ply") for name, mesh in meshes.items()}
     for name in entries.keys() & {"wall", "plate"}:
         entries[name]["bsdf"] = _matt(0.0)
@@ -205,7 +206,7 @@ def lamps(channels: Sequence[Channel], lens: Lens, folder: Path) -> dict[str, En
     first, slide = channels[0].source, {}
     if first.kind == "collimated":
         sources = [_plate(c.source, c.weight, lens, folder / f"lamp{k}.ply") for k, c in enumerate(channels)]
-    elif first.profile == "uniform" and first.half_angle < 89:
+    elif first.profile == "uniform" and first.is_cone:
         sources = [_spot(c.source, c.weight, lens) for c in channels]
     else:
         half = ROOM * max(_half(c.source, lens) for c in channels)

@@ -57,7 +57,7 @@ class Lens:
         if self.reflects:
             return (Interface(self.back, back, Reflect(), missed),)
         return (
-            Interface(self.front, front, Refract(1.0, self.index), missed),
+            Interface(self.front.optical, front, Refract(1.0, self.index), missed),
             Interface(self.back, back, Refract(self.index, 1.0), Status.VIGNETTED),
         )
 
@@ -141,7 +141,7 @@ class Lens:
     @property
     def apertures(self) -> tuple[Outline, Outline]:
         """The clear apertures of front and back: light that meets a face outside of its own is lost."""
-        return self.clear or (self.outline, self.outline)
+        return self.clear or (self.front.outline or self.outline, self.outline)
 
     @property
     def entrance(self) -> Surface:
@@ -150,7 +150,7 @@ class Lens:
 
     def unbounded(self) -> Lens:
         """The same solid without an edge: no light misses its faces."""
-        return replace(self, outline=EVERYWHERE, clear=None)
+        return replace(self, outline=EVERYWHERE, clear=(EVERYWHERE, EVERYWHERE))
 
     def grown(self, by: float) -> Lens:
         """The same surfaces, the clear apertures of the solid larger by a factor."""

@@ -38,7 +38,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import in_pairs
-from bstcad.optics.trace import Ghost, Simulation, simulate, through
+from bstcad.optics.trace import UNDERSIDE, Ghost, Simulation, simulate, through
 from bstcad.optics.tubes import SHEET, Tubes, area_of, arriving, corners, launch_tubes, middle, picture, rays_to
 
 SETS = 8  # of rays, independent of each other: the jackknife then knows a standard error to a quarter of it
@@ -109,7 +109,7 @@ class Light:
     @property
     def used(self) -> float:
         """Part of the light that enters the lens which falls on the target."""
-        enters = 1 - self.flux["missed the lens"]
+        enters = 1 - self.flux["missed the lens"] - self.flux.get(UNDERSIDE, 0.0)
         return self.flux["on target"] / enters if enters > 0 else 0.0
 
 

@@ -197,8 +197,13 @@ def of_lens(lens: Lens) -> MassProperties:
     lens, total = lens.plain(), Sums()
     z_ref = lens.front.z  # heights are measured from there, so that digits stay
     for face, sign in ((lens.back, 1), (lens.front, -1)):
-        border, raised = outline_border(lens.outline, face), face.z - z_ref
-        cap, wall = of_face(face, border, raised), of_wall(face, border, raised)
+        rim, raised = face.around, face.around.z - z_ref
+        border = outline_border(lens.outline, rim)
+        cap, wall = of_face(rim, border, raised), of_wall(rim, border, raised)
+        if face.outline is not None:  # there the plane makes way for the optical part
+            inner = outline_border(face.outline, face.optical)
+            hole, dome = of_face(rim, inner, raised), of_face(face.optical, inner, face.z - z_ref)
+            cap += Sums(dome.area - hole.area, dome.volume - hole.volume, dome.moment - hole.moment)
         volume, moment = sign * (cap.volume + wall.volume), sign * (cap.moment + wall.moment)
         total += Sums(cap.area + sign * wall.area, volume, moment)
     return MassProperties.of(total, z_ref)

@@ -22,6 +22,8 @@ from bstcad.optics.key import Key
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays, Vector, axes, tilt_of
 
+HALF_SPACE = math.pi / 2  # rad; the edge of light that fills all directions on the lens's side
+WIDEST = math.radians(89.0)  # of a cone whose edge counts on planes
 Wavelength = float | tuple[tuple[float, float], ...]  # nm; or lines, each (nm, weight), weights of any sum
 WavelengthKey = Annotated[  # of every source
     Wavelength,
@@ -218,7 +220,7 @@ class Point(Emitter):
     """Rays from one point into the half space on the lens's side of it.
 
     gaussian: irradiance on z = const falls as exp(-2 r² / w²), w = distance · tan(half_angle_1e2);
-    lambertian: radiant intensity cos(theta); uniform: constant radiant intensity up to half_angle.
+    lambertian: radiant intensity cos(theta), up to half_angle if there is one; uniform: constant up to half_angle.
     Tilted, all that is turned about the point, plane and half space included (`_tilted_irradiance`); what no longer
     goes to the lens's side misses the lens.  A disc or a rectangle lies across the axis, each point such a source.
     """
@@ -240,7 +242,7 @@ class Point(Emitter):
         ),
     ] = None
     half_angle: Annotated[
-        float | None, Key("Angle from the axis at which a uniform profile ends.", "degrees", 1e-3, 90.0)
+        float | None, Key("Angle from the axis at which a uniform or lambertian profile ends.", "degrees", 1e-3, 90.0)
     ] = None
     diameter: Annotated[float | None, Key("Diameter of a disc that shines, simulated.", "mm", 0.0, 1e6)] = None
     width: Annotated[
@@ -288,8 +290,9 @@ class Point(Emitter):
     def irradiance(self, x: Tensor, y: Tensor, z: float) -> Tensor:
         """E(x, y) (1/mm²) on the plane z; all the light sent to its side is 1.
 
-        gaussian: 2 / (π w²) exp(-2 r² / w²).  lambertian: I = cos θ / π and E = I cos θ / d², so E = D² / (π d⁴)
-        with D the distance of the plane and d that of the point.  uniform: I = 1 / (2π (1 - cos θ_max)), E = I D / d³.
+        gaussian: 2 / (π w²) exp(-2 r² / w²).  lambertian: I = cos θ / (π sin² θ_max) and E = I cos θ / d², so
+        E = D² / (π sin² θ_max d⁴) with D the distance of the plane and d that of the point.  uniform:
+        I = 1 / (2π (1 - cos θ_max)), E = I D / d³.  Beyond θ_max both are dark.
         """
         distance = abs(z - self.position[2])
         if self.tilted:
@@ -299,12 +302,23 @@ class Point(Emitter):
         if self.profile == "gaussian":
             w2 = (distance * math.tan(math.radians(self.half_angle_1e2))) ** 2
             return 2 / (math.pi * w2) * elementary(torch.exp, -2 * r2 / w2)
+        edge = self.edge
         if self.profile == "lambertian":
-            return distance**2 / (math.pi * d2 * d2)
-        edge = math.radians(self.half_angle)
-        intensity = 1 / (2 * math.pi * (1 - math.cos(edge)))
-        inside = r2 <= (distance * math.tan(edge)) ** 2 if self.half_angle < 90 else torch.ones_like(r2, dtype=bool)
-        return torch.where(inside, intensity * distance / (d2 * torch.sqrt(d2)), torch.zeros_like(d2))
+            e = distance**2 / (math.pi * math.sin(edge) ** 2 * d2 * d2)
+        else:
+            intensity = 1 / (2 * math.pi * (1 - math.cos(edge)))
+            e = intensity * distance / (d2 * torch.sqrt(d2))
+        return e if edge == HALF_SPACE else torch.where(r2 <= (distance * math.tan(edge)) ** 2, e, torch.zeros_like(e))
+
+    @property
+    def edge(self) -> float:
+        """The angle from the axis (rad) at which a uniform or lambertian profile ends: π / 2 lights the half space."""
+        return HALF_SPACE if self.half_angle is None or self.profile == "gaussian" else math.radians(self.half_angle)
+
+    @property
+    def is_cone(self) -> bool:
+        """Has its light an edge, on planes before it too?"""
+        return self.edge < WIDEST
 
     def towards(self, z: float) -> Vector:
         """Its axis, its light's way to the plane z, in a frame in which that plane is ahead along +z."""
@@ -314,9 +328,10 @@ class Point(Emitter):
     def _tilted_irradiance(self, x: Tensor, y: Tensor, distance: float, axis: Vector) -> Tensor:
         """E of a tilted source at (x, y) from its foot on a plane at the distance D; c = n · (x, y, D) = d cos θ.
 
-        E = I(θ) D / d³, and nothing where c <= 0.  lambertian: I = cos θ / π, E = D c / (π d⁴).  uniform: I constant
-        where cos θ >= cos θ_max.  gaussian: on its own planes E ∝ exp(-2 tan² θ / t²), t = tan(half_angle_1e2), so
-        I = 2 / (π t²) exp(-2 tan² θ / t²) / cos³ θ, and E = 2 D / (π t² c³) exp(-2 (d² - c²) / (t² c²)).
+        E = I(θ) D / d³, and nothing where c <= 0.  lambertian: I = cos θ / (π sin² θ_max), E = D c / (π sin² θ_max d⁴);
+        uniform: I constant, both where cos θ >= cos θ_max.  gaussian: on its own planes E ∝ exp(-2 tan² θ / t²),
+        t = tan(half_angle_1e2), so I = 2 / (π t²) exp(-2 tan² θ / t²) / cos³ θ, and
+        E = 2 D / (π t² c³) exp(-2 (d² - c²) / (t² c²)).
         """
         d2 = x * x + y * y + distance**2
         c = axis[0] * x + axis[1] * y + axis[2] * distance
@@ -326,12 +341,14 @@ class Point(Emitter):
             t2 = math.tan(math.radians(self.half_angle_1e2)) ** 2
             c2 = c * c
             e = 2 * distance / (math.pi * t2) * elementary(torch.exp, -2 / t2 * (d2 - c2) / c2) / (c2 * c)
-        elif self.profile == "lambertian":
-            e = distance / math.pi * c / (d2 * d2)
         else:
-            cos, d = math.cos(math.radians(self.half_angle)), torch.sqrt(d2)
-            ahead = ahead & (c >= cos * d)
-            e = distance / (2 * math.pi * (1 - cos)) / (d2 * d)
+            edge, d = self.edge, torch.sqrt(d2)
+            if edge < HALF_SPACE:
+                ahead = ahead & (c >= math.cos(edge) * d)
+            if self.profile == "lambertian":
+                e = distance / (math.pi * math.sin(edge) ** 2) * c / (d2 * d2)
+            else:
+                e = distance / (2 * math.pi * (1 - math.cos(edge))) / (d2 * d)
         return torch.where(ahead, e, torch.zeros_like(e))
 
     def window(self, outline: Outline, z: float, sags: tuple[float, ...]) -> Rectangle:
@@ -348,16 +365,16 @@ class Point(Emitter):
             w = distance / max(distance + away, 1e-3 * distance)  # a point at h is seen at p + w (h - p)
             seen = (w * h + abs(1 - w) * p for h, p in zip(outline.half_extent, offsets, strict=True))
             half = [max(h, s) for h, s in zip(half, seen, strict=True)]
-        if self.profile == "uniform" and self.half_angle < 89:
+        if self.is_cone:
             half = [min(h, p + distance * s) for h, p, s in zip(half, offsets, self._cone_slopes(z), strict=True)]
         return Rectangle(2 * half[0], 2 * half[1])
 
     def _cone_slopes(self, z: float) -> tuple[float, float]:
-        """The largest |dx/dz| and |dy/dz| of a uniform cone's rays to the plane z; infinite if it runs along that.
+        """The largest |dx/dz| and |dy/dz| of a cone's rays to the plane z; infinite if it runs along that.
 
         X = dx/dz ends where the line of all Y touches the cone: (1 + X²) sin² θ_max = (n_x - n_z X)².
         """
-        edge = math.radians(self.half_angle)
+        edge = self.edge
         if not self.tilted:
             return math.tan(edge), math.tan(edge)
         x, y, z = self.towards(z)
@@ -368,11 +385,11 @@ class Point(Emitter):
         return tuple((abs(a * z) + root) / (z * z - sin2) for a, root in zip((x, y), roots, strict=True))
 
     def spot(self, z: float) -> tuple[Outline | None, tuple[float, float]]:
-        """(outline, centre in mm) of the light on the plane z, None where it has no edge: a uniform cone's disc."""
+        """(outline, centre in mm) of the light on the plane z, None where it has no edge: a cone's disc."""
         centre = self.position[:2]
-        if self.profile != "uniform" or self.half_angle >= 89 or self.tilted:
+        if not self.is_cone or self.tilted:
             return None, centre
-        return Circle(abs(z - self.position[2]) * math.tan(math.radians(self.half_angle))), centre
+        return Circle(abs(z - self.position[2]) * math.tan(self.edge)), centre
 
     def rays(self, x: Tensor, y: Tensor, z: float, area: float) -> Rays:
         """Rays from the point through (x, y) of the plane z."""

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics.outlines import STRICT, Outline
+from bstcad.optics.outlines import STRICT, Circle, Outline
 
 EQUATOR = 1e-6  # of 1 - (1 + k) c² r², for a sphere cos² of its slope's angle: below it a surface is too steep
 
@@ -30,6 +30,17 @@ class Surface(ABC):
     curvature: float | Tensor | None  # at the vertex (1/mm), positive towards +z; None: it is no surface of revolution
     conic_constant: float | Tensor | None
     detail = math.inf  # width (mm) of its smooth pieces
+    outline: Circle | None = None  # of its optical part, around which it is a plane; None: all of it is optical
+
+    @property
+    def optical(self) -> Surface:
+        """Its optical part."""
+        return self
+
+    @property
+    def around(self) -> Surface:
+        """What lies at the rim of a lens that is larger than its outline: the plane around it, else itself."""
+        return self
 
     @abstractmethod
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -185,3 +196,77 @@ class Conic(_Revolved):
     def parameters(self) -> dict[str, float | Tensor]:
         """The curvature (1/mm) and the conic constant."""
         return {"curvature": self.curvature, "conic_constant": self.conic_constant}
+
+
+@dataclass(frozen=True)
+class Recess(Surface):
+    """z = that of a surface of revolution inside a circle, and beyond it that of its rim, a plane z = const.
+
+    Such as the dome over an LED in a flat underside, or a bulge of one.  Light is traced to the optical part alone.
+    """
+
+    face: Sphere | Conic  # the optical part
+    outline: Circle  # of that, about the axis
+
+    @property
+    def optical(self) -> Sphere | Conic:
+        """Its optical part."""
+        return self.face
+
+    @property
+    def z(self) -> float:
+        """The vertex (mm)."""
+        return self.face.z
+
+    @property
+    def kind(self) -> str:
+        """That of the optical part, which kernels trace."""
+        return self.face.kind
+
+    @property
+    def curvature(self) -> float | Tensor:
+        """At the vertex (1/mm)."""
+        return self.face.curvature
+
+    @property
+    def conic_constant(self) -> float | Tensor:
+        """Of the optical part."""
+        return self.face.conic_constant
+
+    @property
+    def around(self) -> Plane:
+        """The plane through its rim."""
+        falls, rises = self.face.sags(self.outline)
+        return Plane(float(self.z) + falls + rises)  # one of which is zero
+
+    def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm."""
+        inside, none = self.outline.contains(x, y), torch.zeros_like(x)
+        h, z_x, z_y = self.face.relative_sag_and_slope(x, y)
+        rim = torch.full_like(h, sum(self.face.sags(self.outline)))
+        return torch.where(inside, h, rim), torch.where(inside, z_x, none), torch.where(inside, z_y, none)
+
+    def sags(self, outline: Outline) -> tuple[float, float]:
+        """Zero and the sag of the optical part where that, or the outline, ends, the lower one first."""
+        smaller = math.hypot(*outline.farthest) < self.outline.radius
+        return self.face.sags(outline if smaller else self.outline)
+
+    def parameters(self) -> dict[str, float | Tensor]:
+        """Those of the optical part."""
+        return self.face.parameters()
+
+    def with_parameters(self, **values: float | Tensor) -> Recess:
+        """The same with another optical part."""
+        return replace(self, face=self.face.with_parameters(**values))
+
+    def moved(self, z: float) -> Recess:
+        """The same with its vertex at another z (mm)."""
+        return replace(self, face=self.face.moved(z))
+
+    def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Recess:
+        """The same with its tensors in another precision or on another device."""
+        return replace(self, face=self.face.to(dtype, device))
+
+    def plain(self) -> Recess:
+        """The same in float64 on the CPU, without gradient."""
+        return replace(self, face=self.face.plain())

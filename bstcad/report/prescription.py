@@ -26,7 +26,7 @@ from bstcad.optics import quadrature
 from bstcad.optics.bspline import DEGREE
 from bstcad.optics.lens import Lens
 from bstcad.optics.media import density
-from bstcad.optics.surfaces import sag
+from bstcad.optics.surfaces import Surface, sag
 from bstcad.report.units import Rows, mm, tables
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
@@ -67,7 +67,8 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "index": lens.index,
         "outline": asdict(lens.outline),
         "clear": lens.clear and tuple(map(asdict, lens.clear)),  # apertures of front and back; None: no mount
-        "front": _face(front.kind, float(front.z), curvature, None if constant is None else float(constant)),
+        "front": _own(front)
+        | _face(front.kind, float(front.z), curvature, None if constant is None else float(constant)),
         "back": _face("bspline", vertex(lens)),
         "reflects": lens.reflects,  # is it a mirror, whose back is the face that light meets?
         "net": {
@@ -99,6 +100,11 @@ def _face(kind: str, z: float, curvature: float | None = None, constant: float |
     return {
         "kind": kind, "vertex": (0.0, 0.0, z), "curvature": curvature, "radius": radius, "conic_constant": constant,
     }  # fmt: skip
+
+
+def _own(front: Surface) -> dict[str, Any]:
+    """Of a front with an outline of its own: that, and z of the plane around it."""
+    return {} if front.outline is None else {"outline": asdict(front.outline), "around": front.around.z}
 
 
 def _known(table: Mapping[str, Any]) -> dict[str, Any]:
@@ -290,5 +296,5 @@ def _front_radius(lens: Lens) -> float | None:
         return found if found < FLATTEST else None
     if not front.curvature < 0:
         return None
-    (x, y), c, k = lens.outline.farthest, float(front.curvature), float(front.conic_constant)
+    (x, y), c, k = (front.outline or lens.outline).farthest, float(front.curvature), float(front.conic_constant)
     return max(1 - max(k, 0.0) * c * c * (x * x + y * y), 0.0) ** 1.5 / -c

@@ -23,6 +23,7 @@ from pydantic_core import to_jsonable_python
 from typing_extensions import TypedDict
 
 from bstcad.analysis.light import Blur, FinestDetail, finest_detail
+from bstcad.analysis.steepness import Steepness
 from bstcad.judges.comparison import Judge
 from bstcad.measured.form_error import MAP
 from bstcad.measured.made_part import MadePart
@@ -114,7 +115,8 @@ class Making:
     history: tuple[Point, ...] = ()
     machine: Mapping[str, Scalar] | None = None
     versions: Mapping[str, str] | None = None  # of the libraries
-    transport: Mapping[str, Scalar] | None = None  # grid, iterations, mass error, reason to stop
+    # grid, iterations, mass error, reason to stop, and of analysis.steepness the share and the steepest slope (degrees)
+    transport: Mapping[str, Scalar] | None = None
     skipped_steps: int | None = None  # left out because their gradient was not finite
     stopped: str | None = None  # the reason why tailoring ended
     twins: PrecisionTest | None = None
@@ -171,7 +173,8 @@ class Contents:
     contrast: Size | None = None  # mean irradiance of the lit pixels over that of the dark ones; None: or without leak
     optic: Literal["lens", "mirror"] = "lens"  # the kind of the design
     quality: str | None = None  # tailoring.quality
-    transport: Mapping[str, Scalar] | None = None  # grid, iterations, mass error, reason to stop
+    # grid, iterations, mass error, reason to stop, and of analysis.steepness the share and the steepest slope (degrees)
+    transport: Mapping[str, Scalar] | None = None
     skipped_steps: Annotated[int, Field(ge=0)] | None = None  # steps left out since their gradient was not finite
     stopped: str | None = None  # the reason why tailoring ended
     twins: PrecisionTest | None = None  # None: there was no time for it
@@ -344,6 +347,12 @@ def remarks(report: Contents, scene: Scene, target: np.ndarray, irradiance: np.n
         "remarks.txt.j2", "remarks", report=report, scene=scene, allowed=allowed, cut=CUT, names=LEFT_OUT,
         unlit=_unlit(target, irradiance, scene.target), lifted=_lifted(target, irradiance),
     )  # fmt: skip
+
+
+def too_steep(found: Steepness) -> list[str]:
+    """The light that would need a steeper back than a height over a plane carries; nothing if hardly any does."""
+    sent = {"steep_share": found.share, "steepest_deg": found.steepest}
+    return paragraphs("remarks.txt.j2", "steep", sent=sent)
 
 
 def bounds(found: Mapping[str, Any] | None) -> str:

@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +25,7 @@ import numpy as np
 if TYPE_CHECKING:
     from bstcad.cad.mesh import Mesh
     from bstcad.optics.lens import Lens
+    from bstcad.optics.outlines import Outline
     from bstcad.optics.surfaces import Surface
 
 PATIENCE = 120.0  # seconds a picture may take
@@ -356,28 +357,42 @@ def turnable(lens: Lens) -> str:
 
     def at_nodes(surface: Surface) -> np.ndarray:
         """x, y, z (mm), ∂z/∂x and ∂z/∂y of a face at its nodes: (5, cells + 1, cells + 1)."""
-        x, y = nodes(lens.outline, COARSE if math.isinf(surface.detail) else FINE)
-        return np.stack([x, y, *sampled(surface, x, y)])
+        x, y = nodes(surface.outline or lens.outline, COARSE if math.isinf(surface.detail) else FINE)
+        return np.stack([x, y, *sampled(surface.optical, x, y)])
+
+    def on_rim(outline: Outline, cells: int) -> np.ndarray:
+        """x and y (mm) of the nodes once around an outline: (2, 4 cells)."""
+        x, y = nodes(outline, cells)
+        at = rim(np.arange(x.size).reshape(x.shape))
+        return np.stack([x.ravel()[at], y.ravel()[at]])
+
+    def around(plane: Surface, inner: Outline) -> Iterator[np.ndarray]:
+        """The quarters of a plane between an outline and that of the lens, as `at_nodes` has faces."""
+        begin, end = (on_rim(outline, COARSE)[:, None] for outline in (inner, lens.outline))
+        places = begin + np.linspace(0, 1, COARSE + 1)[:, None] * (end - begin)
+        for k in range(4):
+            x, y = places[:, :, np.arange(k * COARSE, (k + 1) * COARSE + 1) % (4 * COARSE)]
+            yield np.stack([x, y, *sampled(plane, x, y)])
 
     lens = lens.plain()
     faces = [at_nodes(lens.back), at_nodes(lens.front)]
-    x, y = nodes(lens.outline, FINE)
-    at = rim(np.arange(x.size).reshape(x.shape))
-    x, y = x.ravel()[at], y.ravel()[at]
-    around = np.stack([x, y, sampled(lens.front, x, y)[0], sampled(lens.back, x, y)[0]])
-    places = np.concatenate([*(face[:3].reshape(3, -1) for face in faces), around[:3], around[[0, 1, 3]]], axis=1)
+    if lens.front.outline is not None:
+        faces += around(lens.front.around, lens.front.outline)
+    x, y = on_rim(lens.outline, FINE)
+    wall = np.stack([x, y, sampled(lens.front, x, y)[0], sampled(lens.back, x, y)[0]])
+    places = np.concatenate([*(face[:3].reshape(3, -1) for face in faces), wall[:3], wall[[0, 1, 3]]], axis=1)
     if not np.isfinite(places).all():
         return ""
     low, size = places.min(axis=1), np.maximum(np.ptp(places, axis=1), LEAST)
     told, values = [], []
-    for face, up in zip(faces, (1, -1), strict=True):
+    for number, face in enumerate(faces):
         steepest = max(float(np.abs(face[3:]).max()), LEAST)
-        told.append({"cells": face.shape[1] - 1, "up": up, "steepest": steepest})
+        told.append({"cells": face.shape[1] - 1, "up": -1 if number else 1, "steepest": steepest})
         values += [_steps(face[k], low[k], size[k]) for k in range(3)]
         values += [_steps(face[k], -steepest, 2 * steepest) for k in (3, 4)]
-    values += [_steps(around[k], low[min(k, 2)], size[min(k, 2)]) for k in range(4)]
+    values += [_steps(wall[k], low[min(k, 2)], size[min(k, 2)]) for k in range(4)]
     numbers = base64.b64encode(np.concatenate(values).tobytes()).decode()
-    shape = {"low": low.tolist(), "size": size.tolist(), "faces": told, "rim": around.shape[1]}
+    shape = {"low": low.tolist(), "size": size.tolist(), "faces": told, "rim": wall.shape[1]}
     lit = {"eye": EYE, "angle": VIEW_ANGLE, "clay": [int(CLAY[k : k + 2], 16) / 255 for k in (1, 3, 5)]}
     lit |= {"lamps": [direction for direction, _ in LIGHTS], "bright": [intensity for _, intensity in LIGHTS]}
     return json.dumps(shape | lit | FINISH | {"values": numbers})

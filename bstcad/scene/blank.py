@@ -18,7 +18,7 @@ from bstcad.optics.key import Key
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.sides import Sides, both, plain
-from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface
+from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Surface
 from bstcad.runs import files
 from bstcad.scene.errors import SceneError
 from bstcad.scene.schema import COORDINATES, LENGTHS, OneOrTwo, Record, from_file
@@ -29,6 +29,9 @@ if TYPE_CHECKING:  # which loads numba
 
 # (1 + k) c² r² of a conic at the rim: at most, where a sphere that stands upright has 1, and at least (nearly a cone).
 UPRIGHT, CONE = 0.85, -7.0
+STEEPEST = 80.0  # degrees, of a front with an outline of its own at its rim: what a height over a plane carries well
+FLATTEST = 1e-3  # mm; of such a front the least sag at its rim, by which its edge is one
+LEAST_BESIDE = 1e-2  # mm; between the outline of a front and that of the lens
 CONIC_CONSTANTS = (-1e3, 1e3)
 INDICES = (1.01, 5.0)  # of refraction
 BOUNDS = ("tool_radius", "max_slope", "max_thickness", "edge_thickness")  # the keys of LensBlank that bound the back
@@ -115,6 +118,10 @@ def _net_of_step(path: Path) -> np.ndarray:
 
 Z = Key("Where it crosses the axis, its vertex.", "mm", *COORDINATES, example=8.0)
 CURVATURE = Key("Curvature at the vertex; positive bends towards +z.", "1/mm", -1e3, 1e3)
+OUTLINE = Key(
+    "Outline of its own, inside the lens's: the lens's underside around it is a plane through its rim.",
+    example={"shape": "circle", "diameter": 10.0},
+)
 OPTIMISE = Key("Parameters that tailoring finds: true for all of them, or a list of names.")
 NetFile = from_file(GivenNet, read_net, lambda net: NET_FILE, "file = 'outputs/earlier'")
 
@@ -128,11 +135,17 @@ def _some(*names: str) -> Any:
 
 class _Front:
     optimise: bool | tuple[str, ...] = False
+    outline: Circle | None = None
     given: GivenNet | None = None  # the net of a freeform front
 
     @property
     def surface(self) -> Surface:
         """The surface in the terms of optics."""
+        return self.optical if self.outline is None else Recess(self.optical, self.outline)
+
+    @property
+    def optical(self) -> Surface:
+        """The surface without an outline of its own."""
         of, _ = FRONTS[self.kind]
         names = (name for name in ("curvature", "conic_constant") if hasattr(self, name))
         return of(self.z, **{name: getattr(self, name) for name in names})
@@ -149,7 +162,25 @@ class _Front:
 
     def complaints(self, outline: Outline) -> Iterator[str]:
         """Everything that keeps the front from a lens of this outline, each as "key: sentence"."""
-        return iter(())
+        own, half = self.outline, min(outline.half_extent)
+        if own is None:
+            return
+        if not own.radius <= half - LEAST_BESIDE:
+            size = f"{2 * own.radius:g} mm, and the lens is {2 * half:g} mm wide"
+            yield f"outline.diameter: {size}; make it smaller, or leave the outline out"
+        if self.free:
+            yield "optimise: a front with an outline of its own keeps its shape; leave out one of the two"
+        reached = self.optical.reaches(*(torch.tensor(p, dtype=torch.float64) for p in own.farthest))
+        _, slope, _ = self.optical.relative_sag_and_slope(
+            *(torch.tensor(p, dtype=torch.float64) for p in own.farthest)
+        )
+        steep = math.degrees(math.atan(abs(float(slope)))) if bool(reached) else 90.0
+        if not steep <= STEEPEST:
+            stands = "does not reach it" if steep == 90.0 else f"stands at {steep:.3g} degrees there"
+            why = f"the {self.kind} {stands}, and a height over a plane carries {STEEPEST:g}"
+            yield f"outline.diameter: at its rim, {own.radius:g} mm from the axis, {why}; make the outline smaller"
+        if not max(map(abs, self.surface.sags(own))) >= FLATTEST:
+            yield f"outline: a front so flat (curvature {self.curvature:g} 1/mm) has no edge of its own; leave it out"
 
 
 @dataclass(frozen=True)
@@ -168,6 +199,7 @@ class SphereFront(_Front):
 
     z: Annotated[float, Z]
     curvature: Annotated[float, CURVATURE] = 0.0
+    outline: Annotated[Circle | None, OUTLINE] = None
     optimise: Annotated[_some("curvature"), OPTIMISE] = False
     kind: Annotated[Literal["sphere"], Key("A sphere.")] = "sphere"
 
@@ -175,9 +207,13 @@ class SphereFront(_Front):
 
     def complaints(self, outline: Outline) -> Iterator[str]:
         """It ends inside the lens."""
+        yield from super().complaints(outline)
+        if self.outline is not None:
+            return
         if not bool(self.surface.reaches(*(torch.tensor(p, dtype=torch.float64) for p in outline.farthest))):
             rim, radius = math.hypot(*outline.farthest), 1 / abs(self.curvature)
-            yield f"curvature: a sphere of radius {radius:g} mm ends before the rim, at {rim:g} mm; make it smaller"
+            remedy = "make it smaller, or give lens.front an outline of its own"
+            yield f"curvature: a sphere of radius {radius:g} mm ends before the rim, at {rim:g} mm; {remedy}"
 
 
 @dataclass(frozen=True)
@@ -187,6 +223,7 @@ class ConicFront(_Front):
     z: Annotated[float, Z]
     curvature: Annotated[float, CURVATURE] = 0.0
     conic_constant: Annotated[float, Key("0 is a sphere, -1 a paraboloid.", "", *CONIC_CONSTANTS)] = 0.0
+    outline: Annotated[Circle | None, OUTLINE] = None
     optimise: Annotated[_some("curvature", "conic_constant"), OPTIMISE] = False
     kind: Annotated[Literal["conic"], Key("A conic turned about the axis.")] = "conic"
 
@@ -194,6 +231,8 @@ class ConicFront(_Front):
 
     def complaints(self, outline: Outline) -> Iterator[str]:
         """It ends in the lens or nearly, is nearly a cone, or its shape does not depend on its free parameter."""
+        yield from super().complaints(outline)
+        outline = self.outline or outline
         rim = sum(p * p for p in outline.farthest) ** 0.5
         bend = (1 + self.conic_constant) * (self.curvature * rim) ** 2
         conic = f"a conic of constant {self.conic_constant:g} and radius {1 / (self.curvature or 1):g} mm"
@@ -251,7 +290,8 @@ def as_front(value: Any, outline: Outline | None = None) -> Any:
         return GivenFront(value.z + value.moved(0.0).from_vertex().z, GivenNet.of(value))
     if value.kind in FRONTS:
         _, front = FRONTS[value.kind]
-        return front(value.z, **value.parameters())
+        own = {} if value.outline is None else {"outline": value.outline}
+        return front(value.z, **value.parameters(), **own)
     if outline is None:
         raise ValueError(f"a scene has no {value.kind}; give it by scene.changed, which fits a net to it")
     return as_front(fitted(value, outline))

@@ -194,6 +194,8 @@ class Mount(Record):
         if self.rim is None and not (self.draft or self.bevel):
             return None
         rim = self.rim_of(lens.outline).outline
+        if lens.front.outline is not None:
+            return lens.front.outline, rim
         if not (self.draft or self.bevel):
             return rim, rim
         lens = lens.plain()
@@ -250,6 +252,8 @@ def complaints(mount: Mount, lens: LensBlank) -> Iterator[str]:
     rim = mount.rim_of(lens.outline)
     if (lens.outline.depth(*rim.outline.places()) < -1e-9).any():
         yield "mount.rim: reaches beyond lens.outline; make it smaller, or the lens larger"
+    if (own := lens.front.outline) and not _inradius(rim) > own.radius:
+        yield f"mount.rim: cuts the front, whose own outline is {own.words}; make the rim larger"
     if mount.datum == "flange" and mount.flange is None:
         yield 'mount.datum: "flange", but there is no [mount.flange]; add one, or choose "front" or "source"'
     if mount.draft or mount.bevel:
@@ -278,8 +282,16 @@ def _walls(mount: Mount, lens: LensBlank, rim: Round | Box) -> Iterator[str]:
         yield f"mount.bevel: {mount.bevel:g} mm off a wall of {wall:.4g} mm leaves none; make it smaller"
     taken, half = mount.bevel + (top - front.min()) * tangent, min(rim.outline.half_extent)
     yield from _corner("mount.rim", rim, taken)
+    if (own := lens.front.outline) and not _inradius(rim) - taken > own.radius:
+        beside = f"the front, {own.words}, ends {_inradius(rim) - own.radius:.3g} mm from the rim"
+        yield f"{key}: draft and bevel take {taken:.3g} mm there, and {beside}; make them smaller"
     if not taken < half:
         yield f"{key}: draft and bevel take {taken:.3g} mm off {half:g} mm from rim to axis; make them smaller"
+
+
+def _inradius(shape: Round | Box) -> float:
+    """The radius of the largest circle about the axis inside it (mm)."""
+    return float(shape.outline.depth(np.zeros(1), np.zeros(1))[0])
 
 
 def _fall(front: Surface, rim: Outline) -> float:
@@ -311,7 +323,7 @@ def _flange(flange: Flange, lens: LensBlank, rim: Round | Box) -> Iterator[str]:
     if upper <= high or flange.z >= lens.back.z:
         lies = f"from z = {flange.z:g} to {upper:g} mm and the lens from {high:.6g} to {lens.back.z:g} mm"
         yield f"{key}.z: the flange lies {lies} before it is tailored; let them meet"
-    if low <= flange.z <= high and not lens.front.surface.level and not lens.front.free:
+    if low <= flange.z <= high and not lens.front.surface.around.level and not lens.front.free:
         cuts = f"z = {flange.z:g} mm, cuts the rim of the front, which runs from z = {low:.6g} to {high:.6g} mm"
         yield f"{key}.z: the flange's lower face, {cuts}; put it below or above that"
     holes = flange.all_holes()

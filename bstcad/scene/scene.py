@@ -52,7 +52,7 @@ LARGEST_FILE = 1_000_000  # bytes of a scene file
 DOTS = 100  # in a line of one: tomllib takes the square of a dotted key's length to read it
 DEEPEST = 20  # tables and lists in one another; a scene has four
 NESTED = "is nested too deeply; give a scene file like those in templates"
-OUTLINES = ("source.aperture", "lens.outline", "target.outline")
+OUTLINES = ("source.aperture", "lens.outline", "target.outline", "lens.front.outline")
 ONE_OF = {  # alternatives among the keys of a table: a later one replaces the others
     "target": PICTURES, "lens": ("material", "index"), **dict.fromkeys(OUTLINES, ("radius", "diameter")),
 }  # fmt: skip
@@ -69,7 +69,9 @@ PROFILES = {  # the width that a profile of the irradiance needs, by the kind of
     ("collimated", "gaussian"): "radius_1e2",
     ("point", "gaussian"): "half_angle_1e2",
     ("point", "uniform"): "half_angle",
+    ("point", "lambertian"): "half_angle",
 }
+UNBOUNDED = ("point", "lambertian")  # the profile that does without: it lights the half space
 
 
 class Accept(Record):
@@ -292,8 +294,9 @@ class Scene(Record):
 
 def _of_source(source: Source, lens: LensBlank) -> Iterator[str]:
     """Complaints about the profile, the spectrum and the size of a source before this lens."""
-    width = PROFILES.get((source.kind, source.profile))
-    if width and getattr(source, width) is None:
+    profile = source.kind, source.profile
+    width = PROFILES.get(profile)
+    if width and profile != UNBOUNDED and getattr(source, width) is None:
         unit = "mm" if width == "radius_1e2" else "degrees"
         yield f"source.{width}: missing, and a {source.profile} profile needs it; add it in {unit}"
     for other in PROFILES.values():
@@ -359,6 +362,8 @@ def _order(source: Source, lens: LensBlank, target: Target) -> Iterator[str]:
         yield f"{key}: missing, and a mirror's light comes from above; add the plane it starts from, above z = {back:g}"
     elif not start > back:
         yield f"{key}: the light starts at z = {start:g}, not above the mirror at z = {back:g}; move one of them"
+    if lens.back.reflect and lens.front.outline is not None:
+        yield "lens.front.outline: the front of a mirror is the rear of its plate, which no light meets; remove it"
     if lens.back.reflect and lens.front.free:
         yield "lens.front.optimise: the front of a mirror is the rear of its plate, which no light meets; remove it"
     if not target.z > back:
@@ -549,10 +554,13 @@ def _validated(data: dict[str, Any], folder: Path, pictures: Mapping[str, Pictur
 
 def _circle(data: dict[str, Any], place: str) -> None:
     """A circle may be written by its diameter; the record has one noun, the radius."""
-    table, key = place.split(".")
-    outline = data[table].get(key) if isinstance(data.get(table), dict) else None
+    outline: Any = data
+    for key in place.split("."):
+        outline = outline.get(key) if isinstance(outline, dict) else None
     if not isinstance(outline, dict):
         return
+    if place == "lens.front.outline" and outline.setdefault("shape", "circle") != "circle":
+        raise SceneError(f'{place}.shape: must be "circle", on which a front of revolution ends level; write that')
     if outline.get("shape") not in ("circle", "rectangle"):
         raise SceneError(f'{place}.shape: must be "circle" or "rectangle"; write one of them')
     if outline["shape"] == "circle" and "diameter" in outline:

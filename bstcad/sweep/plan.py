@@ -22,10 +22,11 @@ import numpy as np
 
 from bstcad.analysis.cost import ControlCells, control_cells, limits
 from bstcad.analysis.light import blur
+from bstcad.analysis.steepness import Steepness
 from bstcad.optics.lens import Lens
 from bstcad.optics.sides import both, coarser, scaled
-from bstcad.pipeline import check_thickness, reached
-from bstcad.report.record import simulated
+from bstcad.pipeline import check_thickness, reached, steepness, transport_of
+from bstcad.report.record import simulated, too_steep
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.quality import COARSEST_GRID, PRESETS, Tailoring
 from bstcad.scene.scene import Scene
@@ -198,6 +199,7 @@ class Pilot:
     detail: float  # of the scene's picture, finer than the pilot's pixels
     doubtful: bool  # did stage 1 try the other way as well?
     lens: Lens
+    steep: Steepness  # that its target's light needs of the back
 
 
 def pilots(scene: Scene, lens: Lens) -> dict[str, Pilot]:
@@ -219,13 +221,15 @@ def _pilot(scene: Scene, lens: Lens, quality: str) -> Pilot:
     )  # fmt: skip
     flat = small.flat_lens(knobs.levels[0], as_wide_as=knobs.levels[-1])
     first = list(stage1.steps(task, replace(flat, front=lens.front)))
+    sent = transport_of(first[-1], first[-1].lens, task.screen)
     *_, state = (step.state for step in first if step.state is not None)
     judged = [step.judged for step in first if step.judged is not None]
     reached(first[-1].lens, judged[-1])
     check_thickness(first[-1].lens, scene)
     *_, last = (step for step in stage2.steps(task, first[-1].lens) if step.judged is not None)
     unseen = detail(scene.target.irradiance(), max(target.columns_rows))
-    return Pilot(last.judged, factor, unseen, stage1.doubtful(judged[0], state), lens=last.lens)
+    steep = steepness(task.heaviest.source, last.lens, target.screen, task.target, sent=sent)
+    return Pilot(last.judged, factor, unseen, stage1.doubtful(judged[0], state), lens=last.lens, steep=steep)
 
 
 def _small(scene: Scene, quality: str) -> tuple[Scene, float, Tailoring]:
@@ -320,7 +324,7 @@ def outlook(scene: Scene, lens: Lens, units: Callable[[], Units]) -> dict[str, A
         return {q: forecast(scene, q, rrmsds[q], unit, other_way=small[q].doubtful) for q in QUALITIES}
 
     predicted = each(scene, likely)
-    found |= {"predicted": predicted, "notes": list(_ends_early(scene, predicted))}
+    found |= {"predicted": predicted, "notes": [*too_steep(small["standard"].steep), *_ends_early(scene, predicted)]}
     net = scaled(scene.lens.back.net, 2)
     if max(both(net)) <= FIT_NETS[1]:
         finer = scene.changed({"lens.back.control_points": net, "tailoring.levels": None})

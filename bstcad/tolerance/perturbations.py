@@ -97,6 +97,8 @@ def _position(source: Source, entrance: float) -> Vector:
 def _scaled(surface: Surface, factor: float, about: float) -> Surface:
     """A face larger by a factor about the point of the axis at z = `about` (mm)."""
     moved = surface.moved(about + factor * (surface.z - about))
+    if surface.outline is not None:
+        moved = replace(moved, outline=surface.outline.scaled(factor))
     if surface.is_net:
         x, y = (tuple(factor * end for end in side) for side in (surface.x, surface.y))
         return replace(moved, heights=factor * surface.heights, x=x, y=y)
@@ -231,7 +233,8 @@ def _thicker(setup: Setup, by: float) -> Setup:
 
 def _front_power(setup: Setup, by: float) -> Setup:
     """A front whose rim stands higher by so much (mm): c + 2 by / R², R the farthest from the axis."""
-    front, rim2 = setup.lens.front, sum(p * p for p in setup.lens.outline.farthest)
+    front = setup.lens.front
+    rim2 = sum(p * p for p in (front.outline or setup.lens.outline).farthest)
     if front.is_net:
         x, y = (np.linspace(*side, m) for side, m in zip((front.x, front.y), front.shape, strict=True))
         bent = _higher(front, by * (x[:, None] ** 2 + y[None, :] ** 2) / rim2)
@@ -307,8 +310,8 @@ SMOOTH = 4.0  # control cells in a correlation length or a period, at least
 
 def form_error(lens: Lens, correlation_length: float, seed: int, face: str = "back") -> Kind:
     """A random field on the back or the front; amounts are its RMS (mm)."""
-    net = as_net(getattr(lens, face), lens.outline)
-    field = random_field(net, correlation_length, seed + FRONT * (face == "front"), inside(lens.outline, net))
+    net, outline = _net(lens, face)
+    field = random_field(net, correlation_length, seed + FRONT * (face == "front"), inside(outline, net))
     words = f"form of the {face}, correlated over {correlation_length:.3g} mm (draw {seed})"
     return Kind(f"{face}.form_{seed}", words, "mm RMS", partial(_raised, face, field))
 
@@ -373,8 +376,16 @@ def as_net(face: Surface, outline: Outline) -> BSplineSurface:
 
 
 def _raised(face: str, field: np.ndarray, setup: Setup, by: float) -> Setup:
-    net = as_net(getattr(setup.lens, face), setup.lens.outline)
-    return replace(setup, lens=replace(setup.lens, **{face: _higher(net, by * field)}))
+    net, _ = _net(setup.lens, face)
+    own = {"clear": setup.lens.apertures} if getattr(setup.lens, face).outline is not None else {}
+    return replace(setup, lens=replace(setup.lens, **{face: _higher(net, by * field)}, **own))
+
+
+def _net(lens: Lens, face: str) -> tuple[BSplineSurface, Outline]:
+    """The optical part of a face as a net, and its outline."""
+    surface = getattr(lens, face)
+    outline = surface.outline or lens.outline
+    return as_net(surface.optical, outline), outline
 
 
 def _higher(net: BSplineSurface, heights: np.ndarray) -> BSplineSurface:

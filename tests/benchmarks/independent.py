@@ -299,7 +299,8 @@ def light_of(source, sense, vertex):
             width = math.tan(math.radians(source["half_angle_1e2"]))
             peak = 2 / (math.pi * width**2)
         elif profile == 2:
-            peak = 1 / math.pi
+            edge = math.radians(source.get("half_angle") or 90.0)
+            width, peak = math.cos(edge) if edge < math.pi / 2 else 0.0, 1 / (math.pi * math.sin(edge) ** 2)
         else:
             width = math.cos(math.radians(source["half_angle"]))
             peak = 1 / (2 * math.pi * (1 - width))
@@ -445,12 +446,10 @@ def emitted(light, p, u, v):
     if cos <= 0 or light.sense * dz <= 0:
         return dx, dy, dz, 0.0
     intensity = light.peak
-    if light.profile == 2:
-        intensity *= cos
-    elif light.profile == 1:  # on planes across the axis E = I cos³ θ / D²
+    if light.profile == 1:  # on planes across the axis E = I cos³ θ / D²
         intensity *= math.exp(-2 * (1 / (cos * cos) - 1) / light.width**2) / cos**3
-    elif cos < light.width:
-        intensity = 0.0
+    else:
+        intensity *= 0.0 if cos < light.width else (cos if light.profile == 2 else 1.0)
     return dx, dy, dz, intensity / (d * d)
 
 

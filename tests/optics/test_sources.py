@@ -47,6 +47,10 @@ def test_all_light_of_a_point_source_crosses_a_large_plane(place):
     assert flux(gaussian, Rectangle(8 * d, 8 * d)) == pytest.approx(1, rel=1e-6)
     cone = Point(position=place, profile="uniform", half_angle=35.0)
     assert flux(cone, Rectangle(4 * d, 4 * d)) == pytest.approx(1, rel=1e-3)  # the rim's cells
+    cone = Point(position=place, half_angle=60.0)  # on a disc of radius 1.73 d
+    assert flux(cone, Rectangle(5 * d, 5 * d)) == pytest.approx(1, rel=1e-3)  # the rim's cells
+    [disc, (x, y)] = cone.spot(Z)
+    assert (disc.radius, x, y) == pytest.approx((d * math.tan(math.radians(60)), *place[:2]))
     half = 40 * d  # a share d² / (R² + d²) passes beside a disc of radius R; the square's inner circle has R = half
     assert 1 - 1 / 40**2 - 1e-3 < flux(Point(position=place), Rectangle(2 * half, 2 * half)) < 1
 
@@ -63,9 +67,10 @@ def uniform_intensity(cos):
     ("law", "intensity"),
     [
         ({"profile": "lambertian"}, lambda cos: cos / math.pi),
+        ({"profile": "lambertian", "half_angle": 35.0}, lambda cos: cos * (cos >= EDGE) / (math.pi * (1 - EDGE**2))),
         ({"profile": "uniform", "half_angle": 35.0}, uniform_intensity),
     ],
-    ids=("lambertian", "uniform"),
+    ids=("lambertian", "lambertian cone", "uniform"),
 )
 def test_irradiance_is_intensity_times_cosine_over_distance_squared(law, intensity, z):
     source = Point(position=(1.0, 2.0, 3.0), **law)
@@ -133,6 +138,7 @@ def none_enters_from_outside_the_window(source, lens):
 
 PROFILES = [
     {"profile": "lambertian"},
+    {"profile": "lambertian", "half_angle": 35.0},
     {"profile": "uniform", "half_angle": 35.0},
     {"profile": "gaussian", "half_angle_1e2": 30.0},
 ]
@@ -141,7 +147,7 @@ TILTS = [(20.0, 0.0), (-15.0, 30.0), (0.0, 60.0), (80.0, 10.0)]
 
 @pytest.mark.parametrize("z", [Z, -9.0])
 @pytest.mark.parametrize("tilt", TILTS, ids=str)
-@pytest.mark.parametrize("law", PROFILES, ids=lambda law: law["profile"])
+@pytest.mark.parametrize("law", PROFILES, ids=str)
 def test_a_tilted_source_is_the_same_source_seen_from_its_own_frame(law, tilt, z):
     """E / D of both: E = I D / d³, and I knows no frame.  To a plane below, all is turned about the axis."""
     source, straight = Point((3.0, -2.0, 5.0), tilt=tilt, **law), Point(**law)
@@ -203,7 +209,7 @@ def test_no_tilted_ray_from_outside_the_window_enters_the_lens(tilt, front, outl
     ids=str,
 )
 def test_window_of_a_tilted_cone_holds_it_and_no_more(place, tilt):
-    cone = Point(place, profile="uniform", half_angle=15.0, tilt=tilt)
+    cone = Point(place, half_angle=15.0, tilt=tilt)
     area = cone.window(Rectangle(250.0, 250.0), Z, (0.0,))
     x, y = sampling.grid(Rectangle(250.0, 250.0), 1000)
     lit = cone.irradiance(x, y, Z) > 0

@@ -194,6 +194,9 @@ REMARKS = [
      "much, that light is lost.", "near-total-reflection"),
     ("The darkest parts are lifted: pixels that ask for less than 1 % of the mean irradiance get 20.0 % of it, and in "
      "all 10.0 % of the light on the target more than they ask for.", "lifted"),
+    ("12.5 % of the light of the target would need a back steeper than 70°, up to 97°, which overhangs: a height over "
+     "a plane carries no more, and that light is sent elsewhere.", "too-steep"),
+    ("5.0 % of the light that the source sends out meets the underside beside the front.", "underside"),
     ("The back is as steep as 75°: hardly a tool reaches that.", "steep"),
     ("The facets of lens.stl and lens.3mf lie within 1.75 µm of the lens, not within 1 µm: that would take more "
      "triangles than a file should have; lens.step is exact.", "facets"),
@@ -226,7 +229,7 @@ def test_the_remarks_of_a_report_have_sections():
 
 
 @pytest.mark.parametrize(
-    ("template", "macros"), [("remarks.txt.j2", ["bounds", "remarks"]), ("verdict.txt.j2", ["doubts"])]
+    ("template", "macros"), [("remarks.txt.j2", ["bounds", "remarks", "steep"]), ("verdict.txt.j2", ["doubts"])]
 )
 def test_no_words_of_the_templates_are_in_no_example(template, macros):
     """So a new remark needs an example above, and with it a section."""

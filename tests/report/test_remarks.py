@@ -47,6 +47,8 @@ SENTENCES = [  # changes of the facts, of the scene; what the sentences hold, ea
     ({"flux.lost through the sides": 0.16}, {}, ["20.0 % of the light that enters the lens leaves through the sides"]),
     ({"flux.lost through the sides": 0.0004, "efficiency": 0.9995, "flux.missed the lens": 0.25}, {}, []),
     ({"flux.missed the lens": 0.47}, {}, ["47.0 % of the light that the source sends out misses the lens."]),
+    ({"flux.vignetted by the underside": 0.05}, {}, ["5.0 % of the light that the source sends out meets the under"]),
+    ({"flux.vignetted by the underside": 0.0005}, {}, []),
     ({"efficiency": 0.97}, {}, ["3.0 % of the light that leaves the lens falls outside the target."]),
     ({"stability.tir_margin_deg": 1.25}, {}, ["only 1.25° short of total internal reflection"]),
     ({"stability.tir_margin_deg": -0.5}, {}, ["0.5° beyond the critical angle, and is reflected."]),
@@ -59,6 +61,11 @@ SENTENCES = [  # changes of the facts, of the scene; what the sentences hold, ea
     ({"shape.centre_thickness": 5.04}, {}, []),
     ({"shape.thickness_min": 0.25}, {}, ["The lens is 0.25 mm thin where 0.5 mm was asked."]),
     ({"shape.slope_max_deg": 75.0}, {}, ["as steep as 75°"]),
+    ({"transport": {"steep_share": 0.125, "steepest_deg": 97.4}}, {}, [
+        "12.5 % of the light of the target would need a back steeper than 70°, up to 97°, which overhangs: a height "
+        "over a plane carries no more, and that light is sent elsewhere."]),
+    ({"transport": {"steep_share": 0.02, "steepest_deg": 74.0}}, {}, ["steeper than 70°, up to 74°: a height over"]),
+    ({"transport": {"steep_share": 0.0005, "steepest_deg": 74.0}}, {}, []),
     ({"stopped": "time"}, {}, ["ended when its time was up"]),
     ({"stopped": "interrupt"}, {}, ["stopped by hand"]),
     ({"skipped_steps": 3}, {}, ["Steps left out because their gradient was not finite: 3."]),

@@ -16,7 +16,9 @@ from PIL import Image
 
 from bstcad import Circle, Lens, Plane, Rectangle, Sphere
 from bstcad.cad.mesh import Mesh
+from bstcad.optics import quadrature
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.surfaces import Recess
 from bstcad.report import rendering
 
 CUBE = trimesh.creation.box((24.0, 24.0, 10.0))
@@ -81,6 +83,22 @@ def test_nodes_and_slopes_are_those_of_the_surfaces(front, outline):
     assert (rim[3] > rim[2] + 5).all()
     steps = np.hypot(*(np.roll(rim[:2], -1, axis=1) - rim[:2]))
     assert steps.max() < 3 * steps.mean()  # once around, without a jump
+
+
+@pytest.mark.parametrize("outline", OUTLINES, ids=lambda outline: outline.shape)
+def test_a_dome_in_the_underside_is_drawn_with_the_plane_around_it(outline):
+    """The volume below the faces, as solid_view.js divides them, is the lens's; between them there is no gap."""
+    made = lens(Recess(Sphere(15.0, -0.3), Circle(2.5)), outline)
+    faces, _ = read(rendering.turnable(made))
+    assert len(faces) == 6
+    volume = area = 0.0
+    for face, up in zip(faces, (1, -1, -1, -1, -1, -1), strict=True):
+        a, b, c, d = (face[:3, i : i - 1 or None, j : j - 1 or None] for i, j in ((0, 0), (1, 0), (1, 1), (0, 1)))
+        flat = ((c - a)[0] * (d - b)[1] - (c - a)[1] * (d - b)[0]) / 2  # of a cell, seen along z; counterclockwise
+        assert flat.min() > 0
+        volume += up * float((flat * (a + b + c + d)[2] / 4).sum())
+        area += up * float(flat.sum())
+    assert volume == pytest.approx(quadrature.of_lens(made).volume, rel=2e-3) and abs(area) < 2e-3 * outline.area
 
 
 def test_what_is_not_finite_is_not_drawn():

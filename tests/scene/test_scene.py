@@ -14,7 +14,7 @@ from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import TiltedPlane
 from bstcad.optics.sources import Collimated, Point
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.surfaces import Plane, Recess, Sphere
 from bstcad.optics.trace import ghost_light
 from bstcad.report.record import simulated
 from bstcad.scene.blank import Back, LensBlank, PlaneFront, SphereFront
@@ -485,3 +485,13 @@ def test_what_is_held_against_an_outline_is_the_wire_that_is_built(outline):
     x, y = outline.places()
     assert np.abs(outline.depth(x, y)).max() < 1e-12 and (outline.depth(x / 2, y / 2) > 0).all()
     assert (outline.depth(1.1 * x, 1.1 * y) < 0).all()
+
+
+def test_a_front_with_an_outline_is_the_same_from_a_file_and_from_python(tmp_path):
+    front = {"kind": "sphere", "z": 8.0, "curvature": -0.1, "outline": {"diameter": 14.0}}
+    scene = load(DISK, {"lens.front": front, "source.half_angle": "35"})
+    assert through_its_file(scene, tmp_path) == scene
+    surface = scene.lens.front.surface
+    assert surface == Recess(Sphere(8.0, -0.1), Circle(7.0)) and surface.around.z == pytest.approx(8 - 10 + 51**0.5)
+    assert scene.changed({"lens.front": surface}) == scene
+    assert scene.flat_lens(9).apertures == (Circle(7.0), scene.lens.outline)

@@ -13,7 +13,7 @@ import pytest
 from bstcad import cli
 from bstcad.optics.key import Key
 from bstcad.scene import schema
-from bstcad.scene.scene import Scene
+from bstcad.scene.scene import OUTLINES, Scene
 
 TEMPLATES = sorted((Path(__file__).parent.parent.parent / "templates").glob("*.toml"))
 THU = Path(__file__).parent.parent.parent / "templates" / "thu.toml"
@@ -59,7 +59,7 @@ def test_the_keys_are_those_of_the_models(capsys):
     assert cli.run(["keys"]) == 0
     rows = [line.split("\t") for line in capsys.readouterr().out.splitlines()]
     assert all(len(row) == 5 and row[1] and row[2] and row[4].endswith(".") for row in rows)
-    diameters = {f"{table}.diameter" for table in ("source.aperture", "lens.outline", "target.outline")}  # of a circle
+    diameters = {f"{table}.diameter" for table in OUTLINES}  # of a circle
     assert {row[0] for row in rows} == {dotted for dotted, *_ in FIELDS} | diameters
     assert len(FIELDS) > 150
 

@@ -20,7 +20,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Status, TargetPlane, TiltedPlane, middle
-from bstcad.optics.sources import Collimated, Point, Source
+from bstcad.optics.sources import HALF_SPACE, Collimated, Point, Source
 
 NODES = 4097  # of a table of a face's transmission
 ALONG_Z = (0, 0.0, 0.0, 1.0, 0.0)  # the last fields of a Beam that is not tilted
@@ -152,16 +152,16 @@ def beam(source: Source, z: float) -> Beam:
     if source.tilted:
         law = _tilted_law(source, distance)
         return Beam(x, y, *round_, math.inf, *law[:3], distance, distance, 1, *_floats(source.towards(z)), law[3])
-    reach2, law = math.inf, None
+    reach2, edge = math.inf, source.edge
     if source.profile == "gaussian":
         w2 = (distance * math.tan(math.radians(source.half_angle_1e2))) ** 2
         law = 2 / (math.pi * w2), 2 / w2, 0
     elif source.profile == "lambertian":
-        law = distance**2 / math.pi, 0.0, 4
+        law = distance**2 / (math.pi * math.sin(edge) ** 2), 0.0, 4
     else:
-        edge = math.radians(source.half_angle)
-        reach2 = (distance * math.tan(edge)) ** 2 if source.half_angle < 90 else math.inf
         law = distance / (2 * math.pi * (1 - math.cos(edge))), 0.0, 3
+    if edge < HALF_SPACE:
+        reach2 = (distance * math.tan(edge)) ** 2
     return Beam(x, y, *round_, reach2, *law, distance, distance, *ALONG_Z)
 
 
@@ -182,10 +182,10 @@ def _tilted_law(source: Point, distance: float) -> tuple[float, float, int, floa
     if source.profile == "gaussian":
         t2 = math.tan(math.radians(source.half_angle_1e2)) ** 2
         return 2 * distance / (math.pi * t2), 2 / t2, 0, 0.0
+    least = math.cos(source.edge) if source.edge < HALF_SPACE else 0.0
     if source.profile == "lambertian":
-        return distance / math.pi, 0.0, 4, 0.0
-    cos = math.cos(math.radians(source.half_angle))
-    return distance / (2 * math.pi * (1 - cos)), 0.0, 3, cos
+        return distance / (math.pi * math.sin(source.edge) ** 2), 0.0, 4, least
+    return distance / (2 * math.pi * (1 - math.cos(source.edge))), 0.0, 3, least
 
 
 def rules() -> Rules:

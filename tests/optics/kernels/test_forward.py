@@ -74,6 +74,12 @@ SCENES = {  # source, lens, the fates of rays through a window larger than the l
         {0, 1, 2, 3},
     ),
     "point, lambertian, tilted": (Point(tilt=(60.0, 20.0)), Lens(Plane(15.0), deep(), SQUARE, 1.6), {0, 1, 2, 3}),
+    "point, lambertian cone": (Point(half_angle=33.0), Lens(Plane(15.0), deep(), SQUARE, 1.6), {0, 2, 3}),
+    "point, lambertian cone, tilted": (
+        Point(half_angle=33.0, tilt=(0.0, -20.0)),
+        Lens(Sphere(15.0, 0.02), deep(), SQUARE, 1.6),
+        {0, 1, 2, 3},
+    ),
     "point, gaussian, tilted": (
         replace(ASIDE, tilt=(-25.0, 15.0)),
         Lens(Plane(15.0), deep(), SQUARE, 1.6),
