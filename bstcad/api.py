@@ -130,7 +130,9 @@ class Design:
         SceneError names the property of a lens that does not fit.
         """
         scene, lens = _fitting(lens, self._made.scene, self.lens.front)
-        made = Made(scene, scene.as_mounted(lens), self.target, Making(stopped=BY_HAND), device=self._made.device)
+        made = replace(
+            self._made, scene=scene, lens=scene.as_mounted(lens), making=Making(stopped=BY_HAND), transport=None
+        )
         return Design(made)
 
     def with_heights(self, heights: Any) -> Design:

@@ -257,6 +257,7 @@ Trial = option(int | None, "N", "Write the lens of this trial as trial-N.step, a
 Kinds = option(str | None, "NAMES", f"{EXPORTS}, or several with commas between.", "--as")
 Points = option(int | None, "N", "Points along the wider side of grids (default: as many as control points).")
 Png = place("FILE", "A picture to write.", "--png", "-o")
+ReachPng = place("FILE", "Draw the target and the part of it that light can reach.", "--png")
 # Of tradeoff, batch and keys.
 Budget = option(
     float, "S",
@@ -304,20 +305,23 @@ def generate(
     raise Stopped(" with the best so far; the same command with --resume goes on from there")
 
 
-@app.command(epilog=examples("plan templates/thu.toml", "plan my-lens.toml --json"))
-def plan(scene: SceneFile, settings: Settings = None, as_json: AsJson = False) -> int:
-    """List the effects that are simulated and left out, with their changes; then predict time, error and memory."""
+@app.command(epilog=examples("plan templates/thu.toml", "plan my-lens.toml --png reach.png"))
+def plan(scene: SceneFile, settings: Settings = None, as_json: AsJson = False, png: ReachPng = None) -> int:
+    """Say what light cannot reach, and which effects are left out; then predict time, error and memory."""
     with loading():
         wanted = load_scene(scene, settings)
         from bstcad import folder as folders
         from bstcad.report import report as reports
         from bstcad.sweep.plan import plan as planned
+        from bstcad.sweep.plan import reach_drawn
 
     warn(wanted)
     wanted, choice = with_net_said(wanted)
     given = wanted, scene.read_text(encoding="utf-8-sig"), [setting.partition("=")[0] for setting in settings or []]
     parts = planned(*given)
     effects = next(parts)
+    if png is not None:
+        files.put(png, reach_drawn(wanted))
     if as_json:
         net = {"control_points": asdict(choice)} if choice else {}
         sizes = {"files": {"lens.step": round(folders.step_size(wanted))}}

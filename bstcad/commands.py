@@ -194,7 +194,7 @@ def _written_and_proved(
         if limit is not None:
             effort, left = effort or FULL, limit - BEHIND - made.making.seconds_total - (written - began)
             effort = replace(effort, seconds=min(effort.seconds, max(left, LEAST)))
-        nominal = folders.nominal(made.scene, made.lens, made.target)
+        nominal = folders.nominal(made.scene, made.lens, made.target, made.reachable)
         proof = _proof(made, nominal, place, drawn, additions=additions, effort=effort, progress=progress)
         for work in meanwhile:
             work.result()
@@ -333,7 +333,8 @@ def read(folder: Path) -> Made:
 def _read(folder: Path) -> tuple[Made, Nominal]:
     scene, nominal = folders.read_nominal(folder)
     making, sent = record.making(folder / "report.json"), folders.read_transport(folder, scene)
-    return Made(scene, nominal.lens, nominal.target, making, transport=sent), nominal
+    part = nominal.reachable
+    return Made(scene, nominal.lens, nominal.target, making, transport=sent, reachable=part), nominal
 
 
 def _made_part(cloud: Cloud, proof: Proof, nominal: Nominal, *, effort: Effort | None, progress: Progress) -> MadePart:
@@ -370,7 +371,7 @@ def _contents(made: Made, proof: Proof, estimates: tuple[LeftOut, ...]) -> Conte
     )  # fmt: skip
     return contents_of(
         scene, made.lens, made.target, proof, making=made.making, circumstances=circumstances(made.device),
-        estimates=estimates, diagnosis=diagnosed,
+        estimates=estimates, diagnosis=diagnosed, reachable=made.reachable,
     )  # fmt: skip
 
 

@@ -30,6 +30,7 @@ from bstcad.optics import quadrature
 from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL
+from bstcad.optics.reach import restricted
 from bstcad.optics.sides import Sides, both, scaled
 from bstcad.optics.surfaces import Surface
 from bstcad.report.prescription import scene_text
@@ -54,7 +55,7 @@ class Made:
 
     scene: scenes.Scene
     lens: Lens  # float64, on the CPU
-    target: np.ndarray  # as scene.target.irradiance()
+    target: np.ndarray  # as scene.target.irradiance(), of the pixels that light can reach
     making: Making = Making()  # stages, history and machine, for the report
     device: str = "cpu"  # of the design
     transport: TransportMap | None = None  # the map of stage 1; None for a lens of the user's own, or if not known
@@ -64,6 +65,7 @@ class Made:
     def told(self) -> Made:
         """The same with all that a report tells."""
         return self if self.compared is None else replace(self, making=self.compared(), compared=None)
+    reachable: np.ndarray | None = None  # (rows, columns) the pixels that light can reach; None: all that are to be lit
 
     def is_lens_of(self, other: Made) -> bool:
         """Is it the same lens, to the last bit, for the same light and picture?"""
@@ -277,7 +279,8 @@ def _write_scene(design: Made, folder: Path) -> None:
 def write_design(design: Made, irradiance: np.ndarray | None, folder: Path) -> None:
     """design.npz: the optimised surfaces, the target, the irradiance if it is traced, and the scene's text.
 
-    The transport map, if known (TransportMap): transport_x (c,) and transport_y (r,), mm on the target;
+    reachable (rows, columns): 1 in the pixels that light can reach; no such array where it reaches all that are to be
+    lit.  The transport map, if known (TransportMap): transport_x (c,) and transport_y (r,), mm on the target;
     transport_back or transport_entrance (c, r, 2), x and y (mm) where the light for them passes the back, or the
     plane of the first vertex.
     """
@@ -291,6 +294,7 @@ def write_design(design: Made, irradiance: np.ndarray | None, folder: Path) -> N
         **({"front_curvature": 0.0} | _numbers(front)),
         **({"front_control_points": front.control_points()} if front.is_net else {}),
         target=design.target,
+        **({} if design.reachable is None else {"reachable": design.reachable.astype(np.uint8)}),
         **({} if irradiance is None else {"irradiance": irradiance}),
         scene=scene_text(design.scene, design.lens),
         **({f"transport_{sent.plane}": sent.source, "transport_x": sent.x, "transport_y": sent.y} if sent else {}),
@@ -360,10 +364,13 @@ def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
     scene = scenes.load(folder / SCENE)
     columns, rows = scene.target.columns_rows
     shapes = {"control_points": (*both(scene.lens.back.net), 3), "target": (rows, columns), "front_curvature": ()}
+    if "reachable" in files.names(folder / DESIGN):
+        shapes["reachable"] = rows, columns
     found = _arrays(folder, shapes | dict.fromkeys(_numbers(scene.lens.front.surface), ()), scene)
-    if not found["target"].sum() > 0:
+    part = found["reachable"] > 0 if "reachable" in found else None
+    if not found["target"].sum() > 0 or not restricted(scene.target.irradiance(), part).sum() > 0:
         raise SceneError(f"{folder / DESIGN}: the target is all black; {AGAIN}")
-    return scene, nominal(scene, _lens(scene, found), found["target"])
+    return scene, nominal(scene, _lens(scene, found), found["target"], part)
 
 
 def read_irradiance(folder: Path, scene: scenes.Scene) -> np.ndarray:
@@ -419,11 +426,19 @@ def _lens(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
     return scene.as_mounted(Lens(front, back, scene.lens.outline, scene.index, reflects=scene.lens.back.reflect))
 
 
-def nominal(scene: scenes.Scene, lens: Lens, stored_target: np.ndarray) -> Nominal:
-    """The design that the files are held to; its target is the scene's own, not that of design.npz."""
+def nominal(
+    scene: scenes.Scene, lens: Lens, stored_target: np.ndarray, part: np.ndarray | None = None
+) -> Nominal:
+    """The design that the files are held to; its target is the scene's own, not that of design.npz.
+
+    part: of the target, that light can reach, as design.npz has it; None: all of it.
+    """
+    picture = scene.target.irradiance()
     return Nominal(
         lens=lens,
-        target=scene.target.irradiance(),
+        target=restricted(picture, part),
+        whole=None if part is None else picture,
+        reachable=part,
         screen=scene.target.screen,
         channels=scene.judging_channels(),
         accept=scene.accept,

@@ -20,6 +20,7 @@ from bstcad.baselines import integration, paper
 from bstcad.folder import Made
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
+from bstcad.optics.reach import GRAZING, grazing_of, restricted, spread_at, unreached
 from bstcad.optics.sides import both
 from bstcad.optics.sources import Source
 from bstcad.report.record import Making, Point
@@ -27,8 +28,10 @@ from bstcad.report.record import Stage as StageRecord
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import slope_map, stage1, stage2
+from bstcad.tailoring.grazing import cleared
 from bstcad.tailoring.machinability import BOUNDED, UNBOUNDED, kept, moved_clear
-from bstcad.tailoring.run import JUDGING, Driver, Parameters, Progress, Record, Step, Task, forget, never, silent
+from bstcad.tailoring.reachable import reachable
+from bstcad.tailoring.run import JUDGING, Driver, Edge, Parameters, Progress, Record, Step, Task, forget, never, silent
 from bstcad.tailoring.source_image import Spread
 from bstcad.tailoring.stage2 import Comparison, compare_precisions
 from bstcad.transport.mapping import Mapping, TransportMap
@@ -45,6 +48,12 @@ COMPARED = "float32 beside float64"  # the name of that stage
 # Seconds that writing, proving and reporting take on two cores; PER_NET of 513 x 513 control points, PER_PICTURE of
 # 512 x 512 pixels.
 FIXED, PER_NET, PER_PICTURE = 4.0, 5.0, 3.0
+REACH_NET = 33  # control points a side of the flat back from which the reach of light is found
+LEAST_REACHED = 1e-3  # of the light of a target that has to be within reach
+FURTHER = {  # how light gets to all of a target, by the optic
+    "lens": "move the target nearer to the axis or further away, take a higher lens.index, or reflect with a mirror",
+    "mirror": "move the target nearer to where a flat mirror would send the light, or further away",
+}
 
 
 @dataclass(frozen=True)
@@ -85,7 +94,10 @@ def design(
     began = time.perf_counter() if began is None else began
     torch.manual_seed(scene.tailoring.seed)
     device = device_for(device)
-    target = scene.target
+    target, picture = scene.target, scene.target.irradiance()
+    part, edge = reachable_part(scene, picture)
+    if part is not None:
+        progress("reach", 0, 0, f"{unreachable(scene, part, picture)}; the design is for the rest")
     knobs = scene.tailoring.resolved(scene.lens.back.net)
     later = later and knobs.max_time is None
     screen = target.screen
@@ -93,9 +105,9 @@ def design(
     light, scaled = scene.with_source_scaled(0.0).channels(), [scene.with_source_scaled(share) for share, _ in sizes]
     grown = tuple(each.channels() for each in scaled)
     task = Task(
-        light, screen, target.irradiance(), knobs, least=scene.lens.min_thickness,
+        light, screen, restricted(picture, part), knobs, least=scene.lens.min_thickness,
         free=scene.lens.front.free, rim_sags=scene.rim_sags, progress=progress, grown=grown, bounds=scene.lens.bounds,
-        spreads=tuple(Spread(each.source, light, each.draw) for each in scaled), merit=merit,
+        spreads=tuple(Spread(each.source, light, each.draw) for each in scaled), edge=edge, merit=merit,
     )  # fmt: skip
     limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve(scene) + JUDGING}
     record = Record() if start is None else start.record
@@ -122,9 +134,46 @@ def design(
     making = _making(followed, driver.record, stopped, steep)
     return Made(
         resolved(scene, lens), scene.as_mounted(lens), task.target, making, device=device,
-        transport=followed.transport,
+        transport=followed.transport, reachable=part,
         compared=partial(_compared, making, task, after_stage1, stages) if later else None,
     )  # fmt: skip
+
+
+def reachable_part(scene: Scene, picture: np.ndarray) -> tuple[np.ndarray | None, Edge | None]:
+    """(rows, columns) True in the pixels that a design of the scene can light, and the light at their edge.
+
+    None, None: it can light all that its picture lights.  A mirror, whose slope alone binds it, has no such edge.
+    SceneError where it can light none, or not all in a scene with target.unreachable = "refuse".
+    """
+    channels = scene.with_source_scaled(0.0).channels()
+    light = max(channels, key=lambda channel: channel.weight)  # stage 1 reckons with it alone
+    lens, screen = light.through(scene.flat_lens(REACH_NET)), scene.target.screen
+    grazing = GRAZING
+    if not lens.reflects:
+        grazing = grazing_of(light.index, [each.index for each in channels], spread_at(scene.source, lens))
+    part = reachable(light.source, lens, picture, screen=screen, grazing=grazing)
+    if part is not None and scene.lens.front.free:  # another front may send light further
+        front = stage1.shaped_front(
+            light.source, lens, picture, screen, free=scene.lens.front.free, rim_sags=scene.rim_sags, repeats=1
+        ).front
+        part = reachable(light.source, lens.with_front(front), picture, screen=screen, grazing=grazing)
+    if part is None:
+        return None, None
+    if not picture[part].sum() > LEAST_REACHED:
+        reached(lens, math.nan)
+    if scene.target.unreachable == "refuse":
+        raise SceneError(f"target: {unreachable(scene, part, picture)}; {FURTHER[scene.optic]}")
+    return part, None if lens.reflects else Edge(light, grazing)
+
+
+def unreachable(scene: Scene, part: np.ndarray, picture: np.ndarray) -> str:
+    """How much of a target lies outside of the part that can be lit, and why, as a sentence without its end."""
+    found = unreached(picture, part, None if scene.lens.back.reflect else scene.index)
+    area, light = (f"{100 * found[key]:.2g} %" for key in ("area", "light"))
+    why = "no slope up to 70 degrees sends light there"
+    if found["angle"] is not None:
+        why = f"a face of index {scene.index:.4g} turns light by less than {found['angle']:.3g} degrees, or reflects it"
+    return f"{area} of the target, with {light} of its light, cannot be lit: {why}"
 
 
 def resolved(scene: Scene, lens: Lens) -> Scene:
@@ -219,6 +268,8 @@ def _stage2(task: Task, driver: Driver, lens: Lens, followed: Followed, state: S
         return Saved(driver.record, None, followed, state)
 
     lens = driver.run(steps, task.whole, saved, lambda: driver.hurry).lens
+    if task.edge is not None:
+        lens = cleared(lens, task.edge)
     lens = moved_clear(lens, lens.back.z, task.least, task.bounds)  # where no light falls stage 2 is free to bend it
     if task.bounds is not None:
         lens = kept(lens, task.bounds)

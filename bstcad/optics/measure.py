@@ -100,6 +100,7 @@ class Light:
     witness: Witness | None = None  # None: of a source of some size, with losses, without a kernel, or unasked
     ghost: np.ndarray | None = field(default=None, repr=False)  # the part of the picture by a ghost; None: left out
     leak: Leak | None = None  # of the rays' mean picture, not smoothed; None: the target is dark nowhere
+    rrmsd_whole: float | None = None  # against a picture of which the target is a part; None: there is none
 
     @property
     def efficiency(self) -> float:
@@ -115,7 +116,7 @@ class Light:
 
 def measure(
     lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, effort: Effort = FULL,
-    ghost: GhostLight | None = None, draw: Draw | None = None,
+    ghost: GhostLight | None = None, draw: Draw | None = None, whole: np.ndarray | None = None,
 ) -> Light:  # fmt: skip
     """The light that `lens` throws on `screen`, held to `target`.
 
@@ -123,6 +124,7 @@ def measure(
     of any sum, row 0 = y max.  ghost: how light is followed that is reflected twice inside the lens
     (trace.ghost_light), to be a part of the picture and of the ledger; None: it is left out.
     draw: other points of an extended source for each set of rays; None: all sets begin at those of `channels`.
+    whole: a picture of the target's sum to which the light is held, too.
     """
     wanted = torch.from_numpy(np.asarray(target, dtype=np.float64))
     stray = ghost and ghost(lens, channels, screen, round(a_side(channels) * effort.rays / GHOSTS), effort.seed)
@@ -145,6 +147,7 @@ def measure(
         witness=_witness(lens, channels, screen, wanted=wanted, rays=rays, ghost=stray) if witnessed else None,
         ghost=stray and (stray.picture.cpu() * (total(wanted) / rays.on_screen)).numpy(),
         leak=leak((sum(rays.boxes) / SETS).numpy(), wanted.numpy()),
+        rrmsd_whole=None if whole is None else _value(rays, torch.from_numpy(whole))[0],
     )  # fmt: skip
 
 

@@ -159,6 +159,11 @@ def middle(plane: TargetPlane) -> float:
     return plane.centre[2] if isinstance(plane, TiltedPlane) else plane
 
 
+def normal_of(plane: TargetPlane) -> Vector:
+    """The unit normal of a plane, which points away from where light comes from."""
+    return plane.axes[2] if isinstance(plane, TiltedPlane) else (0.0, 0.0, 1.0)
+
+
 def advance(rays: Rays, plane: TargetPlane) -> tuple[Tensor, Tensor]:
     """(n · d, n · (p - C)): how fast rays rise from the plane along their way, and how far above it they are (mm)."""
     if not isinstance(plane, TiltedPlane):

@@ -258,6 +258,26 @@ def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) 
 
 
 @styled
+def reach_picture(target: np.ndarray, reachable: np.ndarray, view: View) -> Figure:
+    """The target, and that part of it which light can reach, the rest in vermilion.
+
+    target, reachable: (rows, columns) in coordinates; reachable is True where light gets to.
+    """
+    from matplotlib.colors import ListedColormap
+
+    figure = new_figure(9.0, 1.3 + 3.6 * view.proportion)
+    panels = figure.subplots(1, 2, sharey=True)
+    top, part = HEADROOM * float(target.max()), np.where(reachable, target, 0.0)
+    titles = "Target", f"Within reach: {100 * part.sum() / target.sum():.3g} % of its light"
+    for axes, title in zip(panels, titles, strict=True):
+        _grey(axes, target, view, top=top, title=title)
+    draw_picture(panels[1], np.where(reachable, np.nan, 1.0), view, cmap=ListedColormap([VERMILION]), alpha=0.6)
+    panels[0].set_ylabel("y (mm)")
+    view.note(figure, "  In vermilion: no face of this index or slope sends light there.")
+    return figure
+
+
+@styled
 def ghost_picture(target: np.ndarray, ghost: np.ndarray, view: View) -> Figure:
     """The light that was reflected twice inside the lens, in percent of the mean lit irradiance.
 

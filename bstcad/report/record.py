@@ -28,6 +28,7 @@ from bstcad.judges.comparison import Judge
 from bstcad.measured.form_error import MAP
 from bstcad.measured.made_part import MadePart
 from bstcad.optics.lens import Lens
+from bstcad.optics.reach import unreached
 from bstcad.report.light_figures import rrmsd
 from bstcad.report.prescription import Order, prescription
 from bstcad.report.units import DIGITS, Rows, number, paragraphs, percent, tables
@@ -169,6 +170,10 @@ class Contents:
     versions: Mapping[str, str]  # of the libraries, by name
     seed: int  # of every random choice
     version: str | None = None  # of bstcad, which wrote it
+    rrmsd_whole: Rrmsd | None = None  # against the whole picture, of which light can reach a part; None: it reaches all
+    # what light cannot reach: area (of the target, as a part of it), light (of the picture), angle (degrees by which a
+    # face of the index turns light before it reflects it; None: of a mirror); None: nothing
+    unreachable: Mapping[str, Size | None] | None = None
     leak: Share | None = None  # of the light on the target, on its dark pixels (optics.irradiance.Leak); None: no dark
     contrast: Size | None = None  # mean irradiance of the lit pixels over that of the dark ones; None: or without leak
     optic: Literal["lens", "mirror"] = "lens"  # the kind of the design
@@ -240,9 +245,11 @@ class Examined:
 def contents_of(
     scene: Scene, lens: Lens, target: np.ndarray, proof: Proof, *, making: Making,
     circumstances: Mapping[str, Any], estimates: tuple[LeftOut, ...], diagnosis: Mapping[str, Any],
+    reachable: np.ndarray | None = None,
 ) -> Contents:  # fmt: skip
     """The contents of report.json.
 
+    reachable: the pixels (rows, columns) that light can reach; None: all that are to be lit.
     lens: as designed.  circumstances: version, machine and versions of libraries now, which those of its making
     precede.  estimates: of the effects that are left out.  diagnosis: convergence, remaining_error, limits and bounds.
     """
@@ -268,6 +275,8 @@ def contents_of(
             "left_out": tuple(LEFT_OUT[entry.kind] for entry in estimates),
         },
         seed=scene.tailoring.seed,
+        rrmsd_whole=light.rrmsd_whole,
+        unreachable=None if reachable is None else _unreached(scene, reachable),
         leak=dark and dark.share,
         contrast=dark and dark.contrast,
         optic=scene.optic,
@@ -282,6 +291,10 @@ def contents_of(
         estimates=estimates,
     )
     return _remarked(contents, *remarks(contents, scene, target, light.picture))
+
+
+def _unreached(scene: Scene, reachable: np.ndarray) -> dict[str, float | None]:
+    return unreached(scene.target.irradiance(), reachable, None if scene.optic == "mirror" else scene.index)
 
 
 def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:

@@ -17,7 +17,7 @@ from bstcad.optics.sides import in_words
 from bstcad.report import explained
 from bstcad.report.prescription import WAYS, order_rows
 from bstcad.report.record import LEFT_OUT, Contents, Examined, LeftOut, bounds, changes
-from bstcad.report.units import Rows, about, bound, environment, number, paragraphs, quantity, tables
+from bstcad.report.units import Rows, about, bound, environment, number, paragraphs, percent, quantity, tables
 from bstcad.runs import files
 from bstcad.verify.verdict import Check
 
@@ -48,6 +48,11 @@ IMAGE = (
     "target. The target blurred by this image has an RRMSD of {rrmsd}; a {optic} comes below that as far as it "
     "sharpens coarser detail beforehand."
 )
+UNREACHABLE = (
+    "{area} of the target, with {light} of its light, cannot be lit; the {optic} will be for the rest. --png FILE "
+    "draws it."
+)
+TURNED = "A face of this index turns light by less than {angle:.3g} degrees, or reflects it."
 INTERVALS = (
     "In brackets what nine of ten designs keep to. Seconds: from the command to its end, with nothing else running."
 )
@@ -247,6 +252,10 @@ def plan_effects(plan: Mapping[str, Any], title: str, optic: str) -> Group:
         if entry.simulate_by:
             remedies.add_row(Text(f"  {LEFT_OUT[entry.kind]}"), Text(entry.simulate_by))
     lines = [Text(title, "bold"), simulated, left_out, Text(ESTIMATED.format(optic))]
+    if beyond := plan.get("unreachable"):
+        lines += [Text(), Text(UNREACHABLE.format(**{k: percent(beyond[k]) for k in ("area", "light")}, optic=optic))]
+        if beyond["angle"] is not None:
+            lines.append(Text(TURNED.format(**beyond)))
     if plan["blur"] is not None:
         image = {key: number(value) for key, value in plan["blur"].items()}
         lines += [Text(), Text(IMAGE.format(**image, optic=optic))]

@@ -64,6 +64,9 @@ class Target(Record):
         "crop"
     )
     outline: Annotated[Outlined | None, Key("Light falls only inside this outline, which is centred.")] = None
+    unreachable: Annotated[
+        Literal["dark", "refuse"], Key("What light cannot reach stays dark, or the scene is refused.", example="refuse")
+    ] = "dark"
 
     def complaints(self) -> Iterator[str]:
         """Everything that is wrong with the table by itself."""

@@ -24,8 +24,9 @@ from bstcad.analysis.cost import ControlCells, control_cells, limits
 from bstcad.analysis.light import blur
 from bstcad.analysis.steepness import Steepness
 from bstcad.optics.lens import Lens
+from bstcad.optics.reach import restricted, unreached
 from bstcad.optics.sides import both, coarser, scaled
-from bstcad.pipeline import check_thickness, reached, steepness, transport_of
+from bstcad.pipeline import check_thickness, reachable_part, reached, steepness, transport_of
 from bstcad.report.record import simulated, too_steep
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.quality import COARSEST_GRID, PRESETS, Tailoring
@@ -47,7 +48,10 @@ Interval = tuple[float, float, float]  # low, likely, high
 def plan(
     scene: Scene, text: str = "", keys: Sequence[str] = (), units: Callable[[], Units] = measured_units
 ) -> Iterator[dict[str, Any]]:
-    """The entries of `plan --json`: first simulated, left_out by change of the RRMSD, blur; then the predictions.
+    """The entries of `plan --json`: first simulated, left_out by change of the RRMSD, blur, unreachable; then the
+    predictions.
+
+    unreachable: what light cannot reach, as optics.reach.unreached has it; None: it reaches all that is to be lit.
 
     blur: width (mm, and pixels) of the image that a source of some size throws through the coarse lens, and the RRMSD
     of the target convolved with this image; None: the source has no size.
@@ -57,11 +61,27 @@ def plan(
     """
     at, lens = toml_positions(text), coarse_lens(scene)
     asked = [{"what": what, "key": key, **_asked(key, at, keys)} for what, key in simulated(scene)]
-    target = scene.target.irradiance()
+    picture = scene.target.irradiance()
+    part, _ = reachable_part(scene, picture)
+    target = restricted(picture, part)
+    beyond = None if part is None else unreached(picture, part, None if lens.reflects else scene.index)
     estimates, image = left_out(scene, lens, target), blur(scene.channels(), lens, scene.target.screen, target)
     left = [asdict(estimate) for estimate in estimates]
-    yield {"simulated": asked, "left_out": left, "blur": image and rounded(asdict(image), 3)}
+    yield {
+        "simulated": asked, "left_out": left, "blur": image and rounded(asdict(image), 3),
+        "unreachable": beyond and rounded(beyond, 3),
+    }  # fmt: skip
     yield rounded(outlook(scene, lens, units), 3)
+
+
+def reach_drawn(scene: Scene) -> bytes:
+    """A PNG of the target and the part of it that light can reach."""
+    from bstcad.report.drawing import png
+    from bstcad.report.light_figures import View, reach_picture
+
+    picture = scene.target.irradiance()
+    part, _ = reachable_part(scene, picture)
+    return png(reach_picture(picture, np.ones(picture.shape, dtype=bool) if part is None else part, View.of(scene)))
 
 
 def _asked(key: str, at: Mapping[str, int], keys: Sequence[str]) -> dict[str, Any]:
@@ -215,9 +235,11 @@ def pilots(scene: Scene, lens: Lens) -> dict[str, Pilot]:
 def _pilot(scene: Scene, lens: Lens, quality: str) -> Pilot:
     small, factor, knobs = _small(scene, quality)
     target = small.target
+    picture = target.irradiance()
+    part, edge = reachable_part(small, picture)
     task = Task(
-        small.channels(), target.screen, target.irradiance(), knobs, least=small.lens.min_thickness,
-        rim_sags=small.rim_sags,
+        small.channels(), target.screen, restricted(picture, part), knobs, least=small.lens.min_thickness,
+        rim_sags=small.rim_sags, edge=edge,
     )  # fmt: skip
     flat = small.flat_lens(knobs.levels[0], as_wide_as=knobs.levels[-1])
     first = list(stage1.steps(task, replace(flat, front=lens.front)))

@@ -9,13 +9,16 @@ Its Hessian is Δ e E Δ, so in c with δz = Δ^-1 E^-1/2 c it would be the unit
 average out detail finer than they are, which makes a weaker power of Δ better: 0.5 by measurement, since letters gain
 by a still weaker one and portraits by a stronger one.  The weight E^-1/2 halves the evaluations that a picture with
 dark parts takes.  Δ is diagonal in the cosine transform of the net.
+
+L is no constant near the critical angle: there dθ' = η cos θ / cos θ' dθ grows without bound, and a place of the face
+moves its light many times further than most places do.  The weight falls by as much there, and is left alone elsewhere.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -26,11 +29,14 @@ from torch import Tensor
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel, weighted_sum
+from bstcad.optics.interfaces import Law
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.reductions import elementary, total
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import RayTubes
-from bstcad.optics.rays import Landed
+from bstcad.optics.rays import Landed, Rays, TargetPlane
+from bstcad.optics.rays import middle as middle_of
+from bstcad.optics.reach import wanted_slopes
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import through
 from bstcad.optics.tubes import arriving, rays_to
@@ -39,6 +45,9 @@ EXPONENT = 0.5  # of the Laplacian
 BLUR = 1.0  # pixels; irradiance for the weight
 SMOOTH = 1.5  # control points; of the weight's logarithm
 MOST = 4.0  # weights are clamped to [1 / MOST, MOST]
+FAR, FARTHEST = 3.0, 96.0  # times the median throw: from there on the weight falls with the throw, and no further
+STEP = 1e-6  # of the distance to the target: step of the difference quotients of the throw
+EVERY = 8  # control points, at one of which the throw is looked at first: few lenses throw that far anywhere
 
 
 def landing(rays: Landed, aim: Tensor) -> Tensor:
@@ -148,7 +157,38 @@ def local_weight(source: Source, lens: Lens, target: np.ndarray, screen: Screen,
     picture = gaussian_filter(target / target.mean(), BLUR)
     irradiance = map_coordinates(picture, [row - 0.5, column - 0.5], order=1, mode="nearest")
     logarithm = np.where(seen, np.log(np.maximum(irradiance, MOST**-4)), 0.0)
-    return torch.from_numpy(np.clip(np.exp(-0.5 * gaussian_filter(logarithm, SMOOTH)), 1 / MOST, MOST))
+    weight = np.clip(np.exp(-0.5 * gaussian_filter(logarithm, SMOOTH)), 1 / MOST, MOST)
+    if number == lens.freeform[-1]:
+        further = _further(at_net, landed.position, screen.plane, law=onwards[0].law, seen=seen)
+        if further is not None:
+            weight = weight / np.exp(gaussian_filter(np.log(further), SMOOTH))
+    return torch.from_numpy(weight)
+
+
+def _further(at_net: Rays, aim: Tensor, plane: TargetPlane, law: Law, seen: np.ndarray) -> np.ndarray | None:
+    """(m, m) the throw where it is more than FAR times its median, over that; else 1.  None: 1 everywhere.
+
+    The throw is the largest singular value of ∂t/∂p (mm), p(b, t) the slopes that send light to a place t: the inverse
+    of the smallest one of ∂p/∂t.
+    """
+    for some in (slice(None, None, EVERY), slice(None)):
+        rays = replace(at_net, **{key: getattr(at_net, key)[..., some, some] for key in ("position", "direction")})
+        t, lit = aim[..., some, some], seen[some, some]
+        if not lit.any():
+            return None
+        step = STEP * torch.sqrt((t**2).sum(0) + (middle_of(plane) - at_net.z) ** 2).max()
+        here, *there = (
+            torch.stack(wanted_slopes(rays, t + step * torch.tensor(way).to(t).view(2, 1, 1), plane, law))
+            for way in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
+        )
+        (a, b), (c, d) = ((p - here) / step for p in there)
+        square, det = a * a + b * b + c * c + d * d, a * d - b * c
+        largest = (square + torch.sqrt((square * square - 4 * det * det).clamp(min=0))) / 2
+        throw = (largest.sqrt() / det.abs().clamp(min=1e-300)).cpu().double().numpy()
+        further = np.where(lit, throw / (FAR * np.median(throw[lit])), 1.0).clip(1.0, FARTHEST / FAR)
+        if not (further > 1).any():
+            return None
+    return further
 
 
 @dataclass(frozen=True)

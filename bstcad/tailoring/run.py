@@ -72,6 +72,14 @@ def silent(stage: str, done: int, total: int, text: str) -> None:
 
 
 @dataclass(frozen=True)
+class Edge:
+    """The light at the edge of what can be reached, which must not be reflected."""
+
+    light: Channel  # of the source's middle, at the line with most of the flux
+    angle: float  # from the normal (rad), at which it may leave the last face at most
+
+
+@dataclass(frozen=True)
 class Task:
     """Light, target and knobs of a design."""
 
@@ -86,6 +94,7 @@ class Task:
     grown: tuple[tuple[Channel, ...], ...] = ()  # points of the source, as it grows to its size; () of a point
     bounds: Bounds | None = None  # on the back; None: it may have any shape
     spreads: tuple[Spread, ...] = ()  # the same source in each of these sizes, about its middle
+    edge: Edge | None = None  # of a target that is cut to what light can reach; None: light can reach all of it
     # of a picture (rows, columns) and the target, both of sum 1 or less, what stage 2 makes least; None: RRMSD²
     merit: Callable[[Tensor, Tensor], Tensor] | None = None
 

@@ -7,7 +7,6 @@ is a linear least-squares problem: a few preconditioned conjugate-gradient steps
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -15,16 +14,15 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.bspline import BSplineSurface, evaluate, net_gradient
-from bstcad.optics.interfaces import Law, intersect
+from bstcad.optics.interfaces import intersect
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
-from bstcad.optics.rays import Rays, TargetPlane, way_to
+from bstcad.optics.rays import Rays, TargetPlane
+from bstcad.optics.reach import wanted_slopes
 from bstcad.optics.trace import across
 from bstcad.tailoring.merit import Spectrum
 
-GRAZING = math.radians(85)  # from the normal, in air; 0.2° from the critical angle in PMMA
 INDEPENDENT = 1e-12  # of a monomial's squared slopes: less than that is rounding
-STEEPEST = math.tan(math.radians(70))  # slope; no tool reaches a steeper one, which makes the lens as thick as wide
 
 
 @dataclass(frozen=True)
@@ -34,30 +32,6 @@ class Fit:
     bending: float = 1e-4  # weight of (spacing · curvature)² beside slope²: decides where no ray falls
     steps: int = 8  # of conjugate gradients
     degree: int = 0  # of a polynomial that is fitted first and goes on smoothly where no ray falls
-
-
-def wanted_slopes(at_face: Rays, aim: Tensor, plane: TargetPlane, law: Law) -> tuple[Tensor, Tensor]:
-    """(∂z/∂x, ∂z/∂y) that send each ray towards aim (2, …) mm on the plane.
-
-    Both laws say that η d - d' is parallel to the normal (-z_x, -z_y, 1), d and d' the directions before the face and
-    behind it.  Where no face can do that, the slope turns the ray towards the same side, as far as a ray that leaves at
-    GRAZING, and is no steeper than STEEPEST.
-    """
-    out = way_to(at_face, aim, plane)
-    d, out = at_face.direction, out / torch.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
-    along = d[0] * out[0] + d[1] * out[1] + d[2] * out[2]
-    least = -1.0 if law.reverses else math.cos(largest_deflection(law.eta))
-    across = out - along * d
-    across = across / torch.sqrt(across[0] ** 2 + across[1] ** 2 + across[2] ** 2).clamp(min=1e-12)
-    out = torch.where(along < least, least * d + math.sqrt(1 - least * least) * across, out)
-    normal = at_face.sense * (law.eta * d - out)
-    height = torch.maximum(normal[2], torch.sqrt(normal[0] ** 2 + normal[1] ** 2) / STEEPEST)
-    return -normal[0] / height, -normal[1] / height
-
-
-def largest_deflection(index: float) -> float:
-    """The angle (rad) by which a face turns a ray that leaves it at GRAZING from the normal."""
-    return GRAZING - math.asin(math.sin(GRAZING) / index)
 
 
 def fit_slopes(

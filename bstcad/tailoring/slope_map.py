@@ -36,12 +36,13 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, TargetPlane
+from bstcad.optics.reach import wanted_slopes
 from bstcad.optics.sides import Sides, both
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import across, clear_window, gets_through
 from bstcad.optics.tubes import rays_to
 from bstcad.scene.errors import SceneError
-from bstcad.tailoring.slope_fit import Fit, fit_slopes, wanted_slopes
+from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.transport.bfm import Step
 from bstcad.transport.density import Density, spread
 from bstcad.transport.mapping import Frame, Mapping, TransportMap, nodes, solve
@@ -151,7 +152,7 @@ def slope_map(
 
 def _moved(picture: np.ndarray, before: tuple[np.ndarray, np.ndarray], now: tuple[np.ndarray, np.ndarray]) -> float:
     """RMS distance (mm) between two places of each corner of the lit pixels."""
-    lit = _corners_of(picture)
+    lit = corners_of(picture)
     x, y = ((a - b)[lit] for a, b in zip(now, before, strict=True))
     return float(np.sqrt(np.mean(x * x + y * y)))
 
@@ -200,18 +201,26 @@ def gathering(grid: FaceGrid, lens: Lens, plane: TargetPlane, middle: tuple[floa
     return fit_slopes(net, *(p.reshape(-1).to(x) for p in (x, y, z_x, z_y)), weight=lit.reshape(-1), fit=GATHERED)
 
 
-def _needed(grid: FaceGrid, lens: Lens, plane: TargetPlane, b: tuple, t: tuple) -> tuple[np.ndarray, np.ndarray]:
-    """p(b, t): the slopes that send the light at b (mm) to t (mm) on the plane; direction and sag bilinear at b."""
+def between(grid: FaceGrid, values: Tensor, b: tuple) -> Tensor:
+    """Values (n, n) of the cells of a grid at points b (mm), bilinear."""
     sizes = (grid.window.width, grid.window.height)
     where = [(np.asarray(p) / size + 0.5) * n - 0.5 for p, size, n in zip(b, sizes, grid.shape, strict=True)]
+    return torch.from_numpy(map_coordinates(values.cpu().double().numpy(), where, order=1, mode="nearest"))
 
-    def at(values: Tensor) -> Tensor:
-        return torch.from_numpy(map_coordinates(values.cpu().double().numpy(), where, order=1, mode="nearest"))
 
-    position = torch.stack([torch.from_numpy(b[0]), torch.from_numpy(b[1]), at(grid.at_face.position[2])])
-    d_x, d_y, d_z = (at(d) for d in grid.at_face.direction)
+def rays_at(grid: FaceGrid, b: tuple) -> Rays:
+    """The light that meets the face at points b (mm); direction and sag are bilinear between the grid's."""
+    position = torch.stack(
+        [torch.from_numpy(b[0]), torch.from_numpy(b[1]), between(grid, grid.at_face.position[2], b)]
+    )
+    d_x, d_y, d_z = (between(grid, d, b) for d in grid.at_face.direction)
     direction = torch.stack([d_x, d_y, d_z]) / torch.sqrt(d_x * d_x + d_y * d_y + d_z * d_z)
-    rays = replace(grid.at_face, position=position, direction=direction)
+    return replace(grid.at_face, position=position, direction=direction)
+
+
+def _needed(grid: FaceGrid, lens: Lens, plane: TargetPlane, b: tuple, t: tuple) -> tuple[np.ndarray, np.ndarray]:
+    """p(b, t): the slopes that send the light at b (mm) to t (mm) on the plane."""
+    rays = rays_at(grid, b)
     aim = torch.stack([torch.from_numpy(t[0]), torch.from_numpy(t[1])])
     p = wanted_slopes(rays, aim, plane, lens.last_freeform.law)
     return p[0].numpy(), p[1].numpy()
@@ -233,7 +242,7 @@ def pixel_corners(screen: Screen) -> list[np.ndarray]:
 
 def spread_density(picture: np.ndarray, corners: tuple[np.ndarray, np.ndarray], n: int) -> tuple[Density, Frame]:
     """A picture whose pixels have their corners there, on n x n cells of the smallest square around its lit part."""
-    lit = _corners_of(picture)
+    lit = corners_of(picture)
     low, high = (np.array([f(c[lit]) for c in corners]) for f in (np.min, np.max))
     frame = Frame(tuple((low + high) / 2), float((high - low).max()))
     flux = np.ascontiguousarray(picture[::-1].T)  # row 0 is y max
@@ -242,7 +251,7 @@ def spread_density(picture: np.ndarray, corners: tuple[np.ndarray, np.ndarray], 
     return Density.from_values(spread(flux, x, y, n=n, parts=parts), floor=FLOOR), frame
 
 
-def _corners_of(picture: np.ndarray) -> np.ndarray:
+def corners_of(picture: np.ndarray) -> np.ndarray:
     """(columns + 1, rows + 1), x first: the pixel corners of all that is not black."""
     lit = np.pad(picture[::-1].T > 0, 1)  # row 0 is y max
     return lit[1:, 1:] | lit[1:, :-1] | lit[:-1, 1:] | lit[:-1, :-1]

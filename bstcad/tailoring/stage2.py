@@ -25,6 +25,7 @@ from bstcad.optics.measure import a_side, images, rrmsd_by_tubes
 from bstcad.optics.sides import coarser
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
+from bstcad.tailoring.grazing import Grazing
 from bstcad.tailoring.machinability import excess, weight
 from bstcad.tailoring.merit import SobolevVariable, TubeMerit, local_weight
 from bstcad.tailoring.minimise import Best, Reached, Search, lbfgs, minimise
@@ -135,12 +136,15 @@ def run_rounds(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = N
             place = replace(place, round=number, round_end=place.done + now.evaluations, sheet_from=Parameters.of(lens))
         if place.round_end <= place.done:
             continue
-        merit = now.merit(place.sheet_from.applied(lens))
+        launched = place.sheet_from.applied(lens)
+        merit = now.merit(launched)
+        grazing = task.edge and Grazing.of(task.edge, launched)
         while place.done < place.round_end:
             if state is None:
                 place = replace(place, search_from=Parameters.of(lens))
             begun = place.search_from.applied(lens)
-            for reached, step in _search(now, begun, merit, place, total=total, bound_weight=bound_weight, state=state):
+            problem = Problem(begun, merit, task.bounds, bound_weight, grazing=grazing)
+            for reached, step in _search(now, problem, place, total=total, state=state):
                 yield replace(step, part=part)
                 if reached.reason:
                     break
@@ -184,18 +188,16 @@ def _pull(task: Task, lens: Lens) -> float:
 
 
 def _search(
-    now: Round, lens: Lens, merit: TubeMerit | BlurredMerit, place: Place, *, total: int, bound_weight: float,
-    state: TubeSearch | None,
-) -> Iterator[tuple[Reached, Step]]:  # fmt: skip
-    """One run of the minimiser from `lens`, or on from a saved state; it also ends when the goal is reached.
+    now: Round, problem: Problem, place: Place, *, total: int, state: TubeSearch | None
+) -> Iterator[tuple[Reached, Step]]:
+    """One run of the minimiser from the lens of a problem, or on from a saved state; it also ends at the goal.
 
-    total: evaluations of all rounds; bound_weight: weight of the penalty on exceeding the bounds of the back.
+    total: evaluations of all rounds.
     """
+    lens = problem.lens
     task, evaluations = now.task, place.round_end - place.done
     variables, work = variables_of(task, lens), 0.0  # the first step also sets this up: its time is not known
-    for reached in search(
-        lens, Problem(lens, merit, task.bounds, bound_weight), variables, evaluations=evaluations, state=state
-    ):
+    for reached in search(lens, problem, variables, evaluations=evaluations, state=state):
         best, reason = reached.best, reached.reason
         step = Step(partial(improved, lens, variables, best), work=work, skipped=reached.skipped)
         if not reached.skipped:
@@ -206,7 +208,7 @@ def _search(
         if reached.state is not None and not reason:
             step = replace(step, state=TubeSearch(place, best, reached.state))
         yield replace(reached, reason=reason), step
-        work = merit.tubes / EVALUATED
+        work = problem.merit.tubes / EVALUATED
 
 
 @dataclass(frozen=True)
@@ -221,6 +223,7 @@ class Problem:
     merit: TubeMerit | BlurredMerit
     bounds: Bounds | None = None  # on the back; the excess over them adds to the merit
     bound_weight: float = 0.0  # of the excess
+    grazing: Grazing | None = None  # keeps light at the edge of its reach from total reflection
 
     def __call__(self, heights: Sequence[Tensor]) -> tuple[float, list[Tensor], float]:
         """(merit, ∂merit/∂heights of each net, RRMSD) at the heights of the nets (mm)."""
@@ -233,6 +236,9 @@ class Problem:
             over, back = excess(lens.plain(), self.bounds), lens.freeform.index(lens.number_of_back)
             gradients[back] = gradients[back] + self.bound_weight * over.gradient.to(gradients[back])
             value += self.bound_weight * over.mean_square
+        if self.grazing is not None:
+            over, gradient, _ = self.grazing(heights[-1])
+            value, gradients[-1] = value + over, gradients[-1] + gradient
         return value, gradients, float(rrmsd)
 
 

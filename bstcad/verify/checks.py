@@ -85,6 +85,9 @@ class Nominal:
     part: Part = field(default_factory=Part)  # whose facts lens.step should state besides the shape
     draw: Draw | None = None  # how points of an extended source are drawn; None: it is a point
     accuracy: float = FULL.accuracy  # of the RRMSD: its standard error, as a part of it, that is asked for
+    # of the whole picture, where light can reach but a part of it, which is `target`; None: it can reach all
+    whole: np.ndarray | None = None
+    reachable: np.ndarray | None = None  # (rows, columns) which pixels those are
 
     def effort(self, given: Effort | None = None) -> Effort:
         """The rays and tubes of a measurement of this design, a draft's with fewer; given: a limit, None: no limit."""
@@ -141,7 +144,8 @@ def verify(
     lit, of_aperture, why = (lens, (), "") if mount is None else _as_made(seen, lens, nominal, folder)
     known(lit)
     light = measure(
-        lit, nominal.channels, nominal.screen, nominal.target, effort=effort, ghost=nominal.ghost, draw=nominal.draw
+        lit, nominal.channels, nominal.screen, nominal.target, effort=effort, ghost=nominal.ghost, draw=nominal.draw,
+        whole=nominal.whole,
     )
     if not light.rrmsd >= 0:
         name = "lens.step" if mount is None else "part.step"

@@ -173,6 +173,10 @@ REMARKS = [
      "What they cost was not measured in this run.", "bounds"),
     ("The time limit of 20.0 s was missed by 6.8 s: loading, stage 1 and writing run whole, and this machine took that "
      "long for them.", "time-limit"),
+    ("32.1 % of the target, with 30.6 % of its light, cannot be lit: a face of index 1.494 turns light by less than 48 "
+     "degrees, or reflects it. The lens is for the rest; against the whole picture its RRMSD is 0.682.", "unreachable"),
+    ("2.0 % of the target, with 1.0 % of its light, cannot be lit: no slope up to 70 degrees sends light there. The "
+     "mirror is for the rest; against the whole picture its RRMSD is 0.1.", "unreachable"),
     ("0.80 % of the lit part of the target is left dark, with less than 10 % of what was asked there; the largest "
      "patch lies at x = -152 to -144 mm, y = -40 to 120 mm.", "dark"),
     ("The mount cuts away 30.0 % of the light that the uncut lens would let through.", "mount-cut"),

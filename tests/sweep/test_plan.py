@@ -248,11 +248,9 @@ class TestCommand:
         assert cli.run([*few, "--json"]) == 0
         out, err = capsys.readouterr()
         found = json.loads(out)
-        assert (
-            set(found) == {"predicted", "not_predicted", "finer", "notes", "simulated", "left_out", "blur", "files"}
-            and err == ""
-        )
-        assert found["blur"] is None  # of a beam of no size
+        keys = {"predicted", "not_predicted", "finer", "notes", "simulated", "left_out", "blur", "unreachable", "files"}
+        assert set(found) == keys and err == ""
+        assert found["blur"] is None and found["unreachable"] is None  # a beam of no size, all within reach
         assert found["predicted"] is None and "target.pixels from 128 to 512" in found["not_predicted"]
         assert cli.run(few) == 0
         out, _ = capsys.readouterr()

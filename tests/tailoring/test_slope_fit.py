@@ -11,11 +11,12 @@ from bstcad.optics.interfaces import Refract, deflect, intersect
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Status, TiltedPlane
+from bstcad.optics.reach import STEEPEST, largest_deflection, wanted_slopes
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import to_first_net, trace
 from bstcad.tailoring.merit import landing
-from bstcad.tailoring.slope_fit import STEEPEST, Fit, fit_slopes, largest_deflection, tailor_to_aim, wanted_slopes
+from bstcad.tailoring.slope_fit import Fit, fit_slopes, tailor_to_aim
 from tests.tracing import stratified
 
 SQUARE = Rectangle(20.0, 20.0)

@@ -14,7 +14,7 @@ from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit
-from bstcad.tailoring.slope_map import _corners_of, face_grid, lit_window, slope_map, sloped
+from bstcad.tailoring.slope_map import corners_of, face_grid, lit_window, slope_map, sloped
 from tests.tracing import simulated
 
 SQUARE = Rectangle(20.0, 20.0)
@@ -97,8 +97,8 @@ def test_a_back_that_no_ray_is_found_to_is_one_sentence():
         lit_window(Point(position=(100.0, 0.0, 0.0)), lens)
 
 
-def test_the_corners_of_what_is_lit():
+def test_thecorners_of_what_is_lit():
     """x first and y upwards, though a picture has its rows first and y max on top."""
     picture = np.zeros((4, 4))
     picture[0, 2] = 1.0
-    assert np.argwhere(_corners_of(picture)).tolist() == [[2, 3], [2, 4], [3, 3], [3, 4]]
+    assert np.argwhere(corners_of(picture)).tolist() == [[2, 3], [2, 4], [3, 3], [3, 4]]

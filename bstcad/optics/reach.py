@@ -1,0 +1,115 @@
+"""Reach: where a face can send light, in closed form.
+
+A face of relative index η = n / n' > 1 turns a ray by θ' - θ, sin θ' = η sin θ.  The angle grows with θ, and at the
+critical angle, sin θ = 1 / η, where light leaves along the face, it is 90° - asin(1 / η): 48° at η = 1.4936.  A place
+of the face can send its light towards an aim if the angle between the two directions is less than that of a ray which
+leaves at GRAZING, and if the normal that the law asks for, parallel to η d - d', stands in a slope of at most STEEPEST.
+A mirror is bound by its slope alone.
+
+Which of the places sends its light there is for a map to say (tailoring/reachable.py).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bstcad.optics.interfaces import Law
+from bstcad.optics.kernels.reductions import total
+from bstcad.optics.lens import Lens
+from bstcad.optics.rays import Rays, TargetPlane, normal_of, way_to
+from bstcad.optics.sources import Source
+from bstcad.optics.tubes import rays_to
+
+GRAZING = math.radians(85)  # from the normal, in air; 0.2° from the critical angle in PMMA
+STEEPEST = math.tan(math.radians(70))  # slope; no tool reaches a steeper one, which makes the lens as thick as wide
+
+
+def largest_deflection(index: float, grazing: float = GRAZING) -> float:
+    """The angle (rad) by which a face turns a ray that leaves it at `grazing` (rad) from the normal."""
+    return grazing - math.asin(math.sin(grazing) / index)
+
+
+def grazing_of(index: float, others: Iterable[float], spread: float = 0.0) -> float:
+    """The angle (rad) to the normal, GRAZING at most, at which light may leave so that no other light is reflected.
+
+    others: relative indices for other lines of the light, of which the greatest meets its critical angle first; spread:
+    angle (rad) in the glass between a ray and the others that meet the face at the same place.
+    """
+    steepest = math.asin(math.sin(GRAZING) / max((index, *others)))  # of incidence, for the line that is bent most
+    return math.asin(index * math.sin(max(steepest - spread, 0.0)))
+
+
+def spread_at(source: Source, lens: Lens) -> float:
+    """The largest angle (rad) before the last freeform face, at its middle, between light from the middle of a source
+    and light from the ends of its extent; 0 for a point.
+    """
+    if source.extent is None:
+        return 0.0
+    a, b = source.extent.half_extent
+    x, y = torch.meshgrid(*[torch.tensor([-1e-3, 1e-3], dtype=torch.float64)] * 2, indexing="ij")
+    middle, *ends = (
+        rays_to(source.element(a * u, b * v).central, lens, x, y, number=lens.freeform[-1])[2].direction[:, 0, 0]
+        for u, v in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
+    )
+    return max(math.acos(min(float(total(middle * end)), 1.0)) for end in ends)
+
+
+def directions(at_face: Rays, aim: Tensor, plane: TargetPlane) -> tuple[Tensor, Tensor, Tensor]:
+    """(d, d', d · d') of rays at a face and towards aims (2, …) mm on the plane, both unit vectors (3, …)."""
+    out = way_to(at_face, aim, plane)
+    d, out = at_face.direction, out / torch.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
+    return d, out, d[0] * out[0] + d[1] * out[1] + d[2] * out[2]
+
+
+def wanted_slopes(at_face: Rays, aim: Tensor, plane: TargetPlane, law: Law) -> tuple[Tensor, Tensor]:
+    """(∂z/∂x, ∂z/∂y) that send each ray towards aim (2, …) mm on the plane.
+
+    Both laws say that η d - d' is parallel to the normal (-z_x, -z_y, 1), d and d' the directions before the face and
+    behind it.  Where no face can do that, the slope turns the ray towards the same side, as far as a ray that leaves at
+    GRAZING, and is no steeper than STEEPEST.
+    """
+    d, out, along = directions(at_face, aim, plane)
+    least = -1.0 if law.reverses else math.cos(largest_deflection(law.eta))
+    across = out - along * d
+    across = across / torch.sqrt(across[0] ** 2 + across[1] ** 2 + across[2] ** 2).clamp(min=1e-12)
+    out = torch.where(along < least, least * d + math.sqrt(1 - least * least) * across, out)
+    normal = at_face.sense * (law.eta * d - out)
+    height = torch.maximum(normal[2], torch.sqrt(normal[0] ** 2 + normal[1] ** 2) / STEEPEST)
+    return -normal[0] / height, -normal[1] / height
+
+
+def room(at_face: Rays, aim: Tensor, plane: TargetPlane, law: Law, grazing: float = GRAZING) -> Tensor:
+    """How far (a cosine) each ray is from the end of what a slope of the face can do to it: negative beyond.
+
+    The least of three: d · d' less the cosine of the largest deflection; n_z - |(n_x, n_y)| / STEEPEST of the normal
+    n = η d - d'; and the cosine to the plane's normal with which the light meets the plane from before it.
+    """
+    d, out, along = directions(at_face, aim, plane)
+    normal = at_face.sense * (law.eta * d - out)
+    upright = normal[2] - torch.sqrt(normal[0] ** 2 + normal[1] ** 2) / STEEPEST
+    n_x, n_y, n_z = normal_of(plane)
+    onwards = (-at_face.sense if law.reverses else at_face.sense) * (n_x * out[0] + n_y * out[1] + n_z * out[2])
+    least = torch.minimum(upright, onwards)
+    return least if law.reverses else torch.minimum(least, along - math.cos(largest_deflection(law.eta, grazing)))
+
+
+def unreached(picture: np.ndarray, part: np.ndarray, index: float | None) -> dict[str, float | None]:
+    """What lies outside of the part of a target that can be lit: its share of the area, and of the light of a picture.
+
+    angle: the largest (degrees) by which a face of the index turns light before it reflects it; None of a mirror.
+    """
+    angle = None if index is None else math.degrees(math.acos(1 / index))
+    return {"area": float(1 - part.mean()), "light": float(picture[~part].sum() / picture.sum()), "angle": angle}
+
+
+def restricted(picture: np.ndarray, part: np.ndarray | None) -> np.ndarray:
+    """A picture (rows, columns) of the same sum, dark but for the pixels in which `part` is True; None: itself."""
+    if part is None:
+        return picture
+    kept = np.where(part, picture, 0.0)
+    return kept * (picture.sum() / (kept.sum() or 1.0))

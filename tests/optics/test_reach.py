@@ -1,0 +1,88 @@
+"""Where a face can send light: the critical angle, the slope of a mirror, tilted planes, and the law itself."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from bstcad.optics.interfaces import Reflect, Refract, deflect
+from bstcad.optics.rays import Rays, TiltedPlane
+from bstcad.optics.reach import GRAZING, STEEPEST, grazing_of, largest_deflection, restricted, room, wanted_slopes
+
+INDEX = 1.4936
+GLASS = Refract(INDEX, 1.0)
+DISTANCE = 200.0
+
+
+def ray(direction=(0.0, 0.0, 1.0), sense=1, n=1):
+    """n rays at the origin."""
+    way = torch.tensor(direction, dtype=torch.float64)[:, None].expand(3, n)
+    alive = torch.zeros(n, dtype=torch.uint8)
+    return Rays(torch.zeros((3, n), dtype=torch.float64), way, torch.ones(n), alive, sense=sense)
+
+
+def at(*angles):
+    """Places (2, n) of the plane z = DISTANCE that are seen under these angles (degrees) from the origin."""
+    x = torch.tensor([DISTANCE * math.tan(math.radians(a)) for a in angles], dtype=torch.float64)
+    return torch.stack([x, torch.zeros_like(x)])
+
+
+def test_a_ring_about_the_largest_deflection_is_half_within_reach():
+    """Light along the axis: δ = θ' - asin(sin θ' / n) at θ' = 85°, 43.2° at n = 1.4936; 48° at the critical angle."""
+    most = math.degrees(largest_deflection(INDEX))
+    assert most == pytest.approx(43.16, abs=0.01) and most < math.degrees(math.acos(1 / INDEX)) < 48.0
+    turned = torch.linspace(0, 2 * math.pi, 13, dtype=torch.float64)[:-1]
+    for off, reached in ((-1e-3, True), (1e-3, False)):
+        radius = DISTANCE * math.tan(math.radians(most + off))
+        ring = radius * torch.stack([torch.cos(turned), torch.sin(turned)])
+        rest = room(ray(n=12), ring, DISTANCE, GLASS)
+        assert ((rest >= 0) == reached).all()
+
+
+@pytest.mark.parametrize(
+    "plane", [DISTANCE, TiltedPlane((30.0, -20.0, DISTANCE), (25.0, -40.0))], ids=["level", "tilted"]
+)
+@pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (0.3, -0.1, math.sqrt(0.9))], ids=["along the axis", "oblique"])
+def test_what_is_within_reach_is_what_snells_law_brings_there(plane, direction):
+    """Where there is room, the wanted slope sends the ray to its aim and it leaves short of GRAZING; elsewhere not."""
+    line = torch.linspace(-600.0, 600.0, 41, dtype=torch.float64)
+    aim = torch.stack([t.reshape(-1) for t in torch.meshgrid(line, line, indexing="ij")])
+    rays = ray(direction, n=aim.shape[1])
+    inside = room(rays, aim, plane, GLASS) > 1e-9
+    z_x, z_y = wanted_slopes(rays, aim, plane, GLASS)
+    hit = deflect(rays, z_x, z_y, GLASS)
+    way = hit.rays.direction
+    level = torch.stack([*aim, torch.full_like(aim[0], DISTANCE)])
+    point = level if plane == DISTANCE else torch.stack(plane.point(*aim))
+    arrives = ((way * point).sum(0) / point.norm(dim=0)) > 1 - 1e-12
+    assert 0.05 < inside.double().mean() < 0.9
+    assert arrives[inside].all() and (hit.cos_out[inside] >= math.cos(GRAZING) - 1e-9).all()
+    assert not (arrives & ~inside & hit.rays.alive & (hit.cos_out > math.cos(GRAZING) + 1e-9)).any()
+
+
+def test_a_mirror_reaches_as_far_as_its_slope():
+    """Light from above, thrown back by a slope of s: it leaves under twice the angle."""
+    steepest = math.degrees(math.atan(STEEPEST))
+    down = ray((0.0, 0.0, -1.0), sense=-1, n=3)
+    rest = room(down, at(0.0, 60.0, 89.0), DISTANCE, Reflect())
+    assert (rest >= 0).all() and steepest > 45.0  # twice 45° is level: all that lies above is within reach
+    assert float(room(down, at(10.0)[:, :1].expand(2, 3), -DISTANCE, Reflect()).max()) < 0  # behind the mirror
+
+
+def test_other_lines_and_a_source_of_some_size_take_from_the_reach():
+    """No other line may be reflected where the main one leaves, nor light that comes aslant to it."""
+    assert grazing_of(INDEX, [INDEX]) == pytest.approx(GRAZING, abs=1e-12)
+    blue = 1.51
+    angle = grazing_of(INDEX, [INDEX, blue])
+    assert math.sin(angle) / INDEX * blue == pytest.approx(math.sin(GRAZING))
+    aslant = grazing_of(INDEX, [INDEX], spread=math.radians(0.1))
+    inside = math.asin(math.sin(aslant) / INDEX) + math.radians(0.1)
+    assert INDEX * math.sin(inside) == pytest.approx(math.sin(GRAZING))
+
+
+def test_a_picture_keeps_its_light_on_the_part_within_reach():
+    picture, part = np.array([[0.5, 0.1], [0.1, 0.3]]), np.array([[True, False], [True, True]])
+    kept = restricted(picture, part)
+    assert kept.sum() == pytest.approx(1.0) and kept[0, 1] == 0 and kept[0, 0] / kept[1, 1] == pytest.approx(5 / 3)
+    assert restricted(picture, None) is picture
