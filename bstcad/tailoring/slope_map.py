@@ -120,9 +120,9 @@ class SlopeMap:
         """(∂z/∂x, ∂z/∂y) wanted at points (n,) of the back face (mm)."""
         sent = self.mapping(x.cpu().double().numpy(), y.cpu().double().numpy())
         beyond = (torch.from_numpy(np.ascontiguousarray(s)).to(x) for s in sent)
-        _, *gathering = self.gathering.relative_sag_and_slope(x, y)
-        g_x, g_y = (self.sign * s + g for s, g in zip(beyond, gathering, strict=True))
-        return g_x, g_y
+        _, *gathering = self.gathering.relative_sag_and_slope(x.cpu().double(), y.cpu().double())
+        z_x, z_y = (self.sign * s + g.to(x) for s, g in zip(beyond, gathering, strict=True))
+        return z_x, z_y
 
 
 def slope_map(
@@ -191,14 +191,14 @@ def gathering(grid: FaceGrid, lens: Lens, plane: TargetPlane, middle: tuple[floa
     """
     thin = tuple(slice(step // 2, None, step) for step in (max(1, n // SAMPLES) for n in grid.shape))
     faces = replace(grid.at_face, **{k: getattr(grid.at_face, k)[(..., *thin)] for k in ("position", "direction")})
-    x, y, _ = (p.double() for p in faces.position)
+    x, y, _ = faces.position
     aim = torch.stack([torch.full_like(x, m) for m in middle])
-    z_x, z_y = wanted_slopes(faces, aim.to(faces.position), plane, lens.last_freeform.law)
+    z_x, z_y = wanted_slopes(faces, aim, plane, lens.last_freeform.law)
     half_x, half_y = (REACH * size / 2 for size in (grid.window.width, grid.window.height))
-    flat = torch.zeros((GATHERING, GATHERING), dtype=x.dtype, device=x.device)
+    flat = torch.zeros((GATHERING, GATHERING), dtype=torch.float64)
     net = BSplineSurface(0.0, flat, (-half_x, half_x), (-half_y, half_y))
-    lit = (grid.density[thin] > 0).to(x)
-    return fit_slopes(net, *(p.reshape(-1).to(x) for p in (x, y, z_x, z_y)), weight=lit.reshape(-1), fit=GATHERED)
+    samples = (p.reshape(-1).cpu().double() for p in (x, y, z_x, z_y, grid.density[thin] > 0))
+    return fit_slopes(net, *samples, fit=GATHERED)
 
 
 def between(grid: FaceGrid, values: Tensor, b: tuple) -> Tensor:
