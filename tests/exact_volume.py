@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 from scipy.interpolate import BSpline, NdBSpline
 
-from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
+from bstcad.optics.bspline import DEGREE, BSplineSurface, knots, parameter
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.quadrature import gauss_rule, rim_breaks
@@ -19,7 +20,7 @@ def exact_volume(lens: Lens) -> float:
 
 
 def integral(face: Surface, outline: Outline) -> float:
-    """∫∫ (z - z0) dx dy over the outline (mm³); a net ends at the sides of a rectangle.
+    """∫∫ (z - z0) dx dy over the outline (mm³).
 
     Of a surface of revolution over a disc of radius a, with the sag h at its rim, pi h (3 a² - (1 + k) h²) / 6; over a
     rectangle by 96 x 96 Gauss points, exact to rounding up to a half diagonal of 0.95 R.
@@ -27,7 +28,8 @@ def integral(face: Surface, outline: Outline) -> float:
     if face.is_net:
         if outline.is_round:
             return _over_disc(face, outline.radius)
-        across, along = (_weights(face.m, pitch) for pitch in face.pitch)  # Σ_i Σ_j w_i w_j h_ij
+        axes = zip(face.shape, (face.x, face.y), outline.half_extent, strict=True)
+        across, along = (_weights(m, ends, half) for m, ends, half in axes)  # Σ_i Σ_j w_i w_j h_ij
         return float((across[:, None] * face.plain().heights.numpy() * along).sum())
     face, (a, b) = face.plain().moved(0.0), outline.half_extent
     if outline.is_round:
@@ -38,12 +40,16 @@ def integral(face: Surface, outline: Outline) -> float:
     return float(a * b * (weight[:, None] * h * weight).sum())
 
 
-def _weights(m: int, pitch: float) -> np.ndarray:
-    """∫ B_i dx (m,) in mm, x(t) = pitch Σ j B_j(t): a cubic in each span, so two Gauss points are exact."""
+def _weights(m: int, ends: tuple[float, float], half: float) -> np.ndarray:
+    """∫ B_i dx (m,) in mm from -half to half, x(t) = Σ x_j B_j(t): cubic in each span, which two Gauss points hold."""
+    position = BSpline(knots(m), np.linspace(*ends, m), DEGREE)
+    places = torch.tensor([-half, half], dtype=torch.float64)
+    low, high = parameter(((places - ends[0]) * (m - 1) / (ends[1] - ends[0])).clamp(0.0, m - 1.0), m).tolist()
+    breaks = np.unique([low, *(k for k in range(m - 1) if low < k < high), high])
     point, weight = gauss_rule(2)
-    t = (np.arange(m - 2)[:, None] + (point + 1) / 2).ravel()
-    position = BSpline(knots(m), pitch * np.arange(m), DEGREE)
-    dx = position(t, 1) * np.tile(weight / 2, m - 2)
+    width = np.diff(breaks)[:, None]
+    t = (breaks[:-1, None] + width * (point + 1) / 2).ravel()
+    dx = position(t, 1) * (width * weight / 2).ravel()
     return BSpline.design_matrix(t, knots(m), DEGREE).T @ dx
 
 
