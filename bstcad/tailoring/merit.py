@@ -158,7 +158,7 @@ def local_weight(source: Source, lens: Lens, target: np.ndarray, screen: Screen,
     irradiance = map_coordinates(picture, [row - 0.5, column - 0.5], order=1, mode="nearest")
     logarithm = np.where(seen, np.log(np.maximum(irradiance, MOST**-4)), 0.0)
     weight = np.clip(np.exp(-0.5 * gaussian_filter(logarithm, SMOOTH)), 1 / MOST, MOST)
-    if number == lens.freeform[-1]:
+    if number == lens.freeform[-1] and onwards[0].law.eta > 1:
         further = _further(at_net, landed.position, screen.plane, law=onwards[0].law, seen=seen)
         if further is not None:
             weight = weight / np.exp(gaussian_filter(np.log(further), SMOOTH))
