@@ -88,7 +88,7 @@ def same_front(one: Surface, other: Surface) -> bool:
 
 LARGE = 100e6  # bytes of lens.step from which on they are said before a design
 STATEMENT = len("# = CARTESIAN_POINT('',(,,));\n") + len("#,")  # besides numbers; and the reference to it
-REST = 45_000, 560  # bytes of the other statements, and of those along the rim for each control point of a side
+REST = 103_000, 1600  # bytes of the other statements, and of those along the rim for each control point of a side
 
 
 def step_size(scene: scenes.Scene, net: Sides | None = None) -> float:

@@ -202,7 +202,7 @@ def test_what_is_wrong_and_what_is_doubted():
     scene = bstcad.load("templates/caustic_portrait.toml").changed(PLATE)
     [_] = scene.warnings()  # of a cropped picture
     _, doubt = sorted(scene.changed({"lens.back.control_points": 33}).warnings(), reverse=True)
-    assert doubt.startswith("lens.back.control_points: cells of 1.25 x 0.312 mm; [65, 17] makes them square")
+    assert doubt.startswith("lens.back.control_points: cells of 1.43 x 0.357 mm; [65, 17] makes them square")
     disc = {"lens.outline": {"shape": "circle", "radius": 5.0}, "source.aperture": {"shape": "circle", "radius": 5.0}}
     with pytest.raises(SceneError, match="a round lens takes a square net, not one of 65 x 17"):
         scene.changed(disc)
