@@ -190,7 +190,7 @@ def with_heights(heights: np.ndarray) -> Lens:
     """The lens of PEER whose exit face is Mitsuba's mesh of heights (n, n) in mm, y along the first axis."""
     net = control_net(heights)
     flat = load(TEMPLATES / f"{PEER}.toml").flat_lens(len(net))
-    half = flat.back.x[1] * (1 + 1 / (len(heights) - 1))  # the net reaches half a pitch beyond the mesh
+    half = flat.outline.half_extent[0] * (1 + 1 / (len(heights) - 1))  # the net reaches half a pitch beyond the mesh
     return replace(
         flat, back=replace(flat.back, heights=torch.from_numpy(net.T.copy()), x=(-half, half), y=(-half, half))
     )
