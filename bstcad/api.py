@@ -124,15 +124,17 @@ class Design:
         """The design of another lens for the same source and target, to verify and to write; this one stays as it is.
 
         lens: of the scene's outline and index (at the main wavelength), a mirror where the scene has a mirror, its net
-        as wide as this design's; brought to float64 on the CPU.  Another front and another number of control points
-        go into the new design's scene; losses stay those of the scene's [[effects]].  Nothing is claimed of how the
-        lens was found: there are no stages, no history and no transport map, and the report says "changed by hand".
+        as wide as the scene's of as many points; brought to float64 on the CPU.  Another front and another number of
+        control points go into the new design's scene; losses stay those of the scene's [[effects]].  Nothing is
+        claimed of how the lens was found: there are no stages, no history and no transport map, and the report says
+        "changed by hand".
         SceneError names the property of a lens that does not fit.
         """
         scene, lens = _fitting(lens, self._made.scene, self.lens.front)
         made = replace(
-            self._made, scene=scene, lens=scene.as_mounted(lens), making=Making(stopped=BY_HAND), transport=None
-        )
+            self._made, scene=scene, lens=scene.as_mounted(lens), making=Making(stopped=BY_HAND), transport=None,
+            compared=None,
+        )  # fmt: skip
         return Design(made)
 
     def with_heights(self, heights: Any) -> Design:

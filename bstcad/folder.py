@@ -59,13 +59,13 @@ class Made:
     making: Making = Making()  # stages, history and machine, for the report
     device: str = "cpu"  # of the design
     transport: TransportMap | None = None  # the map of stage 1; None for a lens of the user's own, or if not known
+    reachable: np.ndarray | None = None  # (rows, columns) the pixels that light can reach; None: all that are to be lit
     # what `making` is with float32 beside float64, which only a report tells; None: it has it, or nothing is to be told
     compared: Callable[[], Making] | None = None
 
     def told(self) -> Made:
         """The same with all that a report tells."""
         return self if self.compared is None else replace(self, making=self.compared(), compared=None)
-    reachable: np.ndarray | None = None  # (rows, columns) the pixels that light can reach; None: all that are to be lit
 
     def is_lens_of(self, other: Made) -> bool:
         """Is it the same lens, to the last bit, for the same light and picture?"""

@@ -2,6 +2,7 @@
 
 import inspect
 import io
+import re
 import subprocess
 import sys
 import types
@@ -12,6 +13,7 @@ from rich.console import Console
 
 import bstcad
 from bstcad import cli
+from bstcad import folder as folders
 from bstcad.runs import progress
 
 ROOT = Path(__file__).parent.parent
@@ -23,6 +25,7 @@ class FakeCommands(types.ModuleType):
 
     def __init__(self):
         super().__init__("bstcad.commands")
+        self.folders = folders
         self.calls = []
         self.passed = True
         self.error = None
@@ -65,6 +68,13 @@ def test_the_exit_code_is_the_verdict_and_every_check_is_listed_when_asked(comma
         out, err = capsys.readouterr()
         assert f"verdict {passed}" in out and ("every check" in out) is bool(option)
         assert ("stage 1: 2/2, RRMSD 0.25" in err) is (command[0] == "generate")
+
+
+@pytest.mark.parametrize(("points", "size"), [(65, None), (2049, r"about \d+ MB for 2049 x 2049 control points")])
+def test_a_large_file_is_said_before_the_design(commands, capsys, points, size):
+    assert cli.run(["generate", THU, "--set", f"lens.back.control_points={points}"]) == 0
+    before, stage, _ = capsys.readouterr().err.partition("stage 1")
+    assert stage and (re.search(f"lens.step will take {size}", before) if size else "lens.step" not in before)
 
 
 def test_options_reach_the_commands(commands, tmp_path):

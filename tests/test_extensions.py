@@ -78,6 +78,9 @@ def test_a_surface_that_no_net_comes_near_is_refused(scene):
 
 
 def test_a_merit_of_its_own_is_made_less_than_by_rrmsd(scene):
+    """Of a letter on black, which 33 x 33 control points cannot draw: what is left over can be had in two ways."""
+    scene = scene.changed({"target.uniform": None, "target.outline": None, "target.text": "L"})
+
     def relative(picture, target):
         weight = 1 / (target + 0.1 * target.mean())
         return (weight * (picture - target) ** 2).sum() / (weight * target**2).sum()
@@ -88,7 +91,7 @@ def test_a_merit_of_its_own_is_made_less_than_by_rrmsd(scene):
         channels, screen = made.scene.channels(), made.scene.target.screen
         picture = bstcad.RayTubes.launched(made.lens, channels, 192).picture(made.lens, screen)
         merits.append(float(relative(picture / picture.sum(), torch.from_numpy(made.target))))
-    assert merits[1] < merits[0]
+    assert merits[1] < 0.9 * merits[0]
 
 
 def test_checks_and_sections_of_a_script_join_verdict_and_page(design, monkeypatch):
@@ -145,7 +148,7 @@ def test_a_judge_of_a_script_is_heard(design, wrong, monkeypatch):
 def test_the_picture_of_tubes_has_the_gradient_of_its_differences(design):
     lens, channels, screen = design.lens, design.scene.channels(), design.scene.target.screen
     target = torch.from_numpy(design.target)
-    tubes = bstcad.RayTubes.launched(lens, channels, 96)
+    tubes = bstcad.RayTubes.launched(lens, channels, 97)  # odd: no tube ends at x = 0, as pixels do
 
     def merit(heights):
         picture = tubes.picture(lens.with_heights([heights]), screen)
@@ -153,13 +156,11 @@ def test_the_picture_of_tubes_has_the_gradient_of_its_differences(design):
 
     heights = lens.back.heights.clone().requires_grad_()
     merit(heights).backward()
-    along = torch.zeros_like(lens.back.heights)  # rays on the rim, where the net ends, have a derivative to each side
-    inner = (slice(4, -4), slice(4, -4))
-    along[inner] = torch.randn(along[inner].shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    along = torch.randn(heights.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     step = 1e-7  # mm
     with torch.no_grad():
         difference = (merit(heights + step * along) - merit(heights - step * along)) / (2 * step)
-    assert float((heights.grad * along).sum()) == pytest.approx(float(difference), rel=1e-5)
+    assert float((heights.grad * along).sum()) == pytest.approx(float(difference), rel=1e-6)
 
 
 def test_the_picture_is_upright_for_the_side_that_the_scene_names(design):
