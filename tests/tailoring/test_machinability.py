@@ -47,13 +47,11 @@ def bound():
 def steepest(lens):
     """Largest slope, and largest curvature of a valley and a ridge (1/mm), by slopes of places a little apart.
 
-    Four places a knot span, inside of it; nothing here is what tailoring reckons with.
+    On the rectangle of glass, some four places a knot span; nothing here is what tailoring reckons with.
     """
     back, e = lens.back, 1e-6
-    ends = ((low + (high - low) / (4 * (back.m - 1)) * 0.37, high, 4 * (back.m - 1)) for low, high in (back.x, back.y))
-    x, y = (
-        p.flatten() for p in torch.meshgrid(*(torch.linspace(a, b - e, n).double() for a, b, n in ends), indexing="ij")
-    )
+    lines = (torch.linspace(e - half, half, 4 * back.m, dtype=torch.float64) for half in lens.outline.half_extent)
+    x, y = (p.flatten() for p in torch.meshgrid(*lines, indexing="ij"))
     _, p, q = back.sag_and_slope(x, y)
     (_, p_x, q_x), (_, p_y, q_y) = back.sag_and_slope(x - e, y), back.sag_and_slope(x, y - e)
     r, s, t = (p - p_x) / e, ((q - q_x) + (p - p_y)) / (2 * e), (q - q_y) / e
@@ -106,7 +104,8 @@ def test_a_tool_of_50_mm_fits_and_the_picture_stays(free, bound):
     lens = bound[0].lens
     assert steepest(free.lens)[1] > 1.2 / 50 and steepest(lens)[1] <= 1 / 50
     judged = {stage.name: stage.rrmsd for stage in bound[0].making.stages}
-    assert judged["bounds on the back"] < 0.01  # 0.0035, and 0.0021 without; the first lens with them has 0.05
+    without = free.making.stages[-1].rrmsd
+    assert judged["bounds on the back"] < 1.1 * without < 0.015  # 0.0105, and 0.0108; stage 1 leaves 0.046
 
 
 def test_it_goes_on_from_where_it_was_left(bound, tmp_path):

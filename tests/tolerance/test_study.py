@@ -155,7 +155,7 @@ def studied(small_design, tmp_path_factory):
     said, quick = io.StringIO(), tolerancing.tolerance
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said):
         patch.setattr(tolerancing, "tolerance", lambda *a, **k: quick(*a, **k, tubes=TUBES, full=10, trials=500))
-        assert cli.run(["tolerance", str(folder), "--yield", "90", "--grade", "precise"]) == 0
+        assert cli.run(["tolerance", str(folder), "--yield", "90", "--grade", "moulded"]) == 0
     return folder, said.getvalue()
 
 
