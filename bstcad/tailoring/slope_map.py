@@ -36,7 +36,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, TargetPlane
-from bstcad.optics.reach import wanted_slopes
+from bstcad.optics.reach import room, wanted_slopes
 from bstcad.optics.sides import Sides, both
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import across, clear_window, gets_through
@@ -53,6 +53,7 @@ FLOOR = 1e-3  # of the mean slope density: flux that may be spent on black parts
 GATHERING, SAMPLES = 33, 96  # control points a side of g, and about as many places each way that it is fitted to
 REACH = (GATHERING - 1) / (GATHERING - 5)  # of g over the window: its end spans lie beyond
 GATHERED = Fit(bending=1e-3, steps=40, degree=5)
+ROUGHLY = Fit(steps=0, degree=2)  # a paraboloid, where no face gathers the light
 TARGET_FLOOR = 1e-3  # of the mean: flux that the map may spend on black parts
 
 
@@ -185,7 +186,7 @@ def centroid(picture: np.ndarray, screen: Screen) -> tuple[float, float]:
 
 
 def gathering(grid: FaceGrid, lens: Lens, plane: TargetPlane, middle: tuple[float, float]) -> BSplineSurface:
-    """g: the net of GATHERING points a side whose slopes come nearest to p(b, m) over the lit part of a grid.
+    """g: the net of GATHERING points a side with slopes nearest to p(b, m) over the lit part of a grid.
 
     With the sag frozen p(b, m) is a gradient but for a curl of the order ∂p/∂z x y; ∇g is one.
     """
@@ -197,8 +198,10 @@ def gathering(grid: FaceGrid, lens: Lens, plane: TargetPlane, middle: tuple[floa
     half_x, half_y = (REACH * size / 2 for size in (grid.window.width, grid.window.height))
     flat = torch.zeros((GATHERING, GATHERING), dtype=torch.float64)
     net = BSplineSurface(0.0, flat, (-half_x, half_x), (-half_y, half_y))
-    samples = (p.reshape(-1).cpu().double() for p in (x, y, z_x, z_y, grid.density[thin] > 0))
-    return fit_slopes(net, *samples, fit=GATHERED)
+    lit = grid.density[thin] > 0
+    able = room(faces, aim, plane, law=lens.last_freeform.law) >= 0  # of the others the slope is a makeshift
+    samples = (p.reshape(-1).cpu().double() for p in (x, y, z_x, z_y, lit))
+    return fit_slopes(net, *samples, fit=GATHERED if bool(able[lit].all()) else ROUGHLY)
 
 
 def between(grid: FaceGrid, values: Tensor, b: tuple) -> Tensor:

@@ -100,7 +100,7 @@ def _aside(near: float) -> dict[str, Any]:
 
 DESIGNS: dict[str, Hard] = {
     "one bright pixel": Hard("disk", _PICTURE, one_pixel, rrmsd=0.13, says=(MOVED, MISSES, SIDES, CLOSE, LIFTED)),
-    "checkerboard 1 : 1000": Hard("disk", _PICTURE, checkerboard, rrmsd=0.18, says=(MISSED, MISSES, SIDES, LIFTED)),
+    "checkerboard 1 : 1000": Hard("disk", _PICTURE, checkerboard, rrmsd=0.2, says=(MISSED, MISSES, SIDES, LIFTED)),
     "thin ring": Hard("disk", _PICTURE, ring, rrmsd=0.06, says=(MISSES, SIDES, LIFTED), bench=True),
     "two islands": Hard("disk", _PICTURE, islands, rrmsd=0.15, efficiency=0.98,
                         says=(MOVED, MISSED, MISSES, SIDES, OUTSIDE, CLOSE, LIFTED), bench=True),
@@ -115,8 +115,10 @@ DESIGNS: dict[str, Hard] = {
     "source 5 mm before": Hard("disk", {"source.position": [0.0, 0.0, 10.0]}, rrmsd=0.12, says=(MOVED, SIDES, LIFTED),
                                bench=True),
     "source 500 mm before": Hard("disk", {"source.position": [0.0, 0.0, -485.0]}, rrmsd=0.02, bench=True),
-    "index 1.05": Hard("disk", {**_PICTURE, "lens.index": 1.05}, rrmsd=0.19, efficiency=0.95,
-                       says=(CHANGED, MISSED, MISSES, SIDES)),
+    "index 1.05": Hard(  # more rounds come nearer to the picture, with less of the light
+        "disk", {**_PICTURE, "lens.index": 1.05}, rrmsd=0.19, efficiency=0.95, rough={"tailoring.rounds": 3},
+        says=(CHANGED, MISSED, MISSES, SIDES), perhaps=(OUTSIDE, "would need a back steeper"),
+    ),
     "index 1.05, a target it cannot reach": Hard(  # without a surface for it each round ends elsewhere
         "disk", {"lens.index": 1.05}, rrmsd=0.6, efficiency=0.9, rough={"tailoring.rounds": 3},
         says=(MOVED, MISSED, MISSES, SIDES, OUTSIDE, LIFTED), perhaps=(CLOSE, STEEP, DARK), bench=True,
