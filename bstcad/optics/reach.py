@@ -83,6 +83,26 @@ def wanted_slopes(at_face: Rays, aim: Tensor, plane: TargetPlane, law: Law) -> t
     return -normal[0] / height, -normal[1] / height
 
 
+def kept_from_reflection(
+    at_face: Rays, slopes: tuple[Tensor, Tensor], law: Law, grazing: float = GRAZING
+) -> tuple[Tensor, Tensor]:
+    """Slopes (∂z/∂x, ∂z/∂y) at which no ray leaves a refracting face further than `grazing` (rad) from the normal.
+
+    A normal that stands too far from the ray is turned towards it, in their common plane; all others stay.
+    """
+    if law.reverses or law.eta <= 1:
+        return slopes
+    z_x, z_y = slopes
+    d, most = at_face.sense * at_face.direction, math.asin(math.sin(grazing) / law.eta)
+    normal = torch.stack([-z_x, -z_y, torch.ones_like(z_x)]) / torch.sqrt(1 + z_x * z_x + z_y * z_y)
+    along = d[0] * normal[0] + d[1] * normal[1] + d[2] * normal[2]
+    across = normal - along * d
+    across = across / torch.sqrt(across[0] ** 2 + across[1] ** 2 + across[2] ** 2).clamp(min=1e-12)
+    turned = math.cos(most) * d + math.sin(most) * across
+    beyond = (along < math.cos(most)) & (turned[2] > 0)
+    return torch.where(beyond, -turned[0] / turned[2], z_x), torch.where(beyond, -turned[1] / turned[2], z_y)
+
+
 def room(at_face: Rays, aim: Tensor, plane: TargetPlane, law: Law, grazing: float = GRAZING) -> Tensor:
     """How far (a cosine) each ray is from the end of what a slope of the face can do to it: negative beyond.
 

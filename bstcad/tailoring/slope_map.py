@@ -36,7 +36,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, TargetPlane
-from bstcad.optics.reach import room, wanted_slopes
+from bstcad.optics.reach import GRAZING, kept_from_reflection, room, wanted_slopes
 from bstcad.optics.sides import Sides, both
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import across, clear_window, gets_through
@@ -158,8 +158,13 @@ def _moved(picture: np.ndarray, before: tuple[np.ndarray, np.ndarray], now: tupl
     return float(np.sqrt(np.mean(x * x + y * y)))
 
 
-def sloped(lens: Lens, wanted: SlopeMap, grid: FaceGrid, fit: Fit, unlit: float, parts: int = 1) -> Lens:
+def sloped(
+    lens: Lens, wanted: SlopeMap, grid: FaceGrid, fit: Fit, unlit: float, parts: int = 1, grazing: float = GRAZING
+) -> Lens:
     """The lens whose last net has the wanted slopes where light meets it, by least squares; it keeps its vertex.
+
+    A map may send some light beyond what the face reaches, into the black around a picture: that light has to leave at
+    `grazing` (rad).
 
     Where no light falls the slopes it has now are wanted with the weight `unlit`; zero leaves that part to the bending.
     parts: places at which slopes are wanted in each cell of the grid, each way.
@@ -170,7 +175,9 @@ def sloped(lens: Lens, wanted: SlopeMap, grid: FaceGrid, fit: Fit, unlit: float,
     lit = (grid.density > 0).repeat_interleave(parts, 0).repeat_interleave(parts, 1).reshape(-1)
     net = lens.nets[-1]
     _, now_x, now_y = net.relative_sag_and_slope(x, y)
-    z_x, z_y = (torch.where(lit, s, now) for s, now in zip(wanted.slopes(x, y), (now_x, now_y), strict=True))
+    arriving = rays_at(grid, (x.cpu().numpy(), y.cpu().numpy()))
+    slopes = kept_from_reflection(arriving, wanted.slopes(x, y), lens.last_freeform.law, grazing)
+    z_x, z_y = (torch.where(lit, s, now) for s, now in zip(slopes, (now_x, now_y), strict=True))
     weight = torch.where(lit, 1.0, unlit).to(x)
     return lens.with_last_net(
         fit_slopes(net, x, y, z_x=z_x, z_y=z_y, weight=weight, fit=fit).from_vertex().moved(net.z)

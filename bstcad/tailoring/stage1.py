@@ -18,6 +18,7 @@ from bstcad.optics import sampling
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays
+from bstcad.optics.reach import GRAZING
 from bstcad.optics.sides import both
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import clear_window, trace
@@ -131,7 +132,8 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[
     sides = [min(2 * points, knobs.rays) for points in both(m)]
     parts = math.ceil(max(sides) / LIT)
     grid = face_grid(source, lens, window, (math.ceil(sides[0] / parts), math.ceil(sides[1] / parts)))
-    return sloped(lens, wanted, grid, *(FINE if left <= FINE_ROUNDS else COARSE), parts), wanted
+    grazing = GRAZING if task.edge is None else task.edge.angle
+    return sloped(lens, wanted, grid, *(FINE if left <= FINE_ROUNDS else COARSE), parts, grazing), wanted
 
 
 def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numba import njit, prange
@@ -14,6 +15,8 @@ from bstcad.transport.density import Density, gradient_at_corners
 from bstcad.transport.monge_ampere import MongeAmpere, climb, corners
 
 FLOOR = 1e-3  # of the mean: a darker target is lifted to this, since no gradient of a convex function can avoid a hole
+ROUGH = 0.01  # mass error above which the solve begins anew with a higher floor
+FALLING = (0.03, 0.01, 0.003)  # of the mean: floors of that solve, before FLOOR
 COARSE = 64  # cells a side up to which the back-and-forth method runs; Newton takes over from there
 NEWTON_STEPS = 8  # the most on each grid
 NODES = 257  # the most points a side of a TransportMap: 0.5 MB
@@ -112,15 +115,24 @@ def solve(
 
     iterations: of the back-and-forth method, on each of its grids.  tolerance: mass error (mean |F - nu|, both of
     mean 1) at which the solve has converged; where the grid allows no less, `transport.reason` is "plateau".
-    A target with zeros is lifted to FLOOR of its mean; `mapping.target` is the lifted one.
+    A target with zeros is lifted to FLOOR of its mean; `mapping.target` is the lifted one.  Where a bright rim ends in
+    black, Newton's first step on a grid would fold the map: there the floor is high first, and falls on the last grid.
     """
-    target = target.lifted(FLOOR)
-    grids = ladder(source, target, COARSE)
-    phi = back_and_forth(*grids[0], iterations=iterations, tolerance=tolerance, progress=progress).phi
-    phi, errors, reason = climb(
-        grids, phi * grids[0][0].n ** 2, steps=NEWTON_STEPS, tolerance=tolerance, progress=progress
-    )
-    n = source.n
+    newton = partial(climb, steps=NEWTON_STEPS, tolerance=tolerance, progress=progress)
+
+    def climbed(floor: float) -> tuple[np.ndarray, list[float], str]:
+        grids = ladder(source, target.lifted(floor), COARSE)
+        phi = back_and_forth(*grids[0], iterations=iterations, tolerance=tolerance, progress=progress).phi
+        return newton(grids, phi * grids[0][0].n ** 2)
+
+    phi, errors, reason = climbed(FLOOR)
+    if errors[-1] > ROUGH:
+        other, *_ = climbed(FALLING[0])
+        for floor in (*FALLING[1:], FLOOR):
+            other, left, why = newton([(source, target.lifted(floor))], other, smoothing=0.0)
+        if left[-1] < errors[-1]:
+            phi, errors, reason = other, left, why
+    target, n = target.lifted(FLOOR), source.n
     half = half_square(n)
     u = legendre(half - phi)
     dual = float(((half - u) * source.values).mean() + (phi * target.values).mean()) / n**2

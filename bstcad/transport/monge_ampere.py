@@ -83,15 +83,17 @@ def climb(
     steps: int,
     tolerance: float,
     progress: Callable[[Step], None] | None = None,
+    smoothing: float = SMOOTHING,
 ) -> tuple[np.ndarray, list[float], str]:
     """Newton on each rung of (source, target), from phi (cell units) on the first.
 
-    Returns phi (cell units), the mass errors on the last rung and why it stopped there.
+    smoothing: width (cells) of the Gaussian blur of phi before each.  Returns phi (cell units), the mass errors on the
+    last rung and why it stopped there.
     """
     for k, (source, target) in enumerate(ladder):
         if k:
             phi = prolong(phi)
-        phi = gaussian_filter(phi, SMOOTHING, mode="nearest")
+        phi = gaussian_filter(phi, smoothing, mode="nearest") if smoothing else phi
         with threads(source.n):
             phi, errors, reason = _newton_steps(
                 MongeAmpere(source, target), phi, steps=steps, tolerance=tolerance, progress=progress

@@ -8,7 +8,16 @@ import torch
 
 from bstcad.optics.interfaces import Reflect, Refract, deflect
 from bstcad.optics.rays import Rays, TiltedPlane
-from bstcad.optics.reach import GRAZING, STEEPEST, grazing_of, largest_deflection, restricted, room, wanted_slopes
+from bstcad.optics.reach import (
+    GRAZING,
+    STEEPEST,
+    grazing_of,
+    kept_from_reflection,
+    largest_deflection,
+    restricted,
+    room,
+    wanted_slopes,
+)
 
 INDEX = 1.4936
 GLASS = Refract(INDEX, 1.0)
@@ -38,6 +47,27 @@ def test_a_ring_about_the_largest_deflection_is_half_within_reach():
         ring = radius * torch.stack([torch.cos(turned), torch.sin(turned)])
         rest = room(ray(n=12), ring, DISTANCE, GLASS)
         assert ((rest >= 0) == reached).all()
+
+
+@pytest.mark.parametrize("sense", [1, -1])
+@pytest.mark.parametrize("law", [GLASS, Reflect()], ids=["glass", "mirror"])
+def test_slopes_that_would_reflect_all_are_turned_back_to_grazing_light(law, sense):
+    """Beyond the angle light leaves at it, in the plane of ray and normal as before; all other slopes stay."""
+    generator = torch.Generator().manual_seed(3)
+    z_x, z_y = 1.2 * torch.randn((2, 400), dtype=torch.float64, generator=generator)
+    rays = ray((0.2, -0.1, sense * math.sqrt(0.95)), sense=sense, n=400)
+    kept = kept_from_reflection(rays, (z_x, z_y), law)
+    before, after = (deflect(rays, *slopes, law) for slopes in ((z_x, z_y), kept))
+    moved = (kept[0] != z_x) | (kept[1] != z_y)
+    assert after.rays.alive.all()
+    if law is not GLASS:
+        assert not moved.any()
+        return
+    assert 0.1 < moved.double().mean() < 0.9 and (before.cos_out[~moved] >= math.cos(GRAZING) - 1e-9).all()
+    assert after.cos_out[moved] == pytest.approx(math.cos(GRAZING), abs=1e-9)
+    d = rays.direction[:, moved]
+    normals = [torch.stack([-x[moved], -y[moved], torch.ones_like(x[moved])]) for x, y in ((z_x, z_y), kept)]
+    assert torch.linalg.cross(d, normals[0], dim=0).mul(normals[1]).sum(0).abs().max() < 1e-9
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,18 @@ def test_a_smooth_picture_is_delivered_to_its_pixels():
     assert rrmsd(delivered(mapping, 64, 20), target) < 0.012  # of it 0.006 are the 256 points a pixel
 
 
+def test_a_bright_rim_that_ends_in_black_is_reached():
+    """A disc as bright as 1 / (1 - r²), as light near the critical angle asks for: Newton's first step folds the map."""
+    target = Density.from_function(lambda x, y: edge(4 * ((x - 0.5) ** 2 + (y - 0.5) ** 2)), 256)
+    source = Density.from_function(lambda x, y: np.ones_like(x), 256)
+    assert mass_error(solve(source, target)) < 0.03  # 0.055 with the low floor from the start
+
+
+def edge(square):
+    """1 / (1 - square), dark from 0.98 on."""
+    return np.where(square < 0.98, 1 / (1 - np.minimum(square, 0.98)), 0.0)
+
+
 def test_the_two_maps_undo_each_other(letter):
     x, y = np.random.default_rng(2).random((2, 5000))
     inside = disc(x, y) > 0
