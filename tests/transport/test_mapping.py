@@ -108,7 +108,7 @@ def test_a_smooth_picture_is_delivered_to_its_pixels():
 
 
 def test_a_bright_rim_that_ends_in_black_is_reached():
-    """A disc as bright as 1 / (1 - r²), as light near the critical angle asks for: Newton's first step folds the map."""
+    """A disc as bright as 1 / (1 - r²), as light near the critical angle asks for: a first step folds the map."""
     target = Density.from_function(lambda x, y: edge(4 * ((x - 0.5) ** 2 + (y - 0.5) ** 2)), 256)
     source = Density.from_function(lambda x, y: np.ones_like(x), 256)
     assert mass_error(solve(source, target)) < 0.03  # 0.055 with the low floor from the start
