@@ -51,7 +51,7 @@ SUBPIXELS = 8  # parts of a pixel in each transport cell, each way; at least one
 FLOOR = 1e-3  # of the mean slope density: flux that may be spent on black parts
 GATHERING, SAMPLES = 33, 96  # control points a side of g, and about as many places each way that it is fitted to
 REACH = (GATHERING - 1) / (GATHERING - 5)  # of g over the window: its end spans lie beyond
-GATHERED = Fit(bending=1e-3, steps=24, degree=5)
+GATHERED = Fit(bending=1e-3, steps=40, degree=5)
 ROUGHLY = Fit(steps=0, degree=2)  # a paraboloid, where no face gathers the light
 TARGET_FLOOR = 1e-3  # of the mean: flux that the map may spend on black parts
 
