@@ -96,12 +96,12 @@ class TestOwnSurfaces:
         design = made.with_lens(lens)
         assert made.transport is not None and design.transport is None and "changed by hand" in repr(design)
         report = design.write(tmp_path / "own", progress=False)
-        scene, effort = made.scene, Effort(512, seed=5)
+        scene, effort = made.scene, Effort(2048, seed=5)
         theirs, ours = (
             bstcad.measure(one, scene.channels(), scene.target.screen, made.target, effort).rrmsd
             for one in (made.lens, lens)
         )
-        assert report.rrmsd == pytest.approx(ours, rel=0.02) and ours > 1.05 * theirs
+        assert report.rrmsd == pytest.approx(ours, abs=3 * report.rrmsd_noise) and ours > 1.05 * theirs
         facts = report.facts
         assert [stage["name"] for stage in facts["stages"]] == ["write", "verify", "report"]
         assert facts["stopped"] == "by hand" and all(point["seconds"] < 600 for point in facts["history"])

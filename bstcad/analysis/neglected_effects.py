@@ -235,11 +235,14 @@ class Spline:
 
 def zoomed(field: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """(rows, columns) in pixels of a field in cells of the target, linear between the middles of the cells."""
-    weights = []  # (pixels, cells) of the cells in each pixel, along one axis
-    for cells, pixels in zip(field.shape, shape, strict=True):
+    for axis, pixels in enumerate(shape):
+        cells = field.shape[axis]
         at = ((np.arange(pixels) + 0.5) / pixels * cells - 0.5).clip(0, cells - 1)
-        weights.append(np.clip(1 - np.abs(at[:, None] - np.arange(cells)), 0, None))
-    return weights[0] @ field @ weights[1].T
+        low = at.astype(int)
+        share = (at - low).reshape((-1, 1) if axis == 0 else (1, -1))
+        below, above = (field.take(cell, axis) for cell in (low, (low + 1).clip(max=cells - 1)))
+        field = below + share * (above - below)
+    return field
 
 
 def blurred(picture: np.ndarray, sigma: float) -> np.ndarray:

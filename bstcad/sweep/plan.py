@@ -244,14 +244,15 @@ def _pilot(scene: Scene, lens: Lens, quality: str) -> Pilot:
     flat = small.flat_lens(knobs.levels[0], as_wide_as=knobs.levels[-1])
     first = list(stage1.steps(task, replace(flat, front=lens.front)))
     sent = transport_of(first[-1], first[-1].lens, task.screen)
-    *_, state = (step.state for step in first if step.state is not None)
+    *_, rounds = (step for step in first if step.state is not None)
     judged = [step.judged for step in first if step.judged is not None]
     reached(first[-1].lens, judged[-1])
     check_thickness(first[-1].lens, scene)
     *_, last = (step for step in stage2.steps(task, first[-1].lens) if step.judged is not None)
     unseen = detail(scene.target.irradiance(), max(target.columns_rows))
     steep = steepness(task.heaviest.source, last.lens, target.screen, task.target, sent=sent)
-    return Pilot(last.judged, factor, unseen, stage1.doubtful(judged[0], state), lens=last.lens, steep=steep)
+    doubtful = stage1.doubtful(task, rounds.lens, judged[0], rounds.state)
+    return Pilot(last.judged, factor, unseen, doubtful, lens=last.lens, steep=steep)
 
 
 def _small(scene: Scene, quality: str) -> tuple[Scene, float, Tailoring]:

@@ -56,7 +56,7 @@ class Grazing:
         axes = zip((net.x, net.y), net.pitch, net.shape, strict=True)
         x, y = np.meshgrid(*(low + pitch * _places(m) for (low, _), pitch, m in axes), indexing="ij")
         inside = (np.abs(x) <= window.width / 2) & (np.abs(y) <= window.height / 2)
-        light = np.where(inside, between(grid, grid.density, (x, y)).numpy(), 0.0)
+        light = np.where(inside, between(grid, grid.density[None], (x, y))[0].numpy(), 0.0)
         share = torch.from_numpy(maximum_filter(light, 5))  # a span that is lit in part has places beyond
         rays, eta = rays_at(grid, (x, y)), seen.last_freeform.law.eta
         return cls(net, rays, share / total(share), eta=eta, angle=edge.angle)

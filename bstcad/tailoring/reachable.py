@@ -84,9 +84,9 @@ def reachable(
     return found if (picture[~found] > 0).any() else None
 
 
-def coarse(screen: Screen, picture: np.ndarray) -> tuple[Screen, np.ndarray]:
-    """The screen and the picture with at most AIMS pixels along the longer side."""
-    shrunk = max(1.0, max(screen.shape) / AIMS)
+def coarse(screen: Screen, picture: np.ndarray, most: int = AIMS) -> tuple[Screen, np.ndarray]:
+    """The screen and the picture with at most so many pixels along the longer side."""
+    shrunk = max(1.0, max(screen.shape) / most)
     rows, columns = (max(round(n / shrunk), 1) for n in screen.shape)
     whole = (0.0, 0.0, screen.columns, screen.rows)
     small = average(lambda box: picture[box[1] : box[3], box[0] : box[2]], whole[2:], whole, (columns, rows))

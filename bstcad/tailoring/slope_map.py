@@ -26,7 +26,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from bstcad.optics import sampling
@@ -212,18 +211,20 @@ def gathering(grid: FaceGrid, lens: Lens, plane: TargetPlane, middle: tuple[floa
 
 
 def between(grid: FaceGrid, values: Tensor, b: tuple) -> Tensor:
-    """Values (n, n) of the cells of a grid at points b (mm), bilinear."""
+    """Values (k, m, n) of the cells of a grid at points b (…) mm, bilinear, (k, …); beyond the outer cells constant."""
     sizes = (grid.window.width, grid.window.height)
-    where = [(np.asarray(p) / size + 0.5) * n - 0.5 for p, size, n in zip(b, sizes, grid.shape, strict=True)]
-    return torch.from_numpy(map_coordinates(values.cpu().double().numpy(), where, order=1, mode="nearest"))
+    x, y = (torch.from_numpy(p) / (size / 2) for p, size in zip(b, sizes, strict=True))
+    where = torch.stack([y, x], dim=-1)  # -1 to 1 across the window; the last axis of the values comes first
+    found = torch.nn.functional.grid_sample(
+        values.cpu().double()[None], where.reshape(1, 1, -1, 2), padding_mode="border", align_corners=False
+    )
+    return found.view(len(values), *x.shape)
 
 
 def rays_at(grid: FaceGrid, b: tuple) -> Rays:
     """The light that meets the face at points b (mm); direction and sag are bilinear between the grid's."""
-    position = torch.stack(
-        [torch.from_numpy(b[0]), torch.from_numpy(b[1]), between(grid, grid.at_face.position[2], b)]
-    )
-    d_x, d_y, d_z = (between(grid, d, b) for d in grid.at_face.direction)
+    sag, d_x, d_y, d_z = between(grid, torch.cat([grid.at_face.position[2:], grid.at_face.direction]), b)
+    position = torch.stack([torch.from_numpy(b[0]), torch.from_numpy(b[1]), sag])
     direction = torch.stack([d_x, d_y, d_z]) / torch.sqrt(d_x * d_x + d_y * d_y + d_z * d_z)
     return replace(grid.at_face, position=position, direction=direction)
 

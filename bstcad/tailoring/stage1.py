@@ -27,6 +27,7 @@ from bstcad.scene.quality import COARSEST_GRID
 from bstcad.scene.scene import INSIDE
 from bstcad.tailoring.machinability import moved_clear
 from bstcad.tailoring.merit import landing
+from bstcad.tailoring.reachable import coarse
 from bstcad.tailoring.run import Parameters, Step, Task
 from bstcad.tailoring.slope_fit import Fit, tailor_to_aim
 from bstcad.tailoring.slope_map import SlopeMap, aim_points, face_grid, lit_window, map_to_target, slope_map, sloped
@@ -76,7 +77,7 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[S
         yield last
     first, judged = last.lens, task.rrmsd(last.lens)
     yield replace(last, state=None, judged=judged)
-    if not doubtful(judged, last.state):
+    if not doubtful(task, first, judged, last.state):
         return
     other, mapping = follow_aims(task, lens.with_front(first.front))
     value = task.rrmsd(other)
@@ -85,8 +86,14 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[S
         yield Step(lambda: other, mapping=mapping, judged=value)
 
 
-def doubtful(judged: float, state: SlopeRound) -> bool:
-    """Are RRMSD and last state of the rounds a reason to try the other way?"""
+def doubtful(task: Task, lens: Lens, judged: float, state: SlopeRound) -> bool:
+    """Are the lens of the rounds, its RRMSD and their last state a reason to try the other way?
+
+    What a net of fewer points than the target has pixels cannot show is none: no other way would show it.
+    """
+    few, shown = coarse(task.screen, task.target, most=max(both(task.knobs.levels[-1])))
+    if judged > RETRY_ABOVE and few.shape != task.screen.shape:
+        judged = replace(task, screen=few, target=shown).rrmsd(lens)
     return not judged <= RETRY_ABOVE or state.wanted.moved > UNSETTLED  # NaN: no light on the target
 
 

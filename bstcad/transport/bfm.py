@@ -43,7 +43,7 @@ GROW, SHRINK, HALVE = 1.25, 0.8, 0.5  # sigma after too cautious, too bold and r
 BOLD, CAUTIOUS = 0.25, 0.75  # Armijo-Goldstein bounds on (gain of J) / (sigma |∇J|²)
 STALL = 0.005  # relative fall of the mass error over PATIENCE iterations below which it is a plateau
 PATIENCE = 5
-COOLINGS = 2  # step halvings before a plateau stops the iteration: the mass error settles at a height set by sigma
+COOLINGS = 1  # step halvings before a plateau stops the iteration: the mass error settles at a height set by sigma
 
 
 def half_square(n: int) -> np.ndarray:
