@@ -90,7 +90,10 @@ def launch_tubes(source: Source, lens: Lens, n: int) -> Tubes:
             flux.append(band.flux)
             yield band.coming
 
-    return Tubes(joined(coming(), sheet.count + 1, shared=1), torch.cat(flux))
+    whole = joined(coming(), sheet.count + 1, shared=1)
+    if not whole.taken:  # all of them still have the share 1: told once
+        whole = replace(whole, flux=whole.flux[:1, :1].clone().expand(whole.flux.shape))
+    return Tubes(whole, torch.cat(flux))
 
 
 @torch.no_grad()
