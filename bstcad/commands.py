@@ -182,11 +182,13 @@ def _written_and_proved(
 ) -> tuple[Made, Proof]:  # fmt: skip
     """Write the geometry and prove it; the design with these two stages, and its proof.  limit: see `write`."""
     made = made.told()
+    processes.return_freed()  # the second process needs it for the solid
     began = time.perf_counter()
     progress("write", 0, 1, "STEP, STL, 3MF")
     drawn.solid(made.lens)  # as designed, so that it can be drawn while OCC writes and reads the file
     with refusals(f"{made.scene.name}: "):  # the tailored faces bound no solid: nothing that a shop could open
         write_3mf = folders.write_geometry(made, place, processes.submit)
+    processes.return_freed()
     with ThreadPoolExecutor(1) as beside:
         meanwhile = [beside.submit(work) for work in (write_3mf, prepare)]
         progress("write", 1, 1, "")

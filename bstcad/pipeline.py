@@ -25,6 +25,7 @@ from bstcad.optics.sides import both
 from bstcad.optics.sources import Source
 from bstcad.report.record import Making, Point
 from bstcad.report.record import Stage as StageRecord
+from bstcad.runs import processes
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import slope_map, stage1, stage2
@@ -106,7 +107,8 @@ def design(
     grown = tuple(each.channels() for each in scaled)
     task = Task(
         light, screen, restricted(picture, part), knobs, least=scene.lens.min_thickness,
-        free=scene.lens.front.free, rim_sags=scene.rim_sags, progress=progress, grown=grown, bounds=scene.lens.bounds,
+        free=scene.lens.front.free, rim_sags=scene.rim_sags, progress=progress, tidy=processes.return_freed,
+        grown=grown, bounds=scene.lens.bounds,
         spreads=tuple(Spread(each.source, light, each.draw) for each in scaled), edge=edge, merit=merit,
     )  # fmt: skip
     limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve(scene) + JUDGING}

@@ -136,16 +136,15 @@ def basis_matrix(u: np.ndarray, m: int, derivative: int = 0) -> scipy.sparse.csr
     return scipy.sparse.csr_matrix((values.ravel(), columns.ravel(), rows), shape=(len(points), m))
 
 
-def prolongation(coarse: int, fine: int) -> np.ndarray:
-    """The (fine, coarse) matrix that carries a net to more control points with least change of the surface.
+def carried(values: np.ndarray, fine: int) -> np.ndarray:
+    """The coefficients (m, …) of a spline on `fine` control points, with least change of the spline: (fine, …).
 
     These knot vectors are not nested, so the finer net is the least-squares fit at eight points a span of the finer
-    net; in two dimensions apply it along each axis.
+    net; in two dimensions apply it along each axis.  Both matrices are banded: the work grows as the net does.
     """
-    u = np.linspace(0.0, 1.0, 8 * (fine - 2) + 1)
-    on_fine = basis_matrix(u * (fine - 1), fine)
-    on_coarse = basis_matrix(u * (coarse - 1), coarse)
-    return _least_squares(on_fine, (on_fine.T @ on_coarse).toarray())
+    coarse, u = len(values), np.linspace(0.0, 1.0, 8 * (fine - 2) + 1)
+    on_fine, on_coarse = basis_matrix(u * (fine - 1), fine), basis_matrix(u * (coarse - 1), coarse)
+    return _least_squares(on_fine, (on_fine.T @ on_coarse) @ values)
 
 
 def _least_squares(basis: scipy.sparse.csr_matrix, projected: np.ndarray) -> np.ndarray:
@@ -250,12 +249,10 @@ class BSplineSurface(Surface):
         """The same surface on so many control points a side, or along x and along y; by least squares along each."""
         if both(sides) == self.shape:
             return self
-        axes = list(zip(self.shape, both(sides), strict=True))
-        # sparse only in name: their products are sums in a fixed order
-        carry = {axis: scipy.sparse.csr_array(prolongation(*axis)) for axis in set(axes)}
-        in_x, in_y = (carry[axis] for axis in axes)
-        coarse = self.heights.detach().cpu().double().numpy()
-        return replace(self, heights=torch.from_numpy(in_x @ (in_y @ coarse.T).T).to(self.heights))
+        in_x, in_y = both(sides)
+        heights = carried(self.heights.detach().cpu().double().numpy(), in_x)
+        heights = np.ascontiguousarray(carried(np.ascontiguousarray(heights.T), in_y).T)
+        return replace(self, heights=torch.from_numpy(heights).to(self.heights))
 
     def sags(self, outline: Outline) -> tuple[float, float]:
         """Lowest and highest of the heights that the surface inside the outline depends on (mm), and of zero."""

@@ -7,8 +7,8 @@ told by its z (mm) alone, or a tilted one; a place on it has two coordinates x a
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
 from types import MappingProxyType
@@ -29,6 +29,9 @@ class Status(IntEnum):
     VIGNETTED = 2  # left the glass through a side: met the back surface outside the outline, or not at all
     TOTAL_REFLECTION = 3  # total internal reflection at a face
     TURNED_BACK = 4  # left the last surface, but not towards the plane it should land on
+
+
+ARRAYS = ("position", "direction", "flux", "status")  # of a bundle
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,23 @@ class Rays:
     def lose(self, where: Tensor, reason: Status) -> Tensor:
         """The status after rays at `where` are lost for `reason`; a ray keeps its first reason."""
         return torch.where(self.alive & where, torch.full_like(self.status, int(reason)), self.status)
+
+
+def joined(bands: Iterable[Rays], rows: int, shared: int = 0) -> Rays:
+    """The bundle (…, rows, columns) of bands of rows, each of which begins with the last `shared` rows before it.
+
+    No more than one band is held beside the whole.
+    """
+    whole: dict[str, Tensor] = {}
+    done = 0
+    for band in bands:
+        parts = {name: getattr(band, name) for name in ARRAYS} | dict(band.taken)
+        for name, part in parts.items():
+            if name not in whole:
+                whole[name] = part.new_empty((*part.shape[:-2], rows, part.shape[-1]))
+            whole[name][..., done : done + part.shape[-2], :] = part
+        done += band.status.shape[-2] - shared
+    return replace(band, **{name: whole.pop(name) for name in ARRAYS}, taken=whole)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ differentiable in the landing points, whereas the counting of rays in a pixel is
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +22,7 @@ from bstcad.optics.kernels.compiling import fused, fused_whole
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
-from bstcad.optics.rays import Landed, Rays, Status, TargetPlane
+from bstcad.optics.rays import Landed, Rays, Status, TargetPlane, joined
 from bstcad.optics.sides import Sides, both, spread
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import across, from_first_net, gets_through
@@ -31,6 +31,7 @@ ALL = slice(None)
 SHEET = 256  # tubes a side of the sheet through which finer ones are interpolated
 INWARDS = 1e-9  # relative shrink towards the middle: corners on the rim of the light are counted as lit
 BAND = 256  # rows of tubes traced at a time for a picture alone; even, since the diagonals alternate
+CACHED = 1 << 17  # rays that plain torch takes at a time: a megabyte of each quantity
 PARTS = 4  # of a tube on the rim of the light, each way
 THINNEST = 1e-9  # pixel²: a triangle of less area gives all its flux to the pixel of its centre, without gradient
 COARSE = 129  # points a side of the grid on which the rays to given points are found first
@@ -81,7 +82,18 @@ def launch_tubes(source: Source, lens: Lens, n: int) -> Tubes:
     the rim of the light.  A tube in which only part of the light gets through carries that part, spread over all of it.
     """
     sheet = _sheet(source, lens, n)
-    return _tubes(source, lens, *sheet.rows(ALL), sheet.cut)
+    flux: list[Tensor] = []
+
+    def coming() -> Iterator[Rays]:
+        for rows in _bands(sheet.count, _few_rows(n)):
+            band = _tubes(source, lens, *sheet.rows(rows), sheet.cut)
+            flux.append(band.flux)
+            yield band.coming
+
+    whole = joined(coming(), sheet.count + 1, shared=1)
+    if not whole.taken:  # all of them still have the share 1: told once
+        whole = replace(whole, flux=whole.flux[:1, :1].clone().expand(whole.flux.shape))
+    return Tubes(whole, torch.cat(flux))
 
 
 @torch.no_grad()
@@ -96,9 +108,8 @@ def picture(
     """
     sheet = _sheet(source, lens, n, few=few, over_the_back=over_the_back)
     whole = torch.zeros(screen.shape, dtype=torch.float64, device=lens.like.device)
-    for first in range(0, sheet.count, BAND):
-        band = sheet.rows(slice(first, min(first + BAND, sheet.count) + 1))
-        x, y = (p + INWARDS * (middle - p) for p, middle in zip(band, sheet.middle, strict=True))
+    for rows in _bands(sheet.count, BAND):
+        x, y = (p + INWARDS * (middle - p) for p, middle in zip(sheet.rows(rows), sheet.middle, strict=True))
         whole = whole + _tubes(source, lens, x=x, y=y, cut=sheet.cut).picture(lens, screen)
     return whole.clamp(min=0)  # a black pixel may be off by rounding
 
@@ -111,6 +122,17 @@ class _Sheet:
     count: int  # rows of tubes, along x
     middle: tuple[float, float]  # of all (mm)
     cut: bool  # does the lens cut the beam?
+
+
+def _bands(count: int, size: int) -> Iterator[slice]:
+    """The rows of corners of `size` rows of tubes at a time, of so many in all."""
+    for first in range(0, count, size):
+        yield slice(first, min(first + size, count) + 1)
+
+
+def _few_rows(columns: int) -> int:
+    """Rows of a sheet that plain torch takes at a time."""
+    return max(1, CACHED // columns)
 
 
 def _tubes(source: Source, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes:
@@ -261,6 +283,10 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor, number: int | None
     before = replace(lens.unbounded(), losses=None).interfaces[:number]  # the way alone is asked for
 
     def arrive(p: Tensor, q: Tensor, height: Tensor) -> Rays:
+        bands = range(0, len(p), rows := _few_rows(p.shape[1]))
+        return joined((arrive_few(*(t[first : first + rows] for t in (p, q, height))) for first in bands), len(p))
+
+    def arrive_few(p: Tensor, q: Tensor, height: Tensor) -> Rays:
         coming = across(source.rays(p, q, lens.entrance.z, 1.0), before)
         ahead = (coming.sense * coming.direction[2]).clamp(min=1e-3)
         path = coming.sense * (height - coming.above(face.z)) / ahead

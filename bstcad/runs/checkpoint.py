@@ -26,6 +26,7 @@ from bstcad.runs import files
 from bstcad.runs.files import SceneError
 
 MAGIC = b"bstcad checkpoint 5\n"  # to be raised whenever a record of a state changes its fields
+DIGEST = 65  # bytes of the line with the SHA-256
 LARGEST = 8 << 30  # bytes; 2049 x 2049 control points need 1 GB
 SHARE = 0.02  # the most of the run's time that checkpoints may take
 
@@ -40,10 +41,13 @@ def write(path: Path, purpose: Purpose, state: Any) -> None:
     """Put a checkpoint of a design (`purpose`) at `path`, whole or not at all; OSError."""
     arrays: dict[str, np.ndarray] = {}
     tree = json.dumps([purpose, state], default=partial(_packed, arrays))
-    archive = io.BytesIO()
-    np.savez(archive, tree=np.frombuffer(tree.encode(), dtype=np.uint8), **arrays)  # type: ignore[arg-type]
-    body = archive.getbuffer()
-    files.put(path, MAGIC, hashlib.sha256(body).hexdigest().encode() + b"\n", body)
+    with files.whole(path) as file:  # no copy of the state in memory
+        file.write(MAGIC + bytes(DIGEST))
+        np.savez(file, tree=np.frombuffer(tree.encode(), dtype=np.uint8), **arrays)  # type: ignore[arg-type]
+        file.seek(len(MAGIC) + DIGEST)
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+        file.seek(len(MAGIC))
+        file.write(digest.encode() + b"\n")
 
 
 def read(path: Path, kind: type, device: str = "cpu") -> tuple[Purpose, Any]:
@@ -55,7 +59,8 @@ def read(path: Path, kind: type, device: str = "cpu") -> tuple[Purpose, Any]:
         content = files.contents(path, LARGEST)
     except ValueError as error:
         raise SceneError(f"{path}: cannot be read ({error}); start without --resume") from error
-    magic, digest, body = content[: len(MAGIC)], content[len(MAGIC) : len(MAGIC) + 65], content[len(MAGIC) + 65 :]
+    begin = len(MAGIC) + DIGEST
+    magic, digest, body = content[: len(MAGIC)], content[len(MAGIC) : begin], content[begin:]
     if magic != MAGIC:
         found = repr(magic.partition(b"\n")[0].decode("latin-1"))
         raise SceneError(f"{path}: is no checkpoint of this version ({found}); start without --resume")

@@ -155,11 +155,18 @@ def check_free(folder: Path, ours: Sequence[str] = OURS, whose: str = "a design'
 
 def put(path: Path, *parts: bytes | memoryview) -> None:
     """Write a file whole over an older one, or not at all; a link gives way, and its target stays as it is."""
+    with whole(path) as file:
+        file.writelines(parts)
+
+
+@contextlib.contextmanager
+def whole(path: Path) -> Iterator[io.BufferedRandom]:
+    """A file to be written and read, which takes its place, as that of `put` does, when the block ends."""
     new = path.with_name(f".{path.name.removeprefix('.')}.new")
     new.unlink(missing_ok=True)
     try:
-        with new.open("xb") as file:
-            file.writelines(parts)
+        with new.open("x+b") as file:
+            yield file
             file.flush()
             os.fsync(file.fileno())
         os.replace(new, path)

@@ -62,7 +62,8 @@ NEEDED = (
     "matplotlib.backends.backend_pdf",
 )
 NO_LEAK = "1000000000000000"  # bytes; loky would take a solid in memory for a leak and end the process
-TRIM_THRESHOLD, MMAP_THRESHOLD, KEPT = -1, -3, (1 << 31) - 1  # glibc's names for mallopt (malloc.h); bytes
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # glibc's names for mallopt (malloc.h)
+KEPT, LARGE = (1 << 31) - 1, 1 << 27  # bytes: of all that is kept, and of an array that is not
 
 # A function, or its name "module.function" where to import it would load OCC into this process.
 Work = str | Callable[..., Any]
@@ -162,6 +163,9 @@ def _serve(parent: int) -> None:
 
 def peak_memory() -> float | None:
     """Peak memory of this process (GB); None where the system does not tell.  psutil has no peak on Linux."""
+    with contextlib.suppress(OSError, StopIteration):  # on Linux getrusage counts the process that started this one
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return int(next(line for line in lines if line.startswith("VmHWM:")).split()[1]) * 1024 / 1e9
     try:
         import resource
     except ImportError:  # not on Windows
@@ -171,15 +175,24 @@ def peak_memory() -> float | None:
 
 
 def keep_freed() -> None:
-    """Let up to 2 GB of freed memory stay with this process; without glibc nothing changes.
+    """Let up to 2 GB of freed memory stay with this process, in arrays of up to 128 MiB; without glibc nothing
+    changes.
 
     glibc returns every freed array of more than 32 MiB to the system, which hands the next one out page by page,
-    cleared: an eighth of the time of an evaluation of a few million tubes.
+    cleared: an eighth of the time of an evaluation of a few million tubes.  Arrays of more than 128 MiB, as many more
+    tubes have, would leave holes that no other one fits in, of a third of all memory.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
         mallopt(TRIM_THRESHOLD, KEPT)
-        mallopt(MMAP_THRESHOLD, KEPT)
+        mallopt(MMAP_THRESHOLD, LARGE)
+
+
+def return_freed() -> None:
+    """Give freed memory back to the system, before work that needs other sizes of it; without glibc nothing happens."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
 
 
 # --- commands in child processes --------------------------------------------------------------------------------------

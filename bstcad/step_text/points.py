@@ -32,7 +32,8 @@ def taken_out(data: bytes) -> tuple[bytes, np.ndarray, np.ndarray]:
     rest, reals = np.empty(len(text), np.uint8), np.empty(len(text), np.uint8)
     numbers = np.empty(data.count(b"CARTESIAN_POINT"), np.int64)
     sizes = _taken_out(text, start.end(), stop, BLANK, BEGIN, END, rest, reals, numbers)
-    xyz = np.fromstring(reals[: sizes[1]].tobytes(), dtype=np.float64, sep=",")
+    reals.flags.writeable = False  # so that no copy of it need be made
+    xyz = np.fromstring(reals[: sizes[1]], dtype=np.float64, sep=",")  # each ends with a comma
     return rest[: sizes[0]].tobytes(), numbers[: sizes[2]].copy(), xyz.reshape(-1, 3)
 
 

@@ -24,6 +24,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.sides import both, scaled
 from bstcad.report.record import LeftOut, Making
 from bstcad.report.units import about, number, two_digits
+from bstcad.scene.blank import LARGEST_NET
 from bstcad.scene.effects import Absorption, Effect, Fresnel, losses, named, reflection_of
 from bstcad.scene.scene import Scene
 from bstcad.scene.schema import toml
@@ -195,7 +196,8 @@ def diagnosis(
     at_bounds: share of the back that is at each bound.
     """
     net, screen = scene.lens.back.net, scene.target.screen
-    knobs, finer = scene.tailoring.resolved(net), scene.tailoring.resolved(scaled(net, 2))
+    knobs, finer = scene.tailoring.resolved(net), scaled(net, 2)
+    possible = max(both(finer)) <= LARGEST_NET
     sizes = [k for k, stage in enumerate(making.stages) if stage.name.startswith(SIZES)]
     curve = ending(
         [(point.seconds, point.rrmsd) for point in making.history],
@@ -215,8 +217,10 @@ def diagnosis(
         singles=None if twins is None else (twins["rrmsd_float32"], twins["rrmsd_float64"]),
         anew=ours and knobs.stage2_iterations < FEW,
         blurred=blurred,
-        finer_tubes=finer.rays / knobs.rays,
+        finer_tubes=scene.tailoring.resolved(finer).rays / knobs.rays if possible else 1.0,
     )
+    if not possible:  # a step that no scene may take
+        found = tuple(limit for limit in found if limit.by != "control points")
     if knobs.method == "integration":  # its map limits it, and no knob does
         found = ()
     judged = {stage.name: stage.rrmsd for stage in making.stages}

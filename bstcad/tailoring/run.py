@@ -91,6 +91,7 @@ class Task:
     free: tuple[str, ...] = ()  # the parameters of the front that tailoring searches for
     rim_sags: tuple[float, float] = (-math.inf, math.inf)  # that such a front may have (mm)
     progress: Progress = silent  # told of the progress within a step
+    tidy: Callable[[], None] = lambda: None  # called where freed memory has not the sizes that are needed next
     grown: tuple[tuple[Channel, ...], ...] = ()  # points of the source, as it grows to its size; () of a point
     bounds: Bounds | None = None  # on the back; None: it may have any shape
     spreads: tuple[Spread, ...] = ()  # the same source in each of these sizes, about its middle

@@ -41,7 +41,7 @@ from bstcad.optics.sources import Source
 from bstcad.optics.trace import across, clear_window, gets_through
 from bstcad.optics.tubes import rays_to
 from bstcad.scene.errors import SceneError
-from bstcad.tailoring.slope_fit import Fit, fit_slopes
+from bstcad.tailoring.slope_fit import Fit, blocks, fit_slopes
 from bstcad.transport.bfm import Step
 from bstcad.transport.density import Density, spread
 from bstcad.transport.mapping import Frame, Mapping, TransportMap, nodes, solve
@@ -173,10 +173,14 @@ def sloped(
     x, y = (p.to(grid.density.device).reshape(-1) for p in places)
     lit = (grid.density > 0).repeat_interleave(parts, 0).repeat_interleave(parts, 1).reshape(-1)
     net = lens.nets[-1]
-    _, now_x, now_y = net.relative_sag_and_slope(x, y)
-    arriving = rays_at(grid, (x.cpu().numpy(), y.cpu().numpy()))
-    slopes = kept_from_reflection(arriving, wanted.slopes(x, y), lens.last_freeform.law, grazing)
-    z_x, z_y = (torch.where(lit, s, now) for s, now in zip(slopes, (now_x, now_y), strict=True))
+    z_x, z_y = torch.empty_like(x), torch.empty_like(y)
+    for some in blocks(len(x)):
+        _, *now = net.relative_sag_and_slope(x[some], y[some])
+        arriving = rays_at(grid, tuple(p[some].cpu().double().numpy() for p in (x, y)))
+        slopes = (s.cpu().double() for s in wanted.slopes(x[some], y[some]))
+        kept = kept_from_reflection(arriving, tuple(slopes), lens.last_freeform.law, grazing)
+        for z, sent, own in zip((z_x, z_y), kept, now, strict=True):
+            z[some] = torch.where(lit[some], sent.to(x), own)
     weight = torch.where(lit, 1.0, unlit).to(x)
     return lens.with_last_net(
         fit_slopes(net, x, y, z_x=z_x, z_y=z_y, weight=weight, fit=fit).from_vertex().moved(net.z)

@@ -111,6 +111,7 @@ def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> It
         if turn >= done:
             lens, wanted = _round(task, lens, wanted, turn)
             lens = moved_clear(lens, z, task.least, task.bounds)  # the next round reckons with where the back is now
+            task.tidy()
         turn = max(turn + 1, knobs.rounds - FINE_ROUNDS if wanted.moved <= SETTLED else 0)
         yield Step(
             partial(lens.refined, knobs.levels[-1]),

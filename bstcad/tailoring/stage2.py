@@ -136,15 +136,19 @@ def run_rounds(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = N
             place = replace(place, round=number, round_end=place.done + now.evaluations, sheet_from=Parameters.of(lens))
         if place.round_end <= place.done:
             continue
-        launched = place.sheet_from.applied(lens)
-        merit = now.merit(launched)
+        launched, merit = place.sheet_from.applied(lens), None
         grazing = task.edge and Grazing.of(task.edge, launched)
         while place.done < place.round_end:
             if state is None:
                 place = replace(place, search_from=Parameters.of(lens))
             begun = place.search_from.applied(lens)
+            task.tidy()
+            variables = variables_of(task, begun)  # which takes some memory: before the sheet does
+            if merit is None:
+                merit = now.merit(launched)
+                task.tidy()
             problem = Problem(begun, merit, task.bounds, bound_weight, grazing=grazing)
-            for reached, step in _search(now, problem, place, total=total, state=state):
+            for reached, step in _search(now, problem, variables, place, total=total, state=state):
                 yield replace(step, part=part)
                 if reached.reason:
                     break
@@ -156,6 +160,7 @@ def run_rounds(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = N
                 reason = "evaluations"  # so it will have been, if none are left
             elif reason != "evaluations":
                 break
+        del merit, problem  # else two sheets would stand beside each other
         judged = judged or task.rrmsd(lens)
         whole = task.channels == rounds[-1].task.channels  # is this all of the light, and not of a smaller source?
         if accuracy is not None and judged <= accuracy:
@@ -188,15 +193,15 @@ def _pull(task: Task, lens: Lens) -> float:
 
 
 def _search(
-    now: Round, problem: Problem, place: Place, *, total: int, state: TubeSearch | None
-) -> Iterator[tuple[Reached, Step]]:
+    now: Round, problem: Problem, variables: Sequence[SobolevVariable], place: Place, *, total: int,
+    state: TubeSearch | None,
+) -> Iterator[tuple[Reached, Step]]:  # fmt: skip
     """One run of the minimiser from the lens of a problem, or on from a saved state; it also ends at the goal.
 
     total: evaluations of all rounds.
     """
-    lens = problem.lens
-    task, evaluations = now.task, place.round_end - place.done
-    variables, work = variables_of(task, lens), 0.0  # the first step also sets this up: its time is not known
+    lens, evaluations = problem.lens, place.round_end - place.done
+    work = 0.0  # the first step has other work before it: its time is not known
     for reached in search(lens, problem, variables, evaluations=evaluations, state=state):
         best, reason = reached.best, reached.reason
         step = Step(partial(improved, lens, variables, best), work=work, skipped=reached.skipped)

@@ -37,7 +37,7 @@ from bstcad.optics.measure import (
     tubes_of,
 )
 from bstcad.optics.outlines import Outline
-from bstcad.runs.processes import Submit, here
+from bstcad.runs.processes import Submit, here, return_freed
 from bstcad.scene.blank import LensBlank
 from bstcad.scene.mount import Mount, Part, as_cut
 from bstcad.scene.scene import Accept
@@ -139,6 +139,7 @@ def verify(
     text = part21.read_lens(path)  # its sentences say more than OCC's
     mesh = meshes.read_stl(folder / "lens.stl")
     sealed = Check.true("STL watertight, winding consistent", meshes.is_closed(mesh))
+    return_freed()  # the texts: OCC holds more of it still
     lens = _result(lens, path)
     whole = quadrature.of_lens(lens)  # not as it was stated
     lit, of_aperture, why = (lens, (), "") if mount is None else _as_made(seen, lens, nominal, folder)

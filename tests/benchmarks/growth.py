@@ -2,7 +2,7 @@
 
 CPU seconds are of all threads.  What a design leaves to a second process, writing and reading STEP, is done in this
 one.  Memory is the most that was held on the way over what was held before; where the system does not tell, there is
-none.
+none.  Nets grow up to the largest that a scene may have.
 
 One lens serves all: a small design of the peers' case, carried over to finer nets, so that its picture fills the
 screen whatever grows.
@@ -27,14 +27,18 @@ import numpy as np
 import torch
 from skimage.data import astronaut
 
+from bstcad.cad import mesh as meshes
+from bstcad.cad import step_reading, step_writing
 from bstcad.folder import Made, nominal, write_geometry
 from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort
 from bstcad.optics.sampling import grid
+from bstcad.optics.tubes import launch_tubes
 from bstcad.pipeline import design
 from bstcad.scene.scene import Scene, load
-from bstcad.tailoring.merit import SobolevVariable, TubeMerit
+from bstcad.step_text import part21
+from bstcad.tailoring.merit import SobolevVariable, TubeMerit, local_weight
 from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.tailoring.stage2 import Problem
 from bstcad.transport import Density, solve
@@ -157,6 +161,18 @@ def _slope_fit(m: int) -> Work:
     return partial(fit_slopes, start, x, y, z_x, z_y, torch.ones_like(x), Fit(steps=10))
 
 
+def _start(m: int) -> Work:
+    """A round of stage 2 begins: two tubes launched a control point each way, and the local weight of its variable."""
+    scene, lens = _scene(m, PIXELS), lens_of(m)
+    (light,), target = scene.channels(), scene.target.irradiance()
+
+    def begin() -> None:
+        launch_tubes(light.source, light.through(lens), 2 * m)
+        local_weight(light.source, light.through(lens), target, scene.target.screen)
+
+    return begin
+
+
 def _evaluation(m: int = NET, n: int = TUBES, pixels: int = PIXELS, lines: int = 1) -> Work:
     """An evaluation of stage 2: corners traced, tubes cut at pixel borders, the adjoint of both, and the variable."""
     scene, lens = _scene(m, pixels), lens_of(m)
@@ -175,14 +191,25 @@ def _made(m: int, pixels: int = PIXELS) -> Made:
     return Made(scene, lens_of(m), scene.target.irradiance())
 
 
+def _in_a_folder(work: Callable[[Path], Any]) -> None:
+    with tempfile.TemporaryDirectory() as place:
+        work(Path(place))
+
+
 def _writing(m: int) -> Work:
+    lens = lens_of(m)
+    return partial(_in_a_folder, lambda place: step_writing.write_lens(lens, place / "lens.step", "lens"))
+
+
+def _mesh(m: int) -> Work:
     made = _made(m)
 
-    def write() -> None:
-        with tempfile.TemporaryDirectory() as place:
-            write_geometry(made, Path(place))()
+    def write(place: Path) -> None:
+        _, mesh = meshes.fitting(made.lens, made.scene.mesh_tolerance)
+        meshes.write_stl(mesh, place / "lens.stl")
+        meshes.write_3mf(mesh, place / "lens.3mf")
 
-    return write
+    return partial(_in_a_folder, write)
 
 
 @cache
@@ -192,6 +219,10 @@ def _written(m: int) -> tempfile.TemporaryDirectory:
     return place
 
 
+def _reading(read: Callable[[Path], Any], m: int) -> Work:
+    return partial(read, Path(_written(m).name) / "lens.step")
+
+
 def _proof(m: int = NET, pixels: int = PIXELS) -> Work:
     made = _made(m, pixels)
     place = _written(m)
@@ -199,7 +230,7 @@ def _proof(m: int = NET, pixels: int = PIXELS) -> Work:
     return partial(checks.verify, Path(place.name), wanted, effort=PROOF)
 
 
-NETS, PICTURES = (65, 129, 257, 513, 1025), (64, 128, 256, 512, 1024)
+NETS, PICTURES = (257, 513, 1025, 2049), (64, 128, 256, 512, 1024)
 SERIES = (
     Series(
         "transport", "cells", PICTURES, 2, _transport, (0.7, 1.15), 1.5,
@@ -219,7 +250,7 @@ SERIES = (
         "tubes are cut into is pixels",
     ),
     Series(
-        "evaluation of stage 2", "control points", NETS, 2, lambda m: _evaluation(m=m), (-0.05, 0.35), 0.8,
+        "evaluation of stage 2", "control points", NETS, 2, lambda m: _evaluation(m=m), (0.1, 0.6), 1.2,
         "0 at first: a corner meets nine control points, however many there are; 1 in the end, for the transforms of "
         "the net (four an evaluation) and its gradient",
     ),
@@ -235,8 +266,30 @@ SERIES = (
         "of a source k^-1/2 of the tubes, so that there it is 0.5",
     ),
     Series(
-        "writing", "control points", NETS, 2, _writing, (0.2, 1.0), 1.2,
-        "1 in the end, that of the STEP text; before that the meshes, whose facets follow the lens and not its net",
+        "evaluation of stage 2", "control points and tubes", NETS, 2, lambda m: _evaluation(m=m, n=2 * m), (0.7, 1.1),
+        1.4,
+        "1: two tubes a control point each way, as a design has them",
+    ),
+    Series(
+        "start of a round", "control points and tubes", NETS, 2, _start, (0.7, 1.25), 1.4,
+        "1: each tube is launched, and the ray to each control point found, by itself",
+    ),
+    Series(
+        "writing STEP", "control points", NETS, 2, _writing, (0.5, 1.05), 1.2,
+        "1 in the end, that of the text: a statement a control point; before that what OCC does for the solid",
+    ),
+    Series(
+        "mesh", "control points", NETS, 2, _mesh, (-0.1, 0.9), 1.2,
+        "0 once there are as many triangles as a mesh may have: the facets follow the lens and not its net; each is "
+        "compared with the lens at two places a knot span or more, up to a number that does not grow",
+    ),
+    Series(
+        "reading STEP by OCC", "control points", NETS, 2, partial(_reading, step_reading.read), (0.6, 1.1), 1.3,
+        "1: OCC makes an entity and an object of each control point",
+    ),
+    Series(
+        "reading STEP as text", "control points", NETS, 2, partial(_reading, part21.read_lens), (0.6, 1.2), 1.3,
+        "1: one pass over the bytes of the file",
     ),
     Series(
         "proof", "control points", NETS, 2, _proof, (0.1, 0.9), 1.2,

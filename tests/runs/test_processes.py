@@ -30,6 +30,25 @@ def test_another_process_always_the_same_does_one_work_after_the_other(fresh, tm
     assert quick.result() and slow.done()
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="tells of memory in another way")
+def test_memory_that_is_freed_goes_back_when_asked_and_the_peak_is_that_of_the_process_itself():
+    held = bytearray(400_000_000)  # here: getrusage in a process that is started now counts it, too
+    work = """
+from bstcad.runs.processes import keep_freed, peak_memory, return_freed
+import numpy as np, psutil
+keep_freed()
+large, small = np.ones(12_500_000), np.ones(10)
+peak = peak_memory()
+del large
+kept = psutil.Process().memory_info().rss
+return_freed()
+print(peak, (kept - psutil.Process().memory_info().rss) / 1e9)
+"""
+    told = subprocess.run([sys.executable, "-c", work], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    peak, returned = map(float, told.split())
+    assert 0.1 < peak < len(held) / 1e9 and returned == pytest.approx(0.1, rel=0.1)
+
+
 @pytest.mark.parametrize("submit", [processes.submit, processes.here])
 def test_an_error_there_is_the_same_error_here(submit):
     with pytest.raises(ValueError, match="invalid literal"):

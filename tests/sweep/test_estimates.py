@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from bstcad import pipeline
 from bstcad.optics.measure import Effort, measure, tubes_picture
 from bstcad.report import report as reports
 from bstcad.report.record import LEFT_OUT
+from bstcad.scene.blank import LARGEST_NET
 from bstcad.scene.scene import load
 from bstcad.sweep.estimates import coarse_lens, diagnosis, left_out
 from tests.conftest import DISK, SMALL
@@ -87,6 +89,14 @@ def test_where_a_source_blurs_nothing_but_a_smaller_one_is_offered():
     left = {limit["by"]: limit["rrmsd"] for limit in limits}
     assert "tubes" not in left and set(left) >= {"source size", "control points"}
     assert min(value for by, value in left.items() if by != "source size") >= 0.96 * (1 - 1e-12)
+
+
+def test_no_larger_net_is_offered_than_there_may_be():
+    found = pipeline.design(load(DISK, TINY))
+    largest = found.scene.changed({"lens.back.control_points": LARGEST_NET})
+    (few, _), (most, _) = of(found), of(replace(found, scene=largest))
+    known, left = ({limit["by"] for limit in each["limits"]} for each in (few, most))
+    assert known - left == {"control points"} and left
 
 
 def _by(limits, name):
