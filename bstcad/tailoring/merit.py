@@ -42,6 +42,7 @@ from bstcad.optics.trace import through
 from bstcad.optics.tubes import arriving, rays_to
 
 EXPONENT = 0.5  # of the Laplacian
+OF_FEW_WAVES = 0.75  # the same where long waves alone move: they are wider than a pixel
 BLUR = 1.0  # pixels; irradiance for the weight
 SMOOTH = 1.5  # control points; of the weight's logarithm
 MOST = 4.0  # weights are clamped to [1 / MOST, MOST]
@@ -111,22 +112,25 @@ class TubeMerit:
 
 @dataclass(frozen=True)
 class SobolevVariable:
-    """Heights h (m, n) in mm as a function of c (m, n): h = p C^T (λ^-EXPONENT · C (w c) C^T) C.
+    """Heights h (m, n) in mm as a function of c (m, n): h = p C^T (λ^-e · C (w c) C^T) C, e the exponent.
 
     C is the orthonormal cosine transform; λ_ij = 4 - 2 cos(π i / m) - 2 cos(π j / n) is the Laplacian on the
     net, zero for the piston; p the (mean) pitch in mm.
     """
 
     weight: Tensor  # (m, n) w, a local step size
-    scale: Tensor  # (m, n) p λ^-EXPONENT
+    scale: Tensor  # (m, n) p λ^-e
 
     @classmethod
-    def of(cls, surface: BSplineSurface, weight: Tensor) -> SobolevVariable:
-        """For the net of a surface."""
+    def of(cls, surface: BSplineSurface, weight: Tensor, waves: int | None = None) -> SobolevVariable:
+        """For the net of a surface; waves: the cosines of as many and more half-waves a side stand still."""
         x, y = map(laplacian, surface.shape)
         energy = x[:, None] + y
+        exponent = EXPONENT if waves is None else OF_FEW_WAVES
         # by numpy, in one thread: torch rounds a power in another way where a thread's share ends
-        power = torch.from_numpy(np.power(torch.where(energy > 0, energy, math.inf).numpy(), -EXPONENT))
+        power = torch.from_numpy(np.power(torch.where(energy > 0, energy, math.inf).numpy(), -exponent))
+        if waves is not None:
+            power[waves:], power[:, waves:] = 0.0, 0.0
         scale = math.sqrt(math.prod(surface.pitch)) * power
         return cls(weight.to(surface.heights), scale.to(surface.heights))
 

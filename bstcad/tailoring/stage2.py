@@ -29,6 +29,7 @@ from bstcad.tailoring.grazing import Grazing
 from bstcad.tailoring.machinability import excess, weight
 from bstcad.tailoring.merit import SobolevVariable, TubeMerit, local_weight
 from bstcad.tailoring.minimise import Best, Reached, Search, lbfgs, minimise
+from bstcad.tailoring.reachable import coarse
 from bstcad.tailoring.run import EVALUATED, Parameters, Step, Task
 from bstcad.tailoring.source_image import BlurredMerit, Spread
 
@@ -37,6 +38,9 @@ ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))  # (tubes a side, evaluatio
 # net between the tubes where they see nothing, which the last one has to mend.  (Found, for 1025 control points by two
 # tubes a cell: the portrait ends at 0.018 where it would end at 0.020 by the shares above in the same time.)
 SPARSE, DENSE = ((1 / 2, 0.40), (3 / 4, 0.35), (1.0, 0.25)), 2.5
+# (pixels along the longer side, tubes a side, evaluations) of the rounds before those, where RRMSD is above FAR_OFF on
+# the first of these numbers of pixels
+COARSE, FAR_OFF = ((32, 256, 60), (64, 384, 60), (128, 512, 60)), 0.04
 UNBOUNDED_SHARE, FEWEST = 1 / 8, 8  # of the evaluations, and the least number, without the bounds on the back
 SEEN = 16  # places a side of the lens through which a source's images are looked at
 FEW = 30  # evaluations: fewer make one round, since each has its own start to pay for
@@ -56,17 +60,19 @@ class Round:
     tubes: int  # a side of the sheet of each channel
     evaluations: int
     stage: str = "stage 2"  # of which it is a part
+    pixels: int | None = None  # along the longer side, that it sees instead of the target's
     spread: Spread | None = None  # of a source of some size, whose points the task's channels are
 
     @property
     def name(self) -> str:
         """For the list of times."""
         sheets = len(self.task.channels if self.spread is None else self.spread.centre)
-        return f"{self.stage}, {self.tubes}² tubes" if sheets == 1 else f"{self.stage}, {sheets} × {self.tubes}² tubes"
+        tubes = f"{self.tubes}² tubes" if sheets == 1 else f"{sheets} × {self.tubes}² tubes"
+        return ", ".join([self.stage, *([f"{self.pixels} pixels"] if self.pixels else []), tubes])
 
     def merit(self, lens: Lens) -> TubeMerit | BlurredMerit:
         """By tubes launched for a lens."""
-        task = self.task
+        task = self.task if self.pixels is None else coarsened(self.task, self.pixels)
         target, pull = torch.from_numpy(task.target).to(lens.like.device), _pull(task, lens)
         if self.spread is not None:
             return BlurredMerit.of(
@@ -104,7 +110,30 @@ def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Iterator[S
 
     The error is large at first, and few tubes resolve it as well as many; the last round corrects the finer errors.
     """
-    return run_rounds(tuple(Round(task, *round) for round in sheets(task.knobs)), lens, state)
+    rounds = (Round(task, *round) for round in sheets(task.knobs))
+    return run_rounds((*coarse_rounds(task, lens), *rounds), lens, state)
+
+
+def coarse_rounds(task: Task, lens: Lens) -> tuple[Round, ...]:
+    """Rounds by few pixels and tubes for a lens after stage 1 whose picture is wrong at large; () for most lenses.
+
+    Where the map has not come to rest, near a lamp or a wall, light has to move far, by long waves of the face: many
+    evaluations at first, but each costs a thirtieth, and as the shorter waves stand still the tubes need not tell them.
+    """
+    least, tubes, _ = COARSE[0]
+    if task.merit is not None or not task.knobs.stage2_iterations or max(task.screen.shape) <= least:
+        return ()
+    seen = coarsened(task, least)
+    if not rrmsd_by_tubes(lens.plain(), seen.channels, seen.screen, target=seen.target, n=tubes) > FAR_OFF:
+        return ()
+    fewer = (each for each in COARSE if each[0] < max(task.screen.shape))
+    return tuple(Round(task, tubes, evaluations, pixels=pixels) for pixels, tubes, evaluations in fewer)
+
+
+def coarsened(task: Task, pixels: int) -> Task:
+    """The task with at most so many pixels along the longer side."""
+    screen, target = coarse(task.screen, task.target, pixels)
+    return replace(task, screen=screen, target=target)
 
 
 def sheets(knobs: Tailoring) -> Iterator[tuple[int, int]]:
@@ -143,7 +172,7 @@ def run_rounds(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = N
                 place = replace(place, search_from=Parameters.of(lens))
             begun = place.search_from.applied(lens)
             task.tidy()
-            variables = variables_of(task, begun)  # which takes some memory: before the sheet does
+            variables = variables_of(task, begun, now.pixels)  # which takes some memory: before the sheet does
             if merit is None:
                 merit = now.merit(launched)
                 task.tidy()
@@ -207,9 +236,10 @@ def _search(
         step = Step(partial(improved, lens, variables, best), work=work, skipped=reached.skipped)
         if not reached.skipped:
             done = min(place.done + best.evaluations, total)  # a line search may run over a little
-            progress = (now.stage, done, total, f"RRMSD {best.figure:.4f}")
-            step = replace(step, rrmsd=best.figure, progress=progress)
-            reason = "accuracy" if best.figure <= place.goal_by_tubes else reason
+            step = replace(step, progress=(now.stage, done, total, f"RRMSD {best.figure:.4f}"))
+            if now.pixels is None:
+                step = replace(step, rrmsd=best.figure)
+                reason = "accuracy" if best.figure <= place.goal_by_tubes else reason
         if reached.state is not None and not reason:
             step = replace(step, state=TubeSearch(place, best, reached.state))
         yield replace(reached, reason=reason), step
@@ -247,14 +277,14 @@ class Problem:
         return value, gradients, float(rrmsd)
 
 
-def variables_of(task: Task, lens: Lens) -> tuple[SobolevVariable, ...]:
+def variables_of(task: Task, lens: Lens, waves: int | None = None) -> tuple[SobolevVariable, ...]:
     """The variable of each freeform interface, for the light of the task."""
     light = task.heaviest
     seen = light.through(lens)
     weights = (
         local_weight(light.source, seen, task.target, screen=task.screen, number=number) for number in lens.freeform
     )
-    return tuple(map(SobolevVariable.of, lens.nets, weights))
+    return tuple(SobolevVariable.of(net, weight, waves) for net, weight in zip(lens.nets, weights, strict=True))
 
 
 def search(
@@ -310,7 +340,10 @@ def with_stage3(before: Stage2 | None, task: Task, lens: Lens, state: Any = None
                 last = replace(last, judged=whole.rrmsd(last.lens))
             yield replace(last, reason="")
         lens, state = last.lens, None
-    for step in run_rounds(stage3_rounds(task), lens, state and state.grown):
+    rounds = stage3_rounds(task)
+    if before is None:
+        rounds = (*coarse_rounds(task, lens), *rounds)
+    for step in run_rounds(rounds, lens, state and state.grown):
         yield replace(step, state=step.state and Grown(step.state))
 
 

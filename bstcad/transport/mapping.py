@@ -12,10 +12,9 @@ from numpy.typing import ArrayLike
 
 from bstcad.transport.bfm import Step, Transport, back_and_forth, half_square, ladder, legendre
 from bstcad.transport.density import Density, gradient_at_corners
-from bstcad.transport.monge_ampere import MongeAmpere, climb, corners
+from bstcad.transport.monge_ampere import ROUGH, MongeAmpere, climb, corners
 
 FLOOR = 1e-3  # of the mean: a darker target is lifted to this, since no gradient of a convex function can avoid a hole
-ROUGH = 0.01  # mass error above which the solve begins anew with a higher floor
 FALLING = (0.03, 0.01, 0.003)  # of the mean: floors of that solve, before FLOOR
 COARSE = 64  # cells a side up to which the back-and-forth method runs; Newton takes over from there
 NEWTON_STEPS = 8  # the most on each grid

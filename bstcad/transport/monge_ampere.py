@@ -28,6 +28,7 @@ SMOOTHING = 1.0  # cells: Gaussian blur of phi that takes out the grid noise of 
 GRADIENT_STEPS, GRADIENT_FALL = 15, 0.1  # conjugate gradients: the most steps, the fall of the residual at the end
 SHORTEST = 0.05  # shortest fraction of a Newton step that is tried
 ENOUGH = 0.9  # a step that leaves more than this of the mass error is the last
+ROUGH, SLOW, PATIENT = 0.005, 0.98, 3  # above that mass error a step may leave SLOW, and PATIENT times as many are taken
 
 
 class MongeAmpere:
@@ -105,8 +106,8 @@ def _newton_steps(tubes, phi, *, steps, tolerance, progress):
     r = tubes.nu - tubes.flux(phi)
     smoothed = tubes.poisson.solve(r)
     errors, reason = [float(np.abs(r).mean())], "iterations"
-    for k in range(steps):
-        if errors[-1] <= tolerance:
+    for k in range(PATIENT * steps):
+        if errors[-1] <= tolerance or (k >= steps and errors[-1] <= ROUGH):
             break
         found = _line_search(tubes, phi, r, smoothed=smoothed, eta=tubes.newton(phi, r, smoothed))
         error = np.inf if found is None else float(np.abs(found[1]).mean())
@@ -117,7 +118,7 @@ def _newton_steps(tubes, phi, *, steps, tolerance, progress):
         errors.append(error)
         if progress is not None:
             progress(Step(phi.shape[0], k + 1, errors[-1], "tubes"))
-        if errors[-1] > ENOUGH * errors[-2]:
+        if errors[-1] > (SLOW if errors[-1] > ROUGH else ENOUGH) * errors[-2]:
             reason = "plateau"
             break
     return phi, errors, "converged" if errors[-1] <= tolerance else reason
