@@ -28,7 +28,7 @@ SMOOTHING = 1.0  # cells: Gaussian blur of phi that takes out the grid noise of 
 GRADIENT_STEPS, GRADIENT_FALL = 15, 0.1  # conjugate gradients: the most steps, the fall of the residual at the end
 SHORTEST = 0.05  # shortest fraction of a Newton step that is tried
 ENOUGH = 0.9  # a step that leaves more than this of the mass error is the last
-ROUGH, SLOW, PATIENT = 0.005, 0.98, 3  # above that mass error a step may leave SLOW, and PATIENT times as many are taken
+ROUGH, SLOW, PATIENT = 0.005, 0.98, 3  # above that mass error a step may leave SLOW; PATIENT times as many are taken
 
 
 class MongeAmpere:

@@ -14,8 +14,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bstcad.optics.measure import Effort, measure
 from bstcad.pipeline import design
 from bstcad.scene.scene import Scene

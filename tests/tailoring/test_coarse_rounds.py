@@ -1,0 +1,82 @@
+"""Rounds of stage 2 by few pixels and long waves, for a lens whose light has to move far."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.measure import Effort, measure
+from bstcad.pipeline import design
+from bstcad.scene.scene import Scene
+from bstcad.tailoring import stage2
+from bstcad.tailoring.merit import SobolevVariable, cosine
+
+SIDE = {"shape": "rectangle", "width": 60.0, "height": 60.0}
+NEAR = {  # a wall nearer than the plate is wide, fifty times as bright in one corner as in another
+    "name": "near",
+    "source": {"kind": "collimated", "aperture": SIDE},
+    "lens": {
+        "material": "PMMA",
+        "outline": SIDE,
+        "front": {"kind": "plane", "z": 0.0},
+        "back": {"kind": "bspline", "z": 12.0, "control_points": 65},
+    },
+    "target": {"z": 62.0, "x": [-30.0, 30.0], "y": [-30.0, 30.0], "pixels": 64, "uniform": True},
+    "tailoring": {"quality": "draft", "rays": 192, "transport_grid": 128, "stage2_iterations": 12},
+}
+
+
+def near(z=62.0):
+    """The scene, with the wall at z mm."""
+    line = torch.linspace(-1.5, 1.5, 64)
+    picture = torch.exp(line[:, None] + 0.3 * line[None, :])
+    scene = Scene.model_validate(NEAR | {"target": NEAR["target"] | {"z": z}})
+    return scene.changed({"target.uniform": None, "target.image": picture.numpy()})
+
+
+def rrmsd(made):
+    """RRMSD by rays of its own."""
+    scene = made.scene
+    return measure(made.lens, scene.channels(), scene.target.screen, made.target, Effort(512, witness=False)).rrmsd
+
+
+def names(made):
+    """The rounds of stage 2."""
+    return [stage.name for stage in made.making.stages if stage.name.startswith("stage 2")]
+
+
+@pytest.fixture(scope="module")
+def states():
+    return []
+
+
+@pytest.fixture(scope="module")
+def made(states):
+    return design(near(), device="cpu", save=states.append, later=True)
+
+
+def test_they_bring_light_far(made, monkeypatch):
+    assert names(made)[0] == "stage 2, 32 pixels, 256² tubes" and len(names(made)) == 2
+    monkeypatch.setattr(stage2, "FAR_OFF", float("inf"))
+    without = design(near(), device="cpu", later=True)
+    assert len(names(without)) == 1
+    assert rrmsd(made) < 0.4 * rrmsd(without)
+
+
+def test_a_lens_whose_map_came_to_rest_has_none(made):
+    assert len(names(design(near(600.0), device="cpu", later=True))) == 1
+
+
+def test_a_design_goes_on_from_within_them(made, states):
+    within = [s for s in states if getattr(s.second, "place", None) and s.second.place.round == 0]
+    assert within
+    again = design(near(), device="cpu", start=within[len(within) // 2], later=True)
+    assert torch.equal(again.lens.back.heights, made.lens.back.heights)
+
+
+def test_shorter_waves_stand_still():
+    net = BSplineSurface(0.0, torch.zeros((40, 30), dtype=torch.float64), (-2.0, 2.0), (-1.5, 1.5))
+    moved = SobolevVariable.of(net, torch.rand((40, 30), dtype=torch.float64), 8).heights(torch.randn(40, 30).double())
+    waves = cosine(moved).abs()
+    assert waves[:8, :8].amax() > 0.1 and waves[8:].amax() < 1e-12 and waves[:, 8:].amax() < 1e-12
