@@ -120,14 +120,15 @@ def coarse_rounds(task: Task, lens: Lens) -> tuple[Round, ...]:
     Where the map has not come to rest, near a lamp or a wall, light has to move far, by long waves of the face: many
     evaluations at first, but each costs a thirtieth, and as the shorter waves stand still the tubes need not tell them.
     """
-    least, tubes, _ = COARSE[0]
-    if task.merit is not None or not task.knobs.stage2_iterations or max(task.screen.shape) <= least:
+    most = min(max(task.screen.shape) - 1, task.knobs.side // 2)  # pixels that the net can tell
+    rounds = [
+        Round(task, tubes, evaluations, pixels=pixels) for pixels, tubes, evaluations in COARSE if pixels <= most
+    ]
+    if not rounds or task.merit is not None or not task.knobs.stage2_iterations:
         return ()
-    seen = coarsened(task, least)
-    if not rrmsd_by_tubes(lens.plain(), seen.channels, seen.screen, target=seen.target, n=tubes) > FAR_OFF:
-        return ()
-    fewer = (each for each in COARSE if each[0] < max(task.screen.shape))
-    return tuple(Round(task, tubes, evaluations, pixels=pixels) for pixels, tubes, evaluations in fewer)
+    seen, tubes = coarsened(task, COARSE[0][0]), COARSE[0][1]
+    far_off = rrmsd_by_tubes(lens.plain(), seen.channels, seen.screen, target=seen.target, n=tubes) > FAR_OFF
+    return tuple(rounds) if far_off else ()
 
 
 def coarsened(task: Task, pixels: int) -> Task:
