@@ -39,8 +39,9 @@ ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))  # (tubes a side, evaluatio
 # tubes a cell: the portrait ends at 0.018 where it would end at 0.020 by the shares above in the same time.)
 SPARSE, DENSE = ((1 / 2, 0.40), (3 / 4, 0.35), (1.0, 0.25)), 2.5
 # (pixels along the longer side, tubes a side, evaluations) of the rounds before those, where RRMSD is above FAR_OFF on
-# the first of these numbers of pixels
-COARSE, FAR_OFF = ((32, 256, 60), (64, 384, 60), (128, 512, 60)), 0.04
+# LARGE pixels, which a net that is only too coarse for the picture gets right
+COARSE = ((32, 256, 60), (64, 384, 60), (128, 512, 60))
+LARGE, FAR_OFF = 16, 0.04
 UNBOUNDED_SHARE, FEWEST = 1 / 8, 8  # of the evaluations, and the least number, without the bounds on the back
 SEEN = 16  # places a side of the lens through which a source's images are looked at
 FEW = 30  # evaluations: fewer make one round, since each has its own start to pay for
@@ -126,7 +127,7 @@ def coarse_rounds(task: Task, lens: Lens) -> tuple[Round, ...]:
     ]
     if not rounds or task.merit is not None or not task.knobs.stage2_iterations:
         return ()
-    seen, tubes = coarsened(task, COARSE[0][0]), COARSE[0][1]
+    seen, tubes = coarsened(task, LARGE), COARSE[0][1]
     far_off = rrmsd_by_tubes(lens.plain(), seen.channels, seen.screen, target=seen.target, n=tubes) > FAR_OFF
     return tuple(rounds) if far_off else ()
 
