@@ -89,7 +89,7 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[S
 def doubtful(task: Task, lens: Lens, judged: float, state: SlopeRound) -> bool:
     """Are the lens of the rounds, its RRMSD and their last state a reason to try the other way?
 
-    What a net of fewer points than the target has pixels cannot show is none: no other way would show it.
+    Detail that a net of fewer points than the target has pixels cannot show is no reason: no other way would show it.
     """
     few, shown = coarse(task.screen, task.target, most=max(both(task.knobs.levels[-1])))
     if judged > RETRY_ABOVE and few.shape != task.screen.shape:
