@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
@@ -27,6 +27,7 @@ from bstcad.report.record import Making, Point
 from bstcad.report.record import Stage as StageRecord
 from bstcad.runs import processes
 from bstcad.scene.errors import SceneError
+from bstcad.scene.quality import Tailoring
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import slope_map, stage1, stage2
 from bstcad.tailoring.grazing import cleared
@@ -95,22 +96,15 @@ def design(
     began = time.perf_counter() if began is None else began
     torch.manual_seed(scene.tailoring.seed)
     device = device_for(device)
-    target, picture = scene.target, scene.target.irradiance()
+    picture = scene.target.irradiance()
     part, edge = reachable_part(scene, picture)
     if part is not None:
         progress("reach", 0, 0, f"{unreachable(scene, part, picture)}; the design is for the rest")
     knobs = scene.tailoring.resolved(scene.lens.back.net)
     later = later and knobs.max_time is None
-    screen = target.screen
-    sizes = stage2.SIZES if scene.source.extent and knobs.method != "integration" else ()  # that knows points alone
-    light, scaled = scene.with_source_scaled(0.0).channels(), [scene.with_source_scaled(share) for share, _ in sizes]
-    grown = tuple(each.channels() for each in scaled)
-    task = Task(
-        light, screen, restricted(picture, part), knobs, least=scene.lens.min_thickness,
-        free=scene.lens.front.free, rim_sags=scene.rim_sags, progress=progress, tidy=processes.return_freed,
-        grown=grown, bounds=scene.lens.bounds,
-        spreads=tuple(Spread(each.source, light, each.draw) for each in scaled), edge=edge, merit=merit,
-    )  # fmt: skip
+    task = task_of(
+        scene, restricted(picture, part), knobs, edge, progress=progress, tidy=processes.return_freed, merit=merit
+    )
     limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve(scene) + JUDGING}
     record = Record() if start is None else start.record
     driver = Driver(progress, began, **limits, interrupted=interrupted, save=save, record=record)
@@ -132,13 +126,37 @@ def design(
     lens = replace(lens.plain(), index=scene.index, losses=None)
     if not scene.lens.front.free:  # as it was given: tailoring may have worked with less digits of it
         lens = replace(lens, front=scene.lens.front.surface)
-    steep = steepness(task.heaviest.source, lens, screen, task.target, sent=followed.transport)
+    steep = steepness(task.heaviest.source, lens, task.screen, task.target, sent=followed.transport)
     making = _making(followed, driver.record, stopped, steep)
     return Made(
         resolved(scene, lens), scene.as_mounted(lens), task.target, making, device=device,
         transport=followed.transport, reachable=part,
         compared=partial(_compared, making, task, after_stage1, stages) if later else None,
     )  # fmt: skip
+
+
+def task_of(scene: Scene, target: np.ndarray, knobs: Tailoring, edge: Edge | None, **more: Any) -> Task:
+    """The task of a scene; target: (rows, columns) that its light shall have, edge: as `reachable_part` has it.
+
+    more: fields of Task that no scene tells.
+    """
+    light = scene.with_source_scaled(0.0).channels()
+    sizes = stage2.SIZES if scene.source.extent and knobs.method != "integration" else ()  # that knows points alone
+    scaled = [scene.with_source_scaled(share) for share, _ in sizes]
+    return Task(
+        light, scene.target.screen, target, knobs, least=scene.lens.min_thickness, free=scene.lens.front.free,
+        rim_sags=scene.rim_sags, grown=tuple(each.channels() for each in scaled), bounds=scene.lens.bounds,
+        spreads=tuple(Spread(each.source, light, each.draw) for each in scaled), edge=edge, **more,
+    )  # fmt: skip
+
+
+def second_stage(task: Task, lens: Lens, state: Stage2State | None = None) -> tuple[str, Iterator[Step]]:
+    """The name and the steps of the stage that follows stage 1: stage 2, and 3 for a source of some size."""
+    *_, stage = PROCEDURES[task.knobs.method]
+    if not task.grown:
+        return "stage 2", stage(task, lens, state)
+    before = stage if task.knobs.method == "adam" else None  # the paper's procedure knows points alone
+    return "stage 3", stage2.with_stage3(before, task, lens, state)
 
 
 def reachable_part(scene: Scene, picture: np.ndarray) -> tuple[np.ndarray | None, Edge | None]:
@@ -260,11 +278,7 @@ def _stage2(task: Task, driver: Driver, lens: Lens, followed: Followed, state: S
     """Stage 2, and 3 for a source of some size, from stage 1 or further from a state: the lens, and why it ended."""
     if state is None and not driver.wish:  # which cuts stages short: a later run shall not
         driver.save(Saved(driver.record, followed=followed))
-    *_, stage = PROCEDURES[task.knobs.method]
-    name, steps = "stage 2", stage(task, lens, state)
-    if task.grown:
-        before = stage if task.knobs.method == "adam" else None  # the paper's procedure knows points alone
-        name, steps = "stage 3", stage2.with_stage3(before, task, lens, state)
+    name, steps = second_stage(task, lens, state)
 
     def saved(state: Stage2State) -> Saved:
         return Saved(driver.record, None, followed, state)

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -145,6 +146,13 @@ def carried(values: np.ndarray, fine: int) -> np.ndarray:
     coarse, u = len(values), np.linspace(0.0, 1.0, 8 * (fine - 2) + 1)
     on_fine, on_coarse = basis_matrix(u * (fine - 1), fine), basis_matrix(u * (coarse - 1), coarse)
     return _least_squares(on_fine, (on_fine.T @ on_coarse) @ values)
+
+
+@lru_cache(maxsize=16)
+def carrier(coarse: int, fine: int) -> scipy.sparse.csr_array:
+    """The matrix (fine, coarse) of `carried`, but for what falls off below rounding: a band around its diagonal."""
+    whole = carried(np.eye(coarse), fine)
+    return scipy.sparse.csr_array(np.where(np.abs(whole) > np.finfo(whole.dtype).eps, whole, 0.0))
 
 
 def _least_squares(basis: scipy.sparse.csr_matrix, projected: np.ndarray) -> np.ndarray:

@@ -5,8 +5,9 @@ flux, and the source's flux density where its light crosses the back tells the a
 light, which many such cells would have to carry, has few.  What of a picture is finer than its cells can make, and how
 the cells resolve edges and rims, give the RRMSD of a net; amounts of work (plan.py) give its seconds and memory.
 
-The smallest net is chosen beyond which no larger one gains a quarter, of those that memory, tailoring.max_time and the
-tool's radius allow.  tests/benchmarks/test_net_choice.py holds it to designs with every net.
+Of those that memory, tailoring.max_time and the tool's radius allow, the smallest net is chosen whose RRMSD each larger
+one would lower by less than a fifth, or by less than half in three times the time.
+tests/benchmarks/test_net_choice.py holds it to designs with every net.
 """
 
 from __future__ import annotations
@@ -23,27 +24,26 @@ from bstcad.analysis.cost import TILE, ControlCells
 from bstcad.analysis.light import blur
 from bstcad.optics.interfaces import cross
 from bstcad.optics.lens import Lens
-from bstcad.optics.sides import Sides, coarser, in_words, side, spread
+from bstcad.optics.sides import Sides, coarser, in_words, spread
 from bstcad.optics.tubes import area_of, collect, launch_tubes
 from bstcad.report.units import duration, number, two_digits
 from bstcad.scene.blank import LARGEST_NET
 from bstcad.scene.scene import Scene
 from bstcad.sweep.cold_run import Units
 from bstcad.sweep.estimates import coarse_lens
-from bstcad.sweep.plan import amounts, fitted, memory_gb, seconds
+from bstcad.sweep.plan import UNDONE, amounts, fitted, memory_gb, seconds
 
 KEY = "lens.back.control_points"
 SQUARE = (65, 129, 257, 513, 1025)  # control points a side of the nets that are tried, or as many in square cells
 NEARLY = 1.25  # as wide as high: a plate no more oblong than that gets a square net
-GAIN = 1.25  # times less RRMSD, for which a larger net is worth its time
+WORTH = ((1.25, 1.0), (2.0, 3.0))  # (times less RRMSD, times the time): a larger net that gives no more is not worth it
 ROOM = 0.8  # of the machine's memory, that a design may take
 TWO_CORES = Units(tubes=0.1, serial=0.01)  # seconds: of a machine of pace 1
 TUBES = 256  # a side, by which the light is followed
-FLOOR, RIM = 0.7, 3.0  # RRMSD of the least error by the cells (ControlCells.floor), and of one control point a side
-BY_QUALITY = {"draft": (1.4, 0.002), "standard": (1.0, 0.006), "fine": (0.9, 0.003)}  # times that, and what is left
-UNDONE = 0.5  # of the blur by a source of some size, that stage 3 leaves
+FLOOR, HALVED = 0.68, 0.43  # of the least error by the cells (ControlCells.floor), and by half as many each way
+BY_QUALITY = {"draft": (1.4, 0.002), "standard": (1.0, 0.001), "fine": (0.9, 0.001)}  # times that, and what is left
 SEAM = 7.0  # pixels; a valley of the tool's radius that moves light by less within a cell is narrower than it need be
-ENOUGH = 9.0  # cells a pixel; more shape nothing that a pixel shows
+ENOUGH, BEYOND = 5.0, 1.4  # cells a pixel; more of them lower the RRMSD by that factor at most, and that once
 DIM = 1e-3  # of the mean flux; tiles of less are taken for the mean
 
 
@@ -55,6 +55,7 @@ class Candidate:
     rrmsd: float
     seconds: float  # on two cores of pace 1
     memory_gb: float
+    cells: tuple[float, float]  # mm, along x and along y
     moved: float = math.inf  # pixels, see `moved`
 
     @property
@@ -108,18 +109,28 @@ def chosen(scene: Scene) -> Choice:
     lens, screen, target = coarse_lens(tried[0]), scene.target.screen, scene.target.irradiance()
     light, image = cells_of_a_mm2(tried[0], lens), blur(tried[0].channels(), lens, screen, target)
     blurred = image.rrmsd if image is not None else 0.0
-    candidates = [
-        Candidate(
-            each.lens.back.net, rrmsd(light, each, blurred), seconds(amounts(each), fitted()["prices"], TWO_CORES),
-            memory_gb(each, fitted()["memory"]), moved=moved(each),
-        )
-        for k, each in enumerate(tried)
-        if k == 0 or light.a_pixel.sum() / math.prod(each.lens.cells) <= ENOUGH * target.size
-    ]  # fmt: skip
+    candidates: list[Candidate] = []
+    for each in tried:
+        likely = rrmsd(light, each, blurred)
+        if candidates and light.a_pixel.sum() / math.prod(candidates[-1].cells) > ENOUGH * target.size:
+            break
+        if candidates and light.a_pixel.sum() / math.prod(each.lens.cells) > ENOUGH * target.size:
+            likely = max(likely, candidates[-1].rrmsd / BEYOND)
+        candidates.append(
+            Candidate(
+                each.lens.back.net, likely, seconds(amounts(each), fitted()["prices"], TWO_CORES),
+                memory_gb(each, fitted()["memory"]), cells=each.lens.cells, moved=moved(each),
+            )
+        )  # fmt: skip
     possible, limit = _possible(scene, candidates)
-    least = min(each.rrmsd for each in possible)
-    first = next(k for k, each in enumerate(possible) if each.rrmsd <= GAIN * least)
+    first = next(k for k, each in enumerate(possible) if not any(_worth(each, other) for other in possible[k + 1 :]))
     return Choice(possible, first, limit if first == len(possible) - 1 else "")
+
+
+def _worth(coarse: Candidate, fine: Candidate) -> bool:
+    """Is a finer net worth its time beside a coarser one?"""
+    less, longer = coarse.rrmsd / fine.rrmsd, fine.seconds / coarse.seconds
+    return not any(less <= gain and longer >= time for gain, time in WORTH)
 
 
 def _possible(scene: Scene, candidates: list[Candidate]) -> tuple[tuple[Candidate, ...], str]:
@@ -187,15 +198,16 @@ def cells_of_a_mm2(scene: Scene, lens: Lens) -> ControlCells:
 
 
 def rrmsd(light: ControlCells, scene: Scene, blurred: float = 0.0) -> float:
-    """RRMSD of a scene with its net, roughly: detail that its cells cannot make, rims that its spans blur, the rest.
+    """RRMSD of a scene with its net, roughly: detail that its cells cannot make, or make badly, and the rest.
 
-    blurred: RRMSD of the target blurred by the source's size.  Found by designs of half the size; of standard quality
-    half of them keep to 1.14 times this, nine of ten to 1.7 times.
+    blurred: RRMSD of the target blurred by the source's size.  Fitted to the designs of net_choice.json, in standard
+    quality: half of them keep to 1.21 times this, nine of ten to 1.73 times.
     """
     factor, rest = BY_QUALITY.get(scene.tailoring.quality, BY_QUALITY["standard"])
     width, height = scene.lens.cells
     finer, half = 1 / math.sqrt(width * height), TILE // 2
     between = replace(light, a_pixel=light.a_pixel[half:, half:], target=light.target[half:, half:])  # other tiles
-    floor = math.sqrt((light.floor(finer) ** 2 + between.floor(finer) ** 2) / 2)
-    by_net = factor * (FLOOR * floor + RIM / side(scene.lens.back.net)) + rest
+    floors = (FLOOR * light.floor(finer), FLOOR * between.floor(finer))
+    halved = (HALVED * light.floor(finer / 2), HALVED * between.floor(finer / 2))
+    by_net = factor * math.hypot(*floors, *halved) / math.sqrt(2) + rest
     return math.hypot(by_net, UNDONE * blurred)

@@ -26,7 +26,7 @@ from bstcad.analysis.steepness import Steepness
 from bstcad.optics.lens import Lens
 from bstcad.optics.reach import restricted, unreached
 from bstcad.optics.sides import both, coarser, scaled
-from bstcad.pipeline import check_thickness, reachable_part, reached, steepness, transport_of
+from bstcad.pipeline import check_thickness, reachable_part, reached, second_stage, steepness, task_of, transport_of
 from bstcad.report.record import simulated, too_steep
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.quality import COARSEST_GRID, PRESETS, Tailoring
@@ -35,8 +35,8 @@ from bstcad.scene.target import FEWEST
 from bstcad.sweep.cold_run import PIXELS, TUBES, Units, rounded
 from bstcad.sweep.cold_run import units as measured_units
 from bstcad.sweep.estimates import coarse_lens, left_out
-from bstcad.tailoring import stage1, stage2
-from bstcad.tailoring.run import EVALUATED, Task
+from bstcad.tailoring import stage1
+from bstcad.tailoring.run import EVALUATED
 from bstcad.tailoring.slope_map import SUBCELLS
 from bstcad.tailoring.stage1 import aimed
 from bstcad.tailoring.stage2 import blurred_sheets, sheets
@@ -207,6 +207,7 @@ QUALITIES = ("draft", "standard", "fine")
 # Most pixels, control points and tubes a side; more pixels where the control points would be fewer than FEWEST_POINTS.
 SIZES = {"draft": (256, 385, 768), "standard": (128, 193, 512)}
 FEWEST_POINTS = 65  # control points a side
+UNDONE = 0.5  # of the blur by a source of some size, that stage 3 leaves
 PILOT_CELLS = (16, 256)  # a side of its transport, at least and at most
 
 
@@ -217,6 +218,7 @@ class Pilot:
     rrmsd: float
     factor: float  # pixels a side of the scene over those of the pilot
     detail: float  # of the scene's picture, finer than the pilot's pixels
+    blurred: float  # RRMSD that a source of some size blurs, by the scene's pixels less than by the pilot's
     doubtful: bool  # did stage 1 try the other way as well?
     lens: Lens
     steep: Steepness  # that its target's light needs of the back
@@ -237,10 +239,7 @@ def _pilot(scene: Scene, lens: Lens, quality: str) -> Pilot:
     target = small.target
     picture = target.irradiance()
     part, edge = reachable_part(small, picture)
-    task = Task(
-        small.channels(), target.screen, restricted(picture, part), knobs, least=small.lens.min_thickness,
-        rim_sags=small.rim_sags, edge=edge,
-    )  # fmt: skip
+    task = replace(task_of(small, restricted(picture, part), knobs, edge), free=())  # it has a front already
     flat = small.flat_lens(knobs.levels[0], as_wide_as=knobs.levels[-1])
     first = list(stage1.steps(task, replace(flat, front=lens.front)))
     sent = transport_of(first[-1], first[-1].lens, task.screen)
@@ -248,11 +247,18 @@ def _pilot(scene: Scene, lens: Lens, quality: str) -> Pilot:
     judged = [step.judged for step in first if step.judged is not None]
     reached(first[-1].lens, judged[-1])
     check_thickness(first[-1].lens, scene)
-    *_, last = (step for step in stage2.steps(task, first[-1].lens) if step.judged is not None)
+    *_, last = (step for step in second_stage(task, first[-1].lens)[1] if step.judged is not None)
     unseen = detail(scene.target.irradiance(), max(target.columns_rows))
     steep = steepness(task.heaviest.source, last.lens, target.screen, task.target, sent=sent)
     doubtful = stage1.doubtful(task, rounds.lens, judged[0], rounds.state)
-    return Pilot(last.judged, factor, unseen, doubtful, lens=last.lens, steep=steep)
+    blurred = _blurred(scene, last.lens) - _blurred(small, last.lens) if factor > 1 else 0.0
+    return Pilot(last.judged, factor, unseen, blurred, doubtful, lens=last.lens, steep=steep)
+
+
+def _blurred(scene: Scene, lens: Lens) -> float:
+    """RRMSD of the target convolved with the image that a source of some size throws; 0 for a point."""
+    image = blur(scene.channels(), lens, scene.target.screen, scene.target.irradiance())
+    return 0.0 if image is None else image.rrmsd
 
 
 def _small(scene: Scene, quality: str) -> tuple[Scene, float, Tailoring]:
@@ -281,7 +287,7 @@ def detail(picture: np.ndarray, pixels: int) -> float:
 
 def _cells(scene: Scene, lens: Lens) -> ControlCells:
     """Of a net of as many control points as the scene has, by the way that light takes through a pilot's lens."""
-    light = max(scene.channels(), key=lambda channel: channel.weight)
+    light = max(scene.with_source_scaled(0.0).channels(), key=lambda channel: channel.weight)
     few = control_cells(light, lens.plain(), scene.target.screen, scene.target.irradiance())
     pairs = zip(both(scene.lens.back.net), lens.back.shape, strict=True)
     finer = math.prod((many - 2) / (known - 2) for many, known in pairs)
@@ -290,7 +296,7 @@ def _cells(scene: Scene, lens: Lens) -> ControlCells:
 
 # --- predictions ------------------------------------------------------------------------------------------------------
 
-FIT_NETS, FIT_PIXELS = (65, 1025), (128, 512)  # a side, of the fit; pixels: of the longer side
+FIT_NETS, FIT_PIXELS = (65, 1025), (120, 512)  # a side, of the fit; pixels: of the longer side
 ASPECT = 2.0  # of the target, or its inverse
 ENDS = {"quality", "seed", "accuracy", "max_time", "source_points"}  # keys of [tailoring] that set no amount of work
 GAINED = 0.43  # times the RRMSD: with 1025 control points instead of 513, for the portrait, the largest gain of the fit
@@ -307,8 +313,6 @@ def _bounds(scene: Scene) -> Iterator[tuple[Any, str, str]]:
     net, (columns, rows), front = scene.lens.back.net, scene.target.columns_rows, scene.lens.front.kind
     integrated = scene.tailoring.method == "integration"
     yield integrated, "tailored lenses", 'tailoring.method = "integration" tailors none'
-    yield scene.lens.back.reflect, "lenses", "lens.back.reflect = true makes a mirror"
-    yield scene.source.extent is not None, "points and parallel light", "the source has a size"
     yield len(scene.source.lines) > 1, "one wavelength", "source.wavelength has several"
     tilted = scene.source.tilt or scene.target.tilt
     yield tilted, "sources and targets that look along the axis", "here one is tilted"
@@ -351,10 +355,10 @@ def outlook(scene: Scene, lens: Lens, units: Callable[[], Units]) -> dict[str, A
     net = scaled(scene.lens.back.net, 2)
     if max(both(net)) <= FIT_NETS[1]:
         finer = scene.changed({"lens.back.control_points": net, "tailoring.levels": None})
-        cells = _cells(scene, small["standard"].lens)
+        cells, blurred = _cells(scene, small["standard"].lens), UNDONE * _blurred(scene, small["standard"].lens)
         for quality, value in likely.items():  # as reports of designs estimate it
             gains = {limit.by: limit.rrmsd for limit in limits(value, cells)}
-            likely[quality] = value * max(gains["control points"], GAINED)
+            likely[quality] = min(value, max(value * max(gains["control points"], GAINED), blurred))
         found["finer"] = {"control_points": net, "predicted": each(finer, likely)}
     return found
 
@@ -389,9 +393,9 @@ def rrmsds(small: Mapping[str, Pilot]) -> dict[str, float]:
 
 
 def rrmsd(small: Pilot, constants: Mapping[str, float]) -> float:
-    """A share of the pilot's RRMSD, less the smaller the pilot, and a share of the detail that it does not see."""
+    """A share of the pilot's RRMSD, less the smaller the pilot, and shares of detail and blur that it does not see."""
     seen = constants["pilot"] * small.factor ** constants["power"] * small.rrmsd
-    return seen + constants["detail"] * small.detail
+    return seen + constants["detail"] * small.detail + UNDONE * small.blurred
 
 
 def _ends_early(scene: Scene, predicted: Mapping[str, Mapping[str, Interval]]) -> Iterator[str]:

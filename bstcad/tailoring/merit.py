@@ -25,9 +25,10 @@ import numpy as np
 import scipy.fft
 import torch
 from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.sparse import csr_array
 from torch import Tensor
 
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import BSplineSurface, carrier
 from bstcad.optics.channels import Channel, weighted_sum
 from bstcad.optics.interfaces import Law
 from bstcad.optics.irradiance import Screen
@@ -42,7 +43,7 @@ from bstcad.optics.trace import through
 from bstcad.optics.tubes import arriving, rays_to
 
 EXPONENT = 0.5  # of the Laplacian
-OF_FEW_WAVES = 0.75  # the same where long waves alone move: they are wider than a pixel
+OF_COARSE = 0.75  # the same for coarse cells, which are wider than a pixel
 BLUR = 1.0  # pixels; irradiance for the weight
 SMOOTH = 1.5  # control points; of the weight's logarithm
 MOST = 4.0  # weights are clamped to [1 / MOST, MOST]
@@ -122,17 +123,18 @@ class SobolevVariable:
     scale: Tensor  # (m, n) p λ^-e
 
     @classmethod
-    def of(cls, surface: BSplineSurface, weight: Tensor, waves: int | None = None) -> SobolevVariable:
-        """For the net of a surface; waves: the cosines of as many and more half-waves a side stand still."""
+    def of(cls, surface: BSplineSurface, weight: Tensor, exponent: float = EXPONENT) -> SobolevVariable:
+        """For the net of a surface."""
         x, y = map(laplacian, surface.shape)
         energy = x[:, None] + y
-        exponent = EXPONENT if waves is None else OF_FEW_WAVES
         # by numpy, in one thread: torch rounds a power in another way where a thread's share ends
         power = torch.from_numpy(np.power(torch.where(energy > 0, energy, math.inf).numpy(), -exponent))
-        if waves is not None:
-            power[waves:], power[:, waves:] = 0.0, 0.0
         scale = math.sqrt(math.prod(surface.pitch)) * power
         return cls(weight.to(surface.heights), scale.to(surface.heights))
+
+    def zero(self) -> Tensor:
+        """c of no change."""
+        return torch.zeros_like(self.weight)
 
     def heights(self, c: Tensor) -> Tensor:
         """h of c (mm)."""
@@ -141,6 +143,43 @@ class SobolevVariable:
     def adjoint(self, g: Tensor) -> Tensor:
         """The transpose of `heights`: from a gradient in the control points to one in c."""
         return self.weight * inverse_cosine(self.scale * cosine(g))
+
+
+@dataclass(frozen=True)
+class CoarseVariable:
+    """Heights h (m, n) in mm of a net by the variable of a coarser net over the same face: h = P h'(c) Q^T.
+
+    P (m, m') and Q (n, n') carry a spline to the finer net.  (The long cosines of the finer net itself have no slope at
+    its rim, and would make one there by ripples all over it.)
+    """
+
+    coarse: SobolevVariable
+    along_x: csr_array  # P
+    along_y: csr_array  # Q
+
+    @classmethod
+    def of(cls, surface: BSplineSurface, coarse: BSplineSurface, weight: Tensor) -> CoarseVariable:
+        """For the net of a surface by a coarser one, with the weight at the coarser one's control points."""
+        across = (carrier(few, many) for few, many in zip(coarse.shape, surface.shape, strict=True))
+        return cls(SobolevVariable.of(coarse, weight, OF_COARSE), *across)
+
+    def zero(self) -> Tensor:
+        """c of no change."""
+        return self.coarse.zero()
+
+    def heights(self, c: Tensor) -> Tensor:
+        """h of c (mm)."""
+        return _between(self.along_x, self.coarse.heights(c), self.along_y)
+
+    def adjoint(self, g: Tensor) -> Tensor:
+        """The transpose of `heights`: from a gradient in the control points to one in c."""
+        return self.coarse.adjoint(_between(self.along_x.T, g, self.along_y.T))
+
+
+def _between(left: csr_array, t: Tensor, right: csr_array) -> Tensor:
+    """left t right^T; by scipy, in one thread, whose sums have one order."""
+    within = np.ascontiguousarray((left @ t.cpu().numpy()).T)
+    return torch.from_numpy(np.ascontiguousarray((right @ within).T)).to(t)
 
 
 def local_weight(source: Source, lens: Lens, target: np.ndarray, screen: Screen, number: int | None = None) -> Tensor:

@@ -27,7 +27,7 @@ from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.grazing import Grazing
 from bstcad.tailoring.machinability import excess, weight
-from bstcad.tailoring.merit import SobolevVariable, TubeMerit, local_weight
+from bstcad.tailoring.merit import CoarseVariable, SobolevVariable, TubeMerit, local_weight
 from bstcad.tailoring.minimise import Best, Reached, Search, lbfgs, minimise
 from bstcad.tailoring.reachable import coarse
 from bstcad.tailoring.run import EVALUATED, Parameters, Step, Task
@@ -38,12 +38,13 @@ ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))  # (tubes a side, evaluatio
 # net between the tubes where they see nothing, which the last one has to mend.  (Found, for 1025 control points by two
 # tubes a cell: the portrait ends at 0.018 where it would end at 0.020 by the shares above in the same time.)
 SPARSE, DENSE = ((1 / 2, 0.40), (3 / 4, 0.35), (1.0, 0.25)), 2.5
-# (pixels along the longer side, tubes a side, evaluations) of the rounds before those, where RRMSD is above FAR_OFF on
-# LARGE pixels, which a net that is only too coarse for the picture gets right
-COARSE = ((32, 256, 60), (64, 384, 60), (128, 512, 60))
+# Where RRMSD is above FAR_OFF on LARGE pixels, which a net that is only too coarse for the picture gets right, light
+# has to move far: (pixels along the longer side, tubes a side, evaluations) of the rounds before those, the last of
+# which comes again after the first of those; and how many times the evaluations those have then.
+COARSE, MORE = ((32, 256, 60), (64, 384, 60)), 1.5
 LARGE, FAR_OFF = 16, 0.04
 UNBOUNDED_SHARE, FEWEST = 1 / 8, 8  # of the evaluations, and the least number, without the bounds on the back
-SEEN = 16  # places a side of the lens through which a source's images are looked at
+SEEN, BY = 16, 8  # places a side of the lens, and points of a source, by which the width of its image is measured
 FEW = 30  # evaluations: fewer make one round, since each has its own start to pay for
 NET = 65  # control points along the longer side, at most: the comparison shall cost a fraction of a second
 TUBES = 128  # a side
@@ -51,6 +52,8 @@ COMPARED = 6  # evaluations in each precision
 # (of the source, evaluations), as shares of all; what its images leave out is measured anew in each round
 SIZES = ((1 / 3, 1 / 8), (2 / 3, 1 / 8), (1.0, 1 / 4), (1.0, 1 / 4), (1.0, 1 / 4))
 A_CELL, A_PIXEL = 2.0, 1.1  # tubes a control cell and a pixel a side, at least: what is finer the source's image blurs
+
+Variable = SobolevVariable | CoarseVariable
 
 
 @dataclass(frozen=True)
@@ -111,15 +114,16 @@ def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Iterator[S
 
     The error is large at first, and few tubes resolve it as well as many; the last round corrects the finer errors.
     """
-    rounds = (Round(task, *round) for round in sheets(task.knobs))
-    return run_rounds((*coarse_rounds(task, lens), *rounds), lens, state)
+    coarse = coarse_rounds(task, lens)
+    first, *others = (Round(task, n, round(MORE * count) if coarse else count) for n, count in sheets(task.knobs))
+    return run_rounds((*coarse, first, *coarse[-1:], *others), lens, state)
 
 
 def coarse_rounds(task: Task, lens: Lens) -> tuple[Round, ...]:
-    """Rounds by few pixels and tubes for a lens after stage 1 whose picture is wrong at large; () for most lenses.
+    """Rounds by few pixels, tubes and control points for a lens after stage 1 whose picture is wrong at large, or ().
 
-    Where the map has not come to rest, near a lamp or a wall, light has to move far, by long waves of the face: many
-    evaluations at first, but each costs a thirtieth, and as the shorter waves stand still the tubes need not tell them.
+    Where the map has not come to rest, near a lamp or a wall, light has to move far: many evaluations at first, but
+    each costs a thirtieth, and the tubes need not tell the cells of the lens's own net.
     """
     most = min(max(task.screen.shape) - 1, task.knobs.side // 2)  # pixels that the net can tell
     rounds = [
@@ -218,13 +222,15 @@ def _pull(task: Task, lens: Lens) -> float:
     Within w of the border some light falls outside whatever the lens does, and to be pulled in would blur the edge.
     """
     overshoot = task.knobs.overshoot
-    if points(task.channels) == 1:
+    count = points(task.channels)
+    if count == 1:
         return overshoot
-    return overshoot / (1 + images(task.channels, lens, task.screen, SEEN).width() ** 2)
+    some = task.channels[:: count // BY + 1]  # of an even grid a diagonal, which is as wide
+    return overshoot / (1 + images(some, lens, task.screen, SEEN).width() ** 2)
 
 
 def _search(
-    now: Round, problem: Problem, variables: Sequence[SobolevVariable], place: Place, *, total: int,
+    now: Round, problem: Problem, variables: Sequence[Variable], place: Place, *, total: int,
     state: TubeSearch | None,
 ) -> Iterator[tuple[Reached, Step]]:  # fmt: skip
     """One run of the minimiser from the lens of a problem, or on from a saved state; it also ends at the goal.
@@ -238,7 +244,8 @@ def _search(
         step = Step(partial(improved, lens, variables, best), work=work, skipped=reached.skipped)
         if not reached.skipped:
             done = min(place.done + best.evaluations, total)  # a line search may run over a little
-            step = replace(step, progress=(now.stage, done, total, f"RRMSD {best.figure:.4f}"))
+            of_few = f" on {now.pixels} pixels" if now.pixels else ""
+            step = replace(step, progress=(now.stage, done, total, f"RRMSD {best.figure:.4f}{of_few}"))
             if now.pixels is None:
                 step = replace(step, rrmsd=best.figure)
                 reason = "accuracy" if best.figure <= place.goal_by_tubes else reason
@@ -279,20 +286,25 @@ class Problem:
         return value, gradients, float(rrmsd)
 
 
-def variables_of(task: Task, lens: Lens, waves: int | None = None) -> tuple[SobolevVariable, ...]:
-    """The variable of each freeform interface, for the light of the task."""
+def variables_of(task: Task, lens: Lens, pixels: int | None = None) -> tuple[Variable, ...]:
+    """The variable of each freeform interface, for the light of the task; pixels: by nets of about as many cells."""
+    nets = lens.nets
+    if pixels is not None:
+        lens = lens.with_nets(net.refined(coarser(net.shape, pixels + 1)) for net in nets)
     light = task.heaviest
     seen = light.through(lens)
-    weights = (
+    weights = [
         local_weight(light.source, seen, task.target, screen=task.screen, number=number) for number in lens.freeform
-    )
-    return tuple(SobolevVariable.of(net, weight, waves) for net, weight in zip(lens.nets, weights, strict=True))
+    ]
+    if pixels is None:
+        return tuple(SobolevVariable.of(net, weight) for net, weight in zip(nets, weights, strict=True))
+    return tuple(CoarseVariable.of(*each) for each in zip(nets, lens.nets, weights, strict=True))
 
 
 def search(
     lens: Lens,
     problem: Problem,
-    variables: Sequence[SobolevVariable],
+    variables: Sequence[Variable],
     evaluations: int,
     state: TubeSearch | None = None,
 ) -> Iterator[Reached]:
@@ -304,18 +316,18 @@ def search(
         merit, gradients, rrmsd = problem(heights)
         return merit, [v.adjoint(g) for v, g in zip(variables, gradients, strict=True)], rrmsd
 
-    method = lbfgs([torch.zeros_like(h) for h in start], evaluations, state and state.search)
+    method = lbfgs([variable.zero() for variable in variables], evaluations, state and state.search)
     return minimise(in_c, method, evaluations, state.best if state else Best())
 
 
-def improved(lens: Lens, variables: Sequence[SobolevVariable], best: Best) -> Lens:
+def improved(lens: Lens, variables: Sequence[Variable], best: Best) -> Lens:
     """The lens with the best nets of a search that began at it; itself if every value of that was not finite."""
     if not best.parameters:
         return lens
     return lens.with_heights(_moved([net.heights for net in lens.nets], variables, best.parameters))
 
 
-def _moved(start: Sequence[Tensor], variables: Sequence[SobolevVariable], c: Sequence[Tensor]) -> list[Tensor]:
+def _moved(start: Sequence[Tensor], variables: Sequence[Variable], c: Sequence[Tensor]) -> list[Tensor]:
     """The heights (mm) of each net at c."""
     return [h + variable.heights(at) for h, variable, at in zip(start, variables, c, strict=True)]
 

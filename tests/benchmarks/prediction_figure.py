@@ -1,4 +1,4 @@
-"""Predictions of twelve scenes that were kept out of the fit, against what cold runs of them took and came to.
+"""Predictions of fourteen scenes that were kept out of the fit, against what cold runs of them took and came to.
 
 Every scene of prediction_scenes.py is designed by a cold `bstcad generate`, one after the other.
 

@@ -1,4 +1,4 @@
-"""Scenes by which predictions are fitted, and twelve others that they are held to.
+"""Scenes by which predictions are fitted, and fourteen others that they are held to.
 
 Each is a template with other values; pictures are scikit-image's bundled ones, letters, and some that are drawn
 (prediction_pictures.py), all as linear irradiance.  No picture, text or geometry of the kept-out scenes is among those
@@ -37,6 +37,9 @@ class Case:
 DRAFT, STANDARD, BOTH, ALL = ("draft",), ("standard",), ("draft", "standard"), ("draft", "standard", "fine")
 NET, PIXELS = "lens.back.control_points", "target.pixels"
 X, Y, Z, TEXT, OUTLINE, SAMPLE = (f"target.{key}" for key in ("x", "y", "z", "text", "outline", "sample"))
+
+DIAMETER = "source.diameter"
+PLAIN = {"effects": (), "tailoring.rays": None}  # of the LED's scene: no losses, tubes as the quality has them
 
 
 def square(half: float) -> dict[str, tuple[float, float]]:
@@ -160,9 +163,6 @@ FIT = (
     Case("astronaut", "portrait", STANDARD, "astronaut", {Z: 900.0}),
     Case("camera-near", "disk", DRAFT, "camera", {NET: 1025, PIXELS: 384, OUTLINE: None, Z: 1000.0}),
     Case("cat-far", "thu", DRAFT, "chelsea", {PIXELS: 384, Z: 1400.0}),
-)  # fmt: skip
-
-KEPT_OUT = (
     Case("hopper", "portrait", STANDARD, "hopper", {Z: 1200.0}),
     Case("terrain", "caustic_portrait", DRAFT, "terrain", {NET: 385, PIXELS: 384, Z: 360.0}),
     Case("head", "off_axis", DRAFT, "head", {NET: 257, PIXELS: 256, Z: 1150.0}),
@@ -176,6 +176,35 @@ KEPT_OUT = (
     Case("distress", "portrait", STANDARD, "", {NET: 129, PIXELS: 256, SAMPLE: None, TEXT: "SOS", Z: 1000.0}),
     Case("quarter-wave", "disk", DRAFT, "", {NET: 257, PIXELS: 384, OUTLINE: None,
                                              TEXT: "λ/4", Z: 1400.0, **square(350.0)}),
+    Case("led", "led", BOTH, "", PLAIN),
+    Case("led-ramp", "led", BOTH, "ramp", PLAIN | {NET: 129, PIXELS: 128, "target.uniform": None}),
+    Case("led-glow", "led", DRAFT, "glow", PLAIN | {NET: 257, PIXELS: 256, "target.uniform": None, Z: 700.0}),
+    Case("led-faces", "led", STANDARD, "faces", PLAIN | {NET: 129, PIXELS: 192, "target.uniform": None, DIAMETER: 0.2}),
+    Case("sun-caustic", "sun_caustic", BOTH),
+    Case("sun-letters", "sun_caustic", STANDARD, "", {SAMPLE: None, TEXT: "SUN", Z: 600.0, "source.divergence": 0.2}),
+    Case("sun-swirl", "sun_caustic", DRAFT, "swirl", {NET: 513, PIXELS: 384, Z: 200.0, "source.divergence": 0.1}),
+    Case("sun-coins", "sun_caustic", STANDARD, "coins", {NET: 129, PIXELS: 192, Z: 150.0}),
+    Case("mirror", "mirror", BOTH),
+    Case("mirror-letters", "mirror", STANDARD, "", {NET: 257, PIXELS: 320, SAMPLE: None, TEXT: "ab\ncd", Z: 900.0}),
+    Case("mirror-clouds", "mirror", DRAFT, "clouds", {NET: 385, PIXELS: 384}),
+    Case("mirror-hills", "mirror", STANDARD, "hills", {NET: 129, PIXELS: 256, Z: 1200.0}),
+)  # fmt: skip
+
+KEPT_OUT = (
+    Case("ripple", "portrait", STANDARD, "ripple", {NET: 257, PIXELS: 320, Z: 1100.0}),
+    Case("weave", "caustic_portrait", DRAFT, "weave", {NET: 385, PIXELS: 320, Z: 240.0}),
+    Case("crescent", "off_axis", STANDARD, "crescent", {NET: 385, PIXELS: 384, Z: 950.0}),
+    Case("nebula", "thu", DRAFT, "nebula", {NET: 257, PIXELS: 256, Z: 1900.0}),
+    Case("lakes", "disk", STANDARD, "lakes", {PIXELS: 384, OUTLINE: None, Z: 1000.0}),
+    Case("grid", "portrait", DRAFT, "grid", {PIXELS: 448, Z: 950.0}),
+    Case("comet", "caustic_letters", STANDARD, "comet", {NET: 129, PIXELS: 192, Z: 340.0}),
+    Case("saddle", "off_axis", DRAFT, "saddle", {NET: 129, PIXELS: 128, Z: 1400.0}),
+    Case("kaleidoscope", "thu", ("fine",), "kaleidoscope", {NET: 257, PIXELS: 256, Z: 800.0}),
+    Case("lux", "disk", DRAFT, "", {NET: 1025, PIXELS: 512, OUTLINE: None, TEXT: "LUX", Z: 1700.0, **square(480.0)}),
+    Case("led-saddle", "led", STANDARD, "saddle", PLAIN | {NET: 129, PIXELS: 160, "target.uniform": None, Z: 800.0}),
+    Case("sun-arch", "sun_caustic", DRAFT, "arch", {PIXELS: 320, Z: 320.0, "source.divergence": 0.3}),
+    Case("mirror-pebbles", "mirror", STANDARD, "pebbles", {NET: 385, PIXELS: 320, Z: 750.0}),
+    Case("mirror-time", "mirror", DRAFT, "", {NET: 257, PIXELS: 256, SAMPLE: None, TEXT: "8:15", Z: 1000.0}),
 )  # fmt: skip
 
 CASES = {"fit": FIT, "kept out": KEPT_OUT}
