@@ -74,10 +74,8 @@ def wanted_slopes(at_face: Rays, aim: Tensor, plane: TargetPlane, law: Law) -> t
     GRAZING, and is no steeper than STEEPEST.
     """
     d, out, along = directions(at_face, aim, plane)
-    least = -1.0 if law.reverses else math.cos(largest_deflection(law.eta))
-    across = out - along * d
-    across = across / torch.sqrt(across[0] ** 2 + across[1] ** 2 + across[2] ** 2).clamp(min=1e-12)
-    out = torch.where(along < least, least * d + math.sqrt(1 - least * least) * across, out)
+    most = math.pi if law.reverses else largest_deflection(law.eta)
+    out = torch.where(along < math.cos(most), _turned(d, out, along, most), out)
     normal = at_face.sense * (law.eta * d - out)
     height = torch.maximum(normal[2], torch.sqrt(normal[0] ** 2 + normal[1] ** 2) / STEEPEST)
     return -normal[0] / height, -normal[1] / height
@@ -96,11 +94,16 @@ def kept_from_reflection(
     d, most = at_face.sense * at_face.direction, math.asin(math.sin(grazing) / law.eta)
     normal = torch.stack([-z_x, -z_y, torch.ones_like(z_x)]) / torch.sqrt(1 + z_x * z_x + z_y * z_y)
     along = d[0] * normal[0] + d[1] * normal[1] + d[2] * normal[2]
-    across = normal - along * d
-    across = across / torch.sqrt(across[0] ** 2 + across[1] ** 2 + across[2] ** 2).clamp(min=1e-12)
-    turned = math.cos(most) * d + math.sin(most) * across
+    turned = _turned(d, normal, along, most)
     beyond = (along < math.cos(most)) & (turned[2] > 0)
     return torch.where(beyond, -turned[0] / turned[2], z_x), torch.where(beyond, -turned[1] / turned[2], z_y)
+
+
+def _turned(d: Tensor, towards: Tensor, along: Tensor, angle: float) -> Tensor:
+    """Unit vectors (3, …) at an angle (rad) to d, in its plane with others; along: the product d · towards of both."""
+    across = towards - along * d
+    across = across / torch.sqrt(across[0] ** 2 + across[1] ** 2 + across[2] ** 2).clamp(min=1e-12)
+    return math.cos(angle) * d + math.sin(angle) * across
 
 
 def room(at_face: Rays, aim: Tensor, plane: TargetPlane, law: Law, grazing: float = GRAZING) -> Tensor:

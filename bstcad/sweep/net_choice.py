@@ -55,7 +55,6 @@ class Candidate:
     rrmsd: float
     seconds: float  # on two cores of pace 1
     memory_gb: float
-    cells: tuple[float, float]  # mm, along x and along y
     moved: float = math.inf  # pixels, see `moved`
 
     @property
@@ -109,19 +108,16 @@ def chosen(scene: Scene) -> Choice:
     lens, screen, target = coarse_lens(tried[0]), scene.target.screen, scene.target.irradiance()
     light, image = cells_of_a_mm2(tried[0], lens), blur(tried[0].channels(), lens, screen, target)
     blurred = image.rrmsd if image is not None else 0.0
+    a_pixel = [light.a_pixel.sum() / math.prod(each.lens.cells) / target.size for each in tried]  # cells, on average
     candidates: list[Candidate] = []
-    for each in tried:
-        likely = rrmsd(light, each, blurred)
-        if candidates and light.a_pixel.sum() / math.prod(candidates[-1].cells) > ENOUGH * target.size:
+    for each, cells, coarser_cells in zip(tried, a_pixel, [0.0, *a_pixel], strict=False):
+        if coarser_cells > ENOUGH:
             break
-        if candidates and light.a_pixel.sum() / math.prod(each.lens.cells) > ENOUGH * target.size:
+        likely = rrmsd(light, each, blurred)
+        if candidates and cells > ENOUGH:
             likely = max(likely, candidates[-1].rrmsd / BEYOND)
-        candidates.append(
-            Candidate(
-                each.lens.back.net, likely, seconds(amounts(each), fitted()["prices"], TWO_CORES),
-                memory_gb(each, fitted()["memory"]), cells=each.lens.cells, moved=moved(each),
-            )
-        )  # fmt: skip
+        time, memory = seconds(amounts(each), fitted()["prices"], TWO_CORES), memory_gb(each, fitted()["memory"])
+        candidates.append(Candidate(each.lens.back.net, likely, time, memory, moved=moved(each)))
     possible, limit = _possible(scene, candidates)
     first = next(k for k, each in enumerate(possible) if not any(_worth(each, other) for other in possible[k + 1 :]))
     return Choice(possible, first, limit if first == len(possible) - 1 else "")
