@@ -211,10 +211,10 @@ def _proof(
 ) -> Proof:  # fmt: skip
     """The proof of the files in a folder, with the pictures of its light begun."""
     progress("verify", 0, 1, "from the written files")
-    proof = checks.verify(folder, nominal, processes.submit, drawn.lens, effort=effort)
+    draw = partial(drawn.begin, draw_light, made.target)
+    proof = checks.verify(folder, nominal, processes.submit, known=drawn.lens, lit=draw, effort=effort)
     added = (check for of_script in additions.checks for check in of_script(proof, folder))
     proof = replace(proof, checks=(*proof.checks, *added))
-    drawn.begin(draw_light, made.target, proof)
     progress("verify", 1, 1, f"RRMSD {proof.light.rrmsd:.4f}")
     return proof
 

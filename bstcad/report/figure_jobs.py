@@ -19,6 +19,7 @@ from bstcad.analysis.shape import least_squares, survey
 from bstcad.cad import mesh as meshes
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
+from bstcad.optics.measure import Light, Line
 from bstcad.optics.rays import TiltedPlane
 from bstcad.optics.sources import Source
 from bstcad.report import data_sheet, light_figures, rendering
@@ -40,7 +41,6 @@ from bstcad.report.record import Contents, Point, Stage
 from bstcad.report.rendering import LightPath
 from bstcad.report.units import number, turned
 from bstcad.scene.scene import Scene
-from bstcad.verify.checks import Proof
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -127,17 +127,17 @@ def draw_lens(source: Source, lens: Lens, screen: Screen, view: View) -> Pngs:
     }
 
 
-def draw_light(target: np.ndarray, proof: Proof, view: View) -> Pngs:
-    """The pictures of the light; one of the ghost and of lines if the proof has any."""
-    found = proof.light.picture
+def draw_light(target: np.ndarray, light: Light, lines: Sequence[Line], view: View) -> Pngs:
+    """The pictures of the light; one of the ghost and of the lines of a spectrum if there are any."""
+    found = light.picture
     pictures = {
         "irradiance": light_figures.irradiance_triptych(target, found, view),
         "cross_section": light_figures.cross_section(target, found, view),
     }
-    if proof.light.ghost is not None:
-        pictures["ghost"] = light_figures.ghost_picture(target, proof.light.ghost, view)
-    if proof.lines:
-        pictures["lines"] = light_figures.lines_apart(target, found, proof.lines, view)
+    if light.ghost is not None:
+        pictures["ghost"] = light_figures.ghost_picture(target, light.ghost, view)
+    if lines:
+        pictures["lines"] = light_figures.lines_apart(target, found, lines, view)
     return {name: png(picture) for name, picture in pictures.items()}
 
 

@@ -119,12 +119,14 @@ def verify(
     nominal: Nominal,
     submit: Submit = here,
     known: Callable[[Lens], None] = lambda lens: None,
+    lit: Callable[[Light, tuple[Line, ...]], None] = lambda light, lines: None,
     effort: Effort | None = None,
 ) -> Proof:
     """Check lens.step and lens.stl in `folder` against the design; ValueError if one of them cannot be read at all.
 
     With bstcad.runs.processes.submit OCC reads the STEP file in its own process, while this one reads its text and the
-    mesh.  `known` is called with the lens of the STEP file as soon as that is known.
+    mesh.  `known` is called with the lens of the STEP file as soon as that is known, and `lit` with its light and the
+    lines of a spectrum.
     """
     effort = nominal.effort(effort)
     effort = replace(effort, seed=effort.seed + VERIFY_SEED)
@@ -142,18 +144,22 @@ def verify(
     return_freed()  # the texts: OCC holds more of it still
     lens = _result(lens, path)
     whole = quadrature.of_lens(lens)  # not as it was stated
-    lit, of_aperture, why = (lens, (), "") if mount is None else _as_made(seen, lens, nominal, folder)
-    known(lit)
+    as_made, of_aperture, why = (lens, (), "") if mount is None else _as_made(seen, lens, nominal, folder)
+    known(as_made)
     light = measure(
-        lit, nominal.channels, nominal.screen, nominal.target, effort=effort, ghost=nominal.ghost, draw=nominal.draw,
-        whole=nominal.whole,
+        as_made, nominal.channels, nominal.screen, nominal.target, effort=effort, ghost=nominal.ghost,
+        draw=nominal.draw, whole=nominal.whole,
     )
     if not light.rrmsd >= 0:
         name = "lens.step" if mount is None else "part.step"
         raise ValueError(f"{name}: none of its light falls on the target; write it again, or check scene.toml")
+    lines = lines_apart(
+        as_made, nominal.channels, nominal.screen, target=nominal.target, n=max(LINE_TUBES, tubes_of(as_made))
+    )
+    lit(light, lines)
     cut = as_cut(lens, mount)
     shape = describe(cut, effort.places) | {"volume": whole.volume}
-    stability = _stability(lit, nominal, light, shape)
+    stability = _stability(as_made, nominal, light, shape)
     machined, at_bounds = of_bounds(cut, nominal.blank, shape)
     margin = math.nan if stability["tir_margin_deg"] is None else stability["tir_margin_deg"]
     checks = (
@@ -174,11 +180,8 @@ def verify(
         Check.at_most("values that are not finite", stability["non_finite"], 0),
     )
     return Proof(
-        checks, lit, light, shape, stability=stability,
-        blur=blur(nominal.channels, lit, nominal.screen, nominal.target),
-        lines=lines_apart(
-            lit, nominal.channels, nominal.screen, target=nominal.target, n=max(LINE_TUBES, tubes_of(lit))
-        ),
+        checks, as_made, light, shape, stability=stability,
+        blur=blur(nominal.channels, as_made, nominal.screen, nominal.target), lines=lines,
         at_bounds=at_bounds or None,
     )  # fmt: skip
 
