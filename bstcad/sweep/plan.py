@@ -252,7 +252,7 @@ def _pilot(scene: Scene, lens: Lens, quality: str) -> Pilot:
     steep = steepness(task.heaviest.source, last.lens, target.screen, task.target, sent=sent)
     doubtful = stage1.doubtful(task, rounds.lens, judged[0], rounds.state)
     blurred = _blurred(scene, last.lens) - _blurred(small, last.lens) if factor > 1 else 0.0
-    return Pilot(last.judged, factor, unseen, blurred, doubtful, lens=last.lens, steep=steep)
+    return Pilot(last.judged, factor, unseen, blurred=blurred, doubtful=doubtful, lens=last.lens, steep=steep)
 
 
 def _blurred(scene: Scene, lens: Lens) -> float:

@@ -147,8 +147,14 @@ def verify(
     as_made, of_aperture, why = (lens, (), "") if mount is None else _as_made(seen, lens, nominal, folder)
     known(as_made)
     light = measure(
-        as_made, nominal.channels, nominal.screen, nominal.target, effort=effort, ghost=nominal.ghost,
-        draw=nominal.draw, whole=nominal.whole,
+        as_made,
+        nominal.channels,
+        nominal.screen,
+        nominal.target,
+        effort=effort,
+        ghost=nominal.ghost,
+        draw=nominal.draw,
+        whole=nominal.whole,
     )
     if not light.rrmsd >= 0:
         name = "lens.step" if mount is None else "part.step"
