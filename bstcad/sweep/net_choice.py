@@ -41,7 +41,7 @@ ROOM = 0.8  # of the machine's memory, that a design may take
 TWO_CORES = Units(tubes=0.1, serial=0.01)  # seconds: of a machine of pace 1
 TUBES = 256  # a side, by which the light is followed
 FLOOR, HALVED = 0.68, 0.43  # of the least error by the cells (ControlCells.floor), and by half as many each way
-BY_QUALITY = {"draft": (1.4, 0.002), "standard": (1.0, 0.001), "fine": (0.9, 0.001)}  # times that, and what is left
+BY_QUALITY = {"draft": (1.5, 0.012), "standard": (1.0, 0.002), "fine": (0.7, 0.004)}  # times that, and what is left
 SEAM = 7.0  # pixels; a valley of the tool's radius that moves light by less within a cell is narrower than it need be
 ENOUGH, BEYOND = 5.0, 1.4  # cells a pixel; more of them lower the RRMSD by that factor at most, and that once
 DIM = 1e-3  # of the mean flux; tiles of less are taken for the mean
@@ -196,8 +196,8 @@ def cells_of_a_mm2(scene: Scene, lens: Lens) -> ControlCells:
 def rrmsd(light: ControlCells, scene: Scene, blurred: float = 0.0) -> float:
     """RRMSD of a scene with its net, roughly: detail that its cells cannot make, or make badly, and the rest.
 
-    blurred: RRMSD of the target blurred by the source's size.  Fitted to the designs of net_choice.json, in standard
-    quality: half of them keep to 1.21 times this, nine of ten to 1.73 times.
+    blurred: RRMSD of the target blurred by the source's size.  Fitted to designs in standard quality, of which half
+    keep to 1.3 times this, and nine of ten to 2 times; drafts and fine designs are a little further off.
     """
     factor, rest = BY_QUALITY.get(scene.tailoring.quality, BY_QUALITY["standard"])
     width, height = scene.lens.cells
