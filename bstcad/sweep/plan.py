@@ -207,7 +207,6 @@ QUALITIES = ("draft", "standard", "fine")
 # Most pixels, control points and tubes a side; more pixels where the control points would be fewer than FEWEST_POINTS.
 SIZES = {"draft": (256, 385, 768), "standard": (128, 193, 512)}
 FEWEST_POINTS = 65  # control points a side
-UNDONE = 0.5  # of the blur by a source of some size, that stage 3 leaves
 PILOT_CELLS = (16, 256)  # a side of its transport, at least and at most
 
 
@@ -218,7 +217,6 @@ class Pilot:
     rrmsd: float
     factor: float  # pixels a side of the scene over those of the pilot
     detail: float  # of the scene's picture, finer than the pilot's pixels
-    blurred: float  # RRMSD that a source of some size blurs, by the scene's pixels less than by the pilot's
     doubtful: bool  # did stage 1 try the other way as well?
     lens: Lens
     steep: Steepness  # that its target's light needs of the back
@@ -251,14 +249,7 @@ def _pilot(scene: Scene, lens: Lens, quality: str) -> Pilot:
     unseen = detail(scene.target.irradiance(), max(target.columns_rows))
     steep = steepness(task.heaviest.source, last.lens, target.screen, task.target, sent=sent)
     doubtful = stage1.doubtful(task, rounds.lens, judged[0], rounds.state)
-    blurred = _blurred(scene, last.lens) - _blurred(small, last.lens) if factor > 1 else 0.0
-    return Pilot(last.judged, factor, unseen, blurred=blurred, doubtful=doubtful, lens=last.lens, steep=steep)
-
-
-def _blurred(scene: Scene, lens: Lens) -> float:
-    """RRMSD of the target convolved with the image that a source of some size throws; 0 for a point."""
-    image = blur(scene.channels(), lens, scene.target.screen, scene.target.irradiance())
-    return 0.0 if image is None else image.rrmsd
+    return Pilot(last.judged, factor, unseen, doubtful, lens=last.lens, steep=steep)
 
 
 def _small(scene: Scene, quality: str) -> tuple[Scene, float, Tailoring]:
@@ -296,7 +287,7 @@ def _cells(scene: Scene, lens: Lens) -> ControlCells:
 
 # --- predictions ------------------------------------------------------------------------------------------------------
 
-FIT_NETS, FIT_PIXELS = (65, 1025), (120, 512)  # a side, of the fit; pixels: of the longer side
+FIT_NETS, FIT_PIXELS = (65, 1025), (128, 512)  # a side, of the fit; pixels: of the longer side
 ASPECT = 2.0  # of the target, or its inverse
 ENDS = {"quality", "seed", "accuracy", "max_time", "source_points"}  # keys of [tailoring] that set no amount of work
 GAINED = 0.43  # times the RRMSD: with 1025 control points instead of 513, for the portrait, the largest gain of the fit
@@ -313,6 +304,8 @@ def _bounds(scene: Scene) -> Iterator[tuple[Any, str, str]]:
     net, (columns, rows), front = scene.lens.back.net, scene.target.columns_rows, scene.lens.front.kind
     integrated = scene.tailoring.method == "integration"
     yield integrated, "tailored lenses", 'tailoring.method = "integration" tailors none'
+    yield scene.lens.back.reflect, "lenses", "lens.back.reflect = true makes a mirror"
+    yield scene.source.extent is not None, "points and parallel light", "the source has a size"
     yield len(scene.source.lines) > 1, "one wavelength", "source.wavelength has several"
     tilted = scene.source.tilt or scene.target.tilt
     yield tilted, "sources and targets that look along the axis", "here one is tilted"
@@ -355,10 +348,10 @@ def outlook(scene: Scene, lens: Lens, units: Callable[[], Units]) -> dict[str, A
     net = scaled(scene.lens.back.net, 2)
     if max(both(net)) <= FIT_NETS[1]:
         finer = scene.changed({"lens.back.control_points": net, "tailoring.levels": None})
-        cells, blurred = _cells(scene, small["standard"].lens), UNDONE * _blurred(scene, small["standard"].lens)
+        cells = _cells(scene, small["standard"].lens)
         for quality, value in likely.items():  # as reports of designs estimate it
             gains = {limit.by: limit.rrmsd for limit in limits(value, cells)}
-            likely[quality] = min(value, max(value * max(gains["control points"], GAINED), blurred))
+            likely[quality] = value * max(gains["control points"], GAINED)
         found["finer"] = {"control_points": net, "predicted": each(finer, likely)}
     return found
 
@@ -393,9 +386,9 @@ def rrmsds(small: Mapping[str, Pilot]) -> dict[str, float]:
 
 
 def rrmsd(small: Pilot, constants: Mapping[str, float]) -> float:
-    """A share of the pilot's RRMSD, less the smaller the pilot, and shares of detail and blur that it does not see."""
+    """A share of the pilot's RRMSD, less the smaller the pilot, and a share of the detail that it does not see."""
     seen = constants["pilot"] * small.factor ** constants["power"] * small.rrmsd
-    return seen + constants["detail"] * small.detail + UNDONE * small.blurred
+    return seen + constants["detail"] * small.detail
 
 
 def _ends_early(scene: Scene, predicted: Mapping[str, Mapping[str, Interval]]) -> Iterator[str]:

@@ -79,7 +79,7 @@ def _seconds(run: Run, stage: str) -> float:
     """What a stage of a run took; the start is all that is none of the others."""
     spent: dict[str, float] = {}
     for name, taken in run["stages"]:
-        of = "stage 2" if name.startswith(("stage 2", "stage 3")) else STAGES.get(name, "start")
+        of = "stage 2" if name.startswith("stage 2") else STAGES.get(name, "start")
         spent[of] = spent.get(of, 0.0) + taken
     spent["start"] += run["seconds"] - sum(spent.values())
     return spent.get(stage, 0.0)
