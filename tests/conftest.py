@@ -159,4 +159,4 @@ def verify_with(patch, few):
 
     verify = checks.verify
     patch.setattr(checks, "margins", partial(checks.margins, n=64))
-    patch.setattr(checks, "verify", lambda *given, effort=None: verify(*given, effort=effort or few))
+    patch.setattr(checks, "verify", lambda *given, effort=None, **more: verify(*given, effort=effort or few, **more))
