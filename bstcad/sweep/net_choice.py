@@ -2,8 +2,8 @@
 
 Where the light of k cells of the net falls on a pixel, the lens has k numbers to shape it with.  A pixel asks for a
 flux, and the source's flux density where its light crosses the back tells the area of the back that sends it: scarce
-light, which many such cells would have to carry, has few.  What of a picture is finer than its cells can make, and how
-the cells resolve edges and rims, give the RRMSD of a net; amounts of work (plan.py) give its seconds and memory.
+light, which many such cells would have to carry, has few.  What of a picture is finer than its cells can make, and than
+half as many each way can, gives the RRMSD of a net; amounts of work (plan.py) give its seconds and memory.
 
 Of those that memory, tailoring.max_time and the tool's radius allow, the smallest net is chosen whose RRMSD each larger
 one would lower by less than a fifth, or by less than half in three times the time.

@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bstcad.optics.channels import points
+from bstcad.optics.channels import channels_of, points
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import a_side, images, rrmsd_by_tubes
 from bstcad.optics.sides import coarser
@@ -222,11 +222,13 @@ def _pull(task: Task, lens: Lens) -> float:
     Within w of the border some light falls outside whatever the lens does, and to be pulled in would blur the edge.
     """
     overshoot = task.knobs.overshoot
-    count = points(task.channels)
-    if count == 1:
+    if points(task.channels) == 1:
         return overshoot
-    some = task.channels[:: count // BY + 1]  # of an even grid a diagonal, which is as wide
-    return overshoot / (1 + images(some, lens, task.screen, SEEN).width() ** 2)
+    few, light = task.channels, task.heaviest
+    if task.spreads:
+        source = replace(task.spreads[-1].source, wavelength=light.source.wavelength)
+        few = channels_of(source, lambda _: light.index, BY)  # whose second moments are those of all points
+    return overshoot / (1 + images(few, lens, task.screen, SEEN).width() ** 2)
 
 
 def _search(

@@ -18,9 +18,11 @@ from bstcad.optics.measure import RayTubes, apart, simulated
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
+from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.run import Task
 from bstcad.tailoring.source_image import BlurredMerit, Images, Spread, _biquadratic, blurs, bordered
-from bstcad.tailoring.stage2 import Problem
+from bstcad.tailoring.stage2 import Problem, _pull
 
 INDEX, SIZE = 1.5, 2.4
 SCREEN = Screen(150.0, (-38.0, 36.0), (-36.0, 36.0), (50, 48))  # wider than the light, whose rim is sharp
@@ -153,3 +155,13 @@ def test_a_rectangle_of_light_casts_a_rectangle():
     nine = seen.offset.mean(-1)
     wide, high = float((nine[0, 5] - nine[0, 3]).abs()), float((nine[1, 7] - nine[1, 1]).abs())
     assert wide / high == pytest.approx(SIZE, rel=0.1) and Rectangle(SIZE, 1.0) == CHIP.extent
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_a_few_points_tell_how_wide_the_image_is(name):
+    """The pull on light beyond the border falls with the width of the image, by all 64 points or by a few."""
+    source = SOURCES[name]
+    light, knobs = channels_of(source, lambda nm: INDEX, 64), Tailoring(overshoot=0.03)
+    task = Task(light, SCREEN, target().numpy(), knobs, spreads=(spread(source),))
+    by_all = _pull(replace(task, spreads=()), lens())
+    assert _pull(task, lens()) == pytest.approx(by_all, rel=0.02) and by_all < 0.02
