@@ -8,7 +8,7 @@
 #              tests.benchmarks.accuracy --list tells their names), with ONLY= writes alone
 # make published   published results beside ours on the same scenes, each judged by an independent Monte Carlo, into
 #              docs/published.md; ONLY= as above, and SUN_PICTURE= the path of diffinytrace's examples/img1.jpg
-# make prediction   what is predicted and what is found, an hour and a half, into docs/prediction.md
+# make prediction   what is predicted and what is found, about an hour, into docs/prediction.md
 # make effects what each effect costs, into docs/effects.md
 # make stability   the hard cases, those of make bench too, and what they measured, into docs/stability.md
 # make docs    the documentation, into docs/_build/html: its tutorials and gallery run, some five minutes

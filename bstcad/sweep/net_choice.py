@@ -31,7 +31,7 @@ from bstcad.scene.blank import LARGEST_NET
 from bstcad.scene.scene import Scene
 from bstcad.sweep.cold_run import Units
 from bstcad.sweep.estimates import coarse_lens
-from bstcad.sweep.plan import amounts, fitted, memory_gb, seconds
+from bstcad.sweep.plan import UNDONE, amounts, fitted, memory_gb, seconds
 
 KEY = "lens.back.control_points"
 SQUARE = (65, 129, 257, 513, 1025)  # control points a side of the nets that are tried, or as many in square cells
@@ -42,7 +42,6 @@ TWO_CORES = Units(tubes=0.1, serial=0.01)  # seconds: of a machine of pace 1
 TUBES = 256  # a side, by which the light is followed
 FLOOR, HALVED = 0.68, 0.43  # of the least error by the cells (ControlCells.floor), and by half as many each way
 BY_QUALITY = {"draft": (1.5, 0.012), "standard": (1.0, 0.002), "fine": (0.7, 0.004)}  # times that, and what is left
-UNDONE = 0.5  # of the blur by a source of some size, that stage 3 leaves
 SEAM = 7.0  # pixels; a valley of the tool's radius that moves light by less within a cell is narrower than it need be
 ENOUGH, BEYOND = 5.0, 1.4  # cells a pixel; more of them lower the RRMSD by that factor at most, and that once
 DIM = 1e-3  # of the mean flux; tiles of less are taken for the mean

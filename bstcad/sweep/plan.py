@@ -24,6 +24,7 @@ from bstcad.analysis.cost import ControlCells, control_cells, limits
 from bstcad.analysis.light import blur
 from bstcad.analysis.steepness import Steepness
 from bstcad.optics.lens import Lens
+from bstcad.optics.measure import Effort, rrmsd_by_rays
 from bstcad.optics.reach import restricted, unreached
 from bstcad.optics.sides import both, coarser, scaled
 from bstcad.pipeline import check_thickness, reachable_part, reached, second_stage, steepness, task_of, transport_of
@@ -122,10 +123,13 @@ KINDS = {
     "launched": ("stage 2", "tubes"),  # tubes of a point, at the start of each round
     "crossings": ("stage 2", "tubes"),  # of tubes and pixel borders
     "variable": ("stage 2", "tubes"),  # control points, in each evaluation
+    "images": ("stage 2", "tubes"),  # of a source of some size, at the start of each round
+    "blurs": ("stage 2", "serial"),  # by these images, in each evaluation
     "writing": ("write", "serial"),
     "net written": ("write", "serial"),
     "rays": ("verify", "tubes"),
     "tubes": ("verify", "tubes"),
+    "points": ("verify", "tubes"),  # of a source of some size
     "net read": ("verify", "serial"),
     "report": ("report", "serial"),
     "pictures": ("report", "serial"),
@@ -166,10 +170,13 @@ def amounts(scene: Scene, other_way: bool = False) -> dict[str, float]:
         "launched": spread * sum(tubes**2 for tubes, _ in rounds) if point else 0.0,
         "crossings": spread * sum(tubes * count for tubes, count in rounds) * math.sqrt(pixels),
         "variable": net * sum(count for _, count in rounds),
+        "images": float(len(rounds)) if wide else 0.0,
+        "blurs": pixels * sum(count for _, count in rounds) if wide else 0.0,
         "writing": 1.0,
         "net written": net,
         "rays": (ROUGHLY if knobs.quality == "draft" else RAYS) * (2.0 if point else 1.0),
-        "tubes": ((2 * knobs.side + 5) / TUBES) ** 2 if scene.source.extent is None else 0.0,
+        "tubes": 0.0 if wide else ((2 * knobs.side + 5) / TUBES) ** 2,
+        "points": 1.0 if wide else 0.0,
         "net read": net,
         "report": 1.0,
         "pictures": pixels,
@@ -207,7 +214,9 @@ QUALITIES = ("draft", "standard", "fine")
 # Most pixels, control points and tubes a side; more pixels where the control points would be fewer than FEWEST_POINTS.
 SIZES = {"draft": (256, 385, 768), "standard": (128, 193, 512)}
 FEWEST_POINTS = 65  # control points a side
+UNDONE = 0.5  # of the blur by a source of some size, that stage 3 leaves
 PILOT_CELLS = (16, 256)  # a side of its transport, at least and at most
+PILOT_JUDGED = Effort(rays=2048, accuracy=0.02, witness=False)  # few rays are noisier than smooth light is wrong
 
 
 @dataclass(frozen=True)
@@ -217,6 +226,7 @@ class Pilot:
     rrmsd: float
     factor: float  # pixels a side of the scene over those of the pilot
     detail: float  # of the scene's picture, finer than the pilot's pixels
+    blurred: float  # RRMSD that a source of some size blurs, by the scene's pixels less than by the pilot's
     doubtful: bool  # did stage 1 try the other way as well?
     lens: Lens
     steep: Steepness  # that its target's light needs of the back
@@ -249,7 +259,17 @@ def _pilot(scene: Scene, lens: Lens, quality: str) -> Pilot:
     unseen = detail(scene.target.irradiance(), max(target.columns_rows))
     steep = steepness(task.heaviest.source, last.lens, target.screen, task.target, sent=sent)
     doubtful = stage1.doubtful(task, rounds.lens, judged[0], rounds.state)
-    return Pilot(last.judged, factor, unseen, doubtful, lens=last.lens, steep=steep)
+    blurred = _blurred(scene, last.lens) - _blurred(small, last.lens) if factor > 1 else 0.0
+    judged = rrmsd_by_rays(
+        last.lens, small.channels(), target.screen, target=task.target, effort=PILOT_JUDGED, draw=small.draw
+    )
+    return Pilot(judged, factor, unseen, blurred=blurred, doubtful=doubtful, lens=last.lens, steep=steep)
+
+
+def _blurred(scene: Scene, lens: Lens) -> float:
+    """RRMSD of the target convolved with the image that a source of some size throws; 0 for a point."""
+    image = blur(scene.channels(), lens, scene.target.screen, scene.target.irradiance())
+    return 0.0 if image is None else image.rrmsd
 
 
 def _small(scene: Scene, quality: str) -> tuple[Scene, float, Tailoring]:
@@ -287,7 +307,7 @@ def _cells(scene: Scene, lens: Lens) -> ControlCells:
 
 # --- predictions ------------------------------------------------------------------------------------------------------
 
-FIT_NETS, FIT_PIXELS = (65, 1025), (128, 512)  # a side, of the fit; pixels: of the longer side
+FIT_NETS, FIT_PIXELS = (65, 1025), (120, 512)  # a side, of the fit; pixels: of the longer side
 ASPECT = 2.0  # of the target, or its inverse
 ENDS = {"quality", "seed", "accuracy", "max_time", "source_points"}  # keys of [tailoring] that set no amount of work
 GAINED = 0.43  # times the RRMSD: with 1025 control points instead of 513, for the portrait, the largest gain of the fit
@@ -304,8 +324,6 @@ def _bounds(scene: Scene) -> Iterator[tuple[Any, str, str]]:
     net, (columns, rows), front = scene.lens.back.net, scene.target.columns_rows, scene.lens.front.kind
     integrated = scene.tailoring.method == "integration"
     yield integrated, "tailored lenses", 'tailoring.method = "integration" tailors none'
-    yield scene.lens.back.reflect, "lenses", "lens.back.reflect = true makes a mirror"
-    yield scene.source.extent is not None, "points and parallel light", "the source has a size"
     yield len(scene.source.lines) > 1, "one wavelength", "source.wavelength has several"
     tilted = scene.source.tilt or scene.target.tilt
     yield tilted, "sources and targets that look along the axis", "here one is tilted"
@@ -348,10 +366,10 @@ def outlook(scene: Scene, lens: Lens, units: Callable[[], Units]) -> dict[str, A
     net = scaled(scene.lens.back.net, 2)
     if max(both(net)) <= FIT_NETS[1]:
         finer = scene.changed({"lens.back.control_points": net, "tailoring.levels": None})
-        cells = _cells(scene, small["standard"].lens)
+        cells, blurred = _cells(scene, small["standard"].lens), UNDONE * _blurred(scene, small["standard"].lens)
         for quality, value in likely.items():  # as reports of designs estimate it
             gains = {limit.by: limit.rrmsd for limit in limits(value, cells)}
-            likely[quality] = value * max(gains["control points"], GAINED)
+            likely[quality] = min(value, max(value * max(gains["control points"], GAINED), blurred))
         found["finer"] = {"control_points": net, "predicted": each(finer, likely)}
     return found
 
@@ -386,9 +404,9 @@ def rrmsds(small: Mapping[str, Pilot]) -> dict[str, float]:
 
 
 def rrmsd(small: Pilot, constants: Mapping[str, float]) -> float:
-    """A share of the pilot's RRMSD, less the smaller the pilot, and a share of the detail that it does not see."""
+    """The pilot's RRMSD, less the smaller the pilot, and shares of detail and blur that it does not see."""
     seen = constants["pilot"] * small.factor ** constants["power"] * small.rrmsd
-    return seen + constants["detail"] * small.detail
+    return seen + constants["detail"] * small.detail + UNDONE * small.blurred
 
 
 def _ends_early(scene: Scene, predicted: Mapping[str, Mapping[str, Interval]]) -> Iterator[str]:

@@ -2,8 +2,8 @@
 
     python -m tests.benchmarks.net_scenes [--half] [--case NAME ...] [--net N ...]
 
-designs each scene with each net and adds to net_choice.json what it comes to; --half takes half of the pixels, tubes
-and control points a side, which tells nearly the same ratios in a quarter of the time.
+designs each scene with each net and adds to net_choice.json its RRMSD and CPU seconds; --half: with half of the pixels
+a side.
 """
 
 from __future__ import annotations
@@ -46,13 +46,11 @@ CASES = (
 
 
 def scene_of(case: Case, half: bool) -> Scene:
-    """The scene of a case, its net left to be chosen or set."""
+    """The scene of a case, its net left to be chosen or set; half: with half of its pixels a side."""
     scene = case.scene("standard")
-    if not half:
-        return scene
     pixels = scene.target.pixels
     less = pixels // 2 if isinstance(pixels, int) else [n // 2 for n in pixels]
-    return scene.changed({PIXELS: less, "tailoring.rays": 768, "tailoring.transport_grid": 256})
+    return scene.changed({PIXELS: less}) if half else scene
 
 
 def with_net(scene: Scene, side: int) -> Scene:
@@ -75,11 +73,11 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--half", action="store_true")
     parser.add_argument("--case", nargs="*", default=[case.name for case in CASES])
-    parser.add_argument("--net", nargs="*", type=int, default=[])
+    parser.add_argument("--net", nargs="*", type=int, default=NETS)
     asked = parser.parse_args()
     size = "half" if asked.half else "whole"
     for case in (case for case in CASES if case.name in asked.case):
-        for side in asked.net or [(n - 1) // (2 if asked.half else 1) + 1 for n in NETS]:
+        for side in asked.net:
             found = measure(scene := with_net(scene_of(case, asked.half), side))
             known = json.loads(FIGURES.read_text()) if FIGURES.exists() else {}
             known.setdefault(size, {}).setdefault(case.name, {})[str(side)] = found

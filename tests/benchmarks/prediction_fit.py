@@ -79,7 +79,7 @@ def _seconds(run: Run, stage: str) -> float:
     """What a stage of a run took; the start is all that is none of the others."""
     spent: dict[str, float] = {}
     for name, taken in run["stages"]:
-        of = "stage 2" if name.startswith("stage 2") else STAGES.get(name, "start")
+        of = "stage 2" if name.startswith(("stage 2", "stage 3")) else STAGES.get(name, "start")
         spent[of] = spent.get(of, 0.0) + taken
     spent["start"] += run["seconds"] - sum(spent.values())
     return spent.get(stage, 0.0)
@@ -94,12 +94,16 @@ def _memory(runs: Sequence[Run]) -> dict[str, float]:
 
 
 def _rrmsd(runs: Iterable[Run]) -> dict[str, dict[str, float]]:
-    """By quality: the constants that leave the least deviations of logarithms; fine designs are too few for both."""
+    """By quality: the constants that leave the least deviations of logarithms.
+
+    A pilot as large as its design is this design: its share is 1.  Fine designs are few, and have pilots of standard
+    quality: all but their share is as in standard.
+    """
     found: dict[str, dict[str, float]] = {}
     for quality in QUALITIES:
         of_it = [run for run in runs if run["quality"] == quality]
-        like = found.get("standard", {"pilot": 0.7, "power": -0.3, "detail": 0.1})
-        free = ("pilot",) if quality == "fine" else tuple(like)
+        like = found.get("standard", {"pilot": 1.0, "power": -0.3, "detail": 0.1})
+        free = ("pilot",) if quality == "fine" else ("power", "detail")
 
         def named(tried: np.ndarray, like=like, free=free) -> dict[str, float]:
             return like | {name: abs(x) if name != "power" else x for name, x in zip(free, tried.tolist(), strict=True)}

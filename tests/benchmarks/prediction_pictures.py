@@ -43,24 +43,6 @@ def _faces() -> np.ndarray:
     return np.block([[faces[4 * i + j] for j in range(4)] for i in range(4)])
 
 
-def _motorcycle() -> np.ndarray:
-    """A photograph of a motorcycle in a workshop, three wide to two high; no shadow below a twentieth of the lights."""
-    from skimage import data
-
-    photograph = data.stereo_motorcycle()[0].mean(2)
-    return photograph.clip(photograph.max() / 20)
-
-
-def _relief() -> np.ndarray:
-    """How near everything is in that photograph: even slopes with steps between them."""
-    from scipy.ndimage import distance_transform_edt
-    from skimage import data
-
-    disparity = data.stereo_motorcycle()[2].astype(float)
-    nearest = distance_transform_edt(~np.isfinite(disparity), return_distances=False, return_indices=True)
-    return disparity[tuple(nearest)]  # what the cameras did not see is as its surroundings
-
-
 def _bar_code(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Dark bars, one to four modules wide, on a lit label."""
     widths = np.random.default_rng(11).integers(1, 5, 41)
@@ -243,6 +225,13 @@ def _julia(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
     return 0.1 + stayed / stayed.max()
 
 
+def _mosaic(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """Forty stones of a pavement, each of its own grey: the cells of the points nearest to them."""
+    rng = np.random.default_rng(23)
+    middles, greys = rng.uniform(-1, 1, (40, 2)), rng.uniform(0.15, 1.0, 40)
+    return greys[np.argmin([np.hypot(x - u, y - v) for u, v in middles], axis=0)]
+
+
 def _hearts(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Nine hearts in rows, bright in their middles."""
     across, up = np.mod(3 * (x + 1) / 2, 1) * 2.6 - 1.3, np.mod(3 * (y + 1) / 2, 1) * 2.6 - 1.2
@@ -287,21 +276,20 @@ def _coast() -> np.ndarray:
 
 
 SAMPLES = {  # that Matplotlib or scikit-image brings along, or that have a size of their own
-    "hopper": _hopper, "head": _head, "terrain": _terrain, "coast": _coast, "faces": _faces, "motorcycle": _motorcycle,
-    "relief": _relief, "matrix code": _matrix_code, "maze": _maze,
+    "hopper": _hopper, "head": _head, "terrain": _terrain, "coast": _coast, "faces": _faces,
+    "matrix code": _matrix_code, "maze": _maze,
 }  # fmt: skip
 
 PATTERNS = {
     **{"bar code": _bar_code, "line drawing": _line_drawing, "contours": _contours, "keys": _keys, "blobs": _blobs},
     **{"frame": _frame, "emblem": _emblem, "bust": _bust, "cells": _cells, "cog": _cog, "sunset": _sunset},
-    **{"julia": _julia, "hearts": _hearts},
+    **{"julia": _julia, "hearts": _hearts, "mosaic": _mosaic},
     "rings": lambda x, y, r: 1 + 0.6 * np.cos(14 * r),
     "checks": lambda x, y, r: np.where((np.floor(4 * x) + np.floor(4 * y)) % 2, 1.0, 0.15),
     "spots": lambda x, y, r: 0.05 + np.exp(4 * (np.cos(9 * x) * np.cos(9 * y) - 1)),
     "slope": lambda x, y, r: 0.1 + 0.9 * (x + 1) / 2,
     "ramp": lambda x, y, r: 0.2 + 0.8 * (y + 0.5 * x + 1.5) / 3,
     "glow": lambda x, y, r: 0.1 + np.exp(-3 * r**2),
-    "wedge": lambda x, y, r: 0.15 + (np.arctan2(y, x) + np.pi) / (2 * np.pi) * np.clip(4 * r, 0, 1),
     "vignette": lambda x, y, r: 1 - 0.4 * r**2,
     "spiral": lambda x, y, r: 1 + 0.7 * np.cos(16 * r + 3 * np.arctan2(y, x)),
     "zone plate": lambda x, y, r: 0.1 + (np.cos(40 * r**2) > 0),
@@ -310,26 +298,41 @@ PATTERNS = {
     "islands": lambda x, y, r: np.where(_noise(len(x), -2.0) > 0, 1.0, 0.1),
     "dusk": lambda x, y, r: np.exp(-1.5 * (y + 0.3 * x)),
     "sheen": lambda x, y, r: 0.15 + np.exp(-(((x - y - 0.3) / 0.7) ** 2)),
-    "petals": lambda x, y, r: 1 + 0.8 * np.cos(7 * np.arctan2(y, x)) * np.exp(-3 * (r - 0.5) ** 2),
     "stripes": lambda x, y, r: np.where(np.sin(14 * (x + 0.4 * y)) > 0, 1.2, 0.2),
     "corner": lambda x, y, r: 0.1 + (x + 1) * (y + 1.2),
     "swirl": lambda x, y, r: 1 + 0.7 * np.sin(12 * r + 3 * np.arctan2(y, x)),
-    "few polygons": lambda x, y, r: _polygons(x, y, 3, 5),
-    "polygons": lambda x, y, r: _polygons(x, y, 1, 8),
     "many polygons": lambda x, y, r: _polygons(x, y, 2, 20),
     "discs": lambda x, y, r: _discs(x, y, 4, 12, 0.01),
-    "many discs": lambda x, y, r: _discs(x, y, 5, 40, 0.004),
     "marble": lambda x, y, r: np.exp(0.5 * _noise(len(x), -1.2, 1)),
     "hills": lambda x, y, r: np.exp(_noise(len(x), -2.0, 2)),
     "felt": lambda x, y, r: np.exp(0.3 * _noise(len(x), -0.8, 3)),
     "strokes": lambda x, y, r: _strokes(x, y, 1, 6, 0.03),
     "many strokes": lambda x, y, r: _strokes(x, y, 2, 14, 0.015),
-    "fine dots": lambda x, y, r: np.where(np.cos(30 * x) * np.cos(30 * y) > 0.45 * (x + y), 1.0, DIM),
     "dots": lambda x, y, r: np.where(np.cos(16 * x) * np.cos(16 * y) > 0.45 * (x + y), 1.0, DIM),
     "cross": lambda x, y, r: np.where((np.abs(x) < 0.15) | (np.abs(y) < 0.15), 1.1, 0.1),
     "bullseye": lambda x, y, r: np.where(np.cos(25 * r) > 0, 1.1, 0.1),
-    "fringes": lambda x, y, r: 1 + 0.9 * np.cos(20 * x),
     "folds": lambda x, y, r: 0.2 + 0.8 * np.abs(np.mod(5 * x + 3 * y, 2) - 1),
-    "steps": lambda x, y, r: 0.1 + np.floor(4 * (x + 1)) / 8,
+    "ripple": lambda x, y, r: 1 + 0.8 * np.cos(18 * np.hypot(x - 0.4, y + 0.3)),
+    "weave": lambda x, y, r: 0.15 + 0.85 * np.abs(np.sin(9 * (x + y)) * np.sin(9 * (x - y))),
+    "crescent": lambda x, y, r: np.where((r < 0.75) & (np.hypot(x - 0.3, y) > 0.55), 1.0, 0.05),
+    "nebula": lambda x, y, r: np.exp(_noise(len(x), -1.7, 5)),
+    "lakes": lambda x, y, r: np.where(_noise(len(x), -2.2, 9) > 0.3, 1.0, 0.15),
+    "grid": lambda x, y, r: np.where((np.mod(6 * x, 1) < 0.15) | (np.mod(6 * y, 1) < 0.15), 1.0, 0.08),
+    "comet": lambda x, y, r: 0.05 + np.exp(-8 * r) + np.exp(-((y / 0.12) ** 2) - 2 * (x + 0.1)) * (x > -0.1) / 2,
+    "saddle": lambda x, y, r: 1 + 0.8 * x * y,
+    "kaleidoscope": lambda x, y, r: 1 + 0.8 * np.cos(6 * np.arctan2(y, x)) * np.cos(10 * r),
+    "arch": lambda x, y, r: np.where((np.abs(r - 0.6) < 0.12) & (y < 0.2), 1.0, 0.06),
+    "pebbles": lambda x, y, r: _discs(x, y, 9, 25, 0.02),
+    "lattice": lambda x, y, r: 1.2 + (np.cos(15 * x) + np.cos(7.5 * x + 13 * y) + np.cos(7.5 * x - 13 * y)) / 3,
+    "drops": lambda x, y, r: 0.1 + _discs(x, y, 12, 18, 0.06) * (1 + 0.5 * y),
+    "horizon": lambda x, y, r: 0.15 + 0.85 / (1 + np.exp(-14 * (y - 0.25 * np.sin(3 * x)))),
+    "eclipse": lambda x, y, r: np.where(r < 0.45, 0.04, 0.04 + np.exp(-4 * (r - 0.45))),
+    "hatching": lambda x, y, r: np.where(np.cos(np.where(x > y, 22 * (x + y), 22 * (x - y))) > 0.2, 1.0, 0.12),
+    "feather": lambda x, y, r: 0.1 + np.exp(-5 * x**2 - 2.4 * y**4) * (1 + 0.6 * np.sin(18 * (y - np.abs(x)))),
+    "bowl": lambda x, y, r: 0.3 + 0.7 * ((x - 0.2) ** 2 + 0.7 * y**2),
+    "knot": lambda x, y, r: 0.12 + np.exp(-((np.abs(r - 0.55 - 0.2 * np.cos(3 * np.arctan2(y, x))) / 0.09) ** 2)),
+    "shelf": lambda x, y, r: 0.2 + 0.8 / (1 + np.exp(-8 * (x + 0.2))),
+    "leaf": lambda x, y, r: np.where(np.hypot(x, np.abs(y) + 0.5) < 0.95, np.where(np.abs(y) < 0.03, 0.4, 1.0), 0.08),
+    "valley": lambda x, y, r: 0.2 + np.abs(y - 0.3 * np.sin(4 * x)) ** 1.5,
     "window": lambda x, y, r: 0.04 + np.exp(-(((x / 0.3) ** 2 + (y / 0.5) ** 2) ** 2)),
 }
