@@ -49,11 +49,3 @@ def test_the_sunlight_picture_stands_in_its_border(tmp_path):
 @pytest.mark.parametrize("name", [name for name in published.CASES if name != published.SUN])
 def test_the_scenes_can_be_read(name):
     assert load(published.CASES[name].scene).target.irradiance().sum() > 0
-
-
-def test_the_error_within_reach_leaves_out_the_pixels_beyond():
-    target = np.ones((8, 8))
-    lit = target.copy()
-    lit[0, 0] = 0.0  # its middle is 247 mm from the axis
-    assert published.within(222.0, target, lit) == 0.0
-    assert published.within(300.0, target, lit) > 0.1
