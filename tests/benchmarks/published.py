@@ -213,7 +213,7 @@ def page(recorded: Mapping[str, Any], others: Mapping[str, Any]) -> str:
         "ssim": f"{recorded[SUN]['ssim']:.3f}" if SUN in recorded else UNKNOWN,
     }
     for name, found in recorded.items():
-        case, whole = CASES[name], found["whole"]
+        case, whole = CASES[name], found.get("whole")
         text = case.unlike.format(**told, whole=UNKNOWN if whole is None else f"{whole:.3f}")
         failed = f" Of bstcad's own checks failed: {'; '.join(found['failed'])}." if found["failed"] else ""
         parts.append(f"- **{case.title}**: {text}{failed}")
