@@ -260,10 +260,10 @@ def _pilot(scene: Scene, lens: Lens, quality: str) -> Pilot:
     steep = steepness(task.heaviest.source, last.lens, target.screen, task.target, sent=sent)
     doubtful = stage1.doubtful(task, rounds.lens, judged[0], rounds.state)
     blurred = _blurred(scene, last.lens) - _blurred(small, last.lens) if factor > 1 else 0.0
-    judged = rrmsd_by_rays(
+    rrmsd = rrmsd_by_rays(
         last.lens, small.channels(), target.screen, target=task.target, effort=PILOT_JUDGED, draw=small.draw
     )
-    return Pilot(judged, factor, unseen, blurred=blurred, doubtful=doubtful, lens=last.lens, steep=steep)
+    return Pilot(rrmsd, factor, unseen, blurred=blurred, doubtful=doubtful, lens=last.lens, steep=steep)
 
 
 def _blurred(scene: Scene, lens: Lens) -> float:
@@ -404,7 +404,7 @@ def rrmsds(small: Mapping[str, Pilot]) -> dict[str, float]:
 
 
 def rrmsd(small: Pilot, constants: Mapping[str, float]) -> float:
-    """The pilot's RRMSD, less the smaller the pilot, and shares of detail and blur that it does not see."""
+    """The pilot's RRMSD (of `fine` a share of it), less the smaller the pilot; shares of unseen detail and blur."""
     seen = constants["pilot"] * small.factor ** constants["power"] * small.rrmsd
     return seen + constants["detail"] * small.detail + UNDONE * small.blurred
 

@@ -158,10 +158,10 @@ predicts before.
 - seconds: amounts of work (ray tubes times evaluations, control points, pixels, transport …), each with a price in
   units of a calibration that takes three seconds or so: an evaluation of 1024 x 1024 ray tubes on all processors, and
   text and transforms on one.  The prices were fitted stage by stage.
-- RRMSD: a part of what pilots come to, designs of the same scene by the same steps at a quarter of its size or so (a
-  half in drafts), less the smaller they are, a part of the detail of the picture that they do not see, and half of what
-  a source of some size blurs beyond what they see.  Three constants a quality; `fine` goes by the pilot of standard
-  and was fitted on {fine} designs.
+- RRMSD: the result of pilots, designs of the same scene by the same steps at a quarter of its size or so (a half in
+  drafts), less the smaller they are, a part of the detail of the picture that they do not see, and half of the blur by
+  a source of some size that they do not see.  Two constants a quality; `fine` goes by the pilot of standard, of which
+  it has a share that was fitted on {fine} designs.
 - memory: the most that both processes hold, as a sum.
 - In brackets: what nine of ten designs keep to, of those of the fit and of these, whichever is more.
 

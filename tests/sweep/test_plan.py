@@ -29,7 +29,7 @@ from bstcad.sweep.plan import (
     plan,
     seconds,
 )
-from tests.benchmarks.prediction_scenes import FIT, KEPT_OUT, NET, PIXELS
+from tests.benchmarks.prediction_scenes import FIT, KEPT_OUT, NET, PIXELS, PLAIN
 
 ROOT = Path(__file__).parent.parent.parent
 TEMPLATES = ROOT / "templates"
@@ -144,6 +144,11 @@ def test_a_scene_with_the_knobs_of_its_quality_is_predicted():
     scene = load(TEMPLATES / "thu.toml")
     assert complaint(scene) == ""
     assert complaint(scene.changed({"tailoring.rays": 1536, "tailoring.stage2_iterations": 98})) == ""
+
+
+@pytest.mark.parametrize(("template", "changes"), [("mirror", {}), ("sun_caustic", {}), ("led", PLAIN)])
+def test_mirrors_and_sources_of_some_size_are_predicted(template, changes):
+    assert complaint(load(TEMPLATES / f"{template}.toml", changes)) == ""
 
 
 def test_what_ends_a_design_early_is_said(known_pilots):
