@@ -148,7 +148,7 @@ def test_a_scene_with_the_knobs_of_its_quality_is_predicted():
 
 @pytest.mark.parametrize(("template", "changes"), [("mirror", {}), ("sun_caustic", {}), ("led", PLAIN)])
 def test_mirrors_and_sources_of_some_size_are_predicted(template, changes):
-    assert complaint(load(TEMPLATES / f"{template}.toml", changes)) == ""
+    assert complaint(load(TEMPLATES / f"{template}.toml").changed(changes)) == ""
 
 
 def test_what_ends_a_design_early_is_said(known_pilots):
