@@ -73,12 +73,14 @@ class Made:
             same_front(self.lens.front, other.lens.front)
             and np.array_equal(self.lens.back.control_points(), other.lens.back.control_points())
             and self.scene.source == other.scene.source
-            and self.scene.target == other.scene.target
+            and self.scene.targets == other.scene.targets
         )
 
 
 def same_front(one: Surface, other: Surface) -> bool:
     """The same surface, to the last bit?"""
+    if one.is_net and other.is_net:  # whatever the plane that their heights are measured from
+        return np.array_equal(one.control_points(), other.control_points())
     both = [{"z": front.z, **front.parameters()} for front in (one.plain(), other.plain())]
     same = (one.kind, one.outline) == (other.kind, other.outline) and both[0].keys() == both[1].keys()
     return same and all(np.array_equal(both[0][key], both[1][key]) for key in both[0])
@@ -96,12 +98,15 @@ def step_size(scene: scenes.Scene, net: Sides | None = None) -> float:
 
     net: control points a side, or along x and along y; None: those of the scene.
     """
-    m, n = both(net or scene.lens.back.net)
     half = scene.lens.outline.half_extent
     digits = [np.mean([len(f"{x:.14f}") for x in np.linspace(-end, end, 101)]) for end in half]
     digits.append(len(f"{scene.lens.back.z:.14f}"))
-    nets = 1 + (scene.lens.front.given is not None)
-    return nets * (m * n * (STATEMENT + 2 * len(str(m * n)) + math.fsum(digits)) + REST[1] * (m + n) / 2) + REST[0]
+
+    def of_net(net: Sides) -> float:
+        m, n = both(net)
+        return m * n * (STATEMENT + 2 * len(str(m * n)) + math.fsum(digits)) + REST[1] * (m + n) / 2
+
+    return math.fsum(map(of_net, scene.lens.nets(net))) + REST[0]
 
 
 def said_of_sizes(scene: scenes.Scene) -> str:
@@ -222,8 +227,8 @@ def _stamps(folder: Path) -> list[tuple[object, ...]]:
 def scene_files(scene: scenes.Scene) -> dict[str, bytes]:
     """scene.toml and the files that it names, by file name; a folder of them loads to the same scene."""
     contents = {SCENE: scene.toml().encode()}
-    if scene.target.image is not None:
-        contents[scene.target.image.name] = scene.target.image.data
+    for image in (target.image for target in scene.targets if target.image is not None):
+        contents[image.name] = image.data
     if scene.lens.front.given is not None:
         contents[FRONT] = scene.lens.front.given.archive()
     return contents
@@ -364,6 +369,8 @@ def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
     scene = scenes.load(folder / SCENE)
     columns, rows = scene.target.columns_rows
     shapes = {"control_points": (*both(scene.lens.back.net), 3), "target": (rows, columns), "front_curvature": ()}
+    if scene.lens.front.shaped:
+        shapes["front_control_points"] = (*both(scene.lens.nets()[1]), 3)
     if "reachable" in files.names(folder / DESIGN):
         shapes["reachable"] = rows, columns
     found = _arrays(folder, shapes | dict.fromkeys(_numbers(scene.lens.front.surface), ()), scene)
@@ -396,8 +403,8 @@ def read_transport(folder: Path, scene: scenes.Scene) -> TransportMap | None:
 
 def _arrays(folder: Path, shapes: Mapping[str, tuple[int, ...]], scene: scenes.Scene) -> dict[str, np.ndarray]:
     """Arrays of finite numbers out of the design.npz of a scene."""
-    path, (columns, rows), given = folder / DESIGN, scene.target.columns_rows, scene.lens.front.given
-    points = math.prod(both(scene.lens.back.net)) + (math.prod(given.shape) if given else 0)  # of both nets together
+    path, (columns, rows) = folder / DESIGN, scene.target.columns_rows
+    points = sum(math.prod(both(net)) for net in scene.lens.nets())
     try:
         found = files.arrays(
             path, shapes, 25 * points + 17 * columns * rows + 3_000_000
@@ -416,14 +423,24 @@ def _numbers(front: Surface) -> dict[str, float]:
 
 
 def _lens(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
-    """The designed lens, to the last bit, from its control net (m, n, 3) in mm and the numbers of its front."""
-    net, z = found["control_points"], scene.lens.back.z
+    """The designed lens, to the last bit, from its control nets (m, n, 3) in mm and the numbers of its front."""
+    blank = scene.lens
+    front = blank.front.surface
+    if blank.front.shaped:
+        front = _surface(found["front_control_points"], blank.front.z)
+    else:
+        front = front.with_parameters(**{name.removeprefix("front_"): float(found[name]) for name in _numbers(front)})
+    back = _surface(found["control_points"], blank.back.z)
+    return scene.as_mounted(
+        Lens(front, back, blank.outline, scene.index, reflects=blank.back.reflect, shaped=blank.shaped)
+    )
+
+
+def _surface(net: np.ndarray, z: float) -> BSplineSurface:
+    """The surface of a control net (m, n, 3) in mm, to the last bit, its heights measured from z if they can be."""
     if not np.array_equal(z + (net[..., 2] - z), net[..., 2]):  # where the two differ much in size a bit would be lost
         z = 0.0
-    front = scene.lens.front.surface
-    front = front.with_parameters(**{name.removeprefix("front_"): float(found[name]) for name in _numbers(front)})
-    back = BSplineSurface.from_control_points(net, z)
-    return scene.as_mounted(Lens(front, back, scene.lens.outline, scene.index, reflects=scene.lens.back.reflect))
+    return BSplineSurface.from_control_points(net, z)
 
 
 def nominal(

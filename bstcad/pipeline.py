@@ -124,7 +124,7 @@ def design(
     else:
         lens, stopped = _stage2(task, driver, lens, followed, state=start and start.second)
     lens = replace(lens.plain(), index=scene.index, losses=None)
-    if not scene.lens.front.free:  # as it was given: tailoring may have worked with less digits of it
+    if scene.lens.front.fixed:  # as it was given: tailoring may have worked with less digits of it
         lens = replace(lens, front=scene.lens.front.surface)
     steep = steepness(task.heaviest.source, lens, task.screen, task.target, sent=followed.transport)
     making = _making(followed, driver.record, stopped, steep)
@@ -199,7 +199,7 @@ def unreachable(scene: Scene, part: np.ndarray, picture: np.ndarray) -> str:
 def resolved(scene: Scene, lens: Lens) -> Scene:
     """The scene with the designed front, so that a design of it is this one, and has no front to search for.
 
-    The paper's procedure finds front and back together; its scene stays as it is.
+    The paper's procedure finds front and back together, and so is a freeform front; such a scene stays as it is.
     """
     if scene.tailoring.resolved(lens.back.shape).method == "adam":
         return scene
@@ -314,18 +314,20 @@ def device_for(asked: str) -> str:
 
 def reserve(scene: Scene) -> float:
     """Seconds that writing, proving and reporting will take on two cores."""
-    pixels, net = math.prod(scene.target.columns_rows) / 512**2, math.prod(both(scene.lens.back.net)) / 513**2
+    pixels = sum(math.prod(target.columns_rows) for target in scene.targets) / 512**2
+    net = math.prod(both(scene.lens.back.net)) / 513**2
     return FIXED + PER_NET * net + PER_PICTURE * pixels
 
 
 def purpose(scene: Scene, device: str) -> dict[str, Any]:
     """Everything that the result of `design` depends on: a state of it belongs to no other design."""
-    picture, net = scene.target.image, scene.lens.front.given
+    pictures = [target.image and hashlib.sha256(target.image.data).hexdigest() for target in scene.targets]
+    net = scene.lens.front.given
     wanted = scene.model_dump(mode="json", exclude={"name", "title", "output", "accept"})
     return {
         "version": bstcad.__version__,
         "device": device_for(device),
-        "picture": hashlib.sha256(picture.data).hexdigest() if picture else None,
+        "picture": pictures[0] if len(pictures) == 1 else pictures,
         **({"front": hashlib.sha256(net.data).hexdigest()} if net else {}),
         **wanted,
     }

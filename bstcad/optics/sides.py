@@ -38,6 +38,13 @@ def scaled(net: Sides, share: float) -> Sides:
     return plain((x, y))
 
 
+def in_proportion(net: Sides, of: Sides, to: Sides) -> Sides:
+    """The net with as many spans to those of `to` as `net` has to those of `of`, each way; beside `of` it is `to`."""
+    each = zip(both(net), both(of), both(to), strict=True)
+    x, y = (max(round((m - 1) * (t - 1) / (o - 1)) + 1, FEWEST) for m, o, t in each)
+    return plain((x, y))
+
+
 def coarser(net: Sides, longer: int) -> Sides:
     """A net with so many control points along its longer side and spans of (nearly) the same shape; `net` if finer."""
     most = max(both(net))

@@ -17,11 +17,11 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag
 from bstcad.optics.key import Key
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
-from bstcad.optics.sides import Sides, both, plain
+from bstcad.optics.sides import Sides, both, coarser, in_proportion, plain
 from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Surface
 from bstcad.runs import files
 from bstcad.scene.errors import SceneError
-from bstcad.scene.schema import COORDINATES, LENGTHS, OneOrTwo, Record, from_file
+from bstcad.scene.schema import COORDINATES, LENGTHS, OneOrTwo, Record, from_file, leaving_out
 from bstcad.step_text import part21
 
 if TYPE_CHECKING:  # which loads numba
@@ -136,7 +136,8 @@ def _some(*names: str) -> Any:
 class _Front:
     optimise: bool | tuple[str, ...] = False
     outline: Circle | None = None
-    given: GivenNet | None = None  # the net of a freeform front
+    given: GivenNet | None = None  # the net of a freeform front, or the one that its tailoring starts from
+    shaped = False  # is it a net that tailoring shapes?
 
     @property
     def surface(self) -> Surface:
@@ -149,6 +150,11 @@ class _Front:
         of, _ = FRONTS[self.kind]
         names = (name for name in ("curvature", "conic_constant") if hasattr(self, name))
         return of(self.z, **{name: getattr(self, name) for name in names})
+
+    @property
+    def fixed(self) -> bool:
+        """Is nothing of it left for tailoring to find?"""
+        return not (self.free or self.shaped)
 
     @property
     def free(self) -> tuple[str, ...]:
@@ -245,27 +251,54 @@ class ConicFront(_Front):
 
 
 @dataclass(frozen=True)
-class GivenFront(_Front):
-    """The freeform back of an earlier design, moved along z."""
+class NetFront(_Front):
+    """A freeform front: the back of an earlier design, moved along z, or one that is tailored, from there or flat."""
 
     z: Annotated[float, Z]
-    file: Annotated[NetFile, Key("Folder of a design, its design.npz or its lens.step.", example="outputs/earlier")]
-    kind: Annotated[Literal["bspline"], Key("The freeform back of an earlier design.")] = "bspline"
+    file: Annotated[
+        NetFile | None, Key("Folder of a design, its design.npz or its lens.step.", example="outputs/earlier")
+    ] = None
+    optimise: Annotated[bool, Key("It is tailored, from the net of the file, or else flat.", example=True)] = False
+    control_points: Annotated[
+        OneOrTwo | None,
+        Key("Control points along each side, or [along x, along y]; as many as the back's if absent.", "", 5,
+            LARGEST_NET, example=513),
+        BeforeValidator(lambda given: tuple(given) if isinstance(given, list) else given),  # as strict reading asks
+    ] = None
+    kind: Annotated[Literal["bspline"], Key("A freeform face: of an earlier design, or tailored.")] = "bspline"
 
+    written = leaving_out(optimise=False)
     __pydantic_config__ = STRICT
 
     @property
-    def surface(self) -> BSplineSurface:
-        """The surface in the terms of optics."""
-        return self.file.surface(self.z)
+    def surface(self) -> Surface:
+        """The surface in the terms of optics; flat before it is tailored."""
+        return Plane(self.z) if self.file is None else self.file.surface(self.z)
 
     @property
-    def given(self) -> GivenNet:
-        """The net."""
+    def given(self) -> GivenNet | None:
+        """The net of the file."""
         return self.file
 
+    @property
+    def shaped(self) -> bool:
+        """Is it a net that tailoring shapes?"""
+        return self.optimise
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """None by name: it has its heights."""
+        return ()
+
     def complaints(self, outline: Outline) -> Iterator[str]:
-        """It is that of a lens of another outline; a net may also end at the sides of a rectangle."""
+        """It is of nothing, or of a lens of another outline; a net may also end at the sides of a rectangle."""
+        if self.file is None:
+            if not self.optimise:
+                yield 'file: missing, and the front is not tailored; add file = "outputs/earlier", or optimise = true'
+            yield from (f"control_points: {complaint}" for complaint in of_net(outline, self.control_points))
+            return
+        if self.control_points is not None:
+            yield "control_points: the front has those of its file; remove one of the two"
         own, sides = net_extent(outline, self.file.shape), outline.half_extent
         for name, ends, half, side in zip("xy", (self.file.x, self.file.y), own, sides, strict=True):
             known = (half,) if outline.is_round else (half, side)
@@ -287,7 +320,7 @@ def as_front(value: Any, outline: Outline | None = None) -> Any:
     if not hasattr(value, "relative_sag_and_slope"):
         return value
     if value.is_net:
-        return GivenFront(value.z + value.moved(0.0).from_vertex().z, GivenNet.of(value))
+        return NetFront(value.z + value.moved(0.0).from_vertex().z, GivenNet.of(value))
     if value.kind in FRONTS:
         _, front = FRONTS[value.kind]
         own = {} if value.outline is None else {"outline": value.outline}
@@ -328,8 +361,18 @@ def net_extent(outline: Outline, net: Sides) -> tuple[float, float]:
     return half_x, half_y
 
 
+def of_net(outline: Outline, points: Sides | None) -> Iterator[str]:
+    """Complaints about the number of control points of a net over an outline; None: they are chosen later."""
+    m, n = both(points or FEWEST_ROUND)
+    if outline.is_round and m != n:
+        yield f"a round lens takes a square net, not one of {m} x {n}; give one number"
+    if outline.is_round and m < FEWEST_ROUND:
+        few = f"{m} are too few for a round lens, whose net reaches two spans beyond its rim"
+        yield f"{few}; give {FEWEST_ROUND} or more"
+
+
 Front = Annotated[
-    Annotated[PlaneFront | SphereFront | ConicFront | GivenFront, Field(discriminator="kind")],
+    Annotated[PlaneFront | SphereFront | ConicFront | NetFront, Field(discriminator="kind")],
     BeforeValidator(as_front),
 ]
 
@@ -338,7 +381,7 @@ Front = Annotated[
 
 
 class Back(Record):
-    """The freeform face before tailoring: a flat B-spline net at z."""
+    """The freeform face before tailoring: a flat B-spline net at z; not optimised it stays so."""
 
     kind: Annotated[Literal["bspline"], Key("The freeform face that bstcad finds.")] = "bspline"
     z: Annotated[float, Key("Place of the flat face before tailoring.", "mm", *COORDINATES, example=20.0)]
@@ -348,6 +391,11 @@ class Back(Record):
             example=257),
     ] = None
     reflect: Annotated[bool, Key("A mirror: light comes along -z and goes back along +z.")] = False
+    optimise: Annotated[
+        bool, Key("It is tailored; false: it stays flat, and the front is tailored alone.", example=False)
+    ] = True
+
+    written = leaving_out(optimise=True)
 
     @property
     def net(self) -> Sides:
@@ -432,6 +480,45 @@ class LensBlank(Record):
         return self.front.surface.sags(self.outline)
 
     @property
+    def shaped(self) -> tuple[int, ...] | None:
+        """The faces that tailoring shapes, as Lens.shaped numbers them: 0 the front, 1 the back; None: the back."""
+        if not self.front.shaped:
+            return None
+        return (0, 1) if self.back.optimise else (0,)
+
+    def front_net(self, net: Sides) -> Sides | None:
+        """Control points of a freeform front beside a back with those of `net`; None: the front has few numbers.
+
+        A front that tailoring shapes keeps its proportion to the back, such as both once have; a given one has its own.
+        """
+        own = self.front.given.shape if self.front.given else self.front.control_points if self.front.shaped else None
+        if not self.front.shaped:
+            return own and plain(own)
+        if own is None:
+            return net
+        if self.back.control_points is None:  # the proportion is not known yet
+            return coarser(plain(own), max(both(net)))
+        return in_proportion(net, of=self.back.net, to=plain(own))
+
+    def nets(self, net: Sides | None = None) -> tuple[Sides, ...]:
+        """Control points of the freeform faces: of the back, `net` or as the scene has it, then of the front."""
+        back = net or self.back.net
+        front = self.front_net(back)
+        return (back,) if front is None else (back, front)
+
+    def flat_front(self, net: Sides, as_wide_as: Sides | None = None) -> Surface:
+        """The front before tailoring, beside a back with control points of `net`; as_wide_as: as Scene.flat_lens."""
+        if not self.front.shaped:
+            return self.front.surface
+        if self.front.given is not None:
+            return self.front.given.surface(self.front.z).refined(self.front_net(net))
+        from bstcad.optics.bspline import BSplineSurface
+
+        half_x, half_y = net_extent(self.outline, self.front_net(as_wide_as or net))
+        heights = torch.zeros(both(self.front_net(net)), dtype=torch.float64)
+        return BSplineSurface(self.front.z, heights, (-half_x, half_x), (-half_y, half_y))
+
+    @property
     def cells(self) -> tuple[float, float]:
         """Width and height of a cell of the net (mm)."""
         half_x, half_y = net_extent(self.outline, self.back.net)
@@ -460,13 +547,11 @@ class LensBlank(Record):
             yield f"lens: light does not enter a mirror (back.reflect), so it has no {given[0]}; remove it"
         if not self.back.reflect and len(given) != 1:
             yield 'lens: needs exactly one of material and index; give for example material = "PMMA"'
-        m, n = both(self.back.control_points or FEWEST_ROUND)
-        points = "lens.back.control_points"
-        if self.outline.is_round and m != n:
-            yield f"{points}: a round lens takes a square net, not one of {m} x {n}; give one number"
-        if self.outline.is_round and m < FEWEST_ROUND:
-            few = f"{m} are too few for a round lens, whose net reaches two spans beyond its rim"
-            yield f"{points}: {few}; give {FEWEST_ROUND} or more"
+        of_back = of_net(self.outline, self.back.control_points)
+        yield from (f"lens.back.control_points: {complaint}" for complaint in of_back)
+        if not self.back.optimise and not self.front.shaped:
+            tailored = f'lens.front = {{ kind = "bspline", z = {self.front.z:g}, optimise = true }}'
+            yield f"lens.back.optimise: false leaves no face to tailor; write {tailored}, or remove it"
         yield from (f"lens.front.{complaint}" for complaint in self.front.complaints(self.outline))
         (falls, rises), least, most = self.front_sags, self.min_thickness, self.max_thickness
         highest = "thinnest place" if self.front.surface.is_net else "rim"

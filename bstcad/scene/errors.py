@@ -25,9 +25,10 @@ NOT_BUILT = {  # words that a scene may well have: the feature that each asks fo
     **dict.fromkeys(("wavefront", "zernike", "phase", "aberrations"), "tailoring for a wavefront is"),
     **dict.fromkeys(("diffraction", "coherent", "interference"), "wave optics is"),
     **dict.fromkeys(("scatter", "scattering", "bsdf", "haze"), "scattering is"),
-    **dict.fromkeys(("weight", "targets"), "a lens for several targets is"),
     "unreachable": "a choice of where the target may stay dark is",
 }
+# A key of the target at the beginning of a sentence, or in its middle; and one that says which of several it is.
+THE_TARGET, ONE_TARGET = re.compile(r"^target(?=[.:])|(?<=\s)target(?=\.[a-z])"), re.compile(r"target\[\d+\]")
 NEAR = 0.7  # difflib's ratio from which on a known word may be meant: "ies" and "pixels" have 0.67
 
 UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
@@ -40,11 +41,17 @@ SENTENCES = {  # by pydantic's types of errors, of a value that is `shown`
     ("bool_type", "bool_parsing"): "{shown} is neither true nor false; write one of the two, without quotes",
     ("tuple_type",): "{shown} is not a list; write it in brackets, such as {listed}",
     ("too_long",): "{actual_length} values where {max_length} belong; remove the rest",
+    ("too_short",): "{actual_length} values where at least {min_length} belong; add some",
     ("dataclass_type", "model_type", "model_attributes_type", "dict_type"): (
         "{shown} is not a table; write for example {example}"
     ),
     ("missing",): "missing; add for example {example}",
 }
+
+
+def about(sentence: str, key: str) -> str:
+    """A sentence on the one target, "target.z: …", as one on the target of this key, "target[1]"."""
+    return THE_TARGET.sub(key, sentence)
 
 
 def nearest(word: str, known: list[str], otherwise: str) -> str:
@@ -70,7 +77,10 @@ def _applies(location: tuple[int | str, ...], data: Any) -> bool:
     for step in location:
         if step in ("Circle", "Rectangle") and isinstance(data, dict):
             return data.get("shape") == step.lower()
-        data = data.get(step, data) if isinstance(data, dict) else data
+        if isinstance(data, dict):
+            data = data.get(step, data)
+        elif isinstance(data, list) and isinstance(step, int):
+            data = data[step] if step < len(data) else data
     return True
 
 
@@ -122,7 +132,7 @@ def _sentence(problem: ErrorDetails) -> str:
     place, value, context = _Place(problem), problem["input"], problem.get("ctx", {})
     key, fault = place.key, context.get("error")
     if isinstance(fault, SceneError) or (fault and not key):  # of a validator of our own
-        return str(fault)
+        return about(str(fault), target[0]) if (target := ONE_TARGET.match(key)) else str(fault)
     return f"{key}: {fault}" if fault else _of_type(problem["type"], place, value, context)
 
 
@@ -175,6 +185,9 @@ def toml_positions(text: str) -> dict[str, int]:
             lines.setdefault(table, number)
         elif key := KEY.match(line):
             lines.setdefault(f"{table}.{_plain(key[1])}".lstrip("."), number)
+    for table in (table for table, last in counts.items() if last == 0):  # alone, it may be called without a number
+        alone = f"{table}[0]"
+        lines |= {table + key.removeprefix(alone): line for key, line in lines.items() if key.startswith(alone)}
     return lines
 
 

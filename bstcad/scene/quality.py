@@ -119,6 +119,8 @@ class Tailoring(Record):
                 yield f"tailoring.{name}: {who} runs to its end; remove it or choose another {other}"
         if who and lens.bounded_by:
             yield f"lens.{lens.bounded_by[0]}: {who} knows no such bounds; remove it, or choose another {other}"
+        if who and lens.front.shaped:
+            yield f"lens.front.optimise: {who} finds no freeform front; remove it, or choose another {other}"
         if self.method == "integration" and lens.front.free:
             front = "remove it and give the front as it shall be"
             yield f"lens.front.optimise: {who} finds no front; {front}, or choose another {other}"

@@ -7,14 +7,11 @@ tables are the engine's own nouns (bstcad.optics) where one exists.
 
 from __future__ import annotations
 
-import copy
 import datetime
 import json
 import math
-import os
 import re
-import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path, PurePath
 from types import MappingProxyType
@@ -23,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 import numpy as np
 import tomli_w
 import torch
-from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_serializer, model_validator
 
 from bstcad.optics import sampling
 from bstcad.optics.channels import Channel, channels_of, drawn_channels, merged
@@ -33,29 +30,22 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import TiltedPlane
 from bstcad.optics.sides import Sides, both
 from bstcad.optics.sources import Collimated, Point, Source
-from bstcad.runs import files
-from bstcad.scene import effects, mount, picture
+from bstcad.scene import effects, mount, picture, scene_file
 from bstcad.scene.blank import INDICES, GivenNet, LensBlank, as_front, net_extent
+from bstcad.scene.dotted_keys import OUTLINES, override, tables_at
 from bstcad.scene.effects import Effects
-from bstcad.scene.errors import SceneError, explain, line_of, toml_positions
+from bstcad.scene.errors import SceneError, about, explain, line_of, toml_positions
 from bstcad.scene.mount import Mount, Part
 from bstcad.scene.picture import Picture
 from bstcad.scene.quality import JUDGE_DRAW, JUDGE_POINTS, Tailoring, Tolerance, tolerance_complaints
 from bstcad.scene.schema import FILE, Record, of_model
-from bstcad.scene.target import PICTURES, Target
+from bstcad.scene.target import Target, Targets, coplanar
 
 if TYPE_CHECKING:
     from bstcad.optics.measure import Draw, GhostLight
 
 MESH = 1e-3  # mm; how far facets may lie from a lens of up to 100 mm
-LARGEST_FILE = 1_000_000  # bytes of a scene file
-DOTS = 100  # in a line of one: tomllib takes the square of a dotted key's length to read it
-DEEPEST = 20  # tables and lists in one another; a scene has four
-NESTED = "is nested too deeply; give a scene file like those in templates"
-OUTLINES = ("source.aperture", "lens.outline", "target.outline", "lens.front.outline")
-ONE_OF = {  # alternatives among the keys of a table: a later one replaces the others
-    "target": PICTURES, "lens": ("material", "index"), **dict.fromkeys(OUTLINES, ("radius", "diameter")),
-}  # fmt: skip
+IMAGE = re.compile(r"target(\[\d+\])?\.image")  # the keys of images
 INSIDE = 0.999  # of the way to where a front would be refused: where the search may go
 TINY, FAR = 0.5, 10.0  # mm; in metres no lens is wider than the one, no target further than the other
 NARROW = 20.0  # times narrower than the lens: the light of a lens is seldom gathered so far
@@ -114,7 +104,9 @@ class Scene(Record):
     title: Annotated[str, Key("One line for the report.")] = ""
     source: Annotated[Collimated | Point, Field(discriminator="kind"), Key("The light.")]
     lens: Annotated[LensBlank, Key("The lens before tailoring, and the bounds on its back.")]
-    target: Annotated[Target, Key("The picture and where it falls.")]
+    targets: Annotated[
+        Targets, Field(alias="target"), Key("The picture and where it falls, or several: [[target]] tables.")
+    ]
     tailoring: Annotated[Tailoring, Key("How much work goes into the surface.")] = Tailoring()
     effects: Annotated[Effects, Key("What is simulated beyond refraction: [[effects]] tables.")] = ()
     accept: Annotated[Accept, Key("The limits that the report holds the design to.")] = Accept()
@@ -128,17 +120,17 @@ class Scene(Record):
     @model_validator(mode="after")
     def _possible(self) -> Self:
         for complaint in self._complaints():
-            raise SceneError("; ".join((complaint, *_metres(self.target, self.lens))))
+            raise SceneError("; ".join((complaint, *self._metres())))
         return self
 
     def _complaints(self) -> Iterator[str]:
         """Everything that keeps the scene from being built: the first one counts, and those behind rely on it."""
-        source, lens, target = self.source, self.lens, self.target
+        source, lens = self.source, self.lens
         if not picture.safe_name(self.name):
             yield f"name: {self.name!r} makes no folder name; use letters a-z, digits, '-' or '_'"
         if not (self.title.isprintable() and len(self.title) <= 200):  # it goes to the terminal too
             yield "title: must be one line of up to 200 characters that can be printed; shorten it"
-        yield from target.complaints()
+        yield from self._of_targets(Target.complaints)
         yield from lens.complaints()
         yield from _of_source(source, lens)
         yield from effects.complaints(self.effects, lens)
@@ -146,9 +138,11 @@ class Scene(Record):
             self.channels()
         except ValueError as error:  # data of the material or the metal that an effect lacks
             yield f"effects: {error}"
-        yield from _order(source, lens, target)
+        yield from _order(source, lens)
+        yield from self._of_targets(lambda target: _behind(target, lens))
         yield from _unlit(self)
-        yield from _tilted(self)
+        yield from self._of_targets(lambda target: _tilted(target, lens))
+        yield from coplanar(self.targets)
         yield from self.tailoring.complaints(lens)
         yield from tolerance_complaints(self.tolerance)
         yield from _mesh(self.output.mesh_tolerance, lens)
@@ -156,13 +150,43 @@ class Scene(Record):
         if self.mount is not None:
             yield from mount.complaints(self.mount, lens)
 
+    def _of_targets(self, sentences: Callable[[Target], Iterable[str]]) -> Iterator[str]:
+        """Sentences on each target, by its own key."""
+        for key, target in zip(self.target_keys, self.targets, strict=True):
+            yield from (about(sentence, key) for sentence in sentences(target))
+
+    def _metres(self) -> list[str]:
+        """Questions where lengths look as if they were in metres, each once."""
+        return [*dict.fromkeys(self._of_targets(lambda target: _metres(target, self.lens)))]
+
     def warnings(self) -> tuple[str, ...]:
         """Sentences on settings that are possible but perhaps not meant."""
-        doubts = [*_metres(self.target, self.lens), *self.lens.doubts()]
+        doubts = [*self._metres(), *self.lens.doubts()]
         if isinstance(self.source, Collimated):
             key = "mount.rim" if self.mount and self.mount.rim else "lens.outline"
             doubts += _beam(self.source.aperture, self.rim, key)
-        return (*doubts, *self.target.remarks())
+        return (*doubts, *self._of_targets(Target.remarks))
+
+    # ---- the targets ----
+
+    @property
+    def target(self) -> Target:
+        """The target, the first of several."""
+        return self.targets[0]
+
+    @property
+    def target_keys(self) -> tuple[str, ...]:
+        """By which sentences call the targets: target, or target[0], target[1], …"""
+        several = len(self.targets) > 1
+        return tuple(f"target[{k}]" for k in range(len(self.targets))) if several else ("target",)
+
+    @model_serializer(mode="wrap")
+    def _written(self, handler: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
+        """As a file has it: `target` is a table, or a list of several."""
+        found = {("target" if name == "targets" else name): value for name, value in handler(self).items()}
+        if len(found.get("target", ())) == 1:
+            found["target"] = found["target"][0]
+        return found
 
     # ---- the lens and its light ----
 
@@ -193,9 +217,8 @@ class Scene(Record):
         return INSIDE * falls, INSIDE * (lens.back.z - lens.front.z - lens.min_thickness)
 
     def clearance(self, highest: float) -> float:
-        """How far (mm) the target's plane passes a lens that reaches up to z = highest (mm); negative: it cuts it."""
-        plane = TiltedPlane(self.target.screen.middle, self.target.tilt or (0.0, 0.0))
-        return -plane.height((0.0, 0.0, highest)) - self.lens.outline.reach(*plane.axes[2][:2])
+        """How far (mm) the targets' planes pass a lens that reaches up to z = highest (mm); negative: one cuts it."""
+        return min(_clearance(target, self.lens, highest) for target in self.targets)
 
     def flat_lens(
         self, net: Sides, dtype: torch.dtype = torch.float64, device: str | torch.device = "cpu",
@@ -203,15 +226,20 @@ class Scene(Record):
     ) -> Lens:  # fmt: skip
         """The lens before tailoring, its back a flat net of so many control points a side, or along x and along y.
 
-        as_wide_as: the net that it is the first level of, whose spare spans past the rim it has (default: itself).
+        A front that is tailored is a net beside it, of as many more or fewer control points as in the scene, flat or as
+        its file has it.  as_wide_as: the net of the back that `net` is the first level of, whose spare spans past the
+        rim it has (default: itself); the front's likewise.
         """
         from bstcad.optics.bspline import BSplineSurface  # loads numba, which a scene alone does not need
 
         half_x, half_y = net_extent(self.lens.outline, as_wide_as or net)
         heights = torch.zeros(both(net), dtype=dtype, device=device)
         back = BSplineSurface(self.lens.back.z, heights, (-half_x, half_x), (-half_y, half_y))
-        front = self.lens.front.surface.to(heights.dtype, device)
-        return self.as_mounted(Lens(front, back, self.lens.outline, self.index, reflects=self.lens.back.reflect))
+        lens = Lens(
+            self.lens.flat_front(net, as_wide_as).to(heights.dtype, device), back, self.lens.outline, self.index,
+            reflects=self.lens.back.reflect, shaped=self.lens.shaped,
+        )  # fmt: skip
+        return self.as_mounted(lens)
 
     def as_mounted(self, lens: Lens) -> Lens:
         """A lens of this scene, with the clear apertures that the mount leaves of its faces."""
@@ -265,7 +293,8 @@ class Scene(Record):
         """The scene with other values, by dotted key: scene.changed({"lens.back.z": 21.0, "target.text": "HI"}).
 
         A value is of Python's own types: a number, a text, a list, a record (bstcad.Sphere(8.0, 0.01)), for
-        target.image an array of irradiance; None takes the key out.  Of alternatives (text, image, …) the one given
+        target.image an array of irradiance; None takes the key out.  Of several targets "target[1].text" is the
+        second's.  Of alternatives (text, image, …) the one given
         replaces the others; a path is relative to the working folder.  lens.front may be a bstcad.Surface of one's own:
         the scene holds a net within 1e-6 mm of it, inside the outline.  Raises SceneError.
         """
@@ -275,7 +304,7 @@ class Scene(Record):
         for key, value in changes.items():
             if key == "lens.front":
                 value = as_front(value, outline)
-            _override(data, key, _from_python(value, key, pictures), key)
+            override(data, key, _from_python(value, key, pictures), key)
         return _validated(data, Path("."), pictures)
 
     def toml(self) -> str:
@@ -351,8 +380,8 @@ def _size(source: Point, lens: LensBlank) -> Iterator[str]:
         yield f"source.{name}: {sizes[name]:g} mm is more than {far}; make the source smaller or move it away"
 
 
-def _order(source: Source, lens: LensBlank, target: Target) -> Iterator[str]:
-    """Light, lens and target that do not follow each other along z; a mirror's light comes from above."""
+def _order(source: Source, lens: LensBlank) -> Iterator[str]:
+    """Light and lens that do not follow each other along z; a mirror's light comes from above."""
     front, back = lens.front.z + lens.front_sags[0], lens.back.z
     key, start = ("source.position", _nearest(source, lens)) if isinstance(source, Point) else ("source.z", source.z)
     if not lens.back.reflect:
@@ -364,9 +393,13 @@ def _order(source: Source, lens: LensBlank, target: Target) -> Iterator[str]:
         yield f"{key}: the light starts at z = {start:g}, not above the mirror at z = {back:g}; move one of them"
     if lens.back.reflect and lens.front.outline is not None:
         yield "lens.front.outline: the front of a mirror is the rear of its plate, which no light meets; remove it"
-    if lens.back.reflect and lens.front.free:
+    if lens.back.reflect and not lens.front.fixed:
         yield "lens.front.optimise: the front of a mirror is the rear of its plate, which no light meets; remove it"
-    if not target.z > back:
+
+
+def _behind(target: Target, lens: LensBlank) -> Iterator[str]:
+    """A target that does not follow the lens along z."""
+    if not target.z > (back := lens.back.z):
         place = "above the mirror, whose face" if lens.back.reflect else "behind the lens, whose back"
         yield f"target.z: the target at z = {target.z:g} is not {place} is at z = {back:g}; move it further along +z"
 
@@ -391,17 +424,23 @@ def _unlit(scene: Scene) -> Iterator[str]:
         yield f"source.{key}: none of the light goes to the {lens.optic}; turn or move the source towards it"
 
 
-def _tilted(scene: Scene) -> Iterator[str]:
+def _clearance(target: Target, lens: LensBlank, highest: float) -> float:
+    """How far (mm) a target's plane passes a lens that reaches up to z = highest (mm); negative: it cuts it."""
+    plane = TiltedPlane(target.screen.middle, target.tilt or (0.0, 0.0))
+    return -plane.height((0.0, 0.0, highest)) - lens.outline.reach(*plane.axes[2][:2])
+
+
+def _tilted(target: Target, lens: LensBlank) -> Iterator[str]:
     """A tilted target that does not face the lens, cuts it, or comes down to it."""
-    if scene.target.tilt is None:
+    if target.tilt is None:
         return
-    screen, back, optic = scene.target.screen, scene.lens.back.z, scene.optic
+    screen, back, optic = target.screen, lens.back.z, lens.optic
     plane = screen.plane
     vertex = (0.0, 0.0, back)
     lowest = min(plane.point(x, y)[2] for x in screen.x for y in screen.y)
     if not -plane.height(vertex) > math.sin(EDGE_ON) * math.dist(plane.centre, vertex):
         yield f"target.tilt: the target plane is edge-on to the {optic}, or shows it its rear; turn it less, or move it"
-    if not scene.clearance(back) > 0:
+    if not _clearance(target, lens, back) > 0:
         yield f"target.tilt: the target plane cuts into the {optic}; turn it less, or move the target further along +z"
     if not lowest > back:
         edge = f"comes down to z = {lowest:.6g}, not beyond the {optic}, whose back is at z = {back:g}"
@@ -450,86 +489,20 @@ def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
     An override's text is read as a TOML value and, where it is none, as text.  Raises SceneError.
     """
     path = Path(path)
-    text, data = _read(path)
+    text, data = scene_file.read(path)
     try:
         for key, value in (overrides or {}).items():
-            _override(data, key, _toml_value(value) if isinstance(value, str) else value, f"--set {key}")
+            override(data, key, scene_file.toml_value(value) if isinstance(value, str) else value, f"--set {key}")
         return _validated(data, path.parent)
     except RecursionError:
-        raise SceneError(f"{path}: {NESTED}") from None
+        raise SceneError(f"{path}: {scene_file.NESTED}") from None
     except SceneError as error:
         key = str(error).partition(":")[0]
-        replaced = any(f"{key}.".startswith(f"{name}.") for name in overrides or ())
+        names = [name.removesuffix("[0]").replace("[0].", ".") for name in overrides or ()]
+        replaced = any(key == name or key.startswith((f"{name}.", f"{name}[")) for name in (*names, *(overrides or ())))
         if not replaced and (line := line_of(key, toml_positions(text))):
             error.add_note(f"line {line} of {path}")
         raise
-
-
-def _read(path: Path) -> tuple[str, dict[str, Any]]:
-    """The text and the tables of a scene file."""
-    if os.path.isdir(path):
-        inside = min(path.glob("*.toml"), default=path / "scene.toml")
-        raise SceneError(f"{path}: is a folder; give a scene file, such as {inside}")
-    if not os.path.isfile(path):
-        raise SceneError(f"{path}: no such scene file; give the path of a TOML file, such as templates/thu.toml")
-    try:
-        text = files.contents(path, LARGEST_FILE).decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise SceneError(f"{path}: is not UTF-8 text; give a TOML file") from None
-    except ValueError as error:
-        raise SceneError(f"{path}: cannot be read ({error}); give the path of a scene file") from None
-    if _dotted(text):
-        raise SceneError(f"{path}: has a line of over {DOTS} dots, which is no scene file; shorten that line")
-    try:
-        return text, tomllib.loads(text)
-    except RecursionError:
-        raise SceneError(f"{path}: {NESTED}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise SceneError(f"{path}: not valid TOML: {_fault(text, str(error))}") from None
-    except ValueError:
-        raise SceneError(f"{path}: has a number of too many digits; shorten it") from None
-
-
-def _fault(text: str, fault: str) -> str:
-    """A fault of tomllib, "Expected ']' (at line 3, column 5)", with its line and a remedy."""
-    lines = text.split("\n")
-    fault = fault.replace("at end of document", f"at line {len(lines)}, column {len(lines[-1]) + 1}")
-    line = lines[int(re.search(r"at line (\d+)", fault)[1]) - 1]
-    remedy = "write paths with / or in single quotes" if "\\" in line else "mend that line"
-    return f"{fault[:1].lower()}{fault[1:]}; {remedy}"
-
-
-def _dotted(text: str) -> bool:
-    """Has a line that is no comment more than DOTS dots, so that reading it could take hours?"""
-    return any(line.count(".") > DOTS for line in text.split("\n") if not line.lstrip().startswith("#"))
-
-
-def _toml_value(text: str) -> Any:
-    """An override as TOML has it, or else as a text."""
-    try:
-        table = {} if _dotted(text) else tomllib.loads(f"value = {text}")
-    except (ValueError, RecursionError):
-        return text
-    return table["value"] if len(table) == 1 else text
-
-
-def _override(data: dict[str, Any], key: str, value: Any, shown: str) -> None:
-    """Set a dotted key, `shown` so in a sentence; None takes it out.  It replaces its alternatives (ONE_OF)."""
-    *tables, last = key.split(".")
-    if not all((*tables, last)):
-        raise SceneError(f"{shown}: is no dotted key; write one such as lens.back.control_points")
-    table = data
-    for name in tables:
-        table = table.setdefault(name, {})
-        if not isinstance(table, dict):
-            raise SceneError(f"{shown}: {name} is not a table; set it whole instead")
-    if value is None:
-        table.pop(last, None)
-        return
-    alternatives = ONE_OF.get(".".join(tables), ())
-    for name in alternatives if last in alternatives else ():
-        table.pop(name, None)
-    table[last] = copy.deepcopy(value)  # a later key may go into it
 
 
 def _validated(data: dict[str, Any], folder: Path, pictures: Mapping[str, Picture] = MappingProxyType({})) -> Scene:
@@ -539,24 +512,28 @@ def _validated(data: dict[str, Any], folder: Path, pictures: Mapping[str, Pictur
         raise SceneError(f"tolerances.{key}: this table is called [{table}] now; write {table}.{key}")
     if isinstance(data.get("part"), dict) and type(date := data["part"].get("date")) is datetime.date:
         data["part"]["date"] = date.isoformat()  # as TOML has dates
-    _plain(data)
-    for key in OUTLINES:
-        _circle(data, key)
+    if isinstance(listed := data.get("target"), list) and len(listed) == 1:  # of which sentences speak without a number
+        [data["target"]] = listed
+    scene_file.check_plain(data)
+    for outline in OUTLINES:
+        for key, table in tables_at(data, outline):
+            _circle(table, key)
     try:
         # By way of JSON, pydantic is strict (no "8" for 8.0, no true for 1) and still takes lists for tuples.
         context = {"folder": folder, "contents": pictures}
         scene = Scene.model_validate_json(json.dumps(data), strict=True, context=context)
     except ValidationError as error:
         raise SceneError(explain(error, data)) from None
-    scene.target.irradiance()  # a damaged or black picture is found before any work
+    for key, target in zip(scene.target_keys, scene.targets, strict=True):
+        try:
+            target.irradiance()  # a damaged or black picture is found before any work
+        except SceneError as error:
+            raise SceneError(about(str(error), key)) from None
     return scene
 
 
-def _circle(data: dict[str, Any], place: str) -> None:
+def _circle(outline: Any, place: str) -> None:
     """A circle may be written by its diameter; the record has one noun, the radius."""
-    outline: Any = data
-    for key in place.split("."):
-        outline = outline.get(key) if isinstance(outline, dict) else None
     if not isinstance(outline, dict):
         return
     if place == "lens.front.outline" and outline.setdefault("shape", "circle") != "circle":
@@ -571,37 +548,19 @@ def _circle(data: dict[str, Any], place: str) -> None:
         outline["radius"] = diameter / 2
 
 
-def _plain(data: Any, key: str = "", depth: int = 0) -> None:
-    """SceneError for values that JSON does not have: dates, infinity, NaN, half characters."""
-    if depth > DEEPEST:
-        raise RecursionError
-    if isinstance(data, dict | list):
-        for name, value in data.items() if isinstance(data, dict) else enumerate(data):
-            where = f"{key}[{name}]" if isinstance(data, list) else f"{key}.{name}".lstrip(".")
-            _plain(name, where, depth + 1)
-            _plain(value, where, depth + 1)
-    elif isinstance(data, int | float) and not abs(data) < 1e300:  # also NaN
-        shown = data if isinstance(data, float) else "a number of over 300 digits"  # too many may not be written out
-        raise SceneError(f"{key}: {shown} is not a finite number; give one")
-    elif isinstance(data, str) and not data.isascii() and any("\ud800" <= c <= "\udfff" for c in data):
-        raise SceneError(f"{key}: holds half a character; write the text again in UTF-8")
-    elif not isinstance(data, str | int | float):
-        raise SceneError(f"{key}: {data} is a date or a time; give a number or a text")
-
-
 def _from_python(value: Any, key: str, pictures: dict[str, Picture]) -> Any:
     """A value of Python (record, array, path, tuple) under a dotted key as TOML could have it; None stays None.
 
     A picture, or a given net, is put into `pictures`, and a name that no file has stands for it.
     """
-    if hasattr(value, "__array__") and np.ndim(value) and key == "target.image":
-        value = picture.from_array(np.asarray(value))
+    if hasattr(value, "__array__") and np.ndim(value) and IMAGE.fullmatch(key):
+        value = _image(np.asarray(value), key.removesuffix(".image"))
     if isinstance(value, Picture | GivenNet):
         name = f"\0{len(pictures)}"
         pictures[name] = value
         return name
     if isinstance(value, BaseModel):
-        value = {name: getattr(value, name) for name in type(value).model_fields}
+        value = {field.alias or name: getattr(value, name) for name, field in type(value).model_fields.items()}
     elif is_dataclass(value) and not isinstance(value, type):
         value = {field.name: getattr(value, field.name) for field in fields(value)}
     elif hasattr(value, "__array__"):
@@ -617,6 +576,14 @@ def _from_python(value: Any, key: str, pictures: dict[str, Picture]) -> Any:
         return value
     kind = type(value).__name__
     raise SceneError(f"{key}: no scene holds a value of type {kind}; give a number, a text, a list or a record")
+
+
+def _image(values: np.ndarray, key: str) -> Picture:
+    """An array as the picture of the target of this key."""
+    try:
+        return picture.from_array(values)
+    except SceneError as error:
+        raise SceneError(about(str(error), key)) from None
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from pydantic import (
     Tag,
     ValidationInfo,
     WithJsonSchema,
+    model_serializer,
 )
 from pydantic.json_schema import GenerateJsonSchema
 
@@ -72,6 +73,16 @@ def from_file(kind: type, read: Callable[[Path], Any], name: Callable[[Any], str
     return Annotated[
         kind, BeforeValidator(content), PlainSerializer(name, return_type=str), WithJsonSchema({"type": "string"})
     ]
+
+
+def leaving_out(**defaults: Any) -> Any:
+    """The way a record is written, without the keys that have these values: files from before such a key stay as is."""
+
+    def written(self: Any, handler: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
+        found = handler(self)
+        return {name: value for name, value in found.items() if name not in defaults or value != defaults[name]}
+
+    return model_serializer(mode="wrap")(written)
 
 
 # ---- the schema that the records make --------------------------------------------------------------------------------
@@ -132,12 +143,15 @@ def schema() -> Node:
 
 
 def records(node: Node) -> list[Node]:
-    """The tables that may stand at a node, by themselves or in a list."""
+    """The tables that may stand at a node, by themselves or in a list; each once."""
     if "$ref" in node:
         return records(schema()["$defs"][node["$ref"].rpartition("/")[2]])
     if "properties" in node:
         return [node]
-    return [record for part in _parts(node) for record in records(part)]
+    found: list[Node] = []
+    for record in (record for part in _parts(node) for record in records(part)):
+        found += [] if record in found else [record]
+    return found
 
 
 def tags(record: Node) -> dict[str, Any]:
@@ -190,7 +204,8 @@ def _union(union: list[Node], table: str) -> list[Row]:
     for kind, record in zip(kinds, union, strict=True):
         for row in rows(record, table):
             found.setdefault(row, []).append(kind)
-    tag = Row(f"{table}.{name}", "none", " | ".join(kinds), default="required", meaning=" ".join(meanings))
+    told = {"default": "required", "meaning": " ".join(meanings), "example": kinds[0]}
+    tag = Row(f"{table}.{name}", "none", " | ".join(kinds), **told)
     others = (row if of == kinds or row.kinds else replace(row, kinds=tuple(of)) for row, of in found.items())
     return [tag, *(row for row in others if row.key != tag.key)]
 

@@ -8,26 +8,31 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
 import torch
-from pydantic import AfterValidator, BeforeValidator
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag
 from scipy.sparse import csr_array
 
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.key import Key
 from bstcad.optics.outlines import Outline
+from bstcad.optics.rays import TiltedPlane
 from bstcad.scene import picture
 from bstcad.scene.blank import Outlined
 from bstcad.scene.errors import SceneError
 from bstcad.scene.picture import Box, strips
-from bstcad.scene.schema import COORDINATES, OneOrTwo, Record, from_file
+from bstcad.scene.profile import Profile
+from bstcad.scene.schema import COORDINATES, OneOrTwo, Record, from_file, leaving_out
 
 FEWEST = 8  # pixels along a side, unless asked for fewer (which the range of `pixels` refuses)
 NARROWEST = 1e-3  # mm; a target's side, as an outline's
-PICTURES = ("text", "image", "sample", "uniform")  # a target has exactly one
+PICTURES = ("text", "image", "sample", "uniform", "profile")  # a target has exactly one
+WITHOUT_GAMMA = ("text", "uniform", "profile")
+MOST = 8  # targets of a scene
+NEAREST = 1e-3  # mm; planes of two targets that are nearer to each other are one
 
 
 PictureFile = Annotated[
@@ -53,6 +58,9 @@ class Target(Record):
     ] = None
     sample: Annotated[Literal[picture.SAMPLES] | None, Key("The picture as one of scikit-image's.")] = None
     uniform: Annotated[Literal[True] | None, Key("No picture: the same irradiance everywhere.")] = None
+    profile: Annotated[
+        Profile | None, Key("No picture: a shape of light.", example={"shape": "disc", "radius": 6.0})
+    ] = None
     gamma: Annotated[
         float | None, Key("Irradiance = number ^ gamma; the file's own if absent.", "", 0.1, 10.0, example=1.0)
     ] = None
@@ -67,6 +75,9 @@ class Target(Record):
     unreachable: Annotated[
         Literal["dark", "refuse"], Key("What light cannot reach stays dark, or the scene is refused.", example="refuse")
     ] = "dark"
+    weight: Annotated[float, Key("Weight of its squared error among all goals.", "", 1e-6, 1e6, example=2.0)] = 1.0
+
+    written = leaving_out(weight=1.0)
 
     def complaints(self) -> Iterator[str]:
         """Everything that is wrong with the table by itself."""
@@ -81,13 +92,28 @@ class Target(Record):
                 yield f"target.{axis}: is narrower than {NARROWEST:g} mm; move its ends apart"
         if self.text is not None and not (self.text.strip() and len(self.text) <= 100):
             yield 'target.text: must have 1 to 100 letters; give for example text = "THU"'
-        if self.gamma is not None and given[0] in ("text", "uniform"):
+        if self.gamma is not None and given[0] in WITHOUT_GAMMA:
             yield "target.gamma: only an image or a sample has a gamma; remove it"
         if self.invert and self.uniform:
             yield "target.invert: a uniform target inverted is dark; remove one of the two"
+        if self.invert and self.profile:
+            yield "target.invert: a profile has no dark and light to change; remove one of the two"
+        yield from self._of_profile() if self.profile else ()
         for axis, half, size in zip("xy", self.outline.half_extent if self.outline else (), self.size, strict=False):
             if 2 * half > size:
                 yield f"target.outline: is larger than the target along {axis}; make it smaller or widen {axis}"
+
+    def _of_profile(self) -> Iterator[str]:
+        """A profile that is larger than the target as it lies, or narrower than a pixel."""
+        half = self.profile.half_extent
+        half = half[::-1] if self.rotate in (90, 270) else half
+        pixel = (side / n for side, n in zip(self.size, self.columns_rows, strict=True))
+        for axis, along, size, least in zip("xy", half, self.size, pixel, strict=True):
+            if 2 * along > size:
+                yield f"target.profile: is larger than the target along {axis}; make it smaller or widen {axis}"
+            if along < least:
+                fine = f"reaches {along:g} mm from the middle along {axis}, less than a pixel of {least:.3g} mm"
+                yield f"target.profile: {fine}; make it larger, or ask for more pixels"
 
     @property
     def _pictures(self) -> list[str]:
@@ -138,7 +164,62 @@ class Drawing:
     remarks: tuple[str, ...] = ()
 
 
-@functools.lru_cache(maxsize=1)  # a photograph takes seconds, and is asked for when it is read and when it is used
+# ---- several ---------------------------------------------------------------------------------------------------------
+
+
+def distinct(given: Target | tuple[Target, ...]) -> tuple[Target, ...]:
+    """All targets of a scene, none of whose images has the name of another image: copies lie in one folder."""
+    images: dict[str, bytes] = {}  # by name, as a file system may compare names
+
+    def named(image: picture.Picture) -> picture.Picture:
+        return next(one for one in _numbered(image) if images.setdefault(one.name.casefold(), one.data) == image.data)
+
+    def own(target: Target) -> Target:
+        image = target.image and named(target.image)
+        return target if image == target.image else target.model_copy(update={"image": image})
+
+    return tuple(map(own, given if isinstance(given, tuple) else (given,)))
+
+
+def _numbered(image: picture.Picture) -> Iterator[picture.Picture]:
+    """The image by its own name, photo.jpg, and by photo-2.jpg and so on."""
+    yield image
+    stem, _, kind = image.name.rpartition(".")
+    yield from (replace(image, name=f"{stem[:70]}-{k}.{kind}") for k in range(2, 2 + MOST))
+
+
+def coplanar(targets: tuple[Target, ...]) -> Iterator[str]:
+    """Targets in the plane of an earlier one."""
+    for k, target in enumerate(targets):
+        for i, earlier in enumerate(targets[:k]):
+            if _in_one_plane(target.screen, earlier.screen):
+                yield (
+                    f"target[{k}].z: lies in the plane of target[{i}]; move one of them along z, or put what both "
+                    "show into one picture"
+                )
+
+
+def _in_one_plane(one: Screen, other: Screen) -> bool:
+    """Do the corners of each lie in the other's plane?"""
+
+    def off(screen: Screen, plane: Screen) -> float:
+        mine, theirs = (TiltedPlane(s.middle, s.tilt or (0.0, 0.0)) for s in (screen, plane))
+        return max(abs(theirs.height(mine.point(x, y))) for x in screen.x for y in screen.y)
+
+    return max(off(one, other), off(other, one)) < NEAREST
+
+
+Targets = Annotated[  # of a file: one table, or a list of them
+    Annotated[Target, Tag("table")] | Annotated[tuple[Target, ...], Tag("list"), Field(min_length=1, max_length=MOST)],
+    Discriminator(lambda given: "list" if isinstance(given, list | tuple) else "table"),
+    AfterValidator(distinct),
+]
+
+
+# ---- what is drawn ---------------------------------------------------------------------------------------------------
+
+
+@functools.lru_cache(maxsize=2)  # a photograph takes seconds, and is asked for when it is read and when it is used
 def drawing(target: Target) -> Drawing:
     """The light of a target's picture in each pixel, before its outline, and remarks on that."""
     pixels, size, remarks = target.columns_rows, target.size, ()
@@ -149,6 +230,8 @@ def drawing(target: Target) -> Drawing:
         light = 1.0 - ink if target.invert else ink
     elif target.uniform:
         light = np.ones(pixels[::-1])
+    elif target.profile is not None:
+        light = target.profile.light(pixels, size)
     else:
         given = target.sample if target.image is None else target.image
         with picture.decoding(getattr(given, "name", given)):

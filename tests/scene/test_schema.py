@@ -32,7 +32,8 @@ def fields(record, table=""):
         if name not in (record.__dataclass_fields__ if is_dataclass(record) else record.model_fields):
             continue
         inner = [leaf for leaf in leaves(hint) if hasattr(leaf, "model_fields") or hasattr(leaf, "__pydantic_config__")]
-        listed = "[]" if inner and "..." in str(hint) else ""
+        listed = "[]" if inner and "..." in str(hint) and "'table'" not in str(hint) else ""  # a table may stand alone
+        name = (not is_dataclass(record) and record.model_fields[name].alias) or name
         yield f"{table}{name}{listed}", name, hint
         for leaf in inner:
             yield from fields(leaf, f"{table}{name}{listed}.")

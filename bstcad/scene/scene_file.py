@@ -1,0 +1,83 @@
+"""The file of a scene as it stands there: its text, and its tables as TOML has them, before anything is checked."""
+
+from __future__ import annotations
+
+import os
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from bstcad.runs import files
+from bstcad.scene.errors import SceneError
+
+LARGEST_FILE = 1_000_000  # bytes of a scene file
+DOTS = 100  # in a line of one: tomllib takes the square of a dotted key's length to read it
+DEEPEST = 20  # tables and lists in one another; a scene has four
+NESTED = "is nested too deeply; give a scene file like those in templates"
+
+
+def read(path: Path) -> tuple[str, dict[str, Any]]:
+    """The text and the tables of a scene file."""
+    if os.path.isdir(path):
+        inside = min(path.glob("*.toml"), default=path / "scene.toml")
+        raise SceneError(f"{path}: is a folder; give a scene file, such as {inside}")
+    if not os.path.isfile(path):
+        raise SceneError(f"{path}: no such scene file; give the path of a TOML file, such as templates/thu.toml")
+    try:
+        text = files.contents(path, LARGEST_FILE).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise SceneError(f"{path}: is not UTF-8 text; give a TOML file") from None
+    except ValueError as error:
+        raise SceneError(f"{path}: cannot be read ({error}); give the path of a scene file") from None
+    if _dotted(text):
+        raise SceneError(f"{path}: has a line of over {DOTS} dots, which is no scene file; shorten that line")
+    try:
+        return text, tomllib.loads(text)
+    except RecursionError:
+        raise SceneError(f"{path}: {NESTED}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError(f"{path}: not valid TOML: {_fault(text, str(error))}") from None
+    except ValueError:
+        raise SceneError(f"{path}: has a number of too many digits; shorten it") from None
+
+
+def _fault(text: str, fault: str) -> str:
+    """A fault of tomllib, "Expected ']' (at line 3, column 5)", with its line and a remedy."""
+    lines = text.split("\n")
+    fault = fault.replace("at end of document", f"at line {len(lines)}, column {len(lines[-1]) + 1}")
+    line = lines[int(re.search(r"at line (\d+)", fault)[1]) - 1]
+    remedy = "write paths with / or in single quotes" if "\\" in line else "mend that line"
+    return f"{fault[:1].lower()}{fault[1:]}; {remedy}"
+
+
+def _dotted(text: str) -> bool:
+    """Has a line that is no comment more than DOTS dots, so that reading it could take hours?"""
+    return any(line.count(".") > DOTS for line in text.split("\n") if not line.lstrip().startswith("#"))
+
+
+def toml_value(text: str) -> Any:
+    """An override as TOML has it, or else as a text."""
+    try:
+        table = {} if _dotted(text) else tomllib.loads(f"value = {text}")
+    except (ValueError, RecursionError):
+        return text
+    return table["value"] if len(table) == 1 else text
+
+
+def check_plain(data: Any, key: str = "", depth: int = 0) -> None:
+    """SceneError for values that JSON does not have: dates, infinity, NaN, half characters."""
+    if depth > DEEPEST:
+        raise RecursionError
+    if isinstance(data, dict | list):
+        for name, value in data.items() if isinstance(data, dict) else enumerate(data):
+            where = f"{key}[{name}]" if isinstance(data, list) else f"{key}.{name}".lstrip(".")
+            check_plain(name, where, depth + 1)
+            check_plain(value, where, depth + 1)
+    elif isinstance(data, int | float) and not abs(data) < 1e300:  # also NaN
+        shown = data if isinstance(data, float) else "a number of over 300 digits"  # too many may not be written out
+        raise SceneError(f"{key}: {shown} is not a finite number; give one")
+    elif isinstance(data, str) and not data.isascii() and any("\ud800" <= c <= "\udfff" for c in data):
+        raise SceneError(f"{key}: holds half a character; write the text again in UTF-8")
+    elif not isinstance(data, str | int | float):
+        raise SceneError(f"{key}: {data} is a date or a time; give a number or a text")
