@@ -16,13 +16,16 @@ import numpy as np
 
 from bstcad.judges import faces
 from bstcad.judges.faces import Face, FaceError, Traced
+from bstcad.optics import sampling
 from bstcad.optics.channels import Channel, places
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import a_side
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Rays, axes
-from bstcad.optics.trace import launch_strips
+from bstcad.optics.sources import Collimated, Source
+from bstcad.optics.trace import clear_window, launch_strips
+from bstcad.optics.wavefront_error import followed
 
 BEYOND = 0.125  # of a face's width: margin of its grid beyond the rim, where the search for a ray may begin
 ARCS = 4096  # corners of the polygon of an outline with round corners
@@ -95,6 +98,54 @@ def through(lens: Lens, known: Sequence[Placed], rays: Rays) -> Any:
         batoid.refract(at.surface, theirs, before, behind, coordSys=at.frame)
         batoid.obscure(beyond, theirs)
     return theirs
+
+
+@dataclass(frozen=True)
+class PathsApart:
+    """How far two traces of the same rays are apart, at most."""
+
+    path: float  # mm, optical path from source to plane
+    place: float  # mm, on the plane
+    rays: int  # that both traces bring there
+
+
+def paths_apart(lens: Lens, source: Source, z: float, n: int = 128) -> PathsApart:
+    """batoid against bstcad: places and optical paths on a plane z (mm), n x n rays of a point or of parallel light.
+
+    The clear apertures of the lens have to keep one and a half pitches inside the rims of its nets.  batoid's rays
+    count their path from where they start: at the point, or on the plane before the lens on which ours start.
+    """
+    import batoid
+
+    lens, source = lens.plain(), source.central
+    area = clear_window(source, lens)
+    rays = source.rays(*sampling.grid(area, n), lens.entrance.z, area.area / n**2)
+    ours, path, _ = followed(source, lens, rays, z)
+    theirs = through(lens, surfaces(lens), _flat(rays))
+    batoid.intersect(batoid.Plane(), theirs, _frame((0.0, 0.0, z)))
+    both = (ours.alive & (rays.flux > 0)).numpy().ravel() & ~theirs.failed & ~theirs.vignetted
+    x, y, _ = (p.numpy().ravel() for p in ours.position)
+    ahead = theirs.t - _before_reference(source, rays, lens.entrance.z)
+    off = np.abs(ahead - path.numpy().ravel()), np.hypot(theirs.x - x, theirs.y - y)
+    return PathsApart(*(float(apart[both].max()) for apart in off), rays=int(both.sum()))
+
+
+def _flat(rays: Rays) -> Rays:
+    """The same rays in one row."""
+    position, direction = (part.reshape(3, -1) for part in (rays.position, rays.direction))
+    return replace(rays, position=position, direction=direction)
+
+
+def _before_reference(source: Source, rays: Rays, z: float) -> np.ndarray:
+    """Path (mm) of each ray, from its start, that ours leave out: to the reference of `wavefront_error.followed`.
+
+    That is the plane across parallel light, or the sphere about a point, through where the axis meets the plane z.
+    """
+    x, y, h = (p.numpy().ravel() for p in (*rays.position[:2], rays.above(z)))
+    if not isinstance(source, Collimated):
+        return np.full_like(x, math.dist(source.position, (0.0, 0.0, z)))
+    d_x, d_y, d_z = (p.numpy().ravel() for p in rays.direction)
+    return -(x * d_x + y * d_y + h * d_z)
 
 
 def cannot(lens: Lens, channels: Sequence[Channel]) -> str:

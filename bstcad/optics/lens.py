@@ -135,8 +135,9 @@ class Lens:
 
     @property
     def like(self) -> Tensor:
-        """A tensor of the precision and on the device of the lens: the heights of a free net."""
-        return self.nets[-1].heights
+        """A tensor of the precision and on the device of the lens: the heights of a net, else float64 on the CPU."""
+        last = self.nets[-1]
+        return last.heights if last.is_net else torch.zeros(0, dtype=torch.float64)
 
     @property
     def apertures(self) -> tuple[Outline, Outline]:

@@ -51,10 +51,15 @@ def through(rays: Rays, interfaces: Sequence[Interface], plane: TargetPlane) -> 
     """`land` of `across`, with each net by a fused kernel where the kernels take the tensors."""
     *others, last = interfaces
     for interface in others:
-        rays = crossing.behind(rays, interface) if _is_fused(rays, interface) else cross(rays, interface).rays
+        rays = behind(rays, interface)
     if _is_fused(rays, last):
         return crossing.landed(rays, last, plane)
     return land(cross(rays, last).rays, plane)
+
+
+def behind(rays: Rays, interface: Interface) -> Rays:
+    """Rays behind an interface: across a net by a fused kernel where that takes the tensors."""
+    return crossing.behind(rays, interface) if _is_fused(rays, interface) else cross(rays, interface).rays
 
 
 def _is_fused(rays: Rays, interface: Interface) -> bool:

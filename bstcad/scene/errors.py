@@ -22,7 +22,6 @@ HEADER, KEY = re.compile(rf"\s*(\[\[?)\s*({DOTTED})\s*\]"), re.compile(rf"\s*({D
 NOT_BUILT = {  # words that a scene may well have: the feature that each asks for, and which there is not yet
     **dict.fromkeys(("ies", "ldt", "eulumdat", "intensity"), "files of luminous intensity (IES, EULUMDAT) are"),
     **dict.fromkeys(("rayfile", "ray_file", "rayset", "ray_set"), "files of measured rays are"),
-    **dict.fromkeys(("wavefront", "zernike", "phase", "aberrations"), "tailoring for a wavefront is"),
     **dict.fromkeys(("diffraction", "coherent", "interference"), "wave optics is"),
     **dict.fromkeys(("scatter", "scattering", "bsdf", "haze"), "scattering is"),
     "unreachable": "a choice of where the target may stay dark is",

@@ -30,6 +30,7 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import TiltedPlane
 from bstcad.optics.sides import Sides, both
 from bstcad.optics.sources import Collimated, Point, Source
+from bstcad.optics.wavefront import ALONG, PlaneWave, SphericalWave, Wave, ZernikeWave
 from bstcad.scene import effects, mount, picture, scene_file
 from bstcad.scene.blank import INDICES, GivenNet, LensBlank, as_front, net_extent
 from bstcad.scene.dotted_keys import OUTLINES, override, tables_at
@@ -79,6 +80,9 @@ class Accept(Record):
     decentre: Annotated[
         float | None, Key("Greatest decentre of a measured part in its points' frame.", "mm", 1e-6, 1e3)
     ] = None
+    wavefront: Annotated[
+        float | None, Key("Greatest RMS of the wavefront error, in waves.", "", 1e-9, 1e6, example=0.1)
+    ] = None
 
 
 class Output(Record):
@@ -107,6 +111,10 @@ class Scene(Record):
     targets: Annotated[
         Targets, Field(alias="target"), Key("The picture and where it falls, or several: [[target]] tables.")
     ]
+    wavefront: Annotated[
+        Annotated[PlaneWave | SphericalWave | ZernikeWave, Field(discriminator="kind")] | None,
+        Key("The wave that the light behind the lens shall be."),
+    ] = None
     tailoring: Annotated[Tailoring, Key("How much work goes into the surface.")] = Tailoring()
     effects: Annotated[Effects, Key("What is simulated beyond refraction: [[effects]] tables.")] = ()
     accept: Annotated[Accept, Key("The limits that the report holds the design to.")] = Accept()
@@ -143,6 +151,7 @@ class Scene(Record):
         yield from _unlit(self)
         yield from self._of_targets(lambda target: _tilted(target, lens))
         yield from coplanar(self.targets)
+        yield from _of_wavefront(self.wavefront, source, lens, accept=self.accept)
         yield from self.tailoring.complaints(lens)
         yield from tolerance_complaints(self.tolerance)
         yield from _mesh(self.output.mesh_tolerance, lens)
@@ -445,6 +454,20 @@ def _tilted(target: Target, lens: LensBlank) -> Iterator[str]:
     if not lowest > back:
         edge = f"comes down to z = {lowest:.6g}, not beyond the {optic}, whose back is at z = {back:g}"
         yield f"target.tilt: an edge of the target {edge}; turn it less, make it smaller or move it along +z"
+
+
+def _of_wavefront(wave: Wave | None, source: Source, lens: LensBlank, accept: Accept) -> Iterator[str]:
+    """A wave that a lens cannot give to this light, or that no ray has."""
+    if wave is None:
+        if accept.wavefront is not None:
+            yield "accept.wavefront: limits the error of a [wavefront], and there is none; add one, or remove it"
+        return
+    if source.extent is not None:
+        light = "parallel light of one direction" if isinstance(source, Collimated) else "a point"
+        yield f"wavefront: light of a source of some extent has no one wavefront; make the source {light}"
+    yield from (f"wavefront.{complaint}" for complaint in wave.complaints(lens.back.z))
+    if isinstance(wave, ZernikeWave) and not wave.steepest(source.main_wavelength) < math.sin(ALONG):
+        yield "wavefront.coefficients: the wave is too steep to have rays; make them smaller, or the radius larger"
 
 
 def _mesh(tolerance: float | None, lens: LensBlank) -> Iterator[str]:

@@ -16,6 +16,8 @@ BOX = {"shape": "rectangle", "width": 40.0, "height": 40.0}
 SPHERE = {"lens.front.kind": "sphere", "lens.front.curvature": 0.14}
 ROUND = SPHERE | {"lens.outline": {"shape": "circle", "radius": 4.5}}
 SQUARE = SPHERE | {"lens.outline": {**BOX, "width": 9.0, "height": 9.0}, "lens.front.curvature": 0.02}
+PLANE = {"kind": "plane", "z": 40.0}
+ZERNIKE = {"kind": "zernike", "z": 40.0, "radius": 10.0, "coefficients": [0.0]}
 
 
 def flange(changed):
@@ -139,6 +141,25 @@ WRONG = {
         ({"source.tilt": "[10, 0]", "source.z": "-500"}, "source.tilt: none of the light goes to the lens; turn"),
         ({"source.tilt": "10"}, "source.tilt: 10 is not a list"),
         ({"source.centre": "[100, 0]"}, "source.centre: none of the light goes to the lens; turn or move"),
+        ({"wavefront": {"z": 40.0}}, "wavefront: kind is missing; give one of 'plane', 'sphere', 'zernike'"),
+        ({"wavefront": '{kind="plain",z=40}'}, "wavefront.kind: 'plain' is not possible; did you mean 'plane'"),
+        ({"wavefront": '{kind="plane"}'}, "wavefront.z: missing; add for example z = 40.0"),
+        ({"wavefront": PLANE | {"focus": [0.0, 0.0, 90.0]}}, "wavefront.focus: unknown key; the keys here are direc"),
+        ({"wavefront": PLANE | {"z": 20.0}},
+         "wavefront.z: the plane at z = 20 is not behind the back at z = 20; move it further along"),
+        ({"wavefront": PLANE | {"direction": [1.0, 0.0, 0.0]}}, "wavefront.direction: does not lead along .z, away"),
+        ({"wavefront": PLANE | {"direction": [0.0, 0.0, -1.0]}}, "wavefront.direction: does not lead along .z, away"),
+        ({"wavefront": PLANE | {"direction": [0.0, 0.0, 0.0]}}, "wavefront.direction: does not lead along .z, away"),
+        ({"wavefront": PLANE, "source.divergence": 0.5},
+         "wavefront: light of a source of some extent has no one wavefront; make the source parallel light of one"),
+        ({"wavefront": PLANE | {"kind": "sphere"}}, r"wavefront.focus: missing; add for example focus = \[0.0, 0"),
+        ({"wavefront": PLANE | {"kind": "sphere", "focus": [5.0, 0.0, 40.0]}},
+         "wavefront.focus: lies in the plane at z = 40; move one of them along z"),
+        ({"wavefront": ZERNIKE | {"coefficients": []}}, "wavefront.coefficients: none is in it; give some, such as"),
+        ({"wavefront": ZERNIKE | {"coefficients": [0.0, 9e4]}},
+         "wavefront.coefficients: the wave is too steep to have rays; make them smaller, or the radius larger"),
+        ({"wavefront": ZERNIKE | {"radius": 0.0}}, "wavefront.radius: 0 mm is not between 0.001 and"),
+        ({"accept.wavefront": 0.1}, r"accept.wavefront: limits the error of a \[wavefront\], and there is none; add"),
     ],
     "disk": [
         ({"lens.outline": {"shape": "circle", "radius": 8.0}, "lens.back.control_points": 5},
