@@ -29,7 +29,9 @@ from bstcad.runs import processes
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import Tailoring
 from bstcad.scene.scene import Scene
-from bstcad.tailoring import slope_map, stage1, stage2
+from bstcad.tailoring import slope_map, stage1, stage2, two_faces
+from bstcad.tailoring.feasibility import demands, refused
+from bstcad.tailoring.goals import Goal
 from bstcad.tailoring.grazing import cleared
 from bstcad.tailoring.machinability import BOUNDED, UNBOUNDED, kept, moved_clear
 from bstcad.tailoring.reachable import reachable
@@ -43,8 +45,9 @@ PROCEDURES = {  # tailoring.method: (name of the first stage, the first stage, s
     "adam": ("stage 1", paper.stage1, paper.stage2),
     "integration": ("integration", integration.steps, stage2.steps),  # of no evaluations
 }
-Stage1State = stage1.SlopeRound | paper.Level
+Stage1State = stage1.SlopeRound | paper.Level | two_faces.FrontRound
 Stage2State = stage2.TubeSearch | paper.RaySearch | stage2.Grown
+SIGNS = {"convex": 1.0, "concave": -1.0}  # tailoring.solution
 DEVICES = ("auto", "cpu", "cuda")
 COMPARED = "float32 beside float64"  # the name of that stage
 # Seconds that writing, proving and reporting take on two cores; PER_NET of 513 x 513 control points, PER_PICTURE of
@@ -105,6 +108,7 @@ def design(
     task = task_of(
         scene, restricted(picture, part), knobs, edge, progress=progress, tidy=processes.return_freed, merit=merit
     )
+    task = posed(scene, task)
     limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve(scene) + JUDGING}
     record = Record() if start is None else start.record
     driver = Driver(progress, began, **limits, interrupted=interrupted, save=save, record=record)
@@ -141,13 +145,30 @@ def task_of(scene: Scene, target: np.ndarray, knobs: Tailoring, edge: Edge | Non
     more: fields of Task that no scene tells.
     """
     light = scene.with_source_scaled(0.0).channels()
-    sizes = stage2.SIZES if scene.source.extent and knobs.method != "integration" else ()  # that knows points alone
+    several = len(scene.targets) > 1 or scene.wavefront is not None  # of which stage 3 knows nothing
+    sizes = stage2.SIZES if scene.source.extent and knobs.method != "integration" and not several else ()
     scaled = [scene.with_source_scaled(share) for share, _ in sizes]
     return Task(
         light, scene.target.screen, target, knobs, least=scene.lens.min_thickness, free=scene.lens.front.free,
         rim_sags=scene.rim_sags, grown=tuple(each.channels() for each in scaled), bounds=scene.lens.bounds,
-        spreads=tuple(Spread(each.source, light, each.draw) for each in scaled), edge=edge, **more,
+        spreads=tuple(Spread(each.source, light, each.draw) for each in scaled), edge=edge,
+        weight=scene.target.weight, further=tuple(Goal(t.screen, t.irradiance(), t.weight) for t in scene.targets[1:]),
+        wave=scene.wavefront, solution=SIGNS.get(knobs.solution), front_sides=scene.lens.front_net, **more,
     )  # fmt: skip
+
+
+def posed(scene: Scene, task: Task) -> Task:
+    """The task with the solution that asks less of two freeform faces; it says what they cannot do.  SceneError."""
+    lens = scene.flat_lens(REACH_NET)
+    if lens.freeform != (0, 1) or not task.several:
+        return task
+    demand = demands(task, task.heaviest.through(lens))
+    sentences = tuple(demand.sentences(scene.lens.back.z - scene.lens.front.z))
+    if refused(demand):
+        raise SceneError(f"target: {'; '.join(sentences[1:])}")
+    for sentence in sentences:
+        task.progress("reach", 0, 0, sentence)
+    return replace(task, solution=demand.solution)
 
 
 def second_stage(task: Task, lens: Lens, state: Stage2State | None = None) -> tuple[str, Iterator[Step]]:
@@ -165,6 +186,8 @@ def reachable_part(scene: Scene, picture: np.ndarray) -> tuple[np.ndarray | None
     None, None: it can light all that its picture lights.  A mirror, whose slope alone binds it, has no such edge.
     SceneError where it can light none, or not all in a scene with target.unreachable = "refuse".
     """
+    if scene.lens.front.shaped:  # which may send light further than any back: `posed` tells
+        return None, None
     channels = scene.with_source_scaled(0.0).channels()
     light = max(channels, key=lambda channel: channel.weight)  # stage 1 reckons with it alone
     lens, screen = light.through(scene.flat_lens(REACH_NET)), scene.target.screen
@@ -250,6 +273,7 @@ def _stage1(
     if driver.wish and state is None:
         raise KeyboardInterrupt  # there is nothing to show
     name, stage, _ = PROCEDURES[task.knobs.method]
+    stage = stage if scene.lens.shaped is None else two_faces.steps
     last = driver.run(stage(task, lens, state), task, lambda state: Saved(driver.record, state), lambda: driver.wish)
     lens, bounds = last.lens, task.bounds
     if bounds is None:

@@ -67,16 +67,23 @@ def directions(at_face: Rays, aim: Tensor, plane: TargetPlane) -> tuple[Tensor, 
 
 
 def wanted_slopes(at_face: Rays, aim: Tensor, plane: TargetPlane, law: Law) -> tuple[Tensor, Tensor]:
-    """(∂z/∂x, ∂z/∂y) that send each ray towards aim (2, …) mm on the plane.
+    """(∂z/∂x, ∂z/∂y) that send each ray towards aim (2, …) mm on the plane, as `slopes_towards` has it."""
+    _, out, _ = directions(at_face, aim, plane)
+    return slopes_towards(at_face, out, law)
+
+
+def slopes_towards(at_face: Rays, out: Tensor, law: Law) -> tuple[Tensor, Tensor]:
+    """(∂z/∂x, ∂z/∂y) that turn each ray into the direction d' of `out`, unit vectors (3, …).
 
     Both laws say that η d - d' is parallel to the normal (-z_x, -z_y, 1), d and d' the directions before the face and
-    behind it.  Where no face can do that, the slope turns the ray towards the same side, as far as a ray that leaves at
-    GRAZING, and is no steeper than STEEPEST.
+    behind it; into glass, η < 1, it is antiparallel.  Where no face can do that, the slope turns the ray towards the
+    same side, as far as a ray that meets or leaves it at GRAZING, and is no steeper than STEEPEST.
     """
-    d, out, along = directions(at_face, aim, plane)
-    most = math.pi if law.reverses else largest_deflection(law.eta)
+    d = at_face.direction
+    along = d[0] * out[0] + d[1] * out[1] + d[2] * out[2]
+    most = math.pi if law.reverses else largest_deflection(max(law.eta, 1 / law.eta))
     out = torch.where(along < math.cos(most), _turned(d, out, along, most), out)
-    normal = at_face.sense * (law.eta * d - out)
+    normal = (at_face.sense if law.eta >= 1 else -at_face.sense) * (law.eta * d - out)
     height = torch.maximum(normal[2], torch.sqrt(normal[0] ** 2 + normal[1] ** 2) / STEEPEST)
     return -normal[0] / height, -normal[1] / height
 

@@ -79,7 +79,7 @@ def followed(source: Source, lens: Lens, rays: Rays, z: float) -> tuple[Rays, Te
     for interface in lens.interfaces:
         there = behind(rays, interface)
         if path is None:
-            path = index * _from_reference(source, lens.entrance.z, there, sense)
+            path = index * from_reference(source, lens.entrance.z, there, sense)
         else:
             path = path + index * _between(rays, there)
             longest += index * _longest(_between(rays, there), there)
@@ -91,7 +91,7 @@ def followed(source: Source, lens: Lens, rays: Rays, z: float) -> tuple[Rays, Te
     return landed, path + ahead * last, ROUNDINGS * torch.finfo(torch.float64).eps * longest
 
 
-def _from_reference(source: Source, z: float, rays: Rays, sense: int) -> Tensor:
+def from_reference(source: Source, z: float, rays: Rays, sense: int) -> Tensor:
     """The way (mm) of rays to the first surface from where paths count; z: of its vertex, sense: of the light there."""
     place = torch.stack([*rays.position[:2], rays.above(z)])
     if not isinstance(source, Collimated):

@@ -68,6 +68,10 @@ class Tailoring(Record):
     source_points: Annotated[
         int | None, Key("Points that tell how wide an extended source's image is.", "", 2, 4096)
     ] = None
+    solution: Annotated[
+        Literal["convex", "concave"] | None,
+        Key("Of two pictures: rays do not cross between them, or all do; chosen if absent.", example="concave"),
+    ] = None
     precision: Annotated[
         Literal["float32", "float64"] | None, Key("Numbers that tailoring works with.", example="float64")
     ] = None

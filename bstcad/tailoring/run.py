@@ -19,8 +19,11 @@ from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, measure, rrmsd_by_rays
+from bstcad.optics.sides import Sides
+from bstcad.optics.wavefront import Wave
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
+from bstcad.tailoring.goals import Goal
 from bstcad.tailoring.source_image import Spread
 from bstcad.transport.mapping import Mapping
 
@@ -98,6 +101,11 @@ class Task:
     edge: Edge | None = None  # of a target that is cut to what light can reach; None: light can reach all of it
     # of a picture (rows, columns) and the target, both of sum 1 or less, what stage 2 makes least; None: RRMSD²
     merit: Callable[[Tensor, Tensor], Tensor] | None = None
+    weight: float = 1.0  # of the target among all goals
+    further: tuple[Goal, ...] = ()  # pictures on other planes
+    wave: Wave | None = None  # that the light behind the lens shall be; None: any
+    solution: float | None = None  # σ of light_behind.py; None: the gentler one
+    front_sides: Callable[[Sides], Sides | None] = lambda sides: None  # of a tailored front, by those of the back
 
     @property
     def heaviest(self) -> Channel:
@@ -105,17 +113,37 @@ class Task:
         return max(self.channels, key=lambda channel: channel.weight)
 
     @property
+    def several(self) -> bool:
+        """Is there another goal than one picture?"""
+        return bool(self.further) or self.wave is not None
+
+    @property
+    def goals(self) -> tuple[Goal, ...]:
+        """The pictures on all planes."""
+        return (Goal(self.screen, self.target, self.weight), *self.further)
+
+    def sides(self, lens: Lens, sides: Sides) -> tuple[Sides, ...]:
+        """Control points of each of the lens's nets where a back has so many."""
+        front = self.front_sides(sides)
+        return tuple(sides if k == lens.number_of_back or front is None else front for k in lens.freeform)
+
+    @property
     def whole(self) -> Task:
         """The same task with the light of the whole source."""
         return replace(self, channels=self.grown[-1], grown=()) if self.grown else self
 
     def rrmsd(self, lens: Lens) -> float:
-        """RRMSD by rays on the CPU, without the bias of the tubes that tailor the lens."""
+        """RRMSD by rays on the CPU, without the bias of the tubes that tailor the lens; the largest of several."""
         effort = ASKED
         if self.knobs.accuracy is None and self.bounds is None:
             effort = replace(BETWEEN, rays=round(BETWEEN.rays * (self.target.size / PIXELS**2) ** (1 / 3)))
         draw = self.spreads[-1].draw if self.spreads and not self.grown else None  # not of its middle alone
-        return rrmsd_by_rays(lens.plain(), self.channels, self.screen, target=self.target, effort=effort, draw=draw)
+        lens = lens.plain()
+        values = [
+            rrmsd_by_rays(lens, self.channels, goal.screen, target=goal.target, effort=effort, draw=draw)
+            for goal in self.goals
+        ]
+        return math.nan if any(map(math.isnan, values)) else max(values)
 
     def used(self, lens: Lens) -> float:
         """Part of the light that enters the lens which falls on the target."""

@@ -11,7 +11,7 @@ by its image (source_image.py); first of a small source, then of a larger one, a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -20,11 +20,13 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.channels import channels_of, points
+from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import a_side, images, rrmsd_by_tubes
 from bstcad.optics.sides import coarser
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
+from bstcad.tailoring.goals import JointMerit
 from bstcad.tailoring.grazing import Grazing
 from bstcad.tailoring.machinability import excess, weight
 from bstcad.tailoring.merit import CoarseVariable, SobolevVariable, TubeMerit, local_weight
@@ -38,6 +40,8 @@ ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))  # (tubes a side, evaluatio
 # net between the tubes where they see nothing, which the last one has to mend.  (Found, for 1025 control points by two
 # tubes a cell: the portrait ends at 0.018 where it would end at 0.020 by the shares above in the same time.)
 SPARSE, DENSE = ((1 / 2, 0.40), (3 / 4, 0.35), (1.0, 0.25)), 2.5
+# For several goals: two nets have twice the freedom to bend between the tubes.
+JOINT = ((2 / 3, 0.45), (1.0, 0.35), (4 / 3, 0.2))
 # Where RRMSD is above FAR_OFF on LARGE pixels, which a net that is only too coarse for the picture gets right, light
 # has to move far: (pixels along the longer side, tubes a side, evaluations) of the rounds before those, the last of
 # which comes again after the first of those; and how many times the evaluations those have then.
@@ -74,10 +78,12 @@ class Round:
         tubes = f"{self.tubes}² tubes" if sheets == 1 else f"{sheets} × {self.tubes}² tubes"
         return ", ".join([self.stage, *([f"{self.pixels} pixels"] if self.pixels else []), tubes])
 
-    def merit(self, lens: Lens) -> TubeMerit | BlurredMerit:
+    def merit(self, lens: Lens) -> TubeMerit | BlurredMerit | JointMerit:
         """By tubes launched for a lens."""
         task = self.task if self.pixels is None else coarsened(self.task, self.pixels)
         target, pull = torch.from_numpy(task.target).to(lens.like.device), _pull(task, lens)
+        if task.several:
+            return JointMerit.of(task.channels, lens, self.tubes, task.goals, overshoot=pull, wave=task.wave)
         if self.spread is not None:
             return BlurredMerit.of(
                 self.spread, lens, self.tubes, screen=task.screen, target=target, overshoot=pull,
@@ -115,7 +121,9 @@ def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Iterator[S
     The error is large at first, and few tubes resolve it as well as many; the last round corrects the finer errors.
     """
     coarse = coarse_rounds(task, lens)
-    first, *others = (Round(task, n, round(MORE * count) if coarse else count) for n, count in sheets(task.knobs))
+    first, *others = (
+        Round(task, n, round(MORE * count) if coarse else count) for n, count in sheets(task.knobs, task.several)
+    )
     return run_rounds((*coarse, first, *coarse[-1:], *others), lens, state)
 
 
@@ -139,12 +147,17 @@ def coarse_rounds(task: Task, lens: Lens) -> tuple[Round, ...]:
 def coarsened(task: Task, pixels: int) -> Task:
     """The task with at most so many pixels along the longer side."""
     screen, target = coarse(task.screen, task.target, pixels)
-    return replace(task, screen=screen, target=target)
+    further = ((goal, *coarse(goal.screen, goal.target, pixels)) for goal in task.further)
+    return replace(
+        task, screen=screen, target=target,
+        further=tuple(replace(goal, screen=seen, target=wanted) for goal, seen, wanted in further),
+    )  # fmt: skip
 
 
-def sheets(knobs: Tailoring) -> Iterator[tuple[int, int]]:
+def sheets(knobs: Tailoring, several: bool = False) -> Iterator[tuple[int, int]]:
     """(tubes a side, evaluations) of each round; no fewer tubes than control points: they could not tell them apart."""
-    shares = ROUNDS if knobs.rays >= DENSE * knobs.side else SPARSE
+    single = ROUNDS if knobs.rays >= DENSE * knobs.side else SPARSE
+    shares = JOINT if several else single
     if knobs.stage2_iterations < FEW:
         shares = ((1.0, 1.0),)
     least = min(knobs.rays, knobs.side)
@@ -266,7 +279,7 @@ class Problem:
     """
 
     lens: Lens
-    merit: TubeMerit | BlurredMerit
+    merit: TubeMerit | BlurredMerit | JointMerit
     bounds: Bounds | None = None  # on the back; the excess over them adds to the merit
     bound_weight: float = 0.0  # of the excess
     grazing: Grazing | None = None  # keeps light at the edge of its reach from total reflection
@@ -296,11 +309,23 @@ def variables_of(task: Task, lens: Lens, pixels: int | None = None) -> tuple[Var
     light = task.heaviest
     seen = light.through(lens)
     weights = [
-        local_weight(light.source, seen, task.target, screen=task.screen, number=number) for number in lens.freeform
+        _mean(
+            local_weight(light.source, seen, goal.target, screen=goal.screen, number=number) for goal in task.goals
+        )
+        for number in lens.freeform
     ]
     if pixels is None:
         return tuple(SobolevVariable.of(net, weight) for net, weight in zip(nets, weights, strict=True))
     return tuple(CoarseVariable.of(*each) for each in zip(nets, lens.nets, weights, strict=True))
+
+
+def _mean(weights: Iterable[Tensor]) -> Tensor:
+    """The geometric mean of the weights for several goals; of one itself."""
+    first, *others = weights
+    if not others:
+        return first
+    logarithm = sum((elementary(torch.log, w) for w in others), elementary(torch.log, first))
+    return elementary(torch.exp, logarithm / (1 + len(others)))
 
 
 def search(

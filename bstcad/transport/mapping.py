@@ -174,8 +174,7 @@ def _forward(sx, sy, px, py, out):
 @njit(cache=True, nogil=True)
 def _residual(sx, sy, x, y, p, q):
     """x - S(p, q) and the four derivatives of S there."""
-    n = sx.shape[0] - 1
-    i, j = min(int(p), n - 1), min(int(q), n - 1)
+    i, j = min(int(p), sx.shape[0] - 2), min(int(q), sx.shape[1] - 2)
     a, b = p - i, q - j
     ex, ey = sx[i + 1, j] - sx[i, j], sy[i + 1, j] - sy[i, j]
     fx, fy = sx[i, j + 1] - sx[i, j], sy[i, j + 1] - sy[i, j]
@@ -187,9 +186,9 @@ def _residual(sx, sy, x, y, p, q):
 
 
 @njit(cache=True, nogil=True)
-def _solve_point(sx, sy, x, y, p, q):
+def solve_point(sx, sy, x, y, p, q):
     """(p, q) with S(p, q) = (x, y): Levenberg-Marquardt, which is ascent on the concave x·y - v(y) where S folds."""
-    n = sx.shape[0] - 1.0
+    rows, columns = sx.shape[0] - 1.0, sx.shape[1] - 1.0
     rx, ry, a, b, c, d = _residual(sx, sy, x, y, p, q)
     here = rx * rx + ry * ry
     damping = 0.0
@@ -207,7 +206,7 @@ def _solve_point(sx, sy, x, y, p, q):
         reach = max(abs(dp), abs(dq))
         if reach > 4.0:  # pixels: beyond that the linear model says nothing
             dp, dq = 4.0 * dp / reach, 4.0 * dq / reach
-        tp, tq = min(max(p + dp, 0.0), n), min(max(q + dq, 0.0), n)
+        tp, tq = min(max(p + dp, 0.0), rows), min(max(q + dq, 0.0), columns)
         tx, ty, ta, tb, tc, td = _residual(sx, sy, x, y, tp, tq)
         there = tx * tx + ty * ty
         if there < here:
@@ -250,10 +249,40 @@ def _invert(phi, sx, sy, gx, gy, px, py, out):
             i, j = min(int(px[k]), n - 1), min(int(py[k]), n - 1)
             a, b = px[k] - i, py[k] - j
             p, q = _bilinear(gx, i, j, a, b), _bilinear(gy, i, j, a, b)
-            tp, tq, regular = _solve_point(sx, sy, px[k], py[k], p, q)
+            tp, tq, regular = solve_point(sx, sy, px[k], py[k], p, q)
             if not regular:  # a fold: ask the potential itself, whose best pixel is never inside one
                 cp, cq = _best_pixel(phi, px[k], py[k], p, q)
-                tp, tq, regular = _solve_point(sx, sy, px[k], py[k], cp, cq)
+                tp, tq, regular = solve_point(sx, sy, px[k], py[k], cp, cq)
                 if not regular:
                     tp, tq = cp, cq
             out[0, k], out[1, k] = tp, tq
+
+
+def places_in(grid_x: np.ndarray, grid_y: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The real row and column of a grid of places (mm) at which it has the points (x, y) (m, n); outside at its rim."""
+    per_mm = (max(grid_x.shape) - 1) / max(np.ptp(grid_x), np.ptp(grid_y))
+    out = np.empty((2, *x.shape))
+    grid_x, grid_y, x, y = (np.ascontiguousarray(per_mm * p) for p in (grid_x, grid_y, x, y))
+    _search(grid_x, grid_y, x, y, out)
+    return out[0], out[1]
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _search(grid_x, grid_y, x, y, out):
+    """From the neighbour's place, or from where an even grid has it; row by row."""
+    rows, columns = grid_x.shape[0] - 1.0, grid_x.shape[1] - 1.0
+    left, low = grid_x.min(), grid_y.min()
+    wide, high = grid_x.max() - left, grid_y.max() - low
+    for k in prange(x.shape[0]):
+        near = False
+        p, q = 0.0, 0.0
+        for j in range(x.shape[1]):
+            found = False
+            if near:
+                p, q, found = solve_point(grid_x, grid_y, x[k, j], y[k, j], p, q)
+            if not found:
+                p = min(max((x[k, j] - left) / wide, 0.0), 1.0) * rows
+                q = min(max((y[k, j] - low) / high, 0.0), 1.0) * columns
+                p, q, found = solve_point(grid_x, grid_y, x[k, j], y[k, j], p, q)
+            near = found
+            out[0, k, j], out[1, k, j] = p, q

@@ -1,0 +1,219 @@
+"""The light that a lens with two freeform faces has to send out: one ray through each place of the nearest target.
+
+Behind a lens the rays of a point or of parallel light are normal to wavefronts (Malus and Dupin; Born and Wolf,
+Principles of Optics, section 3.1.2), so that their direction cosines on a plane A are the gradient of an eikonal there.
+Which eikonal, is told by a wave that is asked for (`of_wave`), or by a picture on a second plane B (`between_targets`):
+the light that crosses A at p shall meet B at t.  With the direction cosines along A
+
+    c(p, t) = (t - p) / |t - p|,    y = σ (c(p, t) - c(p, m)),
+
+m the centroid of B's light, y hardly depends on p for a fixed t, and p -> y is the gradient of a convex function: the
+optimal map from A's picture to that of B, whose pixels are seen in these coordinates.  The remaining dependence on p
+enters through the p that the previous round assigned to each t, as in slope_map.py.  σ = 1 is the convex solution, in
+which no two rays cross between the planes; in the concave one, σ = -1, all of them do.
+
+Followed back from A, rays may cross before they come to the lens: then no lens can send them.  Light of the convex
+solution does so where B asks for light much denser than A, by more than the distances A-B and lens-A allow (an
+eigenvalue of ∂t/∂p above 1 + |AB| / |lens A|).  `uncrossed` has the nearest light that does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.rays import TargetPlane, TiltedPlane, Vector
+from bstcad.optics.surfaces import Surface
+from bstcad.optics.wavefront import Wave
+from bstcad.tailoring.run import Task
+from bstcad.tailoring.slope_map import centroid, pixel_corners, spread_density
+from bstcad.transport.bfm import Step
+from bstcad.transport.mapping import places_in, solve
+
+ROUNDS, COARSE_SHARE, COARSEST = 3, 4, 64  # of the map between two planes: the last one on all cells
+SEARCH = 40  # steps to the place of a stated wave that sends light to a place of the target
+FOUND = 1e-9  # mm
+MEETING = 8  # Newton steps back to a face
+CROSSED = 1e-4  # of the light, whose rays may cross before they come to the lens, as rounding leaves
+
+Grid = tuple[np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class LightBehind:
+    """Rays behind the lens through the corners of equal parts of the pixels of a target."""
+
+    place: np.ndarray  # (3, c + 1, r + 1) mm in space, x first
+    direction: np.ndarray  # (3, c + 1, r + 1) unit vectors
+    picture: np.ndarray  # (rows, columns) the light through each pixel, row 0 = y max
+    parts: int  # of a pixel, each way
+
+    @property
+    def of_pixels(self) -> LightBehind:
+        """The rays through the corners of whole pixels alone."""
+        every = (slice(None), slice(None, None, self.parts), slice(None, None, self.parts))
+        return replace(self, place=self.place[every], direction=self.direction[every], parts=1)
+
+    def meeting(self, surface: Surface) -> np.ndarray:
+        """(3, c + 1, r + 1) where each ray, followed back, meets a surface (mm)."""
+        (x, y, z), (dx, dy, dz) = (torch.from_numpy(v) for v in (self.place, self.direction))
+        path = (surface.z - z) / dz
+        for _ in range(MEETING):
+            h, z_x, z_y = surface.sag_and_slope(x + path * dx, y + path * dy)
+            path = path - (z + path * dz - h) / (dz - z_x * dx - z_y * dy)
+        return torch.stack([x + path * dx, y + path * dy, z + path * dz]).numpy()
+
+    def crossed(self, surface: Surface) -> float:
+        """Part of the light whose neighbouring rays cross between a surface and the target."""
+        return float(self._flux[_folds(*self.meeting(surface)[:2])].sum())
+
+    def beyond(self, surface: Surface, contains: Callable[[Tensor, Tensor], Tensor]) -> float:
+        """Part of the light that meets a surface outside of what `contains` says of (x, y) in mm."""
+        x, y = (torch.from_numpy(p) for p in self.meeting(surface)[:2])
+        outside = ~contains(x, y).numpy()
+        quads = outside[1:, 1:] & outside[1:, :-1] & outside[:-1, 1:] & outside[:-1, :-1]
+        return float(self._flux[quads].sum())
+
+    def leaving(self, surface: Surface, x: Tensor, y: Tensor) -> Tensor:
+        """(3, …) the directions in which light has to leave a surface at points (…) mm; beyond the light as at its rim.
+
+        x, y: two-dimensional, neighbours beside each other.
+        """
+        b_x, b_y, _ = self.meeting(surface)
+        i, j = places_in(b_x, b_y, x.cpu().double().numpy(), y.cpu().double().numpy())
+        found = torch.from_numpy(_between(self.direction, i, j))
+        return (found / torch.sqrt((found * found).sum(0))).to(x)
+
+    @property
+    def _flux(self) -> np.ndarray:
+        """(c, r) of each part, x first."""
+        part = np.ones((self.parts, self.parts)) / self.parts**2
+        return np.kron(self.picture[::-1].T, part)
+
+
+def of_task(task: Task) -> LightBehind:
+    """The light through the nearest target that meets the wave of a task, or its furthest target."""
+    near, *_, far = sorted((*task.goals, *task.goals), key=lambda goal: goal.screen.z)
+    n = task.knobs.transport_grid
+    parts = max(1, round(n / max(near.screen.shape)))
+    if task.wave is not None:
+        return of_wave(
+            near.screen, near.target, task.wave, wavelength=task.heaviest.source.wavelength, parts=parts
+        )
+
+    def progress(s: Step) -> None:
+        task.progress("stage 1", 0, task.knobs.rounds, f"between the targets, {s.grid}² cells")
+
+    return between_targets(
+        (near.screen, near.target), (far.screen, far.target), n, parts=parts, sign=task.solution or 1.0,
+        iterations=task.knobs.transport_iterations, progress=progress,
+    )  # fmt: skip
+
+
+def corners(screen: Screen, parts: int) -> Grid:
+    """x and y (mm) on the screen of the corners of so many parts of its pixels each way, x first."""
+    return tuple(pixel_corners(replace(screen, pixels=(parts * screen.columns, parts * screen.rows))))
+
+
+def in_space(plane: TargetPlane, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """(3, …) the points (mm) of places on a plane."""
+    points = plane.point(x, y) if isinstance(plane, TiltedPlane) else (x, y, np.full_like(x, plane))
+    return np.stack(points)
+
+
+def _axes(plane: TargetPlane) -> tuple[Vector, Vector, Vector]:
+    return plane.axes if isinstance(plane, TiltedPlane) else ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+def _along(vector: Vector, of: np.ndarray) -> np.ndarray:
+    return vector[0] * of[0] + vector[1] * of[1] + vector[2] * of[2]
+
+
+def of_wave(screen: Screen, picture: np.ndarray, wave: Wave, *, wavelength: float, parts: int) -> LightBehind:
+    """The light that is a wave, through the places of a screen; wavelength: nm."""
+    place = in_space(screen.plane, *corners(screen, parts))
+    x, y = (torch.from_numpy(p) for p in place[:2])
+    below = torch.from_numpy(wave.z - place[2])
+    direction = wave.directions(x, y, wavelength)
+    for _ in range(SEARCH):  # the place of the wave's plane whose ray goes there
+        path = below / direction[2]
+        there = x + path * direction[0], y + path * direction[1]
+        before, direction = direction, wave.directions(*there, wavelength)
+        if not bool(((direction - before).abs() * below.abs().max() > FOUND).any()):
+            break
+    return LightBehind(place, direction.numpy(), picture, parts)
+
+
+def between_targets(
+    near: tuple[Screen, np.ndarray], far: tuple[Screen, np.ndarray], n: int, *, parts: int, sign: float = 1.0,
+    iterations: int = 40, progress: Callable[[Step], None] | None = None,
+) -> LightBehind:  # fmt: skip
+    """The light through two pictures, (screen, (rows, columns) of any sum) each, by transport on n x n cells.
+
+    sign: σ, 1 for the convex solution and -1 for the concave one.
+    """
+    (screen, picture), (behind, wanted) = near, far
+    e_x, e_y, normal = _axes(screen.plane)
+
+    def cosines(p: np.ndarray, t: np.ndarray) -> Grid:
+        way = t - p
+        way = way / np.sqrt((way * way).sum(0))
+        return _along(e_x, way), _along(e_y, way)
+
+    t = in_space(behind.plane, *pixel_corners(behind))
+    m = in_space(behind.plane, *(np.array(c) for c in centroid(wanted, behind))).reshape(3, 1, 1)
+    p = in_space(screen.plane, *(np.full_like(t[0], sum(ends) / 2) for ends in (screen.x, screen.y)))
+    for turn in range(ROUNDS):
+        cells = n if turn == ROUNDS - 1 else max(COARSEST, n // COARSE_SHARE)
+        y = tuple(sign * (c - g) for c, g in zip(cosines(p, t), cosines(p, m), strict=True))
+        rho, frame = spread_density(picture, tuple(pixel_corners(screen)), cells)
+        sigma, seen = spread_density(wanted, y, cells)
+        mapping = solve(rho, sigma, frame, seen, iterations=iterations, progress=progress)
+        p = in_space(screen.plane, *mapping.inverse(*y))
+    x, y = corners(screen, parts)
+    place = in_space(screen.plane, x, y)
+    a, b = (sign * s + g for s, g in zip(mapping(x, y), cosines(place, m), strict=True))
+    upright = np.sqrt(np.clip(1 - a * a - b * b, 0.0, None))
+    direction = np.stack([a * u + b * v + upright * w for u, v, w in zip(e_x, e_y, normal, strict=True)])
+    return LightBehind(place, direction, picture / picture.sum(), parts)
+
+
+def uncrossed(light: LightBehind, screen: Screen, surface: Surface, n: int) -> LightBehind:
+    """The light itself, or the nearest to it of which no rays cross between a level surface and the screen.
+
+    It sends each place of the surface as much light, by the optimal map from the screen, which crosses no rays.
+    """
+    if light.crossed(surface) <= CROSSED:
+        return light
+    b_x, b_y, b_z = light.of_pixels.meeting(surface)
+    rho, frame = spread_density(light.picture, tuple(pixel_corners(screen)), n)
+    sigma, seen = spread_density(light.picture, (b_x, b_y), n)
+    mapping = solve(rho, sigma, frame, seen)
+    b = np.stack([*mapping(*corners(screen, light.parts)), np.full(light.place.shape[1:], float(b_z.mean()))])
+    way = light.place - b
+    return replace(light, direction=way / np.sqrt((way * way).sum(0)))
+
+
+# ---- grids of places -------------------------------------------------------------------------------------------------
+
+
+def _folds(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Which quads of a grid of places are turned over."""
+    return (x[1:, 1:] - x[:-1, :-1]) * (y[:-1, 1:] - y[1:, :-1]) - (x[:-1, 1:] - x[1:, :-1]) * (
+        y[1:, 1:] - y[:-1, :-1]
+    ) <= 0
+
+
+def _between(values: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+    """Values (k, m, n) of the corners of a grid at real places among them, bilinear."""
+    row = np.clip(i.astype(int), 0, values.shape[-2] - 2)
+    column = np.clip(j.astype(int), 0, values.shape[-1] - 2)
+    a, b = i - row, j - column
+    here = (1 - b) * values[:, row, column] + b * values[:, row, column + 1]
+    below = (1 - b) * values[:, row + 1, column] + b * values[:, row + 1, column + 1]
+    return (1 - a) * here + a * below
