@@ -33,7 +33,7 @@ from bstcad.tailoring import slope_map, stage1, stage2, two_faces
 from bstcad.tailoring.feasibility import demands, refused
 from bstcad.tailoring.goals import Goal
 from bstcad.tailoring.grazing import cleared
-from bstcad.tailoring.machinability import BOUNDED, UNBOUNDED, kept, moved_clear
+from bstcad.tailoring.machinability import BOUNDED, UNBOUNDED, front_shaped, held, kept, moved_clear
 from bstcad.tailoring.reachable import reachable
 from bstcad.tailoring.run import JUDGING, Driver, Edge, Parameters, Progress, Record, Step, Task, forget, never, silent
 from bstcad.tailoring.source_image import Spread
@@ -275,12 +275,14 @@ def _stage1(
     name, stage, _ = PROCEDURES[task.knobs.method]
     stage = stage if scene.lens.shaped is None else two_faces.steps
     last = driver.run(stage(task, lens, state), task, lambda state: Saved(driver.record, state), lambda: driver.wish)
-    lens, bounds = last.lens, task.bounds
+    lens, bounds = last.lens, held(last.lens, task.bounds, task.least)
     if bounds is None:
         check_thickness(lens, scene)
     driver.end(name, reached(lens, task.rrmsd(lens) if last.judged is None else last.judged))
     if bounds is not None:
         driver.progress(BOUNDED, 0, 1, "")
+        if front_shaped(lens):  # stage 2 takes a move into account, but makes none itself
+            lens = moved_clear(lens, lens.back.z, task.least, bounds)
         lens = kept(lens, bounds)
         check_thickness(lens, scene)
         driver.end(f"{BOUNDED}, after stage 1", possible(scene, task.rrmsd(lens)))
@@ -310,11 +312,13 @@ def _stage2(task: Task, driver: Driver, lens: Lens, followed: Followed, state: S
     lens = driver.run(steps, task.whole, saved, lambda: driver.hurry).lens
     if task.edge is not None:
         lens = cleared(lens, task.edge)
-    lens = moved_clear(lens, lens.back.z, task.least, task.bounds)  # where no light falls stage 2 is free to bend it
-    if task.bounds is not None:
-        lens = kept(lens, task.bounds)
+    bounds = held(lens, task.bounds, task.least)
+    if not front_shaped(lens):  # where no light falls stage 2 is free to bend the back
+        lens = moved_clear(lens, lens.back.z, task.least, bounds)
+    if bounds is not None:
+        lens = kept(lens, bounds)
         driver.end(BOUNDED, task.whole.rrmsd(lens))
-        if not driver.hurry:
+        if task.bounds is not None and not driver.hurry:
             driver.aside(UNBOUNDED, stage2.rrmsd_without_bounds(task, lens))
     total = task.knobs.stage2_iterations
     driver.progress(name, total, total, driver.stopped)
@@ -377,7 +381,8 @@ def possible(scene: Scene, rrmsd: float) -> float:
     """RRMSD of the first lens that keeps to the bounds on its back; SceneError if it throws no light on the target."""
     if math.isfinite(rrmsd):
         return rrmsd
-    bounds = " and ".join(f"lens.{key} = {getattr(scene.lens, key):g}" for key in scene.lens.bounded_by)
+    keys = scene.lens.bounded_by or ("min_thickness",)
+    bounds = " and ".join(f"lens.{key} = {getattr(scene.lens, key):g}" for key in keys)
     raise SceneError(f"{bounds}: no back that keeps to it brings light onto the target; allow the back more")
 
 

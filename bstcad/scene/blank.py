@@ -409,9 +409,12 @@ class Back(Record):
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds on a back everywhere inside the outline; None: unbounded."""
+    """Bounds on tailored faces everywhere inside the outline; None: unbounded.
 
-    concave: float | None = None  # largest curvature of a valley towards +z (1/mm)
+    Valleys and ridges are those of the back, which a tool sees from +z; a front's tool sees them from -z.
+    """
+
+    concave: float | None = None  # largest curvature of a valley (1/mm), of the back one towards +z
     convex: float | None = None  # of a ridge (1/mm)
     slope: float | None = None  # steepest |∇z|
     thinnest: float = 0.0  # mm; between front and back, along the axis
@@ -433,13 +436,13 @@ class LensBlank(Record):
         Back, Key("The face that is tailored.", example={"kind": "bspline", "z": 20.0, "control_points": 257})
     ]
     tool_radius: Annotated[
-        float | None, Key("Least radius of the back's valleys, where a tool fits in.", "mm", 1e-6, 1e9)
+        float | None, Key("Least radius of a tailored face's valleys, where a tool fits in.", "mm", 1e-6, 1e9)
     ] = None
     mould: Annotated[bool, Key("The tool cuts a mould: tool_radius bounds the ridges.", example=True)] = False
-    max_slope: Annotated[float | None, Key("Steepest angle of the back against z = const.", "degrees", 1e-3, 89.0)] = (
-        None
-    )
-    min_thickness: Annotated[float, Key("Least thickness along z; the back is moved to keep it.", "mm", *LENGTHS)] = 0.5
+    max_slope: Annotated[
+        float | None, Key("Steepest angle of a tailored face against z = const.", "degrees", 1e-3, 89.0)
+    ] = None
+    min_thickness: Annotated[float, Key("Least thickness along z; faces make way to keep it.", "mm", *LENGTHS)] = 0.5
     max_thickness: Annotated[float | None, Key("Greatest thickness along z.", "mm", *LENGTHS)] = None
     edge_thickness: Annotated[float | None, Key("Least thickness along the rim.", "mm", *LENGTHS)] = None
 
@@ -456,12 +459,12 @@ class LensBlank(Record):
 
     @property
     def bounded_by(self) -> tuple[str, ...]:
-        """The keys that bound the back."""
+        """The keys that bound the tailored faces."""
         return tuple(key for key in BOUNDS if getattr(self, key) is not None)
 
     @property
     def bounds(self) -> Bounds | None:
-        """The bounds that the back keeps to while it is tailored; None: there are none."""
+        """The bounds that the faces keep to while they are tailored; None: none is asked for."""
         if not self.bounded_by:
             return None
         curvature = None if self.tool_radius is None else 1 / self.tool_radius

@@ -28,7 +28,7 @@ from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.goals import JointMerit
 from bstcad.tailoring.grazing import Grazing
-from bstcad.tailoring.machinability import excess, weight
+from bstcad.tailoring.machinability import excess, held, weight
 from bstcad.tailoring.merit import CoarseVariable, SobolevVariable, TubeMerit, local_weight
 from bstcad.tailoring.minimise import Best, Reached, Search, lbfgs, minimise
 from bstcad.tailoring.reachable import coarse
@@ -195,7 +195,8 @@ def run_rounds(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = N
             if merit is None:
                 merit = now.merit(launched)
                 task.tidy()
-            problem = Problem(begun, merit, task.bounds, bound_weight, grazing=grazing)
+            bounds = held(begun, task.bounds, task.least)
+            problem = Problem(begun, merit, bounds, bound_weight, grazing=grazing)
             for reached, step in _search(now, problem, variables, place, total=total, state=state):
                 yield replace(step, part=part)
                 if reached.reason:
@@ -280,7 +281,7 @@ class Problem:
 
     lens: Lens
     merit: TubeMerit | BlurredMerit | JointMerit
-    bounds: Bounds | None = None  # on the back; the excess over them adds to the merit
+    bounds: Bounds | None = None  # on the tailored faces; the excess over them adds to the merit
     bound_weight: float = 0.0  # of the excess
     grazing: Grazing | None = None  # keeps light at the edge of its reach from total reflection
 
@@ -291,9 +292,11 @@ class Problem:
         merit, rrmsd = self.merit(self.merit.landing(lens))
         gradients = list(torch.autograd.grad(merit, leaves))
         value = float(merit.detach())
-        if self.bounds is not None and lens.number_of_back in lens.freeform:
-            over, back = excess(lens.plain(), self.bounds), lens.freeform.index(lens.number_of_back)
-            gradients[back] = gradients[back] + self.bound_weight * over.gradient.to(gradients[back])
+        if self.bounds is not None:
+            over = excess(lens.plain(), self.bounds)
+            if over.mean_square:
+                pairs = zip(gradients, over.gradients, strict=True)
+                gradients = [g + self.bound_weight * own.to(g) for g, own in pairs]
             value += self.bound_weight * over.mean_square
         if self.grazing is not None:
             over, gradient, _ = self.grazing(heights[-1])
