@@ -32,7 +32,7 @@ from bstcad.measured.cloud import Cloud
 from bstcad.measured.form_error import map_files
 from bstcad.measured.made_part import MadePart
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import FULL, Effort, Light
+from bstcad.optics.measure import FULL, Effort, Light, Line
 from bstcad.pipeline import Saved, design, purpose
 from bstcad.report import data_sheet, exports, prescription, record, rendering, report, tolerances
 from bstcad.report.data_sheet import Sheet
@@ -147,7 +147,8 @@ def write(
             made, building, drawn, additions, progress=progress, effort=effort, limit=limit
         )
         proven = time.perf_counter()
-        folders.write_design(made, proof.light.picture, building)
+        irradiance, *further = (light.picture for light in proof.lights)
+        folders.write_design(made, irradiance, building, further=further)
         exports.export(
             made.lens, made.scene.output.export, building, label=folders.label(made.scene), mount=made.scene.mount
         )
@@ -162,7 +163,7 @@ def write(
         sheet = drawn.data_sheet()
         _write_report(made, proof.lens, contents, building, drawn=drawn, sheet=sheet, sections=additions.sections)
         progress("report", 1, 1, "")
-    return Report(contents, proof.light.picture)
+    return Report(contents, irradiance, further_irradiance=tuple(further))
 
 
 def prove(
@@ -173,7 +174,9 @@ def prove(
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place, _nothing_left_running():
         drawn = NoPictures(made.scene, processes.submit)
         made, proof = _written_and_proved(made, Path(place), drawn, additions, progress=progress, effort=effort)
-    return Report(_contents(made, proof, left_out(made.scene, proof.lens, proof.light.picture)), proof.light.picture)
+    irradiance, *further = (light.picture for light in proof.lights)
+    contents = _contents(made, proof, left_out(made.scene, proof.lens, irradiance))
+    return Report(contents, irradiance, further_irradiance=tuple(further))
 
 
 def _written_and_proved(
@@ -196,7 +199,8 @@ def _written_and_proved(
         if limit is not None:
             effort, left = effort or FULL, limit - BEHIND - made.making.seconds_total - (written - began)
             effort = replace(effort, seconds=min(effort.seconds, max(left, LEAST)))
-        nominal = folders.nominal(made.scene, made.lens, made.target, made.reachable)
+        (target, part), *more = zip(made.targets, made.parts, strict=True)
+        nominal = folders.nominal(made.scene, made.lens, target, part, further=more)
         proof = _proof(made, nominal, place, drawn, additions=additions, effort=effort, progress=progress)
         for work in meanwhile:
             work.result()
@@ -211,11 +215,14 @@ def _proof(
 ) -> Proof:  # fmt: skip
     """The proof of the files in a folder, with the pictures of its light begun."""
     progress("verify", 0, 1, "from the written files")
-    draw = partial(drawn.begin, draw_light, made.target)
+
+    def draw(light: Light, lines: tuple[Line, ...], number: int) -> None:
+        drawn.begin(draw_light, made.targets[number], light, lines, number=number)
+
     proof = checks.verify(folder, nominal, processes.submit, known=drawn.lens, lit=draw, effort=effort)
     added = (check for of_script in additions.checks for check in of_script(proof, folder))
     proof = replace(proof, checks=(*proof.checks, *added))
-    progress("verify", 1, 1, f"RRMSD {proof.light.rrmsd:.4f}")
+    progress("verify", 1, 1, "RRMSD " + ", ".join(f"{light.rrmsd:.4f}" for light in proof.lights))
     return proof
 
 
@@ -313,7 +320,8 @@ def verify(
             if place is None:
                 write(contents, amended, sheet=drawn.data_sheet())
             progress("report", 1, 1, "")
-    return Report(contents, proof.light.picture, part)
+    further = tuple(light.picture for light in proof.further)
+    return Report(contents, proof.light.picture, part, further_irradiance=further)
 
 
 def examine(path: Path) -> Examined:
@@ -335,8 +343,11 @@ def read(folder: Path) -> Made:
 def _read(folder: Path) -> tuple[Made, Nominal]:
     scene, nominal = folders.read_nominal(folder)
     making, sent = record.making(folder / "report.json"), folders.read_transport(folder, scene)
-    part = nominal.reachable
-    return Made(scene, nominal.lens, nominal.target, making, transport=sent, reachable=part), nominal
+    part, *further = (goal.reachable for goal in nominal.goals)
+    made = Made(
+        scene, nominal.lens, nominal.target, making, transport=sent, reachable=part, further_reachable=tuple(further)
+    )
+    return made, nominal
 
 
 def _made_part(cloud: Cloud, proof: Proof, nominal: Nominal, *, effort: Effort | None, progress: Progress) -> MadePart:
@@ -373,7 +384,7 @@ def _contents(made: Made, proof: Proof, estimates: tuple[LeftOut, ...]) -> Conte
     )  # fmt: skip
     return contents_of(
         scene, made.lens, made.target, proof, making=made.making, circumstances=circumstances(made.device),
-        estimates=estimates, diagnosis=diagnosed, reachable=made.reachable,
+        estimates=estimates, diagnosis=diagnosed, reachable=made.reachable, further=made.targets[1:],
     )  # fmt: skip
 
 
@@ -391,9 +402,11 @@ def _sheet(
     made: Made, proof: Proof | Contents, light: Light | Contents, irradiance: np.ndarray, *, order: Order
 ) -> Sheet:
     """The data sheet of a design, by its proof or by its report."""
+    lights = proof.lights if isinstance(proof, Proof) else proof.targets or (proof,)
     return Sheet(
         scene=made.scene, designed=made.lens, shape=proof.shape, order=order, target=made.target, irradiance=irradiance,
         rrmsd=light.rrmsd, light_on_target=light.flux["on target"], passed=proof.passed, version=bstcad.__version__,
+        further_rrmsds=tuple(each.rrmsd for each in lights[1:]),
     )  # fmt: skip
 
 

@@ -16,10 +16,10 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -40,10 +40,12 @@ from bstcad.runs.files import MachineError, SceneError
 from bstcad.runs.processes import Submit, here, runs
 from bstcad.scene import scene as scenes
 from bstcad.scene.blank import NET_FILE as FRONT
+from bstcad.scene.target import numbered
 from bstcad.transport.mapping import TransportMap, nodes
-from bstcad.verify.checks import Nominal
+from bstcad.verify.checks import Goal, Nominal
 
 SCENE, DESIGN, PART = "scene.toml", "design.npz", "part.step"
+FRONT_KNOTS = ("front_knots_x", "front_knots_y")  # in design.npz, of a front that is tailored
 PROVEN = (SCENE, DESIGN, "lens.step", "lens.stl", PART, FRONT)  # the files that a verification reads
 ROUGH = 0.01  # standard error of a draft's RRMSD, relative to it, at which the proof ends
 AGAIN = "generate the design again"
@@ -60,8 +62,25 @@ class Made:
     device: str = "cpu"  # of the design
     transport: TransportMap | None = None  # the map of stage 1; None for a lens of the user's own, or if not known
     reachable: np.ndarray | None = None  # (rows, columns) the pixels that light can reach; None: all that are to be lit
+    # the same of the targets behind the first, in their order; (): light reaches all of them
+    further_reachable: tuple[np.ndarray | None, ...] = ()
     # what `making` is with float32 beside float64, which only a report tells; None: it has it, or nothing is to be told
     compared: Callable[[], Making] | None = None
+
+    @cached_property
+    def targets(self) -> tuple[np.ndarray, ...]:
+        """The light that all targets ask for, of the pixels that light can reach; the first is `target`."""
+        further = zip(self.scene.targets[1:], self._further_parts, strict=True)
+        return (self.target, *(restricted(target.irradiance(), part) for target, part in further))
+
+    @property
+    def parts(self) -> tuple[np.ndarray | None, ...]:
+        """Of all targets the pixels that light can reach; None: all that are to be lit."""
+        return (self.reachable, *self._further_parts)
+
+    @property
+    def _further_parts(self) -> tuple[np.ndarray | None, ...]:
+        return self.further_reachable or (None,) * (len(self.scene.targets) - 1)
 
     def told(self) -> Made:
         """The same with all that a report tells."""
@@ -281,9 +300,13 @@ def _write_scene(design: Made, folder: Path) -> None:
         (folder / name).write_bytes(data)
 
 
-def write_design(design: Made, irradiance: np.ndarray | None, folder: Path) -> None:
+def write_design(
+    design: Made, irradiance: np.ndarray | None, folder: Path, further: Sequence[np.ndarray] = ()
+) -> None:  # fmt: skip
     """design.npz: the optimised surfaces, the target, the irradiance if it is traced, and the scene's text.
 
+    further: the irradiance on the targets behind the first, if it is traced, whose arrays are target_2, irradiance_2,
+    reachable_2 and so on.
     reachable (rows, columns): 1 in the pixels that light can reach; no such array where it reaches all that are to be
     lit.  The transport map, if known (TransportMap): transport_x (c,) and transport_y (r,), mm on the target;
     transport_back or transport_entrance (c, r, 2), x and y (mm) where the light for them passes the back, or the
@@ -298,12 +321,26 @@ def write_design(design: Made, irradiance: np.ndarray | None, folder: Path) -> N
         degree=DEGREE,
         **({"front_curvature": 0.0} | _numbers(front)),
         **({"front_control_points": front.control_points()} if front.is_net else {}),
+        **(dict(zip(FRONT_KNOTS, map(knots, front.shape), strict=True)) if design.lens.shapes_front else {}),
         target=design.target,
         **({} if design.reachable is None else {"reachable": design.reachable.astype(np.uint8)}),
         **({} if irradiance is None else {"irradiance": irradiance}),
+        **_further(design, further),
         scene=scene_text(design.scene, design.lens),
         **({f"transport_{sent.plane}": sent.source, "transport_x": sent.x, "transport_y": sent.y} if sent else {}),
     )
+
+
+def _further(design: Made, irradiance: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays of the targets behind the first, by their names in design.npz."""
+    parts = (None if part is None else part.astype(np.uint8) for part in design.parts)
+    found = {"target": design.targets, "reachable": tuple(parts), "irradiance": (None, *irradiance)}
+    return {
+        numbered(name, k): values
+        for name, each in found.items()
+        for k, values in enumerate(each)
+        if k and values is not None
+    }
 
 
 @contextlib.contextmanager
@@ -367,24 +404,36 @@ def _holds(kept: Path, design: Made) -> bool:
 def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
     """Scene and nominal design of a folder; SceneError if design.npz or scene.toml is missing or damaged."""
     scene = scenes.load(folder / SCENE)
-    columns, rows = scene.target.columns_rows
-    shapes = {"control_points": (*both(scene.lens.back.net), 3), "target": (rows, columns), "front_curvature": ()}
+    shapes = {"control_points": (*both(scene.lens.back.net), 3), "front_curvature": ()}
     if scene.lens.front.shaped:
         shapes["front_control_points"] = (*both(scene.lens.nets()[1]), 3)
-    if "reachable" in files.names(folder / DESIGN):
-        shapes["reachable"] = rows, columns
+    held = files.names(folder / DESIGN)
+    for k, target in enumerate(scene.targets):
+        shapes[numbered("target", k)] = target.columns_rows[::-1]
+        if (name := numbered("reachable", k)) in held:
+            shapes[name] = target.columns_rows[::-1]
     found = _arrays(folder, shapes | dict.fromkeys(_numbers(scene.lens.front.surface), ()), scene)
-    part = found["reachable"] > 0 if "reachable" in found else None
-    if not found["target"].sum() > 0 or not restricted(scene.target.irradiance(), part).sum() > 0:
-        raise SceneError(f"{folder / DESIGN}: the target is all black; {AGAIN}")
-    return scene, nominal(scene, _lens(scene, found), found["target"], part)
+    kept = []
+    for k, (key, target) in enumerate(zip(scene.target_keys, scene.targets, strict=True)):
+        stored, reached = found[numbered("target", k)], found.get(numbered("reachable", k))
+        part = None if reached is None else reached > 0
+        if not stored.sum() > 0 or not restricted(target.irradiance(), part).sum() > 0:
+            raise SceneError(f"{folder / DESIGN}: the {key} is all black; {AGAIN}")
+        kept.append((stored, part))
+    return scene, nominal(scene, _lens(scene, found), *kept[0], further=kept[1:])
 
 
 def read_irradiance(folder: Path, scene: scenes.Scene) -> np.ndarray:
-    """The irradiance through the written lens; SceneError if design.npz is damaged."""
-    columns, rows = scene.target.columns_rows
-    found = _arrays(folder, {"irradiance": (rows, columns)}, scene)["irradiance"]
-    if not (found.min() >= 0 and found.sum() > 0):
+    """The irradiance through the written lens on the target, the first of several; SceneError as `read_irradiances`."""
+    return read_irradiances(folder, scene)[0]
+
+
+def read_irradiances(folder: Path, scene: scenes.Scene) -> tuple[np.ndarray, ...]:
+    """The irradiance through the written lens on each target; SceneError if design.npz is damaged."""
+    shapes = {numbered("irradiance", k): target.columns_rows[::-1] for k, target in enumerate(scene.targets)}
+    arrays = _arrays(folder, shapes, scene)
+    found = tuple(arrays[name] for name in shapes)
+    if not all(each.min() >= 0 and each.sum() > 0 for each in found):
         raise SceneError(f"{folder / DESIGN}: its irradiance is none; {AGAIN}")
     return found
 
@@ -403,12 +452,10 @@ def read_transport(folder: Path, scene: scenes.Scene) -> TransportMap | None:
 
 def _arrays(folder: Path, shapes: Mapping[str, tuple[int, ...]], scene: scenes.Scene) -> dict[str, np.ndarray]:
     """Arrays of finite numbers out of the design.npz of a scene."""
-    path, (columns, rows) = folder / DESIGN, scene.target.columns_rows
+    path, pixels = folder / DESIGN, sum(math.prod(target.columns_rows) for target in scene.targets)
     points = sum(math.prod(both(net)) for net in scene.lens.nets())
     try:
-        found = files.arrays(
-            path, shapes, 25 * points + 17 * columns * rows + 3_000_000
-        )  # with the arrays that are not read
+        found = files.arrays(path, shapes, 25 * points + 17 * pixels + 3_000_000)  # with the arrays that are not read
     except Exception as error:  # numpy, zipfile, zlib and tokenize each raise their own for a damaged file
         raise SceneError(f"{path}: cannot be read ({files.first_line(error)}); {AGAIN}") from None
     for name, shape in shapes.items():
@@ -444,11 +491,13 @@ def _surface(net: np.ndarray, z: float) -> BSplineSurface:
 
 
 def nominal(
-    scene: scenes.Scene, lens: Lens, stored_target: np.ndarray, part: np.ndarray | None = None
-) -> Nominal:
+    scene: scenes.Scene, lens: Lens, stored_target: np.ndarray, part: np.ndarray | None = None, *,
+    further: Sequence[tuple[np.ndarray, np.ndarray | None]] = (),
+) -> Nominal:  # fmt: skip
     """The design that the files are held to; its target is the scene's own, not that of design.npz.
 
-    part: of the target, that light can reach, as design.npz has it; None: all of it.
+    part: of the target, that light can reach, as design.npz has it; None: all of it.  further: stored target and part
+    of each target behind the first; (): the scene's own, and all of them.
     """
     picture = scene.target.irradiance()
     return Nominal(
@@ -469,4 +518,19 @@ def nominal(
         part=scene.part.of(scene.lens),
         draw=scene.draw,
         accuracy=ROUGH if scene.tailoring.quality == "draft" else FULL.accuracy,
+        weight=scene.target.weight,
+        further=tuple(_goals(scene, further)),
     )
+
+
+def _goals(
+    scene: scenes.Scene, stored: Sequence[tuple[np.ndarray, np.ndarray | None]]
+) -> Iterator[Goal]:  # fmt: skip
+    """The targets behind the first, as `nominal` has them."""
+    for k, (key, target) in enumerate(zip(scene.target_keys[1:], scene.targets[1:], strict=True)):
+        picture = target.irradiance()
+        kept, part = stored[k] if stored else (picture, None)
+        yield Goal(
+            key, target.screen, restricted(picture, part), kept, weight=target.weight,
+            whole=None if part is None else picture, reachable=part,
+        )  # fmt: skip

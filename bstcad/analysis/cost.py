@@ -227,7 +227,7 @@ def control_cells(channel: Channel, lens: Lens, screen: Screen, target: np.ndarr
     lens = channel.through(lens)
     tubes = launch_tubes(channel.source, lens, TUBES)
     x, y = cross(tubes.coming, lens.interfaces[lens.freeform[0]]).rays.position[:2]
-    pitch_x, pitch_y = lens.back.pitch
+    pitch_x, pitch_y = lens.nets[0].pitch
     cells = area_of(x, y).double() / (pitch_x * pitch_y)
     landed = tubes.landing(lens, screen.plane)
     corners = screen.pixels_of(landed.position.double())

@@ -19,7 +19,16 @@ from bstcad.optics.measure import IMAGE_PLACES, detail_width, images
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays, TargetPlane
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import clear_window, from_first_net, launch_strips, to_first_net, to_plane, trace, window
+from bstcad.optics.trace import (
+    across,
+    clear_window,
+    from_first_net,
+    launch_strips,
+    to_first_net,
+    to_plane,
+    trace,
+    window,
+)
 
 
 def _at_interfaces(rays: Rays, lens: Lens) -> list[Rays]:
@@ -197,7 +206,8 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
         critical = math.inf if last.law.reverses else math.degrees(math.asin(min(1.0 / last.law.eta, 1.0)))
         for rays in launch_strips(channel.source, through, n, seed):
             coming = to_first_net(rays, through)
-            met, z_x, z_y = intersect(last.surface, coming, last.outline, last.status_if_missed)
+            at_last = across(coming, through.interfaces[through.freeform[0] : -1])
+            met, z_x, z_y = intersect(last.surface, at_last, last.outline, last.status_if_missed)
             dx, dy, dz = met.direction
             along = met.sense * (dz - dx * z_x - dy * z_y)
             meets = met.alive & (met.flux > 0)

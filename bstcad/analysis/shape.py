@@ -1,6 +1,6 @@
 """The shape of a lens in the numbers that a machine shop asks for; lengths in mm, angles in degrees.
 
-Radii and slopes of the back are taken on a grid four times finer than its net.  Curvature jumps at the knots, so each
+Radii and slopes of a face are taken on a grid four times finer than its net.  Curvature jumps at the knots, so each
 knot span is sampled by itself, up to its ends, at optics.bspline.QUARTERS inside the outline; slopes on the rim too.
 """
 
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -30,26 +31,36 @@ RIM_ROUNDING = 1e-9  # of the outline's size: where the net ends at the rim, its
 def describe(lens: Lens, grid: int = GRID) -> dict[str, float | None]:
     """Thickness, relief, slope, radii and departure from the best sphere of the back face; mm and degrees.
 
-    A radius is None if the back bends that way nowhere.
+    A radius is None if the back bends that way nowhere.  Of a front that is tailored the same by keys front_…, seen
+    from outside as the back is: its valleys are concave.
     """
     x, y = _points(lens.outline, grid)
     front, back = _sags(lens, x, y)
     thickness, (front_vertex, back_vertex) = back - front, _sags(lens, *torch.zeros(2, 1, dtype=torch.float64))
-    edge, bends = thickness[: 4 * grid], survey(lens)
-    concave, convex = (bend.largest if bend.largest < FLATTEST else None for bend in (bends.concave, bends.convex))
-    octaves = slope_octaves(lens.back)
-    below, top = octaves[-2:] / octaves.sum() if octaves.sum() > 0 else (0.0, 0.0)
+    edge, flat = thickness[: 4 * grid], (x.numpy(), y.numpy())
+    of_front = _of_face(lens.front, survey_front(lens), (*flat, front)) if lens.shapes_front else {}
     return {
         "centre_thickness": float((back_vertex - front_vertex)[0]),
         "edge_thickness_min": float(edge.min()),
         "edge_thickness_max": float(edge.max()),
         "thickness_min": float(thickness.min()),
         "thickness_max": float(thickness.max()),
-        "sag_pv": float(np.ptp(back)),
+        **_of_face(lens.back, survey(lens), (*flat, back)),
+        **{f"front_{key}": value for key, value in of_front.items()},
+    }
+
+
+def _of_face(net: BSplineSurface, bends: Survey, places: tuple[np.ndarray, np.ndarray, np.ndarray]) -> dict[str, Any]:
+    """The figures of one freeform face; places: x, y and z (mm) of points all over it."""
+    concave, convex = (bend.largest if bend.largest < FLATTEST else None for bend in (bends.concave, bends.convex))
+    octaves = slope_octaves(net)
+    below, top = octaves[-2:] / octaves.sum() if octaves.sum() > 0 else (0.0, 0.0)
+    return {
+        "sag_pv": float(np.ptp(places[2])),
         "slope_max_deg": bends.slope.largest,
         "radius_min_concave": concave,
         "radius_min_convex": convex,
-        "departure_best_sphere": departure(x.numpy(), y.numpy(), back),
+        "departure_best_sphere": departure(*places),
         "slope_energy_top_octave": float(top),
         "slope_energy_octave_below": float(below),
     }
@@ -101,22 +112,22 @@ def inside(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
     return (x.reshape(-1), y.reshape(-1)) if bool(held.all()) else (x[held], y[held])
 
 
-def slope_octaves(back: BSplineSurface) -> np.ndarray:
+def slope_octaves(face: BSplineSurface) -> np.ndarray:
     """Slope energy of the control net by octaves of frequency, coarse to fine (mm², squared steps); ripple is last.
 
     Σ λ |ĥ|² over the cosine transform ĥ of the net without its best cubic polynomial (a tilt has no even
     continuation), λ the Laplacian; octave k holds the frequencies whose larger index lies in (m / 2^(k+1), m / 2^k],
     m the control points along the longer side and an index along the shorter one counted up to m, too.
     """
-    m = max(back.shape)
-    u, v = (np.linspace(-1, 1, count) for count in back.shape)
+    m = max(face.shape)
+    u, v = (np.linspace(-1, 1, count) for count in face.shape)
     columns = np.stack([np.outer(u**i, v**j).ravel() for i in range(4) for j in range(4 - i)], axis=1)
-    h = back.heights.detach().cpu().double().numpy().ravel()
+    h = face.heights.detach().cpu().double().numpy().ravel()
     h = h - columns @ least_squares(columns, h)
-    along_x, along_y = (2 - 2 * np.cos(np.pi * np.arange(count) / count) for count in back.shape)
-    energy = (along_x[:, None] + along_y) * scipy.fft.dctn(h.reshape(back.shape), norm="ortho") ** 2
-    energy[energy < (ROUNDING * (abs(back.z) + np.abs(h).max())) ** 2] = 0.0
-    larger = np.maximum(*(index * (m / count) for index, count in zip(np.indices(back.shape), back.shape, strict=True)))
+    along_x, along_y = (2 - 2 * np.cos(np.pi * np.arange(count) / count) for count in face.shape)
+    energy = (along_x[:, None] + along_y) * scipy.fft.dctn(h.reshape(face.shape), norm="ortho") ** 2
+    energy[energy < (ROUNDING * (abs(face.z) + np.abs(h).max())) ** 2] = 0.0
+    larger = np.maximum(*(index * (m / count) for index, count in zip(np.indices(face.shape), face.shape, strict=True)))
     borders = [m / 2**k for k in range(int(np.log2(m)), -1, -1)]
     return np.array([energy[(larger > a) & (larger <= b)].sum() for a, b in zip(borders, borders[1:], strict=False)])
 
@@ -136,7 +147,7 @@ def least_squares(columns: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def departure(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> float:
-    """Peak to valley (mm) of the back against its best sphere, which may be a plane.
+    """Peak to valley (mm) of a face against its best sphere, which may be a plane.
 
     Least squares of P = h - k (x² + y² + h²) - a x - b y - d, h = z - mean: zero on a sphere of curvature 2 k / n,
     n² = 1 + a² + b² - 4 k d, from which a point is 2 P / (n + sqrt(n² - 4 k P)) away (Pratt 1987).
@@ -154,7 +165,7 @@ def departure(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class Extreme:
-    """The extreme of a quantity over the back."""
+    """The extreme of a quantity over a face."""
 
     largest: float
     where: str
@@ -163,7 +174,7 @@ class Extreme:
 
 @dataclass(frozen=True)
 class Survey:
-    """The extremes of a back."""
+    """The extremes of a face, seen from outside the lens."""
 
     concave: Extreme  # the smallest principal radius of a valley (mm), as `largest`; FLATTEST if there is no valley
     convex: Extreme  # the same of a ridge
@@ -187,6 +198,14 @@ def survey(lens: Lens, concave: float | None = None, convex: float | None = None
         for value, (i, j), n in zip(found, place, count, strict=True)
     )
     return Survey(_radius(valley), _radius(ridge), _angle(lens, steep))
+
+
+def survey_front(
+    lens: Lens, concave: float | None = None, convex: float | None = None, slope: float | None = None
+) -> Survey:  # fmt: skip
+    """Survey the front of a lens, a net: seen from outside, from below, a ridge towards +z is a valley."""
+    found = survey(replace(lens, back=lens.front), concave=convex, convex=concave, slope=slope)
+    return Survey(concave=found.convex, convex=found.concave, slope=found.slope)
 
 
 def _grid(back: BSplineSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

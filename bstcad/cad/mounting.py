@@ -275,7 +275,7 @@ def part_of(lens: Lens, mount: Mount) -> NamedSolid:
         raise ValueError(
             f"mount: OCC cannot build it ({type(error).__name__}); make bevel or draft smaller, or leave them out"
         ) from error
-    return found._replace(solid=found.solid.translate((0, 0, -mount.origin(lens.front.z))))
+    return found._replace(solid=found.solid.translate((0, 0, -mount.origin(lens.front_vertex))))
 
 
 def wire(outline: Round | Box) -> cadquery.Wire:

@@ -286,14 +286,19 @@ def _conic(patch: Geom_BSplineSurface) -> Sphere | Conic:
     return Sphere(z, c) if flat else found
 
 
-def sample(step_lens: StepLens, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) of the re-read back face at (x, y) (mm), evaluated by OCC, and its unit normals there, towards +z.
+def sample(
+    step_lens: StepLens, x: np.ndarray, y: np.ndarray, *, of: str = "back"
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Points (n, 3) of a re-read net at (x, y) (mm), evaluated by OCC, and its unit normals there, towards +z.
+
+    of: "back", or "front" of a lens whose front is a net.
 
     (u, v) comes from (x, y) by the closed form for uniform control points; the points' own x and y tell whether the
     file's net is that uniform.
     """
-    u, v = patches.of_net(step_lens.back)(np.ravel(x), np.ravel(y)).T.tolist()
-    found = points_and_tangents(BRepAdaptor_Surface(step_lens.faces[1]).BSpline(), u, v)
+    number = ("front", "back").index(of)
+    u, v = patches.of_net(getattr(step_lens, of))(np.ravel(x), np.ravel(y)).T.tolist()
+    found = points_and_tangents(BRepAdaptor_Surface(step_lens.faces[number]).BSpline(), u, v)
     normals = np.cross(found[:, 1], found[:, 2])
     return found[:, 0], normals / np.linalg.norm(normals, axis=1, keepdims=True)
 

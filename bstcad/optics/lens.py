@@ -14,7 +14,7 @@ from bstcad.optics.interfaces import Interface, Reflect, Refract
 from bstcad.optics.outlines import EVERYWHERE, Outline
 from bstcad.optics.rays import Status
 from bstcad.optics.sides import Sides
-from bstcad.optics.surfaces import Surface
+from bstcad.optics.surfaces import Surface, sag
 
 
 class Dimming(Protocol):
@@ -91,6 +91,16 @@ class Lens:
         """The surfaces of `freeform`."""
         interfaces = self.interfaces
         return tuple(interfaces[k].surface for k in self.freeform)
+
+    @property
+    def shapes_front(self) -> bool:
+        """Does tailoring shape the front of the solid?"""
+        return not self.reflects and len(self.before) in (self.shaped or ())
+
+    @property
+    def front_vertex(self) -> float:
+        """z (mm) where the front crosses the axis; the heights of a net that is tailored are counted from elsewhere."""
+        return float(sag(self.front, 0.0, 0.0)) if self.shapes_front else float(self.front.z)
 
     @property
     def last_freeform(self) -> Interface:

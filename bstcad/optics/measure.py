@@ -140,7 +140,8 @@ def measure(
     (value, error), (tent, _) = _value(rays, wanted), apart(rays.tents, wanted)
     shown, off = _shown(rays.boxes, wanted)
     lenses = [c.through(lens) for c in channels]
-    simple = draw is None and all(seen.losses is None and fused_whole(seen.interfaces) for seen in lenses)
+    plain = lens.shapes_front  # no kernel traces two nets as a whole, and both are to have a witness
+    simple = draw is None and all(seen.losses is None and (plain or fused_whole(seen.interfaces)) for seen in lenses)
     witnessed = effort.witness and simple
     return Light(
         shown.numpy(), value, error, rays=rays.count, flux=rays.flux, tent=math.sqrt(max(tent, 0.0)), picture_off=off,

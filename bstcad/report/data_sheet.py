@@ -53,6 +53,7 @@ class Sheet:
     light_on_target: float  # share of the source's light
     passed: bool  # every check
     version: str  # of the program
+    further_rrmsds: tuple[float, ...] = ()  # on the targets behind the first
 
     @property
     def mount(self) -> Mount | None:
@@ -82,6 +83,9 @@ class Sheet:
             mount=self.mount, light=defaultdict(lambda: None, self.record["source"]), passed=self.passed,
             rrmsd=self.rrmsd, light_on_target=self.light_on_target, across=across, walls=wall_words,
             apertures=[_aperture(patch, self.lens.outline) for patch in self.apertures], kinds_of_holes=kinds_of_holes,
+            further=list(zip(
+                self.scene.target_keys[1:], self.scene.targets[1:], self.further_rrmsds, strict=True,
+            )),
             limits={face: settings_of(self.scene.tolerance, f"{face}.form").get("limit") for face in ("front", "back")},
         )  # fmt: skip
 

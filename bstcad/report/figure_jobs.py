@@ -15,13 +15,14 @@ import numpy as np
 import torch
 
 from bstcad.analysis.light import bundle, fan, ray_map
-from bstcad.analysis.shape import least_squares, survey
+from bstcad.analysis.shape import least_squares, survey, survey_front
 from bstcad.cad import mesh as meshes
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Light, Line
 from bstcad.optics.rays import TiltedPlane
 from bstcad.optics.sources import Source
+from bstcad.optics.surfaces import Surface
 from bstcad.report import data_sheet, light_figures, rendering
 from bstcad.report.data_sheet import Sheet
 from bstcad.report.drawing import (
@@ -41,6 +42,7 @@ from bstcad.report.record import Contents, Point, Stage
 from bstcad.report.rendering import LightPath
 from bstcad.report.units import number, turned
 from bstcad.scene.scene import Scene
+from bstcad.scene.target import numbered
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -60,7 +62,7 @@ class Pictures:
     """Figures and data sheet of a scene's design, begun one by one and waited for together."""
 
     def __init__(self, scene: Scene, submit: Submit) -> None:
-        self._scene, self._submit, self._view = scene, submit, View.of(scene)
+        self._scene, self._submit = scene, submit
         self._vtk = ThreadPoolExecutor(1)  # waits for VTK, which draws in a process of its own
         self._jobs: list[Future] = []
         self._sheet: Future | None = None
@@ -71,9 +73,9 @@ class Pictures:
     def __exit__(self, *error: object) -> None:
         self._vtk.shutdown()
 
-    def begin(self, draw: Callable[..., Pngs], *given: Any) -> None:
-        """Begin the pictures that draw(*given, view) makes."""
-        self._jobs.append(self._submit(draw, *given, self._view))
+    def begin(self, draw: Callable[..., Pngs], *given: Any, number: int = 0) -> None:
+        """Begin the pictures that draw(*given, view) makes; number: of the target that the view is of."""
+        self._jobs.append(self._submit(draw, *given, View.of(self._scene, number)))
 
     def solid(self, lens: Lens) -> None:
         """Begin the 3-D picture."""
@@ -81,7 +83,10 @@ class Pictures:
 
     def lens(self, lens: Lens) -> None:
         """Begin the maps of the lens and its rays."""
-        self.begin(draw_lens, self._scene.source.central, lens, self._scene.target.screen)
+        source, screens = self._scene.source.central, [target.screen for target in self._scene.targets]
+        self.begin(draw_lens, source, lens, screens)
+        for k, screen in enumerate(screens[1:], start=1):
+            self.begin(draw_transport, source, lens, screen, number=k)
 
     def sheet(self, sheet: Sheet) -> None:
         """Begin the data sheet of a part."""
@@ -108,7 +113,7 @@ class Pictures:
 class NoPictures(Pictures):
     """No pictures, for a design whose figures are not wanted."""
 
-    def begin(self, draw: Callable[..., Pngs], *given: Any) -> None:
+    def begin(self, draw: Callable[..., Pngs], *given: Any, number: int = 0) -> None:
         """Draw nothing."""
 
     def solid(self, lens: Lens) -> None:
@@ -118,13 +123,24 @@ class NoPictures(Pictures):
         """Draw nothing."""
 
 
-def draw_lens(source: Source, lens: Lens, screen: Screen, view: View) -> Pngs:
-    """The pictures of the lens but the 3-D one, with its rays to the screen."""
+def draw_lens(source: Source, lens: Lens, screens: Sequence[Screen], view: View) -> Pngs:
+    """The pictures of the lens but the 3-D one, with its rays to the screens; the front's surface if it is tailored."""
+    first, *others = screens
+    farthest = max(screens, key=lambda screen: screen.z)
+    of_front = {}
+    if lens.shapes_front:
+        of_front["surface_front"] = png(surface_maps(lens, survey_front(lens).slope.largest, face="front"))
     return {
         "surface": png(surface_maps(lens, survey(lens).slope.largest)),
-        "side_view": png(side_view(lens, fan(source, lens, screen.plane), screen)),
-        "transport": png(transport_map(*ray_map(source, lens, screen.plane), view)),
+        **of_front,
+        "side_view": png(side_view(lens, fan(source, lens, farthest.plane), first, others)),
+        **draw_transport(source, lens, first, view),
     }
+
+
+def draw_transport(source: Source, lens: Lens, screen: Screen, view: View) -> Pngs:
+    """The map of the light from the source to a screen."""
+    return {numbered("transport", view.number): png(transport_map(*ray_map(source, lens, screen.plane), view))}
 
 
 def draw_light(target: np.ndarray, light: Light, lines: Sequence[Line], view: View) -> Pngs:
@@ -138,7 +154,7 @@ def draw_light(target: np.ndarray, light: Light, lines: Sequence[Line], view: Vi
         pictures["ghost"] = light_figures.ghost_picture(target, light.ghost, view)
     if lines:
         pictures["lines"] = light_figures.lines_apart(target, found, lines, view)
-    return {name: png(picture) for name, picture in pictures.items()}
+    return {numbered(name, view.number): png(picture) for name, picture in pictures.items()}
 
 
 def draw_convergence(report: Contents, view: View) -> Pngs:
@@ -152,14 +168,14 @@ def draw_convergence(report: Contents, view: View) -> Pngs:
 
 
 @styled
-def surface_maps(lens: Lens, steepest: float) -> Figure:
-    """Samples of the back surface inside the outline: height, slope angle, mean curvature (optics.curvature.principal).
+def surface_maps(lens: Lens, steepest: float, face: str = "back") -> Figure:
+    """Samples of a freeform face inside the outline: height, slope angle, mean curvature (optics.curvature.principal).
 
-    steepest: slope of the back (degrees), which the samples would miss.
+    steepest: slope of the face (degrees), which the samples would miss.  face: "back" or "front".
 
     The best plane is taken off the height where it hides the rest (its PV exceeds that of the remainder).
     """
-    x, y, sag, slope_x, slope_y = _sample(lens)
+    x, y, sag, slope_x, slope_y = _sample(lens, getattr(lens, face))
     columns = np.stack([np.ones_like(sag), *np.meshgrid(x, y)], axis=-1)
     known = np.isfinite(sag)
     plane = np.where(known, columns @ least_squares(columns[known], sag[known]), np.nan)
@@ -199,23 +215,24 @@ def surface_maps(lens: Lens, steepest: float) -> Figure:
     return figure
 
 
-def _sample(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """x (n,), y (n,) and sag (mm), ∂z/∂x, ∂z/∂y (n, n) of the back surface, row 0 = y min, NaN outside the outline."""
+def _sample(lens: Lens, face: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """x (n,), y (n,) and sag (mm), ∂z/∂x, ∂z/∂y (n, n) of a face, row 0 = y min, NaN outside the outline."""
     reach_x, reach_y = lens.outline.half_extent
     x = torch.linspace(-reach_x, reach_x, MAP_POINTS, dtype=torch.float64)
     y = torch.linspace(-reach_y, reach_y, MAP_POINTS, dtype=torch.float64)
     grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
     inside = lens.outline.contains(grid_x, grid_y)
-    back = lens.back.plain()
-    maps = (torch.where(inside, part, torch.nan) for part in back.sag_and_slope(grid_x, grid_y))
+    maps = (torch.where(inside, part, torch.nan) for part in face.plain().sag_and_slope(grid_x, grid_y))
     return tuple(part.detach().numpy() for part in (x, y, *maps))
 
 
 @styled
-def side_view(lens: Lens, rays: np.ndarray, screen: Screen | None = None) -> Figure:
+def side_view(
+    lens: Lens, rays: np.ndarray, screen: Screen | None = None, others: Sequence[Screen] = ()
+) -> Figure:  # fmt: skip
     """The lens cut along y = 0 with rays (n_rays, n_points, 3) in mm projected on x-z: close, and the whole path.
 
-    A tilted screen is drawn too, as its edges are seen along y.
+    A tilted screen is drawn too, as its edges are seen along y, and all screens of several (others: behind the first).
     """
     figure = new_figure(11.0, 3.4)
     close, whole = figure.subplots(1, 2, width_ratios=(1, 1.9))
@@ -232,7 +249,12 @@ def side_view(lens: Lens, rays: np.ndarray, screen: Screen | None = None) -> Fig
     close.set(xlim=(low - reach * 0.5, high + reach * 0.5), ylim=(-1.25 * reach, 1.25 * reach))
     close.set(title=f"{'Mirror' if lens.reflects else 'Lens'}, cut along y = 0", aspect="equal")
     whole.set_title("Whole path, source to target (axes not to one scale)")
-    if screen is not None and screen.tilt:
+    for each in (screen, *others) if others else ():
+        edges = corners(each)
+        whole.fill(edges[:, 2], edges[:, 0], facecolor="none", edgecolor=GREY, linewidth=1.0, gid="screen")
+    if others:
+        footnote(figure, "Grey: the targets.")
+    elif screen is not None and screen.tilt:
         edges = corners(screen)
         whole.fill(edges[:, 2], edges[:, 0], facecolor="none", edgecolor=GREY, linewidth=1.0, gid="screen")
         footnote(figure, f"Grey: the target, its plane tilted by {turned(screen.tilt)}.")

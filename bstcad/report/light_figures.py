@@ -68,12 +68,13 @@ class View:
     seen_from: str  # lens | behind
     optic: str = "lens"  # or "mirror"
     tilt: tuple[float, float] | None = None  # of the target plane, about x and then about y (degrees); None: level
+    number: int = 0  # of the target among several, by which its figures are named
 
     @classmethod
-    def of(cls, scene: Scene) -> View:
-        """Of a scene's target."""
-        target = scene.target
-        return cls(target.x, target.y, target.seen_from, optic=scene.optic, tilt=target.tilt)
+    def of(cls, scene: Scene, number: int = 0) -> View:
+        """Of a scene's target, the first of several or another."""
+        target = scene.targets[number]
+        return cls(target.x, target.y, target.seen_from, optic=scene.optic, tilt=target.tilt, number=number)
 
     @property
     def words(self) -> str:

@@ -321,7 +321,7 @@ class Views:
     @property
     def vertices(self) -> tuple[float, float]:
         """z (mm) where front and back cross the axis."""
-        return float(self.lens.front.z) - self.origin, float(sag(self.lens.back, 0.0, 0.0)) - self.origin
+        return self.lens.front_vertex - self.origin, float(sag(self.lens.back, 0.0, 0.0)) - self.origin
 
 
 @dataclass(frozen=True)

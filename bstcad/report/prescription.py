@@ -15,15 +15,15 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bstcad.analysis.shape import FLATTEST, describe, heights, survey, thickness_range
+from bstcad.analysis.shape import FLATTEST, describe, heights, survey_front, thickness_range
 from bstcad.optics import quadrature
-from bstcad.optics.bspline import DEGREE
+from bstcad.optics.bspline import DEGREE, BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.media import density
 from bstcad.optics.surfaces import Surface, sag
@@ -45,8 +45,12 @@ Prescription of {name}
 Lengths in mm, angles in degrees, wavelengths in nm.  The axis is x = y = 0.
 {way}.
 A radius is positive if its centre lies further along +z than the vertex.
-The freeform back is exact in lens.step, and its control points are in design.npz.
+{exact}
 """
+EXACT = (  # of a lens with one tailored face, and with two
+    "The freeform back is exact in lens.step, and its control points are in design.npz.",
+    "Both freeform faces are exact in lens.step, and their control points are in design.npz.",
+)
 SHEET, PART, LENS = "datasheet.pdf", "part.step", "lens.step"
 DATUMS = {"front": "the vertex of the front", "flange": "the lower face of the flange"}  # mount.datum: z = 0 is there
 FILLED = 1e-3  # of an outline's area; an edge that leaves no more of it out is its own
@@ -68,16 +72,11 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "outline": asdict(lens.outline),
         "clear": lens.clear and tuple(map(asdict, lens.clear)),  # apertures of front and back; None: no mount
         "front": _own(front)
-        | _face(front.kind, float(front.z), curvature, None if constant is None else float(constant)),
+        | _face(front.kind, lens.front_vertex, curvature, None if constant is None else float(constant)),
         "back": _face("bspline", vertex(lens)),
         "reflects": lens.reflects,  # is it a mirror, whose back is the face that light meets?
-        "net": {
-            "control_points": lens.back.shape,  # along x and y
-            "degree": DEGREE,
-            "knots": _knots(lens.back.shape),
-            "x": lens.back.x,  # between which the net lies; beyond the rim of a round lens
-            "y": lens.back.y,
-        },
+        "net": _net(lens.back),
+        **({"front_net": _net(front), "front_asked": scene.lens.front.z} if lens.shapes_front else {}),
         "back_asked": scene.lens.back.z,  # z at which the scene has the back's vertex
         "centre_thickness": shape["centre_thickness"],
         "edge_thickness": (shape["edge_thickness_min"], shape["edge_thickness_max"]),
@@ -85,6 +84,22 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "mass": None if heavy is None else shape["volume"] * heavy / 1000,  # g; None: no density is known
         "source": _known(asdict(scene.source)),
         "target": _known(scene.target.model_dump(mode="json")),
+        **(
+            {"further_targets": [_known(target.model_dump(mode="json")) for target in scene.targets[1:]]}
+            if scene.targets[1:]
+            else {}
+        ),
+    }
+
+
+def _net(face: BSplineSurface) -> dict[str, Any]:
+    """The net of a face that is tailored."""
+    return {
+        "control_points": face.shape,  # along x and y
+        "degree": DEGREE,
+        "knots": _knots(face.shape),
+        "x": face.x,  # between which the net lies; beyond the rim of a round lens
+        "y": face.y,
     }
 
 
@@ -133,7 +148,8 @@ def sections(record: Mapping[str, Any]) -> dict[str, Rows]:
 def text(record: Mapping[str, Any]) -> str:
     """prescription.txt."""
     name = f"{record['name']}: {record['title']}" if record["title"] else record["name"]
-    head = TEXT.format(name=name, way=WAYS["mirror" if record["reflects"] else "lens"])
+    way = WAYS["mirror" if record["reflects"] else "lens"]
+    head = TEXT.format(name=name, way=way, exact=EXACT["front_net" in record])
     parts = (f"\n{heading}\n" + "".join(f"    {name:<30}{value}\n" for name, value in rows)
              for heading, rows in sections(record).items())  # fmt: skip
     return head + "".join(parts)
@@ -179,7 +195,7 @@ def order_of(
     """
     mount, stated = scene.mount if found else None, scene.part.of(scene.lens)
     low, high, volume = found or (*_corners(lens, None), shape["volume"])
-    path, front = folder / (PART if mount else LENS), float(lens.front.z)
+    path, front = folder / (PART if mount else LENS), lens.front_vertex
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     radii = filter(None, (shape["radius_min_concave"], _front_radius(as_cut(lens, scene.mount))))
@@ -234,7 +250,7 @@ def part(lens: Lens, whole: WholePart | None = None, stated: float | None = None
     import shapely  # a twentieth of a second, which a design need not pay
 
     shape, lies = describe(lens), list(zip(*_corners(lens, whole), strict=True))
-    vertex = lens.front.z + shape["centre_thickness"]
+    vertex = lens.front_vertex + shape["centre_thickness"]
     edge, outline = None if whole is None else whole.edge, lens.outline
     fills = edge is None or outline.is_round or shapely.Polygon(edge).area > (1 - FILLED) * outline.area
     found = tables(
@@ -266,7 +282,7 @@ def _volume(lens: Lens, whole: WholePart | None) -> float | None:
 
 def _origin(lens: Lens, vertex: float, bare: bool = True) -> str:
     """The position of axis and front, seen from the point (0, 0, 0) of the file; vertex: z of the back's."""
-    front = lens.front.z
+    front = lens.front_vertex
     axis = f"on the axis of the {'mirror' if lens.reflects else 'lens'}" + " (the middle of its outline)" * bare
     if lens.reflects:  # its light comes from above
         if vertex < 0:
@@ -292,7 +308,7 @@ def _front_radius(lens: Lens) -> float | None:
     if lens.reflects:
         return None
     if front.is_net:
-        found = survey(replace(lens, back=front)).convex.largest  # a ridge from above is a valley from below
+        found = survey_front(lens).concave.largest
         return found if found < FLATTEST else None
     if not front.curvature < 0:
         return None

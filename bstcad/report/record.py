@@ -10,19 +10,19 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import numpy as np
-import scipy.ndimage
 from pydantic import ConfigDict, FailFast, Field, TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 from typing_extensions import TypedDict
 
 from bstcad.analysis.light import Blur, FinestDetail, finest_detail
+from bstcad.analysis.missed_light import lifted, unlit
 from bstcad.analysis.steepness import Steepness
 from bstcad.judges.comparison import Judge
 from bstcad.measured.form_error import MAP
@@ -40,7 +40,6 @@ from bstcad.verify.verdict import Check, verdict
 if TYPE_CHECKING:
     from bstcad.optics.sources import Collimated
     from bstcad.optics.sources import Point as PointSource
-    from bstcad.scene.target import Target
 
 BY_HAND = "by hand"  # Making.stopped of a lens that was changed after it was designed, or comes from elsewhere
 LARGEST = 20_000_000  # bytes of a report; ten thousand evaluations fill one
@@ -105,6 +104,22 @@ class Line:
     wavelength: Size  # nm
     share: Share  # of all light
     rrmsd: Rrmsd  # of its picture against the target
+
+
+@dataclass(frozen=True)
+class TargetFigures:
+    """The light on one of several targets."""
+
+    key: str  # target[0], target[1], …
+    z: float  # mm, of its plane
+    weight: Size  # of its squared error among all goals
+    rrmsd: Rrmsd  # by the flux into each pixel
+    rrmsd_standard_error: Annotated[float, Field(ge=0, le=1e3)]
+    rrmsd_tent: Rrmsd | None  # by linear binning
+    light_on_target: Share  # of the source's flux
+    efficiency: Share  # flux on the target over flux that leaves the back face
+    leak: Share | None  # as in Contents
+    contrast: Size | None
 
 
 @dataclass(frozen=True)
@@ -208,6 +223,8 @@ class Contents:
     # a made part by its cloud, as measured.made_part has it: points, alignment, pv, rms, rrmsd_predicted, passed …
     measured: Mapping[str, Any] | None = None
     order: Order | None = None  # for a machine shop
+    # the light on each of several targets, the first one too, whose figures are those above; none: there is one target
+    targets: tuple[TargetFigures, ...] = ()
 
     @property
     def making(self) -> Making:
@@ -245,11 +262,12 @@ class Examined:
 def contents_of(
     scene: Scene, lens: Lens, target: np.ndarray, proof: Proof, *, making: Making,
     circumstances: Mapping[str, Any], estimates: tuple[LeftOut, ...], diagnosis: Mapping[str, Any],
-    reachable: np.ndarray | None = None,
+    reachable: np.ndarray | None = None, further: Sequence[np.ndarray] = (),
 ) -> Contents:  # fmt: skip
     """The contents of report.json.
 
-    reachable: the pixels (rows, columns) that light can reach; None: all that are to be lit.
+    reachable: the pixels (rows, columns) that light can reach; None: all that are to be lit.  further: the targets
+    behind the first, whose light is `proof.further`.
     lens: as designed.  circumstances: version, machine and versions of libraries now, which those of its making
     precede.  estimates: of the effects that are left out.  diagnosis: convergence, remaining_error, limits and bounds.
     """
@@ -289,8 +307,27 @@ def contents_of(
         finest_detail=_finest_detail(scene, proof, estimates),
         lines=tuple(Line(line.wavelength, line.share, rrmsd(target, line.picture)) for line in proof.lines),
         estimates=estimates,
+        targets=tuple(_figures(scene, proof)) if proof.further else (),
     )
-    return _remarked(contents, *remarks(contents, scene, target, light.picture))
+    pictures = tuple(zip(further, (each.picture for each in proof.further), strict=True))
+    return _remarked(contents, *remarks(contents, scene, target, light.picture, further=pictures))
+
+
+def _figures(scene: Scene, proof: Proof) -> Iterator[TargetFigures]:
+    """The light on each target."""
+    for key, target, light in zip(scene.target_keys, scene.targets, proof.lights, strict=True):
+        yield TargetFigures(
+            key,
+            target.z,
+            target.weight,
+            light.rrmsd,
+            rrmsd_standard_error=light.standard_error,
+            rrmsd_tent=light.tent,
+            light_on_target=light.flux["on target"],
+            efficiency=light.efficiency,
+            leak=light.leak and light.leak.share,
+            contrast=light.leak and light.leak.contrast,
+        )
 
 
 def _unreached(scene: Scene, reachable: np.ndarray) -> dict[str, float | None]:
@@ -347,18 +384,24 @@ def extent(source: Collimated | PointSource) -> Iterator[tuple[str, str]]:
 # lens may be right to the last nanometre and still lose light, or be thicker than drawn, because the scene left no
 # other way; who reads only "passed" or "failed" should not have to search the tables for that.
 
-DARK = 0.01  # of the picture's mean: darker is dark
-UNLIT = 0.1  # of the target's irradiance: a pixel with less of it was left dark
-PATCH = 5e-3  # of the lit area: less of it left dark is not worth a sentence
 OUTLIERS = 0.01  # of the points of a made part: more outliers are worth a sentence
 
 
-def remarks(report: Contents, scene: Scene, target: np.ndarray, irradiance: np.ndarray) -> list[str]:
-    """Remarks on a report, by its target and irradiance (rows, columns), both of one sum; the most important first."""
+def remarks(
+    report: Contents, scene: Scene, target: np.ndarray, irradiance: np.ndarray,
+    further: Sequence[tuple[np.ndarray, np.ndarray]] = (),
+) -> list[str]:  # fmt: skip
+    """Remarks on a report, by its target and irradiance (rows, columns), both of one sum; the most important first.
+
+    further: the same of each target behind the first.
+    """
     allowed = DEFAULT_RRMSD_LIMIT if report.rrmsd_asked is None else report.rrmsd_asked
+    names = scene.target_keys if further else ("the target",)
+    pictures = list(zip(names, scene.targets, ((target, irradiance), *further), strict=True))
     return paragraphs(
         "remarks.txt.j2", "remarks", report=report, scene=scene, allowed=allowed, cut=CUT, names=LEFT_OUT,
-        unlit=_unlit(target, irradiance, scene.target), lifted=_lifted(target, irradiance),
+        unlit={name: unlit(*pair, x=where.x, y=where.y) for name, where, pair in pictures},
+        lifted={name: lifted(*pair) for name, _, pair in pictures},
     )  # fmt: skip
 
 
@@ -369,32 +412,8 @@ def too_steep(found: Steepness) -> list[str]:
 
 
 def bounds(found: Mapping[str, Any] | None) -> str:
-    """The bounds on the back ([lens] tool_radius, max_slope, thicknesses) and their price; nothing if none is asked."""
+    """The bounds on faces ([lens] tool_radius, max_slope, thicknesses) and their price; nothing if none is asked."""
     return "".join(paragraphs("remarks.txt.j2", "bounds", found=found))
-
-
-def _unlit(target: np.ndarray, irradiance: np.ndarray, where: Target) -> dict[str, Any]:
-    """The share of the lit part that gets hardly any light; least and largest x and y (mm) of its largest patch."""
-    lit = target > DARK * target.mean()
-    unlit = lit & (irradiance < UNLIT * target)
-    share = float(unlit.sum() / lit.sum())
-    if share < PATCH or target[unlit].sum() < PATCH * target.sum():  # which a rim of pixels that are lit in part is not
-        return {}
-    patches, count = scipy.ndimage.label(unlit, np.ones((3, 3)))
-    largest = 1 + np.argmax(scipy.ndimage.sum_labels(unlit, patches, range(1, count + 1)))
-    rows, columns = scipy.ndimage.find_objects(patches)[largest - 1]
-    x, y = (np.linspace(*ends, pixels + 1) for ends, pixels in zip((where.x, where.y), target.shape[::-1], strict=True))
-    return {"share": share, "place": (x[columns.start], x[columns.stop], y[-1 - rows.stop], y[-1 - rows.start])}
-
-
-def _lifted(target: np.ndarray, irradiance: np.ndarray) -> dict[str, float]:
-    """The light on the dark parts of the target, of all light, and its level, of the mean irradiance.
-
-    A smooth face cannot part its light without a seam.
-    """
-    dark = target < DARK * target.mean()
-    light = float((irradiance - target)[dark].sum() / target.sum())
-    return {"light": light, "level": float(irradiance[dark].mean() / target.mean()) if dark.any() else 0.0}
 
 
 # --- from and to a file -----------------------------------------------------------------------------------------------
@@ -501,6 +520,7 @@ class Report:
     # the made part that this verification was given: facts, outliers (n, 3), irradiance as predicted, and deviation,
     # whose x, y and form (rows y, columns x; mm, + out of the glass, NaN outside) are the deviation map; None: none
     measured: Any = None
+    further_irradiance: tuple[np.ndarray, ...] = ()  # the same on the targets behind the first
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -521,12 +541,17 @@ class Report:
         failed = (check for check in self.checks if not check.passed)
         return "\n  ".join(
             [
-                f"Report {self.name!r}: {self.verdict}, RRMSD {number(self.rrmsd)}, "
+                f"Report {self.name!r}: {self.verdict}, RRMSD {rrmsds(self.contents)}, "
                 f"{percent(self.light_on_target)} of the source's light is on the target",
                 *(f"failed: {check.name}" + (f" ({check.where})" if check.where else "") for check in failed),
                 *(f"given up: {sentence}" for sentence in self.given_up),
             ]
         )
+
+
+def rrmsds(report: Contents) -> str:
+    """The RRMSD, or that of each of several targets, in their order."""
+    return ", ".join(number(each.rrmsd) for each in report.targets or (report,))
 
 
 def changes(entry: LeftOut) -> tuple[str, str, str]:

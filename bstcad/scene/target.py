@@ -188,6 +188,11 @@ def _numbered(image: picture.Picture) -> Iterator[picture.Picture]:
     yield from (replace(image, name=f"{stem[:70]}-{k}.{kind}") for k in range(2, 2 + MOST))
 
 
+def numbered(name: str, k: int) -> str:
+    """An array of design.npz or a figure of target[k]: name for the first of several, name_2 for the second."""
+    return name if k == 0 else f"{name}_{k + 1}"
+
+
 def coplanar(targets: tuple[Target, ...]) -> Iterator[str]:
     """Targets in the plane of an earlier one."""
     for k, target in enumerate(targets):

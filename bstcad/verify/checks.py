@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.analysis.light import Blur, blur, margins, mount_losses
-from bstcad.analysis.shape import describe, survey
+from bstcad.analysis.shape import describe, survey, survey_front
 from bstcad.cad import mesh as meshes
 from bstcad.optics import quadrature
 from bstcad.optics.channels import Channel
@@ -45,8 +45,9 @@ from bstcad.step_text import part21
 from bstcad.verify import text_checks
 from bstcad.verify.verdict import Check
 
-if TYPE_CHECKING:  # which loads OCC
-    from bstcad.cad.solid_properties import WholePart
+if TYPE_CHECKING:
+    from bstcad.cad.solid_properties import WholePart  # which loads OCC
+    from bstcad.optics.wavefront_error import WavefrontError
 
 VERTEX_ROUNDING = 2e-7  # of the largest coordinate: a vertex in float32 on a slope, off its face
 VERIFY_SEED = 1_000_003  # added to the seed: rays that tailoring never saw
@@ -64,6 +65,24 @@ CUT_EXCUSE = 1e-3  # of the light: a mount that cuts away less is no reason for 
 MAX_ON_FLANGE = 1e-3  # of the light that gets through the lens; no wall of a flange is to stand in the way of more
 UNASKED = " (by default: none was asked)"
 GRID = ", on a grid four times finer than the net"
+
+
+@dataclass(frozen=True, eq=False)
+class Goal:
+    """One target of a design, and the picture that its light is held to."""
+
+    key: str  # by which sentences call it: target, or target[0], target[1], … of several
+    screen: Screen
+    target: np.ndarray  # (rows, columns), row 0 = y max
+    stored_target: np.ndarray  # as design.npz has it
+    weight: float = 1.0  # of its squared error among all goals
+    whole: np.ndarray | None = None  # as Nominal has these two
+    reachable: np.ndarray | None = None
+
+    @property
+    def suffix(self) -> str:
+        """Behind the names of its checks: which of several targets it is."""
+        return "" if self.key == "target" else f", {self.key}"
 
 
 @dataclass(frozen=True)
@@ -88,6 +107,17 @@ class Nominal:
     # of the whole picture, where light can reach but a part of it, which is `target`; None: it can reach all
     whole: np.ndarray | None = None
     reachable: np.ndarray | None = None  # (rows, columns) which pixels those are
+    weight: float = 1.0  # of the target, the first of several, among all goals
+    further: tuple[Goal, ...] = ()  # the targets behind the first
+
+    @property
+    def goals(self) -> tuple[Goal, ...]:
+        """All targets, the first one too."""
+        first = Goal(
+            "target[0]" if self.further else "target", self.screen, self.target, self.stored_target,
+            weight=self.weight, whole=self.whole, reachable=self.reachable,
+        )  # fmt: skip
+        return (first, *self.further)
 
     def effort(self, given: Effort | None = None) -> Effort:
         """The rays and tubes of a measurement of this design, a draft's with fewer; given: a limit, None: no limit."""
@@ -101,12 +131,19 @@ class Proof:
 
     checks: tuple[Check, ...]
     lens: Lens  # as re-read from lens.step; with a mount that of part.step, with its clear apertures
-    light: Light  # that it throws on the target
+    light: Light  # that it throws on the target, the first of several
     shape: dict[str, float | None]  # of the lens within the mount's rim; volume: of lens.step
     stability: dict[str, float | int | None]
     blur: Blur | None = None  # by the source's size; None: it is a point, or a beam of parallel light
     lines: tuple[Line, ...] = ()  # of a spectrum, each by itself
-    at_bounds: dict[str, float] | None = None  # share of the back that is at each bound on it, by key; None: no bounds
+    at_bounds: dict[str, float] | None = None  # share of the faces that is at each bound, by key; None: no bounds
+    further: tuple[Light, ...] = ()  # on the targets behind the first
+    wavefront: WavefrontError | None = None  # of the light, against the one asked for; None: none was
+
+    @property
+    def lights(self) -> tuple[Light, ...]:
+        """On all targets, the first one too."""
+        return (self.light, *self.further)
 
     @property
     def passed(self) -> bool:
@@ -119,17 +156,17 @@ def verify(
     nominal: Nominal,
     submit: Submit = here,
     known: Callable[[Lens], None] = lambda lens: None,
-    lit: Callable[[Light, tuple[Line, ...]], None] = lambda light, lines: None,
+    lit: Callable[[Light, tuple[Line, ...], int], None] = lambda light, lines, number: None,
     effort: Effort | None = None,
 ) -> Proof:
     """Check lens.step and lens.stl in `folder` against the design; ValueError if one of them cannot be read at all.
 
     With bstcad.runs.processes.submit OCC reads the STEP file in its own process, while this one reads its text and the
-    mesh.  `known` is called with the lens of the STEP file as soon as that is known, and `lit` with its light and the
-    lines of a spectrum.
+    mesh.  `known` is called with the lens of the STEP file as soon as that is known, and `lit` with its light on each
+    target, the lines of a spectrum there, and the number of the target.
     """
     effort = nominal.effort(effort)
-    effort = replace(effort, seed=effort.seed + VERIFY_SEED)
+    effort = replace(effort, seed=effort.seed + VERIFY_SEED, seconds=effort.seconds / len(nominal.goals))
     path = (folder / "lens.step").absolute()
     lens = submit("bstcad.verify.step_checks.lens", path, nominal.lens.index, nominal.lens.reflects)
     mount = nominal.mount
@@ -142,31 +179,22 @@ def verify(
     mesh = meshes.read_stl(folder / "lens.stl")
     sealed = Check.true("STL watertight, winding consistent", meshes.is_closed(mesh))
     return_freed()  # the texts: OCC holds more of it still
-    lens = _result(lens, path)
+    lens = _as_shaped(_result(lens, path), nominal.lens)
     whole = quadrature.of_lens(lens)  # not as it was stated
     as_made, of_aperture, why = (lens, (), "") if mount is None else _as_made(seen, lens, nominal, folder)
     known(as_made)
-    light = measure(
-        as_made,
-        nominal.channels,
-        nominal.screen,
-        nominal.target,
-        effort=effort,
-        ghost=nominal.ghost,
-        draw=nominal.draw,
-        whole=nominal.whole,
-    )
-    if not light.rrmsd >= 0:
-        name = "lens.step" if mount is None else "part.step"
-        raise ValueError(f"{name}: none of its light falls on the target; write it again, or check scene.toml")
-    lines = lines_apart(
-        as_made, nominal.channels, nominal.screen, target=nominal.target, n=max(LINE_TUBES, tubes_of(as_made))
-    )
-    lit(light, lines)
+    found = []
+    for number, goal in enumerate(nominal.goals):
+        found.append(_lit(as_made, nominal, goal, effort=effort))
+        lit(*found[-1], number)
+    (light, lines), *others = found
+    lights = (light, *(other for other, _ in others))
     cut = as_cut(lens, mount)
     shape = describe(cut, effort.places) | {"volume": whole.volume}
-    stability = _stability(as_made, nominal, light, shape)
+    stability = _stability(as_made, nominal, lights, shape)
     machined, at_bounds = of_bounds(cut, nominal.blank, shape)
+    meets = "meets the mirror" if lens.reflects else "enters the lens"
+    goals = [(goal, each, goal.suffix) for goal, each in zip(nominal.goals, lights, strict=True)]
     margin = math.nan if stability["tir_margin_deg"] is None else stability["tir_margin_deg"]
     checks = (
         *text_checks.of_lens(text, nominal.lens),
@@ -177,19 +205,45 @@ def verify(
         *of_aperture,
         *machined,
         _ripple(shape, max(lens.back.shape)),
+        *([_ripple(shape, max(lens.front.shape), "front")] if lens.shapes_front else []),
         sealed,
         *_facets(mesh, lens, shape["volume"], nominal),
-        _picture(nominal.stored_target, nominal.target),
-        *_because(why, _of_light(light, nominal.accept, "meets the mirror" if lens.reflects else "enters the lens")),
-        *([] if light.leak is None else [Check.at_most(DARK, light.leak.share, nominal.accept.leak)]),
+        *(_picture(goal) for goal, _, _ in goals),
+        *(c for _, each, of in goals for c in _because(why, _of_light(each, nominal.accept, meets, of=of))),
+        *(Check.at_most(f"{DARK}{of}", each.leak.share, nominal.accept.leak) for _, each, of in goals if each.leak),
         *([] if lens.reflects else [Check.at_least(TOTAL_REFLECTION, margin, None, "deg")]),
         Check.at_most("values that are not finite", stability["non_finite"], 0),
     )
     return Proof(
         checks, as_made, light, shape, stability=stability,
         blur=blur(nominal.channels, as_made, nominal.screen, nominal.target), lines=lines,
-        at_bounds=at_bounds or None,
+        at_bounds=at_bounds or None, further=lights[1:],
     )  # fmt: skip
+
+
+def _lit(lens: Lens, nominal: Nominal, goal: Goal, effort: Effort) -> tuple[Light, tuple[Line, ...]]:
+    """The light that the lens throws on a target, and that of each line of a spectrum; ValueError if there is none."""
+    light = measure(
+        lens,
+        nominal.channels,
+        goal.screen,
+        goal.target,
+        effort=effort,
+        ghost=nominal.ghost,
+        draw=nominal.draw,
+        whole=goal.whole,
+    )
+    if not light.rrmsd >= 0:
+        name, on = "lens.step" if nominal.mount is None else "part.step", "the target"
+        on = goal.key if goal.suffix else on
+        raise ValueError(f"{name}: none of its light falls on {on}; write it again, or check scene.toml")
+    n = max(LINE_TUBES, tubes_of(lens))
+    return light, lines_apart(lens, nominal.channels, goal.screen, target=goal.target, n=n)
+
+
+def _as_shaped(lens: Lens, designed: Lens) -> Lens:
+    """The re-read lens with what no file says: which faces tailoring shaped, if its front is a net as well."""
+    return replace(lens, shaped=designed.shaped if lens.front.is_net else None)
 
 
 def _as_made(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> tuple[Lens, Sequence[Check], str]:
@@ -199,7 +253,7 @@ def _as_made(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> tuple[
     """
     designed, flange = nominal.lens, nominal.mount.flange
     try:
-        lens = replace(_result(read, folder / "part.step"), outline=bare.outline)
+        lens = replace(_as_shaped(_result(read, folder / "part.step"), designed), outline=bare.outline)
         checks = [_aperture(*each) for each in zip(("front", "back"), lens.apertures, designed.apertures, strict=True)]
     except ValueError as error:
         lens = replace(bare, clear=designed.clear)
@@ -231,15 +285,18 @@ def _aperture(name: str, measured: Outline, designed: Outline) -> Check:
     return Check.at_most(name, off, APERTURE_DIFFERENCE, unit="mm", where=where)
 
 
-def _stability(lens: Lens, nominal: Nominal, light: Light, shape: dict) -> dict[str, float | int | None]:
+def _stability(
+    lens: Lens, nominal: Nominal, lights: Sequence[Light], shape: dict
+) -> dict[str, float | int | None]:  # fmt: skip
     """How far the lens is from where its numbers would go wrong; angles in degrees, curvature in 1/mm."""
     worst = margins(nominal.channels, lens, nominal.screen, nominal.seed + VERIFY_SEED)
-    radii = [shape[key] for key in ("radius_min_concave", "radius_min_convex") if shape[key]]
+    least = (f"{face}radius_min_{kind}" for face in ("", "front_") for kind in ("concave", "convex"))
+    radii = [shape[key] for key in least if shape.get(key)]
     return {
         "tir_margin_deg": worst.tir_margin_deg,
         "newton_slope_min": worst.newton_slope_min,
         "curvature_max": 1 / min(radii) if radii else 0.0,
-        "non_finite": worst.non_finite + int((~np.isfinite(light.picture)).sum()),
+        "non_finite": worst.non_finite + sum(int((~np.isfinite(light.picture)).sum()) for light in lights),
     }
 
 
@@ -258,40 +315,48 @@ def _result(read: Future, path: Path, again: Callable[[], Future] | None = None)
         raise ValueError(f"{path.name}: OCC broke down over it, the file is damaged; write it again") from error
 
 
-def _ripple(shape: dict[str, float | None], m: int) -> Check:
+def _ripple(shape: dict[str, float | None], m: int, face: str = "back") -> Check:
     """The spectrum of the net has to fall off: control points that go up and down in turn are no lens surface.
 
     A crease (slope ∝ 1 / k) gives 0.7 to 1, white noise of the slopes 4, of the heights 16.
     """
-    top, below = shape["slope_energy_top_octave"], shape["slope_energy_octave_below"]
+    front = face == "front"
+    keys = (f"{'front_' * front}slope_energy_{octave}" for octave in ("top_octave", "octave_below"))
+    top, below = (shape[key] for key in keys)
     ratio = top / below if below > 0 else 0.0
     limit = RIPPLE if m >= OCTAVES else None  # a coarse net has too few octaves to say
-    return Check.at_most("ripple: slope energy of the net's highest octave over the one below", ratio, limit)
+    name = f"ripple{' of the front' if front else ''}: slope energy of the net's highest octave over the one below"
+    return Check.at_most(name, ratio, limit)
 
 
 def of_bounds(
     lens: Lens, asked: LensBlank | None, shape: Mapping[str, float | None]
 ) -> tuple[list[Check], dict[str, float]]:
-    """Checks of the bounds that a scene puts on the back, and the share of the back at each on curvature and slope.
+    """Checks of the bounds that a scene puts on its tailored faces, and the share of these at each bound on bending.
 
-    The bounds are tool_radius, max_slope and the thicknesses of [lens]; shape: of the re-read lens.
+    The bounds are tool_radius, max_slope and the thicknesses of [lens]; shape: of the re-read lens.  A front that is
+    tailored is held to them as the back is, seen from outside: a tool has to fit into its valleys.
     """
     if asked is None:
         return [], {}
-    checks, at_bounds = [], {}
+    checks, shares = [], {}
     radius, degrees, kind = asked.tool_radius, asked.max_slope, "convex" if asked.mould else "concave"
     if radius is not None or degrees is not None:
-        bending = survey(lens, **{kind: radius}, slope=degrees)
-        if radius is not None:
-            met = getattr(bending, kind)
-            checks.append(
-                Check.at_least(f"smallest {kind} radius{GRID}", met.largest, radius, unit="mm", where=met.where)
-            )
-            at_bounds["tool_radius"] = met.at_bound
-        if degrees is not None:
-            met = bending.slope
-            checks.append(Check.at_most(f"steepest slope{GRID}", met.largest, degrees, unit="deg", where=met.where))
-            at_bounds["max_slope"] = met.at_bound
+        surveys = [(survey, "")] + ([(survey_front, " of the front")] if lens.shapes_front else [])
+        for surveyed, of in surveys:
+            bending = surveyed(lens, **{kind: radius}, slope=degrees)
+            if radius is not None:
+                met = getattr(bending, kind)
+                checks.append(
+                    Check.at_least(f"smallest {kind} radius{of}{GRID}", met.largest, radius, unit="mm", where=met.where)
+                )
+                shares.setdefault("tool_radius", []).append(met.at_bound)
+            if degrees is not None:
+                met = bending.slope
+                name = f"steepest slope{of}{GRID}"
+                checks.append(Check.at_most(name, met.largest, degrees, unit="deg", where=met.where))
+                shares.setdefault("max_slope", []).append(met.at_bound)
+    at_bounds = {key: math.fsum(each) / len(each) for key, each in shares.items()}
     for name, judge, key, limit in (
         ("smallest thickness", Check.at_least, "thickness_min", asked.min_thickness),
         ("largest thickness", Check.at_most, "thickness_max", asked.max_thickness),
@@ -302,13 +367,13 @@ def of_bounds(
     return checks, at_bounds
 
 
-def _picture(stored: np.ndarray, target: np.ndarray) -> Check:
+def _picture(goal: Goal) -> Check:
     """The target that travels with a design against the picture of its scene."""
-    off = np.abs(stored - target)
+    off = np.abs(goal.stored_target - goal.target)
     row, column = np.unravel_index(np.argmax(off), off.shape)
-    name = "target in design.npz against the scene's, of its brightest pixel"
+    name = f"target in design.npz against the scene's, of its brightest pixel{goal.suffix}"
     where = f"pixel ({column}, {row}), counted from the upper left"
-    return Check.at_most(name, float(off.max() / target.max()), TARGET_DIFFERENCE, where=where)
+    return Check.at_most(name, float(off.max() / goal.target.max()), TARGET_DIFFERENCE, where=where)
 
 
 def _facets(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> list[Check]:
@@ -334,20 +399,23 @@ def _facets(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> l
     ]
 
 
-def _of_light(light: Light, accept: Accept, meets: str = "enters the lens") -> list[Check]:
-    """The irradiance through the re-read geometry, by rays, and by ray tubes that share only the trace with them."""
+def _of_light(light: Light, accept: Accept, meets: str = "enters the lens", of: str = "") -> list[Check]:
+    """The irradiance through the re-read geometry, by rays, and by ray tubes that share only the trace with them.
+
+    of: which of several targets it falls on, as Goal.suffix has it.
+    """
     closure, tubes = abs(sum(light.flux.values()) - 1), light.witness
-    rrmsd, on_target = "RRMSD, box pixels, through the re-read STEP", f"light on the target, of what {meets}"
+    rrmsd, on_target = f"RRMSD, box pixels, through the re-read STEP{of}", f"light on the target, of what {meets}{of}"
     checks = [
         Check.at_most(*_asked(rrmsd, light.rrmsd, accept.rrmsd, DEFAULT_RRMSD_LIMIT)),
-        Check.at_most("standard error of that RRMSD, times five", RESOLVED * light.standard_error, light.rrmsd),
+        Check.at_most(f"standard error of that RRMSD, times five{of}", RESOLVED * light.standard_error, light.rrmsd),
         Check.at_least(*_asked(on_target, light.used, accept.light_on_target, DEFAULT_LIGHT_LIMIT)),
-        Check.at_least("efficiency", light.efficiency, accept.efficiency),
-        Check.at_most("flux ledger: distance of its sum from 1", closure, 1e-12),
+        Check.at_least(f"efficiency{of}", light.efficiency, accept.efficiency),
+        Check.at_most(f"flux ledger: distance of its sum from 1{of}", closure, 1e-12),
     ]
     if tubes is not None:  # which may be off by their own error: it is less than that of any lens for pictures
         limit = max(FAINT, min(light.rrmsd, tubes.rrmsd))
-        checks.insert(2, Check.at_most("picture by ray tubes, off the one by rays", tubes.off, limit))
+        checks.insert(2, Check.at_most(f"picture by ray tubes, off the one by rays{of}", tubes.off, limit))
     return checks
 
 

@@ -65,13 +65,14 @@ def lens(path: Path, index: float, reflects: bool = False) -> Lens:
 def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, ...]:
     """The checks of the solid in the STEP file of a design; ValueError if it holds none.
 
-    form: tolerance of the back face and of the front's vertex (mm); points: of the back at which it is compared.
+    form: tolerance of the tailored faces and of the front's vertex (mm); points: of a face at which it is compared.
     """
     reread = _read(path, _stamp(path))
     return (
         *_sound(reread.shape),
         *_edges(reread, nominal),
         *_form(reread, nominal.back, form, points),
+        *(_form(reread, nominal.front, form, points, of="front") if nominal.shapes_front else ()),
         *_front(reread.front, nominal, form),
     )
 
@@ -137,18 +138,24 @@ def _edges(reread: StepLens, lens: Lens, bare: bool = True) -> Iterator[Check]:
         yield Check.at_most("solid: edges off the wall of the lens", wall, BRIDGED, unit="mm", where=on_wall)
 
 
-def _form(reread: StepLens, back: BSplineSurface, tolerance: float, count: int) -> Iterator[Check]:
-    """Distances (mm) and angles between normals (rad) of the back at `count` Sobol points, evaluated by OCC."""
+def _form(
+    reread: StepLens, face: BSplineSurface, tolerance: float, count: int, *, of: str = "back"
+) -> Iterator[Check]:  # fmt: skip
+    """Distances (mm) and angles between normals (rad) of a face at `count` Sobol points, evaluated by OCC."""
+    which, turns = ("front", "the front's normals") if of == "front" else ("back", "the normals")
+    if of == "front" and not reread.front.is_net:
+        yield Check.true(f"form: re-read {which} face against the optimised one", False, "the file's front is no net")
+        return
     points = torch.quasirandom.SobolEngine(2, scramble=True, seed=1).draw(count, dtype=torch.float64)
-    x, y = (low + p * (high - low) for p, (low, high) in zip(points.T, (back.x, back.y), strict=True))
-    sampled, normals = step_reading.sample(reread, x.numpy(), y.numpy())
-    z, z_x, z_y = back.sag_and_slope(*(torch.from_numpy(sampled[:, i].copy()) for i in (0, 1)))
+    x, y = (low + p * (high - low) for p, (low, high) in zip(points.T, (face.x, face.y), strict=True))
+    sampled, normals = step_reading.sample(reread, x.numpy(), y.numpy(), of=of)
+    z, z_x, z_y = face.sag_and_slope(*(torch.from_numpy(sampled[:, i].copy()) for i in (0, 1)))
     wanted = torch.nn.functional.normalize(torch.stack([-z_x, -z_y, torch.ones_like(z)], dim=1), dim=1).numpy()
     off = np.abs(sampled - torch.stack([x, y, z], dim=1).numpy()).max(axis=1)
     turned = np.linalg.norm(normals - wanted, axis=1)
     for name, error, limit, unit in (
-        ("form: re-read back face against the optimised one", off, tolerance, "mm"),
-        ("form: direction of the normals", turned, NORMAL, "rad"),
+        (f"form: re-read {which} face against the optimised one", off, tolerance, "mm"),
+        (f"form: direction of {turns}", turned, NORMAL, "rad"),
     ):
         k = int(error.argmax())
         yield Check.at_most(name, float(error[k]), limit, unit, where=f"at ({x[k]:.4g}, {y[k]:.4g}) mm")
@@ -157,7 +164,7 @@ def _form(reread: StepLens, back: BSplineSurface, tolerance: float, count: int) 
 def _front(reread: Surface, lens: Lens, tolerance: float) -> Iterator[Check]:
     """The re-read front against the designed one."""
     wanted, difference = lens.front, "difference from the designed one"
-    yield Check.at_most(f"form: vertex of the front, {difference}", abs(reread.z - wanted.z), tolerance, "mm")
+    yield Check.at_most(f"form: vertex of the front, {difference}", abs(reread.z - lens.front_vertex), tolerance, "mm")
     if wanted.is_net:
         net = reread.control_points() if reread.is_net else np.empty(0)
         yield net_check(f"form: control points of the front, {difference}", net, wanted.control_points())
@@ -183,7 +190,7 @@ def lens_of_part(folder: Path, designed: Lens, mount: Mount) -> Lens:
     path = folder / PART
     if not path.exists():
         raise ValueError(f"{PART}: is not there")
-    reread, up = step_reading.read(path), mount.origin(designed.front.z)
+    reread, up = step_reading.read(path), mount.origin(designed.front_vertex)
     front, back = (face.moved(face.z + up) for face in (reread.front, reread.back))
     return replace(designed, front=front, back=back, clear=reread.clear, losses=None)
 
@@ -202,7 +209,12 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
         text, solid = part21.read_lens(path), step_reading.solid(path)
     except ValueError as error:
         return (Check.true(f"{PART}: can be read", False, str(error)),)
-    net = lens.back.control_points() - np.array([0.0, 0.0, mount.origin(lens.front.z)])
+    down = np.array([0.0, 0.0, mount.origin(lens.front_vertex)])
+    net = lens.back.control_points() - down
+    of_front = ()
+    if lens.shapes_front:
+        name, held = f"{PART}: control points of the front", text_checks.net_of_front(text)
+        of_front = (net_check(name, held, lens.front.control_points() - down),)
     properties = solid_properties.of_solid(solid) if text.properties.of_shape else None
     if text.properties.of_shape and properties is None:  # of a damaged face, which other checks find
         stated = [Check.true(f"{PART}: area, volume and centroid can be found", False, "a face is of an unknown kind")]
@@ -212,6 +224,7 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
     return (
         *text_checks.structure(text, lens.back.shape, PART),
         net_check(f"{PART}: control points", text.surface.control_points, net),
+        *of_front,
         *_sound(solid, of_part=True),
         Check.true(edges, False, why) if wanted is None else _edges_moved(edges, wanted, solid),
         *stated,

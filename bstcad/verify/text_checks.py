@@ -32,10 +32,15 @@ def of_lens(text: StepText, lens: Lens) -> list[Check]:
     """The STEP file as text, held to the design."""
     checks = structure(text, lens.back.shape)
     checks.append(net_check(f"{TEXT}: control points", text.surface.control_points, lens.back.control_points()))
-    if text.front is not None and lens.front.is_net:
+    if lens.front.is_net and (text.front is not None or lens.shapes_front):
         name = f"{TEXT}: control points of the front"
-        checks.append(net_check(name, text.front.control_points, lens.front.control_points()))
+        checks.append(net_check(name, net_of_front(text), lens.front.control_points()))
     return checks
+
+
+def net_of_front(text: StepText) -> np.ndarray:
+    """The control points (m, n, 3) of the front that a file holds, in mm; none of a front that is no net."""
+    return np.empty((0, 0, 3)) if text.front is None else text.front.control_points
 
 
 def structure(text: StepText, shape: tuple[int, int], name: str = TEXT) -> list[Check]:

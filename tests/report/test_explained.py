@@ -41,6 +41,10 @@ WORDS = {  # in a function, what a variable part of a name may stand for
     ("_absent", "', '.join(missing)"): ("centroid", "area, volume"),
     ("_aperture", "name"): ("front", "back"),
     ("_of_light", "meets"): ("enters the lens", "meets the mirror"),
+    ("_of_light", "of"): ("", ", target[1]"),
+    ("_picture", "goal.suffix"): ("", ", target[1]"),
+    ("verify", "of"): ("", ", target[1]"),
+    ("of_bounds", "of"): ("", " of the front"),
     ("compare", "name"): ("batoid", "mitsuba"),
 }
 
@@ -159,9 +163,12 @@ REMARKS = [
      "thinnest place keeps 0.6 mm.", "back-moved"),
     ("The lens is 4.8 mm thick on the axis instead of 5 mm: tailoring moved the vertex of the back by −0.2 mm along z.",
      "vertex-moved"),
+    ("The lens is 4.8 mm thick on the axis instead of 5 mm: tailoring moved the vertices of its faces by −0.2 mm along "
+     "z.", "vertex-moved"),
     ("The mirror is 0.25 mm thin where 0.5 mm was asked.", "too-thin"),
     ("The accuracy of 0.02 that was asked is not reached: the RRMSD is 0.03.", "accuracy"),
     ("The RRMSD is 0.234 where 0.1 was asked.", "rrmsd"),
+    ("The RRMSD of target[1] is 0.234 where 0.1 was asked.", "rrmsd"),
     ("The source is too large for the picture: the finest detail on the target is 46 mm wide (source.divergence = 0.53 "
      "degrees), and the picture with no finer detail has an RRMSD of 0.54 where 0.1 is allowed; with the target "
      "250 mm instead of 5\u202f000 mm from the lens it is 2.4 mm.", "source-too-large"),
@@ -171,6 +178,8 @@ REMARKS = [
      "one run can measure; a design without them tells all.", "bounds"),
     ("The back was tailored within bounds (lens.max_slope = 36 degrees); 1.2 % of it is within 3 % of lens.max_slope. "
      "What they cost was not measured in this run.", "bounds"),
+    ("Both faces were tailored within bounds (lens.max_slope = 36 degrees); 1.2 % of them is within 3 % of "
+     "lens.max_slope. What they cost was not measured in this run.", "bounds"),
     ("The time limit of 20.0 s was missed by 6.8 s: loading, stage 1 and writing run whole, and this machine took that "
      "long for them.", "time-limit"),
     ("32.1 % of the target, with 30.6 % of its light, cannot be lit: a face of index 1.494 turns light by less than 48 "
@@ -179,6 +188,8 @@ REMARKS = [
      "mirror is for the rest; against the whole picture its RRMSD is 0.1.", "unreachable"),
     ("0.80 % of the lit part of the target is left dark, with less than 10 % of what was asked there; the largest "
      "patch lies at x = -152 to -144 mm, y = -40 to 120 mm.", "dark"),
+    ("0.80 % of the lit part of target[1] is left dark, with less than 10 % of what was asked there; the largest "
+     "patch lies at x = -152 to -144 mm, y = -40 to 120 mm.", "dark"),
     ("The mount cuts away 30.0 % of the light that the uncut lens would let through.", "mount-cut"),
     ("The mount cuts away 30.0 % of the light that the uncut mirror would reflect.", "mount-cut"),
     ("47.0 % of the light that the source sends out misses the lens.", "misses"),
@@ -186,6 +197,7 @@ REMARKS = [
     ("4.0 % of the light that enters the lens is lost to total internal reflection.", "total-reflection"),
     ("20.0 % of the light that enters the lens leaves through the sides, before it meets the back.", "sides"),
     ("3.0 % of the light that leaves the lens falls outside the target.", "outside"),
+    ("3.0 % of the light that leaves the lens falls outside target[1].", "outside"),
     ('Left out: Fresnel reflection would change the picture by an RRMSD of 0.031, more than the stated 0.03; '
      '[[effects]] kind = "fresnel" in the scene simulates it.', "left-out"),
     ("Left out: ghosts, light reflected twice inside the lens, roughly, since it may gather to a spot, would change "
@@ -198,10 +210,13 @@ REMARKS = [
      "much, that light is lost.", "near-total-reflection"),
     ("The darkest parts are lifted: pixels that ask for less than 1 % of the mean irradiance get 20.0 % of it, and in "
      "all 10.0 % of the light on the target more than they ask for.", "lifted"),
+    ("The darkest parts of target[1] are lifted: pixels that ask for less than 1 % of the mean irradiance get 20.0 % "
+     "of it, and in all 10.0 % of the light on target[1] more than they ask for.", "lifted"),
     ("12.5 % of the light of the target would need a back steeper than 70°, up to 97°, which overhangs: a height over "
      "a plane carries no more, and that light is sent elsewhere.", "too-steep"),
     ("5.0 % of the light that the source sends out meets the underside beside the front.", "underside"),
     ("The back is as steep as 75°: hardly a tool reaches that.", "steep"),
+    ("The front is as steep as 75°: hardly a tool reaches that.", "steep"),
     ("The facets of lens.stl and lens.3mf lie within 1.75 µm of the lens, not within 1 µm: that would take more "
      "triangles than a file should have; lens.step is exact.", "facets"),
     ("Tailoring ended when its time was up, before it had gained all it could.", "time-up"),
