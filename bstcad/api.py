@@ -82,7 +82,8 @@ def open(folder: str | os.PathLike[str]) -> Design:
         contents = record.read(folder / "report.json")
     except ValueError:  # it is gone or damaged; verify writes it anew
         return Design(made, None, folder)
-    return Design(made, Report(contents, folders.read_irradiance(folder, made.scene)), folder)
+    irradiance, *further = folders.read_irradiances(folder, made.scene)
+    return Design(made, Report(contents, irradiance, further_irradiance=tuple(further)), folder)
 
 
 class Design:
@@ -387,10 +388,27 @@ def _fitting(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
     for axis, own, theirs in (("x", lens.back.x, net.x), ("y", lens.back.y, net.y)):
         if not np.allclose(own, theirs, rtol=0, atol=SAME * (theirs[1] - theirs[0])):
             _check_same(f"extent of its net along {axis} (mm)", own, theirs)
-    if not same_front(lens.front, front):
+    if scene.lens.front.shaped and lens.front.is_net:
+        scene, lens = _fitting_front(lens, scene)
+    elif not same_front(lens.front, front):
         scene = scene.changed({"lens.front": lens.front})
         lens = lens.with_front(scene.lens.front.surface)  # of a surface of one's own the net that stands for it
-    return scene, replace(lens, back=replace(lens.back, x=net.x, y=net.y), index=scene.index)
+    back = replace(lens.back, x=net.x, y=net.y)
+    return scene, replace(lens, back=back, index=scene.index, shaped=scene.lens.shaped)
+
+
+def _fitting_front(lens: Lens, scene: Scene) -> tuple[Scene, Lens]:
+    """A lens whose front stays one that is tailored, and the scene with its number of points; SceneError as below."""
+    front, points = lens.front, lens.front.shape
+    if not bool(torch.isfinite(front.heights).all()) or not math.isfinite(front.z):
+        raise SceneError("with_lens: heights of its front are not finite; give numbers in mm")
+    if points != both(scene.lens.nets()[1]):
+        scene = scene.changed({"lens.front.control_points": plain(points), "lens.front.file": None})
+    net = scene.flat_lens(scene.lens.back.net).front
+    for axis, own, theirs in (("x", front.x, net.x), ("y", front.y, net.y)):
+        if not np.allclose(own, theirs, rtol=0, atol=SAME * (theirs[1] - theirs[0])):
+            _check_same(f"extent of its front's net along {axis} (mm)", own, theirs)
+    return scene, lens.with_front(replace(front, x=net.x, y=net.y))
 
 
 def _check_same(name: str, own: Any, theirs: Any) -> None:

@@ -98,6 +98,8 @@ def _files(
                 yield "zemax-front.dat", zemax_grid(lens, lens.front, points)
         case "turning":
             yield "turning.csv", turning_cloud(lens, (points + 1) // 2)
+            if lens.front.is_net:
+                yield "turning-front.csv", turning_cloud(lens, (points + 1) // 2, lens.front)
         case "dxf":
             yield "outline.dxf", dxf(lens.outline, mount, label)
         case "svg":
@@ -123,8 +125,10 @@ def points_table(lens: Lens, face: Surface, points: int) -> str:
     return _csv(x_mm=x, y_mm=y, z_mm=z, normal_x=-z_x / length, normal_y=-z_y / length, normal_z=1 / length)
 
 
-def turning_cloud(lens: Lens, points: int) -> str:
-    """CSV for diamond turning with a slow tool: radius, angle from +x towards +y, height of the back over its vertex.
+def turning_cloud(lens: Lens, points: int, face: Surface | None = None) -> str:
+    """CSV for diamond turning with a slow tool: radius, angle from +x towards +y, height of a face over its vertex.
+
+    face: None is the back.  Heights are along +z, so that those of the front count into the glass.
 
     Rings of equal spacing, `points` from the axis to the farthest point of the outline, each with as many angles as
     the outermost ring needs for that spacing; points outside the outline are left out.  The tool's radius is not in it.
@@ -134,7 +138,8 @@ def turning_cloud(lens: Lens, points: int) -> str:
     radius, angle = (p.ravel() for p in np.meshgrid(ring, np.arange(count) * 360.0 / count, indexing="ij"))
     x, y = radius * np.cos(np.radians(angle)), radius * np.sin(np.radians(angle))
     inside = lens.outline.contains(*(torch.from_numpy(p * (1 - 1e-12)) for p in (x, y))).numpy()  # and on its rim
-    height = sag(lens.back, x[inside], y[inside]) - sag(lens.back, 0.0, 0.0)
+    face = face or lens.back
+    height = sag(face, x[inside], y[inside]) - sag(face, 0.0, 0.0)
     return _csv(radius_mm=radius[inside], angle_deg=angle[inside], sag_mm=height)
 
 

@@ -109,6 +109,7 @@ class Tolerances:
     sensitivities: Annotated[tuple[Sensitivity, ...], Field(max_length=1000)]  # the worst first
     worst: Annotated[tuple[Trial, ...], Field(max_length=100)]  # of the fully traced trials
     inverse: Inverse | None = None  # None: it was not asked for
+    target: str | None = None  # which of several targets was studied, by its key; None: there is one
 
     def facts(self) -> dict[str, Any]:
         """The entries of tolerance.json as plain values, in their order."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +59,8 @@ def tolerance(
             pictures, limit, seed, light.rrmsd, linear=trials, full=full, progress=progress, spread=spread or here
         )
         record = _record(study, wanted, name=scene.name, grade=_grade(scene, grade), tubes=tubes)
+        if len(scene.targets) > 1:
+            record = replace(record, target=scene.target_keys[0])
         progress("report", 0, 1, "")
         tolerances.write(record, amended / "tolerance.json")
         drawn = _drawn(scene, pictures, study)

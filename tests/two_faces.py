@@ -1,0 +1,48 @@
+"""A lens with two bent nets, by hand, for two targets: no solver is needed to prove and to report it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from bstcad.folder import Made
+from bstcad.report.record import BY_HAND, Making
+from bstcad.scene.scene import load
+
+DISK = "templates/disk.toml"
+CHANGES = {
+    "name": "two-faces", "title": "Two faces, two targets", "source": {
+        "kind": "collimated", "aperture": {"shape": "circle", "radius": 3.5}, "wavelength": 633.0,
+    },
+    "lens.outline": {"shape": "rectangle", "width": 8.0, "height": 8.0},
+    "lens.front": {"kind": "bspline", "z": 8.0, "optimise": True, "control_points": 33},
+    "lens.back": {"kind": "bspline", "z": 14.0, "control_points": 65},
+    "lens.tool_radius": 0.5, "lens.max_slope": 60.0,
+    "tailoring": {"quality": "draft"}, "accept": {"rrmsd": 3.0},
+    "target": [
+        {"z": 60.0, "x": [-5.0, 5.0], "y": [-5.0, 5.0], "pixels": 16, "uniform": True,
+         "outline": {"shape": "circle", "radius": 4.0}},
+        {"z": 150.0, "x": [-8.0, 8.0], "y": [-6.0, 6.0], "pixels": [24, 18], "uniform": True, "weight": 2.5},
+    ],
+}  # fmt: skip
+
+
+def bent(net, size, along=(2.0, 3.0)):
+    """The net with waves of this height (mm), which do not vanish on the axis."""
+    sides = zip((net.x, net.y), net.shape, strict=True)
+    x, y = (torch.linspace(*ends, count, dtype=torch.float64) for ends, count in sides)
+    waves = torch.cos(x / along[0])[:, None] * torch.cos(y / along[1])
+    return replace(net, heights=size * waves)
+
+
+def scene_of(**changes):
+    """The scene of both targets."""
+    return load(DISK).changed(CHANGES | changes)
+
+
+def made_of(scene, front=0.06, back=-0.08):
+    """The lens by hand; front, back: height of the waves of each face (mm)."""
+    flat = scene.flat_lens(scene.lens.back.net)
+    lens = replace(flat, front=bent(flat.front, front), back=bent(flat.back, back, (3.0, 2.0)))
+    return Made(scene, scene.as_mounted(lens), scene.target.irradiance(), Making(stopped=BY_HAND))
