@@ -356,12 +356,15 @@ def _witness(lens, channels, screen: Screen, wanted: Tensor, rays: _Rays, ghost:
 
 
 def tubes_of(lens: Lens, pixels: int = 0) -> int:
-    """Tubes a side that follow the nets: two a control point, or more where they have few.
+    """Tubes a side that follow the nets: two a control point and net, or more where they have few.
+
+    Light that a first net has bent changes within the cells of the next one: two nets take twice as many.
 
     Where a cell of the net lights more than a pixel, its light changes from pixel to pixel: two tubes a pixel, four a
     cell at most.  A little more than two: lines of the net and corners of tubes do not coincide.
     """
-    return max(*(2 * max(net.side, min(pixels, 2 * net.side)) + 5 for net in lens.nets), LEAST)
+    each = 2 * len(lens.nets)
+    return max(*(each * max(net.side, min(pixels, 2 * net.side)) + 5 for net in lens.nets), LEAST)
 
 
 @dataclass(frozen=True)
