@@ -36,7 +36,7 @@ from bstcad.optics.measure import FULL, Effort, Light, Line
 from bstcad.pipeline import Saved, design, purpose
 from bstcad.report import data_sheet, exports, prescription, record, rendering, report, tolerances
 from bstcad.report.data_sheet import Sheet
-from bstcad.report.figure_jobs import NoPictures, Pictures, draw_convergence, draw_light, light_path_of
+from bstcad.report.figure_jobs import NoPictures, Pictures, draw_convergence, draw_light, draw_wavefront, light_path_of
 from bstcad.report.light_figures import draw_judges, draw_part
 from bstcad.report.prescription import SHEET, Order
 from bstcad.report.record import Contents, Examined, LeftOut, Report, Stage, contents_of, with_part
@@ -220,6 +220,8 @@ def _proof(
         drawn.begin(draw_light, made.targets[number], light, lines, number=number)
 
     proof = checks.verify(folder, nominal, processes.submit, known=drawn.lens, lit=draw, effort=effort)
+    if proof.wavefront is not None:
+        drawn.begin(draw_wavefront, proof.wavefront)
     added = (check for of_script in additions.checks for check in of_script(proof, folder))
     proof = replace(proof, checks=(*proof.checks, *added))
     progress("verify", 1, 1, "RRMSD " + ", ".join(f"{light.rrmsd:.4f}" for light in proof.lights))

@@ -520,6 +520,7 @@ def nominal(
         accuracy=ROUGH if scene.tailoring.quality == "draft" else FULL.accuracy,
         weight=scene.target.weight,
         further=tuple(_goals(scene, further)),
+        wave=scene.wavefront,
     )
 
 

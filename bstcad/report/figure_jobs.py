@@ -23,6 +23,7 @@ from bstcad.optics.measure import Light, Line
 from bstcad.optics.rays import TiltedPlane
 from bstcad.optics.sources import Source
 from bstcad.optics.surfaces import Surface
+from bstcad.optics.wavefront_error import WavefrontError
 from bstcad.report import data_sheet, light_figures, rendering
 from bstcad.report.data_sheet import Sheet
 from bstcad.report.drawing import (
@@ -41,6 +42,7 @@ from bstcad.report.light_figures import View, plain_ticks
 from bstcad.report.record import Contents, Point, Stage
 from bstcad.report.rendering import LightPath
 from bstcad.report.units import number, turned
+from bstcad.report.wavefront_figure import wavefront_map
 from bstcad.scene.scene import Scene
 from bstcad.scene.target import numbered
 
@@ -141,6 +143,11 @@ def draw_lens(source: Source, lens: Lens, screens: Sequence[Screen], view: View)
 def draw_transport(source: Source, lens: Lens, screen: Screen, view: View) -> Pngs:
     """The map of the light from the source to a screen."""
     return {numbered("transport", view.number): png(transport_map(*ray_map(source, lens, screen.plane), view))}
+
+
+def draw_wavefront(error: WavefrontError, view: View) -> Pngs:
+    """The map of a wavefront error."""
+    return {"wavefront": png(wavefront_map(error))}
 
 
 def draw_light(target: np.ndarray, light: Light, lines: Sequence[Line], view: View) -> Pngs:

@@ -29,6 +29,7 @@ from bstcad.measured.form_error import MAP
 from bstcad.measured.made_part import MadePart
 from bstcad.optics.lens import Lens
 from bstcad.optics.reach import unreached
+from bstcad.optics.wavefront_error import WavefrontError
 from bstcad.report.light_figures import rrmsd
 from bstcad.report.prescription import Order, prescription
 from bstcad.report.units import DIGITS, Rows, number, paragraphs, percent, tables
@@ -120,6 +121,31 @@ class TargetFigures:
     efficiency: Share  # flux on the target over flux that leaves the back face
     leak: Share | None  # as in Contents
     contrast: Size | None
+
+
+@dataclass(frozen=True)
+class WavefrontFigures:
+    """The wavefront behind the lens against the one asked for (wavefront_error.py); waves are of `wavelength`."""
+
+    z: float  # mm, of the plane on which it is measured
+    wavelength: Size  # nm
+    rms: Size  # waves, piston and tilt removed
+    pv: Size  # waves, piston and tilt removed
+    rms_with_tilt: Size  # waves, piston alone removed
+    tilt: tuple[float, float]  # µrad towards +x and +y, that is removed
+    angle_rms: Size  # µrad between rays and wanted rays
+    angle_max: Size  # µrad
+    floor: Size  # waves that rounding may add
+    flux: Share  # of the source's, that is measured
+
+    @classmethod
+    def of(cls, error: WavefrontError) -> WavefrontFigures:
+        """Those of a measurement."""
+        return cls(
+            error.z, error.wavelength, error.without_tilt.rms, error.without_tilt.pv,
+            rms_with_tilt=error.without_piston.rms, tilt=error.tilt, angle_rms=error.angle_rms,
+            angle_max=error.angle_max, floor=error.floor, flux=error.flux,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -225,6 +251,7 @@ class Contents:
     order: Order | None = None  # for a machine shop
     # the light on each of several targets, the first one too, whose figures are those above; none: there is one target
     targets: tuple[TargetFigures, ...] = ()
+    wavefront: WavefrontFigures | None = None  # of the light; None: none was asked for
 
     @property
     def making(self) -> Making:
@@ -308,6 +335,7 @@ def contents_of(
         lines=tuple(Line(line.wavelength, line.share, rrmsd(target, line.picture)) for line in proof.lines),
         estimates=estimates,
         targets=tuple(_figures(scene, proof)) if proof.further else (),
+        wavefront=None if proof.wavefront is None else WavefrontFigures.of(proof.wavefront),
     )
     pictures = tuple(zip(further, (each.picture for each in proof.further), strict=True))
     return _remarked(contents, *remarks(contents, scene, target, light.picture, further=pictures))

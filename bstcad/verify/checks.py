@@ -47,6 +47,7 @@ from bstcad.verify.verdict import Check
 
 if TYPE_CHECKING:
     from bstcad.cad.solid_properties import WholePart  # which loads OCC
+    from bstcad.optics.wavefront import Wave
     from bstcad.optics.wavefront_error import WavefrontError
 
 VERTEX_ROUNDING = 2e-7  # of the largest coordinate: a vertex in float32 on a slope, off its face
@@ -63,6 +64,7 @@ CUT = "part.step: light that the mount cuts away, of what gets through the uncut
 APERTURE_DIFFERENCE = 1e-3  # mm; of a front whose edge is not level the scene knows its largest inset along the rim
 CUT_EXCUSE = 1e-3  # of the light: a mount that cuts away less is no reason for a picture that fails
 MAX_ON_FLANGE = 1e-3  # of the light that gets through the lens; no wall of a flange is to stand in the way of more
+FAINTEST = 1e-6  # waves; rounding of less than a tenth of that is none
 UNASKED = " (by default: none was asked)"
 GRID = ", on a grid four times finer than the net"
 
@@ -109,6 +111,7 @@ class Nominal:
     reachable: np.ndarray | None = None  # (rows, columns) which pixels those are
     weight: float = 1.0  # of the target, the first of several, among all goals
     further: tuple[Goal, ...] = ()  # the targets behind the first
+    wave: Wave | None = None  # that the light behind the lens shall be; None: any
 
     @property
     def goals(self) -> tuple[Goal, ...]:
@@ -189,6 +192,7 @@ def verify(
         lit(*found[-1], number)
     (light, lines), *others = found
     lights = (light, *(other for other, _ in others))
+    wavefront = None if nominal.wave is None else _wavefront(as_made, nominal)
     cut = as_cut(lens, mount)
     shape = describe(cut, effort.places) | {"volume": whole.volume}
     stability = _stability(as_made, nominal, lights, shape)
@@ -211,13 +215,14 @@ def verify(
         *(_picture(goal) for goal, _, _ in goals),
         *(c for _, each, of in goals for c in _because(why, _of_light(each, nominal.accept, meets, of=of))),
         *(Check.at_most(f"{DARK}{of}", each.leak.share, nominal.accept.leak) for _, each, of in goals if each.leak),
+        *([] if wavefront is None else _of_wavefront(wavefront, nominal.accept)),
         *([] if lens.reflects else [Check.at_least(TOTAL_REFLECTION, margin, None, "deg")]),
         Check.at_most("values that are not finite", stability["non_finite"], 0),
     )
     return Proof(
         checks, as_made, light, shape, stability=stability,
         blur=blur(nominal.channels, as_made, nominal.screen, nominal.target), lines=lines,
-        at_bounds=at_bounds or None, further=lights[1:],
+        at_bounds=at_bounds or None, further=lights[1:], wavefront=wavefront,
     )  # fmt: skip
 
 
@@ -239,6 +244,23 @@ def _lit(lens: Lens, nominal: Nominal, goal: Goal, effort: Effort) -> tuple[Ligh
         raise ValueError(f"{name}: none of its light falls on {on}; write it again, or check scene.toml")
     n = max(LINE_TUBES, tubes_of(lens))
     return light, lines_apart(lens, nominal.channels, goal.screen, target=goal.target, n=n)
+
+
+def _wavefront(lens: Lens, nominal: Nominal) -> WavefrontError:
+    """The wavefront behind the lens, at the line with most of the light."""
+    from bstcad.optics.wavefront_error import wavefront_error
+
+    heaviest = max(nominal.channels, key=lambda channel: channel.weight)
+    return wavefront_error(heaviest.source, heaviest.through(lens), nominal.wave)
+
+
+def _of_wavefront(error: WavefrontError, accept: Accept) -> list[Check]:
+    """Its RMS against the limit, and the floor of its own figure."""
+    rms = error.without_tilt.rms
+    return [
+        Check.at_most("wavefront error, RMS, piston and tilt removed", rms, accept.wavefront, unit="waves"),
+        Check.at_most("rounding in that RMS, times ten", 10 * error.floor, max(rms, FAINTEST), unit="waves"),
+    ]
 
 
 def _as_shaped(lens: Lens, designed: Lens) -> Lens:
