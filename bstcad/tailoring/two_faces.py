@@ -277,8 +277,8 @@ def _by_way_of_back(
     back, plane = replace(lens.interfaces[1], outline=lens.unbounded().outline, losses=()), screen.plane
     grid = face_grid(source, lens, window, SAMPLES)
     q = rays_at(grid, places or tuple(np.zeros_like(p.numpy()) for p in t))
-    start = _in_space(q)
-    b = start[:2].clone()
+    q = replace(q, flux=torch.ones_like(t[0]), status=torch.zeros(t[0].shape, dtype=torch.uint8), taken={})
+    b = q.position[:2].clone()
     for _ in range(CLOSING):
         miss = _landing(q, b, back, plane) - t
         step = NUDGE * (lens.back.z - lens.front.z)

@@ -1,0 +1,197 @@
+"""Two freeform faces and several goals: the merit's gradient, the light behind the lens, and small designs."""
+
+import numpy as np
+import pytest
+import torch
+
+import bstcad
+from bstcad import pipeline
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.channels import Channel
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.measure import rrmsd_by_rays
+from bstcad.optics.outlines import Rectangle
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Plane
+from bstcad.optics.tubes import collect
+from bstcad.optics.wavefront import PlaneWave, SphericalWave, ZernikeWave
+from bstcad.optics.wavefront_error import wavefront_error
+from bstcad.tailoring import light_behind
+from bstcad.tailoring.goals import Goal, JointMerit
+from bstcad.tailoring.merit import TubeMerit
+
+SQUARE, N = Rectangle(20.0, 20.0), 1.5
+BEAM = Collimated(aperture=Rectangle(16.0, 16.0), wavelength=600.0)
+NEAR, FAR = Screen(30.0, (-9.0, 9.0), (-9.0, 9.0), 24), Screen(60.0, (-9.0, 9.0), (-9.0, 9.0), 24)
+WAVES = {
+    "plane": PlaneWave(30.0), "sphere": SphericalWave((0.0, 0.0, 400.0), 30.0),
+    "zernike": ZernikeWave((0.0, 0.0, 0.0, 2.0, 1.0), 8.0, 30.0),
+}  # fmt: skip
+
+
+def net(z, seed, size=0.02, m=17):
+    heights = size * torch.randn((m, m), dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    return BSplineSurface(z, heights, (-14.0, 14.0), (-14.0, 14.0))
+
+
+def bumpy(m=17):
+    return Lens(net(0.0, 1, m=m), net(8.0, 2), SQUARE, N, shaped=(0, 1))
+
+
+def picture(seed):
+    light = 1.0 + np.random.default_rng(seed).random((24, 24))
+    return light / light.sum()
+
+
+def merit_of(lens, source=BEAM, wave=None, n=40, weights=(1.0, 2.0)):
+    goals = [Goal(s, picture(k), w) for k, (s, w) in enumerate(zip((NEAR, FAR), weights, strict=True))]
+    return JointMerit.of((Channel(source, N),), lens, n, goals, overshoot=0.03, wave=wave)
+
+
+@pytest.mark.parametrize("source", [BEAM, Point((0.5, 0.0, -300.0), half_angle=1.2, wavelength=600.0)])
+@pytest.mark.parametrize("wave", [None, *WAVES.values()], ids=["none", *WAVES])
+def test_the_gradient_is_that_of_differences(source, wave):
+    lens = bumpy(m=13)
+    merit = merit_of(lens, source, wave)
+    heights = [net.heights for net in lens.nets]
+
+    def value(h):
+        return merit(merit.landing(lens.with_heights(h)))[0]
+
+    leaves = [h.clone().requires_grad_() for h in heights]
+    gradients = torch.autograd.grad(value(leaves), leaves)
+    for seed in range(3):
+        generator = torch.Generator().manual_seed(seed)
+        way = [torch.randn(h.shape, dtype=h.dtype, generator=generator) for h in heights]
+        known = float(sum((g * w).sum() for g, w in zip(gradients, way, strict=True)))
+        step = 1e-7
+        there, back = (
+            float(value([h + sign * step * w for h, w in zip(heights, way, strict=True)])) for sign in (1, -1)
+        )
+        assert (there - back) / (2 * step) == pytest.approx(known, rel=3e-5)
+
+
+def test_one_goal_is_the_merit_of_one_target():
+    lens, channels = bumpy(), (Channel(BEAM, N),)
+    one = JointMerit.of(channels, lens, 40, [Goal(NEAR, picture(0), 5.0)], overshoot=0.03)
+    known = TubeMerit.of(channels, lens, 40, screen=NEAR, target=torch.from_numpy(picture(0)), overshoot=0.03)
+    for value, other in zip(one(one.landing(lens)), known(known.landing(lens)), strict=True):
+        assert float(value) == pytest.approx(float(other), rel=1e-12)
+
+
+def test_weights_count_by_their_proportion():
+    lens = bumpy()
+    values = [float(m(m.landing(lens))[0]) for m in (merit_of(lens), merit_of(lens, weights=(3.0, 6.0)))]
+    assert values[0] == pytest.approx(values[1], rel=1e-12)
+
+
+@pytest.mark.parametrize("name", WAVES)
+def test_the_waves_term_is_the_measured_error(name):
+    lens, wave = bumpy(), WAVES[name]
+    merit = merit_of(lens, wave=wave, n=256)
+    term = float(merit._of_wave(*merit.landing(lens)[0]))
+    assert term**0.5 == pytest.approx(wavefront_error(BEAM, lens, wave, 512).without_piston.rms, rel=0.01)
+
+
+# ---- the light behind the lens ---------------------------------------------------------------------------------------
+
+
+def far_picture(light, screen, far):
+    path = (far.z - light.place[2]) / light.direction[2]
+    there = torch.from_numpy(light.place[:2] + path * light.direction[:2])
+    return collect(far.pixels_of(there), torch.from_numpy(np.ascontiguousarray(light.picture[::-1].T)), far.shape)[0]
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_even_light_between_squares_is_affine(sign):
+    far = Screen(630.0, (-18.0, 18.0), (-18.0, 18.0), 24)  # far off: there the cost is nearly quadratic
+    even = np.full((24, 24), 1 / 576)
+    light = light_behind.between_targets((NEAR, even), (far, even), 64, parts=1, sign=sign)
+    x, y, _ = light.place
+    for place, across in ((x, light.direction[0]), (y, light.direction[1])):
+        assert np.abs(600.0 * across / light.direction[2] - (sign * 2 - 1) * place).max() < 0.1
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("tilt", [None, (10.0, -15.0)])
+def test_the_light_makes_the_far_picture(sign, tilt):
+    near = Screen(30.0, (-9.0, 9.0), (-9.0, 9.0), 64, tilt=tilt)
+    far = Screen(90.0, (-9.0, 9.0), (-9.0, 9.0), 64)
+    x, y = np.meshgrid(np.linspace(-1, 1, 64), np.linspace(-1, 1, 64))
+    first, second = (p / p.sum() for p in (1.5 + np.sin(3 * x), 1.5 + np.cos(4 * y + x)))
+    light = light_behind.between_targets((near, first), (far, second), 128, parts=1, sign=sign)
+    assert np.abs((light.direction**2).sum(0) - 1).max() < 1e-12
+    made = far_picture(light, near, far).numpy()
+    off = (made - second)[2:-2, 2:-2]  # light of the outermost cells lands a little inside or outside
+    assert np.sqrt((off**2).sum() / (second**2).sum()) < 0.05
+
+
+def test_a_spherical_wave_goes_through_its_focus():
+    light = light_behind.of_wave(NEAR, picture(0), WAVES["sphere"], wavelength=600.0, parts=2)
+    path = (400.0 - light.place[2]) / light.direction[2]
+    assert np.abs(light.place + path * light.direction - np.array([0.0, 0.0, 400.0]).reshape(3, 1, 1)).max() < 1e-9
+
+
+def test_crossings_before_the_target_are_removed():
+    near, far = Screen(60.0, (-9.0, 9.0), (-9.0, 9.0), 48), Screen(70.0, (-9.0, 9.0), (-9.0, 9.0), 48)
+    dark = np.full((48, 48), 0.02)
+    dark[:, :24] = 1.0
+    light = light_behind.between_targets((near, dark[:, ::-1] / dark.sum()), (far, dark / dark.sum()), 64, parts=1)
+    back = Plane(0.0)
+    assert light.crossed(back) > 0.05
+    assert light_behind.uncrossed(light, near, back, 64).crossed(back) < 1e-3
+    assert light_behind.uncrossed(light, near, Plane(59.9), 64) is light
+
+
+# ---- small designs ---------------------------------------------------------------------------------------------------
+
+TWO = {
+    "name": "two", "source": {"kind": "collimated", "wavelength": 600.0, "aperture": {"shape": "rectangle",
+    "width": 20.0, "height": 20.0}}, "lens": {"index": 1.5, "outline": {"shape": "rectangle", "width": 21.0,
+    "height": 21.0}, "front": {"kind": "bspline", "z": 0.0, "optimise": True, "control_points": 49},
+    "back": {"kind": "bspline", "z": 10.0, "control_points": 65}},
+    "target": {"z": 30.0, "x": [-10.0, 10.0], "y": [-10.0, 10.0], "pixels": 32, "uniform": True},
+    "tailoring": {"quality": "draft", "rays": 160, "stage2_iterations": 30, "transport_grid": 64},
+}  # fmt: skip
+
+
+def waves_of(phase):
+    x, y = np.meshgrid(np.linspace(-1, 1, 32), np.linspace(-1, 1, 32))
+    return 1.0 + 0.3 * np.sin(4 * x + phase) * np.cos(3 * y - phase)
+
+
+def scene_of(tmp_path, **more):
+    import tomli_w
+
+    path = tmp_path / "scene.toml"
+    path.write_text(tomli_w.dumps(TWO | more))
+    return bstcad.load(path)
+
+
+def test_two_pictures_are_met_together(tmp_path):
+    first = TWO["target"]
+    scene = scene_of(tmp_path, target=[first, first | {"z": 80.0}])
+    scene = scene.changed({"target[0].image": waves_of(0.0), "target[1].image": waves_of(1.5)})
+    said = []
+    made = pipeline.design(scene, progress=lambda *told: said.append(told[3]))
+    assert [net.shape for net in made.lens.nets] == [(49, 49), (65, 65)]
+    for target in scene.targets:
+        value = rrmsd_by_rays(made.lens, scene.channels(), target.screen, target=target.irradiance())
+        assert value < 0.03
+    assert any("convex solution" in text for text in said)
+
+
+def test_a_front_alone_makes_a_picture(tmp_path):
+    scene = scene_of(tmp_path, lens=TWO["lens"] | {"back": TWO["lens"]["back"] | {"optimise": False}})
+    scene = scene.changed({"target.image": waves_of(0.0), "target.z": 60.0})
+    made = pipeline.design(scene)
+    assert not made.lens.back.heights.any() and made.lens.freeform == (0,)
+    assert rrmsd_by_rays(made.lens, scene.channels(), scene.target.screen, target=scene.target.irradiance()) < 0.1
+
+
+def test_a_picture_with_parallel_light_behind_it(tmp_path):
+    scene = scene_of(tmp_path, wavefront={"kind": "plane", "z": 30.0}).changed({"target.image": waves_of(0.0)})
+    made = pipeline.design(scene)
+    assert rrmsd_by_rays(made.lens, scene.channels(), scene.target.screen, target=scene.target.irradiance()) < 0.05
+    assert wavefront_error(scene.source, made.lens, scene.wavefront).without_tilt.rms < 1.0
