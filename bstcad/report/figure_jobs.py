@@ -145,11 +145,6 @@ def draw_transport(source: Source, lens: Lens, screen: Screen, view: View) -> Pn
     return {numbered("transport", view.number): png(transport_map(*ray_map(source, lens, screen.plane), view))}
 
 
-def draw_wavefront(error: WavefrontError, view: View) -> Pngs:
-    """The map of a wavefront error."""
-    return {"wavefront": png(wavefront_map(error))}
-
-
 def draw_light(target: np.ndarray, light: Light, lines: Sequence[Line], view: View) -> Pngs:
     """The pictures of the light; one of the ghost and of the lines of a spectrum if there are any."""
     found = light.picture
@@ -162,6 +157,11 @@ def draw_light(target: np.ndarray, light: Light, lines: Sequence[Line], view: Vi
     if lines:
         pictures["lines"] = light_figures.lines_apart(target, found, lines, view)
     return {numbered(name, view.number): png(picture) for name, picture in pictures.items()}
+
+
+def draw_wavefront(error: WavefrontError, view: View) -> Pngs:
+    """The map of a wavefront error, which is of the lens and of no target."""
+    return {"wavefront": png(wavefront_map(error))}
 
 
 def draw_convergence(report: Contents, view: View) -> Pngs:

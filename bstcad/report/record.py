@@ -125,26 +125,27 @@ class TargetFigures:
 
 @dataclass(frozen=True)
 class WavefrontFigures:
-    """The wavefront behind the lens against the one asked for (wavefront_error.py); waves are of `wavelength`."""
+    """The wavefront behind the lens against the one asked for; waves are those of `wavelength` in air."""
 
-    z: float  # mm, of the plane on which it is measured
+    z: float  # mm, the plane on which both are compared
     wavelength: Size  # nm
-    rms: Size  # waves, piston and tilt removed
-    pv: Size  # waves, piston and tilt removed
+    rms: Size  # waves, each ray by its flux
+    pv: Size  # waves, greatest less least of all rays
     rms_with_tilt: Size  # waves, piston alone removed
-    tilt: tuple[float, float]  # µrad towards +x and +y, that is removed
-    angle_rms: Size  # µrad between rays and wanted rays
-    angle_max: Size  # µrad
-    floor: Size  # waves that rounding may add
-    flux: Share  # of the source's, that is measured
+    tilt_urad: tuple[float, float]  # removed; light that leans towards +x and towards +y of the wanted light
+    angle_rms_urad: Size  # between rays and wanted rays, each ray by its flux; tilt included
+    angle_max_urad: Size
+    floor: Size  # waves that rounding may add to the RMS
+    flux: Share  # of the source's flux, that is measured
+    removed: Literal["piston and tilt"] = "piston and tilt"  # before rms and pv
 
     @classmethod
     def of(cls, error: WavefrontError) -> WavefrontFigures:
-        """Those of a measurement."""
+        """Those of a measurement, whose flux is a sum over a grid: at the edge of a beam it may go beyond 1."""
         return cls(
             error.z, error.wavelength, error.without_tilt.rms, error.without_tilt.pv,
-            rms_with_tilt=error.without_piston.rms, tilt=error.tilt, angle_rms=error.angle_rms,
-            angle_max=error.angle_max, floor=error.floor, flux=error.flux,
+            rms_with_tilt=error.without_piston.rms, tilt_urad=error.tilt, angle_rms_urad=error.angle_rms,
+            angle_max_urad=error.angle_max, floor=error.floor, flux=min(error.flux, 1.0),
         )  # fmt: skip
 
 
@@ -251,7 +252,7 @@ class Contents:
     order: Order | None = None  # for a machine shop
     # the light on each of several targets, the first one too, whose figures are those above; none: there is one target
     targets: tuple[TargetFigures, ...] = ()
-    wavefront: WavefrontFigures | None = None  # of the light; None: none was asked for
+    wavefront: WavefrontFigures | None = None  # None: none is asked for, or no light comes to where it is stated
 
     @property
     def making(self) -> Making:
@@ -335,7 +336,7 @@ def contents_of(
         lines=tuple(Line(line.wavelength, line.share, rrmsd(target, line.picture)) for line in proof.lines),
         estimates=estimates,
         targets=tuple(_figures(scene, proof)) if proof.further else (),
-        wavefront=None if proof.wavefront is None else WavefrontFigures.of(proof.wavefront),
+        wavefront=proof.wavefront and WavefrontFigures.of(proof.wavefront),
     )
     pictures = tuple(zip(further, (each.picture for each in proof.further), strict=True))
     return _remarked(contents, *remarks(contents, scene, target, light.picture, further=pictures))

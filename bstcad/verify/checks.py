@@ -37,6 +37,8 @@ from bstcad.optics.measure import (
     tubes_of,
 )
 from bstcad.optics.outlines import Outline
+from bstcad.optics.wavefront import Wave
+from bstcad.optics.wavefront_error import WavefrontError, wavefront_error
 from bstcad.runs.processes import Submit, here, return_freed
 from bstcad.scene.blank import LensBlank
 from bstcad.scene.mount import Mount, Part, as_cut
@@ -47,8 +49,6 @@ from bstcad.verify.verdict import Check
 
 if TYPE_CHECKING:
     from bstcad.cad.solid_properties import WholePart  # which loads OCC
-    from bstcad.optics.wavefront import Wave
-    from bstcad.optics.wavefront_error import WavefrontError
 
 VERTEX_ROUNDING = 2e-7  # of the largest coordinate: a vertex in float32 on a slope, off its face
 VERIFY_SEED = 1_000_003  # added to the seed: rays that tailoring never saw
@@ -64,7 +64,8 @@ CUT = "part.step: light that the mount cuts away, of what gets through the uncut
 APERTURE_DIFFERENCE = 1e-3  # mm; of a front whose edge is not level the scene knows its largest inset along the rim
 CUT_EXCUSE = 1e-3  # of the light: a mount that cuts away less is no reason for a picture that fails
 MAX_ON_FLANGE = 1e-3  # of the light that gets through the lens; no wall of a flange is to stand in the way of more
-FAINTEST = 1e-6  # waves; rounding of less than a tenth of that is none
+WAVEFRONT = "wavefront error, RMS in waves, piston and tilt removed"
+FLOOR = 0.1  # of the wavefront error that is allowed: rounding that adds more leaves the verdict open
 UNASKED = " (by default: none was asked)"
 GRID = ", on a grid four times finer than the net"
 
@@ -111,7 +112,12 @@ class Nominal:
     reachable: np.ndarray | None = None  # (rows, columns) which pixels those are
     weight: float = 1.0  # of the target, the first of several, among all goals
     further: tuple[Goal, ...] = ()  # the targets behind the first
-    wave: Wave | None = None  # that the light behind the lens shall be; None: any
+    wave: Wave | None = None  # that the light behind the lens is to be; None: none is asked for
+
+    @property
+    def heaviest(self) -> Channel:
+        """The channel with the most light: that of the main line, by which waves are counted."""
+        return max(self.channels, key=lambda channel: channel.weight)
 
     @property
     def goals(self) -> tuple[Goal, ...]:
@@ -141,7 +147,8 @@ class Proof:
     lines: tuple[Line, ...] = ()  # of a spectrum, each by itself
     at_bounds: dict[str, float] | None = None  # share of the faces that is at each bound, by key; None: no bounds
     further: tuple[Light, ...] = ()  # on the targets behind the first
-    wavefront: WavefrontError | None = None  # of the light, against the one asked for; None: none was
+    # of the light, against the one asked for; None: none was, or no light comes to where it is stated
+    wavefront: WavefrontError | None = None
 
     @property
     def lights(self) -> tuple[Light, ...]:
@@ -192,7 +199,7 @@ def verify(
         lit(*found[-1], number)
     (light, lines), *others = found
     lights = (light, *(other for other, _ in others))
-    wavefront = None if nominal.wave is None else _wavefront(as_made, nominal)
+    wavefront, of_wavefront = _of_wavefront(as_made, nominal)
     cut = as_cut(lens, mount)
     shape = describe(cut, effort.places) | {"volume": whole.volume}
     stability = _stability(as_made, nominal, lights, shape)
@@ -215,7 +222,7 @@ def verify(
         *(_picture(goal) for goal, _, _ in goals),
         *(c for _, each, of in goals for c in _because(why, _of_light(each, nominal.accept, meets, of=of))),
         *(Check.at_most(f"{DARK}{of}", each.leak.share, nominal.accept.leak) for _, each, of in goals if each.leak),
-        *([] if wavefront is None else _of_wavefront(wavefront, nominal.accept)),
+        *of_wavefront,
         *([] if lens.reflects else [Check.at_least(TOTAL_REFLECTION, margin, None, "deg")]),
         Check.at_most("values that are not finite", stability["non_finite"], 0),
     )
@@ -244,23 +251,6 @@ def _lit(lens: Lens, nominal: Nominal, goal: Goal, effort: Effort) -> tuple[Ligh
         raise ValueError(f"{name}: none of its light falls on {on}; write it again, or check scene.toml")
     n = max(LINE_TUBES, tubes_of(lens))
     return light, lines_apart(lens, nominal.channels, goal.screen, target=goal.target, n=n)
-
-
-def _wavefront(lens: Lens, nominal: Nominal) -> WavefrontError:
-    """The wavefront behind the lens, at the line with most of the light."""
-    from bstcad.optics.wavefront_error import wavefront_error
-
-    heaviest = max(nominal.channels, key=lambda channel: channel.weight)
-    return wavefront_error(heaviest.source, heaviest.through(lens), nominal.wave)
-
-
-def _of_wavefront(error: WavefrontError, accept: Accept) -> list[Check]:
-    """Its RMS against the limit, and the floor of its own figure."""
-    rms = error.without_tilt.rms
-    return [
-        Check.at_most("wavefront error, RMS, piston and tilt removed", rms, accept.wavefront, unit="waves"),
-        Check.at_most("rounding in that RMS, times ten", 10 * error.floor, max(rms, FAINTEST), unit="waves"),
-    ]
 
 
 def _as_shaped(lens: Lens, designed: Lens) -> Lens:
@@ -439,6 +429,21 @@ def _of_light(light: Light, accept: Accept, meets: str = "enters the lens", of: 
         limit = max(FAINT, min(light.rrmsd, tubes.rrmsd))
         checks.insert(2, Check.at_most(f"picture by ray tubes, off the one by rays{of}", tubes.off, limit))
     return checks
+
+
+def _of_wavefront(lens: Lens, nominal: Nominal) -> tuple[WavefrontError | None, list[Check]]:
+    """The wavefront through the re-read lens against the wave asked for, and its checks; nothing if none is."""
+    if nominal.wave is None:
+        return None, []
+    light, asked = nominal.heaviest, nominal.accept.wavefront
+    try:
+        error = wavefront_error(light.source.central, light.through(lens), nominal.wave)
+    except ValueError as none:  # a lens that misses the wave is written all the same, and fails
+        return None, [Check.at_most(WAVEFRONT, math.nan, asked, unit="waves", where=str(none))]
+    return error, [
+        Check.at_most(WAVEFRONT, error.without_tilt.rms, asked, unit="waves"),
+        Check.at_most("wavefront error floor", error.floor, None if asked is None else FLOOR * asked, unit="waves"),
+    ]
 
 
 def _asked(name: str, value: float, limit: float | None, default: float) -> tuple[str, float, float]:

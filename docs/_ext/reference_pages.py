@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "reference"
 RECORDS = {  # of each JSON file: the module's file and its records, the file's own record first
     "report.json": [
-        ("report/record.py", ["Contents", "Stage", "Point", "PrecisionTest", "Line", "LeftOut"]),
+        ("report/record.py", ["Contents", "Stage", "Point", "PrecisionTest", "Line", "WavefrontFigures", "LeftOut"]),
         ("verify/verdict.py", ["Check"]),
         ("analysis/light.py", ["Blur", "FinestDetail"]),
         ("judges/comparison.py", ["Judge"]),

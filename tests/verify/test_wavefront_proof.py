@@ -1,0 +1,153 @@
+"""The wavefront through the written files, in proof and report; one written design of two nets serves most tests."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+from rich.console import Console
+
+from bstcad import commands
+from bstcad import folder as folders
+from bstcad.optics.wavefront import ZernikeWave
+from bstcad.optics.wavefront_error import wavefront_error
+from bstcad.report import record, report
+from bstcad.report.explained import topic
+from bstcad.verify import checks
+from tests.conftest import flat_pictures, proofs, quick_effort
+from tests.two_faces import CHANGES, made_of, scene_of
+
+WAVE = {"kind": "plane", "z": 60.0}
+ONE = {"target": CHANGES["target"][0], "wavefront": WAVE}
+RMS, FLOOR = checks.WAVEFRONT, "wavefront error floor"
+KEYS = [
+    "z", "wavelength", "rms", "pv", "rms_with_tilt", "tilt_urad", "angle_rms_urad", "angle_max_urad", "floor", "flux",
+    "removed",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def one(tmp_path_factory):
+    """A lens of two nets for one target and a plane wave in a folder, with its report."""
+    made, folder = made_of(scene_of(**ONE)), tmp_path_factory.mktemp("wave") / "faces"
+    with pytest.MonkeyPatch.context() as patch:
+        kept = proofs(patch)
+        found = commands.write(made, folder, effort=quick_effort(), drawing=flat_pictures())
+    return SimpleNamespace(made=made, folder=folder, report=found, proof=kept[0])
+
+
+def judged(folder, nominal, **accept):
+    """The proof by other limits, and its two checks of the wavefront by name."""
+    nominal = replace(nominal, accept=nominal.accept.model_copy(update=accept))
+    proof = checks.verify(folder, nominal, effort=quick_effort())
+    return proof, {check.name: check for check in proof.checks if "wavefront" in check.name}
+
+
+def test_the_written_lens_has_the_wavefront_of_the_designed_one(one):
+    scene, lens = one.made.scene, one.made.lens
+    designed, found = wavefront_error(scene.source, lens, scene.wavefront), one.proof.wavefront
+    assert found.without_tilt.rms > 1  # a lens that is bent by hand
+    assert found.without_tilt.rms == pytest.approx(designed.without_tilt.rms, rel=1e-6)
+    assert found.rays == designed.rays and found.wavelength == 633.0 and 0 < found.floor < 1e-8
+
+
+def test_without_a_limit_both_values_are_stated(one):
+    found = {check.name: check for check in one.report.checks if "wavefront" in check.name}
+    assert found.keys() == {RMS, FLOOR} and all(check.passed and check.limit is None for check in found.values())
+    assert found[RMS].value == one.proof.wavefront.without_tilt.rms and found[RMS].unit == "waves"
+    assert one.report.passed and (topic(RMS), topic(FLOOR)) == ("check-wavefront", "check-wavefront-floor")
+
+
+def test_a_wavefront_beyond_its_limit_fails_and_nothing_else_does(one):
+    nominal, rms = folders.read_nominal(one.folder)[1], one.proof.wavefront.without_tilt.rms
+    assert nominal.wave == one.made.scene.wavefront
+    proof, found = judged(one.folder, nominal, wavefront=0.99 * rms)
+    assert not proof.passed and [check.name for check in proof.checks if not check.passed] == [RMS]
+    assert found[FLOOR].limit == pytest.approx(0.099 * rms)
+    proof, found = judged(one.folder, nominal, wavefront=1.01 * rms)
+    assert proof.passed and found[RMS].limit == 1.01 * rms
+
+
+def test_a_limit_that_rounding_hides_fails_by_the_floor(one):
+    nominal, floor = folders.read_nominal(one.folder)[1], one.proof.wavefront.floor
+    proof, found = judged(one.folder, nominal, wavefront=5 * floor)
+    assert not found[FLOOR].passed and found[FLOOR].limit == 0.5 * floor and not proof.passed
+
+
+def test_a_wave_that_no_light_meets_fails_and_has_no_figures(one):
+    nominal = replace(folders.read_nominal(one.folder)[1], wave=ZernikeWave((0.0,), 1.0, z=60.0, centre=(500.0, 0.0)))
+    proof, found = judged(one.folder, nominal)
+    assert not proof.passed and proof.wavefront is None and found.keys() == {RMS}
+    assert found[RMS].value is None and "no light comes to where the wavefront is stated" in found[RMS].where
+
+
+def test_a_flat_plate_leaves_parallel_light_parallel(tmp_path):
+    """Of a plain lens: parallel light through level faces has no error but rounding."""
+    made = made_of(scene_of(**ONE), front=0.0, back=0.0)
+    folders.write_geometry(made, tmp_path)()
+    nominal = folders.nominal(made.scene, made.lens, made.target)
+    proof, found = judged(tmp_path, nominal, wavefront=1e-6)
+    assert found[RMS].passed and found[FLOOR].passed and proof.wavefront.without_piston.rms < 1e-8
+    assert proof.wavefront.angle_max < 1e-6
+
+
+def test_a_mounted_lens_is_measured_as_it_is_made(tmp_path):
+    """The rim of the mount cuts away light that the bare lens lets through."""
+    made = made_of(scene_of(**ONE, mount={"datum": "front", "rim": {"shape": "circle", "diameter": 6.4}}))
+    folders.write_geometry(made, tmp_path)()
+    proof, _ = judged(tmp_path, folders.nominal(made.scene, made.lens, made.target))
+    bare = wavefront_error(made.scene.source, replace(made.lens, clear=None), made.scene.wavefront)
+    cut = wavefront_error(made.scene.source, made.lens, made.scene.wavefront)
+    assert proof.wavefront.flux == pytest.approx(cut.flux, abs=1e-4) and proof.wavefront.flux < 0.95 * bare.flux
+
+
+def test_waves_are_those_of_the_main_line():
+    source = CHANGES["source"] | {"wavelength": [[633.0, 1.0], [520.0, 3.0], [450.0, 1.0]]}
+    made = made_of(scene_of(**ONE, source=source))
+    heaviest = folders.nominal(made.scene, made.lens, made.target).heaviest
+    assert heaviest.source == made.scene.source.central and heaviest.source.wavelength == 520.0
+
+
+# ---- the report ------------------------------------------------------------------------------------------------------
+
+
+def test_report_json_tells_the_wavefront_and_reads_back(one):
+    told, error = json.loads((one.folder / "report.json").read_text())["wavefront"], one.proof.wavefront
+    assert list(told) == KEYS and told["removed"] == "piston and tilt" and told["z"] == 60.0
+    assert told["rms"] == pytest.approx(error.without_tilt.rms, rel=1e-11)
+    assert told["pv"] == pytest.approx(error.without_tilt.pv, rel=1e-11)
+    assert told["rms_with_tilt"] == pytest.approx(error.without_piston.rms, rel=1e-11)
+    assert told["tilt_urad"] == pytest.approx(error.tilt, rel=1e-11)
+    assert (told["angle_rms_urad"], told["angle_max_urad"]) == pytest.approx((error.angle_rms, error.angle_max))
+    assert record.read(one.folder / "report.json").facts()["wavefront"] == told
+    assert error.flux > 1 == told["flux"]  # on a grid the edge of the beam is a little too wide
+
+
+def test_the_page_the_terminal_and_the_figures_show_it(one):
+    page = (one.folder / "report.html").read_text(encoding="utf-8")
+    assert page.count("<h2>Wavefront</h2>") == 1 and page.count("Optical path differences in waves") == 1
+    assert "RMS, piston and tilt removed" in page and "Floor: what rounding may add" in page
+    assert (one.folder / "figures" / "wavefront.png").read_bytes().startswith(b"\x89PNG")
+    console = Console(width=400)
+    with console.capture() as shown:
+        console.print(report.summary(one.report.contents))
+    [line] = [line for line in shown.get().splitlines() if line.startswith("Wavefront error")]
+    assert "waves" in line and "of 633 nm, piston and tilt removed" in line
+
+
+def test_verify_draws_and_tells_it_again(one, tmp_path):
+    copy = shutil.copytree(one.folder, tmp_path / "faces")
+    shutil.rmtree(copy / "figures")
+    again = commands.verify(copy, effort=quick_effort(), drawing=flat_pictures())
+    assert again.wavefront == one.report.wavefront and (copy / "figures" / "wavefront.png").exists()
+
+
+def test_a_scene_without_a_wave_has_nothing_of_it(small_design):
+    assert "wavefront" not in small_design.report
+    assert [check["name"] for check in small_design.report["checks"] if "wavefront" in check["name"]] == []
+    page = (small_design.folder / "report.html").read_text(encoding="utf-8")
+    assert "Wavefront" not in page and not (small_design.folder / "figures" / "wavefront.png").exists()
+    assert folders.read_nominal(small_design.folder)[1].wave is None
