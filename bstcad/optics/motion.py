@@ -40,6 +40,12 @@ class Motion:
         back = self.rotation.T
         return Motion(back, self.about, tuple((-back @ np.array(self.shift)).tolist()))
 
+    def after(self, first: Motion | None) -> Motion:
+        """The motion `first`, None for none, and then this one."""
+        if first is None:
+            return self
+        return Motion(self.rotation @ first.rotation, shift=self.point(first.point((0.0, 0.0, 0.0))))
+
     @property
     def turns(self) -> bool:
         """Is it more than a shift?"""

@@ -17,7 +17,7 @@ and without piston and tilt.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from torch import Tensor
 from bstcad.optics import sampling
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
+from bstcad.optics.motion import Motion
 from bstcad.optics.rays import Rays
 from bstcad.optics.sources import Collimated, Source
 from bstcad.optics.trace import behind, clear_window, to_plane
@@ -66,6 +67,25 @@ def exit_pupil(source: Source, lens: Lens, z: float, n: int = RAYS) -> ExitPupil
     *columns, roundings = zip(*parts, strict=True)
     (x, y), direction, path, flux, alive = (torch.cat(column, dim=-2) for column in columns)
     return ExitPupil(x, y, direction, path=path, flux=flux, alive=alive, rounding=max(roundings))
+
+
+def moved_pupil(pupil: ExitPupil, motion: Motion, z: float) -> ExitPupil:
+    """The light of a pupil on the plane z (mm) after a motion, on the plane of that z again.
+
+    So the light of a lens that was moved is seen from where the wanted wave stays.
+    """
+    place = torch.stack([pupil.x, pupil.y, torch.full_like(pupil.x, z)])
+    turns, about = motion.rotation.tolist(), motion.point((0.0, 0.0, 0.0))
+    x, y, height = (_turned(row, place) + shift for row, shift in zip(turns, about, strict=True))
+    direction = torch.stack([_turned(row, pupil.direction) for row in turns])
+    way = torch.where(pupil.alive, (z - height) / direction[2], torch.zeros_like(height))
+    return replace(
+        pupil, x=x + way * direction[0], y=y + way * direction[1], direction=direction, path=pupil.path + way
+    )
+
+
+def _turned(row: list[float], vectors: Tensor) -> Tensor:
+    return row[0] * vectors[0] + row[1] * vectors[1] + row[2] * vectors[2]
 
 
 def followed(source: Source, lens: Lens, rays: Rays, z: float) -> tuple[Rays, Tensor, float]:
@@ -147,15 +167,10 @@ def wavefront_error(source: Source, lens: Lens, wave: Wave, n: int = RAYS) -> Wa
     The lens is that of the source's main wavelength.  Raises ValueError if no ray can be compared.
     """
     pupil, nm = exit_pupil(source, lens, wave.z, n), source.main_wavelength
-    seen = pupil.alive & wave.contains(pupil.x, pupil.y)
-    if int(seen.sum()) < 3:
-        raise ValueError(f"no light comes to where the wavefront is stated on the plane z = {wave.z:g}")
-    x, y, path, flux = (part[seen] for part in (pupil.x, pupil.y, pupil.path, pupil.flux))
+    seen, flat, fit, share = _against(pupil, wave, nm)
+    x, y = pupil.x[seen], pupil.y[seen]
     off = pupil.direction[:, seen] - wave.directions(x, y, nm)
-    opd = path - wave.path(x, y, nm)
-    share = flux / (measured := float(total(flux)))
-    fit = _least_squares(x, y, opd, share=share)
-    flat = opd - fit.piston
+    measured = float(total(pupil.flux[seen]))
     level = flat - fit.at(x, y)
     unit, angle = 1 / (nm * NM), 2e6 * torch.asin((length(off) / 2).clamp(max=1))
     slopes = [p - tilt for p, tilt in zip(off[:2], fit.slopes, strict=True)]
@@ -166,6 +181,29 @@ def wavefront_error(source: Source, lens: Lens, wave: Wave, n: int = RAYS) -> Wa
         tilt=(1e6 * fit.slopes[0], 1e6 * fit.slopes[1]), angle_rms=_rms(angle, share), angle_max=float(angle.max()),
         floor=unit * pupil.rounding, flux=measured, rays=len(x), x=along_x, y=along_y, opd=unit * seen_map,
     )  # fmt: skip
+
+
+@torch.no_grad()
+def residual(pupil: ExitPupil, wave: Wave, nm: float) -> Tensor:
+    """(n, n) OPD without piston and tilt in waves of nm, times the root of each ray's share of the flux; 0: not seen.
+
+    Its root of the sum of squares is the RMS.  Raises ValueError if no ray can be compared.
+    """
+    seen, flat, fit, share = _against(pupil, wave, nm)
+    weighted = torch.zeros_like(pupil.path)
+    weighted[seen] = (flat - fit.at(pupil.x[seen], pupil.y[seen])) * share.sqrt() / (nm * NM)
+    return weighted
+
+
+def _against(pupil: ExitPupil, wave: Wave, nm: float) -> tuple[Tensor, Tensor, _Fit, Tensor]:
+    """(seen (n, n); of the rays that are: OPD without piston in mm, its least-squares plane, share of their flux)."""
+    seen = pupil.alive & wave.contains(pupil.x, pupil.y)
+    if int(seen.sum()) < 3:
+        raise ValueError(f"no light comes to where the wavefront is stated on the plane z = {wave.z:g}")
+    x, y, path, flux = (part[seen] for part in (pupil.x, pupil.y, pupil.path, pupil.flux))
+    opd, share = path - wave.path(x, y, nm), flux / float(total(flux))
+    fit = _least_squares(x, y, opd, share=share)
+    return seen, opd - fit.piston, fit, share
 
 
 @dataclass(frozen=True)

@@ -62,8 +62,9 @@ class Sensitivity:
     distribution: Literal["normal", "uniform", "field"]
     cost: Width  # of holding the limit, beside the others' 1
     sigma: Width  # standard deviation
-    rrmsd_change: float  # by one sigma
-    share: Share  # of the mean square that all errors add to the picture
+    rrmsd_change: float  # by one sigma; of several targets, of that which it changes most
+    share: Share  # of the mean square that all errors add to the picture; of several targets, to all pictures
+    wavefront_change: float | None = None  # of the RMS wavefront error (waves) by one sigma; None: no wave is wanted
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,37 @@ class Inverse:
 
 
 @dataclass(frozen=True)
+class TargetStudy:
+    """One of several targets by itself, in the same trials."""
+
+    key: str  # by which sentences call it: target[0], target[1], …
+    z: float  # mm, of its middle
+    rrmsd: Rrmsd  # of the design there
+    passed: Annotated[Yield, Field(alias="yield")]  # lenses that keep to the limit on this target
+    passed_full: Annotated[Yield, Field(alias="yield_full")]  # of those that were traced in full
+    passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]  # of these, with this screen adjusted
+    rrmsd_trials: Spread  # of the trials by superposed pictures
+    rrmsd_full: Spread  # of the trials traced in full
+    rrmsd_adjusted: Spread  # of these, with this screen shifted, focused, tilted and turned to fit
+    model_off: Disagreement  # of the model and the full traces
+    sensitivities: Annotated[tuple[Sensitivity, ...], Field(max_length=1000)]  # on this target, the worst first
+
+
+@dataclass(frozen=True)
+class WavefrontStudy:
+    """The wavefront in the same trials: RMS of its error in waves, piston and tilt removed."""
+
+    rms: Size  # of the design
+    rms_trials: Spread  # of the trials by superposed wavefronts
+    rms_full: Spread  # of the trials traced in full
+    model_off: Disagreement  # of the model and the full traces
+    limit: Size | None = None  # accept.wavefront; None: it asks for none
+    # lenses that keep to the limit, by superposed wavefronts
+    passed: Annotated[Yield | None, Field(alias="yield")] = None
+    passed_full: Annotated[Yield | None, Field(alias="yield_full")] = None  # of those that were traced in full
+
+
+@dataclass(frozen=True)
 class Tolerances:
     """All of tolerance.json: a field a key, in its order; `passed…` are its keys `yield…`."""
 
@@ -96,10 +128,11 @@ class Tolerances:
     seed: Annotated[int, Field(ge=0)]  # of the trials
     tubes: Count  # a side, a channel
     limit: Rrmsd  # the RRMSD at which a lens passes
-    rrmsd: Rrmsd  # of the design
+    rrmsd: Rrmsd  # of the design; of several targets here and below the worst one's, lens by lens
     trials: Count  # by the model of superposed pictures
     full_trials: Count  # of them by full traces
-    passed: Annotated[Yield, Field(alias="yield")]  # the yield by superposed pictures
+    # the yield by superposed pictures: lenses that keep to the limit on all targets, and to that of the wavefront
+    passed: Annotated[Yield, Field(alias="yield")]
     passed_full: Annotated[Yield, Field(alias="yield_full")]  # the yield of the lenses that were traced in full
     passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]  # of the full trials, with the screen adjusted
     rrmsd_trials: Spread  # of the trials by superposed pictures
@@ -109,17 +142,19 @@ class Tolerances:
     sensitivities: Annotated[tuple[Sensitivity, ...], Field(max_length=1000)]  # the worst first
     worst: Annotated[tuple[Trial, ...], Field(max_length=100)]  # of the fully traced trials
     inverse: Inverse | None = None  # None: it was not asked for
-    target: str | None = None  # which of several targets was studied, by its key; None: there is one
+    targets: Annotated[tuple[TargetStudy, ...], Field(max_length=100)] | None = None  # None: there is one
+    wavefront: WavefrontStudy | None = None  # None: the scene asks for no wave
 
     def facts(self) -> dict[str, Any]:
         """The entries of tolerance.json as plain values, in their order."""
-        facts = _keys(plain(self))
-        return facts if self.inverse is None else facts | {"inverse": _keys(facts["inverse"])}
+        return _known(plain(self))
 
     @property
     def trusted(self) -> bool:
-        """Do superposed pictures stand up to the full traces?"""
-        return self.model_off["95 %"] <= LOOSE[0] and self.model_off["median"] <= LOOSE[1]
+        """Do superposed pictures, and wavefronts that a limit is held to, stand up to the full traces?"""
+        judged = self.wavefront is not None and self.wavefront.limit is not None
+        offs = (self.model_off, self.wavefront.model_off) if judged else (self.model_off,)
+        return all(off["95 %"] <= LOOSE[0] and off["median"] <= LOOSE[1] for off in offs)
 
     @property
     def loosest(self) -> Mapping[str, float]:
@@ -127,9 +162,11 @@ class Tolerances:
         return {} if self.inverse is None else self.inverse.limits
 
 
-def _keys(entries: dict[str, Any]) -> dict[str, Any]:
+def _known(value: Any) -> Any:
     """The same by the keys of the file, without those that are not known."""
-    return {key.replace("passed", "yield"): value for key, value in entries.items() if value is not None}
+    if isinstance(value, dict):
+        return {key.replace("passed", "yield"): _known(part) for key, part in value.items() if part is not None}
+    return list(map(_known, value)) if isinstance(value, list) else value
 
 
 def read(path: Path) -> Tolerances:
@@ -193,6 +230,7 @@ def errors(found: Tolerances) -> list[dict[str, Any]]:
 
 def _error(items: Sequence[Sensitivity], loosest: Mapping[str, float]) -> dict[str, Any]:
     first, part, change = items[0], *(math.fsum(getattr(i, key) for i in items) for key in ("share", "rrmsd_change"))
+    waves = [item.wavefront_change for item in items if item.wavefront_change is not None]
     words, loose = first.words.partition(" (draw")[0], [loosest[item.name] for item in items if item.name in loosest]
     widest = WIDEST * math.hypot(*(item.limit for item in items))  # which the search does not exceed
     at_least = "≥ " if math.isclose(math.hypot(*loose), widest) else ""
@@ -200,11 +238,16 @@ def _error(items: Sequence[Sensitivity], loosest: Mapping[str, float]) -> dict[s
         "words": words[:1].upper() + words[1:],
         "width": amount(math.hypot(*(item.limit for item in items)), first.unit),
         "distribution": "random field" if first.distribution == "field" else first.distribution,
-        "change": f"{'+' if change > 0 else ''}{about(change)}",
+        "change": _signed(change),
+        "wavefront": _signed(math.fsum(waves)) if waves else "",
         "share": percent(part),
         "part": part,
         "loosest": at_least + amount(math.hypot(*loose), first.unit) if loose else "",
     }
+
+
+def _signed(change: float) -> str:
+    return f"{'+' if change > 0 else ''}{about(change)}"
 
 
 def worst_errors(found: Tolerances, trial: Trial) -> str:
@@ -228,6 +271,8 @@ def summary(found: Tolerances) -> Group:
     from rich.text import Text
 
     columns = {"words": "error", "width": "±", "change": "RRMSD by 1 σ", "share": "share"}
+    if found.wavefront:
+        columns["wavefront"] = "waves by 1 σ"
     if found.loosest:
         columns["loosest"] = "loosest ±"
     table = Table(title=Text(f"Tolerances of {found.name}: {found.grade.words}"), title_justify="left")

@@ -146,6 +146,7 @@ Name = Literal[
     "lens.tilt", "lens.tilt_x", "lens.tilt_y", "lens.clocking",
     "lens.thickness", "lens.index", "lens.front_power", "lens.scale", "temperature",
     "back.form", "back.ripple", "front.form",
+    "front.decentre", "front.decentre_x", "front.decentre_y", "lens.wedge", "lens.wedge_x", "lens.wedge_y",
     "source.decentre", "source.decentre_x", "source.decentre_y", "source.axial",
     "source.tilt", "source.tilt_x", "source.tilt_y", "source.angle", "source.size", "wavelength",
     "screen.decentre", "screen.decentre_x", "screen.decentre_y", "screen.axial",
@@ -153,6 +154,7 @@ Name = Literal[
 ]  # fmt: skip
 FORM, RIPPLE = ("back.form", "front.form"), ("back.ripple",)
 OF_FACES = {"correlation_length": FORM, "period": RIPPLE, "pattern": RIPPLE}  # keys that only these have
+OF_TWO_FACES = ("front.", "lens.wedge")  # errors of a lens that refracts at two faces; only off where they are named
 NONE = "none"  # a grade: cannot be off
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from bstcad.optics.lens import Lens
 from bstcad.scene.errors import SceneError
-from bstcad.scene.quality import FORM, NONE, RIPPLE, Tolerance, settings_of
+from bstcad.scene.quality import FORM, NONE, OF_TWO_FACES, RIPPLE, Tolerance, settings_of
 from bstcad.tolerance.perturbations import Kind, Perturbation, Setup, form_error, kinds, ripple
 
 USUAL = "diamond-turned"
@@ -24,8 +24,8 @@ class Grade:
     """± limits of all errors; of form and ripple RMS."""
 
     words: str
-    decentre: float  # mm, of lens and source, and along the axis
-    tilt: float  # degrees, and clocking
+    decentre: float  # mm, of lens, front and source, and along the axis
+    tilt: float  # degrees, clocking and wedge too
     screen: float  # its shift over its width, and along the axis over its distance
     thickness: float  # mm
     index: float
@@ -65,7 +65,7 @@ def limit(kind: Kind, grade: Grade, setup: Setup) -> float:
         screen = setup.screen
         width, distance = screen.x[1] - screen.x[0], abs(screen.z - setup.pivot("lens")[2])
         return grade.screen * (distance if error == "axial" else width)
-    if error.startswith(("tilt", "clocking")):
+    if error.startswith(("tilt", "clocking", "wedge")):
         return grade.tilt
     if error.startswith(("decentre", "axial")):
         return grade.decentre
@@ -90,18 +90,22 @@ def start_of(table: Sequence[Tolerance]) -> str:
 def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None = None) -> tuple[Perturbation, ...]:
     """All errors of the setup by a whole table.
 
-    Errors that the lens's net is too coarse for are left out, unless the table names them.  Raises SceneError, in a
-    sentence, for tables of errors that do not exist.
+    Errors that the lens's net is too coarse for are left out, unless the table names them; those of one face against
+    the other are off only where it does.  Raises SceneError, in a sentence, for tables of errors that do not exist.
     """
     errors = []
     for kind in kinds(setup, material).values():
         told = settings_of(table, kind.name)
-        if told.get("grade") != NONE:
+        left_out = kind.name.startswith(OF_TWO_FACES) and not _named(table, kind.name)
+        if told.get("grade") != NONE and not left_out:
             size = told["limit"] if "limit" in told else limit(kind, GRADES[told["grade"]], setup)
             errors.append(Perturbation(kind, size, told.get("distribution", "normal"), told.get("cost", 1.0)))
     errors += _of_faces(setup.lens, table)
     for k, entry in enumerate(table[1:]):
         none = entry.name and settings_of(table, entry.name).get("grade") == NONE
+        if entry.name and not none and entry.name.startswith(OF_TWO_FACES) and setup.lens.reflects:
+            only = "is of a lens that refracts at two faces, and a mirror has one face"
+            raise SceneError(f"tolerance[{k}].name: {entry.name!r} {only}; remove that table")
         if entry.name and not none and not any(entry.covers(error.kind.name) for error in errors):
             raise SceneError(
                 f"tolerance[{k}].name: {entry.name!r} changes nothing here, or the scene does not say by how much "
@@ -112,10 +116,15 @@ def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None
     return tuple(errors)
 
 
+def _named(table: Sequence[Tolerance], error: str) -> bool:
+    """Does a table name it?"""
+    return any(entry.name and entry.covers(error) for entry in table)
+
+
 def _of_faces(lens: Lens, table: Sequence[Tolerance]) -> Iterator[Perturbation]:
     """Form errors and ripple; of the front if the table names it: that takes twice as long to trace."""
     for name in (*FORM, *RIPPLE):
-        told, by_name = settings_of(table, name), any(entry.name == name for entry in table)
+        told, by_name = settings_of(table, name), _named(table, name)
         face = name.partition(".")[0]
         if told.get("grade") == NONE or face not in lens.optical_faces or not (by_name or face == "back"):
             continue

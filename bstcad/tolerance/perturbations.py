@@ -42,6 +42,7 @@ class Setup:
     lens: Lens
     channels: tuple[Channel, ...]
     screen: Screen
+    placed: Motion | None = None  # of the lens in the room, where a wanted wave stays; None: it is where it was
 
     def pivot(self, part: str) -> Vector:
         """Point about which a part ("lens", "source", "screen") tilts.
@@ -65,7 +66,8 @@ class Setup:
     def moved(self, part: str, motion: Motion) -> Setup:
         """With its lens, source or screen moved; seen from a moved lens, source and screen move the other way."""
         if part == "lens":
-            return self.moved("source", motion.inverse).moved("screen", motion.inverse)
+            around = self.moved("source", motion.inverse).moved("screen", motion.inverse)
+            return replace(around, placed=motion if self.placed is None else self.placed.after(motion))
         if part == "screen":
             return replace(self, screen=moved_screen(self.screen, motion))
         return self.with_sources(lambda source: moved_source(source, motion, self.lens.entrance.z))
@@ -162,9 +164,9 @@ def draws(perturbations: Sequence[Perturbation], even: np.ndarray) -> np.ndarray
 
 
 def perturbed(setup: Setup, perturbations: Sequence[Perturbation], amounts: Sequence[float]) -> Setup:
-    """The setup with these amounts, in the order of the perturbations; shapes before motions."""
+    """The setup with these amounts, in the order of the perturbations; shapes before motions, also of a face."""
     pairs = [(p.kind, float(a)) for p, a in zip(perturbations, amounts, strict=True) if a]
-    motions = ("lens.decentre", "lens.tilt", "lens.axial", "lens.clocking", "source.", "screen.")
+    motions = ("lens.decentre", "lens.tilt", "lens.axial", "lens.clocking", "source.", "screen.", "front.decentre")
     for kind, amount in sorted(pairs, key=lambda pair: pair[0].name.startswith(motions)):
         setup = kind.apply(setup, amount)
     return setup
@@ -188,7 +190,8 @@ MOTIONS = (  # error, words, axis, is it a turn?
 
 def kinds(setup: Setup, material: str | None = None) -> dict[str, Kind]:
     """All errors of a setup that have one amount, but those without effect there or of an unknown material."""
-    return {kind.name: kind for kind in (*_motions(setup), *_shapes(setup, material), *_lights(setup))}
+    found = (*_motions(setup), *_shapes(setup, material), *_lights(setup), *_alignments(setup.lens))
+    return {kind.name: kind for kind in found}
 
 
 def _motions(setup: Setup) -> Iterator[Kind]:
@@ -295,6 +298,54 @@ def _larger(setup: Setup, by: float) -> Setup:
         return replace(source, position=tuple((middle + (1 + by) * (np.array(source.position) - middle)).tolist()))
 
     return setup.with_sources(change)
+
+
+# --- one face against the other ---------------------------------------------------------------------------------------
+
+
+def _alignments(lens: Lens) -> Iterator[Kind]:
+    """Wedge of two refracting faces, and decentre of the front, which of a plane does nothing."""
+    for axis, name in enumerate("" if lens.reflects else "xy"):
+        words = f"wedge of the lens, the tilt of its back about {name} to the front"
+        yield Kind(f"lens.wedge_{name}", words, "deg", partial(_wedged, axis))
+        if not lens.front.level:
+            words = f"decentre of the front in {name} to the back"
+            yield Kind(f"front.decentre_{name}", words, "mm", partial(_front_decentred, axis))
+
+
+def _front_decentred(axis: int, setup: Setup, by: float) -> Setup:
+    """With the front shifted, and the lens's rim with it; the back stays in the room.
+
+    A lens is traced in the frame of its front, so its back shifts the other way and the whole lens with the front.
+    The net grows, straight on, by as many control points as it takes to reach the rim: inside, the face stays as it is.
+    """
+    back, side = setup.lens.back, "xy"[axis]
+    (low, high), pitch = getattr(back, side), back.pitch[axis]
+    short = setup.lens.outline.half_extent[axis] + abs(by) - min(-low, high)
+    more = max(0, math.ceil(short / pitch))
+    heights = np.pad(back.heights, [(more * (k == axis),) * 2 for k in (0, 1)], "reflect", reflect_type="odd")
+    ends = low - more * pitch - by, high + more * pitch - by
+    stays = replace(back, heights=torch.from_numpy(heights), **{side: ends})
+    shift = tuple(by if k == axis else 0.0 for k in range(3))
+    return replace(setup, lens=setup.lens.with_back(stays)).moved("lens", Motion.of(shift=shift))
+
+
+def _wedged(axis: int, setup: Setup, by: float) -> Setup:
+    """With the back turned about its vertex v; front, rim and all else stay.
+
+    A point p = v + (x, y, ζ) of the turned face was at v + q, q = Rᵀ (p - v), before.  There the face lies as high as
+    its tangent plane over (x, y) says, which is off by curvature · (turn · sag)², 1 nm at a tenth of a degree:
+    q_z = h - h_v + ∇h · ((q_x, q_y) - (x, y)), linear in ζ.
+    """
+    back = setup.lens.back
+    turn = Motion.of(turn=tuple(by if k == axis else 0.0 for k in range(3))).inverse.rotation.tolist()
+    x, y = _points(back)
+    h, h_x, h_y = back.relative_sag_and_slope(x, y)
+    vertex = float(back.from_vertex().z) - back.z
+    level = [row[0] * x + row[1] * y for row in turn]  # q of ζ = 0
+    rise = h - vertex + h_x * (level[0] - x) + h_y * (level[1] - y) - level[2]
+    along = turn[2][2] - h_x * turn[0][2] - h_y * turn[1][2]
+    return replace(setup, lens=setup.lens.with_back(_higher(back, (vertex + rise / along - h).numpy())))
 
 
 # --- errors of the form of a face, as heights of its control net ------------------------------------------------------

@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import count, repeat
-from typing import Any
+from typing import Any, Protocol
 
 import numba
 import numpy as np
@@ -77,6 +77,8 @@ class Pictures:
     target: np.ndarray  # (rows, columns) of any sum
     tubes: int  # a side, a channel
 
+    figure = "RRMSD"  # that the norm of `of` is
+
     def of(self, amounts: Sequence[float]) -> np.ndarray:
         """(pixels,) the picture with these amounts, less the target: its norm is the RRMSD."""
         target = self.target.ravel()
@@ -91,6 +93,23 @@ class Pictures:
     def rrmsd(self, amounts: Sequence[float]) -> float:
         """RRMSD by a full trace (Wang et al. 2023, Eq. 15)."""
         return _norm(self.of(amounts))
+
+
+class Traced(Protocol):
+    """What is traced of a setup with errors: Pictures, or Wavefronts (wavefronts.py)."""
+
+    setup: Setup
+    perturbations: tuple[Perturbation, ...]
+    figure: str  # of merit
+
+    def of(self, amounts: Sequence[float]) -> np.ndarray:
+        """(any,) a vector whose norm is the figure of merit, nearly linear in the amounts."""
+        ...
+
+
+def _figure(goal: Traced, amounts: Sequence[float]) -> float:
+    """The figure of merit by a full trace."""
+    return _norm(goal.of(amounts))
 
 
 def _norm(vector: np.ndarray) -> float:
@@ -148,7 +167,7 @@ def _cardinal(nodes: tuple[float, ...]) -> tuple[CubicSpline, CubicSpline]:
     return spline, spline.derivative()
 
 
-def model(pictures: Pictures, progress: Progress = lambda *told: None, spread: Spread = here) -> Model:
+def model(pictures: Traced, progress: Progress = lambda *told: None, spread: Spread = here) -> Model:
     """Traces two pictures for each perturbation, and some along each main direction, more along the stronger ones."""
     sigmas = np.array([p.sigma for p in pictures.perturbations])
     n = len(sigmas)
@@ -156,7 +175,7 @@ def model(pictures: Pictures, progress: Progress = lambda *told: None, spread: S
     total, done = 1 + 2 * n + sum(map(len, nodes)), count(1)
 
     def traced(amounts: Sequence[np.ndarray]) -> Iterator[np.ndarray]:
-        for picture in spread(Pictures.of, pictures, [z * sigmas for z in amounts]):
+        for picture in spread(type(pictures).of, pictures, [z * sigmas for z in amounts]):
             progress("sensitivity", next(done), total, "")
             yield picture
 
@@ -210,12 +229,12 @@ Yield = tuple[float, float, float]  # share of the trials within a limit: low, l
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """Result of a Monte Carlo of a setup."""
+    """Result of a Monte Carlo of a setup; of a wavefront every RRMSD is its RMS in waves."""
 
     perturbations: tuple[Perturbation, ...]
     model: Model  # of the perturbations, followed by the adjustments of the screen that are not among them
     sensitivities: tuple[Sensitivity, ...]  # the worst first
-    limit: float  # RRMSD
+    limit: float  # RRMSD; infinite: any passes
     seed: int
     rrmsd: float  # of the setup as designed
     linear: np.ndarray  # (trials,) RRMSD of all trials by the model
@@ -227,6 +246,10 @@ class Study:
         """(fewer,) relative difference of the model from the full traces."""
         return np.abs(self.linear[: len(self.full)] / self.full - 1)
 
+    def change_of(self, error: str) -> float:
+        """The change of its figure by one standard deviation of an error."""
+        return next(s.rrmsd_change for s in self.sensitivities if s.name == error)
+
     @property
     def worst(self) -> list[int]:
         """Numbers of the worst fully traced trials."""
@@ -234,17 +257,50 @@ class Study:
 
     def share(self, rrmsds: np.ndarray) -> Yield:
         """Share of these trials within the limit."""
-        good = int((rrmsds <= self.limit).sum())
-        interval = binomtest(good, len(rrmsds)).proportion_ci(method="wilson")
-        return float(interval.low), good / len(rrmsds), float(interval.high)
+        return share_of(rrmsds <= self.limit)
+
+    @property
+    def off(self) -> float:
+        """What the design's own figure, squared, has too much by the traces of the study."""
+        return self.model.rrmsd**2 - self.rrmsd**2
+
+    def kept(self, amounts: np.ndarray) -> np.ndarray:
+        """(…) True for amounts (…, k) with which the limit is kept, by the model."""
+        return _less(self.model.rrmsds(amounts), self.off) <= self.limit
+
+
+def share_of(good: np.ndarray) -> Yield:
+    """Share of the trials (trials,) that are True."""
+    interval = binomtest(int(good.sum()), len(good)).proportion_ci(method="wilson")
+    return float(interval.low), int(good.sum()) / len(good), float(interval.high)
+
+
+def worst_of(studies: Sequence[Study]) -> Study:
+    """Studies of the targets of one lens, of the same trials and one limit: in each figure the worst target; one as is.
+
+    Shares are of the mean square that errors add to all pictures, each over its target's norm.
+    """
+    first, *others = studies
+    if not others:
+        return first
+    added = sum(np.sum(study.model.first[: len(first.perturbations)] ** 2, axis=1) for study in studies)
+    shares = {p.kind.name: float(a) for p, a in zip(first.perturbations, added / (added.sum() or 1.0), strict=True)}
+    changes = {name: max(s.change_of(name) for s in studies) for name in shares}
+    sensitivities = [
+        replace(s, rrmsd_change=changes[s.name], share=shares[s.name])
+        for s in sorted(first.sensitivities, key=lambda s: changes[s.name], reverse=True)
+    ]
+    worst = {name: np.max([getattr(s, name) for s in studies], axis=0) for name in ("linear", "full", "adjusted")}
+    return replace(first, sensitivities=tuple(sensitivities), rrmsd=max(s.rrmsd for s in studies), **worst)
 
 
 def study(
-    pictures: Pictures, limit: float, seed: int, rrmsd: float, *, linear: int = LINEAR, full: int = FULL,
+    pictures: Traced, limit: float, seed: int, rrmsd: float, *, linear: int = LINEAR, full: int = FULL,
     progress: Progress = lambda *told: None, spread: Spread = here,
 ) -> Study:  # fmt: skip
     """Sensitivities and trials.  spread: where pictures are traced.
 
+    limit and rrmsd are those of the figure of merit, of a wavefront its RMS in waves, as are all figures of the study.
     rrmsd: of the design, by independent rays.  Tubes have an error, the same in every trial: its square is taken off
     each RRMSD², so that the trials compare with the design's own figure.
     """
@@ -254,9 +310,9 @@ def study(
     off = superposed.rrmsd**2 - rrmsd**2
     amounts = trials(perturbations, seed, range(linear))
     traced = []
-    for k, rrmsd_of_it in enumerate(spread(Pictures.rrmsd, pictures, amounts[:full]), 1):
+    for k, rrmsd_of_it in enumerate(spread(_figure, pictures, amounts[:full]), 1):
         traced.append(rrmsd_of_it)
-        progress("trials", k, min(full, linear), f"RRMSD {rrmsd_of_it:.4f}")
+        progress("trials", k, min(full, linear), f"{pictures.figure} {rrmsd_of_it:.4f}")
     adjusted = [adjust(superposed, with_adjustments, amounts[k]) for k in range(len(traced))]
     return Study(
         perturbations, superposed, _sensitivities(superposed, perturbations, off), limit=limit, seed=seed, rrmsd=rrmsd,
@@ -276,7 +332,7 @@ def _sensitivities(superposed: Model, perturbations: Sequence[Perturbation], off
     sigmas = np.diag(superposed.sigmas[:n])
     either = (_less(superposed.rrmsds(sigmas), off) + _less(superposed.rrmsds(-sigmas), off)) / 2
     added = np.sum(superposed.first[:n] ** 2, axis=1)
-    changes, shares = either - _less(np.array([superposed.rrmsd]), off), added / added.sum()
+    changes, shares = either - _less(np.array([superposed.rrmsd]), off), added / (added.sum() or 1.0)
     each = [
         Sensitivity(
             name=p.kind.name, words=p.kind.words, unit=p.kind.unit, limit=p.limit, distribution=p.distribution,
@@ -319,27 +375,35 @@ def adjust(superposed: Model, perturbations: Sequence[Perturbation], amounts: np
     return float(superposed.rrmsds(moved(best.x)))
 
 
-def loosest(study: Study, wanted: float) -> tuple[tuple[Perturbation, ...], Yield]:
+def loosest(study: Study, wanted: float, others: Sequence[Study] = ()) -> tuple[tuple[Perturbation, ...], Yield]:
     """The loosest tolerances that keep a yield (0 … 1), and their yield by independent trials.
+
+    others: studies of further goals by the same trials; a lens passes that keeps to all limits, over which the squares
+    q_i of all goals add up.
 
     Holding error i at u_i times its limit costs c_i / u_i and adds q_i u_i² to the mean square of the picture.  The
     least cost for a given sum of the latter is at u_i ∝ (c_i / q_i)^(1/3); one factor on all then brings the yield, by
     the model.
     """
-    perturbations = study.perturbations
-    added = np.maximum(np.sum(study.model.first[: len(perturbations)] ** 2, axis=1), 1e-30)
+    perturbations, goals = study.perturbations, (study, *others)
+    added = sum(
+        (study.limit / goal.limit) ** 2 * np.sum(goal.model.first[: len(perturbations)] ** 2, axis=1) for goal in goals
+    )
+    added = np.maximum(added, 1e-30)
     shape = np.cbrt(np.array([p.cost for p in perturbations]) / added)
     shape /= np.exp(np.mean(np.log(shape)))
-    off = study.model.rrmsd**2 - study.rrmsd**2
     even = np.random.default_rng((study.seed, OTHER)).random((LINEAR, len(perturbations)))
     unit = draws(perturbations, even)
 
+    def all_kept(amounts: np.ndarray) -> np.ndarray:
+        return np.logical_and.reduce([goal.kept(amounts) for goal in goals])
+
     def excess(log_factor: float) -> float:
         widths = np.minimum(np.exp(log_factor) * shape, WIDEST)
-        return float(np.mean(_less(study.model.rrmsds(unit * widths), off) <= study.limit)) - wanted
+        return float(np.mean(all_kept(unit * widths))) - wanted
 
     log_factor = 10.0 if excess(10.0) >= 0 else brentq(excess, -10.0, 10.0, xtol=1e-4)
     widths = np.minimum(np.exp(log_factor) * shape, WIDEST)
     loose = tuple(replace(p, limit=float(p.limit * w)) for p, w in zip(perturbations, widths, strict=True))
     fresh = trials(loose, study.seed + OTHER, range(LINEAR))
-    return loose, study.share(_less(study.model.rrmsds(fresh), off))
+    return loose, share_of(all_kept(fresh))

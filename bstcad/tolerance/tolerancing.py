@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +18,16 @@ from bstcad.optics.measure import Effort, measure
 from bstcad.report import tolerances
 from bstcad.report.drawing import png
 from bstcad.report.light_figures import SHOWN, View, histogram, worst_trials
-from bstcad.report.tolerances import Grade, Inverse, Tolerances, Trial
+from bstcad.report.tolerances import Grade, Inverse, TargetStudy, Tolerances, Trial, WavefrontStudy
 from bstcad.runs import files
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
+from bstcad.scene.target import Target
 from bstcad.tolerance import study as studies
 from bstcad.tolerance.grades import GRADES, perturbations, start_of, whole_table
 from bstcad.tolerance.perturbations import Kind, Setup, perturbed, trials
-from bstcad.tolerance.study import Pictures, Progress, Spread, Study, here
+from bstcad.tolerance.study import Pictures, Progress, Spread, Study, Yield, here, share_of
+from bstcad.tolerance.wavefronts import Wavefronts
 from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, Nominal
 
 TUBES = 1031  # a side, a channel: their error is the same in every trial
@@ -44,26 +49,25 @@ def tolerance(
         scene, nominal = read_nominal(folder)
         if nominal.ghost is not None:
             raise SceneError("[[effects]] ghost: tolerances do not follow stray light yet; remove it from scene.toml")
-        pictures = _pictures(scene, nominal, grade, tubes)
-        light = measure(
-            nominal.lens, nominal.channels, nominal.screen, nominal.target,
-            effort=nominal.effort(Effort(witness=False)), draw=nominal.draw,
-        )  # fmt: skip
-        limit = scene.accept.rrmsd or DEFAULT_RRMSD_LIMIT
-        if wanted is not None and not light.rrmsd < limit:
-            raise SceneError(
-                f"accept.rrmsd: the design itself is at {light.rrmsd:.4f}, not below {limit:g}, and no tolerances "
-                "keep a yield; design it better, or allow more in scene.toml"
-            )
-        study = studies.study(
-            pictures, limit, seed, light.rrmsd, linear=trials, full=full, progress=progress, spread=spread or here
-        )
-        record = _record(study, wanted, name=scene.name, grade=_grade(scene, grade), tubes=tubes)
-        if len(scene.targets) > 1:
-            record = replace(record, target=scene.target_keys[0])
+        pictures, limit = _pictures(scene, nominal, grade, tubes), scene.accept.rrmsd or DEFAULT_RRMSD_LIMIT
+        goals = [("accept.rrmsd", each, limit, _rrmsd(nominal, each)) for each in pictures]
+        if scene.wavefront is not None:
+            setup, errors = pictures[0].setup, pictures[0].perturbations
+            waves = Wavefronts(setup, errors, scene.wavefront, scene.source.main_wavelength)
+            goals.append(("accept.wavefront", waves, scene.accept.wavefront or math.inf, waves.designed))
+        for key, _, most, designed in goals if wanted is not None else ():
+            if not designed < most:
+                raise SceneError(
+                    f"{key}: the design itself is at {designed:.4f}, not below {most:g}, and no tolerances "
+                    "keep a yield; design it better, or allow more in scene.toml"
+                )
+        of = partial(studies.study, linear=trials, full=full, progress=progress, spread=spread or here)
+        found = [of(goal, most, seed, designed) for _, goal, most, designed in goals]
+        study = studies.worst_of(found[: len(pictures)])
+        record = _record(study, found, wanted, scene=scene, grade=_grade(scene, grade), tubes=tubes)
         progress("report", 0, 1, "")
         tolerances.write(record, amended / "tolerance.json")
-        drawn = _drawn(scene, pictures, study)
+        drawn = _drawn(scene, pictures[0], study, own=found[0])
         figures = files.folder_in_place(amended / "figures")
         for name, picture in drawn.items():
             files.put(figures / f"{name}.png", picture)
@@ -80,18 +84,27 @@ def write_trial(
 ) -> tuple[tuple[Kind, float], ...]:  # fmt: skip
     """The lens of one trial as a STEP file, in its own frame; its amounts by kind, decentres and tilts among them."""
     scene, nominal = read_nominal(folder)
-    pictures = _pictures(scene, nominal, grade, TUBES)
+    pictures = _pictures(scene, nominal, grade, TUBES)[0]
     [amounts] = trials(pictures.perturbations, seed, [number])
     lens = perturbed(pictures.setup, pictures.perturbations, amounts).lens
     step_writing.write_lens(lens, path, f"{scene.name}, trial {number}")
     return tuple((p.kind, float(a)) for p, a in zip(pictures.perturbations, amounts, strict=True))
 
 
-def _pictures(scene: Scene, nominal: Nominal, grade: str | None, tubes: int) -> Pictures:
+def _pictures(scene: Scene, nominal: Nominal, grade: str | None, tubes: int) -> tuple[Pictures, ...]:
+    """Of each target; the errors are the same for all, and screens move alike."""
     channels = scene.channels(POINTS) if scene.source.extent else scene.channels()
     setup = Setup(nominal.lens, channels, scene.target.screen)
     errors = perturbations(setup, whole_table(scene.tolerance, grade), scene.lens.material)
-    return Pictures(setup, errors, nominal.target, tubes)
+    return tuple(Pictures(replace(setup, screen=goal.screen), errors, goal.target, tubes) for goal in nominal.goals)
+
+
+def _rrmsd(nominal: Nominal, pictures: Pictures) -> float:
+    """Of the design on the screen of these pictures, by rays."""
+    return measure(
+        nominal.lens, nominal.channels, pictures.setup.screen, pictures.target,
+        effort=nominal.effort(Effort(witness=False)), draw=nominal.draw,
+    ).rrmsd  # fmt: skip
 
 
 def _grade(scene: Scene, grade: str | None) -> Grade:
@@ -103,36 +116,73 @@ def _grade(scene: Scene, grade: str | None) -> Grade:
     return Grade(name, words)
 
 
-def _record(study: Study, wanted: float | None, *, name: str, grade: Grade, tubes: int) -> Tolerances:
-    def percentiles(rrmsds: np.ndarray) -> dict[str, float]:
-        return {f"{p} %": float(np.percentile(rrmsds, p)) for p in (5, 50, 95)}
-
-    off, names = study.disagreement, [error.kind.name for error in study.perturbations]
+def _record(
+    study: Study, goals: Sequence[Study], wanted: float | None, *, scene: Scene, grade: Grade, tubes: int
+) -> Tolerances:  # fmt: skip
+    """study: of the worst target; goals: of each target, and of the wavefront if one is wanted."""
+    count = len(scene.targets)
+    each, wave = goals[:count], goals[count] if len(goals) > count else None
+    names = [error.kind.name for error in study.perturbations]
     worst = zip(study.worst, trials(study.perturbations, study.seed, study.worst).tolist(), strict=True)
     inverse = None
     if wanted is not None:
-        loose, kept = studies.loosest(study, wanted)
+        loose, kept = studies.loosest(goals[0], wanted, goals[1:])
         inverse = Inverse(wanted, kept, {error.kind.name: error.limit for error in loose})
     return Tolerances(
-        name=name, version=bstcad.__version__, grade=grade, seed=study.seed, tubes=tubes, limit=study.limit,
+        name=scene.name, version=bstcad.__version__, grade=grade, seed=study.seed, tubes=tubes, limit=study.limit,
         rrmsd=study.rrmsd, trials=len(study.linear), full_trials=len(study.full),
-        passed=study.share(study.linear), passed_full=study.share(study.full),
-        passed_adjusted=study.share(study.adjusted),
-        rrmsd_trials=percentiles(study.linear), rrmsd_full=percentiles(study.full),
-        rrmsd_adjusted=percentiles(study.adjusted),
-        model_off={"median": float(np.median(off)), "95 %": float(np.percentile(off, 95))},
-        sensitivities=study.sensitivities,
+        passed=_together(goals, "linear"), passed_full=_together(goals, "full"),
+        passed_adjusted=_together(goals, "adjusted"),
+        rrmsd_trials=_percentiles(study.linear), rrmsd_full=_percentiles(study.full),
+        rrmsd_adjusted=_percentiles(study.adjusted), model_off=_disagreement(study),
+        sensitivities=tuple(
+            replace(s, wavefront_change=wave and wave.change_of(s.name)) for s in study.sensitivities
+        ),
         worst=tuple(Trial(k, float(study.full[k]), dict(zip(names, amounts, strict=True))) for k, amounts in worst),
         inverse=inverse,
+        targets=tuple(map(_of_target, scene.target_keys, scene.targets, each)) if count > 1 else None,
+        wavefront=wave and _of_wavefront(wave),
     )  # fmt: skip
 
 
-def _drawn(scene: Scene, pictures: Pictures, study: Study) -> dict[str, bytes]:
-    """The pictures of the report's section."""
+def _of_target(key: str, target: Target, study: Study) -> TargetStudy:
+    return TargetStudy(
+        key=key, z=target.z, rrmsd=study.rrmsd, passed=study.share(study.linear), passed_full=study.share(study.full),
+        passed_adjusted=study.share(study.adjusted), rrmsd_trials=_percentiles(study.linear),
+        rrmsd_full=_percentiles(study.full), rrmsd_adjusted=_percentiles(study.adjusted),
+        model_off=_disagreement(study), sensitivities=study.sensitivities,
+    )  # fmt: skip
+
+
+def _of_wavefront(study: Study) -> WavefrontStudy:
+    asked = math.isfinite(study.limit)
+    return WavefrontStudy(
+        limit=study.limit if asked else None, rms=study.rrmsd, passed=study.share(study.linear) if asked else None,
+        passed_full=study.share(study.full) if asked else None, rms_trials=_percentiles(study.linear),
+        rms_full=_percentiles(study.full), model_off=_disagreement(study),
+    )  # fmt: skip
+
+
+def _together(goals: Sequence[Study], trials: str) -> Yield:
+    """Share of these trials ("linear", "full" or "adjusted") that keep to the limits of all goals."""
+    return share_of(np.logical_and.reduce([getattr(goal, trials) <= goal.limit for goal in goals]))
+
+
+def _percentiles(figures: np.ndarray) -> dict[str, float]:
+    return {f"{p} %": float(np.percentile(figures, p)) for p in (5, 50, 95)}
+
+
+def _disagreement(study: Study) -> dict[str, float]:
+    off = study.disagreement
+    return {"median": float(np.median(off)), "95 %": float(np.percentile(off, 95))}
+
+
+def _drawn(scene: Scene, pictures: Pictures, study: Study, own: Study) -> dict[str, bytes]:
+    """The pictures of the report's section, on the first target; own: its study, that of the worst target `study`."""
     shown = study.worst[:SHOWN]
     amounts = trials(study.perturbations, study.seed, shown)
-    worst = [(k, float(study.full[k]), pictures.light(z)) for k, z in zip(shown, amounts, strict=True)]
+    worst = [(k, float(own.full[k]), pictures.light(z)) for k, z in zip(shown, amounts, strict=True)]
     nominal = pictures.light(np.zeros(len(study.perturbations)))
     rrmsds = histogram(study.rrmsd, study.limit, linear=study.linear, full=study.full, adjusted=study.adjusted)
-    drawn = rrmsds, worst_trials(study.rrmsd, nominal, worst, View.of(scene))
+    drawn = rrmsds, worst_trials(own.rrmsd, nominal, worst, View.of(scene))
     return dict(zip(tolerances.FIGURES, map(png, drawn), strict=True))

@@ -23,7 +23,12 @@ RECORDS = {  # of each JSON file: the module's file and its records, the file's 
         ("judges/comparison.py", ["Judge"]),
         ("report/prescription.py", ["Order"]),
     ],
-    "tolerance.json": [("report/tolerances.py", ["Tolerances", "Grade", "Sensitivity", "Trial", "Inverse"])],
+    "tolerance.json": [
+        (
+            "report/tolerances.py",
+            ["Tolerances", "Grade", "Sensitivity", "Trial", "Inverse", "TargetStudy", "WavefrontStudy"],
+        )
+    ],
     "batch.json": [("sweep/batch.py", ["Batch", "Row"])],
     "tradeoff.json": [
         ("sweep/results.py", ["Table", "TableKnob", "Calibration", "Preset", "Place"]),
