@@ -134,7 +134,7 @@ class WavefrontFigures:
     rms_with_tilt: Size  # waves, piston alone removed
     tilt_urad: tuple[float, float]  # removed; light that leans towards +x and towards +y of the wanted light
     angle_rms_urad: Size  # between rays and wanted rays, each ray by its flux; tilt included
-    angle_max_urad: Size
+    angle_max_urad: Size  # between rays and wanted rays
     floor: Size  # waves that rounding may add to the RMS
     flux: Share  # of the source's flux, that is measured
     removed: Literal["piston and tilt"] = "piston and tilt"  # before rms and pv

@@ -414,7 +414,7 @@ def test_a_ghost_brings_the_reflections_of_its_faces_by_the_coating_that_is_name
 @pytest.mark.parametrize("quality", PRESETS)
 def test_every_knob_gets_a_value(quality):
     knobs = Tailoring(quality=quality).resolved(513)
-    assert {key for key, value in knobs.model_dump().items() if value is None} == {"accuracy", "max_time", "solution"}  # no limits, no choice
+    assert {key for key, value in knobs.model_dump().items() if value is None} == {"accuracy", "max_time", "solution"}
     assert knobs.levels == (33, 129, 513)
     each_way = 2**0.5 if quality == "draft" else 2  # rays a control cell: at least two
     assert knobs.rays >= each_way * 513 and knobs.stage2_iterations > 0
