@@ -20,7 +20,7 @@ from torch import Tensor
 
 from bstcad.optics.channels import Channel, weighted_sum
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels.reductions import total
+from bstcad.optics.kernels.reductions import quotient, total
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import RayTubes
 from bstcad.optics.rays import Rays
@@ -90,7 +90,7 @@ class JointMerit:
         images, beyond = zip(*(sheet.collect(corners, goal.screen) for sheet, corners in pairs), strict=True)
         image, outside = weighted_sum(channels, images), weighted_sum(channels, beyond)
         arrived = weighted_sum(channels, (total(arriving(sheet.flux, corners)) for sheet, corners in pairs))
-        off = total((image / left - target) ** 2) / size
+        off = total((quotient(image, left) - target) ** 2) / size
         seen = image.detach() / total(image.detach())
         merit = off + self.overshoot * outside / left + (1 - arrived / flux)
         return merit, (total((seen - target) ** 2) / size).sqrt()
@@ -106,7 +106,7 @@ class JointMerit:
         opd = (path + way - self.wave.path(x, y, wavelength)) / (wavelength * NM)
         opd = torch.where(held, opd, torch.zeros_like(opd))
         share = flux / total(flux)
-        piston = total(share * opd)
+        piston = total(share * opd).detach()  # the mean makes the sum least: there is no gradient in it
         return total(share * (opd - piston) ** 2)
 
 

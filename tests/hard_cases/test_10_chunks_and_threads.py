@@ -28,12 +28,15 @@ from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import compiling
 from bstcad.optics.lens import Lens
+from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.measure import RayTubes
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.trace import Simulation, from_first_net, to_first_net
+from bstcad.optics.wavefront import SphericalWave
 from bstcad.scene.scene import load
+from bstcad.tailoring.goals import Goal, JointMerit
 from bstcad.tailoring.merit import SobolevVariable, TubeMerit
 from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.transport.density import Density
@@ -44,6 +47,7 @@ ROOT = Path(__file__).parent.parent.parent
 SOURCE = Point(position=(1.0, -2.0, 0.0), profile="uniform", half_angle=35.0)
 GAUSSIAN = {"profile": "gaussian", "half_angle_1e2": 30.0}
 SCREEN = Screen(300.0, (-70.0, 90.0), (-80.0, 60.0), 192)  # 36 864 pixels: torch shares sums of more than 32 768
+FURTHER = replace(SCREEN, z=600.0, x=(-150.0, 170.0), y=(-160.0, 140.0))
 RAYS, TUBES = 300, 260  # each way: four parts
 
 
@@ -61,6 +65,24 @@ def target() -> torch.Tensor:
     wave = torch.sin(torch.arange(SCREEN.pixels, dtype=torch.float64) / 9) ** 2
     picture = wave[:, None] * wave[None, :] + 0.1
     return picture / picture.sum()
+
+
+def of_two_faces(dtype) -> dict[str, torch.Tensor]:
+    """Merit and gradients of two nets for two pictures of lossy light, and for a wave beside them."""
+    back = lens(dtype).back
+    front = replace(back, z=15.0, heights=-0.1 * back.heights.flip(0, 1))
+    held = Lens(front, back, Circle(10.0), 1.5, shaped=(0, 1))
+    light = (Channel(SOURCE, held.index, losses=Losses(Fresnel(587.6), Absorption(0.01))),)
+    goals = [Goal(screen, target().numpy(), weight) for screen, weight in ((SCREEN, 1.0), (FURTHER, 2.0))]
+    found = {}
+    for name, wave in (("two faces", None), ("two faces and a wave", SphericalWave((0.0, 0.0, -80.0), 30.0))):
+        merit = JointMerit.of(light, held, TUBES, goals, overshoot=0.03, wave=wave)
+        leaves = [net.heights.clone().requires_grad_() for net in held.nets]
+        value, _ = merit(merit.landing(held.with_heights(leaves)))
+        gradients = torch.autograd.grad(value, leaves)
+        found |= {f"merit, {name}": value.detach()}
+        found |= {f"gradient, {name}, {face}": g for face, g in zip(("front", "back"), gradients, strict=True)}
+    return found
 
 
 def by_rays(found: Simulation) -> dict[str, torch.Tensor]:
@@ -85,7 +107,7 @@ def image_and_gradient(dtype=torch.float64) -> dict[str, torch.Tensor]:
         value = merit(held.with_heights([heights]))
         found[f"merit, {name}"] = value.detach()
         found[f"gradient, {name}"] = torch.autograd.grad(value, heights)[0]
-    return found | {"image, tubes": tubes.picture(SOURCE, held, SCREEN, TUBES)}
+    return found | {"image, tubes": tubes.picture(SOURCE, held, SCREEN, TUBES)} | of_two_faces(dtype)
 
 
 def everything(dtype=torch.float64) -> dict[str, torch.Tensor]:

@@ -8,12 +8,13 @@ import torch
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import compiling
+from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.sources import Point
 from bstcad.scene.blank import Bounds
 from bstcad.tailoring.goals import Goal, JointMerit
 from bstcad.tailoring.machinability import excess
 from bstcad.tailoring.stage2 import Problem
-from tests.tailoring.test_two_faces import BEAM, WAVES, N, bumpy, merit_of, picture
+from tests.tailoring.test_two_faces import BEAM, FAR, NEAR, WAVES, N, bumpy, merit_of, picture
 
 POINT = Point((0.5, 0.0, -300.0), half_angle=1.2, wavelength=600.0)
 OBLONG = Screen(30.0, (-9.0, 9.0), (-6.0, 6.0), (24, 16))
@@ -31,6 +32,12 @@ def two_lines(lens, source, wave=None):
     return JointMerit.of(channels, lens, 40, goals, overshoot=0.03, wave=wave)
 
 
+def lossy(lens, source):
+    """The merit of light of which faces and glass take some."""
+    channel = Channel(source, N, losses=Losses(Fresnel(600.0), Absorption(0.01)))
+    return JointMerit.of((channel,), lens, 40, [Goal(NEAR, picture(0)), Goal(FAR, picture(1))], overshoot=0.03)
+
+
 def bowl():
     """The back as a bowl so steep that it reflects some of the light."""
     faces = bumpy(m=13)
@@ -46,6 +53,7 @@ CASES = {  # the lens, how its merit is made, the bounds on its faces
     "a plane wave": (FACES, partial(merit_of, wave=WAVES["plane"]), None),
     "a point and a spherical wave": (FACES, partial(merit_of, source=POINT, wave=WAVES["sphere"]), None),
     "two lines and a wave": (FACES, partial(two_lines, source=BEAM, wave=WAVES["zernike"]), None),
+    "losses": (FACES, partial(lossy, source=BEAM), None),
     "lost rays": (BOWL, merit_of, None),
     "lost rays and a wave": (BOWL, partial(merit_of, wave=WAVES["zernike"]), None),
     "faces that touch": (FACES, merit_of, TOUCHING),

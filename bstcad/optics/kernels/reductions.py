@@ -41,6 +41,26 @@ def total(t: Tensor) -> Tensor:
     return flat[:whole].view(-1, ROW).sum(1).sum() + flat[whole:].sum()
 
 
+def quotient(t: Tensor, whole: Tensor) -> Tensor:
+    """t / whole, a number, differentiable in both: torch's own gradient in the number is one long sum."""
+    return Quotient.apply(t, whole)
+
+
+class Quotient(torch.autograd.Function):
+    """(t, whole) -> t / whole, with the gradient in the number `whole` as a sum in fixed parts."""
+
+    @staticmethod
+    def forward(ctx, t: Tensor, whole: Tensor):  # noqa: D102
+        ctx.save_for_backward(whole, divided := t / whole)
+        return divided
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, g: Tensor):  # noqa: D102
+        whole, divided = ctx.saved_tensors
+        return g / whole, -total(g * divided) / whole
+
+
 def elementary(function: Callable[[Tensor], Tensor], t: Tensor) -> Tensor:
     """exp, sin, cos … of each number of t, differentiable: by the same vector code for the same number, always."""
     if t.device.type != "cpu" or t.numel() <= ELEMENTARY:

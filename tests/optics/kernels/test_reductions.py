@@ -46,6 +46,20 @@ def test_no_bit_depends_on_the_number_of_threads(threads, dtype):
     assert reductions.dot(a, b) == pytest.approx(exact, abs=1e-14 * float((a.double() * b.double()).abs().sum()))
 
 
+def test_a_quotient_has_the_gradient_of_torchs_own_from_any_number_of_threads(threads):
+    t, weight = noise(700, 600), noise(600, 700).T
+    whole = torch.tensor(1.3, dtype=torch.float64)
+
+    def gradients(of):
+        leaves = [t.clone().requires_grad_(), whole.clone().requires_grad_()]
+        return torch.autograd.grad(reductions.total(of(*leaves) * weight), leaves)
+
+    found = [gradients(reductions.quotient) for _ in threads()]
+    assert all(torch.equal(g, own) for each in found for g, own in zip(each, found[0], strict=True))
+    for g, own in zip(found[0], gradients(torch.div), strict=True):
+        torch.testing.assert_close(g, own, rtol=1e-12, atol=0)
+
+
 def test_parts_that_reach_some_rows_and_parts_that_reach_none():
     """Buffers are not clear before they are reached: here they are full of what was there before."""
     rows = [[], [(4, 6), (9, 10), (2, 5)], [(0, 3)], [(11, 12), (7, 8)]]
