@@ -77,8 +77,8 @@ class FrontRound:
 
     round: int  # of those that are done
     lens: Parameters
-    front: Grid  # q(t) (mm), at the corners of the nearest target's pixels
-    back: Grid  # b(t) likewise
+    wanted: SlopeMap  # that the front follows; its places are q(t) (mm), at the corners of the nearest target's pixels
+    back: Grid  # b(t) (mm) likewise
 
 
 class Aims(NamedTuple):
@@ -106,10 +106,10 @@ def steps(task: Task, lens: Lens, state: FrontRound | None = None) -> Iterator[S
 
 def follow(task: Task, lens: Lens, state: FrontRound | None) -> Iterator[Step]:
     """The rounds; all but the last two work on coarse grids and nets, and end once they are settled."""
-    knobs, z, done, places = task.knobs, lens.back.z, 0, None
+    knobs, z, done, wanted = task.knobs, lens.back.z, 0, None
     light = behind_lens(task, lens)
     if state is not None:
-        lens, done, places = state.lens.applied(lens), state.round, state.front
+        lens, done, wanted, b = state.lens.applied(lens), state.round, state.wanted, state.back
     turn = min(done, knobs.rounds - 1)
     while turn < knobs.rounds:
         if turn >= done:
@@ -121,13 +121,13 @@ def follow(task: Task, lens: Lens, state: FrontRound | None) -> Iterator[Step]:
                 net.refined(sides) for net, sides in zip(lens.nets, task.sides(lens, level), strict=True)
             )
             fit = stage1.FINE if fine else stage1.COARSE
+            places = None if wanted is None else wanted.places
             lens, wanted, b = _round(task, lens, light, places, turn=turn, cells=cells, fit=fit)
             lens = moved_clear(lens, z, task.least, task.bounds)
-            places = wanted.places
             task.tidy()
         turn = max(turn + 1, knobs.rounds - FINE_ROUNDS if wanted.moved <= SETTLED else 0)
         yield Step(
-            partial(_final, task, lens), FrontRound(turn, Parameters.of(lens), wanted.places, b),
+            partial(_final, task, lens), FrontRound(turn, Parameters.of(lens), wanted, b),
             mapping=wanted.mapping, places=b, progress=("stage 1", turn, knobs.rounds, ""),
         )  # fmt: skip
 

@@ -40,6 +40,7 @@ from bstcad.tailoring.goals import Goal, JointMerit
 from bstcad.tailoring.merit import SobolevVariable, TubeMerit
 from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.transport.density import Density
+from tests import two_faces
 from tests.conftest import DISK, SMALL
 from tests.tracing import launch, simulated, simulated_plain
 
@@ -208,30 +209,48 @@ def test_one_thread_and_other_strips_make_the_same_design(threads, monkeypatch, 
         assert np.array_equal(found, wanted["control_points"])
 
 
+def test_any_number_of_threads_makes_the_same_two_faces(threads):
+    """For a picture and a wave, by more corners than one thread of torch takes: 32 768."""
+    quick = {"tailoring": two_faces.SMALL["tailoring"] | {"rays": 200, "rounds": 2, "stage2_iterations": 12}}
+    scene, found = load(DISK, two_faces.SMALL | two_faces.WITH_WAVE | quick), []
+    for n in (1, 2, 4):
+        threads(n)
+        found.append([net.control_points() for net in pipeline.design(scene, device="cpu", later=True).lens.nets])
+    assert all(np.array_equal(*each) for other in found[1:] for each in zip(found[0], other, strict=True))
+
+
 PROCESSORS = {  # what BLAS, torch and numba take the processor for
     "as it is": {}, "MKL_CBWR=COMPATIBLE": {"MKL_CBWR": "COMPATIBLE"}, "MKL_CBWR=AVX2": {"MKL_CBWR": "AVX2"},
     "torch without vector units": {"ATEN_CPU_CAPABILITY": "default"}, "any, to numba": {"NUMBA_CPU_NAME": "generic"},
 }  # fmt: skip
 
 
-def digest_of_a_design(threads: int) -> str:
-    """The control points of a design of 129 x 129, with a front that is searched for; on so many threads."""
+LARGER = {"lens.back.control_points": 65, "tailoring.rays": 200, "tailoring.transport_grid": 64}
+TAILORED = {  # a front that is searched for; two nets for two pictures, and for a picture and a wave
+    "one net": SMALL | {"lens.back.control_points": 129, "tailoring.rays": 300, "lens.front.optimise": True},
+    "two nets": two_faces.SMALL | LARGER,
+    "two nets and a wave": two_faces.SMALL | two_faces.WITH_WAVE | LARGER,
+}
+
+
+def digest_of_a_design(name: str, threads: int) -> str:
+    """The control points of a design on so many threads."""
     torch.set_num_threads(threads)
-    larger = {"lens.back.control_points": 129, "tailoring.rays": 300, "lens.front.optimise": True}
-    back = pipeline.design(load(DISK, SMALL | larger), device="cpu").lens.back
-    return hashlib.sha256(back.control_points().tobytes()).hexdigest()
+    nets = pipeline.design(load(DISK, TAILORED[name]), device="cpu").lens.nets
+    return hashlib.sha256(b"".join(net.control_points().tobytes() for net in nets)).hexdigest()
 
 
 @pytest.mark.bench
 @pytest.mark.parametrize("processor", PROCESSORS)
-def test_any_processor_and_any_number_of_threads(processor):
+@pytest.mark.parametrize("name", TAILORED)
+def test_any_processor_and_any_number_of_threads(name, processor):
     """Other processors round otherwise, but each the same on any number of threads; processes of their own."""
     digests = {}
     for threads in (1, 2, 4):
         counts = {f"{library}_NUM_THREADS": str(threads) for library in ("NUMBA", "OMP", "MKL", "OPENBLAS")}
-        code = f"import bstcad, {__name__} as m; print(m.digest_of_a_design({threads}))"
+        code = f"import bstcad, {__name__} as m; print(m.digest_of_a_design({name!r}, {threads}))"
         given = os.environ | counts | PROCESSORS[processor] | {"PYTHONPATH": str(ROOT)}
         done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=given, capture_output=True, text=True)
         digests[threads] = done.stdout.strip()
-    print(f"{processor}: {digests}")
+    print(f"{name}, {processor}: {digests}")
     assert len(set(digests.values())) == 1 and all(len(digest) == 64 for digest in digests.values()), digests
