@@ -55,13 +55,13 @@ class Demand:
         )
         if self.crossed > SAID:
             yield (
-                f"rays of {100 * self.crossed:.2g} % of the light would have to cross between the lens and the nearest "
+                f"rays of {100 * self.crossed:.3g} % of the light would have to cross between the lens and the nearest "
                 "target; there the further goals are met as far as rays that do not cross allow: bring the nearest "
                 "target closer to the lens, or move the others further away"
             )
         if self.outside > SAID:
             yield (
-                f"{100 * self.outside:.2g} % of the light would have to leave the back outside of lens.outline; "
+                f"{100 * self.outside:.3g} % of the light would have to leave the back outside of lens.outline; "
                 "make the targets smaller, or the lens wider"
             )
         if self.in_glass > self.limit:

@@ -11,6 +11,7 @@ from bstcad.optics.measure import Effort, measure
 from bstcad.scene.scene import load
 from bstcad.sweep.estimates import diagnosis
 from tests.benchmarks.cold import TEMPLATES, generate
+from tests.hard_cases.designs import as_toml
 
 pytestmark = pytest.mark.bench
 SMALL = {"lens.back.control_points": 129, "target.pixels": 256, "tailoring.rays": 520}
@@ -82,3 +83,23 @@ def test_memory_does_not_grow_with_the_control_points(tmp_path):
     few, many = (designed(tmp_path / str(m), *rough, f"lens.back.control_points={m}")[0] for m in (129, 513))
     assert many["rrmsd"] <= 0.15
     assert many["machine"]["peak_memory_gb"] < 2 * few["machine"]["peak_memory_gb"]
+
+
+# 513 control points each; fewer evaluations than standard quality takes, by the same tubes: 1024², 1536² and 2048²
+TWO_FACES = {
+    "source.aperture": {"shape": "rectangle", "width": 20.0, "height": 20.0},
+    "lens.front": {"kind": "bspline", "z": 8.0, "optimise": True, "control_points": 513},
+    "target": [
+        {"z": 100.0, "x": [-11.0, 11.0], "y": [-11.0, 11.0], "pixels": 512, "uniform": True},
+        {"z": 300.0, "x": [-14.0, 14.0], "y": [-14.0, 14.0], "pixels": 512, "sample": "astronaut"},
+    ],
+    "tailoring.stage2_iterations": 40,
+}
+
+
+def test_two_nets_for_two_pictures_take_less_than_6_gb(tmp_path):
+    """At its peak, with writing and proof."""
+    report, _ = designed(tmp_path, *(f"{key}={as_toml(value)}" for key, value in TWO_FACES.items()))
+    stages = [stage["name"] for stage in report["stages"]]
+    assert "stage 2, 2048² tubes" in stages
+    assert 1.0 < report["machine"]["peak_memory_gb"] < 6.0
