@@ -22,7 +22,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from bstcad.optics.interfaces import Interface, dimmed
+from bstcad.optics.interfaces import Interface, dimmed, net_bounds
 from bstcad.optics.kernels import kernel_arguments, reductions
 from bstcad.optics.kernels.compiling import compiled
 from bstcad.optics.kernels.forward import (
@@ -51,7 +51,7 @@ from bstcad.optics.kernels.forward import (
     to_screen,
 )
 from bstcad.optics.kernels.spline import curved, net_of, scatter
-from bstcad.optics.rays import Landed, Rays, TargetPlane
+from bstcad.optics.rays import Landed, Rays, Status, TargetPlane
 
 # The adjoint also keeps of a block: ∂L/∂ of landing or hit and direction, of path and cosine of incidence, and second
 # derivatives of the sag.
@@ -357,6 +357,8 @@ def behind(rays: Rays, interface: Interface) -> Rays:
 def _across(rays: Rays, interface: Interface, plane: TargetPlane | None) -> tuple[Tensor, Rays]:
     """(out of `Cross`, the rays with flux and status as behind the face)."""
     shape, heights, lossy = rays.status.shape, interface.surface.heights, bool(interface.losses)
+    if rays.axial and interface.status_if_missed == Status.MISSED_FRONT:
+        rays = _begun_before(rays, interface)
     ways = (upright(t, rays.sense).reshape(3, -1).contiguous() for t in (rays.position, rays.direction))
     crossing = Crossing(*kernel_arguments.faces(interface, plane, rays.sense, rays.z), plane is not None, lossy)
     out, status, path, cos_in = Cross.apply(
@@ -367,6 +369,20 @@ def _across(rays: Rays, interface: Interface, plane: TargetPlane | None) -> tupl
         cos_in, path = cos_in.view(shape), path.view(shape)
         left = dimmed(left, cos_in, interface.law.turned(cos_in)[1], path=path, losses=interface.losses)
     return out.view(len(out), *shape), left
+
+
+def _begun_before(rays: Rays, interface: Interface) -> Rays:
+    """Light along the axis from a source, begun before all of a net.
+
+    Where such a beam begins is a matter of convention: interfaces.intersect meets the net without a look at it, and the
+    kernels, which find no way back, would lose the light where a deep net reaches further.
+    """
+    surface, sense = interface.surface, rays.sense
+    lowest = net_bounds(surface, torch.float64, sense).lowest
+    short = float((sense * rays.above(surface.z)).detach().max()) - lowest
+    if not short > 0:
+        return rays
+    return replace(rays, z=rays.z - sense * short)
 
 
 def upright(vectors: Tensor, sense: int) -> Tensor:

@@ -63,6 +63,20 @@ def test_landings_and_their_gradient(scene, dtype):
     close(g, g_plain, dtype, float(g_plain.abs().max()), roundings=1e4 if dtype == torch.float64 else 10)
 
 
+def test_a_beam_meets_a_front_that_reaches_beyond_where_it_begins():
+    """12 mm before the front of a lens 20 mm wide: where a beam begins is a convention, to the closed form none."""
+    front = replace(deep(depth=-30.0), z=15.0)
+    lens = Lens(front, deep(), Rectangle(20.0, 20.0), 1.6, shaped=(0, 1))
+    beam = Collimated(Rectangle(17.0, 17.0))
+    x, y = stratified(Rectangle(17.0, 17.0), 60, 0)
+    rays, interface = beam.rays(x, y, 15.0, 1.0), lens.interfaces[0]
+    assert float(front.sag_and_slope(x, y)[0].min()) < rays.z - 5.0
+    fused, plain = trace.behind(rays, interface), trace.across(rays, (interface,))
+    assert fused.alive.all() and torch.equal(fused.status, plain.status)
+    for ours, wanted in ((fused.position, plain.position), (fused.direction, plain.direction)):
+        torch.testing.assert_close(ours, wanted, rtol=1e-12, atol=1e-12)
+
+
 PLANES = {"level": 120.0, "tilted": TiltedPlane((3.0, 2.0, 120.0), (20.0, -10.0), 5.0)}
 LOSSES = Losses(Fresnel(587.6), Absorption(0.01))
 NETS = {  # a lens, and the rays on their way to its net
