@@ -53,7 +53,8 @@ def make_small(scene, path):
     text = re.sub(r"control_points = \d+", "control_points = 33", text)
     text = re.sub(r"pixels = \d+", "pixels = 48", text)
     text = re.sub(r"source_points = \d+", "source_points = 4", text)
-    text = re.sub(r"rrmsd = [\d.]+", "rrmsd = 0.3", text)
+    text = re.sub(r"rrmsd = [\d.]+", "rrmsd = 0.4", text)
+    text = re.sub(r"wavefront = [\d.]+", "wavefront = 1.0", text)
     few = "" if scene.name == "thu.toml" else "\nrays = 192"  # `bstcad plan` knows no scenes with knobs of their own
     if "quality = " in text:
         text = re.sub(r'quality = "\w+"(.*\nrays = \d+)?', f'quality = "draft"{few}', text)
