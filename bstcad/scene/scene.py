@@ -170,7 +170,7 @@ class Scene(Record):
 
     def warnings(self) -> tuple[str, ...]:
         """Sentences on settings that are possible but perhaps not meant."""
-        doubts = [*self._metres(), *self.lens.doubts()]
+        doubts = [*self._metres(), *self.lens.doubts(), *_idle_front(self)]
         if isinstance(self.source, Collimated):
             key = "mount.rim" if self.mount and self.mount.rim else "lens.outline"
             doubts += _beam(self.source.aperture, self.rim, key)
@@ -468,6 +468,15 @@ def _of_wavefront(wave: Wave | None, source: Source, lens: LensBlank, accept: Ac
     yield from (f"wavefront.{complaint}" for complaint in wave.complaints(lens.back.z))
     if isinstance(wave, ZernikeWave) and not wave.steepest(source.main_wavelength) < math.sin(ALONG):
         yield "wavefront.coefficients: the wave is too steep to have rays; make them smaller, or the radius larger"
+
+
+def _idle_front(scene: Scene) -> Iterator[str]:
+    """Two faces to tailor for one goal: the back meets it alone."""
+    if scene.lens.shaped == (0, 1) and len(scene.targets) == 1 and scene.wavefront is None:
+        yield (
+            "lens.front.optimise: one picture is the back's work alone, and the front stays as it is; add a second "
+            "[[target]] or a [wavefront], or set lens.back.optimise = false to have the front tailored instead"
+        )
 
 
 def _mesh(tolerance: float | None, lens: LensBlank) -> Iterator[str]:

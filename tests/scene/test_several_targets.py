@@ -20,7 +20,8 @@ from bstcad.scene.scene import load
 from bstcad.scene.target import Target
 
 HERE = Path(__file__).parent
-TEMPLATES = sorted((HERE.parent.parent / "templates").glob("*.toml"))
+EVERY = sorted((HERE.parent.parent / "templates").glob("*.toml"))
+TEMPLATES = [path for path in EVERY if "[[target]]" not in path.read_text(encoding="utf-8")]
 THU, THREE = HERE.parent.parent / "templates" / "thu.toml", HERE / "three_targets.toml"
 RAMP = np.linspace(0.0, 3.0, 32)[:, None] * np.ones((1, 32))
 

@@ -18,6 +18,8 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 
 DISK, MIRROR = "templates/disk.toml", "templates/mirror.toml"  # a square lens, its front at 15, its back at 20
+BEAM = {"kind": "collimated", "wavelength": 633.0, "aperture": {"shape": "circle", "radius": 8.0}}
+WAVE = {"kind": "plane", "z": 60.0}
 FLAT = {"kind": "bspline", "z": 15.0, "optimise": True}
 
 
@@ -49,7 +51,19 @@ def test_a_front_that_is_tailored_goes_through_its_file(disk, more, tmp_path):
     front = scene.lens.front
     assert front.shaped and not front.fixed and front.free == () and front.given is None
     assert scene.lens.front_sags == (0.0, 0.0) and scene.rim_sags == disk.rim_sags  # those of a plane
-    assert scene.warnings() == disk.warnings()
+    assert len(scene.warnings()) == len(disk.warnings()) + 1  # see the next test
+
+
+def test_a_front_without_a_goal_of_its_own_is_said_to_stay_as_it_is(disk):
+    further = disk.target.model_copy(update={"z": 2 * disk.target.z})
+    idle = [
+        warning
+        for goals in ({}, {"wavefront": WAVE}, {"target": [disk.target, further]}, {"lens.back.optimise": False})
+        for warning in with_front(disk, {"source": BEAM} | goals).warnings()
+        if warning.startswith("lens.front.optimise: ")
+    ]
+    assert len(idle) == 1 and "the front stays as it is; add a second [[target]] or a [wavefront], or" in idle[0]
+    assert not any("optimise" in warning for warning in disk.changed({"lens.front": a_net(disk)}).warnings())
 
 
 def test_a_given_net_may_be_where_tailoring_starts(disk, tmp_path):
