@@ -170,7 +170,7 @@ class Scene(Record):
 
     def warnings(self) -> tuple[str, ...]:
         """Sentences on settings that are possible but perhaps not meant."""
-        doubts = [*self._metres(), *self.lens.doubts(), *_idle_front(self)]
+        doubts = [*self._metres(), *self.lens.doubts(), *_of_goals(self)]
         if isinstance(self.source, Collimated):
             key = "mount.rim" if self.mount and self.mount.rim else "lens.outline"
             doubts += _beam(self.source.aperture, self.rim, key)
@@ -470,13 +470,24 @@ def _of_wavefront(wave: Wave | None, source: Source, lens: LensBlank, accept: Ac
         yield "wavefront.coefficients: the wave is too steep to have rays; make them smaller, or the radius larger"
 
 
-def _idle_front(scene: Scene) -> Iterator[str]:
-    """Two faces to tailor for one goal: the back meets it alone."""
-    if scene.lens.shaped == (0, 1) and len(scene.targets) == 1 and scene.wavefront is None:
+def _of_goals(scene: Scene) -> Iterator[str]:
+    """As many goals as tailored faces can all be met: with fewer a front is idle, with more none is met whole."""
+    lens, pictures = scene.lens, len(scene.targets)
+    goals, shaped = pictures + (scene.wavefront is not None), lens.shaped or (1,)
+    if goals < len(shaped):
         yield (
             "lens.front.optimise: one picture is the back's work alone, and the front stays as it is; add a second "
             "[[target]] or a [wavefront], or set lens.back.optimise = false to have the front tailored instead"
         )
+    if goals > len(shaped):
+        faces, remedy = "two tailored faces, which meet", "state what matters by weight, or ask for less"
+        if len(shaped) == 1:
+            faces = "one tailored face, which meets"
+            front = f'lens.front = {{ kind = "bspline", z = {lens.front.z:g}, optimise = true }}'
+            also = f"have the front tailored too, {front}" if shaped == (1,) else "remove lens.back.optimise = false"
+            remedy = "a mirror has no second face, so state what matters by weight" if lens.back.reflect else also
+        key = "target" if pictures > 1 else "wavefront"
+        yield f"{key}: {goals} goals for {faces} them only as far as least squares by their weights go; {remedy}"
 
 
 def _mesh(tolerance: float | None, lens: LensBlank) -> Iterator[str]:

@@ -180,7 +180,8 @@ def test_warnings_and_remarks_name_their_target(three):
     assert [w for w in scene.warnings() if "fit" in w][0].startswith("target[1].fit: the picture is 512 x 512, the tar")
     scene = three.changed({"target[0].x": [-0.1, 0.1], "target[0].y": [-0.1, 0.1]})
     assert any(w.startswith("target[0].x: 0.2 mm wide; are these metres?") for w in scene.warnings())
-    assert three.warnings() == ()
+    [compromise] = three.warnings()
+    assert compromise.startswith("target: 3 goals for two tailored faces, which meet them only as far as least squares")
 
 
 # ---- images ----------------------------------------------------------------------------------------------------------
