@@ -257,7 +257,7 @@ Trial = option(int | None, "N", "Write the lens of this trial as trial-N.step, a
 Kinds = option(str | None, "NAMES", f"{EXPORTS}, or several with commas between.", "--as")
 Points = option(int | None, "N", "Points along the wider side of grids (default: as many as control points).")
 Png = place("FILE", "A picture to write.", "--png", "-o")
-ReachPng = place("FILE", "Draw the target and the part of it that light can reach.", "--png")
+ReachPng = place("FILE", "Draw the target, and the part of it that light can reach; a second one into FILE_2.", "--png")
 # Of tradeoff, batch and keys.
 Budget = option(
     float, "S",
@@ -312,16 +312,18 @@ def plan(scene: SceneFile, settings: Settings = None, as_json: AsJson = False, p
         wanted = load_scene(scene, settings)
         from bstcad import folder as folders
         from bstcad.report import report as reports
+        from bstcad.scene.target import numbered
         from bstcad.sweep.plan import plan as planned
         from bstcad.sweep.plan import reach_drawn
 
     warn(wanted)
     wanted, choice = with_net_said(wanted)
     given = wanted, scene.read_text(encoding="utf-8-sig"), [setting.partition("=")[0] for setting in settings or []]
+    drawn = () if png is None else reach_drawn(wanted)
     parts = planned(*given)
     effects = next(parts)
-    if png is not None:
-        files.put(png, reach_drawn(wanted))
+    for k, picture in enumerate(drawn):
+        files.put(png.with_stem(numbered(png.stem, k)), picture)
     if as_json:
         net = {"control_points": asdict(choice)} if choice else {}
         sizes = {"files": {"lens.step": round(folders.step_size(wanted))}}

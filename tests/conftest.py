@@ -134,6 +134,12 @@ def draws_nothing(patch):
     patch.setattr("bstcad.commands.Pictures", NoPictures)
 
 
+def pixels_of_all(path, pixels):
+    """Overrides by which each target of a scene file has so many pixels."""
+    number = path.read_text(encoding="utf-8").count("[[target]]")
+    return {key: pixels for key in [f"target[{k}].pixels" for k in range(number)] or ["target.pixels"]}
+
+
 def quick_effort():
     """As many tubes and rays as it takes to resolve the small design, and few points where files are compared."""
     from bstcad.optics.measure import Effort

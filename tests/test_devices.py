@@ -20,17 +20,18 @@ from bstcad.scene.scene import load
 from bstcad.tailoring import stage2
 from bstcad.tailoring.merit import TubeMerit
 from bstcad.tailoring.stage2 import Problem
+from tests.conftest import pixels_of_all
 from tests.fake_device import SECOND, SecondDevice, on_second
 
 TEMPLATES = sorted((Path(__file__).parent.parent / "templates").glob("*.toml"))
 TINY = {
     "lens.back.control_points": 33,
-    "target.pixels": 25,  # odd, as the tubes are even: in a symmetric lens no edge of a tube runs along a pixel border
     "tailoring.rays": 48,
     "tailoring.transport_grid": 32,
     "tailoring.rounds": 2,
     "tailoring.source_points": 4,
 }
+PIXELS = 25  # odd, as the tubes are even: in a symmetric lens no edge of a tube runs along a pixel border
 QUALITIES = {
     "draft": {"tailoring.stage2_iterations": 1},
     "standard": {"tailoring.stage2_iterations": 31},  # three rounds
@@ -60,7 +61,7 @@ BOUNDED = ("machinable_letters", "paper")  # the paper's procedure knows no boun
 
 
 def scene(template, quality):
-    return load(template, TINY | {"tailoring.quality": quality} | QUALITIES[quality])
+    return load(template, TINY | pixels_of_all(template, PIXELS) | {"tailoring.quality": quality} | QUALITIES[quality])
 
 
 @pytest.mark.parametrize(

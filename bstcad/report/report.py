@@ -22,7 +22,7 @@ from bstcad.runs import files
 from bstcad.verify.verdict import Check
 
 if TYPE_CHECKING:
-    from rich.console import Group
+    from rich.console import Group, RenderableType
     from rich.table import Table
     from rich.text import Text
 
@@ -242,26 +242,39 @@ def plan_effects(plan: Mapping[str, Any], title: str, optic: str) -> Group:
     from rich.table import Table
     from rich.text import Text
 
-    simulated, left_out = _table("simulated", "<asked for by"), _table("left out", "light on target", "RRMSD", "blur")
-    remedies = Table.grid(padding=(0, 2))
+    simulated, remedies = _table("simulated", "<asked for by"), Table.grid(padding=(0, 2))
     for item in plan["simulated"]:
         simulated.add_row(Text(item["what"]), Text(item["asked_by"]))
     for entry in (LeftOut(**entry) for entry in plan["left_out"]):
-        detail = (f", {entry.detail}" if entry.detail else "", "dim")
-        left_out.add_row(Text.assemble(LEFT_OUT[entry.kind], detail), *changes(entry))
         if entry.simulate_by:
             remedies.add_row(Text(f"  {LEFT_OUT[entry.kind]}"), Text(entry.simulate_by))
-    lines = [Text(title, "bold"), simulated, left_out, Text(ESTIMATED.format(optic))]
-    if beyond := plan.get("unreachable"):
-        lines += [Text(), Text(UNREACHABLE.format(**{k: percent(beyond[k]) for k in ("area", "light")}, optic=optic))]
-        if beyond["angle"] is not None:
-            lines.append(Text(TURNED.format(**beyond)))
-    if plan["blur"] is not None:
-        image = {key: number(value) for key, value in plan["blur"].items()}
-        lines += [Text(), Text(IMAGE.format(**image, optic=optic))]
+    lines, further = [Text(title, "bold"), simulated], plan.get("further", ())
+    for each in (plan, *further):
+        lines += _of_target(each, f", {each.get('target', 'target[0]')}" if further else "", optic)
+    lines.append(Text(" ".join(filter(None, (ESTIMATED.format(optic), plan.get("caveat"))))))
     if remedies.row_count:
         lines += [Text(), Text("To have it simulated, write in the scene:"), remedies]
     return Group(*lines)
+
+
+def _of_target(plan: Mapping[str, Any], of: str, optic: str) -> Iterator[RenderableType]:
+    """What a plan says of the light of one target; of: ", target[1]" where there are several."""
+    from rich.text import Text
+
+    left_out = _table(f"left out{of}", "light on target", "RRMSD", "blur")
+    for entry in (LeftOut(**entry) for entry in plan["left_out"]):
+        detail = (f", {entry.detail}" if entry.detail else "", "dim")
+        left_out.add_row(Text.assemble(LEFT_OUT[entry.kind], detail), *changes(entry))
+    yield left_out
+    if beyond := plan.get("unreachable"):
+        yield Text(UNREACHABLE.format(**{k: percent(beyond[k]) for k in ("area", "light")}, optic=optic))
+        if beyond["angle"] is not None:
+            yield Text(TURNED.format(**beyond))
+        yield Text()
+    if plan["blur"] is not None:
+        image = {key: number(value) for key, value in plan["blur"].items()}
+        yield Text(IMAGE.format(**image, optic=optic))
+        yield Text()
 
 
 def plan_predictions(plan: Mapping[str, Any]) -> Group:

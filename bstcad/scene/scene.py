@@ -189,6 +189,15 @@ class Scene(Record):
         several = len(self.targets) > 1
         return tuple(f"target[{k}]" for k in range(len(self.targets))) if several else ("target",)
 
+    def each_alone(self) -> tuple[Self, ...]:
+        """The scene once for each target, which it has alone, and no wavefront: what is known of one picture at a time.
+
+        A front that is tailored keeps nothing to do then; see `warnings`.
+        """
+        if len(self.targets) == 1:
+            return (self,)
+        return tuple(self.model_copy(update={"targets": (each,), "wavefront": None}) for each in self.targets)
+
     @model_serializer(mode="wrap")
     def _written(self, handler: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
         """As a file has it: `target` is a table, or a list of several."""

@@ -24,7 +24,7 @@ from bstcad.analysis.cost import TILE, ControlCells
 from bstcad.analysis.light import blur
 from bstcad.optics.interfaces import cross
 from bstcad.optics.lens import Lens
-from bstcad.optics.sides import Sides, coarser, in_words, spread
+from bstcad.optics.sides import Sides, both, coarser, in_words, spread
 from bstcad.optics.tubes import area_of, collect, launch_tubes
 from bstcad.report.units import duration, number, two_digits
 from bstcad.scene.blank import LARGEST_NET
@@ -103,7 +103,12 @@ def with_net(scene: Scene) -> tuple[Scene, Choice | None]:
 
 
 def chosen(scene: Scene) -> Choice:
-    """The choice for a scene without a net."""
+    """The choice for a scene without a net; of several targets that which asks for the finest one."""
+    return max((_chosen(each) for each in scene.each_alone()), key=lambda choice: math.prod(both(choice.net)))
+
+
+def _chosen(scene: Scene) -> Choice:
+    """The choice for a scene of one target."""
     tried = [scene.changed({KEY: net}) for net in nets(scene)]
     lens, screen, target = coarse_lens(tried[0]), scene.target.screen, scene.target.irradiance()
     light, image = cells_of_a_mm2(tried[0], lens), blur(tried[0].channels(), lens, screen, target)

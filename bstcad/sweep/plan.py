@@ -44,6 +44,7 @@ from bstcad.tailoring.stage2 import blurred_sheets, sheets
 
 FITTED = Path(__file__).with_name("fitted.json")
 Interval = tuple[float, float, float]  # low, likely, high
+ALONE = "The lens is one for this target alone, by its back alone: one of several goals or faces turns light otherwise."
 
 
 def plan(
@@ -57,32 +58,58 @@ def plan(
     blur: width (mm, and pixels) of the image that a source of some size throws through the coarse lens, and the RRMSD
     of the target convolved with this image; None: the source has no size.
 
+    further: the last three of each further target, by its key; only there if there are several.  caveat: what the lens
+    of the estimates lacks of the scene's, a sentence; only there if it lacks anything.
+
     text: of the scene file, whose lines are named.  keys: that the command line gives instead.  units: measures the
     units of this machine.
     """
-    at, lens = toml_positions(text), coarse_lens(scene)
+    at, (first, *others) = toml_positions(text), scene.each_alone()
     asked = [{"what": what, "key": key, **_asked(key, at, keys)} for what, key in simulated(scene)]
+    lens = coarse_lens(first)
+    found = {"simulated": asked, **_effects(first, lens)}
+    if others:
+        pairs = zip(scene.target_keys[1:], others, strict=True)
+        found["further"] = [{"target": key, **_effects(alone, coarse_lens(alone))} for key, alone in pairs]
+    if others or scene.lens.front.shaped:
+        found["caveat"] = ALONE
+    yield found
+    yield rounded(outlook(scene, lens, units), 3)
+
+
+def _effects(scene: Scene, lens: Lens) -> dict[str, Any]:
+    """The entries left_out, blur and unreachable of `plan`, of the light of one target; lens: a coarse one for it."""
     picture = scene.target.irradiance()
     part, _ = reachable_part(scene, picture)
     target = restricted(picture, part)
     beyond = None if part is None else unreached(picture, part, None if lens.reflects else scene.index)
     estimates, image = left_out(scene, lens, target), blur(scene.channels(), lens, scene.target.screen, target)
-    left = [asdict(estimate) for estimate in estimates]
-    yield {
-        "simulated": asked, "left_out": left, "blur": image and rounded(asdict(image), 3),
+    return {
+        "left_out": [asdict(estimate) for estimate in estimates], "blur": image and rounded(asdict(image), 3),
         "unreachable": beyond and rounded(beyond, 3),
     }  # fmt: skip
-    yield rounded(outlook(scene, lens, units), 3)
 
 
-def reach_drawn(scene: Scene) -> bytes:
-    """A PNG of the target and the part of it that light can reach."""
+def reach_drawn(scene: Scene) -> tuple[bytes, ...]:
+    """A PNG of each target and the part of it that light can reach.  SceneError for a front that is tailored."""
     from bstcad.report.drawing import png
     from bstcad.report.light_figures import View, reach_picture
 
+    if scene.lens.front.shaped:
+        raise SceneError(
+            "--png: draws what light can reach by way of a tailored back, and here the front is tailored; leave it "
+            "out: `bstcad generate` says first what such a lens cannot do"
+        )
+    return tuple(
+        png(reach_picture(each.target.irradiance(), _reached_part(each), View.of(each))) for each in scene.each_alone()
+    )
+
+
+def _reached_part(scene: Scene) -> np.ndarray:
+    """(rows, columns) True in the pixels that light can reach."""
     picture = scene.target.irradiance()
     part, _ = reachable_part(scene, picture)
-    return png(reach_picture(picture, np.ones(picture.shape, dtype=bool) if part is None else part, View.of(scene)))
+    return np.ones(picture.shape, dtype=bool) if part is None else part
 
 
 def _asked(key: str, at: Mapping[str, int], keys: Sequence[str]) -> dict[str, Any]:
@@ -325,6 +352,8 @@ def _bounds(scene: Scene) -> Iterator[tuple[Any, str, str]]:
     integrated = scene.tailoring.method == "integration"
     yield integrated, "tailored lenses", 'tailoring.method = "integration" tailors none'
     yield len(scene.source.lines) > 1, "one wavelength", "source.wavelength has several"
+    yield len(scene.targets) > 1, "one target", f"the scene has {len(scene.targets)}"
+    yield scene.wavefront is not None, "pictures alone", "the scene has a [wavefront]"
     tilted = scene.source.tilt or scene.target.tilt
     yield tilted, "sources and targets that look along the axis", "here one is tilted"
     yield front not in ("plane", "sphere"), "plane and spherical fronts", f'lens.front.kind = "{front}"'

@@ -50,6 +50,13 @@ def test_a_picture_of_fewer_pixels_gets_a_coarser_net():
     assert [max(sides(PLATE.changed({"target.pixels": pixels}))) for pixels in (64, 128, 512)] == [257, 513, 1025]
 
 
+def test_several_targets_get_the_net_of_the_most_demanding_one():
+    target = PLATE.target.model_dump(mode="json", exclude_none=True)
+    two = PLATE.changed({"target": [target | {"pixels": 64}, target | {"z": 640.0, "pixels": 256}]})
+    alone = [chosen(each).net for each in two.each_alone()]
+    assert alone[0] < alone[1] == chosen(two).net == with_net(two)[0].lens.back.net
+
+
 def test_time_memory_and_the_tool_bound_it(monkeypatch):
     free = chosen(PLATE)
     timely = chosen(PLATE.changed({"tailoring.max_time": 25.0}))

@@ -30,6 +30,7 @@ from bstcad.sweep.plan import (
     seconds,
 )
 from tests.benchmarks.prediction_scenes import FIT, KEPT_OUT, NET, PIXELS, PLAIN
+from tests.conftest import pixels_of_all
 
 ROOT = Path(__file__).parent.parent.parent
 TEMPLATES = ROOT / "templates"
@@ -220,11 +221,49 @@ def test_what_is_simulated_names_the_line_that_asks_for_it(tmp_path):
 
 @pytest.mark.parametrize("path", sorted(TEMPLATES.glob("*.toml")), ids=lambda path: path.stem)
 def test_every_template_has_a_plan(path):
-    scene = load(path, FEW)
+    scene = load(path, pixels_of_all(path, 48))
     found = next(plan(scene, path.read_text(encoding="utf-8")))
     assert [item["what"] for item in found["simulated"]] == [words for words, _ in simulated(scene)]
     assert all(item["line"] for item in found["simulated"])
     assert any(entry["rrmsd_change"] for entry in found["left_out"])
+
+
+TWO = {  # pictures, behind a back that is tailored
+    "target": [{"z": z, "x": [-20.0, 20.0], "y": [-20.0, 20.0], "pixels": 32, "uniform": True} for z in (220.0, 660.0)],
+    "lens.back.control_points": 65,
+}  # fmt: skip
+
+
+def test_each_target_has_its_own_estimates():
+    """Three times as far off the image of the source's cone is three times as wide."""
+    scene = load(TEMPLATES / "caustic_portrait.toml").changed(TWO | {"source.real_divergence": 0.5})
+    found, predicted = plan(scene)
+    [further] = found["further"]
+    near, far = (
+        next(entry for entry in each["left_out"] if entry["kind"] == "source size") for each in (found, further)
+    )
+    assert further["target"] == "target[1]" and far["blur_pixels"] / near["blur_pixels"] == pytest.approx(3, rel=0.1)
+    alone = next(plan(scene.changed({"target": scene.targets[1]})))
+    assert further["left_out"] == alone["left_out"] and "further" not in alone and "caveat" not in alone
+    assert found["caveat"] == plans.ALONE
+    assert predicted["not_predicted"] == "predictions were fitted on one target, and the scene has 2"
+    wave = scene.changed({"target": scene.target, "wavefront": {"kind": "plane", "z": 220.0}})
+    assert complaint(wave) == "predictions were fitted on pictures alone, and the scene has a [wavefront]"
+
+
+def test_the_reach_of_each_target_is_drawn_and_of_two_faces_refused(tmp_path, capsys):
+    scene = load(TEMPLATES / "caustic_portrait.toml").changed(TWO | {"name": "two", "target[1].x": [-20.0, 30.0]})
+    (tmp_path / "two.toml").write_text(scene.toml(), encoding="utf-8")
+    png = tmp_path / "reach.png"
+    assert cli.run(["plan", str(tmp_path / "two.toml"), "--png", str(png)]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "left out, target[0]" in out and "left out, target[1]" in out and plans.ALONE in out
+    first, second = (png.with_stem(stem).read_bytes() for stem in ("reach", "reach_2"))
+    assert first.startswith(b"\x89PNG") and second.startswith(b"\x89PNG") and first != second
+    both = tmp_path / "both.png"
+    assert cli.run(["plan", str(TEMPLATES / "two_pictures.toml"), "--png", str(both)]) == 2
+    assert "--png: draws what light can reach by way of a tailored back" in capsys.readouterr().err
+    assert not both.exists()
 
 
 def test_the_image_of_a_chip_is_stated_before_the_design():
