@@ -97,6 +97,8 @@ def design(
     later: float32 is compared with float64 when a report asks for it (`Made.told`), and not where none is made.
     """
     began = time.perf_counter() if began is None else began
+    if merit is not None and (len(scene.targets) > 1 or scene.wavefront is not None):
+        raise SceneError("merit: is one of a picture, and the scene has several goals; leave it out, or ask for less")
     torch.manual_seed(scene.tailoring.seed)
     device = device_for(device)
     picture = scene.target.irradiance()

@@ -11,9 +11,11 @@ import pytest
 import torch
 
 import bstcad
+from bstcad import pipeline
 from bstcad.judges.faces import Traced
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import sag
+from bstcad.scene.errors import SceneError
 from tests.conftest import draws_nothing, quick_effort
 
 OUTLINE = Rectangle(16.0, 16.0)
@@ -75,6 +77,12 @@ def test_a_surface_that_no_net_comes_near_is_refused(scene):
     rough = Asphere(15.0, 0.0, 0.5, 0.0)
     with pytest.raises(bstcad.SceneError, match="control points come within .* mm of the asphere, and 1e-06 mm are"):
         scene.changed({"lens.front": rough})
+
+
+def test_a_merit_of_its_own_is_refused_for_several_goals(scene):
+    two = scene.changed({"target": [scene.target, scene.target.model_copy(update={"z": 2 * scene.target.z})]})
+    with pytest.raises(SceneError, match="^merit: is one of a picture, and the scene has several goals; leave it out"):
+        pipeline.design(two, merit=lambda picture, target: ((picture - target) ** 2).sum())
 
 
 def test_a_merit_of_its_own_is_made_less_than_by_rrmsd(scene):

@@ -578,6 +578,15 @@ class Report:
         )
 
 
+def of_worst_target(report: Mapping[str, Any]) -> dict[str, float | None]:
+    """rrmsd, rrmsd_noise, leak and light_on_target of a report.json; of several targets those of the largest RRMSD."""
+    keys = {"rrmsd": "rrmsd", "rrmsd_noise": "rrmsd_noise", "leak": "leak", "light_on_target": "light_on_target"}
+    if not report.get("targets"):
+        return {key: report[key] for key in keys}
+    worst = max(report["targets"], key=lambda each: math.inf if each["rrmsd"] is None else each["rrmsd"])
+    return {key: worst[name] for key, name in (keys | {"rrmsd_noise": "rrmsd_standard_error"}).items()}
+
+
 def rrmsds(report: Contents) -> str:
     """The RRMSD, or that of each of several targets, in their order."""
     return ", ".join(number(each.rrmsd) for each in report.targets or (report,))

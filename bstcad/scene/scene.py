@@ -38,7 +38,7 @@ from bstcad.scene.effects import Effects
 from bstcad.scene.errors import SceneError, about, explain, line_of, toml_positions
 from bstcad.scene.mount import Mount, Part
 from bstcad.scene.picture import Picture
-from bstcad.scene.quality import JUDGE_DRAW, JUDGE_POINTS, Tailoring, Tolerance, tolerance_complaints
+from bstcad.scene.quality import JUDGE_DRAW, JUDGE_POINTS, PRESETS, WHOLE, Tailoring, Tolerance, tolerance_complaints
 from bstcad.scene.schema import FILE, Record, of_model
 from bstcad.scene.target import Target, Targets, coplanar
 
@@ -153,6 +153,7 @@ class Scene(Record):
         yield from coplanar(self.targets)
         yield from _of_wavefront(self.wavefront, source, lens, accept=self.accept)
         yield from self.tailoring.complaints(lens)
+        yield from _of_method(self)
         yield from tolerance_complaints(self.tolerance)
         yield from _mesh(self.output.mesh_tolerance, lens)
         yield from self.part.complaints(lens)
@@ -477,6 +478,15 @@ def _of_wavefront(wave: Wave | None, source: Source, lens: LensBlank, accept: Ac
     yield from (f"wavefront.{complaint}" for complaint in wave.complaints(lens.back.z))
     if isinstance(wave, ZernikeWave) and not wave.steepest(source.main_wavelength) < math.sin(ALONG):
         yield "wavefront.coefficients: the wave is too steep to have rays; make them smaller, or the radius larger"
+
+
+def _of_method(scene: Scene) -> Iterator[str]:
+    """A method that knows one picture, in a scene of several goals."""
+    goals = len(scene.targets) + (scene.wavefront is not None)
+    method = scene.tailoring.method or PRESETS[scene.tailoring.quality]["method"]
+    who, key = WHOLE.get(method, ("", ""))
+    if who and goals > 1:
+        yield f"{key}: {who} serves one picture alone, and the scene has {goals} goals; choose another {key}"
 
 
 def _of_goals(scene: Scene) -> Iterator[str]:

@@ -22,6 +22,7 @@ import psutil
 import bstcad
 from bstcad import folder as folders
 from bstcad.pipeline import Saved, purpose
+from bstcad.report.record import of_worst_target
 from bstcad.runs import environment, files, processes
 from bstcad.runs.checkpoint import Keeper
 from bstcad.runs.cluster import Answer, Cluster, Machines
@@ -54,7 +55,7 @@ class Row(Stored):
     scene: str  # the file, as the user named it
     name: str = ""  # of the scene and of the design's folder
     status: str = STOPPED  # its verdict (verify.verdict.VERDICTS), REFUSED, BROKEN or STOPPED
-    rrmsd: float | None = None  # of the report
+    rrmsd: float | None = None  # of the report; this and the next three: of several targets on the worst
     rrmsd_noise: float | None = None  # its standard error
     leak: float | None = None  # share of the light on the target that falls where the target is dark
     light_on_target: float | None = None  # share of the light of the source
@@ -242,7 +243,7 @@ def _ended(row: Row, answer: Answer, folder: Path, here: bool) -> Row:
         seconds=report["seconds_total"],
         report=f"{row.name}/report.html",
         design=_design_in(folder / row.name),
-        **{key: report[key] for key in ("rrmsd", "rrmsd_noise", "leak", "light_on_target")},
+        **of_worst_target(report),
     )
 
 

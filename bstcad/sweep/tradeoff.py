@@ -91,16 +91,17 @@ def knobs(scene: Scene) -> tuple[Knob, ...]:
         value = getattr(known, name)
         return _numbers(f"tailoring.{name}", value, (round(share * value) for share in of), limits)
 
+    presets = PRESETS if _by_paper(scene) else [name for name in PRESETS if name != "paper"]
     nets = {own, *filter(_possible, (scaled(own, share) for share in (1 / 4, HALF, 1, 2, 4)))}
     every = (
-        Knob("quality", "Quality presets", _choices("tailoring.quality", scene.tailoring.quality, PRESETS)),
+        Knob("quality", "Quality presets", _choices("tailoring.quality", scene.tailoring.quality, presets)),
         Knob("evaluations", "Evaluations of stage 2", shares("stage2_iterations", (1 / 8, 1 / 4, HALF, 1, 2, 4))),
         Knob("tubes", "Rays a side" if adam else "Ray tubes a side",
              shares("rays", (1 / 4, HALF, ROOT, 1, 1 / ROOT, 2))),
         Knob("control_points", "Control points a side", _choices(NET_KEY, own, sorted(nets))),
-        Knob("adam", "Adam on control points, by rays", _adam(known.quality == "paper")),
+        Knob("adam", "Adam on control points, by rays", _adam(known.quality == "paper") if _by_paper(scene) else {}),
         Knob("precision", "Precision", _choices("tailoring.precision", known.precision, ("float32", "float64"))),
-        Knob("pixels", "Pixels tailored to", _pixels(*scene.target.columns_rows)),
+        Knob("pixels", "Pixels tailored to", _pixels(scene)),
         Knob("rounds", "Rounds of stage 1", {} if adam else _numbers("tailoring.rounds", known.rounds, ROUNDS)),
         Knob("transport_grid", "Transport grid, cells a side", shares("transport_grid", (1 / 4, HALF, 1, 2), GRIDS)),
         Knob("transport_iterations", "Transport iterations", shares("transport_iterations", (1 / 8, 1 / 4, 1, 2))),
@@ -111,6 +112,15 @@ def knobs(scene: Scene) -> tuple[Knob, ...]:
             (NET_KEY, own, (1 / 4, HALF, 1, 2)), ("tailoring.rays", known.rays, (1 / 4, HALF, 1, 2))), combines=True),
     )  # fmt: skip
     return tuple(knob for knob in every if len(knob.points) > 1)
+
+
+def _by_paper(scene: Scene) -> bool:
+    """Can the paper's procedure design the scene?  It knows one picture and one tailored face, and no bounds on it."""
+    try:
+        scene.changed({"tailoring.quality": "paper"})
+    except SceneError:
+        return False
+    return True
 
 
 def _choices(key: str, own: Value, values: Iterable[Value]) -> Points:
@@ -126,12 +136,16 @@ def _possible(net: Sides) -> bool:
     return NETS[0] <= max(both(net)) <= NETS[1]
 
 
-def _pixels(columns: int, rows: int) -> Points:
-    """Coarser and finer pictures to tailor to; the lens is judged on the base's pixels."""
-    sizes = [(round(share * columns), round(share * rows)) for share in (1 / 4, HALF, 1, 2)]
-    fit = [size for size in sizes if PIXELS[0] <= min(size) and max(size) <= PIXELS[1]]
-    own, *values = (size[0] if columns == rows else size for size in ((columns, rows), *fit))
-    return _choices("target.pixels", own, values)
+def _pixels(scene: Scene) -> Points:
+    """Coarser and finer pictures to tailor to, all targets' together; the lens is judged on the base's pixels."""
+    own, points = [target.columns_rows for target in scene.targets], {}
+    for share in (1 / 4, HALF, 1, 2):
+        sizes = [(round(share * columns), round(share * rows)) for columns, rows in own]
+        if share == 1 or all(PIXELS[0] <= min(size) and max(size) <= PIXELS[1] for size in sizes):
+            values = [columns if columns == rows else (columns, rows) for columns, rows in sizes]
+            changed = {f"{key}.pixels": value for key, value in zip(scene.target_keys, values, strict=True)}
+            points[" and ".join(map(as_text, values))] = () if share == 1 else settings(changed)
+    return points
 
 
 def _adam(own: bool) -> Points:
@@ -217,7 +231,7 @@ OVER = 0.1  # of the budget, by which a run may go beyond it that takes longer t
 MORE = 1.5  # times as long a run may take that was ended before and is begun again
 JUDGE = (
     "stratified rays that tailoring never saw, in independent sets, until the standard error is below {:.2%} of the "
-    "RRMSD; {} x {} pixels; the lens as read back from its folder"
+    "RRMSD; {} pixels; the lens as read back from its folder"
 )
 UNKNOWN = dict.fromkeys(("seconds", "cpu_seconds", "kernel_seconds", "cost_seconds"))  # of a run that was not run
 
@@ -416,7 +430,7 @@ def table(
         versions=of_all.versions if of_all else {},
         reference={
             "rays": sorted({run.rays for run in runs if run.rays}),
-            "what": JUDGE.format(REFERENCE.accuracy, *scene.target.columns_rows),
+            "what": JUDGE.format(REFERENCE.accuracy, _judged_on(scene)),
         },
         calibration=Calibration(
             seconds=statistics.median(unit) if unit else None, lowest=min(unit, default=None),
@@ -441,6 +455,12 @@ def table(
         seeds=seed_matters(scene, knobs, {run.settings: run for run in runs}),
         history=timed[()].history if () in timed else (),
     )  # fmt: skip
+
+
+def _judged_on(scene: Scene) -> str:
+    """The pixels of the reference; "64 x 48"."""
+    sizes = " and ".join("{} x {}".format(*target.columns_rows) for target in scene.targets)
+    return f"the target with the largest RRMSD, of {sizes}" if len(scene.targets) > 1 else sizes
 
 
 def places(scene: Scene, knob: Knob, runs: Mapping[Settings, Run], timed: bool = True) -> tuple[Place, ...]:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from bstcad.folder import scene_files
-from bstcad.sweep.cold_run import SMALLEST, Units, rounded, units
+from bstcad.sweep.cold_run import SMALLEST, SMALLEST_PIXELS, Units, rounded, units
 from bstcad.sweep.estimates import coarse_lens
 from bstcad.sweep.plan import QUALITIES, fitted, outlook
 from tests import markdown
@@ -181,7 +181,8 @@ def main() -> None:
     parser.add_argument("--recorded", action="store_true", help="take the runs on record where there are some")
     again = not parser.parse_args().recorded
     if again:
-        run(CASES["fit"][0], "draft", **SMALLEST)  # does not count: kernels are compiled, libraries come from the disk
+        smallest = SMALLEST | {"target.pixels": SMALLEST_PIXELS}
+        run(CASES["fit"][0], "draft", **smallest)  # does not count: kernels are compiled, libraries come from the disk
     prediction_fit.write(prediction_fit.fit(list(runs("fit", again))))
     fitted.cache_clear()
     found = []

@@ -184,6 +184,21 @@ def test_warnings_and_remarks_name_their_target(three):
     assert compromise.startswith("target: 3 goals for two tailored faces, which meet them only as far as least squares")
 
 
+@pytest.mark.parametrize(("more", "key"), [
+    ({"tailoring.quality": "paper"}, "tailoring.quality: the paper's procedure"),
+    ({"tailoring.method": "integration"}, "tailoring.method: point-by-point integration"),
+])  # fmt: skip
+def test_methods_for_one_picture_refuse_several_goals(three, more, key):
+    one = load(THU)
+    assert one.changed(more)
+    wave = {"wavefront": {"kind": "plane", "z": 1200.0}}
+    for goals, number in (({"target": three.targets}, 3), (wave, 2)):
+        with pytest.raises(
+            SceneError, match=f"^{key} serves one picture alone, and the scene has {number} goals; choos"
+        ):
+            one.changed(goals | more)
+
+
 # ---- images ----------------------------------------------------------------------------------------------------------
 
 

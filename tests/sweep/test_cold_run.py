@@ -15,6 +15,7 @@ import pytest
 from bstcad import folder as folders
 from bstcad.folder import scene_files
 from bstcad.optics.measure import Effort
+from bstcad.report.record import of_worst_target
 from bstcad.runs import environment
 from bstcad.runs.cluster import Cluster
 from bstcad.sweep import tradeoff
@@ -104,6 +105,25 @@ def test_a_lens_tailored_to_other_pixels_is_judged_on_those_of_the_base(small_de
     assert abs(full.rrmsd / small_design.report["rrmsd"] - 1) < 0.1  # other rays than its proof's
     assert coarse.rrmsd < 0.9 * full.rrmsd  # four pixels in one hide errors within
     assert full.net == coarse.net and len(full.net) == 64
+
+
+def test_of_several_targets_the_worst_counts(small_design):
+    run, (scene, _) = Run(settings=(), status=DONE), folders.read_nominal(small_design.folder)
+    own = scene.target.model_dump(mode="json", exclude_none=True)
+    both = [own | {"z": scene.target.z + 40.0}, own]  # for the first of which nobody designed the lens
+    alone, first, worst = (
+        judged(run, scene.changed({"target": targets}), small_design.folder, Effort(256))
+        for targets in (own, both[0], both)
+    )
+    assert alone.rrmsd < 0.9 * first.rrmsd and worst.rrmsd == first.rrmsd
+
+
+def test_a_report_of_several_targets_is_counted_by_the_worst(small_design):
+    report, keys = small_design.report, ("rrmsd", "rrmsd_noise", "leak", "light_on_target")
+    assert of_worst_target(report) == {key: report[key] for key in keys}
+    of_one = {"rrmsd_standard_error": 1e-4, "leak": None, "light_on_target": 0.5}
+    found = of_worst_target(report | {"targets": [of_one | {"rrmsd": 0.1}, of_one | {"rrmsd": 0.3, "leak": 0.02}]})
+    assert found == {"rrmsd": 0.3, "rrmsd_noise": 1e-4, "leak": 0.02, "light_on_target": 0.5}
 
 
 def test_the_kernel_is_the_same_work_each_time():

@@ -65,6 +65,19 @@ class TestKnobs:
         assert full["control_points"] == ["129", "257", "513", "1025"]
         assert full["quality"] == ["draft", "standard", "fine", "paper"]
 
+    def test_all_targets_are_turned_together_and_the_paper_is_left_out(self, tiny):
+        target = tiny.target.model_dump(mode="json", exclude_none=True)
+        two = tiny.changed({"target": [target | {"pixels": 64}, target | {"z": 900.0, "pixels": [96, 48]}]})
+        points = {knob.key: knob.points for knob in knobs(two)}
+        assert list(points["pixels"]) == ["16 and [24, 12]", "32 and [48, 24]", "64 and [96, 48]", "128 and [192, 96]"]
+        assert dict(points["pixels"]["16 and [24, 12]"]) == {"target[0].pixels": 16, "target[1].pixels": (24, 12)}
+        for found in points.values():
+            for point in found.values():
+                two.changed(dict(point))
+        assert "paper" not in points["quality"] and "adam" not in points and "paper" in {
+            name for knob in knobs(tiny) for name in knob.points
+        }  # fmt: skip
+
     def test_presets_come_first_then_neighbours_and_the_paper_last(self, tiny):
         order = run_order(tiny, knobs(tiny))
         assert order[:2] == [(), settings({"tailoring.quality": "standard"})]  # the base is the draft
