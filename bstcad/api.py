@@ -32,7 +32,7 @@ from bstcad.optics.surfaces import Surface
 from bstcad.report import record
 from bstcad.report.drawing import png
 from bstcad.report.light_figures import View, irradiance_triptych, tones
-from bstcad.report.record import BY_HAND, Contents, Making, Report
+from bstcad.report.record import BY_HAND, Contents, Making, Report, rrmsds
 from bstcad.report.units import number, quantity
 from bstcad.runs import files
 from bstcad.runs import progress as progresses
@@ -300,13 +300,17 @@ class Design:
         """Draw the lens at work, rays and screen with it: to a PNG file, or in a window until it is closed."""
         commands.show(self._own_folder(), None if png is None else Path(png).expanduser())
 
-    def picture(self, png: str | os.PathLike[str] | None = None) -> np.ndarray:
+    def picture(self, png: str | os.PathLike[str] | None = None, *, target: int = 0) -> np.ndarray:
         """The light on the target as an eye sees it from the scene's side: grey tones (rows, columns), uint8, sRGB.
 
         A pixel of the target is a pixel of the picture, white the end of the report's scale.  As verified, or else by a
-        glance with few ray tubes.  png: a file to write it to as well.
+        glance with few ray tubes.  png: a file to write it to as well.  target: which of several, from 0.
         """
-        grey = np.ascontiguousarray(View.of(self.scene).picture(tones(self._irradiance(), self.target)))
+        wanted = self._made.targets
+        if not 0 <= target < len(wanted):
+            raise SceneError(f"target: there is no target[{target}], the last is target[{len(wanted) - 1}]; give one")
+        seen = View.of(self.scene, target).picture(tones(self._irradiance(target), wanted[target]))
+        grey = np.ascontiguousarray(seen)
         if png is not None:
             Image.fromarray(grey).save(Path(png).expanduser(), format="png")
         return grey
@@ -328,11 +332,13 @@ class Design:
         return f"Design {self.scene.name!r}{title}\n  {self._shape()}\n  {self._worth()}"
 
     def _repr_html_(self) -> str:
-        """For a notebook: the same three lines, the target and the irradiance."""
+        """For a notebook: the same three lines, each target and the irradiance on it."""
         lines = "<br>".join(html.escape(line.strip()) for line in repr(self).splitlines())
-        picture = irradiance_triptych(self.target, self._irradiance(), View.of(self.scene))
-        data = base64.b64encode(png(picture)).decode()
-        shown = f'<img alt="Target, irradiance, their difference" width="100%" src="data:image/png;base64,{data}">'
+        shown = ""
+        for k, target in enumerate(self._made.targets):
+            picture = irradiance_triptych(target, self._irradiance(k), View.of(self.scene, k))
+            data = base64.b64encode(png(picture)).decode()
+            shown += f'<img alt="Target, irradiance, their difference" width="100%" src="data:image/png;base64,{data}">'
         return f"<div>{lines}<br>{shown}</div>"
 
     def _shape(self) -> str:
@@ -349,19 +355,19 @@ class Design:
     def _worth(self) -> str:
         if self.report is not None:
             where = f", in {self.folder}" if self.folder else ""
-            return f"RRMSD {number(self.report.rrmsd)}, {self.report.verdict}{where}"
+            return f"RRMSD {rrmsds(self.report.contents)}, {self.report.verdict}{where}"
         if self._made.making.stopped == BY_HAND:
             return "changed by hand; not verified yet"
         values = [stage.rrmsd for stage in self._made.making.stages if stage.rrmsd is not None]
         return f"RRMSD {number(values[-1])} as tailored; not verified yet" if values else "not verified yet"
 
-    def _irradiance(self) -> np.ndarray:
-        """As verified, or else by a glance: (rows, columns), with the target's sum."""
+    def _irradiance(self, number: int = 0) -> np.ndarray:
+        """On a target, as verified, or else by a glance: (rows, columns), with the target's sum."""
         if self.report is not None:
-            return self.report.irradiance
-        screen = folders.nominal(self.scene, self.lens, self.target).screen
+            return (self.report.irradiance, *self.report.further_irradiance)[number]
+        screen, target = self.scene.targets[number].screen, self._made.targets[number]
         found = tubes_picture(self.lens, self.scene.channels(), screen, GLANCE).numpy()
-        return found * (self.target.sum() / found.sum())
+        return found * (target.sum() / found.sum())
 
 
 def _fitting(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:

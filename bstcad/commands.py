@@ -26,6 +26,7 @@ import bstcad
 from bstcad import folder as folders
 from bstcad.folder import Made
 from bstcad.judges import comparison
+from bstcad.judges.comparison import Compared
 from bstcad.measured import cloud as clouds
 from bstcad.measured import made_part
 from bstcad.measured.cloud import Cloud
@@ -295,11 +296,14 @@ def verify(
             with refusals(f"{path}: "):
                 proof = _proof(made, nominal, path, drawn, additions=additions, effort=effort, progress=progress)
             drawn.solid(proof.lens)
-            judged = comparison.against(
-                against, proof.lens, nominal.channels, nominal.screen, target=nominal.target, seed=nominal.seed,
-                progress=progress,
-            )  # fmt: skip
-            drawn.begin(draw_judges, judged)
+            judged: list[Compared] = []
+            for number, goal in enumerate(nominal.goals):
+                by_others = comparison.against(
+                    against, proof.lens, nominal.channels, goal.screen, target=goal.target, seed=nominal.seed,
+                    progress=progress, key=goal.key if nominal.further else "",
+                )  # fmt: skip
+                drawn.begin(draw_judges, by_others, number=number)
+                judged += by_others
             proof = replace(proof, checks=(*proof.checks, *(check for each in judged for check in each.checks)))
             order = _order(made, proof.shape, path)
             contents = _contents(made, proof, left_out(made.scene, proof.lens, proof.light.picture))
@@ -313,7 +317,8 @@ def verify(
             )  # fmt: skip
             if cloud is not None:
                 part = _made_part(cloud, proof, nominal, effort=effort, progress=progress)
-                drawn.begin(draw_part, part, proof.light.picture)
+                for number, light in enumerate(proof.lights):
+                    drawn.begin(draw_part, part, light.picture, number=number)
                 own = Path() if place is not None else Path("measured") / _name_of(cloud, path)
                 write(with_part(contents, part), amended / own, sheet=None)
                 for name, data in map_files(part.deviation).items():
@@ -501,9 +506,10 @@ def show(folder: Path, png: Path | None) -> None:
 
 
 def light_path_in(folder: Path) -> LightPath:
-    """The lens of a folder, rays through it and their picture; SceneError if no light arrives."""
+    """The lens of a folder, rays through it and their pictures; SceneError if no light arrives."""
     scene, nominal = folders.read_nominal(folder)
-    found = light_path_of(scene, nominal.lens, nominal.target, folders.read_irradiance(folder, scene))
+    wanted, found = (goal.target for goal in nominal.goals), folders.read_irradiances(folder, scene)
+    found = light_path_of(scene, nominal.lens, [*zip(wanted, found, strict=True)])
     if found is None:
         raise SceneError(f"{folder}: no light of this design arrives at the target; there is nothing to show")
     return found

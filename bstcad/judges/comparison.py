@@ -14,6 +14,7 @@ import importlib
 import importlib.metadata
 import importlib.util
 import math
+import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -48,6 +49,7 @@ class Judge:
     name: str  # of the program
     version: str  # of the program
     declined: str = ""  # why it cannot trace this light
+    target: str = ""  # which of several targets the figures are of: target[0], target[1], …
     by: str | None = None  # the program's variant, if it has several
     rays: int | None = None  # in both halves
     pixels: tuple[int, int] | None = None  # columns, rows
@@ -65,6 +67,12 @@ class Judge:
     slopes_off: float | None = None  # rad, RMS
     moved_by: float | None = None  # pixels, shift of light by that
     seconds: float | None = None  # of the judge
+
+    @property
+    def figure(self) -> str:
+        """The name of its pictures: judge_batoid, and judge_batoid_2 of the second target."""
+        number = int(re.sub(r"\D", "", self.target) or 0) + 1
+        return f"judge_{self.name}" if number == 1 else f"judge_{self.name}_{number}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,13 +116,13 @@ def chosen(names: Sequence[str | OwnJudge]) -> tuple[str | OwnJudge, ...]:
 
 def against(
     names: Sequence[str | OwnJudge], lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray,
-    seed: int, progress: Callable[[str, int, int, str], None],
+    seed: int, progress: Callable[[str, int, int, str], None], key: str = "",
 ) -> tuple[Compared, ...]:  # fmt: skip
-    """Each judge's picture beside bstcad's, one after the other."""
+    """Each judge's picture beside bstcad's, one after the other; key: of the target, if there are several."""
     compared = []
     for number, name in enumerate(names):
-        progress("judges", number, len(names), getattr(name, "name", name))
-        compared.append(compare(name, lens, channels, screen, target=target, rays=RAYS, seed=seed))
+        progress("judges", number, len(names), " ".join((getattr(name, "name", name), key)).strip())
+        compared.append(compare(name, lens, channels, screen, target=target, rays=RAYS, seed=seed, key=key))
     if names:
         progress("judges", len(names), len(names), "")
     return tuple(compared)
@@ -122,16 +130,17 @@ def against(
 
 def compare(
     given: str | OwnJudge, lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, *, rays: int,
-    seed: int = 0,
+    seed: int = 0, key: str = "",
 ) -> Compared:  # fmt: skip
     """A judge's picture of the light that `lens` throws on `screen`, beside bstcad's.
 
-    rays: of the judge in all.  seed: of them.  target: (rows, columns) of any sum, row 0 = y max.
+    rays: of the judge in all.  seed: of them.  target: (rows, columns) of any sum, row 0 = y max.  key: target[1], by
+    which checks name it; "": it is the only one.
     """
     began = time.perf_counter()
     judge, name, version = _known(given)
     if declined := judge.cannot(lens, channels):
-        return Compared(Judge(name, version, declined))
+        return Compared(Judge(name, version, declined, target=key))
     raster = coarse(screen)
     target, light = resampled(target, raster.shape), judge.light(lens, channels)
     traced = judge.trace(lens, light, raster, rays=rays, seed=seed)
@@ -143,14 +152,16 @@ def compare(
     noise = math.hypot(_difference(first, second, target) / 2, ours.picture_off)
     over_noise, limit = difference / max(noise, EXACT), AGREE * (1 + 3 / math.sqrt(_effective_pixels(first - second)))
     on_target, on_target_ours = float(traced.picture.sum()), ours.flux.get("on target", 0.0)
-    flux = f"light on the target by {name} against the ledger's, of the source's"
+    of = f", {key}" if key else ""
+    flux = f"light on the target by {name} against the ledger's, of the source's{of}"
     checks = (
-        Check.at_most(f"irradiance by {name} against bstcad's, over the noise", over_noise, limit),
+        Check.at_most(f"irradiance by {name} against bstcad's, over the noise{of}", over_noise, limit),
         Check.at_most(flux, abs(on_target - on_target_ours), FLUX),
     )
     outcome = Judge(
         name,
         version,
+        target=key,
         by=traced.by,
         rays=traced.rays,
         pixels=(raster.columns, raster.rows),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -15,7 +16,8 @@ from bstcad.measured.cloud import Cloud
 from bstcad.measured.form_error import Deviation, Form, deviation, fitted, minimum_zone
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, Light, measure
-from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, UNASKED, Nominal
+from bstcad.optics.wavefront_error import wavefront_error
+from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, UNASKED, WAVEFRONT, Goal, Nominal
 from bstcad.verify.verdict import Check
 
 FARTHEST = 3e-3  # of the half width, RMS after alignment: a part beyond is of another design
@@ -39,6 +41,7 @@ class MadePart:
     deviation: Deviation
     irradiance: np.ndarray = field(repr=False)  # (rows, columns) predicted, row 0 = y max, with the target's sum
     outliers: np.ndarray = field(repr=False)  # (n, 3) mm on the design, left out of the fit
+    further_irradiance: tuple[np.ndarray, ...] = field(default=(), repr=False)  # on the targets behind the first
 
 
 def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = None) -> MadePart:
@@ -54,7 +57,8 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
         raise ValueError(f"{cloud.path}: {error}") from None
     form = fitted(face, placed)
     deviates = deviation(lens, placed, form)
-    light, high = _light(lens, form, nominal, replace(nominal.effort(effort), witness=False))
+    least = replace(nominal.effort(effort), witness=False)
+    lights = [_light(lens, form, nominal, goal, effort=least) for goal in nominal.goals]
     scale, uncertainty = aligning.scale(face, placed)
     x, y, _ = placed.pose.shift
     rrmsd, unasked = (nominal.accept.rrmsd, "") if nominal.accept.rrmsd is not None else (DEFAULT_RRMSD_LIMIT, UNASKED)
@@ -75,15 +79,46 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
             "made part: decentre in the frame of the cloud", math.hypot(x, y), nominal.accept.decentre, "mm",
             where=f"x {x:+.4g} mm, y {y:+.4g} mm",
         ),
-        Check.at_most(f"made part: RRMSD predicted{unasked}", light.rrmsd, rrmsd),
-        Check.at_most("made part: RRMSD, were all that the points leave open against it", high, None),
+        *(
+            check
+            for goal, (light, high) in zip(nominal.goals, lights, strict=True)
+            for check in (
+                Check.at_most(f"made part: RRMSD predicted{goal.suffix}{unasked}", light.rrmsd, rrmsd),
+                Check.at_most(
+                    f"made part: RRMSD, were all that the points leave open against it{goal.suffix}", high, None
+                ),
+            )
+        ),
+        *_wavefront(replace(lens, back=form.on(lens.back)), nominal),
     )  # fmt: skip
-    predicted = {
-        "rrmsd_predicted": light.rrmsd if math.isfinite(light.rrmsd) else None,
-        "rrmsd_high": high if math.isfinite(high) else None,
-    }
     facts = _facts(face, placed, deviates, cloud) | {"scale": scale, "passed": all(check.passed for check in checks)}
-    return MadePart(checks, facts | predicted, deviates, irradiance=light.picture, outliers=placed.outliers)
+    predicted = [_predicted(*found) for found in lights]
+    if nominal.further:
+        facts["targets"] = [{"key": goal.key} | of for goal, of in zip(nominal.goals, predicted, strict=True)]
+    irradiance, *further = (light.picture for light, _ in lights)
+    return MadePart(
+        checks, facts | predicted[0], deviates, irradiance=irradiance, outliers=placed.outliers,
+        further_irradiance=tuple(further),
+    )  # fmt: skip
+
+
+def _predicted(light: Light, high: float) -> dict[str, float | None]:
+    """RRMSD of a light, and with all that the points leave open against it; None: none of it falls on the target."""
+    found = {"rrmsd_predicted": light.rrmsd, "rrmsd_high": high}
+    return {key: value if math.isfinite(value) else None for key, value in found.items()}
+
+
+def _wavefront(lens: Lens, nominal: Nominal) -> Iterator[Check]:
+    """The check of the wavefront behind the made lens, where one is asked for."""
+    if nominal.wave is None:
+        return
+    light, value, none = nominal.heaviest, math.nan, ""
+    try:
+        value = wavefront_error(light.source.central, light.through(lens), nominal.wave).without_tilt.rms
+    except ValueError as error:
+        none = str(error)
+    name, asked = f"made part: {WAVEFRONT}, predicted", nominal.accept.wavefront
+    yield Check.at_most(name, value, asked, unit="waves", where=none)
 
 
 def _aligned(face: Face, points: np.ndarray) -> tuple[Alignment, str]:
@@ -133,14 +168,14 @@ def _covered(lens: Lens, points: np.ndarray) -> float:
     return float(held[lens.outline.depth(*middles) >= 0].mean())
 
 
-def _light(lens: Lens, form: Form, nominal: Nominal, effort: Effort) -> tuple[Light, float]:
+def _light(lens: Lens, form: Form, nominal: Nominal, goal: Goal, *, effort: Effort) -> tuple[Light, float]:
     """(light of the lens with the form error, RRMSD with the remaining uncertainty added, mean of both signs)."""
     draw = np.random.default_rng(nominal.seed).normal(size=form.spread.shape)
 
     def of(form: Form) -> Light:
         made = replace(lens, back=form.on(lens.back))
-        target, how = nominal.target, {"effort": effort, "ghost": nominal.ghost, "draw": nominal.draw}
-        return measure(made, nominal.channels, nominal.screen, target, **how)
+        how = {"effort": effort, "ghost": nominal.ghost, "draw": nominal.draw}
+        return measure(made, nominal.channels, goal.screen, goal.target, **how)
 
     light = of(form)
     return light, max(

@@ -317,28 +317,43 @@ def convergence(history: Sequence[Point], stages: Sequence[Stage], noise: float)
 # --- a lens at work ---------------------------------------------------------------------------------------------------
 
 
-def light_path_of(scene: Scene, lens: Lens, target: np.ndarray, irradiance: np.ndarray) -> LightPath | None:
-    """The lens, rays through it and their picture for `bstcad show`; None if no light arrives at the target."""
-    source, screen = scene.source.central, scene.target.screen
-    rays, flux = bundle(source, lens, screen.plane, RAYS)
+def light_path_of(
+    scene: Scene, lens: Lens, pictures: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> LightPath | None:  # fmt: skip
+    """The lens, rays through it and their pictures for `bstcad show`; None if no light arrives at the furthest target.
+
+    pictures: of each target of the scene what is wanted, and the irradiance, (rows, columns).
+    """
+    source, screens = scene.source.central, [target.screen for target in scene.targets]
+    rays, flux = bundle(source, lens, max(screens, key=lambda screen: screen.z).plane, RAYS)
     if not len(rays):
         return None
     mesh = meshes.lens_mesh(lens, SHOWN_CELLS)
-    width, height = (number(high - low) for low, high in (screen.x, screen.y))
     of = "of the middle of the source" if scene.source.extent is not None else "of the source"
+    drawn = [light_figures.tones(irradiance, target) for target, irradiance in pictures]
     return LightPath(
         vertices=mesh.vertices,
         faces=mesh.faces,
         rays=rays,
         flux=MILLIONTHS * flux,
-        screen=corners(screen),
-        picture=light_figures.tones(irradiance, target),
+        screen=corners(screens[0]),
+        picture=drawn[0],
         lamp=rays[:1, 0] if np.ptp(rays[:, 0], axis=0).max() < 1e-6 else np.empty((0, 3)),
         seen_along=1 if scene.target.seen_from == "lens" else -1,
         mirror=lens.reflects,
         title=scene.title or scene.name,
-        words=f"Target {width} × {height} mm at z = {number(screen.z)} mm\n{len(rays)} rays {of}, true to scale",
+        words=f"{_sizes(screens)}\n{len(rays)} rays {of}, true to scale",
+        further=tuple(zip(map(corners, screens[1:]), drawn[1:], strict=True)),
     )
+
+
+def _sizes(screens: Sequence[Screen]) -> str:
+    """How large the targets are, and where they lie."""
+    told = (
+        f"{number(x[1] - x[0])} × {number(y[1] - y[0])} mm at z = {number(screen.z)} mm"
+        for screen, x, y in ((screen, screen.x, screen.y) for screen in screens)
+    )
+    return f"Target{'s' * (len(screens) > 1)} {', '.join(told)}"
 
 
 def corners(screen: Screen) -> np.ndarray:

@@ -17,6 +17,7 @@ from bstcad.optics.measure import Line
 from bstcad.report.drawing import BLUE, GREEN, GREY, VERMILION, footnote, new_figure, png, round_up, steps, styled
 from bstcad.report.units import number, quantity, turned
 from bstcad.scene.picture import to_srgb
+from bstcad.scene.target import numbered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -381,7 +382,7 @@ def _lobe(wavelength: float, weight: float, centre: float, below: float, above: 
 
 def draw_judges(judges: Sequence[Compared], view: View) -> dict[str, bytes]:
     """The pictures by other programs, as far as they served, as PNG bytes by name."""
-    return {f"judge_{each.judge.name}": png(judged_picture(each, view)) for each in judges if not each.judge.declined}
+    return {each.judge.figure: png(judged_picture(each, view)) for each in judges if not each.judge.declined}
 
 
 @styled
@@ -400,14 +401,15 @@ def judged_picture(compared: Compared, view: View) -> Figure:
 
 def draw_part(made: MadePart, designed: np.ndarray, view: View) -> dict[str, bytes]:
     """The picture of a made part as PNG bytes by name; designed: irradiance."""
-    return {"made_part": png(made_part(made, designed, view))}
+    return {numbered("made_part", view.number): png(made_part(made, designed, view))}
 
 
 @styled
 def made_part(made: MadePart, designed: np.ndarray, view: View) -> Figure:
     """The fitted form error, the light of the made part, and the difference of this light from the designed light."""
     x, y, form = made.deviation.x, made.deviation.y, made.deviation.form
-    predicted, outliers, unit = made.irradiance, made.outliers[:, :2], lit_mean(designed)
+    predicted = (made.irradiance, *made.further_irradiance)[view.number]
+    outliers, unit = made.outliers[:, :2], lit_mean(designed)
     most, pv = float(np.nanmax(np.abs(form))), float(np.nanmax(form) - np.nanmin(form))
     _, times, written = next(rung for rung in FORM_UNITS if most >= rung[0])
     figure = new_figure(11.0, 1.3 + 2.8 * view.proportion, layout="compressed")

@@ -261,7 +261,11 @@ class Contents:
 
     def facts(self) -> dict[str, Any]:
         """The entries of report.json as plain values, in their order; those that are not known are no keys."""
-        return {key: value for key, value in plain(self).items() if key in STATED or value not in (None, [])}
+        found = {key: value for key, value in plain(self).items() if key in STATED or value not in (None, [])}
+        for judge in found.get("judges", ()):
+            if not judge["target"]:  # which judges name where there are several
+                del judge["target"]
+        return found
 
 
 ALL = tuple(entry.name for entry in fields(Contents))

@@ -50,6 +50,8 @@ NEAR = (0.9, 0.5, 0.75)  # towards the eye, from near by the lens, whose back fa
 TITLE = 46  # letters of a line of it
 PATH_ANGLE = 24.0  # degrees, from the lower to the upper edge
 FILLED, ROOM = 0.88, 0.6  # of a view: all of the way, and a lens with room for its rays
+BEFORE = 0.8  # opacity of a screen that light goes on behind
+SCREEN, SEEN = "further_screen_", "further_picture_"  # arrays of a file, with a number
 AHEAD, EACH = 2.0, 5  # from near by: diagonals of the lens that rays are drawn for, and every fifth ray
 
 # The lens to be turned.
@@ -76,7 +78,9 @@ def lens_picture(mesh: Mesh) -> bytes | None:
 
 def draw(path: LightPath, picture: Path | None) -> bool:
     """Write `picture` (PNG), or open a window until it is closed; False where this machine cannot."""
-    arrays = {name: np.asarray(value) for name, value in vars(path).items()}
+    arrays = {name: np.asarray(value) for name, value in vars(path).items() if name != "further"}
+    for k, (screen, seen) in enumerate(path.further):
+        arrays |= {f"{SCREEN}{k}": screen, f"{SEEN}{k}": seen}
     return _run(arrays, "", None) if picture is None else _run(arrays, str(picture), PATIENCE)
 
 
@@ -105,7 +109,8 @@ def main(arrays: str, picture: str) -> None:
         image = Image.fromarray(clay(told["vertices"], told["faces"]))
         image.crop(image.getchannel("A").getbbox()).save(picture)
         return
-    plotter = plotter_of(LightPath(**told), off_screen=bool(picture))
+    further = [(told.pop(f"{SCREEN}{k}"), told.pop(f"{SEEN}{k}")) for k in range(sum(SCREEN in name for name in told))]
+    plotter = plotter_of(LightPath(**told, further=tuple(further)), off_screen=bool(picture))
     if picture:
         plotter.screenshot(picture)
     else:
@@ -207,7 +212,7 @@ class LightPath:
 
     vertices: np.ndarray  # (n, 3), of the lens
     faces: np.ndarray  # (k, 3), vertices of its triangles
-    rays: np.ndarray  # (rays, stops, 3), from the source over the faces to the screen
+    rays: np.ndarray  # (rays, stops, 3), from the source over the faces to the furthest screen
     flux: np.ndarray  # (rays,) that each arrives with, in millionths of the source's light
     screen: np.ndarray  # (4, 3), its corners: (x min, y min), (x max, y min), (x max, y max), (x min, y max)
     picture: np.ndarray  # (rows, columns) uint8, the tones of its irradiance; row 0 at y max
@@ -216,6 +221,12 @@ class LightPath:
     mirror: bool
     title: str
     words: str  # a caption of a line or two
+    further: tuple[tuple[np.ndarray, np.ndarray], ...] = ()  # screen and picture of each target behind the first
+
+    @property
+    def screens(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+        """Screen and picture of each target."""
+        return ((self.screen, self.picture), *self.further)
 
 
 def plotter_of(path: LightPath, off_screen: bool) -> Any:
@@ -236,9 +247,13 @@ def plotter_of(path: LightPath, off_screen: bool) -> Any:
             "flux of a ray, in millionths of the source's light\n", mapper=drawn, color=SOFT, title_font_size=16,
             label_font_size=15, n_labels=3, fmt="%.4g", width=0.4, height=0.08, position_x=0.57, position_y=0.02,
         )  # fmt: skip
-    _add_screen(plotter, path)
+    *near, last = sorted(path.screens, key=lambda pair: pair[0][:, 2].mean())
+    for screen, picture in near:
+        _add_screen(plotter, screen, picture, BEFORE)
+    _add_screen(plotter, *last)
     _say(plotter, path.words, (0.02, 0.03), size=10, colour=SOFT)
-    everything = np.concatenate([path.vertices, path.rays.reshape(-1, 3), path.screen])
+    corners = [screen for screen, _ in path.screens]
+    everything = np.concatenate([path.vertices, path.rays.reshape(-1, 3), *corners])
     _frame(plotter, everything, path, np.multiply(ASIDE, [1, 1, -path.seen_along]), filled=FILLED)
     plotter.subplot(0, 0)
     _add_lens(plotter, solid, path)
@@ -302,16 +317,16 @@ def _add_rays(plotter: Any, rays: np.ndarray, flux: np.ndarray, opacity: float) 
     return drawn.mapper
 
 
-def _add_screen(plotter: Any, path: LightPath) -> None:
-    """The picture at its place, and its frame."""
+def _add_screen(plotter: Any, screen: np.ndarray, picture: np.ndarray, opacity: float = 1.0) -> None:
+    """A picture at its place, and its frame; screen, picture: as LightPath has them."""
     import pyvista
 
-    quad = pyvista.PolyData(path.screen.astype(np.float32), faces=[4, 0, 1, 2, 3])
+    quad = pyvista.PolyData(screen.astype(np.float32), faces=[4, 0, 1, 2, 3])
     quad.active_texture_coordinates = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float32)
-    picture = pyvista.Texture(np.repeat(path.picture[..., None], 3, axis=2))
-    picture.interpolate = True
-    plotter.add_mesh(quad, texture=picture, lighting=False)
-    border = pyvista.lines_from_points(path.screen[[0, 1, 2, 3, 0]].astype(np.float32))
+    texture = pyvista.Texture(np.repeat(picture[..., None], 3, axis=2))
+    texture.interpolate = True
+    plotter.add_mesh(quad, texture=texture, lighting=False, opacity=opacity)
+    border = pyvista.lines_from_points(screen[[0, 1, 2, 3, 0]].astype(np.float32))
     plotter.add_mesh(border, color=SOFT, line_width=1.5, lighting=False)
 
 

@@ -38,7 +38,7 @@ def light(nominal):
 @pytest.fixture
 def same_light(monkeypatch, light):
     """Whatever is wrong with a part, its light is the design's: for tests of its form."""
-    monkeypatch.setattr(made_part, "_light", lambda *given: (light, light.rrmsd))
+    monkeypatch.setattr(made_part, "_light", lambda *given, **more: (light, light.rrmsd))
 
 
 def judged(found, nominal, unit="mm"):

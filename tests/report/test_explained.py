@@ -46,6 +46,8 @@ WORDS = {  # in a function, what a variable part of a name may stand for
     ("verify", "of"): ("", ", target[1]"),
     ("of_bounds", "of"): ("", " of the front"),
     ("compare", "name"): ("batoid", "mitsuba"),
+    ("compare", "key"): ("target[1]",),
+    ("judge", "goal.suffix"): ("", ", target[1]"),
 }
 
 
