@@ -6,26 +6,33 @@ from pathlib import Path
 from typing import Any
 
 from PIL import Image
-from sphinx_gallery.scrapers import figure_rst
 
 WIDEST, NARROWEST = 1000, 480  # pixels of a picture in the page
-SHOWN = ("wall", "light", "irradiance", "lens", "part")  # names of the pictures that the page shows, in this order
+# Names of the pictures that the page shows, in this order; wall_2 and irradiance_2 are those of a second target.
+SHOWN = ("wall", "light", "irradiance", "wavefront", "lens", "part")
 
 
 def pictures(block: Any, variables: dict[str, Any], configuration: dict[str, Any]) -> str:
     """The pictures that the block wrote, as reStructuredText; sphinx-gallery calls it after each block."""
+    from sphinx_gallery.scrapers import figure_rst  # which a test of the names need not have
+
     script = Path(variables["src_file"])
     shown = variables["example_globals"].setdefault("_shown", set())
-    new = [
-        path for name in SHOWN for path in sorted((script.parent / "outputs" / script.stem).rglob(f"{name}.png"))
-        if path not in shown
-    ]  # fmt: skip
+    new = [path for path in written(script.parent / "outputs" / script.stem) if path not in shown]
     paths = []
     for path in new:
         shown.add(path)
         paths.append(next(variables["image_path_iterator"]))
         fitting(Image.open(path)).save(paths[-1], optimize=True)
     return figure_rst(paths, configuration["src_dir"]) if paths else ""
+
+
+def written(folder: Path) -> list[Path]:
+    """The pictures in a folder and below that the page shows, in its order."""
+    return [
+        path for name in SHOWN for pattern in (f"{name}.png", f"{name}_[0-9].png")
+        for path in sorted(folder.rglob(pattern))
+    ]  # fmt: skip
 
 
 def fitting(picture: Image.Image) -> Image.Image:
