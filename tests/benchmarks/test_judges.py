@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -103,8 +104,8 @@ DECLINED = {("sun_caustic", "mitsuba")}  # the sun's directions
 @pytest.mark.parametrize("template", templates())
 def test_other_programs_agree(template, tmp_path):
     lens = written(template, {"tailoring.quality": "draft"}, tmp_path)
-    target, channels = lens.scene.target, lens.scene.judging_channels()
-    for name in comparison.JUDGES:
+    channels = lens.scene.judging_channels()
+    for name, target in product(comparison.JUDGES, lens.scene.targets):
         found = comparison.compare(name, lens.lens, channels, target.screen, target.irradiance(), rays=MANY)
         judge = found.judge
         assert bool(judge.declined) is ((template, name) in DECLINED)
