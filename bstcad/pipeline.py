@@ -275,9 +275,12 @@ def _stage1(
     if driver.wish and state is None:
         raise KeyboardInterrupt  # there is nothing to show
     name, stage, _ = PROCEDURES[task.knobs.method]
-    stage = stage if scene.lens.shaped is None else two_faces.steps
+    like = lens.like
+    if scene.lens.shaped is not None:  # whose light behind the lens is one of numpy: a second of work on the CPU
+        stage, lens = two_faces.steps, lens.to(like.dtype, "cpu")
     last = driver.run(stage(task, lens, state), task, lambda state: Saved(driver.record, state), lambda: driver.wish)
-    lens, bounds = last.lens, held(last.lens, task.bounds, task.least)
+    lens = last.lens.to(like.dtype, like.device)
+    bounds = held(lens, task.bounds, task.least)
     if bounds is None:
         check_thickness(lens, scene)
     driver.end(name, reached(lens, task.rrmsd(lens) if last.judged is None else last.judged))

@@ -40,8 +40,8 @@ QUALITIES = {
 }
 SAME = {"draft": 1e-6, "paper": 1e-4}  # of the relief: where stage 1's solvers end; a few steps of Adam in float32
 
-# Designs of two kinds, besides the mirror and the paper's procedure below; the others are run by `make bench`.
-QUICK = {"disk": ("draft",), "machinable_letters": ("draft",)}
+# Designs of three kinds, besides the mirror and the paper's procedure below; the others are run by `make bench`.
+QUICK = {"beam_shaper": ("draft",), "disk": ("draft",), "machinable_letters": ("draft",)}
 LOSSES = {
     "portrait": [
         {"kind": "fresnel", "coating": {"index": 1.38, "thickness": 100.0}},
@@ -95,12 +95,13 @@ def held_to_the_cpu(wanted, quality):
     assert second.marked > 1000
     assert not second.mixed
     assert found.device == "cuda"
-    assert not on_second(found.lens.back.heights) and found.lens.back.heights.dtype == torch.float64
-    assert isinstance(getattr(found.lens.front, "curvature", 0.0), float)
+    assert not any(on_second(net.heights) or net.heights.dtype != torch.float64 for net in found.lens.nets)
+    assert found.lens.front.is_net or isinstance(getattr(found.lens.front, "curvature", 0.0), float)
     searched = quality == "paper" and wanted.source.extent  # by stage 3, in single precision; see the test below
     if quality in SAME and not searched:  # the plain form there, compiled kernels here
-        heights, plain = design(wanted, device="cpu").lens.back.heights, found.lens.back.heights
-        assert float((plain - heights).abs().max()) <= SAME[quality] * float(np.ptp(heights.numpy()))
+        for net, plain in zip(design(wanted, device="cpu").lens.nets, found.lens.nets, strict=True):
+            off, relief = float((plain.heights - net.heights).abs().max()), float(np.ptp(net.heights.numpy()))
+            assert off <= SAME[quality] * relief
 
 
 OF_A_KIND = ("disk", "led", "machinable_letters", "mirror", "portrait", "white_logo")  # the others are beams like these
@@ -139,8 +140,8 @@ def evaluated(wanted, heights):
     screen = Screen(target.z, target.x, target.y, target.columns_rows)
     picture = torch.from_numpy(target.irradiance()).to(heights)
     merit = TubeMerit.of(wanted.channels(), lens, 48, screen, picture, 0.03)
-    value, (gradient,), _ = Problem(lens, merit)([lens.back.heights])
-    return value, gradient
+    value, gradients, _ = Problem(lens, merit)([net.heights for net in lens.nets])
+    return value, torch.cat([gradient.reshape(-1) for gradient in gradients])
 
 
 @pytest.mark.parametrize("quality", [pytest.param("standard", marks=pytest.mark.bench), "paper"])

@@ -113,15 +113,22 @@ def verified(two, tmp_path_factory):
     cloud, tracer = place / "cloud.csv", Tracer(wrong_at=(far,))
     waved = sag(two.design.lens.back, x, y) + 0.002 * np.cos(1.5 * x)
     np.savetxt(cloud, np.stack([x, y, waved], axis=-1), delimiter=",")
+    drawn = []
+
+    class Drawing(flat_pictures()):
+        def begin(self, draw, *given, number=0):
+            drawn.append((draw.__name__, number))
+            super().begin(draw, *given, number=number)
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(comparison, "OURS", replace(quick_effort(), witness=False))
         found = commands.verify(
-            two.folder, against=[tracer], measured=cloud, effort=quick_effort(), drawing=flat_pictures(),
+            two.folder, against=[tracer], measured=cloud, effort=quick_effort(), drawing=Drawing,
             place=place / "part",
         )  # fmt: skip
     page = (place / "part" / "report.html").read_text(encoding="utf-8")
     figures = {path.stem for path in (place / "part" / "figures").iterdir()}
-    return SimpleNamespace(report=found, tracer=tracer, page=page, figures=figures)
+    return SimpleNamespace(report=found, tracer=tracer, page=page, figures=figures, drawn=drawn)
 
 
 def test_another_program_traces_each_target(two, verified):
@@ -134,6 +141,7 @@ def test_another_program_traces_each_target(two, verified):
     assert checks["irradiance by tracer against bstcad's, over the noise, target[1]"] is False
     assert sum(checks.values()) == len(checks) - 1 == 3 and all(map(page_of, checks))
     assert {"judge_tracer", "judge_tracer_2"} <= verified.figures
+    assert [number for name, number in verified.drawn if name == "draw_judges"] == [0, 1]
     assert "tracer 1, target[0]" in verified.page and "tracer 1, target[1]" in verified.page
 
 
