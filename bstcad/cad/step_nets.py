@@ -146,9 +146,7 @@ def _points(net: np.ndarray, first: int) -> Iterator[bytes]:
         if before is None or not np.array_equal(row[:, 1], before):  # they are the same in each row of a lens's net
             before, y = row[:, 1], _reals(row[:, 1])
         numbers = range(first + n * i, first + n * (i + 1))
-        lines = [
-            f"#{k} = CARTESIAN_POINT('',({a},{b},{c}));\n" for k, a, b, c in zip(numbers, x, y, z, strict=True)
-        ]
+        lines = [f"#{k} = CARTESIAN_POINT('',({a},{b},{c}));\n" for k, a, b, c in zip(numbers, x, y, z, strict=True)]
         yield "".join(lines).encode()
 
 

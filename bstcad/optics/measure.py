@@ -132,9 +132,7 @@ def measure(
     if draw is not None:
         rays = _enough_of_source(lens, draw, screen, wanted=wanted, effort=effort, ghost=stray, seen=seen)
     else:
-        rays = _enough(
-            lens, lambda count, seed: channels, screen, wanted=wanted, effort=effort, ghost=stray, seen=seen
-        )
+        rays = _enough(lens, lambda count, seed: channels, screen, wanted=wanted, effort=effort, ghost=stray, seen=seen)
     if not rays.boxes:
         return Light(np.zeros(screen.shape), math.nan, math.inf, rays=rays.count, flux=rays.flux)
     (value, error), (tent, _) = _value(rays, wanted), apart(rays.tents, wanted)

@@ -177,9 +177,7 @@ class _Front:
         if self.free:
             yield "optimise: a front with an outline of its own keeps its shape; leave out one of the two"
         reached = self.optical.reaches(*(torch.tensor(p, dtype=torch.float64) for p in own.farthest))
-        _, slope, _ = self.optical.relative_sag_and_slope(
-            *(torch.tensor(p, dtype=torch.float64) for p in own.farthest)
-        )
+        _, slope, _ = self.optical.relative_sag_and_slope(*(torch.tensor(p, dtype=torch.float64) for p in own.farthest))
         steep = math.degrees(math.atan(abs(float(slope)))) if bool(reached) else 90.0
         if not steep <= STEEPEST:
             stands = "does not reach it" if steep == 90.0 else f"stands at {steep:.3g} degrees there"
@@ -261,8 +259,13 @@ class NetFront(_Front):
     optimise: Annotated[bool, Key("It is tailored, from the net of the file, or else flat.", example=True)] = False
     control_points: Annotated[
         OneOrTwo | None,
-        Key("Control points along each side, or [along x, along y]; as many as the back's if absent.", "", 5,
-            LARGEST_NET, example=513),
+        Key(
+            "Control points along each side, or [along x, along y]; as many as the back's if absent.",
+            "",
+            5,
+            LARGEST_NET,
+            example=513,
+        ),
         BeforeValidator(lambda given: tuple(given) if isinstance(given, list) else given),  # as strict reading asks
     ] = None
     kind: Annotated[Literal["bspline"], Key("A freeform face: of an earlier design, or tailored.")] = "bspline"
@@ -387,8 +390,13 @@ class Back(Record):
     z: Annotated[float, Key("Place of the flat face before tailoring.", "mm", *COORDINATES, example=20.0)]
     control_points: Annotated[
         OneOrTwo | None,
-        Key("Control points of the net along each side, or [along x, along y]; chosen if absent.", "", 5, 2049,
-            example=257),
+        Key(
+            "Control points of the net along each side, or [along x, along y]; chosen if absent.",
+            "",
+            5,
+            2049,
+            example=257,
+        ),
     ] = None
     reflect: Annotated[bool, Key("A mirror: light comes along -z and goes back along +z.")] = False
     optimise: Annotated[

@@ -59,7 +59,7 @@ class Candidate:
 
     @property
     def words(self) -> str:
-        """"RRMSD about 0.02 in 42 s"."""
+        """ "RRMSD about 0.02 in 42 s"."""
         return f"an RRMSD of about {number(two_digits(self.rrmsd))} in {duration(self.seconds)}"
 
 

@@ -102,9 +102,7 @@ def of_task(task: Task) -> LightBehind:
     n = task.knobs.transport_grid
     parts = max(1, round(n / max(near.screen.shape)))
     if task.wave is not None:
-        return of_wave(
-            near.screen, near.target, task.wave, wavelength=task.heaviest.source.wavelength, parts=parts
-        )
+        return of_wave(near.screen, near.target, task.wave, wavelength=task.heaviest.source.wavelength, parts=parts)
 
     def progress(s: Step) -> None:
         task.progress("stage 1", 0, task.knobs.rounds, f"between the targets, {s.grid}² cells")

@@ -246,6 +246,7 @@ class BlurredMerit:
 
     def _lost(self, landed: Sequence[Landed]) -> Tensor:
         """Share of the light that does not arrive."""
+
         def whole(flux: Callable[[Tubes, Landed], Tensor]) -> Tensor:
             pairs = zip(self.light.sheets, landed, strict=True)
             return weighted_sum(self.light.channels, (total(flux(sheet, corners)) for sheet, corners in pairs))

@@ -134,9 +134,7 @@ def coarse_rounds(task: Task, lens: Lens) -> tuple[Round, ...]:
     each costs a thirtieth, and the tubes need not tell the cells of the lens's own net.
     """
     most = min(max(task.screen.shape) - 1, task.knobs.side // 2)  # pixels that the net can tell
-    rounds = [
-        Round(task, tubes, evaluations, pixels=pixels) for pixels, tubes, evaluations in COARSE if pixels <= most
-    ]
+    rounds = [Round(task, tubes, evaluations, pixels=pixels) for pixels, tubes, evaluations in COARSE if pixels <= most]
     if not rounds or task.merit is not None or not task.knobs.stage2_iterations:
         return ()
     seen, tubes = coarsened(task, LARGE), COARSE[0][1]
@@ -312,9 +310,7 @@ def variables_of(task: Task, lens: Lens, pixels: int | None = None) -> tuple[Var
     light = task.heaviest
     seen = light.through(lens)
     weights = [
-        _mean(
-            local_weight(light.source, seen, goal.target, screen=goal.screen, number=number) for goal in task.goals
-        )
+        _mean(local_weight(light.source, seen, goal.target, screen=goal.screen, number=number) for goal in task.goals)
         for number in lens.freeform
     ]
     if pixels is None:

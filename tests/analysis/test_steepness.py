@@ -29,9 +29,7 @@ def found(half, at_back=True):
     ends = np.linspace(-1, 1, PIXELS + 1)
     share = np.stack(np.meshgrid(ends, ends, indexing="ij"), axis=-1)
     places = HALF * share * (1.0 if at_back else 12.0 / HEIGHT)  # the same rays on the plane of the dome's vertex
-    return share, needed(
-        Point(), LENS, screen, EVEN, x=half * ends, y=half * ends, places=places, at_back=at_back
-    )
+    return share, needed(Point(), LENS, screen, EVEN, x=half * ends, y=half * ends, places=places, at_back=at_back)
 
 
 @pytest.mark.parametrize("at_back", [True, False])

@@ -37,7 +37,7 @@ def lens(front=DOME, outline=ROUND):
 @pytest.mark.parametrize("face", [DOME.face, Conic(8.0, 0.05, -2.0)], ids=lambda face: face.kind)
 def test_inside_it_is_its_optical_part_and_beyond_a_plane_through_the_rim(face):
     front = Recess(face, Circle(EDGE))
-    x, y = (40 * (torch.rand((2, 1000), generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5))
+    x, y = 40 * (torch.rand((2, 1000), generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5)
     inside = x * x + y * y <= EDGE**2
     for found, own in zip(front.sag_and_slope(x, y), face.sag_and_slope(x, y), strict=True):
         assert torch.equal(found[inside], own[inside])
