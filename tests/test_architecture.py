@@ -209,6 +209,7 @@ def test_nothing_that_is_read_is_run():
 PRODUCTS = {
     "optics/bspline.py": "of sparse matrices",
     "optics/motion.py": "of 3 x 3 numbers; nothing that tailors a lens moves",
+    "tailoring/net_variables.py": "of sparse matrices",
     "tailoring/merit.py": "on a GPU",
     "transport/density.py": "by a sparse matrix",
     "tolerance/study.py": "by numpy's own loops, which einsum takes unless it optimises",

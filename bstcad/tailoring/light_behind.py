@@ -38,6 +38,8 @@ from bstcad.transport.mapping import places_in, solve
 ROUNDS, COARSE_SHARE, COARSEST = 3, 4, 64  # of the map between two planes: the last one on all cells
 SEARCH = 40  # steps to the place of a stated wave that sends light to a place of the target
 FOUND = 1e-9  # mm
+DIM = 0.03  # of the mean: the carried picture is lifted to it; a hole in it would be a hole in the map
+FALLING = (0.1, 0.03, 0.01, 0.003)  # of the mean: floors of the other one, where it has holes
 MEETING = 8  # Newton steps back to a face
 CROSSED = 1e-4  # of the light, whose rays may cross before they come to the lens, as rounding leaves
 
@@ -153,32 +155,45 @@ def between_targets(
 ) -> LightBehind:  # fmt: skip
     """The light through two pictures, (screen, (rows, columns) of any sum) each, by transport on n x n cells.
 
-    sign: σ, 1 for the convex solution and -1 for the concave one.
+    sign: σ, 1 for the convex solution and -1 for the concave one.  The light of the picture with less contrast is
+    carried to the other one, since maps to pictures with holes are found more safely than maps from such.
     """
-    (screen, picture), (behind, wanted) = near, far
-    e_x, e_y, normal = _axes(screen.plane)
+    followed_back = _contrast(near[1]) > _contrast(far[1])
+    (screen, picture), (behind, wanted) = (far, near) if followed_back else (near, far)
+    along = _axes(screen.plane)[:2]
 
     def cosines(p: np.ndarray, t: np.ndarray) -> Grid:
-        way = t - p
-        way = way / np.sqrt((way * way).sum(0))
-        return _along(e_x, way), _along(e_y, way)
+        way = _unit(t - p)
+        return _along(along[0], way), _along(along[1], way)
 
-    t = in_space(behind.plane, *pixel_corners(behind))
+    fine = parts if followed_back else 1
+    t = in_space(behind.plane, *corners(behind, fine))
     m = in_space(behind.plane, *(np.array(c) for c in centroid(wanted, behind))).reshape(3, 1, 1)
     p = in_space(screen.plane, *(np.full_like(t[0], sum(ends) / 2) for ends in (screen.x, screen.y)))
     for turn in range(ROUNDS):
         cells = n if turn == ROUNDS - 1 else max(COARSEST, n // COARSE_SHARE)
         y = tuple(sign * (c - g) for c, g in zip(cosines(p, t), cosines(p, m), strict=True))
         rho, frame = spread_density(picture, tuple(pixel_corners(screen)), cells)
-        sigma, seen = spread_density(wanted, y, cells)
-        mapping = solve(rho, sigma, frame, seen, iterations=iterations, progress=progress)
+        sigma, seen = spread_density(wanted, tuple(c[::fine, ::fine] for c in y), cells)
+        mapping = solve(rho.lifted(DIM), sigma, frame, seen, iterations=iterations, falling=FALLING, progress=progress)
         p = in_space(screen.plane, *mapping.inverse(*y))
-    x, y = corners(screen, parts)
-    place = in_space(screen.plane, x, y)
-    a, b = (sign * s + g for s, g in zip(mapping(x, y), cosines(place, m), strict=True))
+    place, light = in_space(near[0].plane, *corners(near[0], parts)), near[1] / near[1].sum()
+    if followed_back:
+        return LightBehind(place, _unit(p - t), light, parts)
+    a, b = (sign * s + g for s, g in zip(mapping(*corners(screen, parts)), cosines(place, m), strict=True))
     upright = np.sqrt(np.clip(1 - a * a - b * b, 0.0, None))
-    direction = np.stack([a * u + b * v + upright * w for u, v, w in zip(e_x, e_y, normal, strict=True)])
-    return LightBehind(place, direction, picture / picture.sum(), parts)
+    direction = np.stack([a * u + b * v + upright * w for u, v, w in zip(*_axes(screen.plane), strict=True)])
+    return LightBehind(place, direction, light, parts)
+
+
+def _contrast(picture: np.ndarray) -> float:
+    """Mean square over squared mean."""
+    return float((picture**2).mean() / picture.mean() ** 2)
+
+
+def _unit(way: np.ndarray) -> np.ndarray:
+    """(3, …) the unit vectors along vectors."""
+    return way / np.sqrt((way * way).sum(0))
 
 
 def uncrossed(light: LightBehind, screen: Screen, surface: Surface, n: int) -> LightBehind:

@@ -108,6 +108,7 @@ def solve(
     *,
     iterations: int = 40,
     tolerance: float = 2e-3,
+    falling: tuple[float, ...] = FALLING,
     progress: Callable[[Step], None] | None = None,
 ) -> Mapping:
     """The map that carries source to target: back-and-forth on a coarse grid, then Newton on ray tubes to the finest.
@@ -116,6 +117,7 @@ def solve(
     mean 1) at which the solve has converged; where the grid allows no less, `transport.reason` is "plateau".
     A target with zeros is lifted to FLOOR of its mean; `mapping.target` is the lifted one.  Where a bright rim ends in
     black, Newton's first step on a grid would fold the map: there the floor is high first, and falls on the last grid.
+    falling: these floors, of the mean.
     """
     newton = partial(climb, steps=NEWTON_STEPS, tolerance=tolerance, progress=progress)
 
@@ -126,8 +128,8 @@ def solve(
 
     phi, errors, reason = climbed(FLOOR)
     if errors[-1] > ROUGH:
-        other, *_ = climbed(FALLING[0])
-        for floor in (*FALLING[1:], FLOOR):
+        other, *_ = climbed(falling[0])
+        for floor in (*falling[1:], FLOOR):
             other, left, why = newton([(source, target.lifted(floor))], other, smoothing=0.0)
         if left[-1] < errors[-1]:
             phi, errors, reason = other, left, why

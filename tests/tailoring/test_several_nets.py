@@ -88,7 +88,7 @@ def test_the_gradient_of_the_merit_is_that_of_differences(name):
 def test_the_merit_of_any_nets_falls_strongly(name):
     task, lens, problem = problem_of(name)
     begun, variables = problem([n.heights for n in lens.nets]), variables_of(task, lens)
-    assert len(variables) == len(lens.freeform)
+    assert len(variables.blocks) == len(lens.freeform)
     *_, last = search(lens, problem, variables, EVALUATIONS)
     found = improved(lens, variables, last.best)
     assert last.best.merit < begun[0] / 50 and last.best.figure < begun[2] / 6

@@ -1,0 +1,76 @@
+"""The variables of two nets: the wavefront behind the lens stands still for one block, and adjoints are exact."""
+
+import pytest
+import torch
+
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Rectangle
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.trace import behind, land
+from bstcad.tailoring.goals import Goal
+from bstcad.tailoring.merit import SobolevVariable
+from bstcad.tailoring.net_variables import NetVariables, along_light
+
+BEAM, POINT = Collimated(aperture=Rectangle(16.0, 16.0)), Point((1.0, 0.0, -80.0), half_angle=5.0)
+SCREENS = [Screen(30.0, (-9.0, 9.0), (-9.0, 9.0), 8), Screen(70.0, (-9.0, 9.0), (-9.0, 9.0), 8)]
+GOALS = [Goal(screen, torch.ones((8, 8)).numpy() / 64, 1.0) for screen in SCREENS]
+
+
+def surface(z, of, m):
+    flat = BSplineSurface(z, torch.zeros((m, m), dtype=torch.float64), (-12.0, 12.0), (-12.0, 12.0))
+    x, y = (torch.linspace(-12.0, 12.0, m, dtype=torch.float64) for _ in range(2))
+    return flat if of is None else BSplineSurface(z, of(x[:, None], y[None, :]), flat.x, flat.y)
+
+
+def lens_of(m=97, back=65):
+    front = surface(0.0, lambda x, y: 0.004 * (x * x + y * y) + 0.05 * torch.cos(x / 4) * torch.cos(y / 3), m)
+    last = surface(12.0, lambda x, y: -0.006 * (x * x + 2 * y * y) + 0.06 * torch.sin(x / 3) * torch.cos(y / 4), back)
+    return Lens(front, last, Rectangle(22.0, 22.0), 1.5, shaped=(0, 1))
+
+
+def traced(source, lens, q):
+    rays = source.rays(q[0], q[1], lens.entrance.z, 1.0)
+    for interface in lens.unbounded().interfaces:
+        rays = behind(rays, interface)
+    return [land(rays, screen.z).position for screen in SCREENS]
+
+
+def jacobian(places, step):
+    """(…, 2, 2) by differences along the grid."""
+    return torch.stack([torch.stack(torch.gradient(p, spacing=(step, step)), -1) for p in places], -2)
+
+
+@pytest.mark.parametrize("source", [BEAM, POINT], ids=["parallel", "point"])
+def test_a_change_carried_along_the_light_leaves_the_light_behind_as_it_is(source):
+    """Rays move on the near plane, and on the far one just as the unchanged light goes on from there."""
+    lens = lens_of()
+    along, _ = along_light(source, lens, GOALS)
+    bump = surface(0.0, lambda x, y: 1e-5 * torch.cos(x / 1.6 + 0.3) * torch.sin(y / 2), 97).heights
+    carried = torch.from_numpy(along @ bump.numpy().reshape(-1)).reshape(lens.back.shape)
+    line = torch.linspace(-6.0, 6.0, 97, dtype=torch.float64)
+    q = torch.stack(torch.meshgrid(line, line, indexing="ij"))
+    near, far = traced(source, lens, q)
+    straight = torch.linalg.solve(jacobian(near, 0.125), jacobian(far, 0.125), left=False)  # ∂far / ∂near
+    off = {}
+    for name, heights in (("alone", torch.zeros_like(carried)), ("carried", carried)):
+        moved = lens.with_heights([lens.front.heights + bump, lens.back.heights + heights])
+        there, beyond = traced(source, moved, q)
+        goes_on = (straight @ (there - near).permute(1, 2, 0)[..., None])[..., 0].permute(2, 0, 1)
+        off[name] = (beyond - far - goes_on)[:, 4:-4, 4:-4].square().mean().sqrt()
+        assert (there - near).square().mean().sqrt() > 1e-6  # mm: the light did move
+    assert off["carried"] < 0.02 * off["alone"]
+
+
+@pytest.mark.parametrize("back", [97, 65])
+def test_the_adjoint_is_the_transpose(back):
+    lens, generator = lens_of(back=back), torch.Generator().manual_seed(1)
+    blocks = tuple(SobolevVariable.of(net, torch.rand(net.shape, generator=generator) + 0.5) for net in lens.nets)
+    variables = NetVariables(blocks, *along_light(BEAM, lens, GOALS))
+    c, g = ([torch.randn(net.shape, dtype=torch.float64, generator=generator) for net in lens.nets] for _ in range(2))
+    one, other = (
+        sum(float((a * b).sum()) for a, b in zip(*pair, strict=True))
+        for pair in ((variables.heights(c), g), (c, variables.adjoint(g)))
+    )
+    assert one == pytest.approx(other, rel=1e-12)
