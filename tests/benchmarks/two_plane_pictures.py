@@ -13,10 +13,15 @@ model, 0.0093 and 0.0098 by LuxCore.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
+from bstcad.cad import step_reading
+from bstcad.optics.measure import tubes_picture
 from bstcad.scene.picture import SAMPLES, from_srgb, to_srgb
+from bstcad.scene.scene import Scene
 from bstcad.scene.target import Target, drawing
 
 SIDE, THICKNESS, INDEX = 100.0, 20.0, 1.49  # mm, mm, relative to air: of T1's lens
@@ -29,6 +34,7 @@ PUBLISHED = {"own model": (0.0063, 0.0062), "LuxCore": (0.0093, 0.0098)}  # thei
 PHOTOGRAPHS = SAMPLES  # of the second case, on these planes, as wide as the lens
 PHOTOGRAPH_PLANES = (100.0, 240.0)  # mm behind the exit face
 PHOTOGRAPH_PIXELS = 512
+TUBES = 3001  # a side, for the light of a written lens
 
 SRGB = "srgb"
 Decoding = float | str  # an exponent, or SRGB
@@ -84,3 +90,51 @@ def encoded_error(irradiance: np.ndarray, wanted: np.ndarray, decoding: Decoding
     """
     scale = decoded(wanted, decoding).sum() / irradiance.sum()
     return float(np.abs(encoded(scale * irradiance, decoding) - wanted).mean())
+
+
+T1 = """\
+name = "t1"
+title = "The words of Sun, Deng and Zhang 2026 on two planes"
+
+[source]
+kind = "collimated"
+wavelength = 633.0
+aperture = {{ shape = "rectangle", width = {side}, height = {side} }}
+
+[lens]
+index = {index}
+outline = {{ shape = "rectangle", width = {blank}, height = {blank} }}
+front = {{ kind = "bspline", z = 0.0, optimise = true }}
+back = {{ kind = "bspline", z = {thickness}, control_points = 513 }}
+
+[accept]
+rrmsd = 0.04
+"""
+PLANE = """
+[[target]]
+z = {z}
+x = [{low}, {high}]
+y = [{low}, {high}]
+pixels = 256
+image = "{image}"
+gamma = 1.0
+"""
+MARGIN = 1.0  # mm on each side, of the blank around the light
+
+
+def write_t1(folder: Path, decoding: Decoding) -> Path:
+    """The scene file of T1 and its two pictures, as 16-bit numbers in proportion to irradiance, in a folder."""
+    text = T1.format(side=SIDE, blank=SIDE + 2 * MARGIN, thickness=THICKNESS, index=INDEX)
+    for number, (words, behind) in enumerate(zip(pictures(decoding), PLANES, strict=True)):
+        image = f"words_{number}.png"
+        Image.fromarray(np.round(65535 * words.linear / words.linear.max()).astype(np.uint16)).save(folder / image)
+        text += PLANE.format(z=THICKNESS + behind, low=-SIDE / 2, high=SIDE / 2, image=image)
+    path = folder / "t1.toml"
+    path.write_text(text)
+    return path
+
+
+def light_of_step(step: Path, scene: Scene) -> list[np.ndarray]:
+    """The irradiance (rows, columns) on each target of the light through the lens of a STEP file, by exact tubes."""
+    lens = step_reading.lens(step_reading.read(step), scene.index)
+    return [np.asarray(tubes_picture(lens, scene.channels(), t.screen, TUBES)) for t in scene.targets]
