@@ -78,9 +78,7 @@ def test_the_published_case_by_the_command(decoding, tmp_path):
     path = two.write_t1(tmp_path, decoding)
     subprocess.run([sys.executable, "-m", "bstcad.cli", "generate", path, "--output", tmp_path / "made"], check=True)
     report = json.loads((tmp_path / "made" / "report.json").read_text())
-    light = two.light_of_step(tmp_path / "made" / "lens.step", load(path))
-    words = two.pictures(decoding)
-    errors = [two.encoded_error(e, w.encoded, decoding) for e, w in zip(light, words, strict=True)]
+    errors = two.errors_of_step(tmp_path / "made" / "lens.step", load(path), decoding)
     figures = [target["rrmsd"] for target in report["targets"]]
     print("encoded errors", errors, "RRMSD", figures)
     assert max(errors) <= 0.003 and max(figures) <= 0.025

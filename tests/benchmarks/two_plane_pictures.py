@@ -134,7 +134,13 @@ def write_t1(folder: Path, decoding: Decoding) -> Path:
     return path
 
 
-def light_of_step(step: Path, scene: Scene) -> list[np.ndarray]:
-    """The irradiance (rows, columns) on each target of the light through the lens of a STEP file, by exact tubes."""
+def errors_of_step(step: Path, scene: Scene, decoding: Decoding) -> list[float]:
+    """The encoded error on each plane, of the light through the lens of a STEP file, by exact tubes."""
     lens = step_reading.lens(step_reading.read(step), scene.index)
-    return [np.asarray(tubes_picture(lens, scene.channels(), t.screen, TUBES)) for t in scene.targets]
+    errors = []
+    for target, words in zip(scene.targets, pictures(decoding), strict=True):
+        light = np.asarray(tubes_picture(lens, scene.channels(), target.screen, TUBES))
+        irradiance = target.irradiance()  # as the light has it, which is not as the picture is read
+        wanted = encoded(irradiance / irradiance.max() * words.linear.max(), decoding)
+        errors.append(encoded_error(light, wanted, decoding))
+    return errors
