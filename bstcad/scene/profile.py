@@ -6,6 +6,7 @@ A profile is centred on the middle of its target; r is the distance from there (
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from typing import Annotated, Literal
 
 import numpy as np
@@ -27,13 +28,13 @@ class _Profile(Record):
     """A profile: its light, and how far it reaches."""
 
     @property
+    @abstractmethod
     def half_extent(self) -> tuple[float, float]:
         """Half the width and height (mm) of its stated size, which a target has to hold."""
-        raise NotImplementedError
 
+    @abstractmethod
     def light(self, pixels: Pixels, size: Size) -> np.ndarray:
         """(rows, columns) means of E over the pixels of a target of a size."""
-        raise NotImplementedError
 
 
 class DiscProfile(_Profile):
