@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from bstcad import folder as folders
+from bstcad.judges.comparison import Judge
 from bstcad.report import prescription, record, rendering, report
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -27,12 +28,11 @@ PART = {  # as a made part is told of in report.json
     "form_pv": 4e-4, "form_rms": 1e-4, "slope_rms": 1.6e-4, "noise": 5e-5, "rrmsd_predicted": 0.02, "rrmsd_high": 0.03,
     "bands": [{"period": period, "rms": 1e-6, "slope_rms": 1e-6} for period in (None, [44.8, 22.4], [0.7, 0.35])],
 }  # fmt: skip
-JUDGE = {
-    "name": "batoid", "version": "0.9.0", "declined": "", "by": "", "rays": 16773632, "pixels": (128, 128),
-    "losses": "none", "rrmsd": 0.0201, "rrmsd_ours": 0.0194, "difference": 0.00496, "noise": 0.00494,
-    "over_noise": 1.003, "limit": 1.544, "agrees": True, "on_target": 0.21, "on_target_ours": 0.21,
-    "heights_off": 2.2e-7, "slopes_off": 5.5e-6, "moved_by": 4.1e-4, "seconds": 25.1,
-}  # fmt: skip
+JUDGE = Judge(
+    "batoid", "0.9.0", by="", rays=16773632, pixels=(128, 128), losses="none", rrmsd=0.0201, rrmsd_ours=0.0194,
+    difference=0.00496, noise=0.00494, over_noise=1.003, limit=1.544, agrees=True, on_target=0.21, on_target_ours=0.21,
+    heights_off=2.2e-7, slopes_off=5.5e-6, moved_by=4.1e-4, seconds=25.1,
+)  # fmt: skip
 
 HIDDEN = """(selector) => [...document.querySelectorAll(selector)].filter((e) => !e.checkVisibility()).length"""
 CONTRASTS = """() => {
