@@ -22,7 +22,7 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: lens test coverage bench accuracy published prediction effects stability docs wheel lint
+.PHONY: lens test coverage bench accuracy published prediction effects tradeoff stability docs wheel lint
 
 lens: $(READY)
 	$(BIN)/python generate_lens.py templates/thu.toml
@@ -54,6 +54,9 @@ prediction: $(READY)
 
 effects: $(READY)
 	$(BIN)/python -m tests.benchmarks.effects_table
+
+tradeoff: $(READY)
+	$(BIN)/python -m tests.benchmarks.wavefront_weights
 
 stability: $(READY)
 	$(BIN)/python -m pytest -q tests/hard_cases -m 'not slow' --stability docs/stability.md

@@ -1,4 +1,4 @@
-"""The light that a lens with two freeform faces has to send out: one ray through each place of the nearest target.
+"""The light that a lens with two freeform faces has to send out: one ray through each place of a target.
 
 Behind a lens the rays of a point or of parallel light are normal to wavefronts (Malus and Dupin; Born and Wolf,
 Principles of Optics, section 3.1.2), so that their direction cosines on a plane A are the gradient of an eikonal there.
@@ -10,11 +10,12 @@ the light that crosses A at p shall meet B at t.  With the direction cosines alo
 m the centroid of B's light, y hardly depends on p for a fixed t, and p -> y is the gradient of a convex function: the
 optimal map from A's picture to that of B, whose pixels are seen in these coordinates.  The remaining dependence on p
 enters through the p that the previous round assigned to each t, as in slope_map.py.  σ = 1 is the convex solution, in
-which no two rays cross between the planes; in the concave one, σ = -1, all of them do.
+which no two rays cross between the planes; in the concave one, σ = -1, all of them do.  A is the plane whose picture
+has less contrast: where that is the further one, light is followed against its way.
 
-Followed back from A, rays may cross before they come to the lens: then no lens can send them.  Light of the convex
-solution does so where B asks for light much denser than A, by more than the distances A-B and lens-A allow (an
-eigenvalue of ∂t/∂p above 1 + |AB| / |lens A|).  `uncrossed` has the nearest light that does not.
+Followed back from the nearest target, rays may cross before they come to the lens: then no lens can send them.  Light
+of the convex solution does so where B asks for light much denser than A, by more than the distances A-B and lens-A
+allow (an eigenvalue of ∂t/∂p above 1 + |AB| / |lens A|).  `uncrossed` has the nearest light that does not.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.interpolate import LinearNDInterpolator
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bstcad.optics.irradiance import Screen
@@ -38,7 +41,7 @@ from bstcad.transport.mapping import places_in, solve
 ROUNDS, COARSE_SHARE, COARSEST = 3, 4, 64  # of the map between two planes: the last one on all cells
 SEARCH = 40  # steps to the place of a stated wave that sends light to a place of the target
 FOUND = 1e-9  # mm
-DIM = 0.03  # of the mean: the carried picture is lifted to it; a hole in it would be a hole in the map
+DIM = 0.1  # of the mean: the picture that is followed is lifted to it; a hole in it would be a hole in the map
 FALLING = (0.1, 0.03, 0.01, 0.003)  # of the mean: floors of the other one, where it has holes
 MEETING = 8  # Newton steps back to a face
 CROSSED = 1e-4  # of the light, whose rays may cross before they come to the lens, as rounding leaves
@@ -48,7 +51,7 @@ Grid = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class LightBehind:
-    """Rays behind the lens through the corners of equal parts of the pixels of a target."""
+    """Rays behind the lens through the corners of equal parts of the pixels of a target, near or far."""
 
     place: np.ndarray  # (3, c + 1, r + 1) mm in space, x first
     direction: np.ndarray  # (3, c + 1, r + 1) unit vectors
@@ -60,6 +63,26 @@ class LightBehind:
         """The rays through the corners of whole pixels alone."""
         every = (slice(None), slice(None, None, self.parts), slice(None, None, self.parts))
         return replace(self, place=self.place[every], direction=self.direction[every], parts=1)
+
+    def turned(self) -> LightBehind:
+        """The same rays in the opposite order, both ways."""
+        place, direction = (v[:, ::-1, ::-1].copy() for v in (self.place, self.direction))
+        return replace(self, place=place, direction=direction, picture=self.picture[::-1, ::-1])
+
+    def on(self, plane: TargetPlane) -> Grid:
+        """x and y (mm) along a plane at which its rays cross it."""
+        *along, normal = _axes(plane)
+        centre = np.array(plane.centre if isinstance(plane, TiltedPlane) else (0.0, 0.0, plane))
+        off = centre.reshape(3, 1, 1) - self.place
+        off = _along(normal, off) / _along(normal, self.direction) * self.direction - off
+        return tuple(_along(axis, off) + c for axis, c in zip(along, centre, strict=False))
+
+    def places_of(self, screen: Screen, values: np.ndarray) -> np.ndarray:
+        """(k, columns + 1, rows + 1) at the corners of a screen's pixels: values (k, c + 1, r + 1) of its rays."""
+        x, y = self.on(screen.plane)
+        if float((x[1:] - x[:-1]).mean()) < 0:
+            x, y, values = x[::-1, ::-1], y[::-1, ::-1], values[:, ::-1, ::-1]
+        return _between(values, *places_in(x, y, *pixel_corners(screen)))
 
     def meeting(self, surface: Surface) -> np.ndarray:
         """(3, c + 1, r + 1) where each ray, followed back, meets a surface (mm)."""
@@ -84,11 +107,20 @@ class LightBehind:
     def leaving(self, surface: Surface, x: Tensor, y: Tensor) -> Tensor:
         """(3, …) the directions in which light has to leave a surface at points (…) mm; beyond the light as at its rim.
 
-        x, y: two-dimensional, neighbours beside each other.
+        Linear on the Delaunay triangles of the places where rays meet the surface: where those of two bright parts of
+        a picture leave a gap, the directions change evenly across it, whatever the order of the rays.
+        x, y: two-dimensional; of more rays than points as many as those are taken, evenly.
         """
-        b_x, b_y, _ = self.meeting(surface)
-        i, j = places_in(b_x, b_y, x.cpu().double().numpy(), y.cpu().double().numpy())
-        found = torch.from_numpy(_between(self.direction, i, j))
+        every = np.ix_(
+            range(3), *(np.linspace(0, m - 1, min(m, max(x.shape)), dtype=int) for m in self.place.shape[1:])
+        )
+        few = replace(self, place=self.place[every], direction=self.direction[every])
+        met, directions = few.meeting(surface)[:2].reshape(2, -1).T, few.direction.reshape(3, -1).T
+        at = np.stack([p.cpu().double().numpy().reshape(-1) for p in (x, y)], axis=-1)
+        found = LinearNDInterpolator(met, directions)(at)
+        beyond = np.isnan(found[:, 0])
+        found[beyond] = directions[cKDTree(met).query(at[beyond])[1]]
+        found = torch.from_numpy(found.T.reshape(3, *x.shape).copy())
         return (found / torch.sqrt((found * found).sum(0))).to(x)
 
     @property
@@ -99,7 +131,7 @@ class LightBehind:
 
 
 def of_task(task: Task) -> LightBehind:
-    """The light through the nearest target that meets the wave of a task, or its furthest target."""
+    """The light through the nearest target that meets the wave of a task, or that through it and the furthest one."""
     near, *_, far = sorted((*task.goals, *task.goals), key=lambda goal: goal.screen.z)
     n = task.knobs.transport_grid
     parts = max(1, round(n / max(near.screen.shape)))
@@ -155,35 +187,35 @@ def between_targets(
 ) -> LightBehind:  # fmt: skip
     """The light through two pictures, (screen, (rows, columns) of any sum) each, by transport on n x n cells.
 
-    sign: σ, 1 for the convex solution and -1 for the concave one.  The light of the picture with less contrast is
-    carried to the other one, since maps to pictures with holes are found more safely than maps from such.
+    sign: σ, 1 for the convex solution and -1 for the concave one.  The light through the pixels of the picture with
+    less contrast is followed to the other one: maps to pictures with holes are found more safely than maps from such,
+    and their few bright pixels would be too coarse a grid for the detail of the other picture.
     """
-    followed_back = _contrast(near[1]) > _contrast(far[1])
-    (screen, picture), (behind, wanted) = (far, near) if followed_back else (near, far)
-    along = _axes(screen.plane)[:2]
+    against = _contrast(near[1]) > _contrast(far[1])  # is the light followed against its way, from far to near?
+    (screen, picture), (behind, wanted) = (far, near) if against else (near, far)
+    picture = np.maximum(picture, DIM * picture.mean())
+    axes = _axes(screen.plane)
 
     def cosines(p: np.ndarray, t: np.ndarray) -> Grid:
         way = _unit(t - p)
-        return _along(along[0], way), _along(along[1], way)
+        return _along(axes[0], way), _along(axes[1], way)
 
-    fine = parts if followed_back else 1
-    t = in_space(behind.plane, *corners(behind, fine))
+    t = in_space(behind.plane, *pixel_corners(behind))
     m = in_space(behind.plane, *(np.array(c) for c in centroid(wanted, behind))).reshape(3, 1, 1)
     p = in_space(screen.plane, *(np.full_like(t[0], sum(ends) / 2) for ends in (screen.x, screen.y)))
     for turn in range(ROUNDS):
         cells = n if turn == ROUNDS - 1 else max(COARSEST, n // COARSE_SHARE)
         y = tuple(sign * (c - g) for c, g in zip(cosines(p, t), cosines(p, m), strict=True))
         rho, frame = spread_density(picture, tuple(pixel_corners(screen)), cells)
-        sigma, seen = spread_density(wanted, tuple(c[::fine, ::fine] for c in y), cells)
-        mapping = solve(rho.lifted(DIM), sigma, frame, seen, iterations=iterations, falling=FALLING, progress=progress)
+        sigma, seen = spread_density(wanted, y, cells)
+        mapping = solve(rho, sigma, frame, seen, iterations=iterations, falling=FALLING, progress=progress)
         p = in_space(screen.plane, *mapping.inverse(*y))
-    place, light = in_space(near[0].plane, *corners(near[0], parts)), near[1] / near[1].sum()
-    if followed_back:
-        return LightBehind(place, _unit(p - t), light, parts)
+    place = in_space(screen.plane, *corners(screen, parts))
     a, b = (sign * s + g for s, g in zip(mapping(*corners(screen, parts)), cosines(place, m), strict=True))
-    upright = np.sqrt(np.clip(1 - a * a - b * b, 0.0, None))
-    direction = np.stack([a * u + b * v + upright * w for u, v, w in zip(*_axes(screen.plane), strict=True)])
-    return LightBehind(place, direction, light, parts)
+    upright = (-1 if against else 1) * np.sqrt(np.clip(1 - a * a - b * b, 0.0, None))
+    way = np.stack([a * u + b * v + upright * w for u, v, w in zip(*axes, strict=True)])
+    light = LightBehind(place, -way if against else way, picture / picture.sum(), parts)
+    return light.turned() if against and sign < 0 else light
 
 
 def _contrast(picture: np.ndarray) -> float:
@@ -204,12 +236,13 @@ def uncrossed(light: LightBehind, screen: Screen, surface: Surface, n: int) -> L
     if light.crossed(surface) <= CROSSED:
         return light
     b_x, b_y, b_z = light.of_pixels.meeting(surface)
-    rho, frame = spread_density(light.picture, tuple(pixel_corners(screen)), n)
+    rho, frame = spread_density(light.picture, light.of_pixels.on(screen.plane), n)
     sigma, seen = spread_density(light.picture, (b_x, b_y), n)
-    mapping = solve(rho, sigma, frame, seen)
-    b = np.stack([*mapping(*corners(screen, light.parts)), np.full(light.place.shape[1:], float(b_z.mean()))])
-    way = light.place - b
-    return replace(light, direction=way / np.sqrt((way * way).sum(0)))
+    mapping, there = solve(rho, sigma, frame, seen), light.on(screen.plane)
+    b = np.stack([*mapping(*there), np.full(light.place.shape[1:], float(b_z.mean()))])
+    place = in_space(screen.plane, *there)
+    way = place - b
+    return replace(light, place=place, direction=way / np.sqrt((way * way).sum(0)))
 
 
 # ---- grids of places -------------------------------------------------------------------------------------------------

@@ -137,8 +137,8 @@ def coarse_rounds(task: Task, lens: Lens) -> tuple[Round, ...]:
     """
     most = min(max(task.screen.shape) - 1, task.knobs.side // 2)  # pixels that the net can tell
     rounds = [Round(task, tubes, evaluations, pixels=pixels) for pixels, tubes, evaluations in COARSE if pixels <= most]
-    if not rounds or task.merit is not None or not task.knobs.stage2_iterations:
-        return ()
+    if not rounds or task.merit is not None or task.several or not task.knobs.stage2_iterations:
+        return ()  # of several goals: two nets bend between so few tubes
     seen, tubes = coarsened(task, LARGE), COARSE[0][1]
     far_off = rrmsd_by_tubes(lens.plain(), seen.channels, seen.screen, target=seen.target, n=tubes) > FAR_OFF
     return tuple(rounds) if far_off else ()

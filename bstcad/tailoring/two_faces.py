@@ -1,6 +1,6 @@
 """Stage 1 of a lens whose front is freeform: the front brings the light to its places on the back, which turns it.
 
-Let the light behind the lens be known (light_behind.py): through each place t of the nearest target one ray, which
+Let the light behind the lens be known (light_behind.py): through each place t of a target one ray, which
 followed back meets the back face at b(t).  The front has to send each b(t) its light: a transport in slope coordinates
 as in slope_map.py, from points q of the front to the slopes p(q, b) that Snell's law asks for there,
 
@@ -80,14 +80,14 @@ class FrontRound:
 
     round: int  # of those that are done
     lens: Parameters
-    wanted: SlopeMap  # that the front follows; its places are q(t) (mm), at the corners of the nearest target's pixels
-    back: Grid  # b(t) (mm) likewise
+    wanted: SlopeMap  # that the front follows; its places are q(t) (mm), through the corners of a target's pixels
+    back: Grid  # b(t) (mm) through those of target[0]
 
 
 class Aims(NamedTuple):
     """Where the front shall send the light."""
 
-    picture: np.ndarray  # (rows, columns) the light through each pixel of the target, row 0 = y max
+    picture: np.ndarray  # (rows, columns) the light through each pixel of a target, row 0 = y max
     back: np.ndarray  # (3, c + 1, r + 1) mm in space: b of each of the pixels' corners
 
 
@@ -156,13 +156,15 @@ def _round(
     fit: tuple[Fit, float],
 ) -> tuple[Lens, SlopeMap, Grid]:  # fmt: skip
     """One round: the lens, the map that its front follows, and b(t)."""
-    source, near = task.heaviest.source, min(task.goals, key=lambda goal: goal.screen.z)
+    source, first = task.heaviest.source, task.goals[0]
     front = replace(lens, shaped=(0,))
     window = lit_window(source, front)
     if light is None:
-        picture, back = near.target, _by_way_of_back(source, front, window, near.screen, places=places)
+        picture, back = first.target, _by_way_of_back(source, front, window, first.screen, places=places)
+        through = back[:2]
     else:
         picture, back = light.picture, light.of_pixels.meeting(lens.back)
+        through = light.of_pixels.places_of(first.screen, back[:2])
 
     def progress(s: TransportStep) -> None:
         task.progress("stage 1", turn, task.knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
@@ -184,7 +186,7 @@ def _round(
         x, y = (p.reshape(-1) for p in sampling.grid(window, grid.shape))
         z_x, z_y = (s.reshape(-1) for s in slopes)
         lens = lens.with_back(_fitted(lens.back, grid, x, y, z_x=z_x, z_y=z_y, fit=fit))
-    return lens, wanted, (back[0], back[1])
+    return lens, wanted, tuple(through)
 
 
 def _flat(grid: FaceGrid, slopes) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -221,9 +223,9 @@ def front_map(
     back = torch.from_numpy(aims.back)
     lit = corners_of(aims.picture)
     low, high = (np.array([f(p[lit]) for p in aims.back[:2]]) for f in (np.min, np.max))
-    stretch, shift = float((high - low).max()) / side, (low + high) / 2
+    stretch, shift = (high - low) / (window.width, window.height), (low + high) / 2
     if places is None:
-        q_x, q_y = ((p - s) / stretch for p, s in zip(aims.back[:2], shift, strict=True))
+        q_x, q_y = ((p - s) / k for p, s, k in zip(aims.back[:2], shift, stretch, strict=True))
         places = tuple(np.clip(q, -side / 2, side / 2) for q in (q_x, q_y))
     net = _gathering(grid, lens, back, stretch=stretch, shift=shift)
     slopes = _slopes_at(rays_at(grid, places), back, lens)
@@ -247,13 +249,13 @@ def _in_space(rays: Rays) -> Tensor:
     return torch.stack([*rays.position[:2], rays.above(0.0)])
 
 
-def _gathering(grid: FaceGrid, lens: Lens, back: Tensor, stretch: float, shift: np.ndarray) -> BSplineSurface:
+def _gathering(grid: FaceGrid, lens: Lens, back: Tensor, stretch: np.ndarray, shift: np.ndarray) -> BSplineSurface:
     """g of the module's docstring, as a net of GATHERING points a side over the lit part of a grid."""
     thin = tuple(slice(step // 2, None, step) for step in (max(1, n // SAMPLES) for n in grid.shape))
     faces = replace(grid.at_face, **{k: getattr(grid.at_face, k)[(..., *thin)] for k in ("position", "direction")})
     x, y, z = _in_space(faces).cpu().double()
     height = float(back[2].mean())
-    reference = torch.stack([stretch * x + shift[0], stretch * y + shift[1], torch.full_like(x, height)])
+    reference = torch.stack([stretch[0] * x + shift[0], stretch[1] * y + shift[1], torch.full_like(x, height)])
     lit = grid.density[thin] > 0
     z_x, z_y = _slopes_at(faces, reference, lens)
     step = NUDGE * (height - float(z.mean()))

@@ -74,10 +74,11 @@ def test_the_waves_term_is_the_measured_error(name):
 # ---- the light behind the lens ---------------------------------------------------------------------------------------
 
 
-def far_picture(light, screen, far):
-    path = (far.z - light.place[2]) / light.direction[2]
-    there = torch.from_numpy(light.place[:2] + path * light.direction[:2])
-    return collect(far.pixels_of(there), torch.from_numpy(np.ascontiguousarray(light.picture[::-1].T)), far.shape)[0]
+def shown(light, screen):
+    """The picture on a screen, by the quads of the light."""
+    there = torch.from_numpy(np.stack(light.on(screen.plane)))
+    flux = torch.from_numpy(np.ascontiguousarray(light.picture[::-1].T))
+    return collect(screen.pixels_of(there), flux, screen.shape)[0].numpy()
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -91,17 +92,49 @@ def test_even_light_between_squares_is_affine(sign):
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("sharper", ["near", "far"])
 @pytest.mark.parametrize("tilt", [None, (10.0, -15.0)])
-def test_the_light_makes_the_far_picture(sign, tilt):
+def test_the_light_makes_both_pictures(sign, sharper, tilt):
+    """Followed from the near plane to the far one or against its way: from the picture of less contrast."""
     near = Screen(30.0, (-9.0, 9.0), (-9.0, 9.0), 64, tilt=tilt)
     far = Screen(90.0, (-9.0, 9.0), (-9.0, 9.0), 64)
     x, y = np.meshgrid(np.linspace(-1, 1, 64), np.linspace(-1, 1, 64))
-    first, second = (p / p.sum() for p in (1.5 + np.sin(3 * x), 1.5 + np.cos(4 * y + x)))
+    waves = (1.2 + np.sin(3 * x), 2.0 + np.cos(4 * y + x))
+    first, second = (p / p.sum() for p in (waves if sharper == "near" else waves[::-1]))
     light = light_behind.between_targets((near, first), (far, second), 128, parts=1, sign=sign)
-    assert np.abs((light.direction**2).sum(0) - 1).max() < 1e-12
-    made = far_picture(light, near, far).numpy()
-    off = (made - second)[2:-2, 2:-2]  # light of the outermost cells lands a little inside or outside
-    assert np.sqrt((off**2).sum() / (second**2).sum()) < 0.05
+    assert np.abs((light.direction**2).sum(0) - 1).max() < 1e-12 and light.direction[2].min() > 0.8
+    assert light.crossed(Plane(29.0)) == 0  # the order of its rays is that of their places near by
+    for screen, wanted in ((near, first), (far, second)):
+        off = (shown(light, screen) - wanted)[2:-2, 2:-2]  # light of the outermost cells lands a little beside
+        assert np.sqrt((off**2).sum() / (wanted**2).sum()) < 0.05
+
+
+def test_bright_letters_near_and_grey_far_are_both_shown():
+    """The light of a few bright pixels makes all of the other picture, and that of no ray between them is lost."""
+    near, far = Screen(30.0, (-9.0, 9.0), (-9.0, 9.0), 64), Screen(90.0, (-6.0, 6.0), (-6.0, 6.0), 64)
+    letters = np.zeros((64, 64))
+    letters[16:48, 8:20] = letters[16:48, 40:52] = 1.0
+    grey = 1.5 + np.sin(6 * np.linspace(-1, 1, 64)) * np.ones((64, 1))
+    letters, grey = letters / letters.sum(), grey / grey.sum()
+    light = light_behind.between_targets((near, letters), (far, grey), 128, parts=1, sign=-1.0)
+    blocks = [p.reshape(16, 4, 16, 4).sum((1, 3)) for p in (shown(light, near), letters)]
+    assert np.sqrt(((blocks[0] - blocks[1]) ** 2).sum() / (blocks[1] ** 2).sum()) < 0.12
+    assert np.abs(shown(light, far) / grey - 1).max() < 1e-9
+
+
+def test_directions_in_a_gap_change_evenly_from_the_one_side_to_the_other():
+    """Two patches of light, which arrive in the wrong order of their rays too."""
+    x, y = np.meshgrid(np.linspace(-8, 8, 32), np.linspace(-8, 8, 32), indexing="ij")
+    x[:16] -= 4.0
+    x[16:] += 4.0
+    a = np.where(x < 0, 0.1, -0.1)
+    direction = np.stack([a, np.zeros_like(a), np.sqrt(1 - a * a)])
+    light = light_behind.LightBehind(np.stack([x, y, np.zeros_like(x)]), direction, np.ones((31, 31)) / 961, parts=1)
+    where = [torch.from_numpy(p) for p in np.meshgrid(np.linspace(-3, 3, 32), np.linspace(-5, 5, 32), indexing="ij")]
+    edge = 4.0 + 8 / 31
+    for rays in (light, light.turned()):
+        found = rays.leaving(Plane(0.0), *where)
+        assert float((found[0] / found[2] + 0.1 / edge * where[0] / 0.99**0.5).abs().max()) < 1e-9
 
 
 def test_a_spherical_wave_goes_through_its_focus():
