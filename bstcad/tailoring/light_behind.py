@@ -10,8 +10,8 @@ the light that crosses A at p shall meet B at t.  With the direction cosines alo
 m the centroid of B's light, y hardly depends on p for a fixed t, and p -> y is the gradient of a convex function: the
 optimal map from A's picture to that of B, whose pixels are seen in these coordinates.  The remaining dependence on p
 enters through the p that the previous round assigned to each t, as in slope_map.py.  σ = 1 is the convex solution, in
-which no two rays cross between the planes; in the concave one, σ = -1, all of them do.  A is the plane whose picture
-has less contrast: where that is the further one, light is followed against its way.
+which no two rays cross between the planes; in the concave one, σ = -1, all of them do.  A is the nearest
+target, or, where its picture has clearly more contrast, the furthest one: then light is followed against its way.
 
 Followed back from the nearest target, rays may cross before they come to the lens: then no lens can send them.  Light
 of the convex solution does so where B asks for light much denser than A, by more than the distances A-B and lens-A
@@ -43,6 +43,7 @@ SEARCH = 40  # steps to the place of a stated wave that sends light to a place o
 FOUND = 1e-9  # mm
 DIM = 0.1  # of the mean: the picture that is followed is lifted to it; a hole in it would be a hole in the map
 FALLING = (0.1, 0.03, 0.01, 0.003)  # of the mean: floors of the other one, where it has holes
+SHARPER = 1.5  # times the contrast of the further picture: from then on the light of that one is followed
 MEETING = 8  # Newton steps back to a face
 CROSSED = 1e-4  # of the light, whose rays may cross before they come to the lens, as rounding leaves
 
@@ -100,9 +101,9 @@ class LightBehind:
     def beyond(self, surface: Surface, contains: Callable[[Tensor, Tensor], Tensor]) -> float:
         """Part of the light that meets a surface outside of what `contains` says of (x, y) in mm."""
         x, y = (torch.from_numpy(p) for p in self.meeting(surface)[:2])
-        outside = ~contains(x, y).numpy()
-        quads = outside[1:, 1:] & outside[1:, :-1] & outside[:-1, 1:] & outside[:-1, :-1]
-        return float(self._flux[quads].sum())
+        outside = (~contains(x, y)).double().numpy()
+        share = (outside[1:, 1:] + outside[1:, :-1] + outside[:-1, 1:] + outside[:-1, :-1]) / 4  # of each quad
+        return float((self._flux * share).sum())
 
     def leaving(self, surface: Surface, x: Tensor, y: Tensor) -> Tensor:
         """(3, …) the directions in which light has to leave a surface at points (…) mm; beyond the light as at its rim.
@@ -187,18 +188,19 @@ def between_targets(
 ) -> LightBehind:  # fmt: skip
     """The light through two pictures, (screen, (rows, columns) of any sum) each, by transport on n x n cells.
 
-    sign: σ, 1 for the convex solution and -1 for the concave one.  The light through the pixels of the picture with
-    less contrast is followed to the other one: maps to pictures with holes are found more safely than maps from such,
-    and their few bright pixels would be too coarse a grid for the detail of the other picture.
+    sign: σ, 1 for the convex solution and -1 for the concave one.  Light through the pixels of the near picture is
+    followed to the far one, or against its way where the near picture has clearly more contrast: maps to pictures with
+    holes are found more safely than maps from such, and their few bright pixels would be too coarse a grid for the
+    detail of the other picture.
     """
-    against = _contrast(near[1]) > _contrast(far[1])  # is the light followed against its way, from far to near?
+    against = _contrast(near[1]) > SHARPER * _contrast(far[1])  # is light followed against its way, from far to near?
     (screen, picture), (behind, wanted) = (far, near) if against else (near, far)
     picture = np.maximum(picture, DIM * picture.mean())
-    axes = _axes(screen.plane)
+    along = _axes(screen.plane)[:2]
 
     def cosines(p: np.ndarray, t: np.ndarray) -> Grid:
         way = _unit(t - p)
-        return _along(axes[0], way), _along(axes[1], way)
+        return _along(along[0], way), _along(along[1], way)
 
     t = in_space(behind.plane, *pixel_corners(behind))
     m = in_space(behind.plane, *(np.array(c) for c in centroid(wanted, behind))).reshape(3, 1, 1)
@@ -210,10 +212,9 @@ def between_targets(
         sigma, seen = spread_density(wanted, y, cells)
         mapping = solve(rho, sigma, frame, seen, iterations=iterations, falling=FALLING, progress=progress)
         p = in_space(screen.plane, *mapping.inverse(*y))
-    place = in_space(screen.plane, *corners(screen, parts))
-    a, b = (sign * s + g for s, g in zip(mapping(*corners(screen, parts)), cosines(place, m), strict=True))
-    upright = (-1 if against else 1) * np.sqrt(np.clip(1 - a * a - b * b, 0.0, None))
-    way = np.stack([a * u + b * v + upright * w for u, v, w in zip(*axes, strict=True)])
+    place, there = in_space(screen.plane, *corners(screen, parts)), mapping(*corners(screen, parts))
+    i, j = places_in(*(sign * c for c in y), *(sign * c for c in there))  # which increase with t
+    way = _unit(in_space(behind.plane, *_between(np.stack(pixel_corners(behind)), i, j)) - place)
     light = LightBehind(place, -way if against else way, picture / picture.sum(), parts)
     return light.turned() if against and sign < 0 else light
 

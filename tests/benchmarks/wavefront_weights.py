@@ -31,8 +31,8 @@ def scene(tailored: bool, weight: float) -> Scene:
 def errors(tailored: bool) -> Iterator[tuple[float, float, float]]:
     """(weight, RMS in waves without tilt, RRMSD) of each design."""
     for weight in WEIGHTS:
-        report = bstcad.design(scene(tailored, weight), progress=False).report
-        found = weight, report["wavefront"]["rms"], report["rrmsd"]
+        report = bstcad.design(scene(tailored, weight), progress=False).verify(progress=False)
+        found = weight, report.wavefront.rms, report.rrmsd
         print(tailored, found, flush=True)
         yield found
 
