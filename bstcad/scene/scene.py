@@ -491,8 +491,13 @@ def _of_method(scene: Scene) -> Iterator[str]:
 
 def _of_goals(scene: Scene) -> Iterator[str]:
     """As many goals as tailored faces can all be met: with fewer a front is idle, with more none is met whole."""
-    lens, pictures = scene.lens, len(scene.targets)
-    goals, shaped = pictures + (scene.wavefront is not None), lens.shaped or (1,)
+    lens, wave, different = scene.lens, scene.wavefront, []
+    for target in scene.targets:  # parallel light along the axis repeats a picture on every plane: that is one goal
+        alike = target.model_copy(update={"z": 0.0, "weight": 1.0})
+        if alike not in different or not (isinstance(wave, PlaneWave) and wave.normal == (0.0, 0.0, 1.0)):
+            different.append(alike)
+    pictures, shaped = len(different), lens.shaped or (1,)
+    goals = pictures + (wave is not None)
     if goals < len(shaped):
         yield (
             "lens.front.optimise: one picture is the back's work alone, and the front stays as it is; add a second "

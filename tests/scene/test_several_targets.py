@@ -184,6 +184,14 @@ def test_warnings_and_remarks_name_their_target(three):
     assert compromise.startswith("target: 3 goals for two tailored faces, which meet them only as far as least squares")
 
 
+def test_a_picture_that_parallel_light_repeats_is_one_goal():
+    scene = load(Path(__file__).parents[2] / "templates" / "beam_shaper.toml")
+    assert len(scene.targets) == 2 and scene.warnings() == ()
+    for change in ({"wavefront.direction": [0.1, 0.0, 1.0]}, {"target[1].profile.radius": 5.0}):
+        [compromise] = scene.changed(change).warnings()
+        assert compromise.startswith("target: 3 goals for two tailored faces")
+
+
 @pytest.mark.parametrize(("more", "key"), [
     ({"tailoring.quality": "paper"}, "tailoring.quality: the paper's procedure"),
     ({"tailoring.method": "integration"}, "tailoring.method: point-by-point integration"),
