@@ -98,7 +98,7 @@ def _small(task: Task, solution: float) -> Task:
 
 def _of(task: Task, lens: Lens) -> tuple[Demand, LightBehind]:
     light = light_behind.of_task(task)
-    angle = np.degrees(np.arccos(light.of_pixels.direction[2].clip(-1, 1)))[corners_of(light.picture)]
+    angle = np.degrees(np.arccos(light.direction[2].clip(-1, 1)))[corners_of(light.picture)]
     crossed = light.crossed(lens.back)
     near = min(task.goals, key=lambda goal: goal.screen.z)
     served = light_behind.uncrossed(light, near.screen, lens.back, CELLS)
@@ -112,7 +112,7 @@ def _of(task: Task, lens: Lens) -> tuple[Demand, LightBehind]:
 
 def _in_glass(task: Task, lens: Lens, light: LightBehind) -> float:
     front, source = replace(lens, shaped=(0,)), task.heaviest.source
-    back = light.of_pixels.meeting(lens.back)
+    back = light.meeting(lens.back)
     with torch.no_grad():
         wanted = front_map(source, front, lit_window(source, front), Aims(light.picture, back), n=CELLS, places=None)
     lit = corners_of(light.picture)

@@ -80,15 +80,15 @@ class FrontRound:
 
     round: int  # of those that are done
     lens: Parameters
-    wanted: SlopeMap  # that the front follows; its places are q(t) (mm), through the corners of a target's pixels
+    wanted: SlopeMap  # that the front follows; its places are q(t) (mm) of the rays behind the lens
     back: Grid  # b(t) (mm) through those of target[0]
 
 
 class Aims(NamedTuple):
     """Where the front shall send the light."""
 
-    picture: np.ndarray  # (rows, columns) the light through each pixel of a target, row 0 = y max
-    back: np.ndarray  # (3, c + 1, r + 1) mm in space: b of each of the pixels' corners
+    picture: np.ndarray  # (r, c) the light between each four of its rays, row 0 = y max
+    back: np.ndarray  # (3, c + 1, r + 1) mm in space: b of each ray
 
 
 def steps(task: Task, lens: Lens, state: FrontRound | None = None) -> Iterator[Step]:
@@ -163,8 +163,8 @@ def _round(
         picture, back = first.target, _by_way_of_back(source, front, window, first.screen, places=places)
         through = back[:2]
     else:
-        picture, back = light.picture, light.of_pixels.meeting(lens.back)
-        through = light.of_pixels.places_of(first.screen, back[:2])
+        picture, back = light.picture, light.meeting(lens.back)
+        through = light.places_of(first.screen, back[:2])
 
     def progress(s: TransportStep) -> None:
         task.progress("stage 1", turn, task.knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")

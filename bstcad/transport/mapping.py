@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -109,6 +109,7 @@ def solve(
     iterations: int = 40,
     tolerance: float = 2e-3,
     falling: tuple[float, ...] = FALLING,
+    sharper: Sequence[Density] = (),
     progress: Callable[[Step], None] | None = None,
 ) -> Mapping:
     """The map that carries source to target: back-and-forth on a coarse grid, then Newton on ray tubes to the finest.
@@ -118,6 +119,8 @@ def solve(
     A target with zeros is lifted to FLOOR of its mean; `mapping.target` is the lifted one.  Where a bright rim ends in
     black, Newton's first step on a grid would fold the map: there the floor is high first, and falls on the last grid.
     falling: these floors, of the mean.
+    sharper: sources of ever more detail, to which the map is carried on by Newton's method on the last grid, as long as
+    its mass error stays below ROUGH; `mapping.source` is the last one of them that it reaches.
     """
     newton = partial(climb, steps=NEWTON_STEPS, tolerance=tolerance, progress=progress)
 
@@ -133,6 +136,11 @@ def solve(
             other, left, why = newton([(source, target.lifted(floor))], other, smoothing=0.0)
         if left[-1] < errors[-1]:
             phi, errors, reason = other, left, why
+    for sharp in sharper:
+        other, left, why = newton([(sharp, target.lifted(FLOOR))], phi, smoothing=0.0)
+        if left[-1] > ROUGH:
+            break
+        phi, errors, reason, source = other, left, why, sharp
     target, n = target.lifted(FLOOR), source.n
     half = half_square(n)
     u = legendre(half - phi)
