@@ -98,7 +98,7 @@ def along_light(source: Source, lens: Lens, goals: Sequence[Goal]) -> tuple[csr_
     lit = _array((source.irradiance(*coming.position[:2], lens.entrance.z) > 0) & out.alive)
     places = [_array(p) for p in out.position[:2]]
     row, column = places_in(*places, *(p.numpy() for p in torch.meshgrid(*_control_points(back), indexing="ij")))
-    row, column = (gaussian_filter(at, SMOOTH, mode="nearest") for at in (row, column))
+    row, column = (_smoothed(at) for at in (row, column))
     carried = _interpolation(row, column, q.shape[1:]) @ diags_array(np.where(lit, factor, 1.0).reshape(-1))
 
     own = (back.z - front.z) / lens.index / _magnification(q.numpy(), places, lit)
@@ -130,6 +130,13 @@ def _magnification(q: np.ndarray, places: Sequence[np.ndarray], lit: np.ndarray)
 
     lit = lit > 0
     return (along(places[0], q[0]) + along(places[1], q[1])) / 2
+
+
+def _smoothed(at: np.ndarray) -> np.ndarray:
+    """By a Gaussian of SMOOTH; beyond the rim it goes on as steeply as within."""
+    wide = math.ceil(4 * SMOOTH)
+    padded = np.pad(at, wide, mode="reflect", reflect_type="odd")
+    return gaussian_filter(padded, SMOOTH)[wide:-wide, wide:-wide]
 
 
 def _interpolation(row: np.ndarray, column: np.ndarray, sides: tuple[int, int]) -> csr_array:

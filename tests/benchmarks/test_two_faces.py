@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tomli_w
 import torch
 
 from bstcad import folder as folders
@@ -56,6 +58,22 @@ def test_batoid_finds_the_same_places_and_paths(made):
         apart = batoid.paths_apart(channel.through(lens), channel.source, target.z)
         print(name, target.z, apart)
         assert apart.rays > 1000 and apart.place < LANDING and apart.path < PATH
+
+
+def test_letters_near_by_and_a_portrait_behind_them(tmp_path):
+    """White letters on black, whose light makes a portrait further on: the hardest pair of pictures."""
+    scene = tomllib.loads((ROOT / "templates" / "two_pictures.toml").read_text())
+    near, far = scene["target"]
+    del near["sample"]
+    near["text"], scene["lens"]["back"]["z"], near["z"], far["z"] = "THU", 160.0, 260.0, 400.0
+    scene["tailoring"]["stage2_iterations"], far["weight"] = 140, 1.1
+    scene["accept"]["rrmsd"] = 0.06
+    path, folder = tmp_path / "letters.toml", tmp_path / "made"
+    path.write_text(tomli_w.dumps(scene))
+    subprocess.run([sys.executable, "-m", "bstcad.cli", "generate", path, "--output", folder], check=True)
+    report = json.loads((folder / "report.json").read_text())
+    print("letters", [target["rrmsd"] for target in report["targets"]], "seconds", report["seconds_total"])
+    assert all(target["rrmsd"] <= 0.06 for target in report["targets"]) and report["verdict"] != "failed"
 
 
 @pytest.mark.parametrize("made", ["beam_shaper"], indirect=True)

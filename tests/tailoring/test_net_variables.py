@@ -1,8 +1,11 @@
 """The variables of two nets: the wavefront behind the lens stands still for one block, and adjoints are exact."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
+from bstcad.analysis.shape import slope_octaves
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
@@ -74,3 +77,19 @@ def test_the_adjoint_is_the_transpose(back):
         for pair in ((variables.heights(c), g), (c, variables.adjoint(g)))
     )
     assert one == pytest.approx(other, rel=1e-12)
+
+
+def test_where_rays_cross_in_the_glass_the_back_gets_no_ripple():
+    """There q(b) is many-valued; the carried change is smooth all the same: it falls off towards the highest octave."""
+    m = 97
+    front = surface(0.0, lambda x, y: 0.004 * (x * x + y * y) + 0.25 * torch.cos(x / 0.8) * torch.cos(y / 0.8), m)
+    lens = Lens(front, lens_of().back, Rectangle(22.0, 22.0), 1.5, shaped=(0, 1))
+    within = behind(BEAM.rays(*torch.meshgrid(*[torch.linspace(-6, 6, 97).double()] * 2, indexing="ij"), 0.0, 1.0),
+                    lens.unbounded().interfaces[0])  # fmt: skip
+    there = within.position[:2] + (12.0 - within.above(0.0)) * within.direction[:2] / within.direction[2]
+    assert bool((torch.linalg.det(jacobian(there, 0.125)) < 0).any())  # they do cross
+    along, _ = along_light(BEAM, lens, GOALS)
+    change = surface(0.0, lambda x, y: torch.cos(x / 3 + 0.3) * torch.sin(y / 2), m)
+    carried = torch.from_numpy(along @ change.heights.numpy().reshape(-1)).reshape(lens.back.shape)
+    below, top = slope_octaves(replace(lens.back, heights=carried))[-2:]
+    assert top < below
