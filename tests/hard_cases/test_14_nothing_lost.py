@@ -41,20 +41,31 @@ CONTENTS = {
 DRAWN = {"figures", "datasheet.pdf"}
 
 
-def design_with_checkpoints(folder):
-    """In a process that is to be killed: the small design, with a checkpoint at every step and --resume."""
+SCENES = {  # (scene, what makes it small)
+    "one face": (DISK, SMALL | {"tailoring.stage2_iterations": 45}),
+    "two faces": (
+        ROOT / "templates" / "two_pictures.toml",
+        {"lens.back.control_points": 65, "lens.front.control_points": 49, "target[0].pixels": 32,
+         "target[1].pixels": 32, "tailoring.rays": 160, "tailoring.stage2_iterations": 20,
+         "tailoring.transport_grid": 64},
+    ),
+}  # fmt: skip
+
+
+def design_with_checkpoints(folder, name="one face"):
+    """In a process that is to be killed: a small design, with a checkpoint at every step and --resume."""
     commands.Keeper = functools.partial(commands.Keeper, every=0.0)
     checkpoint.SHARE = 1e9  # no pause, however long the writing takes
     rendering.lens_picture = lambda mesh: None
-    scene = load(DISK, SMALL | {"tailoring.stage2_iterations": 45})
+    scene = load(*SCENES[name])
     print("ready", flush=True)
     commands.generate(scene, Path(folder), device="cpu", resume=True, effort=Effort(256))
     print("done")
 
 
-def started(folder):
+def started(folder, name):
     """Such a process, from when it is ready."""
-    code = f"import {__name__} as m; m.design_with_checkpoints({str(folder)!r})"
+    code = f"import {__name__} as m; m.design_with_checkpoints({str(folder)!r}, {name!r})"
     given = {"cwd": ROOT, "env": os.environ | {"PYTHONPATH": str(ROOT)}, "text": True}
     running = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **given)
     assert running.stdout.readline() == "ready\n", running.communicate()[0]
@@ -66,18 +77,18 @@ def digest_of(folder):
 
 
 @pytest.mark.bench
-@pytest.mark.parametrize("kills", [50])
-def test_kill_9_at_random_moments(kills, tmp_path, holds):
+@pytest.mark.parametrize(("name", "kills"), [("one face", 50), ("two faces", 20)])
+def test_kill_9_at_random_moments(name, kills, tmp_path, holds):
     """Each time the next run goes on; a design that got finished in between begins anew beside its folder.
 
     The moments are those of the first, the second and the last third of an undisturbed run in turn.
     """
     whole, folder, moments = tmp_path / "whole", tmp_path / "lens", random.Random(kills)
-    undisturbed, began = started(whole), time.perf_counter()
+    undisturbed, began = started(whole, name), time.perf_counter()
     assert "done" in undisturbed.communicate()[0]
     seconds, digest = time.perf_counter() - began, digest_of(whole)
     for kill in range(kills):
-        running = started(folder)
+        running = started(folder, name)
         time.sleep(seconds * (kill % 3 + moments.random()) / 3)
         running.kill()
         running.communicate()
@@ -85,9 +96,9 @@ def test_kill_9_at_random_moments(kills, tmp_path, holds):
         kept = tmp_path / ".lens.checkpoint"
         if kept.exists():
             checkpoint.read(kept, Saved)  # raises if it is damaged
-    assert "done" in started(folder).communicate(timeout=300)[0] and intact(folder, digest)
+    assert "done" in started(folder, name).communicate(timeout=300)[0] and intact(folder, digest)
     assert sorted(tmp_path.iterdir()) == [folder, whole]  # what the killed ones left has been cleared away
-    holds(f"runs killed at random ({kills}) that left a damaged folder or checkpoint", 0, 0)
+    holds(f"runs killed at random ({name}, {kills}) that left a damaged folder or checkpoint", 0, 0)
 
 
 def intact(folder, digest):
