@@ -133,20 +133,23 @@ def _magnification(q: np.ndarray, places: Sequence[np.ndarray], lit: np.ndarray)
 
 
 def _smoothed(row: np.ndarray, column: np.ndarray) -> list[np.ndarray]:
-    """q(b) as real rows and columns, blurred by SMOOTH where a control cell of the back has FEW of the mean light."""
-    blurred = [_blurred(at) for at in (row, column)]
-    (xx, xy), (yx, yy) = (np.gradient(at) for at in blurred)
-    light = xx * yy - xy * yx  # control cells of the front for one of the back
-    few = minimum_filter(light, 2 * math.ceil(SMOOTH) + 1) < FEW * light[light > 0].mean()
-    share = np.clip(2 * gaussian_filter(few.astype(float), SMOOTH), 0.0, 1.0)
-    return [at + share * (wide - at) for at, wide in zip((row, column), blurred, strict=True)]
+    """q(b) as real rows and columns, blurred by SMOOTH around control cells of the back that have FEW of the light.
 
-
-def _blurred(at: np.ndarray) -> np.ndarray:
-    """By a Gaussian of SMOOTH; beyond the rim it goes on as steeply as within."""
+    FEW: of the mean; cells in which rays have crossed have less than none.
+    """
     wide = math.ceil(4 * SMOOTH)
-    padded = np.pad(at, wide, mode="reflect", reflect_type="odd")
-    return gaussian_filter(padded, SMOOTH)[wide:-wide, wide:-wide]
+    padded = (np.pad(at, wide, mode="reflect", reflect_type="odd") for at in (row, column))  # as steep beyond the rim
+    blurred = [gaussian_filter(at, SMOOTH)[wide:-wide, wide:-wide] for at in padded]
+    own, mean = _light(row, column), _light(*blurred)
+    few = minimum_filter(np.minimum(own, mean), 2 * math.ceil(SMOOTH) + 1) < FEW * mean[mean > 0].mean()
+    share = np.clip(2 * gaussian_filter(few.astype(float), SMOOTH), 0.0, 1.0)
+    return [at + share * (smooth - at) for at, smooth in zip((row, column), blurred, strict=True)]
+
+
+def _light(row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """Control cells of the front for one of the back."""
+    (xx, xy), (yx, yy) = (np.gradient(at) for at in (row, column))
+    return xx * yy - xy * yx
 
 
 def _interpolation(row: np.ndarray, column: np.ndarray, sides: tuple[int, int]) -> csr_array:
