@@ -206,7 +206,10 @@ def _written_and_proved(
         for work in meanwhile:
             work.result()
     verified = time.perf_counter()
-    last = Stage("write", written - began), Stage("verify", verified - written, proof.light.rrmsd)
+    last = (
+        Stage("write", written - began),
+        Stage("verify", verified - written, max(light.rrmsd for light in proof.lights)),
+    )
     return replace(made, making=made.making.followed_by(*last)), proof
 
 
@@ -385,9 +388,11 @@ def _name_of(cloud: Cloud, folder: Path) -> str:
 def _contents(made: Made, proof: Proof, estimates: tuple[LeftOut, ...]) -> Contents:
     """The contents of report.json; estimates: of the effects that are left out."""
     scene, blurred = made.scene, proof.blur.rrmsd if proof.blur else 0.0
+    of_targets = zip(scene.each_alone(), made.targets, proof.lights, strict=True)
+    alone, target, light = max(of_targets, key=lambda each: each[2].rrmsd)  # tailoring counts the largest RRMSD
     diagnosed = diagnosis(
-        scene, made.making, proof.lens, picture=proof.light.picture, target=made.target, rrmsd=proof.light.rrmsd,
-        efficiency=proof.light.efficiency, blurred=blurred, at_bounds=proof.at_bounds,
+        alone, made.making, proof.lens, picture=light.picture, target=target, rrmsd=light.rrmsd,
+        efficiency=light.efficiency, blurred=blurred, at_bounds=proof.at_bounds,
     )  # fmt: skip
     return contents_of(
         scene, made.lens, made.target, proof, making=made.making, circumstances=circumstances(made.device),

@@ -226,8 +226,11 @@ def control_cells(channel: Channel, lens: Lens, screen: Screen, target: np.ndarr
     """By ray tubes, each of which carries the part of the net that it crosses; channel: of a point, or parallel."""
     lens = channel.through(lens)
     tubes = launch_tubes(channel.source, lens, TUBES)
-    x, y = cross(tubes.coming, lens.interfaces[lens.freeform[0]]).rays.position[:2]
-    pitch_x, pitch_y = lens.nets[0].pitch
+    rays = tubes.coming
+    for interface in lens.interfaces[lens.freeform[0] : lens.freeform[-1] + 1]:
+        rays = cross(rays, interface).rays
+    x, y = rays.position[:2]
+    pitch_x, pitch_y = lens.nets[-1].pitch
     cells = area_of(x, y).double() / (pitch_x * pitch_y)
     landed = tubes.landing(lens, screen.plane)
     corners = screen.pixels_of(landed.position.double())

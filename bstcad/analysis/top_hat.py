@@ -128,3 +128,32 @@ def _half_width(count: np.ndarray, half: float) -> float:
     count = np.append(count, 0)
     k = int((count < half).argmax())
     return k - (half - count[k]) / (count[k - 1] - count[k])
+
+
+@dataclass(frozen=True)
+class FlatTop:
+    """The light on a target whose profile is flat, as a report has it: levels are parts of the maximum."""
+
+    key: str  # target, target[0], …
+    uniformity: float  # U_0.9: RMS deviation over the mean, where the light is above 0.9; 0: even
+    plateau_uniformity: float  # U_P: width of the histogram's peak over the maximum; 0: even
+    flatness: float  # F_0.9: mean over maximum, where the light is above 0.9; 1: even
+    fractional_power: float  # f_0.9: of the light on the target, above 0.9
+    edge_steepness: float  # s: part of the area above 0.1 that is not above 0.9; 0: upright
+    efficiency: float  # of the source's flux, inside the profile; of a super-Gaussian, where it asks for 0.9 or more
+
+    @classmethod
+    def of(
+        cls, key: str, picture: np.ndarray, pixel: tuple[float, float], inside: np.ndarray, on_picture: float
+    ) -> FlatTop:
+        """Of a picture whose pixels are so wide and high (mm); inside: their shares within the profile."""
+        found = top_hat(picture, pixel, inside, on_picture=on_picture)
+        return cls(
+            key=key,
+            uniformity=found.uniformity,
+            plateau_uniformity=found.plateau_uniformity,
+            flatness=found.flatness,
+            fractional_power=found.fractional_power,
+            edge_steepness=found.edge_steepness,
+            efficiency=float(found.efficiency),
+        )

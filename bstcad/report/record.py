@@ -24,6 +24,7 @@ from typing_extensions import TypedDict
 from bstcad.analysis.light import Blur, FinestDetail, finest_detail
 from bstcad.analysis.missed_light import lifted, unlit
 from bstcad.analysis.steepness import Steepness
+from bstcad.analysis.top_hat import FLAT, FlatTop
 from bstcad.judges.comparison import Judge
 from bstcad.measured.form_error import MAP
 from bstcad.measured.made_part import MadePart
@@ -35,6 +36,7 @@ from bstcad.report.prescription import Order, prescription
 from bstcad.report.units import DIGITS, Rows, number, paragraphs, percent, tables
 from bstcad.runs import files
 from bstcad.scene.scene import Scene
+from bstcad.scene.target import drawing
 from bstcad.verify.checks import CUT, DEFAULT_RRMSD_LIMIT, Proof
 from bstcad.verify.verdict import Check, verdict
 
@@ -115,12 +117,12 @@ class TargetFigures:
     z: float  # mm, of its plane
     weight: Size  # of its squared error among all goals
     rrmsd: Rrmsd  # by the flux into each pixel
-    rrmsd_standard_error: Annotated[float, Field(ge=0, le=1e3)]
+    rrmsd_standard_error: Annotated[float, Field(ge=0, le=1e3)]  # of rrmsd, by independent sets of rays
     rrmsd_tent: Rrmsd | None  # by linear binning
     light_on_target: Share  # of the source's flux
     efficiency: Share  # flux on the target over flux that leaves the back face
-    leak: Share | None  # as in Contents
-    contrast: Size | None
+    leak: Share | None  # of the light on the target, on its dark pixels; None: it has none
+    contrast: Size | None  # mean irradiance of the lit pixels over that of the dark ones; None: or without leak
 
 
 @dataclass(frozen=True)
@@ -243,7 +245,8 @@ class Contents:
     # what limits the design, the most limiting first: {by, rrmsd (times what it is, after one step of it), figures,
     # because}, as analysis.cost.Limit has them
     limits: tuple[Mapping[str, Any], ...] = ()
-    # the bounds on the back: asked {key of [lens]: value}, at (part of the back that is at each), rrmsd and rrmsd_freed
+    # the bounds on the tailored faces: asked {key of [lens]: value}, at (part of them that is at each), both or front
+    # (true where not the back alone is tailored), rrmsd and rrmsd_freed
     # (of the design, and of the same tailored on without them, by the same tubes); None: none is asked
     bounds: Mapping[str, Any] | None = None
     judges: tuple[Judge, ...] = ()  # by --against
@@ -252,6 +255,7 @@ class Contents:
     order: Order | None = None  # for a machine shop
     # the light on each of several targets, the first one too, whose figures are those above; none: there is one target
     targets: tuple[TargetFigures, ...] = ()
+    flat_tops: tuple[FlatTop, ...] = ()  # of the targets with a flat profile
     wavefront: WavefrontFigures | None = None  # None: none is asked for, or no light comes to where it is stated
 
     @property
@@ -340,6 +344,7 @@ def contents_of(
         lines=tuple(Line(line.wavelength, line.share, rrmsd(target, line.picture)) for line in proof.lines),
         estimates=estimates,
         targets=tuple(_figures(scene, proof)) if proof.further else (),
+        flat_tops=tuple(_flat_tops(scene, proof)),
         wavefront=proof.wavefront and WavefrontFigures.of(proof.wavefront),
     )
     pictures = tuple(zip(further, (each.picture for each in proof.further), strict=True))
@@ -361,6 +366,17 @@ def _figures(scene: Scene, proof: Proof) -> Iterator[TargetFigures]:
             leak=light.leak and light.leak.share,
             contrast=light.leak and light.leak.contrast,
         )
+
+
+def _flat_tops(scene: Scene, proof: Proof) -> Iterator[FlatTop]:
+    """Of each target with a profile that is flat, if light falls on it."""
+    for key, target, light in zip(scene.target_keys, scene.targets, proof.lights, strict=True):
+        if target.profile is not None and target.profile.shape != "gaussian" and light.picture.any():
+            pixel = tuple(side / n for side, n in zip(target.size, target.columns_rows, strict=True))
+            inside = drawing(target).light  # the share of each pixel, of shapes with an edge
+            if target.profile.shape == "super_gaussian":
+                inside = (inside >= FLAT * inside.max()).astype(float)
+            yield FlatTop.of(key, light.picture, pixel, inside, on_picture=light.flux["on target"])
 
 
 def _unreached(scene: Scene, reachable: np.ndarray) -> dict[str, float | None]:
@@ -572,10 +588,11 @@ class Report:
     def __repr__(self) -> str:
         """The verdict and the two figures that matter most; then each remark and each check that failed."""
         failed = (check for check in self.checks if not check.passed)
+        where = self.targets[0].key if self.targets else "the target"
         return "\n  ".join(
             [
                 f"Report {self.name!r}: {self.verdict}, RRMSD {rrmsds(self.contents)}, "
-                f"{percent(self.light_on_target)} of the source's light is on the target",
+                f"{percent(self.light_on_target)} of the source's light is on {where}",
                 *(f"failed: {check.name}" + (f" ({check.where})" if check.where else "") for check in failed),
                 *(f"given up: {sentence}" for sentence in self.given_up),
             ]

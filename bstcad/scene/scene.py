@@ -197,7 +197,8 @@ class Scene(Record):
         """
         if len(self.targets) == 1:
             return (self,)
-        return tuple(self.model_copy(update={"targets": (each,), "wavefront": None}) for each in self.targets)
+        less = {"wavefront": None, "accept": self.accept.model_copy(update={"wavefront": None})}
+        return tuple(self.model_copy(update={"targets": (each,), **less}) for each in self.targets)
 
     @model_serializer(mode="wrap")
     def _written(self, handler: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
@@ -498,6 +499,11 @@ def _of_goals(scene: Scene) -> Iterator[str]:
             different.append(alike)
     pictures, shaped = len(different), lens.shaped or (1,)
     goals = pictures + (wave is not None)
+    if goals > 1 and scene.source.extent is not None:
+        yield (
+            "source: for several goals the lens is tailored for light of a point, or parallel light, and judged by the "
+            "source as it is; expect the pictures blurred by its size"
+        )
     if goals < len(shaped):
         yield (
             "lens.front.optimise: one picture is the back's work alone, and the front stays as it is; add a second "

@@ -194,7 +194,7 @@ def numbered(name: str, k: int) -> str:
 
 
 def coplanar(targets: tuple[Target, ...]) -> Iterator[str]:
-    """Targets in the plane of an earlier one."""
+    """Targets in the plane of an earlier one, or that cut through it."""
     for k, target in enumerate(targets):
         for i, earlier in enumerate(targets[:k]):
             if _in_one_plane(target.screen, earlier.screen):
@@ -202,16 +202,25 @@ def coplanar(targets: tuple[Target, ...]) -> Iterator[str]:
                     f"target[{k}].z: lies in the plane of target[{i}]; move one of them along z, or put what both "
                     "show into one picture"
                 )
+            elif _cuts(target.screen, earlier.screen) and _cuts(earlier.screen, target.screen):
+                yield f"target[{k}].z: cuts through target[{i}]; move one of them along z, or turn it less"
 
 
 def _in_one_plane(one: Screen, other: Screen) -> bool:
     """Do the corners of each lie in the other's plane?"""
+    return max(map(abs, (*_off(one, other), *_off(other, one)))) < NEAREST
 
-    def off(screen: Screen, plane: Screen) -> float:
-        mine, theirs = (TiltedPlane(s.middle, s.tilt or (0.0, 0.0)) for s in (screen, plane))
-        return max(abs(theirs.height(mine.point(x, y))) for x in screen.x for y in screen.y)
 
-    return max(off(one, other), off(other, one)) < NEAREST
+def _cuts(screen: Screen, other: Screen) -> bool:
+    """Do its corners lie on both sides of the other's plane?"""
+    off = _off(screen, other)
+    return min(off) < 0 < max(off)
+
+
+def _off(screen: Screen, other: Screen) -> list[float]:
+    """How far (mm) its corners lie before the other's plane."""
+    mine, theirs = (TiltedPlane(s.middle, s.tilt or (0.0, 0.0)) for s in (screen, other))
+    return [theirs.height(mine.point(x, y)) for x in screen.x for y in screen.y]
 
 
 Targets = Annotated[  # of a file: one table, or a list of them

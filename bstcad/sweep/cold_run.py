@@ -38,7 +38,7 @@ from bstcad.optics.surfaces import Plane
 from bstcad.report.record import of_worst_target
 from bstcad.runs import environment, files, processes
 from bstcad.runs.cluster import HERE, Answer
-from bstcad.scene.errors import MachineError
+from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.scene import Scene, load
 from bstcad.tailoring.merit import TubeMerit
 from bstcad.tailoring.stage2 import Problem
@@ -310,7 +310,10 @@ def warm_up(contents: Mapping[str, bytes], tick: Tick) -> None:
     """A small run that does not count, so that the first run that counts is no colder than the others."""
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         base = load(unpacked(contents, Path(place)))
-        small = base.changed(SMALLEST | {f"{key}.pixels": SMALLEST_PIXELS for key in base.target_keys})
+        try:
+            small = base.changed(SMALLEST | {f"{key}.pixels": SMALLEST_PIXELS for key in base.target_keys})
+        except SceneError:  # a profile that so few pixels cannot show
+            small = base.changed(SMALLEST)
         _generate(unpacked(scene_files(small), Path(place)), Path(place) / "design", (), math.inf, tick=tick)
     kernel()
 

@@ -227,7 +227,7 @@ def diagnosis(
     bounds = {
         "asked": {key: getattr(scene.lens, key) for key in scene.lens.bounded_by}, "at": dict(at_bounds or {}),
         "rrmsd": judged.get(BOUNDED), "rrmsd_freed": judged.get(UNBOUNDED),
-        **({"both": True} if lens.shapes_front else {}),  # of the faces that the bounds are on
+        **({"front" if scene.lens.shaped == (0,) else "both": True} if lens.shapes_front else {}),  # that they are on
     }  # fmt: skip
     return {
         "convergence": None if curve is None else asdict(curve),

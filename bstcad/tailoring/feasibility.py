@@ -17,9 +17,9 @@ import torch
 from bstcad.optics.lens import Lens
 from bstcad.tailoring import light_behind
 from bstcad.tailoring.light_behind import LightBehind
-from bstcad.tailoring.reachable import coarse
-from bstcad.tailoring.run import Task
+from bstcad.tailoring.run import Task, silent
 from bstcad.tailoring.slope_map import corners_of, lit_window
+from bstcad.tailoring.stage2 import coarsened
 from bstcad.tailoring.two_faces import Aims, front_map, limit_in_glass, steepest_in_glass
 
 CELLS, PIXELS = 64, 128  # a side
@@ -87,13 +87,8 @@ def _solutions(task: Task) -> tuple[float, ...]:
 
 
 def _small(task: Task, solution: float) -> Task:
-    screen, target = coarse(task.screen, task.target, PIXELS)
-    further = ((goal, *coarse(goal.screen, goal.target, PIXELS)) for goal in task.further)
     knobs = task.knobs.model_copy(update={"transport_grid": CELLS, "transport_iterations": ITERATIONS})
-    return replace(
-        task, screen=screen, target=target, knobs=knobs, solution=solution, progress=lambda *_: None,
-        further=tuple(replace(goal, screen=seen, target=wanted) for goal, seen, wanted in further),
-    )  # fmt: skip
+    return replace(coarsened(task, PIXELS), knobs=knobs, solution=solution, progress=silent)
 
 
 def _of(task: Task, lens: Lens) -> tuple[Demand, LightBehind]:

@@ -5,7 +5,8 @@ error in waves:
 
     M = (Σ_k w_k RRMSD_k² + w (RMS / λ)²) / (Σ_k w_k + w),
 
-beside the pull on light outside a target and the light that is lost, as TubeMerit has them.  The RMS is that of the
+beside the pull on light outside a target and the light that is lost, as TubeMerit has them, in their mean over the
+pictures.  The RMS is that of the
 optical path S of each ray to the wave's plane less the wave's own W there (wavefront_error.py), without piston.
 """
 
@@ -73,15 +74,17 @@ class JointMerit:
         """(merit, the largest RRMSD of the light on a target) of the corners behind the lens."""
         whole = sum(goal.weight for goal in self.goals) + (self.wave.weight if self.wave else 0.0)
         merit, worst = 0.0, torch.zeros(())
+        pictures = sum(goal.weight for goal in self.goals)
         for goal in self.goals:
-            of_goal, rrmsd = self._of_picture(goal, ways)
-            merit, worst = merit + goal.weight / whole * of_goal, torch.maximum(worst.to(rrmsd), rrmsd)
+            off, beside, rrmsd = self._of_picture(goal, ways)
+            merit = merit + goal.weight / whole * off + goal.weight / pictures * beside
+            worst = torch.maximum(worst.to(rrmsd), rrmsd)
         if self.wave is not None:
             merit = merit + self.wave.weight / whole * self._of_wave(*ways[0])
         return merit, worst
 
-    def _of_picture(self, goal: Goal, ways: tuple[Ways, ...]) -> tuple[Tensor, Tensor]:
-        """RRMSD², the pull and the loss of one picture; its RRMSD."""
+    def _of_picture(self, goal: Goal, ways: tuple[Ways, ...]) -> tuple[Tensor, Tensor, Tensor]:
+        """RRMSD² of one picture; its pull and loss; its RRMSD."""
         channels, sheets = self.light.channels, self.light.sheets
         pairs = [(sheet, land(rays, goal.screen.plane)) for sheet, (rays, _) in zip(sheets, ways, strict=True)]
         target = torch.from_numpy(goal.target).to(pairs[0][0].flux.device)
@@ -92,8 +95,8 @@ class JointMerit:
         arrived = weighted_sum(channels, (total(arriving(sheet.flux, corners)) for sheet, corners in pairs))
         off = total((quotient(image, left) - target) ** 2) / size
         seen = image.detach() / total(image.detach())
-        merit = off + self.overshoot * outside / left + (1 - arrived / flux)
-        return merit, (total((seen - target) ** 2) / size).sqrt()
+        beside = self.overshoot * outside / left + (1 - arrived / flux)
+        return off, beside, (total((seen - target) ** 2) / size).sqrt()
 
     def _of_wave(self, rays: Rays, path: Tensor) -> Tensor:
         """(RMS / λ)² of the optical path differences without piston, by the flux around each corner."""

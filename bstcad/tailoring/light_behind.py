@@ -36,7 +36,8 @@ from torch import Tensor
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.rays import TargetPlane, TiltedPlane, Vector
 from bstcad.optics.surfaces import Surface
-from bstcad.optics.wavefront import Wave
+from bstcad.optics.wavefront import SphericalWave, Wave
+from bstcad.scene.errors import SceneError
 from bstcad.tailoring.run import Task
 from bstcad.tailoring.slope_map import centroid, pixel_corners, spread_density
 from bstcad.transport.bfm import Step
@@ -135,15 +136,15 @@ def of_task(task: Task) -> LightBehind:
     """The light through the nearest target that meets the wave of a task, or that through it and the furthest one."""
     near, *_, far = sorted((*task.goals, *task.goals), key=lambda goal: goal.screen.z)
     n = task.knobs.transport_grid
-    parts = max(1, round(n / max(near.screen.shape)))
     if task.wave is not None:
+        parts = max(1, round(n / max(near.screen.shape)))
         return of_wave(near.screen, near.target, task.wave, wavelength=task.heaviest.source.wavelength, parts=parts)
 
     def progress(s: Step) -> None:
         task.progress("stage 1", 0, task.knobs.rounds, f"between the targets, {s.grid}² cells")
 
     return between_targets(
-        (near.screen, near.target), (far.screen, far.target), n, parts=parts, sign=task.solution or 1.0,
+        (near.screen, near.target), (far.screen, far.target), n, sign=task.solution or 1.0,
         iterations=task.knobs.transport_iterations, progress=progress,
     )  # fmt: skip
 
@@ -174,7 +175,10 @@ def _along(vector: Vector, of: np.ndarray) -> np.ndarray:
 
 def of_wave(screen: Screen, picture: np.ndarray, wave: Wave, *, wavelength: float, parts: int) -> LightBehind:
     """The light that is a wave, through the places of a screen; wavelength: nm."""
-    place = in_space(screen.plane, *corners(screen, parts))
+    place, picture = in_space(screen.plane, *corners(screen, parts)), parted(picture, parts)
+    if isinstance(wave, SphericalWave):  # each ray is the line through the focus
+        way = _unit(place - np.array(wave.focus).reshape(3, 1, 1))
+        return LightBehind(place, way * np.where(way[2] < 0, -1.0, 1.0), picture)
     x, y = (torch.from_numpy(p) for p in place[:2])
     below = torch.from_numpy(wave.z - place[2])
     direction = wave.directions(x, y, wavelength)
@@ -183,20 +187,23 @@ def of_wave(screen: Screen, picture: np.ndarray, wave: Wave, *, wavelength: floa
         there = x + path * direction[0], y + path * direction[1]
         before, direction = direction, wave.directions(*there, wavelength)
         if not bool(((direction - before).abs() * below.abs().max() > FOUND).any()):
-            break
-    return LightBehind(place, direction.numpy(), parted(picture, parts))
+            return LightBehind(place, direction.numpy(), picture)
+    raise SceneError(
+        f"wavefront.z: rays of the wave at z = {wave.z:g} cross on their way to the target; move the wavefront's plane "
+        "nearer to it, or make the coefficients smaller"
+    )
 
 
 def between_targets(
-    near: tuple[Screen, np.ndarray], far: tuple[Screen, np.ndarray], n: int, *, parts: int, sign: float = 1.0,
-    iterations: int = 40, progress: Callable[[Step], None] | None = None,
+    near: tuple[Screen, np.ndarray], far: tuple[Screen, np.ndarray], n: int, *, sign: float = 1.0, iterations: int = 40,
+    progress: Callable[[Step], None] | None = None,
 ) -> LightBehind:  # fmt: skip
     """The light through two pictures, (screen, (rows, columns) of any sum) each, by transport on n x n cells.
 
     sign: σ, 1 for the convex solution and -1 for the concave one.  Light through the pixels of the near picture is
     followed to the far one, or against its way where the near picture has clearly more contrast: maps to pictures with
-    holes are found more safely than maps from such.  parts: of a pixel, each way, between whose corners the rays are;
-    of a picture of much contrast more, for its bright pixels have to tell the other picture's detail.
+    holes are found more safely than maps from such.  The rays are about as close as the cells; of a picture of much
+    contrast closer, for its bright pixels have to tell the other picture's detail.
     """
     contrasts = [float((p**2).mean() / p.mean() ** 2) for _, p in (near, far)]
     against = contrasts[0] > SHARPER * contrasts[1]  # is light followed against its way, from far to near?
@@ -223,12 +230,13 @@ def between_targets(
         )
         p = in_space(screen.plane, *mapping.inverse(*y))
     if max(contrasts) > SHARPER * min(contrasts):
-        parts = round(parts * math.sqrt(max(contrasts)))
+        parts = max(1, round(n * math.sqrt(max(contrasts)) / max(behind.shape)))
         place = in_space(behind.plane, *corners(behind, parts))
         i, j = np.meshgrid(*(np.arange(parts * pixels + 1) / parts for pixels in behind.shape[::-1]), indexing="ij")
         way = _unit(place - in_space(screen.plane, *mapping.inverse(*_between(np.stack(y), i, j))))
         light = LightBehind(place, -way if against else way, parted(wanted / wanted.sum(), parts))
         return light.turned() if sign < 0 and not against else light
+    parts = max(1, round(n / max(screen.shape)))
     reached = next(p for p, d in zip(pictures, (rho, *sharper), strict=True) if d is mapping.source)
     place, there = in_space(screen.plane, *corners(screen, parts)), mapping(*corners(screen, parts))
     i, j = places_in(*(sign * c for c in y), *(sign * c for c in there))  # which increase with t
@@ -254,8 +262,7 @@ def uncrossed(light: LightBehind, screen: Screen, surface: Surface, n: int) -> L
     mapping, there = solve(rho, sigma, frame, seen), light.on(screen.plane)
     b = np.stack([*mapping(*there), np.full(light.place.shape[1:], float(b_z.mean()))])
     place = in_space(screen.plane, *there)
-    way = place - b
-    return replace(light, place=place, direction=way / np.sqrt((way * way).sum(0)))
+    return replace(light, place=place, direction=_unit(place - b))
 
 
 # ---- grids of places -------------------------------------------------------------------------------------------------

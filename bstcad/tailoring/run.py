@@ -42,17 +42,19 @@ class Parameters:
 
     nets: tuple[NetParameters, ...]  # in the order of Lens.freeform
     front: dict[str, float | Tensor]  # by name, such as curvature (1/mm); none of a plane or of a net
+    back: float  # mm, the plane of the back, which is moved though its heights may be given
 
     @classmethod
     def of(cls, lens: Lens) -> Parameters:
         """The parameters of a lens."""
         front = {} if lens.front.is_net else lens.front.parameters()
-        return cls(tuple(NetParameters(net.z, net.heights) for net in lens.nets), front)
+        return cls(tuple(NetParameters(net.z, net.heights) for net in lens.nets), front, lens.back.z)
 
     def applied(self, lens: Lens) -> Lens:
         """The lens with these parameters, on its own device."""
         like = lens.like
         lens = lens.with_front(lens.front.with_parameters(**self.front).to(like.dtype, like.device))
+        lens = lens.with_back(lens.back.moved(self.back))
         own = zip(lens.nets, self.nets, strict=True)
         return lens.with_nets(replace(net, z=p.z, heights=p.heights.to(like.device)) for net, p in own)
 
@@ -96,7 +98,7 @@ class Task:
     progress: Progress = silent  # told of the progress within a step
     tidy: Callable[[], None] = lambda: None  # called where freed memory has not the sizes that are needed next
     grown: tuple[tuple[Channel, ...], ...] = ()  # points of the source, as it grows to its size; () of a point
-    bounds: Bounds | None = None  # on the back; None: it may have any shape
+    bounds: Bounds | None = None  # on the tailored faces; None: they may have any shape
     spreads: tuple[Spread, ...] = ()  # the same source in each of these sizes, about its middle
     edge: Edge | None = None  # of a target that is cut to what light can reach; None: light can reach all of it
     # of a picture (rows, columns) and the target, both of sum 1 or less, what stage 2 makes least; None: RRMSD²
@@ -136,7 +138,8 @@ class Task:
         """RRMSD by rays on the CPU, without the bias of the tubes that tailor the lens; the largest of several."""
         effort = ASKED
         if self.knobs.accuracy is None and self.bounds is None:
-            effort = replace(BETWEEN, rays=round(BETWEEN.rays * (self.target.size / PIXELS**2) ** (1 / 3)))
+            largest = max(goal.target.size for goal in self.goals)
+            effort = replace(BETWEEN, rays=round(BETWEEN.rays * (largest / PIXELS**2) ** (1 / 3)))
         draw = self.spreads[-1].draw if self.spreads and not self.grown else None  # not of its middle alone
         lens = lens.plain()
         values = [

@@ -32,6 +32,7 @@ from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
+from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, TargetPlane
@@ -64,7 +65,7 @@ from bstcad.transport.density import Density
 from bstcad.transport.mapping import Frame, solve
 
 NUDGE = 1e-4  # of the thickness: step of the difference quotients of the slopes
-CLOSING, LANDED = 6, 1e-9  # steps to the place of the back by which light comes to a place; of the throw, its miss
+CLOSING = 6  # Newton steps to the place of the back by which light comes to a place
 # Of these rounds the last one is on all of the transport's grid and of the nets, the others on half of the grid and on
 # the last net but one, until both faces fit each other.  (After two such rounds alone, two photographs have half as
 # much error again by blocks of 4 and of 32 pixels.)
@@ -254,17 +255,17 @@ def _gathering(grid: FaceGrid, lens: Lens, back: Tensor, stretch: np.ndarray, sh
     thin = tuple(slice(step // 2, None, step) for step in (max(1, n // SAMPLES) for n in grid.shape))
     faces = replace(grid.at_face, **{k: getattr(grid.at_face, k)[(..., *thin)] for k in ("position", "direction")})
     x, y, z = _in_space(faces).cpu().double()
-    height = float(back[2].mean())
+    height = float(total(back[2]) / back[2].numel())
     reference = torch.stack([stretch[0] * x + shift[0], stretch[1] * y + shift[1], torch.full_like(x, height)])
     lit = grid.density[thin] > 0
     z_x, z_y = _slopes_at(faces, reference, lens)
-    step = NUDGE * (height - float(z.mean()))
+    step = NUDGE * (height - float(total(z) / z.numel()))
     quotient = 0.0
     for axis, here in enumerate((z_x, z_y)):  # ∂p/∂b, a number: the mean over the light
         nudge = torch.zeros((3, 1, 1), dtype=reference.dtype)
         nudge[axis] = step
         there = _slopes_at(faces, reference + nudge, lens)[axis]
-        quotient += float((there - here)[lit].mean()) / (2 * step)
+        quotient += float(total((there - here)[lit]) / lit.sum()) / (2 * step)
     wanted = (p - r * quotient for p, r in zip((z_x, z_y), reference[:2], strict=True))
     half_x, half_y = (REACH * size / 2 for size in (grid.window.width, grid.window.height))
     flat = torch.zeros((GATHERING, GATHERING), dtype=torch.float64)

@@ -354,7 +354,8 @@ def of_bounds(
     checks, shares = [], {}
     radius, degrees, kind = asked.tool_radius, asked.max_slope, "convex" if asked.mould else "concave"
     if radius is not None or degrees is not None:
-        surveys = [(survey, "")] + ([(survey_front, " of the front")] if lens.shapes_front else [])
+        faces = asked.shaped or (1,)
+        surveys = [(survey, "")] * (1 in faces) + [(survey_front, " of the front")] * (0 in faces)
         for surveyed, of in surveys:
             bending = surveyed(lens, **{kind: radius}, slope=degrees)
             if radius is not None:

@@ -17,9 +17,11 @@ from bstcad.optics.surfaces import Plane
 from bstcad.optics.tubes import collect
 from bstcad.optics.wavefront import PlaneWave, SphericalWave, ZernikeWave
 from bstcad.optics.wavefront_error import wavefront_error
+from bstcad.scene.errors import SceneError
 from bstcad.tailoring import light_behind
 from bstcad.tailoring.goals import Goal, JointMerit
 from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.run import Parameters
 
 SQUARE, N = Rectangle(20.0, 20.0), 1.5
 BEAM = Collimated(aperture=Rectangle(16.0, 16.0), wavelength=600.0)
@@ -85,7 +87,7 @@ def shown(light, screen):
 def test_even_light_between_squares_is_affine(sign):
     far = Screen(630.0, (-18.0, 18.0), (-18.0, 18.0), 24)  # far off: there the cost is nearly quadratic
     even = np.full((24, 24), 1 / 576)
-    light = light_behind.between_targets((NEAR, even), (far, even), 64, parts=1, sign=sign)
+    light = light_behind.between_targets((NEAR, even), (far, even), 64, sign=sign)
     x, y, _ = light.place
     for place, across in ((x, light.direction[0]), (y, light.direction[1])):
         assert np.abs(600.0 * across / light.direction[2] - (sign * 2 - 1) * place).max() < 0.1
@@ -101,7 +103,7 @@ def test_the_light_makes_both_pictures(sign, sharper, tilt):
     x, y = np.meshgrid(np.linspace(-1, 1, 64), np.linspace(-1, 1, 64))
     waves = (1.2 + np.sin(3 * x), 2.0 + np.cos(4 * y + x))
     first, second = (p / p.sum() for p in (waves if sharper == "near" else waves[::-1]))
-    light = light_behind.between_targets((near, first), (far, second), 128, parts=1, sign=sign)
+    light = light_behind.between_targets((near, first), (far, second), 128, sign=sign)
     assert np.abs((light.direction**2).sum(0) - 1).max() < 1e-12 and light.direction[2].min() > 0.8
     assert light.crossed(Plane(29.0)) == 0  # the order of its rays is that of their places near by
     for screen, wanted in ((near, first), (far, second)):
@@ -121,7 +123,7 @@ def test_bright_letters_and_a_grey_picture_are_both_shown(sign, place):
     if place == "far":
         near, far = far, near
     goals = sorted(((near, letters), (far, grey)), key=lambda goal: goal[0].z)
-    light = light_behind.between_targets(*goals, 128, parts=1, sign=sign)
+    light = light_behind.between_targets(*goals, 128, sign=sign)
     assert light.crossed(Plane(29.0)) == 0
     assert np.abs(shown(light, near) - letters).max() < 1e-12  # no light in the black gap
     off, wanted = (p.reshape(16, 4, 16, 4).sum((1, 3)) for p in (shown(light, far) - grey, grey))
@@ -153,7 +155,7 @@ def test_crossings_before_the_target_are_removed():
     near, far = Screen(60.0, (-9.0, 9.0), (-9.0, 9.0), 48), Screen(70.0, (-9.0, 9.0), (-9.0, 9.0), 48)
     dark = np.full((48, 48), 0.02)
     dark[:, :24] = 1.0
-    light = light_behind.between_targets((near, dark[:, ::-1] / dark.sum()), (far, dark / dark.sum()), 64, parts=1)
+    light = light_behind.between_targets((near, dark[:, ::-1] / dark.sum()), (far, dark / dark.sum()), 64)
     back = Plane(0.0)
     assert light.crossed(back) > 0.05
     assert light_behind.uncrossed(light, near, back, 64).crossed(back) < 1e-3
@@ -211,3 +213,34 @@ def test_a_picture_with_parallel_light_behind_it(tmp_path):
     made = pipeline.design(scene)
     assert rrmsd_by_rays(made.lens, scene.channels(), scene.target.screen, target=scene.target.irradiance()) < 0.05
     assert wavefront_error(scene.source, made.lens, scene.wavefront).without_tilt.rms < 1.0
+
+
+# ---- faults of scenes ------------------------------------------------------------------------------------------------
+
+
+def test_light_of_a_sphere_before_its_focus_goes_through_it_from_far_planes_too():
+    """The wave diverges from a focus before its plane, and the target stands far behind that."""
+    wave, far = SphericalWave((0.0, 0.0, -20.0), 40.0), Screen(200.0, (-60.0, 60.0), (-60.0, 60.0), 8)
+    light = light_behind.of_wave(far, np.ones((8, 8)) / 64, wave, wavelength=600.0, parts=1)
+    path = (-20.0 - light.place[2]) / light.direction[2]
+    assert np.abs(light.place + path * light.direction - np.array([0.0, 0.0, -20.0]).reshape(3, 1, 1)).max() < 1e-9
+    assert light.direction[2].min() > 0
+
+
+def test_a_wave_whose_rays_cross_before_the_target_is_refused():
+    wave = ZernikeWave((0.0, 0.0, 0.0, -300.0), 8.0, 30.0)
+    with pytest.raises(SceneError, match="rays of the wave at z = 30 cross"):
+        light_behind.of_wave(Screen(400.0, (-9.0, 9.0), (-9.0, 9.0), 8), picture(0), wave, wavelength=600.0, parts=1)
+
+
+def test_targets_that_cut_through_each_other_are_refused(tmp_path):
+    first = TWO["target"]
+    with pytest.raises(SceneError, match=r"target\[1\].z: cuts through target\[0\]"):
+        scene_of(tmp_path, target=[first, first | {"z": 32.0, "tilt": [0.0, 30.0]}])
+
+
+def test_the_move_of_a_back_that_is_given_is_kept():
+    """A front alone is tailored, and the back makes way for it."""
+    lens = Lens(net(0.0, 1), net(8.0, 2), SQUARE, N, shaped=(0,))
+    moved = lens.with_back(lens.back.moved(9.5))
+    assert Parameters.of(moved).applied(lens).back.z == 9.5
