@@ -208,7 +208,9 @@ def between_targets(
     contrasts = [float((p**2).mean() / p.mean() ** 2) for _, p in (near, far)]
     against = contrasts[0] > SHARPER * contrasts[1]  # is light followed against its way, from far to near?
     (screen, picture), (behind, wanted) = (far, near) if against else (near, far)
-    pictures = [np.maximum(p, DIM * p.mean()) for p in (gaussian_filter(picture, b, mode="nearest") for b in BLURS)]
+    own, *pictures = (
+        np.maximum(p, DIM * p.mean()) for p in (picture, *(gaussian_filter(picture, b, mode="nearest") for b in BLURS))
+    )
     along = _axes(screen.plane)[:2]
 
     def cosines(p: np.ndarray, t: np.ndarray) -> Grid:
@@ -237,11 +239,10 @@ def between_targets(
         light = LightBehind(place, -way if against else way, parted(wanted / wanted.sum(), parts))
         return light.turned() if sign < 0 and not against else light
     parts = max(1, round(n / max(screen.shape)))
-    reached = next(p for p, d in zip(pictures, (rho, *sharper), strict=True) if d is mapping.source)
     place, there = in_space(screen.plane, *corners(screen, parts)), mapping(*corners(screen, parts))
     i, j = places_in(*(sign * c for c in y), *(sign * c for c in there))  # which increase with t
     way = _unit(in_space(behind.plane, *_between(np.stack(pixel_corners(behind)), i, j)) - place)
-    return LightBehind(place, way, parted(reached / reached.sum(), parts))
+    return LightBehind(place, way, parted(own / own.sum(), parts))
 
 
 def _unit(way: np.ndarray) -> np.ndarray:

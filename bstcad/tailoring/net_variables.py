@@ -26,7 +26,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.ndimage import gaussian_filter, minimum_filter
+from scipy.ndimage import gaussian_filter
 from scipy.sparse import csr_array, diags_array
 from torch import Tensor
 
@@ -42,7 +42,7 @@ from bstcad.transport.mapping import places_in
 SHARE = 0.2  # of the scale at which both blocks move the pictures as far, by measurement
 # Control points of the back over which q is smoothed.  In a gap between two parts of the light, where few rays fall and
 # some cross, q(b) jumps from point to point: R then drew ripples of 0.07 mm into the back, that no ray tube saw.
-SMOOTH, FEW = 3.0, 0.2
+SMOOTH = 3.0
 TAPS = 4  # control points of the front each way from which one of the back takes its share
 
 
@@ -98,7 +98,7 @@ def along_light(source: Source, lens: Lens, goals: Sequence[Goal]) -> tuple[csr_
     lit = _array((source.irradiance(*coming.position[:2], lens.entrance.z) > 0) & out.alive)
     places = [_array(p) for p in out.position[:2]]
     row, column = places_in(*places, *(p.numpy() for p in torch.meshgrid(*_control_points(back), indexing="ij")))
-    row, column = _smoothed(row, column)
+    row, column = (_smoothed(at) for at in (row, column))
     carried = _interpolation(row, column, q.shape[1:]) @ diags_array(np.where(lit, factor, 1.0).reshape(-1))
 
     own = (back.z - front.z) / lens.index / _magnification(q.numpy(), places, lit)
@@ -132,24 +132,11 @@ def _magnification(q: np.ndarray, places: Sequence[np.ndarray], lit: np.ndarray)
     return (along(places[0], q[0]) + along(places[1], q[1])) / 2
 
 
-def _smoothed(row: np.ndarray, column: np.ndarray) -> list[np.ndarray]:
-    """q(b) as real rows and columns, blurred by SMOOTH around control cells of the back that have FEW of the light.
-
-    FEW: of the mean; cells in which rays have crossed have less than none.
-    """
+def _smoothed(at: np.ndarray) -> np.ndarray:
+    """By a Gaussian of SMOOTH; beyond the rim it goes on as steeply as within."""
     wide = math.ceil(4 * SMOOTH)
-    padded = (np.pad(at, wide, mode="reflect", reflect_type="odd") for at in (row, column))  # as steep beyond the rim
-    blurred = [gaussian_filter(at, SMOOTH)[wide:-wide, wide:-wide] for at in padded]
-    own, mean = _light(row, column), _light(*blurred)
-    few = minimum_filter(np.minimum(own, mean), 2 * math.ceil(SMOOTH) + 1) < FEW * mean[mean > 0].mean()
-    share = np.clip(2 * gaussian_filter(few.astype(float), SMOOTH), 0.0, 1.0)
-    return [at + share * (smooth - at) for at, smooth in zip((row, column), blurred, strict=True)]
-
-
-def _light(row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    """Control cells of the front for one of the back."""
-    (xx, xy), (yx, yy) = (np.gradient(at) for at in (row, column))
-    return xx * yy - xy * yx
+    padded = np.pad(at, wide, mode="reflect", reflect_type="odd")
+    return gaussian_filter(padded, SMOOTH)[wide:-wide, wide:-wide]
 
 
 def _interpolation(row: np.ndarray, column: np.ndarray, sides: tuple[int, int]) -> csr_array:
