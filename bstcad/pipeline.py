@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
@@ -101,14 +101,18 @@ def design(
         raise SceneError("merit: is one of a picture, and the scene has several goals; leave it out, or ask for less")
     torch.manual_seed(scene.tailoring.seed)
     device = device_for(device)
-    picture = scene.target.irradiance()
-    part, edge = reachable_part(scene, picture)
-    if part is not None:
-        progress("reach", 0, 0, f"{unreachable(scene, part, picture)}; the design is for the rest")
+    parts, edge, wanted = [], None, []
+    for alone, key in zip(scene.each_alone(), scene.target_keys, strict=True):
+        picture = alone.target.irradiance()
+        part, its_edge = reachable_part(alone, picture, key)
+        if part is not None:
+            of = f"{key}: " if len(scene.targets) > 1 else ""
+            progress("reach", 0, 0, f"{of}{unreachable(alone, part, picture)}; the design is for the rest")
+        parts, edge, wanted = [*parts, part], edge or its_edge, [*wanted, restricted(picture, part)]
     knobs = scene.tailoring.resolved(scene.lens.back.net)
     later = later and knobs.max_time is None
     task = task_of(
-        scene, restricted(picture, part), knobs, edge, progress=progress, tidy=processes.return_freed, merit=merit
+        scene, wanted[0], knobs, edge, further=wanted[1:], progress=progress, tidy=processes.return_freed, merit=merit
     )
     task = posed(scene, task)
     limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve(scene) + JUDGING}
@@ -136,16 +140,21 @@ def design(
     making = _making(followed, driver.record, stopped, steep)
     return Made(
         resolved(scene, lens), scene.as_mounted(lens), task.target, making, device=device,
-        transport=followed.transport, reachable=part,
+        transport=followed.transport, reachable=parts[0], further_reachable=tuple(parts[1:]),
         compared=partial(_compared, making, task, after_stage1, stages) if later else None,
     )  # fmt: skip
 
 
-def task_of(scene: Scene, target: np.ndarray, knobs: Tailoring, edge: Edge | None, **more: Any) -> Task:
+def task_of(
+    scene: Scene, target: np.ndarray, knobs: Tailoring, edge: Edge | None, *, further: Sequence[np.ndarray] = (),
+    **more: Any,
+) -> Task:  # fmt: skip
     """The task of a scene; target: (rows, columns) that its light shall have, edge: as `reachable_part` has it.
 
-    more: fields of Task that no scene tells.
+    further: the same for the targets behind the first; (): all of their pictures.  more: fields of Task that no scene
+    tells.
     """
+    others = zip(scene.targets[1:], further or [t.irradiance() for t in scene.targets[1:]], strict=True)
     light = scene.with_source_scaled(0.0).channels()
     several = len(scene.targets) > 1 or scene.wavefront is not None  # of which stage 3 knows nothing
     sizes = stage2.SIZES if scene.source.extent and knobs.method != "integration" and not several else ()
@@ -154,7 +163,7 @@ def task_of(scene: Scene, target: np.ndarray, knobs: Tailoring, edge: Edge | Non
         light, scene.target.screen, target, knobs, least=scene.lens.min_thickness, free=scene.lens.front.free,
         rim_sags=scene.rim_sags, grown=tuple(each.channels() for each in scaled), bounds=scene.lens.bounds,
         spreads=tuple(Spread(each.source, light, each.draw) for each in scaled), edge=edge,
-        weight=scene.target.weight, further=tuple(Goal(t.screen, t.irradiance(), t.weight) for t in scene.targets[1:]),
+        weight=scene.target.weight, further=tuple(Goal(t.screen, wanted, t.weight) for t, wanted in others),
         wave=scene.wavefront, solution=SIGNS.get(knobs.solution), front_sides=scene.lens.front_net, **more,
     )  # fmt: skip
 
@@ -182,8 +191,12 @@ def second_stage(task: Task, lens: Lens, state: Stage2State | None = None) -> tu
     return "stage 3", stage2.with_stage3(before, task, lens, state)
 
 
-def reachable_part(scene: Scene, picture: np.ndarray) -> tuple[np.ndarray | None, Edge | None]:
+def reachable_part(
+    scene: Scene, picture: np.ndarray, key: str = "target"
+) -> tuple[np.ndarray | None, Edge | None]:  # fmt: skip
     """(rows, columns) True in the pixels that a design of the scene can light, and the light at their edge.
+
+    key: by which sentences call the target.
 
     None, None: it can light all that its picture lights.  A mirror, whose slope alone binds it, has no such edge.
     SceneError where it can light none, or not all in a scene with target.unreachable = "refuse".
@@ -207,7 +220,7 @@ def reachable_part(scene: Scene, picture: np.ndarray) -> tuple[np.ndarray | None
     if not picture[part].sum() > LEAST_REACHED:
         reached(lens, math.nan)
     if scene.target.unreachable == "refuse":
-        raise SceneError(f"target: {unreachable(scene, part, picture)}; {FURTHER[scene.optic]}")
+        raise SceneError(f"{key}: {unreachable(scene, part, picture)}; {FURTHER[scene.optic]}")
     return part, None if lens.reflects else Edge(light, grazing)
 
 

@@ -67,20 +67,20 @@ def plan(
     at, (first, *others) = toml_positions(text), scene.each_alone()
     asked = [{"what": what, "key": key, **_asked(key, at, keys)} for what, key in simulated(scene)]
     lens = coarse_lens(first)
-    found = {"simulated": asked, **_effects(first, lens)}
+    found = {"simulated": asked, **_effects(first, lens, scene.target_keys[0])}
     if others:
         pairs = zip(scene.target_keys[1:], others, strict=True)
-        found["further"] = [{"target": key, **_effects(alone, coarse_lens(alone))} for key, alone in pairs]
+        found["further"] = [{"target": key, **_effects(alone, coarse_lens(alone), key)} for key, alone in pairs]
     if others or scene.lens.front.shaped:
         found["caveat"] = ALONE
     yield found
     yield rounded(outlook(scene, lens, units), 3)
 
 
-def _effects(scene: Scene, lens: Lens) -> dict[str, Any]:
-    """The entries left_out, blur and unreachable of `plan`, of the light of one target; lens: a coarse one for it."""
+def _effects(scene: Scene, lens: Lens, key: str) -> dict[str, Any]:
+    """The entries left_out, blur and unreachable of `plan` for one target, of that key; lens: a coarse one for it."""
     picture = scene.target.irradiance()
-    part, _ = reachable_part(scene, picture)
+    part, _ = reachable_part(scene, picture, key)
     target = restricted(picture, part)
     beyond = None if part is None else unreached(picture, part, None if lens.reflects else scene.index)
     estimates, image = left_out(scene, lens, target), blur(scene.channels(), lens, scene.target.screen, target)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.special import gammainc
 
-from bstcad.analysis.top_hat import FINEST, plateau_uniformity, top_hat
+from bstcad.analysis.top_hat import FINEST, FlatTop, plateau_uniformity, top_hat
 
 PIXELS, HALF = 600, 4.0  # of a square screen, and its half width (mm)
 PITCH = 2 * HALF / PIXELS
@@ -127,3 +127,13 @@ def test_the_scale_and_the_pixels_proportions_do_not_matter():
 def test_what_has_no_such_numbers_is_refused_in_a_sentence(picture, more, sentence):
     with pytest.raises(ValueError, match=sentence):
         numbers(picture, **more)
+
+
+def test_a_report_states_an_even_disc_as_even_and_all_of_its_light_inside():
+    """All but what falls beside the picture; a tenth of the light spread over all of it lies partly outside."""
+    found = FlatTop.of("target", DISC, (PITCH, PITCH), DISC, on_picture=0.98)
+    assert found.key == "target" and found.flatness == pytest.approx(1.0) and found.uniformity < 1e-12
+    assert found.fractional_power == pytest.approx(1.0, abs=0.02) and found.efficiency == pytest.approx(0.98, abs=0.02)
+    haze = DISC / DISC.sum() + 0.1 / DISC.size
+    inside = float((haze * DISC).sum() / haze.sum())
+    assert FlatTop.of("target", haze, (PITCH, PITCH), DISC, on_picture=1.0).efficiency == pytest.approx(inside)

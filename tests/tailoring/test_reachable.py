@@ -125,6 +125,20 @@ def test_refuse_names_angle_and_remedy(wide, capsys):
     assert not (wide.parent / "out").exists()
 
 
+def test_each_of_several_targets_is_cut_to_what_light_can_reach(wide):
+    """A small target near by, which light reaches whole, and the wide one behind it, of which it reaches a disc."""
+    text = wide.read_text()
+    near = "[[target]]\nz = 102.0\nx = [-40.0, 40.0]\ny = [-40.0, 40.0]\npixels = 24\nuniform = true\n"
+    wide.write_text(text.replace("[target]", near + "[[target]]"))
+    scene = load(wide)
+    made = design(scene.changed({"tailoring.stage2_iterations": 4}))
+    part, _ = part_of(scene.each_alone()[1])
+    assert made.parts[0] is None and np.array_equal(made.parts[1], part)
+    assert not made.targets[1][~part].any() and made.targets[1][part].all()
+    with pytest.raises(SceneError, match=r"^target\[1\]: "):
+        design(scene.changed({"target[1].unreachable": "refuse"}))
+
+
 def test_the_pull_is_zero_up_to_its_angle_and_falls_with_its_gradient():
     """A wedge of a slope whose light leaves at θ': (η² sin² θ - sin² θ'_most) / cos² θ'_most is u."""
     index, square, most = 1.5, Rectangle(4.0, 4.0), math.radians(85)
