@@ -354,8 +354,7 @@ def of_bounds(
     checks, shares = [], {}
     radius, degrees, kind = asked.tool_radius, asked.max_slope, "convex" if asked.mould else "concave"
     if radius is not None or degrees is not None:
-        faces = asked.shaped or (1,)
-        surveys = [(survey, "")] * (1 in faces) + [(survey_front, " of the front")] * (0 in faces)
+        surveys = [(survey, "")] * (lens.shaped != (0,)) + [(survey_front, " of the front")] * lens.shapes_front
         for surveyed, of in surveys:
             bending = surveyed(lens, **{kind: radius}, slope=degrees)
             if radius is not None:
