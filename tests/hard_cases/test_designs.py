@@ -60,7 +60,8 @@ def test_it_comes_through(name, tmp_path, monkeypatch):
     failed = {check["name"] for check in report["checks"] if not check["passed"]}
     assert not [name for name in failed if not name.startswith("RRMSD, box pixels")]
     assert report["passed"] is not bool(failed)
-    assert all(each["rrmsd"] <= hard.rrmsd for each in report.get("targets") or [report])
+    rrmsds = [each["rrmsd"] for each in report.get("targets") or [report]]
+    assert max(rrmsds) <= hard.rrmsd, rrmsds
     assert report["efficiency"] >= hard.efficiency
     assert report["shape"]["thickness_min"] >= scene.lens.min_thickness
     assert report["skipped_steps"] == 0
