@@ -6,8 +6,8 @@ error in waves:
     M = (Σ_k w_k RRMSD_k² + w (RMS / λ)²) / (Σ_k w_k + w),
 
 beside the pull on light outside a target and the light that is lost, as TubeMerit has them, in their mean over the
-pictures.  The RMS is that of the
-optical path S of each ray to the wave's plane less the wave's own W there (wavefront_error.py), without piston.
+pictures.  The RMS is that of the optical path S of each ray to the wave's plane less the wave's own W there
+(wavefront_error.py), without piston.
 """
 
 from __future__ import annotations

@@ -155,9 +155,9 @@ DESIGNS: dict[str, Hard] = {
         says=(MOVED, OUTSIDE, OUTSIDE), perhaps=(STEEP,), bench=True,
     ),
     "two faces, rays that cross": Hard(
-        "disk", _two_faces(6.0, _even(100.0, 3.2), _even(150.0, 3.2, text="AB"), width=14.0), rrmsd=0.8,
-        efficiency=0.75, told=(CROSSED,), says=(MISSED, MISSED, "back steeper than", OUTSIDE, OUTSIDE),
-        perhaps=(MOVED, CLOSE, LIFTED, STEEP), bench=True,
+        "disk", _two_faces(6.0, _even(100.0, 3.2), _even(150.0, 3.2, text="AB"), width=14.0), rrmsd=0.65,
+        efficiency=0.8, told=(CROSSED,), says=(MISSED, MISSED, "back steeper than", OUTSIDE, OUTSIDE),
+        perhaps=(CLOSE, LIFTED, STEEP), bench=True,
     ),
     "two faces, rays that all cross": Hard(
         "disk", _two_faces(6.0, _even(100.0, 3.2, text="O"), _even(130.0, 3.2, text="X"),
