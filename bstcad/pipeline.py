@@ -179,7 +179,7 @@ def posed(scene: Scene, task: Task) -> Task:
         raise SceneError(f"target: {'; '.join(sentences[1:])}")
     for sentence in sentences:
         task.progress("reach", 0, 0, sentence)
-    return replace(task, solution=demand.solution)
+    return replace(task, solution=demand.solution, floor=demand.floor)
 
 
 def second_stage(task: Task, lens: Lens, state: Stage2State | None = None) -> tuple[str, Iterator[Step]]:

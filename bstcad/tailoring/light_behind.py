@@ -144,8 +144,8 @@ def of_task(task: Task) -> LightBehind:
         task.progress("stage 1", 0, task.knobs.rounds, f"between the targets, {s.grid}² cells")
 
     return between_targets(
-        (near.screen, near.target), (far.screen, far.target), n, sign=task.solution or 1.0,
-        iterations=task.knobs.transport_iterations, progress=progress,
+        (near.screen, near.target), (far.screen, np.maximum(far.target, task.floor * far.target.mean())), n,
+        sign=task.solution or 1.0, iterations=task.knobs.transport_iterations, progress=progress,
     )  # fmt: skip
 
 

@@ -107,6 +107,7 @@ class Task:
     further: tuple[Goal, ...] = ()  # pictures on other planes
     wave: Wave | None = None  # that the light behind the lens shall be; None: any
     solution: float | None = None  # σ of light_behind.py; None: the gentler one
+    floor: float = 0.0  # of its mean, to which stage 1 of two faces lifts the furthest picture
     front_sides: Callable[[Sides], Sides | None] = lambda sides: None  # of a tailored front, by those of the back
 
     @property

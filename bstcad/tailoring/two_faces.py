@@ -36,7 +36,7 @@ from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, TargetPlane
-from bstcad.optics.reach import kept_from_reflection, largest_deflection, slopes_towards
+from bstcad.optics.reach import kept_from_reflection, slopes_towards
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import land
 from bstcad.scene.quality import COARSEST_GRID
@@ -304,16 +304,3 @@ def _landing(q: Rays, b: Tensor, back, plane: TargetPlane) -> Tensor:
     way = torch.stack([b[0], b[1], height]) - _in_space(q)
     rays = replace(q, direction=way / torch.sqrt((way * way).sum(0)), axial=False)
     return land(cross(rays, back).rays, plane).position
-
-
-def steepest_in_glass(lens: Lens, front: Grid, back: np.ndarray) -> float:
-    """The largest angle (degrees) at the axis of a ray in the glass from q of the front to b of the back."""
-    x, y = (torch.from_numpy(q) for q in front)
-    depth = back[2] - lens.front.sag_and_slope(x, y)[0].numpy()
-    across = np.hypot(back[0] - front[0], back[1] - front[1])
-    return math.degrees(float(np.arctan2(across, depth).max()))
-
-
-def limit_in_glass(index: float) -> float:
-    """The largest angle (degrees) by which a face of the index turns a ray that enters it."""
-    return math.degrees(largest_deflection(index))

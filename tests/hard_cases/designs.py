@@ -35,7 +35,10 @@ MOVED, CHANGED = "the back was moved by", "tailoring moved the vertex of the bac
 MISSED, STEEP = "The RRMSD", "as steep as"
 CLOSE = "Some light meets the back"  # so short of total internal reflection, or beyond
 # What two faces cannot do, as it is said before stage 2.
-CROSSED, IN_GLASS = "would have to cross between the lens and the nearest target", "light would have to run at"
+CROSSED, IN_GLASS = (
+    "would have to cross between the lens and the nearest target",
+    "the front would have to turn light by",
+)
 
 
 @dataclass(frozen=True)
@@ -157,7 +160,7 @@ DESIGNS: dict[str, Hard] = {
     "two faces, rays that cross": Hard(
         "disk", _two_faces(6.0, _even(100.0, 3.2), _even(150.0, 3.2, text="AB"), width=14.0), rrmsd=0.65,
         efficiency=0.8, told=(CROSSED,), says=(MISSED, MISSED, "back steeper than", OUTSIDE, OUTSIDE),
-        perhaps=(CLOSE, LIFTED, STEEP), bench=True,
+        perhaps=(CLOSE, LIFTED, STEEP, DARK), bench=True,
     ),
     "two faces, rays that all cross": Hard(
         "disk", _two_faces(6.0, _even(100.0, 3.2, text="O"), _even(130.0, 3.2, text="X"),
