@@ -68,20 +68,31 @@ def _is_fused(rays: Rays, interface: Interface) -> bool:
 
 
 def land(rays: Rays, plane: TargetPlane) -> Landed:
-    """Rays behind the last interface, on the plane."""
-    landed = to_plane(rays, plane)
-    return Landed(coordinates(landed, plane), landed.flux, landed.status, landed.taken)
+    """Rays behind the last interface, on the plane.
+
+    Each component is followed by itself: the gradient of a part of a stacked tensor is as large as the whole.
+    """
+    parts = replace(rays, position=rays.position.unbind(0), direction=rays.direction.unbind(0))
+    path, status = _path_to_plane(parts, plane)
+    there = (p + path * d for p, d in zip(parts.position, parts.direction, strict=True))
+    at = coordinates(replace(parts, position=tuple(there)), plane)
+    return Landed(torch.stack(tuple(at)), rays.flux, status, rays.taken)
 
 
 def to_plane(rays: Rays, plane: TargetPlane) -> Rays:
     """Move the rays along their direction to the plane ahead of them; those that lead away from it are lost."""
+    path, status = _path_to_plane(rays, plane)
+    return replace(rays, position=rays.position + path * rays.direction, status=status)
+
+
+def _path_to_plane(rays: Rays, plane: TargetPlane) -> tuple[Tensor, Tensor]:
+    """(path to the plane (mm), zero for rays that do not come to it; status)."""
     rise, above = advance(rays, plane)
     ahead = rise if rays.sense > 0 else -rise
     status = rays.lose(ahead <= GRAZING, Status.TURNED_BACK)
     lands = status == Status.ALIVE
     rise = torch.where(lands, rise, torch.ones_like(rise))
-    path = torch.where(lands, -above / rise, torch.zeros_like(rise))
-    return replace(rays, position=rays.position + path * rays.direction, status=status)
+    return torch.where(lands, -above / rise, torch.zeros_like(rise)), status
 
 
 def to_first_net(rays: Rays, lens: Lens) -> Rays:

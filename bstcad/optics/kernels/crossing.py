@@ -349,9 +349,9 @@ def landed(rays: Rays, interface: Interface, plane: TargetPlane) -> Landed:
 def behind(rays: Rays, interface: Interface) -> Rays:
     """Rays across a net: those of `interfaces.cross`."""
     out, left = _across(rays, interface, None)
-    out = upright(out, rays.sense)
+    position, direction = upright(out, rays.sense).split(3)
     sense = -rays.sense if interface.law.reverses else rays.sense
-    return replace(left, position=out[:3], direction=out[3:], z=interface.surface.z, axial=False, sense=sense)
+    return replace(left, position=position, direction=direction, z=interface.surface.z, axial=False, sense=sense)
 
 
 def _across(rays: Rays, interface: Interface, plane: TargetPlane | None) -> tuple[Tensor, Rays]:
