@@ -51,8 +51,8 @@ SIGNS = {"convex": 1.0, "concave": -1.0}  # tailoring.solution
 DEVICES = ("auto", "cpu", "cuda")
 COMPARED = "float32 beside float64"  # the name of that stage
 # Seconds that writing, proving and reporting take on two cores; PER_NET of 513 x 513 control points, PER_PICTURE of
-# 512 x 512 pixels.
-FIXED, PER_NET, PER_PICTURE = 4.0, 5.0, 3.0
+# 512 x 512 pixels, PER_WITNESS of a target by the finer ray tubes that two nets need.
+FIXED, PER_NET, PER_PICTURE, PER_WITNESS = 4.0, 5.0, 3.0, 15.0
 REACH_NET = 33  # control points a side of the flat back from which the reach of light is found
 LEAST_REACHED = 1e-3  # of the light of a target that has to be within reach
 FURTHER = {  # how light gets to all of a target, by the optic
@@ -361,8 +361,10 @@ def device_for(asked: str) -> str:
 def reserve(scene: Scene) -> float:
     """Seconds that writing, proving and reporting will take on two cores."""
     pixels = sum(math.prod(target.columns_rows) for target in scene.targets) / 512**2
-    net = math.prod(both(scene.lens.back.net)) / 513**2
-    return FIXED + PER_NET * net + PER_PICTURE * pixels
+    nets = scene.lens.nets()
+    points = sum(math.prod(both(net)) for net in nets) / 513**2
+    witnesses = len(scene.targets) * (len(nets) - 1)
+    return FIXED + PER_NET * points + PER_PICTURE * pixels + PER_WITNESS * witnesses
 
 
 def purpose(scene: Scene, device: str) -> dict[str, Any]:

@@ -40,7 +40,7 @@ from bstcad.tailoring import stage1
 from bstcad.tailoring.run import EVALUATED
 from bstcad.tailoring.slope_map import SUBCELLS
 from bstcad.tailoring.stage1 import aimed
-from bstcad.tailoring.stage2 import blurred_sheets, sheets
+from bstcad.tailoring.stage2 import JOINT, blurred_sheets, sheets
 
 FITTED = Path(__file__).with_name("fitted.json")
 Interval = tuple[float, float, float]  # low, likely, high
@@ -222,7 +222,13 @@ def memory_amounts(scene: Scene) -> dict[str, float]:
     corners = (knobs.rays / TUBES) ** 2
     roots = corners if scene.source.kind == "point" else 0.0
     pixels = columns * rows / PIXELS**2
-    return {"libraries": 1.0, "corners": corners, "roots": roots, "net": (knobs.side / NET) ** 2, "pixels": pixels}
+    goals = len(scene.targets) + (scene.wavefront is not None)
+    if goals > 1:
+        corners *= A_GOAL * goals * JOINT[-1][0] ** 2
+    return {
+        "libraries": 1.0, "corners": corners, "roots": roots, "net": len(scene.lens.nets()) * (knobs.side / NET) ** 2,
+        "pixels": pixels,
+    }  # fmt: skip
 
 
 def memory_gb(scene: Scene, prices: Mapping[str, float]) -> float:
@@ -241,6 +247,7 @@ QUALITIES = ("draft", "standard", "fine")
 # Most pixels, control points and tubes a side; more pixels where the control points would be fewer than FEWEST_POINTS.
 SIZES = {"draft": (256, 385, 768), "standard": (128, 193, 512)}
 FEWEST_POINTS = 65  # control points a side
+A_GOAL = 3.0  # times the memory of corners for one target, that each of several goals takes (6.2 GB; 5.9 measured)
 UNDONE = 0.5  # of the blur by a source of some size, that stage 3 leaves
 PILOT_CELLS = (16, 256)  # a side of its transport, at least and at most
 PILOT_JUDGED = Effort(rays=2048, accuracy=0.02, witness=False)  # few rays are noisier than smooth light is wrong
