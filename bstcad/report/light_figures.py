@@ -469,11 +469,12 @@ def histogram(design: float, limit: float, linear: np.ndarray, full: np.ndarray,
 
 @styled
 def worst_trials(
-    design: float, nominal: np.ndarray, worst: Sequence[tuple[int, float, np.ndarray]], view: View
+    design: float, nominal: np.ndarray, worst: Sequence[tuple[int, float, np.ndarray]], view: View, of: str = ""
 ) -> Figure:
     """The light as designed, beside it the light of the worst trials, and below each trial its difference.
 
-    worst: number, RRMSD and picture (rows, columns) in coordinates, with the target's sum, of each.
+    worst: number, RRMSD and picture (rows, columns) in coordinates, with the target's sum, of each.  of: ", target[0]",
+    where there are several.
     """
     worst, unit = worst[:SHOWN], lit_mean(nominal)
     figure = new_figure(11.0, 1.0 + 4.6 * view.proportion, layout="compressed")
@@ -481,7 +482,7 @@ def worst_trials(
     top = max(brightest(nominal, picture) for _, _, picture in worst) / unit
     off = [100.0 * (picture - nominal) / unit for _, _, picture in worst]
     most = _largest(np.array(off), 0.0)
-    lit = _grey(panels[0, 0], nominal / unit, view, top=top, title=f"As designed (RRMSD {design:.3g})")
+    lit = _grey(panels[0, 0], nominal / unit, view, top=top, title=f"As designed{of} (RRMSD {design:.3g})")
     for (above, below), (trial, value, picture), apart in zip(panels[:, 1:].T, worst, off, strict=False):
         _grey(above, picture / unit, view, top=top, title=f"Trial {trial} (RRMSD {value:.3g})").axes.set_xlabel("")
         changed = _signed(below, apart, view, most=most, title=f"Trial {trial} − as designed")

@@ -24,19 +24,18 @@ from typing_extensions import TypedDict
 from bstcad.analysis.light import Blur, FinestDetail, finest_detail
 from bstcad.analysis.missed_light import lifted, unlit
 from bstcad.analysis.steepness import Steepness
-from bstcad.analysis.top_hat import FLAT, FlatTop
+from bstcad.analysis.top_hat import FlatTop
 from bstcad.judges.comparison import Judge
 from bstcad.measured.form_error import MAP
 from bstcad.measured.made_part import MadePart
 from bstcad.optics.lens import Lens
 from bstcad.optics.reach import unreached
-from bstcad.optics.wavefront_error import WavefrontError
+from bstcad.report.goal_figures import Rrmsd, Share, Size, TargetFigures, WavefrontFigures, flat_tops, of_targets
 from bstcad.report.light_figures import rrmsd
 from bstcad.report.prescription import Order, prescription
 from bstcad.report.units import DIGITS, Rows, number, paragraphs, percent, tables
 from bstcad.runs import files
 from bstcad.scene.scene import Scene
-from bstcad.scene.target import drawing
 from bstcad.verify.checks import CUT, DEFAULT_RRMSD_LIMIT, Proof
 from bstcad.verify.verdict import Check, verdict
 
@@ -63,10 +62,7 @@ NOTHING = 1e-4  # of the light, and of RRMSD: an effect that changes less change
 SHARP = 5e-3  # pixels; a smaller blur is none
 
 Scalar = str | float | int | bool | None
-Share = Annotated[float, Field(ge=-1e-6, le=1 + 1e-6)]  # of 1, but for the rounding of a sum
-Size = Annotated[float, Field(ge=0, le=1e12)]
 Seconds = Annotated[float, Field(ge=0, le=1e9)]
-Rrmsd = Annotated[float, Field(gt=0, le=1e3)]
 Record = TypeVar("Record")
 
 
@@ -107,48 +103,6 @@ class Line:
     wavelength: Size  # nm
     share: Share  # of all light
     rrmsd: Rrmsd  # of its picture against the target
-
-
-@dataclass(frozen=True)
-class TargetFigures:
-    """The light on one of several targets."""
-
-    key: str  # target[0], target[1], …
-    z: float  # mm, of its plane
-    weight: Size  # of its squared error among all goals
-    rrmsd: Rrmsd  # by the flux into each pixel
-    rrmsd_standard_error: Annotated[float, Field(ge=0, le=1e3)]  # of rrmsd, by independent sets of rays
-    rrmsd_tent: Rrmsd | None  # by linear binning
-    light_on_target: Share  # of the source's flux
-    efficiency: Share  # flux on the target over flux that leaves the back face
-    leak: Share | None  # of the light on the target, on its dark pixels; None: it has none
-    contrast: Size | None  # mean irradiance of the lit pixels over that of the dark ones; None: or without leak
-
-
-@dataclass(frozen=True)
-class WavefrontFigures:
-    """The wavefront behind the lens against the one asked for; waves are those of `wavelength` in air."""
-
-    z: float  # mm, the plane on which both are compared
-    wavelength: Size  # nm
-    rms: Size  # waves, each ray by its flux
-    pv: Size  # waves, greatest less least of all rays
-    rms_with_tilt: Size  # waves, piston alone removed
-    tilt_urad: tuple[float, float]  # removed; light that leans towards +x and towards +y of the wanted light
-    angle_rms_urad: Size  # between rays and wanted rays, each ray by its flux; tilt included
-    angle_max_urad: Size  # between rays and wanted rays
-    floor: Size  # waves that rounding may add to the RMS
-    flux: Share  # of the source's flux, that is measured
-    removed: Literal["piston and tilt"] = "piston and tilt"  # before rms and pv
-
-    @classmethod
-    def of(cls, error: WavefrontError) -> WavefrontFigures:
-        """Those of a measurement, whose flux is a sum over a grid: at the edge of a beam it may go beyond 1."""
-        return cls(
-            error.z, error.wavelength, error.without_tilt.rms, error.without_tilt.pv,
-            rms_with_tilt=error.without_piston.rms, tilt_urad=error.tilt, angle_rms_urad=error.angle_rms,
-            angle_max_urad=error.angle_max, floor=error.floor, flux=min(error.flux, 1.0),
-        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -343,40 +297,12 @@ def contents_of(
         finest_detail=_finest_detail(scene, proof, estimates),
         lines=tuple(Line(line.wavelength, line.share, rrmsd(target, line.picture)) for line in proof.lines),
         estimates=estimates,
-        targets=tuple(_figures(scene, proof)) if proof.further else (),
-        flat_tops=tuple(_flat_tops(scene, proof)),
+        targets=tuple(of_targets(scene, proof)) if proof.further else (),
+        flat_tops=tuple(flat_tops(scene, proof)),
         wavefront=proof.wavefront and WavefrontFigures.of(proof.wavefront),
     )
     pictures = tuple(zip(further, (each.picture for each in proof.further), strict=True))
     return _remarked(contents, *remarks(contents, scene, target, light.picture, further=pictures))
-
-
-def _figures(scene: Scene, proof: Proof) -> Iterator[TargetFigures]:
-    """The light on each target."""
-    for key, target, light in zip(scene.target_keys, scene.targets, proof.lights, strict=True):
-        yield TargetFigures(
-            key,
-            target.z,
-            target.weight,
-            light.rrmsd,
-            rrmsd_standard_error=light.standard_error,
-            rrmsd_tent=light.tent,
-            light_on_target=light.flux["on target"],
-            efficiency=light.efficiency,
-            leak=light.leak and light.leak.share,
-            contrast=light.leak and light.leak.contrast,
-        )
-
-
-def _flat_tops(scene: Scene, proof: Proof) -> Iterator[FlatTop]:
-    """Of each target with a profile that is flat, if light falls on it."""
-    for key, target, light in zip(scene.target_keys, scene.targets, proof.lights, strict=True):
-        if target.profile is not None and target.profile.shape != "gaussian" and light.picture.any():
-            pixel = tuple(side / n for side, n in zip(target.size, target.columns_rows, strict=True))
-            inside = drawing(target).light  # the share of each pixel, of shapes with an edge
-            if target.profile.shape == "super_gaussian":
-                inside = (inside >= FLAT * inside.max()).astype(float)
-            yield FlatTop.of(key, light.picture, pixel, inside, on_picture=light.flux["on target"])
 
 
 def _unreached(scene: Scene, reachable: np.ndarray) -> dict[str, float | None]:

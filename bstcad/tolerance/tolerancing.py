@@ -184,5 +184,6 @@ def _drawn(scene: Scene, pictures: Pictures, study: Study, own: Study) -> dict[s
     worst = [(k, float(own.full[k]), pictures.light(z)) for k, z in zip(shown, amounts, strict=True)]
     nominal = pictures.light(np.zeros(len(study.perturbations)))
     rrmsds = histogram(study.rrmsd, study.limit, linear=study.linear, full=study.full, adjusted=study.adjusted)
-    drawn = rrmsds, worst_trials(own.rrmsd, nominal, worst, View.of(scene))
+    of = f", {scene.target_keys[0]}" if len(scene.targets) > 1 else ""
+    drawn = rrmsds, worst_trials(own.rrmsd, nominal, worst, View.of(scene), of=of)
     return dict(zip(tolerances.FIGURES, map(png, drawn), strict=True))

@@ -1,0 +1,89 @@
+"""The figures of each goal in report.json: the light on each of several targets, flat tops, and the wavefront."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from bstcad.analysis.top_hat import FLAT, FlatTop
+from bstcad.optics.wavefront_error import WavefrontError
+from bstcad.scene.scene import Scene
+from bstcad.scene.target import drawing
+from bstcad.verify.checks import Proof
+
+Share = Annotated[float, Field(ge=-1e-6, le=1 + 1e-6)]  # of 1, but for the rounding of a sum
+Size = Annotated[float, Field(ge=0, le=1e12)]
+Rrmsd = Annotated[float, Field(gt=0, le=1e3)]
+
+
+@dataclass(frozen=True)
+class TargetFigures:
+    """The light on one of several targets."""
+
+    key: str  # target[0], target[1], …
+    z: float  # mm, of its plane
+    weight: Size  # of its squared error among all goals
+    rrmsd: Rrmsd  # by the flux into each pixel
+    rrmsd_standard_error: Annotated[float, Field(ge=0, le=1e3)]  # of rrmsd, by independent sets of rays
+    rrmsd_tent: Rrmsd | None  # by linear binning
+    light_on_target: Share  # of the source's flux
+    efficiency: Share  # flux on the target over flux that leaves the back face
+    leak: Share | None  # of the light on the target, on its dark pixels; None: it has none
+    contrast: Size | None  # mean irradiance of the lit pixels over that of the dark ones; None: or without leak
+
+
+@dataclass(frozen=True)
+class WavefrontFigures:
+    """The wavefront behind the lens against the one asked for; waves are those of `wavelength` in air."""
+
+    z: float  # mm, the plane on which both are compared
+    wavelength: Size  # nm
+    rms: Size  # waves, each ray by its flux
+    pv: Size  # waves, greatest less least of all rays
+    rms_with_tilt: Size  # waves, piston alone removed
+    tilt_urad: tuple[float, float]  # removed; light that leans towards +x and towards +y of the wanted light
+    angle_rms_urad: Size  # between rays and wanted rays, each ray by its flux; tilt included
+    angle_max_urad: Size  # between rays and wanted rays
+    floor: Size  # waves that rounding may add to the RMS
+    flux: Share  # of the source's flux, that is measured
+    removed: Literal["piston and tilt"] = "piston and tilt"  # before rms and pv
+
+    @classmethod
+    def of(cls, error: WavefrontError) -> WavefrontFigures:
+        """Those of a measurement, whose flux is a sum over a grid: at the edge of a beam it may go beyond 1."""
+        return cls(
+            error.z, error.wavelength, error.without_tilt.rms, error.without_tilt.pv,
+            rms_with_tilt=error.without_piston.rms, tilt_urad=error.tilt, angle_rms_urad=error.angle_rms,
+            angle_max_urad=error.angle_max, floor=error.floor, flux=min(error.flux, 1.0),
+        )  # fmt: skip
+
+
+def of_targets(scene: Scene, proof: Proof) -> Iterator[TargetFigures]:
+    """The light on each target."""
+    for key, target, light in zip(scene.target_keys, scene.targets, proof.lights, strict=True):
+        yield TargetFigures(
+            key,
+            target.z,
+            target.weight,
+            light.rrmsd,
+            rrmsd_standard_error=light.standard_error,
+            rrmsd_tent=light.tent,
+            light_on_target=light.flux["on target"],
+            efficiency=light.efficiency,
+            leak=light.leak and light.leak.share,
+            contrast=light.leak and light.leak.contrast,
+        )
+
+
+def flat_tops(scene: Scene, proof: Proof) -> Iterator[FlatTop]:
+    """Of each target with a profile that is flat, if light falls on it."""
+    for key, target, light in zip(scene.target_keys, scene.targets, proof.lights, strict=True):
+        if target.profile is not None and target.profile.shape != "gaussian" and light.picture.any():
+            pixel = tuple(side / n for side, n in zip(target.size, target.columns_rows, strict=True))
+            inside = drawing(target).light  # the share of each pixel, of shapes with an edge
+            if target.profile.shape == "super_gaussian":
+                inside = (inside >= FLAT * inside.max()).astype(float)
+            yield FlatTop.of(key, light.picture, pixel, inside, on_picture=light.flux["on target"])
