@@ -66,7 +66,6 @@ def test_letters_near_by_and_a_portrait_behind_them(tmp_path):
     near, far = scene["target"]
     del near["sample"]
     near["text"], scene["lens"]["back"]["z"], near["z"], far["z"] = "THU", 160.0, 260.0, 400.0
-    scene["tailoring"]["stage2_iterations"], far["weight"] = 140, 1.1
     scene["accept"]["rrmsd"] = 0.06
     path, folder = tmp_path / "letters.toml", tmp_path / "made"
     path.write_text(tomli_w.dumps(scene))
