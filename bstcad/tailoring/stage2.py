@@ -46,7 +46,7 @@ SPARSE, DENSE = ((1 / 2, 0.40), (3 / 4, 0.35), (1.0, 0.25)), 2.5
 JOINT = ((2 / 3, 0.45), (1.0, 0.35), (4 / 3, 0.2))
 # Two pictures take twice the evaluations of one, and more in proportion to the side of a net of more than OF_SIDE
 # control points: the variable leaves the Hessian a power of the Laplacian.  (Letters before a portrait, 769 points:
-# 0.057 and 0.062 by 98 for each 196 evaluations in three rounds, 0.048 and 0.058 by 309 in these two.)
+# RRMSD 0.057 and 0.062 after 196 evaluations in three rounds, 0.047 and 0.057 after 309 in these two.)
 PICTURES, OF_SIDE = ((2 / 3, 1.4), (4 / 3, 0.7)), 513
 # Where RRMSD is above FAR_OFF on LARGE pixels, which a net that is only too coarse for the picture gets right, light
 # has to move far: (pixels along the longer side, tubes a side, evaluations) of the rounds before those, the last of
