@@ -19,6 +19,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 __version__ = "0.1.0"
 _HOMES = {
     **dict.fromkeys(("design", "open", "mounted", "Design"), "api"),
+    "workbench": "app.widget",
     "Report": "report.record",
     **dict.fromkeys(("Scene", "Accept", "load"), "scene.scene"),
     **dict.fromkeys(("LensBlank", "Back"), "scene.blank"),

@@ -242,6 +242,10 @@ Size = option(str | None, "MM", "Of the plate: 80, or width x height, 80x60.")
 Distance = option(str | None, "MM", "To the wall (5 times the size; in the sun 2.5 times).")
 Template = option(str | None, "T", "Copy this template instead; see --list.")
 Listed = option(bool, None, "List the templates.", "--list")
+# Of app.
+Opened = argument(Path | None, "SCENE|DIR", "A scene file, a design's folder, or a folder of both.", parser=path_meant)
+Port = option(int, "N", "On loopback (0: a free one).", min=0, max=65535)
+Browser = option(bool, None, "Open the page in the browser.", "--browser/--no-browser")
 # Of verify.
 Written = argument(Path, "DIR|STEP", "A design's folder, or a STEP file by itself.", parser=design_folder)
 Measured = place("CLOUD", "Measured points of a made part, to judge it too.")
@@ -359,6 +363,21 @@ def new(
     if written.sentences:
         print(written.sentences)
     print(f"{written.path} is written; next: bstcad generate {written.path}")
+    return 0
+
+
+@app.command(name="app", epilog=examples("app", "app my-lens.toml", "app outputs/thu --no-browser"))
+def workbench(given: Opened = None, port: Port = 0, browser: Browser = True) -> int:
+    """Open the workbench: a page on this machine where the picture on the wall follows each change of a scene."""
+    try:
+        with loading():
+            from bstcad.app import server
+    except ImportError as error:
+        raise InputError(f"{error.name} is not installed; pip install 'bstcad[app]' brings it") from None
+    import webbrowser
+
+    seen = sys.stdout.isatty() and browser
+    server.serve(given, port, say=lambda sentence: print(sentence, flush=True), show=webbrowser.open if seen else len)
     return 0
 
 

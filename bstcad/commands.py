@@ -52,7 +52,7 @@ from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
 from bstcad.sweep.estimates import diagnosis, left_out
 from bstcad.sweep.net_choice import with_net
-from bstcad.tailoring.run import Progress, silent
+from bstcad.tailoring.run import Look, Progress, silent, unseen
 from bstcad.verify import checks, text_checks
 from bstcad.verify.checks import Nominal, Proof
 from bstcad.verify.verdict import Check, verdict
@@ -78,14 +78,15 @@ NO_ADDITIONS = Additions()
 
 def generate(
     scene: Scene, folder: Path, *, device: str = "auto", progress: Progress = silent, began: float | None = None,
-    resume: bool = False, effort: Effort | None = None, drawing: Drawing | None = None,
+    resume: bool = False, effort: Effort | None = None, drawing: Drawing | None = None, look: Look = unseen,
 ) -> Report:  # fmt: skip
     """Design a lens, write it to `folder` and prove it from the written files.
 
     began (time.perf_counter(), default now) is when the time of the report and of tailoring.max_time starts.
     While it designs it leaves a checkpoint beside the folder now and then, and goes on from there if asked to `resume`.
     After a Ctrl-C meanwhile the best lens so far is written, never over an earlier design: see `place_for`.
-    effort: of the proof; None: all that it may need.  drawing: of its figures; None: Pictures.
+    effort: of the proof; None: all that it may need.  drawing: of its figures; None: Pictures.  look: called now and
+    then with the function that makes the best lens so far.
     """
     scene, choice = with_net(scene)
     if choice is not None:
@@ -103,8 +104,9 @@ def generate(
             keeper.say("the design that was stopped here begins anew; --resume would go on with it")
         with _nothing_lost(keeper, refused=(SceneError,)), signals.first_interrupt_is_a_wish() as wished:
             found = design(
-                scene, device=device, progress=progress, began=began, save=keeper, start=state, interrupted=wished
-            )
+                scene, device=device, progress=progress, began=began, save=keeper, start=state, interrupted=wished,
+                look=look,
+            )  # fmt: skip
         with _nothing_lost(keeper):
             report = write(
                 found, place_for(folder, found.making.stopped), progress=progress, effort=effort,

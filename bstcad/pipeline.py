@@ -35,7 +35,21 @@ from bstcad.tailoring.goals import Goal
 from bstcad.tailoring.grazing import cleared
 from bstcad.tailoring.machinability import BOUNDED, UNBOUNDED, front_shaped, held, kept, moved_clear
 from bstcad.tailoring.reachable import reachable
-from bstcad.tailoring.run import JUDGING, Driver, Edge, Parameters, Progress, Record, Step, Task, forget, never, silent
+from bstcad.tailoring.run import (
+    JUDGING,
+    Driver,
+    Edge,
+    Look,
+    Parameters,
+    Progress,
+    Record,
+    Step,
+    Task,
+    forget,
+    never,
+    silent,
+    unseen,
+)
 from bstcad.tailoring.source_image import Spread
 from bstcad.tailoring.stage2 import Comparison, compare_precisions
 from bstcad.transport.mapping import Mapping, TransportMap
@@ -87,6 +101,7 @@ def design(
     scene: Scene, *, device: str = "auto", progress: Progress = silent, began: float | None = None,
     save: Callable[[Saved], None] = forget, start: Saved | None = None, interrupted: Callable[[], bool] = never,
     merit: Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None = None, later: bool = False,
+    look: Look = unseen,
 ) -> Made:  # fmt: skip
     """From a scene to a tailored lens: transport map, stage 1, stage 2, or stage 3 for a source of some size.
 
@@ -94,6 +109,7 @@ def design(
     `save` is called now and then with a state; given as `start`, the design goes on from there and ends the same.
     Once `interrupted` says so, tailoring ends with the best so far; KeyboardInterrupt if there is no lens yet.
     merit: of a picture and the target, what stages 2 and 3 make least; None: RRMSD².
+    look: called now and then with the function that makes the best lens so far.
     later: float32 is compared with float64 when a report asks for it (`Made.told`), and not where none is made.
     """
     began = time.perf_counter() if began is None else began
@@ -101,14 +117,7 @@ def design(
         raise SceneError("merit: is one of a picture, and the scene has several goals; leave it out, or ask for less")
     torch.manual_seed(scene.tailoring.seed)
     device = device_for(device)
-    parts, edge, wanted = [], None, []
-    for alone, key in zip(scene.each_alone(), scene.target_keys, strict=True):
-        picture = alone.target.irradiance()
-        part, its_edge = reachable_part(alone, picture, key)
-        if part is not None:
-            of = f"{key}: " if len(scene.targets) > 1 else ""
-            progress("reach", 0, 0, f"{of}{unreachable(alone, part, picture)}; the design is for the rest")
-        parts, edge, wanted = [*parts, part], edge or its_edge, [*wanted, restricted(picture, part)]
+    parts, edge, wanted = within_reach(scene, progress)
     knobs = scene.tailoring.resolved(scene.lens.back.net)
     later = later and knobs.max_time is None
     task = task_of(
@@ -117,7 +126,7 @@ def design(
     task = posed(scene, task)
     limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve(scene) + JUDGING}
     record = Record() if start is None else start.record
-    driver = Driver(progress, began, **limits, interrupted=interrupted, save=save, record=record)
+    driver = Driver(progress, began, **limits, interrupted=interrupted, save=save, look=look, record=record)
     precision = getattr(torch, knobs.precision)
     lens = scene.flat_lens(knobs.levels[0], dtype=precision, device=device, as_wide_as=knobs.levels[-1])
     if start is None:
@@ -143,6 +152,24 @@ def design(
         transport=followed.transport, reachable=parts[0], further_reachable=tuple(parts[1:]),
         compared=partial(_compared, making, task, after_stage1, stages) if later else None,
     )  # fmt: skip
+
+
+def within_reach(
+    scene: Scene, progress: Progress
+) -> tuple[list[np.ndarray | None], Edge | None, list[np.ndarray]]:  # fmt: skip
+    """(parts, edge, wanted): of each target what light can reach of it, as `reachable_part` has it, and its picture.
+
+    Of a target that light cannot reach all of, `progress` is told.  SceneError as `reachable_part`.
+    """
+    parts, edge, wanted = [], None, []
+    for alone, key in zip(scene.each_alone(), scene.target_keys, strict=True):
+        picture = alone.target.irradiance()
+        part, its_edge = reachable_part(alone, picture, key)
+        if part is not None:
+            of = f"{key}: " if len(scene.targets) > 1 else ""
+            progress("reach", 0, 0, f"{of}{unreachable(alone, part, picture)}; the design is for the rest")
+        parts, edge, wanted = [*parts, part], edge or its_edge, [*wanted, restricted(picture, part)]
+    return parts, edge, wanted
 
 
 def task_of(

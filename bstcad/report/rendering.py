@@ -8,6 +8,7 @@ file runs itself as a script, which draws arrays of a file into a PNG or a windo
 from __future__ import annotations
 
 import base64
+import io
 import json
 import math
 import os
@@ -56,6 +57,8 @@ AHEAD, EACH = 2.0, 5  # from near by: diagonals of the lens that rays are drawn 
 
 # The lens to be turned.
 FINE, COARSE = 256, 64  # cells each way of a net, and of a surface that is one smooth piece
+MOST_RAYS = 200  # that are sent with it
+TENTHS_OF_MICRONS, PARTS = 4, 3  # decimals of a place in mm, and of a flux
 STEPS = 65535  # of a number, over its range
 LEAST = 1e-9  # range (mm, or a slope) of values that are all equal
 
@@ -332,8 +335,7 @@ def _add_screen(plotter: Any, screen: np.ndarray, picture: np.ndarray, opacity: 
 
 def _frame(plotter: Any, points: np.ndarray, path: LightPath, towards: np.ndarray, filled: float) -> None:
     """Have all of the points in the view, y up, from the side that the screen is not off to."""
-    off = path.screen[:, 0].mean() - path.vertices[:, 0].mean()
-    towards = towards * [-1 if off > 0 else 1, 1, 1] / np.linalg.norm(towards)
+    towards = _clear_of_screen(path, towards)
     right = np.cross([0.0, 1.0, 0.0], towards)
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(towards, right), towards])
@@ -355,11 +357,19 @@ def _frame(plotter: Any, points: np.ndarray, path: LightPath, towards: np.ndarra
     plotter.reset_camera_clipping_range()
 
 
+def _clear_of_screen(path: LightPath, towards: np.ndarray) -> np.ndarray:
+    """The direction towards the eye (a unit vector), on the side that the screen is not off to."""
+    off = path.screen[:, 0].mean() - path.vertices[:, 0].mean()
+    return towards * [-1 if off > 0 else 1, 1, 1] / np.linalg.norm(towards)
+
+
 # --- the lens to be turned --------------------------------------------------------------------------------------------
 
 
-def turnable(lens: Lens) -> str:
-    """The JSON that solid_view.js reads: lengths in mm, and the lamps of the picture in clay.
+def turnable(lens: Lens, path: LightPath | None = None, cells: int = FINE) -> str:
+    """The JSON that solid_view.js reads: lengths in mm, and the lamps of the picture in clay; `path`: its light too.
+
+    cells: of a net each way, even; fewer for a preview that is sent again and again (256: 0.9 MB, 96: 0.2 MB).
 
     "" of faces that are not finite everywhere, as a damaged file may have them.  solid_view.js draws in plain WebGL,
     which every browser has: a solid of one material needs a shader of twenty lines, not a library of 0.6 to 1 MB.  The
@@ -367,12 +377,13 @@ def turnable(lens: Lens) -> str:
 
     values: base64 of 16-bit numbers, low byte first, each a part of its range.  For each face the places x, y, z of
     (cells + 1)² nodes and their slopes along x and y; then x, y, z of the front and z of the back around the rim.
+    With a path what `_light` tells.
     """
     from bstcad.cad.mesh import nodes, rim, sampled
 
     def at_nodes(surface: Surface) -> np.ndarray:
         """x, y, z (mm), ∂z/∂x and ∂z/∂y of a face at its nodes: (5, cells + 1, cells + 1)."""
-        x, y = nodes(surface.outline or lens.outline, COARSE if math.isinf(surface.detail) else FINE)
+        x, y = nodes(surface.outline or lens.outline, min(COARSE, cells) if math.isinf(surface.detail) else cells)
         return np.stack([x, y, *sampled(surface.optical, x, y)])
 
     def on_rim(outline: Outline, cells: int) -> np.ndarray:
@@ -393,7 +404,7 @@ def turnable(lens: Lens) -> str:
     faces = [at_nodes(lens.back), at_nodes(lens.front)]
     if lens.front.outline is not None:
         faces += around(lens.front.around, lens.front.outline)
-    x, y = on_rim(lens.outline, FINE)
+    x, y = on_rim(lens.outline, cells)
     wall = np.stack([x, y, sampled(lens.front, x, y)[0], sampled(lens.back, x, y)[0]])
     places = np.concatenate([*(face[:3].reshape(3, -1) for face in faces), wall[:3], wall[[0, 1, 3]]], axis=1)
     if not np.isfinite(places).all():
@@ -410,7 +421,39 @@ def turnable(lens: Lens) -> str:
     shape = {"low": low.tolist(), "size": size.tolist(), "faces": told, "rim": wall.shape[1]}
     lit = {"eye": EYE, "angle": VIEW_ANGLE, "clay": [int(CLAY[k : k + 2], 16) / 255 for k in (1, 3, 5)]}
     lit |= {"lamps": [direction for direction, _ in LIGHTS], "bright": [intensity for _, intensity in LIGHTS]}
-    return json.dumps(shape | lit | FINISH | {"values": numbers})
+    light = {} if path is None else _light(path)
+    return json.dumps(shape | lit | FINISH | {"values": numbers} | light)
+
+
+def _light(path: LightPath) -> dict[str, Any]:
+    """A light path as JSON has it: places in mm.
+
+    rays: some of them, each its stops from the source over the faces to the furthest screen; flux: of each, that of
+    the brightest is 1.  screens: the corners as LightPath has them, and the picture as a data URL, row 0 at y max.
+    lamp: the place of a point source, if it is one.  aside: towards the eye that sees all of the way, y up.
+    """
+    every = math.ceil(len(path.rays) / MOST_RAYS) | 1  # odd, or of an even grid they would all lie in a few columns
+    rays, flux = path.rays[::every], path.flux[::every] / path.flux.max()
+    return {
+        "rays": np.round(rays, TENTHS_OF_MICRONS).tolist(),
+        "flux": np.round(flux, PARTS).tolist(),
+        "screens": [
+            {"corners": np.round(screen, TENTHS_OF_MICRONS).tolist(), "picture": _data_url(picture)}
+            for screen, picture in path.screens
+        ],
+        "lamp": np.round(path.lamp, TENTHS_OF_MICRONS).tolist(),
+        "mirror": bool(path.mirror),
+        "aside": _clear_of_screen(path, np.multiply(ASIDE, [1, 1, -path.seen_along])).tolist(),
+    }
+
+
+def _data_url(picture: np.ndarray) -> str:
+    """Tones (rows, columns) uint8 as a PNG that a page holds."""
+    from PIL import Image
+
+    png = io.BytesIO()
+    Image.fromarray(picture).save(png, "PNG")
+    return f"data:image/png;base64,{base64.b64encode(png.getvalue()).decode()}"
 
 
 def _steps(values: np.ndarray, low: float, size: float) -> np.ndarray:

@@ -1,49 +1,130 @@
 "use strict";
 // Puts a lens that can be turned in the place of its picture.  The picture stays where this cannot draw, and on paper.
 // Nothing moves by itself, so there is nothing to still for those who asked for less motion.
-(() => {
+//
+// A page that draws a lens again and again calls solidView.begin(figure, solid) once, with what rendering.turnable
+// tells of the lens, and then update(solid) of what that returned.  With rays there are two framings: look("lens"),
+// from near by, z up, and look("way"), all of the way of the light with its walls, true to scale, y up.  The pictures
+// on walls are data URLs, which the page's policy has to allow (img-src data:).
+globalThis.solidView = (() => {
   const STEP = Math.PI / 36, NEARER = 1.25, FARTHEST = 0.6, NEAREST = 8, CLOSE = 1.5, FILLED = 0.92;
   const UPRIGHT = 1.55, MOST_PIXELS = 2; // radians; device pixels a pixel of the page
+  const SOME = 2, AHEAD = 2; // from near by: every second ray, for two diagonals of the lens
+  const ROOM = 0.5, BESIDE = 1.5; // that much of them is in view, and a lamp that is so near to the middle
+  const FAR = 2.4; // the eye from the middle of all of the way, in its diagonals
+  const FAINTEST = 0.35, SPARSE = 0.75, DENSE = 0.4; // opacity of a ray without flux, and of all near by and on the way
+  const BEFORE = 0.8; // opacity of a wall that light goes on behind
+  const GLASS = [0.62, 0.75, 0.88], SHARP = 0.82; // a colour; the cosine of the least turn that makes an edge
+  const RAY = 0, BORDER = 1, EDGE = 2, LAMP = 3; // lines: of light, around a wall, of glass; and a dot
+  const LINE = 9; // numbers of a line: its ends, the opacity at them, and what it is
 
-  // Positions in mm, seen from `distance` along the axis `turn[2]` of the eye; `focal` is 1 / tan(half the angle).
-  const VERTEX = `#version 300 es
-    layout(location = 0) in vec3 place;
-    layout(location = 1) in vec3 normal;
-    uniform mat3 turn;
-    uniform vec3 centre;
-    uniform vec2 focal, shift;
-    uniform float distance, reach;
-    out vec3 seen, facing;
-    void main() {
-      seen = turn * (place - centre) - vec3(0.0, 0.0, distance);
-      facing = turn * normal;
-      float near = distance - 0.55 * reach, far = distance + 0.55 * reach;
-      float depth = ((near + far) * seen.z + 2.0 * near * far) / (near - far);
-      gl_Position = vec4(focal * seen.xy - shift * seen.z, depth, -seen.z);
+  // Positions in mm, seen from `distance` along the last of the axes (right, up, towards the eye); `focal` is
+  // 1 / tan(half the angle); `range` is how near and how far from the eye something is drawn.
+  const SIGHT = `#version 300 es
+    precision highp float;
+    uniform vec3 axes[3], centre;
+    uniform vec2 focal, shift, range;
+    uniform float distance;
+    vec3 turned(vec3 way) { return way * mat3(axes[0], axes[1], axes[2]); }
+    vec3 seenAt(vec3 place) { return turned(place - centre) - vec3(0.0, 0.0, distance); }
+    vec4 drawnAt(vec3 seen) {
+      float depth = ((range.x + range.y) * seen.z + 2.0 * range.x * range.y) / (range.x - range.y);
+      return vec4(focal * seen.xy - shift * seen.z, depth, -seen.z);
     }`;
 
-  // The same clay under the same lamps as in the picture.
-  const FRAGMENT = `#version 300 es
+  const SOLID = [`${SIGHT}
+    layout(location = 0) in vec3 place;
+    layout(location = 1) in vec3 normal;
+    out vec3 seen, facing;
+    void main() {
+      seen = seenAt(place);
+      facing = turned(normal);
+      gl_Position = drawnAt(seen);
+    }`,
+  // The same clay under the same lamps as in the picture; or glass, the less clear the more it is seen aslant.
+  `#version 300 es
     precision highp float;
     in vec3 seen, facing;
-    uniform vec3 clay, lamps[3], finish;
-    uniform float bright[3], gloss;
+    uniform vec3 clay, lamps[3], bright, finish;
+    uniform float gloss;
+    uniform vec2 veil; // opacity: seen head on, and aslant
     out vec4 colour;
     void main() {
       vec3 normal = normalize(facing), eye = normalize(-seen), light = finish.x * clay;
+      float shone = 0.0;
+      if (!gl_FrontFacing) normal = -normal;
       for (int i = 0; i < 3; i++) {
         float cosine = max(dot(normal, lamps[i]), 0.0);
         float shine = cosine > 0.0 ? pow(max(dot(reflect(-lamps[i], normal), eye), 0.0), gloss) : 0.0;
         light += bright[i] * (finish.y * cosine * clay + finish.z * shine);
+        shone += bright[i] * finish.z * shine;
       }
-      colour = vec4(min(light, 1.0), 1.0);
-    }`;
+      float slant = 1.0 - abs(dot(normal, eye));
+      colour = vec4(min(light, 1.0), 1.0) * min(mix(veil.x, veil.y, slant * slant) + shone, 1.0);
+    }`];
+
+  // A line is a strip as wide in pixels as what it is; a browser's own lines are one pixel wide on any display.
+  const LINES = [`${SIGHT}
+    layout(location = 0) in vec3 begin;
+    layout(location = 1) in vec3 end;
+    layout(location = 2) in vec3 look;
+    uniform vec2 pixels;
+    uniform float ratio;
+    const float WIDTHS[4] = float[4](1.2, 1.6, 1.2, 9.0); // of the page's pixels
+    const vec3 COLOURS[4] = vec3[4](
+      vec3(0.93, 0.46, 0.05), vec3(0.55, 0.59, 0.63), vec3(0.42, 0.53, 0.64), vec3(1.0, 0.70, 0.05));
+    out vec4 ink;
+    out vec2 off;
+    out float thick;
+    void main() {
+      vec3 a = seenAt(begin), b = seenAt(end);
+      gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // nowhere: all of it is behind the eye
+      if (max(-a.z, -b.z) <= range.x) return;
+      if (-a.z < range.x) a = mix(b, a, (range.x + b.z) / (b.z - a.z));
+      if (-b.z < range.x) b = mix(a, b, (range.x + a.z) / (a.z - b.z));
+      vec4 p = drawnAt(a), q = drawnAt(b);
+      p /= p.w;
+      q /= q.w;
+      vec2 way = (q.xy - p.xy) * pixels / 2.0;
+      way = length(way) > 0.001 ? normalize(way) : vec2(1.0, 0.0);
+      int kind = int(look.z);
+      bool last = gl_VertexID > 1;
+      thick = WIDTHS[kind] * ratio / 2.0;
+      float along = kind == 3 ? thick + 1.0 : 0.0; // a lamp is round
+      off = vec2(last ? along : -along, gl_VertexID % 2 == 0 ? thick + 1.0 : -thick - 1.0);
+      vec4 drawn = last ? q : p;
+      gl_Position = vec4(drawn.xy + (way * off.x + vec2(-way.y, way.x) * off.y) * 2.0 / pixels, drawn.z, 1.0);
+      ink = vec4(COLOURS[kind], 1.0) * (last ? look.y : look.x);
+    }`,
+  `#version 300 es
+    precision highp float;
+    in vec4 ink;
+    in vec2 off;
+    in float thick;
+    out vec4 colour;
+    void main() { colour = ink * clamp(thick + 0.5 - length(off), 0.0, 1.0); }`];
+
+  // Row 0 of a picture, which a texture begins with, is at the last two corners.
+  const WALL = [`${SIGHT}
+    uniform vec3 corners[4];
+    out vec2 at;
+    void main() {
+      at = vec2(gl_VertexID == 1 || gl_VertexID == 2, gl_VertexID < 2);
+      gl_Position = drawnAt(seenAt(corners[gl_VertexID]));
+    }`,
+  `#version 300 es
+    precision highp float;
+    in vec2 at;
+    uniform sampler2D picture;
+    uniform float opacity;
+    out vec4 colour;
+    void main() { colour = vec4(texture(picture, at).rgb, 1.0) * opacity; }`];
 
   // Triangles of the faces and of the wall between their rims, six numbers a corner: place and normal.
   function meshOf(solid) {
     const bytes = Uint8Array.from(atob(solid.values), (letter) => letter.charCodeAt(0));
     const values = new Uint16Array(bytes.buffer);
-    const mesh = { corners: [], triangles: [] };
+    const mesh = { corners: [], triangles: [], rim: [] };
     const place = (axis, value) => solid.low[axis] + (solid.size[axis] * value) / 65535;
     let at = 0;
     for (const face of solid.faces) {
@@ -69,6 +150,7 @@
     const rim = (k) => values.subarray(at + k * solid.rim, at + (k + 1) * solid.rim);
     const [x, y, low, high] = [0, 1, 2, 3].map(rim);
     for (let i = 0; i < solid.rim; i++) {
+      mesh.rim.push([low, high].map((z) => [place(0, x[i]), place(1, y[i]), place(2, z[i])]));
       const next = (i + 1) % solid.rim, first = mesh.corners.length / 6;
       const [x0, x1, y0, y1] = [place(0, x[i]), place(0, x[next]), place(1, y[i]), place(1, y[next])];
       const length = Math.hypot(x1 - x0, y1 - y0) || 1, normal = [(y1 - y0) / length, (x0 - x1) / length, 0];
@@ -79,43 +161,245 @@
     return mesh;
   }
 
-  // A program that draws the mesh; null where there is no WebGL 2.
-  function painter(canvas, solid) {
-    const gl = canvas.getContext("webgl2", { antialias: true, preserveDrawingBuffer: true }); // kept: it may be printed
-    if (!gl) return null;
+  // Every so many rays, up to `longest` mm before and behind the lens.
+  function raysOf(solid, every, longest, opacity) {
+    const lines = [], afar = solid.lamp.length ? 1 : 0; // opacity where the light begins: it fades in if from no lamp
+    solid.rays.forEach((stops, ray) => {
+      if (ray % every) return;
+      const tone = opacity * (FAINTEST + (1 - FAINTEST) * solid.flux[ray]), last = stops.length - 2;
+      for (let k = 0; k <= last; k++) {
+        const [begin, end] = [stops[k], stops[k + 1]];
+        const share = longest / Math.hypot(...end.map((part, axis) => part - begin[axis])), cut = share < 1;
+        const from = (place, other) => place.map((part, axis) => part + share * (other[axis] - part));
+        const first = k === 0 && cut ? from(end, begin) : begin, final = k === last && cut ? from(begin, end) : end;
+        // It fades where it is cut, and is faint on the wall, where the picture is to be seen.
+        lines.push(...first, ...final, k ? tone : cut ? 0 : tone * afar, k < last ? tone : cut ? 0 : tone / 2, RAY);
+      }
+    });
+    return lines;
+  }
+
+  const lampOf = (solid) => solid.lamp.flatMap((place) => [...place, ...place, 1, 1, LAMP]);
+  const bordersOf = ({ corners }) => corners.flatMap((at, k) => [...at, ...corners[(k + 1) % 4], 1, 1, BORDER]);
+
+  // Where the faces of the lens meet its wall, and corners of that.
+  function edgesOf({ rim }) {
+    const lines = [], add = (a, b) => lines.push(...a, ...b, 0.9, 0.9, EDGE);
+    rim.forEach(([low, high], k) => {
+      const [before, after] = [rim.at(k - 1)[0], rim[(k + 1) % rim.length][0]];
+      add(low, after);
+      add(high, rim[(k + 1) % rim.length][1]);
+      const [a, b] = [[low[0] - before[0], low[1] - before[1]], [after[0] - low[0], after[1] - low[1]]];
+      if (a[0] * b[0] + a[1] * b[1] < SHARP * Math.hypot(...a) * Math.hypot(...b)) add(low, high);
+    });
+    return lines;
+  }
+
+  const isGlass = (solid) => Boolean(solid.rays) && !solid.mirror; // by itself a lens is of clay
+
+  // What is drawn, and seen from where: the lens by itself, among rays that go on, or with walls at the end of them.
+  function framingOf(solid, mesh, look) {
+    const reach = Math.hypot(...solid.size), distance = reach * Math.hypot(...solid.eye);
+    const centre = solid.low.map((low, k) => low + solid.size[k] / 2), glass = isGlass(solid);
+    const range = [distance - 0.55 * reach, distance + 0.55 * reach];
+    const alone = { look, eye: solid.eye, centre, distance, range, glass, walls: [], lines: [], points: [] };
+    if (!solid.rays) return withExtent(alone, mesh);
+    const edges = glass ? edgesOf(mesh) : [];
+    if (look === "lens") {
+      const near = ([x, y, z]) => Math.hypot(x - centre[0], y - centre[1], z - centre[2]) < BESIDE * reach;
+      const begun = raysOf(solid, SOME, ROOM * reach, 1).filter((part, k) => k % LINE < 6);
+      return withExtent({
+        ...alone, range: [0.05 * reach, distance + (AHEAD + 0.6) * reach],
+        points: [...begun, ...solid.lamp.filter(near).flat()],
+        lines: [...edges, ...raysOf(solid, SOME, AHEAD * reach, SPARSE), ...lampOf(solid)],
+      }, mesh);
+    }
+    const points = [solid.rays, solid.screens.map((screen) => screen.corners), solid.lamp].flat(Infinity);
+    const ends = solid.low.map((low, axis) => [low, low + solid.size[axis]]);
+    points.forEach((part, k) => ends[k % 3].push(part));
+    const [low, high] = [Math.min, Math.max].map((choose) => ends.map((parts) => choose(...parts)));
+    const whole = Math.hypot(...high.map((end, axis) => end - low[axis])); // a ball of this width holds all of it
+    return withExtent({
+      ...alone, eye: solid.aside, centre: low.map((end, axis) => (end + high[axis]) / 2), distance: FAR * whole,
+      range: [(FAR - 0.55) * whole, (FAR + 0.55) * whole], walls: solid.screens, points,
+      lines: [...edges, ...solid.screens.flatMap(bordersOf), ...raysOf(solid, 1, Infinity, DENSE), ...lampOf(solid)],
+    }, mesh);
+  }
+
+  // How far to each side the solid and the other points of a framing are seen from its eye, at a focal length of 1.
+  function withExtent(framing, mesh) {
+    const { look, eye, centre, distance } = framing, axes = axesOf(look, ...anglesOf(look, eye));
+    let [left, right, lowest, highest] = [Infinity, -Infinity, Infinity, -Infinity];
+    for (const [points, stride] of [[mesh.corners, 6], [framing.points, 3]]) {
+      for (let at = 0; at < points.length; at += stride) {
+        const along = (axis) => axis.reduce((sum, part, k) => sum + part * (points[at + k] - centre[k]), 0);
+        const scale = 1 / (distance - along(axes[2])), x = scale * along(axes[0]), y = scale * along(axes[1]);
+        [left, right] = [Math.min(left, x), Math.max(right, x)];
+        [lowest, highest] = [Math.min(lowest, y), Math.max(highest, y)];
+      }
+    }
+    if (framing.walls.length) { // as far to both sides: what is long would be turned out of a view off the middle
+      [right, highest] = [Math.max(right, -left), Math.max(highest, -lowest)];
+      [left, lowest] = [-right, -highest];
+    }
+    return { ...framing, extent: { left, right, lowest, highest } };
+  }
+
+  // The view from the framing's eye with all of it in the middle; not so near that a turn would cut much off.
+  function homeOf({ look, eye, extent: { left, right, lowest, highest } }, focal, canvas) {
+    const [around, above] = anglesOf(look, eye);
+    const ratio = canvas.clientHeight / canvas.clientWidth || 1; // 1: it is not shown yet
+    const nearer = Math.min(CLOSE, (2 * FILLED) / focal / Math.max((right - left) * ratio, highest - lowest));
+    const half = (nearer * focal) / 2;
+    return { around, above, nearer, x: -half * ratio * (left + right), y: -half * (lowest + highest) };
+  }
+
+  function programOf(gl, texts) {
     const program = gl.createProgram();
-    for (const [kind, text] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
+    [gl.VERTEX_SHADER, gl.FRAGMENT_SHADER].forEach((kind, k) => {
       const shader = gl.createShader(kind);
-      gl.shaderSource(shader, text);
+      gl.shaderSource(shader, texts[k]);
       gl.compileShader(shader);
       gl.attachShader(program, shader);
-    }
+    });
     gl.linkProgram(program);
-    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) return null;
-    gl.useProgram(program);
-    const mesh = meshOf(solid);
-    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(mesh.corners), gl.STATIC_DRAW);
+    return gl.getProgramParameter(program, gl.LINK_STATUS) ? program : null;
+  }
+
+  // Draws solids one after the other, in the same few buffers and textures; null where there is no WebGL 2.
+  function painter(canvas, redraw) {
+    const wanted = { antialias: true, stencil: true, preserveDrawingBuffer: true }; // the last: it may be printed
+    const gl = canvas.getContext("webgl2", wanted);
+    const programs = gl && [SOLID, LINES, WALL].map((texts) => programOf(gl, texts));
+    if (!programs?.every(Boolean)) return null;
+    const [ofSolid, ofLines, ofWall] = programs;
+    const send = (program, values) => {
+      gl.useProgram(program);
+      for (const [name, value] of Object.entries(values)) {
+        const at = gl.getUniformLocation(program, name);
+        if (typeof value === "number") gl.uniform1f(at, value);
+        else gl[value.length === 2 ? "uniform2fv" : "uniform3fv"](at, value);
+      }
+    };
+    const [solidArray, linesArray, noArray] = [1, 2, 3].map(() => gl.createVertexArray());
+    const [corners, lines] = [gl.createBuffer(), gl.createBuffer()];
+    const parts = (array, buffer, stride, sizes) => { // numbers that follow each other in a buffer
+      gl.bindVertexArray(array);
+      gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+      sizes.forEach((size, index) => {
+        gl.enableVertexAttribArray(index);
+        gl.vertexAttribPointer(index, size, gl.FLOAT, false, 4 * stride, 12 * index);
+        if (array === linesArray) gl.vertexAttribDivisor(index, 1);
+      });
+    };
+    parts(linesArray, lines, LINE, [3, 3, 3]);
+    parts(solidArray, corners, 6, [3, 3]);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, new Uint32Array(mesh.triangles), gl.STATIC_DRAW);
-    for (const [index, offset] of [[0, 0], [1, 12]]) {
-      gl.enableVertexAttribArray(index);
-      gl.vertexAttribPointer(index, 3, gl.FLOAT, false, 24, offset);
-    }
+    const pour = (buffer, numbers) => {
+      gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+      gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(numbers), gl.DYNAMIC_DRAW);
+    };
     gl.enable(gl.DEPTH_TEST);
-    gl.enable(gl.CULL_FACE); // or the far wall's rim would shine through along the edge before it
-    const name = (text) => gl.getUniformLocation(program, text);
-    const reach = Math.hypot(...solid.size), distance = reach * Math.hypot(...solid.eye);
-    const start = axesOf(...anglesOf(solid.eye)); // the lamps stay with the eye: what is turned catches the light anew
-    gl.uniform3fv(name("centre"), solid.low.map((low, k) => low + solid.size[k] / 2));
-    gl.uniform3fv(name("clay"), solid.clay);
-    gl.uniform3fv(name("finish"), [solid.ambient, solid.diffuse, solid.specular]);
-    gl.uniform3fv(name("lamps"), solid.lamps.flatMap((lamp) => through(start, lamp)));
-    gl.uniform1fv(name("bright"), solid.bright);
-    gl.uniform1f(name("gloss"), solid.specular_power);
-    gl.uniform1f(name("reach"), reach);
-    gl.uniform1f(name("distance"), distance);
-    const focal = 1 / Math.tan((solid.angle * Math.PI) / 360);
+    gl.depthFunc(gl.LEQUAL);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.polygonOffset(1, 1); // of walls: their borders lie before them
+
+    let count = 0, focal = 1, framing = null, mesh = null, solid = null;
+    const hung = []; // a texture of each wall, and the picture that it has or waits for
+    const hang = (picture, k) => {
+      if (!hung[k]) {
+        hung[k] = { texture: gl.createTexture() };
+        gl.bindTexture(gl.TEXTURE_2D, hung[k].texture);
+        gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array([0, 0, 0, 255]));
+        gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
+        gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+        gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
+      }
+      const wall = hung[k];
+      if (wall.picture === picture) return;
+      wall.picture = picture; // the one before stays until this is decoded
+      const image = new Image();
+      image.onload = () => {
+        if (wall.picture !== picture || !gl.isTexture(wall.texture)) return; // another came, or the context was lost
+        gl.bindTexture(gl.TEXTURE_2D, wall.texture);
+        gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, image);
+        gl.generateMipmap(gl.TEXTURE_2D);
+        redraw();
+      };
+      image.src = picture;
+    };
+
+    const take = (given) => {
+      [solid, mesh, framing] = [given, meshOf(given), null];
+      count = mesh.triangles.length;
+      focal = 1 / Math.tan((solid.angle * Math.PI) / 360);
+      pour(corners, mesh.corners);
+      gl.bindVertexArray(solidArray);
+      gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, new Uint32Array(mesh.triangles), gl.DYNAMIC_DRAW);
+      const start = axesOf("lens", ...anglesOf("lens", solid.eye)); // lamps stay with the eye: a turn shows new shades
+      send(ofSolid, {
+        lamps: solid.lamps.flatMap((lamp) => through(start, lamp)), bright: solid.bright, gloss: solid.specular_power,
+        clay: isGlass(solid) ? GLASS : solid.clay, finish: [solid.ambient, solid.diffuse, solid.specular],
+      });
+      const pictures = (solid.screens ?? []).map((screen) => screen.picture);
+      for (const { texture } of hung.splice(pictures.length)) gl.deleteTexture(texture);
+      pictures.forEach(hang);
+    };
+    const frame = (look) => {
+      if (framing?.look !== look) {
+        framing = framingOf(solid, mesh, look);
+        pour(lines, framing.lines);
+      }
+      return homeOf(framing, focal, canvas);
+    };
+
+    const drawSolid = (veil, hidden) => {
+      send(ofSolid, { veil });
+      gl.enable(gl.CULL_FACE); // or the far wall's rim would shine through along the edge before it
+      gl.cullFace(hidden);
+      gl.bindVertexArray(solidArray);
+      gl.drawElements(gl.TRIANGLES, count, gl.UNSIGNED_INT, 0);
+    };
+    const drawLines = (depth) => {
+      gl.useProgram(ofLines);
+      gl.disable(gl.CULL_FACE);
+      gl.depthFunc(depth);
+      gl.depthMask(false);
+      gl.bindVertexArray(linesArray);
+      gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, framing.lines.length / LINE);
+      gl.depthMask(true);
+      gl.depthFunc(gl.LEQUAL);
+    };
+    // The far side of the glass, the rays behind its near side, that side, and the rays before it (drawn by `draw`).
+    const drawGlass = () => {
+      gl.depthMask(false);
+      drawSolid([0.25, 0.5], gl.FRONT);
+      gl.depthMask(true);
+      gl.enable(gl.STENCIL_TEST); // 1 where the glass is seen
+      gl.stencilOp(gl.KEEP, gl.KEEP, gl.REPLACE);
+      gl.stencilFunc(gl.ALWAYS, 1, 1);
+      gl.colorMask(false, false, false, false);
+      drawSolid([1, 1], gl.BACK);
+      gl.colorMask(true, true, true, true);
+      gl.stencilFunc(gl.EQUAL, 1, 1);
+      drawLines(gl.GREATER);
+      gl.disable(gl.STENCIL_TEST);
+      drawSolid([0.35, 0.8], gl.BACK);
+    };
+    const drawWalls = (axes) => {
+      gl.disable(gl.CULL_FACE);
+      gl.enable(gl.POLYGON_OFFSET_FILL);
+      gl.bindVertexArray(noArray);
+      const along = (axis, { corners }) => dot(axis, corners[0]) + dot(axis, corners[2]); // of its middle, twice
+      const last = Math.max(...framing.walls.map((wall) => along([0, 0, 1], wall)));
+      const farthestFirst = [...framing.walls].sort((a, b) => along(axes[2], a) - along(axes[2], b));
+      for (const wall of farthestFirst) {
+        gl.bindTexture(gl.TEXTURE_2D, hung[framing.walls.indexOf(wall)].texture);
+        send(ofWall, { corners: wall.corners.flat(), opacity: along([0, 0, 1], wall) < last ? BEFORE : 1 });
+        gl.drawArrays(gl.TRIANGLE_FAN, 0, 4);
+      }
+      gl.disable(gl.POLYGON_OFFSET_FILL);
+    };
     const draw = (view) => {
       const ratio = Math.min(window.devicePixelRatio || 1, MOST_PIXELS);
       const wide = Math.round(canvas.clientWidth * ratio), high = Math.round(canvas.clientHeight * ratio);
@@ -123,44 +407,41 @@
       if (canvas.width !== wide || canvas.height !== high) Object.assign(canvas, { width: wide, height: high });
       gl.viewport(0, 0, wide, high);
       gl.clearColor(0, 0, 0, 0);
-      gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-      const axes = axesOf(view.around, view.above), near = focal * view.nearer;
-      gl.uniformMatrix3fv(name("turn"), true, axes.flat());
-      gl.uniform2f(name("focal"), (near * high) / wide, near);
-      gl.uniform2f(name("shift"), view.x, view.y);
-      gl.drawElements(gl.TRIANGLES, mesh.triangles.length, gl.UNSIGNED_INT, 0);
+      gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT | gl.STENCIL_BUFFER_BIT);
+      const { look, centre, distance, range, glass } = framing, near = focal * view.nearer;
+      const axes = axesOf(look, view.around, view.above);
+      const fit = { focal: [(near * high) / wide, near], shift: [view.x, view.y] };
+      for (const program of programs) send(program, { axes: axes.flat(), centre, distance, range, ...fit });
+      send(ofLines, { pixels: [wide, high], ratio });
+      gl.disable(gl.BLEND);
+      if (!framing.lines.length) return drawSolid([1, 1], gl.BACK);
+      gl.enable(gl.BLEND);
+      drawWalls(axes);
+      if (glass) drawGlass();
+      else drawSolid([1, 1], gl.BACK);
+      drawLines(gl.LEQUAL);
     };
-    return { draw, fitting: fitting(mesh.corners, solid, start, distance, focal, canvas) };
+    return { take, frame, draw };
   }
 
-  // The view from the picture's eye with all of the solid in the middle; not so near that a turn would cut much off.
-  function fitting(corners, solid, axes, distance, focal, canvas) {
-    const middle = solid.low.map((low, k) => low + solid.size[k] / 2);
-    let [left, right, lowest, highest] = [Infinity, -Infinity, Infinity, -Infinity];
-    for (let at = 0; at < corners.length; at += 6) {
-      const along = (axis) => axis.reduce((sum, part, k) => sum + part * (corners[at + k] - middle[k]), 0);
-      const scale = focal / (distance - along(axes[2])), x = scale * along(axes[0]), y = scale * along(axes[1]);
-      [left, right] = [Math.min(left, x), Math.max(right, x)];
-      [lowest, highest] = [Math.min(lowest, y), Math.max(highest, y)];
-    }
-    const ratio = canvas.clientHeight / canvas.clientWidth;
-    const nearer = Math.min(CLOSE, (2 * FILLED) / Math.max((right - left) * ratio, highest - lowest));
-    return { nearer, x: (-nearer * ratio * (left + right)) / 2, y: (-nearer * (lowest + highest)) / 2 };
-  }
-
-  const anglesOf = ([x, y, z]) => [Math.atan2(y, x), Math.atan2(z, Math.hypot(x, y))];
+  // From the picture's x, y, z, where z is up, to those that a framing has up: y up for all of the way.
+  const anglesOf = (look, eye) => {
+    const [x, y, z] = look === "way" ? [eye[2], eye[0], eye[1]] : eye;
+    return [Math.atan2(y, x), Math.atan2(z, Math.hypot(x, y))];
+  };
   const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
   const through = (axes, lamp) => axes.map((axis) => dot(axis, lamp) / Math.hypot(...lamp));
 
-  // What is right, up and towards the eye, for one that stands `above` the x-y plane, turned `around` z (radians).
-  function axesOf(around, above) {
+  // What is right, up and towards the eye, for one that stands `above` the level, turned `around` what is up (radians).
+  function axesOf(look, around, above) {
     const [c, s, level, up] = [Math.cos(around), Math.sin(around), Math.cos(above), Math.sin(above)];
-    return [[-s, c, 0], [-up * c, -up * s, level], [level * c, level * s, up]];
+    const axes = [[-s, c, 0], [-up * c, -up * s, level], [level * c, level * s, up]];
+    return look === "way" ? axes.map(([z, x, y]) => [x, y, z]) : axes;
   }
 
   function begin(figure, solid) {
-    const canvas = figure.querySelector("canvas"), [around, above] = anglesOf(solid.eye);
-    let view = null, waiting = false, painted = null;
+    const canvas = figure.querySelector("canvas"), views = {}, homes = {}; // by their framing
+    let view = null, home = null, waiting = false, painted = null, look = "lens";
     const between = (low, value, high) => Math.min(Math.max(value, low), high);
     const draw = () => {
       if (waiting) return;
@@ -176,14 +457,15 @@
       view.y = between(-NEAREST, view.y + up, NEAREST);
     };
     const zoom = (factor) => {
-      const nearer = between(FARTHEST, view.nearer * factor, NEAREST), ratio = nearer / view.nearer;
+      const farthest = FARTHEST * Math.min(1, home.nearer);
+      const nearer = between(farthest, view.nearer * factor, NEAREST), ratio = nearer / view.nearer;
       Object.assign(view, { nearer, x: view.x * ratio, y: view.y * ratio });
     };
     const actions = {
       ArrowLeft: () => turn(-STEP, 0), ArrowRight: () => turn(STEP, 0),
       ArrowUp: () => turn(0, STEP), ArrowDown: () => turn(0, -STEP),
       "+": () => zoom(NEARER), "=": () => zoom(NEARER), "-": () => zoom(1 / NEARER),
-      Home: () => { view = { around, above, ...painted.fitting }; },
+      Home: () => { Object.assign(view, home); },
     };
     const act = (key) => {
       const known = Object.hasOwn(actions, key);
@@ -229,12 +511,20 @@
       canvas.addEventListener(end, (event) => held.delete(event.pointerId));
     }
 
+    // The view of what is shown now: what the person changed of it stays, the rest follows the solid and the canvas.
+    const frame = () => {
+      const name = solid.rays ? look : "lens", before = homes[name];
+      [home, view] = [painted.frame(name), views[name] ??= {}];
+      for (const [part, value] of Object.entries(home)) if (!before || view[part] === before[part]) view[part] = value;
+      homes[name] = home;
+      painted.draw(view);
+    };
     const show = () => {
       figure.classList.add("drawn"); // first: a canvas that is not shown has no size
-      painted = painter(canvas, solid);
+      painted = painter(canvas, draw);
       if (!painted) return figure.classList.remove("drawn");
-      view = { around, above, ...painted.fitting };
-      painted.draw(view);
+      painted.take(solid);
+      frame();
     };
     canvas.addEventListener("webglcontextlost", (event) => {
       event.preventDefault();
@@ -242,9 +532,23 @@
     });
     canvas.addEventListener("webglcontextrestored", show);
     show();
-    if (painted) new ResizeObserver(() => painted.draw(view)).observe(canvas);
+    const drawing = () => painted && figure.classList.contains("drawn"); // else it waits until the context comes back
+    if (painted) new ResizeObserver(() => drawing() && frame()).observe(canvas);
+    return {
+      update: (other) => {
+        solid = other;
+        if (!drawing()) return;
+        painted.take(solid);
+        frame();
+      },
+      look: (name) => {
+        look = name;
+        if (drawing()) frame();
+      },
+    };
   }
 
   const text = document.getElementById("solid");
   if (text) begin(document.querySelector(".turnable"), JSON.parse(text.textContent));
+  return { begin };
 })();

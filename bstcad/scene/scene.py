@@ -562,7 +562,11 @@ def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
     An override's text is read as a TOML value and, where it is none, as text.  Raises SceneError.
     """
     path = Path(path)
-    text, data = scene_file.read(path)
+    return of_text(*scene_file.read(path), path, overrides)
+
+
+def of_text(text: str, data: dict[str, Any], path: Path, overrides: Mapping[str, Any] | None = None) -> Scene:
+    """The scene in the text of a TOML file of that path, which need not be there; data: the tables of the text."""
     try:
         for key, value in (overrides or {}).items():
             override(data, key, scene_file.toml_value(value) if isinstance(value, str) else value, f"--set {key}")

@@ -30,10 +30,15 @@ def read(path: Path) -> tuple[str, dict[str, Any]]:
         raise SceneError(f"{path}: is not UTF-8 text; give a TOML file") from None
     except ValueError as error:
         raise SceneError(f"{path}: cannot be read ({error}); give the path of a scene file") from None
+    return text, tables(text, path)
+
+
+def tables(text: str, path: Path) -> dict[str, Any]:
+    """The tables of a scene file's text; path: by which sentences call it."""
     if _dotted(text):
         raise SceneError(f"{path}: has a line of over {DOTS} dots, which is no scene file; shorten that line")
     try:
-        return text, tomllib.loads(text)
+        return tomllib.loads(text)
     except RecursionError:
         raise SceneError(f"{path}: {NESTED}") from None
     except tomllib.TOMLDecodeError as error:

@@ -233,9 +233,16 @@ Targets = Annotated[  # of a file: one table, or a list of them
 # ---- what is drawn ---------------------------------------------------------------------------------------------------
 
 
-@functools.lru_cache(maxsize=2)  # a photograph takes seconds, and is asked for when it is read and when it is used
+ELSEWHERE = {"z": 0.0, "tilt": None, "weight": 1.0, "outline": None, "seen_from": "lens", "unreachable": "dark"}
+
+
 def drawing(target: Target) -> Drawing:
     """The light of a target's picture in each pixel, before its outline, and remarks on that."""
+    return _drawing(target.model_copy(update=ELSEWHERE))  # the same wherever it falls
+
+
+@functools.lru_cache(maxsize=4)  # a photograph takes half a second, and is asked for when it is read and when it is used
+def _drawing(target: Target) -> Drawing:
     pixels, size, remarks = target.columns_rows, target.size, ()
     if lies := target.rotate in (90, 270):  # the light is turned once it is made
         pixels, size = pixels[::-1], size[::-1]

@@ -31,7 +31,7 @@ from bstcad.scene.blank import LARGEST_NET
 from bstcad.scene.scene import Scene
 from bstcad.sweep.cold_run import Units
 from bstcad.sweep.estimates import coarse_lens
-from bstcad.sweep.plan import UNDONE, amounts, fitted, memory_gb, seconds
+from bstcad.sweep.plan import UNDONE, amounts, fitted, memory_gb, of_quality, seconds
 
 KEY = "lens.back.control_points"
 SQUARE = (65, 129, 257, 513, 1025)  # control points a side of the nets that are tried, or as many in square cells
@@ -126,6 +126,34 @@ def _chosen(scene: Scene) -> Choice:
     possible, limit = _possible(scene, candidates)
     first = next(k for k, each in enumerate(possible) if not any(_worth(each, other) for other in possible[k + 1 :]))
     return Choice(possible, first, limit if first == len(possible) - 1 else "")
+
+
+def estimated(scene: Scene) -> dict[str, dict[str, float]]:
+    """{quality: {"seconds", "rrmsd"}} of a scene with its net, roughly and in a second or so: of two cores of pace 1.
+
+    `plan.plan` predicts both better, from designs made small; of several targets this is that of the worst.
+    """
+    by_target = [_estimated(each) for each in scene.each_alone()]
+    return {
+        quality: {key: max(found[quality][key] for found in by_target) for key in ("seconds", "rrmsd")}
+        for quality in BY_QUALITY
+    }
+
+
+def _estimated(scene: Scene) -> dict[str, dict[str, float]]:
+    lens = coarse_lens(scene)
+    light, image = (
+        cells_of_a_mm2(scene, lens),
+        blur(scene.channels(), lens, scene.target.screen, scene.target.irradiance()),
+    )
+    wanted = {quality: of_quality(scene, quality) for quality in BY_QUALITY}
+    return {
+        quality: {
+            "seconds": seconds(amounts(each), fitted()["prices"], TWO_CORES),
+            "rrmsd": two_digits(rrmsd(light, each, 0.0 if image is None else image.rrmsd)),
+        }
+        for quality, each in wanted.items()
+    }
 
 
 def _worth(coarse: Candidate, fine: Candidate) -> bool:

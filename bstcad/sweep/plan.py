@@ -48,7 +48,11 @@ ALONE = "The lens is one for this target alone, by its back alone: one of severa
 
 
 def plan(
-    scene: Scene, text: str = "", keys: Sequence[str] = (), units: Callable[[], Units] = measured_units
+    scene: Scene,
+    text: str = "",
+    keys: Sequence[str] = (),
+    units: Callable[[], Units] = measured_units,
+    tick: Callable[[], None] = lambda: None,
 ) -> Iterator[dict[str, Any]]:
     """The entries of `plan --json`: first simulated, left_out by change of the RRMSD, blur, unreachable; then the
     predictions.
@@ -62,7 +66,7 @@ def plan(
     of the estimates lacks of the scene's, a sentence; only there if it lacks anything.
 
     text: of the scene file, whose lines are named.  keys: that the command line gives instead.  units: measures the
-    units of this machine.
+    units of this machine.  tick: called now and then; an exception from it ends the plan.
     """
     at, (first, *others) = toml_positions(text), scene.each_alone()
     asked = [{"what": what, "key": key, **_asked(key, at, keys)} for what, key in simulated(scene)]
@@ -74,7 +78,7 @@ def plan(
     if others or scene.lens.front.shaped:
         found["caveat"] = ALONE
     yield found
-    yield rounded(outlook(scene, lens, units), 3)
+    yield rounded(outlook(scene, lens, units, tick), 3)
 
 
 def _effects(scene: Scene, lens: Lens, key: str) -> dict[str, Any]:
@@ -266,30 +270,31 @@ class Pilot:
     steep: Steepness  # that its target's light needs of the back
 
 
-def pilots(scene: Scene, lens: Lens) -> dict[str, Pilot]:
+def pilots(scene: Scene, lens: Lens, tick: Callable[[], None] = lambda: None) -> dict[str, Pilot]:
     """By quality; a fine pilot would be dear, and its quality goes by that of standard.
 
     lens: a coarse one for the scene, whose front the pilots have.  SceneError where a design would be refused: no light
     reaches the target, or the lens would be too thick or too thin.
     """
-    found = {quality: _pilot(scene, lens, quality) for quality in SIZES}
+    found = {quality: _pilot(scene, lens, quality, tick) for quality in SIZES}
     return found | {"fine": found["standard"]}
 
 
-def _pilot(scene: Scene, lens: Lens, quality: str) -> Pilot:
+def _pilot(scene: Scene, lens: Lens, quality: str, tick: Callable[[], None]) -> Pilot:
     small, factor, knobs = _small(scene, quality)
     target = small.target
     picture = target.irradiance()
     part, edge = reachable_part(small, picture)
     task = replace(task_of(small, restricted(picture, part), knobs, edge), free=())  # it has a front already
     flat = small.flat_lens(knobs.levels[0], as_wide_as=knobs.levels[-1])
-    first = list(stage1.steps(task, replace(flat, front=lens.front)))
+    first = [step for step in stage1.steps(task, replace(flat, front=lens.front)) if tick() is None]
     sent = transport_of(first[-1], first[-1].lens, task.screen)
     *_, rounds = (step for step in first if step.state is not None)
     judged = [step.judged for step in first if step.judged is not None]
     reached(first[-1].lens, judged[-1])
     check_thickness(first[-1].lens, scene)
-    *_, last = (step for step in second_stage(task, first[-1].lens)[1] if step.judged is not None)
+    second = (step for step in second_stage(task, first[-1].lens)[1] if tick() is None)
+    *_, last = (step for step in second if step.judged is not None)
     unseen = detail(scene.target.irradiance(), max(target.columns_rows))
     steep = steepness(task.heaviest.source, last.lens, target.screen, task.target, sent=sent)
     doubtful = stage1.doubtful(task, rounds.lens, judged[0], rounds.state)
@@ -380,7 +385,9 @@ def _bounds(scene: Scene) -> Iterator[tuple[Any, str, str]]:
         yield value != getattr(preset, key), "the qualities as they are", f"tailoring.{key} is set"
 
 
-def outlook(scene: Scene, lens: Lens, units: Callable[[], Units]) -> dict[str, Any]:
+def outlook(
+    scene: Scene, lens: Lens, units: Callable[[], Units], tick: Callable[[], None] = lambda: None
+) -> dict[str, Any]:  # fmt: skip
     """Predictions of a scene in each quality, and with about twice the control points; or why there are none.
 
     lens: a coarse one for the scene, from which the pilots start.
@@ -389,7 +396,7 @@ def outlook(scene: Scene, lens: Lens, units: Callable[[], Units]) -> dict[str, A
     if found["not_predicted"]:
         return found
     try:
-        small = pilots(scene, lens)
+        small = pilots(scene, lens, tick)
     except SceneError as refusal:
         return found | {"not_predicted": f"a small design of this scene is refused: {refusal}"}
     unit, likely = units(), rrmsds(small)

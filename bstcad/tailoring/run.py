@@ -187,6 +187,13 @@ def forget(state: Any) -> None:
     """States are not saved anywhere."""
 
 
+Look = Callable[[Callable[[], Lens]], None]  # called with the function that makes the best lens so far
+
+
+def unseen(make: Callable[[], Lens]) -> None:
+    """Nobody looks at the lens while it is tailored."""
+
+
 @dataclass(frozen=True)
 class Stage:
     """Time and RRMSD of one stage."""
@@ -213,7 +220,8 @@ class Driver:
 
     limit: seconds from the start to the end of the whole run, including the work after tailoring, which takes `reserve`
     seconds on a machine of pace 1.  interrupted: has the user asked for the best lens so far?  save: called with each
-    state from which the design could resume.  record: of the earlier runs that this one resumes.
+    state from which the design could resume.  look: called as soon as the lens has come to an RRMSD.  record: of the
+    earlier runs that this one resumes.
     """
 
     def __init__(
@@ -225,11 +233,12 @@ class Driver:
         reserve: float = 0.0,
         interrupted: Callable[[], bool] = never,
         save: Callable[[Any], None] = forget,
+        look: Look = unseen,
         record: Record = Record(),
         clock: Callable[[], float] = time.perf_counter,
         processor: Callable[[], float] = time.process_time,
     ) -> None:
-        self.progress, self.interrupted, self.save = progress, interrupted, save
+        self.progress, self.interrupted, self.save, self.look = progress, interrupted, save, look
         self.pace = 1.0  # how many times longer work takes here than on a machine of pace 1, as measured of late
         self.stopped = ""  # what ended tailoring: "evaluations", "plateau", "accuracy", "time" or "interrupt"
         self._limit, self._reserve, self._clock, self._before = limit, reserve, clock, record
@@ -284,6 +293,8 @@ class Driver:
         self._record = replace(self._record, skipped=self._record.skipped + step.skipped)
         if step.rrmsd is not None:
             self.note(step.rrmsd)
+        if step.make and (step.rrmsd is not None or step.judged is not None):
+            self.look(step.make)
         if step.ends:
             self.end(step.part, step.judged)
         if step.state is not None:

@@ -209,11 +209,16 @@ class BlurredMerit:
     @classmethod
     def of(
         cls, spread: Spread, lens: Lens, n: int, *, screen: Screen, target: Tensor, overshoot: float, seed: int,
-        own: Callable[[Tensor, Tensor], Tensor] | None = None,
+        own: Callable[[Tensor, Tensor], Tensor] | None = None, by_images: bool = False,
     ) -> BlurredMerit:  # fmt: skip
-        """By n x n tubes a line launched for `lens`; the target may have any sum.  seed: of the rays."""
+        """By n x n tubes a line launched for `lens`; the target may have any sum.  seed: of the rays.
+
+        by_images: alone; then nobody measures by rays what they leave out, which takes most of a second.
+        """
         light, target = RayTubes.launched(lens, spread.centre, n), target / total(target)
         merit = cls(light, blurs(spread, lens.plain(), screen), screen, target, overshoot=overshoot, own=own)
+        if by_images:
+            return merit
         return replace(merit, left_out=merit.measured(spread.draw, lens, seed).to(target.device))
 
     @property

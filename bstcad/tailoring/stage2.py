@@ -74,6 +74,7 @@ class Round:
     stage: str = "stage 2"  # of which it is a part
     pixels: int | None = None  # along the longer side, that it sees instead of the target's
     spread: Spread | None = None  # of a source of some size, whose points the task's channels are
+    by_images: bool = False  # of that source alone, without the rays that tell what they leave out: for a preview
 
     @property
     def name(self) -> str:
@@ -91,7 +92,7 @@ class Round:
         if self.spread is not None:
             return BlurredMerit.of(
                 self.spread, lens, self.tubes, screen=task.screen, target=target, overshoot=pull,
-                seed=task.knobs.seed, own=task.merit,
+                seed=task.knobs.seed, own=task.merit, by_images=self.by_images,
             )  # fmt: skip
         return TubeMerit.of(
             task.channels, lens, self.tubes, screen=task.screen, target=target, overshoot=pull, own=task.merit

@@ -1,7 +1,11 @@
-"""The report in a real browser, Chromium without a window: quiet, alone, legible, and with a lens that turns."""
+"""The report in a real browser, Chromium without a window: quiet, alone, legible, and with a lens that turns.
+
+The script that turns it also serves a page that draws a lens again and again, with its rays and the wall they light.
+"""
 
 import base64
 import io
+import json
 import re
 import shutil
 from dataclasses import replace
@@ -10,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from bstcad import commands
 from bstcad import folder as folders
 from bstcad.judges.comparison import Judge
 from bstcad.report import prescription, record, rendering, report
@@ -246,3 +251,134 @@ def test_the_page_opens_with_the_verdict_pictures_and_first_figures(opened):
     assert page.locator("details[open] td.pass").first.is_visible()
     levels = page.evaluate("[...document.querySelectorAll('h1, h2, h3')].map((heading) => +heading.tagName[1])")
     assert levels[0] == 1 and levels.count(1) == 1 and max(np.diff(levels)) == 1
+
+
+# --- a page that draws a lens again and again -------------------------------------------------------------------------
+
+BENCH = """<!DOCTYPE html><meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; script-src 'unsafe-inline';
+  style-src 'unsafe-inline'">
+<style>canvas {{ display: none; }} .drawn canvas {{ display: block; width: 400px; height: 300px; }}
+  .drawn p {{ display: none; }}</style>
+<figure><p>No picture.</p><canvas tabindex="0"></canvas></figure>
+<script>{viewer}</script>
+<script>const given = {given}, shown = solidView.begin(document.querySelector("figure"), given[0]);</script>"""
+COUNTED = """
+const made = window.made = {};
+for (const kind of ["Buffer", "Texture", "VertexArray", "Program", "Shader"]) {
+  for (const [act, step] of [["create", 1], ["delete", -1]]) {
+    const plain = WebGL2RenderingContext.prototype[act + kind];
+    WebGL2RenderingContext.prototype[act + kind] = function (...given) {
+      made[kind] = (made[kind] ?? 0) + step;
+      return plain.apply(this, given);
+    };
+  }
+}"""
+PATIENCE = 5000  # ms until a picture is decoded and drawn, at most
+
+
+@pytest.fixture(scope="module")
+def at_work(small_design):
+    """The lens of the small design and its light, on a wider wall, white where x and y are large, and seen along +z."""
+    _, nominal = folders.read_nominal(small_design.folder)
+    path = commands.light_path_in(small_design.folder)
+    picture = np.zeros((64, 64), np.uint8)
+    picture[:32, 32:] = 255
+    middle = path.screen.mean(axis=0)
+    return nominal.lens, replace(path, screen=middle + 4 * (path.screen - middle), picture=picture, seen_along=1)
+
+
+@pytest.fixture(scope="module")
+def bench(at_work, tmp_path_factory):
+    """The path of such a page: given[0] with the light, [1] without, [2] a mirror's and with a wall more."""
+    lens, path = at_work
+    two = replace(path, mirror=True, further=((path.screen + [0, 0, 20], path.picture),))
+    given = [rendering.turnable(lens, light, 32) for light in (path, None, two)]
+    viewer = report.VIEWER.read_text(encoding="utf-8")
+    file = tmp_path_factory.mktemp("bench") / "bench.html"
+    file.write_text(BENCH.format(viewer=viewer, given=f"[{','.join(given)}]"), encoding="utf-8")
+    return file
+
+
+def settled(page):
+    """What is seen once the pictures on the walls are decoded: two looks at it are alike."""
+    now = seen(page)
+    for _ in range(PATIENCE // 50):
+        page.wait_for_timeout(50)
+        before, now = now, seen(page)
+        if before.shape == now.shape and changed(before, now) == 0:
+            return now
+    raise AssertionError("it changes all the time")
+
+
+def kinds(pixels):
+    """Where rays, glass, and the white and the black of a wall are seen."""
+    red, green, blue, opacity = np.moveaxis(pixels, 2, 0)
+    grey, opaque = np.ptp(pixels[..., :3], axis=2) < 12, opacity == 255
+    return {
+        "rays": (red - blue > 60) & (opacity > 60),
+        "glass": (blue - red > 15) & (opacity > 60) & ~opaque,
+        "white": grey & opaque & (red > 240), "black": grey & opaque & (red < 15), "ground": opacity == 0,
+    }  # fmt: skip
+
+
+def test_a_lens_at_work_is_seen_from_near_by_and_with_the_wall(opened, bench, at_work):
+    page = opened(path=bench)
+    near = {kind: where.mean() for kind, where in kinds(settled(page)).items()}
+    assert near["rays"] > 0.01 and near["glass"] > 0.02 and near["ground"] > 0.3 and near["white"] == 0
+    page.evaluate("shown.look('way')")
+    way = kinds(settled(page))
+    share = {kind: where.mean() for kind, where in way.items()}
+    assert share["rays"] > 0.005 and share["white"] > 0.002 and share["black"] > 0.01 and share["glass"] > 1e-4
+    place = {kind: np.argwhere(way[kind]).mean(axis=0) for kind in ("white", "black")}
+    assert place["white"][0] < place["black"][0] - 3  # row 0 is the upper one
+    assert json.loads(rendering.turnable(*at_work))["aside"][2] < 0  # seen along +z, so that x max is at the left
+    assert place["white"][1] < place["black"][1] - 3
+    assert page.said == []
+
+
+def test_a_lens_drawn_anew_keeps_the_view_and_what_was_made_for_it(opened, bench):
+    page = opened(COUNTED, path=bench)
+    page.evaluate("shown.look('way')")
+    start = settled(page)
+    page.locator("canvas").focus()
+    for key in ("ArrowRight", "ArrowUp", "+"):
+        page.keyboard.press(key)
+    turned = settled(page)
+    made = page.evaluate("shown.update(given[0]), ({...made})")
+    assert changed(turned, settled(page)) == 0 and changed(start, turned) > 0.02
+    for _ in range(3):
+        page.evaluate("shown.update(given[2])")
+        two = settled(page)
+        page.evaluate("shown.update(given[1])")
+        clay = settled(page)
+        page.evaluate("shown.update(given[0])")
+        assert changed(turned, settled(page)) == 0 and changed(turned, two) > 0.01
+    assert (clay[..., 3] == 255).any() and set(np.unique(clay[..., 3])) >= {0, 255}
+    assert not kinds(clay)["rays"].any() and not kinds(clay)["white"].any()
+    assert page.evaluate("made") == made  # of buffers, textures and programs as many as at first
+    page.keyboard.press("Home")
+    assert changed(start, settled(page)) == 0 and page.said == []
+
+
+def test_a_lens_comes_back_as_it_is_by_then_when_the_context_was_lost(opened, bench):
+    page = opened(path=bench)
+    page.evaluate("shown.look('way')")
+    page.locator("canvas").focus()
+    page.keyboard.press("ArrowRight")
+    page.evaluate("shown.update(given[2])")
+    wanted = settled(page)
+    page.evaluate("shown.update(given[0])")
+    page.evaluate("""window.context = document.querySelector("canvas").getContext("webgl2")
+      .getExtension("WEBGL_lose_context"), context.loseContext()""")
+    page.locator("p").wait_for(state="visible")
+    page.evaluate("shown.update(given[1]), shown.look('lens'), shown.update(given[2]), shown.look('way')")
+    page.evaluate("context.restoreContext()")
+    page.locator("canvas").wait_for(state="visible")
+    assert changed(wanted, settled(page)) == 0 and [text for text in page.said if "CONTEXT_LOST" not in text] == []
+
+
+def test_without_webgl_a_page_may_go_on_asking(opened, bench):
+    page = opened("HTMLCanvasElement.prototype.getContext = () => null", path=bench)
+    page.evaluate("shown.update(given[1]), shown.look('way'), shown.update(given[0])")
+    assert page.locator("p").is_visible() and not page.locator("canvas").is_visible() and page.said == []

@@ -1,12 +1,14 @@
 """The 3-D picture: drawn where the machine can, None where it cannot, and never a crash or a line on the terminal.
 
-The lens that a page turns is the lens: read back as the script reads it, its nodes and slopes are the same.
+The lens that a page turns is the lens: read back as the script reads it, its nodes and slopes are the same; and so is
+the light that a page shows with it.
 """
 
 import base64
 import io
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ import torch
 import trimesh
 from PIL import Image
 
-from bstcad import Circle, Lens, Plane, Rectangle, Sphere
+from bstcad import Circle, Lens, Plane, Rectangle, Sphere, commands
 from bstcad.cad.mesh import Mesh
 from bstcad.optics import quadrature
 from bstcad.optics.bspline import BSplineSurface
@@ -112,3 +114,65 @@ def test_it_is_small_and_no_text_of_a_page(small_design):
     assert len(page) < 3_000_000  # of 6 MB that a report may have, before the pictures of judges and made parts
     text = page[page.index('id="solid">') + 11 :].partition("</script>")[0]
     assert "<" not in text and json.loads(text)["rim"] == 4 * rendering.FINE
+
+
+@pytest.fixture(scope="module")
+def path(small_design):
+    """The light of the small design."""
+    return commands.light_path_in(small_design.folder)
+
+
+@pytest.fixture(scope="module")
+def light(path):
+    """What a page is told of it."""
+    return json.loads(rendering.turnable(lens(Plane(15.0), OUTLINES[0]), path))
+
+
+def tones(url):
+    """The pixels of a picture that a page holds."""
+    kind, _, text = url.partition(",")
+    assert kind == "data:image/png;base64"
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(text))))
+
+
+def test_light_is_told_beside_the_lens_which_stays_as_it_was(light):
+    alone = json.loads(rendering.turnable(lens(Plane(15.0), OUTLINES[0])))
+    added = {"rays", "flux", "screens", "lamp", "mirror", "aside"}
+    assert not added & alone.keys() and {key: light[key] for key in alone} == alone
+    assert light.keys() - alone.keys() == added and light["mirror"] is False
+
+
+def test_rays_that_are_told_are_some_of_all_and_end_on_the_wall(light, path, small_scene):
+    rays, flux, (wall,) = np.array(light["rays"]), np.array(light["flux"]), light["screens"]
+    assert 50 < len(rays) <= rendering.MOST_RAYS and len(flux) == len(rays)
+    apart = np.abs(rays[:, None] - path.rays[None]).max(axis=(2, 3))
+    assert apart.min(axis=1).max() <= 0.51e-4  # mm, by rounding
+    whole = path.flux[apart.argmin(axis=1)] / path.flux.max()
+    np.testing.assert_allclose(flux, whole, atol=0.51e-3)
+    assert rays[:, -1, 2] == pytest.approx(small_scene.target.z, abs=1e-4)
+    np.testing.assert_allclose(wall["corners"], path.screen, atol=0.51e-4)
+    assert (tones(wall["picture"]) == path.picture).all()
+    assert light["lamp"] == [list(small_scene.source.position)]
+    spread = np.ptp(rays[:, 1, :2], axis=0) / np.ptp(path.rays[:, 1, :2], axis=0)
+    assert (spread > 0.85).all()  # from all over the lens
+
+
+@pytest.mark.parametrize("seen_along", [1, -1])
+@pytest.mark.parametrize("off", [-300.0, 300.0])
+def test_the_eye_is_on_the_side_that_shows_the_picture_and_not_behind_the_wall(path, off, seen_along):
+    shifted = replace(
+        path, screen=path.screen + [off, 0, 0], seen_along=seen_along, further=((path.screen, path.picture),)
+    )
+    light = json.loads(rendering.turnable(lens(Plane(15.0), OUTLINES[0]), shifted))
+    x, y, z = light["aside"]
+    assert np.hypot(np.hypot(x, y), z) == pytest.approx(1) and y > 0
+    assert x * off < 0 and z * seen_along < 0
+    assert [screen["corners"][0][0] for screen in light["screens"]] == [shifted.screen[0, 0], path.screen[0, 0]]
+
+
+def test_a_preview_is_coarse_and_small(path):
+    made = lens(Sphere(15.0, 0.03), OUTLINES[0])
+    faces, rim = read(rendering.turnable(made, path, 96))
+    assert [face.shape[1] for face in faces] == [97, 65] and rim.shape[1] == 4 * 96
+    np.testing.assert_allclose(read(rendering.turnable(made, cells=32))[0][1].shape, (5, 33, 33))
+    assert len(rendering.turnable(made, path, 96)) < 0.35 * len(rendering.turnable(made, path))

@@ -1,0 +1,1 @@
+"""The workbench: a local page on which a person edits a scene while a preview follows."""

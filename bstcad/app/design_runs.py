@@ -1,0 +1,177 @@
+"""Runs in processes of their own: begun, followed, stopped and gone on with by the files of their folders.
+
+A run belongs to the folder of its design: .NAME.KIND-run beside it holds the job, its progress and its state.  A server
+that starts finds runs that an earlier server began, whether they still run, ended meanwhile, or were killed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from bstcad import folder as folders
+from bstcad.app.design_process import JOB, JOBS, LIGHT, SCENE, STATE, WORDS, State
+from bstcad.runs import files
+from bstcad.scene.errors import SceneError
+from bstcad.scene.scene import Scene
+
+DESIGN = "design"  # the kind of a run that designs a lens; others are work on a finished design
+LARGEST = 50_000_000  # bytes of progress
+GRACE = 60.0  # seconds that runs have to keep their checkpoints when the server ends
+LOST = "its process was killed, or the memory of this machine was too little for it"
+NONE = State("none")
+
+
+@dataclass(frozen=True)
+class Run:
+    """The run of a kind that belongs to a design, there or not."""
+
+    design: Path  # its folder
+    kind: str = DESIGN  # of JOBS
+
+    @property
+    def place(self) -> Path:
+        """The folder of the run."""
+        return files.beside(self.design, f"{self.kind}-run")
+
+    # ---- begun and ended ----
+
+    def begin(self, job: Mapping[str, Any] | None = None, contents: Mapping[str, bytes] | None = None) -> None:
+        """Begin it anew in a process of its own; contents: files for it.  SceneError if it is under way."""
+        if self.state.state == "running":
+            raise SceneError(f"{self.design.name}: this is under way already; wait for its end, or stop it")
+        shutil.rmtree(self.place, ignore_errors=True)
+        self.place.mkdir(parents=True)
+        for name, data in (contents or {}).items():
+            files.put(self.place / name, data)
+        files.put(self.place / JOB, json.dumps({"kind": self.kind, **(job or {})}).encode())
+        self._start()
+
+    def go_on(self) -> None:
+        """Go on with a run that was stopped or killed, a design from its checkpoint."""
+        if not (self.place / JOB).is_file():
+            raise SceneError(f"{self.design.name}: has no run to go on with; begin it anew")
+        if self.state.state != "running":
+            self._start("--resume")
+
+    def _start(self, *options: str) -> None:
+        """Start the process, in a session of its own: a Ctrl-C in the terminal is not meant for it."""
+        source = str(Path(__file__).parents[2])  # it runs these sources
+        paths = os.pathsep.join(filter(None, (source, os.environ.get("PYTHONPATH"))))
+        with (self.place / "process.log").open("ab") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "bstcad.app.design_process", str(self.place), str(self.design), *options],
+                stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
+                env=os.environ | {"PYTHONPATH": paths},
+            )  # fmt: skip
+        State("running", process.pid, time.time()).put(self.place)
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send its process a signal, if it runs: SIGINT ends a design with the best lens so far, SIGTERM at once."""
+        state = self.state
+        if state.state == "running":
+            os.kill(state.process, number)
+
+    # ---- followed ----
+
+    @property
+    def state(self) -> State:
+        """How it stands."""
+        stated = self._stated()
+        if stated.state != "running" or self._lives(stated.process):
+            return stated
+        again = self._stated()  # it may have ended between the two looks
+        if again.state != "running":
+            return again
+        return replace(again, state="stopped", process=0, sentence=LOST)
+
+    def _stated(self) -> State:
+        try:
+            return State(**json.loads(files.contents(self.place / STATE, LARGEST)))
+        except (ValueError, TypeError):
+            return NONE
+
+    def _lives(self, process: int) -> bool:
+        """Is that process the one of this run?  The system gives the numbers of ended processes to others."""
+        try:
+            found = psutil.Process(process)
+            return found.status() != psutil.STATUS_ZOMBIE and str(self.place) in found.cmdline()
+        except (psutil.Error, ValueError, OverflowError):
+            return False
+
+    def news(self, since: int) -> dict[str, Any]:
+        """Its state, and the lines of its progress from number `since` on.
+
+        A line is [seconds since 1970, stage, done, total, text].
+        """
+        state = self.state
+        try:
+            lines = files.contents(self.place / WORDS, LARGEST).decode("utf-8", "replace").split("\n")[:-1]
+        except ValueError:
+            lines = []
+        told = [json.loads(line) for line in lines[max(since, 0) :]]
+        resumable = state.state in ("stopped", "failed") and self.kind == DESIGN
+        stamp = {"light": self._stamp(LIGHT), "next": len(lines), "now": time.time()}
+        return asdict(state) | stamp | {"lines": told, "resumable": resumable, "kind": self.kind}
+
+    def _stamp(self, name: str) -> str:
+        try:
+            return str((self.place / name).stat().st_mtime_ns)
+        except OSError:
+            return ""
+
+    @property
+    def light(self) -> bytes:
+        """The PNG of the light through the best lens so far; b"" before there is one."""
+        try:
+            return files.contents(self.place / LIGHT, LARGEST)
+        except ValueError:
+            return b""
+
+
+def begin_design(scene: Scene, design: Path) -> Run:
+    """Design a scene into a folder.  SceneError where that folder is another's, or a run is under way."""
+    files.check_free(design)
+    run = Run(design)
+    run.begin(contents=folders.scene_files(scene))
+    return run
+
+
+def scene_text_of(run: Run) -> str:
+    """The scene that a run designs, as a file has it; "" of a run that is gone."""
+    try:
+        return files.contents(run.place / SCENE, LARGEST).decode("utf-8", "replace")
+    except ValueError:
+        return ""
+
+
+def all_runs(designs: Path) -> list[Run]:
+    """The runs in a folder of designs, under way or ended."""
+    found = []
+    for kind in JOBS:
+        for path in sorted(designs.glob(f".*.{kind}-run")) if designs.is_dir() else ():
+            if (path / STATE).is_file():
+                found.append(Run(designs / path.name[1 : -len(f".{kind}-run")], kind))
+    return found
+
+
+def end(runs: list[Run]) -> list[Run]:
+    """End runs before the server ends, each with its checkpoint; those that ran."""
+    running = [run for run in runs if run.state.state == "running"]
+    for run in running:
+        run.signal(signal.SIGTERM)
+    until = time.monotonic() + GRACE
+    while any(run.state.state == "running" for run in running) and time.monotonic() < until:
+        time.sleep(0.1)
+    return running

@@ -1,0 +1,217 @@
+"""A preview of a scene: the light that its lens will throw, in about a second, by the steps of a design made small.
+
+The preview is a design of the same scene with fewer pixels, control points, ray tubes and evaluations, so that a pixel
+has as many control cells and tubes as it has in a draft.  Left out are the judging of a lens on its way, and the search
+for light that has to move far.  A preview shows no detail that is finer than PIXELS a side.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from bstcad import pipeline
+from bstcad.analysis.shape import describe
+from bstcad.optics.lens import Lens
+from bstcad.optics.measure import a_side, simulated, tubes_picture
+from bstcad.optics.sides import both, coarser
+from bstcad.report.light_figures import rrmsd
+from bstcad.scene.scene import Scene
+from bstcad.tailoring import stage1, stage2, two_faces
+from bstcad.tailoring.machinability import front_shaped, held, kept, moved_clear
+from bstcad.tailoring.run import Parameters, Progress, Step, Task
+from bstcad.tailoring.source_image import BlurredMerit
+
+PIXELS = 128  # of a picture's longer side
+NET = 240  # control points along the longer side; a product of small factors: cosine transforms of it are quick
+COARSE_NET = 33  # of the first rounds of stage 1
+TUBES = 288  # a side
+CELLS = 64  # of the transport, a side
+COLD = 3  # rounds of stage 1, at least, where no earlier preview says where the light goes
+FRONT_CELLS, FRONT_NET, FRONT_STEPS = 32, 17, 40  # by which a front is sought of which something is free
+SEEN = 2.5  # ray tubes a pixel and side, by which the picture is taken: others than those that tailored the lens
+RAYS = 160  # a side, by which light that goes astray is counted
+SHAPE = 129  # points a side, at which the thickness is looked at
+SEED = 77  # of those rays
+
+
+@dataclass(frozen=True)
+class Pains:
+    """How much work goes into a preview."""
+
+    rounds: int  # of stage 1
+    evaluations: int  # of stage 2
+
+
+AT_ONCE, SETTLED = Pains(rounds=2, evaluations=12), Pains(rounds=4, evaluations=40)
+
+
+class Outdated(Exception):
+    """The scene has changed meanwhile: nobody waits for this preview any more."""
+
+
+@dataclass(frozen=True, eq=False)
+class Preview:
+    """A lens made small, its light, and the figures of both."""
+
+    scene: Scene  # made small
+    lens: Lens
+    pictures: tuple[tuple[np.ndarray, np.ndarray], ...]  # of each target (wanted, irradiance), both (rows, columns)
+    flux: dict[str, float]  # the ledger of the light; its lines sum to 1
+    shape: dict[str, float | None]  # of the lens, by the keys of report.json
+    remarks: tuple[str, ...]  # on the scene, and on light that cannot get where it is wanted
+    seconds: float = math.nan
+    round: Any = None  # where stage 1 ended: from here a preview of nearly the same scene begins
+
+    @property
+    def rrmsds(self) -> tuple[float, ...]:
+        """Of each target, on the pixels of the preview."""
+        return tuple(rrmsd(target, picture) for target, picture in self.pictures)
+
+
+def preview(
+    scene: Scene, before: Preview | None = None, pains: Pains = AT_ONCE, outdated: Callable[[], bool] = lambda: False
+) -> Preview:  # fmt: skip
+    """The preview of a scene.  SceneError where a design would be refused; Outdated once `outdated` says so.
+
+    before: of nearly the same scene, whose map of the light is the start for this one; None: of none, and the preview
+    depends on the scene alone.
+    """
+    began, remarks = time.perf_counter(), list(scene.warnings())
+    small = made_small(scene, pains)
+    told = _listening(outdated, remarks)
+    _, edge, wanted = pipeline.within_reach(small, told)
+    knobs = small.tailoring.resolved(small.lens.back.net)
+    task = pipeline.task_of(small, wanted[0], knobs, edge, further=wanted[1:], progress=told)
+    task = pipeline.posed(small, task)
+    lens = small.flat_lens(knobs.levels[0], torch.float32, as_wide_as=knobs.levels[-1])
+    start = before if before is not None and _alike(before.scene, small) else None
+    *_, last = (step for step in _first_stage(task, lens, start) if told("stage 1", 0, 0, "") is None)
+    lens = small.as_mounted(last.lens)
+    pipeline.check_thickness(lens, small)
+    bounds = held(lens, task.bounds, task.least)
+    if bounds is not None:
+        lens = kept(moved_clear(lens, lens.back.z, task.least, bounds), bounds)
+    *_, best = (step for step in _second_stage(task, lens) if told("stage 2", 0, 0, "") is None)
+    lens = best.lens
+    if not front_shaped(lens):
+        lens = moved_clear(lens, lens.back.z, task.least, bounds)
+    if bounds is not None:
+        lens = kept(lens, bounds)
+    lens = small.as_mounted(replace(lens.plain(), index=small.index, losses=None))
+    found = _lit(small, task, lens, wanted)
+    return replace(found, remarks=tuple(remarks), round=last.state, seconds=time.perf_counter() - began)
+
+
+def _listening(outdated: Callable[[], bool], remarks: list[str]) -> Progress:
+    """A progress that raises Outdated, and collects remarks on light that cannot get where it is wanted."""
+
+    def told(stage: str, done: int, total: int, text: str) -> None:
+        if outdated():
+            raise Outdated
+        if stage == "reach":
+            remarks.append(text)
+
+    return told
+
+
+def made_small(scene: Scene, pains: Pains) -> Scene:
+    """The scene with the pixels, control points and knobs of a preview; its method is that of this program."""
+    net = coarser(scene.lens.back.control_points or NET, NET)
+    if max(both(net)) > NET:
+        net = coarser(net, NET)
+    changes: dict[str, Any] = dict.fromkeys(f"tailoring.{key}" for key in ("method", "accuracy", "max_time"))
+    changes |= {
+        "lens.back.control_points": net,
+        "tailoring.quality": "draft",
+        "tailoring.levels": [coarser(net, COARSE_NET), net] if max(both(net)) > 1.5 * COARSE_NET else None,
+        "tailoring.rays": TUBES,
+        "tailoring.transport_grid": CELLS,
+        "tailoring.stage2_iterations": pains.evaluations,
+        "tailoring.rounds": pains.rounds,
+    }
+    for key, target in zip(scene.target_keys, scene.targets, strict=True):
+        factor = max(max(target.columns_rows) / PIXELS, 1.0)
+        changes[f"{key}.pixels"] = [max(round(n / factor), 8) for n in target.columns_rows]
+    return scene.changed(changes)
+
+
+def _alike(one: Scene, other: Scene) -> bool:
+    """Is the map of light through the one lens a start for the other?"""
+    a, b = one.lens, other.lens
+    sizes = (a.outline, a.back.net, a.back.reflect, a.shaped) == (b.outline, b.back.net, b.back.reflect, b.shaped)
+    return sizes and len(one.targets) == len(other.targets) and one.source.kind == other.source.kind
+
+
+def _first_stage(task: Task, lens: Lens, before: Preview | None) -> Iterator[Step]:
+    """Stage 1, without the other way that a design tries where the map does not settle."""
+    if lens.shaped is not None:
+        yield from (step for step in two_faces.steps(task, lens) if step.state is not None)
+        return
+    lens = task.heaviest.through(lens)
+    state = None
+    if before is not None and before.round is not None:
+        state = replace(before.round, round=0)
+    else:
+        task = replace(task, knobs=task.knobs.model_copy(update={"rounds": max(COLD, task.knobs.rounds)}))
+    if task.free:
+        lens = _with_front(task, lens)
+    if state is not None:  # the back of before, the front of now
+        state = replace(state, lens=replace(state.lens, front=Parameters.of(lens).front))
+    yield from stage1.follow_slopes(task, lens, state)
+
+
+def _with_front(task: Task, lens: Lens) -> Lens:
+    """The lens with the front that suits a coarse back best."""
+    coarse = lens.refined(coarser(lens.back.shape, FRONT_NET))
+    shaped = stage1.shaped_front(
+        task.heaviest.source, coarse, task.target, task.screen, free=task.free, rim_sags=task.rim_sags, n=FRONT_CELLS,
+        iterations=FRONT_STEPS, repeats=1,
+    )  # fmt: skip
+    return lens.with_front(shaped.front)
+
+
+def _second_stage(task: Task, lens: Lens) -> Iterator[Step]:
+    """One round of stage 2, or of stage 3 for all of a source of some size; left before anybody judges its lens."""
+    whole = stage2.Round(task, task.knobs.rays, task.knobs.stage2_iterations)
+    if task.grown:
+        light = replace(task, channels=task.grown[-1], grown=(), spreads=task.spreads[-1:])
+        whole = replace(whole, task=light, spread=task.spreads[-1], by_images=True)
+    for step in stage2.run_rounds([whole], lens):
+        if step.ends:
+            return
+        if step.make:
+            yield step
+        if step.progress and step.progress[1] >= whole.evaluations:
+            return
+
+
+def _lit(scene: Scene, task: Task, lens: Lens, wanted: Sequence[np.ndarray]) -> Preview:
+    """The preview of a lens: its light by fresh tubes, of a source of some size by its images, and its figures."""
+    pictures = []
+    for target, picture in zip(scene.targets, wanted, strict=True):
+        light = _picture(scene, task, lens, target.screen)
+        pictures.append((picture, light * (picture.sum() / max(light.sum(), 1e-300))))
+    channels = scene.channels()
+    rays = max(round(a_side(channels) * RAYS), 8)
+    ledger = simulated(lens, channels, scene.target.screen, n=rays, seed=SEED).flux
+    return Preview(scene, lens, tuple(pictures), flux=ledger, shape=describe(lens, SHAPE), remarks=())
+
+
+@torch.no_grad()
+def _picture(scene: Scene, task: Task, lens: Lens, screen: Any) -> np.ndarray:
+    """(rows, columns) of the light on a screen."""
+    n = round(SEEN * max(screen.shape))
+    if not task.spreads:
+        return tubes_picture(lens, scene.channels(), screen, n).numpy()
+    merit = BlurredMerit.of(
+        task.spreads[-1], lens, n, screen=screen, target=torch.ones(screen.shape, dtype=torch.float64), overshoot=0.0,
+        seed=SEED, by_images=True,
+    )  # fmt: skip
+    return merit.picture(merit.landing(lens))[0].cpu().numpy().clip(min=0.0)

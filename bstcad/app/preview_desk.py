@@ -1,0 +1,195 @@
+"""The thread that makes previews: the newest scene of each page first, and what takes longer once nothing is asked.
+
+Each request of a page replaces its request before, whose work ends at its next step.  Its answers come in the order of
+STAGES: a preview at once, a settled preview, the effects that are left out, predictions of each quality.  On two cores
+two previews at a time would each take twice as long: so there is one thread.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bstcad.app.preview import SETTLED, Outdated, Preview, preview
+from bstcad.scene.errors import SceneError
+from bstcad.scene.new_scene import Plate
+from bstcad.scene.scene import Scene, of_text
+from bstcad.scene.scene_file import tables
+from bstcad.sweep.cold_run import Units, units
+from bstcad.sweep.net_choice import estimated, with_net
+from bstcad.sweep.plan import plan
+
+STAGES = ("preview", "settled", "effects", "predicted")
+MOST = 32  # pages whose last request is kept
+LEFT = 60.0  # seconds without a word from a page, after which nobody waits for its answers
+
+
+@dataclass(eq=False)
+class Request:
+    """A scene whose previews a page waits for."""
+
+    page: str
+    number: int  # of the page's requests
+    scene: Scene
+    text: str = ""  # of its file, whose lines a plan names
+    answers: list[tuple[str, Any]] = field(
+        default_factory=list
+    )  # (stage, answer), an answer an Exception where it failed
+    replaced: bool = False  # by a later request of the page
+    heard: float = field(default_factory=time.monotonic)  # when the page asked last
+    plan: Iterator[dict[str, Any]] | None = None  # whose first part has been made
+
+    @property
+    def done(self) -> bool:
+        """Are all answers there, or is nobody waiting for more?"""
+        return self.replaced or len(self.answers) == len(STAGES) or time.monotonic() > self.heard + LEFT
+
+
+class PreviewDesk:
+    """Takes requests of pages, and makes their answers in a thread."""
+
+    def __init__(self) -> None:
+        self._news = threading.Condition()
+        self._requests: dict[str, Request] = {}  # the last one of each page
+        self._latest: Preview | None = None  # the start for the next
+        self._ended = False
+        self._thread = threading.Thread(target=self._work, name="previews", daemon=True)
+        self._thread.start()
+
+    def ask(self, request: Request) -> None:
+        """Take a request; an older one of the page is dropped."""
+        with self._news:
+            before = self._requests.pop(request.page, None)
+            if before is not None and before.number > request.number:  # they came in another order
+                request.replaced = True
+                self._requests[request.page] = before
+            else:
+                if before is not None:
+                    before.replaced = True
+                self._requests[request.page] = request
+                while len(self._requests) > MOST:
+                    self._requests.pop(next(iter(self._requests))).replaced = True
+            self._news.notify_all()
+
+    def answer(self, request: Request, stage: int, patience: float) -> tuple[str, Any] | None:
+        """Wait for an answer by its number; None if it is not there in so many seconds, or nobody waits for it."""
+        with self._news:
+            request.heard = time.monotonic()
+            self._news.notify_all()  # it may have been given up
+            self._news.wait_for(lambda: len(request.answers) > stage or request.replaced or self._ended, patience)
+            return request.answers[stage] if len(request.answers) > stage else None
+
+    def last(self, page: str) -> Request | None:
+        """The last request of a page."""
+        with self._news:
+            return self._requests.get(page)
+
+    def forget(self, page: str) -> None:
+        """Nobody waits for answers to a page any more."""
+        with self._news:
+            if (request := self._requests.pop(page, None)) is not None:
+                request.replaced = True
+
+    def end(self) -> None:
+        """Drop all requests, and end the thread."""
+        with self._news:
+            self._ended = True
+            for request in self._requests.values():
+                request.replaced = True
+            self._news.notify_all()
+        self._thread.join(timeout=10.0)
+
+    # ---- the thread ----
+
+    def _work(self) -> None:
+        with contextlib.suppress(Exception):  # libraries load, and kernels compile, before anybody waits for them
+            preview(first_scene(), outdated=lambda: self._ended or bool(self._requests))
+        while True:
+            with self._news:
+                self._news.wait_for(lambda: self._ended or self._next() is not None)
+                if self._ended:
+                    return
+                request = self._next()
+            self._serve(request)
+
+    def _next(self) -> Request | None:
+        """The request with the fewest answers, of these the latest: what is asked newly comes first."""
+        waiting = [request for request in self._requests.values() if not request.done]
+        return min(reversed(waiting), key=lambda request: len(request.answers), default=None)
+
+    def _outdated(self, request: Request) -> Callable[[], bool]:
+        """Is the request replaced, or has another one fewer answers?"""
+
+        def found() -> bool:
+            had = len(request.answers)
+            others = list(self._requests.values())
+            return request.replaced or self._ended or any(not o.done and len(o.answers) < had for o in others)
+
+        return found
+
+    def _serve(self, request: Request) -> None:
+        """Make the next answer of a request; left without, it is made again later if it is still wanted."""
+        stage = STAGES[len(request.answers)]
+        try:
+            found: Any = getattr(self, f"_{stage}")(request, self._outdated(request))
+        except Outdated:
+            request.plan = None
+            return
+        except SceneError as refusal:
+            found = refusal
+        except Exception as fault:  # a preview that fails must not end the thread
+            found = fault
+        with self._news:
+            failed = stage == "preview" and isinstance(found, Exception)
+            request.answers += [(each, found) for each in (STAGES if failed else (stage,))]
+            self._news.notify_all()
+
+    def _preview(self, request: Request, outdated: Callable[[], bool]) -> Preview:
+        before = self._latest
+        found = preview(request.scene, before, outdated=outdated)
+        self._latest = found
+        return found
+
+    def _settled(self, request: Request, outdated: Callable[[], bool]) -> Preview:
+        return preview(request.scene, pains=SETTLED, outdated=outdated)
+
+    def _effects(self, request: Request, outdated: Callable[[], bool]) -> dict[str, Any]:
+        """The entries of `plan --json` on effects; `net`: which is chosen where the scene states none, in a line."""
+        return self._planned(request, outdated)
+
+    def _predicted(self, request: Request, outdated: Callable[[], bool]) -> dict[str, Any]:
+        """The entries of `plan --json` on predictions."""
+        if request.plan is None:
+            self._planned(request, outdated)
+        return next(request.plan)
+
+    def _planned(self, request: Request, outdated: Callable[[], bool]) -> dict[str, Any]:
+        """Begin the plan of a request: its first part."""
+
+        def tick() -> None:
+            if outdated():
+                raise Outdated
+
+        tick()
+        scene, choice = with_net(request.scene)
+        tick()
+        request.plan = plan(scene, request.text, units=_units, tick=tick)
+        return next(request.plan) | {"net": None if choice is None else choice.line, "estimated": estimated(scene)}
+
+
+def first_scene() -> Scene:
+    """A scene for which nobody has to wait: letters by a plate."""
+    text = Plate.of().text("first")
+    return of_text(text, tables(text, Path("first.toml")), Path("first.toml"))
+
+
+@functools.cache
+def _units() -> Units:
+    """Of this machine, measured once."""
+    return units()

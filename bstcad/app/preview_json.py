@@ -1,0 +1,117 @@
+"""A preview, a plan and a finished design as the page gets them: pictures, figures in words, and the solid to turn."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from bstcad.app.preview import Preview
+from bstcad.report.figure_jobs import light_path_of
+from bstcad.report.light_figures import View, tones
+from bstcad.report.record import LEFT_OUT, LeftOut, changes
+from bstcad.report.rendering import turnable
+from bstcad.report.units import duration, number, percent, quantity
+from bstcad.scene.scene import Scene
+from bstcad.sweep.plan import QUALITIES
+
+CELLS = 96  # of the lens to be turned, a side
+ASTRAY = 0.002  # of the light; a line of the ledger with less is not told
+
+
+def of_preview(found: Preview) -> dict[str, Any]:
+    """The pictures on each target, the lens with its light, and figures."""
+    path = light_path_of(found.scene, found.lens, found.pictures)
+    views = [View.of(found.scene, k) for k in range(len(found.pictures))]
+    targets = [
+        {
+            "key": key, "rrmsd": number(value), "wanted": png(view.picture(tones(wanted, wanted))),
+            "light": png(view.picture(tones(light, wanted))), "seen": view.words, "pixels": list(light.shape[::-1]),
+        }
+        for key, view, value, (wanted, light) in zip(
+            found.scene.target_keys, views, found.rrmsds, found.pictures, strict=True
+        )
+    ]  # fmt: skip
+    return {
+        "seconds": round(found.seconds, 3), "targets": targets, "figures": figures(found),
+        "remarks": list(found.remarks), "solid": json.loads(turnable(found.lens, path, cells=CELLS) or "null"),
+    }  # fmt: skip
+
+
+def png(grey: np.ndarray) -> str:
+    """Grey tones (rows, columns) as the data URL of a PNG."""
+    written = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(grey)).save(written, "png")
+    return f"data:image/png;base64,{base64.b64encode(written.getvalue()).decode()}"
+
+
+def figures(found: Preview) -> list[list[str]]:
+    """[name, value] of the light and the shape of a lens."""
+    shape, optic = found.shape, found.scene.optic
+    astray = [
+        f"{line.replace('the lens', f'the {optic}')} {percent(part)}"
+        for line, part in found.flux.items()
+        if line != "on target" and part > ASTRAY
+    ]
+    rows = [
+        ["Light on the target", f"{percent(found.flux['on target'])} of the source's"],
+        ["Lost", ", ".join(astray) or "hardly any"],
+        ["Thickness on the axis", quantity(shape["centre_thickness"], "mm")],
+        [
+            "Thinnest and thickest",
+            f"{quantity(shape['thickness_min'], 'mm')}, {quantity(shape['thickness_max'], 'mm')}",
+        ],
+        ["Relief of the back", quantity(shape["sag_pv"], "mm")],
+        ["Steepest slope", f"{number(shape['slope_max_deg'])}°"],
+        ["Smallest radius", _radii(shape)],
+    ]
+    return rows
+
+
+def _radii(shape: Mapping[str, float | None]) -> str:
+    """The smallest radii of valleys and of ridges."""
+    kinds = (("of a valley", "radius_min_concave"), ("of a ridge", "radius_min_convex"))
+    told = [f"{quantity(shape[key], 'mm')} {words}" for words, key in kinds if shape[key] is not None]
+    return ", ".join(told) or "none: it is flat"
+
+
+def of_plan(plan: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
+    """The effects that are left out, a row each, and rough seconds and RRMSD of each quality."""
+    parts = [(plan, scene.target_keys[0]), *((part, part["target"]) for part in plan.get("further", ()))]
+    rows = [
+        [" ".join(filter(None, (LEFT_OUT[entry.kind], entry.detail and f"({entry.detail})"))), *changes(entry), of]
+        for part, key in parts
+        for of in [key if len(parts) > 1 else ""]
+        for entry in (LeftOut(**item) for item in part["left_out"])
+    ]
+    rough = {quality: told(each["seconds"], each["rrmsd"]) for quality, each in plan["estimated"].items()}
+    simulated = [item["what"] for item in plan["simulated"]]
+    return {"simulated": simulated, "left_out": rows, "net": plan["net"], "qualities": rough}
+
+
+def of_predictions(plan: Mapping[str, Any]) -> dict[str, Any]:
+    """Seconds and RRMSD of each quality as predicted, or why they are not."""
+    if plan["predicted"] is None:
+        return {"not_predicted": plan["not_predicted"], "notes": [], "qualities": {}}
+    known = {
+        quality: told(each["seconds"][1], each["rrmsd"][1], each["seconds"][::2], each["rrmsd"][::2])
+        for quality, each in plan["predicted"].items()
+        if quality in QUALITIES
+    }
+    return {"not_predicted": None, "notes": plan["notes"], "qualities": known}
+
+
+def told(
+    seconds: float, rrmsd: float, within: tuple[float, float] | None = None, about: tuple[float, float] | None = None
+) -> dict[str, str]:  # fmt: skip
+    """A quality in words; within, about: the ranges that nine of ten designs keep to; None: a rough estimate."""
+    if within is None or about is None:
+        return {"seconds": f"about {duration(seconds)}", "rrmsd": f"about {number(rrmsd)}", "range": "a rough estimate"}
+    low, high = (number(value) for value in about)
+    span = f"{duration(within[0])} to {duration(within[1])}; RRMSD {low} to {high}"
+    return {"seconds": duration(seconds), "rrmsd": number(rrmsd), "range": f"nine of ten designs: {span}"}

@@ -1,0 +1,526 @@
+"""The server of the workbench: pages, and what their script asks for.  All of it on loopback, behind guard.py.
+
+Nothing of a scene lives here alone: texts lie in the workspace, runs in their folders, and previews can be made again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import re
+import secrets
+import signal
+import socket
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import uvicorn
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response, StreamingResponse
+from starlette.routing import Route
+from starlette.staticfiles import StaticFiles
+
+import bstcad
+from bstcad.app import design_runs, form, preview_json, scene_text, sketch
+from bstcad.app.design_runs import Run
+from bstcad.app.followers import with_followers
+from bstcad.app.guard import POLICY, SANDBOX, Guard
+from bstcad.app.preview_desk import STAGES, PreviewDesk
+from bstcad.app.preview_desk import Request as Asked
+from bstcad.app.workspace import LARGEST_UPLOAD, Workspace
+from bstcad.report import record
+from bstcad.report.report import VIEWER
+from bstcad.runs import files
+from bstcad.runs.files import SentenceError
+from bstcad.scene import new_scene
+from bstcad.scene.errors import SceneError, line_of, toml_positions
+from bstcad.scene.picture import SAMPLES
+
+PATIENCE = 20.0  # seconds that an answer is waited for; then the page asks again
+UPLOAD = "/api/picture"  # where more may be sent
+STATIC, SITES = (
+    Path(__file__).parent / "static",
+    (Path(__file__).parents[1] / "site", Path(__file__).parents[2] / "docs/_build/html"),
+)
+LARGEST_REPORT = 600_000_000  # bytes
+SHOWN = {".html": "text/html", ".json": "application/json", ".png": "image/png", ".pdf": "application/pdf"}
+SLOWEST = 5.0  # seconds that open requests have when the server ends
+CLOUDS = ((b"ply", ".ply"), (b"solid", ".stl"))  # how files of measured points begin
+
+
+class Workbench:
+    """The application of one start."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self.workspace, self.desk = workspace, PreviewDesk()
+        self.started: list[Run] = []  # by this server
+        self._pages = jinja2.Environment(
+            loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True,
+            lstrip_blocks=True, undefined=jinja2.StrictUndefined,
+        )  # fmt: skip
+        scene, design = "/api/scene/{name}", "/api/design/{name}"
+        routes = [
+            Route("/", self.start_page),
+            Route("/scene/{name}", self.scene_page),
+            Route("/design/{name}", self.design_page),
+            Route("/compare", self.compare_page),
+            Route("/solid_view.js", lambda request: FileResponse(VIEWER, media_type="text/javascript")),
+            Route("/api/scenes", self.add_scene, methods=["POST"]),
+            Route(UPLOAD, self.keep_picture, methods=["POST"]),
+            Route(scene, self.scene_state),
+            Route(f"{scene}/change", self.change_scene, methods=["POST"]),
+            Route(f"{scene}/save", self.save_scene, methods=["POST"]),
+            Route(f"{scene}/drop", self.drop_changes, methods=["POST"]),
+            Route(f"{scene}/preview", self.preview, methods=["POST"]),
+            Route(f"{scene}/answer", self.answer),
+            Route(f"{scene}/make", self.make, methods=["POST"]),
+            Route(f"{design}/run", self.follow),
+            Route(f"{design}/light.png", self.light),
+            Route(f"{design}/stop", self.stop, methods=["POST"]),
+            Route(f"{design}/go-on", self.go_on, methods=["POST"]),
+            Route(f"{design}/edit", self.edit, methods=["POST"]),
+            Route(f"{design}/tolerance", self.tolerance, methods=["POST"]),
+            Route(f"{design}/tradeoff", self.tradeoff, methods=["POST"]),
+            Route(f"{design}/measured", self.measured, methods=["POST"]),
+            Route("/design/{name}/all.zip", self.all_files),
+            Route("/design/{name}/files/{path:path}", self.one_file),
+        ]
+        self.app = Starlette(routes=routes, exception_handlers={SentenceError: self._refused, 404: self._no_page})
+        self.app.mount("/static", StaticFiles(directory=STATIC))
+        site = next((place for place in SITES if (place / "index.html").is_file()), None)
+        self.has_docs = site is not None
+        if site is not None:
+            self.app.mount("/docs", _Site(directory=site, html=True))
+
+    def end(self) -> list[Run]:
+        """End the previews and the runs that this server began; the runs that were under way."""
+        self.desk.end()
+        return design_runs.end(self.started)
+
+    def _refused(self, request: Request, error: Exception) -> Response:
+        return JSONResponse({"sentence": self.workspace.without_paths(str(error))}, status_code=400)
+
+    def _no_page(self, request: Request, error: Exception) -> Response:
+        return self._page("lost.html.j2", status=404, title="No such page")
+
+    def _page(self, template: str, status: int = 200, **values: Any) -> HTMLResponse:
+        common = {"version": bstcad.__version__, "has_docs": self.has_docs}
+        return HTMLResponse(self._pages.get_template(template).render(**common, **values), status_code=status)
+
+    # ---- pages ----
+
+    def start_page(self, request: Request) -> Response:
+        """Where a picture is dropped, and the list of scenes and designs."""
+        lights = [{"name": name, "of": light.of} for name, light in new_scene.LIGHTS.items()]
+        return self._page(
+            "start.html.j2", title="Workbench", lights=lights, samples=SAMPLES, templates=new_scene.templates(),
+            scenes=self.workspace.scene_names(), designs=[*self._designs()],
+        )  # fmt: skip
+
+    def _designs(self) -> Iterator[dict[str, Any]]:
+        """The designs that are finished or under way, a card each."""
+        running = {run.design.name: run for run in design_runs.all_runs(self.workspace.designs) if run.kind == "design"}
+        finished = self.workspace.design_names()
+        for name in [*(name for name in running if name not in finished), *finished]:
+            run, known = running.get(name), self._report(name) if name in finished else None
+            state = run.state.state if run is not None else "none"
+            yield {
+                "name": name, "title": known.title if known else "", "verdict": known.verdict if known else "",
+                "rrmsd": record.rrmsds(known) if known else "", "state": state,
+                "picture": self._thumbnail(name, run),
+            }  # fmt: skip
+
+    def _thumbnail(self, name: str, run: Run | None) -> str:
+        """The address of a design's picture; "" if it has none."""
+        if (self.workspace.design(name) / "figures" / "irradiance.png").is_file():
+            return f"/design/{name}/files/figures/irradiance.png"
+        return f"/api/design/{name}/light.png" if run is not None and run.light else ""
+
+    def _report(self, name: str) -> record.Contents | None:
+        try:
+            return record.read(self.workspace.design(name) / "report.json")
+        except ValueError:
+            return None
+
+    def scene_page(self, request: Request) -> Response:
+        """Where a scene is changed while its light is seen."""
+        opened = self.workspace.opened(request.path_params["name"])
+        return self._page("scene.html.j2", title=opened.name, name=opened.name, state=self._state(opened.name))
+
+    def design_page(self, request: Request) -> Response:
+        """A design under way or finished."""
+        name = request.path_params["name"]
+        folder, run = self.workspace.design(name), Run(self.workspace.design(name))
+        known = self._report(name)
+        if known is None and run.state.state == "none":
+            raise SceneError(f"{name}: there is no such design; choose one of the list")
+        names = self.workspace.file_names(name) if folder.is_dir() else []
+        return self._page(
+            "design.html.j2", title=name, name=name, report=known, files=_sorted(names),
+            rrmsd=record.rrmsds(known) if known else "", run=run.news(10**9),
+            jobs={kind: Run(folder, kind).news(10**9) for kind in ("tolerance", "tradeoff", "measured")},
+            has_light="figures/irradiance.png" in names,
+        )  # fmt: skip
+
+    def compare_page(self, request: Request) -> Response:
+        """Two or more designs side by side: their pictures, their curves, and the keys in which they differ."""
+        names = [name for name in request.query_params.getlist("design")][:4]
+        known = [(name, self._report(name)) for name in names]
+        found = [{"name": name, "report": report, "rrmsd": record.rrmsds(report)} for name, report in known if report]
+        texts = [files.contents(self.workspace.design(each["name"]) / "scene.toml", LARGEST_REPORT) for each in found]
+        flat = [_flat(scene_text.tables(text.decode())) for text in texts]
+        keys = sorted({key for each in flat for key in each})
+        rows = [(key, [each.get(key, "") for each in flat]) for key in keys if len({e.get(key) for e in flat}) > 1]
+        curves = [[[point.seconds, point.rrmsd] for point in each["report"].history] for each in found]
+        return self._page("compare.html.j2", title="Compared", designs=found, rows=rows, curves=json.dumps(curves))
+
+    # ---- scenes ----
+
+    async def add_scene(self, request: Request) -> Response:
+        """A new scene file: {light, and picture, sample or text} or {template}."""
+        asked = await _json(request)
+        known = {key: str(asked[key]) for key in ("sample", "text", "template") if asked.get(key)}
+        image = str(asked["picture"]) if asked.get("picture") else None
+        light = str(asked.get("light") or next(iter(new_scene.LIGHTS)))
+        name = await run_in_threadpool(lambda: self.workspace.add(light, image=image, **known))
+        return JSONResponse({"name": name})
+
+    async def keep_picture(self, request: Request) -> Response:
+        """Keep an uploaded picture, the body of the request; its name here."""
+        data = await request.body()
+        return JSONResponse({"picture": await run_in_threadpool(self.workspace.keep, data)})
+
+    def scene_state(self, request: Request) -> Response:
+        """A scene as it is being edited, its form and its fault."""
+        known, name = request.query_params.get("revision"), request.path_params["name"]
+        if known is not None and known == self.workspace.opened(name).revision:
+            return JSONResponse({"revision": known})
+        return JSONResponse(self._state(name))
+
+    def _state(self, name: str) -> dict[str, Any]:
+        opened = self.workspace.opened(name)
+        told = {"name": name, "text": opened.text, "revision": opened.revision, "saved": opened.saved}
+        try:
+            data = scene_text.tables(opened.text)
+        except SceneError as fault:
+            return told | {"form": None, "error": {"key": "", "sentence": str(fault), "line": _line(str(fault))}}
+        error = self._fault(name, opened.text)
+        shown = form.form(data)
+        told["design"] = data.get("name") if isinstance(data.get("name"), str) else name
+        errors = {error["key"]: error["sentence"]} if error else {}
+        return told | {"form": self._linked(form.html(shown, errors)), "error": error, "sketch": sketch.svg(data)}
+
+    def _linked(self, html: str) -> str:
+        """The form's links to the documentation as the server has it; without it none."""
+        if self.has_docs:
+            return html.replace('<a href="reference/', '<a target="_blank" rel="noopener" href="/docs/reference/')
+        return re.sub(r'<p><a href="reference/[^<]*</a></p>', "", html)
+
+    def _fault(self, name: str, text: str) -> dict[str, Any] | None:
+        """The fault of a scene: its key, the sentence of the terminal, and the line."""
+        try:
+            self.workspace.scene(name, text)
+        except SentenceError as fault:
+            sentence = self.workspace.without_paths(str(fault))
+            key = sentence.partition(":")[0]
+            return {"key": key, "sentence": sentence, "line": line_of(key, toml_positions(text))}
+        return None
+
+    async def change_scene(self, request: Request) -> Response:
+        """Another text, {text}, or another value as a person typed it, {key, words}; {key, value} as JSON has it."""
+        asked, name = await _json(request), request.path_params["name"]
+
+        def changed() -> dict[str, Any]:
+            whole = "text" in asked
+            text = str(asked["text"]).replace("\r\n", "\n") if whole else self._with_value(name, asked)
+            self.workspace.change(name, text)
+            return self._state(name)
+
+        return JSONResponse(await run_in_threadpool(changed))
+
+    def _with_value(self, name: str, asked: Mapping[str, Any]) -> str:
+        """The text of a scene with another value."""
+        text, key = self.workspace.opened(name).text, str(asked["key"])
+        data = scene_text.tables(text)
+        value = asked["value"] if "value" in asked else scene_text.typed(key, str(asked["words"]), data)
+        for other, own in with_followers(data, key, value).items():
+            text = scene_text.changed(text, other, own)
+        return text
+
+    async def save_scene(self, request: Request) -> Response:
+        """Put the text into the scene file; {anyway: true} over another program's."""
+        asked, name = await _json(request), request.path_params["name"]
+        self.workspace.save(name, anyway=bool(asked.get("anyway")))
+        return JSONResponse(await run_in_threadpool(self._state, name))
+
+    def drop_changes(self, request: Request) -> Response:
+        """Forget the changes that are not saved."""
+        self.workspace.drop(request.path_params["name"])
+        return JSONResponse(self._state(request.path_params["name"]))
+
+    # ---- previews ----
+
+    async def preview(self, request: Request) -> Response:
+        """The preview of the scene as it is: {page, number}.  {replaced: true} where the page asked again meanwhile."""
+        asked, name = await _json(request), request.path_params["name"]
+        text = self.workspace.opened(name).text
+
+        def made() -> dict[str, Any]:
+            asking = Asked(str(asked["page"])[:40], int(asked["number"]), self.workspace.scene(name, text), text)
+            self.desk.ask(asking)
+            return self._told(asking, 0)
+
+        return JSONResponse(await run_in_threadpool(made))
+
+    async def answer(self, request: Request) -> Response:
+        """A later answer to a request of a page: ?page, number and stage; {} if there is none yet."""
+        query = request.query_params
+        asked, stage = self.desk.last(query["page"]), int(query["stage"])
+        if asked is None or asked.number != int(query["number"]) or not 0 <= stage < len(STAGES):
+            return JSONResponse({"replaced": True})
+        return JSONResponse(await run_in_threadpool(self._told, asked, stage))
+
+    def _told(self, asked: Asked, stage: int) -> dict[str, Any]:
+        answer = self.desk.answer(asked, stage, PATIENCE)
+        if answer is None:
+            return {"replaced": True} if asked.replaced else {}
+        name, found = answer
+        head = {"stage": name, "number": asked.number}
+        if isinstance(found, SentenceError):
+            return head | {"refused": self.workspace.without_paths(str(found))}
+        if isinstance(found, Exception):
+            return head | {"refused": f"no {name} could be made ({files.first_line(found)}); a design may do better"}
+        if name in ("preview", "settled"):
+            return head | preview_json.of_preview(found)
+        return head | (
+            preview_json.of_plan(found, asked.scene) if name == "effects" else preview_json.of_predictions(found)
+        )
+
+    # ---- designs ----
+
+    async def make(self, request: Request) -> Response:
+        """Save the scene and design it, in a process of its own: {page, which waits for no preview now}; its name."""
+        asked = await _json(request)
+        self.desk.forget(str(asked.get("page")))
+        return await run_in_threadpool(self._make, request.path_params["name"])
+
+    def _make(self, name: str) -> Response:
+        scene = self.workspace.scene(name, self.workspace.opened(name).text)
+        self.workspace.save(name)
+        folder = self.workspace.design(scene.name)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        self.started.append(design_runs.begin_design(scene, folder))
+        return JSONResponse({"design": scene.name})
+
+    def _run(self, request: Request) -> Run:
+        kind = request.query_params.get("kind", design_runs.DESIGN)
+        if kind not in design_runs.JOBS:
+            raise SceneError(f"{kind}: is no kind of run; choose one of {', '.join(design_runs.JOBS)}")
+        return Run(self.workspace.design(request.path_params["name"]), kind)
+
+    def follow(self, request: Request) -> Response:
+        """How a run stands, and its progress from line `since` on."""
+        news = self._run(request).news(int(request.query_params.get("since", 0)))
+        news["sentence"] = self.workspace.without_paths(news["sentence"])
+        for line in news["lines"]:
+            line[4] = self.workspace.without_paths(str(line[4]))
+        return JSONResponse(news)
+
+    def light(self, request: Request) -> Response:
+        """The light through the best lens so far."""
+        data = Run(self.workspace.design(request.path_params["name"])).light
+        return Response(data, media_type="image/png") if data else Response(status_code=404)
+
+    def stop(self, request: Request) -> Response:
+        """End a run: a design with the best lens so far, or at once with a checkpoint (?at_once)."""
+        run = self._run(request)
+        gently = run.kind == design_runs.DESIGN and "at_once" not in request.query_params
+        run.signal(signal.SIGINT if gently else signal.SIGTERM)
+        return JSONResponse({})
+
+    def go_on(self, request: Request) -> Response:
+        """Go on with a run that was stopped or killed."""
+        run = self._run(request)
+        run.go_on()
+        self.started.append(run)
+        return JSONResponse({})
+
+    def edit(self, request: Request) -> Response:
+        """A new scene file with the scene of a design; its name."""
+        name = request.path_params["name"]
+        folder = self.workspace.design(name)
+        source = folder if (folder / "scene.toml").is_file() else Run(folder).place
+        return JSONResponse({"name": self.workspace.adopt(name, source)})
+
+    async def tolerance(self, request: Request) -> Response:
+        """How exactly the lens must be made: {grade, yield in percent}, each perhaps absent."""
+        asked = await _json(request)
+        wanted = asked.get("yield")
+        job = {"grade": asked.get("grade") or None, "yield": None if wanted in (None, "") else float(wanted) / 100}
+        return await run_in_threadpool(self._begin, request, "tolerance", job)
+
+    async def tradeoff(self, request: Request) -> Response:
+        """The price of accuracy in time: {budget in seconds}."""
+        budget = float((await _json(request)).get("budget") or 600)
+        if not 1 <= budget <= 86_400:
+            raise SceneError(f"budget: {budget:g} s is not between 1 s and a day; give seconds, such as 600")
+        return await run_in_threadpool(self._begin, request, "tradeoff", {"budget": budget})
+
+    async def measured(self, request: Request) -> Response:
+        """Judge a made part by its measured points, the body of the request."""
+        data = await request.body()
+        ending = next((ending for start, ending in CLOUDS if data[:80].lstrip().lower().startswith(start)), ".csv")
+        if ending == ".csv" and b"\0" in data[:200]:
+            ending = ".stl"  # a binary one
+        return await run_in_threadpool(self._begin, request, "measured", {}, {f"cloud{ending}": data})
+
+    def _begin(
+        self, request: Request, kind: str, job: Mapping[str, Any], contents: Mapping[str, bytes] | None = None
+    ) -> Response:
+        run = Run(self.workspace.design(request.path_params["name"]), kind)
+        self.workspace.file(run.design.name, "lens.step")
+        run.begin(job, contents)
+        self.started.append(run)
+        return JSONResponse({})
+
+    # ---- files ----
+
+    def one_file(self, request: Request) -> Response:
+        """A file of a design: its pages and pictures to look at, others to keep."""
+        path = self.workspace.file(request.path_params["name"], request.path_params["path"])
+        kind = SHOWN.get(path.suffix)
+        if kind is None or "download" in request.query_params:
+            return FileResponse(path, media_type="application/octet-stream", filename=path.name)
+        policy = SANDBOX if kind == "text/html" else POLICY  # a folder may come from elsewhere: its page has no origin
+        return FileResponse(path, media_type=kind, headers={"Content-Security-Policy": policy})
+
+    def all_files(self, request: Request) -> Response:
+        """All files of a design as a ZIP archive, written while it is sent."""
+        name = request.path_params["name"]
+        paths = [(each, self.workspace.file(name, each)) for each in self.workspace.file_names(name)]
+        if not paths:
+            raise SceneError(f"{name}: has no files yet; wait for the end of its design")
+        headers = {"Content-Disposition": f'attachment; filename="{name}.zip"'}
+        return StreamingResponse(_zipped(name, paths), media_type="application/zip", headers=headers)
+
+
+class _Site(StaticFiles):
+    """The documentation, whose pages have scripts and styles of their own."""
+
+    async def get_response(self, path: str, scope: Any) -> Response:
+        answer = await super().get_response(path, scope)
+        answer.headers["Content-Security-Policy"] = (
+            "default-src 'self' 'unsafe-inline' data:; object-src 'none'; base-uri 'none'; frame-ancestors 'none'"
+        )
+        return answer
+
+
+async def _json(request: Request) -> dict[str, Any]:
+    """The body of a request as a table of JSON.  SceneError."""
+    try:
+        found = json.loads(await request.body() or b"{}")
+    except (ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict):
+        raise SceneError("the request is no table of JSON; reload the page")
+    return found
+
+
+def _zipped(name: str, paths: list[tuple[str, Path]]) -> Iterator[bytes]:
+    """A ZIP archive of files in a folder of that name, piece by piece."""
+    sink = _Sink()
+    with zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED) as archive:
+        for each, path in paths:
+            with path.open("rb") as source, archive.open(f"{name}/{each}", "w", force_zip64=True) as target:
+                while piece := source.read(1 << 20):
+                    target.write(piece)
+                    yield sink.taken()
+    yield sink.taken()
+
+
+class _Sink(io.RawIOBase):
+    """A file that is written only, and taken away in between."""
+
+    def __init__(self) -> None:
+        self._held = bytearray()
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:
+        self._held += data
+        return len(data)
+
+    def taken(self) -> bytes:
+        """The bytes since the last time."""
+        held, self._held = bytes(self._held), bytearray()
+        return held
+
+
+def _sorted(names: list[str]) -> list[str]:
+    """First the files that people come for."""
+    first = ("lens.step", "part.step", "report.html", "datasheet.pdf", "lens.stl", "lens.3mf")
+    return [*(name for name in first if name in names), *(name for name in names if name not in first)]
+
+
+def _flat(table: Mapping[str, Any], at: str = "") -> dict[str, str]:
+    """The values of a scene by dotted key, as text."""
+    found: dict[str, str] = {}
+    for name, value in table.items():
+        key = f"{at}.{name}".lstrip(".")
+        if isinstance(value, dict):
+            found |= _flat(value, key)
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            found |= {k: v for i, part in enumerate(value) for k, v in _flat(part, f"{key}[{i}]").items()}
+        else:
+            found[key] = json.dumps(value, ensure_ascii=False)
+    return found
+
+
+def _line(sentence: str) -> int | None:
+    """The line that a sentence on wrong TOML names."""
+    found = re.search(r"at line (\d+)", sentence)
+    return int(found[1]) if found else None
+
+
+# ---- the server ------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def bound(port: int) -> Iterator[socket.socket]:
+    """A socket on loopback; port 0: a free one.  SceneError if the port is taken."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as own:
+        own.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            own.bind(("127.0.0.1", port))
+        except OSError as error:
+            raise SceneError(f"--port {port}: cannot be had ({error.strerror}); give another one, or none") from None
+        yield own
+
+
+def serve(given: Path | None, port: int, say: Callable[[str], None], show: Callable[[str], Any]) -> None:
+    """Serve the workbench until a Ctrl-C.  say: called with sentences for the terminal; show: with the address."""
+    workspace, page = Workspace.of(given)
+    workbench, token = Workbench(workspace), secrets.token_urlsafe(24)
+    with bound(port) as own:
+        number = own.getsockname()[1]
+        guarded = Guard(workbench.app, number, token, larger=(UPLOAD, LARGEST_UPLOAD))
+        config = uvicorn.Config(
+            guarded, log_level="error", access_log=False, server_header=False, timeout_graceful_shutdown=int(SLOWEST),
+            lifespan="off", ws="none", http="h11",
+        )  # fmt: skip
+        address = f"http://127.0.0.1:{number}{page}?token={token}"
+        say(f"Workbench: {address}")
+        say("It is for this machine alone; Ctrl-C ends it, and designs under way can be gone on with.")
+        show(address)
+        with contextlib.suppress(KeyboardInterrupt, ClientDisconnect):
+            uvicorn.Server(config).run(sockets=[own])
+    stopped = workbench.end()
+    for run in stopped:
+        say(f"{run.design.name}: is stopped and kept; bstcad app goes on with it")

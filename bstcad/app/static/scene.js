@@ -1,0 +1,278 @@
+// The page of a scene: each change goes to the server, which answers with the text, the form and the fault; then the
+// preview follows.  Of changes that come while an earlier one is under way only the latest counts, and an older preview
+// stays until a new one is there.
+import { ask, element, embedded, pause, row } from "./common.js";
+
+let state = embedded();
+const at = `/api/scene/${encodeURIComponent(state.name)}`, page = crypto.randomUUID();
+const QUALITIES = ["draft", "standard", "fine"], LOOK = 1500; // milliseconds between two looks for other pages' changes
+let number = 0, waiting = null, busy = false, dragging = null, viewer = null, look = "lens", qualities = {};
+const log = (globalThis.previewLog = []); // milliseconds from each change to its preview, for measurements
+let changedAt = null;
+
+// ---- the form ----
+
+const form = element("form");
+
+function take(told) {
+  const anew = told.revision !== state.revision || !form.firstChild;
+  state = told;
+  element("saved").textContent = told.saved ? "saved" : "changed, not saved yet; kept here";
+  element("save").disabled = element("drop-changes").disabled = told.saved;
+  const area = element("text");
+  if (document.activeElement !== area || !area.dataset.changed) area.value = told.text;
+  const error = told.error;
+  element("fault").hidden = !error;
+  element("fault").textContent = error ? (error.line ? `${error.sentence} (line ${error.line})` : error.sentence) : "";
+  element("make").disabled = Boolean(error);
+  if (told.form !== null && dragging === null && (anew || error)) replaceForm(told.form);
+  if (told.sketch !== undefined) element("sketch").innerHTML = told.sketch;
+  const quality = /^\s*quality\s*=\s*"(\w+)"/m.exec(told.text);
+  const place = QUALITIES.indexOf(quality ? quality[1] : "standard");
+  if (place >= 0 && dragging !== element("quality")) element("quality").value = place;
+  sayQuality();
+}
+
+// The form comes as HTML; what was open stays open, and the focus stays where it was.
+function replaceForm(html) {
+  const active = document.activeElement, key = form.contains(active) ? active.dataset.key : null, type = active?.type;
+  const open = new Set([...form.querySelectorAll("details[open]")].map((part) => part.dataset.section));
+  const selection = key && type === "text" ? [active.selectionStart, active.selectionEnd] : null;
+  form.innerHTML = html;
+  for (const part of form.querySelectorAll("details")) part.open ||= open.has(part.dataset.section);
+  if (key === null) return;
+  const again = [...form.querySelectorAll("[data-key]")].find((part) => part.dataset.key === key && part.type === type);
+  again?.focus({ preventScroll: true });
+  if (selection && again) again.setSelectionRange(...selection);
+}
+
+function change(given) {
+  changedAt = performance.now();
+  waiting = given;
+  if (!busy) send();
+}
+
+async function send() {
+  busy = true;
+  while (waiting !== null) {
+    const given = waiting;
+    waiting = null;
+    try {
+      take(await ask(`${at}/change`, given));
+      if (waiting === null && !state.error) preview();
+    } catch (error) {
+      refuse(given.key, error.message);
+    }
+  }
+  busy = false;
+}
+
+// What a person typed that is no value of the key: it stays in the field, with the sentence under it.
+function refuse(key, sentence) {
+  element("fault").hidden = false;
+  element("fault").textContent = sentence;
+  for (const control of form.querySelectorAll("[data-key]")) {
+    if (control.dataset.key === key && control.type !== "button") control.setAttribute("aria-invalid", "true");
+  }
+}
+
+// The slider of a pair is its width: both ends move about their middle.
+function wordsOf(control) {
+  if (control.type === "checkbox") return String(control.checked);
+  if (!control.dataset.middle) return control.value;
+  const half = Number(control.value) / 2, middle = Number(control.dataset.middle);
+  return [middle - half, middle + half].map((end) => Number(end.toPrecision(12))).join("; ");
+}
+
+form.addEventListener("change", ({ target }) => {
+  if (target.dataset.key) change({ key: target.dataset.key, words: wordsOf(target) });
+});
+form.addEventListener("input", ({ target }) => {
+  if (target.type !== "range") return;
+  dragging = target;
+  for (const other of form.querySelectorAll("input[type=text]")) {
+    if (other.dataset.key === target.dataset.key) other.value = wordsOf(target);
+  }
+  change({ key: target.dataset.key, words: wordsOf(target) });
+});
+for (const kind of ["pointerup", "pointercancel", "keyup"]) {
+  document.addEventListener(kind, () => {
+    if (dragging === null) return;
+    dragging = null;
+    if (state.form !== null) replaceForm(state.form);
+  });
+}
+form.addEventListener("click", ({ target }) => {
+  if (target.type === "button" && target.dataset.key) change({ key: target.dataset.key, value: JSON.parse(target.dataset.value) });
+});
+for (const [kind, lit] of [["focusin", true], ["focusout", false]]) {
+  form.addEventListener(kind, ({ target }) => {
+    const key = target.dataset.key;
+    for (const part of key ? element("sketch").querySelectorAll("[data-of]") : []) {
+      part.classList.toggle("lit", lit && `${key}.`.startsWith(`${part.dataset.of}.`));
+    }
+  });
+}
+
+const area = element("text");
+area.addEventListener("input", () => { area.dataset.changed = "yes"; });
+area.addEventListener("change", () => {
+  delete area.dataset.changed;
+  change({ text: area.value });
+});
+element("quality").addEventListener("change", ({ target }) => change({ key: "tailoring.quality", words: QUALITIES[target.value] }));
+
+// ---- the preview ----
+
+async function preview() {
+  const mine = ++number, began = changedAt ?? performance.now();
+  element("targets").classList.add("waiting");
+  element("status").textContent = "A new preview is on its way …";
+  let told;
+  try {
+    told = await ask(`${at}/preview`, { page, number: mine });
+    while (mine === number && !told.replaced && !told.stage) told = await ask(answer(mine, 0));
+  } catch (error) {
+    if (mine === number) element("status").textContent = error.message;
+    return;
+  }
+  if (mine !== number || told.replaced) return;
+  show(told);
+  log.push(performance.now() - began);
+  if (told.refused) return;
+  for (let stage = 1; stage < 4; stage++) {
+    do {
+      told = await ask(answer(mine, stage)).catch(() => ({ replaced: true }));
+      if (mine !== number || told.replaced) return;
+    } while (!told.stage);
+    show(told);
+  }
+}
+
+const answer = (mine, stage) => `${at}/answer?page=${page}&number=${mine}&stage=${stage}`;
+
+function show(told) {
+  if (told.stage === "preview" || told.stage === "settled") showLight(told);
+  else if (!told.refused) showPlan(told);
+}
+
+function showLight(told) {
+  element("targets").classList.remove("waiting");
+  if (told.refused) {
+    if (told.stage === "preview") element("status").textContent = told.refused;
+    return;
+  }
+  element("targets").replaceChildren(...told.targets.map((target) => {
+    const pair = document.createElement("div");
+    pair.className = "both";
+    const of = told.targets.length > 1 ? `${target.key}: ` : "";
+    pair.append(figure(target.light, `${of}Light through the lens`, `${of}by the lens, RRMSD ${target.rrmsd} on ${target.pixels.join(" × ")} pixels`, "light-on-wall"));
+    pair.append(figure(target.wanted, `${of}The picture that is asked for`, `${of}asked for; ${target.seen.toLowerCase()}`));
+    return pair;
+  }));
+  const sure = told.stage === "settled" ? "Settled preview" : "Preview";
+  element("status").textContent = `${sure} in ${told.seconds.toFixed(1)} s; a design sees all pixels.`;
+  element("figures").tBodies[0].replaceChildren(...told.figures.map((cells) => row(cells)));
+  element("remarks").replaceChildren(...told.remarks.map((sentence) => {
+    const item = document.createElement("li");
+    item.textContent = sentence;
+    return item;
+  }));
+  if (!told.solid) return;
+  if (viewer === null) viewer = solidView.begin(element("solid-figure"), told.solid);
+  else viewer.update(told.solid);
+  viewer?.look(look);
+}
+
+function figure(source, alt, caption, kind = "") {
+  const made = document.createElement("figure"), image = document.createElement("img"), words = document.createElement("figcaption");
+  Object.assign(image, { src: source, alt, className: kind });
+  words.textContent = caption;
+  made.append(image, words);
+  return made;
+}
+
+element("solid-figure").addEventListener("click", ({ target }) => {
+  if (!target.dataset.look) return;
+  look = target.dataset.look;
+  for (const button of element("solid-figure").querySelectorAll("[data-look]")) button.setAttribute("aria-pressed", button === target);
+  viewer?.look(look);
+});
+
+// ---- time and accuracy, and what is left out ----
+
+function showPlan(told) {
+  if (told.stage === "effects") {
+    qualities = told.qualities;
+    element("net").textContent = told.net ?? "";
+    element("left-out").querySelector("tbody").replaceChildren(...told.left_out.map((cells) => row(cells, { numbers: [1, 2, 3] })));
+  } else {
+    qualities = { ...qualities, ...told.qualities };
+    element("notes").textContent = told.not_predicted ? `Rough estimates alone: ${told.not_predicted}.` : told.notes.join(" ");
+  }
+  element("predicted").tBodies[0].replaceChildren(...QUALITIES.filter((quality) => qualities[quality]).map((quality) => {
+    const made = row([quality, qualities[quality].seconds, qualities[quality].rrmsd], { numbers: [1, 2] });
+    made.title = qualities[quality].range;
+    made.dataset.quality = quality;
+    return made;
+  }));
+  sayQuality();
+}
+
+function sayQuality() {
+  const chosen = QUALITIES[element("quality").value], known = qualities[chosen];
+  const words = known ? `${chosen}: ${known.seconds}, RRMSD ${known.rrmsd} (${known.range})` : chosen;
+  if (element("quality-says").textContent !== words) element("quality-says").textContent = words;
+  element("quality").setAttribute("aria-valuetext", known ? `${chosen}, ${known.seconds}, RRMSD ${known.rrmsd}` : chosen);
+  for (const tr of element("predicted").tBodies[0].rows) {
+    if (tr.dataset.quality === chosen) tr.setAttribute("aria-current", "true");
+    else tr.removeAttribute("aria-current");
+  }
+}
+
+// ---- saving and making ----
+
+async function order(address, body = {}) {
+  try {
+    take(await ask(`${at}/${address}`, body));
+  } catch (error) {
+    if (address === "save" && /another program/.test(error.message) && confirm(error.message)) return order("save", { anyway: true });
+    element("fault").hidden = false;
+    element("fault").textContent = error.message;
+  }
+}
+
+element("save").addEventListener("click", () => order("save"));
+element("drop-changes").addEventListener("click", async () => {
+  await order("drop");
+  preview();
+});
+element("make").addEventListener("click", async () => {
+  element("make").disabled = true;
+  try {
+    while (busy) await pause(50);
+    const { design } = await ask(`${at}/make`, { page });
+    location.href = `/design/${design}`;
+  } catch (error) {
+    element("make").disabled = false;
+    element("fault").hidden = false;
+    element("fault").textContent = error.message;
+  }
+});
+
+// ---- other pages on the same scene ----
+
+async function watch() {
+  for (;;) {
+    await pause(LOOK);
+    if (busy || dragging !== null || document.hidden || area.dataset.changed) continue;
+    const told = await ask(`${at}?revision=${state.revision}`).catch(() => null);
+    if (busy || told === null || told.text === undefined || told.revision === state.revision) continue;
+    take(told);
+    if (!told.error) preview();
+  }
+}
+
+take(state);
+if (!state.error) preview();
+watch();

@@ -1,0 +1,47 @@
+// A picture, or something else to throw, becomes a scene: then the page of that scene opens.
+import { ask, element } from "./common.js";
+
+const form = element("new"), drop = element("drop"), file = element("picture"), said = element("said");
+
+const use = () => {
+  const chosen = form.querySelector("input[name=use]:checked");
+  return chosen.dataset.template === undefined ? { light: chosen.value } : { template: chosen.value };
+};
+
+async function begin(given, words) {
+  said.textContent = words;
+  try {
+    const { name } = await ask("/api/scenes", given);
+    location.href = `/scene/${name}`;
+  } catch (error) {
+    said.textContent = error.message;
+  }
+}
+
+async function take(picture) {
+  if (!picture) return;
+  said.textContent = "Reading the picture …";
+  try {
+    const kept = await ask("/api/picture", picture);
+    await begin({ ...use(), ...kept }, "Making the scene …");
+  } catch (error) {
+    said.textContent = error.message;
+  }
+}
+
+file.addEventListener("change", () => take(file.files[0]));
+for (const kind of ["dragenter", "dragover"]) {
+  drop.addEventListener(kind, (event) => { event.preventDefault(); drop.classList.add("over"); });
+}
+for (const kind of ["dragleave", "drop"]) drop.addEventListener(kind, () => drop.classList.remove("over"));
+drop.addEventListener("drop", (event) => { event.preventDefault(); take(event.dataTransfer.files[0]); });
+form.addEventListener("submit", (event) => event.preventDefault());
+form.addEventListener("click", (event) => {
+  const { sample, letters } = event.target.dataset;
+  if (sample) begin({ ...use(), sample }, "Making the scene …");
+  if (letters !== undefined) begin({ ...use(), text: element("letters").value }, "Making the scene …");
+});
+document.addEventListener("click", (event) => {
+  const { start } = event.target.dataset;
+  if (start) begin({ template: start }, "Making the scene …");
+});

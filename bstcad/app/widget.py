@@ -1,0 +1,161 @@
+"""The preview of a scene in a notebook: widgets that change it, the light that follows, and the scene as it then is.
+
+    bench = bstcad.workbench("my-lens.toml")   # shown by the cell
+    design = bstcad.design(bench.scene)
+
+Widgets talk to the notebook's own kernel, wherever that runs; a page in a frame would talk to this machine alone.
+"""
+
+from __future__ import annotations
+
+import html
+import os
+import threading
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from bstcad.app import form, preview_json, scene_text
+from bstcad.app.followers import with_followers
+from bstcad.app.preview import Outdated, Preview, preview
+from bstcad.runs import files
+from bstcad.runs.files import SentenceError
+from bstcad.scene import scene_file
+from bstcad.scene.errors import SceneError
+from bstcad.scene.scene import Scene, load, of_text
+
+WIDE = "180px"  # of a description
+
+
+def workbench(scene: Scene | str | os.PathLike[str]) -> Workbench:
+    """A scene, or a scene file, to be changed in a notebook while its preview follows.  SceneError."""
+    return Workbench(scene)
+
+
+class Workbench:
+    """The widgets of a scene; `scene` is the scene as it is now, `text` its file's text."""
+
+    def __init__(self, scene: Scene | str | os.PathLike[str]) -> None:
+        try:
+            import ipywidgets
+        except ImportError:
+            raise SceneError("ipywidgets is not installed; pip install 'bstcad[app]' brings it") from None
+        self._widgets = ipywidgets
+        if isinstance(scene, Scene):
+            self.scene, self._given, self._path = scene, scene, Path("scene.toml")
+            self.text = tomli_w.dumps(scene.model_dump(mode="json", exclude_none=True))
+        else:
+            self._path, self._given = Path(scene), None
+            self.text, _ = scene_file.read(self._path)
+            self.scene = load(self._path)
+        self.preview: Preview | None = None  # of the scene, if one could be made
+        self._number, self._lock = 0, threading.Lock()
+        self._said, self._light = ipywidgets.HTML(), ipywidgets.HTML()
+        self._fields = ipywidgets.VBox()
+        self._draw_fields()
+        self.box = ipywidgets.HBox([ipywidgets.VBox([self._light, self._said]), self._fields])
+        self.refresh()
+
+    def set(self, key: str, value: Any) -> None:
+        """Change a value by its dotted key, as the widgets do, and show the preview.  SceneError; then it stays."""
+        text = self.text
+        for other, own in with_followers(scene_text.tables(text), key, value).items():
+            text = scene_text.changed(text, other, own)
+        self.scene, self.text = self._loaded(text), text
+        self.refresh()
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the scene's text to a file, comments and all; the path."""
+        path = Path(path)
+        files.put(path, self.text.encode())
+        return path
+
+    def refresh(self) -> None:
+        """Make the preview of the scene, unless a later change comes meanwhile."""
+        with self._lock:
+            self._number += 1
+            mine = self._number
+        try:
+            found = preview(self.scene, self.preview, outdated=lambda: mine != self._number)
+        except Outdated:
+            return
+        except SentenceError as refusal:
+            self._say(str(refusal))
+            return
+        self.preview = found
+        self._show(preview_json.of_preview(found))
+
+    def _loaded(self, text: str) -> Scene:
+        """The scene of a text; of a scene that came as an object with the pictures and nets that it holds."""
+        data = scene_file.tables(text, self._path)
+        if self._given is None:
+            return of_text(text, data, self._path)
+        changes = {
+            key: value for key, value in _leaves(data).items() if _leaves(scene_text.tables(self.text)).get(key) != value
+        }  # fmt: skip
+        gone = _leaves(scene_text.tables(self.text)).keys() - _leaves(data).keys()
+        return self.scene.changed(dict.fromkeys(gone) | changes)
+
+    # ---- what is seen ----
+
+    def _draw_fields(self) -> None:
+        """A widget for each of the keys that most people need."""
+        found = form.form(scene_text.tables(self.text)).first
+        self._fields.children = tuple(self._control(field) for field in found)
+
+    def _control(self, field: form.Field) -> Any:
+        widgets, words = self._widgets, f"{field.label}{f' ({field.unit})' if field.unit else ''}"
+        told = {"description": words, "tooltip": field.meaning, "style": {"description_width": WIDE}}
+        span = form.slider(field)
+        if field.control == "choice":
+            options = list(dict.fromkeys(["", *field.choices, field.value]))
+            control = widgets.Dropdown(options=options, value=field.value, **told)
+        elif span is not None:
+            control = widgets.FloatSlider(
+                value=float(span.value), min=float(span.least), max=float(span.most), step=float(span.step),
+                continuous_update=False, readout_format=".5g", **told,
+            )  # fmt: skip
+        elif field.control == "check":
+            control = widgets.Checkbox(value=(field.value or field.default) == "true", indent=False, **told)
+        else:
+            control = widgets.Text(value=field.value, continuous_update=False, **told)
+        control.observe(lambda change: self._changed(field.key, change["new"]), names="value")
+        return control
+
+    def _changed(self, key: str, new: Any) -> None:
+        try:
+            words = str(new).lower() if isinstance(new, bool) else str(new)
+            self.set(key, scene_text.typed(key, words, scene_text.tables(self.text)))
+        except SentenceError as refusal:
+            self._say(str(refusal))
+
+    def _say(self, sentence: str) -> None:
+        self._said.value = f"<p role='alert'><b>{html.escape(sentence)}</b></p>"
+
+    def _show(self, told: dict[str, Any]) -> None:
+        """The light on each target beside the picture that is asked for, and the figures."""
+        style = "width:250px;image-rendering:auto;background:#000"
+        pictures = [
+            f'<img alt="Light through the lens" style="{style}" src="{each["light"]}"> '
+            f'<img alt="The picture that is asked for" style="{style}" src="{each["wanted"]}">'
+            f"<br>RRMSD {each['rrmsd']} on {' × '.join(map(str, each['pixels']))} pixels"
+            for each in told["targets"]
+        ]
+        self._light.value = "<br>".join(pictures)
+        rows = "".join(f"<tr><th>{html.escape(a)}</th><td>{html.escape(b)}</td></tr>" for a, b in told["figures"])
+        remarks = "".join(f"<li>{html.escape(sentence)}</li>" for sentence in told["remarks"])
+        self._said.value = f"<table>{rows}</table><ul>{remarks}</ul>"
+
+    def _repr_mimebundle_(self, **options: Any) -> Any:
+        """For a notebook: the widgets."""
+        return self.box._repr_mimebundle_(**options)
+
+
+def _leaves(table: Any, at: str = "") -> dict[str, Any]:
+    """The values of tables by dotted key; a list of tables is one value."""
+    found: dict[str, Any] = {}
+    for name, value in table.items():
+        key = f"{at}.{name}".lstrip(".")
+        found |= _leaves(value, key) if isinstance(value, dict) else {key: value}
+    return found

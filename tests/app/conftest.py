@@ -1,0 +1,144 @@
+"""A workbench that runs, as the command starts it, and pages in Chromium."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+ARGUMENTS = (
+    "--no-sandbox", "--disable-background-networking", "--disable-component-update", "--use-gl=angle",
+    "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+)  # fmt: skip
+START = 120.0  # seconds
+SMALL = """\
+# An evenly lit disc, small enough for a test: every comment stays
+name = "small"  # of the folder
+
+[source]
+kind = "collimated"
+aperture = { shape = "circle", radius = 6.0 }  # mm
+
+[lens]
+material = "PMMA"
+outline = { shape = "circle", diameter = 12.0 }
+front = { kind = "plane", z = 0.0 }
+back = { kind = "bspline", z = 4.0, control_points = 65 }
+
+[target]
+z = 100.0
+x = [-8.0, 8.0]
+y = [-8.0, 8.0]
+pixels = 48
+uniform = true
+outline = { shape = "circle", radius = 7.5 }
+
+[tailoring]
+quality = "draft"
+rays = 160
+"""
+
+
+@dataclass
+class Served:
+    """A workbench in a process of its own."""
+
+    folder: Path
+    process: subprocess.Popen
+    address: str  # with the token
+
+    @property
+    def root(self) -> str:
+        return self.address.partition("?")[0].rstrip("/")
+
+    def end(self, number: int = signal.SIGINT) -> str:
+        """End it by a signal; what it said."""
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        said, _ = self.process.communicate(timeout=START)
+        return said
+
+
+def begin(folder: Path, *arguments: str) -> Served:
+    """bstcad app in a folder, once it answers."""
+    command = [sys.executable, "-m", "bstcad.cli", "app", str(folder), "--no-browser", *arguments]
+    source = str(Path(__file__).parents[2])
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=folder,
+        env=os.environ | {"PYTHONPATH": source},
+    )  # fmt: skip
+    line = process.stdout.readline()
+    assert line.startswith("Workbench: http://127.0.0.1:"), line + process.stdout.read()
+    return Served(folder, process, line.split()[1])
+
+
+@pytest.fixture
+def served(tmp_path):
+    """A workbench of one test, in a folder of its own with the scene small.toml."""
+    (tmp_path / "small.toml").write_text(SMALL, encoding="utf-8")
+    own = begin(tmp_path)
+    yield own
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        own.end()
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory):
+    """A workbench of all tests of a file."""
+    folder = tmp_path_factory.mktemp("workbench")
+    (folder / "small.toml").write_text(SMALL, encoding="utf-8")
+    own = begin(folder)
+    yield own
+    own.end()
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    """Chromium without a window."""
+    if CHROMIUM is None:
+        pytest.skip("no Chromium here")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as found:
+        browser = found.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        yield browser
+        browser.close()
+
+
+class Faults(list):
+    """What a page complained of: errors of its script, and requests to other places."""
+
+
+@pytest.fixture
+def open_page(chromium):
+    """A function that opens an address in a window of its own, which ends with the test; no page may complain."""
+    contexts, faults = [], Faults()
+
+    def opened(address: str, **options):
+        context = chromium.new_context(**{"viewport": {"width": 1360, "height": 900}, **options})
+        contexts.append(context)
+        page = context.new_page()
+        page.on("pageerror", lambda error: faults.append(f"script: {error}"))
+        page.on("request", lambda request: _elsewhere(request.url, address, faults))
+        page.goto(address)
+        return page
+
+    opened.faults = faults
+    yield opened
+    for context in contexts:
+        context.close()
+    assert faults == []
+
+
+def _elsewhere(url: str, address: str, faults: list[str]) -> None:
+    host = address.split("/")[2]
+    if not url.startswith((f"http://{host}/", "data:", "blob:", "about:")):
+        faults.append(f"asks elsewhere: {url}")

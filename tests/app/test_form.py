@@ -1,0 +1,292 @@
+"""Every key of a scene has a field, which says what the schema says; and the form's HTML is sound."""
+
+import contextlib
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from collections import Counter
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+import tomli_w
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bstcad.app.form import FIRST, Field, Form, form, html, html_id, slider
+from bstcad.app.kinds import new_table, plain
+from bstcad.app.scene_text import changed, same, typed
+from bstcad.scene.errors import SceneError
+from bstcad.scene.scene import _validated
+from bstcad.scene.schema import rows, toml
+
+ROOT = Path(__file__).parents[2]
+TEXTS = {path.stem: path.read_text(encoding="utf-8") for path in sorted((ROOT / "templates").glob("*.toml"))}
+DATA = {name: tomllib.loads(text) for name, text in TEXTS.items()}
+sys.path.append(str(ROOT / "docs" / "_ext"))
+
+
+def steps(found: Form, key: str):
+    """What a person may do in a form on the way to a key: (key, value) for `changed`."""
+    groups = [*found.additions, *(addition for group in found.groups() for addition in group.additions)]
+    for addition in groups:
+        if f"{key}.".startswith(f"{plain(addition.key)}."):
+            yield addition.key, addition.value
+    for field in found.fields():
+        table, _, name = field.key.rpartition(".")
+        if name in ("kind", "shape") and f"{key}.".startswith(f"{plain(table)}."):
+            yield from ((field.key, choice) for choice in field.choices if choice != field.value)
+
+
+def ways_to(row, text, left=4):
+    """Whether some steps lead from a text to a form that has the key of a row, with its meaning."""
+    found = form(tomllib.loads(text))
+    key = row.key.replace("[]", "")
+    if row.range in ("table", "tables"):
+        if any(plain(group.key) == key and group.meaning in (row.meaning, "") for group in found.groups()):
+            return True
+    elif any(plain(field.key) == key and field.meaning == row.meaning for field in found.fields()):
+        return True
+    return left > 0 and any(ways_to(row, changed(text, *step), left - 1) for step in steps(found, key))
+
+
+@pytest.mark.parametrize("row", rows(), ids=lambda row: f"{row.key}-{'-'.join(row.kinds)}")
+def test_every_key_can_be_reached(row):
+    assert ways_to(row, TEXTS["disk"])
+
+
+@pytest.mark.parametrize("name", DATA)
+def test_a_field_says_what_the_schema_says_and_what_the_scene_has(name):
+    told = {}
+    for row in rows():
+        told.setdefault(plain(row.key), []).append(row)
+    found = form(DATA[name])
+    assert max(Counter(field.key for field in found.fields()).values()) == 1
+    for field in found.fields():
+        [row, *_] = [row for row in told[plain(field.key)] if row.meaning == field.meaning]
+        assert field.unit == row.unit.replace("none", "")
+        assert field.least is None or row.range.startswith(f"{field.least:g}" if field.least < 1e4 else "1")
+        assert field.required == (row.default == "required")
+        default = "" if field.required else row.default
+        assert field.default == default or toml(typed(field.key, field.default, DATA[name])) == default
+        assert field.control != "choice" or " | ".join(field.choices) in row.range
+        assert field.given == (field.value != "")
+        assert (
+            field.value == ""
+            or changed(TEXTS[name], field.key, typed(field.key, field.value, DATA[name])) == TEXTS[name]
+        )
+
+
+def values(table, prefix=""):
+    """The keys of everything in some tables that is no table."""
+    for name, value in table.items():
+        key = f"{prefix}.{name}".lstrip(".")
+        parts = value if isinstance(value, list) and value and isinstance(value[0], dict) else [value]
+        for k, part in enumerate(parts):
+            yield from (
+                values(part, f"{key}[{k}]" if part is not value else key)
+                if isinstance(part, dict)
+                else [key] * (k == 0)
+            )
+
+
+@pytest.mark.parametrize("name", DATA)
+def test_every_value_of_a_scene_is_in_its_form(name):
+    assert {field.key for field in form(DATA[name]).fields() if field.given} == {*values(DATA[name])}
+
+
+@pytest.mark.parametrize("name", DATA)
+def test_what_is_added_is_there_and_goes_again(name):
+    found = form(DATA[name])
+    for addition in [*found.additions, *(each for group in found.groups() for each in group.additions)]:
+        text = changed(TEXTS[name], addition.key, addition.value)
+        new = {group.key: group for group in form(tomllib.loads(text)).groups()}
+        key = addition.key if addition.key in new else addition.key.replace("[0]", "")
+        assert new[key].removable
+        if plain(addition.key) != "target.profile":  # which replaces the picture
+            left = tomllib.loads(changed(text, addition.key, None))
+            one = {name: part[0] if name == "target" and len(part) == 1 else part for name, part in left.items()}
+            assert same(left, DATA[name]) or same(one, DATA[name])
+
+
+def test_the_first_fields_are_keys_and_follow_the_kind():
+    known = {plain(row.key): row for row in rows()}
+    assert all(key in known and label for labels in FIRST for key, label in labels.items())
+    labels = {name: {field.label: field for field in form(data).first} for name, data in DATA.items()}
+    assert {"Width of the lens", "Height of the lens", "Distance to the wall", "Quality"} <= labels["disk"].keys()
+    assert labels["beam_shaper"]["Diameter of the lens"].value == "15"
+    assert labels["led"]["Radius of the lens"].value == "12" and "Width of the lens" not in labels["led"]
+    assert labels["beam_shaper"]["Refractive index"].key == "lens.index"
+    assert labels["two_pictures"]["Distance to the wall (target 1)"].key == "target[0].z"
+    assert labels["disk"]["Even light, no picture"].control == "check"
+    assert labels["white_logo"]["Wavelength"].control == "lines"
+    assert all(10 <= len(first) <= len(FIRST) for first in labels.values())
+
+
+def test_a_field_leads_to_its_section_of_the_documentation():
+    from reference_pages import scene_keys
+
+    sections = dict(re.findall(r"^\(([\w-]+)\)=\n(.*?)(?=^\(|\Z)", scene_keys(), re.S | re.M))
+    for data in DATA.values():
+        for field in form(data).fields():
+            page, anchor = field.page.split("#")
+            keys = re.findall(r"^\| `([^`]+)`", sections[anchor], re.M)
+            assert page == "reference/scene-keys.html" and plain(field.key) in map(plain, keys)
+
+
+# ---- HTML ------------------------------------------------------------------------------------------------------------
+
+
+VOID = {"input", "br", "hr", "img", "meta", "link"}
+ATTRIBUTES = {
+    "id", "name", "class", "for", "type", "value", "checked", "selected", "inputmode", "autocomplete", "spellcheck",
+    "rows", "placeholder", "min", "max", "step", "role", "href", "open", "data-key", "data-value", "data-section",
+    "aria-label", "aria-describedby", "aria-invalid", "aria-required",
+}  # fmt: skip
+
+
+class Sound(HTMLParser):
+    """The elements of a piece of HTML, each of which is closed where it may be."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.found, self.words = [], [], Counter()
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        names = [name for name, _ in attrs]
+        assert len(names) == len(set(names)) and set(names) <= ATTRIBUTES, names
+        assert tag not in ("script", "style")
+        assert self.open[-1:] not in (["p"], ["option"], ["summary"]) or tag in ("a", "button"), (self.open, tag)
+        self.found.append((tag, dict(attrs), (*self.open,)))
+        self.open += [tag] * (tag not in VOID)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.words[self.found[-1][1].get("id") if self.found else None] += len(data.strip())
+
+
+def is_sound(text, found):
+    """Assert what holds of every form's HTML; its elements."""
+    sound = Sound(text)
+    ids = Counter(attrs["id"] for _, attrs, _ in sound.found if "id" in attrs)
+    assert max(ids.values()) == 1
+    labelled = {attrs["for"] for tag, attrs, _ in sound.found if tag == "label"}
+    controls = {}
+    for tag, attrs, outside in sound.found:
+        if tag in ("input", "select", "textarea"):
+            assert attrs.get("id") in labelled or attrs["aria-label"]
+            assert "name" not in attrs or attrs["name"] == attrs["data-key"]
+            for other in attrs.get("aria-describedby", "").split():
+                assert other in ids and (other.endswith("-error") or sound.words[other])
+            controls[attrs["data-key"]] = attrs
+        assert tag != "button" or (attrs["type"] == "button" and attrs["data-key"] and attrs["data-value"])
+        assert tag != "legend" or outside[-1] == "fieldset"
+    assert controls.keys() == {field.key for field in found.fields()}
+    assert labelled == {html_id(key) for key in controls}
+    return sound.found
+
+
+@pytest.mark.parametrize("name", DATA)
+def test_the_html_is_sound(name):
+    found = form(DATA[name])
+    elements = is_sound(html(found, {}), found)
+    assert not [attrs for _, attrs, _ in elements if "aria-invalid" in attrs or attrs.get("role") == "alert"]
+    buttons = {attrs["data-key"]: json.loads(attrs["data-value"]) for tag, attrs, _ in elements if tag == "button"}
+    assert all(value is None or isinstance(value, dict) for value in buttons.values())
+    by_key = {attrs["name"]: (tag, attrs) for tag, attrs, _ in elements if "name" in attrs}
+    for field in found.fields():
+        tag, attrs = by_key[field.key]
+        assert {"choice": "select", "lines": "textarea"}.get(field.control, "input") == tag
+        assert field.control != "number" or (attrs["inputmode"], attrs["value"]) == ("decimal", field.value)
+        assert field.control != "check" or ("checked" in attrs) == ((field.value or field.default) == "true")
+    sliders = [attrs for _, attrs, _ in elements if attrs.get("type") == "range"]
+    numbers = [field.key for field in found.first if field.control == "number"]
+    assert [attrs["data-key"] for attrs in sliders] == numbers and len(numbers) >= 3
+
+
+def test_a_sentence_stands_at_its_key_or_at_the_top():
+    found = form(DATA["two_pictures"])
+    errors = {
+        "target[0].z": "first: <b>", "target[1].x[0]": "second", "lens.outline": "table", "lens.front.nothing": "front",
+        "zzz": "unknown & new", "effects[0].kind": "list", "target": "all",
+    }  # fmt: skip
+    text = html(found, errors)
+    elements = is_sound(text, found)
+    alerts = [attrs.get("id") for _, attrs, _ in elements if attrs.get("role") == "alert"]
+    assert sorted(map(str, alerts)) == sorted([
+        "None", "key-target-0-z-error", "key-target-1-x-error", "key-lens-outline-table-error",
+        "key-lens-front-table-error", "key-effects-table-error", "key-target-table-error",
+    ])  # fmt: skip
+    assert "first: &lt;b&gt;" in text and "unknown &amp; new" in text
+    invalid = {attrs["data-key"]: attrs["aria-describedby"] for _, attrs, _ in elements if "aria-invalid" in attrs}
+    assert invalid == {key: f"{html_id(key)}-help {html_id(key)}-error" for key in ("target[0].z", "target[1].x")}
+    opened = {attrs["data-section"] for tag, attrs, _ in elements if tag == "details" and "open" in attrs}
+    assert opened == {"target", "lens", "effects"}
+    is_sound(html(form(DATA["disk"]), {"target[0].z": "one"}), form(DATA["disk"]))
+    assert "key-target-z-error" in html(form(DATA["disk"]), {"target[0].z": "one"})
+
+
+@given(st.floats(1e-3, 1e6) | st.floats(-1e6, -1e-3), st.floats(-1e8, 0.0), st.floats(0.0, 1e8))
+def test_a_slider_goes_from_half_to_double_within_the_range(value, least, most):
+    field = Field(
+        "target.z", "z", unit="mm", least=least, most=most, meaning="", default="", example="", control="number",
+        choices=(), value=repr(value), given=True, required=True, page="",
+    )  # fmt: skip
+    if (found := slider(field)) is None:
+        assert not least < value < most or most < value / 2 or abs(value) * 1e-9 > most - least
+        return
+    low, high, step = (float(each) for each in (found.least, found.most, found.step))
+    near = 1e-9 * abs(value)
+    assert min(value / 2, 2 * value) - near <= low < high <= max(value / 2, 2 * value) + near
+    assert least - near <= low and high <= most + near
+    assert 50 <= (high - low) / step <= 260 and float(found.value) == pytest.approx(value, rel=1e-9)
+
+
+ODD = st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.floats() | st.text(max_size=5) | st.dates()
+ODD = ODD | st.lists(ODD, max_size=3) | st.dictionaries(st.sampled_from(["kind", "shape", "z", "x"]), ODD, max_size=3)
+ODD = ODD | st.lists(st.dictionaries(st.sampled_from(["kind", "z", "profile"]), ODD, max_size=2), max_size=3)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.data())
+def test_a_wrong_scene_has_a_form_too(draw):
+    """Anything may stand anywhere: a person is in the middle of typing."""
+    data = tomllib.loads(TEXTS[draw.draw(st.sampled_from(sorted(TEXTS)))])
+    for _ in range(draw.draw(st.integers(1, 4))):
+        table = data
+        for _ in range(draw.draw(st.integers(0, 2))):
+            inner = [part for part in table.values() if isinstance(part, dict)]
+            table = draw.draw(st.sampled_from(inner)) if inner else table
+        name = draw.draw(st.sampled_from([*table, "kind", "profile", "target", "effects", "new"]))
+        table[name] = draw.draw(ODD)
+    found, text = form(data), tomli_w.dumps(data)
+    is_sound(html(found, {"lens": "wrong"}), found)
+    field = draw.draw(st.sampled_from([*found.fields()]))
+    additions = [*found.additions, *(addition for group in found.groups() for addition in group.additions)]
+    done = [(each.key, each.value) for each in additions] + [(field.key, choice) for choice in field.choices]
+    for key, value in [*done, (field.key, None), *((group.key, None) for group in found.groups() if group.removable)]:
+        with contextlib.suppress(SceneError):
+            assert tomllib.loads(changed(text, key, value))
+
+
+def test_no_scene_at_all_can_be_begun():
+    assert [field.label for field in form({}).first] == ["Quality"]
+    text = ""
+    while additions := [each for each in form(tomllib.loads(text)).additions if each.key in ("source", "lens")]:
+        text = changed(text, additions[0].key, additions[0].value)
+    text = changed(changed(text, "target", new_table("target", {})), "lens.material", "PMMA")
+    _validated(tomllib.loads(changed(text, "name", "new")), ROOT)
+
+
+def test_a_form_loads_no_torch():
+    code = "import sys\nfrom bstcad.app.form import form, html\nhtml(form({}), {})\n"
+    code += "print([m for m in ('torch', 'numpy', 'scipy') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,235 @@
+"""The workbench in a browser, as a person uses it: with a picture, a mouse, the keyboard, a telephone, two windows."""
+
+from __future__ import annotations
+
+import io
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from bstcad import commands
+from bstcad import folder as folders
+from bstcad.scene.scene import load
+from tests.app.conftest import SMALL
+
+SEEN = ".light-on-wall"
+PATIENCE = 120_000  # milliseconds, on a busy machine
+
+
+def picture() -> bytes:
+    """A PNG with light in it."""
+    x, y = np.meshgrid(np.linspace(-1, 1, 96), np.linspace(-1, 1, 96))
+    grey = (255 * np.exp(-3 * (x**2 + (y - 0.2) ** 2))).astype(np.uint8)
+    written = io.BytesIO()
+    Image.fromarray(grey).save(written, "png")
+    return written.getvalue()
+
+
+def pixels(source: str) -> np.ndarray:
+    """Of a data URL."""
+    import base64
+
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(source.partition(",")[2]))))
+
+
+def scene_page(open_page, shared, **options):
+    page = open_page(shared.address, **options)
+    page.click("text=small.toml")
+    page.wait_for_selector(SEEN, timeout=PATIENCE)
+    return page
+
+
+def test_a_dropped_picture_is_a_scene_with_a_preview(open_page, shared):
+    page = open_page(shared.address)
+    page.click("text=A plate for the sun")
+    page.set_input_files("#picture", {"name": "../../etc/evil.png", "mimeType": "image/png", "buffer": picture()})
+    page.wait_for_selector(SEEN, timeout=PATIENCE)
+    assert page.url.endswith("/scene/my-sun")
+    [kept] = (shared.folder / "pictures").iterdir()
+    assert kept.read_bytes() == picture() and "evil" not in kept.name
+    assert load(shared.folder / "my-sun.toml").source.divergence == 0.53
+    assert pixels(page.get_attribute(SEEN, "src")).std() > 10  # there is a picture on it
+    assert "token" not in page.url
+
+
+def test_a_change_is_seen_and_kept_beside_the_file_until_it_is_saved(open_page, shared):
+    path = shared.folder / "small.toml"
+    path.write_text(SMALL, encoding="utf-8")
+    page = scene_page(open_page, shared)
+    before, seen = path.read_bytes(), page.get_attribute(SEEN, "src")
+    page.fill("input[type=text][data-key='target.z']", "60,5")  # a decimal comma
+    page.keyboard.press("Tab")
+    page.wait_for_selector("#saved:text('not saved')")
+    page.wait_for_selector(f"{SEEN}:not([src='{seen}'])", timeout=PATIENCE)
+    assert "z = 60.5" in page.input_value("#text") and path.read_bytes() == before
+    page.reload()
+    assert "z = 60.5" in page.input_value("#text")
+    page.click("#save")
+    page.wait_for_selector("#saved:text-is('saved')")
+    assert path.read_text() == SMALL.replace("z = 100.0", "z = 60.5")  # comments and all
+
+
+def test_a_wrong_value_is_marked_where_it_stands_with_the_terminals_sentence(open_page, shared):
+    path = shared.folder / "wrong.toml"
+    path.write_text(SMALL.replace('"small"', '"wrong"'), encoding="utf-8")
+    page = open_page(shared.address)
+    page.goto(f"{shared.root}/scene/wrong")
+    page.wait_for_selector(SEEN, timeout=PATIENCE)
+    page.fill("input[type=text][data-key='target.z']", "2")
+    page.keyboard.press("Tab")
+    page.wait_for_selector("[aria-invalid=true]")
+    told = page.inner_text("#form .error")
+    said = subprocess.run(
+        [sys.executable, "-m", "bstcad.cli", "generate", str(path), "--set", "target.z=2.0"], capture_output=True,
+        text=True,
+    ).stderr  # fmt: skip
+    assert told and told in said and page.is_disabled("#make")
+    control = page.locator("[aria-invalid=true]").first
+    assert control.get_attribute("data-key") == "target.z"
+    assert page.locator(f"#{control.get_attribute('aria-describedby').split()[-1]}").inner_text() == told
+    page.fill("input[type=text][data-key='target.z']", "far")
+    page.keyboard.press("Tab")
+    page.wait_for_selector("#fault:has-text('far')")
+
+
+def test_two_windows_show_one_scene(open_page, shared):
+    path = shared.folder / "both.toml"
+    path.write_text(SMALL.replace('"small"', '"both"'), encoding="utf-8")
+    one, other = open_page(shared.address), open_page(shared.address)
+    for page in (one, other):
+        page.goto(f"{shared.root}/scene/both")
+        page.wait_for_selector(SEEN, timeout=PATIENCE)
+    one.fill("input[type=text][data-key='target.z']", "77")
+    one.keyboard.press("Tab")
+    other.wait_for_selector("#form input[type=text][data-key='target.z'][value^='77']", timeout=PATIENCE)
+    assert "z = 77" in other.input_value("#text")
+
+
+def test_the_text_can_be_edited_and_says_where_it_is_wrong(open_page, shared):
+    path = shared.folder / "text.toml"
+    path.write_text(SMALL.replace('"small"', '"text"'), encoding="utf-8")
+    page = open_page(shared.address)
+    page.goto(f"{shared.root}/scene/text")
+    page.wait_for_selector(SEEN, timeout=PATIENCE)
+    page.click("text=scene.toml")
+    text = page.input_value("#text")
+    page.fill("#text", text.replace("pixels = 48", "pixels = ["))
+    page.locator("#text").blur()
+    page.wait_for_selector("#fault:has-text('line')")
+    page.fill("#text", text.replace("pixels = 48", "pixels = 64"))
+    page.locator("#text").blur()
+    page.wait_for_selector("figcaption:has-text('64 × 64 pixels')", timeout=PATIENCE)
+    assert page.is_hidden("#fault")
+
+
+def test_the_keyboard_alone_leads_from_the_start_to_a_changed_preview(open_page, shared):
+    page = open_page(shared.address)
+    for _ in range(40):
+        page.keyboard.press("Tab")
+        if page.evaluate("document.activeElement.dataset.letters !== undefined"):
+            break
+    page.keyboard.press("Enter")
+    page.wait_for_selector(SEEN, timeout=PATIENCE)
+    seen = page.get_attribute(SEEN, "src")
+    for _ in range(80):
+        page.keyboard.press("Tab")
+        if page.evaluate("document.activeElement.type === 'range' && document.activeElement.dataset.key === 'target.z'"):
+            break
+    page.keyboard.press("ArrowRight")
+    page.wait_for_selector(f"{SEEN}:not([src='{seen}'])", timeout=PATIENCE)
+    assert page.evaluate("document.activeElement.dataset.key") == "target.z"  # the focus stays
+
+
+def design(page, shared, name: str) -> None:
+    """Open a scene of that name, and have it designed."""
+    path = shared.folder / f"{name}.toml"
+    path.write_text(SMALL.replace('"small"', f'"{name}"'), encoding="utf-8")
+    page.goto(f"{shared.root}/scene/{name}")
+    page.wait_for_selector(SEEN, timeout=PATIENCE)
+    page.click("#make")
+    page.wait_for_url(f"**/design/{name}")
+
+
+def test_a_design_goes_on_without_its_page_and_is_the_one_of_the_command(open_page, shared, tmp_path):
+    page = open_page(shared.address)
+    design(page, shared, "made")
+    page.reload()  # in mid-run
+    page.close()
+    again = open_page(shared.address)
+    again.goto(f"{shared.root}/design/made")
+    again.wait_for_selector("#step", timeout=PATIENCE)
+    with again.expect_download() as download:
+        again.click("#step")
+    step = tmp_path / "lens.step"
+    download.value.save_as(step)
+    assert commands.verify(step).passed
+    done = commands.generate(load(shared.folder / "made.toml"), tmp_path / "alone")
+    assert done.passed
+    nets = [folders.read_nominal(place)[1].lens.back.control_points() for place in (shared.folder / "made", tmp_path / "alone")]
+    assert np.array_equal(*nets)  # to the last bit
+    with again.expect_download() as download:
+        again.click("text=All files (ZIP)")
+    assert download.value.suggested_filename == "made.zip"
+    with again.expect_popup() as report:
+        again.click("text=The report")
+    report.value.wait_for_load_state()
+    assert "made" in report.value.title() or "made" in report.value.inner_text("body")
+
+
+def test_two_designs_are_compared(open_page, shared):
+    page = open_page(shared.address)
+    design(page, shared, "left")
+    page.wait_for_selector("#step", timeout=PATIENCE)
+    path = shared.folder / "left.toml"
+    path.write_text(path.read_text().replace('"left"', '"right"').replace("z = 100.0", "z = 90.0"), encoding="utf-8")
+    page.goto(f"{shared.root}/scene/left")
+    page.wait_for_selector(SEEN, timeout=PATIENCE)
+    page.click("#make")
+    page.wait_for_url("**/design/right")
+    page.wait_for_selector("#step", timeout=PATIENCE)
+    page.goto(shared.root)
+    for name in ("left", "right"):
+        page.check(f"input[name=design][value={name}]")
+    page.click("text=Compare the chosen ones")
+    rows = {row.locator("th").inner_text() for row in page.locator("tbody tr").all()}
+    assert rows == {"name", "target.z"}
+    assert page.locator("#curve path").count() == 2
+
+
+def test_nobody_is_shut_out(open_page, shared):
+    """axe-core finds no serious fault on any page, in light and dark, and on a telephone."""
+    from axe_playwright_python.sync_playwright import Axe
+
+    page = open_page(shared.address)
+    design(page, shared, "seen")
+    page.wait_for_selector("#step", timeout=PATIENCE)
+    addresses = ("/", "/scene/small", "/design/seen", "/compare?design=seen&design=seen")
+    found = []
+    for options in ({"color_scheme": "light"}, {"color_scheme": "dark", "viewport": {"width": 340, "height": 700}}):
+        page = open_page(shared.address, bypass_csp=True, **options)
+        for address in addresses:
+            page.goto(shared.root + address)
+            if "scene" in address:
+                page.wait_for_selector(SEEN, timeout=PATIENCE)
+                page.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
+            faults = Axe().run(page).response["violations"]
+            found += [
+                (address, options["color_scheme"], fault["id"], node["target"], node["failureSummary"][:150])
+                for fault in faults if fault["impact"] in ("serious", "critical") for node in fault["nodes"][:3]
+            ]  # fmt: skip
+            wide = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
+            if wide > 0:
+                found.append((address, options["color_scheme"], f"{wide} pixels wider than the window"))
+    assert found == []
+
+
+@pytest.mark.parametrize("text", ["name = ", SMALL.replace("kind", "knd", 1)])
+def test_a_damaged_scene_opens_with_its_fault(open_page, shared, text):
+    (shared.folder / "damaged.toml").write_text(text, encoding="utf-8")
+    page = open_page(shared.address)
+    page.goto(f"{shared.root}/scene/damaged")
+    page.wait_for_selector("#fault:visible")
+    assert page.input_value("#text") == text and page.is_disabled("#make")
