@@ -33,6 +33,7 @@ NET = 240  # control points along the longer side; a product of small factors: c
 COARSE_NET = 33  # of the first rounds of stage 1
 TUBES = 288  # a side
 CELLS = 64  # of the transport, a side
+SEVERAL, TIMES = 0.5, 3  # of several goals: each of these times this, and times the evaluations
 COLD = 3  # rounds of stage 1, at least, where no earlier preview says where the light goes
 FRONT_CELLS, FRONT_NET, FRONT_STEPS = 32, 17, 40  # by which a front is sought of which something is free
 SEEN = 2.5  # ray tubes a pixel and side, by which the picture is taken: others than those that tailored the lens
@@ -47,9 +48,10 @@ class Pains:
 
     rounds: int  # of stage 1
     evaluations: int  # of stage 2
+    blurred: int  # the same of a source of some size, each of which takes twice as long
 
 
-AT_ONCE, SETTLED = Pains(rounds=2, evaluations=12), Pains(rounds=4, evaluations=40)
+AT_ONCE, SETTLED = Pains(rounds=2, evaluations=12, blurred=8), Pains(rounds=4, evaluations=40, blurred=30)
 
 
 class Outdated(Exception):
@@ -89,12 +91,11 @@ def preview(
     _, edge, wanted = pipeline.within_reach(small, told)
     knobs = small.tailoring.resolved(small.lens.back.net)
     task = pipeline.task_of(small, wanted[0], knobs, edge, further=wanted[1:], progress=told)
-    task = pipeline.posed(small, task)
-    lens = small.flat_lens(knobs.levels[0], torch.float32, as_wide_as=knobs.levels[-1])
+    task = replace(pipeline.posed(small, task), hasty=True)
+    lens = small.flat_lens(knobs.levels[0], as_wide_as=knobs.levels[-1])
     start = before if before is not None and _alike(before.scene, small) else None
     *_, last = (step for step in _first_stage(task, lens, start) if told("stage 1", 0, 0, "") is None)
     lens = small.as_mounted(last.lens)
-    pipeline.check_thickness(lens, small)
     bounds = held(lens, task.bounds, task.least)
     if bounds is not None:
         lens = kept(moved_clear(lens, lens.back.z, task.least, bounds), bounds)
@@ -106,6 +107,8 @@ def preview(
         lens = kept(lens, bounds)
     lens = small.as_mounted(replace(lens.plain(), index=small.index, losses=None))
     found = _lit(small, task, lens, wanted)
+    if not found.shape["thickness_min"] > 0 or not small.clearance(lens.front.z + found.shape["thickness_max"]) > 0:
+        pipeline.check_thickness(lens, small)
     return replace(found, remarks=tuple(remarks), round=last.state, seconds=time.perf_counter() - began)
 
 
@@ -123,21 +126,25 @@ def _listening(outdated: Callable[[], bool], remarks: list[str]) -> Progress:
 
 def made_small(scene: Scene, pains: Pains) -> Scene:
     """The scene with the pixels, control points and knobs of a preview; its method is that of this program."""
-    net = coarser(scene.lens.back.control_points or NET, NET)
-    if max(both(net)) > NET:
-        net = coarser(net, NET)
+    several = len(scene.targets) > 1 or scene.wavefront is not None
+    share, times = (SEVERAL, TIMES) if several else (1.0, 1)
+    most = round(share * NET)
+    net = scene.lens.back.control_points or NET
+    if max(both(net)) > most:
+        net = coarser(net, most)
+    evaluations = times * (pains.evaluations if scene.source.extent is None else pains.blurred)
     changes: dict[str, Any] = dict.fromkeys(f"tailoring.{key}" for key in ("method", "accuracy", "max_time"))
     changes |= {
         "lens.back.control_points": net,
         "tailoring.quality": "draft",
         "tailoring.levels": [coarser(net, COARSE_NET), net] if max(both(net)) > 1.5 * COARSE_NET else None,
-        "tailoring.rays": TUBES,
+        "tailoring.rays": round(share * TUBES),
         "tailoring.transport_grid": CELLS,
-        "tailoring.stage2_iterations": pains.evaluations,
+        "tailoring.stage2_iterations": evaluations,
         "tailoring.rounds": pains.rounds,
     }
     for key, target in zip(scene.target_keys, scene.targets, strict=True):
-        factor = max(max(target.columns_rows) / PIXELS, 1.0)
+        factor = max(max(target.columns_rows) / (share * PIXELS), 1.0)
         changes[f"{key}.pixels"] = [max(round(n / factor), 8) for n in target.columns_rows]
     return scene.changed(changes)
 
@@ -146,7 +153,8 @@ def _alike(one: Scene, other: Scene) -> bool:
     """Is the map of light through the one lens a start for the other?"""
     a, b = one.lens, other.lens
     sizes = (a.outline, a.back.net, a.back.reflect, a.shaped) == (b.outline, b.back.net, b.back.reflect, b.shaped)
-    return sizes and len(one.targets) == len(other.targets) and one.source.kind == other.source.kind
+    pixels = [[target.columns_rows for target in scene.targets] for scene in (one, other)]
+    return sizes and pixels[0] == pixels[1] and one.source.kind == other.source.kind
 
 
 def _first_stage(task: Task, lens: Lens, before: Preview | None) -> Iterator[Step]:
@@ -160,8 +168,8 @@ def _first_stage(task: Task, lens: Lens, before: Preview | None) -> Iterator[Ste
         state = replace(before.round, round=0)
     else:
         task = replace(task, knobs=task.knobs.model_copy(update={"rounds": max(COLD, task.knobs.rounds)}))
-    if task.free:
-        lens = _with_front(task, lens)
+    if task.free:  # the front of before suits well enough at once
+        lens = lens.with_front(before.lens.front) if state is not None else _with_front(task, lens)
     if state is not None:  # the back of before, the front of now
         state = replace(state, lens=replace(state.lens, front=Parameters.of(lens).front))
     yield from stage1.follow_slopes(task, lens, state)

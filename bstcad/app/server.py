@@ -21,7 +21,7 @@ import jinja2
 import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import Request
 from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.staticfiles import StaticFiles
@@ -507,9 +507,9 @@ def bound(port: int) -> Iterator[socket.socket]:
 def serve(given: Path | None, port: int, say: Callable[[str], None], show: Callable[[str], Any]) -> None:
     """Serve the workbench until a Ctrl-C.  say: called with sentences for the terminal; show: with the address."""
     workspace, page = Workspace.of(given)
-    workbench, token = Workbench(workspace), secrets.token_urlsafe(24)
     with bound(port) as own:
-        number = own.getsockname()[1]
+        number, token = own.getsockname()[1], secrets.token_urlsafe(24)
+        workbench = Workbench(workspace)
         guarded = Guard(workbench.app, number, token, larger=(UPLOAD, LARGEST_UPLOAD))
         config = uvicorn.Config(
             guarded, log_level="error", access_log=False, server_header=False, timeout_graceful_shutdown=int(SLOWEST),
@@ -518,9 +518,10 @@ def serve(given: Path | None, port: int, say: Callable[[str], None], show: Calla
         address = f"http://127.0.0.1:{number}{page}?token={token}"
         say(f"Workbench: {address}")
         say("It is for this machine alone; Ctrl-C ends it, and designs under way can be gone on with.")
-        show(address)
-        with contextlib.suppress(KeyboardInterrupt, ClientDisconnect):
-            uvicorn.Server(config).run(sockets=[own])
-    stopped = workbench.end()
-    for run in stopped:
-        say(f"{run.design.name}: is stopped and kept; bstcad app goes on with it")
+        try:
+            show(address)
+            with contextlib.suppress(KeyboardInterrupt):
+                uvicorn.Server(config).run(sockets=[own])
+        finally:
+            for run in workbench.end():
+                say(f"{run.design.name}: is stopped and kept; bstcad app goes on with it")

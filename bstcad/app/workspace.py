@@ -165,17 +165,20 @@ class Workspace:
             else:
                 new_scene.new_scene(name, self.scenes, template=template)
             if key and (template or given is None):
-                self._show(name, key, value)
+                self._show(name, key, value, plate=None if template else new_scene.Plate.of(light))
         return name
 
-    def _show(self, name: str, key: str, value: str) -> None:
-        """Write another picture into a new scene file, which an error leaves no trace of."""
+    def _show(self, name: str, key: str, value: str, plate: new_scene.Plate | None) -> None:
+        """Write another picture into a new scene file, which an error leaves no trace of; plate: that it is of."""
         path = self.path(name)
         try:
             text = _text(path)
             targets = tables(text)["target"]
-            target = "target[0]" if isinstance(targets, list) and len(targets) > 1 else "target"
-            files.put(path, _encoded(name, changed(text, f"{target}.{key}", value)))
+            key = f"target[0].{key}" if isinstance(targets, list) and len(targets) > 1 else f"target.{key}"
+            text = changed(text, key, value)
+            if plate is not None and (blurred := plate.blurred(self.scene(name, text))) is not None:
+                text = changed(plate.text(name, blurred=blurred), key, value)  # its limit is for this picture
+            files.put(path, _encoded(name, text))
         except BaseException:
             path.unlink()
             raise

@@ -127,11 +127,11 @@ class SlopeMap:
 
 def slope_map(
     source: Source, lens: Lens, window: Rectangle, picture: np.ndarray, screen: Screen, n: int,
-    previous: SlopeMap | None, **solver,
+    previous: SlopeMap | None, hasty: bool = False, **solver,
 ) -> SlopeMap:  # fmt: skip
     """One round: transport on n x n cells for the sag of `lens`, with b(t) of the round before (the axis at first).
 
-    window: `lit_window` of the lens.
+    window: `lit_window` of the lens.  hasty: with g of the round before, which takes as long as all else.
     """
     side = max(window.width, window.height)
     grid = face_grid(source, lens, Rectangle(side, side), n * SUBCELLS)
@@ -139,7 +139,7 @@ def slope_map(
     t_x, t_y = pixel_corners(screen)
     b_x, b_y = previous.places if previous else (np.zeros_like(t_x), np.zeros_like(t_y))
     sign = -1.0 if lens.last_freeform.law.reverses else 1.0
-    net = gathering(grid, lens, screen.plane, centroid(picture, screen))
+    net = previous.gathering if hasty else gathering(grid, lens, screen.plane, centroid(picture, screen))
     needed = _needed(grid, lens, screen.plane, b=(b_x, b_y), t=(t_x, t_y))
     _, *g = net.relative_sag_and_slope(*(torch.from_numpy(p) for p in (b_x, b_y)))
     y_x, y_y = (sign * (p - own.numpy()) for p, own in zip(needed, g, strict=True))

@@ -4,7 +4,6 @@ import asyncio
 import json
 import struct
 import zlib
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from urllib.parse import unquote
@@ -71,9 +70,9 @@ class Asking:
     app: object
 
     def __call__(self, target, body=b"", method=None, **headers):
-        """The answer; a header whose value is None is not sent.  body: bytes, parts of them, or what is JSON."""
-        if not isinstance(body, bytes | Iterable) or isinstance(body, dict | str | list):
-            body = json.dumps(body).encode()
+        """The answer; a header that is None is not sent.  body: a text, bytes, parts of them, or a table as JSON."""
+        body = json.dumps(body) if isinstance(body, dict) else body
+        body = body.encode() if isinstance(body, str) else body
         parts = [body] if isinstance(body, bytes) else body
         method = method or ("POST" if body != b"" else "GET")
         own = {"host": HOST, "cookie": f"bstcad-{PORT}={TOKEN}"} | {k.replace("_", "-"): v for k, v in headers.items()}

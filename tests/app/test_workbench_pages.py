@@ -196,7 +196,7 @@ def test_two_designs_are_compared(open_page, shared):
     page.click("text=Compare the chosen ones")
     rows = {row.locator("th").inner_text() for row in page.locator("tbody tr").all()}
     assert rows == {"name", "target.z"}
-    assert page.locator("#curve path").count() == 2
+    page.wait_for_selector("#curve path.line-1", state="attached")
 
 
 def test_nobody_is_shut_out(open_page, shared):
