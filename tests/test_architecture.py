@@ -44,8 +44,12 @@ MAY_IMPORT = {
     # Designs come about in processes of their own; a sweep times and judges with the engine's tools.
     "sweep": {"runs", "scene", "optics", "tailoring", "analysis", "verify", "report", "designs", "bstcad"},
     "tolerance": {"runs", "scene", "optics", "cad", "verify", "report", "designs", "bstcad"},
-    "commands": {*ENGINE, "designs", "sweep", "tolerance", "bstcad"},
-    "bstcad": {*ENGINE, "commands"},  # __init__
+    "commands": {*ENGINE, "designs", "sweep", "tolerance", "app", "bstcad"},
+    # The workbench's previews are designs made small, by the steps of tailoring.
+    "app": {
+        "runs", "scene", "optics", "tailoring", "analysis", "report", "designs", "sweep", "commands", "bstcad",
+    },
+    "bstcad": {*ENGINE, "commands", "app"},  # __init__
 }
 # A library, and the only parts that may import it.
 ONLY = {
@@ -57,6 +61,10 @@ ONLY = {
     "vtkmodules": {"report"},
     "pydantic": {"scene", "report", "sweep"},
     "typer": {"commands"},
+    "starlette": {"app"},
+    "uvicorn": {"app"},
+    "tomlkit": {"app"},
+    "ipywidgets": {"app"},
     "ezdxf": {"report"},
     "loky": {"runs"},
     "filelock": {"runs"},
@@ -374,7 +382,7 @@ def test_a_start_is_light(start):
 PUBLIC = """
     design open mounted Design Report Scene load LensBlank Back Accept Target Collimated Point Circle Rectangle
     Plane Sphere Conic Interface Refract Reflect cross measure Effort Light Lens BSplineSurface Channel Screen Tailoring
-    SceneError Check RayTubes Surface trace effect __version__
+    SceneError Check RayTubes Surface trace effect workbench __version__
 """
 
 

@@ -18,11 +18,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import psutil
-
 from bstcad import folder as folders
 from bstcad.app.design_process import JOB, JOBS, LIGHT, SCENE, STATE, WORDS, State
 from bstcad.runs import files
+from bstcad.runs.processes import command_of
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 
@@ -104,11 +103,7 @@ class Run:
 
     def _lives(self, process: int) -> bool:
         """Is that process the one of this run?  The system gives the numbers of ended processes to others."""
-        try:
-            found = psutil.Process(process)
-            return found.status() != psutil.STATUS_ZOMBIE and str(self.place) in found.cmdline()
-        except (psutil.Error, ValueError, OverflowError):
-            return False
+        return str(self.place) in command_of(process)
 
     def news(self, since: int) -> dict[str, Any]:
         """Its state, and the lines of its progress from number `since` on.

@@ -378,10 +378,14 @@ class Workbench:
         ending = next((ending for start, ending in CLOUDS if data[:80].lstrip().lower().startswith(start)), ".csv")
         if ending == ".csv" and b"\0" in data[:200]:
             ending = ".stl"  # a binary one
-        return await run_in_threadpool(self._begin, request, "measured", {}, {f"cloud{ending}": data})
+        return await run_in_threadpool(self._begin, request, "measured", contents={f"cloud{ending}": data})
 
     def _begin(
-        self, request: Request, kind: str, job: Mapping[str, Any], contents: Mapping[str, bytes] | None = None
+        self,
+        request: Request,
+        kind: str,
+        job: Mapping[str, Any] | None = None,
+        contents: Mapping[str, bytes] | None = None,
     ) -> Response:
         run = Run(self.workspace.design(request.path_params["name"]), kind)
         self.workspace.file(run.design.name, "lens.step")

@@ -28,9 +28,9 @@ def svg(data: Mapping[str, Any]) -> str:
     z = _number(targets[0], "z")
     away = None if None in (z, back) else z - back
     thick = None if None in (front, back) else back - front
-    parts += _dimension(LENS + (0 if mirror else LEAST), WALL, HIGH - 20, _mm(away), "target.z")
+    parts += _dimension(LENS + (0 if mirror else LEAST), WALL, HIGH - 20, words=_mm(away), of="target.z")
     if not mirror:
-        parts += _dimension(LENS, LENS + LEAST, HIGH - 52, _mm(thick), "lens.back.z")
+        parts += _dimension(LENS, LENS + LEAST, HIGH - 52, words=_mm(thick), of="lens.back.z")
     parts += _upright(LENS - 16, LENS_HALF, _across(lens.get("outline")), "lens.outline")
     parts += _upright(WALL + 40, WALL_HALF, _range(targets[0].get("y")), "target.y")
     parts.append(_label(WALL, AXIS - WALL_HALF - 10, _range(targets[0].get("x")), "target.x"))

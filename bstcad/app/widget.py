@@ -14,8 +14,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-import tomli_w
-
+from bstcad import folder as folders
 from bstcad.app import form, preview_json, scene_text
 from bstcad.app.followers import with_followers
 from bstcad.app.preview import Outdated, Preview, preview
@@ -42,33 +41,38 @@ class Workbench:
         except ImportError:
             raise SceneError("ipywidgets is not installed; pip install 'bstcad[app]' brings it") from None
         self._widgets = ipywidgets
-        if isinstance(scene, Scene):
-            self.scene, self._given, self._path = scene, scene, Path("scene.toml")
-            self.text = tomli_w.dumps(scene.model_dump(mode="json", exclude_none=True))
-        else:
-            self._path, self._given = Path(scene), None
-            self.text, _ = scene_file.read(self._path)
-            self.scene = load(self._path)
+        self._path = None if isinstance(scene, Scene) else Path(scene).expanduser()
+        self.scene = scene if isinstance(scene, Scene) else load(self._path)
+        self.text = self.scene.toml() if self._path is None else scene_file.read(self._path)[0]
         self.preview: Preview | None = None  # of the scene, if one could be made
         self._number, self._lock = 0, threading.Lock()
         self._said, self._light = ipywidgets.HTML(), ipywidgets.HTML()
-        self._fields = ipywidgets.VBox()
-        self._draw_fields()
-        self.box = ipywidgets.HBox([ipywidgets.VBox([self._light, self._said]), self._fields])
+        found = form.form(scene_text.tables(self.text)).first  # the keys that most people need
+        self.controls = {field.key: self._control(field) for field in found}
+        self.box = ipywidgets.HBox(
+            [ipywidgets.VBox([self._light, self._said]), ipywidgets.VBox(list(self.controls.values()))]
+        )
         self.refresh()
 
     def set(self, key: str, value: Any) -> None:
         """Change a value by its dotted key, as the widgets do, and show the preview.  SceneError; then it stays."""
-        text = self.text
-        for other, own in with_followers(scene_text.tables(text), key, value).items():
-            text = scene_text.changed(text, other, own)
-        self.scene, self.text = self._loaded(text), text
+        changes = with_followers(scene_text.tables(self.text), key, value)
+        if self._path is None:  # a scene holds its pictures, and its text only names them
+            self.scene = self.scene.changed(changes)
+            self.text = self.scene.toml()
+        else:
+            text = self.text
+            for other, own in changes.items():
+                text = scene_text.changed(text, other, own)
+            self.scene, self.text = of_text(text, scene_file.tables(text, self._path), self._path), text
         self.refresh()
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the scene's text to a file, comments and all; the path."""
-        path = Path(path)
-        files.put(path, self.text.encode())
+        """Write the scene to a file, comments and all, the pictures of a scene that came as an object beside it."""
+        path = Path(path).expanduser()
+        beside = folders.scene_files(self.scene) if self._path is None else {}
+        for name, data in (beside | {folders.SCENE: self.text.encode()}).items():
+            files.put(path if name == folders.SCENE else path.with_name(name), data)
         return path
 
     def refresh(self) -> None:
@@ -86,23 +90,7 @@ class Workbench:
         self.preview = found
         self._show(preview_json.of_preview(found))
 
-    def _loaded(self, text: str) -> Scene:
-        """The scene of a text; of a scene that came as an object with the pictures and nets that it holds."""
-        data = scene_file.tables(text, self._path)
-        if self._given is None:
-            return of_text(text, data, self._path)
-        changes = {
-            key: value for key, value in _leaves(data).items() if _leaves(scene_text.tables(self.text)).get(key) != value
-        }  # fmt: skip
-        gone = _leaves(scene_text.tables(self.text)).keys() - _leaves(data).keys()
-        return self.scene.changed(dict.fromkeys(gone) | changes)
-
     # ---- what is seen ----
-
-    def _draw_fields(self) -> None:
-        """A widget for each of the keys that most people need."""
-        found = form.form(scene_text.tables(self.text)).first
-        self._fields.children = tuple(self._control(field) for field in found)
 
     def _control(self, field: form.Field) -> Any:
         widgets, words = self._widgets, f"{field.label}{f' ({field.unit})' if field.unit else ''}"
@@ -150,12 +138,3 @@ class Workbench:
     def _repr_mimebundle_(self, **options: Any) -> Any:
         """For a notebook: the widgets."""
         return self.box._repr_mimebundle_(**options)
-
-
-def _leaves(table: Any, at: str = "") -> dict[str, Any]:
-    """The values of tables by dotted key; a list of tables is one value."""
-    found: dict[str, Any] = {}
-    for name, value in table.items():
-        key = f"{at}.{name}".lstrip(".")
-        found |= _leaves(value, key) if isinstance(value, dict) else {key: value}
-    return found

@@ -40,6 +40,17 @@ def runs(process: int) -> bool:
         return False
 
 
+def command_of(process: int) -> tuple[str, ...]:
+    """The words of the command line of a process; () if there is none of that number, or it has ended already."""
+    import psutil
+
+    try:
+        found = psutil.Process(process)
+        return () if found.status() == psutil.STATUS_ZOMBIE else tuple(found.cmdline())
+    except (psutil.Error, ValueError, OverflowError):
+        return ()
+
+
 def _end_with(parent: int, end: Callable[[], Any]) -> None:
     """Call `end`, which ends this process, as soon as the process that started this one is gone."""
 

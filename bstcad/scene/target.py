@@ -241,7 +241,7 @@ def drawing(target: Target) -> Drawing:
     return _drawing(target.model_copy(update=ELSEWHERE))  # the same wherever it falls
 
 
-@functools.lru_cache(maxsize=4)  # a photograph takes half a second, and is asked for when it is read and when it is used
+@functools.lru_cache(maxsize=4)  # a photograph takes half a second, and is asked for when it is read and when used
 def _drawing(target: Target) -> Drawing:
     pixels, size, remarks = target.columns_rows, target.size, ()
     if lies := target.rotate in (90, 270):  # the light is turned once it is made

@@ -136,7 +136,9 @@ def test_the_keyboard_alone_leads_from_the_start_to_a_changed_preview(open_page,
     seen = page.get_attribute(SEEN, "src")
     for _ in range(80):
         page.keyboard.press("Tab")
-        if page.evaluate("document.activeElement.type === 'range' && document.activeElement.dataset.key === 'target.z'"):
+        if page.evaluate(
+            "document.activeElement.type === 'range' && document.activeElement.dataset.key === 'target.z'"
+        ):
             break
     page.keyboard.press("ArrowRight")
     page.wait_for_selector(f"{SEEN}:not([src='{seen}'])", timeout=PATIENCE)
@@ -168,7 +170,10 @@ def test_a_design_goes_on_without_its_page_and_is_the_one_of_the_command(open_pa
     assert commands.verify(step).passed
     done = commands.generate(load(shared.folder / "made.toml"), tmp_path / "alone")
     assert done.passed
-    nets = [folders.read_nominal(place)[1].lens.back.control_points() for place in (shared.folder / "made", tmp_path / "alone")]
+    nets = [
+        folders.read_nominal(place)[1].lens.back.control_points()
+        for place in (shared.folder / "made", tmp_path / "alone")
+    ]
     assert np.array_equal(*nets)  # to the last bit
     with again.expect_download() as download:
         again.click("text=All files (ZIP)")
