@@ -20,6 +20,7 @@ from typing import Any
 
 from bstcad import folder as folders
 from bstcad.app.design_process import JOB, JOBS, LIGHT, SCENE, STATE, WORDS, State
+from bstcad.app.workspace import NAME
 from bstcad.runs import files
 from bstcad.runs.processes import command_of
 from bstcad.scene.errors import SceneError
@@ -97,9 +98,10 @@ class Run:
 
     def _stated(self) -> State:
         try:
-            return State(**json.loads(files.contents(self.place / STATE, LARGEST)))
-        except (ValueError, TypeError):
+            found = State(**json.loads(files.contents(self.place / STATE, LARGEST)))
+        except (ValueError, TypeError, RecursionError):
             return NONE
+        return found if isinstance(found.process, int) and isinstance(found.sentence, str) else NONE
 
     def _lives(self, process: int) -> bool:
         """Is that process the one of this run?  The system gives the numbers of ended processes to others."""
@@ -115,7 +117,7 @@ class Run:
             lines = files.contents(self.place / WORDS, LARGEST).decode("utf-8", "replace").split("\n")[:-1]
         except ValueError:
             lines = []
-        told = [json.loads(line) for line in lines[max(since, 0) :]]
+        told = [found for line in lines[max(since, 0) :] if (found := _read(line)) is not None]
         resumable = state.state in ("stopped", "failed") and self.kind == DESIGN
         stamp = {"light": self._stamp(LIGHT), "next": len(lines), "now": time.time()}
         return asdict(state) | stamp | {"lines": told, "resumable": resumable, "kind": self.kind}
@@ -133,6 +135,15 @@ class Run:
             return files.contents(self.place / LIGHT, LARGEST)
         except ValueError:
             return b""
+
+
+def _read(line: str) -> list[Any] | None:
+    """A line of progress; None for one that a full disk or a kill has cut."""
+    try:
+        at, stage, done, total, text = json.loads(line)
+    except (ValueError, TypeError, RecursionError):
+        return None
+    return [at, str(stage), done, total, str(text)]
 
 
 def begin_design(scene: Scene, design: Path) -> Run:
@@ -156,8 +167,9 @@ def all_runs(designs: Path) -> list[Run]:
     found = []
     for kind in JOBS:
         for path in sorted(designs.glob(f".*.{kind}-run")) if designs.is_dir() else ():
-            if (path / STATE).is_file():
-                found.append(Run(designs / path.name[1 : -len(f".{kind}-run")], kind))
+            name = path.name[1 : -len(f".{kind}-run")]
+            if (path / STATE).is_file() and NAME.fullmatch(name):
+                found.append(Run(designs / name, kind))
     return found
 
 

@@ -23,14 +23,16 @@ FIRST: tuple[Mapping[str, str], ...] = (  # what most people change: a key and i
         "target.image": "Picture", "target.text": "Letters as the picture", "target.sample": "Sample as the picture",
         "target.uniform": "Even light, no picture", "target.profile.shape": "Shape of light, no picture",
     },
-    {"target.z": "Distance to the wall"},
-    {"target.x": "Width of the picture on the wall (its two ends)"},
-    {"target.y": "Height of the picture on the wall (its two ends)"},
+    {"target.z": "Place of the wall (z)"},
+    {"target.x": "Picture on the wall, its ends in x"},
+    {"target.y": "Picture on the wall, its ends in y"},
+    {"lens.outline.shape": "Outline of the lens"},
     {
         "lens.outline.width": "Width of the lens", "lens.outline.diameter": "Diameter of the lens",
         "lens.outline.radius": "Radius of the lens",
     },
     {"lens.outline.height": "Height of the lens"},
+    {"lens.back.z": "Back of the lens (z)"},
     {"lens.material": "Material", "lens.index": "Refractive index"},
     {"source.kind": "Light"},
     {"source.wavelength": "Wavelength"},
@@ -264,11 +266,17 @@ class Slider:
     most: str
     step: str
     value: str
+    middle: str = ""  # of a pair, whose width the slider has: both ends move about it
 
 
 def slider(field: Field) -> Slider | None:
-    """A slider from half to double the number of a field, within its range; None: it has no such number."""
-    value = number(field.value or field.default or field.example) if field.control == "number" else None
+    """A slider from half to double the number of a field, or the width of its pair; None: it has no such number."""
+    words, middle = field.value or field.default or field.example, ""
+    value = number(words) if field.control == "number" else None
+    if field.control == "pair":
+        ends = [number(part) for part in words.replace(";", ",").split(",")]
+        if len(ends) == 2 and None not in ends:
+            value, middle = ends[1] - ends[0], f"{(ends[0] + ends[1]) / 2:.12g}"
     if not value or field.least is None or field.most is None:
         return None
     low, high = sorted((value / 2, 2 * value))
@@ -278,7 +286,7 @@ def slider(field: Field) -> Slider | None:
     ten = 10.0 ** math.floor(math.log10((high - low) / STEPS))
     step = next(figure * ten for figure in ROUND if figure * ten * STEPS <= high - low)
     ends = math.ceil(low / step) * step, math.floor(high / step) * step
-    return Slider(*(f"{each:.12g}" for each in (*ends, step, value)))
+    return Slider(*(f"{each:.12g}" for each in (*ends, step, value)), middle)
 
 
 def html(form: Form, errors: Mapping[str, str]) -> str:

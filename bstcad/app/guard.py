@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 import secrets
 from collections.abc import Awaitable, Callable, MutableMapping
-from html import escape
 from typing import Any
 from urllib.parse import parse_qs, quote
 
@@ -119,12 +118,10 @@ def _onward(path: str, from_own: bool) -> Response:
     A redirect goes on counting as the first page's: one from a terminal in a web page ends in a page that is asked for
     from elsewhere, and without the strict cookie.  So a page of our own leads on from there.
     """
-    place = quote("/" + path.lstrip("/"))  # //name would be another server
+    place = quote("/" + path.lstrip("/"))  # //name would be another server; no quotation mark is left
     if from_own:
         return RedirectResponse(place, status_code=303)
-    return HTMLResponse(
-        f'<!doctype html><title>bstcad</title><meta http-equiv="refresh" content="0;url={escape(place)}">'
-    )
+    return HTMLResponse(f'<!doctype html><title>bstcad</title><meta http-equiv="refresh" content="0;url={place}">')
 
 
 class _Body:

@@ -105,7 +105,8 @@ def cast(node: Node, value: Any) -> Any:
         taken = type(value) in TYPES[node["type"]]
     if not taken:
         raise ValueError
-    return float(value) if node.get("type") == "number" else value
+    is_number = node.get("type") == "number" and abs(value) < 10**300
+    return float(value) if is_number else value
 
 
 def _cast_table(union: list[Node], table: Any) -> dict[str, Any]:

@@ -29,9 +29,7 @@ from bstcad.tailoring.run import Parameters, Progress, Step, Task
 from bstcad.tailoring.source_image import BlurredMerit
 
 PIXELS = 128  # of a picture's longer side
-NET = 240  # control points along the longer side; a product of small factors: cosine transforms of it are quick
 COARSE_NET = 33  # of the first rounds of stage 1
-TUBES = 288  # a side
 CELLS = 64  # of the transport, a side
 SEVERAL, TIMES = 0.5, 3  # of several goals: each of these times this, and times the evaluations
 COLD = 3  # rounds of stage 1, at least, where no earlier preview says where the light goes
@@ -46,12 +44,15 @@ SEED = 77  # of those rays
 class Pains:
     """How much work goes into a preview."""
 
+    net: int  # control points along the longer side; of small factors, by which cosine transforms are quick
+    tubes: int  # a side
     rounds: int  # of stage 1
     evaluations: int  # of stage 2
     blurred: int  # the same of a source of some size, each of which takes twice as long
 
 
-AT_ONCE, SETTLED = Pains(rounds=2, evaluations=12, blurred=8), Pains(rounds=4, evaluations=40, blurred=30)
+AT_ONCE = Pains(net=240, tubes=288, rounds=2, evaluations=12, blurred=8)
+SETTLED = Pains(net=320, tubes=384, rounds=4, evaluations=50, blurred=30)
 
 
 class Outdated(Exception):
@@ -128,8 +129,8 @@ def made_small(scene: Scene, pains: Pains) -> Scene:
     """The scene with the pixels, control points and knobs of a preview; its method is that of this program."""
     several = len(scene.targets) > 1 or scene.wavefront is not None
     share, times = (SEVERAL, TIMES) if several else (1.0, 1)
-    most = round(share * NET)
-    net = scene.lens.back.control_points or NET
+    most = round(share * pains.net)
+    net = scene.lens.back.control_points or most
     if max(both(net)) > most:
         net = coarser(net, most)
     evaluations = times * (pains.evaluations if scene.source.extent is None else pains.blurred)
@@ -138,7 +139,7 @@ def made_small(scene: Scene, pains: Pains) -> Scene:
         "lens.back.control_points": net,
         "tailoring.quality": "draft",
         "tailoring.levels": [coarser(net, COARSE_NET), net] if max(both(net)) > 1.5 * COARSE_NET else None,
-        "tailoring.rays": round(share * TUBES),
+        "tailoring.rays": round(share * pains.tubes),
         "tailoring.transport_grid": CELLS,
         "tailoring.stage2_iterations": evaluations,
         "tailoring.rounds": pains.rounds,

@@ -25,6 +25,7 @@ from bstcad.app.words import as_words as as_words
 from bstcad.app.words import braced, quoted
 from bstcad.app.words import shown as shown
 from bstcad.app.words import typed as typed
+from bstcad.scene import scene_file
 from bstcad.scene.errors import SceneError
 from bstcad.scene.schema import TAGS, Node, records, schema
 
@@ -38,11 +39,24 @@ Steps = tuple[str | int, ...]  # of a table or a key: names, and the number of a
 
 def tables(text: str) -> dict[str, Any]:
     """The tables of a scene's text."""
+    if scene_file.too_dotted(text):
+        raise SceneError(f"the text has a line of over {scene_file.DOTS} dots, which is no scene; shorten that line")
     try:
-        return tomllib.loads(text)
+        found = tomllib.loads(text)
+        huge = _has_huge(found)
     except (ValueError, RecursionError) as error:
         fault = str(error)[:1].lower() + str(error)[1:]
         raise SceneError(f"the text is not valid TOML: {fault}; mend that line") from None
+    if huge:
+        raise SceneError("the text has a number of over 300 digits; shorten it")
+    return found
+
+
+def _has_huge(value: Any) -> bool:
+    """Is a whole number in it that no decimal number can be?"""
+    if isinstance(value, dict | list):
+        return any(map(_has_huge, value.values() if isinstance(value, dict) else value))
+    return isinstance(value, int) and abs(value) >= 10**300
 
 
 def changed(text: str, key: str, value: Any) -> str:

@@ -38,17 +38,18 @@ from bstcad.report import record
 from bstcad.report.report import VIEWER
 from bstcad.runs import files
 from bstcad.runs.files import SentenceError
-from bstcad.scene import new_scene
+from bstcad.scene import new_scene, scene_file
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.picture import SAMPLES
+from bstcad.scene.scene_file import DOTS
 
 PATIENCE = 20.0  # seconds that an answer is waited for; then the page asks again
-UPLOAD = "/api/picture"  # where more may be sent
+UPLOAD = "/api/picture"
+LARGER = rf"{UPLOAD}|/api/design/[^/]+/measured"  # where more may be sent
 STATIC, SITES = (
     Path(__file__).parent / "static",
     (Path(__file__).parents[1] / "site", Path(__file__).parents[2] / "docs/_build/html"),
 )
-LARGEST_REPORT = 600_000_000  # bytes
 SHOWN = {".html": "text/html", ".json": "application/json", ".png": "image/png", ".pdf": "application/pdf"}
 SLOWEST = 5.0  # seconds that open requests have when the server ends
 CLOUDS = ((b"ply", ".ply"), (b"solid", ".stl"))  # how files of measured points begin
@@ -163,8 +164,8 @@ class Workbench:
         names = self.workspace.file_names(name) if folder.is_dir() else []
         return self._page(
             "design.html.j2", title=name, name=name, report=known, files=_sorted(names),
-            rrmsd=record.rrmsds(known) if known else "", run=run.news(10**9),
-            jobs={kind: Run(folder, kind).news(10**9) for kind in ("tolerance", "tradeoff", "measured")},
+            rrmsd=record.rrmsds(known) if known else "", run=self._news(run),
+            jobs={kind: self._news(Run(folder, kind)) for kind in ("tolerance", "tradeoff", "measured")},
             has_light="figures/irradiance.png" in names,
         )  # fmt: skip
 
@@ -173,8 +174,7 @@ class Workbench:
         names = [name for name in request.query_params.getlist("design")][:4]
         known = [(name, self._report(name)) for name in names]
         found = [{"name": name, "report": report, "rrmsd": record.rrmsds(report)} for name, report in known if report]
-        texts = [files.contents(self.workspace.design(each["name"]) / "scene.toml", LARGEST_REPORT) for each in found]
-        flat = [_flat(scene_text.tables(text.decode())) for text in texts]
+        flat = [_flat(scene_file.read(self.workspace.file(each["name"], "scene.toml"))[1]) for each in found]
         keys = sorted({key for each in flat for key in each})
         rows = [(key, [each.get(key, "") for each in flat]) for key in keys if len({e.get(key) for e in flat}) > 1]
         curves = [[[point.seconds, point.rrmsd] for point in each["report"].history] for each in found]
@@ -238,17 +238,20 @@ class Workbench:
 
         def changed() -> dict[str, Any]:
             whole = "text" in asked
-            text = str(asked["text"]).replace("\r\n", "\n") if whole else self._with_value(name, asked)
-            self.workspace.change(name, text)
+            if whole:
+                self.workspace.change(name, str(asked["text"]).replace("\r\n", "\n"))
+            else:
+                self.workspace.edit(name, lambda text: self._with_value(text, asked))
             return self._state(name)
 
         return JSONResponse(await run_in_threadpool(changed))
 
-    def _with_value(self, name: str, asked: Mapping[str, Any]) -> str:
+    def _with_value(self, text: str, asked: Mapping[str, Any]) -> str:
         """The text of a scene with another value."""
-        text, key = self.workspace.opened(name).text, str(asked["key"])
-        data = scene_text.tables(text)
-        value = asked["value"] if "value" in asked else scene_text.typed(key, str(asked["words"]), data)
+        key, data = str(_given(asked, "key")), scene_text.tables(text)
+        if key.count(".") > DOTS:
+            raise SceneError(f"{key[:20]}…: is no key of a scene; reload the page")
+        value = asked["value"] if "value" in asked else scene_text.typed(key, str(_given(asked, "words")), data)
         for other, own in with_followers(data, key, value).items():
             text = scene_text.changed(text, other, own)
         return text
@@ -272,7 +275,8 @@ class Workbench:
         text = self.workspace.opened(name).text
 
         def made() -> dict[str, Any]:
-            asking = Asked(str(asked["page"])[:40], int(asked["number"]), self.workspace.scene(name, text), text)
+            page, number = str(_given(asked, "page"))[:40], _whole(_given(asked, "number"))
+            asking = Asked(page, number, self.workspace.scene(name, text), text)
             self.desk.ask(asking)
             return self._told(asking, 0)
 
@@ -281,8 +285,9 @@ class Workbench:
     async def answer(self, request: Request) -> Response:
         """A later answer to a request of a page: ?page, number and stage; {} if there is none yet."""
         query = request.query_params
-        asked, stage = self.desk.last(query["page"]), int(query["stage"])
-        if asked is None or asked.number != int(query["number"]) or not 0 <= stage < len(STAGES):
+        number, stage = _whole(_given(query, "number")), _whole(_given(query, "stage"))
+        asked = self.desk.last(_given(query, "page"))
+        if asked is None or asked.number != number or not 0 <= stage < len(STAGES):
             return JSONResponse({"replaced": True})
         return JSONResponse(await run_in_threadpool(self._told, asked, stage))
 
@@ -295,7 +300,8 @@ class Workbench:
         if isinstance(found, SentenceError):
             return head | {"refused": self.workspace.without_paths(str(found))}
         if isinstance(found, Exception):
-            return head | {"refused": f"no {name} could be made ({files.first_line(found)}); a design may do better"}
+            why = self.workspace.without_paths(files.first_line(found))
+            return head | {"refused": f"no {name} could be made ({why}); a design may do better"}
         if name in ("preview", "settled"):
             return head | preview_json.of_preview(found)
         return head | (
@@ -326,11 +332,15 @@ class Workbench:
 
     def follow(self, request: Request) -> Response:
         """How a run stands, and its progress from line `since` on."""
-        news = self._run(request).news(int(request.query_params.get("since", 0)))
+        return JSONResponse(self._news(self._run(request), _whole(request.query_params.get("since", 0))))
+
+    def _news(self, run: Run, since: int = 10**9) -> dict[str, Any]:
+        """What there is to tell of a run, without folders of this machine."""
+        news = run.news(since)
         news["sentence"] = self.workspace.without_paths(news["sentence"])
         for line in news["lines"]:
-            line[4] = self.workspace.without_paths(str(line[4]))
-        return JSONResponse(news)
+            line[4] = self.workspace.without_paths(line[4])
+        return news
 
     def light(self, request: Request) -> Response:
         """The light through the best lens so far."""
@@ -362,12 +372,13 @@ class Workbench:
         """How exactly the lens must be made: {grade, yield in percent}, each perhaps absent."""
         asked = await _json(request)
         wanted = asked.get("yield")
-        job = {"grade": asked.get("grade") or None, "yield": None if wanted in (None, "") else float(wanted) / 100}
+        share = None if wanted in (None, "") else _number(wanted, "yield") / 100
+        job = {"grade": asked.get("grade") or None, "yield": share}
         return await run_in_threadpool(self._begin, request, "tolerance", job)
 
     async def tradeoff(self, request: Request) -> Response:
         """The price of accuracy in time: {budget in seconds}."""
-        budget = float((await _json(request)).get("budget") or 600)
+        budget = _number((await _json(request)).get("budget") or 600, "budget")
         if not 1 <= budget <= 86_400:
             raise SceneError(f"budget: {budget:g} s is not between 1 s and a day; give seconds, such as 600")
         return await run_in_threadpool(self._begin, request, "tradeoff", {"budget": budget})
@@ -434,6 +445,29 @@ async def _json(request: Request) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise SceneError("the request is no table of JSON; reload the page")
     return found
+
+
+def _given(table: Mapping[str, Any], name: str) -> Any:
+    """What a request states.  SceneError."""
+    if name not in table:
+        raise SceneError(f"{name}: is missing in the request; reload the page")
+    return table[name]
+
+
+def _whole(given: Any) -> int:
+    """A whole number of a request.  SceneError."""
+    try:
+        return int(given)
+    except (ValueError, TypeError, OverflowError):
+        raise SceneError(f"{str(given)[:40]!r}: is no whole number; reload the page") from None
+
+
+def _number(given: Any, key: str) -> float:
+    """A number that a person typed.  SceneError."""
+    try:
+        return float(given)
+    except (ValueError, TypeError, OverflowError):
+        raise SceneError(f"{key}: {str(given)[:40]!r} is not a number; write one") from None
 
 
 def _zipped(name: str, paths: list[tuple[str, Path]]) -> Iterator[bytes]:
@@ -514,7 +548,7 @@ def serve(given: Path | None, port: int, say: Callable[[str], None], show: Calla
     with bound(port) as own:
         number, token = own.getsockname()[1], secrets.token_urlsafe(24)
         workbench = Workbench(workspace)
-        guarded = Guard(workbench.app, number, token, larger=(UPLOAD, LARGEST_UPLOAD))
+        guarded = Guard(workbench.app, number, token, larger=(LARGER, LARGEST_UPLOAD))
         config = uvicorn.Config(
             guarded, log_level="error", access_log=False, server_header=False, timeout_graceful_shutdown=int(SLOWEST),
             lifespan="off", ws="none", http="h11",

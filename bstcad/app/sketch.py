@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from html import escape
 from typing import Any
 
-WIDE, HIGH, AXIS = 640, 230, 108  # of the drawing, and where its axis is
+WIDE, HIGH, AXIS = 640, 250, 108  # of the drawing, and where its axis is
 LAMP, LENS, WALL = 60, 210, 560  # places along the axis
 LENS_HALF, WALL_HALF = 58, 78  # half heights
 LEAST = 34  # pixels of glass
@@ -28,9 +28,9 @@ def svg(data: Mapping[str, Any]) -> str:
     z = _number(targets[0], "z")
     away = None if None in (z, back) else z - back
     thick = None if None in (front, back) else back - front
-    parts += _dimension(LENS + (0 if mirror else LEAST), WALL, HIGH - 20, words=_mm(away), of="target.z")
+    parts += _dimension(LENS + (0 if mirror else LEAST), WALL, HIGH - 24, words=_mm(away), of="target.z")
     if not mirror:
-        parts += _dimension(LENS, LENS + LEAST, HIGH - 52, words=_mm(thick), of="lens.back.z")
+        parts += _dimension(LENS, LENS + LEAST, AXIS + LENS_HALF + 14, words=_mm(thick), of="lens.back.z")
     parts += _upright(LENS - 16, LENS_HALF, _across(lens.get("outline")), "lens.outline")
     parts += _upright(WALL + 40, WALL_HALF, _range(targets[0].get("y")), "target.y")
     parts.append(_label(WALL, AXIS - WALL_HALF - 10, _range(targets[0].get("x")), "target.x"))
@@ -89,7 +89,7 @@ def _dimension(x: float, to_x: float, y: float, words: str, of: str) -> list[str
     if not words:
         return []
     ends = [_line(end, y - 5, end, y + 5, "size") for end in (x, to_x)]
-    return [f'<g data-of="{of}">', _line(x, y, to_x, y, "size"), *ends, _label((x + to_x) / 2, y - 6, words), "</g>"]
+    return [f'<g data-of="{of}">', _line(x, y, to_x, y, "size"), *ends, _label((x + to_x) / 2, y + 16, words), "</g>"]
 
 
 def _upright(x: float, half: float, words: str, of: str) -> list[str]:

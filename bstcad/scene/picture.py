@@ -16,6 +16,7 @@ import os
 import re
 import struct
 import sys
+import threading
 import unicodedata
 import warnings
 from collections.abc import Callable, Iterator
@@ -52,6 +53,8 @@ UPRIGHT = {  # by a camera's orientation
     5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_270, 7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }  # fmt: skip
+
+_DECODING = threading.RLock()  # the error stream and the filters of warnings are the process's
 
 Box = tuple[int, int, int, int]  # whole pixels of a picture: left, top, right, bottom
 Curve = Callable[[np.ndarray], np.ndarray]  # from numbers to irradiance, both from 0 to 1
@@ -126,7 +129,7 @@ def _faults(values: np.ndarray) -> Iterator[str]:
 def decoding(name: str) -> Iterator[None]:
     """All errors of the decoders become one sentence, and their warnings are silenced."""
     try:
-        with warnings.catch_warnings(), _silent():
+        with _DECODING, warnings.catch_warnings(), _silent():
             warnings.simplefilter("ignore")
             yield
     except SceneError:

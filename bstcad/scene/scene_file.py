@@ -35,7 +35,7 @@ def read(path: Path) -> tuple[str, dict[str, Any]]:
 
 def tables(text: str, path: Path) -> dict[str, Any]:
     """The tables of a scene file's text; path: by which sentences call it."""
-    if _dotted(text):
+    if too_dotted(text):
         raise SceneError(f"{path}: has a line of over {DOTS} dots, which is no scene file; shorten that line")
     try:
         return tomllib.loads(text)
@@ -56,7 +56,7 @@ def _fault(text: str, fault: str) -> str:
     return f"{fault[:1].lower()}{fault[1:]}; {remedy}"
 
 
-def _dotted(text: str) -> bool:
+def too_dotted(text: str) -> bool:
     """Has a line that is no comment more than DOTS dots, so that reading it could take hours?"""
     return any(line.count(".") > DOTS for line in text.split("\n") if not line.lstrip().startswith("#"))
 
@@ -64,7 +64,7 @@ def _dotted(text: str) -> bool:
 def toml_value(text: str) -> Any:
     """An override as TOML has it, or else as a text."""
     try:
-        table = {} if _dotted(text) else tomllib.loads(f"value = {text}")
+        table = {} if too_dotted(text) else tomllib.loads(f"value = {text}")
     except (ValueError, RecursionError):
         return text
     return table["value"] if len(table) == 1 else text

@@ -115,11 +115,11 @@ def test_the_first_fields_are_keys_and_follow_the_kind():
     known = {plain(row.key): row for row in rows()}
     assert all(key in known and label for labels in FIRST for key, label in labels.items())
     labels = {name: {field.label: field for field in form(data).first} for name, data in DATA.items()}
-    assert {"Width of the lens", "Height of the lens", "Distance to the wall", "Quality"} <= labels["disk"].keys()
+    assert {"Width of the lens", "Height of the lens", "Place of the wall (z)", "Quality"} <= labels["disk"].keys()
     assert labels["beam_shaper"]["Diameter of the lens"].value == "15"
     assert labels["led"]["Radius of the lens"].value == "12" and "Width of the lens" not in labels["led"]
     assert labels["beam_shaper"]["Refractive index"].key == "lens.index"
-    assert labels["two_pictures"]["Distance to the wall (target 1)"].key == "target[0].z"
+    assert labels["two_pictures"]["Place of the wall (z) (target 1)"].key == "target[0].z"
     assert labels["disk"]["Even light, no picture"].control == "check"
     assert labels["white_logo"]["Wavelength"].control == "lines"
     assert all(10 <= len(first) <= len(FIRST) for first in labels.values())
@@ -143,7 +143,7 @@ VOID = {"input", "br", "hr", "img", "meta", "link"}
 ATTRIBUTES = {
     "id", "name", "class", "for", "type", "value", "checked", "selected", "inputmode", "autocomplete", "spellcheck",
     "rows", "placeholder", "min", "max", "step", "role", "href", "open", "data-key", "data-value", "data-section",
-    "aria-label", "aria-describedby", "aria-invalid", "aria-required",
+    "aria-label", "data-middle", "aria-describedby", "aria-invalid", "aria-required",
 }  # fmt: skip
 
 
@@ -207,8 +207,8 @@ def test_the_html_is_sound(name):
         assert field.control != "number" or (attrs["inputmode"], attrs["value"]) == ("decimal", field.value)
         assert field.control != "check" or ("checked" in attrs) == ((field.value or field.default) == "true")
     sliders = [attrs for _, attrs, _ in elements if attrs.get("type") == "range"]
-    numbers = [field.key for field in found.first if field.control == "number"]
-    assert [attrs["data-key"] for attrs in sliders] == numbers and len(numbers) >= 3
+    spans = [field.key for field in found.first if field.control in ("number", "pair")]
+    assert [attrs["data-key"] for attrs in sliders] == spans and len(spans) >= 3
 
 
 def test_a_sentence_stands_at_its_key_or_at_the_top():

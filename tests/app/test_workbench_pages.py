@@ -184,34 +184,32 @@ def test_a_design_goes_on_without_its_page_and_is_the_one_of_the_command(open_pa
     assert "made" in report.value.title() or "made" in report.value.inner_text("body")
 
 
+@pytest.fixture(scope="module")
+def designed(shared):
+    """Two finished designs, left and right."""
+    for name, z in (("left", 100.0), ("right", 90.0)):
+        path = shared.folder / f"{name}.toml"
+        path.write_text(SMALL.replace('"small"', f'"{name}"').replace("z = 100.0", f"z = {z}"), encoding="utf-8")
+        commands.generate(load(path), shared.folder / name)
+
+
+@pytest.mark.usefixtures("designed")
 def test_two_designs_are_compared(open_page, shared):
     page = open_page(shared.address)
-    design(page, shared, "left")
-    page.wait_for_selector("#step", timeout=PATIENCE)
-    path = shared.folder / "left.toml"
-    path.write_text(path.read_text().replace('"left"', '"right"').replace("z = 100.0", "z = 90.0"), encoding="utf-8")
-    page.goto(f"{shared.root}/scene/left")
-    page.wait_for_selector(SEEN, timeout=PATIENCE)
-    page.click("#make")
-    page.wait_for_url("**/design/right")
-    page.wait_for_selector("#step", timeout=PATIENCE)
-    page.goto(shared.root)
     for name in ("left", "right"):
         page.check(f"input[name=design][value={name}]")
     page.click("text=Compare the chosen ones")
+    page.wait_for_selector("#curve path.line-1", state="attached")
     rows = {row.locator("th").inner_text() for row in page.locator("tbody tr").all()}
     assert rows == {"name", "target.z"}
-    page.wait_for_selector("#curve path.line-1", state="attached")
 
 
+@pytest.mark.usefixtures("designed")
 def test_nobody_is_shut_out(open_page, shared):
     """axe-core finds no serious fault on any page, in light and dark, and on a telephone."""
     from axe_playwright_python.sync_playwright import Axe
 
-    page = open_page(shared.address)
-    design(page, shared, "seen")
-    page.wait_for_selector("#step", timeout=PATIENCE)
-    addresses = ("/", "/scene/small", "/design/seen", "/compare?design=seen&design=seen")
+    addresses = ("/", "/scene/small", "/design/left", "/compare?design=left&design=right")
     found = []
     for options in ({"color_scheme": "light"}, {"color_scheme": "dark", "viewport": {"width": 340, "height": 700}}):
         page = open_page(shared.address, bypass_csp=True, **options)

@@ -19,7 +19,26 @@ function take(told) {
   state = told;
   element("saved").textContent = told.saved ? "saved" : "changed, not saved yet; kept here";
   element("save").disabled = element("drop-changes").disabled = told.saved;
-  const area = element("text");
+  // A picture that is chosen, or dropped anywhere on the page, takes the place of the one that the scene has.
+async function takePicture(file) {
+  if (!file) return;
+  try {
+    const { picture } = await ask("/api/picture", file);
+    const first = form.querySelector('[data-key="target[0].z"]') ? "target[0]" : "target";
+    change({ key: `${first}.image`, value: `pictures/${picture}` });
+  } catch (error) {
+    refuse("", error.message);
+  }
+}
+
+element("picture").addEventListener("change", ({ target }) => takePicture(target.files[0]));
+document.addEventListener("dragover", (event) => event.preventDefault());
+document.addEventListener("drop", (event) => {
+  event.preventDefault();
+  takePicture(event.dataTransfer.files[0]);
+});
+
+const area = element("text");
   if (document.activeElement !== area || !area.dataset.changed) area.value = told.text;
   const error = told.error;
   element("fault").hidden = !error;

@@ -1,0 +1,101 @@
+"""Previews: they depend on the scene alone, stop when nobody waits, and are near the draft that is finished later."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bstcad import pipeline
+from bstcad.app import preview_desk
+from bstcad.app.preview import SETTLED, Outdated, preview
+from bstcad.app.preview_desk import STAGES, PreviewDesk, Request
+from bstcad.optics.measure import tubes_picture
+from bstcad.scene.errors import SceneError
+from bstcad.scene.scene import load
+from bstcad.sweep.net_choice import TWO_CORES
+
+SMALL = {"tailoring.quality": "draft", "lens.back.control_points": 129, "target.pixels": 64}
+NEAR = 0.05  # RRMSD between two pictures
+
+
+def apart(one: np.ndarray, other: np.ndarray) -> float:
+    return float(np.sqrt(((one - other) ** 2).sum() / (other**2).sum()))
+
+
+def draft(scene):
+    """The light of a finished draft, with the target's sum."""
+    made = pipeline.design(scene)
+    light = tubes_picture(made.lens, scene.channels(), scene.target.screen, 301).numpy()
+    return light * (made.target.sum() / light.sum())
+
+
+@pytest.mark.parametrize("name", ["caustic_portrait", "mirror", "off_axis"])
+def test_a_preview_is_near_the_finished_draft(name):
+    scene = load(f"templates/{name}.toml", SMALL)
+    wanted = draft(scene)
+    found = preview(scene)
+    assert apart(found.pictures[0][1], wanted) < NEAR
+    assert found.flux["on target"] > 0.9 and found.shape["thickness_min"] > 0
+
+
+def test_a_preview_is_the_same_each_time_and_nearly_the_same_from_another_scene():
+    scene = load("templates/caustic_portrait.toml", SMALL)
+    cold = preview(scene)
+    assert np.array_equal(preview(scene).pictures[0][1], cold.pictures[0][1])
+    other = preview(scene.changed({"target.z": 180.0, "target.x": [-40.0, 60.0]}), cold)
+    back = preview(scene, other)
+    assert apart(back.pictures[0][1], cold.pictures[0][1]) < NEAR
+    for changes in ({"target.pixels": 96}, {"lens.outline": {"shape": "circle", "radius": 45.0}}, {"target.text": "A"}):
+        assert np.isfinite(preview(scene.changed(changes), cold).rrmsds).all()
+
+
+@pytest.mark.parametrize("name", ["sun_caustic", "led", "two_pictures", "machinable_letters", "collimated_portrait"])
+def test_every_kind_of_scene_has_a_preview(name):
+    found = preview(load(f"templates/{name}.toml"))
+    assert len(found.pictures) == len(found.scene.targets)
+    assert max(found.rrmsds) < 0.3 and all(light.min() >= 0 for _, light in found.pictures)
+
+
+def test_a_preview_that_nobody_waits_for_ends():
+    looks = []
+    with pytest.raises(Outdated):
+        preview(load("templates/disk.toml"), outdated=lambda: looks.append(1) or len(looks) > 3)
+    assert len(looks) == 4
+
+
+def test_a_scene_that_a_design_would_refuse_is_refused():
+    scene = load(
+        "templates/caustic_portrait.toml", SMALL | {"target.x": [5000.0, 5100.0], "target.unreachable": "refuse"}
+    )
+    with pytest.raises(SceneError, match="no light reaches it"):
+        preview(scene)
+
+
+def test_the_desk_answers_the_newest_request_of_each_page_in_order(monkeypatch):
+    monkeypatch.setattr(preview_desk, "units", lambda: TWO_CORES)  # three seconds of measurement
+    desk = PreviewDesk()
+    scene = load("templates/disk.toml", {"lens.back.control_points": 65, "target.pixels": 32})
+    try:
+        first = Request("one", 1, scene)
+        desk.ask(first)
+        newer, other = Request("one", 2, scene.changed({"target.z": 150.0})), Request("two", 1, scene)
+        desk.ask(newer)
+        desk.ask(other)
+        assert desk.answer(first, 0, 60.0) is None and first.replaced
+        for request in (other, newer):
+            stage, found = desk.answer(request, 0, 60.0)
+            assert stage == "preview" and found.scene.target.z == request.scene.target.z
+        late = Request("one", 1, scene)  # which came after a newer one
+        desk.ask(late)
+        assert late.replaced and not newer.replaced
+        assert [desk.answer(newer, k, 120.0)[0] for k in range(len(STAGES))] == list(STAGES)
+        settled = newer.answers[1][1]
+        assert np.array_equal(settled.pictures[0][1], preview(newer.scene, pains=SETTLED).pictures[0][1])
+        assert set(newer.answers[2][1]["estimated"]) == {"draft", "standard", "fine"}
+        refused = Request("three", 1, scene.changed({"target.x": [9e4, 9.1e4]}))
+        desk.ask(refused)
+        assert isinstance(desk.answer(refused, 0, 60.0)[1], SceneError) and refused.done
+        desk.forget("two")
+        assert other.replaced
+    finally:
+        desk.end()
