@@ -2,7 +2,7 @@
 
 The preview is a design of the same scene with fewer pixels, control points, ray tubes and evaluations, so that a pixel
 has as many control cells and tubes as it has in a draft.  Left out are the judging of a lens on its way, and the search
-for light that has to move far.  A preview shows no detail that is finer than PIXELS a side.
+for light that has to move far.  A preview shows no detail that is finer than its pixels.
 """
 
 from __future__ import annotations
@@ -23,17 +23,18 @@ from bstcad.optics.measure import a_side, simulated, tubes_picture
 from bstcad.optics.sides import both, coarser
 from bstcad.report.light_figures import rrmsd
 from bstcad.scene.scene import Scene
+from bstcad.scene.target import Target
 from bstcad.tailoring import stage1, stage2, two_faces
 from bstcad.tailoring.machinability import front_shaped, held, kept, moved_clear
 from bstcad.tailoring.run import Parameters, Progress, Step, Task
 from bstcad.tailoring.source_image import BlurredMerit
 
-PIXELS = 128  # of a picture's longer side
 COARSE_NET = 33  # of the first rounds of stage 1
 CELLS = 64  # of the transport, a side
 SEVERAL, TIMES = 0.5, 3  # of several goals: each of these times this, and times the evaluations
 COLD = 3  # rounds of stage 1, at least, where no earlier preview says where the light goes
 FRONT_CELLS, FRONT_NET, FRONT_STEPS = 32, 17, 40  # by which a front is sought of which something is free
+NEARLY = 0.3  # of a target's size, and of its distance: from one further off no preview starts
 SEEN = 2.5  # ray tubes a pixel and side, by which the picture is taken: others than those that tailored the lens
 RAYS = 160  # a side, by which light that goes astray is counted
 SHAPE = 129  # points a side, at which the thickness is looked at
@@ -44,6 +45,7 @@ SEED = 77  # of those rays
 class Pains:
     """How much work goes into a preview."""
 
+    pixels: int  # of a picture's longer side
     net: int  # control points along the longer side; of small factors, by which cosine transforms are quick
     tubes: int  # a side
     rounds: int  # of stage 1
@@ -51,8 +53,8 @@ class Pains:
     blurred: int  # the same of a source of some size, each of which takes twice as long
 
 
-AT_ONCE = Pains(net=240, tubes=288, rounds=2, evaluations=12, blurred=8)
-SETTLED = Pains(net=320, tubes=384, rounds=4, evaluations=50, blurred=30)
+AT_ONCE = Pains(pixels=96, net=200, tubes=224, rounds=2, evaluations=12, blurred=8)
+SETTLED = Pains(pixels=128, net=320, tubes=384, rounds=4, evaluations=50, blurred=30)
 
 
 class Outdated(Exception):
@@ -145,7 +147,7 @@ def made_small(scene: Scene, pains: Pains) -> Scene:
         "tailoring.rounds": pains.rounds,
     }
     for key, target in zip(scene.target_keys, scene.targets, strict=True):
-        factor = max(max(target.columns_rows) / (share * PIXELS), 1.0)
+        factor = max(max(target.columns_rows) / (share * pains.pixels), 1.0)
         changes[f"{key}.pixels"] = [max(round(n / factor), 8) for n in target.columns_rows]
     return scene.changed(changes)
 
@@ -154,8 +156,16 @@ def _alike(one: Scene, other: Scene) -> bool:
     """Is the map of light through the one lens a start for the other?"""
     a, b = one.lens, other.lens
     sizes = (a.outline, a.back.net, a.back.reflect, a.shaped) == (b.outline, b.back.net, b.back.reflect, b.shaped)
-    pixels = [[target.columns_rows for target in scene.targets] for scene in (one, other)]
-    return sizes and pixels[0] == pixels[1] and one.source.kind == other.source.kind
+    if not sizes or one.source.kind != other.source.kind or len(one.targets) != len(other.targets):
+        return False
+    return all(_near(p, q, a.back.z) for p, q in zip(one.targets, other.targets, strict=True))
+
+
+def _near(one: Target, other: Target, z: float) -> bool:
+    """Does one target of a lens whose back is at z (mm) fall nearly where the other does?"""
+    moved = max(abs(p - q) for p, q in zip((*one.x, *one.y), (*other.x, *other.y), strict=True))
+    near = moved <= NEARLY * max(one.size) and abs(one.z - other.z) <= NEARLY * abs(one.z - z)
+    return near and one.columns_rows == other.columns_rows
 
 
 def _first_stage(task: Task, lens: Lens, before: Preview | None) -> Iterator[Step]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -27,6 +28,7 @@ from bstcad.sweep.plan import plan
 
 STAGES = ("preview", "settled", "effects", "predicted")
 MOST = 32  # pages whose last request is kept
+IDLE = 0.7  # seconds after a preview in which another change may come; then work on later answers begins
 LEFT = 60.0  # seconds without a word from a page, after which nobody waits for its answers
 
 
@@ -42,6 +44,7 @@ class Request:
         default_factory=list
     )  # (stage, answer), an answer an Exception where it failed
     replaced: bool = False  # by a later request of the page
+    shown: float = math.inf  # when its preview was made
     heard: float = field(default_factory=time.monotonic)  # when the page asked last
     plan: Iterator[dict[str, Any]] | None = None  # whose first part has been made
 
@@ -109,19 +112,24 @@ class PreviewDesk:
 
     def _work(self) -> None:
         with contextlib.suppress(Exception):  # libraries load, and kernels compile, before anybody waits for them
-            preview(first_scene(), outdated=lambda: self._ended or bool(self._requests))
+            self._latest = preview(first_scene(), outdated=lambda: self._ended or bool(self._requests))
         while True:
             with self._news:
-                self._news.wait_for(lambda: self._ended or self._next() is not None)
+                while not self._ended and self._next() is None:
+                    self._news.wait(IDLE / 4 if self._unanswered() else None)
                 if self._ended:
                     return
                 request = self._next()
             self._serve(request)
 
     def _next(self) -> Request | None:
-        """The request with the fewest answers, of these the latest: what is asked newly comes first."""
-        waiting = [request for request in self._requests.values() if not request.done]
+        """The request with the fewest answers, of these the latest: a new request comes first."""
+        now = time.monotonic()
+        waiting = [each for each in self._unanswered() if not each.answers or now > each.shown + IDLE]
         return min(reversed(waiting), key=lambda request: len(request.answers), default=None)
+
+    def _unanswered(self) -> list[Request]:
+        return [request for request in self._requests.values() if not request.done]
 
     def _outdated(self, request: Request) -> Callable[[], bool]:
         """Is the request replaced, or has another one fewer answers?"""
@@ -147,6 +155,7 @@ class PreviewDesk:
             found = fault
         with self._news:
             failed = stage == "preview" and isinstance(found, Exception)
+            request.shown = min(request.shown, time.monotonic())
             request.answers += [(each, found) for each in (STAGES if failed else (stage,))]
             self._news.notify_all()
 

@@ -6,8 +6,9 @@ import { ask, element, embedded, pause, row } from "./common.js";
 let state = embedded();
 const at = `/api/scene/${encodeURIComponent(state.name)}`, page = crypto.randomUUID();
 const QUALITIES = ["draft", "standard", "fine"], LOOK = 1500; // milliseconds between two looks for other pages' changes
-let number = 0, waiting = null, busy = false, dragging = null, viewer = null, look = "lens", qualities = {};
+let number = 0, sent = {}, waiting = null, busy = false, dragging = null, viewer = null, look = "lens", qualities = {};
 const log = (globalThis.previewLog = []); // milliseconds from each change to its preview, for measurements
+const parts = (globalThis.parts = []);
 let changedAt = null;
 
 // ---- the form ----
@@ -19,26 +20,7 @@ function take(told) {
   state = told;
   element("saved").textContent = told.saved ? "saved" : "changed, not saved yet; kept here";
   element("save").disabled = element("drop-changes").disabled = told.saved;
-  // A picture that is chosen, or dropped anywhere on the page, takes the place of the one that the scene has.
-async function takePicture(file) {
-  if (!file) return;
-  try {
-    const { picture } = await ask("/api/picture", file);
-    const first = form.querySelector('[data-key="target[0].z"]') ? "target[0]" : "target";
-    change({ key: `${first}.image`, value: `pictures/${picture}` });
-  } catch (error) {
-    refuse("", error.message);
-  }
-}
-
-element("picture").addEventListener("change", ({ target }) => takePicture(target.files[0]));
-document.addEventListener("dragover", (event) => event.preventDefault());
-document.addEventListener("drop", (event) => {
-  event.preventDefault();
-  takePicture(event.dataTransfer.files[0]);
-});
-
-const area = element("text");
+  const area = element("text");
   if (document.activeElement !== area || !area.dataset.changed) area.value = told.text;
   const error = told.error;
   element("fault").hidden = !error;
@@ -66,6 +48,8 @@ function replaceForm(html) {
 }
 
 function change(given) {
+  if (given.words !== undefined && given.key === sent.key && given.words === sent.words) return; // a slider says it twice
+  sent = given;
   changedAt = performance.now();
   waiting = given;
   if (!busy) send();
@@ -133,6 +117,25 @@ for (const [kind, lit] of [["focusin", true], ["focusout", false]]) {
   });
 }
 
+// A picture that is chosen, or dropped anywhere on the page, takes the place of the one that the scene has.
+async function takePicture(file) {
+  if (!file) return;
+  try {
+    const { picture } = await ask("/api/picture", file);
+    const first = form.querySelector('[data-key="target[0].z"]') ? "target[0]" : "target";
+    change({ key: `${first}.image`, value: `pictures/${picture}` });
+  } catch (error) {
+    refuse("", error.message);
+  }
+}
+
+element("picture").addEventListener("change", ({ target }) => takePicture(target.files[0]));
+document.addEventListener("dragover", (event) => event.preventDefault());
+document.addEventListener("drop", (event) => {
+  event.preventDefault();
+  takePicture(event.dataTransfer.files[0]);
+});
+
 const area = element("text");
 area.addEventListener("input", () => { area.dataset.changed = "yes"; });
 area.addEventListener("change", () => {
@@ -156,8 +159,10 @@ async function preview() {
     return;
   }
   if (mine !== number || told.replaced) return;
+  const answered = performance.now();
   show(told);
   log.push(performance.now() - began);
+  parts.push([answered - began, told.seconds * 1e3]);
   if (told.refused) return;
   for (let stage = 1; stage < 4; stage++) {
     do {
