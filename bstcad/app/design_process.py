@@ -177,7 +177,8 @@ def _ended(error: BaseException) -> State:
     """How a run ended that wrote no lens."""
     note = "; ".join(getattr(error, "__notes__", ()))
     if signals.ended() or isinstance(error, KeyboardInterrupt):
-        return State("stopped", sentence=note or "nothing is kept")
+        kept = "the design so far is kept" if "is kept" in note else "nothing is kept"
+        return State("stopped", sentence=kept)
     if isinstance(error, SentenceError):
         return State("refused", sentence="; ".join(filter(None, (str(error), note))))
     words = f"{type(error).__name__}: {files.first_line(error)}"

@@ -89,6 +89,8 @@ class Run:
     def state(self) -> State:
         """How it stands."""
         stated = self._stated()
+        if stated.state in ("stopped", "failed") and self._finished_elsewhere():
+            return replace(stated, state="finished", folder=self.design.name, sentence="")
         if stated.state != "running" or self._lives(stated.process):
             return stated
         again = self._stated()  # it may have ended between the two looks
@@ -102,6 +104,15 @@ class Run:
         except (ValueError, TypeError, RecursionError):
             return NONE
         return found if isinstance(found.process, int) and isinstance(found.sentence, str) else NONE
+
+    def _finished_elsewhere(self) -> bool:
+        """Did another program, such as `bstcad generate --resume`, go on with this design to its end?"""
+        if self.kind != DESIGN or files.beside(self.design, "checkpoint").exists():
+            return False
+        try:
+            return (self.design / "report.json").stat().st_mtime > (self.place / STATE).stat().st_mtime
+        except OSError:
+            return False
 
     def _lives(self, process: int) -> bool:
         """Is that process the one of this run?  The system gives the numbers of ended processes to others."""

@@ -105,10 +105,13 @@ class Workbench:
         return design_runs.end(self.started)
 
     def _refused(self, request: Request, error: Exception) -> Response:
-        return JSONResponse({"sentence": self.workspace.without_paths(str(error))}, status_code=400)
+        sentence = self.workspace.without_paths(str(error))
+        if not request.url.path.startswith("/api/"):
+            return self._page("lost.html.j2", status=400, title="Not to be shown", sentence=sentence)
+        return JSONResponse({"sentence": sentence}, status_code=400)
 
     def _no_page(self, request: Request, error: Exception) -> Response:
-        return self._page("lost.html.j2", status=404, title="No such page")
+        return self._page("lost.html.j2", status=404, title="No such page", sentence="")
 
     def _page(self, template: str, status: int = 200, **values: Any) -> HTMLResponse:
         common = {"version": bstcad.__version__, "has_docs": self.has_docs}
@@ -550,8 +553,8 @@ def serve(given: Path | None, port: int, say: Callable[[str], None], show: Calla
         workbench = Workbench(workspace)
         guarded = Guard(workbench.app, number, token, larger=(LARGER, LARGEST_UPLOAD))
         config = uvicorn.Config(
-            guarded, log_level="error", access_log=False, server_header=False, timeout_graceful_shutdown=int(SLOWEST),
-            lifespan="off", ws="none", http="h11",
+            guarded, log_level="critical", access_log=False, server_header=False, lifespan="off", ws="none", http="h11",
+            timeout_graceful_shutdown=int(SLOWEST),
         )  # fmt: skip
         address = f"http://127.0.0.1:{number}{page}?token={token}"
         say(f"Workbench: {address}")

@@ -77,7 +77,7 @@ export function drawCurves(svg, curves) {
   add("line", { x1: left, y1: high - low, x2: wide - 10, y2: high - low, class: "axis" });
   add("line", { x1: left, y1: 10, x2: left, y2: high - low, class: "axis" });
   for (const power of [1, 0, -1, -2, -3]) {
-    for (const step of [5, 2, 1]) {
+    for (const step of most - least > 0.8 ? [5, 2, 1] : [9, 8, 7, 6, 5, 4, 3, 2, 1]) {
       const value = step * 10 ** power, log = Math.log10(value);
       if (log < least || log > most) continue;
       add("line", { x1: left - 4, y1: y(value), x2: left, y2: y(value), class: "axis" });

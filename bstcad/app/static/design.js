@@ -6,7 +6,7 @@ const EVERY = 700; // milliseconds between two looks
 const stages = new Map(), curve = [];
 let next = 0, began = null, light = "";
 
-const WORDS = { running: "Being designed …", stopped: "Stopped", refused: "Refused", failed: "Failed", finished: "Finished", none: "" };
+const WORDS = { running: "Being designed", stopped: "Stopped", refused: "Refused", failed: "Failed", finished: "Finished", none: "" };
 
 function take(news) {
   for (const [when, stage, done, total, text] of news.lines) {
@@ -22,7 +22,7 @@ function take(news) {
     bar.max = Math.max(total, 1);
     bar.value = Math.min(done, bar.max);
     bar.setAttribute("aria-label", `${stage}: ${done} of ${total}`);
-    return row([stage, bar, `${(last - first).toFixed(1)} s`, text], { numbers: [2] });
+    return row([stage, bar, `${(last - first).toFixed(1)} s`, text === "evaluations" ? "" : text], { numbers: [2] });
   }));
   element("curve").parentElement.hidden = curve.length < 2;
   drawCurves(element("curve"), [curve]);
@@ -71,7 +71,7 @@ if (run.state !== "none" && !(run.state === "finished" && finished)) follow();
 // ---- work on a finished design ----
 
 const RESULTS = {
-  tolerance: () => [[`/design/${name}/files/report.html#tolerances`, "the report's section on tolerances"], [`/design/${name}/files/tolerance.json`, "tolerance.json"]],
+  tolerance: () => [[`/design/${name}/files/report.html`, "the report's section on tolerances"], [`/design/${name}/files/tolerance.json`, "tolerance.json"]],
   tradeoff: (state) => [[`/design/${state.folder}/files/tradeoff.html`, "time against accuracy"], [`/design/${state.folder}/files/tradeoff.csv`, "tradeoff.csv"]],
   measured: () => [[`/design/${name}/files/measured/cloud/report.html`, "the part's report"]],
 };

@@ -229,7 +229,10 @@ function showPlan(told) {
   if (told.stage === "effects") {
     qualities = told.qualities;
     element("net").textContent = told.net ?? "";
-    element("left-out").querySelector("tbody").replaceChildren(...told.left_out.map((cells) => row(cells, { numbers: [1, 2, 3] })));
+    const several = told.left_out.some((cells) => cells[4]);
+    element("left-out").querySelector("th:last-child").hidden = !several;
+    const rows = told.left_out.map((cells) => row(several ? cells : cells.slice(0, 4), { numbers: [1, 2, 3] }));
+    element("left-out").querySelector("tbody").replaceChildren(...rows);
   } else {
     qualities = { ...qualities, ...told.qualities };
     element("notes").textContent = told.not_predicted ? `Rough estimates alone: ${told.not_predicted}.` : told.notes.join(" ");
