@@ -11,7 +11,7 @@ import skimage.data
 from PIL import Image
 
 import bstcad
-from bstcad.app.preview import AT_ONCE, PIXELS, SETTLED
+from bstcad.app.preview import AT_ONCE, SETTLED
 from bstcad.optics.surfaces import sag
 from tests.app.conftest import begin
 
@@ -50,7 +50,7 @@ def test_the_tutorial_names_what_stands_on_the_pages():
     named = {" ".join(found.split()) for found in re.findall(r"(?<![*\w])\*([^*]+)\*(?!\*)", text)}
     assert len(named) > 20 and [name for name in sorted(named) if name not in words] == []
     for words, pains in (("preview", AT_ONCE), ("settled preview", SETTLED)):
-        assert f"| {words} | {PIXELS} at most | {pains.net} at most | {pains.evaluations} |" in text
+        assert f"| {words} | {pains.pixels} at most | {pains.net} at most | {pains.evaluations} |" in text
 
 
 # ---- the steps of the tutorial ---------------------------------------------------------------------------------------
@@ -117,7 +117,6 @@ def change_the_scene(page):
     page.wait_for_selector("#predicted tr[data-quality=draft]:not([title*='rough'])", timeout=PATIENCE)
     page.click("#toml > summary")
     page.click("#form details[data-section=target] > summary")
-    page.locator(".seen").evaluate("(part) => part.scrollTo(0, 0)")
     keep(page, "workbench-scene.png", high=WHOLE)
 
 
