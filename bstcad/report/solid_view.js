@@ -195,12 +195,12 @@ globalThis.solidView = (() => {
     return lines;
   }
 
-  const isGlass = (solid) => Boolean(solid.rays) && !solid.mirror; // by itself a lens is of clay
+  const seenThrough = (solid) => Boolean(solid.rays) && !solid.mirror; // by itself a lens is of clay
 
   // What is drawn, and seen from where: the lens by itself, among rays that go on, or with walls at the end of them.
   function framingOf(solid, mesh, look) {
     const reach = Math.hypot(...solid.size), distance = reach * Math.hypot(...solid.eye);
-    const centre = solid.low.map((low, k) => low + solid.size[k] / 2), glass = isGlass(solid);
+    const centre = solid.low.map((low, k) => low + solid.size[k] / 2), glass = seenThrough(solid);
     const range = [distance - 0.55 * reach, distance + 0.55 * reach];
     const alone = { look, eye: solid.eye, centre, distance, range, glass, walls: [], lines: [], points: [] };
     if (!solid.rays) return withExtent(alone, mesh);
@@ -339,7 +339,7 @@ globalThis.solidView = (() => {
       const start = axesOf("lens", ...anglesOf("lens", solid.eye)); // lamps stay with the eye: a turn shows new shades
       send(ofSolid, {
         lamps: solid.lamps.flatMap((lamp) => through(start, lamp)), bright: solid.bright, gloss: solid.specular_power,
-        clay: isGlass(solid) ? GLASS : solid.clay, finish: [solid.ambient, solid.diffuse, solid.specular],
+        clay: seenThrough(solid) ? GLASS : solid.clay, finish: [solid.ambient, solid.diffuse, solid.specular],
       });
       const pictures = (solid.screens ?? []).map((screen) => screen.picture);
       for (const { texture } of hung.splice(pictures.length)) gl.deleteTexture(texture);

@@ -53,7 +53,7 @@ def flown():
 @pytest.fixture
 def known_pilots(flown, monkeypatch):
     """Predictions of this scene take the pilots that were flown already."""
-    monkeypatch.setattr(plans, "pilots", lambda scene, lens: flown[scene.lens.back.control_points])
+    monkeypatch.setattr(plans, "pilots", lambda scene, lens, tick: flown[scene.lens.back.control_points])
 
 
 @pytest.fixture
