@@ -30,9 +30,9 @@ from bstcad.tailoring.run import Parameters, Progress, Step, Task
 from bstcad.tailoring.source_image import BlurredMerit
 
 COARSE_NET = 33  # of the first rounds of stage 1
-CELLS = 96  # of the transport, a side
+CELLS = 64  # of the transport, a side
 SEVERAL, TIMES = 0.5, 3  # of several goals: each of these times this, and times the evaluations
-COLD = 3  # rounds of stage 1, at least, where no earlier preview says where the light goes
+COLD = 3  # rounds of stage 1, at least, for a point whose light no earlier preview has followed
 FRONT_CELLS, FRONT_NET, FRONT_STEPS = 32, 17, 40  # by which a front is sought of which something is free
 NEARLY = 0.3  # of a target's size, and of its distance: from one further off no preview starts
 SEEN = 2.5  # ray tubes a pixel and side, by which the picture is taken: others than those that tailored the lens
@@ -177,7 +177,7 @@ def _first_stage(task: Task, lens: Lens, before: Preview | None) -> Iterator[Ste
     state = None
     if before is not None and before.round is not None:
         state = replace(before.round, round=0)
-    else:
+    elif task.heaviest.source.kind == "point":
         task = replace(task, knobs=task.knobs.model_copy(update={"rounds": max(COLD, task.knobs.rounds)}))
     if task.free:  # the front of before suits well enough at once
         lens = lens.with_front(before.lens.front) if state is not None else _with_front(task, lens)

@@ -371,7 +371,7 @@ globalThis.solidView = (() => {
       gl.depthFunc(gl.LEQUAL);
     };
     // The far side of the glass, the rays behind its near side, that side, and the rays before it (drawn by `draw`).
-    const drawGlass = () => {
+    const drawClear = () => {
       gl.depthMask(false);
       drawSolid([0.25, 0.5], gl.FRONT);
       gl.depthMask(true);
@@ -417,7 +417,7 @@ globalThis.solidView = (() => {
       if (!framing.lines.length) return drawSolid([1, 1], gl.BACK);
       gl.enable(gl.BLEND);
       drawWalls(axes);
-      if (glass) drawGlass();
+      if (glass) drawClear();
       else drawSolid([1, 1], gl.BACK);
       drawLines(gl.LEQUAL);
     };
