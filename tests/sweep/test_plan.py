@@ -322,7 +322,7 @@ class TestCommand:
     def test_effects_are_shown_before_anything_is_predicted(self, capsys, monkeypatch):
         shown = []
 
-        def outlook(scene, lens, units):
+        def outlook(scene, lens, units, tick):
             shown.extend(capsys.readouterr())
             return {"predicted": None, "not_predicted": "the test ends here", "finer": None, "notes": []}
 
