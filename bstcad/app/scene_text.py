@@ -14,6 +14,7 @@ import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import tomlkit
@@ -39,16 +40,9 @@ Steps = tuple[str | int, ...]  # of a table or a key: names, and the number of a
 
 def tables(text: str) -> dict[str, Any]:
     """The tables of a scene's text."""
-    if scene_file.too_dotted(text):
-        raise SceneError(f"the text has a line of over {scene_file.DOTS} dots, which is no scene; shorten that line")
-    try:
-        found = tomllib.loads(text)
-        huge = _has_huge(found)
-    except (ValueError, RecursionError) as error:
-        fault = str(error)[:1].lower() + str(error)[1:]
-        raise SceneError(f"the text is not valid TOML: {fault}; mend that line") from None
-    if huge:
-        raise SceneError("the text has a number of over 300 digits; shorten it")
+    found = scene_file.tables(text, Path("the text"))
+    if _has_huge(found):
+        raise SceneError("the text: has a number of over 300 digits; shorten it")
     return found
 
 

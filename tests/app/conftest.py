@@ -19,6 +19,7 @@ ARGUMENTS = (
     "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
 )  # fmt: skip
 START = 120.0  # seconds
+SEEN, PATIENCE = ".light-on-wall", 120_000  # a preview on a page; milliseconds, on a busy machine
 SMALL = """\
 # An evenly lit disc, small enough for a test: every comment stays
 name = "small"  # of the folder
@@ -111,6 +112,15 @@ def chromium():
         browser = found.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
         yield browser
         browser.close()
+
+
+def open_scene(page, own: Served, name: str) -> Path:
+    """Open the page of the small scene under another name, until it shows a preview; the scene's file."""
+    path = own.folder / f"{name}.toml"
+    path.write_text(SMALL.replace('"small"', f'"{name}"'), encoding="utf-8")
+    page.goto(f"{own.root}/scene/{name}")
+    page.wait_for_selector(SEEN, timeout=PATIENCE)
+    return path
 
 
 class Faults(list):

@@ -231,7 +231,7 @@ def test_an_empty_text_becomes_one_and_a_broken_one_is_told():
     text = changed(changed(changed("", "target.z", 5.0), "source.kind", "point"), "name", "lens")
     assert text == 'name = "lens"\n\n[source]\nkind = "point"\n\n[target]\nz = 5.0\n'
     for wrong in ("a = = 1", "[" * 5000, "a = 1\na = 2"):
-        with pytest.raises(SceneError, match="the text is not valid TOML: .*; mend that line"):
+        with pytest.raises(SceneError, match="the text: not valid TOML: .*; mend that line"):
             changed(wrong, "name", "x")
 
 

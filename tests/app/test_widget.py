@@ -9,8 +9,6 @@ import bstcad
 from bstcad.scene.scene import load
 from tests.app.conftest import SMALL
 
-pytest.importorskip("ipywidgets")
-
 
 @pytest.fixture
 def path(tmp_path):

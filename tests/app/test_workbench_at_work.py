@@ -20,11 +20,11 @@ from bstcad import folder as folders
 from bstcad.app.design_runs import Run
 from bstcad.app.preview import AT_ONCE, SETTLED, preview
 from bstcad.scene.scene import load
-from tests.app.conftest import SMALL, begin
+from tests.app.conftest import SEEN, SMALL, begin, open_scene
 
 pytestmark = pytest.mark.bench
 
-SEEN, PATIENCE = ".light-on-wall", 600_000
+PATIENCE = 600_000  # milliseconds
 CHANGES = 50
 PAINS = {"at once": AT_ONCE, "settled": SETTLED}
 LARGER = (
@@ -170,11 +170,8 @@ def test_the_design_ends_the_same_to_the_last_bit(open_page, tmp_path, undisturb
 
 def test_work_on_a_finished_design(open_page, shared):
     """Tolerance, trade-off and a made part, each from the design's page."""
-    path = shared.folder / "worked.toml"
-    path.write_text(SMALL.replace('"small"', '"worked"'), encoding="utf-8")
     page = open_page(shared.address)
-    page.goto(f"{shared.root}/scene/worked")
-    page.wait_for_selector(SEEN, timeout=PATIENCE)
+    open_scene(page, shared, "worked")
     page.click("#make")
     page.wait_for_selector("#step", timeout=PATIENCE)
     _, nominal = folders.read_nominal(shared.folder / "worked")

@@ -13,10 +13,7 @@ from PIL import Image
 from bstcad import commands
 from bstcad import folder as folders
 from bstcad.scene.scene import load
-from tests.app.conftest import SMALL
-
-SEEN = ".light-on-wall"
-PATIENCE = 120_000  # milliseconds, on a busy machine
+from tests.app.conftest import PATIENCE, SEEN, SMALL, open_scene
 
 
 def picture() -> bytes:
@@ -73,11 +70,8 @@ def test_a_change_is_seen_and_kept_beside_the_file_until_it_is_saved(open_page, 
 
 
 def test_a_wrong_value_is_marked_where_it_stands_with_the_terminals_sentence(open_page, shared):
-    path = shared.folder / "wrong.toml"
-    path.write_text(SMALL.replace('"small"', '"wrong"'), encoding="utf-8")
     page = open_page(shared.address)
-    page.goto(f"{shared.root}/scene/wrong")
-    page.wait_for_selector(SEEN, timeout=PATIENCE)
+    path = open_scene(page, shared, "wrong")
     page.fill("input[type=text][data-key='target.z']", "2")
     page.keyboard.press("Tab")
     page.wait_for_selector("[aria-invalid=true]")
@@ -96,12 +90,9 @@ def test_a_wrong_value_is_marked_where_it_stands_with_the_terminals_sentence(ope
 
 
 def test_two_windows_show_one_scene(open_page, shared):
-    path = shared.folder / "both.toml"
-    path.write_text(SMALL.replace('"small"', '"both"'), encoding="utf-8")
     one, other = open_page(shared.address), open_page(shared.address)
     for page in (one, other):
-        page.goto(f"{shared.root}/scene/both")
-        page.wait_for_selector(SEEN, timeout=PATIENCE)
+        open_scene(page, shared, "both")
     one.fill("input[type=text][data-key='target.z']", "77")
     one.keyboard.press("Tab")
     other.wait_for_selector("#form input[type=text][data-key='target.z'][value^='77']", timeout=PATIENCE)
@@ -109,11 +100,8 @@ def test_two_windows_show_one_scene(open_page, shared):
 
 
 def test_the_text_can_be_edited_and_says_where_it_is_wrong(open_page, shared):
-    path = shared.folder / "text.toml"
-    path.write_text(SMALL.replace('"small"', '"text"'), encoding="utf-8")
     page = open_page(shared.address)
-    page.goto(f"{shared.root}/scene/text")
-    page.wait_for_selector(SEEN, timeout=PATIENCE)
+    open_scene(page, shared, "text")
     page.click("text=scene.toml")
     text = page.input_value("#text")
     page.fill("#text", text.replace("pixels = 48", "pixels = ["))
@@ -147,10 +135,7 @@ def test_the_keyboard_alone_leads_from_the_start_to_a_changed_preview(open_page,
 
 def design(page, shared, name: str) -> None:
     """Open a scene of that name, and have it designed."""
-    path = shared.folder / f"{name}.toml"
-    path.write_text(SMALL.replace('"small"', f'"{name}"'), encoding="utf-8")
-    page.goto(f"{shared.root}/scene/{name}")
-    page.wait_for_selector(SEEN, timeout=PATIENCE)
+    open_scene(page, shared, name)
     page.click("#make")
     page.wait_for_url(f"**/design/{name}")
 
