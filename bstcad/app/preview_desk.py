@@ -60,7 +60,6 @@ class PreviewDesk:
     def __init__(self) -> None:
         self._news = threading.Condition()
         self._requests: dict[str, Request] = {}  # the last one of each page
-        self._latest: Preview | None = None  # the start for the next
         self._ended = False
         self._thread = threading.Thread(target=self._work, name="previews", daemon=True)
         self._thread.start()
@@ -112,7 +111,7 @@ class PreviewDesk:
 
     def _work(self) -> None:
         with contextlib.suppress(Exception):  # libraries load, and kernels compile, before anybody waits for them
-            self._latest = preview(first_scene(), outdated=lambda: self._ended or bool(self._requests))
+            preview(first_scene(), outdated=lambda: self._ended or bool(self._requests))
         while True:
             with self._news:
                 while not self._ended and self._next() is None:
@@ -160,10 +159,7 @@ class PreviewDesk:
             self._news.notify_all()
 
     def _preview(self, request: Request, outdated: Callable[[], bool]) -> Preview:
-        before = self._latest
-        found = preview(request.scene, before, outdated=outdated)
-        self._latest = found
-        return found
+        return preview(request.scene, outdated=outdated)
 
     def _settled(self, request: Request, outdated: Callable[[], bool]) -> Preview:
         return preview(request.scene, pains=SETTLED, outdated=outdated)

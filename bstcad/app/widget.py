@@ -81,7 +81,7 @@ class Workbench:
             self._number += 1
             mine = self._number
         try:
-            found = preview(self.scene, self.preview, outdated=lambda: mine != self._number)
+            found = preview(self.scene, outdated=lambda: mine != self._number)
         except Outdated:
             return
         except SentenceError as refusal:

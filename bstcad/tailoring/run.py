@@ -106,7 +106,7 @@ class Task:
     weight: float = 1.0  # of the target among all goals
     further: tuple[Goal, ...] = ()  # pictures on other planes
     wave: Wave | None = None  # that the light behind the lens shall be; None: any
-    hasty: bool = False  # for a preview: g of slope_map.py stays that of the first map
+    hasty: bool = False  # for a preview: g of slope_map.py by fewer places
     solution: float | None = None  # σ of light_behind.py; None: the gentler one
     floor: float = 0.0  # of its mean, to which stage 1 of two faces lifts the furthest picture
     front_sides: Callable[[Sides], Sides | None] = lambda sides: None  # of a tailored front, by those of the back

@@ -135,7 +135,7 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[
     window = lit_window(source, lens)
     wanted = slope_map(
         source, lens, window, picture=task.target, screen=task.screen, n=coarse, previous=wanted,
-        iterations=knobs.transport_iterations, progress=progress, hasty=task.hasty and wanted is not None,
+        iterations=knobs.transport_iterations, progress=progress, hasty=task.hasty,
     )  # fmt: skip
     sides = [min(2 * points, knobs.rays) for points in both(m)]
     parts = math.ceil(max(sides) / LIT)

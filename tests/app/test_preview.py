@@ -38,15 +38,12 @@ def test_a_preview_is_near_the_finished_draft(name):
     assert found.flux["on target"] > 0.9 and found.shape["thickness_min"] > 0
 
 
-def test_a_preview_is_the_same_each_time_and_nearly_the_same_from_another_scene():
+def test_a_preview_depends_on_the_scene_alone():
     scene = load("templates/caustic_portrait.toml", SMALL)
-    cold = preview(scene)
-    assert np.array_equal(preview(scene).pictures[0][1], cold.pictures[0][1])
-    other = preview(scene.changed({"target.z": 180.0, "target.x": [-40.0, 60.0]}), cold)
-    back = preview(scene, other)
-    assert apart(back.pictures[0][1], cold.pictures[0][1]) < NEAR
+    first = preview(scene)
     for changes in ({"target.pixels": 96}, {"lens.outline": {"shape": "circle", "radius": 45.0}}, {"target.text": "A"}):
-        assert np.isfinite(preview(scene.changed(changes), cold).rrmsds).all()
+        assert np.isfinite(preview(scene.changed(changes)).rrmsds).all()
+    assert np.array_equal(preview(scene).pictures[0][1], first.pictures[0][1])
 
 
 @pytest.mark.parametrize("name", ["sun_caustic", "led", "two_pictures", "machinable_letters", "collimated_portrait"])
