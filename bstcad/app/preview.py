@@ -29,7 +29,7 @@ from bstcad.tailoring.run import Progress, Step, Task
 from bstcad.tailoring.source_image import BlurredMerit
 
 COARSE_NET = 33  # of the first rounds of stage 1
-CELLS = 64  # of the transport, a side
+CELLS = 48  # of the transport, a side
 SEVERAL, TIMES = 0.5, 3  # of several goals: each of these times this, and times the evaluations
 NEARER = 3  # rounds of stage 1, at least, for the light of a point
 FRONT_CELLS, FRONT_NET, FRONT_STEPS = 32, 17, 40  # by which a front is sought of which something is free
@@ -51,7 +51,7 @@ class Pains:
     blurred: int  # the same of a source of some size, each of which takes twice as long
 
 
-AT_ONCE = Pains(pixels=90, net=240, tubes=256, rounds=2, evaluations=14, blurred=8)
+AT_ONCE = Pains(pixels=72, net=180, tubes=240, rounds=2, evaluations=12, blurred=8)
 SETTLED = Pains(pixels=128, net=320, tubes=384, rounds=4, evaluations=50, blurred=30)
 
 

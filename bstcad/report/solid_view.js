@@ -324,7 +324,7 @@ globalThis.solidView = (() => {
         gl.bindTexture(gl.TEXTURE_2D, wall.texture);
         gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, image);
         gl.generateMipmap(gl.TEXTURE_2D);
-        redraw();
+        if (framing?.walls.length) redraw();
       };
       image.src = picture;
     };
@@ -517,7 +517,7 @@ globalThis.solidView = (() => {
       [home, view] = [painted.frame(name), views[name] ??= {}];
       for (const [part, value] of Object.entries(home)) if (!before || view[part] === before[part]) view[part] = value;
       homes[name] = home;
-      painted.draw(view);
+      draw();
     };
     const show = () => {
       figure.classList.add("drawn"); // first: a canvas that is not shown has no size

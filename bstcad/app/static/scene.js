@@ -203,9 +203,10 @@ function showLight(told) {
     return item;
   }));
   if (!told.solid) return;
-  if (viewer === null) viewer = solidView.begin(element("solid-figure"), told.solid);
-  else viewer.update(told.solid);
-  viewer?.look(look);
+  if (viewer === null) {
+    viewer = solidView.begin(element("solid-figure"), told.solid);
+    viewer?.look(look);
+  } else viewer.update(told.solid);
 }
 
 function figure(source, alt, caption, kind = "") {
