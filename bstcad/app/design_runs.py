@@ -29,6 +29,7 @@ from bstcad.scene.scene import Scene
 DESIGN = "design"  # the kind of a run that designs a lens; others are work on a finished design
 LARGEST = 50_000_000  # bytes of progress
 GRACE = 60.0  # seconds that runs have to keep their checkpoints when the server ends
+START = 30.0  # seconds that the process of a run has to start
 LOST = "its process was killed, or the memory of this machine was too little for it"
 NONE = State("none")
 
@@ -75,7 +76,19 @@ class Run:
                 stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
                 env=os.environ | {"PYTHONPATH": paths},
             )  # fmt: skip
-        State("running", process.pid, time.time()).put(self.place)
+        self._await(process)
+
+    def _await(self, process: subprocess.Popen) -> None:
+        """Wait until the process has stated that it runs; it alone writes its state."""
+        until = time.monotonic() + START
+        while self._stated().process != process.pid and time.monotonic() < until:
+            if process.poll() is not None:  # it has ended already
+                if self._stated() == NONE:
+                    State("failed", sentence="its process did not start; process.log in its folder says why").put(
+                        self.place
+                    )
+                return
+            time.sleep(0.01)
 
     def signal(self, number: signal.Signals) -> None:
         """Send its process a signal, if it runs: SIGINT ends a design with the best lens so far, SIGTERM at once."""

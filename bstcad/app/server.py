@@ -12,6 +12,7 @@ import re
 import secrets
 import signal
 import socket
+import traceback
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -92,7 +93,8 @@ class Workbench:
             Route("/design/{name}/all.zip", self.all_files),
             Route("/design/{name}/files/{path:path}", self.one_file),
         ]
-        self.app = Starlette(routes=routes, exception_handlers={SentenceError: self._refused, 404: self._no_page})
+        handlers = {SentenceError: self._refused, Exception: self._failed, 404: self._no_page}
+        self.app = Starlette(routes=routes, exception_handlers=handlers)
         self.app.mount("/static", StaticFiles(directory=STATIC))
         site = next((place for place in SITES if (place / "index.html").is_file()), None)
         self.has_docs = site is not None
@@ -109,6 +111,13 @@ class Workbench:
         if not request.url.path.startswith("/api/"):
             return self._page("lost.html.j2", status=400, title="Not to be shown", sentence=sentence)
         return JSONResponse({"sentence": sentence}, status_code=400)
+
+    def _failed(self, request: Request, error: Exception) -> Response:
+        """A fault of this program: a sentence for the page, the rest for the terminal."""
+        traceback.print_exception(error)
+        words = f"{type(error).__name__}: {files.first_line(error)}"
+        sentence = self.workspace.without_paths(f"{words}; the terminal of the workbench says where it happened")
+        return JSONResponse({"sentence": sentence}, status_code=500)
 
     def _no_page(self, request: Request, error: Exception) -> Response:
         return self._page("lost.html.j2", status=404, title="No such page", sentence="")
@@ -542,6 +551,7 @@ def bound(port: int) -> Iterator[socket.socket]:
             own.bind(("127.0.0.1", port))
         except OSError as error:
             raise SceneError(f"--port {port}: cannot be had ({error.strerror}); give another one, or none") from None
+        own.listen()  # a browser that comes before the server answers waits
         yield own
 
 

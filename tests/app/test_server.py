@@ -16,6 +16,7 @@ import pytest
 from bstcad.app import design_process, design_runs, scene_text, server
 from bstcad.app.design_process import State
 from bstcad.app.design_runs import Run
+from bstcad.app.workspace import Workspace
 from tests.app.asking import MB, bench, made, png, routes, tree
 from tests.app.conftest import SMALL
 
@@ -365,6 +366,16 @@ def test_a_scene_that_is_a_link_out_of_a_design_is_not_compared(own):
     (own.folder / "other/scene.toml").unlink()
     os.symlink(own.outside / "secret.toml", own.folder / "other/scene.toml")
     assert SECRET not in own.ask("/compare?design=made&design=other").text
+
+
+def test_a_fault_of_the_program_is_a_sentence_and_the_terminal_has_the_rest(own, monkeypatch, capfd):
+    def broken(self, name):
+        raise RuntimeError(f"no such thing as {self.folder}")
+
+    monkeypatch.setattr(Workspace, "opened", broken)
+    answer = own.ask("/api/scene/small")
+    assert answer.status == 500 and "RuntimeError: no such thing" in answer.json["sentence"]
+    assert str(own.outside) not in answer.text and "broken" in capfd.readouterr().err
 
 
 # ---- changes ---------------------------------------------------------------------------------------------------------
