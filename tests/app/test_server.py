@@ -370,7 +370,7 @@ def test_a_scene_that_is_a_link_out_of_a_design_is_not_compared(own):
 
 def test_a_fault_of_the_program_is_a_sentence_and_the_terminal_has_the_rest(own, monkeypatch, capfd):
     def broken(self, name):
-        raise RuntimeError(f"no such thing as {self.folder}")
+        raise RuntimeError(f"no such thing as {self.designs}")
 
     monkeypatch.setattr(Workspace, "opened", broken)
     answer = own.ask("/api/scene/small")
