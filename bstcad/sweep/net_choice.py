@@ -142,10 +142,8 @@ def estimated(scene: Scene) -> dict[str, dict[str, float]]:
 
 def _estimated(scene: Scene) -> dict[str, dict[str, float]]:
     lens = coarse_lens(scene)
-    light, image = (
-        cells_of_a_mm2(scene, lens),
-        blur(scene.channels(), lens, scene.target.screen, scene.target.irradiance()),
-    )
+    light = cells_of_a_mm2(scene, lens)
+    image = blur(scene.channels(), lens, scene.target.screen, scene.target.irradiance())
     wanted = {quality: of_quality(scene, quality) for quality in BY_QUALITY}
     return {
         quality: {
