@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import shutil
 import subprocess
 import sys
 
@@ -12,6 +13,7 @@ from PIL import Image
 
 from bstcad import commands
 from bstcad import folder as folders
+from bstcad.app import scene_text
 from bstcad.scene.scene import load
 from tests.app.conftest import PATIENCE, SEEN, SMALL, open_scene
 
@@ -170,12 +172,12 @@ def test_a_design_goes_on_without_its_page_and_is_the_one_of_the_command(open_pa
 
 
 @pytest.fixture(scope="module")
-def designed(shared):
-    """Two finished designs, left and right."""
+def designed(shared, small_design):
+    """Two finished designs, left and right, whose scenes differ in the place of the wall."""
     for name, z in (("left", 100.0), ("right", 90.0)):
-        path = shared.folder / f"{name}.toml"
-        path.write_text(SMALL.replace('"small"', f'"{name}"').replace("z = 100.0", f"z = {z}"), encoding="utf-8")
-        commands.generate(load(path), shared.folder / name)
+        path = shutil.copytree(small_design.folder, shared.folder / name) / folders.SCENE
+        text = scene_text.changed(path.read_text(encoding="utf-8"), "name", name)
+        path.write_text(scene_text.changed(text, "target.z", z), encoding="utf-8")
 
 
 @pytest.mark.usefixtures("designed")
