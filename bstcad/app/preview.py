@@ -31,7 +31,7 @@ from bstcad.tailoring.source_image import BlurredMerit
 COARSE_NET = 33  # of the first rounds of stage 1
 CELLS = 48  # of the transport, a side
 SEVERAL, TIMES = 0.5, 3  # of several goals: each of these times this, and times the evaluations
-NEARER = 3  # rounds of stage 1, at least, for the light of a point
+OF_A_POINT = 3  # rounds of stage 1, at least, for the light of a point
 FRONT_CELLS, FRONT_NET, FRONT_STEPS = 32, 17, 40  # by which a front is sought of which something is free
 SEEN = 2.5  # ray tubes a pixel and side, by which the picture is taken: others than those that tailored the lens
 RAYS = 160  # a side, by which light that goes astray is counted
@@ -153,7 +153,7 @@ def _first_stage(task: Task, lens: Lens) -> Iterator[Step]:
         return
     lens = task.heaviest.through(lens)
     if task.heaviest.source.kind == "point":
-        task = replace(task, knobs=task.knobs.model_copy(update={"rounds": max(NEARER, task.knobs.rounds)}))
+        task = replace(task, knobs=task.knobs.model_copy(update={"rounds": max(OF_A_POINT, task.knobs.rounds)}))
     yield from stage1.follow_slopes(task, _with_front(task, lens) if task.free else lens)
 
 

@@ -107,17 +107,20 @@ class Workbench:
         return design_runs.end(self.started)
 
     def _refused(self, request: Request, error: Exception) -> Response:
-        sentence = self.workspace.without_paths(str(error))
-        if not request.url.path.startswith("/api/"):
-            return self._page("lost.html.j2", status=400, title="Not to be shown", sentence=sentence)
-        return JSONResponse({"sentence": sentence}, status_code=400)
+        return self._told_of(request, str(error), 400)
 
     def _failed(self, request: Request, error: Exception) -> Response:
         """A fault of this program: a sentence for the page, the rest for the terminal."""
         traceback.print_exception(error)
         words = f"{type(error).__name__}: {files.first_line(error)}"
-        sentence = self.workspace.without_paths(f"{words}; the terminal of the workbench says where it happened")
-        return JSONResponse({"sentence": sentence}, status_code=500)
+        return self._told_of(request, f"{words}; the terminal of the workbench says where it happened", 500)
+
+    def _told_of(self, request: Request, sentence: str, status: int) -> Response:
+        """A sentence without folders of this machine, as a script or a person asked for it."""
+        sentence = self.workspace.without_paths(sentence)
+        if not request.url.path.startswith("/api/"):
+            return self._page("lost.html.j2", status=status, title="Not to be shown", sentence=sentence)
+        return JSONResponse({"sentence": sentence}, status_code=status)
 
     def _no_page(self, request: Request, error: Exception) -> Response:
         return self._page("lost.html.j2", status=404, title="No such page", sentence="")

@@ -376,6 +376,8 @@ def test_a_fault_of_the_program_is_a_sentence_and_the_terminal_has_the_rest(own,
     answer = own.ask("/api/scene/small")
     assert answer.status == 500 and "RuntimeError: no such thing" in answer.json["sentence"]
     assert str(own.outside) not in answer.text and "broken" in capfd.readouterr().err
+    page = own.ask("/scene/small")
+    assert page.status == 500 and "RuntimeError: no such thing" in page.text and str(own.outside) not in page.text
 
 
 # ---- changes ---------------------------------------------------------------------------------------------------------

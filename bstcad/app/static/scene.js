@@ -8,7 +8,6 @@ const at = `/api/scene/${encodeURIComponent(state.name)}`, page = crypto.randomU
 const QUALITIES = ["draft", "standard", "fine"], LOOK = 1500; // milliseconds between two looks for other pages' changes
 let number = 0, sent = {}, waiting = null, busy = false, dragging = null, viewer = null, look = "lens", qualities = {};
 const log = (globalThis.previewLog = []); // milliseconds from each change to its preview, for measurements
-const parts = (globalThis.parts = []);
 let changedAt = null;
 
 // ---- the form ----
@@ -159,10 +158,8 @@ async function preview() {
     return;
   }
   if (mine !== number || told.replaced) return;
-  const answered = performance.now();
   show(told);
   log.push(performance.now() - began);
-  parts.push([answered - began, told.seconds * 1e3]);
   if (told.refused) return;
   for (let stage = 1; stage < 4; stage++) {
     do {
@@ -205,7 +202,7 @@ function showLight(told) {
   if (!told.solid) return;
   if (viewer === null) {
     viewer = solidView.begin(element("solid-figure"), told.solid);
-    viewer?.look(look);
+    viewer.look(look);
   } else viewer.update(told.solid);
 }
 
