@@ -52,13 +52,13 @@ class Shape:
 class Freeform:
     """A quadratic B-spline of a net that is even in x and in y; beyond the net its tangent."""
 
-    net: np.ndarray  # (m, m, 3) mm, x along the first axis
+    net: np.ndarray  # (m, n, 3) mm, x along the first axis
 
     @cached_property
-    def knots(self) -> np.ndarray:
-        """{0, 0, 0, 1, 2, …, m-3, m-2, m-2, m-2}."""
-        m = len(self.net)
-        return np.r_[0.0, 0.0, np.arange(m - 1.0), m - 2.0, m - 2.0]
+    def knots(self) -> tuple[np.ndarray, np.ndarray]:
+        """{0, 0, 0, 1, 2, …, m-3, m-2, m-2, m-2} along x, and the same of n along y."""
+        m, n = (np.r_[0.0, 0.0, np.arange(m - 1.0), m - 2.0, m - 2.0] for m in self.net.shape[:2])
+        return m, n
 
     @cached_property
     def _ends(self) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -66,13 +66,13 @@ class Freeform:
 
     def lines(self, parts: int) -> tuple[np.ndarray, np.ndarray]:
         """x and y (mm) of the lines of an even grid, a pitch in 2 `parts`: on all knots, at 1.5, 2.5, … pitches."""
-        steps = 2 * parts * (len(self.net) - 1) + 1
-        return tuple(np.linspace(*ends, steps) for ends in self._ends)
+        pairs = zip(self._ends, self.net.shape, strict=False)
+        return tuple(np.linspace(*ends, 2 * parts * (m - 1) + 1) for ends, m in pairs)
 
     def at(self, x: np.ndarray, y: np.ndarray) -> Shape:
         """At points (mm), by scipy's NdBSpline."""
         (inside_x, u, u_x), (inside_y, v, v_y) = self._parameter(x, 0), self._parameter(y, 1)
-        spline = NdBSpline((self.knots, self.knots), np.ascontiguousarray(self.net[..., 2]), 2)
+        spline = NdBSpline(self.knots, np.ascontiguousarray(self.net[..., 2]), 2)
         z, z_u, z_v = (spline(np.stack([u, v], axis=-1), nu=nu) for nu in ((0, 0), (1, 0), (0, 1)))
         z_x, z_y = z_u * u_x, z_v * v_y
         return Shape(x, y, z + z_x * (x - inside_x) + z_y * (y - inside_y), z_x=z_x, z_y=z_y)
@@ -80,8 +80,8 @@ class Freeform:
     def on_grid(self, x: np.ndarray, y: np.ndarray) -> Shape:
         """Where lines x and y (mm) cross, y along the first axis, with the mixed derivative; by scipy's BSpline."""
         (inside_x, u, u_x), (inside_y, v, v_y) = self._parameter(x, 0), self._parameter(y, 1)
-        along = [BSpline(self.knots, self.net[..., 2], 2)(u, nu=nu).T for nu in (0, 1)]
-        z, z_u, z_v, z_uv = (BSpline(self.knots, a, 2)(v, nu=nu) for nu in (0, 1) for a in along)
+        along = [BSpline(self.knots[0], self.net[..., 2], 2)(u, nu=nu).T for nu in (0, 1)]
+        z, z_u, z_v, z_uv = (BSpline(self.knots[1], a, 2)(v, nu=nu) for nu in (0, 1) for a in along)
         z_x, z_y, z_xy = z_u * u_x, z_v * v_y[:, None], z_uv * u_x * v_y[:, None]
         off_x, off_y = x - inside_x, (y - inside_y)[:, None]
         grid_x, grid_y = np.meshgrid(x, y)
@@ -90,9 +90,9 @@ class Freeform:
 
     def _parameter(self, x: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(x clipped to the net, t, dt/dx): x(t) = Σ B_i(t) x_i, by Newton's method."""
-        ends, m = self._ends[axis], len(self.net)
+        ends, m = self._ends[axis], self.net.shape[axis]
         x = np.clip(x, *ends)
-        along = BSpline(self.knots, np.linspace(*ends, m), 2)
+        along = BSpline(self.knots[axis], np.linspace(*ends, m), 2)
         last = m - 2.0
         t = np.clip((x - ends[0]) / (ends[1] - ends[0]) * (m - 1) - 0.5, 0.0, last)
         for _ in range(NEWTON):

@@ -523,8 +523,9 @@ def _through(channel: Channel, lens: Lens, screen: Screen, x: Tensor, y: Tensor)
     p, q, coming = rays_to(channel.source, seen, x, y)
     behind = replace(seen.unbounded(), losses=None).interfaces[seen.number_of_back :]
     landed = through(coming, behind, screen.plane)
-    inside = seen.number_of_back == 0 or seen.apertures[0].contains(middle(p), middle(q))
     flux = channel.weight * channel.source.irradiance(middle(p), middle(q), seen.entrance.z) * area_of(p, q)
-    flux = arriving(torch.where(inside, flux, torch.zeros_like(flux)), landed).double()
+    if seen.number_of_back > 0:  # a mirror's back is the first face that light meets
+        flux = torch.where(seen.apertures[0].contains(middle(p), middle(q)), flux, torch.zeros_like(flux))
+    flux = arriving(flux, landed).double()
     at = torch.stack([middle(c) for c in landed.position])
     return Landed(at.reshape(2, -1), flux.reshape(-1), landed.status[1:, 1:].reshape(-1))

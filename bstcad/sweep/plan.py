@@ -177,7 +177,7 @@ def amounts(scene: Scene, other_way: bool = False) -> dict[str, float]:
     point = scene.source.kind == "point"
     judged = JUDGED * pixels ** (2 / 3)  # rays as run.BETWEEN has them
     adam, slopes = knobs.method == "adam", knobs.method == "least-squares"
-    counts = blurred_sheets(knobs, max(columns, rows)) if wide else sheets(knobs)
+    counts = blurred_sheets(knobs, (columns, rows)) if wide else sheets(knobs)
     rounds = [] if adam else [(tubes / TUBES, evaluations) for tubes, evaluations in counts]
     traced = spread * sum(tubes**2 * count for tubes, count in rounds)
     steps = knobs.stage1_iterations * len(knobs.levels) + knobs.stage2_iterations

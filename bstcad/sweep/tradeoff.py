@@ -98,7 +98,7 @@ def knobs(scene: Scene) -> tuple[Knob, ...]:
         Knob("evaluations", "Evaluations of stage 2", shares("stage2_iterations", (1 / 8, 1 / 4, HALF, 1, 2, 4))),
         Knob("tubes", "Rays a side" if adam else "Ray tubes a side",
              shares("rays", (1 / 4, HALF, ROOT, 1, 1 / ROOT, 2))),
-        Knob("control_points", "Control points a side", _choices(NET_KEY, own, sorted(nets))),
+        Knob("control_points", "Control points a side", _choices(NET_KEY, own, sorted(nets, key=both))),
         Knob("adam", "Adam on control points, by rays", _adam(known.quality == "paper") if _by_paper(scene) else {}),
         Knob("precision", "Precision", _choices("tailoring.precision", known.precision, ("float32", "float64"))),
         Knob("pixels", "Pixels tailored to", _pixels(scene)),

@@ -23,7 +23,7 @@ from bstcad.optics.channels import channels_of, points
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import a_side, images, rrmsd_by_tubes
-from bstcad.optics.sides import coarser
+from bstcad.optics.sides import both, coarser
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.goals import JointMerit
@@ -408,17 +408,23 @@ def stage3_rounds(task: Task) -> tuple[Round, ...]:
         replace(task, channels=channels, grown=(), spreads=(spread,))
         for channels, spread in zip(task.grown, task.spreads, strict=True)
     )
-    counts = blurred_sheets(task.knobs, max(task.screen.shape))
+    counts = blurred_sheets(task.knobs, (task.screen.columns, task.screen.rows))
     return tuple(
         Round(light, tubes, evaluations, stage="stage 3", spread=spread)
         for light, spread, (tubes, evaluations) in zip(lights, task.spreads, counts, strict=True)
     )
 
 
-def blurred_sheets(knobs: Tailoring, pixels: int) -> Iterator[tuple[int, int]]:
-    """(tubes a side, evaluations) of each round for a source of some size; pixels: along the longer side."""
+def blurred_sheets(knobs: Tailoring, pixels: tuple[int, int]) -> Iterator[tuple[int, int]]:
+    """(tubes a side, evaluations) of each round for a source of some size; pixels: columns and rows.
+
+    A sheet of n tubes a side has n √(m_x / m_y) along x and n √(m_y / m_x) along y over a net of m_x x m_y points.
+    """
     total = knobs.stage2_iterations * (2 if knobs.stage2_iterations < FEW else 1)  # each is cheap, and all have a start
-    tubes = min(knobs.rays, math.ceil(max(A_CELL * knobs.levels[-1], A_PIXEL * pixels)))
+    (m_x, m_y), (columns, rows) = both(knobs.levels[-1]), pixels
+    oblong = math.sqrt(m_x / m_y)
+    a_pixel = A_PIXEL * max(columns / oblong, rows * oblong)
+    tubes = min(knobs.rays, math.ceil(max(A_CELL * knobs.side, a_pixel)))
     for _, share in SIZES:
         yield tubes, round(share * total)
 

@@ -13,10 +13,10 @@ from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 
 
-def waved(m=33, half=10.0, amplitude=0.05):
-    """A back that no symmetry maps onto itself."""
-    x = np.linspace(-1, 1, m)
-    heights = 0.02 * half * (x[:, None] ** 2 + 1.3 * x**2) + amplitude * np.sin(2 * x[:, None] + 0.5) * np.cos(3 * x)
+def waved(m=33, half=10.0, amplitude=0.05, n=None):
+    """A back that no symmetry maps onto itself, with m x n control points (n: m by default)."""
+    x, y = np.linspace(-1, 1, m)[:, None], np.linspace(-1, 1, n or m)
+    heights = 0.02 * half * (x**2 + 1.3 * y**2) + amplitude * np.sin(2 * x + 0.5) * np.cos(3 * y)
     return BSplineSurface(20.0, torch.from_numpy(-heights), (-half, half), (-half, half))
 
 

@@ -13,7 +13,7 @@ from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.forward import land
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort, measure, tubes_picture
+from bstcad.optics.measure import Effort, images, measure, tubes_picture
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Rays
 from bstcad.optics.sources import Collimated, Point
@@ -124,6 +124,16 @@ def test_a_disc_behind_a_pinhole_makes_its_own_image(tilt):
     magnified = 300.0 / 102.0  # of the plate 0.02 mm thick no hundredth of a mm is seen
     wide = [2 * magnified * (math.cos(math.radians(40)) if tilt else 1.0), 2 * magnified]
     assert [2 * math.sqrt(v) for v in found] == pytest.approx(wide, rel=0.02)
+
+
+def test_a_flat_mirror_shows_a_chip_as_large_as_the_distances_say():
+    """Each place of the mirror is a pinhole: the image of a rectangle w x h has the variances w²/12 and h²/12."""
+    flat = BSplineSurface(0.0, torch.zeros(25, 25, dtype=torch.float64), (-11.0, 11.0), (-11.0, 11.0))
+    mirror = Lens(Plane(-3.0), flat, SQUARE, 1.0, reflects=True)
+    chip = Point((0.0, 0.0, 50.0), profile="uniform", half_angle=40.0, width=4.0, height=2.0)
+    found = images(channels_of(chip, lambda nm: 1.0, 64), mirror, Screen(150.0, (-60.0, 60.0), (-60.0, 60.0), 120))
+    variances = (found.offset**2 * found.flux).sum((1, 2)) / found.flux.sum()  # pixels of 1 mm
+    assert variances.tolist() == pytest.approx([12.0**2 / 12, 6.0**2 / 12], rel=0.02)
 
 
 SCREEN = Screen(120.0, (-14.0, 12.0), (-12.0, 12.0), (13, 12))

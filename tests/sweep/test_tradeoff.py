@@ -65,6 +65,13 @@ class TestKnobs:
         assert full["control_points"] == ["129", "257", "513", "1025"]
         assert full["quality"] == ["draft", "standard", "fine", "paper"]
 
+    def test_nets_that_are_nearly_square_go_up_too(self):
+        """Half of 34 x 33 control points are 17 x 17, one number beside pairs."""
+        lens = {"lens.outline": {"shape": "rectangle", "width": 60.0, "height": 58.0}}
+        few = load("templates/thu.toml").changed(lens | {"lens.back.control_points": [34, 33]})
+        [points] = (knob.points for knob in knobs(few) if knob.key == "control_points")
+        assert list(points) == ["9", "17", "[34, 33]", "[67, 65]", "[133, 129]"]
+
     def test_all_targets_are_turned_together_and_the_paper_is_left_out(self, tiny):
         target = tiny.target.model_dump(mode="json", exclude_none=True)
         two = tiny.changed({"target": [target | {"pixels": 64}, target | {"z": 900.0, "pixels": [96, 48]}]})
