@@ -230,10 +230,10 @@ class Design:
     def export(self, *kinds: str, points: int | None = None) -> list[Path]:
         """Write files for the shop into the design's folder: by the names of bstcad.report.exports, such as "zemax".
 
-        points: along the wider side of grids (default: as many as control points).  Returns their paths; SceneError if
-        a kind is none of these or the design was never written.
+        points: along the wider side of grids (default: as many as control points; for OpticStudio the knots).  Returns
+        their paths; SceneError if a kind is none of these or the design was never written.
         """
-        return commands.export(self._own_folder(), kinds, points)
+        return commands.export(self._own_folder(), kinds, points).paths
 
     def write(
         self, folder: str | os.PathLike[str], *, progress: bool = True, effort: Effort | None = None,

@@ -301,6 +301,7 @@ def generate(
         print(f"bstcad: {commands.folders.said_of_sizes(wanted)}", file=sys.stderr)
     with progress.watch(Console(stderr=True)) as watched:
         report = commands.generate(wanted, folder, device=device, progress=watched, began=STARTED, resume=resume)
+    print(*report.notes, sep="\n", end="\n" if report.notes else "")
     if report.stopped != "interrupt":
         return conclude(report.contents, folder, verbose)
     conclude(report.contents, commands.place_for(folder, "interrupt"), verbose)
@@ -433,7 +434,8 @@ def export(folder: Folder, kinds: Kinds = None, points: Points = None) -> int:
     """Write a lens for the shop: tables, Zemax's grid sag, a cloud for turning, the outline, previews, the sheet."""
     if kinds is None:
         raise InputError(f"--as is missing; give what to write: {EXPORTS}")
-    print("Files: " + ", ".join(map(str, engine().export(folder, words(kinds), points))))
+    written = engine().export(folder, words(kinds), points)
+    print(*written.notes, "Files: " + ", ".join(map(str, written.paths)), sep="\n")
     return 0
 
 

@@ -37,7 +37,9 @@ from bstcad.optics.measure import FULL, Effort, Light, Line
 from bstcad.pipeline import Saved, design, purpose
 from bstcad.report import data_sheet, exports, prescription, record, rendering, report, tolerances
 from bstcad.report.data_sheet import Sheet
+from bstcad.report.exports import Exported
 from bstcad.report.figure_jobs import NoPictures, Pictures, draw_convergence, draw_light, draw_wavefront, light_path_of
+from bstcad.report.grid_sag import Throw
 from bstcad.report.light_figures import draw_judges, draw_part
 from bstcad.report.prescription import SHEET, Order
 from bstcad.report.record import Contents, Examined, LeftOut, Report, Stage, contents_of, with_part
@@ -152,9 +154,7 @@ def write(
         proven = time.perf_counter()
         irradiance, *further = (light.picture for light in proof.lights)
         folders.write_design(made, irradiance, building, further=further)
-        exports.export(
-            made.lens, made.scene.output.export, building, label=folders.label(made.scene), mount=made.scene.mount
-        )
+        exported = _export(made, made.scene.output.export, building)
         order = _order(made, proof.shape, building)
         drawn.sheet(_sheet(made, proof, proof.light, proof.light.picture, order=order))
         progress("report", 0, 1, "")
@@ -166,7 +166,7 @@ def write(
         sheet = drawn.data_sheet()
         _write_report(made, proof.lens, contents, building, drawn=drawn, sheet=sheet, sections=additions.sections)
         progress("report", 1, 1, "")
-    return Report(contents, irradiance, further_irradiance=tuple(further))
+    return Report(contents, irradiance, further_irradiance=tuple(further), notes=tuple(exported.notes))
 
 
 def prove(
@@ -471,18 +471,25 @@ def tolerance(
         return tolerancing.tolerance(folder, grade=grade, seed=seed, wanted=wanted, progress=progress, spread=spread)
 
 
-def export(folder: Path, kinds: Sequence[str], points: int | None = None) -> list[Path]:
-    """Write files for the shop into a design's folder, see bstcad.report.exports; their paths."""
+def export(folder: Path, kinds: Sequence[str], points: int | None = None) -> Exported:
+    """Write files for the shop into a design's folder, see bstcad.report.exports."""
     with folders.amending(folder) as amended:
         made = read(folder)
         with refusals("export: "):
-            written = exports.export(
-                made.lens, kinds, amended, points, label=folders.label(made.scene), mount=made.scene.mount
-            )
+            written = _export(made, kinds, amended, points)
         if exports.SHEET in kinds:
-            written.append(amended / SHEET)
-            files.put(written[-1], data_sheet.draw(_sheet_again(made, folder)))
-    return [folder / path.name for path in written]
+            written.paths.append(amended / SHEET)
+            files.put(written.paths[-1], data_sheet.draw(_sheet_again(made, folder)))
+    return replace(written, paths=[folder / path.name for path in written.paths])
+
+
+def _export(made: Made, kinds: Sequence[str], folder: Path, points: int | None = None) -> Exported:
+    """Write the files of these kinds of a design into a folder."""
+    scene, lens = made.scene, made.lens
+    throw = Throw(scene.source.central, tuple(target.screen for target in scene.targets))
+    return exports.export(
+        lens, kinds, folder, points=points, label=folders.label(scene), mount=scene.mount, throw=throw
+    )
 
 
 def _sheet_again(made: Made, folder: Path) -> Sheet:

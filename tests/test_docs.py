@@ -1,4 +1,4 @@
-"""Every command and code block of README, tutorials and how-to guides runs, page by page, on templates made small."""
+"""Every command and code block of README, tutorials, guides and the page on files runs, on templates made small."""
 
 import re
 import runpy
@@ -36,6 +36,7 @@ PAGES = [
     ROOT / "README.md",
     *sorted((ROOT / "docs").glob("tutorials/*.md")),
     *sorted((ROOT / "docs").glob("how-to/*.md")),
+    ROOT / "docs" / "reference" / "files.md",
 ]
 RUN = [page for page in PAGES if any(block.kind != "toml" for block in blocks(page))]
 LONG = {"measured-part", "time-and-accuracy", "tolerances"}  # ten seconds and more: make bench runs their blocks

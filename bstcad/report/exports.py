@@ -12,6 +12,7 @@ import io
 import math
 import textwrap
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -20,15 +21,15 @@ import numpy as np
 import torch
 
 from bstcad.cad.mesh import UNNAMED, Label, preview_files
-from bstcad.optics.bspline import BSplineSurface, basis_matrix
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import Surface, sag
+from bstcad.report.grid_sag import FEWEST, MOST, GridSag, Throw, axes, table_note
 from bstcad.report.units import paragraphs
 from bstcad.runs import files
 from bstcad.scene.mount import Mount
 
-FEWEST, MOST = 3, 4097  # points a side
+SIDECAR = ".txt"  # ending of a file that states how far the light moves by the interpolation of another
 SHEET = "datasheet"  # drawn by the caller, from the report beside the lens
 ALL = ("sag", "points", "zemax", "turning", "dxf", "svg", "preview", SHEET)
 
@@ -58,48 +59,63 @@ DXF_SIGNS = str.maketrans({"Ø": "%%c", "°": "%%d", "×": "x"})  # which every 
 Piece = tuple[str, str, tuple[Any, ...]]
 
 
+@dataclass(frozen=True)
+class Exported:
+    """Files that were written."""
+
+    paths: list[Path]
+    notes: list[str]  # sentences on grids and tables: how far the light moves by their interpolation
+
+
 def export(
     lens: Lens, kinds: Sequence[str], folder: Path, points: int | None = None, label: Label = UNNAMED,
-    mount: Mount | None = None,
-) -> list[Path]:  # fmt: skip
-    """Write the files of these kinds, but SHEET, to the folder, each whole or not at all; their paths.
+    mount: Mount | None = None, throw: Throw | None = None,
+) -> Exported:  # fmt: skip
+    """Write the files of these kinds, but SHEET, to the folder, each whole or not at all.
 
-    points: along the wider side of grids, by default as many as the net of the back has; label: name of meshes and
-    of a part; mount: drawings show the part that it makes; None: the lens's outline.
+    points: along the wider side of grids, by default as many as the net of the back has, and for OpticStudio the knots
+    of the net; label: name of meshes and of a part; mount: drawings show the part that it makes; None: the lens's
+    outline; throw: the light by which grids and tables are judged; None: they are not.
     ValueError names the kind or number that is not possible.
     """
     for kind in kinds:
         if kind not in ALL:
             raise ValueError(f"'{kind}' is nothing that can be exported; give one of {', '.join(ALL)}")
-    points = max(lens.back.shape) if points is None else points
-    if not FEWEST <= points <= MOST:
+    if points is not None and not FEWEST <= points <= MOST:
         raise ValueError(f"{points} points a side are not possible; give {FEWEST} to {MOST}")
-    lens, written = lens.plain(), []
+    lens, written, notes = lens.plain(), [], []
     for kind in dict.fromkeys(kinds):
-        for name, data in _files(kind, lens, points, label=label, mount=mount):
+        for name, data in _files(kind, lens, points, label=label, mount=mount, throw=throw):
             files.put(folder / name, data.encode("utf-8") if isinstance(data, str) else data)
             written.append(folder / name)
-    return written
+            if name.endswith(SIDECAR):
+                notes.append(str(data).strip())
+    return Exported(written, notes)
 
 
 def _files(
-    kind: str, lens: Lens, points: int, *, label: Label, mount: Mount | None
+    kind: str, lens: Lens, points: int | None, *, label: Label, mount: Mount | None, throw: Throw | None
 ) -> Iterator[tuple[str, str | bytes]]:  # fmt: skip
     """(name, data) of each file of a kind."""
+    count = min(max(lens.back.shape), MOST) if points is None else points
     match kind:
         case "sag":
-            yield "sag.csv", sag_table(lens, points)
+            yield "sag.csv", sag_table(lens, count)
+            yield from _said("sag", lens, count, throw)
         case "points":
-            yield "points-front.csv", points_table(lens, lens.front, points)
-            yield "points-back.csv", points_table(lens, lens.back, points)
+            yield "points-front.csv", points_table(lens, lens.front, count)
+            yield "points-back.csv", points_table(lens, lens.back, count)
+            yield from _said("points", lens, count, throw)
         case "zemax":  # of a front that is no net prescription.txt has the numbers
-            yield "zemax-back.dat", zemax_grid(lens, lens.back, points)
-            if lens.front.is_net:
-                yield "zemax-front.dat", zemax_grid(lens, lens.front, points)
+            for name, face in (("zemax-back", lens.back), ("zemax-front", lens.front)):
+                if face.is_net:
+                    grid = GridSag.of(lens, face, points, throw)
+                    yield f"{name}.dat", grid.text()
+                    yield f"{name}{SIDECAR}", grid.note(f"{name}.dat") + "\n"
         case "turning":
-            yield "turning.csv", turning_cloud(lens, (points + 1) // 2)
+            yield "turning.csv", turning_cloud(lens, (count + 1) // 2)
             if lens.front.is_net:
-                yield "turning-front.csv", turning_cloud(lens, (points + 1) // 2, lens.front)
+                yield "turning-front.csv", turning_cloud(lens, (count + 1) // 2, lens.front)
         case "dxf":
             yield "outline.dxf", dxf(lens.outline, mount, label)
         case "svg":
@@ -143,46 +159,15 @@ def turning_cloud(lens: Lens, points: int, face: Surface | None = None) -> str:
     return _csv(radius_mm=radius[inside], angle_deg=angle[inside], sag_mm=height)
 
 
-def zemax_grid(lens: Lens, face: BSplineSurface, points: int) -> str:
-    """Zemax OpticStudio's grid sag file (.DAT) of a face over the bounding box of the outline.
-
-    Header: nx ny, spacings in x and y, unit (0: mm), decentre in x and y.  Then a line a point, from (-x, +y) along +x
-    and downwards: sag over the vertex, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y, all exact, and 0: there is data.
-    """
-    x, y = axes(lens.outline, points)
-    z, *derivatives = on_grid(face, x, y)
-    columns = [values.T[::-1].ravel() for values in (z - sag(face, 0.0, 0.0), *derivatives)]
-    text = io.StringIO()
-    text.write(f"{len(x)} {len(y)} {x[1] - x[0]:.17g} {y[1] - y[0]:.17g} 0 0 0\n")
-    np.savetxt(text, np.column_stack(columns), fmt="%.17g %.17g %.17g %.17g 0")
-    return text.getvalue()
-
-
-def axes(outline: Outline, points: int) -> tuple[np.ndarray, np.ndarray]:
-    """x and y (mm) of a grid over the outline's bounding box, nearly square cells, centred on the axis.
-
-    points: along the wider side, both ends included.
-    """
-    a, b = outline.half_extent
-    spacing = 2 * max(a, b) / (points - 1)
-    x, y = (np.linspace(-end, end, max(2, round(2 * end / spacing) + 1)) for end in (a, b))
-    return x, y
-
-
-def on_grid(face: BSplineSurface, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-    """(z, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y) (mm, 1, 1, 1/mm) of a face at each pair of x and y (mm) within its net.
-
-    z = Σ_i Σ_j B_i(u(x)) B_j(v(y)) h_ij (Wang et al. 2023, Eq. 2) is a product of three matrices on a grid, and each
-    derivative is the same product with derivatives of one or both bases.
-    """
-    bases = []
-    for at, (low, _), pitch, m in zip((x, y), (face.x, face.y), face.pitch, face.shape, strict=True):
-        u = np.clip((at - low) / pitch, 0.0, m - 1.0)
-        bases.append((basis_matrix(u, m), basis_matrix(u, m, derivative=1) / pitch))
-    (b_x, d_x), (b_y, d_y) = bases
-    heights = face.plain().heights.numpy()
-    along, across = b_x @ heights, d_x @ heights  # (len(x), n)
-    return face.z + (b_y @ along.T).T, (b_y @ across.T).T, (d_y @ along.T).T, (d_y @ across.T).T
+def _said(name: str, lens: Lens, points: int, throw: Throw | None) -> Iterator[tuple[str, str]]:
+    """(name, text) of the sidecar of a table of sags, for each face that is a net."""
+    sentences = []
+    for side, face in (("front", lens.front), ("back", lens.back)):
+        if throw is not None and face.is_net:
+            table = f"{name}.csv, {side}" if name == "sag" else f"{name}-{side}.csv"
+            sentences.append(table_note(lens, face, table, points=points, throw=throw))
+    if sentences:
+        yield f"{name}{SIDECAR}", "\n".join(sentences) + "\n"
 
 
 def _inside(lens: Lens, points: int) -> tuple[np.ndarray, np.ndarray]:

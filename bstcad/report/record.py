@@ -496,6 +496,7 @@ class Report:
     # whose x, y and form (rows y, columns x; mm, + out of the glass, NaN outside) are the deviation map; None: none
     measured: Any = None
     further_irradiance: tuple[np.ndarray, ...] = ()  # the same on the targets behind the first
+    notes: tuple[str, ...] = ()  # sentences on the exported files, which stand in their sidecars, too
 
     @property
     def facts(self) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from bstcad.optics.measure import tubes_picture
 from bstcad.optics.quadrature import of_lens
 from bstcad.optics.trace import follow_ghost, ghost_light, to_first_net, to_plane, trace
 from bstcad.pipeline import design
-from bstcad.report import exports
+from bstcad.report.grid_sag import GridSag
 from bstcad.scene.new_scene import templates
 from bstcad.scene.scene import Scene, load
 from tests.benchmarks.cold import TEMPLATES
@@ -128,7 +128,7 @@ def test_the_grid_sag_for_zemax_is_optiland_s_spline():
     from optiland.geometries.nurbs.nurbs_geometry import NurbsGeometry
 
     lens = plate("plane")
-    x, y, (z, *_) = read_zemax(exports.zemax_grid(lens, lens.back, 33))
+    x, y, (z, *_) = read_zemax(GridSag.of(lens, lens.back, 33).text())
     full = knots(lens.back.m) / knots(lens.back.m)[-1]
     net = np.moveaxis(lens.back.control_points(), -1, 0)
     theirs = NurbsGeometry(

@@ -21,7 +21,8 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Sphere, sag
-from bstcad.report import exports
+from bstcad.report import exports, grid_sag
+from bstcad.report.grid_sag import GridSag
 from bstcad.scene.mount import Box, Flange, Mount, Round, Screws
 from bstcad.scene.scene import Output
 
@@ -59,7 +60,7 @@ def table_of(text):
 @pytest.mark.parametrize("outline", [RECTANGLE, CIRCLE], ids=lambda outline: outline.shape)
 def test_zemax_reads_the_surface_with_its_derivatives(outline):
     lens = wavy(outline)
-    x, y, (z, z_x, z_y, z_xy) = read_zemax(exports.zemax_grid(lens, lens.back, 33))
+    x, y, (z, z_x, z_y, z_xy) = read_zemax(GridSag.of(lens, lens.back, 33).text())
     assert (x[-1], y[-1]) == pytest.approx(outline.half_extent, abs=1e-12)
     at_x, at_y = np.meshgrid(x, y)
     wanted = lens.back.sag_and_slope(*(torch.from_numpy(p.copy()) for p in (at_x, at_y)))
@@ -113,8 +114,8 @@ def test_derivatives_on_a_grid_are_those_of_a_polynomial():
     lens = wavy(RECTANGLE)
     net = lens.back.control_points()
     bent = replace(lens.back, heights=torch.from_numpy(0.05 * net[..., 0] * net[..., 1]))
-    x, y = exports.axes(RECTANGLE, 57)
-    _, z_x, z_y, z_xy = exports.on_grid(bent, x, y)
+    x, y = grid_sag.axes(RECTANGLE, 57)
+    _, z_x, z_y, z_xy = grid_sag.on_grid(bent, x, y)
     assert z_xy == pytest.approx(0.05, abs=1e-13)
     assert np.abs(z_x - 0.05 * y).max() < 1e-13 and np.abs(z_y - 0.05 * x[:, None]).max() < 1e-13
 
@@ -128,8 +129,12 @@ def test_the_command_and_the_scene_write_every_kind_and_the_design_still_proves(
     assert cli.run(["export", str(folder), "--as", ", ".join(kinds), "--points", "17"]) == 0
     out = capsys.readouterr().out
     written = {"sag.csv", "points-front.csv", "points-back.csv", "zemax-back.dat", "turning.csv", "outline.dxf",
-               "outline.svg", "preview.glb", "preview.3mf", "datasheet.pdf"}  # fmt: skip
+               "outline.svg", "preview.glb", "preview.3mf", "datasheet.pdf",
+               "sag.txt", "points.txt", "zemax-back.txt"}  # fmt: skip
     assert all(str(folder / name) in out for name in written)
+    for name in ("sag", "points", "zemax-back"):  # what the sidecars state, the terminal says
+        [sentence] = (folder / f"{name}.txt").read_text().splitlines()
+        assert sentence in out and "the light moves on the target by" in sentence
     assert (folder / "datasheet.pdf").read_bytes() == sheet  # as generate drew it
     design = bstcad.open(folder)
     x, y, (z, *_) = read_zemax((folder / "zemax-back.dat").read_text())

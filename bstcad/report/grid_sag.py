@@ -1,0 +1,302 @@
+"""Zemax OpticStudio's grid sag of a net: its points, its file, and how far the light moves by it.
+
+OpticStudio interpolates between the points of a grid by bicubic Hermite patches.  A net is one biquadratic piece in
+each knot span (optics/bspline.py), and the patch over the four corners of a span is that piece: a grid whose points are
+the knots is exact.  In the end spans x(t) is quadratic, and the net is no polynomial in x; there a grid through all
+knots is made finer until the light moves by less than BOUND.
+
+`Patches` is the surface that such a program has.  Rays through it and through the lens show how far the light moves.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from scipy.interpolate import RectBivariateSpline
+from torch import Tensor
+
+from bstcad.optics.bspline import BSplineSurface, basis_matrix
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.kernels.reductions import total
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Outline
+from bstcad.optics.sources import Source
+from bstcad.optics.surfaces import Surface, sag
+from bstcad.optics.trace import launch_strips, trace
+from bstcad.report.units import environment
+
+FEWEST, MOST = 3, 4097  # points a side of a table
+LEAST_OF_ZEMAX = 5  # points a side: "the nx and ny values must be no smaller than 5" (OpticStudio's help, Grid Sag)
+BOUND = 0.1  # target pixels that light may move by a grid of our own density
+PARTS = (1, 2, 4, 8, 16)  # grid cells a knot span
+RAYS = 192  # a side, by which the light is compared
+NEAR = 1e-9  # of a pitch, by which a knot may miss the rim
+NEWTON = 12  # steps to where a ray meets the patches; smooth faces need 5
+STEEP = 1e-6  # smallest rise of a ray over a face, by which a step of Newton's method is divided
+MET = 1e-9  # mm from the face: the ray has met it before the last step
+
+
+@dataclass(frozen=True)
+class Throw:
+    """The light by which a grid is judged."""
+
+    source: Source  # a point or a parallel beam of one line
+    screens: tuple[Screen, ...]
+
+
+@dataclass(frozen=True)
+class Moved:
+    """How far the light of a lens moves on a target if another surface stands for one of its faces."""
+
+    rms: float  # mm, weighted by flux
+    most: float  # mm
+    pixel: float  # mm, shorter side of a pixel of the target
+
+    def __str__(self) -> str:
+        """Both lengths in mm and in pixels."""
+        number = environment().filters["number"]
+        pixels = f"{number(self.rms / self.pixel)} and {number(self.most / self.pixel)} target pixels"
+        return f"{number(self.rms)} mm RMS, {number(self.most)} mm at most ({pixels})"
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Heights and derivatives of a face at each pair of x and y."""
+
+    x: np.ndarray  # (nx,) mm, equally spaced
+    y: np.ndarray  # (ny,) mm
+    values: tuple[np.ndarray, ...]  # z, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y (mm, 1, 1, 1/mm), each (nx, ny)
+
+    @property
+    def step(self) -> tuple[float, float]:
+        """Spacing of the points along x and y (mm)."""
+        return tuple(float(at[-1] - at[0]) / (len(at) - 1) for at in (self.x, self.y))
+
+
+@dataclass(frozen=True)
+class Patches(Surface):
+    """z = Σ over the corners of a cell of H(s) H(t) z + …: bicubic Hermite patches between the points of a grid.
+
+    s and t from 0 to 1 across a cell, H0 = (1 + 2 s)(1 - s)², its slope's K0 = s (1 - s)², and H1(s) = H0(1 - s),
+    K1(s) = -K0(1 - s); z_x goes with K H, z_y with H K, z_xy with K K, each times the cell's sides.
+    """
+
+    z: float  # the plane that the heights are measured from (mm)
+    grid: Grid
+    kind: Literal["patches"] = "patches"
+
+    curvature = conic_constant = None
+
+    @property
+    def detail(self) -> float:
+        """Width of its smooth pieces (mm): a cell."""
+        return min(self.grid.step)
+
+    @classmethod
+    def through(cls, face: Surface, x: np.ndarray, y: np.ndarray) -> Patches:
+        """The bicubic spline through the heights of a face alone, as a program has it that reads a table of sags."""
+        heights = sag(face, x[:, None], y[None, :]) - float(face.z)
+        spline = RectBivariateSpline(x, y, heights, kx=min(3, len(x) - 1), ky=min(3, len(y) - 1))
+        slopes = (spline(x, y, dx=i, dy=j) for i, j in ((1, 0), (0, 1), (1, 1)))
+        return cls(float(face.z), Grid(x, y, (heights, *slopes)))
+
+    def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; a point beyond the grid is moved to its rim."""
+        (dx, dy), columns = self.grid.step, len(self.grid.y)
+        i, along = _in_cell(x, self.grid.x, dx)
+        j, across = _in_cell(y, self.grid.y, dy)
+        h = h_x = h_y = torch.zeros_like(x)
+        for (order_x, order_y), table in zip(((0, 0), (1, 0), (0, 1), (1, 1)), self.grid.values, strict=True):
+            flat = torch.from_numpy(np.ascontiguousarray(table)).reshape(-1) * (dx**order_x * dy**order_y)
+            for a in (0, 1):
+                for b in (0, 1):
+                    value = flat[(i + a) * columns + j + b]
+                    (f, f_s), (g, g_t) = along[order_x][a], across[order_y][b]
+                    h, h_x, h_y = h + f * g * value, h_x + f_s * g * value / dx, h_y + f * g_t * value / dy
+        return h, h_x, h_y
+
+    def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
+        """(s in mm, met): path along rays from (x, y) of the plane z0 to the surface, by Newton's method.
+
+        F(s) = s d_z - h(x + s d_x, y + s d_y), s ← s - F / F'.
+        """
+        dx, dy, dz = direction
+        s = torch.zeros_like(x)
+        for _ in range(NEWTON):
+            h, h_x, h_y = self.relative_sag_and_slope(x + s * dx, y + s * dy)
+            off, rise = s * dz - h, dz - h_x * dx - h_y * dy
+            s = s - off / torch.where(rise.abs() > STEEP, rise, torch.full_like(rise, STEEP))
+        return s, off.abs() < MET
+
+    def sags(self, outline: Outline) -> tuple[float, float]:
+        """Lowest and highest of the heights of its points (mm), and of zero."""
+        heights = self.grid.values[0]
+        return min(float(heights.min()), 0.0), max(float(heights.max()), 0.0)
+
+
+Shapes = tuple[tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]], ...]
+
+
+def _in_cell(at: Tensor, nodes: np.ndarray, step: float) -> tuple[Tensor, Shapes]:
+    """(the cell of each point, [height or slope][corner]: (Hermite function, its derivative in s))."""
+    place = ((at - float(nodes[0])) / step).clamp(0.0, len(nodes) - 1.0)
+    cell = place.detach().nan_to_num(0.0).floor().clamp(0, len(nodes) - 2)
+    s = place - cell
+    q = 1 - s
+    rise = 6 * s * q
+    heights = ((1 + 2 * s) * q * q, -rise), ((3 - 2 * s) * s * s, rise)
+    slopes = (s * q * q, q * (1 - 3 * s)), (-s * s * q, s * (3 * s - 2))
+    return cell.long(), (heights, slopes)
+
+
+# ---- the points of a grid --------------------------------------------------------------------------------------------
+
+
+def axes(outline: Outline, points: int, least: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    """x and y (mm) of a grid over the outline's bounding box, nearly square cells, centred on the axis.
+
+    points: along the wider side, both ends included; least: along each side.
+    """
+    a, b = outline.half_extent
+    spacing = 2 * max(a, b) / (points - 1)
+    x, y = (np.linspace(-end, end, max(least, round(2 * end / spacing) + 1)) for end in (a, b))
+    return x, y
+
+
+def through_knots(face: BSplineSurface, outline: Outline, parts: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """x and y (mm) of a grid through all knots near the outline's bounding box, a knot span being `parts` cells.
+
+    None: there is none.  With one cell a span it ends at the knots between the end spans, which are one and a half
+    pitches long, and has to cover the box within them.
+    """
+    found = []
+    for (low, _), pitch, m, half in zip((face.x, face.y), face.pitch, face.shape, outline.half_extent, strict=True):
+        places = np.arange(m - 3) + 1.5 if parts == 1 else np.arange(parts * (m - 1) + 1) / parts  # x(t) = t + 1/2
+        first = np.searchsorted(places, (-half - low) / pitch + NEAR, "right") - 1
+        last = np.searchsorted(places, (half - low) / pitch - NEAR, "left")
+        if first < 0 or last >= len(places) or not LEAST_OF_ZEMAX <= last - first + 1 <= MOST:
+            return None
+        found.append(low + pitch * places[first : last + 1])
+    return found[0], found[1]
+
+
+def on_grid(face: BSplineSurface, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+    """(z, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y) (mm, 1, 1, 1/mm) of a face at each pair of x and y (mm) within its net.
+
+    z = Σ_i Σ_j B_i(u(x)) B_j(v(y)) h_ij (Wang et al. 2023, Eq. 2) is a product of three matrices on a grid, and each
+    derivative is the same product with derivatives of one or both bases.
+    """
+    heights, *slopes = _relative(face, x, y)
+    return (face.z + heights, *slopes)
+
+
+def _relative(face: BSplineSurface, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+    """`on_grid` with heights over the plane face.z."""
+    bases = []
+    for at, (low, _), pitch, m in zip((x, y), (face.x, face.y), face.pitch, face.shape, strict=True):
+        u = np.clip((at - low) / pitch, 0.0, m - 1.0)
+        bases.append((basis_matrix(u, m), basis_matrix(u, m, derivative=1) / pitch))
+    (b_x, d_x), (b_y, d_y) = bases
+    heights = face.plain().heights.numpy()
+    along, across = b_x @ heights, d_x @ heights  # (len(x), n)
+    return (b_y @ along.T).T, (b_y @ across.T).T, (d_y @ along.T).T, (d_y @ across.T).T
+
+
+# ---- the light -------------------------------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def moved(lens: Lens, other: Lens, throw: Throw) -> Moved:
+    """How far the light of `other` lands from that of `lens`, on the target where that is the most pixels."""
+    found = []
+    for screen in throw.screens:
+        square = weight = most = 0.0
+        for rays in launch_strips(throw.source, lens, RAYS, 0):
+            one, two = (trace(rays, each, screen.plane) for each in (lens, other))
+            flux = torch.where(one.alive & two.alive, one.flux, torch.zeros_like(one.flux))
+            apart = torch.where(flux > 0, ((two.position - one.position) ** 2).sum(0), torch.zeros_like(flux))
+            square, weight = square + float(total(flux * apart)), weight + float(total(flux))
+            most = max(most, float(apart.max()))
+        pixel = min((screen.x[1] - screen.x[0]) / screen.columns, (screen.y[1] - screen.y[0]) / screen.rows)
+        found.append(Moved((square / weight) ** 0.5 if weight else 0.0, most**0.5, pixel))
+    return max(found, key=lambda each: each.rms / each.pixel)
+
+
+def with_face(lens: Lens, face: Surface, other: Surface) -> Lens:
+    """The lens with another surface in place of one of its two faces."""
+    return lens.with_back(other) if face is lens.back else lens.with_front(other)
+
+
+def moved_by(lens: Lens, face: Surface, patches: Patches, throw: Throw) -> Moved:
+    """How far the light of a lens moves if these patches stand for one of its faces."""
+    plain = replace(lens, shaped=None, losses=None)
+    return moved(plain, with_face(plain, face, patches), throw)
+
+
+# ---- the file --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class GridSag:
+    """A grid for OpticStudio, and how far the light moves by it."""
+
+    face: BSplineSurface
+    grid: Grid
+    moved: Moved | None  # None: there is no light to judge it by
+
+    @classmethod
+    def of(cls, lens: Lens, face: BSplineSurface, points: int | None = None, throw: Throw | None = None) -> GridSag:
+        """The grid of so many points along the wider side of the outline's bounding box, or by default of the knots."""
+        if points is not None:
+            return cls._at(lens, face, axes(lens.outline, max(points, LEAST_OF_ZEMAX), LEAST_OF_ZEMAX), throw)
+        best = None
+        for parts in PARTS:
+            if (at := through_knots(face, lens.outline, parts)) is None:
+                continue
+            best = cls._at(lens, face, at, throw)
+            if best.moved is None or best.moved.most <= BOUND * best.moved.pixel:
+                return best
+        return best or cls.of(lens, face, min(2 * max(face.shape), MOST), throw)
+
+    @classmethod
+    def _at(cls, lens: Lens, face: BSplineSurface, at: tuple[np.ndarray, np.ndarray], throw: Throw | None) -> GridSag:
+        """The grid of these x and y."""
+        grid = Grid(*at, _relative(face, *at))
+        return cls(face, grid, throw and moved_by(lens, face, Patches(face.z, grid), throw))
+
+    def text(self) -> str:
+        """The file (.DAT).
+
+        Header: nx ny, spacings in x and y, unit (0: mm), decentre in x and y.  Then a line a point, from (-x, +y) along
+        +x and downwards: sag over the vertex, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y, all exact, and 0: there is data.
+        """
+        (x, y), (dx, dy) = (self.grid.x, self.grid.y), self.grid.step
+        vertex = float(sag(self.face, 0.0, 0.0)) - self.face.z
+        height, *slopes = self.grid.values
+        columns = [values.T[::-1].ravel() for values in (height - vertex, *slopes)]
+        decentre = ((at[0] + at[-1]) / 2 if abs(at[0] + at[-1]) > 1e-9 * step else 0 for at, step in ((x, dx), (y, dy)))
+        text = io.StringIO()
+        text.write(f"{len(x)} {len(y)} {dx:.17g} {dy:.17g} 0 {' '.join(f'{c:.17g}' for c in decentre)}\n")
+        np.savetxt(text, np.column_stack(columns), fmt="%.17g %.17g %.17g %.17g 0")
+        return text.getvalue()
+
+    def note(self, name: str) -> str:
+        """A sentence on the file of this name."""
+        (dx, dy), grid = self.grid.step, self.grid
+        size = f"{name}: {len(grid.x)} x {len(grid.y)} points, {dx:.6g} x {dy:.6g} mm apart"
+        if self.moved is None:
+            return f"{size}."
+        coarse = self.moved.most > BOUND * self.moved.pixel
+        advice = "; leave out --points for a grid through the knots" if coarse else ""
+        return f"{size}; by bicubic interpolation of them the light moves on the target by {self.moved}{advice}."
+
+
+def table_note(lens: Lens, face: Surface, name: str, *, points: int, throw: Throw) -> str:
+    """A sentence on a table of sags: how far the light moves by a bicubic spline through the heights of its grid."""
+    by = moved_by(lens, face, Patches.through(face, *axes(lens.outline, points)), throw)
+    coarse = "; zemax-back.dat and lens.step are exact" if by.most > BOUND * by.pixel else ""
+    return f"{name}: by a bicubic spline through its heights the light moves on the target by {by}{coarse}."

@@ -1,0 +1,93 @@
+"""OpticStudio's grid sag: its density follows from the net, and how far the light moves by it is stated truly."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import CubicHermiteSpline
+
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Plane, sag
+from bstcad.report.grid_sag import BOUND, GridSag, Moved, Patches, Throw, moved_by
+from tests.report.test_exports import read_zemax
+
+OUTLINE, THROW = Rectangle(8.0, 6.0), 200.0  # mm
+BEAM = Throw(Collimated(OUTLINE), (Screen(4.0 + THROW, (-20.0, 20.0), (-15.0, 15.0), (160, 120)),))
+
+
+def wavy(shape=(21, 17), past=2, outline=OUTLINE):
+    """A plate whose back has waves of all lengths that its net can hold, which reaches `past` spans past the rim."""
+    heights = torch.from_numpy(np.random.default_rng(7).normal(0.0, 0.002, shape))
+    ends = [half * (m - 1) / (m - 1 - 2 * past) for half, m in zip(outline.half_extent, shape, strict=True)]
+    back = BSplineSurface(4.0, heights, (-ends[0], ends[0]), (-ends[1], ends[1]))
+    return Lens(Plane(1.0), back, outline, 1.49)
+
+
+def interpolated(text, x, y):
+    """∂z/∂x and ∂z/∂y of a grid sag at points, cell by cell along x and then along y, by SciPy's cubics."""
+    at_x, at_y, (z, z_x, z_y, z_xy) = read_zemax(text)
+    along, across = (CubicHermiteSpline(at_x, value, slope, axis=1) for value, slope in ((z, z_x), (z_y, z_xy)))
+    found = []
+    for px, py in zip(x, y, strict=True):
+        in_x, in_y = ([each(px, nu) for each in (along, across)] for nu in (1, 0))
+        found.append([CubicHermiteSpline(at_y, *in_x)(py), CubicHermiteSpline(at_y, *in_y)(py, 1)])
+    return np.array(found).T
+
+
+@pytest.mark.parametrize("points", [None, 21, 60])
+def test_the_light_moves_as_far_as_is_stated(points):
+    """A slope that is off by δ turns light by (n - 1) δ, as long as the face is nearly level."""
+    lens = wavy()
+    grid = GridSag.of(lens, lens.back, points, BEAM)
+    x, y = np.random.default_rng(1).uniform(-1.0, 1.0, (2, 1500)) * np.array([[4.0], [3.0]])
+    slopes = np.array([part.numpy() for part in lens.back.sag_and_slope(*map(torch.from_numpy, (x, y)))[1:]])
+    off = (lens.index - 1) * THROW * np.linalg.norm(interpolated(grid.text(), x, y) - slopes, axis=0)
+    if points is None:  # through the knots: nothing moves
+        assert off.max() < 1e-9 and grid.moved.most < 1e-9 and len(grid.grid.x) == 18 and len(grid.grid.y) == 14
+        assert "leave out --points" not in grid.note("a.dat")
+    else:
+        assert grid.moved.rms == pytest.approx(np.sqrt((off**2).mean()), rel=0.1)  # by 1500 points
+        assert grid.moved.most == pytest.approx(off.max(), rel=0.3)
+        assert ("leave out --points" in grid.note("a.dat")) == (grid.moved.most > BOUND * grid.moved.pixel)
+        assert grid.moved.pixel == 0.25 and f"{points} x" in grid.note("a.dat")
+
+
+@pytest.mark.parametrize("outline", [OUTLINE, Circle(3.0)], ids=lambda outline: outline.shape)
+def test_where_the_lens_reaches_into_the_end_spans_the_grid_gets_finer(outline):
+    """There the net is no polynomial in x: it takes a grid of some cells a span, still through all knots."""
+    lens = wavy((21, 21), past=0, outline=outline)
+    grid = GridSag.of(lens, lens.back, throw=replace(BEAM, source=Collimated(outline)))
+    cells = np.array(lens.back.pitch) / grid.grid.step
+    assert cells == pytest.approx(cells.round()) and cells[0] >= 2
+    assert 0 < grid.moved.most <= BOUND * grid.moved.pixel
+    assert moved_by(lens, lens.back, Patches(4.0, GridSag.of(lens, lens.back, 21).grid), BEAM).rms > 10 * grid.moved.rms
+
+
+def test_light_of_a_point_and_a_face_before_it_are_judged_too():
+    """Rays that run askew meet the patches where they meet the face."""
+    lens = wavy()
+    lens = replace(lens, front=lens.back.moved(1.0), back=Plane(4.0))
+    throw = Throw(Point((0.0, 0.0, -30.0), half_angle=5.0, profile="uniform"), BEAM.screens)
+    exact, coarse = (GridSag.of(lens, lens.front, points, throw).moved for points in (None, 21))
+    assert exact.most < 1e-9 < 1e-3 < coarse.rms < coarse.most
+
+
+def test_a_narrow_lens_has_the_five_points_that_opticstudio_asks_for():
+    lens = wavy((21, 9), outline=Rectangle(8.0, 0.5))
+    for points in (None, 9):
+        grid = GridSag.of(lens, lens.back, points)
+        assert len(grid.grid.y) >= 5 and len(grid.grid.x) >= 5 and grid.moved is None
+        x, y, (z, *_) = read_zemax(grid.text())
+        assert x[-1] >= 4.0 - 1e-9 and y[-1] >= 0.25 - 1e-9
+        assert np.abs(z + sag(lens.back, 0.0, 0.0) - sag(lens.back, *np.meshgrid(x, y))).max() < 1e-12
+
+
+def test_a_length_is_stated_in_pixels_too():
+    assert str(Moved(0.0169, 0.332, 0.3125)) == (
+        "0.0169 mm RMS, 0.332 mm at most (0.0541 and 1.06 target pixels)"
+    )  # fmt: skip
