@@ -44,9 +44,21 @@ class State:
     folder: str = ""  # the name of the folder that holds the lens, if there is one
     sentence: str = ""  # why it stopped, was refused or failed
 
+    def is_sound(self) -> bool:
+        """Has each field, read from a file, a value of its kind, which JSON can hold?"""
+        numbers = (self.began, *([] if self.rrmsd is None else [self.rrmsd]))
+        texts = (self.state, self.folder, self.sentence)
+        known = type(self.process) is int and (self.passed is None or isinstance(self.passed, bool))
+        return known and all(map(is_finite, numbers)) and all(isinstance(text, str) for text in texts)
+
     def put(self, run: Path) -> None:
         """Write it into a run's folder."""
         files.put(run / STATE, json.dumps(asdict(self)).encode())
+
+
+def is_finite(value: object) -> bool:
+    """Is a value of JSON a number that a page can take?"""
+    return type(value) in (int, float) and abs(value) < 1e300
 
 
 class Words:

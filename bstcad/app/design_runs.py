@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from bstcad import folder as folders
-from bstcad.app.design_process import JOB, JOBS, LIGHT, SCENE, STATE, WORDS, State
+from bstcad.app.design_process import JOB, JOBS, LIGHT, STATE, WORDS, State, is_finite
 from bstcad.app.workspace import NAME
 from bstcad.runs import files
 from bstcad.runs.processes import command_of
@@ -52,6 +52,8 @@ class Run:
         """Begin it anew in a process of its own; contents: files for it.  SceneError if it is under way."""
         if self.state.state == "running":
             raise SceneError(f"{self.design.name}: this is under way already; wait for its end, or stop it")
+        if self.place.is_symlink() or self.place.is_file():  # somebody's; what a link leads to stays as it is
+            self.place.unlink()
         shutil.rmtree(self.place, ignore_errors=True)
         self.place.mkdir(parents=True)
         for name, data in (contents or {}).items():
@@ -61,9 +63,12 @@ class Run:
 
     def go_on(self) -> None:
         """Go on with a run that was stopped or killed, a design from its checkpoint."""
-        if not (self.place / JOB).is_file():
+        if not self.read(JOB):
             raise SceneError(f"{self.design.name}: has no run to go on with; begin it anew")
         if self.state.state != "running":
+            for path in self.place.iterdir():
+                if path.is_symlink():  # nothing is written through it
+                    path.unlink()
             self._start("--resume")
 
     def _start(self, *options: str) -> None:
@@ -113,10 +118,18 @@ class Run:
 
     def _stated(self) -> State:
         try:
-            found = State(**json.loads(files.contents(self.place / STATE, LARGEST)))
+            found = State(**json.loads(self.read(STATE)))
         except (ValueError, TypeError, RecursionError):
             return NONE
-        return found if isinstance(found.process, int) and isinstance(found.sentence, str) else NONE
+        return found if found.is_sound() else NONE
+
+    def read(self, name: str) -> bytes:
+        """The bytes of a file of the run; b"" if there is none, or it lies outside of the folder of the designs."""
+        try:
+            place = self.place
+            return files.contents(files.within(place / name, place.parent), LARGEST)
+        except ValueError:
+            return b""
 
     def _finished_elsewhere(self) -> bool:
         """Did another program, such as `bstcad generate --resume`, go on with this design to its end?"""
@@ -137,10 +150,7 @@ class Run:
         A line is [seconds since 1970, stage, done, total, text].
         """
         state = self.state
-        try:
-            lines = files.contents(self.place / WORDS, LARGEST).decode("utf-8", "replace").split("\n")[:-1]
-        except ValueError:
-            lines = []
+        lines = self.read(WORDS).decode("utf-8", "replace").split("\n")[:-1]
         told = [found for line in lines[max(since, 0) :] if (found := _read(line)) is not None]
         resumable = state.state in ("stopped", "failed") and self.kind == DESIGN
         stamp = {"light": self._stamp(LIGHT), "next": len(lines), "now": time.time()}
@@ -155,10 +165,7 @@ class Run:
     @property
     def light(self) -> bytes:
         """The PNG of the light through the best lens so far; b"" before there is one."""
-        try:
-            return files.contents(self.place / LIGHT, LARGEST)
-        except ValueError:
-            return b""
+        return self.read(LIGHT)
 
 
 def _read(line: str) -> list[Any] | None:
@@ -167,7 +174,8 @@ def _read(line: str) -> list[Any] | None:
         at, stage, done, total, text = json.loads(line)
     except (ValueError, TypeError, RecursionError):
         return None
-    return [at, str(stage), done, total, str(text)]
+    known = all(map(is_finite, (at, done, total))) and isinstance(stage, str) and isinstance(text, str)
+    return [at, stage, done, total, text] if known else None
 
 
 def begin_design(scene: Scene, design: Path) -> Run:
@@ -178,23 +186,24 @@ def begin_design(scene: Scene, design: Path) -> Run:
     return run
 
 
-def scene_text_of(run: Run) -> str:
-    """The scene that a run designs, as a file has it; "" of a run that is gone."""
-    try:
-        return files.contents(run.place / SCENE, LARGEST).decode("utf-8", "replace")
-    except ValueError:
-        return ""
-
-
 def all_runs(designs: Path) -> list[Run]:
     """The runs in a folder of designs, under way or ended."""
     found = []
     for kind in JOBS:
         for path in sorted(designs.glob(f".*.{kind}-run")) if designs.is_dir() else ():
             name = path.name[1 : -len(f".{kind}-run")]
-            if (path / STATE).is_file() and NAME.fullmatch(name):
+            own = NAME.fullmatch(name) and _is_within(path / STATE, designs) and _is_within(designs / name, designs)
+            if own and (path / STATE).is_file():
                 found.append(Run(designs / name, kind))
     return found
+
+
+def _is_within(path: Path, folder: Path) -> bool:
+    try:
+        files.within(path, folder)
+    except ValueError:
+        return False
+    return True
 
 
 def end(runs: list[Run]) -> list[Run]:

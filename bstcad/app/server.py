@@ -12,6 +12,7 @@ import re
 import secrets
 import signal
 import socket
+import sys
 import traceback
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
@@ -22,13 +23,14 @@ import jinja2
 import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.staticfiles import StaticFiles
 
 import bstcad
 from bstcad.app import design_runs, form, preview_json, scene_text, sketch
+from bstcad.app.connections import HeadersInTime
 from bstcad.app.design_runs import Run
 from bstcad.app.followers import with_followers
 from bstcad.app.guard import POLICY, SANDBOX, Guard
@@ -93,7 +95,10 @@ class Workbench:
             Route("/design/{name}/all.zip", self.all_files),
             Route("/design/{name}/files/{path:path}", self.one_file),
         ]
-        handlers = {SentenceError: self._refused, Exception: self._failed, 404: self._no_page}
+        handlers = {
+            SentenceError: self._refused, OSError: self._unusable, ClientDisconnect: self._broken_off,
+            Exception: self._failed, 404: self._no_page,
+        }  # fmt: skip
         self.app = Starlette(routes=routes, exception_handlers=handlers)
         self.app.mount("/static", StaticFiles(directory=STATIC))
         site = next((place for place in SITES if (place / "index.html").is_file()), None)
@@ -108,6 +113,18 @@ class Workbench:
 
     def _refused(self, request: Request, error: Exception) -> Response:
         return self._told_of(request, str(error), 400)
+
+    def _unusable(self, request: Request, error: Exception) -> Response:
+        """A file or a folder that cannot be read or written: a folder in its place, a full disk."""
+        assert isinstance(error, OSError)
+        place = f"{Path(error.filename).name}: " if isinstance(error.filename, str) else ""
+        words = f"{place}{error.strerror or type(error).__name__}"
+        return self._told_of(request, f"{words}; check that it may be read and written, and that space is left", 400)
+
+    def _broken_off(self, request: Request, error: Exception) -> Response:
+        """A request whose sender went away: a line for the terminal; nobody reads the answer."""
+        print(f"bstcad: {request.url.path}: was broken off by its sender; nothing of it is kept", file=sys.stderr)
+        return Response(status_code=400)
 
     def _failed(self, request: Request, error: Exception) -> Response:
         """A fault of this program: a sentence for the page, the rest for the terminal."""
@@ -160,7 +177,7 @@ class Workbench:
 
     def _report(self, name: str) -> record.Contents | None:
         try:
-            return record.read(self.workspace.design(name) / "report.json")
+            return record.read(self.workspace.file(name, "report.json"))
         except ValueError:
             return None
 
@@ -388,6 +405,8 @@ class Workbench:
         asked = await _json(request)
         wanted = asked.get("yield")
         share = None if wanted in (None, "") else _number(wanted, "yield") / 100
+        if share is not None and not 0 < share < 1:
+            raise SceneError(f"yield: {100 * share:g} % is not between 0 and 100 %; give one such as 90")
         job = {"grade": asked.get("grade") or None, "yield": share}
         return await run_in_threadpool(self._begin, request, "tolerance", job)
 
@@ -396,6 +415,7 @@ class Workbench:
         budget = _number((await _json(request)).get("budget") or 600, "budget")
         if not 1 <= budget <= 86_400:
             raise SceneError(f"budget: {budget:g} s is not between 1 s and a day; give seconds, such as 600")
+        self.workspace.design(f"{request.path_params['name']}-tradeoff")  # where its files go
         return await run_in_threadpool(self._begin, request, "tradeoff", {"budget": budget})
 
     async def measured(self, request: Request) -> Response:
@@ -558,6 +578,15 @@ def bound(port: int) -> Iterator[socket.socket]:
         yield own
 
 
+def uvicorn_server(app: Any) -> uvicorn.Server:
+    """The server of an application, which writes nothing to the terminal."""
+    config = uvicorn.Config(
+        app, log_level="critical", access_log=False, server_header=False, lifespan="off", ws="none",
+        http=HeadersInTime, timeout_graceful_shutdown=int(SLOWEST),
+    )  # fmt: skip
+    return uvicorn.Server(config)
+
+
 def serve(given: Path | None, port: int, say: Callable[[str], None], show: Callable[[str], Any]) -> None:
     """Serve the workbench until a Ctrl-C.  say: called with sentences for the terminal; show: with the address."""
     workspace, page = Workspace.of(given)
@@ -565,17 +594,13 @@ def serve(given: Path | None, port: int, say: Callable[[str], None], show: Calla
         number, token = own.getsockname()[1], secrets.token_urlsafe(24)
         workbench = Workbench(workspace)
         guarded = Guard(workbench.app, number, token, larger=(LARGER, LARGEST_UPLOAD))
-        config = uvicorn.Config(
-            guarded, log_level="critical", access_log=False, server_header=False, lifespan="off", ws="none", http="h11",
-            timeout_graceful_shutdown=int(SLOWEST),
-        )  # fmt: skip
         address = f"http://127.0.0.1:{number}{page}?token={token}"
         say(f"Workbench: {address}")
         say("It is for this machine alone; Ctrl-C ends it, and designs under way can be gone on with.")
         try:
             show(address)
             with contextlib.suppress(KeyboardInterrupt):
-                uvicorn.Server(config).run(sockets=[own])
+                uvicorn_server(guarded).run(sockets=[own])
         finally:
             for run in workbench.end():
                 say(f"{run.design.name}: is stopped and kept; bstcad app goes on with it")

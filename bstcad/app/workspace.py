@@ -83,14 +83,32 @@ class Workspace:
     def scene_names(self) -> list[str]:
         """The scene files, the latest first."""
         paths = self.scenes.glob("*.toml") if self.scenes.is_dir() else ()
-        known = [path for path in paths if NAME.fullmatch(path.stem) and path.is_file()]
+        known = [path for path in paths if NAME.fullmatch(path.stem) and self._is_own(path) and path.is_file()]
         return [path.stem for path in sorted(known, key=lambda path: -path.stat().st_mtime)]
 
     def path(self, name: str) -> Path:
-        """The file of a scene; SceneError for a name that is none."""
+        """The file of a scene; SceneError for a name that is none, or a link that leads out of the workspace."""
         if not NAME.fullmatch(name):
             raise SceneError(f"{name!r}: is no name of a scene; give letters, digits, '-' and '_'")
-        return self.scenes / f"{name}.toml"
+        path = self.scenes / f"{name}.toml"
+        self._own(path)
+        self._own(files.beside(path, UNSAVED))
+        return path
+
+    def _own(self, path: Path) -> Path:
+        """Return the path without its links.  SceneError if they lead out of the workspace's folders."""
+        try:
+            return files.within(path, self.scenes, self.designs)
+        except ValueError as error:
+            raise SceneError(f"{path.name}: {error}; put there what it leads to") from None
+
+    def _is_own(self, path: Path) -> bool:
+        """Is the path none that leads out of the workspace's folders?"""
+        try:
+            self._own(path)
+        except SceneError:
+            return False
+        return True
 
     def opened(self, name: str) -> Opened:
         """A scene with the changes that are not saved yet.  SceneError if there is no such file."""
@@ -98,9 +116,9 @@ class Workspace:
         with self._changing:
             unsaved = files.beside(path, UNSAVED)
             if not unsaved.is_file():
-                return Opened(name, _text(path), saved=True)
-            text = _text(unsaved).partition("\n")[2]
-            return Opened(name, text, saved=path.is_file() and text == _text(path))
+                return Opened(name, self._text(path), saved=True)
+            text = self._text(unsaved).partition("\n")[2]
+            return Opened(name, text, saved=path.is_file() and text == self._text(path))
 
     def change(self, name: str, text: str) -> Opened:
         """Take the text of a scene, right or wrong, as the one being edited."""
@@ -109,7 +127,7 @@ class Workspace:
             raise SceneError(f"{name}: holds over {scene_file.LARGEST_FILE / 1e6:g} MB, which is no scene; shorten it")
         with self._changing:
             unsaved = files.beside(path, UNSAVED)
-            before = _text(unsaved).partition("\n")[0] if unsaved.is_file() else _digest(_text(path))
+            before = self._text(unsaved).partition("\n")[0] if unsaved.is_file() else _digest(self._text(path))
             files.put(unsaved, f"{before}\n".encode(), data)  # first the hash of the file as it was when editing began
             return self.opened(name)
 
@@ -124,8 +142,8 @@ class Workspace:
         with self._changing:
             unsaved = files.beside(path, UNSAVED)
             if unsaved.is_file():
-                before, _, text = _text(unsaved).partition("\n")
-                now = _digest(_text(path)) if path.is_file() else ""
+                before, _, text = self._text(unsaved).partition("\n")
+                now = _digest(self._text(path)) if path.is_file() else ""
                 if not anyway and now not in (before, _digest(text)):
                     raise SceneError(
                         f"{path.name}: was changed by another program since it was opened here; "
@@ -143,8 +161,16 @@ class Workspace:
 
     def scene(self, name: str, text: str) -> Scene:
         """The scene that a text makes, its files relative to the scene file.  SceneError."""
-        path = self.path(name)
-        return scenes.of_text(text, scene_file.tables(text, Path(path.name)), path)
+        return self._loaded(self.path(name), text)
+
+    def _loaded(self, path: Path, text: str) -> Scene:
+        """The scene that a text makes in the place of a file, whose links may not lead out of the workspace."""
+        bounds = (self.scenes, self.designs)
+        return scenes.of_text(text, scene_file.tables(text, Path(path.name)), path, bounds=bounds)
+
+    def _text(self, path: Path) -> str:
+        """The text of a file of the workspace, as _text."""
+        return _text(self._own(path))
 
     def add(
         self, light: str, image: str | None = None, sample: str | None = None, text: str | None = None,
@@ -172,7 +198,7 @@ class Workspace:
         """Write another picture into a new scene file, which an error leaves no trace of; plate: that it is of."""
         path = self.path(name)
         try:
-            text = _text(path)
+            text = self._text(path)
             targets = tables(text)["target"]
             key = f"target[0].{key}" if isinstance(targets, list) and len(targets) > 1 else f"target.{key}"
             text = changed(text, key, value)
@@ -185,8 +211,8 @@ class Workspace:
 
     def adopt(self, design: str, folder: Path) -> str:
         """A new scene file for the scene in a folder, with the files that it names; the scene's name."""
-        text = _text(folder / "scene.toml")
-        loaded = scenes.load(folder / "scene.toml")
+        text = self._text(folder / "scene.toml")
+        loaded = self._loaded(folder / "scene.toml", text)
         self.scenes.mkdir(parents=True, exist_ok=True)
         with self._changing:
             name = self._free_name(design.removeprefix("my-"))
@@ -203,14 +229,15 @@ class Workspace:
         """my-KIND, or my-KIND-2 and so on: of neither a scene nor a design that is there."""
         stem, number = f"my-{picture.safe_name(kind)[:70].rstrip('.') or 'lens'}", 1
         name = stem
-        while any(path.exists() for path in self._of(name)):
+        while any(os.path.lexists(path) for path in self._of(name)):
             number += 1
             name = f"{stem}-{number}"
         return name
 
     def _of(self, name: str) -> tuple[Path, Path, Path]:
         """What may be there by a name: a scene, its changes, though somebody took the scene away, and a design."""
-        return self.path(name), files.beside(self.path(name), UNSAVED), self.design(name)
+        path = self.scenes / f"{name}.toml"
+        return path, path.with_name(f".{path.name}.{UNSAVED}"), self.designs / name
 
     # ---- pictures ----
 
@@ -221,8 +248,8 @@ class Workspace:
         with picture.decoding("the picture"):
             picture.photo(picture.Picture(name, data))  # its pixels, too
         with self._changing:
-            folder.mkdir(parents=True, exist_ok=True)
-            files.put(folder / name, data)
+            self._own(folder).mkdir(parents=True, exist_ok=True)
+            files.put(self._own(folder) / name, data)
         return name
 
     def upload(self, name: str) -> Path:
@@ -230,6 +257,7 @@ class Workspace:
         path = self.scenes / PICTURES / name
         if not NAME.fullmatch(name) or not path.is_file():
             raise SceneError(f"{name!r}: no such picture was uploaded; give the picture again")
+        self._own(path)
         return path
 
     # ---- designs ----
@@ -237,13 +265,15 @@ class Workspace:
     def design_names(self) -> list[str]:
         """The folders of finished designs, the latest first."""
         folders = self.designs.iterdir() if self.designs.is_dir() else ()
-        known = [path for path in folders if NAME.fullmatch(path.name) and (path / DESIGN[0]).is_file()]
+        named = (path for path in folders if NAME.fullmatch(path.name) and self._is_own(path))
+        known = [path for path in named if (path / DESIGN[0]).is_file()]
         return [path.name for path in sorted(known, key=lambda path: -path.stat().st_mtime)]
 
     def design(self, name: str) -> Path:
-        """The folder of a design, finished or not; SceneError for a name that is none."""
+        """The folder of a design, finished or not; SceneError for a name that is none, or a link that leads out."""
         if not NAME.fullmatch(name):
             raise SceneError(f"{name!r}: is no name of a design; give letters, digits, '-' and '_'")
+        self._own(self.designs / name)
         return self.designs / name
 
     def file(self, design: str, name: str) -> Path:

@@ -80,6 +80,20 @@ def contents(path: Path, largest: int) -> bytes:
         raise ValueError(error.strerror or type(error).__name__) from error
 
 
+def within(path: Path, *folders: Path) -> Path:
+    """Return the path without its links; ValueError if they lead out of these folders, or back to themselves."""
+    try:
+        found = path.resolve()
+        endless = found.is_symlink()  # the newer pathlib; the older raises
+    except (OSError, RuntimeError):
+        endless = True
+    if endless:
+        raise ValueError("leads by its links back to itself")
+    if not any(found.is_relative_to(folder) for folder in folders):
+        raise ValueError(f"leads by links out of the folder {folders[0].name}")
+    return found
+
+
 def arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], largest: int) -> dict[str, np.ndarray]:
     """Arrays of float64 from an .npz archive of at most `largest` bytes, by name, as the shapes say.
 
@@ -199,6 +213,8 @@ def held(folder: Path) -> Iterator[None]:
     from filelock import FileLock, Timeout  # a quarter of a second, which --help need not pay
 
     path = beside(folder, "lock")
+    if path.is_symlink():  # somebody's: its target stays as it is
+        path.unlink()
     lock = FileLock(path)
     try:
         lock.acquire(blocking=False)

@@ -11,7 +11,7 @@ import datetime
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path, PurePath
 from types import MappingProxyType
@@ -565,12 +565,17 @@ def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
     return of_text(*scene_file.read(path), path, overrides)
 
 
-def of_text(text: str, data: dict[str, Any], path: Path, overrides: Mapping[str, Any] | None = None) -> Scene:
-    """The scene in the text of a TOML file of that path, which need not be there; data: the tables of the text."""
+def of_text(
+    text: str, data: dict[str, Any], path: Path, overrides: Mapping[str, Any] | None = None, bounds: Sequence[Path] = ()
+) -> Scene:  # fmt: skip
+    """The scene in the text of a TOML file of that path, which need not be there; data: the tables of the text.
+
+    bounds: folders that no link in them may lead out of to a file that the scene names.
+    """
     try:
         for key, value in (overrides or {}).items():
             override(data, key, scene_file.toml_value(value) if isinstance(value, str) else value, f"--set {key}")
-        return _validated(data, path.parent)
+        return _validated(data, path.parent, bounds=bounds)
     except RecursionError:
         raise SceneError(f"{path}: {scene_file.NESTED}") from None
     except SceneError as error:
@@ -582,7 +587,10 @@ def of_text(text: str, data: dict[str, Any], path: Path, overrides: Mapping[str,
         raise
 
 
-def _validated(data: dict[str, Any], folder: Path, pictures: Mapping[str, Picture] = MappingProxyType({})) -> Scene:
+def _validated(
+    data: dict[str, Any], folder: Path, pictures: Mapping[str, Picture] = MappingProxyType({}),
+    bounds: Sequence[Path] = (),
+) -> Scene:  # fmt: skip
     """The scene that tables as of a file make; `pictures` by their name, others are files relative to `folder`."""
     for key in data["tolerances"] if isinstance(data.get("tolerances"), dict) else ():
         table = "lens" if key.endswith("_thickness") else "accept"
@@ -597,7 +605,7 @@ def _validated(data: dict[str, Any], folder: Path, pictures: Mapping[str, Pictur
             _circle(table, key)
     try:
         # By way of JSON, pydantic is strict (no "8" for 8.0, no true for 1) and still takes lists for tuples.
-        context = {"folder": folder, "contents": pictures}
+        context = {"folder": folder, "contents": pictures, "bounds": bounds}
         scene = Scene.model_validate_json(json.dumps(data), strict=True, context=context)
     except ValidationError as error:
         raise SceneError(explain(error, data)) from None

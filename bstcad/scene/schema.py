@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,6 +26,8 @@ from pydantic import (
     model_serializer,
 )
 from pydantic.json_schema import GenerateJsonSchema
+
+from bstcad.runs import files
 
 FILE = Path(__file__).with_name("schema.json")
 TAGS = ("kind", "shape")  # keys whose value tells which record of a union a table is
@@ -52,7 +54,8 @@ class Record(BaseModel):
 def from_file(kind: type, read: Callable[[Path], Any], name: Callable[[Any], str], example: str) -> Any:
     """The type of a field that a file names by its path and that holds the file's content, a `kind`.
 
-    A path is relative to the scene file, or to the user's home; `name` names the copy beside a design.
+    A path is relative to the scene file, or to the user's home; `name` names the copy beside a design.  Where the
+    context of a validation has `bounds`, folders, a path into them must not lead out of them by links.
     """
 
     def content(given: Any, info: ValidationInfo) -> Any:
@@ -64,6 +67,7 @@ def from_file(kind: type, read: Callable[[Path], Any], name: Callable[[Any], str
         if given in (known := context.get("contents", {})):
             return known[given]
         folder = Path(context.get("folder", "."))
+        _check_links(folder / given, context.get("bounds", ()))
         if os.path.lexists(folder / given):
             return read(folder / given)
         if any(c in ESCAPES for c in str(given)):
@@ -73,6 +77,17 @@ def from_file(kind: type, read: Callable[[Path], Any], name: Callable[[Any], str
     return Annotated[
         kind, BeforeValidator(content), PlainSerializer(name, return_type=str), WithJsonSchema({"type": "string"})
     ]
+
+
+def _check_links(path: Path, bounds: Sequence[Path]) -> None:
+    """ValueError if a path into one of these folders, or the archive of a design there, leads out of all of them."""
+    for each in (path, path / "design.npz") if bounds else ():
+        plain = Path(os.path.abspath(each))
+        if any(plain.is_relative_to(folder) for folder in bounds) or each.resolve() != plain.resolve():
+            try:
+                files.within(each, *bounds)
+            except ValueError as error:
+                raise ValueError(f"{str(path)!r} {error}; copy the file itself there") from None
 
 
 def leaving_out(**defaults: Any) -> Any:

@@ -69,8 +69,11 @@ class Asking:
 
     app: object
 
-    def __call__(self, target, body=b"", method=None, **headers):
-        """The answer; a header that is None is not sent.  body: a text, bytes, parts of them, or a table as JSON."""
+    def __call__(self, target, body=b"", method=None, receive=None, **headers):
+        """The answer; a header that is None is not sent.  body: a text, bytes, parts of them, or a table as JSON.
+
+        receive: hands out the messages of the request instead.
+        """
         body = json.dumps(body) if isinstance(body, dict) else body
         body = body.encode() if isinstance(body, str) else body
         parts = [body] if isinstance(body, bytes) else body
@@ -83,9 +86,9 @@ class Asking:
             "root_path": "", "client": ("127.0.0.1", 50000), "server": ("127.0.0.1", PORT),
             "headers": [(k.encode(), v.encode("latin-1")) for k, v in own.items() if v is not None],
         }  # fmt: skip
-        return asyncio.run(self._asked(scope, iter(parts)))
+        return asyncio.run(self._asked(scope, iter(parts), receive))
 
-    async def _asked(self, scope, parts):
+    async def _asked(self, scope, parts, given=None):
         answer, over = Answer(), False
 
         async def receive():
@@ -106,7 +109,7 @@ class Asking:
                 answer.body += message.get("body", b"")
 
         try:
-            await self.app(scope, receive, send)
+            await self.app(scope, given or receive, send)
         except Exception as error:
             answer.error = error
         return answer
