@@ -1,43 +1,131 @@
 """Keys that follow another one, so that a change of one number leaves a scene that a person would draw.
 
-A beam that fills the lens goes on filling it; a picture that is widened keeps its proportions; a lens that is moved or
-made thicker keeps its distance to the wall.  In the text of a scene each key can still be set by itself.
+A beam that fills the lens goes on filling it; a lens that is moved or made thicker keeps its distance to the wall; and
+light of another profile gets the width that this profile has.  With a closed lock, width and height keep their
+proportions.  Nothing follows a wrong entry.  In the text of a scene each key can still be set by itself.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from typing import Any
 
+from bstcad.app.form import LOCKS
+from bstcad.app.kinds import extent, table_at
+from bstcad.app.scene_text import changed, same, tables
+from bstcad.runs.files import SentenceError
+
 SHAPES = {"lens.outline": "source.aperture"}  # an outline, and the outline that follows where both are alike
-MOVED = {"lens.back.z": "target.z"}  # a plane, and the plane that keeps its distance
+MOVED = "lens.back.z"  # the plane from which targets keep their distance
+WIDTHS = {  # the key that states the width of a profile, by the kind of source and the profile
+    ("collimated", "gaussian"): "radius_1e2",
+    ("point", "gaussian"): "half_angle_1e2",
+    ("point", "uniform"): "half_angle",
+}
 
 
-def with_followers(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
-    """The changes, by key, that a change of one key makes in the tables of a scene; that key is the first."""
-    changes = {key: value}
+def take_change(
+    text: str, key: str, value: Any, *, is_sound: Callable[[str], bool], sound: str | None = None, locked: bool = False
+) -> tuple[str, tuple[str, ...]]:
+    """Return a scene's text with another value of a key, and the keys that followed.
+
+    is_sound: is a text a valid scene?  Keys follow only where the scene is valid with them.  sound: the latest valid
+    text of the scene, from which followers are computed, so that a wrong entry in between leaves no trace in them.
+    """
+    alone = changed(text, key, value)
+    before = tables(text if sound is None else sound)
+    for changes in (with_followers(before, key, value, locked=locked), _with_aperture(before, key, value)):
+        others = {other: own for other, own in changes.items() if other != key}
+        if not others or not _untouched(before, tables(text), others):
+            continue
+        try:
+            together = alone
+            for other, own in others.items():
+                together = changed(together, other, own)
+        except SentenceError:
+            continue
+        if is_sound(together):
+            return together, tuple(other for other in others if not same(_at(tables(text), other), others[other]))
+        if is_sound(alone):
+            break
+    return alone, ()
+
+
+def with_followers(data: Mapping[str, Any], key: str, value: Any, locked: bool = False) -> dict[str, Any]:
+    """Return the changes, by key, that a change of one key makes in the tables of a scene; that key is the first.
+
+    locked: the other side of a target or an outline keeps its ratio to the side that is changed.
+    """
+    changes = {key: value} | (_locked(data, key, value) if locked else {})
     for leader, follower in SHAPES.items():
-        table, name = key.rpartition(".")[::2]
-        if table == leader and _at(data, leader) == _at(data, follower) is not None:
-            changes[f"{follower}.{name}"] = copy.deepcopy(value)
-    if key in MOVED and _number(value):
-        before, other = _at(data, key), _at(data, MOVED[key])
-        if _number(before) and _number(other):
-            changes[MOVED[key]] = _rounded(other + value - before)
-    if key == "target.x" and _is_range(value):
-        x, y = _at(data, "target.x"), _at(data, "target.y")
-        if _is_range(x) and _is_range(y):
-            ratio, middle = (value[1] - value[0]) / (x[1] - x[0]), (y[0] + y[1]) / 2
-            changes["target.y"] = [_rounded(middle + ratio * (end - middle)) for end in y]
+        for each, own in [*changes.items()]:
+            table, name = each.rpartition(".")[::2]
+            if table == leader and _at(data, leader) == _at(data, follower) is not None:
+                changes[f"{follower}.{name}"] = copy.deepcopy(own)
+    if key == MOVED and _number(value) and _number(before := _at(data, key)):
+        targets = data.get("target")
+        names = [f"target[{k}].z" for k in range(len(targets))] if isinstance(targets, list) else ["target.z"]
+        changes |= {name: _rounded(z + value - before) for name in names if _number(z := _at(data, name))}
+    return changes | (_of_profile(data, value) if key == "source.profile" else {})
+
+
+def _untouched(before: Mapping[str, Any], now: Mapping[str, Any], keys: Mapping[str, Any]) -> bool:
+    """Do the keys have the values of the latest valid scene still?"""
+    return all(same(_at(before, key), _at(now, key)) for key in keys)
+
+
+def _locked(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
+    """Return the other side of a table, in the ratio to this one that it has; {} where one of them has no length."""
+    place, _, name = key.rpartition(".")
+    other = f"{place}.{LOCKS.get(name, '')}"
+    was, its = _at(data, key), _at(data, other)
+    if _number(value) and _number(was) and _number(its) and was and value > 0:
+        return {other: _rounded(its * value / was)}
+    if not (_is_range(value) and _is_range(was) and _is_range(its)):
+        return {}
+    ratio, middle = (value[1] - value[0]) / (was[1] - was[0]), (its[0] + its[1]) / 2
+    return {other: [_rounded(middle + ratio * (end - middle)) for end in its]}
+
+
+def _with_aperture(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
+    """Return the changes where an outline of another shape needs an aperture of that shape, too."""
+    has_aperture = key == "lens.outline.shape" and table_at("source.aperture", dict(data))
+    return {key: value, "source.aperture.shape": value} if has_aperture else {key: value}
+
+
+def _of_profile(data: Mapping[str, Any], profile: Any) -> dict[str, Any]:
+    """Return the widths of a profile: the one that it has is made of the lens, those of other profiles go."""
+    source = table_at("source", data)
+    kind = source.get("kind")
+    wanted = WIDTHS.get((kind, profile))
+    changes: dict[str, Any] = {
+        f"source.{name}": None for (of, _), name in WIDTHS.items() if of == kind and name in source and name != wanted
+    }
+    if wanted is not None and wanted not in source and (made := _width(data, source, wanted)) is not None:
+        changes[f"source.{wanted}"] = made
     return changes
 
 
+def _width(data: Mapping[str, Any], source: Mapping[str, Any], name: str) -> float | None:
+    """Return the width of a profile that fills the lens: a radius (mm), or the half angle of its corners (degrees)."""
+    sizes = extent(table_at("lens.outline", data))
+    if sizes is None:
+        return None
+    if name == "radius_1e2":
+        return max(sizes) / 2
+    position, front = source.get("position"), _at(data, "lens.front.z")
+    start = position[-1] if isinstance(position, list) and position else 0.0
+    if not (_number(start) and _number(front)) or front == start:
+        return None
+    return round(math.degrees(math.atan(math.hypot(*sizes) / 2 / abs(front - start))), 1)
+
+
 def _at(data: Any, key: str) -> Any:
-    """The value of a dotted key; None if it is not there."""
-    for name in key.split("."):
-        data = data.get(name) if isinstance(data, Mapping) else None
-    return data
+    """Return the value of a dotted key; None if it is not there."""
+    place, _, name = key.rpartition(".")
+    return (table_at(place, data) if place else data).get(name)
 
 
 def _number(value: Any) -> bool:
@@ -49,5 +137,5 @@ def _is_range(value: Any) -> bool:
 
 
 def _rounded(value: float) -> float:
-    """Without the last digits of a sum."""
+    """Return a number without the last digits of a sum."""
     return float(f"{value:.10g}")

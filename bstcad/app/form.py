@@ -42,6 +42,7 @@ FIRST: tuple[Mapping[str, str], ...] = (  # what most people change: a key and i
     {"target.gamma": "Brightness of the picture's tones (gamma)"},
     {"tailoring.quality": "Quality"},
 )  # fmt: skip
+LOCKS = {"x": "y", "y": "x", "width": "height", "height": "width"}  # a side, and the one that a closed lock moves
 ASKED_FOR = ("mount",)  # tables that mean something by being there, even without a key
 MANY = 1000  # tables of a list that has no limit
 STEPS, ROUND = 100, (5, 2, 1)  # of a slider, at least; and the figures that a step may have
@@ -109,6 +110,15 @@ class Form:
     first: tuple[Field, ...]
     sections: tuple[Group, ...]  # in the schema's order
     additions: tuple[Addition, ...]  # of sections
+
+    def in_rows(self) -> Iterator[tuple[Field, ...]]:
+        """The first fields one by one, but two sides that a lock may join together."""
+        left = [*self.first]
+        while left:
+            field = left.pop(0)
+            place, _, name = field.key.rpartition(".")
+            joined = left and name in LOCKS and left[0].key == f"{place}.{LOCKS[name]}"
+            yield (field, left.pop(0)) if joined else (field,)
 
     def groups(self) -> Iterator[Group]:
         """All groups, those in others too."""

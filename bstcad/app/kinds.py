@@ -64,6 +64,12 @@ def node_at(key: str, data: Table) -> Node | None:
     return next((record["properties"][name] for record in union if name in record["properties"]), None)
 
 
+def kinds_at(key: str, data: Table) -> list[Any]:
+    """Return all kinds that the table of a key such as source.kind may be; [] for a key that tells no kind."""
+    place, _, name = key.rpartition(".")
+    return [tags(record)[name] for record in records_at(place, data) if name in tags(record)]
+
+
 def of_kinds(union: list[Node], table: Table) -> list[Node]:
     """The record of a union that a table is by its tag; all of them if it is none."""
     chosen = [record for record in union if tags(record) and tags(record).items() <= _hashable(table).items()]
@@ -204,8 +210,8 @@ def _completed(place: str, record: Node, kept: Table, data: Table) -> dict[str, 
 def _made(key: str, node: Node, data: Table) -> Any:
     """A value for a key that a table needs: by the size or the place of what is there, else the schema's example."""
     place, _, name = key.rpartition(".")
-    sizes, like = _sizes(table_at(place, data)), LIKE.get(plain(place))
-    if sizes is None and like is not None and (found := _sizes(table_at(like[0], data))):
+    sizes, like = extent(table_at(place, data)), LIKE.get(plain(place))
+    if sizes is None and like is not None and (found := extent(table_at(like[0], data))):
         sizes = (like[1] * found[0], like[1] * found[1])
     if name in MEASURES and sizes is not None:
         return MEASURES[name](sizes)
@@ -224,7 +230,7 @@ MEASURES: Mapping[str, Callable[[tuple[float, float]], float]] = {  # of an outl
 }
 
 
-def _sizes(table: Table) -> tuple[float, float] | None:
+def extent(table: Table) -> tuple[float, float] | None:
     """The extent of an outline, or of a target, along x and y."""
     ends = [table.get(axis) for axis in "xy"]
     if all(isinstance(pair, list) and len(pair) == 2 and _numbers(*pair) for pair in ends):
@@ -258,7 +264,7 @@ def _focus(data: Table) -> list[float] | None:
 
 def _circle(data: Table) -> float | None:
     """Of the holes of a flange, half way between lens and rim."""
-    sizes = _sizes(table_at("lens.outline", data)), _sizes(table_at("mount.flange.outline", data))
+    sizes = extent(table_at("lens.outline", data)), extent(table_at("mount.flange.outline", data))
     return None if None in sizes else (min(sizes[0]) + min(sizes[1])) / 2
 
 

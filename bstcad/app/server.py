@@ -30,9 +30,10 @@ from starlette.staticfiles import StaticFiles
 
 import bstcad
 from bstcad.app import design_runs, form, preview_json, scene_text, sketch
+from bstcad.app.choices import impossible
 from bstcad.app.connections import HeadersInTime
 from bstcad.app.design_runs import Run
-from bstcad.app.followers import with_followers
+from bstcad.app.followers import take_change
 from bstcad.app.guard import POLICY, SANDBOX, Guard
 from bstcad.app.preview_desk import STAGES, PreviewDesk
 from bstcad.app.preview_desk import Request as Asked
@@ -54,6 +55,7 @@ STATIC, SITES = (
     (Path(__file__).parents[1] / "site", Path(__file__).parents[2] / "docs/_build/html"),
 )
 SHOWN = {".html": "text/html", ".json": "application/json", ".png": "image/png", ".pdf": "application/pdf"}
+MOST_SOUND = 31  # scenes, besides the latest, whose latest valid text is kept
 SLOWEST = 5.0  # seconds that open requests have when the server ends
 CLOUDS = ((b"ply", ".ply"), (b"solid", ".stl"))  # how files of measured points begin
 
@@ -64,6 +66,7 @@ class Workbench:
     def __init__(self, workspace: Workspace) -> None:
         self.workspace, self.desk = workspace, PreviewDesk()
         self.started: list[Run] = []  # by this server
+        self._sound: dict[str, str] = {}  # the latest valid text of each scene of late, from which keys follow
         self._pages = jinja2.Environment(
             loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True,
             lstrip_blocks=True, undefined=jinja2.StrictUndefined,
@@ -79,6 +82,7 @@ class Workbench:
             Route(UPLOAD, self.keep_picture, methods=["POST"]),
             Route(scene, self.scene_state),
             Route(f"{scene}/change", self.change_scene, methods=["POST"]),
+            Route(f"{scene}/impossible", self.impossible_choices),
             Route(f"{scene}/save", self.save_scene, methods=["POST"]),
             Route(f"{scene}/drop", self.drop_changes, methods=["POST"]),
             Route(f"{scene}/preview", self.preview, methods=["POST"]),
@@ -243,6 +247,8 @@ class Workbench:
         except SceneError as fault:
             return told | {"form": None, "error": {"key": "", "sentence": str(fault), "line": _line(str(fault))}}
         error = self._fault(name, opened.text)
+        if error is None:
+            self._sound = {**dict([*self._sound.items()][-MOST_SOUND:]), name: opened.text}
         shown = form.form(data)
         told["design"] = data.get("name") if isinstance(data.get("name"), str) else name
         errors = {error["key"]: error["sentence"]} if error else {}
@@ -265,28 +271,44 @@ class Workbench:
         return None
 
     async def change_scene(self, request: Request) -> Response:
-        """Another text, {text}, or another value as a person typed it, {key, words}; {key, value} as JSON has it."""
+        """Another text, {text}, or another value as a person typed it, {key, words}; {key, value} as JSON has it.
+
+        {locked: true}: the other side of a target or a lens keeps its ratio to the one that is changed.  The answer's
+        `followed` names the keys that changed besides.
+        """
         asked, name = await _json(request), request.path_params["name"]
+        followed: tuple[str, ...] = ()
+
+        def with_value(text: str) -> str:
+            nonlocal followed
+            text, followed = self._with_value(name, text, asked)
+            return text
 
         def changed() -> dict[str, Any]:
-            whole = "text" in asked
-            if whole:
+            if "text" in asked:
                 self.workspace.change(name, str(asked["text"]).replace("\r\n", "\n"))
             else:
-                self.workspace.edit(name, lambda text: self._with_value(text, asked))
-            return self._state(name)
+                self.workspace.edit(name, with_value)
+            return self._state(name) | {"followed": followed}
 
         return JSONResponse(await run_in_threadpool(changed))
 
-    def _with_value(self, text: str, asked: Mapping[str, Any]) -> str:
-        """The text of a scene with another value."""
+    def _with_value(self, name: str, text: str, asked: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
+        """Return the text of a scene with another value, and the keys that followed."""
         key, data = str(_given(asked, "key")), scene_text.tables(text)
         if key.count(".") > DOTS:
             raise SceneError(f"{key[:20]}…: is no key of a scene; reload the page")
         value = asked["value"] if "value" in asked else scene_text.typed(key, str(_given(asked, "words")), data)
-        for other, own in with_followers(data, key, value).items():
-            text = scene_text.changed(text, other, own)
-        return text
+        return take_change(
+            text, key, value, is_sound=lambda each: self._fault(name, each) is None, sound=self._sound.get(name),
+            locked=asked.get("locked") is True,
+        )  # fmt: skip
+
+    def impossible_choices(self, request: Request) -> Response:
+        """The choices of the form that this scene cannot have: {key: {choice: why}}."""
+        name = request.path_params["name"]
+        text = self.workspace.opened(name).text
+        return JSONResponse(impossible(text, lambda each: (self._fault(name, each) or {}).get("sentence")))
 
     async def save_scene(self, request: Request) -> Response:
         """Put the text into the scene file; {anyway: true} over another program's."""

@@ -10,7 +10,18 @@ from typing import Any
 
 import tomlkit
 
-from bstcad.app.kinds import alternatives, cast, choices, new_table, node_at, of_kinds, plain, records_at, table_at
+from bstcad.app.kinds import (
+    alternatives,
+    cast,
+    choices,
+    kinds_at,
+    new_table,
+    node_at,
+    of_kinds,
+    plain,
+    records_at,
+    table_at,
+)
 from bstcad.scene.errors import SceneError, nearest
 from bstcad.scene.schema import Node, records
 
@@ -48,6 +59,8 @@ def typed(key: str, words: str, data: Mapping[str, Any]) -> Any:
         return words
     unit = node["unit"] if node["unit"] != "none" else ""
     words = words.strip().removesuffix(unit).rstrip()
+    if kinds := kinds_at(key, data):  # another kind of table is possible, too
+        node = {name: part for name, part in node.items() if name != "const"} | {"enum": kinds}
     for value in _readings(node, words):
         if value is False and node.get("const") is True:
             return None

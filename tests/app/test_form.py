@@ -143,7 +143,8 @@ VOID = {"input", "br", "hr", "img", "meta", "link"}
 ATTRIBUTES = {
     "id", "name", "class", "for", "type", "value", "checked", "selected", "inputmode", "autocomplete", "spellcheck",
     "rows", "placeholder", "min", "max", "step", "role", "href", "open", "data-key", "data-value", "data-section",
-    "aria-label", "data-middle", "aria-describedby", "aria-invalid", "aria-required",
+    "aria-label", "aria-pressed", "aria-hidden", "title", "data-locks", "viewbox", "d", "data-middle",
+    "aria-describedby", "aria-invalid", "aria-required",
 }  # fmt: skip
 
 
@@ -186,7 +187,9 @@ def is_sound(text, found):
             for other in attrs.get("aria-describedby", "").split():
                 assert other in ids and (other.endswith("-error") or sound.words[other])
             controls[attrs["data-key"]] = attrs
-        assert tag != "button" or (attrs["type"] == "button" and attrs["data-key"] and attrs["data-value"])
+        if tag == "button":
+            locks = attrs.get("data-locks", "").split()
+            assert attrs["type"] == "button" and (len(locks) == 2 or (attrs["data-key"] and attrs["data-value"]))
         assert tag != "legend" or outside[-1] == "fieldset"
     assert controls.keys() == {field.key for field in found.fields()}
     assert labelled == {html_id(key) for key in controls}
@@ -198,7 +201,12 @@ def test_the_html_is_sound(name):
     found = form(DATA[name])
     elements = is_sound(html(found, {}), found)
     assert not [attrs for _, attrs, _ in elements if "aria-invalid" in attrs or attrs.get("role") == "alert"]
-    buttons = {attrs["data-key"]: json.loads(attrs["data-value"]) for tag, attrs, _ in elements if tag == "button"}
+    pressed = [attrs for tag, attrs, _ in elements if tag == "button"]
+    buttons = {attrs["data-key"]: json.loads(attrs["data-value"]) for attrs in pressed if "data-key" in attrs}
+    locks = {key for attrs in pressed for key in attrs.get("data-locks", "").split()}
+    keys = {field.key for field in found.first}
+    both = [key for key in keys if key.endswith((".x", ".y")) or {"lens.outline.width", "lens.outline.height"} <= keys]
+    assert locks == {key for key in both if key.rpartition(".")[2] in ("x", "y", "width", "height")}
     assert all(value is None or isinstance(value, dict) for value in buttons.values())
     by_key = {attrs["name"]: (tag, attrs) for tag, attrs, _ in elements if "name" in attrs}
     for field in found.fields():

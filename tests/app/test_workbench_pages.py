@@ -86,9 +86,62 @@ def test_a_wrong_value_is_marked_where_it_stands_with_the_terminals_sentence(ope
     control = page.locator("[aria-invalid=true]").first
     assert control.get_attribute("data-key") == "target.z"
     assert page.locator(f"#{control.get_attribute('aria-describedby').split()[-1]}").inner_text() == told
-    page.fill("input[type=text][data-key='target.z']", "far")
+    assert page.locator("#targets img, #figures td, #predicted td").count() == 0  # of the scene before
+    assert told in page.inner_text("#status")
+    page.fill("input[type=text][data-key='target.z']", "100")
     page.keyboard.press("Tab")
-    page.wait_for_selector("#fault:has-text('far')")
+    page.wait_for_selector(SEEN, timeout=PATIENCE)
+    page.wait_for_selector("#figures td")
+    assert page.is_enabled("#make")
+
+
+def type_into(page, key: str, words: str) -> None:
+    """Type into a field of the form, and leave it."""
+    page.fill(f"input[type=text][data-key='{key}']", words)
+    page.keyboard.press("Tab")
+
+
+def text_has(page, words: str) -> None:
+    """Wait until the text of the scene has some words."""
+    page.wait_for_function("words => document.getElementById('text').value.includes(words)", arg=words)
+
+
+def test_a_wrong_entry_stays_in_its_field_and_no_lens_is_made_of_it(open_page, shared):
+    page = open_page(shared.address)
+    open_scene(page, shared, "typed")
+    lock = page.locator(".lock[data-locks='target.x target.y']")
+    assert "proportions" in lock.inner_text().lower() and lock.get_attribute("aria-pressed") == "false"
+    page.focus("input[type=range][data-key='target.x']")
+    page.keyboard.press("Tab")  # the lock stands between the two
+    page.keyboard.press("Enter")
+    assert lock.get_attribute("aria-pressed") == "true"
+    type_into(page, "target.x", "wide")
+    page.wait_for_selector("#form .error:has-text('wide')")
+    type_into(page, "lens.back.z", "4,5")  # another field is right, and the first is wrong still
+    text_has(page, "z = 100.5")
+    assert "target.z = 100.5" in page.inner_text("#followed")
+    field = page.locator("input[type=text][data-key='target.x']")
+    assert field.input_value() == "wide" and field.get_attribute("aria-invalid") == "true"
+    assert page.is_disabled("#make") and "y = [-8.0, 8.0]" in page.input_value("#text")
+    type_into(page, "target.x", "-16; 16")
+    text_has(page, "y = [-16.0, 16.0]")
+    assert lock.get_attribute("aria-pressed") == "true" and page.is_enabled("#make")
+    assert page.locator("#form .error").count() == 0 and page.is_hidden("#fault")
+
+
+def test_no_figure_stays_after_an_estimate_that_fails(open_page, shared):
+    page = open_page(shared.address)
+    page.route("**/preview", lambda route: route.fulfill(json={"stage": "preview", "number": 1, "refused": "too far"}))
+    page.goto(f"{shared.root}/scene/small")
+    page.wait_for_selector("#status:has-text('No preview: too far')")
+    page.unroute("**/preview")
+    type_into(page, "target.z", "101")
+    page.wait_for_selector("#predicted td:has-text('s')", timeout=PATIENCE)
+    refused = {"number": 2, "refused": "no memory"}
+    page.route("**/preview", lambda route: route.fulfill(json=refused | {"stage": "preview"}))
+    type_into(page, "target.z", "102")
+    page.wait_for_selector("#status:has-text('No preview: no memory')")
+    assert page.locator("#targets img, #figures td, #remarks li, #predicted td, #left-out td").count() == 0
 
 
 def test_two_windows_show_one_scene(open_page, shared):

@@ -7,6 +7,9 @@ let state = embedded();
 const at = `/api/scene/${encodeURIComponent(state.name)}`, page = crypto.randomUUID();
 const QUALITIES = ["draft", "standard", "fine"], LOOK = 1500; // milliseconds between two looks for other pages' changes
 let number = 0, sent = {}, waiting = null, busy = false, dragging = null, viewer = null, look = "lens", qualities = {};
+const wrong = new Map(); // what a person typed that is no value: by key, the words and the sentence
+const closed = new Set(); // locks, by their keys
+let impossible = {}; // by key and choice, why this scene cannot have it
 const log = (globalThis.previewLog = []); // milliseconds from each change to its preview, for measurements
 let changedAt = null;
 
@@ -22,10 +25,12 @@ function take(told) {
   const area = element("text");
   if (document.activeElement !== area || !area.dataset.changed) area.value = told.text;
   const error = told.error;
-  element("fault").hidden = !error;
-  element("fault").textContent = error ? (error.line ? `${error.sentence} (line ${error.line})` : error.sentence) : "";
-  element("make").disabled = Boolean(error);
+  if (anew) impossible = {};
   if (told.form !== null && dragging === null && (anew || error)) replaceForm(told.form);
+  else markForm();
+  sayFollowed(told.followed ?? []);
+  sayFault();
+  if (error) noEstimates(error.sentence);
   if (told.sketch !== undefined) element("sketch").innerHTML = told.sketch;
   const quality = /^\s*quality\s*=\s*"(\w+)"/m.exec(told.text);
   const place = QUALITIES.indexOf(quality ? quality[1] : "standard");
@@ -40,6 +45,7 @@ function replaceForm(html) {
   const selection = key && type === "text" ? [active.selectionStart, active.selectionEnd] : null;
   form.innerHTML = html;
   for (const part of form.querySelectorAll("details")) part.open ||= open.has(part.dataset.section);
+  markForm();
   if (key === null) return;
   const again = [...form.querySelectorAll("[data-key]")].find((part) => part.dataset.key === key && part.type === type);
   again?.focus({ preventScroll: true });
@@ -60,22 +66,83 @@ async function send() {
     const given = waiting;
     waiting = null;
     try {
-      take(await ask(`${at}/change`, given));
+      const told = await ask(`${at}/change`, given);
+      if (given.key === undefined) wrong.clear();
+      else wrong.delete(given.key);
+      take(told);
       if (waiting === null && !state.error) preview();
     } catch (error) {
-      refuse(given.key, error.message);
+      sent = {};
+      wrong.set(given.key ?? "", { words: given.words, sentence: error.message });
+      markForm();
+      sayFault();
     }
   }
   busy = false;
 }
 
-// What a person typed that is no value of the key: it stays in the field, with the sentence under it.
-function refuse(key, sentence) {
-  element("fault").hidden = false;
-  element("fault").textContent = sentence;
-  for (const control of form.querySelectorAll("[data-key]")) {
-    if (control.dataset.key === key && control.type !== "button") control.setAttribute("aria-invalid", "true");
+const controlsOf = (key) => [...form.querySelectorAll("[data-key]")].filter((part) => part.dataset.key === key && part.type !== "button");
+
+// What the server does not know of the form: entries that are no values, closed locks, and choices that cannot be.
+function markForm() {
+  for (const old of form.querySelectorAll("[data-typed]")) {
+    if (old.tagName === "P") old.remove();
+    else {
+      old.removeAttribute("aria-invalid");
+      old.setAttribute("aria-describedby", `${old.id}-help`);
+      delete old.dataset.typed;
+    }
   }
+  for (const [key, { words, sentence }] of wrong) {
+    for (const control of controlsOf(key)) {
+      control.closest("details")?.setAttribute("open", "");
+      if (control.type === "range") continue;
+      if (words !== undefined && control.type !== "checkbox" && control.tagName !== "SELECT") control.value = words;
+      control.setAttribute("aria-invalid", "true");
+      control.dataset.typed = "wrong";
+      const told = document.createElement("p");
+      Object.assign(told, { className: "error", id: `${control.id}-typed`, textContent: sentence });
+      told.setAttribute("role", "alert");
+      told.dataset.typed = "wrong";
+      control.closest(".field").append(told);
+      control.setAttribute("aria-describedby", `${control.id}-help ${told.id}`);
+    }
+  }
+  for (const lock of form.querySelectorAll(".lock")) lock.setAttribute("aria-pressed", closed.has(lock.dataset.locks));
+  for (const [key, choices] of Object.entries(impossible)) for (const control of controlsOf(key)) grey(control, choices);
+}
+
+// A choice that this scene cannot have is greyed, with the reason under the field.
+function grey(control, choices) {
+  if (control.tagName !== "SELECT" || control.dataset.greyed) return;
+  control.dataset.greyed = "yes";
+  const reasons = document.createElement("small");
+  for (const option of control.options) {
+    const why = choices[option.value];
+    if (!why) continue;
+    option.value = option.value; // its text changes below
+    option.disabled = true;
+    option.textContent = `${option.value} (not here)`;
+    reasons.append(`Not ${option.value} here: ${why}. `);
+  }
+  reasons.id = `${control.id}-reasons`;
+  control.setAttribute("aria-describedby", `${control.getAttribute("aria-describedby")} ${reasons.id}`);
+  control.closest(".field").append(reasons);
+}
+
+// The sentence at the top, and whether a lens can be made: not while any entry is wrong.
+function sayFault() {
+  const { error } = state, typed = [...wrong.values()].map(({ sentence }) => sentence);
+  const sentence = error ? (error.line ? `${error.sentence} (line ${error.line})` : error.sentence) : typed.join(" ");
+  element("fault").hidden = !sentence;
+  if (element("fault").textContent !== sentence) element("fault").textContent = sentence;
+  element("make").disabled = Boolean(error) || wrong.size > 0;
+}
+
+// Keys that changed with another one are named, and marked for a while.
+function sayFollowed(keys) {
+  element("followed").textContent = keys.length ? `Changed with it: ${keys.map((key) => `${key} = ${controlsOf(key)[0]?.value ?? "as well"}`).join("; ")}.` : "";
+  for (const key of keys) for (const control of controlsOf(key)) control.classList.add("followed");
 }
 
 // The slider of a pair is its width: both ends move about their middle.
@@ -86,8 +153,13 @@ function wordsOf(control) {
   return [middle - half, middle + half].map((end) => Number(end.toPrecision(12))).join("; ");
 }
 
+const given = (control) => {
+  const key = control.dataset.key;
+  return { key, words: wordsOf(control), locked: [...closed].some((keys) => keys.split(" ").includes(key)) };
+};
+
 form.addEventListener("change", ({ target }) => {
-  if (target.dataset.key) change({ key: target.dataset.key, words: wordsOf(target) });
+  if (target.dataset.key) change(given(target));
 });
 form.addEventListener("input", ({ target }) => {
   if (target.type !== "range") return;
@@ -95,7 +167,7 @@ form.addEventListener("input", ({ target }) => {
   for (const other of form.querySelectorAll("input[type=text]")) {
     if (other.dataset.key === target.dataset.key) other.value = wordsOf(target);
   }
-  change({ key: target.dataset.key, words: wordsOf(target) });
+  change(given(target));
 });
 for (const kind of ["pointerup", "pointercancel", "keyup"]) {
   document.addEventListener(kind, () => {
@@ -105,6 +177,11 @@ for (const kind of ["pointerup", "pointercancel", "keyup"]) {
   });
 }
 form.addEventListener("click", ({ target }) => {
+  const lock = target.closest(".lock")?.dataset.locks;
+  if (lock) {
+    if (!closed.delete(lock)) closed.add(lock);
+    markForm();
+  }
   if (target.type === "button" && target.dataset.key) change({ key: target.dataset.key, value: JSON.parse(target.dataset.value) });
 });
 for (const [kind, lit] of [["focusin", true], ["focusout", false]]) {
@@ -123,9 +200,11 @@ async function takePicture(file) {
     const { picture } = await ask("/api/picture", file);
     const first = form.querySelector('[data-key="target[0].z"]') ? "target[0]" : "target";
     change({ key: `${first}.image`, value: `pictures/${picture}` });
+    element("picture-fault").textContent = "";
   } catch (error) {
-    refuse("", error.message);
+    element("picture-fault").textContent = error.message;
   }
+  element("picture-fault").hidden = !element("picture-fault").textContent;
 }
 
 element("picture").addEventListener("change", ({ target }) => takePicture(target.files[0]));
@@ -148,19 +227,21 @@ element("quality").addEventListener("change", ({ target }) => change({ key: "tai
 async function preview() {
   const mine = ++number, began = changedAt ?? performance.now();
   element("targets").classList.add("waiting");
+  element("status").className = "";
   element("status").textContent = "A new preview is on its way …";
   let told;
   try {
     told = await ask(`${at}/preview`, { page, number: mine });
     while (mine === number && !told.replaced && !told.stage) told = await ask(answer(mine, 0));
   } catch (error) {
-    if (mine === number) element("status").textContent = error.message;
+    if (mine === number) noEstimates(error.message);
     return;
   }
   if (mine !== number || told.replaced) return;
   show(told);
   log.push(performance.now() - began);
   if (told.refused) return;
+  findImpossible(mine);
   for (let stage = 1; stage < 4; stage++) {
     do {
       told = await ask(answer(mine, stage)).catch(() => ({ replaced: true }));
@@ -172,15 +253,46 @@ async function preview() {
 
 const answer = (mine, stage) => `${at}/answer?page=${page}&number=${mine}&stage=${stage}`;
 
+async function findImpossible(mine) {
+  await pause(LOOK);
+  if (mine !== number || dragging !== null) return;
+  const found = await ask(`${at}/impossible`).catch(() => null);
+  if (mine !== number || found === null || dragging !== null) return;
+  impossible = found;
+  markForm();
+}
+
 function show(told) {
   if (told.stage === "preview" || told.stage === "settled") showLight(told);
-  else if (!told.refused) showPlan(told);
+  else showPlan(told);
+}
+
+// No figure stays of a scene that is no more: the reason stands in its place.
+function noEstimates(sentence) {
+  number++; // answers that are under way are of the scene before
+  const status = element("status");
+  element("targets").classList.remove("waiting");
+  element("targets").replaceChildren();
+  status.textContent = `No preview: ${sentence}`;
+  status.className = "error";
+  for (const part of ["figures", "remarks"]) (element(part).tBodies?.[0] ?? element(part)).replaceChildren();
+  element("solid-figure").classList.remove("drawn");
+  noPlan("");
+}
+
+function noPlan(sentence) {
+  qualities = {};
+  for (const table of [element("predicted"), element("left-out").querySelector("table")]) table.tBodies[0].replaceChildren();
+  element("net").textContent = "";
+  element("notes").textContent = sentence;
+  sayQuality();
 }
 
 function showLight(told) {
   element("targets").classList.remove("waiting");
   if (told.refused) {
-    if (told.stage === "preview") element("status").textContent = told.refused;
+    if (told.stage === "preview") noEstimates(told.refused);
+    else element("status").textContent += ` No finer preview: ${told.refused}.`;
     return;
   }
   element("targets").replaceChildren(...told.targets.map((target) => {
@@ -203,7 +315,10 @@ function showLight(told) {
   if (viewer === null) {
     viewer = solidView.begin(element("solid-figure"), told.solid);
     viewer.look(look);
-  } else viewer.update(told.solid);
+  } else {
+    element("solid-figure").classList.add("drawn");
+    viewer.update(told.solid);
+  }
 }
 
 function figure(source, alt, caption, kind = "") {
@@ -224,7 +339,8 @@ element("solid-figure").addEventListener("click", ({ target }) => {
 // ---- time and accuracy, and what is left out ----
 
 function showPlan(told) {
-  if (told.stage === "effects") {
+  if (told.refused) noPlan(`No estimate: ${told.refused}.`);
+  else if (told.stage === "effects") {
     qualities = told.qualities;
     element("net").textContent = told.net ?? "";
     const several = told.left_out.some((cells) => cells[4]);
@@ -259,7 +375,9 @@ function sayQuality() {
 
 async function order(address, body = {}) {
   try {
-    take(await ask(`${at}/${address}`, body));
+    const told = await ask(`${at}/${address}`, body);
+    if (address === "drop") wrong.clear();
+    take(told);
   } catch (error) {
     if (address === "save" && /another program/.test(error.message) && confirm(error.message)) return order("save", { anyway: true });
     element("fault").hidden = false;
@@ -270,12 +388,13 @@ async function order(address, body = {}) {
 element("save").addEventListener("click", () => order("save"));
 element("drop-changes").addEventListener("click", async () => {
   await order("drop");
-  preview();
+  if (!state.error) preview();
 });
 element("make").addEventListener("click", async () => {
   element("make").disabled = true;
   try {
     while (busy) await pause(50);
+    if (state.error || wrong.size) return sayFault(); // an entry that was left just now
     const { design } = await ask(`${at}/make`, { page });
     location.href = `/design/${design}`;
   } catch (error) {
