@@ -36,9 +36,11 @@ from bstcad.tailoring.grazing import cleared
 from bstcad.tailoring.machinability import BOUNDED, UNBOUNDED, front_shaped, held, kept, moved_clear
 from bstcad.tailoring.reachable import reachable
 from bstcad.tailoring.run import (
+    BEST,
     JUDGING,
     Driver,
     Edge,
+    Judged,
     Look,
     Parameters,
     Progress,
@@ -83,6 +85,7 @@ class Followed:
     mapping: Mapping  # the transport map that it followed
     transport: TransportMap  # the same, inverted, from the target's pixels
     precision: Comparison | None  # float32 beside float64; None if there was no time for it
+    rrmsd: float  # of the lens, by the light of the source's middle and without a mount
 
 
 @dataclass(frozen=True)
@@ -93,6 +96,7 @@ class Saved:
     first: Stage1State | None = None  # where stage 1 stands; None: it has ended
     followed: Followed | None = None  # None: stage 1 has not ended
     second: Stage2State | None = None  # where stage 2 or 3 stands; None: it has not begun, or it has ended
+    best: Judged | None = None  # the best lens at the ends of its parts so far
     lens: Parameters | None = None  # after that
     stopped: str = ""  # the reason why tailoring ended
 
@@ -141,7 +145,7 @@ def design(
     if start and start.lens:
         lens, stopped = start.lens.applied(lens), start.stopped
     else:
-        lens, stopped = _stage2(task, driver, lens, followed, state=start and start.second)
+        lens, stopped = _stage2(task, driver, lens, followed, state=start and start.second, best=start and start.best)
     lens = replace(lens.plain(), index=scene.index, losses=None)
     if scene.lens.front.fixed:  # as it was given: tailoring may have worked with less digits of it
         lens = replace(lens, front=scene.lens.front.surface)
@@ -323,19 +327,21 @@ def _stage1(
     bounds = held(lens, task.bounds, task.least)
     if bounds is None:
         check_thickness(lens, scene)
-    driver.end(name, reached(lens, task.rrmsd(lens) if last.judged is None else last.judged))
+    rrmsd = reached(lens, task.rrmsd(lens) if last.judged is None else last.judged)
+    driver.end(name, rrmsd)
     if bounds is not None:
         driver.progress(BOUNDED, 0, 1, "")
         if front_shaped(lens):  # stage 2 takes a move into account, but makes none itself
             lens = moved_clear(lens, lens.back.z, task.least, bounds)
         lens = kept(lens, bounds)
         check_thickness(lens, scene)
-        driver.end(f"{BOUNDED}, after stage 1", possible(scene, task.rrmsd(lens)))
+        rrmsd = possible(scene, task.rrmsd(lens))
+        driver.end(f"{BOUNDED}, after stage 1", rrmsd)
     precision = None
     if compare and not driver.hurry:
         precision = compare_precisions(task, lens)
         driver.end(COMPARED)
-    return Followed(Parameters.of(lens), last.mapping, transport_of(last, lens, task.screen), precision)
+    return Followed(Parameters.of(lens), last.mapping, transport_of(last, lens, task.screen), precision, rrmsd=rrmsd)
 
 
 def transport_of(last: Step, lens: Lens, screen: Screen) -> TransportMap:
@@ -345,31 +351,73 @@ def transport_of(last: Step, lens: Lens, screen: Screen) -> TransportMap:
     return slope_map.sent_from(last.places, screen)
 
 
-def _stage2(task: Task, driver: Driver, lens: Lens, followed: Followed, state: Stage2State | None) -> tuple[Lens, str]:
-    """Stage 2, and 3 for a source of some size, from stage 1 or further from a state: the lens, and why it ended."""
+def _stage2(
+    task: Task, driver: Driver, lens: Lens, followed: Followed, state: Stage2State | None, best: Judged | None
+) -> tuple[Lens, str]:  # fmt: skip
+    """Stage 2, and 3 for a source of some size, from stage 1 or further from a state: the lens, and why it ended.
+
+    It is no worse than the lens of stage 1, nor than that of any part on the way.
+    """
     if state is None and not driver.wish:  # which cuts stages short: a later run shall not
         driver.save(Saved(driver.record, followed=followed))
     name, steps = second_stage(task, lens, state)
+    whole = task.whole
+    known = not task.grown and lens.clear is None
+    first = whole.judged(lens, followed.rrmsd if known else whole.rrmsd(lens))
 
     def saved(state: Stage2State) -> Saved:
-        return Saved(driver.record, None, followed, state)
+        return Saved(driver.record, None, followed, state, best=driver.best)
 
-    lens = driver.run(steps, task.whole, saved, lambda: driver.hurry).lens
-    if task.edge is not None:
-        lens = cleared(lens, task.edge)
-    bounds = held(lens, task.bounds, task.least)
-    if not front_shaped(lens):  # where no light falls stage 2 is free to bend the back
-        lens = moved_clear(lens, lens.back.z, task.least, bounds)
-    if bounds is not None:
-        lens = kept(lens, bounds)
-        driver.end(BOUNDED, task.whole.rrmsd(lens))
-        if task.bounds is not None and not driver.hurry:
-            driver.aside(UNBOUNDED, stage2.rrmsd_without_bounds(task, lens))
+    last = driver.run(steps, whole, saved, lambda: driver.hurry, best=best or first)
+    lens = _handed_on(whole, driver, last, (driver.best, first))
+    if task.bounds is not None and not driver.hurry:
+        driver.aside(UNBOUNDED, stage2.rrmsd_without_bounds(task, lens))
     total = task.knobs.stage2_iterations
     driver.progress(name, total, total, driver.stopped)
     if driver.stopped != "interrupt":
         driver.save(Saved(driver.record, followed=followed, lens=Parameters.of(lens), stopped=driver.stopped))
     return lens, driver.stopped
+
+
+def _handed_on(task: Task, driver: Driver, last: Step, before: Sequence[Judged]) -> Lens:
+    """The lens after the last step of a stage, mended; or one from before, mended too, if that is better.
+
+    before: the best first.  The paper's procedure hands on its last lens, as it does.
+    """
+    lens = last.lens
+    mended, value = _mended(task, lens), last.judged
+    if held(lens, task.bounds, task.least) is not None:
+        driver.end(BOUNDED, value := task.rrmsd(mended))
+    elif value is not None and (_moved(lens, mended) or not last.whole):
+        value = task.rrmsd(mended)
+    if value is None or task.knobs.method == "adam":
+        return mended
+    latest = task.judged(mended, value)
+    for known in before:
+        if known.beats(latest):
+            lens = known.lens.applied(lens)
+            other = _mended(task, lens)
+            judged = task.judged(other, task.rrmsd(other)) if _moved(lens, other) else known
+            if judged.beats(latest):
+                driver.end(BEST, judged.rrmsd)
+                return other
+    return mended
+
+
+def _mended(task: Task, lens: Lens) -> Lens:
+    """The lens with no light reflected at the edge of its reach, with its faces clear of each other, within bounds."""
+    if task.edge is not None:
+        lens = cleared(lens, task.edge)
+    bounds = held(lens, task.bounds, task.least)
+    if not front_shaped(lens):  # where no light falls stage 2 is free to bend the back
+        lens = moved_clear(lens, lens.back.z, task.least, bounds)
+    return lens if bounds is None else kept(lens, bounds)
+
+
+def _moved(lens: Lens, other: Lens) -> bool:
+    """Is the other lens of other heights, or with its back elsewhere?"""
+    nets = zip(lens.nets, other.nets, strict=True)
+    return lens.back.z != other.back.z or any(a.heights is not b.heights for a, b in nets)
 
 
 def device_for(asked: str) -> str:

@@ -37,7 +37,7 @@ from bstcad.sweep.cold_run import PIXELS, TUBES, Units, rounded
 from bstcad.sweep.cold_run import units as measured_units
 from bstcad.sweep.estimates import coarse_lens, left_out
 from bstcad.tailoring import stage1
-from bstcad.tailoring.run import EVALUATED
+from bstcad.tailoring.run import EVALUATED, Driver
 from bstcad.tailoring.slope_map import SUBCELLS
 from bstcad.tailoring.stage1 import aimed
 from bstcad.tailoring.stage2 import JOINT, blurred_sheets, sheets
@@ -293,16 +293,19 @@ def _pilot(scene: Scene, lens: Lens, quality: str, tick: Callable[[], None]) -> 
     judged = [step.judged for step in first if step.judged is not None]
     reached(first[-1].lens, judged[-1])
     check_thickness(first[-1].lens, scene)
-    second = (step for step in second_stage(task, first[-1].lens)[1] if tick() is None)
-    *_, last = (step for step in second if step.judged is not None)
+    driver, second = Driver(), second_stage(task, first[-1].lens)[1]
+    last = driver.run((step for step in second if tick() is None), task.whole, lambda state: state, lambda: "")
+    made, best = last.lens, driver.best
+    if best is not None and last.judged is not None and best.beats(task.whole.judged(made, last.judged)):
+        made = best.lens.applied(made)  # as a design hands it on
     unseen = detail(scene.target.irradiance(), max(target.columns_rows))
-    steep = steepness(task.heaviest.source, last.lens, target.screen, task.target, sent=sent)
+    steep = steepness(task.heaviest.source, made, target.screen, task.target, sent=sent)
     doubtful = stage1.doubtful(task, rounds.lens, judged[0], rounds.state)
-    blurred = _blurred(scene, last.lens) - _blurred(small, last.lens) if factor > 1 else 0.0
+    blurred = _blurred(scene, made) - _blurred(small, made) if factor > 1 else 0.0
     rrmsd = rrmsd_by_rays(
-        last.lens, small.channels(), target.screen, target=task.target, effort=PILOT_JUDGED, draw=small.draw
+        made, small.channels(), target.screen, target=task.target, effort=PILOT_JUDGED, draw=small.draw
     )
-    return Pilot(rrmsd, factor, unseen, blurred=blurred, doubtful=doubtful, lens=last.lens, steep=steep)
+    return Pilot(rrmsd, factor, unseen, blurred=blurred, doubtful=doubtful, lens=made, steep=steep)
 
 
 def _blurred(scene: Scene, lens: Lens) -> float:

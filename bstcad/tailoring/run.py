@@ -23,7 +23,7 @@ from bstcad.optics.sides import Sides
 from bstcad.optics.wavefront import Wave
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
-from bstcad.tailoring.goals import Goal
+from bstcad.tailoring.goals import Goal, JointMerit
 from bstcad.tailoring.source_image import Spread
 from bstcad.transport.mapping import Mapping
 
@@ -59,6 +59,22 @@ class Parameters:
         return lens.with_nets(replace(net, z=p.z, heights=p.heights.to(like.device)) for net, p in own)
 
 
+@dataclass(frozen=True)
+class Judged:
+    """A lens and its figures by the measure of the whole design: all pixels, all goals, all of the light."""
+
+    rrmsd: float  # by `Task.rrmsd`
+    figure: float  # root of the joint merit of all goals (goals.py): the RRMSD itself where no wave is asked for
+    lens: Parameters
+
+    def beats(self, other: Judged) -> bool:
+        """Is this lens better than another by more than the errors of judging?"""
+        return WORSE * self.figure < (math.inf if math.isnan(other.figure) else other.figure)  # NaN: no light arrives
+
+
+WORSE = 1.05  # ratio of two figures that is no error of judging: BETWEEN knows an RRMSD to some 5 %
+BEST = "back to the best lens before"  # the name of a part of a design
+WAVE_TUBES = 256  # a side, by which the wavefront of a lens between the stages is judged
 EVALUATED = 4.7e6  # tubes a second of pace 1, with the gradient of the merit
 JUDGING = 0.5  # seconds that `Task.rrmsd` takes on a machine of pace 1
 # Of a lens between the stages, for a target of PIXELS a side: to some 5 %.  A target of p pixels a side takes
@@ -150,6 +166,15 @@ class Task:
         ]
         return math.nan if any(map(math.isnan, values)) else max(values)
 
+    def judged(self, lens: Lens, rrmsd: float) -> Judged:
+        """The lens, of this RRMSD by `rrmsd`, as the whole design is judged."""
+        figure = rrmsd
+        if self.wave is not None:
+            merit = JointMerit.of(self.channels, lens, WAVE_TUBES, goals=(), overshoot=0.0, wave=self.wave)
+            square, pictures = float(merit(merit.landing(lens))[0]), sum(goal.weight for goal in self.goals)
+            figure = math.sqrt((pictures * rrmsd**2 + self.wave.weight * square) / (pictures + self.wave.weight))
+        return Judged(rrmsd, figure, Parameters.of(lens))
+
     def used(self, lens: Lens) -> float:
         """Part of the light that enters the lens which falls on the target."""
         return measure(lens.plain(), self.channels, self.screen, target=self.target, effort=COUNTED).used
@@ -167,6 +192,7 @@ class Step:
     progress: tuple[str, int, int, str] | None = None  # stage, done, total, text
     rrmsd: float | None = None  # of the lens, by the rays that tailor it
     judged: float | None = None  # of the lens, by `Task.rrmsd`
+    whole: bool = True  # is it judged by all of the light, and not by that of a smaller source?
     work: float = 0.0  # seconds that the step takes on a machine of pace 1; 0: nobody knows
     skipped: bool = False  # was the step left out, because its gradient was not finite?
     part: str = ""  # which part of the design is under way, for the list of its times; "": none has begun
@@ -247,6 +273,7 @@ class Driver:
         self._step = 0.0  # seconds that the last evaluation took; the next one will take as long
         self._last = clock()  # end of the last step
         self._processor, self._spent = processor, processor()
+        self.best: Judged | None = None  # of the stage under way, at the ends of its parts
         self._record = record
 
     @property
@@ -266,20 +293,35 @@ class Driver:
         """The same for a stage that runs whole, however long it takes: "interrupt" or ""."""
         return "interrupt" if self.interrupted() else ""
 
-    def run(self, steps: Iterator[Step], task: Task, saved: Callable[[Any], Any], why: Callable[[], str]) -> Step:
+    def run(
+        self, steps: Iterator[Step], task: Task, saved: Callable[[Any], Any], why: Callable[[], str],
+        best: Judged | None = None,
+    ) -> Step:  # fmt: skip
         """Go through a stage until it ends or `why` says why it has to; its last step.
 
-        saved: the state to save, from that of a step.
+        saved: the state to save, from that of a step.  best: the best lens before; afterwards `self.best` is the best
+        at the ends of all parts.  A part sees fewer pixels or less light, and may end with a lens that is worse.
         """
-        self._last = self._clock()
+        self._last, self.best = self._clock(), best
         for step in steps:
             self.stopped = self._take(step, saved) or (step.make and why()) or ""
+            if step.ends:
+                self._compare(step, task)
             if self.stopped:
                 break
         if self.stopped and step.part and not step.ends:
-            self.end(step.part, task.rrmsd(step.lens) if step.judged is None else step.judged)
+            step = replace(step, judged=task.rrmsd(step.lens) if step.judged is None else step.judged)
+            self.end(step.part, step.judged)
+            self._compare(step, task)
         self.stopped = self.stopped or "evaluations"
         return step
+
+    def _compare(self, step: Step, task: Task) -> None:
+        """Note the lens of a step if it is the best so far."""
+        if step.judged is not None and step.whole:
+            latest = task.judged(step.lens, step.judged)
+            if self.best is None or math.isnan(self.best.figure) or latest.figure < self.best.figure:
+                self.best = latest
 
     def _take(self, step: Step, saved: Callable[[Any], Any]) -> str:
         """Note a step; why the stage ends with it, if it does."""
