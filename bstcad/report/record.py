@@ -189,6 +189,7 @@ class Contents:
     blur: Blur | None = None  # by the source's size; None: it has no size
     finest_detail: FinestDetail | None = None  # how wide a point of the picture becomes
     lines: tuple[Line, ...] = ()  # of a spectrum; none: it has one line
+    picture: tuple[str, ...] = ()  # sentences on how the picture was read: first of several, tones, transparency, fit
     given_up: tuple[str, ...] = ()  # remarks: sentences on wishes of the scene that the design does not fulfil
     estimates: tuple[LeftOut, ...] = ()  # of the effects that are not simulated, the largest change first
     # the end of the convergence curve, as analysis.cost.Ending has it; None: there is no curve
@@ -295,6 +296,7 @@ def contents_of(
         stability=proof.stability,
         blur=proof.blur,
         finest_detail=_finest_detail(scene, proof, estimates),
+        picture=scene.of_pictures(),
         lines=tuple(Line(line.wavelength, line.share, rrmsd(target, line.picture)) for line in proof.lines),
         estimates=estimates,
         targets=tuple(of_targets(scene, proof)) if proof.further else (),

@@ -1,9 +1,9 @@
 """Pictures: from a file, an array, a sample or letters to grey light.
 
 A photograph's numbers are sRGB (IEC 61966-2-1): E = c / 12.92 up to c = 0.04045 and ((c + 0.055) / 1.055)^2.4 above it,
-for a channel c and the irradiance E, both from 0 to 1.  Numbers of 16 bits and more are irradiance itself.  Before
+for a channel c and the irradiance E, both from 0 to 1; of 16 bits as of 8.  Floats are irradiance itself.  Before
 either goes the file's own statement: cICP, an ICC profile, sRGB or gAMA, in this order, as PNG has it.  Grey is the
-mean of the channels' light.
+mean of the channels' light.  Of a file of several pictures the first is read.
 """
 
 from __future__ import annotations
@@ -30,10 +30,14 @@ from bstcad.runs import files
 from bstcad.scene.errors import SceneError
 
 FORMATS = {  # that are read, and the ending of a copy
-    "PNG": ".png", "JPEG": ".jpg", "MPO": ".jpg", "TIFF": ".tif", "WEBP": ".webp", "BMP": ".bmp", "HEIF": ".heic",
+    "PNG": ".png", "JPEG": ".jpg", "MPO": ".jpg", "TIFF": ".tif", "WEBP": ".webp", "BMP": ".bmp", "GIF": ".gif",
+    "HEIF": ".heic", "AVIF": ".avif",
 }  # fmt: skip
-OPENED = ("PNG", "JPEG", "TIFF", "WEBP", "BMP")  # by Pillow itself; an MPO is a JPEG with others behind it
-KINDS = "PNG, JPEG, TIFF, WebP, BMP or HEIC"
+OPENED = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "GIF")  # by Pillow itself; an MPO is a JPEG with others behind it
+KINDS = "PNG, JPEG, TIFF, WebP, BMP, GIF, HEIC or AVIF"
+AVIF = (b"avif", b"avis")  # brands of a HEIF file whose pixels are coded as AV1: one picture, a sequence
+DESCRIPTION = 270  # tag of a TIFF file
+IRRADIANCE = "irradiance"  # the description of an array's file: its floats are meant to be light
 LARGEST = 64_000_000  # pixels of a picture
 LONGEST = 65_535  # pixels along a side: as far as JPEG goes
 TILE_WIDTH, TILE_LENGTH = 322, 323  # tags of a TIFF file, which is decoded by whole tiles
@@ -41,6 +45,8 @@ LARGEST_TILE = 4096**2  # pixels; programs write tiles of up to 1024 a side
 LARGEST_FILE = 400_000_000  # bytes: 64 million pixels of three 16-bit channels
 LARGEST_PROFILE = 10_000_000  # bytes; printers' profiles have a few millions
 STRIP = 256  # rows of a picture in work at a time
+WHOLE = "16 bits or more and no colour tag: its numbers are taken as sRGB; gamma = 1 takes them as light"
+FLOATS = "floats and no colour tag: they are taken as light; gamma = 2.2 takes them as a screen does"
 BLACK = 8 / 255  # of all that is opaque: a logo for a white ground, of which the transparency is the picture
 STEEPEST_GAMMA = 10.0  # an exponent beyond it, or below its inverse, is a mistake in the file
 LINEAR, PQ, HLG = 8, 16, 18  # transfer characteristics of a cICP chunk (ITU-T H.273)
@@ -104,7 +110,7 @@ def from_array(values: np.ndarray) -> Picture:
     for fault in _faults(values):
         raise SceneError(f"target.image: {fault}")
     values, file = values.astype(np.float64), io.BytesIO()
-    Image.fromarray((values / values.max()).astype(np.float32)).save(file, "TIFF")
+    Image.fromarray((values / values.max()).astype(np.float32)).save(file, "TIFF", description=IRRADIANCE)
     return Picture("array.tif", file.getvalue())
 
 
@@ -160,19 +166,23 @@ def _silent() -> Iterator[None]:
 
 def _opened(name: str, data: bytes) -> Image.Image:
     """The picture's header; its pixels are not decoded yet."""
-    sizes = []
+    sizes, kinds = [], f"no {KINDS} picture; save it as one of these"
     try:
-        if data[4:8] == b"ftyp":  # a telephone's HEIC picture, which may show a part of the coded pixels (boxes ispe)
-            from pillow_heif import HeifImageFile  # only where there is one
+        if data[4:8] == b"ftyp":  # boxes, as of a telephone's HEIC picture, which may show a part of the coded pixels
+            if _is_avif(data):
+                kinds = "an AVIF picture that cannot be decoded here; save it as PNG or JPEG"
+                image = Image.open(io.BytesIO(data), formats=["AVIF"])
+            else:
+                from pillow_heif import HeifImageFile  # only where there is one
 
-            image = HeifImageFile(io.BytesIO(data))
+                image = HeifImageFile(io.BytesIO(data))
             sizes = [struct.unpack(">II", size) for size in re.findall(rb"ispe\0{4}(.{8})", data, re.DOTALL)]
         else:
             image = Image.open(io.BytesIO(data), formats=OPENED)
     except Image.DecompressionBombError:
         raise SceneError(f"target.image: {name!r} has over {LARGEST // 10**6} million pixels; shrink it") from None
-    except (OSError, SyntaxError, ValueError):
-        raise SceneError(f"target.image: {name!r} is no {KINDS} picture; save it as one of these") from None
+    except (OSError, SyntaxError, ValueError, KeyError):  # KeyError: a Pillow that knows no AVIF
+        raise SceneError(f"target.image: {name!r} is {kinds}") from None
     for width, height in (image.size, *sizes):
         if width * height > LARGEST or max(width, height) > LONGEST:
             most = f"more than {LARGEST // 10**6} million or than {LONGEST} along a side"
@@ -180,6 +190,12 @@ def _opened(name: str, data: bytes) -> Image.Image:
     if image.format == "TIFF" and image.tag_v2.get(TILE_WIDTH, 1) * image.tag_v2.get(TILE_LENGTH, 1) > LARGEST_TILE:
         raise SceneError(f"target.image: {name!r} has tiles larger than any picture; save it again, or as PNG")
     return image
+
+
+def _is_avif(data: bytes) -> bool:
+    """Do the brands of a HEIF file say AVIF?  They stand in its first box: size, "ftyp", major brand, version, more."""
+    end = min(struct.unpack(">I", data[:4])[0], 1024)
+    return data[8:12] in AVIF or any(data[at : at + 4] in AVIF for at in range(16, end, 4))
 
 
 # ---- from numbers to light -------------------------------------------------------------------------------------------
@@ -212,6 +228,9 @@ class Photo:
     profile: Callable[[Image.Image], Image.Image] | None = None  # from the picture's colours to sRGB
     low: Image.Image | None = None  # the second bytes of colours of 16 bits, of which Pillow keeps the first
     white: float = 1.0  # of numbers that have neither 8 nor 16 bits
+    other_curve: Curve | None = None  # that the numbers may follow as well, of a file of uncommon depth without a tag
+    assumed: str = ""  # a sentence on the curve that was taken in its place
+    several: bool = False  # does the file hold further pictures?
 
     def light(self, box: Box) -> np.ndarray:
         """Grey irradiance (h, w) of a part, from 0 to 1; transparent parts stand before black."""
@@ -302,10 +321,24 @@ def photo(given: Picture | str, gamma: float | None = None, invert: bool = False
     image.load()
     low, white = _second_bytes(image, given.data) if deep else None, _white(image)
     turned = UPRIGHT.get(image.getexif().get(ExifTags.Base.Orientation))
-    curve, profile = _meaning(image, given.data, deep) if gamma is None else (power(gamma), None)
+    stated = (power(gamma), None) if gamma is not None else _meaning(image, given.data)
+    curve, profile = stated or (_usual_curve(image), None)
+    other, assumed, several = None, "", bool(getattr(image, "is_animated", False))
+    if stated is None and deep and getattr(image, "tag_v2", {}).get(DESCRIPTION) != IRRADIANCE:
+        other = from_srgb if image.mode == "F" else power(1.0)
+        assumed = FLOATS if image.mode == "F" else WHOLE
     if turned is not None:
         image, low = image.transpose(turned), low and low.transpose(turned)
-    return Photo(given.name, image, _inverted(curve) if invert else curve, profile=profile, low=low, white=white)
+    curve, other = (_inverted(each) if invert and each else each for each in (curve, other))
+    return Photo(
+        given.name, image, curve, profile=profile, low=low, white=white, other_curve=other, assumed=assumed,
+        several=several,
+    )  # fmt: skip
+
+
+def _usual_curve(image: Image.Image) -> Curve:
+    """The curve of a file that states none: floats are light, whole numbers sRGB."""
+    return power(1.0) if image.mode == "F" else from_srgb
 
 
 def _white(image: Image.Image) -> float:
@@ -339,8 +372,8 @@ def _second_bytes(image: Image.Image, data: bytes) -> Image.Image | None:
     return other
 
 
-def _meaning(image: Image.Image, data: bytes, deep: bool) -> tuple[Curve, Callable | None]:
-    """The curve and the colour profile that the file states, or the curve by its depth (16 bits and more: linear)."""
+def _meaning(image: Image.Image, data: bytes) -> tuple[Curve, Callable | None] | None:
+    """The curve and the colour profile that the file states; None: it states none."""
     transfer = (
         re.search(rb"\x00\x00\x00\x04cICP.(.)", data.partition(b"IDAT")[0], re.DOTALL)
         if image.format == "PNG"
@@ -358,7 +391,7 @@ def _meaning(image: Image.Image, data: bytes, deep: bool) -> tuple[Curve, Callab
     encoded = image.info.get("gamma")
     if isinstance(encoded, float) and 1 / STEEPEST_GAMMA <= encoded <= STEEPEST_GAMMA:
         return power(1 / encoded), None
-    return (power(1.0) if deep else from_srgb), None
+    return None
 
 
 def _profile(image: Image.Image) -> Callable[[Image.Image], Image.Image] | None:

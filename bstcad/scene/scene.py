@@ -175,7 +175,11 @@ class Scene(Record):
         if isinstance(self.source, Collimated):
             key = "mount.rim" if self.mount and self.mount.rim else "lens.outline"
             doubts += _beam(self.source.aperture, self.rim, key)
-        return (*doubts, *self._of_targets(Target.remarks))
+        return (*doubts, *self.of_pictures())
+
+    def of_pictures(self) -> tuple[str, ...]:
+        """Sentences on what happens to the pictures and what the scene does not ask for."""
+        return tuple(self._of_targets(Target.remarks))
 
     # ---- the targets ----
 

@@ -32,6 +32,7 @@ NARROWEST = 1e-3  # mm; a target's side, as an outline's
 PICTURES = ("text", "image", "sample", "uniform", "profile")  # a target has exactly one
 WITHOUT_GAMMA = ("text", "uniform", "profile")
 MOST = 8  # targets of a scene
+SEEN = 0.01  # RRMSD between two readings of a picture, from which on it is said which was taken
 NEAREST = 1e-3  # mm; planes of two targets that are nearer to each other are one
 
 
@@ -260,9 +261,26 @@ def _drawing(target: Target) -> Drawing:
             is_logo, transparent = photo.transparency()
             part = window(shown := photo.image.size, size, target.fit)
             light = average(photo.silhouette if is_logo else photo.light, shown, part, pixels)
-        remarks = (transparent, _fitted(shown[::-1] if lies else shown, target.size, target.fit))
+            assumed = "" if is_logo else _assumed(photo, light, part, pixels)
+        remarks = (
+            "target.image: the file holds several pictures; the first is taken" if photo.several else "",
+            transparent,
+            assumed,
+            _fitted(shown[::-1] if lies else shown, target.size, target.fit),
+        )
     light = np.rot90(light, target.rotate // 90)
     return Drawing(light[:, ::-1] if target.mirror else light, tuple(filter(None, remarks)))
+
+
+def _assumed(photo: picture.Photo, light: np.ndarray, part: Window, pixels: tuple[int, int]) -> str:
+    """A remark on the curve of a file that states none, if the other one changes the light by more than SEEN; or ""."""
+    if photo.other_curve is None:
+        return ""
+    other = average(replace(photo, curve=photo.other_curve).light, photo.image.size, part, pixels)
+    if not (light.sum() > 0 and other.sum() > 0):
+        return ""
+    off = float(np.linalg.norm(other * (light.sum() / other.sum()) - light) / np.linalg.norm(light))
+    return f"target.image: the file has {photo.assumed} (an RRMSD of {off:.2g} apart)" if off > SEEN else ""
 
 
 def _ink(text: str, pixels: tuple[int, int], size: tuple[float, float]) -> np.ndarray:

@@ -128,6 +128,7 @@ FORMS = (
     *(("TIFF", "RGB", {"compression": name}) for name in ("tiff_adobe_deflate", "tiff_lzw", "packbits")),
     *(("JPEG", mode, {}) for mode in ("L", "RGB", "CMYK")), ("WEBP", "RGB", {}), ("WEBP", "RGBA", {"lossless": True}),
     ("WEBP", "RGBA", {"save_all": True}), ("BMP", "1", {}), ("BMP", "P", {}), ("BMP", "RGB", {}), ("HEIF", "RGBA", {}),
+    ("GIF", "P", {}), ("GIF", "P", {"save_all": True}), ("AVIF", "RGB", {}), ("AVIF", "RGBA", {}),
 )  # fmt: skip
 
 

@@ -106,6 +106,7 @@ SAID = [  # changes of REPORT: words of the page; do they stand on the terminal,
     ({"limits": [LIMIT]}, "was not tailored, so there is no curve whose end could be looked at.", False),
     ({"limits": [LIMIT], "convergence": CURVE}, "took 40 % of the time up to there (4.0 s). To go on has", False),
     ({"limits": [LIMIT], "convergence": CURVE | {"halving": 5.66}}, "about 5.7 times the evaluations' time", False),
+    ({"picture": ["target.image: the first", "target.fit: cropped"]}, "image: the first; target.fit: cropped.", False),
     ({"limits": [LIMIT], "convergence": CURVE | {"power": None}}, "The curve has too few points", False),
 ]
 

@@ -78,21 +78,26 @@ def test_eight_bits_are_srgb(kind):
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])
-def test_sixteen_bits_are_linear_to_the_last(channels):
+def test_sixteen_bits_are_srgb_to_the_last_as_eight_bits_are(channels):
     values = RANDOM.integers(0, 65536, (16, 16, channels), dtype=np.uint16)
     if channels == 4:
         values[..., 3] = 65535
     colours = values[..., :3] / 65535
-    np.testing.assert_allclose(light(png(values)), colours.mean(-1), rtol=1e-12)
-    negative = from_srgb(1 - to_srgb(colours)).mean(-1)
-    np.testing.assert_allclose(light(png(values), invert=True), negative, rtol=1e-9)
+    np.testing.assert_allclose(light(png(values)), from_srgb(colours).mean(-1), rtol=1e-12)
+    np.testing.assert_allclose(light(png(values), gamma=1.0), colours.mean(-1), rtol=1e-12)
+    negative = from_srgb(1 - colours).mean(-1)
+    np.testing.assert_allclose(light(png(values), invert=True), negative, rtol=1e-6, atol=1e-9)  # 1e-12 of its tones
+    copy = np.tile(RAMP[..., None], channels)
+    copy[..., 3:] = 255
+    grey = copy[..., 0] if channels == 1 else copy  # the same picture in 16 bits, and in 8
+    np.testing.assert_allclose(light(png(copy.astype(np.uint16) * 257)), light(saved(grey)), rtol=1e-12)
 
 
 @pytest.mark.parametrize(("order", "compression"), [("<", None), (">", None), ("<", "deflate"), (">", "deflate")])
-def test_a_tiff_of_sixteen_bits_a_colour_is_linear_to_the_last(order, compression):
+def test_a_tiff_of_sixteen_bits_a_colour_is_srgb_to_the_last(order, compression):
     values, buffer = RANDOM.integers(0, 65536, (16, 16, 3), dtype=np.uint16), io.BytesIO()
     tifffile.imwrite(buffer, values, photometric="rgb", byteorder=order, compression=compression)
-    np.testing.assert_allclose(light(buffer.getvalue(), name="p.tif"), values.mean(-1) / 65535, rtol=1e-12)
+    np.testing.assert_allclose(light(buffer.getvalue(), name="p.tif"), from_srgb(values / 65535).mean(-1), rtol=1e-12)
 
 
 def test_floats_are_linear_and_grey_with_opacity_of_sixteen_bits_has_eight():
@@ -100,7 +105,24 @@ def test_floats_are_linear_and_grey_with_opacity_of_sixteen_bits_has_eight():
     np.testing.assert_allclose(light(saved(values, "TIFF"), name="p.tif"), values, rtol=1e-7)
     values = np.full((16, 16, 2), 65535, np.uint16)
     values[:, :8, 0] = 0x4000
-    np.testing.assert_allclose(light(png(values))[:, :8], 0x4000 / 65535, rtol=0.01)
+    np.testing.assert_allclose(light(png(values))[:, :8], from_srgb(0x4000 / 65535), rtol=0.02)
+
+
+def test_it_is_said_which_curve_was_taken_where_that_changes_the_light():
+    """1 % of the light is the bound; a file that states its colours, and one of our own arrays, leaves nothing open."""
+    deep = RAMP.astype(np.uint16)[..., None] * 257
+    [remark] = drawn(png(deep)).remarks
+    off = np.linalg.norm(from_srgb(RAMP / 255) * RAMP.mean() / from_srgb(RAMP / 255).mean() - RAMP)
+    assert remark.startswith("target.image: the file has 16 bits or more and no colour tag: its numbers are")
+    other = off * from_srgb(RAMP / 255).mean() / RAMP.mean() / np.linalg.norm(from_srgb(RAMP / 255))
+    assert f"(an RRMSD of {other:.2g} apart)" in remark
+    [remark] = drawn(saved((RAMP / 255).astype(np.float32), "TIFF"), name="p.tif").remarks
+    assert "the file has floats and no colour tag: they are taken as light; gamma = 2.2" in remark
+    stated = with_chunk(png(deep), b"sRGB", b"\0"), png(deep, (b"gAMA", struct.pack(">I", 100_000))), saved(RAMP)
+    white = png(np.where(RAMP > 99, 65535, 0).astype(np.uint16)[..., None])  # black and white are alike by both
+    for silent in (*stated, white, picture.from_array(RAMP / 255)):
+        assert drawn(silent).remarks == ()
+    assert drawn(png(deep), gamma=1.0).remarks == ()
 
 
 SAID = {  # chunks of a PNG of eight bits: the exponent they mean, None for sRGB
@@ -121,7 +143,7 @@ def test_a_png_says_what_its_numbers_mean(what, deep):
     for name, body in chunks:
         data = with_chunk(data, name, body)
     value = RAMP / 255
-    wanted = value if deep and what == "gAMA of nothing" else from_srgb(value) if exponent is None else value**exponent
+    wanted = from_srgb(value) if exponent is None else value**exponent
     np.testing.assert_allclose(light(data), wanted, rtol=1e-4, atol=1e-12)  # 45455 is not quite 1 / 2.2
     np.testing.assert_allclose(light(data, gamma=3.0), value**3, rtol=1e-12)  # the scene goes before the file
 
@@ -214,7 +236,8 @@ def test_every_mode_is_read(mode):
 
 SHAPE = np.zeros((32, 32), np.uint8)  # no mirror image of itself
 SHAPE[4:12, 4:8] = SHAPE[4:8, 4:24] = SHAPE[20:28, 16:28] = 255
-KINDS = {"BMP": ".bmp", "WEBP": ".webp", "moving WebP": ".webp", "HEIC": ".heic", "MPO": ".jpg", "JPEG": ".jpg"}
+KINDS = {"BMP": ".bmp", "WEBP": ".webp", "HEIC": ".heic", "AVIF": ".avif", "JPEG": ".jpg", "GIF": ".gif"}
+SEVERAL = {"MPO": ".jpg", "WEBP": ".webp", "PNG": ".png", "TIFF": ".tif", "GIF": ".gif"}
 
 
 def in_file(tmp_path, kind):
@@ -222,13 +245,21 @@ def in_file(tmp_path, kind):
     image, path = Image.fromarray(SHAPE).convert("RGB"), tmp_path / "shape.jpg"
     if kind == "HEIC":
         pillow_heif.from_pillow(image).save(path, quality=90)
-    elif kind == "MPO":  # what telephones call a JPEG: another picture behind the first
-        image.save(path, "MPO", save_all=True, append_images=[Image.new("RGB", (32, 32))], quality=95)
-    elif kind == "moving WebP":
-        image.save(path, "WEBP", save_all=True, append_images=[Image.new("RGB", (32, 32), (9, 9, 9))], lossless=True)
     else:
         image.save(path, kind, **({"lossless": True} if kind == "WEBP" else {}))
     return path
+
+
+@pytest.mark.parametrize("kind", SEVERAL)
+def test_the_first_of_several_pictures_is_taken_and_that_is_said(tmp_path, kind):
+    """A telephone's JPEG with another behind it (MPO), pages of a TIFF file, moving pictures."""
+    image, path = Image.fromarray(SHAPE).convert("RGB"), tmp_path / "shape.jpg"
+    how = {"MPO": {"quality": 95}, "WEBP": {"lossless": True}}.get(kind, {})
+    image.save(path, kind, save_all=True, append_images=[Image.new("RGB", (32, 32), (9, 99, 9))], **how)
+    found = read_picture(path)
+    assert found.name == f"shape{SEVERAL[kind]}"
+    np.testing.assert_array_equal(light(found, 32) > 0.4, SHAPE > 0)
+    assert drawn(found, 32).remarks == ("target.image: the file holds several pictures; the first is taken",)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -237,7 +268,13 @@ def test_what_cameras_and_programs_write_is_read(tmp_path, kind):
     assert found.name == f"shape{KINDS[kind]}"
     grey = light(found, 32)
     np.testing.assert_array_equal(grey > 0.4, SHAPE > 0)
-    assert grey[SHAPE > 0].min() > 0.8 and grey[SHAPE == 0].max() < 0.1
+    assert grey[SHAPE > 0].min() > 0.8 and grey[SHAPE == 0].max() < 0.1 and drawn(found, 32).remarks == ()
+
+
+def test_an_avif_that_cannot_be_decoded_is_called_so():
+    whole = saved(Image.fromarray(SHAPE).convert("RGB"), "AVIF")
+    with pytest.raises(SceneError, match="'p.avif' is an AVIF picture that cannot be decoded here; save it"):
+        light(whole[:40], name="p.avif")
 
 
 @pytest.mark.parametrize("value", [np.nan, -1.0, np.inf])
@@ -254,11 +291,11 @@ def test_values_that_are_no_light_are_refused_and_others_are_parts_of_the_larges
 
 @pytest.mark.parametrize("side", [8001, 20_000])  # over our own limit; over the limit of Pillow itself
 def test_files_that_are_damaged_or_huge_or_of_another_kind_are_refused(tmp_path, side):
-    whole, path = saved(RANDOM.integers(0, 256, (64, 64), dtype=np.uint8)), tmp_path / "p.gif"
+    whole, path = saved(RANDOM.integers(0, 256, (64, 64), dtype=np.uint8)), tmp_path / "p.ppm"
     with pytest.raises(SceneError, match="is damaged"):
         light(whole[: len(whole) // 2], 64)
     Image.new("L", (8, 8), 255).save(path)
-    with pytest.raises(SceneError, match="no PNG, JPEG, TIFF, WebP, BMP or HEIC picture"):
+    with pytest.raises(SceneError, match="no PNG, JPEG, TIFF, WebP, BMP, GIF, HEIC or AVIF picture"):
         read_picture(path)
     Image.new("1", (side, side)).save(path, "PNG")
     with pytest.raises(SceneError, match="shrink it"):

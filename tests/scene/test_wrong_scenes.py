@@ -51,7 +51,7 @@ WRONG = {
         ({"target.text": " "}, "target.text: must have 1 to 100 letters"),
         ({"target.sample": "astronut"}, "target.sample: 'astronut' is not possible; did you mean 'astronaut'"),
         ({"target.image": "me.png"}, "target.image: .*me.png' not found; give a path relative to the scene file"),
-        ({"target.image": "thu.toml"}, "target.image: 'thu.toml' is no PNG, JPEG, TIFF, WebP, BMP or HEIC"),
+        ({"target.image": "thu.toml"}, "target.image: 'thu.toml' is no PNG, JPEG, TIFF, WebP, BMP, GIF, HEIC or AVIF"),
         ({"target.image": "3"}, "target.image: 3 is no file name"),
         ({"target.outline": '{shape="circle",radius=201}'}, "target.outline: is larger than the target along x"),
         ({"name": "../.."}, "name: '../..' makes no folder name"),
