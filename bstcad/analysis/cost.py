@@ -218,7 +218,8 @@ class ControlCells:
         energy = dctn(tiles, axes=(1, 2), norm="ortho").reshape(len(tiles), -1)[:, COARSE_TO_FINE] ** 2
         made = np.floor(np.minimum(finer**2 * cells.sum((1, 2)), TILE**2)).astype(int)
         left = np.where(np.arange(TILE**2) >= made[:, None], energy, 0.0)
-        return math.sqrt(float(left.sum()) / float((tiles**2).sum()))
+        whole = float((tiles**2).sum())
+        return math.sqrt(float(left.sum()) / whole) if whole else 0.0  # a part of a picture may be dark
 
 
 @torch.no_grad()

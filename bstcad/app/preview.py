@@ -142,7 +142,7 @@ def made_small(scene: Scene, pains: Pains) -> Scene:
     }
     for key, target in zip(scene.target_keys, scene.targets, strict=True):
         factor = max(max(target.columns_rows) / (share * pains.pixels), 1.0)
-        changes[f"{key}.pixels"] = [max(round(n / factor), 8) for n in target.columns_rows]
+        changes[f"{key}.pixels"] = target.fewer_pixels(factor)
     return scene.changed(changes)
 
 

@@ -368,7 +368,7 @@ def of_net(outline: Outline, points: Sides | None) -> Iterator[str]:
     """Complaints about the number of control points of a net over an outline; None: they are chosen later."""
     m, n = both(points or FEWEST_ROUND)
     if outline.is_round and m != n:
-        yield f"a round lens takes a square net, not one of {m} x {n}; give one number"
+        yield f"a round lens (lens.outline) takes a square net, not one of {m} x {n}; give one number"
     if outline.is_round and m < FEWEST_ROUND:
         few = f"{m} are too few for a round lens, whose net reaches two spans beyond its rim"
         yield f"{few}; give {FEWEST_ROUND} or more"
@@ -555,7 +555,7 @@ class LensBlank(Record):
         """Everything that is wrong with the table by itself."""
         given = [name for name in ("material", "index") if getattr(self, name) is not None]
         if self.back.reflect and given:
-            yield f"lens: light does not enter a mirror (back.reflect), so it has no {given[0]}; remove it"
+            yield f"lens: light does not enter a mirror (lens.back.reflect), so it has no {given[0]}; remove it"
         if not self.back.reflect and len(given) != 1:
             yield 'lens: needs exactly one of material and index; give for example material = "PMMA"'
         of_back = of_net(self.outline, self.back.control_points)

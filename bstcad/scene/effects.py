@@ -113,9 +113,11 @@ def complaints(effects: Effects, lens: LensBlank) -> Iterator[str]:
                 f"bstcad.effect({effect.name!r}, …) first, or install its package"
             )
         if mirror and effect.kind in ("absorption", "ghost"):
-            yield f"{key}: light does not enter a mirror (back.reflect), so it has no {effect.kind}; remove the table"
+            no_glass = "light does not enter a mirror (lens.back.reflect)"
+            yield f"{key}: {no_glass}, so it has no {effect.kind}; remove the table"
         if mirror and getattr(effect, "coating", None) is not None:
-            yield f"{key}.coating: a mirror's face is bare metal; remove it, or name the metal by {key}.metal"
+            bare = "a mirror's face (lens.back.reflect) is bare metal"
+            yield f"{key}.coating: {bare}; remove it, or name the metal by {key}.metal"
         if not mirror and getattr(effect, "metal", None) is not None:
             yield f"{key}.metal: is for a mirror (lens.back.reflect); remove it"
         if effect.kind == "absorption" and effect.coefficient is None and lens.material is None:

@@ -478,8 +478,10 @@ def _of_wavefront(wave: Wave | None, source: Source, lens: LensBlank, accept: Ac
             yield "accept.wavefront: limits the error of a [wavefront], and there is none; add one, or remove it"
         return
     if source.extent is not None:
-        light = "parallel light of one direction" if isinstance(source, Collimated) else "a point"
-        yield f"wavefront: light of a source of some extent has no one wavefront; make the source {light}"
+        key, light = "divergence", "parallel light of one direction"
+        if isinstance(source, Point):
+            key, light = "width" if source.diameter is None else "diameter", "a point"
+        yield f"wavefront: light of a source of some size (source.{key}) has no one wavefront; make it {light}"
     yield from (f"wavefront.{complaint}" for complaint in wave.complaints(lens.back.z))
     if isinstance(wave, ZernikeWave) and not wave.steepest(source.main_wavelength) < math.sin(ALONG):
         yield "wavefront.coefficients: the wave is too steep to have rays; make them smaller, or the radius larger"

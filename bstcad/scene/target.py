@@ -106,15 +106,19 @@ class Target(Record):
 
     def _of_profile(self) -> Iterator[str]:
         """A profile that is larger than the target as it lies, or narrower than a pixel."""
-        half = self.profile.half_extent
-        half = half[::-1] if self.rotate in (90, 270) else half
         pixel = (side / n for side, n in zip(self.size, self.columns_rows, strict=True))
-        for axis, along, size, least in zip("xy", half, self.size, pixel, strict=True):
+        for axis, along, size, least in zip("xy", self._half_profile, self.size, pixel, strict=True):
             if 2 * along > size:
                 yield f"target.profile: is larger than the target along {axis}; make it smaller or widen {axis}"
             if along < least:
                 fine = f"reaches {along:g} mm from the middle along {axis}, less than a pixel of {least:.3g} mm"
                 yield f"target.profile: {fine}; make it larger, or ask for more pixels"
+
+    @property
+    def _half_profile(self) -> tuple[float, float]:
+        """Half the width and height (mm) of the profile as it lies."""
+        along_x, along_y = self.profile.half_extent
+        return (along_y, along_x) if self.rotate in (90, 270) else (along_x, along_y)
 
     @property
     def _pictures(self) -> list[str]:
@@ -132,6 +136,15 @@ class Target(Record):
             return self.pixels
         longer = max(self.size)
         return tuple(max(round(self.pixels * side / longer), min(self.pixels, FEWEST)) for side in self.size)
+
+    def fewer_pixels(self, factor: float) -> tuple[int, int]:
+        """Columns and rows over a factor: FEWEST at least, and so many that half a profile is no less than a pixel."""
+        least = (FEWEST, FEWEST)
+        if self.profile is not None:
+            sides = zip(self.size, self._half_profile, strict=True)
+            least = tuple(max(FEWEST, math.ceil(size / half)) for size, half in sides)
+        counts = zip(self.columns_rows, least, strict=True)
+        return tuple(min(max(round(n / factor), fewest), max(n, FEWEST)) for n, fewest in counts)
 
     @property
     def screen(self) -> Screen:

@@ -232,8 +232,9 @@ def rrmsd(light: ControlCells, scene: Scene, blurred: float = 0.0) -> float:
     """
     factor, rest = BY_QUALITY.get(scene.tailoring.quality, BY_QUALITY["standard"])
     width, height = scene.lens.cells
-    finer, half = 1 / math.sqrt(width * height), TILE // 2
-    between = replace(light, a_pixel=light.a_pixel[half:, half:], target=light.target[half:, half:])  # other tiles
+    finer = 1 / math.sqrt(width * height)
+    other_tiles = tuple(slice(TILE // 2 if side > TILE // 2 else 0, None) for side in light.target.shape)
+    between = replace(light, a_pixel=light.a_pixel[other_tiles], target=light.target[other_tiles])
     floors = (FLOOR * light.floor(finer), FLOOR * between.floor(finer))
     halved = (HALVED * light.floor(finer / 2), HALVED * between.floor(finer / 2))
     by_net = factor * math.hypot(*floors, *halved) / math.sqrt(2) + rest

@@ -32,7 +32,6 @@ from bstcad.report.record import simulated, too_steep
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.quality import COARSEST_GRID, PRESETS, Tailoring
 from bstcad.scene.scene import Scene
-from bstcad.scene.target import FEWEST
 from bstcad.sweep.cold_run import PIXELS, TUBES, Units, rounded
 from bstcad.sweep.cold_run import units as measured_units
 from bstcad.sweep.estimates import coarse_lens, left_out
@@ -322,7 +321,7 @@ def _small(scene: Scene, quality: str) -> tuple[Scene, float, Tailoring]:
     fewest, most = ((m - 1) / (points - 1) for points in (FEWEST_POINTS, net))
     factor = max(min(max(max(columns, rows) / pixels, most), fewest), 1.0)
     less = {"lens.back.control_points": coarser(own, round((m - 1) / factor) + 1), "tailoring.levels": None}
-    small = scene.changed(less | {"target.pixels": [max(round(n / factor), FEWEST) for n in (columns, rows)]})
+    small = scene.changed(less | {"target.pixels": scene.target.fewer_pixels(factor)})
     whole, knobs = (Tailoring(quality=quality).resolved(each.lens.back.net) for each in (scene, small))
     cells = int(np.clip(round(whole.transport_grid / factor), *PILOT_CELLS))
     rays = min(round(whole.rays / factor), tubes)

@@ -18,6 +18,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import bstcad
 from bstcad.folder import SCENE, scene_files
@@ -116,8 +117,13 @@ def knobs(scene: Scene) -> tuple[Knob, ...]:
 
 def _by_paper(scene: Scene) -> bool:
     """Can the paper's procedure design the scene?  It knows one picture and one tailored face, and no bounds on it."""
+    return _is_allowed(scene, {"tailoring.quality": "paper"})
+
+
+def _is_allowed(scene: Scene, changes: Mapping[str, Any]) -> bool:
+    """Does the scene allow these changes?"""
     try:
-        scene.changed({"tailoring.quality": "paper"})
+        scene.changed(changes)
     except SceneError:
         return False
     return True
@@ -144,7 +150,8 @@ def _pixels(scene: Scene) -> Points:
         if share == 1 or all(PIXELS[0] <= min(size) and max(size) <= PIXELS[1] for size in sizes):
             values = [columns if columns == rows else (columns, rows) for columns, rows in sizes]
             changed = {f"{key}.pixels": value for key, value in zip(scene.target_keys, values, strict=True)}
-            points[" and ".join(map(as_text, values))] = () if share == 1 else settings(changed)
+            if share == 1 or _is_allowed(scene, changed):  # a profile may be too narrow for larger pixels
+                points[" and ".join(map(as_text, values))] = () if share == 1 else settings(changed)
     return points
 
 

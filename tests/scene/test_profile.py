@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from pydantic import TypeAdapter
 from scipy.integrate import dblquad
 from scipy.special import gamma
 
+from bstcad.app.preview import AT_ONCE, made_small
 from bstcad.scene.errors import SceneError
 from bstcad.scene.profile import Profile, corner_area
 from bstcad.scene.scene import load
@@ -142,3 +144,14 @@ def test_a_wrong_profile_is_one_sentence(thu, changes, sentence):
     with pytest.raises(SceneError, match="^" + re.escape(sentence)) as refused:
         thu.changed(changes)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("rotate", [0, 90])
+def test_a_coarser_picture_still_shows_a_narrow_profile(thu, rotate):
+    """A preview and a pilot of a plan have fewer pixels, which are no reason to refuse the scene."""
+    thin = {"shape": "rectangle", "width": 12.0, "height": 0.5}
+    scene = thu.changed({"target.profile": thin, "target.rotate": rotate, "target.pixels": 400})
+    fewer = scene.target.fewer_pixels(50.0)
+    assert scene.changed({"target.pixels": fewer}).target.irradiance().sum() == pytest.approx(1)
+    assert max(fewer) < 400 and min(fewer) == 8 and thu.target.fewer_pixels(4.0) == (10, 8)
+    assert made_small(scene, replace(AT_ONCE, pixels=10)).target.columns_rows == scene.target.fewer_pixels(40.0)

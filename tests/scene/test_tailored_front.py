@@ -85,7 +85,7 @@ def test_a_given_net_may_be_where_tailoring_starts(disk, tmp_path):
     (DISK, {"lens.front": FLAT | {"optimise": ["heights"]}}, "lens.front.optimise: ['heights'] is neither true nor"),
     (DISK, {"lens.front": FLAT | {"control_points": 4}}, "lens.front.control_points: 4 is not between 5 and 2049"),
     (DISK, {"lens.front": FLAT | {"control_points": [9, 17]}, "lens.outline": {"shape": "circle", "radius": 8.0}},
-     "lens.front.control_points: a round lens takes a square net, not one of 9 x 17; give one number"),
+     "lens.front.control_points: a round lens (lens.outline) takes a square net, not one of 9 x 17; give one number"),
     (DISK, {"lens.front": FLAT | {"control_points": 5}, "lens.outline": {"shape": "circle", "radius": 8.0}},
      "lens.front.control_points: 5 are too few for a round lens"),
     (DISK, {"lens.back.optimise": False}, "lens.back.optimise: false leaves no face to tailor; write lens.front = {"),

@@ -50,6 +50,14 @@ def test_a_picture_of_fewer_pixels_gets_a_coarser_net():
     assert [max(sides(PLATE.changed({"target.pixels": pixels}))) for pixels in (64, 128, 512)] == [257, 513, 1025]
 
 
+def test_a_picture_narrower_than_half_a_tile_has_its_net_too():
+    """Cells are counted over tiles of 16 x 16 pixels, and again over tiles half of that further on."""
+    assert sides(PLATE.changed({"target.pixels": [24, 8]})) == sides(PLATE.changed({"target.pixels": [8, 24]}))
+    left = net_choice.ControlCells(np.ones((24, 16)), np.eye(24, 16) * (np.arange(16) < 8))
+    assert not left.target[8:, 8:].any()  # half a tile further on it is dark
+    assert math.isfinite(rrmsd(left, PLATE.changed({"lens.back.control_points": 65})))
+
+
 def test_several_targets_get_the_net_of_the_most_demanding_one():
     target = PLATE.target.model_dump(mode="json", exclude_none=True)
     two = PLATE.changed({"target": [target | {"pixels": 64}, target | {"z": 640.0, "pixels": 256}]})
