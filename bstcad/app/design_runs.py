@@ -28,6 +28,7 @@ from bstcad.scene.scene import Scene
 
 DESIGN = "design"  # the kind of a run that designs a lens; others are work on a finished design
 LARGEST = 50_000_000  # bytes of progress
+WRITTEN = "written.toml"  # file of a run: the scene as its page had it, comments and all
 GRACE = 60.0  # seconds that runs have to keep their checkpoints when the server ends
 START = 30.0  # seconds that the process of a run has to start
 LOST = "its process was killed, or the memory of this machine was too little for it"
@@ -178,11 +179,14 @@ def _read(line: str) -> list[Any] | None:
     return [at, stage, done, total, text] if known else None
 
 
-def begin_design(scene: Scene, design: Path) -> Run:
-    """Design a scene into a folder.  SceneError where that folder is another's, or a run is under way."""
+def begin_design(scene: Scene, design: Path, text: str = "") -> Run:
+    """Design a scene into a folder, and keep the text that it was made of.
+
+    SceneError where that folder is another's, or a run is under way.
+    """
     files.check_free(design)
     run = Run(design)
-    run.begin(contents=folders.scene_files(scene))
+    run.begin(contents=folders.scene_files(scene) | {WRITTEN: text.encode()})
     return run
 
 

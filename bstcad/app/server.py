@@ -32,7 +32,7 @@ import bstcad
 from bstcad.app import design_runs, form, preview_json, scene_text, sketch
 from bstcad.app.choices import impossible
 from bstcad.app.connections import HeadersInTime
-from bstcad.app.design_runs import Run
+from bstcad.app.design_runs import WRITTEN, Run
 from bstcad.app.followers import take_change
 from bstcad.app.guard import POLICY, SANDBOX, Guard
 from bstcad.app.preview_desk import STAGES, PreviewDesk
@@ -219,12 +219,13 @@ class Workbench:
     # ---- scenes ----
 
     async def add_scene(self, request: Request) -> Response:
-        """A new scene file: {light, and picture, sample or text} or {template}."""
+        """A new scene file: {light, size as of `bstcad new`, and picture, sample or text} or {template}."""
         asked = await _json(request)
         known = {key: str(asked[key]) for key in ("sample", "text", "template") if asked.get(key)}
         image = str(asked["picture"]) if asked.get("picture") else None
         light = str(asked.get("light") or next(iter(new_scene.LIGHTS)))
-        name = await run_in_threadpool(lambda: self.workspace.add(light, image=image, **known))
+        size = str(asked["size"])[:40] if asked.get("size") and "template" not in known else None
+        name = await run_in_threadpool(lambda: self.workspace.add(light, image=image, size=size, **known))
         return JSONResponse({"name": name})
 
     async def keep_picture(self, request: Request) -> Response:
@@ -371,11 +372,12 @@ class Workbench:
         return await run_in_threadpool(self._make, request.path_params["name"])
 
     def _make(self, name: str) -> Response:
-        scene = self.workspace.scene(name, self.workspace.opened(name).text)
+        text = self.workspace.opened(name).text
+        scene = self.workspace.scene(name, text)
         self.workspace.save(name)
         folder = self.workspace.design(scene.name)
         folder.parent.mkdir(parents=True, exist_ok=True)
-        self.started.append(design_runs.begin_design(scene, folder))
+        self.started.append(design_runs.begin_design(scene, folder, text))
         return JSONResponse({"design": scene.name})
 
     def _run(self, request: Request) -> Run:
@@ -420,7 +422,7 @@ class Workbench:
         name = request.path_params["name"]
         folder = self.workspace.design(name)
         source = folder if (folder / "scene.toml").is_file() else Run(folder).place
-        return JSONResponse({"name": self.workspace.adopt(name, source)})
+        return JSONResponse({"name": self.workspace.adopt(name, source, Run(folder).place / WRITTEN)})
 
     async def tolerance(self, request: Request) -> Response:
         """How exactly the lens must be made: {grade, yield in percent}, each perhaps absent."""

@@ -8,6 +8,7 @@ loses a change; `save` puts it into the scene file, unless another program wrote
 from __future__ import annotations
 
 import codecs
+import contextlib
 import hashlib
 import os
 import re
@@ -18,6 +19,7 @@ from pathlib import Path
 
 from bstcad.app.scene_text import changed, tables
 from bstcad.runs import files
+from bstcad.runs.files import SentenceError
 from bstcad.scene import new_scene, picture, scene_file
 from bstcad.scene import scene as scenes
 from bstcad.scene.errors import SceneError
@@ -174,11 +176,12 @@ class Workspace:
 
     def add(
         self, light: str, image: str | None = None, sample: str | None = None, text: str | None = None,
-        template: str | None = None,
+        template: str | None = None, size: str | None = None,
     ) -> str:  # fmt: skip
         """Write a new scene file for a light of `bstcad new`, or by a template; the scene's name.
 
-        image: the name of an upload.  What is given takes the place of a template's picture, the first of several.
+        image: the name of an upload.  size: of the plate, as `bstcad new` takes it.
+        What is given takes the place of a template's picture, the first of several.
         """
         self.scenes.mkdir(parents=True, exist_ok=True)
         given = None if image is None else self.upload(image).relative_to(self.scenes)
@@ -187,11 +190,11 @@ class Workspace:
         with self._changing:
             name = self._free_name(template or light)
             if template is None:
-                new_scene.new_scene(name, self.scenes, picture=given, light=light)
+                new_scene.new_scene(name, self.scenes, picture=given, light=light, size=size)
             else:
                 new_scene.new_scene(name, self.scenes, template=template)
             if key and (template or given is None):
-                self._show(name, key, value, plate=None if template else new_scene.Plate.of(light))
+                self._show(name, key, value, plate=None if template else new_scene.Plate.of(light, size))
         return name
 
     def _show(self, name: str, key: str, value: str, plate: new_scene.Plate | None) -> None:
@@ -209,13 +212,21 @@ class Workspace:
             path.unlink()
             raise
 
-    def adopt(self, design: str, folder: Path) -> str:
-        """A new scene file for the scene in a folder, with the files that it names; the scene's name."""
+    def adopt(self, design: str, folder: Path, written: Path | None = None) -> str:
+        """A new scene file for the scene in a folder, with the files that it names; the scene's name.
+
+        written: a file with the text that the scene was made of.  Its comments stay, or those of the scene file of the
+        design's name, where that makes the same scene still.
+        """
         text = self._text(folder / "scene.toml")
         loaded = self._loaded(folder / "scene.toml", text)
         self.scenes.mkdir(parents=True, exist_ok=True)
         with self._changing:
             name = self._free_name(design.removeprefix("my-"))
+            commented = self._commented(loaded, [*filter(None, [written]), self.path(design)])
+            if commented is not None:
+                files.put(self.path(name), changed(_renamed(commented, name), "name", name).encode())
+                return name
             for key, target in zip(loaded.target_keys, loaded.targets, strict=True):
                 if target.image is not None:
                     text = changed(text, f"{key}.image", f"{PICTURES}/{self.keep(target.image.data)}")
@@ -224,6 +235,16 @@ class Workspace:
                 text = changed(text, "lens.front.file", f"{name}-front.npz")
             files.put(self.path(name), changed(text, "name", name).encode())
         return name
+
+    def _commented(self, scene: Scene, paths: list[Path]) -> str | None:
+        """Return the text of the first file that makes a scene, whose number of control points may be chosen anew."""
+        alike = [scene, scene.changed({"lens.back.control_points": None})]
+        for path in paths:
+            with contextlib.suppress(SentenceError):
+                text = self._text(path)
+                if self.scene(scene.name, text) in alike:
+                    return text
+        return None
 
     def _free_name(self, kind: str) -> str:
         """my-KIND, or my-KIND-2 and so on: of neither a scene nor a design that is there."""
@@ -294,6 +315,14 @@ class Workspace:
         paths = (path for path in sorted(folder.rglob("*")) if path.is_file() and not path.is_symlink())
         names = (path.relative_to(folder) for path in paths)
         return [name.as_posix() for name in names if not _hidden(name)]
+
+
+def _renamed(text: str, name: str) -> str:
+    """Return a scene's text whose comments name another scene."""
+    before = str(tables(text).get("name"))
+    for words in (f"bstcad generate {before}.toml", f"bstcad plan {before}.toml", f"outputs/{before}"):
+        text = re.sub(rf"{re.escape(words)}(?![\w-])", words.replace(before, name), text)
+    return text
 
 
 def _hidden(name: Path) -> bool:

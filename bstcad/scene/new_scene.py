@@ -26,6 +26,8 @@ RANGES = {"size": (1.0, 10_000.0), "distance": (1.0, 1e7)}  # mm
 OVER_BLUR = 1.1  # times the RRMSD of the blurred picture: standard quality ends well below that, a draft hardly
 FEWEST_RRMSD, MOST_RRMSD = 0.05, 0.25  # the limit that is written; the latter passes where a scene asks for none
 
+LIKE_THE_PHOTO = re.compile(r"(?:([^xX×]+)[xX×])?photo")  # a size: the longer side, or SIZE, by the photo's other side
+
 TEMPLATE = Path(__file__).with_name("plate.toml.j2")
 COLUMN = 32  # of a line's comment, where the line is not longer
 WIDTH = 118  # of a comment
@@ -37,7 +39,7 @@ class Light:
 
     name: str  # the word of the option --light
     of: str
-    header: str  # which light that is; {before}: mm before the plate
+    header: str  # which light that is, in sentences that stay true where the scene's lengths are changed
     pixels: int = 256
     size: float = 0.0  # mm of a lamp, degrees of parallel light; 0: the picture is as sharp as its pixels
     square: bool = False  # a chip; else a disc
@@ -140,7 +142,6 @@ class Plate:
         """The scene file, with the picture of that path or else with letters."""
         import jinja2  # which a list of the templates need not wait for
 
-        header = f"{self.light.header} {self.expectation(blurred)}".format(before=f"{self.before:g}")
         text = jinja2.Template(
             TEMPLATE.read_text(encoding="utf-8"), trim_blocks=True, keep_trailing_newline=True
         ).render(
@@ -148,7 +149,7 @@ class Plate:
             light=self.light,
             name=name,
             title=_quoted(f"{name}, for {self.light.of}"),
-            header=textwrap.wrap(header, WIDTH),
+            header=textwrap.wrap(self.light.header, WIDTH),
             picture=picture and _quoted(picture.as_posix()),
             rrmsd=blurred and min(max(math.ceil(100 * OVER_BLUR * blurred) / 100, FEWEST_RRMSD), MOST_RRMSD),
             blurred=blurred,
@@ -170,11 +171,12 @@ def new_scene(
 ) -> Written:  # fmt: skip
     """Write NAME.toml to `folder`, a commented scene that loads; never over another file.  SceneError.
 
-    A plate of that size (mm; one number, or "80x60", width by height), a picture as large as the plate's shadow on a
-    wall at that distance, by that light (LIGHTS); or a copy of a template.  The path of the picture is relative to the
+    A plate of that size (mm; one number, "80x60", width by height, or in the picture's proportions "photo" or
+    "120xphoto"), a picture as large as the plate's shadow on a wall at that distance, by that light (LIGHTS); or a copy
+    of a template.  The path of the picture is relative to the
     folder.
     """
-    from bstcad.scene.picture import read_picture, safe_name  # loads much, which a list of the templates need not
+    from bstcad.scene.picture import photo_size, read_picture, safe_name  # loads much, unlike a list of the templates
 
     name = name.removesuffix(".toml")
     if not name or safe_name(name) != name:
@@ -186,12 +188,17 @@ def new_scene(
             raise SceneError(f"--template {template}: {given}; give either it or them")
         _written(path, _template(template, name))
         return Written(path)
-    plate = Plate.of(light, size, distance)
     if picture is not None:
         picture = Path(os.path.expanduser(picture))
         if not (folder / picture).exists():
             raise SceneError(f"--picture {picture}: not found; give the path of a picture file")
         read_picture(folder / picture)  # before anything is written
+    if (longer := LIKE_THE_PHOTO.fullmatch(str(size))) is not None:
+        if picture is None:
+            raise SceneError(f"--size {size}: there is no photo; give --picture FILE, or a size such as 80x60")
+        [side] = _lengths("size", longer[1] or SIZE, "80", 1)
+        size = in_proportions(side, photo_size(read_picture(folder / picture)))
+    plate = Plate.of(light, size, distance)
     scene = _written(path, plate.text(name, picture))
     if (blurred := plate.blurred(scene)) is not None:
         path.write_text(plate.text(name, picture, blurred), encoding="utf-8")
@@ -200,6 +207,12 @@ def new_scene(
     words = 'The picture is the word "Hello"; target.text in the file has it, --picture FILE another.'
     of_picture = [words] if picture is None else scene.target.remarks()
     return Written(path, "\n".join([made, plate.expectation(blurred), *of_picture]))
+
+
+def in_proportions(side: float, shown: tuple[int, int]) -> str:
+    """Return the size of a plate with a picture's proportions (width, height) and the longer side (mm): "80x53.3"."""
+    width, height = (max(side * each / max(shown), RANGES["size"][0]) for each in shown)
+    return f"{width:.4g}x{height:.4g}"
 
 
 def _lengths(name: str, given: str | float, such_as: str, most: int) -> list[float]:

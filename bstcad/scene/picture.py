@@ -20,7 +20,7 @@ import threading
 import unicodedata
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -232,6 +232,10 @@ class Photo:
     assumed: str = ""  # a sentence on the curve that was taken in its place
     several: bool = False  # does the file hold further pictures?
 
+    def part(self, box: Box) -> Photo:
+        """Return a part of the picture as a picture."""
+        return replace(self, image=self.image.crop(box), low=self.low and self.low.crop(box))
+
     def light(self, box: Box) -> np.ndarray:
         """Grey irradiance (h, w) of a part, from 0 to 1; transparent parts stand before black."""
         numbers, alpha = self.numbers(box)
@@ -339,6 +343,12 @@ def photo(given: Picture | str, gamma: float | None = None, invert: bool = False
 def _usual_curve(image: Image.Image) -> Curve:
     """The curve of a file that states none: floats are light, whole numbers sRGB."""
     return power(1.0) if image.mode == "F" else from_srgb
+
+
+def photo_size(given: Picture | str) -> tuple[int, int]:
+    """Return width and height (pixels) of a picture file or a sample, upright."""
+    with decoding(getattr(given, "name", given)):
+        return photo(given).image.size
 
 
 def _white(image: Image.Image) -> float:

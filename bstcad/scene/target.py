@@ -72,6 +72,13 @@ class Target(Record):
     fit: Annotated[Literal["crop", "pad", "stretch"], Key("Fit of a picture of other proportions.", example="pad")] = (
         "crop"
     )
+    crop: Annotated[
+        tuple[float, float, float, float] | None,
+        Key(
+            "Part of the picture that is shown, [left, top, right, bottom] in parts of its width and height.", "",
+            0.0, 1.0, example=[0.1, 0.0, 0.9, 1.0],
+        ),
+    ] = None  # fmt: skip
     outline: Annotated[Outlined | None, Key("Light falls only inside this outline, which is centred.")] = None
     unreachable: Annotated[
         Literal["dark", "refuse"], Key("What light cannot reach stays dark, or the scene is refused.", example="refuse")
@@ -95,6 +102,13 @@ class Target(Record):
             yield 'target.text: must have 1 to 100 letters; give for example text = "THU"'
         if self.gamma is not None and given[0] in WITHOUT_GAMMA:
             yield "target.gamma: only an image or a sample has a gamma; remove it"
+        if self.crop is not None:
+            left, top, right, bottom = self.crop
+            if given[0] in WITHOUT_GAMMA:
+                yield "target.crop: only an image or a sample has parts; remove it"
+            if not (left < right and top < bottom):
+                ends = ", ".join(f"{end:g}" for end in self.crop)
+                yield f"target.crop: [{ends}] is no part; write left, top, right and bottom, such as [0.1, 0, 0.9, 1]"
         if self.invert and self.uniform:
             yield "target.invert: a uniform target inverted is dark; remove one of the two"
         if self.invert and self.profile:
@@ -271,6 +285,8 @@ def _drawing(target: Target) -> Drawing:
         given = target.sample if target.image is None else target.image
         with picture.decoding(getattr(given, "name", given)):
             photo = picture.photo(given, target.gamma, target.invert)
+            if target.crop is not None:
+                photo = photo.part(cropped(photo.image.size, target.crop))
             is_logo, transparent = photo.transparency()
             part = window(shown := photo.image.size, size, target.fit)
             light = average(photo.silhouette if is_logo else photo.light, shown, part, pixels)
@@ -306,6 +322,26 @@ def _ink(text: str, pixels: tuple[int, int], size: tuple[float, float]) -> np.nd
 
 
 # ---- how a picture fills the target ----------------------------------------------------------------------------------
+
+
+def cropped(shown: tuple[int, int], crop: tuple[float, float, float, float] | None) -> Box:
+    """Return the whole pixels (left, top, right, bottom) of a part of a picture (width, height), one at least."""
+    if crop is None:
+        return 0, 0, *shown
+    left, top = (min(round(start * most), most - 1) for start, most in zip(crop[:2], shown, strict=True))
+    right, bottom = (round(stop * most) for stop, most in zip(crop[2:], shown, strict=True))
+    return left, top, max(right, left + 1), max(bottom, top + 1)
+
+
+def shown_size(target: Target) -> tuple[int, int] | None:
+    """Return width and height (pixels) of a target's photo as it is shown, cropped and turned; None: it has none."""
+    given = target.sample if target.image is None else target.image
+    if given is None:
+        return None
+    left, top, right, bottom = cropped(picture.photo_size(given), target.crop)
+    width, height = right - left, bottom - top
+    return (height, width) if target.rotate in (90, 270) else (width, height)
+
 
 Window = tuple[float, float, float, float]  # a part of a picture in its pixels, as a Box; it may reach beyond
 

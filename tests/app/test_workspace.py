@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from bstcad.app import workspace as module
+from bstcad.app.design_runs import Run
 from bstcad.app.scene_text import changed
 from bstcad.app.workspace import Opened, Workspace
 from bstcad.scene import new_scene, scene_file
@@ -414,7 +415,7 @@ def test_a_new_scene_of_each_light_shows_what_is_given(own, light, what):
     blurred = new_scene.Plate.of(light).blurred(scene)
     if blurred is not None:  # what the source's size leaves of this very picture
         assert blurred < scene.accept.rrmsd or scene.accept.rrmsd == new_scene.MOST_RRMSD
-        assert f"blurred by the source: {blurred:.2g} " in own.opened(name).text
+        assert "blurred by the source, and a little more" in own.opened(name).text
 
 
 @pytest.mark.parametrize("light", new_scene.LIGHTS)
@@ -518,6 +519,32 @@ def test_the_scene_of_a_design_is_a_new_scene_with_its_pictures(own, tmp_path):
     )
     assert own.adopt("my-two", folder) == "my-two-2"
     assert own.adopt("x" * 80, folder).startswith("my-xxx")
+
+
+def test_comments_survive_the_way_through_a_design(own):
+    """By the text of the design's run, or by its scene file where that is the same scene still."""
+    name = own.add("sun", text="HI")
+    text = own.opened(name).text
+    folder = own.designs / name
+    made(folder)
+    (folder / "scene.toml").write_text(load(own.path(name)).changed({"lens.back.control_points": 129}).toml())
+    again = own.opened(own.adopt(name, folder)).text
+    assert "# the wall, on which" in again and again.count(" # ") == text.count(" # ")
+    assert again.split() == text.replace(name, f"{name}-2").replace(f'"{name}-2, for', f'"{name}, for').split()
+    own.path(name).write_text(text.replace("divergence = 0.53", "divergence = 0.4"))  # another scene meanwhile
+    assert "# the wall" not in own.opened(own.adopt(name, folder)).text
+    run = Run(folder).place
+    run.mkdir()
+    (run / "written.toml").write_text(text)
+    assert "# the wall, on which" in own.opened(own.adopt(name, folder, run / "written.toml")).text
+
+
+def test_a_new_scene_has_the_proportions_of_its_photo(own):
+    given = {"image": own.keep(png(20, 30))}
+    scene = load(own.path(own.add("laser", **given, size="120xphoto")))
+    assert scene.lens.outline.half_extent == (40, 60) == scene.source.aperture.half_extent
+    assert scene.target.size == (80, 120)
+    assert load(own.path(own.add("laser", **given))).target.size == (80, 80)
 
 
 def test_a_damaged_scene_of_a_design_makes_no_scene(own):

@@ -85,6 +85,24 @@ class TestPlate:
         assert f"40 x 40, the target {size}: cropped to the middle 40 x 30" in capsys.readouterr().out
 
 
+    @pytest.mark.parametrize(("size", "given", "made"), [
+        ((800, 1200), "photo", (53.33, 80.0)), ((1200, 800), "120xphoto", (120.0, 80.0)),
+        ((40, 40), "60xphoto", (60, 60)),
+    ])  # fmt: skip
+    def test_a_plate_in_the_proportions_of_the_photo(self, place, size, given, made):
+        Image.new("L", size, 200).save(place / "p.png")
+        scene, _ = written(place, "--picture", "p.png", "--size", given)
+        assert scene.lens.outline.half_extent == pytest.approx((made[0] / 2, made[1] / 2))
+        assert scene.target.size == pytest.approx(made) and scene.target.remarks() == ()
+        assert scene.source.aperture == scene.lens.outline
+
+    def test_a_size_of_no_photo_is_refused(self, place, capsys):
+        assert cli.run(["new", "mine", "--size", "photo"]) == 2
+        assert "--size photo: there is no photo; give --picture FILE" in capsys.readouterr().err
+        assert cli.run(["new", "mine", "--picture", str(PHOTO), "--size", "widexphoto"]) == 2
+        assert "--size wide: is no size" in capsys.readouterr().err and list(place.iterdir()) == []
+
+
 class TestLight:
     """The light that is asked for is simulated, and the file and the command say which detail it leaves."""
 
@@ -93,10 +111,9 @@ class TestLight:
         scene, text = written(place, "--picture", str(PHOTO), "--light", "sun", "--size", "100", "--distance", "600")
         assert scene.source.kind == "collimated" and scene.source.divergence == 0.53
         assert scene.source.profile == "uniform" and scene.source.aperture == scene.lens.outline
-        told = " ".join(line.removeprefix("# ") for line in text.splitlines())
-        for said in (printed := capsys.readouterr().out, told):
-            assert "The finest detail on this wall is 5.6 mm wide, 1/18 of the picture's 100 mm; on a wall at" in said
-            assert "at 250 mm it is 2.4 mm (--distance 250)." in said
+        printed = capsys.readouterr().out
+        assert "The finest detail on this wall is 5.6 mm wide, 1/18 of the picture's 100 mm; on a wall at" in printed
+        assert "at 250 mm it is 2.4 mm (--distance 250)." in printed
         assert text.startswith("# A picture on a wall, by a plate for the sun") and "target.fit" not in printed
         assert printed.endswith("\nmine.toml is written; next: bstcad generate mine.toml\n")
 
@@ -108,7 +125,14 @@ class TestLight:
         assert plate.blurred(scene.changed(disc)) == pytest.approx(math.sqrt(0.0676 * 5.55 * 2 / 30), rel=0.08)
         blurred = new_scene.Plate.of("sun", 80, 150).blurred(scene)
         assert scene.accept.rrmsd == math.ceil(110 * blurred) / 100 < new_scene.MOST_RRMSD
-        assert f"blurred by the source: {blurred:.2g} (bstcad plan states it)" in text and "too coarse" not in text
+        assert "blurred by the source, and a little more" in text and "too coarse" not in text
+
+    @pytest.mark.parametrize("light", new_scene.LIGHTS)
+    def test_no_comment_states_a_figure_that_a_change_makes_wrong(self, light):
+        """Two plates of other sizes and distances have the same comments."""
+        texts = (new_scene.Plate.of(light, size, far).text("x", None, 0.1) for size, far in ((40, 300), ("90x70", 900)))
+        comments = [re.findall(r"# .*", re.sub(r"diameter = [\d.]+", "", text)) for text in texts]
+        assert [line.replace("along each side", "along the longer side") for line in comments[0]] == comments[1]
 
     @pytest.mark.parametrize(("arguments", "made", "sentence"), [
         ([], {"source.kind": "collimated", "source.extent": None, "source.profile": "gaussian", "source.radius_1e2": 40,

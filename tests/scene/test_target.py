@@ -2,6 +2,7 @@
 
 import io
 import math
+import re
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from bstcad.report.light_figures import HEADROOM, View, irradiance_triptych
 from bstcad.scene.errors import SceneError
 from bstcad.scene.picture import Picture, from_srgb, to_srgb
 from bstcad.scene.scene import load
-from bstcad.scene.target import Target, drawing, inside, overlap
+from bstcad.scene.target import Target, drawing, inside, overlap, shown_size
 
 F = np.zeros((16, 16), np.uint8)  # stem at the left, bars to the right of it, the upper one longer and at the top
 F[2:14, 4:6] = F[2:4, 4:13] = F[7:9, 4:10] = 255
@@ -265,3 +266,27 @@ def test_the_figure_shows_the_tones_of_the_drawing_where_they_belong(scene):
         column, row = box.x0 + box.width * x / WIDTH, box.y1 - box.height * (y - TOP) / WIDTH
         found = shown[shown.shape[0] - 1 - int(row), int(column)]
         assert found == pytest.approx(to_srgb(from_srgb(grey / 255) * scale), abs=5 / 255), f"grey {grey}"
+
+
+@pytest.mark.parametrize("rotate", [0, 90])
+def test_a_crop_is_the_picture_of_that_part_alone(rotate):
+    """Whole pixels of the file, upright; `fit` then sees the part as the picture."""
+    whole = np.add.outer(np.arange(40.0), np.arange(60.0)) + 1.0
+    given = {"z": 100.0, "x": (-20.0, 20.0), "y": (-30.0, 30.0), "pixels": 30, "gamma": 1.0, "rotate": rotate}
+    by_crop = Target(**given, image=whole, crop=(0.25, 0.1, 0.751, 0.9))
+    by_hand = Target(**given, image=whole[4:36, 15:45])
+    assert by_crop.irradiance() == pytest.approx(by_hand.irradiance(), rel=1e-6)
+    assert shown_size(by_crop) == shown_size(by_hand) == ((30, 32) if rotate == 0 else (32, 30))
+    assert by_crop.remarks() == by_hand.remarks() != ()
+    assert Target(**given, image=whole, crop=(0, 0, 1, 1)).irradiance() == pytest.approx(
+        Target(**given, image=whole).irradiance(), rel=1e-12
+    )
+
+
+@pytest.mark.parametrize(("given", "sentence"), [
+    ({"uniform": True, "crop": (0.0, 0.0, 1.0, 0.5)}, "target.crop: only an image or a sample has parts"),
+    ({"sample": "astronaut", "crop": (0.5, 0.0, 0.5, 1.0)}, r"target.crop: \[0.5, 0, 0.5, 1\] is no part"),
+])  # fmt: skip
+def test_a_crop_of_nothing_is_refused(given, sentence):
+    target = Target(z=100.0, x=(-20.0, 20.0), y=(-30.0, 30.0), pixels=30, **given)
+    assert re.match(sentence, next(target.complaints()))
