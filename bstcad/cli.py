@@ -30,6 +30,7 @@ from rich.text import Text
 from bstcad import __version__
 from bstcad.runs import files, processes, progress, signals
 from bstcad.runs.files import SentenceError
+from bstcad.step_text import beginning
 
 if TYPE_CHECKING:
     from bstcad.report.record import Contents, Examined
@@ -395,6 +396,7 @@ def verify(
     verbose: Verbose = False,
 ) -> int:  # fmt: skip
     """Verify a lens from its written files."""
+    beginning.check(path)
     processes.begin()
     commands = engine()
     with progress.watch(Console(stderr=True)) as watched:

@@ -52,6 +52,7 @@ from bstcad.runs.environment import circumstances
 from bstcad.runs.files import MachineError, SceneError
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
+from bstcad.step_text import beginning
 from bstcad.sweep.estimates import diagnosis, left_out
 from bstcad.sweep.net_choice import with_net
 from bstcad.tailoring.run import Look, Progress, silent, unseen
@@ -338,13 +339,19 @@ def verify(
 
 def examine(path: Path) -> Examined:
     """Look at one STEP file by itself: its checks and its part, without a design."""
+    beginning.check(path)
     with refusals(f"{path}: "):
-        found, lens, whole = checks.examine(path, processes.submit)
-    passed, stated = all(c.passed for c in found), [c.value for c in found if c.name == text_checks.DENSITY]
-    rows = prescription.part(lens, whole, stated[0] if len(stated) == 1 else None)
+        found = checks.examine(path, processes.submit)
+    passed = all(check.passed for check in found.checks)
+    stated = [check.value for check in found.checks if check.name == text_checks.DENSITY]
+    placement = found.placement.facts() if found.placement.moves else None
+    rows = prescription.part(
+        found.lens, found.whole, stated[0] if len(stated) == 1 else None, placement=placement
+    )  # fmt: skip
     return Examined(
-        name=path.stem, title=str(path), verdict=verdict(passed, ()), passed=passed, checks=tuple(found), part=rows
-    )
+        name=path.stem, title=str(path), verdict=verdict(passed, ()), passed=passed, checks=found.checks, part=rows,
+        placement=placement,
+    )  # fmt: skip
 
 
 def read(folder: Path) -> Made:
@@ -406,8 +413,9 @@ def _order(made: Made, shape: Mapping[str, Any], folder: Path) -> Order:
     """The order for a shop of the design in a folder; shape: as report.json has it."""
     mount, path = made.scene.mount, (folder / folders.PART).absolute()
     try:
-        found = processes.submit(prescription.measured, path).result() if mount and path.is_file() else None
-    except (BrokenExecutor, ValueError):  # a damaged part, which a check tells: the lens is sent
+        asked = mount and path.is_file() and processes.submit(prescription.measured, path)
+        found = processes.result(asked, checks.time_limit(path)) if asked else None
+    except (BrokenExecutor, ValueError, processes.Overdue):  # a damaged part, which a check tells: the lens is sent
         found = None
     return prescription.order_of(made.scene, made.lens, shape, folder, found=found)
 

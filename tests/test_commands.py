@@ -241,6 +241,21 @@ class TestGenerate:
                 commands.verify(path)
         assert contents(folder) == before
 
+    def test_a_second_process_that_does_not_end_over_the_file_is_stopped(self, folder, monkeypatch):
+        """Within the limit, in a sentence that says what took how long."""
+
+        def submit(work, *arguments):
+            name = work if isinstance(work, str) else f"{work.__module__}.{work.__name__}"
+            hangs = name.startswith("bstcad.verify.step_checks")
+            return Future() if hangs else commands.processes.here(work, *arguments)
+
+        monkeypatch.setattr(commands.processes, "submit", submit)
+        monkeypatch.setattr(commands.checks, "LIMIT", 0.1)
+        monkeypatch.setattr(commands.checks, "LIMIT_PER_MB", 0.0)
+        for path in (folder, folder / "lens.step"):
+            with pytest.raises(SceneError, match=r"lens\.step: OCC had not ended after 0 s and was stopped; export"):
+                commands.verify(path)
+
     def test_the_3d_picture_is_drawn_where_the_machine_can(self, proved):
         commands.verify(proved, drawing=pictures("solid"))
         page, drawn = (proved / "report.html").read_text(), proved / "figures" / "lens.png"

@@ -119,9 +119,10 @@ def test_the_given_front_is_in_every_file(behind_another, small_design):
 
 def test_its_step_file_stands_alone(behind_another, tmp_path):
     """Checked without the design, and as a front itself."""
-    checks, lens, _ = step_checks.examine(behind_another.folder / "lens.step")
-    assert all(check.passed for check in checks) and lens.front.m == 33
-    assert any("control points of the front" in check.name for check in checks)
+    found = step_checks.examine(behind_another.folder / "lens.step")
+    lens = found.lens
+    assert all(check.passed for check in found.checks) and lens.front.m == 33
+    assert any("control points of the front" in check.name for check in found.checks)
     again = behind_another.scene.changed({"lens.front.file": str(behind_another.folder / "lens.step")})
     assert np.ptp(again.lens.front.surface.control_points()[..., 2] - lens.back.control_points()[..., 2]) < 1e-12
 

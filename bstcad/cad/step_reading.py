@@ -1,5 +1,7 @@
 """The lens that a STEP file holds, read by OCC; in a process of its own, since OCC may end it over a damaged file.
 
+A lens that another program has turned or moved is read in its own frame, with its placement beside it: its axis is z,
+and light enters through the front, towards +z.
 Its faces, its outline and clear apertures, which the edges tell, and whether these edges lie on the faces that they
 bound: OCC's own checks look at the ends of an edge and at a few points between, and call a solid valid whose rim runs
 the long way around its circle.
@@ -10,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +23,14 @@ from OCP.BRepCheck import BRepCheck_Analyzer
 from OCP.BRepTools import BRepTools, BRepTools_WireExplorer
 from OCP.Geom import Geom_BSplineSurface
 from OCP.GeomAbs import GeomAbs_SurfaceType as Kind
-from OCP.gp import gp_Pnt, gp_Vec
+from OCP.gp import gp_Pnt, gp_Trsf, gp_Vec
 from OCP.IFSelect import IFSelect_RetDone
 from OCP.Message import Message
 from OCP.ShapeAnalysis import ShapeAnalysis_ShapeTolerance
 from OCP.STEPControl import STEPControl_Reader
 from OCP.TopAbs import TopAbs_EDGE, TopAbs_FACE, TopAbs_Orientation, TopAbs_ShapeEnum, TopAbs_SOLID, TopAbs_VERTEX
 from OCP.TopExp import TopExp
+from OCP.TopLoc import TopLoc_Location
 from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Shape, TopoDS_Solid
 from OCP.TopTools import TopTools_IndexedMapOfShape
 
@@ -36,6 +39,7 @@ from bstcad.optics.bspline import SMALLEST_NET, BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle, Rounded
 from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Surface, sag
+from bstcad.step_text.placement import Placement, own_frame, unmoved
 
 UNIFORM = 1e-9  # mm; a net further from uniform in x and y is not one of ours
 AXIAL = 1e-9  # mm or rad; a wall further off does not belong to an outline about the axis
@@ -50,15 +54,16 @@ Face = tuple[TopoDS_Face, BRepAdaptor_Surface]
 
 @dataclass(frozen=True)
 class StepLens:
-    """A lens as one STEP file holds it; lengths in mm."""
+    """A lens as one STEP file holds it, in its own frame; lengths in mm."""
 
-    shape: TopoDS_Solid
+    shape: TopoDS_Solid  # moved into that frame
     control_points: np.ndarray  # (m, n, 3) of the back, x along the first axis, as OCC has them
     back: BSplineSurface
     front: Surface
     outline: Outline  # of the walls of a lens and no more; of others how far the edge of the back reaches
     edge: np.ndarray | None  # (n, 2) mm, once around the back, if its walls are not those of its outline
     faces: tuple[TopoDS_Face, TopoDS_Face]  # front and back
+    placement: Placement = field(default_factory=unmoved)  # of that frame in the file
 
     @property
     def clear(self) -> tuple[Outline, Outline]:
@@ -108,9 +113,9 @@ def solid(path: Path) -> TopoDS_Solid:
 def read(path: str | Path) -> StepLens:
     """The lens in a STEP file; ValueError in one sentence if OCC does not find exactly one there."""
     path = Path(path)
-    found = solid(path)
     try:
-        return _lens_in(found)
+        found, placement = in_own_frame(solid(path))
+        return replace(_lens_in(found), placement=placement)
     except ValueError as error:
         raise ValueError(f"{path.name}: read by OCC: {error}") from error
 
@@ -133,16 +138,55 @@ def gaps(solid: TopoDS_Solid) -> float:
     return ShapeAnalysis_ShapeTolerance().Tolerance(solid, 1)
 
 
+# ---- own frame ----------------------------------------------------------------------------------------------------
+
+
+def in_own_frame(solid: TopoDS_Solid) -> tuple[TopoDS_Solid, Placement]:
+    """The solid of a lens in the frame of the lens, and the placement of that frame in the file.
+
+    The frame is the one in which the file defines the solid, where the back lies over x and y there; else it is that of
+    the back's net.  A solid without such a net stays in the frame of its definition.
+    """
+    stated = _placement(solid.Location())
+    defined = TopoDS.Solid_s(solid.Located(TopLoc_Location()))
+    back = _back(_nets(_faces(defined)))
+    if back is None:
+        return defined, stated
+    face, surface = back
+    frame = own_frame(patches.net_of(surface.BSpline()))
+    if not frame.moves:
+        return defined, stated
+    if not _looks_along_net(face):
+        why = "its freeform face looks against the normal of its net, u x v, as in a mirror image"
+        raise ValueError(f"{why}; export the lens as bstcad wrote it")
+    return TopoDS.Solid_s(defined.Moved(_location(frame.inverse))), stated.after(frame)
+
+
+def _placement(location: TopLoc_Location) -> Placement:
+    """A location of OCC as a placement."""
+    if location.IsIdentity():
+        return unmoved()
+    motion = location.Transformation()
+    rows = np.array([[motion.Value(i, j) for j in range(1, 5)] for i in range(1, 4)])
+    return Placement(rows[:, :3], rows[:, 3])
+
+
+def _location(placement: Placement) -> TopLoc_Location:
+    """A placement as a location of OCC."""
+    motion = gp_Trsf()
+    motion.SetValues(*np.column_stack([placement.rotation, placement.shift]).ravel().tolist())
+    return TopLoc_Location(motion)
+
+
 # ---- back and front ------------------------------------------------------------------------------------------------
 
 
 def _lens_in(solid: TopoDS_Solid) -> StepLens:
-    faces = [(face, BRepAdaptor_Surface(face)) for face in map(TopoDS.Face_s, parts_of(solid, TopAbs_FACE))]
-    nets = [face for face in faces if is_freeform(face[1])]
-    backs = [face for face in nets if len(nets) == 1 or _looks_up(*face)]
-    if len(backs) != 1 or len(nets) > 2:
+    faces = _faces(solid)
+    nets = _nets(faces)
+    if (found := _back(nets)) is None:
         raise ValueError(f"{len(nets)} B-spline faces; a lens has one, or two that face away from each other")
-    [(back_face, back)], fronts = backs, [face for face in nets if face is not backs[0]]
+    (back_face, back), fronts = found, [face for face in nets if face is not found]
     net = patches.net_of(back.BSpline())
     middle = (net[0, 0, :2] + net[-1, -1, :2]) / 2
     if not np.abs(middle).max() <= AXIAL:
@@ -160,6 +204,26 @@ def _lens_in(solid: TopoDS_Solid) -> StepLens:
         outline = _around(edge)
     faces = chosen[0], back_face
     return StepLens(solid, net, _uniform_net(back, net), front=front, outline=outline, edge=edge, faces=faces)
+
+
+def _faces(solid: TopoDS_Solid) -> list[Face]:
+    return [(face, BRepAdaptor_Surface(face)) for face in map(TopoDS.Face_s, parts_of(solid, TopAbs_FACE))]
+
+
+def _nets(faces: Sequence[Face]) -> list[Face]:
+    """The freeform faces among these."""
+    return [face for face in faces if is_freeform(face[1])]
+
+
+def _back(nets: Sequence[Face]) -> Face | None:
+    """The freeform face through which light leaves: of two the one that looks along the normal of its net."""
+    backs = [face for face in nets if len(nets) == 1 or _looks_along_net(face[0])]
+    return backs[0] if len(backs) == 1 and len(nets) <= 2 else None
+
+
+def _looks_along_net(face: TopoDS_Face) -> bool:
+    """Does a face look along ∂u x ∂v of its surface, as a height over (x, y) does that is seen from above?"""
+    return face.Orientation() != TopAbs_Orientation.TopAbs_REVERSED
 
 
 def is_freeform(surface: BRepAdaptor_Surface) -> bool:

@@ -229,8 +229,9 @@ def measured(path: Path) -> tuple[Place, Place, float | None]:
     The volume is None where the part has faces that nothing here integrates.
     """
     from bstcad.cad import solid_properties, step_reading  # the first process need not load OCC
+    from bstcad.verify import step_checks
 
-    reread = step_reading.read(path)
+    reread = step_checks.read(path)
     lens = step_reading.lens(reread, index=1.5)
     whole = solid_properties.whole_part(reread, solid_properties.of_solid(reread.shape))
     return *_corners(lens, whole), _volume(lens, whole)
@@ -241,11 +242,14 @@ def order_rows(order: Order) -> Rows:
     return tables("order.txt.j2", order=order)["order"]
 
 
-def part(lens: Lens, whole: WholePart | None = None, stated: float | None = None) -> dict[str, str]:
+def part(
+    lens: Lens, whole: WholePart | None = None, stated: float | None = None, placement: Mapping[str, Any] | None = None
+) -> dict[str, str]:  # fmt: skip
     """The facts of a part that a STEP file holds, in the order in which a machine is set up; no design is needed.
 
     whole: the walls around the lens, if it is not bare: then its outline only holds the edge of its back.
     stated: density (g/cm³) in the file; None: the file states none, or several.
+    placement: of the lens in the file (its words); None: its own frame is that of the file.
     """
     import shapely  # a twentieth of a second, which a design need not pay
 
@@ -258,6 +262,7 @@ def part(lens: Lens, whole: WholePart | None = None, stated: float | None = None
         origin=_origin(lens, vertex, whole is None), fills=fills,
         edge=edge is not None and list(zip(edge.min(0), edge.max(0), strict=True)),
         thinnest=thickness_range(lens, edge)[0], volume=_volume(lens, whole), density=stated,
+        placement=placement,
     )  # fmt: skip
     return dict(found["part"])
 

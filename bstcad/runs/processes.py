@@ -100,6 +100,21 @@ def submit(work: Work, *arguments: Any) -> Future:
         return _process.submit(_call, work, *arguments)
 
 
+class Overdue(TimeoutError):
+    """A work of the second process that took too long; the process has been ended."""
+
+
+def result(work: Future, limit: float) -> Any:
+    """The result of a work of the second process; Overdue if it is not there after `limit` seconds."""
+    try:
+        return work.result(limit)
+    except TimeoutError as error:
+        if work.done():  # the work itself raised it
+            raise
+        end()
+        raise Overdue(f"not ended after {limit:.3g} s") from error
+
+
 def here(work: Work, *arguments: Any) -> Future:
     """Call a function in this process: a finished Future."""
     done: Future = Future()
@@ -134,7 +149,7 @@ def end() -> None:
     ended, _process = _process, None
     if ended is not None:
         thread = isinstance(ended, ThreadPoolExecutor)
-        ended.shutdown(wait=True, **{"cancel_futures" if thread else "kill_workers": True})
+        ended.shutdown(wait=not thread, **{"cancel_futures" if thread else "kill_workers": True})
 
 
 def _call(work: Work, *arguments: Any) -> Any:

@@ -23,6 +23,7 @@ from bstcad.runs import files
 from bstcad.scene.errors import SceneError
 from bstcad.scene.schema import COORDINATES, LENGTHS, OneOrTwo, Record, from_file, leaving_out
 from bstcad.step_text import part21
+from bstcad.step_text.placement import own_frame
 
 if TYPE_CHECKING:  # which loads numba
     from bstcad.optics.bspline import BSplineSurface
@@ -38,6 +39,7 @@ BOUNDS = ("tool_radius", "max_slope", "max_thickness", "edge_thickness")  # the 
 
 NET_FILE = "front.npz"  # the copy of a given net beside a design
 NET_REMEDY = "give the folder of a design, its design.npz or its lens.step"
+LEVEL = 1e-9  # sine of the angle between a side of a net and an axis of the file; a larger one is a turn
 UNIFORM = 1e-9  # mm; a net further from uniform in x and y is not one of ours
 ROUNDING = 1e-12  # mm; a net whose vertex is so near to zero is measured from there already
 LARGEST_NET = 2049  # control points a side
@@ -84,7 +86,10 @@ class GivenNet:
 
 
 def read_net(path: Path) -> GivenNet:
-    """The back face of the design at `path`; SceneError if there is none, or it is damaged."""
+    """The back face of the design at `path`; SceneError if there is none, or it is damaged.
+
+    That of a STEP file lies as the file places it, of which the shift along z is of no matter.
+    """
     from bstcad.optics.bspline import SMALLEST_NET, BSplineSurface
 
     name = repr(str(path))
@@ -107,13 +112,32 @@ def _net_of_step(path: Path) -> np.ndarray:
     from bstcad.optics.bspline import knots
 
     text = part21.read(path)
+    if text.solids != 1:
+        raise ValueError(f"{text.solids} solids in it, and a lens is one")
     surface, shape = text.surface, text.surface.control_points.shape[:2]
     if text.unit != "millimetre":
         raise ValueError(f"its lengths are in {text.unit}, not in millimetres")
     ours = (np.array_equal(full, knots(m)) for full, m in zip(surface.full_knots, shape, strict=True))
     if surface.degrees != (2, 2) or not all(ours):
         raise ValueError("its freeform face has other knots than bstcad's")
-    return surface.control_points
+    return _along_axes(surface.control_points)
+
+
+def _along_axes(net: np.ndarray) -> np.ndarray:
+    """A net (m, n, 3) as a height over x and y, with x rising along its first axis and y along its second.
+
+    ValueError if its lens is turned so that the axis is not along z, or the sides of the net not along x and y.
+    """
+    frame = own_frame(net)
+    sines = np.abs(frame.rotation)
+    if not (np.abs(sines - sines.round()).max() <= LEVEL and sines[2, 2] > 0.5):
+        over = "a front is a height over x and y, and the sides of its net lie along them"
+        raise ValueError(f"its lens is {frame.turn_words}, and {over}: export it unturned")
+    along = np.abs(net[-1, 0, :2] - net[0, 0, :2])
+    net = net.transpose(1, 0, 2) if along[1] > along[0] else net
+    for axis in (0, 1):
+        net = np.flip(net, axis) if net[-1, -1, axis] < net[0, 0, axis] else net
+    return np.ascontiguousarray(net)
 
 
 Z = Key("Where it crosses the axis, its vertex.", "mm", *COORDINATES, example=8.0)
@@ -304,6 +328,11 @@ class NetFront(_Front):
             yield "control_points: the front has those of its file; remove one of the two"
         own, sides = net_extent(outline, self.file.shape), outline.half_extent
         for name, ends, half, side in zip("xy", (self.file.x, self.file.y), own, sides, strict=True):
+            middle = (ends[0] + ends[1]) / 2
+            if abs(middle) > UNIFORM and abs(ends[1] - ends[0] - 2 * half) <= 4 * UNIFORM:
+                place = f"its net lies about {name} = {middle:.6g} mm and not about the axis"
+                yield f"file: {place}; export the lens centred on its axis, or give its design"
+                continue
             known = (half,) if outline.is_round else (half, side)
             if min(max(abs(ends[0] + end), abs(ends[1] - end)) for end in known) > UNIFORM:
                 covers = f"{name} = {ends[0]:g} to {ends[1]:g} mm, and not {-half:g} to {half:g} mm"

@@ -14,29 +14,26 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from bstcad.runs import files
 from bstcad.runs.files import one_line
+from bstcad.step_text import beginning
+from bstcad.step_text.assembly import placement_of
+from bstcad.step_text.entities import NAME, REAL, Entities, damaged, read_entities, without_blanks
+from bstcad.step_text.placement import Placement, unmoved
 
 MAX_BYTES = 600_000_000  # of a file: 2049 x 2049 control points, 130 bytes each with all references to them
-MAX_COORDINATE = 1e12  # of a point; a target may be 1e8 mm away
 MAX_DEGREE = 25  # of a spline; OCC goes no further
 CONIC_NET = 9  # control points of a conic or a nearly flat sphere; the net of a freeform face is larger
 
-NAME = r"[1-9]\d{0,17}"  # an entity's number: one of 64 bits
-REAL = r"[-+]?\d+\.\d*(?:E[-+]?\d+)?"
 REALS = rf"{REAL}(?:,{REAL})*"
 COUNTS = r"\d{1,9}(?:,\d{1,9})*"
 FLAG = r"\.([TFU])\."
-BLANKS = bytes(code for code in range(256) if chr(code).isspace())
-STRING = re.compile(r"'[^']*(?:''[^']*)*'")
-POINT = re.compile(rf"(?<=;)#({NAME})=CARTESIAN_POINT\('\d*',\(({REAL},{REAL},{REAL})\)\);")
-STATEMENT = re.compile(rf"#({NAME})=([A-Z][A-Z_0-9]*)?(\(.*\))", re.DOTALL)
 REFERENCES = re.compile(rf"#{NAME}(?:,#{NAME})*")
 RULED = re.compile(r"\d+,1,")  # a wall: of degree 1 in v
 SURFACE = re.compile(
@@ -57,7 +54,7 @@ class FreeformSurface:
     """A B_SPLINE_SURFACE_WITH_KNOTS as the file states it; with weights it is another entity, and no lens of ours."""
 
     degrees: tuple[int, int]  # u, v
-    control_points: np.ndarray  # (m, n, 3), the file's unit of length, u along the first axis
+    control_points: np.ndarray  # (m, n, 3) in the frame and the unit of length of the file, u along the first axis
     knots: tuple[np.ndarray, np.ndarray]  # distinct values
     multiplicities: tuple[np.ndarray, np.ndarray]
     closed: tuple[bool, bool]
@@ -91,6 +88,13 @@ class ValidationProperties:
     densities: tuple[float, ...] = ()  # g/cm³
     profiles: tuple[Profile, ...] = ()
 
+    def moved(self, placement: Placement) -> ValidationProperties:
+        """The same part elsewhere."""
+        if not placement.moves:
+            return self
+        moved = (placement(np.array(centroid)).tolist() for centroid in self.centroids)
+        return replace(self, centroids=tuple((x, y, z) for x, y, z in moved))
+
     @property
     def of_shape(self) -> bool:
         """Does the file state area, volume or centroid?"""
@@ -107,46 +111,16 @@ class StepText:
     schema: str
     solids: int  # MANIFOLD_SOLID_BREP and BREP_WITH_VOIDS
     faces: int
-    surface: FreeformSurface  # the freeform back: of two large nets that with the higher middle
+    surface: FreeformSurface  # the freeform back; of two nets the one that looks away from the other along u x v
     front: FreeformSurface | None  # the other one
     edge_uses: dict[int, tuple[int, int]]  # edge -> uses (forward, reversed)
     properties: ValidationProperties
+    placement: Placement = field(default_factory=unmoved)  # of its solid, as the file states it
 
     @property
     def closed(self) -> bool:
         """Is every edge used exactly twice, once in each direction?"""
         return bool(self.edge_uses) and all(uses == (1, 1) for uses in self.edge_uses.values())
-
-
-@dataclass(frozen=True)
-class Entities:
-    """The entities of a STEP file, by the digits of their numbers."""
-
-    bodies: Mapping[str, tuple[str, str]]  # (kind, attributes without blanks); a complex entity's kind is COMPLEX
-    strings: Sequence[str]  # 'k' in the attributes is string k, as the file has it
-    point_numbers: np.ndarray  # (n,) ascending: nearly all entities are points in space, and not among the bodies
-    xyz: np.ndarray  # (n, 3), in that order, the file's unit of length
-
-    def of(self, kind: str) -> dict[str, str]:
-        """The attributes of the entities of a kind."""
-        return {number: body for number, (its, body) in self.bodies.items() if its == kind}
-
-    def references(self, number: str) -> list[str]:
-        """The entities that an entity refers to, in order."""
-        return re.findall(r"#(\d+)", self.bodies[number][1])
-
-    def string(self, number: str, place: int) -> str:
-        """The first or second attribute of an entity as a string in one line; "" if it is none."""
-        attributes = re.match(r"\((?:'(\d*)')?(?:,'(\d*)')?", self.bodies[number][1]).groups()
-        return decoded(self.strings[int(attributes[place])]) if attributes[place] else ""
-
-    def points(self, numbers: np.ndarray) -> np.ndarray:
-        """The points of these entities; KeyError names an entity that is no point."""
-        rows = np.searchsorted(self.point_numbers, numbers).clip(max=len(self.xyz) - 1)
-        wrong = numbers[self.point_numbers[rows] != numbers] if len(self.xyz) else numbers.ravel()
-        if len(wrong):
-            raise KeyError(f"#{wrong[0]}")
-        return self.xyz[rows]
 
 
 def read(path: str | Path) -> StepText:
@@ -182,97 +156,38 @@ def parse(text: bytes | str) -> StepText:
         raise ValueError(one_line(error)) from error
     except UNREADABLE as error:
         fault = f"{error.args[0]} is missing, or of another kind" if isinstance(error, KeyError) else "one is malformed"
-        raise ValueError(one_line(_damaged(f"of its entities {fault}"))) from error
+        raise ValueError(one_line(damaged(f"of its entities {fault}"))) from error
 
 
 def _parse(text: bytes) -> StepText:
+    if (fault := beginning.fault(text)) is not None:
+        raise ValueError(fault)
     from bstcad.step_text import points  # with numba, which a scene without a STEP file need not load
 
-    if not text.lstrip().startswith(b"ISO-10303-21;"):
-        raise ValueError("not a STEP file (it does not begin with ISO-10303-21); export the lens as STEP")
     if b"END-ISO-10303-21;" not in text[-200:]:
         raise ValueError("the file is truncated (no END-ISO-10303-21 at its end); write or copy it again")
     rest, *taken = points.taken_out(text)
-    data, strings = _bare(rest.decode("latin-1"))  # Part 21 is ASCII; latin-1 never fails
-    entities = _entities(data, strings, *taken)
+    data, strings = without_blanks(rest.decode("latin-1"))  # Part 21 is ASCII; latin-1 never fails
+    entities = read_entities(data, strings, *taken)
     lengths, angles = (_units(kind, entities) for kind in ("LENGTH", "PLANE_ANGLE"))
     if len(lengths) != 1:
         raise ValueError(f"{len(lengths)} units of length ({', '.join(lengths)}); export it in millimetres only")
-    surface, front = _freeform_surfaces(entities)
+    solids = [*entities.of("MANIFOLD_SOLID_BREP"), *entities.of("BREP_WITH_VOIDS")]
+    placement = placement_of(solids[0], entities) if len(solids) == 1 else unmoved()
+    surface, *fronts = (_placed(each, placement) for each in _freeform_surfaces(entities))
     return StepText(
         product=_product(entities),
         unit=lengths[0],
         angle=", ".join(angles) or "radian",
         schema=_schema(data, strings),
-        solids=len(entities.of("MANIFOLD_SOLID_BREP")) + len(entities.of("BREP_WITH_VOIDS")),
+        solids=len(solids),
         faces=len(_shell_faces(entities)),
         surface=surface,
-        front=front,
+        front=fronts[0] if fronts else None,
         edge_uses=_edge_uses(entities),
         properties=_properties(entities),
+        placement=placement,
     )
-
-
-# ---- statements ----------------------------------------------------------------------------------------------------
-
-
-def _bare(text: str) -> tuple[str, list[str]]:
-    """(the text without blanks, the strings): each string in it gives way to its place in the list, '' stays."""
-    strings: list[str] = []
-
-    def numbered(hit: re.Match[str]) -> str:
-        if len(hit[0]) == 2:
-            return "''"
-        strings.append(hit[0][1:-1])
-        return f"'{len(strings) - 1}'"
-
-    data = STRING.sub(numbered, text)
-    return data.encode("latin-1", "replace").translate(None, BLANKS).decode("latin-1"), strings
-
-
-def _entities(data: str, strings: Sequence[str], numbers: np.ndarray, xyz: np.ndarray) -> Entities:
-    """numbers, xyz: of the points that are taken out of the data."""
-    from bstcad.step_text import points
-
-    start, end = data.find("DATA;"), data.rfind("ENDSEC;")
-    if not 0 <= start < end:
-        raise _damaged("it has no DATA section")
-    parts = POINT.split(data[start + len("DATA") : end])  # from its semicolon on
-    rest, names, values = "".join(parts[::3]), parts[1::3], parts[2::3]
-    *texts, tail = rest[1:].split(";")
-    hits = [STATEMENT.fullmatch(each) for each in texts]
-    if tail or not hits or None in hits:
-        raise _damaged("a statement is no entity")
-    numbers = np.concatenate([numbers, np.fromstring(",".join(names), dtype=np.int64, sep=",")])
-    xyz = np.concatenate([xyz, np.fromstring(",".join(values), dtype=np.float64, sep=",").reshape(-1, 3)])
-    known = np.sort(np.concatenate([numbers, np.array([hit[1] for hit in hits], dtype=np.int64)]))
-    if not (np.diff(known) > 0).all():
-        raise _damaged("two entities share a number")
-    named = points.references(rest.encode("latin-1"))
-    missing = named[known[np.searchsorted(known, named).clip(max=len(known) - 1)] != named]
-    if len(missing):
-        raise _damaged(f"entity #{missing.min()} is missing")
-    if not np.isfinite(xyz).all():
-        raise ValueError("a CARTESIAN_POINT is not finite; write the file again")
-    if np.abs(xyz).max(initial=0.0) > MAX_COORDINATE:
-        raise ValueError(f"a CARTESIAN_POINT is over {MAX_COORDINATE:g} away; write the file again")
-    order = np.argsort(numbers)
-    return Entities({hit[1]: (hit[2] or "COMPLEX", hit[3]) for hit in hits}, strings, numbers[order], xyz[order])
-
-
-def _damaged(fault: str) -> ValueError:
-    return ValueError(f"the file is damaged ({fault}); write it again")
-
-
-def decoded(string: str) -> str:
-    """A string of Part 21, without its quotes, as it is meant: escapes resolved, in one line."""
-    string = re.sub(r"[\r\n]", "", string).replace("''", "'")
-    string = re.sub(
-        r"\\X2\\((?:[0-9A-F]{4})*)\\X0\\",
-        lambda hit: bytes.fromhex(hit.group(1)).decode("utf-16-be", "replace"),
-        string,
-    )
-    return one_line(re.sub(r"\\X\\([0-9A-F]{2})", lambda hit: chr(int(hit.group(1), 16)), string))
 
 
 def _schema(data: str, strings: Sequence[str]) -> str:
@@ -305,7 +220,7 @@ def _unit_name(body: str, entities: Entities) -> str:
         name = one_line(entities.strings[int(place)].lower()[:40])
         return f"{name} by a factor of its own" if "metre" in name or "radian" in name else name
     if body.count("SI_UNIT(") != 1:
-        raise _damaged("a unit is of no kind or of two")
+        raise damaged("a unit is of no kind or of two")
     prefix, unit = re.search(r"SI_UNIT\((\.\w+\.|\$),\.(\w+)\.\)", body).groups()
     return (prefix.strip(".$") + unit).lower()[:40]
 
@@ -350,8 +265,8 @@ def _flagged(kind: str, before: str, entities: Entities) -> dict[str, tuple[str,
 # ---- freeform surfaces ---------------------------------------------------------------------------------------------
 
 
-def _freeform_surfaces(entities: Entities) -> tuple[FreeformSurface, FreeformSurface | None]:
-    """The back, and the front if it has a freeform net."""
+def _freeform_surfaces(entities: Entities) -> list[FreeformSurface]:
+    """The back, and the front if it has a freeform net, before they are placed."""
     attributes = {n: body.partition("',")[2] for n, body in entities.of("B_SPLINE_SURFACE_WITH_KNOTS").items()}
     bodies = [(number, body) for number, body in attributes.items() if not RULED.match(body)]
     bodies.sort(key=lambda each: each[1].count("#"), reverse=True)
@@ -361,14 +276,23 @@ def _freeform_surfaces(entities: Entities) -> tuple[FreeformSurface, FreeformSur
     if len(large) > 2:
         raise ValueError(f"{len(bodies)} freeform surfaces in the file; a lens has one or two: export it alone")
     surfaces = [_surface(*each, entities) for each in large or bodies[:1]]
-    surfaces.sort(key=_middle, reverse=True)
-    return surfaces[0], surfaces[1] if len(surfaces) > 1 else None
+    if len(surfaces) > 1:
+        (middle, normal), (other, its_normal) = map(_middle, surfaces)
+        if (normal + its_normal) @ (middle - other) < 0:
+            surfaces.reverse()
+    return surfaces
 
 
-def _middle(surface: FreeformSurface) -> float:
-    """z of the control point in its middle."""
-    m, n, _ = surface.control_points.shape
-    return float(surface.control_points[m // 2, n // 2, 2])
+def _middle(surface: FreeformSurface) -> tuple[np.ndarray, np.ndarray]:
+    """The control point (3,) in the middle of a net, and the unit vector (3,) along its sides u x v."""
+    net = surface.control_points
+    m, n, _ = net.shape
+    normal = np.cross(net[-1, 0] - net[0, 0], net[0, -1] - net[0, 0])
+    return net[m // 2, n // 2], normal / max(math.sqrt(normal @ normal), 1e-300)
+
+
+def _placed(surface: FreeformSurface, placement: Placement) -> FreeformSurface:
+    return replace(surface, control_points=placement(surface.control_points)) if placement.moves else surface
 
 
 def _surface(entity: str, body: str, entities: Entities) -> FreeformSurface:
@@ -403,10 +327,10 @@ def _net(text: str) -> np.ndarray:
 def _check_knots(counts: np.ndarray, knots: np.ndarray, points: int, degree: int) -> None:
     """ValueError unless knots of these multiplicities carry a spline of this degree and number of control points."""
     if not 1 <= degree <= MAX_DEGREE:
-        raise _damaged(f"a spline of degree {degree}")
+        raise damaged(f"a spline of degree {degree}")
     rising = np.isfinite(knots).all() and (np.diff(knots) > 0).all()
     if not rising or len(counts) != len(knots) or counts.min() < 1 or counts.sum() != points + degree + 1:
-        raise _damaged(f"{counts.sum()} knots for {points} control points of degree {degree}")
+        raise damaged(f"{counts.sum()} knots for {points} control points of degree {degree}")
 
 
 # ---- statements about the part besides its shape -------------------------------------------------------------------

@@ -16,6 +16,7 @@ BLANK = np.array([chr(code).isspace() for code in range(256)])
 BEGIN = np.frombuffer(b"=CARTESIAN_POINT('',(", np.uint8)  # what stands between the number of a point and its first
 END = np.frombuffer(b"));", np.uint8)
 LONGEST = 18  # digits of an entity's number: one of 64 bits
+LONGEST_REAL = 64  # characters of a coordinate
 START, STOP = re.compile(rb"DATA\s*;"), b"ENDSEC"
 
 
@@ -60,7 +61,7 @@ def _references(text, numbers):
 
 @njit(cache=True, nogil=True)
 def _taken_out(text, start, stop, blank, begin, end, rest, reals, numbers):
-    """Copies `text` to `rest` without its points, whose coordinates go to `reals`, each with a comma behind it.
+    """Copies `text` to `rest` without comments and points, whose coordinates go to `reals`, a comma behind each.
 
     Returns the lengths of rest, reals and numbers.  A point begins behind a semicolon that stands in no string.
     """
@@ -79,6 +80,12 @@ def _taken_out(text, start, stop, blank, begin, end, rest, reals, numbers):
                 continue
         if c == 39:  # '
             in_string = not in_string
+        if not in_string and c == 47 and i + 1 < text.size and text[i + 1] == 42:  # /*
+            i += 2
+            while i + 1 < text.size and not (text[i] == 42 and text[i + 1] == 47):  # */
+                i += 1
+            i += 2
+            continue
         if not blank[c]:
             begins = c == 59 and not in_string  # ;
         rest[kept] = c
@@ -134,6 +141,7 @@ def _behind(text, i, stop, blank, word):
 @njit(cache=True, nogil=True)
 def _real(text, i, stop, blank, reals, written):
     """(place of what stands behind a real, place behind its copy); (0, 0) for none: sign, digits, a point, exponent."""
+    begun = written
     part, digits = 0, 0  # 0: before the digits, 1: among them, 2: behind the point, 3: behind E, 4: in the exponent
     while i < stop:
         c = text[i]
@@ -163,6 +171,6 @@ def _real(text, i, stop, blank, reals, written):
         reals[written] = c
         written += 1
         i += 1
-    if part < 2 or part == 3 or (part == 4 and digits == 0):
+    if part < 2 or part == 3 or (part == 4 and digits == 0) or written - begun > LONGEST_REAL:
         return 0, 0
     return i, written

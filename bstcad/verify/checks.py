@@ -39,7 +39,7 @@ from bstcad.optics.measure import (
 from bstcad.optics.outlines import Outline
 from bstcad.optics.wavefront import Wave
 from bstcad.optics.wavefront_error import WavefrontError, wavefront_error
-from bstcad.runs.processes import Submit, here, return_freed
+from bstcad.runs.processes import Overdue, Submit, end, here, result, return_freed
 from bstcad.scene.blank import LensBlank
 from bstcad.scene.mount import Mount, Part, as_cut
 from bstcad.scene.scene import Accept
@@ -48,7 +48,7 @@ from bstcad.verify import text_checks
 from bstcad.verify.verdict import Check
 
 if TYPE_CHECKING:
-    from bstcad.cad.solid_properties import WholePart  # which loads OCC
+    from bstcad.verify.step_checks import ExaminedFile  # which loads OCC
 
 VERTEX_ROUNDING = 2e-7  # of the largest coordinate: a vertex in float32 on a slope, off its face
 VERIFY_SEED = 1_000_003  # added to the seed: rays that tailoring never saw
@@ -67,6 +67,7 @@ MAX_ON_FLANGE = 1e-3  # of the light that gets through the lens; no wall of a fl
 WAVEFRONT = "wavefront error, RMS in waves, piston and tilt removed"
 FLOOR = 0.1  # of the wavefront error that is allowed: rounding that adds more leaves the verdict open
 UNASKED = " (by default: none was asked)"
+LIMIT, LIMIT_PER_MB = 120.0, 3.0  # s that OCC may take over a file, and more for each MB; it needs a hundredth of them
 GRID = ", on a grid four times finer than the net"
 
 
@@ -185,7 +186,12 @@ def verify(
     of_step = submit(*step_job)
     part_job = "bstcad.verify.step_checks.check_part", folder.absolute(), nominal.lens, mount, nominal.part
     of_part = mount and submit(*part_job)
-    text = part21.read_lens(path)  # its sentences say more than OCC's
+    try:
+        text = part21.read_lens(path)  # its sentences say more than OCC's
+    except ValueError:
+        if not lens.done():  # OCC may never end over a file that is damaged
+            end()
+        raise
     mesh = meshes.read_stl(folder / "lens.stl")
     sealed = Check.true("STL watertight, winding consistent", meshes.is_closed(mesh))
     return_freed()  # the texts: OCC holds more of it still
@@ -312,19 +318,28 @@ def _stability(
     }
 
 
-def examine(path: Path, submit: Submit = here) -> tuple[list[Check], Lens, WholePart | None]:
-    """Check a STEP file by itself; its lens and the part around it; ValueError if it holds no lens."""
+def examine(path: Path, submit: Submit = here) -> ExaminedFile:
+    """Check a STEP file by itself; ValueError if it holds no lens."""
     return _result(submit("bstcad.verify.step_checks.examine", path.absolute()), path)
 
 
 def _result(read: Future, path: Path, again: Callable[[], Future] | None = None) -> Any:
     """The answer of OCC's process; `again` asks it anew, where it may have ended over another file before."""
+    limit = time_limit(path)
     try:
-        return read.result()
+        return result(read, limit)
+    except Overdue as error:
+        took = f"OCC had not ended after {limit:.0f} s and was stopped"
+        raise ValueError(f"{path.name}: {took}; export the lens again, alone, or by another program") from error
     except BrokenExecutor as error:
         if again is not None:
             return _result(again(), path)
         raise ValueError(f"{path.name}: OCC broke down over it, the file is damaged; write it again") from error
+
+
+def time_limit(path: Path) -> float:
+    """Seconds that OCC may take over a STEP file."""
+    return LIMIT + (LIMIT_PER_MB * path.stat().st_size / 1e6 if path.is_file() else 0.0)
 
 
 def _ripple(shape: dict[str, float | None], m: int, face: str = "back") -> Check:

@@ -9,7 +9,7 @@ import contextlib
 import functools
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from bstcad.optics.surfaces import Surface
 from bstcad.runs import processes
 from bstcad.scene.mount import Mount, Part
 from bstcad.step_text import part21
+from bstcad.step_text.placement import Placement
 from bstcad.verify import text_checks
 from bstcad.verify.text_checks import net_check
 from bstcad.verify.verdict import Check
@@ -37,6 +38,7 @@ FLAT = 1e-9  # mm; a front so flat that all conics of its curvature are alike to
 BRIDGED = 5e-7  # mm; written with 1e-7
 MOVED = 1e-6  # mm, of an edge of a part; written with 1e-7
 PART = "part.step"
+PLACED = "form: placement of the lens in the file, largest shift of a control point"
 
 
 def one_sentence(work: Callable[..., Any]) -> Callable[..., Any]:
@@ -55,6 +57,16 @@ def one_sentence(work: Callable[..., Any]) -> Callable[..., Any]:
     return asked
 
 
+@dataclass(frozen=True)
+class ExaminedFile:
+    """A STEP file by itself."""
+
+    checks: tuple[Check, ...]
+    lens: Lens  # that it holds, in its own frame, of an index that does not matter
+    whole: WholePart | None  # the part around that lens; None: it is bare
+    placement: Placement  # of the lens's frame in the file
+
+
 @one_sentence
 def lens(path: Path, index: float, reflects: bool = False) -> Lens:
     """The lens of a STEP file, which says neither its index nor whether it is a mirror; ValueError if it holds none."""
@@ -69,12 +81,20 @@ def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, .
     """
     reread = _read(path, _stamp(path))
     return (
+        *_placed(reread, form),
         *_sound(reread.shape),
         *_edges(reread, nominal),
         *_form(reread, nominal.back, form, points),
         *(_form(reread, nominal.front, form, points, of="front") if nominal.shapes_front else ()),
         *_front(reread.front, nominal, form),
     )
+
+
+@one_sentence
+def read(path: Path) -> StepLens:
+    """The lens of a STEP file of which no text is damaged: over another one OCC may never end."""
+    part21.read_lens(path)
+    return step_reading.read(path)
 
 
 @functools.lru_cache(maxsize=1)
@@ -98,30 +118,41 @@ def _stamp(path: Path) -> tuple[int, int, int] | None:
 
 
 @one_sentence
-def examine(path: Path) -> tuple[list[Check], Lens, WholePart | None]:
-    """Check a STEP file by itself; the lens it holds, of an index that does not matter, and the part around that lens.
+def examine(path: Path) -> ExaminedFile:
+    """Check a STEP file by itself.
 
     There is no design to compare it with: the checks are whether its two readers, its text and its faces agree.
     """
-    text, reread = part21.read_lens(path), step_reading.read(path)
-    lens_read = step_reading.lens(reread, index=1.5)
+    text, reread = part21.read_lens(path), step_reading.read(path)  # in this order: see `read`
+    lens_read, placed = step_reading.lens(reread, index=1.5), reread.placement
     properties = solid_properties.of_solid(reread.shape)
     checks = [
         *text_checks.structure(text, lens_read.back.shape),
         *_sound(reread.shape),
         *_edges(reread, lens_read, bare=reread.edge is None),
-        net_check("STEP text against OCC: control points", text.surface.control_points, reread.control_points),
+        net_check("STEP text against OCC: control points", text.surface.control_points, placed(reread.control_points)),
     ]
     if text.front is not None:
         name = "STEP text against OCC: control points of the front"
-        checks.append(net_check(name, text.front.control_points, reread.front.control_points()))
+        own = reread.front.control_points() if reread.front.is_net else np.empty((0, 0, 3))
+        checks.append(net_check(name, text.front.control_points, placed(own)))
     checks.append(Check.at_least("smallest thickness", thickness_range(lens_read, reread.edge)[0], 0.0, "mm"))
     if properties is None:  # it has faces that no lens and no mount has
         checks.append(Check("STEP text: what it states can be held to its faces", False, None, unit="", passed=True))
     else:
-        checks += text_checks.measures(text.properties, properties, reread.outline)
+        from_definition = placed.inverse.after(text.placement)
+        checks += text_checks.measures(text.properties.moved(from_definition), properties, reread.outline)
     checks += text_checks.density(text.properties)
-    return checks, lens_read, solid_properties.whole_part(reread, properties)
+    whole = solid_properties.whole_part(reread, properties)
+    return ExaminedFile(tuple(checks), lens_read, whole, placed)
+
+
+def _placed(reread: StepLens, tolerance: float) -> Iterator[Check]:
+    """The placement of the lens in the file of its design, if it has one."""
+    if reread.placement.moves:
+        net, words = reread.control_points, reread.placement.words
+        off = float(np.abs(reread.placement(net) - net).max())
+        yield Check.at_most(PLACED, off, tolerance, "mm", where=f"the lens is {words}")
 
 
 def _sound(solid: Any, of_part: bool = False) -> Iterator[Check]:
@@ -190,7 +221,7 @@ def lens_of_part(folder: Path, designed: Lens, mount: Mount) -> Lens:
     path = folder / PART
     if not path.exists():
         raise ValueError(f"{PART}: is not there")
-    reread, up = step_reading.read(path), mount.origin(designed.front_vertex)
+    reread, up = read(path), mount.origin(designed.front_vertex)
     front, back = (face.moved(face.z + up) for face in (reread.front, reread.back))
     return replace(designed, front=front, back=back, clear=reread.clear, losses=None)
 

@@ -22,6 +22,7 @@ from bstcad.verify.verdict import Check
 TEXT = "STEP text"
 DENSITY = f"{TEXT}: stated density"  # of a file by itself: no scene says what it should be
 NET = 1e-11  # mm; rounding of a control point to sixteen digits of text
+ROUNDINGS = 2e-15  # of the largest coordinate; a lens over 5 m from the origin of its file is rounded by more than NET
 AGREE = 1e-6  # of area, volume and the part's size; the sums over a rough back leave some 1e-9
 DIGITS = 1e-12  # mm or g/cm³; more than the text leaves of a number
 
@@ -81,7 +82,8 @@ def _open_edge(text: StepText) -> str:
 def net_check(name: str, read: np.ndarray, designed: np.ndarray) -> Check:
     """The control points (m, n, 3) that a file holds against the designed ones (mm)."""
     off, where = _off_by(read, designed, "control point")
-    return Check.at_most(name, off, NET, unit="mm", where=where)
+    farthest = float(np.abs(designed).max(initial=0.0))
+    return Check.at_most(name, off, max(NET, ROUNDINGS * farthest), unit="mm", where=where)
 
 
 def _off_by(read: np.ndarray, designed: np.ndarray, name: str) -> tuple[float, str]:

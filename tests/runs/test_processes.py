@@ -30,6 +30,14 @@ def test_another_process_always_the_same_does_one_work_after_the_other(fresh, tm
     assert quick.result() and slow.done()
 
 
+def test_a_work_that_takes_too_long_is_ended_and_the_next_one_done(fresh):
+    process = processes.submit("os.getpid").result()
+    with pytest.raises(processes.Overdue, match=r"not ended after 0\.2 s"):
+        processes.result(processes.submit("time.sleep", 600), 0.2)
+    assert processes.command_of(process) == ()
+    assert processes.result(processes.submit("os.getpid"), 60.0) != process
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="tells of memory in another way")
 def test_memory_that_is_freed_goes_back_when_asked_and_the_peak_is_that_of_the_process_itself():
     held = bytearray(400_000_000)  # here: getrusage in a process that is started now counts it, too

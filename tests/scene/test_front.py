@@ -5,12 +5,13 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import cadquery
 import numpy as np
 import pytest
 import torch
 
 import bstcad
-from bstcad.cad import step_writing
+from bstcad.cad import step_reading, step_writing
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
@@ -145,6 +146,44 @@ def test_a_face_of_another_outline_is_refused(outline):
         load(DISK).changed({"lens.front": a_face(outline, z=15.0)})
     round_lens, face = load(DISK, {"lens.outline": "{shape='circle',diameter=16}"}), a_face(Circle(8.0), z=15.0)
     assert round_lens.changed({"lens.front": face}).lens.front.given.shape == face.shape
+
+
+@pytest.mark.parametrize("how", ["lifted", "turned", "face down"])
+def test_the_placement_of_a_step_file_is_applied(earlier, how):
+    """(x, y, z) comes to lie at (-y, x, z) by a quarter turn about z, at (x, -y, -z) by half a turn about x."""
+    place = {
+        "lifted": cadquery.Location(cadquery.Vector(0, 0, 5)),
+        "turned": cadquery.Location(cadquery.Vector(0, 0, 0), cadquery.Vector(0, 0, 1), 90),
+        "face down": cadquery.Location(cadquery.Vector(0, 0, 0), cadquery.Vector(1, 0, 0), 180),
+    }[how]
+    front = load(DISK, given(placed(earlier, place))).lens.front.surface
+    x, y = np.random.default_rng(0).uniform(-8.0, 8.0, (2, 100))
+    sign, at = {"lifted": (1, (x, y)), "turned": (1, (y, -x)), "face down": (-1, (x, -y))}[how]
+    face = a_face()
+    assert np.abs((sag(front, x, y) - 15.0) - sign * (sag(face, *at) - sag(face, 0.0, 0.0))).max() < 1e-11
+
+
+def placed(earlier, place):
+    """The lens of a folder as an assembly of another program has it."""
+    solid = cadquery.Shape.cast(step_reading.solid(earlier / "lens.step"))
+    cadquery.Assembly(name="whole").add(solid, name="lens", loc=place).export(str(earlier / "placed.step"))
+    return earlier / "placed.step"
+
+
+@pytest.mark.parametrize(
+    ("place", "sentence"),
+    [
+        (((1e-6, 0, 0),), "its net lies about x = 1e-06 mm and not about the axis; export the lens centred"),
+        (((0, 3, 0),), "its net lies about y = 3 mm and not about the axis"),
+        (((0, 0, 0), (1, 0, 0), 90), r"cannot be read \(its lens is turned by 90° about x, and a front is a height"),
+        (((0, 0, 0), (0, 0, 1), 30), "its lens is turned by 30° about z, and"),
+    ],
+)
+def test_a_placement_that_is_no_front_is_refused(earlier, place, sentence):
+    vectors = [cadquery.Vector(*each) if isinstance(each, tuple) else each for each in place]
+    with pytest.raises(SceneError, match=rf"^lens\.front\.file: .*{sentence}") as caught:
+        load(DISK, given(placed(earlier, cadquery.Location(*vectors))))
+    assert "\n" not in str(caught.value)
 
 
 def test_a_net_follows_a_bowl_to_the_rim_where_it_reaches_past_it():

@@ -7,6 +7,7 @@ import re
 import shutil
 from dataclasses import replace
 
+import cadquery
 import numpy as np
 import pytest
 import torch
@@ -14,7 +15,7 @@ import torch
 from bstcad import cli
 from bstcad.analysis import shape
 from bstcad.cad import mesh as meshes
-from bstcad.cad import step_writing
+from bstcad.cad import step_reading, step_writing
 from bstcad.folder import read_nominal
 from bstcad.optics import measure
 from bstcad.optics.bspline import BSplineSurface
@@ -176,6 +177,17 @@ def test_a_changed_step_file_fails_by_name(folder, nominal, change):
     proof = checks.verify(folder, nominal)
     assert failing(proof) == expected
     assert proof.passed is False
+
+
+def test_a_lens_out_of_its_place_fails_in_the_folder_of_its_design(folder, nominal):
+    """With the turn and the shift; the rest of its form is held to the design in the lens's own frame."""
+    path, place = folder / "lens.step", cadquery.Location(cadquery.Vector(0, 0, 5), cadquery.Vector(0, 0, 1), 90)
+    solid = cadquery.Shape.cast(step_reading.solid(path))
+    cadquery.Assembly(name="whole").add(solid, name="lens", loc=place).export(str(path))
+    failed = {check.name: check for check in checks.verify(folder, nominal).checks if not check.passed}
+    assert failed.keys() >= {NET, step_checks.PLACED}
+    assert failed[step_checks.PLACED].where == "the lens is turned by 90° about z, then shifted by (0, 0, 5) mm"
+    assert not [name for name in failed if name.startswith(("form: re-read", "form: vertex", "RRMSD"))]
 
 
 def test_a_face_with_ripple_of_ten_nanometres_fails_by_name(small_design, few, tmp_path, capsys, monkeypatch):
@@ -486,4 +498,4 @@ def test_a_limit_counts_as_kept():
 def test_a_step_file_by_itself_can_fail(folder, few, alter, name):
     path = folder / "lens.step"
     path.write_text(alter(path.read_text()))
-    assert name in {check.name for check in checks.examine(path)[0] if not check.passed}
+    assert name in {check.name for check in checks.examine(path).checks if not check.passed}

@@ -158,7 +158,8 @@ def test_a_part_passes_by_itself(design, tmp_path, mount, outline, plane):
     scene = design.scene.changed({"mount": mount})
     said = scene.part.of(scene.lens)
     mounting.write_if_it_fits(lens, scene.mount, tmp_path / "part.step", "part", said)
-    checks, found, whole = step_checks.examine(tmp_path / "part.step")
+    examined = step_checks.examine(tmp_path / "part.step")
+    checks, found, whole = examined.checks, examined.lens, examined.whole
     assert [check for check in checks if not check.passed] == []
     bare = set(mount) <= {"rim"}
     assert ("solid: edges off the wall of the lens" in {check.name for check in checks}) is bare
@@ -176,8 +177,9 @@ def test_a_part_passes_by_itself(design, tmp_path, mount, outline, plane):
 def test_a_script_s_cut_passes_by_itself(design, tmp_path):
     """A triangle off the axis, in the rectangle about the axis that holds it."""
     triangle = cadquery.Wire.makePolygon([(x, y, 0.0) for x, y in ((-1.0, -1.0), (2.5, -1.0), (2.5, 2.0))], close=True)
-    checks, found, whole = step_checks.examine(design.write_part(tmp_path / "part.step", trim=triangle))
-    assert all(check.passed for check in checks)
+    examined = step_checks.examine(design.write_part(tmp_path / "part.step", trim=triangle))
+    found, whole = examined.lens, examined.whole
+    assert all(check.passed for check in examined.checks)
     assert found.outline.half_extent == pytest.approx((2.5, 2.0), abs=1e-7)
     said = part(found, whole)
     assert said["Outline"].startswith("that of the back: x = −1 to 2.5, y = −1 to 2 mm with cut corners")
@@ -187,7 +189,8 @@ def test_a_script_s_cut_passes_by_itself(design, tmp_path):
 def test_the_words_of_a_part_by_itself_are_those_of_the_whole(written):
     """Size and volume of lens and flange, not of the lens."""
     scene, folder, _ = written
-    _, lens, whole = step_checks.examine(folder / "part.step")
+    examined = step_checks.examine(folder / "part.step")
+    lens, whole = examined.lens, examined.whole
     said, solid = part(lens, whole), step_reading.solid(folder / "part.step")
     volume = GProp_GProps()
     BRepGProp.VolumePropertiesGK_s(solid, volume, 1e-4)

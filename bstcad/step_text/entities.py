@@ -1,0 +1,143 @@
+"""The statements of a STEP file's DATA section (ISO 10303-21), cut apart into entities.
+
+What is no token of Part 21, such as NAN or 1.5.2, is refused here with the number of its statement: other readers of
+STEP take it for zero or never end over it.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bstcad.runs.files import one_line
+
+MAX_COORDINATE = 1e12  # of a point; a target may be 1e8 mm away
+MAX_DIGITS = 64  # characters of a number; 17 digits, a sign and an exponent are all that a double holds
+
+NAME = r"[1-9]\d{0,17}"  # an entity's number: one of 64 bits
+REAL = r"[-+]?\d+\.\d*(?:E[-+]?\d+)?"
+COORDINATE = rf"[-+]?\d{{1,{MAX_DIGITS}}}\.\d{{0,{MAX_DIGITS}}}(?:E[-+]?\d{{1,4}})?"
+BLANKS = bytes(code for code in range(256) if chr(code).isspace())
+STRING = re.compile(r"'[^']*(?:''[^']*)*'")
+POINT = re.compile(rf"(?<=;)#({NAME})=CARTESIAN_POINT\('\d*',\(({COORDINATE},{COORDINATE},{COORDINATE})\)\);")
+STATEMENT = re.compile(rf"#({NAME})=([A-Z][A-Z_0-9]*)?(\(.*\))", re.DOTALL)
+TOKENS = re.compile(  # of a text without blanks: separators, references, numbers, strings, enumerations, keywords
+    r"[(),;]++|(?:,?#\d++)++(?=[,)=])=?|'\d*+'|\.[A-Z_0-9]++\.|[$*](?=[,)])|!?[A-Z_][A-Z_0-9]*+(?=\()"
+    r"|[-+]?\d++(?:\.\d*+(?:[Ee][-+]?\d++)?)?(?=[,)])|\"[0-9A-F]*+\""
+)
+LONG = re.compile(rf"(?<=[(,])[-+.\d][-+.\dEe]{{{MAX_DIGITS},}}")
+LARGE = re.compile(r"(?<=[(,])[-+]?\d++\.\d*+[Ee]\+?\d{3,}+")  # 1e100 or more
+
+
+@dataclass(frozen=True)
+class Entities:
+    """The entities of a STEP file, by the digits of their numbers."""
+
+    bodies: Mapping[str, tuple[str, str]]  # (kind, attributes without blanks); a complex entity's kind is COMPLEX
+    strings: Sequence[str]  # 'k' in the attributes is string k, as the file has it
+    point_numbers: np.ndarray  # (n,) ascending: nearly all entities are points in space, and not among the bodies
+    xyz: np.ndarray  # (n, 3), in that order, the file's unit of length
+
+    def of(self, kind: str) -> dict[str, str]:
+        """The attributes of the entities of a kind."""
+        return {number: body for number, (its, body) in self.bodies.items() if its == kind}
+
+    def references(self, number: str) -> list[str]:
+        """The entities that an entity refers to, in order."""
+        return re.findall(r"#(\d+)", self.bodies[number][1])
+
+    def string(self, number: str, place: int) -> str:
+        """The first or second attribute of an entity as a string in one line; "" if it is none."""
+        attributes = re.match(r"\((?:'(\d*)')?(?:,'(\d*)')?", self.bodies[number][1]).groups()
+        return decoded(self.strings[int(attributes[place])]) if attributes[place] else ""
+
+    def points(self, numbers: np.ndarray) -> np.ndarray:
+        """The points of these entities; KeyError names an entity that is no point."""
+        rows = np.searchsorted(self.point_numbers, numbers).clip(max=len(self.xyz) - 1)
+        wrong = numbers[self.point_numbers[rows] != numbers] if len(self.xyz) else numbers.ravel()
+        if len(wrong):
+            raise KeyError(f"#{wrong[0]}")
+        return self.xyz[rows]
+
+
+def without_blanks(text: str) -> tuple[str, list[str]]:
+    """(the text without blanks, the strings): each string in it gives way to its place in the list, '' stays."""
+    strings: list[str] = []
+
+    def numbered(hit: re.Match[str]) -> str:
+        if len(hit[0]) == 2:
+            return "''"
+        strings.append(hit[0][1:-1])
+        return f"'{len(strings) - 1}'"
+
+    data = STRING.sub(numbered, text)
+    return data.encode("latin-1", "replace").translate(None, BLANKS).decode("latin-1"), strings
+
+
+def read_entities(data: str, strings: Sequence[str], numbers: np.ndarray, xyz: np.ndarray) -> Entities:
+    """Read the statements of the DATA section; numbers, xyz: of the points that are taken out of the data."""
+    from bstcad.step_text import points
+
+    start, end = data.find("DATA;"), data.rfind("ENDSEC;")
+    if not 0 <= start < end:
+        raise damaged("it has no DATA section")
+    parts = POINT.split(data[start + len("DATA") : end])  # from its semicolon on
+    rest, names, values = "".join(parts[::3]), parts[1::3], parts[2::3]
+    *texts, tail = rest[1:].split(";")
+    hits = [STATEMENT.fullmatch(each) for each in texts]
+    if tail or not hits or None in hits:
+        raise damaged("a statement is no entity")
+    _check_tokens(rest, hits)
+    numbers = np.concatenate([numbers, np.fromstring(",".join(names), dtype=np.int64, sep=",")])
+    xyz = np.concatenate([xyz, np.fromstring(",".join(values), dtype=np.float64, sep=",").reshape(-1, 3)])
+    known = np.sort(np.concatenate([numbers, np.array([hit[1] for hit in hits], dtype=np.int64)]))
+    if not (np.diff(known) > 0).all():
+        raise damaged("two entities share a number")
+    named = points.references(rest.encode("latin-1"))
+    missing = named[known[np.searchsorted(known, named).clip(max=len(known) - 1)] != named]
+    if len(missing):
+        raise damaged(f"entity #{missing.min()} is missing")
+    if not np.isfinite(xyz).all():
+        raise ValueError("a CARTESIAN_POINT is not finite; write the file again")
+    if np.abs(xyz).max(initial=0.0) > MAX_COORDINATE:
+        raise ValueError(f"a CARTESIAN_POINT is over {MAX_COORDINATE:g} away; write the file again")
+    order = np.argsort(numbers)
+    return Entities({hit[1]: (hit[2] or "COMPLEX", hit[3]) for hit in hits}, strings, numbers[order], xyz[order])
+
+
+def damaged(fault: str) -> ValueError:
+    """Return the error of a file whose text is damaged."""
+    return ValueError(f"the file is damaged ({fault}); write it again")
+
+
+def decoded(string: str) -> str:
+    """A string of Part 21, without its quotes, as it is meant: escapes resolved, in one line."""
+    string = re.sub(r"[\r\n]", "", string).replace("''", "'")
+    string = re.sub(
+        r"\\X2\\((?:[0-9A-F]{4})*)\\X0\\",
+        lambda hit: bytes.fromhex(hit.group(1)).decode("utf-16-be", "replace"),
+        string,
+    )
+    return one_line(re.sub(r"\\X\\([0-9A-F]{2})", lambda hit: chr(int(hit.group(1), 16)), string))
+
+
+def _check_tokens(rest: str, hits: Sequence[re.Match[str]]) -> None:
+    """ValueError, with the statement, if a text holds what is no token of Part 21 or a number that no double holds."""
+    if TOKENS.sub("", rest):
+        number, kind, body = next(hit.groups() for hit in hits if TOKENS.sub("", hit[3]))
+        atoms = (atom for atom in re.split(r"[(),]+", body) if TOKENS.sub("", f"({atom})"))
+        atom = next(atoms, "its text")
+        raise damaged(f"statement #{number} = {kind or 'COMPLEX'} is malformed: {_cut(atom)!r} is no number of STEP")
+    for pattern, fault in ((LONG, f"has over {MAX_DIGITS} characters"), (LARGE, "is not finite")):
+        for found in pattern.finditer(rest):
+            if pattern is LONG or not math.isfinite(float(found[0])):
+                number = rest[: found.start()].rpartition(";")[2].partition("(")[0].replace("=", " = ")
+                raise damaged(f"statement {number} is malformed: the number {_cut(found[0])} {fault}")
+
+
+def _cut(word: str) -> str:
+    return one_line(word if len(word) <= 24 else f"{word[:20]}…")
