@@ -191,8 +191,13 @@ def _facts(face: Face, placed: Alignment, deviates: Deviation, cloud: Cloud) -> 
         "cloud": cloud.path.name,
         "sha256": cloud.sha256,
         "unit": cloud.unit,
+        "columns": cloud.columns,
         "points": len(placed.points),
-        "left_out": {"outside the outline": placed.outside, "off the face": placed.off_face},
+        "left_out": {
+            "without data": cloud.without_data,
+            "outside the outline": placed.outside,
+            "off the face": placed.off_face,
+        },
         "outliers": {
             "points": len(apart),
             "share": placed.outlier_share,

@@ -1,5 +1,8 @@
 """Reading a cloud: any usual text and mesh, and one sentence for each file that is no cloud of the face."""
 
+import struct
+import tracemalloc
+
 import numpy as np
 import pytest
 import trimesh
@@ -23,8 +26,17 @@ def named(found):
 
 WRONG = {
     "two columns": (lines(GOOD[:, :2], ","), "line 1 holds 2 numbers; give x, y and z in mm"),
-    "nan": (lines(GOOD, ",") + "\n1,nan,3", "point 201 is not three finite numbers"),
-    "words": (lines(GOOD, " ") + "\n1 two 3", "line 201 is not three numbers"),
+    "infinite": (lines(GOOD, ",") + "\n1,inf,3", "line 201: y = inf mm is beyond 1000000 mm"),
+    "far": ("x [m],y [m],z [m]\n" + lines(GOOD / 1e3, ",") + "\n1,2,3e3", "line 202: z = 3e+06 mm is beyond 1000000"),
+    "a placeholder": (lines(GOOD, " ") + "\n1 2 -1e10", "leave out what was not measured"),
+    "nothing measured": ("1,2,Bad\n" * 200, "holds 0 points and 200 without data, too few"),
+    "decimal commas": ("x,y,z\n" + lines(GOOD, ",").replace(".", ","), "line 2 holds 6 fields where its heading"),
+    "nominal alone": ("X_nom,Y_nom,Z_nom\n" + lines(GOOD, ","), "its heading, 'X_nom,Y_nom,Z_nom', names nominal"),
+    "both, and others": ("x,y,z,z act\n" + lines(GOOD[:, [0, 1, 2, 2]], ","), "names x, y or z twice"),
+    "pixels": ("Zygo XYZ Data File - Format 2\n#\n0 0 No Data\n0 1 16025.3\n#", "x and y count pixels"),
+    "a zip archive": (b"PK\x03\x04" + bytes(50), "is a zip archive, such as X3P"),
+    "half of UTF-16": ("x,y,z\n".encode("utf-16") + b"1", "is no text in UTF-16"),
+    "words": (lines(GOOD, " ") + "\n1 two 3", "line 201 is not three numbers ('1 two 3')"),
     "a short line": ("x,y,z\n" + lines(GOOD, ",") + "\n1,2\n", "line 202 is not three numbers"),
     "ten points": (lines(GOOD[:10], ","), "holds 10 points, too few"),
     "more columns": (lines(np.hstack([GOOD, GOOD]), ","), "holds 6 columns, and no heading says which are x, y and z"),
@@ -70,13 +82,55 @@ def test_a_wrong_cloud_ends_the_command_with_2_and_changes_nothing(small_design,
         ("a.txt", "# serial 17\n# x [in]  y [in]  z [in]  nx ny nz\n" + lines(np.hstack([GOOD / 25.4, GOOD]), " ")),
         ("a.csv", "made by an instrument\nID,X_mm,Y_mm,Z_mm,normal x,intensity\n" + named(GOOD)),
         ("a.csv", "x nominal,x actual,y actual,z actual\n" + lines(GOOD[:, [1, 0, 1, 2]], ",")),
+        ("a.csv", "X_nom,Y_nom,Z_nom,ActX,YMeas,Z [ist]\n" + lines(np.hstack([0 * GOOD, GOOD]), ",")),
+        ("a.txt", "\n".join(f"PT{k}  {x:.7f} {y:.7f} {z:.7f}" for k, (x, y, z) in enumerate(GOOD))),  # named points
+        ("a.txt", "\n".join(f"{k} {x:.7f} {y:.7f} {z:.7f}" for k, (x, y, z) in enumerate(GOOD, 1))),  # numbered points
+        ("a.csv", "X,Y,Z\n" + "\n".join(",".join(f'"{v:.7f}"'.replace(".", ",") for v in row) for row in GOOD)),
+        ("a.txt", lines(GOOD, "  ").replace(".", ",")),
+        ("a.txt", "X Y Z\n" + "\n".join(" ".join(f"{v:.8E}".replace("E", "D") for v in row) for row in GOOD)),
+        ("a.csv", ("x [\u00b5m];y [mm];z [mm]\n" + lines(GOOD * [1e3, 1, 1], ";").replace(".", ",")).encode("cp1252")),
+        ("a.csv", ("x,y,z\r\n" + lines(GOOD, ",")).encode("utf-16")),
+        ("a.csv", ("x,y,z\n" + lines(GOOD, ",")).encode("utf-16-le")),
+        ("a.csv", ("x,y,z\n" + lines(GOOD, ",")).encode("utf-8-sig")),
+        ("a.csv", "sep=;\nX;Y;Z\n" + lines(GOOD, ";").replace(".", ",")),
+        ("a.csv", lines(GOOD, ",").replace("\n", ",\n")),  # a comma behind each line
+        ("a.txt", "; by a CMM\n# part 17\n% mm\nX;Y;Z\n" + lines(GOOD, ";")),
         ("a.csv", '"x","y","z","note"\n' + "\n".join(f'{x:.7f},{y:.7f},{z:.7f},"a, b"' for x, y, z in GOOD)),
     ],
 )
 def test_text_is_read_with_any_separator_and_heading(tmp_path, name, text):
-    (tmp_path / name).write_text(text)
+    (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
     found = clouds.load(tmp_path / name, ROUND)
     assert found.points == pytest.approx(GOOD, abs=2e-5) and found.unit == "mm"  # half of the last digit, in inches
+    assert found.without_data == 0
+
+
+NO_DATA = ("Bad", "No Data", "NaN", "-nan(ind)", "-1.#IND00", "n/a", "---", "NoData", "null", "")
+
+
+@pytest.mark.parametrize("separator", [" ", "\t", ",", ";"])
+@pytest.mark.parametrize("heading", ["", "x{0}y{0}z\n"])
+def test_lines_without_data_are_counted_and_left_out(tmp_path, separator, heading):
+    """By the words of instruments, and by an empty height where the separator shows it."""
+    words = NO_DATA[: 9 if separator == " " else 10]
+    rows = [f"{x:.6f}{separator}{y:.6f}{separator}{z:.6f}" for x, y, z in GOOD]
+    for k, word in enumerate(words):
+        place = 17 * k + (k > 0)  # the first line, too
+        rows[place] = rows[place].rsplit(separator, 1)[0] + separator + word
+    (tmp_path / "a.txt").write_text(heading.format(separator) + "\n".join(rows) + "\n")
+    found = clouds.load(tmp_path / "a.txt", ROUND)
+    kept = np.delete(GOOD, [17 * k + (k > 0) for k in range(len(words))], axis=0)
+    assert found.without_data == len(words) and found.points == pytest.approx(kept, abs=1e-6)
+
+
+def test_the_actual_columns_are_taken_and_that_is_known(tmp_path):
+    heading = "ID;X nom;Y nom;Z nom;X act;Y act;Z act;Dev"
+    rows = [f"{k};0;0;0;{x};{y};{z};0" for k, (x, y, z) in enumerate(GOOD)]
+    (tmp_path / "a.csv").write_text("\n".join([heading, *rows]))
+    found = clouds.load(tmp_path / "a.csv", ROUND)
+    assert found.columns == "X act, Y act, Z act" and found.points == pytest.approx(GOOD)
+    (tmp_path / "a.csv").write_text("\n".join(["x,y,z", lines(GOOD, ",")]))
+    assert clouds.load(tmp_path / "a.csv", ROUND).columns == ""
 
 
 def test_a_cloud_without_a_unit_as_large_as_the_lens_in_inches_is_in_inches(tmp_path):
@@ -92,5 +146,69 @@ def test_vertices_of_meshes_are_points(tmp_path, ending):
     found = clouds.load(path, ROUND).points
     assert len(found) == len(mesh.vertices) and np.linalg.norm(found, axis=1) == pytest.approx(4.0, abs=1e-6)
     path.write_bytes(path.read_bytes()[:150])
-    with pytest.raises(ValueError, match=rf"is no {ending.upper()} file that can be read|holds .* points|no points"):
+    with pytest.raises(ValueError, match="its header does not end|promises 1280 triangles, and 1.32 follow"):
+        clouds.load(path, ROUND)
+
+
+HEADER = "ply\nformat {} 1.0\ncomment made here\n{}element vertex {}\n{}{}end_header\n"
+XYZ = "property double x\nproperty float quality\nproperty double y\nproperty double z\n"
+FACES = "element face {}\nproperty list uchar int vertex_indices\n"
+
+
+def ply(order, promised=200, faces=2, triangles=2, more=b""):
+    """A PLY file of GOOD, with an element before the points and faces of 3 and 4 corners behind them."""
+    camera = "element camera 1\nproperty float view\nproperty list uchar int ids\n"
+    form = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    head = HEADER.format(form, camera, promised, XYZ, FACES.format(faces)).encode()
+    if not order:
+        rows = ["0.5 2 7 8", *(f"{x:.9g} 1 {y:.9g} {z:.9g}" for x, y, z in GOOD), *["3 0 1 2", "4 0 1 2 3"][:triangles]]
+        return head + "\n".join(rows).encode() + b"\n" + more
+    rows = [struct.pack(f"{order}dfdd", x, 1, y, z) for x, y, z in GOOD]
+    ends = [struct.pack(f"{order}B3i", 3, 0, 1, 2), struct.pack(f"{order}B4i", 4, 0, 1, 2, 3)][:triangles]
+    return head + struct.pack(f"{order}fB2i", 0.5, 2, 7, 8) + b"".join(rows + ends) + more
+
+
+@pytest.mark.parametrize("order", ["", "<", ">"])
+def test_a_ply_file_is_held_to_what_its_header_promises(tmp_path, order):
+    path = tmp_path / "a.ply"
+    path.write_bytes(ply(order))
+    found = clouds.load(path, ROUND)
+    assert found.points == pytest.approx(np.unique(GOOD, axis=0), abs=1e-8)
+    wrong = {
+        "promises 1000000000 points, and": ply(order, 10**9),  # 28 GB
+        "promises 999999999999999999 rows of element 'face', and 2 follow": ply(order, faces=10**18 - 1),
+        "promises 2 rows of element 'face', and 1 follow": ply(order, triangles=1),
+        "follow": ply(order, more=b"1 2 3\n"),
+        "is no PLY file that can be read ('element vertex -5' in its header)": ply(order, -5),
+    }
+    for sentence, data in wrong.items():
+        path.write_bytes(data)
+        tracemalloc.start()
+        with pytest.raises(ValueError, match="a.ply: ") as error:
+            clouds.load(path, ROUND)
+        assert sentence in str(error.value) and tracemalloc.get_traced_memory()[1] < 1e6
+        tracemalloc.stop()
+
+
+def test_points_of_a_ply_file_without_data_or_far_off_are_told_as_in_text(tmp_path):
+    path, rows = tmp_path / "a.ply", [" ".join(map(str, row)) for row in GOOD]
+    head = "ply\nformat ascii 1.0\nelement vertex 202\n" + XYZ.replace("property float quality\n", "") + "end_header\n"
+    path.write_text(head + "\n".join([*rows, "1 2 nan", "nan nan nan"]))
+    found = clouds.load(path, ROUND)
+    assert len(found.points) == 200 and found.without_data == 2
+    path.write_text(head + "\n".join([*rows, "1 2 nan", "1 2 1e9"]))
+    with pytest.raises(ValueError, match=r"point 202: z = 1e\+09 mm is beyond"):
+        clouds.load(path, ROUND)
+    path.write_text(head + "\n".join([*rows, "1 2 nan", "1 2"]))
+    with pytest.raises(ValueError, match="its point 202 is not three numbers"):
+        clouds.load(path, ROUND)
+
+
+def test_a_broken_stl_of_text_is_told_by_its_corners(tmp_path):
+    path = tmp_path / "a.stl"
+    trimesh.creation.icosphere(2, 4.0).export(path, file_type="stl_ascii")
+    found = clouds.load(path, ROUND).points
+    assert len(found) == 162
+    path.write_text(path.read_text().rsplit("vertex", 1)[0])
+    with pytest.raises(ValueError, match="it has 320 triangles, and 959 corners follow"):
         clouds.load(path, ROUND)

@@ -191,13 +191,19 @@ def test_many_parts_of_one_design_are_judged_beside_it(small_design, nominal, tm
     """By the command and in Python; the design's folder stays as it is to the last bit, and the map is the form."""
     folder, place = shutil.copytree(small_design.folder, tmp_path / "design"), tmp_path / "serial-17"
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    given = saved(tmp_path / "cloud.csv", cloud(with_form_error(nominal.lens, 1e-4, 2.0), 5000, 1e-5))
+    given, found = tmp_path / "cloud.csv", cloud(with_form_error(nominal.lens, 1e-4, 2.0), 5000, 1e-5)
+    rows = [f"{k};0;0;0;{x:.7f};{y:.7f};{f'{z:.7f}' if k % 50 else 'Bad'}" for k, (x, y, z) in enumerate(found)]
+    given.write_text("\n".join(["ID;X nom;Y nom;Z nom;X act;Y act;Z act", *rows]).replace(".", ","))
     assert cli.run(["verify", str(folder), "--measured", str(given), "-o", str(place)]) == 0
-    assert f"Files: {place}" in capsys.readouterr().out
+    out, page = capsys.readouterr().out, (place / "report.html").read_text()
+    assert f"Files: {place}" in out and "of its actual columns X act, Y act, Z act; 100 without data left out" in out
+    assert "its actual columns X act, Y act, Z act; left out: 100 without data" in " ".join(page.split())
     report = bstcad.open(folder).verify(measured=given, folder=place, progress=False)
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
     written = json.loads((place / "report.json").read_text())
     assert written["measured"]["deviation_map"] == ["deviation.npz", "deviation.csv"]
+    left_out = written["measured"]["left_out"]
+    assert left_out["without data"] == 100 and sum(left_out.values()) == 5000 - written["measured"]["points"]
     assert "The made part" in (place / "report.html").read_text() and (place / "figures" / "made_part.png").is_file()
     with np.load(place / "deviation.npz") as found:
         x, y, off = (found[name] for name in ("x", "y", "deviation"))
