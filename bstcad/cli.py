@@ -21,16 +21,19 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-import typer.core
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
-
 from bstcad import __version__
-from bstcad.runs import files, processes, progress, signals
-from bstcad.runs.files import SentenceError
-from bstcad.step_text import beginning
+from bstcad.runs import signals
+
+with signals.ending_at_once():  # from the first libraries on, a quarter of a second
+    import typer
+    import typer.core
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from bstcad.runs import files, processes, progress
+    from bstcad.runs.files import SentenceError
+    from bstcad.step_text import beginning
 
 if TYPE_CHECKING:
     from bstcad.report.record import Contents, Examined
@@ -41,6 +44,7 @@ if TYPE_CHECKING:
 STARTED = time.perf_counter()  # heavy libraries load after it: their time is the command's
 INTERRUPTED, BROKEN = 130, 70  # exit codes: Ctrl-C; a fault of bstcad itself
 NOTHING_KEPT = "there was no lens yet, and nothing is kept"
+NOTHING_MORE = "nothing more is written"  # of commands other than generate
 OFTEN, SELDOM = 1.0, 30.0  # seconds between two lines of progress of a sweep: on a terminal, in a file
 SITES = (
     Path(__file__).parent / "site",
@@ -74,7 +78,8 @@ class _Commands(typer.core.TyperGroup):
         try:
             return super().invoke(context)
         except KeyboardInterrupt as error:
-            raise Stopped(f"; {note(error) or NOTHING_KEPT}") from error
+            lost = NOTHING_KEPT if context.invoked_subcommand == "generate" else NOTHING_MORE
+            raise Stopped(f"; {note(error) or lost}") from error
 
     def resolve_command(self, context: Any, arguments: list[str]) -> Any:
         """The command that the first argument names."""
@@ -113,12 +118,12 @@ def _bstcad(context: typer.Context, version: Version = False) -> None:
 
 @contextlib.contextmanager
 def loading() -> Iterator[None]:
-    """Libraries load in the block: signals wait until it ends, and nothing looks for garbage.
+    """Libraries load in the block: signals end this process at once, and nothing looks for garbage.
 
     What is loaded is a million objects that stay.  To walk over them while they come would take half a second, and
     later it is not needed either.
     """
-    with signals.waiting():
+    with signals.ending_at_once():
         gc.disable()
         try:
             yield
@@ -653,7 +658,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
             traceback.print_exc()
             sentence, code = "the fault above is bstcad's, not yours; please report it with the scene file", BROKEN
         return _say("; ".join(filter(None, (sentence, note(error)))), code)
-    return _say(f"stopped; {NOTHING_KEPT}", code) if code == INTERRUPTED else code
+    return _say(f"stopped; {NOTHING_MORE}", code) if code == INTERRUPTED else code
 
 
 def _say(sentence: str, code: int) -> int:

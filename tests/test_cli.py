@@ -1,8 +1,10 @@
 """The command line: exit codes, one sentence for whatever is wrong, and nothing written then."""
 
+import contextlib
 import inspect
 import io
 import re
+import signal
 import subprocess
 import sys
 import types
@@ -14,7 +16,7 @@ from rich.console import Console
 import bstcad
 from bstcad import cli
 from bstcad import folder as folders
-from bstcad.runs import progress
+from bstcad.runs import progress, signals
 
 ROOT = Path(__file__).parent.parent
 THU = str(ROOT / "templates" / "thu.toml")
@@ -44,7 +46,7 @@ class FakeCommands(types.ModuleType):
         if self.error:
             raise self.error
         contents = types.SimpleNamespace(passed=self.passed)
-        return types.SimpleNamespace(stopped="evaluations", contents=contents)
+        return types.SimpleNamespace(stopped="evaluations", contents=contents, notes=())
 
 
 @pytest.fixture
@@ -163,6 +165,13 @@ def test_a_fault_is_one_sentence_and_a_traceback_if_it_is_ours(commands, capsys,
     assert ("Traceback" in err) is (code == 70)
 
 
+def test_an_interrupted_plan_does_not_speak_of_a_lens(capsys, monkeypatch):
+    monkeypatch.setattr(cli, "load_scene", lambda *given: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(signals, "ending_at_once", contextlib.nullcontext)
+    assert cli.run(["plan", THU]) == 130
+    assert capsys.readouterr().err == "bstcad: stopped; nothing more is written\n"
+
+
 def test_an_interrupt_with_a_note_says_what_is_kept(commands, capsys):
     commands.error = KeyboardInterrupt()
     commands.error.add_note("the design so far is kept; the same command with --resume goes on from there")
@@ -244,7 +253,7 @@ def test_progress_is_few_lines_that_show_the_end_or_bars_with_the_merit():
 
 @pytest.mark.parametrize(
     "library",
-    ["loky.process_executor", "torch._C"]
+    ["typer", "loky.process_executor", "torch._C"]
     + [
         pytest.param(library, marks=pytest.mark.bench)
         for library in (
@@ -259,7 +268,7 @@ def test_progress_is_few_lines_that_show_the_end_or_bars_with_the_merit():
         )
     ],
 )
-def test_ctrl_c_is_heard_while_libraries_load_and_by_one_process_only(library, tmp_path):
+def test_ctrl_c_ends_at_once_while_libraries_load_and_is_heard_by_one_process_only(library, tmp_path):
     """As a terminal sends it, to both processes, when this one begins to load a library: some swallow it half-way."""
     code = (
         "import os, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # the suite may be deaf
@@ -275,7 +284,7 @@ def test_ctrl_c_is_heard_while_libraries_load_and_by_one_process_only(library, t
     run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, start_new_session=True, check=False)
     said = run.stdout + run.stderr
     assert run.returncode == cli.INTERRUPTED and "Traceback" not in said
-    assert said.splitlines()[-1] == "bstcad: stopped; there was no lens yet, and nothing is kept"
+    assert said.splitlines()[-1] == "bstcad: stopped at its start; nothing was written"
     assert list(tmp_path.iterdir()) == []
 
 

@@ -29,7 +29,7 @@ from bstcad.scene.scene import Scene
 DESIGN = "design"  # the kind of a run that designs a lens; others are work on a finished design
 LARGEST = 50_000_000  # bytes of progress
 WRITTEN = "written.toml"  # file of a run: the scene as its page had it, comments and all
-GRACE = 60.0  # seconds that runs have to keep their checkpoints when the server ends
+GRACE = 1.0  # seconds that the server waits for runs to keep their checkpoints when it ends; they go on with it alone
 START = 30.0  # seconds that the process of a run has to start
 LOST = "its process was killed, or the memory of this machine was too little for it"
 NONE = State("none")
@@ -116,6 +116,15 @@ class Run:
         if again.state != "running":
             return again
         return replace(again, state="stopped", process=0, sentence=LOST)
+
+    @property
+    def ending(self) -> str:
+        """How it ended, or is about to, after the server asked it to."""
+        state, name = self.state, f"{self.design.name}: the {self.kind}"
+        if state.state == "running":
+            return f"{name} is being stopped, and keeps what it has; bstcad app in this folder goes on with it"
+        kept = f"{state.sentence}; " if state.sentence else ""
+        return f"{name} is {state.state}; {kept}bstcad app in this folder shows it"
 
     def _stated(self) -> State:
         try:
@@ -211,11 +220,16 @@ def _is_within(path: Path, folder: Path) -> bool:
 
 
 def end(runs: list[Run]) -> list[Run]:
-    """End runs before the server ends, each with its checkpoint; those that ran."""
+    """Have runs end before the server ends, each with its checkpoint; those that ran."""
     running = [run for run in runs if run.state.state == "running"]
     for run in running:
         run.signal(signal.SIGTERM)
+    return running
+
+
+def endings(running: list[Run]) -> list[str]:
+    """Wait a moment for runs that were asked to end; a sentence on each, for the terminal."""
     until = time.monotonic() + GRACE
     while any(run.state.state == "running" for run in running) and time.monotonic() < until:
         time.sleep(0.1)
-    return running
+    return [run.ending for run in running]

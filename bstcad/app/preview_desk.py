@@ -29,6 +29,7 @@ from bstcad.sweep.plan import plan
 STAGES = ("preview", "settled", "effects", "predicted")
 MOST = 32  # pages whose last request is kept
 IDLE = 0.7  # seconds after a preview in which another change may come; then work on later answers begins
+ENDING = 0.5  # seconds that the thread has to end
 LEFT = 60.0  # seconds without a word from a page, after which nobody waits for its answers
 
 
@@ -98,14 +99,18 @@ class PreviewDesk:
             if (request := self._requests.pop(page, None)) is not None:
                 request.replaced = True
 
-    def end(self) -> None:
-        """Drop all requests, and end the thread."""
+    def close(self) -> None:
+        """Drop all requests: nobody waits for an answer any more."""
         with self._news:
             self._ended = True
             for request in self._requests.values():
                 request.replaced = True
             self._news.notify_all()
-        self._thread.join(timeout=10.0)
+
+    def end(self) -> None:
+        """Drop all requests, and end the thread; one that compiles a kernel ends with the process."""
+        self.close()
+        self._thread.join(timeout=ENDING)
 
     # ---- the thread ----
 

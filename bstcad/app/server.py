@@ -17,6 +17,7 @@ import traceback
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import jinja2
@@ -56,7 +57,7 @@ STATIC, SITES = (
 )
 SHOWN = {".html": "text/html", ".json": "application/json", ".png": "image/png", ".pdf": "application/pdf"}
 MOST_SOUND = 31  # scenes, besides the latest, whose latest valid text is kept
-SLOWEST = 5.0  # seconds that open requests have when the server ends
+SLOWEST = 1  # seconds that open requests have when the server ends
 CLOUDS = ((b"ply", ".ply"), (b"solid", ".stl"))  # how files of measured points begin
 
 
@@ -110,10 +111,11 @@ class Workbench:
         if site is not None:
             self.app.mount("/docs", _Site(directory=site, html=True))
 
-    def end(self) -> list[Run]:
-        """End the previews and the runs that this server began; the runs that were under way."""
+    def end(self) -> list[str]:
+        """End the previews and the runs that this server began; a sentence on each run that was under way."""
+        running = design_runs.end(self.started)
         self.desk.end()
-        return design_runs.end(self.started)
+        return design_runs.endings(running)
 
     def _refused(self, request: Request, error: Exception) -> Response:
         return self._told_of(request, str(error), 400)
@@ -602,13 +604,26 @@ def bound(port: int) -> Iterator[socket.socket]:
         yield own
 
 
-def uvicorn_server(app: Any) -> uvicorn.Server:
-    """The server of an application, which writes nothing to the terminal."""
+def uvicorn_server(app: Any, ends: Callable[[], None] = lambda: None) -> uvicorn.Server:
+    """The server of an application, which writes nothing to the terminal; ends: called when a signal ends it."""
     config = uvicorn.Config(
         app, log_level="critical", access_log=False, server_header=False, lifespan="off", ws="none",
-        http=HeadersInTime, timeout_graceful_shutdown=int(SLOWEST),
+        http=HeadersInTime, timeout_graceful_shutdown=SLOWEST,
     )  # fmt: skip
-    return uvicorn.Server(config)
+    return _Server(config, ends)
+
+
+class _Server(uvicorn.Server):
+    """A server that wakes the requests that wait, as soon as it is to end."""
+
+    def __init__(self, config: uvicorn.Config, ends: Callable[[], None]) -> None:
+        super().__init__(config)
+        self._ends = ends
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Hear a signal."""
+        self._ends()
+        super().handle_exit(sig, frame)
 
 
 def serve(given: Path | None, port: int, say: Callable[[str], None], show: Callable[[str], Any]) -> None:
@@ -624,7 +639,7 @@ def serve(given: Path | None, port: int, say: Callable[[str], None], show: Calla
         try:
             show(address)
             with contextlib.suppress(KeyboardInterrupt):
-                uvicorn_server(guarded).run(sockets=[own])
+                uvicorn_server(guarded, workbench.desk.close).run(sockets=[own])
         finally:
-            for run in workbench.end():
-                say(f"{run.design.name}: is stopped and kept; bstcad app goes on with it")
+            for sentence in workbench.end():
+                say(sentence)

@@ -7,6 +7,7 @@ so do SIGTERM and SIGHUP: a SIGKILL may follow.  The design so far is kept in ea
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -14,6 +15,8 @@ from collections.abc import Callable, Iterator
 ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))  # no SIGHUP on Windows
 TERMINAL = (signal.SIGINT, *ENDING[1:])  # that a terminal sends to every process of its group
 _heard: list[int] = []  # of ENDING, since `endings` began
+_starting: list[object] = []  # one for each process that is being started
+_late: list[int] = []  # signals that came meanwhile to a block of `ending_at_once`
 
 
 class Ended(BaseException):
@@ -76,26 +79,39 @@ def unheard_by_children() -> Iterator[None]:
     """
     masks = hasattr(signal, "pthread_sigmask")
     held = signal.pthread_sigmask(signal.SIG_BLOCK, TERMINAL) if masks else ()
+    _starting.append(start := object())
     try:
         with _heard_by(signal.SIG_IGN, *TERMINAL):
             yield
     finally:
+        _starting.remove(start)
         if masks:
             signal.pthread_sigmask(signal.SIG_SETMASK, held)
+        if _late:
+            _end_at_once(_late[0])
 
 
 @contextlib.contextmanager
-def waiting() -> Iterator[None]:
-    """Signals wait for the end of the block: some libraries swallow them while they load, and stay half loaded."""
-    pressed: list[int] = []
+def ending_at_once() -> Iterator[None]:
+    """Within the block, in which libraries load, a signal ends this process at once, with a sentence.
+
+    Some libraries swallow the exception of a signal while they load, and stay half loaded; to wait for all of them can
+    take ten seconds on a busy machine.  Nothing has been written yet.
+    """
     numbers = [n for n in (signal.SIGINT, *ENDING) if signal.getsignal(n) not in (signal.SIG_IGN, signal.SIG_DFL)]
-    with _heard_by(lambda number, frame: pressed.append(number), *numbers):
+    with _heard_by(_end_at_once, *numbers):
         yield
-    for number in pressed:
-        if number == signal.SIGINT:
-            raise KeyboardInterrupt
-        _heard.append(number)
-        raise Ended(number)
+
+
+def _end_at_once(number: int, frame: object = None) -> None:
+    if _starting:  # a process that is half started would complain of it
+        _late.append(number)
+        return
+    interrupted = number == signal.SIGINT
+    how = "stopped" if interrupted else f"ended by {Ended(number).name}"
+    with contextlib.suppress(OSError):  # a terminal that is gone
+        os.write(2, f"bstcad: {how} at its start; nothing was written\n".encode())
+    os._exit(128 + number)
 
 
 @contextlib.contextmanager

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import pytest
 
@@ -96,3 +98,15 @@ def test_the_desk_answers_the_newest_request_of_each_page_in_order(monkeypatch):
         assert other.replaced
     finally:
         desk.end()
+
+
+def test_a_desk_that_closes_wakes_who_waits_for_an_answer(monkeypatch):
+    """Ctrl-C would else wait for them, and cut them off."""
+    monkeypatch.setattr(PreviewDesk, "_work", lambda self: None)
+    desk, request = PreviewDesk(), Request("a", 1, None)
+    desk.ask(request)
+    waiting = threading.Thread(target=desk.answer, args=(request, 3, 60.0))
+    waiting.start()
+    desk.close()
+    waiting.join(30.0)
+    assert not waiting.is_alive() and request.replaced
