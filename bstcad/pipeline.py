@@ -33,7 +33,7 @@ from bstcad.tailoring import slope_map, stage1, stage2, two_faces
 from bstcad.tailoring.feasibility import demands, refused
 from bstcad.tailoring.goals import Goal
 from bstcad.tailoring.grazing import cleared
-from bstcad.tailoring.machinability import BOUNDED, UNBOUNDED, front_shaped, held, kept, moved_clear
+from bstcad.tailoring.machinability import BOUNDED, front_shaped, held, kept, moved_clear
 from bstcad.tailoring.reachable import reachable
 from bstcad.tailoring.run import (
     BEST,
@@ -370,8 +370,6 @@ def _stage2(
 
     last = driver.run(steps, whole, saved, lambda: driver.hurry, best=best or first)
     lens = _handed_on(whole, driver, last, (driver.best, first))
-    if task.bounds is not None and not driver.hurry:
-        driver.aside(UNBOUNDED, stage2.rrmsd_without_bounds(task, lens))
     total = task.knobs.stage2_iterations
     driver.progress(name, total, total, driver.stopped)
     if driver.stopped != "interrupt":

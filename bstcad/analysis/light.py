@@ -5,17 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from bstcad.analysis.neglected_effects import difference
+from bstcad.analysis.shape import ripple
 from bstcad.optics import sampling
 from bstcad.optics.channels import Channel, points
 from bstcad.optics.interfaces import cross, intersect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import IMAGE_PLACES, detail_width, images
+from bstcad.optics.measure import IMAGE_PLACES, detail_width, images, tubes_of, tubes_picture
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays, TargetPlane
 from bstcad.optics.sources import Source
@@ -128,6 +131,26 @@ def _patch(hits: Tensor, aperture: Outline) -> Outline | None:
     a, b = aperture.half_extent
     alike = aperture.is_round or not patch.is_round
     return None if alike and half_x >= WHOLE * a and half_y >= WHOLE * b else patch
+
+
+# --- the light that a ripple moves ------------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def rrmsd_of_ripple(channel: Channel, lens: Lens, screen: Screen, face: Literal["front", "back"]) -> float:
+    """Return the RRMSD between the pictures of a lens with and without the ripple of a face; 0 without a ripple.
+
+    channel: of a point of the source.  The ripple fades towards the rim, and so does its light; a small one's RRMSD is
+    proportional to its height.
+    """
+    net = getattr(lens, face)
+    waves = ripple(net)
+    if waves.slope == 0:
+        return 0.0
+    smooth = replace(lens, **{face: replace(net, heights=net.heights - torch.from_numpy(waves.heights))})
+    n = tubes_of(lens, max(screen.shape))
+    before, after = (tubes_picture(each, [channel], screen, n).cpu().numpy() for each in (smooth, lens))
+    return difference(after, before) / waves.fading
 
 
 # --- the light that a mount blocks ------------------------------------------------------------------------------------

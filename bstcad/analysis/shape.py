@@ -23,6 +23,7 @@ from bstcad.optics.sampling import rim
 
 GRID = 1025  # points each way of the grid for thickness, and along a quarter of the rim
 ROUNDING = 1e-13  # of the heights
+RIPPLE = 2.0  # slope energy of a net's highest octave over that of the octave below, at most, of a net without ripple
 AT_BOUND = 0.97  # of a bound: a point beyond counts as at the bound (the penalty of tailoring begins at 0.99)
 FLAT, FLATTEST = 1e-9, 1e9  # 1/mm: less curvature is rounding; mm: the radius reported for it
 RIM_ROUNDING = 1e-9  # of the outline's size: where the net ends at the rim, its last points are on the rim
@@ -53,8 +54,8 @@ def describe(lens: Lens, grid: int = GRID) -> dict[str, float | None]:
 def _of_face(net: BSplineSurface, bends: Survey, places: tuple[np.ndarray, np.ndarray, np.ndarray]) -> dict[str, Any]:
     """The figures of one freeform face; places: x, y and z (mm) of points all over it."""
     concave, convex = (bend.largest if bend.largest < FLATTEST else None for bend in (bends.concave, bends.convex))
-    octaves = slope_octaves(net)
-    below, top = octaves[-2:] / octaves.sum() if octaves.sum() > 0 else (0.0, 0.0)
+    octaves, waves = slope_octaves(net), ripple(net)
+    top = octaves[-1] / octaves.sum() if octaves.sum() > 0 else 0.0
     return {
         "sag_pv": float(np.ptp(places[2])),
         "slope_max_deg": bends.slope.largest,
@@ -62,7 +63,8 @@ def _of_face(net: BSplineSurface, bends: Survey, places: tuple[np.ndarray, np.nd
         "radius_min_convex": convex,
         "departure_best_sphere": departure(*places),
         "slope_energy_top_octave": float(top),
-        "slope_energy_octave_below": float(below),
+        "ripple_height": waves.height,
+        "ripple_slope": waves.slope,
     }
 
 
@@ -112,24 +114,76 @@ def inside(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
     return (x.reshape(-1), y.reshape(-1)) if bool(held.all()) else (x[held], y[held])
 
 
+@dataclass(frozen=True, eq=False)
+class Ripple:
+    """Waves of a face whose control points go up and down in turn."""
+
+    heights: np.ndarray  # (m, n) mm, of the control points; they fade towards the rim of the net
+    height: float  # mm RMS over the face, where they do not fade
+    slope: float  # rad RMS over the face, where they do not fade
+    fading: float  # RMS of the factor by which `heights` fade
+
+
+def ripple(face: BSplineSurface) -> Ripple:
+    """Return what the highest octave of a net holds beyond a smooth net's.
+
+    The octaves are those of the net under a Hann window, sin² from rim to rim: without it the cosine transform takes a
+    smooth net for one with a kink along its rim, whose highest octave may have some hundred µrad.  The part
+    1 - RIPPLE E' / E of the highest octave's slope energy E counts, where E' is that of the octave below.  The mean
+    squares over the face follow from the overlaps of the basis functions of degree 2 and of their slopes.
+    """
+    fading = np.outer(*(np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 2 for count in face.shape))
+    rest = _without_cubic(face)
+    waves = scipy.fft.dctn(rest * fading, norm="ortho")
+    energy, octave = _energy(face, waves), _octave(face)
+    waves[(octave != 0) | (energy == 0)] = 0.0
+    top, below = energy[octave == 0].sum(), energy[octave == 1].sum()
+    share = max(0.0, 1 - RIPPLE * below / top) if top > 0 else 0.0
+    turns = [np.cos(np.pi * np.arange(count) / count) for count in face.shape]
+    (of_x, of_y), (along_x, along_y) = (
+        [(16 + 13 * turn + turn**2) / 30 for turn in turns],
+        [(2 - 2 * turn) / pitch**2 * (2 + turn) / 3 for turn, pitch in zip(turns, face.pitch, strict=True)],
+    )
+    squares = share * waves**2 / (fading**2).sum()
+    slopes = np.outer(along_x, of_y) + np.outer(of_x, along_y)
+    return Ripple(
+        math.sqrt(share) * scipy.fft.idctn(waves, norm="ortho"), math.sqrt((squares * np.outer(of_x, of_y)).sum()),
+        math.sqrt((squares * slopes).sum()), fading=math.sqrt((fading**2).mean()),
+    )  # fmt: skip
+
+
 def slope_octaves(face: BSplineSurface) -> np.ndarray:
-    """Slope energy of the control net by octaves of frequency, coarse to fine (mm², squared steps); ripple is last.
+    """Slope energy of the control net by octaves of frequency, coarse to fine (mm², squared steps).
 
     Σ λ |ĥ|² over the cosine transform ĥ of the net without its best cubic polynomial (a tilt has no even
     continuation), λ the Laplacian; octave k holds the frequencies whose larger index lies in (m / 2^(k+1), m / 2^k],
     m the control points along the longer side and an index along the shorter one counted up to m, too.
     """
-    m = max(face.shape)
+    energy, octave = _energy(face, scipy.fft.dctn(_without_cubic(face), norm="ortho")), _octave(face)
+    return np.array([energy[octave == k].sum() for k in reversed(range(int(np.log2(max(face.shape)))))])
+
+
+def _without_cubic(face: BSplineSurface) -> np.ndarray:
+    """(m, n) heights (mm) of the control points without their best cubic polynomial."""
     u, v = (np.linspace(-1, 1, count) for count in face.shape)
     columns = np.stack([np.outer(u**i, v**j).ravel() for i in range(4) for j in range(4 - i)], axis=1)
     h = face.heights.detach().cpu().double().numpy().ravel()
-    h = h - columns @ least_squares(columns, h)
+    return (h - columns @ least_squares(columns, h)).reshape(face.shape)
+
+
+def _energy(face: BSplineSurface, waves: np.ndarray) -> np.ndarray:
+    """(m, n) slope energy (mm², squared steps) of the cosines of a net, by their amplitudes; 0 where it is rounding."""
     along_x, along_y = (2 - 2 * np.cos(np.pi * np.arange(count) / count) for count in face.shape)
-    energy = (along_x[:, None] + along_y) * scipy.fft.dctn(h.reshape(face.shape), norm="ortho") ** 2
-    energy[energy < (ROUNDING * (abs(face.z) + np.abs(h).max())) ** 2] = 0.0
+    energy = (along_x[:, None] + along_y) * waves**2
+    rounding = ROUNDING * (abs(face.z) + float(face.heights.abs().max()))
+    return np.where(energy < rounding**2, 0.0, energy)
+
+
+def _octave(face: BSplineSurface) -> np.ndarray:
+    """(m, n) number of the octave of each cosine of a net, from the highest octave, 0, down."""
+    m = max(face.shape)
     larger = np.maximum(*(index * (m / count) for index, count in zip(np.indices(face.shape), face.shape, strict=True)))
-    borders = [m / 2**k for k in range(int(np.log2(m)), -1, -1)]
-    return np.array([energy[(larger > a) & (larger <= b)].sum() for a, b in zip(borders, borders[1:], strict=False)])
+    return np.floor(np.log2(m / np.maximum(larger, 0.5))).astype(int)
 
 
 def least_squares(columns: np.ndarray, values: np.ndarray) -> np.ndarray:

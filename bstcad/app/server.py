@@ -40,7 +40,7 @@ from bstcad.app.preview_desk import STAGES, PreviewDesk
 from bstcad.app.preview_desk import Request as Asked
 from bstcad.app.workspace import LARGEST_UPLOAD, Workspace
 from bstcad.report import record
-from bstcad.report.report import VIEWER
+from bstcad.report.report import VIEWER, doubts
 from bstcad.runs import files
 from bstcad.runs.files import SentenceError
 from bstcad.scene import new_scene, scene_file
@@ -202,7 +202,7 @@ class Workbench:
         names = self.workspace.file_names(name) if folder.is_dir() else []
         return self._page(
             "design.html.j2", title=name, name=name, report=known, files=_sorted(names),
-            rrmsd=record.rrmsds(known) if known else "", run=self._news(run),
+            rrmsd=record.rrmsds(known) if known else "", doubts=doubts(known) if known else (), run=self._news(run),
             jobs={kind: self._news(Run(folder, kind)) for kind in ("tolerance", "tradeoff", "measured")},
             has_light="figures/irradiance.png" in names,
         )  # fmt: skip

@@ -81,6 +81,7 @@ class Sheet:
         return tables(
             "data_sheet.txt.j2", lens=self.record, order=self.order, shape=self.shape, target=self.scene.target,
             mount=self.mount, light=defaultdict(lambda: None, self.record["source"]), passed=self.passed,
+            asked=self.scene.limits_light,
             rrmsd=self.rrmsd, light_on_target=self.light_on_target, across=across, walls=wall_words,
             apertures=[_aperture(patch, self.lens.outline) for patch in self.apertures], kinds_of_holes=kinds_of_holes,
             further=list(zip(

@@ -37,7 +37,7 @@ from bstcad.report.units import DIGITS, Rows, number, paragraphs, percent, table
 from bstcad.runs import files
 from bstcad.scene.scene import Scene
 from bstcad.verify.checks import CUT, DEFAULT_RRMSD_LIMIT, Proof
-from bstcad.verify.verdict import Check, verdict
+from bstcad.verify.verdict import NO_LIMIT, Check, verdict
 
 if TYPE_CHECKING:
     from bstcad.optics.sources import Collimated
@@ -150,7 +150,8 @@ class Contents:
 
     name: str  # of the design and of its folder
     title: str  # of the scene
-    verdict: Literal["passed", "passed with remarks", "failed"]  # see passed and given_up
+    # see passed and given_up; "no limit was asked": every check passed, and the scene sets no limit on the light
+    verdict: Literal["passed", "passed with remarks", "no limit was asked", "failed"]
     passed: bool  # every check
     rrmsd: Rrmsd  # of the irradiance against the target, by the flux into each pixel
     rrmsd_tent: Rrmsd | None  # by linear binning
@@ -200,9 +201,9 @@ class Contents:
     # what limits the design, the most limiting first: {by, rrmsd (times what it is, after one step of it), figures,
     # because}, as analysis.cost.Limit has them
     limits: tuple[Mapping[str, Any], ...] = ()
-    # the bounds on the tailored faces: asked {key of [lens]: value}, at (part of them that is at each), both or front
-    # (true where not the back alone is tailored), rrmsd and rrmsd_freed
-    # (of the design, and of the same tailored on without them, by the same tubes); None: none is asked
+    # the bounds on the tailored faces: asked {key of [lens]: value}, at {key: part of the faces that is at the bound;
+    # None: of a thickness that is}, tightest {key: place, in words}, both or front (true where not the back alone is
+    # tailored); None: none is asked
     bounds: Mapping[str, Any] | None = None
     judges: tuple[Judge, ...] = ()  # by --against
     # a made part by its cloud, as measured.made_part has it: points, alignment, pv, rms, rrmsd_predicted, passed …
@@ -270,7 +271,7 @@ def contents_of(
         **diagnosis,
         name=scene.name,
         title=scene.title,
-        verdict=verdict(proof.passed, ()),
+        verdict=verdict(proof.passed, (), scene.limits_light),
         passed=proof.passed,
         rrmsd=light.rrmsd,
         rrmsd_tent=light.tent,
@@ -330,7 +331,8 @@ def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:
 def _remarked(contents: Contents, *more: str) -> Contents:
     """The contents with more remarks, and the verdict that follows."""
     given_up = (*contents.given_up, *more)
-    return replace(contents, given_up=given_up, verdict=verdict(contents.passed, given_up))
+    asked = contents.verdict != NO_LIMIT
+    return replace(contents, given_up=given_up, verdict=verdict(contents.passed, given_up, asked))
 
 
 def _finest_detail(scene: Scene, proof: Proof, estimates: tuple[LeftOut, ...]) -> FinestDetail | None:
@@ -390,7 +392,7 @@ def too_steep(found: Steepness) -> list[str]:
 
 
 def bounds(found: Mapping[str, Any] | None) -> str:
-    """The bounds on faces ([lens] tool_radius, max_slope, thicknesses) and their price; nothing if none is asked."""
+    """The bounds on faces ([lens] tool_radius, max_slope, thicknesses), and which are met where."""
     return "".join(paragraphs("remarks.txt.j2", "bounds", found=found))
 
 

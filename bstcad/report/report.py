@@ -19,7 +19,8 @@ from bstcad.report.prescription import WAYS, order_rows
 from bstcad.report.record import LEFT_OUT, Contents, Examined, LeftOut, bounds, changes
 from bstcad.report.units import Rows, about, bound, environment, number, paragraphs, percent, quantity, tables
 from bstcad.runs import files
-from bstcad.verify.verdict import Check
+from bstcad.verify.checks import UNASKED
+from bstcad.verify.verdict import NO_LIMIT, Check
 
 if TYPE_CHECKING:
     from rich.console import Group, RenderableType
@@ -35,6 +36,7 @@ VIEWER = Path(__file__).with_name("solid_view.js")
 BADGES = {  # report["verdict"]: (sign, style of the page, of the terminal)
     "passed": ("✓", "pass", "bold green"),
     "passed with remarks": ("✓", "remarks", "bold yellow"),
+    NO_LIMIT: ("?", "plain", "bold cyan"),
     "failed": ("✗", "fail", "bold red"),
 }
 OF_GLASS = ("lost through the sides", "total internal reflection")  # lines of the ledger that a mirror cannot have
@@ -70,11 +72,13 @@ def explanation(report: Contents | Examined) -> str:
     """The verdict in sentences: how many checks passed or failed, and doubts on the RRMSD."""
     count, failed = len(report.checks), sum(not check.passed for check in report.checks)
     text = f"{failed} of {count} checks failed." if failed else f"All {count} checks passed."
+    if report.verdict == NO_LIMIT:
+        text = f"All {count} checks passed; none of them is a limit that the scene sets on the light."
     return " ".join((text, *doubts(report)))
 
 
 def doubts(report: Contents | Examined) -> list[str]:
-    """Sentences on the RRMSD: that the scene asks for none, that it is not resolved."""
+    """Sentences on the RRMSD: that the scene sets no limit on it or on the light, that it is not resolved."""
     if isinstance(report, Examined):
         return []
     most = next((check.limit for check in report.checks if check.name.startswith("RRMSD")), None)
@@ -184,9 +188,12 @@ def encoded(pictures: Mapping[str, bytes | None]) -> dict[str, str]:
 def junit(report: Contents) -> bytes:
     """The checks of a design as a suite, each a test case; a check that is stated, not judged, passes.
 
-    The time of the suite is that of the verification; remarks stand in its output.
+    The time of the suite is that of the verification; remarks stand in its output.  Where no limit was asked, the
+    checks that keep a default limit are skipped: neither passed nor failed.
     """
-    return NO_XML.sub("�", environment().get_template("junit.xml.j2").render(report=report)).encode()
+    unjudged = [check for check in report.checks if report.verdict == NO_LIMIT and check.name.endswith(UNASKED)]
+    text = environment().get_template("junit.xml.j2").render(report=report, unjudged=unjudged)
+    return NO_XML.sub("�", text).encode()
 
 
 # --- terminal ---------------------------------------------------------------------------------------------------------
@@ -201,7 +208,7 @@ def summary(report: Contents | Examined, verbose: bool = False) -> Group:
     from rich.text import Text
 
     lines = [Text.assemble((report.verdict.upper(), BADGES[report.verdict][2]), f": {report.title or report.name}")]
-    remarks = (*report.given_up, *doubts(report))
+    remarks = (*doubts(report), *report.given_up) if report.verdict == NO_LIMIT else (*report.given_up, *doubts(report))
     lines += [Text.assemble(f"Remark: {sentence}", named(sentence)) for sentence in remarks]
     figures = first_figures(report)
     wide = max((len(name) for name, _, _ in figures), default=0)

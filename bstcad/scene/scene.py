@@ -305,6 +305,13 @@ class Scene(Record):
         return effects.ghost(self.effects)
 
     @property
+    def limits_light(self) -> bool:
+        """Does the scene set a limit on the light, by [accept] or by tailoring.accuracy?"""
+        accept = self.accept
+        limits = accept.rrmsd, accept.efficiency, accept.light_on_target, accept.leak, accept.wavefront
+        return any(limit is not None for limit in (*limits, self.tailoring.accuracy))
+
+    @property
     def mesh_tolerance(self) -> float:
         """Of STL and 3MF (mm): as asked for, else 1 µm, and more in proportion for a lens wider than 100 mm."""
         if self.output.mesh_tolerance is not None:

@@ -34,7 +34,7 @@ from bstcad.sweep import cold_run
 from bstcad.sweep.cold_run import LocalPool, Stored, unpacked
 from bstcad.sweep.net_choice import with_net
 from bstcad.sweep.plan import fitted, memory_gb
-from bstcad.verify.verdict import VERDICTS, Check
+from bstcad.verify.verdict import NO_LIMIT, VERDICTS, Check
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -44,7 +44,7 @@ COLUMNS = (
     "scene", "name", "status", "rrmsd", "rrmsd_noise", "leak", "light_on_target", "checks_failed", "seconds", "report",
     "where", "reason",
 )  # fmt: skip
-STYLES = {"passed": "green", "passed with remarks": "yellow"}  # of the terminal; all others are red
+STYLES = {"passed": "green", "passed with remarks": "yellow", NO_LIMIT: "cyan"}  # of the terminal; others are red
 KILLED = -9  # exit code of a process that somebody, or the system for want of memory, has killed
 CORES = 2  # that a design keeps busy
 

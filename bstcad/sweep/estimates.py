@@ -28,11 +28,12 @@ from bstcad.scene.blank import LARGEST_NET
 from bstcad.scene.effects import Absorption, Effect, Fresnel, losses, named, reflection_of
 from bstcad.scene.scene import Scene
 from bstcad.scene.schema import toml
-from bstcad.tailoring.machinability import BOUNDED, UNBOUNDED, moved_clear
+from bstcad.tailoring.machinability import moved_clear
 from bstcad.tailoring.slope_fit import Fit
 from bstcad.tailoring.slope_map import face_grid, lit_window, slope_map, sloped
 from bstcad.tailoring.stage2 import FEW
 from bstcad.tailoring.stage2 import SIZES as SHARES
+from bstcad.verify.checks import AtBound
 
 # --- a coarse lens ----------------------------------------------------------------------------------------------------
 
@@ -187,13 +188,13 @@ NOTHING = 0.05  # of the RRMSD: these estimates do not tell less from none
 
 def diagnosis(
     scene: Scene, making: Making, lens: Lens, *, picture: np.ndarray, target: np.ndarray, rrmsd: float,
-    efficiency: float, blurred: float = 0.0, at_bounds: Mapping[str, float] | None = None,
+    efficiency: float, blurred: float = 0.0, at_bounds: Mapping[str, AtBound] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Of a design the entries convergence, remaining_error, limits and bounds of report.json (record.Contents).
 
     lens: as re-read, which throws this picture (rows, columns), of the target's sum and this RRMSD.
     blurred: RRMSD of the target blurred by the source's size; 0 for a point.
-    at_bounds: share of the back that is at each bound.
+    at_bounds: where the tailored faces are at a bound, by key.
     """
     net, screen = scene.lens.back.net, scene.target.screen
     knobs, finer = scene.tailoring.resolved(net), scaled(net, 2)
@@ -223,10 +224,10 @@ def diagnosis(
         found = tuple(limit for limit in found if limit.by != "control points")
     if knobs.method == "integration":  # its map limits it, and no knob does
         found = ()
-    judged = {stage.name: stage.rrmsd for stage in making.stages}
+    met = {key: at for key, at in (at_bounds or {}).items() if key in scene.lens.bounded_by}
     bounds = {
-        "asked": {key: getattr(scene.lens, key) for key in scene.lens.bounded_by}, "at": dict(at_bounds or {}),
-        "rrmsd": judged.get(BOUNDED), "rrmsd_freed": judged.get(UNBOUNDED),
+        "asked": {key: getattr(scene.lens, key) for key in scene.lens.bounded_by},
+        "at": {key: at.share for key, at in met.items()}, "tightest": {key: at.tightest for key, at in met.items()},
         **({"front" if scene.lens.shaped == (0,) else "both": True} if lens.shapes_front else {}),  # that they are on
     }  # fmt: skip
     return {

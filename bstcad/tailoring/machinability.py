@@ -42,7 +42,7 @@ from bstcad.tailoring.minimise import lbfgs, minimise
 
 PLACES = 513  # points each way at which the thickness is looked at
 RELIEF_SPARE = 0.02  # of the relief of the back, which stage 2 may still take
-BOUNDED, UNBOUNDED = "bounds on the back", "the same without bounds"  # names of parts of a design
+BOUNDED = "bounds on the back"  # name of a part of a design
 SPARE = 1e-3  # of a bound, kept for the digits of a file and for places in between
 # Of the mean squared excess, relative to the bound, beside RRMSD²: in a stage's last round, the one before and so on,
 # and in its only one.  (A heavy one from the start holds the search to where it began: the small lens of the tests,

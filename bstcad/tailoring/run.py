@@ -357,12 +357,6 @@ class Driver:
         record = self.record
         self._record = replace(record, history=(*record.history, (record.seconds, value)))
 
-    def aside(self, name: str, value: float) -> None:
-        """Record a part that judged another lens: its value stays out of the history."""
-        history = self._record.history
-        self.end(name, value)
-        self._record = replace(self._record, history=history)
-
     def end(self, name: str, value: float | None = None) -> None:
         """End a part of the design; its time runs from the end of the part before."""
         record = self.record

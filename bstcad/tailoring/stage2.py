@@ -56,7 +56,6 @@ COARSE, MORE = ((32, 256, 60), (64, 384, 60)), 1.5
 # of a plate bound to 2 mm: RRMSD 0.264 by 1.5 times, 0.236 by 3, but 0.408 if 60 evaluations on 64 pixels come last.)
 MORE_ALONE = 3.0
 LARGE, FAR_OFF = 16, 0.04
-UNBOUNDED_SHARE, FEWEST = 1 / 8, 8  # of the evaluations, and the least number, without the bounds on the back
 SEEN, BY = 16, 8  # places a side of the lens, and points of a source, by which the width of its image is measured
 FEW = 30  # evaluations: fewer make one round, since each has its own start to pay for
 NET = 65  # control points along the longer side, at most: the comparison shall cost a fraction of a second
@@ -231,16 +230,6 @@ def run_rounds(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = N
         yield Step(lambda lens=lens: lens, judged=judged, whole=whole, part=part, ends=True, reason=reason)
         if reason:
             return
-
-
-def rrmsd_without_bounds(task: Task, lens: Lens) -> float:
-    """RRMSD of the lens after a few evaluations more without the bounds on its back."""
-    knobs = task.knobs.model_copy(update={"accuracy": None})
-    free = replace(task, bounds=None, knobs=knobs)
-    evaluations = max(FEWEST, round(UNBOUNDED_SHARE * knobs.stage2_iterations))
-    whole = stage3_rounds(free)[-1] if task.grown else Round(free, knobs.rays, evaluations)
-    *_, last = run_rounds((replace(whole, evaluations=evaluations),), lens)
-    return task.whole.rrmsd(last.lens)
 
 
 def _pull(task: Task, lens: Lens) -> float:

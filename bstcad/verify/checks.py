@@ -12,12 +12,12 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from bstcad.analysis.light import Blur, blur, margins, mount_losses
-from bstcad.analysis.shape import describe, survey, survey_front
+from bstcad.analysis.light import Blur, blur, margins, mount_losses, rrmsd_of_ripple
+from bstcad.analysis.shape import AT_BOUND, describe, survey, survey_front
 from bstcad.cad import mesh as meshes
 from bstcad.optics import quadrature
 from bstcad.optics.channels import Channel
@@ -52,7 +52,9 @@ if TYPE_CHECKING:
 
 VERTEX_ROUNDING = 2e-7  # of the largest coordinate: a vertex in float32 on a slope, off its face
 VERIFY_SEED = 1_000_003  # added to the seed: rays that tailoring never saw
-RIPPLE = 2.0  # of the slope energy of the net's highest octave over that of the octave below
+RIPPLE_SLOPE = 5e-5  # rad RMS; turning leaves slope errors of 50 to 100 µrad on a freeform face
+RIPPLE_LIGHT = 1 / 3  # of the RRMSD that is allowed: what a ripple may make by itself, a ninth of the squared error
+OF_RIPPLE = "ripple_rrmsd"  # key of a face's figures
 OCTAVES = 17  # control points a side of a net from which on its octaves are judged
 TARGET_DIFFERENCE = 1e-3  # of the brightest pixel: versions of the libraries that read pictures and draw letters differ
 DEFAULT_RRMSD_LIMIT = 0.25  # RRMSD above which a design fails where accept.rrmsd asks for none
@@ -136,6 +138,14 @@ class Nominal:
 
 
 @dataclass(frozen=True)
+class AtBound:
+    """How near the tailored faces come to a bound of the scene."""
+
+    share: float | None  # of their area within 3 % of the bound; None: of a thickness that is
+    tightest: str  # place nearest to the bound, "at (1, 2) mm"; of a thickness none
+
+
+@dataclass(frozen=True)
 class Proof:
     """The outcome of the proof of a design's files."""
 
@@ -146,7 +156,7 @@ class Proof:
     stability: dict[str, float | int | None]
     blur: Blur | None = None  # by the source's size; None: it is a point, or a beam of parallel light
     lines: tuple[Line, ...] = ()  # of a spectrum, each by itself
-    at_bounds: dict[str, float] | None = None  # share of the faces that is at each bound, by key; None: no bounds
+    at_bounds: dict[str, AtBound] | None = None  # by key; None: no bounds
     further: tuple[Light, ...] = ()  # on the targets behind the first
     # of the light, against the one asked for; None: none was, or no light comes to where it is stated
     wavefront: WavefrontError | None = None
@@ -207,7 +217,9 @@ def verify(
     lights = (light, *(other for other, _ in others))
     wavefront, of_wavefront = _of_wavefront(as_made, nominal)
     cut = as_cut(lens, mount)
-    shape = describe(cut, effort.places) | {"volume": whole.volume}
+    shape = describe(cut, effort.places) | {"volume": whole.volume} | _ripples_in_light(as_made, nominal)
+    allowed = DEFAULT_RRMSD_LIMIT if nominal.accept.rrmsd is None else nominal.accept.rrmsd
+    most_ripple = RIPPLE_LIGHT * allowed
     stability = _stability(as_made, nominal, lights, shape)
     machined, at_bounds = of_bounds(cut, nominal.blank, shape)
     meets = "meets the mirror" if lens.reflects else "enters the lens"
@@ -221,8 +233,8 @@ def verify(
         *(_result(of_part, folder / "part.step", lambda: submit(*part_job)) if of_part else ()),
         *of_aperture,
         *machined,
-        _ripple(shape, max(lens.back.shape)),
-        *([_ripple(shape, max(lens.front.shape), "front")] if lens.shapes_front else []),
+        _ripple(shape, max(lens.back.shape), most=most_ripple),
+        *([_ripple(shape, max(lens.front.shape), "front", most=most_ripple)] if lens.shapes_front else []),
         sealed,
         *_facets(mesh, lens, shape["volume"], nominal),
         *(_picture(goal) for goal, _, _ in goals),
@@ -342,31 +354,50 @@ def time_limit(path: Path) -> float:
     return LIMIT + (LIMIT_PER_MB * path.stat().st_size / 1e6 if path.is_file() else 0.0)
 
 
-def _ripple(shape: dict[str, float | None], m: int, face: str = "back") -> Check:
-    """The spectrum of the net has to fall off: control points that go up and down in turn are no lens surface.
+def _ripple(
+    shape: Mapping[str, float | None], m: int, face: Literal["front", "back"] = "back",
+    most: float = RIPPLE_LIGHT * DEFAULT_RRMSD_LIMIT,
+) -> Check:  # fmt: skip
+    """Check that control points do not go up and down in turn by more than a tool or the light feels.
 
-    A crease (slope ∝ 1 / k) gives 0.7 to 1, white noise of the slopes 4, of the heights 16.
+    m: control points along the longer side.  most: RRMSD that the ripple of a face may make by itself; where shape
+    does not state what it makes, the tool decides.
     """
-    front = face == "front"
-    keys = (f"{'front_' * front}slope_energy_{octave}" for octave in ("top_octave", "octave_below"))
-    top, below = (shape[key] for key in keys)
-    ratio = top / below if below > 0 else 0.0
-    limit = RIPPLE if m >= OCTAVES else None  # a coarse net has too few octaves to say
-    name = f"ripple{' of the front' if front else ''}: slope energy of the net's highest octave over the one below"
-    return Check.at_most(name, ratio, limit)
+    front = "front_" if face == "front" else ""
+    slope, height = shape[f"{front}ripple_slope"], shape[f"{front}ripple_height"]
+    made = shape.get(f"{front}{OF_RIPPLE}")
+    limit = RIPPLE_SLOPE if m >= OCTAVES else None  # a coarse net has too few octaves to say
+    if limit is not None and made:
+        limit = min(limit, slope * most / made)
+    name = f"ripple{' of the front' if front else ''}: RMS slope of control points that go up and down in turn"
+    where = f"{1e6 * height:.3g} nm RMS high"
+    if made is not None:
+        where += f"; by itself it makes an RRMSD of {made:.2g}, and {most:.2g} may be"
+    return Check.at_most(name, slope, limit, unit="rad", where=where)
+
+
+def _ripples_in_light(lens: Lens, nominal: Nominal) -> dict[str, float]:
+    """RRMSD that the ripple of each tailored face makes by itself, by keys of Proof.shape."""
+    light = nominal.heaviest
+    channel = replace(light, source=light.source.central, weight=1.0)
+    faces = ("back", "front") if lens.shapes_front else ("back",)
+    return {
+        f"{'front_' if face == 'front' else ''}{OF_RIPPLE}": rrmsd_of_ripple(channel, lens, nominal.screen, face)
+        for face in faces
+    }
 
 
 def of_bounds(
     lens: Lens, asked: LensBlank | None, shape: Mapping[str, float | None]
-) -> tuple[list[Check], dict[str, float]]:
-    """Checks of the bounds that a scene puts on its tailored faces, and the share of these at each bound on bending.
+) -> tuple[list[Check], dict[str, AtBound]]:
+    """Checks of the bounds that a scene puts on its tailored faces, and which of the bounds these meet, by key.
 
     The bounds are tool_radius, max_slope and the thicknesses of [lens]; shape: of the re-read lens.  A front that is
     tailored is held to them as the back is, seen from outside: a tool has to fit into its valleys.
     """
     if asked is None:
         return [], {}
-    checks, shares = [], {}
+    checks, found = [], {}
     radius, degrees, kind = asked.tool_radius, asked.max_slope, "convex" if asked.mould else "concave"
     if radius is not None or degrees is not None:
         surveys = [(survey, "")] * (lens.shaped != (0,)) + [(survey_front, " of the front")] * lens.shapes_front
@@ -377,20 +408,26 @@ def of_bounds(
                 checks.append(
                     Check.at_least(f"smallest {kind} radius{of}{GRID}", met.largest, radius, unit="mm", where=met.where)
                 )
-                shares.setdefault("tool_radius", []).append(met.at_bound)
+                found.setdefault("tool_radius", []).append((met.largest, met, of))
             if degrees is not None:
                 met = bending.slope
                 name = f"steepest slope{of}{GRID}"
                 checks.append(Check.at_most(name, met.largest, degrees, unit="deg", where=met.where))
-                shares.setdefault("max_slope", []).append(met.at_bound)
-    at_bounds = {key: math.fsum(each) / len(each) for key, each in shares.items()}
-    for name, judge, key, limit in (
-        ("smallest thickness", Check.at_least, "thickness_min", asked.min_thickness),
-        ("largest thickness", Check.at_most, "thickness_max", asked.max_thickness),
-        ("smallest thickness of the edge", Check.at_least, "edge_thickness_min", asked.edge_thickness),
+                found.setdefault("max_slope", []).append((-met.largest, met, of))
+    at_bounds = {}
+    for key, faces in found.items():
+        _, met, of = min(faces, key=lambda face: face[0])
+        share = math.fsum(face.at_bound for _, face, _ in faces) / len(faces)
+        at_bounds[key] = AtBound(share, f"{met.where}{of}")
+    for name, judge, figure, key in (
+        ("smallest thickness", Check.at_least, "thickness_min", "min_thickness"),
+        ("largest thickness", Check.at_most, "thickness_max", "max_thickness"),
+        ("smallest thickness of the edge", Check.at_least, "edge_thickness_min", "edge_thickness"),
     ):
-        if limit is not None:
-            checks.append(judge(name, shape[key], limit, "mm"))
+        if (limit := getattr(asked, key)) is not None:
+            checks.append(judge(name, shape[figure], limit, "mm"))
+            if min(shape[figure], limit) >= AT_BOUND * max(shape[figure], limit):
+                at_bounds[key] = AtBound(None, "")
     return checks, at_bounds
 
 

@@ -6,7 +6,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-VERDICTS = ("passed", "passed with remarks", "failed")
+NO_LIMIT = "no limit was asked"
+VERDICTS = ("passed", "passed with remarks", NO_LIMIT, "failed")
 
 
 @dataclass(frozen=True)
@@ -45,9 +46,15 @@ class Check:
         return cls(name, bool(value), True, unit="", passed=bool(value), where="" if value else where)
 
 
-def verdict(passed: bool, given_up: Sequence[str]) -> str:
-    """One of VERDICTS; given_up: the wishes of the scene that were given up, which are the remarks."""
-    clean, remarked, failed = VERDICTS
+def verdict(passed: bool, given_up: Sequence[str], asked: bool = True) -> str:
+    """Return one of VERDICTS; given_up: the wishes of the scene that were given up, which are the remarks.
+
+    asked: does the scene set any limit on the light?  Without one only a failed check says that a lens is not good;
+    nothing says that it is.
+    """
+    clean, remarked, no_limit, failed = VERDICTS
     if not passed:
         return failed
+    if not asked:
+        return no_limit
     return remarked if given_up else clean

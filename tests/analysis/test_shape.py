@@ -11,7 +11,7 @@ import pytest
 import torch
 from scipy.interpolate import BSpline
 
-from bstcad.analysis.shape import describe, slope_octaves, survey, thickness_range
+from bstcad.analysis.shape import describe, ripple, slope_octaves, survey, thickness_range
 from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
@@ -107,11 +107,11 @@ def test_tilt_is_no_departure():
 
 def test_departure_is_the_rest_beside_the_best_sphere():
     """A ripple of known height on a known sphere, too fine for a sphere to follow; on a slope along the normal."""
-    ripple = 1e-3  # mm, PV 2e-3
-    shape = describe(lens_of(lambda x, y: cap(80.0)(x, y) + ripple * np.cos(2 * x) * np.cos(2 * y)))
-    assert shape["departure_best_sphere"] == pytest.approx(2 * ripple, rel=0.05)
-    steep = describe(lens_of(lambda x, y: 0.7 * x - 0.7 * y + ripple * np.cos(2 * x) * np.cos(2 * y)))
-    assert steep["departure_best_sphere"] == pytest.approx(2 * ripple / np.sqrt(1 + 0.7**2 + 0.7**2), rel=0.05)
+    height = 1e-3  # mm, PV 2e-3
+    shape = describe(lens_of(lambda x, y: cap(80.0)(x, y) + height * np.cos(2 * x) * np.cos(2 * y)))
+    assert shape["departure_best_sphere"] == pytest.approx(2 * height, rel=0.05)
+    steep = describe(lens_of(lambda x, y: 0.7 * x - 0.7 * y + height * np.cos(2 * x) * np.cos(2 * y)))
+    assert steep["departure_best_sphere"] == pytest.approx(2 * height / np.sqrt(1 + 0.7**2 + 0.7**2), rel=0.05)
 
 
 def test_the_slope_energy_of_a_mode_lies_in_its_octave():
@@ -124,6 +124,20 @@ def test_the_slope_energy_of_a_mode_lies_in_its_octave():
     x = torch.linspace(-1, 1, M, dtype=torch.float64)
     tilted = BSplineSurface(20.0, 0.3 * x[:, None] - x, (-10.0, 10.0), (-10.0, 10.0))
     assert slope_octaves(tilted).sum() < 1e-24
+
+
+@pytest.mark.parametrize("k", [(50, 20), (40, 45), (10, 40)])
+def test_height_and_slope_of_a_ripple_are_those_of_the_face(k):
+    """Of one cosine in the highest octave, by points all over the face; a kink along the rim of the net is none."""
+    heights = np.outer(*(np.cos(i * np.pi * (np.arange(M) + 0.5) / M) for i in k))
+    face = BSplineSurface(20.0, torch.from_numpy(1e-3 * heights), (-10.0, 10.0), (-7.0, 7.0))
+    at = np.random.default_rng(0).uniform(-0.95, 0.95, (2, 40_000))
+    z, z_x, z_y = (v.numpy() for v in face.sag_and_slope(*torch.from_numpy(at * [[10.0], [7.0]])))
+    found = ripple(face)
+    assert found.height == pytest.approx(float(np.sqrt(((z - 20.0) ** 2).mean())), rel=0.03)
+    assert found.slope == pytest.approx(float(np.sqrt((z_x**2 + z_y**2).mean())), rel=0.03)
+    dome = lens_of(lambda x, y: np.cos(x / 6) * np.cos(y / 6)).back
+    assert ripple(dome).slope == 0.0
 
 
 class TestSurvey:

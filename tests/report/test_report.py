@@ -174,6 +174,23 @@ class TestHtml:
         assert "✓ PASSED WITH REMARKS" in page and page.index("The lens is thick.") < page.index("<h2>Irradiance")
         assert printed(remarked).startswith("PASSED WITH REMARKS: Letters\nRemark: The lens is thick.\n")
 
+    def test_where_no_limit_was_asked_neither_a_pass_nor_a_fail_is_said(self, tmp_path):
+        checks = copy.deepcopy(REPORT["checks"])
+        checks[0] |= {"name": "RRMSD (by default: none was asked)", "value": 0.25, "limit": 0.25}
+        report = REPORT | {"verdict": "no limit was asked", "rrmsd": 0.25, "light_on_target": 0.51, "checks": checks}
+        report |= {"rrmsd_asked": None, "given_up": ["The lens is thick."]}
+        first, second, *_ = printed(report).splitlines()
+        assert first == "NO LIMIT WAS ASKED: Letters"
+        assert second.startswith("Remark: No limit on the light was asked: the RRMSD is 0.25, with 51.0 % of the")
+        page = page_of(tmp_path, report)
+        assert '<div class="verdict plain"><strong>? NO LIMIT WAS ASKED' in page and "All 3 checks passed;" in page
+        assert "PASSED" not in page and "any up to" not in page
+        suite = etree.fromstring(reports.junit(contents(report)))[0]
+        assert (suite.get("failures"), suite.get("skipped")) == ("0", "1")
+        assert [case.get("name") for case in suite.iter("testcase") if case.find("skipped") is not None] == [
+            "RRMSD (by default: none was asked)"
+        ]
+
     def test_a_failing_check_fails_and_is_named(self, tmp_path):
         page = page_of(tmp_path, failing())
         header = page[page.index("<header>") : page.index("</header>")]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import shutil
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+import bstcad
 from bstcad import cli
 from bstcad.analysis import shape
 from bstcad.cad import mesh as meshes
@@ -27,6 +29,7 @@ from bstcad.optics.surfaces import Plane
 from bstcad.tolerance.perturbations import Setup, ripple
 from bstcad.verify import checks, step_checks
 from bstcad.verify.checks import Check
+from bstcad.verify.verdict import verdict
 from tests.conftest import draws_nothing, verify_with
 
 POINT = r"CARTESIAN_POINT\('',\([^,]*,[^,]*,\s*"  # up to its z
@@ -83,7 +86,7 @@ THICKNESS, EFFICIENCY = "smallest thickness", "efficiency"
 RRMSD, NOISE = "RRMSD, box pixels, through the re-read STEP", "standard error of that RRMSD, times five"
 LIGHT = "light on the target, of what enters the lens"
 UNASKED = " (by default: none was asked)"
-RIPPLE = "ripple: slope energy of the net's highest octave over the one below"
+RIPPLE = "ripple: RMS slope of control points that go up and down in turn"
 AGREE = "picture by ray tubes, off the one by rays"
 FINITE = "values that are not finite"
 TARGET = "target in design.npz against the scene's, of its brightest pixel"
@@ -205,6 +208,22 @@ def test_a_face_with_ripple_of_ten_nanometres_fails_by_name(small_design, few, t
     assert failed[BACK]["value"] == pytest.approx(np.abs(heights).max(), rel=0.3)  # of the face, which its net exceeds
     said = capsys.readouterr().out
     assert "FAILED" in said and "STEP text: control points (control point" in said
+
+
+def test_where_no_limit_was_asked_the_verdict_is_one_of_its_own(small_design, tmp_path, capsys, monkeypatch):
+    """Neither a pass nor a fail, in the terminal, in report.json and in Python; a check that fails, fails."""
+    draws_nothing(monkeypatch)
+    folder = shutil.copytree(small_design.folder, tmp_path / "unasked")
+    text = (folder / "scene.toml").read_text(encoding="utf-8")
+    (folder / "scene.toml").write_text(re.sub(r"(?ms)^\[accept\].*?(?=^\[|\Z)", "", text), encoding="utf-8")
+    assert cli.run(["verify", str(folder)]) == 0
+    said, report = capsys.readouterr().out, json.loads((folder / "report.json").read_text())
+    assert said.startswith("NO LIMIT WAS ASKED: ") and "PASSED" not in said
+    assert (report["verdict"], report["passed"]) == ("no limit was asked", True)
+    assert bstcad.open(folder).report.verdict == "no limit was asked"
+    for passed, given_up, asked in itertools.product((True, False), ((), ("a remark",)), (True, False)):
+        found = verdict(passed, given_up, asked)
+        assert (found == "failed") == (not passed) and (found == "no limit was asked") == (passed and not asked)
 
 
 UNREADABLE = {
@@ -391,6 +410,30 @@ def test_control_points_that_go_up_and_down_in_turn_fail():
         lens = Lens(Plane(8.0), BSplineSurface(20.0, heights, (-8.0, 8.0), (-8.0, 8.0)), Rectangle(16.0, 16.0), 1.5)
         verdicts.append(checks._ripple(shape.describe(lens), 33))
     assert [check.passed for check in verdicts] == [True, False] and verdicts[0].name == RIPPLE
+
+
+def test_a_ripple_that_neither_tool_nor_light_feels_passes(nominal):
+    """Its slope energy is 16 times that of the octave below, as much as in a face that fails; of 1 nm, and of 1 µm.
+
+    On the way to a target so far away, and held to an RRMSD so small, 1 nm fails by the light alone.
+    """
+    back = nominal.lens.back
+    u, v = (torch.linspace(-1, 1, count, dtype=torch.float64) for count in back.shape)
+    noise = torch.from_numpy(np.random.default_rng(0).normal(size=back.shape))
+    smooth = 0.1 * u[:, None] ** 2 * v
+
+    def judged(height, most=checks.RIPPLE_LIGHT * 0.25):
+        lens = replace(nominal.lens, back=replace(back, heights=smooth + height * noise))
+        found = shape.describe(lens) | checks._ripples_in_light(lens, nominal)
+        return found, checks._ripple(found, 33, most=most)
+
+    (still, smooth_check), (fine, finest), (coarse, failed) = map(judged, (0.0, 1e-6, 1e-3))
+    assert still["ripple_slope"] == 0 and smooth_check.value == 0 and smooth_check.passed
+    octaves = shape.slope_octaves(replace(back, heights=1e-6 * noise))
+    assert octaves[-1] > 2 * octaves[-2] and 0 < fine["ripple_height"] < 1e-6 and finest.passed
+    assert not failed.passed and coarse["ripple_slope"] == pytest.approx(1e3 * fine["ripple_slope"], rel=0.05)
+    assert fine["ripple_rrmsd"] > 0 and re.search(r"nm RMS high; by itself it makes an RRMSD of", failed.where)
+    assert not judged(1e-6, most=0.5 * fine["ripple_rrmsd"])[1].passed
 
 
 def test_a_scene_that_asks_for_nothing_is_held_to_stated_defaults(folder, nominal):

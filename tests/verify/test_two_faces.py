@@ -167,7 +167,8 @@ def test_bounds_hold_for_both_faces(two):
     found, at_bounds = checks.of_bounds(lens, asked, shape)
     failed = {check.name.partition(",")[0] for check in found if not check.passed}
     assert failed == {"smallest concave radius of the front", "steepest slope of the front"}
-    assert at_bounds.keys() == {"tool_radius", "max_slope"} and all(0 < part < 1 for part in at_bounds.values())
+    assert at_bounds.keys() == {"tool_radius", "max_slope"} and all(0 < at.share < 1 for at in at_bounds.values())
+    assert [at.tightest.endswith("of the front") for at in at_bounds.values()] == [True, True]
     alone, _ = checks.of_bounds(replace(lens, shaped=None), asked, shape)
     assert all(check.passed for check in alone)
 
