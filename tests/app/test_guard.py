@@ -306,7 +306,7 @@ NO_PICTURES = {
     "of no width": png(0, 5),
     "damaged": png(64, 64).replace(b"IDAT", b"IDAT\0", 1),
     "no pixels": b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", png(8, 8)[16:29]) + chunk(b"IEND", b""),
-    "gif": b"GIF89a\1\0\1\0\x80\0\0\0\0\0\xff\xff\xff,\0\0\0\0\1\0\1\0\0\2\2D\1\0;",
+    "ppm": b"P6 1 1 255\n\0\0\0",
     "eps": b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n(/etc/passwd) run\n",
     "heic": b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(64),
     "toml": b'name = "x"\n',

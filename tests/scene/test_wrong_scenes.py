@@ -29,7 +29,7 @@ WRONG = {
     "thu": [
         ({"target.pixel": 3}, "target.pixel: unknown key; did you mean 'pixels'"),
         ({"target.ies": "'led.ies'"}, r"target.ies: unknown key; files of .*\(IES, EULUMDAT\) are not built yet; the"),
-        ({"target.lies": "3"}, "target.lies: unknown key; the keys here are fit, gamma"),
+        ({"target.lies": "3"}, "target.lies: unknown key; the keys here are crop, fit, gamma"),
         ({"lens.back.tilt": 1}, "lens.back.tilt: unknown key; the keys here are control_points, kind, optimise, refl"),
         ({"source.aperture": '{shape="circle",radus=3}'}, "source.aperture.radus: unknown key; did you mean 'radius'"),
         ({"source.aperture": '{shape="oval"}'}, "source.aperture.shape: must be"),
