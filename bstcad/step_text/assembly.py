@@ -38,15 +38,27 @@ class Step:
 
 def placement_of(solid: str, entities: Entities) -> Placement:
     """The placement of a solid in the file; ValueError if the file places it not exactly once."""
-    items = dict(_items(entities))
-    steps: dict[str, list[Step]] = {name: [] for name in items}
-    for name, step in _steps(items, entities):
-        steps.setdefault(name, []).append(step)
-    homes = [name for name, inside in items.items() if solid in inside]
+    homes, steps = _home(solid, entities)
     ways = [way for home in homes[:1] for way in _ways(home, steps, frozenset())]
     if len(ways) > 1:
         raise ValueError("the file places its lens more than once; export one alone")
     return composed(ways[0] if ways else [])
+
+
+def products_of(solid: str, entities: Entities) -> set[str]:
+    """The product definitions whose own shape a solid is, not those of assemblies that it is a part of."""
+    homes, steps = _home(solid, entities)
+    own = {name for home in homes[:1] for name in _same(home, steps)}
+    return {product for product, shapes in _shapes(entities).items() if not own.isdisjoint(shapes)}
+
+
+def _home(solid: str, entities: Entities) -> tuple[list[str], dict[str, list[Step]]]:
+    """The representations that hold a solid, and each representation's steps into others."""
+    items = dict(_items(entities))
+    steps: dict[str, list[Step]] = {name: [] for name in items}
+    for name, step in _steps(items, entities):
+        steps.setdefault(name, []).append(step)
+    return [name for name, inside in items.items() if solid in inside], steps
 
 
 def _ways(home: str, steps: dict[str, list[Step]], seen: frozenset[str]) -> list[list[Placement]]:
@@ -108,30 +120,36 @@ def _steps(items: dict[str, list[str]], entities: Entities) -> Iterator[tuple[st
     for name, inside in items.items():
         for item in inside:
             if entities.bodies.get(item, ("",))[0] == "MAPPED_ITEM":
-                source, target = entities.references(item)
-                origin, mapped = entities.references(source)
+                source, target = _pair(item, entities)
+                origin, mapped = _pair(source, entities)
                 yield mapped, Step(name, _frame(target, entities).after(_frame(origin, entities).inverse))
 
 
 def _components(entities: Entities) -> Iterator[tuple[str, set[str]]]:
     """The relationship of each assembly's part, and the representations of that part."""
-    shapes: dict[str, set[str]] = {}  # product definition -> its representations
-    for definition in entities.of("SHAPE_DEFINITION_REPRESENTATION"):
-        shape, representation = entities.references(definition)
-        for product in entities.references(shape)[:1]:
-            shapes.setdefault(product, set()).add(representation)
+    shapes = _shapes(entities)
     for context in entities.of("CONTEXT_DEPENDENT_SHAPE_REPRESENTATION"):
-        relation, shape = entities.references(context)
+        relation, shape = _pair(context, entities)
         usage = entities.references(shape)[:1]
         related = entities.references(usage[0])[1:2] if usage else []  # relating, related
         yield relation, shapes.get(related[0], set()) if related else set()
+
+
+def _shapes(entities: Entities) -> dict[str, set[str]]:
+    """The shape representations of each product definition."""
+    shapes: dict[str, set[str]] = {}
+    for definition in entities.of("SHAPE_DEFINITION_REPRESENTATION"):
+        shape, representation = _pair(definition, entities)
+        for product in entities.references(shape)[:1]:
+            shapes.setdefault(product, set()).add(representation)
+    return shapes
 
 
 def _transformation(name: str, first: list[str], second: list[str], entities: Entities) -> Placement:
     """The placement from one representation to another; first, second: the items of the two."""
     if entities.bodies[name][0] != "ITEM_DEFINED_TRANSFORMATION":
         return _frame(name, entities)
-    origin, target = entities.references(name)
+    origin, target = _pair(name, entities)
     if not (origin in first and target in second) and target in first and origin in second:
         origin, target = target, origin
     return _frame(target, entities).after(_frame(origin, entities).inverse)
@@ -167,6 +185,14 @@ def _axes(location: str, axis: str | None, reference: str | None, entities: Enti
         raise ValueError("it has no reference direction, and readers of STEP differ in the one that they assume")
     x = X if reference is None else _direction(reference, entities)
     return Placement.of_axes(entities.points(np.array([location], dtype=np.int64))[0], z, x)
+
+
+def _pair(name: str, entities: Entities) -> list[str]:
+    """The two entities that an entity refers to."""
+    found = entities.references(name)
+    if len(found) != 2:
+        raise damaged(f"statement #{name} = {entities.bodies[name][0]} refers to {len(found)} entities, not to two")
+    return found
 
 
 def _direction(name: str, entities: Entities) -> np.ndarray:

@@ -131,7 +131,8 @@ def _check_tokens(rest: str, hits: Sequence[re.Match[str]]) -> None:
         number, kind, body = next(hit.groups() for hit in hits if TOKENS.sub("", hit[3]))
         atoms = (atom for atom in re.split(r"[(),]+", body) if TOKENS.sub("", f"({atom})"))
         atom = next(atoms, "its text")
-        raise damaged(f"statement #{number} = {kind or 'COMPLEX'} is malformed: {_cut(atom)!r} is no number of STEP")
+        statement = f"statement #{number} = {kind or 'COMPLEX'}"
+        raise damaged(f"{statement} is malformed: {_cut(atom)!r} is no number or word of STEP")
     for pattern, fault in ((LONG, f"has over {MAX_DIGITS} characters"), (LARGE, "is not finite")):
         for found in pattern.finditer(rest):
             if pattern is LONG or not math.isfinite(float(found[0])):

@@ -23,7 +23,7 @@ import numpy as np
 from bstcad.runs import files
 from bstcad.runs.files import one_line
 from bstcad.step_text import beginning
-from bstcad.step_text.assembly import placement_of
+from bstcad.step_text.assembly import placement_of, products_of
 from bstcad.step_text.entities import NAME, REAL, Entities, damaged, read_entities, without_blanks
 from bstcad.step_text.placement import Placement, unmoved
 
@@ -185,7 +185,7 @@ def _parse(text: bytes) -> StepText:
         surface=surface,
         front=fronts[0] if fronts else None,
         edge_uses=_edge_uses(entities),
-        properties=_properties(entities),
+        properties=_properties(entities, products_of(solids[0], entities) if placement.moves else set()),
         placement=placement,
     )
 
@@ -336,15 +336,19 @@ def _check_knots(counts: np.ndarray, knots: np.ndarray, points: int, degree: int
 # ---- statements about the part besides its shape -------------------------------------------------------------------
 
 
-def _properties(entities: Entities) -> ValidationProperties:
-    """The properties in a file; a number that cannot be read is UNKNOWN."""
+def _properties(entities: Entities, products: set[str]) -> ValidationProperties:
+    """The properties in a file; a number that cannot be read is UNKNOWN.
+
+    products: of the lens, if the file has others, such as an assembly in whose frame its centroid lies elsewhere.
+    """
     items: dict[tuple[str, str], list[str]] = {}  # (kind of property, its name) -> first items of its representations
     for body in entities.of("PROPERTY_DEFINITION_REPRESENTATION").values():
         definition, representation = re.fullmatch(r"\(#(\d+),#(\d+)\)", body).groups()
         kind, name = (entities.string(each, 0) for each in (definition, representation))
         if kind == VALIDATION:  # of the whole part, not of a face or of an assembly's instance
-            target = entities.bodies.get(entities.references(definition)[-1], ("",))[0]
-            kind = kind if target == "PRODUCT_DEFINITION_SHAPE" else ""
+            target = entities.references(definition)[-1]
+            of_part = entities.bodies.get(target, ("",))[0] == "PRODUCT_DEFINITION_SHAPE"
+            kind = kind if of_part and not (products and products.isdisjoint(entities.references(target))) else ""
         if kind in (VALIDATION, MATERIAL):
             items.setdefault((kind, name), []).extend(entities.references(representation)[:1])
 

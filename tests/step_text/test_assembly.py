@@ -75,6 +75,17 @@ def test_nested_placements_follow_each_other():
     assert np.array_equal(found(points), whole(MOVED(points)))
 
 
+def test_the_centroid_of_an_assembly_is_not_that_of_its_part():
+    """Both are stated, each in its own frame; area and volume are alike."""
+    stated = "".join(
+        f"#{n}0 = PROPERTY_DEFINITION_REPRESENTATION(#{n}1,#{n}2); #{n}1 = PROPERTY_DEFINITION('geometric validation "
+        f"property','centroid',{shape}); #{n}2 = SHAPE_REPRESENTATION('centroid',(#{n}3),#900);\n"
+        f"#{n}3 = CARTESIAN_POINT('centre point',({n}.,0.,0.));\n"
+        for n, shape in ((20, "#131"), (21, "#137"), (22, "#135"))
+    ) + "#137 = PRODUCT_DEFINITION_SHAPE('','',#133);\n"  # fmt: skip
+    assert part21.parse(text(SIMPLE + square() + ASSEMBLY + stated)).properties.centroids == ((20.0, 0.0, 0.0),)
+
+
 REFUSED = {
     "scaled": (STATED["an operator"][0].replace("1.,#102", "2.,#102"), "it scales the lens by 2"),
     "ambiguous": (ASSEMBLY.replace("#102,#103", "#103,$"), "no reference direction"),
