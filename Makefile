@@ -26,6 +26,8 @@ READY := $(VENV)/.ready
 
 lens: $(READY)
 	$(BIN)/python generate_lens.py templates/thu.toml
+	@echo "Next: $(BIN)/bstcad app for the page in your browser, or $(BIN)/bstcad --help. To type bstcad alone, activate $(VENV):"
+	@echo "  bash, zsh: source $(BIN)/activate   fish: source $(BIN)/activate.fish   PowerShell: $(BIN)/Activate.ps1"
 
 TEST = $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder \
     $(if $(ROOM),$(wildcard tests/$(ROOM) tests/test_$(ROOM).py)) $(if $(DURATIONS),--record-durations)

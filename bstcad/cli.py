@@ -276,7 +276,7 @@ Budget = option(
 )  # fmt: skip
 Scenes = argument(list[str], "SCENES...", "Scene files (TOML), or patterns such as 'scenes/*.toml'.")
 Topic = argument(
-    str | None, "TOPIC", "A check or a remark, as reports name them: check-rrmsd (default: the first page)."
+    str | None, "TOPIC", "A page, or a check or a remark as reports name them: check-rrmsd (default: the first page)."
 )
 KeyName = argument(str | None, "KEY", "A key or a table, such as lens.tool_radius (default: all).")
 
@@ -602,31 +602,47 @@ def schema() -> int:
 # --- documentation ----------------------------------------------------------------------------------------------------
 
 
-@app.command(epilog=examples("docs", "docs check-rrmsd"))
+@app.command(epilog=examples("docs tutorials/first-lens", "docs check-rrmsd"))
 def docs(topic: Topic = None) -> int:
     """Open the documentation, complete without a network; of a check or a remark print its section."""
-    from bstcad.report import explained
+    from bstcad.report import explained, manual
 
-    page, topics = "index.html", {name.partition("#")[2]: name for name in explained.sections()}
-    if topic is not None and topic not in topics:
+    topics = {name.partition("#")[2]: name for name in explained.sections()}
+    site = next((place for place in SITES if (place / "index.html").is_file()), None)
+    if topic in topics:
+        print(explained.read_in_a_terminal(topics[topic]))
+        if site is not None:
+            print(f"Documentation: {site / 'reference' / topics[topic].replace('#', '.html#')}")
+        return 0
+    name = manual.FIRST if topic is None else manual.name_of(topic)
+    if name is None:
         from bstcad.scene.errors import nearest
 
-        raise InputError(f"{topic}: no check or remark is named so; {nearest(topic, list(topics), 'known are')}")
-    if topic is not None:
-        print(explained.read_in_a_terminal(topics[topic]))
-        page = "reference/" + topics[topic].replace("#", ".html#")
-    site = next((place for place in SITES if (place / "index.html").is_file()), None)
-    if site is None and topic is not None:
-        return 0
+        known = nearest(topic, [*topics, *manual.pages()], "known are")
+        raise InputError(f"{topic}: no page, check or remark is named so; {known}")
     if site is None:
-        print("bstcad: this copy of bstcad came without pages; make docs builds them from its sources", file=sys.stderr)
-        return 2
-    print(f"Documentation: {site / page}")
-    if topic is None and sys.stdout.isatty():
+        print("bstcad: the pages are not built here (make docs builds them); this is their text", file=sys.stderr)
+        _read(manual.first() if topic is None else manual.page(name))
+        return 0
+    print(f"Documentation: {site / name}.html")
+    if sys.stdout.isatty():
         import webbrowser
 
-        webbrowser.open((site / page).as_uri())
+        webbrowser.open((site / f"{name}.html").as_uri())
     return 0
+
+
+def _read(text: str) -> None:
+    """Show Markdown: rendered, in a pager, on a terminal; else as it is."""
+    from rich.markdown import Markdown
+
+    console = Console()
+    if not console.is_terminal:
+        print(text, end="")
+        return
+    os.environ.setdefault("LESS", "-R")  # by which less shows bold and colour
+    with console.pager(styles=True):
+        console.print(Markdown(text))
 
 
 # --- the program, and errors in one sentence --------------------------------------------------------------------------

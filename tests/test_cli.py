@@ -16,6 +16,7 @@ from rich.console import Console
 import bstcad
 from bstcad import cli
 from bstcad import folder as folders
+from bstcad.report import manual
 from bstcad.runs import progress, signals
 
 ROOT = Path(__file__).parent.parent
@@ -333,7 +334,37 @@ def test_docs_explains_a_check_and_names_its_page(capsys, monkeypatch, tmp_path)
     assert out.endswith(f"Documentation: {tmp_path / 'reference/checks.html#check-rrmsd'}\n")
     assert cli.run(["docs"]) == 0
     assert capsys.readouterr().out == f"Documentation: {tmp_path / 'index.html'}\n"
-    monkeypatch.setattr(cli, "SITES", (tmp_path / "none",))
-    assert cli.run(["docs"]) == 2 and "make docs builds" in capsys.readouterr().err
+    assert cli.run(["docs", "first-lens"]) == 0
+    assert capsys.readouterr().out == f"Documentation: {tmp_path / 'tutorials/first-lens.html'}\n"
     assert cli.run(["docs", "check-rmsd"]) == 2
     assert capsys.readouterr().err.strip().endswith("did you mean 'check-rrmsd'?")
+
+
+def test_docs_without_built_pages_shows_their_text(capsys, monkeypatch, tmp_path):
+    """From the sources; of a copy without them the pages of checks and remarks."""
+    monkeypatch.setattr(cli, "SITES", (tmp_path,))
+    assert cli.run(["docs"]) == 0
+    out, err = capsys.readouterr()
+    assert out.startswith("# bstcad\n") and "make docs builds them" in err
+    for name in ("tutorials/first-lens", "reference/checks", "how-to/resume"):
+        assert f"- `bstcad docs {name}`: " in out
+    assert "- **Tutorials** (`bstcad docs tutorials/index`): A first lens" in out
+    assert ":::" not in out and "```{" not in out and "toctree" not in out
+    for name in ("resume", "how-to/resume", "how-to/resume.md"):
+        assert cli.run(["docs", name]) == 0
+        out = capsys.readouterr().out
+        assert out.startswith("# ") and "(`bstcad docs reference/remarks`)" in out and "](" not in out
+    monkeypatch.setattr(manual, "PLACES", (tmp_path,))
+    manual.pages.cache_clear()
+    try:
+        assert cli.run(["docs"]) == 0 and "- `bstcad docs reference/checks`: " in capsys.readouterr().out
+        assert cli.run(["docs", "checks"]) == 0 and "accept.rrmsd" in capsys.readouterr().out
+        assert cli.run(["docs", "resume"]) == 2
+    finally:
+        manual.pages.cache_clear()
+
+
+def test_every_page_of_the_documentation_can_be_read_in_a_terminal():
+    for name in manual.pages():
+        text = manual.page(name)
+        assert text.startswith("# ") and not re.search(r"^(:::|```\{|\([\w-]+\)=$)", text, re.M), name
