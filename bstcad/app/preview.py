@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from bstcad import pipeline
+from bstcad.analysis.light import blur
 from bstcad.analysis.shape import describe
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import a_side, simulated, tubes_picture
@@ -36,6 +37,7 @@ FRONT_CELLS, FRONT_NET, FRONT_STEPS = 32, 17, 40  # by which a front is sought o
 SEEN = 2.5  # ray tubes a pixel and side, by which the picture is taken: others than those that tailored the lens
 RAYS = 160  # a side, by which light that goes astray is counted
 SHAPE = 129  # points a side, at which the thickness is looked at
+IMAGE_PLACES = 16  # a side of the back, through each of which the source is seen
 SEED = 77  # of those rays
 
 
@@ -68,6 +70,7 @@ class Preview:
     pictures: tuple[tuple[np.ndarray, np.ndarray], ...]  # of each target (wanted, irradiance), both (rows, columns)
     flux: dict[str, float]  # the ledger of the light; its lines sum to 1
     shape: dict[str, float | None]  # of the lens, by the keys of report.json
+    source_images: tuple[float | None, ...]  # mm; width of the source's image on each target; None of a point
     remarks: tuple[str, ...]  # on the scene, and on light that cannot get where it is wanted
     seconds: float = math.nan
 
@@ -191,7 +194,11 @@ def _lit(scene: Scene, task: Task, lens: Lens, wanted: Sequence[np.ndarray]) -> 
     channels = scene.channels()
     rays = max(round(a_side(channels) * RAYS), 8)
     ledger = simulated(lens, channels, scene.target.screen, n=rays, seed=SEED).flux
-    return Preview(scene, lens, tuple(pictures), flux=ledger, shape=describe(lens, SHAPE), remarks=())
+    images = [blur(channels, lens, target.screen, target.irradiance(), n=IMAGE_PLACES) for target in scene.targets]
+    return Preview(
+        scene, lens, tuple(pictures), flux=ledger, shape=describe(lens, SHAPE),
+        source_images=tuple(each and each.width for each in images), remarks=(),
+    )  # fmt: skip
 
 
 @torch.no_grad()

@@ -27,14 +27,16 @@ ASTRAY = 0.002  # of the light; a line of the ledger with less is not told
 def of_preview(found: Preview) -> dict[str, Any]:
     """The pictures on each target, the lens with its light, and figures."""
     path = light_path_of(found.scene, found.lens, found.pictures)
+    seen = [(*pair, image) for pair, image in zip(found.pictures, found.source_images, strict=True)]
     views = [View.of(found.scene, k) for k in range(len(found.pictures))]
     targets = [
         {
             "key": key, "rrmsd": number(value), "wanted": png(view.picture(tones(wanted, wanted))),
             "light": png(view.picture(tones(light, wanted))), "seen": view.words, "pixels": list(light.shape[::-1]),
+            "source_image": image and quantity(image, "mm"),
         }
-        for key, view, value, (wanted, light) in zip(
-            found.scene.target_keys, views, found.rrmsds, found.pictures, strict=True
+        for key, view, value, (wanted, light, image) in zip(
+            found.scene.target_keys, views, found.rrmsds, seen, strict=True
         )
     ]  # fmt: skip
     return {

@@ -56,6 +56,11 @@ STATIC, SITES = (
     (Path(__file__).parents[1] / "site", Path(__file__).parents[2] / "docs/_build/html"),
 )
 SHOWN = {".html": "text/html", ".json": "application/json", ".png": "image/png", ".pdf": "application/pdf"}
+RRMSD = (
+    "RRMSD states how far the light is from the picture: the root mean square of the difference, over that of the "
+    "picture. 0 is the picture itself."
+)
+CARDS = {"lamp": "a small lamp or LED", "led": ""}  # words of lights on the first page; "": it has no card of its own
 MOST_SOUND = 31  # scenes, besides the latest, whose latest valid text is kept
 SLOWEST = 1  # seconds that open requests have when the server ends
 CLOUDS = ((b"ply", ".ply"), (b"solid", ".stl"))  # how files of measured points begin
@@ -149,14 +154,15 @@ class Workbench:
         return self._page("lost.html.j2", status=404, title="No such page", sentence="")
 
     def _page(self, template: str, status: int = 200, **values: Any) -> HTMLResponse:
-        common = {"version": bstcad.__version__, "has_docs": self.has_docs}
+        common = {"version": bstcad.__version__, "has_docs": self.has_docs, "rrmsd_words": RRMSD}
         return HTMLResponse(self._pages.get_template(template).render(**common, **values), status_code=status)
 
     # ---- pages ----
 
     def start_page(self, request: Request) -> Response:
         """Where a picture is dropped, and the list of scenes and designs."""
-        lights = [{"name": name, "of": light.of} for name, light in new_scene.LIGHTS.items()]
+        lights = [{"name": name, "of": CARDS.get(name, light.of)} for name, light in new_scene.LIGHTS.items()]
+        lights = [light for light in lights if light["of"]]
         return self._page(
             "start.html.j2", title="Workbench", lights=lights, samples=SAMPLES, templates=new_scene.templates(),
             scenes=self.workspace.scene_names(), designs=[*self._designs()],

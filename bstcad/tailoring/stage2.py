@@ -76,6 +76,7 @@ class Round:
     stage: str = "stage 2"  # of which it is a part
     pixels: int | None = None  # along the longer side, that it sees instead of the target's
     spread: Spread | None = None  # of a source of some size, whose points the task's channels are
+    share: float = 1.0  # of the source's size, of which the light of this round is
     by_images: bool = False  # of that source alone, without the rays that tell what they leave out: for a preview
 
     @property
@@ -263,6 +264,7 @@ def _search(
         if not reached.skipped:
             done = min(place.done + best.evaluations, total)  # a line search may run over a little
             of_few = f" on {now.pixels} pixels" if now.pixels else ""
+            of_few += f", with {100 * now.share:.0f} % of the source's size" if now.share < 1 else ""
             step = replace(step, progress=(now.stage, done, total, f"RRMSD {best.figure:.4f}{of_few}"))
             if now.pixels is None:
                 step = replace(step, rrmsd=best.figure)
@@ -402,8 +404,8 @@ def stage3_rounds(task: Task) -> tuple[Round, ...]:
     )
     counts = blurred_sheets(task.knobs, (task.screen.columns, task.screen.rows))
     return tuple(
-        Round(light, tubes, evaluations, stage="stage 3", spread=spread)
-        for light, spread, (tubes, evaluations) in zip(lights, task.spreads, counts, strict=True)
+        Round(light, tubes, evaluations, stage="stage 3", spread=spread, share=share)
+        for light, spread, (tubes, evaluations), (share, _) in zip(lights, task.spreads, counts, SIZES, strict=True)
     )
 
 

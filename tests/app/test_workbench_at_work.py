@@ -19,6 +19,7 @@ from bstcad import commands
 from bstcad import folder as folders
 from bstcad.app.design_runs import Run
 from bstcad.app.preview import AT_ONCE, SETTLED, preview
+from bstcad.report import record
 from bstcad.scene.scene import load
 from tests.app.conftest import SEEN, SMALL, begin, open_scene
 
@@ -73,6 +74,7 @@ def test_a_photo_is_a_verified_lens_in_four_clicks(open_page, shared, photo, tmp
     download.value.save_as(tmp_path / "lens.step")
     assert commands.verify(tmp_path / "lens.step").passed
     folder = shared.folder / "my-laser"
+    assert load(shared.folder / "my-laser.toml").lens.outline.half_extent == (40, 30)  # the photo's proportions
     finished, _ = folders.read_nominal(folder)
     light = folders.read_irradiance(folder, finished)
     scene = load(shared.folder / "my-laser.toml")
@@ -81,7 +83,31 @@ def test_a_photo_is_a_verified_lens_in_four_clicks(open_page, shared, photo, tmp
     assert max(apart.values()) <= 0.05
 
 
-@pytest.mark.parametrize("light", ["laser", "sun", "lamp", "led"])
+@pytest.mark.parametrize("size", [(80, 120), (120, 80)])
+@pytest.mark.parametrize("light", ["laser", "sun", "lamp"])  # the lamp's card is that of an LED, too
+def test_a_photo_that_is_not_square_is_a_lens_in_four_clicks(open_page, shared, light, size, tmp_path):
+    """80 x 120 and 120 x 80 mm: the card, the file, Make it, and the lens, which passes at standard quality."""
+    written = io.BytesIO()
+    y, x = np.mgrid[0 : 6 * size[1], 0 : 6 * size[0]]
+    grey = 60 + 150 * np.exp(-((x - 2.5 * size[0]) ** 2 + (y - 3 * size[1]) ** 2) / (1.5 * min(size)) ** 2)
+    Image.fromarray(grey.astype(np.uint8)).save(written, "jpeg", quality=92)
+    page = open_page(shared.address)
+    page.fill("#side", "120")
+    page.check(f"input[name=use][value={light}]", force=True)  # click 1
+    page.set_input_files("#picture", {"name": "p.jpg", "mimeType": "image/jpeg", "buffer": written.getvalue()})  # 2
+    page.wait_for_selector(SEEN, timeout=PATIENCE)
+    name = page.url.rpartition("/")[2]
+    assert load(shared.folder / f"{name}.toml").lens.outline.half_extent == (size[0] / 2, size[1] / 2)
+    page.click("#make")  # click 3
+    page.wait_for_selector("#step", timeout=PATIENCE)
+    with page.expect_download() as download:
+        page.click("#step")  # click 4
+    download.value.save_as(tmp_path / "lens.step")
+    assert commands.verify(tmp_path / "lens.step").passed
+    assert record.read(shared.folder / name / "report.json").passed
+
+
+@pytest.mark.parametrize("light", ["laser", "sun", "lamp"])
 def test_fifty_changes_are_followed(open_page, shared, photo, light, request):
     page = open_page(shared.address)
     page.check(f"input[name=use][value={light}]", force=True)

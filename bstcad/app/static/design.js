@@ -4,7 +4,17 @@ import { ask, drawCurves, element, embedded, pause, row } from "./common.js";
 const { name, run, jobs, finished } = embedded(), at = `/api/design/${encodeURIComponent(name)}`;
 const EVERY = 700; // milliseconds between two looks
 const stages = new Map(), curve = [];
+const source = { size: 0, last: 0 }; // percent of its size, and the RRMSD, as last told
 let next = 0, began = null, light = "";
+
+// The stages as the tutorial names them.
+const STAGES = {
+  "control points": "control points", reach: "what light reaches", "stage 1": "stage 1: the map of the light",
+  "stage 2": "stage 2: the face, by traced light", "stage 3": "stage 3: the face, for the whole source",
+  write: "the files", verify: "the proof", report: "the report",
+};
+const named = (stage) => STAGES[stage] ?? stage;
+const left = (seconds) => (seconds < 90 ? `${Math.ceil(seconds)} s left` : `${Math.ceil(seconds / 60)} min left`);
 
 const WORDS = { running: "Being designed", stopped: "Stopped", refused: "Refused", failed: "Failed", finished: "Finished", none: "" };
 
@@ -13,7 +23,13 @@ function take(news) {
     if (began === null) began = when;
     stages.set(stage, { done, total, text, first: stages.get(stage)?.first ?? when, last: when });
     const value = /RRMSD ([0-9.]+)/.exec(text);
-    if (value && stage.startsWith("stage")) curve.push([when - began, Number(value[1])]);
+    if (!value || !stage.startsWith("stage")) continue;
+    const share = /with (\d+) %/.exec(text), size = stage !== "stage 3" ? 0 : share ? Number(share[1]) : 100;
+    if (size > source.size && source.last && Number(value[1]) > 1.01 * source.last) {
+      element("growth").textContent = `The rise from ${source.last} to ${value[1]} is the source: stage 3 tailors for more and more of its size, now ${size} %, and a wider source blurs more.`;
+    }
+    Object.assign(source, { size, last: Number(value[1]) });
+    curve.push([when - began, Number(value[1])]);
   }
   next = news.next;
   const body = element("stages").tBodies[0];
@@ -21,8 +37,8 @@ function take(news) {
     const bar = document.createElement("progress");
     bar.max = Math.max(total, 1);
     bar.value = Math.min(done, bar.max);
-    bar.setAttribute("aria-label", `${stage}: ${done} of ${total}`);
-    return row([stage, bar, `${(last - first).toFixed(1)} s`, text === "evaluations" ? "" : text], { numbers: [2] });
+    bar.setAttribute("aria-label", `${named(stage)}: ${done} of ${total}`);
+    return row([named(stage), bar, `${(last - first).toFixed(1)} s`, text === "evaluations" ? "" : text], { numbers: [2] });
   }));
   element("curve").parentElement.hidden = curve.length < 2;
   drawCurves(element("curve"), [curve]);
@@ -78,8 +94,16 @@ const RESULTS = {
 
 function show(form, state) {
   const place = form.querySelector("[role=status]"), kind = form.dataset.job;
-  const last = state.lines.at(-1), text = last ? [`${last[1]}:`, last[4], last[3] ? `(${last[2]} of ${last[3]})` : ""].join(" ") : "";
-  if (state.state === "running") place.textContent = `Under way … ${text}`;
+  const running = state.state === "running", bar = form.querySelector("progress");
+  form.began ??= new Map();
+  for (const [when, stage] of state.lines) if (!form.began.has(stage)) form.began.set(stage, when);
+  const last = state.lines.at(-1), [, stage, done, total, words] = last ?? [];
+  bar.hidden = form.querySelector(".stop").hidden = !running;
+  if (total) Object.assign(bar, { max: total, value: Math.min(done, total) });
+  else bar.removeAttribute("value");
+  const rest = total && done ? ((state.now - form.began.get(stage)) * (total - done)) / done : 0;
+  const text = last ? [`${named(stage)}:`, words, total ? `${done} of ${total},` : "", rest ? left(rest) : ""].filter(Boolean).join(" ").replace(/,$/, "") : "";
+  if (running) place.textContent = `Under way … ${text}`;
   else if (state.state === "finished") {
     place.replaceChildren("Finished: ", ...RESULTS[kind](state).flatMap(([address, words], k) => {
       const link = document.createElement("a");
@@ -106,6 +130,7 @@ for (const form of document.querySelectorAll("form.job")) {
   const kind = form.dataset.job;
   show(form, jobs[kind]);
   if (jobs[kind].state === "running") followJob(form);
+  form.querySelector(".stop").addEventListener("click", () => ask(`${at}/stop?kind=${kind}`, {}).catch((error) => alert(error.message)));
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
     const fields = new FormData(form), cloud = fields.get("cloud");
@@ -114,6 +139,7 @@ for (const form of document.querySelectorAll("form.job")) {
       const number = (key) => (fields.get(key) ?? "").trim().replace(",", ".");
       await ask(`${at}/${kind}`, cloud || { grade: fields.get("grade"), yield: number("yield"), budget: number("budget") });
       form.next = 0;
+      form.began = new Map();
       followJob(form);
     } catch (error) {
       form.querySelector("[role=status]").textContent = error.message;

@@ -299,7 +299,7 @@ function showLight(told) {
     const pair = document.createElement("div");
     pair.className = "both";
     const of = told.targets.length > 1 ? `${target.key}: ` : "";
-    pair.append(figure(target.light, `${of}Light through the lens`, `${of}by the lens, RRMSD ${target.rrmsd} on ${target.pixels.join(" × ")} pixels`, "light-on-wall"));
+    pair.append(figure(target.light, `${of}Light through the lens`, `${of}by the lens, RRMSD ${target.rrmsd} on ${target.pixels.join(" × ")} pixels${target.source_image ? `; the source's image there is ${target.source_image} wide, and blurs finer detail` : ""}`, "light-on-wall"));
     pair.append(figure(target.wanted, `${of}The picture that is asked for`, `${of}asked for; ${target.seen.toLowerCase()}`));
     return pair;
   }));

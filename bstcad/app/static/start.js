@@ -8,6 +8,12 @@ const use = () => {
   return chosen.dataset.template === undefined ? { light: chosen.value } : { template: chosen.value };
 };
 
+// The size of a plate as `bstcad new --size` takes it: 80, or 80xphoto for the proportions of the photo.
+const size = (photo) => {
+  const side = element("side").value.trim().replace(",", ".");
+  return photo && element("proportions").checked ? `${side ? `${side}x` : ""}photo` : side;
+};
+
 async function begin(given, words) {
   said.textContent = words;
   try {
@@ -23,7 +29,7 @@ async function take(picture) {
   said.textContent = "Reading the picture …";
   try {
     const kept = await ask("/api/picture", picture);
-    await begin({ ...use(), ...kept }, "Making the scene …");
+    await begin({ ...use(), size: size(true), ...kept }, "Making the scene …");
   } catch (error) {
     said.textContent = error.message;
   }
@@ -38,8 +44,8 @@ drop.addEventListener("drop", (event) => { event.preventDefault(); take(event.da
 form.addEventListener("submit", (event) => event.preventDefault());
 form.addEventListener("click", (event) => {
   const { sample, letters } = event.target.dataset;
-  if (sample) begin({ ...use(), sample }, "Making the scene …");
-  if (letters !== undefined) begin({ ...use(), text: element("letters").value }, "Making the scene …");
+  if (sample) begin({ ...use(), size: size(false), sample }, "Making the scene …");
+  if (letters !== undefined) begin({ ...use(), size: size(false), text: element("letters").value }, "Making the scene …");
 });
 document.addEventListener("click", (event) => {
   const { start } = event.target.dataset;

@@ -1,0 +1,75 @@
+"""From a photo that is not square to a verified lens: the requests of four clicks, without a browser, by few points."""
+
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from bstcad import commands
+from bstcad.app import design_process
+from bstcad.app.design_runs import Run
+from bstcad.report import record
+from bstcad.scene import new_scene
+from bstcad.scene.scene import load
+from tests.app.asking import bench
+
+SIZES = {(80, 120): "120xphoto", (120, 80): "120xphoto"}  # mm, as the page asks for a photo of those proportions
+FEW = {"lens.back.control_points": "33", "target.pixels": "24", "tailoring.rays": "96"}  # made in a second or two
+
+
+def photo(width, height):
+    """A JPEG of these proportions: a bright disc beside the middle, on a grey ground."""
+    y, x = np.mgrid[0 : 4 * height, 0 : 4 * width]
+    grey = 90 + 120 * np.exp(-((x - 1.6 * width) ** 2 + (y - 2 * height) ** 2) / (0.9 * min(width, height)) ** 2)
+    written = io.BytesIO()
+    Image.fromarray(grey.astype(np.uint8)).save(written, "jpeg", quality=90)
+    return written.getvalue()
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """A workbench whose runs are done at once, in this process."""
+
+    def start(run, *options):
+        design_process.JOBS["design"]({}, run.place, run.design, False).put(run.place)
+
+    monkeypatch.setattr(Run, "_start", start)
+    return bench(tmp_path / "lenses", monkeypatch)
+
+
+def with_scene(own, light, size):
+    """Click 1, the file, after the light's card was chosen: the name of the scene."""
+    picture = own.ask("/api/picture", photo(*size)).json["picture"]
+    return own.ask("/api/scenes", {"light": light, "picture": picture, "size": SIZES[size]}).json["name"]
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("light", new_scene.LIGHTS)
+def test_plate_and_picture_have_the_proportions_of_the_photo(own, light, size):
+    name = with_scene(own, light, size)
+    scene = load(own.workspace.path(name))
+    assert scene.lens.outline.half_extent == (size[0] / 2, size[1] / 2) and scene.target.remarks() == ()
+    assert scene.target.size[0] * size[1] == pytest.approx(scene.target.size[1] * size[0])
+    page = own.ask(f"/scene/{name}")
+    assert page.status == 200 and '"error": null' in page.text
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # a process would end with its file
+@pytest.mark.parametrize(("light", "size"), [("laser", (80, 120)), ("lamp", (120, 80))])
+def test_a_photo_is_a_verified_lens_in_four_requests(own, light, size):
+    name = with_scene(own, light, size)
+    for key, words in FEW.items():
+        assert own.ask(f"/api/scene/{name}/change", {"key": key, "words": words}).status == 200
+    answer = own.ask(f"/api/scene/{name}/change", {"key": "tailoring.quality", "words": "draft"})  # click 2
+    assert answer.json["error"] is None
+    made = own.ask(f"/api/scene/{name}/make", {"page": "p"})  # click 3
+    assert made.status == 200, made.text
+    assert 'id="step"' in own.ask(f"/design/{name}").text
+    step = own.ask(f"/design/{name}/files/lens.step?download")  # click 4
+    assert step.status == 200 and step.body.startswith(b"ISO-10303-21")
+    report = record.read(own.folder / name / "report.json")
+    assert [check.name for check in report.checks if not check.passed] == []
+    assert commands.verify(own.folder / name / "lens.step").passed
+    again = own.ask(f"/api/design/{name}/edit", {}).json["name"]  # and its scene, with the comments that it had
+    assert "# the wall, on which" in own.workspace.opened(again).text
