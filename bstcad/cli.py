@@ -265,7 +265,7 @@ Yield = option(float | None, "P", "Find the loosest tolerances that keep this yi
 Seed = option(int, "N", "Of the trials.", min=0)
 Trial = option(int | None, "N", "Write the lens of this trial as trial-N.step, and nothing else.", min=0)
 Kinds = option(str | None, "NAMES", f"{EXPORTS}, or several with commas between.", "--as")
-Points = option(int | None, "N", "Points along the wider side of grids (default: as many as control points).")
+Points = option(int | None, "N", "Points along the wider side of grids (default: control points; of zemax its knots).")
 Png = place("FILE", "A picture to write.", "--png", "-o")
 ReachPng = place("FILE", "Draw the target, and the part of it that light can reach; a second one into FILE_2.", "--png")
 # Of tradeoff, batch and keys.

@@ -210,8 +210,11 @@ def _relative(face: BSplineSurface, x: np.ndarray, y: np.ndarray) -> tuple[np.nd
 
 
 @torch.no_grad()
-def moved(lens: Lens, other: Lens, throw: Throw) -> Moved:
-    """How far the light of `other` lands from that of `lens`, on the target where that is the most pixels."""
+def moved(lens: Lens, other: Lens, throw: Throw) -> Moved | None:
+    """How far the light of `other` lands from that of `lens`, on the target where that is the most pixels.
+
+    None: no light comes to a target.
+    """
     found = []
     for screen in throw.screens:
         square = weight = most = 0.0
@@ -220,10 +223,10 @@ def moved(lens: Lens, other: Lens, throw: Throw) -> Moved:
             flux = torch.where(one.alive & two.alive, one.flux, torch.zeros_like(one.flux))
             apart = torch.where(flux > 0, ((two.position - one.position) ** 2).sum(0), torch.zeros_like(flux))
             square, weight = square + float(total(flux * apart)), weight + float(total(flux))
-            most = max(most, float(apart.max()))
+            most = max(most, float(apart.max())) if apart.numel() else most  # a strip may launch no rays
         pixel = min((screen.x[1] - screen.x[0]) / screen.columns, (screen.y[1] - screen.y[0]) / screen.rows)
-        found.append(Moved((square / weight) ** 0.5 if weight else 0.0, most**0.5, pixel))
-    return max(found, key=lambda each: each.rms / each.pixel)
+        found += [Moved((square / weight) ** 0.5, most**0.5, pixel)] if weight else []
+    return max(found, key=lambda each: each.rms / each.pixel, default=None)
 
 
 def with_face(lens: Lens, face: Surface, other: Surface) -> Lens:
@@ -231,8 +234,8 @@ def with_face(lens: Lens, face: Surface, other: Surface) -> Lens:
     return lens.with_back(other) if face is lens.back else lens.with_front(other)
 
 
-def moved_by(lens: Lens, face: Surface, patches: Patches, throw: Throw) -> Moved:
-    """How far the light of a lens moves if these patches stand for one of its faces."""
+def moved_by(lens: Lens, face: Surface, patches: Patches, throw: Throw) -> Moved | None:
+    """How far the light of a lens moves if these patches stand for one of its faces; None: it comes to no target."""
     plain = replace(lens, shaped=None, losses=None)
     return moved(plain, with_face(plain, face, patches), throw)
 
@@ -246,7 +249,7 @@ class GridSag:
 
     face: BSplineSurface
     grid: Grid
-    moved: Moved | None  # None: there is no light to judge it by
+    moved: Moved | None  # None: there is no light to judge it by, or none comes to the target
 
     @classmethod
     def of(cls, lens: Lens, face: BSplineSurface, points: int | None = None, throw: Throw | None = None) -> GridSag:
@@ -265,8 +268,13 @@ class GridSag:
     @classmethod
     def _at(cls, lens: Lens, face: BSplineSurface, at: tuple[np.ndarray, np.ndarray], throw: Throw | None) -> GridSag:
         """The grid of these x and y."""
-        grid = Grid(*at, _relative(face, *at))
-        return cls(face, grid, throw and moved_by(lens, face, Patches(face.z, grid), throw))
+        found = cls(face, Grid(*at, _relative(face, *at)), None)
+        return found if throw is None else replace(found, moved=moved_by(lens, face, found.patches, throw))
+
+    @property
+    def patches(self) -> Patches:
+        """The surface that OpticStudio has by it."""
+        return Patches(self.face.z, self.grid)
 
     def text(self) -> str:
         """The file (.DAT).
@@ -298,5 +306,7 @@ class GridSag:
 def table_note(lens: Lens, face: Surface, name: str, *, points: int, throw: Throw) -> str:
     """A sentence on a table of sags: how far the light moves by a bicubic spline through the heights of its grid."""
     by = moved_by(lens, face, Patches.through(face, *axes(lens.outline, points)), throw)
+    if by is None:
+        return f"{name}: no light comes to the target."
     coarse = "; zemax-back.dat and lens.step are exact" if by.most > BOUND * by.pixel else ""
     return f"{name}: by a bicubic spline through its heights the light moves on the target by {by}{coarse}."

@@ -13,7 +13,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, sag
-from bstcad.report.grid_sag import BOUND, GridSag, Moved, Patches, Throw, moved_by
+from bstcad.report.grid_sag import BOUND, GridSag, Moved, Throw, moved_by, table_note
 from tests.report.test_exports import read_zemax
 
 OUTLINE, THROW = Rectangle(8.0, 6.0), 200.0  # mm
@@ -65,7 +65,7 @@ def test_where_the_lens_reaches_into_the_end_spans_the_grid_gets_finer(outline):
     cells = np.array(lens.back.pitch) / grid.grid.step
     assert cells == pytest.approx(cells.round()) and cells[0] >= 2
     assert 0 < grid.moved.most <= BOUND * grid.moved.pixel
-    assert moved_by(lens, lens.back, Patches(4.0, GridSag.of(lens, lens.back, 21).grid), BEAM).rms > 10 * grid.moved.rms
+    assert moved_by(lens, lens.back, GridSag.of(lens, lens.back, 21).patches, BEAM).rms > 10 * grid.moved.rms
 
 
 def test_light_of_a_point_and_a_face_before_it_are_judged_too():
@@ -75,6 +75,17 @@ def test_light_of_a_point_and_a_face_before_it_are_judged_too():
     throw = Throw(Point((0.0, 0.0, -30.0), half_angle=5.0, profile="uniform"), BEAM.screens)
     exact, coarse = (GridSag.of(lens, lens.front, points, throw).moved for points in (None, 21))
     assert exact.most < 1e-9 < 1e-3 < coarse.rms < coarse.most
+    beside = replace(throw, source=Point((300.0, 0.0, -30.0), half_angle=1.0, profile="uniform"))
+    assert GridSag.of(lens, lens.front, 21, beside).moved is None
+    assert "no light comes to the target" in table_note(lens, lens.front, "sag.csv", points=21, throw=beside)
+
+
+def test_a_mirror_is_judged_by_its_own_light():
+    """A slope that is off by δ turns reflected light by 2 δ: four times as far as through a lens of index 1.5."""
+    through = replace(wavy(), index=1.5)
+    mirror = replace(through, front=Plane(-2.0), reflects=True)
+    moved = [moved_by(lens, lens.back, GridSag.of(lens, lens.back, 21).patches, BEAM) for lens in (through, mirror)]
+    assert moved[1].rms == pytest.approx(4 * moved[0].rms, rel=0.02)
 
 
 def test_a_narrow_lens_has_the_five_points_that_opticstudio_asks_for():
