@@ -26,9 +26,9 @@ STRING = re.compile(r"'[^']*(?:''[^']*)*'")
 POINT = re.compile(rf"(?<=;)#({NAME})=CARTESIAN_POINT\('\d*',\(({COORDINATE},{COORDINATE},{COORDINATE})\)\);")
 STATEMENT = re.compile(rf"#({NAME})=([A-Z][A-Z_0-9]*)?(\(.*\))", re.DOTALL)
 TOKENS = re.compile(  # of a text without blanks: separators, references, numbers, strings, enumerations, keywords
-    r"[(),;]++|(?:,?#\d++)++(?=[,)=])=?|'\d*+'|\.[A-Z_0-9]++\.|[$*](?=[,)])|!?[A-Z_][A-Z_0-9]*+(?=\()"
-    r"|[-+]?\d++(?:\.\d*+(?:[Ee][-+]?\d++)?)?(?=[,)])|\"[0-9A-F]*+\""
-)
+    r"[(),;]++|(?:#\d{1,20}+,)++|#\d{1,20}+(?=[)=])=?|'\d*+'|\.[A-Z_0-9]++\.|[$*](?=[,)])|!?[A-Z_][A-Z_0-9]{0,99}+(?=\()"
+    r"|[-+]?\d{1,99}+(?:\.\d{0,99}+(?:[Ee][-+]?\d{1,9}+)?)?(?=[,)])|\"[0-9A-F]*+\""
+)  # each is bounded, or begins with a character that it does not hold: a time in proportion to the text
 LONG = re.compile(rf"(?<=[(,])[-+.\d][-+.\dEe]{{{MAX_DIGITS},}}")
 LARGE = re.compile(r"(?<=[(,])[-+]?\d++\.\d*+[Ee]\+?\d{3,}+")  # 1e100 or more
 

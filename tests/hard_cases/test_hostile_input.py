@@ -163,6 +163,7 @@ PIECES = (  # each was seen to take the square of its number, or is a neighbour 
     "#1,", "'", "(", "()", "#", "#1=(", "#1=A(#2)", ")#3=(", ";", "= ", " ", "=PRODUCT('", "FILE_SCHEMA((",
     "LENGTH_UNIT()", "GLOBAL_UNIT_ASSIGNED_CONTEXT((", "B_SPLINE_SURFACE(2,", "B_SPLINE_CURVE_WITH_KNOTS('',2,(#1",
     "#7=CARTESIAN_POINT('',(", "DATA;", "ENDSEC;", ".T", "1.E1,", "SI_UNIT(", "\\X2\\", "A", ".A.,",
+    "1", "#1", "1.", "-", "NAN,", "/*",
 )  # fmt: skip
 AROUND = (
     ("", ""), ("#99000=(", ");"), ("#99000=PRODUCT('", "','','',());"),
