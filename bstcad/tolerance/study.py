@@ -56,8 +56,8 @@ def here(work: Callable[[Any, Any], Any], shared: Any, items: Sequence[Any]) -> 
     threads = ThreadPoolExecutor(at_once)
     try:
         yield from threads.map(work, repeat(shared), items[1:])
-    finally:
-        threads.shutdown(cancel_futures=True)
+    finally:  # nobody waits for a picture under way, which may take ten seconds, after a Ctrl-C
+        threads.shutdown(wait=False, cancel_futures=True)
 
 
 def _threads_may_share() -> bool:

@@ -8,6 +8,7 @@ import json
 import math
 import re
 import shutil
+import threading
 from dataclasses import replace
 
 import distributed
@@ -64,6 +65,25 @@ def test_pictures_two_at_a_time_are_those_of_one(pictures, layer, monkeypatch):
     found = list(here(of, pictures, amounts))
     assert max(most) == {"omp": 2, "workqueue": 1}[layer]
     assert all(np.array_equal(a, pictures.of(z)) for a, z in zip(found, amounts, strict=True))
+
+
+def test_after_an_interrupt_nobody_waits_for_a_picture_under_way():
+    """One of a large net takes ten seconds, and Ctrl-C ends a study within three."""
+    began, goes_on, ended = threading.Event(), threading.Event(), []
+
+    def work(shared, item):
+        if item == 2:
+            began.set()
+            goes_on.wait(10.0)
+            ended.append(item)
+        return item
+
+    found = here(work, None, [0, 1, 2, 3, 4])
+    assert (next(found), next(found)) == (0, 1) and began.wait(10.0)
+    with pytest.raises(KeyboardInterrupt):
+        found.throw(KeyboardInterrupt())
+    assert ended == []
+    goes_on.set()
 
 
 def test_amounts_are_as_wide_as_they_say(pictures):
