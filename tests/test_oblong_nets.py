@@ -185,8 +185,8 @@ def test_it_can_be_a_front_and_a_shop_gets_its_grid(made):
     )
     assert behind.lens.front.surface.shape == (65, 17)
     grid, note = design.export("zemax")
-    assert grid.read_text().splitlines()[0].split()[:2] == ["62", "14"]  # its knots but for those at the ends
-    assert "62 x 14 points" in note.read_text()
+    assert grid.read_text().splitlines()[0].split()[:2] == ["121", "25"]  # its knots and the middles between them
+    assert "121 x 25 points" in note.read_text()
 
 
 def test_square_cells_serve_a_wide_picture_no_worse_than_as_many_oblong_ones(made):

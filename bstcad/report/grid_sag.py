@@ -2,8 +2,8 @@
 
 OpticStudio interpolates between the points of a grid by bicubic Hermite patches.  A net is one biquadratic piece in
 each knot span (optics/bspline.py), and the patch over the four corners of a span is that piece: a grid whose points are
-the knots is exact.  In the end spans x(t) is quadratic, and the net is no polynomial in x; there a grid through all
-knots is made finer until the light moves by less than BOUND.
+the knots, and perhaps points between them, is exact.  In the end spans x(t) is quadratic, and the net is no polynomial
+in x; there a grid through all knots is made finer until the light moves by less than BOUND.
 
 `Patches` is the surface that such a program has.  Rays through it and through the lens show how far the light moves.
 """
@@ -33,6 +33,7 @@ FEWEST, MOST = 3, 4097  # points a side of a table
 LEAST_OF_ZEMAX = 5  # points a side: "the nx and ny values must be no smaller than 5" (OpticStudio's help, Grid Sag)
 BOUND = 0.1  # target pixels that light may move by a grid of our own density
 PARTS = (1, 2, 4, 8, 16)  # grid cells a knot span
+FLUSH = 1_050_000  # points of a grid that ends at the rim, at most; larger ones end at the knots beyond it, with fewer
 RAYS = 192  # a side, by which the light is compared
 NEAR = 1e-9  # of a pitch, by which a knot may miss the rim
 NEWTON = 12  # steps to where a ray meets the patches; smooth faces need 5
@@ -184,6 +185,12 @@ def through_knots(face: BSplineSurface, outline: Outline, parts: int) -> tuple[n
     return found[0], found[1]
 
 
+def _is_flush(x: np.ndarray, y: np.ndarray, outline: Outline) -> bool:
+    """Does a grid end at the outline's bounding box?  The rim of most nets lies on a knot, or half between two."""
+    box = zip((x, y), outline.half_extent, strict=True)
+    return all(max(abs(at[0] + half), abs(at[-1] - half)) < NEAR * (at[1] - at[0]) for at, half in box)
+
+
 def on_grid(face: BSplineSurface, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
     """(z, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y) (mm, 1, 1, 1/mm) of a face at each pair of x and y (mm) within its net.
 
@@ -256,10 +263,10 @@ class GridSag:
         """The grid of so many points along the wider side of the outline's bounding box, or by default of the knots."""
         if points is not None:
             return cls._at(lens, face, axes(lens.outline, max(points, LEAST_OF_ZEMAX), LEAST_OF_ZEMAX), throw)
+        grids = [at for parts in PARTS if (at := through_knots(face, lens.outline, parts)) is not None]
+        flush = [(x, y) for x, y in grids[:2] if _is_flush(x, y, lens.outline) and len(x) * len(y) <= FLUSH]
         best = None
-        for parts in PARTS:
-            if (at := through_knots(face, lens.outline, parts)) is None:
-                continue
+        for at in (*flush, *grids):
             best = cls._at(lens, face, at, throw)
             if best.moved is None or best.moved.most <= BOUND * best.moved.pixel:
                 return best

@@ -13,6 +13,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, sag
+from bstcad.report import grid_sag
 from bstcad.report.grid_sag import BOUND, GridSag, Moved, Throw, moved_by, table_note
 from tests.report.test_exports import read_zemax
 
@@ -47,8 +48,10 @@ def test_the_light_moves_as_far_as_is_stated(points):
     x, y = np.random.default_rng(1).uniform(-1.0, 1.0, (2, 1500)) * np.array([[4.0], [3.0]])
     slopes = np.array([part.numpy() for part in lens.back.sag_and_slope(*map(torch.from_numpy, (x, y)))[1:]])
     off = (lens.index - 1) * THROW * np.linalg.norm(interpolated(grid.text(), x, y) - slopes, axis=0)
-    if points is None:  # through the knots: nothing moves
-        assert off.max() < 1e-9 and grid.moved.most < 1e-9 and len(grid.grid.x) == 18 and len(grid.grid.y) == 14
+    at = grid.grid.x, grid.grid.y
+    assert [each[-1] for each in at] == pytest.approx([4.0, 3.0]) == [-each[0] for each in at]  # as large as the lens
+    if points is None:  # through the knots, with one point between two: nothing moves
+        assert off.max() < 1e-9 and grid.moved.most < 1e-9 and [len(each) for each in at] == [33, 25]
         assert "leave out --points" not in grid.note("a.dat")
     else:
         assert grid.moved.rms == pytest.approx(np.sqrt((off**2).mean()), rel=0.1)  # by 1500 points
@@ -86,6 +89,15 @@ def test_a_mirror_is_judged_by_its_own_light():
     mirror = replace(through, front=Plane(-2.0), reflects=True)
     moved = [moved_by(lens, lens.back, GridSag.of(lens, lens.back, 21).patches, BEAM) for lens in (through, mirror)]
     assert moved[1].rms == pytest.approx(4 * moved[0].rms, rel=0.02)
+
+
+def test_a_large_grid_ends_at_the_knots_beyond_the_rim(monkeypatch):
+    """It has a quarter of the points; so has the grid of a net whose rim lies elsewhere between the knots."""
+    monkeypatch.setattr(grid_sag, "FLUSH", 33 * 25 - 1)
+    for lens in (wavy(), wavy(past=1.8)):
+        each = GridSag.of(lens, lens.back, None, BEAM)
+        assert (len(each.grid.x), len(each.grid.y)) == (18, 14) and each.moved.most < 1e-9
+        assert 4.0 < each.grid.x[-1] < 4.0 + each.grid.step[0] and each.grid.x[0] == pytest.approx(-each.grid.x[-1])
 
 
 def test_a_narrow_lens_has_the_five_points_that_opticstudio_asks_for():
