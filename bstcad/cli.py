@@ -338,7 +338,8 @@ def plan(scene: SceneFile, settings: Settings = None, as_json: AsJson = False, p
     if as_json:
         net = {"control_points": asdict(choice)} if choice else {}
         sizes = {"files": {"lens.step": round(folders.step_size(wanted))}}
-        print(json.dumps(next(parts) | effects | net | sizes, ensure_ascii=False, indent=2))
+        likely = next(parts)
+        print(json.dumps({"verdict": None} | effects | likely | net | sizes, ensure_ascii=False, indent=2))
         return 0
     console = Console()
     console.print(reports.plan_effects(effects, wanted.title or wanted.name, wanted.optic))

@@ -93,19 +93,21 @@ def of_plan(plan: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
     ]
     rough = {quality: told(each["seconds"], each["rrmsd"]) for quality, each in plan["estimated"].items()}
     simulated = [item["what"] for item in plan["simulated"]]
-    return {"simulated": simulated, "left_out": rows, "net": plan["net"], "qualities": rough}
+    verdict = plan.get("verdict")
+    return {"simulated": simulated, "left_out": rows, "net": plan["net"], "qualities": rough, "verdict": verdict}
 
 
 def of_predictions(plan: Mapping[str, Any]) -> dict[str, Any]:
     """Seconds and RRMSD of each quality as predicted, or why they are not."""
     if plan["predicted"] is None:
-        return {"not_predicted": plan["not_predicted"], "notes": [], "qualities": {}}
+        none = {"not_predicted": plan["not_predicted"], "notes": [], "qualities": {}}
+        return none | {"verdict": plan["verdict"] if plan["verdict"]["kind"] == "blurred" else None}
     known = {
         quality: told(each["seconds"][1], each["rrmsd"][1], each["seconds"][::2], each["rrmsd"][::2])
         for quality, each in plan["predicted"].items()
         if quality in QUALITIES
     }
-    return {"not_predicted": None, "notes": plan["notes"], "qualities": known}
+    return {"not_predicted": None, "notes": plan["notes"], "qualities": known, "verdict": plan["verdict"]}
 
 
 def told(

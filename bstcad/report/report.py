@@ -39,6 +39,10 @@ BADGES = {  # report["verdict"]: (sign, style of the page, of the terminal)
     NO_LIMIT: ("?", "plain", "bold cyan"),
     "failed": ("✗", "fail", "bold red"),
 }
+OF_PLAN = {  # kind of a plan's verdict: style of the terminal
+    "blurred": "bold red", "beyond": "bold red", "open": "bold yellow", "within": "bold green", "no limit": "bold cyan",
+    "not predicted": "bold yellow",
+}  # fmt: skip
 OF_GLASS = ("lost through the sides", "total internal reflection")  # lines of the ledger that a mirror cannot have
 ESTIMATED = (
     "Estimated on a coarse lens; most figures are good to a factor of two. RRMSD: what the effect alone gives a {} "
@@ -244,7 +248,10 @@ def named(text: str) -> tuple[str, str]:
 
 
 def plan_effects(plan: Mapping[str, Any], title: str, optic: str) -> Group:
-    """Tables of the effects that are simulated and left out, from the entries of `plan --json`."""
+    """Tables of the effects that are simulated and left out, from the entries of `plan --json`.
+
+    The verdict comes first where they decide it.
+    """
     from rich.console import Group
     from rich.table import Table
     from rich.text import Text
@@ -255,13 +262,21 @@ def plan_effects(plan: Mapping[str, Any], title: str, optic: str) -> Group:
     for entry in (LeftOut(**entry) for entry in plan["left_out"]):
         if entry.simulate_by:
             remedies.add_row(Text(f"  {LEFT_OUT[entry.kind]}"), Text(entry.simulate_by))
-    lines, further = [Text(title, "bold"), simulated], plan.get("further", ())
+    early = [*_verdict(plan), Text()] if "verdict" in plan else []
+    lines, further = [*early, Text(title, "bold"), simulated], plan.get("further", ())
     for each in (plan, *further):
         lines += _of_target(each, f", {each.get('target', 'target[0]')}" if further else "", optic)
     lines.append(Text(" ".join(filter(None, (ESTIMATED.format(optic), plan.get("caveat"))))))
     if remedies.row_count:
         lines += [Text(), Text("To have it simulated, write in the scene:"), remedies]
     return Group(*lines)
+
+
+def _verdict(plan: Mapping[str, Any]) -> Iterator[Text]:
+    """What a plan comes to."""
+    from rich.text import Text
+
+    yield Text.assemble(("PLAN: ", OF_PLAN[plan["verdict"]["kind"]]), plan["verdict"]["sentence"])
 
 
 def _of_target(plan: Mapping[str, Any], of: str, optic: str) -> Iterator[RenderableType]:
@@ -289,6 +304,7 @@ def plan_predictions(plan: Mapping[str, Any]) -> Group:
     from rich.console import Group
     from rich.text import Text
 
+    head = list(_verdict(plan)) if plan["verdict"]["kind"] not in ("blurred", "not predicted") else []
     if plan["predicted"] is None:
         return Group(Text(), Text(f"Seconds, RRMSD and memory are not predicted: {plan['not_predicted']}."))
     rows, finer = dict(plan["predicted"]), plan["finer"]
@@ -299,7 +315,7 @@ def plan_predictions(plan: Mapping[str, Any]) -> Group:
         intervals = (map(about, entry[key]) for key in ("seconds", "rrmsd", "memory_gb"))
         cells = (Text.assemble(likely, (f" ({low} to {high})", "dim")) for low, likely, high in intervals)
         table.add_row(Text(name), *cells)
-    return Group(Text(), table, Text(" ".join((*plan["notes"], INTERVALS))))
+    return Group(Text(), *head, table, Text(" ".join((*plan["notes"], INTERVALS))))
 
 
 def _table(first: str, *others: str) -> Table:

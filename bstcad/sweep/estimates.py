@@ -87,6 +87,8 @@ def _central(scene: Scene, *more: Effect) -> Channel:
 
 # --- effects that are left out ----------------------------------------------------------------------------------------
 
+VISIBLE = (400.0, 700.0)  # nm; of white light
+SUN = (0.5, 0.56)  # degrees; divergence of sunlight, 0.53 in the mean
 LINE = 10.0  # nm; width of a line of which the scene says nothing: an LED's is 20 to 40, a laser's below 1
 DIAMETER = 0.1  # mm; of a point source
 DIVERGENCE = 0.1  # degrees; of parallel light
@@ -148,13 +150,24 @@ def _dispersion(scene: Scene, reference: Reference) -> LeftOut:
     channel, material = reference.channel, scene.lens.material
     if material is None:
         return _entry("dispersion", None, "lens.index names no material", f"lens.material, and {BY_LINES}")
-    middle = channel.source.wavelength
-    around = [(middle + LINE / 2 * place, weight) for place, weight in THREE]
+    low, high = band(scene)
+    around = [((low + high) / 2 + (high - low) / 2 * place, weight) for place, weight in THREE]
     try:
         channels = [replace(channel, index=media.refractive_index(material, nm), weight=w) for nm, w in around]
     except ValueError:
-        return _entry("dispersion", None, f"there are no data of {material} around {middle:g} nm", BY_LINES)
-    return _entry("dispersion", reference.change(channels), f"of a line {LINE:g} nm wide", BY_LINES, assumed=True)
+        between = f"from {low:g} to {high:g} nm"
+        return _entry("dispersion", None, f"there are no data of {material} {between}", BY_LINES)
+    sun = (low, high) == VISIBLE
+    words = f"of sunlight, even from {low:g} to {high:g} nm" if sun else f"of a line {LINE:g} nm wide"
+    return _entry("dispersion", reference.change(channels), words, BY_LINES, assumed=not sun)
+
+
+def band(scene: Scene) -> tuple[float, float]:
+    """Return the band (nm) that light of one wavelength stands for: of the sun's divergence VISIBLE, else LINE wide."""
+    source = scene.source
+    if source.kind != "point" and SUN[0] <= (source.divergence or source.real_divergence or 0.0) <= SUN[1]:
+        return VISIBLE
+    return source.main_wavelength - LINE / 2, source.main_wavelength + LINE / 2
 
 
 def _size(scene: Scene, reference: Reference) -> Iterator[LeftOut]:

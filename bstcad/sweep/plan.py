@@ -29,6 +29,7 @@ from bstcad.optics.reach import restricted, unreached
 from bstcad.optics.sides import both, coarser, scaled
 from bstcad.pipeline import check_thickness, reachable_part, reached, second_stage, steepness, task_of, transport_of
 from bstcad.report.record import simulated, too_steep
+from bstcad.report.units import about, duration, number, quantity, two_digits
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.quality import COARSEST_GRID, PRESETS, Tailoring
 from bstcad.scene.scene import Scene
@@ -40,6 +41,7 @@ from bstcad.tailoring.run import EVALUATED, Driver
 from bstcad.tailoring.slope_map import SUBCELLS
 from bstcad.tailoring.stage1 import aimed
 from bstcad.tailoring.stage2 import JOINT, blurred_sheets, sheets
+from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT
 
 FITTED = Path(__file__).with_name("fitted.json")
 Interval = tuple[float, float, float]  # low, likely, high
@@ -64,6 +66,8 @@ def plan(
     further: the last three of each further target, by its key; only there if there are several.  caveat: what the lens
     of the estimates lacks of the scene's, a sentence; only there if it lacks anything.
 
+    verdict: {kind, sentence}, with the effects only where these decide it: see `verdict`.
+
     text: of the scene file, whose lines are named.  keys: that the command line gives instead.  units: measures the
     units of this machine.  tick: called now and then; an exception from it ends the plan.
     """
@@ -76,8 +80,60 @@ def plan(
         found["further"] = [{"target": key, **_effects(alone, coarse_lens(alone), key)} for key, alone in pairs]
     if others or scene.lens.front.shaped:
         found["caveat"] = ALONE
+    if early := verdict(scene, found):
+        found["verdict"] = early
     yield found
-    yield rounded(outlook(scene, lens, units, tick), 3)
+    likely = rounded(outlook(scene, lens, units, tick), 3)
+    yield likely | {"verdict": verdict(scene, found | likely)}
+
+
+def verdict(scene: Scene, found: Mapping[str, Any]) -> dict[str, str] | None:
+    """Return what a plan comes to, {kind, sentence}; None: the entries that are known so far do not decide it.
+
+    kind: blurred (by the source's image, beyond the RRMSD that is allowed, whatever the lens), within, open or beyond
+    (of the RRMSD that is asked, by what nine of ten designs keep to), no limit (is asked), not predicted.
+    """
+    asked = scene.accept.rrmsd
+    allowed = DEFAULT_RRMSD_LIMIT if asked is None else asked
+    targets = zip(scene.targets, (found, *found.get("further", ())), strict=True)
+    images = [(each["blur"]["rrmsd"], each["blur"]["width"], target) for target, each in targets if each["blur"]]
+    blurred, width, target = max(images, key=lambda image: image[0], default=(0.0, 0.0, scene.target))
+    wide = max(high - low for low, high in (target.screen.x, target.screen.y))
+    least, most = (number(two_digits(value)) for value in (UNDONE * blurred, blurred))
+    if UNDONE * blurred > allowed:
+        sentence = (
+            f"The picture will be blurred: through each place of the {scene.optic} the source throws an image of "
+            f"itself {about(width, 'mm')} wide on the target, which is {quantity(wide, 'mm')} wide. The RRMSD will be "
+            f"{least} to {most} whatever the {scene.optic}, where {number(allowed)} is allowed. Take a smaller source, "
+            f"one further before the {scene.optic}, a target nearer behind it, or a coarser picture."
+        )
+        return {"kind": "blurred", "sentence": sentence}
+    if "predicted" not in found:
+        return None
+    if found["predicted"] is None:
+        text = f"No RRMSD is predicted: {found.get('not_predicted')}."
+        if blurred > NOTABLE:
+            text += f" The source's image, {about(width, 'mm')} wide on the target, makes one of {least} to {most}."
+        return {"kind": "not predicted", "sentence": text}
+    quality = scene.tailoring.quality if scene.tailoring.quality in QUALITIES else "standard"
+    (low, likely, high), (_, time, _) = (found["predicted"][quality][key] for key in ("rrmsd", "seconds"))
+    took = about(time, "s") if time < MINUTE else duration(two_digits(time))
+    text = f"An RRMSD of about {about(likely)} in about {took}, in {quality} quality"
+    if asked is None:
+        kept = f"[accept] rrmsd = {two_digits(high):g}"
+        kind, words = "no limit", f"none is asked; nine of ten designs would keep {kept}"
+    elif high <= asked:
+        kind, words = "within", f"{number(asked)} is allowed"
+    elif low > asked:
+        kind, words = "beyond", f"{number(asked)} is allowed, and will hardly be reached"
+    else:
+        kind, words = "open", f"{number(asked)} is allowed, and {about(low)} to {about(high)} may come out"
+    if COARSE * width > wide:
+        words += (
+            f". The source's image on the target is {about(width, 'mm')} wide, and the target {quantity(wide, 'mm')}: "
+            "finer detail is lost"
+        )
+    return {"kind": kind, "sentence": f"{text}; {words}."}
 
 
 def _effects(scene: Scene, lens: Lens, key: str) -> dict[str, Any]:
@@ -251,6 +307,9 @@ QUALITIES = ("draft", "standard", "fine")
 SIZES = {"draft": (256, 385, 768), "standard": (128, 193, 512)}
 FEWEST_POINTS = 65  # control points a side
 A_GOAL = 3.0  # times the memory of corners for one target, that each of several goals takes (6.2 GB; 5.9 measured)
+MINUTE = 60.0  # s
+NOTABLE = 0.01  # RRMSD by the source's image that is worth a sentence
+COARSE = 10.0  # images of the source beside each other on a target: where there are fewer, a plan says so
 UNDONE = 0.5  # of the blur by a source of some size, that stage 3 leaves
 PILOT_CELLS = (16, 256)  # a side of its transport, at least and at most
 PILOT_JUDGED = Effort(rays=2048, accuracy=0.02, witness=False)  # few rays are noisier than smooth light is wrong

@@ -17,7 +17,7 @@ from bstcad.optics.measure import tubes_picture
 from bstcad.optics.trace import ghost_light
 from bstcad.scene.effects import Absorption, Fresnel
 from bstcad.scene.scene import load
-from bstcad.sweep.estimates import DIAMETER, DIVERGENCE, LINE, coarse_lens, left_out
+from bstcad.sweep.estimates import DIAMETER, DIVERGENCE, band, coarse_lens, left_out
 from tests.benchmarks.cold import TEMPLATES
 
 pytestmark = pytest.mark.bench
@@ -41,9 +41,10 @@ def switched_on(scene, kind):
     if kind == "absorption":
         return scene.model_copy(update={"effects": (*scene.effects, Absorption(kind="absorption"))}).channels()
     if kind == "dispersion":
-        lines = (np.arange(LINES) + 0.5) / LINES - 0.5
+        low, high = band(scene)
+        lines = low + (high - low) * (np.arange(LINES) + 0.5) / LINES
         return [replace(channel, weight=channel.weight / LINES,
-                        index=media.refractive_index(scene.lens.material, channel.source.wavelength + LINE * line))
+                        index=media.refractive_index(scene.lens.material, line))
                 for channel in channels for line in lines.tolist()]  # fmt: skip
     if kind == "source size":
         turn, far = GOLDEN * np.arange(SAMPLES), np.sqrt((np.arange(SAMPLES) + 0.5) / SAMPLES)

@@ -99,6 +99,23 @@ def test_no_larger_net_is_offered_than_there_may_be():
     assert known - left == {"control points"} and left
 
 
+def test_sunlight_parts_over_all_that_is_seen():
+    """Of the sun's divergence, light from 400 to 700 nm counts; of a laser's a line of 10 nm."""
+    scene = load(TEMPLATES / "sun_caustic.toml", {"target.pixels": 64, "lens.back.control_points": 65})
+    lens = coarse_lens(scene)
+
+    def dispersion(divergence):
+        changed = scene.changed({"source.divergence": None, "source.real_divergence": divergence})
+        [entry] = [e for e in left_out(changed, lens, scene.target.irradiance()) if e.kind == "dispersion"]
+        return entry
+
+    sun, laser = dispersion(0.53), dispersion(0.01)
+    assert sun.detail == "of sunlight, even from 400 to 700 nm" and not sun.assumed
+    assert laser.detail == "of a line 10 nm wide" and laser.assumed
+    # the index of PMMA changes by 0.0155 between 434 and 666 nm, and by 3.6e-4 over the line
+    assert 20 < sun.blur_pixels / laser.blur_pixels < 60 and sun.rrmsd_change > 10 * laser.rrmsd_change
+
+
 def _by(limits, name):
     [limit] = [limit for limit in limits if limit["by"] == name]
     return limit

@@ -279,6 +279,46 @@ def test_the_image_of_a_chip_is_stated_before_the_design():
     assert small["width"] == pytest.approx(found["width"] / 2, rel=0.05) and small["rrmsd"] < found["rrmsd"]
 
 
+def predicted(low, likely, high):
+    return {"predicted": {"standard": {"rrmsd": (low, likely, high), "seconds": (20.0, 30.0, 40.0)}}, "blur": None}
+
+
+VERDICTS = [
+    (0.1, predicted(0.02, 0.03, 0.04), "within", "An RRMSD of about 0.03 in about 30 s, in standard qualit"),
+    (0.1, predicted(0.08, 0.12, 0.15), "open", "0.1 is allowed, and 0.08 to 0.15 may come out."),
+    (0.1, predicted(0.2, 0.3, 0.4), "beyond", "0.1 is allowed, and will hardly be reached."),
+    (None, predicted(0.02, 0.03, 0.04), "no limit", "nine of ten designs would keep [accept] rrmsd = 0.0"),
+    (0.1, {"predicted": None, "not_predicted": "too odd", "blur": None}, "not predicted", "is predicted: too odd."),
+    (0.1, {"blur": {"rrmsd": 0.3, "width": 9.0, "pixels": 3.0}}, "blurred", "The RRMSD will be 0.15 to 0.3 whatever"),
+    (0.5, {"blur": {"rrmsd": 0.3, "width": 9.0, "pixels": 3.0}}, None, ""),
+]
+
+
+@pytest.mark.parametrize(("asked", "found", "kind", "words"), VERDICTS, ids=[kind for _, _, kind, _ in VERDICTS])
+def test_a_plan_comes_to_a_verdict(asked, found, kind, words):
+    told = plans.verdict(portrait(65).changed({"accept.rrmsd": asked}), found)
+    assert (told and told["kind"]) == kind and (kind is None or words in told["sentence"])
+
+
+def test_a_chip_that_blurs_the_picture_is_said_first(tmp_path, capsys, monkeypatch):
+    """A chip of 5 mm before a lens of 60 mm, whose image on the wall is some 40 mm wide: a line of 300 mm is gone."""
+    scene = load(TEMPLATES / "led.toml", {
+        "source.diameter": None, "source.width": 5.0, "source.height": 5.0, "lens.front.z": 60.0, "lens.back.z": 70.0,
+        "lens.outline.radius": 30.0, "target.z": 570.0, "target.x": [-150.0, 150.0], "target.y": [-150.0, 150.0],
+        "target.uniform": None, "target.text": "thirty-two words", "target.pixels": 96, "accept.rrmsd": None,
+    })  # fmt: skip
+    monkeypatch.setattr(plans, "outlook", lambda *given: {"predicted": None, "not_predicted": "the test ends here"})
+    path = tmp_path / "chip.toml"
+    path.write_text(scene.toml(), encoding="utf-8")
+    assert cli.run(["plan", str(path), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert next(iter(found)) == "verdict" and found["verdict"]["kind"] == "blurred" and found["blur"]["rrmsd"] > 0.5
+    assert found["blur"]["width"] == pytest.approx((4 / 3) ** 0.5 * 5 * 500 / (60 + 10 / scene.index), rel=0.1)
+    monkeypatch.setattr(plans, "outlook", lambda *given: {"predicted": None, "not_predicted": "x", "finer": None})
+    assert cli.run(["plan", str(path)]) == 0
+    assert capsys.readouterr().out.startswith("PLAN: The picture will be blurred: through each place of the lens")
+
+
 class TestCommand:
     def test_the_image_of_a_chip_is_a_sentence(self, capsys):
         assert cli.run(["plan", str(TEMPLATES / "led.toml"), "--set", "target.pixels=48"]) == 0
@@ -291,6 +331,7 @@ class TestCommand:
         out, err = capsys.readouterr()
         found = json.loads(out)
         keys = {"predicted", "not_predicted", "finer", "notes", "simulated", "left_out", "blur", "unreachable", "files"}
+        keys |= {"verdict"}
         assert set(found) == keys and err == ""
         assert found["blur"] is None and found["unreachable"] is None  # a beam of no size, all within reach
         assert found["predicted"] is None and "target.pixels from 120 to 512" in found["not_predicted"]

@@ -284,6 +284,7 @@ function noPlan(sentence) {
   qualities = {};
   for (const table of [element("predicted"), element("left-out").querySelector("table")]) table.tBodies[0].replaceChildren();
   element("net").textContent = "";
+  element("comes-to").textContent = "";
   element("notes").textContent = sentence;
   sayQuality();
 }
@@ -339,6 +340,10 @@ element("solid-figure").addEventListener("click", ({ target }) => {
 // ---- time and accuracy, and what is left out ----
 
 function showPlan(told) {
+  if (!told.refused) {
+    element("comes-to").textContent = told.verdict?.sentence ?? "";
+    element("comes-to").className = told.verdict?.kind === "blurred" ? "error" : "";
+  }
   if (told.refused) noPlan(`No estimate: ${told.refused}.`);
   else if (told.stage === "effects") {
     qualities = told.qualities;
