@@ -20,6 +20,7 @@ class Key:
     least: float | None = None  # None: the field holds no number
     most: float | None = None
     example: Any = None  # of a key that every scene has to give
+    remedy: str = ""  # what to do about a number out of range; "": to choose one in between
 
     def in_range(self, value: Any) -> Any:
         """The value of a field, if all of its numbers are in the range; else ValueError, a sentence."""
@@ -27,7 +28,7 @@ class Key:
             if not self.least <= number <= self.most:
                 unit = f" {self.unit}" if self.unit else ""
                 in_um = self.unit == "nm" and 0.1 <= number <= 20
-                remedy = f"did you mean {number * 1000:g} nm?" if in_um else "choose a value in between"
+                remedy = f"did you mean {number * 1000:g} nm?" if in_um else self.remedy or "choose a value in between"
                 between = f"{self.least:.10g} and {self.most:.10g}{unit}"
                 raise ValueError(f"{number:g}{unit} is not between {between}; {remedy}")
         return value

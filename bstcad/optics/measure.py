@@ -57,6 +57,9 @@ FEW = 64  # tubes a side of a coarse sheet of many: finding that is half of the 
 PASS = 1 << 20  # between the seeds of passes by rays from an extended source
 GHOSTS = 4  # times fewer rays a side for the light reflected twice, which is a hundredth of all
 IMAGE_PLACES = 48  # a side of the back face, through each of which the source is seen
+# Light that grazes a tilted plane lands anywhere, and is no image: more than so many times as far from the screen's
+# middle as the screen is wide and half of the light is far.
+ASTRAY = 16
 EVEN = 2048  # pairs of points of an evenly bright source
 
 
@@ -462,20 +465,30 @@ class Images:
         square = torch.where(self.flux > 0, (self.offset**2).sum(0), torch.zeros_like(self.flux))
         return 2 * math.sqrt(2 * float(total(square * self.flux) / total(self.flux)))
 
-    def mean(self) -> np.ndarray:
-        """(rows, columns) the mean image, centred, sum 1; both odd."""
-        reach = [math.ceil(float(p[self.flux > 0].abs().max())) + 1 for p in self.offset]
-        sides = [2 * r + 1 for r in reach]
+    def mean(self, most: tuple[int, int]) -> np.ndarray:
+        """(rows, columns) the mean image, centred, of sum 1; both odd.
+
+        most: columns and rows as far as which it is wanted; light that is farther away counts in the sum alone.
+        """
+        far = [math.ceil(float(p[self.flux > 0].abs().max())) + 1 for p in self.offset]
+        sides = [2 * min(reach, side) + 1 for reach, side in zip(far, most, strict=True)]
         own = Screen(0.0, (-sides[0] / 2, sides[0] / 2), (-sides[1] / 2, sides[1] / 2), tuple(sides))
         position = self.offset * torch.tensor([1.0, -1.0]).view(2, 1, 1)  # rows count downwards
         image = tent(Landed(position, self.flux, torch.zeros(self.flux.shape, dtype=torch.uint8)), own)
-        return (image / image.sum()).numpy()
+        whole = image.sum() if all(reach <= side for reach, side in zip(far, most, strict=True)) else self.flux.sum()
+        return (image / whole).numpy()
 
     def deviation(self, target: np.ndarray) -> float:
-        """RRMSD of a target (rows, columns) convolved with the mean image, against the target itself."""
+        """RRMSD of a target (rows, columns) convolved with the mean image, against the target itself.
+
+        Light that is shifted by more than the target's width falls on none of it, and takes no room.
+        """
         from scipy.signal import fftconvolve  # half a second to load, which a point source need not pay
 
-        blurred = fftconvolve(target, self.mean(), mode="same").clip(min=0)
+        rows, columns = target.shape
+        blurred = fftconvolve(target, self.mean((columns, rows)), mode="same").clip(min=0)
+        if not blurred.any():  # the image is so much wider than the target that no sample of it falls there
+            blurred = np.ones_like(target)
         return float(rrmsd(torch.from_numpy(blurred), torch.from_numpy(np.asarray(target, dtype=np.float64))))
 
 
@@ -499,6 +512,10 @@ def images(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int = IMA
     first = channels[0]
     channels = [c for c in channels if (c.source.wavelength, c.index) == (first.source.wavelength, first.index)]
     pixel, flux = seen_through(channels, lens, screen, n)
+    if (flux > 0).any():
+        middle_off = (pixel - torch.tensor([screen.columns / 2, screen.rows / 2]).to(pixel).view(2, 1, 1)).abs().amax(0)
+        astray = middle_off > ASTRAY * (max(screen.shape) + middle_off[flux > 0].median())
+        flux = torch.where(astray, torch.zeros_like(flux), flux)
     lit = flux.sum(0) > 0
     flux, share = flux[:, lit], flux[:, lit] / flux[:, lit].sum(0)
     pixel = torch.where(flux > 0, pixel[..., lit], torch.zeros_like(share))

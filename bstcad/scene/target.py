@@ -43,13 +43,20 @@ PictureFile = Annotated[
 Tilt = Annotated[tuple[float, float] | None, AfterValidator(lambda tilt: tilt if tilt and any(tilt) else None)]
 
 
+# What to do about a wall that the axis runs along, or nearly so.
+AIM = (
+    "to light a wall beside the lamp, turn the lamp towards its middle: target.z is then the distance to there, and "
+    "target.tilt the angle that is left, such as [60.0, 0.0]"
+)
+
+
 class Target(Record):
     """The picture on the plane z, or on one that is turned about its middle, over the rectangle x by y."""
 
     z: Annotated[float, Key("Plane of the target, or its middle if tilted.", "mm", *COORDINATES, example=1000.0)]
     x: Annotated[tuple[float, float], Key("Ends of the target along x.", "mm", *COORDINATES, example=[-200.0, 200.0])]
     y: Annotated[tuple[float, float], Key("Ends of the target along y.", "mm", *COORDINATES, example=[-200.0, 200.0])]
-    tilt: Annotated[Tilt, Key("Tilt about x, then about y.", "degrees", -89.0, 89.0)] = None
+    tilt: Annotated[Tilt, Key("Tilt about x, then about y.", "degrees", -89.0, 89.0, remedy=AIM)] = None
     pixels: Annotated[OneOrTwo, Key("Pixels along the longer side, or [columns, rows].", "", FEWEST, 4096, example=512)]
     text: Annotated[
         str | None, Key("The picture as letters, centred, over 84 % of the width or 80 % of the height.")

@@ -145,7 +145,7 @@ def slope_map(
     _, *g = net.relative_sag_and_slope(*(torch.from_numpy(p) for p in (b_x, b_y)))
     y_x, y_y = (sign * (p - own.numpy()) for p, own in zip(needed, g, strict=True))
     sigma, frame = spread_density(picture, (y_x, y_y), n)
-    mapping = solve(Density.from_values(rho), sigma, Frame((0.0, 0.0), side), frame, **solver)
+    mapping = solve(light_density(rho, side), sigma, Frame((0.0, 0.0), side), frame, **solver)
     places = mapping.inverse(y_x, y_y)
     moved = _moved(picture, (b_x, b_y), places) / (side / 2) if previous else math.nan
     return SlopeMap(mapping, net, sign, places=places, moved=moved)
@@ -270,6 +270,17 @@ def spread_density(picture: np.ndarray, corners: tuple[np.ndarray, np.ndarray], 
     return Density.from_values(spread(flux, x, y, n=n, parts=parts), floor=FLOOR), frame
 
 
+def light_density(values: np.ndarray, side: float) -> Density:
+    """The density of the light on cells of a square of this side (mm); SceneError if it falls between them."""
+    if not values.any():
+        raise SceneError(
+            "source: its light at the lens is narrower than a cell of the transport's grid "
+            f"({side / len(values):.3g} mm); make the sides of lens.outline more alike, or give a larger "
+            "tailoring.transport_grid"
+        )
+    return Density.from_values(values)
+
+
 def corners_of(picture: np.ndarray) -> np.ndarray:
     """(columns + 1, rows + 1), x first: the pixel corners of all that is not black."""
     lit = np.pad(picture[::-1].T > 0, 1)  # row 0 is y max
@@ -285,7 +296,7 @@ def source_density(source: Source, lens: Lens, n: int) -> tuple[Density, Frame]:
     flux = source.irradiance(x, y, lens.entrance.z)
     flux = flux * gets_through(source.rays(x, y, lens.entrance.z, 1.0), lens)
     flux = flux.cpu().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3))
-    return Density.from_values(flux), Frame((0.0, 0.0), side)
+    return light_density(flux, side), Frame((0.0, 0.0), side)
 
 
 def map_to_target(

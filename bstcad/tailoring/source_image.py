@@ -46,6 +46,8 @@ FINER = 5  # an odd number
 SIDE = 1448  # rays a side of each of the two sets that tell what the images leave out
 POINTS = 256  # of the source in each set
 SMOOTH = 0.15  # of the image's reach in pixels: standard deviation by which that picture is smoothed
+ROOM, BYTES = 2 << 30, 8  # bytes of the transforms of all images, and of each at a place
+LEAST_BORDER = 16  # pixels
 SEED = 500_009  # added to the seed: rays that no judge sees
 
 
@@ -160,7 +162,18 @@ def blurs(spread: Spread, lens: Lens, screen: Screen) -> tuple[Blur, ...]:
         near = [seen.nearest(column, row) for row in nodes[0] for column in nodes[1]]
         kernels.append([tuple((part[..., None] * dots).sum(-2) for part in image) for image in near])
     reach = max(float(offset.abs().max()) for images in kernels for offset, _ in images)
-    return tuple(_blur(images, screen, border=math.ceil(reach) + 2) for images in kernels)
+    border = min(math.ceil(reach) + 2, widest(screen, len(kernels)))
+    return tuple(_blur(images, screen, border) for images in kernels)
+
+
+def widest(screen: Screen, lines: int) -> int:
+    """The widest border (pixels) of the transforms: no wider than the screen, and of ROOM bytes for all lines.
+
+    Light that is shifted by more than the screen's width comes from beside it.  Near a tilted plane that some light
+    grazes, images would have no end.
+    """
+    side = math.sqrt(ROOM / (lines * NODES**2 * BYTES))
+    return max(min(max(screen.shape), int((side - max(screen.shape)) / 4)), LEAST_BORDER)
 
 
 def _blur(images: Sequence[tuple[Tensor, Tensor]], screen: Screen, border: int) -> Blur:

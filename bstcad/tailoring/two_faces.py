@@ -55,13 +55,13 @@ from bstcad.tailoring.slope_map import (
     SlopeMap,
     corners_of,
     face_grid,
+    light_density,
     lit_window,
     pixel_corners,
     rays_at,
     spread_density,
 )
 from bstcad.transport.bfm import Step as TransportStep
-from bstcad.transport.density import Density
 from bstcad.transport.mapping import Frame, solve
 
 NUDGE = 1e-4  # of the thickness: step of the difference quotients of the slopes
@@ -233,7 +233,7 @@ def front_map(
     _, *g = net.relative_sag_and_slope(*(torch.from_numpy(q) for q in places))
     y_x, y_y = (own.numpy() - p.numpy() for p, own in zip(slopes, g, strict=True))
     sigma, frame = spread_density(aims.picture, (y_x, y_y), n)
-    mapping = solve(Density.from_values(rho), sigma, Frame((0.0, 0.0), side), frame, **solver)
+    mapping = solve(light_density(rho, side), sigma, Frame((0.0, 0.0), side), frame, **solver)
     now = mapping.inverse(y_x, y_y)
     moved = math.sqrt(np.mean(sum((a - b)[lit] ** 2 for a, b in zip(now, places, strict=True)))) / (side / 2)
     return SlopeMap(mapping, net, -1.0, places=now, moved=moved)
