@@ -30,7 +30,7 @@ from starlette.routing import Route
 from starlette.staticfiles import StaticFiles
 
 import bstcad
-from bstcad.app import design_runs, form, preview_json, scene_text, sketch
+from bstcad.app import crop, design_runs, form, preview_json, scene_text, sketch
 from bstcad.app.choices import impossible
 from bstcad.app.connections import HeadersInTime
 from bstcad.app.design_runs import WRITTEN, Run
@@ -88,6 +88,8 @@ class Workbench:
             Route(UPLOAD, self.keep_picture, methods=["POST"]),
             Route(scene, self.scene_state),
             Route(f"{scene}/change", self.change_scene, methods=["POST"]),
+            Route(f"{scene}/photo.png", self.photo),
+            Route(f"{scene}/proportions", self.take_proportions, methods=["POST"]),
             Route(f"{scene}/impossible", self.impossible_choices),
             Route(f"{scene}/save", self.save_scene, methods=["POST"]),
             Route(f"{scene}/drop", self.drop_changes, methods=["POST"]),
@@ -312,6 +314,28 @@ class Workbench:
             text, key, value, is_sound=lambda each: self._fault(name, each) is None, sound=self._sound.get(name),
             locked=asked.get("locked") is True,
         )  # fmt: skip
+
+    def photo(self, request: Request) -> Response:
+        """The photo of a target, ?key, whole and small: a frame is dragged over it."""
+        name, key = request.path_params["name"], request.query_params.get("key", "target")
+        scene = self.workspace.scene(name, self.workspace.opened(name).text)
+        return Response(crop.small_photo(crop.target_of(scene, key)), media_type="image/png")
+
+    async def take_proportions(self, request: Request) -> Response:
+        """Give plate and picture the proportions of a target's photo: {key of the target}."""
+        key, name = str((await _json(request)).get("key") or "target"), request.path_params["name"]
+
+        def with_proportions(text: str) -> str:
+            target = crop.target_of(self.workspace.scene(name, text), key)
+            for other, value in crop.in_proportions(scene_text.tables(text), key, target).items():
+                text = scene_text.changed(text, other, value)
+            return text
+
+        def changed() -> dict[str, Any]:
+            self.workspace.edit(name, with_proportions)
+            return self._state(name)
+
+        return JSONResponse(await run_in_threadpool(changed))
 
     def impossible_choices(self, request: Request) -> Response:
         """The choices of the form that this scene cannot have: {key: {choice: why}}."""

@@ -55,6 +55,23 @@ def test_plate_and_picture_have_the_proportions_of_the_photo(own, light, size):
     assert page.status == 200 and '"error": null' in page.text
 
 
+@pytest.mark.parametrize("crop", ["", "0; 0.5; 1; 1"])
+def test_plate_and_picture_take_the_proportions_of_a_photo_that_is_there(own, crop):
+    picture = own.ask("/api/picture", photo(80, 120)).json["picture"]
+    name = own.ask("/api/scenes", {"light": "led", "picture": picture}).json["name"]
+    small = Image.open(io.BytesIO(own.ask(f"/api/scene/{name}/photo.png?key=target").body))
+    assert small.size == (320, 480)
+    own.ask(f"/api/scene/{name}/change", {"key": "target.crop", "words": crop})
+    answer = own.ask(f"/api/scene/{name}/proportions", {"key": "target"}).json
+    scene = own.workspace.scene(name, answer["text"])
+    sides = (80, 60) if crop else (53.33, 80)
+    assert scene.lens.outline.half_extent == pytest.approx([side / 2 for side in sides])
+    assert scene.target.size == pytest.approx([6 * side for side in sides], rel=1e-3) and answer["error"] is None
+    for key in ("target[3]", "lens", ""):
+        assert own.ask("/api/scene/small/proportions", {"key": key}).status == 400  # no photo
+    assert own.ask("/api/scene/small/photo.png").status == 400
+
+
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # a process would end with its file
 @pytest.mark.parametrize(("light", "size"), [("laser", (80, 120)), ("lamp", (120, 80))])
 def test_a_photo_is_a_verified_lens_in_four_requests(own, light, size):

@@ -129,6 +129,35 @@ def test_a_wrong_entry_stays_in_its_field_and_no_lens_is_made_of_it(open_page, s
     assert page.locator("#form .error").count() == 0 and page.is_hidden("#fault")
 
 
+def test_a_crop_is_dragged_and_moved_by_keys(open_page, shared):
+    page = open_page(shared.address)
+    page.uncheck("#proportions")
+    wide = Image.open(io.BytesIO(picture())).crop((0, 20, 96, 84))  # 3 : 2
+    written = io.BytesIO()
+    wide.save(written, "png")
+    page.set_input_files("#picture", {"name": "p.png", "mimeType": "image/png", "buffer": written.getvalue()})
+    page.wait_for_selector("#frame:visible", timeout=PATIENCE)
+    page.wait_for_selector("#remarks li:has-text('cropped to the middle')", timeout=PATIENCE)
+    frame, photo = page.locator("#frame"), page.locator("#photo")
+    frame.scroll_into_view_if_needed()
+    box, whole = frame.bounding_box(), photo.bounding_box()
+    assert box["width"] == pytest.approx(whole["height"], abs=1)  # square, as the target is
+    page.mouse.move(box["x"] + 20, box["y"] + 20)
+    page.mouse.down()
+    page.mouse.move(box["x"] - 200, box["y"] + 20, steps=3)  # as far to the left as it goes
+    page.mouse.up()
+    text_has(page, "crop = [0.0, 0.0, 0.6667, 1.0]")
+    frame.focus()
+    page.keyboard.press("ArrowRight")
+    text_has(page, "crop = [0.02, 0.0, 0.6867, 1.0]")
+    assert page.evaluate("document.activeElement.id") == "frame"
+    page.click("#whole")
+    page.wait_for_function("() => !document.getElementById('text').value.includes('crop = [')")
+    page.click("#in-proportions")
+    text_has(page, "width = 80.0, height = 53.33")
+    text_has(page, "y = [-26.66667, 26.66667]")
+
+
 def test_no_figure_stays_after_an_estimate_that_fails(open_page, shared):
     page = open_page(shared.address)
     page.route("**/preview", lambda route: route.fulfill(json={"stage": "preview", "number": 1, "refused": "too far"}))

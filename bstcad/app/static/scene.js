@@ -2,6 +2,7 @@
 // preview follows.  Of changes that come while an earlier one is under way only the latest counts, and an older preview
 // stays until a new one is there.
 import { ask, element, embedded, pause, row } from "./common.js";
+import * as crop from "./crop.js";
 
 let state = embedded();
 const at = `/api/scene/${encodeURIComponent(state.name)}`, page = crypto.randomUUID();
@@ -28,6 +29,7 @@ function take(told) {
   if (anew) impossible = {};
   if (told.form !== null && dragging === null && (anew || error)) replaceForm(told.form);
   else markForm();
+  showCrop();
   sayFollowed(told.followed ?? []);
   sayFault();
   if (error) noEstimates(error.sentence);
@@ -111,6 +113,27 @@ function markForm() {
   for (const lock of form.querySelectorAll(".lock")) lock.setAttribute("aria-pressed", closed.has(lock.dataset.locks));
   for (const [key, choices] of Object.entries(impossible)) for (const control of controlsOf(key)) grey(control, choices);
 }
+
+// The frame over the photo of the first target.
+const numbersOf = (key) => (controlsOf(key)[0]?.value ?? "").split(/[;,]/).map(Number);
+const firstTarget = () => (controlsOf("target[0].z").length ? "target[0]" : "target");
+
+function showCrop() {
+  const key = firstTarget(), given = ["image", "sample"].map((name) => controlsOf(`${key}.${name}`)[0]?.value).find(Boolean);
+  const [x, y] = ["x", "y"].map((axis) => numbersOf(`${key}.${axis}`)), sides = [x[1] - x[0], y[1] - y[0]];
+  if (state.error || !given || !(sides[0] > 0 && sides[1] > 0)) return crop.hide();
+  const part = numbersOf(`${key}.crop`), fit = controlsOf(`${key}.fit`)[0]?.value || "crop";
+  if (["90", "270"].includes(controlsOf(`${key}.rotate`)[0]?.value)) sides.reverse();
+  const address = `${at}/photo.png?key=${encodeURIComponent(key)}&of=${encodeURIComponent(given)}`;
+  crop.show(address, { sides, given: part.length === 4 ? part : null, fills: fit === "crop" }, (value) => change({ key: `${key}.crop`, value }));
+}
+
+element("whole").addEventListener("click", () => change({ key: `${firstTarget()}.crop`, value: null }));
+element("in-proportions").addEventListener("click", async () => {
+  while (busy) await pause(50);
+  await order("proportions", { key: firstTarget() });
+  if (!state.error) preview();
+});
 
 // A choice that this scene cannot have is greyed, with the reason under the field.
 function grey(control, choices) {
@@ -198,8 +221,7 @@ async function takePicture(file) {
   if (!file) return;
   try {
     const { picture } = await ask("/api/picture", file);
-    const first = form.querySelector('[data-key="target[0].z"]') ? "target[0]" : "target";
-    change({ key: `${first}.image`, value: `pictures/${picture}` });
+    change({ key: `${firstTarget()}.image`, value: `pictures/${picture}` });
     element("picture-fault").textContent = "";
   } catch (error) {
     element("picture-fault").textContent = error.message;
