@@ -428,6 +428,13 @@ def read_irradiance(folder: Path, scene: scenes.Scene) -> np.ndarray:
     return read_irradiances(folder, scene)[0]
 
 
+def read_pictures(folder: Path, scene: scenes.Scene) -> tuple[np.ndarray, np.ndarray]:
+    """The first target's picture and irradiance as a design holds them; SceneError if design.npz is damaged."""
+    shape = scene.target.columns_rows[::-1]
+    arrays = _arrays(folder, {"target": shape, "irradiance": shape}, scene)
+    return arrays["target"], arrays["irradiance"]
+
+
 def read_irradiances(folder: Path, scene: scenes.Scene) -> tuple[np.ndarray, ...]:
     """The irradiance through the written lens on each target; SceneError if design.npz is damaged."""
     shapes = {numbered("irradiance", k): target.columns_rows[::-1] for k, target in enumerate(scene.targets)}

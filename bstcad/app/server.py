@@ -30,6 +30,7 @@ from starlette.routing import Route
 from starlette.staticfiles import StaticFiles
 
 import bstcad
+from bstcad import folder as folders
 from bstcad.app import crop, design_runs, form, preview_json, scene_text, sketch
 from bstcad.app.choices import impossible
 from bstcad.app.connections import HeadersInTime
@@ -40,10 +41,12 @@ from bstcad.app.preview_desk import STAGES, PreviewDesk
 from bstcad.app.preview_desk import Request as Asked
 from bstcad.app.workspace import LARGEST_UPLOAD, Workspace
 from bstcad.report import record
+from bstcad.report.light_figures import View, dark_triptych
 from bstcad.report.report import VIEWER, doubts
 from bstcad.runs import files
 from bstcad.runs.files import SentenceError
 from bstcad.scene import new_scene, scene_file
+from bstcad.scene import scene as scenes
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.picture import SAMPLES
 from bstcad.scene.scene_file import DOTS
@@ -98,6 +101,7 @@ class Workbench:
             Route(f"{scene}/make", self.make, methods=["POST"]),
             Route(f"{design}/run", self.follow),
             Route(f"{design}/light.png", self.light),
+            Route(f"{design}/irradiance-dark.png", self.dark_figure),
             Route(f"{design}/stop", self.stop, methods=["POST"]),
             Route(f"{design}/go-on", self.go_on, methods=["POST"]),
             Route(f"{design}/edit", self.edit, methods=["POST"]),
@@ -434,6 +438,17 @@ class Workbench:
         """The light through the best lens so far."""
         data = Run(self.workspace.design(request.path_params["name"])).light
         return Response(data, media_type="image/png") if data else Response(status_code=404)
+
+    def dark_figure(self, request: Request) -> Response:
+        """The figure of a finished design's irradiance for a page in dark mode; the usual one where that fails."""
+        name = request.path_params["name"]
+        usual = self.workspace.file(name, "figures/irradiance.png")
+        try:
+            scene = scenes.load(self.workspace.file(name, "scene.toml"))
+            found = folders.read_pictures(self.workspace.file(name, "design.npz").parent, scene)
+            return Response(dark_triptych(*found, View.of(scene)), media_type="image/png")
+        except SentenceError:
+            return FileResponse(usual, media_type="image/png")
 
     def stop(self, request: Request) -> Response:
         """End a run: a design with the best lens so far, or at once with a checkpoint (?at_once)."""

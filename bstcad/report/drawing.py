@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 BLUE, VERMILION, GREEN = "#0072b2", "#d55e00", "#009e73"  # of Okabe and Ito
 GREY, GLASS = "#6b6b6b", "#d6e8f2"
+DARK, LIGHT = "#14181c", "#e6eaee"  # ground and letters of a page in dark mode
 STYLE: dict[str, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9.0,
@@ -75,24 +76,40 @@ def footnote(figure: Figure, text: str) -> None:
 
 
 @styled
-def png(figure: Figure) -> bytes:
-    """The figure as PNG bytes, white ground, margins trimmed; drawn coarser where it would exceed HEAVIEST."""
-    picture = _encode(figure, DPI)
+def png(figure: Figure, ground: str = "#ffffff") -> bytes:
+    """The figure as PNG bytes on its ground, margins trimmed; drawn coarser where it would exceed HEAVIEST."""
+    picture = _encode(figure, DPI, ground)
     if len(picture) > HEAVIEST:
-        picture = _encode(figure, DPI * 0.95 * (HEAVIEST / len(picture)) ** 0.5)
+        picture = _encode(figure, DPI * 0.95 * (HEAVIEST / len(picture)) ** 0.5, ground)
     return picture
 
 
-def _encode(figure: Figure, dpi: float) -> bytes:
+def darkened(figure: Figure) -> Figure:
+    """Return the figure with light letters and axes on a dark ground; its pictures stay as they are."""
+    from matplotlib.text import Text
+
+    figure.set_facecolor(DARK)
+    for axes in figure.axes:
+        axes.set_facecolor(DARK)
+        axes.tick_params(colors=LIGHT, which="both")
+        for spine in axes.spines.values():
+            spine.set_edgecolor(LIGHT)
+    for text in figure.findobj(Text):
+        text.set_color(LIGHT)
+    return figure
+
+
+def _encode(figure: Figure, dpi: float, ground: str) -> bytes:
     """PNG bytes at `dpi` without alpha; with a palette where so few colours occur that it cannot be told apart."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from PIL import Image, ImageOps
+    from PIL import Image, ImageChops, ImageOps
 
     figure.set_dpi(dpi)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()  # once: a tight box by matplotlib would draw everything twice
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    picture = ImageOps.expand(picture.crop(ImageOps.invert(picture).getbbox()), round(MARGIN * dpi), "white")
+    drawn = ImageChops.difference(picture, Image.new("RGB", picture.size, ground)).getbbox()
+    picture = ImageOps.expand(picture.crop(drawn), round(MARGIN * dpi), ground)
     small = io.BytesIO()
     if picture.getcolors(FEW_COLOURS) is not None:
         picture = picture.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)

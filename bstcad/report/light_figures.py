@@ -14,7 +14,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.optics.measure import Line
-from bstcad.report.drawing import BLUE, GREEN, GREY, VERMILION, footnote, new_figure, png, round_up, steps, styled
+from bstcad.report.drawing import (
+    BLUE,
+    DARK,
+    GREEN,
+    GREY,
+    VERMILION,
+    darkened,
+    footnote,
+    new_figure,
+    png,
+    round_up,
+    steps,
+    styled,
+)
 from bstcad.report.units import number, quantity, turned
 from bstcad.scene.picture import to_srgb
 from bstcad.scene.target import numbered
@@ -235,6 +248,11 @@ def _mark(axes: Axes, cut: Cut, view: View) -> None:
     if cut.name == "brightest place":
         axes.plot(cut.x, cut.y, "o", markersize=7, markerfacecolor="none", markeredgecolor=CUTS[cut.name], gid="ring")
     axes.set(xlim=view.across, ylim=view.y)
+
+
+def dark_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) -> bytes:
+    """The irradiance's figure as a PNG for a page in dark mode."""
+    return png(darkened(irradiance_triptych(target, irradiance, view)), ground=DARK)
 
 
 @styled

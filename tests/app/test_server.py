@@ -5,13 +5,16 @@ import io
 import json
 import os
 import re
+import shutil
 import threading
 import time
 import zipfile
 from pathlib import Path
 from urllib.parse import unquote
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from bstcad.app import design_process, design_runs, scene_text, server
 from bstcad.app.design_process import State
@@ -227,6 +230,21 @@ def test_what_a_run_says_is_told_without_folders(own):
     assert news.json["lines"][0][4] == "x.png is dark"
     for answer in (news, own.ask("/design/made"), own.ask("/")):
         assert answer.status == 200 and str(own.outside) not in answer.text
+
+
+def test_the_figure_of_a_design_follows_dark_mode(own, small_design):
+    """Its ground and letters change; a design whose arrays are gone has the usual figure."""
+    shutil.copytree(small_design.folder, own.folder / "real")
+    usual, dark = (
+        np.asarray(Image.open(io.BytesIO(own.ask(address).body)).convert("RGB")).astype(int)
+        for address in ("/design/real/files/figures/irradiance.png", "/api/design/real/irradiance-dark.png")
+    )
+    assert np.abs(dark[0, 0] - [20, 24, 28]).max() <= 2 and (usual[0, 0] == 255).all()
+    letters = [np.abs(image[-40:].mean(-1) - image[0, 0].mean()).max() for image in (usual, dark)]  # of the footnote
+    assert min(letters) > 100
+    assert own.ask("/api/design/made/irradiance-dark.png").body == own.files["figures/irradiance.png"]
+    for page in ("/design/real", "/compare?design=real&design=made"):
+        assert 'media="(prefers-color-scheme: dark)"' in own.ask(page).text
 
 
 @pytest.mark.parametrize("stage", ["preview", "effects"])

@@ -60,9 +60,10 @@ export const pause = (milliseconds) => new Promise((done) => setTimeout(done, mi
 
 // Curves of [seconds, RRMSD] on a logarithmic scale of the RRMSD.
 export function drawCurves(svg, curves) {
-  const [wide, high, left, low] = [480, 220, 52, 34], name = "http://www.w3.org/2000/svg";
+  const [wide, high, left, low] = [Math.max(Math.round(svg.getBoundingClientRect().width), 240) || 480, 240, 60, 38], name = "http://www.w3.org/2000/svg";
   const points = curves.flat().filter(([, value]) => value > 0);
   svg.replaceChildren();
+  svg.setAttribute("viewBox", `0 0 ${wide} ${high}`); // a unit is a pixel, so that letters are as large as the page's
   if (points.length < 2) return;
   const last = Math.max(...points.map(([seconds]) => seconds)), values = points.map(([, value]) => Math.log10(value));
   const [least, most] = [Math.min(...values) - 0.05, Math.max(...values) + 0.05];
@@ -86,6 +87,7 @@ export function drawCurves(svg, curves) {
   }
   add("text", { x: wide - 10, y: high - 12, "text-anchor": "end" }, `${last.toPrecision(3)} s`);
   add("text", { x: left, y: high - 12 }, "0 s");
+  add("text", { x: left + 10, y: 24 }, "RRMSD");
   curves.forEach((curve, k) => {
     const path = curve.filter(([, value]) => value > 0).map(([s, v], i) => `${i ? "L" : "M"}${x(s).toFixed(1)} ${y(v).toFixed(1)}`);
     add("path", { d: path.join(" "), class: `line-${k}` });
