@@ -40,7 +40,7 @@ from bstcad.app.guard import POLICY, SANDBOX, Guard
 from bstcad.app.preview_desk import STAGES, PreviewDesk
 from bstcad.app.preview_desk import Request as Asked
 from bstcad.app.workspace import LARGEST_UPLOAD, Workspace
-from bstcad.report import record
+from bstcad.report import manual, record
 from bstcad.report.light_figures import View, dark_triptych
 from bstcad.report.report import VIEWER, doubts
 from bstcad.runs import files
@@ -50,6 +50,7 @@ from bstcad.scene import scene as scenes
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.picture import SAMPLES
 from bstcad.scene.scene_file import DOTS
+from bstcad.scene.schema import rows
 
 PATIENCE = 20.0  # seconds that an answer is waited for; then the page asks again
 UPLOAD = "/api/picture"
@@ -64,6 +65,7 @@ RRMSD = (
     "picture. 0 is the picture itself."
 )
 CARDS = {"lamp": "a small lamp or LED", "led": ""}  # words of lights on the first page; "": it has no card of its own
+KEYS_PAGE = "reference/scene-keys"  # page of the documentation that is made of the schema
 MOST_SOUND = 31  # scenes, besides the latest, whose latest valid text is kept
 SLOWEST = 1  # seconds that open requests have when the server ends
 CLOUDS = ((b"ply", ".ply"), (b"solid", ".stl"))  # how files of measured points begin
@@ -118,9 +120,11 @@ class Workbench:
         self.app = Starlette(routes=routes, exception_handlers=handlers)
         self.app.mount("/static", StaticFiles(directory=STATIC))
         site = next((place for place in SITES if (place / "index.html").is_file()), None)
-        self.has_docs = site is not None
+        self.has_docs = site is not None or manual.FIRST in manual.pages()
         if site is not None:
             self.app.mount("/docs", _Site(directory=site, html=True))
+        elif self.has_docs:
+            self.app.router.routes.append(Route("/docs/{page:path}", self.manual_page))
 
     def end(self) -> list[str]:
         """End the previews and the runs that this server began; a sentence on each run that was under way."""
@@ -158,6 +162,18 @@ class Workbench:
 
     def _no_page(self, request: Request, error: Exception) -> Response:
         return self._page("lost.html.j2", status=404, title="No such page", sentence="")
+
+    def manual_page(self, request: Request) -> Response:
+        """A page of the documentation as Markdown, where its pages are not built."""
+        name = request.path_params["page"].removesuffix(".html")
+        if name == KEYS_PAGE:
+            keys = (f"{row.key}: {row.meaning} {row.unit}; {row.range}; {row.default}" for row in rows())
+            text = "\n".join(["# Keys of a scene: meaning, unit, range, default", "", *keys])
+        elif name in manual.pages():
+            text = manual.first() if name == manual.FIRST else manual.page(name)
+        else:
+            return self._no_page(request, KeyError(name))
+        return self._page("manual.html.j2", title="Documentation", text=text)
 
     def _page(self, template: str, status: int = 200, **values: Any) -> HTMLResponse:
         common = {"version": bstcad.__version__, "has_docs": self.has_docs, "rrmsd_words": RRMSD}

@@ -232,6 +232,19 @@ def test_what_a_run_says_is_told_without_folders(own):
         assert answer.status == 200 and str(own.outside) not in answer.text
 
 
+def test_each_section_leads_to_the_documentation_built_or_not(own):
+    """Without built pages their Markdown stands there; no link leads nowhere."""
+    links = set()
+    for page in ("/", "/scene/small", "/design/made"):
+        links |= {*re.findall(r'href=\\?"(/docs/[^"#\\]+)', own.ask(page).text)}
+    assert len(links) >= 8 and {"/docs/reference/scene-keys.html", "/docs/how-to/tolerances.html"} <= links
+    for link in sorted(links):
+        answer = own.ask(link)
+        assert answer.status == 200 and len(answer.text) > 1500, link
+    assert "target.crop" in own.ask("/docs/reference/scene-keys.html").text
+    assert own.ask("/docs/no/such.html").status == 404
+
+
 def test_the_figure_of_a_design_follows_dark_mode(own, small_design):
     """Its ground and letters change; a design whose arrays are gone has the usual figure."""
     shutil.copytree(small_design.folder, own.folder / "real")

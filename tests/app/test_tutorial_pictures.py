@@ -136,7 +136,7 @@ def make_it(page):
 def study(page, folder):
     """7: tolerances, the trade-off, and a made part."""
     back = bstcad.open(folder / "my-laser").lens.back
-    x, y = np.meshgrid(np.linspace(-39.5, 39.5, 200), np.linspace(-39.5, 39.5, 200))
+    x, y = np.meshgrid(np.linspace(-34.5, 34.5, 200), np.linspace(-39.5, 39.5, 200))
     np.savetxt(folder / "cloud.csv", np.stack([x, y, sag(back, x, y)], axis=-1).reshape(-1, 3), delimiter=",")
     page.select_option("form[data-job=tolerance] select", "moulded")
     page.click("text=Study tolerances")
