@@ -29,7 +29,7 @@ from bstcad.optics.reach import restricted, unreached
 from bstcad.optics.sides import both, coarser, scaled
 from bstcad.pipeline import check_thickness, reachable_part, reached, second_stage, steepness, task_of, transport_of
 from bstcad.report.record import simulated, too_steep
-from bstcad.report.units import about, duration, number, quantity, two_digits
+from bstcad.report.units import about, number, quantity, two_digits
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.quality import COARSEST_GRID, PRESETS, Tailoring
 from bstcad.scene.scene import Scene
@@ -117,7 +117,7 @@ def verdict(scene: Scene, found: Mapping[str, Any]) -> dict[str, str] | None:
         return {"kind": "not predicted", "sentence": text}
     quality = scene.tailoring.quality if scene.tailoring.quality in QUALITIES else "standard"
     (low, likely, high), (_, time, _) = (found["predicted"][quality][key] for key in ("rrmsd", "seconds"))
-    took = about(time, "s") if time < MINUTE else duration(two_digits(time))
+    took = about(time, "s") if time < 2 * MINUTE else about(time / MINUTE, "minutes")
     text = f"An RRMSD of about {about(likely)} in about {took}, in {quality} quality"
     if asked is None:
         kept = f"[accept] rrmsd = {two_digits(high):g}"

@@ -128,9 +128,9 @@ def command_line() -> str:
     page = get_docs_for_click(obj=group, ctx=click.Context(group, info_name="bstcad"), name="bstcad")
     page = page.replace("# `bstcad`", "# Command line", 1).replace("```console", "```text")
     exits = (
-        "Exit codes: 0, every check passed; 1, the lens is written, but a check failed; 2, the input is wrong; 70, a\n"
-        "fault of bstcad; 129, 130, 143, ended by SIGHUP, Ctrl-C, SIGTERM. `bstcad tolerance` exits with 0 at\n"
-        "any yield, also below the yield that `--yield` asks for.\n\n"
+        "Exit codes: 0, every check passed, or no limit on the light was asked; 1, the lens is written, but a check\n"
+        "failed; 2, the input is wrong; 70, a fault of bstcad; 129, 130, 143, ended by SIGHUP, Ctrl-C, SIGTERM.\n"
+        "`bstcad tolerance` exits with 0 at any yield, also below the yield that `--yield` asks for.\n\n"
     )
     return page.replace("## `bstcad generate`", exits + "## `bstcad generate`", 1)
 
