@@ -6,14 +6,17 @@ an argument.
 RRMSD is measured without bias, from SETS independent sets of stratified rays.  Each gives a picture A_i = A + n_i, the
 lens's own picture A and noise of mean zero, so that the square of its distance from the target T is too large by that
 of the noise.  The product of two of them is not: E <(A_i - T) (A_j - T)> = <(A - T)²>, i ≠ j.  The mean over all pairs
-is a U-statistic (Hoeffding 1948), and its standard error follows from leaving out one set after the other (the
-jackknife).  Rays are added until that error is as small as asked for.  Of an extended source each set has points of
-its own, so that their number leaves no bias either.
+is a U-statistic (Hoeffding 1948), and its standard error follows from the scatter of the pairs (`apart`).  Rays are
+added until that error is as small as asked for.  Of an extended source each set has points of its own, so that their
+number leaves no bias either.
 
 The picture for people is the mean of all sets, smoothed as far as that takes more noise from it than detail.  Ray tubes
-(tubes.py), in whose picture there is no noise, share nothing with the rays but the trace: they are the witness.  Their
-RRMSD (`rrmsd_by_tubes`) compares twins of float32 and float64; it is a few per cent too low where tailoring has learnt
-its tubes.  A ghost is traced once, and its noise stands in all sets alike.
+(tubes.py), in whose picture there is no noise, share nothing with the rays but the trace: they are the witness.  They
+interpolate linearly between their corners, which leaves out how light changes within a cell of the net: two tubes a
+cell are off by about the RRMSD that tailoring by tubes leaves, four by a third of it, eight by a tenth (measured).
+Tubes are therefore made half as wide until both pictures agree, or until the tubes' own error cannot be why they do
+not.  Their RRMSD (`rrmsd_by_tubes`) compares twins of float32 and float64; it is a few per cent too low where tailoring
+has learnt its tubes.  A ghost is traced once, and its noise stands in all sets alike.
 
 A source of some size throws an image of itself through each place of the lens (`Images`).  All rays that leave one
 point of the back face share its slope, whatever point of the source they come from: no lens can bring them together.
@@ -41,11 +44,13 @@ from bstcad.optics.sampling import in_pairs
 from bstcad.optics.trace import UNDERSIDE, Ghost, Simulation, simulate, through
 from bstcad.optics.tubes import SHEET, Tubes, area_of, arriving, corners, launch_tubes, middle, picture, rays_to
 
-SETS = 8  # of rays, independent of each other: the jackknife then knows a standard error to a quarter of it
+SETS = 8  # of rays, independent of each other: a standard error is then known to a quarter of it
 FEWEST = 5  # times fewer rays a side in the first sets, which tell how many are needed
 SEEN = 0.45  # of the RRMSD, at the default accuracy: noise of the mean picture, whose RRMSD is then a tenth too large
 RESOLVED = 5.0  # times its standard error an RRMSD must be at least
-FAINT = 0.01  # of the target: by which pictures by rays and by tubes may always differ
+# By which pictures by rays and by tubes may differ: this part of the smaller RRMSD, and always this much of the target.
+AGREED, FAINT = 0.5, 0.002
+FINEST = 4200  # tubes a side at most, to which the witness goes where the pictures differ by more
 SMOOTHED = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # pixels, standard deviation of a normal kernel
 # Tubes and rays a side fall with the number k of points of an extended source, as k to this power: there are as many in
 # all as of one point.
@@ -87,6 +92,8 @@ class Witness:
 
     rrmsd: float  # of their picture
     off: float  # their picture against the rays', without bias, as RRMSD has it
+    limit: float  # of `off`: what the RRMSD allows, or what tubes of this density and the noise of the rays do not tell
+    tubes: int  # a side
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,8 +213,13 @@ def _value(rays: _Rays, wanted: Tensor) -> tuple[float, float]:
 def apart(pictures: Sequence[Tensor], other: Tensor) -> tuple[float, float]:
     """(|A - other|² / |other|² without the noise of independent pictures A_i of A, its standard error).
 
-    U = mean over i ≠ j of d_i · d_j, d_i = A_i - other.  With U_k that without set k, of which there are M, the
-    jackknife has σ² = (M - 1) / M Σ (U_k - mean U_k)² (Efron and Stein 1981).
+    U = mean over i ≠ j of p_ij = d_i · d_j, d_i = A_i - other.  With M sets and Hoeffding's p_ij = U + a_i + a_j + e_ij
+
+        σ² = 4 σ_a² / M + 2 σ_e² / (M (M - 1)).
+
+    The jackknife, 4 / M times the variance of the means of p_ij over j times ((M - 1) / (M - 2))², has 4 σ_e² / (M (M -
+    2)) as its second term (Efron and Stein 1981): twice too much where noise times noise rules, or by luck a tenth of
+    it.  σ_e² follows from what a_i and a_j leave of the M (M - 1) / 2 products, with M (M - 3) / 2 degrees of freedom.
     """
     off = [(picture - other).reshape(-1) for picture in pictures]
     size, m = _squared(other), len(off)
@@ -215,10 +227,13 @@ def apart(pictures: Sequence[Tensor], other: Tensor) -> tuple[float, float]:
     for i in range(m):
         for j in range(i):
             products[i, j] = products[j, i] = dot(off[i], off[j]) / size
-    whole, of_each = products.sum(), products.sum(0)
-    without = (whole - 2 * of_each) / ((m - 1) * (m - 2))
-    spread = (m - 1) / m * float(((without - without.mean()) ** 2).sum())
-    return float(whole) / (m * (m - 1)), math.sqrt(spread)
+    mean, of_each = products.sum() / (m * (m - 1)), products.sum(0) / (m - 1)
+    single = (of_each - mean) * (m - 1) / (m - 2)  # a_i
+    rest = (products - mean - single[:, None] - single)[~np.eye(m, dtype=bool)]  # e_ij, each of them twice
+    pairs = float((rest**2).sum()) / (m * (m - 3))  # σ_e²
+    jackknife = 4 / m * float((single**2).sum()) / (m - 1)
+    least = 2 * pairs / (m * (m - 1))
+    return float(mean), math.sqrt(max(jackknife - 4 * pairs / (m * (m - 2)) + least, least))
 
 
 def _noise(pictures: Sequence[Tensor], wanted: Tensor) -> float:
@@ -347,13 +362,44 @@ def _traced(lens, draw: Draw, screen: Screen, wanted: Tensor, side: int, seed: i
 
 
 def _witness(lens, channels, screen: Screen, wanted: Tensor, rays: _Rays, ghost: Ghost | None) -> Witness:
-    """The witness by `tubes_of` the lens, on these pixels."""
-    n = tubes_of(lens, max(screen.shape))
-    seen = _joined(tubes_picture(lens, channels, screen, n), ghost)
-    if not total(seen) > 0:
-        return Witness(math.nan, math.inf)
-    seen = seen * (total(wanted) / total(seen))
-    return Witness(float(rrmsd(seen, wanted)), math.sqrt(max(apart(rays.boxes, seen)[0], 0.0)))
+    """The witness by `tubes_of` the lens, on these pixels, or by tubes of half the width and so on (`_compared`)."""
+
+    def by_tubes(n: int) -> Tensor | None:
+        seen = _joined(tubes_picture(lens, channels, screen, n), ghost)
+        return seen * (total(wanted) / total(seen)) if total(seen) > 0 else None
+
+    value = math.sqrt(max(apart(rays.boxes, wanted)[0], 0.0))
+    return _compared(rays.boxes, by_tubes, wanted, rrmsd_by_rays=value, first=tubes_of(lens, max(screen.shape)))
+
+
+def _compared(
+    boxes: Sequence[Tensor], by_tubes: Callable[[int], Tensor | None], wanted: Tensor, rrmsd_by_rays: float, first: int
+) -> Witness:
+    """Pictures of independent sets of rays beside that `by_tubes` of a number a side, `first` or more.
+
+    The error of n tubes a side falls as n^-1.6 or so, so that it is less than half of the distance from the picture by
+    n / 2.  Where n tubes differ from the rays by over twice that distance, no finer ones will agree.
+    """
+
+    def change_from(seen: Tensor | None, coarse: Tensor | None) -> float:
+        return 0.0 if seen is None or coarse is None else math.sqrt(_squared(seen - coarse) / _squared(wanted))
+
+    n, seen, change = first, by_tubes(first), math.inf
+    while True:
+        if seen is None:
+            return Witness(math.nan, math.inf, limit=0.0, tubes=n)
+        squared, noise = apart(boxes, seen)
+        off, value = math.sqrt(max(squared, 0.0)), float(rrmsd(seen, wanted))
+        allowed = math.hypot(max(FAINT, AGREED * min(rrmsd_by_rays, value)), math.sqrt(2 * noise))
+        if off <= allowed:
+            return Witness(value, off, limit=allowed, tubes=n)
+        if 2 * n > FINEST and math.isinf(change):  # a fine net, whose first tubes are the finest, too
+            change = change_from(seen, by_tubes(n // 2))
+        if 2 * n > FINEST or 2 * change < off:
+            return Witness(value, off, limit=max(allowed, change), tubes=n)
+        n, coarse = 2 * n, seen
+        seen = by_tubes(n)
+        change = change_from(seen, coarse)
 
 
 def tubes_of(lens: Lens, pixels: int = 0) -> int:

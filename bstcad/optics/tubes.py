@@ -30,7 +30,8 @@ from bstcad.optics.trace import across, from_first_net, gets_through
 ALL = slice(None)
 SHEET = 256  # tubes a side of the sheet through which finer ones are interpolated
 INWARDS = 1e-9  # relative shrink towards the middle: corners on the rim of the light are counted as lit
-BAND = 256  # rows of tubes traced at a time for a picture alone; even, since the diagonals alternate
+BAND = 256  # rows of tubes at most traced at a time for a picture alone; even, since the diagonals alternate
+IN_BAND = 1 << 19  # tubes at most in these rows: of more columns fewer rows, so that memory does not grow
 CACHED = 1 << 17  # rays that plain torch takes at a time: a megabyte of each quantity
 PARTS = 4  # of a tube on the rim of the light, each way
 THINNEST = 1e-9  # pixel²: a triangle of less area gives all its flux to the pixel of its centre, without gradient
@@ -108,7 +109,7 @@ def picture(
     """
     sheet = _sheet(source, lens, n, few=few, over_the_back=over_the_back)
     whole = torch.zeros(screen.shape, dtype=torch.float64, device=lens.like.device)
-    for rows in _bands(sheet.count, BAND):
+    for rows in _bands(sheet.count, min(BAND, 2 * max(1, IN_BAND // (2 * n)))):
         x, y = (p + INWARDS * (middle - p) for p, middle in zip(sheet.rows(rows), sheet.middle, strict=True))
         whole = whole + _tubes(source, lens, x=x, y=y, cut=sheet.cut).picture(lens, screen)
     return whole.clamp(min=0)  # a black pixel may be off by rounding

@@ -24,7 +24,6 @@ from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import (
-    FAINT,
     FULL,
     RESOLVED,
     Draw,
@@ -477,9 +476,8 @@ def _of_light(light: Light, accept: Accept, meets: str = "enters the lens", of: 
         Check.at_least(f"efficiency{of}", light.efficiency, accept.efficiency),
         Check.at_most(f"flux ledger: distance of its sum from 1{of}", closure, 1e-12),
     ]
-    if tubes is not None:  # which may be off by their own error: it is less than that of any lens for pictures
-        limit = max(FAINT, min(light.rrmsd, tubes.rrmsd))
-        checks.insert(2, Check.at_most(f"picture by ray tubes, off the one by rays{of}", tubes.off, limit))
+    if tubes is not None:
+        checks.insert(2, Check.at_most(f"picture by ray tubes, off the one by rays{of}", tubes.off, tubes.limit))
     return checks
 
 

