@@ -40,8 +40,8 @@ QUALITIES = {
 }
 SAME = {"draft": 1e-6, "paper": 1e-4}  # of the relief: where stage 1's solvers end; a few steps of Adam in float32
 
-# Designs of three kinds, besides the mirror and the paper's procedure below; the others are run by `make bench`.
-QUICK = {"beam_shaper": ("draft",), "disk": ("draft",), "machinable_letters": ("draft",)}
+# Designs of two kinds, besides the mirror and the paper's procedure below; the others are run by `make bench`.
+QUICK = {"beam_shaper": ("draft",), "machinable_letters": ("draft",)}
 LOSSES = {
     "portrait": [
         {"kind": "fresnel", "coating": {"index": 1.38, "thickness": 100.0}},

@@ -31,7 +31,10 @@ def draft(scene):
     return light * (made.target.sum() / light.sum())
 
 
-@pytest.mark.parametrize("name", ["caustic_portrait", "mirror", "off_axis"])
+BENCH = pytest.mark.bench
+
+
+@pytest.mark.parametrize("name", ["caustic_portrait", "mirror", pytest.param("off_axis", marks=BENCH)])
 def test_a_preview_is_near_the_finished_draft(name):
     scene = load(f"templates/{name}.toml", SMALL)
     wanted = draft(scene)
@@ -48,7 +51,13 @@ def test_a_preview_depends_on_the_scene_alone():
     assert np.array_equal(preview(scene).pictures[0][1], first.pictures[0][1])
 
 
-@pytest.mark.parametrize("name", ["sun_caustic", "led", "two_pictures", "machinable_letters", "collimated_portrait"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "led", "two_pictures",
+        *(pytest.param(name, marks=BENCH) for name in ("sun_caustic", "machinable_letters", "collimated_portrait")),
+    ],
+)  # fmt: skip
 def test_every_kind_of_scene_has_a_preview(name):
     found = preview(load(f"templates/{name}.toml"))
     assert len(found.pictures) == len(found.scene.targets)

@@ -48,7 +48,10 @@ def of(found):
     ), making
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    "name",  # least squares and a draft have the parts of a spectrum
+    [pytest.param(name, marks=[pytest.mark.bench] * (name in ("least squares", "draft"))) for name in SCENES],
+)
 def test_every_kind_of_design_has_one(name):
     change = dict(SCENES[name])
     if name == "spectrum":
