@@ -1,0 +1,355 @@
+"""Every two values of every two choices of a scene in at least one lens; every light, rim and front by `make bench`.
+
+Each scene is planned, previewed, designed with few control points and pixels, written, proved from its files and opened
+again.  It may end in a report, whose failed checks are true (MAY_FAIL), or in a refusal that names the keys that do not
+go together (REFUSED).  A new value of a choice is one line of CHOICES.
+
+The array is made here: the packages for such arrays know one strength for all choices, and triples of some are wanted.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+import re
+
+import numpy as np
+import pytest
+
+import bstcad
+from bstcad import commands
+from bstcad.app.preview import Pains, preview
+from bstcad.optics import measure
+from bstcad.optics.measure import Effort
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.sides import both
+from bstcad.optics.surfaces import Sphere
+from bstcad.scene.blank import as_front, net_extent
+from bstcad.scene.errors import SceneError
+from bstcad.sweep import estimates
+from bstcad.sweep.cold_run import Units
+from bstcad.sweep.net_choice import with_net
+from bstcad.sweep.plan import plan
+from bstcad.tailoring import run as tailoring
+from bstcad.tailoring import source_image
+from tests.conftest import draws_nothing, verify_with
+
+# --- the choices ------------------------------------------------------------------------------------------------------
+
+SIZES = {"square": (16.0, 16.0), "wide": (24.0, 12.0), "tall": (12.0, 24.0), "circle": (16.0, 16.0)}  # mm
+THROW, BEFORE = 80.0, 60.0  # mm: from the back to the wall, from the lamp to the lens
+BACK = 6.0  # mm, z of the back; the front is at 0
+
+
+def rim(chosen, less=0.0):
+    """The rim of the lens, or one so many mm smaller."""
+    width, height = (side - less for side in SIZES[chosen["rim"]])
+    if chosen["rim"] == "circle":
+        return {"shape": "circle", "diameter": width}
+    return {"shape": "rectangle", "width": width, "height": height}
+
+
+def beam(**more):
+    """Parallel light over the lens; before a mirror it starts above."""
+
+    def source(chosen):
+        start = {"z": BEFORE} if chosen["front"] == "mirror" else {}
+        return {"source": {"kind": "collimated", "aperture": rim(chosen), **start, **more}}
+
+    return source
+
+
+def lamp(**more):
+    def source(chosen):
+        position = [0.0, 0.0, BEFORE if chosen["front"] == "mirror" else -BEFORE]
+        return {"source": {"kind": "point", "profile": "lambertian", "position": position, **more}}
+
+    return source
+
+
+def wall(x, y, tilt=(0.0, 0.0)):
+    return {"target.x": x, "target.y": y, "target.tilt": list(tilt)}
+
+
+def photo(chosen):
+    x, y = np.meshgrid(np.linspace(0, 3, 48), np.linspace(0, 3, 40))
+    return {"target.image": 0.3 + np.sin(x) ** 2 * np.cos(y - 1) ** 2}
+
+
+def spline_file(chosen):
+    """The net of a bowl."""
+    outline = Circle(8.0) if chosen["rim"] == "circle" else Rectangle(*SIZES[chosen["rim"]])
+    half_x, half_y = net_extent(outline, 17)
+    bowl = bstcad.BSplineSurface.fitted(Sphere(0.0, -0.005), (-half_x, half_x), (-half_y, half_y), 17)
+    return {"lens.front": as_front(bowl)}
+
+
+def pair(chosen):
+    """About a control point a millimetre, more along the longer side."""
+    width, height = SIZES[chosen["rim"]]
+    return {"lens.back.control_points": [round(1.3 * width), round(1.3 * height) + 2]}
+
+
+def flange(chosen):
+    """A plate around the lens between its faces."""
+    return {"mount": {"flange": {"outline": rim(chosen, -6.0), "z": 0.6, "thickness": 0.5}}}
+
+
+def cut(chosen):
+    return {"mount": {"rim": rim(chosen, 1.0), "draft": 1.0, "bevel": 0.1, "datum": "front"}}
+
+
+def two(chosen):
+    """A second wall, twice as far away, where light goes on that fills the lens and the first one."""
+    own = changes_of(chosen, "targets")
+    near = SMALL["target"] | {key.removeprefix("target."): own[key] for key in own if key.startswith("target.")}
+    halves = zip("xy", (side / 2 for side in SIZES[chosen["rim"]]), strict=True)
+    ends = {axis: [2 * near[axis][0] + half, 2 * near[axis][1] - half] for axis, half in halves}
+    return {"target": [near, near | ends | {"z": near["z"] + THROW}]}
+
+
+def front(**more):
+    return {"lens.front": {"z": 0.0, **more}}
+
+
+CHOICES = {
+    "light": {
+        "laser": beam(),
+        "Gaussian beam": beam(profile="gaussian", radius_1e2=8.0),
+        "tilted beam": beam(tilt=[2.0, -3.0]),
+        "sun": beam(divergence=0.53),
+        "point": lamp(),
+        "cone": lamp(profile="uniform", half_angle=12.0),
+        "round LED": lamp(diameter=1.0),
+        "chip": lamp(width=1.0, height=0.5),
+        "spectrum": beam(wavelength=[[486.1, 1.0], [656.3, 1.0]]),
+    },
+    "rim": dict.fromkeys(SIZES, lambda chosen: {"lens.outline": rim(chosen)}),
+    "wall": {
+        "square": wall([-18.0, 18.0], [-18.0, 18.0]),
+        "wide": wall([-24.0, 24.0], [-12.0, 12.0]),
+        "tall": wall([-12.0, 12.0], [-24.0, 24.0]),
+        "off axis": wall([4.0, 36.0], [-14.0, 18.0]),
+        "tilted": wall([-18.0, 18.0], [-18.0, 18.0], tilt=(12.0, -18.0)),
+    },
+    "picture": {
+        "letters": {"target.text": "HI"},
+        "photo": photo,
+        "even": {"target.uniform": True},
+        "profile": {"target.profile": {"shape": "disc", "radius": 12.0}},
+    },
+    "front": {
+        "plane": front(kind="plane"),
+        "sphere": front(kind="sphere", curvature=0.005),
+        "free sphere": front(kind="sphere", optimise=True),
+        "conic": front(kind="conic", curvature=0.005, conic_constant=-1.0),
+        "spline file": spline_file,
+        "tailored spline": front(kind="bspline", optimise=True),
+        "mirror": front(kind="plane") | {"lens.back.reflect": True, "lens.material": None},
+    },
+    "net": {"one number": {}, "pair": pair, "chosen": {"lens.back.control_points": None}},
+    "effects": {
+        "none": {},
+        "reflection": {"effects": [{"kind": "fresnel"}]},
+        "coating": {"effects": [{"kind": "fresnel", "coating": {"index": 1.38, "thickness": 100.0}}]},
+        "absorption": {"effects": [{"kind": "absorption"}]},
+        "ghost": {"effects": [{"kind": "ghost"}]},
+    },
+    "bounds": {
+        "none": {},
+        "tool": {"lens.tool_radius": 5.0},
+        "mould": {"lens.tool_radius": 5.0, "lens.mould": True},
+        "slope": {"lens.max_slope": 40.0},
+        "thickness": {"lens.max_thickness": 12.0, "lens.edge_thickness": 1.0},
+    },
+    "mount": {"none": {}, "flange": flange, "cut": cut},
+    "wavefront": {
+        "none": {},
+        "plane": {"wavefront": {"kind": "plane", "z": 45.0}},
+        "sphere": {"wavefront": {"kind": "sphere", "z": 45.0, "focus": [0.0, 0.0, -60.0]}},
+    },
+    "precision": {"float64": {}, "float32": {"tailoring.precision": "float32"}},
+    "accuracy": {"none": {}, "asked": {"tailoring.accuracy": 0.3}},
+    "time": {"none": {}, "limited": {"tailoring.max_time": 100.0}},
+    "reach": {"whole": {}, "part": {"target.x": [-18.0, 130.0]}},  # glass turns light by 48 degrees at most
+    "targets": {"one": {}, "two": two},
+}
+PLAIN = {choice: next(iter(values)) for choice, values in CHOICES.items()}
+SMALL = {
+    "name": "combination", "accept": {}, "target": {"z": BACK + THROW, "pixels": 24},
+    "lens": {"material": "PMMA", "min_thickness": 1.5, "back": {"kind": "bspline", "z": BACK, "control_points": 21}},
+    "tailoring": {
+        "quality": "draft", "rays": 48, "transport_grid": 32, "transport_iterations": 12, "stage2_iterations": 6,
+        "rounds": 2,
+    },
+}  # fmt: skip
+REFUSED = (  # the least sets of values that no scene has together
+    *(
+        {("light", light), ("wavefront", wave)}
+        for light in ("sun", "round LED", "chip")
+        for wave in ("plane", "sphere")
+    ),
+    {("rim", "circle"), ("net", "pair")},
+    *({("front", "mirror"), ("effects", effect)} for effect in ("coating", "absorption", "ghost")),
+)
+NAMED = {  # the key of a choice, as the sentence of a refusal has it
+    "light": "source.", "wavefront": "wavefront", "rim": "lens.outline", "net": "lens.back.control_points",
+    "front": "lens.back.reflect", "effects": "effects[0]",
+}  # fmt: skip
+
+
+def changes_of(chosen, *but):
+    """The keys of a scene; but: choices that are left out."""
+    found = {}
+    for choice in (choice for choice in CHOICES if choice not in but):
+        value = CHOICES[choice][chosen[choice]]
+        found |= value(chosen) if callable(value) else value
+    return found
+
+
+def scene_of(chosen):
+    changes = SMALL | changes_of(chosen)
+    if isinstance(changes["target"], list):
+        changes = {key: value for key, value in changes.items() if not key.startswith("target.")}
+    return bstcad.load("templates/disk.toml").changed(changes)
+
+
+# --- the array --------------------------------------------------------------------------------------------------------
+
+
+def possible(values):
+    """Can a scene have these (choice, value) together?"""
+    return not any(together <= values for together in REFUSED)
+
+
+def to_cover(strength, choices=tuple(CHOICES)):
+    """All sets of so many (choice, value) that a scene can have."""
+    for some in itertools.combinations(choices, strength):
+        for values in itertools.product(*(CHOICES[choice] for choice in some)):
+            if possible(found := frozenset(zip(some, values, strict=True))):
+                yield found
+
+
+def covering(wanted, tries=8):
+    """Scenes in which each wanted set occurs, the best of some tries at a time (AETG, Cohen et al. 1997)."""
+    left, chance, scenes = list(wanted), random.Random(1), []
+    while left:
+        found = [scene_with(left[0], left, chance) for _ in range(tries)]
+        best = max(found, key=lambda scene: sum(each <= scene for each in left))
+        left = [each for each in left if not each <= best]
+        scenes.append({choice: dict(best)[choice] for choice in CHOICES})
+    return scenes
+
+
+def scene_with(first, left, chance):
+    """A scene that holds a set: its other choices in any order, each by the value that meets most of what is left."""
+    scene, others = set(first), [choice for choice in CHOICES if choice not in dict(first)]
+    for choice in chance.sample(others, len(others)):
+        values = [(choice, value) for value in CHOICES[choice] if possible(scene | {(choice, value)})]
+        met = [sum(value in each and each <= scene | {value} for each in left) for value in values]
+        scene.add(chance.choice([value for value, count in zip(values, met, strict=True) if count == max(met)]))
+    return scene
+
+
+PAIRS = covering(to_cover(2))
+TRIPLES = "light", "rim", "front"
+
+
+# --- a scene from its plan to its files and back ----------------------------------------------------------------------
+
+EFFORT = Effort(192, places=33, points=256)
+HASTY = Pains(pixels=24, net=21, tubes=48, rounds=2, evaluations=3, blurred=2)
+MAY_FAIL = (  # checks by the beginning of their names, the choices under which they may fail, and why that is true
+    ("RRMSD", {}, "21 control points and six evaluations make no sharp picture, nor one net several pictures"),
+    ("ripple", {}, "six evaluations leave the ripple of a net that was cut at its bounds"),
+    ("light on the target", {"targets": "two"}, "light that fills one wall goes past the other one"),
+    ("light on the target", {"wavefront": "plane"}, "light that is parallel to the axis goes past a wall beside it"),
+    ("light on the target", {"wavefront": "sphere"}, "light from a focus on the axis goes past a wall beside it"),
+    (
+        "light on the target",
+        {"reach": "part"},
+        "light that a face would have to turn by more than it can goes elsewhere",
+    ),
+    ("wavefront", {}, "one net has no two goals"),
+    (r"part\.step", {"mount": "flange"}, "a back that is steep is cut by the plane of the flange"),
+)
+MAY_REFUSE = (  # sentences of designs, and the choices that cannot be had together there
+    (r"target: .* of the light would have to leave the back outside of lens.outline", {"front": "tailored spline"}),
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick():
+    """Few rays and tubes, and no figures."""
+    with pytest.MonkeyPatch.context() as patch:
+        draws_nothing(patch)
+        verify_with(patch, EFFORT)
+        patch.setattr(source_image, "SIDE", 128)
+        patch.setattr(source_image, "POINTS", 32)
+        patch.setattr(measure, "LEAST", 97)
+        patch.setattr(tailoring, "ASKED", Effort(256, accuracy=0.02, witness=False))
+        patch.setattr(estimates, "STEPS", 10)
+        yield
+
+
+def faults(chosen, folder):
+    """The faults of a scene from its plan to its files and back, as sentences."""
+    scene = scene_of(chosen)
+    try:
+        found, _ = with_net(scene)
+        told, predicted = plan(found, units=lambda: Units(tubes=0.1, serial=0.01))
+        assert {"simulated", "left_out", "blur"} <= set(told) and "predicted" in predicted
+        seen = preview(scene, HASTY)
+        assert all(np.isfinite(picture).all() for pictures in seen.pictures for picture in pictures)
+        report = commands.generate(scene, folder, device="cpu", effort=EFFORT)
+    except SceneError as refusal:
+        return [] if any(_holds(*each, str(refusal), chosen) for each in MAY_REFUSE) else [f"refused: {refusal}"]
+    again = bstcad.open(folder)
+    assert again.report.rrmsd == pytest.approx(report.rrmsd, rel=1e-3)
+    assert again.lens.back.shape == both(found.lens.back.net)
+    failed = [check for check in report.checks if not check.passed]
+    return [
+        f"{check.name}: {check.value} ({check.limit}) {check.where}"
+        for check in failed
+        if not any(_holds(name, choices, check.name, chosen) for name, choices, _ in MAY_FAIL)
+    ]
+
+
+def _holds(pattern, choices, text, chosen):
+    return bool(re.match(pattern, text)) and choices.items() <= chosen.items()
+
+
+def test_the_array_has_all_pairs_and_no_refused_ones():
+    pairs = {pair for scene in PAIRS for pair in map(frozenset, itertools.combinations(scene.items(), 2))}
+    count = sum(len(CHOICES[a]) * len(CHOICES[b]) for a, b in itertools.combinations(CHOICES, 2))
+    assert len(pairs) == count - len(REFUSED) and not any(together in pairs for together in map(frozenset, REFUSED))
+    assert math.prod(sorted(map(len, CHOICES.values()))[-2:]) <= len(PAIRS) + 3  # nearly the least number of scenes
+
+
+@pytest.mark.parametrize("together", REFUSED, ids=lambda together: " and ".join(sorted(dict(together).values())))
+def test_a_refusal_names_both_keys(together, tmp_path, capsys):
+    with pytest.raises(SceneError) as refusal:
+        scene_of(PLAIN | dict(together))
+    assert all(NAMED[choice] in str(refusal.value) for choice, _ in together)
+
+
+@pytest.mark.bench
+@pytest.mark.parametrize("chosen", PAIRS, ids=lambda chosen: f"{chosen['light']}, {chosen['front']}, {chosen['rim']}")
+def test_each_pair(chosen, tmp_path):
+    assert faults(chosen, tmp_path / "out") == []
+
+
+@pytest.mark.bench
+def test_each_light_rim_and_front(tmp_path):
+    scenes = covering(itertools.chain(to_cover(2), to_cover(3, TRIPLES)))
+    found = {}
+    for number, chosen in enumerate(scenes):
+        try:
+            found[number] = faults(chosen, tmp_path / str(number))
+        except Exception as error:  # of each scene, not of the first alone
+            found[number] = [f"{type(error).__name__}: {error}"]
+        if found[number]:
+            print(chosen, *found[number], sep="\n    ")
+    print(f"{len(scenes)} scenes, {sum(map(bool, found.values()))} with faults")
+    assert not any(found.values())
