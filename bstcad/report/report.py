@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bstcad.analysis.cost import WORTH
+from bstcad.analysis.cost import HELD, WORTH
 from bstcad.optics.sides import in_words
 from bstcad.report import explained
 from bstcad.report.prescription import WAYS, order_rows
@@ -98,7 +98,7 @@ def check_line(check: Check) -> str:
 
 def limit(limits: Sequence[Mapping[str, Any]]) -> str:
     """What limits a design now, and the change that helps, in a short sentence; none if nothing is known."""
-    return "".join(paragraphs("verdict.txt.j2", "limit", limits=limits, worth=WORTH))
+    return "".join(paragraphs("verdict.txt.j2", "limit", limits=limits, worth=WORTH, held=HELD))
 
 
 def machine(facts: Mapping[str, Any]) -> Rows:

@@ -29,6 +29,7 @@ from bstcad.scene.effects import Absorption, Effect, Fresnel, losses, named, ref
 from bstcad.scene.scene import Scene
 from bstcad.scene.schema import toml
 from bstcad.tailoring.machinability import moved_clear
+from bstcad.tailoring.run import BEST
 from bstcad.tailoring.slope_fit import Fit
 from bstcad.tailoring.slope_map import face_grid, lit_window, slope_map, sloped
 from bstcad.tailoring.stage2 import FEW
@@ -218,6 +219,9 @@ def diagnosis(
         [(stage.seconds, stage.rrmsd) for stage in making.stages],
         since=math.fsum(stage.seconds for stage in making.stages[: max(sizes[2:], default=0)]),  # of the whole source
     )
+    whole_curve = curve
+    if any(stage.name == BEST for stage in making.stages):
+        curve = None  # it ends at another lens than this one
     light = max(scene.with_source_scaled(0.0).channels(), key=lambda channel: channel.weight)
     ours, twins = knobs.method == "least-squares", making.twins if knobs.precision == "float32" else None
     grown = [making.stages[k].rrmsd for k in sizes]
@@ -244,7 +248,7 @@ def diagnosis(
         **({"front" if scene.lens.shaped == (0,) else "both": True} if lens.shapes_front else {}),  # that they are on
     }  # fmt: skip
     return {
-        "convergence": None if curve is None else asdict(curve),
+        "convergence": None if whole_curve is None else asdict(whole_curve),
         "remaining_error": remaining(picture, target, screen.per_mm) | {"outside": 1 - efficiency},
         "limits": tuple(asdict(limit) | {"because": because(limit, scene)} for limit in found),
         "bounds": bounds if bounds["asked"] else None,

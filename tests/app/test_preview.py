@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 
 from bstcad import pipeline
+from bstcad.analysis.shape import describe
 from bstcad.app import preview_desk
 from bstcad.app.preview import SETTLED, Outdated, preview
 from bstcad.app.preview_desk import STAGES, PreviewDesk, Request
+from bstcad.app.preview_json import OF_DESIGN, SPREAD, figures
 from bstcad.optics.measure import tubes_picture
+from bstcad.report.units import quantity
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.sweep.net_choice import TWO_CORES
@@ -41,6 +44,18 @@ def test_a_preview_is_near_the_finished_draft(name):
     found = preview(scene)
     assert apart(found.pictures[0][1], wanted) < NEAR
     assert found.flux["on target"] > 0.9 and found.shape["thickness_min"] > 0
+
+
+def test_a_preview_tells_no_size_of_its_own_net():
+    """Its thickness is near the draft's within what is said; no radius, slope or tool is told of its few points."""
+    scene = load("templates/off_axis.toml", SMALL)
+    found, made = preview(scene), pipeline.design(scene, later=True)
+    told = dict(figures(found))
+    assert told["Smallest radius, steepest slope"] == OF_DESIGN and not any("tool" in name for name in told)
+    shape, finished = found.shape, describe(made.lens, 65)
+    for key in ("thickness_min", "thickness_max", "sag_pv"):
+        assert abs(shape[key] - finished[key]) < SPREAD * shape["sag_pv"]
+    assert told["Relief of the back"].endswith(f"± {quantity(SPREAD * shape['sag_pv'], 'mm')}")
 
 
 def test_a_preview_depends_on_the_scene_alone():
