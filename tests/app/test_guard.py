@@ -363,12 +363,13 @@ def served(tmp_path, monkeypatch):
     made(tmp_path / "lenses/made")
     servers, said, shown = [], [], []
 
-    class Server(server.uvicorn.Server):
-        def __init__(self, config):
-            super().__init__(config)
-            servers.append(self)
+    begin = server.uvicorn_server
 
-    monkeypatch.setattr(server.uvicorn, "Server", Server)
+    def begun(*given):
+        servers.append(begin(*given))
+        return servers[-1]
+
+    monkeypatch.setattr(server, "uvicorn_server", begun)
     arguments = (tmp_path / "lenses", 0, said.append, shown.append)
     thread = threading.Thread(target=server.serve, args=arguments, daemon=True)
     thread.start()
