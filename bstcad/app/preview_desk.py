@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from bstcad.app.preview import SETTLED, Outdated, Preview, preview
+from bstcad.runs import processes
 from bstcad.scene.errors import SceneError
 from bstcad.scene.new_scene import Plate
 from bstcad.scene.scene import Scene, of_text
@@ -157,6 +158,7 @@ class PreviewDesk:
             found = refusal
         except Exception as fault:  # a preview that fails must not end the thread
             found = fault
+        processes.return_freed()  # sizes change from preview to preview: holes that nothing fits in would add up
         with self._news:
             failed = stage == "preview" and isinstance(found, Exception)
             request.shown = min(request.shown, time.monotonic())
