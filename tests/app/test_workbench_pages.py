@@ -166,11 +166,17 @@ def test_no_figure_stays_after_an_estimate_that_fails(open_page, shared):
     page.unroute("**/preview")
     type_into(page, "target.z", "101")
     page.wait_for_selector("#predicted td:has-text('s')", timeout=PATIENCE)
+    page.click("text=scene.toml")
+    text = page.input_value("#text").replace('kind = "collimated"', 'kind = "collimated"\ndivergence = 2.0')
+    page.fill("#text", text + "\n[accept]\nrrmsd = 0.01\n")
+    page.locator("#text").blur()
+    page.wait_for_selector("#comes-to.error:has-text('The picture will be blurred')", timeout=PATIENCE)
     refused = {"number": 2, "refused": "no memory"}
     page.route("**/preview", lambda route: route.fulfill(json=refused | {"stage": "preview"}))
     type_into(page, "target.z", "102")
     page.wait_for_selector("#status:has-text('No preview: no memory')")
     assert page.locator("#targets img, #figures td, #remarks li, #predicted td, #left-out td").count() == 0
+    assert page.inner_text("#comes-to") == ""
 
 
 def test_two_windows_show_one_scene(open_page, shared):
