@@ -276,6 +276,19 @@ def resolved(scene: Scene, lens: Lens) -> Scene:
     return scene.model_copy(update={"lens": blank})
 
 
+def check_front(lens: Lens, scene: Scene) -> None:
+    """A front that was found, and that does not go with the rest of the scene, is refused; SceneError says why.
+
+    Such a design would be written to a folder that no command could read.
+    """
+    if not scene.lens.front.free:
+        return
+    try:
+        resolved(scene, lens).changed({})
+    except SceneError as error:
+        raise SceneError(f"lens.front.optimise: with the front that the target needs, {error}") from None
+
+
 def _compared(making: Making, task: Task, lens: Lens, before: int) -> Making:
     """The record with float32 beside float64, for the lens of stage 1, behind so many stages."""
     began, cpu = time.perf_counter(), time.process_time()
@@ -324,6 +337,7 @@ def _stage1(
         stage, lens = two_faces.steps, lens.to(like.dtype, "cpu")
     last = driver.run(stage(task, lens, state), task, lambda state: Saved(driver.record, state), lambda: driver.wish)
     lens = last.lens.to(like.dtype, like.device)
+    check_front(lens, scene)
     bounds = held(lens, task.bounds, task.least)
     if bounds is None:
         check_thickness(lens, scene)

@@ -95,6 +95,7 @@ def preview(scene: Scene, pains: Pains = AT_ONCE, outdated: Callable[[], bool] =
     task = replace(pipeline.posed(small, task), hasty=True)
     lens = small.flat_lens(knobs.levels[0], as_wide_as=knobs.levels[-1])
     *_, last = (step for step in _first_stage(task, lens) if told("stage 1", 0, 0, "") is None)
+    pipeline.check_front(last.lens, small)
     lens = small.as_mounted(last.lens)
     bounds = held(lens, task.bounds, task.least)
     if bounds is not None:

@@ -247,9 +247,17 @@ def chordal_error(mesh: Mesh, lens: Lens) -> float:
 
 
 def vertex_error(mesh: Mesh, lens: Lens) -> float:
-    """Largest distance along z (mm) of a vertex from the nearer face of the lens."""
-    x, y, z = mesh.vertices.T
-    return float(np.minimum(*(np.abs(sag(face, x, y) - z) for face in (lens.back, lens.front))).max())
+    """Largest distance (mm) of a vertex from the nearer face of the lens: |Δz| / sqrt(1 + |∇z|²), by its tangent plane.
+
+    Along z the rounding of x and y would count |∇z| times.
+    """
+    x, y, z = (torch.from_numpy(np.ascontiguousarray(p)) for p in mesh.vertices.T)
+
+    def off(face: Surface) -> np.ndarray:
+        height, p, q = face.plain().sag_and_slope(x, y)
+        return ((height - z).abs() / torch.sqrt(1 + p**2 + q**2)).numpy()
+
+    return float(np.minimum(off(lens.back), off(lens.front)).max())
 
 
 def _numbers(surface: Surface) -> tuple[FaceNumbers, np.ndarray]:

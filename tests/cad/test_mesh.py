@@ -16,7 +16,8 @@ from bstcad.cad.mesh import Mesh, chordal_error, is_closed, lens_mesh, volume_an
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.surfaces import Plane, Sphere, sag
+from bstcad.verify.checks import VERTEX_ROUNDING
 from tests.cad.facets import deviation
 from tests.exact_volume import exact_volume
 
@@ -229,3 +230,15 @@ def test_corners_that_are_made_to_collide_are_welded_all_the_same(tmp_path):
     read = mesh.read_stl(path)
     assert len(read.vertices) == len(alike) // 2
     assert (read.vertices[read.faces.ravel()] == alike).all()
+
+
+def test_vertices_in_single_precision_lie_on_the_steepest_of_faces():
+    """Rounding moves a vertex by 2^-24 of a coordinate; along z, where the slope is 4, by five times that."""
+    lens = Lens(Plane(-5.0), Sphere(0.0, -0.097), Circle(10.0), 1.5)
+    radius, turn = np.random.default_rng(0).uniform(9.5, 10.0, 20_000), np.linspace(0, 2 * np.pi, 20_000)
+    x, y = radius * np.cos(turn), radius * np.sin(turn)
+    exact = np.stack([x, y, sag(lens.back, x, y)], axis=1)
+    rounded = Mesh(exact.astype(np.float32).astype(float), np.zeros((0, 3), dtype=np.int32))
+    assert mesh.vertex_error(rounded, lens) < VERTEX_ROUNDING * np.abs(exact).max()
+    moved = Mesh(exact + [0.0, 0.0, 1e-4], rounded.faces)  # and a mesh that is off is seen
+    assert 1e-5 < mesh.vertex_error(moved, lens) < 1e-4
