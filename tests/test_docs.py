@@ -39,7 +39,9 @@ PAGES = [
     ROOT / "docs" / "reference" / "files.md",
 ]
 RUN = [page for page in PAGES if any(block.kind != "toml" for block in blocks(page))]
-LONG = {"measured-part", "time-and-accuracy", "tolerances"}  # ten seconds and more: make bench runs their blocks
+LONG = {  # some seconds and more: make bench runs their blocks, and make docs those of tutorials
+    "measured-part", "time-and-accuracy", "tolerances", "two-faces", "part-with-flange", "led", "your-photo",
+}  # fmt: skip
 FENCES = re.compile(r"^```(\S+)", re.M)
 
 

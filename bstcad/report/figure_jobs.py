@@ -72,8 +72,10 @@ class Pictures:
     def __enter__(self) -> Pictures:
         return self
 
-    def __exit__(self, *error: object) -> None:
-        self._vtk.shutdown()
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
+        if kind is not None:  # a Ctrl-C, or a fault: VTK would take seconds
+            rendering.stop()
+        self._vtk.shutdown(cancel_futures=kind is not None)
 
     def begin(self, draw: Callable[..., Pngs], *given: Any, number: int = 0) -> None:
         """Begin the pictures that draw(*given, view) makes; number: of the target that the view is of."""

@@ -63,6 +63,9 @@ STEPS = 65535  # of a number, over its range
 LEAST = 1e-9  # range (mm, or a slope) of values that are all equal
 
 
+_drawing: list[subprocess.Popen] = []  # the processes that draw now
+
+
 def draw_solid(mesh: Mesh) -> dict[str, bytes | None]:
     """The 3-D picture of a report by its name."""
     return {"lens": lens_picture(mesh)}
@@ -97,9 +100,21 @@ def _run(arrays: Mapping[str, np.ndarray], picture: str, patience: float | None)
         # pyvista need not open a window first to see whether it can: if it cannot, that process ends.
         env = os.environ | {"ALLOW_PLOTTING": "true"}
         try:
-            return subprocess.run(command, capture_output=True, timeout=patience, check=False, env=env).returncode == 0
+            with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=env) as drawing:
+                _drawing.append(drawing)
+                try:
+                    return drawing.wait(patience) == 0
+                finally:
+                    _drawing.remove(drawing)
+                    drawing.kill()
         except (OSError, subprocess.TimeoutExpired):
             return False
+
+
+def stop() -> None:
+    """End the processes that draw: nobody waits for their pictures any more."""
+    for drawing in tuple(_drawing):
+        drawing.kill()
 
 
 def main(arrays: str, picture: str) -> None:

@@ -8,6 +8,8 @@ import base64
 import io
 import json
 import shutil
+import signal
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +24,7 @@ from bstcad.optics import quadrature
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.surfaces import Recess
 from bstcad.report import rendering
+from bstcad.report.figure_jobs import Pictures
 
 CUBE = trimesh.creation.box((24.0, 24.0, 10.0))
 OUTLINES = (Rectangle(8.0, 6.0), Circle(4.0))
@@ -46,6 +49,22 @@ def test_a_renderer_that_dies_or_hangs_gives_no_picture(monkeypatch):
         assert rendering.lens_picture(BOX) is None
     monkeypatch.setattr(rendering, "PATIENCE", 0.01)
     assert rendering.lens_picture(BOX) is None
+
+
+def test_an_interrupted_report_waits_for_no_picture(small_scene, monkeypatch, tmp_path):
+    """A Ctrl-C ends the process that draws, which would take seconds, or a minute on a busy machine."""
+    slow = tmp_path / "slow"
+    slow.write_text("#!/bin/sh\nexec sleep 60\n")
+    slow.chmod(0o755)
+    monkeypatch.setattr(rendering.sys, "executable", str(slow))
+    found = []
+    with pytest.raises(KeyboardInterrupt), Pictures(small_scene, submit=None) as drawn:
+        job = drawn._vtk.submit(lambda: found.append(rendering.lens_picture(BOX)))
+        while not rendering._drawing and not job.done():
+            time.sleep(0.01)
+        [drawing] = rendering._drawing
+        raise KeyboardInterrupt
+    assert found == [None] and drawing.returncode == -signal.SIGKILL  # not 0, the end of its sleep
 
 
 def lens(front, outline):
