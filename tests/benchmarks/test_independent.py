@@ -18,12 +18,12 @@ from bstcad import commands
 from bstcad.report.figure_jobs import NoPictures
 from bstcad.scene.scene import load
 from tests.benchmarks.cold import TEMPLATES, generate
-from tests.benchmarks.independent import judge
+from tests.benchmarks.independent import POINTS, judge
 
 pytestmark = pytest.mark.bench
 AGREED = 0.01  # of the independent RRMSD
 SIGMAS = 2.5  # combined standard errors, where these are more than that
-FEW, MOST = 1 << 18, 1 << 22  # points of each scrambling through small lenses: the first pass, and in all
+FEW, MOST = 1 << 18, 1 << 23  # points of each scrambling through small lenses: the first pass, and in all
 FLUX = 1e-3  # of the source's light
 DRAFT = "tailoring.quality=draft"
 SMALL = ("lens.back.control_points=129", "target.pixels=128")
@@ -201,7 +201,7 @@ def test_small_errors_are_those_of_an_independent_monte_carlo(name, designs, cap
     stated = report["rrmsd"], report["rrmsd_noise"]
     if two:
         stated = tuple(report["targets"][number][key] for key in ("rrmsd", "rrmsd_standard_error"))
-    judged = judge(folder, points=MOST if two else FEW, number=number, most=MOST)
+    judged = judge(folder, points=POINTS if two else FEW, number=number, most=MOST)
     apart, error = stated[0] - judged.rrmsd, math.hypot(stated[1], judged.error)
     with capsys.disabled():
         print(
