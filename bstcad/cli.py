@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 STARTED = time.perf_counter()  # heavy libraries load after it: their time is the command's
 INTERRUPTED, BROKEN = 130, 70  # exit codes: Ctrl-C; a fault of bstcad itself
 NOTHING_KEPT = "there was no lens yet, and nothing is kept"
-NOTHING_MORE = "nothing more is written"  # of commands other than generate
+NOTHING_MORE = "nothing more is written"  # said by commands other than generate
 OFTEN, SELDOM = 1.0, 30.0  # seconds between two lines of progress of a sweep: on a terminal, in a file
 SITES = (
     Path(__file__).parent / "site",
@@ -641,7 +641,7 @@ def _read(text: str) -> None:
     if not console.is_terminal:
         print(text, end="")
         return
-    os.environ.setdefault("LESS", "-R")  # by which less shows bold and colour
+    os.environ.setdefault("LESS", "-R")  # this option has less show bold and colour
     with console.pager(styles=True):
         console.print(Markdown(text))
 

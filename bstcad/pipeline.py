@@ -85,7 +85,7 @@ class Followed:
     mapping: Mapping  # the transport map that it followed
     transport: TransportMap  # the same, inverted, from the target's pixels
     precision: Comparison | None  # float32 beside float64; None if there was no time for it
-    rrmsd: float  # of the lens, by the light of the source's middle and without a mount
+    rrmsd: float  # RRMSD of the lens for the source's middle, without a mount
 
 
 @dataclass(frozen=True)

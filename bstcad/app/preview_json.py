@@ -21,8 +21,8 @@ from bstcad.scene.scene import Scene
 from bstcad.sweep.plan import QUALITIES
 
 CELLS = 96  # of the lens to be turned, a side
-# Of the relief: by how much thicknesses and relief of a finished lens differ at most, of ten templates.  (0.33 of three
-# lenses off axis, whose unlit corners bend on; 0.03 of the others.)
+# Largest difference of a finished lens's thicknesses and relief from the preview's, as a part of the relief, among ten
+# templates.  (0.33 of three lenses off axis, whose unlit corners bend on; 0.03 of the others.)
 SPREAD = 0.35
 # Both follow the number of control points, of which a preview has few: a plate had a smallest radius of 7.9 mm in the
 # quick preview, of 2.6 mm in the settled one, and of 1.1 mm as a draft.

@@ -63,7 +63,7 @@ class StepLens:
     outline: Outline  # of the walls of a lens and no more; of others how far the edge of the back reaches
     edge: np.ndarray | None  # (n, 2) mm, once around the back, if its walls are not those of its outline
     faces: tuple[TopoDS_Face, TopoDS_Face]  # front and back
-    placement: Placement = field(default_factory=unmoved)  # of that frame in the file
+    placement: Placement = field(default_factory=unmoved)  # where that frame lies in the file
 
     @property
     def clear(self) -> tuple[Outline, Outline]:

@@ -15,7 +15,7 @@ import numpy as np
 from bstcad.measured.point_text import Points, measured
 
 AGAIN = "export it again"
-TYPES = {  # of PLY, as numpy has them
+TYPES = {  # PLY's number types, as numpy has them
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
@@ -49,7 +49,7 @@ class _Element:
     """A table of a PLY file."""
 
     name: str
-    count: int  # of rows, as promised
+    count: int  # promised number of rows
     properties: tuple[tuple[str, str, str], ...]  # (name, type, type of a list's length or "")
 
     @property

@@ -79,7 +79,7 @@ def read_text(data: bytes) -> Points:
             "is a Zygo XYZ file, whose x and y count pixels and whose heights are in \u00b5m; export x and y in mm "
             "under a heading such as x [mm],y [mm],z [\u00b5m]"
         )
-    if every and (named := re.fullmatch(r"sep=(.)", every[0][1].strip())):  # as Excel has it
+    if every and (named := re.fullmatch(r"sep=(.)", every[0][1].strip())):  # Excel's statement of its separator
         every = every[1:]
     forced = named[1] if every and named else ""
     heading = _heading([line for _, line in every[:HEADING]])
@@ -199,8 +199,8 @@ class _Heading:
     """The heading of a table."""
 
     lines: int = 0  # up to and with it; 0: there is none
-    columns: tuple[int, ...] = (0, 1, 2)  # of x, y and z
-    units: np.ndarray | float = 1.0  # of each in mm
+    columns: tuple[int, ...] = (0, 1, 2)  # places of x, y and z in a line
+    units: np.ndarray | float = 1.0  # mm, one for all columns or one each
     fields: int = 3
     taken: str = ""  # the actual columns, where there are nominal ones, too
 

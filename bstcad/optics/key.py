@@ -20,7 +20,7 @@ class Key:
     least: float | None = None  # None: the field holds no number
     most: float | None = None
     example: Any = None  # of a key that every scene has to give
-    remedy: str = ""  # what to do about a number out of range; "": to choose one in between
+    remedy: str = ""  # advice on a number out of range; "": choose one in between
 
     def in_range(self, value: Any) -> Any:
         """The value of a field, if all of its numbers are in the range; else ValueError, a sentence."""

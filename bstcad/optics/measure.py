@@ -44,11 +44,11 @@ from bstcad.optics.sampling import in_pairs
 from bstcad.optics.trace import UNDERSIDE, Ghost, Simulation, simulate, through
 from bstcad.optics.tubes import SHEET, Tubes, area_of, arriving, corners, launch_tubes, middle, picture, rays_to
 
-SETS = 8  # of rays, independent of each other: a standard error is then known to a quarter of it
+SETS = 8  # independent sets of rays: a standard error is then known to a quarter of it
 FEWEST = 5  # times fewer rays a side in the first sets, which tell how many are needed
 SEEN = 0.45  # of the RRMSD, at the default accuracy: noise of the mean picture, whose RRMSD is then a tenth too large
 RESOLVED = 5.0  # times its standard error an RRMSD must be at least
-# By which pictures by rays and by tubes may differ: this part of the smaller RRMSD, and always this much of the target.
+# Differences that pictures by rays and by tubes may have: a part of the smaller RRMSD, and always a part of the target.
 AGREED, FAINT = 0.5, 0.002
 FINEST = 4200  # tubes a side at most, to which the witness goes where the pictures differ by more
 SMOOTHED = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # pixels, standard deviation of a normal kernel
@@ -92,7 +92,7 @@ class Witness:
 
     rrmsd: float  # of their picture
     off: float  # their picture against the rays', without bias, as RRMSD has it
-    limit: float  # of `off`: what the RRMSD allows, or what tubes of this density and the noise of the rays do not tell
+    limit: float  # largest `off` that passes, by the RRMSD, or by the tubes' own error and the noise of the rays
     tubes: int  # a side
 
 

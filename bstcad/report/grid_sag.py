@@ -35,7 +35,7 @@ BOUND = 0.1  # target pixels that light may move by a grid of our own density
 PARTS = (1, 2, 4, 8, 16)  # grid cells a knot span
 FLUSH = 1_050_000  # points of a grid that ends at the rim, at most; larger ones end at the knots beyond it, with fewer
 RAYS = 192  # a side, by which the light is compared
-NEAR = 1e-9  # of a pitch, by which a knot may miss the rim
+RIM_ROUNDING = 1e-9  # distance by which a knot may miss the rim, as a part of a pitch
 NEWTON = 12  # steps to where a ray meets the patches; smooth faces need 5
 STEEP = 1e-6  # smallest rise of a ray over a face, by which a step of Newton's method is divided
 MET = 1e-9  # mm from the face: the ray has met it before the last step
@@ -177,8 +177,8 @@ def through_knots(face: BSplineSurface, outline: Outline, parts: int) -> tuple[n
     found = []
     for (low, _), pitch, m, half in zip((face.x, face.y), face.pitch, face.shape, outline.half_extent, strict=True):
         places = np.arange(m - 3) + 1.5 if parts == 1 else np.arange(parts * (m - 1) + 1) / parts  # x(t) = t + 1/2
-        first = np.searchsorted(places, (-half - low) / pitch + NEAR, "right") - 1
-        last = np.searchsorted(places, (half - low) / pitch - NEAR, "left")
+        first = np.searchsorted(places, (-half - low) / pitch + RIM_ROUNDING, "right") - 1
+        last = np.searchsorted(places, (half - low) / pitch - RIM_ROUNDING, "left")
         if first < 0 or last >= len(places) or not LEAST_OF_ZEMAX <= last - first + 1 <= MOST:
             return None
         found.append(low + pitch * places[first : last + 1])
@@ -188,7 +188,7 @@ def through_knots(face: BSplineSurface, outline: Outline, parts: int) -> tuple[n
 def _is_flush(x: np.ndarray, y: np.ndarray, outline: Outline) -> bool:
     """Does a grid end at the outline's bounding box?  The rim of most nets lies on a knot, or half between two."""
     box = zip((x, y), outline.half_extent, strict=True)
-    return all(max(abs(at[0] + half), abs(at[-1] - half)) < NEAR * (at[1] - at[0]) for at, half in box)
+    return all(max(abs(at[0] + half), abs(at[-1] - half)) < RIM_ROUNDING * (at[1] - at[0]) for at, half in box)
 
 
 def on_grid(face: BSplineSurface, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -12,7 +12,7 @@ from posixpath import dirname, join, normpath
 
 from bstcad.report import explained
 
-PLACES = (Path(__file__).parents[1] / "manual", Path(__file__).parents[2] / "docs")  # of a wheel, of sources
+PLACES = (Path(__file__).parents[1] / "manual", Path(__file__).parents[2] / "docs")  # in a wheel, in sources
 FIRST = "index"  # name of the first page
 DIRECTIVE = re.compile(r"^```\{.*?^```$\n?", re.M | re.S)
 CARD = re.compile(r"^:::\{grid-item-card\} ([^\n]+)\n:link: (\S+)\n:link-type: doc\n(.*?)^:::$\n?", re.M | re.S)

@@ -243,7 +243,7 @@ class Examined:
     passed: bool
     checks: tuple[Check, ...]
     part: Mapping[str, str]  # rows of name and value (prescription.part)
-    placement: Mapping[str, Any] | None = None  # of the lens in the file (Placement.facts); None: unmoved
+    placement: Mapping[str, Any] | None = None  # where the lens lies in the file (Placement.facts); None: unmoved
     given_up: tuple[str, ...] = ()  # these as in Contents: nothing is known without a design
     limits: tuple[Mapping[str, Any], ...] = ()
     bounds: Mapping[str, Any] | None = None

@@ -273,7 +273,7 @@ def plan_effects(plan: Mapping[str, Any], title: str, optic: str) -> Group:
 
 
 def _verdict(plan: Mapping[str, Any]) -> Iterator[Text]:
-    """What a plan comes to."""
+    """Yield the verdict of a plan, as the terminal shows it."""
     from rich.text import Text
 
     yield Text.assemble(("PLAN: ", OF_PLAN[plan["verdict"]["kind"]]), plan["verdict"]["sentence"])

@@ -33,7 +33,7 @@ FORMATS = {  # that are read, and the ending of a copy
     "PNG": ".png", "JPEG": ".jpg", "MPO": ".jpg", "TIFF": ".tif", "WEBP": ".webp", "BMP": ".bmp", "GIF": ".gif",
     "HEIF": ".heic", "AVIF": ".avif",
 }  # fmt: skip
-OPENED = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "GIF")  # by Pillow itself; an MPO is a JPEG with others behind it
+OPENED = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "GIF")  # formats read by Pillow; an MPO is a JPEG with others behind
 KINDS = "PNG, JPEG, TIFF, WebP, BMP, GIF, HEIC or AVIF"
 AVIF = (b"avif", b"avis")  # brands of a HEIF file whose pixels are coded as AV1: one picture, a sequence
 DESCRIPTION = 270  # tag of a TIFF file
@@ -228,7 +228,7 @@ class Photo:
     profile: Callable[[Image.Image], Image.Image] | None = None  # from the picture's colours to sRGB
     low: Image.Image | None = None  # the second bytes of colours of 16 bits, of which Pillow keeps the first
     white: float = 1.0  # of numbers that have neither 8 nor 16 bits
-    other_curve: Curve | None = None  # that the numbers may follow as well, of a file of uncommon depth without a tag
+    other_curve: Curve | None = None  # another curve that an untagged file of uncommon depth may follow
     assumed: str = ""  # a sentence on the curve that was taken in its place
     several: bool = False  # does the file hold further pictures?
 

@@ -43,7 +43,7 @@ PictureFile = Annotated[
 Tilt = Annotated[tuple[float, float] | None, AfterValidator(lambda tilt: tilt if tilt and any(tilt) else None)]
 
 
-# What to do about a wall that the axis runs along, or nearly so.
+# Advice on a wall that the axis runs along, or nearly so.
 AIM = (
     "to light a wall beside the lamp, turn the lamp towards its middle: target.z is then the distance to there, and "
     "target.tilt the angle that is left, such as [60.0, 0.0]"

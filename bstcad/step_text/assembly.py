@@ -17,7 +17,7 @@ from bstcad.step_text.entities import REAL, Entities, damaged
 from bstcad.step_text.placement import Placement, composed
 
 DEEPEST = 100  # representations on the way from a part to the whole
-SAME_SIZE = 1e-12  # of a scale: a transformation that departs from 1 by more changes the lens
+SAME_SIZE = 1e-12  # largest departure of a scale from 1 that leaves the lens as it is
 Z, X = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
 NAMES = r"(?:'\d*'|\$),(?:'\d*'|\$)"  # name and description of an entity
 DIRECTION = re.compile(rf"\('\d*',\(({REAL}),({REAL}),({REAL})\)\)")

@@ -9,9 +9,9 @@ from pathlib import Path
 from bstcad.runs.files import SceneError
 
 READ = 65_536  # bytes; comments before the first statement of a file are shorter
-MARK = b"\xef\xbb\xbf"  # of UTF-8
+MARK = b"\xef\xbb\xbf"  # byte order mark of UTF-8
 BEGIN = re.compile(rb"(?:\s|/\*(?:[^*]|\*(?!/))*+\*/)*+ISO-10303-21\s*;")
-OTHERS = {  # what else is given for STEP, by its first bytes
+OTHERS = {  # remedies for files that are not STEP, by their first bytes
     b"\x1f\x8b": "it is packed by gzip; unpack it first", b"PK\x03\x04": "it is a zip archive; unpack it first",
     b"BZh": "it is packed by bzip2; unpack it first", b"\xfd7zXZ": "it is packed by xz; unpack it first",
     b"\xff\xfe": "it is text in UTF-16; export the lens as STEP again",

@@ -15,7 +15,7 @@ import numpy as np
 
 from bstcad.runs.files import one_line
 
-MAX_COORDINATE = 1e12  # of a point; a target may be 1e8 mm away
+MAX_COORDINATE = 1e12  # largest coordinate of a point (mm); a target may be 1e8 mm away
 MAX_DIGITS = 64  # characters of a number; 17 digits, a sign and an exponent are all that a double holds
 
 NAME = r"[1-9]\d{0,17}"  # an entity's number: one of 64 bits
@@ -25,7 +25,7 @@ BLANKS = bytes(code for code in range(256) if chr(code).isspace())
 STRING = re.compile(r"'[^']*(?:''[^']*)*'")
 POINT = re.compile(rf"(?<=;)#({NAME})=CARTESIAN_POINT\('\d*',\(({COORDINATE},{COORDINATE},{COORDINATE})\)\);")
 STATEMENT = re.compile(rf"#({NAME})=([A-Z][A-Z_0-9]*)?(\(.*\))", re.DOTALL)
-TOKENS = re.compile(  # of a text without blanks: separators, references, numbers, strings, enumerations, keywords
+TOKENS = re.compile(  # tokens without blanks: separators, references, numbers, strings, enumerations, keywords
     r"[(),;]++|(?:#\d{1,20}+,)++|#\d{1,20}+(?=[)=])=?|'\d*+'|\.[A-Z_0-9]++\.|[$*](?=[,)])|!?[A-Z_][A-Z_0-9]{0,99}+(?=\()"
     r"|[-+]?\d{1,99}+(?:\.\d{0,99}+(?:[Ee][-+]?\d{1,9}+)?)?(?=[,)])|\"[0-9A-F]*+\""
 )  # each is bounded, or begins with a character that it does not hold: a time in proportion to the text

@@ -89,7 +89,7 @@ class ValidationProperties:
     profiles: tuple[Profile, ...] = ()
 
     def moved(self, placement: Placement) -> ValidationProperties:
-        """The same part elsewhere."""
+        """Return the properties of the part in another place."""
         if not placement.moves:
             return self
         moved = (placement(np.array(centroid)).tolist() for centroid in self.centroids)
@@ -115,7 +115,7 @@ class StepText:
     front: FreeformSurface | None  # the other one
     edge_uses: dict[int, tuple[int, int]]  # edge -> uses (forward, reversed)
     properties: ValidationProperties
-    placement: Placement = field(default_factory=unmoved)  # of its solid, as the file states it
+    placement: Placement = field(default_factory=unmoved)  # placement of its solid, as the file states it
 
     @property
     def closed(self) -> bool:

@@ -65,7 +65,7 @@ class Placement:
     def turn(self) -> tuple[float, np.ndarray]:
         """(angle in degrees, 0 to 180; the unit vector (3,) about which it turns)."""
         r = self.rotation
-        sine = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]) / 2  # of the angle, along the axis
+        sine = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]) / 2  # sine of the angle, on the axis
         angle = math.atan2(math.sqrt(sine @ sine), (np.trace(r) - 1) / 2)
         if angle < math.pi / 2:
             about = sine

@@ -44,7 +44,7 @@ COLUMNS = (
     "scene", "name", "status", "rrmsd", "rrmsd_noise", "leak", "light_on_target", "checks_failed", "seconds", "report",
     "where", "reason",
 )  # fmt: skip
-STYLES = {"passed": "green", "passed with remarks": "yellow", NO_LIMIT: "cyan"}  # of the terminal; others are red
+STYLES = {"passed": "green", "passed with remarks": "yellow", NO_LIMIT: "cyan"}  # terminal colours; others are red
 KILLED = -9  # exit code of a process that somebody, or the system for want of memory, has killed
 CORES = 2  # that a design keeps busy
 

@@ -58,7 +58,7 @@ class Candidate:
     moved: float = math.inf  # pixels, see `moved`
 
     def beside(self, other: Candidate) -> str:
-        """What it would come to in the place of another: "about 1.3 times the RRMSD in 0.77 times the time".
+        """Return its RRMSD and time beside those of another: "about 1.3 times the RRMSD in 0.77 times the time".
 
         Factors alone, since `plan` predicts RRMSD and seconds better than they are known here.
         """

@@ -63,7 +63,7 @@ class Parameters:
 class Judged:
     """A lens and its figures by the measure of the whole design: all pixels, all goals, all of the light."""
 
-    rrmsd: float  # by `Task.rrmsd`
+    rrmsd: float  # RRMSD by `Task.rrmsd`
     figure: float  # root of the joint merit of all goals (goals.py): the RRMSD itself where no wave is asked for
     lens: Parameters
 
@@ -273,7 +273,7 @@ class Driver:
         self._step = 0.0  # seconds that the last evaluation took; the next one will take as long
         self._last = clock()  # end of the last step
         self._processor, self._spent = processor, processor()
-        self.best: Judged | None = None  # of the stage under way, at the ends of its parts
+        self.best: Judged | None = None  # best lens at the ends of the parts of the stage under way
         self._record = record
 
     @property

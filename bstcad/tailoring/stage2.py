@@ -52,8 +52,9 @@ PICTURES, OF_SIDE = ((2 / 3, 1.4), (4 / 3, 0.7)), 513
 # has to move far: (pixels along the longer side, tubes a side, evaluations) of the rounds before those, the last of
 # which comes again after the first of those; and how many times the evaluations those have then.
 COARSE, MORE = ((32, 256, 60), (64, 384, 60)), 1.5
-# The same where those are one round, which then comes last: no stage ends with a round that sees few pixels.  (A draft
-# of a plate bound to 2 mm: RRMSD 0.264 by 1.5 times, 0.236 by 3, but 0.408 if 60 evaluations on 64 pixels come last.)
+# Factor of the evaluations where those are one round, which then comes last, since no stage may end with a round that
+# sees few pixels.  (A draft of a plate bound to 2 mm: RRMSD 0.264 by 1.5 times, 0.236 by 3, but 0.408 if 60 evaluations
+# on 64 pixels come last.)
 MORE_ALONE = 3.0
 LARGE, FAR_OFF = 16, 0.04
 SEEN, BY = 16, 8  # places a side of the lens, and points of a source, by which the width of its image is measured
@@ -76,7 +77,7 @@ class Round:
     stage: str = "stage 2"  # of which it is a part
     pixels: int | None = None  # along the longer side, that it sees instead of the target's
     spread: Spread | None = None  # of a source of some size, whose points the task's channels are
-    share: float = 1.0  # of the source's size, of which the light of this round is
+    share: float = 1.0  # size of the source in this round, as a part of its full size
     by_images: bool = False  # of that source alone, without the rays that tell what they leave out: for a preview
 
     @property

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 VERTEX_ROUNDING = 2e-7  # of the largest coordinate: a vertex in float32 on a slope, off its face
 VERIFY_SEED = 1_000_003  # added to the seed: rays that tailoring never saw
 RIPPLE_SLOPE = 5e-5  # rad RMS; turning leaves slope errors of 50 to 100 µrad on a freeform face
-RIPPLE_LIGHT = 1 / 3  # of the RRMSD that is allowed: what a ripple may make by itself, a ninth of the squared error
+RIPPLE_LIGHT = 1 / 3  # largest RRMSD by the ripple alone, as a part of the allowed RRMSD: a ninth of the squared error
 OF_RIPPLE = "ripple_rrmsd"  # key of a face's figures
 OCTAVES = 17  # control points a side of a net from which on its octaves are judged
 TARGET_DIFFERENCE = 1e-3  # of the brightest pixel: versions of the libraries that read pictures and draw letters differ
@@ -140,7 +140,7 @@ class Nominal:
 class AtBound:
     """How near the tailored faces come to a bound of the scene."""
 
-    share: float | None  # of their area within 3 % of the bound; None: of a thickness that is
+    share: float | None  # part of their area within 3 % of the bound; None: a thickness is there
     tightest: str  # place nearest to the bound, "at (1, 2) mm"; of a thickness none
 
 
@@ -155,7 +155,7 @@ class Proof:
     stability: dict[str, float | int | None]
     blur: Blur | None = None  # by the source's size; None: it is a point, or a beam of parallel light
     lines: tuple[Line, ...] = ()  # of a spectrum, each by itself
-    at_bounds: dict[str, AtBound] | None = None  # by key; None: no bounds
+    at_bounds: dict[str, AtBound] | None = None  # the bounds met, by key; None: no bounds
     further: tuple[Light, ...] = ()  # on the targets behind the first
     # of the light, against the one asked for; None: none was, or no light comes to where it is stated
     wavefront: WavefrontError | None = None

@@ -62,9 +62,9 @@ class ExaminedFile:
     """A STEP file by itself."""
 
     checks: tuple[Check, ...]
-    lens: Lens  # that it holds, in its own frame, of an index that does not matter
+    lens: Lens  # lens of the file, in its own frame; its index does not matter
     whole: WholePart | None  # the part around that lens; None: it is bare
-    placement: Placement  # of the lens's frame in the file
+    placement: Placement  # where the lens's frame lies in the file
 
 
 @one_sentence

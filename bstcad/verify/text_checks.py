@@ -22,7 +22,7 @@ from bstcad.verify.verdict import Check
 TEXT = "STEP text"
 DENSITY = f"{TEXT}: stated density"  # of a file by itself: no scene says what it should be
 NET = 1e-11  # mm; rounding of a control point to sixteen digits of text
-ROUNDINGS = 2e-15  # of the largest coordinate; a lens over 5 m from the origin of its file is rounded by more than NET
+ROUNDINGS = 2e-15  # rounding, as a part of the largest coordinate; over 5 m from the file's origin it exceeds NET
 AGREE = 1e-6  # of area, volume and the part's size; the sums over a rough back leave some 1e-9
 DIGITS = 1e-12  # mm or g/cm³; more than the text leaves of a number
 
