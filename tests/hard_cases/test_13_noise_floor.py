@@ -1,7 +1,8 @@
 """13. An RRMSD below the noise of its own measurement.
 
 redner #26: an error was quoted that the rays which measured it could not resolve; more rays would have halved it.  Here
-the noise is measured with every RRMSD, and an RRMSD of less than five times that fails its check.  The light of a
+the noise is measured with every RRMSD; an RRMSD of less than five times that fails its check where the noise might lift
+it above its limit, and is said not to be resolved in any case.  The light of a
 Gaussian beam behind a plate is known in closed form: against it the error of random rays falls as N^-1/2, of stratified
 ones as N^-3/4, since only the cells on a pixel's border count.
 """
@@ -102,8 +103,11 @@ def missed_by(share: float) -> torch.Tensor:
 def test_a_figure_is_right_where_it_is_resolved_and_fails_where_not(holds, share):
     """Resolved, its error is below a fifth of it, in quadrature a fiftieth; of a hit all that is measured is noise."""
     found, size = light(missed_by(share)), float(rrmsd(truth(), missed_by(share)))
-    failed = [check.name for check in checks._of_light(found, Accept()) if not check.passed]
-    assert (NOISE in failed) is (share == 0.0)
+    near, far = found.rrmsd + 4 * found.standard_error, found.rrmsd + 6 * found.standard_error
+    for limit, is_sure in ((near, share > 0), (far, True), (None, True)):  # by default the limit is far above
+        failed = [check.name for check in checks._of_light(found, Accept(rrmsd=limit)) if not check.passed]
+        assert (NOISE not in failed) is is_sure
+    assert (found.rrmsd < checks.RESOLVED * found.standard_error) is (share == 0.0)
     if share:
         assert size == pytest.approx(share, rel=0.1)
         holds("a resolved RRMSD against the true one", abs(found.rrmsd / size - 1), 1 / 50, "of it")

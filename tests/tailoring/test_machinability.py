@@ -109,7 +109,7 @@ def test_a_tool_of_50_mm_fits_and_the_picture_stays(free, bound):
     assert steepest(free.lens)[1] > 1.2 / 50 and steepest(lens)[1] <= 1 / 50
     judged = {stage.name: stage.rrmsd for stage in bound[0].making.stages}
     without = free.making.stages[-1].rrmsd
-    assert judged["bounds on the back"] < 1.5 * without < 0.015  # 0.0103, and 0.0078; stage 1 leaves 0.046
+    assert max(judged["bounds on the back"], without) < 0.0115  # 0.0103, and 0.0078; stage 1 leaves 0.046
 
 
 def test_it_goes_on_from_where_it_was_left(bound, tmp_path):
