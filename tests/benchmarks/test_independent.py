@@ -144,7 +144,9 @@ SMOOTH = {  # name: changes of POINT, table by table
     "super_gaussian_of_a_laser": {
         "source": LASER, "target": {"profile": {"shape": "super_gaussian", "radius_1e2": 150.0, "order": 6.0}},
     },
-    "stripes_of_a_laser": {"source": LASER, "target": {"image": "stripes"}},
+    "wide_stripes_by_an_even_cone": {
+        "source": {**POINT["source"], "profile": "uniform", "half_angle": 32.0}, "target": {"image": "wide_stripes"},
+    },
     "hills_by_an_even_cone": {
         "source": {**POINT["source"], "profile": "uniform", "half_angle": 32.0}, "target": {"image": "hills"},
     },
