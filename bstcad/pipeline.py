@@ -409,8 +409,8 @@ def _handed_on(task: Task, driver: Driver, last: Step, before: Sequence[Judged])
         if known.beats(latest):
             lens = known.lens.applied(lens)
             other = _mended(task, lens)
-            judged = task.judged(other, task.rrmsd(other)) if _moved(lens, other) else known
-            if judged.beats(latest):
+            best, judged = task.better(mended, other)
+            if best is other:
                 driver.end(BEST, judged.rrmsd)
                 return other
     return mended

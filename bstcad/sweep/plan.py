@@ -355,7 +355,7 @@ def _pilot(scene: Scene, lens: Lens, quality: str, tick: Callable[[], None]) -> 
     last = driver.run((step for step in second if tick() is None), task.whole, lambda state: state, lambda: "")
     made, best = last.lens, driver.best
     if best is not None and last.judged is not None and best.beats(task.whole.judged(made, last.judged)):
-        made = best.lens.applied(made)  # a design hands on its best lens
+        made, _ = task.whole.better(made, best.lens.applied(made))  # a design hands on its best lens
     unseen = detail(scene.target.irradiance(), max(target.columns_rows))
     steep = steepness(task.heaviest.source, made, target.screen, task.target, sent=sent)
     doubtful = stage1.doubtful(task, rounds.lens, judged[0], rounds.state)

@@ -221,7 +221,7 @@ class TestBlur:
 
     def test_the_mean_image_is_that_of_the_disc(self):
         """Sum 1, its centroid in the middle, and even inside."""
-        mean = images(self.disc(4.0, count=400), self.plate(), replace(self.SCREEN, pixels=(30, 20)), 5).mean()
+        mean = images(self.disc(4.0, count=400), self.plate(), replace(self.SCREEN, pixels=(30, 20)), 5).mean((30, 20))
         rows, columns = (np.arange(k) - (k - 1) / 2 for k in mean.shape)
         assert (mean.sum(), mean.sum(1) @ rows, mean.sum(0) @ columns) == pytest.approx((1.0, 0.0, 0.0), abs=1e-9)
         inside = mean[np.hypot(rows[:, None], columns) < 4]  # of 5 pixels

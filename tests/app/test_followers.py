@@ -10,7 +10,7 @@ from bstcad.app.followers import take_change
 from bstcad.app.form import form
 from bstcad.app.scene_text import changed, typed
 from bstcad.runs.files import SentenceError
-from bstcad.scene import new_scene
+from bstcad.scene import effects, new_scene
 from bstcad.scene.scene import of_text
 from tests.app.conftest import SMALL
 
@@ -72,8 +72,9 @@ def test_a_wrong_entry_changes_no_other_field_and_leaves_no_trace(key, wrong, ot
 
 
 @pytest.mark.parametrize("name", TEXTS)
-def test_a_choice_that_is_offered_is_possible_or_told_why_not(name):
+def test_a_choice_that_is_offered_is_possible_or_told_why_not(name, monkeypatch):
     """Each is typed as the page sends it; what is not possible is greyed, all else makes a valid scene."""
+    monkeypatch.setattr(effects, "_KNOWN", {})  # of other tests of this process
     text = TEXTS[name]
     greyed, data = impossible(text, fault), tomllib.loads(text)
     for field in form(data).fields():
