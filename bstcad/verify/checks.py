@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -218,7 +219,7 @@ def verify(
     cut = as_cut(lens, mount)
     shape = describe(cut, effort.places) | {"volume": whole.volume} | _ripples_in_light(as_made, nominal)
     allowed = DEFAULT_RRMSD_LIMIT if nominal.accept.rrmsd is None else nominal.accept.rrmsd
-    most_ripple = RIPPLE_LIGHT * allowed
+    ripple = partial(_ripple, shape, most=RIPPLE_LIGHT * allowed, rrmsd=max(each.rrmsd for each in lights))
     stability = _stability(as_made, nominal, lights, shape)
     machined, at_bounds = of_bounds(cut, nominal.blank, shape)
     meets = "meets the mirror" if lens.reflects else "enters the lens"
@@ -232,8 +233,8 @@ def verify(
         *(_result(of_part, folder / "part.step", lambda: submit(*part_job)) if of_part else ()),
         *of_aperture,
         *machined,
-        _ripple(shape, max(lens.back.shape), most=most_ripple),
-        *([_ripple(shape, max(lens.front.shape), "front", most=most_ripple)] if lens.shapes_front else []),
+        ripple(max(lens.back.shape)),
+        *([ripple(max(lens.front.shape), "front")] if lens.shapes_front else []),
         sealed,
         *_facets(mesh, lens, shape["volume"], nominal),
         *(_picture(goal) for goal, _, _ in goals),
@@ -355,23 +356,24 @@ def time_limit(path: Path) -> float:
 
 def _ripple(
     shape: Mapping[str, float | None], m: int, face: Literal["front", "back"] = "back",
-    most: float = RIPPLE_LIGHT * DEFAULT_RRMSD_LIMIT,
+    most: float = RIPPLE_LIGHT * DEFAULT_RRMSD_LIMIT, rrmsd: float = math.inf,
 ) -> Check:  # fmt: skip
-    """Check that control points do not go up and down in turn by more than a tool or the light feels.
+    """Check that control points do not go up and down in turn by more than the light feels.
 
     m: control points along the longer side.  most: RRMSD that the ripple of a face may make by itself; where shape
-    does not state what it makes, the tool decides.
+    does not state what it makes, the slope that turning leaves is the limit.  rrmsd: of the lens; a ripple that by
+    itself makes more is a part of the picture, and costs no more than the lens's RRMSD.
     """
     front = "front_" if face == "front" else ""
     slope, height = shape[f"{front}ripple_slope"], shape[f"{front}ripple_height"]
     made = shape.get(f"{front}{OF_RIPPLE}")
     limit = RIPPLE_SLOPE if m >= OCTAVES else None  # a coarse net has too few octaves to say
     if limit is not None and made:
-        limit = min(limit, slope * most / made)
+        limit = slope * most / max(min(made, rrmsd), 1e-12)
     name = f"ripple{' of the front' if front else ''}: RMS slope of control points that go up and down in turn"
     where = f"{1e6 * height:.3g} nm RMS high"
     if made is not None:
-        where += f"; by itself it makes an RRMSD of {made:.2g}, and {most:.2g} may be"
+        where += f"; by itself it makes an RRMSD of {made:.2g}, where {most:.2g} is allowed"
     return Check.at_most(name, slope, limit, unit="rad", where=where)
 
 
