@@ -266,10 +266,15 @@ class Blur:
 def blur(
     channels: Sequence[Channel], lens: Lens, screen: Screen, target: np.ndarray, n: int = IMAGE_PLACES
 ) -> Blur | None:
-    """The blur by a source whose points are the channels, at its first line; None for a point source."""
+    """The blur by a source whose points are the channels, at its first line; None for a point source.
+
+    None, too, where none of its light gets through the lens, so that there is no image.
+    """
     if points(channels) == 1:
         return None
     found = images(channels, lens, screen, n)
+    if not found.flux.any():
+        return None
     width = found.width()
     return Blur(width * _pixel(screen), width, found.deviation(target))
 

@@ -219,6 +219,9 @@ class TestBlur:
         both, alone = (self.of((here, replace(there, weight=weight))) for weight in (0.5, 0.0))
         assert alone.width < 1e-9 < 1 < both.width
 
+    def test_a_source_whose_light_does_not_get_through_has_no_image(self):
+        assert self.of(tuple(replace(each, weight=0.0) for each in self.disc(1.0))) is None
+
     def test_the_mean_image_is_that_of_the_disc(self):
         """Sum 1, its centroid in the middle, and even inside."""
         mean = images(self.disc(4.0, count=400), self.plate(), replace(self.SCREEN, pixels=(30, 20)), 5).mean((30, 20))
