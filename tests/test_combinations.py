@@ -14,25 +14,23 @@ import math
 import random
 import re
 
+import numba
 import numpy as np
 import pytest
+import torch
 
 import bstcad
 from bstcad import commands
 from bstcad.app.preview import Pains, preview
-from bstcad.optics import measure
 from bstcad.optics.measure import Effort
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sides import both
 from bstcad.optics.surfaces import Sphere
 from bstcad.scene.blank import as_front, net_extent
 from bstcad.scene.errors import SceneError
-from bstcad.sweep import estimates
 from bstcad.sweep.cold_run import Units
 from bstcad.sweep.net_choice import with_net
 from bstcad.sweep.plan import plan
-from bstcad.tailoring import run as tailoring
-from bstcad.tailoring import source_image
 from tests.conftest import draws_nothing, verify_with
 
 # --- the choices ------------------------------------------------------------------------------------------------------
@@ -136,6 +134,7 @@ CHOICES = {
     "picture": {
         "letters": {"target.text": "HI"},
         "photo": photo,
+        "part of a photo": lambda chosen: photo(chosen) | {"target.crop": [0.1, 0.0, 0.9, 0.7]},
         "even": {"target.uniform": True},
         "profile": {"target.profile": {"shape": "disc", "radius": 12.0}},
     },
@@ -181,7 +180,7 @@ SMALL = {
     "lens": {"material": "PMMA", "min_thickness": 1.5, "back": {"kind": "bspline", "z": BACK, "control_points": 21}},
     "tailoring": {
         "quality": "draft", "rays": 48, "transport_grid": 32, "transport_iterations": 12, "stage2_iterations": 6,
-        "rounds": 2,
+        "rounds": 2, "source_points": 4,
     },
 }  # fmt: skip
 REFUSED = (  # the least sets of values that no scene has together
@@ -258,8 +257,8 @@ TRIPLES = "light", "rim", "front"
 
 # --- a scene from its plan to its files and back ----------------------------------------------------------------------
 
-EFFORT = Effort(192, places=33, points=256)
-HASTY = Pains(pixels=24, net=21, tubes=48, rounds=2, evaluations=3, blurred=2)
+EFFORT = Effort(96, places=33, points=64)
+HASTY = Pains(pixels=24, net=17, tubes=36, rounds=1, evaluations=2, blurred=1)
 MAY_FAIL = (  # checks by the beginning of their names, the choices under which they may fail, and why that is true
     ("RRMSD", {}, "21 control points and six evaluations make no sharp picture, nor one net several pictures"),
     ("ripple", {}, "six evaluations leave the ripple of a net that was cut at its bounds"),
@@ -278,6 +277,26 @@ MAY_REFUSE = (  # sentences of designs, and the choices that cannot be had toget
     (r"lens.front.optimise: with the front that the target needs, mount\.", {"front": "free sphere"}),
     (r"target: .* of the light would have to leave the back outside of lens.outline", {"front": "tailored spline"}),
 )
+COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which figures are found
+    "optics.measure": {"LEAST": 65, "FEW_POINTS": 4, "MANY_POINTS": 8},
+    "scene.scene": {"JUDGE_POINTS": 4},
+    "tailoring.run": {"ASKED": Effort(96, accuracy=0.0, witness=False)},
+    "tailoring.stage1": {"COARSEST_GRID": 16},
+    "tailoring.slope_map.lit_window": {"__defaults__": (32,)},
+    "tailoring.source_image": {"SIDE": 64, "POINTS": 8, "PLACES": 8, "NODES": 3, "PAIRS": 32},
+    "tailoring.machinability": {"PLACES": 65, "RIM": 129, "REPAIR": 20},
+    "tailoring.reachable": {"PLACES": 17, "AIMS": 24, "CELLS": 16, "STEPS": 10, "ROUNDS": 2},
+    "tailoring.feasibility": {"CELLS": 24, "PIXELS": 32, "ITERATIONS": 20},
+    "analysis.light": {"MOUNT_RAYS": 96, "FEWEST": 16, "MARGIN_RAYS": 64, "NEEDED_RAYS": 65},
+    "analysis.light.blur": {"__defaults__": (12,)},
+    "analysis.neglected_effects": {"PLACES": 24, "GHOSTS": 32},
+    "analysis.shape": {"GRID": 257},
+    "app.preview": {"IMAGE_PLACES": 6, "CELLS": 16, "RAYS": 32, "SHAPE": 33, "FRONT_CELLS": 16, "FRONT_STEPS": 10},
+    "sweep.estimates": {"NET": 17, "CELLS": 16, "PIXELS": 24, "FRONT_NET": 9, "STEPS": 10},
+    "sweep.net_choice": {"TUBES": 64},
+    "sweep.plan": {"PILOT_CELLS": (16, 16)},
+    "verify.checks": {"LINE_TUBES": 65},
+}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -286,12 +305,15 @@ def quick():
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
         verify_with(patch, EFFORT)
-        patch.setattr(source_image, "SIDE", 128)
-        patch.setattr(source_image, "POINTS", 32)
-        patch.setattr(measure, "LEAST", 97)
-        patch.setattr(tailoring, "ASKED", Effort(256, accuracy=0.02, witness=False))
-        patch.setattr(estimates, "STEPS", 10)
+        for where, figures in COARSE.items():
+            for name, figure in figures.items():
+                patch.setattr(f"bstcad.{where}.{name}", figure)
+        threads = torch.get_num_threads(), numba.get_num_threads()
+        torch.set_num_threads(1)  # on so few points more threads cost more than they save
+        numba.set_num_threads(1)
         yield
+        torch.set_num_threads(threads[0])
+        numba.set_num_threads(threads[1])
 
 
 def faults(chosen, folder):
