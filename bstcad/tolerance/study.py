@@ -56,7 +56,7 @@ def here(work: Callable[[Any, Any], Any], shared: Any, items: Sequence[Any]) -> 
     threads = ThreadPoolExecutor(at_once)
     try:
         yield from threads.map(work, repeat(shared), items[1:])
-    finally:  # nobody waits for a picture under way, which may take ten seconds, after a Ctrl-C
+    finally:  # a picture under way may take ten seconds, and a Ctrl-C does not wait for it
         threads.shutdown(wait=False, cancel_futures=True)
 
 
