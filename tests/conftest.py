@@ -11,7 +11,8 @@ import shutil
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 if beside := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):  # they share the cores: a tenth less time in all
-    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // beside)))
+    for library in ("OMP", "OPENBLAS"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // beside)))
 
 from collections import Counter
 from functools import partial

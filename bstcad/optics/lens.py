@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Protocol
 
 import torch
@@ -44,7 +45,7 @@ class Lens:
     behind: tuple[Interface, ...] = ()  # and behind it, such as a fold mirror
     shaped: tuple[int, ...] | None = None  # the interfaces that tailoring shapes; None: the back alone
 
-    @property
+    @cached_property
     def interfaces(self) -> tuple[Interface, ...]:
         """All that light crosses, in its order."""
         own = self._lossless

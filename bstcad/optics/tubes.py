@@ -8,6 +8,7 @@ differentiable in the landing points, whereas the counting of rays in a pixel is
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -25,7 +26,7 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed, Rays, Status, TargetPlane, joined
 from bstcad.optics.sides import Sides, both, spread
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import across, from_first_net, gets_through
+from bstcad.optics.trace import behind, from_first_net, gets_through
 
 ALL = slice(None)
 SHEET = 256  # tubes a side of the sheet through which finer ones are interpolated
@@ -288,7 +289,7 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor, number: int | None
         return joined((arrive_few(*(t[first : first + rows] for t in (p, q, height))) for first in bands), len(p))
 
     def arrive_few(p: Tensor, q: Tensor, height: Tensor) -> Rays:
-        coming = across(source.rays(p, q, lens.entrance.z, 1.0), before)
+        coming = functools.reduce(behind, before, source.rays(p, q, lens.entrance.z, 1.0))
         ahead = (coming.sense * coming.direction[2]).clamp(min=1e-3)
         path = coming.sense * (height - coming.above(face.z)) / ahead
         return replace(coming, position=coming.position + path * coming.direction)
@@ -296,8 +297,9 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor, number: int | None
     def jacobian(p: Tensor, q: Tensor, height: Tensor) -> list[Tensor]:
         """∂(hit) / ∂(p, q), inverted: [xx, xy, yx, yy]."""
         step = DIFFERENCE * extent
-        one, two = (arrive(p + a, q + b, height).position - arrive(p - a, q - b, height).position
-                    for a, b in ((step, 0.0), (0.0, step)))  # fmt: skip
+        beside = [torch.cat(turns) for turns in ((p + step, p - step, p, p), (q, q, q + step, q - step))]
+        right, left, above, below = arrive(*beside, height.repeat(4, 1)).position.chunk(4, dim=1)
+        one, two = right - left, above - below
         xx, yx, xy, yy = (d / (2 * step) for d in (one[0], one[1], two[0], two[1]))
         det = xx * yy - xy * yx
         det = torch.where(det.abs() > 1e-6, det, torch.ones_like(det))

@@ -31,6 +31,7 @@ import torch
 from scipy.interpolate import LinearNDInterpolator
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from bstcad.optics.irradiance import Screen
@@ -120,7 +121,8 @@ class LightBehind:
         few = replace(self, place=self.place[every], direction=self.direction[every])
         met, directions = few.meeting(surface)[:2].reshape(2, -1).T, few.direction.reshape(3, -1).T
         at = np.stack([p.cpu().double().numpy().reshape(-1) for p in (x, y)], axis=-1)
-        found = LinearNDInterpolator(met, directions)(at)
+        with threadpool_limits(1, "blas"):  # LAPACK takes a 2 x 2 matrix of each triangle: its threads wait for cores
+            found = LinearNDInterpolator(met, directions)(at)
         beyond = np.isnan(found[:, 0])
         found[beyond] = directions[cKDTree(met).query(at[beyond])[1]]
         found = torch.from_numpy(found.T.reshape(3, *x.shape).copy())
