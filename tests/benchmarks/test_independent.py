@@ -158,6 +158,19 @@ SMOOTH = {  # name: changes of POINT, table by table
         "lens": {"front": {"kind": "conic", "z": 15.0, "curvature": -0.01, "conic_constant": -0.8}},
         "target": {"image": "stripes", "tilt": [5.0, -8.0]},
     },
+    "two_faces_and_a_plane_wave": {
+        "source": {**LASER, "radius_1e2": 5.0, "aperture": {"shape": "circle", "radius": 7.0}},
+        "lens": {
+            "outline": {"shape": "circle", "diameter": 15.0},
+            "front": {"kind": "bspline", "z": 0.0, "optimise": True},
+            "back": {"kind": "bspline", "z": 20.0, "control_points": 97},
+        },
+        "target": {
+            "z": 80.0, "x": [-8.0, 8.0], "y": [-8.0, 8.0],
+            "profile": {"shape": "super_gaussian", "radius_1e2": 5.0, "order": 4.0},
+        },
+        "wavefront": {"kind": "plane", "z": 80.0},
+    },
 }  # fmt: skip
 TWO_FACES = {"beam_shaper_near": 0, "beam_shaper_far": 1}  # name: target of the template at full size
 
@@ -179,7 +192,7 @@ def drawn(name, folder):
 
 def smooth_scene(name, folder):
     """The path of the scene file of a lens of SMOOTH in a folder."""
-    scene = {table: {**POINT.get(table, {}), **SMOOTH[name].get(table, {})} for table in POINT}
+    scene = {table: {**POINT.get(table, {}), **SMOOTH[name].get(table, {})} for table in POINT | SMOOTH[name]}
     if SMOOTH[name].get("source", {}).get("kind"):
         scene["source"] = SMOOTH[name]["source"]
     scene["lens"] = {key: value for key, value in scene["lens"].items() if value is not None}
