@@ -260,16 +260,6 @@ TRIPLES = "light", "rim", "front"
 EFFORT = Effort(96, places=33, points=64)
 HASTY = Pains(pixels=24, net=17, tubes=36, rounds=1, evaluations=2, blurred=1)
 MAY_FAIL = (  # checks by the beginning of their names, the choices under which they may fail, and why that is true
-    ("RRMSD", {}, "21 control points and six evaluations make no sharp picture, nor one net several pictures"),
-    ("ripple", {}, "six evaluations leave the ripple of a net that was cut at its bounds"),
-    ("light on the target", {"targets": "two"}, "light that fills one wall goes past the other one"),
-    ("light on the target", {"wavefront": "plane"}, "light that is parallel to the axis goes past a wall beside it"),
-    ("light on the target", {"wavefront": "sphere"}, "light from a focus on the axis goes past a wall beside it"),
-    (
-        "light on the target",
-        {"reach": "part"},
-        "light that a face would have to turn by more than it can goes elsewhere",
-    ),
     ("wavefront", {}, "one net has no two goals"),
     (r"part\.step", {"mount": "flange"}, "a back that is steep is cut by the plane of the flange"),
 )

@@ -17,7 +17,7 @@ from bstcad.measured.form_error import Deviation, Form, deviation, fitted, minim
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, Light, measure
 from bstcad.optics.wavefront_error import wavefront_error
-from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, UNASKED, WAVEFRONT, Goal, Nominal
+from bstcad.verify.checks import WAVEFRONT, Goal, Nominal
 from bstcad.verify.verdict import Check
 
 FARTHEST = 3e-3  # of the half width, RMS after alignment: a part beyond is of another design
@@ -61,7 +61,6 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
     lights = [_light(lens, form, nominal, goal, effort=least) for goal in nominal.goals]
     scale, uncertainty = aligning.scale(face, placed)
     x, y, _ = placed.pose.shift
-    rrmsd, unasked = (nominal.accept.rrmsd, "") if nominal.accept.rrmsd is not None else (DEFAULT_RRMSD_LIMIT, UNASKED)
     checks = (
         Check.true("made part: the cloud is in mm", cloud.unit == "mm", f"its extent is the lens's in {cloud.unit}"),
         Check.true("made part: the axes of the cloud are the design's", not axes, axes),
@@ -83,7 +82,7 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
             check
             for goal, (light, high) in zip(nominal.goals, lights, strict=True)
             for check in (
-                Check.at_most(f"made part: RRMSD predicted{goal.suffix}{unasked}", light.rrmsd, rrmsd),
+                Check.at_most(f"made part: RRMSD predicted{goal.suffix}", light.rrmsd, nominal.accept.rrmsd),
                 Check.at_most(
                     f"made part: RRMSD, were all that the points leave open against it{goal.suffix}", high, None
                 ),

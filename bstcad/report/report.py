@@ -19,7 +19,6 @@ from bstcad.report.prescription import WAYS, order_rows
 from bstcad.report.record import LEFT_OUT, Contents, Examined, LeftOut, bounds, changes
 from bstcad.report.units import Rows, about, bound, environment, number, paragraphs, percent, quantity, tables
 from bstcad.runs import files
-from bstcad.verify.checks import UNASKED
 from bstcad.verify.verdict import NO_LIMIT, Check
 
 if TYPE_CHECKING:
@@ -85,8 +84,7 @@ def doubts(report: Contents | Examined) -> list[str]:
     """Sentences on the RRMSD: that the scene sets no limit on it or on the light, that it is not resolved."""
     if isinstance(report, Examined):
         return []
-    most = next((check.limit for check in report.checks if check.name.startswith("RRMSD")), None)
-    return paragraphs("verdict.txt.j2", "doubts", report=report, resolved=resolved(report), most=most)
+    return paragraphs("verdict.txt.j2", "doubts", report=report, resolved=resolved(report))
 
 
 def check_line(check: Check) -> str:
@@ -193,9 +191,9 @@ def junit(report: Contents) -> bytes:
     """The checks of a design as a suite, each a test case; a check that is stated, not judged, passes.
 
     The time of the suite is that of the verification; remarks stand in its output.  Where no limit was asked, the
-    checks that keep a default limit are skipped: neither passed nor failed.
+    checks without a limit are skipped: neither passed nor failed.
     """
-    unjudged = [check for check in report.checks if report.verdict == NO_LIMIT and check.name.endswith(UNASKED)]
+    unjudged = [check for check in report.checks if report.verdict == NO_LIMIT and check.limit is None]
     text = environment().get_template("junit.xml.j2").render(report=report, unjudged=unjudged)
     return NO_XML.sub("�", text).encode()
 

@@ -24,7 +24,7 @@ SLIM = 10.0  # a plate is so many times as wide as thick …
 LEAST = 3.0  # … but at least so thick (mm)
 RANGES = {"size": (1.0, 10_000.0), "distance": (1.0, 1e7)}  # mm
 OVER_BLUR = 1.1  # times the RRMSD of the blurred picture: standard quality ends well below that, a draft hardly
-FEWEST_RRMSD, MOST_RRMSD = 0.05, 0.25  # the limit that is written; the latter passes where a scene asks for none
+FEWEST_RRMSD, MOST_RRMSD = 0.05, 0.25  # the smallest and the largest limit that is written
 
 LIKE_THE_PHOTO = re.compile(r"(?:([^xX×]+)[xX×])?photo")  # a size: the longer side, or SIZE, by the photo's other side
 

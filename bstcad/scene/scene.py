@@ -67,15 +67,15 @@ UNBOUNDED = ("point", "lambertian")  # the profile that does without: it lights 
 
 
 class Accept(Record):
-    """Limits of the checks in the report; None: the check has a default limit, or only states its value."""
+    """Limits of the checks in the report; None: the check only states its value."""
 
-    rrmsd: Annotated[float | None, Key("Greatest RRMSD of the irradiance; 0.25 if absent.", "", 1e-6, 10.0)] = None
+    rrmsd: Annotated[float | None, Key("Greatest RRMSD of the irradiance.", "", 1e-6, 10.0)] = None
     form: Annotated[float, Key("Greatest distance of lens.step from the tailored surface.", "mm", 1e-12, 1.0)] = 1e-6
     efficiency: Annotated[
         float | None, Key("Least share on the target of the light that leaves the back.", "", 0.0, 1.0, example=0.9)
     ] = None
     light_on_target: Annotated[
-        float | None, Key("Least share on the target of the light in the lens; 0.5 if absent.", "", 0.0, 1.0)
+        float | None, Key("Least share on the target of the light in the lens.", "", 0.0, 1.0)
     ] = None
     leak: Annotated[float | None, Key("Greatest share of the light where the target is dark.", "", 0.0, 1.0)] = None
     decentre: Annotated[

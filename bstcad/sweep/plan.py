@@ -101,10 +101,11 @@ def verdict(scene: Scene, found: Mapping[str, Any]) -> dict[str, str] | None:
     wide = max(high - low for low, high in (target.screen.x, target.screen.y))
     least, most = (number(two_digits(value)) for value in (UNDONE * blurred, blurred))
     if UNDONE * blurred > allowed:
+        permits = "" if asked is None else f", where {number(asked)} is allowed"
         sentence = (
             f"The picture will be blurred: through each place of the {scene.optic} the source throws an image of "
             f"itself {about(width, 'mm')} wide on the target, which is {quantity(wide, 'mm')} wide. The RRMSD will be "
-            f"{least} to {most} whatever the {scene.optic}, where {number(allowed)} is allowed. Take a smaller source, "
+            f"{least} to {most} whatever the {scene.optic}{permits}. Take a smaller source, "
             f"one further before the {scene.optic}, a target nearer behind it, or a coarser picture."
         )
         return {"kind": "blurred", "sentence": sentence}

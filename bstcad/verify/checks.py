@@ -11,9 +11,8 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -52,13 +51,8 @@ if TYPE_CHECKING:
 
 VERTEX_ROUNDING = 2e-7  # of the largest coordinate: a vertex in float32 on a slope, off its face
 VERIFY_SEED = 1_000_003  # added to the seed: rays that tailoring never saw
-RIPPLE_SLOPE = 5e-5  # rad RMS; turning leaves slope errors of 50 to 100 µrad on a freeform face
-RIPPLE_LIGHT = 1 / 3  # largest RRMSD by the ripple alone, as a part of the allowed RRMSD: a ninth of the squared error
-OF_RIPPLE = "ripple_rrmsd"  # key of a face's figures
-OCTAVES = 17  # control points a side of a net from which on its octaves are judged
 TARGET_DIFFERENCE = 1e-3  # of the brightest pixel: versions of the libraries that read pictures and draw letters differ
-DEFAULT_RRMSD_LIMIT = 0.25  # RRMSD above which a design fails where accept.rrmsd asks for none
-DEFAULT_LIGHT_LIMIT = 0.5  # least light on the target, of all that enters the lens, where light_on_target asks for none
+DEFAULT_RRMSD_LIMIT = 0.25  # RRMSD that remarks, plans and tolerance studies take where accept.rrmsd asks for none
 LINE_TUBES = 1031  # tubes a side at least for the picture of each line of a spectrum by itself
 DARK = "light where the target is dark, of all on the target"
 TOTAL_REFLECTION = "smallest margin to total internal reflection"
@@ -68,7 +62,6 @@ CUT_EXCUSE = 1e-3  # of the light: a mount that cuts away less is no reason for 
 MAX_ON_FLANGE = 1e-3  # of the light that gets through the lens; no wall of a flange is to stand in the way of more
 WAVEFRONT = "wavefront error, RMS in waves, piston and tilt removed"
 FLOOR = 0.1  # of the wavefront error that is allowed: rounding that adds more leaves the verdict open
-UNASKED = " (by default: none was asked)"
 LIMIT, LIMIT_PER_MB = 120.0, 3.0  # s that OCC may take over a file, and more for each MB; it needs a hundredth of them
 GRID = ", on a grid four times finer than the net"
 
@@ -218,8 +211,6 @@ def verify(
     wavefront, of_wavefront = _of_wavefront(as_made, nominal)
     cut = as_cut(lens, mount)
     shape = describe(cut, effort.places) | {"volume": whole.volume} | _ripples_in_light(as_made, nominal)
-    allowed = DEFAULT_RRMSD_LIMIT if nominal.accept.rrmsd is None else nominal.accept.rrmsd
-    ripple = partial(_ripple, shape, most=RIPPLE_LIGHT * allowed, rrmsd=max(each.rrmsd for each in lights))
     stability = _stability(as_made, nominal, lights, shape)
     machined, at_bounds = of_bounds(cut, nominal.blank, shape)
     meets = "meets the mirror" if lens.reflects else "enters the lens"
@@ -233,8 +224,7 @@ def verify(
         *(_result(of_part, folder / "part.step", lambda: submit(*part_job)) if of_part else ()),
         *of_aperture,
         *machined,
-        ripple(max(lens.back.shape)),
-        *([ripple(max(lens.front.shape), "front")] if lens.shapes_front else []),
+        *_of_ripple(shape),
         sealed,
         *_facets(mesh, lens, shape["volume"], nominal),
         *(_picture(goal) for goal, _, _ in goals),
@@ -354,37 +344,26 @@ def time_limit(path: Path) -> float:
     return LIMIT + (LIMIT_PER_MB * path.stat().st_size / 1e6 if path.is_file() else 0.0)
 
 
-def _ripple(
-    shape: Mapping[str, float | None], m: int, face: Literal["front", "back"] = "back",
-    most: float = RIPPLE_LIGHT * DEFAULT_RRMSD_LIMIT, rrmsd: float = math.inf,
-) -> Check:  # fmt: skip
-    """Check that control points do not go up and down in turn by more than the light feels.
+def _of_ripple(shape: Mapping[str, float | None]) -> list[Check]:
+    """State how steep the control points of each tailored face go up and down in turn.
 
-    m: control points along the longer side.  most: RRMSD that the ripple of a face may make by itself; where shape
-    does not state what it makes, the slope that turning leaves is the limit.  rrmsd: of the lens; a ripple that by
-    itself makes more is a part of the picture, and costs no more than the lens's RRMSD.
+    No limit: the RRMSD judges what the light feels of it, and the bounds of the scene what a tool feels.
     """
-    front = "front_" if face == "front" else ""
-    slope, height = shape[f"{front}ripple_slope"], shape[f"{front}ripple_height"]
-    made = shape.get(f"{front}{OF_RIPPLE}")
-    limit = RIPPLE_SLOPE if m >= OCTAVES else None  # a coarse net has too few octaves to say
-    if limit is not None and made:
-        limit = slope * most / max(min(made, rrmsd), 1e-12)
-    name = f"ripple{' of the front' if front else ''}: RMS slope of control points that go up and down in turn"
-    where = f"{1e6 * height:.3g} nm RMS high"
-    if made is not None:
-        where += f"; by itself it makes an RRMSD of {made:.2g}, where {most:.2g} is allowed"
-    return Check.at_most(name, slope, limit, unit="rad", where=where)
+    faces = {"": shape["ripple_slope"], " of the front": shape.get("front_ripple_slope")}
+    return [
+        Check.at_most(f"ripple{of}: RMS slope of control points that go up and down in turn", slope, None, "rad")
+        for of, slope in faces.items()
+        if slope is not None
+    ]
 
 
 def _ripples_in_light(lens: Lens, nominal: Nominal) -> dict[str, float]:
     """RRMSD that the ripple of each tailored face makes by itself, by keys of Proof.shape."""
     light = nominal.heaviest
     channel = replace(light, source=light.source.central, weight=1.0)
-    faces = ("back", "front") if lens.shapes_front else ("back",)
+    faces = {"": "back"} | ({"front_": "front"} if lens.shapes_front else {})
     return {
-        f"{'front_' if face == 'front' else ''}{OF_RIPPLE}": rrmsd_of_ripple(channel, lens, nominal.screen, face)
-        for face in faces
+        f"{key}ripple_rrmsd": rrmsd_of_ripple(channel, lens, nominal.screen, face) for key, face in faces.items()
     }
 
 
@@ -471,12 +450,12 @@ def _of_light(light: Light, accept: Accept, meets: str = "enters the lens", of: 
     """
     closure, tubes = abs(sum(light.flux.values()) - 1), light.witness
     rrmsd, on_target = f"RRMSD, box pixels, through the re-read STEP{of}", f"light on the target, of what {meets}{of}"
-    allowed = DEFAULT_RRMSD_LIMIT if accept.rrmsd is None else accept.rrmsd
-    sure = max(light.rrmsd, allowed - light.rrmsd)  # noise below it changes neither the figure much nor the verdict
+    # noise below the RRMSD leaves its figure resolved; noise below its distance from the limit leaves its verdict sure
+    noise = None if accept.rrmsd is None else max(light.rrmsd, accept.rrmsd - light.rrmsd)
     checks = [
-        Check.at_most(*_asked(rrmsd, light.rrmsd, accept.rrmsd, DEFAULT_RRMSD_LIMIT)),
-        Check.at_most(f"standard error of that RRMSD, times five{of}", RESOLVED * light.standard_error, sure),
-        Check.at_least(*_asked(on_target, light.used, accept.light_on_target, DEFAULT_LIGHT_LIMIT)),
+        Check.at_most(rrmsd, light.rrmsd, accept.rrmsd),
+        Check.at_most(f"standard error of that RRMSD, times five{of}", RESOLVED * light.standard_error, noise),
+        Check.at_least(on_target, light.used, accept.light_on_target),
         Check.at_least(f"efficiency{of}", light.efficiency, accept.efficiency),
         Check.at_most(f"flux ledger: distance of its sum from 1{of}", closure, 1e-12),
     ]
@@ -498,8 +477,3 @@ def _of_wavefront(lens: Lens, nominal: Nominal) -> tuple[WavefrontError | None, 
         Check.at_most(WAVEFRONT, error.without_tilt.rms, asked, unit="waves"),
         Check.at_most("wavefront error floor", error.floor, None if asked is None else FLOOR * asked, unit="waves"),
     ]
-
-
-def _asked(name: str, value: float, limit: float | None, default: float) -> tuple[str, float, float]:
-    """Name, value and limit of a check by the scene's limit; without it by the default, and the name says so."""
-    return (name + UNASKED, value, default) if limit is None else (name, value, limit)

@@ -29,8 +29,7 @@ PARAGRAPHS = {
 # ---- the names of checks, by the source ------------------------------------------------------------------------------
 
 # Calls whose first argument is the name of a check; `judge` is one of the first two, from a table.
-MAKERS = ("Check", "Check.at_most", "Check.at_least", "Check.true", "judge", "net_check", "_edges_moved", "_asked")
-UNASKED = ("_asked",)  # which may add checks.UNASKED to the name
+MAKERS = ("Check", "Check.at_most", "Check.at_least", "Check.true", "judge", "net_check", "_edges_moved")
 STEP = ("STEP text", "part.step")
 WORDS = {  # in a function, what a variable part of a name may stand for
     ("structure", "name"): STEP,
@@ -42,6 +41,7 @@ WORDS = {  # in a function, what a variable part of a name may stand for
     ("_aperture", "name"): ("front", "back"),
     ("_of_light", "meets"): ("enters the lens", "meets the mirror"),
     ("_of_light", "of"): ("", ", target[1]"),
+    ("_of_ripple", "of"): ("", " of the front"),
     ("_picture", "goal.suffix"): ("", ", target[1]"),
     ("verify", "of"): ("", ", target[1]"),
     ("of_bounds", "of"): ("", " of the front"),
@@ -121,10 +121,7 @@ def names(path):
             maker, first = ast.unparse(call.func), call.args[0]
             if maker not in MAKERS or isinstance(first, ast.Starred) or function.name == "net_check":
                 continue
-            found = texts(first, function.name, local, outer)
-            yield from found
-            if maker in UNASKED:
-                yield from (f"{name} (by default: none was asked)" for name in found)
+            yield from texts(first, function.name, local, outer)
 
 
 @functools.cache
@@ -221,7 +218,7 @@ REMARKS = [
     ("No limit on the light was asked: the RRMSD is 0.25, with 51.0 % of the source's light on the target. Whether "
      "that is enough, the scene does not say: write limits into its table [accept], such as rrmsd = 0.1 and "
      "light_on_target = 0.8.", "no-limit"),
-    ("No RRMSD was asked (accept.rrmsd); any up to 0.25 passes.", "no-rrmsd-asked"),
+    ("No RRMSD was asked (accept.rrmsd): the verdict does not judge it.", "no-rrmsd-asked"),
     ("The RRMSD is not resolved: 0.0284 is less than five times its standard error, 0.02. The lens may be better than "
      "that figure, or worse, up to 0.0484 or so; fewer target.pixels are resolved more easily.", "not-resolved"),
 ]  # fmt: skip

@@ -290,6 +290,7 @@ VERDICTS = [
     (None, predicted(0.02, 0.03, 0.04), "no limit", "nine of ten designs would keep [accept] rrmsd = 0.0"),
     (0.1, {"predicted": None, "not_predicted": "too odd", "blur": None}, "not predicted", "is predicted: too odd."),
     (0.1, {"blur": {"rrmsd": 0.3, "width": 9.0, "pixels": 3.0}}, "blurred", "The RRMSD will be 0.15 to 0.3 whatever"),
+    (None, {"blur": {"rrmsd": 0.6, "width": 9.0, "pixels": 3.0}}, "blurred", "to 0.6 whatever the lens. Take"),
     (0.5, {"blur": {"rrmsd": 0.3, "width": 9.0, "pixels": 3.0}}, None, ""),
 ]
 

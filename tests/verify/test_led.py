@@ -87,7 +87,8 @@ def test_the_part_of_its_light_that_arrives_is_said_first(made):
     assert "missed the lens 46.9 %, sides 1" in light[2]
     for text in (printed(report), (folder / "report.html").read_text(encoding="utf-8")):
         assert "Light on the target" in text
-        assert "PASSED WITH REMARKS" in text and "No RRMSD was asked (accept.rrmsd); any up to 0.25 passes." in text
+        assert "PASSED WITH REMARKS" in text
+        assert "No RRMSD was asked (accept.rrmsd): the verdict does not judge it." in text
 
 
 def test_what_the_scene_asked_for_and_did_not_get_comes_first(made):
@@ -110,7 +111,7 @@ def test_the_folder_says_where_the_back_stands(made):
     assert (again["verdict"], again["given_up"]) == (report["verdict"], report["given_up"])
 
 
-def test_light_that_leaves_through_the_sides_fails_unless_the_scene_allows_it(write):
+def test_light_that_leaves_through_the_sides_is_a_remark_and_fails_by_a_limit(write):
     """A rod of 45 mm behind a source 2 mm before it: four fifths of the light meet its side."""
     rod = {**ROUGH, "source.position": [0.0, 0.0, 13.0], "lens.back.z": 60.0, "accept.rrmsd": 1.0}
     rod |= {"tailoring.rays": 64, "tailoring.rounds": 1, "tailoring.stage2_iterations": 1}
@@ -119,11 +120,11 @@ def test_light_that_leaves_through_the_sides_fails_unless_the_scene_allows_it(wr
     enters = 1 - report["flux"]["missed the lens"]
     assert report["flux"]["lost through the sides"] > 0.8 * enters
     light = "light on the target, of what enters the lens"
-    assert outcome(report, f"{light} (by default: none was asked)") is False
-    assert report["verdict"] == "failed" and "FAILED" in printed(report)
+    assert outcome(report, light) is True and report["verdict"] == "passed with remarks"
+    assert any("leaves through the sides" in remark for remark in report["given_up"])
     text = (folder / "scene.toml").read_text(encoding="utf-8")
-    (folder / "scene.toml").write_text(text.replace("[accept]", "[accept]\nlight_on_target = 0.05"))
-    assert outcome(commands.verify(folder, effort=Effort(64, places=65, points=1024)).facts, light) is True
+    (folder / "scene.toml").write_text(text.replace("[accept]", "[accept]\nlight_on_target = 0.5"))
+    assert outcome(commands.verify(folder, effort=Effort(64, places=65, points=1024)).facts, light) is False
 
 
 def outcome(report, name):
