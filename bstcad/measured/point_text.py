@@ -74,11 +74,8 @@ def measured(places: np.ndarray, where: Sequence[int] | None = None, columns: st
 def read_text(data: bytes) -> Points:
     """The points of text; ValueError says in a sentence what is wrong with it, and in which line."""
     every = [(number, line.strip(" ")) for number, line in enumerate(decoded(data).splitlines(), 1) if line.strip()]
-    if every and re.match(r"zygo\b.*\bxyz\b", every[0][1], re.IGNORECASE):
-        raise ValueError(
-            "is a Zygo XYZ file, whose x and y count pixels and whose heights are in \u00b5m; export x and y in mm "
-            "under a heading such as x [mm],y [mm],z [\u00b5m]"
-        )
+    if every and re.match(r"zygo\b.*\bdata file", every[0][1], re.IGNORECASE):
+        return _read_zygo(every)
     if every and (named := re.fullmatch(r"sep=(.)", every[0][1].strip())):  # Excel's statement of its separator
         every = every[1:]
     forced = named[1] if every and named else ""
@@ -99,6 +96,33 @@ def read_text(data: bytes) -> Points:
         columns = _columns_without_heading(lines, layout)
     places = _table(lines, layout, columns) * heading.units
     return measured(places, [number for number, _ in lines], heading.taken)
+
+
+def _read_zygo(every: list[tuple[int, str]]) -> Points:
+    """The points of a Zygo XYZ file by its numbered lines: pixel column, pixel row and height in µm.
+
+    MetroPro Reference Guide, ASCII data file format: the seventh number of line 8 is the width of a pixel in metres,
+    0 if the lateral scale was not calibrated.  Points stand between two lines #.  Rows are counted from the top; where
+    an instrument counts them from below, the alignment finds y mirrored.
+    """
+    marks = [place for place, (_, line) in enumerate(every) if line == "#"]
+    if "xyz" not in every[0][1].lower() or not marks:
+        raise ValueError("is a Zygo data file without a table of x, y and z; export it as a Zygo XYZ file")
+    stated = [_number(field) for number, line in every[: marks[0]] if number == 8 for field in line.split()]
+    pixel = stated[6] if len(stated) > 6 else None
+    if pixel is None or not 0 < pixel < 1:
+        raise ValueError(
+            "is a Zygo XYZ file, whose x and y count pixels, and its header states no width of a pixel (seventh number "
+            "of line 8, in metres); calibrate the lateral scale of the instrument and export again, or give x and y "
+            "in mm under a heading such as x [mm],y [mm],z [\u00b5m]"
+        )
+    lines = [(number, line) for number, line in every[marks[0] + 1 :] if line != "#"]
+    if not lines:
+        raise ValueError(f"holds no points; {ASKED}")
+    width = 1e3 * pixel
+    places = _table(lines, _Layout(None, False), (0, 1, 2)) * [width, -width, 1e-3]
+    columns = f"x (pixels of {width:.4g} mm), y (rows of pixels from the top) and z (\u00b5m)"
+    return measured(places, [number for number, _ in lines], columns)
 
 
 def decoded(data: bytes) -> str:

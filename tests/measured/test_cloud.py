@@ -24,6 +24,18 @@ def named(found):
     return "\n".join(f"P{k},{x:.7f},{y:.7f},{z:.7f},0.1,high" for k, (x, y, z) in enumerate(found))
 
 
+def zygo(heights, pixel):
+    """A Zygo XYZ file of rows of heights (mm), the first row at the top; pixel: m.  NaN is "No Data"."""
+    header = ["Zygo XYZ Data File - Format 1", '0 8 1 5 "Mon"', "0 0 9 9 1 255", "0 0 9 9", '""', '""', '""']
+    header += [f"0 0.5 6.328e-07 0 1 0 {pixel:.9g} 1500000000", "640 480 0 0 0 0", "#"]
+    data = [
+        f"{x} {y} " + ("No Data" if np.isnan(height) else f"{1e3 * height:.5f}")
+        for y, row in enumerate(heights)
+        for x, height in enumerate(row)
+    ]
+    return "\n".join([*header, *data, "#"])
+
+
 WRONG = {
     "two columns": (lines(GOOD[:, :2], ","), "line 1 holds 2 numbers; give x, y and z in mm"),
     "infinite": (lines(GOOD, ",") + "\n1,inf,3", "line 201: y = inf mm is beyond 1000000 mm"),
@@ -33,7 +45,9 @@ WRONG = {
     "decimal commas": ("x,y,z\n" + lines(GOOD, ",").replace(".", ","), "line 2 holds 6 fields where its heading"),
     "nominal alone": ("X_nom,Y_nom,Z_nom\n" + lines(GOOD, ","), "its heading, 'X_nom,Y_nom,Z_nom', names nominal"),
     "both, and others": ("x,y,z,z act\n" + lines(GOOD[:, [0, 1, 2, 2]], ","), "names x, y or z twice"),
-    "pixels": ("Zygo XYZ Data File - Format 2\n#\n0 0 No Data\n0 1 16025.3\n#", "x and y count pixels"),
+    "pixels": ("Zygo XYZ Data File - Format 2\n#\n0 0 No Data\n0 1 16025.3\n#", "header states no width of a pixel"),
+    "no calibrated pixel": (zygo(GOOD, 0.0), "header states no width of a pixel"),
+    "raw phases": ("Zygo ASCII Data File - Format 2\n#\n1 2 3 4\n#", "without a table of x, y and z"),
     "a zip archive": (b"PK\x03\x04" + bytes(50), "is a zip archive, such as X3P"),
     "half of UTF-16": ("x,y,z\n".encode("utf-16") + b"1", "is no text in UTF-16"),
     "words": (lines(GOOD, " ") + "\n1 two 3", "line 201 is not three numbers ('1 two 3')"),
@@ -131,6 +145,19 @@ def test_the_actual_columns_are_taken_and_that_is_known(tmp_path):
     assert found.columns == "X act, Y act, Z act" and found.points == pytest.approx(GOOD)
     (tmp_path / "a.csv").write_text("\n".join(["x,y,z", lines(GOOD, ",")]))
     assert clouds.load(tmp_path / "a.csv", ROUND).columns == ""
+
+
+def test_a_zygo_file_is_read_in_its_pixels_from_the_top(tmp_path):
+    """Pixels of 0.1 mm, heights in µm, one of 81 x 61 without data."""
+    x, y = np.meshgrid(np.arange(81) * 0.1, np.arange(61) * 0.1)  # y downwards
+    heights = 0.01 * x**2 - 0.02 * y
+    heights[5, 7] = np.nan
+    (tmp_path / "a.xyz").write_text(zygo(heights, 1e-4))
+    found = clouds.load(tmp_path / "a.xyz", ROUND)
+    assert found.without_data == 1 and len(found.points) == 81 * 61 - 1 and "0.1 mm" in found.columns
+    across, up, height = found.points.T
+    assert (across.max(), up.min(), up.max()) == (pytest.approx(8.0), pytest.approx(-6.0), 0.0)
+    assert height == pytest.approx(0.01 * across**2 + 0.02 * up, abs=1e-8)
 
 
 def test_a_cloud_without_a_unit_as_large_as_the_lens_in_inches_is_in_inches(tmp_path):
