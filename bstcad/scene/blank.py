@@ -115,8 +115,6 @@ def _net_of_step(path: Path) -> np.ndarray:
     if text.solids != 1:
         raise ValueError(f"{text.solids} solids in it, and a lens is one")
     surface, shape = text.surface, text.surface.control_points.shape[:2]
-    if text.unit != "millimetre":
-        raise ValueError(f"its lengths are in {text.unit}, not in millimetres")
     ours = (np.array_equal(full, knots(m)) for full, m in zip(surface.full_knots, shape, strict=True))
     if surface.degrees != (2, 2) or not all(ours):
         raise ValueError("its freeform face has other knots than bstcad's")

@@ -54,7 +54,7 @@ class FreeformSurface:
     """A B_SPLINE_SURFACE_WITH_KNOTS as the file states it; with weights it is another entity, and no lens of ours."""
 
     degrees: tuple[int, int]  # u, v
-    control_points: np.ndarray  # (m, n, 3) in the frame and the unit of length of the file, u along the first axis
+    control_points: np.ndarray  # (m, n, 3) mm, in the frame of the file, u along the first axis
     knots: tuple[np.ndarray, np.ndarray]  # distinct values
     multiplicities: tuple[np.ndarray, np.ndarray]
     closed: tuple[bool, bool]
@@ -83,7 +83,7 @@ class ValidationProperties:
 
     areas: tuple[float, ...] = ()  # of the part's whole surface (mm²)
     volumes: tuple[float, ...] = ()  # mm³
-    centroids: tuple[tuple[float, float, float], ...] = ()  # mm, if the file is in mm
+    centroids: tuple[tuple[float, float, float], ...] = ()  # mm
     materials: tuple[str, ...] = ()
     densities: tuple[float, ...] = ()  # g/cm³
     profiles: tuple[Profile, ...] = ()
@@ -106,7 +106,7 @@ class StepText:
     """The text of one STEP file of one lens."""
 
     product: str
-    unit: str  # of length: millimetre, metre, inch …
+    unit: str  # of length in the file, whose coordinates are in mm here: millimetre, metre, inch …
     angle: str  # unit of angles: radian, degree …
     schema: str
     solids: int  # MANIFOLD_SOLID_BREP and BREP_WITH_VOIDS
@@ -136,10 +136,10 @@ def read(path: str | Path) -> StepText:
         raise ValueError(one_line(f"{path.name}: read as text: {error}")) from error
 
 
-def read_lens(path: str | Path) -> StepText:
-    """A lens in millimetres and radians; ValueError if the file holds anything else."""
+def read_lens(path: str | Path, any_unit: bool = False) -> StepText:
+    """A lens in millimetres (any_unit: or another unit of length) and radians; ValueError for anything else."""
     text, name = read(path), f"{Path(path).name}: read as text"
-    if text.unit != "millimetre":
+    if not any_unit and text.unit != "millimetre":
         raise ValueError(f"{name}: lengths in {text.unit}; export it in millimetres")
     if text.angle != "radian":
         raise ValueError(f"{name}: angles in {text.angle}; export it in radians")
@@ -172,12 +172,17 @@ def _parse(text: bytes) -> StepText:
     lengths, angles = (_units(kind, entities) for kind in ("LENGTH", "PLANE_ANGLE"))
     if len(lengths) != 1:
         raise ValueError(f"{len(lengths)} units of length ({', '.join(lengths)}); export it in millimetres only")
+    ((unit, number),) = lengths.items()
+    size = _size(entities, number)  # mm
+    if size is None or not 0 < size < math.inf:
+        raise ValueError(f"lengths in {unit}, whose size in metres the file does not state; export it in millimetres")
     solids = [*entities.of("MANIFOLD_SOLID_BREP"), *entities.of("BREP_WITH_VOIDS")]
     placement = placement_of(solids[0], entities) if len(solids) == 1 else unmoved()
-    surface, *fronts = (_placed(each, placement) for each in _freeform_surfaces(entities))
+    placement = replace(placement, shift=size * placement.shift)
+    surface, *fronts = (_placed(each, placement, size) for each in _freeform_surfaces(entities))
     return StepText(
         product=_product(entities),
-        unit=lengths[0],
+        unit=unit,
         angle=", ".join(angles) or "radian",
         schema=_schema(data, strings),
         solids=len(solids),
@@ -185,7 +190,7 @@ def _parse(text: bytes) -> StepText:
         surface=surface,
         front=fronts[0] if fronts else None,
         edge_uses=_edge_uses(entities),
-        properties=_properties(entities, products_of(solids[0], entities) if placement.moves else set()),
+        properties=_properties(entities, products_of(solids[0], entities) if placement.moves else set(), size),
         placement=placement,
     )
 
@@ -204,14 +209,15 @@ def _product(entities: Entities) -> str:
     raise ValueError("no PRODUCT in the file; export it with a product name")
 
 
-def _units(quantity: str, entities: Entities) -> list[str]:
-    """The units of a quantity that the shapes' contexts name, each once."""
+def _units(quantity: str, entities: Entities) -> dict[str, str]:
+    """The units of a quantity that the shapes' contexts name, each once, and their numbers in the file."""
     used = set()
     for body in entities.of("COMPLEX").values():
         for context in re.findall(r"GLOBAL_UNIT_ASSIGNED_CONTEXT\(\(([#\d,]*)\)\)", body):
             used.update(re.findall(r"\d+", context))
-    bodies = (entities.bodies[number][1] for number in used)
-    return sorted({_unit_name(body, entities) for body in bodies if f"{quantity}_UNIT()" in body})
+    bodies = {number: entities.bodies[number][1] for number in used}
+    named = {_unit_name(body, entities): each for each, body in bodies.items() if f"{quantity}_UNIT()" in body}
+    return dict(sorted(named.items()))
 
 
 def _unit_name(body: str, entities: Entities) -> str:
@@ -291,8 +297,10 @@ def _middle(surface: FreeformSurface) -> tuple[np.ndarray, np.ndarray]:
     return net[m // 2, n // 2], normal / max(math.sqrt(normal @ normal), 1e-300)
 
 
-def _placed(surface: FreeformSurface, placement: Placement) -> FreeformSurface:
-    return replace(surface, control_points=placement(surface.control_points)) if placement.moves else surface
+def _placed(surface: FreeformSurface, placement: Placement, unit: float) -> FreeformSurface:
+    """The surface in mm and in its place; unit: of length in the file (mm)."""
+    net = surface.control_points if unit == 1 else unit * surface.control_points
+    return replace(surface, control_points=placement(net) if placement.moves else net)
 
 
 def _surface(entity: str, body: str, entities: Entities) -> FreeformSurface:
@@ -336,9 +344,10 @@ def _check_knots(counts: np.ndarray, knots: np.ndarray, points: int, degree: int
 # ---- statements about the part besides its shape -------------------------------------------------------------------
 
 
-def _properties(entities: Entities, products: set[str]) -> ValidationProperties:
+def _properties(entities: Entities, products: set[str], unit: float) -> ValidationProperties:
     """The properties in a file; a number that cannot be read is UNKNOWN.
 
+    unit: of length in the file (mm), in which it states a centroid; a measure names its own.
     products: of the lens, if the file has others, such as an assembly in whose frame its centroid lies elsewhere.
     """
     items: dict[tuple[str, str], list[str]] = {}  # (kind of property, its name) -> first items of its representations
@@ -358,7 +367,7 @@ def _properties(entities: Entities, products: set[str]) -> ValidationProperties:
     return ValidationProperties(
         areas=measures(VALIDATION, "surface area", "AREA_MEASURE"),
         volumes=measures(VALIDATION, "volume", "VOLUME_MEASURE"),
-        centroids=tuple(_centroid(item, entities) for item in items.get((VALIDATION, "centroid"), [])),
+        centroids=tuple(_centroid(item, entities, unit) for item in items.get((VALIDATION, "centroid"), [])),
         materials=tuple(entities.string(item, 1) for item in items.get((MATERIAL, "material name"), [])),
         densities=tuple(PER_CM3 * value for value in measures(MATERIAL, "density", r"\w+_MEASURE")),
         profiles=tuple(_profiles(entities)),
@@ -371,9 +380,9 @@ def _measure(entities: Entities, item: str, kind: str) -> float:
     return float(value[1]) * _scale(entities, value[2]) if value else UNKNOWN
 
 
-def _centroid(item: str, entities: Entities) -> tuple[float, float, float]:
+def _centroid(item: str, entities: Entities, unit: float) -> tuple[float, float, float]:
     try:
-        x, y, z = entities.points(np.array([item], dtype=np.int64))[0].tolist()
+        x, y, z = (unit * entities.points(np.array([item], dtype=np.int64))[0]).tolist()
     except KeyError:
         return UNKNOWN, UNKNOWN, UNKNOWN
     return x, y, z
@@ -395,9 +404,15 @@ def _scale(entities: Entities, unit: str) -> float:
 
 
 def _size(entities: Entities, unit: str) -> float | None:
-    """A named unit of length in mm, of mass in g; None: it has no SI_UNIT."""
-    named = re.search(r"SI_UNIT\((\.\w+\.|\$),\.(\w+)\.\)", entities.bodies[unit][1])
-    return PREFIXES.get(named[1], UNKNOWN) * UNITS.get(named[2], UNKNOWN) if named else None
+    """A named unit of length in mm, of mass in g; None: it follows from no SI_UNIT."""
+    body, factor = entities.bodies[unit][1], 1.0
+    if converted := re.search(r"CONVERSION_BASED_UNIT\('\d+',#(\d+)\)", body):  # an inch, by a measure in mm
+        measure = re.search(rf"\(({NUMBER})\)?,#(\d+)\)", entities.bodies[converted[1]][1])
+        if measure is None:
+            return None
+        factor, body = float(measure[1]), entities.bodies[measure[2]][1]
+    named = re.search(r"SI_UNIT\((\.\w+\.|\$),\.(\w+)\.\)", body)
+    return factor * PREFIXES.get(named[1], UNKNOWN) * UNITS.get(named[2], UNKNOWN) if named else None
 
 
 def _profiles(entities: Entities) -> Iterator[Profile]:

@@ -123,11 +123,11 @@ def examine(path: Path) -> ExaminedFile:
 
     There is no design to compare it with: the checks are whether its two readers, its text and its faces agree.
     """
-    text, reread = part21.read_lens(path), step_reading.read(path)  # in this order: see `read`
+    text, reread = part21.read_lens(path, any_unit=True), step_reading.read(path)  # in this order: see `read`
     lens_read, placed = step_reading.lens(reread, index=1.5), reread.placement
     properties = solid_properties.of_solid(reread.shape)
     checks = [
-        *text_checks.structure(text, lens_read.back.shape),
+        *text_checks.structure(text, lens_read.back.shape, any_unit=True),
         *_sound(reread.shape),
         *_edges(reread, lens_read, bare=reread.edge is None),
         net_check("STEP text against OCC: control points", text.surface.control_points, placed(reread.control_points)),

@@ -44,10 +44,10 @@ def net_of_front(text: StepText) -> np.ndarray:
     return np.empty((0, 0, 3)) if text.front is None else text.front.control_points
 
 
-def structure(text: StepText, shape: tuple[int, int], name: str = TEXT) -> list[Check]:
+def structure(text: StepText, shape: tuple[int, int], name: str = TEXT, any_unit: bool = False) -> list[Check]:
     """Structure of the STEP file: solids, unit, edges, and the form and knots of its freeform faces.
 
-    shape: numbers of control points of the back along x and along y.
+    shape: numbers of control points of the back along x and along y.  any_unit: of length, as other programs write.
     """
     faces = [(text.surface, shape)] + ([(text.front, text.front.control_points.shape[:2])] if text.front else [])
     plain = all(_is_plain(surface, sides) for surface, sides in faces)
@@ -59,7 +59,11 @@ def structure(text: StepText, shape: tuple[int, int], name: str = TEXT) -> list[
     )
     units = f"{text.solids} solids, lengths in {text.unit}"
     return [
-        Check.true(f"{name}: one solid, in millimetres", text.solids == 1 and text.unit == "millimetre", units),
+        Check.true(
+            f"{name}: one solid{'' if any_unit else ', in millimetres'}",
+            text.solids == 1 and (any_unit or text.unit == "millimetre"),
+            units,
+        ),
         Check.true(f"{name}: every edge used twice, once each way", text.closed, _open_edge(text)),
         Check.true(f"{name}: degree 2 x 2, multiplicities 3, 1, …, 1, 3", plain, degrees),
         Check.at_most(f"{name}: knots", moved, 0.0, where=knot),

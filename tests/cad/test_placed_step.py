@@ -82,6 +82,31 @@ def test_a_moved_lens_passes_and_its_placement_is_stated(make_lens, tmp_path, mo
         assert np.abs(np.cross(rotated, found.placement.rotation[:, 2])).max() < 1e-9
 
 
+@pytest.mark.parametrize(("unit", "name", "size"), [("INCH", "inch", 25.4), ("M", "metre", 1e3)])
+def test_a_lens_in_another_unit_passes_in_mm(make_lens, tmp_path, unit, name, size):
+    """By both readers; a design's own folder takes millimetres alone."""
+    from OCP.IFSelect import IFSelect_RetDone
+    from OCP.Interface import Interface_Static
+    from OCP.STEPControl import STEPControl_AsIs, STEPControl_Writer
+
+    lens, path = make_lens(m=9), tmp_path / "lens.step"
+    solid, writer = lens_solid(lens), STEPControl_Writer()
+    before = Interface_Static.CVal_s("write.step.unit")
+    try:
+        Interface_Static.SetCVal_s("write.step.unit", unit)
+        assert writer.Transfer(solid.wrapped, STEPControl_AsIs) == IFSelect_RetDone
+        assert writer.Write(str(path)) == IFSelect_RetDone
+    finally:
+        Interface_Static.SetCVal_s("write.step.unit", before)
+    text, found = part21.read(path), step_checks.examine(path)
+    assert text.unit == name and failed(found) == []
+    net = lens.back.control_points()
+    assert np.abs(text.surface.control_points - net).max() < 1e-12 * size  # of the digits that OCC writes
+    assert np.abs(found.lens.back.control_points() - net).max() < 1e-12 * size
+    with pytest.raises(ValueError, match=f"lengths in {name}; export it in millimetres"):
+        part21.read_lens(path)
+
+
 def matrix(place):
     motion = place.wrapped.Transformation()
     return [[motion.Value(i, j) for j in range(1, 5)] for i in range(1, 4)]

@@ -94,7 +94,7 @@ DAMAGES = {
     "truncated": (lambda t: t[: len(t) // 2], "truncated"),
     "closed half-way": (lambda t: t[: len(t) // 2] + ";\nENDSEC;\nEND-ISO-10303-21;\n", "damaged"),
     "gap": (lambda t: t[: len(t) // 3] + t[len(t) // 3 + 3000 :], "damaged"),
-    "metres": (lambda t: t.replace("SI_UNIT(.MILLI.,.METRE.)", "SI_UNIT($,.METRE.)"), "lengths in metre"),
+    "picometres": (lambda t: t.replace("SI_UNIT(.MILLI.,", "SI_UNIT(.PICO.,"), "lengths in picometre, whose size"),
     "no face": (lambda t: re.sub(r"(CLOSED_SHELL\('',\(#\d+),#\d+,", r"\1,", t), "damaged"),
     "no surface": (lambda t: t.replace("B_SPLINE_SURFACE_WITH_KNOTS", "B_SPLINE_SURFAXE"), "text: no B_SPLINE_SURFACE"),
     "no solid": (lambda t: t.replace("MANIFOLD_SOLID_BREP", "FACETED_BREP"), "0 solids"),

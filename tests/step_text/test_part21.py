@@ -47,10 +47,32 @@ def test_names_units_and_schema():
     found = part21.parse(text())
     assert found.product == "it's #1; (a 鏡) lens"
     assert (found.unit, found.schema, found.solids) == ("millimetre", "AP242_X", 0)
-    inch = UNITS.replace("SI_UNIT(.MILLI.,.METRE.)", "CONVERSION_BASED_UNIT('INCH',#901)")
-    assert part21.parse(text(units=inch)).unit == "inch"
-    assert part21.parse(text(units=UNITS.replace(".MILLI.", "$"))).unit == "metre"
-    assert part21.parse(text(units=UNITS.replace(".MILLI.", ".CENTI."))).unit == "centimetre"
+
+
+MILLI = "SI_UNIT(.MILLI.,.METRE.)"
+INCH = UNITS.replace(MILLI, "CONVERSION_BASED_UNIT('INCH',#902)") + (
+    "#902 = LENGTH_MEASURE_WITH_UNIT(LENGTH_MEASURE(2.54),#903);\n"
+    "#903 = ( LENGTH_UNIT() NAMED_UNIT(*) SI_UNIT(.CENTI.,.METRE.) );\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("units", "name", "size"),
+    [
+        (INCH, "inch", 25.4),
+        (UNITS.replace(".MILLI.", "$"), "metre", 1e3),
+        (UNITS.replace("MILLI", "CENTI"), "centimetre", 10.0),
+    ],
+)
+def test_coordinates_in_another_unit_are_read_in_mm(units, name, size):
+    found = part21.parse(text(units=units))
+    assert found.unit == name
+    np.testing.assert_allclose(found.surface.control_points, size * NET, rtol=1e-15)
+
+
+def test_a_unit_of_no_stated_size_is_refused():
+    with pytest.raises(ValueError, match="lengths in inch, whose size in metres the file does not state"):
+        part21.parse(text(units=UNITS.replace(MILLI, "CONVERSION_BASED_UNIT('INCH',#901)")))
 
 
 def square(loop: str = ".T.,.T.", second: str = ".F.,.T.") -> str:
