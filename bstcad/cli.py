@@ -16,7 +16,6 @@ import sys
 import time
 import traceback
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -336,7 +335,7 @@ def plan(scene: SceneFile, settings: Settings = None, as_json: AsJson = False, p
     for k, picture in enumerate(drawn):
         files.put(png.with_stem(numbered(png.stem, k)), picture)
     if as_json:
-        net = {"control_points": asdict(choice)} if choice else {}
+        net = {"control_points": choice.facts()} if choice else {}
         sizes = {"files": {"lens.step": round(folders.step_size(wanted))}}
         likely = next(parts)
         print(json.dumps({"verdict": None} | effects | likely | net | sizes, ensure_ascii=False, indent=2))

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import psutil
@@ -57,13 +58,9 @@ class Candidate:
     memory_gb: float
     moved: float = math.inf  # pixels, see `moved`
 
-    def beside(self, other: Candidate) -> str:
-        """Return its RRMSD and time beside those of another: "about 1.3 times the RRMSD in 0.77 times the time".
-
-        Factors alone, since `plan` predicts RRMSD and seconds better than they are known here.
-        """
-        less, longer = about(self.rrmsd / other.rrmsd), about(self.seconds / other.seconds)
-        return f"about {less} times the RRMSD in {longer} times the time"
+    def over(self, other: Candidate) -> tuple[float, float]:
+        """Return its RRMSD and its time over those of another: `plan` predicts both better than they are known here."""
+        return self.rrmsd / other.rrmsd, self.seconds / other.seconds
 
 
 @dataclass(frozen=True)
@@ -86,8 +83,20 @@ class Choice:
         for step, word in ((1, "more"), (-1, "fewer")):
             if 0 <= self.number + step < len(self.possible):
                 other = self.possible[self.number + step]
-                around.append(f"{word}, {in_words(other.net)}, would come to {other.beside(chosen)}")
+                less, longer = map(about, other.over(chosen))
+                factors = f"about {less} times the RRMSD in {longer} times the time"
+                around.append(f"{word}, {in_words(other.net)}, would come to {factors}")
         return "; ".join(filter(None, (f"{in_words(chosen.net)} control points are chosen", *around, self.limit)))
+
+    def facts(self) -> dict[str, Any]:
+        """The choice for JSON, each net by its RRMSD and time over those of the chosen one."""
+        chosen = self.possible[self.number]
+        factors = [(each.net, *map(two_digits, each.over(chosen))) for each in self.possible]
+        return {
+            "possible": [dict(zip(("net", "times_rrmsd", "times_seconds"), each, strict=True)) for each in factors],
+            "number": self.number,
+            "limit": self.limit,
+        }
 
 
 def with_net(scene: Scene) -> tuple[Scene, Choice | None]:

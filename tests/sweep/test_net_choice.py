@@ -143,6 +143,9 @@ def test_plan_says_it(tmp_path, capsys, monkeypatch):
     path.write_text(PLATE.changed({"target.pixels": 64, "target.sample": "camera"}).toml())
     assert run(["plan", str(path), "--json"]) == 0
     out, err = capsys.readouterr()
-    told = json.loads(out)["control_points"]
-    assert told["possible"][told["number"]]["net"] == 257
+    told = json.loads(out, parse_constant=pytest.fail)["control_points"]  # no Infinity, which JSON does not have
+    assert told["possible"][told["number"]] == {"net": 257, "times_rrmsd": 1.0, "times_seconds": 1.0}
+    [fewer] = [each for each in told["possible"] if each["net"] == 129]
+    words = f"fewer, 129, would come to about {fewer['times_rrmsd']:g} times the RRMSD in {fewer['times_seconds']:g} t"
+    assert fewer["times_rrmsd"] > 1 > fewer["times_seconds"] and words in err
     assert err.count("\n") == 1 and "257 control points are chosen" in err and "fewer, 129" in err
