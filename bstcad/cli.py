@@ -158,6 +158,7 @@ def design_folder(path: str | Path) -> Path:
 
 def load_scene(path: Path, settings: list[str] | None, quality: str | None = None) -> Scene:
     """The scene with the command line's changes."""
+    check_front(path, settings)
     from bstcad.scene.scene import load
 
     overrides: dict[str, Any] = {}
@@ -169,6 +170,22 @@ def load_scene(path: Path, settings: list[str] | None, quality: str | None = Non
     if quality is not None:
         overrides["tailoring.quality"] = quality
     return load(path, overrides)
+
+
+def check_front(path: Path, settings: list[str] | None) -> None:
+    """Refuse a front's file that does not begin as STEP before libraries load; `load_scene` finds other faults."""
+    from bstcad.scene import dotted_keys, scene_file
+
+    try:
+        _, data = scene_file.read(path)
+        for key, _, value in (setting.partition("=") for setting in settings or []):
+            dotted_keys.override(data, key.strip(), scene_file.toml_value(value.strip()), key)
+        given = [file for _, file in dotted_keys.tables_at(data, "lens.front.file")]
+    except SentenceError:
+        return
+    for file in given:
+        if isinstance(file, str) and file.lower().endswith((".step", ".stp")):
+            beginning.check(path.parent / os.path.expanduser(file), "lens.front.file: ")
 
 
 def warn(scene: Scene, where: str = "") -> None:
@@ -294,6 +311,7 @@ def generate(
     device: Device = "auto", resume: Resume = False, verbose: Verbose = False,
 ) -> int:  # fmt: skip
     """Design a lens for a scene, write it, and verify the written files."""
+    check_front(scene, settings)
     with loading():
         processes.begin()  # it loads its libraries while this process loads others
         wanted = load_scene(scene, settings, quality)

@@ -11,8 +11,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from bstcad.scene.errors import SceneError
-from bstcad.scene.target import PICTURES
 
+PICTURES = ("text", "image", "sample", "uniform", "profile")  # a target has exactly one
 OUTLINES = ("source.aperture", "lens.outline", "target.outline", "lens.front.outline")
 ONE_OF = {  # alternatives among the keys of a table: a later one replaces the others
     "target": PICTURES, "lens": ("material", "index"), **dict.fromkeys(OUTLINES, ("radius", "diameter")),

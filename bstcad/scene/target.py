@@ -22,6 +22,7 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import TiltedPlane
 from bstcad.scene import picture
 from bstcad.scene.blank import Outlined
+from bstcad.scene.dotted_keys import PICTURES
 from bstcad.scene.errors import SceneError
 from bstcad.scene.picture import Box, strips
 from bstcad.scene.profile import Profile
@@ -29,7 +30,6 @@ from bstcad.scene.schema import COORDINATES, OneOrTwo, Record, from_file, leavin
 
 FEWEST = 8  # pixels along a side, unless asked for fewer (which the range of `pixels` refuses)
 NARROWEST = 1e-3  # mm; a target's side, as an outline's
-PICTURES = ("text", "image", "sample", "uniform", "profile")  # a target has exactly one
 WITHOUT_GAMMA = ("text", "uniform", "profile")
 MOST = 8  # targets of a scene
 SEEN = 0.01  # RRMSD between two readings of a picture, from which on it is said which was taken

@@ -31,8 +31,11 @@ def fault(data: bytes) -> str | None:
     return None
 
 
-def check(path: Path) -> None:
-    """SceneError in one sentence unless a file begins as STEP; what is no file or cannot be read, others refuse."""
+def check(path: Path, before: str = "") -> None:
+    """SceneError in one sentence unless a file begins as STEP; what is no file or cannot be read, others refuse.
+
+    before: the key of a scene that names the file, before the sentence.
+    """
     try:
         if not stat.S_ISREG(path.stat().st_mode):
             return
@@ -41,4 +44,4 @@ def check(path: Path) -> None:
     except OSError:
         return
     if found is not None:
-        raise SceneError(f"{path}: {found}")
+        raise SceneError(f"{before}{path}: {found}")
