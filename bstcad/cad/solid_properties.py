@@ -35,8 +35,10 @@ if TYPE_CHECKING:
 
 Point = tuple[float, float, float]
 
+STRAIGHT = 2  # Gauss points along v where r and its derivatives are linear: r (r · n) is cubic at most
 ALONG_V = {  # Gauss points along v by the kind of a face, which leave only rounding: straight, up to a turn, a patch
-    Kind.GeomAbs_Plane: 4, Kind.GeomAbs_Cylinder: 4, Kind.GeomAbs_Cone: 4, Kind.GeomAbs_SurfaceOfExtrusion: 4,
+    Kind.GeomAbs_Plane: STRAIGHT, Kind.GeomAbs_Cylinder: STRAIGHT, Kind.GeomAbs_Cone: STRAIGHT,
+    Kind.GeomAbs_SurfaceOfExtrusion: STRAIGHT,
     Kind.GeomAbs_Sphere: 12, Kind.GeomAbs_Torus: 12, Kind.GeomAbs_BSplineSurface: 32,
 }  # fmt: skip
 ARC_PARTS, ARC_POINTS = 8, 12  # of an edge that is a line or an arc on a smooth face: they leave only rounding
@@ -91,7 +93,9 @@ def _in_parameters(face: TopoDS_Face, surface: BRepAdaptor_Surface, z_ref: float
     A face that OCC has reversed has its border reversed, too, which turns n.
     """
     u, v, du = (each[:, None] for each in _joined(_image(edge, face) for edge in _edges(face)))
-    point, weight = quadrature.gauss_rule(ALONG_V[surface.GetType()])
+    spline = surface.GetType() == Kind.GeomAbs_BSplineSurface
+    ruled = spline and surface.VDegree() == 1 and surface.NbVPoles() == 2
+    point, weight = quadrature.gauss_rule(STRAIGHT if ruled else ALONG_V[surface.GetType()])
     half = (v - BRepTools.UVBounds_s(face)[2]) / 2
     u, along, weight = np.broadcast_arrays(u, v + half * (point - 1), -du * half * weight)
     found = step_reading.points_and_tangents(surface, u.ravel().tolist(), along.ravel().tolist())
