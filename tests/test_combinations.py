@@ -1,8 +1,8 @@
 """Every two values of every two choices of a scene in at least one lens; every light, rim and front by `make bench`.
 
-Each scene is planned, previewed, designed with few control points and pixels, written, proved from its files and opened
-again.  It may end in a report, whose failed checks are true (MAY_FAIL), or in a refusal that names the keys that do not
-go together (REFUSED).  A new value of a choice is one line of CHOICES.
+Each scene is previewed, designed with few control points and pixels, written, proved from its files, opened again and
+planned.  It may end in a report, whose failed checks are true (MAY_FAIL), or in a refusal that names the keys that do
+not go together (REFUSED).  A new value of a choice is one line of CHOICES.
 
 The array is made here: the packages for such arrays know one strength for all choices, and triples of some are wanted.
 """
@@ -29,7 +29,6 @@ from bstcad.optics.surfaces import Sphere
 from bstcad.scene.blank import as_front, net_extent
 from bstcad.scene.errors import SceneError
 from bstcad.sweep.cold_run import Units
-from bstcad.sweep.net_choice import with_net
 from bstcad.sweep.plan import plan
 from tests.conftest import draws_nothing, verify_with
 
@@ -310,17 +309,16 @@ def faults(chosen, folder):
     """The faults of a scene from its plan to its files and back, as sentences."""
     scene = scene_of(chosen)
     try:
-        found, _ = with_net(scene)
-        told, predicted = plan(found, units=lambda: Units(tubes=0.1, serial=0.01))
-        assert {"simulated", "left_out", "blur"} <= set(told) and "predicted" in predicted
         seen = preview(scene, HASTY)
-        assert all(np.isfinite(picture).all() for pictures in seen.pictures for picture in pictures)
         report = commands.generate(scene, folder, device="cpu", effort=EFFORT)
+        again = bstcad.open(folder)  # its scene states the net, if that was to be chosen
+        told, predicted = plan(again.scene, units=lambda: Units(tubes=0.1, serial=0.01))
     except SceneError as refusal:
         return [] if any(_holds(*each, str(refusal), chosen) for each in MAY_REFUSE) else [f"refused: {refusal}"]
-    again = bstcad.open(folder)
+    assert all(np.isfinite(picture).all() for pictures in seen.pictures for picture in pictures)
+    assert {"simulated", "left_out", "blur"} <= set(told) and "predicted" in predicted
     assert again.report.rrmsd == pytest.approx(report.rrmsd, rel=1e-3)
-    assert again.lens.back.shape == both(found.lens.back.net)
+    assert again.lens.back.shape == both(again.scene.lens.back.net)
     failed = [check for check in report.checks if not check.passed]
     return [
         f"{check.name}: {check.value} ({check.limit}) {check.where}"

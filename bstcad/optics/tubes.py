@@ -282,7 +282,8 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor, number: int | None
     face = lens.interfaces[number].surface
     z = face.relative_sag_and_slope(x.to(lens.like), y.to(lens.like))[0].double()
     extent = float(torch.maximum(x.max() - x.min(), y.max() - y.min()))
-    before = replace(lens.unbounded(), losses=None).interfaces[:number]  # the way alone is asked for
+    way = replace(lens.to(x.dtype).unbounded(), losses=None)  # alone; in float32 a net would lie beside x and y
+    before = way.interfaces[:number]
 
     def arrive(p: Tensor, q: Tensor, height: Tensor) -> Rays:
         bands = range(0, len(p), rows := _few_rows(p.shape[1]))

@@ -5,7 +5,7 @@ import itertools
 import pytest
 import torch
 
-from bstcad.optics import tubes
+from bstcad.optics import bspline, tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import intersect
 from bstcad.optics.irradiance import Screen, rrmsd
@@ -170,6 +170,17 @@ def test_rays_meet_the_back_where_they_are_sent(name):
     assert bool(at_back.alive.all())
     torch.testing.assert_close(hit.position, at_back.position, rtol=0, atol=3e-7)
     torch.testing.assert_close(hit.direction.expand_as(at_back.direction), at_back.direction, rtol=0, atol=3e-8)
+
+
+def test_rays_through_a_float32_net_are_found_by_the_kernel(monkeypatch):
+    """Mixed types go by the plain form, four times as long."""
+    front, back = (
+        BSplineSurface.fitted(Sphere(z, c), (-10.0, 10.0), (-10.0, 10.0), 33).to(torch.float32)
+        for z, c in ((0.0, -0.02), (6.0, 0.01))
+    )
+    monkeypatch.setattr(bspline, "evaluate_plain", None)
+    x, y = tubes.corners(Rectangle(10.0, 10.0), 8)
+    assert bool(tubes.rays_to(Point((1.0, -0.5, -30.0)), Lens(front, back, Circle(9.0), 1.49), x, y)[2].alive.all())
 
 
 @pytest.mark.parametrize("pixels", [(7, 11), (11, 7), (24, 5)])
