@@ -20,8 +20,9 @@ from bstcad import pipeline
 from bstcad.analysis.light import blur
 from bstcad.analysis.shape import describe
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import a_side, simulated, tubes_picture
+from bstcad.optics.measure import a_side, seen_through, simulated, tubes_picture
 from bstcad.optics.sides import both, coarser
+from bstcad.optics.tubes import corners, middle
 from bstcad.report.light_figures import rrmsd
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import stage1, stage2, two_faces
@@ -71,6 +72,7 @@ class Preview:
     flux: dict[str, float]  # the ledger of the light; its lines sum to 1
     shape: dict[str, float | None]  # of the lens, by the keys of report.json
     source_images: tuple[float | None, ...]  # mm; width of the source's image on each target; None of a point
+    lit: float  # share of the back, up to its rim, through which light of one point of the source passes
     remarks: tuple[str, ...]  # on the scene, and on light that cannot get where it is wanted
     seconds: float = math.nan
 
@@ -198,8 +200,17 @@ def _lit(scene: Scene, task: Task, lens: Lens, wanted: Sequence[np.ndarray]) -> 
     images = [blur(channels, lens, target.screen, target.irradiance(), n=IMAGE_PLACES) for target in scene.targets]
     return Preview(
         scene, lens, tuple(pictures), flux=ledger, shape=describe(lens, SHAPE),
-        source_images=tuple(each and each.width for each in images), remarks=(),
+        source_images=tuple(each and each.width for each in images), lit=_lit_share(scene, lens), remarks=(),
     )  # fmt: skip
+
+
+def _lit_share(scene: Scene, lens: Lens) -> float:
+    """The share of the back, up to its rim, through which light of one point of the source passes."""
+    x, y = (middle(ends).reshape(-1) for ends in corners(lens.apertures[1], IMAGE_PLACES))
+    _, flux = seen_through(scene.channels()[:1], lens, scene.target.screen, IMAGE_PLACES)
+    inside = lens.apertures[1].contains(x, y)
+    clear = lens.apertures[1].area / lens.outline.area  # of a mount, less than all
+    return clear * float((flux[0] > 0)[inside].double().mean())
 
 
 @torch.no_grad()

@@ -22,8 +22,9 @@ from bstcad.sweep.plan import QUALITIES
 
 CELLS = 96  # of the lens to be turned, a side
 # Largest difference of a finished lens's thicknesses and relief from the preview's, as a part of the relief, among ten
-# templates.  (0.33 of three lenses off axis, whose unlit corners bend on; 0.03 of the others.)
-SPREAD = 0.35
+# templates: of a back that is lit up to its rim, and of one with dark corners, which bend on as no light tells them.
+SPREAD, DARK_SPREAD = 0.03, 0.35
+LIT = 0.99  # share of the back that light passes, from which on it counts as lit up to its rim
 # Both follow the number of control points, of which a preview has few: a plate had a smallest radius of 7.9 mm in the
 # quick preview, of 2.6 mm in the settled one, and of 1.1 mm as a draft.
 OF_DESIGN = "known once the lens is designed: more control points bend it more sharply"
@@ -66,7 +67,7 @@ def figures(found: Preview) -> list[list[str]]:
         for line, part in found.flux.items()
         if line != "on target" and part > ASTRAY
     ]
-    apart = f"± {quantity(SPREAD * shape['sag_pv'], 'mm')}"
+    apart = f"± {quantity((SPREAD if found.lit >= LIT else DARK_SPREAD) * shape['sag_pv'], 'mm')}"
     rows = [
         ["Light on the target", f"{percent(found.flux['on target'])} of the source's"],
         ["Lost", ", ".join(astray) or "hardly any"],

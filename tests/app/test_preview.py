@@ -12,7 +12,7 @@ from bstcad.analysis.shape import describe
 from bstcad.app import preview_desk
 from bstcad.app.preview import SETTLED, Outdated, preview
 from bstcad.app.preview_desk import STAGES, PreviewDesk, Request
-from bstcad.app.preview_json import OF_DESIGN, SPREAD, figures
+from bstcad.app.preview_json import DARK_SPREAD, LIT, OF_DESIGN, SPREAD, figures
 from bstcad.optics.measure import tubes_picture
 from bstcad.report.units import quantity
 from bstcad.scene.errors import SceneError
@@ -46,16 +46,23 @@ def test_a_preview_is_near_the_finished_draft(name):
     assert found.flux["on target"] > 0.9 and found.shape["thickness_min"] > 0
 
 
-def test_a_preview_tells_no_size_of_its_own_net():
-    """Its thickness is near the draft's within what is said; no radius, slope or tool is told of its few points."""
-    scene = load("templates/off_axis.toml", SMALL)
+@pytest.mark.parametrize(
+    ("name", "lit", "spread"), [("off_axis", False, DARK_SPREAD), ("caustic_portrait", True, SPREAD)]
+)
+def test_a_preview_tells_no_size_of_its_own_net(name, lit, spread):
+    """Its thickness is near the draft's within what is said; no radius, slope or tool is told of its few points.
+
+    Where light passes all of the back the two are nearer than where dark corners bend on.
+    """
+    scene = load(f"templates/{name}.toml", SMALL)
     found, made = preview(scene), pipeline.design(scene, later=True)
     told = dict(figures(found))
+    assert (found.lit >= LIT) is lit
     assert told["Smallest radius, steepest slope"] == OF_DESIGN and not any("tool" in name for name in told)
     shape, finished = found.shape, describe(made.lens, 65)
     for key in ("thickness_min", "thickness_max", "sag_pv"):
-        assert abs(shape[key] - finished[key]) < SPREAD * shape["sag_pv"]
-    assert told["Relief of the back"].endswith(f"± {quantity(SPREAD * shape['sag_pv'], 'mm')}")
+        assert abs(shape[key] - finished[key]) < spread * shape["sag_pv"]
+    assert told["Relief of the back"].endswith(f"± {quantity(spread * shape['sag_pv'], 'mm')}")
 
 
 def test_a_preview_depends_on_the_scene_alone():

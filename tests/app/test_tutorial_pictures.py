@@ -20,7 +20,7 @@ PAGE = TUTORIALS / "workbench.md"
 APP = Path(bstcad.__file__).parent / "app"
 PICTURES = ("workbench-start.png", "workbench-scene.png", "workbench-run.png", "workbench-design.png")
 LARGEST = 300_000  # bytes of a picture
-WIDE, HIGH, WHOLE = 1200, 860, 1740  # pixels of the window; WHOLE: high enough for the whole preview
+WIDE, HIGH = 1200, 860  # pixels of the window
 PATIENCE = 1_200_000  # milliseconds, on a busy machine
 ALL_SEEN = "#status:has-text('Settled')"
 DROP = """([place, data]) => {
@@ -117,7 +117,8 @@ def change_the_scene(page):
     page.wait_for_selector("#predicted tr[data-quality=draft]:not([title*='rough'])", timeout=PATIENCE)
     page.click("#toml > summary")
     page.click("#form details[data-section=target] > summary")
-    keep(page, "workbench-scene.png", high=WHOLE)
+    below = page.evaluate("document.getElementById('predicted').getBoundingClientRect().bottom + window.scrollY")
+    keep(page, "workbench-scene.png", high=round(below) + 10)  # up to the end of the preview
 
 
 def make_it(page):
