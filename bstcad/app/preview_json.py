@@ -22,8 +22,8 @@ from bstcad.sweep.plan import QUALITIES
 
 CELLS = 96  # of the lens to be turned, a side
 # Largest difference of a finished lens's thicknesses and relief from the preview's, as a part of the relief, among ten
-# templates: of a back that is lit up to its rim, and of one with dark corners, which bend on as no light tells them.
-SPREAD, DARK_SPREAD = 0.03, 0.35
+# templates: of a back that is lit up to its rim (0.007), and of one dark in places (0.43), where it bends on.
+SPREAD, DARK_SPREAD = 0.03, 0.45
 LIT = 0.99  # share of the back that light passes, from which on it counts as lit up to its rim
 # Both follow the number of control points, of which a preview has few: a plate had a smallest radius of 7.9 mm in the
 # quick preview, of 2.6 mm in the settled one, and of 1.1 mm as a draft.
