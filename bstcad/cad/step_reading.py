@@ -110,11 +110,14 @@ def solid(path: Path) -> TopoDS_Solid:
     return TopoDS.Solid_s(solids[0])
 
 
-def read(path: str | Path) -> StepLens:
-    """The lens in a STEP file; ValueError in one sentence if OCC does not find exactly one there."""
+def read(path: str | Path, shape: TopoDS_Solid | None = None) -> StepLens:
+    """The lens in a STEP file; ValueError in one sentence if OCC does not find exactly one there.
+
+    shape: its `solid`, where that is read already.
+    """
     path = Path(path)
     try:
-        found, placement = in_own_frame(solid(path))
+        found, placement = in_own_frame(shape or solid(path))
         return replace(_lens_in(found), placement=placement)
     except ValueError as error:
         raise ValueError(f"{path.name}: read by OCC: {error}") from error

@@ -228,12 +228,9 @@ def measured(path: Path) -> tuple[Place, Place, float | None]:
 
     The volume is None where the part has faces that nothing here integrates.
     """
-    from bstcad.cad import solid_properties, step_reading  # the first process need not load OCC
-    from bstcad.verify import step_checks
+    from bstcad.verify import step_checks  # the first process need not load OCC
 
-    reread = step_checks.read(path)
-    lens = step_reading.lens(reread, index=1.5)
-    whole = solid_properties.whole_part(reread, solid_properties.of_solid(reread.shape))
+    lens, whole = step_checks.whole_part(path)
     return *_corners(lens, whole), _volume(lens, whole)
 
 

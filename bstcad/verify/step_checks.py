@@ -23,10 +23,12 @@ from bstcad.cad.solid_properties import WholePart
 from bstcad.cad.step_reading import StepLens
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
+from bstcad.optics.quadrature import MassProperties
 from bstcad.optics.surfaces import Surface
 from bstcad.runs import processes
 from bstcad.scene.mount import Mount, Part
 from bstcad.step_text import part21
+from bstcad.step_text.part21 import StepText
 from bstcad.step_text.placement import Placement
 from bstcad.verify import text_checks
 from bstcad.verify.text_checks import net_check
@@ -90,13 +92,6 @@ def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, .
     )
 
 
-@one_sentence
-def read(path: Path) -> StepLens:
-    """The lens of a STEP file of which no text is damaged: over another one OCC may never end."""
-    part21.read_lens(path)
-    return step_reading.read(path)
-
-
 @functools.lru_cache(maxsize=1)
 def _read(path: Path, stamp: object) -> StepLens:
     """The file as OCC reads it; kept, since `lens` and `check` ask for the same file in turn.
@@ -119,11 +114,11 @@ def _stamp(path: Path) -> tuple[int, int, int] | None:
 
 @one_sentence
 def examine(path: Path) -> ExaminedFile:
-    """Check a STEP file by itself.
+    """Check a STEP file by itself, its text first: over a damaged one OCC may never end.
 
     There is no design to compare it with: the checks are whether its two readers, its text and its faces agree.
     """
-    text, reread = part21.read_lens(path, any_unit=True), step_reading.read(path)  # in this order: see `read`
+    text, reread = part21.read_lens(path, any_unit=True), step_reading.read(path)
     lens_read, placed = step_reading.lens(reread, index=1.5), reread.placement
     properties = solid_properties.of_solid(reread.shape)
     checks = [
@@ -212,6 +207,28 @@ def _front(reread: Surface, lens: Lens, tolerance: float) -> Iterator[Check]:
 # ---- part.step -----------------------------------------------------------------------------------------------------
 
 
+@functools.lru_cache(maxsize=1)
+def _part(path: Path, stamp: object) -> tuple[StepText, Any]:
+    """The text of a part and, if that is not damaged, its solid by OCC; kept, since three works ask for them in turn.
+
+    stamp: as of `_read`.
+    """
+    return part21.read_lens(path), step_reading.solid(path)
+
+
+@functools.lru_cache(maxsize=1)
+def _properties(path: Path, stamp: object) -> MassProperties | None:
+    """Area, volume and centroid of the solid of a part."""
+    return solid_properties.of_solid(_part(path, stamp)[1])
+
+
+@one_sentence
+def whole_part(path: Path) -> tuple[Lens, WholePart | None]:
+    """The lens of a part, whose index does not matter, and the walls around it."""
+    reread = step_reading.read(path, _part(path, _stamp(path))[1])
+    return step_reading.lens(reread, index=1.5), solid_properties.whole_part(reread, _properties(path, _stamp(path)))
+
+
 @one_sentence
 def lens_of_part(folder: Path, designed: Lens, mount: Mount) -> Lens:
     """The lens of the part in a design's folder, in the scene's frame, with the clear apertures of the part's faces.
@@ -221,7 +238,7 @@ def lens_of_part(folder: Path, designed: Lens, mount: Mount) -> Lens:
     path = folder / PART
     if not path.exists():
         raise ValueError(f"{PART}: is not there")
-    reread, up = read(path), mount.origin(designed.front_vertex)
+    reread, up = step_reading.read(path, _part(path, _stamp(path))[1]), mount.origin(designed.front_vertex)
     front, back = (face.moved(face.z + up) for face in (reread.front, reread.back))
     return replace(designed, front=front, back=back, clear=reread.clear, losses=None)
 
@@ -237,7 +254,7 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
     if not path.exists():
         return (Check.true(f"{PART}: written", False, why),)
     try:
-        text, solid = part21.read_lens(path), step_reading.solid(path)
+        text, solid = _part(path, _stamp(path))
     except ValueError as error:
         return (Check.true(f"{PART}: can be read", False, str(error)),)
     down = np.array([0.0, 0.0, mount.origin(lens.front_vertex)])
@@ -246,7 +263,7 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
     if lens.shapes_front:
         name, held = f"{PART}: control points of the front", text_checks.net_of_front(text)
         of_front = (net_check(name, held, lens.front.control_points() - down),)
-    properties = solid_properties.of_solid(solid) if text.properties.of_shape else None
+    properties = _properties(path, _stamp(path)) if text.properties.of_shape else None
     if text.properties.of_shape and properties is None:  # of a damaged face, which other checks find
         stated = [Check.true(f"{PART}: area, volume and centroid can be found", False, "a face is of an unknown kind")]
     else:
