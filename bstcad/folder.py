@@ -28,9 +28,9 @@ from bstcad.cad import mesh as meshes
 from bstcad.cad.mesh import SILVER, Label
 from bstcad.optics import quadrature
 from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
+from bstcad.optics.goal import restricted
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL
-from bstcad.optics.reach import restricted
 from bstcad.optics.sides import Sides, both, scaled
 from bstcad.optics.surfaces import Surface
 from bstcad.report.prescription import scene_text

@@ -18,9 +18,10 @@ from bstcad.analysis.shape import thickness_range
 from bstcad.analysis.steepness import Steepness, needed
 from bstcad.baselines import integration, paper
 from bstcad.folder import Made
+from bstcad.optics.goal import restricted
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.reach import GRAZING, grazing_of, restricted, spread_at, unreached
+from bstcad.optics.reach import GRAZING, grazing_of, spread_at, unreached
 from bstcad.optics.sides import both
 from bstcad.optics.sources import Source
 from bstcad.report.record import Making, Point

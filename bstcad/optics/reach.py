@@ -135,11 +135,3 @@ def unreached(picture: np.ndarray, part: np.ndarray, index: float | None) -> dic
     """
     angle = None if index is None else math.degrees(math.acos(1 / index))
     return {"area": float(1 - part.mean()), "light": float(picture[~part].sum() / picture.sum()), "angle": angle}
-
-
-def restricted(picture: np.ndarray, part: np.ndarray | None) -> np.ndarray:
-    """A picture (rows, columns) of the same sum, dark but for the pixels in which `part` is True; None: itself."""
-    if part is None:
-        return picture
-    kept = np.where(part, picture, 0.0)
-    return kept * (picture.sum() / (kept.sum() or 1.0))

@@ -24,6 +24,7 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_se
 
 from bstcad.optics import sampling
 from bstcad.optics.channels import Channel, channels_of, drawn_channels, merged
+from bstcad.optics.goal import Goal
 from bstcad.optics.key import Key
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
@@ -196,6 +197,12 @@ class Scene(Record):
         """By which sentences call the targets: target, or target[0], target[1], …"""
         several = len(self.targets) > 1
         return tuple(f"target[{k}]" for k in range(len(self.targets))) if several else ("target",)
+
+    @property
+    def goals(self) -> tuple[Goal, ...]:
+        """The targets' pictures on their screens."""
+        pairs = zip(self.target_keys, self.targets, strict=True)
+        return tuple(Goal(key, target.screen, target.irradiance(), target.weight) for key, target in pairs)
 
     def each_alone(self) -> tuple[Self, ...]:
         """The scene once for each target, which it has alone, and no wavefront: what is known of one picture at a time.

@@ -23,9 +23,10 @@ import numpy as np
 from bstcad.analysis.cost import ControlCells, control_cells, limits
 from bstcad.analysis.light import blur
 from bstcad.analysis.steepness import Steepness
+from bstcad.optics.goal import restricted
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, rrmsd_by_rays
-from bstcad.optics.reach import restricted, unreached
+from bstcad.optics.reach import unreached
 from bstcad.optics.sides import both, coarser, scaled
 from bstcad.pipeline import check_thickness, reachable_part, reached, second_stage, steepness, task_of, transport_of
 from bstcad.report.record import simulated, too_steep

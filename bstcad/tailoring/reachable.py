@@ -21,11 +21,12 @@ import torch
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
+from bstcad.optics.goal import restricted
 from bstcad.optics.interfaces import Law
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import TargetPlane
-from bstcad.optics.reach import GRAZING, restricted, room
+from bstcad.optics.reach import GRAZING, room
 from bstcad.optics.sources import Source
 from bstcad.scene.target import average
 from bstcad.tailoring.slope_fit import Fit

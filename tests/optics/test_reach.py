@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from bstcad.optics.goal import restricted
 from bstcad.optics.interfaces import Reflect, Refract, deflect
 from bstcad.optics.rays import Rays, TiltedPlane
 from bstcad.optics.reach import (
@@ -14,7 +15,6 @@ from bstcad.optics.reach import (
     grazing_of,
     kept_from_reflection,
     largest_deflection,
-    restricted,
     room,
     wanted_slopes,
 )
