@@ -85,8 +85,7 @@ def open(folder: str | os.PathLike[str]) -> Design:
         contents = record.read(folder / "report.json")
     except ValueError:  # it is gone or damaged; verify writes it anew
         return Design(made, None, folder)
-    irradiance, *further = folders.read_irradiances(folder, made.scene)
-    return Design(made, Report(contents, irradiance, further_irradiance=tuple(further)), folder)
+    return Design(made, Report(contents, folders.read_irradiances(folder, made.scene)), folder)
 
 
 class Design:
@@ -112,8 +111,8 @@ class Design:
 
     @property
     def target(self) -> np.ndarray:
-        """Flux wanted in each pixel, (rows, columns) of sum 1; row 0 = y max, column 0 = x min."""
-        return self._made.target
+        """Flux wanted in each pixel, (rows, columns) of sum 1; row 0 = y max, column 0 = x min; that of target[0]."""
+        return self._made.goals[0].picture
 
     @property
     def transport(self) -> TransportMap | None:
@@ -309,10 +308,10 @@ class Design:
         A pixel of the target is a pixel of the picture, white the end of the report's scale.  As verified, or else by a
         glance with few ray tubes.  png: a file to write it to as well.  target: which of several, from 0.
         """
-        wanted = self._made.targets
+        wanted = self._made.goals
         if not 0 <= target < len(wanted):
             raise SceneError(f"target: there is no target[{target}], the last is target[{len(wanted) - 1}]; give one")
-        seen = View.of(self.scene, target).picture(tones(self._irradiance(target), wanted[target]))
+        seen = View.of(self.scene, target).picture(tones(self._irradiance(target), wanted[target].picture))
         grey = np.ascontiguousarray(seen)
         if png is not None:
             Image.fromarray(grey).save(Path(png).expanduser(), format="png")
@@ -326,7 +325,7 @@ class Design:
         if not self._has_files():
             raise SceneError(f"{self.scene.name}: has no files yet, which that takes; write the design to a folder")
         scene, nominal = folders.read_nominal(self.folder)
-        if not self._made.is_lens_of(Made(scene, nominal.lens, nominal.target)):
+        if not self._made.is_lens_of(Made(scene, nominal.lens, nominal.goals)):
             raise SceneError(f"{self.folder}: holds another design by now; write this one to a folder of its own")
         return self.folder
 
@@ -338,8 +337,8 @@ class Design:
         """For a notebook: the same three lines, each target and the irradiance on it."""
         lines = "<br>".join(html.escape(line.strip()) for line in repr(self).splitlines())
         shown = ""
-        for k, target in enumerate(self._made.targets):
-            picture = irradiance_triptych(target, self._irradiance(k), View.of(self.scene, k))
+        for k, goal in enumerate(self._made.goals):
+            picture = irradiance_triptych(goal.picture, self._irradiance(k), View.of(self.scene, k))
             data = base64.b64encode(png(picture)).decode()
             shown += f'<img alt="Target, irradiance, their difference" width="100%" src="data:image/png;base64,{data}">'
         return f"<div>{lines}<br>{shown}</div>"
@@ -367,10 +366,10 @@ class Design:
     def _irradiance(self, number: int = 0) -> np.ndarray:
         """On a target, as verified, or else by a glance: (rows, columns), with the target's sum."""
         if self.report is not None:
-            return (self.report.irradiance, *self.report.further_irradiance)[number]
-        screen, target = self.scene.targets[number].screen, self._made.targets[number]
-        found = tubes_picture(self.lens, self.scene.channels(), screen, GLANCE).numpy()
-        return found * (target.sum() / found.sum())
+            return self.report.irradiances[number]
+        goal = self._made.goals[number]
+        found = tubes_picture(self.lens, self.scene.channels(), goal.receiver, GLANCE).numpy()
+        return found * (goal.picture.sum() / found.sum())
 
 
 def _fitting(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:

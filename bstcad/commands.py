@@ -39,6 +39,7 @@ from bstcad.report import data_sheet, exports, prescription, record, rendering, 
 from bstcad.report.data_sheet import Sheet
 from bstcad.report.exports import Exported
 from bstcad.report.figure_jobs import NoPictures, Pictures, draw_convergence, draw_light, draw_wavefront, light_path_of
+from bstcad.report.goal_figures import GoalFigures, figures_of
 from bstcad.report.grid_sag import Throw
 from bstcad.report.light_figures import draw_judges, draw_part
 from bstcad.report.prescription import SHEET, Order
@@ -153,13 +154,13 @@ def write(
             made, building, drawn, additions, progress=progress, effort=effort, limit=limit
         )
         proven = time.perf_counter()
-        irradiance, *further = (light.picture for light in proof.lights)
-        folders.write_design(made, irradiance, building, further=further)
+        irradiances = tuple(light.picture for light in proof.lights)
+        folders.write_design(made, irradiances, building)
         exported = _export(made, made.scene.output.export, building)
         order = _order(made, proof.shape, building)
-        drawn.sheet(_sheet(made, proof, proof.light, proof.light.picture, order=order))
+        drawn.sheet(_sheet(made, proof, figures_of(made.goals, proof.lights), irradiances[0], order=order))
         progress("report", 0, 1, "")
-        estimates = left_out(made.scene, proof.lens, proof.light.picture)  # while the pictures are drawn
+        estimates = _left_out(made, proof)  # while the pictures are drawn
         drawn.result()
         made = replace(made, making=made.making.followed_by(Stage("report", time.perf_counter() - proven)))
         contents = replace(_contents(made, proof, estimates), order=order)
@@ -167,7 +168,7 @@ def write(
         sheet = drawn.data_sheet()
         _write_report(made, proof.lens, contents, building, drawn=drawn, sheet=sheet, sections=additions.sections)
         progress("report", 1, 1, "")
-    return Report(contents, irradiance, further_irradiance=tuple(further), notes=tuple(exported.notes))
+    return Report(contents, irradiances, notes=tuple(exported.notes))
 
 
 def prove(
@@ -178,9 +179,8 @@ def prove(
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place, _nothing_left_running():
         drawn = NoPictures(made.scene, processes.submit)
         made, proof = _written_and_proved(made, Path(place), drawn, additions, progress=progress, effort=effort)
-    irradiance, *further = (light.picture for light in proof.lights)
-    contents = _contents(made, proof, left_out(made.scene, proof.lens, irradiance))
-    return Report(contents, irradiance, further_irradiance=tuple(further))
+    contents = _contents(made, proof, _left_out(made, proof))
+    return Report(contents, tuple(light.picture for light in proof.lights))
 
 
 def _written_and_proved(
@@ -203,8 +203,7 @@ def _written_and_proved(
         if limit is not None:
             effort, left = effort or FULL, limit - BEHIND - made.making.seconds_total - (written - began)
             effort = replace(effort, seconds=min(effort.seconds, max(left, LEAST)))
-        (target, part), *more = zip(made.targets, made.parts, strict=True)
-        nominal = folders.nominal(made.scene, made.lens, target, part, further=more)
+        nominal = folders.nominal(made.scene, made.lens, made.goals)
         proof = _proof(made, nominal, place, drawn, additions=additions, effort=effort, progress=progress)
         for work in meanwhile:
             work.result()
@@ -224,7 +223,7 @@ def _proof(
     progress("verify", 0, 1, "from the written files")
 
     def draw(light: Light, lines: tuple[Line, ...], number: int) -> None:
-        drawn.begin(draw_light, made.targets[number], light, lines, number=number)
+        drawn.begin(draw_light, made.goals[number].picture, light, lines, number=number)
 
     proof = checks.verify(folder, nominal, processes.submit, known=drawn.lens, lit=draw, effort=effort)
     if proof.wavefront is not None:
@@ -305,17 +304,17 @@ def verify(
             judged: list[Compared] = []
             for number, goal in enumerate(nominal.goals):
                 by_others = comparison.against(
-                    against, proof.lens, nominal.channels, goal.screen, target=goal.target, seed=nominal.seed,
-                    progress=progress, key=goal.key if nominal.further else "",
+                    against, proof.lens, nominal.channels, goal.receiver, target=goal.picture, seed=nominal.seed,
+                    progress=progress, key=goal.key if goal.suffix else "",
                 )  # fmt: skip
                 drawn.begin(draw_judges, by_others, number=number)
                 judged += by_others
             proof = replace(proof, checks=(*proof.checks, *(check for each in judged for check in each.checks)))
             order = _order(made, proof.shape, path)
-            contents = _contents(made, proof, left_out(made.scene, proof.lens, proof.light.picture))
+            contents = _contents(made, proof, _left_out(made, proof))
             contents = replace(contents, order=order, judges=tuple(each.judge for each in judged))
             if place is None:
-                drawn.sheet(_sheet(made, proof, proof.light, proof.light.picture, order=order))
+                drawn.sheet(_sheet(made, proof, contents.goals, proof.lights[0].picture, order=order))
             drawn.begin(draw_convergence, contents)
             write = partial(
                 _write_report, made, proof.lens, studied=tolerances.of_folder(path, made.scene.optic), drawn=drawn,
@@ -333,8 +332,7 @@ def verify(
             if place is None:
                 write(contents, amended, sheet=drawn.data_sheet())
             progress("report", 1, 1, "")
-    further = tuple(light.picture for light in proof.further)
-    return Report(contents, proof.light.picture, part, further_irradiance=further)
+    return Report(contents, tuple(light.picture for light in proof.lights), part)
 
 
 def examine(path: Path) -> Examined:
@@ -362,11 +360,7 @@ def read(folder: Path) -> Made:
 def _read(folder: Path) -> tuple[Made, Nominal]:
     scene, nominal = folders.read_nominal(folder)
     making, sent = record.making(folder / "report.json"), folders.read_transport(folder, scene)
-    part, *further = (goal.reachable for goal in nominal.goals)
-    made = Made(
-        scene, nominal.lens, nominal.target, making, transport=sent, reachable=part, further_reachable=tuple(further)
-    )
-    return made, nominal
+    return Made(scene, nominal.lens, nominal.goals, making, transport=sent), nominal
 
 
 def _made_part(cloud: Cloud, proof: Proof, nominal: Nominal, *, effort: Effort | None, progress: Progress) -> MadePart:
@@ -397,16 +391,20 @@ def _name_of(cloud: Cloud, folder: Path) -> str:
 def _contents(made: Made, proof: Proof, estimates: tuple[LeftOut, ...]) -> Contents:
     """The contents of report.json; estimates: of the effects that are left out."""
     scene, blurred = made.scene, proof.blur.rrmsd if proof.blur else 0.0
-    of_targets = zip(scene.each_alone(), made.targets, proof.lights, strict=True)
-    alone, target, light = max(of_targets, key=lambda each: each[2].rrmsd)  # tailoring counts the largest RRMSD
+    alone, goal, light = scene.each_alone()[proof.worst], made.goals[proof.worst], proof.light
     diagnosed = diagnosis(
-        alone, made.making, proof.lens, picture=light.picture, target=target, rrmsd=light.rrmsd,
+        alone, made.making, proof.lens, picture=light.picture, target=goal.picture, rrmsd=light.rrmsd,
         efficiency=light.efficiency, blurred=blurred, at_bounds=proof.at_bounds,
     )  # fmt: skip
     return contents_of(
-        scene, made.lens, made.target, proof, making=made.making, circumstances=circumstances(made.device),
-        estimates=estimates, diagnosis=diagnosed, reachable=made.reachable, further=made.targets[1:],
+        scene, made.lens, made.goals, proof, making=made.making, circumstances=circumstances(made.device),
+        estimates=estimates, diagnosis=diagnosed,
     )  # fmt: skip
+
+
+def _left_out(made: Made, proof: Proof) -> tuple[LeftOut, ...]:
+    """The effects that are left out, by the light on the target with the largest RRMSD."""
+    return left_out(made.scene.each_alone()[proof.worst], proof.lens, proof.light.picture)
 
 
 def _order(made: Made, shape: Mapping[str, Any], folder: Path) -> Order:
@@ -421,14 +419,12 @@ def _order(made: Made, shape: Mapping[str, Any], folder: Path) -> Order:
 
 
 def _sheet(
-    made: Made, proof: Proof | Contents, light: Light | Contents, irradiance: np.ndarray, *, order: Order
+    made: Made, proof: Proof | Contents, figures: Sequence[GoalFigures], irradiance: np.ndarray, *, order: Order
 ) -> Sheet:
-    """The data sheet of a design, by its proof or by its report."""
-    lights = proof.lights if isinstance(proof, Proof) else proof.targets or (proof,)
+    """The data sheet of a design, by its proof or by its report; it shows the light on the target that comes first."""
     return Sheet(
-        scene=made.scene, designed=made.lens, shape=proof.shape, order=order, target=made.target, irradiance=irradiance,
-        rrmsd=light.rrmsd, light_on_target=light.flux["on target"], passed=proof.passed, version=bstcad.__version__,
-        further_rrmsds=tuple(each.rrmsd for each in lights[1:]),
+        scene=made.scene, designed=made.lens, shape=proof.shape, order=order, target=made.goals[0].picture,
+        irradiance=irradiance, figures=figures, passed=proof.passed, version=bstcad.__version__,
     )  # fmt: skip
 
 
@@ -506,8 +502,8 @@ def _sheet_again(made: Made, folder: Path) -> Sheet:
         known = record.read(folder / "report.json")
     if known.shape is None or not (folder / "lens.step").is_file():
         raise SceneError(f"{folder}: its report or lens.step is gone or damaged; bstcad verify, or generate, writes it")
-    irradiance, order = folders.read_irradiance(folder, made.scene), _order(made, known.shape, folder)
-    return _sheet(made, known, known, irradiance, order=order)
+    irradiances, order = folders.read_irradiances(folder, made.scene), _order(made, known.shape, folder)
+    return _sheet(made, known, known.goals, irradiances[0], order=order)
 
 
 def show(folder: Path, png: Path | None) -> None:
@@ -530,7 +526,7 @@ def show(folder: Path, png: Path | None) -> None:
 def light_path_in(folder: Path) -> LightPath:
     """The lens of a folder, rays through it and their pictures; SceneError if no light arrives."""
     scene, nominal = folders.read_nominal(folder)
-    wanted, found = (goal.target for goal in nominal.goals), folders.read_irradiances(folder, scene)
+    wanted, found = (goal.picture for goal in nominal.goals), folders.read_irradiances(folder, scene)
     found = light_path_of(scene, nominal.lens, [*zip(wanted, found, strict=True)])
     if found is None:
         raise SceneError(f"{folder}: no light of this design arrives at the target; there is nothing to show")

@@ -19,7 +19,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +28,7 @@ from bstcad.cad import mesh as meshes
 from bstcad.cad.mesh import SILVER, Label
 from bstcad.optics import quadrature
 from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
-from bstcad.optics.goal import restricted
+from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL
 from bstcad.optics.sides import Sides, both, scaled
@@ -42,7 +42,7 @@ from bstcad.scene import scene as scenes
 from bstcad.scene.blank import NET_FILE as FRONT
 from bstcad.scene.target import numbered
 from bstcad.transport.mapping import TransportMap, nodes
-from bstcad.verify.checks import Goal, Nominal
+from bstcad.verify.checks import Nominal
 
 SCENE, DESIGN, PART = "scene.toml", "design.npz", "part.step"
 FRONT_KNOTS = ("front_knots_x", "front_knots_y")  # in design.npz, of a front that is tailored
@@ -57,30 +57,12 @@ class Made:
 
     scene: scenes.Scene
     lens: Lens  # float64, on the CPU
-    target: np.ndarray  # as scene.target.irradiance(), of the pixels that light can reach
+    goals: tuple[Goal, ...]  # their pictures of the pixels that light can reach
     making: Making = Making()  # stages, history and machine, for the report
     device: str = "cpu"  # of the design
     transport: TransportMap | None = None  # the map of stage 1; None for a lens of the user's own, or if not known
-    reachable: np.ndarray | None = None  # (rows, columns) the pixels that light can reach; None: all that are to be lit
-    # the same of the targets behind the first, in their order; (): light reaches all of them
-    further_reachable: tuple[np.ndarray | None, ...] = ()
     # what `making` is with float32 beside float64, which only a report tells; None: it has it, or nothing is to be told
     compared: Callable[[], Making] | None = None
-
-    @cached_property
-    def targets(self) -> tuple[np.ndarray, ...]:
-        """The light that all targets ask for, of the pixels that light can reach; the first is `target`."""
-        further = zip(self.scene.targets[1:], self._further_parts, strict=True)
-        return (self.target, *(restricted(target.irradiance(), part) for target, part in further))
-
-    @property
-    def parts(self) -> tuple[np.ndarray | None, ...]:
-        """Of all targets the pixels that light can reach; None: all that are to be lit."""
-        return (self.reachable, *self._further_parts)
-
-    @property
-    def _further_parts(self) -> tuple[np.ndarray | None, ...]:
-        return self.further_reachable or (None,) * (len(self.scene.targets) - 1)
 
     def told(self) -> Made:
         """The same with all that a report tells."""
@@ -300,19 +282,18 @@ def _write_scene(design: Made, folder: Path) -> None:
         (folder / name).write_bytes(data)
 
 
-def write_design(
-    design: Made, irradiance: np.ndarray | None, folder: Path, further: Sequence[np.ndarray] = ()
-) -> None:  # fmt: skip
-    """design.npz: the optimised surfaces, the target, the irradiance if it is traced, and the scene's text.
+def write_design(design: Made, irradiances: Sequence[np.ndarray], folder: Path) -> None:
+    """design.npz: the optimised surfaces, the pictures, and the scene's text.
 
-    further: the irradiance on the targets behind the first, if it is traced, whose arrays are target_2, irradiance_2,
-    reachable_2 and so on.
+    irradiances: on each target; (): they are not traced.  The arrays of the second target are target_2, irradiance_2
+    and reachable_2, and so on.
     reachable (rows, columns): 1 in the pixels that light can reach; no such array where it reaches all that are to be
     lit.  The transport map, if known (TransportMap): transport_x (c,) and transport_y (r,), mm on the target;
     transport_back or transport_entrance (c, r, 2), x and y (mm) where the light for them passes the back, or the
     plane of the first vertex.
     """
     (m, n), front, sent = design.lens.back.shape, design.lens.front, design.transport
+    parts = ((k, goal.reachable) for k, goal in enumerate(design.goals))
     np.savez_compressed(
         folder / DESIGN,
         control_points=design.lens.back.control_points(),
@@ -322,25 +303,12 @@ def write_design(
         **({"front_curvature": 0.0} | _numbers(front)),
         **({"front_control_points": front.control_points()} if front.is_net else {}),
         **(dict(zip(FRONT_KNOTS, map(knots, front.shape), strict=True)) if design.lens.shapes_front else {}),
-        target=design.target,
-        **({} if design.reachable is None else {"reachable": design.reachable.astype(np.uint8)}),
-        **({} if irradiance is None else {"irradiance": irradiance}),
-        **_further(design, further),
+        **{numbered("target", k): goal.picture for k, goal in enumerate(design.goals)},
+        **{numbered("reachable", k): part.astype(np.uint8) for k, part in parts if part is not None},
+        **{numbered("irradiance", k): picture for k, picture in enumerate(irradiances)},
         scene=scene_text(design.scene, design.lens),
         **({f"transport_{sent.plane}": sent.source, "transport_x": sent.x, "transport_y": sent.y} if sent else {}),
     )
-
-
-def _further(design: Made, irradiance: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
-    """The arrays of the targets behind the first, by their names in design.npz."""
-    parts = (None if part is None else part.astype(np.uint8) for part in design.parts)
-    found = {"target": design.targets, "reachable": tuple(parts), "irradiance": (None, *irradiance)}
-    return {
-        numbered(name, k): values
-        for name, each in found.items()
-        for k, values in enumerate(each)
-        if k and values is not None
-    }
 
 
 @contextlib.contextmanager
@@ -367,7 +335,7 @@ def _keep(design: Made, folder: Path) -> Path:
     def kept_in(place: Path) -> Path:
         with replacing(place) as building:
             _write_scene(design, building)
-            write_design(design, None, building)
+            write_design(design, (), building)
         return place
 
     beside = next(place for place in _kept(folder) if not place.exists() or _holds(place, design))
@@ -395,7 +363,7 @@ def _holds(kept: Path, design: Made) -> bool:
         scene, nominal = read_nominal(kept)
     except Exception:  # zipfile and numpy each raise their own for a damaged file
         return False
-    return design.is_lens_of(Made(scene, nominal.lens, nominal.target))
+    return design.is_lens_of(Made(scene, nominal.lens, nominal.goals))
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
@@ -413,26 +381,14 @@ def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
         if (name := numbered("reachable", k)) in held:
             shapes[name] = target.columns_rows[::-1]
     found = _arrays(folder, shapes | dict.fromkeys(_numbers(scene.lens.front.surface), ()), scene)
-    kept = []
-    for k, (key, target) in enumerate(zip(scene.target_keys, scene.targets, strict=True)):
-        stored, reached = found[numbered("target", k)], found.get(numbered("reachable", k))
-        part = None if reached is None else reached > 0
-        if not stored.sum() > 0 or not restricted(target.irradiance(), part).sum() > 0:
-            raise SceneError(f"{folder / DESIGN}: the {key} is all black; {AGAIN}")
-        kept.append((stored, part))
-    return scene, nominal(scene, _lens(scene, found), *kept[0], further=kept[1:])
-
-
-def read_irradiance(folder: Path, scene: scenes.Scene) -> np.ndarray:
-    """The irradiance through the written lens on the target, the first of several; SceneError as `read_irradiances`."""
-    return read_irradiances(folder, scene)[0]
-
-
-def read_pictures(folder: Path, scene: scenes.Scene) -> tuple[np.ndarray, np.ndarray]:
-    """The first target's picture and irradiance as a design holds them; SceneError if design.npz is damaged."""
-    shape = scene.target.columns_rows[::-1]
-    arrays = _arrays(folder, {"target": shape, "irradiance": shape}, scene)
-    return arrays["target"], arrays["irradiance"]
+    goals, stored = [], []
+    for k, goal in enumerate(scene.goals):
+        part = found.get(numbered("reachable", k))
+        goals.append(goal.restricted(None if part is None else part > 0))
+        stored.append(found[numbered("target", k)])
+        if not stored[k].sum() > 0 or not goals[k].picture.sum() > 0:
+            raise SceneError(f"{folder / DESIGN}: the {goal.key} is all black; {AGAIN}")
+    return scene, nominal(scene, _lens(scene, found), goals, stored)
 
 
 def read_irradiances(folder: Path, scene: scenes.Scene) -> tuple[np.ndarray, ...]:
@@ -498,25 +454,19 @@ def _surface(net: np.ndarray, z: float) -> BSplineSurface:
 
 
 def nominal(
-    scene: scenes.Scene, lens: Lens, stored_target: np.ndarray, part: np.ndarray | None = None, *,
-    further: Sequence[tuple[np.ndarray, np.ndarray | None]] = (),
+    scene: scenes.Scene, lens: Lens, goals: Sequence[Goal], stored: Sequence[np.ndarray] | None = None
 ) -> Nominal:  # fmt: skip
-    """The design that the files are held to; its target is the scene's own, not that of design.npz.
+    """The design that the files are held to.
 
-    part: of the target, that light can reach, as design.npz has it; None: all of it.  further: stored target and part
-    of each target behind the first; (): the scene's own, and all of them.
+    goals: with the scene's own pictures; stored: what design.npz has in their place, None: these.
     """
-    picture = scene.target.irradiance()
     return Nominal(
         lens=lens,
-        target=restricted(picture, part),
-        whole=None if part is None else picture,
-        reachable=part,
-        screen=scene.target.screen,
+        goals=tuple(goals),
+        stored=tuple(goal.picture for goal in goals) if stored is None else tuple(stored),
         channels=scene.judging_channels(),
         accept=scene.accept,
         seed=scene.tailoring.seed,
-        stored_target=stored_target,
         mesh_tolerance=scene.mesh_tolerance,
         mesh_asked=scene.output.mesh_tolerance is not None,
         ghost=scene.ghost,
@@ -525,20 +475,5 @@ def nominal(
         part=scene.part.of(scene.lens),
         draw=scene.draw,
         accuracy=ROUGH if scene.tailoring.quality == "draft" else FULL.accuracy,
-        weight=scene.target.weight,
-        further=tuple(_goals(scene, further)),
         wave=scene.wavefront,
     )
-
-
-def _goals(
-    scene: scenes.Scene, stored: Sequence[tuple[np.ndarray, np.ndarray | None]]
-) -> Iterator[Goal]:  # fmt: skip
-    """The targets behind the first, as `nominal` has them."""
-    for k, (key, target) in enumerate(zip(scene.target_keys[1:], scene.targets[1:], strict=True)):
-        picture = target.irradiance()
-        kept, part = stored[k] if stored else (picture, None)
-        yield Goal(
-            key, target.screen, restricted(picture, part), kept, weight=target.weight,
-            whole=None if part is None else picture, reachable=part,
-        )  # fmt: skip

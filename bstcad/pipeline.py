@@ -150,11 +150,11 @@ def design(
     lens = replace(lens.plain(), index=scene.index, losses=None)
     if scene.lens.front.fixed:  # as it was given: tailoring may have worked with less digits of it
         lens = replace(lens, front=scene.lens.front.surface)
+    goals = tuple(goal.restricted(part) for goal, part in zip(scene.goals, parts, strict=True))
     steep = steepness(task.heaviest.source, lens, task.screen, task.target, sent=followed.transport)
     making = _making(followed, driver.record, stopped, steep)
     return Made(
-        resolved(scene, lens), scene.as_mounted(lens), task.target, making, device=device,
-        transport=followed.transport, reachable=parts[0], further_reachable=tuple(parts[1:]),
+        resolved(scene, lens), scene.as_mounted(lens), goals, making, device=device, transport=followed.transport,
         compared=partial(_compared, making, task, after_stage1, stages) if later else None,
     )  # fmt: skip
 

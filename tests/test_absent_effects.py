@@ -52,7 +52,7 @@ def probed():
     calls.clear()
     with Told():
         found = pipeline.design(made)
-        light = measure(found.lens, made.channels(), made.target.screen, found.target, Effort(32))
+        light = measure(found.lens, made.channels(), found.goals[0].receiver, found.goals[0].picture, Effort(32))
     return {
         "calls": len(calls), "kernels": kernels, "kinds": len(set(calls)),
         "hash": hashlib.sha256("\\n".join(calls).encode()).hexdigest(),

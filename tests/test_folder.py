@@ -131,11 +131,12 @@ class TestReading:
         assert scene == small_scene == load(folder / "scene.toml")
         with np.load(folder / "design.npz") as data:
             assert np.array_equal(nominal.lens.back.control_points(), data["control_points"])  # to the last bit
-            assert np.array_equal(nominal.target, data["target"])
+            assert np.array_equal(nominal.goals[0].picture, data["target"])
         assert nominal.lens.back.heights.dtype == torch.float64
         assert nominal.lens.front == scene.lens.front.surface and nominal.lens.outline == scene.lens.outline
         assert nominal.lens.index == scene.index and nominal.channels == scene.channels()
-        assert (nominal.screen.x, nominal.screen.y, nominal.screen.shape) == ((-30.0, 30.0), (-25.0, 25.0), (48, 64))
+        screen = nominal.goals[0].receiver
+        assert (screen.x, screen.y, screen.shape) == ((-30.0, 30.0), (-25.0, 25.0), (48, 64))
         assert (nominal.accept, nominal.seed) == (scene.accept, 0)
 
     DAMAGES = {
@@ -198,9 +199,9 @@ def test_what_is_written_is_what_is_read(small_design, small_scene, tmp_path):
     g = torch.Generator().manual_seed(1)
     back = replace(nominal.lens.back, heights=torch.randn(33, 33, generator=g, dtype=torch.float64))
     lens = replace(nominal.lens, back=back, front=Sphere(15.0, -0.0123456789))
-    design = folders.Made(scene, lens, nominal.target)
+    design = folders.Made(scene, lens, nominal.goals)
     (tmp_path / "scene.toml").write_text(scene.toml())
-    folders.write_design(design, nominal.target * 2, tmp_path)
+    folders.write_design(design, (nominal.goals[0].picture * 2,), tmp_path)
     again = folders.read_nominal(tmp_path)[1].lens
     assert np.array_equal(again.back.control_points(), lens.back.control_points())
     assert again.front == lens.front

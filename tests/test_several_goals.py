@@ -36,12 +36,12 @@ def two(tmp_path_factory):
 def test_rays_go_to_the_furthest_target_and_light_each_picture_on_their_way(two):
     shown = commands.light_path_in(two.folder)
     near, far = (target.z for target in two.made.scene.targets)
-    assert [screen[:, 2].tolist() for screen, _ in shown.screens] == [[near] * 4, [far] * 4]
-    assert [picture.shape for _, picture in shown.screens] == [(16, 16), (18, 24)]
+    assert [screen[:, 2].tolist() for screen in shown.screens] == [[near] * 4, [far] * 4]
+    assert [picture.shape for picture in shown.pictures] == [(16, 16), (18, 24)]
     assert shown.rays[:, -1, 2] == pytest.approx(far)
     assert "Targets 10 × 10 mm at z = 60 mm, 16 × 12 mm at z = 150 mm" in shown.words
     before, after = shown.rays[:, -2], shown.rays[:, -1]
-    for screen, picture in shown.screens:
+    for screen, picture in zip(shown.screens, shown.pictures, strict=True):
         share = (screen[0, 2] - before[:, 2]) / (after[:, 2] - before[:, 2])
         place = before + share[:, None] * (after - before)
         (low, high), (rows, columns) = screen[[0, 2], :2], picture.shape
@@ -59,7 +59,7 @@ def test_both_screens_are_drawn(two, tmp_path):
     if not rendering.draw(path, both):
         pytest.skip("this machine cannot draw in 3-D")
     alone = tmp_path / "alone.png"
-    assert rendering.draw(replace(path, further=()), alone)
+    assert rendering.draw(replace(path, screens=path.screens[:1], pictures=path.pictures[:1]), alone)
     pictures = [np.asarray(Image.open(name).convert("RGB")).astype(int) for name in (both, alone)]
     assert (np.abs(pictures[0] - pictures[1]).max(axis=2) > 30).mean() > 0.002
 
@@ -73,7 +73,7 @@ def test_each_target_has_a_picture_and_a_figure_in_a_notebook(two):
     with pytest.raises(bstcad.SceneError, match=r"^target: there is no target\[2\], the last is target\[1\]; give one"):
         two.design.picture(target=2)
     assert two.design._repr_html_().count("data:image/png;base64,iVBOR") == 2
-    first, second = (figures.rrmsd for figures in two.design.report.targets)
+    first, second = (figures.rrmsd for figures in two.design.report.goals)
     assert f"RRMSD {first:.3g}, {second:.3g}" in repr(two.design)
 
 
@@ -147,15 +147,15 @@ def test_another_program_traces_each_target(two, verified):
 
 def test_a_made_part_is_judged_on_each_target(two, verified):
     part = verified.report.measured
-    assert [each["key"] for each in part.facts["targets"]] == ["target[0]", "target[1]"]
-    assert part.facts["rrmsd_predicted"] == part.facts["targets"][0]["rrmsd_predicted"]
-    predicted = [each["rrmsd_predicted"] for each in part.facts["targets"]]
-    designed = [figures.rrmsd for figures in two.design.report.targets]
+    assert [each["key"] for each in part.facts["goals"]] == ["target[0]", "target[1]"]
+    predicted = [each["rrmsd_predicted"] for each in part.facts["goals"]]
+    assert part.facts["rrmsd_predicted"] == max(predicted)
+    designed = [figures.rrmsd for figures in two.design.report.goals]
     assert all(abs(found / own - 1) > 1e-3 for found, own in zip(predicted, designed, strict=True))
     names = [check.name for check in part.checks if "RRMSD" in check.name]
     assert [name.partition("target")[2][:3] for name in names] == ["[0]", "[0]", "[1]", "[1]"]
     assert all(map(page_of, names))
-    assert [picture.shape for picture in (part.irradiance, *part.further_irradiance)] == [(16, 16), (18, 24)]
+    assert [picture.shape for picture in part.irradiances] == [(16, 16), (18, 24)]
     assert {"made_part", "made_part_2"} <= verified.figures
     assert " on target[0]." in verified.page and " on target[1]." in verified.page
 

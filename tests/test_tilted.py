@@ -75,7 +75,7 @@ def test_it_is_told(made):
     folder, report, scene = made
     about = {"thu": "30 degrees about x, then -20 degrees about y", "mirror": "35 degrees about y"}[scene.name]
     assert f"tilt                          {about}" in (folder / "prescription.txt").read_text(encoding="utf-8")
-    assert report["prescription"]["target"]["tilt"] == list(scene.target.tilt)
+    assert report["prescription"]["targets"][0]["tilt"] == list(scene.target.tilt)
     assert about in (folder / "report.html").read_text(encoding="utf-8")
     assert bstcad.load(folder / "scene.toml").target == scene.target
 

@@ -46,7 +46,6 @@ from bstcad.report.report import VIEWER, doubts
 from bstcad.runs import files
 from bstcad.runs.files import SentenceError
 from bstcad.scene import new_scene, scene_file
-from bstcad.scene import scene as scenes
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.picture import SAMPLES
 from bstcad.scene.scene_file import DOTS
@@ -460,8 +459,9 @@ class Workbench:
         name = request.path_params["name"]
         usual = self.workspace.file(name, "figures/irradiance.png")
         try:
-            scene = scenes.load(self.workspace.file(name, "scene.toml"))
-            found = folders.read_pictures(self.workspace.file(name, "design.npz").parent, scene)
+            folder = self.workspace.file(name, "design.npz").parent
+            scene, nominal = folders.read_nominal(folder)
+            found = nominal.goals[0].picture, folders.read_irradiances(folder, scene)[0]
             return Response(dark_triptych(*found, View.of(scene)), media_type="image/png")
         except SentenceError:
             return FileResponse(usual, media_type="image/png")

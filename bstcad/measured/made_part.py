@@ -14,10 +14,11 @@ from bstcad.measured import alignment as aligning
 from bstcad.measured.alignment import Alignment, Face, Pose
 from bstcad.measured.cloud import Cloud
 from bstcad.measured.form_error import Deviation, Form, deviation, fitted, minimum_zone
+from bstcad.optics.goal import Goal, worst
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, Light, measure
 from bstcad.optics.wavefront_error import wavefront_error
-from bstcad.verify.checks import WAVEFRONT, Goal, Nominal
+from bstcad.verify.checks import WAVEFRONT, Nominal
 from bstcad.verify.verdict import Check
 
 FARTHEST = 3e-3  # of the half width, RMS after alignment: a part beyond is of another design
@@ -39,9 +40,9 @@ class MadePart:
     checks: tuple[Check, ...]
     facts: dict[str, Any]  # entry `measured` of report.json
     deviation: Deviation
-    irradiance: np.ndarray = field(repr=False)  # (rows, columns) predicted, row 0 = y max, with the target's sum
+    # predicted on each target, (rows, columns), row 0 = y max, with the target's sum
+    irradiances: tuple[np.ndarray, ...] = field(repr=False)
     outliers: np.ndarray = field(repr=False)  # (n, 3) mm on the design, left out of the fit
-    further_irradiance: tuple[np.ndarray, ...] = field(default=(), repr=False)  # on the targets behind the first
 
 
 def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = None) -> MadePart:
@@ -92,13 +93,10 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
     )  # fmt: skip
     facts = _facts(face, placed, deviates, cloud) | {"scale": scale, "passed": all(check.passed for check in checks)}
     predicted = [_predicted(*found) for found in lights]
-    if nominal.further:
-        facts["targets"] = [{"key": goal.key} | of for goal, of in zip(nominal.goals, predicted, strict=True)]
-    irradiance, *further = (light.picture for light, _ in lights)
-    return MadePart(
-        checks, facts | predicted[0], deviates, irradiance=irradiance, outliers=placed.outliers,
-        further_irradiance=tuple(further),
-    )  # fmt: skip
+    facts |= predicted[worst(each["rrmsd_predicted"] for each in predicted)]
+    facts["goals"] = [{"key": goal.key} | of for goal, of in zip(nominal.goals, predicted, strict=True)]
+    irradiances = tuple(light.picture for light, _ in lights)
+    return MadePart(checks, facts, deviates, irradiances=irradiances, outliers=placed.outliers)
 
 
 def _predicted(light: Light, high: float) -> dict[str, float | None]:
@@ -174,7 +172,7 @@ def _light(lens: Lens, form: Form, nominal: Nominal, goal: Goal, *, effort: Effo
     def of(form: Form) -> Light:
         made = replace(lens, back=form.on(lens.back))
         how = {"effort": effort, "ghost": nominal.ghost, "draw": nominal.draw}
-        return measure(made, nominal.channels, goal.screen, goal.target, **how)
+        return measure(made, nominal.channels, goal.receiver, goal.picture, **how)
 
     light = of(form)
     return light, max(

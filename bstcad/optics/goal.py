@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -25,7 +27,12 @@ class Goal:
     @property
     def suffix(self) -> str:
         """Behind the names of its checks: which of several goals it is."""
-        return "" if self.key == "target" else f", {self.key}"
+        return suffix_of(self.key)
+
+    @property
+    def words(self) -> str:
+        """The goal in a sentence."""
+        return words_of(self.key)
 
     def restricted(self, part: np.ndarray | None) -> Goal:
         """The goal with the light of its picture in the pixels in which `part` is True; None: itself."""
@@ -40,3 +47,19 @@ def restricted(picture: np.ndarray, part: np.ndarray | None) -> np.ndarray:
         return picture
     kept = np.where(part, picture, 0.0)
     return kept * (picture.sum() / (kept.sum() or 1.0))
+
+
+def suffix_of(key: str) -> str:
+    """Behind a name: which of several goals it is of; nothing where there is one."""
+    return "" if key == "target" else f", {key}"
+
+
+def words_of(key: str) -> str:
+    """A goal in a sentence, by its key."""
+    return "the target" if key == "target" else key
+
+
+def worst(rrmsds: Iterable[float | None]) -> int:
+    """The number of the goal with the largest RRMSD, whose figures stand for all; None, NaN: no light falls on it."""
+    known = [math.inf if each is None or math.isnan(each) else each for each in rrmsds]
+    return known.index(max(known))

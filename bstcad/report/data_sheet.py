@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -20,6 +20,7 @@ from bstcad.optics.outlines import Outline
 from bstcad.report import part_views
 from bstcad.report.drawing import GREY, styled
 from bstcad.report.exports import across
+from bstcad.report.goal_figures import GoalFigures
 from bstcad.report.light_figures import View, brightest, seen_grey
 from bstcad.report.part_views import NOTES, THICK, THIN, Paper, kinds_of_holes, wall_words, wrapped
 from bstcad.report.prescription import PART, Order, prescription
@@ -47,13 +48,11 @@ class Sheet:
     designed: Lens
     shape: Mapping[str, float | None]  # of the lens as it is cut, and the volume of lens.step
     order: Order  # for the shop, with the file that the sheet belongs to
-    target: np.ndarray  # (rows, columns) in coordinates, one sum
+    target: np.ndarray  # (rows, columns) in coordinates, one sum: of the target that comes first, which is drawn
     irradiance: np.ndarray
-    rrmsd: float
-    light_on_target: float  # share of the source's light
+    figures: Sequence[GoalFigures]  # of the light on each target
     passed: bool  # every check
     version: str  # of the program
-    further_rrmsds: tuple[float, ...] = ()  # on the targets behind the first
 
     @property
     def mount(self) -> Mount | None:
@@ -79,14 +78,11 @@ class Sheet:
     def tables(self) -> dict[str, Rows]:
         """Its tables by their headings: front, body, back, purpose, and of a part the mount."""
         return tables(
-            "data_sheet.txt.j2", lens=self.record, order=self.order, shape=self.shape, target=self.scene.target,
+            "data_sheet.txt.j2", lens=self.record, order=self.order, shape=self.shape,
             mount=self.mount, light=defaultdict(lambda: None, self.record["source"]), passed=self.passed,
             asked=self.scene.limits_light,
-            rrmsd=self.rrmsd, light_on_target=self.light_on_target, across=across, walls=wall_words,
+            pairs=list(zip(self.scene.targets, self.figures, strict=True)), across=across, walls=wall_words,
             apertures=[_aperture(patch, self.lens.outline) for patch in self.apertures], kinds_of_holes=kinds_of_holes,
-            further=list(zip(
-                self.scene.target_keys[1:], self.scene.targets[1:], self.further_rrmsds, strict=True,
-            )),
             limits={face: settings_of(self.scene.tolerance, f"{face}.form").get("limit") for face in ("front", "back")},
         )  # fmt: skip
 

@@ -89,7 +89,7 @@ class Pictures:
         """Begin the maps of the lens and its rays."""
         source, screens = self._scene.source.central, [target.screen for target in self._scene.targets]
         self.begin(draw_lens, source, lens, screens)
-        for k, screen in enumerate(screens[1:], start=1):
+        for k, screen in enumerate(screens):
             self.begin(draw_transport, source, lens, screen, number=k)
 
     def sheet(self, sheet: Sheet) -> None:
@@ -129,7 +129,6 @@ class NoPictures(Pictures):
 
 def draw_lens(source: Source, lens: Lens, screens: Sequence[Screen], view: View) -> Pngs:
     """The pictures of the lens but the 3-D one, with its rays to the screens; the front's surface if it is tailored."""
-    first, *others = screens
     farthest = max(screens, key=lambda screen: screen.z)
     of_front = {}
     if lens.shapes_front:
@@ -137,8 +136,7 @@ def draw_lens(source: Source, lens: Lens, screens: Sequence[Screen], view: View)
     return {
         "surface": png(surface_maps(lens, survey(lens).slope.largest)),
         **of_front,
-        "side_view": png(side_view(lens, fan(source, lens, farthest.plane), first, others)),
-        **draw_transport(source, lens, first, view),
+        "side_view": png(side_view(lens, fan(source, lens, farthest.plane), screens)),
     }
 
 
@@ -236,12 +234,10 @@ def _sample(lens: Lens, face: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 @styled
-def side_view(
-    lens: Lens, rays: np.ndarray, screen: Screen | None = None, others: Sequence[Screen] = ()
-) -> Figure:  # fmt: skip
+def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> Figure:
     """The lens cut along y = 0 with rays (n_rays, n_points, 3) in mm projected on x-z: close, and the whole path.
 
-    A tilted screen is drawn too, as its edges are seen along y, and all screens of several (others: behind the first).
+    A tilted screen is drawn too, as its edges are seen along y, and all screens of several.
     """
     figure = new_figure(11.0, 3.4)
     close, whole = figure.subplots(1, 2, width_ratios=(1, 1.9))
@@ -258,15 +254,14 @@ def side_view(
     close.set(xlim=(low - reach * 0.5, high + reach * 0.5), ylim=(-1.25 * reach, 1.25 * reach))
     close.set(title=f"{'Mirror' if lens.reflects else 'Lens'}, cut along y = 0", aspect="equal")
     whole.set_title("Whole path, source to target (axes not to one scale)")
-    for each in (screen, *others) if others else ():
-        edges = corners(each)
-        whole.fill(edges[:, 2], edges[:, 0], facecolor="none", edgecolor=GREY, linewidth=1.0, gid="screen")
-    if others:
-        footnote(figure, "Grey: the targets.")
-    elif screen is not None and screen.tilt:
+    several = len(screens) > 1
+    drawn = [screen for screen in screens if several or screen.tilt]
+    for screen in drawn:
         edges = corners(screen)
         whole.fill(edges[:, 2], edges[:, 0], facecolor="none", edgecolor=GREY, linewidth=1.0, gid="screen")
-        footnote(figure, f"Grey: the target, its plane tilted by {turned(screen.tilt)}.")
+    if drawn:
+        tilted = "" if several else f"Grey: the target, its plane tilted by {turned(drawn[0].tilt)}."
+        footnote(figure, tilted or "Grey: the targets.")
     return figure
 
 
@@ -332,20 +327,18 @@ def light_path_of(
         return None
     mesh = meshes.lens_mesh(lens, SHOWN_CELLS)
     of = "of the middle of the source" if scene.source.extent is not None else "of the source"
-    drawn = [light_figures.tones(irradiance, target) for target, irradiance in pictures]
     return LightPath(
         vertices=mesh.vertices,
         faces=mesh.faces,
         rays=rays,
         flux=MILLIONTHS * flux,
-        screen=corners(screens[0]),
-        picture=drawn[0],
+        screens=tuple(map(corners, screens)),
+        pictures=tuple(light_figures.tones(irradiance, wanted) for wanted, irradiance in pictures),
         lamp=rays[:1, 0] if np.ptp(rays[:, 0], axis=0).max() < 1e-6 else np.empty((0, 3)),
         seen_along=1 if scene.target.seen_from == "lens" else -1,
         mirror=lens.reflects,
         title=scene.title or scene.name,
         words=f"{_sizes(screens)}\n{len(rays)} rays {of}, true to scale",
-        further=tuple(zip(map(corners, screens[1:]), drawn[1:], strict=True)),
     )
 
 

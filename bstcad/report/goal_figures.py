@@ -1,14 +1,16 @@
-"""The figures of each goal in report.json: the light on each of several targets, flat tops, and the wavefront."""
+"""The figures of each goal in report.json: the light on each target, flat tops, and the wavefront."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import Field
 
 from bstcad.analysis.top_hat import FLAT, FlatTop
+from bstcad.optics.goal import Goal, suffix_of, words_of
+from bstcad.optics.measure import RESOLVED, Light
 from bstcad.optics.wavefront_error import WavefrontError
 from bstcad.scene.scene import Scene
 from bstcad.scene.target import drawing
@@ -20,10 +22,10 @@ Rrmsd = Annotated[float, Field(gt=0, le=1e3)]
 
 
 @dataclass(frozen=True)
-class TargetFigures:
-    """The light on one of several targets."""
+class GoalFigures:
+    """The light on a target."""
 
-    key: str  # target[0], target[1], …
+    key: str  # target, or target[0], target[1], … of several
     z: float  # mm, of its plane
     weight: Size  # of its squared error among all goals
     rrmsd: Rrmsd  # by the flux into each pixel
@@ -33,6 +35,21 @@ class TargetFigures:
     efficiency: Share  # flux on the target over flux that leaves the back face
     leak: Share | None  # of the light on the target, on its dark pixels; None: it has none
     contrast: Size | None  # mean irradiance of the lit pixels over that of the dark ones; None: or without leak
+
+    @property
+    def resolved(self) -> bool:
+        """Is the RRMSD at least five times its standard error?"""
+        return self.rrmsd >= RESOLVED * self.rrmsd_standard_error
+
+    @property
+    def suffix(self) -> str:
+        """Behind a name: which of several targets it is."""
+        return suffix_of(self.key)
+
+    @property
+    def words(self) -> str:
+        """The target in a sentence."""
+        return words_of(self.key)
 
 
 @dataclass(frozen=True)
@@ -61,13 +78,13 @@ class WavefrontFigures:
         )  # fmt: skip
 
 
-def of_targets(scene: Scene, proof: Proof) -> Iterator[TargetFigures]:
+def figures_of(goals: Sequence[Goal], lights: Sequence[Light]) -> tuple[GoalFigures, ...]:
     """The light on each target."""
-    for key, target, light in zip(scene.target_keys, scene.targets, proof.lights, strict=True):
-        yield TargetFigures(
-            key,
-            target.z,
-            target.weight,
+    return tuple(
+        GoalFigures(
+            goal.key,
+            goal.receiver.z,
+            goal.weight,
             light.rrmsd,
             rrmsd_standard_error=light.standard_error,
             rrmsd_tent=light.tent,
@@ -76,6 +93,8 @@ def of_targets(scene: Scene, proof: Proof) -> Iterator[TargetFigures]:
             leak=light.leak and light.leak.share,
             contrast=light.leak and light.leak.contrast,
         )
+        for goal, light in zip(goals, lights, strict=True)
+    )
 
 
 def flat_tops(scene: Scene, proof: Proof) -> Iterator[FlatTop]:

@@ -426,7 +426,7 @@ def draw_part(made: MadePart, designed: np.ndarray, view: View) -> dict[str, byt
 def made_part(made: MadePart, designed: np.ndarray, view: View) -> Figure:
     """The fitted form error, the light of the made part, and the difference of this light from the designed light."""
     x, y, form = made.deviation.x, made.deviation.y, made.deviation.form
-    predicted = (made.irradiance, *made.further_irradiance)[view.number]
+    predicted = made.irradiances[view.number]
     outliers, unit = made.outliers[:, :2], lit_mean(designed)
     most, pv = float(np.nanmax(np.abs(form))), float(np.nanmax(form) - np.nanmin(form))
     _, times, written = next(rung for rung in FORM_UNITS if most >= rung[0])

@@ -83,12 +83,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "volume": shape["volume"],  # mm³
         "mass": None if heavy is None else shape["volume"] * heavy / 1000,  # g; None: no density is known
         "source": _known(asdict(scene.source)),
-        "target": _known(scene.target.model_dump(mode="json")),
-        **(
-            {"further_targets": [_known(target.model_dump(mode="json")) for target in scene.targets[1:]]}
-            if scene.targets[1:]
-            else {}
-        ),
+        "targets": [_known(target.model_dump(mode="json")) for target in scene.targets],
     }
 
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import ConfigDict, FailFast, Field, TypeAdapter, ValidationError
-from pydantic_core import to_jsonable_python
+from pydantic_core import from_json, to_json, to_jsonable_python
 from typing_extensions import TypedDict
 
 from bstcad.analysis.light import Blur, FinestDetail, finest_detail
@@ -28,9 +28,11 @@ from bstcad.analysis.top_hat import FlatTop
 from bstcad.judges.comparison import Judge
 from bstcad.measured.form_error import MAP
 from bstcad.measured.made_part import MadePart
+from bstcad.optics.goal import Goal, worst
+from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.reach import unreached
-from bstcad.report.goal_figures import Rrmsd, Share, Size, TargetFigures, WavefrontFigures, flat_tops, of_targets
+from bstcad.report.goal_figures import GoalFigures, Rrmsd, Share, Size, WavefrontFigures, figures_of, flat_tops
 from bstcad.report.light_figures import rrmsd
 from bstcad.report.prescription import Order, prescription
 from bstcad.report.units import DIGITS, Rows, number, paragraphs, percent, tables
@@ -60,6 +62,10 @@ LEFT_OUT = {  # LeftOut.kind: in words
 }
 NOTHING = 1e-4  # of the light, and of RRMSD: an effect that changes less changes nothing
 SHARP = 5e-3  # pixels; a smaller blur is none
+
+# Keys of a report whose figures are those of the worst of its goals, and what they are called there.
+OF_WORST = {key: key for key in ("rrmsd", "rrmsd_tent", "light_on_target", "efficiency", "leak", "contrast")}
+OF_WORST["rrmsd_noise"] = "rrmsd_standard_error"
 
 Scalar = str | float | int | bool | None
 Seconds = Annotated[float, Field(ge=0, le=1e9)]
@@ -153,6 +159,8 @@ class Contents:
     # see passed and given_up; "no limit was asked": every check passed, and the scene sets no limit on the light
     verdict: Literal["passed", "passed with remarks", "no limit was asked", "failed"]
     passed: bool  # every check
+    # of the light on each target; figures of light outside of this list are those on the target with the largest RRMSD
+    goals: Annotated[tuple[GoalFigures, ...], Field(min_length=1, max_length=100), FailFast()]
     rrmsd: Rrmsd  # of the irradiance against the target, by the flux into each pixel
     rrmsd_tent: Rrmsd | None  # by linear binning
     rrmsd_noise: Annotated[float, Field(ge=0, le=1e3)]  # standard error of rrmsd
@@ -209,10 +217,13 @@ class Contents:
     # a made part by its cloud, as measured.made_part has it: points, alignment, pv, rms, rrmsd_predicted, passed …
     measured: Mapping[str, Any] | None = None
     order: Order | None = None  # for a machine shop
-    # the light on each of several targets, the first one too, whose figures are those above; none: there is one target
-    targets: tuple[TargetFigures, ...] = ()
     flat_tops: tuple[FlatTop, ...] = ()  # of the targets with a flat profile
     wavefront: WavefrontFigures | None = None  # None: none is asked for, or no light comes to where it is stated
+
+    @property
+    def worst(self) -> GoalFigures:
+        """Of the target with the largest RRMSD."""
+        return self.goals[worst(goal.rrmsd for goal in self.goals)]
 
     @property
     def making(self) -> Making:
@@ -253,19 +264,16 @@ class Examined:
 
 
 def contents_of(
-    scene: Scene, lens: Lens, target: np.ndarray, proof: Proof, *, making: Making,
+    scene: Scene, lens: Lens, goals: Sequence[Goal], proof: Proof, *, making: Making,
     circumstances: Mapping[str, Any], estimates: tuple[LeftOut, ...], diagnosis: Mapping[str, Any],
-    reachable: np.ndarray | None = None, further: Sequence[np.ndarray] = (),
 ) -> Contents:  # fmt: skip
     """The contents of report.json.
 
-    reachable: the pixels (rows, columns) that light can reach; None: all that are to be lit.  further: the targets
-    behind the first, whose light is `proof.further`.
     lens: as designed.  circumstances: version, machine and versions of libraries now, which those of its making
     precede.  estimates: of the effects that are left out.  diagnosis: convergence, remaining_error, limits and bounds.
     """
     known = {key: value for key, value in vars(making).items() if value is not None}
-    light, dark = proof.light, proof.light.leak
+    goal, light, dark = goals[proof.worst], proof.light, proof.light.leak
     contents = Contents(
         **{**circumstances, **known},
         **diagnosis,
@@ -273,6 +281,7 @@ def contents_of(
         title=scene.title,
         verdict=verdict(proof.passed, (), scene.limits_light),
         passed=proof.passed,
+        goals=figures_of(goals, proof.lights),
         rrmsd=light.rrmsd,
         rrmsd_tent=light.tent,
         rrmsd_noise=light.standard_error,
@@ -287,7 +296,7 @@ def contents_of(
         },
         seed=scene.tailoring.seed,
         rrmsd_whole=light.rrmsd_whole,
-        unreachable=None if reachable is None else _unreached(scene, reachable),
+        unreachable=_unreached(scene, goal),
         leak=dark and dark.share,
         contrast=dark and dark.contrast,
         optic=scene.optic,
@@ -297,20 +306,20 @@ def contents_of(
         shape=proof.shape,
         stability=proof.stability,
         blur=proof.blur,
-        finest_detail=_finest_detail(scene, proof, estimates),
+        finest_detail=_finest_detail(scene, proof, goal.receiver, estimates),
         picture=scene.of_pictures(),
-        lines=tuple(Line(line.wavelength, line.share, rrmsd(target, line.picture)) for line in proof.lines),
+        lines=tuple(Line(line.wavelength, line.share, rrmsd(goal.picture, line.picture)) for line in proof.lines),
         estimates=estimates,
-        targets=tuple(of_targets(scene, proof)) if proof.further else (),
         flat_tops=tuple(flat_tops(scene, proof)),
         wavefront=proof.wavefront and WavefrontFigures.of(proof.wavefront),
     )
-    pictures = tuple(zip(further, (each.picture for each in proof.further), strict=True))
-    return _remarked(contents, *remarks(contents, scene, target, light.picture, further=pictures))
+    return _remarked(contents, *remarks(contents, scene, goals, [each.picture for each in proof.lights]))
 
 
-def _unreached(scene: Scene, reachable: np.ndarray) -> dict[str, float | None]:
-    return unreached(scene.target.irradiance(), reachable, None if scene.optic == "mirror" else scene.index)
+def _unreached(scene: Scene, goal: Goal) -> dict[str, float | None] | None:
+    if goal.reachable is None:
+        return None
+    return unreached(goal.whole, goal.reachable, None if scene.optic == "mirror" else scene.index)
 
 
 def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:
@@ -335,9 +344,10 @@ def _remarked(contents: Contents, *more: str) -> Contents:
     return replace(contents, given_up=given_up, verdict=verdict(contents.passed, given_up, asked))
 
 
-def _finest_detail(scene: Scene, proof: Proof, estimates: tuple[LeftOut, ...]) -> FinestDetail | None:
+def _finest_detail(
+    scene: Scene, proof: Proof, screen: Screen, estimates: tuple[LeftOut, ...]
+) -> FinestDetail | None:  # fmt: skip
     """The detail that the source allows: of the scene's size, or of the size that the estimates assume of a point."""
-    screen = scene.target.screen
     if proof.blur:
         of = ", ".join(f"source.{key} = {size}" for key, size in extent(scene.source))
         return finest_detail(proof.blur.pixels, proof.lens, screen, of)
@@ -367,21 +377,14 @@ def extent(source: Collimated | PointSource) -> Iterator[tuple[str, str]]:
 OUTLIERS = 0.01  # of the points of a made part: more outliers are worth a sentence
 
 
-def remarks(
-    report: Contents, scene: Scene, target: np.ndarray, irradiance: np.ndarray,
-    further: Sequence[tuple[np.ndarray, np.ndarray]] = (),
-) -> list[str]:  # fmt: skip
-    """Remarks on a report, by its target and irradiance (rows, columns), both of one sum; the most important first.
-
-    further: the same of each target behind the first.
-    """
+def remarks(report: Contents, scene: Scene, goals: Sequence[Goal], irradiances: Sequence[np.ndarray]) -> list[str]:
+    """Remarks on a report, by the irradiance on each target, of its picture's sum; the most important first."""
     allowed = DEFAULT_RRMSD_LIMIT if report.rrmsd_asked is None else report.rrmsd_asked
-    names = scene.target_keys if further else ("the target",)
-    pictures = list(zip(names, scene.targets, ((target, irradiance), *further), strict=True))
+    pairs = list(zip(goals, irradiances, strict=True))
     return paragraphs(
         "remarks.txt.j2", "remarks", report=report, scene=scene, allowed=allowed, cut=CUT, names=LEFT_OUT,
-        unlit={name: unlit(*pair, x=where.x, y=where.y) for name, where, pair in pictures},
-        lifted={name: lifted(*pair) for name, _, pair in pictures},
+        unlit={goal.words: unlit(goal.picture, found, x=goal.receiver.x, y=goal.receiver.y) for goal, found in pairs},
+        lifted={goal.words: lifted(goal.picture, found) for goal, found in pairs},
     )  # fmt: skip
 
 
@@ -423,13 +426,35 @@ def read_as(kind: type[Record], path: Path, remedy: str) -> Record:
 def of_json(data: bytes | str, kind: type[Record] = Contents) -> Record:
     """The record of this kind in JSON; ValueError names the first entry that does not fit."""
     try:
-        found = _adapter(kind).validate_json(data)
+        found = _adapter(kind).validate_json(_renewed(data) if kind is Contents else data)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False, include_context=False)[0]
         raise ValueError(": ".join(filter(None, (".".join(map(str, first["loc"])), first["msg"])))) from None
     if not _legible(plain(found)):
         raise ValueError("it holds text that is no line of a report")
     return found
+
+
+def _renewed(data: bytes | str) -> bytes | str:
+    """A report.json with the keys of today; those before told the first of several targets apart."""
+    try:
+        facts = from_json(data)
+        if "goals" in facts:
+            return data
+        prescribed, measured = facts["prescription"], facts.get("measured") or {}
+        prescribed["targets"] = [prescribed.pop("target"), *prescribed.pop("further_targets", ())]
+        alone = {"key": "target", "z": prescribed["targets"][0]["z"], "weight": 1.0} | {
+            name: facts.get(key) for key, name in OF_WORST.items()
+        }
+        goals = facts["goals"] = facts.pop("targets", [alone])
+        stated = goals[worst(goal["rrmsd"] for goal in goals)]
+        facts |= {key: stated[name] for key, name in OF_WORST.items()}
+        if measured:
+            predicted = {key: measured.get(key) for key in ("rrmsd_predicted", "rrmsd_high")}
+            measured["goals"] = measured.pop("targets", [{"key": "target"} | predicted])
+        return to_json(facts)
+    except (AttributeError, KeyError, TypeError, ValueError):  # no report: that is for the caller to say
+        return data
 
 
 @cache
@@ -496,12 +521,16 @@ class Report:
     """
 
     contents: Contents
-    irradiance: np.ndarray  # (rows, columns), row 0 = y max, with the target's sum
-    # the made part that this verification was given: facts, outliers (n, 3), irradiance as predicted, and deviation,
+    irradiances: tuple[np.ndarray, ...]  # on each target (rows, columns), row 0 = y max, with the target's sum
+    # the made part that this verification was given: facts, outliers (n, 3), irradiances as predicted, and deviation,
     # whose x, y and form (rows y, columns x; mm, + out of the glass, NaN outside) are the deviation map; None: none
     measured: Any = None
-    further_irradiance: tuple[np.ndarray, ...] = ()  # the same on the targets behind the first
     notes: tuple[str, ...] = ()  # sentences on the exported files, which stand in their sidecars, too
+
+    @property
+    def irradiance(self) -> np.ndarray:
+        """On the target with the largest RRMSD."""
+        return self.irradiances[worst(goal.rrmsd for goal in self.contents.goals)]
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -520,29 +549,19 @@ class Report:
     def __repr__(self) -> str:
         """The verdict and the two figures that matter most; then each remark and each check that failed."""
         failed = (check for check in self.checks if not check.passed)
-        where = self.targets[0].key if self.targets else "the target"
         return "\n  ".join(
             [
                 f"Report {self.name!r}: {self.verdict}, RRMSD {rrmsds(self.contents)}, "
-                f"{percent(self.light_on_target)} of the source's light is on {where}",
+                f"{percent(self.light_on_target)} of the source's light is on {self.worst.words}",
                 *(f"failed: {check.name}" + (f" ({check.where})" if check.where else "") for check in failed),
                 *(f"given up: {sentence}" for sentence in self.given_up),
             ]
         )
 
 
-def of_worst_target(report: Mapping[str, Any]) -> dict[str, float | None]:
-    """rrmsd, rrmsd_noise, leak and light_on_target of a report.json; of several targets those of the largest RRMSD."""
-    keys = {"rrmsd": "rrmsd", "rrmsd_noise": "rrmsd_noise", "leak": "leak", "light_on_target": "light_on_target"}
-    if not report.get("targets"):
-        return {key: report[key] for key in keys}
-    worst = max(report["targets"], key=lambda each: math.inf if each["rrmsd"] is None else each["rrmsd"])
-    return {key: worst[name] for key, name in (keys | {"rrmsd_noise": "rrmsd_standard_error"}).items()}
-
-
 def rrmsds(report: Contents) -> str:
-    """The RRMSD, or that of each of several targets, in their order."""
-    return ", ".join(number(each.rrmsd) for each in report.targets or (report,))
+    """The RRMSD on each target, in their order."""
+    return ", ".join(number(each.rrmsd) for each in report.goals)
 
 
 def changes(entry: LeftOut) -> tuple[str, str, str]:

@@ -52,7 +52,6 @@ TITLE = 46  # letters of a line of it
 PATH_ANGLE = 24.0  # degrees, from the lower to the upper edge
 FILLED, ROOM = 0.88, 0.6  # of a view: all of the way, and a lens with room for its rays
 BEFORE = 0.8  # opacity of a screen that light goes on behind
-SCREEN, SEEN = "further_screen_", "further_picture_"  # arrays of a file, with a number
 AHEAD, EACH = 2.0, 5  # from near by: diagonals of the lens that rays are drawn for, and every fifth ray
 
 # The lens to be turned.
@@ -84,9 +83,9 @@ def lens_picture(mesh: Mesh) -> bytes | None:
 
 def draw(path: LightPath, picture: Path | None) -> bool:
     """Write `picture` (PNG), or open a window until it is closed; False where this machine cannot."""
-    arrays = {name: np.asarray(value) for name, value in vars(path).items() if name != "further"}
-    for k, (screen, seen) in enumerate(path.further):
-        arrays |= {f"{SCREEN}{k}": screen, f"{SEEN}{k}": seen}
+    given = vars(path).items()
+    arrays = {name: np.asarray(value) for name, value in given if not isinstance(value, tuple)}
+    arrays |= {f"{name} {k}": each for name, value in given if isinstance(value, tuple) for k, each in enumerate(value)}
     return _run(arrays, "", None) if picture is None else _run(arrays, str(picture), PATIENCE)
 
 
@@ -127,8 +126,9 @@ def main(arrays: str, picture: str) -> None:
         image = Image.fromarray(clay(told["vertices"], told["faces"]))
         image.crop(image.getchannel("A").getbbox()).save(picture)
         return
-    further = [(told.pop(f"{SCREEN}{k}"), told.pop(f"{SEEN}{k}")) for k in range(sum(SCREEN in name for name in told))]
-    plotter = plotter_of(LightPath(**told, further=tuple(further)), off_screen=bool(picture))
+    for name in [name for name in told if " " in name]:  # one of several, in their order
+        told[name.split()[0]] = (*told.get(name.split()[0], ()), told.pop(name))
+    plotter = plotter_of(LightPath(**told), off_screen=bool(picture))
     if picture:
         plotter.screenshot(picture)
     else:
@@ -226,25 +226,19 @@ def _add_lights(plotter: Any, lights: Iterable[tuple[Any, float]], centre: Any) 
 
 @dataclass(frozen=True, eq=False)
 class LightPath:
-    """The solid, rays coloured by their flux, and the screen with its picture, mm."""
+    """The solid, rays coloured by their flux, and the screens with their pictures, mm."""
 
     vertices: np.ndarray  # (n, 3), of the lens
     faces: np.ndarray  # (k, 3), vertices of its triangles
     rays: np.ndarray  # (rays, stops, 3), from the source over the faces to the furthest screen
     flux: np.ndarray  # (rays,) that each arrives with, in millionths of the source's light
-    screen: np.ndarray  # (4, 3), its corners: (x min, y min), (x max, y min), (x max, y max), (x min, y max)
-    picture: np.ndarray  # (rows, columns) uint8, the tones of its irradiance; row 0 at y max
+    screens: tuple[np.ndarray, ...]  # (4, 3), corners of each: (x min, y min), (x max, y min), (x max, y max), …
+    pictures: tuple[np.ndarray, ...]  # (rows, columns) uint8, tones of the irradiance on each; row 0 at y max
     lamp: np.ndarray  # (0 or 1, 3), a point source
     seen_along: int  # +1: the picture is seen from where the light comes from, along +z; -1: from behind the screen
     mirror: bool
     title: str
     words: str  # a caption of a line or two
-    further: tuple[tuple[np.ndarray, np.ndarray], ...] = ()  # screen and picture of each target behind the first
-
-    @property
-    def screens(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-        """Screen and picture of each target."""
-        return ((self.screen, self.picture), *self.further)
 
 
 def plotter_of(path: LightPath, off_screen: bool) -> Any:
@@ -265,13 +259,12 @@ def plotter_of(path: LightPath, off_screen: bool) -> Any:
             "flux of a ray, in millionths of the source's light\n", mapper=drawn, color=SOFT, title_font_size=16,
             label_font_size=15, n_labels=3, fmt="%.4g", width=0.4, height=0.08, position_x=0.57, position_y=0.02,
         )  # fmt: skip
-    *near, last = sorted(path.screens, key=lambda pair: pair[0][:, 2].mean())
+    *near, last = sorted(zip(path.screens, path.pictures, strict=True), key=lambda pair: pair[0][:, 2].mean())
     for screen, picture in near:
         _add_screen(plotter, screen, picture, BEFORE)
     _add_screen(plotter, *last)
     _say(plotter, path.words, (0.02, 0.03), size=10, colour=SOFT)
-    corners = [screen for screen, _ in path.screens]
-    everything = np.concatenate([path.vertices, path.rays.reshape(-1, 3), *corners])
+    everything = np.concatenate([path.vertices, path.rays.reshape(-1, 3), *path.screens])
     _frame(plotter, everything, path, np.multiply(ASIDE, [1, 1, -path.seen_along]), filled=FILLED)
     plotter.subplot(0, 0)
     _add_lens(plotter, solid, path)
@@ -374,7 +367,7 @@ def _frame(plotter: Any, points: np.ndarray, path: LightPath, towards: np.ndarra
 
 def _clear_of_screen(path: LightPath, towards: np.ndarray) -> np.ndarray:
     """The direction towards the eye (a unit vector), on the side that the screen is not off to."""
-    off = path.screen[:, 0].mean() - path.vertices[:, 0].mean()
+    off = path.screens[0][:, 0].mean() - path.vertices[:, 0].mean()
     return towards * [-1 if off > 0 else 1, 1, 1] / np.linalg.norm(towards)
 
 
@@ -454,7 +447,7 @@ def _light(path: LightPath) -> dict[str, Any]:
         "flux": np.round(flux, PARTS).tolist(),
         "screens": [
             {"corners": np.round(screen, TENTHS_OF_MICRONS).tolist(), "picture": _data_url(picture)}
-            for screen, picture in path.screens
+            for screen, picture in zip(path.screens, path.pictures, strict=True)
         ],
         "lamp": np.round(path.lamp, TENTHS_OF_MICRONS).tolist(),
         "mirror": bool(path.mirror),

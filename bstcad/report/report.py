@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 Figure = tuple[str, str, str]  # name, value, remark
 BEGIN, END = "<!-- tolerances -->", "<!-- end of tolerances -->"  # about the section on tolerances
 NO_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")  # XML 1.0 has no such characters
-RESOLVED = 5.0  # an RRMSD below this many standard errors is not resolved
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # a browser fetches nothing, runs one script
 VIEWER = Path(__file__).with_name("solid_view.js")
 BADGES = {  # report["verdict"]: (sign, style of the page, of the terminal)
@@ -66,11 +65,6 @@ INTERVALS = (
 # --- words ------------------------------------------------------------------------------------------------------------
 
 
-def resolved(report: Contents) -> bool:
-    """Is the RRMSD at least five times its standard error?"""
-    return report.rrmsd >= RESOLVED * report.rrmsd_noise
-
-
 def explanation(report: Contents | Examined) -> str:
     """The verdict in sentences: how many checks passed or failed, and doubts on the RRMSD."""
     count, failed = len(report.checks), sum(not check.passed for check in report.checks)
@@ -84,7 +78,7 @@ def doubts(report: Contents | Examined) -> list[str]:
     """Sentences on the RRMSD: that the scene sets no limit on it or on the light, that it is not resolved."""
     if isinstance(report, Examined):
         return []
-    return paragraphs("verdict.txt.j2", "doubts", report=report, resolved=resolved(report))
+    return paragraphs("verdict.txt.j2", "doubts", report=report)
 
 
 def check_line(check: Check) -> str:
@@ -124,7 +118,7 @@ def first_figures(report: Contents | Examined) -> list[Figure]:
     """
     if isinstance(report, Examined):
         return [(name, value, "") for name, value in report.part.items()]
-    rows = tables("first_figures.txt.j2", report=report, resolved=resolved(report))["first"]
+    rows = tables("first_figures.txt.j2", report=report)["first"]
     return [(name, *(part.strip() for part in text.partition(" |")[::2])) for name, text in rows]
 
 
@@ -157,7 +151,6 @@ def write_html(
             badge=BADGES[report.verdict],
             explanation=explanation(report),
             first_figures=first_figures(report),
-            resolved=resolved(report),
             facts_of=tables("report_facts.txt.j2", report=report),
             machine=machine(report.machine),
             ledger=ledger(report.flux, report.optic),

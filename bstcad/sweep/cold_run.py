@@ -35,7 +35,6 @@ from bstcad.optics.measure import Effort, measure
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
-from bstcad.report.record import of_worst_target
 from bstcad.runs import environment, files, processes
 from bstcad.runs.cluster import HERE, Answer
 from bstcad.scene.errors import MachineError, SceneError
@@ -329,12 +328,11 @@ def _generate(scene: Path, folder: Path, point: Settings, limit: float, *, tick:
     if ended.code not in (0, 1) or not (folder / "report.json").is_file():
         return Run(status=FAILED, reason=ended.reason, **took)
     report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-    own = of_worst_target(report)
     return Run(
         status=DONE,
         peak_memory_gb=report["machine"].pop("peak_memory_gb", None),
-        rrmsd_reported=own["rrmsd"],
-        rrmsd_noise_reported=own["rrmsd_noise"],
+        rrmsd_reported=report["rrmsd"],
+        rrmsd_noise_reported=report["rrmsd_noise"],
         passed=report["passed"],
         machine=report["machine"],
         versions=report["versions"],

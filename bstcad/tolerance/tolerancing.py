@@ -96,7 +96,7 @@ def _pictures(scene: Scene, nominal: Nominal, grade: str | None, tubes: int) -> 
     channels = scene.channels(POINTS) if scene.source.extent else scene.channels()
     setup = Setup(nominal.lens, channels, scene.target.screen)
     errors = perturbations(setup, whole_table(scene.tolerance, grade), scene.lens.material)
-    return tuple(Pictures(replace(setup, screen=goal.screen), errors, goal.target, tubes) for goal in nominal.goals)
+    return tuple(Pictures(replace(setup, screen=goal.receiver), errors, goal.picture, tubes) for goal in nominal.goals)
 
 
 def _rrmsd(nominal: Nominal, pictures: Pictures) -> float:

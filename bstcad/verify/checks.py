@@ -21,7 +21,7 @@ from bstcad.analysis.shape import AT_BOUND, describe, survey, survey_front
 from bstcad.cad import mesh as meshes
 from bstcad.optics import quadrature
 from bstcad.optics.channels import Channel
-from bstcad.optics.irradiance import Screen
+from bstcad.optics.goal import Goal, worst
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import (
     FULL,
@@ -66,35 +66,16 @@ LIMIT, LIMIT_PER_MB = 120.0, 3.0  # s that OCC may take over a file, and more fo
 GRID = ", on a grid four times finer than the net"
 
 
-@dataclass(frozen=True, eq=False)
-class Goal:
-    """One target of a design, and the picture that its light is held to."""
-
-    key: str  # by which sentences call it: target, or target[0], target[1], … of several
-    screen: Screen
-    target: np.ndarray  # (rows, columns), row 0 = y max
-    stored_target: np.ndarray  # as design.npz has it
-    weight: float = 1.0  # of its squared error among all goals
-    whole: np.ndarray | None = None  # as Nominal has these two
-    reachable: np.ndarray | None = None
-
-    @property
-    def suffix(self) -> str:
-        """Behind the names of its checks: which of several targets it is."""
-        return "" if self.key == "target" else f", {self.key}"
-
-
 @dataclass(frozen=True)
 class Nominal:
     """The design that the files are held to."""
 
     lens: Lens  # float64
-    target: np.ndarray  # (rows, columns), row 0 = y max
-    screen: Screen
+    goals: tuple[Goal, ...]
+    stored: tuple[np.ndarray, ...]  # their pictures as design.npz has them
     channels: tuple[Channel, ...]
     accept: Accept
     seed: int
-    stored_target: np.ndarray  # as design.npz has it
     mesh_tolerance: float = 1e-3  # mm; how far the facets of the mesh may lie from the lens
     mesh_asked: bool = True  # by the scene; else the mesh with the most triangles is fine enough
     ghost: GhostLight | None = None  # how light reflected twice in the lens is followed; None: it is left out
@@ -103,26 +84,12 @@ class Nominal:
     part: Part = field(default_factory=Part)  # whose facts lens.step should state besides the shape
     draw: Draw | None = None  # how points of an extended source are drawn; None: it is a point
     accuracy: float = FULL.accuracy  # of the RRMSD: its standard error, as a part of it, that is asked for
-    # of the whole picture, where light can reach but a part of it, which is `target`; None: it can reach all
-    whole: np.ndarray | None = None
-    reachable: np.ndarray | None = None  # (rows, columns) which pixels those are
-    weight: float = 1.0  # of the target, the first of several, among all goals
-    further: tuple[Goal, ...] = ()  # the targets behind the first
     wave: Wave | None = None  # that the light behind the lens is to be; None: none is asked for
 
     @property
     def heaviest(self) -> Channel:
         """The channel with the most light: that of the main line, by which waves are counted."""
         return max(self.channels, key=lambda channel: channel.weight)
-
-    @property
-    def goals(self) -> tuple[Goal, ...]:
-        """All targets, the first one too."""
-        first = Goal(
-            "target[0]" if self.further else "target", self.screen, self.target, self.stored_target,
-            weight=self.weight, whole=self.whole, reachable=self.reachable,
-        )  # fmt: skip
-        return (first, *self.further)
 
     def effort(self, given: Effort | None = None) -> Effort:
         """The rays and tubes of a measurement of this design, a draft's with fewer; given: a limit, None: no limit."""
@@ -144,20 +111,25 @@ class Proof:
 
     checks: tuple[Check, ...]
     lens: Lens  # as re-read from lens.step; with a mount that of part.step, with its clear apertures
-    light: Light  # that it throws on the target, the first of several
+    lights: tuple[Light, ...]  # that it throws on each target
     shape: dict[str, float | None]  # of the lens within the mount's rim; volume: of lens.step
     stability: dict[str, float | int | None]
-    blur: Blur | None = None  # by the source's size; None: it is a point, or a beam of parallel light
-    lines: tuple[Line, ...] = ()  # of a spectrum, each by itself
+    # blur by the source's size, None: it has none, and lines of a spectrum: on the target with the largest RRMSD
+    blur: Blur | None = None
+    lines: tuple[Line, ...] = ()
     at_bounds: dict[str, AtBound] | None = None  # the bounds met, by key; None: no bounds
-    further: tuple[Light, ...] = ()  # on the targets behind the first
     # of the light, against the one asked for; None: none was, or no light comes to where it is stated
     wavefront: WavefrontError | None = None
 
     @property
-    def lights(self) -> tuple[Light, ...]:
-        """On all targets, the first one too."""
-        return (self.light, *self.further)
+    def worst(self) -> int:
+        """The number of the target with the largest RRMSD, whose figures stand for the design's."""
+        return worst(light.rrmsd for light in self.lights)
+
+    @property
+    def light(self) -> Light:
+        """That on the target with the largest RRMSD."""
+        return self.lights[self.worst]
 
     @property
     def passed(self) -> bool:
@@ -206,8 +178,8 @@ def verify(
     for number, goal in enumerate(nominal.goals):
         found.append(_lit(as_made, nominal, goal, effort=effort))
         lit(*found[-1], number)
-    (light, lines), *others = found
-    lights = (light, *(other for other, _ in others))
+    lights, lines = zip(*found, strict=True)
+    number = worst(light.rrmsd for light in lights)
     wavefront, of_wavefront = _of_wavefront(as_made, nominal)
     cut = as_cut(lens, mount)
     shape = describe(cut, effort.places) | {"volume": whole.volume} | _ripples_in_light(as_made, nominal)
@@ -227,7 +199,7 @@ def verify(
         *_of_ripple(shape),
         sealed,
         *_facets(mesh, lens, shape["volume"], nominal),
-        *(_picture(goal) for goal, _, _ in goals),
+        *map(_picture, nominal.goals, nominal.stored),
         *(c for _, each, of in goals for c in _because(why, _of_light(each, nominal.accept, meets, of=of))),
         *(Check.at_most(f"{DARK}{of}", each.leak.share, nominal.accept.leak) for _, each, of in goals if each.leak),
         *of_wavefront,
@@ -235,9 +207,9 @@ def verify(
         Check.at_most("values that are not finite", stability["non_finite"], 0),
     )
     return Proof(
-        checks, as_made, light, shape, stability=stability,
-        blur=blur(nominal.channels, as_made, nominal.screen, nominal.target), lines=lines,
-        at_bounds=at_bounds or None, further=lights[1:], wavefront=wavefront,
+        checks, as_made, lights, shape, stability=stability,
+        blur=blur(nominal.channels, as_made, nominal.goals[number].receiver, nominal.goals[number].picture),
+        lines=lines[number], at_bounds=at_bounds or None, wavefront=wavefront,
     )  # fmt: skip
 
 
@@ -246,19 +218,18 @@ def _lit(lens: Lens, nominal: Nominal, goal: Goal, effort: Effort) -> tuple[Ligh
     light = measure(
         lens,
         nominal.channels,
-        goal.screen,
-        goal.target,
+        goal.receiver,
+        goal.picture,
         effort=effort,
         ghost=nominal.ghost,
         draw=nominal.draw,
         whole=goal.whole,
     )
     if not light.rrmsd >= 0:
-        name, on = "lens.step" if nominal.mount is None else "part.step", "the target"
-        on = goal.key if goal.suffix else on
-        raise ValueError(f"{name}: none of its light falls on {on}; write it again, or check scene.toml")
+        name = "lens.step" if nominal.mount is None else "part.step"
+        raise ValueError(f"{name}: none of its light falls on {goal.words}; write it again, or check scene.toml")
     n = max(LINE_TUBES, tubes_of(lens))
-    return light, lines_apart(lens, nominal.channels, goal.screen, target=goal.target, n=n)
+    return light, lines_apart(lens, nominal.channels, goal.receiver, target=goal.picture, n=n)
 
 
 def _as_shaped(lens: Lens, designed: Lens) -> Lens:
@@ -309,14 +280,14 @@ def _stability(
     lens: Lens, nominal: Nominal, lights: Sequence[Light], shape: dict
 ) -> dict[str, float | int | None]:  # fmt: skip
     """How far the lens is from where its numbers would go wrong; angles in degrees, curvature in 1/mm."""
-    worst = margins(nominal.channels, lens, nominal.screen, nominal.seed + VERIFY_SEED)
-    least = (f"{face}radius_min_{kind}" for face in ("", "front_") for kind in ("concave", "convex"))
-    radii = [shape[key] for key in least if shape.get(key)]
+    least = margins(nominal.channels, lens, nominal.goals[0].receiver, nominal.seed + VERIFY_SEED)
+    keys = (f"{face}radius_min_{kind}" for face in ("", "front_") for kind in ("concave", "convex"))
+    radii = [shape[key] for key in keys if shape.get(key)]
     return {
-        "tir_margin_deg": worst.tir_margin_deg,
-        "newton_slope_min": worst.newton_slope_min,
+        "tir_margin_deg": least.tir_margin_deg,
+        "newton_slope_min": least.newton_slope_min,
         "curvature_max": 1 / min(radii) if radii else 0.0,
-        "non_finite": worst.non_finite + sum(int((~np.isfinite(light.picture)).sum()) for light in lights),
+        "non_finite": least.non_finite + sum(int((~np.isfinite(light.picture)).sum()) for light in lights),
     }
 
 
@@ -361,10 +332,8 @@ def _ripples_in_light(lens: Lens, nominal: Nominal) -> dict[str, float]:
     """RRMSD that the ripple of each tailored face makes by itself, by keys of Proof.shape."""
     light = nominal.heaviest
     channel = replace(light, source=light.source.central, weight=1.0)
-    faces = {"": "back"} | ({"front_": "front"} if lens.shapes_front else {})
-    return {
-        f"{key}ripple_rrmsd": rrmsd_of_ripple(channel, lens, nominal.screen, face) for key, face in faces.items()
-    }
+    faces, screen = {"": "back"} | ({"front_": "front"} if lens.shapes_front else {}), nominal.goals[0].receiver
+    return {f"{key}ripple_rrmsd": rrmsd_of_ripple(channel, lens, screen, face) for key, face in faces.items()}
 
 
 def of_bounds(
@@ -411,13 +380,13 @@ def of_bounds(
     return checks, at_bounds
 
 
-def _picture(goal: Goal) -> Check:
+def _picture(goal: Goal, stored: np.ndarray) -> Check:
     """The target that travels with a design against the picture of its scene."""
-    off = np.abs(goal.stored_target - goal.target)
+    off = np.abs(stored - goal.picture)
     row, column = np.unravel_index(np.argmax(off), off.shape)
     name = f"target in design.npz against the scene's, of its brightest pixel{goal.suffix}"
     where = f"pixel ({column}, {row}), counted from the upper left"
-    return Check.at_most(name, float(off.max() / goal.target.max()), TARGET_DIFFERENCE, where=where)
+    return Check.at_most(name, float(off.max() / goal.picture.max()), TARGET_DIFFERENCE, where=where)
 
 
 def _facets(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> list[Check]:

@@ -18,7 +18,7 @@ PAGES = ROOT / "docs" / "reference"
 RECORDS = {  # of each JSON file: the module's file and its records, the file's own record first
     "report.json": [
         ("report/record.py", ["Contents", "Stage", "Point", "PrecisionTest", "Line", "LeftOut"]),
-        ("report/goal_figures.py", ["TargetFigures", "WavefrontFigures"]),
+        ("report/goal_figures.py", ["GoalFigures", "WavefrontFigures"]),
         ("analysis/top_hat.py", ["FlatTop"]),
         ("verify/verdict.py", ["Check"]),
         ("analysis/light.py", ["Blur", "FinestDetail"]),

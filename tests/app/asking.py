@@ -13,6 +13,7 @@ from bstcad.app.guard import Guard
 from bstcad.app.preview_desk import PreviewDesk
 from bstcad.app.workspace import LARGEST_UPLOAD, Workspace
 from bstcad.report import record
+from bstcad.report.goal_figures import GoalFigures
 from tests.app.conftest import SMALL
 
 PORT, TOKEN = 8123, "the-token-of-this-start"
@@ -126,7 +127,9 @@ def contents(name, **more):
         "prescription": {}, "seconds_total": 3.0, "stages": (), "history": (record.Point(1.0, 0.5),), "checks": (),
         "effects": {"simulated": (), "left_out": ()}, "machine": {}, "versions": {}, "seed": 0,
     }  # fmt: skip
-    return record.Contents(name=name, **known | more)
+    known |= more
+    figures = {name: known.get(key) for key, name in record.OF_WORST.items()}
+    return record.Contents(name=name, **known, goals=(GoalFigures("target", 500.0, 1.0, **figures),))
 
 
 def made(folder, **more):

@@ -31,7 +31,7 @@ def draft(scene):
     """The light of a finished draft, with the target's sum."""
     made = pipeline.design(scene)
     light = tubes_picture(made.lens, scene.channels(), scene.target.screen, 301).numpy()
-    return light * (made.target.sum() / light.sum())
+    return light * (made.goals[0].picture.sum() / light.sum())
 
 
 BENCH = pytest.mark.bench

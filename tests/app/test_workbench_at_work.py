@@ -76,7 +76,7 @@ def test_a_photo_is_a_verified_lens_in_four_clicks(open_page, shared, photo, tmp
     folder = shared.folder / "my-laser"
     assert load(shared.folder / "my-laser.toml").lens.outline.half_extent == (40, 30)  # the photo's proportions
     finished, _ = folders.read_nominal(folder)
-    light = folders.read_irradiance(folder, finished)
+    light = folders.read_irradiances(folder, finished)[0]
     scene = load(shared.folder / "my-laser.toml")
     apart = {name: off(preview(scene, pains=pains).pictures[0][1], light) for name, pains in PAINS.items()}
     print(f"\nfrom the drop to the first preview {first:.2f} s; RRMSD between it and the finished draft: {apart}")

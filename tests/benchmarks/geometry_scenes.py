@@ -120,7 +120,7 @@ def measured(scene: Scene) -> dict[str, Any]:
     began, cpu = time.perf_counter(), time.process_time()
     made = design(scene, device="cpu", later=True)
     spent = time.perf_counter() - began, time.process_time() - cpu
-    target = made.target
+    target = made.goals[0].picture
     judged = measure(made.lens, scene.judging_channels(), scene.target.screen, target=target, effort=JUDGED)
     image = judged.picture / judged.picture.sum()
     error = (image - target / target.sum()) ** 2

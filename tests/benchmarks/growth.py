@@ -188,7 +188,7 @@ def _evaluation(m: int = NET, n: int = TUBES, pixels: int = PIXELS, lines: int =
 
 def _made(m: int, pixels: int = PIXELS) -> Made:
     scene = _scene(m, pixels)
-    return Made(scene, lens_of(m), scene.target.irradiance())
+    return Made(scene, lens_of(m), scene.goals)
 
 
 def _in_a_folder(work: Callable[[Path], Any]) -> None:
@@ -226,7 +226,7 @@ def _reading(read: Callable[[Path], Any], m: int) -> Work:
 def _proof(m: int = NET, pixels: int = PIXELS) -> Work:
     made = _made(m, pixels)
     place = _written(m)
-    wanted = nominal(made.scene, made.lens, made.target)
+    wanted = nominal(made.scene, made.lens, made.goals)
     return partial(checks.verify, Path(place.name), wanted, effort=PROOF)
 
 

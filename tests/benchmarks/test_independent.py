@@ -215,7 +215,7 @@ def test_small_errors_are_those_of_an_independent_monte_carlo(name, designs, cap
     report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
     stated = report["rrmsd"], report["rrmsd_noise"]
     if two:
-        stated = tuple(report["targets"][number][key] for key in ("rrmsd", "rrmsd_standard_error"))
+        stated = tuple(report["goals"][number][key] for key in ("rrmsd", "rrmsd_standard_error"))
     judged = judge(folder, points=POINTS if two else FEW, number=number, most=MOST)
     apart, error = stated[0] - judged.rrmsd, math.hypot(stated[1], judged.error)
     with capsys.disabled():

@@ -79,6 +79,6 @@ def test_the_published_case_by_the_command(decoding, tmp_path):
     subprocess.run([sys.executable, "-m", "bstcad.cli", "generate", path, "--output", tmp_path / "made"], check=True)
     report = json.loads((tmp_path / "made" / "report.json").read_text())
     errors = two.errors_of_step(tmp_path / "made" / "lens.step", load(path), decoding)
-    figures = [target["rrmsd"] for target in report["targets"]]
+    figures = [target["rrmsd"] for target in report["goals"]]
     print("encoded errors", errors, "RRMSD", figures)
     assert max(errors) <= 0.003 and max(figures) <= 0.025

@@ -284,15 +284,17 @@ def at_work(small_design):
     path = commands.light_path_in(small_design.folder)
     picture = np.zeros((64, 64), np.uint8)
     picture[:32, 32:] = 255
-    middle = path.screen.mean(axis=0)
-    return nominal.lens, replace(path, screen=middle + 4 * (path.screen - middle), picture=picture, seen_along=1)
+    [screen] = path.screens
+    wall = screen.mean(axis=0) + 4 * (screen - screen.mean(axis=0))
+    return nominal.lens, replace(path, screens=(wall,), pictures=(picture,), seen_along=1)
 
 
 @pytest.fixture(scope="module")
 def bench(at_work, tmp_path_factory):
     """The path of such a page: given[0] with the light, [1] without, [2] a mirror's and with a wall more."""
     lens, path = at_work
-    two = replace(path, mirror=True, further=((path.screen + [0, 0, 20], path.picture),))
+    walls = (*path.screens, path.screens[0] + [0, 0, 20])
+    two = replace(path, mirror=True, screens=walls, pictures=path.pictures * 2)
     given = [rendering.turnable(lens, light, 32) for light in (path, None, two)]
     viewer = report.VIEWER.read_text(encoding="utf-8")
     file = tmp_path_factory.mktemp("bench") / "bench.html"

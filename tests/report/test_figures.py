@@ -219,13 +219,13 @@ class TestSideView:
         """40 mm along x, turned by 60 degrees about y: 20 mm remain, over 34.6 mm of z."""
         lens, rays = lens_of(lambda x, y: 0.0 * x * y), np.zeros((1, 4, 3))
         tilted = Screen(500.0, (80.0, 120.0), (-30.0, 30.0), 8, (0.0, 60.0))
-        figure = figure_jobs.side_view(lens, rays, tilted)
+        figure = figure_jobs.side_view(lens, rays, [tilted])
         [drawn] = [patch for patch in figure.axes[1].patches if patch.get_gid() == "screen"]
         z, x = drawn.get_xy().T
         assert (z.min(), z.max()) == pytest.approx((500 - 10 * np.sqrt(3), 500 + 10 * np.sqrt(3)))
         assert (x.min(), x.max()) == pytest.approx((90.0, 110.0))
         assert "tilted by 60 degrees about y" in figure.get_supxlabel()
-        level = figure_jobs.side_view(lens, rays, replace(tilted, tilt=None))
+        level = figure_jobs.side_view(lens, rays, [replace(tilted, tilt=None)])
         assert not any(patch.get_gid() == "screen" for patch in level.axes[1].patches)
 
 

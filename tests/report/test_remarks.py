@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from bstcad.analysis.light import Blur, FinestDetail
+from bstcad.optics.goal import Goal
+from bstcad.optics.irradiance import Screen
 from bstcad.report.record import LeftOut, remarks
 from bstcad.scene.scene import load
 from bstcad.verify.verdict import Check
@@ -112,7 +114,10 @@ def said(scene, changes=None, target=None, found=None):
         else:
             facts[key] = value
     target = np.full((8, 8), 1 / 64) if target is None else target
-    return remarks(replace(CONTENTS, **facts), scene, target, target if found is None else found)
+    figures = {key: facts[key] for key in ("rrmsd", "efficiency") if key in facts}
+    contents = replace(CONTENTS, **facts, goals=(replace(CONTENTS.goals[0], **figures),))
+    goal = Goal("target", Screen(500.0, (-200.0, 200.0), (-200.0, 200.0), 8), target)
+    return remarks(contents, scene, [goal], [target if found is None else found])
 
 
 @pytest.mark.parametrize(("changes", "asked", "words"), SENTENCES)

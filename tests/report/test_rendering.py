@@ -169,8 +169,8 @@ def test_rays_that_are_told_are_some_of_all_and_end_on_the_wall(light, path, sma
     whole = path.flux[apart.argmin(axis=1)] / path.flux.max()
     np.testing.assert_allclose(flux, whole, atol=0.51e-3)
     assert rays[:, -1, 2] == pytest.approx(small_scene.target.z, abs=1e-4)
-    np.testing.assert_allclose(wall["corners"], path.screen, atol=0.51e-4)
-    assert (tones(wall["picture"]) == path.picture).all()
+    np.testing.assert_allclose(wall["corners"], path.screens[0], atol=0.51e-4)
+    assert (tones(wall["picture"]) == path.pictures[0]).all()
     assert light["lamp"] == [list(small_scene.source.position)]
     spread = np.ptp(rays[:, 1, :2], axis=0) / np.ptp(path.rays[:, 1, :2], axis=0)
     assert (spread > 0.85).all()  # from all over the lens
@@ -180,13 +180,13 @@ def test_rays_that_are_told_are_some_of_all_and_end_on_the_wall(light, path, sma
 @pytest.mark.parametrize("off", [-300.0, 300.0])
 def test_the_eye_is_on_the_side_that_shows_the_picture_and_not_behind_the_wall(path, off, seen_along):
     shifted = replace(
-        path, screen=path.screen + [off, 0, 0], seen_along=seen_along, further=((path.screen, path.picture),)
+        path, screens=(path.screens[0] + [off, 0, 0], *path.screens), pictures=path.pictures * 2, seen_along=seen_along
     )
     light = json.loads(rendering.turnable(lens(Plane(15.0), OUTLINES[0]), shifted))
     x, y, z = light["aside"]
     assert np.hypot(np.hypot(x, y), z) == pytest.approx(1) and y > 0
     assert x * off < 0 and z * seen_along < 0
-    assert [screen["corners"][0][0] for screen in light["screens"]] == [shifted.screen[0, 0], path.screen[0, 0]]
+    assert [screen["corners"][0][0] for screen in light["screens"]] == [shifted.screens[0][0, 0], path.screens[0][0, 0]]
 
 
 def test_a_preview_is_coarse_and_small(path):

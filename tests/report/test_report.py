@@ -19,7 +19,7 @@ from rich.console import Console
 
 from bstcad.report import report as reports
 from bstcad.report import units
-from bstcad.report.record import of_json
+from bstcad.report.record import OF_WORST, of_json
 from bstcad.verify.verdict import Check
 
 PICTURES = (
@@ -29,6 +29,10 @@ PNG = b"\x89PNG not a real picture"
 REPORT = {
     "name": "thu", "title": "Letters", "verdict": "passed", "passed": True, "rrmsd": 0.0283712, "rrmsd_tent": 0.0241,
     "rrmsd_noise": 0.002, "light_on_target": 0.97, "efficiency": 0.99931,
+    "goals": [{
+        "key": "target", "z": 500.0, "weight": 1.0, "rrmsd": 0.0283712, "rrmsd_standard_error": 0.002,
+        "rrmsd_tent": 0.0241, "light_on_target": 0.97, "efficiency": 0.99931, "leak": None, "contrast": None,
+    }],
     "flux": {"on target": 0.97, "off target": 0.01, "missed the lens": 0.02},
     "prescription": {"index": 1.49},
     "seconds_total": 71.4,
@@ -57,7 +61,9 @@ SHAPE = {"centre_thickness": 12.0, "thickness_min": 5.8, "radius_min_concave": 8
 
 
 def contents(report):
-    return of_json(json.dumps(report))
+    """Its record; the figures of its goal are those of the whole."""
+    figures = {name: report[key] for key, name in OF_WORST.items() if key in report}
+    return of_json(json.dumps(report | {"goals": [goal | figures for goal in report["goals"]]}))
 
 
 def page_of(tmp_path, report, figures=None, scene=""):

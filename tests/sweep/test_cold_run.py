@@ -15,7 +15,6 @@ import pytest
 from bstcad import folder as folders
 from bstcad.folder import scene_files
 from bstcad.optics.measure import Effort
-from bstcad.report.record import of_worst_target
 from bstcad.runs import environment
 from bstcad.runs.cluster import Cluster
 from bstcad.sweep import tradeoff
@@ -116,14 +115,6 @@ def test_of_several_targets_the_worst_counts(small_design):
         for targets in (own, both[1], both)
     )
     assert alone.rrmsd < 0.9 * second.rrmsd and worst.rrmsd == second.rrmsd
-
-
-def test_a_report_of_several_targets_is_counted_by_the_worst(small_design):
-    report, keys = small_design.report, ("rrmsd", "rrmsd_noise", "leak", "light_on_target")
-    assert of_worst_target(report) == {key: report[key] for key in keys}
-    of_one = {"rrmsd_standard_error": 1e-4, "leak": None, "light_on_target": 0.5}
-    found = of_worst_target(report | {"targets": [of_one | {"rrmsd": 0.1}, of_one | {"rrmsd": 0.3, "leak": 0.02}]})
-    assert found == {"rrmsd": 0.3, "rrmsd_noise": 1e-4, "leak": 0.02, "light_on_target": 0.5}
 
 
 def test_the_kernel_is_the_same_work_each_time():

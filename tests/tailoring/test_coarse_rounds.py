@@ -43,8 +43,8 @@ def near(z=62.0):
 
 def rrmsd(made):
     """RRMSD by rays of its own."""
-    scene = made.scene
-    return measure(made.lens, scene.channels(), scene.target.screen, made.target, Effort(512, witness=False)).rrmsd
+    [goal] = made.goals
+    return measure(made.lens, made.scene.channels(), goal.receiver, goal.picture, Effort(512, witness=False)).rrmsd
 
 
 def names(made):

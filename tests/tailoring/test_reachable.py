@@ -133,8 +133,8 @@ def test_each_of_several_targets_is_cut_to_what_light_can_reach(wide):
     scene = load(wide)
     made = design(scene.changed({"tailoring.stage2_iterations": 4}))
     part, _ = part_of(scene.each_alone()[1])
-    assert made.parts[0] is None and np.array_equal(made.parts[1], part)
-    assert not made.targets[1][~part].any() and made.targets[1][part].all()
+    assert made.goals[0].reachable is None and np.array_equal(made.goals[1].reachable, part)
+    assert not made.goals[1].picture[~part].any() and made.goals[1].picture[part].all()
     with pytest.raises(SceneError, match=r"^target\[1\]: "):
         design(scene.changed({"target[1].unreachable": "refuse"}))
 
@@ -190,9 +190,10 @@ def test_a_verification_keeps_to_the_part(designed):
 def test_a_whole_target_has_none_of_the_keys(wide, tmp_path):
     scene = load(wide, {"target.z": 602.0})
     made = design(scene)
-    assert made.reachable is None
+    [goal] = made.goals
+    assert goal.reachable is None
     effort = Effort(rays=128, accuracy=1.0)
-    light = measure(made.lens, scene.channels(), scene.target.screen, made.target, effort=effort)
+    light = measure(made.lens, scene.channels(), goal.receiver, goal.picture, effort=effort)
     assert light.rrmsd_whole is None
 
 

@@ -57,7 +57,7 @@ def setups(small_design):
     beam = Collimated(Circle(2.5), z=0.0, wavelength=line, centre=(0.31, 0.17))
     near = Screen(150.0, (-8.0, 6.0), (-7.0, 5.0), (32, 24))  # where the beam is still wide
     return {
-        "cone": Setup(nominal.lens, (Channel(cone, channel.index),), nominal.screen),
+        "cone": Setup(nominal.lens, (Channel(cone, channel.index),), nominal.goals[0].receiver),
         "beam": Setup(nominal.lens, (Channel(beam, channel.index),), near),
     }
 

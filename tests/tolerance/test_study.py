@@ -37,7 +37,7 @@ TUBES, FULL = 257, 40
 @pytest.fixture(scope="module")
 def pictures(small_design, setup):
     _, nominal = read_nominal(small_design.folder)
-    return Pictures(setup, perturbations(setup, whole_table(()), "PMMA"), nominal.target, TUBES)
+    return Pictures(setup, perturbations(setup, whole_table(()), "PMMA"), nominal.goals[0].picture, TUBES)
 
 
 @pytest.fixture(scope="module")

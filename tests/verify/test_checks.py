@@ -20,7 +20,6 @@ from bstcad.cad import mesh as meshes
 from bstcad.cad import step_reading, step_writing
 from bstcad.folder import read_nominal
 from bstcad.optics import measure
-from bstcad.optics.irradiance import Screen
 from bstcad.optics.measure import Effort, Light
 from bstcad.scene.scene import Accept
 from bstcad.tolerance.perturbations import Setup, ripple
@@ -52,11 +51,19 @@ def folder(small_design, tmp_path):
 def nominal(small_design, few):
     """The small design on 16 x 12 pixels, with a target that it misses by 8 %: resolved by few rays."""
     found = read_nominal(small_design.folder)[1]
-    target = found.target.reshape(12, 4, 16, 4).sum((1, 3))
+    [goal] = found.goals
+    target = goal.picture.reshape(12, 4, 16, 4).sum((1, 3))
     target *= 1 + 0.08 * (-1.0) ** np.add.outer(np.arange(12), np.arange(16))
     accept = replace_model(found.accept, rrmsd=0.2, efficiency=0.999)
-    screen = replace(found.screen, pixels=(16, 12))
-    return replace(found, target=target, stored_target=target, screen=screen, accept=accept)
+    return replace(
+        with_picture(found, target, receiver=replace(goal.receiver, pixels=(16, 12))), accept=accept
+    )
+
+
+def with_picture(nominal, picture, **changes):
+    """The same for another picture, which is stored as well."""
+    goals = tuple(replace(goal, picture=picture, **changes) for goal in nominal.goals)
+    return replace(nominal, goals=goals, stored=(picture,))
 
 
 def replace_model(model, **changes):
@@ -102,7 +109,7 @@ def test_the_written_files_pass_every_check(folder, nominal):
     names = [check.name for check in proof.checks]
     assert len(set(names)) == len(names)
     light = proof.light
-    assert light.picture.shape == (12, 16) and light.picture.sum() == pytest.approx(nominal.target.sum())
+    assert light.picture.shape == (12, 16) and light.picture.sum() == pytest.approx(nominal.goals[0].picture.sum())
     assert light.rrmsd == pytest.approx(0.08, rel=0.1)  # the 8 % of the target, beside which the lens's own is small
     assert 5 * light.standard_error < light.rrmsd
     assert sum(light.flux.values()) == pytest.approx(1.0, abs=1e-12)
@@ -371,13 +378,13 @@ def other_limits(nominal, **changes):
 
 def narrower_screen(nominal, right=10.0):
     """Two thirds of the screen and its target: the rest of the light falls beside."""
-    screen = Screen(nominal.screen.z, (-30.0, right), nominal.screen.y, nominal.screen.pixels)
-    target, accept = np.ones((12, 16)), replace_model(nominal.accept, rrmsd=9)
-    return replace(nominal, screen=screen, target=target, stored_target=target, accept=accept)
+    screen = replace(nominal.goals[0].receiver, x=(-30.0, right))
+    accept = replace_model(nominal.accept, rrmsd=9)
+    return replace(with_picture(nominal, np.ones((12, 16)), receiver=screen), accept=accept)
 
 
 DESIGNS = {
-    "the target by 1 %": (lambda n: replace(n, stored_target=1.01 * n.target), {TARGET}),
+    "the target by 1 %": (lambda n: replace(n, stored=(1.01 * n.goals[0].picture,)), {TARGET}),
     "a height by 1 nm": (lambda n: other_net(n, 1e-6), {NET, NORMALS}),
     "a height by 1 µm": (lambda n: other_net(n, 1e-3), {NET, NORMALS, BACK}),
     "the front's curvature by 1e-9": (lambda n: other_front(n, curvature=0.002 + 1e-9), {CURVATURE}),
@@ -404,7 +411,7 @@ def test_a_ripple_fails_a_lens_by_what_the_light_feels_of_it(nominal):
     slopes = []
     for height, fails in ((1e-6, False), (1e-2, True)):
         lens = replace(nominal.lens, back=replace(back, heights=back.heights + height * torch.from_numpy(noise)))
-        light = measure.measure(lens, nominal.channels, nominal.screen, nominal.target, effort=FEW)
+        light = measure.measure(lens, nominal.channels, nominal.goals[0].receiver, nominal.goals[0].picture, effort=FEW)
         found = {c.name: c.passed for c in checks._of_light(light, nominal.accept)}
         assert found[RRMSD] is not fails
         shape_of = shape.describe(lens) | checks._ripples_in_light(lens, nominal)
@@ -436,8 +443,8 @@ def test_noise_fails_where_neither_figure_nor_verdict_is_sure(rrmsd, error, aske
 def test_a_scene_that_asks_for_nothing_is_judged_by_no_limit_on_the_light(folder, nominal):
     """30 % of RRMSD and a fifth of the light pass where nobody asked for more; a limit of either fails by name."""
     board = (-1.0) ** np.add.outer(np.arange(12), np.arange(16))
-    target = nominal.target * (1 + 0.3 * board)
-    poor = replace(other_limits(nominal, rrmsd=None), target=target, stored_target=target)
+    target = nominal.goals[0].picture * (1 + 0.3 * board)
+    poor = with_picture(other_limits(nominal, rrmsd=None), target)
     proof = checks.verify(folder, poor)
     limits = {check.name: check.limit for check in proof.checks}
     assert 0.25 < proof.light.rrmsd < 0.5 and failing(proof) == set()
@@ -468,8 +475,9 @@ def test_values_that_are_not_finite_fail(folder, nominal, monkeypatch):
 
 def test_noise_that_might_lift_the_rrmsd_above_its_limit_fails(folder, nominal):
     """Two rays a pixel in each set, and a target that is the lens's own light."""
-    own = measure.measure(nominal.lens, nominal.channels, nominal.screen, nominal.target, Effort(1024)).picture
-    exact = replace(nominal, target=own, stored_target=own)
+    [goal] = nominal.goals
+    own = measure.measure(nominal.lens, nominal.channels, goal.receiver, goal.picture, Effort(1024)).picture
+    exact = with_picture(nominal, own)
     proof = checks.verify(folder, exact, effort=replace(FEW, rays=32))
     assert 5 * proof.light.standard_error > proof.light.rrmsd and NOISE not in failing(proof)  # 0.2 is far away
     strict = other_limits(exact, rrmsd=proof.light.rrmsd + 4 * proof.light.standard_error)

@@ -88,7 +88,7 @@ def test_a_flat_plate_leaves_parallel_light_parallel(tmp_path):
     """Of a plain lens: parallel light through level faces has no error but rounding."""
     made = made_of(scene_of(**ONE), front=0.0, back=0.0)
     folders.write_geometry(made, tmp_path)()
-    nominal = folders.nominal(made.scene, made.lens, made.target)
+    nominal = folders.nominal(made.scene, made.lens, made.goals)
     proof, found = judged(tmp_path, nominal, wavefront=1e-6)
     assert found[RMS].passed and found[FLOOR].passed and proof.wavefront.without_piston.rms < 1e-8
     assert proof.wavefront.angle_max < 1e-6
@@ -98,7 +98,7 @@ def test_a_mounted_lens_is_measured_as_it_is_made(tmp_path):
     """The rim of the mount cuts away light that the bare lens lets through."""
     made = made_of(scene_of(**ONE, mount={"datum": "front", "rim": {"shape": "circle", "diameter": 6.4}}))
     folders.write_geometry(made, tmp_path)()
-    proof, _ = judged(tmp_path, folders.nominal(made.scene, made.lens, made.target))
+    proof, _ = judged(tmp_path, folders.nominal(made.scene, made.lens, made.goals))
     bare = wavefront_error(made.scene.source, replace(made.lens, clear=None), made.scene.wavefront)
     cut = wavefront_error(made.scene.source, made.lens, made.scene.wavefront)
     assert proof.wavefront.flux == pytest.approx(cut.flux, abs=1e-4) and proof.wavefront.flux < 0.95 * bare.flux
@@ -107,7 +107,7 @@ def test_a_mounted_lens_is_measured_as_it_is_made(tmp_path):
 def test_waves_are_those_of_the_main_line():
     source = CHANGES["source"] | {"wavelength": [[633.0, 1.0], [520.0, 3.0], [450.0, 1.0]]}
     made = made_of(scene_of(**ONE, source=source))
-    heaviest = folders.nominal(made.scene, made.lens, made.target).heaviest
+    heaviest = folders.nominal(made.scene, made.lens, made.goals).heaviest
     assert heaviest.source == made.scene.source.central and heaviest.source.wavelength == 520.0
 
 
