@@ -1,4 +1,4 @@
-"""A surface, a merit, an effect, checks, sections and a judge of a script's own, without a change of the package."""
+"""A surface, a receiver, a merit, an effect, checks, sections and a judge of a script's own: the package stays."""
 
 import json
 import os
@@ -14,8 +14,12 @@ import bstcad
 from bstcad import pipeline
 from bstcad.judges.faces import Traced
 from bstcad.optics.outlines import Rectangle
+from bstcad.optics.rays import Status
+from bstcad.optics.receivers import Receiver
 from bstcad.optics.surfaces import sag
+from bstcad.report.light_figures import View
 from bstcad.scene.errors import SceneError
+from bstcad.scene.target import Target
 from tests.conftest import draws_nothing, quick_effort
 
 OUTLINE = Rectangle(16.0, 16.0)
@@ -64,6 +68,61 @@ def test_a_surface_that_no_net_comes_near_is_refused(scene):
     rough = Asphere(15.0, 0.0, 0.5, 0.0)
     with pytest.raises(bstcad.SceneError, match="control points come within .* mm of the asphere, and 1e-06 mm are"):
         scene.changed({"lens.front": rough})
+
+
+@dataclass(frozen=True)
+class Cylinder(Receiver):
+    """Around the y axis; s is the way along its arc from the z axis (mm)."""
+
+    radius: float
+    names = ("s", "y")
+
+    @property
+    def middle(self):
+        return 0.0, 0.0, self.radius
+
+    def path(self, rays):
+        (x, _, _), (d_x, _, d_z), z = rays.position, rays.direction, rays.above(0.0)
+        a, b, c = d_x * d_x + d_z * d_z, x * d_x + z * d_z, x * x + z * z - self.radius**2
+        inside = (c < 0) & (d_z > 0)
+        status = rays.lose(~inside, Status.TURNED_BACK)
+        return torch.where(inside, (torch.sqrt((b * b - a * c).clamp(min=0)) - b) / a, 0.0), status
+
+    def places(self, rays):
+        return self.radius * torch.atan2(rays.position[0], rays.above(0.0)), rays.position[1]
+
+    def point(self, x, y):
+        angle = torch.as_tensor(x) / self.radius
+        across, along = self.radius * torch.sin(angle), self.radius * torch.cos(angle)
+        return (across, y, along) if isinstance(x, torch.Tensor) else (across.numpy(), y, along.numpy())
+
+    def normal(self, aim):
+        return torch.sin(aim[0] / self.radius), 0.0, torch.cos(aim[0] / self.radius)
+
+
+class OnCylinder(Target):
+    """A target around the lens."""
+
+    @property
+    def screen(self):
+        return replace(super().screen, surface=Cylinder(self.z))
+
+
+def test_light_is_collected_by_a_receiver_of_its_own(scene, tmp_path, monkeypatch):
+    """Even light on a wall around the lens: by design, proof and report; without the lens it is far from even."""
+    draws_nothing(monkeypatch)
+    asked = scene.changed({"target.z": 200.0, "target.x": [-150.0, 150.0], "target.y": [-60.0, 60.0],
+                           "target.outline": None, "target.pixels": [60, 24], "accept.rrmsd": 0.1})  # fmt: skip
+    around = asked.model_copy(update={"targets": (OnCylinder(**dict(asked.target)),)})
+    design = bstcad.Design(pipeline.design(around))
+    screen = around.target.screen
+    flat = bstcad.measure(around.flat_lens(33), around.channels(), screen, around.target.irradiance())
+    assert flat.rrmsd > 0.3
+    report = design.write(tmp_path / "around", progress=False, effort=quick_effort())
+    assert report.passed and report.rrmsd < 0.05, report
+    on_level = bstcad.measure(design.lens, around.channels(), asked.target.screen, around.target.irradiance())
+    assert on_level.rrmsd > 4 * report.rrmsd
+    assert View.of(around).labels == ("s (mm)", "y (mm)")
 
 
 def test_a_merit_of_its_own_is_refused_for_several_goals(scene):

@@ -13,6 +13,7 @@ from PIL import Image
 
 import bstcad
 from bstcad.optics.rays import Status
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.trace import trace
 from bstcad.scene.scene import load
 
@@ -66,7 +67,7 @@ def wall(request, tmp_path_factory):
     lens = bstcad.design(scene, progress=False).lens
     line = (torch.arange(RAYS, dtype=torch.float64) + 0.5) * 20.0 / RAYS - 10.0
     x, y = torch.meshgrid(line, line, indexing="ij")
-    landed = trace(scene.source.rays(x, y, lens.front.z, 1.0), lens, 320.0)
+    landed = trace(scene.source.rays(x, y, lens.front.z, 1.0), lens, LevelPlane(320.0))
     arrived = (landed.status == Status.ALIVE).flatten()
     points = np.stack([*landed.position.flatten(1)[:, arrived].numpy(), np.full(int(arrived.sum()), 320.0)], axis=1)
     return request.param, points, np.array([[-12.0, -20.0, 320.0], [28.0, 20.0, 320.0]])

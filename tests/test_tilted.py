@@ -8,7 +8,6 @@ import torch
 
 import bstcad
 from bstcad import commands
-from bstcad.optics.trace import to_plane
 from bstcad.verify import step_checks
 from tests.conftest import draws_nothing, quick_effort
 
@@ -67,7 +66,7 @@ def test_rays_in_space_draw_the_picture(made):
     wanted = target.irradiance()
     found = found[::-1] / found.sum()
     assert np.sqrt(((found - wanted) ** 2).sum() / (wanted**2).sum()) < 1.5 * report["rrmsd"] + 0.05
-    ours = to_plane(leaving, target.screen.plane)
+    ours = target.screen.plane.to(leaving)
     assert ours.alive.numpy()[alive].all()
 
 

@@ -11,9 +11,10 @@ from bstcad.optics import sampling
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Landed, Rays, TargetPlane
+from bstcad.optics.rays import Landed, Rays
+from bstcad.optics.receivers import Receiver
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import Simulation, across, land, launch_strips, simulate, simulate_plain
+from bstcad.optics.trace import Simulation, across, launch_strips, simulate, simulate_plain
 
 
 def stratified(window: Rectangle, n: int, seed: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
@@ -30,9 +31,9 @@ def launch(source: Source, lens: Lens, n: int, seed: int, area: Rectangle | None
     return replace(strips[0], position=position, direction=direction, flux=flux, status=status)
 
 
-def from_first_net_plain(coming: Rays, lens: Lens, plane: TargetPlane) -> Landed:
+def from_first_net_plain(coming: Rays, lens: Lens, plane: Receiver) -> Landed:
     """`trace.from_first_net` in plain torch."""
-    return land(across(coming, lens.interfaces[lens.freeform[0] :]), plane)
+    return plane.land(across(coming, lens.interfaces[lens.freeform[0] :]))
 
 
 def simulated(source: Source, lens: Lens, screen: Screen, n: int, seed: int) -> Simulation:

@@ -20,7 +20,8 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import IMAGE_PLACES, detail_width, images, tubes_of, tubes_picture
 from bstcad.optics.outlines import Circle, Outline, Rectangle
-from bstcad.optics.rays import Rays, TargetPlane
+from bstcad.optics.rays import Rays
+from bstcad.optics.receivers import Receiver
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import (
     across,
@@ -28,7 +29,6 @@ from bstcad.optics.trace import (
     from_first_net,
     launch_strips,
     to_first_net,
-    to_plane,
     trace,
     window,
 )
@@ -48,14 +48,14 @@ FAN = 15  # rays
 LINES = 33  # of the ray mapping, each way
 
 
-def fan(source: Source, lens: Lens, plane: TargetPlane) -> np.ndarray:
+def fan(source: Source, lens: Lens, plane: Receiver) -> np.ndarray:
     """Polylines (rays, k, 3) in mm in y = 0: source, each surface on the way, the plane; only rays that arrive."""
     half = clear_window(source, lens).width / 2
     x = torch.linspace(-0.98 * half, 0.98 * half, FAN, dtype=torch.float64)
     return _polylines(source.rays(x, torch.zeros_like(x), lens.entrance.z, 1.0), lens, plane)[0]
 
 
-def bundle(source: Source, lens: Lens, plane: TargetPlane, n: int) -> tuple[np.ndarray, np.ndarray]:
+def bundle(source: Source, lens: Lens, plane: Receiver, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Polylines of rays through n x n cells of the light, and the flux (rays,) with which each arrives.
 
     Each ray carries the flux of its cell; the source's whole flux is 1.
@@ -65,16 +65,16 @@ def bundle(source: Source, lens: Lens, plane: TargetPlane, n: int) -> tuple[np.n
     return _polylines(source.rays(x, y, lens.entrance.z, area.area / n**2), lens, plane)
 
 
-def _polylines(rays: Rays, lens: Lens, plane: TargetPlane) -> tuple[np.ndarray, np.ndarray]:
+def _polylines(rays: Rays, lens: Lens, plane: Receiver) -> tuple[np.ndarray, np.ndarray]:
     """Polylines (rays, k, 3) in mm of the rays that arrive, and their flux there."""
     stops = _at_interfaces(rays, lens)
-    stops.append(landed := to_plane(stops[-1], plane))
+    stops.append(landed := plane.to(stops[-1]))
     corners = torch.stack([torch.stack([*stop.position[:2], stop.above(0.0)]) for stop in stops])
     arrive = landed.alive & (landed.flux > 0)
     return corners[:, :, arrive].permute(2, 0, 1).numpy(), landed.flux[arrive].numpy()
 
 
-def ray_map(source: Source, lens: Lens, plane: TargetPlane) -> tuple[np.ndarray, np.ndarray]:
+def ray_map(source: Source, lens: Lens, plane: Receiver) -> tuple[np.ndarray, np.ndarray]:
     """A regular grid on the front's vertex plane, and its landing points on the plane: each (k, k, 2) in mm.
 
     NaN where there is no light or the ray is lost.
@@ -301,7 +301,7 @@ class FinestDetail:
 
 def finest_detail(source_image: float, lens: Lens, screen: Screen, of: str, assumed: bool = False) -> FinestDetail:
     """The finest detail on a target where the image of a source of the size `of` is `source_image` pixels wide."""
-    distance, pixel = abs(screen.z - lens.back.z), _pixel(screen)
+    distance, pixel = abs(screen.plane.throw(lens.back.z)), _pixel(screen)
     sizes = (*(2 * half for half in lens.outline.half_extent), *(high - low for low, high in (screen.x, screen.y)))
     nearer, image = REACH * max(sizes), source_image * pixel
     here, there = (detail_width(image * share, pixel) for share in (1.0, nearer / distance))

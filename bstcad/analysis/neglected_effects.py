@@ -32,7 +32,7 @@ from bstcad.optics.irradiance import Screen, landed_flux
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed
-from bstcad.optics.trace import clear_window, follow_ghost, land, trace
+from bstcad.optics.trace import clear_window, follow_ghost, trace
 from bstcad.optics.tubes import rays_to
 
 PLACES = 64  # points a side of the last face, from which light is traced
@@ -169,7 +169,7 @@ class Reference:
         area = clear_window(source, lens)
         rays = source.rays(*sampling.grid(area, GHOSTS), lens.entrance.z, area.area / GHOSTS**2)
         straight = float(landed_flux(trace(rays, lens, self.screen.plane)).sum())
-        landed = land(follow_ghost(rays, lens)[0], self.screen.plane)
+        landed = self.screen.plane.land(follow_ghost(rays, lens)[0])
         flux = torch.where(landed.alive, landed.flux, torch.zeros_like(landed.flux)).numpy() / straight
         cells = self._landing(flux, self.screen.pixels_of(landed.position).numpy())
         share, cells = float(cells.sum()), scipy.ndimage.gaussian_filter(cells, GRAIN, mode="nearest")
@@ -187,7 +187,7 @@ class Reference:
             return None
         per_mm = math.sqrt(math.prod(self.screen.per_mm))
         wavelength: float = self.channel.source.wavelength  # type: ignore[assignment]  # a channel has one line
-        width = wavelength * 1e-6 * (self.screen.z - self.lens.back.z) / math.sqrt(self._lit_area()) * per_mm
+        width = wavelength * 1e-6 * self.screen.plane.throw(self.lens.back.z) / math.sqrt(self._lit_area()) * per_mm
         return Change(0.0, difference(blurred(self.picture, AIRY * width), self.picture), width)
 
 

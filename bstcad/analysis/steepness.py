@@ -16,7 +16,6 @@ import torch
 from bstcad.optics.interfaces import intersect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.rays import way_to
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import across
 from bstcad.optics.tubes import rays_to
@@ -55,7 +54,7 @@ def needed(
         coming = across(source.rays(p, q, lens.entrance.z, 1.0), before)
         at, _, _ = intersect(back.surface, coming, back.outline, back.status_if_missed)
     aim = torch.stack(torch.meshgrid(torch.from_numpy(x), torch.from_numpy(y), indexing="ij"))
-    out, eta = way_to(at, aim, screen.plane), back.law.eta
+    out, eta = screen.plane.way_to(at, aim), back.law.eta
     out = out / torch.sqrt((out * out).sum(0))
     normal = at.sense * (eta * at.direction - out)
     angle = torch.rad2deg(torch.atan2(torch.hypot(normal[0], normal[1]), normal[2]))

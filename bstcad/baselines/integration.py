@@ -30,7 +30,8 @@ from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface, evaluate, net_gradient
 from bstcad.optics.interfaces import ALONG, Law
 from bstcad.optics.lens import Lens
-from bstcad.optics.rays import Rays, TargetPlane
+from bstcad.optics.rays import Rays
+from bstcad.optics.receivers import Receiver
 from bstcad.optics.sides import Sides, both
 from bstcad.optics.trace import clear_window, to_first_net
 from bstcad.scene.errors import SceneError
@@ -97,7 +98,7 @@ def lit(points: Points, coming: Rays, lens: Lens) -> Tensor:
 
 
 @torch.no_grad()
-def march(coming: Rays, aim: Tensor, plane: TargetPlane, law: Law, z: float, first: First = "x") -> Points:
+def march(coming: Rays, aim: Tensor, plane: Receiver, law: Law, z: float, first: First = "x") -> Points:
     """The points of a face that sends rays (n, n), n odd, to their aims (2, n, n) mm, from that of the middle ray at z.
 
     coming: on their way to it; first: the axis along which the first line runs, all others run across it.  A ray that
@@ -157,7 +158,7 @@ class _Grid:
         """Lines are rays, and rays are lines."""
         return _Grid(*map(_swapped, (self.origin, self.direction, self.aim, self.alive)), self.rays)
 
-    def normals(self, position: Tensor, plane: TargetPlane, law: Law) -> Tensor:
+    def normals(self, position: Tensor, plane: Receiver, law: Law) -> Tensor:
         """(3, rays, lines) n = (-p, -q, 1) of the face that sends each ray from its position (mm) to its aim."""
         at = replace(self.rays, position=position, direction=self.direction)
         p, q = wanted_slopes(at, self.aim, plane, law)
@@ -171,7 +172,7 @@ class _Grid:
         return torch.where(ok, self.origin + path * self.direction, point), ok
 
 
-def _outwards(grid: _Grid, position: Tensor, reached: Tensor, plane: TargetPlane, law: Law) -> Points:
+def _outwards(grid: _Grid, position: Tensor, reached: Tensor, plane: Receiver, law: Law) -> Points:
     """Lines of points, both ways from that on the middle ray of each: position (3, 1, lines) mm, reached (1, lines)."""
     middle = grid.alive.shape[0] // 2
     points, all_reached = torch.zeros_like(grid.origin), torch.zeros_like(grid.alive)

@@ -139,7 +139,10 @@ def compare(
     """
     began = time.perf_counter()
     judge, name, version = _known(given)
-    if declined := judge.cannot(lens, channels):
+    declined = judge.cannot(lens, channels)
+    if isinstance(given, str) and screen.plane.axes is None:
+        declined = "it collects light on planes alone"
+    if declined:
         return Compared(Judge(name, version, declined, target=key))
     raster = coarse(screen)
     target, light = resampled(target, raster.shape), judge.light(lens, channels)

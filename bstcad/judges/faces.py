@@ -145,7 +145,7 @@ class FaceError:
 
     def shift(self, lens: Lens, screen: Screen) -> float:
         """Shift of light on the screen (mm)."""
-        return self.slope * lens.deflection * abs(screen.z - lens.back.z)
+        return self.slope * lens.deflection * abs(screen.plane.throw(lens.back.z))
 
     @classmethod
     def worst(cls, errors: Iterable[FaceError]) -> FaceError:

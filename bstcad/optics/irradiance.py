@@ -8,7 +8,7 @@ result).  Both sum in float64: float32 sums stop growing at 2^24 rays.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -17,7 +17,9 @@ from torch import Tensor
 from bstcad.optics.kernels import splat
 from bstcad.optics.kernels.compiling import fused
 from bstcad.optics.kernels.reductions import total
-from bstcad.optics.rays import Landed, Status, TargetPlane, TiltedPlane
+from bstcad.optics.motion import Motion
+from bstcad.optics.rays import Landed, Status, axes, clocked, clocking_of, tilt_of
+from bstcad.optics.receivers import LevelPlane, Receiver, TiltedPlane
 
 ROUNDING = 1e-12  # of the light on a target
 DARK = 1e-6  # of the brightest pixel of a target; a pixel that wants no more wants no light
@@ -25,14 +27,15 @@ DARK = 1e-6  # of the brightest pixel of a target; a pixel that wants no more wa
 
 @dataclass(frozen=True)
 class Screen:
-    """A rectangle of the plane z, or of a plane turned about its middle, divided into columns x rows of pixels."""
+    """A rectangle of a level or tilted plane, or of another receiver, divided into columns x rows of pixels."""
 
     z: float  # mm; of a tilted screen at its middle
-    x: tuple[float, float]  # mm, on the plane
-    y: tuple[float, float]  # mm, on the plane
+    x: tuple[float, float]  # mm, on the plane; in the unit of the receiver
+    y: tuple[float, float]  # the same
     pixels: int | tuple[int, int]  # along both sides, or (columns, rows)
-    tilt: tuple[float, float] | None = None  # about x, then about y (degrees; rays.TiltedPlane); None: level
+    tilt: tuple[float, float] | None = None  # about x, then about y (degrees; receivers.TiltedPlane); None: level
     clocking: float = 0.0  # then about its own normal (degrees)
+    surface: Receiver | None = None  # which it is a part of; None: the plane of z, tilt and clocking
 
     @property
     def middle(self) -> tuple[float, float, float]:
@@ -40,14 +43,26 @@ class Screen:
         return sum(self.x) / 2, sum(self.y) / 2, self.z
 
     @property
-    def is_tilted(self) -> bool:
-        """Is its plane another than z = const?"""
-        return self.tilt is not None or self.clocking != 0
+    def plane(self) -> Receiver:
+        """The plane, or the receiver of another form, on which light lands."""
+        if self.surface is not None:
+            return self.surface
+        if self.tilt is None and self.clocking == 0:
+            return LevelPlane(self.z)
+        return TiltedPlane(self.middle, self.tilt or (0.0, 0.0), self.clocking)
 
-    @property
-    def plane(self) -> TargetPlane:
-        """The plane on which light lands."""
-        return TiltedPlane(self.middle, self.tilt or (0.0, 0.0), self.clocking) if self.is_tilted else self.z
+    def moved(self, motion: Motion) -> Screen:
+        """The screen after a motion; its pixels stay those that they are."""
+        if self.surface is not None:
+            return replace(self, surface=self.surface.moved(motion))
+        middle = motion.point(self.middle)
+        (x, y), (c_x, c_y, z) = (self.x, self.y), middle
+        old_x, old_y, _ = self.middle
+        x, y = (tuple(end - old + new for end in side) for side, old, new in ((x, old_x, c_x), (y, old_y, c_y)))
+        if not motion.turns:
+            return replace(self, x=x, y=y, z=z)
+        frame = motion.frame(clocked(axes(self.tilt or (0.0, 0.0)), self.clocking))
+        return replace(self, x=x, y=y, z=z, tilt=tilt_of(frame[2]), clocking=clocking_of(frame))
 
     @property
     def columns(self) -> int:

@@ -35,13 +35,12 @@ from torch import Tensor
 
 from bstcad.optics.channels import Channel, places, points, weighted_sum
 from bstcad.optics.irradiance import Leak, Screen, efficiency, leak, rrmsd, tent
-from bstcad.optics.kernels.compiling import fused_whole
 from bstcad.optics.kernels.reductions import dot, total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import in_pairs
-from bstcad.optics.trace import UNDERSIDE, Ghost, Simulation, simulate, through
+from bstcad.optics.trace import UNDERSIDE, Ghost, Simulation, is_whole, simulate, through
 from bstcad.optics.tubes import SHEET, Tubes, area_of, arriving, corners, launch_tubes, middle, picture, rays_to
 
 SETS = 8  # independent sets of rays: a standard error is then known to a quarter of it
@@ -147,9 +146,11 @@ def measure(
         return Light(np.zeros(screen.shape), math.nan, math.inf, rays=rays.count, flux=rays.flux)
     (value, error), (tent, _) = _value(rays, wanted), apart(rays.tents, wanted)
     shown, off = _shown(rays.boxes, wanted)
-    lenses = [c.through(lens) for c in channels]
     plain = lens.shapes_front  # no kernel traces two nets as a whole, and both are to have a witness
-    simple = draw is None and all(seen.losses is None and (plain or fused_whole(seen.interfaces)) for seen in lenses)
+    lenses = [(c.source, c.through(lens)) for c in channels]
+    simple = draw is None and all(
+        seen.losses is None and (plain or is_whole(source, seen, screen.plane)) for source, seen in lenses
+    )
     witnessed = effort.witness and simple
     return Light(
         shown.numpy(), value, error, rays=rays.count, flux=rays.flux, tent=math.sqrt(max(tent, 0.0)), picture_off=off,

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.rays import Vector, axes, clocked, clocking_of, tilt_of
+from bstcad.optics.rays import Vector, tilt_of
 from bstcad.optics.sources import Collimated, Point, Source
 
 FAR = 4.0  # widths of its aperture by which a beam without a plane z of its own gets that plane before the lens
@@ -59,18 +58,6 @@ class Motion:
     def frame(self, vectors: tuple[Vector, ...]) -> tuple[Vector, ...]:
         """Vectors after the motion."""
         return tuple(tuple((self.rotation @ np.array(v)).tolist()) for v in vectors)
-
-
-def moved_screen(screen: Screen, motion: Motion) -> Screen:
-    """The screen after a motion; its pixels stay those that they are."""
-    middle = motion.point(screen.middle)
-    (x, y), (c_x, c_y, z) = (screen.x, screen.y), middle
-    old_x, old_y, _ = screen.middle
-    x, y = (tuple(end - old + new for end in side) for side, old, new in ((x, old_x, c_x), (y, old_y, c_y)))
-    if not motion.turns:
-        return replace(screen, x=x, y=y, z=z)
-    frame = motion.frame(clocked(axes(screen.tilt or (0.0, 0.0)), screen.clocking))
-    return replace(screen, x=x, y=y, z=z, tilt=tilt_of(frame[2]), clocking=clocking_of(frame))
 
 
 def turns_alike(source: Source) -> bool:

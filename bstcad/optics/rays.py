@@ -1,7 +1,6 @@
-"""Ray bundles, and the planes that they land on.
+"""Ray bundles, and frames of directions in space.
 
-A bundle never shrinks: a ray that is lost keeps its place and says why in `status`.  A plane is a level one z = const,
-told by its z (mm) alone, or a tilted one; a place on it has two coordinates x and y (mm), measured on the plane itself.
+A bundle never shrinks: a ray that is lost keeps its place and says why in `status`.
 """
 
 from __future__ import annotations
@@ -10,9 +9,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from functools import cached_property
 from types import MappingProxyType
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -80,9 +77,9 @@ def joined(bands: Iterable[Rays], rows: int, shared: int = 0) -> Rays:
 
 @dataclass(frozen=True)
 class Landed:
-    """Rays where they meet a plane."""
+    """Rays where they meet a receiver."""
 
-    position: Tensor  # (2, …) mm, on the plane
+    position: Tensor  # (2, …) its own coordinates of the places
     flux: Tensor  # (…) fraction of the source's whole flux
     status: Tensor  # (…) uint8, a Status
     taken: Mapping[str, Tensor] = field(default_factory=lambda: NOTHING)  # flux lost on the way, by lines of the ledger
@@ -124,96 +121,3 @@ def clocking_of(frame: tuple[Vector, Vector, Vector]) -> float:
 def tilt_of(n: Vector) -> tuple[float, float]:
     """(α, β) in degrees of the frame whose third axis is n, a unit vector with n_z > 0."""
     return math.degrees(math.asin(max(-1.0, min(1.0, -n[1])))), math.degrees(math.atan2(n[0], n[2]))
-
-
-Array = Any  # of numpy or torch, or a number
-
-
-@dataclass(frozen=True)
-class TiltedPlane:
-    """P = C + (x - c_x) e_x + (y - c_y) e_y: a plane through C, turned about it, and x and y measured on it (mm).
-
-    The axes are those of space, turned first about the x axis by α and then about the y axis by β, right-handed:
-    e_x = (cos β, 0, -sin β), e_y = (sin α sin β, cos α, sin α cos β), and the normal, e_x × e_y,
-    n = (cos α sin β, -sin α, cos α cos β).  Clocked by γ, e_x and e_y are then turned about n.
-    """
-
-    centre: Vector  # C (mm)
-    tilt: tuple[float, float]  # α, β (degrees)
-    clocking: float = 0.0  # γ (degrees)
-
-    @cached_property
-    def axes(self) -> tuple[Vector, Vector, Vector]:
-        """e_x, e_y and n, unit vectors in space."""
-        return clocked(axes(self.tilt), self.clocking) if self.clocking else axes(self.tilt)
-
-    def height(self, point: Vector) -> float:
-        """n · (p - C): how far (mm) a point stands off the plane, negative on the side that light comes from."""
-        return math.fsum(n * (p - c) for n, p, c in zip(self.axes[2], point, self.centre, strict=True))
-
-    def point(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        """The points in space (mm) of places on the plane."""
-        (e_x, e_y, _), (c_x, c_y, _) = self.axes, self.centre
-        return tuple(c + (x - c_x) * a + (y - c_y) * b for c, a, b in zip(self.centre, e_x, e_y, strict=True))
-
-    def seen(self, x: Array, y: Array, eye: float) -> tuple[Array, Array]:
-        """The points of the level plane through C at which its places are seen from (0, 0, eye), all in mm."""
-        p_x, p_y, p_z = self.point(x, y)
-        grown = (self.centre[2] - eye) / (p_z - eye)
-        return grown * p_x, grown * p_y
-
-    def from_seen(self, q_x: Array, q_y: Array, eye: float) -> tuple[Array, Array]:
-        """The places of the plane that are `seen` there."""
-        (e_x, e_y, n), (c_x, c_y, c_z) = self.axes, self.centre
-        throw = c_z - eye
-        path = -self.height((0.0, 0.0, eye)) / (n[0] * q_x + n[1] * q_y + n[2] * throw)
-        off = path * q_x - c_x, path * q_y - c_y, (path - 1) * throw
-        return c_x + _dot(e_x, off), c_y + _dot(e_y, off)
-
-
-TargetPlane = float | TiltedPlane  # a level plane is its z (mm)
-
-
-def middle(plane: TargetPlane) -> float:
-    """z (mm) of a level plane, or of the point C of a tilted plane."""
-    return plane.centre[2] if isinstance(plane, TiltedPlane) else plane
-
-
-def normal_of(plane: TargetPlane) -> Vector:
-    """The unit normal of a plane, which points away from where light comes from."""
-    return plane.axes[2] if isinstance(plane, TiltedPlane) else (0.0, 0.0, 1.0)
-
-
-def advance(rays: Rays, plane: TargetPlane) -> tuple[Tensor, Tensor]:
-    """(n · d, n · (p - C)): how fast rays rise from the plane along their way, and how far above it they are (mm)."""
-    if not isinstance(plane, TiltedPlane):
-        return rays.direction[2], rays.above(plane)
-    normal = plane.axes[2]
-    return _dot(normal, rays.direction), _dot(normal, _from_centre(rays, plane))
-
-
-def coordinates(rays: Rays, plane: TargetPlane) -> Tensor:
-    """(2, …) x and y of rays on the plane (mm)."""
-    if not isinstance(plane, TiltedPlane):
-        return rays.position[:2]
-    offset, (e_x, e_y, _) = _from_centre(rays, plane), plane.axes
-    return torch.stack([plane.centre[0] + _dot(e_x, offset), plane.centre[1] + _dot(e_y, offset)])
-
-
-def way_to(rays: Rays, aim: Tensor, plane: TargetPlane) -> Tensor:
-    """(3, …) from the rays' positions to places (2, …) of the plane (mm)."""
-    if not isinstance(plane, TiltedPlane):
-        return torch.stack([aim[0] - rays.position[0], aim[1] - rays.position[1], -rays.above(plane)])
-    (e_x, e_y, _), offset = plane.axes, _from_centre(rays, plane)
-    x, y = aim[0] - plane.centre[0], aim[1] - plane.centre[1]
-    return torch.stack([x * a + y * b - o for a, b, o in zip(e_x, e_y, offset, strict=True)])
-
-
-def _from_centre(rays: Rays, plane: TiltedPlane) -> tuple[Tensor, Tensor, Tensor]:
-    """p - C (mm)."""
-    x, y, z = plane.centre
-    return rays.position[0] - x, rays.position[1] - y, rays.above(z)
-
-
-def _dot(vector: Vector, of: Array | tuple[Array, ...]) -> Array:
-    return vector[0] * of[0] + vector[1] * of[1] + vector[2] * of[2]

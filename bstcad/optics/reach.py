@@ -21,7 +21,8 @@ from torch import Tensor
 from bstcad.optics.interfaces import Law
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
-from bstcad.optics.rays import Rays, TargetPlane, normal_of, way_to
+from bstcad.optics.rays import Rays
+from bstcad.optics.receivers import Receiver
 from bstcad.optics.sources import Source
 from bstcad.optics.tubes import rays_to
 
@@ -59,15 +60,15 @@ def spread_at(source: Source, lens: Lens) -> float:
     return max(math.acos(min(float(total(middle * end)), 1.0)) for end in ends)
 
 
-def directions(at_face: Rays, aim: Tensor, plane: TargetPlane) -> tuple[Tensor, Tensor, Tensor]:
-    """(d, d', d · d') of rays at a face and towards aims (2, …) mm on the plane, both unit vectors (3, …)."""
-    out = way_to(at_face, aim, plane)
+def directions(at_face: Rays, aim: Tensor, plane: Receiver) -> tuple[Tensor, Tensor, Tensor]:
+    """(d, d', d · d') of rays at a face and towards aims (2, …) on the receiver, both unit vectors (3, …)."""
+    out = plane.way_to(at_face, aim)
     d, out = at_face.direction, out / torch.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
     return d, out, d[0] * out[0] + d[1] * out[1] + d[2] * out[2]
 
 
-def wanted_slopes(at_face: Rays, aim: Tensor, plane: TargetPlane, law: Law) -> tuple[Tensor, Tensor]:
-    """(∂z/∂x, ∂z/∂y) that send each ray towards aim (2, …) mm on the plane, as `slopes_towards` has it."""
+def wanted_slopes(at_face: Rays, aim: Tensor, plane: Receiver, law: Law) -> tuple[Tensor, Tensor]:
+    """(∂z/∂x, ∂z/∂y) that send each ray towards aim (2, …) on the receiver, as `slopes_towards` has it."""
     _, out, _ = directions(at_face, aim, plane)
     return slopes_towards(at_face, out, law)
 
@@ -113,16 +114,16 @@ def _turned(d: Tensor, towards: Tensor, along: Tensor, angle: float) -> Tensor:
     return math.cos(angle) * d + math.sin(angle) * across
 
 
-def room(at_face: Rays, aim: Tensor, plane: TargetPlane, law: Law, grazing: float = GRAZING) -> Tensor:
+def room(at_face: Rays, aim: Tensor, plane: Receiver, law: Law, grazing: float = GRAZING) -> Tensor:
     """How far (a cosine) each ray is from the end of what a slope of the face can do to it: negative beyond.
 
     The least of three: d · d' less the cosine of the largest deflection; n_z - |(n_x, n_y)| / STEEPEST of the normal
-    n = η d - d'; and the cosine to the plane's normal with which the light meets the plane from before it.
+    n = η d - d'; and the cosine to the receiver's normal with which the light meets it from before.
     """
     d, out, along = directions(at_face, aim, plane)
     normal = at_face.sense * (law.eta * d - out)
     upright = normal[2] - torch.sqrt(normal[0] ** 2 + normal[1] ** 2) / STEEPEST
-    n_x, n_y, n_z = normal_of(plane)
+    n_x, n_y, n_z = plane.normal(aim)
     onwards = (-at_face.sense if law.reverses else at_face.sense) * (n_x * out[0] + n_y * out[1] + n_z * out[2])
     least = torch.minimum(upright, onwards)
     return least if law.reverses else torch.minimum(least, along - math.cos(largest_deflection(law.eta, grazing)))

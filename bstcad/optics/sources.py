@@ -11,8 +11,9 @@ above describe simple sources; those of an extended source give the light of its
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,10 +26,35 @@ from bstcad.optics.rays import Rays, Vector, axes, tilt_of
 HALF_SPACE = math.pi / 2  # rad; the edge of light that fills all directions on the lens's side
 WIDEST = math.radians(89.0)  # of a cone whose edge counts on planes
 Wavelength = float | tuple[tuple[float, float], ...]  # nm; or lines, each (nm, weight), weights of any sum
+ALONG_Z = (0, 0.0, 0.0, 1.0, 0.0)  # the last fields of a Beam that is not tilted
 WavelengthKey = Annotated[  # of every source
     Wavelength,
     Key("One wavelength, or lines [[nm, weight], ...] of a spectrum, weights of any sum.", "nm", 100.0, 20_000.0),
 ]
+
+
+class Beam(NamedTuple):
+    """E = peak exp(-fall r²) / d^power on the plane of the front's vertex, r from (x, y), where inside the limits.
+
+    That of a tilted point source is `Point._tilted_irradiance`: c / d^4, 1 / d³ or exp(-fall (d² - c²) / c²) / c³ for
+    the powers 4, 3 and 0, times the peak.
+    """
+
+    x: float  # the source, or the middle of the beam (mm)
+    y: float
+    limit_x: float  # outlines.Limits of the light (mm, mm, mm²)
+    limit_y: float
+    limit_r2: float
+    peak: float
+    fall: float  # 1/mm²; of a tilted source a number
+    power: int  # 0, 3 or 4, of the distance d of a point source
+    distance: float  # of a point source from the plane (mm); 0: collimated
+    start: float  # how far from the plane rays start (mm)
+    tilted: int  # 1: light along n, which is not (0, 0, 1)
+    n_x: float  # the source's axis, in the frame in which light begins along +z
+    n_y: float
+    n_z: float
+    least: float  # cosine to the axis from which on there is light
 
 
 class Emitter:
@@ -64,6 +90,10 @@ class Emitter:
     def axes(self) -> tuple[Vector, Vector, Vector]:
         """Its own axes in space; its light goes along the third, or, to a lens below it, along minus the third."""
         return axes(self.tilt or (0.0, 0.0))
+
+    def beam(self, z: float) -> Beam | None:
+        """`irradiance` on the plane z (mm) as numbers; None: no kernel knows its law, and the plain form traces it."""
+        return None
 
 
 def all_alive(x: Tensor) -> Tensor:
@@ -149,6 +179,18 @@ class Collimated(Emitter):
             return math.pi * w * w / 2 * -math.expm1(-2 * (self.aperture.radius / w) ** 2)
         a, b = self.aperture.half_extent
         return math.pi * w * w / 2 * math.erf(math.sqrt(2) * a / w) * math.erf(math.sqrt(2) * b / w)
+
+    def beam(self, z: float) -> Beam:
+        """`irradiance` on the plane z (mm) as numbers."""
+        (x, y), limits = _floats(self.shift(z)), _floats(self.aperture.limits)
+        peak, fall, start = 1 / self.aperture.area, 0.0, abs(float(z - self.start(z)))
+        if self.profile == "gaussian":
+            peak, fall = 1 / self._gaussian_flux(), 2 / self.radius_1e2**2
+        axis = ALONG_Z
+        if self.tilted:
+            n, sense = self.axes[2], 1 if self.start(z) <= z else -1
+            axis = (1, *_floats((sense * n[0], sense * n[1], n[2])), 0.0)
+        return Beam(x, y, *limits, peak, fall, 0, 0.0, start, *axis)
 
     @property
     def slopes(self) -> tuple[float, float]:
@@ -351,6 +393,35 @@ class Point(Emitter):
                 e = distance / (2 * math.pi * (1 - math.cos(edge))) / (d2 * d)
         return torch.where(ahead, e, torch.zeros_like(e))
 
+    def beam(self, z: float) -> Beam:
+        """`irradiance` on the plane z (mm) as numbers."""
+        x, y, from_z = _floats(self.position)
+        distance, round_ = abs(z - from_z), (0.0, 0.0)
+        if self.tilted:
+            law = self._tilted_law(distance)
+            return Beam(x, y, *round_, math.inf, *law[:3], distance, distance, 1, *_floats(self.towards(z)), law[3])
+        reach2, edge = math.inf, self.edge
+        if self.profile == "gaussian":
+            w2 = (distance * math.tan(math.radians(self.half_angle_1e2))) ** 2
+            law = 2 / (math.pi * w2), 2 / w2, 0
+        elif self.profile == "lambertian":
+            law = distance**2 / (math.pi * math.sin(edge) ** 2), 0.0, 4
+        else:
+            law = distance / (2 * math.pi * (1 - math.cos(edge))), 0.0, 3
+        if edge < HALF_SPACE:
+            reach2 = (distance * math.tan(edge)) ** 2
+        return Beam(x, y, *round_, reach2, *law, distance, distance, *ALONG_Z)
+
+    def _tilted_law(self, distance: float) -> tuple[float, float, int, float]:
+        """(peak, fall, power, least) of `_tilted_irradiance`."""
+        if self.profile == "gaussian":
+            t2 = math.tan(math.radians(self.half_angle_1e2)) ** 2
+            return 2 * distance / (math.pi * t2), 2 / t2, 0, 0.0
+        least = math.cos(self.edge) if self.edge < HALF_SPACE else 0.0
+        if self.profile == "lambertian":
+            return distance / (math.pi * math.sin(self.edge) ** 2), 0.0, 4, least
+        return distance / (2 * math.pi * (1 - math.cos(self.edge))), 0.0, 3, least
+
     def window(self, outline: Outline, z: float, sags: tuple[float, ...]) -> Rectangle:
         """The rectangle of the plane z that holds every ray that can meet the first surface inside its outline.
 
@@ -401,6 +472,11 @@ class Point(Emitter):
         return Rays(
             start.expand_as(direction), direction, flux, all_alive(x), z=start_z, sense=1 if start_z <= z else -1
         )
+
+
+def _floats(values: Sequence[float]) -> tuple[float, ...]:
+    """A kernel is compiled anew for every combination of types: a radius of 12 must not be another than one of 12.0."""
+    return tuple(float(v) for v in values)
 
 
 Source = Collimated | Point

@@ -1,4 +1,4 @@
-"""The trace: rays along the interfaces of a lens to a plane, differentiable in every parameter; and sums of many rays.
+"""The trace: rays along the interfaces of a lens to a receiver, differentiable in all parameters; sums of many rays.
 
 The part of the way before the first freeform interface stays as it is while a lens is tailored: `to_first_net`
 follows it once, and `from_first_net` the rest of it as often as the nets change.
@@ -30,7 +30,8 @@ from bstcad.optics.kernels.compiling import fused, fused_whole
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline, Rectangle
-from bstcad.optics.rays import GRAZING, Landed, Rays, Status, TargetPlane, advance, coordinates
+from bstcad.optics.rays import Landed, Rays, Status
+from bstcad.optics.receivers import Receiver
 from bstcad.optics.sources import Source
 from bstcad.optics.surfaces import Surface
 
@@ -47,14 +48,14 @@ def across(rays: Rays, interfaces: Sequence[Interface]) -> Rays:
     return rays
 
 
-def through(rays: Rays, interfaces: Sequence[Interface], plane: TargetPlane) -> Landed:
-    """`land` of `across`, with each net by a fused kernel where the kernels take the tensors."""
+def through(rays: Rays, interfaces: Sequence[Interface], plane: Receiver) -> Landed:
+    """`across`, and on to the receiver, with each net by a fused kernel where the kernels take the tensors."""
     *others, last = interfaces
     for interface in others:
         rays = behind(rays, interface)
-    if _is_fused(rays, last):
+    if _is_fused(rays, last) and plane.axes is not None:
         return crossing.landed(rays, last, plane)
-    return land(cross(rays, last).rays, plane)
+    return plane.land(cross(rays, last).rays)
 
 
 def behind(rays: Rays, interface: Interface) -> Rays:
@@ -67,32 +68,9 @@ def _is_fused(rays: Rays, interface: Interface) -> bool:
     return surface.is_net and fused(surface.heights, rays.position, rays.direction)
 
 
-def land(rays: Rays, plane: TargetPlane) -> Landed:
-    """Rays behind the last interface, on the plane.
-
-    Each component is followed by itself: the gradient of a part of a stacked tensor is as large as the whole.
-    """
-    parts = replace(rays, position=rays.position.unbind(0), direction=rays.direction.unbind(0))
-    path, status = _path_to_plane(parts, plane)
-    there = (p + path * d for p, d in zip(parts.position, parts.direction, strict=True))
-    at = coordinates(replace(parts, position=tuple(there)), plane)
-    return Landed(torch.stack(tuple(at)), rays.flux, status, rays.taken)
-
-
-def to_plane(rays: Rays, plane: TargetPlane) -> Rays:
-    """Move the rays along their direction to the plane ahead of them; those that lead away from it are lost."""
-    path, status = _path_to_plane(rays, plane)
-    return replace(rays, position=rays.position + path * rays.direction, status=status)
-
-
-def _path_to_plane(rays: Rays, plane: TargetPlane) -> tuple[Tensor, Tensor]:
-    """(path to the plane (mm), zero for rays that do not come to it; status)."""
-    rise, above = advance(rays, plane)
-    ahead = rise if rays.sense > 0 else -rise
-    status = rays.lose(ahead <= GRAZING, Status.TURNED_BACK)
-    lands = status == Status.ALIVE
-    rise = torch.where(lands, rise, torch.ones_like(rise))
-    return torch.where(lands, -above / rise, torch.zeros_like(rise)), status
+def is_whole(source: Source, lens: Lens, plane: Receiver) -> bool:
+    """Does the fused kernel know the whole way: this source, all interfaces of the lens, and the receiver?"""
+    return plane.axes is not None and fused_whole(lens.interfaces) and source.beam(lens.entrance.z) is not None
 
 
 def to_first_net(rays: Rays, lens: Lens) -> Rays:
@@ -100,13 +78,13 @@ def to_first_net(rays: Rays, lens: Lens) -> Rays:
     return across(rays, lens.interfaces[: lens.freeform[0]])
 
 
-def from_first_net(coming: Rays, lens: Lens, plane: TargetPlane) -> Landed:
-    """From the first freeform interface on, across all that follow, to the plane."""
+def from_first_net(coming: Rays, lens: Lens, plane: Receiver) -> Landed:
+    """From the first freeform interface on, across all that follow, to the receiver."""
     return through(coming, lens.interfaces[lens.freeform[0] :], plane)
 
 
-def trace(rays: Rays, lens: Lens, plane: TargetPlane) -> Landed:
-    """From the source along all interfaces of the lens to the plane."""
+def trace(rays: Rays, lens: Lens, plane: Receiver) -> Landed:
+    """From the source along all interfaces of the lens to the receiver."""
     return from_first_net(to_first_net(rays, lens), lens, plane)
 
 
@@ -182,7 +160,7 @@ def simulate(lights: Lights, screen: Screen, n: int) -> Simulation:
 
     Kernel and plain form trace the same rays, and agree to rounding.
     """
-    if all(fused_whole(lens.interfaces) for _, _, lens, _ in lights):
+    if all(is_whole(source, lens, screen.plane) for _, source, lens, _ in lights):
         whole = [(*light, window(light[1], light[2])) for light in lights]
         return _of_all_light(lights, *forward.simulate(whole, screen, n))
     return simulate_plain(lights, screen, n)
@@ -297,7 +275,7 @@ def _ghost_of_channel(channel: Channel, lens: Lens, screen: Screen, n: int, seed
     launched, lines = 0.0, dict.fromkeys((ON, OFF, REFLECTED, TOTAL), 0.0)
     for rays in launch_strips(channel.source, lens, n, seed):
         out, total_at_first = follow_ghost(rays, lens)
-        landed = land(out, screen.plane)
+        landed = screen.plane.land(out)
         on_screen = landed.alive & screen.contains(*landed.position)
         picture += irradiance.box(landed, screen)
         for line, where, sign in (

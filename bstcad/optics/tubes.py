@@ -19,14 +19,15 @@ from torch import Tensor
 from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import clip, forward
-from bstcad.optics.kernels.compiling import fused, fused_whole
+from bstcad.optics.kernels.compiling import fused
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
-from bstcad.optics.rays import Landed, Rays, Status, TargetPlane, joined
+from bstcad.optics.rays import Landed, Rays, Status, joined
+from bstcad.optics.receivers import LevelPlane, Receiver
 from bstcad.optics.sides import Sides, both, spread
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import behind, from_first_net, gets_through
+from bstcad.optics.trace import behind, from_first_net, gets_through, is_whole
 
 ALL = slice(None)
 SHEET = 256  # tubes a side of the sheet through which finer ones are interpolated
@@ -50,8 +51,8 @@ class Tubes:
     coming: Rays  # (3, rows + 1, columns + 1) the corners; their flux is the share that faces and glass leave
     flux: Tensor  # (rows, columns) launched in each tube, as a fraction of the source's
 
-    def landing(self, lens: Lens, plane: TargetPlane) -> Landed:
-        """Where the corners meet the plane; the outline counts in the flux, so that no corner is lost to it."""
+    def landing(self, lens: Lens, plane: Receiver) -> Landed:
+        """Where the corners meet the receiver; the outline counts in the flux, so that no corner is lost to it."""
         return from_first_net(self.coming, lens.unbounded(), plane)
 
     def collect(self, corners: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
@@ -239,8 +240,8 @@ def _partly_lit(source: Source, lens: Lens, x: tuple[Tensor, ...], y: tuple[Tens
 
 def _getting_through(source: Source, lens: Lens, x: Tensor, y: Tensor) -> Tensor:
     """Flux density (n,) (1/mm²) at points of the first vertex's plane (n,), zero where the lens cuts the light."""
-    if lens.losses is None and fused_whole(lens.interfaces):
-        behind = lens.back.z + 1.0  # a plane behind the lens, whichever
+    behind = LevelPlane(lens.back.z + 1.0)  # a plane behind the lens, whichever
+    if lens.losses is None and is_whole(source, lens, behind):
         landed = forward.land(source, lens, behind, x=x.double(), y=y.double())
         return landed.flux * ((landed.status != int(Status.MISSED_FRONT)) & (landed.status != int(Status.VIGNETTED)))
     return source.irradiance(x, y, lens.entrance.z) * gets_through(source.rays(x, y, lens.entrance.z, 1.0), lens)

@@ -28,8 +28,9 @@ from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.motion import Motion
 from bstcad.optics.rays import Rays
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Collimated, Source
-from bstcad.optics.trace import behind, clear_window, to_plane
+from bstcad.optics.trace import behind, clear_window
 from bstcad.optics.wavefront import NM, Wave, beyond, length
 
 RAYS = 512  # a side of the light before the lens
@@ -104,7 +105,7 @@ def followed(source: Source, lens: Lens, rays: Rays, z: float) -> tuple[Rays, Te
             path = path + index * _between(rays, there)
             longest += index * _longest(_between(rays, there), there)
         index, rays = index if interface.law.reverses else interface.law.n_out, there
-    landed = to_plane(rays, z)
+    landed = LevelPlane(z).to(rays)
     ahead = torch.sign(-rays.above(z) * rays.sense)
     last = index * _between(rays, landed)
     longest += _longest(last, landed) + _longest(path, landed)

@@ -20,7 +20,6 @@ from bstcad.cad import mesh as meshes
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Light, Line
-from bstcad.optics.rays import TiltedPlane
 from bstcad.optics.sources import Source
 from bstcad.optics.surfaces import Surface
 from bstcad.optics.wavefront_error import WavefrontError
@@ -129,7 +128,7 @@ class NoPictures(Pictures):
 
 def draw_lens(source: Source, lens: Lens, screens: Sequence[Screen], view: View) -> Pngs:
     """The pictures of the lens but the 3-D one, with its rays to the screens; the front's surface if it is tailored."""
-    farthest = max(screens, key=lambda screen: screen.z)
+    farthest = max(screens, key=lambda screen: screen.plane.throw(0.0))
     of_front = {}
     if lens.shapes_front:
         of_front["surface_front"] = png(surface_maps(lens, survey_front(lens).slope.largest, face="front"))
@@ -267,13 +266,13 @@ def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> F
 
 @styled
 def transport_map(source: np.ndarray, image: np.ndarray, view: View) -> Figure:
-    """Lines of a regular grid (k, k, 2) on the source beside their images (k, k, 2) on the target, both in mm."""
+    """Lines of a regular grid (k, k, 2) on the source (mm) beside their images (k, k, 2) on the target."""
     figure = new_figure(8.2, 4.1)
-    titles = ("Regular grid on the source", "The same lines on the target")
-    for axes, points, title in zip(figure.subplots(1, 2), (source, image), titles, strict=True):
+    sides = (("Regular grid on the source", source, View.labels), ("The same lines on the target", image, view.labels))
+    for axes, (title, points, (x, y)) in zip(figure.subplots(1, 2), sides, strict=True):
         for lines, colour in ((points, BLUE), (points.swapaxes(0, 1), VERMILION)):
             axes.plot(lines[..., 0].T, lines[..., 1].T, color=colour, linewidth=0.6)
-        axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)", aspect="equal")
+        axes.set(title=title, xlabel=x, ylabel=y, aspect="equal")
         axes.xaxis.set_inverted(view.seen_from == "lens")
     view.note(figure)
     return figure
@@ -322,7 +321,7 @@ def light_path_of(
     pictures: of each target of the scene what is wanted, and the irradiance, (rows, columns).
     """
     source, screens = scene.source.central, [target.screen for target in scene.targets]
-    rays, flux = bundle(source, lens, max(screens, key=lambda screen: screen.z).plane, RAYS)
+    rays, flux = bundle(source, lens, max(screens, key=lambda screen: screen.plane.throw(0.0)).plane, RAYS)
     if not len(rays):
         return None
     mesh = meshes.lens_mesh(lens, SHOWN_CELLS)
@@ -345,7 +344,7 @@ def light_path_of(
 def _sizes(screens: Sequence[Screen]) -> str:
     """How large the targets are, and where they lie."""
     told = (
-        f"{number(x[1] - x[0])} × {number(y[1] - y[0])} mm at z = {number(screen.z)} mm"
+        f"{number(x[1] - x[0])} × {number(y[1] - y[0])} {screen.plane.unit} at z = {number(screen.plane.throw(0.0))} mm"
         for screen, x, y in ((screen, screen.x, screen.y) for screen in screens)
     )
     return f"Target{'s' * (len(screens) > 1)} {', '.join(told)}"
@@ -353,6 +352,5 @@ def _sizes(screens: Sequence[Screen]) -> str:
 
 def corners(screen: Screen) -> np.ndarray:
     """The corners of a screen in space (4, 3), mm: once around from x min, y min."""
-    plane = TiltedPlane(screen.middle, screen.tilt or (0.0, 0.0), screen.clocking)
-    around = [plane.point(x, y) for y, x in product(screen.y, screen.x)]
+    around = [screen.plane.point(x, y) for y, x in product(screen.y, screen.x)]
     return np.array(around)[[0, 1, 3, 2]]

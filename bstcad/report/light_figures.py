@@ -83,12 +83,16 @@ class View:
     optic: str = "lens"  # or "mirror"
     tilt: tuple[float, float] | None = None  # of the target plane, about x and then about y (degrees); None: level
     number: int = 0  # of the target among several, by which its figures are named
+    labels: tuple[str, str] = ("x (mm)", "y (mm)")  # of the axes: those of its receiver
 
     @classmethod
     def of(cls, scene: Scene, number: int = 0) -> View:
         """Of a scene's target, the first of several or another."""
         target = scene.targets[number]
-        return cls(target.x, target.y, target.seen_from, optic=scene.optic, tilt=target.tilt, number=number)
+        return cls(
+            target.x, target.y, target.seen_from, optic=scene.optic, tilt=target.tilt, number=number,
+            labels=target.screen.plane.labels,
+        )  # fmt: skip
 
     @property
     def words(self) -> str:
@@ -152,7 +156,7 @@ def seen_grey() -> ListedColormap:
 
 def draw_picture(axes: Axes, values: np.ndarray, view: View, **shades: Any) -> Any:
     """Draw `values`, in coordinates, as they are seen, in a frame."""
-    axes.set_xlabel("x (mm)")
+    axes.set_xlabel(view.labels[0])
     axes.spines[:].set(visible=True, color=GREY, linewidth=0.6)
     place = {"extent": (*view.across, *view.y), "origin": "upper", "interpolation_stage": "data"}
     return axes.imshow(view.picture(values), **place, **shades)
@@ -185,7 +189,7 @@ def _side_by_side(
     for axes, (title, picture) in zip(panels, pictures.items(), strict=False):
         shown = _grey(axes, picture / unit, view, top=top / unit, title=title)
     signed = _signed(panels[-1], error, view, most=_largest(error, spot), title=difference)
-    panels[0].set_ylabel("y (mm)")
+    panels[0].set_ylabel(view.labels[1])
     beyond = "max" if last.max() > top else "neither"
     figure.colorbar(shown, ax=panels[:-1], label=label, fraction=0.04, pad=0.015, extend=beyond)
     figure.colorbar(signed, ax=panels[-1], label=PERCENT_LIT, fraction=0.08, pad=0.03, extend="both")
@@ -292,7 +296,7 @@ def reach_picture(target: np.ndarray, reachable: np.ndarray, view: View) -> Figu
     for axes, title in zip(panels, titles, strict=True):
         _grey(axes, target, view, top=top, title=title)
     draw_picture(panels[1], np.where(reachable, np.nan, 1.0), view, cmap=ListedColormap([VERMILION]), alpha=0.6)
-    panels[0].set_ylabel("y (mm)")
+    panels[0].set_ylabel(view.labels[1])
     view.note(figure, "  In vermilion: no face of this index or slope sends light there.")
     return figure
 
@@ -308,7 +312,7 @@ def ghost_picture(target: np.ndarray, ghost: np.ndarray, view: View) -> Figure:
     axes = figure.subplots()
     top = HEADROOM * float(np.percentile(share, RARE)) or 1.0
     shown = _grey(axes, share, view, top=top, title=f"The ghost alone: up to {number(float(share.max()))} %")
-    axes.set_ylabel("y (mm)")
+    axes.set_ylabel(view.labels[1])
     figure.colorbar(shown, ax=axes, label=PERCENT_LIT, extend="max" if share.max() > top else "neither")
     view.note(figure)
     return figure
@@ -362,7 +366,7 @@ def lines_apart(target: np.ndarray, irradiance: np.ndarray, lines: Sequence[Line
     for axes in panels[1 + len(lines) :]:
         axes.set_visible(False)
     for axes in panels[::ACROSS]:
-        axes.set_ylabel("y (mm)")
+        axes.set_ylabel(view.labels[1])
     view.note(
         figure,
         "  In colour as a camera balanced to the source's white sees it: where it is not grey, the lines "
@@ -509,7 +513,7 @@ def worst_trials(
     panels[0, 0].tick_params(labelbottom=True)
     panels[1, 1].tick_params(labelleft=True)
     for axes in (panels[0, 0], panels[1, 1]):
-        axes.set_ylabel("y (mm)")
+        axes.set_ylabel(view.labels[1])
     slim = {"fraction": 0.03, "pad": 0.015}
     figure.colorbar(lit, ax=panels[0], label=MEAN_LIT, **slim)
     figure.colorbar(changed, ax=panels[1], label=PERCENT_LIT, extend="both", **slim)

@@ -28,7 +28,7 @@ from bstcad.optics.goal import Goal
 from bstcad.optics.key import Key
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
-from bstcad.optics.rays import TiltedPlane
+from bstcad.optics.receivers import TiltedPlane
 from bstcad.optics.sides import Sides, both
 from bstcad.optics.sources import Collimated, Point, Source
 from bstcad.optics.wavefront import ALONG, PlaneWave, SphericalWave, Wave, ZernikeWave

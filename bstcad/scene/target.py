@@ -19,7 +19,7 @@ from scipy.sparse import csr_array
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.key import Key
 from bstcad.optics.outlines import Outline
-from bstcad.optics.rays import TiltedPlane
+from bstcad.optics.receivers import TiltedPlane
 from bstcad.scene import picture
 from bstcad.scene.blank import Outlined
 from bstcad.scene.dotted_keys import PICTURES

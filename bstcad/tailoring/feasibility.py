@@ -118,7 +118,7 @@ def _of(task: Task, lens: Lens) -> tuple[Demand, LightBehind]:
     light = light_behind.of_task(task)
     angle = np.degrees(np.arccos(light.direction[2].clip(-1, 1)))[corners_of(light.picture)]
     crossed = light.crossed(lens.back)
-    near = min(task.goals, key=lambda goal: goal.screen.z)
+    near = min(task.goals, key=lambda goal: goal.screen.plane.throw(0.0))
     served = light_behind.uncrossed(light, near.screen, lens.back, CELLS)
     asked = Demand(
         task.solution, float(angle.max()), float(np.sqrt((angle**2).mean())), crossed=crossed,

@@ -26,7 +26,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.measure import RayTubes
 from bstcad.optics.rays import Rays
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import behind, land
+from bstcad.optics.trace import behind
 from bstcad.optics.tubes import Tubes, arriving
 from bstcad.optics.wavefront import NM, Wave
 from bstcad.optics.wavefront_error import from_reference
@@ -86,7 +86,7 @@ class JointMerit:
     def _of_picture(self, goal: Goal, ways: tuple[Ways, ...]) -> tuple[Tensor, Tensor, Tensor]:
         """RRMSD² of one picture; its pull and loss; its RRMSD."""
         channels, sheets = self.light.channels, self.light.sheets
-        pairs = [(sheet, land(rays, goal.screen.plane)) for sheet, (rays, _) in zip(sheets, ways, strict=True)]
+        pairs = [(sheet, goal.screen.plane.land(rays)) for sheet, (rays, _) in zip(sheets, ways, strict=True)]
         target = torch.from_numpy(goal.target).to(pairs[0][0].flux.device)
         flux, size = weighted_sum(channels, (total(sheet.flux) for sheet in sheets)), total(target**2)
         left = weighted_sum(channels, (total(sheet.carried(corners)) for sheet, corners in pairs))

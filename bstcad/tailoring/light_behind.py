@@ -35,7 +35,8 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.rays import TargetPlane, TiltedPlane, Vector
+from bstcad.optics.rays import Vector
+from bstcad.optics.receivers import Receiver
 from bstcad.optics.surfaces import Surface
 from bstcad.optics.wavefront import SphericalWave, Wave
 from bstcad.scene.errors import SceneError
@@ -73,10 +74,10 @@ class LightBehind:
         place, direction = (v[:, ::-1, ::-1].copy() for v in (self.place, self.direction))
         return replace(self, place=place, direction=direction, picture=self.picture[::-1, ::-1])
 
-    def on(self, plane: TargetPlane) -> Grid:
+    def on(self, plane: Receiver) -> Grid:
         """x and y (mm) along a plane at which its rays cross it."""
-        *along, normal = _axes(plane)
-        centre = np.array(plane.centre if isinstance(plane, TiltedPlane) else (0.0, 0.0, plane))
+        *along, normal = plane.axes
+        centre = np.array(plane.middle)
         off = centre.reshape(3, 1, 1) - self.place
         off = _along(normal, off) / _along(normal, self.direction) * self.direction - off
         return tuple(_along(axis, off) + c for axis, c in zip(along, centre, strict=False))
@@ -136,7 +137,9 @@ class LightBehind:
 
 def of_task(task: Task) -> LightBehind:
     """The light through the nearest target that meets the wave of a task, or that through it and the furthest one."""
-    near, *_, far = sorted((*task.goals, *task.goals), key=lambda goal: goal.screen.z)
+    near, *_, far = sorted((*task.goals, *task.goals), key=lambda goal: goal.screen.plane.throw(0.0))
+    if any(goal.screen.plane.axes is None for goal in (near, far)):
+        raise SceneError("target: light through several targets is followed between planes alone; make each a plane")
     n = task.knobs.transport_grid
     if task.wave is not None:
         parts = max(1, round(n / max(near.screen.shape)))
@@ -161,14 +164,9 @@ def parted(picture: np.ndarray, parts: int) -> np.ndarray:
     return np.kron(picture, np.ones((parts, parts)) / parts**2)
 
 
-def in_space(plane: TargetPlane, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """(3, …) the points (mm) of places on a plane."""
-    points = plane.point(x, y) if isinstance(plane, TiltedPlane) else (x, y, np.full_like(x, plane))
-    return np.stack(points)
-
-
-def _axes(plane: TargetPlane) -> tuple[Vector, Vector, Vector]:
-    return plane.axes if isinstance(plane, TiltedPlane) else ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+def in_space(plane: Receiver, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """(3, …) the points (mm) of places of a receiver."""
+    return np.stack(plane.point(x, y))
 
 
 def _along(vector: Vector, of: np.ndarray) -> np.ndarray:
@@ -213,7 +211,7 @@ def between_targets(
     own, *pictures = (
         np.maximum(p, DIM * p.mean()) for p in (picture, *(gaussian_filter(picture, b, mode="nearest") for b in BLURS))
     )
-    along = _axes(screen.plane)[:2]
+    along = screen.plane.axes[:2]
 
     def cosines(p: np.ndarray, t: np.ndarray) -> Grid:
         way = _unit(t - p)

@@ -35,9 +35,9 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.reductions import elementary, total
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import RayTubes
-from bstcad.optics.rays import Landed, Rays, TargetPlane
-from bstcad.optics.rays import middle as middle_of
+from bstcad.optics.rays import Landed, Rays
 from bstcad.optics.reach import wanted_slopes
+from bstcad.optics.receivers import Receiver
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import through
 from bstcad.optics.tubes import arriving, rays_to
@@ -208,7 +208,7 @@ def local_weight(source: Source, lens: Lens, target: np.ndarray, screen: Screen,
     return torch.from_numpy(weight)
 
 
-def _further(at_net: Rays, aim: Tensor, plane: TargetPlane, law: Law, seen: np.ndarray) -> np.ndarray | None:
+def _further(at_net: Rays, aim: Tensor, plane: Receiver, law: Law, seen: np.ndarray) -> np.ndarray | None:
     """(m, m) the throw where it is more than FAR times its median, over that; else 1.  None: 1 everywhere.
 
     The throw is the largest singular value of ∂t/∂p (mm), p(b, t) the slopes that send light to a place t: the inverse
@@ -219,7 +219,7 @@ def _further(at_net: Rays, aim: Tensor, plane: TargetPlane, law: Law, seen: np.n
         t, lit = aim[..., some, some], seen[some, some]
         if not lit.any():
             return None
-        step = STEP * torch.sqrt((t**2).sum(0) + (middle_of(plane) - at_net.z) ** 2).max()
+        step = STEP * torch.sqrt((t**2).sum(0) + plane.throw(at_net.z) ** 2).max()
         here, *there = (
             torch.stack(wanted_slopes(rays, t + step * torch.tensor(way).to(t).view(2, 1, 1), plane, law))
             for way in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))

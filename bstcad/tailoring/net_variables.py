@@ -32,9 +32,8 @@ from torch import Tensor
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
-from bstcad.optics.rays import middle
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import behind, land
+from bstcad.optics.trace import behind
 from bstcad.tailoring.goals import Goal
 from bstcad.tailoring.merit import CoarseVariable, SobolevVariable
 from bstcad.transport.mapping import places_in
@@ -103,8 +102,7 @@ def along_light(source: Source, lens: Lens, goals: Sequence[Goal]) -> tuple[csr_
 
     own = (back.z - front.z) / lens.index / _magnification(q.numpy(), places, lit)
     shifts = [
-        (middle(goal.screen.plane) - back.z)
-        / _magnification(q.numpy(), _array(land(out, goal.screen.plane).position), lit)
+        goal.screen.plane.throw(back.z) / _magnification(q.numpy(), _array(goal.screen.plane.land(out).position), lit)
         for goal in goals
     ]
     weights = [goal.weight for goal in goals]

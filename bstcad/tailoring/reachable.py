@@ -25,8 +25,8 @@ from bstcad.optics.goal import restricted
 from bstcad.optics.interfaces import Law
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.rays import TargetPlane
 from bstcad.optics.reach import GRAZING, room
+from bstcad.optics.receivers import Receiver
 from bstcad.optics.sources import Source
 from bstcad.scene.target import average
 from bstcad.tailoring.slope_fit import Fit
@@ -94,7 +94,7 @@ def coarse(screen: Screen, picture: np.ndarray, most: int = AIMS) -> tuple[Scree
     return replace(screen, pixels=(columns, rows)), small
 
 
-def from_each(grid: FaceGrid, aims: Sequence[np.ndarray], plane: TargetPlane, law: Law, grazing: float) -> Tensor:
+def from_each(grid: FaceGrid, aims: Sequence[np.ndarray], plane: Receiver, law: Law, grazing: float) -> Tensor:
     """(places, …) the room (optics.reach.room) of lit places of the face to send light to aims, x and y (…) mm."""
     t, some = torch.from_numpy(np.stack(aims)), grid.density[::EACH, ::EACH] > 0
     position, direction = (

@@ -18,8 +18,9 @@ from bstcad.optics.bspline import BSplineSurface, evaluate, net_gradient
 from bstcad.optics.interfaces import intersect
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
-from bstcad.optics.rays import Rays, TargetPlane
+from bstcad.optics.rays import Rays
 from bstcad.optics.reach import wanted_slopes
+from bstcad.optics.receivers import Receiver
 from bstcad.optics.trace import across
 from bstcad.tailoring.merit import Spectrum
 
@@ -147,7 +148,7 @@ def monomials(surface: BSplineSurface, degree: int) -> list[Tensor]:
     return [x[:, None] ** i * y[None, :] ** j for i, j in powers]
 
 
-def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, plane: TargetPlane, repeats: int = 3) -> Lens:
+def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, plane: Receiver, repeats: int = 3) -> Lens:
     """The lens whose last net sends `rays` (…) to `aim` (2, …) mm on the plane, by a least-squares fit of slopes.
 
     Repeated, because the sag moves the hits.  Behind the net the light meets nothing else.

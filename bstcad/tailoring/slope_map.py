@@ -34,8 +34,9 @@ from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Rays, TargetPlane
+from bstcad.optics.rays import Rays
 from bstcad.optics.reach import GRAZING, kept_from_reflection, room, wanted_slopes
+from bstcad.optics.receivers import Receiver
 from bstcad.optics.sides import Sides, both
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import across, clear_window, gets_through
@@ -197,7 +198,7 @@ def centroid(picture: np.ndarray, screen: Screen) -> tuple[float, float]:
 
 
 def gathering(
-    grid: FaceGrid, lens: Lens, plane: TargetPlane, middle: tuple[float, float], hasty: bool = False
+    grid: FaceGrid, lens: Lens, plane: Receiver, middle: tuple[float, float], hasty: bool = False
 ) -> BSplineSurface:  # fmt: skip
     """g: the net of GATHERING points a side with slopes nearest to p(b, m) over the lit part of a grid.
 
@@ -237,7 +238,7 @@ def rays_at(grid: FaceGrid, b: tuple) -> Rays:
     return replace(grid.at_face, position=position, direction=direction)
 
 
-def _needed(grid: FaceGrid, lens: Lens, plane: TargetPlane, b: tuple, t: tuple) -> tuple[np.ndarray, np.ndarray]:
+def _needed(grid: FaceGrid, lens: Lens, plane: Receiver, b: tuple, t: tuple) -> tuple[np.ndarray, np.ndarray]:
     """p(b, t): the slopes that send the light at b (mm) to t (mm) on the plane."""
     rays = rays_at(grid, b)
     aim = torch.stack([torch.from_numpy(t[0]), torch.from_numpy(t[1])])
@@ -314,7 +315,7 @@ def map_to_target(
     where the front's vertex sees it: in those of the plane itself the map would be nowhere near a gradient of heights.
     """
     density, source_frame = source_density(source, lens, n)
-    if screen.is_tilted:
+    if not screen.plane.is_level:
         wanted, frame = spread_density(picture, screen.plane.seen(*pixel_corners(screen), lens.front.z), n)
     else:
         width, height = screen.x[1] - screen.x[0], screen.y[1] - screen.y[0]
@@ -326,7 +327,7 @@ def map_to_target(
 def sent_from_entrance(mapping: Mapping, lens: Lens, screen: Screen) -> TransportMap:
     """The inverse of such a map at corners of the target's pixels."""
     corners = pixel_corners(screen)
-    if screen.is_tilted:
+    if not screen.plane.is_level:
         corners = screen.plane.seen(*corners, lens.front.z)
     return replace(sent_from(mapping.inverse(*corners), screen), plane="entrance")
 
@@ -334,6 +335,6 @@ def sent_from_entrance(mapping: Mapping, lens: Lens, screen: Screen) -> Transpor
 def aim_points(mapping: Mapping, lens: Lens, screen: Screen, x: Tensor, y: Tensor) -> Tensor:
     """(2, …) the points on the screen (mm) to which the map sends the points (x, y) (mm)."""
     sent = mapping(x.detach().cpu().double().numpy(), y.detach().cpu().double().numpy())
-    if screen.is_tilted:
+    if not screen.plane.is_level:
         sent = screen.plane.from_seen(*sent, lens.front.z)
     return torch.stack([torch.from_numpy(np.ascontiguousarray(s)) for s in sent]).to(x)

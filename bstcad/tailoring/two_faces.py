@@ -35,10 +35,10 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Rays, TargetPlane
+from bstcad.optics.rays import Rays
 from bstcad.optics.reach import kept_from_reflection, slopes_towards
+from bstcad.optics.receivers import Receiver
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import land
 from bstcad.scene.quality import COARSEST_GRID
 from bstcad.tailoring import light_behind, stage1
 from bstcad.tailoring.light_behind import LightBehind
@@ -148,7 +148,7 @@ def behind_lens(task: Task, lens: Lens) -> LightBehind | None:
     if lens.freeform == (0,):
         return None
     light = light_behind.of_task(task)
-    near = min(task.goals, key=lambda goal: goal.screen.z)
+    near = min(task.goals, key=lambda goal: goal.screen.plane.throw(0.0))
     return light_behind.uncrossed(light, near.screen, lens.back, task.knobs.transport_grid)
 
 
@@ -298,9 +298,9 @@ def _by_way_of_back(
     return torch.stack([b[0], b[1], height]).numpy()
 
 
-def _landing(q: Rays, b: Tensor, back, plane: TargetPlane) -> Tensor:
+def _landing(q: Rays, b: Tensor, back, plane: Receiver) -> Tensor:
     """(2, …) where light from the front by way of places b of the back lands (mm)."""
     height = back.surface.sag_and_slope(b[0], b[1])[0]
     way = torch.stack([b[0], b[1], height]) - _in_space(q)
     rays = replace(q, direction=way / torch.sqrt((way * way).sum(0)), axial=False)
-    return land(cross(rays, back).rays, plane).position
+    return plane.land(cross(rays, back).rays).position

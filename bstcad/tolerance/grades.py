@@ -63,7 +63,7 @@ def limit(kind: Kind, grade: Grade, setup: Setup) -> float:
     part, _, error = kind.name.partition(".")
     if part == "screen" and kind.unit == "mm":
         screen = setup.screen
-        width, distance = screen.x[1] - screen.x[0], abs(screen.z - setup.pivot("lens")[2])
+        width, distance = screen.x[1] - screen.x[0], abs(screen.plane.throw(setup.pivot("lens")[2]))
         return grade.screen * (distance if error == "axial" else width)
     if error.startswith(("tilt", "clocking", "wedge")):
         return grade.tilt

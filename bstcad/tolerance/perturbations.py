@@ -25,7 +25,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import tubes_picture
 from bstcad.optics.media import refractive_index
-from bstcad.optics.motion import Motion, moved_screen, moved_source, turns_alike
+from bstcad.optics.motion import Motion, moved_source, turns_alike
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Vector
 from bstcad.optics.sides import in_words
@@ -69,7 +69,7 @@ class Setup:
             around = self.moved("source", motion.inverse).moved("screen", motion.inverse)
             return replace(around, placed=motion if self.placed is None else self.placed.after(motion))
         if part == "screen":
-            return replace(self, screen=moved_screen(self.screen, motion))
+            return replace(self, screen=self.screen.moved(motion))
         return self.with_sources(lambda source: moved_source(source, motion, self.lens.entrance.z))
 
     def with_sources(self, change: Callable[[Source], Source]) -> Setup:

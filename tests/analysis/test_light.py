@@ -16,6 +16,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import even_image, images
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 
@@ -31,7 +32,7 @@ def lens_of(sag=lambda x, y: 0 * x * y, front=FRONT, outline=BLOCK, m=33, z=10.0
 
 
 class TestDrawnRays:
-    TARGET = 300.0  # mm
+    TARGET = LevelPlane(300.0)
     EXACT = 1e-9  # mm; the trace stops at 1e-12 of the lens's size, the way to the screen makes a hundred times more
     BEAM = Collimated(Circle(6.0), z=-5.0)
     LAMP = Point((0.4, 0.0, -30.0))
@@ -54,7 +55,7 @@ class TestDrawnRays:
         for stop, face in ((1, front), (2, back)):
             assert np.abs(self.at(face, rays[:, stop])[0] - rays[:, stop, 2]).max() < self.EXACT
             assert self.ROUGH.outline.contains(*torch.from_numpy(rays[:, stop, :2].T.copy())).all()
-        assert (rays[:, 3, 2] == self.TARGET).all() and (np.diff(rays[:, :, 2], axis=1) > 0).all()
+        assert (rays[:, 3, 2] == self.TARGET.z).all() and (np.diff(rays[:, :, 2], axis=1) > 0).all()
 
     @SOURCES
     def test_each_bend_is_snells(self, source):
@@ -90,7 +91,7 @@ class TestDrawnRays:
         """Index 1: a point (x, y) of the front's plane lands where the straight line from the lamp does."""
         start, end = ray_map(self.LAMP, lens_of(lambda x, y: 0.1 * x, index=1.0), self.TARGET)
         lamp = np.array(self.LAMP.position)
-        straight = lamp[:2] + (start - lamp[:2]) * (self.TARGET - lamp[2]) / (2.0 - lamp[2])
+        straight = lamp[:2] + (start - lamp[:2]) * (self.TARGET.z - lamp[2]) / (2.0 - lamp[2])
         lit = np.isfinite(end).all(axis=-1)
         assert lit.sum() > 0.8 * LINES**2 and np.abs(end - straight)[lit].max() < 1e-8
         assert np.array_equal(np.isnan(start), np.isnan(end))  # a lost ray is drawn on neither side

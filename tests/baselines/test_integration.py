@@ -13,16 +13,18 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import Reflect, Refract, deflect, intersect
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.rays import Status, TiltedPlane, coordinates
+from bstcad.optics.rays import Status
+from bstcad.optics.receivers import LevelPlane, TiltedPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
-from bstcad.optics.trace import to_first_net, to_plane
+from bstcad.optics.trace import to_first_net
 from bstcad.scene import scene
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring import stage1
 from bstcad.tailoring.run import Driver, Task
 
-WIDE, TILTED = Rectangle(40.0, 40.0), TiltedPlane((40.0, -9.0, 900.0), (35.0, -50.0))
+WIDE, LEVEL = Rectangle(40.0, 40.0), LevelPlane(900.0)
+TILTED = TiltedPlane((40.0, -9.0, 900.0), (35.0, -50.0))
 LENS = Refract(1.488, 1.0)
 SMALL = {
     "lens.back.control_points": "65",
@@ -36,7 +38,7 @@ SMALL = {
 class Known:
     """A face with known sag, the light on its way to it, and where that lands: a map that this face follows."""
 
-    def __init__(self, face, source, front=None, law=LENS, plane=900.0):
+    def __init__(self, face, source, front=None, law=LENS, plane=LEVEL):
         self.face, self.source, self.front, self.law, self.plane = face, source, front, law, plane
 
     def rays(self, n):
@@ -51,9 +53,9 @@ class Known:
     def aims(self, coming):
         """Where the face sends them (2, n, n) mm, and where they meet it."""
         at, z_x, z_y = intersect(self.face, coming, WIDE, Status.VIGNETTED)
-        landed = to_plane(deflect(at, z_x, z_y, self.law).rays, self.plane)
+        landed = self.plane.to(deflect(at, z_x, z_y, self.law).rays)
         assert landed.alive.all()
-        return coordinates(landed, self.plane), at
+        return torch.stack(tuple(self.plane.places(landed))), at
 
     def error(self, n, first="x"):
         """Largest distance (mm) along z of the points that come of its own map from the face itself."""
@@ -71,7 +73,7 @@ LENSES = {
     "point": Known(Conic(20.0, -0.04, -0.5), Point(), Sphere(15.0, 0.02)),
     "point, off axis": Known(Sphere(20.0, -0.02), Point((1.0, -2.0, 0.0)), Plane(15.0)),
     "tilted target": Known(Sphere(20.0, -0.03), Point(), Plane(15.0), plane=TILTED),
-    "mirror": Known(Sphere(20.0, 0.01), Point((30.0, 0.0, 300.0)), law=Reflect(), plane=900.0),
+    "mirror": Known(Sphere(20.0, 0.01), Point((30.0, 0.0, 300.0)), law=Reflect(), plane=LEVEL),
 }  # fmt: skip
 
 
@@ -125,7 +127,7 @@ def test_a_middle_ray_that_is_lost_is_said():
     status = coming.status.clone()
     status[4, 4] = int(Status.MISSED_FRONT)
     with pytest.raises(SceneError, match=r"source: its ray through the middle .* choose tailoring.method"):
-        march(replace(coming, status=status), torch.zeros((2, 9, 9)).double(), 900.0, LENS, 20.0)
+        march(replace(coming, status=status), torch.zeros((2, 9, 9)).double(), LEVEL, LENS, 20.0)
 
 
 def flat(m):

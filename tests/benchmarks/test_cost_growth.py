@@ -18,6 +18,7 @@ import torch
 from bstcad.optics import bspline, tubes
 from bstcad.optics.irradiance import Screen, collect, collect_plain, landed_flux
 from bstcad.optics.kernels import compiling, forward
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.trace import from_first_net, to_first_net, trace, window
 from bstcad.scene import scene
 from tests.benchmarks.growth import SERIES, exponent, last_step, measured
@@ -94,11 +95,11 @@ def test_the_fused_kernels_are_faster_than_plain_torch(name):
     wanted = scene.load(f"templates/{name}.toml")
     lens = lens_of(wanted, 257)
     rays = to_first_net(launch(wanted.source, lens, 1024, 0), lens)
-    landed = from_first_net(rays, lens, 1000.0)
+    landed = from_first_net(rays, lens, LevelPlane(1000.0))
     screen = Screen(1000.0, wanted.target.x, wanted.target.y, 512)
     u, v = torch.rand((2, 1 << 20), dtype=torch.float64) * 256
     sheet = tubes.launch_tubes(wanted.source, lens, 256)
-    landing = sheet.landing(lens, 1000.0).position
+    landing = sheet.landing(lens, LevelPlane(1000.0)).position
     low, high = landing.amin((1, 2), keepdim=True), landing.amax((1, 2), keepdim=True)
     corners = 512 * (landing - low) / (high - low)  # all of them on the screen
     n = 1 << 20
@@ -111,13 +112,13 @@ def test_the_fused_kernels_are_faster_than_plain_torch(name):
             n,
         ),
         "from_first_net": (
-            lambda: from_first_net(rays, lens, 1000.0),
-            lambda: from_first_net_plain(rays, lens, 1000.0),
+            lambda: from_first_net(rays, lens, LevelPlane(1000.0)),
+            lambda: from_first_net_plain(rays, lens, LevelPlane(1000.0)),
             rays.flux.numel(),
         ),
         "forward.land": (
-            lambda: forward.land(wanted.source, lens, 1000.0, x, y),
-            lambda: trace(wanted.source.rays(x, y, lens.front.z, 1.0), lens, 1000.0), n,
+            lambda: forward.land(wanted.source, lens, LevelPlane(1000.0), x, y),
+            lambda: trace(wanted.source.rays(x, y, lens.front.z, 1.0), lens, LevelPlane(1000.0)), n,
         ),
         "collect (rays)": (
             lambda: collect(landed, screen), lambda: collect_plain(landed.position, landed_flux(landed), screen),

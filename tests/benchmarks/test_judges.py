@@ -25,7 +25,8 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Fresnel, Losses
 from bstcad.optics.measure import tubes_picture
 from bstcad.optics.quadrature import of_lens
-from bstcad.optics.trace import follow_ghost, ghost_light, to_first_net, to_plane, trace
+from bstcad.optics.receivers import LevelPlane
+from bstcad.optics.trace import follow_ghost, ghost_light, to_first_net, trace
 from bstcad.pipeline import design
 from bstcad.report.grid_sag import GridSag
 from bstcad.scene.new_scene import templates
@@ -196,7 +197,7 @@ def test_the_ghost_lands_where_batoid_has_it(through_a_sphere):
     program.refract(back.surface, theirs, glass, air, back.frame)
     x, y, arrived = batoid.land(theirs, lens.scene.target.screen)
     out, _ = follow_ghost(rays, replace(lens.lens, losses=Losses(Fresnel(lens.scene.source.wavelength))))
-    ours = to_plane(out, lens.scene.target.z)
+    ours = LevelPlane(lens.scene.target.z).to(out)
     both = (kept & ours.alive).numpy() & arrived
     rms, worst = rms_apart(ours.position[:2].numpy()[:, both], np.stack([x, y])[:, both])
     print(f"\n{both.sum()} rays of a ghost: rms {rms:.1e} mm, worst {worst:.1e} mm", end="")

@@ -16,6 +16,7 @@ from bstcad.optics.kernels import compiling, forward
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Rays
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Plane, Sphere
 from tests.tracing import from_first_net_plain
 
@@ -29,11 +30,9 @@ NAMES = {torch.float32: "float32", torch.float64: "float64"}
 @contextmanager
 def tracing(engine: str) -> Iterator[Callable[[Rays, Lens, float], Landed]]:
     """From the glass to the screen: plain torch; plain torch on the fused spline; the fused back face."""
-    if engine == "plain":
-        with mock.patch.object(compiling, "ENABLED", False):
-            yield from_first_net_plain
-    else:
-        yield {"mixed": from_first_net_plain, "fused": trace.from_first_net}[engine]
+    form = trace.from_first_net if engine == "fused" else from_first_net_plain
+    with mock.patch.object(compiling, "ENABLED", compiling.ENABLED and engine != "plain"):
+        yield lambda rays, lens, z: form(rays, lens, LevelPlane(z))
 
 
 def engines(source, lens: Lens, x, y, z: float) -> Iterator[tuple[str, Landed]]:
@@ -42,7 +41,7 @@ def engines(source, lens: Lens, x, y, z: float) -> Iterator[tuple[str, Landed]]:
         with tracing(engine) as through_back:
             yield engine, through_back(trace.to_first_net(source.rays(x, y, lens.front.z, 1.0), lens), lens, z)
     if x.dtype == torch.float64:
-        yield "forward", forward.land(source, lens, z, x, y)
+        yield "forward", forward.land(source, lens, LevelPlane(z), x, y)
 
 
 def examples(count: int) -> settings:

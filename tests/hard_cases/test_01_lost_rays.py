@@ -24,6 +24,7 @@ from bstcad.optics.irradiance import Screen, collect
 from bstcad.optics.kernels import forward
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, Status
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Sphere
 from tests.hard_cases.lenses import DTYPES, ENGINES, bundle, lens_of, tracing, uniform, wavy
@@ -101,9 +102,9 @@ def test_the_forward_kernel_lets_no_ray_change_another(beside):
     """Outside the lens, out at a side, beyond the beam, not a number: the others of its block land where they did."""
     lens, source = lens_of(wavy(depth=2.0)), Point()
     x, y = (p.reshape(-1) for p in stratified(Rectangle(12.0, 12.0), 30, 0))
-    whole = forward.land(source, lens, Z, x, y)
+    whole = forward.land(source, lens, LevelPlane(Z), x, y)
     x[300], y[300] = beside
-    found, others = forward.land(source, lens, Z, x, y), torch.arange(900) != 300
+    found, others = forward.land(source, lens, LevelPlane(Z), x, y), torch.arange(900) != 300
     assert whole.alive.all() and torch.equal(found.alive, others)
     assert torch.equal(found.position[:, others], whole.position[:, others])
     assert torch.equal(found.flux[others], whole.flux[others])
@@ -133,7 +134,7 @@ def test_a_lost_ray_lights_no_pixel(dtype):
     """Its landing may be anything: neither picture nor gradient of the others knows of it."""
     screen = Screen(Z, (-100.0, 100.0), (-100.0, 100.0), 12)
     lens = lens_of(wavy(dtype))
-    landed = trace.trace(good(dtype), lens, Z)
+    landed = trace.trace(good(dtype), lens, LevelPlane(Z))
     results = []
     for value in (0.0, INF, NAN, 1e30):
         status, position = landed.status.clone(), landed.position.detach().clone()

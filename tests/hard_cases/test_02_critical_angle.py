@@ -22,6 +22,7 @@ from bstcad.optics.interfaces import SKIMMING, Refract, deflect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.outlines import Circle
 from bstcad.optics.rays import Rays, Status
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Plane
 from tests.hard_cases import exact
@@ -169,7 +170,7 @@ def test_tubes_across_the_angle(dtype, holds):
     leaves = told["on target"] + told["off target"]
     assert told["total internal reflection"] > 0.02
     sheet = tubes.launch_tubes(source, lens, n)
-    corners = sheet.landing(lens, screen.z)
+    corners = sheet.landing(lens, LevelPlane(screen.z))
     through = corners.alive
     some = through[1:, 1:] | through[1:, :-1] | through[:-1, 1:] | through[:-1, :-1]
     whole, border = float(sheet.whole(corners).sum()), float(sheet.flux[some].sum())

@@ -21,6 +21,7 @@ from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Status
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import EQUATOR, Plane, Sphere
 from tests.hard_cases import exact
@@ -111,8 +112,8 @@ def test_along_the_axis_at_the_equator(curvature, dtype, holds):
     # cos² is known to some units, so the angle to units over the cosine
     holds(f"turn near the equator, times the cosine, {NAMES[dtype]}", largest(off * cosine), 8 * eps(dtype))
     if dtype == torch.float64:
-        found = forward.land(Collimated(Circle(30.0)), lens, 300.0, radius, torch.zeros_like(radius))
-        plain = from_first_net_plain(inside, lens, 300.0)
+        found = forward.land(Collimated(Circle(30.0)), lens, LevelPlane(300.0), radius, torch.zeros_like(radius))
+        plain = from_first_net_plain(inside, lens, LevelPlane(300.0))
         assert torch.equal(found.status, plain.status)
 
 

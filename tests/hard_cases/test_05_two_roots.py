@@ -22,6 +22,7 @@ from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
 from bstcad.optics.rays import Status
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Plane, Sphere
 from tests.hard_cases.lenses import (
@@ -107,8 +108,8 @@ def test_the_forward_kernel_chooses_it_too():
     x, y = uniform((2, 3000), 5, -9.9, 9.9)
     rays = source.rays(x, y, 15.0, 1.0)
     in_glass = trace.to_first_net(rays, lens)
-    plain = from_first_net_plain(in_glass, lens, 200.0)
-    found = forward.land(source, lens, 200.0, x, y)
+    plain = from_first_net_plain(in_glass, lens, LevelPlane(200.0))
+    found = forward.land(source, lens, LevelPlane(200.0), x, y)
     assert torch.equal(found.status, plain.status)
     lands = plain.alive
     assert int(lands.sum()) > 300

@@ -19,6 +19,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.kernels import forward, spline
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
 from bstcad.optics.trace import to_first_net
@@ -140,7 +141,7 @@ def test_the_forward_kernel_at_knots_and_corners():
     line = torch.cat([at, torch.tensor([half + 1e-9, -1e6, 1e6], dtype=torch.float64)])
     x, y = (p.reshape(-1).contiguous() for p in torch.meshgrid(line, line, indexing="ij"))
     source = Collimated(Rectangle(3 * half, 3 * half))
-    found = forward.land(source, lens, 120.0, x, y)
+    found = forward.land(source, lens, LevelPlane(120.0), x, y)
     with tracing("plain") as through_back:
         plain = through_back(to_first_net(source.rays(x, y, 8.0, 1.0), lens), lens, 120.0)
     lit = plain.flux > 0

@@ -18,6 +18,7 @@ from bstcad.optics import trace
 from bstcad.optics.interfaces import intersect
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Status
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from tests.hard_cases import exact
@@ -74,7 +75,9 @@ def test_no_curvature_is_the_plane_to_the_bit(source, dtype):
     plane, *others = ([found.position for _, found in engines(source, lens_of(wavy(dtype), front), x, y, 300.0)]
                       for front in fronts)  # fmt: skip
     assert all(torch.equal(a, b) for other in others for a, b in zip(other, plane, strict=True))
-    tiny = trace.trace(source.rays(x, y, 15.0, 1.0), lens_of(wavy(dtype), Sphere(15.0, 1e-300)), 300.0).position
+    tiny = trace.trace(
+        source.rays(x, y, 15.0, 1.0), lens_of(wavy(dtype), Sphere(15.0, 1e-300)), LevelPlane(300.0)
+    ).position
     assert torch.equal(tiny, plane[2])
 
 

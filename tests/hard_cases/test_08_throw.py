@@ -18,6 +18,7 @@ from bstcad.optics import tubes
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
 from tests.hard_cases import exact
@@ -107,7 +108,7 @@ def test_a_shift_changes_no_bit(throw, kind, dtype):
         told = simulated(source, lens, screen, 64, 0)
         sheet = tubes.launch_tubes(source, lens, 12)
         picture = tubes.picture(source, lens, screen, 12)
-        results.append([*found, told.box, told.tent, sheet.flux, sheet.landing(lens, z).position, picture])
+        results.append([*found, told.box, told.tent, sheet.flux, sheet.landing(lens, LevelPlane(z)).position, picture])
         assert float(picture.sum()) > 0.1
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))

@@ -18,6 +18,7 @@ from bstcad.optics.kernels import compiling, reductions
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
 from tests.tracing import simulated
@@ -122,7 +123,7 @@ def test_a_control_point_feels_every_ray_that_lands(holds, dtype, compiled):
     start = torch.tensor([0.0, 0.0, -1.0], dtype=dtype)[:, None].expand(3, g.numel())
     axis = torch.tensor([0.0, 0.0, 1.0], dtype=dtype)[:, None].expand(3, g.numel())
     rays = Rays(start, axis, torch.ones(1, dtype=dtype).expand(g.shape), torch.zeros(g.shape, dtype=torch.uint8))
-    landed = trace.from_first_net(rays, lens, 64.0)
+    landed = trace.from_first_net(rays, lens, LevelPlane(64.0))
     (found,) = torch.autograd.grad(landed.position[0], heights, g)
     slope = torch.tensor([-0.5, 0.0, 0.5], dtype=torch.float64)
     weight = torch.tensor([0.125, 0.75, 0.125], dtype=torch.float64)

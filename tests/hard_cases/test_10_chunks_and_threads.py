@@ -31,6 +31,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.measure import RayTubes
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.trace import Simulation, from_first_net, to_first_net
@@ -102,7 +103,7 @@ def image_and_gradient(dtype=torch.float64) -> dict[str, torch.Tensor]:
     found = by_rays(simulated(SOURCE, held, SCREEN, RAYS, 0))
     for name, merit in (
         ("tubes", lambda bent: by_tubes(by_tubes.landing(bent))[0]),
-        ("rays", lambda bent: by_tents((from_first_net(to_first_net(rays, bent), bent, SCREEN.z),))[0]),
+        ("rays", lambda bent: by_tents((from_first_net(to_first_net(rays, bent), bent, LevelPlane(SCREEN.z)),))[0]),
     ):
         heights = held.back.heights.clone().requires_grad_()
         value = merit(held.with_heights([heights]))

@@ -65,7 +65,7 @@ def border(picture: torch.Tensor) -> torch.Tensor:
 def traced(dtype) -> Landed:
     """Every ray of `simulate` with its fate, by the plain form."""
     held = lens(dtype)
-    return from_first_net_plain(trace.to_first_net(launch(SOURCE, held, RAYS, 0), held), held, SMALL.z)
+    return from_first_net_plain(trace.to_first_net(launch(SOURCE, held, RAYS, 0), held), held, SMALL.plane)
 
 
 def counted(rays: Landed, screen: Screen) -> dict[str, float]:

@@ -22,6 +22,7 @@ from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, Light, measure
 from bstcad.optics.outlines import Rectangle
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
 from bstcad.scene.scene import Accept
@@ -57,7 +58,7 @@ def by_random(form, n: int, seed: int, dtype) -> torch.Tensor:
     """n² independent rays."""
     x, y = sampling.random(APERTURE, n * n, seed, dtype)
     rays = SOURCE.rays(x, y, 5.0, APERTURE.area / n**2)
-    return irradiance.box(trace.trace(rays, plate(dtype), SCREEN.z), SCREEN)
+    return irradiance.box(trace.trace(rays, plate(dtype), LevelPlane(SCREEN.z)), SCREEN)
 
 
 def by_strata(form, n: int, seed: int, dtype) -> torch.Tensor:

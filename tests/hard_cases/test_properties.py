@@ -19,6 +19,7 @@ from bstcad.optics.irradiance import LEDGER, Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Status
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
 from bstcad.scene.scene import load
@@ -121,9 +122,9 @@ def test_a_mirrored_scene_lands_mirrored(depth, curvature, seed, axis):
     mirrored = replace(lens, back=replace(lens.back, heights=lens.back.heights.flip(k).contiguous()))
     points = uniform((2, 100), seed, -8.0, 8.0)
     place = [0.5, -0.75, 1.0]
-    landed = trace.trace(Point(tuple(place)).rays(*points, 15.0, 1.0), lens, 500.0)
+    landed = trace.trace(Point(tuple(place)).rays(*points, 15.0, 1.0), lens, LevelPlane(500.0))
     place[k], points[k] = -place[k], -points[k]
-    other = trace.trace(Point(tuple(place)).rays(*points, 15.0, 1.0), mirrored, 500.0)
+    other = trace.trace(Point(tuple(place)).rays(*points, 15.0, 1.0), mirrored, LevelPlane(500.0))
     assert torch.equal(landed.status, other.status)
     back = other.position.clone()
     back[k] = -back[k]

@@ -22,6 +22,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import tubes_picture
 from bstcad.optics.outlines import Circle
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Surface
 from bstcad.optics.trace import across, trace
@@ -175,7 +176,7 @@ def test_two_fitted_nets_send_light_there_as_far_as_they_resolve_the_faces():
     for radius, most in WITHIN.items():
         assert float(sine[r < radius].max()) < most
         for behind in BEHIND:
-            landed = off(trace(rays, fitted(513), SILICA.thickness + behind), r)
+            landed = off(trace(rays, fitted(513), LevelPlane(SILICA.thickness + behind)), r)
             assert float(landed[r < radius].max()) < behind * most + PLACED
 
 

@@ -16,9 +16,10 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, images, measure, tubes_picture
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Rays
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import to_plane, trace
+from bstcad.optics.trace import trace
 
 SQUARE = Rectangle(20.0, 20.0)
 
@@ -44,7 +45,7 @@ def transfer(lens, state, z, sense):
     )  # fmt: skip
     for interface in lens.interfaces:
         rays = cross(rays, interface).rays
-    landed = to_plane(rays, z)
+    landed = LevelPlane(z).to(rays)
     return torch.cat([landed.position[:2], landed.direction[:2]]), landed.alive
 
 
@@ -73,16 +74,20 @@ def test_etendue_is_conserved_ray_by_ray(lens, sense):
 @pytest.mark.parametrize("z", [None, -7.0], ids=str)
 def test_a_tilted_beam_passes_a_plate_as_snell_says(tilt, z):
     """Shifted by the thickness times tan θ' in the glass, and on its old way behind it."""
-    lens, source, screen = plate(), Collimated(Circle(30.0), tilt=tilt, z=z), 60.0  # all are lit: others end anyhow
+    lens, source, screen = (
+        plate(),
+        Collimated(Circle(30.0), tilt=tilt, z=z),
+        LevelPlane(60.0),
+    )  # all are lit: others end anyhow
     x, y = (p.reshape(-1) for p in torch.meshgrid(*[torch.linspace(-2, 2, 9, dtype=torch.float64)] * 2, indexing="ij"))
     n_x, n_y, n_z = source.axes[2]
     sin = math.hypot(n_x, n_y)
     inside = math.tan(math.asin(sin / 1.5)) / sin  # per component of the direction
-    way = 4.0 * inside + (screen - 6.0) / n_z
+    way = 4.0 * inside + (60.0 - 6.0) / n_z
     for landed in (trace(source.rays(x, y, 2.0, 1.0), lens, screen), land(source, lens, screen, x, y)):
         assert landed.alive.all()
-        torch.testing.assert_close(landed.position[0], x + way * n_x, rtol=0, atol=1e-12 * screen / n_z)
-        torch.testing.assert_close(landed.position[1], y + way * n_y, rtol=0, atol=1e-12 * screen / n_z)
+        torch.testing.assert_close(landed.position[0], x + way * n_x, rtol=0, atol=1e-12 * 60.0 / n_z)
+        torch.testing.assert_close(landed.position[1], y + way * n_y, rtol=0, atol=1e-12 * 60.0 / n_z)
 
 
 def moments(channels, lens, screen):

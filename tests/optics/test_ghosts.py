@@ -13,9 +13,10 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Coating, Fresnel, Losses
 from bstcad.optics.measure import Effort, measure
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import OFF, ON, follow_ghost, ghost, ghost_light, to_plane
+from bstcad.optics.trace import OFF, ON, follow_ghost, ghost, ghost_light
 from tests.hard_cases.lenses import bundle, places, wavy
 
 EXACT = 1e-12
@@ -84,7 +85,7 @@ def test_a_wedge_throws_its_ghost_where_geometry_has_it(front):
     slope = -math.tan(wedge)  # the back falls along +x; its normal leans by A towards +x
     lens = Lens(front, plane(10.0 + thickness, slope), EVERYWHERE, N, losses=BARE)
     out, _ = follow_ghost(bundle((x0, 0.0, 0.0), (0.0, 0.0, 1.0)), lens)
-    landed = to_plane(out, throw)
+    landed = LevelPlane(throw).to(out)
 
     z1 = thickness + slope * x0  # over the front
     x2 = x0 - z1 * math.tan(2 * wedge)  # on the front, after the back has turned light towards -x, down by 2 A

@@ -12,10 +12,11 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
-from bstcad.optics.rays import Rays, Status, TiltedPlane
+from bstcad.optics.rays import Rays, Status
+from bstcad.optics.receivers import LevelPlane, TiltedPlane
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
-from bstcad.optics.trace import across, land, through, to_first_net, trace
+from bstcad.optics.trace import across, through, to_first_net, trace
 from bstcad.optics.tubes import launch_tubes
 from tests.tracing import simulated, stratified
 
@@ -72,8 +73,8 @@ def test_a_window_before_a_lens_and_a_fold_mirror_behind_it_are_data():
     """The window moves the light as a plate does; the mirror sends it to the plane's mirror image."""
     lens = Lens(Sphere(0.0, 0.01), net(6.0, 0.3), SQUARE, N)
     rays = rays_of(SOURCE, lens)
-    folded = trace(rays, replace(lens, behind=FOLD), 60.0 - 35.0)
-    torch.testing.assert_close(folded.position, trace(rays, lens, 60.0 + 35.0).position, rtol=0, atol=1e-12)
+    folded = trace(rays, replace(lens, behind=FOLD), LevelPlane(60.0 - 35.0))
+    torch.testing.assert_close(folded.position, trace(rays, lens, LevelPlane(60.0 + 35.0)).position, rtol=0, atol=1e-12)
     assert replace(lens, behind=FOLD).freeform == (1,) and replace(lens, before=WINDOW, behind=FOLD).freeform == (3,)
 
     seen = replace(lens, before=WINDOW)
@@ -114,11 +115,11 @@ SYSTEMS = {
         TWO, behind=(*(replace(i, surface=i.surface.moved(i.surface.z + 30.0)) for i in WINDOW), MIRROR), shaped=(0, 4)
     ),
 }  # fmt: skip
-PLANES = {"level": 15.0, "tilted": TiltedPlane((3.0, 2.0, 15.0), (20.0, -10.0), 5.0)}
+PLANES = {"level": LevelPlane(15.0), "tilted": TiltedPlane((3.0, 2.0, 15.0), (20.0, -10.0), 5.0)}
 
 
 def plainly(rays, interfaces, plane):
-    return land(across(rays, interfaces), plane)
+    return plane.land(across(rays, interfaces))
 
 
 @pytest.mark.parametrize("plane", PLANES)
@@ -127,7 +128,7 @@ def test_the_gradient_through_several_nets_is_that_of_plain_torch(name, plane):
     lens, found = SYSTEMS[name], []
     goal = PLANES[plane]
     if lens.interfaces[-1].law.reverses is False:  # the plane is ahead of the light
-        goal = 120.0 if plane == "level" else replace(goal, centre=(3.0, 2.0, 120.0))
+        goal = LevelPlane(120.0) if plane == "level" else replace(goal, centre=(3.0, 2.0, 120.0))
     rays = rays_of(SOURCE, lens, size=23.0)
     weight = torch.randn((2, 40, 40), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     for form in (through, plainly):
@@ -149,7 +150,7 @@ def test_the_gradient_through_two_nets_is_finite_differences():
 
     def value(share):
         moved = TWO.with_heights(s.heights + share * c for s, c in zip(TWO.nets, change, strict=True))
-        return (trace(rays, moved, 120.0).position ** 2).mean()
+        return (trace(rays, moved, LevelPlane(120.0)).position ** 2).mean()
 
     at, step = torch.zeros((), dtype=torch.float64, requires_grad=True), 1e-5
     (slope,) = torch.autograd.grad(value(at), at)
@@ -163,7 +164,7 @@ def test_beyond_a_net_the_gradient_is_that_of_its_rim():
 
     def value(share, form):
         moved = lens.with_heights((lens.front.heights + share * way[:, None] * way, lens.back.heights))
-        return (form(to_first_net(rays, moved), moved.interfaces, 120.0).position ** 2).mean()
+        return (form(to_first_net(rays, moved), moved.interfaces, LevelPlane(120.0)).position ** 2).mean()
 
     for form in (through, plainly):
         at, step = torch.zeros((), dtype=torch.float64, requires_grad=True), 1e-5

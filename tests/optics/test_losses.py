@@ -17,6 +17,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Coating, Fresnel, Losses, Transmission, coated_reflectance, reflectance
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.rays import Status
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.tailoring.merit import TubeMerit
@@ -74,7 +75,7 @@ def test_a_plate_takes_by_beer_lambert_and_by_fresnel(degrees):
     flat = wavy(heights=0.0, front=Plane(8.0), losses=Losses(Fresnel(WAVELENGTH), Absorption(0.02)))
     origin = torch.zeros(1, dtype=torch.float64)
     rays = source.rays(origin, origin, 8.0, 1.0)
-    landed = trace.trace(rays, replace(flat, outline=Circle(100.0)), SCREEN.z)
+    landed = trace.trace(rays, replace(flat, outline=Circle(100.0)), LevelPlane(SCREEN.z))
     cos_in, cos_out = angles(1.0, N, degrees)
     t = 1 - effects.reflectance(1.0, N, cos_in, cos_out)
     expected = t * t * torch.exp(-0.02 * 6.0 / cos_out)
@@ -121,7 +122,7 @@ def test_what_is_lost_on_the_way_is_counted_whole_and_without_gradient():
     lens = replace(lens, back=replace(lens.back, heights=lens.back.heights.clone().requires_grad_()))
     x = torch.tensor([0.0, 40.0], dtype=torch.float64)
     rays = SOURCES[1].rays(x, torch.zeros(2, dtype=torch.float64), 8.0, 1.0)
-    landed = trace.trace(rays, lens, SCREEN.z)
+    landed = trace.trace(rays, lens, LevelPlane(SCREEN.z))
     assert not bool(landed.alive[1]) and float(landed.flux[1].detach()) == float(rays.flux[1])
     (gradient,) = torch.autograd.grad(landed.flux.sum() + landed.position.sum(), lens.back.heights)
     assert bool(torch.isfinite(gradient).all()) and float(gradient.abs().max()) > 0

@@ -13,9 +13,10 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.rays import Rays, Status
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
-from bstcad.optics.trace import from_first_net, to_first_net, to_plane, trace
+from bstcad.optics.trace import from_first_net, to_first_net, trace
 from bstcad.optics.tubes import launch_tubes, picture, rays_to
 from tests.tracing import from_first_net_plain, simulated
 
@@ -66,7 +67,7 @@ def test_a_paraboloid_gathers_parallel_light_in_its_focus():
     x, y = (p.reshape(-1) for p in torch.meshgrid(x, x, indexing="ij"))
     rays = Collimated(Circle(20.0), z=200.0).rays(x, y, Z, 1.0)
     for land in (from_first_net, from_first_net_plain):
-        found = land(rays, mirror(paraboloid(c)), Z + 1 / (2 * c))
+        found = land(rays, mirror(paraboloid(c)), LevelPlane(Z + 1 / (2 * c)))
         assert found.alive.all() and float(found.position.abs().max()) < 1e-9
 
 
@@ -79,7 +80,7 @@ def test_an_ellipsoid_takes_light_from_one_focus_to_the_other(conic_constant):
     x, y = (p.reshape(-1) for p in torch.meshgrid(x, x, indexing="ij"))
     face = Interface(Conic(Z, 1 / radius, conic_constant), EVERYWHERE, Reflect(), Status.MISSED_FRONT)
     hit = cross(Point((0.0, 0.0, near)).rays(x, y, Z, 1.0), face)
-    landed = to_plane(hit.rays, far)
+    landed = LevelPlane(far).to(hit.rays)
     assert landed.alive.all() and float(landed.position[:2].abs().max()) < 1e-9
 
 
@@ -141,6 +142,8 @@ def test_the_rays_to_points_of_the_mirror_meet_them(light):
 def test_light_from_below_does_not_pass_for_light_from_above():
     """Its rear is dark: a ray that comes up to the face meets it from behind."""
     rays = beam((0.0, 0.1, 1.0), 1)
-    wrong = trace(Rays(rays.position, rays.direction, rays.flux, rays.status, sense=-1), mirror(bumpy()), 120.0)
+    wrong = trace(
+        Rays(rays.position, rays.direction, rays.flux, rays.status, sense=-1), mirror(bumpy()), LevelPlane(120.0)
+    )
     assert not wrong.alive.any()
     assert to_first_net(rays, mirror(bumpy())) is rays  # nothing stands before a mirror

@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.motion import Motion, moved_screen, moved_source
+from bstcad.optics.motion import Motion, moved_source
 from bstcad.optics.outlines import Circle
-from bstcad.optics.rays import TiltedPlane
 from bstcad.optics.sources import Collimated, Point
 
 MOTIONS = {
@@ -32,8 +31,7 @@ def motion(request):
 
 def place(screen, x, y):
     """A place of a screen in space."""
-    plane = screen.plane
-    return np.array(plane.point(x, y) if isinstance(plane, TiltedPlane) else (x, y, plane))
+    return np.array(screen.plane.point(x, y))
 
 
 def test_a_motion_and_its_inverse_are_none(motion):
@@ -53,7 +51,7 @@ def test_turns_are_right_handed(axis):
 @pytest.mark.parametrize("name", SCREENS)
 def test_each_pixel_goes_where_the_motion_takes_it(name, motion):
     before = SCREENS[name]
-    after = moved_screen(before, motion)
+    after = before.moved(motion)
     for shares in ((0.0, 0.0), (1.0, 0.0), (0.3, 0.8)):
         old, new = (
             [a + s * (b - a) for (a, b), s in zip((each.x, each.y), shares, strict=True)] for each in (before, after)

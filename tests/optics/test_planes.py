@@ -16,10 +16,11 @@ from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.rays import Rays, Status, TiltedPlane, axes, coordinates, tilt_of
+from bstcad.optics.rays import Rays, Status, axes, tilt_of
+from bstcad.optics.receivers import TiltedPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import to_first_net, to_plane, trace
+from bstcad.optics.trace import to_first_net, trace
 from bstcad.optics.tubes import launch_tubes, picture
 from bstcad.tailoring.merit import TubeMerit
 
@@ -75,7 +76,7 @@ def test_rays_land_on_the_plane(light, z):
     lens = replace(lens, front=lens.front.moved(z), back=replace(lens.back, z=lens.back.z + z))
     plane = TiltedPlane((30.0, -5.0, 300.0 + z), TILT)
     leaving = cross(replace(coming, z=coming.z + z), lens.last_freeform).rays
-    landed = to_plane(leaving, plane)
+    landed = plane.to(leaving)
     x, y, height = landed.position[0] - 30.0, landed.position[1] + 5.0, landed.above(300.0 + z)
     n = plane.axes[2]
     off = n[0] * x + n[1] * y + n[2] * height
@@ -83,7 +84,7 @@ def test_rays_land_on_the_plane(light, z):
     assert int(there.sum()) > 500 and float(off[there].abs().max()) < 1e-9
     way = torch.linalg.cross(landed.position - leaving.position, leaving.direction, dim=0)
     assert float(way[:, there].abs().max()) < 1e-9
-    places = coordinates(landed, plane)[:, there]
+    places = torch.stack(plane.places(landed))[:, there]
     wanted = torch.stack([landed.position[0], landed.position[1], landed.above(0.0)])[:, there]
     found = torch.tensor([plane.point(*place) for place in places.T.tolist()], dtype=torch.float64).T
     assert float((found - wanted).abs().max()) < (1e-9 if z == 0 else 1e-8)  # of 1e6 mm a double holds 1e-10
@@ -105,10 +106,10 @@ def test_rays_that_lead_away_from_it_are_lost():
     """A plane steep to the axis: of two rays that lead upwards the one that does not approach it is lost."""
     way = torch.tensor([[0.6, 0.0, 0.8], [-0.6, 0.0, 0.8]], dtype=torch.float64).T
     rays = Rays(torch.zeros_like(way), way, torch.ones(2), torch.zeros(2, dtype=torch.uint8))
-    landed = to_plane(rays, TiltedPlane((50.0, 0.0, 50.0), (0.0, 60.0)))
+    landed = TiltedPlane((50.0, 0.0, 50.0), (0.0, 60.0)).to(rays)
     assert landed.status.tolist() == [Status.ALIVE, Status.TURNED_BACK]
     back = replace(rays, direction=-way, sense=-1)
-    below = to_plane(back, TiltedPlane((-50.0, 0.0, -50.0), (0.0, 60.0)))
+    below = TiltedPlane((-50.0, 0.0, -50.0), (0.0, 60.0)).to(back)
     assert below.status.tolist() == landed.status.tolist()
     assert torch.allclose(below.position[:, 0], -landed.position[:, 0])
 

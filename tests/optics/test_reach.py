@@ -8,7 +8,7 @@ import torch
 
 from bstcad.optics.goal import restricted
 from bstcad.optics.interfaces import Reflect, Refract, deflect
-from bstcad.optics.rays import Rays, TiltedPlane
+from bstcad.optics.rays import Rays
 from bstcad.optics.reach import (
     GRAZING,
     STEEPEST,
@@ -18,6 +18,7 @@ from bstcad.optics.reach import (
     room,
     wanted_slopes,
 )
+from bstcad.optics.receivers import LevelPlane, TiltedPlane
 
 INDEX = 1.4936
 GLASS = Refract(INDEX, 1.0)
@@ -45,7 +46,7 @@ def test_a_ring_about_the_largest_deflection_is_half_within_reach():
     for off, reached in ((-1e-3, True), (1e-3, False)):
         radius = DISTANCE * math.tan(math.radians(most + off))
         ring = radius * torch.stack([torch.cos(turned), torch.sin(turned)])
-        rest = room(ray(n=12), ring, DISTANCE, GLASS)
+        rest = room(ray(n=12), ring, LevelPlane(DISTANCE), GLASS)
         assert ((rest >= 0) == reached).all()
 
 
@@ -71,7 +72,7 @@ def test_slopes_that_would_reflect_all_are_turned_back_to_grazing_light(law, sen
 
 
 @pytest.mark.parametrize(
-    "plane", [DISTANCE, TiltedPlane((30.0, -20.0, DISTANCE), (25.0, -40.0))], ids=["level", "tilted"]
+    "plane", [LevelPlane(DISTANCE), TiltedPlane((30.0, -20.0, DISTANCE), (25.0, -40.0))], ids=["level", "tilted"]
 )
 @pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (0.3, -0.1, math.sqrt(0.9))], ids=["along the axis", "oblique"])
 def test_what_is_within_reach_is_what_snells_law_brings_there(plane, direction):
@@ -83,8 +84,7 @@ def test_what_is_within_reach_is_what_snells_law_brings_there(plane, direction):
     z_x, z_y = wanted_slopes(rays, aim, plane, GLASS)
     hit = deflect(rays, z_x, z_y, GLASS)
     way = hit.rays.direction
-    level = torch.stack([*aim, torch.full_like(aim[0], DISTANCE)])
-    point = level if plane == DISTANCE else torch.stack(plane.point(*aim))
+    point = torch.stack(plane.point(*aim))
     arrives = ((way * point).sum(0) / point.norm(dim=0)) > 1 - 1e-12
     assert 0.05 < inside.double().mean() < 0.9
     assert arrives[inside].all() and (hit.cos_out[inside] >= math.cos(GRAZING) - 1e-9).all()
@@ -95,9 +95,10 @@ def test_a_mirror_reaches_as_far_as_its_slope():
     """Light from above, thrown back by a slope of s: it leaves under twice the angle."""
     steepest = math.degrees(math.atan(STEEPEST))
     down = ray((0.0, 0.0, -1.0), sense=-1, n=3)
-    rest = room(down, at(0.0, 60.0, 89.0), DISTANCE, Reflect())
+    rest = room(down, at(0.0, 60.0, 89.0), LevelPlane(DISTANCE), Reflect())
     assert (rest >= 0).all() and steepest > 45.0  # twice 45° is level: all that lies above is within reach
-    assert float(room(down, at(10.0)[:, :1].expand(2, 3), -DISTANCE, Reflect()).max()) < 0  # behind the mirror
+    behind = LevelPlane(-DISTANCE)  # the mirror
+    assert float(room(down, at(10.0)[:, :1].expand(2, 3), behind, Reflect()).max()) < 0
 
 
 def test_other_lines_and_a_source_of_some_size_take_from_the_reach():

@@ -16,6 +16,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.measure import simulated
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Status
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Conic, Recess, Sphere
 from bstcad.optics.trace import UNDERSIDE, on_underside, simulate, simulate_plain, to_first_net, trace
@@ -101,9 +102,9 @@ def test_the_kernel_traces_a_dome_as_the_plain_form_does(monkeypatch):
     assert fast.flux == pytest.approx(plain.flux, abs=1e-12)
     x = torch.linspace(-15, 15, 40, dtype=torch.float64)
     rays = source.rays(*torch.meshgrid(x, x, indexing="ij"), RADIUS, 1.0)
-    first = trace(rays, wide, 500.0)
+    first = trace(rays, wide, LevelPlane(500.0))
     monkeypatch.setattr(compiling, "ENABLED", False)
-    second = trace(rays, wide, 500.0)
+    second = trace(rays, wide, LevelPlane(500.0))
     assert torch.equal(first.status, second.status) and 100 < int(first.alive.sum()) < 1500
     alive = first.alive
     torch.testing.assert_close(first.position[:, alive], second.position[:, alive], rtol=1e-10, atol=1e-9)

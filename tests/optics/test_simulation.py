@@ -11,6 +11,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import clear_window, trace, window
@@ -72,7 +73,7 @@ def test_the_clear_window_loses_no_light_that_gets_through(source):
     lens = bowl()
     whole, clear = window(source, lens), clear_window(source, lens)
     assert clear.width <= whole.width and clear.height <= whole.height
-    all_rays = trace(launch(source, lens, 150, 0), lens, 100.0)
+    all_rays = trace(launch(source, lens, 150, 0), lens, LevelPlane(100.0))
     x, y = (p.reshape(-1) for p in stratified(whole, 150, 0))
     lit = source.irradiance(x, y, 15.0) > 0
     beyond = (x[lit].abs() > clear.width / 2) | (y[lit].abs() > clear.height / 2)

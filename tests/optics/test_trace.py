@@ -12,6 +12,7 @@ from bstcad.optics.interfaces import Refract, deflect, intersect
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Rays, Status
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from tests.tracing import from_first_net_plain, stratified
@@ -129,7 +130,7 @@ def test_a_ray_that_turns_back_does_not_land(form):
     turned = deflect(at_back, z_x, z_y, Refract(1.5, 1.0)).rays.direction[:, 0].tolist()
     leaves = math.degrees(math.asin(1.5 * math.sin(math.radians(40))))
     assert math.degrees(math.acos(turned[2])) == pytest.approx(20 + leaves)
-    assert not form(leaving, lens, 1000.0).alive.any()
+    assert not form(leaving, lens, LevelPlane(1000.0)).alive.any()
 
 
 def test_axial_closed_form_is_the_newton_answer():
@@ -138,7 +139,9 @@ def test_axial_closed_form_is_the_newton_answer():
     searched = replace(bundle, axial=False)
     for front in (Plane(8.0), Sphere(8.0, -0.03)):
         lens = Lens(front, wavy(), SQUARE, N)
-        closed, newton = (from_first_net_plain(trace.to_first_net(b, lens), lens, 1000.0) for b in (bundle, searched))
+        closed, newton = (
+            from_first_net_plain(trace.to_first_net(b, lens), lens, LevelPlane(1000.0)) for b in (bundle, searched)
+        )
         assert torch.equal(closed.status, newton.status) and 0 < int(closed.alive.sum()) < 900
         there = closed.alive
         torch.testing.assert_close(closed.position[:, there], newton.position[:, there], rtol=0, atol=1e-9)
@@ -161,7 +164,7 @@ def test_a_plane_parallel_plate_shifts_and_does_not_turn():
     expected = thickness * sine * (1 - cos_in / (N * cos_glass))
     torch.testing.assert_close(shift, expected, rtol=0, atol=1e-13)
     # and so it lands: tan θ in air, tan θ' in glass
-    landed = trace.trace(bundle, lens, 500.0)
+    landed = trace.trace(bundle, lens, LevelPlane(500.0))
     reach = sine / cos_in * (500.0 - thickness) + thickness * sine / N / cos_glass
     torch.testing.assert_close(landed.position.norm(dim=0), reach, rtol=0, atol=1e-11)
 
@@ -176,11 +179,11 @@ def test_paraxial_rays_follow_the_transfer_matrix(curvature, z):
     h = torch.tensor([1e-3, 2e-3], dtype=torch.float64)
     bundle = Collimated(Circle(5.0)).rays(h, -h, 0.0, 1.0)
     expected = h * (1 - power * thickness / N) - h * power * (z - 20.0)
-    landed = trace.trace(bundle, lens, z)
+    landed = trace.trace(bundle, lens, LevelPlane(z))
     atol = 10 * float(h.max()) ** 3 * curvature**2 * z * abs(curvature) + 1e-15 * z  # third-order aberration
     torch.testing.assert_close(landed.position, torch.stack([expected, -expected]), rtol=0, atol=atol)
     if curvature > 0:
-        at_focus = trace.trace(bundle, lens, 20.0 + 1 / power - thickness / N)
+        at_focus = trace.trace(bundle, lens, LevelPlane(20.0 + 1 / power - thickness / N))
         assert float(at_focus.position.abs().max()) < 1e-9
 
 
@@ -191,7 +194,7 @@ def test_a_prism_deviates_by_its_closed_form():
     back = replace(flat(), heights=(slope * line)[:, None].expand(9, 9).contiguous())
     x, y = sampling.grid(SQUARE, 5)
     bundle = Collimated(Circle(30.0)).rays(x, y, 0.0, 1.0)
-    landed = trace.trace(bundle, Lens(Plane(8.0), back, SQUARE, N), 1000.0)
+    landed = trace.trace(bundle, Lens(Plane(8.0), back, SQUARE, N), LevelPlane(1000.0))
     tilt = math.atan(slope)
     turn = math.asin(N * math.sin(tilt)) - tilt
     # normal (-s, 0, 1): leaving glass the ray bends away from the normal, to +x
@@ -211,7 +214,7 @@ def test_gradient_in_curvature_net_and_start_is_finite_differences(kind, curvatu
 
     def landing(heights, curvature, x, y):
         lens = Lens(Sphere(15.0, curvature), replace(start, heights=heights), SQUARE, N)
-        return trace.trace(source.rays(x, y, 15.0, 1.0), lens, 60.0).position
+        return trace.trace(source.rays(x, y, 15.0, 1.0), lens, LevelPlane(60.0)).position
 
     x, y = (a.reshape(-1).requires_grad_() for a in stratified(Rectangle(12.0, 12.0), 2, 0))
     c = torch.tensor(curvature, dtype=torch.float64, requires_grad=True)

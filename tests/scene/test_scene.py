@@ -12,7 +12,7 @@ from bstcad.cad.mounting import wire
 from bstcad.optics.losses import Coating, Fresnel
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.rays import TiltedPlane
+from bstcad.optics.receivers import LevelPlane, TiltedPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Recess, Sphere
 from bstcad.optics.trace import ghost_light
@@ -440,7 +440,7 @@ def test_levels_grow_to_the_net_asked_for():
 def test_a_target_that_is_tilted_by_nothing_is_level():
     level, tilted = load(THU), load(THU, {"target.tilt": "[0, 0]"})
     assert level == tilted and level.toml() == tilted.toml() and "tilt" not in level.toml()
-    assert level.target.screen.plane == 1000.0
+    assert level.target.screen.plane == LevelPlane(1000.0)
     plane = load(THU, {"target.tilt": "[0, 40.5]"}).target.screen.plane
     assert plane == TiltedPlane((200.0, 200.0, 1000.0), (0.0, 40.5))
 

@@ -11,7 +11,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.sources import Collimated, Point
-from bstcad.optics.trace import behind, land
+from bstcad.optics.trace import behind
 from bstcad.tailoring.goals import Goal
 from bstcad.tailoring.merit import SobolevVariable
 from bstcad.tailoring.net_variables import NetVariables, along_light
@@ -37,7 +37,7 @@ def traced(source, lens, q):
     rays = source.rays(q[0], q[1], lens.entrance.z, 1.0)
     for interface in lens.unbounded().interfaces:
         rays = behind(rays, interface)
-    return [land(rays, screen.z).position for screen in SCREENS]
+    return [screen.plane.land(rays).position for screen in SCREENS]
 
 
 def jacobian(places, step):

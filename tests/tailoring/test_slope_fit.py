@@ -10,8 +10,9 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import Refract, deflect, intersect
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.rays import Status, TiltedPlane
+from bstcad.optics.rays import Status
 from bstcad.optics.reach import STEEPEST, largest_deflection, wanted_slopes
+from bstcad.optics.receivers import LevelPlane, TiltedPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import to_first_net, trace
@@ -35,7 +36,9 @@ def surface(m, seed=None, size=0.05):
     [(Collimated(Circle(8.0)), Plane(8.0)), (Point(), Sphere(15.0, 0.02)), (Point((1.0, -2.0, 0.0)), Plane(15.0))],
     ids=("collimated", "point", "off axis"),
 )
-@pytest.mark.parametrize("plane", [900.0, TiltedPlane((40.0, -9.0, 900.0), (35.0, -50.0))], ids=["level", "tilted"])
+@pytest.mark.parametrize(
+    "plane", [LevelPlane(900.0), TiltedPlane((40.0, -9.0, 900.0), (35.0, -50.0))], ids=["level", "tilted"]
+)
 def test_wanted_slopes_are_snells_law_inverted(source, front, plane):
     """Slopes measured on a traced lens are the ones wanted for where its rays land."""
     lens = Lens(front, surface(17, 1.0, 0.4), SQUARE, 1.488)
@@ -58,7 +61,7 @@ def test_an_aim_that_no_face_can_reach_turns_the_ray_as_far_as_one_can(index, re
     in_glass = to_first_net(Collimated(Circle(8.0)).rays(x, y, 8.0, 1.0), lens)
     at_face, _, _ = intersect(lens.back, in_glass, SQUARE, Status.VIGNETTED)
     aim = torch.stack([torch.full_like(x, reach), torch.full_like(x, -0.2 * reach)])
-    z_x, z_y = wanted_slopes(at_face, aim, 500.0, Refract(index, 1.0))
+    z_x, z_y = wanted_slopes(at_face, aim, LevelPlane(500.0), Refract(index, 1.0))
     steepness = torch.sqrt(z_x**2 + z_y**2)
     out = deflect(at_face, z_x, z_y, Refract(index, 1.0)).rays
     turned = torch.acos((out.direction * at_face.direction).sum(0))
@@ -101,7 +104,7 @@ def test_tailor_to_aim_lands_where_a_surface_can():
     """A stretched grid, near the axis: the map is a gradient but for the finite throw, so a surface follows it."""
     source, lens = Collimated(Circle(8.0)), Lens(Plane(8.0), surface(33), SQUARE, 1.488)
     x, y = sampling.grid(Rectangle(16.0, 16.0), 66)
-    rays = source.rays(x, y, 8.0, 1.0)
+    rays, screen = source.rays(x, y, 8.0, 1.0), LevelPlane(1000.0)
     aim = torch.stack([4 * x, 3 * y])
-    lens = tailor_to_aim(lens, rays, aim, 1000.0, 4)
-    assert float(landing(trace(rays, lens, 1000.0), aim).sqrt()) < 0.15  # mm, of 32: eight steps of conjugate gradients
+    lens = tailor_to_aim(lens, rays, aim, screen, 4)
+    assert float(landing(trace(rays, lens, screen), aim).sqrt()) < 0.15  # mm, of 32: eight steps of conjugate gradients

@@ -21,7 +21,6 @@ from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import Circle
 from bstcad.optics.rays import Rays
 from bstcad.optics.sources import Collimated, Point
-from bstcad.optics.trace import to_plane
 from bstcad.optics.tubes import collect
 from bstcad.tolerance.perturbations import THERMAL, Setup, kinds
 
@@ -108,7 +107,7 @@ def traced(setup: Setup, amounts: dict[str, torch.Tensor]) -> torch.Tensor:
         rays = cross(rays, interface).rays
     rays = moved(rays, setup.pivot("lens"), amounts, "lens")
     rays = moved(rays, screen.middle, amounts, "screen", back=True)
-    landed = to_plane(rays, screen.plane)
+    landed = screen.plane.to(rays)
     return collect(screen.pixels_of(landed.position[:2]), flux, screen.shape)[0]
 
 

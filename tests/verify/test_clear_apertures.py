@@ -23,7 +23,6 @@ from bstcad.optics.measure import Effort, measure
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import to_plane
 from bstcad.pipeline import design as design_of
 from bstcad.scene.mount import Mount
 from bstcad.scene.scene import load
@@ -121,7 +120,7 @@ def independent(source, lens, around, screen, count=1 << 17):
     for interface, polygon in zip(lens.unbounded().interfaces, around, strict=True):
         rays = cross(rays, interface).rays
         flux *= inside(polygon, rays.position[:2].numpy())
-    x, y, _ = to_plane(rays, screen.plane).position.numpy()
+    x, y, _ = screen.plane.to(rays).position.numpy()
     seen, _, _ = np.histogram2d(y, x, bins=screen.shape, range=(screen.y, screen.x), weights=flux)
     return seen[::-1]
 

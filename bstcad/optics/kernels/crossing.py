@@ -51,7 +51,8 @@ from bstcad.optics.kernels.forward import (
     to_screen,
 )
 from bstcad.optics.kernels.spline import curved, net_of, scatter
-from bstcad.optics.rays import Landed, Rays, Status, TargetPlane
+from bstcad.optics.rays import Landed, Rays, Status
+from bstcad.optics.receivers import Receiver
 
 # The adjoint also keeps of a block: ∂L/∂ of landing or hit and direction, of path and cosine of incidence, and second
 # derivatives of the sag.
@@ -340,8 +341,8 @@ def _numbers(crossing: Crossing) -> tuple[kernel_arguments.Faces, kernel_argumen
     return crossing.faces, crossing.tilted, True if crossing.lands else None
 
 
-def landed(rays: Rays, interface: Interface, plane: TargetPlane) -> Landed:
-    """Rays across a net and on to the plane: `interfaces.cross` and `trace.land`."""
+def landed(rays: Rays, interface: Interface, plane: Receiver) -> Landed:
+    """Rays across a net and on to the plane: `interfaces.cross` and `Receiver.land`."""
     at, left = _across(rays, interface, plane)
     return Landed(at, left.flux, left.status, left.taken)
 
@@ -354,7 +355,7 @@ def behind(rays: Rays, interface: Interface) -> Rays:
     return replace(left, position=position, direction=direction, z=interface.surface.z, axial=False, sense=sense)
 
 
-def _across(rays: Rays, interface: Interface, plane: TargetPlane | None) -> tuple[Tensor, Rays]:
+def _across(rays: Rays, interface: Interface, plane: Receiver | None) -> tuple[Tensor, Rays]:
     """(out of `Cross`, the rays with flux and status as behind the face)."""
     shape, heights, lossy = rays.status.shape, interface.surface.heights, bool(interface.losses)
     if rays.axial and interface.status_if_missed == Status.MISSED_FRONT:

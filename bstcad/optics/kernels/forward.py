@@ -24,7 +24,8 @@ from bstcad.optics.kernels.compiling import compiled
 from bstcad.optics.kernels.spline import beyond2, net_of, sag
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Landed, Status, TargetPlane
+from bstcad.optics.rays import Landed, Status
+from bstcad.optics.receivers import Receiver
 from bstcad.optics.sources import Source
 
 BLOCK = 256  # rays
@@ -198,7 +199,7 @@ def to_tilted(faces, tilted, count, work):
 
 @njit(error_model="numpy")
 def to_screen(faces, tilted, count, work):
-    """From the back face to the screen, and the place on it: `trace.to_plane`, `rays.coordinates`."""
+    """From the back face to the screen, and the place on it: as `TiltedPlane.land` has it."""
     if tilted is not None:
         to_tilted(faces, tilted, count, work)
         return
@@ -481,14 +482,14 @@ def _taken(lens: Lens) -> dict[str, int]:
     return {loss.line: BY_GLASS if loss.in_glass else BY_FACES for loss in losses}
 
 
-def _scenes(lights, plane: TargetPlane, n: int) -> Iterator[tuple[Any, ...]]:
+def _scenes(lights, plane: Receiver, n: int) -> Iterator[tuple[Any, ...]]:
     """Net, beam, faces, tilt of the screen, losses and cells of each light; lenses that are alike are told once."""
     known: tuple[Lens, tuple[Any, ...]] | None = None
     for weight, source, lens, seed, window in lights:
         if known is None or not _alike(lens, known[0]):
             known = lens, (_scene(source, lens, plane), kernel_arguments.losses(lens))
         (net, _, faces, tilted), losses = known[1]
-        cells, beam = kernel_arguments.cells(window, n, seed), kernel_arguments.beam(source, lens.entrance.z)
+        cells, beam = kernel_arguments.cells(window, n, seed), source.beam(lens.entrance.z)
         beam = beam._replace(peak=beam.peak * weight * cells.width * cells.height)  # flux of a ray, not its density
         yield net, beam, faces, tilted, losses, cells
 
@@ -502,7 +503,7 @@ def _alike(one: Lens, other: Lens) -> bool:
     )
 
 
-def land(source: Source, lens: Lens, plane: TargetPlane, x: Tensor, y: Tensor) -> Landed:
+def land(source: Source, lens: Lens, plane: Receiver, x: Tensor, y: Tensor) -> Landed:
     """Rays through (x, y) of the plane of the first vertex, each (n,) float64, on `plane`; flux in 1/mm² there.
 
     `trace.trace` of `source.rays(x, y, lens.entrance.z, 1.0)`, but that rays without flux may end anyhow.
@@ -516,9 +517,9 @@ def land(source: Source, lens: Lens, plane: TargetPlane, x: Tensor, y: Tensor) -
     return Landed(*(torch.from_numpy(a) for a in (landing, flux, fate)))
 
 
-def _scene(source: Source, lens: Lens, plane: TargetPlane) -> tuple[Any, ...]:
+def _scene(source: Source, lens: Lens, plane: Receiver) -> tuple[Any, ...]:
     """Net, beam, faces and tilt of the screen, as the kernels take them; a mirror's light begins along -z."""
     (*front, net), z = lens.interfaces, lens.entrance.z
     heights = net.surface.heights
     faces = kernel_arguments.faces(net, plane, lens.sense, z, *front)
-    return net_of(-heights if lens.sense < 0 else heights), kernel_arguments.beam(source, z), *faces
+    return net_of(-heights if lens.sense < 0 else heights), source.beam(z), *faces

@@ -1,4 +1,6 @@
-"""Source, lens, cells and screen as the plain numbers that a fused kernel takes: named tuples of one type a field.
+"""Lens, cells and screen as the plain numbers that a fused kernel takes: named tuples of one type a field.
+
+A source tells its own (sources.Beam).
 
 So are the constants of the plain form: numba's cache looks at a kernel's own file only, and what that takes from
 another file would stay as it was when the kernel was compiled.
@@ -6,7 +8,6 @@ another file would stay as it was when the kernel was compiled.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -19,35 +20,10 @@ from bstcad.optics.interfaces import Interface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Status, TargetPlane, TiltedPlane, middle
-from bstcad.optics.sources import HALF_SPACE, Collimated, Point, Source
+from bstcad.optics.rays import Status
+from bstcad.optics.receivers import Receiver
 
 NODES = 4097  # of a table of a face's transmission
-ALONG_Z = (0, 0.0, 0.0, 1.0, 0.0)  # the last fields of a Beam that is not tilted
-
-
-class Beam(NamedTuple):
-    """E = peak exp(-fall r²) / d^power on the plane of the front's vertex, r from (x, y), where inside the limits.
-
-    That of a tilted point source is `Point._tilted_irradiance`: c / d^4, 1 / d³ or exp(-fall (d² - c²) / c²) / c³ for
-    the powers 4, 3 and 0, times the peak.
-    """
-
-    x: float  # the source, or the middle of the beam (mm)
-    y: float
-    limit_x: float  # outlines.Limits of the light (mm, mm, mm²)
-    limit_y: float
-    limit_r2: float
-    peak: float
-    fall: float  # 1/mm²; of a tilted source a number
-    power: int  # 0, 3 or 4, of the distance d of a point source
-    distance: float  # of a point source from the plane (mm); 0: collimated
-    start: float  # how far from the plane rays start (mm)
-    tilted: int  # 1: light along n, which is not (0, 0, 1)
-    n_x: float  # the source's axis, in the frame in which light begins along +z
-    n_y: float
-    n_z: float
-    least: float  # cosine to the axis from which on there is light
 
 
 class Rules(NamedTuple):
@@ -143,51 +119,6 @@ class Pixels(NamedTuple):
     per_y: float
 
 
-def beam(source: Source, z: float) -> Beam:
-    """`source.irradiance` on the plane z (mm) as numbers."""
-    if isinstance(source, Collimated):
-        return _parallel(source, z)
-    x, y, from_z = _floats(source.position)
-    distance, round_ = abs(z - from_z), (0.0, 0.0)
-    if source.tilted:
-        law = _tilted_law(source, distance)
-        return Beam(x, y, *round_, math.inf, *law[:3], distance, distance, 1, *_floats(source.towards(z)), law[3])
-    reach2, edge = math.inf, source.edge
-    if source.profile == "gaussian":
-        w2 = (distance * math.tan(math.radians(source.half_angle_1e2))) ** 2
-        law = 2 / (math.pi * w2), 2 / w2, 0
-    elif source.profile == "lambertian":
-        law = distance**2 / (math.pi * math.sin(edge) ** 2), 0.0, 4
-    else:
-        law = distance / (2 * math.pi * (1 - math.cos(edge))), 0.0, 3
-    if edge < HALF_SPACE:
-        reach2 = (distance * math.tan(edge)) ** 2
-    return Beam(x, y, *round_, reach2, *law, distance, distance, *ALONG_Z)
-
-
-def _parallel(source: Collimated, z: float) -> Beam:
-    (x, y), limits = _floats(source.shift(z)), _floats(source.aperture.limits)
-    peak, fall, start = 1 / source.aperture.area, 0.0, abs(float(z - source.start(z)))
-    if source.profile == "gaussian":
-        peak, fall = 1 / source._gaussian_flux(), 2 / source.radius_1e2**2
-    axis = ALONG_Z
-    if source.tilted:
-        n, sense = source.axes[2], 1 if source.start(z) <= z else -1
-        axis = (1, *_floats((sense * n[0], sense * n[1], n[2])), 0.0)
-    return Beam(x, y, *limits, peak, fall, 0, 0.0, start, *axis)
-
-
-def _tilted_law(source: Point, distance: float) -> tuple[float, float, int, float]:
-    """(peak, fall, power, least) of `Point._tilted_irradiance`."""
-    if source.profile == "gaussian":
-        t2 = math.tan(math.radians(source.half_angle_1e2)) ** 2
-        return 2 * distance / (math.pi * t2), 2 / t2, 0, 0.0
-    least = math.cos(source.edge) if source.edge < HALF_SPACE else 0.0
-    if source.profile == "lambertian":
-        return distance / (math.pi * math.sin(source.edge) ** 2), 0.0, 4, least
-    return distance / (2 * math.pi * (1 - math.cos(source.edge))), 0.0, 3, least
-
-
 def rules() -> Rules:
     """The constants of the plain form, as they are now."""
     steps = (interfaces.NEWTON_STEPS, interfaces.APPROACH_STEPS)
@@ -196,7 +127,7 @@ def rules() -> Rules:
 
 
 def faces(
-    interface: Interface, plane: TargetPlane | None, sense: int, start: float, front: Interface | None = None
+    interface: Interface, plane: Receiver | None, sense: int, start: float, front: Interface | None = None
 ) -> tuple[Faces, Tilted | None]:
     """The net of an interface, the screen behind it and the front before it, if there are any, as numbers.
 
@@ -208,7 +139,7 @@ def faces(
     bent = (front.surface.curvature, front.surface.conic_constant) if front else (0.0, 0.0)
     limits = [limit for i in (front or interface, interface) for limit in i.outline.limits]
     net = [surface.x[0], surface.y[0], *(1 / pitch for pitch in surface.pitch)]
-    known, throw = interfaces.net_bounds(surface, torch.float64, sense), middle(plane) if plane is not None else 0.0
+    known, throw = interfaces.net_bounds(surface, torch.float64, sense), plane.middle[2] if plane is not None else 0.0
     face = _floats([*bent, law.eta, *limits, sense * (surface.z - start)])
     net = _floats([*net, *known, sense * (throw - surface.z)])
     fates = [Status.MISSED_FRONT, interface.status_if_missed, law.status_if_blocked, Status.TURNED_BACK]
@@ -253,12 +184,12 @@ def _table(interface: Interface) -> np.ndarray:
     return share.contiguous().numpy()
 
 
-def _tilted(plane: TargetPlane | None, before: int, behind: int) -> Tilted | None:
+def _tilted(plane: Receiver | None, before: int, behind: int) -> Tilted | None:
     """A tilted plane as numbers, None for a level one; before, behind: the light's way along z at the last face."""
-    if not isinstance(plane, TiltedPlane):
+    if plane is None or plane.is_level:
         return None
     along_x, along_y, normal = ((*axis[:2], before * axis[2]) for axis in plane.axes)
-    return Tilted(*_floats([*plane.centre[:2], *(behind * n for n in normal), *along_x, *along_y]))
+    return Tilted(*_floats([*plane.middle[:2], *(behind * n for n in normal), *along_x, *along_y]))
 
 
 def cells(window: Rectangle, n: int, seed: int) -> Cells:

@@ -14,6 +14,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import compiling, kernel_arguments
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.tubes import launch_tubes
@@ -93,7 +94,7 @@ def seen(cliff):
     box = simulated(SOURCE, now, SCREEN, 64, 0).box
     tubes = launch_tubes(SOURCE, now, 32)
     heights = now.back.heights.clone().requires_grad_()
-    landed = tubes.landing(replace(now, back=replace(now.back, heights=heights)), SCREEN.z)
+    landed = tubes.landing(replace(now, back=replace(now.back, heights=heights)), LevelPlane(SCREEN.z))
     picture, _ = tubes.collect(landed, SCREEN)
     (gradient,) = torch.autograd.grad((picture**2).sum(), heights)
     return torch.cat([t.detach().reshape(-1) for t in (box, picture, gradient)])

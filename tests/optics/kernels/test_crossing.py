@@ -10,7 +10,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
-from bstcad.optics.rays import TiltedPlane
+from bstcad.optics.receivers import LevelPlane, TiltedPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from tests.optics.kernels.arrays import DTYPES, close, uniform
@@ -42,7 +42,7 @@ def test_landings_and_their_gradient(scene, dtype):
     lens = Lens(front, deep(dtype=dtype), outline, 1.6)
     x, y = stratified(Rectangle(23.0, 23.0), 90, 0, dtype)
     in_glass = trace.to_first_net(source.rays(x, y, 15.0, 1.0), lens)
-    z, weight = 400.0, uniform(2 * x.numel(), 1).view(2, *x.shape)
+    z, weight = LevelPlane(400.0), uniform(2 * x.numel(), 1).view(2, *x.shape)
     results = []
     for form, kind in ((trace.from_first_net, dtype), (from_first_net_plain, torch.float64)):
         heights = lens.back.heights.detach().to(kind).requires_grad_()
@@ -77,7 +77,7 @@ def test_a_beam_meets_a_front_that_reaches_beyond_where_it_begins():
         torch.testing.assert_close(ours, wanted, rtol=1e-12, atol=1e-12)
 
 
-PLANES = {"level": 120.0, "tilted": TiltedPlane((3.0, 2.0, 120.0), (20.0, -10.0), 5.0)}
+PLANES = {"level": LevelPlane(120.0), "tilted": TiltedPlane((3.0, 2.0, 120.0), (20.0, -10.0), 5.0)}
 LOSSES = Losses(Fresnel(587.6), Absorption(0.01))
 NETS = {  # a lens, and the rays on their way to its net
     "lens": (Lens(Sphere(15.0, -0.02), deep(), Rectangle(20.0, 20.0), 1.6), Point()),
@@ -121,7 +121,9 @@ def test_the_gradient_in_the_rays_is_finite_differences():
     coming = trace.to_first_net(Point().rays(x, y, 15.0, 1.0), lens)
 
     def landing(position, direction):
-        return trace.from_first_net(replace(coming, position=position, direction=direction), lens, 60.0).position
+        return trace.from_first_net(
+            replace(coming, position=position, direction=direction), lens, LevelPlane(60.0)
+        ).position
 
     leaves = tuple(t.detach().clone().requires_grad_() for t in (coming.position, coming.direction))
     assert torch.autograd.gradcheck(landing, leaves, fast_mode=True)
@@ -134,7 +136,7 @@ def test_the_gradient_in_the_front_goes_through_the_fused_back(dtype):
     for form in (trace.from_first_net, from_first_net_plain):
         c = torch.tensor(-0.02, dtype=dtype, requires_grad=True)
         lens = Lens(Sphere(15.0, c), deep(dtype=dtype), Rectangle(20.0, 20.0), 1.5)
-        landed = form(trace.to_first_net(Point().rays(x, y, 15.0, 1.0), lens), lens, 400.0)
+        landed = form(trace.to_first_net(Point().rays(x, y, 15.0, 1.0), lens), lens, LevelPlane(400.0))
         merit = torch.where(landed.alive, landed.position.square().sum(0), 0.0).sum()
         gradients.append(float(torch.autograd.grad(merit, c)[0]))
     assert gradients[0] != 0.0 and gradients[0] == pytest.approx(gradients[1], rel=1e3 * torch.finfo(dtype).eps)
@@ -148,7 +150,7 @@ def test_a_ray_of_no_number_is_lost_alone(form):
     in_glass = trace.to_first_net(Point().rays(x, y, 15.0, 1.0), lens)
     direction = in_glass.direction.clone()
     direction[:, 2, 1] = torch.nan
-    landed = form(replace(in_glass, direction=direction), lens, 400.0)
+    landed = form(replace(in_glass, direction=direction), lens, LevelPlane(400.0))
     expected = torch.ones_like(landed.alive)
     expected[2, 1] = False
     assert torch.equal(landed.alive, expected) and torch.isfinite(landed.position[:, expected]).all()

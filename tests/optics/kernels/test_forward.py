@@ -16,7 +16,8 @@ from bstcad.optics.kernels.forward import land
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
-from bstcad.optics.rays import Landed, TiltedPlane
+from bstcad.optics.rays import Landed
+from bstcad.optics.receivers import LevelPlane, TiltedPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
 from bstcad.optics.trace import simulate, simulate_plain, window
@@ -99,7 +100,9 @@ SCENES = {  # source, lens, the fates of rays through a window larger than the l
 }
 
 
-@pytest.mark.parametrize("plane", [400.0, TiltedPlane((3.0, 2.0, 400.0), (20.0, -10.0), 5.0)], ids=["level", "tilted"])
+@pytest.mark.parametrize(
+    "plane", [LevelPlane(400.0), TiltedPlane((3.0, 2.0, 400.0), (20.0, -10.0), 5.0)], ids=["level", "tilted"]
+)
 @pytest.mark.parametrize("name", SCENES)
 def test_each_ray_ends_as_in_the_plain_form(name, plane):
     """Against `to_first_net` and `from_first_net_plain`: not another fused kernel; all fates occur."""
@@ -267,7 +270,7 @@ def test_the_window_is_the_launching_one():
     source, lens, _ = SCENES["point, sphere"]
     area = window(source, lens)
     x, y = (p.reshape(-1) for p in stratified(area, 100, 3))
-    landed = land(source, lens, SCREEN.z, x, y)
+    landed = land(source, lens, LevelPlane(SCREEN.z), x, y)
     share = float(landed.flux.sum()) * area.area / 100**2
     assert sum(simulated(source, lens, SCREEN, 100, 3).flux.values()) == pytest.approx(1, abs=1e-12)
     missed = float(landed.flux[landed.status == 1].sum()) * area.area / 100**2 + 1 - share

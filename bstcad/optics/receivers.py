@@ -1,0 +1,216 @@
+"""Receivers: where light is collected, each with two coordinates of its own.
+
+A plane is a level one, z = const, or a tilted one, on which x and y are measured (mm).  A receiver of another form says
+how far it is along a ray, which of its places lies there, and where its places are in space; it may measure them in
+another unit, such as degrees.  The kernels know planes alone: light lands on others by the plain form.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bstcad.optics.motion import Motion
+from bstcad.optics.rays import GRAZING, Landed, Rays, Status, Vector, axes, clocked
+
+Array = Any  # of numpy or torch, or a number
+
+
+class Receiver:
+    """Where light is collected; x and y are its own coordinates."""
+
+    unit: str = "mm"  # of x and y
+    names: tuple[str, str] = ("x", "y")  # of its axes
+    axes: tuple[Vector, Vector, Vector] | None = None  # e_x, e_y and n of a plane; None: it is none
+    is_level: bool = False  # a plane z = const?
+
+    @property
+    def labels(self) -> tuple[str, str]:
+        """Of its axes, with their unit."""
+        return tuple(f"{name} ({self.unit})" for name in self.names)
+
+    @property
+    def middle(self) -> Vector:
+        """A point in its middle, in space (mm); of a tilted plane the one that it is turned about."""
+        raise NotImplementedError
+
+    def path(self, rays: Rays) -> tuple[Tensor, Tensor]:
+        """(way along each ray to the receiver (mm), zero for rays that do not come to it; status)."""
+        raise NotImplementedError
+
+    def places(self, rays: Rays) -> Sequence[Tensor]:
+        """x and y of rays that are on the receiver."""
+        raise NotImplementedError
+
+    def point(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
+        """The points in space (mm) of its places."""
+        raise NotImplementedError
+
+    def normal(self, aim: Tensor) -> Sequence[Tensor | float]:
+        """The unit normal in each of these places (2, …), which points away from where light comes from."""
+        raise NotImplementedError
+
+    def moved(self, motion: Motion) -> Receiver:
+        """The receiver after a rigid motion; its places keep their coordinates."""
+        raise NotImplementedError(f"{type(self).__name__} says nothing of how it is moved")
+
+    def land(self, rays: Rays) -> Landed:
+        """Rays behind the last interface, on the receiver.
+
+        Each component is followed by itself: the gradient of a part of a stacked tensor is as large as the whole.
+        """
+        parts = replace(rays, position=rays.position.unbind(0), direction=rays.direction.unbind(0))
+        path, status = self.path(parts)
+        there = (p + path * d for p, d in zip(parts.position, parts.direction, strict=True))
+        at = self.places(replace(parts, position=tuple(there)))
+        return Landed(torch.stack(tuple(at)), rays.flux, status, rays.taken)
+
+    def to(self, rays: Rays) -> Rays:
+        """Move rays along their direction to the receiver ahead of them; those that lead away from it are lost."""
+        path, status = self.path(rays)
+        return replace(rays, position=rays.position + path * rays.direction, status=status)
+
+    def way_to(self, rays: Rays, aim: Tensor) -> Tensor:
+        """(3, …) from the rays' positions to places (2, …) of the receiver (mm)."""
+        x, y, z = self.point(*aim)
+        return torch.stack([x - rays.position[0], y - rays.position[1], z - rays.above(0.0)])
+
+    def throw(self, z: float) -> float:
+        """From the plane z to its middle (mm), along the axis."""
+        return self.middle[2] - z
+
+    def seen(self, x: Array, y: Array, eye: float) -> tuple[Array, Array]:
+        """The points of the level plane through its middle at which its places are seen from (0, 0, eye), in mm."""
+        p_x, p_y, p_z = self.point(x, y)
+        grown = self.throw(eye) / (p_z - eye)
+        return grown * p_x, grown * p_y
+
+    def from_seen(self, q_x: Array, q_y: Array, eye: float) -> tuple[Array, Array]:
+        """The places of the receiver that are `seen` there."""
+        x, y = (torch.as_tensor(q, dtype=torch.float64) for q in (q_x, q_y))
+        way = torch.stack([x, y, torch.full_like(x, self.throw(eye))])
+        status = torch.zeros(x.shape, dtype=torch.uint8)
+        sight = Rays(torch.zeros_like(way), way / torch.sqrt((way * way).sum(0)), torch.ones_like(x), status, z=eye)
+        return tuple(self.land(sight).position.numpy())
+
+
+class Plane(Receiver):
+    """A plane: n · (p - C) = 0."""
+
+    def _advance(self, rays: Rays) -> tuple[Tensor, Tensor]:
+        """(n · d, n · (p - C)): how fast rays rise from it along their way, and how far above it they are (mm)."""
+        raise NotImplementedError
+
+    def path(self, rays: Rays) -> tuple[Tensor, Tensor]:
+        """(way along each ray to the plane (mm), zero for rays that do not come to it; status)."""
+        rise, above = self._advance(rays)
+        ahead = rise if rays.sense > 0 else -rise
+        status = rays.lose(ahead <= GRAZING, Status.TURNED_BACK)
+        lands = status == Status.ALIVE
+        rise = torch.where(lands, rise, torch.ones_like(rise))
+        return torch.where(lands, -above / rise, torch.zeros_like(rise)), status
+
+    def normal(self, aim: Tensor) -> Vector:
+        """The unit normal, everywhere the same."""
+        return self.axes[2]
+
+
+@dataclass(frozen=True)
+class LevelPlane(Plane):
+    """The plane z = const, with the x and y of space."""
+
+    z: float  # mm
+
+    axes = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+    is_level = True
+
+    @property
+    def middle(self) -> Vector:
+        """Its point on the axis (mm)."""
+        return 0.0, 0.0, self.z
+
+    def _advance(self, rays: Rays) -> tuple[Tensor, Tensor]:
+        return rays.direction[2], rays.above(self.z)
+
+    def places(self, rays: Rays) -> Sequence[Tensor]:
+        """x and y of rays that are on the plane (mm)."""
+        return rays.position[:2]
+
+    def point(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
+        """The points in space (mm) of places on the plane."""
+        return x, y, 0.0 * x + self.z
+
+    def way_to(self, rays: Rays, aim: Tensor) -> Tensor:
+        """(3, …) from the rays' positions to places (2, …) of the plane (mm)."""
+        return torch.stack([aim[0] - rays.position[0], aim[1] - rays.position[1], -rays.above(self.z)])
+
+
+@dataclass(frozen=True)
+class TiltedPlane(Plane):
+    """P = C + (x - c_x) e_x + (y - c_y) e_y: a plane through C, turned about it, and x and y measured on it (mm).
+
+    The axes are those of space, turned first about the x axis by α and then about the y axis by β, right-handed:
+    e_x = (cos β, 0, -sin β), e_y = (sin α sin β, cos α, sin α cos β), and the normal, e_x × e_y,
+    n = (cos α sin β, -sin α, cos α cos β).  Clocked by γ, e_x and e_y are then turned about n.
+    """
+
+    centre: Vector  # C (mm)
+    tilt: tuple[float, float]  # α, β (degrees)
+    clocking: float = 0.0  # γ (degrees)
+
+    @cached_property
+    def axes(self) -> tuple[Vector, Vector, Vector]:
+        """e_x, e_y and n, unit vectors in space."""
+        return clocked(axes(self.tilt), self.clocking) if self.clocking else axes(self.tilt)
+
+    @property
+    def middle(self) -> Vector:
+        """C (mm)."""
+        return self.centre
+
+    def height(self, point: Vector) -> float:
+        """n · (p - C): how far (mm) a point stands off the plane, negative on the side that light comes from."""
+        return math.fsum(n * (p - c) for n, p, c in zip(self.axes[2], point, self.centre, strict=True))
+
+    def point(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
+        """The points in space (mm) of places on the plane."""
+        (e_x, e_y, _), (c_x, c_y, _) = self.axes, self.centre
+        return tuple(c + (x - c_x) * a + (y - c_y) * b for c, a, b in zip(self.centre, e_x, e_y, strict=True))
+
+    def from_seen(self, q_x: Array, q_y: Array, eye: float) -> tuple[Array, Array]:
+        """The places of the plane that are `seen` there."""
+        (e_x, e_y, n), (c_x, c_y, c_z) = self.axes, self.centre
+        throw = c_z - eye
+        path = -self.height((0.0, 0.0, eye)) / (n[0] * q_x + n[1] * q_y + n[2] * throw)
+        off = path * q_x - c_x, path * q_y - c_y, (path - 1) * throw
+        return c_x + _dot(e_x, off), c_y + _dot(e_y, off)
+
+    def _advance(self, rays: Rays) -> tuple[Tensor, Tensor]:
+        normal = self.axes[2]
+        return _dot(normal, rays.direction), _dot(normal, self._from_centre(rays))
+
+    def places(self, rays: Rays) -> Sequence[Tensor]:
+        """x and y of rays that are on the plane (mm)."""
+        offset, (e_x, e_y, _) = self._from_centre(rays), self.axes
+        return self.centre[0] + _dot(e_x, offset), self.centre[1] + _dot(e_y, offset)
+
+    def way_to(self, rays: Rays, aim: Tensor) -> Tensor:
+        """(3, …) from the rays' positions to places (2, …) of the plane (mm)."""
+        (e_x, e_y, _), offset = self.axes, self._from_centre(rays)
+        x, y = aim[0] - self.centre[0], aim[1] - self.centre[1]
+        return torch.stack([x * a + y * b - o for a, b, o in zip(e_x, e_y, offset, strict=True)])
+
+    def _from_centre(self, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
+        """p - C (mm)."""
+        x, y, z = self.centre
+        return rays.position[0] - x, rays.position[1] - y, rays.above(z)
+
+
+def _dot(vector: Vector, of: Array | tuple[Array, ...]) -> Array:
+    return vector[0] * of[0] + vector[1] * of[1] + vector[2] * of[2]
