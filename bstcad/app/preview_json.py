@@ -17,7 +17,6 @@ from bstcad.report.light_figures import View, tones
 from bstcad.report.record import LEFT_OUT, LeftOut, changes
 from bstcad.report.rendering import turnable
 from bstcad.report.units import duration, number, percent, quantity
-from bstcad.scene.scene import Scene
 from bstcad.sweep.plan import QUALITIES
 
 CELLS = 96  # of the lens to be turned, a side
@@ -82,14 +81,13 @@ def figures(found: Preview) -> list[list[str]]:
     return rows
 
 
-def of_plan(plan: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
+def of_plan(plan: Mapping[str, Any]) -> dict[str, Any]:
     """The effects that are left out, a row each, and rough seconds and RRMSD of each quality."""
-    parts = [(plan, scene.target_keys[0]), *((part, part["target"]) for part in plan.get("further", ()))]
     rows = [
         [" ".join(filter(None, (LEFT_OUT[entry.kind], entry.detail and f"({entry.detail})"))), *changes(entry), of]
-        for part, key in parts
-        for of in [key if len(parts) > 1 else ""]
-        for entry in (LeftOut(**item) for item in part["left_out"])
+        for goal in plan["goals"]
+        for of in [goal["key"] if len(plan["goals"]) > 1 else ""]
+        for entry in (LeftOut(**item) for item in goal["left_out"])
     ]
     rough = {quality: told(each["seconds"], each["rrmsd"]) for quality, each in plan["estimated"].items()}
     simulated = [item["what"] for item in plan["simulated"]]

@@ -411,7 +411,7 @@ class Workbench:
         if name in ("preview", "settled"):
             return head | preview_json.of_preview(found)
         return head | (
-            preview_json.of_plan(found, asked.scene) if name == "effects" else preview_json.of_predictions(found)
+            preview_json.of_plan(found) if name == "effects" else preview_json.of_predictions(found)
         )
 
     # ---- designs ----

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bstcad.analysis.cost import HELD, WORTH
+from bstcad.optics.goal import suffix_of
 from bstcad.optics.sides import in_words
 from bstcad.report import explained
 from bstcad.report.prescription import WAYS, order_rows
@@ -254,9 +255,9 @@ def plan_effects(plan: Mapping[str, Any], title: str, optic: str) -> Group:
         if entry.simulate_by:
             remedies.add_row(Text(f"  {LEFT_OUT[entry.kind]}"), Text(entry.simulate_by))
     early = [*_verdict(plan), Text()] if "verdict" in plan else []
-    lines, further = [*early, Text(title, "bold"), simulated], plan.get("further", ())
-    for each in (plan, *further):
-        lines += _of_target(each, f", {each.get('target', 'target[0]')}" if further else "", optic)
+    lines = [*early, Text(title, "bold"), simulated]
+    for goal in plan["goals"]:
+        lines += _of_target(goal, suffix_of(goal["key"]), optic)
     lines.append(Text(" ".join(filter(None, (ESTIMATED.format(optic), plan.get("caveat"))))))
     if remedies.row_count:
         lines += [Text(), Text("To have it simulated, write in the scene:"), remedies]

@@ -23,7 +23,7 @@ import numpy as np
 from bstcad.analysis.cost import ControlCells, control_cells, limits
 from bstcad.analysis.light import blur
 from bstcad.analysis.steepness import Steepness
-from bstcad.optics.goal import restricted
+from bstcad.optics.goal import restricted, worst
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, rrmsd_by_rays
 from bstcad.optics.reach import unreached
@@ -56,35 +56,34 @@ def plan(
     units: Callable[[], Units] = measured_units,
     tick: Callable[[], None] = lambda: None,
 ) -> Iterator[dict[str, Any]]:
-    """The entries of `plan --json`: first simulated, left_out by change of the RRMSD, blur, unreachable; then the
-    predictions.
+    """The entries of `plan --json`: first simulated and goals: of each target its key, left_out by change of the RRMSD,
+    blur, unreachable, which stand outside of the list too, of the target that is blurred most; then the predictions.
 
     unreachable: what light cannot reach, as optics.reach.unreached has it; None: it reaches all that is to be lit.
 
     blur: width (mm, and pixels) of the image that a source of some size throws through the coarse lens, and the RRMSD
     of the target convolved with this image; None: the source has no size.
 
-    further: the last three of each further target, by its key; only there if there are several.  caveat: what the lens
-    of the estimates lacks of the scene's, a sentence; only there if it lacks anything.
+    caveat: what the lens of the estimates lacks of the scene's, a sentence; only there if it lacks anything.
 
     verdict: {kind, sentence}, with the effects only where these decide it: see `verdict`.
 
     text: of the scene file, whose lines are named.  keys: that the command line gives instead.  units: measures the
     units of this machine.  tick: called now and then; an exception from it ends the plan.
     """
-    at, (first, *others) = toml_positions(text), scene.each_alone()
+    at, scenes = toml_positions(text), scene.each_alone()
     asked = [{"what": what, "key": key, **_asked(key, at, keys)} for what, key in simulated(scene)]
-    lens = coarse_lens(first)
-    found = {"simulated": asked, **_effects(first, lens, scene.target_keys[0])}
-    if others:
-        pairs = zip(scene.target_keys[1:], others, strict=True)
-        found["further"] = [{"target": key, **_effects(alone, coarse_lens(alone), key)} for key, alone in pairs]
-    if others or scene.lens.front.shaped:
+    lenses = [coarse_lens(alone) for alone in scenes]
+    goals = list(map(_effects, scenes, lenses, scene.target_keys))
+    blurred = worst((goal["blur"] or {}).get("rrmsd", 0.0) for goal in goals)
+    found = {"simulated": asked, **goals[blurred], "goals": goals}
+    del found["key"]
+    if len(goals) > 1 or scene.lens.front.shaped:
         found["caveat"] = ALONE
     if early := verdict(scene, found):
         found["verdict"] = early
     yield found
-    likely = rounded(outlook(scene, lens, units, tick), 3)
+    likely = rounded(outlook(scene, lenses[0], units, tick), 3)
     yield likely | {"verdict": verdict(scene, found | likely)}
 
 
@@ -96,7 +95,7 @@ def verdict(scene: Scene, found: Mapping[str, Any]) -> dict[str, str] | None:
     """
     asked = scene.accept.rrmsd
     allowed = DEFAULT_RRMSD_LIMIT if asked is None else asked
-    targets = zip(scene.targets, (found, *found.get("further", ())), strict=True)
+    targets = zip(scene.targets, found["goals"], strict=True)
     images = [(each["blur"]["rrmsd"], each["blur"]["width"], target) for target, each in targets if each["blur"]]
     blurred, width, target = max(images, key=lambda image: image[0], default=(0.0, 0.0, scene.target))
     wide = max(high - low for low, high in (target.screen.x, target.screen.y))
@@ -139,15 +138,15 @@ def verdict(scene: Scene, found: Mapping[str, Any]) -> dict[str, str] | None:
 
 
 def _effects(scene: Scene, lens: Lens, key: str) -> dict[str, Any]:
-    """The entries left_out, blur and unreachable of `plan` for one target, of that key; lens: a coarse one for it."""
+    """The entries key, left_out, blur and unreachable of `plan` for one target; lens: a coarse one for it."""
     picture = scene.target.irradiance()
     part, _ = reachable_part(scene, picture, key)
     target = restricted(picture, part)
     beyond = None if part is None else unreached(picture, part, None if lens.reflects else scene.index)
     estimates, image = left_out(scene, lens, target), blur(scene.channels(), lens, scene.target.screen, target)
     return {
-        "left_out": [asdict(estimate) for estimate in estimates], "blur": image and rounded(asdict(image), 3),
-        "unreachable": beyond and rounded(beyond, 3),
+        "key": key, "left_out": [asdict(estimate) for estimate in estimates],
+        "blur": image and rounded(asdict(image), 3), "unreachable": beyond and rounded(beyond, 3),
     }  # fmt: skip
 
 

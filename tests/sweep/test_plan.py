@@ -238,13 +238,13 @@ def test_each_target_has_its_own_estimates():
     """Three times as far off the image of the source's cone is three times as wide."""
     scene = load(TEMPLATES / "caustic_portrait.toml").changed(TWO | {"source.real_divergence": 0.5})
     found, predicted = plan(scene)
-    [further] = found["further"]
+    first, second = found["goals"]
     near, far = (
-        next(entry for entry in each["left_out"] if entry["kind"] == "source size") for each in (found, further)
+        next(entry for entry in each["left_out"] if entry["kind"] == "source size") for each in (first, second)
     )
-    assert further["target"] == "target[1]" and far["blur_pixels"] / near["blur_pixels"] == pytest.approx(3, rel=0.1)
+    assert second["key"] == "target[1]" and far["blur_pixels"] / near["blur_pixels"] == pytest.approx(3, rel=0.1)
     alone = next(plan(scene.changed({"target": scene.targets[1]})))
-    assert further["left_out"] == alone["left_out"] and "further" not in alone and "caveat" not in alone
+    assert second["left_out"] == alone["left_out"] == alone["goals"][0]["left_out"] and "caveat" not in alone
     assert found["caveat"] == plans.ALONE
     assert predicted["not_predicted"] == "predictions were fitted on one target, and the scene has 2"
     wave = scene.changed({"target": scene.target, "wavefront": {"kind": "plane", "z": 220.0}})
@@ -280,7 +280,12 @@ def test_the_image_of_a_chip_is_stated_before_the_design():
 
 
 def predicted(low, likely, high):
-    return {"predicted": {"standard": {"rrmsd": (low, likely, high), "seconds": (20.0, 30.0, 40.0)}}, "blur": None}
+    figures = {"rrmsd": (low, likely, high), "seconds": (20.0, 30.0, 40.0)}
+    return {"predicted": {"standard": figures}, "goals": [{"blur": None}]}
+
+
+def blurred(rrmsd):
+    return {"goals": [{"blur": {"rrmsd": rrmsd, "width": 9.0, "pixels": 3.0}}]}
 
 
 VERDICTS = [
@@ -288,10 +293,10 @@ VERDICTS = [
     (0.1, predicted(0.08, 0.12, 0.15), "open", "0.1 is allowed, and 0.08 to 0.15 may come out."),
     (0.1, predicted(0.2, 0.3, 0.4), "beyond", "0.1 is allowed, and will hardly be reached."),
     (None, predicted(0.02, 0.03, 0.04), "no limit", "nine of ten designs would keep [accept] rrmsd = 0.0"),
-    (0.1, {"predicted": None, "not_predicted": "too odd", "blur": None}, "not predicted", "is predicted: too odd."),
-    (0.1, {"blur": {"rrmsd": 0.3, "width": 9.0, "pixels": 3.0}}, "blurred", "The RRMSD will be 0.15 to 0.3 whatever"),
-    (None, {"blur": {"rrmsd": 0.6, "width": 9.0, "pixels": 3.0}}, "blurred", "to 0.6 whatever the lens. Take"),
-    (0.5, {"blur": {"rrmsd": 0.3, "width": 9.0, "pixels": 3.0}}, None, ""),
+    (0.1, {"predicted": None, "not_predicted": "too odd", "goals": [{"blur": None}]}, "not predicted", "too odd."),
+    (0.1, blurred(0.3), "blurred", "The RRMSD will be 0.15 to 0.3 whatever"),
+    (None, blurred(0.6), "blurred", "to 0.6 whatever the lens. Take"),
+    (0.5, blurred(0.3), None, ""),
 ]
 
 
@@ -332,7 +337,7 @@ class TestCommand:
         out, err = capsys.readouterr()
         found = json.loads(out)
         keys = {"predicted", "not_predicted", "finer", "notes", "simulated", "left_out", "blur", "unreachable", "files"}
-        keys |= {"verdict"}
+        keys |= {"verdict", "goals"}
         assert set(found) == keys and err == ""
         assert found["blur"] is None and found["unreachable"] is None  # a beam of no size, all within reach
         assert found["predicted"] is None and "target.pixels from 120 to 512" in found["not_predicted"]
