@@ -1,4 +1,4 @@
-"""A surface, a receiver, a merit, an effect, checks, sections and a judge of a script's own: the package stays."""
+"""A surface, a receiver, an emitter, a merit, an effect, checks, sections, a judge of one's own: the package stays."""
 
 import json
 import os
@@ -14,8 +14,9 @@ import bstcad
 from bstcad import pipeline
 from bstcad.judges.faces import Traced
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Status
+from bstcad.optics.rays import Rays, Status
 from bstcad.optics.receivers import Receiver
+from bstcad.optics.sources import Emitter, all_alive
 from bstcad.optics.surfaces import sag
 from bstcad.report.light_figures import View
 from bstcad.scene.errors import SceneError
@@ -123,6 +124,40 @@ def test_light_is_collected_by_a_receiver_of_its_own(scene, tmp_path, monkeypatc
     on_level = bstcad.measure(design.lens, around.channels(), asked.target.screen, around.target.irradiance())
     assert on_level.rrmsd > 4 * report.rrmsd
     assert View.of(around).labels == ("s (mm)", "y (mm)")
+
+
+@dataclass(frozen=True)
+class Oval(Emitter):
+    """Parallel light along +z, E = 2 / (π w v) exp(-2 (x² / w² + y² / v²))."""
+
+    w: float
+    v: float
+    wavelength: float = 587.6
+
+    def irradiance(self, x, y, z):
+        return 2 / (np.pi * self.w * self.v) * torch.exp(-2 * ((x / self.w) ** 2 + (y / self.v) ** 2))
+
+    def window(self, outline, z, sags):
+        return Rectangle(*(2 * half for half in outline.half_extent))
+
+    def rays(self, x, y, z, area):
+        place = torch.stack([x, y, torch.zeros_like(x)])
+        along = torch.stack([torch.zeros_like(x), torch.zeros_like(x), torch.ones_like(x)])
+        return Rays(place, along, self.irradiance(x, y, z) * area, all_alive(x), axial=True, z=z - 20.0)
+
+
+@pytest.mark.filterwarnings("ignore:Pydantic serializer")  # no file says of which kind such a source is
+def test_light_of_an_emitter_of_its_own_is_spread_evenly(scene, tmp_path, monkeypatch):
+    """By design, proof and report: an oval beam, much brighter in its middle, on an even square."""
+    draws_nothing(monkeypatch)
+    asked = scene.changed({"target.x": [-20.0, 20.0], "target.y": [-20.0, 20.0], "target.outline": None})
+    oval = asked.model_copy(update={"source": Oval(5.0, 8.0)})
+    design = bstcad.Design(pipeline.design(oval))
+    report = design.write(tmp_path / "oval", progress=False, effort=quick_effort())
+    assert report.passed and report.rrmsd < 0.1, report
+    assert sum(report.flux.values()) == pytest.approx(1, abs=1e-12)
+    flat = bstcad.measure(oval.flat_lens(33), oval.channels(), oval.target.screen, oval.target.irradiance())
+    assert flat.rrmsd > 0.5
 
 
 def test_a_merit_of_its_own_is_refused_for_several_goals(scene):

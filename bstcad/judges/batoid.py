@@ -23,9 +23,9 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.measure import a_side
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Rays, axes
-from bstcad.optics.sources import Collimated, Source
+from bstcad.optics.sources import Source
 from bstcad.optics.trace import clear_window, launch_strips
-from bstcad.optics.wavefront_error import followed
+from bstcad.optics.wavefront_error import followed, from_reference
 
 BEYOND = 0.125  # of a face's width: margin of its grid beyond the rim, where the search for a ray may begin
 ARCS = 4096  # corners of the polygon of an outline with round corners
@@ -141,11 +141,7 @@ def _before_reference(source: Source, rays: Rays, z: float) -> np.ndarray:
 
     That is the plane across parallel light, or the sphere about a point, through where the axis meets the plane z.
     """
-    x, y, h = (p.numpy().ravel() for p in (*rays.position[:2], rays.above(z)))
-    if not isinstance(source, Collimated):
-        return np.full_like(x, math.dist(source.position, (0.0, 0.0, z)))
-    d_x, d_y, d_z = (p.numpy().ravel() for p in rays.direction)
-    return -(x * d_x + y * d_y + h * d_z)
+    return -from_reference(source, z, rays, rays.sense).numpy().ravel()
 
 
 def cannot(lens: Lens, channels: Sequence[Channel]) -> str:

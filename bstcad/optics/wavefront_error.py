@@ -29,9 +29,9 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.motion import Motion
 from bstcad.optics.rays import Rays
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.sources import Collimated, Source
+from bstcad.optics.sources import Source
 from bstcad.optics.trace import behind, clear_window
-from bstcad.optics.wavefront import NM, Wave, beyond, length
+from bstcad.optics.wavefront import NM, Wave, length
 
 RAYS = 512  # a side of the light before the lens
 CELLS = 256  # a side of the map, at most
@@ -115,11 +115,7 @@ def followed(source: Source, lens: Lens, rays: Rays, z: float) -> tuple[Rays, Te
 def from_reference(source: Source, z: float, rays: Rays, sense: int) -> Tensor:
     """The way (mm) of rays to the first surface from where paths count; z: of its vertex, sense: of the light there."""
     place = torch.stack([*rays.position[:2], rays.above(z)])
-    if not isinstance(source, Collimated):
-        x, y, start = source.position
-        return beyond(place, (x, y, start - z))
-    n_x, n_y, n_z = source.axes[2]
-    return sense * (n_x * place[0] + n_y * place[1] + n_z * place[2])
+    return source.reference(place, z, sense)
 
 
 def _between(before: Rays, there: Rays) -> Tensor:

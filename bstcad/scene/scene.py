@@ -246,8 +246,7 @@ class Scene(Record):
         The blank keeps lens.min_thickness at the rim, and the rim stays behind the source.
         """
         lens, source = self.lens, self.source
-        start = source.position[2] if isinstance(source, Point) else source.z
-        falls = start - lens.front.z if start is not None else -math.inf
+        falls = source.begins - lens.front.z if source.begins is not None else -math.inf
         return INSIDE * falls, INSIDE * (lens.back.z - lens.front.z - lens.min_thickness)
 
     def clearance(self, highest: float) -> float:

@@ -93,6 +93,7 @@ SUN = (0.5, 0.56)  # degrees; divergence of sunlight, 0.53 in the mean
 LINE = 10.0  # nm; width of a line of which the scene says nothing: an LED's is 20 to 40, a laser's below 1
 DIAMETER = 0.1  # mm; of a point source
 DIVERGENCE = 0.1  # degrees; of parallel light
+USUAL = {"diameter": (DIAMETER, "disc", "mm"), "divergence": (DIVERGENCE, "cone", "degrees")}  # by Emitter.size_key
 THREE = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # Gauss points of an even line, in half widths
 DISC = tuple((x, y, 1 / 4) for x in (-0.5, 0.5) for y in (-0.5, 0.5))  # points of an even disc, in radii; degree 3
 BY_FRESNEL, BY_LINES = '[[effects]] kind = "fresnel"', "source.wavelength = [[nm, weight], …]"
@@ -166,18 +167,15 @@ def _dispersion(scene: Scene, reference: Reference) -> LeftOut:
 def band(scene: Scene) -> tuple[float, float]:
     """Return the band (nm) that light of one wavelength stands for: of the sun's divergence VISIBLE, else LINE wide."""
     source = scene.source
-    if source.kind != "point" and SUN[0] <= (source.divergence or source.real_divergence or 0.0) <= SUN[1]:
+    if source.size_key == "divergence" and SUN[0] <= (source.divergence or source.real_divergence or 0.0) <= SUN[1]:
         return VISIBLE
     return source.main_wavelength - LINE / 2, source.main_wavelength + LINE / 2
 
 
 def _size(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
-    if scene.source.extent is not None:
+    if scene.source.extent is not None or (key := scene.source.size_key) is None:
         return
-    if scene.source.kind == "point":
-        key, stated, usual, shape, unit = "diameter", scene.source.real_diameter, DIAMETER, "disc", "mm"
-    else:
-        key, stated, usual, shape, unit = "divergence", scene.source.real_divergence, DIVERGENCE, "cone", "degrees"
+    stated, (usual, shape, unit) = getattr(scene.source, f"real_{key}"), USUAL[key]
     wide = replace(reference.channel.source, **{key: stated or usual})
     radius = wide.extent.radius
     channels = [replace(reference.channel, source=wide.element(radius * u, radius * v), weight=w) for u, v, w in DISC]

@@ -25,7 +25,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import tubes_picture
 from bstcad.optics.media import refractive_index
-from bstcad.optics.motion import Motion, moved_source, turns_alike
+from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Vector
 from bstcad.optics.sides import in_words
@@ -55,7 +55,7 @@ class Setup:
         if part == "lens":
             back = float(self.lens.back.plain().from_vertex().z)
             return 0.0, 0.0, back if self.lens.reflects else (self.lens.front.z + back) / 2
-        points = [_position(channel.source, self.lens.entrance.z) for channel in self.channels]
+        points = [channel.source.starts(self.lens.entrance.z) for channel in self.channels]
         mean = np.average(points, axis=0, weights=[channel.weight for channel in self.channels])
         return tuple(mean.tolist())
 
@@ -70,7 +70,7 @@ class Setup:
             return replace(around, placed=motion if self.placed is None else self.placed.after(motion))
         if part == "screen":
             return replace(self, screen=self.screen.moved(motion))
-        return self.with_sources(lambda source: moved_source(source, motion, self.lens.entrance.z))
+        return self.with_sources(lambda source: source.moved(motion, self.lens.entrance.z))
 
     def with_sources(self, change: Callable[[Source], Source]) -> Setup:
         """With each channel's source changed."""
@@ -87,13 +87,6 @@ class Setup:
         faces = {name: _scaled(getattr(lens, name), factor, about) for name in ("front", "back")}
         clear = lens.clear and tuple(aperture.scaled(factor) for aperture in lens.clear)
         return replace(self, lens=replace(lens, outline=lens.outline.scaled(factor), clear=clear, **faces))
-
-
-def _position(source: Source, entrance: float) -> Vector:
-    if source.kind == "point":
-        return source.position
-    z = entrance if source.z is None else source.z
-    return (*source.shift(z), z)
 
 
 def _scaled(surface: Surface, factor: float, about: float) -> Surface:
@@ -197,9 +190,9 @@ def kinds(setup: Setup, material: str | None = None) -> dict[str, Kind]:
 def _motions(setup: Setup) -> Iterator[Kind]:
     """Shifts along and turns about x, y and z of lens, source and screen."""
     sources, hidden = [channel.source for channel in setup.channels], {"source.clocking"}
-    if all(source.kind == "collimated" and not source.tilted for source in sources):
+    if all(source.shifts_alike for source in sources):
         hidden.add("source.axial")  # parallel light does not change along the axis
-    if not all(map(turns_alike, sources)):
+    if not all(source.turns_alike for source in sources):
         hidden.add("lens.clocking")  # round light hides that of the source; other light cannot be turned
     for part in ("lens", "source", "screen"):
         name = "mirror" if part == "lens" and setup.lens.reflects else part
@@ -276,28 +269,18 @@ def _redder(material: str, setup: Setup, by: float) -> Setup:
 def _lights(setup: Setup) -> Iterator[Kind]:
     """Errors of the cone and of the size of point sources."""
     sources = [channel.source for channel in setup.channels]
-    if any(source.kind == "point" and (source.half_angle_1e2 or source.half_angle) for source in sources):
+    if any(source.wider(0.0) for source in sources):
         yield Kind("source.angle", "width of the source's cone, relative", "", _wider)
-    if len({source.place for source in sources}) > 1 and all(source.kind == "point" for source in sources):
+    if len({source.place for source in sources}) > 1 and all(source.larger(0.0, source.place) for source in sources):
         yield Kind("source.size", "size of the source, relative", "", _larger)
 
 
 def _wider(setup: Setup, by: float) -> Setup:
-    def change(source: Source) -> Source:
-        name = "half_angle_1e2" if source.half_angle_1e2 else "half_angle"
-        angle = math.radians(getattr(source, name))
-        return replace(source, **{name: math.degrees(math.atan((1 + by) * math.tan(angle)))})
-
-    return setup.with_sources(change)
+    return setup.with_sources(lambda source: source.wider(by))
 
 
 def _larger(setup: Setup, by: float) -> Setup:
-    middle = np.array(setup.pivot("source"))
-
-    def change(source: Source) -> Source:
-        return replace(source, position=tuple((middle + (1 + by) * (np.array(source.position) - middle)).tolist()))
-
-    return setup.with_sources(change)
+    return setup.with_sources(lambda source: source.larger(by, setup.pivot("source")))
 
 
 # --- one face against the other ---------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.motion import Motion, moved_source
+from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Circle
 from bstcad.optics.sources import Collimated, Point
 
@@ -72,7 +72,7 @@ def test_each_pixel_goes_where_the_motion_takes_it(name, motion):
 def test_rays_of_a_moved_source_are_moved_rays(source, motion):
     """Back by the motion, each is a ray of the source: through its point, or along its beam inside its aperture."""
     z = 10.0
-    after = moved_source(source, motion, z)
+    after = source.moved(motion, z)
     x = torch.linspace(-3.0, 3.0, 7, dtype=torch.float64)
     x, y = torch.meshgrid(x, x, indexing="ij")
     if isinstance(source, Collimated):
