@@ -18,7 +18,7 @@ from bstcad.analysis.shape import thickness_range
 from bstcad.analysis.steepness import Steepness, needed
 from bstcad.baselines import integration, paper
 from bstcad.folder import Made
-from bstcad.optics.goal import restricted
+from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.reach import GRAZING, grazing_of, spread_at, unreached
@@ -32,7 +32,6 @@ from bstcad.scene.quality import Tailoring
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import slope_map, stage1, stage2, two_faces
 from bstcad.tailoring.feasibility import demands, refused
-from bstcad.tailoring.goals import Goal
 from bstcad.tailoring.grazing import cleared
 from bstcad.tailoring.machinability import BOUNDED, front_shaped, held, kept, moved_clear
 from bstcad.tailoring.reachable import reachable
@@ -122,12 +121,10 @@ def design(
         raise SceneError("merit: is one of a picture, and the scene has several goals; leave it out, or ask for less")
     torch.manual_seed(scene.tailoring.seed)
     device = device_for(device)
-    parts, edge, wanted = within_reach(scene, progress)
+    goals, edge = within_reach(scene, progress)
     knobs = scene.tailoring.resolved(scene.lens.back.net)
     later = later and knobs.max_time is None
-    task = task_of(
-        scene, wanted[0], knobs, edge, further=wanted[1:], progress=progress, tidy=processes.return_freed, merit=merit
-    )
+    task = task_of(scene, goals, knobs, edge, progress=progress, tidy=processes.return_freed, merit=merit)
     task = posed(scene, task)
     limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve(scene) + JUDGING}
     record = Record() if start is None else start.record
@@ -150,8 +147,7 @@ def design(
     lens = replace(lens.plain(), index=scene.index, losses=None)
     if scene.lens.front.fixed:  # as it was given: tailoring may have worked with less digits of it
         lens = replace(lens, front=scene.lens.front.surface)
-    goals = tuple(goal.restricted(part) for goal, part in zip(scene.goals, parts, strict=True))
-    steep = steepness(task.heaviest.source, lens, task.screen, task.target, sent=followed.transport)
+    steep = steepness(task.heaviest.source, lens, goals[0], sent=followed.transport)
     making = _making(followed, driver.record, stopped, steep)
     return Made(
         resolved(scene, lens), scene.as_mounted(lens), goals, making, device=device, transport=followed.transport,
@@ -159,44 +155,31 @@ def design(
     )  # fmt: skip
 
 
-def within_reach(
-    scene: Scene, progress: Progress
-) -> tuple[list[np.ndarray | None], Edge | None, list[np.ndarray]]:  # fmt: skip
-    """(parts, edge, wanted): of each target what light can reach of it, as `reachable_part` has it, and its picture.
+def within_reach(scene: Scene, progress: Progress) -> tuple[tuple[Goal, ...], Edge | None]:
+    """(goals, edge): the goals of a scene without what light cannot reach, as `reachable_part` has both.
 
     Of a target that light cannot reach all of, `progress` is told.  SceneError as `reachable_part`.
     """
-    parts, edge, wanted = [], None, []
-    for alone, key in zip(scene.each_alone(), scene.target_keys, strict=True):
-        picture = alone.target.irradiance()
-        part, its_edge = reachable_part(alone, picture, key)
+    goals, edge = [], None
+    for alone, goal in zip(scene.each_alone(), scene.goals, strict=True):
+        part, its_edge = reachable_part(alone, goal)
         if part is not None:
-            of = f"{key}: " if len(scene.targets) > 1 else ""
-            progress("reach", 0, 0, f"{of}{unreachable(alone, part, picture)}; the design is for the rest")
-        parts, edge, wanted = [*parts, part], edge or its_edge, [*wanted, restricted(picture, part)]
-    return parts, edge, wanted
+            of = f"{goal.key}: " if len(scene.targets) > 1 else ""
+            progress("reach", 0, 0, f"{of}{unreachable(alone, part, goal.picture)}; the design is for the rest")
+        goals, edge = [*goals, goal.restricted(part)], edge or its_edge
+    return tuple(goals), edge
 
 
-def task_of(
-    scene: Scene, target: np.ndarray, knobs: Tailoring, edge: Edge | None, *, further: Sequence[np.ndarray] = (),
-    **more: Any,
-) -> Task:  # fmt: skip
-    """The task of a scene; target: (rows, columns) that its light shall have, edge: as `reachable_part` has it.
-
-    further: the same for the targets behind the first; (): all of their pictures.  more: fields of Task that no scene
-    tells.
-    """
-    others = zip(scene.targets[1:], further or [t.irradiance() for t in scene.targets[1:]], strict=True)
+def task_of(scene: Scene, goals: Sequence[Goal], knobs: Tailoring, edge: Edge | None, **more: Any) -> Task:
+    """The task of a scene; goals, edge: as `within_reach` has them.  more: fields of Task that no scene tells."""
     light = scene.with_source_scaled(0.0).channels()
-    several = len(scene.targets) > 1 or scene.wavefront is not None  # of which stage 3 knows nothing
-    sizes = stage2.SIZES if scene.source.extent and knobs.method != "integration" and not several else ()
+    sizes = stage2.SIZES if scene.source.extent and knobs.method != "integration" else ()
     scaled = [scene.with_source_scaled(share) for share, _ in sizes]
     return Task(
-        light, scene.target.screen, target, knobs, least=scene.lens.min_thickness, free=scene.lens.front.free,
+        light, tuple(goals), knobs, least=scene.lens.min_thickness, free=scene.lens.front.free,
         rim_sags=scene.rim_sags, grown=tuple(each.channels() for each in scaled), bounds=scene.lens.bounds,
-        spreads=tuple(Spread(each.source, light, each.draw) for each in scaled), edge=edge,
-        weight=scene.target.weight, further=tuple(Goal(t.screen, wanted, t.weight) for t, wanted in others),
-        wave=scene.wavefront, solution=SIGNS.get(knobs.solution), front_sides=scene.lens.front_net, **more,
+        spreads=tuple(Spread(each.source, light, each.draw) for each in scaled), edge=edge, wave=scene.wavefront,
+        solution=SIGNS.get(knobs.solution), front_sides=scene.lens.front_net, **more,
     )  # fmt: skip
 
 
@@ -223,12 +206,8 @@ def second_stage(task: Task, lens: Lens, state: Stage2State | None = None) -> tu
     return "stage 3", stage2.with_stage3(before, task, lens, state)
 
 
-def reachable_part(
-    scene: Scene, picture: np.ndarray, key: str = "target"
-) -> tuple[np.ndarray | None, Edge | None]:  # fmt: skip
-    """(rows, columns) True in the pixels that a design of the scene can light, and the light at their edge.
-
-    key: by which sentences call the target.
+def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | None]:
+    """(rows, columns) True in the pixels that a design for the one goal of a scene can light, and the edge's light.
 
     None, None: it can light all that its picture lights.  A mirror, whose slope alone binds it, has no such edge.
     SceneError where it can light none, or not all in a scene with target.unreachable = "refuse".
@@ -237,22 +216,22 @@ def reachable_part(
         return None, None
     channels = scene.with_source_scaled(0.0).channels()
     light = max(channels, key=lambda channel: channel.weight)  # stage 1 reckons with it alone
-    lens, screen = light.through(scene.flat_lens(REACH_NET)), scene.target.screen
-    grazing = GRAZING
+    lens, grazing = light.through(scene.flat_lens(REACH_NET)), GRAZING
     if not lens.reflects:
         grazing = grazing_of(light.index, [each.index for each in channels], spread_at(scene.source, lens))
-    part = reachable(light.source, lens, picture, screen=screen, grazing=grazing)
+    part = reachable(light.source, lens, goal, grazing=grazing)
     if part is not None and scene.lens.front.free:  # another front may send light further
         front = stage1.shaped_front(
-            light.source, lens, picture, screen, free=scene.lens.front.free, rim_sags=scene.rim_sags, repeats=1
-        ).front
-        part = reachable(light.source, lens.with_front(front), picture, screen=screen, grazing=grazing)
+            light.source, lens, goal.picture, goal.receiver, free=scene.lens.front.free, rim_sags=scene.rim_sags,
+            repeats=1,
+        ).front  # fmt: skip
+        part = reachable(light.source, lens.with_front(front), goal, grazing=grazing)
     if part is None:
         return None, None
-    if not picture[part].sum() > LEAST_REACHED:
+    if not goal.picture[part].sum() > LEAST_REACHED:
         reached(lens, math.nan)
     if scene.target.unreachable == "refuse":
-        raise SceneError(f"{key}: {unreachable(scene, part, picture)}; {FURTHER[scene.optic]}")
+        raise SceneError(f"{goal.key}: {unreachable(scene, part, goal.picture)}; {FURTHER[scene.optic]}")
     return part, None if lens.reflects else Edge(light, grazing)
 
 
@@ -299,10 +278,10 @@ def _compared(making: Making, task: Task, lens: Lens, before: int) -> Making:
     return replace(making, twins=twins, stages=stages, seconds_total=making.seconds_total + stage.seconds)
 
 
-def steepness(source: Source, lens: Lens, screen: Screen, target: np.ndarray, sent: TransportMap) -> Steepness:
-    """The slope that the light of a target needs of the back, by the map of stage 1."""
+def steepness(source: Source, lens: Lens, goal: Goal, sent: TransportMap) -> Steepness:
+    """The slope that the light of a goal needs of the back, by the map of stage 1."""
     at_back = sent.plane == "back"
-    return needed(source, lens, screen, target, x=sent.x, y=sent.y, places=sent.source, at_back=at_back)
+    return needed(source, lens, goal.receiver, goal.picture, x=sent.x, y=sent.y, places=sent.source, at_back=at_back)
 
 
 def _making(followed: Followed, went: Record, stopped: str, steep: Steepness) -> Making:
@@ -356,7 +335,9 @@ def _stage1(
     if compare and not driver.hurry:
         precision = compare_precisions(task, lens)
         driver.end(COMPARED)
-    return Followed(Parameters.of(lens), last.mapping, transport_of(last, lens, task.screen), precision, rrmsd=rrmsd)
+    return Followed(
+        Parameters.of(lens), last.mapping, transport_of(last, lens, task.goals[0].receiver), precision, rrmsd=rrmsd
+    )
 
 
 def transport_of(last: Step, lens: Lens, screen: Screen) -> TransportMap:

@@ -12,13 +12,12 @@ import pytest
 import torch
 
 from bstcad import pipeline
-from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.compiling import fused, fused_whole
 from bstcad.pipeline import design
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage2
-from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.stage2 import Problem
 from tests.conftest import pixels_of_all
 from tests.fake_device import SECOND, SecondDevice, on_second
@@ -136,10 +135,7 @@ def evaluated(wanted, heights):
     """(merit, gradient) of a shallow bowl as the back face."""
     lens = wanted.flat_lens(33, device=heights.device)
     lens = replace(lens, back=replace(lens.back, heights=heights * 1e-3 * wanted.lens.outline.half_extent[0]))
-    target = wanted.target
-    screen = Screen(target.z, target.x, target.y, target.columns_rows)
-    picture = torch.from_numpy(target.irradiance()).to(heights)
-    merit = TubeMerit.of(wanted.channels(), lens, 48, screen, picture, 0.03)
+    merit = Merit.of(wanted.channels(), lens, 48, wanted.goals, 0.03)
     value, gradients, _ = Problem(lens, merit)([net.heights for net in lens.nets])
     return value, torch.cat([gradient.reshape(-1) for gradient in gradients])
 

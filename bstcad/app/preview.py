@@ -19,6 +19,8 @@ import torch
 from bstcad import pipeline
 from bstcad.analysis.light import blur
 from bstcad.analysis.shape import describe
+from bstcad.optics.channels import Channel
+from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import a_side, seen_through, simulated, tubes_picture
 from bstcad.optics.sides import both, coarser
@@ -27,8 +29,8 @@ from bstcad.report.light_figures import rrmsd
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import stage1, stage2, two_faces
 from bstcad.tailoring.machinability import front_shaped, held, kept, moved_clear
+from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Progress, Step, Task
-from bstcad.tailoring.source_image import BlurredMerit
 
 COARSE_NET = 33  # of the first rounds of stage 1
 CELLS = 48  # of the transport, a side
@@ -91,10 +93,9 @@ def preview(scene: Scene, pains: Pains = AT_ONCE, outdated: Callable[[], bool] =
     began, remarks = time.perf_counter(), list(scene.warnings())
     small = made_small(scene, pains)
     told = _listening(outdated, remarks)
-    _, edge, wanted = pipeline.within_reach(small, told)
+    goals, edge = pipeline.within_reach(small, told)
     knobs = small.tailoring.resolved(small.lens.back.net)
-    task = pipeline.task_of(small, wanted[0], knobs, edge, further=wanted[1:], progress=told)
-    task = replace(pipeline.posed(small, task), hasty=True)
+    task = pipeline.posed(small, pipeline.task_of(small, goals, knobs, edge, progress=told, hasty=True))
     lens = small.flat_lens(knobs.levels[0], as_wide_as=knobs.levels[-1])
     *_, last = (step for step in _first_stage(task, lens) if told("stage 1", 0, 0, "") is None)
     pipeline.check_front(last.lens, small)
@@ -109,7 +110,7 @@ def preview(scene: Scene, pains: Pains = AT_ONCE, outdated: Callable[[], bool] =
     if bounds is not None:
         lens = kept(lens, bounds)
     lens = small.as_mounted(replace(lens.plain(), index=small.index, losses=None))
-    found = _lit(small, task, lens, wanted)
+    found = _lit(small, task, lens)
     if not found.shape["thickness_min"] > 0 or not small.clearance(lens.front.z + found.shape["thickness_max"]) > 0:
         pipeline.check_thickness(lens, small)
     return replace(found, remarks=tuple(remarks), seconds=time.perf_counter() - began)
@@ -165,10 +166,10 @@ def _first_stage(task: Task, lens: Lens) -> Iterator[Step]:
 
 def _with_front(task: Task, lens: Lens) -> Lens:
     """The lens with the front that suits a coarse back best."""
-    coarse = lens.refined(coarser(lens.back.shape, FRONT_NET))
+    coarse, goal = lens.refined(coarser(lens.back.shape, FRONT_NET)), task.goals[0]
     shaped = stage1.shaped_front(
-        task.heaviest.source, coarse, task.target, task.screen, free=task.free, rim_sags=task.rim_sags, n=FRONT_CELLS,
-        iterations=FRONT_STEPS, repeats=1,
+        task.heaviest.source, coarse, goal.picture, goal.receiver, free=task.free, rim_sags=task.rim_sags,
+        n=FRONT_CELLS, iterations=FRONT_STEPS, repeats=1,
     )  # fmt: skip
     return lens.with_front(shaped.front)
 
@@ -188,13 +189,12 @@ def _second_stage(task: Task, lens: Lens) -> Iterator[Step]:
             return
 
 
-def _lit(scene: Scene, task: Task, lens: Lens, wanted: Sequence[np.ndarray]) -> Preview:
+def _lit(scene: Scene, task: Task, lens: Lens) -> Preview:
     """The preview of a lens: its light by fresh tubes, of a source of some size by its images, and its figures."""
-    pictures = []
-    for target, picture in zip(scene.targets, wanted, strict=True):
-        light = _picture(scene, task, lens, target.screen)
-        pictures.append((picture, light * (picture.sum() / max(light.sum(), 1e-300))))
-    channels = scene.channels()
+    pictures, channels = [], scene.channels()
+    for goal in task.goals:
+        light = _picture(channels, task, lens, goal)
+        pictures.append((goal.picture, light * (goal.picture.sum() / max(light.sum(), 1e-300))))
     rays = max(round(a_side(channels) * RAYS), 8)
     ledger = simulated(lens, channels, scene.target.screen, n=rays, seed=SEED).flux
     images = [blur(channels, lens, target.screen, target.irradiance(), n=IMAGE_PLACES) for target in scene.targets]
@@ -214,13 +214,11 @@ def _lit_share(scene: Scene, lens: Lens) -> float:
 
 
 @torch.no_grad()
-def _picture(scene: Scene, task: Task, lens: Lens, screen: Any) -> np.ndarray:
-    """(rows, columns) of the light on a screen."""
-    n = round(SEEN * max(screen.shape))
+def _picture(channels: Sequence[Channel], task: Task, lens: Lens, goal: Goal) -> np.ndarray:
+    """(rows, columns) of the light on the receiver of a goal."""
+    n = round(SEEN * max(goal.receiver.shape))
     if not task.spreads:
-        return tubes_picture(lens, scene.channels(), screen, n).numpy()
-    merit = BlurredMerit.of(
-        task.spreads[-1], lens, n, screen=screen, target=torch.ones(screen.shape, dtype=torch.float64), overshoot=0.0,
-        seed=SEED, by_images=True,
-    )  # fmt: skip
-    return merit.picture(merit.landing(lens))[0].cpu().numpy().clip(min=0.0)
+        return tubes_picture(lens, channels, goal.receiver, n).numpy()
+    spread = task.spreads[-1]
+    merit = Merit.of(spread.centre, lens, n, [goal], overshoot=0.0, spread=spread)
+    return merit.picture(0, *merit.landing(lens).on_goals)[0].cpu().numpy().clip(min=0.0)

@@ -76,15 +76,15 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
     Its initial point is on the ray through the middle of the first surface, in the plane of the back; where the back
     would then come too near to the front, it begins anew from as far along +z as that takes.
     """
-    knobs, plane = task.knobs, task.screen.plane
+    knobs, screen = task.knobs, task.goals[0].receiver
     source, exact, z = task.heaviest.source, lens.plain(), lens.back.z
     area, n = clear_window(source, exact), knobs.rays // 2 * 2 + 1  # odd: one ray is through the middle
     x, y = sampling.grid(area, n)
     coming = to_first_net(source.rays(x, y, exact.entrance.z, area.area / n**2), exact)
-    aim = slope_map.aim_points(mapping, exact, task.screen, x=x, y=y)
+    aim = slope_map.aim_points(mapping, exact, screen, x=x, y=y)
     for _ in range(STARTS):
         start = exact.back.z
-        points = march(coming, aim, plane, law=exact.last_freeform.law, z=start, first=first)
+        points = march(coming, aim, screen.plane, law=exact.last_freeform.law, z=start, first=first)
         back = fitted(exact.back, points, lit(points, coming, exact), knobs.levels)
         exact = moved_clear(exact.with_back(back), z, task.least)
         if exact.back.z == start:

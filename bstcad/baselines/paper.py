@@ -84,13 +84,14 @@ def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: 
     n = min(task.knobs.rays, RAYS_PER_CONTROL_POINT * max(lens.back.shape))
     x, y = (t.to(lens.like) for t in sampling.grid(area, n))
     rays = task.heaviest.source.rays(x, y, lens.entrance.z, area.area / n**2)
-    aim, shape = slope_map.aim_points(mapping, lens, task.screen, x=x, y=y), lens.front.parameters()
+    screen, shape = task.goals[0].receiver, lens.front.parameters()
+    aim = slope_map.aim_points(mapping, lens, screen, x=x, y=y)
     start = [lens.back.heights, *(torch.as_tensor(shape[name]).to(lens.back.heights) for name in task.free)]
     nearest = min(RATES, key=lambda m: abs(m - max(lens.back.shape)))
 
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
         leaves = [p.detach().clone().requires_grad_() for p in parameters]
-        merit = landing(trace(rays, with_parameters(lens, leaves, task.free), task.screen.plane), aim)
+        merit = landing(trace(rays, with_parameters(lens, leaves, task.free), screen.plane), aim)
         return float(merit.detach()), list(torch.autograd.grad(merit, leaves)), float("nan")
 
     steps, rates = task.knobs.stage1_iterations, [RATES[nearest], *(FRONT_RATES[name] for name in task.free)]
@@ -108,7 +109,7 @@ def _improved(lens: Lens, best: Best, free: tuple[str, ...], net: Sides) -> Lens
 
 def transport(task: Task, lens: Lens) -> Mapping:
     """The map from the front's vertex plane to the target, for a blank lens."""
-    knobs = task.knobs
+    knobs, goal = task.knobs, task.goals[0]
 
     def progress(s: TransportStep) -> None:
         task.progress("transport", s.iteration, knobs.transport_iterations, f"mass error {s.mass_error:.4f}")
@@ -116,8 +117,8 @@ def transport(task: Task, lens: Lens) -> Mapping:
     return slope_map.map_to_target(
         task.heaviest.source,
         lens,
-        task.target,
-        screen=task.screen,
+        goal.picture,
+        screen=goal.receiver,
         n=knobs.transport_grid,
         iterations=knobs.transport_iterations,
         progress=progress,
@@ -137,7 +138,7 @@ def as_seen_by_tent(target: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class TentMerit:
-    """RRMSD² of rays by tent binning (Wang et al. 2023, Eq. 15), plus TubeMerit's pull; summed over channels."""
+    """RRMSD² of rays by tent binning (Wang et al. 2023, Eq. 15), plus the pull of merit.py; summed over channels."""
 
     channels: tuple[Channel, ...]
     screen: Screen
@@ -169,9 +170,9 @@ class RaySearch:
 
 def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[Step]:
     """Stage 2: freshly sampled random rays in each step; or further from a state."""
-    knobs, start = task.knobs, lens if state is None else state.lens.applied(lens)
-    target = torch.from_numpy(task.target).to(lens.like.device)
-    merit = TentMerit.of(task.channels, task.screen, target, knobs.overshoot)
+    knobs, goal, start = task.knobs, task.goals[0], lens if state is None else state.lens.applied(lens)
+    target = torch.from_numpy(goal.picture).to(lens.like.device)
+    merit = TentMerit.of(task.channels, goal.receiver, target, knobs.overshoot)
     seeds = itertools.count(knobs.seed + 2 + (state.best.evaluations if state else 0))
     bundles = (random_bundles(task.channels, start, knobs.rays**2, seed) for seed in seeds)
     if state is None:

@@ -535,11 +535,6 @@ def _of_goals(scene: Scene) -> Iterator[str]:
             different.append(alike)
     pictures, shaped = len(different), lens.shaped or (1,)
     goals = pictures + (wave is not None)
-    if goals > 1 and scene.source.extent is not None:
-        yield (
-            "source: for several goals the lens is tailored for light of a point, or parallel light, and judged by the "
-            "source as it is; expect the pictures blurred by its size"
-        )
     if goals < len(shaped):
         yield (
             "lens.front.optimise: one picture is the back's work alone, and the front stays as it is; add a second "

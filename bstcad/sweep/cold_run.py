@@ -29,6 +29,7 @@ from typing_extensions import TypedDict
 from bstcad.folder import SCENE, read_nominal, scene_files
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, measure
@@ -39,7 +40,7 @@ from bstcad.runs import environment, files, processes
 from bstcad.runs.cluster import HERE, Answer
 from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.scene import Scene, load
-from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.stage2 import Problem
 
 # --- records ----------------------------------------------------------------------------------------------------------
@@ -194,9 +195,9 @@ def kernel(tubes: int = TUBES) -> Callable[[], Any]:
     outline, span = Rectangle(WIDTH, WIDTH), (-WIDTH / 2, WIDTH / 2)
     back = BSplineSurface(THICKNESS, WAVE * u.cos()[:, None] * u.cos(), span, span)
     lens = Lens(Plane(0.0), back, outline, INDEX)
-    target = torch.full((PIXELS, PIXELS), 1.0, dtype=torch.float64)
+    target = np.full((PIXELS, PIXELS), 1.0)
     channel, screen = Channel(Collimated(outline), INDEX), Screen(SCREEN, span, span, PIXELS)
-    merit = TubeMerit.of((channel,), lens, tubes, screen, target=target, overshoot=0.03)
+    merit = Merit.of((channel,), lens, tubes, [Goal("target", screen, target)], overshoot=0.03)
     once = partial(Problem(lens, merit), [back.heights])
     once()  # compiles and allocates
     return once

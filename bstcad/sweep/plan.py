@@ -23,12 +23,21 @@ import numpy as np
 from bstcad.analysis.cost import ControlCells, control_cells, limits
 from bstcad.analysis.light import blur
 from bstcad.analysis.steepness import Steepness
-from bstcad.optics.goal import restricted, worst
+from bstcad.optics.goal import worst
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, rrmsd_by_rays
 from bstcad.optics.reach import unreached
 from bstcad.optics.sides import both, coarser, scaled
-from bstcad.pipeline import check_thickness, reachable_part, reached, second_stage, steepness, task_of, transport_of
+from bstcad.pipeline import (
+    check_thickness,
+    reachable_part,
+    reached,
+    second_stage,
+    steepness,
+    task_of,
+    transport_of,
+    within_reach,
+)
 from bstcad.report.record import simulated, too_steep
 from bstcad.report.units import about, number, quantity, two_digits
 from bstcad.scene.errors import SceneError, line_of, toml_positions
@@ -38,7 +47,7 @@ from bstcad.sweep.cold_run import PIXELS, TUBES, Units, rounded
 from bstcad.sweep.cold_run import units as measured_units
 from bstcad.sweep.estimates import coarse_lens, left_out
 from bstcad.tailoring import stage1
-from bstcad.tailoring.run import EVALUATED, Driver
+from bstcad.tailoring.run import EVALUATED, Driver, silent
 from bstcad.tailoring.slope_map import SUBCELLS
 from bstcad.tailoring.stage1 import aimed
 from bstcad.tailoring.stage2 import JOINT, blurred_sheets, sheets
@@ -139,10 +148,10 @@ def verdict(scene: Scene, found: Mapping[str, Any]) -> dict[str, str] | None:
 
 def _effects(scene: Scene, lens: Lens, key: str) -> dict[str, Any]:
     """The entries key, left_out, blur and unreachable of `plan` for one target; lens: a coarse one for it."""
-    picture = scene.target.irradiance()
-    part, _ = reachable_part(scene, picture, key)
-    target = restricted(picture, part)
-    beyond = None if part is None else unreached(picture, part, None if lens.reflects else scene.index)
+    goal = replace(scene.goals[0], key=key)
+    goal = goal.restricted(reachable_part(scene, goal)[0])
+    part, target = goal.reachable, goal.picture
+    beyond = None if part is None else unreached(goal.whole, part, None if lens.reflects else scene.index)
     estimates, image = left_out(scene, lens, target), blur(scene.channels(), lens, scene.target.screen, target)
     return {
         "key": key, "left_out": [asdict(estimate) for estimate in estimates],
@@ -167,9 +176,9 @@ def reach_drawn(scene: Scene) -> tuple[bytes, ...]:
 
 def _reached_part(scene: Scene) -> np.ndarray:
     """(rows, columns) True in the pixels that light can reach."""
-    picture = scene.target.irradiance()
-    part, _ = reachable_part(scene, picture)
-    return np.ones(picture.shape, dtype=bool) if part is None else part
+    [goal] = scene.goals
+    part, _ = reachable_part(scene, goal)
+    return np.ones(goal.picture.shape, dtype=bool) if part is None else part
 
 
 def _asked(key: str, at: Mapping[str, int], keys: Sequence[str]) -> dict[str, Any]:
@@ -342,12 +351,11 @@ def pilots(scene: Scene, lens: Lens, tick: Callable[[], None] = lambda: None) ->
 def _pilot(scene: Scene, lens: Lens, quality: str, tick: Callable[[], None]) -> Pilot:
     small, factor, knobs = _small(scene, quality)
     target = small.target
-    picture = target.irradiance()
-    part, edge = reachable_part(small, picture)
-    task = replace(task_of(small, restricted(picture, part), knobs, edge), free=())  # it has a front already
+    goals, edge = within_reach(small, silent)
+    task = replace(task_of(small, goals, knobs, edge), free=())  # it has a front already
     flat = small.flat_lens(knobs.levels[0], as_wide_as=knobs.levels[-1])
     first = [step for step in stage1.steps(task, replace(flat, front=lens.front)) if tick() is None]
-    sent = transport_of(first[-1], first[-1].lens, task.screen)
+    sent = transport_of(first[-1], first[-1].lens, target.screen)
     *_, rounds = (step for step in first if step.state is not None)
     judged = [step.judged for step in first if step.judged is not None]
     reached(first[-1].lens, judged[-1])
@@ -358,11 +366,11 @@ def _pilot(scene: Scene, lens: Lens, quality: str, tick: Callable[[], None]) -> 
     if best is not None and last.judged is not None and best.beats(task.whole.judged(made, last.judged)):
         made, _ = task.whole.better(made, best.lens.applied(made))  # a design hands on its best lens
     unseen = detail(scene.target.irradiance(), max(target.columns_rows))
-    steep = steepness(task.heaviest.source, made, target.screen, task.target, sent=sent)
+    steep = steepness(task.heaviest.source, made, goals[0], sent=sent)
     doubtful = stage1.doubtful(task, rounds.lens, judged[0], rounds.state)
     blurred = _blurred(scene, made) - _blurred(small, made) if factor > 1 else 0.0
     rrmsd = rrmsd_by_rays(
-        made, small.channels(), target.screen, target=task.target, effort=PILOT_JUDGED, draw=small.draw
+        made, small.channels(), target.screen, target=goals[0].picture, effort=PILOT_JUDGED, draw=small.draw
     )
     return Pilot(rrmsd, factor, unseen, blurred=blurred, doubtful=doubtful, lens=made, steep=steep)
 

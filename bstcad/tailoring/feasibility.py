@@ -95,7 +95,7 @@ def demands(task: Task, lens: Lens) -> Demand:
         return best
     best = replace(best, turn=_turn(task, lens, light))
     lifted = [replace(best, lifted_turn=best.turn)]
-    for floor in FLOORS if task.further and task.wave is None else ():
+    for floor in FLOORS if len(task.goals) > 1 and task.wave is None else ():
         if lifted[-1].lifted_turn <= GENTLE:
             break
         _, light = _of(_small(replace(task, floor=floor), best.solution), lens)
@@ -118,8 +118,8 @@ def _of(task: Task, lens: Lens) -> tuple[Demand, LightBehind]:
     light = light_behind.of_task(task)
     angle = np.degrees(np.arccos(light.direction[2].clip(-1, 1)))[corners_of(light.picture)]
     crossed = light.crossed(lens.back)
-    near = min(task.goals, key=lambda goal: goal.screen.plane.throw(0.0))
-    served = light_behind.uncrossed(light, near.screen, lens.back, CELLS)
+    near = min(task.goals, key=lambda goal: goal.receiver.plane.throw(0.0))
+    served = light_behind.uncrossed(light, near.receiver, lens.back, CELLS)
     asked = Demand(
         task.solution, float(angle.max()), float(np.sqrt((angle**2).mean())), crossed=crossed,
         outside=served.beyond(lens.back, lens.apertures[1].scaled(1 + 1e-3).contains),

@@ -137,19 +137,19 @@ class LightBehind:
 
 def of_task(task: Task) -> LightBehind:
     """The light through the nearest target that meets the wave of a task, or that through it and the furthest one."""
-    near, *_, far = sorted((*task.goals, *task.goals), key=lambda goal: goal.screen.plane.throw(0.0))
-    if any(goal.screen.plane.axes is None for goal in (near, far)):
+    near, *_, far = sorted((*task.goals, *task.goals), key=lambda goal: goal.receiver.plane.throw(0.0))
+    if any(goal.receiver.plane.axes is None for goal in (near, far)):
         raise SceneError("target: light through several targets is followed between planes alone; make each a plane")
     n = task.knobs.transport_grid
     if task.wave is not None:
-        parts = max(1, round(n / max(near.screen.shape)))
-        return of_wave(near.screen, near.target, task.wave, wavelength=task.heaviest.source.wavelength, parts=parts)
+        parts = max(1, round(n / max(near.receiver.shape)))
+        return of_wave(near.receiver, near.picture, task.wave, wavelength=task.heaviest.source.wavelength, parts=parts)
 
     def progress(s: Step) -> None:
         task.progress("stage 1", 0, task.knobs.rounds, f"between the targets, {s.grid}² cells")
 
     return between_targets(
-        (near.screen, near.target), (far.screen, np.maximum(far.target, task.floor * far.target.mean())), n,
+        (near.receiver, near.picture), (far.receiver, np.maximum(far.picture, task.floor * far.picture.mean())), n,
         sign=task.solution or 1.0, iterations=task.knobs.transport_iterations, progress=progress,
     )  # fmt: skip
 

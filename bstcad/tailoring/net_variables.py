@@ -31,10 +31,10 @@ from scipy.sparse import csr_array, diags_array
 from torch import Tensor
 
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import behind
-from bstcad.tailoring.goals import Goal
 from bstcad.tailoring.merit import CoarseVariable, SobolevVariable
 from bstcad.transport.mapping import places_in
 
@@ -102,7 +102,8 @@ def along_light(source: Source, lens: Lens, goals: Sequence[Goal]) -> tuple[csr_
 
     own = (back.z - front.z) / lens.index / _magnification(q.numpy(), places, lit)
     shifts = [
-        goal.screen.plane.throw(back.z) / _magnification(q.numpy(), _array(goal.screen.plane.land(out).position), lit)
+        goal.receiver.plane.throw(back.z)
+        / _magnification(q.numpy(), _array(goal.receiver.plane.land(out).position), lit)
         for goal in goals
     ]
     weights = [goal.weight for goal in goals]

@@ -21,7 +21,7 @@ import torch
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
-from bstcad.optics.goal import restricted
+from bstcad.optics.goal import Goal
 from bstcad.optics.interfaces import Law
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
@@ -51,14 +51,13 @@ COARSE = Fit(bending=1e-2, steps=40, degree=3)
 
 
 @torch.no_grad()
-def reachable(
-    source: Source, lens: Lens, picture: np.ndarray, screen: Screen, grazing: float = GRAZING
-) -> np.ndarray | None:
+def reachable(source: Source, lens: Lens, goal: Goal, grazing: float = GRAZING) -> np.ndarray | None:
     """(rows, columns) True in the pixels that a design can light; None: all that the picture wants to be lit.
 
     lens: the blank, with the front that it will have.
     """
-    few, small = coarse(screen, picture)
+    screen, picture, shown = goal.receiver, goal.picture, coarse(goal)
+    few, small = shown.receiver, shown.picture
     grid = face_grid(source, lens, lit_window(source, lens, PLACES), PLACES)
     lit = [corner[corners_of(small)] for corner in pixel_corners(few)]
     around = np.meshgrid(*(np.linspace(aims.min(), aims.max(), BOX) for aims in lit), indexing="ij")
@@ -74,7 +73,7 @@ def reachable(
         if not picture[found].sum() > 0:
             break
         window = lit_window(source, lens)
-        part = coarse(screen, restricted(picture, found))[1]
+        part = coarse(goal.restricted(found)).picture
         wanted = slope_map(source, lens, window, part, screen=few, n=CELLS, previous=wanted, iterations=STEPS)
         grid = face_grid(source, lens, window, 2 * NET)
         aims, rays = torch.from_numpy(np.stack(pixel_corners(few))), rays_at(grid, wanted.places)
@@ -85,13 +84,14 @@ def reachable(
     return found if (picture[~found] > 0).any() else None
 
 
-def coarse(screen: Screen, picture: np.ndarray, most: int = AIMS) -> tuple[Screen, np.ndarray]:
-    """The screen and the picture with at most so many pixels along the longer side."""
+def coarse(goal: Goal, most: int = AIMS) -> Goal:
+    """The goal with at most so many pixels along the longer side, each of the mean light of those it holds."""
+    screen, picture = goal.receiver, goal.picture
     shrunk = max(1.0, max(screen.shape) / most)
     rows, columns = (max(round(n / shrunk), 1) for n in screen.shape)
     whole = (0.0, 0.0, screen.columns, screen.rows)
     small = average(lambda box: picture[box[1] : box[3], box[0] : box[2]], whole[2:], whole, (columns, rows))
-    return replace(screen, pixels=(columns, rows)), small
+    return replace(goal, receiver=replace(screen, pixels=(columns, rows)), picture=small, reachable=None, whole=None)
 
 
 def from_each(grid: FaceGrid, aims: Sequence[np.ndarray], plane: Receiver, law: Law, grazing: float) -> Tensor:

@@ -16,14 +16,14 @@ import numpy as np
 from torch import Tensor
 
 from bstcad.optics.channels import Channel
-from bstcad.optics.irradiance import Screen
+from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, measure, rrmsd_by_rays
 from bstcad.optics.sides import Sides
 from bstcad.optics.wavefront import Wave
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
-from bstcad.tailoring.goals import Goal, JointMerit
+from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.source_image import Spread
 from bstcad.transport.mapping import Mapping
 
@@ -64,7 +64,7 @@ class Judged:
     """A lens and its figures by the measure of the whole design: all pixels, all goals, all of the light."""
 
     rrmsd: float  # RRMSD by `Task.rrmsd`
-    figure: float  # root of the joint merit of all goals (goals.py): the RRMSD itself where no wave is asked for
+    figure: float  # root of the merit of all goals (merit.py): the RRMSD itself where no wave is asked for
     lens: Parameters
 
     def beats(self, other: Judged) -> bool:
@@ -102,11 +102,10 @@ class Edge:
 
 @dataclass(frozen=True)
 class Task:
-    """Light, target and knobs of a design."""
+    """Light, goals and knobs of a design."""
 
     channels: tuple[Channel, ...]  # the light
-    screen: Screen
-    target: np.ndarray  # (rows, columns), row 0 = y max, sum 1
+    goals: tuple[Goal, ...]  # stage 1 of one face follows the first
     knobs: Tailoring  # with every key set
     least: float = 0.0  # thickness of the glass everywhere (mm)
     free: tuple[str, ...] = ()  # the parameters of the front that tailoring searches for
@@ -119,8 +118,6 @@ class Task:
     edge: Edge | None = None  # of a target that is cut to what light can reach; None: light can reach all of it
     # of a picture (rows, columns) and the target, both of sum 1 or less, what stage 2 makes least; None: RRMSD²
     merit: Callable[[Tensor, Tensor], Tensor] | None = None
-    weight: float = 1.0  # of the target among all goals
-    further: tuple[Goal, ...] = ()  # pictures on other planes
     wave: Wave | None = None  # that the light behind the lens shall be; None: any
     hasty: bool = False  # for a preview: g of slope_map.py by fewer places
     solution: float | None = None  # σ of light_behind.py; None: the gentler one
@@ -135,12 +132,7 @@ class Task:
     @property
     def several(self) -> bool:
         """Is there another goal than one picture?"""
-        return bool(self.further) or self.wave is not None
-
-    @property
-    def goals(self) -> tuple[Goal, ...]:
-        """The pictures on all planes."""
-        return (Goal(self.screen, self.target, self.weight), *self.further)
+        return len(self.goals) > 1 or self.wave is not None
 
     def sides(self, lens: Lens, sides: Sides) -> tuple[Sides, ...]:
         """Control points of each of the lens's nets where a back has so many."""
@@ -160,12 +152,12 @@ class Task:
         if effort is None and (self.knobs.accuracy is not None or self.bounds is not None):
             effort = ASKED
         if effort is None:
-            largest = max(goal.target.size for goal in self.goals)
+            largest = max(goal.picture.size for goal in self.goals)
             effort = replace(BETWEEN, rays=round(BETWEEN.rays * (largest / PIXELS**2) ** (1 / 3)))
         draw = self.spreads[-1].draw if self.spreads and not self.grown else None  # not of its middle alone
         lens = lens.plain()
         values = [
-            rrmsd_by_rays(lens, self.channels, goal.screen, target=goal.target, effort=effort, draw=draw)
+            rrmsd_by_rays(lens, self.channels, goal.receiver, target=goal.picture, effort=effort, draw=draw)
             for goal in self.goals
         ]
         return math.nan if any(map(math.isnan, values)) else max(values)
@@ -174,7 +166,7 @@ class Task:
         """The lens, of this RRMSD by `rrmsd`, as the whole design is judged."""
         figure = rrmsd
         if self.wave is not None:
-            merit = JointMerit.of(self.channels, lens, WAVE_TUBES, goals=(), overshoot=0.0, wave=self.wave)
+            merit = Merit.of(self.channels, lens, WAVE_TUBES, goals=(), overshoot=0.0, wave=self.wave)
             square, pictures = float(merit(merit.landing(lens))[0]), sum(goal.weight for goal in self.goals)
             figure = math.sqrt((pictures * rrmsd**2 + self.wave.weight * square) / (pictures + self.wave.weight))
         return Judged(rrmsd, figure, Parameters.of(lens))
@@ -188,8 +180,9 @@ class Task:
         return (before, then) if then.beats(now) else (latest, now)
 
     def used(self, lens: Lens) -> float:
-        """Part of the light that enters the lens which falls on the target."""
-        return measure(lens.plain(), self.channels, self.screen, target=self.target, effort=COUNTED).used
+        """Part of the light that enters the lens which falls on the first target."""
+        goal = self.goals[0]
+        return measure(lens.plain(), self.channels, goal.receiver, target=goal.picture, effort=COUNTED).used
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ rays from points of the source, and stays in the merit as a constant picture: E 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -27,16 +27,14 @@ import torch
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from bstcad.optics.channels import Channel, weighted_sum
+from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen, tent
-from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Draw, RayTubes, a_side, seen_through, simulated
+from bstcad.optics.measure import Draw, a_side, seen_through, simulated
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import in_pairs
 from bstcad.optics.sources import Source
-from bstcad.optics.tubes import Tubes, arriving
 
 NODES = 5  # a side, from border to border of the screen, between which images are interpolated
 PLACES = 32  # a side of the back, through which they are looked for
@@ -103,6 +101,11 @@ class _Blurred(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, g: Tensor):
         return torch.from_numpy(ctx.blur.adjoint(g.cpu().numpy())).to(g.device), None
+
+
+def blurred(light: Tensor, blur: Blur) -> Tensor:
+    """B of the light (rows + 2 border, columns + 2 border) of a source's middle, differentiable in it."""
+    return _Blurred.apply(light, blur)
 
 
 def bordered(screen: Screen, border: int) -> Screen:
@@ -207,86 +210,24 @@ def _hats(side: int, border: int) -> np.ndarray:
     return np.maximum(0, 1 - np.abs(place - np.arange(NODES)[:, None]))
 
 
-@dataclass(frozen=True)
-class BlurredMerit:
-    """`merit.TubeMerit` of a source of some size, by tubes of its middle and its images."""
+@torch.no_grad()
+def unseen(by_images: Tensor, draw: Draw, lens: Lens, screen: Screen, *, border: int, seed: int) -> Tensor:
+    """(rows, columns) of the picture, what the images leave out, by two sets of rays; nothing where noise hides it.
 
-    light: RayTubes  # of the middle
-    blurs: tuple[Blur, ...]  # of each channel
-    screen: Screen
-    target: Tensor  # (rows, columns), sum 1
-    overshoot: float
-    own: Callable[[Tensor, Tensor], Tensor] | None = None  # of picture and target, in place of RRMSD²
-    left_out: Tensor | None = None  # (rows, columns), by the images, of the picture; None: nobody has measured it
+    by_images: the picture by them, over the light that faces and glass leave; border: theirs.
 
-    @classmethod
-    def of(
-        cls, spread: Spread, lens: Lens, n: int, *, screen: Screen, target: Tensor, overshoot: float, seed: int,
-        own: Callable[[Tensor, Tensor], Tensor] | None = None, by_images: bool = False,
-    ) -> BlurredMerit:  # fmt: skip
-        """By n x n tubes a line launched for `lens`; the target may have any sum.  seed: of the rays.
-
-        by_images: alone; then nobody measures by rays what they leave out, which takes most of a second.
-        """
-        light, target = RayTubes.launched(lens, spread.centre, n), target / total(target)
-        merit = cls(light, blurs(spread, lens.plain(), screen), screen, target, overshoot=overshoot, own=own)
-        if by_images:
-            return merit
-        return replace(merit, left_out=merit.measured(spread.draw, lens, seed).to(target.device))
-
-    @property
-    def tubes(self) -> int:
-        """The number of tubes in an evaluation."""
-        return sum(sheet.flux.numel() for sheet in self.light.sheets)
-
-    def landing(self, lens: Lens) -> tuple[Landed, ...]:
-        """Where the corners of each sheet meet the screen."""
-        return self.light.landing(lens, self.screen)
-
-    def picture(self, landed: Sequence[Landed]) -> tuple[Tensor, Tensor]:
-        """(picture, pull on light outside), both over the light that faces and glass leave, of the landed corners."""
-        channels, sheets = self.light.channels, self.light.sheets
-        wide = bordered(self.screen, self.blurs[0].border)
-        left = weighted_sum(channels, (total(sheet.carried(c)) for sheet, c in zip(sheets, landed, strict=True)))
-        seen, beyond = zip(*(sheet.collect(c, wide) for sheet, c in zip(sheets, landed, strict=True)), strict=True)
-        blurred = (_Blurred.apply(one / left, blur) for one, blur in zip(seen, self.blurs, strict=True))
-        return weighted_sum(channels, blurred), weighted_sum(channels, beyond) / left
-
-    def __call__(self, landed: tuple[Landed, ...]) -> tuple[Tensor, Tensor]:
-        """(merit, RRMSD of the light on the screen) of the landed corners of each sheet."""
-        image, outside = self.picture(landed)
-        if self.left_out is not None:
-            image = image + self.left_out
-        size = total(self.target**2)
-        off = total((image - self.target) ** 2) / size if self.own is None else self.own(image, self.target)
-        seen = image.detach() / total(image.detach())
-        return off + self.overshoot * outside + self._lost(landed), (total((seen - self.target) ** 2) / size).sqrt()
-
-    def _lost(self, landed: Sequence[Landed]) -> Tensor:
-        """Share of the light that does not arrive."""
-
-        def whole(flux: Callable[[Tubes, Landed], Tensor]) -> Tensor:
-            pairs = zip(self.light.sheets, landed, strict=True)
-            return weighted_sum(self.light.channels, (total(flux(sheet, corners)) for sheet, corners in pairs))
-
-        return 1 - whole(lambda sheet, c: arriving(sheet.flux, c)) / whole(lambda sheet, c: sheet.flux)
-
-    @torch.no_grad()
-    def measured(self, draw: Draw, lens: Lens, seed: int) -> Tensor:
-        """(rows, columns) of the picture, what the images leave out, by two sets of rays; nothing where noise hides it.
-
-        d_i = E_i - B E_0 of two sets share what is left out, and no noise: of their mean, smoothed, the share
-        d_1 · d_2 / |(d_1 + d_2) / 2|² is taken.
-        """
-        here = self.picture(self.landing(lens))[0].cpu()
-        smooth = SMOOTH * (self.blurs[0].border - 2)
-        off = []
-        for k in range(2):
-            points = draw(POINTS, seed + SEED + k)
-            n = max(1, round(a_side(points) * SIDE))
-            rays = simulated(lens.plain(), points, self.screen, n=n, seed=seed + SEED + k)
-            left = sum(rays.flux[line] for line in ("on target", "off target", "total internal reflection"))
-            off.append(gaussian_filter((rays.box / left - here).numpy(), smooth) if left > 0 else np.zeros(here.shape))
-        mean = (off[0] + off[1]) / 2
-        noisy = float((mean**2).sum())
-        return torch.from_numpy(mean) * (max(float((off[0] * off[1]).sum()), 0.0) / noisy if noisy > 0 else 0.0)
+    d_i = E_i - B E_0 of two sets share what is left out, and no noise: of their mean, smoothed, the share
+    d_1 · d_2 / |(d_1 + d_2) / 2|² is taken.
+    """
+    here, off = by_images.cpu(), []
+    for k in range(2):
+        points = draw(POINTS, seed + SEED + k)
+        n = max(1, round(a_side(points) * SIDE))
+        rays = simulated(lens, points, screen, n=n, seed=seed + SEED + k)
+        left = sum(rays.flux[line] for line in ("on target", "off target", "total internal reflection"))
+        missed = (rays.box / left - here).numpy() if left > 0 else np.zeros(here.shape)
+        off.append(gaussian_filter(missed, SMOOTH * (border - 2)))
+    mean = (off[0] + off[1]) / 2
+    noisy = float((mean**2).sum())
+    share = max(float((off[0] * off[1]).sum()), 0.0) / noisy if noisy > 0 else 0.0
+    return (torch.from_numpy(mean) * share).to(by_images.device)

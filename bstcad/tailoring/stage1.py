@@ -65,11 +65,11 @@ class SlopeRound:
 
 def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[Step]:
     """Stage 1 from a blank lens, or further from a state: its rounds, and the other way where they come to little."""
-    lens = task.heaviest.through(lens)
+    lens, goal = task.heaviest.through(lens), task.goals[0]
     if state is None and task.free:
         coarse = lens.refined(task.knobs.levels[0])
         shaped = shaped_front(
-            task.heaviest.source, coarse, task.target, screen=task.screen, free=task.free, rim_sags=task.rim_sags,
+            task.heaviest.source, coarse, goal.picture, screen=goal.receiver, free=task.free, rim_sags=task.rim_sags,
             iterations=task.knobs.transport_iterations,
         )  # fmt: skip
         lens = lens.with_front(shaped.front)
@@ -91,9 +91,10 @@ def doubtful(task: Task, lens: Lens, judged: float, state: SlopeRound) -> bool:
 
     Detail that a net of fewer points than the target has pixels cannot show is no reason: no other way would show it.
     """
-    few, shown = coarse(task.screen, task.target, most=max(both(task.knobs.levels[-1])))
-    if judged > RETRY_ABOVE and few.shape != task.screen.shape:
-        judged = replace(task, screen=few, target=shown).rrmsd(lens)
+    goal = task.goals[0]
+    few = coarse(goal, most=max(both(task.knobs.levels[-1])))
+    if judged > RETRY_ABOVE and few.receiver.shape != goal.receiver.shape:
+        judged = replace(task, goals=(few,)).rrmsd(lens)
     return not judged <= RETRY_ABOVE or state.wanted.moved > UNSETTLED  # NaN: no light on the target
 
 
@@ -124,7 +125,7 @@ def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> It
 
 def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[Lens, SlopeMap]:
     """One round: the lens, and the map that it follows."""
-    knobs, source, left = task.knobs, task.heaviest.source, task.knobs.rounds - turn
+    knobs, source, goal, left = task.knobs, task.heaviest.source, task.goals[0], task.knobs.rounds - turn
     coarse = max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left - 1, 2))
     m = knobs.levels[max(-left, -len(knobs.levels))] if left <= FINE_ROUNDS else knobs.levels[0]
 
@@ -134,7 +135,7 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[
     lens = lens.refined(m)
     window = lit_window(source, lens)
     wanted = slope_map(
-        source, lens, window, picture=task.target, screen=task.screen, n=coarse, previous=wanted,
+        source, lens, window, picture=goal.picture, screen=goal.receiver, n=coarse, previous=wanted,
         iterations=knobs.transport_iterations, progress=progress, hasty=task.hasty,
     )  # fmt: skip
     sides = [min(2 * points, knobs.rays) for points in both(m)]
@@ -151,20 +152,20 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
     much with the sag: at strong lenses near the source, in glass that hardly bends light.  The part of the map that no
     surface can follow is lost.
     """
-    knobs, z = task.knobs, lens.back.z
+    knobs, goal, z = task.knobs, task.goals[0], lens.back.z
     for turn in range(AIMS):
         n, m = (COARSEST_GRID, knobs.levels[0]) if turn < AIMS - 1 else (knobs.transport_grid, knobs.levels[-1])
         lens = lens.refined(m)
         rays, wanted, mapping = aimed_rays(
             task.heaviest.source,
             lens,
-            task.target,
-            screen=task.screen,
+            goal.picture,
+            screen=goal.receiver,
             n=n,
             side=aimed(max(both(m)), knobs.rays),
             iterations=knobs.transport_iterations,
         )
-        lens = moved_clear(tailor_to_aim(lens, rays, wanted, task.screen.plane), z, task.least, task.bounds)
+        lens = moved_clear(tailor_to_aim(lens, rays, wanted, goal.receiver.plane), z, task.least, task.bounds)
     return lens, mapping
 
 

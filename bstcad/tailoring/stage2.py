@@ -26,15 +26,14 @@ from bstcad.optics.measure import a_side, images, rrmsd_by_tubes
 from bstcad.optics.sides import both, coarser
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
-from bstcad.tailoring.goals import JointMerit
 from bstcad.tailoring.grazing import Grazing
 from bstcad.tailoring.machinability import excess, held, weight
-from bstcad.tailoring.merit import CoarseVariable, SobolevVariable, TubeMerit, local_weight
+from bstcad.tailoring.merit import CoarseVariable, Merit, SobolevVariable, local_weight
 from bstcad.tailoring.minimise import Best, Reached, Search, lbfgs, minimise
 from bstcad.tailoring.net_variables import NetVariables, along_light
 from bstcad.tailoring.reachable import coarse
 from bstcad.tailoring.run import EVALUATED, Parameters, Step, Task
-from bstcad.tailoring.source_image import BlurredMerit, Spread
+from bstcad.tailoring.source_image import Spread
 
 Shares = tuple[tuple[float, float], ...]  # (tubes a side, evaluations) of each round, as shares of the knobs
 ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))
@@ -87,20 +86,14 @@ class Round:
         tubes = f"{self.tubes}² tubes" if sheets == 1 else f"{sheets} × {self.tubes}² tubes"
         return ", ".join([self.stage, *([f"{self.pixels} pixels"] if self.pixels else []), tubes])
 
-    def merit(self, lens: Lens) -> TubeMerit | BlurredMerit | JointMerit:
+    def merit(self, lens: Lens) -> Merit:
         """By tubes launched for a lens."""
         task = self.task if self.pixels is None else coarsened(self.task, self.pixels)
-        target, pull = torch.from_numpy(task.target).to(lens.like.device), _pull(task, lens)
-        if task.several:
-            return JointMerit.of(task.channels, lens, self.tubes, task.goals, overshoot=pull, wave=task.wave)
-        if self.spread is not None:
-            return BlurredMerit.of(
-                self.spread, lens, self.tubes, screen=task.screen, target=target, overshoot=pull,
-                seed=task.knobs.seed, own=task.merit, by_images=self.by_images,
-            )  # fmt: skip
-        return TubeMerit.of(
-            task.channels, lens, self.tubes, screen=task.screen, target=target, overshoot=pull, own=task.merit
-        )
+        return Merit.of(
+            task.channels if self.spread is None else self.spread.centre, lens, self.tubes, task.goals,
+            overshoot=_pull(task, lens), wave=task.wave, own=task.merit, spread=self.spread,
+            seed=None if self.by_images else task.knobs.seed,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -142,28 +135,24 @@ def coarse_rounds(task: Task, lens: Lens) -> tuple[Round, ...]:
     Where the map has not come to rest, near a lamp or a wall, light has to move far: many evaluations at first, but
     each costs a thirtieth, and the tubes need not tell the cells of the lens's own net.
     """
-    most = min(max(task.screen.shape) - 1, task.knobs.side // 2)  # pixels that the net can tell
+    most = min(max(task.goals[0].receiver.shape) - 1, task.knobs.side // 2)  # pixels that the net can tell
     rounds = [Round(task, tubes, evaluations, pixels=pixels) for pixels, tubes, evaluations in COARSE if pixels <= most]
     if not rounds or task.merit is not None or task.several or not task.knobs.stage2_iterations:
         return ()  # of several goals: two nets bend between so few tubes
     seen, tubes = coarsened(task, LARGE), COARSE[0][1]
-    far_off = rrmsd_by_tubes(lens.plain(), seen.channels, seen.screen, target=seen.target, n=tubes) > FAR_OFF
+    [goal] = seen.goals
+    far_off = rrmsd_by_tubes(lens.plain(), seen.channels, goal.receiver, target=goal.picture, n=tubes) > FAR_OFF
     return tuple(rounds) if far_off else ()
 
 
 def coarsened(task: Task, pixels: int) -> Task:
     """The task with at most so many pixels along the longer side."""
-    screen, target = coarse(task.screen, task.target, pixels)
-    further = ((goal, *coarse(goal.screen, goal.target, pixels)) for goal in task.further)
-    return replace(
-        task, screen=screen, target=target,
-        further=tuple(replace(goal, screen=seen, target=wanted) for goal, seen, wanted in further),
-    )  # fmt: skip
+    return replace(task, goals=tuple(coarse(goal, pixels) for goal in task.goals))
 
 
 def shares_of(task: Task) -> Shares | None:
     """The rounds of several goals; None: of one."""
-    if not task.further:
+    if len(task.goals) == 1:
         return JOINT if task.several else None
     larger = max(1.0, task.knobs.side / OF_SIDE)
     return tuple((tubes, larger * share) for tubes, share in PICTURES)
@@ -246,7 +235,7 @@ def _pull(task: Task, lens: Lens) -> float:
     if task.spreads:
         source = replace(task.spreads[-1].source, wavelength=light.source.wavelength)
         few = channels_of(source, lambda _: light.index, BY)  # whose second moments are those of all points
-    return overshoot / (1 + images(few, lens, task.screen, SEEN).width() ** 2)
+    return overshoot / (1 + max(images(few, lens, goal.receiver, SEEN).width() for goal in task.goals) ** 2)
 
 
 def _search(
@@ -285,7 +274,7 @@ class Problem:
     """
 
     lens: Lens
-    merit: TubeMerit | BlurredMerit | JointMerit
+    merit: Merit
     bounds: Bounds | None = None  # on the tailored faces; the excess over them adds to the merit
     bound_weight: float = 0.0  # of the excess
     grazing: Grazing | None = None  # keeps light at the edge of its reach from total reflection
@@ -317,13 +306,15 @@ def variables_of(task: Task, lens: Lens, pixels: int | None = None) -> NetVariab
     light = task.heaviest
     seen = light.through(lens)
     weights = [
-        _mean(local_weight(light.source, seen, goal.target, screen=goal.screen, number=number) for goal in task.goals)
+        _mean(
+            local_weight(light.source, seen, goal.picture, screen=goal.receiver, number=number) for goal in task.goals
+        )
         for number in lens.freeform
     ]
     if pixels is not None:
         return NetVariables(tuple(CoarseVariable.of(*each) for each in zip(nets, lens.nets, weights, strict=True)))
     blocks = tuple(SobolevVariable.of(net, weight) for net, weight in zip(nets, weights, strict=True))
-    if lens.freeform == (0, 1) and task.further:
+    if lens.freeform == (0, 1) and len(task.goals) > 1:
         return NetVariables(blocks, *along_light(light.source, seen, task.goals))
     return NetVariables(blocks)
 
@@ -403,7 +394,8 @@ def stage3_rounds(task: Task) -> tuple[Round, ...]:
         replace(task, channels=channels, grown=(), spreads=(spread,))
         for channels, spread in zip(task.grown, task.spreads, strict=True)
     )
-    counts = blurred_sheets(task.knobs, (task.screen.columns, task.screen.rows))
+    screens = [goal.receiver for goal in task.goals]
+    counts = blurred_sheets(task.knobs, (max(each.columns for each in screens), max(each.rows for each in screens)))
     return tuple(
         Round(light, tubes, evaluations, stage="stage 3", spread=spread, share=share)
         for light, spread, (tubes, evaluations), (share, _) in zip(lights, task.spreads, counts, SIZES, strict=True)
@@ -446,8 +438,8 @@ def compare_precisions(task: Task, lens: Lens) -> Comparison:
     (merit, gradient, single), (exact, wanted, double) = (
         _tried(task, lens.to(d)) for d in (torch.float32, torch.float64)
     )
-    n = round(a_side(task.channels) * (TUBES + 1))
-    rrmsd = [rrmsd_by_tubes(end, task.channels, task.screen, target=task.target, n=n) for end in (single, double)]
+    n, goal = round(a_side(task.channels) * (TUBES + 1)), task.goals[0]
+    rrmsd = [rrmsd_by_tubes(end, task.channels, goal.receiver, target=goal.picture, n=n) for end in (single, double)]
     pairs = zip(single.nets, double.nets, strict=True)
     return Comparison(
         control_points=max(max(net.shape) for net in lens.nets),
@@ -462,10 +454,8 @@ def compare_precisions(task: Task, lens: Lens) -> Comparison:
 
 def _tried(task: Task, lens: Lens) -> tuple[float, Tensor, Lens]:
     """(merit and gradient at the start, the lens after COMPARED evaluations in its own precision, in float64)."""
-    target, n = torch.from_numpy(task.target).to(lens.like.device), min(TUBES, task.knobs.rays)
-    merit = TubeMerit.of(
-        task.channels, lens, n, screen=task.screen, target=target, overshoot=task.knobs.overshoot, own=task.merit
-    )
+    n = min(TUBES, task.knobs.rays)
+    merit = Merit.of(task.channels, lens, n, task.goals[:1], overshoot=task.knobs.overshoot, own=task.merit)
     problem, variables = Problem(lens, merit), variables_of(task, lens)
     value, gradients, _ = problem([net.heights for net in lens.nets])
     *_, last = search(lens, problem, variables, COMPARED)

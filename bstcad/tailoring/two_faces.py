@@ -98,7 +98,7 @@ def steps(task: Task, lens: Lens, state: FrontRound | None = None) -> Iterator[S
     With one goal alone and both faces free the front stays as it is, and the back does all the work.
     """
     lens = task.heaviest.through(lens)
-    if lens.freeform == (0, 1) and not task.further and task.wave is None:
+    if lens.freeform == (0, 1) and not task.several:
         alone = replace(lens.with_nets(_final(task, lens).nets), shaped=None)
         for step in stage1.steps(task, alone, state):
             yield replace(step, make=lambda step=step: replace(step.make(), shaped=(0, 1)))
@@ -148,8 +148,8 @@ def behind_lens(task: Task, lens: Lens) -> LightBehind | None:
     if lens.freeform == (0,):
         return None
     light = light_behind.of_task(task)
-    near = min(task.goals, key=lambda goal: goal.screen.plane.throw(0.0))
-    return light_behind.uncrossed(light, near.screen, lens.back, task.knobs.transport_grid)
+    near = min(task.goals, key=lambda goal: goal.receiver.plane.throw(0.0))
+    return light_behind.uncrossed(light, near.receiver, lens.back, task.knobs.transport_grid)
 
 
 def _round(
@@ -161,11 +161,11 @@ def _round(
     front = replace(lens, shaped=(0,))
     window = lit_window(source, front)
     if light is None:
-        picture, back = first.target, _by_way_of_back(source, front, window, first.screen, places=places)
+        picture, back = first.picture, _by_way_of_back(source, front, window, first.receiver, places=places)
         through = back[:2]
     else:
         picture, back = light.picture, light.meeting(lens.back)
-        through = light.places_of(first.screen, back[:2])
+        through = light.places_of(first.receiver, back[:2])
 
     def progress(s: TransportStep) -> None:
         task.progress("stage 1", turn, task.knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")

@@ -150,8 +150,8 @@ def small(name, **more):
     """(task, blank lens) of a template at toy size."""
     front = {"lens.front.optimise": "false"} if name == "portrait" else {}
     wanted = scene.load(f"templates/{name}.toml", SMALL | front | more)
-    knobs, t = wanted.tailoring.resolved(wanted.lens.back.control_points), wanted.target
-    task = Task(wanted.channels(), t.screen, t.irradiance(), knobs, wanted.lens.min_thickness)
+    knobs = wanted.tailoring.resolved(wanted.lens.back.control_points)
+    task = Task(wanted.channels(), wanted.goals, knobs, wanted.lens.min_thickness)
     return task, wanted.flat_lens(knobs.levels[0])
 
 

@@ -38,7 +38,7 @@ from bstcad.optics.tubes import launch_tubes
 from bstcad.pipeline import design
 from bstcad.scene.scene import Scene, load
 from bstcad.step_text import part21
-from bstcad.tailoring.merit import SobolevVariable, TubeMerit, local_weight
+from bstcad.tailoring.merit import Merit, SobolevVariable, local_weight
 from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.tailoring.stage2 import Problem
 from bstcad.transport import Density, solve
@@ -179,8 +179,7 @@ def _evaluation(m: int = NET, n: int = TUBES, pixels: int = PIXELS, lines: int =
     (light,) = scene.channels()
     spread = (light.index + 1e-4 * (k - (lines - 1) / 2) for k in range(lines))
     channels = tuple(Channel(light.source, index, 1 / lines) for index in spread)
-    target = torch.from_numpy(scene.target.irradiance())
-    problem = Problem(lens, TubeMerit.of(channels, lens, n, scene.target.screen, target, 0.03))
+    problem = Problem(lens, Merit.of(channels, lens, n, scene.goals, 0.03))
     variable = SobolevVariable.of(lens.back, torch.ones_like(lens.back.heights))
     c = torch.zeros_like(lens.back.heights)
     return lambda: variable.adjoint(problem([lens.back.heights + variable.heights(c)])[1][0])

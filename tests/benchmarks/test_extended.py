@@ -35,10 +35,10 @@ ROUND = 30  # evaluations of stage 2 a round of feedback, from the lens of the r
 def task_of(scene):
     """The task of a scene as `pipeline.design` has it, and the blank."""
     knobs = scene.tailoring.resolved(scene.lens.back.control_points)
-    scaled, target = [scene.with_source_scaled(share) for share, _ in stage2.SIZES], scene.target
+    scaled = [scene.with_source_scaled(share) for share, _ in stage2.SIZES]
     light, least = scene.with_source_scaled(0.0).channels(), scene.lens.min_thickness
     task = Task(
-        light, target.screen, target.irradiance(), knobs, least, grown=tuple(each.channels() for each in scaled),
+        light, scene.goals, knobs, least, grown=tuple(each.channels() for each in scaled),
         spreads=tuple(Spread(each.source, light, each.draw) for each in scaled),
     )  # fmt: skip
     return task, scene.flat_lens(knobs.levels[0])
@@ -57,15 +57,15 @@ def judge(scene, lens):
 
 def feedback(task, lens, power, seconds):
     """Lenses of the rounds that fit into so many seconds of the processor."""
-    wanted, began, whole = task.target, time.process_time(), task.whole
-    target = wanted
+    [goal], began, whole = task.goals, time.process_time(), task.whole
+    target = wanted = goal.picture
     few = task.knobs.model_copy(update={"stage2_iterations": ROUND})
     while time.process_time() - began < seconds:
-        made = tubes_picture(lens, whole.channels, task.screen, round(2 * a_side(whole.channels) * task.knobs.rays))
+        made = tubes_picture(lens, whole.channels, goal.receiver, round(2 * a_side(whole.channels) * task.knobs.rays))
         made = made.numpy() * (wanted.sum() / float(made.sum()))
         target = target * np.clip(wanted / np.maximum(made, 1e-6 * wanted.max()), 0.2, 5.0) ** power
         target = target / target.sum()
-        corrected = replace(task, target=target, knobs=few, grown=())
+        corrected = replace(task, goals=(replace(goal, picture=target),), knobs=few, grown=())
         lens = driven(corrected, stage2.steps(corrected, lens))
         yield lens
 

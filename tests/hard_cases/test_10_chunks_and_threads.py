@@ -25,6 +25,7 @@ from bstcad.baselines.paper import TentMerit
 from bstcad.optics import sampling, tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import compiling
 from bstcad.optics.lens import Lens
@@ -37,8 +38,7 @@ from bstcad.optics.surfaces import Sphere
 from bstcad.optics.trace import Simulation, from_first_net, to_first_net
 from bstcad.optics.wavefront import SphericalWave
 from bstcad.scene.scene import load
-from bstcad.tailoring.goals import Goal, JointMerit
-from bstcad.tailoring.merit import SobolevVariable, TubeMerit
+from bstcad.tailoring.merit import Merit, SobolevVariable
 from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.transport.density import Density
 from tests import two_faces
@@ -75,10 +75,10 @@ def of_two_faces(dtype) -> dict[str, torch.Tensor]:
     front = replace(back, z=15.0, heights=-0.1 * back.heights.flip(0, 1))
     held = Lens(front, back, Circle(10.0), 1.5, shaped=(0, 1))
     light = (Channel(SOURCE, held.index, losses=Losses(Fresnel(587.6), Absorption(0.01))),)
-    goals = [Goal(screen, target().numpy(), weight) for screen, weight in ((SCREEN, 1.0), (FURTHER, 2.0))]
+    goals = [Goal("target", screen, target().numpy(), weight) for screen, weight in ((SCREEN, 1.0), (FURTHER, 2.0))]
     found = {}
     for name, wave in (("two faces", None), ("two faces and a wave", SphericalWave((0.0, 0.0, -80.0), 30.0))):
-        merit = JointMerit.of(light, held, TUBES, goals, overshoot=0.03, wave=wave)
+        merit = Merit.of(light, held, TUBES, goals, 0.03, wave=wave)
         leaves = [net.heights.clone().requires_grad_() for net in held.nets]
         value, _ = merit(merit.landing(held.with_heights(leaves)))
         gradients = torch.autograd.grad(value, leaves)
@@ -98,7 +98,7 @@ def image_and_gradient(dtype=torch.float64) -> dict[str, torch.Tensor]:
     held = lens(dtype)
     rays, sheet = launch(SOURCE, held, RAYS, 1), tubes.launch_tubes(SOURCE, held, TUBES)
     light = (Channel(SOURCE, held.index),)
-    by_tubes = TubeMerit(RayTubes(light, (sheet,)), SCREEN, target(), 0.03)
+    by_tubes = Merit(RayTubes(light, (sheet,)), (Goal("target", SCREEN, target().numpy()),), 0.03)
     by_tents = TentMerit.of(light, SCREEN, target(), 0.03)
     found = by_rays(simulated(SOURCE, held, SCREEN, RAYS, 0))
     for name, merit in (

@@ -11,6 +11,7 @@ from bstcad.optics import losses as effects
 from bstcad.optics import trace, tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.goal import Goal
 from bstcad.optics.interfaces import Interface, Refract, cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
@@ -20,7 +21,7 @@ from bstcad.optics.rays import Status
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.stage2 import Problem
 from tests.hard_cases.lenses import bundle
 from tests.tracing import simulated
@@ -90,8 +91,8 @@ def test_the_gradient_of_the_merit_is_that_of_differences_losses_and_all(source,
     """Of a small net, in a random direction; so nothing of an effect's own gradient is left out."""
     lens = wavy(m=9, heights=0.05, losses=None)
     channel = Channel(source, N, losses=losses)
-    target = torch.rand(SCREEN.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64) + 0.5
-    merit = TubeMerit.of((channel,), lens, 60, SCREEN, target, 0.03)
+    goal = Goal("target", SCREEN, np.random.default_rng(1).random(SCREEN.shape) + 0.5)
+    merit = Merit.of((channel,), lens, 60, [goal], 0.03)
     problem = Problem(lens, merit)
     heights = lens.back.heights
     way = torch.randn(heights.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.goal import Goal
 from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
@@ -22,7 +23,7 @@ from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import to_first_net, trace
 from bstcad.optics.tubes import launch_tubes, picture
-from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.merit import Merit
 
 M, HALF, INDEX = 33, 10.0, 1.49
 SQUARE = Rectangle(2 * HALF, 2 * HALF)
@@ -119,8 +120,8 @@ def test_the_gradient_of_the_merit_is_its_derivative(light):
     """By central differences, on the tilted screen."""
     source, reflects = LIGHTS[light]
     lens = optic(bumpy(0.05), reflects)
-    target = torch.ones(SCREEN.shape, dtype=torch.float64)
-    merit = TubeMerit.of((Channel(source, lens.index),), lens, 48, SCREEN, target, 1e-3)
+    goal = Goal("target", SCREEN, np.ones(SCREEN.shape))
+    merit = Merit.of((Channel(source, lens.index),), lens, 48, [goal], 1e-3)
     generator = torch.Generator().manual_seed(1)
     change = torch.nn.functional.avg_pool2d(torch.randn((1, M, M), generator=generator, dtype=torch.float64), 5, 1, 2)[
         0

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from bstcad.analysis.shape import thickness_range
 from bstcad.optics.bspline import QUARTERS, BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
@@ -20,7 +22,7 @@ from bstcad.scene.blank import Bounds, net_extent
 from bstcad.tailoring import machinability
 from bstcad.tailoring.clearance import MARGIN, Cells, clearance, unit
 from bstcad.tailoring.machinability import excess, front_shaped, held, kept
-from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.stage2 import Problem
 
 WHOLE, DISC = Rectangle(4.0, 6.0), Circle(1.5)
@@ -169,7 +171,7 @@ def test_the_merit_of_two_faces_has_the_penalty_in_both():
     lens = crossing(Rectangle(8.0, 8.0), z=3.7)
     screen = Screen(120.0, (-12.1, 12.0), (-12.2, 12.1), 16)
     beam = Channel(Collimated(Rectangle(7.0, 7.0)), 1.5)
-    merit = TubeMerit.of((beam,), lens, 40, screen, torch.ones(screen.shape, dtype=torch.float64), 0.03)
+    merit = Merit.of((beam,), lens, 40, [Goal("target", screen, np.ones(screen.shape))], 0.03)
     bounds = held(lens, None, 0.5)
     free, bound = Problem(lens, merit), Problem(lens, merit, bounds, 100.0)
     start, over = [n.heights for n in lens.nets], excess(lens, bounds)

@@ -38,8 +38,7 @@ def scene_of(width, targets, **more):
 
 
 def demand_of(scene):
-    target = scene.target.irradiance()
-    task = pipeline.task_of(scene, target, scene.tailoring.resolved(scene.lens.back.net), None)
+    task = pipeline.task_of(scene, scene.goals, scene.tailoring.resolved(scene.lens.back.net), None)
     return demands(task, task.heaviest.through(scene.flat_lens(33)))
 
 

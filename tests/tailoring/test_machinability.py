@@ -131,7 +131,8 @@ def test_the_report_says_so_from_the_file(bound, tmp_path):
     said = re.sub(PLACE, "(there)", record.bounds(contents.bounds))
     assert re.fullmatch(
         r"The back was tailored within bounds \(lens.tool_radius = 50 mm\); [\d.]+ % of it is within 3 % of "
-        r"lens.tool_radius, closest \(there\)\.", said
+        r"lens.tool_radius, closest \(there\)\.",
+        said,
     )
     assert contents.shape["radius_min_concave"] >= 50
 

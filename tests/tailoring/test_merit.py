@@ -10,6 +10,7 @@ import torch
 from bstcad.baselines.paper import TentMerit
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import RayTubes
@@ -19,7 +20,7 @@ from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
 from bstcad.optics.tubes import Tubes
 from bstcad.tailoring import merit
-from bstcad.tailoring.merit import SobolevVariable, Spectrum, TubeMerit, local_weight
+from bstcad.tailoring.merit import Landings, Merit, SobolevVariable, Spectrum, local_weight
 
 SCREEN = Screen(100.0, (0.0, 8.0), (0.0, 8.0), 8)
 ONE = (Channel(None, 1.5),)
@@ -50,16 +51,22 @@ def sheet(n, seed=0, spread=0.0):
     return Landed(position, torch.ones((n + 1, n + 1)), status)
 
 
+def of_tubes(flux, target, corners):
+    """(merit, RRMSD) of one sheet of tubes whose corners have landed."""
+    goals = (Goal("target", SCREEN, target.numpy()),)
+    return Merit(RayTubes(ONE, (Tubes(None, flux),)), goals, 0.03)(Landings(((corners,),)))
+
+
 def test_tubes_that_fill_the_pixels_have_merit_zero():
     """Each pixel's light in 3 x 3 tubes of its own; and the RRMSD of a lens that is 10 % off in every second pixel."""
     target = torch.rand((8, 8), generator=torch.Generator().manual_seed(0), dtype=torch.float64) + 0.1
     target /= target.sum()
     flux = target.flip(0).T.repeat_interleave(3, 0).repeat_interleave(3, 1) / 9  # x first, y upwards
-    merit, rrmsd = TubeMerit(RayTubes(ONE, (Tubes(None, flux),)), SCREEN, target, 0.03)((sheet(24),))
+    merit, rrmsd = of_tubes(flux, target, sheet(24))
     assert float(merit) < 1e-24 and float(rrmsd) < 1e-12
     chequered = 1 + 0.1 * (-1.0) ** torch.stack(torch.meshgrid(torch.arange(8), torch.arange(8), indexing="ij")).sum(0)
     other = target * chequered / (target * chequered).sum()
-    _, rrmsd = TubeMerit(RayTubes(ONE, (Tubes(None, flux),)), SCREEN, other, 0.03)((sheet(24),))
+    _, rrmsd = of_tubes(flux, other, sheet(24))
     assert float(rrmsd) == pytest.approx(float((target - other).norm() / other.norm()), rel=1e-9)
 
 
@@ -84,9 +91,12 @@ def test_the_gradient_of_the_tubes_is_that_of_finite_differences():
     target = torch.rand((8, 8), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     corners = sheet(9, 1, 0.6)
     flux = torch.rand((9, 9), generator=torch.Generator().manual_seed(4), dtype=torch.float64)
-    merit = TubeMerit(RayTubes(ONE, (Tubes(None, flux),)), SCREEN, target / target.sum(), 0.03)
     leaf = corners.position.clone().requires_grad_()
-    assert torch.autograd.gradcheck(lambda p: merit((replace(corners, position=p),))[0], (leaf,), eps=1e-7, atol=1e-5)
+
+    def merit(position):
+        return of_tubes(flux, target, replace(corners, position=position))[0]
+
+    assert torch.autograd.gradcheck(merit, (leaf,), eps=1e-7, atol=1e-5)
 
 
 # --- the variable of stage 2 ------------------------------------------------------------------------------------------

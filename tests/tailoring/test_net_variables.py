@@ -2,23 +2,24 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from bstcad.analysis.shape import slope_octaves
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.trace import behind
-from bstcad.tailoring.goals import Goal
 from bstcad.tailoring.merit import SobolevVariable
 from bstcad.tailoring.net_variables import NetVariables, along_light
 
 BEAM, POINT = Collimated(aperture=Rectangle(16.0, 16.0)), Point((1.0, 0.0, -80.0), half_angle=5.0)
 SCREENS = [Screen(30.0, (-9.0, 9.0), (-9.0, 9.0), 8), Screen(70.0, (-9.0, 9.0), (-9.0, 9.0), 8)]
-GOALS = [Goal(screen, torch.ones((8, 8)).numpy() / 64, 1.0) for screen in SCREENS]
+GOALS = [Goal(f"target[{k}]", screen, np.full((8, 8), 1 / 64)) for k, screen in enumerate(SCREENS)]
 
 
 def surface(z, of, m):

@@ -59,7 +59,7 @@ def wide(tmp_path):
 
 
 def part_of(scene):
-    return reachable_part(scene, scene.target.irradiance())
+    return reachable_part(scene, *scene.goals)
 
 
 def radii(scene):

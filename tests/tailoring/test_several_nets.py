@@ -10,6 +10,7 @@ import torch
 from bstcad.analysis.shape import thickness_range
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import images
@@ -18,7 +19,7 @@ from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.machinability import held, kept
-from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Parameters, Task
 from bstcad.tailoring.stage2 import Problem, improved, search, steps, variables_of
 
@@ -54,8 +55,8 @@ MOVED = {Collimated: {"tilt": (1.0, 0.0)}, Point: {"position": (1.5, 0.0, -600.0
 def problem_of(name):
     lens, source = FRONTS[name]
     knobs = Tailoring(rays=96, levels=(M,), stage2_iterations=EVALUATIONS, overshoot=0.03)
-    task = Task((Channel(source, N),), SCREEN, picture(), knobs)
-    merit = TubeMerit.of(task.channels, lens, 96, SCREEN, torch.from_numpy(task.target), 0.03)
+    task = Task((Channel(source, N),), (Goal("target", SCREEN, picture()),), knobs)
+    merit = Merit.of(task.channels, lens, 96, task.goals, 0.03)
     return task, lens, Problem(lens, merit)
 
 

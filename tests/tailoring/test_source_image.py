@@ -11,6 +11,7 @@ import torch
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import channels_of, drawn_channels
+from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
@@ -19,9 +20,9 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
 from bstcad.scene.quality import Tailoring
-from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Task
-from bstcad.tailoring.source_image import BlurredMerit, Images, Spread, _biquadratic, blurs, bordered
+from bstcad.tailoring.source_image import Images, Spread, _biquadratic, blurs, bordered, unseen
 from bstcad.tailoring.stage2 import Problem, _pull
 
 INDEX, SIZE = 1.5, 2.4
@@ -48,12 +49,18 @@ def spread(source):
     return Spread(source, light, lambda points, seed: drawn_channels(source, lambda nm: INDEX, points, seed))
 
 
-def target():
-    return torch.from_numpy(np.random.default_rng(0).uniform(0.5, 1.5, SCREEN.shape))
+GOALS = (Goal("target", SCREEN, np.random.default_rng(0).uniform(0.5, 1.5, SCREEN.shape)),)
 
 
-def merit(source, n=60, seed=1):
-    return BlurredMerit.of(spread(source), lens(), n, screen=SCREEN, target=target(), overshoot=0.03, seed=seed)
+def merit(source, n=60, goals=GOALS, overshoot=0.03, seed=None):
+    light = spread(source)
+    return Merit.of(light.centre, lens(), n, goals, overshoot, spread=light, seed=seed)
+
+
+def shown(merit):
+    """The picture by the images, of each goal."""
+    with torch.no_grad():
+        return [merit.picture(k, landed)[0] for k, landed in enumerate(merit.landing(lens()).on_goals)]
 
 
 def by_rays(source, sets=6):
@@ -77,20 +84,15 @@ def of_point(source):
 def test_the_blurred_light_is_the_sum_over_the_points(name):
     """By images alone, against rays from many points: a quarter at most of what the source's size changes."""
     source = SOURCES[name]
-    rays, by_images = by_rays(source), merit(source)
-    with torch.no_grad():
-        found = by_images.picture(by_images.landing(lens()))[0]
+    rays, (found,) = by_rays(source), shown(merit(source))
     assert off(rays, found) < 0.25 * off(rays, of_point(source))
 
 
 def test_a_source_of_next_to_no_size_is_a_point():
     """Its merit, too, but for light beyond the border, which here is on the wider screen that light is blurred from."""
     tiny = replace(SOURCES["disc"], diameter=1e-6)
-    ours = merit(tiny)
-    ours = replace(ours, left_out=None, overshoot=0.0)
-    light = channels_of(tiny.central, lambda nm: INDEX, 1)
-    plain = TubeMerit.of(light, lens(), 60, screen=SCREEN, target=target(), overshoot=0.0)
-    one, two = (each(each.landing(lens())) for each in (ours, plain))
+    plain = Merit.of(spread(tiny).centre, lens(), 60, GOALS, 0.0)
+    one, two = (each(each.landing(lens())) for each in (merit(tiny, overshoot=0.0), plain))
     for mine, other in zip(one, two, strict=True):
         assert float(mine) == pytest.approx(float(other), rel=1e-3)  # tents of a fifth of a pixel
 
@@ -113,8 +115,23 @@ def test_the_adjoint_is_the_transpose():
     assert (blur.forward(light) * g).sum() == pytest.approx((light * blur.adjoint(g)).sum(), rel=1e-12)
 
 
-def test_the_gradient_is_that_of_differences():
-    problem, heights = Problem(lens(), merit(SOURCES["disc"], n=50)), lens().back.heights
+FURTHER = replace(SCREEN, z=250.0, tilt=(20.0, 0.0))
+TWO = (*GOALS, Goal("target[1]", FURTHER, np.full(FURTHER.shape, 1 / 2400), weight=2.0))
+
+
+def test_each_of_several_goals_is_blurred_by_images_of_its_own():
+    """Its picture is that for the goal alone, and not that of a point."""
+    source = SOURCES["disc"]
+    for goal, found in zip(TWO, shown(merit(source, goals=TWO)), strict=True):
+        [alone] = shown(merit(source, goals=(goal,)))
+        torch.testing.assert_close(found, alone, rtol=1e-9, atol=1e-12)
+        by_point = RayTubes.launched(lens(), spread(source).centre, 60).picture(lens(), goal.receiver)
+        assert float((found / total(found) - by_point / total(by_point)).norm()) > 0.1 * float(found.norm())
+
+
+@pytest.mark.parametrize("goals", [GOALS, TWO], ids=["one goal", "two"])
+def test_the_gradient_is_that_of_differences(goals):
+    problem, heights = Problem(lens(), merit(SOURCES["disc"], n=50, goals=goals, seed=1)), lens().back.heights
     _, [gradient], _ = problem([heights])
     way = 1e-6 * torch.from_numpy(np.random.default_rng(2).normal(size=heights.shape))
     ahead, behind = (problem([heights + sign * way])[0] for sign in (1, -1))
@@ -125,9 +142,8 @@ def test_what_the_images_leave_out_is_measured_by_rays():
     """Images of half the size leave out more; with what rays measured the picture is that of all points again."""
     source = SOURCES["disc"]
     rays, half = by_rays(source), merit(replace(source, diameter=SIZE / 2))
-    with torch.no_grad():
-        found = half.picture(half.landing(lens()))[0]
-    mended = found + half.measured(spread(source).draw, lens(), 3)
+    [found] = shown(half)
+    mended = found + unseen(found, spread(source).draw, lens(), SCREEN, border=half.blurs[0][0].border, seed=3)
     assert off(rays, mended) < 0.5 * off(rays, found)
 
 
@@ -162,6 +178,6 @@ def test_a_few_points_tell_how_wide_the_image_is(name):
     """The pull on light beyond the border falls with the width of the image, by all 64 points or by a few."""
     source = SOURCES[name]
     light, knobs = channels_of(source, lambda nm: INDEX, 64), Tailoring(overshoot=0.03)
-    task = Task(light, SCREEN, target().numpy(), knobs, spreads=(spread(source),))
+    task = Task(light, GOALS, knobs, spreads=(spread(source),))
     by_all = _pull(replace(task, spreads=()), lens())
     assert _pull(task, lens()) == pytest.approx(by_all, rel=0.02) and by_all < 0.02

@@ -77,10 +77,10 @@ def test_the_source_grows_to_its_size():
 
 def task_of(scene):
     """The task of a scene as `pipeline.design` has it."""
-    knobs, wanted = scene.tailoring.resolved(33), scene.target
+    knobs = scene.tailoring.resolved(33)
     light, scaled = scene.with_source_scaled(0.0).channels(), [scene.with_source_scaled(s) for s, _ in stage2.SIZES]
     return pipeline.Task(
-        light, wanted.screen, wanted.irradiance(), knobs, grown=tuple(each.channels() for each in scaled),
+        light, scene.goals, knobs, grown=tuple(each.channels() for each in scaled),
         spreads=tuple(Spread(each.source, light, each.draw) for each in scaled),
     )  # fmt: skip
 

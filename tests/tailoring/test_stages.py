@@ -10,7 +10,7 @@ import torch
 from bstcad.baselines import paper
 from bstcad.scene import scene
 from bstcad.tailoring import stage1, stage2
-from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.merit import Landings, Merit
 from bstcad.tailoring.run import Driver, Step, Task
 from tests.tracing import simulated
 
@@ -26,9 +26,8 @@ def small(name, **more):
     """(task, blank lens) of a template at toy size: laws only, no figures."""
     wanted = scene.load(f"templates/{name}.toml", SMALL | more)
     knobs = wanted.tailoring.resolved(17)
-    t = wanted.target
     free = wanted.lens.front.free
-    task = Task(wanted.channels(), t.screen, t.irradiance(), knobs, free=free)
+    task = Task(wanted.channels(), wanted.goals, knobs, free=free)
     return task, wanted.flat_lens(knobs.levels[0])
 
 
@@ -134,12 +133,13 @@ def test_an_accuracy_that_the_judge_denies_was_not_reached():
 def test_light_that_is_lost_is_no_gain():
     """Half of the tubes lost to total reflection: the merit rises by at least what they carried."""
     (task, _), lens = small("disk"), disk()
-    merit = TubeMerit.of(task.channels, lens, 60, task.screen, torch.from_numpy(task.target), 0.03)
-    [corners] = merit.landing(lens)
+    merit = Merit.of(task.channels, lens, 60, task.goals, 0.03)
+    ((corners,),) = merit.landing(lens).on_goals
     status = corners.status.clone()
     status[:30] = 3
     lost = float(merit.light.sheets[0].flux[:30].sum() / merit.light.sheets[0].flux.sum())
-    assert float(merit((replace(corners, status=status),))[0]) > float(merit((corners,))[0]) + lost
+    less, all_of_it = (float(merit(Landings(((each,),)))[0]) for each in (replace(corners, status=status), corners))
+    assert less > all_of_it + lost
 
 
 def test_time_that_is_up_ends_stage_2_with_the_best_so_far():
@@ -194,7 +194,7 @@ def test_stage_1_finds_the_front_curvature_and_the_back_together():
     tailored, mapping = last.lens, last.mapping
     assert tailored.front.curvature != 0.0
     assert mapping.transport.mass_error[-1] < 0.02
-    found = simulated(task.heaviest.source, tailored, task.screen, 300, 0)
+    found = simulated(task.heaviest.source, tailored, task.goals[0].receiver, 300, 0)
     assert found.efficiency > 0.98
     assert task.rrmsd(tailored) < 0.6 * task.rrmsd(replace(lens, back=lens.back.refined(17)))
 
@@ -237,10 +237,9 @@ def halved(task):
 def test_two_halves_of_a_channel_are_the_channel():
     """Merit, gradient and picture of the tubes: a sum over channels, each with its weight."""
     (task, _), lens = small("disk"), disk()
-    target = torch.from_numpy(task.target)
     found = []
     for light in (task, halved(task)):
-        merit = TubeMerit.of(light.channels, lens, 60, task.screen, target, 0.03)
+        merit = Merit.of(light.channels, lens, 60, task.goals, 0.03)
         found.append((*stage2.Problem(lens, merit)([lens.back.heights]), light.rrmsd(replace(lens))))
     (value, (gradient,), rrmsd, judged), (again, (its,), seen, by) = found
     assert again == pytest.approx(value, rel=1e-12) and seen == pytest.approx(rrmsd, rel=1e-12)

@@ -8,6 +8,7 @@ import bstcad
 from bstcad import pipeline
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import rrmsd_by_rays
@@ -19,8 +20,7 @@ from bstcad.optics.wavefront import PlaneWave, SphericalWave, ZernikeWave
 from bstcad.optics.wavefront_error import wavefront_error
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring import light_behind
-from bstcad.tailoring.goals import Goal, JointMerit
-from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Parameters
 
 SQUARE, N = Rectangle(20.0, 20.0), 1.5
@@ -46,16 +46,19 @@ def picture(seed):
     return light / light.sum()
 
 
+def goals_of(weights):
+    return [Goal(f"target[{k}]", s, picture(k), w) for k, (s, w) in enumerate(zip((NEAR, FAR), weights, strict=True))]
+
+
 def merit_of(lens, source=BEAM, wave=None, n=40, weights=(1.0, 2.0)):
-    goals = [Goal(s, picture(k), w) for k, (s, w) in enumerate(zip((NEAR, FAR), weights, strict=True))]
-    return JointMerit.of((Channel(source, N),), lens, n, goals, overshoot=0.03, wave=wave)
+    return Merit.of((Channel(source, N),), lens, n, goals_of(weights), 0.03, wave=wave)
 
 
-def test_one_goal_is_the_merit_of_one_target():
-    lens, channels = bumpy(), (Channel(BEAM, N),)
-    one = JointMerit.of(channels, lens, 40, [Goal(NEAR, picture(0), 5.0)], overshoot=0.03)
-    known = TubeMerit.of(channels, lens, 40, screen=NEAR, target=torch.from_numpy(picture(0)), overshoot=0.03)
-    for value, other in zip(one(one.landing(lens)), known(known.landing(lens)), strict=True):
+def test_a_goal_twice_is_the_goal_once():
+    """By the kernels as far as the receiver, and by those that end behind the lens."""
+    lens, goal = bumpy(), Goal("target", NEAR, picture(0), 5.0)
+    once, twice = (Merit.of((Channel(BEAM, N),), lens, 40, goals, 0.03) for goals in ([goal], [goal, goal]))
+    for value, other in zip(once(once.landing(lens)), twice(twice.landing(lens)), strict=True):
         assert float(value) == pytest.approx(float(other), rel=1e-12)
 
 
@@ -69,7 +72,7 @@ def test_weights_count_by_their_proportion():
 def test_the_waves_term_is_the_measured_error(name):
     lens, wave = bumpy(), WAVES[name]
     merit = merit_of(lens, wave=wave, n=256)
-    term = float(merit._of_wave(*merit.landing(lens)[0]))
+    term = float(merit._of_wave(*merit.landing(lens).behind))
     assert term**0.5 == pytest.approx(wavefront_error(BEAM, lens, wave, 512).without_piston.rms, rel=0.01)
 
 
