@@ -57,7 +57,7 @@ from bstcad.step_text import beginning
 from bstcad.sweep.estimates import diagnosis, left_out
 from bstcad.sweep.net_choice import with_net
 from bstcad.tailoring.run import Look, Progress, silent, unseen
-from bstcad.verify import checks, text_checks
+from bstcad.verify import checks
 from bstcad.verify.checks import Nominal, Proof
 from bstcad.verify.verdict import Check, verdict
 
@@ -341,7 +341,7 @@ def examine(path: Path) -> Examined:
     with refusals(f"{path}: "):
         found = checks.examine(path, processes.submit)
     passed = all(check.passed for check in found.checks)
-    stated = [check.value for check in found.checks if check.name == text_checks.DENSITY]
+    stated = [check.value for check in found.checks if check.id == "stated-density"]
     placement = found.placement.facts() if found.placement.moves else None
     rows = prescription.part(
         found.lens, found.whole, stated[0] if len(stated) == 1 else None, placement=placement

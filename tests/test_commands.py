@@ -118,7 +118,8 @@ class TestGenerate:
         read = json.loads((small_design.folder / "report.json").read_text())
         assert set(read) >= KEYS and set(read) == set(small_design.report)
         assert read["passed"] is True and all(check["passed"] for check in read["checks"])
-        assert all(set(check) == {"name", "value", "limit", "unit", "passed", "where"} for check in read["checks"])
+        keys = {"name", "value", "limit", "unit", "passed", "where", "id"}
+        assert all(set(check) == keys for check in read["checks"])
         assert read["version"] == read["versions"]["bstcad"] == bstcad.__version__
         assert read["name"] == "small" and read["seed"] == 0 and read["quality"] == "draft"
         assert 0 < 5 * read["rrmsd_noise"] <= read["rrmsd"] < 0.1 and 0 < read["rrmsd_tent"] < 0.1

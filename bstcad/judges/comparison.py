@@ -156,10 +156,11 @@ def compare(
     over_noise, limit = difference / max(noise, EXACT), AGREE * (1 + 3 / math.sqrt(_effective_pixels(first - second)))
     on_target, on_target_ours = float(traced.picture.sum()), ours.flux.get("on target", 0.0)
     of = f", {key}" if key else ""
+    irradiance = f"irradiance by {name} against bstcad's, over the noise{of}"
     flux = f"light on the target by {name} against the ledger's, of the source's{of}"
     checks = (
-        Check.at_most(f"irradiance by {name} against bstcad's, over the noise{of}", over_noise, limit),
-        Check.at_most(flux, abs(on_target - on_target_ours), FLUX),
+        Check.at_most(irradiance, over_noise, limit, id="judge-irradiance"),
+        Check.at_most(flux, abs(on_target - on_target_ours), FLUX, id="judge-flux"),
     )
     outcome = Judge(
         name,

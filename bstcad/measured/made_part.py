@@ -63,29 +63,38 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
     scale, uncertainty = aligning.scale(face, placed)
     x, y, _ = placed.pose.shift
     checks = (
-        Check.true("made part: the cloud is in mm", cloud.unit == "mm", f"its extent is the lens's in {cloud.unit}"),
-        Check.true("made part: the axes of the cloud are the design's", not axes, axes),
+        Check.true(
+            "made part: the cloud is in mm", cloud.unit == "mm", f"its extent is the lens's in {cloud.unit}",
+            id="made-unit",
+        ),
+        Check.true("made part: the axes of the cloud are the design's", not axes, axes, id="made-axes"),
         *_of_this_lens(face, placed),
-        Check.at_least("made part: share of the face that was measured", _covered(lens, placed.points), COVERED),
+        Check.at_least(
+            "made part: share of the face that was measured", _covered(lens, placed.points), COVERED,
+            id="made-covered",
+        ),
         Check.at_most(
             "made part: outliers among the points of the face, as a share", placed.outlier_share, OUTLIERS,
-            where="clean the part and measure it again",
+            where="clean the part and measure it again", id="made-outliers",
         ),
         Check.at_most(
             "made part: scale of the cloud, off 1", abs(scale - 1), max(SCALE, SURE * uncertainty),
-            where=f"it is {scale:.5f} times the design",
+            where=f"it is {scale:.5f} times the design", id="made-scale",
         ),
         Check.at_most(
             "made part: decentre in the frame of the cloud", math.hypot(x, y), nominal.accept.decentre, "mm",
-            where=f"x {x:+.4g} mm, y {y:+.4g} mm",
+            where=f"x {x:+.4g} mm, y {y:+.4g} mm", id="made-decentre",
         ),
         *(
             check
             for goal, (light, high) in zip(nominal.goals, lights, strict=True)
             for check in (
-                Check.at_most(f"made part: RRMSD predicted{goal.suffix}", light.rrmsd, nominal.accept.rrmsd),
                 Check.at_most(
-                    f"made part: RRMSD, were all that the points leave open against it{goal.suffix}", high, None
+                    f"made part: RRMSD predicted{goal.suffix}", light.rrmsd, nominal.accept.rrmsd, id="made-rrmsd"
+                ),
+                Check.at_most(
+                    f"made part: RRMSD, were all that the points leave open against it{goal.suffix}", high, None,
+                    id="made-rrmsd-high",
                 ),
             )
         ),
@@ -115,7 +124,7 @@ def _wavefront(lens: Lens, nominal: Nominal) -> Iterator[Check]:
     except ValueError as error:
         none = str(error)
     name, asked = f"made part: {WAVEFRONT}, predicted", nominal.accept.wavefront
-    yield Check.at_most(name, value, asked, unit="waves", where=none)
+    yield Check.at_most(name, value, asked, unit="waves", where=none, id="made-wavefront")
 
 
 def _aligned(face: Face, points: np.ndarray) -> tuple[Alignment, str]:
@@ -135,10 +144,13 @@ def _of_this_lens(face: Face, placed: Alignment) -> tuple[Check, Check]:
     share, limit = _relief(face, placed.points), FARTHEST * face.reach
     other = "the cloud is of another lens or of another face"
     return (
-        Check.at_most("made part: distance from the design after alignment, RMS", placed.rms, limit, "mm", where=other),
+        Check.at_most(
+            "made part: distance from the design after alignment, RMS", placed.rms, limit, "mm", where=other,
+            id="made-distance",
+        ),
         Check.at_least(
             "made part: fine relief of the face, as a part of the design's", 1.0 if share is None else share,
-            None if share is None else RELIEF, where=other,
+            None if share is None else RELIEF, where=other, id="made-relief",
         ),
     )  # fmt: skip
 

@@ -13,6 +13,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
+from itertools import starmap, zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -35,10 +36,11 @@ from bstcad.optics.reach import unreached
 from bstcad.report.goal_figures import GoalFigures, Rrmsd, Share, Size, WavefrontFigures, figures_of, flat_tops
 from bstcad.report.light_figures import rrmsd
 from bstcad.report.prescription import Order, prescription
-from bstcad.report.units import DIGITS, Rows, number, paragraphs, percent, tables
+from bstcad.report.units import DIGITS, Remark, Rows, number, paragraphs, percent, tables
+from bstcad.report.units import remarks as written
 from bstcad.runs import files
 from bstcad.scene.scene import Scene
-from bstcad.verify.checks import CUT, DEFAULT_RRMSD_LIMIT, Proof
+from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, Proof
 from bstcad.verify.verdict import NO_LIMIT, Check, verdict
 
 if TYPE_CHECKING:
@@ -199,6 +201,7 @@ class Contents:
     lines: tuple[Line, ...] = ()  # of a spectrum; none: it has one line
     picture: tuple[str, ...] = ()  # sentences on how the picture was read: first of several, tones, transparency, fit
     given_up: tuple[str, ...] = ()  # remarks: sentences on wishes of the scene that the design does not fulfil
+    remarks: tuple[str, ...] = ()  # the id of each of these sentences
     estimates: tuple[LeftOut, ...] = ()  # of the effects that are not simulated, the largest change first
     # the end of the convergence curve, as analysis.cost.Ending has it; None: there is no curve
     convergence: Mapping[str, Size | None] | None = None
@@ -229,6 +232,11 @@ class Contents:
         """How the lens was designed."""
         return Making(**{entry.name: getattr(self, entry.name) for entry in fields(Making)})
 
+    @property
+    def remarked(self) -> tuple[Remark, ...]:
+        """The remarks with their ids, which an older report lacks."""
+        return tuple(starmap(Remark, zip_longest(self.remarks, self.given_up, fillvalue="")))
+
     def facts(self) -> dict[str, Any]:
         """The entries of report.json as plain values, in their order; those that are not known are no keys."""
         found = {key: value for key, value in plain(self).items() if key in STATED or value not in (None, [])}
@@ -240,7 +248,8 @@ class Contents:
 
 ALL = tuple(entry.name for entry in fields(Contents))
 KEYS = ALL[: ALL.index("seed") + 1]  # of every report.json, in this order
-STATED = {*KEYS, "leak", "contrast", "optic", "twins", "rrmsd_asked", "given_up"}  # keys though nothing is known
+# keys though nothing is known
+STATED = {*KEYS, "leak", "contrast", "optic", "twins", "rrmsd_asked", "given_up", "remarks"}
 
 
 @dataclass(frozen=True)
@@ -254,7 +263,7 @@ class Examined:
     checks: tuple[Check, ...]
     part: Mapping[str, str]  # rows of name and value (prescription.part)
     placement: Mapping[str, Any] | None = None  # where the lens lies in the file (Placement.facts); None: unmoved
-    given_up: tuple[str, ...] = ()  # these as in Contents: nothing is known without a design
+    remarked: tuple[Remark, ...] = ()  # these as in Contents: nothing is known without a design
     limits: tuple[Mapping[str, Any], ...] = ()
     bounds: Mapping[str, Any] | None = None
 
@@ -326,21 +335,14 @@ def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:
     measured = part.facts | {"deviation_map": [f"{place}{name}" for name in MAP]}
     passed, checks = contents.passed and part.facts["passed"], (*contents.checks, *part.checks)
     contents = replace(contents, checks=checks, passed=passed, measured=measured)
-    share = part.facts["outliers"]["share"]
-    if share <= OUTLIERS:
-        return _remarked(contents)
-    return _remarked(
-        contents,
-        f"{percent(share)} of the measured points are outliers and were left out: dust, glints or slips of the "
-        "instrument. Clean the part and measure it again to be sure.",
-    )
+    return _remarked(contents, *written("remarks.txt.j2", "outliers", share=part.facts["outliers"]["share"]))
 
 
-def _remarked(contents: Contents, *more: str) -> Contents:
+def _remarked(contents: Contents, *more: Remark) -> Contents:
     """The contents with more remarks, and the verdict that follows."""
-    given_up = (*contents.given_up, *more)
-    asked = contents.verdict != NO_LIMIT
-    return replace(contents, given_up=given_up, verdict=verdict(contents.passed, given_up, asked))
+    every, asked = (*contents.remarked, *more), contents.verdict != NO_LIMIT
+    ids, texts = (tuple(part) for part in zip(*every, strict=True)) if every else ((), ())
+    return replace(contents, given_up=texts, remarks=ids, verdict=verdict(contents.passed, texts, asked))
 
 
 def _finest_detail(
@@ -371,15 +373,13 @@ def extent(source: Source) -> Iterator[tuple[str, str]]:
 # lens may be right to the last nanometre and still lose light, or be thicker than drawn, because the scene left no
 # other way; who reads only "passed" or "failed" should not have to search the tables for that.
 
-OUTLIERS = 0.01  # of the points of a made part: more outliers are worth a sentence
 
-
-def remarks(report: Contents, scene: Scene, goals: Sequence[Goal], irradiances: Sequence[np.ndarray]) -> list[str]:
+def remarks(report: Contents, scene: Scene, goals: Sequence[Goal], irradiances: Sequence[np.ndarray]) -> list[Remark]:
     """Remarks on a report, by the irradiance on each target, of its picture's sum; the most important first."""
     allowed = DEFAULT_RRMSD_LIMIT if report.rrmsd_asked is None else report.rrmsd_asked
     pairs = list(zip(goals, irradiances, strict=True))
-    return paragraphs(
-        "remarks.txt.j2", "remarks", report=report, scene=scene, allowed=allowed, cut=CUT, names=LEFT_OUT,
+    return written(
+        "remarks.txt.j2", "remarks", report=report, scene=scene, allowed=allowed, names=LEFT_OUT,
         unlit={goal.words: unlit(goal.picture, found, x=goal.receiver.x, y=goal.receiver.y) for goal, found in pairs},
         lifted={goal.words: lifted(goal.picture, found) for goal, found in pairs},
     )  # fmt: skip
@@ -388,7 +388,7 @@ def remarks(report: Contents, scene: Scene, goals: Sequence[Goal], irradiances: 
 def too_steep(found: Steepness) -> list[str]:
     """The light that would need a steeper back than a height over a plane carries; nothing if hardly any does."""
     sent = {"steep_share": found.share, "steepest_deg": found.steepest}
-    return paragraphs("remarks.txt.j2", "steep", sent=sent)
+    return [remark.text for remark in written("remarks.txt.j2", "steep", sent=sent)]
 
 
 def bounds(found: Mapping[str, Any] | None) -> str:

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 from bstcad.analysis.cost import HELD, WORTH
 from bstcad.optics.goal import suffix_of
 from bstcad.optics.sides import in_words
-from bstcad.report import explained
 from bstcad.report.prescription import WAYS, order_rows
 from bstcad.report.record import LEFT_OUT, Contents, Examined, LeftOut, bounds, changes
-from bstcad.report.units import Rows, about, bound, environment, number, paragraphs, percent, quantity, tables
+from bstcad.report.units import Remark, Rows, about, bound, environment, number, paragraphs, percent, quantity, tables
+from bstcad.report.units import remarks as written
 from bstcad.runs import files
 from bstcad.verify.verdict import NO_LIMIT, Check
 
@@ -72,14 +72,14 @@ def explanation(report: Contents | Examined) -> str:
     text = f"{failed} of {count} checks failed." if failed else f"All {count} checks passed."
     if report.verdict == NO_LIMIT:
         text = f"All {count} checks passed; none of them is a limit that the scene sets on the light."
-    return " ".join((text, *doubts(report)))
+    return " ".join((text, *(doubt.text for doubt in doubts(report))))
 
 
-def doubts(report: Contents | Examined) -> list[str]:
+def doubts(report: Contents | Examined) -> list[Remark]:
     """Sentences on the RRMSD: that the scene sets no limit on it or on the light, that it is not resolved."""
     if isinstance(report, Examined):
         return []
-    return paragraphs("verdict.txt.j2", "doubts", report=report)
+    return written("verdict.txt.j2", "doubts", report=report)
 
 
 def check_line(check: Check) -> str:
@@ -204,8 +204,8 @@ def summary(report: Contents | Examined, verbose: bool = False) -> Group:
     from rich.text import Text
 
     lines = [Text.assemble((report.verdict.upper(), BADGES[report.verdict][2]), f": {report.title or report.name}")]
-    remarks = (*doubts(report), *report.given_up) if report.verdict == NO_LIMIT else (*report.given_up, *doubts(report))
-    lines += [Text.assemble(f"Remark: {sentence}", named(sentence)) for sentence in remarks]
+    said = (*doubts(report), *report.remarked) if report.verdict == NO_LIMIT else (*report.remarked, *doubts(report))
+    lines += [Text.assemble(f"Remark: {remark.text}", named(remark)) for remark in said]
     figures = first_figures(report)
     wide = max((len(name) for name, _, _ in figures), default=0)
     lines += [Text(f"{name:{wide}}  {value}{remark and f' ({remark})'}") for name, value, remark in figures]
@@ -213,7 +213,7 @@ def summary(report: Contents | Examined, verbose: bool = False) -> Group:
     passed = sum(check.passed for check in report.checks)
     lines += check_lines(report.checks, verbose)
     lines.append(Text(f"{passed} checks passed{'' if verbose else '; --verbose lists them'}."))
-    if remarks or verbose or passed < len(report.checks):
+    if said or verbose or passed < len(report.checks):
         lines.append(Text("bstcad docs NAME explains the check or the remark of that [NAME].", "dim"))
     return Group(*lines)
 
@@ -224,16 +224,15 @@ def check_lines(checks: Sequence[Check], verbose: bool, of: str = "") -> Iterato
 
     for check in sorted(checks, key=lambda check: check.passed):
         if not check.passed:
-            yield Text.assemble(("FAIL", "bold red"), f" {of}{check_line(check)}", named(check.name))
+            yield Text.assemble(("FAIL", "bold red"), f" {of}{check_line(check)}", named(check))
         elif verbose:
             judged = "stated" if check.limit is None else "pass"
-            yield Text.assemble(f"{judged} {of}{check_line(check)}", named(check.name))
+            yield Text.assemble(f"{judged} {of}{check_line(check)}", named(check))
 
 
-def named(text: str) -> tuple[str, str]:
+def named(line: Check | Remark) -> tuple[str, str]:
     """The name by which `bstcad docs` explains a check or a remark, and its style; nothing where it explains none."""
-    name = explained.topic(text)
-    return name and f" [{name}]", "dim"
+    return line.topic and f" [{line.topic}]", "dim"
 
 
 # --- terminal: a plan -------------------------------------------------------------------------------------------------

@@ -7,11 +7,10 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from bstcad.report.explained import topic
 from bstcad.verify.verdict import Check
 
 if TYPE_CHECKING:
@@ -161,7 +160,7 @@ def environment() -> Environment:
         undefined=jinja2.StrictUndefined,
     )  # fmt: skip
     filters = (about, amount, bound, duration, exact, interval, mm, number, percent, quantity, rounded_up)
-    found.filters |= {f.__name__: f for f in (*filters, stated, topic, turned)}
+    found.filters |= {f.__name__: f for f in (*filters, stated, turned)}
     found.globals["exact"] = exact
     return found
 
@@ -198,3 +197,20 @@ def paragraphs(template: str, macro: str, **values: Any) -> list[str]:
     """The paragraphs that a macro of a template writes, each in a line."""
     text = str(getattr(_plain_text().get_template(template).module, macro)(**values))
     return [line for part in text.split("\n\n") if (line := re.sub("[ \n]+", " ", part).strip(" "))]
+
+
+class Remark(NamedTuple):
+    """A sentence of a report."""
+
+    id: str  # its section in remarks.md without "remark-", such as "dark"; empty: of a report that knows none
+    text: str
+
+    @property
+    def topic(self) -> str:
+        """The name by which `bstcad docs` explains it; empty: none does."""
+        return self.id and f"remark-{self.id}"
+
+
+def remarks(template: str, macro: str, **values: Any) -> list[Remark]:
+    """The same where each begins with its id: "(dark) A part …"."""
+    return [Remark(*text.removeprefix("(").split(") ", 1)) for text in paragraphs(template, macro, **values)]

@@ -54,9 +54,6 @@ VERIFY_SEED = 1_000_003  # added to the seed: rays that tailoring never saw
 TARGET_DIFFERENCE = 1e-3  # of the brightest pixel: versions of the libraries that read pictures and draw letters differ
 DEFAULT_RRMSD_LIMIT = 0.25  # RRMSD that remarks, plans and tolerance studies take where accept.rrmsd asks for none
 LINE_TUBES = 1031  # tubes a side at least for the picture of each line of a spectrum by itself
-DARK = "light where the target is dark, of all on the target"
-TOTAL_REFLECTION = "smallest margin to total internal reflection"
-CUT = "part.step: light that the mount cuts away, of what gets through the uncut lens"
 APERTURE_DIFFERENCE = 1e-3  # mm; of a front whose edge is not level the scene knows its largest inset along the rim
 CUT_EXCUSE = 1e-3  # of the light: a mount that cuts away less is no reason for a picture that fails
 MAX_ON_FLANGE = 1e-3  # of the light that gets through the lens; no wall of a flange is to stand in the way of more
@@ -168,7 +165,7 @@ def verify(
             end()
         raise
     mesh = meshes.read_stl(folder / "lens.stl")
-    sealed = Check.true("STL watertight, winding consistent", meshes.is_closed(mesh))
+    sealed = Check.true("STL watertight, winding consistent", meshes.is_closed(mesh), id="mesh-closed")
     return_freed()  # the texts: OCC holds more of it still
     lens = _as_shaped(_result(lens, path), nominal.lens)
     whole = quadrature.of_lens(lens)  # not as it was stated
@@ -187,7 +184,8 @@ def verify(
     machined, at_bounds = of_bounds(cut, nominal.blank, shape)
     meets = "meets the mirror" if lens.reflects else "enters the lens"
     goals = [(goal, each, goal.suffix) for goal, each in zip(nominal.goals, lights, strict=True)]
-    margin = math.nan if stability["tir_margin_deg"] is None else stability["tir_margin_deg"]
+    degrees = math.nan if stability["tir_margin_deg"] is None else stability["tir_margin_deg"]
+    margin = Check.at_least("smallest margin to total internal reflection", degrees, None, "deg", id="tir-margin")
     checks = (
         *text_checks.of_lens(text, nominal.lens),
         *text_checks.measures(text.properties, whole, lens.outline),
@@ -201,10 +199,9 @@ def verify(
         *_facets(mesh, lens, shape["volume"], nominal),
         *map(_picture, nominal.goals, nominal.stored),
         *(c for _, each, of in goals for c in _because(why, _of_light(each, nominal.accept, meets, of=of))),
-        *(Check.at_most(f"{DARK}{of}", each.leak.share, nominal.accept.leak) for _, each, of in goals if each.leak),
         *of_wavefront,
-        *([] if lens.reflects else [Check.at_least(TOTAL_REFLECTION, margin, None, "deg")]),
-        Check.at_most("values that are not finite", stability["non_finite"], 0),
+        *([] if lens.reflects else [margin]),
+        Check.at_most("values that are not finite", stability["non_finite"], 0, id="finite"),
     )
     return Proof(
         checks, as_made, lights, shape, stability=stability,
@@ -248,22 +245,24 @@ def _as_made(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> tuple[
         checks = [_aperture(*each) for each in zip(("front", "back"), lens.apertures, designed.apertures, strict=True)]
     except ValueError as error:
         lens = replace(bare, clear=designed.clear)
-        checks = [Check.true("part.step: clear apertures can be measured", False, str(error))]
+        name = "part.step: clear apertures can be measured"
+        checks = [Check.true(name, False, str(error), id="clear-aperture-measured")]
     losses = mount_losses(lens, nominal.channels, None if flange is None else (flange.z, flange.z + flange.thickness))
-    checks.append(Check.at_most(CUT, losses.cut, None))
+    name = "part.step: light that the mount cuts away, of what gets through the uncut lens"
+    checks.append(Check.at_most(name, losses.cut, None, id="mount-cut"))
     if flange is not None:
         where = "a wall of its opening stands in the way; make the flange thinner, or put it where it meets the lens"
         name = "part.step: light that meets the flange"
-        checks.append(Check.at_most(name, losses.on_flange, MAX_ON_FLANGE, where=where))
+        checks.append(Check.at_most(name, losses.on_flange, MAX_ON_FLANGE, where=where, id="flange-light"))
     why = f"the mount leaves {lens.apertures[1].words} of the back and cuts away {100 * losses.cut:.3g} % of the light"
     return lens, checks, why if losses.cut > CUT_EXCUSE else ""
 
 
 def _because(why: str, checks: Sequence[Check]) -> list[Check]:
     """The checks, and of each of the light's way that failed without saying where, why."""
-    of_light = ("RRMSD", "light on the target", "efficiency")
+    of_light = {"rrmsd", "light-on-target", "efficiency"}
     return [
-        replace(check, where=why) if not (check.passed or check.where) and check.name.startswith(of_light) else check
+        replace(check, where=why) if not (check.passed or check.where) and check.id in of_light else check
         for check in checks
     ]
 
@@ -273,7 +272,7 @@ def _aperture(name: str, measured: Outline, designed: Outline) -> Check:
     off = max(float(np.abs(a.depth(*b.places())).max()) for a, b in ((measured, designed), (designed, measured)))
     where = f"the part has {measured.words}, the lens was tailored for {designed.words}; generate the design again"
     name = f"part.step: clear aperture of the {name}, from the mount's"
-    return Check.at_most(name, off, APERTURE_DIFFERENCE, unit="mm", where=where)
+    return Check.at_most(name, off, APERTURE_DIFFERENCE, unit="mm", where=where, id="clear-aperture")
 
 
 def _stability(
@@ -320,9 +319,10 @@ def _of_ripple(shape: Mapping[str, float | None]) -> list[Check]:
 
     No limit: the RRMSD judges what the light feels of it, and the bounds of the scene what a tool feels.
     """
+    measured = "RMS slope of control points that go up and down in turn"
     faces = {"": shape["ripple_slope"], " of the front": shape.get("front_ripple_slope")}
     return [
-        Check.at_most(f"ripple{of}: RMS slope of control points that go up and down in turn", slope, None, "rad")
+        Check.at_most(f"ripple{of}: {measured}", slope, None, "rad", id="ripple")
         for of, slope in faces.items()
         if slope is not None
     ]
@@ -354,27 +354,26 @@ def of_bounds(
             bending = surveyed(lens, **{kind: radius}, slope=degrees)
             if radius is not None:
                 met = getattr(bending, kind)
-                checks.append(
-                    Check.at_least(f"smallest {kind} radius{of}{GRID}", met.largest, radius, unit="mm", where=met.where)
-                )
+                name = f"smallest {kind} radius{of}{GRID}"
+                checks.append(Check.at_least(name, met.largest, radius, "mm", where=met.where, id="tool-radius"))
                 found.setdefault("tool_radius", []).append((met.largest, met, of))
             if degrees is not None:
                 met = bending.slope
                 name = f"steepest slope{of}{GRID}"
-                checks.append(Check.at_most(name, met.largest, degrees, unit="deg", where=met.where))
+                checks.append(Check.at_most(name, met.largest, degrees, "deg", where=met.where, id="slope"))
                 found.setdefault("max_slope", []).append((-met.largest, met, of))
     at_bounds = {}
     for key, faces in found.items():
         _, met, of = min(faces, key=lambda face: face[0])
         share = math.fsum(face.at_bound for _, face, _ in faces) / len(faces)
         at_bounds[key] = AtBound(share, f"{met.where}{of}")
-    for name, judge, figure, key in (
-        ("smallest thickness", Check.at_least, "thickness_min", "min_thickness"),
-        ("largest thickness", Check.at_most, "thickness_max", "max_thickness"),
-        ("smallest thickness of the edge", Check.at_least, "edge_thickness_min", "edge_thickness"),
+    for id, name, judge, figure, key in (
+        ("thickness", "smallest thickness", Check.at_least, "thickness_min", "min_thickness"),
+        ("largest-thickness", "largest thickness", Check.at_most, "thickness_max", "max_thickness"),
+        ("edge-thickness", "smallest thickness of the edge", Check.at_least, "edge_thickness_min", "edge_thickness"),
     ):
         if (limit := getattr(asked, key)) is not None:
-            checks.append(judge(name, shape[figure], limit, "mm"))
+            checks.append(judge(name, shape[figure], limit, "mm", id=id))
             if min(shape[figure], limit) >= AT_BOUND * max(shape[figure], limit):
                 at_bounds[key] = AtBound(None, "")
     return checks, at_bounds
@@ -386,7 +385,7 @@ def _picture(goal: Goal, stored: np.ndarray) -> Check:
     row, column = np.unravel_index(np.argmax(off), off.shape)
     name = f"target in design.npz against the scene's, of its brightest pixel{goal.suffix}"
     where = f"pixel ({column}, {row}), counted from the upper left"
-    return Check.at_most(name, float(off.max() / goal.picture.max()), TARGET_DIFFERENCE, where=where)
+    return Check.at_most(name, float(off.max() / goal.picture.max()), TARGET_DIFFERENCE, where=where, id="target")
 
 
 def _facets(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> list[Check]:
@@ -399,16 +398,16 @@ def _facets(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> l
     limit = None if finest and not nominal.mesh_asked else tolerance
     enclosed, area = meshes.volume_and_area(mesh)
     off, error = abs(enclosed / volume - 1), meshes.chordal_error(mesh, lens)
-    off_faces = meshes.vertex_error(mesh, lens)
+    off_faces, rounding = meshes.vertex_error(mesh, lens), VERTEX_ROUNDING * size
     least = error * len(mesh.faces) / meshes.ASKED  # it falls as their number grows
     most = (
         f"no mesh has over {meshes.ASKED} triangles, which come within some {least:.1g} mm; allow more than that by "
         "output.mesh_tolerance" if finest and error > tolerance else ""
     )  # fmt: skip
     return [
-        Check.at_most("STL: volume against the solid's, relative", off, area * tolerance / volume),
-        Check.at_most("STL: vertices off the solid's faces", off_faces, VERTEX_ROUNDING * size, "mm"),
-        Check.at_most("STL: chordal error", error, limit, unit="mm", where=most),
+        Check.at_most("STL: volume against the solid's, relative", off, area * tolerance / volume, id="mesh-volume"),
+        Check.at_most("STL: vertices off the solid's faces", off_faces, rounding, "mm", id="mesh-vertices"),
+        Check.at_most("STL: chordal error", error, limit, unit="mm", where=most, id="mesh-chord"),
     ]
 
 
@@ -418,18 +417,23 @@ def _of_light(light: Light, accept: Accept, meets: str = "enters the lens", of: 
     of: which of several targets it falls on, as Goal.suffix has it.
     """
     closure, tubes = abs(sum(light.flux.values()) - 1), light.witness
-    rrmsd, on_target = f"RRMSD, box pixels, through the re-read STEP{of}", f"light on the target, of what {meets}{of}"
+    off, error = RESOLVED * light.standard_error, f"standard error of that RRMSD, times five{of}"
+    on_target, least = f"light on the target, of what {meets}{of}", accept.light_on_target
     # noise below the RRMSD leaves its figure resolved; noise below its distance from the limit leaves its verdict sure
     noise = None if accept.rrmsd is None else max(light.rrmsd, accept.rrmsd - light.rrmsd)
     checks = [
-        Check.at_most(rrmsd, light.rrmsd, accept.rrmsd),
-        Check.at_most(f"standard error of that RRMSD, times five{of}", RESOLVED * light.standard_error, noise),
-        Check.at_least(on_target, light.used, accept.light_on_target),
-        Check.at_least(f"efficiency{of}", light.efficiency, accept.efficiency),
-        Check.at_most(f"flux ledger: distance of its sum from 1{of}", closure, 1e-12),
+        Check.at_most(f"RRMSD, box pixels, through the re-read STEP{of}", light.rrmsd, accept.rrmsd, id="rrmsd"),
+        Check.at_most(error, off, noise, id="noise"),
+        Check.at_least(on_target, light.used, least, id="light-on-target"),
+        Check.at_least(f"efficiency{of}", light.efficiency, accept.efficiency, id="efficiency"),
+        Check.at_most(f"flux ledger: distance of its sum from 1{of}", closure, 1e-12, id="ledger"),
     ]
     if tubes is not None:
-        checks.insert(2, Check.at_most(f"picture by ray tubes, off the one by rays{of}", tubes.off, tubes.limit))
+        name = f"picture by ray tubes, off the one by rays{of}"
+        checks.insert(2, Check.at_most(name, tubes.off, tubes.limit, id="tubes"))
+    if light.leak:
+        name = f"light where the target is dark, of all on the target{of}"
+        checks.append(Check.at_most(name, light.leak.share, accept.leak, id="leak"))
     return checks
 
 
@@ -441,8 +445,9 @@ def _of_wavefront(lens: Lens, nominal: Nominal) -> tuple[WavefrontError | None, 
     try:
         error = wavefront_error(light.source.central, light.through(lens), nominal.wave)
     except ValueError as none:  # a lens that misses the wave is written all the same, and fails
-        return None, [Check.at_most(WAVEFRONT, math.nan, asked, unit="waves", where=str(none))]
+        return None, [Check.at_most(WAVEFRONT, math.nan, asked, "waves", where=str(none), id="wavefront")]
+    most = None if asked is None else FLOOR * asked
     return error, [
-        Check.at_most(WAVEFRONT, error.without_tilt.rms, asked, unit="waves"),
-        Check.at_most("wavefront error floor", error.floor, None if asked is None else FLOOR * asked, unit="waves"),
+        Check.at_most(WAVEFRONT, error.without_tilt.rms, asked, "waves", id="wavefront"),
+        Check.at_most("wavefront error floor", error.floor, most, "waves", id="wavefront-floor"),
     ]

@@ -40,7 +40,6 @@ FLAT = 1e-9  # mm; a front so flat that all conics of its curvature are alike to
 BRIDGED = 5e-7  # mm; written with 1e-7
 MOVED = 1e-6  # mm, of an edge of a part; written with 1e-7
 PART = "part.step"
-PLACED = "form: placement of the lens in the file, largest shift of a control point"
 
 
 def one_sentence(work: Callable[..., Any]) -> Callable[..., Any]:
@@ -125,15 +124,22 @@ def examine(path: Path) -> ExaminedFile:
         *text_checks.structure(text, lens_read.back.shape, any_unit=True),
         *_sound(reread.shape),
         *_edges(reread, lens_read, bare=reread.edge is None),
-        net_check("STEP text against OCC: control points", text.surface.control_points, placed(reread.control_points)),
+        net_check(
+            "STEP text against OCC: control points",
+            text.surface.control_points,
+            placed(reread.control_points),
+            id="net-two-readers",
+        ),
     ]
     if text.front is not None:
         name = "STEP text against OCC: control points of the front"
         own = reread.front.control_points() if reread.front.is_net else np.empty((0, 0, 3))
-        checks.append(net_check(name, text.front.control_points, placed(own)))
-    checks.append(Check.at_least("smallest thickness", thickness_range(lens_read, reread.edge)[0], 0.0, "mm"))
+        checks.append(net_check(name, text.front.control_points, placed(own), id="net-two-readers"))
+    thinnest = thickness_range(lens_read, reread.edge)[0]
+    checks.append(Check.at_least("smallest thickness", thinnest, 0.0, "mm", id="thickness"))
     if properties is None:  # it has faces that no lens and no mount has
-        checks.append(Check("STEP text: what it states can be held to its faces", False, None, unit="", passed=True))
+        name = "STEP text: what it states can be held to its faces"
+        checks.append(Check(name, False, None, unit="", passed=True, id="measures-unknown"))
     else:
         from_definition = placed.inverse.after(text.placement)
         checks += text_checks.measures(text.properties.moved(from_definition), properties, reread.outline)
@@ -147,21 +153,25 @@ def _placed(reread: StepLens, tolerance: float) -> Iterator[Check]:
     if reread.placement.moves:
         net, words = reread.control_points, reread.placement.words
         off = float(np.abs(reread.placement(net) - net).max())
-        yield Check.at_most(PLACED, off, tolerance, "mm", where=f"the lens is {words}")
+        name = "form: placement of the lens in the file, largest shift of a control point"
+        yield Check.at_most(name, off, tolerance, "mm", where=f"the lens is {words}", id="placement")
 
 
 def _sound(solid: Any, of_part: bool = False) -> Iterator[Check]:
     valid, gaps = (f"{PART}: solid valid", f"{PART}: gaps") if of_part else ("solid valid", "solid: gaps")
-    yield Check.true(valid, step_reading.is_valid(solid))
-    yield Check.at_most(f"{gaps} that edges and vertices bridge", step_reading.gaps(solid), BRIDGED, "mm")
+    yield Check.true(valid, step_reading.is_valid(solid), id="solid-valid")
+    name = f"{gaps} that edges and vertices bridge"
+    yield Check.at_most(name, step_reading.gaps(solid), BRIDGED, "mm", id="gaps")
 
 
 def _edges(reread: StepLens, lens: Lens, bare: bool = True) -> Iterator[Check]:
     """bare: it is to be a lens and no more; the edges of a flange, or of walls that lean, lie elsewhere."""
     (faces, on_face), (wall, on_wall) = step_reading.edges_off(reread.shape, lens)
-    yield Check.at_most("solid: edges off the faces they bound", faces, BRIDGED, unit="mm", where=on_face)
+    name = "solid: edges off the faces they bound"
+    yield Check.at_most(name, faces, BRIDGED, unit="mm", where=on_face, id="edges-off-faces")
     if bare:
-        yield Check.at_most("solid: edges off the wall of the lens", wall, BRIDGED, unit="mm", where=on_wall)
+        name = "solid: edges off the wall of the lens"
+        yield Check.at_most(name, wall, BRIDGED, unit="mm", where=on_wall, id="edges-off-wall")
 
 
 def _form(
@@ -169,8 +179,9 @@ def _form(
 ) -> Iterator[Check]:  # fmt: skip
     """Distances (mm) and angles between normals (rad) of a face at `count` Sobol points, evaluated by OCC."""
     which, turns = ("front", "the front's normals") if of == "front" else ("back", "the normals")
+    form = f"form: re-read {which} face against the optimised one"
     if of == "front" and not reread.front.is_net:
-        yield Check.true(f"form: re-read {which} face against the optimised one", False, "the file's front is no net")
+        yield Check.true(form, False, "the file's front is no net", id="form")
         return
     points = torch.quasirandom.SobolEngine(2, scramble=True, seed=1).draw(count, dtype=torch.float64)
     x, y = (low + p * (high - low) for p, (low, high) in zip(points.T, (face.x, face.y), strict=True))
@@ -179,29 +190,30 @@ def _form(
     wanted = torch.nn.functional.normalize(torch.stack([-z_x, -z_y, torch.ones_like(z)], dim=1), dim=1).numpy()
     off = np.abs(sampled - torch.stack([x, y, z], dim=1).numpy()).max(axis=1)
     turned = np.linalg.norm(normals - wanted, axis=1)
-    for name, error, limit, unit in (
-        (f"form: re-read {which} face against the optimised one", off, tolerance, "mm"),
-        (f"form: direction of {turns}", turned, NORMAL, "rad"),
-    ):
-        k = int(error.argmax())
-        yield Check.at_most(name, float(error[k]), limit, unit, where=f"at ({x[k]:.4g}, {y[k]:.4g}) mm")
+    j, k = int(off.argmax()), int(turned.argmax())
+    at_j, at_k = (f"at ({x[worst]:.4g}, {y[worst]:.4g}) mm" for worst in (j, k))
+    yield Check.at_most(form, float(off[j]), tolerance, "mm", where=at_j, id="form")
+    yield Check.at_most(f"form: direction of {turns}", float(turned[k]), NORMAL, "rad", where=at_k, id="normals")
 
 
 def _front(reread: Surface, lens: Lens, tolerance: float) -> Iterator[Check]:
     """The re-read front against the designed one."""
     wanted, difference = lens.front, "difference from the designed one"
-    yield Check.at_most(f"form: vertex of the front, {difference}", abs(reread.z - lens.front_vertex), tolerance, "mm")
+    name, off = f"form: vertex of the front, {difference}", abs(reread.z - lens.front_vertex)
+    yield Check.at_most(name, off, tolerance, "mm", id="front-vertex")
     if wanted.is_net:
         net = reread.control_points() if reread.is_net else np.empty(0)
-        yield net_check(f"form: control points of the front, {difference}", net, wanted.control_points())
+        name = f"form: control points of the front, {difference}"
+        yield net_check(name, net, wanted.control_points(), id="front-net")
         return
     off = math.inf if reread.is_net else abs(reread.curvature - wanted.curvature)
-    yield Check.at_most(f"form: curvature of the front, {difference}", float(off), CURVATURE, "1/mm")
+    name = f"form: curvature of the front, {difference}"
+    yield Check.at_most(name, float(off), CURVATURE, "1/mm", id="front-curvature")
     if wanted.conic_constant:
         apart = math.inf if reread.is_net else abs(reread.conic_constant - wanted.conic_constant)
         sag = apart * abs(wanted.curvature) ** 3 * math.hypot(*lens.outline.farthest) ** 4 / 8
         name = f"form: sag at the rim by the front's conic constant, {difference}"
-        yield Check.at_most(name, float(sag), FLAT, "mm")
+        yield Check.at_most(name, float(sag), FLAT, "mm", id="front-conic")
 
 
 # ---- part.step -----------------------------------------------------------------------------------------------------
@@ -252,38 +264,41 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
     except ValueError as error:
         wanted, why = None, str(error)
     if not path.exists():
-        return (Check.true(f"{PART}: written", False, why),)
+        return (Check.true(f"{PART}: written", False, why, id="part-written"),)
     try:
         text, solid = _part(path, _stamp(path))
     except ValueError as error:
-        return (Check.true(f"{PART}: can be read", False, str(error)),)
+        return (Check.true(f"{PART}: can be read", False, str(error), id="part-readable"),)
     down = np.array([0.0, 0.0, mount.origin(lens.front_vertex)])
     net = lens.back.control_points() - down
     of_front = ()
     if lens.shapes_front:
         name, held = f"{PART}: control points of the front", text_checks.net_of_front(text)
-        of_front = (net_check(name, held, lens.front.control_points() - down),)
+        of_front = (net_check(name, held, lens.front.control_points() - down, id="control-points"),)
     properties = _properties(path, _stamp(path)) if text.properties.of_shape else None
     if text.properties.of_shape and properties is None:  # of a damaged face, which other checks find
-        stated = [Check.true(f"{PART}: area, volume and centroid can be found", False, "a face is of an unknown kind")]
+        name, strange = f"{PART}: area, volume and centroid can be found", "a face is of an unknown kind"
+        stated = [Check.true(name, False, strange, id="measures-unknown")]
     else:
         stated = text_checks.measures(text.properties, properties, lens.outline, PART)
-    edges = f"{PART}: edges against the mount's"
     return (
         *text_checks.structure(text, lens.back.shape, PART),
-        net_check(f"{PART}: control points", text.surface.control_points, net),
+        net_check(f"{PART}: control points", text.surface.control_points, net, id="control-points"),
         *of_front,
         *_sound(solid, of_part=True),
-        Check.true(edges, False, why) if wanted is None else _edges_moved(edges, wanted, solid),
+        _edges_moved(wanted, solid, why),
         *stated,
         *text_checks.of_part(text, part, PART),
     )
 
 
-def _edges_moved(name: str, wanted: Any, reread: Any) -> Check:
-    """The largest distance (mm) between an edge of one solid and those of the other."""
+def _edges_moved(wanted: Any, reread: Any, why: str) -> Check:
+    """The largest distance (mm) between an edge of one solid and those of the other; why: there is none wanted."""
+    name = f"{PART}: edges against the mount's"
+    if wanted is None:
+        return Check.true(name, False, why, id="part-edges")
     there, here = (step_reading.along_edges(solid) for solid in (wanted, reread))
     missing, strange = cKDTree(here).query(there)[0], cKDTree(there).query(here)[0]
     worst, places = max((missing, there), (strange, here), key=lambda pair: pair[0].max())
     where = "edge at ({:.4g}, {:.4g}, {:.4g}) mm".format(*places[worst.argmax()])
-    return Check.at_most(name, float(worst.max()), MOVED, unit="mm", where=where)
+    return Check.at_most(name, float(worst.max()), MOVED, unit="mm", where=where, id="part-edges")

@@ -20,7 +20,6 @@ from bstcad.step_text.part21 import FreeformSurface, StepText, ValidationPropert
 from bstcad.verify.verdict import Check
 
 TEXT = "STEP text"
-DENSITY = f"{TEXT}: stated density"  # of a file by itself: no scene says what it should be
 NET = 1e-11  # mm; rounding of a control point to sixteen digits of text
 ROUNDINGS = 2e-15  # rounding, as a part of the largest coordinate; over 5 m from the file's origin it exceeds NET
 AGREE = 1e-6  # of area, volume and the part's size; the sums over a rough back leave some 1e-9
@@ -32,10 +31,11 @@ Numbers = tuple[float, ...]
 def of_lens(text: StepText, lens: Lens) -> list[Check]:
     """The STEP file as text, held to the design."""
     checks = structure(text, lens.back.shape)
-    checks.append(net_check(f"{TEXT}: control points", text.surface.control_points, lens.back.control_points()))
+    name, back = f"{TEXT}: control points", lens.back.control_points()
+    checks.append(net_check(name, text.surface.control_points, back, id="control-points"))
     if lens.front.is_net and (text.front is not None or lens.shapes_front):
-        name = f"{TEXT}: control points of the front"
-        checks.append(net_check(name, net_of_front(text), lens.front.control_points()))
+        name, front = f"{TEXT}: control points of the front", lens.front.control_points()
+        checks.append(net_check(name, net_of_front(text), front, id="control-points"))
     return checks
 
 
@@ -63,10 +63,11 @@ def structure(text: StepText, shape: tuple[int, int], name: str = TEXT, any_unit
             f"{name}: one solid{'' if any_unit else ', in millimetres'}",
             text.solids == 1 and (any_unit or text.unit == "millimetre"),
             units,
+            id="one-solid",
         ),
-        Check.true(f"{name}: every edge used twice, once each way", text.closed, _open_edge(text)),
-        Check.true(f"{name}: degree 2 x 2, multiplicities 3, 1, …, 1, 3", plain, degrees),
-        Check.at_most(f"{name}: knots", moved, 0.0, where=knot),
+        Check.true(f"{name}: every edge used twice, once each way", text.closed, _open_edge(text), id="edges-twice"),
+        Check.true(f"{name}: degree 2 x 2, multiplicities 3, 1, …, 1, 3", plain, degrees, id="degree"),
+        Check.at_most(f"{name}: knots", moved, 0.0, where=knot, id="knots"),
     ]
 
 
@@ -83,11 +84,11 @@ def _open_edge(text: StepText) -> str:
     return next((f"edge #{n}: {there} times forwards, {back} times back" for n, there, back in uses), "no edge")
 
 
-def net_check(name: str, read: np.ndarray, designed: np.ndarray) -> Check:
+def net_check(name: str, read: np.ndarray, designed: np.ndarray, *, id: str) -> Check:
     """The control points (m, n, 3) that a file holds against the designed ones (mm)."""
     off, where = _off_by(read, designed, "control point")
     farthest = float(np.abs(designed).max(initial=0.0))
-    return Check.at_most(name, off, max(NET, ROUNDINGS * farthest), unit="mm", where=where)
+    return Check.at_most(name, off, max(NET, ROUNDINGS * farthest), unit="mm", where=where, id=id)
 
 
 def _off_by(read: np.ndarray, designed: np.ndarray, name: str) -> tuple[float, str]:
@@ -114,20 +115,21 @@ def measures(
         if values := all_stated[quantity]:
             own = getattr(shape, quantity)
             off, where = _worst([(value,) for value in values], (own,), "its faces give", unit)
-            yield Check.at_most(
-                f"{name}: stated {quantity} against the faces', relative", off / own, AGREE, unit="", where=where
-            )
+            stated_by = f"{name}: stated {quantity} against the faces', relative"
+            yield Check.at_most(stated_by, off / own, AGREE, where=where, id="stated-measures")
     if stated.centroids:
         off, where = _worst(stated.centroids, shape.centroid, "its faces give", "mm")
         size = 2 * math.hypot(*outline.half_extent)
-        yield Check.at_most(f"{name}: stated centroid against the faces'", off, AGREE * size, unit="mm", where=where)
+        stated_by = f"{name}: stated centroid against the faces'"
+        yield Check.at_most(stated_by, off, AGREE * size, unit="mm", where=where, id="stated-centroid")
     yield from _absent(name, all_stated)
 
 
 def density(stated: ValidationProperties) -> Iterator[Check]:
     """The density (g/cm³) of a file by itself, as often as it is stated: it has to be a number above zero."""
     for value in stated.densities:
-        yield Check(DENSITY, value if value > 0 else None, None, unit="g/cm³", passed=value > 0)
+        known = value if value > 0 else None
+        yield Check(f"{TEXT}: stated density", known, None, "g/cm³", passed=value > 0, id="stated-density")
 
 
 def of_part(text: StepText, part: Part, name: str = TEXT) -> Iterator[Check]:
@@ -143,22 +145,23 @@ def of_part(text: StepText, part: Part, name: str = TEXT) -> Iterator[Check]:
     for quantity, (unit, values, asked) in numbers.items():
         if values and asked is None:
             difference = f"the file states {_words((values[0],), unit)}, the scene none"
-            yield Check.true(f"{name}: {quantity} is the scene's", False, difference)
+            yield Check.true(f"{name}: {quantity} is the scene's", False, difference, id="stated-values")
         elif values:
             off, where = _worst([(value,) for value in values], (asked,), "the scene", unit)
-            yield Check.at_most(f"{name}: {quantity}, difference from the scene's", off, DIGITS, unit=unit, where=where)
+            apart = f"{name}: {quantity}, difference from the scene's"
+            yield Check.at_most(apart, off, DIGITS, unit=unit, where=where, id="stated-values")
     if backs:
         strange = {each.surface for each in backs} - {"", back}
         where = f"it is of the surface #{min(strange)}, the back is #{back}" if strange else ""
-        yield Check.true(f"{name}: {profile} is of the back", not strange, where)
+        yield Check.true(f"{name}: {profile} is of the back", not strange, where, id="profile-face")
     if fronts:
         where = f"it is of the surface #{back}, which is the back"
         of_front = back not in {each.surface for each in fronts}
-        yield Check.true(f"{name}: {profile} of the front is not of the back", of_front, where)
+        yield Check.true(f"{name}: {profile} of the front is not of the back", of_front, where, id="profile-face")
     if stated.materials:
         wrong = [material for material in stated.materials if material != part.material]
         where = f"the file states {wrong[0]!r}, the scene {part.material!r}" if wrong else ""
-        yield Check.true(f"{name}: material is the scene's", not wrong, where)
+        yield Check.true(f"{name}: material is the scene's", not wrong, where, id="material")
     asked_for = {quantity: values for quantity, (_, values, asked) in numbers.items() if asked is not None}
     yield from _absent(name, asked_for | ({} if part.material is None else {"material": stated.materials}))
 
@@ -180,4 +183,4 @@ def _words(values: Numbers, unit: str) -> str:
 def _absent(name: str, stated: dict[str, Sequence]) -> Iterator[Check]:
     """Which statements the file lacks."""
     if missing := [quantity for quantity, values in stated.items() if not values]:
-        yield Check(f"{name}: states {', '.join(missing)}", False, None, unit="", passed=True)
+        yield Check(f"{name}: states {', '.join(missing)}", False, None, unit="", passed=True, id="not-stated")

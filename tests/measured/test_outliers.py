@@ -100,8 +100,7 @@ def test_outliers_are_counted_and_remarked_and_too_many_fail(nominal, clean):
         "points": len(some.outliers), "share": pytest.approx(0.03, rel=0.03), "above": len(some.outliers),
         "farthest": pytest.approx(0.5, rel=0.05),
     }  # fmt: skip
-    [remark] = with_part(CONTENTS, some).given_up
-    assert remark.startswith("3.0 % of the measured points are outliers") and not with_part(CONTENTS, few).given_up
+    assert with_part(CONTENTS, some).remarks == ("outliers",) and not with_part(CONTENTS, few).remarks
     told = {"report": {"measured": few.facts | {"deviation_map": []}}, "picture": lambda *given: ""}
     page = " ".join(environment().get_template("made_part.html.j2").render(told).split())
     assert "8 outliers (0.10 % of the points near the face) stand alone" in page

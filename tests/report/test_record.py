@@ -31,6 +31,14 @@ def test_a_file_of_before_is_read_and_written_again_to_the_last_character(tmp_pa
     assert (tmp_path / "again.json").read_text() == path.read_text()
 
 
+def test_a_report_without_ids_is_read():
+    old = TOLD["report"] | {"checks": [{k: v for k, v in c.items() if k != "id"} for c in TOLD["report"]["checks"]]}
+    found = of_json(json.dumps({key: value for key, value in old.items() if key != "remarks"}))
+    assert {check.topic for check in found.checks} == {""} and found.remarked == tuple(
+        ("", text) for text in found.given_up
+    )
+
+
 def test_a_written_report_is_kept_whole(small_design):
     path = small_design.folder / "report.json"
     found = record.read(path)
@@ -76,8 +84,9 @@ def test_a_missing_key_is_named(key):
 def test_contract_keys_come_first_in_one_order(tmp_path):
     record.write_json(CONTENTS, tmp_path / "report.json")
     written = json.loads((tmp_path / "report.json").read_text())
-    assert list(written) == [*KEYS, "leak", "contrast", "optic", "twins", "rrmsd_asked", "given_up"]
-    assert written == REPORT | {"leak": None, "contrast": None, "optic": "lens", "twins": None, "given_up": []}
+    assert list(written) == [*KEYS, "leak", "contrast", "optic", "twins", "rrmsd_asked", "given_up", "remarks"]
+    known_as_none = {"leak": None, "contrast": None, "optic": "lens", "twins": None, "given_up": [], "remarks": []}
+    assert written == REPORT | known_as_none
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, np.float64("nan"), np.float32("-inf")])

@@ -42,9 +42,12 @@ REPORT = {
     ],
     "history": [{"seconds": 5.0, "rrmsd": 0.5}, {"seconds": 60.0, "rrmsd": 0.03}],
     "checks": [
-        {"name": "RRMSD", "value": 0.0283712, "limit": 0.05, "unit": "", "passed": True, "where": ""},
-        {"name": "form of the STEP", "value": 3e-7, "limit": 1e-6, "unit": "mm", "passed": True, "where": ""},
-        {"name": "thinnest place", "value": 5.8123, "limit": 1.0, "unit": "mm", "passed": True, "where": ""},
+        {"name": "RRMSD", "value": 0.0283712, "limit": 0.05, "unit": "", "passed": True, "where": "",
+         "id": "rrmsd"},
+        {"name": "form of the STEP", "value": 3e-7, "limit": 1e-6, "unit": "mm", "passed": True, "where": "",
+         "id": "form"},
+        {"name": "thinnest place", "value": 5.8123, "limit": 1.0, "unit": "mm", "passed": True, "where": "",
+         "id": ""},
     ],
     "effects": {"simulated": [], "left_out": ["absorption"]},
     "machine": {"system": "Linux", "cores": 2, "memory_gb": 7.76},
@@ -257,15 +260,15 @@ class TestSummary:
         short, long = printed(REPORT), printed(REPORT, verbose=True)
         assert short.startswith("PASSED: Letters\n") and short.endswith("\n3 checks passed; --verbose lists them.\n")
         assert not any(check["name"] + ":" in short for check in REPORT["checks"])
-        assert "\npass form of the STEP: 0.3 nm, limit ≤ 1 nm\n" in long and "FAIL" not in long
+        assert "\npass form of the STEP: 0.3 nm, limit ≤ 1 nm [check-form]\n" in long and "FAIL" not in long
         assert long.count("\npass ") == 3 and "\n3 checks passed.\nbstcad docs NAME explains" in long
 
     def test_a_failed_check_is_shown_once_with_value_limit_and_place_after_the_first_figures(self):
-        report = failing() | {"given_up": ["The lens is thick."]}
+        report = failing() | {"given_up": ["The lens is thick."], "remarks": ["vertex-moved"]}
         report["checks"][2] |= {"where": "at [red](1, 2) mm", "name": "[/] thinnest place"}
         lines = printed(report).splitlines()
         verdict, remark, *figures, failed, passed, explained = lines
-        assert (verdict, remark) == ("FAILED: Letters", "Remark: The lens is thick.")
+        assert (verdict, remark) == ("FAILED: Letters", "Remark: The lens is thick. [remark-vertex-moved]")
         assert failed == "FAIL [/] thinnest place (at [red](1, 2) mm): 0.7 mm, limit ≥ 1 mm"
         assert (
             explained.startswith("bstcad docs NAME")
@@ -290,7 +293,7 @@ class TestSummary:
 # What Jenkins and GitLab read: the elements that each may hold, and the attributes that each must have.
 HOLDS = {
     "testsuites": {"testsuite"}, "testsuite": {"properties", "testcase", "system-out"}, "properties": {"property"},
-    "testcase": {"failure", "system-out"},
+    "testcase": {"properties", "failure", "system-out"},
 }  # fmt: skip
 HAS = {
     "testsuite": {"name", "tests", "failures", "errors", "skipped"}, "testcase": {"classname", "name"},
@@ -315,8 +318,11 @@ def read(data):
 def test_each_check_of_a_written_design_is_a_case(small_design):
     suite = read((small_design.folder / "report.junit.xml").read_bytes())
     told = json.loads((small_design.folder / "report.json").read_text(encoding="utf-8"))
-    cases = [(case.get("name"), case.find("failure") is None) for case in suite.findall("testcase")]
-    assert cases == [(check["name"], check["passed"]) for check in told["checks"]]
+    cases = [
+        (case.get("name"), case.find("properties/property[@name='id']").get("value"), case.find("failure") is None)
+        for case in suite.findall("testcase")
+    ]
+    assert cases == [(check["name"], check["id"], check["passed"]) for check in told["checks"]]
     seconds = next(stage["seconds"] for stage in told["stages"] if stage["name"] == "verify")
     assert float(suite.get("time")) == pytest.approx(seconds, abs=1e-3)
     assert suite.find("properties/property[@name='verdict']").get("value") == told["verdict"]

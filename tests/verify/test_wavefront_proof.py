@@ -15,7 +15,6 @@ from bstcad import folder as folders
 from bstcad.optics.wavefront import ZernikeWave
 from bstcad.optics.wavefront_error import wavefront_error
 from bstcad.report import record, report
-from bstcad.report.explained import topic
 from bstcad.verify import checks
 from tests.conftest import flat_pictures, proofs, quick_effort
 from tests.two_faces import CHANGES, made_of, scene_of
@@ -58,7 +57,7 @@ def test_without_a_limit_both_values_are_stated(one):
     found = {check.name: check for check in one.report.checks if "wavefront" in check.name}
     assert found.keys() == {RMS, FLOOR} and all(check.passed and check.limit is None for check in found.values())
     assert found[RMS].value == one.proof.wavefront.without_tilt.rms and found[RMS].unit == "waves"
-    assert one.report.passed and (topic(RMS), topic(FLOOR)) == ("check-wavefront", "check-wavefront-floor")
+    assert one.report.passed and (found[RMS].id, found[FLOOR].topic) == ("wavefront", "check-wavefront-floor")
 
 
 def test_a_wavefront_beyond_its_limit_fails_and_nothing_else_does(one):
