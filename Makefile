@@ -1,6 +1,7 @@
 # make lens    the environment if needed, then the lens of templates/thu.toml in outputs/thu
 # make test    the environment if needed, then the suite, in two processes; with ROOM=optics tests/optics alone, with
 #              DURATIONS=1 it keeps how long each file takes in tests/durations.json, by which the suite is shared out
+# make test-fast    the same without the files of the suite that take 5 s or longer: two minutes
 # make coverage   the suite, and how much of the package its lines have run
 # make bench   what accuracy costs in time
 # make accuracy   what accuracy costs in time on the full-size scenes: records what is missing or of another version, and
@@ -22,7 +23,7 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: lens test coverage bench accuracy published prediction effects tradeoff stability docs wheel lint
+.PHONY: lens test test-fast coverage bench accuracy published prediction effects tradeoff stability docs wheel lint
 
 lens: $(READY)
 	$(BIN)/python generate_lens.py templates/thu.toml
@@ -34,6 +35,9 @@ TEST = $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder \
 
 test: $(READY)
 	$(TEST)
+
+test-fast: $(READY)
+	$(TEST) --quick
 
 coverage: $(READY)
 	$(TEST) --cov --cov-report=term:skip-covered

@@ -22,6 +22,7 @@ from types import SimpleNamespace
 import pytest
 
 DURATIONS = Path(__file__).with_name("durations.json")  # seconds of each test file that takes more than one
+SLOW = 5  # seconds; the files below it take two minutes together
 SPENT = pytest.StashKey[Counter]()
 DISK = Path(__file__).parent.parent / "templates" / "disk.toml"
 SMALL = {  # a gentle lens: few triangles keep its mesh within the volume's tolerance
@@ -46,6 +47,13 @@ SMALL = {  # a gentle lens: few triangles keep its mesh within the volume's tole
 
 def pytest_addoption(parser):
     parser.addoption("--record-durations", action="store_true", help="keep the seconds of each file for the scheduler")
+    parser.addoption("--quick", action="store_true", help=f"leave out the files that take {SLOW} s or longer")
+
+
+def pytest_ignore_collect(collection_path, config):
+    if config.getoption("--quick") and collection_path.is_relative_to(config.rootpath):
+        name = collection_path.relative_to(config.rootpath).as_posix()
+        return True if json.loads(DURATIONS.read_text()).get(name, 0.0) >= SLOW else None
 
 
 def pytest_configure(config):
