@@ -271,7 +271,7 @@ class TestVerify:
         again = commands.verify(folder).facts
         for key in JUDGED:
             assert again[key] == small_design.report[key]
-        for key in ("front", "back", "net", "index", "source", "target"):
+        for key in ("front", "back", "net", "index", "source", "targets"):
             assert again["prescription"][key] == small_design.report["prescription"][key]
         for one, two in zip(again["checks"], small_design.report["checks"], strict=True):
             assert one["name"] == two["name"] and one["passed"] == two["passed"] and one["limit"] == two["limit"]
