@@ -15,6 +15,7 @@ from bstcad.optics.bspline import QUARTERS, BSplineSurface, Spans, evaluate, eva
 from bstcad.optics.kernels import compiling, spline
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sides import coarser, plain, scaled, side, spread
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Sphere
@@ -80,7 +81,7 @@ def test_landings_and_their_gradient_are_those_of_the_plain_form_and_of_differen
     in_glass = trace.to_first_net(Point().rays(x, y, 15.0, 1.0), lens)
 
     def merit(form, heights):
-        landed = form(in_glass, replace(lens, back=replace(lens.back, heights=heights)), 200.0)
+        landed = form(in_glass, replace(lens, back=replace(lens.back, heights=heights)), LevelPlane(200.0))
         return torch.where(landed.alive, (landed.position**2).sum(0), 0.0).sum(), landed
 
     gradients = []

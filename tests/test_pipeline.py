@@ -38,7 +38,7 @@ def judged(design):
     target = design.scene.target
     screen = Screen(target.z, target.x, target.y, target.columns_rows)
     found = simulated(design.scene.source, design.lens, screen, 500, 77)
-    return float(rrmsd(found.box, torch.from_numpy(design.target))), found.efficiency
+    return float(rrmsd(found.box, torch.from_numpy(design.goals[0].picture))), found.efficiency
 
 
 @pytest.mark.parametrize("name", RECORDED)
@@ -157,7 +157,7 @@ def test_a_target_that_is_not_square_gets_its_picture():
     """A round spot on 300 x 150 mm, on pixels of equal sides: as round and bright as asked."""
     wide = {"target.x": "[-150.0, 150.0]", "target.y": "[-75.0, 75.0]", "target.pixels": "64"}
     found = pipeline.design(small("disk", **wide, **{"target.outline": '{ shape = "circle", radius = 70.0 }'}))
-    assert found.target.shape == (32, 64)
+    assert found.goals[0].picture.shape == (32, 64)
     value, efficiency = judged(found)
     assert value < 0.16  # on 150 x 150 mm and 32 x 32 pixels: 0.11
     assert efficiency > 0.95

@@ -41,10 +41,10 @@ SCENES = {
 
 def of(found):
     scene, target = found.scene, found.scene.target
-    light = measure(found.lens, scene.channels(), target.screen, found.target, Effort(96))
+    light = measure(found.lens, scene.channels(), target.screen, found.goals[0].picture, Effort(96))
     making = found.making
     return diagnosis(
-        scene, making, found.lens, picture=light.picture, target=found.target, rrmsd=light.rrmsd, efficiency=0.9
+        scene, making, found.lens, picture=light.picture, target=found.goals[0].picture, rrmsd=light.rrmsd, efficiency=0.9
     ), making
 
 
@@ -86,8 +86,8 @@ def test_where_a_source_blurs_nothing_but_a_smaller_one_is_offered():
     """Its images are no tubes, of which there could be more; and no other step leaves less than the blur."""
     found = pipeline.design(load(DISK, TINY | SCENES["extended source"]))
     scene, making = found.scene, found.making
-    light = measure(found.lens, scene.channels(), scene.target.screen, found.target, Effort(96))
-    given = {"picture": light.picture, "target": found.target, "rrmsd": 0.5, "efficiency": 0.9}  # as if all saw 0.5
+    light = measure(found.lens, scene.channels(), scene.target.screen, found.goals[0].picture, Effort(96))
+    given = {"picture": light.picture, "target": found.goals[0].picture, "rrmsd": 0.5, "efficiency": 0.9}  # as if all saw 0.5
     limits = diagnosis(scene, making, found.lens, **given, blurred=0.48)["limits"]
     left = {limit["by"]: limit["rrmsd"] for limit in limits}
     assert "tubes" not in left and set(left) >= {"source size", "control points"}
@@ -97,7 +97,7 @@ def test_where_a_source_blurs_nothing_but_a_smaller_one_is_offered():
 def test_the_gain_of_a_larger_net_is_named_only_where_its_cells_limit_the_lens():
     """In a draft of letters whose cells leave 0.12 of the RRMSD, 0.82 times the RRMSD was named and 0.60 found."""
     found = pipeline.design(load(DISK, TINY | {"target.sample": "camera"}))
-    given = {"picture": found.target, "target": found.target, "efficiency": 1.0}
+    given = {"picture": found.goals[0].picture, "target": found.goals[0].picture, "efficiency": 1.0}
 
     def net(rrmsd):
         limits = diagnosis(found.scene, found.making, found.lens, rrmsd=rrmsd, **given)["limits"]
