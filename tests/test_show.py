@@ -34,7 +34,8 @@ def test_rays_go_from_the_lamp_over_both_faces_to_the_screen_and_carry_the_light
 def test_where_rays_land_the_picture_is_lit(shown):
     """By the corners that the picture is drawn between: it is neither turned nor mirrored against the rays."""
     (rows, columns), landed = shown.pictures[0].shape, shown.rays[:, -1]
-    corner, along_x, along_y = shown.screens[0][3], shown.screens[0][2] - shown.screens[0][3], shown.screens[0][0] - shown.screens[0][3]
+    [screen] = shown.screens
+    corner, along_x, along_y = screen[3], screen[2] - screen[3], screen[0] - screen[3]
     across, down = ((landed - corner) @ axis / (axis @ axis) for axis in (along_x, along_y))
     at = (np.clip(p * n, 0, n - 1).astype(int) for p, n in ((down, rows), (across, columns)))
     assert (shown.pictures[0][tuple(at)] > 128).mean() > 0.9 and (shown.pictures[0] > 128).mean() < 0.7

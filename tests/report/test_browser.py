@@ -30,7 +30,8 @@ PART = {  # as a made part is told of in report.json
     "outliers": {"points": 40, "share": 1e-3, "above": 39, "farthest": 0.1}, "scale": 1.0,
     "alignment": MOVED | {"undetermined": []}, "minimum_zone": MOVED | {"width": 7e-4},
     "worst_at": [-7.58297, -2.32557], "pv": 7e-4, "pvr": 1e-3, "rms": 1e-4,
-    "form_pv": 4e-4, "form_rms": 1e-4, "slope_rms": 1.6e-4, "noise": 5e-5, "goals": [{"key": "target", "rrmsd_predicted": 0.02, "rrmsd_high": 0.03}],
+    "form_pv": 4e-4, "form_rms": 1e-4, "slope_rms": 1.6e-4, "noise": 5e-5,
+    "goals": [{"key": "target", "rrmsd_predicted": 0.02, "rrmsd_high": 0.03}],
     "bands": [{"period": period, "rms": 1e-6, "slope_rms": 1e-6} for period in (None, [44.8, 22.4], [0.7, 0.35])],
 }  # fmt: skip
 JUDGE = Judge(

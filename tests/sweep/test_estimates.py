@@ -44,7 +44,8 @@ def of(found):
     light = measure(found.lens, scene.channels(), target.screen, found.goals[0].picture, Effort(96))
     making = found.making
     return diagnosis(
-        scene, making, found.lens, picture=light.picture, target=found.goals[0].picture, rrmsd=light.rrmsd, efficiency=0.9
+        scene, making, found.lens, picture=light.picture, target=found.goals[0].picture, rrmsd=light.rrmsd,
+        efficiency=0.9,
     ), making
 
 
@@ -87,7 +88,7 @@ def test_where_a_source_blurs_nothing_but_a_smaller_one_is_offered():
     found = pipeline.design(load(DISK, TINY | SCENES["extended source"]))
     scene, making = found.scene, found.making
     light = measure(found.lens, scene.channels(), scene.target.screen, found.goals[0].picture, Effort(96))
-    given = {"picture": light.picture, "target": found.goals[0].picture, "rrmsd": 0.5, "efficiency": 0.9}  # as if all saw 0.5
+    given = {"picture": light.picture, "target": found.goals[0].picture, "rrmsd": 0.5, "efficiency": 0.9}  # for all
     limits = diagnosis(scene, making, found.lens, **given, blurred=0.48)["limits"]
     left = {limit["by"]: limit["rrmsd"] for limit in limits}
     assert "tubes" not in left and set(left) >= {"source size", "control points"}
