@@ -105,7 +105,7 @@ def design(
     scene: Scene, *, device: str = "auto", progress: Progress = silent, began: float | None = None,
     save: Callable[[Saved], None] = forget, start: Saved | None = None, interrupted: Callable[[], bool] = never,
     merit: Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None = None, later: bool = False,
-    look: Look = unseen,
+    look: Look = unseen, hasty: bool = False,
 ) -> Made:  # fmt: skip
     """From a scene to a tailored lens: transport map, stage 1, stage 2, or stage 3 for a source of some size.
 
@@ -114,6 +114,7 @@ def design(
     Once `interrupted` says so, tailoring ends with the best so far; KeyboardInterrupt if there is no lens yet.
     merit: of a picture and the target, what stages 2 and 3 make least; None: RRMSD².
     look: called now and then with the function that makes the best lens so far.
+    hasty: as a preview, see `Task.hasty`; the scene itself says how small it is.
     later: float32 is compared with float64 when a report asks for it (`Made.told`), and not where none is made.
     """
     began = time.perf_counter() if began is None else began
@@ -124,7 +125,7 @@ def design(
     goals, edge = within_reach(scene, progress)
     knobs = scene.tailoring.resolved(scene.lens.back.net)
     later = later and knobs.max_time is None
-    task = task_of(scene, goals, knobs, edge, progress=progress, tidy=processes.return_freed, merit=merit)
+    task = task_of(scene, goals, knobs, edge, progress=progress, tidy=processes.return_freed, merit=merit, hasty=hasty)
     task = posed(scene, task)
     limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve(scene) + JUDGING}
     record = Record() if start is None else start.record
@@ -359,7 +360,7 @@ def _stage2(
     name, steps = second_stage(task, lens, state)
     whole = task.whole
     known = not task.grown and lens.clear is None
-    first = whole.judged(lens, followed.rrmsd if known else whole.rrmsd(lens))
+    first = None if task.hasty else whole.judged(lens, followed.rrmsd if known else whole.rrmsd(lens))
 
     def saved(state: Stage2State) -> Saved:
         return Saved(driver.record, None, followed, state, best=driver.best)
@@ -380,6 +381,8 @@ def _handed_on(task: Task, driver: Driver, last: Step, before: Sequence[Judged])
     """
     lens = last.lens
     mended, value = _mended(task, lens), last.judged
+    if task.hasty:
+        return mended
     if held(lens, task.bounds, task.least) is not None:
         driver.end(BOUNDED, value := task.rrmsd(mended))
     elif value is not None and (_moved(lens, mended) or not last.whole):

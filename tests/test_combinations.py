@@ -286,7 +286,7 @@ COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which f
     "analysis.light.blur": {"__defaults__": (12,)},
     "analysis.neglected_effects": {"PLACES": 24, "GHOSTS": 32},
     "analysis.shape": {"GRID": 257},
-    "app.preview": {"IMAGE_PLACES": 6, "CELLS": 16, "RAYS": 32, "SHAPE": 33, "FRONT_CELLS": 16, "FRONT_STEPS": 10},
+    "app.preview": {"IMAGE_PLACES": 6, "CELLS": 16, "RAYS": 32, "SHAPE": 33},
     "sweep.estimates": {"NET": 17, "CELLS": 16, "PIXELS": 24, "FRONT_NET": 9, "STEPS": 5},
     "sweep.net_choice": {"TUBES": 64},
     "sweep.plan": {"PILOT_CELLS": (16, 16)},

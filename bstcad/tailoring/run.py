@@ -119,7 +119,7 @@ class Task:
     # of a picture (rows, columns) and the target, both of sum 1 or less, what stage 2 makes least; None: RRMSD²
     merit: Callable[[Tensor, Tensor], Tensor] | None = None
     wave: Wave | None = None  # that the light behind the lens shall be; None: any
-    hasty: bool = False  # for a preview: g of slope_map.py by fewer places
+    hasty: bool = False  # for a preview: one round a stage, no lens judged, and no way tried that costs much
     solution: float | None = None  # σ of light_behind.py; None: the gentler one
     floor: float = 0.0  # of its mean, to which stage 1 of two faces lifts the furthest picture
     front_sides: Callable[[Sides], Sides | None] = lambda sides: None  # of a tailored front, by those of the back

@@ -19,7 +19,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays
 from bstcad.optics.reach import GRAZING
-from bstcad.optics.sides import both
+from bstcad.optics.sides import both, coarser
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import clear_window, trace
 from bstcad.scene.blank import CONIC_CONSTANTS
@@ -50,6 +50,8 @@ STEEPEST = 0.5  # sine of the angle of a front's slope at the rim
 UPRIGHT, CONE = 0.8, 6.0  # (1 + k) c² r² at the rim, and -(1 + k) c² r²: a scene would refuse a little more
 UNBOUNDED = (-math.inf, math.inf)
 
+HASTY_NET, HASTY = 17, {"n": 32, "iterations": 40, "repeats": 1}  # by which a front is sought for a preview
+
 Range = tuple[float, float]
 Merit = Callable[[Lens], float]
 
@@ -67,14 +69,18 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[S
     """Stage 1 from a blank lens, or further from a state: its rounds, and the other way where they come to little."""
     lens, goal = task.heaviest.through(lens), task.goals[0]
     if state is None and task.free:
-        coarse = lens.refined(task.knobs.levels[0])
+        net, pains = task.knobs.levels[0], {"iterations": task.knobs.transport_iterations}
+        if task.hasty:
+            net, pains = coarser(lens.back.shape, HASTY_NET), HASTY
         shaped = shaped_front(
-            task.heaviest.source, coarse, goal.picture, screen=goal.receiver, free=task.free, rim_sags=task.rim_sags,
-            iterations=task.knobs.transport_iterations,
+            task.heaviest.source, lens.refined(net), goal.picture, screen=goal.receiver, free=task.free,
+            rim_sags=task.rim_sags, **pains,
         )  # fmt: skip
         lens = lens.with_front(shaped.front)
     for last in follow_slopes(task, lens, state):
         yield last
+    if task.hasty:
+        return
     first, judged = last.lens, task.rrmsd(last.lens)
     yield replace(last, state=None, judged=judged)
     if not doubtful(task, first, judged, last.state):

@@ -77,7 +77,6 @@ class Round:
     pixels: int | None = None  # along the longer side, that it sees instead of the target's
     spread: Spread | None = None  # of a source of some size, whose points the task's channels are
     share: float = 1.0  # size of the source in this round, as a part of its full size
-    by_images: bool = False  # of that source alone, without the rays that tell what they leave out: for a preview
 
     @property
     def name(self) -> str:
@@ -92,7 +91,7 @@ class Round:
         return Merit.of(
             task.channels if self.spread is None else self.spread.centre, lens, self.tubes, task.goals,
             overshoot=_pull(task, lens), wave=task.wave, own=task.merit, spread=self.spread,
-            seed=None if self.by_images else task.knobs.seed,
+            seed=None if task.hasty else task.knobs.seed,
         )  # fmt: skip
 
 
@@ -137,7 +136,7 @@ def coarse_rounds(task: Task, lens: Lens) -> tuple[Round, ...]:
     """
     most = min(max(task.goals[0].receiver.shape) - 1, task.knobs.side // 2)  # pixels that the net can tell
     rounds = [Round(task, tubes, evaluations, pixels=pixels) for pixels, tubes, evaluations in COARSE if pixels <= most]
-    if not rounds or task.merit is not None or task.several or not task.knobs.stage2_iterations:
+    if not rounds or task.merit is not None or task.several or task.hasty or not task.knobs.stage2_iterations:
         return ()  # of several goals: two nets bend between so few tubes
     seen, tubes = coarsened(task, LARGE), COARSE[0][1]
     [goal] = seen.goals
@@ -151,7 +150,9 @@ def coarsened(task: Task, pixels: int) -> Task:
 
 
 def shares_of(task: Task) -> Shares | None:
-    """The rounds of several goals; None: of one."""
+    """The rounds of several goals, and of a preview; None: of one goal."""
+    if task.hasty:
+        return ((1.0, 1.0),)
     if len(task.goals) == 1:
         return JOINT if task.several else None
     larger = max(1.0, task.knobs.side / OF_SIDE)
@@ -213,9 +214,9 @@ def run_rounds(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = N
             elif reason != "evaluations":
                 break
         del merit, problem  # else two sheets would stand beside each other
-        judged = judged or task.rrmsd(lens)
+        judged = None if task.hasty else judged or task.rrmsd(lens)
         whole = task.channels == rounds[-1].task.channels  # is this all of the light, and not of a smaller source?
-        if accuracy is not None and judged <= accuracy:
+        if judged is not None and accuracy is not None and judged <= accuracy:
             reason = "accuracy"  # by rays: a round may end there though its own goal, by tubes, is not reached
         reason = reason if number == len(rounds) - 1 or (reason == "accuracy" and whole) else ""
         yield Step(lambda lens=lens: lens, judged=judged, whole=whole, part=part, ends=True, reason=reason)
@@ -394,6 +395,9 @@ def stage3_rounds(task: Task) -> tuple[Round, ...]:
         replace(task, channels=channels, grown=(), spreads=(spread,))
         for channels, spread in zip(task.grown, task.spreads, strict=True)
     )
+    if task.hasty:
+        *_, light = lights
+        return (Round(light, task.knobs.rays, task.knobs.stage2_iterations, stage="stage 3", spread=light.spreads[0]),)
     screens = [goal.receiver for goal in task.goals]
     counts = blurred_sheets(task.knobs, (max(each.columns for each in screens), max(each.rows for each in screens)))
     return tuple(

@@ -105,7 +105,8 @@ def steps(task: Task, lens: Lens, state: FrontRound | None = None) -> Iterator[S
         return
     for last in follow(task, lens, state):
         yield last
-    yield replace(last, state=None, judged=task.rrmsd(last.lens))
+    if not task.hasty:
+        yield replace(last, state=None, judged=task.rrmsd(last.lens))
 
 
 def follow(task: Task, lens: Lens, state: FrontRound | None) -> Iterator[Step]:
