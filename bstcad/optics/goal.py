@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 class Goal:
     """A picture on a receiver."""
 
-    key: str  # by which sentences and report.json call it: target, or target[0], target[1], … of several
+    key: str  # the name by which sentences and report.json call it: target, or target[0], target[1], … of several
     receiver: Screen  # where its light is collected
     picture: np.ndarray  # (rows, columns), row 0 = y max: the light wanted in each pixel, of sum 1
-    weight: float = 1.0  # of its RRMSD² among all goals
+    weight: float = 1.0  # the weight of its RRMSD² among all goals
     reachable: np.ndarray | None = None  # (rows, columns) True in the pixels that light can reach; None: all to be lit
     whole: np.ndarray | None = None  # the picture before it was restricted to `reachable`; None: `picture` is whole
 

@@ -8,6 +8,7 @@ another unit, such as degrees.  The kernels know planes alone: light lands on ot
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,42 +20,42 @@ from torch import Tensor
 from bstcad.optics.motion import Motion
 from bstcad.optics.rays import GRAZING, Landed, Rays, Status, Vector, axes, clocked
 
-Array = Any  # of numpy or torch, or a number
+Array = Any  # an array of numpy or torch, or a number
 
 
-class Receiver:
+class Receiver(ABC):
     """Where light is collected; x and y are its own coordinates."""
 
-    unit: str = "mm"  # of x and y
-    names: tuple[str, str] = ("x", "y")  # of its axes
+    unit: str = "mm"  # the unit of x and y
+    names: tuple[str, str] = ("x", "y")  # the names of its axes
     axes: tuple[Vector, Vector, Vector] | None = None  # e_x, e_y and n of a plane; None: it is none
     is_level: bool = False  # a plane z = const?
 
     @property
     def labels(self) -> tuple[str, str]:
-        """Of its axes, with their unit."""
+        """The names of its axes, with their unit."""
         return tuple(f"{name} ({self.unit})" for name in self.names)
 
     @property
+    @abstractmethod
     def middle(self) -> Vector:
         """A point in its middle, in space (mm); of a tilted plane the one that it is turned about."""
-        raise NotImplementedError
 
+    @abstractmethod
     def path(self, rays: Rays) -> tuple[Tensor, Tensor]:
         """(way along each ray to the receiver (mm), zero for rays that do not come to it; status)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def places(self, rays: Rays) -> Sequence[Tensor]:
         """x and y of rays that are on the receiver."""
-        raise NotImplementedError
 
+    @abstractmethod
     def point(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
         """The points in space (mm) of its places."""
-        raise NotImplementedError
 
+    @abstractmethod
     def normal(self, aim: Tensor) -> Sequence[Tensor | float]:
         """The unit normal in each of these places (2, …), which points away from where light comes from."""
-        raise NotImplementedError
 
     def moved(self, motion: Motion) -> Receiver:
         """The receiver after a rigid motion; its places keep their coordinates."""
@@ -103,9 +104,9 @@ class Receiver:
 class Plane(Receiver):
     """A plane: n · (p - C) = 0."""
 
+    @abstractmethod
     def _advance(self, rays: Rays) -> tuple[Tensor, Tensor]:
         """(n · d, n · (p - C)): how fast rays rise from it along their way, and how far above it they are (mm)."""
-        raise NotImplementedError
 
     def path(self, rays: Rays) -> tuple[Tensor, Tensor]:
         """(way along each ray to the plane (mm), zero for rays that do not come to it; status)."""

@@ -27,7 +27,7 @@ from bstcad.optics.rays import Rays, Vector, axes, tilt_of
 from bstcad.optics.wavefront import beyond
 
 FAR = 4.0  # widths of its aperture by which a beam without a plane z of its own gets that plane before the lens
-SIDES = "diameter", "width", "height"  # of a disc or rectangle that shines
+SIDES = "diameter", "width", "height"  # sizes of a disc or rectangle that shines
 HALF_SPACE = math.pi / 2  # rad; the edge of light that fills all directions on the lens's side
 WIDEST = math.radians(89.0)  # of a cone whose edge counts on planes
 Wavelength = float | tuple[tuple[float, float], ...]  # nm; or lines, each (nm, weight), weights of any sum
@@ -53,7 +53,7 @@ class Beam(NamedTuple):
     peak: float
     fall: float  # 1/mm²; of a tilted source a number
     power: int  # 0, 3 or 4, of the distance d of a point source
-    distance: float  # of a point source from the plane (mm); 0: collimated
+    distance: float  # distance of a point source from the plane (mm); 0: collimated
     start: float  # how far from the plane rays start (mm)
     tilted: int  # 1: light along n, which is not (0, 0, 1)
     n_x: float  # the source's axis, in the frame in which light begins along +z
