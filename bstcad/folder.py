@@ -227,12 +227,7 @@ def _stamps(folder: Path) -> list[tuple[object, ...]]:
 
 def scene_files(scene: scenes.Scene) -> dict[str, bytes]:
     """scene.toml and the files that it names, by file name; a folder of them loads to the same scene."""
-    contents = {SCENE: scene.toml().encode()}
-    for image in (target.image for target in scene.targets if target.image is not None):
-        contents[image.name] = image.data
-    if scene.lens.front.given is not None:
-        contents[FRONT] = scene.lens.front.given.archive()
-    return contents
+    return {SCENE: scene.toml().encode()} | {name: content.copy for name, content in scene.files.items()}
 
 
 def hash_of(contents: Mapping[str, bytes]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -441,14 +440,11 @@ def reserve(scene: Scene) -> float:
 
 def purpose(scene: Scene, device: str) -> dict[str, Any]:
     """Everything that the result of `design` depends on: a state of it belongs to no other design."""
-    pictures = [target.image and hashlib.sha256(target.image.data).hexdigest() for target in scene.targets]
-    net = scene.lens.front.given
     wanted = scene.model_dump(mode="json", exclude={"name", "title", "output", "accept"})
     return {
         "version": bstcad.__version__,
         "device": device_for(device),
-        "picture": pictures[0] if len(pictures) == 1 else pictures,
-        **({"front": hashlib.sha256(net.data).hexdigest()} if net else {}),
+        "files": {name: content.digest for name, content in sorted(scene.files.items())},
         **wanted,
     }
 

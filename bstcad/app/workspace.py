@@ -24,6 +24,7 @@ from bstcad.scene import new_scene, picture, scene_file
 from bstcad.scene import scene as scenes
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
+from bstcad.scene.schema import contents
 
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")  # of a scene or a design: no path, no hidden file
 PICTURES = "pictures"  # the folder of uploads, beside the scenes
@@ -227,12 +228,12 @@ class Workspace:
             if commented is not None:
                 files.put(self.path(name), changed(_renamed(commented, name), "name", name).encode())
                 return name
-            for key, target in zip(loaded.target_keys, loaded.targets, strict=True):
-                if target.image is not None:
-                    text = changed(text, f"{key}.image", f"{PICTURES}/{self.keep(target.image.data)}")
-            if loaded.lens.front.given is not None:
-                files.put(self.scenes / f"{name}-front.npz", loaded.lens.front.given.archive())
-                text = changed(text, "lens.front.file", f"{name}-front.npz")
+            for key, content in contents(loaded):
+                if isinstance(content, picture.Picture):
+                    place = f"{PICTURES}/{self.keep(content.data)}"
+                else:
+                    files.put(self.scenes / (place := f"{name}-{content.name}"), content.copy)
+                text = changed(text, key if len(loaded.targets) > 1 else key.replace("target[0]", "target"), place)
             files.put(self.path(name), changed(text, "name", name).encode())
         return name
 

@@ -21,7 +21,7 @@ from bstcad.optics.sides import Sides, both, coarser, in_proportion, plain
 from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Surface
 from bstcad.runs import files
 from bstcad.scene.errors import SceneError
-from bstcad.scene.schema import COORDINATES, LENGTHS, OneOrTwo, Record, from_file, leaving_out
+from bstcad.scene.schema import COORDINATES, LENGTHS, FileContent, OneOrTwo, Record, from_file, leaving_out
 from bstcad.step_text import part21
 from bstcad.step_text.placement import own_frame
 
@@ -55,9 +55,10 @@ Outlined = Annotated[Rectangle | Circle, Field(discriminator="shape")]
 
 
 @dataclass(frozen=True)
-class GivenNet:
+class GivenNet(FileContent):
     """A B-spline surface with its vertex at z = 0; the scene keeps it whole, so that a design can be repeated."""
 
+    name = NET_FILE
     shape: tuple[int, int]  # control points along x and along y
     x: tuple[float, float]  # extent (mm)
     y: tuple[float, float]
@@ -78,7 +79,8 @@ class GivenNet:
         heights = np.frombuffer(self.data, "<f8").reshape(self.shape).astype(np.float64)
         return BSplineSurface(z, torch.from_numpy(heights), self.x, self.y)
 
-    def archive(self) -> bytes:
+    @property
+    def copy(self) -> bytes:
         """An .npz file that `read_net` reads as this net: control_points (m, n, 3) in mm."""
         file = io.BytesIO()
         np.savez_compressed(file, control_points=self.surface(0.0).control_points())
@@ -145,7 +147,7 @@ OUTLINE = Key(
     example={"shape": "circle", "diameter": 10.0},
 )
 OPTIMISE = Key("Parameters that tailoring finds: true for all of them, or a list of names.")
-NetFile = from_file(GivenNet, read_net, lambda net: NET_FILE, "file = 'outputs/earlier'")
+NetFile = from_file(GivenNet, read_net, "file = 'outputs/earlier'")
 
 
 def _some(*names: str) -> Any:

@@ -28,6 +28,7 @@ from PIL import ExifTags, Image, ImageCms, ImageDraw, ImageFont
 
 from bstcad.runs import files
 from bstcad.scene.errors import SceneError
+from bstcad.scene.schema import FileContent
 
 FORMATS = {  # that are read, and the ending of a copy
     "PNG": ".png", "JPEG": ".jpg", "MPO": ".jpg", "TIFF": ".tif", "WEBP": ".webp", "BMP": ".bmp", "GIF": ".gif",
@@ -67,8 +68,8 @@ Curve = Callable[[np.ndarray], np.ndarray]  # from numbers to irradiance, both f
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A picture file as it is: the scene keeps it whole, so a design can be repeated from its own folder."""
+class Picture(FileContent):
+    """A picture file as it is."""
 
     name: str  # safe basename, ending as the format wants it
     data: bytes = field(repr=False)

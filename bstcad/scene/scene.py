@@ -33,14 +33,14 @@ from bstcad.optics.sides import Sides, both
 from bstcad.optics.sources import Collimated, Point, Source
 from bstcad.optics.wavefront import ALONG, PlaneWave, SphericalWave, Wave, ZernikeWave
 from bstcad.scene import effects, mount, picture, scene_file
-from bstcad.scene.blank import INDICES, GivenNet, LensBlank, as_front, net_extent
+from bstcad.scene.blank import INDICES, LensBlank, as_front, net_extent
 from bstcad.scene.dotted_keys import OUTLINES, override, tables_at
 from bstcad.scene.effects import Effects
 from bstcad.scene.errors import SceneError, about, explain, line_of, toml_positions
 from bstcad.scene.mount import Mount, Part
 from bstcad.scene.picture import Picture
 from bstcad.scene.quality import JUDGE_DRAW, JUDGE_POINTS, PRESETS, WHOLE, Tailoring, Tolerance, tolerance_complaints
-from bstcad.scene.schema import FILE, Record, of_model
+from bstcad.scene.schema import FILE, FileContent, Record, contents, of_model
 from bstcad.scene.target import AIM, Target, Targets, coplanar
 
 if TYPE_CHECKING:
@@ -329,6 +329,11 @@ class Scene(Record):
 
     # ---- from and to files ----
 
+    @property
+    def files(self) -> dict[str, FileContent]:
+        """The contents of all files that the scene names, by the names of their copies."""
+        return {content.name: content for _, content in contents(self)}
+
     def changed(self, changes: Mapping[str, Any]) -> Scene:
         """The scene with other values, by dotted key: scene.changed({"lens.back.z": 21.0, "target.text": "HI"}).
 
@@ -338,14 +343,14 @@ class Scene(Record):
         replaces the others; a path is relative to the working folder.  lens.front may be a bstcad.Surface of one's own:
         the scene holds a net within 1e-6 mm of it, inside the outline.  Raises SceneError.
         """
-        pictures: dict[str, Picture] = {}
-        data = _from_python(self, "", pictures)
+        given: dict[str, FileContent] = {}
+        data = _from_python(self, "", given)
         outline = changes.get("lens.outline", self.lens.outline)
         for key, value in changes.items():
             if key == "lens.front":
                 value = as_front(value, outline)
-            override(data, key, _from_python(value, key, pictures), key)
-        return _validated(data, Path("."), pictures)
+            override(data, key, _from_python(value, key, given), key)
+        return _validated(data, Path("."), given)
 
     def toml(self) -> str:
         """The scene as a file that loads to an equal scene; an image is named by the basename of its copy."""
@@ -619,10 +624,13 @@ def of_text(
 
 
 def _validated(
-    data: dict[str, Any], folder: Path, pictures: Mapping[str, Picture] = MappingProxyType({}),
+    data: dict[str, Any], folder: Path, given: Mapping[str, FileContent] = MappingProxyType({}),
     bounds: Sequence[Path] = (),
 ) -> Scene:  # fmt: skip
-    """The scene that tables as of a file make; `pictures` by their name, others are files relative to `folder`."""
+    """The scene that tables as of a file make.
+
+    given: the contents of files by their names; other files are relative to `folder`.
+    """
     for key in data["tolerances"] if isinstance(data.get("tolerances"), dict) else ():
         table = "lens" if key.endswith("_thickness") else "accept"
         raise SceneError(f"tolerances.{key}: this table is called [{table}] now; write {table}.{key}")
@@ -636,7 +644,7 @@ def _validated(
             _circle(table, key)
     try:
         # By way of JSON, pydantic is strict (no "8" for 8.0, no true for 1) and still takes lists for tuples.
-        context = {"folder": folder, "contents": pictures, "bounds": bounds}
+        context = {"folder": folder, "contents": given, "bounds": bounds}
         scene = Scene.model_validate_json(json.dumps(data), strict=True, context=context)
     except ValidationError as error:
         raise SceneError(explain(error, data)) from None
@@ -664,16 +672,16 @@ def _circle(outline: Any, place: str) -> None:
         outline["radius"] = diameter / 2
 
 
-def _from_python(value: Any, key: str, pictures: dict[str, Picture]) -> Any:
+def _from_python(value: Any, key: str, given: dict[str, FileContent]) -> Any:
     """A value of Python (record, array, path, tuple) under a dotted key as TOML could have it; None stays None.
 
-    A picture, or a given net, is put into `pictures`, and a name that no file has stands for it.
+    The content of a file is put into `given`, and a name that no file has stands for it.
     """
     if hasattr(value, "__array__") and np.ndim(value) and IMAGE.fullmatch(key):
         value = _image(np.asarray(value), key.removesuffix(".image"))
-    if isinstance(value, Picture | GivenNet):
-        name = f"\0{len(pictures)}"
-        pictures[name] = value
+    if isinstance(value, FileContent):
+        name = f"\0{len(given)}"
+        given[name] = value
         return name
     if isinstance(value, BaseModel):
         value = {field.alias or name: getattr(value, name) for name, field in type(value).model_fields.items()}
@@ -682,10 +690,10 @@ def _from_python(value: Any, key: str, pictures: dict[str, Picture]) -> Any:
     elif hasattr(value, "__array__"):
         value = np.asarray(value).tolist()  # also a single number of numpy or torch
     if isinstance(value, Mapping):
-        table = {str(k): _from_python(part, f"{key}.{k}".lstrip("."), pictures) for k, part in value.items()}
+        table = {str(k): _from_python(part, f"{key}.{k}".lstrip("."), given) for k, part in value.items()}
         return {name: part for name, part in table.items() if part is not None}
     if isinstance(value, list | tuple):
-        return [_from_python(part, f"{key}[{i}]", pictures) for i, part in enumerate(value)]
+        return [_from_python(part, f"{key}[{i}]", given) for i, part in enumerate(value)]
     if isinstance(value, PurePath):
         return str(value)
     if value is None or isinstance(value, str | int | float):

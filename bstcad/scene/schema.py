@@ -7,10 +7,11 @@ schema.json (`python -m bstcad.scene.scene`), and a test holds that the two agre
 from __future__ import annotations
 
 import functools
+import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -51,11 +52,44 @@ class Record(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-def from_file(kind: type, read: Callable[[Path], Any], name: Callable[[Any], str], example: str) -> Any:
+class FileContent:
+    """The content of a file that a scene names; the scene keeps it whole, so that a design can be repeated."""
+
+    name: str  # file name of its copy beside a design
+    data: bytes  # content; a subclass that is a dataclass leaves it out of its repr
+
+    @property
+    def copy(self) -> bytes:
+        """The bytes of the copy."""
+        return self.data
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the content and of the record's other fields."""
+        return hashlib.sha256(repr(self).encode() + self.data).hexdigest()
+
+
+def contents(value: Any, key: str = "") -> Iterator[tuple[str, FileContent]]:
+    """Yield the contents of all files that a value of a scene names, a record or a tuple, by their dotted keys."""
+    if isinstance(value, FileContent):
+        yield key, value
+        return
+    parts: dict[str, Any] = {}
+    if isinstance(value, tuple):
+        parts = {f"{key}[{number}]": part for number, part in enumerate(value)}
+    elif isinstance(value, BaseModel):
+        parts = {f"{key}.{each.alias or name}": getattr(value, name) for name, each in type(value).model_fields.items()}
+    elif is_dataclass(value):
+        parts = {f"{key}.{each.name}": getattr(value, each.name) for each in fields(value)}
+    for name, part in parts.items():
+        yield from contents(part, name.lstrip("."))
+
+
+def from_file(kind: type[FileContent], read: Callable[[Path], FileContent], example: str) -> Any:
     """The type of a field that a file names by its path and that holds the file's content, a `kind`.
 
-    A path is relative to the scene file, or to the user's home; `name` names the copy beside a design.  Where the
-    context of a validation has `bounds`, folders, a path into them must not lead out of them by links.
+    A path is relative to the scene file, or to the user's home.  Where the context of a validation has `bounds`,
+    folders, a path into them must not lead out of them by links.
     """
 
     def content(given: Any, info: ValidationInfo) -> Any:
@@ -75,7 +109,10 @@ def from_file(kind: type, read: Callable[[Path], Any], name: Callable[[Any], str
         return read(folder / os.path.expanduser(given))
 
     return Annotated[
-        kind, BeforeValidator(content), PlainSerializer(name, return_type=str), WithJsonSchema({"type": "string"})
+        kind,
+        BeforeValidator(content),
+        PlainSerializer(lambda found: found.name, return_type=str),
+        WithJsonSchema({"type": "string"}),
     ]
 
 

@@ -37,7 +37,7 @@ NEAREST = 1e-3  # mm; planes of two targets that are nearer to each other are on
 
 
 PictureFile = Annotated[
-    from_file(picture.Picture, picture.read_picture, lambda found: found.name, "image = 'photo.png'"),
+    from_file(picture.Picture, picture.read_picture, "image = 'photo.png'"),
     BeforeValidator(lambda given: picture.from_array(given) if isinstance(given, np.ndarray) else given),
 ]
 Tilt = Annotated[tuple[float, float] | None, AfterValidator(lambda tilt: tilt if tilt and any(tilt) else None)]

@@ -64,7 +64,7 @@ def test_a_given_front_travels_with_its_scene(earlier, tmp_path):
     for k in range(3):
         folder = tmp_path / str(k)
         folder.mkdir()
-        (folder / NET_FILE).write_bytes(scene.lens.front.given.archive())
+        (folder / NET_FILE).write_bytes(scene.lens.front.given.copy)
         (folder / "scene.toml").write_text(scene.toml())
         again = load(folder / "scene.toml")
         assert again == scene and again.lens.front.given.data == scene.lens.front.given.data

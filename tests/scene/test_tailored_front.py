@@ -75,7 +75,7 @@ def test_a_given_net_may_be_where_tailoring_starts(disk, tmp_path):
         (tmp_path / name).write_bytes(data)
     assert load(tmp_path / "scene.toml") == tailored
     one, other = purpose(tailored, "cpu"), purpose(scene, "cpu")
-    assert one["front"] == other["front"] and one != other
+    assert one["files"] == other["files"] and one != other
 
 
 @pytest.mark.parametrize(("path", "changes", "sentence"), [
