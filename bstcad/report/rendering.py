@@ -136,72 +136,19 @@ def main(arrays: str, picture: str) -> None:
 
 
 def clay(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """RGBA image (rows, columns, 4) of the triangles `faces` (n, 3) on `vertices` (k, 3) in mm, back surface up.
-
-    Each report has it, and pyvista, which loads matplotlib, would take a third of its time: so by VTK itself.
-    """
-    import vtkmodules.vtkRenderingOpenGL2 as opengl
-    from vtkmodules import vtkRenderingCore as vtk
-    from vtkmodules.util.numpy_support import vtk_to_numpy
+    """RGBA image (rows, columns, 4) of the triangles `faces` (n, 3) on `vertices` (k, 3) in mm, back surface up."""
+    import pyvista
 
     centre = (vertices.min(0) + vertices.max(0)) / 2
     reach = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    mapper, solid, scene = vtk.vtkPolyDataMapper(), vtk.vtkActor(), vtk.vtkRenderer()
-    mapper.SetInputData(_polygons(vertices, faces))
-    solid.SetMapper(mapper)
-    look = solid.GetProperty()
-    look.SetInterpolationToFlat()
-    look.SetColor(*(int(CLAY[k : k + 2], 16) / 255 for k in (1, 3, 5)))
-    look.SetAmbient(FINISH["ambient"])
-    look.SetDiffuse(FINISH["diffuse"])
-    look.SetSpecular(FINISH["specular"])
-    look.SetSpecularPower(FINISH["specular_power"])
-    scene.AddActor(solid)
-    scene.SetBackground(1.0, 1.0, 1.0)
-    scene.AutomaticLightCreationOff()
+    plotter = pyvista.Plotter(off_screen=True, window_size=list(SIZE), lighting="none")
+    plotter.add_mesh(pyvista.PolyData.from_regular_faces(vertices.astype(np.float32), faces), color=CLAY, **FINISH)
     # The relief is shallow: the key light grazes the back surface; the fill keeps the sides readable.
-    for towards, bright in LIGHTS:
-        light = vtk.vtkLight()
-        light.SetPosition(*(centre + 10 * reach * np.array(towards)))
-        light.SetFocalPoint(*centre)
-        light.SetIntensity(bright)
-        scene.AddLight(light)
-    camera = scene.GetActiveCamera()
-    camera.SetFocalPoint(*centre)
-    camera.SetPosition(*(centre + reach * np.array(EYE)))
-    camera.SetViewUp(0.0, 0.0, 1.0)
-    camera.SetViewAngle(VIEW_ANGLE)
-    scene.ResetCameraClippingRange()
-    smooth = opengl.vtkSSAAPass()
-    smooth.SetDelegatePass(opengl.vtkRenderStepsPass())
-    scene.SetPass(smooth)
-    window, picture = vtk.vtkRenderWindow(), vtk.vtkWindowToImageFilter()
-    window.SetOffScreenRendering(True)
-    window.SetSize(*SIZE)
-    window.SetMultiSamples(0)
-    window.SetAlphaBitPlanes(1)
-    window.AddRenderer(scene)
-    window.Render()
-    picture.SetInput(window)
-    picture.SetInputBufferTypeToRGBA()
-    picture.ReadFrontBufferOff()
-    picture.Update()
-    pixels = vtk_to_numpy(picture.GetOutput().GetPointData().GetScalars())
-    return pixels.reshape(*reversed(SIZE), 4)[::-1]
-
-
-def _polygons(vertices: np.ndarray, faces: np.ndarray) -> Any:
-    """Triangles as VTK has them."""
-    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
-    from vtkmodules.vtkCommonCore import vtkPoints
-    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
-
-    points, cells, solid = vtkPoints(), vtkCellArray(), vtkPolyData()
-    points.SetData(numpy_to_vtk(vertices.astype(np.float32), deep=True))
-    cells.SetData(3, numpy_to_vtkIdTypeArray(np.ascontiguousarray(faces, np.int64).ravel(), deep=True))
-    solid.SetPoints(points)
-    solid.SetPolys(cells)
-    return solid
+    _add_lights(plotter, ((centre + 10 * reach * np.array(towards), bright) for towards, bright in LIGHTS), centre)
+    plotter.camera_position = centre + reach * np.array(EYE), centre, (0.0, 0.0, 1.0)
+    plotter.camera.view_angle = VIEW_ANGLE
+    plotter.enable_anti_aliasing("ssaa")
+    return plotter.screenshot(transparent_background=True)
 
 
 def _solid(vertices: np.ndarray, faces: np.ndarray) -> Any:

@@ -19,7 +19,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -160,8 +160,6 @@ def _call(work: Work, *arguments: Any) -> Any:
 
 
 def _start() -> Executor:
-    from unittest.mock import patch  # with loky at once: both load others
-
     from loky import ProcessPoolExecutor
 
     atexit.register(end)
@@ -169,10 +167,22 @@ def _start() -> Executor:
     quiet = ",".join(filter(None, (os.environ.get("PYTHONWARNINGS"), "ignore:resource_tracker:UserWarning")))
     environment = {"LOKY_MAX_MEMORY_LEAK_SIZE": NO_LEAK}
     try:
-        with unheard_by_children(), patch.dict(os.environ, PYTHONWARNINGS=quiet):
+        with unheard_by_children(), _variable("PYTHONWARNINGS", quiet):
             return ProcessPoolExecutor(1, timeout=IDLE, initializer=_serve, initargs=(os.getpid(),), env=environment)
     except OSError:  # no shared memory for its queues
         return ThreadPoolExecutor(1)
+
+
+@contextlib.contextmanager
+def _variable(name: str, value: str) -> Iterator[None]:
+    """Set an environment variable within the block."""
+    before = os.environ.get(name)
+    os.environ[name] = value
+    try:
+        yield
+    finally:
+        os.environ.pop(name)
+        os.environ.update({} if before is None else {name: before})
 
 
 def _serve(parent: int) -> None:
