@@ -12,6 +12,8 @@ import torch
 
 import bstcad
 from bstcad import pipeline
+from bstcad.cad import mesh, patches
+from bstcad.judges import faces
 from bstcad.judges.faces import Traced
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, Status
@@ -35,7 +37,6 @@ class Asphere(bstcad.Surface):
     a4: float
     a6: float
     kind: str = "asphere"
-    conic_constant = None
 
     def relative_sag_and_slope(self, x, y):
         r2 = x * x + y * y
@@ -63,6 +64,17 @@ def design(scene, tmp_path_factory):
         design = bstcad.design(scene, progress=False)
         design.write(tmp_path_factory.mktemp("own") / "disk", progress=False, effort=quick_effort())
     return design
+
+
+@pytest.mark.parametrize("ask", [
+    lambda lens: patches.front_patch(lens), lambda lens: faces.face(lens.front, OUTLINE),
+    lambda lens: mesh.chordal_error(mesh.lens_mesh(lens, 8), lens), lambda lens: lens.front.scaled(1.01, 0.0),
+], ids=["CAD", "judge", "mesh", "tolerance"])  # fmt: skip
+def test_a_surface_that_no_net_stands_for_is_refused_by_its_kind(scene, ask):
+    """Nothing takes it for a sphere of its curvature."""
+    back = scene.flat_lens(33).back
+    with pytest.raises(ValueError, match="the asphere is neither a net nor .*; give it by scene.changed"):
+        ask(bstcad.Lens(Asphere(15.0, 0.01, 1e-6, 0.0), back, OUTLINE, 1.5))
 
 
 def test_a_surface_that_no_net_comes_near_is_refused(scene):

@@ -265,8 +265,8 @@ def _numbers(surface: Surface) -> tuple[FaceNumbers, np.ndarray]:
     face = surface.plain()
     per_detail = 1 / float(face.detail)
     if not face.is_net:
-        c = float(face.curvature)
-        bend = (1 + float(face.conic_constant)) * c * c
+        c, k = face.conic()
+        bend = (1 + k) * c * c
         ends2 = face.outline.radius**2 if face.outline else math.inf
         return FaceNumbers(
             float(face.z), c, bend, equator=EQUATOR, x=0.0, y=0.0, per_x=0.0, per_y=0.0, per_detail=per_detail,

@@ -13,6 +13,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from io import BytesIO
 
 import numpy as np
@@ -29,7 +30,7 @@ from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Shape
 from bstcad.optics.bspline import BSplineSurface, knots, parameter
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
-from bstcad.optics.surfaces import Conic
+from bstcad.optics.surfaces import Conic, Sphere
 
 WIDER = 1.02  # times as wide as the outline needs: the rim touches no border of the patch
 PARABOLA = 1e-10  # mm; a sphere that departs from its parabola by less is written as that parabola
@@ -83,26 +84,13 @@ def _check_round(surface: BSplineSurface, radius: float) -> None:
 
 
 def front_patch(lens: Lens) -> Patch:
-    """The front on the one kind of OCC surface that is exactly that; its normal may point inwards.
-
-    A sphere whose centre lies 10⁵ mm away would lose its digits: it is written as the parabola z0 + c r²/2, from which
-    it departs by c³ r⁴/8 < PARABOLA.
-    """
+    """The front on the one kind of OCC surface that is exactly that; its normal may point inwards."""
     front, outline = lens.front.plain().optical, lens.front.outline or lens.outline
-    if front.is_net:
-        return _net_patch(front, outline, outward=False)
     if front.level:
         return level_patch(front.z)
-    c, r = front.curvature, float(np.hypot(*outline.farthest))
-    if front.kind != "sphere":
-        return _conic_patch(front, outline)
-    if abs(c) * r >= 1:
-        raise ValueError(
-            f"lens.front: a sphere of radius {1 / abs(c):g} mm ends inside the lens's rim at {r:g} mm; flatten it"
-        )
-    if abs(c) ** 3 * r**4 / 8 < PARABOLA:
-        return _conic_patch(Conic(front.z, c, -1.0), outline)
-    return _sphere_patch(front.z, c)
+    if front.kind not in PATCHES:
+        raise front.unknown
+    return PATCHES[front.kind](front, outline)
 
 
 def level_patch(z: float) -> Patch:
@@ -110,18 +98,27 @@ def level_patch(z: float) -> Patch:
     return Patch(Geom_Plane(gp_Ax3(gp_Pnt(0, 0, z), gp_Dir(0, 0, -1), gp_Dir(1, 0, 0))), True)
 
 
-def _sphere_patch(z: float, c: float) -> Patch:
+def _sphere_patch(front: Sphere, outline: Outline) -> Patch:
     """The sphere with its polar axis along ±x and u = pi at the vertex: no pole (x = ±R) and no seam on the patch.
 
     With s = sign(c): x = s R sin v, y = -R cos v sin u, z - z_centre = s R cos v cos u; normal away from the centre.
+    A sphere whose centre lies 10⁵ mm away would lose its digits: it is written as the parabola z0 + c r²/2, from which
+    it departs by c³ r⁴/8 < PARABOLA.
     """
+    c, r = front.curvature, float(np.hypot(*outline.farthest))
+    if abs(c) * r >= 1:
+        raise ValueError(
+            f"lens.front: a sphere of radius {1 / abs(c):g} mm ends inside the lens's rim at {r:g} mm; flatten it"
+        )
+    if abs(c) ** 3 * r**4 / 8 < PARABOLA:
+        return _conic_patch(Conic(front.z, c, -1.0), outline)
     s, R = np.sign(c), 1 / abs(c)
 
     def uv(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         v = np.arcsin(s * x / R)
         return np.stack([np.pi + np.arcsin(y / (R * np.cos(v))), v], axis=-1)
 
-    axes = gp_Ax3(gp_Pnt(0, 0, z + 1 / c), gp_Dir(s, 0, 0), gp_Dir(0, 0, s))
+    axes = gp_Ax3(gp_Pnt(0, 0, front.z + 1 / c), gp_Dir(s, 0, 0), gp_Dir(0, 0, s))
     return Patch(Geom_SphericalSurface(axes, R), bool(c > 0), uv)
 
 
@@ -162,6 +159,11 @@ def _conic_patch(front: Conic, outline: Outline) -> Patch:
     net, weights = conic_net(front, half_u, half_v)
     surface = bspline_surface(net, np.repeat([-half_u, half_u], 3), np.repeat([-half_v, half_v], 3), weights)
     return Patch(surface, False, uv)
+
+
+PATCHES: dict[str, Callable[..., Patch]] = {  # by the kind of a front that is no plane
+    "bspline": partial(_net_patch, outward=False), "sphere": _sphere_patch, "conic": _conic_patch,
+}  # fmt: skip
 
 
 # ---- arrays ----------------------------------------------------------------------------------------------------------

@@ -133,7 +133,7 @@ def face(surface: Surface, outline: Outline) -> Face:
     plain = surface.plain()
     if plain.is_net:
         return Freeform(plain.control_points())
-    return Revolved(plain.z, plain.curvature, plain.conic_constant, outline.half_extent)
+    return Revolved(plain.z, *plain.conic(), outline.half_extent)
 
 
 @dataclass(frozen=True)

@@ -178,7 +178,6 @@ class BSplineSurface(Surface):
     kind: Literal["bspline"] = "bspline"
 
     is_net = True
-    curvature = conic_constant = None  # a freeform surface has none of its own
 
     @classmethod
     def from_control_points(cls, net: np.ndarray, z: float | None = None) -> BSplineSurface:
@@ -268,6 +267,17 @@ class BSplineSurface(Surface):
         x, y = (np.maximum(np.abs(net[..., i]) - 2 * pitch, 0.0) for i, pitch in enumerate((pitch_x, pitch_y)))
         heights = self.heights.detach().cpu()[outline.contains(torch.from_numpy(x), torch.from_numpy(y))]
         return min(float(heights.min()), 0.0), max(float(heights.max()), 0.0)
+
+    def scaled(self, factor: float, about: float) -> BSplineSurface:
+        """Return the surface larger by a factor about the point of the axis at z = `about` (mm)."""
+        (x0, x1), (y0, y1), z = self.x, self.y, about + factor * (self.z - about)
+        ends = {"x": (factor * x0, factor * x1), "y": (factor * y0, factor * y1)}
+        return replace(self, z=z, heights=factor * self.heights, **ends)
+
+    def bent(self, curvature: float) -> BSplineSurface:
+        """Return the surface higher by curvature r² / 2 (mm): so much more curvature (1/mm) at its vertex."""
+        x, y = (torch.linspace(*ends, m).to(self.heights) for ends, m in zip((self.x, self.y), self.shape, strict=True))
+        return replace(self, heights=self.heights + curvature / 2 * (x[:, None] ** 2 + y[None, :] ** 2))
 
     def parameters(self) -> dict[str, Tensor]:
         """The heights (mm)."""

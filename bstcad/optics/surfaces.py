@@ -27,8 +27,8 @@ class Surface(ABC):
     kind: str
     is_net = False  # is it a B-spline net, with `heights`?
     level = False  # is it z = const, so that light along the axis meets it head on?
-    curvature: float | Tensor | None  # at the vertex (1/mm), positive towards +z; None: it is no surface of revolution
-    conic_constant: float | Tensor | None
+    curvature: float | Tensor  # of a surface of revolution at its vertex (1/mm), positive towards +z
+    conic_constant: float | Tensor  # of a surface of revolution
     detail = math.inf  # width (mm) of its smooth pieces
     outline: Circle | None = None  # of its optical part, around which it is a plane; None: all of it is optical
 
@@ -71,6 +71,24 @@ class Surface(ABC):
         """The same surface from another plane z."""
         return replace(self, z=z)
 
+    def scaled(self, factor: float, about: float) -> Surface:
+        """Return the surface larger by a factor about the point of the axis at z = `about` (mm)."""
+        raise self.unknown
+
+    def bent(self, curvature: float) -> Surface:
+        """Return the surface with so much more curvature (1/mm) at its vertex."""
+        raise self.unknown
+
+    def conic(self) -> tuple[float, float]:
+        """Return curvature (1/mm) and conic constant of a surface of revolution, without gradient."""
+        raise self.unknown
+
+    @property
+    def unknown(self) -> ValueError:
+        """The refusal of a surface that is neither a net nor a plane, a sphere or a conic."""
+        known = "neither a net nor a plane, a sphere or a conic"
+        return ValueError(f"the {self.kind} is {known}; give it by scene.changed, which fits a net to it")
+
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Self:
         """The same surface with its tensors in another precision or on another device; numbers stay numbers."""
         there = {n: v.to(dtype=dtype, device=device) for n, v in self.parameters().items() if isinstance(v, Tensor)}
@@ -110,6 +128,20 @@ class _Revolved(Surface):
     def reaches(self, x: Tensor, y: Tensor) -> Tensor:
         """True where there is a point of the surface over (x, y); a rim where it stands upright does not count."""
         return self._cos2(x * x + y * y) > EQUATOR
+
+    def scaled(self, factor: float, about: float) -> Self:
+        """Return the surface larger by a factor about the point of the axis at z = `about` (mm)."""
+        moved = self.moved(about + factor * (self.z - about))
+        return moved.with_parameters(curvature=self.curvature / factor) if self.curvature else moved
+
+    def bent(self, curvature: float) -> Surface:
+        """Return the surface with so much more curvature (1/mm) at its vertex; a plane becomes a sphere."""
+        curvature = self.curvature + curvature
+        return self.with_parameters(curvature=curvature) if self.curvature else Sphere(self.z, curvature)
+
+    def conic(self) -> tuple[float, float]:
+        """Return curvature (1/mm) and conic constant, without gradient."""
+        return float(self.curvature), float(self.conic_constant)
 
     def _cos2(self, r2: Tensor) -> Tensor:
         return 1 - self.curvature * self.curvature * (1 + self.conic_constant) * r2
@@ -262,6 +294,18 @@ class Recess(Surface):
     def moved(self, z: float) -> Recess:
         """The same with its vertex at another z (mm)."""
         return replace(self, face=self.face.moved(z))
+
+    def scaled(self, factor: float, about: float) -> Recess:
+        """Return the surface and its outline larger by a factor about the point of the axis at z = `about` (mm)."""
+        return Recess(self.face.scaled(factor, about), self.outline.scaled(factor))
+
+    def bent(self, curvature: float) -> Recess:
+        """Return the surface with so much more curvature (1/mm) at its vertex."""
+        return replace(self, face=self.face.bent(curvature))
+
+    def conic(self) -> tuple[float, float]:
+        """Return curvature (1/mm) and conic constant of the optical part, without gradient."""
+        return self.face.conic()
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Recess:
         """The same with its tensors in another precision or on another device."""

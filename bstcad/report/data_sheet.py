@@ -148,9 +148,10 @@ def page(sheet: Sheet) -> Figure:
 
 def _form(sheet: Sheet) -> str:
     """The front's form in short; convex (CX) of a front whose centre lies behind it, along +z (ISO 10110-10)."""
-    radius, net = sheet.record["front"]["radius"], sheet.lens.front.is_net
-    curved = f"R {abs(radius):.5g} {'CX' if radius > 0 else 'CC'}" if radius else "plane"
-    return "freeform" if net else curved
+    front = sheet.record["front"]
+    radii = {name.removeprefix("radius"): radius for name, radius in front.items() if name[:6] == "radius" and radius}
+    words = [f"R{way} {abs(radius):.5g} {'CX' if radius > 0 else 'CC'}" for way, radius in radii.items()]
+    return "freeform" if front["kind"] == "bspline" else ", ".join(words) or "plane"
 
 
 def _column(paper: Paper, left: float, heading: str, rows: Rows) -> None:

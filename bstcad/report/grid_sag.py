@@ -90,8 +90,6 @@ class Patches(Surface):
     grid: Grid
     kind: Literal["patches"] = "patches"
 
-    curvature = conic_constant = None
-
     @property
     def detail(self) -> float:
         """Width of its smooth pieces (mm): a cell."""

@@ -61,8 +61,8 @@ Place = tuple[float, float, float]
 def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str, Any]:
     """Of `lens` as it was designed for `scene`; shape: of bstcad.analysis.shape, and the volume."""
     front, material = lens.front, scene.lens.material
-    curvature = None if front.is_net else float(front.curvature)
-    constant, heavy = front.parameters().get("conic_constant"), density(material) if material else None
+    numbers = ({"curvature": 0.0} if front.level else {}) | scene.lens.front.numbers(front)
+    heavy = density(material) if material else None
     return {
         "name": scene.name,
         "title": scene.title,
@@ -71,9 +71,8 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "index": lens.index,
         "outline": asdict(lens.outline),
         "clear": lens.clear and tuple(map(asdict, lens.clear)),  # apertures of front and back; None: no mount
-        "front": _own(front)
-        | _face(front.kind, lens.front_vertex, curvature, None if constant is None else float(constant)),
-        "back": _face("bspline", vertex(lens)),
+        "front": _own(front) | _face(scene.lens.front.kind, lens.front_vertex, numbers),
+        "back": _face("bspline", vertex(lens), {}),
         "reflects": lens.reflects,  # is it a mirror, whose back is the face that light meets?
         "net": _net(lens.back),
         **({"front_net": _net(front), "front_asked": scene.lens.front.z} if lens.shapes_front else {}),
@@ -104,12 +103,15 @@ def _knots(shape: tuple[int, int]) -> str:
     return each[0] if each[0] == each[1] else f"{each[0]} along x; {each[1]} along y"
 
 
-def _face(kind: str, z: float, curvature: float | None = None, constant: float | None = None) -> dict[str, Any]:
-    """A surface that crosses the axis at z; curvature, radius and conic constant are None of a freeform one."""
-    radius = 1 / curvature if curvature else None  # of a plane None, too
-    return {
-        "kind": kind, "vertex": (0.0, 0.0, z), "curvature": curvature, "radius": radius, "conic_constant": constant,
-    }  # fmt: skip
+def _face(kind: str, z: float, numbers: Mapping[str, float]) -> dict[str, Any]:
+    """A surface that crosses the axis at z; curvature, radius and conic constant are None where it has none.
+
+    numbers: its shape; each curvature is followed by its radius, such as curvature_x by radius_x, None of a plane.
+    """
+    curvatures = {name: value for name, value in numbers.items() if name.startswith("curvature")}
+    radii = {name.replace("curvature", "radius"): 1 / c if c else None for name, c in curvatures.items()}
+    none = dict.fromkeys(("curvature", "radius", "conic_constant"))
+    return {"kind": kind, "vertex": (0.0, 0.0, z)} | none | numbers | radii
 
 
 def _own(front: Surface) -> dict[str, Any]:
@@ -307,7 +309,7 @@ def _front_radius(lens: Lens) -> float | None:
     if front.is_net:
         found = survey_front(lens).concave.largest
         return found if found < FLATTEST else None
-    if not front.curvature < 0:
+    (x, y), (c, k) = (front.outline or lens.outline).farthest, front.conic()
+    if not c < 0:
         return None
-    (x, y), c, k = (front.outline or lens.outline).farthest, float(front.curvature), float(front.conic_constant)
     return max(1 - max(k, 0.0) * c * c * (x * x + y * y), 0.0) ** 1.5 / -c

@@ -6,7 +6,7 @@ import io
 import math
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
@@ -172,8 +172,7 @@ class _Front:
     def optical(self) -> Surface:
         """The surface without an outline of its own."""
         of, _ = FRONTS[self.kind]
-        names = (name for name in ("curvature", "conic_constant") if hasattr(self, name))
-        return of(self.z, **{name: getattr(self, name) for name in names})
+        return of(**{each.name: getattr(self, each.name) for each in fields(of)})
 
     @property
     def fixed(self) -> bool:
@@ -185,6 +184,10 @@ class _Front:
         """The parameters of the surface that tailoring is to find, by name."""
         names = tuple(self.surface.parameters()) if self.optimise else ()
         return names if self.optimise is True else tuple(name for name in names if name in self.optimise)
+
+    def numbers(self, front: Surface) -> dict[str, float]:
+        """Return the shape of a designed front by its keys in the scene; {} of a net, which has its control points."""
+        return {name: value for name, value in front.plain().parameters().items() if isinstance(value, float)}
 
     def designed(self, surface: Surface) -> Self:
         """The same front with the parameters of this surface, and nothing left to find."""

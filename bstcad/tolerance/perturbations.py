@@ -30,7 +30,7 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Vector
 from bstcad.optics.sides import in_words
 from bstcad.optics.sources import Source
-from bstcad.optics.surfaces import Sphere, Surface
+from bstcad.optics.surfaces import Surface
 
 # --- the setup --------------------------------------------------------------------------------------------------------
 
@@ -84,20 +84,9 @@ class Setup:
     def with_lens_scaled(self, factor: float) -> Setup:
         """With its lens larger by a factor about its pivot."""
         lens, (_, _, about) = self.lens, self.pivot("lens")
-        faces = {name: _scaled(getattr(lens, name), factor, about) for name in ("front", "back")}
+        faces = {"front": lens.front.scaled(factor, about), "back": lens.back.scaled(factor, about)}
         clear = lens.clear and tuple(aperture.scaled(factor) for aperture in lens.clear)
         return replace(self, lens=replace(lens, outline=lens.outline.scaled(factor), clear=clear, **faces))
-
-
-def _scaled(surface: Surface, factor: float, about: float) -> Surface:
-    """A face larger by a factor about the point of the axis at z = `about` (mm)."""
-    moved = surface.moved(about + factor * (surface.z - about))
-    if surface.outline is not None:
-        moved = replace(moved, outline=surface.outline.scaled(factor))
-    if surface.is_net:
-        x, y = (tuple(factor * end for end in side) for side in (surface.x, surface.y))
-        return replace(moved, heights=factor * surface.heights, x=x, y=y)
-    return moved.with_parameters(curvature=surface.curvature / factor) if surface.curvature else moved
 
 
 # --- distributions and trials -----------------------------------------------------------------------------------------
@@ -231,13 +220,7 @@ def _front_power(setup: Setup, by: float) -> Setup:
     """A front whose rim stands higher by so much (mm): c + 2 by / R², R the farthest from the axis."""
     front = setup.lens.front
     rim2 = sum(p * p for p in (front.outline or setup.lens.outline).farthest)
-    if front.is_net:
-        x, y = (np.linspace(*side, m) for side, m in zip((front.x, front.y), front.shape, strict=True))
-        bent = _higher(front, by * (x[:, None] ** 2 + y[None, :] ** 2) / rim2)
-    else:
-        curvature = front.curvature + 2 * by / rim2
-        bent = front.with_parameters(curvature=curvature) if front.curvature else Sphere(front.z, curvature)
-    return replace(setup, lens=replace(setup.lens, front=bent))
+    return replace(setup, lens=replace(setup.lens, front=front.bent(2 * by / rim2)))
 
 
 def _warmer(material: str, setup: Setup, by: float) -> Setup:

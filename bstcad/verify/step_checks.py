@@ -206,14 +206,14 @@ def _front(reread: Surface, lens: Lens, tolerance: float) -> Iterator[Check]:
         name = f"form: control points of the front, {difference}"
         yield net_check(name, net, wanted.control_points(), id="front-net")
         return
-    off = math.inf if reread.is_net else abs(reread.curvature - wanted.curvature)
+    curvature, constant = wanted.conic()
+    found = (math.inf, math.inf) if reread.is_net else reread.conic()
     name = f"form: curvature of the front, {difference}"
-    yield Check.at_most(name, float(off), CURVATURE, "1/mm", id="front-curvature")
-    if wanted.conic_constant:
-        apart = math.inf if reread.is_net else abs(reread.conic_constant - wanted.conic_constant)
-        sag = apart * abs(wanted.curvature) ** 3 * math.hypot(*lens.outline.farthest) ** 4 / 8
+    yield Check.at_most(name, abs(found[0] - curvature), CURVATURE, "1/mm", id="front-curvature")
+    if constant:
+        sag = abs(found[1] - constant) * abs(curvature) ** 3 * math.hypot(*lens.outline.farthest) ** 4 / 8
         name = f"form: sag at the rim by the front's conic constant, {difference}"
-        yield Check.at_most(name, float(sag), FLAT, "mm", id="front-conic")
+        yield Check.at_most(name, sag, FLAT, "mm", id="front-conic")
 
 
 # ---- part.step -----------------------------------------------------------------------------------------------------

@@ -79,7 +79,6 @@ class Revolved(Surface):
     z: float
     profile: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
     kind: str = "revolved"
-    curvature = conic_constant = None
 
     def relative_sag_and_slope(self, x, y):
         r = torch.hypot(x, y).numpy()

@@ -11,7 +11,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Collimated, Point
-from bstcad.optics.surfaces import Conic, Plane, Sphere, sag
+from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, sag
 from bstcad.optics.trace import to_first_net
 
 N = 1.5
@@ -124,3 +124,22 @@ def test_every_surface_answers_the_same_questions(surface):
     assert math.prod(surface.sags(Circle(5.0))) == 0.0
     low, high = surface.sags(Circle(5.0))
     assert sag(surface, 3.0, 4.0) - surface.z == pytest.approx(low + high, abs=1e-14)
+
+
+def faces_of_each_kind():
+    net = BSplineSurface.fitted(Sphere(15.0, 0.02), (-12.0, 12.0), (-12.0, 12.0), 33)
+    return [Plane(15.0), Sphere(15.0, 0.02), Conic(15.0, -0.02, -2.0), net, Recess(Sphere(15.0, -0.08), Circle(5.0))]
+
+
+@pytest.mark.parametrize("surface", faces_of_each_kind(), ids=lambda surface: type(surface).__name__)
+def test_a_scaled_surface_goes_through_the_scaled_points(surface):
+    (x, y), factor, about = (p.numpy() for p in places()), 1.01, 12.0
+    there = surface.scaled(factor, about)
+    assert abs(sag(there, factor * x, factor * y) - about - factor * (sag(surface, x, y) - about)).max() < 1e-12
+
+
+@pytest.mark.parametrize("surface", faces_of_each_kind(), ids=lambda surface: type(surface).__name__)
+def test_a_bent_surface_has_so_much_more_curvature_at_its_vertex(surface):
+    h, by = 1e-2, 0.001
+    higher = sag(surface.bent(by), [-h, 0.0, h], 0.0) - sag(surface, [-h, 0.0, h], 0.0)
+    assert (higher[0] - 2 * higher[1] + higher[2]) / h**2 == pytest.approx(by, rel=1e-4)
