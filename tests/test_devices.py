@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from bstcad import pipeline
-from bstcad.optics.kernels.compiling import fused, fused_whole
+from bstcad.optics import bspline, ops, tubes
 from bstcad.pipeline import design
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
@@ -173,8 +173,27 @@ def test_the_compiled_kernels_serve_no_tensor_of_the_gpu():
     with SecondDevice() as second:
         lens = wanted.flat_lens(33, device="cuda")
         u = torch.ones(3, dtype=torch.float64, device="cuda")
-        assert not fused(lens.back.heights, u, u) and not fused_whole(lens.interfaces)
+        assert not any(ops.kernel(name, lens.back.heights, u) for name in ops.KERNELS)
+        assert not ops.whole_kernel("trace.simulate", lens.interfaces)
     assert not second.mixed
+
+
+def test_a_kernel_of_the_gpu_is_an_entry_of_the_table(monkeypatch):
+    """Entered for "cuda", it takes the tensors there and no others: merit and gradient are the CPU's."""
+    calls = dict.fromkeys(("bspline.evaluate", "tubes.collect"), 0)
+
+    def enter(name, plain):
+        def kernel(*given):
+            assert on_second(given[0])
+            calls[name] += 1
+            return plain(*given)
+
+        monkeypatch.setitem(ops.KERNELS[name], "cuda", kernel)
+
+    enter("bspline.evaluate", bspline.evaluate_plain)
+    enter("tubes.collect", lambda corner, flux, shape, thinnest: tubes.collect_plain(corner, flux, shape))
+    same_merit_and_gradient(scene(TEMPLATES[0].with_name("mirror.toml"), "draft"))
+    assert all(calls.values())
 
 
 MIXES = {  # what CUDA refuses

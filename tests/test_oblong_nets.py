@@ -10,9 +10,9 @@ import torch
 import bstcad
 from bstcad import commands
 from bstcad.analysis.shape import _grid, survey
-from bstcad.optics import trace
+from bstcad.optics import ops, trace
 from bstcad.optics.bspline import QUARTERS, BSplineSurface, Spans, evaluate, evaluate_plain, knots, net_gradient
-from bstcad.optics.kernels import compiling, spline
+from bstcad.optics.kernels import spline
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.receivers import LevelPlane
@@ -215,6 +215,6 @@ def test_what_is_wrong_and_what_is_doubted():
 def test_without_kernels_it_is_the_same_surface(monkeypatch):
     net, (x, y) = bowl(), (torch.linspace(-11, 11, 9).double(), torch.linspace(-5, 5, 9).double())
     fused = net.sag_and_slope(x, y)
-    monkeypatch.setattr(compiling, "ENABLED", False)
+    monkeypatch.setattr(ops, "ENABLED", False)
     for one, other in zip(fused, net.sag_and_slope(x, y), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)

@@ -26,8 +26,7 @@ import scipy.sparse
 import torch
 from torch import Tensor
 
-from bstcad.optics.kernels import spline
-from bstcad.optics.kernels.compiling import fused
+from bstcad.optics import ops
 from bstcad.optics.outlines import Outline, inside
 from bstcad.optics.sides import FEWEST, Sides, both, side
 from bstcad.optics.surfaces import Surface
@@ -109,8 +108,8 @@ def evaluate_plain(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tenso
 
 def evaluate(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """`evaluate_plain`, by the fused kernel where it takes these tensors (same values to rounding)."""
-    if fused(heights, u, v):
-        return spline.BSplineSag.apply(heights, *torch.broadcast_tensors(u, v))
+    if fast := ops.kernel("bspline.evaluate", heights, u, v):
+        return fast(heights, *torch.broadcast_tensors(u, v))
     return evaluate_plain(heights, u, v)
 
 
@@ -119,8 +118,8 @@ def net_gradient(heights: Tensor, u: Tensor, v: Tensor, seeds: tuple[Tensor, Ten
 
     It is the same for all heights; the argument gives the net's size, type and device.
     """
-    if fused(heights, u, v):
-        return spline.net_gradient(heights, u, v, seeds)
+    if fast := ops.kernel("bspline.net_gradient", heights, u, v):
+        return fast(heights, u, v, seeds)
     net = torch.zeros_like(heights, requires_grad=True)
     with torch.enable_grad():
         values = evaluate_plain(net, u, v)

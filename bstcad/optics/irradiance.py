@@ -14,8 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics.kernels import splat
-from bstcad.optics.kernels.compiling import fused
+from bstcad.optics import ops
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.motion import Motion
 from bstcad.optics.rays import Landed, Status, axes, clocked, clocking_of, tilt_of
@@ -118,10 +117,10 @@ def collect(rays: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
     Binning gives no gradient to a ray that has left the screen; the second sum does.
     """
     flux = landed_flux(rays)
-    if fused(rays.position, flux) and not flux.requires_grad:
+    if (fast := ops.kernel("irradiance.collect", rays.position, flux)) and not flux.requires_grad:
         (left, _), (_, top), (per_x, per_y) = screen.x, screen.y, screen.per_mm
         position = rays.position.reshape(2, -1).contiguous()
-        return splat.Splat.apply(position, flux.reshape(-1).contiguous(), (left, per_x, top, per_y), screen.shape)
+        return fast(position, flux.reshape(-1).contiguous(), (left, per_x, top, per_y), screen.shape)
     return collect_plain(rays.position, flux, screen)
 
 

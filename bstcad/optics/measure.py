@@ -40,7 +40,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import in_pairs
-from bstcad.optics.trace import UNDERSIDE, Ghost, Simulation, is_whole, simulate, through
+from bstcad.optics.trace import UNDERSIDE, Ghost, Simulation, simulate, through, whole_kernel
 from bstcad.optics.tubes import SHEET, Tubes, area_of, arriving, corners, launch_tubes, middle, picture, rays_to
 
 SETS = 8  # independent sets of rays: a standard error is then known to a quarter of it
@@ -149,7 +149,8 @@ def measure(
     plain = lens.shapes_front  # no kernel traces two nets as a whole, and both are to have a witness
     lenses = [(c.source, c.through(lens)) for c in channels]
     simple = draw is None and all(
-        seen.losses is None and (plain or is_whole(source, seen, screen.plane)) for source, seen in lenses
+        seen.losses is None and (plain or whole_kernel("trace.simulate", source, seen, screen.plane))
+        for source, seen in lenses
     )
     witnessed = effort.witness and simple
     return Light(

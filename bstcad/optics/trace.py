@@ -15,18 +15,17 @@ ghosts, in plain torch.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from bstcad.optics import irradiance, sampling
+from bstcad.optics import irradiance, ops, sampling
 from bstcad.optics.channels import Channel, places, weighted_sum
 from bstcad.optics.interfaces import Interface, Loss, Reflect, Refract, cross, intersect
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import crossing, forward
-from bstcad.optics.kernels.compiling import fused, fused_whole
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline, Rectangle
@@ -53,24 +52,27 @@ def through(rays: Rays, interfaces: Sequence[Interface], plane: Receiver) -> Lan
     *others, last = interfaces
     for interface in others:
         rays = behind(rays, interface)
-    if _is_fused(rays, last) and plane.axes is not None:
-        return crossing.landed(rays, last, plane)
+    if plane.axes is not None and (fast := _of_net("trace.through", rays, last)):
+        return fast(rays, last, plane)
     return plane.land(cross(rays, last).rays)
 
 
 def behind(rays: Rays, interface: Interface) -> Rays:
     """Rays behind an interface: across a net by a fused kernel where that takes the tensors."""
-    return crossing.behind(rays, interface) if _is_fused(rays, interface) else cross(rays, interface).rays
+    fast = _of_net("trace.behind", rays, interface)
+    return fast(rays, interface) if fast else cross(rays, interface).rays
 
 
-def _is_fused(rays: Rays, interface: Interface) -> bool:
+def _of_net(name: str, rays: Rays, interface: Interface) -> Callable[..., Any] | None:
+    """The kernel of this name, if the interface is a net."""
     surface = interface.surface
-    return surface.is_net and fused(surface.heights, rays.position, rays.direction)
+    return ops.kernel(name, surface.heights, rays.position, rays.direction) if surface.is_net else None
 
 
-def is_whole(source: Source, lens: Lens, plane: Receiver) -> bool:
-    """Does the fused kernel know the whole way: this source, all interfaces of the lens, and the receiver?"""
-    return plane.axes is not None and fused_whole(lens.interfaces) and source.beam(lens.entrance.z) is not None
+def whole_kernel(name: str, source: Source, lens: Lens, plane: Receiver) -> Callable[..., Any] | None:
+    """The kernel of this name, if it knows the whole way: this source, all interfaces of the lens and the receiver."""
+    known = plane.axes is not None and source.beam(lens.entrance.z) is not None
+    return ops.whole_kernel(name, lens.interfaces) if known else None
 
 
 def to_first_net(rays: Rays, lens: Lens) -> Rays:
@@ -160,9 +162,10 @@ def simulate(lights: Lights, screen: Screen, n: int) -> Simulation:
 
     Kernel and plain form trace the same rays, and agree to rounding.
     """
-    if all(is_whole(source, lens, screen.plane) for _, source, lens, _ in lights):
+    kernels = [whole_kernel("trace.simulate", source, lens, screen.plane) for _, source, lens, _ in lights]
+    if fast := all(kernels) and kernels[0]:
         whole = [(*light, window(light[1], light[2])) for light in lights]
-        return _of_all_light(lights, *forward.simulate(whole, screen, n))
+        return _of_all_light(lights, *fast(whole, screen, n))
     return simulate_plain(lights, screen, n)
 
 

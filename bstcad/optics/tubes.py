@@ -16,10 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bstcad.optics import ops
 from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import clip, forward
-from bstcad.optics.kernels.compiling import fused
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
@@ -27,7 +26,7 @@ from bstcad.optics.rays import Landed, Rays, Status, joined
 from bstcad.optics.receivers import LevelPlane, Receiver
 from bstcad.optics.sides import Sides, both, spread
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import behind, from_first_net, gets_through, is_whole
+from bstcad.optics.trace import behind, from_first_net, gets_through, whole_kernel
 
 ALL = slice(None)
 SHEET = 256  # tubes a side of the sheet through which finer ones are interpolated
@@ -241,8 +240,8 @@ def _partly_lit(source: Source, lens: Lens, x: tuple[Tensor, ...], y: tuple[Tens
 def _getting_through(source: Source, lens: Lens, x: Tensor, y: Tensor) -> Tensor:
     """Flux density (n,) (1/mm²) at points of the first vertex's plane (n,), zero where the lens cuts the light."""
     behind = LevelPlane(lens.back.z + 1.0)  # a plane behind the lens, whichever
-    if lens.losses is None and is_whole(source, lens, behind):
-        landed = forward.land(source, lens, behind, x=x.double(), y=y.double())
+    if lens.losses is None and (fast := whole_kernel("trace.land", source, lens, behind)):
+        landed = fast(source, lens, behind, x=x.double(), y=y.double())
         return landed.flux * ((landed.status != int(Status.MISSED_FRONT)) & (landed.status != int(Status.VIGNETTED)))
     return source.irradiance(x, y, lens.entrance.z) * gets_through(source.rays(x, y, lens.entrance.z, 1.0), lens)
 
@@ -364,8 +363,8 @@ def collect(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tenso
     outside is Σ flux · (mean square of the corners' distance beyond the border, in pixels): a pull for light that no
     pixel sees.
     """
-    if corner.dtype == torch.float64 and fused(corner):
-        return clip.Clip.apply(corner, flux, shape, THINNEST)
+    if corner.dtype == torch.float64 and (fast := ops.kernel("tubes.collect", corner)):
+        return fast(corner, flux, shape, THINNEST)
     return collect_plain(corner, flux, shape)
 
 

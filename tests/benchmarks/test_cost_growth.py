@@ -15,9 +15,9 @@ from unittest import mock
 import pytest
 import torch
 
-from bstcad.optics import bspline, tubes
+from bstcad.optics import bspline, ops, tubes
 from bstcad.optics.irradiance import Screen, collect, collect_plain, landed_flux
-from bstcad.optics.kernels import compiling, forward
+from bstcad.optics.kernels import forward
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.trace import from_first_net, to_first_net, trace, window
 from bstcad.scene import scene
@@ -73,7 +73,7 @@ def test_an_evaluation_hardly_feels_the_net():
 
 def plain_torch():
     """No fused kernel serves, not even the spline below a plain trace."""
-    return mock.patch.object(compiling, "ENABLED", False)
+    return mock.patch.object(ops, "ENABLED", False)
 
 
 def lens_of(wanted, m, dtype=torch.float64):

@@ -10,9 +10,9 @@ import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
-from bstcad.optics import trace
+from bstcad.optics import ops, trace
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.kernels import compiling, forward
+from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Rays
@@ -31,7 +31,7 @@ NAMES = {torch.float32: "float32", torch.float64: "float64"}
 def tracing(engine: str) -> Iterator[Callable[[Rays, Lens, float], Landed]]:
     """From the glass to the screen: plain torch; plain torch on the fused spline; the fused back face."""
     form = trace.from_first_net if engine == "fused" else from_first_net_plain
-    with mock.patch.object(compiling, "ENABLED", compiling.ENABLED and engine != "plain"):
+    with mock.patch.object(ops, "ENABLED", ops.ENABLED and engine != "plain"):
         yield lambda rays, lens, z: form(rays, lens, LevelPlane(z))
 
 

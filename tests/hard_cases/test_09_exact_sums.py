@@ -11,10 +11,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bstcad.optics import bspline, trace, tubes
+from bstcad.optics import bspline, ops, trace, tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import compiling, reductions
+from bstcad.optics.kernels import reductions
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays
@@ -36,7 +36,7 @@ FORMS = pytest.mark.parametrize("compiled", (True, False), ids=("compiled", "pla
 def plain(request, monkeypatch):
     """Where a test asks for the plain form, no kernel serves."""
     if "compiled" in request.fixturenames and not request.getfixturevalue("compiled"):
-        monkeypatch.setattr(compiling, "ENABLED", False)
+        monkeypatch.setattr(ops, "ENABLED", False)
 
 
 def carried(dtype, count=SINGLE) -> torch.Tensor:

@@ -22,12 +22,11 @@ import torch
 
 from bstcad import pipeline
 from bstcad.baselines.paper import TentMerit
-from bstcad.optics import sampling, tubes
+from bstcad.optics import ops, sampling, tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import compiling
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.measure import RayTubes
@@ -191,7 +190,7 @@ JUMPS = {torch.float64: 1e-12, torch.float32: 0.04}
 @pytest.mark.parametrize("dtype", AGREE, ids=str)
 def test_compiled_or_not(holds, monkeypatch, dtype):
     wanted = image_and_gradient(dtype)
-    monkeypatch.setattr(compiling, "ENABLED", False)
+    monkeypatch.setattr(ops, "ENABLED", False)
     for name, found in image_and_gradient(dtype).items():
         bound = (JUMPS if name == "gradient, rays" else AGREE)[dtype]
         holds(f"compiled or plain, {str(dtype)[6:]}: {name}", apart(name, found, wanted[name]), bound)

@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics import irradiance, trace, tubes
+from bstcad.optics import irradiance, ops, trace, tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import compiling
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Status
@@ -122,7 +121,7 @@ PICTURES = {
 @pytest.mark.parametrize("light", PICTURES)
 def test_nothing_is_piled_on_the_border(holds, monkeypatch, light, form):
     """The same rays in the same pixels; tubes are cut at the border, which leaves rounding of a few tubes' flux."""
-    monkeypatch.setattr(compiling, "ENABLED", form is simulated)
+    monkeypatch.setattr(ops, "ENABLED", form is simulated)
     small, large = (PICTURES[light](screen, form) for screen in (SMALL, LARGE))
     assert float(large.sum()) > 1.1 * float(small.sum())  # light does leave the small screen
     piled = (border(small) - border(cut(large))).abs().max()

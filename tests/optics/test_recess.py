@@ -8,10 +8,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from bstcad.optics import ops
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import compiling
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import simulated
 from bstcad.optics.outlines import Circle, Rectangle
@@ -103,7 +103,7 @@ def test_the_kernel_traces_a_dome_as_the_plain_form_does(monkeypatch):
     x = torch.linspace(-15, 15, 40, dtype=torch.float64)
     rays = source.rays(*torch.meshgrid(x, x, indexing="ij"), RADIUS, 1.0)
     first = trace(rays, wide, LevelPlane(500.0))
-    monkeypatch.setattr(compiling, "ENABLED", False)
+    monkeypatch.setattr(ops, "ENABLED", False)
     second = trace(rays, wide, LevelPlane(500.0))
     assert torch.equal(first.status, second.status) and 100 < int(first.alive.sum()) < 1500
     alive = first.alive

@@ -5,10 +5,10 @@ from functools import partial
 import pytest
 import torch
 
+from bstcad.optics import ops
 from bstcad.optics.channels import Channel
 from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import compiling
 from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.sources import Point
 from bstcad.scene.blank import Bounds
@@ -101,7 +101,7 @@ def test_the_plain_form_is_the_fused_one(name, monkeypatch):
     """Tubes, merit, RRMSD and both gradients: a hit is found to 1e-13 mm by the one, and a step better by the other."""
     found = []
     for enabled in (True, False):
-        monkeypatch.setattr(compiling, "ENABLED", enabled)
+        monkeypatch.setattr(ops, "ENABLED", enabled)
         problem = problem_of(name)
         found.append(problem([net.heights for net in problem.lens.nets]))
     (merit, gradients, rrmsd), (plain, wanted, known) = found

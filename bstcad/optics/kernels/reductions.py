@@ -21,6 +21,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
+from bstcad.optics import ops
 from bstcad.optics.kernels.compiling import compiled
 
 PARTS = 16  # at most; a power of two, so that two, four or eight threads have the same to do
@@ -70,8 +71,12 @@ def elementary(function: Callable[[Tensor], Tensor], t: Tensor) -> Tensor:
 
 def dot(a: Tensor, b: Tensor) -> float:
     """Σ a b of two vectors, in float64; without gradient."""
-    if a.device.type != "cpu":
-        return float(total(a * b))
+    fast = ops.kernel("reductions.dot", a)
+    return fast(a, b) if fast else float(total(a * b))
+
+
+def dot_of_arrays(a: Tensor, b: Tensor) -> float:
+    """`dot` on the CPU, as a sum of PARTS sums."""
     sums = np.empty(PARTS)
     _dot(a.detach().numpy(), b.detach().numpy(), sums)
     return float(sums.sum())
@@ -88,9 +93,14 @@ def _dot(a, b, sums):
 
 def add(a: Tensor, factor: float, b: Tensor) -> None:
     """a += factor b, in place and without gradient: rounded as torch rounds a product and then a sum, in one pass."""
-    if a.device.type != "cpu":
+    if fast := ops.kernel("reductions.add", a):
+        fast(a, factor, b)
+    else:
         a += factor * b
-        return
+
+
+def add_to_array(a: Tensor, factor: float, b: Tensor) -> None:
+    """`add` on the CPU."""
     own = a.numpy()
     _add(own, own.dtype.type(factor), b.detach().numpy())
 

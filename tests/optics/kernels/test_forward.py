@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics import irradiance, trace
+from bstcad.optics import irradiance, ops, trace
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import forward
-from bstcad.optics.kernels.compiling import fused_whole
 from bstcad.optics.kernels.forward import land
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Fresnel, Losses
@@ -219,13 +218,14 @@ def test_memory_does_not_grow_with_the_rays():
 
 def test_what_the_kernel_takes(monkeypatch):
     source, lens, _ = SCENES["point, plane"]
-    assert fused_whole(lens.interfaces)
+    assert ops.whole_kernel("trace.simulate", lens.interfaces) is forward.simulate
     for other in (lens.back.heights.to(torch.float16), lens.back.heights.to("meta")):
-        assert not fused_whole(lens.with_heights([other]).interfaces)
+        assert not ops.whole_kernel("trace.simulate", lens.with_heights([other]).interfaces)
     freeform = replace(lens, front=replace(lens.back, z=6.0, heights=lens.back.heights - 10))
     window = replace(lens.interfaces[0], surface=Plane(1.0))
-    assert not fused_whole(freeform.interfaces) and not fused_whole(replace(lens, before=(window,)).interfaces)
-    monkeypatch.setattr(forward, "simulate", None)
+    for unknown in (freeform, replace(lens, before=(window,))):
+        assert not ops.whole_kernel("trace.simulate", unknown.interfaces)
+    monkeypatch.setitem(ops.KERNELS["trace.simulate"], "cpu", lambda *given: pytest.fail("the kernel is called"))
     assert simulated(source, freeform, SCREEN, 50, 0).rays == 2500  # by the plain form
 
 

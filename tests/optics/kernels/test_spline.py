@@ -7,11 +7,10 @@ import pytest
 import torch
 
 from bstcad.analysis import shape
-from bstcad.optics import bspline, irradiance
+from bstcad.optics import bspline, irradiance, ops
 from bstcad.optics.bspline import QUARTERS, BSplineSurface, Spans, span_places
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import spline
-from bstcad.optics.kernels.compiling import fused
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
 from bstcad.optics.rays import Landed
 from tests.optics.kernels.arrays import DTYPES, LAYOUTS, close, uniform
@@ -20,10 +19,11 @@ from tests.optics.kernels.arrays import DTYPES, LAYOUTS, close, uniform
 @DTYPES
 def test_kernels_serve_matching_cpu_tensors_only(dtype):
     a = torch.zeros(3, dtype=dtype)
-    assert fused(a, a)
-    assert not fused(a, a.to(torch.float16))
-    assert not fused(a, torch.zeros(3, dtype=torch.float64 if dtype == torch.float32 else torch.float32))
-    assert not fused(a.to("meta"), a.to("meta"))
+    other = torch.zeros(3, dtype=torch.float64 if dtype == torch.float32 else torch.float32)
+    for name, by_device in ops.KERNELS.items():
+        assert by_device.keys() == {"cpu"} and callable(ops.kernel(name, a, a))
+        for wrong in ((a, a.to(torch.float16)), (a, other), (a.to("meta"), a.to("meta"))):
+            assert ops.kernel(name, *wrong) is None
 
 
 @DTYPES

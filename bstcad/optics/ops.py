@@ -1,0 +1,61 @@
+"""The functions of optics that have a kernel, by device: the one place where a plain form gives way to a faster one.
+
+A kernel has the values of its plain form to rounding, and takes the same tensors: the caller asks for one by name and
+runs the plain form where there is none.  A kernel for a GPU is one more entry of a row; until there is one, a GPU runs
+plain torch.  Stage 1's transport and the checks of a net's shape (spline.largest_bending) work on arrays of numpy, on
+the CPU whatever the device.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+from collections.abc import Callable, Sequence
+from operator import attrgetter
+from typing import Any
+
+import torch
+from torch import Tensor
+
+ENABLED = True  # tests of the plain forms turn all kernels off
+# Kernels by function and type of device: callables, or their names in bstcad.optics.kernels, which is loaded by need.
+KERNELS: dict[str, dict[str, str | Callable[..., Any]]] = {
+    "bspline.evaluate": {"cpu": "spline.BSplineSag.apply"},
+    "bspline.net_gradient": {"cpu": "spline.net_gradient"},
+    "irradiance.collect": {"cpu": "splat.Splat.apply"},
+    "trace.behind": {"cpu": "crossing.behind"},
+    "trace.through": {"cpu": "crossing.landed"},
+    "trace.simulate": {"cpu": "forward.simulate"},  # the whole way, from the source to the receiver
+    "trace.land": {"cpu": "forward.land"},  # the whole way of single rays
+    "tubes.collect": {"cpu": "clip.Clip.apply"},
+    "reductions.dot": {"cpu": "reductions.dot_of_arrays"},
+    "reductions.add": {"cpu": "reductions.add_to_array"},
+}
+DTYPES = (torch.float32, torch.float64)
+# The kernels of the whole way know the equations of these kinds of Surface, and of no others.
+KINDS = {"bspline": "net", "plane": "revolved", "sphere": "revolved", "conic": "revolved"}
+# The sequences of interfaces that they trace: (of KINDS, does it reflect?) each.
+WHOLE = [("net", True)], [("revolved", False), ("net", False)]
+
+
+def kernel(name: str, *tensors: Tensor) -> Callable[..., Any] | None:
+    """Return the kernel of a function that takes these tensors, of one device and dtype; None: the plain form runs."""
+    device, dtype = tensors[0].device.type, tensors[0].dtype
+    found = KERNELS[name].get(device) if ENABLED else None
+    if found is None or dtype not in DTYPES or any(t.device.type != device or t.dtype != dtype for t in tensors):
+        return None
+    return _loaded(found) if isinstance(found, str) else found
+
+
+def whole_kernel(name: str, interfaces: Sequence[Any]) -> Callable[..., Any] | None:
+    """Return the kernel that traces rays across all of these Interfaces: a mirror, or a front and a net; or None."""
+    given = [(KINDS.get(interface.surface.kind), interface.law.reverses) for interface in interfaces]
+    if given not in WHOLE or not all(loss.fused for interface in interfaces for loss in interface.losses):
+        return None
+    return kernel(name, interfaces[-1].surface.heights)
+
+
+@functools.cache
+def _loaded(name: str) -> Callable[..., Any]:
+    module, _, function = name.partition(".")
+    return attrgetter(function)(importlib.import_module(f"bstcad.optics.kernels.{module}"))
