@@ -297,7 +297,7 @@ def write_design(design: Made, irradiances: Sequence[np.ndarray], folder: Path) 
         degree=DEGREE,
         **({"front_curvature": 0.0} | _numbers(front)),
         **({"front_control_points": front.control_points()} if front.is_net else {}),
-        **(dict(zip(FRONT_KNOTS, map(knots, front.shape), strict=True)) if design.lens.shapes_front else {}),
+        **(dict(zip(FRONT_KNOTS, map(knots, front.shape), strict=True)) if design.lens.shapes("front") else {}),
         **{numbered("target", k): goal.picture for k, goal in enumerate(design.goals)},
         **{numbered("reachable", k): part.astype(np.uint8) for k, part in parts if part is not None},
         **{numbered("irradiance", k): picture for k, picture in enumerate(irradiances)},
@@ -437,7 +437,7 @@ def _lens(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
         front = front.with_parameters(**{name.removeprefix("front_"): float(found[name]) for name in _numbers(front)})
     back = _surface(found["control_points"], blank.back.z)
     return scene.as_mounted(
-        Lens(front, back, blank.outline, scene.index, reflects=blank.back.reflect, shaped=blank.shaped)
+        Lens(front, back, blank.outline, scene.index, reflects=blank.back.reflect).shaping(*blank.shaped)
     )
 
 

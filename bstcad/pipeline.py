@@ -32,7 +32,7 @@ from bstcad.scene.scene import Scene
 from bstcad.tailoring import slope_map, stage1, stage2, two_faces
 from bstcad.tailoring.feasibility import demands, refused
 from bstcad.tailoring.grazing import cleared
-from bstcad.tailoring.machinability import BOUNDED, front_shaped, held, kept, moved_clear
+from bstcad.tailoring.machinability import BOUNDED, held, kept, moved_clear
 from bstcad.tailoring.reachable import reachable
 from bstcad.tailoring.run import (
     BEST,
@@ -186,7 +186,7 @@ def task_of(scene: Scene, goals: Sequence[Goal], knobs: Tailoring, edge: Edge | 
 def posed(scene: Scene, task: Task) -> Task:
     """The task with the solution that asks less of two freeform faces; it says what they cannot do.  SceneError."""
     lens = scene.flat_lens(REACH_NET)
-    if lens.freeform != (0, 1) or not task.several:
+    if not lens.shapes_both or not task.several:
         return task
     demand = demands(task, task.heaviest.through(lens))
     sentences = tuple(demand.sentences(scene.lens.back.z - scene.lens.front.z))
@@ -313,7 +313,7 @@ def _stage1(
         raise KeyboardInterrupt  # there is nothing to show
     name, stage, _ = PROCEDURES[task.knobs.method]
     like = lens.like
-    if scene.lens.shaped is not None:  # whose light behind the lens is one of numpy: a second of work on the CPU
+    if scene.lens.front.shaped:  # whose light behind the lens is one of numpy: a second of work on the CPU
         stage, lens = two_faces.steps, lens.to(like.dtype, "cpu")
     last = driver.run(stage(task, lens, state), task, lambda state: Saved(driver.record, state), lambda: driver.wish)
     lens = last.lens.to(like.dtype, like.device)
@@ -325,7 +325,7 @@ def _stage1(
     driver.end(name, rrmsd)
     if bounds is not None:
         driver.progress(BOUNDED, 0, 1, "")
-        if front_shaped(lens):  # stage 2 takes a move into account, but makes none itself
+        if lens.shapes("front"):  # stage 2 takes a move into account, but makes none itself
             lens = moved_clear(lens, lens.back.z, task.least, bounds)
         lens = kept(lens, bounds)
         check_thickness(lens, scene)
@@ -405,7 +405,7 @@ def _mended(task: Task, lens: Lens) -> Lens:
     if task.edge is not None:
         lens = cleared(lens, task.edge)
     bounds = held(lens, task.bounds, task.least)
-    if not front_shaped(lens):  # where no light falls stage 2 is free to bend the back
+    if not lens.shapes("front"):  # where no light falls stage 2 is free to bend the back
         lens = moved_clear(lens, lens.back.z, task.least, bounds)
     return lens if bounds is None else kept(lens, bounds)
 

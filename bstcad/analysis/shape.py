@@ -39,7 +39,7 @@ def describe(lens: Lens, grid: int = GRID) -> dict[str, float | None]:
     front, back = _sags(lens, x, y)
     thickness, (front_vertex, back_vertex) = back - front, _sags(lens, *torch.zeros(2, 1, dtype=torch.float64))
     edge, flat = thickness[: 4 * grid], (x.numpy(), y.numpy())
-    of_front = _of_face(lens.front, survey_front(lens), (*flat, front)) if lens.shapes_front else {}
+    of_front = _of_face(lens.front, survey_front(lens), (*flat, front)) if lens.shapes("front") else {}
     return {
         "centre_thickness": float((back_vertex - front_vertex)[0]),
         "edge_thickness_min": float(edge.min()),

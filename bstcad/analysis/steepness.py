@@ -44,7 +44,7 @@ def needed(
     """
     i, j = (np.unique(np.linspace(0, n - 1, min(n, MOST)).round().astype(int)) for n in (len(x), len(y)))
     x, y, places = x[i], y[j], places[np.ix_(i, j)]
-    number, lens = lens.number_of_back, lens.plain()
+    number, lens = lens.number_of("back"), lens.plain()
     p, q = (torch.from_numpy(np.ascontiguousarray(places[..., k], dtype=float)) for k in (0, 1))
     back = lens.interfaces[number]
     if at_back:

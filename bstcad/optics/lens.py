@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -16,6 +16,8 @@ from bstcad.optics.outlines import EVERYWHERE, Outline
 from bstcad.optics.rays import Status
 from bstcad.optics.sides import Sides
 from bstcad.optics.surfaces import Surface, sag
+
+Face = Literal["front", "back"]
 
 
 class Dimming(Protocol):
@@ -43,7 +45,7 @@ class Lens:
     clear: tuple[Outline, Outline] | None = None  # of front and back, outside which light is lost; None: the outline
     before: tuple[Interface, ...] = ()  # that light crosses before the solid, such as a window
     behind: tuple[Interface, ...] = ()  # and behind it, such as a fold mirror
-    shaped: tuple[int, ...] | None = None  # the interfaces that tailoring shapes; None: the back alone
+    shaped: tuple[int, ...] | None = None  # numbers of the interfaces that tailoring shapes; None: the back alone
 
     @cached_property
     def interfaces(self) -> tuple[Interface, ...]:
@@ -77,15 +79,27 @@ class Lens:
         """The way along z of the light that meets the lens: a mirror sends it back along +z."""
         return -1 if self.interfaces[0].law.reverses else 1
 
-    @property
-    def number_of_back(self) -> int:
-        """Which of the interfaces is the back of the solid."""
-        return len(self.before) + (0 if self.reflects else 1)
+    def number_of(self, face: Face) -> int:
+        """Return which of the interfaces a face of the solid is; ValueError for the rear of a mirror, which is none."""
+        return len(self.before) + list(self.optical_faces).index(face)
 
     @property
     def freeform(self) -> tuple[int, ...]:
-        """Which of the interfaces are nets that tailoring shapes, in the order of the light."""
-        return (self.number_of_back,) if self.shaped is None else self.shaped
+        """The numbers of the interfaces that are nets which tailoring shapes, in the order of the light."""
+        return (self.number_of("back"),) if self.shaped is None else self.shaped
+
+    def shapes(self, face: Face) -> bool:
+        """Does tailoring shape this face of the solid?"""
+        return face in self.optical_faces and self.number_of(face) in self.freeform
+
+    @property
+    def shapes_both(self) -> bool:
+        """Does tailoring shape front and back of the solid?"""
+        return self.shapes("front") and self.shapes("back")
+
+    def shaping(self, *faces: Face) -> Lens:
+        """Return the same lens, of which tailoring shapes these faces of the solid, in the order of the light."""
+        return replace(self, shaped=tuple(self.number_of(face) for face in faces))
 
     @property
     def nets(self) -> tuple[BSplineSurface, ...]:
@@ -94,14 +108,9 @@ class Lens:
         return tuple(interfaces[k].surface for k in self.freeform)
 
     @property
-    def shapes_front(self) -> bool:
-        """Does tailoring shape the front of the solid?"""
-        return not self.reflects and len(self.before) in (self.shaped or ())
-
-    @property
     def front_vertex(self) -> float:
         """z (mm) where the front crosses the axis; the heights of a net that is tailored are counted from elsewhere."""
-        return float(sag(self.front, 0.0, 0.0)) if self.shapes_front else float(self.front.z)
+        return float(sag(self.front, 0.0, 0.0)) if self.shapes("front") else float(self.front.z)
 
     @property
     def last_freeform(self) -> Interface:
@@ -136,7 +145,7 @@ class Lens:
         return self.with_nets(replace(net, heights=h) for net, h in zip(self.nets, heights, strict=True))
 
     def _with_surface(self, k: int, surface: Surface) -> Lens:
-        first, back = len(self.before), self.number_of_back
+        first, back = len(self.before), self.number_of("back")
         if first <= k <= back:
             return self.with_back(surface) if k == back else self.with_front(surface)
         name, at = ("before", k) if k < first else ("behind", k - back - 1)

@@ -146,7 +146,7 @@ def measure(
         return Light(np.zeros(screen.shape), math.nan, math.inf, rays=rays.count, flux=rays.flux)
     (value, error), (tent, _) = _value(rays, wanted), apart(rays.tents, wanted)
     shown, off = _shown(rays.boxes, wanted)
-    plain = lens.shapes_front  # no kernel traces two nets as a whole, and both are to have a witness
+    plain = lens.shapes("front")  # no kernel traces two nets as a whole, and both are to have a witness
     lenses = [(c.source, c.through(lens)) for c in channels]
     simple = draw is None and all(
         seen.losses is None and (plain or whole_kernel("trace.simulate", source, seen, screen.plane))
@@ -586,10 +586,10 @@ def _through(channel: Channel, lens: Lens, screen: Screen, x: Tensor, y: Tensor)
     """The light of one channel through the places between the points (x, y) (mm) of the back face."""
     seen = channel.through(lens)
     p, q, coming = rays_to(channel.source, seen, x, y)
-    behind = replace(seen.unbounded(), losses=None).interfaces[seen.number_of_back :]
+    behind = replace(seen.unbounded(), losses=None).interfaces[seen.number_of("back") :]
     landed = through(coming, behind, screen.plane)
     flux = channel.weight * channel.source.irradiance(middle(p), middle(q), seen.entrance.z) * area_of(p, q)
-    if seen.number_of_back > 0:  # a mirror's back is the first face that light meets
+    if not seen.reflects:  # light meets the back alone of a mirror
         flux = torch.where(seen.apertures[0].contains(middle(p), middle(q)), flux, torch.zeros_like(flux))
     flux = arriving(flux, landed).double()
     at = torch.stack([middle(c) for c in landed.position])

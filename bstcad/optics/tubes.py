@@ -145,7 +145,7 @@ def _tubes(source: Source, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes
     light = replace(light, flux=torch.ones_like(light.flux))
     inside, ways = source.irradiance(x, y, z) > 0, [light]  # ways: before each interface
     interfaces, edges = lens.unbounded().interfaces, lens.grown(1 + INWARDS).interfaces  # grown: room for rounding
-    first, back = lens.freeform[0], lens.number_of_back
+    first, back = lens.freeform[0], lens.number_of("back")
     for k in range(max(first, back)):
         ways.append(cross(ways[k], interfaces[k]).rays)
         if k < back:
@@ -278,7 +278,7 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor, number: int | None
     one.
     """
     x, y = (p.to(lens.like.device) for p in (x, y))
-    number = lens.number_of_back if number is None else number
+    number = lens.number_of("back") if number is None else number
     face = lens.interfaces[number].surface
     z = face.relative_sag_and_slope(x.to(lens.like), y.to(lens.like))[0].double()
     extent = float(torch.maximum(x.max() - x.min(), y.max() - y.min()))

@@ -130,7 +130,7 @@ def draw_lens(source: Source, lens: Lens, screens: Sequence[Screen], view: View)
     """The pictures of the lens but the 3-D one, with its rays to the screens; the front's surface if it is tailored."""
     farthest = max(screens, key=lambda screen: screen.plane.throw(0.0))
     of_front = {}
-    if lens.shapes_front:
+    if lens.shapes("front"):
         of_front["surface_front"] = png(surface_maps(lens, survey_front(lens).slope.largest, face="front"))
     return {
         "surface": png(surface_maps(lens, survey(lens).slope.largest)),

@@ -241,7 +241,7 @@ def with_face(lens: Lens, face: Surface, other: Surface) -> Lens:
 
 def moved_by(lens: Lens, face: Surface, patches: Patches, throw: Throw) -> Moved | None:
     """How far the light of a lens moves if these patches stand for one of its faces; None: it comes to no target."""
-    plain = replace(lens, shaped=None, losses=None)
+    plain = replace(lens, losses=None).shaping("back")
     return moved(plain, with_face(plain, face, patches), throw)
 
 

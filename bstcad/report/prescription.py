@@ -75,7 +75,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "back": _face("bspline", vertex(lens), {}),
         "reflects": lens.reflects,  # is it a mirror, whose back is the face that light meets?
         "net": _net(lens.back),
-        **({"front_net": _net(front), "front_asked": scene.lens.front.z} if lens.shapes_front else {}),
+        **({"front_net": _net(front), "front_asked": scene.lens.front.z} if lens.shapes("front") else {}),
         "back_asked": scene.lens.back.z,  # z at which the scene has the back's vertex
         "centre_thickness": shape["centre_thickness"],
         "edge_thickness": (shape["edge_thickness_min"], shape["edge_thickness_max"]),

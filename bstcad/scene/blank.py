@@ -15,6 +15,7 @@ import torch
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
 from bstcad.optics.key import Key
+from bstcad.optics.lens import Face
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.sides import Sides, both, coarser, in_proportion, plain
@@ -523,11 +524,10 @@ class LensBlank(Record):
         return self.front.surface.sags(self.outline)
 
     @property
-    def shaped(self) -> tuple[int, ...] | None:
-        """The faces that tailoring shapes, as Lens.shaped numbers them: 0 the front, 1 the back; None: the back."""
-        if not self.front.shaped:
-            return None
-        return (0, 1) if self.back.optimise else (0,)
+    def shaped(self) -> tuple[Face, ...]:
+        """The faces that tailoring shapes, in the order of the light."""
+        front: tuple[Face, ...] = ("front",) if self.front.shaped else ()
+        return (*front, "back") if self.back.optimise else front
 
     def front_net(self, net: Sides) -> Sides | None:
         """Control points of a freeform front beside a back with those of `net`; None: the front has few numbers.

@@ -270,9 +270,9 @@ class Scene(Record):
         back = BSplineSurface(self.lens.back.z, heights, (-half_x, half_x), (-half_y, half_y))
         lens = Lens(
             self.lens.flat_front(net, as_wide_as).to(heights.dtype, device), back, self.lens.outline, self.index,
-            reflects=self.lens.back.reflect, shaped=self.lens.shaped,
+            reflects=self.lens.back.reflect,
         )  # fmt: skip
-        return self.as_mounted(lens)
+        return self.as_mounted(lens.shaping(*self.lens.shaped))
 
     def as_mounted(self, lens: Lens) -> Lens:
         """A lens of this scene, with the clear apertures that the mount leaves of its faces."""
@@ -538,7 +538,7 @@ def _of_goals(scene: Scene) -> Iterator[str]:
         alike = target.model_copy(update={"z": 0.0, "weight": 1.0})
         if alike not in different or not (isinstance(wave, PlaneWave) and wave.normal == (0.0, 0.0, 1.0)):
             different.append(alike)
-    pictures, shaped = len(different), lens.shaped or (1,)
+    pictures, shaped = len(different), lens.shaped
     goals = pictures + (wave is not None)
     if goals < len(shaped):
         yield (
@@ -550,7 +550,9 @@ def _of_goals(scene: Scene) -> Iterator[str]:
         if len(shaped) == 1:
             faces = "one tailored face, which meets"
             front = f'lens.front = {{ kind = "bspline", z = {lens.front.z:g}, optimise = true }}'
-            also = f"have the front tailored too, {front}" if shaped == (1,) else "remove lens.back.optimise = false"
+            also = "remove lens.back.optimise = false"
+            if lens.back.optimise:
+                also = f"have the front tailored too, {front}"
             remedy = "a mirror has no second face, so state what matters by weight" if lens.back.reflect else also
         key = "target" if pictures > 1 else "wavefront"
         yield f"{key}: {goals} goals for {faces} them only as far as least squares by their weights go; {remedy}"

@@ -246,7 +246,7 @@ def diagnosis(
     bounds = {
         "asked": {key: getattr(scene.lens, key) for key in scene.lens.bounded_by},
         "at": {key: at.share for key, at in met.items()}, "tightest": {key: at.tightest for key, at in met.items()},
-        **({"front" if scene.lens.shaped == (0,) else "both": True} if lens.shapes_front else {}),  # that they are on
+        **({"both" if lens.shapes("back") else "front": True} if lens.shapes("front") else {}),  # that they are on
     }  # fmt: skip
     # Where light had to move far, a draft's net is not all that limits it: named 0.70, found 0.85 times the RRMSD.
     far = any(" pixels, " in stage.name for stage in making.stages)

@@ -52,7 +52,7 @@ def clearance(lens: Lens, bounds: Bounds) -> tuple[float, dict[int, Tensor], flo
     The lens is of two nets in one precision; sums go in fixed parts, so no bit depends on the number of threads.
     """
     length, square, worst = unit(lens, bounds), 0.0, -MARGIN
-    faces = {lens.number_of_back - 1: (lens.front, -1.0), lens.number_of_back: (lens.back, 1.0)}  # and ∂t / ∂z of each
+    faces = {lens.number_of("front"): (lens.front, -1.0), lens.number_of("back"): (lens.back, 1.0)}  # and their ∂t / ∂z
     gradients: dict[int, Tensor] = {}
     for x, y, share, least in _places(lens, bounds, MARGIN * length):
         relative, thicker = _beyond(lens, x, y, replace(bounds, thinnest=least))

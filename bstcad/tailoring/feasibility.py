@@ -131,7 +131,7 @@ def _of(task: Task, lens: Lens) -> tuple[Demand, LightBehind]:
 @torch.no_grad()
 def _turn(task: Task, lens: Lens, light: LightBehind) -> float:
     """The largest angle (degrees) between the ray that comes to the front and its way to the back."""
-    front, source = replace(lens, shaped=(0,)), task.heaviest.source
+    front, source = lens.shaping("front"), task.heaviest.source
     back = light.meeting(lens.back)
     wanted = front_map(source, front, lit_window(source, front), Aims(light.picture, back), n=CELLS, places=None)
     lit = corners_of(light.picture)

@@ -31,7 +31,7 @@ from bstcad.optics.bspline import (
     slope_bounds,
 )
 from bstcad.optics.kernels.reductions import total
-from bstcad.optics.lens import Lens
+from bstcad.optics.lens import Face, Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.sampling import rim
 from bstcad.scene.blank import Bounds
@@ -98,17 +98,12 @@ def weight(number: int, rounds: int) -> float:
     return ALONE if rounds == 1 else WEIGHTS[min(rounds - 1 - number, len(WEIGHTS) - 1)]
 
 
-def front_shaped(lens: Lens) -> bool:
-    """Is the front of the solid a net that tailoring shapes, alone or together with the back?"""
-    return not lens.reflects and lens.number_of_back - 1 in lens.freeform
-
-
 def held(lens: Lens, asked: Bounds | None, least: float) -> Bounds | None:
     """The bounds that the tailored faces of a lens keep to: those asked for; None: there are none.
 
     Where the front is tailored, `least` mm of glass is a bound even if none is asked for.
     """
-    return Bounds(thinnest=least) if asked is None and front_shaped(lens) else asked
+    return Bounds(thinnest=least) if asked is None and lens.shapes("front") else asked
 
 
 @dataclass(frozen=True)
@@ -151,9 +146,9 @@ def _parts(lens: Lens, nets: dict[int, BSplineSurface], bounds: Bounds) -> Itera
         for k, from_above in _from_above(lens, bounds).items():
             squared, gradient, worst = _of_shape(nets[k], lens.outline, from_above)
             yield squared, {k: gradient}, worst
-    if front_shaped(lens):
+    if lens.shapes("front"):
         yield clearance(lens.to(torch.float64), bounds)
-    elif bounds.thickest is not None and (back := lens.number_of_back) in nets:
+    elif bounds.thickest is not None and (back := lens.number_of("back")) in nets:
         squared, gradient, worst = _of_thickness(lens.with_back(nets[back]), bounds)
         yield squared, {back: gradient}, worst
 
@@ -161,8 +156,8 @@ def _parts(lens: Lens, nets: dict[int, BSplineSurface], bounds: Bounds) -> Itera
 def _from_above(lens: Lens, bounds: Bounds) -> dict[int, Bounds]:
     """The bounds on z(x, y) as seen from +z of each tailored face of the solid, by its number."""
     front = replace(bounds, concave=bounds.convex, convex=bounds.concave)
-    faces = {lens.number_of_back: bounds} | ({} if lens.reflects else {lens.number_of_back - 1: front})
-    return {k: own for k, own in faces.items() if k in lens.freeform}
+    faces: dict[Face, Bounds] = {"back": bounds, "front": front}
+    return {lens.number_of(face): own for face, own in faces.items() if lens.shapes(face)}
 
 
 def _of_shape(net: BSplineSurface, outline: Outline, bounds: Bounds) -> tuple[float, Tensor, float]:
@@ -222,7 +217,7 @@ def kept(lens: Lens, bounds: Bounds) -> Lens:
     Where the front is tailored, the back is moved only if bending both faces does not do: that changes the picture.
     SceneError if even a flat back exceeds a bound.
     """
-    for place in (_as_it_is, _placed) if front_shaped(lens) else (_placed,):
+    for place in (_as_it_is, _placed) if lens.shapes("front") else (_placed,):
         lens = place(lens, bounds)
         if not _exceeds(lens, bounds):
             return lens

@@ -317,7 +317,7 @@ def local_weight(source: Source, lens: Lens, target: np.ndarray, screen: Screen,
 
     1 where the light does not land on the screen.  number: of the interface, which is a net; None: the back.
     """
-    number = lens.number_of_back if number is None else number
+    number = lens.number_of("back") if number is None else number
     net, onwards = lens.interfaces[number].surface, lens.unbounded().interfaces[number:]
     ends = zip((net.x, net.y), net.shape, strict=True)
     places = (torch.linspace(low, high, count, dtype=torch.float64) for (low, high), count in ends)

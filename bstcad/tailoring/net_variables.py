@@ -34,7 +34,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import behind
+from bstcad.optics.trace import across, behind
 from bstcad.tailoring.merit import CoarseVariable, SobolevVariable
 from bstcad.transport.mapping import places_in
 
@@ -89,9 +89,9 @@ def along_light(source: Source, lens: Lens, goals: Sequence[Goal]) -> tuple[csr_
     front, back = lens.nets
     q = torch.stack(torch.meshgrid(*_control_points(front), indexing="ij"))
     coming = source.rays(*q.to(lens.like.device), lens.entrance.z, 1.0)
-    before, last = lens.unbounded().interfaces
-    within = behind(coming, before)
-    out = behind(within, last)
+    interfaces, number = lens.unbounded().interfaces, lens.number_of("front")
+    within = behind(across(coming, interfaces[:number]), interfaces[number])
+    out = behind(within, interfaces[number + 1])
     glass = lens.index * within.direction[2]
     factor = _array((glass - coming.direction[2]) / (glass - out.direction[2]))
     lit = _array((source.irradiance(*coming.position[:2], lens.entrance.z) > 0) & out.alive)

@@ -137,7 +137,7 @@ class Task:
     def sides(self, lens: Lens, sides: Sides) -> tuple[Sides, ...]:
         """Control points of each of the lens's nets where a back has so many."""
         front = self.front_sides(sides)
-        return tuple(sides if k == lens.number_of_back or front is None else front for k in lens.freeform)
+        return tuple(sides if k == lens.number_of("back") or front is None else front for k in lens.freeform)
 
     @property
     def whole(self) -> Task:

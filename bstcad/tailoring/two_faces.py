@@ -98,10 +98,10 @@ def steps(task: Task, lens: Lens, state: FrontRound | None = None) -> Iterator[S
     With one goal alone and both faces free the front stays as it is, and the back does all the work.
     """
     lens = task.heaviest.through(lens)
-    if lens.freeform == (0, 1) and not task.several:
-        alone = replace(lens.with_nets(_final(task, lens).nets), shaped=None)
+    if lens.shapes_both and not task.several:
+        alone = lens.with_nets(_final(task, lens).nets).shaping("back")
         for step in stage1.steps(task, alone, state):
-            yield replace(step, make=lambda step=step: replace(step.make(), shaped=(0, 1)))
+            yield replace(step, make=lambda step=step: step.make().shaping("front", "back"))
         return
     for last in follow(task, lens, state):
         yield last
@@ -146,7 +146,7 @@ def _final(task: Task, lens: Lens) -> Lens:
 
 def behind_lens(task: Task, lens: Lens) -> LightBehind | None:
     """The light that the lens has to send out; None: its back is given, and one picture alone is asked for."""
-    if lens.freeform == (0,):
+    if not lens.shapes("back"):
         return None
     light = light_behind.of_task(task)
     near = min(task.goals, key=lambda goal: goal.receiver.plane.throw(0.0))
@@ -159,7 +159,7 @@ def _round(
 ) -> tuple[Lens, SlopeMap, Grid]:  # fmt: skip
     """One round: the lens, the map that its front follows, and b(t)."""
     source, first = task.heaviest.source, task.goals[0]
-    front = replace(lens, shaped=(0,))
+    front = lens.shaping("front")
     window = lit_window(source, front)
     if light is None:
         picture, back = first.picture, _by_way_of_back(source, front, window, first.receiver, places=places)
@@ -243,7 +243,7 @@ def front_map(
 def _slopes_at(rays: Rays, aims: Tensor, lens: Lens) -> tuple[Tensor, Tensor]:
     """The slopes that send rays at the front to aims (3, …) mm in space."""
     way = aims - _in_space(rays)
-    return slopes_towards(rays, way / torch.sqrt((way * way).sum(0)), lens.interfaces[0].law)
+    return slopes_towards(rays, way / torch.sqrt((way * way).sum(0)), lens.last_freeform.law)
 
 
 def _in_space(rays: Rays) -> Tensor:
@@ -282,7 +282,8 @@ def _by_way_of_back(
     By Newton's method with difference quotients.  places: None in the first round: q on the straight way from the axis.
     """
     t = torch.stack([torch.from_numpy(p) for p in pixel_corners(screen)])
-    back, plane = replace(lens.interfaces[1], outline=lens.unbounded().outline, losses=()), screen.plane
+    back = replace(lens.interfaces[lens.number_of("back")], outline=lens.unbounded().outline, losses=())
+    plane = screen.plane
     grid = face_grid(source, lens, window, SAMPLES)
     q = rays_at(grid, places or tuple(np.zeros_like(p.numpy()) for p in t))
     q = replace(q, flux=torch.ones_like(t[0]), status=torch.zeros(t[0].shape, dtype=torch.uint8), taken={})

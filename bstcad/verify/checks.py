@@ -332,7 +332,7 @@ def _ripples_in_light(lens: Lens, nominal: Nominal) -> dict[str, float]:
     """RRMSD that the ripple of each tailored face makes by itself, by keys of Proof.shape."""
     light = nominal.heaviest
     channel = replace(light, source=light.source.central, weight=1.0)
-    faces, screen = {"": "back"} | ({"front_": "front"} if lens.shapes_front else {}), nominal.goals[0].receiver
+    faces, screen = {"": "back"} | ({"front_": "front"} if lens.shapes("front") else {}), nominal.goals[0].receiver
     return {f"{key}ripple_rrmsd": rrmsd_of_ripple(channel, lens, screen, face) for key, face in faces.items()}
 
 
@@ -349,7 +349,7 @@ def of_bounds(
     checks, found = [], {}
     radius, degrees, kind = asked.tool_radius, asked.max_slope, "convex" if asked.mould else "concave"
     if radius is not None or degrees is not None:
-        surveys = [(survey, "")] * (lens.shaped != (0,)) + [(survey_front, " of the front")] * lens.shapes_front
+        surveys = [(survey, "")] * lens.shapes("back") + [(survey_front, " of the front")] * lens.shapes("front")
         for surveyed, of in surveys:
             bending = surveyed(lens, **{kind: radius}, slope=degrees)
             if radius is not None:

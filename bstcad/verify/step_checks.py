@@ -86,7 +86,7 @@ def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, .
         *_sound(reread.shape),
         *_edges(reread, nominal),
         *_form(reread, nominal.back, form, points),
-        *(_form(reread, nominal.front, form, points, of="front") if nominal.shapes_front else ()),
+        *(_form(reread, nominal.front, form, points, of="front") if nominal.shapes("front") else ()),
         *_front(reread.front, nominal, form),
     )
 
@@ -272,7 +272,7 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
     down = np.array([0.0, 0.0, mount.origin(lens.front_vertex)])
     net = lens.back.control_points() - down
     of_front = ()
-    if lens.shapes_front:
+    if lens.shapes("front"):
         name, held = f"{PART}: control points of the front", text_checks.net_of_front(text)
         of_front = (net_check(name, held, lens.front.control_points() - down, id="control-points"),)
     properties = _properties(path, _stamp(path)) if text.properties.of_shape else None

@@ -33,7 +33,7 @@ def of_lens(text: StepText, lens: Lens) -> list[Check]:
     checks = structure(text, lens.back.shape)
     name, back = f"{TEXT}: control points", lens.back.control_points()
     checks.append(net_check(name, text.surface.control_points, back, id="control-points"))
-    if lens.front.is_net and (text.front is not None or lens.shapes_front):
+    if lens.front.is_net and (text.front is not None or lens.shapes("front")):
         name, front = f"{TEXT}: control points of the front", lens.front.control_points()
         checks.append(net_check(name, net_of_front(text), front, id="control-points"))
     return checks

@@ -70,7 +70,7 @@ def test_a_given_net_may_be_where_tailoring_starts(disk, tmp_path):
     scene = disk.changed({"lens.front": a_net(disk)})
     assert not scene.lens.front.shaped and scene.lens.front.fixed and "optimise" not in scene.toml()
     tailored = scene.changed({"lens.front.optimise": True})
-    assert tailored.lens.front.shaped and tailored.lens.shaped == (0, 1)
+    assert tailored.lens.front.shaped and tailored.lens.shaped == ("front", "back")
     for name, data in folders.scene_files(tailored).items():
         (tmp_path / name).write_bytes(data)
     assert load(tmp_path / "scene.toml") == tailored
@@ -143,7 +143,7 @@ def test_the_front_may_be_tailored_alone(disk):
     lens = with_front(disk, {"lens.back.optimise": False}).flat_lens(33)
     assert lens.freeform == (0,) and lens.nets == (lens.front,) and lens.last_freeform.surface is lens.front
     assert lens.back.is_net and not lens.back.heights.any()
-    assert disk.flat_lens(33).shaped is None and disk.flat_lens(33).front == disk.lens.front.surface
+    assert disk.flat_lens(33).freeform == (1,) and disk.flat_lens(33).front == disk.lens.front.surface
 
 
 def test_a_back_whose_net_is_chosen_later_has_a_front_beside_it(disk):

@@ -21,7 +21,7 @@ from bstcad.optics.surfaces import Sphere
 from bstcad.scene.blank import Bounds, net_extent
 from bstcad.tailoring import machinability
 from bstcad.tailoring.clearance import MARGIN, Cells, clearance, unit
-from bstcad.tailoring.machinability import excess, front_shaped, held, kept
+from bstcad.tailoring.machinability import excess, held, kept
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.stage2 import Problem
 
@@ -117,10 +117,10 @@ def test_a_tool_sees_the_valleys_of_a_sphere_from_its_own_side(curvature):
 def test_only_a_tailored_front_needs_a_bound_where_none_is_asked():
     asked = Bounds(slope=0.5, thinnest=0.3)
     both, front, back = (rough(shaped=shaped) for shaped in ((0, 1), (0,), None))
-    assert [front_shaped(lens) for lens in (both, front, back)] == [True, True, False]
+    assert [lens.shapes("front") for lens in (both, front, back)] == [True, True, False]
     assert held(both, None, 0.5) == held(front, None, 0.5) == Bounds(thinnest=0.5)
     assert held(back, None, 0.5) is None and held(back, asked, 0.5) == held(both, asked, 0.5) == asked
-    assert not front_shaped(replace(both, reflects=True, shaped=None))
+    assert not replace(both, reflects=True, shaped=None).shapes("front")
 
 
 def crossing(outline, z=3.0, sides=(33, 21), shaped=(0, 1)):

@@ -1,4 +1,4 @@
-"""Stage 2 on any number of nets: the front alone, the front and the back together."""
+"""Stage 2 on any number of nets: of a lens front, back or both, of two mirrors, of a mirror and its cover glass."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from bstcad.analysis.shape import thickness_range
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.goal import Goal
+from bstcad.optics.interfaces import Interface, Reflect, Refract
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import images
-from bstcad.optics.outlines import Rectangle
+from bstcad.optics.outlines import EVERYWHERE, Rectangle
+from bstcad.optics.rays import Status
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane
 from bstcad.scene.quality import Tailoring
@@ -47,8 +49,27 @@ FRONTS = {  # a lens, and the light that meets it
         Lens(net(0.0), net(8.0), SQUARE, N, shaped=(0, 1)), Point((0.5, 0.0, -600.0)),
     ),
 }  # fmt: skip
-
-
+ABOVE = Collimated(Rectangle(1.9 * HALF, 1.9 * HALF), z=250.0)  # a beam that comes down
+BODIES = {  # of mirrors: light comes down to the back, whose front is dark
+    "two mirrors": (  # after the second light goes down, past the first, to z = -60
+        Lens(
+            Plane(-5.0), net(0.0), SQUARE, 1.0, reflects=True,
+            behind=(Interface(net(60.0), SQUARE, Reflect(), Status.VIGNETTED),), shaped=(0, 1),
+        ),
+        replace(SCREEN, z=-60.0),
+    ),
+    "a mirror behind a glass with a net": (  # which light meets once, as where it leaves the mirror at another angle
+        Lens(
+            Plane(-5.0), net(0.0), SQUARE, 1.0, reflects=True,
+            before=(
+                Interface(net(8.0), SQUARE, Refract(1.0, N), Status.MISSED_FRONT),
+                Interface(Plane(4.0), EVERYWHERE, Refract(N, 1.0), Status.VIGNETTED),
+            ),
+            shaped=(0, 2),
+        ),
+        SCREEN,
+    ),
+}  # fmt: skip
 MOVED = {Collimated: {"tilt": (1.0, 0.0)}, Point: {"position": (1.5, 0.0, -600.0)}}  # another point of the source
 
 
@@ -105,6 +126,18 @@ def test_stage_2_shapes_a_front_and_goes_on_from_where_it_was_left():
     state = [step.state for step in on_the_way if step.state is not None][5]
     *_, again = steps(task, lens, state)
     assert all(torch.equal(a.heights, b.heights) for a, b in zip(again.lens.nets, last.lens.nets, strict=True))
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_stage_2_alone_shapes_two_nets_of_a_body_with_mirrors(name):
+    lens, screen = BODIES[name]
+    knobs = Tailoring(rays=96, levels=(M,), stage2_iterations=2 * EVALUATIONS, overshoot=0.03)
+    task = Task((Channel(ABOVE, 1.0),), (Goal("target", screen, picture()),), knobs)
+    begun, (*_, last) = task.rrmsd(lens), steps(task, lens)
+    assert task.rrmsd(last.lens) < begun / 2
+    one, two = (found.heights for found in last.lens.nets)
+    for alone in ((0 * one, two), (one, 0 * two)):  # both nets work: neither alone makes this picture
+        assert task.rrmsd(lens.with_heights(alone)) > 1.2 * task.rrmsd(last.lens)
 
 
 def test_stage_2_keeps_the_least_thickness_and_finds_the_picture():
