@@ -123,7 +123,7 @@ def made_small(scene: Scene, pains: Pains) -> Scene:
         "tailoring.rays": round(share * pains.tubes),
         "tailoring.transport_grid": CELLS,
         "tailoring.stage2_iterations": evaluations,
-        "tailoring.rounds": max(pains.rounds, OF_A_POINT if scene.source.kind == "point" else 0),
+        "tailoring.rounds": max(pains.rounds, 0 if scene.source.parallel else OF_A_POINT),
     }
     for key, target in zip(scene.target_keys, scene.targets, strict=True):
         factor = max(max(target.columns_rows) / (share * pains.pixels), 1.0)

@@ -33,7 +33,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Fresnel, Losses
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import axes
-from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.sources import Collimated, Point, Source
 from bstcad.optics.trace import window
 
 LLVM = 16  # the first version by which its kernels compile; with 15 the process ends
@@ -54,9 +54,11 @@ Entry = dict[str, Any]  # of Mitsuba's scene
 
 def cannot(lens: Lens, channels: Sequence[Channel]) -> str:
     """Why it cannot trace this light, in a sentence; "": it can."""
-    if channels[0].source.kind == "collimated" and points(channels) > 1:
+    if (first := channels[0].source).kind not in LAMPS:
+        return f"Mitsuba has no lamp for the light of {type(first).__name__}"
+    if first.parallel and points(channels) > 1:
         return "parallel light of many directions starts from a plate for each, which would stand in each other's light"
-    if lens.reflects and channels[0].source.kind == "collimated":
+    if lens.reflects and first.parallel:
         return "a parallel beam that comes down to a mirror starts from a plate, which would stand in the light"
     return ""
 
@@ -203,18 +205,25 @@ def _look_at(origin: Iterable[float], target: Iterable[float], up: Iterable[floa
 
 def lamps(channels: Sequence[Channel], lens: Lens, folder: Path) -> dict[str, Entry]:
     """The sources of channels as entries of Mitsuba's scene; each sends the flux of its channel's weight."""
-    first, slide = channels[0].source, {}
-    if first.kind == "collimated":
-        sources = [_plate(c.source, c.weight, lens, folder / f"lamp{k}.ply") for k, c in enumerate(channels)]
-    elif first.profile == "uniform" and first.is_cone:
-        sources = [_spot(c.source, c.weight, lens) for c in channels]
-    else:
-        half = ROOM * max(_half(c.source, lens) for c in channels)
-        sources, slide = (
-            [_projector(c.source, c.weight, lens, half) for c in channels],
-            {"slide": _slide(first, lens, half)},
-        )
-    return slide | {f"lamp{k}": lamp for k, lamp in enumerate(sources)}
+    return LAMPS[channels[0].source.kind](channels, lens, folder)
+
+
+def _plates(channels: Sequence[Channel], lens: Lens, folder: Path) -> dict[str, Entry]:
+    """A plate for each parallel beam."""
+    return {f"lamp{k}": _plate(c.source, c.weight, lens, folder / f"lamp{k}.ply") for k, c in enumerate(channels)}
+
+
+def _spots(channels: Sequence[Channel], lens: Lens, folder: Path) -> dict[str, Entry]:
+    """A spot for each point of one radiant intensity in a cone, else a projector."""
+    first = channels[0].source
+    if first.profile == "uniform" and first.is_cone:
+        return {f"lamp{k}": _spot(c.source, c.weight, lens) for k, c in enumerate(channels)}
+    half = ROOM * max(_half(c.source, lens) for c in channels)
+    slide = {"slide": _slide(first, lens, half)}
+    return slide | {f"lamp{k}": _projector(c.source, c.weight, lens, half) for k, c in enumerate(channels)}
+
+
+LAMPS = {"collimated": _plates, "point": _spots}  # by the kind of source
 
 
 def _plate(source: Collimated, weight: float, lens: Lens, path: Path) -> Entry:
@@ -263,7 +272,7 @@ def _slide(source: Point, lens: Lens, half: float) -> Entry:
     return _texture(_irradiance(source, x - sense * across, y - across, z + sense))
 
 
-def _irradiance(source: Collimated | Point, x: np.ndarray, y: np.ndarray, z: float) -> np.ndarray:
+def _irradiance(source: Source, x: np.ndarray, y: np.ndarray, z: float) -> np.ndarray:
     """(rows, columns) of a source on a plane z (mm)."""
     return source.irradiance(*map(torch.from_numpy, np.meshgrid(x, y)), z).numpy()
 

@@ -11,8 +11,9 @@ above describe simple sources; those of an extended source give the light of its
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -29,6 +30,7 @@ from bstcad.optics.wavefront import beyond
 FAR = 4.0  # widths of its aperture by which a beam without a plane z of its own gets that plane before the lens
 SIDES = "diameter", "width", "height"  # sizes of a disc or rectangle that shines
 HALF_SPACE = math.pi / 2  # rad; the edge of light that fills all directions on the lens's side
+MAX_LEAN = 89.0  # degrees from the lens's axis, of parallel light
 WIDEST = math.radians(89.0)  # of a cone whose edge counts on planes
 Wavelength = float | tuple[tuple[float, float], ...]  # nm; or lines, each (nm, weight), weights of any sum
 ALONG_Z = (0, 0.0, 0.0, 1.0, 0.0)  # the last fields of a Beam that is not tilted
@@ -69,12 +71,26 @@ class Emitter:
     tilt: tuple[float, float] | None = None
     extent: Outline | None = None  # over which simple sources are spread; None: it is one
     profile: str = "own"
-    size_key: str | None = None  # of its size; after real_ that of the real lamp's
+    size_key: str | None = None  # key of its size; after real_ that of the real lamp's
+    kind: str = "own"
+    parallel: bool = False  # is the light of one point of its extent parallel?
+    simple: str = "a source without size"  # what it is without its extent
+    start_key: str = "z"  # key of the place where its light starts
+    widths: Mapping[str, str] = MappingProxyType({})  # key of the width that each profile has
+    unbounded: str | None = None  # profile that needs no width
 
     @property
     def begins(self) -> float | None:
         """The plane z (mm) from which its light starts; None: one before the lens, wherever that is."""
         return None
+
+    def nearest(self, upwards: bool) -> float | None:
+        """z (mm) of the place of its extent that is nearest to a lens above it, or below it; None as in `begins`."""
+        return self.begins
+
+    def complaints(self, z: float, optic: str) -> Iterator[str]:
+        """Faults of its size, as "key: sentence"; z: of the face that its light meets first (mm); optic: of what."""
+        yield from ()
 
     @property
     def central(self) -> Emitter:
@@ -177,12 +193,20 @@ class Collimated(Emitter):
     kind: Annotated[Literal["collimated"], Key("Parallel light.")] = "collimated"
 
     __pydantic_config__ = STRICT
-    size_key = "divergence"
+    size_key, parallel, simple = "divergence", True, "parallel light of one direction"
+    widths = MappingProxyType({"gaussian": "radius_1e2"})
 
     @property
     def begins(self) -> float | None:
         """Its plane."""
         return self.z
+
+    def complaints(self, z: float, optic: str) -> Iterator[str]:
+        """Directions that lean too far from the axis."""
+        lean = math.degrees(math.acos(max(-1.0, min(1.0, self.axes[2][2]))))
+        if not lean + (self.divergence or 0.0) / 2 < MAX_LEAN:
+            key, light = ("divergence", "some of the light runs") if self.divergence else ("tilt", "the light runs")
+            yield f"{key}: {light} {MAX_LEAN:g} degrees off the lens's axis or more; make it smaller"
 
     def starts(self, entrance: float) -> Vector:
         """The middle of its aperture, of a beam without a plane of its own on the plane `entrance` (mm)."""
@@ -392,12 +416,32 @@ class Point(Emitter):
     kind: Annotated[Literal["point"], Key("A point, or with a size a disc or rectangle of points.")] = "point"
 
     __pydantic_config__ = STRICT
-    size_key = "diameter"
+    size_key, simple, start_key = "diameter", "a point", "position"
+    widths = MappingProxyType({"gaussian": "half_angle_1e2", "uniform": "half_angle", "lambertian": "half_angle"})
+    unbounded = "lambertian"  # it lights the half space
 
     @property
     def begins(self) -> float:
         """That of its middle."""
         return self.position[2]
+
+    def nearest(self, upwards: bool) -> float:
+        """z (mm) of the place of the point, disc or rectangle that is nearest to a lens above it, or below it."""
+        reach = 0.0 if self.extent is None else self.extent.reach(*(axis[2] for axis in self.axes[:2]))
+        return self.position[2] + (reach if upwards else -reach)
+
+    def complaints(self, z: float, optic: str) -> Iterator[str]:
+        """A disc or a rectangle that is not described, or that is larger than its distance from the lens."""
+        given = [name for name in ("width", "height") if getattr(self, name) is not None]
+        if given and self.diameter is not None:
+            yield f"diameter: the source also has a {given[0]}; give a diameter, or width and height"
+        for other in {"width", "height"} - set(given) if given else ():
+            yield f"{other}: missing, and a source with a {given[0]} needs it; add it in mm"
+        sizes = {name: getattr(self, name) or 0.0 for name in SIDES}
+        name, distance = max(sizes, key=sizes.get), abs(z - self.position[2])
+        if self.extent is not None and not sizes[name] <= distance:
+            far = f"the {distance:g} mm from the source to the {optic}"
+            yield f"{name}: {sizes[name]:g} mm is more than {far}; make the source smaller or move it away"
 
     def starts(self, entrance: float) -> Vector:
         """Its position."""

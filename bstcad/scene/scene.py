@@ -22,7 +22,6 @@ import tomli_w
 import torch
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_serializer, model_validator
 
-from bstcad.optics import sampling
 from bstcad.optics.channels import Channel, channels_of, drawn_channels, merged
 from bstcad.optics.goal import Goal
 from bstcad.optics.key import Key
@@ -32,8 +31,8 @@ from bstcad.optics.receivers import TiltedPlane
 from bstcad.optics.sides import Sides, both
 from bstcad.optics.sources import Collimated, Point, Source
 from bstcad.optics.wavefront import ALONG, PlaneWave, SphericalWave, Wave, ZernikeWave
-from bstcad.scene import effects, mount, picture, scene_file
-from bstcad.scene.blank import INDICES, LensBlank, as_front, net_extent
+from bstcad.scene import effects, light, mount, picture, scene_file
+from bstcad.scene.blank import LensBlank, as_front, net_extent
 from bstcad.scene.dotted_keys import OUTLINES, override, tables_at
 from bstcad.scene.effects import Effects
 from bstcad.scene.errors import SceneError, about, explain, line_of, toml_positions
@@ -55,16 +54,6 @@ EDGE_ON = math.radians(1.0)  # a plane seen under less than that has no picture
 GRAZED = 8.0  # degrees; a plane seen under less is hardly lit by a lamp (at 10: RRMSD 0.33, at 5: 1.6, at 30: 0.07)
 SINGLE = 2.0**-24  # of a coordinate: the rounding of float32
 FINEST = 4 * SINGLE  # of the largest coordinate: no tolerance of a mesh is finer
-COVERED = 0.9  # of the lens's width: a beam narrower than that leaves a part dark that somebody pays for
-MAX_LEAN = 89.0  # degrees from the lens's axis, of parallel light
-SAMPLES = 200  # a side of the lens, at which light is looked for
-PROFILES = {  # the width that a profile of the irradiance needs, by the kind of source
-    ("collimated", "gaussian"): "radius_1e2",
-    ("point", "gaussian"): "half_angle_1e2",
-    ("point", "uniform"): "half_angle",
-    ("point", "lambertian"): "half_angle",
-}
-UNBOUNDED = ("point", "lambertian")  # the profile that does without: it lights the half space
 
 
 class Accept(Record):
@@ -142,15 +131,15 @@ class Scene(Record):
             yield "title: must be one line of up to 200 characters that can be printed; shorten it"
         yield from self._of_targets(Target.complaints)
         yield from lens.complaints()
-        yield from _of_source(source, lens)
+        yield from light.complaints(source, lens)
         yield from effects.complaints(self.effects, lens)
         try:
             self.channels()
         except ValueError as error:  # data of the material or the metal that an effect lacks
             yield f"effects: {error}"
-        yield from _order(source, lens)
+        yield from light.order(source, lens)
         yield from self._of_targets(lambda target: _behind(target, lens))
-        yield from _unlit(self)
+        yield from light.unlit(source.central, lens, self.rim)
         yield from self._of_targets(lambda target: _tilted(target, lens))
         yield from coplanar(self.targets)
         yield from _of_wavefront(self.wavefront, source, lens, accept=self.accept)
@@ -174,9 +163,9 @@ class Scene(Record):
     def warnings(self) -> tuple[str, ...]:
         """Sentences on settings that are possible but perhaps not meant."""
         doubts = [*self._metres(), *self.lens.doubts(), *_of_goals(self)]
-        if isinstance(self.source, Collimated):
+        if self.source.parallel:
             key = "mount.rim" if self.mount and self.mount.rim else "lens.outline"
-            doubts += _beam(self.source.aperture, self.rim, key)
+            doubts += light.doubts(self.source, self.rim, key)
         else:
             doubts += self._of_targets(lambda target: _grazed(target, self.lens))
         return (*doubts, *self.of_pictures())
@@ -366,107 +355,11 @@ class Scene(Record):
 # ---- complaints of several tables: a sentence with a remedy each -----------------------------------------------------
 
 
-def _of_source(source: Source, lens: LensBlank) -> Iterator[str]:
-    """Complaints about the profile, the spectrum and the size of a source before this lens."""
-    profile = source.kind, source.profile
-    width = PROFILES.get(profile)
-    if width and profile != UNBOUNDED and getattr(source, width) is None:
-        unit = "mm" if width == "radius_1e2" else "degrees"
-        yield f"source.{width}: missing, and a {source.profile} profile needs it; add it in {unit}"
-    for other in PROFILES.values():
-        if other != width and getattr(source, other, None) is not None:
-            yield f"source.{other}: has no meaning for a {source.profile} profile; remove it or change the profile"
-    yield from _spectrum(source, lens)
-    yield from _cone(source) if isinstance(source, Collimated) else _size(source, lens)
-
-
-def _spectrum(source: Source, lens: LensBlank) -> Iterator[str]:
-    """Lines without a weight, of several indices, or of which the material's index is not known or no glass's."""
-    listed = source.wavelength if isinstance(source.wavelength, tuple) else ((source.wavelength, 1.0),)
-    if not listed:
-        yield "source.wavelength: no line is in it; give one wavelength in nm, or lines such as [[587.6, 1.0]]"
-    for nm, weight in listed:
-        if not weight > 0:
-            yield f"source.wavelength: the weight {weight:g} of the line at {nm:g} nm is not above 0; remove the line"
-    if len({nm for nm, _ in listed}) > 1 and lens.index is not None:
-        lines = f"the {len(listed)} lines of source.wavelength"
-        yield f'lens.index: one index does not hold for {lines}; set lens.material instead, such as material = "PMMA"'
-    try:
-        indices = [lens.index_at(nm) for nm, _ in listed]
-    except ValueError as error:
-        yield f"lens.material: {error}"
-        return
-    low, high = INDICES
-    for index in (n for n in indices if lens.material is not None and not low <= n <= high):
-        found = f"the index of {lens.material} is {index:.4g} there, not between {low:g} and {high:g}"
-        yield f"lens.material: {found}; choose a material that lets the source's light through"
-
-
-def _cone(source: Collimated) -> Iterator[str]:
-    """Parallel light whose directions lean too far from the axis."""
-    lean = math.degrees(math.acos(max(-1.0, min(1.0, source.axes[2][2]))))
-    if not lean + (source.divergence or 0.0) / 2 < MAX_LEAN:
-        key, light = ("divergence", "some of the light runs") if source.divergence else ("tilt", "the light runs")
-        yield f"source.{key}: {light} {MAX_LEAN:g} degrees off the lens's axis or more; make it smaller"
-
-
-def _size(source: Point, lens: LensBlank) -> Iterator[str]:
-    """A disc or a rectangle that is not described, or that is larger than its distance from the lens."""
-    given = [name for name in ("width", "height") if getattr(source, name) is not None]
-    if given and source.diameter is not None:
-        yield f"source.diameter: the source also has a {given[0]}; give a diameter, or width and height"
-    for other in {"width", "height"} - set(given) if given else ():
-        yield f"source.{other}: missing, and a source with a {given[0]} needs it; add it in mm"
-    sizes = {name: getattr(source, name) or 0.0 for name in ("diameter", "width", "height")}
-    name = max(sizes, key=sizes.get)
-    distance = abs((lens.back if lens.back.reflect else lens.front).z - source.position[2])
-    if source.extent is not None and not sizes[name] <= distance:
-        far = f"the {distance:g} mm from the source to the {lens.optic}"
-        yield f"source.{name}: {sizes[name]:g} mm is more than {far}; make the source smaller or move it away"
-
-
-def _order(source: Source, lens: LensBlank) -> Iterator[str]:
-    """Light and lens that do not follow each other along z; a mirror's light comes from above."""
-    front, back = lens.front.z + lens.front_sags[0], lens.back.z
-    key, start = ("source.position", _nearest(source, lens)) if isinstance(source, Point) else ("source.z", source.z)
-    if not lens.back.reflect:
-        if start is not None and not start < front:
-            yield f"{key}: the light starts at z = {start:g}, not before the front at z = {front:g}; move one of them"
-    elif start is None:
-        yield f"{key}: missing, and a mirror's light comes from above; add the plane it starts from, above z = {back:g}"
-    elif not start > back:
-        yield f"{key}: the light starts at z = {start:g}, not above the mirror at z = {back:g}; move one of them"
-    if lens.back.reflect and lens.front.outline is not None:
-        yield "lens.front.outline: the front of a mirror is the rear of its plate, which no light meets; remove it"
-    if lens.back.reflect and not lens.front.fixed:
-        yield "lens.front.optimise: the front of a mirror is the rear of its plate, which no light meets; remove it"
-
-
 def _behind(target: Target, lens: LensBlank) -> Iterator[str]:
     """A target that does not follow the lens along z."""
     if not target.z > (back := lens.back.z):
         place = "above the mirror, whose face" if lens.back.reflect else "behind the lens, whose back"
         yield f"target.z: the target at z = {target.z:g} is not {place} is at z = {back:g}; move it further along +z"
-
-
-def _nearest(source: Point, lens: LensBlank) -> float:
-    """z (mm) of the place of a point, disc or rectangle that is nearest to the lens."""
-    reach = 0.0 if source.extent is None else source.extent.reach(*(axis[2] for axis in source.axes[:2]))
-    return source.position[2] + (-reach if lens.back.reflect else reach)
-
-
-def _unlit(scene: Scene) -> Iterator[str]:
-    """A source that is turned or moved sideways and sends no light to the lens inside its rim."""
-    source, lens, rim = scene.source.central, scene.lens, scene.rim
-    if not (source.tilted or getattr(source, "centre", None)):
-        return
-    z, sags = lens.back.z, (0.0,)
-    if not lens.back.reflect:
-        z, sags = lens.front.z, lens.front.surface.sags(rim)
-    x, y = sampling.grid(source.window(rim, z, sags), SAMPLES)
-    if not bool((source.irradiance(x, y, z) > 0).any()):
-        key = "tilt" if source.tilted else "centre"
-        yield f"source.{key}: none of the light goes to the {lens.optic}; turn or move the source towards it"
 
 
 def _clearance(target: Target, lens: LensBlank, highest: float) -> float:
@@ -513,10 +406,8 @@ def _of_wavefront(wave: Wave | None, source: Source, lens: LensBlank, accept: Ac
             yield "accept.wavefront: limits the error of a [wavefront], and there is none; add one, or remove it"
         return
     if source.extent is not None:
-        key, light = "divergence", "parallel light of one direction"
-        if isinstance(source, Point):
-            key, light = "width" if source.diameter is None else "diameter", "a point"
-        yield f"wavefront: light of a source of some size (source.{key}) has no one wavefront; make it {light}"
+        sizes = " and ".join(f"source.{key}" for key, _, _ in source.sizes())
+        yield f"wavefront: light of a source of some size ({sizes}) has no one wavefront; make it {source.simple}"
     yield from (f"wavefront.{complaint}" for complaint in wave.complaints(lens.back.z))
     if isinstance(wave, ZernikeWave) and not wave.steepest(source.main_wavelength) < math.sin(ALONG):
         yield "wavefront.coefficients: the wave is too steep to have rays; make them smaller, or the radius larger"
@@ -577,18 +468,6 @@ def _metres(target: Target, lens: LensBlank) -> Iterator[str]:
         yield f"target.z: {target.z:g} mm; {question}"
     elif widest < min(across / NARROW, FAR):
         yield f"target.x: {target.size[0]:g} mm wide; {question}"
-
-
-def _beam(aperture: Outline, rim: Outline, key: str) -> Iterator[str]:
-    """A parallel beam that is wider than the lens, or leaves part of it dark; key: of the rim."""
-    sides = [*zip("xy", aperture.half_extent, rim.half_extent, strict=True)]
-    if any(b > h for _, b, h in sides):
-        yield "source.aperture: the beam is wider than the lens; what passes beside it is lost"
-    for axis, b, h in [side for side in sides if side[1] < COVERED * side[2]][:1]:
-        yield (
-            f"source.aperture: the beam is {2 * b:g} mm wide along {axis} and the lens {2 * h:g} mm; the lens "
-            f"stays unlit beyond {axis} = -{b:g} and {b:g} mm, so widen the beam or make {key} smaller"
-        )
 
 
 # ---- files and changes -----------------------------------------------------------------------------------------------

@@ -1,0 +1,94 @@
+"""Complaints about the light of a scene: its profile, its spectrum, its start, and whether it reaches the lens."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from bstcad.optics import sampling
+from bstcad.optics.outlines import Outline
+from bstcad.optics.sources import Emitter
+from bstcad.scene.blank import INDICES, LensBlank
+
+COVERED = 0.9  # of the lens's width: a beam narrower than that leaves a part dark that somebody pays for
+SAMPLES = 200  # a side of the lens, at which light is looked for
+
+
+def complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
+    """Complaints about the profile, the spectrum and the size of a source before this lens."""
+    width = source.widths.get(source.profile)
+    if width and source.profile != source.unbounded and getattr(source, width) is None:
+        unit = "mm" if width == "radius_1e2" else "degrees"
+        yield f"source.{width}: missing, and a {source.profile} profile needs it; add it in {unit}"
+    for other in source.widths.values():
+        if other != width and getattr(source, other) is not None:
+            yield f"source.{other}: has no meaning for a {source.profile} profile; remove it or change the profile"
+    yield from _spectrum(source, lens)
+    first = lens.back if lens.back.reflect else lens.front
+    yield from (f"source.{complaint}" for complaint in source.complaints(first.z, lens.optic))
+
+
+def _spectrum(source: Emitter, lens: LensBlank) -> Iterator[str]:
+    """Lines without a weight, of several indices, or of which the material's index is not known or no glass's."""
+    listed = source.wavelength if isinstance(source.wavelength, tuple) else ((source.wavelength, 1.0),)
+    if not listed:
+        yield "source.wavelength: no line is in it; give one wavelength in nm, or lines such as [[587.6, 1.0]]"
+    for nm, weight in listed:
+        if not weight > 0:
+            yield f"source.wavelength: the weight {weight:g} of the line at {nm:g} nm is not above 0; remove the line"
+    if len({nm for nm, _ in listed}) > 1 and lens.index is not None:
+        lines = f"the {len(listed)} lines of source.wavelength"
+        yield f'lens.index: one index does not hold for {lines}; set lens.material instead, such as material = "PMMA"'
+    try:
+        indices = [lens.index_at(nm) for nm, _ in listed]
+    except ValueError as error:
+        yield f"lens.material: {error}"
+        return
+    low, high = INDICES
+    for index in (n for n in indices if lens.material is not None and not low <= n <= high):
+        found = f"the index of {lens.material} is {index:.4g} there, not between {low:g} and {high:g}"
+        yield f"lens.material: {found}; choose a material that lets the source's light through"
+
+
+def order(source: Emitter, lens: LensBlank) -> Iterator[str]:
+    """Light and lens that do not follow each other along z; a mirror's light comes from above."""
+    front, back = lens.front.z + lens.front_sags[0], lens.back.z
+    key, start = f"source.{source.start_key}", source.nearest(upwards=not lens.back.reflect)
+    if not lens.back.reflect:
+        if start is not None and not start < front:
+            yield f"{key}: the light starts at z = {start:g}, not before the front at z = {front:g}; move one of them"
+    elif start is None:
+        yield f"{key}: missing, and a mirror's light comes from above; add the plane it starts from, above z = {back:g}"
+    elif not start > back:
+        yield f"{key}: the light starts at z = {start:g}, not above the mirror at z = {back:g}; move one of them"
+    if lens.back.reflect and lens.front.outline is not None:
+        yield "lens.front.outline: the front of a mirror is the rear of its plate, which no light meets; remove it"
+    if lens.back.reflect and not lens.front.fixed:
+        yield "lens.front.optimise: the front of a mirror is the rear of its plate, which no light meets; remove it"
+
+
+def unlit(source: Emitter, lens: LensBlank, rim: Outline) -> Iterator[str]:
+    """A simple source that is turned or moved sideways and sends no light to the lens inside its rim."""
+    if not (source.tilted or getattr(source, "centre", None)):
+        return
+    z, sags = lens.back.z, (0.0,)
+    if not lens.back.reflect:
+        z, sags = lens.front.z, lens.front.surface.sags(rim)
+    x, y = sampling.grid(source.window(rim, z, sags), SAMPLES)
+    if not bool((source.irradiance(x, y, z) > 0).any()):
+        key = "tilt" if source.tilted else "centre"
+        yield f"source.{key}: none of the light goes to the {lens.optic}; turn or move the source towards it"
+
+
+def doubts(source: Emitter, rim: Outline, key: str) -> Iterator[str]:
+    """A parallel beam that is wider than the lens, or leaves part of it dark; key: of the rim."""
+    beam, _ = source.spot(0.0)
+    if beam is None:  # it has no edge
+        return
+    sides = [*zip("xy", beam.half_extent, rim.half_extent, strict=True)]
+    if any(b > h for _, b, h in sides):
+        yield "source.aperture: the beam is wider than the lens; what passes beside it is lost"
+    for axis, b, h in [side for side in sides if side[1] < COVERED * side[2]][:1]:
+        yield (
+            f"source.aperture: the beam is {2 * b:g} mm wide along {axis} and the lens {2 * h:g} mm; the lens "
+            f"stays unlit beyond {axis} = -{b:g} and {b:g} mm, so widen the beam or make {key} smaller"
+        )
