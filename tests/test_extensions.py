@@ -13,8 +13,9 @@ import torch
 import bstcad
 from bstcad import pipeline
 from bstcad.cad import mesh, patches
-from bstcad.judges import faces
+from bstcad.judges import faces, mitsuba
 from bstcad.judges.faces import Traced
+from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.receivers import Receiver
@@ -23,6 +24,7 @@ from bstcad.optics.surfaces import sag
 from bstcad.report.light_figures import View
 from bstcad.scene.errors import SceneError
 from bstcad.scene.target import Target
+from bstcad.tolerance.perturbations import Setup, kinds
 from tests.conftest import draws_nothing, quick_effort
 
 OUTLINE = Rectangle(16.0, 16.0)
@@ -127,7 +129,7 @@ def test_light_is_collected_by_a_receiver_of_its_own(scene, tmp_path, monkeypatc
     asked = scene.changed({"target.z": 200.0, "target.x": [-150.0, 150.0], "target.y": [-60.0, 60.0],
                            "target.outline": None, "target.pixels": [60, 24], "accept.rrmsd": 0.1})  # fmt: skip
     around = asked.model_copy(update={"targets": (OnCylinder(**dict(asked.target)),)})
-    design = bstcad.Design(pipeline.design(around))
+    design = bstcad.design(around, progress=False)
     screen = around.target.screen
     flat = bstcad.measure(around.flat_lens(33), around.channels(), screen, around.target.irradiance())
     assert flat.rrmsd > 0.3
@@ -138,6 +140,27 @@ def test_light_is_collected_by_a_receiver_of_its_own(scene, tmp_path, monkeypatc
     assert View.of(around).labels == ("s (mm)", "y (mm)")
 
 
+def test_a_receiver_of_its_own_is_moved_as_its_points_are():
+    """Rays meet the moved cylinder where a point of it is, under that point's own coordinates, and at its normal."""
+    motion = Motion.of(shift=(3.0, -2.0, 5.0), turn=(4.0, 7.0, 10.0), about=(0.0, 0.0, 20.0))
+    moved = Cylinder(100.0).moved(motion)
+    x, y = (p.double() for p in torch.meshgrid(torch.linspace(-40, 40, 9), torch.linspace(-30, 30, 7), indexing="xy"))
+    places = torch.stack(moved.point(x, y))
+    way = places - torch.tensor([1.0, 2.0, 0.0]).view(3, 1, 1)
+    start = torch.tensor([1.0, 2.0, -15.0], dtype=torch.float64).view(3, 1, 1).expand_as(way)
+    flux, lost = torch.ones_like(x), torch.zeros(x.shape, dtype=torch.uint8)
+    landed = moved.land(Rays(start, way / way.norm(dim=0), flux, lost, z=15.0))
+    assert landed.alive.all() and torch.allclose(landed.position, torch.stack([x, y]), atol=1e-9)
+    step = 1e-4  # mm along the arc and along y
+    along = [torch.stack(moved.point(x + a, y + b)) - places for a, b in ((step, 0.0), (0.0, step))]
+    normal = torch.stack([torch.as_tensor(n).expand_as(x) for n in moved.normal(torch.stack([x, y]))])
+    for tangent in along:
+        assert ((tangent * normal).sum(0).abs() < 1e-5 * step).all()
+    back = moved.moved(motion.inverse).point(x, y)
+    assert torch.allclose(torch.stack(back), torch.stack(Cylinder(100.0).point(x, y)), atol=1e-9)
+    assert moved.labels == Cylinder(100.0).labels
+
+
 @dataclass(frozen=True)
 class Oval(Emitter):
     """Parallel light along +z, E = 2 / (π w v) exp(-2 (x² / w² + y² / v²))."""
@@ -145,6 +168,7 @@ class Oval(Emitter):
     w: float
     v: float
     wavelength: float = 587.6
+    parallel = True
 
     def irradiance(self, x, y, z):
         return 2 / (np.pi * self.w * self.v) * torch.exp(-2 * ((x / self.w) ** 2 + (y / self.v) ** 2))
@@ -164,12 +188,33 @@ def test_light_of_an_emitter_of_its_own_is_spread_evenly(scene, tmp_path, monkey
     draws_nothing(monkeypatch)
     asked = scene.changed({"target.x": [-20.0, 20.0], "target.y": [-20.0, 20.0], "target.outline": None})
     oval = asked.model_copy(update={"source": Oval(5.0, 8.0)})
-    design = bstcad.Design(pipeline.design(oval))
+    design = bstcad.design(oval, progress=False)
     report = design.write(tmp_path / "oval", progress=False, effort=quick_effort())
     assert report.passed and report.rrmsd < 0.1, report
     assert sum(report.flux.values()) == pytest.approx(1, abs=1e-12)
     flat = bstcad.measure(oval.flat_lens(33), oval.channels(), oval.target.screen, oval.target.irradiance())
     assert flat.rrmsd > 0.5
+
+
+def test_an_emitter_of_its_own_answers_or_declines_in_a_sentence(scene):
+    """Its sizes and place follow from its class; errors that would move its light are refused, and others are not."""
+    oval = scene.model_copy(update={"source": Oval(5.0, 8.0)})
+    setup = Setup(scene.flat_lens(33), oval.channels(), scene.target.screen)
+    assert (oval.source.lumens, oval.source.files, oval.source.wider(0.1)) == (None, {}, None)
+    assert "source.axial" not in (known := kinds(setup)) and "lens.clocking" not in known and "source.size" not in known
+    known["lens.thickness"].apply(setup, 0.1)
+    with pytest.raises(SceneError, match="^tolerance: the emitter Oval does not say how its light moves; give it the"):
+        known["lens.decentre_x"].apply(setup, 0.1)
+    assert mitsuba.cannot(setup.lens, setup.channels) == "Mitsuba has no lamp for the light of Oval"
+
+
+@pytest.mark.filterwarnings("ignore:Pydantic serializer")
+def test_changes_of_a_scene_keep_source_and_targets_of_its_own(scene):
+    around = scene.model_copy(update={"targets": (OnCylinder(**dict(scene.target)),), "source": Oval(5.0, 8.0)})
+    changed = around.changed({"target.z": 300.0, "lens.min_thickness": 0.5})
+    assert changed.target.screen.plane == Cylinder(300.0) and changed.lens.min_thickness == 0.5
+    assert changed.source is around.source
+    assert around.changed({"source": scene.source, "target": scene.target}) == scene
 
 
 def test_a_merit_of_its_own_is_refused_for_several_goals(scene):

@@ -39,6 +39,8 @@ class Screen:
     @property
     def middle(self) -> tuple[float, float, float]:
         """Its middle in space (mm)."""
+        if self.surface is not None:
+            return self.surface.middle
         return sum(self.x) / 2, sum(self.y) / 2, self.z
 
     @property

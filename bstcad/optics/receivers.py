@@ -27,6 +27,7 @@ class Receiver(ABC):
     """Where light is collected; x and y are its own coordinates."""
 
     unit: str = "mm"  # the unit of x and y
+    tilt: tuple[float, float] | None = None  # of a plane: about x, then about y (degrees); None: it is level, or none
     names: tuple[str, str] = ("x", "y")  # the names of its axes
     axes: tuple[Vector, Vector, Vector] | None = None  # e_x, e_y and n of a plane; None: it is none
     is_level: bool = False  # a plane z = const?
@@ -59,7 +60,7 @@ class Receiver(ABC):
 
     def moved(self, motion: Motion) -> Receiver:
         """The receiver after a rigid motion; its places keep their coordinates."""
-        raise NotImplementedError(f"{type(self).__name__} says nothing of how it is moved")
+        return Moved(self, motion)
 
     def land(self, rays: Rays) -> Landed:
         """Rays behind the last interface, on the receiver.
@@ -101,8 +102,68 @@ class Receiver(ABC):
         return tuple(self.land(sight).position.numpy())
 
 
+@dataclass(frozen=True)
+class Moved(Receiver):
+    """A receiver after a rigid motion: light lands on it as light that is moved back lands on the one at rest."""
+
+    rest: Receiver
+    motion: Motion
+
+    @property
+    def unit(self) -> str:
+        """The unit of the receiver at rest."""
+        return self.rest.unit
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """The names of the axes of the receiver at rest."""
+        return self.rest.names
+
+    @property
+    def middle(self) -> Vector:
+        """The point in the middle, in space (mm)."""
+        return self.motion.point(self.rest.middle)
+
+    def path(self, rays: Rays) -> tuple[Tensor, Tensor]:
+        """(way along each ray to the receiver (mm), zero for rays that do not come to it; status)."""
+        return self.rest.path(self._back(rays))
+
+    def places(self, rays: Rays) -> Sequence[Tensor]:
+        """x and y of rays that are on the receiver."""
+        return self.rest.places(self._back(rays))
+
+    def point(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
+        """The points in space (mm) of its places."""
+        shift = self.motion.point((0.0, 0.0, 0.0))
+        return tuple(t + p for t, p in zip(shift, _turned(self.motion, self.rest.point(x, y)), strict=True))
+
+    def normal(self, aim: Tensor) -> Sequence[Tensor | float]:
+        """The unit normal in each of these places (2, …), which points away from where light comes from."""
+        return _turned(self.motion, self.rest.normal(aim))
+
+    def moved(self, motion: Motion) -> Receiver:
+        """The receiver after one more motion."""
+        return replace(self, motion=motion.after(self.motion))
+
+    def _back(self, rays: Rays) -> Rays:
+        """The rays as they lie to the receiver at rest, their places counted from the plane z = 0."""
+        inverse = self.motion.inverse
+        shift, place = inverse.point((0.0, 0.0, 0.0)), (*rays.position[:2], rays.above(0.0))
+        position = tuple(t + p for t, p in zip(shift, _turned(inverse, place), strict=True))
+        return replace(rays, position=position, direction=_turned(inverse, rays.direction), z=0.0)
+
+
+def _turned(motion: Motion, vector: Sequence[Array]) -> tuple[Array, Array, Array]:
+    """Components of vectors after the turn of a motion."""
+    return tuple(_dot(row, vector) for row in motion.rotation.tolist())
+
+
 class Plane(Receiver):
     """A plane: n · (p - C) = 0."""
+
+    def height(self, point: Vector) -> float:
+        """n · (p - C): how far (mm) a point stands off the plane, negative on the side that light comes from."""
+        return math.fsum(n * (p - c) for n, p, c in zip(self.axes[2], point, self.middle, strict=True))
 
     @abstractmethod
     def _advance(self, rays: Rays) -> tuple[Tensor, Tensor]:
@@ -162,7 +223,7 @@ class TiltedPlane(Plane):
     """
 
     centre: Vector  # C (mm)
-    tilt: tuple[float, float]  # α, β (degrees)
+    tilt: tuple[float, float] = (0.0, 0.0)  # α, β (degrees)
     clocking: float = 0.0  # γ (degrees)
 
     @cached_property
@@ -174,10 +235,6 @@ class TiltedPlane(Plane):
     def middle(self) -> Vector:
         """C (mm)."""
         return self.centre
-
-    def height(self, point: Vector) -> float:
-        """n · (p - C): how far (mm) a point stands off the plane, negative on the side that light comes from."""
-        return math.fsum(n * (p - c) for n, p, c in zip(self.axes[2], point, self.centre, strict=True))
 
     def point(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
         """The points in space (mm) of places on the plane."""

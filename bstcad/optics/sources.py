@@ -11,6 +11,7 @@ above describe simple sources; those of an extended source give the light of its
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -64,12 +65,18 @@ class Beam(NamedTuple):
     least: float  # cosine to the axis from which on there is light
 
 
-class Emitter:
-    """A source.  Its colour and axis; an emitter that no more is known of is moved by no tolerance."""
+class Emitter(ABC):
+    """Where light comes from.
+
+    A class of one's own is a frozen dataclass that says its `irradiance`, `rays` and `window`; what else is asked of it
+    follows from these, or is declined in a sentence.
+    """
 
     wavelength: Wavelength
+    lumens: float | None = None  # flux (lm); None: relative
+    files: Mapping[str, bytes] = MappingProxyType({})  # contents of the files that it came from, by name
     tilt: tuple[float, float] | None = None
-    extent: Outline | None = None  # over which simple sources are spread; None: it is one
+    extent: Outline | None = None  # outline over which simple sources are spread; None: it is one
     profile: str = "own"
     size_key: str | None = None  # key of its size; after real_ that of the real lamp's
     kind: str = "own"
@@ -97,9 +104,58 @@ class Emitter:
         """The simple source in its middle, at its main line."""
         return replace(self, wavelength=self.main_wavelength)
 
+    @abstractmethod
+    def irradiance(self, x: Tensor, y: Tensor, z: float) -> Tensor:
+        """E(x, y) (1/mm²) on the plane z (mm); the whole flux is 1."""
+
+    @abstractmethod
+    def rays(self, x: Tensor, y: Tensor, z: float, area: float) -> Rays:
+        """Rays through (x, y) of the plane z (mm), each with the flux of its share `area` (mm²) of the plane."""
+
+    @abstractmethod
+    def window(self, outline: Outline, z: float, sags: tuple[float, ...]) -> Rectangle:
+        """The rectangle of the plane z (mm) that holds every ray that can meet the first surface inside its outline.
+
+        The surface lies between that plane and those at `sags` (mm) from it.
+        """
+
     def spot(self, z: float) -> tuple[Outline | None, tuple[float, float]]:
         """(outline, centre in mm) of the light on the plane z, None where it has no edge."""
         return None, (0.0, 0.0)
+
+    def starts(self, entrance: float) -> Vector:
+        """The middle of its light where that starts, or on the plane `entrance` (mm) if no plane is stated."""
+        z = entrance if self.begins is None else self.begins
+        return (*self.spot(z)[1], z)
+
+    @property
+    def place(self) -> Vector:
+        """Direction of parallel light, or position: it tells a simple source from the others of an extended one."""
+        return self.axes[2] if self.parallel else self.starts(0.0)
+
+    def element(self, x: float, y: float) -> Emitter:
+        """The simple source at (x, y) of its extent."""
+        raise self._silent("the simple sources that its extent consists of", "element(x, y)")
+
+    def scaled(self, share: float) -> Emitter:
+        """The same source with a share of its extent."""
+        raise self._silent("a smaller extent", "scaled(share)")
+
+    def moved(self, motion: Motion, entrance: float) -> Emitter:
+        """The simple source after a motion; entrance: z of the plane through the first vertex (mm)."""
+        raise self._silent("how its light moves", "moved(motion, entrance)")
+
+    def reference(self, place: Tensor, z: float, sense: int) -> Tensor:
+        """Path (mm) to places (3, …), counted from the plane z, from the wavefront through where the axis meets it."""
+        if not self.parallel:
+            raise self._silent("its wavefronts", "reference(place, z, sense)")
+        n_x, n_y, n_z = self.axes[2]
+        return sense * (n_x * place[0] + n_y * place[1] + n_z * place[2])
+
+    def _silent(self, what: str, method: str) -> NotImplementedError:
+        """The sentence by which a class declines what it does not know."""
+        name = type(self).__name__
+        return NotImplementedError(f"the emitter {name} does not say {what}; give it the method {method}")
 
     def sizes(self) -> Iterator[tuple[str, float, str]]:
         """The keys that give it an extent, each with the size and its unit."""
@@ -108,12 +164,12 @@ class Emitter:
     @property
     def turns_alike(self) -> bool:
         """Does its light stay the same when it is turned about its axis?  Else `moved` cannot turn it so."""
-        return self.extent is None or self.extent.is_round
+        return False
 
     @property
     def shifts_alike(self) -> bool:
         """Does its light stay the same when it is shifted along the axis of the lens?"""
-        return False
+        return self.parallel and not self.tilted
 
     def wider(self, by: float) -> Emitter | None:
         """The simple source with the tangent of its cone larger by a share; None: it has no cone."""
@@ -208,16 +264,6 @@ class Collimated(Emitter):
             key, light = ("divergence", "some of the light runs") if self.divergence else ("tilt", "the light runs")
             yield f"{key}: {light} {MAX_LEAN:g} degrees off the lens's axis or more; make it smaller"
 
-    def starts(self, entrance: float) -> Vector:
-        """The middle of its aperture, of a beam without a plane of its own on the plane `entrance` (mm)."""
-        z = entrance if self.z is None else self.z
-        return (*self.shift(z), z)
-
-    def reference(self, place: Tensor, z: float, sense: int) -> Tensor:
-        """Path (mm) to places (3, …), counted from the plane z as they are, from the plane across it on the axis."""
-        n_x, n_y, n_z = self.axes[2]
-        return sense * (n_x * place[0] + n_y * place[1] + n_z * place[2])
-
     def sizes(self) -> Iterator[tuple[str, float, str]]:
         """Its divergence, if it has one."""
         if self.divergence:
@@ -225,13 +271,8 @@ class Collimated(Emitter):
 
     @property
     def turns_alike(self) -> bool:
-        """Are aperture and cone round?"""
-        return self.aperture.is_round and super().turns_alike
-
-    @property
-    def shifts_alike(self) -> bool:
-        """Is it parallel to the axis?"""
-        return not self.tilted
+        """Is the aperture round, as the cone is?"""
+        return self.aperture.is_round
 
     def moved(self, motion: Motion, entrance: float) -> Collimated:
         """The simple beam after a motion; entrance: z of the plane through the first vertex (mm).
@@ -263,11 +304,6 @@ class Collimated(Emitter):
     def scaled(self, share: float) -> Collimated:
         """The same beam with a share of its divergence."""
         return replace(self, divergence=share * self.divergence if share else None)
-
-    @property
-    def place(self) -> Vector:
-        """The direction, which tells it from the other beams of an extended source."""
-        return self.axes[2]
 
     def element(self, u: float, v: float) -> Collimated:
         """The beam at (u, v) of its extent: d = cos α n + u e_x + v e_y in x and y, and d_z from the length 1."""
@@ -443,10 +479,6 @@ class Point(Emitter):
             far = f"the {distance:g} mm from the source to the {optic}"
             yield f"{name}: {sizes[name]:g} mm is more than {far}; make the source smaller or move it away"
 
-    def starts(self, entrance: float) -> Vector:
-        """Its position."""
-        return self.position
-
     def reference(self, place: Tensor, z: float, sense: int) -> Tensor:
         """Path (mm) to places (3, …), counted from the plane z, from the sphere about it through that on the axis."""
         x, y, start = self.position
@@ -455,6 +487,11 @@ class Point(Emitter):
     def sizes(self) -> Iterator[tuple[str, float, str]]:
         """Its diameter, width and height, if it has any."""
         yield from ((key, size, "mm") for key in SIDES if (size := getattr(self, key)))
+
+    @property
+    def turns_alike(self) -> bool:
+        """Is it a point or a disc?"""
+        return self.extent is None or self.extent.is_round
 
     def moved(self, motion: Motion, entrance: float) -> Point:
         """The point after a motion."""
@@ -489,11 +526,6 @@ class Point(Emitter):
         """The same source with a share of its diameter, width and height."""
         sizes = {name: getattr(self, name) for name in SIDES}
         return replace(self, **{name: share * size if share and size else None for name, size in sizes.items()})
-
-    @property
-    def place(self) -> Vector:
-        """The position, which tells it from the other points of an extended source."""
-        return self.position
 
     def element(self, x: float, y: float) -> Point:
         """The point at (x, y) of its extent (mm)."""

@@ -236,7 +236,7 @@ def _sample(lens: Lens, face: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarr
 def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> Figure:
     """The lens cut along y = 0 with rays (n_rays, n_points, 3) in mm projected on x-z: close, and the whole path.
 
-    A tilted screen is drawn too, as its edges are seen along y, and all screens of several.
+    A screen that is not level is drawn too, as its edges are seen along y, and all screens of several.
     """
     figure = new_figure(11.0, 3.4)
     close, whole = figure.subplots(1, 2, width_ratios=(1, 1.9))
@@ -254,13 +254,14 @@ def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> F
     close.set(title=f"{'Mirror' if lens.reflects else 'Lens'}, cut along y = 0", aspect="equal")
     whole.set_title("Whole path, source to target (axes not to one scale)")
     several = len(screens) > 1
-    drawn = [screen for screen in screens if several or screen.tilt]
+    drawn = [screen for screen in screens if several or not screen.plane.is_level]
     for screen in drawn:
         edges = corners(screen)
         whole.fill(edges[:, 2], edges[:, 0], facecolor="none", edgecolor=GREY, linewidth=1.0, gid="screen")
     if drawn:
-        tilted = "" if several else f"Grey: the target, its plane tilted by {turned(drawn[0].tilt)}."
-        footnote(figure, tilted or "Grey: the targets.")
+        tilt = drawn[0].plane.tilt
+        one = f"Grey: the target, its plane tilted by {turned(tilt)}." if tilt else "Grey: the target."
+        footnote(figure, "Grey: the targets." if several else one)
     return figure
 
 

@@ -81,18 +81,17 @@ class View:
     y: Extent
     seen_from: str  # lens | behind
     optic: str = "lens"  # or "mirror"
-    tilt: tuple[float, float] | None = None  # of the target plane, about x and then about y (degrees); None: level
-    number: int = 0  # of the target among several, by which its figures are named
-    labels: tuple[str, str] = ("x (mm)", "y (mm)")  # of the axes: those of its receiver
+    tilt: tuple[float, float] | None = None  # tilt of its plane, as the receiver states it
+    number: int = 0  # number of the target among several, by which its figures are named
+    labels: tuple[str, str] = ("x (mm)", "y (mm)")  # labels of the receiver's axes
 
     @classmethod
     def of(cls, scene: Scene, number: int = 0) -> View:
         """Of a scene's target, the first of several or another."""
-        target = scene.targets[number]
+        target, plane = scene.targets[number], scene.targets[number].screen.plane
         return cls(
-            target.x, target.y, target.seen_from, optic=scene.optic, tilt=target.tilt, number=number,
-            labels=target.screen.plane.labels,
-        )  # fmt: skip
+            target.x, target.y, target.seen_from, optic=scene.optic, tilt=plane.tilt, number=number, labels=plane.labels
+        )
 
     @property
     def words(self) -> str:

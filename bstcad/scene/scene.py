@@ -27,11 +27,10 @@ from bstcad.optics.goal import Goal
 from bstcad.optics.key import Key
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
-from bstcad.optics.receivers import TiltedPlane
 from bstcad.optics.sides import Sides, both
-from bstcad.optics.sources import Collimated, Point, Source
+from bstcad.optics.sources import Collimated, Emitter, Point, Source
 from bstcad.optics.wavefront import ALONG, PlaneWave, SphericalWave, Wave, ZernikeWave
-from bstcad.scene import effects, light, mount, picture, scene_file
+from bstcad.scene import effects, lighting, mount, picture, scene_file
 from bstcad.scene.blank import LensBlank, as_front, net_extent
 from bstcad.scene.dotted_keys import OUTLINES, override, tables_at
 from bstcad.scene.effects import Effects
@@ -131,15 +130,15 @@ class Scene(Record):
             yield "title: must be one line of up to 200 characters that can be printed; shorten it"
         yield from self._of_targets(Target.complaints)
         yield from lens.complaints()
-        yield from light.complaints(source, lens)
+        yield from lighting.complaints(source, lens)
         yield from effects.complaints(self.effects, lens)
         try:
             self.channels()
         except ValueError as error:  # data of the material or the metal that an effect lacks
             yield f"effects: {error}"
-        yield from light.order(source, lens)
+        yield from lighting.order(source, lens)
         yield from self._of_targets(lambda target: _behind(target, lens))
-        yield from light.unlit(source.central, lens, self.rim)
+        yield from lighting.unlit(source.central, lens, self.rim)
         yield from self._of_targets(lambda target: _tilted(target, lens))
         yield from coplanar(self.targets)
         yield from _of_wavefront(self.wavefront, source, lens, accept=self.accept)
@@ -165,7 +164,7 @@ class Scene(Record):
         doubts = [*self._metres(), *self.lens.doubts(), *_of_goals(self)]
         if self.source.parallel:
             key = "mount.rim" if self.mount and self.mount.rim else "lens.outline"
-            doubts += light.doubts(self.source, self.rim, key)
+            doubts += lighting.doubts(self.source, self.rim, key)
         else:
             doubts += self._of_targets(lambda target: _grazed(target, self.lens))
         return (*doubts, *self.of_pictures())
@@ -330,16 +329,25 @@ class Scene(Record):
         target.image an array of irradiance; None takes the key out.  Of several targets "target[1].text" is the
         second's.  Of alternatives (text, image, …) the one given
         replaces the others; a path is relative to the working folder.  lens.front may be a bstcad.Surface of one's own:
-        the scene holds a net within 1e-6 mm of it, inside the outline.  Raises SceneError.
+        the scene holds a net within 1e-6 mm of it, inside the outline.  A source and targets of classes of one's own
+        stay, with other values of the target's keys.  Raises SceneError.
         """
         given: dict[str, FileContent] = {}
-        data = _from_python(self, "", given)
+        own: dict[str, Any] = {"source": self.source} if self.source.kind == Emitter.kind else {}
+        standing_in = Collimated(self.lens.outline, self.source.wavelength, z=self.source.begins)
+        data = _from_python(self.model_copy(update={"source": standing_in}) if own else self, "", given)
         outline = changes.get("lens.outline", self.lens.outline)
         for key, value in changes.items():
             if key == "lens.front":
                 value = as_front(value, outline)
             override(data, key, _from_python(value, key, given), key)
-        return _validated(data, Path("."), given)
+        made = _validated(data, Path("."), given)
+        if any(key.startswith("source") for key in changes):
+            own = {}
+        if any(type(target) is not Target for target in self.targets) and "target" not in changes:
+            pairs = zip(self.targets, made.targets, strict=True)
+            own["targets"] = tuple(before.model_copy(update=dict(after)) for before, after in pairs)
+        return made.model_copy(update=own) if own else made
 
     def toml(self) -> str:
         """The scene as a file that loads to an equal scene; an image is named by the basename of its copy."""
@@ -364,16 +372,18 @@ def _behind(target: Target, lens: LensBlank) -> Iterator[str]:
 
 def _clearance(target: Target, lens: LensBlank, highest: float) -> float:
     """How far (mm) a target's plane passes a lens that reaches up to z = highest (mm); negative: it cuts it."""
-    plane = TiltedPlane(target.screen.middle, target.tilt or (0.0, 0.0))
+    plane = target.screen.plane
+    if plane.axes is None:  # a receiver of one's own surrounds the lens
+        return math.inf
     return -plane.height((0.0, 0.0, highest)) - lens.outline.reach(*plane.axes[2][:2])
 
 
 def _grazed(target: Target, lens: LensBlank) -> Iterator[str]:
     """A tilted target along which the light of a lamp runs."""
-    if target.tilt is None:
-        return
     plane, vertex = target.screen.plane, (0.0, 0.0, lens.back.z)
-    sine = -plane.height(vertex) / math.dist(plane.centre, vertex)  # apart, since no target cuts the lens
+    if plane.tilt is None:
+        return
+    sine = -plane.height(vertex) / math.dist(plane.middle, vertex)  # apart, since no target cuts the lens
     if sine < math.sin(math.radians(GRAZED)):
         angle = math.degrees(math.asin(max(sine, -1.0)))
         yield (
@@ -384,13 +394,12 @@ def _grazed(target: Target, lens: LensBlank) -> Iterator[str]:
 
 def _tilted(target: Target, lens: LensBlank) -> Iterator[str]:
     """A tilted target that does not face the lens, cuts it, or comes down to it."""
-    if target.tilt is None:
+    screen, plane, back, optic = target.screen, target.screen.plane, lens.back.z, lens.optic
+    if plane.tilt is None:
         return
-    screen, back, optic = target.screen, lens.back.z, lens.optic
-    plane = screen.plane
     vertex = (0.0, 0.0, back)
     lowest = min(plane.point(x, y)[2] for x in screen.x for y in screen.y)
-    if not -plane.height(vertex) > math.sin(EDGE_ON) * math.dist(plane.centre, vertex):
+    if not -plane.height(vertex) > math.sin(EDGE_ON) * math.dist(plane.middle, vertex):
         yield f"target.tilt: the target plane is edge-on to the {optic}, or shows it its rear; turn it less, or move it"
     if not _clearance(target, lens, back) > 0:
         yield f"target.tilt: the target plane cuts into the {optic}; turn it less, or move the target further along +z"

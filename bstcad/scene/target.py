@@ -19,7 +19,6 @@ from scipy.sparse import csr_array
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.key import Key
 from bstcad.optics.outlines import Outline
-from bstcad.optics.receivers import TiltedPlane
 from bstcad.scene import picture
 from bstcad.scene.blank import Outlined
 from bstcad.scene.dotted_keys import PICTURES
@@ -254,8 +253,7 @@ def _cuts(screen: Screen, other: Screen) -> bool:
 
 def _off(screen: Screen, other: Screen) -> list[float]:
     """How far (mm) its corners lie before the other's plane."""
-    mine, theirs = (TiltedPlane(s.middle, s.tilt or (0.0, 0.0)) for s in (screen, other))
-    return [theirs.height(mine.point(x, y)) for x in screen.x for y in screen.y]
+    return [other.plane.height(screen.plane.point(x, y)) for x in screen.x for y in screen.y]
 
 
 Targets = Annotated[  # of a file: one table, or a list of them

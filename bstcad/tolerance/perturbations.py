@@ -31,6 +31,7 @@ from bstcad.optics.rays import Vector
 from bstcad.optics.sides import in_words
 from bstcad.optics.sources import Source
 from bstcad.optics.surfaces import Surface
+from bstcad.scene.errors import SceneError
 
 # --- the setup --------------------------------------------------------------------------------------------------------
 
@@ -70,7 +71,10 @@ class Setup:
             return replace(around, placed=motion if self.placed is None else self.placed.after(motion))
         if part == "screen":
             return replace(self, screen=self.screen.moved(motion))
-        return self.with_sources(lambda source: source.moved(motion, self.lens.entrance.z))
+        try:
+            return self.with_sources(lambda source: source.moved(motion, self.lens.entrance.z))
+        except NotImplementedError as error:  # an emitter of one's own
+            raise SceneError(f"tolerance: {error}, or name errors with which it stays where it is") from None
 
     def with_sources(self, change: Callable[[Source], Source]) -> Setup:
         """With each channel's source changed."""
