@@ -39,7 +39,6 @@ from bstcad.runs import progress as progresses
 from bstcad.scene.blank import FEWEST_ROUND
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene, load
-from bstcad.sweep.net_choice import with_net
 from bstcad.transport.mapping import TransportMap
 from bstcad.verify.checks import Proof
 from bstcad.verify.verdict import Check
@@ -67,11 +66,9 @@ def design(
     scene = scene.changed({}) if isinstance(scene, Scene) else load(scene)
     for warning in scene.warnings():
         warnings.warn(warning, stacklevel=2)
-    scene, choice = with_net(scene)
     processes.keep_freed()
     with progresses.shown(progress) as shown:
-        if choice is not None:
-            shown("control points", 1, 1, choice.line)
+        scene = commands.settled(scene, lambda line: shown("control points", 1, 1, line))
         return Design(pipeline.design(scene, device=device, progress=shown, began=began, merit=merit, later=True))
 
 

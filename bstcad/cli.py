@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from bstcad.report.record import Contents, Examined
     from bstcad.scene.scene import Scene
     from bstcad.sweep.batch import Wanted
-    from bstcad.sweep.net_choice import Choice
 
 STARTED = time.perf_counter()  # heavy libraries load after it: their time is the command's
 INTERRUPTED, BROKEN = 130, 70  # exit codes: Ctrl-C; a fault of bstcad itself
@@ -194,14 +193,9 @@ def warn(scene: Scene, where: str = "") -> None:
         print(f"bstcad: warning: {where}{warning}", file=sys.stderr)
 
 
-def with_net_said(scene: Scene) -> tuple[Scene, Choice | None]:
-    """The scene with its net; of a net that is chosen, which one and what others would give, on stderr, too."""
-    from bstcad.sweep.net_choice import with_net
-
-    scene, choice = with_net(scene)
-    if choice is not None:
-        print(f"bstcad: {choice.line}", file=sys.stderr, flush=True)
-    return scene, choice
+def say_of_net(line: str) -> None:
+    """Print on stderr which net is chosen."""
+    print(f"bstcad: {line}", file=sys.stderr, flush=True)
 
 
 def words(names: str | None) -> list[str]:
@@ -319,7 +313,7 @@ def generate(
     files.check_free(folder)
     commands = engine()
     warn(wanted)
-    wanted, _ = with_net_said(wanted)
+    wanted = commands.settled(wanted, say_of_net)
     if commands.folders.step_size(wanted) >= commands.folders.LARGE:
         print(f"bstcad: {commands.folders.said_of_sizes(wanted)}", file=sys.stderr)
     with progress.watch(Console(stderr=True)) as watched:
@@ -341,11 +335,14 @@ def plan(scene: SceneFile, settings: Settings = None, as_json: AsJson = False, p
         from bstcad import folder as folders
         from bstcad.report import report as reports
         from bstcad.scene.target import numbered
+        from bstcad.sweep.net_choice import with_net
         from bstcad.sweep.plan import plan as planned
         from bstcad.sweep.plan import reach_drawn
 
     warn(wanted)
-    wanted, choice = with_net_said(wanted)
+    wanted, choice = with_net(wanted)
+    if choice is not None:
+        say_of_net(choice.line)
     given = wanted, scene.read_text(encoding="utf-8-sig"), [setting.partition("=")[0] for setting in settings or []]
     drawn = () if png is None else reach_drawn(wanted)
     parts = planned(*given)

@@ -92,9 +92,7 @@ def generate(
     effort: of the proof; None: all that it may need.  drawing: of its figures; None: Pictures.  look: called now and
     then with the function that makes the best lens so far.
     """
-    scene, choice = with_net(scene)
-    if choice is not None:
-        progress("control points", 1, 1, choice.line)
+    scene = settled(scene, lambda line: progress("control points", 1, 1, line))
     path, say = files.beside(folder, "checkpoint"), lambda text: progress("checkpoint", 0, 0, text)
     keeper = Keeper(path, purpose(scene, device), say, kind=Saved)
     processes.begin()
@@ -121,6 +119,14 @@ def generate(
         else:
             keeper.remove()
     return report
+
+
+def settled(scene: Scene, say: Callable[[str], None] = lambda line: None) -> Scene:
+    """Return the scene with a net, which is chosen where it states none; `say` is told which, and what others give."""
+    scene, choice = with_net(scene)
+    if choice is not None:
+        say(choice.line)
+    return scene
 
 
 def place_for(folder: Path, stopped: str) -> Path:

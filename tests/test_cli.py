@@ -39,6 +39,9 @@ class FakeCommands(types.ModuleType):
         progress("stage 1", 2, 2, "RRMSD 0.25")
         return self._report()
 
+    def settled(self, scene, say):
+        return scene
+
     def verify(self, path, progress, against, **asked):
         self.calls.append((path, *against))
         return self._report()

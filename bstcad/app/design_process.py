@@ -116,9 +116,8 @@ def design(job: Mapping[str, Any], place: Path, output: Path, resume: bool) -> S
     """Design the scene of the run's folder into `output`."""
     from bstcad import commands
     from bstcad.scene.scene import load
-    from bstcad.sweep.net_choice import with_net
 
-    scene, _ = with_net(load(place / SCENE))
+    scene = load(place / SCENE)
     report = commands.generate(
         scene, output, progress=Words(place / WORDS), began=time.perf_counter(), resume=resume,
         look=Glance(scene, place / LIGHT),
