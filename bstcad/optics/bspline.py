@@ -147,6 +147,23 @@ def carried(values: np.ndarray, fine: int) -> np.ndarray:
     return _least_squares(on_fine, (on_fine.T @ on_coarse) @ values)
 
 
+def interpolated(values: np.ndarray) -> np.ndarray:
+    """The control points (m, n) of the spline that has these values at the places of its control points."""
+    for m in values.shape:
+        basis, bands = basis_matrix(np.arange(m), m), np.zeros((3, m))
+        for k in (1, 0, -1):
+            bands[1 - k, max(k, 0) : m + min(k, 0)] = basis.diagonal(k)
+        values = scipy.linalg.solve_banded((1, 1), bands, values).T
+    return np.ascontiguousarray(values)
+
+
+def halfway(net: np.ndarray) -> np.ndarray:
+    """The values (2 m - 1, 2 n - 1) of the spline at the places of its control points and half way between them."""
+    for m in net.shape:
+        net = (basis_matrix(np.arange(2 * m - 1) / 2, m) @ net).T
+    return net
+
+
 @lru_cache(maxsize=16)
 def carrier(coarse: int, fine: int) -> scipy.sparse.csr_array:
     """The matrix (fine, coarse) of `carried`, but for what falls off below rounding: a band around its diagonal."""

@@ -15,12 +15,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from bstcad.optics.kernels.beam import Beam
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.key import Key
 from bstcad.optics.motion import Motion
@@ -39,30 +40,6 @@ WavelengthKey = Annotated[  # of every source
     Wavelength,
     Key("One wavelength, or lines [[nm, weight], ...] of a spectrum, weights of any sum.", "nm", 100.0, 20_000.0),
 ]
-
-
-class Beam(NamedTuple):
-    """E = peak exp(-fall r²) / d^power on the plane of the front's vertex, r from (x, y), where inside the limits.
-
-    That of a tilted point source is `Point._tilted_irradiance`: c / d^4, 1 / d³ or exp(-fall (d² - c²) / c²) / c³ for
-    the powers 4, 3 and 0, times the peak.
-    """
-
-    x: float  # the source, or the middle of the beam (mm)
-    y: float
-    limit_x: float  # outlines.Limits of the light (mm, mm, mm²)
-    limit_y: float
-    limit_r2: float
-    peak: float
-    fall: float  # 1/mm²; of a tilted source a number
-    power: int  # 0, 3 or 4, of the distance d of a point source
-    distance: float  # distance of a point source from the plane (mm); 0: collimated
-    start: float  # how far from the plane rays start (mm)
-    tilted: int  # 1: light along n, which is not (0, 0, 1)
-    n_x: float  # the source's axis, in the frame in which light begins along +z
-    n_y: float
-    n_z: float
-    least: float  # cosine to the axis from which on there is light
 
 
 class Emitter(ABC):
@@ -208,7 +185,7 @@ class Emitter(ABC):
         return axes(self.tilt or (0.0, 0.0))
 
     def beam(self, z: float) -> Beam | None:
-        """`irradiance` on the plane z (mm) as numbers; None: no kernel knows its law, and the plain form traces it."""
+        """`irradiance` on the plane z (mm) as numbers; None: no kernel knows its law, and takes a table instead."""
         return None
 
 

@@ -26,6 +26,7 @@ from bstcad.optics import irradiance, ops, sampling
 from bstcad.optics.channels import Channel, places, weighted_sum
 from bstcad.optics.interfaces import Interface, Loss, Reflect, Refract, cross, intersect
 from bstcad.optics.irradiance import Screen
+from bstcad.optics.kernels.kernel_arguments import KEPT, beam
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline, Rectangle
@@ -36,6 +37,7 @@ from bstcad.optics.surfaces import Surface
 
 UNDERSIDE = "vignetted by the underside"  # a line of the ledger: light beside the optical part of a front
 CELLS = 256  # a side of the lens, by which that light is summed
+TABULATED = 256  # rays a side from which on a table of the source's light is worth its cost
 GHOST_RAYS = 1024  # a side, at most; a ghost of 1 % of the light with 3 % of noise in a pixel adds 0.0003 to an RRMSD
 ON, OFF, REFLECTED, TOTAL = "ghost on target", "ghost off target", "reflected at the faces", "total internal reflection"
 
@@ -69,10 +71,15 @@ def _of_net(name: str, rays: Rays, interface: Interface) -> Callable[..., Any] |
     return ops.kernel(name, surface.heights, rays.position, rays.direction) if surface.is_net else None
 
 
-def whole_kernel(name: str, source: Source, lens: Lens, plane: Receiver) -> Callable[..., Any] | None:
-    """The kernel of this name, if it knows the whole way: this source, all interfaces of the lens and the receiver."""
-    known = plane.axes is not None and source.beam(lens.entrance.z) is not None
-    return ops.whole_kernel(name, lens.interfaces) if known else None
+def whole_kernel(
+    name: str, source: Source, lens: Lens, plane: Receiver, tables: bool = True
+) -> Callable[..., Any] | None:
+    """The kernel of this name, if it knows the whole way: this source, all interfaces of the lens and the receiver.
+
+    tables: may it take a table of the source's light, which costs as much as some ten thousand rays?
+    """
+    fast = ops.whole_kernel(name, lens.interfaces) if plane.axes is not None else None
+    return fast if fast and beam(source, lens, tables) is not None else None
 
 
 def to_first_net(rays: Rays, lens: Lens) -> Rays:
@@ -162,7 +169,10 @@ def simulate(lights: Lights, screen: Screen, n: int) -> Simulation:
 
     Kernel and plain form trace the same rays, and agree to rounding.
     """
-    kernels = [whole_kernel("trace.simulate", source, lens, screen.plane) for _, source, lens, _ in lights]
+    tables = n >= TABULATED and len(lights) <= KEPT
+    kernels = [
+        whole_kernel("trace.simulate", source, lens, screen.plane, tables=tables) for _, source, lens, _ in lights
+    ]
     if fast := all(kernels) and kernels[0]:
         whole = [(*light, window(light[1], light[2])) for light in lights]
         return _of_all_light(lights, *fast(whole, screen, n))

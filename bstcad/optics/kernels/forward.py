@@ -280,6 +280,21 @@ def _tilt(beam, count, work):
 
 
 @njit(error_model="numpy")
+def _look_up(peak, table, count, work):
+    """Flux density and direction of the rays through the points by the splines of a table."""
+    last_u, last_v = table.m - 1.0, table.n - 1.0
+    for r in range(count):
+        u = min(max((work[X + r] - table.x) * table.per_x, 0.0), last_u)
+        v = min(max((work[Y + r] - table.y) * table.per_y, 0.0), last_v)
+        e, _, _ = sag(table.irradiance, table.m, table.n, u, v)
+        p, _, _ = sag(table.slope_x, table.m, table.n, u, v)
+        q, _, _ = sag(table.slope_y, table.m, table.n, u, v)
+        dz = 1.0 / math.sqrt(1.0 + p * p + q * q)
+        work[FLUX + r] = peak * max(e, 0.0)
+        work[DX + r], work[DY + r], work[DZ + r] = p * dz, q * dz, dz
+
+
+@njit(error_model="numpy")
 def _meet_front(faces, axial, count, work):
     """To the front face: `interfaces.intersect` with `Conic.crossing`, or with the sag for rays along the axis."""
     c, conic, equator = faces.curvature, 1.0 + faces.conic_constant, faces.rules.equator
@@ -312,7 +327,10 @@ def _fly(net, beam, faces, tilted, losses, count, work, active):
 
     losses: where there are any, the cosines of incidence and the path in the glass are kept for `_dim`.
     """
-    _launch(beam, count, work)
+    if beam.table.m > 0:
+        _look_up(beam.peak, beam.table, count, work)
+    else:
+        _launch(beam, count, work)
     if beam.tilted == 1 and beam.distance > 0.0:
         _tilt(beam, count, work)
     if faces.reflects:  # no face was met before: rays begin at the source
@@ -322,8 +340,8 @@ def _fly(net, beam, faces, tilted, losses, count, work, active):
             if beam.distance > 0.0:
                 work[X + r], work[Y + r] = beam.x, beam.y
             elif beam.tilted == 1:
-                work[X + r] -= beam.start * (beam.n_x / beam.n_z)
-                work[Y + r] -= beam.start * (beam.n_y / beam.n_z)
+                work[X + r] -= beam.start * (work[DX + r] / work[DZ + r])
+                work[Y + r] -= beam.start * (work[DY + r] / work[DZ + r])
     else:
         _meet_front(faces, beam.distance == 0.0 and beam.tilted == 0, count, work)
         if losses.told:
@@ -489,7 +507,7 @@ def _scenes(lights, plane: Receiver, n: int) -> Iterator[tuple[Any, ...]]:
         if known is None or not _alike(lens, known[0]):
             known = lens, (_scene(source, lens, plane), kernel_arguments.losses(lens))
         (net, _, faces, tilted), losses = known[1]
-        cells, beam = kernel_arguments.cells(window, n, seed), source.beam(lens.entrance.z)
+        cells, beam = kernel_arguments.cells(window, n, seed), kernel_arguments.beam(source, lens)
         beam = beam._replace(peak=beam.peak * weight * cells.width * cells.height)  # flux of a ray, not its density
         yield net, beam, faces, tilted, losses, cells
 
@@ -522,4 +540,4 @@ def _scene(source: Source, lens: Lens, plane: Receiver) -> tuple[Any, ...]:
     (*front, net), z = lens.interfaces, lens.entrance.z
     heights = net.surface.heights
     faces = kernel_arguments.faces(net, plane, lens.sense, z, *front)
-    return net_of(-heights if lens.sense < 0 else heights), source.beam(z), *faces
+    return net_of(-heights if lens.sense < 0 else heights), kernel_arguments.beam(source, lens), *faces

@@ -1,6 +1,6 @@
 """Lens, cells and screen as the plain numbers that a fused kernel takes: named tuples of one type a field.
 
-A source tells its own (sources.Beam).
+The light of a source is a Beam (beam.py).
 
 So are the constants of the plain form: numba's cache looks at a kernel's own file only, and what that takes from
 another file would stay as it was when the kernel was compiled.
@@ -8,6 +8,8 @@ another file would stay as it was when the kernel was compiled.
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -16,14 +18,25 @@ import torch
 from torch import Tensor
 
 from bstcad.optics import interfaces, rays, sampling, surfaces
+from bstcad.optics.bspline import halfway, interpolated
 from bstcad.optics.interfaces import Interface
 from bstcad.optics.irradiance import Screen
+from bstcad.optics.kernels.beam import Beam, Table
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Status
 from bstcad.optics.receivers import Receiver
+from bstcad.optics.sources import Source
 
-NODES = 4097  # of a table of a face's transmission
+NODES = 4097  # places of a table of a face's transmission
+SIDES = 65, 129, 257, 513  # control points a side of a table, tried in turn
+EXACT = 1e-5  # largest RMS of a table's relative error in the irradiance: far below that of any picture …
+DARK = 1e-4  # … where the irradiance is above this part of the largest
+STRAIGHT = 1e-8  # largest RMS of a table's error in the slopes of rays
+PEAK = 100.0  # largest error over these: the outermost spans are the least exact
+KEPT = 16  # tables at a time
+SLOWER = 0.5  # light whose errors a table of twice the sides does not divide by 1 / SLOWER has an edge
+OF_A_TABLE = 0.0, 0.0, 0.0, 0.0, math.inf, 1.0, 0.0, 0, 0.0  # first fields of the Beam of a table
 
 
 class Rules(NamedTuple):
@@ -182,6 +195,50 @@ def _table(interface: Interface) -> np.ndarray:
         if not loss.in_glass:
             share = share * loss.share(cos_in, cos_out, torch.zeros_like(cosine))
     return share.contiguous().numpy()
+
+
+def beam(source: Source, lens: Lens, tables: bool = True) -> Beam | None:
+    """The light of a source on the plane of the first vertex of a lens; None: the plain form traces it.
+
+    tables: may it be a table?
+    """
+    first, aperture = lens.entrance, lens.interfaces[0].outline
+    found = source.beam(first.z)
+    if found is None and tables:
+        return _tabled(source, source.window(aperture, first.z, first.sags(aperture)), first.z)
+    return found
+
+
+@functools.lru_cache(maxsize=KEPT)  # 6 MB each at most
+@torch.no_grad()
+def _tabled(source: Source, window: Rectangle, z: float) -> Beam | None:
+    """The light by the coarsest table that is right half way between its points; None: none of SIDES is.
+
+    It holds what the source says of its light on the plane z (mm), at the places of the control points of splines.
+    """
+    last = math.inf
+    for side in SIDES:
+        along = np.linspace(-0.5, 0.5, 2 * side - 1)
+        x, y = (torch.from_numpy(p) for p in np.meshgrid(along * window.width, along * window.height, indexing="ij"))
+        rays = source.rays(x, y, z, 1.0)
+        ahead, starts = rays.sense * rays.direction[2], (rays.sense * -rays.above(z)).max()
+        if not bool(rays.alive.all() & (ahead > 0).all()):
+            return None
+        values = [part.numpy() for part in (rays.flux, *(rays.direction[:2] / ahead))]
+        nets = [interpolated(known[::2, ::2]) for known in values]
+        scales = EXACT * (values[0] + DARK * values[0].max()), STRAIGHT, STRAIGHT
+        triples = zip(nets, values, scales, strict=True)
+        off = [(halfway(net) - known) / scale for net, known, scale in triples]
+        error = max(max(np.sqrt(np.mean(part**2)), np.abs(part).max() / PEAK) for part in off)
+        if error <= 1.0:
+            size = window.width, window.height
+            corner = [*(-s / 2 for s in size), *((side - 1) / s for s in size)]
+            table = Table(side, side, *corner, *(net.ravel() for net in nets))
+            return Beam(*OF_A_TABLE, start=float(starts), tilted=1, n_x=0.0, n_y=0.0, n_z=1.0, least=0.0, table=table)
+        if not error < SLOWER * last:
+            return None
+        last = error
+    return None
 
 
 def _tilted(plane: Receiver | None, before: int, behind: int) -> Tilted | None:
