@@ -45,7 +45,7 @@ def _at_interfaces(rays: Rays, lens: Lens) -> list[Rays]:
 # --- rays for figures -------------------------------------------------------------------------------------------------
 
 FAN = 15  # rays
-LINES = 33  # of the ray mapping, each way
+LINES = 33  # lines of the ray mapping, each way
 
 
 def fan(source: Source, lens: Lens, plane: Receiver) -> np.ndarray:
@@ -93,8 +93,8 @@ def ray_map(source: Source, lens: Lens, plane: Receiver) -> tuple[np.ndarray, np
 
 NEEDED_RAYS = 513  # a side of the grid of rays
 ROUND = 1.01  # light is round if it reaches no farther than this times its half width, and its half height
-CORNERS = tuple((u, v) for u in (-1, 0, 1) for v in (-1, 0, 1))  # of an extended source, in halves of its extent
-WHOLE = 0.99  # of the clear aperture: light that reaches so far fills the face
+CORNERS = tuple((u, v) for u in (-1, 0, 1) for v in (-1, 0, 1))  # places on an extended source, in halves of its extent
+WHOLE = 0.99  # part of the clear aperture: light that reaches so far fills the face
 
 
 def used(source: Source, lens: Lens) -> tuple[Outline | None, ...]:
@@ -163,8 +163,8 @@ FEWEST = 48  # a side, of one channel
 class MountLosses:
     """Shares of light that a mount blocks."""
 
-    cut: float  # of the light that gets through both faces of the uncut lens, the share that misses the clear apertures
-    on_flange: float  # of the light through the clear apertures, the share that meets a wall of the flange's opening
+    cut: float  # share, missing the clear apertures, of the light that gets through both faces of the uncut lens
+    on_flange: float  # share, meeting a wall of the flange's opening, of the light through the clear apertures
 
 
 @torch.no_grad()
@@ -247,7 +247,7 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
 # --- blur by an extended source ---------------------------------------------------------------------------------------
 
 REACH = 2.5  # times the wider of lens and picture: the nearest target for a plate a tenth as thick as wide
-WORTH = 0.9  # of the width: a nearer target has to bring less, or the report does not name it
+WORTH = 0.9  # part of the width that a nearer target has to come below, or the report does not name it
 
 
 @dataclass(frozen=True)

@@ -40,16 +40,16 @@ LLVM = 16  # the first version by which its kernels compile; with 15 the process
 WHITE = 1e-3  # reflectance of the screen: light back to the lens does not matter
 STRAIGHT = {False: 3, True: 2}  # surfaces that light meets, the screen the last: of a lens, of a mirror
 AT_ONCE = 1 << 22  # photons in a pass, by memory
-PARTS = (1, 2, 4)  # of half a span of the net
+PARTS = (1, 2, 4)  # parts of half a span of the net
 MOST = 5_000_000  # corners of a mesh
-ENOUGH = 0.007  # of a pixel: shift of light by facets (RMS); 0.02 change a picture by 0.8 %
-TEXELS = 1024  # of a slide, along each side
-CENTRES = (2 * np.arange(TEXELS) + 1) / TEXELS - 1  # of texels, from -1 to 1
+ENOUGH = 0.007  # shift of light by facets (RMS, pixels); 0.02 change a picture by 0.8 %
+TEXELS = 1024  # texels of a slide along each side
+CENTRES = (2 * np.arange(TEXELS) + 1) / TEXELS - 1  # centres of texels, from -1 to 1
 ROOM = 1.01  # field of a projector over the lens's
-SOFT = 1e-5  # of a spot's cone: width of its edge
+SOFT = 1e-5  # width of a spot's edge, as a part of its cone
 PROJECTED = math.pi  # flux of Mitsuba's projector over the irradiance of its slide
 
-Entry = dict[str, Any]  # of Mitsuba's scene
+Entry = dict[str, Any]  # entry of Mitsuba's scene
 
 
 def cannot(lens: Lens, channels: Sequence[Channel]) -> str:
@@ -99,7 +99,7 @@ def trace(
 
 
 def _variant() -> str:
-    """Of Mitsuba: compiled for many photons at once where LLVM is there, else one photon at a time."""
+    """The variant of Mitsuba: many photons at once where LLVM is there, else one photon at a time."""
     import drjit
 
     llvm = drjit.has_backend(drjit.JitBackend.LLVM) and drjit.detail.llvm_version()[0] >= LLVM

@@ -34,7 +34,7 @@ from bstcad.optics.surfaces import Surface
 DEGREE = 2  # order 3
 SMALLEST_NET = FEWEST  # control points a side: two end spans and one inner span
 SPANS = 1 << 14  # looked at together: their numbers stay in the cache
-QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of a span, along x and along y, where bounds on the back are held to it and
+QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # places in a span along x and y, where bounds on the back are held to it and
 # where figures of it are taken: a grid four times finer than the net, with both sides of each knot
 
 

@@ -25,9 +25,9 @@ class Channel:
     """One source in media of one index each."""
 
     source: Source  # its whole flux is 1
-    index: float  # of the lens at the source's wavelength
+    index: float  # refractive index of the lens at the source's wavelength
     weight: float = 1.0  # part of all light; the weights of all channels sum to 1
-    losses: Dimming | None = None  # of faces and glass at its wavelength; None: there are none
+    losses: Dimming | None = None  # losses at faces and in glass at its wavelength; None: there are none
 
     def through(self, lens: Lens) -> Lens:
         """The lens as this channel meets it."""

@@ -33,7 +33,7 @@ APPROACH_STEPS = 200  # a ray that has not come near the face by then runs along
 LEVEL = 1e-2  # |d_z| of a steep ray at or below which it leaves through a side
 FLATTEST = 1e-3  # |F'| below which a Newton step is that of 1e-3, with its sign
 QUICK = 3  # Newton steps after which rays outside the net are checked for; most have arrived by then
-NEAR = 1e-5  # of the net's half width: an approach ends so little below the face
+NEAR = 1e-5  # part of the net's half width, so little below the face an approach ends
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Refract:
     n_in: float  # refractive index before the interface
     n_out: float  # and behind it
 
-    status_if_blocked = Status.TOTAL_REFLECTION  # of rays that the law does not let through
+    status_if_blocked = Status.TOTAL_REFLECTION  # status of rays that the law does not let through
     reverses = False  # does light turn back along z?
 
     @property
@@ -91,7 +91,7 @@ Law = Refract | Reflect
 class Loss(Protocol):
     """A loss of a ray's flux at an interface, or on the way to it (losses.py)."""
 
-    line: str  # of the ledger, under which that part is counted
+    line: str  # line of the ledger under which that part is counted
     in_glass: bool  # it acts on the way to the interface; else at the interface
     fused: bool  # the kernels know it: exp(-coefficient · path) in the glass, at the interface the angle alone
 
@@ -106,7 +106,7 @@ class Interface:
     surface: Surface
     outline: Outline  # light that meets the surface outside is lost
     law: Law
-    status_if_missed: Status  # of rays that do not meet it
+    status_if_missed: Status  # status of rays that do not meet it
     losses: tuple[Loss, ...] = ()  # in the order of the light; none: the paper's lossless refraction
 
 
@@ -115,8 +115,8 @@ class Hit:
     """Rays that have crossed an interface; the cosines hold for those still alive."""
 
     rays: Rays  # on the surface, with their new directions
-    cos_in: Tensor  # of the angle of incidence
-    cos_out: Tensor  # of the angle of refraction or reflection
+    cos_in: Tensor  # cosine of the angle of incidence
+    cos_out: Tensor  # cosine of the angle of refraction or reflection
 
 
 def cross(rays: Rays, interface: Interface) -> Hit:

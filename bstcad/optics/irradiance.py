@@ -20,8 +20,8 @@ from bstcad.optics.motion import Motion
 from bstcad.optics.rays import Landed, Status, axes, clocked, clocking_of, tilt_of
 from bstcad.optics.receivers import LevelPlane, Receiver, TiltedPlane
 
-ROUNDING = 1e-12  # of the light on a target
-DARK = 1e-6  # of the brightest pixel of a target; a pixel that wants no more wants no light
+ROUNDING = 1e-12  # rounding, as a part of the light on a target
+DARK = 1e-6  # part of a target's brightest pixel; a pixel that wants no more wants no light
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ class Key:
     unit: str = ""  # "": a pure number or a word
     least: float | None = None  # None: the field holds no number
     most: float | None = None
-    example: Any = None  # of a key that every scene has to give
+    example: Any = None  # value of a key that every scene has to give
     remedy: str = ""  # advice on a number out of range; "": choose one in between
 
     def in_range(self, value: Any) -> Any:

@@ -41,8 +41,8 @@ class Lens:
     outline: Outline  # both faces of the solid end on it
     index: float  # refractive index at the design wavelength; of a mirror it does not matter
     reflects: bool = False  # is it a mirror?
-    losses: Dimming | None = None  # of its faces and its glass; None: no flux is lost there
-    clear: tuple[Outline, Outline] | None = None  # of front and back, outside which light is lost; None: the outline
+    losses: Dimming | None = None  # losses at its faces and in its glass; None: no flux is lost there
+    clear: tuple[Outline, Outline] | None = None  # apertures of front and back that pass light; None: the outline
     before: tuple[Interface, ...] = ()  # that light crosses before the solid, such as a window
     behind: tuple[Interface, ...] = ()  # and behind it, such as a fold mirror
     shaped: tuple[int, ...] | None = None  # numbers of the interfaces that tailoring shapes; None: the back alone

@@ -45,7 +45,7 @@ from bstcad.optics.tubes import SHEET, Tubes, area_of, arriving, corners, launch
 
 SETS = 8  # independent sets of rays: a standard error is then known to a quarter of it
 FEWEST = 5  # times fewer rays a side in the first sets, which tell how many are needed
-SEEN = 0.45  # of the RRMSD, at the default accuracy: noise of the mean picture, whose RRMSD is then a tenth too large
+SEEN = 0.45  # noise of the mean picture over the RRMSD, at the default accuracy: RRMSD is then a tenth too large
 RESOLVED = 5.0  # times its standard error an RRMSD must be at least
 # Differences that pictures by rays and by tubes may have: a part of the smaller RRMSD, and always a part of the target.
 AGREED, FAINT = 0.5, 0.002
@@ -55,7 +55,7 @@ SMOOTHED = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # pixels, standard de
 # all as of one point.
 RAYS = 0.5
 A_POINT = 1 << 13  # rays of each set a point of an extended source
-FEW_POINTS, MANY_POINTS = 8, 1024  # of an extended source in each set
+FEW_POINTS, MANY_POINTS = 8, 1024  # points of an extended source in each set
 LEAST = 513  # tubes a side of the witness: a few serve no pixels
 FEW = 64  # tubes a side of a coarse sheet of many: finding that is half of the work, and 1e-6 of the light is enough
 PASS = 1 << 20  # between the seeds of passes by rays from an extended source
@@ -72,9 +72,9 @@ class Effort:
     """How much work a measurement may take; the default is that of a verification."""
 
     rays: int = 2896  # a side of the window at most, of each of SETS sets: 67 million in all
-    seed: int = 0  # of the rays
+    seed: int = 0  # seed of the rays
     places: int = 1025  # a side of the lens, where a verification looks at its thickness
-    points: int = 1 << 17  # of a face, where it compares the written file with the design
+    points: int = 1 << 17  # points of a face at which the written file is compared with the design
     accuracy: float = 0.005  # standard error of the RRMSD over the RRMSD at which no more rays are traced; 0: all are
     seconds: float = math.inf  # no further sets of rays are begun that would end later
     witness: bool = True  # do ray tubes trace a source without size, too?
@@ -89,7 +89,7 @@ Draw = Callable[[int, int], Sequence[Channel]]  # channels at this number of poi
 class Witness:
     """The same light by ray tubes."""
 
-    rrmsd: float  # of their picture
+    rrmsd: float  # RRMSD of their picture
     off: float  # their picture against the rays', without bias, as RRMSD has it
     limit: float  # largest `off` that passes, by the RRMSD, or by the tubes' own error and the noise of the rays
     tubes: int  # a side
@@ -101,14 +101,14 @@ class Light:
 
     picture: np.ndarray = field(repr=False)  # (rows, columns), row 0 = y max, with the target's sum: for people
     rrmsd: float  # without bias (Wang et al. 2023, Eq. 15); NaN: no light falls on the screen
-    standard_error: float  # of the RRMSD
+    standard_error: float  # standard error of the RRMSD
     rays: int  # in all
     flux: dict[str, float]  # the ledger: where the source's light goes; the lines sum to 1
     tent: float = math.nan  # RRMSD by linear binning
     picture_off: float = math.nan  # `picture` against the lens's own, as RRMSD has it
     witness: Witness | None = None  # None: of a source of some size, with losses, without a kernel, or unasked
     ghost: np.ndarray | None = field(default=None, repr=False)  # the part of the picture by a ghost; None: left out
-    leak: Leak | None = None  # of the rays' mean picture, not smoothed; None: the target is dark nowhere
+    leak: Leak | None = None  # leak of the rays' mean picture, not smoothed; None: the target is dark nowhere
     rrmsd_whole: float | None = None  # against a picture of which the target is a part; None: there is none
 
     @property
@@ -183,12 +183,12 @@ def rrmsd_by_tubes(lens: Lens, channels: Sequence[Channel], screen: Screen, targ
 class _Rays:
     """Pictures and ledger of independent sets of rays."""
 
-    boxes: tuple[Tensor, ...]  # of each set, (rows, columns) with the target's sum; (): no light falls on it
+    boxes: tuple[Tensor, ...]  # picture by each set, (rows, columns) with the target's sum; (): no light falls on it
     tents: tuple[Tensor, ...]  # the same by linear binning
     flux: dict[str, float]  # the ledger
-    count: int  # of rays
+    count: int  # number of rays
     on_screen: float  # flux on the screen, as a fraction of the source's
-    weight: float = 1.0  # of its pictures among those of others: 1 / the variance of their noise, on any scale
+    weight: float = 1.0  # weight of its pictures among those of others: 1 / the variance of their noise, on any scale
 
     def joined(self, other: _Rays) -> _Rays:
         """Each set with that of `other`: sets stay independent of each other."""
@@ -457,7 +457,7 @@ class Line:
     """The light of one line of a spectrum by itself."""
 
     wavelength: float  # nm
-    share: float  # of all light; the shares of all lines sum to 1
+    share: float  # part of all light; the shares of all lines sum to 1
     picture: np.ndarray = field(repr=False)  # (rows, columns), row 0 = y max, with the target's sum; dark: zero
 
 

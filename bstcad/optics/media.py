@@ -39,7 +39,7 @@ class Curve:
 
     shortest: float  # nm
     longest: float  # nm
-    at: Callable[[float], float]  # of a wavelength in nm; the caller keeps to the range
+    at: Callable[[float], float]  # value at a wavelength in nm; the caller keeps to the range
 
     def covers(self, wavelength: float) -> bool:
         """Does it hold there?"""
@@ -161,7 +161,7 @@ class Medium:
     """A material, and the pages of refractiveindex.info with its n and k."""
 
     name: str
-    page: str  # of n, and of k where `absorption` names none
+    page: str  # page of n, and of k where `absorption` names none
     absorption: str | None = None  # another page, of k
     nominal: float | None = None  # density (g/cm³), where the page has none
 
@@ -208,7 +208,7 @@ MEDIA = (
     Medium("water", "main/H2O/Daimon-20.0C", "main/H2O/Hale", 0.998),
     Medium("glycerol", "organic/glycerol/Gupta", nominal=1.26),
 )
-METALS = (  # of mirrors, opaque films
+METALS = (  # metals of mirrors, opaque films
     Medium("Al", "main/Al/Rakic"),
     Medium("Ag", "main/Ag/Johnson"),
     Medium("Au", "main/Au/Johnson"),

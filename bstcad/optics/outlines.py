@@ -20,7 +20,7 @@ STRICT = {"extra": "forbid", "arbitrary_types_allowed": True, "revalidate_instan
 # boxes with round corners, of which a circle (a = b = 0) and a rectangle (r = 0) are the extremes.
 Limits = tuple[float, float, float]
 SIDES = (1e-3, 1e6)  # mm; of an outline in a scene
-PLACES = 720  # of `places` on a rim: on its arcs together, and about as many on its straight sides together
+PLACES = 720  # number of `places` on a rim: on its arcs together, and about as many on its straight sides together
 
 
 class _Box:

@@ -22,9 +22,9 @@ POINTS = 3  # Gauss points in each part of a chord or of an edge …
 SMOOTH = 96  # Gauss points of a chord over a smooth face; up to a half diagonal of 0.95 R they leave only rounding
 END_PARTS = 12  # at least, of a net's end spans, where x(t) is quadratic and h(x) no polynomial: volumes to 1e-12
 STRIP = 512  # border points at a time
-LEVEL = 1e-14  # of a length: a border that goes no further in x adds nothing
+LEVEL = 1e-14  # part of a length; a border that goes no further in x adds nothing
 FINE = 400  # … 2 in those of a net with as many control points a side: they hold the area of such a lens to 1e-9
-EDGE_PARTS = 256  # of the curve of an edge, at least
+EDGE_PARTS = 256  # least number of parts of an edge's curve
 
 gauss_rule = functools.cache(np.polynomial.legendre.leggauss)  # points and weights from -1 to 1, by their number
 
@@ -66,7 +66,7 @@ def of_face(face: Surface, border: Border, raised: float = 0.0) -> Sums:
     for start in range(0, len(moves), STRIP):
         some = moves[start : start + STRIP]
         total += _at(face, raised, *_chords(face, border.x[some], border.y[some], border.dx[some]))
-    return Sums(abs(total.area), total.volume, total.moment)  # of a border seen from below it is negative
+    return Sums(abs(total.area), total.volume, total.moment)  # the area is negative for a border seen from below
 
 
 def of_wall(face: Surface, border: Border, raised: float = 0.0) -> Sums:
@@ -176,24 +176,24 @@ def _smooth_parts(face: BSplineSurface, axis: int, parts: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MassProperties:
-    """Of a solid of even density; a STEP file states them, so that its reader can check the shape by them.
+    """Properties of a solid of even density; a STEP file states them, so that its reader can check the shape by them.
 
     By the divergence theorem, A = ∮ dA, V = ∮ r·n dA / 3 and V c = ∮ r (r·n) dA / 4.
     """
 
-    area: float  # of the whole surface (mm²)
+    area: float  # area of the whole surface (mm²)
     volume: float  # mm³
     centroid: tuple[float, float, float]  # mm
 
     @classmethod
     def of(cls, total: Sums, z: float) -> MassProperties:
-        """Of a solid by the sums over its whole surface, whose origin is at z (mm) on the axis."""
+        """Properties of a solid by the sums over its whole surface, whose origin is at z (mm) on the axis."""
         c_x, c_y, c_z = (total.moment / total.volume).tolist()
         return cls(total.area, total.volume, (c_x, c_y, z + c_z))
 
 
 def of_lens(lens: Lens) -> MassProperties:
-    """Of a bare lens, from its own surfaces, to about 1e-9; OCC takes minutes over a large net, and leaves 1e-5."""
+    """Properties of a bare lens by its own surfaces, to 1e-9; OCC takes minutes over a large net, and leaves 1e-5."""
     lens, total = lens.plain(), Sums()
     z_ref = lens.front.z  # heights are measured from there, so that digits stay
     for face, sign in ((lens.back, 1), (lens.front, -1)):

@@ -28,7 +28,7 @@ class Status(IntEnum):
     TURNED_BACK = 4  # left the last surface, but not towards the plane it should land on
 
 
-ARRAYS = ("position", "direction", "flux", "status")  # of a bundle
+ARRAYS = ("position", "direction", "flux", "status")  # tensors of a bundle
 
 
 @dataclass(frozen=True)

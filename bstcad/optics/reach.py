@@ -41,7 +41,7 @@ def grazing_of(index: float, others: Iterable[float], spread: float = 0.0) -> fl
     others: relative indices for other lines of the light, of which the greatest meets its critical angle first; spread:
     angle (rad) in the glass between a ray and the others that meet the face at the same place.
     """
-    steepest = math.asin(math.sin(GRAZING) / max((index, *others)))  # of incidence, for the line that is bent most
+    steepest = math.asin(math.sin(GRAZING) / max((index, *others)))  # incidence of the line that is bent most
     return math.asin(index * math.sin(max(steepest - spread, 0.0)))
 
 

@@ -27,7 +27,7 @@ class Receiver(ABC):
     """Where light is collected; x and y are its own coordinates."""
 
     unit: str = "mm"  # the unit of x and y
-    tilt: tuple[float, float] | None = None  # of a plane: about x, then about y (degrees); None: it is level, or none
+    tilt: tuple[float, float] | None = None  # tilt of a plane about x, then y (degrees); None: it is level, or no plane
     names: tuple[str, str] = ("x", "y")  # the names of its axes
     axes: tuple[Vector, Vector, Vector] | None = None  # e_x, e_y and n of a plane; None: it is none
     is_level: bool = False  # a plane z = const?

@@ -33,10 +33,10 @@ FAR = 4.0  # widths of its aperture by which a beam without a plane z of its own
 SIDES = "diameter", "width", "height"  # sizes of a disc or rectangle that shines
 HALF_SPACE = math.pi / 2  # rad; the edge of light that fills all directions on the lens's side
 MAX_LEAN = 89.0  # degrees from the lens's axis, of parallel light
-WIDEST = math.radians(89.0)  # of a cone whose edge counts on planes
+WIDEST = math.radians(89.0)  # widest cone whose edge counts on planes
 Wavelength = float | tuple[tuple[float, float], ...]  # nm; or lines, each (nm, weight), weights of any sum
 ALONG_Z = (0, 0.0, 0.0, 1.0, 0.0)  # the last fields of a Beam that is not tilted
-WavelengthKey = Annotated[  # of every source
+WavelengthKey = Annotated[  # key of every source
     Wavelength,
     Key("One wavelength, or lines [[nm, weight], ...] of a spectrum, weights of any sum.", "nm", 100.0, 20_000.0),
 ]

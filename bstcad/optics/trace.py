@@ -234,9 +234,9 @@ class Reflection:
     """R = 1 - T of a face that light meets from inside the glass; 1 beyond the critical angle."""
 
     through: Loss  # T
-    law: Refract  # of the light that goes through
+    law: Refract  # law for the light that goes through
 
-    line, in_glass, fused = "transmitted", False, True  # of no ledger: light that goes through is no part of the ghost
+    line, in_glass, fused = "transmitted", False, True  # in no ledger: light that goes through is no part of the ghost
 
     def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
         """R at the angle of incidence."""

@@ -34,12 +34,12 @@ INWARDS = 1e-9  # relative shrink towards the middle: corners on the rim of the 
 BAND = 256  # rows of tubes at most traced at a time for a picture alone; even, since the diagonals alternate
 IN_BAND = 1 << 19  # tubes at most in these rows: of more columns fewer rows, so that memory does not grow
 CACHED = 1 << 17  # rays that plain torch takes at a time: a megabyte of each quantity
-PARTS = 4  # of a tube on the rim of the light, each way
+PARTS = 4  # parts of a tube on the rim of the light, each way
 THINNEST = 1e-9  # pixel²: a triangle of less area gives all its flux to the pixel of its centre, without gradient
 COARSE = 65  # points a side of the grid on which the rays to given points are found first
 REVERSE_STEPS = 30  # at most, to find those rays
-ARRIVED = 1e-8  # of the grid's extent: distance from its point at which a ray is found
-DIFFERENCE = 1e-6  # of the grid's extent: step of the difference quotients
+ARRIVED = 1e-8  # distance from its point at which a ray is found, as a part of the grid's extent
+DIFFERENCE = 1e-6  # step of the difference quotients, as a part of the grid's extent
 SINGULAR = 0.1  # Broyden's update is skipped where its divisor is less than this times the square of the step
 
 
@@ -122,7 +122,7 @@ class _Sheet:
 
     rows: Callable[[slice], tuple[Tensor, Tensor]]  # (x, y) of some rows of them (mm)
     count: int  # rows of tubes, along x
-    middle: tuple[float, float]  # of all (mm)
+    middle: tuple[float, float]  # middle of all (mm)
     cut: bool  # does the lens cut the beam?
 
 

@@ -36,7 +36,7 @@ from bstcad.optics.wavefront import NM, Wave, length
 RAYS = 512  # a side of the light before the lens
 CELLS = 256  # a side of the map, at most
 BAND = 1 << 17  # rays traced at a time: a megabyte of each quantity
-ROUNDINGS = 4  # of a stretch of way: of both its ends, of its length and of the sum
+ROUNDINGS = 4  # roundings of a stretch of way: of both its ends, of its length and of the sum
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +159,7 @@ class WavefrontError:
 
 @torch.no_grad()
 def wavefront_error(source: Source, lens: Lens, wave: Wave, n: int = RAYS) -> WavefrontError:
-    """Of n x n rays over the light of a point or of parallel light that gets through the lens.
+    """The error by n x n rays over the light of a point or of parallel light that gets through the lens.
 
     The lens is that of the source's main wavelength.  Raises ValueError if no ray can be compared.
     """

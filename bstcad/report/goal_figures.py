@@ -16,7 +16,7 @@ from bstcad.scene.scene import Scene
 from bstcad.scene.target import drawing
 from bstcad.verify.checks import Proof
 
-Share = Annotated[float, Field(ge=-1e-6, le=1 + 1e-6)]  # of 1, but for the rounding of a sum
+Share = Annotated[float, Field(ge=-1e-6, le=1 + 1e-6)]  # part of 1, but for the rounding of a sum
 Size = Annotated[float, Field(ge=0, le=1e12)]
 Rrmsd = Annotated[float, Field(gt=0, le=1e3)]
 
@@ -27,13 +27,13 @@ class GoalFigures:
 
     key: str  # target, or target[0], target[1], … of several
     z: float  # mm, of its plane
-    weight: Size  # of its squared error among all goals
+    weight: Size  # weight of its squared error among all goals
     rrmsd: Rrmsd  # by the flux into each pixel
-    rrmsd_standard_error: Annotated[float, Field(ge=0, le=1e3)]  # of rrmsd, by independent sets of rays
+    rrmsd_standard_error: Annotated[float, Field(ge=0, le=1e3)]  # standard error of rrmsd, by independent sets of rays
     rrmsd_tent: Rrmsd | None  # by linear binning
-    light_on_target: Share  # of the source's flux
+    light_on_target: Share  # part of the source's flux
     efficiency: Share  # flux on the target over flux that leaves the back face
-    leak: Share | None  # of the light on the target, on its dark pixels; None: it has none
+    leak: Share | None  # part of the light on the target that is on its dark pixels; None: it has none
     contrast: Size | None  # mean irradiance of the lit pixels over that of the dark ones; None: or without leak
 
     @property
@@ -65,7 +65,7 @@ class WavefrontFigures:
     angle_rms_urad: Size  # between rays and wanted rays, each ray by its flux; tilt included
     angle_max_urad: Size  # between rays and wanted rays
     floor: Size  # waves that rounding may add to the RMS
-    flux: Share  # of the source's flux, that is measured
+    flux: Share  # part of the source's flux that is measured
     removed: Literal["piston and tilt"] = "piston and tilt"  # before rms and pv
 
     @classmethod
@@ -98,7 +98,7 @@ def figures_of(goals: Sequence[Goal], lights: Sequence[Light]) -> tuple[GoalFigu
 
 
 def flat_tops(scene: Scene, proof: Proof) -> Iterator[FlatTop]:
-    """Of each target with a profile that is flat, if light falls on it."""
+    """The figures of each target with a profile that is flat, if light falls on it."""
     for key, target, light in zip(scene.target_keys, scene.targets, proof.lights, strict=True):
         if target.profile is not None and target.profile.shape != "gaussian" and light.picture.any():
             pixel = tuple(side / n for side, n in zip(target.size, target.columns_rows, strict=True))

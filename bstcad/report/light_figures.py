@@ -49,19 +49,19 @@ SEEN = {
 }
 LIT = 0.01  # a pixel is lit where the target exceeds this part of its maximum
 HEADROOM = 1.06  # the scale ends above the brightest there is, so that even light is not as white as the paper
-GLARING = 2.0  # of the target's maximum: up to here the scale follows a hot spot …
+GLARING = 2.0  # multiple of the target's maximum: up to here the scale follows a hot spot …
 RARE = 99.9  # … and beyond it this percentile of the irradiance
-SPOT = 0.1  # of the largest difference: the scale reaches as far at least, or even light would look torn
+SPOT = 0.1  # part of the largest difference: the scale reaches as far at least, or even light would look torn
 TONES = 128  # the eye loses nothing, a PNG becomes a third as large
-MARK = 0.045  # of a picture's side: how far the ends of a cut reach into it
+MARK = 0.045  # part of a picture's side, by which the ends of a cut reach into it
 CUTS = {"centre": BLUE, "brightest place": VERMILION}
 ACROSS = 4  # pictures of spectral lines in a row
 PANEL, TALLEST = 2.4, 4.8  # inches: width of such a picture, and at most its height
 DENSE = 300  # outliers whose dots need to be small
 MEAN_LIT, PERCENT_LIT = "irradiance / mean lit", "% of mean lit irradiance"
 FORM_UNITS = ((1e-3, 1e3, "µm"), (0.0, 1e6, "nm"))  # (from this many mm on, times, written)
-BINS = 60  # of the histogram of trials
-SHOWN = 3  # of the worst trials
+BINS = 60  # bins of the histogram of trials
+SHOWN = 3  # number of the worst trials
 # The 1931 standard observer as sums of Gaussians with two widths: weight, centre, width below and above it (nm).
 # Wyman, Sloan and Shirley, Journal of Computer Graphics Techniques 2(2), 2013, multi-lobe fit.
 LOBES = (
@@ -87,7 +87,7 @@ class View:
 
     @classmethod
     def of(cls, scene: Scene, number: int = 0) -> View:
-        """Of a scene's target, the first of several or another."""
+        """The view of a scene's target, the first of several or another."""
         target, plane = scene.targets[number], scene.targets[number].screen.plane
         return cls(
             target.x, target.y, target.seen_from, optic=scene.optic, tilt=plane.tilt, number=number, labels=plane.labels
@@ -223,7 +223,7 @@ def _pixel_centres(extent: Extent, pixels: int) -> np.ndarray:
 class Cut:
     """Where the irradiance is cut: a row and a column of the picture in coordinates."""
 
-    name: str  # of CUTS
+    name: str  # name in CUTS
     row: int
     column: int
     x: float  # mm, the middle of the column

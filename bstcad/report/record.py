@@ -61,7 +61,7 @@ LEFT_OUT = {  # LeftOut.kind: in words
     "stray light": "stray light",
     "diffraction": "diffraction",
 }
-NOTHING = 1e-4  # of the light, and of RRMSD: an effect that changes less changes nothing
+NOTHING = 1e-4  # change of the light, and of RRMSD, below which an effect changes nothing
 SHARP = 5e-3  # pixels; a smaller blur is none
 
 # Keys of a report whose figures are those of the worst of its goals, and what they are called there.
@@ -80,7 +80,7 @@ class Stage:
     name: str  # such as stage 2
     seconds: Seconds  # wall time
     rrmsd: Rrmsd | None = None  # after it
-    cpu_seconds: Seconds | None = None  # of all processors; None: another process had a part in it, or unknown
+    cpu_seconds: Seconds | None = None  # seconds of all processors; None: another process had a part in it, or unknown
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class PrecisionTest(TypedDict):
     control_points: int  # a side
     merit: Size  # relative difference before the first step
     gradient: Size  # relative difference of its norm
-    evaluations: int  # of each precision
+    evaluations: int  # evaluations of each precision
     rrmsd_float64: Rrmsd  # after them
     rrmsd_float32: Rrmsd  # after as many evaluations
     heights: Size  # mm; largest difference of a control point
@@ -108,8 +108,8 @@ class Line:
     """The light of one line of a spectrum by itself."""
 
     wavelength: Size  # nm
-    share: Share  # of all light
-    rrmsd: Rrmsd  # of its picture against the target
+    share: Share  # part of all light
+    rrmsd: Rrmsd  # RRMSD of its picture against the target
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class Making:
     stages: tuple[Stage, ...] = ()
     history: tuple[Point, ...] = ()
     machine: Mapping[str, Scalar] | None = None
-    versions: Mapping[str, str] | None = None  # of the libraries
+    versions: Mapping[str, str] | None = None  # versions of the libraries
     # grid, iterations, mass error, reason to stop, and of analysis.steepness the share and the steepest slope (degrees)
     transport: Mapping[str, Scalar] | None = None
     skipped_steps: int | None = None  # left out because their gradient was not finite
@@ -141,7 +141,7 @@ class LeftOut:
     """An effect that is not simulated, and its change (analysis.neglected_effects.Change); None: not known."""
 
     kind: str  # a word of LEFT_OUT
-    flux_change: float | None  # of 1
+    flux_change: float | None  # change of the flux, as a part of 1
     rrmsd_change: float | None  # absolute
     blur_pixels: float | None  # full width on the target
     detail: str = ""  # the assumption of the estimate, or why nothing is known
@@ -155,17 +155,17 @@ class Contents:
 
     __pydantic_config__ = STRICT
 
-    name: str  # of the design and of its folder
-    title: str  # of the scene
+    name: str  # name of the design and of its folder
+    title: str  # title of the scene
     # see passed and given_up; "no limit was asked": every check passed, and the scene sets no limit on the light
     verdict: Literal["passed", "passed with remarks", "no limit was asked", "failed"]
     passed: bool  # every check
-    # of the light on each target; figures of light outside of this list are those on the target with the largest RRMSD
+    # figures of the light on each target; those outside of this list are of the target with the largest RRMSD
     goals: Annotated[tuple[GoalFigures, ...], Field(min_length=1, max_length=100), FailFast()]
-    rrmsd: Rrmsd  # of the irradiance against the target, by the flux into each pixel
+    rrmsd: Rrmsd  # RRMSD of the irradiance against the target, by the flux into each pixel
     rrmsd_tent: Rrmsd | None  # by linear binning
     rrmsd_noise: Annotated[float, Field(ge=0, le=1e3)]  # standard error of rrmsd
-    light_on_target: Share  # of the source's flux
+    light_on_target: Share  # part of the source's flux
     efficiency: Share  # flux on the target over flux that leaves the back face
     flux: Mapping[str, Share]  # where the source's flux goes; sums to 1
     prescription: Mapping[str, Any]  # every surface as it was designed
@@ -175,14 +175,14 @@ class Contents:
     checks: Annotated[tuple[Check, ...], Field(max_length=1000), FailFast()]  # in their order in the report
     effects: Mapping[str, tuple[str, ...]]  # simulated, left_out
     machine: Mapping[str, Scalar]  # processors, memory, threads, device
-    versions: Mapping[str, str]  # of the libraries, by name
-    seed: int  # of every random choice
-    version: str | None = None  # of bstcad, which wrote it
+    versions: Mapping[str, str]  # versions of the libraries, by name
+    seed: int  # seed of every random choice
+    version: str | None = None  # version of bstcad, which wrote it
     rrmsd_whole: Rrmsd | None = None  # against the whole picture, of which light can reach a part; None: it reaches all
     # what light cannot reach: area (of the target, as a part of it), light (of the picture), angle (degrees by which a
     # face of the index turns light before it reflects it; None: of a mirror); None: nothing
     unreachable: Mapping[str, Size | None] | None = None
-    leak: Share | None = None  # of the light on the target, on its dark pixels (optics.irradiance.Leak); None: no dark
+    leak: Share | None = None  # part of the target's light that is on its dark pixels; None: no dark
     contrast: Size | None = None  # mean irradiance of the lit pixels over that of the dark ones; None: or without leak
     optic: Literal["lens", "mirror"] = "lens"  # the kind of the design
     quality: str | None = None  # tailoring.quality
@@ -198,11 +198,11 @@ class Contents:
     stability: Mapping[str, float | int | None] | None = None
     blur: Blur | None = None  # by the source's size; None: it has no size
     finest_detail: FinestDetail | None = None  # how wide a point of the picture becomes
-    lines: tuple[Line, ...] = ()  # of a spectrum; none: it has one line
+    lines: tuple[Line, ...] = ()  # lines of a spectrum; none: it has one line
     picture: tuple[str, ...] = ()  # sentences on how the picture was read: first of several, tones, transparency, fit
     given_up: tuple[str, ...] = ()  # remarks: sentences on wishes of the scene that the design does not fulfil
     remarks: tuple[str, ...] = ()  # the id of each of these sentences
-    estimates: tuple[LeftOut, ...] = ()  # of the effects that are not simulated, the largest change first
+    estimates: tuple[LeftOut, ...] = ()  # changes by effects that are not simulated, the largest first
     # the end of the convergence curve, as analysis.cost.Ending has it; None: there is no curve
     convergence: Mapping[str, Size | None] | None = None
     # where the error sits: parts [{name, error, pixels}] (parts of the squared error, and of the pixels), octaves
@@ -219,12 +219,12 @@ class Contents:
     # a made part by its cloud, as measured.made_part has it: points, alignment, pv, rms, rrmsd_predicted, passed …
     measured: Mapping[str, Any] | None = None
     order: Order | None = None  # for a machine shop
-    flat_tops: tuple[FlatTop, ...] = ()  # of the targets with a flat profile
+    flat_tops: tuple[FlatTop, ...] = ()  # figures of the targets with a flat profile
     wavefront: WavefrontFigures | None = None  # None: none is asked for, or no light comes to where it is stated
 
     @property
     def worst(self) -> GoalFigures:
-        """Of the target with the largest RRMSD."""
+        """The figures of the target with the largest RRMSD."""
         return self.goals[worst(goal.rrmsd for goal in self.goals)]
 
     @property
@@ -247,7 +247,7 @@ class Contents:
 
 
 ALL = tuple(entry.name for entry in fields(Contents))
-KEYS = ALL[: ALL.index("seed") + 1]  # of every report.json, in this order
+KEYS = ALL[: ALL.index("seed") + 1]  # keys of every report.json, in this order
 # keys though nothing is known
 STATED = {*KEYS, "leak", "contrast", "optic", "twins", "rrmsd_asked", "given_up", "remarks"}
 

@@ -9,7 +9,7 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.sources import Emitter
 from bstcad.scene.blank import INDICES, LensBlank
 
-COVERED = 0.9  # of the lens's width: a beam narrower than that leaves a part dark that somebody pays for
+COVERED = 0.9  # part of the lens's width; a narrower beam leaves a part dark that somebody pays for
 SAMPLES = 200  # a side of the lens, at which light is looked for
 
 

@@ -35,7 +35,7 @@ NEVER = 1e300  # the next border of a walk that crosses no more borders of a kin
 WIDE = 1e6  # pixels; a wider triangle may round its way into any column
 STRIP = 16  # rows of tubes whose gradient one thread takes at a time
 
-ON, NOWHERE = 0, 16  # of a corner: on the screen; farther than FARTHEST, or not a number
+ON, NOWHERE = 0, 16  # state of a corner: on the screen; farther than FARTHEST, or not a number
 LEFT, RIGHT, ABOVE, BELOW = 1, 2, 4, 8  # or beyond one or two of its borders
 
 inlined = njit(forceinline=True, error_model="numpy")

@@ -16,7 +16,7 @@ from typing import Any
 import numba
 
 FOLDER = Path(__file__).parent
-PREFIX = "kernels-"  # of a folder of caches
+PREFIX = "kernels-"  # first part of the name of a folder of caches
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

@@ -284,7 +284,7 @@ def _cross_adjoint(
 class Crossing(NamedTuple):
     """Numbers of a crossing beside the net and the rays."""
 
-    faces: kernel_arguments.Faces  # of which those of the front do not count
+    faces: kernel_arguments.Faces  # numbers, of which those of the front do not count
     tilted: kernel_arguments.Tilted | None  # the screen's tilt
     lands: bool  # on the screen? else rays go on behind the face
     loses: bool  # does the face take flux? then path and angle of incidence are asked for

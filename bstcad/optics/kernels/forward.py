@@ -428,7 +428,7 @@ def _dim(faces, losses, count, work, lines):
             left = flux * math.exp(-losses.coefficient * work[PATH + r])
             lines[BY_GLASS] += flux - left
             flux, cosine = left, work[COS_BACK + r]
-            if not faces.reflects:  # of refraction, in which the table is smooth up to the critical angle
+            if not faces.reflects:  # cosine of refraction, in which the table is smooth up to the critical angle
                 cosine = math.sqrt(max(1.0 - faces.index * faces.index * (1.0 - cosine * cosine), 0.0))
             left = flux * _share(losses.back, cosine)
             lines[BY_FACES] += flux - left

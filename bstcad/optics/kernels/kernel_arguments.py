@@ -64,7 +64,7 @@ class Fates(NamedTuple):
 class Tilted(NamedTuple):
     """A tilted plane as numbers, in the frame in which light begins along +z; z from the net's plane is `throw`."""
 
-    x: float  # of the point C that it is turned about (mm), from which x and y on the plane count
+    x: float  # place of the point C that it is turned about (mm), from which x and y on the plane count
     y: float
     n_x: float  # the normal, with the light that the plane is there for
     n_y: float
@@ -81,8 +81,8 @@ class Faces(NamedTuple):
     """The lens and the screen as numbers, in the frame in which light begins along +z (see `faces`)."""
 
     reflects: int  # 1: the net is a mirror
-    curvature: float  # of the front (1/mm)
-    conic_constant: float  # of the front
+    curvature: float  # curvature of the front (1/mm)
+    conic_constant: float  # conic constant of the front
     index: float  # before the net over that behind it, the law's η
     front_x: float  # outlines.Limits of the front's clear aperture (mm, mm, mm²)
     front_y: float
@@ -111,10 +111,10 @@ class Cells(NamedTuple):
     """n x n cells with a ray in each."""
 
     n: int
-    key: np.uint64  # of the jitter
-    width: float  # of a cell (mm)
+    key: np.uint64  # key of the jitter
+    width: float  # size of a cell (mm)
     height: float
-    half_x: float  # of the window (mm)
+    half_x: float  # half extent of the window (mm)
     half_y: float
     stride: np.uint64  # sampling.STRIDE
     mix_1: np.uint64  # sampling.MIX_1
@@ -170,7 +170,7 @@ class Losses(NamedTuple):
     told: int  # 0: there are none
     front: np.ndarray
     back: np.ndarray
-    coefficient: float  # of absorption (1/mm)
+    coefficient: float  # coefficient of absorption (1/mm)
 
 
 NO_LOSSES = Losses(0, np.ones(2), np.ones(2), 0.0)

@@ -230,7 +230,7 @@ def largest_bending(
             for part, (first, last) in enumerate(zip(ends, ends[1:], strict=False))
         ],
     )
-    first = found.argmax(0)  # of equal values the first, in whichever part
+    first = found.argmax(0)  # the first of equal values, in whichever part
     kinds = np.arange(KINDS)
     values = found[first, kinds]
     values[2] = math.sqrt(max(values[2], 0.0))
@@ -248,7 +248,7 @@ def _across(net, a, i, j):
 @compiled(error_model="numpy")
 def _largest(net, along_x, along_y, x, y, limits, bounds, first, last, found, place, count):
     """The figures of spans first … last - 1 along x, slopes squared."""
-    spans, places = y.shape  # of a line of spans along y
+    spans, places = y.shape  # spans and places of a line of spans along y
     reach_x, reach_y, reach2 = limits
     for i in range(first, last):
         for p in range(places):
