@@ -17,12 +17,12 @@ from bstcad.analysis.shape import thickness_range
 from bstcad.analysis.steepness import Steepness, needed
 from bstcad.baselines import integration, paper
 from bstcad.folder import Made
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.reach import GRAZING, grazing_of, spread_at, unreached
 from bstcad.optics.sides import both
-from bstcad.optics.sources import Source
 from bstcad.report.record import Making, Point
 from bstcad.report.record import Stage as StageRecord
 from bstcad.runs import processes
@@ -278,7 +278,7 @@ def _compared(making: Making, task: Task, lens: Lens, before: int) -> Making:
     return replace(making, twins=twins, stages=stages, seconds_total=making.seconds_total + stage.seconds)
 
 
-def steepness(source: Source, lens: Lens, goal: Goal, sent: TransportMap) -> Steepness:
+def steepness(source: Emitter, lens: Lens, goal: Goal, sent: TransportMap) -> Steepness:
     """The slope that the light of a goal needs of the back, by the map of stage 1."""
     at_back = sent.plane == "back"
     return needed(source, lens, goal.receiver, goal.picture, x=sent.x, y=sent.y, places=sent.source, at_back=at_back)

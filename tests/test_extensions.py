@@ -15,11 +15,11 @@ from bstcad import pipeline
 from bstcad.cad import mesh, patches
 from bstcad.judges import faces, mitsuba
 from bstcad.judges.faces import Traced
+from bstcad.optics.emitters import Emitter, all_alive
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.receivers import Receiver
-from bstcad.optics.sources import Emitter, all_alive
 from bstcad.optics.surfaces import sag
 from bstcad.report.light_figures import View
 from bstcad.scene.errors import SceneError

@@ -15,9 +15,9 @@ from bstcad.optics.bspline import QUARTERS, BSplineSurface, Spans, evaluate, eva
 from bstcad.optics.kernels import spline
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
+from bstcad.optics.point import Point
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.sides import coarser, plain, scaled, side, spread
-from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.tubes import launch_tubes
 from bstcad.scene.errors import SceneError

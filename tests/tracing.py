@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from bstcad.optics import sampling
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Rays
 from bstcad.optics.receivers import Receiver
-from bstcad.optics.sources import Source
 from bstcad.optics.trace import Simulation, across, launch_strips, simulate, simulate_plain
 
 
@@ -23,7 +23,7 @@ def stratified(window: Rectangle, n: int, seed: int, dtype: torch.dtype = torch.
     return torch.cat(x), torch.cat(y)
 
 
-def launch(source: Source, lens: Lens, n: int, seed: int, area: Rectangle | None = None) -> Rays:
+def launch(source: Emitter, lens: Lens, n: int, seed: int, area: Rectangle | None = None) -> Rays:
     """The rays of `launch_strips` in one bundle, (3, rays), neighbours beside each other."""
     strips = list(launch_strips(source, lens, n, seed, area))
     position, direction = (torch.cat([getattr(s, name) for s in strips], dim=1) for name in ("position", "direction"))
@@ -36,11 +36,11 @@ def from_first_net_plain(coming: Rays, lens: Lens, plane: Receiver) -> Landed:
     return plane.land(across(coming, lens.interfaces[lens.freeform[0] :]))
 
 
-def simulated(source: Source, lens: Lens, screen: Screen, n: int, seed: int) -> Simulation:
+def simulated(source: Emitter, lens: Lens, screen: Screen, n: int, seed: int) -> Simulation:
     """The light of n x n stratified rays of one source on the screen."""
     return simulate([(1.0, source, lens, seed)], screen, n)
 
 
-def simulated_plain(source: Source, lens: Lens, screen: Screen, n: int, seed: int) -> Simulation:
+def simulated_plain(source: Emitter, lens: Lens, screen: Screen, n: int, seed: int) -> Simulation:
     """`simulated` in plain torch."""
     return simulate_plain([(1.0, source, lens, seed)], screen, n)

@@ -15,6 +15,7 @@ from bstcad.analysis.neglected_effects import difference
 from bstcad.analysis.shape import ripple
 from bstcad.optics import sampling
 from bstcad.optics.channels import Channel, points
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import cross, intersect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
@@ -22,7 +23,6 @@ from bstcad.optics.measure import IMAGE_PLACES, detail_width, images, tubes_of, 
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays
 from bstcad.optics.receivers import Receiver
-from bstcad.optics.sources import Source
 from bstcad.optics.trace import (
     across,
     clear_window,
@@ -48,14 +48,14 @@ FAN = 15  # rays
 LINES = 33  # lines of the ray mapping, each way
 
 
-def fan(source: Source, lens: Lens, plane: Receiver) -> np.ndarray:
+def fan(source: Emitter, lens: Lens, plane: Receiver) -> np.ndarray:
     """Polylines (rays, k, 3) in mm in y = 0: source, each surface on the way, the plane; only rays that arrive."""
     half = clear_window(source, lens).width / 2
     x = torch.linspace(-0.98 * half, 0.98 * half, FAN, dtype=torch.float64)
     return _polylines(source.rays(x, torch.zeros_like(x), lens.entrance.z, 1.0), lens, plane)[0]
 
 
-def bundle(source: Source, lens: Lens, plane: Receiver, n: int) -> tuple[np.ndarray, np.ndarray]:
+def bundle(source: Emitter, lens: Lens, plane: Receiver, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Polylines of rays through n x n cells of the light, and the flux (rays,) with which each arrives.
 
     Each ray carries the flux of its cell; the source's whole flux is 1.
@@ -74,7 +74,7 @@ def _polylines(rays: Rays, lens: Lens, plane: Receiver) -> tuple[np.ndarray, np.
     return corners[:, :, arrive].permute(2, 0, 1).numpy(), landed.flux[arrive].numpy()
 
 
-def ray_map(source: Source, lens: Lens, plane: Receiver) -> tuple[np.ndarray, np.ndarray]:
+def ray_map(source: Emitter, lens: Lens, plane: Receiver) -> tuple[np.ndarray, np.ndarray]:
     """A regular grid on the front's vertex plane, and its landing points on the plane: each (k, k, 2) in mm.
 
     NaN where there is no light or the ray is lost.
@@ -97,7 +97,7 @@ CORNERS = tuple((u, v) for u in (-1, 0, 1) for v in (-1, 0, 1))  # places on an 
 WHOLE = 0.99  # part of the clear aperture: light that reaches so far fills the face
 
 
-def used(source: Source, lens: Lens) -> tuple[Outline | None, ...]:
+def used(source: Emitter, lens: Lens) -> tuple[Outline | None, ...]:
     """Smallest circle or rectangle about the axis (mm) that holds all light on each face, in the order of the light.
 
     None: the light fills the face's clear aperture.  Only light that gets through all faces counts; of an extended
@@ -111,7 +111,7 @@ def used(source: Source, lens: Lens) -> tuple[Outline | None, ...]:
     return tuple(_patch(face, interface.outline) for face, interface in zip(hits, lens.interfaces, strict=True))
 
 
-def _hits(source: Source, lens: Lens) -> Tensor:
+def _hits(source: Emitter, lens: Lens) -> Tensor:
     """x and y (faces, 2, n) (mm) on each face of the rays that get through all faces."""
     area = clear_window(source, lens)
     line = torch.linspace(-0.5, 0.5, NEEDED_RAYS, dtype=torch.float64) * (1 - 1e-9)

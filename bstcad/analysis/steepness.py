@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import intersect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.sources import Source
 from bstcad.optics.trace import across
 from bstcad.optics.tubes import rays_to
 
@@ -34,7 +34,7 @@ class Steepness:
 
 @torch.no_grad()
 def needed(
-    source: Source, lens: Lens, screen: Screen, picture: np.ndarray, *, x: np.ndarray, y: np.ndarray,
+    source: Emitter, lens: Lens, screen: Screen, picture: np.ndarray, *, x: np.ndarray, y: np.ndarray,
     places: np.ndarray, at_back: bool = True,
 ) -> Steepness:  # fmt: skip
     """By the places (c, r, 2) (mm) on the back where the light passes for points x (c,) by y (r,) (mm) of the screen.

@@ -18,12 +18,12 @@ from bstcad.judges import faces
 from bstcad.judges.faces import Face, FaceError, Traced
 from bstcad.optics import sampling
 from bstcad.optics.channels import Channel, places
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import a_side
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Rays, axes
-from bstcad.optics.sources import Source
 from bstcad.optics.trace import clear_window, launch_strips
 from bstcad.optics.wavefront_error import followed, from_reference
 
@@ -109,7 +109,7 @@ class PathsApart:
     rays: int  # that both traces bring there
 
 
-def paths_apart(lens: Lens, source: Source, z: float, n: int = 128) -> PathsApart:
+def paths_apart(lens: Lens, source: Emitter, z: float, n: int = 128) -> PathsApart:
     """batoid against bstcad: places and optical paths on a plane z (mm), n x n rays of a point or of parallel light.
 
     The clear apertures of the lens have to keep one and a half pitches inside the rims of its nets.  batoid's rays
@@ -136,7 +136,7 @@ def _flat(rays: Rays) -> Rays:
     return replace(rays, position=position, direction=direction)
 
 
-def _before_reference(source: Source, rays: Rays, z: float) -> np.ndarray:
+def _before_reference(source: Emitter, rays: Rays, z: float) -> np.ndarray:
     """Path (mm) of each ray, from its start, that ours leave out: to the reference of `wavefront_error.followed`.
 
     That is the plane across parallel light, or the sphere about a point, through where the axis meets the plane z.

@@ -28,12 +28,14 @@ from trimesh import Trimesh
 from bstcad.judges import faces
 from bstcad.judges.faces import Face, FaceError, Traced
 from bstcad.optics.channels import Channel, points
+from bstcad.optics.collimated import Collimated
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Fresnel, Losses
 from bstcad.optics.outlines import Outline
+from bstcad.optics.point import Point
 from bstcad.optics.rays import axes
-from bstcad.optics.sources import Collimated, Point, Source
 from bstcad.optics.trace import window
 
 LLVM = 16  # the first version by which its kernels compile; with 15 the process ends
@@ -272,7 +274,7 @@ def _slide(source: Point, lens: Lens, half: float) -> Entry:
     return _texture(_irradiance(source, x - sense * across, y - across, z + sense))
 
 
-def _irradiance(source: Source, x: np.ndarray, y: np.ndarray, z: float) -> np.ndarray:
+def _irradiance(source: Emitter, x: np.ndarray, y: np.ndarray, z: float) -> np.ndarray:
     """(rows, columns) of a source on a plane z (mm)."""
     return source.irradiance(*map(torch.from_numpy, np.meshgrid(x, y)), z).numpy()
 

@@ -16,15 +16,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from bstcad.optics import sampling
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.lens import Dimming, Lens
-from bstcad.optics.sources import Source
 
 
 @dataclass(frozen=True)
 class Channel:
     """One source in media of one index each."""
 
-    source: Source  # its whole flux is 1
+    source: Emitter  # its whole flux is 1
     index: float  # refractive index of the lens at the source's wavelength
     weight: float = 1.0  # part of all light; the weights of all channels sum to 1
     losses: Dimming | None = None  # losses at faces and in glass at its wavelength; None: there are none
@@ -35,7 +35,7 @@ class Channel:
         return lens if same else replace(lens, index=self.index, losses=self.losses)
 
 
-def channels_of(source: Source, index: Callable[[float], float], points: int, draw: int = 0) -> tuple[Channel, ...]:
+def channels_of(source: Emitter, index: Callable[[float], float], points: int, draw: int = 0) -> tuple[Channel, ...]:
     """The channels of a source; index: of the lens, by the wavelength (nm).
 
     points: of an extended source, at least two; draw: another number, other points.  A point or a parallel beam of one
@@ -52,7 +52,7 @@ def channels_of(source: Source, index: Callable[[float], float], points: int, dr
     )
 
 
-def drawn_channels(source: Source, index: Callable[[float], float], points: int, seed: int) -> tuple[Channel, ...]:
+def drawn_channels(source: Emitter, index: Callable[[float], float], points: int, seed: int) -> tuple[Channel, ...]:
     """The channels of an extended source at points drawn at random: pictures by them have its picture as their mean.
 
     points: of all lines together, at least one a line (sampling.scattered).
@@ -64,7 +64,7 @@ def drawn_channels(source: Source, index: Callable[[float], float], points: int,
     )
 
 
-def _elements(source: Source, index: Callable[[float], float], places_of: Callable) -> tuple[Channel, ...]:
+def _elements(source: Emitter, index: Callable[[float], float], places_of: Callable) -> tuple[Channel, ...]:
     """The light of each line shared evenly among points of the extent: places_of the line's share and its number."""
     elements = []
     for number, (nm, share) in enumerate(source.lines):
@@ -91,7 +91,7 @@ def places(channels: Sequence[Channel]) -> tuple[int, ...]:
     """For each channel the number of its source among the different ones of its line, from 0 on."""
     numbers = [0] * len(channels)
     for members in _lines(channels):
-        known: dict[Source, int] = {}
+        known: dict[Emitter, int] = {}
         for k in members:
             numbers[k] = known.setdefault(channels[k].source, len(known))
     return tuple(numbers)

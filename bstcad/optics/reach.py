@@ -18,12 +18,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import Law
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays
 from bstcad.optics.receivers import Receiver
-from bstcad.optics.sources import Source
 from bstcad.optics.tubes import rays_to
 
 GRAZING = math.radians(85)  # from the normal, in air; 0.2° from the critical angle in PMMA
@@ -45,7 +45,7 @@ def grazing_of(index: float, others: Iterable[float], spread: float = 0.0) -> fl
     return math.asin(index * math.sin(max(steepest - spread, 0.0)))
 
 
-def spread_at(source: Source, lens: Lens) -> float:
+def spread_at(source: Emitter, lens: Lens) -> float:
     """The largest angle (rad) before the last freeform face, at its middle, between light from the middle of a source
     and light from the ends of its extent; 0 for a point.
     """

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from bstcad.optics import irradiance, ops, sampling
 from bstcad.optics.channels import Channel, places, weighted_sum
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import Interface, Loss, Reflect, Refract, cross, intersect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.kernel_arguments import KEPT, beam
@@ -32,7 +33,6 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline, Rectangle
 from bstcad.optics.rays import Landed, Rays, Status
 from bstcad.optics.receivers import Receiver
-from bstcad.optics.sources import Source
 from bstcad.optics.surfaces import Surface
 
 UNDERSIDE = "vignetted by the underside"  # a line of the ledger: light beside the optical part of a front
@@ -72,7 +72,7 @@ def _of_net(name: str, rays: Rays, interface: Interface) -> Callable[..., Any] |
 
 
 def whole_kernel(
-    name: str, source: Source, lens: Lens, plane: Receiver, tables: bool = True
+    name: str, source: Emitter, lens: Lens, plane: Receiver, tables: bool = True
 ) -> Callable[..., Any] | None:
     """The kernel of this name, if it knows the whole way: this source, all interfaces of the lens and the receiver.
 
@@ -107,14 +107,14 @@ def gets_through(rays: Rays, lens: Lens) -> Tensor:
 # --- many rays from a source ------------------------------------------------------------------------------------------
 
 
-def window(source: Source, lens: Lens) -> Rectangle:
+def window(source: Emitter, lens: Lens) -> Rectangle:
     """The rectangle of the plane through the vertex of the first surface that all useful light crosses."""
     first, aperture = lens.entrance, lens.interfaces[0].outline
     return source.window(aperture, first.z, first.sags(aperture))
 
 
 @torch.no_grad()
-def clear_window(source: Source, lens: Lens, n: int = 256) -> Rectangle:
+def clear_window(source: Emitter, lens: Lens, n: int = 256) -> Rectangle:
     """The rectangle of the same plane that holds all light which gets through both faces, with two cells to spare.
 
     Light outside it still counts as lost; it need not be traced while tailoring.
@@ -131,7 +131,7 @@ def clear_window(source: Source, lens: Lens, n: int = 256) -> Rectangle:
     return Rectangle(2 * half_x, 2 * half_y)
 
 
-def launch_strips(source: Source, lens: Lens, n: int, seed: int, area: Rectangle | None = None) -> Iterator[Rays]:
+def launch_strips(source: Emitter, lens: Lens, n: int, seed: int, area: Rectangle | None = None) -> Iterator[Rays]:
     """n x n stratified rays over `area` (default: the whole window), a strip of it at a time.
 
     Points that carry no flux launch no ray.
@@ -160,7 +160,7 @@ class Simulation:
         return irradiance.efficiency(self.flux)
 
 
-Lights = Sequence[tuple[float, Source, Lens, int]]  # (weight, source, lens as this light meets it, seed) of each
+Lights = Sequence[tuple[float, Emitter, Lens, int]]  # (weight, source, lens as this light meets it, seed) of each
 
 
 @torch.no_grad()
@@ -214,7 +214,7 @@ def _has_underside(lens: Lens) -> bool:
 
 
 @functools.lru_cache(maxsize=4096)  # whatever the back
-def on_underside(source: Source, front: Surface, outline: Outline, n: int = CELLS) -> float:
+def on_underside(source: Emitter, front: Surface, outline: Outline, n: int = CELLS) -> float:
     """Part of a source's light that meets the plane around the optical part of a front, inside the lens's outline."""
     plane, area = front.around, Rectangle(*(2 * half for half in outline.half_extent))
     x, y = sampling.grid(area, n)

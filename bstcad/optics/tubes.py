@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics import ops
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.reductions import total
@@ -25,7 +26,6 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed, Rays, Status, joined
 from bstcad.optics.receivers import LevelPlane, Receiver
 from bstcad.optics.sides import Sides, both, spread
-from bstcad.optics.sources import Source
 from bstcad.optics.trace import behind, from_first_net, gets_through, whole_kernel
 
 ALL = slice(None)
@@ -75,7 +75,7 @@ class Tubes:
 
 
 @torch.no_grad()
-def launch_tubes(source: Source, lens: Lens, n: int) -> Tubes:
+def launch_tubes(source: Emitter, lens: Lens, n: int) -> Tubes:
     """n x n tubes that hold all the light which gets through both faces of the lens.
 
     Across a net of another number of control points along x than along y there are about as many, in the proportion of
@@ -100,7 +100,7 @@ def launch_tubes(source: Source, lens: Lens, n: int) -> Tubes:
 
 @torch.no_grad()
 def picture(
-    source: Source, lens: Lens, screen: Screen, n: int, few: int = SHEET, over_the_back: bool = False
+    source: Emitter, lens: Lens, screen: Screen, n: int, few: int = SHEET, over_the_back: bool = False
 ) -> Tensor:
     """(rows, columns) flux in each pixel by n x n tubes (`launch_tubes`), band by band: memory does not grow with n².
 
@@ -137,7 +137,7 @@ def _few_rows(columns: int) -> int:
     return max(1, CACHED // columns)
 
 
-def _tubes(source: Source, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes:
+def _tubes(source: Emitter, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes:
     z, like = lens.entrance.z, lens.like
     area = area_of(x, y).to(like.device)
     x, y = x.to(like), y.to(like)
@@ -155,7 +155,7 @@ def _tubes(source: Source, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes
     return Tubes(ways[first], _density(source, lens, x=x, y=y, lit=lit) * area)
 
 
-def _density(source: Source, lens: Lens, x: Tensor, y: Tensor, lit: Tensor | None) -> Tensor:
+def _density(source: Emitter, lens: Lens, x: Tensor, y: Tensor, lit: Tensor | None) -> Tensor:
     """Flux a mm² of the vertex plane that each tube carries; `lit`: which corners are, None: all of them."""
     density = source.irradiance(middle(x), middle(y), lens.entrance.z)
     if lit is not None:
@@ -167,12 +167,12 @@ def _density(source: Source, lens: Lens, x: Tensor, y: Tensor, lit: Tensor | Non
     return density.double()
 
 
-def _sheet(source: Source, lens: Lens, n: int, few: int = SHEET, over_the_back: bool = False) -> _Sheet:
+def _sheet(source: Emitter, lens: Lens, n: int, few: int = SHEET, over_the_back: bool = False) -> _Sheet:
     """The sheet over the beam if all of that gets through and none is asked for over the back."""
     return (None if over_the_back else _over_the_beam(source, lens, n)) or _over_the_back(source, lens, n, few)
 
 
-def _over_the_beam(source: Source, lens: Lens, n: int) -> _Sheet | None:
+def _over_the_beam(source: Emitter, lens: Lens, n: int) -> _Sheet | None:
     """A sheet over all of the beam; None if the lens cuts it."""
     z = lens.entrance.z
     spot, centre = source.spot(z)
@@ -196,7 +196,7 @@ def _over_the_beam(source: Source, lens: Lens, n: int) -> _Sheet | None:
     return _Sheet(rows, n_x, centre, cut=False)
 
 
-def _over_the_back(source: Source, lens: Lens, n: int, few: int) -> _Sheet:
+def _over_the_back(source: Emitter, lens: Lens, n: int, few: int) -> _Sheet:
     """A sheet whose rim meets the rim of the back face; on a fine grid by splines through a coarse one.
 
     Only the rim has to lie well: a tube may lie anywhere as long as its flux is that of its own quad.
@@ -229,7 +229,7 @@ def _quads(p: Tensor, where: Tensor) -> tuple[Tensor, ...]:
     return p[row, column], p[row, column + 1], p[row + 1, column], p[row + 1, column + 1]
 
 
-def _partly_lit(source: Source, lens: Lens, x: tuple[Tensor, ...], y: tuple[Tensor, ...]) -> Tensor:
+def _partly_lit(source: Emitter, lens: Lens, x: tuple[Tensor, ...], y: tuple[Tensor, ...]) -> Tensor:
     """Mean flux density (1/mm²) of the light that gets through, over PARTS x PARTS parts of each tube of `_quads`."""
     inner = torch.tensor([(k + 0.5) / PARTS for k in range(PARTS)], dtype=x[0].dtype, device=x[0].device)
     a, b = (t.reshape(-1, 1) for t in torch.meshgrid(inner, inner, indexing="ij"))
@@ -237,7 +237,7 @@ def _partly_lit(source: Source, lens: Lens, x: tuple[Tensor, ...], y: tuple[Tens
     return _getting_through(source, lens, p, q).view(PARTS**2, -1).mean(0)
 
 
-def _getting_through(source: Source, lens: Lens, x: Tensor, y: Tensor) -> Tensor:
+def _getting_through(source: Emitter, lens: Lens, x: Tensor, y: Tensor) -> Tensor:
     """Flux density (n,) (1/mm²) at points of the first vertex's plane (n,), zero where the lens cuts the light."""
     behind = LevelPlane(lens.back.z + 1.0)  # a plane behind the lens, whichever
     if lens.losses is None and (fast := whole_kernel("trace.land", source, lens, behind)):
@@ -268,7 +268,9 @@ def area_of(x: Tensor, y: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor, number: int | None = None) -> tuple[Tensor, Tensor, Rays]:
+def rays_to(
+    source: Emitter, lens: Lens, x: Tensor, y: Tensor, number: int | None = None
+) -> tuple[Tensor, Tensor, Rays]:
     """The rays that meet an interface of the lens at the points (x, y) (rows, columns) mm.
 
     Returns where they cross the vertex plane of the first surface (mm), and the rays at the interface, before they

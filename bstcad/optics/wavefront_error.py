@@ -24,12 +24,12 @@ import torch
 from torch import Tensor
 
 from bstcad.optics import sampling
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.motion import Motion
 from bstcad.optics.rays import Rays
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.sources import Source
 from bstcad.optics.trace import behind, clear_window
 from bstcad.optics.wavefront import NM, Wave, length
 
@@ -53,7 +53,7 @@ class ExitPupil:
 
 
 @torch.no_grad()
-def exit_pupil(source: Source, lens: Lens, z: float, n: int = RAYS) -> ExitPupil:
+def exit_pupil(source: Emitter, lens: Lens, z: float, n: int = RAYS) -> ExitPupil:
     """The light of a point or of parallel light that gets through a lens, on the plane z (mm)."""
     if source.extent is not None:
         raise ValueError("light of a source of some extent has no one wavefront; take one of its points or directions")
@@ -89,7 +89,7 @@ def _turned(row: list[float], vectors: Tensor) -> Tensor:
     return row[0] * vectors[0] + row[1] * vectors[1] + row[2] * vectors[2]
 
 
-def followed(source: Source, lens: Lens, rays: Rays, z: float) -> tuple[Rays, Tensor, float]:
+def followed(source: Emitter, lens: Lens, rays: Rays, z: float) -> tuple[Rays, Tensor, float]:
     """(rays from the source on the plane z, their optical path (mm), what that may be off by in mm).
 
     Let o be where the axis meets the vertex plane of the first surface.  Paths count from the plane through o across
@@ -112,7 +112,7 @@ def followed(source: Source, lens: Lens, rays: Rays, z: float) -> tuple[Rays, Te
     return landed, path + ahead * last, ROUNDINGS * torch.finfo(torch.float64).eps * longest
 
 
-def from_reference(source: Source, z: float, rays: Rays, sense: int) -> Tensor:
+def from_reference(source: Emitter, z: float, rays: Rays, sense: int) -> Tensor:
     """The way (mm) of rays to the first surface from where paths count; z: of its vertex, sense: of the light there."""
     place = torch.stack([*rays.position[:2], rays.above(z)])
     return source.reference(place, z, sense)
@@ -158,7 +158,7 @@ class WavefrontError:
 
 
 @torch.no_grad()
-def wavefront_error(source: Source, lens: Lens, wave: Wave, n: int = RAYS) -> WavefrontError:
+def wavefront_error(source: Emitter, lens: Lens, wave: Wave, n: int = RAYS) -> WavefrontError:
     """The error by n x n rays over the light of a point or of parallel light that gets through the lens.
 
     The lens is that of the source's main wavelength.  Raises ValueError if no ray can be compared.

@@ -17,10 +17,10 @@ import torch
 from bstcad.analysis.light import bundle, fan, ray_map
 from bstcad.analysis.shape import least_squares, survey, survey_front
 from bstcad.cad import mesh as meshes
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Light, Line
-from bstcad.optics.sources import Source
 from bstcad.optics.surfaces import Surface
 from bstcad.optics.wavefront_error import WavefrontError
 from bstcad.report import data_sheet, light_figures, rendering
@@ -126,7 +126,7 @@ class NoPictures(Pictures):
         """Draw nothing."""
 
 
-def draw_lens(source: Source, lens: Lens, screens: Sequence[Screen], view: View) -> Pngs:
+def draw_lens(source: Emitter, lens: Lens, screens: Sequence[Screen], view: View) -> Pngs:
     """The pictures of the lens but the 3-D one, with its rays to the screens; the front's surface if it is tailored."""
     farthest = max(screens, key=lambda screen: screen.plane.throw(0.0))
     of_front = {}
@@ -139,7 +139,7 @@ def draw_lens(source: Source, lens: Lens, screens: Sequence[Screen], view: View)
     }
 
 
-def draw_transport(source: Source, lens: Lens, screen: Screen, view: View) -> Pngs:
+def draw_transport(source: Emitter, lens: Lens, screen: Screen, view: View) -> Pngs:
     """The map of the light from the source to a screen."""
     return {numbered("transport", view.number): png(transport_map(*ray_map(source, lens, screen.plane), view))}
 

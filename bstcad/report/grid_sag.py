@@ -20,11 +20,11 @@ from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
 from bstcad.optics.bspline import BSplineSurface, basis_matrix
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
-from bstcad.optics.sources import Source
 from bstcad.optics.surfaces import Surface, sag
 from bstcad.optics.trace import launch_strips, trace
 from bstcad.report.units import environment
@@ -45,7 +45,7 @@ MET = 1e-9  # mm from the face: the ray has met it before the last step
 class Throw:
     """The light by which a grid is judged."""
 
-    source: Source  # a point or a parallel beam of one line
+    source: Emitter  # a point or a parallel beam of one line
     screens: tuple[Screen, ...]
 
 

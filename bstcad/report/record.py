@@ -44,7 +44,7 @@ from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, Proof
 from bstcad.verify.verdict import NO_LIMIT, Check, verdict
 
 if TYPE_CHECKING:
-    from bstcad.optics.sources import Source
+    from bstcad.optics.emitters import Emitter
 
 BY_HAND = "by hand"  # Making.stopped of a lens that was changed after it was designed, or comes from elsewhere
 LARGEST = 20_000_000  # bytes of a report; ten thousand evaluations fill one
@@ -363,7 +363,7 @@ def simulated(scene: Scene) -> Rows:
     return tables("simulated.txt.j2", scene=scene, extent=list(extent(scene.source)), names=LEFT_OUT)["simulated"]
 
 
-def extent(source: Source) -> Iterator[tuple[str, str]]:
+def extent(source: Emitter) -> Iterator[tuple[str, str]]:
     """The keys that give a source a size, each with the size in words."""
     yield from ((key, f"{size:g} {unit}") for key, size, unit in source.sizes())
 

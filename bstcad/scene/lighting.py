@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from bstcad.optics import sampling
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.outlines import Outline
-from bstcad.optics.sources import Emitter
 from bstcad.scene.blank import INDICES, LensBlank
 
 COVERED = 0.9  # part of the lens's width; a narrower beam leaves a part dark that somebody pays for

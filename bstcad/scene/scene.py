@@ -23,12 +23,14 @@ import torch
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_serializer, model_validator
 
 from bstcad.optics.channels import Channel, channels_of, drawn_channels, merged
+from bstcad.optics.collimated import Collimated
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.goal import Goal
 from bstcad.optics.key import Key
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
+from bstcad.optics.point import Point
 from bstcad.optics.sides import Sides, both
-from bstcad.optics.sources import Collimated, Emitter, Point, Source
 from bstcad.optics.wavefront import ALONG, PlaneWave, SphericalWave, Wave, ZernikeWave
 from bstcad.scene import effects, lighting, mount, picture, scene_file
 from bstcad.scene.blank import LensBlank, as_front, net_extent
@@ -408,7 +410,7 @@ def _tilted(target: Target, lens: LensBlank) -> Iterator[str]:
         yield f"target.tilt: an edge of the target {edge}; turn it less, make it smaller or move it along +z"
 
 
-def _of_wavefront(wave: Wave | None, source: Source, lens: LensBlank, accept: Accept) -> Iterator[str]:
+def _of_wavefront(wave: Wave | None, source: Emitter, lens: LensBlank, accept: Accept) -> Iterator[str]:
     """A wave that a lens cannot give to this light, or that no ray has."""
     if wave is None:
         if accept.wavefront is not None:

@@ -29,12 +29,12 @@ from typing_extensions import TypedDict
 from bstcad.folder import SCENE, read_nominal, scene_files
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, measure
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
 from bstcad.runs import environment, files, processes
 from bstcad.runs.cluster import HERE, Answer

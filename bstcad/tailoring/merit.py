@@ -42,6 +42,7 @@ from torch import Tensor
 
 from bstcad.optics.bspline import BSplineSurface, carrier
 from bstcad.optics.channels import Channel, weighted_sum
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.goal import Goal
 from bstcad.optics.interfaces import Law
 from bstcad.optics.irradiance import Screen
@@ -51,7 +52,6 @@ from bstcad.optics.measure import RayTubes
 from bstcad.optics.rays import Landed, Rays
 from bstcad.optics.reach import wanted_slopes
 from bstcad.optics.receivers import Receiver
-from bstcad.optics.sources import Source
 from bstcad.optics.trace import behind, through
 from bstcad.optics.tubes import Tubes, arriving, rays_to
 from bstcad.optics.wavefront import NM, Wave
@@ -212,7 +212,7 @@ def _from_source(lens: Lens, wave: Wave | None) -> Lens:
     return replace(lens, shaped=(0, *lens.freeform))
 
 
-def _ways(source: Source, sheet: Tubes, lens: Lens, measured: bool) -> tuple[Rays, Tensor | None]:
+def _ways(source: Emitter, sheet: Tubes, lens: Lens, measured: bool) -> tuple[Rays, Tensor | None]:
     """The corners of a sheet behind a lens, whose outline counts in the flux; with the path to there if measured."""
     lens = lens.unbounded()
     rays, path = sheet.coming, None
@@ -312,7 +312,7 @@ def _between(left: csr_array, t: Tensor, right: csr_array) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray((right @ within).T)).to(t)
 
 
-def local_weight(source: Source, lens: Lens, target: np.ndarray, screen: Screen, number: int | None = None) -> Tensor:
+def local_weight(source: Emitter, lens: Lens, target: np.ndarray, screen: Screen, number: int | None = None) -> Tensor:
     """w = (E / mean E)^-1/2 at each control point, E the target's irradiance where its light lands, smoothed.
 
     1 where the light does not land on the screen.  number: of the interface, which is a net; None: the back.

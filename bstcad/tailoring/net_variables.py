@@ -31,9 +31,9 @@ from scipy.sparse import csr_array, diags_array
 from torch import Tensor
 
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
-from bstcad.optics.sources import Source
 from bstcad.optics.trace import across, behind
 from bstcad.tailoring.merit import CoarseVariable, SobolevVariable
 from bstcad.transport.mapping import places_in
@@ -79,7 +79,7 @@ def _times(matrix: csr_array, t: Tensor, like: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def along_light(source: Source, lens: Lens, goals: Sequence[Goal]) -> tuple[csr_array, float]:
+def along_light(source: Emitter, lens: Lens, goals: Sequence[Goal]) -> tuple[csr_array, float]:
     """R and f for a lens with two nets.
 
     f is SHARE of the scale that makes both blocks move the pictures as far: by the paraxial shifts T / (n m_b) and

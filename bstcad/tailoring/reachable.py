@@ -21,13 +21,13 @@ import torch
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.goal import Goal
 from bstcad.optics.interfaces import Law
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.reach import GRAZING, room
 from bstcad.optics.receivers import Receiver
-from bstcad.optics.sources import Source
 from bstcad.scene.target import average
 from bstcad.tailoring.slope_fit import Fit
 from bstcad.tailoring.slope_map import (
@@ -51,7 +51,7 @@ COARSE = Fit(bending=1e-2, steps=40, degree=3)
 
 
 @torch.no_grad()
-def reachable(source: Source, lens: Lens, goal: Goal, grazing: float = GRAZING) -> np.ndarray | None:
+def reachable(source: Emitter, lens: Lens, goal: Goal, grazing: float = GRAZING) -> np.ndarray | None:
     """(rows, columns) True in the pixels that a design can light; None: all that the picture wants to be lit.
 
     lens: the blank, with the front that it will have.

@@ -30,6 +30,7 @@ from torch import Tensor
 
 from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
@@ -38,7 +39,6 @@ from bstcad.optics.rays import Rays
 from bstcad.optics.reach import GRAZING, kept_from_reflection, room, wanted_slopes
 from bstcad.optics.receivers import Receiver
 from bstcad.optics.sides import Sides, both
-from bstcad.optics.sources import Source
 from bstcad.optics.trace import across, clear_window, gets_through
 from bstcad.optics.tubes import rays_to
 from bstcad.scene.errors import SceneError
@@ -74,7 +74,7 @@ class FaceGrid:
 
 
 @torch.no_grad()
-def face_grid(source: Source, lens: Lens, window: Rectangle, cells: Sides) -> FaceGrid:
+def face_grid(source: Emitter, lens: Lens, window: Rectangle, cells: Sides) -> FaceGrid:
     """The ray that meets the last freeform face in the middle of each cell, so many a side or along x and along y.
 
     Its flux density is the source's on the vertex plane of the first surface times |∂q/∂b|, q where the ray crosses
@@ -94,7 +94,7 @@ def face_grid(source: Source, lens: Lens, window: Rectangle, cells: Sides) -> Fa
     return FaceGrid(window, at_face, density)
 
 
-def lit_window(source: Source, lens: Lens, n: int = 128) -> Rectangle:
+def lit_window(source: Emitter, lens: Lens, n: int = 128) -> Rectangle:
     """The rectangle of the last freeform face that light meets, with two cells to spare; SceneError if none does."""
     half_x, half_y = lens.last_freeform.outline.half_extent
     grid = face_grid(source, lens, Rectangle(2 * half_x, 2 * half_y), n)
@@ -128,7 +128,7 @@ class SlopeMap:
 
 
 def slope_map(
-    source: Source, lens: Lens, window: Rectangle, picture: np.ndarray, screen: Screen, n: int,
+    source: Emitter, lens: Lens, window: Rectangle, picture: np.ndarray, screen: Screen, n: int,
     previous: SlopeMap | None, hasty: bool = False, **solver,
 ) -> SlopeMap:  # fmt: skip
     """One round: transport on n x n cells for the sag of `lens`, with b(t) of the round before (the axis at first).
@@ -289,7 +289,7 @@ def corners_of(picture: np.ndarray) -> np.ndarray:
 
 
 @torch.no_grad()
-def source_density(source: Source, lens: Lens, n: int) -> tuple[Density, Frame]:
+def source_density(source: Emitter, lens: Lens, n: int) -> tuple[Density, Frame]:
     """The flux that gets through both faces, on n x n cells of a square in the plane of the first vertex."""
     area = clear_window(source, lens)
     side = max(area.width, area.height)
@@ -301,7 +301,7 @@ def source_density(source: Source, lens: Lens, n: int) -> tuple[Density, Frame]:
 
 
 def map_to_target(
-    source: Source,
+    source: Emitter,
     lens: Lens,
     picture: np.ndarray,
     screen: Screen,

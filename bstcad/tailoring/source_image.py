@@ -28,13 +28,13 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from bstcad.optics.channels import Channel
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import Screen, tent
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Draw, a_side, seen_through, simulated
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import in_pairs
-from bstcad.optics.sources import Source
 
 NODES = 5  # a side, from border to border of the screen, between which images are interpolated
 PLACES = 32  # a side of the back, through which they are looked for
@@ -53,7 +53,7 @@ SEED = 500_009  # added to the seed: rays that no judge sees
 class Spread:
     """A source of some size about its middle."""
 
-    source: Source  # of this size
+    source: Emitter  # of this size
     centre: tuple[Channel, ...]  # the light of its middle, one channel a line
     draw: Draw  # of its points
 
@@ -127,7 +127,7 @@ class Images:
     share: Tensor  # (9, places) flux of each over that of the middle
 
     @classmethod
-    def of(cls, source: Source, channel: Channel, lens: Lens, screen: Screen) -> Images:
+    def of(cls, source: Emitter, channel: Channel, lens: Lens, screen: Screen) -> Images:
         """Through the places that light of the middle and of all nine points gets through."""
         a, b = source.extent.half_extent
         points = [(i * APART, j * APART) for j in (-1, 0, 1) for i in (-1, 0, 1)]

@@ -15,12 +15,12 @@ import scipy.optimize
 from torch import Tensor
 
 from bstcad.optics import sampling
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays
 from bstcad.optics.reach import GRAZING
 from bstcad.optics.sides import both, coarser
-from bstcad.optics.sources import Source
 from bstcad.optics.trace import clear_window, trace
 from bstcad.scene.blank import CONIC_CONSTANTS
 from bstcad.scene.quality import COARSEST_GRID
@@ -181,7 +181,7 @@ def aimed(m: int, rays: int) -> int:
 
 
 def aimed_rays(
-    source: Source, lens: Lens, target: np.ndarray, screen: Screen, n: int, side: int, iterations: int
+    source: Emitter, lens: Lens, target: np.ndarray, screen: Screen, n: int, side: int, iterations: int
 ) -> tuple[Rays, Tensor, Mapping]:
     """Rays that cover the front, `side` each way, and the aim of each (mm) by a map on n x n cells."""
     mapping = map_to_target(source, lens, target, screen=screen, n=n, iterations=iterations, progress=lambda _: None)
@@ -192,7 +192,7 @@ def aimed_rays(
 
 
 def shaped_front(
-    source: Source, lens: Lens, target: np.ndarray, screen: Screen, free: tuple[str, ...],
+    source: Emitter, lens: Lens, target: np.ndarray, screen: Screen, free: tuple[str, ...],
     rim_sags: tuple[float, float], n: int = COARSEST_GRID, iterations: int = 100, repeats: int = 3,
 ) -> Lens:  # fmt: skip
     """The lens with the front for which a surface follows Wang et al.'s own map most closely.

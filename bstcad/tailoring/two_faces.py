@@ -30,6 +30,7 @@ from torch import Tensor
 
 from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.reductions import total
@@ -38,7 +39,6 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays
 from bstcad.optics.reach import kept_from_reflection, slopes_towards
 from bstcad.optics.receivers import Receiver
-from bstcad.optics.sources import Source
 from bstcad.scene.quality import COARSEST_GRID
 from bstcad.tailoring import light_behind, stage1
 from bstcad.tailoring.light_behind import LightBehind
@@ -213,7 +213,7 @@ def _fitted(
 
 
 def front_map(
-    source: Source, lens: Lens, window: Rectangle, aims: Aims, n: int, places: Grid | None, **solver
+    source: Emitter, lens: Lens, window: Rectangle, aims: Aims, n: int, places: Grid | None, **solver
 ) -> SlopeMap:
     """The slopes of the front that send the light to the aims, by transport on n x n cells.
 
@@ -275,7 +275,7 @@ def _gathering(grid: FaceGrid, lens: Lens, back: Tensor, stretch: np.ndarray, sh
 
 
 def _by_way_of_back(
-    source: Source, lens: Lens, window: Rectangle, screen: Screen, *, places: Grid | None
+    source: Emitter, lens: Lens, window: Rectangle, screen: Screen, *, places: Grid | None
 ) -> np.ndarray:
     """(3, c + 1, r + 1) b(t): where light from the places q of the front meets the back to come to the pixels' corners.
 

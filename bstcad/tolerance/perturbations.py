@@ -21,6 +21,7 @@ from scipy.stats import norm
 
 from bstcad.optics.bspline import BSplineSurface, basis_matrix
 from bstcad.optics.channels import Channel
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import tubes_picture
@@ -29,7 +30,6 @@ from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Vector
 from bstcad.optics.sides import in_words
-from bstcad.optics.sources import Source
 from bstcad.optics.surfaces import Surface
 from bstcad.scene.errors import SceneError
 
@@ -76,7 +76,7 @@ class Setup:
         except NotImplementedError as error:  # an emitter of one's own
             raise SceneError(f"tolerance: {error}, or name errors with which it stays where it is") from None
 
-    def with_sources(self, change: Callable[[Source], Source]) -> Setup:
+    def with_sources(self, change: Callable[[Emitter], Emitter]) -> Setup:
         """With each channel's source changed."""
         return replace(self, channels=tuple(replace(c, source=change(c.source)) for c in self.channels))
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.lens import Lens
-from bstcad.optics.sources import Source
 from bstcad.optics.wavefront import Wave
 from bstcad.optics.wavefront_error import exit_pupil, moved_pupil, residual, wavefront_error
 from bstcad.tolerance.perturbations import Perturbation, Setup, perturbed
@@ -48,7 +48,7 @@ class Wavefronts:
         return wavefront_error(*_main(self.setup), self.wave).without_tilt.rms
 
 
-def _main(setup: Setup) -> tuple[Source, Lens]:
+def _main(setup: Setup) -> tuple[Emitter, Lens]:
     """The light of the main line, and the lens as it meets it."""
     channel = setup.channels[0]
     return channel.source, channel.through(setup.lens)

@@ -9,10 +9,10 @@ import torch
 from bstcad.analysis.cost import TILE, Ending, control_cells, ending, limits, masks, remaining
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
 
 

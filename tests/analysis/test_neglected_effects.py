@@ -11,11 +11,12 @@ from bstcad.analysis import neglected_effects
 from bstcad.analysis.neglected_effects import Reference, Spline, blurred, difference, zoomed
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Plane
 
 INDEX, THICKNESS = 1.5, 4.0

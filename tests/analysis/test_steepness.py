@@ -11,7 +11,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
-from bstcad.optics.sources import Point
+from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Recess, Sphere
 
 N, HEIGHT, FAR, PIXELS = 1.5, 15.0, 1e7, 40

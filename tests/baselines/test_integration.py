@@ -10,12 +10,13 @@ from bstcad.baselines import integration
 from bstcad.baselines.integration import FINE, fit_heights, march
 from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import Reflect, Refract, deflect, intersect
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
 from bstcad.optics.receivers import LevelPlane, TiltedPlane
-from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
 from bstcad.optics.trace import to_first_net
 from bstcad.scene import scene

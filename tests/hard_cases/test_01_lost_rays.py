@@ -23,9 +23,9 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen, collect
 from bstcad.optics.kernels import forward
 from bstcad.optics.outlines import Rectangle
+from bstcad.optics.point import Point
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Sphere
 from tests.hard_cases.lenses import DTYPES, ENGINES, bundle, lens_of, tracing, uniform, wavy
 from tests.tracing import stratified

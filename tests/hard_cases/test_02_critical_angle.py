@@ -21,9 +21,9 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import SKIMMING, Refract, deflect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.outlines import Circle
+from bstcad.optics.point import Point
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Plane
 from tests.hard_cases import exact
 from tests.hard_cases.lenses import (

@@ -16,13 +16,13 @@ import torch
 
 from bstcad.optics import trace
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import Refract, deflect, intersect
 from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Status
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import EQUATOR, Plane, Sphere
 from tests.hard_cases import exact
 from tests.hard_cases.lenses import (

@@ -21,9 +21,9 @@ from bstcad.optics.interfaces import intersect
 from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
+from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Plane, Sphere
 from tests.hard_cases.lenses import (
     DTYPES,

@@ -16,11 +16,11 @@ import torch
 
 from bstcad.optics import bspline
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.kernels import forward, spline
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
 from bstcad.optics.trace import to_first_net
 from tests.hard_cases.lenses import DTYPES, NAMES, eps, largest, tracing, uniform

@@ -15,11 +15,12 @@ import pytest
 import torch
 
 from bstcad.optics import trace
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import intersect
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from tests.hard_cases import exact
 from tests.hard_cases.lenses import DTYPES, NAMES, bundle, engines, eps, largest, lens_of, places, uniform, wavy

@@ -15,11 +15,12 @@ import pytest
 import torch
 
 from bstcad.optics import tubes
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.point import Point
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
 from tests.hard_cases import exact
 from tests.hard_cases.lenses import DTYPES, NAMES, engines, eps, lens_of, uniform, wavy

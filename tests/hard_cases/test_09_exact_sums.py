@@ -13,13 +13,13 @@ import torch
 
 from bstcad.optics import bspline, ops, trace, tubes
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import reductions
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
 from tests.tracing import simulated
 

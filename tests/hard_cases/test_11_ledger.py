@@ -18,8 +18,8 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
+from bstcad.optics.point import Point
 from bstcad.optics.rays import Landed, Status
-from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Sphere
 from tests.tracing import from_first_net_plain, launch, simulated, simulated_plain, stratified
 

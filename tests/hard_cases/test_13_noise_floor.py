@@ -18,12 +18,12 @@ import torch
 from bstcad.optics import irradiance, sampling, trace
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, Light, measure
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
 from bstcad.scene.scene import Accept
 from bstcad.verify import checks

@@ -14,13 +14,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bstcad.optics import trace
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import Refract, deflect, intersect
 from bstcad.optics.irradiance import LEDGER, Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
 from bstcad.scene.scene import load
 from tests.conftest import DISK

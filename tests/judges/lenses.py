@@ -6,10 +6,11 @@ import numpy as np
 import torch
 
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
-from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Plane, Sphere
 
 

@@ -12,8 +12,9 @@ import torch
 from bstcad.judges import faces, mitsuba
 from bstcad.judges.faces import FaceError
 from bstcad.optics.channels import Channel, channels_of
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
-from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere, sag
 from tests.judges.lenses import MIRROR, SCREEN, lens, waved
 

@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Plane, Sphere
 from tests.judges.lenses import MIRROR
 

@@ -18,12 +18,12 @@ from scipy.integrate import quad
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import tubes_picture
 from bstcad.optics.outlines import Circle
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Surface
 from bstcad.optics.trace import across, trace
 from tests.optics.beam_shaper import BeamShaper

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from bstcad.optics.channels import Channel, channels_of, merged, places
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.outlines import Circle
+from bstcad.optics.point import Point
 from bstcad.optics.sampling import scattered
-from bstcad.optics.sources import Collimated, Point
 
 LINES = ((486.1, 1.0), (587.6, 2.0), (656.3, 1.0))
 DISC = Point((1.0, -2.0, 3.0), profile="uniform", half_angle=40.0, diameter=2.0)

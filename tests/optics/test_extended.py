@@ -9,15 +9,16 @@ import torch
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel, channels_of, drawn_channels
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.forward import land
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, images, measure, tubes_picture
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.point import Point
 from bstcad.optics.rays import Rays
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import trace
 

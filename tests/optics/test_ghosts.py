@@ -8,13 +8,14 @@ import torch
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Coating, Fresnel, Losses
 from bstcad.optics.measure import Effort, measure
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
+from bstcad.optics.point import Point
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import OFF, ON, follow_ghost, ghost, ghost_light
 from tests.hard_cases.lenses import bundle, places, wavy

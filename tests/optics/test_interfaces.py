@@ -12,9 +12,9 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
+from bstcad.optics.point import Point
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.receivers import LevelPlane, TiltedPlane
-from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
 from bstcad.optics.trace import across, through, to_first_net, trace
 from bstcad.optics.tubes import launch_tubes

@@ -11,15 +11,16 @@ from bstcad.optics import losses as effects
 from bstcad.optics import trace, tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.goal import Goal
 from bstcad.optics.interfaces import Interface, Refract, cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Coating, Fresnel, Losses, Transmission, coated_reflectance, reflectance
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
+from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.stage2 import Problem

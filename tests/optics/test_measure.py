@@ -10,11 +10,12 @@ import torch
 from bstcad.optics import measure as measuring
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, apart, lines_apart, measure, tubes_picture
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Sphere
 
 SCREEN = Screen(120.0, (-14.0, 12.0), (-12.0, 12.0), (13, 12))

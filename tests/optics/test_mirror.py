@@ -8,13 +8,14 @@ import pytest
 import torch
 
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import Interface, Reflect, Refract, cross, deflect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
+from bstcad.optics.point import Point
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
 from bstcad.optics.trace import from_first_net, to_first_net, trace
 from bstcad.optics.tubes import launch_tubes, picture, rays_to

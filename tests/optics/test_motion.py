@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Circle
-from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.point import Point
 
 MOTIONS = {
     "shift": Motion.of(shift=(0.3, -0.2, 0.5)),

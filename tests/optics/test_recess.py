@@ -11,13 +11,14 @@ import torch
 from bstcad.optics import ops
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import simulated
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Conic, Recess, Sphere
 from bstcad.optics.trace import UNDERSIDE, on_underside, simulate, simulate_plain, to_first_net, trace
 

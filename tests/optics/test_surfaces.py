@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import intersect
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.point import Point
 from bstcad.optics.rays import Rays, Status
-from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, sag
 from bstcad.optics.trace import to_first_net
 

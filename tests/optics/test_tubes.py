@@ -7,11 +7,12 @@ import torch
 
 from bstcad.optics import bspline, tubes
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import intersect
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle, Rounded
-from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import to_first_net
 from tests.tracing import simulated

@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
 from bstcad.optics.wavefront import PlaneWave, SphericalWave, ZernikeWave, beyond
 from bstcad.optics.wavefront_error import exit_pupil, wavefront_error

@@ -8,10 +8,11 @@ import torch
 from scipy.interpolate import CubicHermiteSpline
 
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Plane, sag
 from bstcad.report import grid_sag
 from bstcad.report.grid_sag import BOUND, GridSag, Moved, Throw, moved_by, table_note

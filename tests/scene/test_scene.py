@@ -9,11 +9,12 @@ import torch
 from PIL import Image
 
 from bstcad.cad.mounting import wire
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.losses import Coating, Fresnel
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.point import Point
 from bstcad.optics.receivers import LevelPlane, TiltedPlane
-from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Recess, Sphere
 from bstcad.optics.trace import ghost_light
 from bstcad.report.record import simulated

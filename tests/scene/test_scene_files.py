@@ -13,7 +13,7 @@ import pytest
 from bstcad import commands
 from bstcad.folder import scene_files
 from bstcad.optics.key import Key
-from bstcad.optics.sources import Point
+from bstcad.optics.point import Point
 from bstcad.pipeline import Saved, purpose
 from bstcad.runs import checkpoint, files
 from bstcad.scene.scene import Scene, load

@@ -12,11 +12,11 @@ import torch
 from bstcad.analysis.shape import thickness_range
 from bstcad.optics.bspline import QUARTERS, BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Sphere
 from bstcad.scene.blank import Bounds, net_extent
 from bstcad.tailoring import machinability

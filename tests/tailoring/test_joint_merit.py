@@ -10,7 +10,7 @@ from bstcad.optics.channels import Channel
 from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.losses import Absorption, Fresnel, Losses
-from bstcad.optics.sources import Point
+from bstcad.optics.point import Point
 from bstcad.scene.blank import Bounds
 from bstcad.tailoring.machinability import excess
 from bstcad.tailoring.merit import Merit

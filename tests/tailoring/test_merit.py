@@ -10,13 +10,13 @@ import torch
 from bstcad.baselines.paper import TentMerit
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import RayTubes
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed
-from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
 from bstcad.optics.tubes import Tubes
 from bstcad.tailoring import merit

@@ -8,11 +8,12 @@ import torch
 
 from bstcad.analysis.shape import slope_octaves
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.point import Point
 from bstcad.optics.trace import behind
 from bstcad.tailoring.merit import SobolevVariable
 from bstcad.tailoring.net_variables import NetVariables, along_light

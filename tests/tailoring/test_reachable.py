@@ -10,11 +10,11 @@ import torch
 from bstcad import cli
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, measure
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.reach import largest_deflection
-from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
 from bstcad.pipeline import design, reachable_part
 from bstcad.scene.errors import SceneError

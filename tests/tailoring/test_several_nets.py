@@ -10,14 +10,15 @@ import torch
 from bstcad.analysis.shape import thickness_range
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.goal import Goal
 from bstcad.optics.interfaces import Interface, Reflect, Refract
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import images
 from bstcad.optics.outlines import EVERYWHERE, Rectangle
+from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
-from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.machinability import held, kept

@@ -7,13 +7,14 @@ import torch
 
 from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import Refract, deflect, intersect
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
 from bstcad.optics.reach import STEEPEST, largest_deflection, wanted_slopes
 from bstcad.optics.receivers import LevelPlane, TiltedPlane
-from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import to_first_net, trace
 from bstcad.tailoring.merit import landing

@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit

@@ -11,13 +11,14 @@ import torch
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import channels_of, drawn_channels
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import RayTubes, apart, simulated
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Sphere
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.merit import Merit

@@ -8,12 +8,12 @@ import bstcad
 from bstcad import pipeline
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import rrmsd_by_rays
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
 from bstcad.optics.tubes import collect
 from bstcad.optics.wavefront import PlaneWave, SphericalWave, ZernikeWave

@@ -13,14 +13,15 @@ import torch
 from bstcad.folder import read_nominal
 from bstcad.optics import tubes
 from bstcad.optics.channels import Channel
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import tubes_picture
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import Circle
+from bstcad.optics.point import Point
 from bstcad.optics.rays import Rays
-from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.tubes import collect
 from bstcad.tolerance.perturbations import THERMAL, Setup, kinds
 

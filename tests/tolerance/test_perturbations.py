@@ -10,12 +10,12 @@ import torch
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.media import refractive_index
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.tolerance.perturbations import Setup, as_net, form_error, inside, kinds, random_field, ripple
 

@@ -13,11 +13,12 @@ from scipy.interpolate import LinearNDInterpolator
 from bstcad.cad import step_writing
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.wavefront import PlaneWave, SphericalWave, ZernikeWave
 from bstcad.optics.wavefront_error import exit_pupil, moved_pupil

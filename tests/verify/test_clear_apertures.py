@@ -17,11 +17,11 @@ from bstcad.analysis.shape import describe
 from bstcad.cad import mounting
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import cross
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, measure
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.pipeline import design as design_of
 from bstcad.scene.mount import Mount

@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from torch import Tensor
+
+ALONG_Z = (0, 0.0, 0.0, 1.0, 0.0)  # the last fields of a Beam that is not tilted
+
+
+def floats(values: Sequence[float | Tensor]) -> tuple[float, ...]:
+    """A kernel is compiled anew for every combination of types: a radius of 12 must not be another than one of 12.0."""
+    return tuple(float(v) for v in values)
 
 
 class Table(NamedTuple):

@@ -18,6 +18,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import LEDGER, Screen
 from bstcad.optics.kernels import kernel_arguments, reductions
 from bstcad.optics.kernels.compiling import compiled
@@ -26,7 +27,6 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Status
 from bstcad.optics.receivers import Receiver
-from bstcad.optics.sources import Source
 
 BLOCK = 256  # rays
 # Where each quantity begins in `work`; constants, so that the compiler sees that they do not overlap.
@@ -468,7 +468,7 @@ def _rays(net, beam, faces, tilted, losses, x, y, landing, flux, fate):
 
 
 def simulate(
-    lights: Sequence[tuple[float, Source, Lens, int, Rectangle]], screen: Screen, n: int
+    lights: Sequence[tuple[float, Emitter, Lens, int, Rectangle]], screen: Screen, n: int
 ) -> tuple[Tensor, Tensor, dict[str, float], int]:
     """(box picture, tent picture, ledger, number of rays) of n x n stratified rays of each light.
 
@@ -521,7 +521,7 @@ def _alike(one: Lens, other: Lens) -> bool:
     )
 
 
-def land(source: Source, lens: Lens, plane: Receiver, x: Tensor, y: Tensor) -> Landed:
+def land(source: Emitter, lens: Lens, plane: Receiver, x: Tensor, y: Tensor) -> Landed:
     """Rays through (x, y) of the plane of the first vertex, each (n,) float64, on `plane`; flux in 1/mm² there.
 
     `trace.trace` of `source.rays(x, y, lens.entrance.z, 1.0)`, but that rays without flux may end anyhow.
@@ -535,7 +535,7 @@ def land(source: Source, lens: Lens, plane: Receiver, x: Tensor, y: Tensor) -> L
     return Landed(*(torch.from_numpy(a) for a in (landing, flux, fate)))
 
 
-def _scene(source: Source, lens: Lens, plane: Receiver) -> tuple[Any, ...]:
+def _scene(source: Emitter, lens: Lens, plane: Receiver) -> tuple[Any, ...]:
     """Net, beam, faces and tilt of the screen, as the kernels take them; a mirror's light begins along -z."""
     (*front, net), z = lens.interfaces, lens.entrance.z
     heights = net.surface.heights

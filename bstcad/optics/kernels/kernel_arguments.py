@@ -10,23 +10,21 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from bstcad.optics import interfaces, rays, sampling, surfaces
 from bstcad.optics.bspline import halfway, interpolated
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import Interface
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels.beam import Beam, Table
+from bstcad.optics.kernels.beam import Beam, Table, floats
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Status
 from bstcad.optics.receivers import Receiver
-from bstcad.optics.sources import Source
 
 NODES = 4097  # places of a table of a face's transmission
 SIDES = 65, 129, 257, 513  # control points a side of a table, tried in turn
@@ -136,7 +134,7 @@ def rules() -> Rules:
     """The constants of the plain form, as they are now."""
     steps = (interfaces.NEWTON_STEPS, interfaces.APPROACH_STEPS)
     least = (interfaces.LEVEL, interfaces.FLATTEST, interfaces.ALONG, interfaces.SKIMMING)
-    return Rules(*_floats([*steps, *least, surfaces.EQUATOR, rays.GRAZING]))
+    return Rules(*floats([*steps, *least, surfaces.EQUATOR, rays.GRAZING]))
 
 
 def faces(
@@ -153,10 +151,10 @@ def faces(
     limits = [limit for i in (front or interface, interface) for limit in i.outline.limits]
     net = [surface.x[0], surface.y[0], *(1 / pitch for pitch in surface.pitch)]
     known, throw = interfaces.net_bounds(surface, torch.float64, sense), plane.middle[2] if plane is not None else 0.0
-    face = _floats([*bent, law.eta, *limits, sense * (surface.z - start)])
-    net = _floats([*net, *known, sense * (throw - surface.z)])
+    face = floats([*bent, law.eta, *limits, sense * (surface.z - start)])
+    net = floats([*net, *known, sense * (throw - surface.z)])
     fates = [Status.MISSED_FRONT, interface.status_if_missed, law.status_if_blocked, Status.TURNED_BACK]
-    numbers = Faces(int(law.reverses), *face, *surface.shape, *net, rules(), Fates(*_floats(fates)))
+    numbers = Faces(int(law.reverses), *face, *surface.shape, *net, rules(), Fates(*floats(fates)))
     return numbers, _tilted(plane, sense, -sense if law.reverses else sense)
 
 
@@ -197,7 +195,7 @@ def _table(interface: Interface) -> np.ndarray:
     return share.contiguous().numpy()
 
 
-def beam(source: Source, lens: Lens, tables: bool = True) -> Beam | None:
+def beam(source: Emitter, lens: Lens, tables: bool = True) -> Beam | None:
     """The light of a source on the plane of the first vertex of a lens; None: the plain form traces it.
 
     tables: may it be a table?
@@ -211,7 +209,7 @@ def beam(source: Source, lens: Lens, tables: bool = True) -> Beam | None:
 
 @functools.lru_cache(maxsize=KEPT)  # 6 MB each at most
 @torch.no_grad()
-def _tabled(source: Source, window: Rectangle, z: float) -> Beam | None:
+def _tabled(source: Emitter, window: Rectangle, z: float) -> Beam | None:
     """The light by the coarsest table that is right half way between its points; None: none of SIDES is.
 
     It holds what the source says of its light on the plane z (mm), at the places of the control points of splines.
@@ -246,7 +244,7 @@ def _tilted(plane: Receiver | None, before: int, behind: int) -> Tilted | None:
     if plane is None or plane.is_level:
         return None
     along_x, along_y, normal = ((*axis[:2], before * axis[2]) for axis in plane.axes)
-    return Tilted(*_floats([*plane.middle[:2], *(behind * n for n in normal), *along_x, *along_y]))
+    return Tilted(*floats([*plane.middle[:2], *(behind * n for n in normal), *along_x, *along_y]))
 
 
 def cells(window: Rectangle, n: int, seed: int) -> Cells:
@@ -258,9 +256,4 @@ def cells(window: Rectangle, n: int, seed: int) -> Cells:
 
 def pixels(screen: Screen) -> Pixels:
     """The screen as numbers."""
-    return Pixels(*_floats([*screen.x, *screen.y, *screen.per_mm]))
-
-
-def _floats(values: Sequence[float | Tensor]) -> tuple[float, ...]:
-    """A kernel is compiled anew for every combination of types: a radius of 12 must not be another than one of 12.0."""
-    return tuple(float(v) for v in values)
+    return Pixels(*floats([*screen.x, *screen.y, *screen.per_mm]))

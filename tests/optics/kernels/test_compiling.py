@@ -14,8 +14,8 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import compiling, kernel_arguments
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
+from bstcad.optics.point import Point
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.tubes import launch_tubes
 from tests.tracing import simulated

@@ -7,11 +7,12 @@ import torch
 
 from bstcad.optics import sampling, trace
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
+from bstcad.optics.point import Point
 from bstcad.optics.receivers import LevelPlane, TiltedPlane
-from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from tests.optics.kernels.arrays import DTYPES, close, uniform
 from tests.optics.test_mirror import LIGHTS, bumpy, mirror

@@ -9,6 +9,8 @@ import torch
 
 from bstcad.optics import irradiance, ops, trace
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.collimated import Collimated
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import forward
 from bstcad.optics.kernels.forward import land
@@ -16,9 +18,9 @@ from bstcad.optics.kernels.kernel_arguments import DARK, EXACT
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
+from bstcad.optics.point import Point
 from bstcad.optics.rays import Landed
 from bstcad.optics.receivers import LevelPlane, TiltedPlane
-from bstcad.optics.sources import Collimated, Emitter, Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
 from bstcad.optics.trace import simulate, simulate_plain, whole_kernel, window
 from tests.optics.test_mirror import LIGHTS, bumpy, mirror
