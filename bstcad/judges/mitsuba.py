@@ -207,7 +207,8 @@ def _look_at(origin: Iterable[float], target: Iterable[float], up: Iterable[floa
 
 def lamps(channels: Sequence[Channel], lens: Lens, folder: Path) -> dict[str, Entry]:
     """The sources of channels as entries of Mitsuba's scene; each sends the flux of its channel's weight."""
-    return LAMPS[channels[0].source.kind](channels, lens, folder)
+    first = channels[0].source
+    return LAMPS[first.kind](channels, lens, folder)
 
 
 def _plates(channels: Sequence[Channel], lens: Lens, folder: Path) -> dict[str, Entry]:

@@ -75,7 +75,7 @@ class Point(Emitter):
 
     @property
     def begins(self) -> float:
-        """That of its middle."""
+        """The plane z (mm) of its middle."""
         return self.position[2]
 
     def nearest(self, upwards: bool) -> float:

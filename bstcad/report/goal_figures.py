@@ -26,11 +26,11 @@ class GoalFigures:
     """The light on a target."""
 
     key: str  # target, or target[0], target[1], … of several
-    z: float  # mm, of its plane
+    z: float  # place of its plane (mm)
     weight: Size  # weight of its squared error among all goals
-    rrmsd: Rrmsd  # by the flux into each pixel
+    rrmsd: Rrmsd  # RRMSD by the flux into each pixel
     rrmsd_standard_error: Annotated[float, Field(ge=0, le=1e3)]  # standard error of rrmsd, by independent sets of rays
-    rrmsd_tent: Rrmsd | None  # by linear binning
+    rrmsd_tent: Rrmsd | None  # RRMSD by linear binning
     light_on_target: Share  # part of the source's flux
     efficiency: Share  # flux on the target over flux that leaves the back face
     leak: Share | None  # part of the light on the target that is on its dark pixels; None: it has none
@@ -61,16 +61,16 @@ class WavefrontFigures:
     rms: Size  # waves, each ray by its flux
     pv: Size  # waves, greatest less least of all rays
     rms_with_tilt: Size  # waves, piston alone removed
-    tilt_urad: tuple[float, float]  # removed; light that leans towards +x and towards +y of the wanted light
-    angle_rms_urad: Size  # between rays and wanted rays, each ray by its flux; tilt included
-    angle_max_urad: Size  # between rays and wanted rays
+    tilt_urad: tuple[float, float]  # tilt removed: light that leans towards +x and towards +y of the wanted light
+    angle_rms_urad: Size  # RMS angle between rays and wanted rays, each ray by its flux; tilt included
+    angle_max_urad: Size  # largest angle between rays and wanted rays
     floor: Size  # waves that rounding may add to the RMS
     flux: Share  # part of the source's flux that is measured
-    removed: Literal["piston and tilt"] = "piston and tilt"  # before rms and pv
+    removed: Literal["piston and tilt"] = "piston and tilt"  # what is removed before rms and pv
 
     @classmethod
     def of(cls, error: WavefrontError) -> WavefrontFigures:
-        """Those of a measurement, whose flux is a sum over a grid: at the edge of a beam it may go beyond 1."""
+        """The figures of a measurement, whose flux is a sum over a grid: at the edge of a beam it may go beyond 1."""
         return cls(
             error.z, error.wavelength, error.without_tilt.rms, error.without_tilt.pv,
             rms_with_tilt=error.without_piston.rms, tilt_urad=error.tilt, angle_rms_urad=error.angle_rms,
