@@ -9,7 +9,6 @@
 #              tests.benchmarks.accuracy --list tells their names), with ONLY= writes alone
 # make published   published results beside ours on the same scenes, each judged by an independent Monte Carlo, into
 #              docs/published.md; ONLY= as above, and SUN_PICTURE= the path of diffinytrace's examples/img1.jpg
-# make prediction   what is predicted and what is found, about an hour, into docs/prediction.md
 # make effects what each effect costs, into docs/effects.md
 # make stability   the hard cases, those of make bench too, and what they measured, into docs/stability.md
 # make docs    the documentation, into docs/_build/html: its tutorials and gallery run, some five minutes
@@ -23,7 +22,7 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: lens test test-fast coverage bench accuracy published prediction effects tradeoff stability docs wheel lint
+.PHONY: lens test test-fast coverage bench accuracy published effects tradeoff stability docs wheel lint
 
 lens: $(READY)
 	$(BIN)/python generate_lens.py templates/thu.toml
@@ -54,9 +53,6 @@ published: $(READY)
 	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[dev,judges]'
 	$(BIN)/python -m tests.benchmarks.published $(if $(filter undefined,$(origin ONLY)),,--only $(ONLY)) \
 	    $(if $(SUN_PICTURE),--sun-picture '$(SUN_PICTURE)')
-
-prediction: $(READY)
-	$(BIN)/python -m tests.benchmarks.prediction_figure
 
 effects: $(READY)
 	$(BIN)/python -m tests.benchmarks.effects_table

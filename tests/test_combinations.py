@@ -29,7 +29,6 @@ from bstcad.optics.sides import both
 from bstcad.optics.surfaces import Sphere
 from bstcad.scene.blank import as_front, net_extent
 from bstcad.scene.errors import SceneError
-from bstcad.sweep.cold_run import Units
 from bstcad.sweep.plan import plan
 from tests.conftest import draws_nothing, verify_with
 
@@ -289,7 +288,7 @@ COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which f
     "app.preview": {"IMAGE_PLACES": 6, "CELLS": 16, "RAYS": 32, "SHAPE": 33},
     "sweep.estimates": {"NET": 17, "CELLS": 16, "PIXELS": 24, "FRONT_NET": 9, "STEPS": 5},
     "sweep.net_choice": {"TUBES": 64},
-    "sweep.plan": {"PILOT_CELLS": (16, 16)},
+    "sweep.prediction": {"CELLS": (16, 16), "LARGEST": (24, 17, 48), "JUDGED": Effort(96, accuracy=1.0, witness=False)},
     "verify.checks": {"LINE_TUBES": 65},
 }
 
@@ -321,7 +320,7 @@ def faults(chosen, folder):
         seen = preview(scene, HASTY)
         report = commands.generate(scene, folder, device="cpu", effort=EFFORT)
         again = bstcad.open(folder)  # its scene states the net, if that was to be chosen
-        told, predicted = plan(again.scene, units=lambda: Units(tubes=0.1, serial=0.01))
+        told, predicted = plan(again.scene)
     except SceneError as refusal:
         return [] if any(_holds(*each, str(refusal), chosen) for each in MAY_REFUSE) else [f"refused: {refusal}"]
     assert all(np.isfinite(picture).all() for pictures in seen.pictures for picture in pictures)

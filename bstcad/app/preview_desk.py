@@ -8,7 +8,6 @@ two previews at a time would each take twice as long: so there is one thread.
 from __future__ import annotations
 
 import contextlib
-import functools
 import math
 import threading
 import time
@@ -23,8 +22,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.new_scene import Plate
 from bstcad.scene.scene import Scene, of_text
 from bstcad.scene.scene_file import tables
-from bstcad.sweep.cold_run import Units, units
-from bstcad.sweep.net_choice import estimated, with_net
+from bstcad.sweep.net_choice import with_net
 from bstcad.sweep.plan import plan
 
 STAGES = ("preview", "settled", "effects", "predicted")
@@ -191,17 +189,11 @@ class PreviewDesk:
         tick()
         scene, choice = with_net(request.scene)
         tick()
-        request.plan = plan(scene, request.text, units=_units, tick=tick)
-        return next(request.plan) | {"net": None if choice is None else choice.line, "estimated": estimated(scene)}
+        request.plan = plan(scene, request.text, tick=tick)
+        return next(request.plan) | {"net": None if choice is None else choice.line}
 
 
 def first_scene() -> Scene:
     """A scene for which nobody has to wait: letters by a plate."""
     text = Plate.of().text("first")
     return of_text(text, tables(text, Path("first.toml")), Path("first.toml"))
-
-
-@functools.cache
-def _units() -> Units:
-    """Of this machine, measured once."""
-    return units()

@@ -17,7 +17,7 @@ from bstcad.report.light_figures import View, tones
 from bstcad.report.record import LEFT_OUT, LeftOut, changes
 from bstcad.report.rendering import turnable
 from bstcad.report.units import duration, number, percent, quantity
-from bstcad.sweep.plan import QUALITIES
+from bstcad.sweep.prediction import Interval
 
 CELLS = 96  # of the lens to be turned, a side
 # Largest difference of a finished lens's thicknesses and relief from the preview's, as a part of the relief, among ten
@@ -82,17 +82,15 @@ def figures(found: Preview) -> list[list[str]]:
 
 
 def of_plan(plan: Mapping[str, Any]) -> dict[str, Any]:
-    """The effects that are left out, a row each, and rough seconds and RRMSD of each quality."""
+    """The effects that are left out, a row each."""
     rows = [
         [" ".join(filter(None, (LEFT_OUT[entry.kind], entry.detail and f"({entry.detail})"))), *changes(entry), of]
         for goal in plan["goals"]
         for of in [goal["key"] if len(plan["goals"]) > 1 else ""]
         for entry in (LeftOut(**item) for item in goal["left_out"])
     ]
-    rough = {quality: told(each["seconds"], each["rrmsd"]) for quality, each in plan["estimated"].items()}
     simulated = [item["what"] for item in plan["simulated"]]
-    verdict = plan.get("verdict")
-    return {"simulated": simulated, "left_out": rows, "net": plan["net"], "qualities": rough, "verdict": verdict}
+    return {"simulated": simulated, "left_out": rows, "net": plan["net"], "verdict": plan.get("verdict")}
 
 
 def of_predictions(plan: Mapping[str, Any]) -> dict[str, Any]:
@@ -100,20 +98,12 @@ def of_predictions(plan: Mapping[str, Any]) -> dict[str, Any]:
     if plan["predicted"] is None:
         none = {"not_predicted": plan["not_predicted"], "notes": [], "qualities": {}}
         return none | {"verdict": plan["verdict"] if plan["verdict"]["kind"] == "blurred" else None}
-    known = {
-        quality: told(each["seconds"][1], each["rrmsd"][1], each["seconds"][::2], each["rrmsd"][::2])
-        for quality, each in plan["predicted"].items()
-        if quality in QUALITIES
-    }
+    known = {quality: told(each["seconds"], each["rrmsd"]) for quality, each in plan["predicted"].items()}
     return {"not_predicted": None, "notes": plan["notes"], "qualities": known, "verdict": plan["verdict"]}
 
 
-def told(
-    seconds: float, rrmsd: float, within: tuple[float, float] | None = None, about: tuple[float, float] | None = None
-) -> dict[str, str]:  # fmt: skip
-    """A quality in words; within, about: the ranges that nine of ten designs keep to; None: a rough estimate."""
-    if within is None or about is None:
-        return {"seconds": f"about {duration(seconds)}", "rrmsd": f"about {number(rrmsd)}", "range": "a rough estimate"}
-    low, high = (number(value) for value in about)
-    span = f"{duration(within[0])} to {duration(within[1])}; RRMSD {low} to {high}"
-    return {"seconds": duration(seconds), "rrmsd": number(rrmsd), "range": f"nine of ten designs: {span}"}
+def told(seconds: Interval, rrmsd: Interval) -> dict[str, str]:
+    """Return a quality in words, with the ranges that nine of ten designs keep to."""
+    (least, likely, most), (low, error, high) = seconds, rrmsd
+    span = f"{duration(least)} to {duration(most)}; RRMSD {number(low)} to {number(high)}"
+    return {"seconds": duration(likely), "rrmsd": number(error), "range": f"nine of ten designs: {span}"}

@@ -32,7 +32,7 @@ from bstcad.scene.scene import Scene, load
 from bstcad.sweep import cold_run
 from bstcad.sweep.cold_run import LocalPool, Stored, unpacked
 from bstcad.sweep.net_choice import with_net
-from bstcad.sweep.plan import fitted, memory_gb
+from bstcad.sweep.prediction import WITHIN, memory_gb
 from bstcad.verify.verdict import NO_LIMIT, VERDICTS, Check
 
 if TYPE_CHECKING:
@@ -151,7 +151,7 @@ def batch(
         others = [row for row in earlier if row.finished and row.name not in names]
         left = {k: with_net(wanted[k].scene)[0] for k, row in enumerate(rows) if row.status == STOPPED}
         if left:
-            most = fitted()["within"]["memory_gb"] * max(memory_gb(s, fitted()["memory"]) for s in left.values())
+            most = WITHIN["memory_gb"] * max(map(memory_gb, left.values()))
             at_a_time = min(environment.cores() // CORES, int(psutil.virtual_memory().available / 1e9 / most))
             machines = cluster or stack.enter_context(LocalPool(min(workers or max(1, at_a_time), len(left))))
             done, place = sum(row.finished for row in rows), "the cluster" if cluster else "this machine"

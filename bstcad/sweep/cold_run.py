@@ -16,7 +16,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -145,47 +144,13 @@ NET, WIDTH, THICKNESS, INDEX = 257, 20.0, 5.0, 1.49  # control points a side; mm
 SCREEN = 200.0  # mm from the front
 WAVE, PERIODS = 0.003, 3  # mm; over the width
 REPEATS = 3  # of an evaluation, at least
-LONG, PER_TURN = 2.5, 4  # seconds of a calibration; works of one processor beside each evaluation
-NUMBERS, TRANSFORM = 40_000, 512  # of the work of one processor: numbers written and read; a side of a transform
 
 
-@dataclass(frozen=True)
-class Units:
-    """Seconds of the two units of work on a machine."""
-
-    tubes: float  # merit and gradient of TUBES² ray tubes, on all processors, as in most of a design
-    serial: float  # text and transforms on one processor, as in the rest
-
-
-def units() -> Units:
-    """The units on this machine now, in three seconds or so.
-
-    Processors that others use too change their pace by two within seconds, and a design takes longer: the mean pace
-    counts.  Both units are done in turn and averaged without the tenths that took least and most.
-    """
-    from scipy.stats import trim_mean  # a third of a second to load, which a design need not pay
-
-    once, tubes, serial = kernel(), [], []
-    began = time.perf_counter()
-    while time.perf_counter() - began < LONG or len(tubes) < REPEATS:
-        tubes.append(_seconds(once))
-        serial.extend(_seconds(serial_work) for _ in range(PER_TURN))
-    return Units(*(float(trim_mean(found, 0.1)) for found in (tubes, serial)))
-
-
-def _seconds(work: Callable[[], object]) -> float:
+def timed(work: Callable[[], object]) -> float:
+    """Seconds that some work takes."""
     began = time.perf_counter()
     work()
     return time.perf_counter() - began
-
-
-def serial_work() -> float:
-    """Numbers to text and back, as in a STEP file, and a cosine transform, as in a fit of slopes."""
-    from scipy.fft import dctn
-
-    written = ",".join(f"{k / 7:.12g}" for k in range(NUMBERS))
-    read = np.array([float(word) for word in written.split(",")])
-    return float(dctn(np.resize(read, (TRANSFORM, TRANSFORM)), workers=1)[0, 0])
 
 
 @cache
@@ -296,7 +261,7 @@ def carry_out(
     contents: the base and its pictures, by name.  limit: seconds after which the command is ended.
     """
     began = time.perf_counter()
-    unit = min(_seconds(kernel()) for _ in range(REPEATS))  # the least: all disturbances make it longer
+    unit = min(timed(kernel()) for _ in range(REPEATS))  # the least: all disturbances make it longer
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         scene, folder = unpacked(contents, Path(place)), Path(place) / "design"
         run = _generate(scene, folder, point, limit, tick=tick)

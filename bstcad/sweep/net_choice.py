@@ -3,7 +3,7 @@
 Where the light of k cells of the net falls on a pixel, the lens has k numbers to shape it with.  A pixel asks for a
 flux, and the source's flux density where its light crosses the back tells the area of the back that sends it: scarce
 light, which many such cells would have to carry, has few.  What of a picture is finer than its cells can make, and than
-half as many each way can, gives the RRMSD of a net; amounts of work (plan.py) give its seconds and memory.
+half as many each way can, gives the RRMSD of a net; its size gives its seconds and memory (prediction.py).
 
 Of those that memory, tailoring.max_time and the tool's radius allow, the smallest net is chosen whose RRMSD each larger
 one would lower by less than a fifth, or by less than half in three times the time.
@@ -13,6 +13,7 @@ tests/benchmarks/test_net_choice.py holds it to designs with every net.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,21 +31,20 @@ from bstcad.optics.tubes import area_of, collect, launch_tubes
 from bstcad.report.units import about, two_digits
 from bstcad.scene.blank import LARGEST_NET
 from bstcad.scene.scene import Scene
-from bstcad.sweep.cold_run import Units
 from bstcad.sweep.estimates import coarse_lens
-from bstcad.sweep.plan import UNDONE, amounts, fitted, memory_gb, of_quality, seconds
+from bstcad.sweep.prediction import UNDONE, memory_gb, usual
 
 KEY = "lens.back.control_points"
 SQUARE = (65, 129, 257, 513, 1025)  # control points a side of the nets that are tried, or as many in square cells
 NEARLY = 1.25  # as wide as high: a plate no more oblong than that gets a square net
 WORTH = ((1.25, 1.0), (2.0, 3.0))  # (times less RRMSD, times the time): a larger net that gives no more is not worth it
 ROOM = 0.8  # of the machine's memory, that a design may take
-TWO_CORES = Units(tubes=0.1, serial=0.01)  # seconds: of a machine of pace 1
 TUBES = 256  # a side, by which the light is followed
 FLOOR, HALVED = 0.68, 0.43  # of the least error by the cells (ControlCells.floor), and by half as many each way
 BY_QUALITY = {"draft": (1.5, 0.012), "standard": (1.0, 0.002), "fine": (0.7, 0.004)}  # times that, and what is left
 SEAM = 7.0  # pixels; a valley of the tool's radius that moves light by less within a cell is narrower than it need be
 ENOUGH, BEYOND = 5.0, 1.4  # cells a pixel; more of them lower the RRMSD by that factor at most, and that once
+MOST_GAINED = 0.43  # times the RRMSD of the portrait with 1025 control points instead of 513, the largest gain known
 DIM = 1e-3  # of the mean flux; tiles of less are taken for the mean
 
 
@@ -132,37 +132,23 @@ def _chosen(scene: Scene) -> Choice:
         likely = rrmsd(light, each, blurred)
         if candidates and cells > ENOUGH:
             likely = max(likely, candidates[-1].rrmsd / BEYOND)
-        time, memory = seconds(amounts(each), fitted()["prices"], TWO_CORES), memory_gb(each, fitted()["memory"])
-        candidates.append(Candidate(each.lens.back.net, likely, time, memory, moved=moved(each)))
+        candidates.append(Candidate(each.lens.back.net, likely, usual(each).total, memory_gb(each), moved=moved(each)))
     possible, limit = _possible(scene, candidates)
     first = next(k for k, each in enumerate(possible) if not any(_worth(each, other) for other in possible[k + 1 :]))
     return Choice(possible, first, limit if first == len(possible) - 1 else "")
 
 
-def estimated(scene: Scene) -> dict[str, dict[str, float]]:
-    """{quality: {"seconds", "rrmsd"}} of a scene with its net, roughly and in a second or so: of two cores of pace 1.
+def gain(scene: Scene, finer: Scene, lenses: Sequence[Lens]) -> float:
+    """Times the RRMSD of a scene that it has with a finer net, for the target that gains least.
 
-    `plan.plan` predicts both better, from designs made small; of several targets this is that of the worst.
+    lenses: a coarse one for each target.
     """
-    by_target = [_estimated(each) for each in scene.each_alone()]
-    return {
-        quality: {key: max(found[quality][key] for found in by_target) for key in ("seconds", "rrmsd")}
-        for quality in BY_QUALITY
-    }
-
-
-def _estimated(scene: Scene) -> dict[str, dict[str, float]]:
-    lens = coarse_lens(scene)
-    light = cells_of_a_mm2(scene, lens)
-    image = blur(scene.channels(), lens, scene.target.screen, scene.target.irradiance())
-    wanted = {quality: of_quality(scene, quality) for quality in BY_QUALITY}
-    return {
-        quality: {
-            "seconds": seconds(amounts(each), fitted()["prices"], TWO_CORES),
-            "rrmsd": two_digits(rrmsd(light, each, 0.0 if image is None else image.rrmsd)),
-        }
-        for quality, each in wanted.items()
-    }
+    found = []
+    for one, other, lens in zip(scene.each_alone(), finer.each_alone(), lenses, strict=True):
+        light, image = cells_of_a_mm2(one, lens), blur(one.channels(), lens, one.target.screen, one.target.irradiance())
+        few, many = (rrmsd(light, each, 0.0 if image is None else image.rrmsd) for each in (one, other))
+        found.append(many / few)
+    return min(max(*found, MOST_GAINED), 1.0)
 
 
 def _worth(coarse: Candidate, fine: Candidate) -> bool:

@@ -38,13 +38,12 @@ from bstcad.sweep.cold_run import (
     Run,
     Settings,
     Stored,
-    Units,
     Value,
     as_text,
     settings,
 )
 from bstcad.sweep.net_choice import with_net
-from bstcad.sweep.plan import amounts, fitted, seconds
+from bstcad.sweep.prediction import STARTED, usual
 from bstcad.sweep.results import Calibration, Place, Preset, Table, TableKnob, front, halving
 
 # --- knobs ------------------------------------------------------------------------------------------------------------
@@ -393,19 +392,16 @@ class _Search:
 
 # --- predicted seconds of runs ----------------------------------------------------------------------------------------
 
-UNITS = Units(tubes=0.1, serial=0.01)  # seconds before there is a run whose pace tells, on two cores
 JUDGING = 2.0  # seconds of judging a lens
-ADAM_STEP = 0.1  # seconds of a step of the paper's procedure, by 1024² rays
 
 
 def work_of(scene: Scene, point: Settings) -> tuple[bool, float]:
-    """(by the paper's procedure?, seconds as `plan` has them); a run that is refused has its start alone."""
+    """(by the paper's procedure?, seconds on a machine of pace 1); a run that is refused has its start alone."""
     try:
-        work = amounts(scene.changed(dict(point)))
+        changed = scene.changed(dict(point))
     except SceneError:
-        work = {"start": 1.0}
-    steps = work.get("steps of Adam", 0.0)
-    return steps > 0, seconds(work, fitted()["prices"], UNITS) + JUDGING + ADAM_STEP * steps
+        return False, STARTED + JUDGING
+    return changed.tailoring.resolved(changed.lens.back.net).method == "adam", usual(changed).total + JUDGING
 
 
 # --- the table --------------------------------------------------------------------------------------------------------

@@ -9,7 +9,6 @@ import pytest
 
 from bstcad import pipeline
 from bstcad.analysis.shape import describe
-from bstcad.app import preview_desk
 from bstcad.app.preview import SETTLED, Outdated, preview
 from bstcad.app.preview_desk import STAGES, PreviewDesk, Request
 from bstcad.app.preview_json import DARK_SPREAD, LIT, OF_DESIGN, SPREAD, figures
@@ -17,7 +16,6 @@ from bstcad.optics.measure import tubes_picture
 from bstcad.report.units import quantity
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
-from bstcad.sweep.net_choice import TWO_CORES
 
 SMALL = {"tailoring.quality": "draft", "lens.back.control_points": 129, "target.pixels": 64}
 NEAR = 0.05  # RRMSD between two pictures
@@ -101,8 +99,7 @@ def test_a_scene_that_a_design_would_refuse_is_refused():
         preview(scene)
 
 
-def test_the_desk_answers_the_newest_request_of_each_page_in_order(monkeypatch):
-    monkeypatch.setattr(preview_desk, "units", lambda: TWO_CORES)  # three seconds of measurement
+def test_the_desk_answers_the_newest_request_of_each_page_in_order():
     desk = PreviewDesk()
     scene = load("templates/disk.toml", {"lens.back.control_points": 65, "target.pixels": 32})
     try:
@@ -121,7 +118,7 @@ def test_the_desk_answers_the_newest_request_of_each_page_in_order(monkeypatch):
         assert [desk.answer(newer, k, 120.0)[0] for k in range(len(STAGES))] == list(STAGES)
         settled = newer.answers[1][1]
         assert np.array_equal(settled.pictures[0][1], preview(newer.scene, pains=SETTLED).pictures[0][1])
-        assert set(newer.answers[2][1]["estimated"]) == {"draft", "standard", "fine"}
+        assert set(newer.answers[3][1]["predicted"]) == {"draft", "standard", "fine"}
         refused = Request("three", 1, scene.changed({"target.x": [9e4, 9.1e4]}))
         desk.ask(refused)
         assert isinstance(desk.answer(refused, 0, 60.0)[1], SceneError) and refused.done

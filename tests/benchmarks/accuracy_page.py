@@ -112,15 +112,6 @@ TABLES = """## All scenes
   the portrait's front, which it cannot find, is flat.
 """
 
-PREDICTION = """## What `bstcad plan` predicts
-
-`bstcad plan` predicts seconds, RRMSD and memory before a design; [prediction.md](prediction.md), made by `make
-prediction`, holds that to scenes that were kept out of the fit.
-
-![Predicted against found, seconds and RRMSD](prediction.png)
-"""
-
-
 def page(recorded: Mapping[str, Any], beside: Collection[str]) -> str:
     """The whole page; beside: names of the files in docs/, of which it shows those that are there."""
     records = _records(recorded)
@@ -130,8 +121,6 @@ def page(recorded: Mapping[str, Any], beside: Collection[str]) -> str:
     if "mitsuba" in recorded:
         parts.append(_peers(recorded, beside, marks))
     parts += [_sweep(scene, found, beside, marks[_key(found)]) for scene, found in sweeps.items()]
-    if "prediction.png" in beside:
-        parts.append(PREDICTION)
     if "growth" in recorded:
         parts.append(_growth(recorded["growth"]["series"], marks[_key(recorded["growth"])]))
     parts += [TABLES, *_tables(recorded.get("designs", {}), marks), _machines(records, marks)]

@@ -17,7 +17,7 @@ from typing import Any
 from bstcad.optics.measure import Effort, measure
 from bstcad.pipeline import design
 from bstcad.scene.scene import Scene
-from tests.benchmarks.prediction_pictures import drawn
+from tests.benchmarks.pictures import drawn
 
 FIGURES = Path(__file__).with_name("geometry_scenes.json")
 RIM = 16  # of 256 pixels: the outermost ones, whose share of the squared error is kept

@@ -5,9 +5,8 @@ import json
 import pytest
 
 from bstcad.optics.sides import side
-from bstcad.sweep.net_choice import TWO_CORES, chosen
-from bstcad.sweep.plan import amounts, fitted
-from bstcad.sweep.plan import seconds as of_work
+from bstcad.sweep.net_choice import chosen
+from bstcad.sweep.prediction import usual
 from tests.benchmarks.net_scenes import CASES, FIGURES, NET, scene_of, with_net
 
 KNOWN = json.loads(FIGURES.read_text())
@@ -26,8 +25,7 @@ def test_it_is_the_best_or_nearly_so(name, size):
     wanted = side(chosen(scene.changed({NET: None})).net)
     ours = min(measured, key=lambda known: abs(known - wanted))  # an oblong net has nearly as many
     best = min(measured, key=measured.get)
-    work = {points: amounts(with_net(scene, points)) for points in (ours, best)}
-    seconds = {points: of_work(each, fitted()["prices"], TWO_CORES) for points, each in work.items()}
+    seconds = {points: usual(with_net(scene, points)).total for points in (ours, best)}
     error, time = measured[ours] / measured[best], seconds[ours] / seconds[best]
     most = KNOWN_MISSES.get((name, size), 1.25)
     assert (error <= most and time <= 1.5) or (error <= 2 and time <= 1 / 3)

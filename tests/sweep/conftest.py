@@ -9,7 +9,7 @@ from bstcad.runs.cluster import HERE, Answer
 from bstcad.scene.scene import load
 from bstcad.sweep import tradeoff
 from bstcad.sweep.cold_run import DONE, FAILED, Run, carry_out
-from bstcad.sweep.plan import amounts
+from bstcad.sweep.prediction import usual
 from tests.conftest import DISK
 
 TINY = {
@@ -17,7 +17,7 @@ TINY = {
     "tailoring.transport_grid": 64, "tailoring.rounds": 2,
 }  # fmt: skip
 REFUSED = ("target.pixels", 96)  # a setting that comes to no lens
-PACE, KERNEL = 0.1, 0.2  # seconds of an amount of work, of the calibration kernel
+KERNEL = 0.2  # seconds of the calibration kernel
 FAR = "tcp://10.0.0.1:1"  # a worker
 
 
@@ -50,8 +50,7 @@ def record(base, point):
         return Run(settings=point, status=FAILED, reason="ended by SIGKILL", seconds=7.0, cost_seconds=8.0)
     SCENES[base.toml()] = base
     work, knobs = _known(point, base.toml())
-    seconds = 5.0 + PACE * (work["evaluations"] + work["steps of Adam"] + work["net written"])
-    adam, seed = work["steps of Adam"] > 0, dict(point).get("tailoring.seed", 0)
+    seconds, adam, seed = 5.0 + work, knobs.method == "adam", dict(point).get("tailoring.seed", 0)
     error = 0.01 + 1 / (10 + knobs.stage2_iterations) + (0.1 + 0.01 * seed if adam else 0.0)
     return Run(
         settings=point, status=DONE, seconds=seconds, cpu_seconds=1.5 * seconds, peak_memory_gb=1.5, rrmsd=error,
@@ -66,7 +65,7 @@ def record(base, point):
 @cache
 def _known(point, text):
     changed = SCENES[text].changed(dict(point))
-    return amounts(changed), changed.tailoring.resolved(33)
+    return usual(changed).search, changed.tailoring.resolved(33)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -366,17 +366,16 @@ function showPlan(told) {
     element("comes-to").textContent = told.verdict?.sentence ?? "";
     element("comes-to").className = told.verdict?.kind === "blurred" ? "error" : "";
   }
+  qualities = told.qualities ?? {};  // none until the pilots have ended
   if (told.refused) noPlan(`No estimate: ${told.refused}.`);
   else if (told.stage === "effects") {
-    qualities = told.qualities;
     element("net").textContent = told.net ?? "";
     const several = told.left_out.some((cells) => cells[4]);
     element("left-out").querySelector("th:last-child").hidden = !several;
     const rows = told.left_out.map((cells) => row(several ? cells : cells.slice(0, 4), { numbers: [1, 2, 3] }));
     element("left-out").querySelector("tbody").replaceChildren(...rows);
   } else {
-    qualities = { ...qualities, ...told.qualities };
-    element("notes").textContent = told.not_predicted ? `Rough estimates alone: ${told.not_predicted}.` : told.notes.join(" ");
+    element("notes").textContent = told.not_predicted ? `No prediction: ${told.not_predicted}.` : told.notes.join(" ");
   }
   element("predicted").tBodies[0].replaceChildren(...QUALITIES.filter((quality) => qualities[quality]).map((quality) => {
     const made = row([quality, qualities[quality].seconds, qualities[quality].rrmsd], { numbers: [1, 2] });

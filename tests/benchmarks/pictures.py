@@ -1,4 +1,4 @@
-"""Pictures of the scenes in prediction_scenes.py: linear irradiance, row 0 the top.
+"""Pictures of the scenes in net_scenes.py and geometry_scenes.py: linear irradiance, row 0 the top.
 
 Patterns are drawn on the square from -1 to 1 along x (to the right) and y (up); r is the distance from its middle.
 """
@@ -35,30 +35,12 @@ def _noise(side: int, power: float, seed: int = 7) -> np.ndarray:
     return noise / noise.std()
 
 
-def _faces() -> np.ndarray:
-    """Sixteen small photographs of faces side by side."""
-    from skimage import data
-
-    faces = data.lfw_subset()
-    return np.block([[faces[4 * i + j] for j in range(4)] for i in range(4)])
-
-
 def _bar_code(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Dark bars, one to four modules wide, on a lit label."""
     widths = np.random.default_rng(11).integers(1, 5, 41)
     dark = np.pad(np.repeat(np.arange(41) % 2 == 0, widths), 8)
     bars = dark[((x + 1) / 2 * (len(dark) - 1)).round().astype(int)]
     return np.where(bars & (np.abs(y) < 0.75), DIM, 1.0)
-
-
-def _matrix_code() -> np.ndarray:
-    """Dark and lit modules, 29 x 29, with a square eye in three corners and a lit rim."""
-    dark = np.random.default_rng(12).random((29, 29)) < 0.5
-    rows, columns = np.indices(dark.shape)
-    for row, column in ((3, 3), (3, 25), (25, 3)):
-        rings = np.maximum(np.abs(rows - row), np.abs(columns - column))
-        dark[rings <= 4] = np.isin(rings[rings <= 4], (0, 1, 3))
-    return np.kron(np.where(np.pad(dark, 3), DIM, 1.0), np.ones((14, 14)))
 
 
 def _emblem(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
@@ -68,47 +50,6 @@ def _emblem(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
     bars = (np.abs(y + 0.1) < 0.03) | (np.abs(y + 0.25) < 0.03)
     disc = np.hypot(x, y - 0.5) < 0.11
     return np.where(ring | (triangle & ~bars) | disc, 1.0, DIM)
-
-
-BOAT = (  # corners of each line of the drawing
-    ((-0.9, -0.55), (0.9, -0.55)),
-    ((-0.6, -0.3), (0.65, -0.3), (0.4, -0.55), (-0.45, -0.55), (-0.6, -0.3)),
-    ((0.0, -0.3), (0.0, 0.75)),
-    ((0.08, -0.2), (0.08, 0.65), (0.6, -0.2), (0.08, -0.2)),
-    ((-0.08, -0.2), (-0.08, 0.5), (-0.5, -0.2), (-0.08, -0.2)),
-    ((-0.85, -0.75), (-0.55, -0.68), (-0.25, -0.75), (0.05, -0.68), (0.35, -0.75), (0.65, -0.68)),
-)
-
-
-def _line_drawing(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """A sailing boat and the sun in lit lines."""
-    away = np.abs(np.hypot(x + 0.6, y - 0.6) - 0.18)
-    for line in BOAT:
-        for (x0, y0), (x1, y1) in zip(line, line[1:], strict=False):
-            along = ((x - x0) * (x1 - x0) + (y - y0) * (y1 - y0)) / ((x1 - x0) ** 2 + (y1 - y0) ** 2)
-            along = along.clip(0, 1)
-            away = np.minimum(away, np.hypot(x - x0 - along * (x1 - x0), y - y0 - along * (y1 - y0)))
-    return DIM + np.exp(-((away / 0.02) ** 4))
-
-
-BUST = (  # x, y, half width, half height, how much brighter (or darker) than what is behind
-    (0.0, 0.15, 0.36, 0.5, 0.75),
-    (0.0, 0.62, 0.42, 0.22, -0.45),
-    (-0.15, 0.22, 0.09, 0.05, -0.4),
-    (0.15, 0.22, 0.09, 0.05, -0.4),
-    (0.03, 0.03, 0.05, 0.14, 0.2),
-    (0.0, -0.14, 0.13, 0.04, -0.3),
-    (0.0, -0.85, 0.7, 0.4, 0.55),
-    (0.0, -0.45, 0.16, 0.12, 0.2),
-)
-
-
-def _bust(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """A head and shoulders of soft blobs before a ground that darkens towards the corners."""
-    light = 0.45 - 0.15 * r**2
-    for x0, y0, width, height, brighter in BUST:
-        light += brighter * np.exp(-(((x - x0) / width) ** 2) - ((y - y0) / height) ** 2)
-    return light.clip(DIM)
 
 
 def _contours(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
@@ -163,23 +104,10 @@ def _strokes(x: np.ndarray, y: np.ndarray, seed: int, number: int, width: float)
     return DIM + np.exp(-((away / width) ** 4))
 
 
-def _blobs(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Four soft blobs, the least of which is a small bright one."""
-    blobs = ((0.3, 0.2, 0.05), (-0.5, 0.4, 0.02), (-0.1, -0.5, 0.1), (0.6, -0.6, 0.01))
-    return 0.05 + sum(np.exp(-((x - x0) ** 2 + (y - y0) ** 2) / size) for x0, y0, size in blobs)
-
-
 def _frame(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
     """A lit square frame on a dark ground."""
     out = np.maximum(np.abs(x), np.abs(y))
     return np.where((out > 0.6) & (out < 0.85), 1.05, 0.05)
-
-
-def _cells(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Sixty cells, each the places nearest to a point, in even tints."""
-    draw = np.random.default_rng(21)
-    _, nearest = cKDTree(draw.uniform(-1, 1, (60, 2))).query(np.stack((x, y), -1))
-    return draw.uniform(0.1, 1, 60)[nearest]
 
 
 def _cog(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
@@ -207,29 +135,6 @@ def _maze() -> np.ndarray:
         ways[2 * to[0] + 1, 2 * to[1] + 1] = ways[row + to[0] + 1, column + to[1] + 1] = 1
         stack.append(to)
     return np.kron(np.where(ways > 0, 1.0, DIM), np.ones((20, 20)))
-
-
-def _sunset(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """A sun low over the sea: a sky that darkens upwards, the disc, and its glitter on the waves."""
-    sky = 0.25 + 0.5 * np.exp(-1.5 * (y + 0.2).clip(0)) + 0.9 * (np.hypot(x, y - 0.15) < 0.22)
-    glitter = np.exp(-((x / (0.15 + 0.35 * (-0.2 - y).clip(0))) ** 2)) * (1 + np.sin(60 / (y - 0.1) + 9 * x))
-    return np.where(y > -0.2, sky, 0.2 + 0.35 * glitter)
-
-
-def _julia(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """How far z² + c goes in a few dozen steps, c = -0.7 + 0.27 i: bright where it stays."""
-    z, stayed = 1.5 * (x + 1j * y), np.zeros(x.shape)
-    for _ in range(40):
-        z = np.where(np.abs(z) < 4, z**2 - 0.7 + 0.27015j, z)
-        stayed += np.exp(-np.abs(z))
-    return 0.1 + stayed / stayed.max()
-
-
-def _mosaic(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Forty stones of a pavement, each of its own grey: the cells of the points nearest to them."""
-    rng = np.random.default_rng(23)
-    middles, greys = rng.uniform(-1, 1, (40, 2)), rng.uniform(0.15, 1.0, 40)
-    return greys[np.argmin([np.hypot(x - u, y - v) for u, v in middles], axis=0)]
 
 
 def _hearts(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
@@ -275,64 +180,28 @@ def _coast() -> np.ndarray:
     return 0.15 + np.where(height > 0, 0.6, 0.0) + 0.4 * (height - height.min()) / np.ptp(height)
 
 
-SAMPLES = {  # that Matplotlib or scikit-image brings along, or that have a size of their own
-    "hopper": _hopper, "head": _head, "terrain": _terrain, "coast": _coast, "faces": _faces,
-    "matrix code": _matrix_code, "maze": _maze,
-}  # fmt: skip
+SAMPLES = {"hopper": _hopper, "head": _head, "terrain": _terrain, "coast": _coast, "maze": _maze}  # have their own size
 
 PATTERNS = {
-    **{"bar code": _bar_code, "line drawing": _line_drawing, "contours": _contours, "keys": _keys, "blobs": _blobs},
-    **{"frame": _frame, "emblem": _emblem, "bust": _bust, "cells": _cells, "cog": _cog, "sunset": _sunset},
-    **{"julia": _julia, "hearts": _hearts, "mosaic": _mosaic},
-    "rings": lambda x, y, r: 1 + 0.6 * np.cos(14 * r),
+    "bar code": _bar_code, "contours": _contours, "keys": _keys, "frame": _frame, "emblem": _emblem, "cog": _cog,
+    "hearts": _hearts,
     "checks": lambda x, y, r: np.where((np.floor(4 * x) + np.floor(4 * y)) % 2, 1.0, 0.15),
     "spots": lambda x, y, r: 0.05 + np.exp(4 * (np.cos(9 * x) * np.cos(9 * y) - 1)),
     "slope": lambda x, y, r: 0.1 + 0.9 * (x + 1) / 2,
-    "ramp": lambda x, y, r: 0.2 + 0.8 * (y + 0.5 * x + 1.5) / 3,
     "glow": lambda x, y, r: 0.1 + np.exp(-3 * r**2),
     "vignette": lambda x, y, r: 1 - 0.4 * r**2,
-    "spiral": lambda x, y, r: 1 + 0.7 * np.cos(16 * r + 3 * np.arctan2(y, x)),
-    "zone plate": lambda x, y, r: 0.1 + (np.cos(40 * r**2) > 0),
     "star": lambda x, y, r: np.where(r < 0.55 + 0.35 * np.cos(5 * np.arctan2(x, y)), 1.0, 0.05),
-    "clouds": lambda x, y, r: np.exp(0.6 * _noise(len(x), -1.5)),
     "islands": lambda x, y, r: np.where(_noise(len(x), -2.0) > 0, 1.0, 0.1),
     "dusk": lambda x, y, r: np.exp(-1.5 * (y + 0.3 * x)),
     "sheen": lambda x, y, r: 0.15 + np.exp(-(((x - y - 0.3) / 0.7) ** 2)),
     "stripes": lambda x, y, r: np.where(np.sin(14 * (x + 0.4 * y)) > 0, 1.2, 0.2),
     "corner": lambda x, y, r: 0.1 + (x + 1) * (y + 1.2),
-    "swirl": lambda x, y, r: 1 + 0.7 * np.sin(12 * r + 3 * np.arctan2(y, x)),
     "many polygons": lambda x, y, r: _polygons(x, y, 2, 20),
     "discs": lambda x, y, r: _discs(x, y, 4, 12, 0.01),
-    "marble": lambda x, y, r: np.exp(0.5 * _noise(len(x), -1.2, 1)),
     "hills": lambda x, y, r: np.exp(_noise(len(x), -2.0, 2)),
-    "felt": lambda x, y, r: np.exp(0.3 * _noise(len(x), -0.8, 3)),
     "strokes": lambda x, y, r: _strokes(x, y, 1, 6, 0.03),
     "many strokes": lambda x, y, r: _strokes(x, y, 2, 14, 0.015),
     "dots": lambda x, y, r: np.where(np.cos(16 * x) * np.cos(16 * y) > 0.45 * (x + y), 1.0, DIM),
     "cross": lambda x, y, r: np.where((np.abs(x) < 0.15) | (np.abs(y) < 0.15), 1.1, 0.1),
     "bullseye": lambda x, y, r: np.where(np.cos(25 * r) > 0, 1.1, 0.1),
-    "folds": lambda x, y, r: 0.2 + 0.8 * np.abs(np.mod(5 * x + 3 * y, 2) - 1),
-    "ripple": lambda x, y, r: 1 + 0.8 * np.cos(18 * np.hypot(x - 0.4, y + 0.3)),
-    "weave": lambda x, y, r: 0.15 + 0.85 * np.abs(np.sin(9 * (x + y)) * np.sin(9 * (x - y))),
-    "crescent": lambda x, y, r: np.where((r < 0.75) & (np.hypot(x - 0.3, y) > 0.55), 1.0, 0.05),
-    "nebula": lambda x, y, r: np.exp(_noise(len(x), -1.7, 5)),
-    "lakes": lambda x, y, r: np.where(_noise(len(x), -2.2, 9) > 0.3, 1.0, 0.15),
-    "grid": lambda x, y, r: np.where((np.mod(6 * x, 1) < 0.15) | (np.mod(6 * y, 1) < 0.15), 1.0, 0.08),
-    "comet": lambda x, y, r: 0.05 + np.exp(-8 * r) + np.exp(-((y / 0.12) ** 2) - 2 * (x + 0.1)) * (x > -0.1) / 2,
-    "saddle": lambda x, y, r: 1 + 0.8 * x * y,
-    "kaleidoscope": lambda x, y, r: 1 + 0.8 * np.cos(6 * np.arctan2(y, x)) * np.cos(10 * r),
-    "arch": lambda x, y, r: np.where((np.abs(r - 0.6) < 0.12) & (y < 0.2), 1.0, 0.06),
-    "pebbles": lambda x, y, r: _discs(x, y, 9, 25, 0.02),
-    "lattice": lambda x, y, r: 1.2 + (np.cos(15 * x) + np.cos(7.5 * x + 13 * y) + np.cos(7.5 * x - 13 * y)) / 3,
-    "drops": lambda x, y, r: 0.1 + _discs(x, y, 12, 18, 0.06) * (1 + 0.5 * y),
-    "horizon": lambda x, y, r: 0.15 + 0.85 / (1 + np.exp(-14 * (y - 0.25 * np.sin(3 * x)))),
-    "eclipse": lambda x, y, r: np.where(r < 0.45, 0.04, 0.04 + np.exp(-4 * (r - 0.45))),
-    "hatching": lambda x, y, r: np.where(np.cos(np.where(x > y, 22 * (x + y), 22 * (x - y))) > 0.2, 1.0, 0.12),
-    "feather": lambda x, y, r: 0.1 + np.exp(-5 * x**2 - 2.4 * y**4) * (1 + 0.6 * np.sin(18 * (y - np.abs(x)))),
-    "bowl": lambda x, y, r: 0.3 + 0.7 * ((x - 0.2) ** 2 + 0.7 * y**2),
-    "knot": lambda x, y, r: 0.12 + np.exp(-((np.abs(r - 0.55 - 0.2 * np.cos(3 * np.arctan2(y, x))) / 0.09) ** 2)),
-    "shelf": lambda x, y, r: 0.2 + 0.8 / (1 + np.exp(-8 * (x + 0.2))),
-    "leaf": lambda x, y, r: np.where(np.hypot(x, np.abs(y) + 0.5) < 0.95, np.where(np.abs(y) < 0.03, 0.4, 1.0), 0.08),
-    "valley": lambda x, y, r: 0.2 + np.abs(y - 0.3 * np.sin(4 * x)) ** 1.5,
-    "window": lambda x, y, r: 0.04 + np.exp(-(((x / 0.3) ** 2 + (y / 0.5) ** 2) ** 2)),
-}
+}  # fmt: skip

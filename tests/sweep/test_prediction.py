@@ -1,0 +1,107 @@
+"""Predictions by a pilot: what it is made of, what it takes over to the whole design, and which scenes have one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bstcad.optics.sides import both
+from bstcad.scene.scene import load
+from bstcad.scene.target import FEWEST
+from bstcad.sweep import prediction
+from bstcad.sweep.prediction import Pilot, Seconds, detail, fly, made_small, memory_gb, predictions, seconds, usual
+
+NET, PIXELS = "lens.back.control_points", "target.pixels"
+THU = load("templates/thu.toml")
+TINY = {"LARGEST": (32, 33, 64), "FEWEST_POINTS": 17, "CELLS": (16, 32), "pace": lambda: 1.0}
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    """Pilots that take a second or so."""
+    for name, value in TINY.items():
+        monkeypatch.setattr(prediction, name, value)
+
+
+def pilot(scene, *, slower=1.0, factor=4.0):
+    """A pilot that took so many times as long as usual."""
+    small, _ = made_small(scene)
+    took = usual(small)
+    return Pilot(small, Seconds(slower * took.first, slower * took.search, 0.0), 0.04, factor, 0.0, 0.0, None)
+
+
+def test_a_pilot_has_a_quarter_of_the_net_the_pixels_and_the_tubes():
+    small, factor = made_small(THU)
+    assert factor == 4 and both(small.lens.back.net) == (129, 129) and small.target.columns_rows == (128, 128)
+    assert small.tailoring.rays == THU.tailoring.resolved(513).rays / 4
+
+
+def test_both_nets_of_two_faces_shrink_alike():
+    beam = load("templates/beam_shaper.toml", {"lens.front.control_points": 193})
+    assert made_small(beam)[0].lens.nets() == (193, 97)
+
+
+def test_the_pilot_of_a_narrow_target_has_pixels_enough():
+    small, factor = made_small(THU.changed({PIXELS: [128, 64], NET: 1025}))  # SceneError for pixels too few
+    assert factor > 1 and min(small.target.columns_rows) >= FEWEST
+
+
+def test_a_pilot_as_large_as_its_scene_predicts_itself(monkeypatch):
+    monkeypatch.setattr(prediction, "pace", lambda: 1.0)
+    disk = load("templates/disk.toml", {"tailoring.rays": 256})
+    known = {quality: pilot(disk, slower=3.0, factor=1.0) for quality in prediction.FLOWN}
+    found = predictions(disk, known)["standard"]
+    assert found["rrmsd"][1] == pytest.approx(0.04)
+    assert found["seconds"][1] == pytest.approx(3 * (usual(disk).first + usual(disk).search) + usual(disk).rest)
+    assert all(low < likely < high for low, likely, high in found.values())
+
+
+def test_tailoring_takes_as_many_times_longer_as_the_pilot_took_longer(monkeypatch):
+    """A machine of half the pace, or a scene of twice the work: the rest goes by the machine alone."""
+    monkeypatch.setattr(prediction, "pace", lambda: 1.0)
+    once, twice = (seconds(THU, pilot(THU, slower=times)) for times in (1.0, 2.0))
+    assert twice - once == pytest.approx(usual(THU).first + usual(THU).search)
+
+
+def test_a_smaller_pilot_leaves_more_error_and_what_it_does_not_see_adds_to_it():
+    near, far = (prediction.rrmsd(pilot(THU, factor=factor), "standard") for factor in (1.0, 4.0))
+    assert far == pytest.approx(near * 4**prediction.POWER)
+    blind = replace(pilot(THU), detail=0.1, blurred=0.2)
+    assert prediction.rrmsd(blind, "standard") == pytest.approx(far + 0.1 * prediction.DETAIL["standard"] + 0.1)
+
+
+def test_detail_is_what_is_finer_than_the_cells():
+    x = (np.arange(64) + 0.5) / 64
+    wave = 1 + 0.5 * np.cos(np.pi * 20 * x) + np.zeros((64, 64))  # 20 half waves
+    assert detail(wave, 19.5) == pytest.approx(np.sqrt(0.125 / 1.125)) and detail(wave, 20.5) < 1e-12
+
+
+def test_more_tubes_goals_and_nets_take_more_memory():
+    one, wave = THU, load("templates/beam_shaper.toml")
+    assert memory_gb(one.changed({"tailoring.rays": 3000})) > memory_gb(one)
+    alone = wave.changed({"wavefront": None, "accept.wavefront": None})
+    assert memory_gb(wave) > memory_gb(alone) > prediction.LIBRARIES
+
+
+SCENES = {
+    "two pictures": ("two_pictures", {}),
+    "a picture and a wave": ("beam_shaper", {}),
+    "a mirror": ("mirror", {}),
+    "a source of some size, and losses": ("led", {}),
+    "a spectrum": ("white_logo", {}),
+    "bounds": ("machinable_letters", {}),
+    "a tilted target": ("thu", {"target.tilt": [10.0, 0.0]}),
+    "a conic front": ("thu", {"lens.front": {"kind": "conic", "z": 8.0, "curvature": 0.001, "conic_constant": -1.0}}),
+    "knobs of its own": ("thu", {"tailoring.rays": 600}),
+    "integration": ("thu", {"tailoring.method": "integration"}),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_every_scene_is_predicted(name, tiny):
+    template, changes = SCENES[name]
+    scene = load(f"templates/{template}.toml", {"tailoring.quality": "draft"} | changes)
+    flown = fly(scene, "draft")
+    assert flown.seconds.first > 0 and 0 < flown.rrmsd < 1.5
+    found = predictions(scene, dict.fromkeys(prediction.FLOWN, flown))["draft"]
+    assert all(0 < low < likely < high < np.inf for low, likely, high in found.values())
