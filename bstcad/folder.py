@@ -375,7 +375,7 @@ def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
         shapes[numbered("target", k)] = target.columns_rows[::-1]
         if (name := numbered("reachable", k)) in held:
             shapes[name] = target.columns_rows[::-1]
-    found = _arrays(folder, shapes | dict.fromkeys(_numbers(scene.lens.front.surface), ()), scene)
+    found = _arrays(folder, shapes | dict.fromkeys(_numbers(scene.lens.front_surface), ()), scene)
     goals, stored = [], []
     for k, goal in enumerate(scene.goals):
         part = found.get(numbered("reachable", k))
@@ -430,7 +430,7 @@ def _numbers(front: Surface) -> dict[str, float]:
 def _lens(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
     """The designed lens, to the last bit, from its control nets (m, n, 3) in mm and the numbers of its front."""
     blank = scene.lens
-    front = blank.front.surface
+    front = blank.front_surface
     if blank.front.shaped:
         front = _surface(found["front_control_points"], blank.front.z)
     else:

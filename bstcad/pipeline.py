@@ -146,7 +146,7 @@ def design(
         lens, stopped = _stage2(task, driver, lens, followed, state=start and start.second, best=start and start.best)
     lens = replace(lens.plain(), index=scene.index, losses=None)
     if scene.lens.front.fixed:  # as it was given: tailoring may have worked with less digits of it
-        lens = replace(lens, front=scene.lens.front.surface)
+        lens = replace(lens, front=scene.lens.front_surface)
     steep = steepness(task.heaviest.source, lens, goals[0], sent=followed.transport)
     making = _making(followed, driver.record, stopped, steep)
     return Made(

@@ -207,14 +207,18 @@ class BSplineSurface(Surface):
         """The net of m x m control points over x and y (mm) nearest to a surface, by least squares along each axis.
 
         B^T B H C^T C = B^T Z C: Z are the surface's heights at four points a span each way, B and C the basis along
-        x and y.
+        x and y.  Only spans count in which x(t) is linear, all but the first and the last: there the error falls with
+        the third power of the spacing, in an end span with the second.  The outermost control points go on evenly.
         """
-        u = np.linspace(0.0, 1.0, 4 * (m - 2) + 1)
-        basis = basis_matrix(u * (m - 1), m)
-        along = (torch.from_numpy(low + (high - low) * u) for low, high in (x, y))
+        u = np.linspace(1.5, m - 2.5, 4 * (m - 4) + 1)
+        basis = basis_matrix(u, m)[:, 1:-1]  # the first and the last control point end with their spans
+        along = (torch.from_numpy(low + (high - low) * u / (m - 1)) for low, high in (x, y))
         heights = surface.plain().relative_sag_and_slope(*torch.meshgrid(*along, indexing="ij"))[0].numpy()
-        in_x = _least_squares(basis, basis.T @ heights)
-        return cls(surface.z, torch.from_numpy(_least_squares(basis, basis.T @ in_x.T).T.copy()), x, y)
+        for _ in range(2):  # along x, then along y
+            inner = _least_squares(basis, basis.T @ heights)
+            first, last = (3 * end[0] - 3 * end[1] + end[2] for end in (inner, inner[::-1]))
+            heights = np.concatenate([first[None], inner, last[None]]).T
+        return cls(surface.z, torch.from_numpy(heights.copy()), x, y)
 
     @property
     def detail(self) -> float:

@@ -45,7 +45,7 @@ UNIFORM = 1e-9  # mm; a net further from uniform in x and y is not one of ours
 ROUNDING = 1e-12  # mm; a net whose vertex is so near to zero is measured from there already
 LARGEST_NET = 2049  # control points a side
 FITTED = 1e-6  # mm; how far the net that stands for a surface of one's own may lie from it, as accept.form has it
-FITS = (129, 257, 513, 1025)  # control points a side of such a net, tried in turn
+FITS = (33, 65, 129, 257, 513, 1025)  # control points a side of such a net, tried in turn
 OBLONG = 1.5  # a cell of the net longer than so many times its width is doubted
 FEWEST_ROUND = 6  # of a round lens: with 5 its net, two spans past the rim each way, has no extent
 
@@ -174,6 +174,10 @@ class _Front:
         """The surface without an outline of its own."""
         of, _ = FRONTS[self.kind]
         return of(**{each.name: getattr(self, each.name) for each in fields(of)})
+
+    def traced(self, outline: Outline) -> Surface:
+        """Return the surface that a lens of this outline has: the front's own, or the net that stands for it."""
+        return self.surface
 
     @property
     def fixed(self) -> bool:
@@ -524,6 +528,11 @@ class LensBlank(Record):
         return self.front.surface.sags(self.outline)
 
     @property
+    def front_surface(self) -> Surface:
+        """The front as the lens has it, before tailoring."""
+        return self.front.traced(self.outline)
+
+    @property
     def shaped(self) -> tuple[Face, ...]:
         """The faces that tailoring shapes, in the order of the light."""
         front: tuple[Face, ...] = ("front",) if self.front.shaped else ()
@@ -534,9 +543,10 @@ class LensBlank(Record):
 
         A front that tailoring shapes keeps its proportion to the back, such as both once have; a given one has its own.
         """
-        own = self.front.given.shape if self.front.given else self.front.control_points if self.front.shaped else None
         if not self.front.shaped:
-            return own and plain(own)
+            front = self.front.given or self.front_surface
+            return plain(front.shape) if isinstance(front, GivenNet) or front.is_net else None
+        own = self.front.given.shape if self.front.given else self.front.control_points
         if own is None:
             return net
         if self.back.control_points is None:  # the proportion is not known yet
@@ -552,7 +562,7 @@ class LensBlank(Record):
     def flat_front(self, net: Sides, as_wide_as: Sides | None = None) -> Surface:
         """The front before tailoring, beside a back with control points of `net`; as_wide_as: as Scene.flat_lens."""
         if not self.front.shaped:
-            return self.front.surface
+            return self.front_surface
         if self.front.given is not None:
             return self.front.given.surface(self.front.z).refined(self.front_net(net))
         from bstcad.optics.bspline import BSplineSurface
