@@ -28,6 +28,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.media import density
 from bstcad.optics.surfaces import Surface, sag
 from bstcad.report.units import Rows, mm, tables
+from bstcad.scene.blank import FITTED
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
 
@@ -62,6 +63,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
     """Of `lens` as it was designed for `scene`; shape: of bstcad.analysis.shape, and the volume."""
     front, material = lens.front, scene.lens.material
     numbers = ({"curvature": 0.0} if front.level else {}) | scene.lens.front.numbers(front)
+    fitted = {"within": FITTED} if front.is_net and scene.lens.front.kind != "bspline" else {}  # mm
     heavy = density(material) if material else None
     return {
         "name": scene.name,
@@ -71,7 +73,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "index": lens.index,
         "outline": asdict(lens.outline),
         "clear": lens.clear and tuple(map(asdict, lens.clear)),  # apertures of front and back; None: no mount
-        "front": _own(front) | _face(scene.lens.front.kind, lens.front_vertex, numbers),
+        "front": _own(front) | _face(scene.lens.front.kind, lens.front_vertex, numbers) | fitted,
         "back": _face("bspline", vertex(lens), {}),
         "reflects": lens.reflects,  # is it a mirror, whose back is the face that light meets?
         "net": _net(lens.back),
