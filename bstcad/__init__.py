@@ -27,7 +27,7 @@ _HOMES = {
     "Collimated": "optics.collimated",
     "Point": "optics.point",
     **dict.fromkeys(("Circle", "Rectangle"), "optics.outlines"),
-    **dict.fromkeys(("Surface", "Plane", "Sphere", "Conic"), "optics.surfaces"),
+    **dict.fromkeys(("Surface", "Plane", "Sphere", "Conic", "Toroid"), "optics.surfaces"),
     **dict.fromkeys(("Interface", "Refract", "Reflect", "cross"), "optics.interfaces"),
     **dict.fromkeys(("measure", "Effort", "Light", "RayTubes"), "optics.measure"),
     "trace": "optics.trace",

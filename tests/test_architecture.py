@@ -310,7 +310,7 @@ def test_compiled_functions_read_nothing_of_other_files():
     assert offenders(overlooked_by_a_cache, allowed=one_cache) == {}
 
 
-SURFACES = ("Plane", "Sphere", "Conic", "BSplineSurface")
+SURFACES = ("Plane", "Sphere", "Conic", "Toroid", "BSplineSurface")
 
 
 def questions_of_type(tree):
@@ -407,8 +407,8 @@ def test_a_start_is_light(start):
 
 PUBLIC = """
     design open mounted Design Report Scene load LensBlank Back Accept Target Collimated Point Circle Rectangle
-    Plane Sphere Conic Interface Refract Reflect cross measure Effort Light Lens BSplineSurface Channel Screen Tailoring
-    SceneError Check RayTubes Surface trace effect workbench __version__
+    Plane Sphere Conic Toroid Interface Refract Reflect cross measure Effort Light Lens BSplineSurface Channel Screen
+    Tailoring SceneError Check RayTubes Surface trace effect workbench __version__
 """
 
 

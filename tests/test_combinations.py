@@ -142,6 +142,7 @@ CHOICES = {
         "sphere": front(kind="sphere", curvature=0.005),
         "free sphere": front(kind="sphere", optimise=True),
         "conic": front(kind="conic", curvature=0.005, conic_constant=-1.0),
+        "toroid": front(kind="toroid", curvature_x=0.005, curvature_y=-0.003),
         "spline file": spline_file,
         "tailored spline": front(kind="bspline", optimise=True),
         "mirror": front(kind="plane") | {"lens.back.reflect": True, "lens.material": None},

@@ -15,7 +15,7 @@ from bstcad import commands, pipeline
 from bstcad.cad import step_reading
 from bstcad.folder import read_nominal
 from bstcad.optics.outlines import Circle
-from bstcad.optics.surfaces import sag
+from bstcad.optics.surfaces import Toroid, sag
 from bstcad.scene.scene import load
 from bstcad.tolerance import perturbations
 from bstcad.verify import step_checks
@@ -34,6 +34,13 @@ def behind_another(small_scene, small_design, tmp_path_factory):
     """The small lens again, its front the back of the first one, by a scene that names that design's folder."""
     front = {"kind": "bspline", "z": 15.0, "file": str(small_design.folder)}
     return made(small_scene.changed({"lens.front": front}), tmp_path_factory.mktemp("fronts") / "freeform")
+
+
+@pytest.fixture(scope="module")
+def toroid(small_scene, tmp_path_factory):
+    """The small lens with a toroid front, convex along x and concave along y."""
+    front = {"kind": "toroid", "z": 15.0, "curvature_x": 0.006, "curvature_y": -0.004}
+    return made(small_scene.changed({"lens.front": front}), tmp_path_factory.mktemp("fronts") / "toroid")
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +103,7 @@ def test_tolerances_of_a_domed_lens_move_its_dome(dome):
     assert larger.front.curvature == pytest.approx(-1 / 12 / 1.01)
 
 
-@pytest.mark.parametrize("name", ["behind_another", "conic", "dome"])
+@pytest.mark.parametrize("name", ["behind_another", "conic", "dome", "toroid"])
 def test_the_design_passes_its_checks(name, request):
     report = request.getfixturevalue(name).report
     assert [check["name"] for check in report["checks"] if not check["passed"]] == []
@@ -169,3 +176,32 @@ def test_both_numbers_of_the_conic_are_found(conic):
     written = json.loads((conic.folder / "report.json").read_text())["prescription"]["front"]
     assert written["kind"] == "conic" and written["conic_constant"] == front.conic_constant
     assert repr(front.conic_constant) in (conic.folder / "prescription.txt").read_text()
+
+
+def test_the_step_file_of_a_toroid_lies_within_a_nanometre_of_it(toroid):
+    step = step_reading.read(toroid.folder / "lens.step")
+    x, y = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 1000)) * [[4.0], [3.0]]
+    assert np.abs(sag(step.front, x, y) - sag(Toroid(15.0, 0.006, -0.004), x, y)).max() < 1e-6
+    assert sag(step.front, 0.0, 0.0) == pytest.approx(15.0, abs=1e-12)
+
+
+def test_a_toroid_is_read_again_to_the_last_bit_and_its_sheets_have_both_radii(toroid):
+    scene, nominal = read_nominal(toroid.folder)
+    assert scene == toroid.scene and nominal.lens.front.is_net
+    assert np.array_equal(
+        nominal.lens.front.control_points(), np.load(toroid.folder / "design.npz")["front_control_points"]
+    )
+    assert bstcad.open(toroid.folder).lens.front.z == 15.0
+    front = json.loads((toroid.folder / "report.json").read_text())["prescription"]["front"]
+    assert front["kind"] == "toroid" and front["vertex"] == [0.0, 0.0, 15.0]
+    assert (front["radius_x"], front["radius_y"]) == (1 / 0.006, 1 / -0.004) and front["radius"] is None
+    text = (toroid.folder / "prescription.txt").read_text()
+    for words in ("radius in x", repr(1 / 0.006), "radius in y", "-250 mm", "curvature in y", "within 10⁻⁶ mm"):
+        assert words in text
+
+
+def test_another_toroid_than_that_of_the_design_fails(toroid):
+    other = toroid.scene.changed({"lens.front.curvature_y": -0.00401}).lens
+    _, nominal = read_nominal(toroid.folder)
+    checks = step_checks.check(toroid.folder / "lens.step", nominal.lens.with_front(other.front_surface), 1e-6, 1024)
+    assert "front-net" in {check.id for check in checks if not check.passed}

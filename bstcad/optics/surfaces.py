@@ -1,4 +1,4 @@
-"""Surfaces of revolution z(r): plane, sphere, conic.  The docstring of a surface is its equation.
+"""Plane, sphere, conic and toroid.  The docstring of a surface is its equation.
 
 Every surface, the B-spline too (bspline.py), answers the questions of `Surface`, so that tracing asks for no class:
 a plane is a surface of curvature zero, a sphere a conic of conic constant zero.
@@ -121,8 +121,7 @@ class _Revolved(Surface):
         """
         c = self.curvature
         r2 = x * x + y * y
-        cos2 = self._cos2(r2)
-        root = torch.sqrt(torch.where(cos2 > EQUATOR, cos2, torch.full_like(cos2, EQUATOR)))  # guarded before the root
+        root = _root(self._cos2(r2))
         return c * r2 / (1 + root), c * x / root, c * y / root
 
     def reaches(self, x: Tensor, y: Tensor) -> Tensor:
@@ -228,6 +227,59 @@ class Conic(_Revolved):
     def parameters(self) -> dict[str, float | Tensor]:
         """The curvature (1/mm) and the conic constant."""
         return {"curvature": self.curvature, "conic_constant": self.conic_constant}
+
+
+@dataclass(frozen=True)
+class Toroid(Surface):
+    """z = z0 + R - sqrt((R - f)² - y²), R = 1 / c_y, f = c_x x² / (1 + sqrt(1 - c_x² x²)); c_y = 0: z = z0 + f.
+
+    It is the circle of curvature c_x in the plane y = 0, turned about the line parallel to x at z = z0 + R (a toric
+    surface of ISO 10110-12).  With one curvature 0 it is a cylinder, with two equal ones a sphere.
+    """
+
+    z: float  # vertex (mm)
+    curvature_x: float | Tensor = 0.0  # c_x (1/mm); positive bends towards +z
+    curvature_y: float | Tensor = 0.0  # c_y (1/mm)
+    kind: Literal["toroid"] = "toroid"
+
+    __pydantic_config__ = STRICT
+
+    def _profile(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(1 - c_x² x², 1 - c_y f, ((1 - c_y f)² - c_y² y²)): the first and the last are positive inside its rim."""
+        c = self.curvature_x
+        cos2 = 1 - c * c * x * x
+        f = c * x * x / (1 + _root(cos2))
+        left = 1 - self.curvature_y * f
+        return cos2, left, left * left - (self.curvature_y * y) ** 2
+
+    def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; beyond the rim of the surface finite numbers without meaning.
+
+        In the form z - z0 = (f (2 - c_y f) + c_y y²) / (1 + sqrt((1 - c_y f)² - c_y² y²)) it keeps its digits.
+        """
+        cos2, left, g = self._profile(x, y)
+        c_x, c_y, along, root = self.curvature_x, self.curvature_y, _root(cos2), _root(g)
+        h = (c_x * x * x / (1 + along) * (1 + left) + c_y * y * y) / (1 + root)
+        return h, left * c_x * x / along / root, c_y * y / root
+
+    def reaches(self, x: Tensor, y: Tensor) -> Tensor:
+        """True where there is a point of the surface over (x, y); a rim where it stands upright does not count."""
+        cos2, left, g = self._profile(x, y)
+        return (cos2 > EQUATOR) & (g > EQUATOR) & (left > 0)
+
+    def sags(self, outline: Outline) -> tuple[float, float]:
+        """Return the lowest and the highest sag (mm) at the rim of the outline, and zero."""
+        h = self.plain().relative_sag_and_slope(*map(torch.from_numpy, outline.places()))[0]
+        return min(float(h.min()), 0.0), max(float(h.max()), 0.0)
+
+    def parameters(self) -> dict[str, float | Tensor]:
+        """The curvatures along x and y (1/mm)."""
+        return {"curvature_x": self.curvature_x, "curvature_y": self.curvature_y}
+
+
+def _root(square: Tensor) -> Tensor:
+    """Return the square root, guarded where the surface stands upright."""
+    return torch.sqrt(torch.where(square > EQUATOR, square, torch.full_like(square, EQUATOR)))
 
 
 @dataclass(frozen=True)

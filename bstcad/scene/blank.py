@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
@@ -19,7 +20,7 @@ from bstcad.optics.lens import Face
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.sides import Sides, both, coarser, in_proportion, plain
-from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Surface
+from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Surface, Toroid
 from bstcad.runs import files
 from bstcad.scene.errors import SceneError
 from bstcad.scene.schema import COORDINATES, LENGTHS, FileContent, OneOrTwo, Record, from_file, leaving_out
@@ -31,6 +32,7 @@ if TYPE_CHECKING:  # which loads numba
 
 # (1 + k) c² r² of a conic at the rim: at most, where a sphere that stands upright has 1, and at least (nearly a cone).
 UPRIGHT, CONE = 0.85, -7.0
+STEEP_NET = 60.0  # degrees; steepest slope at the rim of a surface for which a net stands
 STEEPEST = 80.0  # degrees, of a front with an outline of its own at its rim: what a height over a plane carries well
 FLATTEST = 1e-3  # mm; of such a front the least sag at its rim, by which its edge is one
 LEAST_BESIDE = 1e-2  # mm; between the outline of a front and that of the lens
@@ -281,6 +283,48 @@ class ConicFront(_Front):
 
 
 @dataclass(frozen=True)
+class ToroidFront(_Front):
+    """A toroid, of another curvature along x than along y; the lens has the net within FITTED that stands for it."""
+
+    z: Annotated[float, Z]
+    curvature_x: Annotated[
+        float, Key("Curvature along x at the vertex; positive bends towards +z.", "1/mm", -1e3, 1e3, example=0.02)
+    ] = 0.0
+    curvature_y: Annotated[
+        float, Key("Curvature along y; the circle along x is turned about its centre.", "1/mm", -1e3, 1e3, example=0.01)
+    ] = 0.0
+    kind: Annotated[Literal["toroid"], Key("A toroid; of one curvature 0 a cylinder.")] = "toroid"
+
+    __pydantic_config__ = STRICT
+
+    def traced(self, outline: Outline) -> Surface:
+        """Return the net that stands for it, its vertex at z."""
+        return _net_of(self.surface, outline)
+
+    def numbers(self, front: Surface) -> dict[str, float]:
+        """Return its curvatures (1/mm), which the net of the lens does not have."""
+        return {"curvature_x": self.curvature_x, "curvature_y": self.curvature_y}
+
+    def complaints(self, outline: Outline) -> Iterator[str]:
+        """It ends before the rim, or stands too steeply there for a net."""
+        x, y = map(torch.from_numpy, outline.places())
+        _, z_x, z_y = self.surface.relative_sag_and_slope(x, y)
+        slope = math.degrees(math.atan(float(torch.hypot(z_x, z_y).max())))
+        if slope <= STEEP_NET and bool(self.surface.reaches(x, y).all()):
+            return
+        half_x, half_y = outline.half_extent
+        name = "curvature_x" if abs(self.curvature_x) * half_x > abs(self.curvature_y) * half_y else "curvature_y"
+        radius = f"{1 / abs(getattr(self, name)):g} mm"
+        why = f"a radius of {radius} ends before the rim, or is steeper than {STEEP_NET:g} degrees there"
+        yield f"{name}: {why}; make the curvature smaller"
+
+
+@lru_cache(maxsize=16)
+def _net_of(surface: Surface, outline: Outline) -> BSplineSurface:
+    return fitted(surface, outline).from_vertex().moved(surface.z)
+
+
+@dataclass(frozen=True)
 class NetFront(_Front):
     """A freeform front: the back of an earlier design, moved along z, or one that is tailored, from there or flat."""
 
@@ -349,6 +393,7 @@ class NetFront(_Front):
 
 FRONTS = {  # by their kind: the surface of optics, and the record
     "plane": (Plane, PlaneFront), "sphere": (Sphere, SphereFront), "conic": (Conic, ConicFront),
+    "toroid": (Toroid, ToroidFront),
 }  # fmt: skip
 
 
@@ -412,7 +457,7 @@ def of_net(outline: Outline, points: Sides | None) -> Iterator[str]:
 
 
 Front = Annotated[
-    Annotated[PlaneFront | SphereFront | ConicFront | NetFront, Field(discriminator="kind")],
+    Annotated[PlaneFront | SphereFront | ConicFront | ToroidFront | NetFront, Field(discriminator="kind")],
     BeforeValidator(as_front),
 ]
 

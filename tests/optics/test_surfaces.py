@@ -12,7 +12,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
 from bstcad.optics.rays import Rays, Status
-from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, sag
+from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Toroid, sag
 from bstcad.optics.trace import to_first_net
 
 N = 1.5
@@ -144,3 +144,61 @@ def test_a_bent_surface_has_so_much_more_curvature_at_its_vertex(surface):
     h, by = 1e-2, 0.001
     higher = sag(surface.bent(by), [-h, 0.0, h], 0.0) - sag(surface, [-h, 0.0, h], 0.0)
     assert (higher[0] - 2 * higher[1] + higher[2]) / h**2 == pytest.approx(by, rel=1e-4)
+
+
+TOROIDS = [(0.03, 0.05), (0.03, -0.05), (-0.04, 0.0), (0.0, 0.04), (1e-9, 0.05), (0.04, 1e-9)]
+
+
+@pytest.mark.parametrize(("c_x", "c_y"), TOROIDS)
+def test_a_toroid_is_its_circle_along_x_turned_about_the_centre_along_y(c_x, c_y):
+    """The points of the circle, turned by up to 25 degrees about z = 1 / c_y, which are shifted along y if c_y = 0."""
+    x, y = places()
+    circle = sag(Sphere(0.0, c_x), x.numpy(), 0.0)
+    if c_y:
+        turn, radius = y * abs(c_y), 1 / c_y - torch.from_numpy(circle)
+        y, height = radius * torch.sin(turn), torch.from_numpy(circle) + 2 * radius * torch.sin(turn / 2) ** 2
+    else:
+        height = torch.from_numpy(circle)
+    error = abs(sag(Toroid(15.0, c_x, c_y), x.numpy(), y.numpy()) - 15.0 - height.numpy())
+    assert error.max() < (1e-13 if abs(c_y) != 1e-9 else 1e-6)  # 1e9 mm away the point itself has no more digits
+
+
+@pytest.mark.parametrize(("c_x", "c_y"), TOROIDS)
+def test_slopes_of_a_toroid_are_the_derivatives_of_its_sag(c_x, c_y):
+    x, y = (p.requires_grad_() for p in places(50))
+    given = [torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in (c_x, c_y)]
+    h, *slopes = Toroid(0.0, c_x, c_y).relative_sag_and_slope(x, y)
+    for found, wanted in zip(slopes, torch.autograd.grad(h.sum(), (x, y)), strict=True):
+        torch.testing.assert_close(found, wanted, rtol=0, atol=1e-14)
+    x, y = x.detach(), y.detach()
+    assert torch.autograd.gradcheck(lambda *each: Toroid(0.0, *each).relative_sag_and_slope(x, y), given)
+
+
+def test_a_toroid_of_equal_curvatures_is_a_sphere():
+    x, y = places()
+    toroid, sphere = Toroid(0.0, -0.06, -0.06), Sphere(0.0, -0.06)
+    pairs = zip(toroid.relative_sag_and_slope(x, y), sphere.relative_sag_and_slope(x, y), strict=True)
+    for one, other in pairs:
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-14)
+
+
+def test_a_toroid_ends_where_it_stands_upright_and_beyond_nothing_is_nan():
+    x = torch.tensor([0.0, 9.9, 10.1, 0.0, 0.0, 0.0, 50.0], dtype=torch.float64, requires_grad=True)
+    y = torch.tensor([0.0, 0.0, 0.0, 4.9, 5.1, 50.0, 50.0], dtype=torch.float64)
+    surface = Toroid(0.0, 0.1, 0.2)
+    # The circle along x, of 10 mm radius, comes to the line that it turns about at x = 8.7 mm.
+    assert surface.reaches(x, y).tolist() == [True, False, False, True, False, False, False]
+    values = surface.relative_sag_and_slope(x, y)
+    assert all(torch.isfinite(value).all() for value in values)
+    assert torch.isfinite(torch.autograd.grad(sum(value.sum() for value in values), x)[0]).all()
+
+
+@pytest.mark.parametrize("outline", [Rectangle(16.0, 10.0), Circle(7.0)], ids=lambda outline: outline.shape)
+@pytest.mark.parametrize(("c_x", "c_y"), TOROIDS)
+def test_no_place_inside_the_outline_is_beyond_the_sags_of_a_toroid(c_x, c_y, outline):
+    x, y = places(4000)
+    inside = outline.contains(x, y)
+    h = Toroid(0.0, c_x, c_y).relative_sag_and_slope(x, y)[0][inside]
+    low, high = Toroid(15.0, c_x, c_y).sags(outline)
+    assert low <= float(h.min()) and float(h.max()) <= high
+    assert high - low < 1.1 * max(float(h.max()), 0.0) - 1.1 * min(float(h.min()), 0.0) + 1e-9

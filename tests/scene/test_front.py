@@ -15,7 +15,7 @@ from bstcad.cad import step_reading, step_writing
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.surfaces import Conic, Plane, Sphere, sag
+from bstcad.optics.surfaces import Conic, Plane, Sphere, Toroid, sag
 from bstcad.scene.blank import NET_FILE, ConicFront, SphereFront, net_extent
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
@@ -209,3 +209,40 @@ def test_a_front_that_comes_too_near_to_the_back_is_refused():
     high = BSplineSurface(15.0, 60.0 * face.heights, face.x, face.y)
     with pytest.raises(SceneError, match=re.escape("lens.back.z: the lens is") + ".* thick at its thinnest place"):
         load(DISK).changed({"lens.front": high})
+
+
+@pytest.mark.parametrize("outline", [Rectangle(16.0, 12.0), Circle(8.0)], ids=lambda outline: outline.shape)
+@pytest.mark.parametrize(("curvatures", "same"), [
+    ((0.03, 0.03), Sphere(15.0, 0.03)), ((-0.08, -0.08), Sphere(15.0, -0.08)), ((0.0, 0.0), Plane(15.0)),
+    ((0.02, -0.05), Toroid(15.0, 0.02, -0.05)), ((0.1, 0.0), Toroid(15.0, 0.1, 0.0)),
+])  # fmt: skip
+def test_the_net_of_a_toroid_lies_within_a_nanometre(outline, curvatures, same):
+    """Of two equal curvatures on the sphere, too; its vertex is at z to the bit."""
+    scene = load(DISK).changed({"lens.outline": outline, "lens.front": Toroid(15.0, *curvatures)})
+    net = scene.lens.front_surface
+    x, y = torch.linspace(-8.0, 8.0, 301, dtype=torch.float64), torch.linspace(-8.0, 8.0, 300, dtype=torch.float64)
+    x, y = torch.meshgrid(x, y, indexing="ij")
+    inside = outline.contains(x, y)
+    assert np.abs(sag(net, x, y) - sag(same, x, y))[inside].max() < 1.1e-6
+    assert sag(net, 0.0, 0.0) == 15.0 and net.is_net and scene.lens.nets(33) == ((33), net.shape[0])
+
+
+def test_a_toroid_stands_in_its_scene_with_both_curvatures(tmp_path):
+    scene = load(DISK).changed({"lens.front": bstcad.Toroid(14.0, 0.01, -0.02)})
+    (tmp_path / "scene.toml").write_text(scene.toml())
+    again = load(tmp_path / "scene.toml")
+    assert again == scene and again.lens.front.surface == Toroid(14.0, 0.01, -0.02) and again.lens.front.fixed
+    assert torch.equal(again.lens.front_surface.heights, scene.lens.front_surface.heights)
+
+
+@pytest.mark.parametrize(("keys", "sentence"), [
+    ({"curvature_x": 0.13}, "curvature_x: a radius of 7.69231 mm ends before the rim, or is steeper than 60"),
+    ({"curvature_y": -0.11}, "curvature_y: a radius of 9.09091 mm .* make the curvature smaller"),
+    ({"curvature_x": 0.08, "curvature_y": 0.1}, "curvature_y: a radius of 10 mm"),  # at the corners
+    ({"curvature_x": 2e3}, r"curvature_x: .*1000"),
+    ({"curvature": 0.1}, "curvature: unknown key"),
+    ({"optimise": True}, "optimise: unknown key"),
+])  # fmt: skip
+def test_a_toroid_that_no_lens_can_have_is_refused_by_its_key(keys, sentence):
+    with pytest.raises(SceneError, match=rf"^lens\.front\.{sentence}"):
+        load(DISK).changed({"lens.front": {"kind": "toroid", "z": 15.0, **keys}})
