@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import json
 from collections.abc import Mapping
 from typing import Any
-
-import numpy as np
-from PIL import Image
 
 from bstcad.app.preview import Preview
 from bstcad.report.figure_jobs import light_path_of
 from bstcad.report.light_figures import View, tones
 from bstcad.report.record import LEFT_OUT, LeftOut, changes
-from bstcad.report.rendering import turnable
+from bstcad.report.rendering import data_url, turnable
 from bstcad.report.units import duration, number, percent, quantity
 from bstcad.sweep.prediction import Interval
 
@@ -37,9 +32,9 @@ def of_preview(found: Preview) -> dict[str, Any]:
     views = [View.of(found.scene, k) for k in range(len(found.pictures))]
     targets = [
         {
-            "key": key, "rrmsd": number(value), "wanted": png(view.picture(tones(wanted, wanted))),
-            "light": png(view.picture(tones(light, wanted))), "seen": view.words, "pixels": list(light.shape[::-1]),
-            "source_image": image and quantity(image, "mm"),
+            "key": key, "rrmsd": number(value), "wanted": data_url(view.picture(tones(wanted, wanted))),
+            "light": data_url(view.picture(tones(light, wanted))), "seen": view.words,
+            "pixels": list(light.shape[::-1]), "source_image": image and quantity(image, "mm"),
         }
         for key, view, value, (wanted, light, image) in zip(
             found.scene.target_keys, views, found.rrmsds, seen, strict=True
@@ -49,13 +44,6 @@ def of_preview(found: Preview) -> dict[str, Any]:
         "seconds": round(found.seconds, 3), "targets": targets, "figures": figures(found),
         "remarks": list(found.remarks), "solid": json.loads(turnable(found.lens, path, cells=CELLS) or "null"),
     }  # fmt: skip
-
-
-def png(grey: np.ndarray) -> str:
-    """Grey tones (rows, columns) as the data URL of a PNG."""
-    written = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(grey)).save(written, "png")
-    return f"data:image/png;base64,{base64.b64encode(written.getvalue()).decode()}"
 
 
 def figures(found: Preview) -> list[list[str]]:

@@ -393,7 +393,7 @@ def _light(path: LightPath) -> dict[str, Any]:
         "rays": np.round(rays, TENTHS_OF_MICRONS).tolist(),
         "flux": np.round(flux, PARTS).tolist(),
         "screens": [
-            {"corners": np.round(screen, TENTHS_OF_MICRONS).tolist(), "picture": _data_url(picture)}
+            {"corners": np.round(screen, TENTHS_OF_MICRONS).tolist(), "picture": data_url(picture)}
             for screen, picture in zip(path.screens, path.pictures, strict=True)
         ],
         "lamp": np.round(path.lamp, TENTHS_OF_MICRONS).tolist(),
@@ -402,7 +402,7 @@ def _light(path: LightPath) -> dict[str, Any]:
     }
 
 
-def _data_url(picture: np.ndarray) -> str:
+def data_url(picture: np.ndarray) -> str:
     """Tones (rows, columns) uint8 as a PNG that a page holds."""
     from PIL import Image
 
