@@ -170,7 +170,7 @@ def new_table(key: str, data: Table) -> dict[str, Any]:
     name, others = plain(key), data.get(plain(key))
     others = [part for part in (others if isinstance(others, list) else [others]) if isinstance(part, dict)]
     if name == "target" and others:
-        return _further(others[-1], table_at("lens.back", data))
+        return _next_target(others[-1], table_at("lens.back", data))
     union = records_at(key, data)
     node: Node = node_at(key, data) or {}
     like = table_at(LIKE.get(name, ("", 0.0))[0], data)
@@ -181,7 +181,7 @@ def new_table(key: str, data: Table) -> dict[str, Any]:
     return _completed(key, union[shapes.index(kind)], {}, data)
 
 
-def _further(target: Table, back: Table) -> dict[str, Any]:
+def _next_target(target: Table, back: Table) -> dict[str, Any]:
     """A target behind another one."""
     z, start = (part.get("z") for part in (target, back))
     if not all(isinstance(each, int | float) for each in (z, start)):

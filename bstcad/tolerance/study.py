@@ -378,8 +378,8 @@ def adjust(superposed: Model, perturbations: Sequence[Perturbation], amounts: np
 def loosest(study: Study, wanted: float, others: Sequence[Study] = ()) -> tuple[tuple[Perturbation, ...], Yield]:
     """The loosest tolerances that keep a yield (0 … 1), and their yield by independent trials.
 
-    others: studies of further goals by the same trials; a lens passes that keeps to all limits, over which the squares
-    q_i of all goals add up.
+    others: studies of the other goals by the same trials; a lens passes that keeps to all limits, over which the
+    squares q_i of all goals add up.
 
     Holding error i at u_i times its limit costs c_i / u_i and adds q_i u_i² to the mean square of the picture.  The
     least cost for a given sum of the latter is at u_i ∝ (c_i / q_i)^(1/3); one factor on all then brings the yield, by
