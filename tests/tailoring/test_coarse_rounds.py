@@ -29,7 +29,7 @@ NEAR = {  # a wall nearer than the plate is wide, fifty times as bright in one c
         "back": {"kind": "bspline", "z": 12.0, "control_points": 65},
     },
     "target": {"z": 62.0, "x": [-30.0, 30.0], "y": [-30.0, 30.0], "pixels": 64, "uniform": True},
-    "tailoring": {"quality": "draft", "rays": 192, "transport_grid": 128, "stage2_iterations": 12},
+    "tailoring": {"quality": "draft", "rays": 128, "transport_grid": 64, "stage2_iterations": 12},
 }
 
 
@@ -63,7 +63,7 @@ def made(states):
 
 
 def test_they_bring_light_far(made, monkeypatch):
-    assert [name[:18] for name in names(made)] == ["stage 2, 32 pixels", "stage 2, 192² tube"]
+    assert [name[:18] for name in names(made)] == ["stage 2, 32 pixels", "stage 2, 128² tube"]
     monkeypatch.setattr(stage2, "FAR_OFF", float("inf"))
     without = design(near(), device="cpu", later=True)
     assert len(names(without)) == 1

@@ -59,7 +59,7 @@ def several(small_design, goals, tmp_path_factory):
     """(folder, record) of a study of both targets and the wave, its limits between the best and the worst lens."""
     place = tmp_path_factory.mktemp("several")
     first = folder_of(small_design, place / "first", {"accept.rrmsd": 5.0} | goals)
-    found = tolerancing.tolerance(first, **FEW | {"tubes": 65, "full": 1})  # where the limits are to be
+    found = tolerancing.tolerance(first, **FEW | {"tubes": 33, "trials": 100, "full": 1})  # where the limits are to be
     wave = found.wavefront
     limits = {
         "accept.rrmsd": (found.rrmsd + found.rrmsd_trials["95 %"]) / 2,
@@ -125,7 +125,7 @@ def test_it_is_written_read_and_said(several, capsys, monkeypatch):
 
 def test_a_wave_without_a_limit_fails_no_lens(small_design, goals, tmp_path):
     folder = folder_of(small_design, tmp_path / "small", {"accept.rrmsd": 5.0, "wavefront": goals["wavefront"]})
-    found = tolerancing.tolerance(folder, **FEW, wanted=0.9)
+    found = tolerancing.tolerance(folder, **FEW | {"tubes": 33, "trials": 100}, wanted=0.9)
     assert found.passed[1] == 1.0 and found.targets is None
     assert "limit" not in found.facts()["wavefront"] and "yield" not in found.facts()["wavefront"]
     assert found.wavefront.rms > 0 and found.wavefront.rms_full["95 %"] > found.wavefront.rms_full["5 %"]
