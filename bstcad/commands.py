@@ -396,11 +396,11 @@ def _name_of(cloud: Cloud, folder: Path) -> str:
 
 def _contents(made: Made, proof: Proof, estimates: tuple[LeftOut, ...]) -> Contents:
     """The contents of report.json; estimates: of the effects that are left out."""
-    scene, blurred = made.scene, proof.blur.rrmsd if proof.blur else 0.0
+    scene = made.scene
     alone, goal, light = scene.each_alone()[proof.worst], made.goals[proof.worst], proof.light
     diagnosed = diagnosis(
-        alone, made.making, proof.lens, picture=light.picture, target=goal.picture, rrmsd=light.rrmsd,
-        efficiency=light.efficiency, blurred=blurred, at_bounds=proof.at_bounds,
+        alone, made.making, proof.lens, picture=light.picture, target=goal.picture, efficiency=light.efficiency,
+        at_bounds=proof.at_bounds,
     )  # fmt: skip
     return contents_of(
         scene, made.lens, made.goals, proof, making=made.making, circumstances=circumstances(made.device),

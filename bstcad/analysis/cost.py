@@ -1,27 +1,19 @@
-"""The cost and the remaining error of a finished design: what its end cost, where its error sits, what limits it.
+"""The cost and the remaining error of a finished design: what its end cost, where its error sits.
 
 - `ending`: the end of the convergence curve, taken for a power law;
 - `remaining`: the squared error by parts of the target and by octaves of its cosine transform;
-- `control_cells`: the cells of the control net that light each pixel, and the least error that they leave;
-- `limits`: the RRMSD after one step more of each thing that costs time or size.
+- `ControlCells`: the cells of a control net that light each pixel, and the least error that they leave.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import torch
 from scipy.fft import dctn
-
-from bstcad.optics.channels import Channel
-from bstcad.optics.interfaces import cross
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.tubes import area_of, collect, launch_tubes
 
 # --- the end of the convergence curve ---------------------------------------------------------------------------------
 
@@ -49,11 +41,6 @@ class Ending:
     power: float | None  # p, zero if the curve does not fall; None: too few points
     fit: float | None  # R² of that line, of logarithms
     halving: float | None  # 2^(1/p); None: no line fits, or it is more than PAYS
-
-    @property
-    def doubled(self) -> float:
-        """RRMSD after twice the time over that now, by the power law; 1 if there is none."""
-        return 2 ** -(self.power or 0.0)
 
 
 def ending(history: Curve, stages: Stages, since: float = 0.0) -> Ending | None:
@@ -179,9 +166,7 @@ def _octaves(error: np.ndarray, per_mm: float) -> list[dict[str, Any]]:
 
 # --- cells of the control net -----------------------------------------------------------------------------------------
 
-TUBES = 256  # a side: cells are counted over tiles, not pixels
 TILE = 16  # pixels a side
-LIT = 0.01  # of the mean of a picture: darker pixels are not lit
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,20 +179,6 @@ class ControlCells:
 
     a_pixel: np.ndarray = field(repr=False)  # (rows, columns) cells that light it, row 0 = y max
     target: np.ndarray = field(repr=False)  # (rows, columns)
-
-    @property
-    def median(self) -> float:
-        """Cells a pixel, where the target is lit."""
-        return float(np.median(self.a_pixel[self._lit]))
-
-    @property
-    def scarce(self) -> float:
-        """The number of cells that a tenth of the lit pixels stay below."""
-        return float(np.quantile(self.a_pixel[self._lit], 0.1))
-
-    @property
-    def _lit(self) -> np.ndarray:
-        return self.target > LIT * self.target.mean()
 
     def floor(self, finer: float = 1.0) -> float:
         """RRMSD that is left if each tile has as many of its lowest cosines as cells light it.
@@ -222,23 +193,6 @@ class ControlCells:
         return math.sqrt(float(left.sum()) / whole) if whole else 0.0  # a part of a picture may be dark
 
 
-@torch.no_grad()
-def control_cells(channel: Channel, lens: Lens, screen: Screen, target: np.ndarray) -> ControlCells:
-    """By ray tubes, each of which carries the part of the net that it crosses; channel: of a point, or parallel."""
-    lens = channel.through(lens)
-    tubes = launch_tubes(channel.source, lens, TUBES)
-    rays = tubes.coming
-    for interface in lens.interfaces[lens.freeform[0] : lens.freeform[-1] + 1]:
-        rays = cross(rays, interface).rays
-    x, y = rays.position[:2]
-    pitch_x, pitch_y = lens.nets[-1].pitch
-    cells = area_of(x, y).double() / (pitch_x * pitch_y)
-    landed = tubes.landing(lens, screen.plane)
-    corners = screen.pixels_of(landed.position.double())
-    carried = torch.where(tubes.whole(landed) > 0, cells, torch.zeros_like(cells))
-    return ControlCells(collect(corners, carried, screen.shape)[0].cpu().numpy(), np.asarray(target, dtype=float))
-
-
 def _tiles(picture: np.ndarray) -> np.ndarray:
     """(number, TILE, TILE); the last row and column of tiles are filled up from the border."""
     rows, columns = (-side % TILE for side in picture.shape)
@@ -249,75 +203,3 @@ def _tiles(picture: np.ndarray) -> np.ndarray:
 
 # The cosines of a tile by the length of their wave vectors.
 COARSE_TO_FINE = np.argsort(np.hypot(*np.indices((TILE, TILE))).ravel(), kind="stable")
-
-# --- what limits a design ---------------------------------------------------------------------------------------------
-
-HALF = 0.5  # of the gain of going on, in logarithms: so much is left if the search begins anew
-# Steps whose named gain was that of designs which took them (control points: 0.53, 0.57, 0.47 times the RRMSD named and
-# 0.53, 0.53, 0.51 found), or that the run itself took in part.  More evaluations: 0.58 named, 0.88 found.
-HELD = ("control points", "source size", "precision")
-WORTH = 0.95  # times the RRMSD: a step that would leave more of it is no remedy
-
-
-@dataclass(frozen=True)
-class Limit:
-    """The RRMSD after one step more of something, and the figures behind it."""
-
-    by: str  # "evaluations", "control points", "tubes", "source size" or "precision"
-    rrmsd: float  # over that now
-    figures: Mapping[str, float]
-
-
-def limits(
-    rrmsd: float,
-    cells: ControlCells,
-    *,
-    curve: Ending | None = None,
-    own: float | None = None,
-    grown: Sequence[float] = (),
-    singles: tuple[float, float] | None = None,
-    anew: bool = False,
-    blurred: float = 0.0,
-    finer_tubes: float = 1.0,
-) -> tuple[Limit, ...]:
-    """Estimates for a design of this RRMSD, the largest gain first; a step without figures is left out.
-
-    One step is twice the evaluations, twice the tubes, twice the control points a side, half the source, float64
-    instead of float32.  tests/benchmarks/test_bottleneck.py holds the largest gain to designs that take the step.
-
-    curve: by whose power law evaluations gain; None: the irradiance was never tailored.  own: RRMSD by the tubes that
-    tailored it: the error beyond that, which they did not see, could be mended by more of them; None: it was by other
-    rays each time.  grown: RRMSD after each size of an extended source: a third, two thirds, all of it.  singles: RRMSD
-    by float32, in which it was tailored, and by float64, after a few evaluations; None: it was by float64.  anew: would
-    more evaluations be shared out anew, instead of going on where they ended?  blurred: RRMSD of the target blurred by
-    the source's image, below which only a smaller source leads.  finer_tubes: tubes a side that come with twice the
-    control points, over those now; they mend their part of the error, too.
-    """
-    seen = 1.0 if own is None else min(own / rrmsd, 1.0)
-    found = [_control_points(rrmsd, cells, seen ** min(2 * math.log2(finer_tubes), 1.0))]
-    if curve is not None and curve.power is not None:
-        left = seen * curve.doubled ** (HALF if anew else 1.0)  # of the error that the tubes see; the rest stays
-        found.append(Limit("evaluations", math.hypot(left, math.sqrt(1 - seen**2)), {"power": curve.power}))
-    if own is not None:
-        found.append(Limit("tubes", seen, {"own": own, "finer": rrmsd}))
-    if singles is not None:
-        single, double = singles
-        found.append(Limit("precision", min(double / single, 1.0), {"float32": single, "float64": double}))
-    least = min(blurred / rrmsd, 1.0)  # the source's blur, which no knob undoes, leaves its part of the error
-    found = [
-        limit if limit.rrmsd >= least else Limit(limit.by, least, {**limit.figures, "blurred": blurred})
-        for limit in found
-    ]
-    if len(grown) == 3:
-        third, most, whole = grown
-        figures = {"third": third, "two thirds": most, "whole": whole}
-        found.append(Limit("source size", min(math.sqrt(third * most) / whole, 1.0), figures))
-    return tuple(sorted(found, key=lambda limit: limit.rrmsd))
-
-
-def _control_points(rrmsd: float, cells: ControlCells, by_tubes: float) -> Limit:
-    """The error falls with the least error by the cells, as far as that is a part of it, and by the factor of tubes."""
-    floor, finer = cells.floor(), cells.floor(2.0)
-    gain = min(floor / rrmsd, 1.0) * (1 - finer / floor) if floor > 0 else 0.0
-    figures = {"floor": floor, "finer": finer, "median": cells.median, "scarce": cells.scarce}
-    return Limit("control points", (1 - gain) * by_tubes, figures)

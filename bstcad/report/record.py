@@ -208,9 +208,6 @@ class Contents:
     # where the error sits: parts [{name, error, pixels}] (parts of the squared error, and of the pixels), octaves
     # [{frequency (cycles a pixel), period (mm), error}], outside (part of the light beside the target)
     remaining_error: Mapping[str, Any] | None = None
-    # what limits the design, the most limiting first: {by, rrmsd (times what it is, after one step of it), figures,
-    # because}, as analysis.cost.Limit has them
-    limits: tuple[Mapping[str, Any], ...] = ()
     # the bounds on the tailored faces: asked {key of [lens]: value}, at {key: part of the faces that is at the bound;
     # None: of a thickness that is}, tightest {key: place, in words}, both or front (true where not the back alone is
     # tailored); None: none is asked
@@ -264,7 +261,6 @@ class Examined:
     part: Mapping[str, str]  # rows of name and value (prescription.part)
     placement: Mapping[str, Any] | None = None  # where the lens lies in the file (Placement.facts); None: unmoved
     remarked: tuple[Remark, ...] = ()  # these as in Contents: nothing is known without a design
-    limits: tuple[Mapping[str, Any], ...] = ()
     bounds: Mapping[str, Any] | None = None
 
 
@@ -278,7 +274,7 @@ def contents_of(
     """The contents of report.json.
 
     lens: as designed.  circumstances: version, machine and versions of libraries now, which those of its making
-    precede.  estimates: of the effects that are left out.  diagnosis: convergence, remaining_error, limits and bounds.
+    precede.  estimates: of the effects that are left out.  diagnosis: convergence, remaining_error and bounds.
     """
     known = {key: value for key, value in vars(making).items() if value is not None}
     goal, light, dark = goals[proof.worst], proof.light, proof.light.leak
@@ -433,11 +429,14 @@ def of_json(data: bytes | str, kind: type[Record] = Contents) -> Record:
 
 
 def _renewed(data: bytes | str) -> bytes | str:
-    """A report.json with the keys of today; those before told the first of several targets apart."""
+    """A report.json with the keys of today: one of before may have estimates of what limits the design, and may tell
+    the first of several targets apart.
+    """
     try:
         facts = from_json(data)
+        facts.pop("limits", None)
         if "goals" in facts:
-            return data
+            return to_json(facts)
         prescribed, measured = facts["prescription"], facts.get("measured") or {}
         prescribed["targets"] = [prescribed.pop("target"), *prescribed.pop("further_targets", ())]
         alone = {"key": "target", "z": prescribed["targets"][0]["z"], "weight": 1.0} | {

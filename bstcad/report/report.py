@@ -12,12 +12,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bstcad.analysis.cost import HELD, WORTH
 from bstcad.optics.goal import suffix_of
 from bstcad.optics.sides import in_words
 from bstcad.report.prescription import WAYS, order_rows
 from bstcad.report.record import LEFT_OUT, Contents, Examined, LeftOut, bounds, changes
-from bstcad.report.units import Remark, Rows, about, bound, environment, number, paragraphs, percent, quantity, tables
+from bstcad.report.units import Remark, Rows, about, bound, environment, number, percent, quantity, tables
 from bstcad.report.units import remarks as written
 from bstcad.runs import files
 from bstcad.verify.verdict import NO_LIMIT, Check
@@ -89,11 +88,6 @@ def check_line(check: Check) -> str:
     return f"{check.name}{where}: {quantity(check.value, check.unit)}{limit}"
 
 
-def limit(limits: Sequence[Mapping[str, Any]]) -> str:
-    """What limits a design now, and the change that helps, in a short sentence; none if nothing is known."""
-    return "".join(paragraphs("verdict.txt.j2", "limit", limits=limits, worth=WORTH, held=HELD))
-
-
 def machine(facts: Mapping[str, Any]) -> Rows:
     """The machine's facts in words, those that are known; of a design on a GPU, that it cannot be had again exactly."""
     known = {key: value for key, value in facts.items() if value is not None}
@@ -159,7 +153,6 @@ def write_html(
             optic=report.optic,
             way=WAYS[report.optic],
             order=report.order and order_rows(report.order),
-            limit=limit(report.limits),
             changes=changes,
             names=LEFT_OUT,
             prescription=prescription,
@@ -209,7 +202,7 @@ def summary(report: Contents | Examined, verbose: bool = False) -> Group:
     figures = first_figures(report)
     wide = max((len(name) for name, _, _ in figures), default=0)
     lines += [Text(f"{name:{wide}}  {value}{remark and f' ({remark})'}") for name, value, remark in figures]
-    lines += map(Text, filter(None, (limit(report.limits), bounds(report.bounds))))
+    lines += map(Text, filter(None, [bounds(report.bounds)]))
     passed = sum(check.passed for check in report.checks)
     lines += check_lines(report.checks, verbose)
     lines.append(Text(f"{passed} checks passed{'' if verbose else '; --verbose lists them'}."))

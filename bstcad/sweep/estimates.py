@@ -2,8 +2,7 @@
 
 Before a design the effects are estimated (analysis.neglected_effects) on a coarse lens of two transport maps and fits
 of slopes, in a second or two; most are good to a factor of two.  Reports have them of the finished lens.  The diagnosis
-of a finished design takes the pictures and the history of the run, and one small sheet of tubes by which the cells of
-the control net are counted: together less than a hundredth of a design.
+of a finished design takes the pictures and the history of the run.
 """
 
 from __future__ import annotations
@@ -16,24 +15,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from bstcad.analysis.cost import Limit, control_cells, ending, limits, remaining
+from bstcad.analysis.cost import ending, remaining
 from bstcad.analysis.neglected_effects import Change, Reference
 from bstcad.optics import media
 from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
-from bstcad.optics.sides import both, scaled
+from bstcad.optics.sides import both
 from bstcad.report.record import LeftOut, Making
-from bstcad.report.units import about, number, two_digits
-from bstcad.scene.blank import LARGEST_NET
 from bstcad.scene.effects import Absorption, Effect, Fresnel, losses, named, reflection_of
 from bstcad.scene.scene import Scene
-from bstcad.scene.schema import toml
 from bstcad.tailoring.machinability import moved_clear
-from bstcad.tailoring.run import BEST
 from bstcad.tailoring.slope_fit import Fit
 from bstcad.tailoring.slope_map import face_grid, lit_window, slope_map, sloped
-from bstcad.tailoring.stage2 import FEW
-from bstcad.tailoring.stage2 import SIZES as SHARES
 from bstcad.verify.checks import AtBound
 
 # --- a coarse lens ----------------------------------------------------------------------------------------------------
@@ -194,108 +187,31 @@ def _entry(kind: str, change: Change | None, detail: str = "", simulate_by: str 
 # --- the diagnosis of a finished design -------------------------------------------------------------------------------
 
 SIZES = "stage 3, "  # how the stages of a design begin that are for one size of the source each
-RESTS = 0.01  # power of time by which a curve that falls no faster has come to rest
-NOTHING = 0.05  # of the RRMSD: these estimates do not tell less from none
-# Least error by the control cells, over the RRMSD, from which on the gain of a larger net is named.  At 0.37 of it 0.63
-# times the RRMSD was named and 0.53 found; at 0.12, where tubes are the larger part of the gain, 0.82 and 0.60.
-NET_SHARE = 0.25
 
 
 def diagnosis(
-    scene: Scene, making: Making, lens: Lens, *, picture: np.ndarray, target: np.ndarray, rrmsd: float,
-    efficiency: float, blurred: float = 0.0, at_bounds: Mapping[str, AtBound] | None = None,
+    scene: Scene, making: Making, lens: Lens, *, picture: np.ndarray, target: np.ndarray, efficiency: float,
+    at_bounds: Mapping[str, AtBound] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Of a design the entries convergence, remaining_error, limits and bounds of report.json (record.Contents).
+    """Return of a design the entries convergence, remaining_error and bounds of report.json (record.Contents).
 
-    lens: as re-read, which throws this picture (rows, columns), of the target's sum and this RRMSD.
-    blurred: RRMSD of the target blurred by the source's size; 0 for a point.
+    lens: as re-read, which throws this picture (rows, columns), of the target's sum.
     at_bounds: where the tailored faces are at a bound, by key.
     """
-    net, screen = scene.lens.back.net, scene.target.screen
-    knobs, finer = scene.tailoring.resolved(net), scaled(net, 2)
-    possible = max(both(finer)) <= LARGEST_NET
     sizes = [k for k, stage in enumerate(making.stages) if stage.name.startswith(SIZES)]
     curve = ending(
         [(point.seconds, point.rrmsd) for point in making.history],
         [(stage.seconds, stage.rrmsd) for stage in making.stages],
         since=math.fsum(stage.seconds for stage in making.stages[: max(sizes[2:], default=0)]),  # of the whole source
     )
-    whole_curve = curve
-    if any(stage.name == BEST for stage in making.stages):
-        curve = None  # it ends at another lens than this one
-    light = max(scene.with_source_scaled(0.0).channels(), key=lambda channel: channel.weight)
-    ours, twins = knobs.method == "least-squares", making.twins if knobs.precision == "float32" else None
-    grown = [making.stages[k].rrmsd for k in sizes]
-    grown = [*grown[:2], *grown[-1:]] if len(grown) == len(SHARES) else []  # the last rounds are of the whole source
-    found = limits(
-        rrmsd,
-        control_cells(light, lens, screen, target),
-        curve=curve,
-        own=curve.rrmsd if curve is not None and ours and not sizes else None,  # images of a source are no tubes
-        grown=[value for value in grown if value is not None and math.isfinite(value)],
-        singles=None if twins is None else (twins["rrmsd_float32"], twins["rrmsd_float64"]),
-        anew=ours and knobs.stage2_iterations < FEW,
-        blurred=blurred,
-        finer_tubes=scene.tailoring.resolved(finer).rays / knobs.rays if possible else 1.0,
-    )
-    if not possible:  # a step that no scene may take
-        found = tuple(limit for limit in found if limit.by != "control points")
-    if knobs.method == "integration":  # its map limits it, and no knob does
-        found = ()
     met = {key: at for key, at in (at_bounds or {}).items() if key in scene.lens.bounded_by}
     bounds = {
         "asked": {key: getattr(scene.lens, key) for key in scene.lens.bounded_by},
         "at": {key: at.share for key, at in met.items()}, "tightest": {key: at.tightest for key, at in met.items()},
         **({"both" if lens.shapes("back") else "front": True} if lens.shapes("front") else {}),  # that they are on
     }  # fmt: skip
-    # Where light had to move far, a draft's net is not all that limits it: named 0.70, found 0.85 times the RRMSD.
-    far = any(" pixels, " in stage.name for stage in making.stages)
-
-    def doubt(limit: Limit) -> dict[str, bool]:
-        """Return the entry of a limit whose gain is not named."""
-        small = limit.by == "control points" and limit.figures["floor"] < NET_SHARE * rrmsd
-        return {"unsure": True} if far or small else {}
-
     return {
-        "convergence": None if whole_curve is None else asdict(whole_curve),
-        "remaining_error": remaining(picture, target, screen.per_mm) | {"outside": 1 - efficiency},
-        "limits": tuple(asdict(limit) | {"because": because(limit, scene)} | doubt(limit) for limit in found),
+        "convergence": None if curve is None else asdict(curve),
+        "remaining_error": remaining(picture, target, scene.target.screen.per_mm) | {"outside": 1 - efficiency},
         "bounds": bounds if bounds["asked"] else None,
     }
-
-
-# By Limit.by: why it limits, in figures of the limit, and one step of it in the scene.
-REMEDIES = {
-    "evaluations": ("the curve {falls}", "tailoring.stage2_iterations = {evaluations}"),
-    "control points": (
-        "a tenth of the lit pixels have less than {scarce} control cells each, half of them less than {median}; "
-        "what of the target is finer than the cells can make is an RRMSD of {floor}, and with twice as many a side of "
-        "{finer}",
-        "lens.back.control_points = {net}",
-    ),
-    "tubes": ("the tubes that tailored it see an RRMSD of {own}, independent rays {finer}", "tailoring.rays = {rays}"),
-    "source size": (
-        "with a third, two thirds and all of the source's size there was an RRMSD of {third}, {two thirds} and {whole}",
-        "a source of half the size, or the target at half the distance,",
-    ),
-    "precision": (
-        "float32 comes to an RRMSD of {float32} where float64 comes to {float64}", 'tailoring.precision = "float64"',
-    ),
-}  # fmt: skip
-
-
-def because(limit: Limit, scene: Scene) -> str:
-    """Why it limits, and behind the last semicolon one step of it in the scene, and the RRMSD after that."""
-    net, figures = scene.lens.back.net, limit.figures
-    knobs = scene.tailoring.resolved(net)
-    told = {name: (about if name in ("scarce", "median") else number)(value) for name, value in figures.items()}
-    told |= {"net": toml(scaled(net, 2)), "evaluations": 2 * knobs.stage2_iterations}
-    told |= {"rays": math.ceil(2**0.5 * knobs.rays), "falls": "has come to rest"}
-    if figures.get("power", 0.0) >= RESTS:
-        told["falls"] = f"still falls, as time to the power of {about(-figures['power'])}"
-    why, step = (text.format_map(told) for text in REMEDIES[limit.by])
-    if "blurred" in figures:
-        why += f"; the source's size alone blurs the target to an RRMSD of {number(figures['blurred'])}"
-    left = two_digits(limit.rrmsd)
-    share = f"about {number(left)} times the RRMSD" if left < 1 else "the RRMSD as it is"
-    return f"{why}; {step} would leave {share if left >= NOTHING else 'hardly any of the RRMSD'}"

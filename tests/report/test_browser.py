@@ -244,7 +244,7 @@ def test_the_page_opens_with_the_verdict_pictures_and_first_figures(opened):
         page.evaluate("""[...document.querySelectorAll("details.fold")].map((details) =>
       [details.querySelector("summary > h2").textContent, details.querySelector("summary > span").textContent])""")
     )
-    assert list(folds) == ["Prescription", "Checks", "Numerical stability", "What it cost, and what limits it",
+    assert list(folds) == ["Prescription", "Checks", "Numerical stability", "What it cost",
                            "How to reproduce"]  # fmt: skip
     assert re.fullmatch(r"\d+ checks, all passed", folds["Checks"]) and all(folds.values())
     assert page.evaluate(HIDDEN, "details table") == page.locator("details table").count() > 5

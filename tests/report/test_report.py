@@ -91,10 +91,6 @@ def printed(report, verbose=False):
     return console.file.getvalue()
 
 
-LIMIT = {"by": "tubes", "rrmsd": 0.8, "because": "they see little; more would leave half", "figures": {}}
-NET = {"by": "control points", "rrmsd": 0.5, "because": "cells are few; 513 would leave half", "figures": {}}
-SIZE = {"by": "source size", "rrmsd": 0.7, "because": "it grew; half of it leaves less", "figures": {}}
-GOING_ON = {"by": "evaluations", "rrmsd": 0.9, "because": "it falls; more would leave most", "figures": {}}
 CURVE = {"last_tenth_seconds": 4.0, "last_tenth": 0.4, "halving": None, "power": 0.01}
 GONE = {"on target": 0.338, "off target": 0.008, "missed the lens": 0.469, "lost through the sides": 0.185}
 SAID = [  # changes of REPORT: words of the page; do they stand on the terminal, too?
@@ -110,20 +106,10 @@ SAID = [  # changes of REPORT: words of the page; do they stand on the terminal,
     ({"title": "[red]Letters[/red]"}, "[red]Letters[/red]", True),
     ({"blur": {"width": 50.2, "pixels": 6.03, "rrmsd": 0.114}}, "50.2 mm or 6.03 pixels wide", False),
     ({"machine": {"device": "NVIDIA X"}}, "another lens of the same merit: a GPU adds up in no fixed order", False),
-    ({"limits": [LIMIT]}, "One run does not tell what limits it now; the first step to try is more.", True),
-    (
-        {"limits": [NET | {"unsure": True}]},
-        "One run does not tell what limits it now; the first step to try is 513.",
-        True,
-    ),
-    ({"limits": [NET, LIMIT]}, "What limits it now is the number of control points: 513 would leave half.", True),
-    ({"limits": [SIZE, LIMIT]}, "The evaluations with the whole source are too few to tell what limits", True),
-    ({"limits": [SIZE, GOING_ON]}, "What limits it now is the size of the source: half of it leaves less.", True),
-    ({"limits": [LIMIT]}, "was not tailored, so there is no curve whose end could be looked at.", False),
-    ({"limits": [LIMIT], "convergence": CURVE}, "took 40 % of the time up to there (4.0 s). To go on has", False),
-    ({"limits": [LIMIT], "convergence": CURVE | {"halving": 5.66}}, "about 5.7 times the evaluations' time", False),
+    ({"convergence": CURVE}, "took 40 % of the time up to there (4.0 s). To go on has", False),
+    ({"convergence": CURVE | {"halving": 5.66}}, "about 5.7 times the evaluations' time", False),
     ({"picture": ["target.image: the first", "target.fit: cropped"]}, "image: the first; target.fit: cropped.", False),
-    ({"limits": [LIMIT], "convergence": CURVE | {"power": None}}, "The curve has too few points", False),
+    ({"convergence": CURVE | {"power": None}}, "The curve has too few points", False),
 ]
 
 
