@@ -21,7 +21,7 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.receivers import Receiver
 from bstcad.optics.surfaces import sag
-from bstcad.report.light_figures import View
+from bstcad.report.light_figures import View, cross_section
 from bstcad.scene.errors import SceneError
 from bstcad.scene.target import Target
 from bstcad.tolerance.perturbations import Setup, kinds
@@ -137,7 +137,9 @@ def test_light_is_collected_by_a_receiver_of_its_own(scene, tmp_path, monkeypatc
     assert report.passed and report.rrmsd < 0.05, report
     on_level = bstcad.measure(design.lens, around.channels(), asked.target.screen, around.target.irradiance())
     assert on_level.rrmsd > 4 * report.rrmsd
-    assert View.of(around).labels == ("s (mm)", "y (mm)")
+    picture = around.target.irradiance()
+    along_s, along_y = cross_section(picture, picture, View.of(around)).axes[:2]
+    assert (along_s.get_xlabel(), along_y.get_xlabel()) == ("s (mm)", "y (mm)") and "(s = " in along_y.get_title("left")
 
 
 def test_a_receiver_of_its_own_is_moved_as_its_points_are():

@@ -21,6 +21,7 @@ from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Light, Line
+from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Surface
 from bstcad.optics.wavefront_error import WavefrontError
 from bstcad.report import data_sheet, light_figures, rendering
@@ -269,7 +270,8 @@ def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> F
 def transport_map(source: np.ndarray, image: np.ndarray, view: View) -> Figure:
     """Lines of a regular grid (k, k, 2) on the source (mm) beside their images (k, k, 2) on the target."""
     figure = new_figure(8.2, 4.1)
-    sides = (("Regular grid on the source", source, View.labels), ("The same lines on the target", image, view.labels))
+    level = LevelPlane(0.0).labels
+    sides = (("Regular grid on the source", source, level), ("The same lines on the target", image, view.labels))
     for axes, (title, points, (x, y)) in zip(figure.subplots(1, 2), sides, strict=True):
         for lines, colour in ((points, BLUE), (points.swapaxes(0, 1), VERMILION)):
             axes.plot(lines[..., 0].T, lines[..., 1].T, color=colour, linewidth=0.6)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.optics.measure import Line
+from bstcad.optics.receivers import LevelPlane, Receiver
 from bstcad.report.drawing import (
     BLUE,
     DARK,
@@ -81,17 +82,19 @@ class View:
     y: Extent
     seen_from: str  # lens | behind
     optic: str = "lens"  # or "mirror"
-    tilt: tuple[float, float] | None = None  # tilt of its plane, as the receiver states it
+    receiver: Receiver = LevelPlane(0.0)  # what its x and y are measured on
     number: int = 0  # number of the target among several, by which its figures are named
-    labels: tuple[str, str] = ("x (mm)", "y (mm)")  # labels of the receiver's axes
 
     @classmethod
     def of(cls, scene: Scene, number: int = 0) -> View:
         """The view of a scene's target, the first of several or another."""
-        target, plane = scene.targets[number], scene.targets[number].screen.plane
-        return cls(
-            target.x, target.y, target.seen_from, optic=scene.optic, tilt=plane.tilt, number=number, labels=plane.labels
-        )
+        target = scene.targets[number]
+        return cls(target.x, target.y, target.seen_from, optic=scene.optic, receiver=target.screen.plane, number=number)
+
+    @property
+    def labels(self) -> tuple[str, str]:
+        """The names of the receiver's axes, with their unit."""
+        return self.receiver.labels
 
     @property
     def words(self) -> str:
@@ -100,8 +103,9 @@ class View:
 
     def note(self, figure: Figure, more: str = "", first: str = "") -> None:
         """A footnote: `first`, the side from which the target is seen, `more`, and the tilt of its plane."""
-        tilt = f"\nThe target plane is tilted by {turned(self.tilt)}; x and y are measured on it." if self.tilt else ""
-        footnote(figure, f"{first}{self.words}.{more}{tilt}")
+        tilt = self.receiver.tilt
+        plane = f"\nThe target plane is tilted by {turned(tilt)}; x and y are measured on it." if tilt else ""
+        footnote(figure, f"{first}{self.words}.{more}{plane}")
 
     @property
     def proportion(self) -> float:
@@ -226,8 +230,8 @@ class Cut:
     name: str  # name in CUTS
     row: int
     column: int
-    x: float  # mm, the middle of the column
-    y: float  # mm, the middle of the row
+    x: float  # middle of the column, in the receiver's unit
+    y: float  # middle of the row
 
 
 def cuts(irradiance: np.ndarray, view: View) -> list[Cut]:
@@ -324,15 +328,16 @@ def cross_section(target: np.ndarray, irradiance: np.ndarray, view: View) -> Fig
     along_x, along_y = _pixel_centres(view.x, target.shape[1]), _pixel_centres(view.y, target.shape[0])[::-1]
     figure = new_figure(11.0, 4.9)
     panels = figure.subplots(2, 2, sharey=True)
+    (x, y), of = view.receiver.names, view.receiver.unit
     for pair, cut in zip(panels, cuts(irradiance, view), strict=True):
         for axes, axis, place, line, ends, where in (
-            (pair[0], "x", along_x, np.s_[cut.row, :], view.across, f"y = {cut.y:.3g} mm"),
-            (pair[1], "y", along_y, np.s_[:, cut.column], view.y, f"x = {cut.x:.3g} mm"),
+            (pair[0], x, along_x, np.s_[cut.row, :], view.across, f"{y} = {cut.y:.3g} {of}"),
+            (pair[1], y, along_y, np.s_[:, cut.column], view.y, f"{x} = {cut.x:.3g} {of}"),
         ):
             axes.fill_between(place, target[line] / unit, step="mid", color="#c9c9c9", linewidth=0, label="target")
             axes.plot(place, irradiance[line] / unit, color=CUTS[cut.name], linewidth=1.0, label="simulated")
             axes.set_title(f"Through the {cut.name}, along {axis} ({where})", color=CUTS[cut.name])
-            axes.set(xlabel=f"{axis} (mm)", xlim=ends)
+            axes.set(xlabel=f"{axis} ({of})", xlim=ends)
         pair[0].set_ylabel(MEAN_LIT)
     panels[0][0].set_ylim(bottom=0.0)
     figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
