@@ -17,7 +17,7 @@ from torch import Tensor
 
 from bstcad.optics.outlines import STRICT, Circle, Outline
 
-EQUATOR = 1e-6  # of 1 - (1 + k) c² r², for a sphere cos² of its slope's angle: below it a surface is too steep
+EQUATOR = 1e-6  # least 1 - (1 + k) c² r², for a sphere cos² of its slope's angle: below it a surface is too steep
 
 
 class Surface(ABC):
@@ -27,10 +27,10 @@ class Surface(ABC):
     kind: str
     is_net = False  # is it a B-spline net, with `heights`?
     level = False  # is it z = const, so that light along the axis meets it head on?
-    curvature: float | Tensor  # of a surface of revolution at its vertex (1/mm), positive towards +z
-    conic_constant: float | Tensor  # of a surface of revolution
+    curvature: float | Tensor  # curvature at the vertex of a surface of revolution (1/mm), > 0 towards +z
+    conic_constant: float | Tensor  # conic constant of a surface of revolution
     detail = math.inf  # width (mm) of its smooth pieces
-    outline: Circle | None = None  # of its optical part, around which it is a plane; None: all of it is optical
+    outline: Circle | None = None  # outline of the optical part, a plane around it; None: all of it is optical
 
     @property
     def optical(self) -> Surface:
@@ -290,7 +290,7 @@ class Recess(Surface):
     """
 
     face: Sphere | Conic  # the optical part
-    outline: Circle  # of that, about the axis
+    outline: Circle  # outline of the optical part, about the axis
 
     @property
     def optical(self) -> Sphere | Conic:
@@ -304,17 +304,17 @@ class Recess(Surface):
 
     @property
     def kind(self) -> str:
-        """That of the optical part, which kernels trace."""
+        """Kind of the surface inside the clear aperture, by which a kernel is chosen."""
         return self.face.kind
 
     @property
     def curvature(self) -> float | Tensor:
-        """At the vertex (1/mm)."""
+        """Curvature at the vertex (1/mm)."""
         return self.face.curvature
 
     @property
     def conic_constant(self) -> float | Tensor:
-        """Of the optical part."""
+        """Conic constant of the optical part."""
         return self.face.conic_constant
 
     @property
@@ -336,7 +336,7 @@ class Recess(Surface):
         return self.face.sags(outline if smaller else self.outline)
 
     def parameters(self) -> dict[str, float | Tensor]:
-        """Those of the optical part."""
+        """Parameters of the optical part."""
         return self.face.parameters()
 
     def with_parameters(self, **values: float | Tensor) -> Recess:
