@@ -202,7 +202,7 @@ def test_an_emitter_of_its_own_answers_or_declines_in_a_sentence(scene):
     """Its sizes and place follow from its class; errors that would move its light are refused, and others are not."""
     oval = scene.model_copy(update={"source": Oval(5.0, 8.0)})
     setup = Setup(scene.flat_lens(33), oval.channels(), scene.target.screen)
-    assert (oval.source.lumens, oval.source.files, oval.source.wider(0.1)) == (None, {}, None)
+    assert (oval.source.lumens, oval.source.wider(0.1)) == (None, None)
     assert "source.axial" not in (known := kinds(setup)) and "lens.clocking" not in known and "source.size" not in known
     known["lens.thickness"].apply(setup, 0.1)
     with pytest.raises(SceneError, match="^tolerance: the emitter Oval does not say how its light moves; give it the"):

@@ -42,7 +42,6 @@ class Emitter(ABC):
 
     wavelength: Wavelength
     lumens: float | None = None  # flux (lm); None: relative
-    files: Mapping[str, bytes] = MappingProxyType({})  # contents of the files that it came from, by name
     tilt: tuple[float, float] | None = None
     extent: Outline | None = None  # outline over which simple sources are spread; None: it is one
     profile: str = "own"
