@@ -23,7 +23,6 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from bstcad.analysis.cost import TILE, ControlCells
-from bstcad.analysis.light import blur
 from bstcad.optics.interfaces import cross
 from bstcad.optics.lens import Lens
 from bstcad.optics.sides import Sides, both, coarser, in_words, spread
@@ -32,7 +31,7 @@ from bstcad.report.units import about, two_digits
 from bstcad.scene.blank import LARGEST_NET
 from bstcad.scene.scene import Scene
 from bstcad.sweep.estimates import coarse_lens
-from bstcad.sweep.prediction import UNDONE, memory_gb, usual
+from bstcad.sweep.prediction import UNDONE, blurred, memory_gb, usual
 
 KEY = "lens.back.control_points"
 SQUARE = (65, 129, 257, 513, 1025)  # control points a side of the nets that are tried, or as many in square cells
@@ -121,15 +120,14 @@ def chosen(scene: Scene) -> Choice:
 def _chosen(scene: Scene) -> Choice:
     """The choice for a scene of one target."""
     tried = [scene.changed({KEY: net}) for net in nets(scene)]
-    lens, screen, target = coarse_lens(tried[0]), scene.target.screen, scene.target.irradiance()
-    light, image = cells_of_a_mm2(tried[0], lens), blur(tried[0].channels(), lens, screen, target)
-    blurred = image.rrmsd if image is not None else 0.0
-    a_pixel = [light.a_pixel.sum() / math.prod(each.lens.cells) / target.size for each in tried]  # cells, on average
+    lens = coarse_lens(tried[0])
+    light, image = cells_of_a_mm2(tried[0], lens), blurred(tried[0], lens)
+    a_pixel = [light.a_pixel.sum() / math.prod(each.lens.cells) / light.target.size for each in tried]  # on average
     candidates: list[Candidate] = []
     for each, cells, coarser_cells in zip(tried, a_pixel, [0.0, *a_pixel], strict=False):
         if coarser_cells > ENOUGH:
             break
-        likely = rrmsd(light, each, blurred)
+        likely = rrmsd(light, each, image)
         if candidates and cells > ENOUGH:
             likely = max(likely, candidates[-1].rrmsd / BEYOND)
         candidates.append(Candidate(each.lens.back.net, likely, usual(each).total, memory_gb(each), moved=moved(each)))
@@ -145,8 +143,8 @@ def gain(scene: Scene, finer: Scene, lenses: Sequence[Lens]) -> float:
     """
     found = []
     for one, other, lens in zip(scene.each_alone(), finer.each_alone(), lenses, strict=True):
-        light, image = cells_of_a_mm2(one, lens), blur(one.channels(), lens, one.target.screen, one.target.irradiance())
-        few, many = (rrmsd(light, each, 0.0 if image is None else image.rrmsd) for each in (one, other))
+        light, image = cells_of_a_mm2(one, lens), blurred(one, lens)
+        few, many = (rrmsd(light, each, image) for each in (one, other))
         found.append(many / few)
     return min(max(*found, MOST_GAINED), 1.0)
 
@@ -221,10 +219,10 @@ def cells_of_a_mm2(scene: Scene, lens: Lens) -> ControlCells:
     return ControlCells(whole * target * over_pixels, target)
 
 
-def rrmsd(light: ControlCells, scene: Scene, blurred: float = 0.0) -> float:
+def rrmsd(light: ControlCells, scene: Scene, image: float = 0.0) -> float:
     """RRMSD of a scene with its net, roughly: detail that its cells cannot make, or make badly, and the rest.
 
-    blurred: RRMSD of the target blurred by the source's size.  Fitted to designs in standard quality, of which half
+    image: RRMSD of the target blurred by the source's size.  Fitted to designs in standard quality, of which half
     keep to 1.3 times this, and nine of ten to 2 times; drafts and fine designs are a little further off.
     """
     factor, rest = BY_QUALITY.get(scene.tailoring.quality, BY_QUALITY["standard"])
@@ -235,4 +233,4 @@ def rrmsd(light: ControlCells, scene: Scene, blurred: float = 0.0) -> float:
     floors = (FLOOR * light.floor(finer), FLOOR * between.floor(finer))
     halved = (HALVED * light.floor(finer / 2), HALVED * between.floor(finer / 2))
     by_net = factor * math.hypot(*floors, *halved) / math.sqrt(2) + rest
-    return math.hypot(by_net, UNDONE * blurred)
+    return math.hypot(by_net, UNDONE * image)
