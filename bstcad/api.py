@@ -399,7 +399,7 @@ def _fitting(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
         scene = scene.changed({"lens.front": lens.front})
         lens = lens.with_front(scene.lens.front_surface)  # of a surface of one's own the net that stands for it
     back = replace(lens.back, x=net.x, y=net.y)
-    return scene, replace(lens, back=back, index=scene.index).shaping(*scene.lens.shaped)
+    return scene, scene.assembled(replace(lens, back=back, index=scene.index))
 
 
 def _fitting_front(lens: Lens, scene: Scene) -> tuple[Scene, Lens]:

@@ -23,6 +23,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.reach import GRAZING, grazing_of, spread_at, unreached
 from bstcad.optics.sides import both
+from bstcad.optics.unfolding import imaged
 from bstcad.report.record import Making, Point
 from bstcad.report.record import Stage as StageRecord
 from bstcad.runs import processes
@@ -188,7 +189,8 @@ def posed(scene: Scene, task: Task) -> Task:
     lens = scene.flat_lens(REACH_NET)
     if not lens.shapes_both or not task.several:
         return task
-    demand = demands(task, task.heaviest.through(lens))
+    aimed, bare = task.aimed(lens)
+    demand = demands(aimed, aimed.heaviest.through(bare))
     sentences = tuple(demand.sentences(scene.lens.back.z - scene.lens.front.z))
     if refused(demand):
         raise SceneError(f"target: {'; '.join(sentences[1:])}")
@@ -217,6 +219,8 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
     channels = scene.with_source_scaled(0.0).channels()
     light = max(channels, key=lambda channel: channel.weight)  # stage 1 reckons with it alone
     lens, grazing = light.through(scene.flat_lens(REACH_NET)), GRAZING
+    goal = replace(goal, receiver=imaged(lens.behind, goal.receiver))
+    lens = replace(lens, behind=())
     if not lens.reflects:
         grazing = grazing_of(light.index, [each.index for each in channels], spread_at(scene.source, lens))
     part = reachable(light.source, lens, goal, grazing=grazing)
@@ -280,8 +284,8 @@ def _compared(making: Making, task: Task, lens: Lens, before: int) -> Making:
 
 def steepness(source: Emitter, lens: Lens, goal: Goal, sent: TransportMap) -> Steepness:
     """The slope that the light of a goal needs of the back, by the map of stage 1."""
-    at_back = sent.plane == "back"
-    return needed(source, lens, goal.receiver, goal.picture, x=sent.x, y=sent.y, places=sent.source, at_back=at_back)
+    at_back, screen = sent.plane == "back", imaged(lens.behind, goal.receiver)
+    return needed(source, lens, screen, goal.picture, x=sent.x, y=sent.y, places=sent.source, at_back=at_back)
 
 
 def _making(followed: Followed, went: Record, stopped: str, steep: Steepness) -> Making:
@@ -315,13 +319,15 @@ def _stage1(
     like = lens.like
     if scene.lens.front.shaped:  # whose light behind the lens is one of numpy: a second of work on the CPU
         stage, lens = two_faces.steps, lens.to(like.dtype, "cpu")
-    last = driver.run(stage(task, lens, state), task, lambda state: Saved(driver.record, state), lambda: driver.wish)
-    lens = last.lens.to(like.dtype, like.device)
+    aimed, bare = task.aimed(lens)
+    last = driver.run(stage(aimed, bare, state), aimed, lambda state: Saved(driver.record, state), lambda: driver.wish)
+    lens = replace(last.lens, behind=lens.behind).to(like.dtype, like.device)
     check_front(lens, scene)
     bounds = held(lens, task.bounds, task.least)
     if bounds is None:
         check_thickness(lens, scene)
-    rrmsd = reached(lens, task.rrmsd(lens) if last.judged is None else last.judged)
+    judged = None if lens.behind else last.judged  # which knows nothing of what is behind the lens
+    rrmsd = reached(lens, task.rrmsd(lens) if judged is None else judged)
     driver.end(name, rrmsd)
     if bounds is not None:
         driver.progress(BOUNDED, 0, 1, "")
@@ -336,7 +342,7 @@ def _stage1(
         precision = compare_precisions(task, lens)
         driver.end(COMPARED)
     return Followed(
-        Parameters.of(lens), last.mapping, transport_of(last, lens, task.goals[0].receiver), precision, rrmsd=rrmsd
+        Parameters.of(lens), last.mapping, transport_of(last, lens, aimed.goals[0].receiver), precision, rrmsd=rrmsd
     )
 
 

@@ -101,9 +101,26 @@ def two(chosen):
     """A second wall, twice as far away, where light goes on that fills the lens and the first one."""
     own = changes_of(chosen, "targets")
     near = SMALL["target"] | {key.removeprefix("target."): own[key] for key in own if key.startswith("target.")}
+    further = -THROW if chosen["elements"] == "fold mirror behind" else THROW
     halves = zip("xy", (side / 2 for side in SIZES[chosen["rim"]]), strict=True)
     ends = {axis: [2 * near[axis][0] + half, 2 * near[axis][1] - half] for axis, half in halves}
-    return {"target": [near, near | ends | {"z": near["z"] + THROW}]}
+    return {"target": [near, near | ends | {"z": near["z"] + further}]}
+
+
+def elements(where, **more):
+    """A window or a mirror; before a lens the light comes from below, before a mirror from above."""
+
+    def element(chosen):
+        z = 20.0 if where == "behind" or chosen["front"] == "mirror" else -20.0
+        return {where: [{"kind": "window", "z": z, "outline": {"shape": "circle", "diameter": 60.0}} | more]}
+
+    return element
+
+
+def fold(chosen):
+    """A mirror half way to the wall, which is as far from the lens as without it."""
+    mirror = elements("behind", kind="mirror", z=BACK + 50.0, outline={"shape": "circle", "diameter": 200.0})
+    return mirror(chosen) | {"target.z": BACK + 2 * 50.0 - THROW}
 
 
 def front(**more):
@@ -163,6 +180,13 @@ CHOICES = {
         "thickness": {"lens.max_thickness": 12.0, "lens.edge_thickness": 1.0},
     },
     "mount": {"none": {}, "flange": flange, "cut": cut},
+    "elements": {
+        "none": {},
+        "window before": elements("before", thickness=3.0, material="N-BK7"),
+        "dome before": elements("before", thickness=3.0, index=1.5, curvature=[0.004, 0.005], tilt=[3.0, 0.0]),
+        "window behind": elements("behind", thickness=3.0, material="N-BK7", tilt=[0.0, 5.0]),
+        "fold mirror behind": fold,
+    },
     "wavefront": {
         "none": {},
         "plane": {"wavefront": {"kind": "plane", "z": 45.0}},
@@ -190,11 +214,12 @@ REFUSED = (  # the least sets of values that no scene has together
         for wave in ("plane", "sphere")
     ),
     {("rim", "circle"), ("net", "pair")},
+    *({("elements", "fold mirror behind"), ("wavefront", wave)} for wave in ("plane", "sphere")),
     *({("front", "mirror"), ("effects", effect)} for effect in ("coating", "absorption", "ghost")),
 )
 NAMED = {  # the key of a choice, as the sentence of a refusal has it
     "light": "source.", "wavefront": "wavefront", "rim": "lens.outline", "net": "lens.back.control_points",
-    "front": "lens.back.reflect", "effects": "effects[0]",
+    "front": "lens.back.reflect", "effects": "effects[0]", "elements": "behind",
 }  # fmt: skip
 
 

@@ -32,6 +32,7 @@ from bstcad.optics.trace import (
     trace,
     window,
 )
+from bstcad.optics.unfolding import throw
 
 
 def _at_interfaces(rays: Rays, lens: Lens) -> list[Rays]:
@@ -98,7 +99,7 @@ WHOLE = 0.99  # part of the clear aperture: light that reaches so far fills the 
 
 
 def used(source: Emitter, lens: Lens) -> tuple[Outline | None, ...]:
-    """Smallest circle or rectangle about the axis (mm) that holds all light on each face, in the order of the light.
+    """Smallest circle or rectangle about the axis (mm) that holds all light on each face of the solid, in its order.
 
     None: the light fills the face's clear aperture.  Only light that gets through all faces counts; of an extended
     source the light of its middle and of the ends of its extent.
@@ -108,7 +109,9 @@ def used(source: Emitter, lens: Lens) -> tuple[Outline | None, ...]:
         a, b = source.extent.half_extent
         elements = [source.element(a * u, b * v) for u, v in CORNERS if not (source.extent.is_round and u and v)]
     hits = torch.cat([_hits(element.central, lens) for element in elements], dim=2)
-    return tuple(_patch(face, interface.outline) for face, interface in zip(hits, lens.interfaces, strict=True))
+    solid = slice(len(lens.before), lens.number_of("back") + 1)
+    pairs = zip(hits[solid], lens.interfaces[solid], strict=True)
+    return tuple(_patch(face, interface.outline) for face, interface in pairs)
 
 
 def _hits(source: Emitter, lens: Lens) -> Tensor:
@@ -178,7 +181,8 @@ def mount_losses(lens: Lens, channels: Sequence[Channel], flange: tuple[float, f
         area = window(channel.source, bare)
         x, y = sampling.grid(area, n)
         rays = channel.source.rays(x, y, own.entrance.z, channel.weight * area.area / n**2)
-        whole, through = _at_interfaces(rays, bare)[-1], _at_interfaces(rays, own)
+        solid = slice(len(own.before), own.number_of("back") + 2)  # the light before, in and behind it
+        whole, through = _at_interfaces(rays, bare)[solid][-1], _at_interfaces(rays, own)[solid]
         out = through[-1]
         uncut += float(whole.flux[whole.alive].sum())
         passing += float(out.flux[out.alive].sum())
@@ -225,11 +229,12 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
     wrong = sum(int((~torch.isfinite(net.heights)).sum()) for net in lens.nets)
     for channel in channels:
         through = channel.through(lens)
-        last = through.interfaces[-1]
+        number = through.number_of("back")
+        last = through.interfaces[number]
         critical = math.inf if last.law.reverses else math.degrees(math.asin(min(1.0 / last.law.eta, 1.0)))
         for rays in launch_strips(channel.source, through, n, seed):
             coming = to_first_net(rays, through)
-            at_last = across(coming, through.interfaces[through.freeform[0] : -1])
+            at_last = across(coming, through.interfaces[through.freeform[0] : number])
             met, z_x, z_y = intersect(last.surface, at_last, last.outline, last.status_if_missed)
             dx, dy, dz = met.direction
             along = met.sense * (dz - dx * z_x - dy * z_y)
@@ -301,11 +306,11 @@ class FinestDetail:
 
 def finest_detail(source_image: float, lens: Lens, screen: Screen, of: str, assumed: bool = False) -> FinestDetail:
     """The finest detail on a target where the image of a source of the size `of` is `source_image` pixels wide."""
-    distance, pixel = abs(screen.plane.throw(lens.back.z)), _pixel(screen)
+    distance, pixel = abs(throw(lens, screen)), _pixel(screen)
     sizes = (*(2 * half for half in lens.outline.half_extent), *(high - low for low, high in (screen.x, screen.y)))
     nearer, image = REACH * max(sizes), source_image * pixel
     here, there = (detail_width(image * share, pixel) for share in (1.0, nearer / distance))
-    worth = there < WORTH * here
+    worth = there < WORTH * here and not lens.behind
     return FinestDetail(
         here, image, pixel, distance, nearer_distance=nearer if worth else None, nearer_width=there if worth else None,
         of=of, assumed=assumed,

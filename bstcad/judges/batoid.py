@@ -19,11 +19,13 @@ from bstcad.judges.faces import Face, FaceError, Traced
 from bstcad.optics import sampling
 from bstcad.optics.channels import Channel, places
 from bstcad.optics.emitters import Emitter
+from bstcad.optics.interfaces import Reflect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import a_side
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Rays, axes
+from bstcad.optics.tilted import Tilted
 from bstcad.optics.trace import clear_window, launch_strips
 from bstcad.optics.wavefront_error import followed, from_reference
 
@@ -36,7 +38,7 @@ COMPARED = 100_000  # points at which its faces are compared with the lens's
 class Placed:
     """A face of a lens as a surface of batoid's with its coordinate system."""
 
-    face: Face
+    face: Face | None  # None: of a tilted window or mirror
     surface: Any
     frame: Any
 
@@ -63,8 +65,22 @@ def placed(face: Face) -> Placed:
 
 
 def surfaces(lens: Lens) -> tuple[Placed, ...]:
-    """The faces that light meets, in its order."""
-    return tuple(placed(faces.face(interface.surface, lens.outline)) for interface in lens.interfaces)
+    """The faces that light meets, in its order, those of windows and mirrors around the lens too."""
+    return tuple(
+        _tilted(surface) if isinstance(surface, Tilted) else placed(faces.face(surface, lens.outline))
+        for surface in (interface.surface for interface in lens.interfaces)
+    )
+
+
+def _tilted(surface: Tilted) -> Placed:
+    """A plane or a sphere in any place as batoid has it; nothing is compared with it."""
+    import batoid
+
+    n = np.array(surface.unit)
+    e_x = np.cross((0.0, 1.0, 0.0), n)
+    e_x /= np.linalg.norm(e_x)
+    shape = batoid.Sphere(1 / surface.bend) if surface.bend else batoid.Plane()
+    return Placed(None, shape, _frame(surface.vertex, np.column_stack([e_x, np.cross(n, e_x), n])))
 
 
 def vector(rays: Rays) -> Any:
@@ -75,13 +91,16 @@ def vector(rays: Rays) -> Any:
     return batoid.RayVector(*(np.ascontiguousarray(p.numpy()) for p in (x, y, rays.above(0.0), *rays.direction)))
 
 
-def land(rays: Any, screen: Screen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(x, y, arrived): where batoid's rays, which it moves on, meet the screen (mm, on its plane)."""
+def land(rays: Any, screen: Screen, sense: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(x, y, arrived): where batoid's rays, which it moves on, meet the screen (mm, on its plane).
+
+    sense: -1 of light that comes to it along -z.
+    """
     import batoid
 
     x, y, _ = screen.middle
     batoid.intersect(batoid.Plane(), rays, _frame(screen.middle, np.column_stack(axes(screen.tilt or (0.0, 0.0)))))
-    arrived = ~rays.failed & ~rays.vignetted & np.isfinite(rays.x) & np.isfinite(rays.y) & (rays.vz > 0)
+    arrived = ~rays.failed & ~rays.vignetted & np.isfinite(rays.x) & np.isfinite(rays.y) & (sense * rays.vz > 0)
     return rays.x + x, rays.y + y, arrived
 
 
@@ -89,14 +108,16 @@ def through(lens: Lens, known: Sequence[Placed], rays: Rays) -> Any:
     """Rays of ours from the source behind the lens, as batoid's; `known`: its surfaces."""
     import batoid
 
-    theirs, outside = vector(rays), [_outside(interface.outline) for interface in lens.interfaces]
-    air, glass = batoid.ConstMedium(1.0), batoid.ConstMedium(lens.index)
-    if lens.reflects:
-        batoid.reflect(known[0].surface, theirs, known[0].frame)
-        return batoid.obscure(outside[0], theirs)
-    for (before, behind), at, beyond in zip(((air, glass), (glass, air)), known, outside, strict=True):
-        batoid.refract(at.surface, theirs, before, behind, coordSys=at.frame)
-        batoid.obscure(beyond, theirs)
+    theirs = vector(rays)
+    for interface, at in zip(lens.interfaces, known, strict=True):
+        if isinstance(interface.law, Reflect):
+            batoid.reflect(at.surface, theirs, coordSys=at.frame)
+        else:
+            media = (batoid.ConstMedium(n) for n in (interface.law.n_in, interface.law.n_out))
+            batoid.refract(at.surface, theirs, *media, coordSys=at.frame)
+        if isinstance(interface.surface, Tilted):  # its outline is that along z
+            theirs.toCoordSys(batoid.CoordSys())
+        batoid.obscure(_outside(interface.outline), theirs)
     return theirs
 
 
@@ -158,18 +179,19 @@ def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, se
     """The picture on a screen by that many stratified rays, in two halves."""
     n = max(1, round(a_side(channels) * math.sqrt(rays / 2)))
     known = surfaces(lens)
-    halves, count = np.zeros((2, *screen.shape)), 0
+    halves, count, solid = np.zeros((2, *screen.shape)), 0, slice(len(lens.before), lens.number_of("back") + 1)
+    sense = (-1) ** sum(interface.law.reverses for interface in lens.behind)
     for half, picture in enumerate(halves):
         for channel, place in zip(channels, places(channels), strict=True):
             glass, landed, launched = channel.through(lens), np.zeros(screen.shape), 0.0
             for strip in launch_strips(channel.source, glass, n, seed + half + 2 * place):
-                x, y, arrived = land(through(glass, known, strip), screen)
+                x, y, arrived = land(through(glass, known, strip), screen, sense)
                 flux = strip.flux.numpy()
                 landed += binned(x[arrived], y[arrived], flux[arrived], screen)
                 launched += flux.sum()
                 count += len(x)
             picture += channel.weight / max(launched, 1.0) * landed  # cells on a beam's rim count in or out
-    faces_of = zip(known, lens.interfaces, strict=True)
+    faces_of = zip(known[solid], lens.interfaces[solid], strict=True)
     return Traced(halves, count, FaceError.worst(face.error(interface.outline) for face, interface in faces_of))
 
 

@@ -56,6 +56,8 @@ Entry = dict[str, Any]  # entry of Mitsuba's scene
 
 def cannot(lens: Lens, channels: Sequence[Channel]) -> str:
     """Why it cannot trace this light, in a sentence; "": it can."""
+    if lens.before or lens.behind:
+        return "it builds the lens alone, and there are windows or mirrors before or behind it"
     if (first := channels[0].source).kind not in LAMPS:
         return f"Mitsuba has no lamp for the light of {type(first).__name__}"
     if first.parallel and points(channels) > 1:

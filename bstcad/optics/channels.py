@@ -17,6 +17,7 @@ from typing import Any
 
 from bstcad.optics import sampling
 from bstcad.optics.emitters import Emitter
+from bstcad.optics.interfaces import Interface
 from bstcad.optics.lens import Dimming, Lens
 
 
@@ -28,11 +29,14 @@ class Channel:
     index: float  # refractive index of the lens at the source's wavelength
     weight: float = 1.0  # part of all light; the weights of all channels sum to 1
     losses: Dimming | None = None  # losses at faces and in glass at its wavelength; None: there are none
+    # interfaces before and behind the lens at its wavelength; None: those that the lens has
+    around: tuple[tuple[Interface, ...], tuple[Interface, ...]] | None = None
 
     def through(self, lens: Lens) -> Lens:
         """The lens as this channel meets it."""
-        same = lens.index == self.index and lens.losses == self.losses
-        return lens if same else replace(lens, index=self.index, losses=self.losses)
+        before, behind = self.around or (lens.before, lens.behind)
+        own = {"index": self.index, "losses": self.losses, "before": before, "behind": behind}
+        return lens if all(getattr(lens, name) == value for name, value in own.items()) else replace(lens, **own)
 
 
 def channels_of(source: Emitter, index: Callable[[float], float], points: int, draw: int = 0) -> tuple[Channel, ...]:

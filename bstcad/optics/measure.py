@@ -146,7 +146,8 @@ def measure(
         return Light(np.zeros(screen.shape), math.nan, math.inf, rays=rays.count, flux=rays.flux)
     (value, error), (tent, _) = _value(rays, wanted), apart(rays.tents, wanted)
     shown, off = _shown(rays.boxes, wanted)
-    plain = lens.shapes("front")  # no kernel traces two nets as a whole, and both are to have a witness
+    # no kernel traces two nets as a whole, or what is around a lens, and all are to have a witness
+    plain = lens.shapes("front") or bool(lens.before or lens.behind)
     lenses = [(c.source, c.through(lens)) for c in channels]
     simple = draw is None and all(
         seen.losses is None and (plain or whole_kernel("trace.simulate", source, seen, screen.plane))

@@ -38,6 +38,16 @@ class Receiver(ABC):
         return tuple(f"{name} ({self.unit})" for name in self.names)
 
     @property
+    def frame(self) -> tuple[Vector, Vector, Vector] | None:
+        """e_x, e_y and n of a plane, of one that no kernel knows, too; None: it is none."""
+        return self.axes
+
+    @property
+    def origin(self) -> tuple[float, float]:
+        """Coordinates of the middle of a plane."""
+        return self.middle[0], self.middle[1]
+
+    @property
     @abstractmethod
     def middle(self) -> Vector:
         """A point in its middle, in space (mm); of a tilted plane the one that it is turned about."""
@@ -163,7 +173,7 @@ class Plane(Receiver):
 
     def height(self, point: Vector) -> float:
         """n · (p - C): how far (mm) a point stands off the plane, negative on the side that light comes from."""
-        return math.fsum(n * (p - c) for n, p, c in zip(self.axes[2], point, self.middle, strict=True))
+        return math.fsum(n * (p - c) for n, p, c in zip(self.frame[2], point, self.middle, strict=True))
 
     @abstractmethod
     def _advance(self, rays: Rays) -> tuple[Tensor, Tensor]:
@@ -180,7 +190,7 @@ class Plane(Receiver):
 
     def normal(self, aim: Tensor) -> Vector:
         """The unit normal, everywhere the same."""
-        return self.axes[2]
+        return self.frame[2]
 
 
 @dataclass(frozen=True)

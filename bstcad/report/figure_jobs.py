@@ -249,6 +249,11 @@ def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> F
     for axes in (close, whole):
         axes.plot(rays[:, :, 2].T, rays[:, :, 0].T, color=VERMILION, linewidth=0.6, alpha=0.8)
         axes.fill(rim_z, rim_x, facecolor=GLASS, edgecolor=BLUE, linewidth=1.0)
+        for interface in (*lens.before, *lens.behind):
+            half = interface.outline.half_extent[0]
+            along = torch.linspace(-half, half, MAP_POINTS, dtype=torch.float64)
+            height = interface.surface.sag_and_slope(along, torch.zeros_like(along))[0].expand_as(along)
+            axes.plot(height.numpy(), along.numpy(), color=BLUE, linewidth=1.0, gid="element")
         axes.set(xlabel="z (mm)", ylabel="x (mm)")
     low, high = rim_z.min(), rim_z.max()
     close.set(xlim=(low - reach * 0.5, high + reach * 0.5), ylim=(-1.25 * reach, 1.25 * reach))

@@ -84,6 +84,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "volume": shape["volume"],  # mm³
         "mass": None if heavy is None else shape["volume"] * heavy / 1000,  # g; None: no density is known
         "source": _known(asdict(scene.source)),
+        **{name: [_known(e.model_dump(mode="json")) for e in found] for name, found in scene.elements if found},
         "targets": [_known(target.model_dump(mode="json")) for target in scene.targets],
     }
 

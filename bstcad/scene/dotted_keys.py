@@ -13,9 +13,12 @@ from typing import Any
 from bstcad.scene.errors import SceneError
 
 PICTURES = ("text", "image", "sample", "uniform", "profile")  # a target has exactly one
-OUTLINES = ("source.aperture", "lens.outline", "target.outline", "lens.front.outline")
+OUTLINES = (
+    "source.aperture", "lens.outline", "target.outline", "lens.front.outline", "before.outline", "behind.outline",
+)  # fmt: skip
 ONE_OF = {  # alternatives among the keys of a table: a later one replaces the others
-    "target": PICTURES, "lens": ("material", "index"), **dict.fromkeys(OUTLINES, ("radius", "diameter")),
+    "target": PICTURES, **dict.fromkeys(("lens", "before", "behind"), ("material", "index")),
+    **dict.fromkeys(OUTLINES, ("radius", "diameter")),
 }  # fmt: skip
 STEP = re.compile(r"([^\[\]]+)(?:\[(\d{1,6})\])?")  # a name, and the number of a table in its list
 

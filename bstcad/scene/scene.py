@@ -32,10 +32,11 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.point import Point
 from bstcad.optics.sides import Sides, both
 from bstcad.optics.wavefront import ALONG, PlaneWave, SphericalWave, Wave, ZernikeWave
-from bstcad.scene import effects, lighting, mount, picture, scene_file
+from bstcad.scene import effects, elements, lighting, mount, picture, scene_file
 from bstcad.scene.blank import LensBlank, as_front, net_extent
 from bstcad.scene.dotted_keys import OUTLINES, override, tables_at
 from bstcad.scene.effects import Effects
+from bstcad.scene.elements import Around, Elements, Way
 from bstcad.scene.errors import SceneError, about, explain, line_of, toml_positions
 from bstcad.scene.mount import Mount, Part
 from bstcad.scene.picture import Picture
@@ -103,6 +104,8 @@ class Scene(Record):
     targets: Annotated[
         Targets, Field(alias="target"), Key("The picture and where it falls, or several: [[target]] tables.")
     ]
+    before: Annotated[Elements, Key("Windows and mirrors that light meets before the lens: [[before]] tables.")] = ()
+    behind: Annotated[Elements, Key("Windows and mirrors that light meets behind the lens: [[behind]] tables.")] = ()
     wavefront: Annotated[
         Annotated[PlaneWave | SphericalWave | ZernikeWave, Field(discriminator="kind")] | None,
         Key("The wave that the light behind the lens shall be."),
@@ -134,15 +137,22 @@ class Scene(Record):
         yield from lens.complaints()
         yield from lighting.complaints(source, lens)
         yield from effects.complaints(self.effects, lens)
+        yield from self.way.complaints()
         try:
             self.channels()
         except ValueError as error:  # data of the material or the metal that an effect lacks
             yield f"effects: {error}"
-        yield from lighting.order(source, lens)
-        yield from self._of_targets(lambda target: _behind(target, lens))
-        yield from lighting.unlit(source.central, lens, self.rim)
-        yield from self._of_targets(lambda target: _tilted(target, lens))
+        if not self.before:  # else elements.complaints looks at the order
+            yield from lighting.order(source, lens)
+        if not self.way.is_folded:
+            yield from self._of_targets(lambda target: _behind(target, lens))
+        if not self.before:
+            yield from lighting.unlit(source.central, lens, self.rim)
+        if not self.way.is_folded:
+            yield from self._of_targets(lambda target: _tilted(target, lens))
         yield from coplanar(self.targets)
+        if self.wavefront is not None and self.way.is_folded:
+            yield "wavefront: is asked for behind the lens, and behind has a mirror, which turns it; remove one of them"
         yield from _of_wavefront(self.wavefront, source, lens, accept=self.accept)
         yield from self.tailoring.complaints(lens)
         yield from _of_method(self)
@@ -167,7 +177,7 @@ class Scene(Record):
         if self.source.parallel:
             key = "mount.rim" if self.mount and self.mount.rim else "lens.outline"
             doubts += lighting.doubts(self.source, self.rim, key)
-        else:
+        elif not self.way.is_folded:
             doubts += self._of_targets(lambda target: _grazed(target, self.lens))
         return (*doubts, *self.of_pictures())
 
@@ -210,7 +220,7 @@ class Scene(Record):
         found = {("target" if name == "targets" else name): value for name, value in handler(self).items()}
         if len(found.get("target", ())) == 1:
             found["target"] = found["target"][0]
-        return found
+        return {name: value for name, value in found.items() if value or name not in ("before", "behind")}
 
     # ---- the lens and its light ----
 
@@ -239,9 +249,30 @@ class Scene(Record):
         falls = source.begins - lens.front.z if source.begins is not None else -math.inf
         return INSIDE * falls, INSIDE * (lens.back.z - lens.front.z - lens.min_thickness)
 
+    @property
+    def way(self) -> Way:
+        """The way of the light."""
+        targets = dict(zip(self.target_keys, self.targets, strict=True))
+        return Way(self.source, self.before, self.lens, behind=self.behind, targets=targets)
+
+    @property
+    def elements(self) -> tuple[tuple[str, Elements], ...]:
+        """The windows and mirrors by the keys of their tables."""
+        return ("before", self.before), ("behind", self.behind)
+
+    def around(self, wavelength: float) -> Around | None:
+        """The interfaces before and behind the lens for light of a wavelength (nm); None: there are none."""
+        if not (self.before or self.behind):
+            return None
+        before = elements.interfaces(self.before, self.way.sense, wavelength)
+        return before, elements.interfaces(self.behind, 1, wavelength)
+
     def clearance(self, highest: float) -> float:
-        """How far (mm) the targets' planes pass a lens that reaches up to z = highest (mm); negative: one cuts it."""
-        return min(_clearance(target, self.lens, highest) for target in self.targets)
+        """How far (mm) what follows passes a lens that reaches up to z = highest (mm); negative: it cuts it."""
+        room = [elements.lowest(self.behind) - highest] if self.behind else []
+        if not self.way.is_folded:
+            room += (_clearance(target, self.lens, highest) for target in self.targets)
+        return min(room)
 
     def flat_lens(
         self, net: Sides, dtype: torch.dtype = torch.float64, device: str | torch.device = "cpu",
@@ -262,7 +293,12 @@ class Scene(Record):
             self.lens.flat_front(net, as_wide_as).to(heights.dtype, device), back, self.lens.outline, self.index,
             reflects=self.lens.back.reflect,
         )  # fmt: skip
-        return self.as_mounted(lens.shaping(*self.lens.shaped))
+        return self.assembled(lens)
+
+    def assembled(self, lens: Lens) -> Lens:
+        """A lens of this scene with all that the scene tells of it: what is around it, which faces are tailored."""
+        before, behind = self.around(self.source.main_wavelength) or ((), ())
+        return self.as_mounted(replace(lens, before=before, behind=behind).shaping(*self.lens.shaped))
 
     def as_mounted(self, lens: Lens) -> Lens:
         """A lens of this scene, with the clear apertures that the mount leaves of its faces."""
@@ -289,8 +325,11 @@ class Scene(Record):
         return lambda points, seed: self._with_losses(drawn_channels(self.source, self.lens.index_at, points, seed))
 
     def _with_losses(self, channels: tuple[Channel, ...]) -> tuple[Channel, ...]:
-        losses = {nm: effects.losses(self.effects, self.lens, nm) for nm, _ in self.source.lines}
-        return merged([replace(c, losses=losses[c.source.wavelength]) for c in channels])
+        lines = [nm for nm, _ in self.source.lines]
+        losses = {nm: effects.losses(self.effects, self.lens, nm) for nm in lines}
+        around = {nm: self.around(nm) for nm in lines}
+        own = ((c, c.source.wavelength) for c in channels)
+        return merged([replace(c, losses=losses[nm], around=around[nm]) for c, nm in own])
 
     def with_source_scaled(self, share: float) -> Self:
         """The scene with a source of this share of its size: 0 makes it a point, or a beam of parallel light."""

@@ -21,6 +21,7 @@ from bstcad.optics import media
 from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
 from bstcad.optics.sides import both
+from bstcad.optics.unfolding import imaged
 from bstcad.report.record import LeftOut, Making
 from bstcad.scene.effects import Absorption, Effect, Fresnel, losses, named, reflection_of
 from bstcad.scene.scene import Scene
@@ -42,7 +43,8 @@ def coarse_lens(scene: Scene) -> Lens:
     channel = _central(scene)
     lens = channel.through(scene.flat_lens(NET))
     picture = _coarse(scene.target.irradiance(), PIXELS)
-    screen = replace(scene.target.screen, pixels=picture.shape[::-1])
+    screen = imaged(lens.behind, replace(scene.target.screen, pixels=picture.shape[::-1]))
+    behind, lens = lens.behind, replace(lens, behind=())
     if scene.lens.front.free:
         from bstcad.tailoring.stage1 import shaped_front  # with scipy.optimize, a tenth of a second to load
 
@@ -61,7 +63,7 @@ def coarse_lens(scene: Scene) -> Lens:
         grid = face_grid(channel.source, lens, window, 2 * NET)
         lens = sloped(lens, wanted, grid, Fit(bending=1e-2, steps=20, degree=3), unlit=0.0)
         lens = moved_clear(lens, z, scene.lens.min_thickness)
-    return lens
+    return replace(lens, behind=behind)
 
 
 def _coarse(picture: np.ndarray, most: int) -> np.ndarray:
@@ -76,7 +78,8 @@ def _coarse(picture: np.ndarray, most: int) -> np.ndarray:
 def _central(scene: Scene, *more: Effect) -> Channel:
     """The light of the middle of the source at its main wavelength, with more effects than the scene names."""
     source = scene.source.central
-    return Channel(source, scene.index, losses=losses((*scene.effects, *more), scene.lens, source.wavelength))
+    lost = losses((*scene.effects, *more), scene.lens, source.wavelength)
+    return Channel(source, scene.index, losses=lost, around=scene.around(source.wavelength))
 
 
 # --- effects that are left out ----------------------------------------------------------------------------------------

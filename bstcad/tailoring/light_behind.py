@@ -76,11 +76,11 @@ class LightBehind:
 
     def on(self, plane: Receiver) -> Grid:
         """x and y (mm) along a plane at which its rays cross it."""
-        *along, normal = plane.axes
+        *along, normal = plane.frame
         centre = np.array(plane.middle)
         off = centre.reshape(3, 1, 1) - self.place
         off = _along(normal, off) / _along(normal, self.direction) * self.direction - off
-        return tuple(_along(axis, off) + c for axis, c in zip(along, centre, strict=False))
+        return tuple(_along(axis, off) + c for axis, c in zip(along, plane.origin, strict=True))
 
     def places_of(self, screen: Screen, values: np.ndarray) -> np.ndarray:
         """(k, columns + 1, rows + 1) at the corners of a screen's pixels: values (k, c + 1, r + 1) of its rays."""
@@ -138,7 +138,7 @@ class LightBehind:
 def of_task(task: Task) -> LightBehind:
     """The light through the nearest target that meets the wave of a task, or that through it and the furthest one."""
     near, *_, far = sorted((*task.goals, *task.goals), key=lambda goal: goal.receiver.plane.throw(0.0))
-    if any(goal.receiver.plane.axes is None for goal in (near, far)):
+    if any(goal.receiver.plane.frame is None for goal in (near, far)):
         raise SceneError("target: light through several targets is followed between planes alone; make each a plane")
     n = task.knobs.transport_grid
     if task.wave is not None:
@@ -211,7 +211,7 @@ def between_targets(
     own, *pictures = (
         np.maximum(p, DIM * p.mean()) for p in (picture, *(gaussian_filter(picture, b, mode="nearest") for b in BLURS))
     )
-    along = screen.plane.axes[:2]
+    along = screen.plane.frame[:2]
 
     def cosines(p: np.ndarray, t: np.ndarray) -> Grid:
         way = _unit(t - p)

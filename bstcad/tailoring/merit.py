@@ -54,6 +54,7 @@ from bstcad.optics.reach import wanted_slopes
 from bstcad.optics.receivers import Receiver
 from bstcad.optics.trace import behind, through
 from bstcad.optics.tubes import Tubes, arriving, rays_to
+from bstcad.optics.unfolding import image
 from bstcad.optics.wavefront import NM, Wave
 from bstcad.optics.wavefront_error import from_reference
 from bstcad.tailoring.source_image import Blur, Spread, blurred, blurs, bordered, unseen
@@ -332,7 +333,8 @@ def local_weight(source: Emitter, lens: Lens, target: np.ndarray, screen: Screen
     logarithm = np.where(seen, np.log(np.maximum(irradiance, MOST**-4)), 0.0)
     weight = np.clip(np.exp(-0.5 * gaussian_filter(logarithm, SMOOTH)), 1 / MOST, MOST)
     if number == lens.freeform[-1] and onwards[0].law.eta > 1:
-        farther = _farther(at_net, landed.position, screen.plane, law=onwards[0].law, seen=seen)
+        plane = image(lens.behind[max(0, number - lens.number_of("back")) :], screen.plane)
+        farther = _farther(at_net, landed.position, plane, law=onwards[0].law, seen=seen)
         if farther is not None:
             weight = weight / np.exp(gaussian_filter(np.log(farther), SMOOTH))
     return torch.from_numpy(weight)

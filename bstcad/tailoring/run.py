@@ -20,6 +20,7 @@ from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, measure, rrmsd_by_rays
 from bstcad.optics.sides import Sides
+from bstcad.optics.unfolding import imaged
 from bstcad.optics.wavefront import Wave
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
@@ -143,6 +144,17 @@ class Task:
     def whole(self) -> Task:
         """The same task with the light of the whole source."""
         return replace(self, channels=self.grown[-1], grown=()) if self.grown else self
+
+    def aimed(self, lens: Lens) -> tuple[Task, Lens]:
+        """Return the task and the lens of stage 1, which aims straight at the receivers.
+
+        Nothing is behind the lens, and the receivers are where it sees them; where there is nothing, both as they are.
+        """
+        if not lens.behind:
+            return self, lens
+        channels = tuple(replace(c, around=(c.through(lens).before, ())) for c in self.channels)
+        goals = tuple(replace(goal, receiver=imaged(lens.behind, goal.receiver)) for goal in self.goals)
+        return replace(self, channels=channels, goals=goals), replace(lens, behind=())
 
     def rrmsd(self, lens: Lens, effort: Effort | None = None) -> float:
         """RRMSD by rays on the CPU, without the bias of the tubes that tailor the lens; the largest of several.

@@ -22,6 +22,7 @@ from scipy.stats import norm
 from bstcad.optics.bspline import BSplineSurface, basis_matrix
 from bstcad.optics.channels import Channel
 from bstcad.optics.emitters import Emitter
+from bstcad.optics.interfaces import Interface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import tubes_picture
@@ -31,6 +32,7 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Vector
 from bstcad.optics.sides import in_words
 from bstcad.optics.surfaces import Surface
+from bstcad.optics.tilted import Tilted
 from bstcad.scene.errors import SceneError
 
 # --- the setup --------------------------------------------------------------------------------------------------------
@@ -65,9 +67,9 @@ class Setup:
         return tubes_picture(self.lens, self.channels, self.screen, tubes, over_the_back=True).cpu().numpy()
 
     def moved(self, part: str, motion: Motion) -> Setup:
-        """With its lens, source or screen moved; seen from a moved lens, source and screen move the other way."""
+        """With its lens, source or screen moved; seen from a moved lens, all else moves the other way."""
         if part == "lens":
-            around = self.moved("source", motion.inverse).moved("screen", motion.inverse)
+            around = self.moved("source", motion.inverse).moved("screen", motion.inverse)._with_elements(motion.inverse)
             return replace(around, placed=motion if self.placed is None else self.placed.after(motion))
         if part == "screen":
             return replace(self, screen=self.screen.moved(motion))
@@ -75,6 +77,18 @@ class Setup:
             return self.with_sources(lambda source: source.moved(motion, self.lens.entrance.z))
         except NotImplementedError as error:  # an emitter of one's own
             raise SceneError(f"tolerance: {error}, or name errors with which it stays where it is") from None
+
+    def _with_elements(self, motion: Motion) -> Setup:
+        """With the faces of windows and mirrors around the lens moved; their rims stay about the axis of the lens."""
+        if not (self.lens.before or self.lens.behind):
+            return self
+
+        def moved(interfaces: tuple[Interface, ...]) -> tuple[Interface, ...]:
+            return tuple(replace(i, surface=Tilted.of(i.surface).moved_by(motion)) for i in interfaces)
+
+        lens = replace(self.lens, before=moved(self.lens.before), behind=moved(self.lens.behind))
+        own = ((c, c.around and (moved(c.around[0]), moved(c.around[1]))) for c in self.channels)
+        return replace(self, lens=lens, channels=tuple(replace(c, around=around) for c, around in own))
 
     def with_sources(self, change: Callable[[Emitter], Emitter]) -> Setup:
         """With each channel's source changed."""

@@ -230,8 +230,12 @@ def _lit(lens: Lens, nominal: Nominal, goal: Goal, effort: Effort) -> tuple[Ligh
 
 
 def _as_shaped(lens: Lens, designed: Lens) -> Lens:
-    """The re-read lens with what no file says: which faces tailoring shaped, if its front is a net as well."""
-    return replace(lens, shaped=designed.shaped if lens.front.is_net else None)
+    """The re-read lens with what no file says: the elements around it, and which faces tailoring shaped.
+
+    The latter if its front is a net as well.
+    """
+    shaped = designed.shaped if lens.front.is_net else None
+    return replace(lens, before=designed.before, behind=designed.behind, shaped=shaped)
 
 
 def _as_made(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> tuple[Lens, Sequence[Check], str]:

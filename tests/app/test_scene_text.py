@@ -42,7 +42,7 @@ def overridden(data, key, value):
     """What `changed` has to make: as `override` does, but lists of tables are lists, and no list is empty."""
     wanted = copy.deepcopy(data)
     override(wanted, key, value, key)
-    for name in ("effects", "tolerance"):
+    for name in ("before", "behind", "effects", "tolerance"):
         if isinstance(wanted.get(name), dict):
             wanted[name] = [wanted[name]]
     return {name: part for name, part in wanted.items() if part != []}

@@ -50,7 +50,7 @@ BINS = 1024  # of y, by which the segments of a border are looked up
 SAME = 1e-6  # mm by which a surface may differ from its equation, or part.step from lens.step
 LEDGER = (
     "on target", "off target", "lost through the sides", "total internal reflection", "reflected at the faces",
-    "absorbed in the glass", "absorbed by the mirror",
+    "absorbed in the glass", "absorbed by the mirror", "stopped beside a window or mirror",
 )  # fmt: skip
 PAGES = {  # of refractiveindex.info: (n, k)
     "PMMA": ("organic/poly_methyl_methacrylate/Szczurowski", "organic/poly_methyl_methacrylate/Zhang-Mitsubishi"),
@@ -132,6 +132,18 @@ class Light(NamedTuple):
     round_extent: bool
     extent: np.ndarray  # (2,) half extents of the source: mm of a point source, direction cosines of a parallel beam
     cone: float  # cosine of the half divergence
+
+
+class Around(NamedTuple):
+    """Faces of windows and mirrors before or behind the lens, in the order of the light: planes and spheres."""
+
+    vertices: np.ndarray  # (k, 3) mm
+    normals: np.ndarray  # (k, 3) unit vectors there, upwards
+    bends: np.ndarray  # (k,) curvatures (1/mm)
+    mirrors: np.ndarray  # (k,) True of a mirror
+    rims: np.ndarray  # (k, 2) half extents along x and y (mm)
+    circles: np.ndarray  # (k,) True of a round rim
+    etas: np.ndarray  # (lines, k) index before the face over that behind it
 
 
 class Screen(NamedTuple):
@@ -325,6 +337,32 @@ def light_of(source, sense, vertex):
     )  # fmt: skip
 
 
+def around_of(tables, sense, wavelengths):
+    """The Around of [[before]] or [[behind]] tables, for light that comes along +z (sense 1) or -z (-1)."""
+    rows, etas = [], []
+    for table in tables:
+        plate = table["kind"] == "window"
+        thick, n = (table["thickness"] if plate else 0.0), turned(table.get("tilt"))[2]
+        shape, middle = table["outline"], np.array([0.0, 0.0, table["z"] + thick / 2])
+        is_round = shape["shape"] == "circle"
+        radius = shape.get("radius") or shape.get("diameter", 0.0) / 2
+        rim = (radius, radius) if is_round else (shape["width"] / 2, shape["height"] / 2)
+        bends = table.get("curvature") or (0.0, 0.0) if plate else (table.get("curvature") or 0.0,)
+        off = (-thick / 2, thick / 2) if plate else (0.0,)
+        faces = [(middle + o * n, n, bend, not plate, rim, is_round) for o, bend in zip(off, bends, strict=True)]
+        rows += faces[:: int(sense)]
+        if plate:
+            index = [table.get("index") or indices(table["material"], nm, extinction=False)[0] for nm in wavelengths]
+            etas += [[1 / i for i in index], index]
+        else:
+            etas.append([1.0] * len(wavelengths))
+            sense = -sense
+    columns = [np.array(column) for column in zip(*rows, strict=True)] if rows else [np.zeros((0, 3))] * 2 + [
+        np.zeros(0), np.zeros(0, bool), np.zeros((0, 2)), np.zeros(0, bool)
+    ]  # fmt: skip
+    return Around(*columns, np.array(etas, float).reshape(len(rows), len(wavelengths)).T.copy())
+
+
 def screen_of(target, shape):
     """The Screen of a [target] table, of (rows, columns) pixels."""
     (x0, x1), (y0, y1), (rows, columns) = target["x"], target["y"], shape
@@ -516,26 +554,82 @@ def refracted(d, n, eta, cos_in, cos_out):
 
 
 @njit(nogil=True, cache=True)
-def trace(points, area, light, front, front_border, net, back_border, glass, screen, picture, ledger):
+def past(around, first, line, p, d):
+    """(arrives, p, d) behind the faces from number `first` on; the ray begins on face `first` - 1 or before it."""
+    for k in range(first, len(around.bends)):
+        v, n, c = around.vertices[k], around.normals[k], around.bends[k]
+        w = (p[0] - v[0], p[1] - v[1], p[2] - v[2])
+        b = n[0] * d[0] + n[1] * d[1] + n[2] * d[2] - c * (w[0] * d[0] + w[1] * d[1] + w[2] * d[2])
+        e = c * (w[0] ** 2 + w[1] ** 2 + w[2] ** 2) - 2 * (n[0] * w[0] + n[1] * w[1] + n[2] * w[2])
+        if b * b - c * e <= 0:
+            return False, p, d
+        s = e / (b + math.copysign(math.sqrt(b * b - c * e), b))
+        if s < 0:
+            return False, p, d
+        arrives, p, d = _turned_by(around, k, line, (p[0] + s * d[0], p[1] + s * d[1], p[2] + s * d[2]), d)
+        if not arrives:
+            return False, p, d
+    return True, p, d
+
+
+@njit(nogil=True, cache=True)
+def _turned_by(around, k, line, p, d):
+    """(goes on, p, d) behind face k, for a ray at a point of it."""
+    a, b = around.rims[k]
+    within = abs(p[0]) <= a and abs(p[1]) <= b
+    if around.circles[k]:
+        within = p[0] * p[0] + p[1] * p[1] <= a * a
+    v, c = around.vertices[k], around.bends[k]
+    m = around.normals[k]
+    m = (m[0] - c * (p[0] - v[0]), m[1] - c * (p[1] - v[1]), m[2] - c * (p[2] - v[2]))
+    size = math.sqrt(m[0] ** 2 + m[1] ** 2 + m[2] ** 2)
+    cos = (m[0] * d[0] + m[1] * d[1] + m[2] * d[2]) / size
+    size = math.copysign(size, cos)
+    m, cos = (m[0] / size, m[1] / size, m[2] / size), abs(cos)
+    if around.mirrors[k]:
+        return within, p, (d[0] - 2 * cos * m[0], d[1] - 2 * cos * m[1], d[2] - 2 * cos * m[2])
+    eta = around.etas[line, k]
+    cos2 = 1 - eta * eta * (1 - cos * cos)
+    if cos2 <= 0:
+        return False, p, d
+    return within, p, refracted(d, m, eta, cos, math.sqrt(cos2))
+
+
+@njit(nogil=True, cache=True)
+def face_height(front, x, y, work):
+    """(z, z_x, z_y) of the front."""
+    if front.free:
+        return height(front.net, x, y, work)
+    return conic_height(front.conic, x, y)
+
+
+@njit(nogil=True, cache=True)
+def trace(points, area, light, front, front_border, net, back_border, glass, screen, before, behind, picture, ledger):
     """Adds the flux of rays to a picture and to a ledger, for the caller to divide by the number of points.
 
     points: (n, 4): x and y (mm) on the first face, and the place on the source's extent in [0, 1]²; area: (n,) mm² of
     the face that each of them stands for, times n.
     """
     work = np.empty((4, 3))
+    apart = len(before.bends) > 0  # does light meet something before the lens?
+    to_lens = -1.0 if glass.mirror else 1.0
     for number in range(len(points)):
         x, y, u, v = points[number]
-        if glass.mirror:
+        if apart:
+            c, m, o = before.bends[0], before.normals[0], before.vertices[0]
+            f = c * ((x - o[0]) ** 2 + (y - o[1]) ** 2) - 2 * (m[0] * (x - o[0]) + m[1] * (y - o[1]))
+            if m[2] * m[2] - c * f <= 0:
+                continue
+            root = math.sqrt(m[2] * m[2] - c * f)
+            z, z_x, z_y = o[2] + f / (m[2] + root), (c * (x - o[0]) - m[0]) / root, (c * (y - o[1]) - m[1]) / root
+        elif glass.mirror:
             if not inside(back_border, x, y):
                 continue
             z, z_x, z_y = height(net, x, y, work)
         else:
             if not inside(front_border, x, y):
                 continue
-            if front.free:
-                z, z_x, z_y = height(front.net, x, y, work)
-            else:
-                z, z_x, z_y = conic_height(front.conic, x, y)
+            z, z_x, z_y = face_height(front, x, y, work)
         dx, dy, dz, flux = emitted(light, (x, y, z), u, v)
         if flux <= 0:
             continue
@@ -545,10 +639,34 @@ def trace(points, area, light, front, front_border, net, back_border, glass, scr
         if cos <= 0:
             continue
         flux *= area[number] * size * cos
-        for line in glass.lines:
+        start = (x, y, z)
+        for i, line in enumerate(glass.lines):
             share, nm, index, extinction, absorbed = line
             rest = flux * share
-            p = (x, y, z)
+            p, d = start, (dx, dy, dz)
+            if apart:
+                arrives, p, d = _turned_by(before, 0, i, p, d)
+                if arrives:
+                    arrives, p, d = past(before, 1, i, p, d)
+                if not arrives:
+                    ledger[7] += rest
+                    continue
+                if glass.mirror:
+                    s, met = _to_net(net, p, d, work)
+                else:
+                    s, met = _to_front(front, p, d, work)
+                p = (p[0] + s * d[0], p[1] + s * d[1], p[2] + s * d[2])
+                if not met or s < 0 or not inside(back_border if glass.mirror else front_border, p[0], p[1]):
+                    continue  # it misses the lens
+                if glass.mirror:
+                    _, z_x, z_y = height(net, p[0], p[1], work)
+                else:
+                    _, z_x, z_y = face_height(front, p[0], p[1], work)
+                size = math.sqrt(1 + z_x * z_x + z_y * z_y)
+                n = (-z_x / size, -z_y / size, 1 / size)
+                cos = to_lens * (d[0] * n[0] + d[1] * n[1] + d[2] * n[2])
+                if cos <= 0:
+                    continue
             if glass.mirror:
                 e = (d[0] + 2 * cos * n[0], d[1] + 2 * cos * n[1], d[2] + 2 * cos * n[2])
                 if glass.fresnel:
@@ -582,6 +700,10 @@ def trace(points, area, light, front, front_border, net, back_border, glass, scr
                 ledger[4] += rest - kept
                 rest = kept
                 e = refracted(inner, m, index, cos_in, math.sqrt(cos2))
+            arrives, p, e = past(behind, 0, i, p, e)
+            if not arrives:
+                ledger[7] += rest
+                continue
             e_x, e_y, across = screen.axes
             o = screen.middle
             fall = e[0] * across[0] + e[1] * across[1] + e[2] * across[2]
@@ -607,6 +729,20 @@ def _to_net(net, p, d, work):
     s = (z - p[2]) / d[2]
     for _ in range(30):
         z, z_x, z_y = height(net, p[0] + s * d[0], p[1] + s * d[1], work)
+        step = (p[2] + s * d[2] - z) / (d[2] - z_x * d[0] - z_y * d[1])
+        s -= step
+        if abs(step) < 1e-11:
+            return s, True
+    return s, False
+
+
+@njit(nogil=True, cache=True)
+def _to_front(front, p, d, work):
+    """(s in mm, met): the path from p along d to the front, by Newton's iteration."""
+    z, _, _ = face_height(front, p[0], p[1], work)
+    s = (z - p[2]) / d[2]
+    for _ in range(30):
+        z, z_x, z_y = face_height(front, p[0] + s * d[0], p[1] + s * d[1], work)
         step = (p[2] + s * d[2] - z) / (d[2] - z_x * d[0] - z_y * d[1])
         s -= step
         if abs(step) < 1e-11:
@@ -648,10 +784,9 @@ class Draw(NamedTuple):
         return points, area
 
 
-def draw_of(border, light, z):
-    """The Draw for a first face with that border near the plane z: by the flux that falls into each column and row."""
-    x, y = border.segments[:, 0], border.segments[:, 1]
-    ends = np.array([np.linspace(p.min(), p.max(), CELLS + 1) for p in (x, y)])
+def draw_of(low, high, light, z):
+    """The Draw for a first face between two corners near the plane z: by the flux into each column and row."""
+    ends = np.array([np.linspace(*pair, CELLS + 1) for pair in zip(low, high, strict=True)])
     straight = light.parallel and not light.extent.any() and (light.axes[2] == (0, 0, 1)).all()
     if straight:  # nothing beside the aperture
         low, high = light.place[:2] - light.aperture, light.place[:2] + light.aperture
@@ -707,10 +842,17 @@ def judge(folder, points=POINTS, seed=31, number=0, most=None):
             front = front._replace(free=True, net=nets["front"])
         else:
             front = front._replace(conic=conic_of(face, vertex, lower))
-    light = light_of(scene["source"], -1.0 if glass.mirror else 1.0, float(vertex))
+    to_lens, wavelengths = -1.0 if glass.mirror else 1.0, [line[1] for line in glass.lines]
+    sense = to_lens * (-1.0) ** sum(table["kind"] == "mirror" for table in scene.get("before", []))
+    before = around_of(scene.get("before", []), sense, wavelengths)
+    behind = around_of(scene.get("behind", []), 1.0, wavelengths)
+    low, high = front_border.segments[:, :2].min(0), front_border.segments[:, :2].max(0)
+    if len(before.bends):
+        vertex, low, high = before.vertices[0, 2], -before.rims[0], before.rims[0]
+    light = light_of(scene["source"], sense, float(vertex))
     asked = scene["target"]
     screen = screen_of(asked[number] if isinstance(asked, list) else asked, target.shape)
-    draw = draw_of(front_border, light, float(vertex))
+    draw = draw_of(low, high, light, float(vertex))
 
     engines = [qmc.Sobol(4, seed=np.random.default_rng((seed, k))) for k in range(SETS)]
     pictures, ledgers = np.zeros((SETS, *target.shape)), np.zeros((SETS, len(LEDGER)))
@@ -718,7 +860,10 @@ def judge(folder, points=POINTS, seed=31, number=0, most=None):
     def follow(k, count):
         for start in range(0, count, CHUNK):
             at, area = draw.points(engines[k].random(min(CHUNK, count - start)))
-            trace(at, area, light, front, front_border, net, back_border, glass, screen, pictures[k], ledgers[k])
+            trace(
+                at, area, light, front, front_border, net, back_border, glass, screen, before, behind, pictures[k],
+                ledgers[k],
+            )  # fmt: skip
 
     most, traced, more = most or (MAX_POINTS if points >= POINTS else points), 0, points
     with ThreadPoolExecutor(min(SETS, os.cpu_count() or 1)) as pool:

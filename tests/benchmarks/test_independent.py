@@ -70,6 +70,13 @@ SCENES = {  # name: (template, changes)
         "mount={datum='flange', draft=2.0, bevel=0.15, rim={shape='circle', diameter=15.0}, "
         "flange={outline={shape='circle', diameter=24.0}, z=15.5, thickness=1.5}}",
     ),
+    "window_and_fold_mirror": (  # the light goes on along (-sin 40°, 0, -cos 40°)
+        "disk", *SMALL, DRAFT, "target.sample=camera", "target.x=[-310.0, -10.0]", "target.y=[-150.0, 150.0]",
+        "target.z=58.0", "target.tilt=[0.0, 40.0]", "target.outline={shape='circle', radius=140.0}",
+        "before=[{kind='window', z=5.0, thickness=3.0, material='N-BK7', tilt=[5.0, 0.0], "
+        "outline={shape='circle', radius=6.0}}]",
+        "behind=[{kind='mirror', z=250.0, tilt=[0.0, 20.0], outline={shape='circle', radius=150.0}}]",
+    ),
     "metal_mirror_tilted_wall": (
         "mirror", *SMALL, DRAFT, "target.tilt=[10.0, -15.0]", "effects=[{kind='fresnel', metal='Al'}]",
     ),
