@@ -26,7 +26,7 @@ class Status(IntEnum):
     VIGNETTED = 2  # left the glass through a side: met the back surface outside the outline, or not at all
     TOTAL_REFLECTION = 3  # total internal reflection at a face
     TURNED_BACK = 4  # left the last surface, but not towards the plane it should land on
-    BLOCKED = 5  # met a window or a mirror before or behind the lens outside its outline, or not at all
+    BLOCKED = 5  # met a window or a mirror behind the lens outside its outline, or not at all
 
 
 ARRAYS = ("position", "direction", "flux", "status")  # tensors of a bundle

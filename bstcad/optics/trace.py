@@ -36,7 +36,7 @@ from bstcad.optics.receivers import Receiver
 from bstcad.optics.surfaces import Plane, Surface
 
 UNDERSIDE = "vignetted by the underside"  # a line of the ledger: light beside the optical part of a front
-BLOCKED = "stopped beside a window or mirror"  # a line of the ledger of a lens with some before or behind it
+BLOCKED = "stopped beside a window or mirror"  # a line of the ledger of a lens with some behind it
 CELLS = 256  # a side of the lens, by which that light is summed
 TABULATED = 256  # rays a side from which on a table of the source's light is worth its cost
 GHOST_RAYS = 1024  # a side, at most; a ghost of 1 % of the light with 3 % of noise in a pixel adds 0.0003 to an RRMSD
@@ -218,7 +218,7 @@ def simulate_plain(lights: Lights, screen: Screen, n: int) -> Simulation:
             box += weight * irradiance.box(landed, screen)
             tent += weight * irradiance.tent(landed, screen)
             lines = irradiance.ledger(landed, screen)
-            if lens.before or lens.behind:
+            if lens.behind:
                 lines[BLOCKED] = float(total(landed.flux[landed.status == int(Status.BLOCKED)].double()))
             for line, value in lines.items():
                 flux[line] = flux.get(line, 0.0) + weight * value

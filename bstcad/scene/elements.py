@@ -143,7 +143,10 @@ def turns(elements: Sequence[Window | Mirror]) -> int:
 
 
 def interfaces(elements: Sequence[Window | Mirror], sense: int, wavelength: float) -> tuple[Interface, ...]:
-    """What light of a wavelength (nm) meets, which comes along +z or -z."""
+    """What light of a wavelength (nm) meets, which comes along +z or -z.
+
+    Light beside them is BLOCKED; before the lens `Scene.around` has it miss the lens.
+    """
     found: list[Interface] = []
     for element in elements:
         found += element.interfaces(sense, wavelength)

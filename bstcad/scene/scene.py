@@ -30,6 +30,7 @@ from bstcad.optics.key import Key
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.point import Point
+from bstcad.optics.rays import Status
 from bstcad.optics.sides import Sides, both
 from bstcad.optics.wavefront import ALONG, PlaneWave, SphericalWave, Wave, ZernikeWave
 from bstcad.scene import effects, elements, lighting, mount, picture, scene_file
@@ -264,7 +265,8 @@ class Scene(Record):
         """The interfaces before and behind the lens for light of a wavelength (nm); None: there are none."""
         if not (self.before or self.behind):
             return None
-        before = elements.interfaces(self.before, self.way.sense, wavelength)
+        met = elements.interfaces(self.before, self.way.sense, wavelength)
+        before = tuple(replace(interface, status_if_missed=Status.MISSED_FRONT) for interface in met)
         return before, elements.interfaces(self.behind, 1, wavelength)
 
     def clearance(self, highest: float) -> float:

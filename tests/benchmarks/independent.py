@@ -649,8 +649,7 @@ def trace(points, area, light, front, front_border, net, back_border, glass, scr
                 if arrives:
                     arrives, p, d = past(before, 1, i, p, d)
                 if not arrives:
-                    ledger[7] += rest
-                    continue
+                    continue  # it misses the lens
                 if glass.mirror:
                     s, met = _to_net(net, p, d, work)
                 else:
