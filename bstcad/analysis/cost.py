@@ -100,8 +100,10 @@ SLIGHT = 0.02  # … if the gradient exceeds this part of the brightest pixel's 
 TENTH = 0.1  # quantile of the irradiance up to which, and from whose counterpart on, a pixel is dark or bright
 
 
-def remaining(picture: np.ndarray, target: np.ndarray, per_mm: tuple[float, float]) -> dict[str, Any]:
-    """Where a picture (rows, columns) differs from a target of the same sum; per_mm: pixels along columns and rows.
+def remaining(picture: np.ndarray, target: np.ndarray, per_unit: tuple[float, float]) -> dict[str, Any]:
+    """Where a picture (rows, columns) differs from a target of the same sum.
+
+    per_unit: pixels along x and y in a unit of the receiver.
 
     parts: [{name: of `masks`, error: share of the squared error, pixels: share of the target's pixels}].
     octaves: as `_octaves` has them.
@@ -112,7 +114,7 @@ def remaining(picture: np.ndarray, target: np.ndarray, per_mm: tuple[float, floa
         {"name": name, "error": float(square[where].sum()) / whole, "pixels": float(where.mean())}
         for name, where in masks(target).items()
     ]
-    return {"parts": parts, "octaves": _octaves(picture - target, math.sqrt(math.prod(per_mm)))}
+    return {"parts": parts, "octaves": _octaves(picture - target, math.sqrt(math.prod(per_unit)))}
 
 
 def masks(target: np.ndarray) -> dict[str, np.ndarray]:
@@ -142,12 +144,12 @@ def _outermost(side: int) -> np.ndarray:
     return np.minimum(along, side - 1 - along) < max(1, round(side / RIM))
 
 
-def _octaves(error: np.ndarray, per_mm: float) -> list[dict[str, Any]]:
+def _octaves(error: np.ndarray, per_unit: float) -> list[dict[str, Any]]:
     """Energy of the cosine transform (orthonormal: Parseval) by the length of the wave vector, from coarse to fine.
 
     Of each octave: frequency (from, below, in cycles a pixel; the finest goes on to 0.71, along the diagonals), period
-    (mm on the target, the coarse end first), error (share of the squared error).  The mean is in no octave, as both
-    pictures have one sum.  A cosine transform is not periodic and makes nothing of opposite sides that differ.
+    (on the target, in its unit, the coarse end first), error (share of the squared error).  The mean is in no octave,
+    as both pictures have one sum.  A cosine transform is not periodic and makes nothing of opposite sides that differ.
     """
     energy = dctn(error, norm="ortho") ** 2
     along = (np.arange(side) / (2 * side) for side in error.shape)
@@ -159,7 +161,7 @@ def _octaves(error: np.ndarray, per_mm: float) -> list[dict[str, Any]]:
     sums = np.bincount((number + count - 1).ravel(), energy.ravel(), count) / whole
     ends = [(0.25 * 2.0**k, 0.5 * 2.0**k) for k in range(1 - count, 1)]
     return [
-        {"frequency": end, "period": tuple(1 / (cycles * per_mm) for cycles in end), "error": float(share)}
+        {"frequency": end, "period": tuple(1 / (cycles * per_unit) for cycles in end), "error": float(share)}
         for end, share in zip(ends, sums, strict=True)
     ]
 

@@ -263,9 +263,10 @@ class Blur:
     to the target than the blurred target is.
     """
 
-    width: float  # mm; diameter of the even disc with the same rms distance from the centroid
+    width: float  # diameter of the even disc with the same rms distance from the centroid, in `unit`
     pixels: float  # the width in pixels
     rrmsd: float  # between the target and the target convolved with the mean image
+    unit: str = "mm"  # unit of the receiver
 
 
 def blur(
@@ -281,7 +282,7 @@ def blur(
     if not found.flux.any():
         return None
     width = found.width()
-    return Blur(width * _pixel(screen), width, found.deviation(target))
+    return Blur(width * _pixel(screen), width, found.deviation(target), screen.plane.unit)
 
 
 @dataclass(frozen=True)
@@ -294,14 +295,15 @@ class FinestDetail:
     distance l before it.  On a target at L' it is D L' / L.  The limit by the net of control points is not included.
     """
 
-    width: float  # mm; w
-    source_image: float  # mm; D
-    pixel: float  # mm; p
+    width: float  # w, in `unit`
+    source_image: float  # D, in `unit`
+    pixel: float  # p, in `unit`
     distance: float  # mm; L
     nearer_distance: float | None  # mm; L' of a nearer target that a lens can light with the same picture; None: no L'
-    nearer_width: float | None  # mm; w on that target
+    nearer_width: float | None  # w on that target, in `unit`
     of: str  # the size of the source: its key in the scene, or an assumption
     assumed: bool  # the scene does not state the size
+    unit: str = "mm"  # unit of the receiver
 
 
 def finest_detail(source_image: float, lens: Lens, screen: Screen, of: str, assumed: bool = False) -> FinestDetail:
@@ -313,10 +315,10 @@ def finest_detail(source_image: float, lens: Lens, screen: Screen, of: str, assu
     worth = there < WORTH * here and not lens.behind
     return FinestDetail(
         here, image, pixel, distance, nearer_distance=nearer if worth else None, nearer_width=there if worth else None,
-        of=of, assumed=assumed,
+        of=of, assumed=assumed, unit=screen.plane.unit,
     )  # fmt: skip
 
 
 def _pixel(screen: Screen) -> float:
-    """The side of a pixel (mm), of a square of its area."""
-    return 1 / math.sqrt(math.prod(screen.per_mm))
+    """The side of a pixel, of a square of its area, in the unit of the receiver."""
+    return 1 / math.sqrt(math.prod(screen.per_unit))

@@ -186,9 +186,9 @@ class Reference:
         """
         if not self.lit:
             return None
-        per_mm = math.sqrt(math.prod(self.screen.per_mm))
+        per_unit = math.sqrt(math.prod(self.screen.per_unit))
         wavelength: float = self.channel.source.wavelength  # type: ignore[assignment]  # a channel has one line
-        width = wavelength * 1e-6 * throw(self.lens, self.screen) / math.sqrt(self._lit_area()) * per_mm
+        width = wavelength * 1e-6 * throw(self.lens, self.screen) / math.sqrt(self._lit_area()) * per_unit
         return Change(0.0, difference(blurred(self.picture, AIRY * width), self.picture), width)
 
 

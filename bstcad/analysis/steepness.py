@@ -70,6 +70,6 @@ def _at_corners(picture: np.ndarray, screen: Screen, x: np.ndarray, y: np.ndarra
     """(c, r): the least of the pixels around each of these pixel corners: zero on the rim of the light."""
     around = np.pad(picture[::-1].T, 1)  # x first, y upwards
     least = np.minimum.reduce([around[1:, 1:], around[1:, :-1], around[:-1, 1:], around[:-1, :-1]])
-    per_x, per_y = screen.per_mm
+    per_x, per_y = screen.per_unit
     i, j = np.rint((x - screen.x[0]) * per_x).astype(int), np.rint((y - screen.y[0]) * per_y).astype(int)
     return least[np.ix_(i, j)]

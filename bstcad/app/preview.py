@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from bstcad import pipeline
-from bstcad.analysis.light import blur
+from bstcad.analysis.light import Blur, blur
 from bstcad.analysis.shape import describe
 from bstcad.folder import Made
 from bstcad.optics.goal import Goal
@@ -71,7 +71,7 @@ class Preview:
     pictures: tuple[tuple[np.ndarray, np.ndarray], ...]  # of each target (wanted, irradiance), both (rows, columns)
     flux: dict[str, float]  # the ledger of the light; its lines sum to 1
     shape: dict[str, float | None]  # of the lens, by the keys of report.json
-    source_images: tuple[float | None, ...]  # mm; width of the source's image on each target; None of a point
+    source_images: tuple[Blur | None, ...]  # the source's image on each target; None of a point
     lit: float  # share of the back, up to its rim, through which light of one point of the source passes
     remarks: tuple[str, ...]  # on the scene, and on light that cannot get where it is wanted
     seconds: float = math.nan
@@ -142,7 +142,7 @@ def _lit(scene: Scene, made: Made) -> Preview:
     images = [blur(channels, lens, target.screen, target.irradiance(), n=IMAGE_PLACES) for target in scene.targets]
     return Preview(
         scene, lens, tuple(pictures), flux=ledger, shape=describe(lens, SHAPE),
-        source_images=tuple(each and each.width for each in images), lit=_lit_share(scene, lens), remarks=(),
+        source_images=tuple(images), lit=_lit_share(scene, lens), remarks=(),
     )  # fmt: skip
 
 

@@ -34,7 +34,7 @@ def of_preview(found: Preview) -> dict[str, Any]:
         {
             "key": key, "rrmsd": number(value), "wanted": data_url(view.picture(tones(wanted, wanted))),
             "light": data_url(view.picture(tones(light, wanted))), "seen": view.words,
-            "pixels": list(light.shape[::-1]), "source_image": image and quantity(image, "mm"),
+            "pixels": list(light.shape[::-1]), "source_image": image and quantity(image.width, image.unit),
         }
         for key, view, value, (wanted, light, image) in zip(
             found.scene.target_keys, views, found.rrmsds, seen, strict=True

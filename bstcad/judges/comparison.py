@@ -181,7 +181,7 @@ def compare(
         on_target_ours=on_target_ours,
         heights_off=traced.error.height,
         slopes_off=traced.error.slope,
-        moved_by=traced.error.shift(lens, raster) * max(raster.per_mm),
+        moved_by=traced.error.shift(lens, raster) * max(raster.per_unit),
         seconds=seconds,
     )
     return Compared(outcome, checks, target, ours.picture, theirs=theirs)

@@ -118,7 +118,7 @@ def _rendered(scene: Any, screen: Screen, photons: float, seed: tuple[int, ...])
     spp = max(1, round(photons / pixels / passes))
     numbers = np.random.SeedSequence([abs(part) for part in seed]).generate_state(passes)
     mean = sum(np.array(mitsuba.render(scene, spp=spp, seed=int(n)), dtype=float) for n in numbers) / passes
-    per_x, per_y = screen.per_mm
+    per_x, per_y = screen.per_unit
     flux = mean.reshape(*screen.shape, -1)[..., 0] * (math.pi / WHITE / (per_x * per_y))
     return flux[:, ::-1], passes * spp * pixels  # looking along +z with y up, x grows to the left
 
@@ -149,7 +149,7 @@ def _ply(mesh: Trimesh, path: Path) -> Entry:
 
 def _fine_enough(face: Face, aperture: Outline, lens: Lens, screen: Screen, up: bool) -> tuple[Trimesh, FaceError]:
     """A face in the coarsest mesh that moves no light by more than ENOUGH of a pixel, or in the finest."""
-    pixel = 1 / max(screen.per_mm)
+    pixel = 1 / max(screen.per_unit)
     for parts in PARTS:
         mesh, error = faces.face_mesh(face, aperture, parts, up)
         if error.shift(lens, screen) <= ENOUGH * pixel or 4 * len(mesh.vertices) > MOST:

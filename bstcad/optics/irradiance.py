@@ -29,7 +29,7 @@ class Screen:
     """A rectangle of a level or tilted plane, or of another receiver, divided into columns x rows of pixels."""
 
     z: float  # mm; of a tilted screen at its middle
-    x: tuple[float, float]  # mm, on the plane; in the unit of the receiver
+    x: tuple[float, float]  # in the unit of the receiver, of planes mm
     y: tuple[float, float]  # the same
     pixels: int | tuple[int, int]  # along both sides, or (columns, rows)
     tilt: tuple[float, float] | None = None  # about x, then about y (degrees; receivers.TiltedPlane); None: level
@@ -81,25 +81,25 @@ class Screen:
         return self.rows, self.columns
 
     @property
-    def per_mm(self) -> tuple[float, float]:
-        """Columns per mm along x, rows per mm along y."""
+    def per_unit(self) -> tuple[float, float]:
+        """Columns along x and rows along y in a unit of the receiver."""
         return self.columns / (self.x[1] - self.x[0]), self.rows / (self.y[1] - self.y[0])
 
     def pixel(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """(column, row) of (x, y) in mm, as real numbers: pixel i reaches from i to i + 1."""
-        per_x, per_y = self.per_mm
+        """(column, row) of (x, y), as real numbers: pixel i reaches from i to i + 1."""
+        per_x, per_y = self.per_unit
         return (x - self.x[0]) * per_x, (self.y[1] - y) * per_y
 
     def pixels_of(self, position: Tensor) -> Tensor:
         """(2, …) the same of positions (2, …), in two passes over them."""
         aside = (2, *[1] * (position.ndim - 1))
-        per_x, per_y = self.per_mm
+        per_x, per_y = self.per_unit
         corner = torch.tensor((self.x[0], self.y[1]), dtype=position.dtype, device=position.device).view(aside)
-        per_mm = torch.tensor((per_x, -per_y), dtype=position.dtype, device=position.device).view(aside)
-        return (position - corner).mul_(per_mm)
+        per_unit = torch.tensor((per_x, -per_y), dtype=position.dtype, device=position.device).view(aside)
+        return (position - corner).mul_(per_unit)
 
     def contains(self, x: Tensor, y: Tensor) -> Tensor:
-        """True where (x, y) in mm is on the screen."""
+        """True where (x, y) is on the screen."""
         return (x >= self.x[0]) & (x <= self.x[1]) & (y >= self.y[0]) & (y <= self.y[1])
 
 
@@ -120,7 +120,7 @@ def collect(rays: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
     """
     flux = landed_flux(rays)
     if (fast := ops.kernel("irradiance.collect", rays.position, flux)) and not flux.requires_grad:
-        (left, _), (_, top), (per_x, per_y) = screen.x, screen.y, screen.per_mm
+        (left, _), (_, top), (per_x, per_y) = screen.x, screen.y, screen.per_unit
         position = rays.position.reshape(2, -1).contiguous()
         return fast(position, flux.reshape(-1).contiguous(), (left, per_x, top, per_y), screen.shape)
     return collect_plain(rays.position, flux, screen)

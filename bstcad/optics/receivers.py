@@ -37,6 +37,10 @@ class Receiver(ABC):
         """The names of its axes, with their unit."""
         return tuple(f"{name} ({self.unit})" for name in self.names)
 
+    def where(self, origin: float = 0.0) -> str:
+        """Return its place in words, for every sheet, page and sentence; z is counted from `origin` (mm)."""
+        return f"z = {round(self.throw(origin), 3) + 0.0:.10g} mm"
+
     @property
     def frame(self) -> tuple[Vector, Vector, Vector] | None:
         """e_x, e_y and n of a plane, of one that no kernel knows, too; None: it is none."""
@@ -128,6 +132,10 @@ class Moved(Receiver):
     def names(self) -> tuple[str, str]:
         """The names of the axes of the receiver at rest."""
         return self.rest.names
+
+    def where(self, origin: float = 0.0) -> str:
+        """Return the place of the receiver at rest in words."""
+        return self.rest.where(origin)
 
     @property
     def middle(self) -> Vector:

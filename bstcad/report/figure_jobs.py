@@ -352,8 +352,8 @@ def light_path_of(
 def _sizes(screens: Sequence[Screen]) -> str:
     """How large the targets are, and where they lie."""
     told = (
-        f"{number(x[1] - x[0])} × {number(y[1] - y[0])} {screen.plane.unit} at z = {number(screen.plane.throw(0.0))} mm"
-        for screen, x, y in ((screen, screen.x, screen.y) for screen in screens)
+        f"{number(x[1] - x[0])} × {number(y[1] - y[0])} {plane.unit} at {plane.where()}"
+        for plane, x, y in ((screen.plane, screen.x, screen.y) for screen in screens)
     )
     return f"Target{'s' * (len(screens) > 1)} {', '.join(told)}"
 

@@ -26,7 +26,7 @@ class GoalFigures:
     """The light on a target."""
 
     key: str  # target, or target[0], target[1], … of several
-    z: float  # place of its plane (mm)
+    where: str  # place of its receiver, in words
     weight: Size  # weight of its squared error among all goals
     rrmsd: Rrmsd  # RRMSD by the flux into each pixel
     rrmsd_standard_error: Annotated[float, Field(ge=0, le=1e3)]  # standard error of rrmsd, by independent sets of rays
@@ -35,6 +35,7 @@ class GoalFigures:
     efficiency: Share  # flux on the target over flux that leaves the back face
     leak: Share | None  # part of the light on the target that is on its dark pixels; None: it has none
     contrast: Size | None  # mean irradiance of the lit pixels over that of the dark ones; None: or without leak
+    unit: str = "mm"  # unit of x and y on its receiver
 
     @property
     def resolved(self) -> bool:
@@ -83,7 +84,7 @@ def figures_of(goals: Sequence[Goal], lights: Sequence[Light]) -> tuple[GoalFigu
     return tuple(
         GoalFigures(
             goal.key,
-            goal.receiver.z,
+            goal.receiver.plane.where(),
             goal.weight,
             light.rrmsd,
             rrmsd_standard_error=light.standard_error,
@@ -92,6 +93,7 @@ def figures_of(goals: Sequence[Goal], lights: Sequence[Light]) -> tuple[GoalFigu
             efficiency=light.efficiency,
             leak=light.leak and light.leak.share,
             contrast=light.leak and light.leak.contrast,
+            unit=goal.receiver.plane.unit,
         )
         for goal, light in zip(goals, lights, strict=True)
     )

@@ -33,6 +33,7 @@ from bstcad.optics.goal import Goal, worst
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.reach import unreached
+from bstcad.optics.receivers import LevelPlane
 from bstcad.report.goal_figures import GoalFigures, Rrmsd, Share, Size, WavefrontFigures, figures_of, flat_tops
 from bstcad.report.light_figures import rrmsd
 from bstcad.report.prescription import Order, prescription
@@ -206,7 +207,8 @@ class Contents:
     # the end of the convergence curve, as analysis.cost.Ending has it; None: there is no curve
     convergence: Mapping[str, Size | None] | None = None
     # where the error sits: parts [{name, error, pixels}] (parts of the squared error, and of the pixels), octaves
-    # [{frequency (cycles a pixel), period (mm), error}], outside (part of the light beside the target)
+    # [{frequency (cycles a pixel), period (in the target's unit), error}],
+    # outside (part of the light beside the target)
     remaining_error: Mapping[str, Any] | None = None
     # the bounds on the tailored faces: asked {key of [lens]: value}, at {key: part of the faces that is at the bound;
     # None: of a thickness that is}, tightest {key: place, in words}, both or front (true where not the back alone is
@@ -376,7 +378,7 @@ def remarks(report: Contents, scene: Scene, goals: Sequence[Goal], irradiances: 
     pairs = list(zip(goals, irradiances, strict=True))
     return written(
         "remarks.txt.j2", "remarks", report=report, scene=scene, allowed=allowed, names=LEFT_OUT,
-        unlit={goal.words: unlit(goal.picture, found, x=goal.receiver.x, y=goal.receiver.y) for goal, found in pairs},
+        unlit={goal.words: unlit(goal.picture, found, goal.receiver) for goal, found in pairs},
         lifted={goal.words: lifted(goal.picture, found) for goal, found in pairs},
     )  # fmt: skip
 
@@ -419,7 +421,7 @@ def read_as(kind: type[Record], path: Path, remedy: str) -> Record:
 def of_json(data: bytes | str, kind: type[Record] = Contents) -> Record:
     """The record of this kind in JSON; ValueError names the first entry that does not fit."""
     try:
-        found = _adapter(kind).validate_json(_renewed(data) if kind is Contents else data)
+        found = _adapter(kind).validate_json(_renewed(data))
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False, include_context=False)[0]
         raise ValueError(": ".join(filter(None, (".".join(map(str, first["loc"])), first["msg"])))) from None
@@ -429,17 +431,23 @@ def of_json(data: bytes | str, kind: type[Record] = Contents) -> Record:
 
 
 def _renewed(data: bytes | str) -> bytes | str:
-    """A report.json with the keys of today: one of before may have estimates of what limits the design, and may tell
-    the first of several targets apart.
+    """A report.json or tolerance.json with the keys of today.
+
+    One of before may have estimates of what limits the design, may tell the first of several targets apart, and has z
+    for the places of targets.
     """
     try:
         facts = from_json(data)
         facts.pop("limits", None)
-        if "goals" in facts:
+        for goal in (*facts.get("goals", ()), *(facts.get("targets") or ())):
+            if "z" in goal:
+                goal["where"] = LevelPlane(goal.pop("z")).where()
+        if "goals" in facts or "prescription" not in facts:
             return to_json(facts)
         prescribed, measured = facts["prescription"], facts.get("measured") or {}
         prescribed["targets"] = [prescribed.pop("target"), *prescribed.pop("further_targets", ())]
-        alone = {"key": "target", "z": prescribed["targets"][0]["z"], "weight": 1.0} | {
+        place = LevelPlane(prescribed["targets"][0]["z"]).where()
+        alone = {"key": "target", "where": place, "weight": 1.0} | {
             name: facts.get(key) for key, name in OF_WORST.items()
         }
         goals = facts["goals"] = facts.pop("targets", [alone])

@@ -48,8 +48,8 @@ ESTIMATED = (
     "picture becomes. ?: not known."
 )
 IMAGE = (
-    "Through each place of the {optic} the source throws an image of itself, {width} mm ({pixels} pixels) wide on the "
-    "target. The target blurred by this image has an RRMSD of {rrmsd}; a {optic} comes below that as far as it "
+    "Through each place of the {optic} the source throws an image of itself, {width} {unit} ({pixels} pixels) wide on "
+    "the target. The target blurred by this image has an RRMSD of {rrmsd}; a {optic} comes below that as far as it "
     "sharpens coarser detail beforehand."
 )
 UNREACHABLE = (
@@ -278,8 +278,8 @@ def _of_target(plan: Mapping[str, Any], of: str, optic: str) -> Iterator[Rendera
             yield Text(TURNED.format(**beyond))
         yield Text()
     if plan["blur"] is not None:
-        image = {key: number(value) for key, value in plan["blur"].items()}
-        yield Text(IMAGE.format(**image, optic=optic))
+        image = {key: number(plan["blur"][key]) for key in ("width", "pixels", "rrmsd")}
+        yield Text(IMAGE.format(**image, unit=plan["blur"]["unit"], optic=optic))
         yield Text()
 
 

@@ -90,7 +90,7 @@ class TargetStudy:
     """One of several targets by itself, in the same trials."""
 
     key: str  # by which sentences call it: target[0], target[1], …
-    z: float  # mm, of its middle
+    where: str  # place of its receiver, in words
     rrmsd: Rrmsd  # of the design there
     passed: Annotated[Yield, Field(alias="yield")]  # lenses that keep to the limit on this target
     passed_full: Annotated[Yield, Field(alias="yield_full")]  # of those that were traced in full

@@ -215,6 +215,6 @@ def diagnosis(
     }  # fmt: skip
     return {
         "convergence": None if curve is None else asdict(curve),
-        "remaining_error": remaining(picture, target, scene.target.screen.per_mm) | {"outside": 1 - efficiency},
+        "remaining_error": remaining(picture, target, scene.target.screen.per_unit) | {"outside": 1 - efficiency},
         "bounds": bounds if bounds["asked"] else None,
     }

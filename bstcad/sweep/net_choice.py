@@ -181,7 +181,7 @@ def moved(scene: Scene) -> float:
         return math.inf
     turn = 2.0 if scene.lens.back.reflect else scene.index - 1
     throw = abs(target.z - scene.lens.back.z) * turn / radius
-    return throw * math.sqrt(math.prod(scene.lens.cells)) * math.sqrt(math.prod(target.screen.per_mm))
+    return throw * math.sqrt(math.prod(scene.lens.cells)) * math.sqrt(math.prod(target.screen.per_unit))
 
 
 def nets(scene: Scene) -> list[Sides]:

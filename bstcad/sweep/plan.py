@@ -45,8 +45,8 @@ def plan(
 
     unreachable: what light cannot reach, as optics.reach.unreached has it; None: it reaches all that is to be lit.
 
-    blur: width (mm, and pixels) of the image that a source of some size throws through the coarse lens, and the RRMSD
-    of the target convolved with this image; None: the source has no size.
+    blur: width (in its unit, and in pixels) of the image that a source of some size throws through the coarse lens, and
+    the RRMSD of the target convolved with this image; None: the source has no size.
 
     caveat: what the lens of the estimates lacks of the scene's, a sentence; only there if it lacks anything.
 
@@ -82,13 +82,13 @@ def verdict(scene: Scene, found: Mapping[str, Any]) -> dict[str, str] | None:
     targets = zip(scene.targets, found["goals"], strict=True)
     images = [(each["blur"]["rrmsd"], each["blur"]["width"], target) for target, each in targets if each["blur"]]
     blurred, width, target = max(images, key=lambda image: image[0], default=(0.0, 0.0, scene.target))
-    wide = max(high - low for low, high in (target.screen.x, target.screen.y))
+    wide, unit = max(high - low for low, high in (target.screen.x, target.screen.y)), target.screen.plane.unit
     least, most = (number(two_digits(value)) for value in (UNDONE * blurred, blurred))
     if UNDONE * blurred > allowed:
         permits = "" if asked is None else f", where {number(asked)} is allowed"
         sentence = (
             f"The picture will be blurred: through each place of the {scene.optic} the source throws an image of "
-            f"itself {about(width, 'mm')} wide on the target, which is {quantity(wide, 'mm')} wide. The RRMSD will be "
+            f"itself {about(width, unit)} wide on the target, which is {quantity(wide, unit)} wide. The RRMSD will be "
             f"{least} to {most} whatever the {scene.optic}{permits}. Take a smaller source, "
             f"one further before the {scene.optic}, a target nearer behind it, or a coarser picture."
         )
@@ -98,7 +98,7 @@ def verdict(scene: Scene, found: Mapping[str, Any]) -> dict[str, str] | None:
     if found["predicted"] is None:
         text = f"No RRMSD is predicted: {found.get('not_predicted')}."
         if blurred > NOTABLE:
-            text += f" The source's image, {about(width, 'mm')} wide on the target, makes one of {least} to {most}."
+            text += f" The source's image, {about(width, unit)} wide on the target, makes one of {least} to {most}."
         return {"kind": "not predicted", "sentence": text}
     quality = scene.tailoring.quality if scene.tailoring.quality in QUALITIES else "standard"
     (low, likely, high), (_, time, _) = (found["predicted"][quality][key] for key in ("rrmsd", "seconds"))
@@ -115,7 +115,7 @@ def verdict(scene: Scene, found: Mapping[str, Any]) -> dict[str, str] | None:
         kind, words = "open", f"{number(asked)} is allowed, and {about(low)} to {about(high)} may come out"
     if COARSE * width > wide:
         words += (
-            f". The source's image on the target is {about(width, 'mm')} wide, and the target {quantity(wide, 'mm')}: "
+            f". The source's image on the target is {about(width, unit)} wide, and the target {quantity(wide, unit)}: "
             "finer detail is lost"
         )
     return {"kind": kind, "sentence": f"{text}; {words}."}

@@ -110,7 +110,7 @@ def blurred(light: Tensor, blur: Blur) -> Tensor:
 
 def bordered(screen: Screen, border: int) -> Screen:
     """The screen with so many pixels more on each side."""
-    per_x, per_y = screen.per_mm
+    per_x, per_y = screen.per_unit
     x, y = screen.x, screen.y
     return replace(
         screen, x=(x[0] - border / per_x, x[1] + border / per_x), y=(y[0] - border / per_y, y[1] + border / per_y),

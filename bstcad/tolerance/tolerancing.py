@@ -147,10 +147,10 @@ def _record(
 
 def _of_target(key: str, target: Target, study: Study) -> TargetStudy:
     return TargetStudy(
-        key=key, z=target.z, rrmsd=study.rrmsd, passed=study.share(study.linear), passed_full=study.share(study.full),
-        passed_adjusted=study.share(study.adjusted), rrmsd_trials=_percentiles(study.linear),
-        rrmsd_full=_percentiles(study.full), rrmsd_adjusted=_percentiles(study.adjusted),
-        model_off=_disagreement(study), sensitivities=study.sensitivities,
+        key=key, where=target.screen.plane.where(), rrmsd=study.rrmsd, passed=study.share(study.linear),
+        passed_full=study.share(study.full), passed_adjusted=study.share(study.adjusted),
+        rrmsd_trials=_percentiles(study.linear), rrmsd_full=_percentiles(study.full),
+        rrmsd_adjusted=_percentiles(study.adjusted), model_off=_disagreement(study), sensitivities=study.sensitivities,
     )  # fmt: skip
 
 

@@ -141,7 +141,7 @@ def test_mitsuba_traces_the_light_of_ray_tubes(case):
 )
 def test_coarse_pixels_are_square_and_keep_the_light(screen):
     raster = comparison.coarse(screen)
-    across, up = raster.per_mm
+    across, up = raster.per_unit
     assert across == pytest.approx(up, rel=1e-3) and max(raster.shape) <= comparison.PIXELS
     picture = np.random.default_rng(0).random(screen.shape)
     coarse = comparison.resampled(picture, raster.shape)

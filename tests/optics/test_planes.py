@@ -147,7 +147,7 @@ def test_irradiance_falls_as_the_cosine_and_the_spot_grows(tilt):
     cosine = screen.plane.axes[2][2]
     assert cosine == pytest.approx(math.prod(math.cos(math.radians(t)) for t in tilt))
     for found in (picture(beam, plate, screen, 64), launch_tubes(beam, plate, 64).picture(plate, screen)):
-        irradiance = found * screen.per_mm[0] * screen.per_mm[1]
+        irradiance = found * screen.per_unit[0] * screen.per_unit[1]
         assert float(found.sum()) == pytest.approx(1, abs=3e-9)  # the rim of the sheet is 1e-9 inside
         lit = irradiance[28:36, 28:36]
         assert torch.allclose(lit, torch.full_like(lit, cosine / 64.0), rtol=1e-9, atol=0)
@@ -157,7 +157,7 @@ def test_irradiance_falls_as_the_cosine_and_the_spot_grows(tilt):
         assert corner[turned, 0].item() == pytest.approx(4.0 / cosine) and corner[
             1 - turned, 0
         ].item() == pytest.approx(4.0)
-        area = (found.sum(turned) > 1e-9).sum() / screen.per_mm[0]
+        area = (found.sum(turned) > 1e-9).sum() / screen.per_unit[0]
         assert float(area) == pytest.approx(8.0 / cosine, abs=1.1)  # two pixels
 
 

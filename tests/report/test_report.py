@@ -30,8 +30,9 @@ REPORT = {
     "name": "thu", "title": "Letters", "verdict": "passed", "passed": True, "rrmsd": 0.0283712, "rrmsd_tent": 0.0241,
     "rrmsd_noise": 0.002, "light_on_target": 0.97, "efficiency": 0.99931,
     "goals": [{
-        "key": "target", "z": 500.0, "weight": 1.0, "rrmsd": 0.0283712, "rrmsd_standard_error": 0.002,
+        "key": "target", "where": "z = 500 mm", "weight": 1.0, "rrmsd": 0.0283712, "rrmsd_standard_error": 0.002,
         "rrmsd_tent": 0.0241, "light_on_target": 0.97, "efficiency": 0.99931, "leak": None, "contrast": None,
+        "unit": "mm",
     }],
     "flux": {"on target": 0.97, "off target": 0.01, "missed the lens": 0.02},
     "prescription": {"index": 1.49},

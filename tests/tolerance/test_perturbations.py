@@ -59,7 +59,7 @@ def test_what_scales_everything_changes_nothing(setup, picture):
 
 
 def test_a_screen_moved_by_a_pixel_moves_the_picture_by_one(setup, picture):
-    pitch = 1 / setup.screen.per_mm[0]
+    pitch = 1 / setup.screen.per_unit[0]
     moved = kinds(setup)["screen.decentre_x"].apply(setup, pitch).picture(TUBES)
     assert np.abs(moved[:, :-1] - picture[:, 1:]).max() < 1e-9 * picture.max()
 

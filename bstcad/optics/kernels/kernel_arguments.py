@@ -256,4 +256,4 @@ def cells(window: Rectangle, n: int, seed: int) -> Cells:
 
 def pixels(screen: Screen) -> Pixels:
     """The screen as numbers."""
-    return Pixels(*floats([*screen.x, *screen.y, *screen.per_mm]))
+    return Pixels(*floats([*screen.x, *screen.y, *screen.per_unit]))
