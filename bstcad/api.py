@@ -55,10 +55,10 @@ def design(
 ) -> Design:  # fmt: skip
     """The lens for a scene, or for the scene file of that path.  SceneError names the fault of a scene.
 
-    progress: a bar, in a terminal or a notebook; elsewhere there is none.  device: "auto" (which is "cpu"), "cpu" or
-    "cuda": a GPU, on which nobody has measured yet that it is right and faster.  merit: a function of the picture and
-    the target, tensors (rows, columns) of the light that leaves the lens, whose value stage 2 makes least in place of
-    RRMSD²; it has to be of that size, and differentiable.  What the proof states stays RRMSD.
+    progress: a bar, in a terminal or a notebook; elsewhere there is none.  device: "auto", "cpu" or "cuda" (see
+    pipeline.device_for).  merit: a function of the picture and the target, tensors (rows, columns) of the light that
+    leaves the lens, whose value stage 2 makes least in place of RRMSD²; it has to be of that size, and differentiable.
+    What the proof states stays RRMSD.
 
     On Linux up to 2 GB of freed memory stay with the process for its next design (bstcad.runs.processes.keep_freed).
     """

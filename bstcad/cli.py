@@ -48,7 +48,7 @@ SITES = (
     Path(__file__).parent / "site",
     Path(__file__).parent.parent / "docs" / "_build" / "html",
 )  # of a wheel, of sources
-EXPORTS = "sag, points, zemax, turning, dxf, svg, preview, datasheet"  # bstcad.report.exports.ALL, which loads torch
+EXPORTS = ", ".join(files.EXPORTS)
 NO_MEMORY = (  # Python, torch, the system and the loader of libraries each say it in their own way
     "not enough memory", "out of memory", "bad_alloc", "cannot allocate memory", "can't allocate memory",
     "failed to map segment", "can't start new thread",

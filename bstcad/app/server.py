@@ -63,7 +63,6 @@ RRMSD = (
     "RRMSD states how far the light is from the picture: the root mean square of the difference, over that of the "
     "picture. 0 is the picture itself."
 )
-CARDS = {"lamp": "a small lamp or LED", "led": ""}  # words of lights on the first page; "": it has no card of its own
 KEYS_PAGE = "reference/scene-keys"  # page of the documentation that is made of the schema
 MOST_SOUND = 31  # scenes, besides the latest, whose latest valid text is kept
 SLOWEST = 1  # seconds that open requests have when the server ends
@@ -182,10 +181,8 @@ class Workbench:
 
     def start_page(self, request: Request) -> Response:
         """Where a picture is dropped, and the list of scenes and designs."""
-        lights = [{"name": name, "of": CARDS.get(name, light.of)} for name, light in new_scene.LIGHTS.items()]
-        lights = [light for light in lights if light["of"]]
         return self._page(
-            "start.html.j2", title="Workbench", lights=lights, samples=SAMPLES, templates=new_scene.templates(),
+            "start.html.j2", title="Workbench", samples=SAMPLES, templates=new_scene.templates(),
             scenes=self.workspace.scene_names(), designs=[*self._designs()],
         )  # fmt: skip
 

@@ -1,9 +1,10 @@
 """The functions of optics that have a kernel, by device: the one place where a plain form gives way to a faster one.
 
 A kernel has the values of its plain form to rounding, and takes the same tensors: the caller asks for one by name and
-runs the plain form where there is none.  A kernel for a GPU is one more entry of a row; until there is one, a GPU runs
-plain torch.  Stage 1's transport and the checks of a net's shape (spline.largest_bending) work on arrays of numpy, on
-the CPU whatever the device.
+runs the plain form where there is none, as on a GPU.  A kernel for a GPU is one more entry of a row and serves this one
+function.  Whatever the device, the blur by the image of a source, stage 1's transport and the checks of a net's shape
+(spline.largest_bending) work on arrays of numpy, on the CPU; the cosine transform of stage 2 is scipy's on the CPU and
+a product of matrices elsewhere.
 """
 
 from __future__ import annotations

@@ -86,8 +86,7 @@ class Surface(ABC):
     @property
     def unknown(self) -> ValueError:
         """The refusal of a surface that is neither a net nor a plane, a sphere or a conic."""
-        known = "neither a net nor a plane, a sphere or a conic"
-        return ValueError(f"the {self.kind} is {known}; give it by scene.changed, which fits a net to it")
+        return ValueError(f"the {self.kind} has no conic constant; give it by scene.changed, which fits a net to it")
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Self:
         """The same surface with its tensors in another precision or on another device; numbers stay numbers."""

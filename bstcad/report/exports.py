@@ -31,7 +31,6 @@ from bstcad.scene.mount import Mount
 
 SIDECAR = ".txt"  # ending of a file that states how far the light moves by the interpolation of another
 SHEET = "datasheet"  # drawn by the caller, from the report beside the lens
-ALL = ("sag", "points", "zemax", "turning", "dxf", "svg", "preview", SHEET)
 
 OUTLINE, RIM, FLANGE, SCREWS, HOLES = "OUTLINE", "RIM", "FLANGE", "SCREW_HOLES", "HOLES"
 CENTRES, TEXT = "CENTRES", "TEXT"
@@ -79,8 +78,8 @@ def export(
     ValueError names the kind or number that is not possible.
     """
     for kind in kinds:
-        if kind not in ALL:
-            raise ValueError(f"'{kind}' is nothing that can be exported; give one of {', '.join(ALL)}")
+        if kind not in files.EXPORTS:
+            raise ValueError(f"'{kind}' is nothing that can be exported; give one of {', '.join(files.EXPORTS)}")
     if points is not None and not FEWEST <= points <= MOST:
         raise ValueError(f"{points} points a side are not possible; give {FEWEST} to {MOST}")
     lens, written, notes = lens.plain(), [], []

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 LONGEST = 600  # characters of a sentence that quotes a file
 PART = ("deviation.npz",)  # a file that only the folder of a made part has
 OURS = ("report.json", "lens.step", "scene.toml")  # files that only a design's folder has
+# Kinds of files for a shop, as `bstcad export --as` and the scene's output.export name them.
+EXPORTS = ("sag", "points", "zemax", "turning", "dxf", "svg", "preview", "datasheet")
 LARGEST = 600_000_000  # bytes of an archive: a net of 2049 x 2049 and pictures of 4096 x 4096
 HEADER = 4096  # bytes of an array's header, and to spare
 

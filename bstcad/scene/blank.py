@@ -30,14 +30,14 @@ from bstcad.step_text.placement import own_frame
 if TYPE_CHECKING:  # which loads numba
     from bstcad.optics.bspline import BSplineSurface
 
-# (1 + k) c² r² of a conic at the rim: at most, where a sphere that stands upright has 1, and at least (nearly a cone).
+# Largest and least (1 + k) c² r² of a conic at the rim: a sphere that stands upright has 1; below the least, a cone.
 UPRIGHT, CONE = 0.85, -7.0
 STEEP_NET = 60.0  # degrees; steepest slope at the rim of a surface for which a net stands
-STEEPEST = 80.0  # degrees, of a front with an outline of its own at its rim: what a height over a plane carries well
-FLATTEST = 1e-3  # mm; of such a front the least sag at its rim, by which its edge is one
-LEAST_BESIDE = 1e-2  # mm; between the outline of a front and that of the lens
+STEEPEST = 80.0  # degrees; steepest slope at the rim of a front with an outline of its own, a height over a plane
+FLATTEST = 1e-3  # mm; least sag of such a front at its rim, by which its edge is one
+LEAST_BESIDE = 1e-2  # mm; least distance between the outline of a front and that of the lens
 CONIC_CONSTANTS = (-1e3, 1e3)
-INDICES = (1.01, 5.0)  # of refraction
+INDICES = (1.01, 5.0)  # range of the refractive index
 BOUNDS = ("tool_radius", "max_slope", "max_thickness", "edge_thickness")  # the keys of LensBlank that bound the back
 
 NET_FILE = "front.npz"  # the copy of a given net beside a design
@@ -46,10 +46,10 @@ LEVEL = 1e-9  # sine of the angle between a side of a net and an axis of the fil
 UNIFORM = 1e-9  # mm; a net further from uniform in x and y is not one of ours
 ROUNDING = 1e-12  # mm; a net whose vertex is so near to zero is measured from there already
 LARGEST_NET = 2049  # control points a side
-FITTED = 1e-6  # mm; how far the net that stands for a surface of one's own may lie from it, as accept.form has it
+FITTED = 1e-6  # mm; largest distance of a net from the surface for which it stands: a toroid, or one of one's own
 FITS = (33, 65, 129, 257, 513, 1025)  # control points a side of such a net, tried in turn
 OBLONG = 1.5  # a cell of the net longer than so many times its width is doubted
-FEWEST_ROUND = 6  # of a round lens: with 5 its net, two spans past the rim each way, has no extent
+FEWEST_ROUND = 6  # control points a side; a net of 5 has no two spans to reach past the rim of a round lens
 
 Outlined = Annotated[Rectangle | Circle, Field(discriminator="shape")]
 

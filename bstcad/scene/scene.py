@@ -33,6 +33,7 @@ from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
 from bstcad.optics.sides import Sides, both
 from bstcad.optics.wavefront import ALONG, PlaneWave, SphericalWave, Wave, ZernikeWave
+from bstcad.runs import files
 from bstcad.scene import effects, elements, lighting, mount, picture, scene_file
 from bstcad.scene.blank import LensBlank, as_front, net_extent
 from bstcad.scene.dotted_keys import OUTLINES, override, tables_at
@@ -86,7 +87,7 @@ class Output(Record):
         None
     )
     export: Annotated[
-        tuple[Literal["sag", "points", "zemax", "turning", "dxf", "svg", "preview", "datasheet"], ...],
+        tuple[Literal[files.EXPORTS], ...],
         Key("Files for the shop.", example=["zemax", "dxf"]),
     ] = ()
 
