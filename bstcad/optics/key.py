@@ -21,6 +21,7 @@ class Key:
     most: float | None = None
     example: Any = None  # value of a key that every scene has to give
     remedy: str = ""  # advice on a number out of range; "": choose one in between
+    of_light: bool = False  # is it a limit of the light, which a verdict asks for?
 
     def in_range(self, value: Any) -> Any:
         """The value of a field, if all of its numbers are in the range; else ValueError, a sentence."""

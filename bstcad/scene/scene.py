@@ -63,20 +63,23 @@ FINEST = 4 * SINGLE  # of the largest coordinate: no tolerance of a mesh is fine
 class Accept(Record):
     """Limits of the checks in the report; None: the check only states its value."""
 
-    rrmsd: Annotated[float | None, Key("Greatest RRMSD of the irradiance.", "", 1e-6, 10.0)] = None
+    rrmsd: Annotated[float | None, Key("Greatest RRMSD of the irradiance.", "", 1e-6, 10.0, of_light=True)] = None
     form: Annotated[float, Key("Greatest distance of lens.step from the tailored surface.", "mm", 1e-12, 1.0)] = 1e-6
     efficiency: Annotated[
-        float | None, Key("Least share on the target of the light that leaves the back.", "", 0.0, 1.0, example=0.9)
+        float | None,
+        Key("Least share on the target of the light that leaves the back.", "", 0.0, 1.0, example=0.9, of_light=True),
     ] = None
     light_on_target: Annotated[
-        float | None, Key("Least share on the target of the light in the lens.", "", 0.0, 1.0)
+        float | None, Key("Least share on the target of the light in the lens.", "", 0.0, 1.0, of_light=True)
     ] = None
-    leak: Annotated[float | None, Key("Greatest share of the light where the target is dark.", "", 0.0, 1.0)] = None
+    leak: Annotated[
+        float | None, Key("Greatest share of the light where the target is dark.", "", 0.0, 1.0, of_light=True)
+    ] = None
     decentre: Annotated[
         float | None, Key("Greatest decentre of a measured part in its points' frame.", "mm", 1e-6, 1e3)
     ] = None
     wavefront: Annotated[
-        float | None, Key("Greatest RMS of the wavefront error, in waves.", "", 1e-9, 1e6, example=0.1)
+        float | None, Key("Greatest RMS of the wavefront error, in waves.", "", 1e-9, 1e6, example=0.1, of_light=True)
     ] = None
 
 
@@ -348,9 +351,8 @@ class Scene(Record):
     @property
     def limits_light(self) -> bool:
         """Does the scene set a limit on the light, by [accept] or by tailoring.accuracy?"""
-        accept = self.accept
-        limits = accept.rrmsd, accept.efficiency, accept.light_on_target, accept.leak, accept.wavefront
-        return any(limit is not None for limit in (*limits, self.tailoring.accuracy))
+        marked = (name for name, field in Accept.model_fields.items() if any(key.of_light for key in field.metadata))
+        return any(limit is not None for limit in (*(getattr(self.accept, n) for n in marked), self.tailoring.accuracy))
 
     @property
     def mesh_tolerance(self) -> float:

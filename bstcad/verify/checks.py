@@ -198,7 +198,7 @@ def verify(
         sealed,
         *_facets(mesh, lens, shape["volume"], nominal),
         *map(_picture, nominal.goals, nominal.stored),
-        *(c for _, each, of in goals for c in _because(why, _of_light(each, nominal.accept, meets, of=of))),
+        *(c for _, each, of in goals for c in _of_light(each, nominal.accept, meets, of=of, why=why)),
         *of_wavefront,
         *([] if lens.reflects else [margin]),
         Check.at_most("values that are not finite", stability["non_finite"], 0, id="finite"),
@@ -260,15 +260,6 @@ def _as_made(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> tuple[
         checks.append(Check.at_most(name, losses.on_flange, MAX_ON_FLANGE, where=where, id="flange-light"))
     why = f"the mount leaves {lens.apertures[1].words} of the back and cuts away {100 * losses.cut:.3g} % of the light"
     return lens, checks, why if losses.cut > CUT_EXCUSE else ""
-
-
-def _because(why: str, checks: Sequence[Check]) -> list[Check]:
-    """The checks, and of each of the light's way that failed without saying where, why."""
-    of_light = {"rrmsd", "light-on-target", "efficiency"}
-    return [
-        replace(check, where=why) if not (check.passed or check.where) and check.id in of_light else check
-        for check in checks
-    ]
 
 
 def _aperture(name: str, measured: Outline, designed: Outline) -> Check:
@@ -415,21 +406,24 @@ def _facets(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> l
     ]
 
 
-def _of_light(light: Light, accept: Accept, meets: str = "enters the lens", of: str = "") -> list[Check]:
+def _of_light(
+    light: Light, accept: Accept, meets: str = "enters the lens", of: str = "", why: str = ""
+) -> list[Check]:  # fmt: skip
     """The irradiance through the re-read geometry, by rays, and by ray tubes that share only the trace with them.
 
-    of: which of several targets it falls on, as Goal.suffix has it.
+    of: which of several targets it falls on, as Goal.suffix has it; why: reason for a limit of accept that is not met.
     """
     closure, tubes = abs(sum(light.flux.values()) - 1), light.witness
     off, error = RESOLVED * light.standard_error, f"standard error of that RRMSD, times five{of}"
     on_target, least = f"light on the target, of what {meets}{of}", accept.light_on_target
+    rrmsd = f"RRMSD, box pixels, through the re-read STEP{of}"
     # noise below the RRMSD leaves its figure resolved; noise below its distance from the limit leaves its verdict sure
     noise = None if accept.rrmsd is None else max(light.rrmsd, accept.rrmsd - light.rrmsd)
     checks = [
-        Check.at_most(f"RRMSD, box pixels, through the re-read STEP{of}", light.rrmsd, accept.rrmsd, id="rrmsd"),
+        Check.at_most(rrmsd, light.rrmsd, accept.rrmsd, where=why, id="rrmsd"),
         Check.at_most(error, off, noise, id="noise"),
-        Check.at_least(on_target, light.used, least, id="light-on-target"),
-        Check.at_least(f"efficiency{of}", light.efficiency, accept.efficiency, id="efficiency"),
+        Check.at_least(on_target, light.used, least, where=why, id="light-on-target"),
+        Check.at_least(f"efficiency{of}", light.efficiency, accept.efficiency, where=why, id="efficiency"),
         Check.at_most(f"flux ledger: distance of its sum from 1{of}", closure, 1e-12, id="ledger"),
     ]
     if tubes is not None:

@@ -23,7 +23,7 @@ from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.mount import GLASS, METAL, Box, Part, Round
 from bstcad.scene.picture import Picture
 from bstcad.scene.quality import JUDGE_POINTS, PRESETS, Tailoring, coarse_to_fine
-from bstcad.scene.scene import Scene, load
+from bstcad.scene.scene import Accept, Scene, load
 from bstcad.scene.target import Target
 
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"
@@ -219,6 +219,14 @@ RAMP = np.linspace(0.0, 3.0, 32)[:, None] * np.ones((1, 32))  # dark at the top
 @pytest.fixture(scope="module")
 def thu():
     return load(THU, {"target.pixels": 16})
+
+
+@pytest.mark.parametrize("key", Accept.model_fields)
+def test_each_limit_but_those_of_form_and_place_is_one_of_the_light(thu, key):
+    """By which a verdict knows whether a limit was asked of the light."""
+    free = {name: None for name in Accept.model_fields}
+    asked = thu.model_copy(update={"accept": Accept.model_construct(**free | {key: 0.1})})
+    assert asked.limits_light == (key not in ("form", "decentre"))
 
 
 @pytest.mark.parametrize(("changes", "overrides"), [
