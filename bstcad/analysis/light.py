@@ -109,8 +109,7 @@ def used(source: Emitter, lens: Lens) -> tuple[Outline | None, ...]:
         a, b = source.extent.half_extent
         elements = [source.element(a * u, b * v) for u, v in CORNERS if not (source.extent.is_round and u and v)]
     hits = torch.cat([_hits(element.central, lens) for element in elements], dim=2)
-    solid = slice(len(lens.before), lens.number_of("back") + 1)
-    pairs = zip(hits[solid], lens.interfaces[solid], strict=True)
+    pairs = zip(hits[lens.solid], lens.interfaces[lens.solid], strict=True)
     return tuple(_patch(face, interface.outline) for face, interface in pairs)
 
 
@@ -181,7 +180,7 @@ def mount_losses(lens: Lens, channels: Sequence[Channel], flange: tuple[float, f
         area = window(channel.source, bare)
         x, y = sampling.grid(area, n)
         rays = channel.source.rays(x, y, own.entrance.z, channel.weight * area.area / n**2)
-        solid = slice(len(own.before), own.number_of("back") + 2)  # the light before, in and behind it
+        solid = slice(own.solid.start, own.solid.stop + 1)  # the light before, in and behind it
         whole, through = _at_interfaces(rays, bare)[solid][-1], _at_interfaces(rays, own)[solid]
         out = through[-1]
         uncut += float(whole.flux[whole.alive].sum())

@@ -179,7 +179,7 @@ def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, se
     """The picture on a screen by that many stratified rays, in two halves."""
     n = max(1, round(a_side(channels) * math.sqrt(rays / 2)))
     known = surfaces(lens)
-    halves, count, solid = np.zeros((2, *screen.shape)), 0, slice(len(lens.before), lens.number_of("back") + 1)
+    halves, count = np.zeros((2, *screen.shape)), 0
     sense = (-1) ** sum(interface.law.reverses for interface in lens.behind)
     for half, picture in enumerate(halves):
         for channel, place in zip(channels, places(channels), strict=True):
@@ -191,7 +191,7 @@ def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, se
                 launched += flux.sum()
                 count += len(x)
             picture += channel.weight / max(launched, 1.0) * landed  # cells on a beam's rim count in or out
-    faces_of = zip(known[solid], lens.interfaces[solid], strict=True)
+    faces_of = zip(known[lens.solid], lens.interfaces[lens.solid], strict=True)
     return Traced(halves, count, FaceError.worst(face.error(interface.outline) for face, interface in faces_of))
 
 

@@ -5,19 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.interfaces import Interface, Reflect, Refract
+from bstcad.optics.interfaces import Interface
 from bstcad.optics.outlines import EVERYWHERE, Outline
+from bstcad.optics.passes import LENS, MIRROR, Face, Passes
 from bstcad.optics.rays import Status
 from bstcad.optics.sides import Sides
 from bstcad.optics.surfaces import Surface, sag
-
-Face = Literal["front", "back"]
 
 
 class Dimming(Protocol):
@@ -33,6 +32,7 @@ class Lens:
 
     A lens refracts: light travels along +z, enters through the front and leaves through the back.  A mirror reflects
     at its back: light comes from above, along -z, and leaves along +z; its front is the rear of the plate, and dark.
+    What light does at which face stands in `passes`, and a face that it meets twice is two of the interfaces.
     Whoever follows light walks `interfaces`; whoever searches surfaces goes by `freeform`.
     """
 
@@ -40,12 +40,13 @@ class Lens:
     back: Surface
     outline: Outline  # both faces of the solid end on it
     index: float  # refractive index at the design wavelength; of a mirror it does not matter
-    reflects: bool = False  # is it a mirror?
+    reflects: bool = False  # short for the passes of a mirror, where none are given
     losses: Dimming | None = None  # losses at its faces and in its glass; None: no flux is lost there
     clear: tuple[Outline, Outline] | None = None  # apertures of front and back that pass light; None: the outline
     before: tuple[Interface, ...] = ()  # that light crosses before the solid, such as a window
     behind: tuple[Interface, ...] = ()  # and behind it, such as a fold mirror
     shaped: tuple[int, ...] | None = None  # numbers of the interfaces that tailoring shapes; None: the back alone
+    way: Passes | None = None  # passes of the light through the solid; None: those of a lens, or of a mirror
 
     @cached_property
     def interfaces(self) -> tuple[Interface, ...]:
@@ -54,34 +55,39 @@ class Lens:
         return (*self.before, *(own if self.losses is None else self.losses.on(own)), *self.behind)
 
     @property
+    def passes(self) -> Passes:
+        """The passes of the light through the solid."""
+        return self.way or (MIRROR if self.reflects else LENS)
+
+    @property
     def _lossless(self) -> tuple[Interface, ...]:
-        """The faces of the solid that light meets."""
-        missed, (front, back) = Status.MISSED_FRONT, self.apertures
-        if self.reflects:
-            return (Interface(self.back, back, Reflect(), missed),)
-        return (
-            Interface(self.front.optical, front, Refract(1.0, self.index), missed),
-            Interface(self.back, back, Refract(self.index, 1.0), Status.VIGNETTED),
+        """The faces of the solid that light meets, at each pass."""
+        surfaces = {"front": self.front.optical, "back": self.back}
+        apertures = dict(zip(("front", "back"), self.apertures, strict=True))
+        lost = (Status.MISSED_FRONT, *(Status.VIGNETTED for _ in self.passes.steps[1:]))
+        return tuple(
+            Interface(surfaces[step.face], apertures[step.face], law, missed)
+            for step, law, missed in zip(self.passes.steps, self.passes.laws(self.index), lost, strict=True)
         )
 
     @property
     def optical_faces(self) -> dict[str, Surface]:
         """The faces of the solid that light meets, by name, in the order of light: of a mirror the back alone."""
-        return {"back": self.back} if self.reflects else {"front": self.front, "back": self.back}
+        return {face: self.front if face == "front" else self.back for face in self.passes.faces}
 
     @property
     def deflection(self) -> float:
         """The angle by which its back deflects a ray, over the slope angle of the back, both small."""
-        return 2.0 if self.reflects else abs(self.index - 1)
-
-    @property
-    def sense(self) -> int:
-        """The way along z of the light that meets the lens: a mirror sends it back along +z."""
-        return -1 if self.interfaces[0].law.reverses else 1
+        return self.passes.deflection("back", self.index)
 
     def number_of(self, face: Face) -> int:
-        """Return which of the interfaces a face of the solid is; ValueError for the rear of a mirror, which is none."""
-        return len(self.before) + list(self.optical_faces).index(face)
+        """Return which of the interfaces a face of the solid is first; ValueError for one that no light meets."""
+        return len(self.before) + [step.face for step in self.passes.steps].index(face)
+
+    @property
+    def solid(self) -> slice:
+        """The numbers of the interfaces that are faces of the solid."""
+        return slice(len(self.before), len(self.before) + len(self.passes.steps))
 
     @property
     def freeform(self) -> tuple[int, ...]:
@@ -90,7 +96,8 @@ class Lens:
 
     def shapes(self, face: Face) -> bool:
         """Does tailoring shape this face of the solid?"""
-        return face in self.optical_faces and self.number_of(face) in self.freeform
+        first = len(self.before)
+        return any(first + k in self.freeform for k in self.passes.numbers_of(face))
 
     @property
     def shapes_both(self) -> bool:
@@ -145,10 +152,10 @@ class Lens:
         return self.with_nets(replace(net, heights=h) for net, h in zip(self.nets, heights, strict=True))
 
     def _with_surface(self, k: int, surface: Surface) -> Lens:
-        first, back = len(self.before), self.number_of("back")
-        if first <= k <= back:
-            return self.with_back(surface) if k == back else self.with_front(surface)
-        name, at = ("before", k) if k < first else ("behind", k - back - 1)
+        solid, steps = self.solid, self.passes.steps
+        if solid.start <= k < solid.stop:
+            return self.with_back(surface) if steps[k - solid.start].face == "back" else self.with_front(surface)
+        name, at = ("before", k) if k < solid.start else ("behind", k - solid.stop)
         around = list(getattr(self, name))
         around[at] = replace(around[at], surface=surface)
         return replace(self, **{name: tuple(around)})

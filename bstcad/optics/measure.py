@@ -590,7 +590,7 @@ def _through(channel: Channel, lens: Lens, screen: Screen, x: Tensor, y: Tensor)
     behind = replace(seen.unbounded(), losses=None).interfaces[seen.number_of("back") :]
     landed = through(coming, behind, screen.plane)
     flux = channel.weight * channel.source.irradiance(middle(p), middle(q), seen.entrance.z) * area_of(p, q)
-    if not seen.reflects:  # light meets the back alone of a mirror
+    if seen.passes.sense > 0:  # light comes to the front
         flux = torch.where(seen.apertures[0].contains(middle(p), middle(q)), flux, torch.zeros_like(flux))
     flux = arriving(flux, landed).double()
     at = torch.stack([middle(c) for c in landed.position])

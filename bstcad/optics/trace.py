@@ -241,7 +241,7 @@ def _of_all_light(lights: Lights, box: Tensor, tent: Tensor, flux: dict[str, flo
 
 def _has_underside(lens: Lens) -> bool:
     """Is there a plane around the optical part of its front, on which light can fall?"""
-    return lens.front.outline is not None and not lens.reflects and not lens.before
+    return lens.front.outline is not None and lens.passes.sense > 0 and not lens.before
 
 
 @functools.lru_cache(maxsize=4096)  # whatever the back

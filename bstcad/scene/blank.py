@@ -16,9 +16,9 @@ import torch
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
 from bstcad.optics.key import Key
-from bstcad.optics.lens import Face
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
+from bstcad.optics.passes import LENS, MIRROR, Face, Passes
 from bstcad.optics.sides import Sides, both, coarser, in_proportion, plain
 from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Surface, Toroid
 from bstcad.runs import files
@@ -537,13 +537,18 @@ class LensBlank(Record):
     edge_thickness: Annotated[float | None, Key("Least thickness along the rim.", "mm", *LENGTHS)] = None
 
     @property
+    def passes(self) -> Passes:
+        """The faces that light meets, in its order, and what each does to it."""
+        return MIRROR if self.back.reflect else LENS
+
+    @property
     def optic(self) -> str:
         """ "lens" or "mirror"."""
-        return "mirror" if self.back.reflect else "lens"
+        return self.passes.optic
 
     def index_at(self, wavelength: float) -> float:
-        """The refractive index at a wavelength (nm); 1 for a mirror, which light does not enter."""
-        if self.back.reflect:
+        """The refractive index at a wavelength (nm); 1 where light does not enter the solid."""
+        if not self.passes.enters:
             return 1.0
         return refractive_index(self.material, wavelength) if self.index is None else self.index
 
@@ -641,9 +646,9 @@ class LensBlank(Record):
     def complaints(self) -> Iterator[str]:
         """Everything that is wrong with the table by itself."""
         given = [name for name in ("material", "index") if getattr(self, name) is not None]
-        if self.back.reflect and given:
+        if not self.passes.enters and given:
             yield f"lens: light does not enter a mirror (lens.back.reflect), so it has no {given[0]}; remove it"
-        if not self.back.reflect and len(given) != 1:
+        if self.passes.enters and len(given) != 1:
             yield 'lens: needs exactly one of material and index; give for example material = "PMMA"'
         of_back = of_net(self.outline, self.back.control_points)
         yield from (f"lens.back.control_points: {complaint}" for complaint in of_back)

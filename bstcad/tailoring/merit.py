@@ -333,7 +333,7 @@ def local_weight(source: Emitter, lens: Lens, target: np.ndarray, screen: Screen
     logarithm = np.where(seen, np.log(np.maximum(irradiance, MOST**-4)), 0.0)
     weight = np.clip(np.exp(-0.5 * gaussian_filter(logarithm, SMOOTH)), 1 / MOST, MOST)
     if number == lens.freeform[-1] and onwards[0].law.eta > 1:
-        plane = image(lens.behind[max(0, number - lens.number_of("back")) :], screen.plane)
+        plane = image(lens.behind[max(0, number - lens.solid.stop + 1) :], screen.plane)
         farther = _farther(at_net, landed.position, plane, law=onwards[0].law, seen=seen)
         if farther is not None:
             weight = weight / np.exp(gaussian_filter(np.log(farther), SMOOTH))

@@ -12,6 +12,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
+from bstcad.optics.passes import Pass, Passes
 from bstcad.optics.point import Point
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.receivers import LevelPlane, TiltedPlane
@@ -102,6 +103,7 @@ def test_a_system_is_simulated_as_its_rays_and_its_tubes_are_traced():
 # Two nets
 
 
+MANGIN = Passes((Pass("front", Refract), Pass("back", Reflect), Pass("front", Refract)))
 LOSSES = Losses(Fresnel(587.6), Absorption(0.01))
 TWO = Lens(net(0.0, 0.4, 2), net(6.0, 0.5), SQUARE, N, shaped=(0, 1))
 MIRROR = replace(FOLD[0], surface=replace(net(60.0, 0.5, 3), x=(-40.0, 40.0), y=(-40.0, 40.0)))
@@ -111,11 +113,29 @@ SYSTEMS = {
     "with a window": replace(TWO, before=WINDOW, shaped=(2, 3)),
     "with a fold mirror": replace(TWO, behind=FOLD),
     "freeform fold mirror": replace(TWO, behind=(MIRROR,), shaped=(0, 1, 2)),
+    "lossy Mangin mirror": replace(TWO, way=MANGIN, losses=Losses(absorption=Absorption(0.01))),
     "a plate between them": replace(
         TWO, behind=(*(replace(i, surface=i.surface.moved(i.surface.z + 30.0)) for i in WINDOW), MIRROR), shaped=(0, 4)
     ),
 }  # fmt: skip
 PLANES = {"level": LevelPlane(15.0), "tilted": TiltedPlane((3.0, 2.0, 15.0), (20.0, -10.0), 5.0)}
+
+
+def test_light_goes_through_a_mangin_mirror_as_snell_has_it():
+    """Between flat faces t mm apart a ray of sine s is displaced by 2 t s / r, on a path of 2 t n / r, r² = n² - s²."""
+    flat = [net(z, 0.0) for z in (0.0, 6.0)]
+    lens = Lens(*flat, SQUARE, N, way=MANGIN)
+    assert lens.passes.sense == 1 and lens.passes.turn == -1 and lens.number_of("back") == 1
+    assert [interface.surface for interface in lens.interfaces] == [flat[0], flat[1], flat[0]]
+    rays = rays_of(SOURCE, lens, size=10.0)
+    landed = trace(rays, lens, LevelPlane(-20.0))
+    sine = rays.direction[:2].norm(dim=0)
+    way = (20.0 - rays.above(0.0)) / rays.direction[2] + 12.0 / torch.sqrt(N**2 - sine**2)  # times the direction
+    wanted = rays.position[:2] + way * rays.direction[:2]
+    torch.testing.assert_close(landed.position[:2], wanted, rtol=0, atol=1e-12)
+    losses = replace(lens, losses=Losses(absorption=Absorption(0.01)))
+    path = 12.0 * N / torch.sqrt(N**2 - sine**2)  # through the glass twice
+    torch.testing.assert_close(trace(rays, losses, LevelPlane(-20.0)).flux, rays.flux * torch.exp(-0.01 * path))
 
 
 def plainly(rays, interfaces, plane):
@@ -127,7 +147,9 @@ def plainly(rays, interfaces, plane):
 def test_the_gradient_through_several_nets_is_that_of_plain_torch(name, plane):
     lens, found = SYSTEMS[name], []
     goal = PLANES[plane]
-    if lens.interfaces[-1].law.reverses is False:  # the plane is ahead of the light
+    if lens.passes.reflects:  # the plane is ahead of the light
+        goal = LevelPlane(-60.0) if plane == "level" else replace(goal, centre=(3.0, 2.0, -60.0))
+    elif lens.interfaces[-1].law.reverses is False:
         goal = LevelPlane(120.0) if plane == "level" else replace(goal, centre=(3.0, 2.0, 120.0))
     rays = rays_of(SOURCE, lens, size=23.0)
     weight = torch.randn((2, 40, 40), generator=torch.Generator().manual_seed(3), dtype=torch.float64)

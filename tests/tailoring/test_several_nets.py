@@ -17,6 +17,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import images
 from bstcad.optics.outlines import EVERYWHERE, Rectangle
+from bstcad.optics.passes import Pass, Passes
 from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
 from bstcad.optics.surfaces import Plane
@@ -51,7 +52,8 @@ FRONTS = {  # a lens, and the light that meets it
     ),
 }  # fmt: skip
 ABOVE = Collimated(Rectangle(1.9 * HALF, 1.9 * HALF), z=250.0)  # a beam that comes down
-BODIES = {  # of mirrors: light comes down to the back, whose front is dark
+MANGIN = Passes((Pass("front", Refract), Pass("back", Reflect), Pass("front", Refract)))
+BODIES = {  # of mirrors: light comes down to the back, whose front is dark; but up to a Mangin mirror's front
     "two mirrors": (  # after the second light goes down, past the first, to z = -60
         Lens(
             Plane(-5.0), net(0.0), SQUARE, 1.0, reflects=True,
@@ -69,6 +71,9 @@ BODIES = {  # of mirrors: light comes down to the back, whose front is dark
             shaped=(0, 2),
         ),
         SCREEN,
+    ),
+    "a Mangin mirror": (  # whose front light crosses twice
+        Lens(net(0.0), net(8.0), SQUARE, N, way=MANGIN, shaped=(0, 1)), replace(SCREEN, z=-120.0),
     ),
 }  # fmt: skip
 MOVED = {Collimated: {"tilt": (1.0, 0.0)}, Point: {"position": (1.5, 0.0, -600.0)}}  # another point of the source
@@ -133,7 +138,8 @@ def test_stage_2_shapes_a_front_and_goes_on_from_where_it_was_left():
 def test_stage_2_alone_shapes_two_nets_of_a_body_with_mirrors(name):
     lens, screen = BODIES[name]
     knobs = Tailoring(rays=96, levels=(M,), stage2_iterations=2 * EVALUATIONS, overshoot=0.03)
-    task = Task((Channel(ABOVE, 1.0),), (Goal("target", screen, picture()),), knobs)
+    source = ABOVE if lens.passes.sense < 0 else BEAM
+    task = Task((Channel(source, lens.index),), (Goal("target", screen, picture()),), knobs)
     begun, (*_, last) = task.rrmsd(lens), steps(task, lens)
     assert task.rrmsd(last.lens) < begun / 2
     one, two = (found.heights for found in last.lens.nets)

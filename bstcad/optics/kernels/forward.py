@@ -539,5 +539,5 @@ def _scene(source: Emitter, lens: Lens, plane: Receiver) -> tuple[Any, ...]:
     """Net, beam, faces and tilt of the screen, as the kernels take them; a mirror's light begins along -z."""
     (*front, net), z = lens.interfaces, lens.entrance.z
     heights = net.surface.heights
-    faces = kernel_arguments.faces(net, plane, lens.sense, z, *front)
-    return net_of(-heights if lens.sense < 0 else heights), kernel_arguments.beam(source, lens), *faces
+    faces = kernel_arguments.faces(net, plane, lens.passes.sense, z, *front)
+    return net_of(-heights if lens.passes.sense < 0 else heights), kernel_arguments.beam(source, lens), *faces
