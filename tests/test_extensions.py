@@ -142,6 +142,19 @@ def test_light_is_collected_by_a_receiver_of_its_own(scene, tmp_path, monkeypatc
     assert (along_s.get_xlabel(), along_y.get_xlabel()) == ("s (mm)", "y (mm)") and "(s = " in along_y.get_title("left")
 
 
+def test_a_receiver_of_its_own_is_refused_where_it_cannot_be(scene):
+    """A cylinder that cuts the lens, which is 8 mm wide to each side, and one that would be seen past a window."""
+    around = scene.model_copy(update={"targets": (OnCylinder(**dict(scene.target)),)})
+    lens = around.lens
+    assert around.target.clearance(lens, 20.0) == pytest.approx(np.sqrt(500.0**2 - 8.0**2) - 20.0)
+    with pytest.raises(SceneError, match=r"^target\.z: the target plane cuts into the lens; move the target further"):
+        around.changed({"target.z": 21.0})
+    rim = {"shape": "circle", "radius": 90.0}
+    window = {"kind": "window", "z": 100.0, "thickness": 3.0, "index": 1.5, "outline": rim}
+    with pytest.raises(SceneError, match=r"^target: windows and mirrors behind a lens are for planes alone"):
+        around.changed({"behind": [window]})
+
+
 def test_a_receiver_of_its_own_is_moved_as_its_points_are():
     """Rays meet the moved cylinder where a point of it is, under that point's own coordinates, and at its normal."""
     motion = Motion.of(shift=(3.0, -2.0, 5.0), turn=(4.0, 7.0, 10.0), about=(0.0, 0.0, 20.0))

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.motion import Motion
+from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import GRAZING, Landed, Rays, Status, Vector, axes, clocked
 
 Array = Any  # an array of numpy or torch, or a number
@@ -29,7 +30,7 @@ class Receiver(ABC):
     unit: str = "mm"  # the unit of x and y
     tilt: tuple[float, float] | None = None  # tilt of a plane about x, then y (degrees); None: it is level, or no plane
     names: tuple[str, str] = ("x", "y")  # the names of its axes
-    axes: tuple[Vector, Vector, Vector] | None = None  # e_x, e_y and n of a plane; None: it is none
+    axes: tuple[Vector, Vector, Vector] | None = None  # e_x, e_y and n for the kernels; None: it has no kernel
     is_level: bool = False  # a plane z = const?
 
     @property
@@ -43,7 +44,7 @@ class Receiver(ABC):
 
     @property
     def frame(self) -> tuple[Vector, Vector, Vector] | None:
-        """e_x, e_y and n of a plane, of one that no kernel knows, too; None: it is none."""
+        """e_x, e_y and n of a plane, with a kernel or without; None: the receiver is no plane."""
         return self.axes
 
     @property
@@ -96,6 +97,15 @@ class Receiver(ABC):
         """(3, …) from the rays' positions to places (2, …) of the receiver (mm)."""
         x, y, z = self.point(*aim)
         return torch.stack([x - rays.position[0], y - rays.position[1], z - rays.above(0.0)])
+
+    def clearance(self, outline: Outline, z: float) -> float:
+        """Return how far (mm) along +z it passes an outline on the plane z; -inf: not all of it lies before it."""
+        x, y = (torch.as_tensor(p, dtype=torch.float64) for p in outline.places())
+        along = torch.stack([torch.zeros_like(x), torch.zeros_like(x), torch.ones_like(x)])
+        start = torch.stack([x, y, torch.zeros_like(x)])
+        rays = Rays(start, along, torch.ones_like(x), torch.zeros(x.shape, dtype=torch.uint8), z=z)
+        path, status = self.path(rays)
+        return float(path.min()) if bool((status == Status.ALIVE).all()) else -math.inf
 
     def throw(self, z: float) -> float:
         """From the plane z to its middle (mm), along the axis."""
@@ -182,6 +192,10 @@ class Plane(Receiver):
     def height(self, point: Vector) -> float:
         """n · (p - C): how far (mm) a point stands off the plane, negative on the side that light comes from."""
         return math.fsum(n * (p - c) for n, p, c in zip(self.frame[2], point, self.middle, strict=True))
+
+    def clearance(self, outline: Outline, z: float) -> float:
+        """Return how far (mm) it passes an outline on the plane z; negative: it cuts the outline."""
+        return -self.height((0.0, 0.0, z)) - outline.reach(*self.frame[2][:2])
 
     @abstractmethod
     def _advance(self, rays: Rays) -> tuple[Tensor, Tensor]:

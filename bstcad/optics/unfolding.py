@@ -35,8 +35,6 @@ class Image(Plane):
         """Return a plane as the image of itself."""
         if isinstance(plane, Image):
             return plane
-        if not isinstance(plane, Plane):
-            raise ValueError(f"{type(plane).__name__}: windows and mirrors behind a lens are for planes alone")
         return cls(plane.middle, plane.origin, plane.frame)
 
     @property

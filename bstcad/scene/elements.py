@@ -6,7 +6,6 @@ then the lens, then those behind it, each once, in the order of the tables, and 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -23,14 +22,13 @@ from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.tilted import Tilted
 from bstcad.optics.unfolding import Image, image
 from bstcad.scene.blank import INDICES, LensBlank, Outlined
+from bstcad.scene.errors import about
 from bstcad.scene.schema import COORDINATES, LENGTHS, Record, leaving_out
-from bstcad.scene.target import Target
+from bstcad.scene.target import WAYS, Target, is_faced
 
 MAX_TILT = 40.0  # degrees; a mirror at 45 sends light across the axis, where it goes neither up nor down along z
 CURVATURES = (-1e3, 1e3)  # 1/mm
 UPRIGHT = 0.85  # (c r)² of a sphere at its rim, at most: of a hemisphere 1
-EDGE_ON = math.sin(math.radians(1.0))  # sine of the angle to a target's plane, from which on it has no picture
-WAYS = {1: "+z", -1: "-z"}
 TURNED = Annotated[tuple[float, float] | None, Key("Tilt about x, then about y.", "degrees", -MAX_TILT, MAX_TILT)]
 RIM = Key("Outline of what light may pass, as seen along z.", example={"shape": "circle", "diameter": 40.0})
 
@@ -203,6 +201,9 @@ class Way:
                     aims = "stage 1 aims from the lens at the target, past planes alone"
                     yield f"{key}.curvature: {aims}; leave it out, or put the element before the lens"
                 yield from element.complaints(key)
+        for key, target in self.targets.items():
+            if self.behind and target.screen.plane.frame is None:
+                yield f"{key}: windows and mirrors behind a lens are for planes alone; leave out [[behind]]"
         if self.before or self.behind:
             yield from self._out_of_order()
         if self.is_folded:
@@ -230,9 +231,10 @@ class Way:
                 yield f"{there.key}: {ends} along {WAYS[sense]}, as the light goes; move one of them"
         sense = turns(self.behind)
         for key, target in self.targets.items():
-            if self.behind and not sense * (target.z - (z := self.behind[-1].vertices[-(sense > 0)])) > 0:
-                where = f"the target at z = {target.z:g} does not follow the {self.behind[-1].kind} at z = {z:g}"
-                yield f"{key}.z: {where} along {WAYS[sense]}, as the light goes; move one of them"
+            if self.behind:
+                last = self.behind[-1]
+                sentences = target.follows(last.kind, last.vertices[-(sense > 0)], sense)
+                yield from (about(sentence, key) for sentence in sentences)
 
     def _unfaced(self) -> Iterator[str]:
         """Targets that the lens sees by way of mirrors from the edge, or from their rear."""
@@ -240,7 +242,7 @@ class Way:
         vertex: Vector = (0.0, 0.0, self.lens.back.z)
         for key, target in self.targets.items():
             seen = Image.of(image(behind, target.screen.plane))
-            if not -seen.height(vertex) > EDGE_ON * math.dist(seen.middle, vertex):
+            if not is_faced(seen, vertex):
                 way = "by way of the mirrors the target is edge-on to the lens, or shows it its rear"
                 yield f"{key}.tilt: {way}; turn the target or a mirror"
 

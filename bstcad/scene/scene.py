@@ -44,7 +44,7 @@ from bstcad.scene.mount import Mount, Part
 from bstcad.scene.picture import Picture
 from bstcad.scene.quality import JUDGE_DRAW, JUDGE_POINTS, PRESETS, WHOLE, Tailoring, Tolerance, tolerance_complaints
 from bstcad.scene.schema import FILE, FileContent, Record, contents, of_model
-from bstcad.scene.target import AIM, Target, Targets, coplanar
+from bstcad.scene.target import Target, Targets, coplanar
 
 if TYPE_CHECKING:
     from bstcad.optics.measure import Draw, GhostLight
@@ -52,10 +52,6 @@ if TYPE_CHECKING:
 MESH = 1e-3  # mm; how far facets may lie from a lens of up to 100 mm
 IMAGE = re.compile(r"target(\[\d+\])?\.image")  # the keys of images
 INSIDE = 0.999  # of the way to where a front would be refused: where the search may go
-TINY, FAR = 0.5, 10.0  # mm; in metres no lens is wider than the one, no target further than the other
-NARROW = 20.0  # times narrower than the lens: the light of a lens is seldom gathered so far
-EDGE_ON = math.radians(1.0)  # a plane seen under less than that has no picture
-GRAZED = 8.0  # degrees; a plane seen under less is hardly lit by a lamp (at 10: RRMSD 0.33, at 5: 1.6, at 30: 0.07)
 SINGLE = 2.0**-24  # of a coordinate: the rounding of float32
 FINEST = 4 * SINGLE  # of the largest coordinate: no tolerance of a mesh is finer
 
@@ -127,9 +123,13 @@ class Scene(Record):
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
+        self.refuse()
+        return self
+
+    def refuse(self) -> None:
+        """Raise SceneError, the first sentence on what keeps the scene from being built."""
         for complaint in self._complaints():
             raise SceneError("; ".join((complaint, *self._metres())))
-        return self
 
     def _complaints(self) -> Iterator[str]:
         """Everything that keeps the scene from being built: the first one counts, and those behind rely on it."""
@@ -150,11 +150,11 @@ class Scene(Record):
         if not self.before:  # else elements.complaints looks at the order
             yield from lighting.order(source, lens)
         if not self.way.is_folded:
-            yield from self._of_targets(lambda target: _behind(target, lens))
+            yield from self._of_targets(lambda target: target.behind(lens))
         if not self.before:
             yield from lighting.unlit(source.central, lens, self.rim)
         if not self.way.is_folded:
-            yield from self._of_targets(lambda target: _tilted(target, lens))
+            yield from self._of_targets(lambda target: target.unfaced(lens))
         yield from coplanar(self.targets)
         if self.wavefront is not None and self.way.is_folded:
             yield "wavefront: is asked for behind the lens, and behind has a mirror, which turns it; remove one of them"
@@ -174,7 +174,7 @@ class Scene(Record):
 
     def _metres(self) -> list[str]:
         """Questions where lengths look as if they were in metres, each once."""
-        return [*dict.fromkeys(self._of_targets(lambda target: _metres(target, self.lens)))]
+        return [*dict.fromkeys(self._of_targets(lambda target: target.metres(self.lens)))]
 
     def warnings(self) -> tuple[str, ...]:
         """Sentences on settings that are possible but perhaps not meant."""
@@ -183,7 +183,7 @@ class Scene(Record):
             key = "mount.rim" if self.mount and self.mount.rim else "lens.outline"
             doubts += lighting.doubts(self.source, self.rim, key)
         elif not self.way.is_folded:
-            doubts += self._of_targets(lambda target: _grazed(target, self.lens))
+            doubts += self._of_targets(lambda target: target.grazed(self.lens))
         return (*doubts, *self.of_pictures())
 
     def of_pictures(self) -> tuple[str, ...]:
@@ -277,7 +277,7 @@ class Scene(Record):
         """How far (mm) what follows passes a lens that reaches up to z = highest (mm); negative: it cuts it."""
         room = [elements.lowest(self.behind) - highest] if self.behind else []
         if not self.way.is_folded:
-            room += (_clearance(target, self.lens, highest) for target in self.targets)
+            room += (target.clearance(self.lens, highest) for target in self.targets)
         return min(room)
 
     def flat_lens(
@@ -393,7 +393,10 @@ class Scene(Record):
         if any(type(target) is not Target for target in self.targets) and "target" not in changes:
             pairs = zip(self.targets, made.targets, strict=True)
             own["targets"] = tuple(before.model_copy(update=dict(after)) for before, after in pairs)
-        return made.model_copy(update=own) if own else made
+        if own:
+            made = made.model_copy(update=own)
+            made.refuse()
+        return made
 
     def toml(self) -> str:
         """The scene as a file that loads to an equal scene; an image is named by the basename of its copy."""
@@ -407,51 +410,6 @@ class Scene(Record):
 
 
 # ---- complaints of several tables: a sentence with a remedy each -----------------------------------------------------
-
-
-def _behind(target: Target, lens: LensBlank) -> Iterator[str]:
-    """A target that does not follow the lens along z."""
-    if not target.z > (back := lens.back.z):
-        place = "above the mirror, whose face" if lens.back.reflect else "behind the lens, whose back"
-        yield f"target.z: the target at z = {target.z:g} is not {place} is at z = {back:g}; move it further along +z"
-
-
-def _clearance(target: Target, lens: LensBlank, highest: float) -> float:
-    """How far (mm) a target's plane passes a lens that reaches up to z = highest (mm); negative: it cuts it."""
-    plane = target.screen.plane
-    if plane.axes is None:  # a receiver of one's own surrounds the lens
-        return math.inf
-    return -plane.height((0.0, 0.0, highest)) - lens.outline.reach(*plane.axes[2][:2])
-
-
-def _grazed(target: Target, lens: LensBlank) -> Iterator[str]:
-    """A tilted target along which the light of a lamp runs."""
-    plane, vertex = target.screen.plane, (0.0, 0.0, lens.back.z)
-    if plane.tilt is None:
-        return
-    sine = -plane.height(vertex) / math.dist(plane.middle, vertex)  # apart, since no target cuts the lens
-    if sine < math.sin(math.radians(GRAZED)):
-        angle = math.degrees(math.asin(max(sine, -1.0)))
-        yield (
-            f"target.tilt: seen from the {lens.optic}, the target is {angle:.2g} degrees from edge-on, and hardly any "
-            f"{lens.optic} makes a picture there; {AIM}"
-        )
-
-
-def _tilted(target: Target, lens: LensBlank) -> Iterator[str]:
-    """A tilted target that does not face the lens, cuts it, or comes down to it."""
-    screen, plane, back, optic = target.screen, target.screen.plane, lens.back.z, lens.optic
-    if plane.tilt is None:
-        return
-    vertex = (0.0, 0.0, back)
-    lowest = min(plane.point(x, y)[2] for x in screen.x for y in screen.y)
-    if not -plane.height(vertex) > math.sin(EDGE_ON) * math.dist(plane.middle, vertex):
-        yield f"target.tilt: the target plane is edge-on to the {optic}, or shows it its rear; turn it less, or move it"
-    if not _clearance(target, lens, back) > 0:
-        yield f"target.tilt: the target plane cuts into the {optic}; turn it less, or move the target further along +z"
-    if not lowest > back:
-        edge = f"comes down to z = {lowest:.6g}, not beyond the {optic}, whose back is at z = {back:g}"
-        yield f"target.tilt: an edge of the target {edge}; turn it less, make it smaller or move it along +z"
 
 
 def _of_wavefront(wave: Wave | None, source: Emitter, lens: LensBlank, accept: Accept) -> Iterator[str]:
@@ -510,19 +468,6 @@ def _mesh(tolerance: float | None, lens: LensBlank) -> Iterator[str]:
     if tolerance is not None and tolerance < (least := FINEST * size):
         rounded = f"coordinates of {size:g} mm in an STL file are rounded by up to {SINGLE * size:.1g} mm"
         yield f"output.mesh_tolerance: {tolerance:g} mm, and {rounded}; ask for {least:.2g} mm or more"
-
-
-def _metres(target: Target, lens: LensBlank) -> Iterator[str]:
-    """A question where lengths look as if they were in metres."""
-    outline, widest = lens.outline, max(target.size)
-    name, size = ("radius", outline.radius) if outline.is_round else ("width", outline.width)
-    across, question = 2 * max(outline.half_extent), "are these metres? lengths are in mm"
-    if across < TINY:
-        yield f"lens.outline.{name}: {size:g} mm; {question}"
-    elif 0 < target.z <= FAR and target.z - lens.back.z < across / 4:
-        yield f"target.z: {target.z:g} mm; {question}"
-    elif widest < min(across / NARROW, FAR):
-        yield f"target.x: {target.size[0]:g} mm wide; {question}"
 
 
 # ---- files and changes -----------------------------------------------------------------------------------------------

@@ -19,8 +19,10 @@ from scipy.sparse import csr_array
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.key import Key
 from bstcad.optics.outlines import Outline
+from bstcad.optics.rays import Vector
+from bstcad.optics.receivers import Receiver
 from bstcad.scene import picture
-from bstcad.scene.blank import Outlined
+from bstcad.scene.blank import LensBlank, Outlined
 from bstcad.scene.dotted_keys import PICTURES
 from bstcad.scene.errors import SceneError
 from bstcad.scene.picture import Box, strips
@@ -33,6 +35,11 @@ WITHOUT_GAMMA = ("text", "uniform", "profile")
 MOST = 8  # targets of a scene
 SEEN = 0.01  # RRMSD between two readings of a picture, from which on it is said which was taken
 NEAREST = 1e-3  # mm; planes of two targets that are nearer to each other are one
+TINY, FAR = 0.5, 10.0  # mm; in metres no lens is wider than the one, no target further than the other
+NARROW = 20.0  # times narrower than the lens: the light of a lens is seldom gathered so far
+EDGE_ON = math.sin(math.radians(1.0))  # sine of the angle to a target's plane, below which it has no picture
+GRAZED = 8.0  # degrees; a plane seen under less is hardly lit by a lamp (at 10: RRMSD 0.33, at 5: 1.6, at 30: 0.07)
+WAYS = {1: "+z", -1: "-z"}
 
 
 PictureFile = Annotated[
@@ -185,9 +192,75 @@ class Target(Record):
             raise SceneError(f"target.{self._pictures[0]}: the picture is all black; give one with some light in it")
         return flux / total
 
+    # ---- its place: complaints, by the receiver that it lies on ----
+
+    def behind(self, lens: LensBlank) -> Iterator[str]:
+        """Complain of a target that does not follow the lens along z."""
+        if not self.z > (back := lens.back.z):
+            place = "above the mirror, whose face" if lens.back.reflect else "behind the lens, whose back"
+            yield f"target.z: the target at z = {self.z:g} is not {place} is at z = {back:g}; move it further along +z"
+
+    def follows(self, words: str, z: float, sense: int) -> Iterator[str]:
+        """Complain of a target that does not follow the last element that light meets, at z, along sense · z."""
+        if not sense * (self.z - z) > 0:
+            where = f"the target at z = {self.z:g} does not follow the {words} at z = {z:g}"
+            yield f"target.z: {where} along {WAYS[sense]}, as the light goes; move one of them"
+
+    def clearance(self, lens: LensBlank, highest: float) -> float:
+        """Return how far (mm) it passes a lens that reaches up to z = highest (mm); negative: it cuts the lens."""
+        return self.screen.plane.clearance(lens.outline, highest)
+
+    def grazed(self, lens: LensBlank) -> Iterator[str]:
+        """Doubt a tilted target along which the light of a lamp runs."""
+        plane, vertex = self.screen.plane, (0.0, 0.0, lens.back.z)
+        if plane.tilt is None:
+            return
+        sine = -plane.height(vertex) / math.dist(plane.middle, vertex)  # apart, since no target cuts the lens
+        if sine < math.sin(math.radians(GRAZED)):
+            angle = math.degrees(math.asin(max(sine, -1.0)))
+            yield (
+                f"target.tilt: seen from the {lens.optic}, the target is {angle:.2g} degrees from edge-on, and hardly "
+                f"any {lens.optic} makes a picture there; {AIM}"
+            )
+
+    def unfaced(self, lens: LensBlank) -> Iterator[str]:
+        """Complain of a target that does not face the lens, cuts it, or comes down to it."""
+        screen, plane, back, optic = self.screen, self.screen.plane, lens.back.z, lens.optic
+        if plane.is_level:
+            return
+        key = "target.z" if plane.tilt is None else "target.tilt"
+        if plane.tilt is not None and not is_faced(plane, (0.0, 0.0, back)):
+            yield f"{key}: the target plane is edge-on to the {optic}, or shows it its rear; turn it less, or move it"
+        if not self.clearance(lens, back) > 0:
+            less = "" if plane.tilt is None else "turn it less, or "
+            yield f"{key}: the target plane cuts into the {optic}; {less}move the target further along +z"
+        if plane.tilt is None:
+            return
+        lowest = min(plane.point(x, y)[2] for x in screen.x for y in screen.y)
+        if not lowest > back:
+            edge = f"comes down to z = {lowest:.6g}, not beyond the {optic}, whose back is at z = {back:g}"
+            yield f"{key}: an edge of the target {edge}; turn it less, make it smaller or move it along +z"
+
+    def metres(self, lens: LensBlank) -> Iterator[str]:
+        """Ask where lengths look as if they were in metres."""
+        outline, widest = lens.outline, max(self.size)
+        name, size = ("radius", outline.radius) if outline.is_round else ("width", outline.width)
+        across, question = 2 * max(outline.half_extent), "are these metres? lengths are in mm"
+        if across < TINY:
+            yield f"lens.outline.{name}: {size:g} mm; {question}"
+        elif 0 < self.z <= FAR and self.z - lens.back.z < across / 4:
+            yield f"target.z: {self.z:g} mm; {question}"
+        elif (unit := self.screen.plane.unit) == "mm" and widest < min(across / NARROW, FAR):
+            yield f"target.x: {self.size[0]:g} {unit} wide; {question}"
+
     def remarks(self) -> tuple[str, ...]:
         """A sentence on each thing that happens to the picture and that the scene does not ask for."""
         return drawing(self).remarks
+
+
+def is_faced(plane: Receiver, vertex: Vector) -> bool:
+    """Is a plane seen from a point at more than EDGE_ON from its edge, and from its front?"""
+    return -plane.height(vertex) > EDGE_ON * math.dist(plane.middle, vertex)
 
 
 @dataclass(frozen=True)
@@ -241,12 +314,16 @@ def coplanar(targets: tuple[Target, ...]) -> Iterator[str]:
 
 
 def _in_one_plane(one: Screen, other: Screen) -> bool:
-    """Do the corners of each lie in the other's plane?"""
+    """Do the corners of each lie in the other's plane?  Receivers of another form are one if they are equal."""
+    if one.plane.frame is None or other.plane.frame is None:
+        return one.plane == other.plane
     return max(map(abs, (*_off(one, other), *_off(other, one)))) < NEAREST
 
 
 def _cuts(screen: Screen, other: Screen) -> bool:
     """Do its corners lie on both sides of the other's plane?"""
+    if screen.plane.frame is None or other.plane.frame is None:
+        return False
     off = _off(screen, other)
     return min(off) < 0 < max(off)
 
