@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import torch
 from torch import Tensor
 
-from bstcad.optics.emitters import Emitter, WavelengthKey, all_alive
+from bstcad.optics.emitters import LAWS, Emitter, WavelengthKey, all_alive
 from bstcad.optics.kernels.beam import ALONG_Z, Beam, floats
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.key import Key
@@ -69,6 +69,11 @@ class Collimated(Emitter):
         if not lean + (self.divergence or 0.0) / 2 < MAX_LEAN:
             key, light = ("divergence", "some of the light runs") if self.divergence else ("tilt", "the light runs")
             yield f"{key}: {light} {MAX_LEAN:g} degrees off the lens's axis or more; make it smaller"
+
+    def words(self, origin: float) -> str:
+        """Return profile, divergence and aperture for a data sheet."""
+        spread = f"divergence {self.divergence:.4g}°, " if self.divergence else ""
+        return f"parallel light, {LAWS[self.profile]}, {spread}{self.aperture.words.replace(' x ', ' × ')}"
 
     def sizes(self) -> Iterator[tuple[str, float, str]]:
         """Its divergence, if it has one."""

@@ -31,6 +31,7 @@ WavelengthKey = Annotated[  # key of every source
     Wavelength,
     Key("One wavelength, or lines [[nm, weight], ...] of a spectrum, weights of any sum.", "nm", 100.0, 20_000.0),
 ]
+LAWS = {"gaussian": "Gaussian", "lambertian": "Lambertian", "uniform": "even"}  # profiles in words
 
 
 class Emitter(ABC):
@@ -123,6 +124,10 @@ class Emitter(ABC):
         """The sentence by which a class declines what it does not know."""
         name = type(self).__name__
         return NotImplementedError(f"the emitter {name} does not say {what}; give it the method {method}")
+
+    def words(self, origin: float) -> str:
+        """Return kind, place, profile and sizes for a data sheet; origin: z (mm) from which the sheet measures."""
+        return "a source of one's own"
 
     def sizes(self) -> Iterator[tuple[str, float, str]]:
         """The keys that give it an extent, each with the size and its unit."""

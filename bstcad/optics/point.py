@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics.emitters import Emitter, WavelengthKey, all_alive
+from bstcad.optics.emitters import LAWS, Emitter, WavelengthKey, all_alive
 from bstcad.optics.kernels.beam import ALONG_Z, Beam, floats
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.key import Key
@@ -100,6 +100,15 @@ class Point(Emitter):
         """Path (mm) to places (3, …), counted from the plane z, from the sphere about it through that on the axis."""
         x, y, start = self.position
         return beyond(place, (x, y, start - z))
+
+    def words(self, origin: float) -> str:
+        """Return place, profile, cone and sizes for a data sheet; origin: z (mm) from which the sheet measures."""
+        x, y, z = self.position
+        place = ", ".join(f"{round(p, 3) + 0.0:.9g}" for p in (x, y, z - origin)).replace("-", "−")
+        angle = self.half_angle or self.half_angle_1e2
+        sizes = [f"half angle {angle:.4g}°"] if angle else []
+        sizes += (f"{key} {size:.4g} {unit}" for key, size, unit in self.sizes())
+        return ", ".join([f"point at ({place}) mm", LAWS[self.profile], *sizes])
 
     def sizes(self) -> Iterator[tuple[str, float, str]]:
         """Its diameter, width and height, if it has any."""

@@ -6,7 +6,6 @@ data_sheet.txt.j2 holds the words of its tables.  A design drawn twice gives equ
 from __future__ import annotations
 
 import io
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -79,7 +78,7 @@ class Sheet:
         """Its tables by their headings: front, body, back, purpose, and of a part the mount."""
         return tables(
             "data_sheet.txt.j2", lens=self.record, order=self.order, shape=self.shape,
-            mount=self.mount, light=defaultdict(lambda: None, self.record["source"]), passed=self.passed,
+            mount=self.mount, light=self.scene.source, passed=self.passed,
             asked=self.scene.limits_light,
             pairs=list(zip(self.scene.targets, self.figures, strict=True)), across=across, walls=wall_words,
             apertures=[_aperture(patch, self.lens.outline) for patch in self.apertures], kinds_of_holes=kinds_of_holes,

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +31,7 @@ from bstcad.report.units import Rows, mm, tables
 from bstcad.scene.blank import FITTED
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
+from bstcad.scene.schema import FileContent
 
 if TYPE_CHECKING:
     from bstcad.cad.solid_properties import WholePart
@@ -65,6 +66,8 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
     numbers = ({"curvature": 0.0} if front.level else {}) | scene.lens.front.numbers(front)
     fitted = {"within": FITTED} if front.is_net and scene.lens.front.kind != "bspline" else {}  # mm
     heavy = density(material) if material else None
+    held = ((each.name, getattr(scene.source, each.name)) for each in fields(scene.source))
+    files = {name: value.name for name, value in held if isinstance(value, FileContent)}
     return {
         "name": scene.name,
         "title": scene.title,
@@ -83,7 +86,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "edge_thickness": (shape["edge_thickness_min"], shape["edge_thickness_max"]),
         "volume": shape["volume"],  # mm³
         "mass": None if heavy is None else shape["volume"] * heavy / 1000,  # g; None: no density is known
-        "source": _known(asdict(scene.source)),
+        "source": _known(asdict(scene.source) | files),
         **{name: [_known(e.model_dump(mode="json")) for e in found] for name, found in scene.elements if found},
         "targets": [_known(target.model_dump(mode="json")) for target in scene.targets],
     }

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from bstcad import commands
+from bstcad.analysis.shape import describe
 from bstcad.folder import scene_files
 from bstcad.optics.key import Key
 from bstcad.optics.point import Point
 from bstcad.pipeline import Saved, purpose
+from bstcad.report.prescription import prescription
 from bstcad.runs import checkpoint, files
 from bstcad.scene.scene import Scene, load
 from bstcad.scene.schema import FileContent, from_file
@@ -85,6 +87,9 @@ def test_a_file_of_a_record_of_ones_own_is_copied_and_hashed(tmp_path):
     (tmp_path / "scene.json").write_text(json.dumps(data))
     (tmp_path / "lamp.ies").write_bytes(b"IESNA:LM-63-2002")
     scene = lit(tmp_path)
+    lens = scene.flat_lens(9)
+    source = prescription(scene, lens, describe(lens) | {"volume": 1.0})["source"]
+    assert source["table"] == "lamp.ies"
     copies = scene_files(scene)
     assert copies.keys() == {"scene.toml", "lamp.ies"} and 'table = "lamp.ies"' in copies["scene.toml"].decode()
     (copy := tmp_path / "copy").mkdir()
