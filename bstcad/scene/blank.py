@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union
 
 import numpy as np
 import torch
@@ -282,9 +282,34 @@ class ConicFront(_Front):
             yield "optimise: a front of curvature 0 has one shape for all conic constants; give a curvature, or true"
 
 
+class _FittedFront(_Front):
+    """A front whose net within FITTED stands for it in the lens; what it bends by are curvature_x and curvature_y."""
+
+    def traced(self, outline: Outline) -> Surface:
+        """Return the net that stands for it, its vertex at z."""
+        return _net_of(self.surface, outline)
+
+    def numbers(self, front: Surface) -> dict[str, float]:
+        """Return its own numbers, which the net of the lens does not have."""
+        return self.surface.parameters()
+
+    def complaints(self, outline: Outline) -> Iterator[str]:
+        """It ends before the rim, or stands too steeply there for a net."""
+        x, y = map(torch.from_numpy, outline.places())
+        _, z_x, z_y = self.surface.relative_sag_and_slope(x, y)
+        slope = math.degrees(math.atan(float(torch.hypot(z_x, z_y).max())))
+        if slope <= STEEP_NET and bool(self.surface.reaches(x, y).all()):
+            return
+        half = dict(zip(("curvature_x", "curvature_y"), outline.half_extent, strict=True))
+        name = max(half, key=lambda name: abs(getattr(self, name)) * half[name])
+        radius = f"{1 / abs(getattr(self, name)):g} mm"
+        why = f"a radius of {radius} ends before the rim, or is steeper than {STEEP_NET:g} degrees there"
+        yield f"{name}: {why}; make the curvature smaller"
+
+
 @dataclass(frozen=True)
-class ToroidFront(_Front):
-    """A toroid, of another curvature along x than along y; the lens has the net within FITTED that stands for it."""
+class ToroidFront(_FittedFront):
+    """A toroid, of another curvature along x than along y."""
 
     z: Annotated[float, Z]
     curvature_x: Annotated[
@@ -296,27 +321,6 @@ class ToroidFront(_Front):
     kind: Annotated[Literal["toroid"], Key("A toroid; of one curvature 0 a cylinder.")] = "toroid"
 
     __pydantic_config__ = STRICT
-
-    def traced(self, outline: Outline) -> Surface:
-        """Return the net that stands for it, its vertex at z."""
-        return _net_of(self.surface, outline)
-
-    def numbers(self, front: Surface) -> dict[str, float]:
-        """Return its curvatures (1/mm), which the net of the lens does not have."""
-        return {"curvature_x": self.curvature_x, "curvature_y": self.curvature_y}
-
-    def complaints(self, outline: Outline) -> Iterator[str]:
-        """It ends before the rim, or stands too steeply there for a net."""
-        x, y = map(torch.from_numpy, outline.places())
-        _, z_x, z_y = self.surface.relative_sag_and_slope(x, y)
-        slope = math.degrees(math.atan(float(torch.hypot(z_x, z_y).max())))
-        if slope <= STEEP_NET and bool(self.surface.reaches(x, y).all()):
-            return
-        half_x, half_y = outline.half_extent
-        name = "curvature_x" if abs(self.curvature_x) * half_x > abs(self.curvature_y) * half_y else "curvature_y"
-        radius = f"{1 / abs(getattr(self, name)):g} mm"
-        why = f"a radius of {radius} ends before the rim, or is steeper than {STEEP_NET:g} degrees there"
-        yield f"{name}: {why}; make the curvature smaller"
 
 
 @lru_cache(maxsize=16)
@@ -457,7 +461,7 @@ def of_net(outline: Outline, points: Sides | None) -> Iterator[str]:
 
 
 Front = Annotated[
-    Annotated[PlaneFront | SphereFront | ConicFront | ToroidFront | NetFront, Field(discriminator="kind")],
+    Annotated[Union[*(front for _, front in FRONTS.values()), NetFront], Field(discriminator="kind")],
     BeforeValidator(as_front),
 ]
 

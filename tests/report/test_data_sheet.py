@@ -26,7 +26,7 @@ from bstcad.cad import mounting
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Light
-from bstcad.report import data_sheet, part_views
+from bstcad.report import data_sheet, part_views, prescription
 from bstcad.report.data_sheet import Sheet
 from bstcad.report.drawing import GLASS
 from bstcad.report.goal_figures import figures_of
@@ -289,6 +289,18 @@ def test_what_is_stated_stands_there_and_what_is_not_is_said():
 
 
 @pytest.mark.filterwarnings("error")
+def test_each_number_of_a_front_stands_on_the_sheet_and_in_the_prescription():
+    """Of a kind with numbers of its own, such as a biconic's."""
+    numbers = {"curvature_x": 0.02, "curvature_y": -0.01, "conic_constant_x": -0.75, "conic_constant_y": 1.25}
+    made = replace(sheet("square"))
+    made.record["front"] = prescription._face("biconic", 15.0, numbers) | {"within": 1e-6}
+    rows, text = dict(next(iter(made.tables.values()))), prescription.text(made.record)
+    assert (rows["Form"], rows["Radius in x"]) == ("biconic; B-spline within 1 nm", "50 mm CX")
+    assert [rows[f"Conic constant in {axis}"] for axis in "xy"] == ["-0.75", "1.25"]
+    for name, value in numbers.items():
+        assert re.search(rf"^ +{name.rpartition('_')[0].replace('_', ' ')} in {name[-1]} +{value!r}", text, re.M)
+
+
 def test_the_pdf_is_one_a4_with_its_fonts_and_the_same_twice():
     made = sheet("round, concave")
     pdf = data_sheet.draw(made)
