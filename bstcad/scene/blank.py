@@ -283,7 +283,7 @@ class ConicFront(_Front):
 
 
 class _FittedFront(_Front):
-    """A front whose net within FITTED stands for it in the lens; what it bends by are curvature_x and curvature_y."""
+    """A front for which the lens has a net within FITTED; its curvatures are curvature_x and curvature_y."""
 
     def traced(self, outline: Outline) -> Surface:
         """Return the net that stands for it, its vertex at z."""
