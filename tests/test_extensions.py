@@ -1,6 +1,7 @@
 """A surface, a receiver, an emitter, a merit, an effect, checks, sections, a judge of one's own: the package stays."""
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -21,7 +22,11 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.receivers import Receiver
 from bstcad.optics.surfaces import sag
+from bstcad.report import record
+from bstcad.report.data_sheet import Sheet
+from bstcad.report.figure_jobs import light_path_of
 from bstcad.report.light_figures import View, cross_section
+from bstcad.report.units import about
 from bstcad.scene.errors import SceneError
 from bstcad.scene.target import Target
 from bstcad.tolerance.perturbations import Setup, kinds
@@ -153,6 +158,95 @@ def test_a_receiver_of_its_own_is_refused_where_it_cannot_be(scene):
     window = {"kind": "window", "z": 100.0, "thickness": 3.0, "index": 1.5, "outline": rim}
     with pytest.raises(SceneError, match=r"^target: windows and mirrors behind a lens are for planes alone"):
         around.changed({"behind": [window]})
+
+
+@dataclass(frozen=True)
+class Directions(Receiver):
+    """Directions by a sphere around the origin: h to the side from the z axis, v up from the plane y = 0 (degrees)."""
+
+    radius: float
+    unit = "degrees"
+    names = ("h", "v")
+
+    @property
+    def middle(self):
+        return 0.0, 0.0, self.radius
+
+    def where(self, origin=0.0):
+        return f"all directions, {self.radius / 1000:g} m away"
+
+    def per_radian(self, z):
+        return math.degrees(self.throw(z) / self.radius)
+
+    def areas(self, x, y, shape):
+        rows, columns = shape
+        heights = np.abs(np.diff(np.sin(np.radians(np.linspace(*y[::-1], rows + 1)))))
+        return np.repeat(heights[:, None] / heights.mean(), columns, axis=1)
+
+    def path(self, rays):
+        place, direction = (*rays.position[:2], rays.above(0.0)), rays.direction
+        b, c = dot(place, direction), dot(place, place) - self.radius**2
+        status = rays.lose(~(c < 0), Status.TURNED_BACK)
+        return torch.where(c < 0, torch.sqrt((b * b - c).clamp(min=0)) - b, 0.0), status
+
+    def places(self, rays):
+        x, y, z = (*rays.position[:2], rays.above(0.0))
+        return torch.rad2deg(torch.atan2(x, z)), torch.rad2deg(torch.asin(y / self.radius))
+
+    def point(self, x, y):
+        h, v = (torch.deg2rad(torch.as_tensor(angle, dtype=torch.float64)) for angle in (x, y))
+        there = torch.cos(v) * torch.sin(h), torch.sin(v), torch.cos(v) * torch.cos(h)
+        return tuple(self.radius * (p if isinstance(x, torch.Tensor) else p.numpy()) for p in there)
+
+    def normal(self, aim):
+        return tuple(p / self.radius for p in self.point(*aim))
+
+
+def dot(a, b):
+    return sum(p * q for p, q in zip(a, b, strict=True))
+
+
+class OverDirections(Target):
+    """A target over directions."""
+
+    @property
+    def screen(self):
+        return replace(super().screen, surface=Directions(self.z))
+
+
+def test_light_over_directions_is_stated_in_degrees(scene, tmp_path, monkeypatch):
+    """Even light a solid angle, by design, proof and report; pages, sheets and sentences have the receiver's words."""
+    draws_nothing(monkeypatch)
+    asked = scene.changed({"target.z": 10_000.0, "target.x": [-20.0, 20.0], "target.y": [-40.0, 40.0],
+                           "target.outline": None, "target.pixels": [24, 48], "accept.rrmsd": 0.1})  # fmt: skip
+    far = asked.model_copy(update={"targets": (OverDirections(**dict(asked.target)),)})
+    design = bstcad.design(far, progress=False)
+    report = design.write(tmp_path / "far", progress=False, effort=quick_effort())
+    assert report.passed and report.rrmsd < 0.05, report
+    flux = bstcad.measure(design.lens, far.channels(), far.target.screen, design.target).picture.sum(1)
+    v = np.radians(np.linspace(40.0, -40.0, 49))
+    intensity = flux / (np.sin(v[:-1]) - np.sin(v[1:]))
+    assert intensity[2:-2] == pytest.approx(intensity.mean(), rel=0.05)
+    assert flux[3] < 0.85 * flux[24]  # cos 36 degrees, nearly
+
+    contents = record.read(tmp_path / "far" / "report.json")
+    [goal] = contents.goals
+    place = "all directions, 10 m away"
+    assert (goal.where, goal.unit, contents.finest_detail.unit) == (place, "degrees", "degrees")
+    detail = contents.finest_detail
+    assert detail.pixel == pytest.approx(40 / 24) and detail.nearer_distance is None
+    page = (tmp_path / "far" / "report.html").read_text(encoding="utf-8")
+    assert about(detail.width, "degrees") in page
+    sheet = Sheet(
+        scene=far, designed=design.lens, shape=contents.shape, order=contents.order, target=design.target,
+        irradiance=design.target, figures=contents.goals, passed=True, version="1",
+    )  # fmt: skip
+    [words] = [dict(rows) for rows in sheet.tables.values() if "Picture" in dict(rows)]
+    assert words["Size"].startswith("40 × 80 degrees") and words["Screen"] == f"{place} in lens.step"
+    assert words["It covers"] == "h ±20, v ±40 degrees"
+    assert View.of(far).labels == ("h (degrees)", "v (degrees)")
+    shown = light_path_of(far, design.lens, [(design.target, design.target)])
+    assert f"Target 40 × 80 degrees at {place}" in shown.words
 
 
 def test_a_receiver_of_its_own_is_moved_as_its_points_are():

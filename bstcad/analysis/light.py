@@ -32,7 +32,7 @@ from bstcad.optics.trace import (
     trace,
     window,
 )
-from bstcad.optics.unfolding import throw
+from bstcad.optics.unfolding import per_radian, seen_by
 
 
 def _at_interfaces(rays: Rays, lens: Lens) -> list[Rays]:
@@ -307,11 +307,12 @@ class FinestDetail:
 
 def finest_detail(source_image: float, lens: Lens, screen: Screen, of: str, assumed: bool = False) -> FinestDetail:
     """The finest detail on a target where the image of a source of the size `of` is `source_image` pixels wide."""
-    distance, pixel = abs(throw(lens, screen)), _pixel(screen)
+    distance, pixel = abs(seen_by(lens, screen).throw(lens.back.z)), _pixel(screen)
+    grows = distance == abs(per_radian(lens, screen))  # with the distance; an image over angles keeps its width
     sizes = (*(2 * half for half in lens.outline.half_extent), *(high - low for low, high in (screen.x, screen.y)))
     nearer, image = REACH * max(sizes), source_image * pixel
     here, there = (detail_width(image * share, pixel) for share in (1.0, nearer / distance))
-    worth = there < WORTH * here and not lens.behind
+    worth = there < WORTH * here and grows and not lens.behind
     return FinestDetail(
         here, image, pixel, distance, nearer_distance=nearer if worth else None, nearer_width=there if worth else None,
         of=of, assumed=assumed, unit=screen.plane.unit,

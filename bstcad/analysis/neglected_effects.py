@@ -34,7 +34,7 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed
 from bstcad.optics.trace import clear_window, follow_ghost, trace
 from bstcad.optics.tubes import rays_to
-from bstcad.optics.unfolding import throw
+from bstcad.optics.unfolding import per_radian
 
 PLACES = 64  # points a side of the last face, from which light is traced
 GHOSTS, GRAIN = 128, 0.7  # rays a side of a ghost; cells over which the ghost's picture is smoothed
@@ -188,7 +188,7 @@ class Reference:
             return None
         per_unit = math.sqrt(math.prod(self.screen.per_unit))
         wavelength: float = self.channel.source.wavelength  # type: ignore[assignment]  # a channel has one line
-        width = wavelength * 1e-6 * throw(self.lens, self.screen) / math.sqrt(self._lit_area()) * per_unit
+        width = wavelength * 1e-6 * per_radian(self.lens, self.screen) / math.sqrt(self._lit_area()) * per_unit
         return Change(0.0, difference(blurred(self.picture, AIRY * width), self.picture), width)
 
 

@@ -140,7 +140,7 @@ def compare(
     began = time.perf_counter()
     judge, name, version = _known(given)
     declined = judge.cannot(lens, channels)
-    if isinstance(given, str) and screen.plane.axes is None:
+    if isinstance(given, str) and screen.plane.frame is None:
         declined = "it collects light on planes alone"
     if declined:
         return Compared(Judge(name, version, declined, target=key))

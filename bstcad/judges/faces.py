@@ -19,7 +19,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.surfaces import Surface
-from bstcad.optics.unfolding import throw
+from bstcad.optics.unfolding import per_radian
 
 NEWTON = 6  # steps for the parameter of a point; the first guess is at most half a knot off
 CELLS = 512  # a side of the grid over a face without knots
@@ -145,8 +145,8 @@ class FaceError:
     slope: float  # rad, RMS angle between normals
 
     def shift(self, lens: Lens, screen: Screen) -> float:
-        """Shift of light on the screen (mm)."""
-        return self.slope * lens.deflection * abs(throw(lens, screen))
+        """Return the shift of light on the screen, in its unit."""
+        return self.slope * lens.deflection * abs(per_radian(lens, screen))
 
     @classmethod
     def worst(cls, errors: Iterable[FaceError]) -> FaceError:

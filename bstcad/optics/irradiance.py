@@ -85,6 +85,11 @@ class Screen:
         """Columns along x and rows along y in a unit of the receiver."""
         return self.columns / (self.x[1] - self.x[0]), self.rows / (self.y[1] - self.y[0])
 
+    @property
+    def areas(self) -> np.ndarray | None:
+        """Areas or solid angles of the pixels (rows, columns), of mean 1; None: they are equal."""
+        return self.plane.areas(self.x, self.y, self.shape)
+
     def pixel(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """(column, row) of (x, y), as real numbers: pixel i reaches from i to i + 1."""
         per_x, per_y = self.per_unit

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -111,6 +112,14 @@ class Receiver(ABC):
         """From the plane z to its middle (mm), along the axis."""
         return self.middle[2] - z
 
+    def per_radian(self, z: float) -> float:
+        """Return how far, in its unit, light from (0, 0, z) moves in its middle as it turns by a radian."""
+        return self.throw(z)
+
+    def areas(self, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]) -> np.ndarray | None:
+        """Return the areas or solid angles of the (rows, columns) cells of x by y, of mean 1; None: they are equal."""
+        return None
+
     def seen(self, x: Array, y: Array, eye: float) -> tuple[Array, Array]:
         """The points of the level plane through its middle at which its places are seen from (0, 0, eye), in mm."""
         p_x, p_y, p_z = self.point(x, y)
@@ -146,6 +155,14 @@ class Moved(Receiver):
     def where(self, origin: float = 0.0) -> str:
         """Return the place of the receiver at rest in words."""
         return self.rest.where(origin)
+
+    def per_radian(self, z: float) -> float:
+        """Return how far, in its unit, light from (0, 0, z) moves at rest in its middle as it turns by a radian."""
+        return self.rest.per_radian(z)
+
+    def areas(self, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]) -> np.ndarray | None:
+        """Return the areas of the cells of the receiver at rest, of mean 1; None: they are equal."""
+        return self.rest.areas(x, y, shape)
 
     @property
     def middle(self) -> Vector:

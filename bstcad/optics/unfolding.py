@@ -114,9 +114,14 @@ def imaged(behind: Sequence[Interface], screen: Screen) -> Screen:
     return replace(screen, surface=image(behind, screen.plane)) if behind else screen
 
 
-def throw(lens: Lens, screen: Screen) -> float:
-    """Return the distance (mm) along the axis from the back of a lens to a screen where the lens sees it."""
-    return image(lens.behind, screen.plane).throw(lens.back.z)
+def seen_by(lens: Lens, screen: Screen) -> Receiver:
+    """Return the receiver of a screen where a lens sees it."""
+    return image(lens.behind, screen.plane)
+
+
+def per_radian(lens: Lens, screen: Screen) -> float:
+    """Return how far, in a screen's unit, light moves on it as it leaves the back of a lens turned by a radian."""
+    return seen_by(lens, screen).per_radian(lens.back.z)
 
 
 def _reflected(v: Vector, n: Vector) -> Vector:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
+from dataclasses import replace
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -147,15 +148,16 @@ def draw_transport(source: Emitter, lens: Lens, screen: Screen, view: View) -> P
 
 def draw_light(target: np.ndarray, light: Light, lines: Sequence[Line], view: View) -> Pngs:
     """The pictures of the light; one of the ghost and of the lines of a spectrum if there are any."""
-    found = light.picture
+    target, found = view.irradiance(target), view.irradiance(light.picture)
     pictures = {
         "irradiance": light_figures.irradiance_triptych(target, found, view),
         "cross_section": light_figures.cross_section(target, found, view),
     }
     if light.ghost is not None:
-        pictures["ghost"] = light_figures.ghost_picture(target, light.ghost, view)
+        pictures["ghost"] = light_figures.ghost_picture(target, view.irradiance(light.ghost), view)
     if lines:
-        pictures["lines"] = light_figures.lines_apart(target, found, lines, view)
+        drawn = [replace(line, picture=view.irradiance(line.picture)) for line in lines]
+        pictures["lines"] = light_figures.lines_apart(target, found, drawn, view)
     return {numbered(name, view.number): png(picture) for name, picture in pictures.items()}
 
 

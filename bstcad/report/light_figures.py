@@ -116,6 +116,11 @@ class View:
         """An array in coordinates (column 0 = x min), mirrored if the target is seen from the lens."""
         return values[:, ::-1] if self.seen_from == "lens" else values
 
+    def irradiance(self, flux: np.ndarray) -> np.ndarray:
+        """Return the irradiance of the flux in each pixel, in units of the mean pixel's area."""
+        areas = self.receiver.areas(self.x, self.y, flux.shape)
+        return flux if areas is None else flux / areas
+
     @property
     def across(self) -> Extent:
         """x at the left and at the right."""

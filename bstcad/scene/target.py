@@ -187,6 +187,8 @@ class Target(Record):
         flux = seen[:, ::-1] if self.seen_from == "lens" else seen
         if self.outline is not None:
             flux = flux * inside(self.outline, self.columns_rows, self.size)
+        if (areas := self.screen.areas) is not None:  # the picture is irradiance
+            flux = flux * areas
         total = flux.sum()
         if not total > 0:
             raise SceneError(f"target.{self._pictures[0]}: the picture is all black; give one with some light in it")

@@ -173,14 +173,14 @@ def _possible(scene: Scene, candidates: list[Candidate]) -> tuple[tuple[Candidat
 def moved(scene: Scene) -> float:
     """Pixels by which the tightest valley that the tool makes moves light on the target within a cell; inf: any.
 
-    p L (n - 1) / R of a cell of pitch p behind a throw L (mm); a mirror turns light by twice its slope.  Where light
+    p L (n - 1) / R of a cell of pitch p behind a throw L; a mirror turns light by twice its slope.  Where light
     has to part, a seam is as wide as the tool makes it, and much finer cells do not narrow it.
     """
     radius, target = scene.lens.tool_radius, scene.target
     if radius is None:
         return math.inf
     turn = 2.0 if scene.lens.back.reflect else scene.index - 1
-    throw = abs(target.z - scene.lens.back.z) * turn / radius
+    throw = abs(target.screen.plane.per_radian(scene.lens.back.z)) * turn / radius
     return throw * math.sqrt(math.prod(scene.lens.cells)) * math.sqrt(math.prod(target.screen.per_unit))
 
 

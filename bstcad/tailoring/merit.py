@@ -351,7 +351,7 @@ def _farther(at_net: Rays, aim: Tensor, plane: Receiver, law: Law, seen: np.ndar
         t, lit = aim[..., some, some], seen[some, some]
         if not lit.any():
             return None
-        step = STEP * torch.sqrt((t**2).sum(0) + plane.throw(at_net.z) ** 2).max()
+        step = STEP * torch.sqrt((t**2).sum(0) + plane.per_radian(at_net.z) ** 2).max()
         here, *there = (
             torch.stack(wanted_slopes(rays, t + step * torch.tensor(way).to(t).view(2, 1, 1), plane, law))
             for way in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))

@@ -102,7 +102,7 @@ def along_light(source: Emitter, lens: Lens, goals: Sequence[Goal]) -> tuple[csr
 
     own = (back.z - front.z) / lens.index / _magnification(q.numpy(), places, lit)
     shifts = [
-        goal.receiver.plane.throw(back.z)
+        goal.receiver.plane.per_radian(back.z)
         / _magnification(q.numpy(), _array(goal.receiver.plane.land(out).position), lit)
         for goal in goals
     ]

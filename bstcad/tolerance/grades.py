@@ -62,8 +62,9 @@ def limit(kind: Kind, grade: Grade, setup: Setup) -> float:
     """± of a kind of error, in its unit."""
     part, _, error = kind.name.partition(".")
     if part == "screen" and kind.unit == "mm":
-        screen = setup.screen
-        width, distance = screen.x[1] - screen.x[0], abs(screen.plane.throw(setup.pivot("lens")[2]))
+        screen, z = setup.screen, setup.pivot("lens")[2]
+        distance = abs(screen.plane.throw(z))
+        width = (screen.x[1] - screen.x[0]) * (distance / abs(screen.plane.per_radian(z)))  # mm
         return grade.screen * (distance if error == "axial" else width)
     if error.startswith(("tilt", "clocking", "wedge")):
         return grade.tilt
