@@ -31,7 +31,7 @@ from bstcad.optics.sides import both, in_words, plain
 from bstcad.optics.surfaces import Surface
 from bstcad.report import record
 from bstcad.report.drawing import png
-from bstcad.report.light_figures import View, irradiance_triptych, tones
+from bstcad.report.light_figures import View, irradiance_triptych
 from bstcad.report.record import BY_HAND, Contents, Making, Report, rrmsds
 from bstcad.report.units import number, quantity
 from bstcad.runs import files, processes
@@ -308,7 +308,8 @@ class Design:
         wanted = self._made.goals
         if not 0 <= target < len(wanted):
             raise SceneError(f"target: there is no target[{target}], the last is target[{len(wanted) - 1}]; give one")
-        seen = View.of(self.scene, target).picture(tones(self._irradiance(target), wanted[target].picture))
+        view = View.of(self.scene, target)
+        seen = view.picture(view.tones(self._irradiance(target), wanted[target].picture))
         grey = np.ascontiguousarray(seen)
         if png is not None:
             Image.fromarray(grey).save(Path(png).expanduser(), format="png")

@@ -236,7 +236,8 @@ def test_light_over_directions_is_stated_in_degrees(scene, tmp_path, monkeypatch
     detail = contents.finest_detail
     assert detail.pixel == pytest.approx(40 / 24) and detail.nearer_distance is None
     page = (tmp_path / "far" / "report.html").read_text(encoding="utf-8")
-    assert about(detail.width, "degrees") in page
+    finest = contents.remaining_error["octaves"][-1]["period"]
+    assert about(detail.width, "degrees") in page and about(finest[0], "degrees") in page
     sheet = Sheet(
         scene=far, designed=design.lens, shape=contents.shape, order=contents.order, target=design.target,
         irradiance=design.target, figures=contents.goals, passed=True, version="1",
@@ -244,7 +245,8 @@ def test_light_over_directions_is_stated_in_degrees(scene, tmp_path, monkeypatch
     [words] = [dict(rows) for rows in sheet.tables.values() if "Picture" in dict(rows)]
     assert words["Size"].startswith("40 × 80 degrees") and words["Screen"] == f"{place} in lens.step"
     assert words["It covers"] == "h ±20, v ±40 degrees"
-    assert View.of(far).labels == ("h (degrees)", "v (degrees)")
+    view = View.of(far)
+    assert view.labels == ("h (degrees)", "v (degrees)") and np.ptp(view.tones(design.target, design.target)) == 0
     shown = light_path_of(far, design.lens, [(design.target, design.target)])
     assert f"Target 40 × 80 degrees at {place}" in shown.words
 

@@ -94,7 +94,7 @@ class Glance:
         from PIL import Image
 
         from bstcad.optics.measure import a_side, tubes_picture
-        from bstcad.report.light_figures import View, tones
+        from bstcad.report.light_figures import View
 
         scene, target = self._scene, self._scene.target
         channels = scene.channels(SPREAD_POINTS) if scene.source.extent else scene.channels()
@@ -102,7 +102,8 @@ class Glance:
         light, wanted = tubes_picture(lens.plain(), channels, screen, n).numpy(), target.irradiance()
         if not light.sum() > 0:
             return
-        image = Image.fromarray(View.of(scene).picture(tones(light * (wanted.sum() / light.sum()), wanted)).copy())
+        view, scaled = View.of(scene), light * (wanted.sum() / light.sum())
+        image = Image.fromarray(view.picture(view.tones(scaled, wanted)).copy())
         image.thumbnail((SIZE, SIZE))
         written = io.BytesIO()
         image.save(written, "png")

@@ -8,7 +8,7 @@ from typing import Any
 
 from bstcad.app.preview import Preview
 from bstcad.report.figure_jobs import light_path_of
-from bstcad.report.light_figures import View, tones
+from bstcad.report.light_figures import View
 from bstcad.report.record import LEFT_OUT, LeftOut, changes
 from bstcad.report.rendering import data_url, turnable
 from bstcad.report.units import duration, number, percent, quantity
@@ -32,8 +32,8 @@ def of_preview(found: Preview) -> dict[str, Any]:
     views = [View.of(found.scene, k) for k in range(len(found.pictures))]
     targets = [
         {
-            "key": key, "rrmsd": number(value), "wanted": data_url(view.picture(tones(wanted, wanted))),
-            "light": data_url(view.picture(tones(light, wanted))), "seen": view.words,
+            "key": key, "rrmsd": number(value), "wanted": data_url(view.picture(view.tones(wanted, wanted))),
+            "light": data_url(view.picture(view.tones(light, wanted))), "seen": view.words,
             "pixels": list(light.shape[::-1]), "source_image": image and quantity(image.width, image.unit),
         }
         for key, view, value, (wanted, light, image) in zip(

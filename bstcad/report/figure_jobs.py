@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
-from dataclasses import replace
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -148,16 +147,15 @@ def draw_transport(source: Emitter, lens: Lens, screen: Screen, view: View) -> P
 
 def draw_light(target: np.ndarray, light: Light, lines: Sequence[Line], view: View) -> Pngs:
     """The pictures of the light; one of the ghost and of the lines of a spectrum if there are any."""
-    target, found = view.irradiance(target), view.irradiance(light.picture)
+    found = light.picture
     pictures = {
         "irradiance": light_figures.irradiance_triptych(target, found, view),
         "cross_section": light_figures.cross_section(target, found, view),
     }
     if light.ghost is not None:
-        pictures["ghost"] = light_figures.ghost_picture(target, view.irradiance(light.ghost), view)
+        pictures["ghost"] = light_figures.ghost_picture(target, light.ghost, view)
     if lines:
-        drawn = [replace(line, picture=view.irradiance(line.picture)) for line in lines]
-        pictures["lines"] = light_figures.lines_apart(target, found, drawn, view)
+        pictures["lines"] = light_figures.lines_apart(target, found, lines, view)
     return {numbered(name, view.number): png(picture) for name, picture in pictures.items()}
 
 
@@ -342,7 +340,7 @@ def light_path_of(
         rays=rays,
         flux=MILLIONTHS * flux,
         screens=tuple(map(corners, screens)),
-        pictures=tuple(light_figures.tones(irradiance, wanted) for wanted, irradiance in pictures),
+        pictures=tuple(View.of(scene, k).tones(light, wanted) for k, (wanted, light) in enumerate(pictures)),
         lamp=rays[:1, 0] if np.ptp(rays[:, 0], axis=0).max() < 1e-6 else np.empty((0, 3)),
         seen_along=1 if scene.target.seen_from == "lens" else -1,
         mirror=lens.reflects,

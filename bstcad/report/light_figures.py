@@ -116,6 +116,10 @@ class View:
         """An array in coordinates (column 0 = x min), mirrored if the target is seen from the lens."""
         return values[:, ::-1] if self.seen_from == "lens" else values
 
+    def tones(self, light: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        """Return flux in each pixel as grey tones, in coordinates, on the scale of what is wanted."""
+        return tones(self.irradiance(light), self.irradiance(wanted))
+
     def irradiance(self, flux: np.ndarray) -> np.ndarray:
         """Return the irradiance of the flux in each pixel, in units of the mean pixel's area."""
         areas = self.receiver.areas(self.x, self.y, flux.shape)
@@ -273,6 +277,7 @@ def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) 
 
     target, irradiance: (rows, columns) in coordinates, one sum.
     """
+    target, irradiance = view.irradiance(target), view.irradiance(irradiance)
     simulated = "Simulated through the lens" if view.optic == "lens" else "Simulated by the mirror"
     pictures, height = {"Target": target, simulated: irradiance}, 1.3 + 2.8 * view.proportion
     figure, panels = _side_by_side(
@@ -315,7 +320,7 @@ def ghost_picture(target: np.ndarray, ghost: np.ndarray, view: View) -> Figure:
 
     ghost: (rows, columns) in coordinates, of the irradiance that has the target's sum.
     """
-    share = 100.0 * ghost / lit_mean(target)
+    share = 100.0 * view.irradiance(ghost) / lit_mean(view.irradiance(target))
     figure = new_figure(5.6, 4.6, layout="compressed")
     axes = figure.subplots()
     top = HEADROOM * float(np.percentile(share, RARE)) or 1.0
@@ -329,6 +334,7 @@ def ghost_picture(target: np.ndarray, ghost: np.ndarray, view: View) -> Figure:
 @styled
 def cross_section(target: np.ndarray, irradiance: np.ndarray, view: View) -> Figure:
     """Target and simulated irradiance along rows and columns: through the centre, and through the brightest place."""
+    target, irradiance = view.irradiance(target), view.irradiance(irradiance)
     unit = lit_mean(target)
     along_x, along_y = _pixel_centres(view.x, target.shape[1]), _pixel_centres(view.y, target.shape[0])[::-1]
     figure = new_figure(11.0, 4.9)
@@ -359,19 +365,20 @@ def lines_apart(target: np.ndarray, irradiance: np.ndarray, lines: Sequence[Line
 
     target, irradiance by all lines, and pictures: (rows, columns) in coordinates, one sum.
     """
-    unit = lit_mean(target)
-    top = brightest(target, irradiance) / unit
+    even = view.irradiance(target)
+    unit = lit_mean(even)
+    top = brightest(even, view.irradiance(irradiance)) / unit
     rows = -(-(1 + len(lines)) // ACROSS)
     tall = PANEL * (view.y[1] - view.y[0]) / (view.x[1] - view.x[0])
     figure = new_figure(11.0, 0.6 + rows * (0.6 + min(tall, TALLEST)), layout="compressed")
     panels = figure.subplots(rows, ACROSS, sharey=True, sharex=True, squeeze=False).ravel()
-    parts = ([getattr(line, name) for line in lines] for name in ("picture", "wavelength", "share"))
-    colours = balanced(*parts)
+    alone = [view.irradiance(line.picture) for line in lines]
+    colours = balanced(alone, *([getattr(line, name) for line in lines] for name in ("wavelength", "share")))
     draw_picture(panels[0], to_srgb(np.clip(colours / unit / top, 0.0, 1.0)), view)
     panels[0].set_title("All lines")
-    for axes, line in zip(panels[1:], lines, strict=False):
+    for axes, line, picture in zip(panels[1:], lines, alone, strict=False):
         title = f"{line.wavelength:g} nm (RRMSD {rrmsd(target, line.picture):.3g})"
-        _grey(axes, line.picture / unit, view, top=top, title=title)
+        _grey(axes, picture / unit, view, top=top, title=title)
     for axes in panels[1 + len(lines) :]:
         axes.set_visible(False)
     for axes in panels[::ACROSS]:
@@ -439,7 +446,7 @@ def draw_part(made: MadePart, designed: np.ndarray, view: View) -> dict[str, byt
 def made_part(made: MadePart, designed: np.ndarray, view: View) -> Figure:
     """The fitted form error, the light of the made part, and the difference of this light from the designed light."""
     x, y, form = made.deviation.x, made.deviation.y, made.deviation.form
-    predicted = made.irradiances[view.number]
+    designed, predicted = view.irradiance(designed), view.irradiance(made.irradiances[view.number])
     outliers, unit = made.outliers[:, :2], lit_mean(designed)
     most, pv = float(np.nanmax(np.abs(form))), float(np.nanmax(form) - np.nanmin(form))
     _, times, written = next(rung for rung in FORM_UNITS if most >= rung[0])
@@ -507,7 +514,9 @@ def worst_trials(
     worst: number, RRMSD and picture (rows, columns) in coordinates, with the target's sum, of each.  of: ", target[0]",
     where there are several.
     """
-    worst, unit = worst[:SHOWN], lit_mean(nominal)
+    nominal = view.irradiance(nominal)
+    worst = [(number, value, view.irradiance(picture)) for number, value, picture in worst[:SHOWN]]
+    unit = lit_mean(nominal)
     figure = new_figure(11.0, 1.0 + 4.6 * view.proportion, layout="compressed")
     panels = figure.subplots(2, 1 + SHOWN, sharex=True, sharey=True, squeeze=False)
     top = max(brightest(nominal, picture) for _, _, picture in worst) / unit

@@ -30,7 +30,7 @@ from bstcad.scene.profile import Profile
 from bstcad.scene.schema import COORDINATES, OneOrTwo, Record, from_file, leaving_out
 
 FEWEST = 8  # pixels along a side, unless asked for fewer (which the range of `pixels` refuses)
-NARROWEST = 1e-3  # mm; a target's side, as an outline's
+NARROWEST = 1e-3  # mm, or another unit of the target; a target's side, as an outline's
 WITHOUT_GAMMA = ("text", "uniform", "profile")
 MOST = 8  # targets of a scene
 SEEN = 0.01  # RRMSD between two readings of a picture, from which on it is said which was taken
@@ -110,7 +110,7 @@ class Target(Record):
             if not low < high:
                 yield f"target.{axis}: [{low:g}, {high:g}] is no interval; write the smaller end first"
             if high - low < NARROWEST:
-                yield f"target.{axis}: is narrower than {NARROWEST:g} mm; move its ends apart"
+                yield f"target.{axis}: is narrower than {NARROWEST:g} {self.unit}; move its ends apart"
         if self.text is not None and not (self.text.strip() and len(self.text) <= 100):
             yield 'target.text: must have 1 to 100 letters; give for example text = "THU"'
         if self.gamma is not None and given[0] in WITHOUT_GAMMA:
@@ -138,12 +138,12 @@ class Target(Record):
             if 2 * along > size:
                 yield f"target.profile: is larger than the target along {axis}; make it smaller or widen {axis}"
             if along < least:
-                fine = f"reaches {along:g} mm from the middle along {axis}, less than a pixel of {least:.3g} mm"
-                yield f"target.profile: {fine}; make it larger, or ask for more pixels"
+                fine = f"reaches {along:g} {self.unit} from the middle along {axis}, less than a pixel of {least:.3g}"
+                yield f"target.profile: {fine} {self.unit}; make it larger, or ask for more pixels"
 
     @property
     def _half_profile(self) -> tuple[float, float]:
-        """Half the width and height (mm) of the profile as it lies."""
+        """Half the width and height of the profile as it lies, in `unit`."""
         along_x, along_y = self.profile.half_extent
         return (along_y, along_x) if self.rotate in (90, 270) else (along_x, along_y)
 
@@ -153,8 +153,13 @@ class Target(Record):
 
     @property
     def size(self) -> tuple[float, float]:
-        """Width and height (mm)."""
+        """Width and height, in `unit`."""
         return self.x[1] - self.x[0], self.y[1] - self.y[0]
+
+    @property
+    def unit(self) -> str:
+        """Unit of x and y, by the receiver."""
+        return self.screen.plane.unit
 
     @property
     def columns_rows(self) -> tuple[int, int]:
@@ -252,8 +257,8 @@ class Target(Record):
             yield f"lens.outline.{name}: {size:g} mm; {question}"
         elif 0 < self.z <= FAR and self.z - lens.back.z < across / 4:
             yield f"target.z: {self.z:g} mm; {question}"
-        elif (unit := self.screen.plane.unit) == "mm" and widest < min(across / NARROW, FAR):
-            yield f"target.x: {self.size[0]:g} {unit} wide; {question}"
+        elif self.unit == "mm" and widest < min(across / NARROW, FAR):
+            yield f"target.x: {self.size[0]:g} mm wide; {question}"
 
     def remarks(self) -> tuple[str, ...]:
         """A sentence on each thing that happens to the picture and that the scene does not ask for."""
@@ -379,7 +384,7 @@ def _drawing(target: Target) -> Drawing:
             "target.image: the file holds several pictures; the first is taken" if photo.several else "",
             transparent,
             assumed,
-            _fitted(shown[::-1] if lies else shown, target.size, target.fit),
+            _fitted(shown[::-1] if lies else shown, target),
         )
     light = np.rot90(light, target.rotate // 90)
     return Drawing(light[:, ::-1] if target.mirror else light, tuple(filter(None, remarks)))
@@ -397,7 +402,7 @@ def _assumed(photo: picture.Photo, light: np.ndarray, part: Window, pixels: tupl
 
 
 def _ink(text: str, pixels: tuple[int, int], size: tuple[float, float]) -> np.ndarray:
-    """(rows, columns) share of ink of a text over a size (mm)."""
+    """(rows, columns) share of ink of a text over a size (width, height)."""
     aspect, side = size[0] / size[1], min(4 * max(pixels), 4096)  # drawn finer, then averaged: smooth rims
     width, height = max(round(side * min(aspect, 1.0)), 16), max(round(side * min(1 / aspect, 1.0)), 16)
     image = picture.letters(text, width, height)
@@ -445,11 +450,11 @@ def window(shown: tuple[int, int], size: tuple[float, float], fit: str) -> Windo
     return 0.0, (height - down) / 2, width, (height + down) / 2
 
 
-def _fitted(shown: tuple[int, int], size: tuple[float, float], fit: str) -> str:
-    """A remark on what `fit` does to a picture on a target of a size (mm); "" if it does nothing."""
-    width, height = shown
+def _fitted(shown: tuple[int, int], target: Target) -> str:
+    """A remark on what `fit` does to a picture on a target; "" if it does nothing."""
+    (width, height), size, fit = shown, target.size, target.fit
     left, top, right, bottom = window(shown, size, fit)
-    target = "square" if size[0] == size[1] else f"{size[0]:g} x {size[1]:g} mm"
+    form = "square" if size[0] == size[1] else f"{size[0]:g} x {size[1]:g} {target.unit}"
     stretched = (width * size[1]) / (height * size[0])
     if (right - left, bottom - top) != shown and fit == "pad":
         done = 'kept whole, with dark strips beside it; fit = "crop" fills the target'
@@ -460,7 +465,7 @@ def _fitted(shown: tuple[int, int], size: tuple[float, float], fit: str) -> str:
         done = f'stretched {along} by {more:.2g} %; fit = "crop" keeps its proportions'
     else:
         return ""
-    return f"target.fit: the picture is {width} x {height}, the target {target}: {done}"
+    return f"target.fit: the picture is {width} x {height}, the target {form}: {done}"
 
 
 def average(
@@ -492,7 +497,7 @@ def overlap(size: int, pixels: int, start: float = 0.0, stop: float | None = Non
 
 
 def inside(outline: Outline, pixels: tuple[int, int], size: tuple[float, float]) -> np.ndarray:
-    """The share of each pixel (columns, rows) that lies inside an outline centred in a rectangle of a size (mm)."""
+    """The share of each pixel (columns, rows) that lies inside an outline centred in a rectangle of a size."""
     columns, rows = pixels
     fine = max(2048 // max(pixels), 4)  # sub-pixels along a pixel's side
     x, y = (

@@ -82,7 +82,7 @@ def verdict(scene: Scene, found: Mapping[str, Any]) -> dict[str, str] | None:
     targets = zip(scene.targets, found["goals"], strict=True)
     images = [(each["blur"]["rrmsd"], each["blur"]["width"], target) for target, each in targets if each["blur"]]
     blurred, width, target = max(images, key=lambda image: image[0], default=(0.0, 0.0, scene.target))
-    wide, unit = max(high - low for low, high in (target.screen.x, target.screen.y)), target.screen.plane.unit
+    wide, unit = max(high - low for low, high in (target.x, target.y)), target.unit
     least, most = (number(two_digits(value)) for value in (UNDONE * blurred, blurred))
     if UNDONE * blurred > allowed:
         permits = "" if asked is None else f", where {number(asked)} is allowed"
