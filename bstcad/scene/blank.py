@@ -192,10 +192,6 @@ class _Front:
         names = tuple(self.surface.parameters()) if self.optimise else ()
         return names if self.optimise is True else tuple(name for name in names if name in self.optimise)
 
-    def numbers(self, front: Surface) -> dict[str, float]:
-        """Return the shape of a designed front by its keys in the scene; {} of a net, which has its control points."""
-        return {name: value for name, value in front.plain().parameters().items() if isinstance(value, float)}
-
     def designed(self, surface: Surface) -> Self:
         """The same front with the parameters of this surface, and nothing left to find."""
         return replace(self, **surface.plain().parameters(), optimise=False) if self.free else self
@@ -289,10 +285,6 @@ class _FittedFront(_Front):
         """Return the net that stands for it, its vertex at z."""
         return _net_of(self.surface, outline)
 
-    def numbers(self, front: Surface) -> dict[str, float]:
-        """Return its own numbers, which the net of the lens does not have."""
-        return self.surface.parameters()
-
     def complaints(self, outline: Outline) -> Iterator[str]:
         """It ends before the rim, or stands too steeply there for a net."""
         x, y = map(torch.from_numpy, outline.places())
@@ -302,9 +294,8 @@ class _FittedFront(_Front):
             return
         half = dict(zip(("curvature_x", "curvature_y"), outline.half_extent, strict=True))
         name = max(half, key=lambda name: abs(getattr(self, name)) * half[name])
-        radius = f"{1 / abs(getattr(self, name)):g} mm"
-        why = f"a radius of {radius} ends before the rim, or is steeper than {STEEP_NET:g} degrees there"
-        yield f"{name}: {why}; make the curvature smaller"
+        why = f"ends before the rim, or is steeper than {STEEP_NET:g} degrees there; make the curvature smaller"
+        yield f"{name}: a radius of {1 / abs(getattr(self, name)):g} mm {why}"
 
 
 @dataclass(frozen=True)
