@@ -383,10 +383,9 @@ def _fitting(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
         raise SceneError(f"with_lens: its back has heights of shape {shape}; give m along x and n along y, (m, n)")
     if not bool(torch.isfinite(lens.back.heights).all()) or not math.isfinite(lens.back.z):
         raise SceneError("with_lens: heights of its back are not finite; give numbers in mm")
-    kinds = {True: "a mirror", False: "a lens"}
     _check_same("outline", lens.outline, scene.lens.outline)
-    _check_same("kind", kinds[lens.reflects], kinds[scene.lens.back.reflect])
-    if not (lens.reflects or math.isclose(lens.index, scene.index, rel_tol=SAME)):
+    _check_same("way of light", lens.passes.words, scene.lens.passes.words)
+    if lens.passes.enters and not math.isclose(lens.index, scene.index, rel_tol=SAME):
         _check_same("index", lens.index, scene.index)
     if lens.back.shape != both(scene.lens.back.net):
         scene = scene.changed({"lens.back.control_points": plain(lens.back.shape), "tailoring.levels": None})

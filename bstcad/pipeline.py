@@ -221,7 +221,7 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
     lens, grazing = light.through(scene.flat_lens(REACH_NET)), GRAZING
     goal = replace(goal, receiver=imaged(lens.behind, goal.receiver))
     lens = replace(lens, behind=())
-    if not lens.reflects:
+    if refracts := lens.passes.largest_turn(light.index) is not None:
         grazing = grazing_of(light.index, [each.index for each in channels], spread_at(scene.source, lens))
     part = reachable(light.source, lens, goal, grazing=grazing)
     if part is not None and scene.lens.front.free:  # another front may send light further
@@ -236,12 +236,12 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
         reached(lens, math.nan)
     if scene.target.unreachable == "refuse":
         raise SceneError(f"{goal.key}: {unreachable(scene, part, goal.picture)}; {FURTHER[scene.optic]}")
-    return part, None if lens.reflects else Edge(light, grazing)
+    return part, Edge(light, grazing) if refracts else None
 
 
 def unreachable(scene: Scene, part: np.ndarray, picture: np.ndarray) -> str:
     """How much of a target lies outside of the part that can be lit, and why, as a sentence without its end."""
-    found = unreached(picture, part, None if scene.lens.back.reflect else scene.index)
+    found = unreached(picture, part, scene.lens.passes.largest_turn(scene.index))
     area, light = (f"{100 * found[key]:.2g} %" for key in ("area", "light"))
     why = "no slope up to 70 degrees sends light there"
     if found["angle"] is not None:
@@ -457,7 +457,8 @@ def purpose(scene: Scene, device: str) -> dict[str, Any]:
 
 def reached(lens: Lens, rrmsd: float) -> float:
     """RRMSD after stage 1; SceneError if no light reaches the target, which no later stage could bring there."""
-    if not math.isfinite(rrmsd) and lens.reflects:
+    angle = lens.passes.largest_turn(lens.index)
+    if not math.isfinite(rrmsd) and angle is None:
         raise SceneError(
             "target: no light that the mirror throws back reaches it; move it nearer to where a flat mirror would send "
             "the light, or further from the mirror along +z"
@@ -465,7 +466,7 @@ def reached(lens: Lens, rrmsd: float) -> float:
     if not math.isfinite(rrmsd):
         raise SceneError(
             f"target: no light reaches it: a face of index {lens.index:.4g} turns light by less than "
-            f"{math.degrees(math.acos(1 / lens.index)):.3g} degrees before it reflects it; "
+            f"{angle:.3g} degrees before it reflects it; "
             "move the target nearer to where the light falls by itself"
         )
     return rrmsd

@@ -140,7 +140,10 @@ class TestOwnSurfaces:
             "outline is Circle.*the scene's is Rectangle",
         ),
         (lambda d: d.with_lens(replace(d.lens, index=1.6)), "index is 1.6, and the scene's is 1.49"),
-        (lambda d: d.with_lens(replace(d.lens, reflects=True)), "kind is a mirror, and the scene's is a lens"),
+        (
+            lambda d: d.with_lens(replace(d.lens, reflects=True)),
+            "way of light is by a mirror's back, and the scene's is by a lens's front, back",
+        ),
         (
             lambda d: d.with_lens(net(d, x=(-3.0, 4.0))),
             r"net along x \(mm\) is \(-3.0, 4.0\), and the scene's is \(-4\.571\d+, 4\.571\d+\); give that",

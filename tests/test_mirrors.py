@@ -47,7 +47,7 @@ def test_every_check_passes(made):
 def test_the_wall_shows_the_letter_as_it_is_to_whom_looks_along_z(made):
     """x grows to the left there; a letter that is turned or mirrored correlates less."""
     folder, _, scene = made
-    lens = step_checks.lens(folder / "lens.step", scene.index, reflects=True)
+    lens = step_checks.lens(folder / "lens.step", scene.index, scene.lens.passes)
     light = bstcad.measure(lens, scene.channels(), scene.target.screen, scene.target.irradiance(), EFFORT)
     seen = light.picture[:, ::-1]
     wanted = scene.target.irradiance()[:, ::-1]
@@ -80,5 +80,5 @@ def test_it_is_told_in_the_words_of_a_mirror(made):
     assert "Mirror report" in page and "missed the mirror" in page and "meets the mirror" in page
     assert "total internal reflection" not in page and "missed the lens" not in page and "Glass" not in page
     text = (folder / "prescription.txt").read_text(encoding="utf-8")
-    assert "Rear of the plate" in text and "refractive index" not in text
+    assert "Rear: dark" in text and "refractive index" not in text
     assert "reflect = true" in (folder / "scene.toml").read_text(encoding="utf-8")

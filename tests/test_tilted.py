@@ -43,7 +43,7 @@ def test_it_passes_and_is_about_as_good_as_the_level_one(made):
 def test_rays_in_space_draw_the_picture(made):
     """The lens as it was read back, its rays carried to the plane by n · (P - C) = 0 here, counted in pixels."""
     folder, report, scene = made
-    lens = step_checks.lens(folder / "lens.step", scene.index, reflects=scene.lens.back.reflect)
+    lens = step_checks.lens(folder / "lens.step", scene.index, scene.lens.passes)
     half_x, half_y = lens.outline.half_extent
     line = (torch.arange(500, dtype=torch.float64) + 0.5) / 250 - 1
     x, y = (p.reshape(-1) for p in torch.meshgrid(half_x * line, half_y * line, indexing="ij"))

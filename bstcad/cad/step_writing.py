@@ -95,7 +95,7 @@ def write_lens(
     part: the file states its facts; None: a colour.  properties: those of the lens, where they are known already.
     ValueError if the lens's faces bound no solid.
     """
-    part = part or Part(colour=METAL if lens.reflects else GLASS)
+    part = part or Part(colour=GLASS if lens.passes.enters else METAL)
     shape, faces = lens_shape(lens)
     write(shape, path, name, part, faces=faces, properties=properties or quadrature.of_lens(lens))
 

@@ -180,7 +180,7 @@ def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, se
     n = max(1, round(a_side(channels) * math.sqrt(rays / 2)))
     known = surfaces(lens)
     halves, count = np.zeros((2, *screen.shape)), 0
-    sense = (-1) ** sum(interface.law.reverses for interface in lens.behind)
+    sense = lens.passes.sense * (-1) ** sum(interface.law.reverses for interface in lens.interfaces[lens.solid.start :])
     for half, picture in enumerate(halves):
         for channel, place in zip(channels, places(channels), strict=True):
             glass, landed, launched = channel.through(lens), np.zeros(screen.shape), 0.0

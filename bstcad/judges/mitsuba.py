@@ -40,7 +40,6 @@ from bstcad.optics.trace import window
 
 LLVM = 16  # the first version by which its kernels compile; with 15 the process ends
 WHITE = 1e-3  # reflectance of the screen: light back to the lens does not matter
-STRAIGHT = {False: 3, True: 2}  # surfaces that light meets, the screen the last: of a lens, of a mirror
 AT_ONCE = 1 << 22  # photons in a pass, by memory
 PARTS = (1, 2, 4)  # parts of half a span of the net
 MOST = 5_000_000  # corners of a mesh
@@ -58,18 +57,20 @@ def cannot(lens: Lens, channels: Sequence[Channel]) -> str:
     """Why it cannot trace this light, in a sentence; "": it can."""
     if lens.before or lens.behind:
         return "it builds the lens alone, and there are windows or mirrors before or behind it"
+    if lens.way is not None:
+        return "it builds a lens or a mirror, and light takes another way through this solid"
     if (first := channels[0].source).kind not in LAMPS:
         return f"Mitsuba has no lamp for the light of {type(first).__name__}"
     if first.parallel and points(channels) > 1:
         return "parallel light of many directions starts from a plate for each, which would stand in each other's light"
-    if lens.reflects and first.parallel:
+    if lens.passes.sense < 0 and first.parallel:
         return "a parallel beam that comes down to a mirror starts from a plate, which would stand in the light"
     return ""
 
 
 def light(lens: Lens, channels: Sequence[Channel]) -> tuple[Channel, ...]:
     """The channels with the losses that it simulates."""
-    if lens.reflects:
+    if not lens.passes.enters:
         return tuple(replace(channel, losses=None) for channel in channels)
     return tuple(replace(channel, losses=Losses(Fresnel(channel.source.wavelength))) for channel in channels)
 
@@ -93,7 +94,7 @@ def trace(
         for channel in channels:
             by_index.setdefault(channel.index, []).append(channel)
         for number, alike in enumerate(by_index.values()):
-            scene = _scene(bench, alike, lens, edges=STRAIGHT[lens.reflects] + reflections + 1, folder=folder)
+            scene = _scene(bench, alike, lens, edges=len(lens.passes.steps) + reflections + 2, folder=folder)
             share = math.fsum(channel.weight for channel in alike)
             for half, picture in enumerate(halves):
                 flux, count = _rendered(scene, screen, share * rays / 2, (seed, number, half))
@@ -128,7 +129,7 @@ def _bench(lens: Lens, screen: Screen, folder: Path) -> tuple[dict[str, Entry], 
     back, (below, above) = faces.face(lens.back, lens.outline), lens.apertures
     upper, error = _fine_enough(back, above, lens, screen, up=True)
     meshes = {"back": upper}
-    if not lens.reflects:
+    if "front" in lens.passes.faces:
         front, level = faces.face(lens.front, below), faces.face(lens.front.around, lens.outline)
         meshes["front"], of_front = _fine_enough(front, below, lens, screen, up=False)
         error = FaceError.worst((error, of_front))
@@ -162,7 +163,7 @@ def _scene(bench: dict[str, Entry], channels: Sequence[Channel], lens: Lens, *, 
     import mitsuba
 
     material = {"type": "dielectric", "int_ior": channels[0].index, "ext_ior": 1.0}
-    if lens.reflects:
+    if not lens.passes.enters:
         material = {"type": "conductor", "material": "none"}
     bench = bench | {name: bench[name] | {"bsdf": material} for name in bench.keys() & {"front", "back"}}
     tracer = {"type": "ptracer", "max_depth": edges, "rr_depth": 100, "hide_emitters": True}

@@ -40,13 +40,19 @@ class Lens:
     back: Surface
     outline: Outline  # both faces of the solid end on it
     index: float  # refractive index at the design wavelength; of a mirror it does not matter
-    reflects: bool = False  # short for the passes of a mirror, where none are given
+    reflects: bool = False  # does a face reflect?  Without `way` True says a mirror, False a lens
     losses: Dimming | None = None  # losses at its faces and in its glass; None: no flux is lost there
     clear: tuple[Outline, Outline] | None = None  # apertures of front and back that pass light; None: the outline
     before: tuple[Interface, ...] = ()  # that light crosses before the solid, such as a window
     behind: tuple[Interface, ...] = ()  # and behind it, such as a fold mirror
     shaped: tuple[int, ...] | None = None  # numbers of the interfaces that tailoring shapes; None: the back alone
-    way: Passes | None = None  # passes of the light through the solid; None: those of a lens, or of a mirror
+    way: Passes | None = None  # passes of the light through the solid, if neither a lens's nor a mirror's
+
+    def __post_init__(self) -> None:
+        if self.way is not None:
+            object.__setattr__(self, "reflects", self.way.reflects)
+            if self.way in (LENS, MIRROR):  # said by `reflects` alone, so that equal lenses are equal
+                object.__setattr__(self, "way", None)
 
     @cached_property
     def interfaces(self) -> tuple[Interface, ...]:

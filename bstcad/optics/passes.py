@@ -7,6 +7,7 @@ light crosses its front once on the way to the back and once on the way out.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -73,15 +74,31 @@ class Passes:
         by_law = {Reflect: 2.0 * (index if self.enters else 1.0), Refract: abs(index - 1)}
         return sum(by_law[self.steps[k].law] for k in self.numbers_of(face))
 
+    def largest_turn(self, index: float) -> float | None:
+        """The largest angle (degrees) by which one face turns light before it reflects all; None: any, by a mirror."""
+        return None if self.reflects else math.degrees(math.acos(1 / index))
+
     @property
     def optic(self) -> Literal["lens", "mirror"]:
         """What the solid is called."""
         return "mirror" if self.reflects else "lens"
 
+    @property
+    def words(self) -> str:
+        """How light passes the solid, such as "by a mirror's back"."""
+        return f"by a {self.optic}'s {', '.join(step.face for step in self.steps)}"
+
     def name(self, face: Face) -> str:
         """What a face is called: front, back, the mirror face, or the rear, which no light meets."""
         laws = [self.steps[k].law for k in self.numbers_of(face)]
         return face if Refract in laws else "mirror face" if laws else "rear"
+
+    def role(self, face: Face) -> str:
+        """What light does at a face, in words."""
+        crossings = [k for k in self.numbers_of(face) if self.steps[k].law is Refract]
+        ends = {0: "enters", len(self.steps) - 1: "leaves"}
+        does = " and ".join(ends[k] for k in crossings if k in ends)
+        return f"light {does}" if does else "light meets it" if face in self.faces else "dark"
 
 
 LENS = Passes((Pass("front", Refract), Pass("back", Refract)))

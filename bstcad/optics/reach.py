@@ -129,10 +129,9 @@ def room(at_face: Rays, aim: Tensor, plane: Receiver, law: Law, grazing: float =
     return least if law.reverses else torch.minimum(least, along - math.cos(largest_deflection(law.eta, grazing)))
 
 
-def unreached(picture: np.ndarray, part: np.ndarray, index: float | None) -> dict[str, float | None]:
+def unreached(picture: np.ndarray, part: np.ndarray, angle: float | None) -> dict[str, float | None]:
     """What lies outside of the part of a target that can be lit: its share of the area, and of the light of a picture.
 
-    angle: the largest (degrees) by which a face of the index turns light before it reflects it; None of a mirror.
+    angle: the largest (degrees) by which a face turns light (Passes.largest_turn).
     """
-    angle = None if index is None else math.degrees(math.acos(1 / index))
     return {"area": float(1 - part.mean()), "light": float(picture[~part].sum() / picture.sum()), "angle": angle}

@@ -77,7 +77,7 @@ class Sheet:
     def tables(self) -> dict[str, Rows]:
         """Its tables by their headings: front, body, back, purpose, and of a part the mount."""
         return tables(
-            "data_sheet.txt.j2", lens=self.record, order=self.order, shape=self.shape,
+            "data_sheet.txt.j2", lens=self.record, passes=self.lens.passes, order=self.order, shape=self.shape,
             mount=self.mount, light=self.scene.source, passed=self.passed,
             asked=self.scene.limits_light,
             pairs=list(zip(self.scene.targets, self.figures, strict=True)), across=across, walls=wall_words,
@@ -126,10 +126,10 @@ def page(sheet: Sheet) -> Figure:
     paper.line([(left, TABLE), (right, TABLE)], THICK)
     paper.line([(TITLE, low), (TITLE, TABLE)], THICK)
     paper.line([(ASIDE, TABLE), (ASIDE, high)], THIN)
-    names, forms = ("Rear", "Mirror face") if sheet.lens.reflects else ("Front", "Back"), (_form(sheet), "freeform")
+    faces = {"front": _form(sheet), "back": "freeform"}
     views = part_views.Views(
         sheet.lens, sheet.mount or Mount(), sheet.order.origin, used=sheet.apertures[-1],
-        names=tuple((f"{name}: {form}", form) for name, form in zip(names, forms, strict=True)),
+        names=tuple((f"{sheet.lens.passes.name(face).capitalize()}: {form}", form) for face, form in faces.items()),
     )  # fmt: skip
     scale = part_views.draw(paper, views, left=left, low=TABLE, right=ASIDE, high=high)
     *columns, purpose, mount = [*sheet.tables.items(), None][:5]

@@ -257,7 +257,7 @@ def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> F
         axes.set(xlabel="z (mm)", ylabel="x (mm)")
     low, high = rim_z.min(), rim_z.max()
     close.set(xlim=(low - reach * 0.5, high + reach * 0.5), ylim=(-1.25 * reach, 1.25 * reach))
-    close.set(title=f"{'Mirror' if lens.reflects else 'Lens'}, cut along y = 0", aspect="equal")
+    close.set(title=f"{lens.passes.optic.capitalize()}, cut along y = 0", aspect="equal")
     whole.set_title("Whole path, source to target (axes not to one scale)")
     several = len(screens) > 1
     drawn = [screen for screen in screens if several or not screen.plane.is_level]
@@ -343,7 +343,7 @@ def light_path_of(
         pictures=tuple(View.of(scene, k).tones(light, wanted) for k, (wanted, light) in enumerate(pictures)),
         lamp=rays[:1, 0] if np.ptp(rays[:, 0], axis=0).max() < 1e-6 else np.empty((0, 3)),
         seen_along=1 if scene.target.seen_from == "lens" else -1,
-        mirror=lens.reflects,
+        mirror=not lens.passes.enters,
         title=scene.title or scene.name,
         words=f"{_sizes(screens)}\n{len(rays)} rays {of}, true to scale",
     )

@@ -371,7 +371,7 @@ def draw(paper: Paper, views: Views, *, left: float, low: float, right: float, h
 
 def origin(views: Views) -> str:
     """Position of the point (0, 0, 0) of the file on the axis, from the nearer face."""
-    names = ("rear", "mirror face") if views.lens.reflects else ("front", "back")
+    names = map(views.lens.passes.name, ("front", "back"))
     near, name = min(zip(views.vertices, names, strict=True), key=lambda face: abs(face[0]))
     if not near:
         return f"where the axis meets the {name}"
@@ -411,7 +411,7 @@ def _plan(paper: Paper, views: Views, at: Placed) -> None:
     else:
         paper.dimension((x - a, x + a), y - b - 12, (y - b, y - b), mm(outer.width))
         paper.dimension((y - b, y + b), x - a - 11, (x - a, x - a), mm(outer.height), upright=True)
-    face = "Mirror face" if views.lens.reflects else "Back"
+    face = views.lens.passes.name("back").capitalize()
     paper.text(x, y + b + 12, f"{face}, seen along \u2212z", ha="center", weight="bold")
     note = f"contours of z every {step}" if step else "no contours: the back is level"
     paper.text(x, y - b - 17, note, NOTES, ha="center", color=BLUE)
@@ -487,7 +487,7 @@ def _section(paper: Paper, views: Views, which: int, scale: float, *, left: floa
     cut, half = views.cuts[which], [scale * half for half in views.outermost.half_extent]
     (lowest, highest), _ = cut.ends
     at, right = Placed(scale, left - scale * lowest, middle), left + scale * (highest - lowest)
-    reach, mirror = half[1 - which], views.lens.reflects
+    reach, sense = half[1 - which], views.lens.passes.sense
     for body in cut.bodies:  # cut material: a tone, and thin lines at 45 degrees (ISO 128-50)
         paper.area(at(body), facecolor=GLASS, hatch="//", edgecolor=GREY, zorder=0.5)
         paper.line(at(np.concatenate([body, body[1:2]])), THICK, zorder=5)
@@ -508,7 +508,7 @@ def _section(paper: Paper, views: Views, which: int, scale: float, *, left: floa
     if which == 1:
         _walls(paper, views, at, reach)
         return
-    start, sense = (right + 10, -1) if mirror else (left - 15.5, 1)  # an arrow with the light, to the face it meets
+    start = left - 15.5 if sense > 0 else right + 10  # an arrow with the light, to the face it meets
     end, y = start + sense * 8.5, middle - 9
     paper.line([(start, y), (end - sense, y)], 0.25, color=VERMILION)
     paper.arrow((end, y), sense * RIGHT, VERMILION)

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.analysis.shape import FLATTEST, describe, heights, survey_front, thickness_range
-from bstcad.optics import quadrature
+from bstcad.optics import passes, quadrature
 from bstcad.optics.bspline import DEGREE, BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.media import density
@@ -144,15 +144,19 @@ def scene_text(scene: Scene, lens: Lens) -> str:
     return f"# {stands}\n{scene.toml()}"
 
 
+def _passes(record: Mapping[str, Any]) -> passes.Passes:
+    return passes.MIRROR if record["reflects"] else passes.LENS
+
+
 def sections(record: Mapping[str, Any]) -> dict[str, Rows]:
     """The prescription in words, by headings; numbers in full."""
-    return tables("prescription.txt.j2", lens=record)
+    return tables("prescription.txt.j2", lens=record, passes=_passes(record))
 
 
 def text(record: Mapping[str, Any]) -> str:
     """prescription.txt."""
     name = f"{record['name']}: {record['title']}" if record["title"] else record["name"]
-    way = WAYS["mirror" if record["reflects"] else "lens"]
+    way = WAYS[_passes(record).optic]
     head = TEXT.format(name=name, way=way, exact=EXACT["front_net" in record])
     parts = (f"\n{heading}\n" + "".join(f"    {name:<30}{value}\n" for name, value in rows)
              for heading, rows in sections(record).items())  # fmt: skip
@@ -289,8 +293,8 @@ def _volume(lens: Lens, whole: WholePart | None) -> float | None:
 def _origin(lens: Lens, vertex: float, bare: bool = True) -> str:
     """The position of axis and front, seen from the point (0, 0, 0) of the file; vertex: z of the back's."""
     front = lens.front_vertex
-    axis = f"on the axis of the {'mirror' if lens.reflects else 'lens'}" + " (the middle of its outline)" * bare
-    if lens.reflects:  # its light comes from above
+    axis = f"on the axis of the {lens.passes.optic}" + " (the middle of its outline)" * bare
+    if lens.passes.sense < 0:  # its light comes from above
         if vertex < 0:
             return f"{axis}, {mm(-vertex)} mm before the vertex of the mirror, on the light's side"
         rear = "the vertex of the rear"
@@ -311,7 +315,7 @@ def _front_radius(lens: Lens) -> float | None:
     Of a conic the meridional radius, R (1 - k c² r²)^(3/2), which falls towards the rim for k > 0.
     """
     front = lens.front
-    if lens.reflects:
+    if "front" not in lens.passes.faces:
         return None
     if front.is_net:
         found = survey_front(lens).concave.largest

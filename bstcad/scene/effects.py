@@ -104,7 +104,7 @@ Effects = tuple[Effect, ...]
 def complaints(effects: Effects, lens: LensBlank) -> Iterator[str]:
     """Effects that are named twice, that the lens or the mirror does not have, or of which no data are known."""
     for k, effect in enumerate(effects):
-        key, mirror = f"effects[{k}]", lens.back.reflect
+        key, glass = f"effects[{k}]", lens.passes.enters
         if any(_name(effect) == _name(other) for other in effects[:k]):
             yield f"{key}: {_name(effect)!r} is named twice; remove one of the two tables"
         if isinstance(effect, Own) and effect._makes is None:
@@ -112,13 +112,13 @@ def complaints(effects: Effects, lens: LensBlank) -> Iterator[str]:
                 f"{key}.name: no effect is called {effect.name!r} here; let the script that has it call "
                 f"bstcad.effect({effect.name!r}, …) first, or install its package"
             )
-        if mirror and effect.kind in ("absorption", "ghost"):
+        if not glass and effect.kind in ("absorption", "ghost"):
             no_glass = "light does not enter a mirror (lens.back.reflect)"
             yield f"{key}: {no_glass}, so it has no {effect.kind}; remove the table"
-        if mirror and getattr(effect, "coating", None) is not None:
+        if not glass and getattr(effect, "coating", None) is not None:
             bare = "a mirror's face (lens.back.reflect) is bare metal"
             yield f"{key}.coating: {bare}; remove it, or name the metal by {key}.metal"
-        if not mirror and getattr(effect, "metal", None) is not None:
+        if not lens.passes.reflects and getattr(effect, "metal", None) is not None:
             yield f"{key}.metal: is for a mirror (lens.back.reflect); remove it"
         if effect.kind == "absorption" and effect.coefficient is None and lens.material is None:
             yield f"{key}.coefficient: missing, and lens.index names no material; add it in 1/mm, or give lens.material"
@@ -162,7 +162,7 @@ def losses(effects: Effects, lens: LensBlank, wavelength: float) -> Losses | Non
     reflection = absorbed = None
     if fresnel is not None:
         coating = fresnel.coating and physics.Coating(fresnel.coating.index, fresnel.coating.thickness)
-        metal = media.complex_index(fresnel.metal or METAL, wavelength) if lens.back.reflect else None
+        metal = media.complex_index(fresnel.metal or METAL, wavelength) if lens.passes.reflects else None
         reflection = physics.Fresnel(wavelength, fresnel.polarisation, coating, metal)
     if absorption is not None:
         given = absorption.coefficient

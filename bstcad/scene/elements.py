@@ -181,7 +181,7 @@ class Way:
     @property
     def sense(self) -> int:
         """The way along z, 1 or -1, of the light that leaves the source."""
-        return turns(self.before) * (-1 if self.lens.back.reflect else 1)
+        return turns(self.before) * self.lens.passes.sense
 
     @property
     def is_folded(self) -> bool:
@@ -218,7 +218,7 @@ class Way:
             [(Station.of(f"{name}[{k}]", element), element.kind == "mirror") for k, element in enumerate(of)]
             for name, of in (("before", self.before), ("behind", self.behind))
         )
-        stops = [*before, (optic, lens.back.reflect), *behind]
+        stops = [*before, (optic, lens.passes.turn < 0), *behind]
         if start is not None:
             stops.insert(0, (Station(key, "the source", start, start), False))
         elif sense < 0:

@@ -23,7 +23,7 @@ def complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
         if other != width and getattr(source, other) is not None:
             yield f"source.{other}: has no meaning for a {source.profile} profile; remove it or change the profile"
     yield from _spectrum(source, lens)
-    first = lens.back if lens.back.reflect else lens.front
+    first = getattr(lens, lens.passes.faces[0])
     yield from (f"source.{complaint}" for complaint in source.complaints(first.z, lens.optic))
 
 
@@ -52,17 +52,17 @@ def _spectrum(source: Emitter, lens: LensBlank) -> Iterator[str]:
 def order(source: Emitter, lens: LensBlank) -> Iterator[str]:
     """Light and lens that do not follow each other along z; a mirror's light comes from above."""
     front, back = lens.front.z + lens.front_sags[0], lens.back.z
-    key, start = f"source.{source.start_key}", source.nearest(upwards=not lens.back.reflect)
-    if not lens.back.reflect:
+    key, start = f"source.{source.start_key}", source.nearest(upwards=lens.passes.sense > 0)
+    if lens.passes.sense > 0:
         if start is not None and not start < front:
             yield f"{key}: the light starts at z = {start:g}, not before the front at z = {front:g}; move one of them"
     elif start is None:
         yield f"{key}: missing, and a mirror's light comes from above; add the plane it starts from, above z = {back:g}"
     elif not start > back:
         yield f"{key}: the light starts at z = {start:g}, not above the mirror at z = {back:g}; move one of them"
-    if lens.back.reflect and lens.front.outline is not None:
+    if "front" not in lens.passes.faces and lens.front.outline is not None:
         yield "lens.front.outline: the front of a mirror is the rear of its plate, which no light meets; remove it"
-    if lens.back.reflect and not lens.front.fixed:
+    if "front" not in lens.passes.faces and not lens.front.fixed:
         yield "lens.front.optimise: the front of a mirror is the rear of its plate, which no light meets; remove it"
 
 
@@ -71,7 +71,7 @@ def unlit(source: Emitter, lens: LensBlank, rim: Outline) -> Iterator[str]:
     if not (source.tilted or getattr(source, "centre", None)):
         return
     z, sags = lens.back.z, (0.0,)
-    if not lens.back.reflect:
+    if lens.passes.sense > 0:
         z, sags = lens.front.z, lens.front.surface.sags(rim)
     x, y = sampling.grid(source.window(rim, z, sags), SAMPLES)
     if not bool((source.irradiance(x, y, z) > 0).any()):

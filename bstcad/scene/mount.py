@@ -60,7 +60,7 @@ class Part:
 
     def of(self, lens: LensBlank) -> Part:
         """The same, completed by the lens: its material with the density, a colour."""
-        known: dict[str, str | float | None] = {"colour": METAL if lens.back.reflect else GLASS}
+        known: dict[str, str | float | None] = {"colour": GLASS if lens.passes.enters else METAL}
         if lens.material is not None:
             its = medium(lens.material)
             known |= {"material": its.name, "density": its.density}

@@ -297,7 +297,7 @@ class Scene(Record):
         back = BSplineSurface(self.lens.back.z, heights, (-half_x, half_x), (-half_y, half_y))
         lens = Lens(
             self.lens.flat_front(net, as_wide_as).to(heights.dtype, device), back, self.lens.outline, self.index,
-            reflects=self.lens.back.reflect,
+            way=self.lens.passes,
         )  # fmt: skip
         return self.assembled(lens)
 
@@ -401,7 +401,7 @@ class Scene(Record):
     def toml(self) -> str:
         """The scene as a file that loads to an equal scene; an image is named by the basename of its copy."""
         unused = set() if self.source.extent else {"source_points"}
-        optic = "a mirror" if self.lens.back.reflect else f"refractive index {self.index:.6g}"
+        optic = f"refractive index {self.index:.6g}" if self.lens.passes.enters else f"a {self.optic}"
         comment = f"# {optic}; quality {self.tailoring.quality}"
         if self.lens.back.control_points is not None:  # by which they are set
             knobs = self.tailoring.resolved(self.lens.back.net).model_dump(exclude={"quality", "seed"} | unused)
@@ -457,7 +457,8 @@ def _of_goals(scene: Scene) -> Iterator[str]:
             also = "remove lens.back.optimise = false"
             if lens.back.optimise:
                 also = f"have the front tailored too, {front}"
-            remedy = "a mirror has no second face, so state what matters by weight" if lens.back.reflect else also
+            alone = "a mirror has no second face, so state what matters by weight"
+            remedy = also if "front" in lens.passes.faces else alone
         key = "target" if pictures > 1 else "wavefront"
         yield f"{key}: {goals} goals for {faces} them only as far as least squares by their weights go; {remedy}"
 

@@ -103,7 +103,7 @@ def left_out(scene: Scene, lens: Lens, picture: np.ndarray) -> tuple[LeftOut, ..
     reference = Reference.of(
         lens, _central(scene), scene.target.screen, picture=picture, control_points=math.prod(both(scene.lens.back.net))
     )
-    found = list(_mirror(scene, reference) if lens.reflects else _lens(scene, reference))
+    found = list(_lens(scene, reference) if lens.passes.enters else _mirror(scene, reference))
     found += _size(scene, reference)
     found.append(_entry("diffraction", reference.diffraction(), "of the whole aperture"))
     found.append(_entry("stray light", None, "it depends on the finish of the faces"))

@@ -126,7 +126,7 @@ def _effects(scene: Scene, lens: Lens, key: str) -> dict[str, Any]:
     goal = replace(scene.goals[0], key=key)
     goal = goal.restricted(reachable_part(scene, goal)[0])
     part, target = goal.reachable, goal.picture
-    beyond = None if part is None else unreached(goal.whole, part, None if lens.reflects else scene.index)
+    beyond = None if part is None else unreached(goal.whole, part, lens.passes.largest_turn(scene.index))
     estimates, image = left_out(scene, lens, target), blur(scene.channels(), lens, scene.target.screen, target)
     return {
         "key": key, "left_out": [asdict(estimate) for estimate in estimates],

@@ -104,7 +104,7 @@ def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None
     errors += _of_faces(setup.lens, table)
     for k, entry in enumerate(table[1:]):
         none = entry.name and settings_of(table, entry.name).get("grade") == NONE
-        if entry.name and not none and entry.name.startswith(OF_TWO_FACES) and setup.lens.reflects:
+        if entry.name and not none and entry.name.startswith(OF_TWO_FACES) and "front" not in setup.lens.passes.faces:
             only = "is of a lens that refracts at two faces, and a mirror has one face"
             raise SceneError(f"tolerance[{k}].name: {entry.name!r} {only}; remove that table")
         if entry.name and not none and not any(entry.covers(error.kind.name) for error in errors):

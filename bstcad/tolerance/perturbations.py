@@ -57,7 +57,7 @@ class Setup:
             return self.screen.middle
         if part == "lens":
             back = float(self.lens.back.plain().from_vertex().z)
-            return 0.0, 0.0, back if self.lens.reflects else (self.lens.front.z + back) / 2
+            return 0.0, 0.0, (self.lens.front.z + back) / 2 if "front" in self.lens.passes.faces else back
         points = [channel.source.starts(self.lens.entrance.z) for channel in self.channels]
         mean = np.average(points, axis=0, weights=[channel.weight for channel in self.channels])
         return tuple(mean.tolist())
@@ -202,7 +202,7 @@ def _motions(setup: Setup) -> Iterator[Kind]:
     if not all(source.turns_alike for source in sources):
         hidden.add("lens.clocking")  # round light hides that of the source; other light cannot be turned
     for part in ("lens", "source", "screen"):
-        name = "mirror" if part == "lens" and setup.lens.reflects else part
+        name = setup.lens.passes.optic if part == "lens" else part
         for error, words, axis, turns in MOTIONS:
             if f"{part}.{error}" not in hidden:
                 moves = partial(_moved, part, axis, turns)
@@ -216,12 +216,11 @@ def _moved(part: str, axis: int, turns: bool, setup: Setup, by: float) -> Setup:
 
 def _shapes(setup: Setup, material: str | None) -> Iterator[Kind]:
     """Errors of the lens's shape, glass and temperature, and of the wavelength."""
-    refracts = not setup.lens.reflects
+    optic, refracts = setup.lens.passes.optic, setup.lens.passes.enters
     if refracts:
         yield Kind("lens.thickness", "thickness of the lens", "mm", _thicker)
         yield Kind("lens.index", "refractive index", "", lambda setup, by: setup.with_indices(lambda n: n + by))
         yield Kind("lens.front_power", "sag of the front at its rim", "mm", _front_power)
-    optic = "lens" if refracts else "mirror"
     yield Kind("lens.scale", f"scale of the {optic} (shrinkage)", "", lambda s, by: s.with_lens_scaled(1 + by))
     if material in THERMAL and refracts:
         yield Kind("temperature", f"temperature of the lens ({material})", "K", partial(_warmer, material))
@@ -289,7 +288,7 @@ def _larger(setup: Setup, by: float) -> Setup:
 
 def _alignments(lens: Lens) -> Iterator[Kind]:
     """Wedge of two refracting faces, and decentre of the front, which of a plane does nothing."""
-    for axis, name in enumerate("" if lens.reflects else "xy"):
+    for axis, name in enumerate("xy" if "front" in lens.passes.faces else ""):
         words = f"wedge of the lens, the tilt of its back about {name} to the front"
         yield Kind(f"lens.wedge_{name}", words, "deg", partial(_wedged, axis))
         if not lens.front.level:

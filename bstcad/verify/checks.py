@@ -151,7 +151,7 @@ def verify(
     effort = nominal.effort(effort)
     effort = replace(effort, seed=effort.seed + VERIFY_SEED, seconds=effort.seconds / len(nominal.goals))
     path = (folder / "lens.step").absolute()
-    lens = submit("bstcad.verify.step_checks.lens", path, nominal.lens.index, nominal.lens.reflects)
+    lens = submit("bstcad.verify.step_checks.lens", path, nominal.lens.index, nominal.lens.passes)
     mount = nominal.mount
     seen = mount and submit("bstcad.verify.step_checks.lens_of_part", folder.absolute(), nominal.lens, mount)
     step_job = "bstcad.verify.step_checks.check", path, nominal.lens, nominal.accept.form, effort.points
@@ -182,7 +182,7 @@ def verify(
     shape = describe(cut, effort.places) | {"volume": whole.volume} | _ripples_in_light(as_made, nominal)
     stability = _stability(as_made, nominal, lights, shape)
     machined, at_bounds = of_bounds(cut, nominal.blank, shape)
-    meets = "meets the mirror" if lens.reflects else "enters the lens"
+    meets = f"{'enters' if lens.passes.enters else 'meets'} the {lens.passes.optic}"
     goals = [(goal, each, goal.suffix) for goal, each in zip(nominal.goals, lights, strict=True)]
     degrees = math.nan if stability["tir_margin_deg"] is None else stability["tir_margin_deg"]
     margin = Check.at_least("smallest margin to total internal reflection", degrees, None, "deg", id="tir-margin")
@@ -200,7 +200,7 @@ def verify(
         *map(_picture, nominal.goals, nominal.stored),
         *(c for _, each, of in goals for c in _of_light(each, nominal.accept, meets, of=of, why=why)),
         *of_wavefront,
-        *([] if lens.reflects else [margin]),
+        *([margin] if lens.passes.enters else []),
         Check.at_most("values that are not finite", stability["non_finite"], 0, id="finite"),
     )
     return Proof(

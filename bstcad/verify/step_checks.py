@@ -23,6 +23,7 @@ from bstcad.cad.solid_properties import WholePart
 from bstcad.cad.step_reading import StepLens
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
+from bstcad.optics.passes import LENS, Passes
 from bstcad.optics.quadrature import MassProperties
 from bstcad.optics.surfaces import Surface
 from bstcad.runs import processes
@@ -69,9 +70,9 @@ class ExaminedFile:
 
 
 @one_sentence
-def lens(path: Path, index: float, reflects: bool = False) -> Lens:
-    """The lens of a STEP file, which says neither its index nor whether it is a mirror; ValueError if it holds none."""
-    return replace(step_reading.lens(_read(path, _stamp(path)), index), reflects=reflects)
+def lens(path: Path, index: float, passes: Passes = LENS) -> Lens:
+    """The lens of a STEP file, which says neither its index nor the passes of light; ValueError if it holds none."""
+    return replace(step_reading.lens(_read(path, _stamp(path)), index), way=passes)
 
 
 @one_sentence
