@@ -104,9 +104,9 @@ class Transmission:
 
 @dataclass(frozen=True)
 class MetalReflection:
-    """R of a mirror of metal in air; the rest is absorbed there."""
+    """R of a mirror of metal; the rest is absorbed there."""
 
-    index: complex  # n + ik of the metal
+    index: complex  # n + ik of the metal, over the index of the medium before it
     polarisation: Polarisation = "none"
 
     line, in_glass, fused = BY_THE_MIRROR, False, True
@@ -167,11 +167,11 @@ class Fresnel:
     coating: Coating | None = None
     metal: complex | None = None  # n + ik
 
-    def of(self, interface: Interface) -> Loss:
-        """The loss at an interface."""
+    def of(self, interface: Interface, index: float = 1.0) -> Loss:
+        """The loss at an interface; index: of the medium before it."""
         law = interface.law
         if law.reverses:
-            return MetalReflection(self.metal, self.polarisation)
+            return MetalReflection(self.metal / index, self.polarisation)
         return Transmission(law.n_in, law.n_out, self.wavelength, polarisation=self.polarisation, coating=self.coating)
 
 
@@ -185,12 +185,13 @@ class Losses:
 
     def on(self, interfaces: Sequence[Interface]) -> tuple[Interface, ...]:
         """The interfaces of a lens with the losses at each, and in the glass on the way to it."""
-        return tuple(replace(interface, losses=self._at(k, interface)) for k, interface in enumerate(interfaces))
+        index = getattr(interfaces[0].law, "n_out", 1.0)  # behind the first interface
+        return tuple(replace(each, losses=self._at(k, each, index if k else 1.0)) for k, each in enumerate(interfaces))
 
-    def _at(self, k: int, interface: Interface) -> tuple[Loss, ...]:
+    def _at(self, k: int, interface: Interface, index: float) -> tuple[Loss, ...]:
         inside = (self.absorption,) if self.absorption and k > 0 else ()  # behind the first interface is glass
         own = (loss for loss in self.own if k > 0 or not loss.in_glass)
-        return (*inside, *own, *((self.fresnel.of(interface),) if self.fresnel else ()))  # a ghost takes the last
+        return (*inside, *own, *((self.fresnel.of(interface, index),) if self.fresnel else ()))  # the last: a ghost's
 
 
 def _amplitudes(n_in: float, n_out: float, cos_in: Tensor, cos_out: Tensor) -> tuple[Tensor, Tensor]:

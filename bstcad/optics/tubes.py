@@ -146,12 +146,13 @@ def _tubes(source: Emitter, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tube
     inside, ways = source.irradiance(x, y, z) > 0, [light]  # ways: before each interface
     interfaces, edges = lens.unbounded().interfaces, lens.grown(1 + INWARDS).interfaces  # grown: room for rounding
     first, back = lens.freeform[0], lens.number_of("back")
-    for k in range(max(first, back)):
+    end = lens.solid.stop if lens.solid.stop > back + 1 else back  # light may meet the front again behind the back
+    for k in range(max(first, end)):
         ways.append(cross(ways[k], interfaces[k]).rays)
-        if k < back:
+        if k < end and k != back:  # the sheet ends at the back's rim by itself
             inside = inside & edges[k].outline.contains(*ways[-1].position[:2])
     if cut:
-        lit = inside & ways[back].alive
+        lit = inside & ways[end].alive
     return Tubes(ways[first], _density(source, lens, x=x, y=y, lit=lit) * area)
 
 

@@ -580,8 +580,8 @@ class LensBlank(Record):
     @property
     def shaped(self) -> tuple[Face, ...]:
         """The faces that tailoring shapes, in the order of the light."""
-        front: tuple[Face, ...] = ("front",) if self.front.shaped else ()
-        return (*front, "back") if self.back.optimise else front
+        tailored = {"front": self.front.shaped, "back": self.back.optimise}
+        return tuple(face for face in self.passes.faces if tailored[face])
 
     def front_net(self, net: Sides) -> Sides | None:
         """Control points of a freeform front beside a back with those of `net`; None: the front has few numbers.

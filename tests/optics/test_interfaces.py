@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import Interface, Reflect, Refract, cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
@@ -136,6 +137,26 @@ def test_light_goes_through_a_mangin_mirror_as_snell_has_it():
     losses = replace(lens, losses=Losses(absorption=Absorption(0.01)))
     path = 12.0 * N / torch.sqrt(N**2 - sine**2)  # through the glass twice
     torch.testing.assert_close(trace(rays, losses, LevelPlane(-20.0)).flux, rays.flux * torch.exp(-0.01 * path))
+
+
+def test_a_mangin_mirror_is_simulated_as_its_tubes_are_traced():
+    """Light that comes back to the front beside its rim is lost: a fifth of what enters."""
+    lens = Lens(Sphere(0.0, 0.01), net(6.0, 0.2), SQUARE, N, way=MANGIN)
+    screen = Screen(-30.0, (-60.0, 60.0), (-60.0, 60.0), 8)
+    source = Point((1.0, -2.0, -60.0), profile="uniform", half_angle=30.0)
+    rays, tubes = simulated(source, lens, screen, 600, 0), launch_tubes(source, lens, 240).picture(lens, screen)
+    assert rays.flux["lost through the sides"] > 0.15 * rays.flux["on target"]
+    assert float(tubes.sum()) == pytest.approx(rays.flux["on target"], rel=3e-3)
+
+
+def test_the_metal_of_a_mangin_mirror_is_met_from_the_glass():
+    """At normal incidence the face reflects |(m - n) / (m + n)|², and light crosses a bare front before and behind."""
+    metal, flat = 1.2 + 6.0j, [net(z, 0.0) for z in (0.0, 6.0)]
+    lens = Lens(*flat, SQUARE, N, way=MANGIN, losses=Losses(Fresnel(587.6, metal=metal)))
+    rays = Collimated(Rectangle(4.0, 4.0)).rays(*stratified(Rectangle(4.0, 4.0), 4, 0), 0.0, 1.0)
+    left = trace(rays, lens, LevelPlane(-20.0)).flux / rays.flux
+    wanted = (1 - ((N - 1) / (N + 1)) ** 2) ** 2 * abs((metal - N) / (metal + N)) ** 2
+    torch.testing.assert_close(left, torch.full_like(left, wanted), rtol=1e-12, atol=0)
 
 
 def plainly(rays, interfaces, plane):
