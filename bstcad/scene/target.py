@@ -204,7 +204,7 @@ class Target(Record):
     def behind(self, lens: LensBlank) -> Iterator[str]:
         """Complain of a target that does not follow the lens along z."""
         if not self.z > (back := lens.back.z):
-            place = "above the mirror, whose face" if lens.back.reflect else "behind the lens, whose back"
+            place = "behind the lens, whose back" if lens.passes.sense > 0 else "above the mirror, whose face"
             yield f"target.z: the target at z = {self.z:g} is not {place} is at z = {back:g}; move it further along +z"
 
     def follows(self, words: str, z: float, sense: int) -> Iterator[str]:
