@@ -182,7 +182,6 @@ CHOICES = {
     "mount": {"none": {}, "flange": flange, "cut": cut},
     "elements": {
         "none": {},
-        "window before": elements("before", thickness=3.0, material="N-BK7"),
         "dome before": elements("before", thickness=3.0, index=1.5, curvature=[0.004, 0.005], tilt=[3.0, 0.0]),
         "window behind": elements("behind", thickness=3.0, material="N-BK7", tilt=[0.0, 5.0]),
         "fold mirror behind": fold,
@@ -314,8 +313,12 @@ COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which f
     "app.preview": {"IMAGE_PLACES": 6, "CELLS": 16, "RAYS": 32, "SHAPE": 33},
     "sweep.estimates": {"NET": 17, "CELLS": 16, "PIXELS": 24, "FRONT_NET": 9, "STEPS": 5},
     "sweep.net_choice": {"TUBES": 64},
-    "sweep.prediction": {"CELLS": (16, 16), "LARGEST": (24, 17, 48), "JUDGED": Effort(96, accuracy=1.0, witness=False)},
+    "sweep.prediction": {
+        "CELLS": (16, 16), "LARGEST": (24, 17, 48), "JUDGED": Effort(96, accuracy=1.0, witness=False),
+        "FLOWN": ("draft",),
+    },
     "verify.checks": {"LINE_TUBES": 65},
+    "sweep.plan": {"FLOWN": ("draft",)},
 }
 
 

@@ -38,6 +38,7 @@ from bstcad.optics.surfaces import Plane, Surface
 UNDERSIDE = "vignetted by the underside"  # a line of the ledger: light beside the optical part of a front
 BLOCKED = "stopped beside a window or mirror"  # a line of the ledger of a lens with some behind it
 CELLS = 256  # a side of the lens, by which that light is summed
+WINDOW_CELLS = 96  # a side of the rectangle in which useful light is looked for, past what is before a lens
 TABULATED = 256  # rays a side from which on a table of the source's light is worth its cost
 GHOST_RAYS = 1024  # a side, at most; a ghost of 1 % of the light with 3 % of noise in a pixel adds 0.0003 to an RRMSD
 ON, OFF, REFLECTED, TOTAL = "ghost on target", "ghost off target", "reflected at the faces", "total internal reflection"
@@ -122,7 +123,7 @@ def window(source: Emitter, lens: Lens) -> Rectangle:
 @functools.lru_cache(maxsize=4096)
 @torch.no_grad()
 def _useful(
-    source: Emitter, before: tuple[Interface, ...], faces: tuple[Interface, ...], area: Rectangle, n: int = CELLS
+    source: Emitter, before: tuple[Interface, ...], faces: tuple[Interface, ...], area: Rectangle, n: int = WINDOW_CELLS
 ) -> Rectangle:
     """The part of a rectangle of the first vertex's plane that holds all light which meets one of the planes behind.
 

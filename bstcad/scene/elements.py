@@ -29,7 +29,10 @@ from bstcad.scene.target import WAYS, Target, is_faced
 MAX_TILT = 40.0  # degrees; a mirror at 45 sends light across the axis, where it goes neither up nor down along z
 CURVATURES = (-1e3, 1e3)  # 1/mm
 UPRIGHT = 0.85  # (c r)² of a sphere at its rim, at most: of a hemisphere 1
-TURNED = Annotated[tuple[float, float] | None, Key("Tilt about x, then about y.", "degrees", -MAX_TILT, MAX_TILT)]
+TURNED = Annotated[
+    tuple[float, float] | None,
+    Key("Tilt about x, then about y.", "degrees", -MAX_TILT, MAX_TILT, example=[0.0, 20.0]),
+]
 RIM = Key("Outline of what light may pass, as seen along z.", example={"shape": "circle", "diameter": 40.0})
 
 
@@ -39,11 +42,12 @@ class Window(Record):
     kind: Annotated[Literal["window"], Key("A plate that light goes through.")]
     z: Annotated[float, Key("Place of the face with the lower z.", "mm", *COORDINATES, example=40.0)]
     thickness: Annotated[float, Key("Thickness on the axis.", "mm", *LENGTHS, example=3.0)]
-    material: Annotated[str | None, Key("Name on refractiveindex.info; or give the index.")] = None
+    material: Annotated[str | None, Key("Name on refractiveindex.info; or give the index.", example="N-BK7")] = None
     index: Annotated[float | None, Key("Refractive index.", "", *INDICES, example=1.5168)] = None
     outline: Annotated[Outlined, RIM]
     curvature: Annotated[
-        tuple[float, float], Key("Curvatures of the face with the lower z and of the other.", "1/mm", *CURVATURES)
+        tuple[float, float],
+        Key("Curvatures of the face with the lower z and of the other.", "1/mm", *CURVATURES, example=[0.01, 0.011]),
     ] = (0.0, 0.0)
     tilt: TURNED = None
 
@@ -89,7 +93,7 @@ class Mirror(Record):
     kind: Annotated[Literal["mirror"], Key("A mirror, which sends light back along z.")]
     z: Annotated[float, Key("Place of the face on the axis.", "mm", *COORDINATES, example=120.0)]
     outline: Annotated[Outlined, RIM]
-    curvature: Annotated[float, Key("Curvature; positive bends towards +z.", "1/mm", *CURVATURES)] = 0.0
+    curvature: Annotated[float, Key("Curvature; positive bends towards +z.", "1/mm", *CURVATURES, example=0.002)] = 0.0
     tilt: TURNED = None
 
     written = leaving_out(curvature=0.0)

@@ -95,6 +95,8 @@ def along_light(source: Emitter, lens: Lens, goals: Sequence[Goal]) -> tuple[csr
     glass = lens.index * within.direction[2]
     factor = _array((glass - coming.direction[2]) / (glass - out.direction[2]))
     lit = _array((source.irradiance(*coming.position[:2], lens.entrance.z) > 0) & out.alive)
+    if any(np.unique(at[lit > 0]).size < 2 for at in q.numpy()):  # a narrow beam and few control points
+        lit = _array(out.alive)
     places = [_array(p) for p in out.position[:2]]
     row, column = places_in(*places, *(p.numpy() for p in torch.meshgrid(*_control_points(back), indexing="ij")))
     row, column = (_smoothed(at) for at in (row, column))

@@ -269,7 +269,7 @@ def test_verify_finds_the_same_figures_again(two, tmp_path, monkeypatch):
 def test_report_json_tells_each_target(two):
     told = json.loads((two.folder / "report.json").read_text())
     first, second = told["goals"]
-    assert first["key"] == "target[0]" and second["key"] == "target[1]" and second["z"] == 150.0
+    assert first["key"] == "target[0]" and second["key"] == "target[1]" and second["where"] == "z = 150 mm"
     assert [each["weight"] for each in told["goals"]] == [1.0, 2.5]
     worst = max(first, second, key=lambda goal: goal["rrmsd"])
     assert worst["rrmsd"] == told["rrmsd"] and worst["rrmsd_standard_error"] == told["rrmsd_noise"]
