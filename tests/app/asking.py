@@ -129,7 +129,7 @@ def contents(name, **more):
     }  # fmt: skip
     known |= more
     figures = {name: known.get(key) for key, name in record.OF_WORST.items()}
-    return record.Contents(name=name, **known, goals=(GoalFigures("target", 500.0, 1.0, **figures),))
+    return record.Contents(name=name, **known, goals=(GoalFigures("target", "z = 500 mm", 1.0, **figures),))
 
 
 def made(folder, **more):
