@@ -234,7 +234,7 @@ def test_batoid_traces_them_too(folder):
     again = bstcad.open(folder)
     target = again.scene.target
     found = compare(
-        "batoid", again.lens, again.scene.judging_channels(), target.screen, target.irradiance(), rays=400_000, seed=1
+        "batoid", again.lens, again.scene.judging_channels(), target.screen, target.irradiance(), rays=100_000, seed=1
     )
     assert found.judge.agrees, found.judge
     said = compare("mitsuba", again.lens, again.scene.channels(), target.screen, target.irradiance(), rays=1)
