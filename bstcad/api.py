@@ -397,7 +397,7 @@ def _fitting(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
         scene, lens = _fitting_front(lens, scene)
     elif not same_front(lens.front, front):
         scene = scene.changed({"lens.front": lens.front})
-        lens = lens.with_front(scene.lens.front_surface)  # of a surface of one's own the net that stands for it
+        lens = lens.with_front(scene.lens.front_surface)  # a net stands for a surface of one's own
     back = replace(lens.back, x=net.x, y=net.y)
     return scene, scene.assembled(replace(lens, back=back, index=scene.index))
 

@@ -161,7 +161,7 @@ def _conic_patch(front: Conic, outline: Outline) -> Patch:
     return Patch(surface, False, uv)
 
 
-PATCHES: dict[str, Callable[..., Patch]] = {  # by the kind of a front that is no plane
+PATCHES: dict[str, Callable[..., Patch]] = {  # Patch of each kind of front that is no plane
     "bspline": partial(_net_patch, outward=False), "sphere": _sphere_patch, "conic": _conic_patch,
 }  # fmt: skip
 

@@ -229,7 +229,7 @@ def _spots(channels: Sequence[Channel], lens: Lens, folder: Path) -> dict[str, E
     return slide | {f"lamp{k}": _projector(c.source, c.weight, lens, half) for k, c in enumerate(channels)}
 
 
-LAMPS = {"collimated": _plates, "point": _spots}  # by the kind of source
+LAMPS = {"collimated": _plates, "point": _spots}  # Mitsuba's lamps for each kind of source
 
 
 def _plate(source: Collimated, weight: float, lens: Lens, path: Path) -> Entry:

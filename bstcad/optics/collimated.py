@@ -91,7 +91,7 @@ class Collimated(Emitter):
         The aperture is one of a plane z = const, and stays in one when the light is turned: it is wider by 1 / cos than
         it should be, 1.5e-6 of its size at 0.1 degrees.
         """
-        if not (motion.turns or self.tilted):  # the same on all planes
+        if not (motion.turns or self.tilted):  # light along z has one flux density on all planes
             x, y = (p + d for p, d in zip(self.centre or (0.0, 0.0), motion.shift, strict=False))
             return self if (x, y) == (0.0, 0.0) and self.centre is None else replace(self, centre=(x, y))
         wide = 2 * math.hypot(*self.aperture.half_extent)

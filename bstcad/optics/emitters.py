@@ -49,7 +49,7 @@ class Emitter(ABC):
     size_key: str | None = None  # key of its size; after real_ that of the real lamp's
     kind: str = "own"
     parallel: bool = False  # is the light of one point of its extent parallel?
-    simple: str = "a source without size"  # what it is without its extent
+    simple: str = "a source without size"  # name of the source without its extent
     start_key: str = "z"  # key of the place where its light starts
     widths: Mapping[str, str] = MappingProxyType({})  # key of the width that each profile has
     unbounded: str | None = None  # profile that needs no width

@@ -80,7 +80,7 @@ class Passes:
 
     @property
     def optic(self) -> Literal["lens", "mirror"]:
-        """What the solid is called."""
+        """Return the name of the solid."""
         return "mirror" if self.reflects else "lens"
 
     @property

@@ -49,7 +49,7 @@ class Sheet:
     order: Order  # for the shop, with the file that the sheet belongs to
     target: np.ndarray  # (rows, columns) in coordinates, one sum: of the target that comes first, which is drawn
     irradiance: np.ndarray
-    figures: Sequence[GoalFigures]  # of the light on each target
+    figures: Sequence[GoalFigures]  # figures of the light on each target
     passed: bool  # every check
     version: str  # of the program
 

@@ -67,7 +67,7 @@ class WavefrontFigures:
     angle_max_urad: Size  # largest angle between rays and wanted rays
     floor: Size  # waves that rounding may add to the RMS
     flux: Share  # part of the source's flux that is measured
-    removed: Literal["piston and tilt"] = "piston and tilt"  # what is removed before rms and pv
+    removed: Literal["piston and tilt"] = "piston and tilt"  # terms that are removed before rms and pv
 
     @classmethod
     def of(cls, error: WavefrontError) -> WavefrontFigures:

@@ -82,7 +82,7 @@ class View:
     y: Extent
     seen_from: str  # lens | behind
     optic: str = "lens"  # or "mirror"
-    receiver: Receiver = LevelPlane(0.0)  # what its x and y are measured on
+    receiver: Receiver = LevelPlane(0.0)  # receiver on which its x and y are measured
     number: int = 0  # number of the target among several, by which its figures are named
 
     @classmethod

@@ -63,7 +63,7 @@ Place = tuple[float, float, float]
 def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str, Any]:
     """Of `lens` as it was designed for `scene`; shape: of bstcad.analysis.shape, and the volume."""
     front, material = lens.front, scene.lens.material
-    own = scene.lens.front.designed(front).surface.plain().parameters()  # of a net: its heights
+    own = scene.lens.front.designed(front).surface.plain().parameters()  # heights, if it is a net
     numbers = ({"curvature": 0.0} if front.level else {}) | {n: v for n, v in own.items() if isinstance(v, float)}
     fitted = {"within": FITTED} if front.is_net and scene.lens.front.kind != "bspline" else {}  # mm
     heavy = density(material) if material else None
