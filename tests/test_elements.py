@@ -230,6 +230,7 @@ def test_rays_in_space_draw_its_picture(folder):
     assert np.linalg.norm(picture - wanted) / np.linalg.norm(wanted) < 0.06
 
 
+@pytest.mark.bench  # batoid and mitsuba come with the extra `judges`
 def test_batoid_traces_them_too(folder):
     again = bstcad.open(folder)
     target = again.scene.target
@@ -237,6 +238,12 @@ def test_batoid_traces_them_too(folder):
         "batoid", again.lens, again.scene.judging_channels(), target.screen, target.irradiance(), rays=100_000, seed=1
     )
     assert found.judge.agrees, found.judge
+
+
+@pytest.mark.bench
+def test_mitsuba_says_that_it_knows_none_of_them(folder):
+    again = bstcad.open(folder)
+    target = again.scene.target
     said = compare("mitsuba", again.lens, again.scene.channels(), target.screen, target.irradiance(), rays=1)
     assert "windows or mirrors" in said.judge.declined
 

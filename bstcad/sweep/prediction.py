@@ -13,9 +13,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
+from numba.core.event import RecordingListener, install_listener
 
 from bstcad import pipeline
 from bstcad.analysis.light import blur
@@ -76,7 +77,11 @@ class Pilot:
 def fly(scene: Scene, quality: str, tick: Callable[[], None] = lambda: None) -> Pilot:
     """Design a scene of some quality made small.  SceneError where its design would be refused."""
     small, factor = made_small(of_quality(scene, quality))
-    made = pipeline.design(small, progress=lambda *told: tick(), later=True)
+    compiled, design = RecordingListener(), partial(pipeline.design, small, progress=lambda *told: tick(), later=True)
+    with install_listener("numba:compile", compiled):
+        made = design()
+    if compiled.buffer:  # the first design after an installation: its stages waited for the compiler
+        made = design()
     light, finer = small.channels(), factor > 1
     rrmsd = max(
         rrmsd_by_rays(made.lens, light, goal.receiver, target=goal.picture, effort=JUDGED, draw=small.draw)
