@@ -187,15 +187,18 @@ TUBES, POINTS, PIXELS, GRID, ITERATIONS = 1024, 513, 512, 256, 40  # a side, or 
 KERNEL = 0.115  # seconds of cold_run.kernel on two cores of pace 1, on which the following is stated too
 ROUND, TRANSPORT, FIT = 0.06, 0.2, 0.6  # seconds of stage 1: a round, the transport of GRID², a fit of POINTS²
 TWO_FACES = 2.4  # seconds of the transport of GRID² behind two freeform faces, where the light between them is followed
+BETWEEN = 3.0  # seconds of stage 1 of two freeform faces that do not grow with its sizes
 FOUND = 1.0  # seconds in which the rays of a point through TUBES² given places are found
 FRONT = 1.7  # seconds of the search for a curved front
 EVALUATION, VARIABLE, BLUR = 0.11, 0.046, 0.30  # seconds of an evaluation: TUBES², POINTS², PIXELS² blurred by images
+CALLED = 0.01  # seconds of an evaluation that do not grow with its sizes
 IMAGES = 0.7  # seconds in which the images of a source of some size are found, in each round
 ADAM = 0.1  # seconds of a step of the paper's procedure by TUBES² rays
 STARTED = 2.8  # seconds of imports, and of the end of the process
 WRITTEN, A_NET, A_PICTURE = 1.5, 2.4, 1.1  # seconds of writing, proof and report: in all, for POINTS², for PIXELS²
-RAYS, RAYS_OF_A_DRAFT = 1.6, 0.6  # seconds of the rays of a proof, for a target and a wavelength; of a lamp twice that
-WITNESS = 6.0  # seconds of the finer ray tubes that a second net needs, for a target
+A_MOUNT = 2.5  # seconds of cutting and proving the mounted part
+RAYS, RAYS_OF_A_DRAFT = 1.6, 1.0  # seconds of the rays of a proof, for a target and a wavelength; of a lamp twice that
+WITNESS, WITNESS_OF_A_DRAFT = 6.0, 2.5  # seconds of the finer ray tubes that a second net needs, for a target
 LIBRARIES = 1.5  # GB in both processes
 CORNERS, NET_GB, PIXELS_GB = 0.12, 0.27, 0.02  # GB of TUBES² tubes, POINTS² control points, PIXELS² pixels
 A_GOAL = 3.0  # memory for each of several goals over that of the tubes for one target
@@ -218,10 +221,11 @@ def usual(scene: Scene) -> Seconds:
     halvings, transport = (1, TWO_FACES) if scene.lens.front.shaped else (2, TRANSPORT)
     grids = [max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left, halvings)) for left in range(knobs.rounds)]
     first = ROUND * knobs.rounds + (FRONT if scene.lens.front.free else 0.0)
+    first += BETWEEN if scene.lens.front.shaped else 0.0
     first += transport * sum((grid / GRID) ** 2 for grid in grids) * knobs.transport_iterations / ITERATIONS
     fits = [fitted for level in knobs.levels[-2:] for fitted in scene.lens.nets(level)]
     first += FIT * sum(math.prod(both(fitted)) for fitted in fits) / POINTS**2
-    each, begun = VARIABLE * net, JUDGING * pixels ** (2 / 3)  # of an evaluation, and of a round
+    each, begun = CALLED + VARIABLE * net, JUDGING * pixels ** (2 / 3)  # of an evaluation, and of a round
     if scene.source.extent is not None:
         each, begun = each + BLUR * pixels, begun + IMAGES
     launched = sum((tubes / TUBES) ** 2 for tubes, _ in sheets)
@@ -252,9 +256,11 @@ def memory_gb(scene: Scene) -> float:
 def proved(scene: Scene) -> float:
     """Seconds of writing, proof and report on two cores of pace 1; pipeline.reserve is a bound above it."""
     wide = not scene.source.parallel or scene.source.extent is not None
-    a_line = (RAYS_OF_A_DRAFT if scene.tailoring.quality == "draft" else RAYS) * (2 if wide else 1)
-    a_target = a_line * len(scene.source.lines) + WITNESS * (len(scene.lens.nets()) - 1)
-    return WRITTEN + A_NET * _points(scene) + A_PICTURE * _pixels(scene) + a_target * len(scene.targets)
+    draft = scene.tailoring.quality == "draft"
+    rays, witness = (RAYS_OF_A_DRAFT, WITNESS_OF_A_DRAFT) if draft else (RAYS, WITNESS)
+    a_target = rays * (2 if wide else 1) * len(scene.source.lines) + witness * (len(scene.lens.nets()) - 1)
+    mounted = A_MOUNT if scene.mount is not None else 0.0
+    return WRITTEN + A_NET * _points(scene) + A_PICTURE * _pixels(scene) + a_target * len(scene.targets) + mounted
 
 
 def _points(scene: Scene) -> float:
