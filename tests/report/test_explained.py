@@ -77,9 +77,6 @@ class TestPages:
         links = re.findall(r"\]\((\w+)\.md#([\w-]+)\)", explained._page(page))
         assert links and [link for link in links if "#".join(link) not in sections()] == []
 
-    def test_lines_are_short(self, page):
-        assert [line for line in explained._page(page).splitlines() if len(line) > 120] == []
-
 
 def test_keys_of_the_scene_are_known():
     known = {row.key.replace("[]", "") for row in rows()} | {"mount.flange", "lens.front", "lens.outline"}

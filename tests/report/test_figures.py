@@ -29,7 +29,7 @@ from bstcad.report.light_figures import (
     primary,
 )
 from bstcad.report.record import Point, Stage
-from bstcad.scene.picture import from_srgb, to_srgb
+from bstcad.scene.picture import to_srgb
 
 X, Y = (0.0, 400.0), (-100.0, 200.0)
 LENS, BEHIND = View(X, Y, "lens"), View(X, Y, "behind")
@@ -78,15 +78,8 @@ class TestIrradianceTriptych:
         others = [pixel_at(figure, target, x, y) for x, y in ((378.0, 184.5), (22.0, -84.5), (378.0, -84.5))]
         assert bright.min() > 0.9
         assert np.max(others) < 0.6
-
-    def test_from_the_lens_x_grows_to_the_left_and_the_figure_says_so(self):
-        for view, ends in ((LENS, X[::-1]), (BEHIND, X)):
-            figure = irradiance_triptych(corner_picture(), corner_picture(), view)
-            pictures = [axes for axes in figure.axes if axes.images]
-            assert [axes.get_xlim() for axes in pictures] == [ends] * 3
-            assert [axes.get_ylim() for axes in pictures] == [Y] * 3
-            assert view.words in figure.get_supxlabel()
-        assert "Seen from the lens" in LENS.words and "behind" in BEHIND.words
+        assert all(axes.get_xlim() == (X[::-1] if view is LENS else X) for axes in figure.axes if axes.images)
+        assert view.words in figure.get_supxlabel()
 
     def test_grey_is_what_a_screen_has_to_be_sent(self):
         """Half the irradiance is 188 of 255, and the scale's ticks are linear."""
@@ -96,7 +89,6 @@ class TestIrradianceTriptych:
         dark, bright = (pixel_at(figure, figure.axes[0], 100.0, y)[0] for y in (0.0, 150.0))
         assert bright == pytest.approx(to_srgb(1 / light_figures.HEADROOM), abs=1 / 127)
         assert dark == pytest.approx(to_srgb(0.5 / light_figures.HEADROOM), abs=1 / 127)
-        assert from_srgb(dark) / from_srgb(bright) == pytest.approx(0.5, abs=0.02)
         scale = next(axes for axes in figure.axes if "irradiance" in axes.get_ylabel())
         ticks = [scale.transData.transform((0, tick))[1] for tick in (0.0, 0.5, 1.0)]
         assert ticks[1] - ticks[0] == pytest.approx(ticks[2] - ticks[1])
@@ -112,8 +104,6 @@ class TestIrradianceTriptych:
         simulated.lines[-1].set_visible(False)  # the ring around it
         spot, ground = pixel_at(figure, simulated, x, y)[0], pixel_at(figure, simulated, 300.0, 0.0)[0]
         assert ground < 0.92 and spot > ground + 0.08
-        assert all(spine.get_visible() for spine in simulated.spines.values())
-        assert simulated.images[0].get_clim()[1] > 1.3
 
     def test_difference_is_signed_percent_of_the_mean_lit_irradiance(self):
         target = np.zeros((8, 8))
@@ -133,28 +123,22 @@ class TestIrradianceTriptych:
         assert lit_mean(target) == 1.0
 
 
-class TestCrossSection:
-    TARGET = np.full((8, 8), 0.1)
-    FOUND = TARGET.copy()
-    FOUND[1, 2] = 2.0  # row 1, column 2 of 8 over [0, 8]²: y = 6.5, x = 2.5
-    FOUND[4, :4] = 0.7  # left half of the row through the centre
-
-    @pytest.mark.parametrize("seen_from", ["lens", "behind"])
-    def test_cuts_go_through_the_centre_and_through_the_brightest_place(self, seen_from):
-        view = View((0.0, 8.0), (0.0, 8.0), seen_from)
-        centre_x, centre_y, hot_x, hot_y = cross_section(self.TARGET, self.FOUND, view).axes
-        assert "centre, along x (y = 3.5 mm)" in centre_x.get_title(loc="left")
-        assert "centre, along y (x = 4.5 mm)" in centre_y.get_title(loc="left")
-        assert "brightest place, along x (y = 6.5 mm)" in hot_x.get_title(loc="left")
-        assert "brightest place, along y (x = 2.5 mm)" in hot_y.get_title(loc="left")
-        x, values = centre_x.lines[0].get_data()
-        assert values[x < 4] == pytest.approx(7.0) and values[x > 4] == pytest.approx(1.0)
-        x, values = hot_x.lines[0].get_data()
-        assert x[np.argmax(values)] == 2.5
-        y, values = hot_y.lines[0].get_data()
-        assert y[np.argmax(values)] == 6.5
-        assert centre_x.get_xlim() == hot_x.get_xlim() == ((8.0, 0.0) if seen_from == "lens" else (0.0, 8.0))
-        assert centre_y.get_xlim() == hot_y.get_xlim() == (0.0, 8.0)
+@pytest.mark.parametrize("seen_from", ["lens", "behind"])
+def test_cuts_go_through_the_centre_and_through_the_brightest_place(seen_from):
+    target = np.full((8, 8), 0.1)
+    found = target.copy()
+    found[1, 2] = 2.0  # row 1, column 2 of 8 over [0, 8]²: y = 6.5, x = 2.5
+    found[4, :4] = 0.7  # left half of the row through the centre
+    centre_x, centre_y, hot_x, hot_y = cross_section(target, found, View((0.0, 8.0), (0.0, 8.0), seen_from)).axes
+    for axes, place in ((centre_x, "(y = 3.5 mm)"), (centre_y, "(x = 4.5 mm)"), (hot_x, "(y = 6.5 mm)")):
+        assert place in axes.get_title(loc="left")
+    x, values = centre_x.lines[0].get_data()
+    assert values[x < 4] == pytest.approx(7.0) and values[x > 4] == pytest.approx(1.0)
+    for axes, hot in ((hot_x, 2.5), (hot_y, 6.5)):
+        place, values = axes.lines[0].get_data()
+        assert place[np.argmax(values)] == hot
+    assert centre_x.get_xlim() == hot_x.get_xlim() == ((8.0, 0.0) if seen_from == "lens" else (0.0, 8.0))
+    assert centre_y.get_xlim() == hot_y.get_xlim() == (0.0, 8.0)
 
 
 class TestSurfaceMaps:
@@ -199,11 +183,6 @@ class TestSurfaceMaps:
         shown = np.isfinite(np.ma.filled(height.get_array(), np.nan))
         assert shown.mean() == pytest.approx(np.pi / 4, abs=0.02)  # a sample is 1 % of the width
 
-    def test_single_precision_and_flat(self):
-        flat = lens_of(lambda x, y: 0.0 * x * y)
-        figure = maps(Lens(flat.front, flat.back.to(torch.float32), flat.outline, flat.index))
-        assert png(figure).startswith(b"\x89PNG")
-
 
 class TestSideView:
     def test_the_section_reaches_from_face_to_face(self):
@@ -240,22 +219,14 @@ def test_transport_map_draws_each_line_both_ways(view):
     assert view.words in figure.get_supxlabel()
 
 
-class TestConvergence:
-    HISTORY = [Point(2.0 + i, 0.5 * 0.8**i) for i in range(10)]
-    STAGES = [Stage("transport", 1.5), Stage("stage 2", 10.0, 0.07)]
-
-    def test_points_stages_and_floor(self):
-        axes = figure_jobs.convergence(self.HISTORY, self.STAGES, 0.01).axes[0]
-        curve, *lines = (line.get_xydata() for line in axes.lines)
-        assert curve[:, 1] == pytest.approx([point.rrmsd for point in self.HISTORY])
-        upright = [line[0, 0] for line in lines if line[0, 0] == line[1, 0]]
-        level = [line[0, 1] for line in lines if line[0, 1] == line[1, 1]]
-        assert upright == pytest.approx([1.5, 11.5])  # where the stages end
-        assert level == pytest.approx([0.01])
-        assert axes.get_yscale() == "log"
-
-    def test_one_point_without_stages_or_noise(self):
-        assert png(figure_jobs.convergence(self.HISTORY[:1], [], 0.0)).startswith(b"\x89PNG")
+def test_convergence_has_its_points_stages_and_floor():
+    history = [Point(2.0 + i, 0.5 * 0.8**i) for i in range(10)]
+    axes = figure_jobs.convergence(history, [Stage("transport", 1.5), Stage("stage 2", 10.0, 0.07)], 0.01).axes[0]
+    curve, *lines = (line.get_xydata() for line in axes.lines)
+    assert curve[:, 1] == pytest.approx([point.rrmsd for point in history])
+    assert [line[0, 0] for line in lines if line[0, 0] == line[1, 0]] == pytest.approx([1.5, 11.5])  # stages' ends
+    assert [line[0, 1] for line in lines if line[0, 1] == line[1, 1]] == pytest.approx([0.01])
+    assert png(figure_jobs.convergence(history[:1], [], 0.0)).startswith(b"\x89PNG")
 
 
 def test_a_picture_of_noise_stays_light():
@@ -265,29 +236,19 @@ def test_a_picture_of_noise_stays_light():
     assert Image.open(io.BytesIO(picture)).width > 700
 
 
-WAVELENGTHS = (450.0, 530.0, 630.0)
+WAVELENGTHS = (450.0, 530.0, 630.0)  # nm: blue, green, red
 
 
-@pytest.mark.parametrize(("wavelength", "channel"), [(450.0, 2), (530.0, 1), (630.0, 0)])
-def test_blue_green_and_red_are_what_they_are_called(wavelength, channel):
-    assert int(np.argmax(primary(wavelength))) == channel
-
-
-@pytest.mark.parametrize("wavelengths", (WAVELENGTHS, (486.1, 587.6, 656.3), (400.0, 900.0)))
-def test_where_all_lines_are_alike_the_light_is_grey(wavelengths):
+@pytest.mark.parametrize("wavelengths", (WAVELENGTHS, (400.0, 900.0)))
+def test_each_line_has_its_colour_and_where_all_are_alike_the_light_is_grey(wavelengths):
+    assert [int(np.argmax(primary(wavelength))) for wavelength in WAVELENGTHS] == [2, 1, 0]
     picture = np.random.default_rng(0).random((6, 8))
     shares = np.full(len(wavelengths), 1 / len(wavelengths))
     colours = balanced([picture] * len(wavelengths), wavelengths, shares)
     assert np.abs(colours - picture[..., None]).max() < 1e-12
 
 
-def test_light_of_one_line_alone_has_its_colour():
-    one, none = np.ones((2, 2)), np.zeros((2, 2))
-    red = balanced([none, none, one], WAVELENGTHS, [1 / 3] * 3)[0, 0]
-    assert red[0] > 0.9 and red[2] < 0.1
-
-
-@pytest.mark.parametrize("count", (2, 3, 7))
+@pytest.mark.parametrize("count", (2, 7))
 def test_the_figure_has_a_picture_of_all_lines_and_one_of_each(count):
     target = np.ones((10, 20))
     lines = [Line(450.0 + 30 * k, 1 / count, target * (1 + 0.1 * k)) for k in range(count)]

@@ -15,7 +15,7 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Plane, sag
 from bstcad.report import grid_sag
-from bstcad.report.grid_sag import BOUND, GridSag, Moved, Throw, moved_by, table_note
+from bstcad.report.grid_sag import BOUND, GridSag, Throw, moved_by, table_note
 from tests.report.test_exports import read_zemax
 
 OUTLINE, THROW = Rectangle(8.0, 6.0), 200.0  # mm
@@ -109,9 +109,3 @@ def test_a_narrow_lens_has_the_five_points_that_opticstudio_asks_for():
         x, y, (z, *_) = read_zemax(grid.text())
         assert x[-1] >= 4.0 - 1e-9 and y[-1] >= 0.25 - 1e-9
         assert np.abs(z + sag(lens.back, 0.0, 0.0) - sag(lens.back, *np.meshgrid(x, y))).max() < 1e-12
-
-
-def test_a_length_is_stated_in_pixels_too():
-    assert str(Moved(0.0169, 0.332, 0.3125)) == (
-        "0.0169 mm RMS, 0.332 mm at most (0.0541 and 1.06 target pixels)"
-    )  # fmt: skip

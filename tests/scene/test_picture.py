@@ -195,10 +195,6 @@ def test_a_profile_that_is_none_or_of_other_channels_or_of_srgb_changes_nothing(
     np.testing.assert_allclose(found, RAMP, atol=off + 1e-4)
 
 
-def test_inverted_is_the_negative_that_is_seen():
-    np.testing.assert_allclose(light(saved(RAMP), invert=True), from_srgb(1 - RAMP / 255), atol=1e-12)
-
-
 def test_a_cmyk_jpeg_has_its_white_bright_and_its_ink_dark():
     image = Image.new("CMYK", (16, 16), (0, 0, 0, 0))
     image.paste((0, 0, 0, 255), (0, 0, 16, 8))
@@ -269,12 +265,6 @@ def test_what_cameras_and_programs_write_is_read(tmp_path, kind):
     grey = light(found, 32)
     np.testing.assert_array_equal(grey > 0.4, SHAPE > 0)
     assert grey[SHAPE > 0].min() > 0.8 and grey[SHAPE == 0].max() < 0.1 and drawn(found, 32).remarks == ()
-
-
-def test_an_avif_that_cannot_be_decoded_is_called_so():
-    whole = saved(Image.fromarray(SHAPE).convert("RGB"), "AVIF")
-    with pytest.raises(SceneError, match="'p.avif' is an AVIF picture that cannot be decoded here; save it"):
-        light(whole[:40], name="p.avif")
 
 
 @pytest.mark.parametrize("value", [np.nan, -1.0, np.inf])

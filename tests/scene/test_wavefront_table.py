@@ -22,12 +22,6 @@ WAVES = {
 }
 
 
-def test_without_the_table_nothing_is_asked_for():
-    scene = load(TEMPLATES / "thu.toml")
-    assert scene.wavefront is None and scene.accept.wavefront is None
-    assert "wavefront" not in scene.toml()
-
-
 @pytest.mark.parametrize("text", WAVES)
 def test_a_wave_is_read_and_written_back(text, tmp_path):
     file = tmp_path / "scene.toml"
@@ -45,8 +39,3 @@ def test_a_scene_is_changed_by_the_record_itself():
     assert changed.wavefront == wave
     assert changed.changed({"wavefront.weight": 2.0}).wavefront.weight == 2.0
     assert changed.changed({"wavefront": None}).wavefront is None
-
-
-def test_a_mirror_may_have_a_wave():
-    scene = load(TEMPLATES / "mirror.toml", {"wavefront": {"kind": "plane", "z": 120.0}})
-    assert scene.wavefront == PlaneWave(120.0)
