@@ -52,9 +52,8 @@ def ways_to(row, text, left=4):
     return left > 0 and any(ways_to(row, changed(text, *step), left - 1) for step in steps(found, key))
 
 
-@pytest.mark.parametrize("row", rows(), ids=lambda row: f"{row.key}-{'-'.join(row.kinds)}")
-def test_every_key_can_be_reached(row):
-    assert ways_to(row, TEXTS["disk"])
+def test_every_key_can_be_reached():
+    assert [row.key for row in rows() if not ways_to(row, TEXTS["disk"])] == []
 
 
 @pytest.mark.parametrize("name", DATA)
@@ -73,10 +72,8 @@ def test_a_field_says_what_the_schema_says_and_what_the_scene_has(name):
         assert field.default == default or toml(typed(field.key, field.default, DATA[name])) == default
         assert field.control != "choice" or " | ".join(field.choices) in row.range
         assert field.given == (field.value != "")
-        assert (
-            field.value == ""
-            or changed(TEXTS[name], field.key, typed(field.key, field.value, DATA[name])) == TEXTS[name]
-        )
+        typed_again = typed(field.key, field.value, DATA[name])
+        assert field.value == "" or changed(TEXTS[name], field.key, typed_again) == TEXTS[name]
 
 
 def values(table, prefix=""):
@@ -85,11 +82,8 @@ def values(table, prefix=""):
         key = f"{prefix}.{name}".lstrip(".")
         parts = value if isinstance(value, list) and value and isinstance(value[0], dict) else [value]
         for k, part in enumerate(parts):
-            yield from (
-                values(part, f"{key}[{k}]" if part is not value else key)
-                if isinstance(part, dict)
-                else [key] * (k == 0)
-            )
+            of_part = values(part, f"{key}[{k}]" if part is not value else key) if isinstance(part, dict) else [key]
+            yield from of_part
 
 
 @pytest.mark.parametrize("name", DATA)
@@ -294,7 +288,7 @@ def test_no_scene_at_all_can_be_begun():
 
 
 def test_a_form_loads_no_torch():
-    code = "import sys\nfrom bstcad.app.form import form, html\nhtml(form({}), {})\n"
+    code = "import sys, bstcad.app.scene_text\nfrom bstcad.app.form import form, html\nhtml(form({}), {})\n"
     code += "print([m for m in ('torch', 'numpy', 'scipy') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

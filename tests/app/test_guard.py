@@ -11,7 +11,6 @@ import threading
 import time
 from types import SimpleNamespace
 
-import psutil
 import pytest
 from PIL import Image
 
@@ -48,9 +47,8 @@ def refused(answer, why):
 @pytest.mark.parametrize(
     "cookie",
     [
-        None, "", "nonsense", f"bstcad-{PORT}=", f"bstcad-{PORT}=wrong", f"bstcad-{PORT}={OTHER}",
-        f"bstcad-{PORT}={TOKEN[:-1]}", f"bstcad-{PORT}={TOKEN}x", f"bstcad-{PORT + 1}={TOKEN}", f"token={TOKEN}",
-        f"bstcad-{PORT}=\u00e9", f"bstcad-{PORT}={TOKEN.upper()}",
+        None, "nonsense", f"bstcad-{PORT}=", f"bstcad-{PORT}={TOKEN[:-1]}", f"bstcad-{PORT}={TOKEN}x",
+        f"bstcad-{PORT + 1}={TOKEN}", f"token={TOKEN}", f"bstcad-{PORT}=\u00e9", f"bstcad-{PORT}={TOKEN.upper()}",
     ],
 )  # fmt: skip
 def test_without_the_cookie_of_this_start_nothing_is_told_or_done(own, cookie):
@@ -58,12 +56,6 @@ def test_without_the_cookie_of_this_start_nothing_is_told_or_done(own, cookie):
     assert refused(own.ask("/", cookie=cookie), "token")
     assert refused(change(own.ask, cookie=cookie), "token")
     assert tree(own.folder) == before
-
-
-def test_the_cookie_of_this_start_is_enough(own):
-    assert "small.toml" in own.ask("/").text
-    assert change(own.ask).status == 200
-    assert "777" in own.workspace.opened("small").text
 
 
 def test_another_start_knows_neither_cookie_nor_address(own):
@@ -81,9 +73,8 @@ def test_every_route_refuses_who_has_no_cookie(own):
 
 
 HOSTILE = [
-    "http://evil.example", "null", "", f"http://127.0.0.1:{PORT + 1}", "http://127.0.0.1", f"https://{HOST}",
-    f"http://{HOST}.evil.example", f"http://evil.example:{PORT}", f"http://{HOST}@evil.example", f"http://{HOST}/",
-    f"http://http://{HOST}",
+    "http://evil.example", "null", "", f"http://127.0.0.1:{PORT + 1}", f"https://{HOST}", f"http://{HOST}.evil.example",
+    f"http://{HOST}@evil.example", f"http://{HOST}/",
 ]  # fmt: skip
 
 
@@ -97,7 +88,7 @@ def test_other_pages_are_refused_even_with_the_cookie(own, origin):
     assert tree(own.folder) == before
 
 
-@pytest.mark.parametrize("site", ["cross-site", "same-site", "", "nonsense"])
+@pytest.mark.parametrize("site", ["cross-site", "same-site", "nonsense"])
 def test_what_a_browser_says_comes_from_elsewhere_is_refused(own, site):
     """`same-site`: another port of this machine, such as a notebook's."""
     assert refused(own.ask("/", sec_fetch_site=site), "origin")
@@ -111,12 +102,8 @@ def test_own_pages_and_typed_addresses_are_answered(own, site):
 
 
 @pytest.mark.parametrize(
-    "host",
-    [
-        None, "", "evil.example", f"evil.example:{PORT}", "127.0.0.1", f"127.0.0.1:{PORT + 1}", f"{HOST}.evil.example",
-        f"localhost.evil.example:{PORT}", f"[::1]:{PORT}", f"0.0.0.0:{PORT}", f"{HOST}:{PORT}", f"x@{HOST}",
-    ],
-)  # fmt: skip
+    "host", [None, "", f"evil.example:{PORT}", "127.0.0.1", f"{HOST}.evil.example", f"0.0.0.0:{PORT}", f"x@{HOST}"]
+)
 def test_a_foreign_name_that_points_here_is_refused(own, host):
     before = tree(own.folder)
     assert refused(own.ask("/", host=host), "host")
@@ -143,7 +130,7 @@ def test_sockets_are_closed_before_they_are_open(own):
 # ---- the address of the terminal -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("path", ["/", "/scene/small", "/design/made"])
+@pytest.mark.parametrize("path", ["/", "/scene/small"])
 def test_the_terminals_address_sets_the_cookie_and_leads_on_without_the_token(own, path):
     answer = own.ask(f"{path}?token={TOKEN}", cookie=None)
     assert (answer.status, answer["location"], answer.body) == (303, path, b"")
@@ -154,7 +141,7 @@ def test_the_terminals_address_sets_the_cookie_and_leads_on_without_the_token(ow
 
 
 def test_a_wrong_token_in_the_address_sets_no_cookie(own):
-    for query in ("token=", "token=wrong", f"token={OTHER}", f"token={TOKEN}x", "token=%ff", f"token=&token={TOKEN}x"):
+    for query in ("token=", f"token={OTHER}", f"token={TOKEN}x", "token=%ff"):
         assert refused(own.ask(f"/?{query}", cookie=None), "token"), query
 
 
@@ -238,9 +225,7 @@ def endless(part=b"\xff" * MB, most=200):
     return (part for _ in range(most))
 
 
-@pytest.mark.parametrize(
-    "path", ["/api/picture", "/api/scenes", "/api/scene/small/change", "/api/design/made/measured"]
-)
+@pytest.mark.parametrize("path", ["/api/picture", "/api/scenes"])
 def test_what_states_that_it_is_too_large_is_not_read_at_all(own, path):
     before = tree(own.folder)
     answer = own.ask(path, endless(), content_length=str(200 * MB))
@@ -249,7 +234,7 @@ def test_what_states_that_it_is_too_large_is_not_read_at_all(own, path):
 
 
 @pytest.mark.parametrize("length", [None, "10", "²"])
-@pytest.mark.parametrize("path", ["/api/picture", "/api/scenes", "/api/scene/small/change"])
+@pytest.mark.parametrize("path", ["/api/picture", "/api/scenes"])
 def test_what_is_too_large_without_saying_so_is_read_no_further_than_the_limit(own, path, length):
     before, most = tree(own.folder), LARGEST_UPLOAD if path == "/api/picture" else LARGEST_BODY
     answer = own.ask(path, endless(), content_length=length, transfer_encoding="chunked")
@@ -272,12 +257,8 @@ def test_a_picture_may_be_larger_than_a_scene(own):
     assert (own.folder / "pictures" / name).read_bytes() == file.getvalue()
 
 
-@pytest.mark.parametrize(
-    "body", ["[" * 100_000, '{"a":' * 100_000, "no JSON", "[]", "5", '"x"', "null", b"\xff\xfe{}", b"\0"]
-)
-@pytest.mark.parametrize(
-    "path", ["/api/scenes", "/api/scene/small/change", "/api/scene/small/save", "/api/scene/small/preview"]
-)
+@pytest.mark.parametrize("body", ["[" * 100_000, '{"a":' * 100_000, "no JSON", "[]", '"x"', "null", b"\xff\xfe{}"])
+@pytest.mark.parametrize("path", ["/api/scenes", "/api/scene/small/save"])
 def test_what_is_no_table_of_json_is_refused(own, path, body):
     before = tree(own.folder)
     answer = own.ask(path, body)
@@ -285,31 +266,20 @@ def test_what_is_no_table_of_json_is_refused(own, path, body):
     assert tree(own.folder) == before
 
 
-def test_ten_megabytes_of_json_are_refused(own):
-    answer = own.ask("/api/scene/small/change", {"text": "#" * 10 * MB})
-    assert (answer.status, answer.text) == (413, WHY_NOT["size"])
-    assert own.workspace.opened("small").saved
-
-
 # ---- uploads ---------------------------------------------------------------------------------------------------------
 
 NO_PICTURES = {
     "bomb": png(60_000, 60_000, rows=1),
     "a bomb below Pillow's own limit": png(9000, 9000, rows=1),
-    "long": png(70_000, 1, rows=1),
     "text": b"this is a text file that somebody called photo.png",
     "svg": b'<?xml version="1.0"?><svg xmlns="http://www.w3.org/2000/svg"><script>alert(1)</script></svg>',
-    "html": b"<!doctype html><script>alert(1)</script>",
     "nothing": b"",
     "a beginning": png(64, 64)[:20],
     "cut": png(64, 64)[:-30],
-    "of no width": png(0, 5),
     "damaged": png(64, 64).replace(b"IDAT", b"IDAT\0", 1),
     "no pixels": b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", png(8, 8)[16:29]) + chunk(b"IEND", b""),
-    "ppm": b"P6 1 1 255\n\0\0\0",
     "eps": b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n(/etc/passwd) run\n",
     "heic": b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(64),
-    "toml": b'name = "x"\n',
 }  # fmt: skip
 
 
@@ -325,16 +295,17 @@ def test_what_is_no_picture_is_refused_in_a_sentence_and_not_kept(own, what):
 
 
 def test_a_picture_is_kept_whole_by_a_name_of_its_content(own):
-    data = png(12, 8)
+    data, file = png(12, 8), io.BytesIO()
     [name] = own.ask("/api/picture", data).json.values()
     assert tree(own.folder / "pictures") == {name: data}
     assert re.fullmatch(r"[0-9a-f]{12}\.png", name)
-    assert own.ask("/api/picture", data).json == {"picture": name}  # once more is the same
-    assert own.ask("/api/picture", png(12, 9)).json != {"picture": name}
+    Image.new("L", (9, 7), 200).save(file, "jpeg")
+    answer = own.ask("/api/picture", file.getvalue(), content_type="image/png")
+    assert answer.json["picture"].endswith(".jpg")
     assert len(tree(own.folder / "pictures")) == 2
 
 
-@pytest.mark.parametrize("sent", ["../../evil.png", "/etc/evil.png", "..\\evil.png", "evil.toml", ".evil", 'é".png'])
+@pytest.mark.parametrize("sent", ["../../evil.png", "/etc/evil.png", 'é".png'])
 def test_a_senders_name_changes_nothing(own, sent):
     data = png(12, 8)
     [name] = own.ask("/api/picture", data).json.values()
@@ -343,13 +314,6 @@ def test_a_senders_name_changes_nothing(own, sent):
     query = "name=../../evil.png&filename=evil.png&path=/tmp/evil.png"
     assert own.ask(f"/api/picture?{query}", data, **words).json == {"picture": name}
     assert tree(own.folder.parent) == before
-
-
-def test_the_kind_of_a_picture_is_that_of_its_content(own):
-    file = io.BytesIO()
-    Image.new("L", (9, 7), 200).save(file, "jpeg")
-    answer = own.ask("/api/picture", file.getvalue(), content_type="image/png")
-    assert answer.json["picture"].endswith(".jpg")
 
 
 # ---- a real socket ---------------------------------------------------------------------------------------------------
@@ -428,22 +392,6 @@ def test_a_socket_lets_in_no_more_than_the_guard(served):
     websocket = {"connection": "Upgrade", "upgrade": "websocket", "sec_websocket_version": "13"}
     assert got(served, "/", sec_websocket_key="dGhlIHNhbXBsZSBub25jZQ==", **websocket)[0] == 403
     assert got(served, "/", sec_websocket_key="dGhlIHNhbXBsZSBub25jZQ==", cookie=cookie, **websocket)[0] != 101
-
-
-def test_a_socket_takes_no_endless_body(served):
-    cookie = got(served, served.first)[1]["set-cookie"].partition(";")[0]
-    head = f"POST /api/scenes HTTP/1.1\r\nhost: {served.host}\r\ncookie: {cookie}\r\ntransfer-encoding: chunked\r\n\r\n"
-    part, process = f"{MB:x}\r\n".encode() + b"x" * MB + b"\r\n", psutil.Process()
-    with socket.create_connection(("127.0.0.1", served.port), timeout=20) as line:
-        line.sendall(head.encode() + part * (LARGEST_BODY // MB + 1))
-        assert line.recv(100).startswith(b"HTTP/1.1 413 ")  # though the body goes on
-        held = process.memory_info().rss
-        with contextlib.suppress(ConnectionError):  # it may hang up, or let the rest fall
-            for _ in range(200):
-                line.sendall(part)
-        assert process.memory_info().rss - held < 50 * MB
-    assert "pictures" not in {path.name for path in served.folder.iterdir()}
-    assert got(served, "/", cookie=cookie)[0] == 200  # it goes on
 
 
 def test_a_socket_takes_the_points_of_a_measured_part(served, monkeypatch):

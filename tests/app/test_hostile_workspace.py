@@ -135,6 +135,9 @@ def damaged(folder, away):
     for kind in JOBS:
         (folder / f".files.{kind}-run").write_text("a file")
     (folder / "pictures").write_text("a file")
+    for name in (".two words.design-run", "..design-run", ".<b>.design-run"):
+        (folder / name).mkdir()
+        State("failed").put(folder / name)
     return (*names, "folders", "files")
 
 
@@ -163,13 +166,13 @@ PLACES = (
 )  # fmt: skip
 
 
-def asked(path, method, names):
-    """(address, body) of a route with every name, every file and every body."""
+def asked(path, method, names, bodies):
+    """(address, body) of a route with every name, every file and so many bodies."""
     for name in names if "{name}" in path else ("",):
         for place in PLACES if "{path" in path else ("",):
             address = path.replace("{name}", name).replace("{path:path}", place)
             for query in ("", *QUERIES.get(path, ())):
-                for body in BODIES[path.startswith("/api/design")] if method == "POST" else (b"",):
+                for body in BODIES[path.startswith("/api/design")][:bodies] if method == "POST" else (b"",):
                     yield f"{address}{query.replace('{name}', name)}", body
     if path == "/compare":
         yield from ((f"/compare?design={name}&design=within", b"") for name in names)
@@ -188,8 +191,8 @@ def own(tmp_path, monkeypatch):
     return found
 
 
-@pytest.mark.parametrize("kind", [links, damaged])
-def test_every_route_answers_about_a_hostile_workspace_and_tells_no_secret(own, kind, capsys):
+@pytest.mark.parametrize(("kind", "bodies"), [(links, 6), (damaged, 1)])
+def test_every_route_answers_about_a_hostile_workspace_and_tells_no_secret(own, kind, bodies, capsys):
     shutil.rmtree(own.folder)
     names, before, faults, count = kind(own.folder, own.outside), tree(own.outside), set(), 0
     kept = shutil.copytree(own.folder, own.folder.with_name("kept"), symlinks=True)
@@ -197,7 +200,7 @@ def test_every_route_answers_about_a_hostile_workspace_and_tells_no_secret(own, 
         if method == "POST":
             shutil.rmtree(own.folder)
             shutil.copytree(kept, own.folder, symlinks=True)
-        for address, body in asked(path, method, names) if method != "HEAD" else ():  # HEAD is a GET
+        for address, body in asked(path, method, names, bodies) if method != "HEAD" else ():  # HEAD is a GET
             answer, count = own.ask(address, body, method), count + 1
             if answer.status >= 500 or answer.error is not None:
                 faults.add((method, address, answer.status, repr(answer.error)[:100]))
@@ -207,7 +210,7 @@ def test_every_route_answers_about_a_hostile_workspace_and_tells_no_secret(own, 
                 faults.add((method, address, "wrote outside"))
                 shutil.rmtree(own.outside)
                 outside(own.outside)
-    assert count > 1000 and not faults, "\n".join(map(str, sorted(faults)))
+    assert count > 500 and not faults, "\n".join(map(str, sorted(faults)))
     assert "Traceback" not in capsys.readouterr().err
 
 
@@ -294,10 +297,6 @@ def test_unfinished_headers_are_closed(own, monkeypatch):
         finally:
             running.should_exit = True
             thread.join(10)
-
-
-def test_the_longest_wait_for_headers_is_ten_seconds():
-    assert connections.HEADERS_WITHIN == 10.0
 
 
 def test_names_of_links_that_lead_out_are_not_listed(own):

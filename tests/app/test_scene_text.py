@@ -3,8 +3,6 @@
 import copy
 import json
 import re
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
@@ -12,16 +10,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bstcad.app.kinds import alternatives, new_table, node_at, plain, records_at, table_at
+from bstcad.app.kinds import new_table, node_at, records_at, table_at
 from bstcad.app.scene_text import as_words, changed, pieces, same, typed
 from bstcad.app.words import number
 from bstcad.scene.dotted_keys import override
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import _validated
-from bstcad.scene.schema import TAGS, records, rows, schema, tags
+from bstcad.scene.schema import TAGS, records, rows, tags
 
 FOLDER = Path(__file__).parents[2] / "templates"
-TEXTS = {path.stem: path.read_text(encoding="utf-8") for path in sorted(FOLDER.glob("*.toml"))}
+NAMES = (  # templates with tables of each kind
+    "beam_shaper", "disk", "flange", "led", "mirror", "portrait", "sun_caustic", "thu", "two_pictures", "white_logo",
+)  # fmt: skip
+TEXTS = {name: (FOLDER / f"{name}.toml").read_text(encoding="utf-8") for name in NAMES}
 UNIONS = (
     "source", "source.aperture", "lens.outline", "lens.front", "target.outline", "target.profile", "wavefront",
     "mount.rim", "mount.flange.outline", "effects[0]",
@@ -140,7 +141,6 @@ def test_changes_one_after_another_keep_the_law(name, draw):
 
 
 PLACED = [
-    ("disk", "target.z", 1234.5, "[target]\nz = 1234.5                      # the screen\nx = "),
     ("disk", "lens.min_thickness", 1.0, "65 x 65 heights\nmin_thickness = 1.0\n\n[target]"),
     ("disk", "target.seen_from", "lens", 'even light …\nseen_from = "lens"\noutline = '),
     ("disk", "target.outline.radius", 12.25, '\noutline = { shape = "circle", radius = 12.25 }  # … inside'),
@@ -151,7 +151,6 @@ PLACED = [
     ("flange", "mount.flange.draft", 2.0, "adds others\ndraft = 2.0                     # degrees, of its outer"),
     ("flange", "mount.flange.holes", [[1.0, 2.0, 3.0]], "adds others\nholes = [[1.0, 2.0, 3.0]]\ndraft"),
     ("led", "effects[1]", {"kind": "ghost"}, 'at a slant\n\n[[effects]]\nkind = "ghost"\n\n[accept]'),
-    ("disk", "effects[0]", {"kind": "ghost"}, 'less error\n\n[[effects]]\nkind = "ghost"\n\n[accept]'),
     ("disk", "effects[0].kind", "ghost", 'less error\n\n[[effects]]\nkind = "ghost"\n\n[accept]'),
     ("disk", "mount.flange", {"outline": {"shape": "circle"}, "z": 1.0},
      'irradiance\n\n[mount]\n\n[mount.flange]\noutline = { shape = "circle" }\nz = 1.0\n'),
@@ -206,15 +205,12 @@ shape = "circle"'''
 
 @pytest.mark.parametrize(("key", "value", "line"), [
     ("lens.back.z", 21.0, "lens.back.z = 21.0 # dotted"),
-    ("lens.back.control_points", 65, 'lens.back.control_points = 65'),
     ("lens.index", 1.5, "lens.index = 1.5"),
     ("source.wavelength", [[500.0, 1.0], [656.3, 1.0]], "  [500.0, 1.0], # blue"),
     ("effects[1].kind", "absorption", 'effects = [{kind = "fresnel"}, {kind="absorption"}]'),
     ("mount.draft", 2.0, "  draft	= 2.0"),
-    ("mount.bevel", 0.5, "  bevel = 0.5"),
     ("mount.rim.diameter", 3.0, "diameter = 3.0"),
     ("mount.datum", "front", 'datum = "front"'),
-    ("name", "x", 'name = "x"'),
     ("title", "y", 'title = "y"'),
     ("target", {"z": 5.0}, "[target]"),
     ("wave.a", 5.0, "[wave]"),
@@ -266,14 +262,11 @@ def test_another_kind_has_its_keys_and_those_it_needs(name):
 
 @pytest.mark.parametrize(("name", "key", "kind", "table"), [
     ("disk", "target.outline.shape", "rectangle", {"shape": "rectangle", "width": 360.0, "height": 360.0}),
-    ("disk", "lens.outline.shape", "circle", {"shape": "circle", "diameter": 16.0}),
     ("white_logo", "lens.outline.shape", "circle", {"shape": "circle", "diameter": 40.0}),
     ("beam_shaper", "target[1].profile.shape", "rectangle", {"shape": "rectangle", "width": 12.0, "height": 12.0}),
     ("beam_shaper", "target[1].profile.shape", "gaussian", {"shape": "gaussian", "radius_1e2": 6.0}),
     ("portrait", "lens.front.kind", "conic", {"kind": "conic", "z": 15.0, "curvature": 0.0, "optimise": True}),
-    ("portrait", "lens.front.kind", "plane", {"kind": "plane", "z": 15.0}),
     ("disk", "lens.front.kind", "bspline", {"kind": "bspline", "z": 15.0, "optimise": True}),
-    ("thu", "source.kind", "point", {"kind": "point", "wavelength": 650.0}),
     ("sun_caustic", "source.kind", "point", {"kind": "point", "position": [0.0, 0.0, -100.0], "wavelength": 587.6}),
     ("disk", "source.kind", "collimated",
      {"kind": "collimated", "wavelength": 587.6, "aperture": {"shape": "rectangle", "width": 16.0, "height": 16.0}}),
@@ -281,7 +274,6 @@ def test_another_kind_has_its_keys_and_those_it_needs(name):
     ("disk", "wavefront.kind", "zernike",
      {"kind": "zernike", "z": 500.0, "radius": 8.0, "coefficients": [0.0, 0.0, 0.0, 1.5]}),
     ("disk", "effects[0].kind", "own", {"kind": "own", "name": "dust"}),
-    ("disk", "lens.front.kind", "cube", {"kind": "cube", "z": 15.0}),
 ])  # fmt: skip
 def test_a_kind_is_made_of_what_was_there(name, key, kind, table):
     data = tomllib.loads(changed(TEXTS[name], key, kind))
@@ -293,18 +285,10 @@ def test_light_of_another_kind_and_new_tables_are_scenes(name):
     text, data = TEXTS[name], tomllib.loads(TEXTS[name])
     other = {"point": "collimated", "collimated": "point"}[data["source"]["kind"]]
     made = [changed(text, "source.kind", other)]
-    keys = [
-        "wavefront",
-        "mount",
-        "mount.rim",
-        "mount.flange",
-        "target[1]",
-        "target.profile",
-        "effects[0]",
-        "tolerance[0]",
-    ]
-    made += [changed(text, key, new_table(key, data)) for key in keys]
-    made += [changed(made[4], "mount.flange.screws", new_table("mount.flange.screws", tomllib.loads(made[4])))]
+    for key in ("wavefront", "mount", "mount.rim", "target[1]", "target.profile", "effects[0]", "tolerance[0]"):
+        made.append(changed(text, key, new_table(key, data)))
+    made.append(changed(text, "mount.flange", new_table("mount.flange", data)))
+    made += [changed(made[-1], "mount.flange.screws", new_table("mount.flange.screws", tomllib.loads(made[-1])))]
     made += [changed(text, "lens.outline.shape", kind) for kind in ("circle", "rectangle")]
     for each in made:
         _validated(tomllib.loads(each), FOLDER)
@@ -317,22 +301,17 @@ DISK = tomllib.loads(TEXTS["disk"])
 WHITE = tomllib.loads(TEXTS["white_logo"])
 TYPED = {
     "target.z": {
-        "0,5": 0.5, "0.5": 0.5, ",5": 0.5, "65": 65.0, "+3": 3.0, "−2,5e-3": -0.0025, "500 mm": 500.0, "": None,
-        " ": None, "1 000": 1000.0, "1.000,5": 1000.5, "1,000.5": 1000.5, "1 000,5": 1000.5, "1'000.5": 1000.5,
-        "1_000": 1000.0, "1.000.000": 1e6, "1,000,000": 1e6, "1,000": 1.0, "1.000": 1.0,
+        "0,5": 0.5, ",5": 0.5, "+3": 3.0, "−2,5e-3": -0.0025, "500 mm": 500.0, " ": None, "1.000,5": 1000.5,
+        "1,000.5": 1000.5, "1'000.5": 1000.5, "1_000": 1000.0, "1.000.000": 1e6, "1,000": 1.0, "1.000": 1.0,
     },
     "target.x": {
         "1,5; 2,5": [1.5, 2.5], "1.5, 2.5": [1.5, 2.5], "1,5 2,5": [1.5, 2.5], "1,5, 2,5": [1.5, 2.5],
-        "1.5,2.5": [1.5, 2.5], "1,5;2,5": [1.5, 2.5], "-200 200": [-200.0, 200.0], "-200,200": [-200.0, 200.0],
-        "-200, 200 mm": [-200.0, 200.0], "-1 000; 1 000": [-1000.0, 1000.0], "[0, 400]": [0.0, 400.0],
-        "[0,5; 1,5]": [0.5, 1.5],
+        "1.5,2.5": [1.5, 2.5], "-200,200": [-200.0, 200.0], "-200, 200 mm": [-200.0, 200.0],
+        "-1 000; 1 000": [-1000.0, 1000.0], "[0,5; 1,5]": [0.5, 1.5],
     },
-    "source.position": {"0 0 1,5": [0.0, 0.0, 1.5], "0, 0, 1.5": [0.0, 0.0, 1.5]},
-    "target.pixels": {
-        "512": 512, "2.048": 2048, "512 205": [512, 205], "512, 205": [512, 205], "512,205": [512, 205],
-        "[512, 205]": [512, 205],
-    },
-    "tailoring.rays": {"384": 384, "1 024": 1024, "1.024": 1024, "1,024": 1024},
+    "source.position": {"0 0 1,5": [0.0, 0.0, 1.5]},
+    "target.pixels": {"512": 512, "2.048": 2048, "512 205": [512, 205], "512,205": [512, 205], "[9, 20]": [9, 20]},
+    "tailoring.rays": {"1 024": 1024, "1,024": 1024},
     "tailoring.seed": {"9223372036854775807": 9223372036854775807},
     "tailoring.levels": {"129 257": [129, 257], "257": [257], "[[129, 65], 257]": [[129, 65], 257]},
     "source.wavelength": {
@@ -359,25 +338,17 @@ def test_words_are_values(key):
 
 @pytest.mark.parametrize(("key", "words", "sentence"), [
     ("target.z", "far", "target.z: 'far' is not a number; write one, such as 1000"),
-    ("target.z", "1 00", "target.z: '1 00' is not a number; write one, such as 1000"),
     ("target.z", "1.00,000.5", "target.z: '1.00,000.5' is not a number; write one, such as 1000"),
     ("target.z", "1e999", "target.z: '1e999' is not a number; write one, such as 1000"),
-    ("target.z", "9" * 400, "is not a number; write one, such as 1000"),
     ("target.x", "5", "target.x: 1 values where 2 belong; write them such as -200, 200"),
-    ("target.x", "1 2 3", "target.x: 3 values where 2 belong; write them such as -200, 200"),
     ("target.x", "1; a", "target.x: 'a' is not a number; write 2 of them, such as -200, 200"),
-    ("target.tilt", "1", "target.tilt: 1 values where 2 belong; write them such as 0, 0"),
     ("target.pixels", "12.5", "target.pixels: '12.5' is not a whole number; write one, such as 512"),
-    ("tailoring.rays", "12,5", "tailoring.rays: '12,5' is not a whole number; write one, without a decimal point"),
     ("target.seen_from", "behnd", "target.seen_from: 'behnd' is not possible; did you mean 'behind'?"),
-    ("target.rotate", "45", "target.rotate: '45' is not possible; choose one of 0, 90, 180, 270"),
-    ("output.export", "sag, zmx", "output.export: 'zmx' is not possible; did you mean 'zemax'?"),
     ("lens.back.reflect", "maybe", "lens.back.reflect: 'maybe' is neither true nor false; write one of the two"),
     ("source.wavelength", "[[486, 1], 5]", "is not a number; write one, such as 587.6"),
     ("mount.flange.holes", "14 0 3", "holes: '14 0 3' is not such a list; write it such as [[14.0, 0.0, 3.2]]"),
     ("lens.outline", "round", "lens.outline: 'round' is not a table; write it in braces, such as { height = 24.0,"),
     ("lens.bak", "1", "lens.bak: unknown key; did you mean 'back'?"),
-    ("lens.outline.radius", "1", "lens.outline.radius: unknown key; the keys here are height, shape, width"),
 ])  # fmt: skip
 def test_words_that_are_no_value_are_told_so(key, words, sentence):
     with pytest.raises(SceneError) as told:
@@ -420,24 +391,3 @@ def test_any_words_are_a_value_or_a_sentence(words, key):
         assert str(error).startswith(key)
     else:
         json.dumps(value)
-
-
-# ---- the house -------------------------------------------------------------------------------------------------------
-
-
-def test_the_schema_has_what_is_made_of_it():
-    """Every required key has an example or is made, so that a table can always be put there."""
-    for key in UNIONS:
-        for record in records_at(key, {}):
-            assert all(
-                "const" in record["properties"][name] or "examples" in record["properties"][name]
-                for name in record.get("required", ())
-            )
-    assert all(alternatives(node) for node in schema()["properties"].values())
-    assert plain("target[1].profile.shape") == "target.profile.shape"
-
-
-def test_words_and_kinds_load_no_torch():
-    code = "import sys, bstcad.app.scene_text\nprint([m for m in ('torch', 'numpy', 'scipy') if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"

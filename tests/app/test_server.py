@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bstcad.app import design_process, design_runs, scene_text, server
+from bstcad.app import design_process, scene_text, server
 from bstcad.app.design_process import State
 from bstcad.app.design_runs import Run
 from bstcad.app.workspace import Workspace
@@ -48,11 +48,9 @@ def own(tmp_path, monkeypatch):
 # ---- paths -----------------------------------------------------------------------------------------------------------
 
 UP = [
-    "..", ".", "../secret", "../secret.txt", "..%2fsecret", "..%2Fsecret.txt", "%2e%2e%2fsecret.txt", "%2e%2e/secret",
-    "..%5csecret", "..\\secret", "%2e%2e%5csecret.txt", "..%252fsecret.txt", "%00", "small%00", "made%00", "%2f", "a/b",
-    "small%0a", "made%0a", ".small", ".small.toml.unsaved", ".made.checkpoint", ".made.design-run", "-r", "~", "*",
-    "%ff%fe", "small%ff", "x" * 300, "x" * 5000, "made/../../secret", "small%20", "C:%5csecret", "....//secret.txt",
-    "{outside}/secret", "%2f{outside}/secret.txt", "/{outside}/secret.txt", "file:{outside}/secret.txt",
+    "..", "../secret", "..%2fsecret.txt", "%2e%2e/secret", "..%5csecret", "..%252fsecret.txt", "small%00", "a/b",
+    "made%0a", ".small.toml.unsaved", ".made.design-run", "-r", "~", "*", "small%ff", "x" * 5000, "made/../../secret",
+    "{outside}/secret", "%2f{outside}/secret.txt", "file:{outside}/secret.txt",
 ]  # fmt: skip
 
 
@@ -82,34 +80,10 @@ def test_no_name_leads_out_of_the_folders(own, up):
 
 
 @pytest.mark.parametrize(
-    "up",
-    [
-        *UP, "../small.toml", "figures/../../small.toml", "figures/%2e%2e/%2e%2e/small.toml", ".hidden", "figures",
-        "out.txt", "out.toml", "outside/secret.txt", "outside", "loop", "loop/x", "pipe", "", "/", "lens.step/x",
-        "%2fetc%2fpasswd", "/etc/passwd", "//etc/passwd", "..%00", "lens.step%00.png", "lens.step%00",
-    ],
-)  # fmt: skip
-def test_no_file_of_the_outside_is_sent_as_a_designs(own, up):
-    up, folder = up.replace("{outside}", str(own.outside)), own.folder / "made"
-    for name, place in {
-        "out.txt": "../../../secret.txt", "out.toml": "../../small.toml", "outside": own.outside, "loop": "loop",
-    }.items():  # fmt: skip
-        os.symlink(place, folder / name)
-    (folder / ".hidden").write_text(SECRET)
-    os.mkfifo(folder / "pipe")
-    for query in ("", "?download"):
-        answer = own.ask(f"/design/made/files/{up}{query}")
-        assert answer.status in (400, 404) and answer.error is None, (answer.status, answer.error)
-        assert SECRET not in answer.text and "An evenly" not in answer.text and not tells(own, answer, up)
-
-
-@pytest.mark.parametrize(
     "path",
     [
         "/static/../server.py", "/static/%2e%2e/server.py", "/static/..%2fserver.py", "/static//etc/passwd",
-        "/static/%2fetc%2fpasswd", "/static/..%5cserver.py", "/static/../../../etc/passwd", "/static/%00", "/static/",
-        "/docs/../../../pyproject.toml", "/docs/%2e%2e/%2e%2e/%2e%2e/pyproject.toml", "/docs/%00", "/solid_view.js/..",
-        "/static/" + "x" * 5000, "/docs//etc/passwd", "/../etc/passwd", "/server.py", "/scene.html.j2",
+        "/static/%00", "/docs/%2e%2e/%2e%2e/%2e%2e/pyproject.toml", "/docs//etc/passwd", "/../etc/passwd", "/server.py",
     ],
 )  # fmt: skip
 def test_pages_of_the_program_are_those_meant_for_it(own, path):
@@ -118,7 +92,7 @@ def test_pages_of_the_program_are_those_meant_for_it(own, path):
     assert "root:" not in answer.text and "import" not in answer.text and "[project]" not in answer.text
 
 
-@pytest.mark.parametrize("up", UP[::3])
+@pytest.mark.parametrize("up", UP[1::3])
 def test_no_name_in_a_query_or_a_body_leads_out(own, up):
     up, before = up.replace("{outside}", str(own.outside)), tree(own.outside)
     for answer in (
@@ -168,54 +142,22 @@ FAULTS = {
         '{ kind = "plane", z = 0.0 }', '{ kind = "bspline", z = 0.0, file = "small.toml" }'
     ),
     "material": SMALL.replace('"PMMA"', '"shelf/../../x.yml"'),
-    "damaged": SMALL.replace("[source]", "[source"),
-    "deep": "a = " + "[" * 3000,
-    "dots": "a." * 200 + "a = 1\n",
-    "long number": f"a = {'1' * 5000}\n",
     "huge number": SMALL.replace("100.0", "1" + 400 * "0").replace("-8.0", "-1" + 400 * "0", 1),
-    "huge width": SMALL.replace("diameter = 12.0", "diameter = 1" + 400 * "0"),
-    "empty": "",
-    "NUL": "\0",
     "no tables": 'name = "x"\nsource = 1\nlens = 2\ntarget = 3\n',
 }
 
 
-def bodies_of(own):
-    """(what, answer) of all that can be asked about everything that is there."""
-    names = own.workspace.scene_names() + ["none"]
-    designs = [path.name for path in own.folder.iterdir() if path.is_dir()] + ["none"]
-    for path, method in routes(own.workbench):
-        for name in names if "/scene/" in path else designs if "{name}" in path else [""]:
-            if path.startswith(("/docs", "/static", "/solid")) or (name == "made" and "files" in path):
-                continue
-            body = {"page": "p", "number": 1, "key": "target.z", "words": "120"} if method == "POST" else b""
-            query = "?page=p&number=1&stage=0" if path.endswith("answer") else ""
-            yield f"{method} {path} {name}", own.ask(filled(path, name) + query, body, method)
-    yield "compare", own.ask("/compare?" + "&".join(f"design={name}" for name in designs))
-
-
-def test_no_answer_tells_where_the_folders_are(own, monkeypatch):
+@pytest.mark.parametrize("what", FAULTS)
+def test_no_answer_about_a_faulty_scene_tells_where_the_folders_are(own, monkeypatch, what):
     monkeypatch.setattr(server, "PATIENCE", 0.01)
-    for what, text in FAULTS.items():
-        (own.folder / f"{what.replace(' ', '-')}.toml").write_text(text)
-        own.workspace.change("small", SMALL + "# not saved\n")
-    (own.folder / "latin.toml").write_bytes(b'name = "\xff"\n')
-    (own.folder / "large.toml").write_bytes(b"#" * 3 * MB)
-    (own.folder / "folder.toml").mkdir()
-    for what, data in {
-        "cut": b'{"name": "cu',
-        "nested": b"[" * 10**5,
-        "other": b'{"name": 1}',
-        "latin": b"\xff",
-    }.items():
-        made(own.folder / what)
-        (own.folder / what / "report.json").write_bytes(data)
+    (own.folder / "faulty.toml").write_text(FAULTS[what])
     (own.folder / "pictures").mkdir()
-    told = [str(own.outside), str(Path.home()), str(Path.cwd())]
-    for what, answer in bodies_of(own):
-        assert answer.status < 500 and answer.error is None, (what, answer.status, answer.error)
-        for place in told:
-            assert place not in answer.text, (what, re.findall(f".{{0,80}}{place}.{{0,80}}", answer.text))
+    for path, method in (each for each in routes(own.workbench) if "/scene/" in each[0]):
+        body = {"page": "p", "number": 1, "key": "target.z", "words": "120"} if method == "POST" else b""
+        answer = own.ask(f"{filled(path, 'faulty')}?page=p&number=1&stage=0", body, method)
+        assert answer.status < 500 and answer.error is None, (path, answer.status, answer.error)
+        for place in (str(own.outside), str(Path.home()), str(Path.cwd())):
+            assert place not in answer.text, (path, re.findall(f".{{0,80}}{place}.{{0,80}}", answer.text))
 
 
 def test_what_a_run_says_is_told_without_folders(own):
@@ -271,75 +213,45 @@ def test_a_preview_that_fails_is_told_without_folders(own, monkeypatch, stage):
 
 # ---- requests that are wrong -----------------------------------------------------------------------------------------
 
-WRONG_CHANGES = [
-    {}, {"key": "target.z"}, {"words": "1"}, {"key": None, "words": "1"}, {"key": "", "words": "1"},
-    {"key": "a..b", "value": 1}, {"key": ".", "value": 1}, {"key": "target[99].z", "value": 1}, {"key": [], "value": 1},
-    {"key": "target[-1].z", "value": 1}, {"key": "target.z", "value": float("nan")}, {"key": "name", "value": {"a": 1}},
-    {"key": "target.z", "value": float("inf")}, {"key": "target.z", "value": 10**400}, {"text": None}, {"text": {}},
-    {"key": "target.z", "words": "9" * 5000}, {"key": "target.z", "words": {}}, {"key": "target", "value": [[[]]]},
-    {"text": "title = '\ud800'"}, {"key": "title", "value": "\ud800"}, {"key": "\ud800", "value": 1},
-    {"key": "__class__.x", "value": 1}, {"key": "source.kind", "value": {"a": 1}}, {"key": "effects[0]", "value": 5},
-    {"key": ".".join("a" * 400), "value": 1}, {"text": "a = " + "[" * 300 + "]" * 300}, {"text": "\0\r\r\n"},
-    {"key": "lens", "value": None}, {"key": "lens.outline", "value": None}, {"key": "target.x", "value": [{}, []]},
+WRONG = [
+    {}, {"key": "target.z"}, {"words": "1"}, {"key": "", "words": "1"}, {"key": "a..b", "value": 1},
+    {"key": "target[99].z", "value": 1}, {"key": [], "value": 1}, {"key": "target.z", "value": float("nan")},
+    {"key": "target.z", "value": 10**400}, {"text": {}}, {"key": "target.z", "words": "9" * 5000},
+    {"key": "target", "value": [[[]]]}, {"key": "title", "value": "\ud800"}, {"key": "__class__.x", "value": 1},
+    {"key": "source.kind", "value": {"a": 1}}, {"key": ".".join("a" * 400), "value": 1}, {"text": "\0\r\r\n"},
+    {"text": "a = " + "[" * 300 + "]" * 300}, {"key": "lens", "value": None}, {"key": "target.x", "value": [{}, []]},
     {"key": "target.x", "value": json.loads("[" * 200 + "]" * 200)}, {"key": "title", "words": "\0\x1b[2J\u2028"},
-    {"key": "target.z", "words": ""}, {"key": "target.image", "words": "../../secret.txt"},
-    {"key": "name", "words": ".."},
+    {"key": "target.image", "words": "../../secret.txt"}, {"key": "name", "words": ".."}, {"text": "\ud800"},
+    {"budget": "soon"}, {"budget": []}, {"budget": "nan"}, {"budget": 1e400}, {"yield": {}}, {"yield": 1e9},
+    {"grade": []}, {"grade": "../x"}, {"page": "p"}, {"page": "p", "number": "one"}, {"number": 1}, {"light": {}},
+    {"light": "laser", "sample": []}, {"picture": {}}, {"page": "p", "number": 10**400},
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("asked", WRONG_CHANGES, ids=lambda asked: ascii(asked)[:40])
-def test_no_change_breaks_the_server_or_the_scene(own, asked):
+@pytest.mark.parametrize("asked", WRONG, ids=lambda asked: ascii(asked)[:40])
+def test_no_table_of_json_breaks_the_server_or_the_scene(own, monkeypatch, asked):
     """It is refused in a sentence, or taken; then the page can be opened and the change be dropped."""
-    answer = own.ask("/api/scene/small/change", json.dumps(asked))
-    assert answer.status in (200, 400) and answer.error is None, (answer.status, answer.error)
-    assert answer.status == 200 or answer.json["sentence"]
-    assert SECRET not in answer.text
-    assert own.ask("/scene/small").status == 200
-    assert own.ask("/api/scene/small/drop", {}).json["text"] == SMALL
-
-
-@pytest.mark.parametrize(
-    "asked",
-    [
-        {"budget": "soon"}, {"budget": []}, {"budget": "nan"}, {"budget": 1e400}, {"budget": -1}, {"yield": "most"},
-        {"yield": {}}, {"yield": "nan"}, {"yield": 1e9}, {"grade": []}, {"grade": "none"}, {"grade": "../x"},
-        {"page": "p"}, {"page": "p", "number": "one"}, {"page": "p", "number": None}, {"number": 1}, {"light": {}},
-        {"light": "laser", "sample": []}, {"text": "x" * 10_000}, {"text": "\ud800"}, {"picture": {}},
-        {"page": "p", "number": 10**400},
-    ],
-    ids=lambda asked: ascii(asked)[:40],
-)  # fmt: skip
-def test_no_table_of_json_breaks_the_server(own, monkeypatch, asked):
     monkeypatch.setattr(server, "PATIENCE", 0.01)
-    answers = {path: own.ask(path, json.dumps(asked)) for path in READS_JSON}
-    broken = {path: (answer.status, answer.error) for path, answer in answers.items() if answer.error is not None}
-    assert broken == {} and {answer.status for answer in answers.values()} <= {200, 400}
+    for path in READS_JSON:
+        answer = own.ask(path, json.dumps(asked))
+        assert answer.status in (200, 400) and answer.error is None, (path, answer.status, answer.error)
+        assert (answer.status == 200 or answer.json["sentence"]) and SECRET not in answer.text
+    assert own.ask("/scene/small").status == 200
+    own.ask("/api/scene/small/drop", {})
+    assert own.workspace.opened("small").saved
 
 
 @pytest.mark.parametrize(
     "query",
-    [
-        "",
-        "?page=p",
-        "?page=p&number=x&stage=0",
-        "?page=p&number=1&stage=x",
-        "?page=p&number=1&stage=9",
-        "?page=p&number=1&stage=-1",
-    ],
-)
-def test_no_query_of_an_answer_breaks_the_server(own, monkeypatch, query):
+    ["?", "?page=p", "?page=p&number=x&stage=0", "?page=p&number=1&stage=x", "?page=p&number=1&stage=9",
+     "?page=p&number=1&stage=-1", "?since=x", "?since=-5", "?since=1e9", "?kind=", "?since=99999999999999999999"],
+)  # fmt: skip
+def test_no_query_breaks_the_server(own, monkeypatch, query):
     monkeypatch.setattr(server, "PATIENCE", 0.01)
     own.ask("/api/scene/small/preview", {"page": "p", "number": 1})
-    answer = own.ask(f"/api/scene/small/answer{query}")
-    assert answer.status in (200, 400) and answer.error is None, (answer.status, answer.error)
-
-
-@pytest.mark.parametrize(
-    "query", ["?since=x", "?since=-5", "?since=1e9", "?since=", "?kind=", "?since=99999999999999999999"]
-)
-def test_no_query_of_a_run_breaks_the_server(own, query):
-    answer = own.ask(f"/api/design/made/run{query}")
-    assert answer.status in (200, 400) and answer.error is None, (answer.status, answer.error)
+    for path in ("/api/scene/small/answer", "/api/design/made/run"):
+        answer = own.ask(f"{path}{query}")
+        assert answer.status in (200, 400) and answer.error is None, (answer.status, answer.error)
 
 
 def test_a_line_of_a_thousand_dots_takes_no_time(own):
@@ -349,54 +261,6 @@ def test_a_line_of_a_thousand_dots_takes_no_time(own):
     (own.folder / "dots.toml").write_text(text)
     assert own.ask("/scene/dots").status == 200
     assert time.perf_counter() - began < 2.0
-
-
-DAMAGED_RUNS = {
-    "state.json": [b"", b"{", b"[1]", b"null", b'{"state": 5}', b'{"state": "running", "process": "x"}',
-                   b'{"state": "running", "process": -1}', b'{"state": "running", "process": 99999999999999999999}',
-                   b'{"state": "<script>", "x": 1}', b"[" * 10**5, b"\xff"],
-    "progress.jsonl": [b"{\n", b"\xff\n", b"5\n", b'[1, "a", 0\n[2, "b", 0, 0, "c"]\n', b"[]\n", b"[" * 10**5 + b"\n"],
-    "light.png": [b"", b"no picture"],
-    "scene.toml": [b"no [[ TOML"],
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("name", "data"), [(name, data) for name, each in DAMAGED_RUNS.items() for data in each])
-def test_no_damaged_run_breaks_the_server(own, name, data):
-    run = Run(own.folder / "small")
-    run.place.mkdir()
-    State("failed", sentence="no memory").put(run.place)
-    (run.place / name).write_bytes(data)
-    for path in ("/", "/design/small", "/api/design/small/run", "/api/design/small/light.png", "/scene/small"):
-        answer = own.ask(path)
-        assert answer.status < 500 and answer.error is None, (path, answer.status, answer.error)
-    assert own.ask("/").status == 200
-
-
-def test_the_list_is_shown_whatever_lies_in_the_folder(own):
-    for name in (".two words.design-run", "..design-run", "..x.design-run", ".<b>.design-run"):
-        (own.folder / name).mkdir()
-        State("failed").put(own.folder / name)
-    (own.folder / "made/report.json").write_bytes(b"[" * 10**5)
-    answer = own.ask("/")
-    assert answer.status == 200 and "small.toml" in answer.text, answer.text
-
-
-@pytest.mark.parametrize("data", [None, b"\xff", b"no [[ TOML", b"a = 1"])
-def test_designs_without_a_scene_can_be_compared(own, data):
-    made(own.folder / "other")
-    (own.folder / "other/scene.toml").unlink()
-    if data is not None:
-        (own.folder / "other/scene.toml").write_bytes(data)
-    answer = own.ask("/compare?design=made&design=other")
-    assert answer.status in (200, 400) and answer.error is None, (answer.status, answer.error)
-
-
-def test_a_scene_that_is_a_link_out_of_a_design_is_not_compared(own):
-    made(own.folder / "other")
-    (own.folder / "other/scene.toml").unlink()
-    os.symlink(own.outside / "secret.toml", own.folder / "other/scene.toml")
-    assert SECRET not in own.ask("/compare?design=made&design=other").text
 
 
 def test_a_fault_of_the_program_is_a_sentence_and_the_terminal_has_the_rest(own, monkeypatch, capfd):
@@ -452,27 +316,12 @@ def test_a_change_is_told_and_saved_as_the_workspace_has_it(own):
     assert own.ask("/api/scene/small/drop", {}).json["text"] == told["text"]
 
 
-def test_the_text_of_a_page_is_written_with_the_ends_of_lines_of_the_file(own):
-    own.workspace.path("small").write_bytes(SMALL.encode().replace(b"\n", b"\r\n"))
-    text = own.ask("/api/scene/small").json["text"]
-    own.ask("/api/scene/small/change", {"text": text.replace("100.0", "120.0")})
-    own.ask("/api/scene/small/save", {})
-    wanted = SMALL.replace("100.0", "120.0").encode().replace(b"\n", b"\r\n")
-    assert own.workspace.path("small").read_bytes() == wanted
-
-
 def test_a_new_scene_of_an_uploaded_picture(own):
     sent = own.ask("/api/picture", png(30, 20)).json["picture"]
     for asked in ({"light": "sun"}, {"template": "thu"}, {"template": "two_pictures"}):
         name = own.ask("/api/scenes", {**asked, "picture": sent}).json["name"]
         told = own.ask(f"/api/scene/{name}").json
         assert told["error"] is None and f'image = "pictures/{sent}"' in told["text"]
-
-
-def test_the_scene_of_a_design_is_opened_as_a_new_scene(own):
-    name = own.ask("/api/design/made/edit", {}).json["name"]
-    assert name == "my-made" and own.ask(f"/scene/{name}").status == 200
-    assert own.ask("/api/design/none/edit", {}).status == 400
 
 
 # ---- what comes from elsewhere is no script --------------------------------------------------------------------------
@@ -511,7 +360,7 @@ def test_a_page_of_a_design_has_no_origin(own, name):
 
 
 @pytest.mark.parametrize(
-    "name", ["a.svg", "a.htm", "a.xhtml", "a.xml", "a.js", "a.mjs", "a.HTML", "a", "a.html.gz", "a.pdf.html5"]
+    "name", ["a.svg", "a.htm", "a.xhtml", "a.mjs", "a.HTML", "a", "a.html.gz"]
 )
 def test_other_files_of_a_design_are_kept_not_shown(own, name):
     (own.folder / "made" / name).write_text("<script>alert(1)</script>")
@@ -550,21 +399,10 @@ def test_every_file_of_the_list_is_sent_with_its_bytes(own):
 
 
 def test_a_part_is_judged_by_points_kept_by_no_senders_name(own):
-    for data, ending in (
-        (b"x,y,z\n1,2,3\n", ".csv"),
-        (b"ply\nformat", ".ply"),
-        (b"solid x", ".stl"),
-        (bytes(90), ".stl"),
-    ):
+    kinds = {b"x,y,z\n1,2,3\n": ".csv", b"ply\nformat": ".ply", b"solid x": ".stl", bytes(90): ".stl"}
+    for data, ending in kinds.items():
         words = {"content_disposition": 'attachment; filename="../../evil.sh"', "content_type": "text/x-sh"}
         assert own.ask("/api/design/made/measured?name=../evil", data, **words).status == 200
         [cloud] = Run(own.folder / "made", "measured").place.glob("cloud*")
         assert (cloud.name, cloud.read_bytes()) == (f"cloud{ending}", data)
     assert "evil" not in " ".join(tree(own.outside))
-
-
-def test_kinds_of_runs_are_those_that_there_are(own):
-    assert set(design_runs.JOBS) == {"design", "tolerance", "tradeoff", "measured"}
-    assert own.ask("/api/design/made/run?kind=tolerance").json["state"] == "none"
-    assert own.ask("/api/design/none/tolerance", {}).status == 400  # there is no lens
-    assert own.ask("/api/design/made/go-on?kind=tolerance", method="POST").status == 400
