@@ -119,7 +119,8 @@ def _even(z: float, half: float, **more: Any) -> dict[str, Any]:
 
 DESIGNS: dict[str, Hard] = {
     "one bright pixel": Hard("disk", _PICTURE, one_pixel, rrmsd=0.13, says=(MOVED, MISSES, SIDES, CLOSE, LIFTED)),
-    "checkerboard 1 : 1000": Hard("disk", _PICTURE, checkerboard, rrmsd=0.2, says=(MISSED, MISSES, SIDES, LIFTED)),
+    "checkerboard 1 : 1000": Hard("disk", _PICTURE, checkerboard, rrmsd=0.2, says=(MISSED, MISSES, SIDES, LIFTED),
+                                  bench=True),
     "thin ring": Hard("disk", _PICTURE, ring, rrmsd=0.06, says=(MISSES, SIDES, LIFTED), bench=True),
     "two islands": Hard("disk", _PICTURE, islands, rrmsd=0.15, efficiency=0.98,
                         says=(MOVED, MISSED, MISSES, SIDES, OUTSIDE, CLOSE, LIFTED), bench=True),
@@ -143,7 +144,7 @@ DESIGNS: dict[str, Hard] = {
         says=(MOVED, MISSED, MISSES, SIDES, OUTSIDE, LIFTED), perhaps=(CLOSE, STEEP, DARK), bench=True,
     ),
     "index 2.4": Hard("disk", {"lens.index": 2.4}, bench=True),
-    "lens of 2 mm": Hard("disk", _size(25.0, **_SMALL), says=(MOVED, MISSES, SIDES)),
+    "lens of 2 mm": Hard("disk", _size(25.0, **_SMALL), says=(MOVED, MISSES, SIDES), bench=True),
     "lens of 300 mm": Hard("disk", _size(3750.0, **_LARGE), bench=True),
     "33 control points": Hard("disk", {}, sizes={"lens.back.control_points": 33}, bench=True),
     "1025 control points": Hard(

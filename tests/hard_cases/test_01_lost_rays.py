@@ -27,7 +27,8 @@ from bstcad.optics.point import Point
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Sphere
-from tests.hard_cases.lenses import DTYPES, ENGINES, bundle, lens_of, tracing, uniform, wavy
+from tests.hard_cases.lenses import DTYPES, ENGINES, tracing
+from tests.lenses import bundle, lens_of, uniform, wavy
 from tests.tracing import stratified
 
 NAN, INF = float("nan"), float("inf")

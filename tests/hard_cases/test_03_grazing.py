@@ -25,21 +25,8 @@ from bstcad.optics.rays import Status
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import EQUATOR, Plane, Sphere
 from tests.hard_cases import exact
-from tests.hard_cases.lenses import (
-    DTYPES,
-    ENGINES,
-    NAMES,
-    N,
-    bundle,
-    eps,
-    first_crossing,
-    largest,
-    lens_of,
-    places,
-    tracing,
-    uniform,
-    wavy,
-)
+from tests.hard_cases.lenses import DTYPES, ENGINES, NAMES, eps, first_crossing, largest, tracing
+from tests.lenses import N, bundle, lens_of, net, places, uniform, wavy
 from tests.tracing import from_first_net_plain
 
 OFFSETS = [s * 10.0**-k for k in range(1, 13) for s in (1, -1)] + [0.0]
@@ -122,7 +109,7 @@ def test_along_the_axis_at_the_equator(curvature, dtype, holds):
 @pytest.mark.parametrize("dz", [0.0, 1e-300, 1e-13, -1e-13, 1e-7, -1e-7, 1e-3, -1e-3, -0.3])
 def test_rays_along_a_level_back_are_flagged(dz, engine, dtype):
     """In the glass below a level face: parallel to it, nearly so on either side, and away from it."""
-    back = BSplineSurface(20.0, torch.zeros((9, 9), dtype=dtype), (-12.0, 12.0), (-12.0, 12.0))
+    back = net(m=9, half=12.0, dtype=dtype)
     for depth in (5.0, 1e-3, 1e-9):
         rays = bundle((0.0, 0.0, 20.0 - depth), (1.0, 0.2, dz), dtype)
         with tracing(engine) as through_back:
@@ -135,9 +122,7 @@ def test_rays_along_a_level_back_are_flagged(dz, engine, dtype):
 
 def crests(dtype=torch.float64) -> BSplineSurface:
     """Waves with crests at different heights, which light in the glass may touch from below."""
-    line = torch.linspace(-1, 1, 41, dtype=torch.float64)
-    h = torch.cos(9 * line)[:, None] * torch.cos(5 * line) + 0.5 * line[:, None]
-    return BSplineSurface(20.0, h.to(dtype), (-10.0, 10.0), (-10.0, 10.0))
+    return net(lambda x, y: torch.cos(0.9 * x) * torch.cos(0.5 * y) + 0.05 * x, m=41, dtype=dtype)
 
 
 @DTYPES

@@ -25,20 +25,8 @@ from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Plane, Sphere
-from tests.hard_cases.lenses import (
-    DTYPES,
-    ENGINES,
-    NAMES,
-    SQUARE,
-    N,
-    bundle,
-    eps,
-    first_crossing,
-    largest,
-    places,
-    tracing,
-    uniform,
-)  # fmt: skip
+from tests.hard_cases.lenses import DTYPES, ENGINES, NAMES, eps, first_crossing, largest, tracing
+from tests.lenses import SQUARE, N, bundle, net, places, uniform
 from tests.tracing import from_first_net_plain
 
 HALF = 10.0
@@ -46,9 +34,8 @@ HALF = 10.0
 
 def waves(depth: float, number: float, dtype=torch.float64) -> BSplineSurface:
     """Waves both ways, slopes up to depth · number / 10."""
-    line = torch.linspace(-1, 1, 33, dtype=torch.float64)
-    h = depth * torch.cos(number * line)[:, None] * torch.cos(number * line + 0.4)
-    return BSplineSurface(20.0, h.to(dtype), (-HALF, HALF), (-HALF, HALF))
+    k = number / HALF
+    return net(lambda x, y: depth * torch.cos(k * x) * torch.cos(k * y + 0.4), m=33, half=HALF, dtype=dtype)
 
 
 def from_below(back: BSplineSurface, steepest: float, n: int, dtype=torch.float64, seed=0):

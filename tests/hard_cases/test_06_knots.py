@@ -23,7 +23,8 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Plane
 from bstcad.optics.trace import to_first_net
-from tests.hard_cases.lenses import DTYPES, NAMES, eps, largest, tracing, uniform
+from tests.hard_cases.lenses import DTYPES, NAMES, eps, largest, tracing
+from tests.lenses import uniform
 
 NETS = (5, 6, 7, 33, 513, 2049)
 FORMS = [bspline.evaluate, bspline.evaluate_plain]

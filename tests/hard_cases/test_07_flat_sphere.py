@@ -23,7 +23,8 @@ from bstcad.optics.rays import Status
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Plane, Sphere
 from tests.hard_cases import exact
-from tests.hard_cases.lenses import DTYPES, NAMES, bundle, engines, eps, largest, lens_of, places, uniform, wavy
+from tests.hard_cases.lenses import DTYPES, NAMES, engines, eps, largest
+from tests.lenses import bundle, lens_of, places, uniform, wavy
 
 FLAT = (0.0, 1e-300, 1e-15, 1e-9, -1e-9, 1 / 50_000, -1 / 50_000, 1e-3, 0.01, -0.01, 1 / 30, -1 / 30)
 RIM = 14.0  # mm

@@ -23,7 +23,8 @@ from bstcad.optics.point import Point
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Sphere
 from tests.hard_cases import exact
-from tests.hard_cases.lenses import DTYPES, NAMES, engines, eps, lens_of, uniform, wavy
+from tests.hard_cases.lenses import DTYPES, NAMES, engines, eps
+from tests.lenses import lens_of, uniform, wavy
 from tests.tracing import simulated
 
 THROWS = (0.1, 1.0, 100.0, 1e3, 1e5, 1e7)

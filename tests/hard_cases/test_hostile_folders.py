@@ -105,17 +105,13 @@ def net(folder, data, method=zipfile.ZIP_DEFLATED):
 SHAPE = r"design\.npz: cannot be read .*is not \(33, 33, 3\) numbers.*; generate"
 FILES = {  # how a file of the folder is changed, and the sentence
     "a STEP file of gigabytes": (lambda f: hole(f / "lens.step", 2 * GIGABYTE), r"lens\.step: .*over 600 MB"),
-    "an STL of gigabytes": (lambda f: hole(f / "lens.stl", 2 * GIGABYTE), r"lens\.stl: .*over 1600 MB"),
-    "a scene of gigabytes": (lambda f: hole(f / "scene.toml", 2 * GIGABYTE), r"scene\.toml: .*over 1 MB"),
     "an archive of gigabytes": (lambda f: hole(f / "design.npz", 3 * GIGABYTE), r"holds over 3\.\d+ MB"),
     "an STL that claims 2 GB": (
         lambda f: altered(f / "lens.stl", 80, np.uint32(2 * GIGABYTE // 50).tobytes()), "no binary STL of 42949672",
     ),
-    "an STL of zeros": (lambda f: (f / "lens.stl").write_bytes(bytes(84)), r"lens\.stl: 84 bytes, no binary STL"),
     "a bomb of half a GB": (lambda f: net(f, npy("<f8", (33, 33, 3), bytes(GIGABYTE // 2))), "holds 5368709"),
     "a claim of 8 TB": (lambda f: net(f, npy("<f8", (10**12,))), SHAPE),
     "a number of 1 GB": (lambda f: net(f, npy(f"|V{GIGABYTE}", (33, 33, 3))), SHAPE),
-    "negative sides": (lambda f: net(f, npy("<f8", (-33, -33, 3))), SHAPE),
     "a header of brackets": (lambda f: net(f, npy("<f8", ()).replace(b"()", b"(" * 900)), "be read .*; generate"),
     "a header of 4 GB": (lambda f: net(f, npy("<f8", (33, 33, 3), version=2)), "no array of this program"),
     "another packing": (lambda f: net(f, b"", zipfile.ZIP_LZMA), "control_points holds"),  # whose reader takes no limit
@@ -156,11 +152,8 @@ def long_png(*size):
 MANY, TILES = "million.*; shrink it", "tiles larger than any picture"
 PICTURES = {
     "long": (lambda: long_png(64_000_000, 1), "along a side; shrink it"),
-    "high": (lambda: long_png(1, 64_000_000), "along a side; shrink it"),
     "tiles": (lambda: tiff({322: 65_520, 323: 65_520}), TILES),
-    "a wide tile": (lambda: tiff({322: 64_000_000}), TILES),
     "BMP over our limit": (lambda: claiming("BMP", 8001), MANY),
-    "WebP over our limit": (lambda: claiming("WEBP", 8001), MANY),
     "the largest WebP": (lambda: claiming("WEBP", 16_383), MANY),
     "HEIF over our limit": (lambda: claiming("HEIF", 8001), MANY),
 }
@@ -179,10 +172,8 @@ REPORTS = {
     "huge": lambda: '{"history": [' + ",".join(['{"seconds": 1.0, "rrmsd": 0.1}'] * 700_000) + "]}",
     "deep": lambda: "[" * 1_000_000,
     "a long number": lambda: '{"seconds_total": ' + "9" * 4000 + "}",
-    "an endless number": lambda: '{"seconds_total": 1e999}',
     "stages of other kinds": lambda: '{"stages": [1, {"name": [], "seconds": "x", "rrmsd": null}]}',
     "a history that no axis holds": lambda: '{"history": [{"seconds": 1e300, "rrmsd": 0.0}]}',
-    "a machine of lists": lambda: '{"machine": {"memory_gb": "much", "x": [[1]]}, "versions": {"python": {}}}',
     "passed": lambda: '{"passed": true, "checks": [], "rrmsd": 0.0, "rrmsd_noise": 0, "shape": {"volume": "x"}}',
 }
 
@@ -207,9 +198,8 @@ def test_an_earlier_report_that_does_not_fit_is_not_believed(quick_folder, holds
 
 
 NO_FILES = [
-    *(("pipe", name) for name in ("lens.step", "lens.stl", "design.npz", "scene.toml", "report.json")),
-    ("device", "lens.step"), ("device", "scene.toml"), ("device", "report.json"), ("process", "design.npz"),
-    ("process", "scene.toml"), ("folder", "lens.stl"), ("folder", "lens.step"),
+    ("pipe", "lens.step"), ("pipe", "design.npz"), ("pipe", "report.json"), ("device", "scene.toml"),
+    ("process", "scene.toml"), ("folder", "lens.stl"),
 ]  # fmt: skip
 
 
@@ -234,9 +224,7 @@ def test_what_is_no_file_is_one_sentence_or_left_out(quick_folder, kind, name):
     assert str(caught.value).isprintable() and ";" in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "image", ["/proc/self/mem", "/dev/zero", "/proc/kmsg", "a" * 300 + ".png", "a\0b", ".", "pipe"]
-)
+@pytest.mark.parametrize("image", ["/proc/self/mem", "/dev/zero", "a" * 300 + ".png", "a\0b", ".", "pipe"])
 def test_an_image_that_is_no_file_is_one_sentence(tmp_path, image):
     os.mkfifo(tmp_path / "pipe")
     path = tmp_path / "scene.toml"  # in whose folder the image is looked for
@@ -301,7 +289,7 @@ def test_no_name_leads_out_of_the_folder(tmp_path, monkeypatch, holds):
     holds("hostile names: files written outside the folder", len(outside), 0)
 
 
-@pytest.mark.parametrize("name", ["../x.png", "/x.png", "a\\b.png", "", ".x.png", "a\0.png", "x" * 200, "nul.png"])
+@pytest.mark.parametrize("name", ["../x.png", "a\\b.png", "", "a\0.png", "nul.png"])
 def test_a_picture_made_in_python_has_a_plain_name_too(name):
     with pytest.raises(ValueError, match="is no plain file name"):
         Picture(name, b"")

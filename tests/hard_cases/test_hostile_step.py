@@ -178,44 +178,22 @@ def test_what_moves_a_corner_or_a_pole_is_not_immaterial(folder):
 
 # ---- by name, and where ----------------------------------------------------------------------------------------------
 
-NET, KNOTS, EDGES = "STEP text: control points", "STEP text: knots", "STEP text: every edge used twice, once each way"
 
-
-def moved_pole(text, i, j, by, axis=2):
-    """One coordinate of control point (i, j) of 33 x 33."""
+def moved_pole(text, i, j, by):
+    """z of control point (i, j) of 33 x 33."""
     net = re.search(r"B_SPLINE_SURFACE_WITH_KNOTS\('',2,2,\((.*?)\)\s*\)\s*,\s*\.", text, re.DOTALL).group(1)
     number = re.findall(r"#(\d+)", net)[33 * i + j]
     hit = re.search(rf"#{number} = CARTESIAN_POINT\('',\(([^)]*)\)", text)
     values = [float(value) for value in hit.group(1).split(",")]
-    values[axis] += by
+    values[2] += by
     return text[: hit.start(1)] + ",".join(f"{value:.14f}" for value in values) + text[hit.end(1) :]
 
 
-def moved_knot(text, knot, axis, by):
-    """A knot of the freeform face, in u (0) or v (1)."""
-    start = text.index("B_SPLINE_SURFACE_WITH_KNOTS")
-    places = [hit.start() for hit in re.finditer(rf"(?<![\d.]){knot}\.0+(?!\d)", text[start : text.index(";", start)])]
-    at = start + places[axis]
-    return text[:at] + f"{knot + by:.14f}" + text[at + len(f"{knot:.14f}") :]
-
-
-WHERE = {
-    "a height at the rim by 2e-11": (lambda t: moved_pole(t, 32, 5, -2e-11), NET, "control point (32, 5)"),
-    "a knot in v": (lambda t: moved_knot(t, 23, 1, -1e-13), KNOTS, "in v: knot 23"),
-    "an edge": (
-        lambda t: re.sub(r"(ORIENTED_EDGE\('',\*,\*,#21,)\.T\.", r"\1.F.", t, count=1), EDGES,
-        "edge #21: 0 times forwards, 2 times back",
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("change", WHERE)
-def test_a_change_is_named_with_its_place(folder, change):
-    alter, name, where = WHERE[change]
+def test_a_change_is_named_with_its_place(folder):
+    """A height at the rim by 2e-11 mm."""
+    name, where = "STEP text: control points", "control point (32, 5)"
     path = folder / "lens.step"
-    text = path.read_text()
-    path.write_text(alter(text))
-    assert path.read_text() != text
+    path.write_text(moved_pole(path.read_text(), 32, 5, -2e-11))
     (folder / "report.json").write_text('{"passed": true, "checks": [], "rrmsd": 0.0}')  # which is not believed
     proof = commands.verify(folder).contents
     found = proof.facts()
@@ -226,24 +204,3 @@ def test_a_change_is_named_with_its_place(folder, change):
     page = (folder / "report.html").read_text()
     assert f"{name} ({where}" in "".join(map(str, report.summary(proof).renderables)) and f"{name} ({where}" in page
     assert all(line["where"] == "" for line in found["checks"] if line["passed"])
-
-
-SAID = {  # what the reader itself refuses
-    "sideways": (lambda t: moved_pole(t, 12, 20, 1e-6, 0), r"1\.0e-06 mm off a uniform grid, the worst at \(12, 20\)"),
-    "a millimetre of its own": (
-        lambda t: t.replace("SI_UNIT(.MILLI.,.METRE.)", "CONVERSION_BASED_UNIT('MILLIMETRE',#2190)"),
-        "lengths in millimetre by a factor of its own",
-    ),
-    "thousandths of a radian": (lambda t: t.replace("$,.RADIAN.", ".MILLI.,.RADIAN."), "angles in milliradian"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("change", SAID)
-def test_what_is_no_lens_in_millimetres_says_what_it_is(folder, change):
-    alter, sentence = SAID[change]
-    path = folder / "lens.step"
-    text = path.read_text()
-    path.write_text(alter(text))
-    assert path.read_text() != text
-    with pytest.raises(SceneError, match=rf"lens\.step: .*{sentence}"):
-        commands.verify(folder)

@@ -25,7 +25,8 @@ from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Sphere
 from bstcad.scene.scene import load
 from tests.conftest import DISK
-from tests.hard_cases.lenses import SQUARE, N, eps, examples, largest, places, uniform, wavy
+from tests.hard_cases.lenses import eps, examples, largest
+from tests.lenses import SQUARE, N, places, uniform, wavy
 from tests.tracing import simulated, simulated_plain
 
 EPS = eps(torch.float64)
