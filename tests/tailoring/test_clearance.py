@@ -18,12 +18,13 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Sphere
-from bstcad.scene.blank import Bounds, net_extent
+from bstcad.scene.blank import Bounds
 from bstcad.tailoring import machinability
 from bstcad.tailoring.clearance import MARGIN, Cells, clearance, unit
 from bstcad.tailoring.machinability import excess, held, kept
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.stage2 import Problem
+from tests.lenses import half_over, net
 
 WHOLE, DISC = Rectangle(4.0, 6.0), Circle(1.5)
 OUTLINES = pytest.mark.parametrize("outline", [WHOLE, DISC], ids=("rectangle", "circle"))
@@ -125,13 +126,10 @@ def test_only_a_tailored_front_needs_a_bound_where_none_is_asked():
 
 def crossing(outline, z=3.0, sides=(33, 21), shaped=(0, 1)):
     """Both faces bulge into the glass and would cross on the axis, where they stand 3.6 mm towards each other."""
-    nets = []
-    for m, plane, sign in ((sides[0], 0.0, 1.8), (sides[1], z, -1.8)):
-        half = net_extent(outline, m)
-        x, y = (torch.linspace(-h, h, m, dtype=torch.float64) for h in half)
-        nets.append(
-            BSplineSurface(plane, sign * torch.exp(-(x[:, None] ** 2) - y**2), (-half[0], half[0]), (-half[1], half[1]))
-        )
+    nets = [
+        net(lambda x, y, sag=sag: sag * torch.exp(-(x**2) - y**2), plane, m, half_over(outline, m))
+        for m, plane, sag in ((sides[0], 0.0, 1.8), (sides[1], z, -1.8))
+    ]
     return Lens(*nets, outline, 1.5, shaped=shaped)
 
 
@@ -143,8 +141,8 @@ def test_faces_that_would_cross_make_way_for_each_other(shaped, outline):
     found = kept(lens, bounds)
     assert 0.5 <= thickness_range(found)[0] < 0.52  # bent no further than it takes
     assert found.back.z == lens.back.z  # no move
-    for k, (net, before) in enumerate(zip((found.front, found.back), (lens.front, lens.back), strict=True)):
-        assert torch.equal(net.heights, before.heights) == (k not in shaped)
+    for k, (after, before) in enumerate(zip((found.front, found.back), (lens.front, lens.back), strict=True)):
+        assert torch.equal(after.heights, before.heights) == (k not in shaped)
 
 
 def test_a_lens_with_room_stays_as_it_is():

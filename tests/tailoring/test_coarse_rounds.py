@@ -8,13 +8,11 @@ import pytest
 import torch
 
 from bstcad import pipeline
-from bstcad.analysis.shape import thickness_range
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.measure import Effort, measure
 from bstcad.pipeline import design
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import stage1, stage2
-from bstcad.tailoring.machinability import BOUNDED
 from bstcad.tailoring.merit import CoarseVariable
 from bstcad.tailoring.run import BEST
 
@@ -33,12 +31,11 @@ NEAR = {  # a wall nearer than the plate is wide, fifty times as bright in one c
 }
 
 
-def near(z=62.0):
-    """The scene, with the wall at z mm."""
+def near():
+    """The scene, with its picture."""
     line = torch.linspace(-1.5, 1.5, 64)
     picture = torch.exp(line[:, None] + 0.3 * line[None, :])
-    scene = Scene.model_validate(NEAR | {"target": NEAR["target"] | {"z": z}})
-    return scene.changed({"target.uniform": None, "target.image": picture.numpy()})
+    return Scene.model_validate(NEAR).changed({"target.uniform": None, "target.image": picture.numpy()})
 
 
 def rrmsd(made):
@@ -70,12 +67,7 @@ def test_they_bring_light_far(made, monkeypatch):
     assert rrmsd(made) < 0.4 * rrmsd(without)
 
 
-def test_a_lens_whose_map_came_to_rest_has_none(made):
-    assert len(names(design(near(600.0), device="cpu", later=True))) == 1
-
-
-@pytest.mark.parametrize("bounds", [{}, {"lens.max_thickness": 17.0}])
-def test_a_stage_hands_on_its_best_lens(bounds, monkeypatch):
+def test_a_stage_hands_on_its_best_lens(monkeypatch):
     """A stage that ends with a round on 32 pixels, by which a letter on 64 pixels gets worse."""
 
     def steps(task, lens, state=None):
@@ -83,13 +75,12 @@ def test_a_stage_hands_on_its_best_lens(bounds, monkeypatch):
         return stage2.run_rounds((*coarse, stage2.Round(task, tubes, evaluations), *coarse[-1:]), lens, state)
 
     monkeypatch.setitem(pipeline.PROCEDURES, "least-squares", ("stage 1", stage1.steps, steps))
-    made = design(near().changed({"target.image": None, "target.text": "T", **bounds}), device="cpu", later=True)
+    made = design(near().changed({"target.image": None, "target.text": "T"}), device="cpu", later=True)
     judged = {stage.name: stage.rrmsd for stage in made.making.stages}
     on_few, on_all = (judged[name] for name in names(made)[-1:-3:-1])
     assert on_few > 1.2 * on_all  # else there is nothing to see here
-    assert judged[BEST] < (judged[BOUNDED] / 1.05 if bounds else 1.05 * on_all)
+    assert judged[BEST] < 1.05 * on_all
     assert rrmsd(made) == pytest.approx(judged[BEST], rel=0.05)
-    assert thickness_range(made.lens)[1] <= bounds.get("lens.max_thickness", 100.0)
 
 
 def test_a_design_goes_on_from_within_them(made, states):

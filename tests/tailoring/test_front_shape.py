@@ -7,19 +7,18 @@ import math
 import pytest
 import torch
 
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import Conic, Plane, Sphere
 from bstcad.scene.blank import as_front
 from bstcad.tailoring.stage1 import best_front
+from tests.lenses import SQUARE, net
 
 RIM = math.hypot(10.0, 10.0)
 
 
 def lens_with(front):
-    back = BSplineSurface(25.0, torch.zeros((5, 5), dtype=torch.float64), (-10.0, 10.0), (-10.0, 10.0))
-    return Lens(front, back, Rectangle(20.0, 20.0), 1.5)
+    return Lens(front, net(z=25.0, m=5), SQUARE, 1.5)
 
 
 def searched(front, free, merit, rim_sags=(-math.inf, math.inf)):

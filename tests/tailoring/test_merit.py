@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from bstcad.baselines.paper import TentMerit
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.goal import Goal
@@ -20,7 +19,8 @@ from bstcad.optics.rays import Landed
 from bstcad.optics.surfaces import Plane
 from bstcad.optics.tubes import Tubes
 from bstcad.tailoring import merit
-from bstcad.tailoring.merit import Landings, Merit, SobolevVariable, Spectrum, local_weight
+from bstcad.tailoring.merit import Landings, Merit, SobolevVariable, local_weight
+from tests.lenses import net
 
 SCREEN = Screen(100.0, (0.0, 8.0), (0.0, 8.0), 8)
 ONE = (Channel(None, 1.5),)
@@ -29,16 +29,6 @@ ONE = (Channel(None, 1.5),)
 def landed(x, y, flux=None):
     flux = torch.full_like(x, 1 / x.numel()) if flux is None else flux
     return Landed(torch.stack([x, y]), flux, torch.zeros(x.shape, dtype=torch.uint8))
-
-
-def test_a_perfect_lens_has_merit_zero_by_the_tent():
-    """Even light in each pixel, brightness from pixel to pixel at random: rays on a fine grid, flux by the pixel."""
-    target = torch.rand((8, 8), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    places = (torch.arange(8 * 64, dtype=torch.float64) + 0.5) / 64
-    x, y = (p.reshape(-1) for p in torch.meshgrid(places, places, indexing="ij"))
-    flux = target[(8 - y).floor().long().clamp(0, 7), x.floor().long()]
-    merit, rrmsd = TentMerit.of(ONE, SCREEN, target, 0.03)((landed(x, y, flux / flux.sum()),))
-    assert float(merit) < 1e-6 and float(rrmsd) < 1e-3  # a grid of 64 rays a pixel instead of even light
 
 
 def sheet(n, seed=0, spread=0.0):
@@ -103,7 +93,7 @@ def test_the_gradient_of_the_tubes_is_that_of_finite_differences():
 
 
 M = 33
-FLAT = BSplineSurface(20.0, torch.zeros((M, M), dtype=torch.float64), (-8.0, 8.0), (-8.0, 8.0))
+FLAT = net(m=M, half=8.0)
 
 
 def noise(seed, m=M):
@@ -112,11 +102,6 @@ def noise(seed, m=M):
 
 def variable(seed=0):
     return SobolevVariable.of(FLAT, noise(seed).exp())
-
-
-def test_adjoint_is_the_transpose():
-    one, c, g = variable(), noise(1), noise(2)
-    assert float((one.heights(c) * g).sum()) == pytest.approx(float((c * one.adjoint(g)).sum()), rel=1e-12)
 
 
 def test_the_piston_stays():
@@ -152,30 +137,6 @@ def test_black_and_unlit_parts_have_a_bounded_weight():
     weight = local_weight(Collimated(Rectangle(16.0, 16.0)), lens, picture, Screen(100.0, (-8.0, 0.0), (-8.0, 8.0), 64))
     assert float(weight.max()) == merit.MOST and float(weight.min()) >= 1 / merit.MOST
     assert float(weight[-8:].mean()) == pytest.approx(1.0, abs=1e-6)  # what lands beside the screen
-
-
-def flat(m):
-    return BSplineSurface(20.0, torch.zeros((m, m), dtype=torch.float64), (-10.0, 10.0), (-6.0, 6.0))
-
-
-def test_the_sobolev_variable_measures_slope():
-    """The mean of |∇h|² over the net is Σ c² for smooth nets: by a fine midpoint sum of the surface's own slopes."""
-    m, n = 33, 400
-    spectrum = Spectrum.of(flat(m))
-    c = torch.zeros((m, m), dtype=torch.float64)
-    c[:4, :4] = noise(0, 4)
-    c[0, 0] = 0.0  # the piston has no slope
-    surface = BSplineSurface(20.0, spectrum.heights(c), (-10.0, 10.0), (-6.0, 6.0))
-    line = (torch.arange(n, dtype=torch.float64) + 0.5) / n - 0.5
-    x, y = torch.meshgrid(20 * line, 12 * line, indexing="ij")
-    _, z_x, z_y = surface.sag_and_slope(x, y)
-    assert float((z_x**2 + z_y**2).mean()) == pytest.approx(float((c**2).sum()), rel=0.06)  # of order 1 / m: the ends
-
-
-def test_the_adjoint_of_the_spectrum_is_the_transpose():
-    spectrum = Spectrum.of(flat(17))
-    c, g = noise(1, 17), noise(2, 17)
-    assert float((spectrum.heights(c) * g).sum()) == pytest.approx(float((c * spectrum.adjoint(g)).sum()), rel=1e-12)
 
 
 def test_the_cosine_transform_by_products_is_that_by_scipy():

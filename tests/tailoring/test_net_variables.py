@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from bstcad.analysis.shape import slope_octaves
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
@@ -17,16 +16,15 @@ from bstcad.optics.point import Point
 from bstcad.optics.trace import behind
 from bstcad.tailoring.merit import SobolevVariable
 from bstcad.tailoring.net_variables import NetVariables, along_light
+from tests.lenses import net
 
 BEAM, POINT = Collimated(aperture=Rectangle(16.0, 16.0)), Point((1.0, 0.0, -80.0), half_angle=5.0)
 SCREENS = [Screen(30.0, (-9.0, 9.0), (-9.0, 9.0), 8), Screen(70.0, (-9.0, 9.0), (-9.0, 9.0), 8)]
 GOALS = [Goal(f"target[{k}]", screen, np.full((8, 8), 1 / 64)) for k, screen in enumerate(SCREENS)]
 
 
-def surface(z, of, m):
-    flat = BSplineSurface(z, torch.zeros((m, m), dtype=torch.float64), (-12.0, 12.0), (-12.0, 12.0))
-    x, y = (torch.linspace(-12.0, 12.0, m, dtype=torch.float64) for _ in range(2))
-    return flat if of is None else BSplineSurface(z, of(x[:, None], y[None, :]), flat.x, flat.y)
+def surface(z, sag, m):
+    return net(sag, z, m, 12.0)
 
 
 def lens_of(m=97, back=65):

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from bstcad.optics import sampling
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import Refract, deflect, intersect
 from bstcad.optics.lens import Lens
@@ -19,17 +18,12 @@ from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import to_first_net, trace
 from bstcad.tailoring.merit import landing
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, tailor_to_aim
+from tests.lenses import SQUARE, net
 from tests.tracing import stratified
 
-SQUARE = Rectangle(20.0, 20.0)
 
-
-def surface(m, seed=None, size=0.05):
-    heights = torch.zeros((m, m), dtype=torch.float64)
-    if seed is not None:
-        line = torch.linspace(-1, 1, m, dtype=torch.float64)
-        heights = size * torch.sin(3 * line + seed)[:, None] * torch.cos(2 * line)[None, :]
-    return BSplineSurface(20.0, heights, (-10.0, 10.0), (-10.0, 10.0))
+def surface(m, phase, size=0.05):
+    return net(lambda x, y: size * torch.sin(0.3 * x + phase) * torch.cos(0.2 * y), m=m)
 
 
 @pytest.mark.parametrize(
@@ -58,7 +52,7 @@ def test_wanted_slopes_are_snells_law_inverted(source, front, plane):
 def test_an_aim_that_no_face_can_reach_turns_the_ray_as_far_as_one_can(index, reach):
     """Never reflected, never steeper than it may be, towards the aim, and as far as it goes where that is the limit."""
     x, y = torch.meshgrid(*[torch.linspace(-3.0, 3.0, 7, dtype=torch.float64)] * 2, indexing="ij")
-    lens = Lens(Plane(8.0), surface(5), SQUARE, index)
+    lens = Lens(Plane(8.0), net(m=5), SQUARE, index)
     in_glass = to_first_net(Collimated(Circle(8.0)).rays(x, y, 8.0, 1.0), lens)
     at_face, _, _ = intersect(lens.back, in_glass, SQUARE, Status.VIGNETTED)
     aim = torch.stack([torch.full_like(x, reach), torch.full_like(x, -0.2 * reach)])
@@ -78,7 +72,7 @@ def test_a_surface_comes_back_from_its_slopes(fit):
     true = surface(17, 0.7)
     x, y = (p.reshape(-1) for p in stratified(SQUARE, 40, 0))
     _, z_x, z_y = true.sag_and_slope(x, y)
-    found = fit_slopes(surface(17), x, y, z_x, z_y, torch.ones_like(x), fit)
+    found = fit_slopes(net(m=17), x, y, z_x, z_y, torch.ones_like(x), fit)
     off = found.from_vertex().heights - true.from_vertex().heights
     assert float(off.abs().max()) < 1e-8  # mm
 
@@ -87,23 +81,15 @@ def test_a_polynomial_goes_on_where_no_ray_falls():
     """Slopes of a paraboloid, known in a disc only: the fit finds the corners too."""
     x, y = (p.reshape(-1) for p in stratified(SQUARE, 60, 0))
     inside = (x * x + y * y < 81.0).to(x)
-    found = fit_slopes(surface(17), x, y, 0.3 + 0.02 * x, 0.01 * y, inside, Fit(bending=1e-2, steps=40, degree=3))
+    found = fit_slopes(net(m=17), x, y, 0.3 + 0.02 * x, 0.01 * y, inside, Fit(bending=1e-2, steps=40, degree=3))
     corner = torch.tensor([9.5], dtype=torch.float64)
     _, z_x, z_y = found.sag_and_slope(corner, corner)
     assert float(z_x) == pytest.approx(0.49, abs=1e-2) and float(z_y) == pytest.approx(0.095, abs=1e-2)
 
 
-def test_refine_keeps_the_surface():
-    coarse = surface(33, 0.4)
-    fine = coarse.refined(65)
-    x, y = sampling.grid(SQUARE, 50)
-    for a, b, bound in zip(coarse.sag_and_slope(x, y), fine.sag_and_slope(x, y), (2e-5, 1e-3, 1e-3), strict=True):
-        assert float((a - b).abs().max()) < bound  # mm, slope: the nets are not nested
-
-
 def test_tailor_to_aim_lands_where_a_surface_can():
     """A stretched grid, near the axis: the map is a gradient but for the finite throw, so a surface follows it."""
-    source, lens = Collimated(Circle(8.0)), Lens(Plane(8.0), surface(33), SQUARE, 1.488)
+    source, lens = Collimated(Circle(8.0)), Lens(Plane(8.0), net(m=33), SQUARE, 1.488)
     x, y = sampling.grid(Rectangle(16.0, 16.0), 66)
     rays, screen = source.rays(x, y, 8.0, 1.0), LevelPlane(1000.0)
     aim = torch.stack([4 * x, 3 * y])

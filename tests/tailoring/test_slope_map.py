@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
@@ -16,9 +15,9 @@ from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit
 from bstcad.tailoring.slope_map import corners_of, face_grid, lit_window, slope_map, sloped
+from tests.lenses import SQUARE, N, net
 from tests.tracing import simulated
 
-SQUARE = Rectangle(20.0, 20.0)
 CASES = {
     "off axis": (Collimated(Rectangle(16.0, 16.0)), Plane(8.0), Screen(1000.0, (60.0, 300.0), (40.0, 280.0), 96)),
     "point and sphere": (
@@ -30,16 +29,13 @@ CASES = {
 
 def known_lens(name):
     """A back face whose ray mapping does not fold."""
-    m = 33
-    line = torch.linspace(-10.0, 10.0, m, dtype=torch.float64)
-    x, y = line[:, None], line[None, :]
-    if name == "off axis":
-        h = 0.33 * x + 0.3 * y + 0.005 * (x**2 + y**2) + 0.02 * torch.sin(0.5 * x) * torch.cos(0.4 * y)
-    else:
-        h = 0.0 * x * y + 0.05 * torch.sin(0.4 * x) * torch.cos(0.3 * y)
-    return Lens(
-        CASES[name][1], BSplineSurface(20.0, h, (-10.0, 10.0), (-10.0, 10.0)).from_vertex().moved(20.0), SQUARE, 1.488
-    )
+    sags = {
+        "off axis": lambda x, y: (
+            0.33 * x + 0.3 * y + 0.005 * (x**2 + y**2) + 0.02 * torch.sin(0.5 * x) * torch.cos(0.4 * y)
+        ),
+        "point and sphere": lambda x, y: 0.05 * torch.sin(0.4 * x) * torch.cos(0.3 * y),
+    }
+    return Lens(CASES[name][1], net(sags[name], m=33).from_vertex().moved(20.0), SQUARE, N)
 
 
 def slope_error(name, cells):
@@ -92,8 +88,7 @@ def test_the_grid_is_met_and_carries_the_flux(name):
 
 def test_a_back_that_no_ray_is_found_to_is_one_sentence():
     """A point 0.05 mm from the front and far beside it: in 20 mm of glass its light gets no further than 18 mm."""
-    back = BSplineSurface(20.0, torch.zeros((33, 33), dtype=torch.float64), (-8.0, 8.0), (-8.0, 8.0))
-    lens = Lens(Plane(0.05), back, Rectangle(16.0, 16.0), 1.49)
+    lens = Lens(Plane(0.05), net(m=33, half=8.0), Rectangle(16.0, 16.0), 1.49)
     with pytest.raises(SceneError, match="^source: no ray from it to the back face was found"):
         lit_window(Point(position=(100.0, 0.0, 0.0)), lens)
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import channels_of, drawn_channels
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.goal import Goal
@@ -25,6 +24,7 @@ from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Task
 from bstcad.tailoring.source_image import Images, Spread, _biquadratic, blurs, bordered, unseen
 from bstcad.tailoring.stage2 import Problem, _pull
+from tests.lenses import net
 
 INDEX, SIZE = 1.5, 2.4
 SCREEN = Screen(150.0, (-38.0, 36.0), (-36.0, 36.0), (50, 48))  # wider than the light, whose rim is sharp
@@ -39,9 +39,7 @@ SOURCES = {
 
 
 def lens():
-    u = torch.linspace(-1, 1, 25, dtype=torch.float64)
-    heights = -0.3 * (u[:, None] ** 2 + u**2) + 0.02 * torch.cos(4 * u)[:, None] * torch.sin(3 * u)
-    back = BSplineSurface(6.0, heights, (-10.0, 10.0), (-10.0, 10.0))
+    back = net(lambda x, y: -0.003 * (x**2 + y**2) + 0.02 * torch.cos(0.4 * x) * torch.sin(0.3 * y), 6.0, 25)
     return Lens(Sphere(1.0, 0.005), back, Circle(9.0), INDEX)
 
 

@@ -8,7 +8,7 @@ import torch
 from bstcad import pipeline
 from bstcad.optics.measure import rrmsd_by_tubes
 from bstcad.pipeline import design
-from bstcad.scene.quality import JUDGE_DRAW, Tailoring
+from bstcad.scene.quality import JUDGE_DRAW
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage2
 from bstcad.tailoring.source_image import Spread
@@ -55,13 +55,6 @@ def test_it_tells_what_each_size_costs(compensated):
     assert rrmsd == pytest.approx(last, rel=0.5)
 
 
-def test_a_source_of_no_size_is_a_point_to_the_last_bit():
-    few = TINY | {"tailoring.rounds": 2, "tailoring.stage2_iterations": 3}
-    point, none = (pipeline.design(load(DISK, few | more), device="cpu") for more in ({}, {"source.diameter": 0.0}))
-    assert torch.equal(none.lens.back.heights, point.lens.back.heights)
-    assert [s.name for s in none.making.stages] == [s.name for s in point.making.stages]
-
-
 def test_the_source_grows_to_its_size():
     scene = load(DISK, WIDE)
     sizes = [share for share, _ in stage2.SIZES]
@@ -91,19 +84,6 @@ def test_no_more_tubes_than_the_net_and_the_pixels_ask_for():
     assert number == 66  # 33 control points, 32 pixels
     few = load(DISK, WIDE | {"tailoring.rays": 40})
     assert {each.tubes for each in stage2.stage3_rounds(task_of(few))} == {40}
-
-
-@pytest.mark.parametrize("net", [(129, 33), (33, 129)])
-def test_a_sheet_over_an_oblong_net_has_two_tubes_a_cell_and_a_tenth_more_than_the_pixels(net):
-    """A sheet of n tubes a side has n √(m_x / m_y) tubes along x."""
-    knobs = Tailoring(rays=9999).resolved(net)
-    longer = (net[0] / net[1]) ** 0.5
-    for pixels in ((16, 16), (400, 100), (100, 400)):
-        [tubes] = {count for count, _ in stage2.blurred_sheets(knobs, pixels)}
-        across = tubes * longer, tubes / longer
-        assert all(n >= 1.1 * p for n, p in zip(across, pixels, strict=True))
-        assert tubes**2 >= 4 * net[0] * net[1] * 0.98
-        assert tubes <= max(2 * (net[0] * net[1]) ** 0.5, 1.1 * pixels[0] / longer, 1.1 * pixels[1] * longer) + 2
 
 
 @pytest.fixture(scope="module")

@@ -53,10 +53,10 @@ def tailored(task, lens):
     return driven(driver, task, stage2.steps(task, lens)).lens, driver
 
 
-@pytest.mark.parametrize("tilt", ["[0.0, 0.0]", "[0.0, 20.0]"])
-def test_stage_1_goes_another_way_where_the_first_one_fails(tilt):
+def test_stage_1_goes_another_way_where_the_first_one_fails():
     """A source 5 mm before the lens: the slopes that a point needs change too much with the sag to settle."""
-    task, lens = small("disk", **{"source.position": "[0.0, 0.0, 10.0]", "tailoring.rounds": "3", "target.tilt": tilt})
+    near = {"source.position": "[0.0, 0.0, 10.0]", "tailoring.rounds": "3", "target.tilt": "[0.0, 20.0]"}
+    task, lens = small("disk", **near)
     task = replace(task, least=0.5)
     *_, first = stage1.follow_slopes(task, lens)
     first, other = task.rrmsd(first.lens), task.rrmsd(stage1.follow_aims(task, lens)[0])
@@ -97,26 +97,6 @@ def test_an_accuracy_that_is_reached_ends_stage_2():
     lens, driver = tailored(task, lens)
     assert driver.stopped == "accuracy" and task.rrmsd(lens) <= 0.03
     assert len([point for point in driver.record.history if point[1] > 0]) < 60
-
-
-def test_an_accuracy_that_a_round_ends_with_needs_no_further_round():
-    """Coarse tubes flatter themselves most: what they were told to aim for is more than finer ones must reach."""
-
-    class Stern(Task):
-        """Its judge sees five times the error, once."""
-
-        calls = itertools.count()
-
-        def rrmsd(self, lens):
-            return super().rrmsd(lens) * (1 if next(self.calls) else 5)
-
-    evaluations = {"tailoring.stage2_iterations": "30"}
-    (task, _), lens = small("disk", **evaluations), disk()
-    ends = [step for step in stage2.steps(task, lens) if step.ends]
-    asked, _ = small("disk", **evaluations, **{"tailoring.accuracy": str(1.05 * ends[0].judged)})
-    found, driver = tailored(Stern(**vars(asked)), lens)
-    assert driver.stopped == "accuracy" and asked.rrmsd(found) <= 1.05 * ends[0].judged
-    assert len(driver.record.stages) < len(ends)
 
 
 def test_an_accuracy_that_the_judge_denies_was_not_reached():
