@@ -20,10 +20,6 @@ def lines(found, separator):
     return "\n".join(separator.join(f"{value:.6f}" for value in row) for row in found)
 
 
-def named(found):
-    return "\n".join(f"P{k},{x:.7f},{y:.7f},{z:.7f},0.1,high" for k, (x, y, z) in enumerate(found))
-
-
 def zygo(heights, pixel):
     """A Zygo XYZ file of rows of heights (mm), the first row at the top; pixel: m.  NaN is "No Data"."""
     header = ["Zygo XYZ Data File - Format 1", '0 8 1 5 "Mon"', "0 0 9 9 1 255", "0 0 9 9", '""', '""', '""']
@@ -39,28 +35,16 @@ def zygo(heights, pixel):
 WRONG = {
     "two columns": (lines(GOOD[:, :2], ","), "line 1 holds 2 numbers; give x, y and z in mm"),
     "infinite": (lines(GOOD, ",") + "\n1,inf,3", "line 201: y = inf mm is beyond 1000000 mm"),
-    "far": ("x [m],y [m],z [m]\n" + lines(GOOD / 1e3, ",") + "\n1,2,3e3", "line 202: z = 3e+06 mm is beyond 1000000"),
     "a placeholder": (lines(GOOD, " ") + "\n1 2 -1e10", "leave out what was not measured"),
-    "nothing measured": ("1,2,Bad\n" * 200, "holds 0 points and 200 without data, too few"),
     "decimal commas": ("x,y,z\n" + lines(GOOD, ",").replace(".", ","), "line 2 holds 6 fields where its heading"),
     "nominal alone": ("X_nom,Y_nom,Z_nom\n" + lines(GOOD, ","), "its heading, 'X_nom,Y_nom,Z_nom', names nominal"),
-    "both, and others": ("x,y,z,z act\n" + lines(GOOD[:, [0, 1, 2, 2]], ","), "names x, y or z twice"),
     "pixels": ("Zygo XYZ Data File - Format 2\n#\n0 0 No Data\n0 1 16025.3\n#", "header states no width of a pixel"),
-    "no calibrated pixel": (zygo(GOOD, 0.0), "header states no width of a pixel"),
-    "raw phases": ("Zygo ASCII Data File - Format 2\n#\n1 2 3 4\n#", "without a table of x, y and z"),
     "a zip archive": (b"PK\x03\x04" + bytes(50), "is a zip archive, such as X3P"),
     "half of UTF-16": ("x,y,z\n".encode("utf-16") + b"1", "is no text in UTF-16"),
-    "words": (lines(GOOD, " ") + "\n1 two 3", "line 201 is not three numbers ('1 two 3')"),
-    "a short line": ("x,y,z\n" + lines(GOOD, ",") + "\n1,2\n", "line 202 is not three numbers"),
-    "ten points": (lines(GOOD[:10], ","), "holds 10 points, too few"),
     "more columns": (lines(np.hstack([GOOD, GOOD]), ","), "holds 6 columns, and no heading says which are x, y and z"),
-    "another heading": ("r,phi,z\n" + lines(GOOD, ","), "its heading, 'r,phi,z', names no x, y and z"),
     "x twice": ("x,y,z,x\n" + lines(GOOD[:, [0, 1, 2, 0]], ","), "names x, y or z twice"),
     "another unit": ("x [ft],y [ft],z [ft]\n" + lines(GOOD, ","), "'x[ft]', has a unit that is not known; give mm"),
     "metres": (lines(GOOD / 1000, ","), "as if they were in metres; give them in mm"),
-    "nothing": ("\n \n", "is empty"),
-    "a heading alone": ("x,y,z\n", "holds no points"),
-    "another size": (lines(GOOD * 20, ","), "where the lens is 8 mm wide"),
     "no text": (bytes(range(256)), "is no text"),
 }
 
@@ -89,22 +73,15 @@ def test_a_wrong_cloud_ends_the_command_with_2_and_changes_nothing(small_design,
     [
         ("a.csv", "x,y,z\n" + lines(GOOD, ",")),
         ("a.txt", "# by an instrument\n" + lines(GOOD, "\t")),
-        ("a.xyz", lines(GOOD, "  ")),
         ("a.csv", lines(GOOD, ";").replace(".", ",")),
-        ("a.csv", "z,x,y\n" + lines(GOOD[:, [2, 0, 1]], ",")),
         ("a.csv", "z [\u00b5m];x [mm];y [mm]\n" + lines(GOOD[:, [2, 0, 1]] * [1e3, 1, 1], ";").replace(".", ",")),
         ("a.txt", "# serial 17\n# x [in]  y [in]  z [in]  nx ny nz\n" + lines(np.hstack([GOOD / 25.4, GOOD]), " ")),
-        ("a.csv", "made by an instrument\nID,X_mm,Y_mm,Z_mm,normal x,intensity\n" + named(GOOD)),
-        ("a.csv", "x nominal,x actual,y actual,z actual\n" + lines(GOOD[:, [1, 0, 1, 2]], ",")),
         ("a.csv", "X_nom,Y_nom,Z_nom,ActX,YMeas,Z [ist]\n" + lines(np.hstack([0 * GOOD, GOOD]), ",")),
         ("a.txt", "\n".join(f"PT{k}  {x:.7f} {y:.7f} {z:.7f}" for k, (x, y, z) in enumerate(GOOD))),  # named points
-        ("a.txt", "\n".join(f"{k} {x:.7f} {y:.7f} {z:.7f}" for k, (x, y, z) in enumerate(GOOD, 1))),  # numbered points
         ("a.csv", "X,Y,Z\n" + "\n".join(",".join(f'"{v:.7f}"'.replace(".", ",") for v in row) for row in GOOD)),
-        ("a.txt", lines(GOOD, "  ").replace(".", ",")),
         ("a.txt", "X Y Z\n" + "\n".join(" ".join(f"{v:.8E}".replace("E", "D") for v in row) for row in GOOD)),
         ("a.csv", ("x [\u00b5m];y [mm];z [mm]\n" + lines(GOOD * [1e3, 1, 1], ";").replace(".", ",")).encode("cp1252")),
         ("a.csv", ("x,y,z\r\n" + lines(GOOD, ",")).encode("utf-16")),
-        ("a.csv", ("x,y,z\n" + lines(GOOD, ",")).encode("utf-16-le")),
         ("a.csv", ("x,y,z\n" + lines(GOOD, ",")).encode("utf-8-sig")),
         ("a.csv", "sep=;\nX;Y;Z\n" + lines(GOOD, ";").replace(".", ",")),
         ("a.csv", lines(GOOD, ",").replace("\n", ",\n")),  # a comma behind each line
@@ -122,8 +99,7 @@ def test_text_is_read_with_any_separator_and_heading(tmp_path, name, text):
 NO_DATA = ("Bad", "No Data", "NaN", "-nan(ind)", "-1.#IND00", "n/a", "---", "NoData", "null", "")
 
 
-@pytest.mark.parametrize("separator", [" ", "\t", ",", ";"])
-@pytest.mark.parametrize("heading", ["", "x{0}y{0}z\n"])
+@pytest.mark.parametrize(("separator", "heading"), [(" ", ""), (";", "x;y;z\n")])
 def test_lines_without_data_are_counted_and_left_out(tmp_path, separator, heading):
     """By the words of instruments, and by an empty height where the separator shows it."""
     words = NO_DATA[: 9 if separator == " " else 10]
@@ -131,7 +107,7 @@ def test_lines_without_data_are_counted_and_left_out(tmp_path, separator, headin
     for k, word in enumerate(words):
         place = 17 * k + (k > 0)  # the first line, too
         rows[place] = rows[place].rsplit(separator, 1)[0] + separator + word
-    (tmp_path / "a.txt").write_text(heading.format(separator) + "\n".join(rows) + "\n")
+    (tmp_path / "a.txt").write_text(heading + "\n".join(rows) + "\n")
     found = clouds.load(tmp_path / "a.txt", ROUND)
     kept = np.delete(GOOD, [17 * k + (k > 0) for k in range(len(words))], axis=0)
     assert found.without_data == len(words) and found.points == pytest.approx(kept, abs=1e-6)

@@ -4,23 +4,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from scipy.optimize import linprog
 
 from bstcad.measured.alignment import Face, aligned, sampled, scale, unmoved
 from bstcad.measured.form_error import deviation, fitted, map_files, minimum_zone, robust_pv, zernike
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
 from bstcad.optics.surfaces import Plane
+from tests.lenses import net
 from tests.measured.synthetic import points, with_form_error
 
 
 @pytest.fixture(scope="module")
 def lens():
-    x = torch.linspace(-6, 6, 33, dtype=torch.float64)
-    heights = 0.02 * x[:, None] ** 2 + 0.01 * x[None, :] ** 2 + 0.003 * x[:, None] ** 3 / 6
-    return Lens(Plane(0.0), BSplineSurface(5.0, heights, (-6.0, 6.0), (-6.0, 6.0)), Circle(5.0), 1.5)
+    back = net(lambda x, y: 0.02 * x**2 + 0.01 * y**2 + 0.0005 * x**3, 5.0, 33, 6.0)
+    return Lens(Plane(0.0), back, Circle(5.0), 1.5)
 
 
 def test_the_minimum_zone_is_that_of_all_points(lens):

@@ -17,12 +17,11 @@ import bstcad
 from bstcad import cli
 from bstcad.analysis import shape
 from bstcad.cad import mesh as meshes
-from bstcad.cad import step_reading, step_writing
+from bstcad.cad import step_reading
 from bstcad.folder import read_nominal
 from bstcad.optics import measure
 from bstcad.optics.measure import Effort, Light
 from bstcad.scene.scene import Accept
-from bstcad.tolerance.perturbations import Setup, ripple
 from bstcad.verify import checks, step_checks
 from bstcad.verify.checks import Check
 from bstcad.verify.verdict import verdict
@@ -55,9 +54,7 @@ def nominal(small_design, few):
     target = goal.picture.reshape(12, 4, 16, 4).sum((1, 3))
     target *= 1 + 0.08 * (-1.0) ** np.add.outer(np.arange(12), np.arange(16))
     accept = replace_model(found.accept, rrmsd=0.2, efficiency=0.999)
-    return replace(
-        with_picture(found, target, receiver=replace(goal.receiver, pixels=(16, 12))), accept=accept
-    )
+    return replace(with_picture(found, target, receiver=replace(goal.receiver, pixels=(16, 12))), accept=accept)
 
 
 def with_picture(nominal, picture, **changes):
@@ -71,29 +68,8 @@ def replace_model(model, **changes):
 
 
 def failing(proof):
-    return {check.name for check in proof.checks if not check.passed}
-
-
-TEXT, FORM = "STEP text: ", "form: "
-NET, KNOTS, EDGES = TEXT + "control points", TEXT + "knots", TEXT + "every edge used twice, once each way"
-BACK, NORMALS = FORM + "re-read back face against the optimised one", FORM + "direction of the normals"
-VERTEX, CURVATURE = (
-    FORM + "vertex of the front, difference from the designed one",
-    (FORM + "curvature of the front, difference from the designed one"),
-)
-VOLUME_SAID = TEXT + "stated volume against the faces', relative"
-ON_FACES, ON_WALL = "solid: edges off the faces they bound", "solid: edges off the wall of the lens"
-GAPS = "solid: gaps that edges and vertices bridge"
-CLOSED, VOLUME = "STL watertight, winding consistent", "STL: volume against the solid's, relative"
-VERTICES, CHORD = "STL: vertices off the solid's faces", "STL: chordal error"
-THICKNESS, EFFICIENCY = "smallest thickness", "efficiency"
-RRMSD, NOISE = "RRMSD, box pixels, through the re-read STEP", "standard error of that RRMSD, times five"
-LIGHT = "light on the target, of what enters the lens"
-RIPPLE = "ripple: RMS slope of control points that go up and down in turn"
-AGREE = "picture by ray tubes, off the one by rays"
-FINITE = "values that are not finite"
-TARGET = "target in design.npz against the scene's, of its brightest pixel"
-LEDGER = "flux ledger: distance of its sum from 1"
+    """The ids of the checks that fail."""
+    return {check.id for check in proof.checks if not check.passed}
 
 
 def numbers(proof):
@@ -163,14 +139,19 @@ def moved_path(text, by):
 
 
 STEP = {  # what is changed: (how, the checks that see it)
-    "a control point by 1 nm": (lambda t: moved_control_point(t, 1e-6), {NET, NORMALS}),
-    "a control point by 30 nm": (lambda t: moved_control_point(t, 3e-5), {NET, NORMALS, BACK, VERTICES}),
-    "a knot by 1e-13": (lambda t: moved_knot(t, 1e-13), {KNOTS}),
-    "a corner by 1 nm": (lambda t: moved_vertex(t, 1e-6), {GAPS, ON_WALL}),
-    "an edge turned around": (turned_edge, {EDGES}),
-    "a rim's path on its face by 2e-6 rad": (lambda t: moved_path(t, 2e-6), {ON_FACES}),
-    "the front by 10 nm": (lambda t: moved_sphere(t, 1e-5), {VERTEX, GAPS, ON_FACES, VERTICES, VOLUME_SAID}),
-}
+    "a control point by 1 nm": (lambda t: moved_control_point(t, 1e-6), {"control-points", "normals"}),
+    "a control point by 30 nm": (
+        lambda t: moved_control_point(t, 3e-5), {"control-points", "normals", "form", "mesh-vertices"},
+    ),
+    "a knot by 1e-13": (lambda t: moved_knot(t, 1e-13), {"knots"}),
+    "a corner by 1 nm": (lambda t: moved_vertex(t, 1e-6), {"gaps", "edges-off-wall"}),
+    "an edge turned around": (turned_edge, {"edges-twice"}),
+    "a rim's path on its face by 2e-6 rad": (lambda t: moved_path(t, 2e-6), {"edges-off-faces"}),
+    "the front by 10 nm": (
+        lambda t: moved_sphere(t, 1e-5),
+        {"front-vertex", "gaps", "edges-off-faces", "mesh-vertices", "stated-measures"},
+    ),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("change", STEP)
@@ -194,23 +175,6 @@ def test_a_lens_out_of_its_place_fails_in_the_folder_of_its_design(folder, nomin
     assert failed.keys() >= {"control-points", "placement"}
     assert failed["placement"].where == "the lens is turned by 90° about z, then shifted by (0, 0, 5) mm"
     assert not failed.keys() & {"form", "front-vertex", "rrmsd"}
-
-
-def test_a_face_with_ripple_of_ten_nanometres_fails_by_name(small_design, few, tmp_path, capsys, monkeypatch):
-    """As a whole and valid solid, which nothing but the face itself tells from the design."""
-    draws_nothing(monkeypatch)
-    folder = shutil.copytree(small_design.folder, tmp_path / "rippled")
-    lens = read_nominal(folder)[1].lens
-    rippled = ripple(lens, 1.5, "spiral").apply(Setup(lens, (), None), 1e-5).lens  # mm RMS
-    heights = (rippled.back.heights - lens.back.heights).numpy()
-    step_writing.write_lens(rippled, folder / "lens.step", "rippled")
-    assert cli.run(["verify", str(folder)]) == 1
-    failed = {c["name"]: c for c in json.loads((folder / "report.json").read_text())["checks"] if not c["passed"]}
-    assert {NET, BACK, NORMALS} <= failed.keys()
-    assert failed[NET]["value"] == pytest.approx(np.abs(heights).max(), rel=1e-3)
-    assert failed[BACK]["value"] == pytest.approx(np.abs(heights).max(), rel=0.3)  # of the face, which its net exceeds
-    said = capsys.readouterr().out
-    assert "FAILED" in said and "STEP text: control points (control point" in said
 
 
 def test_where_no_limit_was_asked_the_verdict_is_one_of_its_own(small_design, tmp_path, capsys, monkeypatch):
@@ -249,27 +213,15 @@ def test_a_step_file_that_holds_no_such_lens_is_one_sentence(folder, nominal, ch
 
 def test_a_solid_that_occ_calls_invalid_fails(folder, nominal, monkeypatch):
     monkeypatch.setattr(step_checks.step_reading, "is_valid", lambda reread: False)
-    assert failing(checks.verify(folder, nominal)) == {"solid valid"}
+    assert failing(checks.verify(folder, nominal)) == {"solid-valid"}
 
 
-@pytest.mark.parametrize(
-    ("change", "name"),
-    [
-        ({"unit": "inch"}, "one solid, in millimetres"),
-        ({"solids": 2}, "one solid, in millimetres"),
-        ({"degrees": (3, 2)}, "degree 2 x 2, multiplicities 3, 1, …, 1, 3"),
-        ({"multiplicities": (np.array([3, 2, *[1] * 29, 3]),) * 2}, "degree 2 x 2, multiplicities 3, 1, …, 1, 3"),
-    ],
-    ids=["inch", "two solids", "cubic", "a double knot"],
-)
-def test_a_text_that_says_something_else_fails(folder, nominal, monkeypatch, change, name):
-    """What our own parser finds decides, though the reader refuses such files before."""
+def test_what_our_own_parser_finds_decides(folder, nominal, monkeypatch):
+    """Lengths in inches and a double knot, though the reader refuses such files before."""
     text = checks.part21.read_lens(folder / "lens.step")
-    surface = {key: value for key, value in change.items() if key not in ("unit", "solids")}
-    rest = {key: value for key, value in change.items() if key in ("unit", "solids")}
-    altered = replace(text, surface=replace(text.surface, **surface), **rest)
-    monkeypatch.setattr(checks.part21, "read_lens", lambda path: altered)
-    assert TEXT + name in failing(checks.verify(folder, nominal))
+    double = replace(text.surface, multiplicities=(np.array([3, 2, *[1] * 29, 3]),) * 2)
+    monkeypatch.setattr(checks.part21, "read_lens", lambda path: replace(text, unit="inch", surface=double))
+    assert failing(checks.verify(folder, nominal)) >= {"one-solid", "degree"}
 
 
 def test_a_net_of_another_size_fails_and_stays_reportable(folder, nominal):
@@ -277,8 +229,8 @@ def test_a_net_of_another_size_fails_and_stays_reportable(folder, nominal):
     back = nominal.lens.back
     coarse = replace(back, heights=torch.zeros((17, 17), dtype=torch.float64))
     proof = checks.verify(folder, replace(nominal, lens=replace(nominal.lens, back=coarse)))
-    assert {NET, KNOTS} <= failing(proof)
-    [net] = [check for check in proof.checks if check.name == NET]
+    assert {"control-points", "knots"} <= failing(proof)
+    [net] = [check for check in proof.checks if check.id == "control-points"]
     assert net.value is None
     json.dumps(numbers(proof), allow_nan=False)
 
@@ -296,11 +248,6 @@ def rewrite(path, found):
 
 def without_one(found):
     return np.delete(found, 100)
-
-
-def one_corner(found):
-    found["corners"][100, 0, 2] += 0.01
-    return found
 
 
 def one_vertex(found):
@@ -321,18 +268,11 @@ def one_turned(found):
     return found
 
 
-def larger(found):
-    found["corners"] *= 1 + 1e-3
-    return found
-
-
 STLS = {
-    without_one: {CLOSED},
-    one_corner: {CLOSED, VERTICES, CHORD},
-    one_vertex: {VERTICES, CHORD},
-    inverted: {VOLUME, CHORD},
-    one_turned: {CLOSED, CHORD},
-    larger: {VOLUME, VERTICES, CHORD},
+    without_one: {"mesh-closed"},
+    one_vertex: {"mesh-vertices", "mesh-chord"},
+    inverted: {"mesh-volume", "mesh-chord"},
+    one_turned: {"mesh-closed", "mesh-chord"},
 }
 
 
@@ -341,7 +281,7 @@ def test_a_changed_mesh_fails_by_name(folder, nominal, change):
     path = folder / "lens.stl"
     rewrite(path, change(triangles(path)))
     proof = checks.verify(folder, nominal)
-    assert failing(proof) - {VOLUME} == STLS[change] - {VOLUME}  # a hole or a moved corner may also show in the volume
+    assert failing(proof) | {"mesh-volume"} == STLS[change] | {"mesh-volume"}  # in which a hole may show, too
     assert STLS[change] <= failing(proof)
 
 
@@ -352,7 +292,7 @@ def test_a_mesh_too_coarse_fails_unless_nobody_asked_for_a_finer_one_than_there_
     monkeypatch.setattr(meshes, "MOST", most)
     mesh = meshes.read_stl(folder / "lens.stl")
     found = checks._facets(mesh, nominal.lens, 1e9, replace(nominal, mesh_tolerance=1e-9, mesh_asked=asked))
-    [chord] = [check for check in found if check.name == CHORD]
+    [chord] = [check for check in found if check.id == "mesh-chord"]
     assert chord.value > 1e-6 and chord.passed is not fails
     [said] = re.findall(r"no mesh has over \d+ triangles, which come within some (.*) mm; allow", chord.where) or [None]
     assert (said is not None) is (fails and most == 10)
@@ -362,14 +302,9 @@ def test_a_mesh_too_coarse_fails_unless_nobody_asked_for_a_finer_one_than_there_
 # ---- the design ----------------------------------------------------------------------------------------------------
 
 
-def other_net(nominal, by):
-    heights = nominal.lens.back.heights.clone()
-    heights[16, 16] += by
-    return replace(nominal, lens=replace(nominal.lens, back=replace(nominal.lens.back, heights=heights)))
-
-
-def other_front(nominal, **changes):
-    return replace(nominal, lens=replace(nominal.lens, front=replace(nominal.lens.front, **changes)))
+def other_front(nominal):
+    front = replace(nominal.lens.front, curvature=0.002 + 1e-9)
+    return replace(nominal, lens=replace(nominal.lens, front=front))
 
 
 def other_limits(nominal, **changes):
@@ -384,18 +319,18 @@ def narrower_screen(nominal, right=10.0):
 
 
 DESIGNS = {
-    "the target by 1 %": (lambda n: replace(n, stored=(1.01 * n.goals[0].picture,)), {TARGET}),
-    "a height by 1 nm": (lambda n: other_net(n, 1e-6), {NET, NORMALS}),
-    "a height by 1 µm": (lambda n: other_net(n, 1e-3), {NET, NORMALS, BACK}),
-    "the front's curvature by 1e-9": (lambda n: other_front(n, curvature=0.002 + 1e-9), {CURVATURE}),
-    "the front by 10 nm": (lambda n: other_front(n, z=15.0 + 1e-5), {VERTEX, ON_WALL}),
-    "RRMSD asked for: 1e-6": (lambda n: other_limits(n, rrmsd=1e-6), {RRMSD}),
-    "thickness asked for: 9.9 mm": (lambda n: replace(n, blank=replace_model(n.blank, min_thickness=9.9)), {THICKNESS}),
-    "light beside the screen": (narrower_screen, {EFFICIENCY}),
+    "the target by 1 %": (lambda n: replace(n, stored=(1.01 * n.goals[0].picture,)), {"target"}),
+    "the front's curvature by 1e-9": (other_front, {"front-curvature"}),
+    "RRMSD asked for: 1e-6": (lambda n: other_limits(n, rrmsd=1e-6), {"rrmsd"}),
+    "thickness asked for: 9.9 mm": (
+        lambda n: replace(n, blank=replace_model(n.blank, min_thickness=9.9)),
+        {"thickness"},
+    ),
+    "light beside the screen": (narrower_screen, {"efficiency"}),
     "most of the light beside the screen": (
-        lambda n: narrower_screen(other_limits(n, light_on_target=0.5), -5.0), {EFFICIENCY, LIGHT},
+        lambda n: narrower_screen(other_limits(n, light_on_target=0.5), -5.0),
+        {"efficiency", "light-on-target"},
     ),  # fmt: skip
-    "light asked for: all": (lambda n: other_limits(n, light_on_target=1.0), {LIGHT}),
 }
 
 
@@ -406,22 +341,22 @@ def test_another_design_or_tolerance_fails_by_name(folder, nominal, change):
 
 
 def test_a_ripple_fails_a_lens_by_what_the_light_feels_of_it(nominal):
-    """The slope of the control points is stated; 1 nm of noise on the design passes, 10 µm fail by the RRMSD."""
+    """The slope of the control points is stated; 1 nm of noise on the design passes, 10 µm fail by the "rrmsd"."""
     back, noise = nominal.lens.back, np.random.default_rng(0).normal(size=nominal.lens.back.shape)
     slopes = []
     for height, fails in ((1e-6, False), (1e-2, True)):
         lens = replace(nominal.lens, back=replace(back, heights=back.heights + height * torch.from_numpy(noise)))
         light = measure.measure(lens, nominal.channels, nominal.goals[0].receiver, nominal.goals[0].picture, effort=FEW)
-        found = {c.name: c.passed for c in checks._of_light(light, nominal.accept)}
-        assert found[RRMSD] is not fails
+        found = {c.id: c.passed for c in checks._of_light(light, nominal.accept)}
+        assert found["rrmsd"] is not fails
         shape_of = shape.describe(lens) | checks._ripples_in_light(lens, nominal)
         (stated,) = checks._of_ripple(shape_of)
-        assert stated.name == RIPPLE and stated.passed and stated.limit is None
+        assert stated.id == "ripple" and stated.passed and stated.limit is None
         slopes.append(stated.value)
     assert slopes[1] > 1e-4 and shape_of["ripple_rrmsd"] > nominal.accept.rrmsd
 
 
-NOISES = [  # RRMSD, its standard error, accept.rrmsd, does the noise pass?
+NOISES = [  # "rrmsd", its standard error, accept.rrmsd, does the noise pass?
     (0.05, 0.009, 0.06, True),  # resolved: more than five times its standard error
     (0.05, 0.011, 0.06, False),  # neither resolved nor five standard errors below the limit
     (0.01, 0.009, 0.06, True),  # not resolved, but five standard errors below the limit
@@ -436,20 +371,20 @@ NOISES = [  # RRMSD, its standard error, accept.rrmsd, does the noise pass?
 def test_noise_fails_where_neither_figure_nor_verdict_is_sure(rrmsd, error, asked, passes):
     flux = {"on target": 1.0, "off target": 0.0, "missed the lens": 0.0}
     light = Light(np.ones((2, 2)), rrmsd, error, rays=1, flux=flux)
-    (noise,) = (check for check in checks._of_light(light, Accept(rrmsd=asked)) if check.name == NOISE)
+    (noise,) = (check for check in checks._of_light(light, Accept(rrmsd=asked)) if check.id == "noise")
     assert noise.passed is passes and noise.value == 5 * error
 
 
 def test_a_scene_that_asks_for_nothing_is_judged_by_no_limit_on_the_light(folder, nominal):
-    """30 % of RRMSD and a fifth of the light pass where nobody asked for more; a limit of either fails by name."""
+    """30 % of "rrmsd" and a fifth of the light pass where nobody asked for more; a limit of either fails by name."""
     board = (-1.0) ** np.add.outer(np.arange(12), np.arange(16))
     target = nominal.goals[0].picture * (1 + 0.3 * board)
     poor = with_picture(other_limits(nominal, rrmsd=None), target)
     proof = checks.verify(folder, poor)
-    limits = {check.name: check.limit for check in proof.checks}
+    limits = {check.id: check.limit for check in proof.checks}
     assert 0.25 < proof.light.rrmsd < 0.5 and failing(proof) == set()
-    assert (limits[RRMSD], limits[LIGHT], limits[NOISE]) == (None, None, None)
-    assert failing(checks.verify(folder, other_limits(poor, rrmsd=0.25))) == {RRMSD}
+    assert (limits["rrmsd"], limits["light-on-target"], limits["noise"]) == (None, None, None)
+    assert failing(checks.verify(folder, other_limits(poor, rrmsd=0.25))) == {"rrmsd"}
     assert failing(checks.verify(folder, other_limits(poor, rrmsd=0.5))) == set()
 
 
@@ -464,24 +399,13 @@ def test_light_that_is_unaccounted_for_fails(folder, nominal, monkeypatch):
         return replace(found, flux=found.flux | {"missed the lens": found.flux["missed the lens"] - 1e-9})
 
     monkeypatch.setattr(measure, "simulate", leaky)
-    assert failing(checks.verify(folder, nominal)) == {LEDGER}
+    assert failing(checks.verify(folder, nominal)) == {"ledger"}
 
 
 def test_values_that_are_not_finite_fail(folder, nominal, monkeypatch):
     margins = checks.margins
     monkeypatch.setattr(checks, "margins", lambda *what: replace(margins(*what), non_finite=1))
-    assert failing(checks.verify(folder, nominal)) == {FINITE}
-
-
-def test_noise_that_might_lift_the_rrmsd_above_its_limit_fails(folder, nominal):
-    """Two rays a pixel in each set, and a target that is the lens's own light."""
-    [goal] = nominal.goals
-    own = measure.measure(nominal.lens, nominal.channels, goal.receiver, goal.picture, Effort(1024)).picture
-    exact = with_picture(nominal, own)
-    proof = checks.verify(folder, exact, effort=replace(FEW, rays=32))
-    assert 5 * proof.light.standard_error > proof.light.rrmsd and NOISE not in failing(proof)  # 0.2 is far away
-    strict = other_limits(exact, rrmsd=proof.light.rrmsd + 4 * proof.light.standard_error)
-    assert failing(checks.verify(folder, strict, effort=replace(FEW, rays=32))) >= {NOISE}
+    assert failing(checks.verify(folder, nominal)) == {"finite"}
 
 
 def test_rays_that_do_not_see_what_the_tubes_see_fail(folder, nominal, monkeypatch):
@@ -493,9 +417,9 @@ def test_rays_that_do_not_see_what_the_tubes_see_fail(folder, nominal, monkeypat
         return replace(found, box=found.box + 0.33 * (found.box.roll(1, 0) - found.box))
 
     effort = replace(FEW, rays=512)
-    assert AGREE not in failing(checks.verify(folder, nominal, effort=effort))
+    assert "tubes" not in failing(checks.verify(folder, nominal, effort=effort))
     monkeypatch.setattr(measure, "simulate", moved)
-    assert AGREE in failing(checks.verify(folder, nominal, effort=effort))
+    assert "tubes" in failing(checks.verify(folder, nominal, effort=effort))
 
 
 def test_the_rays_are_none_that_tailoring_saw(folder, nominal, monkeypatch):
@@ -512,12 +436,11 @@ def test_the_rays_are_none_that_tailoring_saw(folder, nominal, monkeypatch):
 
 
 def test_every_judged_check_is_seen_to_fail_above(folder, nominal):
-    seen = {"solid valid", FINITE, LEDGER, NOISE, AGREE}
-    seen |= {TEXT + "one solid, in millimetres", TEXT + "degree 2 x 2, multiplicities 3, 1, …, 1, 3"}
-    seen = seen.union(*STLS.values(), *(names for _, names in (*STEP.values(), *DESIGNS.values()))) - {LIGHT}
-    judged = {check.name for check in checks.verify(folder, nominal).checks if check.limit is not None}
-    assert seen <= judged
-    assert all(re.match(f"{TEXT}(stated|material|density)", name) for name in judged - seen)  # test_stated_checks
+    seen = {"solid-valid", "finite", "ledger", "noise", "tubes", "one-solid", "degree"}
+    seen = seen.union(*STLS.values(), *(ids for _, ids in (*STEP.values(), *DESIGNS.values()))) - {"light-on-target"}
+    judged = {check.id for check in checks.verify(folder, nominal).checks if check.limit is not None}
+    stated = {"stated-measures", "stated-centroid", "stated-values", "stated-density", "material", "profile-face"}
+    assert seen <= judged <= seen | stated  # those of the statements fail in test_stated_checks.py
 
 
 # ---- a check by itself, a file by itself ---------------------------------------------------------------------------
@@ -539,14 +462,12 @@ def test_a_limit_counts_as_kept():
 @pytest.mark.parametrize(
     ("alter", "name"),
     [
-        (turned_edge, EDGES),
-        (lambda t: moved_knot(t, 1e-13), KNOTS),
-        (lambda t: moved_vertex(t, 1e-6), GAPS),
-        (lambda t: moved_sphere(t, 15.0), THICKNESS),
+        (turned_edge, "edges-twice"),
+        (lambda t: moved_sphere(t, 15.0), "thickness"),
     ],
-    ids=["edge", "knot", "corner", "crossing faces"],
+    ids=["edge", "crossing faces"],
 )
 def test_a_step_file_by_itself_can_fail(folder, few, alter, name):
     path = folder / "lens.step"
     path.write_text(alter(path.read_text()))
-    assert name in {check.name for check in checks.examine(path).checks if not check.passed}
+    assert name in {check.id for check in checks.examine(path).checks if not check.passed}

@@ -6,14 +6,13 @@ import math
 from types import SimpleNamespace
 
 import pytest
-import torch
 
 from bstcad.analysis.shape import describe, survey
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane
 from bstcad.verify.checks import of_bounds
+from tests.lenses import net
 
 A, B, M = 0.05, -0.02, 65  # z = (A x² + B y²) / 2 (1/mm): curved by A and B on the axis, where it is level
 KEYS = ("tool_radius", "max_slope", "min_thickness", "max_thickness", "edge_thickness")
@@ -21,10 +20,8 @@ NONE = dict.fromkeys(KEYS) | {"mould": False}
 
 
 def saddle(outline):
-    line = torch.linspace(-4.0, 4.0, M, dtype=torch.float64)
-    pitch = 8.0 / (M - 1)
-    heights = (A * line[:, None] ** 2 + B * line**2) / 2 - (A + B) * pitch**2 / 8  # a quadratic's control points
-    return Lens(Plane(0.0), BSplineSurface(3.0, heights, (-4.0, 4.0), (-4.0, 4.0)), outline, 1.5)
+    lower = (A + B) * (8.0 / (M - 1)) ** 2 / 8  # mm: control points of a quadratic lie below it
+    return Lens(Plane(0.0), net(lambda x, y: (A * x**2 + B * y**2) / 2 - lower, 3.0, M, 4.0), outline, 1.5)
 
 
 def judged(**asked):

@@ -77,27 +77,22 @@ def test_what_is_sent_is_the_part_by_its_digest_volume_mass_and_size(written, de
 
 @pytest.mark.parametrize("harm, words", [
     ("missing", "generate the design again"),
-    ("half", "truncated"),
     ("bent", "control point"),
     ("lighter", "the file states 9"),
-    ("turned", "edge at ("),
     ("steeper", "edge at ("),
 ])  # fmt: skip
 def test_a_part_that_is_not_the_design_s_fails_by_name(written, design, tmp_path, harm, words):
     scene, folder, _ = written
     text = (folder / "part.step").read_text()
-    if harm == "half":
-        (tmp_path / "part.step").write_text(text[: len(text) // 2])
-    elif harm == "bent":
+    if harm == "bent":
         bent = design.lens.back.control_points()
         bent[5, 7, 2] += 1e-9
         lens = replace(design.lens, back=bstcad.BSplineSurface.from_control_points(bent, design.lens.back.z))
         mounting.write_if_it_fits(lens, scene.mount, tmp_path / "part.step", "bent", scene.part)
     elif harm == "lighter":
         (tmp_path / "part.step").write_text(re.sub(r"(?<=VOLUME_MEASURE\()\s*[-+.E\d]+", "900.0", text))
-    elif harm != "missing":  # a part of another mount: of the same measures, or with walls that hardly differ
-        change = {"turned": {"screws": MOUNT["flange"]["screws"] | {"first": 1.0}}, "steeper": {"draft": 1.001}}[harm]
-        other = design.scene.changed({"mount": MOUNT | {"flange": MOUNT["flange"] | change}}).mount
+    elif harm == "steeper":  # a part of another mount, with walls that hardly differ
+        other = design.scene.changed({"mount": MOUNT | {"flange": MOUNT["flange"] | {"draft": 1.001}}}).mount
         mounting.write_if_it_fits(design.lens, other, tmp_path / "part.step", "other", scene.part)
     said = scene.part.of(scene.lens)
     failed = [check for check in step_checks.check_part(tmp_path, design.lens, scene.mount, said) if not check.passed]
@@ -147,10 +142,8 @@ ROUNDED = {"shape": "rectangle", "width": 7.0, "height": 5.0, "corner_radius": 1
 
 @pytest.mark.parametrize("mount, outline, plane", [
     ({}, None, True),
-    ({"rim": {"shape": "circle", "diameter": 5.0}}, Circle(2.5), False),
     ({"rim": {"shape": "circle", "diameter": 5.0}, "draft": 3.0, "bevel": 0.2, "datum": "front"}, Circle(2.5), True),
     (MOUNT | {"rim": ROUNDED}, Rectangle(7.0, 5.0), True),
-    ({"draft": 2.0, "bevel": 0.1, "flange": MOUNT["flange"]}, None, False),
 ])  # fmt: skip
 def test_a_part_passes_by_itself(design, tmp_path, mount, outline, plane):
     """Its outline is that of its back, whatever walls are around it; of a bare lens the walls are judged, too."""
