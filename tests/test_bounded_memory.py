@@ -35,13 +35,12 @@ SCENE = {
     "target": {"z": 1000.0, "x": ENDS, "y": ENDS, "pixels": 48, "uniform": True},
     "tailoring": {"quality": "draft", "transport_grid": 32},
 }
-DAILY = [
+CASES = [
     *((light, {"target.tilt": [angle, 0.0]}) for light, angle in (("led", 85.0), ("led", 89.0), ("chip", 88.0))),
     ("sun", {"target.x": [-0.01, 0.01], "target.y": [-0.01, 0.01]}),
     ("led", {"target.z": 1e6, "target.x": [-1.0, 1.0], "target.y": [-1.0, 1.0]}),
     ("point", {"lens.outline": {"shape": "rectangle", "width": 2000.0, "height": 20.0}}),
 ]
-ALL = [(light, {"target.tilt": [angle, 0.0]}) for light in LIGHTS for angle in (80.0, 85.0, 88.0, 89.0, 89.9)]
 MOST = 1 << 30  # bytes beyond the libraries; an image without an end took 21 GB
 PLANS = """
 import json, resource, sys
@@ -62,14 +61,13 @@ for source, scene, changes in json.load(sys.stdin):
 """
 
 
-@pytest.mark.parametrize("cases", [DAILY, pytest.param(ALL, marks=pytest.mark.bench)], ids=["daily", "all"])
-def test_a_plan_keeps_within_its_memory_or_is_refused(cases):
-    given = json.dumps([(LIGHTS[light], SCENE, changes) for light, changes in cases])
+def test_a_plan_keeps_within_its_memory_or_is_refused():
+    given = json.dumps([(LIGHTS[light], SCENE, changes) for light, changes in CASES])
     run = subprocess.run(
         [sys.executable, "-c", PLANS, str(MOST)], input=given, capture_output=True, text=True, timeout=300, check=True
     )
     found = [json.loads(line) for line in run.stdout.splitlines()]
-    assert len(found) == len(cases)
+    assert len(found) == len(CASES)
     assert all(key in said for said in found if isinstance(said, str) for key in [": ", "; "])  # what, and what to do
 
 

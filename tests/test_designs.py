@@ -19,7 +19,7 @@ from bstcad import commands
 from bstcad.optics.measure import Effort
 from bstcad.optics.trace import trace
 from bstcad.optics.tubes import rays_to
-from bstcad.runs import files, progress
+from bstcad.runs import files
 from bstcad.step_text import part21
 from bstcad.tolerance import tolerancing as tolerances
 from bstcad.transport.mapping import nodes
@@ -78,11 +78,6 @@ class TestDesign:
         with pytest.raises(bstcad.SceneError, match=r"lens\.back\.z: the lens is -74 mm thick"):
             bstcad.design(wrong)
 
-    def test_plumbing_is_not_in_the_signature(self):
-        import inspect
-
-        assert list(inspect.signature(bstcad.design).parameters) == ["scene", "progress", "device", "merit"]
-
 
 def bumped(lens, by=2e-4):
     """The lens with a gentle wave on its back (mm)."""
@@ -139,27 +134,15 @@ class TestOwnSurfaces:
             lambda d: d.with_lens(replace(d.lens, outline=bstcad.Circle(3.0))),
             "outline is Circle.*the scene's is Rectangle",
         ),
-        (lambda d: d.with_lens(replace(d.lens, index=1.6)), "index is 1.6, and the scene's is 1.49"),
-        (
-            lambda d: d.with_lens(replace(d.lens, reflects=True)),
-            "way of light is by a mirror's back, and the scene's is by a lens's front, back",
-        ),
         (
             lambda d: d.with_lens(net(d, x=(-3.0, 4.0))),
             r"net along x \(mm\) is \(-3.0, 4.0\), and the scene's is \(-4\.571\d+, 4\.571\d+\); give that",
         ),
-        (
-            lambda d: d.with_lens(net(d, heights=torch.zeros(33, 30))),
-            r"net along y \(mm\) is \(-3\.428\d+, 3\.428\d+\), and the scene's is \(-3\.4[78]\d*, 3\.4[78]\d*\)",
-        ),
-        (lambda d: d.with_lens(net(d, heights=torch.zeros(33, 33, 1))), r"heights of shape \(33, 33, 1\)"),
         (lambda d: d.with_heights(torch.full((33, 33), math.nan)), "heights of its back are not finite"),
         (
             lambda d: d.with_heights(np.zeros((33, 32, 1))),
             r"takes \(m, n\) real .*, not numbers of shape \(33, 32, 1\)",
         ),
-        (lambda d: d.with_heights(np.zeros((33, 33), dtype=complex)), r"takes \(m, n\) real numbers"),
-        (lambda d: d.with_heights([[0.0], [1.0, 2.0]]), "real numbers in mm, such as lens.back.heights, not list"),
         (lambda d: d.with_heights(np.zeros((4, 4))), "control_points: 4 is not between 5 and 2049"),
         (lambda d: d.with_lens(replace(d.lens, front=bstcad.Plane(26.0))), "the lens is -1 mm thick at its centre"),
     )
@@ -175,39 +158,17 @@ def net(design, **more):
 
 
 class TestTransport:
-    @pytest.mark.parametrize("method", ["least-squares", "integration"])
-    def test_light_from_there_lands_where_the_map_says(self, small_scene, made, method):
+    def test_light_from_there_lands_where_the_map_says(self, made):
         """The finished lens traced: within a tenth of a pixel of 0.94 mm inside the lit disc."""
-        if method != "least-squares":
-            change = {"tailoring.method": method, "tailoring.stage2_iterations": 0}
-            made = bstcad.design(small_scene.changed(change), progress=False)
         sent, lens, source = made.transport, made.lens, made.scene.source
-        assert sent.plane == {"least-squares": "back", "integration": "entrance"}[method]
+        assert sent.plane == "back"
         assert sent.source.shape == sent.target.shape == (65, 49, 2) and sent.source.dtype == np.float32
         x, y = torch.from_numpy(sent.source.astype(np.float64)).unbind(-1)
-        if sent.plane == "back":
-            x, y, _ = rays_to(source, lens, x, y)
+        x, y, _ = rays_to(source, lens, x, y)
         landed = trace(source.rays(x, y, lens.entrance.z, 1.0), lens, made.scene.target.screen.plane)
         off = np.linalg.norm(np.stack(landed.position[:2], axis=-1) - sent.target, axis=-1)
         inside = np.linalg.norm(sent.target, axis=-1) < 18
         assert np.percentile(off[inside], 95) < 0.1 and sent.target[inside].std() > 5
-
-    def test_between_neighbours_there_is_the_light_that_the_target_wants(self, made):
-        """Flux of the source through each quadrilateral of the back, by the ray through its middle."""
-        sent, lens, source = made.transport, made.lens, made.scene.source
-        corners = sent.source.astype(np.float64)
-        one, other = corners[1:, 1:] - corners[:-1, :-1], corners[:-1, 1:] - corners[1:, :-1]
-        area = np.abs(one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0]) / 2
-        middle = (corners[1:, 1:] + corners[:-1, :-1] + corners[:-1, 1:] + corners[1:, :-1]) / 4
-        q_x, q_y, _ = rays_to(source, lens, *torch.from_numpy(middle).unbind(-1))
-        step = 1e-4
-        moved = [rays_to(source, lens, *torch.from_numpy(middle + step * np.eye(2)[i]).unbind(-1))[:2] for i in (0, 1)]
-        (xx, yx), (xy, yy) = (((a - q_x) / step, (b - q_y) / step) for a, b in moved)
-        flux = (source.irradiance(q_x, q_y, lens.entrance.z) * (xx * yy - xy * yx).abs()).numpy() * area
-        wanted = made.target[::-1].T
-        inside = np.hypot(*np.meshgrid(sent.x[1:] - 0.5, sent.y[1:] - 0.5, indexing="ij")) < 18
-        share = flux[inside] / flux[inside].sum() / (wanted[inside] / wanted[inside].sum())
-        assert np.abs(share - 1).mean() < 0.05
 
     def test_it_comes_back_with_its_folder(self, made, folder):
         kept = bstcad.open(folder)
@@ -232,18 +193,18 @@ class TestTransport:
 
 
 class TestLeak:
-    def test_light_in_the_dark_is_told_and_held_to_what_is_asked(self, small_scene, quick):
-        """A letter on black."""
-        change = {"target.uniform": None, "target.outline": None, "target.text": "L", "accept.rrmsd": 0.9}
-        made, passed = bstcad.design(small_scene.changed(change), progress=False), {}
+    def test_light_in_the_dark_is_told_and_held_to_what_is_asked(self, made, quick):
+        """The lens of a disc of 20 mm, held to one of 15 mm; the picture is smoothed, the leak is not."""
+        small = {"target.outline": {"shape": "circle", "radius": 15.0}, "accept.rrmsd": 9.0}
+        passed = {}
         for asked in (None, 1e-9):
-            scene = made.scene.changed({"accept.leak": asked})
-            report = bstcad.Design(replace(made._made, scene=scene)).verify(progress=False)
-            dark = made.target == 0
+            scene = made.scene.changed(small | {"accept.leak": asked})
+            report = bstcad.Design(replace(made._made, scene=scene, goals=scene.goals)).verify(progress=False)
+            dark = scene.target.irradiance() == 0
             share = report.irradiance[dark].sum() / report.irradiance.sum()
-            assert report.leak == report.facts["leak"] == pytest.approx(share) and 1e-9 < share < 0.05
+            assert report.leak == report.facts["leak"] == pytest.approx(share, rel=1e-4) and 0.3 < share < 0.5
             lit = report.irradiance[~dark].mean()
-            assert report.contrast == pytest.approx(lit / report.irradiance[dark].mean())
+            assert report.contrast == pytest.approx(lit / report.irradiance[dark].mean(), rel=1e-4)
             [check] = [check for check in report.checks if "target is dark" in check.name]
             assert (check.value, check.limit) == (report.leak, asked)
             passed[asked] = report.passed
@@ -251,22 +212,6 @@ class TestLeak:
 
 
 class TestWrite:
-    def test_the_folder_is_the_command_lines(self, fresh, small_design, quick, tmp_path):
-        report = fresh.write(tmp_path / "out", progress=False)
-        assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
-        assert [path.name for path in tmp_path.iterdir()] == ["out"]
-        for name in ("lens.stl", "scene.toml"):  # the others tell the time
-            assert (tmp_path / "out" / name).read_bytes() == (small_design.folder / name).read_bytes()
-        ours, theirs = arrays(tmp_path / "out"), arrays(small_design.folder)
-        assert ours.keys() == theirs.keys() and all(np.array_equal(ours[name], theirs[name]) for name in ours)
-        one, other = (
-            json.loads((place / "report.json").read_text()) for place in (tmp_path / "out", small_design.folder)
-        )
-        assert one.keys() == other.keys() and one["rrmsd"] == other["rrmsd"]
-        assert [s["name"] for s in one["stages"]] == [s["name"] for s in other["stages"]]
-        assert sum(s["seconds"] for s in one["stages"]) <= one["seconds_total"]
-        assert fresh.report is report and fresh.folder == tmp_path / "out"
-
     def test_files_that_are_not_a_design_s_stay(self, fresh, tmp_path):
         (tmp_path / "letter.txt").write_text("dear")
         with pytest.raises(bstcad.SceneError, match="holds files that are not a design's; give a new folder"):
@@ -327,7 +272,7 @@ class TestVerify:
         assert json.loads((folder / "report.json").read_text())["passed"] is False
         assert "failed: STEP text: every edge used twice, once each way" in repr(opened.report)
 
-    @pytest.mark.parametrize("other", ["control_points", "front_curvature", "target"])
+    @pytest.mark.parametrize("other", ["control_points", "target"])
     def test_the_files_of_another_design_are_not_taken_for_its_own(self, fresh, folder, quick, other):
         opened = bstcad.open(folder)
         kept = arrays(folder)
@@ -335,18 +280,12 @@ class TestVerify:
             text = (folder / "scene.toml").read_text()
             (folder / "scene.toml").write_text(text.replace("radius = 20.0", "radius = 19.0"))
         else:
-            kept[other] = kept[other] + 1e-9
+            kept["control_points"] += 1e-9
         np.savez_compressed(folder / "design.npz", **kept)
         before = (folder / "report.json").read_bytes()
         with pytest.raises(bstcad.SceneError, match="holds another design by now"):
             opened.verify(progress=False)
         assert (folder / "report.json").read_bytes() == before
-
-    def test_files_that_are_gone_are_no_hindrance(self, folder, quick):
-        opened = bstcad.open(folder)
-        shutil.rmtree(folder)
-        found = opened.verify(progress=False, effort=Effort(64, 0, 65, 4096))
-        assert found.flux == pytest.approx(opened.report.flux, abs=1e-3) and not folder.exists()
 
 
 class TestJudged:
@@ -366,11 +305,6 @@ class TestJudged:
             opened.tolerance(wanted=90, progress=False)
         with pytest.raises(bstcad.SceneError, match="give one of the two"):
             opened.tolerance(workers=2, scheduler="tcp://127.0.0.1:9", progress=False)
-
-    def test_it_is_drawn_as_the_command_draws_it(self, folder, monkeypatch, tmp_path):
-        monkeypatch.setattr("bstcad.report.rendering.draw", lambda path, picture: bool(picture.write_bytes(b"drawn")))
-        bstcad.open(folder).show(tmp_path / "light.png")
-        assert (tmp_path / "light.png").read_bytes() == b"drawn"
 
     def test_what_takes_files_says_so(self, fresh):
         for ask in (fresh.tolerance, fresh.show, lambda: fresh.verify(measured="cloud.csv")):
@@ -406,9 +340,11 @@ class TestOpen:
         (tmp_path / "copy" / "stale.txt").write_text("old")
         bstcad.open(folder).write(tmp_path / "copy", progress=False)
         assert {path.name for path in (tmp_path / "copy").iterdir()} == FILES
+        assert {path.name for path in tmp_path.iterdir()} == {"small", "copy"}
         one, other = arrays(folder), arrays(tmp_path / "copy")
         assert all(np.array_equal(one[name], other[name]) for name in one)
-        assert (tmp_path / "copy" / "scene.toml").read_bytes() == (folder / "scene.toml").read_bytes()
+        for name in ("lens.stl", "scene.toml"):  # the others tell the time
+            assert (tmp_path / "copy" / name).read_bytes() == (folder / name).read_bytes()
         ours, theirs = (json.loads((place / "report.json").read_text()) for place in (tmp_path / "copy", folder))
         for key in ("history", "transport", "stopped", "twins", "machine", "passed"):
             assert ours[key] == theirs[key]
@@ -448,16 +384,10 @@ class TestShown:
             assert lines[1] == "  8 x 6 mm of PMMA (index 1.4906), 10 mm thick on the axis, 33 x 33 control points"
             assert re.match(r"  RRMSD 0\.0\d+", lines[2])
 
-    @pytest.mark.parametrize("verified", [False, True])
-    def test_in_a_notebook_with_the_picture(self, fresh, folder, verified):
-        shown = (bstcad.open(folder) if verified else fresh)._repr_html_()
+    def test_in_a_notebook_with_the_picture(self, fresh):
+        shown = fresh._repr_html_()
         assert "A &lt;small&gt; disc" in shown and shown.count("data:image/png;base64,iVBOR") == 1
         assert len(shown) > 10_000 and shown.startswith("<div>") and shown.endswith("</div>")
-
-    def test_the_glance_is_close_to_what_is_verified(self, fresh, folder):
-        glance, proved = fresh._irradiance(), bstcad.open(folder).report.irradiance
-        assert np.linalg.norm(glance - proved) / np.linalg.norm(proved) < 0.02
-        assert glance.sum() == pytest.approx(fresh.target.sum())
 
 
 class TestProgress:
@@ -480,25 +410,3 @@ class TestProgress:
             bstcad.design(scene)
             assert b"stage 1" in os.read(ours, 65536)
         os.close(ours)
-
-    def test_in_a_notebook(self, monkeypatch):
-        """As IPython's display does it: one cell, updated in place."""
-        updates = []
-        handle = types.SimpleNamespace(update=lambda data, raw: updates.append(data["text/html"]))
-        with progress.cells(lambda *given, **more: handle, clock=iter(range(1000)).__next__) as report:
-            report("stage 1", 1, 2, "RRMSD <0.5>")
-            report("stage 1", 2, 2, "RRMSD 0.25")
-            report("stage 2", 0, 0, "")
-        assert updates[0].count("<tr>") == 1 and 'value="1"' in updates[0] and "RRMSD &lt;0.5&gt;" in updates[0]
-        assert updates[-1].count("<tr>") == 2 and "RRMSD 0.25" in updates[-1]
-
-    def test_a_notebook_is_known_by_its_kernel(self, monkeypatch):
-        fake = types.ModuleType("IPython")
-        fake.get_ipython = lambda: types.SimpleNamespace(kernel=None)
-        shown = types.ModuleType("IPython.display")
-        shown.display = print
-        monkeypatch.setitem(sys.modules, "IPython", fake)
-        monkeypatch.setitem(sys.modules, "IPython.display", shown)
-        assert progress._notebook() is print
-        fake.get_ipython = lambda: types.SimpleNamespace()  # IPython in a terminal
-        assert progress._notebook() is None

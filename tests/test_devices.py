@@ -39,15 +39,8 @@ QUALITIES = {
 }
 SAME = {"draft": 1e-6, "paper": 1e-4}  # of the relief: where stage 1's solvers end; a few steps of Adam in float32
 
-# Designs of two kinds, besides the mirror and the paper's procedure below; the others are run by `make bench`.
-QUICK = {"beam_shaper": ("draft",), "machinable_letters": ("draft",)}
-LOSSES = {
-    "portrait": [
-        {"kind": "fresnel", "coating": {"index": 1.38, "thickness": 100.0}},
-        {"kind": "absorption", "coefficient": 1e-2},
-    ],
-    "mirror": [{"kind": "fresnel", "metal": "Al", "polarisation": "s"}],
-}
+# A design besides the mirror and the paper's procedure below; the others are run by `make bench`.
+QUICK = ("beam_shaper", "draft")
 
 
 @pytest.fixture(autouse=True)
@@ -68,7 +61,7 @@ def scene(template, quality):
     [
         pytest.param(
             template, quality, id=f"{template.stem}-{quality}",
-            marks=() if quality in QUICK.get(template.stem, ()) else pytest.mark.bench,
+            marks=() if (template.stem, quality) == QUICK else pytest.mark.bench,
         )
         for template in TEMPLATES
         for quality in QUALITIES
@@ -80,10 +73,10 @@ def test_a_design_mixes_no_devices_and_finds_the_lens_of_the_cpu(template, quali
     held_to_the_cpu(scene(template, quality), quality)
 
 
-@pytest.mark.parametrize("template", [pytest.param("portrait", marks=pytest.mark.bench), "mirror"])
-def test_so_does_one_for_a_tilted_target_that_loses_light_on_the_way(template):
-    wanted = scene(TEMPLATES[0].with_name(f"{template}.toml"), "draft")
-    wanted = wanted.changed({"target.tilt": [20.0, -35.0], "effects": LOSSES[template]})
+def test_so_does_one_for_a_tilted_target_that_loses_light_on_the_way():
+    metal = {"kind": "fresnel", "metal": "Al", "polarisation": "s"}
+    wanted = scene(TEMPLATES[0].with_name("mirror.toml"), "draft")
+    wanted = wanted.changed({"target.tilt": [20.0, -35.0], "effects": [metal]})
     held_to_the_cpu(wanted, "draft")
     same_merit_and_gradient(wanted)
 
@@ -103,7 +96,7 @@ def held_to_the_cpu(wanted, quality):
             assert off <= SAME[quality] * relief
 
 
-OF_A_KIND = ("disk", "led", "machinable_letters", "mirror", "portrait", "white_logo")  # the others are beams like these
+OF_A_KIND = ("led", "white_logo")  # a source of some size and a spectrum; beams and a mirror are designed above
 
 
 @pytest.mark.parametrize(
@@ -198,16 +191,12 @@ def test_a_kernel_of_the_gpu_is_an_entry_of_the_table(monkeypatch):
 
 MIXES = {  # what CUDA refuses
     "a sum": lambda gpu, cpu: gpu + cpu,
-    "a number that is on the GPU": lambda gpu, cpu: gpu.sum() * cpu,
     "a CPU tensor made of a number of the GPU": lambda gpu, cpu: torch.ones_like(cpu) * gpu[0],
     "a mask": lambda gpu, cpu: torch.where(cpu > 0, gpu, gpu),
     "a stack": lambda gpu, cpu: torch.stack([gpu, cpu]),
-    "a stack of numbers": lambda gpu, cpu: torch.stack([gpu[0], cpu[0]]),
     "an index": lambda gpu, cpu: cpu[gpu > 0],
-    "an index of a result": lambda gpu, cpu: cpu[(gpu * 2).long() * 0],
     "an assignment to places": lambda gpu, cpu: gpu.__setitem__(gpu > 0, cpu),
     "numpy": lambda gpu, cpu: gpu.numpy(),
-    "numpy of a view": lambda gpu, cpu: gpu.detach()[1:].numpy(),
     "numpy's own functions": lambda gpu, cpu: np.asarray(gpu),
     "a product in place": lambda gpu, cpu: cpu.mul_(gpu),
     "a gradient": lambda gpu, cpu: torch.autograd.grad((gpu.requires_grad_() ** 2).sum(), gpu)[0] + cpu,
@@ -216,9 +205,7 @@ PERMITTED = {
     "a number of Python": lambda gpu, cpu: gpu + 1.0,
     "a number that is on the CPU": lambda gpu, cpu: gpu * cpu.sum(),
     "what is made like it": lambda gpu, cpu: gpu + torch.zeros_like(gpu) + gpu.new_ones(3),
-    "by the device of another": lambda gpu, cpu: gpu + torch.arange(3, device=gpu.device),
     "moved": lambda gpu, cpu: (gpu + cpu.to(gpu) + cpu.to("cuda"), cpu + gpu.cpu() + gpu.to(cpu)),
-    "moved and of another precision": lambda gpu, cpu: gpu + cpu.to(dtype=torch.float64, device="cuda"),
     "an index of the CPU": lambda gpu, cpu: gpu[cpu > 0],
     "a copy": lambda gpu, cpu: cpu.copy_(gpu),
     "a read": lambda gpu, cpu: (float(gpu.sum()), gpu.tolist(), bool((gpu > 0).any()), gpu.cpu().numpy()),

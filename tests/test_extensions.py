@@ -15,7 +15,6 @@ import bstcad
 from bstcad import pipeline
 from bstcad.cad import mesh, patches
 from bstcad.judges import faces, mitsuba
-from bstcad.judges.faces import Traced
 from bstcad.optics.emitters import Emitter, all_alive
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Rectangle
@@ -25,7 +24,7 @@ from bstcad.optics.surfaces import sag
 from bstcad.report import record
 from bstcad.report.data_sheet import Sheet
 from bstcad.report.figure_jobs import light_path_of
-from bstcad.report.light_figures import View, cross_section
+from bstcad.report.light_figures import View
 from bstcad.report.units import about
 from bstcad.scene.errors import SceneError
 from bstcad.scene.target import Target
@@ -126,25 +125,6 @@ class OnCylinder(Target):
     @property
     def screen(self):
         return replace(super().screen, surface=Cylinder(self.z))
-
-
-def test_light_is_collected_by_a_receiver_of_its_own(scene, tmp_path, monkeypatch):
-    """Even light on a wall around the lens: by design, proof and report; without the lens it is far from even."""
-    draws_nothing(monkeypatch)
-    asked = scene.changed({"target.z": 200.0, "target.x": [-150.0, 150.0], "target.y": [-60.0, 60.0],
-                           "target.outline": None, "target.pixels": [60, 24], "accept.rrmsd": 0.1})  # fmt: skip
-    around = asked.model_copy(update={"targets": (OnCylinder(**dict(asked.target)),)})
-    design = bstcad.design(around, progress=False)
-    screen = around.target.screen
-    flat = bstcad.measure(around.flat_lens(33), around.channels(), screen, around.target.irradiance())
-    assert flat.rrmsd > 0.3
-    report = design.write(tmp_path / "around", progress=False, effort=quick_effort())
-    assert report.passed and report.rrmsd < 0.05, report
-    on_level = bstcad.measure(design.lens, around.channels(), asked.target.screen, around.target.irradiance())
-    assert on_level.rrmsd > 4 * report.rrmsd
-    picture = around.target.irradiance()
-    along_s, along_y = cross_section(picture, picture, View.of(around)).axes[:2]
-    assert (along_s.get_xlabel(), along_y.get_xlabel()) == ("s (mm)", "y (mm)") and "(s = " in along_y.get_title("left")
 
 
 def test_a_receiver_of_its_own_is_refused_where_it_cannot_be(scene):
@@ -367,65 +347,6 @@ def test_checks_and_sections_of_a_script_join_verdict_and_page(design, monkeypat
     assert f"<h2>Light budget</h2>\n<p id='budget'>{report.light_on_target:.3f}</p>" in page
     assert json.loads((design.folder / "report.json").read_text())["verdict"] == "failed"
     assert design.verify(progress=False, effort=quick_effort()).passed
-
-
-class Own:
-    """A judge that traces by bstcad itself; `wrong` is a fault that the comparison has to find."""
-
-    name, version = "our own", "1"
-
-    def __init__(self, wrong):
-        self.wrong = wrong
-
-    def cannot(self, lens, channels):
-        return ""
-
-    def light(self, lens, channels):
-        return channels
-
-    def trace(self, lens, channels, screen, rays, seed):
-        halves = []
-        for half in (0, 1):
-            effort = bstcad.Effort(rays=256, seed=seed + 1000 * half, accuracy=0.0, witness=False)
-            light = bstcad.measure(lens, channels, screen, np.ones(screen.shape) / np.prod(screen.shape), effort)
-            picture = light.picture * light.flux["on target"] / light.picture.sum()
-            halves.append(np.fliplr(picture) * np.linspace(0.5, 1.5, screen.columns) if self.wrong else picture)
-        error = type("Error", (), {"height": 0.0, "slope": 0.0, "shift": lambda self, lens, raster: 0.0})()
-        return Traced(np.stack(halves), 16 * 256**2, error)
-
-
-@pytest.mark.parametrize("wrong", [False, True])
-def test_a_judge_of_a_script_is_heard(design, wrong, monkeypatch):
-    draws_nothing(monkeypatch)
-    report = design.verify(against=[Own(wrong)], progress=False, effort=quick_effort())
-    [judge] = report.judges
-    assert judge.name == "our own" and judge.agrees is (not wrong) and report.passed is (not wrong)
-
-
-def test_the_picture_of_tubes_has_the_gradient_of_its_differences(design):
-    lens, channels, screen = design.lens, design.scene.channels(), design.scene.target.screen
-    target = torch.from_numpy(design.target)
-    tubes = bstcad.RayTubes.launched(lens, channels, 97)  # odd: no tube ends at x = 0, as pixels do
-
-    def merit(heights):
-        picture = tubes.picture(lens.with_heights([heights]), screen)
-        return (picture / picture.sum() - target).square().sum() / target.square().sum()
-
-    heights = lens.back.heights.clone().requires_grad_()
-    merit(heights).backward()
-    along = torch.randn(heights.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    step = 1e-7  # mm
-    with torch.no_grad():
-        difference = (merit(heights + step * along) - merit(heights - step * along)) / (2 * step)
-    assert float((heights.grad * along).sum()) == pytest.approx(float(difference), rel=1e-6)
-
-
-def test_the_picture_is_upright_for_the_side_that_the_scene_names(design):
-    seen = design.picture()
-    behind = bstcad.Design(replace(design._made, scene=design.scene.changed({"target.seen_from": "behind"})))
-    assert seen.dtype == np.uint8 and seen.shape == design.target.shape
-    glance = bstcad.Design(design._made).picture()
-    assert np.array_equal(behind.picture(), glance[:, ::-1])
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,14 +10,13 @@ import pytest
 import torch
 
 import bstcad
-from bstcad import commands, pipeline
+from bstcad import commands
 from bstcad.cad import step_reading
 from bstcad.folder import read_nominal
 from bstcad.optics.outlines import Circle
 from bstcad.optics.surfaces import Toroid, sag
 from bstcad.scene.scene import load
 from bstcad.tolerance import perturbations
-from bstcad.verify import step_checks
 from tests.conftest import draws_nothing, quick_effort
 
 
@@ -124,16 +122,6 @@ def test_the_given_front_is_in_every_file(behind_another, small_design):
     assert "freeform" in (behind_another.folder / "prescription.txt").read_text()
 
 
-def test_its_step_file_stands_alone(behind_another, tmp_path):
-    """Checked without the design, and as a front itself."""
-    found = step_checks.examine(behind_another.folder / "lens.step")
-    lens = found.lens
-    assert all(check.passed for check in found.checks) and lens.front.m == 33
-    assert any("control points of the front" in check.name for check in found.checks)
-    again = behind_another.scene.changed({"lens.front.file": str(behind_another.folder / "lens.step")})
-    assert np.ptp(again.lens.front.surface.control_points()[..., 2] - lens.back.control_points()[..., 2]) < 1e-12
-
-
 def test_it_reads_back_to_the_last_bit_without_the_earlier_design(behind_another):
     """From its own copy of the net."""
     scene, nominal = read_nominal(behind_another.folder)
@@ -141,26 +129,6 @@ def test_it_reads_back_to_the_last_bit_without_the_earlier_design(behind_another
     assert torch.equal(nominal.lens.front.heights, behind_another.scene.lens.front.surface.heights)
     again = bstcad.open(behind_another.folder)
     assert again.lens.front.z == 15.0 and again.solid().isValid()
-
-
-@pytest.mark.bench
-def test_a_given_front_keeps_its_digits_whatever_precision_tailors(behind_another):
-    quick = {"tailoring.precision": "float32", "tailoring.rays": 48, "tailoring.stage2_iterations": 2}
-    scene = behind_another.scene.changed(quick | {"tailoring.rounds": 2, "target.pixels": 16})
-    lens = pipeline.design(scene, device="cpu").lens
-    assert torch.equal(lens.front.heights, scene.lens.front.surface.heights)
-    assert lens.front.heights.dtype == lens.back.heights.dtype == torch.float64
-
-
-def test_a_front_of_the_file_that_is_another_fails(behind_another):
-    """The same design with its front a nanometre higher in one control point of the middle."""
-    _, nominal = read_nominal(behind_another.folder)
-    heights = nominal.lens.front.heights.clone()
-    heights[16, 16] += 1e-6
-    other = replace(nominal.lens, front=replace(nominal.lens.front, heights=heights))
-    checks = step_checks.check(behind_another.folder / "lens.step", other, 1e-6, 1024)
-    failed = {check.name for check in checks if not check.passed}
-    assert any("control points of the front" in name for name in failed)
 
 
 def test_both_numbers_of_the_conic_are_found(conic):
@@ -198,10 +166,3 @@ def test_a_toroid_is_read_again_to_the_last_bit_and_its_sheets_have_both_radii(t
     text = (toroid.folder / "prescription.txt").read_text()
     for words in ("radius in x", repr(1 / 0.006), "radius in y", "-250 mm", "curvature in y", "within 10⁻⁶ mm"):
         assert words in text
-
-
-def test_another_toroid_than_that_of_the_design_fails(toroid):
-    other = toroid.scene.changed({"lens.front.curvature_y": -0.00401}).lens
-    _, nominal = read_nominal(toroid.folder)
-    checks = step_checks.check(toroid.folder / "lens.step", nominal.lens.with_front(other.front_surface), 1e-6, 1024)
-    assert "front-net" in {check.id for check in checks if not check.passed}

@@ -1,23 +1,25 @@
-"""A scene with a ghost: designed, written, proved; its share and its picture in the report."""
+"""A scene with a ghost: written, proved; its share and its picture in the report."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
+import bstcad
 from bstcad import commands
 from bstcad.cli import run
 from bstcad.folder import read_irradiances
 from bstcad.report.figure_jobs import NoPictures
-from tests.conftest import pictures, proofs, quick_effort, verify_with
+from tests.conftest import pictures, proofs, quick_effort
 
 
 @pytest.fixture(scope="module")
-def design(small_scene, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("ghost") / "small"
-    scene = small_scene.changed({"effects": [{"kind": "ghost"}]})
-    with pytest.MonkeyPatch.context() as patch:
-        verify_with(patch, quick_effort())
-        return scene, folder, commands.generate(scene, folder, device="cpu", drawing=pictures("light")).facts
+def design(small_design, tmp_path_factory):
+    """(scene, folder, report) of the small design with a ghost."""
+    folder, made = tmp_path_factory.mktemp("ghost") / "small", bstcad.open(small_design.folder)._made
+    scene = made.scene.changed({"effects": [{"kind": "ghost"}]})
+    made = replace(made, scene=scene)
+    return scene, folder, commands.write(made, folder, effort=quick_effort(), drawing=pictures("light")).facts
 
 
 def test_the_ledger_has_a_line_for_it_and_closes(design):

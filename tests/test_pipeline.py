@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from bstcad import pipeline
-from bstcad.analysis.shape import describe
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.scene import scene
@@ -19,7 +18,7 @@ SMALL = {
     "tailoring.stage2_iterations": "40",
 }  # fmt: skip
 FINER = {"portrait": {"lens.back.control_points": "37"}}  # 32 spans under the lens, besides four past its rim
-RECORDED = {"disk": 0.06, "thu": 0.30, "portrait": 0.18}  # RRMSD that the small designs reach, with some to spare
+RECORDED = {"thu": 0.30, "portrait": 0.18}  # RRMSD that the small designs reach, with some to spare
 
 
 def small(name, **more):
@@ -61,13 +60,6 @@ def test_a_template_becomes_a_lens(name):
     assert lens_solid(found.lens).isValid()
 
 
-def test_nothing_in_it_is_random():
-    """Tubes need no seed; the paper's procedure does."""
-    few = {"tailoring.rays": "64", "tailoring.rounds": "2", "tailoring.stage2_iterations": "3"}
-    one, other = (pipeline.design(small("disk", **few, **{"tailoring.seed": seed})) for seed in "01")
-    assert torch.equal(other.lens.back.heights, one.lens.back.heights)
-
-
 def test_float32_is_compared_when_a_report_asks_for_it():
     """The lens is the same, and what the report tells in the end, too."""
     few = {"tailoring.rays": "64", "tailoring.rounds": "2", "tailoring.stage2_iterations": "3"}
@@ -81,8 +73,8 @@ def test_float32_is_compared_when_a_report_asks_for_it():
 
 
 def test_float32_comes_close_to_float64():
-    value, _ = judged(pipeline.design(small("disk", **{"tailoring.precision": "float32"})))
-    assert value == pytest.approx(judged(designed("disk")[0])[0], rel=0.3)
+    value, _ = judged(pipeline.design(small("thu", **{"tailoring.precision": "float32"})))
+    assert value == pytest.approx(judged(designed("thu")[0])[0], rel=0.3)
 
 
 def test_max_time_that_is_over_gives_the_best_so_far():
@@ -107,47 +99,11 @@ def test_a_device_that_is_not_there_is_refused(device, sentence, monkeypatch):
         pipeline.design(small("disk"), device=device)
 
 
-def test_a_picture_of_unequal_sides_and_a_round_lens():
-    found = pipeline.design(
-        small("thu", **{"lens.outline": '{ shape = "circle", diameter = 26.0 }', "target.y": "[100.0, 300.0]"})
-    )
-    value, efficiency = judged(found)
-    assert value < 0.4 and efficiency > 0.95
-    assert lens_solid(found.lens).isValid()
-
-
-CROSSING = {"lens.front.z": "19.0"}
-
-
-def test_a_back_that_would_cross_the_front_is_moved_clear_of_it():
-    found = pipeline.design(small("thu", **CROSSING))
-    assert describe(found.lens)["thickness_min"] >= 0.5 and found.lens.back.z > 23.0
-    assert judged(found)[0] < RECORDED["thu"]
-
-
-@pytest.mark.parametrize(
-    ("more", "sentence"),
-    [
-        (
-            {"target.z": "24.0", "target.x": "[-8.0, 12.0]", "target.y": "[-8.0, 12.0]"},
-            r"^target\.z: the back that this target needs would reach it, at z = \d\d\.\d",
-        ),
-        (
-            {"tailoring.quality": "paper", "tailoring.stage1_iterations": "400", "tailoring.rays": "64"},
-            r"^lens\.front\.z: .* cross the front by .* mm; lower the front",
-        ),
-        ({"target.x": "[3000.0, 3100.0]"}, r"^target: no light reaches it: .* less than 47\.\d degrees"),
-    ],
-    ids=("near target", "the paper's way", "out of reach"),
-)
-def test_a_lens_that_there_is_no_room_for_is_refused(more, sentence):
-    with pytest.raises(SceneError, match=sentence):
-        pipeline.design(small("thu", **CROSSING | more))
-
-
-def test_a_back_that_would_reach_the_target_is_refused():
+def test_a_back_that_would_reach_the_front_or_the_target_is_refused():
     near = small("thu", **{"target.z": "24.0"})
     lens = near.flat_lens(near.lens.back.net)
+    with pytest.raises(SceneError, match=r"^lens\.front\.z: .* cross the front by 0\.5 mm; lower the front"):
+        pipeline.check_thickness(lens.with_back(lens.back.moved(lens.front.z - 0.5)), near)
     with pytest.raises(SceneError, match=r"^target\.z: .* reach it, at z = 24\.5; move the target further"):
         pipeline.check_thickness(lens.with_back(lens.back.moved(24.5)), near)
     pipeline.check_thickness(lens.with_back(lens.back.moved(23.5)), near)

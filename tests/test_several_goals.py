@@ -7,14 +7,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from PIL import Image
 
 import bstcad
 from bstcad import commands
 from bstcad.judges import comparison
 from bstcad.judges.faces import FaceError, Traced
 from bstcad.optics.surfaces import sag
-from bstcad.report import rendering
 from bstcad.report.figure_jobs import NoPictures
 from tests.conftest import flat_pictures, quick_effort
 from tests.two_faces import made_of, scene_of
@@ -48,19 +46,6 @@ def test_rays_go_to_the_furthest_target_and_light_each_picture_on_their_way(two)
         inside = (across > 0) & (across < 1) & (up > 0) & (up < 1)
         row, column = ((1 - up[inside]) * rows).astype(int), (across[inside] * columns).astype(int)
         assert inside.mean() > 0.8 and (picture[row, column] > 60).mean() > 0.95
-
-
-@pytest.mark.bench  # two pictures by VTK
-def test_both_screens_are_drawn(two, tmp_path):
-    """The view without the further one is another."""
-    both = tmp_path / "both.png"
-    path = commands.light_path_in(two.folder)
-    if not rendering.draw(path, both):
-        pytest.skip("this machine cannot draw in 3-D")
-    alone = tmp_path / "alone.png"
-    assert rendering.draw(replace(path, screens=path.screens[:1], pictures=path.pictures[:1]), alone)
-    pictures = [np.asarray(Image.open(name).convert("RGB")).astype(int) for name in (both, alone)]
-    assert (np.abs(pictures[0] - pictures[1]).max(axis=2) > 30).mean() > 0.002
 
 
 # ---- pictures in Python ----------------------------------------------------------------------------------------------
