@@ -1,6 +1,5 @@
 """The end of known curves, errors in known places, cells of a plate over pixels."""
 
-
 import numpy as np
 import pytest
 

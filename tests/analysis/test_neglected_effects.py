@@ -5,11 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from bstcad.analysis import neglected_effects
 from bstcad.analysis.neglected_effects import Reference, Spline, blurred, difference, zoomed
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
@@ -18,6 +16,7 @@ from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Plane
+from tests.lenses import tilted
 
 INDEX, THICKNESS = 1.5, 4.0
 SMOOTH = 100.0  # pixels that a control cell lights
@@ -26,11 +25,9 @@ LAMP = Point((0.0, 0.0, -50.0), profile="uniform", half_angle=4.0)
 SCREEN = Screen(1000.0, (-8.0, 8.0), (-6.0, 6.0), (64, 48))
 
 
-def plate(slope=0.0, m=9):
+def plate(slope=0.0):
     """Two planes, of which the back rises by `slope` along x: a prism, which sends light towards +x."""
-    u = torch.linspace(-6.0, 6.0, m, dtype=torch.float64)
-    back = BSplineSurface(THICKNESS, (slope * u)[:, None].repeat(1, m), (-6.0, 6.0), (-6.0, 6.0))
-    return Lens(Plane(0.0), back, Rectangle(12.0, 12.0), INDEX)
+    return Lens(Plane(0.0), tilted(slope, THICKNESS, 6.0), Rectangle(12.0, 12.0), INDEX)
 
 
 def checks(period=8):

@@ -16,6 +16,7 @@ from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
+from tests.lenses import half_over, net
 
 M = 65
 SQUARE, DISC, PLATE = Rectangle(20.0, 20.0), Circle(10.0), Plane(8.0)
@@ -29,12 +30,11 @@ def lens_of(sag, outline=DISC, front=PLATE, z=20.0) -> Lens:
 
     Control heights (-1 10 -1)/8 of the samples, each way: exact for a parabola, and no end span disturbs the next.
     """
-    reach = (M - 1) / (M - 5) if outline.is_round else 1.0
-    (half_x, half_y), place = (reach * half for half in outline.half_extent), np.arange(-1, M + 1) * 2 / (M - 1) - 1
-    f = sag(half_x * place[:, None], half_y * place[None, :])
+    half, place = half_over(outline, M), np.arange(-1, M + 1) * 2 / (M - 1) - 1
+    f = sag(half[0] * place[:, None], half[1] * place[None, :])
     f = (10 * f[1:-1] - f[:-2] - f[2:]) / 8
     heights = torch.from_numpy((10 * f[:, 1:-1] - f[:, :-2] - f[:, 2:]) / 8)
-    return Lens(front, BSplineSurface(z, heights, (-half_x, half_x), (-half_y, half_y)), outline, 1.5)
+    return Lens(front, net(heights, z, half=half), outline, 1.5)
 
 
 def cap(radius, sign=1.0):
@@ -121,9 +121,7 @@ def test_the_slope_energy_of_a_mode_lies_in_its_octave():
         heights = torch.from_numpy(np.cos(k * place)[:, None] * np.cos(3 * place))
         energy = slope_octaves(BSplineSurface(20.0, heights, (-10.0, 10.0), (-10.0, 10.0)))
         assert energy[octave] > 0.98 * energy.sum(), k
-    x = torch.linspace(-1, 1, M, dtype=torch.float64)
-    tilted = BSplineSurface(20.0, 0.3 * x[:, None] - x, (-10.0, 10.0), (-10.0, 10.0))
-    assert slope_octaves(tilted).sum() < 1e-24
+    assert slope_octaves(net(lambda x, y: 0.03 * x - 0.1 * y, m=M)).sum() < 1e-24
 
 
 @pytest.mark.parametrize("k", [(50, 20), (40, 45), (10, 40)])
@@ -207,8 +205,8 @@ class TestSurvey:
 
     def test_the_slope_of_the_rim_counts(self):
         """z = x² / 2 R over a round lens is steepest at two points of its rim, between the places of the grid."""
-        line = torch.linspace(-self.HALF, self.HALF, self.M, dtype=torch.float64)
-        slope = survey(self.rough(Circle(4.37), (line[:, None] ** 2 / 40.0).expand(self.M, self.M).contiguous())).slope
+        heights = net(lambda x, y: x**2 / 40.0, m=self.M, half=self.HALF).heights
+        slope = survey(self.rough(Circle(4.37), heights)).slope
         assert slope.largest == pytest.approx(math.degrees(math.atan(4.37 / 20.0)), rel=1e-9)
         assert re.match(r"at \(-?4.37, ", slope.where)
 

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
 from bstcad.analysis.steepness import LIMIT, needed
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
 from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Recess, Sphere
+from tests.lenses import net
 
 N, HEIGHT, FAR, PIXELS = 1.5, 15.0, 1e7, 40
 HALF = 18.0  # mm, of the places on the flat back: up to 50 degrees along x, 60 in the corners
 LENS = Lens(
     Recess(Sphere(12.0, -1 / 12), Circle(11.0)),
-    BSplineSurface(HEIGHT, torch.zeros((9, 9), dtype=torch.float64), (-60.0, 60.0), (-60.0, 60.0)), Circle(28.0), N,
+    net(z=HEIGHT, half=60.0), Circle(28.0), N,
 )  # fmt: skip
 EVEN = np.ones((PIXELS, PIXELS))
 

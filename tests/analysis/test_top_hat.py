@@ -31,17 +31,6 @@ def test_a_disc_is_flat_even_and_upright():
     assert found.average == pytest.approx(7.0) and found.efficiency is None
 
 
-def test_a_disc_in_shares_of_pixels_is_as_steep_as_its_rim_of_pixels():
-    """Of 2 π R / h rim pixels, times 4 / π by their orientation, those are lit to more than ε but not than η."""
-    fine = (np.arange(8 * PIXELS) + 0.5) * PITCH / 8 - HALF
-    share = (np.hypot(fine, fine[:, None]) < RADIUS).reshape(PIXELS, 8, PIXELS, 8).mean((1, 3))
-    rim = ((share > 0.1) & (share <= 0.9)).sum() * PITCH**2
-    found = numbers(share)
-    assert found.edge_steepness == pytest.approx(rim / (found.clip_level_area + rim), rel=1e-12)
-    assert 0.5 < rim / (2 * math.pi * RADIUS * PITCH) < 4 / math.pi
-    assert found.flatness > 0.999
-
-
 @pytest.mark.parametrize("eta", [0.9, 0.5])
 def test_a_gaussian(eta):
     """A_η = π w² / 2 ln 1/η, f_η = 1 - η, E_η = (1 - η) / ln 1/η, U_η² = (1 + η) ln 1/η / (2 (1 - η)) - 1."""
@@ -58,7 +47,7 @@ def test_a_gaussian(eta):
     assert found.plateau_uniformity > 0.99  # no plateau
 
 
-@pytest.mark.parametrize("order", [4, 10, 24])
+@pytest.mark.parametrize("order", [4, 24])
 def test_a_super_gaussian(order):
     """exp(-2 (r / w)^p): A_η = π w² (ln(1/η) / 2)^(2/p), f_η = P(2 / p, ln 1/η), the incomplete gamma function."""
     w, eta, epsilon = 2.0, 0.9, 0.1
@@ -74,7 +63,7 @@ def test_a_super_gaussian(order):
     assert found.plateau_uniformity < 0.06
 
 
-@pytest.mark.parametrize("noise", [0.003, 0.03, 0.1])
+@pytest.mark.parametrize("noise", [0.003, 0.1])
 def test_noise_is_the_uniformity_and_its_full_width_the_plateau_uniformity(noise):
     """σ, and 2 sqrt(2 ln 2) σ; E_max grows by less than 2 σ, where the brightest pixel grows by 4.5."""
     normal = np.random.default_rng(0).standard_normal(R.shape)
@@ -105,14 +94,6 @@ def test_efficiency_is_the_share_of_the_light_inside_the_outline():
     inside = DISC.sum()
     assert found.efficiency == pytest.approx(0.9 * 1.01 * inside / (inside + 0.01 * DISC.size), rel=1e-12)
     assert replace(found, efficiency=None) == numbers(DISC + 0.01)
-
-
-def test_the_scale_and_the_pixels_proportions_do_not_matter():
-    narrow = top_hat(DISC[:, ::2], (2 * PITCH, PITCH))
-    assert narrow.clip_level_area == pytest.approx(numbers(DISC).clip_level_area, rel=1e-3)
-    one, other = (numbers(scale * np.exp(-2 * (R / 2) ** 6)) for scale in (1.0, 1e-9))
-    for name in ("flatness", "uniformity", "plateau_uniformity", "edge_steepness", "fractional_power"):
-        assert getattr(one, name) == pytest.approx(getattr(other, name), rel=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ from bstcad import pipeline
 from bstcad.baselines import integration
 from bstcad.baselines.integration import FINE, fit_heights, march
 from bstcad.optics import sampling
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import Reflect, Refract, deflect, intersect
 from bstcad.optics.lens import Lens
@@ -23,6 +22,7 @@ from bstcad.scene import scene
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring import stage1
 from bstcad.tailoring.run import Driver, Task
+from tests.lenses import net
 
 WIDE, LEVEL = Rectangle(40.0, 40.0), LevelPlane(900.0)
 TILTED = TiltedPlane((40.0, -9.0, 900.0), (35.0, -50.0))
@@ -48,8 +48,8 @@ class Known:
         x, y = torch.meshgrid(line, line, indexing="ij")
         if self.front is None:
             return self.source.rays(x, y, self.face.z, 1.0)
-        flat = BSplineSurface(self.face.z, torch.zeros((5, 5), dtype=torch.float64), (-9.0, 9.0), (-9.0, 9.0))
-        return to_first_net(self.source.rays(x, y, self.front.z, 1.0), Lens(self.front, flat, WIDE, self.law.n_in))
+        lens = Lens(self.front, net(z=self.face.z), WIDE, self.law.n_in)
+        return to_first_net(self.source.rays(x, y, self.front.z, 1.0), lens)
 
     def aims(self, coming):
         """Where the face sends them (2, n, n) mm, and where they meet it."""
@@ -131,17 +131,12 @@ def test_a_middle_ray_that_is_lost_is_said():
         march(replace(coming, status=status), torch.zeros((2, 9, 9)).double(), LEVEL, LENS, 20.0)
 
 
-def flat(m):
-    """A net of 20 x 20 mm."""
-    return BSplineSurface(20.0, torch.zeros((m, m), dtype=torch.float64), (-10.0, 10.0), (-10.0, 10.0))
-
-
 def test_the_net_is_as_near_to_points_as_splines_of_third_order_are():
     x, y = (p.reshape(-1) for p in sampling.grid(Rectangle(20.0, 20.0), 199))
     wave, inner = 0.2 * torch.sin(0.4 * x) * torch.cos(0.3 * y), torch.maximum(x.abs(), y.abs()) < 8.0
 
     def error(m):
-        sag, _, _ = fit_heights(flat(m), x, y, wave, *FINE).relative_sag_and_slope(x, y)
+        sag, _, _ = fit_heights(net(m=m), x, y, wave, *FINE).relative_sag_and_slope(x, y)
         return float((sag - wave)[inner].abs().max())
 
     assert error(65) < error(33) / 6 and error(65) < 1e-5  # mm

@@ -67,7 +67,7 @@ def lean_of(face, places=9):
 
 @pytest.mark.parametrize(
     "front, rim",
-    [*((front, rim) for front in ("plane", "convex") for rim in RIMS), ("concave", "rectangle"),
+    [("plane", "circle"), ("plane", "rounded"), ("convex", "circle"), ("concave", "rectangle"),
      ("nearly flat", "rounded"), ("conic", "rectangle"), ("freeform", "rounded")],
 )  # fmt: skip
 def test_it_is_a_closed_solid_whose_walls_lean_by_the_draft(front, rim, tmp_path):
@@ -132,13 +132,12 @@ PEANUT = (cq.Workplane("XY").moveTo(WAIST[0], -WAIST[1]).threePointArc((3.6, 0),
           .threePointArc((0, 1.5 - np.sqrt(3.1**2 - 4)), (WAIST[0], -WAIST[1])).close().wires().val())  # fmt: skip
 
 
-@pytest.mark.parametrize("front", ["plane", "concave"])
 @pytest.mark.parametrize(
     "rim", [SLOT, BEAN.close().wires().val(), KITE, PEANUT], ids=["slot", "bean", "kite", "peanut"]
 )
-def test_the_rim_may_be_any_smooth_wire_and_any_polygon(front, rim, tmp_path):
+def test_the_rim_may_be_any_smooth_wire_and_any_polygon(rim, tmp_path):
     """Walls on a spline are ruled; they, too, lean by the draft, below a straight corner's mitre as beside it."""
-    solid, names = named_solid(plate(front), rim, draft=LEAN)
+    solid, names = named_solid(plate("concave"), rim, draft=LEAN)
     assert solid.isValid() and worst_gap(solid, 33) < 1e-7
     step_writing.write(solid, tmp_path / "lean.step", "lean", faces=names)
     text = part21.read_lens(tmp_path / "lean.step")

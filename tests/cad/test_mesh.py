@@ -13,13 +13,12 @@ import trimesh
 
 from bstcad.cad import mesh
 from bstcad.cad.mesh import Mesh, chordal_error, is_closed, lens_mesh, volume_and_area
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere, sag
 from bstcad.verify.checks import VERTEX_ROUNDING
-from tests.cad.facets import deviation
 from tests.exact_volume import exact_volume
+from tests.lenses import lens_of, net
 
 RECTANGLE, CIRCLE = Rectangle(24.0, 20.0), Circle(12.0)
 OUTLINES = pytest.mark.parametrize("outline", [RECTANGLE, CIRCLE], ids=lambda o: o.shape)
@@ -28,11 +27,6 @@ FRONTS = pytest.mark.parametrize("front", [Plane(8.0), Sphere(8.0, 0.02), Sphere
 
 def by_trimesh(made):
     return trimesh.Trimesh(made.vertices, made.faces, process=False)
-
-
-def flat_lens(front, outline, half):
-    """A lens with a plane back, for errors that are known from the front or the rim alone."""
-    return Lens(front, BSplineSurface(20.0, torch.zeros(9, 9), (-half, half), (-half, half)), outline, 1.5)
 
 
 @OUTLINES
@@ -67,28 +61,11 @@ def test_the_grid_is_as_fine_as_its_tolerance_requires_and_no_finer(make_lens, o
         assert abs(volume - exact_volume(lens)) <= area * tolerance
 
 
-SMALL = [(Plane(8.0), Rectangle(4.0, 3.0)), (Sphere(8.0, -0.03), Circle(2.0))]
-
-
-@pytest.mark.parametrize("front, outline", SMALL, ids=["rectangle", "circle"])
-def test_facets_of_the_file_lie_as_near_as_was_asked_wherever_one_looks(make_lens, tmp_path, front, outline):
-    lens = make_lens(front, outline, m=9)
-    for asked in (1e-2, 1e-3, 1e-4):  # mm
-        cells, made = mesh.fitting(lens, asked)
-        mesh.write_stl(made, tmp_path / "lens.stl")
-        again = mesh.read_stl(tmp_path / "lens.stl")
-        assert is_closed(again)
-        found = deviation(again, lens, 500_000)
-        assert found <= asked and (found > 0.5 * asked or cells == mesh.COARSEST)
-        assert found <= 1.02 * chordal_error(again, lens)  # which looks at few places of each facet
-
-
 @pytest.mark.parametrize("sense", [1, -1])
 def test_cells_are_cut_along_a_ridge(sense):
     """A cylinder of curvature c at 45 degrees: cut over it, facets are off by c h²/4, along it by c h²/16 at edges."""
-    c, x = 0.01, torch.linspace(-10.0, 10.0, 65, dtype=torch.float64)
-    heights = c / 4 * (x[:, None] - sense * x[None, :]) ** 2
-    lens = Lens(Plane(8.0), BSplineSurface(20.0, heights, (-10.0, 10.0), (-10.0, 10.0)), Rectangle(20.0, 20.0), 1.5)
+    c = 0.01
+    lens = lens_of(net(lambda x, y: c / 4 * (x - sense * y) ** 2, m=65), Plane(8.0))
     across = 20.0 / 32
     assert chordal_error(lens_mesh(lens, 32), lens) < 1.1 * c * across**2 / 16
 
@@ -107,9 +84,8 @@ def test_what_so_many_triangles_cannot_do_is_not_tried(make_lens, monkeypatch):
 
 def test_facets_larger_than_what_they_have_to_follow_are_seen_to_miss_it():
     """A net that goes up and down from point to point by 1 µm, under facets of eight spans."""
-    ripple = 5e-4 * (-1.0) ** np.add.outer(np.arange(129), np.zeros(129))
-    back = BSplineSurface(20.0, torch.from_numpy(ripple), (-10.0, 10.0), (-10.0, 10.0))
-    lens = Lens(Plane(8.0), back, Rectangle(20.0, 20.0), 1.5)
+    ripple = 5e-4 * (-1.0) ** torch.arange(129)
+    lens = lens_of(net(ripple[:, None].expand(129, 129).double()), Plane(8.0))
     heights = lens.back.sag_and_slope(*(torch.linspace(-10, 10, 50_000, dtype=torch.float64),) * 2)[0]
     swing = float(heights.max() - heights.min())
     error = chordal_error(lens_mesh(lens, 16), lens)
@@ -119,10 +95,10 @@ def test_facets_larger_than_what_they_have_to_follow_are_seen_to_miss_it():
 
 def test_the_chordal_error_of_a_sphere_is_the_sagitta_and_of_a_round_wall_that_of_its_polygon():
     """The worst facet of a sphere is off by c (d/2)² / 2 in the middle of a diagonal d."""
-    lens = flat_lens(Sphere(8.0, 1e-3), Rectangle(20.0, 20.0), 10.0)
+    lens = lens_of(net(), Sphere(8.0, 1e-3))
     sagitta = 1e-3 * ((20.0 / 16) ** 2 / 2) / 2
     assert chordal_error(lens_mesh(lens, 16), lens) == pytest.approx(sagitta, rel=1e-3)
-    lens = flat_lens(Plane(8.0), CIRCLE, 24.0)
+    lens = lens_of(net(half=24.0), Plane(8.0), CIRCLE)
     polygon = 12.0 * (1 - np.cos(np.pi / 64))  # 16 cells: 64 sides
     assert chordal_error(lens_mesh(lens, 16), lens) == pytest.approx(polygon, rel=1e-9)
 
@@ -208,11 +184,6 @@ def test_a_3mf_states_millimetres_the_mesh_a_name_and_a_colour_and_is_the_same_t
     assert item.get("objectid") == thing.get("id") != material.get("id")
     again = trimesh.load(tmp_path / "one.3mf", force="mesh")
     assert again.is_watertight and again.volume == pytest.approx(volume_and_area(made)[0], rel=1e-9)
-
-
-def test_an_odd_grid_is_refused(make_lens):
-    with pytest.raises(ValueError, match="even number"):
-        lens_mesh(make_lens(), 15)
 
 
 def test_corners_that_are_made_to_collide_are_welded_all_the_same(tmp_path):

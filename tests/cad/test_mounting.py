@@ -111,8 +111,7 @@ def test_a_flange_s_bevels_are_at_45_degrees_whatever_its_walls_lean(outline, dr
     assert plate.Volume() == pytest.approx(simpson.sum(), rel=1e-9)
 
 
-@pytest.mark.parametrize("draft", [0.0, 1.0])
-@pytest.mark.parametrize("bevel", [0.0, 0.2])
+@pytest.mark.parametrize(("draft", "bevel"), [(0.0, 0.0), (1.0, 0.2)])
 @pytest.mark.parametrize("outline", [Round(shape="circle", diameter=20.0), *(
     Box(shape="rectangle", width=20.0, height=16.0, corner_radius=corner) for corner in (0.0, 2.0)
 )])  # fmt: skip

@@ -15,13 +15,13 @@ from OCP.ShapeAnalysis import ShapeAnalysis_ShapeTolerance
 from bstcad.cad import patches, step_reading, step_writing, walls, wires
 from bstcad.cad.patches import back_patch, conic_net, front_patch
 from bstcad.cad.solid import image, lens_solid
-from bstcad.optics.bspline import BSplineSurface, knots
-from bstcad.optics.lens import Lens
+from bstcad.optics.bspline import knots
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Conic, Plane, Sphere, sag
 from bstcad.step_text import part21
 from tests.cad.test_trimming import occ_volume
 from tests.exact_volume import exact_volume
+from tests.lenses import half_over, lens_of, net
 
 OUTLINES = {"rectangle": Rectangle(24.0, 20.0), "circle": Circle(12.0)}
 CONICS = {
@@ -29,29 +29,20 @@ CONICS = {
     "paraboloid": Conic(8.0, -0.03, -1.0),
     "hyperboloid": Conic(8.0, 0.03, -4.0),
     "oblate": Conic(8.0, -0.025, 1.5),
-    "sphere": Conic(8.0, 0.03, 0.0),
     "long": Conic(8.0, 0.01, -60.0),
     "flat": Conic(8.0, 1e-6, -0.5),
-    "plane": Conic(8.0, 0.0, -0.5),
 }
 
-CURVATURES = (0.0, -1e-9, 3e-5, -5e-5, -0.03, 0.055)  # written as a parabola below about 4e-5
-TURNED = {"level": Plane(8.0), **{f"sphere {c:g}": Sphere(8.0, c) for c in CURVATURES}, **CONICS}
+CURVATURES = (-1e-9, -5e-5, -0.03, 0.055)  # written as a parabola below about 4e-5
+FRONTS = {"level": Plane(8.0), **{f"sphere {c:g}": Sphere(8.0, c) for c in CURVATURES}, **CONICS}
 
 
 def given_net(outline, m=21):
     """A freeform front as an earlier design's back could be, its vertex at z = 8."""
-    half_x, half_y = outline.half_extent
-    if isinstance(outline, Circle):
-        half_x = half_y = outline.radius * (m - 1) / (m - 5)
-    x = torch.linspace(-half_x, half_x, m, dtype=torch.float64)[:, None]
-    y = torch.linspace(-half_y, half_y, m, dtype=torch.float64)[None, :]
-    heights = 0.03 * x + 0.01 * x * y + 0.1 * torch.sin(x / 3) * torch.cos(y / 4)
-    return BSplineSurface(8.0, heights, (-half_x, half_x), (-half_y, half_y)).from_vertex().moved(8.0)
-
-
-def the_front(name, outline):
-    return given_net(outline) if name == "net" else TURNED[name]
+    given = net(
+        lambda x, y: 0.03 * x + 0.01 * x * y + 0.1 * torch.sin(x / 3) * torch.cos(y / 4), 8.0, m, half_over(outline, m)
+    )
+    return given.from_vertex().moved(8.0)
 
 
 @pytest.fixture(params=OUTLINES)
@@ -59,37 +50,22 @@ def outline(request):
     return OUTLINES[request.param]
 
 
-@pytest.fixture(params=[*TURNED, "net"])
-def lens(request, outline, make_lens):
-    return make_lens(the_front(request.param, outline), outline)
-
-
-@pytest.fixture(params=[*TURNED, "net"])
-def any_lens(request, outline, make_lens):
-    return make_lens(the_front(request.param, outline), outline, m=7)
+@pytest.fixture(params=[*FRONTS, "net"])
+def front(request, outline):
+    return given_net(outline) if request.param == "net" else FRONTS[request.param]
 
 
 @pytest.fixture
-def reread(lens, tmp_path):
-    step_writing.write_lens(lens, tmp_path / "lens.step", "lens")
-    return step_reading.read(tmp_path / "lens.step")
-
-
-@pytest.fixture
-def text(reread, tmp_path):
-    """The same file as our own parser reads it."""
-    return part21.read(tmp_path / "lens.step")
+def lens(front, outline, make_lens):
+    return make_lens(front, outline, m=9)
 
 
 @pytest.mark.parametrize("name", CONICS)
 def test_the_patch_of_a_conic_is_the_conic(name, outline):
     """Points that OCC evaluates all over the patch fulfil c r² - 2 h + (1 + k) c h² = 0."""
-    front = CONICS[name]
-    if not front.curvature:
-        return
-    a, b = 8.0, 7.0
-    net, weights = conic_net(front, a, b)
-    surface = patches.bspline_surface(net, np.repeat([-a, a], 3), np.repeat([-b, b], 3), weights)
+    front, (a, b) = CONICS[name], (8.0, 7.0)
+    poles, weights = conic_net(front, a, b)
+    surface = patches.bspline_surface(poles, np.repeat([-a, a], 3), np.repeat([-b, b], 3), weights)
     points = np.array([surface.Value(u, v).Coord() for u in np.linspace(-a, a, 9) for v in np.linspace(-b, b, 9)])
     x, y, h = points[:, 0], points[:, 1], points[:, 2] - front.z
     c = front.curvature
@@ -98,13 +74,13 @@ def test_the_patch_of_a_conic_is_the_conic(name, outline):
     assert np.abs(points[:, 2] - sag(front, x, y)).max() < 1e-13
 
 
-def test_the_solid_is_valid_tight_of_the_lens_s_volume_and_faces_out(any_lens):
-    solid = lens_solid(any_lens)
+def test_the_solid_is_valid_tight_of_the_lens_s_volume_and_faces_out(lens):
+    solid = lens_solid(lens)
     assert solid.isValid() and solid.ShapeType() == "Solid"
-    counts = (6, 12, 8) if isinstance(any_lens.outline, Rectangle) else (4, 6, 4)
+    counts = (6, 12, 8) if isinstance(lens.outline, Rectangle) else (4, 6, 4)
     assert (len(solid.Faces()), len(solid.Edges()), len(solid.Vertices())) == counts
     assert ShapeAnalysis_ShapeTolerance().Tolerance(solid.wrapped, 1) <= 1e-7  # mm, the loosest of all
-    assert occ_volume(solid, 1e-7) == pytest.approx(exact_volume(any_lens), rel=2e-6)  # OCC's own accuracy
+    assert occ_volume(solid, 1e-7) == pytest.approx(exact_volume(lens), rel=2e-6)  # OCC's own accuracy
     for face in solid.Faces():
         u0, u1, v0, v1 = face._uvBounds()
         normal, point = face.normalAt((u0 + u1) / 2, (v0 + v1) / 2)
@@ -112,12 +88,12 @@ def test_the_solid_is_valid_tight_of_the_lens_s_volume_and_faces_out(any_lens):
         assert solid.isInside(inside) and not solid.isInside(outside)
 
 
-def test_the_borders_lie_on_the_front(any_lens):
+def test_the_borders_lie_on_the_front(lens):
     """In space and by way of the patch, at the same parameter."""
-    front, patch = any_lens.front, front_patch(any_lens)
+    front, patch = lens.front, front_patch(lens)
     far = 3e-10 if isinstance(front, Sphere) else 0.0  # mm; PARABOLA, and the digits of a far centre
-    near = walls.RIM if front.is_net and any_lens.outline.is_round else 1e-11  # mm
-    for curve, edge in zip(*borders(front, any_lens.outline), strict=True):
+    near = walls.RIM if front.is_net and lens.outline.is_round else 1e-11  # mm
+    for curve, edge in zip(*borders(front, lens.outline), strict=True):
         border, uv = BRepAdaptor_Curve(edge), image(patch, curve) if patch.uv else None
         for t in np.linspace(0.0, curve.piece.end, 101).tolist():
             point = np.array(border.Value(t).Coord())
@@ -135,15 +111,26 @@ def borders(surface, outline):
 
 def test_the_borders_of_a_rectangle_s_back_are_the_net_s_own(make_lens):
     lens = make_lens(m=9)
-    net, patch = lens.back.control_points(), back_patch(lens)
-    sides = [net[:, 0], net[-1], net[::-1, -1], net[0, ::-1]]
+    points, patch = lens.back.control_points(), back_patch(lens)
+    sides = [points[:, 0], points[-1], points[::-1, -1], points[0, ::-1]]
     for curve, side in zip(borders(lens.back, lens.outline)[0], sides, strict=True):
         assert np.array_equal(curve.poles, side) and np.array_equal(curve.knots, knots(9))
         ends = image(patch, curve)
         assert (ends.Degree(), ends.NbPoles(), ends.LastParameter()) == (1, 2, 7.0)
 
 
-def test_the_front_is_read_back(lens, reread, text):
+def test_the_file_is_sound_and_the_front_is_read_back(lens, tmp_path):
+    """By OCC and by the reader of the text."""
+    step_writing.write_lens(lens, tmp_path / "lens.step", "lens")
+    reread, text = step_reading.read(tmp_path / "lens.step"), part21.read(tmp_path / "lens.step")
+    faces, edges = (6, 12) if isinstance(lens.outline, Rectangle) else (4, 6)
+    assert text.closed and (text.solids, text.faces, len(text.edge_uses)) == (1, faces, edges)
+    assert (text.unit, text.product) == ("millimetre", "lens") and text.schema.startswith("AP242")
+    assert np.abs(reread.control_points - lens.back.control_points()).max() < 1e-11
+    off_face, off_wall = step_reading.edges_off(reread.shape, lens)
+    assert off_face[0] < 5e-8 and off_wall[0] < 5e-8  # mm
+    whole = step_reading.lens(reread, lens.index)
+    assert whole.outline == lens.outline and exact_volume(whole) == pytest.approx(exact_volume(lens), rel=1e-11)
     front, again = lens.front, reread.front
     assert again.z == pytest.approx(8.0, abs=1e-10 if front.kind == "sphere" else 1e-12)  # of a centre 4e4 mm away
     if front.is_net:
@@ -158,18 +145,6 @@ def test_the_front_is_read_back(lens, reread, text):
     assert effect * abs(again.conic_constant - front.conic_constant) < 1e-11
     x, y = np.random.default_rng(1).uniform(-8.0, 8.0, (2, 200))
     assert np.abs(sag(again, x, y) - sag(front, x, y)).max() < (1e-9 if front.kind == "sphere" else 1e-12)
-
-
-def test_the_file_is_sound(lens, reread, text):
-    faces, edges = (6, 12) if isinstance(lens.outline, Rectangle) else (4, 6)
-    assert text.closed and (text.solids, text.faces, len(text.edge_uses)) == (1, faces, edges)
-    assert (text.unit, text.product) == ("millimetre", "lens") and text.schema.startswith("AP242")
-    assert np.abs(reread.control_points - lens.back.control_points()).max() < 1e-11
-    assert text.surface.control_points.shape == lens.back.control_points().shape
-    off_face, off_wall = step_reading.edges_off(reread.shape, lens)
-    assert off_face[0] < 5e-8 and off_wall[0] < 5e-8  # mm
-    again = step_reading.lens(reread, lens.index)
-    assert again.outline == lens.outline and exact_volume(again) == pytest.approx(exact_volume(lens), rel=1e-11)
 
 
 @pytest.mark.parametrize("front", [Conic(8.0, 0.075, 0.2), Conic(8.0, -0.07, -60.0)])
@@ -235,25 +210,12 @@ def test_a_round_rim_is_exact_in_the_face_and_tight_in_space(make_lens):
             assert rim.Value(t).Distance(q) < 2 * walls.RIM
 
 
-def test_float32_heights_make_the_same_solid_as_their_float64_values(make_lens):
-    lens = make_lens(m=9)
-    single = Lens(lens.front, lens.back.to(torch.float32), lens.outline, lens.index)
-    same = Lens(lens.front, single.back.to(torch.float64), lens.outline, lens.index)
-    assert exact_volume(single) == exact_volume(same)
-    assert lens_solid(single).isValid()
-
-
-def of_net(*ends):
-    back = BSplineSurface(20.0, torch.zeros(17, 17), *((-end, end) for end in ends))
-    return Lens(Plane(8.0), back, Circle(12.0), 1.5)
-
-
 def test_a_lens_that_cannot_be_is_refused_in_one_sentence(make_lens):
     for lens, words in (
         (make_lens(Plane(19.0)), "move the front down"),
         (make_lens(Sphere(0.0, -0.08)), "ends inside the lens's rim"),
-        (of_net(12.0, 12.0), "two spans past the rim"),
-        (of_net(20.0, 24.0), "square net"),
+        (lens_of(net(half=12.0), Plane(8.0), Circle(12.0)), "two spans past the rim"),
+        (lens_of(net(half=(20.0, 24.0)), Plane(8.0), Circle(12.0)), "square net"),
     ):
         with pytest.raises(ValueError, match=words):
             lens_solid(lens)

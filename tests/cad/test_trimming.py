@@ -17,22 +17,22 @@ from OCP.TopTools import TopTools_IndexedMapOfShape
 
 from bstcad.cad import step_writing
 from bstcad.cad.solid import lens_solid
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Conic, Plane, Sphere, sag
 from bstcad.step_text import part21
 from tests.exact_volume import exact_volume
+from tests.lenses import net, rough
 
 HOLES = [(2.0, 1.5, 0.8), (-2.2, 1.0, 0.5), (0.3, -2.0, 1.1)]  # x, y, diameter (mm)
 
 
 def waves(m=17, seed=3, z=4.0, half=(5.0, 4.0)):
     """A net with relief on the scale of its cells, no symmetry, and as smooth as lenses are."""
-    x, y = np.meshgrid(np.linspace(-1, 1, m), np.linspace(-1, 1, m), indexing="ij")
-    noise = np.random.default_rng(seed).normal(0, 1e-3, (m, m))
-    heights = 0.3 * np.sin(3 * x + 0.5) * np.cos(2 * y) + 0.1 * x * y + noise
-    return BSplineSurface(z, torch.from_numpy(heights), (-half[0], half[0]), (-half[1], half[1]))
+    (a, b), noise = half, rough(1e-3, seed, m=m).heights
+    return net(
+        lambda x, y: 0.3 * torch.sin(3 * x / a + 0.5) * torch.cos(2 * y / b) + 0.1 * x / a * y / b + noise, z, m, half
+    )
 
 
 FRONTS = {
@@ -133,7 +133,7 @@ def test_without_wires_it_is_the_lens_itself():
 
 def test_a_wire_of_one_closed_edge():
     """An ellipse of the half axes 3 and 2 mm, whose area says how much of a plate it cuts out."""
-    flat = replace(plate(), back=replace(waves(), heights=torch.zeros(17, 17, dtype=torch.float64)))
+    flat = replace(plate(), back=net(z=4.0, half=(5.0, 4.0)))
     ellipse = cq.Workplane("XY").ellipse(3, 2).wires().val()
     solid = lens_solid(flat, ellipse, [cq.Workplane("XY").ellipse(0.5, 0.4).wires().val()])
     assert solid.isValid() and worst_gap(solid) < 1e-7
@@ -156,13 +156,6 @@ def rectangle(width, height, x=0.0, y=0.0):
 
 def polygon(*places):
     return cq.Wire.makePolygon([cq.Vector(x, y, 0) for x, y in places], close=True)
-
-
-def test_a_wire_may_come_as_a_closed_edge_or_a_workplane_and_a_hole_as_a_list():
-    wire = cq.Workplane("XY").circle(2.0)
-    volumes = [lens_solid(plate(), trim, [[0.5, 0.0, 1.0]]).Volume() for trim in (
-        wire, wire.val(), cq.Edge.makeCircle(2.0))]  # fmt: skip
-    assert volumes == pytest.approx([occ_volume(lens_solid(plate(), wire.val(), [(0.5, 0.0, 1.0)]))] * 3, rel=1e-4)
 
 
 FAULT, OPEN, NO_WIRE = "trim or holes: {} near .*; draw each", "a wire is open", "where one closed wire is needed"

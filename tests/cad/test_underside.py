@@ -15,12 +15,12 @@ from bstcad.cad import mesh, solid_properties, step_reading, step_writing
 from bstcad.cad.mounting import part_of
 from bstcad.cad.solid import lens_solid, named_solid
 from bstcad.optics import quadrature
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Conic, Recess, Sphere
 from bstcad.scene.mount import Flange, Mount, Round
 from bstcad.verify import step_checks
+from tests.lenses import half_over, net
 
 RADIUS, EDGE = 12.0, 10.5
 OUTLINES = {"round": Circle(25.0), "oblong": Rectangle(50.0, 30.0)}
@@ -33,16 +33,12 @@ FRONTS = {
 
 
 def lens(front="dome", outline="round"):
-    x = torch.linspace(-1, 1, 33, dtype=torch.float64)
-    heights = -3 * (x[:, None] ** 2 + x[None, :] ** 2) + 0.2 * torch.sin(5 * x)[:, None]
-    ends = [(-half * 32 / 28, half * 32 / 28) for half in OUTLINES[outline].half_extent]
-    if outline == "oblong":
-        ends = [(-25.0, 25.0), (-15.0, 15.0)]
-    return Lens(FRONTS[front], BSplineSurface(22.0, heights, *ends), OUTLINES[outline], 1.5)
+    a, b = half = half_over(OUTLINES[outline], 33)
+    back = net(lambda x, y: -3 * ((x / a) ** 2 + (y / b) ** 2) + 0.2 * torch.sin(5 * x / a), 22.0, 33, half)
+    return Lens(FRONTS[front], back, OUTLINES[outline], 1.5)
 
 
-@pytest.mark.parametrize("outline", OUTLINES)
-@pytest.mark.parametrize("front", FRONTS)
+@pytest.mark.parametrize(("front", "outline"), [*((front, "round") for front in FRONTS), ("dome", "oblong")])
 def test_the_step_file_holds_the_lens_exactly(front, outline, tmp_path):
     made, path = lens(front, outline), tmp_path / "lens.step"
     step_writing.write_lens(made, path, "lens")
@@ -88,11 +84,6 @@ def test_the_mesh_is_closed_and_as_near_as_asked(front):
     assert len(mesh.lens_mesh(made, mesh.finest(made, 20_000)).faces) <= 20_000
 
 
-def test_a_mesh_of_another_front_is_not_near():
-    _, found = mesh.fitting(lens(), 2e-3)
-    assert mesh.chordal_error(found, replace(lens(), front=Recess(FRONTS["dome"].face, Circle(9.0)))) > 0.1
-
-
 def test_the_preview_of_a_dome_is_closed_and_shaded_by_its_own_normals():
     found = dict(mesh.preview_files(lens(), mesh.Label("dome")))
     [solid] = trimesh.load(io.BytesIO(found["preview.glb"]), file_type="glb").geometry.values()
@@ -129,8 +120,3 @@ def test_a_flange_holds_it(z, tmp_path):
     step_writing.write(part.solid, tmp_path / "part.step", "part", faces=part.faces)
     read = step_reading.read(tmp_path / "part.step")
     assert read.front.outline == made.front.outline and read.clear == (made.front.outline, made.outline)
-
-
-def test_draft_and_a_rim_compose_with_it():
-    part = part_of(lens(), Mount(rim=Round(shape="circle", diameter=46.0), draft=3.0, bevel=0.3))
-    assert part.solid.isValid() and "bevel" in part.faces and "underside" in part.faces

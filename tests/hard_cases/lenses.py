@@ -14,14 +14,11 @@ from bstcad.optics import ops, trace
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Rays
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.surfaces import Plane, Sphere
+from tests.lenses import SQUARE, N, bundle, lens_of, places, uniform, wavy  # noqa: F401
 from tests.tracing import from_first_net_plain
 
-N = 1.488
-SQUARE = Rectangle(20.0, 20.0)
 DTYPES = pytest.mark.parametrize("dtype", (torch.float32, torch.float64), ids=("float32", "float64"))
 ENGINES = pytest.mark.parametrize("engine", ("plain", "mixed", "fused"))
 NAMES = {torch.float32: "float32", torch.float64: "float64"}
@@ -55,18 +52,6 @@ def eps(dtype: torch.dtype) -> float:
     return torch.finfo(dtype).eps
 
 
-def wavy(dtype=torch.float64, m=17, depth=0.8, ripple=0.05, z=20.0, half=12.0) -> BSplineSurface:
-    """A bowl with ripples, no mirror image of itself."""
-    line = torch.linspace(-1, 1, m, dtype=torch.float64)
-    x, y = line[:, None], line[None, :]
-    h = depth * (x**2 + 0.7 * y**2) + ripple * torch.sin(7 * x + 0.3) * torch.cos(5 * y)
-    return BSplineSurface(z, h.to(dtype), (-half, half), (-half, half))
-
-
-def lens_of(back: BSplineSurface, front: Plane | Sphere | None = None, outline=SQUARE, index=N) -> Lens:
-    return Lens(front or Sphere(15.0, -0.02), back, outline, index)
-
-
 def landing_gradient(rays: Rays, lens: Lens, z: float, engine: str) -> tuple[Landed, torch.Tensor]:
     """(rays on the plane z, gradient in the net of the sum of x + y over those that land)."""
     heights = lens.back.heights.detach().clone().requires_grad_()
@@ -74,26 +59,6 @@ def landing_gradient(rays: Rays, lens: Lens, z: float, engine: str) -> tuple[Lan
         landed = through_back(rays, lens.with_heights([heights]), z)
     whole = torch.where(landed.alive, landed.position.sum(0), 0.0).sum()
     return landed, torch.autograd.grad(whole, heights)[0]
-
-
-def bundle(position, direction, dtype=torch.float64) -> Rays:
-    """Rays from points (n, 3) along directions (n, 3), or one of either for all; directions are made unit vectors."""
-    position, direction = (torch.as_tensor(a, dtype=torch.float64).reshape(-1, 3).T for a in (position, direction))
-    n = max(position.shape[1], direction.shape[1])
-    direction = direction / direction.norm(dim=0)
-    position, direction = (a.expand(3, n).to(dtype).contiguous() for a in (position, direction))
-    return Rays(position, direction, torch.ones(n, dtype=dtype), torch.zeros(n, dtype=torch.uint8))
-
-
-def uniform(shape, seed=0, low=0.0, high=1.0) -> torch.Tensor:
-    random = torch.Generator().manual_seed(seed)
-    return low + (high - low) * torch.rand(shape, generator=random, dtype=torch.float64)
-
-
-def places(rays: Rays) -> torch.Tensor:
-    """Positions (3, …) with z from the origin, in float64."""
-    x, y, _ = rays.position.double()
-    return torch.stack([x, y, rays.position[2].double() + rays.z])
 
 
 def largest(values: torch.Tensor) -> float:

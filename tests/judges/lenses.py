@@ -2,27 +2,25 @@
 
 from dataclasses import replace
 
-import numpy as np
 import torch
 
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
 from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Plane, Sphere
+from tests.lenses import SQUARE, lens_of, net
 
 
-def waved(m=33, half=10.0, amplitude=0.05, n=None):
-    """A back that no symmetry maps onto itself, with m x n control points (n: m by default)."""
-    x, y = np.linspace(-1, 1, m)[:, None], np.linspace(-1, 1, n or m)
-    heights = 0.02 * half * (x**2 + 1.3 * y**2) + amplitude * np.sin(2 * x + 0.5) * np.cos(3 * y)
-    return BSplineSurface(20.0, torch.from_numpy(-heights), (-half, half), (-half, half))
+def waved(z=20.0, m=33, ripple=0.05, phase=0.5):
+    """A back that no symmetry maps onto itself."""
+    return net(
+        lambda x, y: -0.002 * (x**2 + 1.3 * y**2) - ripple * torch.sin(0.2 * x + phase) * torch.cos(0.3 * y), z, m
+    )
 
 
-def lens(front=None, outline=None, **more):
-    return Lens(front or Sphere(12.0, -0.01), waved(), outline or Rectangle(20.0, 20.0), 1.49, **more)
+def lens(front=None, outline=SQUARE, **more):
+    return lens_of(waved(), front or Sphere(12.0, -0.01), outline, 1.49, **more)
 
 
 MIRROR = lens(Plane(0.0), reflects=True)

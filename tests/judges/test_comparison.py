@@ -88,15 +88,8 @@ class TestStandIn:
     def test_each_judge_is_asked_in_turn(self, judge, monkeypatch):
         told, (glass, source, screen) = [], CASES["a beam"]
         monkeypatch.setattr(comparison, "RAYS", 1 << 12)
-        found = comparison.against(
-            ["numpy"],
-            glass,
-            (Channel(source, glass.index),),
-            screen,
-            np.ones(screen.shape),
-            0,
-            lambda *a: told.append(a),
-        )
+        given = glass, (Channel(source, glass.index),), screen, np.ones(screen.shape), 0
+        found = comparison.against(["numpy"], *given, lambda *a: told.append(a))
         assert [each.judge.rays for each in found] == [1 << 12]
         assert told == [("judges", 0, 1, "numpy"), ("judges", 1, 1, "")]
 

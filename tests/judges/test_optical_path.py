@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-import torch
 
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Plane, Sphere
-from tests.judges.lenses import MIRROR
+from tests.judges.lenses import MIRROR, waved
 
 PATH, PLACE = 1e-6, 1e-9  # mm: a nanometre of path, a picometre of place
 SCREEN = 120.0  # mm
@@ -26,16 +24,8 @@ SOURCES = {
 }
 
 
-def bumpy(z, m, size, phase):
-    """Ripples of this height (mm) over [-10, 10]², which no symmetry maps onto itself."""
-    line = torch.linspace(-10.0, 10.0, m, dtype=torch.float64)
-    x, y = line[:, None], line[None, :]
-    heights = size * torch.sin(0.4 * x + phase) * torch.cos(0.3 * y - phase) - 1e-3 * (x * x + 0.7 * y * y)
-    return BSplineSurface(z, heights, (-10.0, 10.0), (-10.0, 10.0))
-
-
 def two_nets():
-    return Lens(bumpy(10.0, 33, 0.03, 0.4), bumpy(20.0, 41, -0.05, 1.1), APERTURE, 1.49)
+    return Lens(waved(10.0, 33, 0.03, 0.4), waved(20.0, 41, -0.05, 1.1), APERTURE, 1.49)
 
 
 @pytest.fixture

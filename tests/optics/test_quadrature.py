@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.quadrature import Border, gauss_points, of_face, of_wall, outline_border, rim_breaks
+from bstcad.optics.quadrature import Border, gauss_points, of_face, of_wall, outline_border
 from bstcad.optics.surfaces import Conic, Plane, Sphere
+from tests import lenses
 from tests.exact_volume import integral
+from tests.lenses import half_over, net
 
 A, B, C = 0.3, -0.2, 1.7  # of a tilted plane
 OUTLINES = [Rectangle(16.0, 14.0), Circle(6.5)]
@@ -18,21 +19,17 @@ OUTLINES = [Rectangle(16.0, 14.0), Circle(6.5)]
 
 def tilted(m):
     """z = C + A x + B y as a net: control points of a plane lie on it."""
-    x = torch.linspace(-12, 12, m, dtype=torch.float64)
-    return BSplineSurface(5.0, C + A * x[:, None] + B * x[None, :], (-12.0, 12.0), (-12.0, 12.0))
+    return net(lambda x, y: C + A * x + B * y, 5.0, m, 12.0)
 
 
-def rough(m, half_x=8.0, half_y=7.0):
-    x, y = (torch.linspace(-half, half, m, dtype=torch.float64) for half in (half_x, half_y))
-    noise = torch.randn(m, m, generator=torch.Generator().manual_seed(m), dtype=torch.float64)
-    heights = 1.0 + 0.3 * torch.sin(x / 3)[:, None] * torch.cos(y / 2 + 1) + 0.3 / m * noise
-    return BSplineSurface(5.0, heights, (-half_x, half_x), (-half_y, half_y))
+def rough(m, half=(8.0, 7.0)):
+    noise = lenses.rough(0.3 / m, m, m=m).heights
+    return net(lambda x, y: 1.0 + 0.3 * torch.sin(x / 3) * torch.cos(y / 2 + 1) + noise, 5.0, m, half)
 
 
 SMOOTH = [Plane(8.0), Sphere(8.0, 0.04), Conic(8.0, 0.05, -1.3)]
 CASES = [(outline, face) for outline in OUTLINES for face in SMOOTH]
-CASES += [(OUTLINES[0], rough(m)) for m in (9, 40, 131)]
-CASES += [(OUTLINES[1], rough(m, *[6.5 * (m - 1) / (m - 5)] * 2)) for m in (9, 40, 131)]  # two spans past the rim
+CASES += [(outline, rough(m, half_over(outline, m))) for outline in OUTLINES for m in (9, 131)]
 
 
 def disc(radius, x=0.0, y=0.0, turn=1):
@@ -87,14 +84,3 @@ def test_area_and_moments_of_a_rough_net(m):
     assert cap.area == pytest.approx((weight * np.sqrt(1 + h_x**2 + h_y**2)).sum(), rel=1e-8)
     wanted = [(weight * h * each).sum() for each in (x, y, h / 2)]
     assert cap.moment + wall.moment == pytest.approx(wanted, rel=1e-8, abs=1e-6)  # mm⁴, of some 2000
-
-
-def test_rim_breaks_go_once_around_and_hold_every_crossing():
-    face = rough(21, 12.0, 12.0)
-    theta = rim_breaks(face, 10.0)
-    assert theta[0] == 0 and theta[-1] == 2 * np.pi and (np.diff(theta) > 0).all()
-    middle, lines = (theta[:-1] + theta[1:]) / 2, face.x[0] + face.pitch[0] * (np.arange(1, face.m - 2) + 0.5)
-    for position in (np.cos, np.sin):
-        cell = np.searchsorted(lines, 10.0 * position(middle))
-        for end in (theta[:-1] + 1e-7, theta[1:] - 1e-7):
-            assert (np.searchsorted(lines, 10.0 * position(end)) == cell).all()

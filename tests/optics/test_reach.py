@@ -1,6 +1,7 @@
 """Where a face can send light: the critical angle, the slope of a mirror, tilted planes, and the law itself."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,6 @@ import torch
 
 from bstcad.optics.goal import restricted
 from bstcad.optics.interfaces import Reflect, Refract, deflect
-from bstcad.optics.rays import Rays
 from bstcad.optics.reach import (
     GRAZING,
     STEEPEST,
@@ -19,6 +19,7 @@ from bstcad.optics.reach import (
     wanted_slopes,
 )
 from bstcad.optics.receivers import LevelPlane, TiltedPlane
+from tests.lenses import bundle
 
 INDEX = 1.4936
 GLASS = Refract(INDEX, 1.0)
@@ -27,9 +28,7 @@ DISTANCE = 200.0
 
 def ray(direction=(0.0, 0.0, 1.0), sense=1, n=1):
     """n rays at the origin."""
-    way = torch.tensor(direction, dtype=torch.float64)[:, None].expand(3, n)
-    alive = torch.zeros(n, dtype=torch.uint8)
-    return Rays(torch.zeros((3, n), dtype=torch.float64), way, torch.ones(n), alive, sense=sense)
+    return replace(bundle(torch.zeros(n, 3), direction), sense=sense)
 
 
 def at(*angles):

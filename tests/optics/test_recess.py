@@ -9,18 +9,16 @@ import pytest
 import torch
 
 from bstcad.optics import ops
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.channels import Channel
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import simulated
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Conic, Recess, Sphere
 from bstcad.optics.trace import UNDERSIDE, on_underside, simulate, simulate_plain, to_first_net, trace
+from tests.lenses import net
 
 RADIUS, EDGE, RIM = 12.0, 10.0, 25.0  # mm: of the dome, of its outline, of the lens
 PLANE = math.sqrt(RADIUS**2 - EDGE**2)  # z of the underside, the centre of the dome at 0
@@ -31,9 +29,7 @@ SCREEN = Screen(500.0, (-1e4, 1e4), (-1e4, 1e4), 16)
 
 def lens(front=DOME, outline=ROUND):
     """A back that falls towards the rim, so that light of 60 degrees meets it."""
-    x = torch.linspace(-1, 1, 17, dtype=torch.float64)
-    heights = -6 * (x[:, None] ** 2 + x[None, :] ** 2)
-    return Lens(front, BSplineSurface(24.0, heights, (-35.0, 35.0), (-35.0, 35.0)), outline, 1.5)
+    return Lens(front, net(lambda x, y: -6 * (x**2 + y**2) / 35**2, 24.0, half=35.0), outline, 1.5)
 
 
 @pytest.mark.parametrize("face", [DOME.face, Conic(8.0, 0.05, -2.0)], ids=lambda face: face.kind)
@@ -88,11 +84,6 @@ def test_a_source_in_the_dome_lights_no_underside():
     beside = on_underside(Point((0.0, 0.0, -30.0)), bulge, Rectangle(50.0, 50.0))
     d = 30.0 + bulge.around.z
     assert 0.2 < beside < 50**2 / math.pi / d**2 - EDGE**2 / (EDGE**2 + d**2)
-
-
-def test_a_lens_without_an_outline_of_its_front_has_no_such_line():
-    light = simulated(lens(Sphere(RADIUS, -1 / 60)), [Channel(Point(), 1.5)], SCREEN, n=64, seed=1)
-    assert UNDERSIDE not in light.flux
 
 
 def test_the_kernel_traces_a_dome_as_the_plain_form_does(monkeypatch):

@@ -7,29 +7,15 @@ import pytest
 import torch
 
 from bstcad.optics import irradiance
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.outlines import Circle
 from bstcad.optics.point import Point
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.surfaces import Plane
 from bstcad.optics.trace import clear_window, trace, window
+from tests.lenses import lens_of, net, wavy
 from tests.tracing import launch, simulated, stratified
-
-SQUARE = Rectangle(20.0, 20.0)
-
-
-def plate(dtype=torch.float64):
-    back = BSplineSurface(12.0, torch.zeros((7, 7), dtype=dtype), (-10.0, 10.0), (-10.0, 10.0))
-    return Lens(Plane(8.0), back, SQUARE, 1.5)
-
-
-def bowl(dtype=torch.float64, depth=3.0, front=None):
-    line = torch.linspace(-1, 1, 17, dtype=torch.float64)
-    h = (depth * (line[:, None] ** 2 + line[None, :] ** 2)).to(dtype)
-    return Lens(front or Sphere(15.0, -0.02), BSplineSurface(22.0, h, (-10.0, 10.0), (-10.0, 10.0)), SQUARE, 1.6)
 
 
 def covered(screen, radius):
@@ -50,7 +36,7 @@ EXPECTED = torch.as_tensor(covered(SCREEN, 6.5) / (math.pi * 6.5**2))
 
 def test_a_disc_beam_through_a_plate_lands_as_the_disc():
     """Pixel by pixel, in absolute flux: the beam is cut by two sides of the screen and fills whole pixels and parts."""
-    result = simulated(DISC, plate(), SCREEN, 600, seed=0)
+    result = simulated(DISC, lens_of(net(z=12.0), Plane(8.0)), SCREEN, 600, seed=0)
     assert float(EXPECTED.sum()) < 0.999  # some of it falls beside the screen
     assert float((result.box - EXPECTED).abs().max()) < 0.03 * float(EXPECTED.max())
     assert float(irradiance.rrmsd(result.box, EXPECTED)) < 8e-3
@@ -61,7 +47,7 @@ def test_a_disc_beam_through_a_plate_lands_as_the_disc():
 def test_flux_through_the_lens_is_the_sources():
     """A Lambertian point, a plane front: what crosses the square outline is the view factor of a centred square,
     (4 / π) X / sqrt(1 + X²) atan(X / sqrt(1 + X²)), X = half side over distance (each quarter a standard factor)."""
-    lens = bowl(depth=0.0, front=Plane(15.0))
+    lens = lens_of(net(z=22.0), Plane(15.0))
     result = simulated(Point(), lens, Screen(100.0, (-500.0, 500.0), (-500.0, 500.0), 8), 400, seed=0)
     ratio = 10.0 / 15.0
     slant = math.sqrt(1 + ratio**2)
@@ -71,7 +57,7 @@ def test_flux_through_the_lens_is_the_sources():
 
 @pytest.mark.parametrize("source", [Point(), DISC], ids=("point", "collimated"))
 def test_the_clear_window_loses_no_light_that_gets_through(source):
-    lens = bowl()
+    lens = lens_of(wavy(z=22.0, depth=3.0, half=10.0), index=1.6)
     whole, clear = window(source, lens), clear_window(source, lens)
     assert clear.width <= whole.width and clear.height <= whole.height
     all_rays = trace(launch(source, lens, 150, 0), lens, LevelPlane(100.0))

@@ -5,16 +5,15 @@ import itertools
 import pytest
 import torch
 
-from bstcad.optics import bspline, tubes
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics import tubes
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import intersect
 from bstcad.optics.irradiance import Screen, rrmsd
-from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle, Rounded
 from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import to_first_net
+from tests.lenses import lens_of, net
 from tests.tracing import simulated
 
 SHAPE = (7, 9)
@@ -80,11 +79,12 @@ def test_the_fused_form_is_the_plain_one_with_its_gradient():
     weight = torch.rand(SHAPE, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     results = []
     for form in (tubes.collect, tubes.collect_plain):
-        leaf = corner.clone().requires_grad_()
-        image, outside = form(leaf, flux, SHAPE)
+        leaf, light = corner.clone().requires_grad_(), flux.clone().requires_grad_()
+        image, outside = form(leaf, light, SHAPE)
         merit = (image * weight).sum() + 0.3 * outside
-        results.append((image.detach(), outside.detach(), torch.autograd.grad(merit, leaf)[0]))
-    (image, outside, gradient), (plain, plain_outside, plain_gradient) = results
+        results.append((image.detach(), outside.detach(), *torch.autograd.grad(merit, (leaf, light))))
+    (image, outside, gradient, in_flux), (plain, plain_outside, plain_gradient, plain_in_flux) = results
+    assert float((in_flux - plain_in_flux).abs().max()) < 1e-10 * float(plain_in_flux.abs().max())
     assert float(outside) == pytest.approx(float(plain_outside), rel=1e-12)
     torch.testing.assert_close(image, plain, rtol=0, atol=1e-11)
     on_border = torch.zeros_like(gradient, dtype=torch.bool)
@@ -111,25 +111,11 @@ def test_an_edge_through_the_corners_of_pixels_has_the_gradient_of_its_neighbour
 
 # --- launching --------------------------------------------------------------------------------------------------------
 
-WAVY = 0.02 * torch.cos(torch.arange(33.0, dtype=torch.float64))[:, None] * torch.ones(33, dtype=torch.float64)
 
-
-def lens_of(front, outline, half=12.0):
+def lens_behind(front, outline):
     """outline: of the lens, or the clear apertures of front and back."""
-    clear = outline if isinstance(outline, tuple) else None
-    outline = Rectangle(20.0, 20.0) if clear else outline
-    return Lens(front, BSplineSurface(20.0, WAVY, (-half, half), (-half, half)), outline, 1.49, clear=clear)
-
-
-@pytest.mark.parametrize("shape", [Rectangle(4.0, 6.0), Circle(3.0), Rounded(6.0, 8.0, corner_radius=1.5)])
-def test_a_sheet_covers_its_shape_evenly(shape):
-    x, y = tubes.corners(shape, 64)
-    area = tubes.area_of(x, y)
-    assert float(area.sum()) == pytest.approx(shape.area, rel=1e-3)
-    assert float(area.max() / area.min()) < (2.5 if isinstance(shape, Rounded) else 1.15)  # a corner moves inwards
-    reach = torch.cat([torch.stack([p[0], p[-1], p[:, 0], p[:, -1]])[None] for p in (x, y)])
-    if isinstance(shape, Circle):
-        assert float((reach.norm(dim=0) - shape.radius).abs().max()) < 1e-12
+    back = net(lambda x, y: 0.02 * torch.cos(1.33 * x), m=33, half=12.0)
+    return lens_of(back, front, **({"clear": outline} if isinstance(outline, tuple) else {"outline": outline}))
 
 
 SMALL, LARGE = Rounded(11.0, 13.0, corner_radius=3.0), Rounded(12.0, 14.0, corner_radius=4.0)
@@ -151,7 +137,7 @@ SOURCES = {
 def test_tubes_hold_the_light_that_rays_find_behind_the_lens(name):
     """Flux and picture of both, the picture on few pixels so that the rays have little noise."""
     source, front, outline = SOURCES[name]
-    lens = lens_of(front, outline)
+    lens = lens_behind(front, outline)
     screen = Screen(100.0, (-60.0, 60.0), (-60.0, 45.0), (12, 9))
     sheet = tubes.launch_tubes(source, lens, 200)
     found = sheet.picture(lens, screen)
@@ -163,7 +149,7 @@ def test_tubes_hold_the_light_that_rays_find_behind_the_lens(name):
 @pytest.mark.parametrize("name", SOURCES)
 def test_rays_meet_the_back_where_they_are_sent(name):
     source, front, outline = SOURCES[name]
-    lens = lens_of(front, outline)
+    lens = lens_behind(front, outline)
     x, y = tubes.corners(Rectangle(14.0, 12.0), 300)
     p, q, at_back = tubes.rays_to(source, lens, x, y)
     entered = to_first_net(source.rays(p, q, lens.front.z, 1.0), lens.unbounded())
@@ -173,22 +159,10 @@ def test_rays_meet_the_back_where_they_are_sent(name):
     torch.testing.assert_close(hit.direction.expand_as(at_back.direction), at_back.direction, rtol=0, atol=3e-8)
 
 
-def test_rays_through_a_float32_net_are_found_by_the_kernel(monkeypatch):
-    """Mixed types go by the plain form, four times as long."""
-    front, back = (
-        BSplineSurface.fitted(Sphere(z, c), (-10.0, 10.0), (-10.0, 10.0), 33).to(torch.float32)
-        for z, c in ((0.0, -0.02), (6.0, 0.01))
-    )
-    monkeypatch.setattr(bspline, "evaluate_plain", None)
-    x, y = tubes.corners(Rectangle(10.0, 10.0), 8)
-    assert bool(tubes.rays_to(Point((1.0, -0.5, -30.0)), Lens(front, back, Circle(9.0), 1.49), x, y)[2].alive.all())
-
-
 @pytest.mark.parametrize("pixels", [(7, 11), (11, 7), (24, 5)])
 def test_an_even_beam_gives_each_pixel_its_area(pixels):
     """Through a plate a rectangular beam lands as it is, cut by two sides of the screen: areas known by hand."""
-    back = BSplineSurface(12.0, torch.zeros((7, 7), dtype=torch.float64), (-10.0, 10.0), (-10.0, 10.0))
-    lens, beam = Lens(Plane(8.0), back, Rectangle(20.0, 20.0), 1.5), Rectangle(9.0, 12.0)
+    lens, beam = lens_of(net(z=12.0), Plane(8.0)), Rectangle(9.0, 12.0)
     screen = Screen(50.0, (-3.3, 6.7), (-8.1, 4.9), pixels)
     sides = zip((screen.x, screen.y), pixels, strict=True)
     edges = (torch.linspace(*ends, n + 1, dtype=torch.float64) for ends, n in sides)

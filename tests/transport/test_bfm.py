@@ -10,10 +10,6 @@ from bstcad.transport.bfm import Poisson, PoissonWithoutCheckerboard, half_squar
 N = 64
 
 
-def gaussian(cx, cy, sx, sy):
-    return lambda x, y: np.exp(-0.5 * (((x - cx) / sx) ** 2 + ((y - cy) / sy) ** 2))
-
-
 def displacement(potential):
     """-∇psi at cell centres, unit-square units."""
     return tuple(-g * potential.shape[0] for g in np.gradient(potential))
@@ -32,21 +28,6 @@ def test_translation_and_its_cost():
     inside = rho.values > 0.9 * rho.values.max()
     for got, want in zip(displacement(t.psi), d, strict=True):
         assert abs(got[inside] - want).mean() < 0.5 / N  # half a cell: the c-transform maps centres to centres
-
-
-def test_gaussian_to_gaussian():
-    """T = m2 + (s2 / s1)(x - m1) along each axis."""
-    rho = Density.from_function(gaussian(0.5, 0.5, 0.07, 0.09), N)
-    t = back_and_forth(rho, Density.from_function(gaussian(0.53, 0.46, 0.11, 0.07), N))
-    q = (np.arange(N) + 0.5) / N
-    dx, dy = displacement(t.psi)
-    bright = rho.values > 0.1 * rho.values.max()
-    want_x = np.broadcast_to(((0.53 + 0.11 / 0.07 * (q - 0.5)) - q)[:, None], (N, N))
-    want_y = np.broadcast_to(((0.46 + 0.07 / 0.09 * (q - 0.5)) - q)[None, :], (N, N))
-    assert abs(dx - want_x)[bright].mean() < 0.5 / N
-    assert abs(dy - want_y)[bright].mean() < 0.5 / N
-    cost = 0.5 * (0.03**2 + 0.04**2 + 0.04**2 + 0.02**2)  # Gelbrich: (m2 - m1)² + (s2 - s1)², halved
-    assert t.dual[-1] == pytest.approx(cost, rel=0.03)
 
 
 @pytest.fixture(scope="module")
@@ -74,11 +55,6 @@ def test_why_it_stopped(rough):
     assert back_and_forth(*rough, tolerance=0.0, iterations=200).reason == "plateau"
     assert back_and_forth(*rough, tolerance=0.0, iterations=2).reason == "iterations"
     assert back_and_forth(rough[0], rough[0]).reason == "converged"
-
-
-def test_grids_must_agree(rough):
-    with pytest.raises(ValueError, match="one grid"):
-        back_and_forth(rough[0], rough[1].halved())
 
 
 def minus_laplacian(g):
@@ -113,15 +89,6 @@ def test_one_series_and_an_elimination_equal_two_series(n):
     np.testing.assert_allclose(PoissonWithoutCheckerboard(n).solve(r), want, atol=1e-11 * np.abs(want).max())
 
 
-def test_the_checkerboard_is_kept_out():
-    """The highest term of the cosine series is a checkerboard; the plain solve gives 1/8 of it back."""
-    n = 200
-    line = np.cos(np.pi * (n - 1) * (np.arange(n) + 0.5) / n)
-    board = np.outer(line, line)
-    np.testing.assert_allclose(Poisson(n).solve(board), board / 8, atol=1e-4)  # s = 4 cos²(pi/2n)
-    np.testing.assert_allclose(PoissonWithoutCheckerboard(n).solve(board), 0.0, atol=1e-4)
-
-
 def c_transform(phi):
     """phi^c(x) = min_y |x - y|²/2 - phi(y), cell units."""
     half = half_square(phi.shape[0])
@@ -136,10 +103,11 @@ def brute_force(phi):
 
 
 @pytest.mark.parametrize("n", [4, 9, 32])
-@pytest.mark.parametrize("scale", [0.0, 1.0, 300.0])
+@pytest.mark.parametrize("scale", [0.0, 1.0, 300.0, 1e5])
 def test_c_transform_is_the_minimum_over_all_pairs(n, scale):
+    """At the largest scale every slope is steeper than the grid is wide, so that the rim is chosen."""
     phi = scale * np.random.default_rng(n).normal(size=(n, n))
-    np.testing.assert_allclose(c_transform(phi), brute_force(phi), atol=1e-11)  # rounding of values near n²
+    np.testing.assert_allclose(c_transform(phi), brute_force(phi), rtol=1e-14, atol=1e-11)  # rounding of values near n²
 
 
 def test_double_transform_lies_above_and_triple_equals_single():
@@ -149,30 +117,3 @@ def test_double_transform_lies_above_and_triple_equals_single():
     assert (twice >= phi - 1e-11).all()
     assert (twice > phi + 0.1).any()  # a rough phi is truly lifted
     np.testing.assert_allclose(c_transform(twice), once, atol=1e-11)
-
-
-def test_half_square_is_its_own_transform():
-    np.testing.assert_allclose(legendre(half_square(50)), half_square(50), atol=1e-11)
-
-
-def test_dilation_of_the_square():
-    """v = a |y|²/2 gives v* = |x|²/(2a) where x/a is a cell centre."""
-    n, a = 63, 3.0
-    got = legendre(a * half_square(n))
-    inside = np.arange(1, n, 3)  # (i + 1/2) / 3 = j + 1/2
-    np.testing.assert_allclose(got[np.ix_(inside, inside)], (half_square(n) / a)[np.ix_(inside, inside)], atol=1e-11)
-
-
-def test_a_concave_function_counts_by_the_corners_of_the_square_alone():
-    n = 30
-    got = legendre(-half_square(n))
-    q, ends = np.arange(n) + 0.5, np.array([0.5, n - 0.5])
-    best = (q[:, None] * ends + 0.5 * ends**2).max(axis=1)
-    np.testing.assert_allclose(got, best[:, None] + best[None, :], atol=1e-11)
-
-
-def test_steep_slopes_choose_the_rim():
-    """Beyond every x of the grid, both ways: the walk starts or stays at an end of the hull."""
-    q = np.arange(16) + 0.5
-    v = 1e3 * q[:, None] - 1e3 * q[None, :]
-    np.testing.assert_allclose(legendre(v), 0.5 * q[:, None] + 15.5 * q[None, :] + 15e3, atol=1e-11)

@@ -127,15 +127,6 @@ def test_the_two_maps_undo_each_other(letter):
     assert np.mean(back < 1e-9) > 0.99  # the rest lie in seams the grid cannot hold open
 
 
-def test_monotone(letter):
-    """(T(a) - T(b)) · (a - b) >= 0: T is the gradient of a convex function."""
-    a, b = np.random.default_rng(3).random((2, 2, 20000))
-    both = (disc(*a) > 0) & (disc(*b) > 0) & (np.hypot(*(a - b)) > 0.02)
-    (ax, ay), (bx, by) = letter(*a[:, both]), letter(*b[:, both])
-    product = (ax - bx) * (a[0] - b[0])[both] + (ay - by) * (a[1] - b[1])[both]
-    assert np.mean(product < -1e-6) < 1e-3
-
-
 def test_points_outside_move_to_the_rim_and_nan_stays_nan(letter):
     assert letter(-3.0, 0.5) == letter(0.0, 0.5)
     assert np.isnan(letter(np.nan, 0.5)).all()

@@ -14,9 +14,5 @@ LAYOUTS = {
 }
 
 
-def uniform(n, seed, dtype=torch.float64):
-    return torch.rand(n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
-
-
 def close(a, b, dtype, scale=1.0, roundings=50):
     torch.testing.assert_close(a.double(), b.double(), rtol=0, atol=roundings * scale * torch.finfo(dtype).eps)

@@ -8,12 +8,13 @@ import torch
 
 from bstcad.analysis import shape
 from bstcad.optics import bspline, irradiance, ops
-from bstcad.optics.bspline import QUARTERS, BSplineSurface, Spans, span_places
+from bstcad.optics.bspline import QUARTERS, Spans, span_places
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import spline
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
 from bstcad.optics.rays import Landed
-from tests.optics.kernels.arrays import DTYPES, LAYOUTS, close, uniform
+from tests.lenses import rough, uniform
+from tests.optics.kernels.arrays import DTYPES, LAYOUTS, close
 
 
 @DTYPES
@@ -32,12 +33,12 @@ def test_kernels_serve_matching_cpu_tensors_only(dtype):
 def test_evaluate_and_its_gradients(m, layout, dtype):
     """Also with a net that is not contiguous, and where autograd hands over expanded gradients."""
     n = 5 * 7 * 300  # several chunks
-    u, v = (LAYOUTS[layout](uniform(n, s, dtype) * (m - 1)) for s in (0, 1))
-    net = (uniform(m * m, 2).view(m, m) - 0.5).to(dtype).T
-    weights = [LAYOUTS[layout](uniform(n, s, dtype)) for s in (3, 4, 5)]
+    u, v = (LAYOUTS[layout](uniform(n, s).to(dtype) * (m - 1)) for s in (0, 1))
+    heights = (uniform((m, m), 2) - 0.5).to(dtype).T
+    weights = [LAYOUTS[layout](uniform(n, s).to(dtype)) for s in (3, 4, 5)]
     results = []
     for evaluate, kind in ((bspline.evaluate, dtype), (bspline.evaluate_plain, torch.float64)):
-        inputs = [t.detach().to(kind).requires_grad_() for t in (net, u, v)]
+        inputs = [t.detach().to(kind).requires_grad_() for t in (heights, u, v)]
         out = evaluate(*inputs)
         merit = sum((o * w.to(kind)).sum() for o, w in zip(out, weights, strict=True)) + out[0].sum()
         results.append((out, torch.autograd.grad(merit, inputs)))
@@ -45,7 +46,7 @@ def test_evaluate_and_its_gradients(m, layout, dtype):
     for a, b in zip(out, plain, strict=True):
         assert a.dtype == dtype and a.shape == u.shape
         close(a.detach(), b.detach(), dtype)
-    for a, b, like in zip(grads, plain_grads, (net, u, v), strict=True):
+    for a, b, like in zip(grads, plain_grads, (heights, u, v), strict=True):
         assert a.dtype == dtype and a.shape == like.shape
         close(a, b, dtype, max(1.0, float(b.abs().max()) if b.numel() else 1.0))
 
@@ -55,10 +56,10 @@ def test_evaluate_and_its_gradients(m, layout, dtype):
 def test_collect_and_its_gradients(layout, dtype):
     n = 5 * 7 * 300
     screen = Screen(0.0, (0.0, 16.0), (0.0, 8.0), (16, 10))  # pixels of 1 x 0.8 mm
-    x, y = (LAYOUTS[layout](uniform(n, s, dtype) * 20 - 2) for s in (0, 1))
-    flux = LAYOUTS[layout](uniform(n, 2, dtype))
+    x, y = (LAYOUTS[layout](uniform(n, s).to(dtype) * 20 - 2) for s in (0, 1))
+    flux = LAYOUTS[layout](uniform(n, 2).to(dtype))
     status = (LAYOUTS[layout](uniform(n, 3)) < 0.1).to(torch.uint8)
-    weight = uniform(160, 4).view(10, 16)
+    weight = uniform((10, 16), 4)
     results = []
     for kind in (dtype, torch.float64):  # the kernel, and the plain form in double
         position = torch.stack([x, y]).to(kind).requires_grad_()
@@ -82,15 +83,14 @@ def test_collect_and_its_gradients(layout, dtype):
 )
 @pytest.mark.parametrize("m", (5, 18, 33))
 def test_largest_and_where_and_how_many(m, outline):
-    heights = torch.from_numpy(np.random.default_rng(m).normal(0.0, 0.3, (m, m)))
-    surface = BSplineSurface(1.0, heights, (-3.0, 3.0), (-2.0, 2.0))
+    surface = rough(0.3, m, 1.0, m, (3.0, 2.0))
     i, j = (index.flatten() for index in torch.meshgrid(torch.arange(m - 2), torch.arange(m - 2), indexing="ij"))
     jet, (x, y) = Spans.of(surface, i, j).jet(QUARTERS), span_places(surface, i, j, QUARTERS)
     held = outline.contains(x, y).broadcast_to(jet.slope.shape)
     most, least = jet.curvatures
     grid = shape._grid(surface)
     limits, bounds = tuple(outline.limits), (1.0, 2.0, 0.5)
-    values, place, count = spline.largest_bending(heights.numpy(), grid[2:], grid[:2], limits, bounds)
+    values, place, count = spline.largest_bending(surface.heights.numpy(), grid[2:], grid[:2], limits, bounds)
     for k, wanted in enumerate((most, -least, jet.slope)):
         wanted = torch.where(held, wanted, -math.inf)
         assert values[k] == pytest.approx(float(wanted.max()), rel=1e-11)
