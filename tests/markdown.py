@@ -1,9 +1,12 @@
-"""Tables of docs/*.md, and the places on a page where a program writes them."""
+"""Pages of docs/*.md from their templates, tables, and the places on a page where a program writes them."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
+
+import jinja2
 
 END = "<!-- end -->"
 
@@ -25,3 +28,11 @@ def write(page: Path, begin: str, content: str) -> None:
     if not (found and ended):
         raise ValueError(f"{page} has no '{begin}' … '{END}'")
     page.write_text(f"{before}{found}\n\n{content}\n\n{END}{after}", encoding="utf-8")
+
+
+def page(template: Path, recorded: Mapping[str, Any], **more: Any) -> str:
+    """Fill a template with records.  Callables of `more` are filters, too; `number` formats what is known, else –."""
+    environment = jinja2.Environment(trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
+    environment.filters["number"] = lambda value, form: format(value, form) if isinstance(value, int | float) else "–"
+    environment.filters.update({name: value for name, value in more.items() if callable(value)})
+    return environment.from_string(template.read_text(encoding="utf-8")).render(**recorded, **more)

@@ -7,7 +7,7 @@ python -m tests.benchmarks.accuracy --only            writes alone: seconds
 
 Each piece is a cold run or a sweep of them, one at a time, on a machine with nothing else to do; it is kept as soon as
 it has ended, so that a recording that was stopped goes on.  Pieces of many minutes are recorded anew only if they are
-named.
+named.  The text of the page is accuracy.md.j2.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from functools import cache, partial, reduce
 from pathlib import Path
+from types import SimpleNamespace as Named
 from typing import Any
 
 import numpy as np
@@ -33,15 +34,31 @@ import torch
 from bstcad.folder import read_nominal
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import measure
+from bstcad.report.drawing import new_figure, png, styled
 from bstcad.runs import environment, files
 from bstcad.scene.scene import load
 from bstcad.sweep.cold_run import REFERENCE, rounded
-from tests.benchmarks import accuracy_page, growth
+from bstcad.sweep.results import legend, plane
+from tests import markdown
+from tests.benchmarks import growth
 from tests.benchmarks.cold import ROOT, TEMPLATES, generate
 from tests.benchmarks.mitsuba_caustic import control_net
 
 RECORDED, PAGE = ROOT / "docs" / "accuracy.json", ROOT / "docs" / "accuracy.md"
-FIGURES = {scene: ROOT / "docs" / name for scene, name in accuracy_page.FIGURES.items()}  # by sweep
+TEXT = Path(__file__).with_name("accuracy.md.j2")
+SCENES = {  # template: what it is
+    "thu": "Letters, off axis, collimated (example 2)",
+    "portrait": "Portrait, point source (example 1)",
+    "off_axis": "Portrait, off axis, collimated",
+    "mirror": "Portrait on the wall, by a mirror below a lamp",
+    "caustic_portrait": "Portrait, on axis, 100 mm (the peers' case)",
+    "caustic_letters": "Letters, on axis, 100 mm (the peers' case)",
+}
+PEER = "caustic_portrait"  # the scene of Mitsuba's caustic optimisation
+FIGURES = {PEER: "accuracy.png", "thu": "accuracy-letters.png"}  # by sweep, in docs/
+QUALITIES = ("draft", "standard", "fine", "paper", "stage 1", "integration")
+QUIET = 0.1  # of all cores: what other programs may take while something is recorded
+BUSY = "; **the machine was busy with other work**: seconds are too long by an unknown factor, CPU seconds by less"
 SWEPT = ROOT / "outputs" / "accuracy"  # records of the runs of sweeps, from which one that was stopped goes on
 SLOW = {  # qualities that take minutes, and how many
     "thu": {"fine": 2, "paper": 4}, "portrait": {"fine": 2, "paper": 12}, "caustic_portrait": {"paper": 4},
@@ -53,8 +70,7 @@ BESIDE = {  # what else a table has: the settings of a standard design that it i
         "portrait": ("tailoring.method=integration", "lens.front.optimise=false"),
     },
 }
-PEER = accuracy_page.PEER  # the scene of Mitsuba's caustic optimisation
-COARSE = 128  # pixels a side of its pictures
+COARSE = 128  # pixels a side of Mitsuba's pictures
 SMALLEST = (
     "lens.back.control_points=33", "target.pixels=64", "tailoring.rays=96", "tailoring.transport_grid=64",
     "tailoring.stage1_iterations=2", "tailoring.stage2_iterations=2",
@@ -86,7 +102,7 @@ class Piece:
 def pieces(budget: float, limit: float) -> dict[str, Piece]:
     """All of them by name; budget: seconds of a sweep; limit: seconds of Mitsuba's run."""
     found = {}
-    for scene in accuracy_page.SCENES:
+    for scene in SCENES:
         for quality, minutes in {"draft": 0.3, "standard": 0.8, **SLOW.get(scene, {})}.items():
             record = partial(designed, scene, quality)
             found[f"{scene}-{quality}"] = Piece(("designs", scene, quality), minutes, record, minutes > 1)
@@ -225,11 +241,79 @@ def put(recorded: Mapping[str, Any]) -> None:
 
 
 def write(recorded: Mapping[str, Any]) -> None:
-    """The page and its figures."""
-    for scene, path in FIGURES.items():
-        if picture := accuracy_page.draw(recorded, scene):
-            files.put(path, picture)
-    files.put(PAGE, accuracy_page.page(recorded, {path.name for path in PAGE.parent.iterdir()}).encode())
+    """Write the page and its figures."""
+    for scene, name in FIGURES.items():
+        if scene in recorded["sweeps"]:
+            files.put(PAGE.with_name(name), png(figure(recorded, scene)))
+    files.put(PAGE, page(recorded).encode())
+
+
+def page(recorded: Mapping[str, Any]) -> str:
+    """Return the page, each record marked by its day and a letter for its machine and versions."""
+    every = [entry for scene in recorded["designs"].values() for entry in scene.values()]
+    every += [*recorded["sweeps"].values(), recorded["mitsuba"], recorded["growth"]]
+    circumstances = sorted({_circumstances(entry) for entry in every})
+    marks = {each: f"{each[0]} ({chr(ord('a') + k)})" for k, each in enumerate(circumstances)}
+    names = ("date", "version", "machine", "versions", "busy")
+    return markdown.page(
+        TEXT, recorded, mark=lambda record: marks[_circumstances(record)], halving=halving, busy=BUSY, peer=PEER,
+        records={mark: dict(zip(names, each, strict=True)) for each, mark in marks.items()}, qualities=QUALITIES,
+        scenes=SCENES, figures=FIGURES,
+    )  # fmt: skip
+
+
+def _circumstances(record: Mapping[str, Any]) -> tuple[str, str, str, str, bool]:
+    found = record["recorded"]
+    busy = (found.get("others") or 0.0) > QUIET
+    return found["date"], found["version"], found["machine"], found["versions"], busy
+
+
+def halving(points: Sequence[Mapping[str, Any]]) -> Sequence[Mapping[str, Any]]:
+    """Return the last point of a run, and those that had half the iterations of the one after."""
+    chosen = [points[-1]]
+    for point in reversed(points):
+        if 2 * point["iterations"] <= chosen[-1]["iterations"]:
+            chosen.append(point)
+    return chosen[::-1]
+
+
+@styled
+def figure(recorded: Mapping[str, Any], scene: str) -> Any:
+    """Draw a sweep as `results.plane` draws a Table, with room for the paper's procedure and Mitsuba's run."""
+    sweep = _named(recorded["sweeps"][scene])
+    points = _named(recorded["mitsuba"]["points"]) if scene == PEER else []
+    paper = recorded["designs"][scene].get("paper")  # by itself: few budgets last for it
+    papers = [*(preset for preset in sweep.presets if preset.name == "paper"), *([_named(paper)] if paper else [])][:1]
+    sweep.presets = [preset for preset in sweep.presets if preset.name != "paper"]
+    ends = [Named(seconds=s, rrmsd=e) for s, e in zip(sweep.range.seconds, sweep.range.rrmsd, strict=True)]
+    sweep.best = sorted(sweep.front, key=lambda run: run.seconds)
+    sweep.knobs = [knob for knob in sweep.knobs if len(knob.places) > 1]
+    tried = [place for knob in sweep.knobs for place in knob.places]
+    sweep.shown = [*ends, *sweep.presets, *points, *papers, *tried]
+    sweep.history = [{"seconds": seconds, "rrmsd": rrmsd} for seconds, rrmsd in sweep.history]
+    drawn = new_figure(9.6, 8.0)
+    axes = drawn.subplots()
+    plane(axes, sweep)
+    for design in papers:
+        axes.plot(design.seconds, design.rrmsd, "*", ms=17, color="#ffffff", mec="#111111", mew=1.1, zorder=5)
+        axes.annotate("the procedure of Wang et al. 2023", (design.seconds, design.rrmsd), (12, -13), ha="right",
+                      va="top", textcoords="offset points", weight="bold", zorder=6)  # fmt: skip
+    if points:  # each height map judged as our lenses are, on the target's pixels and on its own
+        seconds, coarse = [point.seconds for point in points], [point.rrmsd_coarse for point in points]
+        look = {"color": "#b00058", "lw": 1.8, "zorder": 4, "marker": "o", "ms": 4.5}
+        reached = f"5 to {points[-1].iterations} of 1000 iterations"
+        label = f"Mitsuba 3: caustic optimisation, {reached}"
+        axes.plot(seconds, [point.rrmsd for point in points], label=label, **look)
+        axes.plot(seconds, coarse, ls=(0, (4, 2)), mfc="white", label="the same, on its own 128² pixels", **look)
+        axes.annotate("Mitsuba 3's caustic optimisation", (seconds[-1], min(coarse)), (0, -10), ha="right", va="top",
+                      textcoords="offset points", color=look["color"], weight="bold")  # fmt: skip
+    legend(axes)
+    return drawn
+
+
+def _named(record: Any) -> Any:
+    """A record of JSON whose keys are attributes."""
+    return json.loads(json.dumps(record), object_hook=lambda entry: Named(**entry))
 
 
 def wanted(all_pieces: Mapping[str, Piece], only: Sequence[str] | None, recorded: Mapping[str, Any]) -> list[str]:

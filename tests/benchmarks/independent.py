@@ -109,12 +109,13 @@ class Conic(NamedTuple):
     q: float
 
 
-class Front(NamedTuple):
-    """The first face of a lens: a net, or a conic."""
+class Face(NamedTuple):
+    """A face of a lens or mirror: a net, or a conic."""
 
     free: bool  # a net
     conic: Conic
     net: Net
+    border: Border
 
 
 class Light(NamedTuple):
@@ -596,15 +597,39 @@ def _turned_by(around, k, line, p, d):
 
 
 @njit(nogil=True, cache=True)
-def face_height(front, x, y, work):
-    """(z, z_x, z_y) of the front."""
-    if front.free:
-        return height(front.net, x, y, work)
-    return conic_height(front.conic, x, y)
+def face_height(face, x, y, work):
+    """(z, z_x, z_y) of a face."""
+    if face.free:
+        return height(face.net, x, y, work)
+    return conic_height(face.conic, x, y)
 
 
 @njit(nogil=True, cache=True)
-def trace(points, area, light, front, front_border, net, back_border, glass, screen, before, behind, picture, ledger):
+def upwards(z_x, z_y):
+    """The unit normal of a face, upwards."""
+    size = math.sqrt(1 + z_x * z_x + z_y * z_y)
+    return -z_x / size, -z_y / size, 1 / size
+
+
+@njit(nogil=True, cache=True)
+def met(face, p, d, work):
+    """(arrives, s in mm, place, normal upwards) of a ray from p along d, by Newton's iteration."""
+    z, z_x, z_y = face_height(face, p[0], p[1], work)
+    s, near = (z - p[2]) / d[2], False
+    for _ in range(30):
+        z, z_x, z_y = face_height(face, p[0] + s * d[0], p[1] + s * d[1], work)
+        step = (p[2] + s * d[2] - z) / (d[2] - z_x * d[0] - z_y * d[1])
+        s -= step
+        if abs(step) < 1e-11:
+            near = True
+            break
+    p = (p[0] + s * d[0], p[1] + s * d[1], p[2] + s * d[2])
+    _, z_x, z_y = face_height(face, p[0], p[1], work)
+    return near and s >= 0 and inside(face.border, p[0], p[1]), s, p, upwards(z_x, z_y)
+
+
+@njit(nogil=True, cache=True)
+def trace(points, area, light, first, back, glass, screen, before, behind, picture, ledger):
     """Adds the flux of rays to a picture and to a ledger, for the caller to divide by the number of points.
 
     points: (n, 4): x and y (mm) on the first face, and the place on the source's extent in [0, 1]²; area: (n,) mm² of
@@ -622,50 +647,28 @@ def trace(points, area, light, front, front_border, net, back_border, glass, scr
                 continue
             root = math.sqrt(m[2] * m[2] - c * f)
             z, z_x, z_y = o[2] + f / (m[2] + root), (c * (x - o[0]) - m[0]) / root, (c * (y - o[1]) - m[1]) / root
-        elif glass.mirror:
-            if not inside(back_border, x, y):
-                continue
-            z, z_x, z_y = height(net, x, y, work)
+        elif inside(first.border, x, y):
+            z, z_x, z_y = face_height(first, x, y, work)
         else:
-            if not inside(front_border, x, y):
-                continue
-            z, z_x, z_y = face_height(front, x, y, work)
-        dx, dy, dz, flux = emitted(light, (x, y, z), u, v)
-        if flux <= 0:
             continue
-        size = math.sqrt(1 + z_x * z_x + z_y * z_y)
-        n, d = (-z_x / size, -z_y / size, 1 / size), (dx, dy, dz)
-        cos = light.sense * (d[0] * n[0] + d[1] * n[1] + d[2] * n[2])
-        if cos <= 0:
+        start, facing = (x, y, z), upwards(z_x, z_y)
+        dx, dy, dz, flux = emitted(light, start, u, v)
+        along = light.sense * (dx * facing[0] + dy * facing[1] + dz * facing[2])
+        if flux <= 0 or along <= 0:
             continue
-        flux *= area[number] * size * cos
-        start = (x, y, z)
+        flux *= area[number] * along / facing[2]
         for i, line in enumerate(glass.lines):
             share, nm, index, extinction, absorbed = line
-            rest = flux * share
-            p, d = start, (dx, dy, dz)
+            rest, p, d, n, cos = flux * share, start, (dx, dy, dz), facing, along
             if apart:
                 arrives, p, d = _turned_by(before, 0, i, p, d)
                 if arrives:
                     arrives, p, d = past(before, 1, i, p, d)
-                if not arrives:
+                if arrives:
+                    arrives, _, p, n = met(first, p, d, work)
+                    cos = to_lens * (d[0] * n[0] + d[1] * n[1] + d[2] * n[2])
+                if not arrives or cos <= 0:
                     continue  # it misses the lens
-                if glass.mirror:
-                    s, met = _to_net(net, p, d, work)
-                else:
-                    s, met = _to_front(front, p, d, work)
-                p = (p[0] + s * d[0], p[1] + s * d[1], p[2] + s * d[2])
-                if not met or s < 0 or not inside(back_border if glass.mirror else front_border, p[0], p[1]):
-                    continue  # it misses the lens
-                if glass.mirror:
-                    _, z_x, z_y = height(net, p[0], p[1], work)
-                else:
-                    _, z_x, z_y = face_height(front, p[0], p[1], work)
-                size = math.sqrt(1 + z_x * z_x + z_y * z_y)
-                n = (-z_x / size, -z_y / size, 1 / size)
-                cos = to_lens * (d[0] * n[0] + d[1] * n[1] + d[2] * n[2])
-                if cos <= 0:
-                    continue
             if glass.mirror:
                 e = (d[0] + 2 * cos * n[0], d[1] + 2 * cos * n[1], d[2] + 2 * cos * n[2])
                 if glass.fresnel:
@@ -679,17 +682,13 @@ def trace(points, area, light, front, front_border, net, back_border, glass, scr
                 ledger[4] += rest - kept
                 rest = kept
                 inner = refracted(d, n, eta, cos, cos_out)
-                s, met = _to_net(net, p, inner, work)
-                p = (p[0] + s * inner[0], p[1] + s * inner[1], p[2] + s * inner[2])
-                if not met or s < 0 or not inside(back_border, p[0], p[1]):
+                arrives, s, p, m = met(back, p, inner, work)
+                if not arrives:
                     ledger[2] += rest
                     continue
                 kept = rest * math.exp(-absorbed * s)
                 ledger[5] += rest - kept
                 rest = kept
-                _, b_x, b_y = height(net, p[0], p[1], work)
-                size = math.sqrt(1 + b_x * b_x + b_y * b_y)
-                m = (-b_x / size, -b_y / size, 1 / size)
                 cos_in = inner[0] * m[0] + inner[1] * m[1] + inner[2] * m[2]
                 cos2 = 1 - index * index * (1 - cos_in * cos_in)
                 if cos2 <= 0 or cos_in <= 0:
@@ -721,34 +720,6 @@ def trace(points, area, light, front, front_border, net, back_border, glass, scr
                 ledger[1] += rest
 
 
-@njit(nogil=True, cache=True)
-def _to_net(net, p, d, work):
-    """(s in mm, met): the path from p along d to the net, by Newton's iteration."""
-    z, _, _ = height(net, p[0], p[1], work)
-    s = (z - p[2]) / d[2]
-    for _ in range(30):
-        z, z_x, z_y = height(net, p[0] + s * d[0], p[1] + s * d[1], work)
-        step = (p[2] + s * d[2] - z) / (d[2] - z_x * d[0] - z_y * d[1])
-        s -= step
-        if abs(step) < 1e-11:
-            return s, True
-    return s, False
-
-
-@njit(nogil=True, cache=True)
-def _to_front(front, p, d, work):
-    """(s in mm, met): the path from p along d to the front, by Newton's iteration."""
-    z, _, _ = face_height(front, p[0], p[1], work)
-    s = (z - p[2]) / d[2]
-    for _ in range(30):
-        z, z_x, z_y = face_height(front, p[0] + s * d[0], p[1] + s * d[1], work)
-        step = (p[2] + s * d[2] - z) / (d[2] - z_x * d[0] - z_y * d[1])
-        s -= step
-        if abs(step) < 1e-11:
-            return s, True
-    return s, False
-
-
 # --- the judgement ---------------------------------------------------------------------------------------------------
 
 
@@ -758,13 +729,6 @@ def paired(pictures, target):
     count, whole, own = len(errors), errors.sum(0), (errors**2).sum()
     square = (whole @ whole - own) / (count * (count - 1)) / (target @ target)
     return math.copysign(math.sqrt(abs(square)), square)
-
-
-def rrmsd_of(pictures, target):
-    """(RRMSD, its standard error by the jackknife)."""
-    left = np.array([paired(np.delete(pictures, k, axis=0), target) for k in range(len(pictures))])
-    error = math.sqrt((len(left) - 1) * left.var())
-    return paired(pictures, target), error
 
 
 class Draw(NamedTuple):
@@ -831,21 +795,20 @@ def judge(folder, points=POINTS, seed=31, number=0, most=None):
     with np.load(folder / "design.npz") as kept:
         target = kept["target" if number == 0 else f"target_{number + 1}"].astype(float)
     (nets, of_name, lower), glass = nets_of(folder, scene), glass_of(scene)
-    net, back_border = nets["back"], border_of(of_name["back"])
-    given = scene["lens"]["front"]
-    front, front_border, vertex = Front(False, Conic(0.0, 0.0, 0.0), net), back_border, scene["lens"]["back"]["z"]
+    back = Face(True, Conic(0.0, 0.0, 0.0), nets["back"], border_of(of_name["back"]))
+    first, vertex = back, scene["lens"]["back"]["z"]
     if not glass.mirror:
-        vertex, face = given["z"], of_name["front"]
-        front_border = border_of(face)
+        face, vertex = of_name["front"], scene["lens"]["front"]["z"]
+        first = back._replace(border=border_of(face))
         if "front" in nets:
-            front = front._replace(free=True, net=nets["front"])
+            first = first._replace(net=nets["front"])
         else:
-            front = front._replace(conic=conic_of(face, vertex, lower))
+            first = first._replace(free=False, conic=conic_of(face, vertex, lower))
     to_lens, wavelengths = -1.0 if glass.mirror else 1.0, [line[1] for line in glass.lines]
     sense = to_lens * (-1.0) ** sum(table["kind"] == "mirror" for table in scene.get("before", []))
     before = around_of(scene.get("before", []), sense, wavelengths)
     behind = around_of(scene.get("behind", []), 1.0, wavelengths)
-    low, high = front_border.segments[:, :2].min(0), front_border.segments[:, :2].max(0)
+    low, high = first.border.segments[:, :2].min(0), first.border.segments[:, :2].max(0)
     if len(before.bends):
         vertex, low, high = before.vertices[0, 2], -before.rims[0], before.rims[0]
     light = light_of(scene["source"], sense, float(vertex))
@@ -859,17 +822,17 @@ def judge(folder, points=POINTS, seed=31, number=0, most=None):
     def follow(k, count):
         for start in range(0, count, CHUNK):
             at, area = draw.points(engines[k].random(min(CHUNK, count - start)))
-            trace(
-                at, area, light, front, front_border, net, back_border, glass, screen, before, behind, pictures[k],
-                ledgers[k],
-            )  # fmt: skip
+            trace(at, area, light, first, back, glass, screen, before, behind, pictures[k], ledgers[k])
 
     most, traced, more = most or (MAX_POINTS if points >= POINTS else points), 0, points
     with ThreadPoolExecutor(min(SETS, os.cpu_count() or 1)) as pool:
         while True:
             list(pool.map(follow, range(SETS), [more] * SETS))
             traced += more
-            rrmsd, error = rrmsd_of(pictures.reshape(SETS, -1), target.ravel())
+            sets = pictures.reshape(SETS, -1)
+            rrmsd = paired(sets, target.ravel())
+            left_out = np.array([paired(np.delete(sets, k, axis=0), target.ravel()) for k in range(SETS)])
+            error = math.sqrt((SETS - 1) * left_out.var())  # the jackknife
             if error <= ACCURACY * rrmsd or 2 * traced > most:
                 break
             more = traced

@@ -16,12 +16,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from scipy.spatial import cKDTree
+from skimage import data
+
 from bstcad.optics.measure import Effort, rrmsd_by_rays
 from bstcad.optics.sides import both, coarser, spread
 from bstcad.pipeline import design
 from bstcad.scene.scene import Scene, load
 from tests.benchmarks.cold import TEMPLATES
-from tests.benchmarks.pictures import drawn
 
 FIGURES = Path(__file__).with_name("net_choice.json")
 NETS = (129, 257, 513, 1025)
@@ -39,11 +42,11 @@ WIDE = {
 
 @dataclass(frozen=True)
 class Case:
-    """A template with another picture (pictures.py) and other values."""
+    """A template with another picture (`drawn`) and other values."""
 
     name: str
     template: str
-    picture: str = ""  # "": the template's
+    picture: str = ""  # "": that of the template
     changes: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -61,6 +64,41 @@ CASES = (
     Case("coffee", LAMP, "coffee", EVEN),
     Case("wide-portrait", CAUSTIC, "", WIDE),
 )
+
+
+def strokes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Fourteen lit strokes on a dim ground, each a parabola through three places."""
+    draw, away, along = np.random.default_rng(2), np.full(x.shape, np.inf), np.linspace(0, 1, 400)[:, None]
+    for _ in range(14):
+        first, last, middle = draw.uniform(-0.9, 0.9, (3, 2))
+        stroke = (1 - along) ** 2 * first + 2 * along * (1 - along) * middle + along**2 * last
+        away = np.minimum(away, cKDTree(stroke).query(np.stack((x, y), -1))[0])
+    return 0.08 + np.exp(-((away / 0.015) ** 4))
+
+
+def frame(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A lit square frame on a dark ground."""
+    out = np.maximum(np.abs(x), np.abs(y))
+    return np.where((out > 0.6) & (out < 0.85), 1.05, 0.05)
+
+
+PATTERNS = {  # on the square from -1 to 1 along x (to the right) and y (up)
+    "many strokes": strokes,
+    "frame": frame,
+    "checks": lambda x, y: np.where((np.floor(4 * x) + np.floor(4 * y)) % 2, 1.0, 0.15),
+    "slope": lambda x, y: 0.1 + 0.9 * (x + 1) / 2,
+    "star": lambda x, y: np.where(np.hypot(x, y) < 0.55 + 0.35 * np.cos(5 * np.arctan2(x, y)), 1.0, 0.05),
+    "spots": lambda x, y: 0.05 + np.exp(4 * (np.cos(9 * x) * np.cos(9 * y) - 1)),
+}
+
+
+def drawn(name: str) -> np.ndarray:
+    """Irradiance of a pattern, or of a picture that scikit-image brings along; row 0 is the top."""
+    if name in PATTERNS:
+        y, x = np.mgrid[1:-1:512j, -1:1:512j]
+        return PATTERNS[name](x, y)
+    picture = np.asarray(getattr(data, name)(), dtype=float)
+    return picture.mean(2) if picture.ndim == 3 else picture
 
 
 def scene_of(case: Case, half: bool) -> Scene:

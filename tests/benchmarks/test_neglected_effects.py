@@ -13,6 +13,7 @@ import pytest
 from bstcad import pipeline
 from bstcad.analysis.neglected_effects import difference
 from bstcad.optics import media
+from bstcad.optics.channels import channels_of
 from bstcad.optics.measure import tubes_picture
 from bstcad.optics.trace import ghost_light
 from bstcad.scene.effects import Absorption, Fresnel
@@ -26,7 +27,6 @@ SAMPLES, LINES = 12, 6  # points of a source that is given a size, lines of a sp
 FACTOR = 2.0
 NOTHING = {"flux_change": 1e-3, "rrmsd_change": 2e-3, "blur_pixels": 0.05}  # differences of pictures below it are noise
 ROUGH = {("disk", "ghost", "rrmsd_change")}  # that ghost gathers to a spot, 0.0024; the coarse lens spreads it, 0.0005
-GOLDEN = np.pi * (3 - 5**0.5)
 
 
 def scaled(picture, target):
@@ -47,10 +47,9 @@ def switched_on(scene, kind):
                         index=media.refractive_index(scene.lens.material, line))
                 for channel in channels for line in lines.tolist()]  # fmt: skip
     if kind == "source size":
-        turn, far = GOLDEN * np.arange(SAMPLES), np.sqrt((np.arange(SAMPLES) + 0.5) / SAMPLES)
-        places = list(zip((far * np.cos(turn)).tolist(), (far * np.sin(turn)).tolist(), strict=True))
-        return [replace(channel, source=at(wide(scene, channel.source), *place), weight=channel.weight / SAMPLES)
-                for channel in channels for place in places]  # fmt: skip
+        return [replace(channel, source=point.source, weight=channel.weight * point.weight)
+                for channel in channels
+                for point in channels_of(wide(scene, channel.source), lambda nm: 1.0, SAMPLES)]  # fmt: skip
     return None
 
 
@@ -59,11 +58,6 @@ def wide(scene, source):
     if scene.source.kind == "point":
         return replace(source, diameter=scene.source.real_diameter or DIAMETER)
     return replace(source, divergence=scene.source.real_divergence or DIVERGENCE)
-
-
-def at(source, u, v):
-    """The point of an extended source at (u, v) of its radius."""
-    return source.element(source.extent.radius * u, source.extent.radius * v)
 
 
 def picture_of(scene, lens, channels):

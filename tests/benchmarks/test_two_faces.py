@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 import tomllib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,9 +12,9 @@ import torch
 from bstcad import folder as folders
 from bstcad.optics.wavefront import NM
 from bstcad.optics.wavefront_error import followed
-from tests.optics.beam_shaper import BeamShaper
+from tests.benchmarks.beam_shaper import BeamShaper
+from tests.benchmarks.cold import TEMPLATES, generate
 
-ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.bench
 
 RRMSD = {  # of each target of the template
@@ -33,11 +29,9 @@ LANDING, PATH = 1e-9, 1e-6  # mm: batoid against bstcad
 @pytest.fixture(scope="module", params=RRMSD)
 def made(request, tmp_path_factory):
     """(name, scene, lens, report) of a template, made by the command and read back from its folder."""
-    folder = tmp_path_factory.mktemp(request.param) / "made"
-    scene = ROOT / "templates" / f"{request.param}.toml"
-    subprocess.run([sys.executable, "-m", "bstcad.cli", "generate", scene, "--output", folder], check=True)
-    scene, nominal = folders.read_nominal(folder)
-    return request.param, scene, nominal.lens, json.loads((folder / "report.json").read_text())
+    run = generate(request.param, tmp_path_factory.mktemp(request.param) / "made")
+    scene, nominal = folders.read_nominal(run.folder)
+    return request.param, scene, nominal.lens, run.report()
 
 
 def test_a_template_keeps_its_errors(made):
@@ -62,15 +56,13 @@ def test_batoid_finds_the_same_places_and_paths(made):
 
 def test_letters_near_by_and_a_portrait_behind_them(tmp_path):
     """White letters on black, whose light makes a portrait further on: the hardest pair of pictures."""
-    scene = tomllib.loads((ROOT / "templates" / "two_pictures.toml").read_text())
+    scene = tomllib.loads((TEMPLATES / "two_pictures.toml").read_text())
     near, far = scene["target"]
     del near["sample"]
     near["text"], scene["lens"]["back"]["z"], near["z"], far["z"] = "THU", 160.0, 260.0, 400.0
     scene["accept"]["rrmsd"] = 0.06
-    path, folder = tmp_path / "letters.toml", tmp_path / "made"
-    path.write_text(tomli_w.dumps(scene))
-    subprocess.run([sys.executable, "-m", "bstcad.cli", "generate", path, "--output", folder], check=True)
-    report = json.loads((folder / "report.json").read_text())
+    (tmp_path / "letters.toml").write_text(tomli_w.dumps(scene))
+    report = generate(tmp_path / "letters.toml", tmp_path / "made").report()
     print("letters", [target["rrmsd"] for target in report["goals"]], "seconds", report["seconds_total"])
     assert all(target["rrmsd"] <= 0.06 for target in report["goals"]) and report["verdict"] != "failed"
 
@@ -83,6 +75,8 @@ def test_the_beam_shaper_is_the_quadrature_s(made):
     """
     name, scene, lens, _ = made
     shaper = BeamShaper(5.0, 7.0, 6.0, 1.457, 20.0)
+    *laws, slope = shaper.errors(np.linspace(1e-3, shaper.aperture, 2000))
+    assert max(laws) < 1e-12 and slope < 1e-8
     (channel, *_) = scene.channels()
     lens, source = channel.through(lens.plain()), channel.source
     r, turn = torch.meshgrid(

@@ -29,11 +29,6 @@ class BeamShaper:
     index: float  # n
     thickness: float  # T
 
-    def __post_init__(self):
-        with np.errstate(invalid="ignore"):
-            if np.isnan(self.in_glass(np.linspace(0, self.aperture, 1000))[1]).any():
-                raise ValueError(f"no ray goes so far aside in {self.thickness:g} mm; take a thicker lens")
-
     @property
     def lost(self):
         """The share of the whole Gaussian beam outside the aperture: exp(-2 a² / w²)."""
@@ -72,7 +67,7 @@ class BeamShaper:
         return self.index * self.thickness + plane - self.thickness
 
     def errors(self, r):
-        """The largest errors at r > 0 of the two faces: Snell's law at front and back, and the path (mm).
+        """The largest errors at r > 0: Snell's law at front and back, the path (mm), the slope of the front.
 
         Snell: n d x N - n' d' x N, with the ray drawn from the point on the front to that on the back.
         """
@@ -82,4 +77,6 @@ class BeamShaper:
         across, along = (landing - r) / length, (back - front) / length
         snell = [(n * (across + along * s) - s) / np.hypot(1, s) for s in (front_slope, back_slope)]
         off = front + n * length + (self.thickness - back) - n * self.thickness
-        return tuple(float(np.abs(error).max()) for error in (*snell, off))
+        step = 1e-5  # mm, for slopes as differences of the heights
+        rise = (self.front(r + step)[0] - self.front(r - step)[0]) / (2 * step) - front_slope
+        return tuple(float(np.abs(error).max()) for error in (*snell, off, rise))

@@ -1,0 +1,87 @@
+"""docs/accuracy.md and docs/published.md are what their records give, and every piece of them is recorded."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from bstcad.report.drawing import HEAVIEST
+from bstcad.scene.scene import load
+from tests.benchmarks import accuracy, published
+from tests.benchmarks.mitsuba_caustic import VERTICES, control_net
+
+KNOWN, PUBLISHED = accuracy.known(), published.known()
+
+
+def test_each_page_is_what_its_records_give():
+    """Else: python -m tests.benchmarks.accuracy --only, or published --only, which writes it anew."""
+    assert accuracy.PAGE.read_text(encoding="utf-8") == accuracy.page(KNOWN)
+    assert published.PAGE.read_text(encoding="utf-8") == published.page(PUBLISHED, KNOWN)
+
+
+def test_every_piece_is_recorded_with_its_circumstances_and_pictures():
+    for piece in accuracy.pieces(600.0, 600.0).values():
+        record = piece.find(KNOWN)
+        assert record and {"date", "version", "machine", "versions", "others"} == set(record["recorded"])
+    pictures = [accuracy.PAGE.with_name(name) for name in accuracy.FIGURES.values()]
+    for name, found in PUBLISHED.items():
+        pictures.append(published.PICTURES / f"{name}.png")
+        assert Image.open(pictures[-1]).size == (2 * published.SIDE + published.GAP, published.SIDE)
+        assert found["stated"] == pytest.approx(found["rrmsd"], rel=0.01) and found["error"] < 0.01 * found["rrmsd"]
+    assert list(PUBLISHED) == list(published.CASES) and all(path.stat().st_size < HEAVIEST for path in pictures)
+
+
+def test_mitsuba_the_paper_and_the_knobs_stand_on_the_axes_of_one_figure():
+    [axes] = accuracy.figure(KNOWN, accuracy.PEER).axes
+    named = {text.get_text().partition(":")[0] for text in axes.get_legend().get_texts()}
+    assert {"Mitsuba 3", "the same, on its own 128² pixels"} <= named
+    assert "the procedure of Wang et al. 2023" in [text.get_text() for text in axes.texts]
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    for point in KNOWN["mitsuba"]["points"]:
+        assert left < point["seconds"] < right and low < point["rrmsd"] < high
+
+
+def test_only_what_is_missing_of_another_version_or_named_is_recorded():
+    pieces = accuracy.pieces(600.0, 600.0)
+    named = accuracy.wanted(pieces, ["thu-*", "mitsuba"], KNOWN)
+    assert named[:2] == ["thu-draft", "thu-standard"] and named[-1] == "mitsuba" and len(named) == 7
+    with pytest.raises(SystemExit, match="no piece is called mitzuba"):
+        accuracy.wanted(pieces, ["mitzuba"], KNOWN)
+    known: dict = {}
+    for piece in pieces.values():
+        piece.keep(known, {"recorded": {"version": "another"}})
+    again = accuracy.wanted(pieces, None, known)
+    assert {"thu-draft", "sweep-thu"} <= set(again) and not {"thu-paper", "mitsuba"} & set(again)
+    del known["mitsuba"]
+    assert "mitsuba" in accuracy.wanted(pieces, None, known)
+
+
+def test_the_surface_of_a_mesh_has_its_vertex_normals_as_slopes():
+    """A wavy height map: at inner vertices the slope is the mean over the facets around."""
+    x = np.linspace(-50.0, 50.0, VERTICES)
+    pitch = x[1] - x[0]
+    heights = 0.05 * np.sin(0.4 * x)[None, :] * np.cos(0.3 * x)[:, None]  # y along the first axis
+    assert control_net(heights).shape == (VERTICES + 1, VERTICES + 1)
+    back, inner = accuracy.with_heights(heights).back, torch.from_numpy(x[2:-2])
+    ours = back.relative_sag_and_slope(*torch.meshgrid(inner, inner, indexing="ij"))[1].numpy().T
+    across = (heights[:, 2:] - heights[:, :-2]) / (2 * pitch)
+    mean = ((across[:-2] + 2 * across[1:-1] + across[2:]) / 4)[1:-1, 1:-1]
+    assert np.abs(ours - mean).max() < 1e-12 and np.abs(mean).max() > 0.019
+
+
+def test_the_sunlight_picture_stands_in_its_border_and_every_scene_can_be_read(tmp_path):
+    """A picture of the size of diffinytrace's, of which the middle square is shown."""
+    values = np.full((1200, 1600), 10, np.uint8)
+    values[:, 200:1400] = 200
+    Image.fromarray(values).save(tmp_path / "given.png")
+    made = published.bordered(tmp_path / "given.png")
+    shown = np.asarray(made).astype(int)
+    assert shown.shape == (256, 256) and (shown[22:-22, 22:-22] == 200).all() and shown.sum() == 200 * 212**2
+    made.save(tmp_path / "sun_picture.png")
+    for name, (_, path) in published.CASES.items():
+        if name == published.SUN:
+            (tmp_path / path.name).write_text(path.read_text(encoding="utf-8"), encoding="utf-8")
+            path = tmp_path / path.name
+        assert load(path).target.irradiance().sum() > 0
