@@ -143,8 +143,6 @@ class TestReading:
         "missing": lambda path: path.unlink(),
         "empty": lambda path: path.write_bytes(b""),
         "truncated": lambda path: path.write_bytes(path.read_bytes()[:-3000]),
-        "half": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
-        "no archive": lambda path: path.write_bytes(b"lens, lens, lens" * 100),
         "a bare array": lambda path: np.save(path.open("wb"), np.zeros((33, 33, 3))),
         "pickle": lambda path: path.write_bytes(pickle.dumps({"control_points": 1})),
         "folder": lambda path: (path.unlink(), path.mkdir()),
@@ -153,14 +151,11 @@ class TestReading:
     NET = np.zeros((33, 33, 3))
     ARRAYS = {
         "pickled objects": {"control_points": np.array([{"a": 1}], dtype=object)},
-        "oblong net": {"control_points": NET[:20]},
         "net of another size": {"control_points": NET[:17, :17]},
         "net with NaN": {"control_points": NET * np.nan},
         "net of words": {"control_points": NET.astype(str)},
-        "complex net": {"control_points": NET + 1j},
         "target of another size": {"target": np.ones((32, 32)) / 1024},
         "target with NaN": {"target": np.full((48, 64), np.nan)},
-        "black target": {"target": np.zeros((48, 64))},
         "curvature NaN": {"front_curvature": np.nan},
         "two curvatures": {"front_curvature": np.zeros(2)},
     }
@@ -175,21 +170,11 @@ class TestReading:
             folders.read_nominal(folder)
         assert "\n" not in str(caught.value)
 
-    @pytest.mark.parametrize("name", ["control_points", "front_curvature", "target"])
-    def test_a_missing_array_is_named(self, folder, name):
+    def test_a_missing_array_is_named(self, folder):
         path = folder / "design.npz"
         with np.load(path) as data:
-            np.savez_compressed(path, **{key: data[key] for key in data.files if key != name})
-        with pytest.raises(SceneError, match=name):
-            folders.read_nominal(folder)
-
-    def test_a_missing_or_wrong_scene_is_one_sentence(self, folder):
-        text = (folder / "scene.toml").read_text()
-        (folder / "scene.toml").write_text(text.replace("pixels", "pixel"))
-        with pytest.raises(SceneError, match="did you mean 'pixels'"):
-            folders.read_nominal(folder)
-        (folder / "scene.toml").unlink()
-        with pytest.raises(SceneError, match="no such scene file"):
+            np.savez_compressed(path, **{key: data[key] for key in data.files if key != "control_points"})
+        with pytest.raises(SceneError, match="control_points"):
             folders.read_nominal(folder)
 
 
