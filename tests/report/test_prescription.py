@@ -110,9 +110,7 @@ def test_a_plane_has_no_radius_and_an_index_no_mass(small_design):
     assert "infinite" in text and "not known" in text and "not named" in text
 
 
-@pytest.mark.parametrize(
-    ("material", "mass"), [("N-LAK33A", 2.11), ("main/CaF2/Malitson", 1.59), ("other/Optorez1330/Sultanova", None)]
-)
+@pytest.mark.parametrize(("material", "mass"), [("N-LAK33A", 2.11), ("other/Optorez1330/Sultanova", None)])
 def test_the_mass_is_known_where_the_density_is(small_design, material, mass):
     scene, nominal = read_nominal(small_design.folder)
     other = scene.model_copy(update={"lens": scene.lens.model_copy(update={"material": material})})
@@ -122,16 +120,11 @@ def test_the_mass_is_known_where_the_density_is(small_design, material, mass):
     assert material in text and ("not known: the density is not" in text) == (mass is None)
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {},
-        {"lens.min_thickness": 8.0},  # more than half of the blank, which the search keeps anyhow
-        {"source.position": [0.0, 0.0, 13.5]},
-        {"lens.front.curvature": 0.03, "lens.min_thickness": 8.0},
-    ],
-    ids=["nothing asked", "a thick rim", "a source near the rim", "a curvature of its own"],
-)
+@pytest.mark.parametrize("changes", [
+    {},
+    {"source.position": [0.0, 0.0, 13.5]},  # near the rim
+    {"lens.front.curvature": 0.03, "lens.min_thickness": 8.0},  # more than half of the blank
+], ids=str)  # fmt: skip
 def test_a_front_that_is_found_is_one_that_the_scene_may_have(changes):
     """At either end of what the search may try, and that is no small part of what is possible."""
     scene = load(DISK, FREE | changes)
@@ -140,10 +133,7 @@ def test_a_front_that_is_found_is_one_that_the_scene_may_have(changes):
     low, high = min(low, scene.lens.front.curvature), max(high, scene.lens.front.curvature)
     for curvature in (low, high):
         scene.changed({"lens.front.curvature": curvature})
-    beyond = 0
+    assert low < 0 < high
     for curvature in (1.02 * low, 1.02 * high):
-        try:
+        with pytest.raises(SceneError):
             scene.changed({"lens.front.curvature": curvature})
-        except SceneError:
-            beyond += 1
-    assert low < 0 < high and beyond == 2
