@@ -22,7 +22,7 @@ NAME = r"[1-9]\d{0,17}"  # an entity's number: one of 64 bits
 REAL = r"[-+]?\d+\.\d*(?:E[-+]?\d+)?"
 COORDINATE = rf"[-+]?\d{{1,{MAX_DIGITS}}}\.\d{{0,{MAX_DIGITS}}}(?:E[-+]?\d{{1,4}})?"
 BLANKS = bytes(code for code in range(256) if chr(code).isspace())
-STRING = re.compile(r"'[^']*(?:''[^']*)*'")
+STRING = re.compile(r"'[^']*(?:''[^']*)*'|/\*.*?(?:\*/|\Z)", re.DOTALL)  # or a comment, in which a quote means nothing
 POINT = re.compile(rf"(?<=;)#({NAME})=CARTESIAN_POINT\('\d*',\(({COORDINATE},{COORDINATE},{COORDINATE})\)\);")
 STATEMENT = re.compile(rf"#({NAME})=([A-Z][A-Z_0-9]*)?(\(.*\))", re.DOTALL)
 TOKENS = re.compile(  # tokens without blanks: separators, references, numbers, strings, enumerations, keywords
@@ -65,12 +65,14 @@ class Entities:
 
 
 def without_blanks(text: str) -> tuple[str, list[str]]:
-    """(the text without blanks, the strings): each string in it gives way to its place in the list, '' stays."""
+    """(the text without comments and blanks, the strings): a string gives way to its place in the list, '' stays."""
     strings: list[str] = []
 
     def numbered(hit: re.Match[str]) -> str:
-        if len(hit[0]) == 2:
-            return "''"
+        if hit[0].startswith("/*"):
+            return ""
+        if hit[0] == "''":
+            return hit[0]
         strings.append(hit[0][1:-1])
         return f"'{len(strings) - 1}'"
 
@@ -78,10 +80,8 @@ def without_blanks(text: str) -> tuple[str, list[str]]:
     return data.encode("latin-1", "replace").translate(None, BLANKS).decode("latin-1"), strings
 
 
-def read_entities(data: str, strings: Sequence[str], numbers: np.ndarray, xyz: np.ndarray) -> Entities:
-    """Read the statements of the DATA section; numbers, xyz: of the points that are taken out of the data."""
-    from bstcad.step_text import points
-
+def read_entities(data: str, strings: Sequence[str]) -> Entities:
+    """Read the statements of the DATA section."""
     start, end = data.find("DATA;"), data.rfind("ENDSEC;")
     if not 0 <= start < end:
         raise damaged("it has no DATA section")
@@ -92,12 +92,12 @@ def read_entities(data: str, strings: Sequence[str], numbers: np.ndarray, xyz: n
     if tail or not hits or None in hits:
         raise damaged("a statement is no entity")
     _check_tokens(rest, hits)
-    numbers = np.concatenate([numbers, np.fromstring(",".join(names), dtype=np.int64, sep=",")])
-    xyz = np.concatenate([xyz, np.fromstring(",".join(values), dtype=np.float64, sep=",").reshape(-1, 3)])
+    numbers = np.fromstring(",".join(names), dtype=np.int64, sep=",")
+    xyz = np.fromstring(",".join(values), dtype=np.float64, sep=",").reshape(-1, 3)
     known = np.sort(np.concatenate([numbers, np.array([hit[1] for hit in hits], dtype=np.int64)]))
     if not (np.diff(known) > 0).all():
         raise damaged("two entities share a number")
-    named = points.references(rest.encode("latin-1"))
+    named = np.fromstring(",".join(re.findall(r"#(\d+)", rest)), dtype=np.int64, sep=",")
     missing = named[known[np.searchsorted(known, named).clip(max=len(known) - 1)] != named]
     if len(missing):
         raise damaged(f"entity #{missing.min()} is missing")

@@ -162,13 +162,10 @@ def parse(text: bytes | str) -> StepText:
 def _parse(text: bytes) -> StepText:
     if (fault := beginning.fault(text)) is not None:
         raise ValueError(fault)
-    from bstcad.step_text import points  # with numba, which a scene without a STEP file need not load
-
     if b"END-ISO-10303-21;" not in text[-200:]:
         raise ValueError("the file is truncated (no END-ISO-10303-21 at its end); write or copy it again")
-    rest, *taken = points.taken_out(text)
-    data, strings = without_blanks(rest.decode("latin-1"))  # Part 21 is ASCII; latin-1 never fails
-    entities = read_entities(data, strings, *taken)
+    data, strings = without_blanks(text.decode("latin-1"))  # Part 21 is ASCII; latin-1 never fails
+    entities = read_entities(data, strings)
     lengths, angles = (_units(kind, entities) for kind in ("LENGTH", "PLANE_ANGLE"))
     if len(lengths) != 1:
         raise ValueError(f"{len(lengths)} units of length ({', '.join(lengths)}); export it in millimetres only")

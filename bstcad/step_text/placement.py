@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 ON_AXIS = 1e-9  # mm; a net that lies on its uniform grid and about the axis more closely than this is not moved
 FLAT = 1e-7  # mm, RMS; a net that departs by less from a plane has the normal of that plane
@@ -64,17 +65,9 @@ class Placement:
     @property
     def turn(self) -> tuple[float, np.ndarray]:
         """(angle in degrees, 0 to 180; the unit vector (3,) about which it turns)."""
-        r = self.rotation
-        sine = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]) / 2  # sine of the angle, on the axis
-        angle = math.atan2(math.sqrt(sine @ sine), (np.trace(r) - 1) / 2)
-        if angle < math.pi / 2:
-            about = sine
-        else:  # where the sine vanishes: R + R' = 2 cos + 2 (1 - cos) a a'
-            outer = (r + r.T) / 2 - math.cos(angle) * np.eye(3)
-            about = outer[np.abs(np.diag(outer)).argmax()]
-            about = about if about @ sine >= 0 else -about
-        length = math.sqrt(about @ about)
-        return math.degrees(angle), about / length if length > 0 else np.array([0.0, 0.0, 1.0])
+        about = Rotation.from_matrix(self.rotation).as_rotvec()
+        angle = math.sqrt(about @ about)
+        return math.degrees(angle), about / angle if angle > 0 else np.array([0.0, 0.0, 1.0])
 
     @property
     def words(self) -> str:
