@@ -27,7 +27,7 @@ from numba import njit
 from bstcad.optics import tubes
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
-from bstcad.optics.surfaces import EQUATOR, Surface, sag
+from bstcad.optics.surfaces import EQUATOR, Surface, sag, sampled
 from bstcad.runs import files
 from bstcad.scene.scene import SINGLE
 
@@ -102,12 +102,6 @@ def nodes(outline: Outline, cells: int) -> tuple[np.ndarray, np.ndarray]:
     """x and y (mm) of a square grid of nodes, (cells + 1, cells + 1), whose rim lies on the outline."""
     x, y = tubes.corners(outline, cells)
     return x.numpy(), y.numpy()
-
-
-def sampled(surface: Surface, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
-    """z (mm), ∂z/∂x and ∂z/∂y of a face at points (mm)."""
-    values = surface.plain().sag_and_slope(*(torch.from_numpy(np.ravel(p).copy()) for p in (x, y)))
-    return [np.broadcast_to(value.numpy(), x.size).reshape(x.shape) for value in values]
 
 
 def _triangles(grid: np.ndarray, rising: np.ndarray) -> np.ndarray:
@@ -251,11 +245,11 @@ def vertex_error(mesh: Mesh, lens: Lens) -> float:
 
     Along z the rounding of x and y would count |∇z| times.
     """
-    x, y, z = (torch.from_numpy(np.ascontiguousarray(p)) for p in mesh.vertices.T)
+    x, y, z = mesh.vertices.T
 
     def off(face: Surface) -> np.ndarray:
-        height, p, q = face.plain().sag_and_slope(x, y)
-        return ((height - z).abs() / torch.sqrt(1 + p**2 + q**2)).numpy()
+        height, p, q = sampled(face, x, y)
+        return np.abs(height - z) / np.sqrt(1 + p**2 + q**2)
 
     return float(np.minimum(off(lens.back), off(lens.front)).max())
 
@@ -374,7 +368,7 @@ METRE = 1e-3  # of a mm: the unit of glTF, whose y points up
 VERTEX = b'<vertex x="%.10g" y="%.10g" z="%.10g"/>\n'
 TRIANGLE = b'<triangle v1="%d" v2="%d" v3="%d"/>\n'
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-PROBES = 4096  # places of the hash table that a corner may find taken; half of the table is free
+ODD = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0xD6E8FEB86659FD93], np.uint64)  # factors of a corner's key
 STL_HEADER = b"bstcad, binary STL, lengths in mm"  # must not begin with "solid"
 LINE = 90  # bytes of a line of a 3MF model at most
 CLEAR, SILVER = "#A9D3EE80", "#C9CED4FF"  # red, green, blue (sRGB) and opacity: clear material, a mirror
@@ -424,42 +418,10 @@ def read_stl(path: str | Path) -> Mesh:
         raise ValueError(f"{path.name}: a corner is not finite; write it again")
     corners = np.ascontiguousarray(corners) + np.float32(0)  # -0 becomes 0
     bits = corners.view(np.uint32)
-    first, same = _welded(bits)
-    if not len(same):  # by sorting: two million triangles in 2 s, by hash in 0.2 s
+    _, first, same = np.unique((bits * ODD).sum(axis=1), return_index=True, return_inverse=True)
+    if not np.array_equal(bits[first[same]], bits):  # two corners of one key, which no surface has by accident
         _, first, same = np.unique(bits, axis=0, return_index=True, return_inverse=True)
     return Mesh(corners[first].astype(np.float64), same.reshape(-1, 3))
-
-
-@njit(cache=True, nogil=True)
-def _welded(bits):
-    """(first corner of each group of equal ones, group of each corner) of float32 corners (n, 3) as uint32, by hash.
-
-    Both empty where a corner finds PROBES places taken, which no surface does by accident.
-    """
-    size = 1 << 16
-    while size < 2 * len(bits):
-        size *= 2
-    table, first, same = np.full(size, -1, np.int32), np.empty(len(bits), np.int32), np.empty(len(bits), np.int32)
-    count = 0
-    for k in range(len(bits)):
-        x, y, z = bits[k, 0], bits[k, 1], bits[k, 2]
-        key = np.uint64(x) * np.uint64(0x9E3779B97F4A7C15)  # odd factors of no structure
-        key += np.uint64(y) * np.uint64(0xC2B2AE3D27D4EB4F) + np.uint64(z) * np.uint64(0xD6E8FEB86659FD93)
-        slot = np.int64((key ^ (key >> np.uint64(32))) & np.uint64(size - 1))
-        for probe in range(PROBES + 1):
-            if probe == PROBES:
-                return first[:0], same[:0]
-            group = table[slot]
-            if group < 0:
-                group = table[slot] = count
-                first[count] = k
-                count += 1
-            other = first[group]
-            if bits[other, 0] == x and bits[other, 1] == y and bits[other, 2] == z:
-                break
-            slot = (slot + 1) & (size - 1)
-        same[k] = group
-    return first[:count].copy(), same
 
 
 # ---- 3MF -----------------------------------------------------------------------------------------------------------

@@ -82,7 +82,7 @@ def write(
     shape: cadquery.Shape | TopoDS_Shape, path: str | Path, name: str, part: Part = NOTHING, faces: Sequence[str] = (),
     properties: MassProperties | None = None,
 ) -> None:  # fmt: skip
-    """Write the shape (cadquery's or OCC's) as STEP in mm: see `encode`."""
+    """Write the shape (cadquery's or OCC's) as STEP in mm: see `encoded`."""
     with Path(path).open("wb") as file:
         file.writelines(encoded(shape, name, part, faces=faces, properties=properties))
 
@@ -98,14 +98,6 @@ def write_lens(
     part = part or Part(colour=GLASS if lens.passes.enters else METAL)
     shape, faces = lens_shape(lens)
     write(shape, path, name, part, faces=faces, properties=properties or quadrature.of_lens(lens))
-
-
-def encode(
-    shape: cadquery.Shape | TopoDS_Shape, name: str, part: Part = NOTHING, faces: Sequence[str] = (),
-    properties: MassProperties | None = None,
-) -> bytes:  # fmt: skip
-    """The text of the STEP file of a shape, see `encoded`."""
-    return b"".join(encoded(shape, name, part, faces=faces, properties=properties))
 
 
 def encoded(

@@ -16,7 +16,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from numpy.lib.stride_tricks import sliding_window_view
 from OCP.BRep import BRep_Builder
 from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeEdge, BRepBuilderAPI_MakeVertex
@@ -37,7 +36,7 @@ from scipy.interpolate import BSpline
 from bstcad.cad import patches, wires
 from bstcad.cad.wires import Curve, Piece
 from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
-from bstcad.optics.surfaces import Plane, Surface, sag
+from bstcad.optics.surfaces import Plane, Surface, sag, sampled
 from bstcad.scene.mount import MOST_DRAFT, STEEPEST
 
 TOLERANCE = 1e-7  # mm, of every face, edge and vertex
@@ -330,8 +329,7 @@ class LeaningPiece:
         """How far below z (n,) (mm) lines that lean inwards by `tangent` meet the front, by Newton's method."""
         depth, least = np.zeros(len(start)), np.ones(len(start))
         for _ in range(STEPS):
-            x, y = (torch.from_numpy(np.ascontiguousarray(p)) for p in (start + tangent * depth[:, None] * inwards).T)
-            height, *slopes = (part.numpy() for part in self.front.sag_and_slope(x, y))
+            height, *slopes = sampled(self.front, *(start + tangent * depth[:, None] * inwards).T)
             closing = 1 + tangent * (np.stack(slopes, axis=1) * inwards).sum(axis=1)  # mm a mm of depth
             least = np.minimum(least, closing)
             step = (z - depth - height) / np.maximum(closing, STEEPEST)

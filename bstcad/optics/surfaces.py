@@ -98,11 +98,17 @@ class Surface(ABC):
         return replace(self, z=float(self.z), **{name: float(value) for name, value in self.parameters().items()})
 
 
-def sag(surface: Surface, x: Any, y: Any) -> np.ndarray:
-    """z (mm) of a surface at points (mm), numpy arrays of one shape or numbers, in float64."""
+def sampled(surface: Surface, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """z (mm), ∂z/∂x and ∂z/∂y of a surface at points (mm), numpy arrays of one shape or numbers, in float64."""
     x, y = (np.require(p, float, ["C", "W"]) for p in np.broadcast_arrays(x, y))
-    z, _, _ = surface.plain().sag_and_slope(*(torch.from_numpy(p.ravel()) for p in (x, y)))
-    return z.numpy().reshape(x.shape)
+    values = surface.plain().sag_and_slope(*(torch.from_numpy(p.ravel()) for p in (x, y)))
+    z, z_x, z_y = (value.numpy().reshape(x.shape) for value in values)
+    return z, z_x, z_y
+
+
+def sag(surface: Surface, x: Any, y: Any) -> np.ndarray:
+    """z (mm) of a surface at points (mm), as `sampled` has it."""
+    return sampled(surface, x, y)[0]
 
 
 class _Revolved(Surface):
@@ -296,25 +302,9 @@ class Recess(Surface):
         """Its optical part."""
         return self.face
 
-    @property
-    def z(self) -> float:
-        """The vertex (mm)."""
-        return self.face.z
-
-    @property
-    def kind(self) -> str:
-        """Kind of the surface inside the clear aperture, by which a kernel is chosen."""
-        return self.face.kind
-
-    @property
-    def curvature(self) -> float | Tensor:
-        """Curvature at the vertex (1/mm)."""
-        return self.face.curvature
-
-    @property
-    def conic_constant(self) -> float | Tensor:
-        """Conic constant of the optical part."""
-        return self.face.conic_constant
+    def __post_init__(self) -> None:
+        for name in ("z", "kind", "curvature", "conic_constant", "conic", "parameters"):  # those of the optical part
+            object.__setattr__(self, name, getattr(self.face, name))
 
     @property
     def around(self) -> Plane:
@@ -334,10 +324,6 @@ class Recess(Surface):
         smaller = math.hypot(*outline.farthest) < self.outline.radius
         return self.face.sags(outline if smaller else self.outline)
 
-    def parameters(self) -> dict[str, float | Tensor]:
-        """Parameters of the optical part."""
-        return self.face.parameters()
-
     def with_parameters(self, **values: float | Tensor) -> Recess:
         """The same with another optical part."""
         return replace(self, face=self.face.with_parameters(**values))
@@ -353,10 +339,6 @@ class Recess(Surface):
     def bent(self, curvature: float) -> Recess:
         """Return the surface with so much more curvature (1/mm) at its vertex."""
         return replace(self, face=self.face.bent(curvature))
-
-    def conic(self) -> tuple[float, float]:
-        """Return curvature (1/mm) and conic constant of the optical part, without gradient."""
-        return self.face.conic()
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Recess:
         """The same with its tensors in another precision or on another device."""

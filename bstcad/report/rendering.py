@@ -334,7 +334,8 @@ def turnable(lens: Lens, path: LightPath | None = None, cells: int = FINE) -> st
     (cells + 1)² nodes and their slopes along x and y; then x, y, z of the front and z of the back around the rim.
     With a path what `_light` tells.
     """
-    from bstcad.cad.mesh import nodes, rim, sampled
+    from bstcad.cad.mesh import nodes, rim
+    from bstcad.optics.surfaces import sampled
 
     def at_nodes(surface: Surface) -> np.ndarray:
         """x, y, z (mm), ∂z/∂x and ∂z/∂y of a face at its nodes: (5, cells + 1, cells + 1)."""

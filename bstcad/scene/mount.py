@@ -10,14 +10,13 @@ from dataclasses import dataclass, fields, replace
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-import torch
 from pydantic import Field
 
 from bstcad.optics.key import Key
 from bstcad.optics.lens import Lens
 from bstcad.optics.media import medium
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle, Rounded
-from bstcad.optics.surfaces import Surface, sag
+from bstcad.optics.surfaces import Surface, sag, sampled
 from bstcad.scene.blank import LensBlank
 from bstcad.scene.schema import COORDINATES, LENGTHS, Record
 
@@ -298,8 +297,8 @@ def _fall(front: Surface, rim: Outline) -> float:
     """The steepest descent of a front inwards from the rim (mm a mm)."""
     x, y = rim.places()
     m_x, m_y = rim.inwards(x, y)
-    _, z_x, z_y = front.plain().sag_and_slope(torch.from_numpy(x), torch.from_numpy(y))
-    return -float((z_x.numpy() * m_x + z_y.numpy() * m_y).min())
+    _, z_x, z_y = sampled(front, x, y)
+    return -float((z_x * m_x + z_y * m_y).min())
 
 
 def _corner(key: str, shape: Round | Box, taken: float) -> Iterator[str]:

@@ -25,7 +25,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.passes import LENS, Passes
 from bstcad.optics.quadrature import MassProperties
-from bstcad.optics.surfaces import Surface
+from bstcad.optics.surfaces import Surface, sampled
 from bstcad.runs import processes
 from bstcad.scene.mount import Mount, Part
 from bstcad.step_text import part21
@@ -186,10 +186,11 @@ def _form(
         return
     points = torch.quasirandom.SobolEngine(2, scramble=True, seed=1).draw(count, dtype=torch.float64)
     x, y = (low + p * (high - low) for p, (low, high) in zip(points.T, (face.x, face.y), strict=True))
-    sampled, normals = step_reading.sample(reread, x.numpy(), y.numpy(), of=of)
-    z, z_x, z_y = face.sag_and_slope(*(torch.from_numpy(sampled[:, i].copy()) for i in (0, 1)))
-    wanted = torch.nn.functional.normalize(torch.stack([-z_x, -z_y, torch.ones_like(z)], dim=1), dim=1).numpy()
-    off = np.abs(sampled - torch.stack([x, y, z], dim=1).numpy()).max(axis=1)
+    found, normals = step_reading.sample(reread, x.numpy(), y.numpy(), of=of)
+    z, z_x, z_y = sampled(face, *found[:, :2].T)
+    wanted = np.stack([-z_x, -z_y, np.ones_like(z)], axis=1)
+    wanted /= np.linalg.norm(wanted, axis=1, keepdims=True)
+    off = np.abs(found - np.stack([x.numpy(), y.numpy(), z], axis=1)).max(axis=1)
     turned = np.linalg.norm(normals - wanted, axis=1)
     j, k = int(off.argmax()), int(turned.argmax())
     at_j, at_k = (f"at ({x[worst]:.4g}, {y[worst]:.4g}) mm" for worst in (j, k))

@@ -119,7 +119,7 @@ def test_every_face_of_a_flanged_lens_has_its_name_in_step(outline, draft, bevel
     """As the solid has them: OCC's writer turns the left-handed walls of a taper, and had left them unnamed."""
     part = mounted(body(Flange(outline=outline, z=1.2, thickness=1.3, draft=draft, bevel=bevel, holes=((7, 4, 1),))),
                    [Placed(plate("concave"))])  # fmt: skip
-    text = step_writing.encode(part.solid, "part", faces=part.faces).decode()
+    text = b"".join(step_writing.encoded(part.solid, "part", faces=part.faces)).decode()
     assert Counter(re.findall(r"=\s*ADVANCED_FACE\('([^']*)'", text)) == Counter(part.faces)
     check(part)
 

@@ -105,7 +105,7 @@ DAMAGES = {
 def test_a_damaged_file_is_refused_in_one_sentence(make_lens, tmp_path, damage):
     change, sentence = DAMAGES[damage]
     path = tmp_path / "lens.step"
-    text = step_writing.encode(lens_solid(make_lens(Sphere(8.0, 0.02), m=9)), "lens").decode()
+    text = b"".join(step_writing.encoded(lens_solid(make_lens(Sphere(8.0, 0.02), m=9)), "lens")).decode()
     path.write_text(change(text))
     assert path.read_text() != text
     with pytest.raises(ValueError, match=rf"lens\.step: .*{sentence}") as caught:

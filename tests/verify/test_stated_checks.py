@@ -97,7 +97,7 @@ def test_what_nobody_asked_for_is_not_the_scene_s(lens, text):
 
 
 def test_what_is_not_stated_is_told_and_not_failed(lens):
-    bare = step_writing.encode(lens_solid(lens), "lens").decode()
+    bare = b"".join(step_writing.encoded(lens_solid(lens), "lens")).decode()
     checks = checked(bare, lens)
     assert [check.name for check in checks] == [
         SAID + "states area, volume, centroid", SAID + "states profile tolerance, density, material"
