@@ -142,27 +142,9 @@ class Moved(Receiver):
     rest: Receiver
     motion: Motion
 
-    @property
-    def unit(self) -> str:
-        """The unit of the receiver at rest."""
-        return self.rest.unit
-
-    @property
-    def names(self) -> tuple[str, str]:
-        """The names of the axes of the receiver at rest."""
-        return self.rest.names
-
-    def where(self, origin: float = 0.0) -> str:
-        """Return the place of the receiver at rest in words."""
-        return self.rest.where(origin)
-
-    def per_radian(self, z: float) -> float:
-        """Return how far, in its unit, light from (0, 0, z) moves at rest in its middle as it turns by a radian."""
-        return self.rest.per_radian(z)
-
-    def areas(self, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]) -> np.ndarray | None:
-        """Return the areas of the cells of the receiver at rest, of mean 1; None: they are equal."""
-        return self.rest.areas(x, y, shape)
+    def __post_init__(self) -> None:
+        for name in ("unit", "names", "where", "per_radian", "areas"):  # which no motion changes
+            object.__setattr__(self, name, getattr(self.rest, name))
 
     @property
     def middle(self) -> Vector:
@@ -200,11 +182,11 @@ class Moved(Receiver):
 
 def _turned(motion: Motion, vector: Sequence[Array]) -> tuple[Array, Array, Array]:
     """Components of vectors after the turn of a motion."""
-    return tuple(_dot(row, vector) for row in motion.rotation.tolist())
+    return tuple(dot(row, vector) for row in motion.rotation.tolist())
 
 
 class Plane(Receiver):
-    """A plane: n · (p - C) = 0."""
+    """P = C + (x - o_x) e_x + (y - o_y) e_y, the plane n · (p - C) = 0; C its middle, o the coordinates of C on it."""
 
     def height(self, point: Vector) -> float:
         """n · (p - C): how far (mm) a point stands off the plane, negative on the side that light comes from."""
@@ -214,9 +196,25 @@ class Plane(Receiver):
         """Return how far (mm) it passes an outline on the plane z; negative: it cuts the outline."""
         return -self.height((0.0, 0.0, z)) - outline.reach(*self.frame[2][:2])
 
-    @abstractmethod
+    def point(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
+        """The points in space (mm) of places on the plane."""
+        (e_x, e_y, _), (o_x, o_y) = self.frame, self.origin
+        return tuple(c + (x - o_x) * a + (y - o_y) * b for c, a, b in zip(self.middle, e_x, e_y, strict=True))
+
+    def places(self, rays: Rays) -> Sequence[Tensor]:
+        """x and y of rays that are on the plane (mm)."""
+        offset, (e_x, e_y, _), (o_x, o_y) = self._from_centre(rays), self.frame, self.origin
+        return o_x + dot(e_x, offset), o_y + dot(e_y, offset)
+
+    def _from_centre(self, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
+        """p - C (mm)."""
+        x, y, z = self.middle
+        return rays.position[0] - x, rays.position[1] - y, rays.above(z)
+
     def _advance(self, rays: Rays) -> tuple[Tensor, Tensor]:
         """(n · d, n · (p - C)): how fast rays rise from it along their way, and how far above it they are (mm)."""
+        normal = self.frame[2]
+        return dot(normal, rays.direction), dot(normal, self._from_centre(rays))
 
     def path(self, rays: Rays) -> tuple[Tensor, Tensor]:
         """(way along each ray to the plane (mm), zero for rays that do not come to it; status)."""
@@ -264,7 +262,7 @@ class LevelPlane(Plane):
 
 @dataclass(frozen=True)
 class TiltedPlane(Plane):
-    """P = C + (x - c_x) e_x + (y - c_y) e_y: a plane through C, turned about it, and x and y measured on it (mm).
+    """A plane through C, turned about it, and x and y measured on it (mm): o = (c_x, c_y).
 
     The axes are those of space, turned first about the x axis by α and then about the y axis by β, right-handed:
     e_x = (cos β, 0, -sin β), e_y = (sin α sin β, cos α, sin α cos β), and the normal, e_x × e_y,
@@ -285,27 +283,13 @@ class TiltedPlane(Plane):
         """C (mm)."""
         return self.centre
 
-    def point(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        """The points in space (mm) of places on the plane."""
-        (e_x, e_y, _), (c_x, c_y, _) = self.axes, self.centre
-        return tuple(c + (x - c_x) * a + (y - c_y) * b for c, a, b in zip(self.centre, e_x, e_y, strict=True))
-
     def from_seen(self, q_x: Array, q_y: Array, eye: float) -> tuple[Array, Array]:
         """The places of the plane that are `seen` there."""
         (e_x, e_y, n), (c_x, c_y, c_z) = self.axes, self.centre
         throw = c_z - eye
         path = -self.height((0.0, 0.0, eye)) / (n[0] * q_x + n[1] * q_y + n[2] * throw)
         off = path * q_x - c_x, path * q_y - c_y, (path - 1) * throw
-        return c_x + _dot(e_x, off), c_y + _dot(e_y, off)
-
-    def _advance(self, rays: Rays) -> tuple[Tensor, Tensor]:
-        normal = self.axes[2]
-        return _dot(normal, rays.direction), _dot(normal, self._from_centre(rays))
-
-    def places(self, rays: Rays) -> Sequence[Tensor]:
-        """x and y of rays that are on the plane (mm)."""
-        offset, (e_x, e_y, _) = self._from_centre(rays), self.axes
-        return self.centre[0] + _dot(e_x, offset), self.centre[1] + _dot(e_y, offset)
+        return c_x + dot(e_x, off), c_y + dot(e_y, off)
 
     def way_to(self, rays: Rays, aim: Tensor) -> Tensor:
         """(3, …) from the rays' positions to places (2, …) of the plane (mm)."""
@@ -313,11 +297,7 @@ class TiltedPlane(Plane):
         x, y = aim[0] - self.centre[0], aim[1] - self.centre[1]
         return torch.stack([x * a + y * b - o for a, b, o in zip(e_x, e_y, offset, strict=True)])
 
-    def _from_centre(self, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
-        """p - C (mm)."""
-        x, y, z = self.centre
-        return rays.position[0] - x, rays.position[1] - y, rays.above(z)
 
-
-def _dot(vector: Vector, of: Array | tuple[Array, ...]) -> Array:
+def dot(vector: Sequence[float], of: Array | Sequence[Array]) -> Array:
+    """The product of a vector and others (3, …)."""
     return vector[0] * of[0] + vector[1] * of[1] + vector[2] * of[2]

@@ -10,13 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from torch import Tensor
-
 from bstcad.optics.interfaces import Interface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.rays import Rays, Vector
-from bstcad.optics.receivers import LevelPlane, Plane, Receiver
+from bstcad.optics.rays import Vector
+from bstcad.optics.receivers import LevelPlane, Plane, Receiver, dot
 from bstcad.optics.tilted import Tilted
 
 STRAIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -24,7 +22,7 @@ STRAIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @dataclass(frozen=True)
 class Image(Plane):
-    """P = C + (x - o_x) e_x + (y - o_y) e_y: the image of a plane, on which its places keep their coordinates."""
+    """The image of a plane, on which its places keep their coordinates."""
 
     centre: Vector  # C (mm)
     at: tuple[float, float]  # o: the coordinates of C on the plane
@@ -69,23 +67,6 @@ class Image(Plane):
         (c_x, c_y, z), (o_x, o_y) = self.centre, self.origin
         return LevelPlane(z) if self.frame == STRAIGHT and (c_x, c_y) == (o_x, o_y) else self
 
-    def point(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The points in space (mm) of places on the plane."""
-        (e_x, e_y, _), (o_x, o_y) = self.frame, self.origin
-        return tuple(c + (x - o_x) * a + (y - o_y) * b for c, a, b in zip(self.centre, e_x, e_y, strict=True))
-
-    def _offset(self, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
-        x, y, z = self.centre
-        return rays.position[0] - x, rays.position[1] - y, rays.above(z)
-
-    def _advance(self, rays: Rays) -> tuple[Tensor, Tensor]:
-        return _dot(self.frame[2], rays.direction), _dot(self.frame[2], self._offset(rays))
-
-    def places(self, rays: Rays) -> tuple[Tensor, Tensor]:
-        """x and y of rays that are on the plane (mm)."""
-        offset, (e_x, e_y, _), (o_x, o_y) = self._offset(rays), self.frame, self.origin
-        return o_x + _dot(e_x, offset), o_y + _dot(e_y, offset)
-
 
 def image(behind: Sequence[Interface], plane: Receiver) -> Receiver:
     """Return where a lens sees a plane by way of these interfaces, whose surfaces are flat; the plane itself: of none.
@@ -125,9 +106,5 @@ def per_radian(lens: Lens, screen: Screen) -> float:
 
 
 def _reflected(v: Vector, n: Vector) -> Vector:
-    along = 2 * _dot(v, n)
+    along = 2 * dot(v, n)
     return tuple(part - along * unit for part, unit in zip(v, n, strict=True))
-
-
-def _dot(vector: Sequence[float], of: Sequence) -> Tensor:
-    return vector[0] * of[0] + vector[1] * of[1] + vector[2] * of[2]

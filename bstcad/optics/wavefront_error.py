@@ -29,7 +29,7 @@ from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.motion import Motion
 from bstcad.optics.rays import Rays
-from bstcad.optics.receivers import LevelPlane
+from bstcad.optics.receivers import LevelPlane, dot
 from bstcad.optics.trace import behind, clear_window
 from bstcad.optics.wavefront import NM, Wave, length
 
@@ -77,16 +77,12 @@ def moved_pupil(pupil: ExitPupil, motion: Motion, z: float) -> ExitPupil:
     """
     place = torch.stack([pupil.x, pupil.y, torch.full_like(pupil.x, z)])
     turns, about = motion.rotation.tolist(), motion.point((0.0, 0.0, 0.0))
-    x, y, height = (_turned(row, place) + shift for row, shift in zip(turns, about, strict=True))
-    direction = torch.stack([_turned(row, pupil.direction) for row in turns])
+    x, y, height = (dot(row, place) + shift for row, shift in zip(turns, about, strict=True))
+    direction = torch.stack([dot(row, pupil.direction) for row in turns])
     way = torch.where(pupil.alive, (z - height) / direction[2], torch.zeros_like(height))
     return replace(
         pupil, x=x + way * direction[0], y=y + way * direction[1], direction=direction, path=pupil.path + way
     )
-
-
-def _turned(row: list[float], vectors: Tensor) -> Tensor:
-    return row[0] * vectors[0] + row[1] * vectors[1] + row[2] * vectors[2]
 
 
 def followed(source: Emitter, lens: Lens, rays: Rays, z: float) -> tuple[Rays, Tensor, float]:
