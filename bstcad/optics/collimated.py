@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.emitters import LAWS, Emitter, WavelengthKey, all_alive
-from bstcad.optics.kernels.beam import ALONG_Z, Beam, floats
+from bstcad.optics.kernels.records import ALONG_Z, Beam, floats
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.key import Key
 from bstcad.optics.motion import Motion

@@ -20,7 +20,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from bstcad.optics.kernels.beam import Beam
+from bstcad.optics.kernels.records import Beam
 from bstcad.optics.key import Key
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Outline, Rectangle

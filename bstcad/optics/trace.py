@@ -233,16 +233,12 @@ def _of_all_light(lights: Lights, box: Tensor, tent: Tensor, flux: dict[str, flo
     whole = max(launched, 1.0)  # cells on the rim of a beam count in or out: together a little more than the beam
     flux = {line: value / whole for line, value in flux.items()}
     flux["missed the lens"] += 1.0 - launched / whole
-    if any(_has_underside(lens) for _, _, lens, _ in lights):
+    first = lights[0][2]
+    if first.front.outline is not None and first.passes.sense > 0 and not first.before:  # light meets the plane around
         stopped = sum(part * on_underside(source, lens.front.plain(), lens.outline) for part, source, lens, _ in lights)
         flux[UNDERSIDE] = max(min(stopped, flux["missed the lens"]), 0.0)
         flux["missed the lens"] -= flux[UNDERSIDE]
     return Simulation(box / whole, tent / whole, flux, count)
-
-
-def _has_underside(lens: Lens) -> bool:
-    """Is there a plane around the optical part of its front, on which light can fall?"""
-    return lens.front.outline is not None and lens.passes.sense > 0 and not lens.before
 
 
 @functools.lru_cache(maxsize=4096)  # whatever the back

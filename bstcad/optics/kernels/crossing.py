@@ -27,6 +27,7 @@ from bstcad.optics.kernels import kernel_arguments, reductions
 from bstcad.optics.kernels.compiling import compiled
 from bstcad.optics.kernels.forward import (
     BLOCK,
+    COS_BACK,
     DX,
     DY,
     DZ,
@@ -43,6 +44,7 @@ from bstcad.optics.kernels.forward import (
     Y,
     Z,
     at_back,
+    cosines,
     reflect,
     refract,
     search,
@@ -50,6 +52,7 @@ from bstcad.optics.kernels.forward import (
     to_net,
     to_screen,
 )
+from bstcad.optics.kernels.records import Faces, Tilted
 from bstcad.optics.kernels.spline import curved, net_of, scatter
 from bstcad.optics.rays import Landed, Rays, Status
 from bstcad.optics.receivers import Receiver
@@ -68,14 +71,6 @@ def _load(position, direction, status, first, count, work):
         work[X + r], work[Y + r], work[Z + r] = position[0, at], position[1, at], position[2, at]
         work[DX + r], work[DY + r], work[DZ + r] = direction[0, at], direction[1, at], direction[2, at]
         work[FATE + r], work[FLUX + r] = status[at], 1.0
-
-
-@njit(error_model="numpy")
-def _incidence(count, work, first, cosine):
-    for r in range(count):
-        p, q = work[SLOPE_X + r], work[SLOPE_Y + r]
-        along = work[DZ + r] - p * work[DX + r] - q * work[DY + r]
-        cosine[first + r] = along / math.sqrt(1.0 + p * p + q * q)
 
 
 @compiled()
@@ -97,7 +92,7 @@ def _cross(net, faces, tilted, lands, position, direction, status, out, path, co
         for r in range(count):
             path[begin + r] = work[Z + r] + work[S + r]
         if cosine.size > 0:
-            _incidence(count, work, begin, cosine)
+            cosines(COS_BACK, count, work)
         if lands is None:
             for r in range(count):
                 work[Z + r] = work[S + r] * work[DZ + r]
@@ -112,8 +107,8 @@ def _cross(net, faces, tilted, lands, position, direction, status, out, path, co
             status[begin + r] = np.uint8(fate)
             out[0, begin + r] = work[X + r] if fate == 0.0 else 0.0
             out[1, begin + r] = work[Y + r] if fate == 0.0 else 0.0
-            if fate != 0.0 and cosine.size > 0:
-                cosine[begin + r] = 1.0
+            if cosine.size > 0:
+                cosine[begin + r] = work[COS_BACK + r] if fate == 0.0 else 1.0
         if lands is None:
             _store_directions(count, work, begin, direction, out)
 
@@ -284,8 +279,8 @@ def _cross_adjoint(
 class Crossing(NamedTuple):
     """Numbers of a crossing beside the net and the rays."""
 
-    faces: kernel_arguments.Faces  # numbers, of which those of the front do not count
-    tilted: kernel_arguments.Tilted | None  # the screen's tilt
+    faces: Faces  # numbers, of which those of the front do not count
+    tilted: Tilted | None  # the screen's tilt
     lands: bool  # on the screen? else rays go on behind the face
     loses: bool  # does the face take flux? then path and angle of incidence are asked for
 
@@ -336,7 +331,7 @@ class Cross(torch.autograd.Function):
         return torch.from_numpy(reductions.merged(*buffers)).to(heights.dtype), d_position, d_direction, None, None
 
 
-def _numbers(crossing: Crossing) -> tuple[kernel_arguments.Faces, kernel_arguments.Tilted | None, bool | None]:
+def _numbers(crossing: Crossing) -> tuple[Faces, Tilted | None, bool | None]:
     """The arguments of the kernels; None is a type of its own to numba, which leaves out the other branches."""
     return crossing.faces, crossing.tilted, True if crossing.lands else None
 

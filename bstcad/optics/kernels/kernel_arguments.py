@@ -1,16 +1,13 @@
-"""Lens, cells and screen as the plain numbers that a fused kernel takes: named tuples of one type a field.
+"""How the numbers that a fused kernel takes (records.py) follow from lens, light, cells and screen.
 
-The light of a source is a Beam (beam.py).
-
-So are the constants of the plain form: numba's cache looks at a kernel's own file only, and what that takes from
-another file would stay as it was when the kernel was compiled.
+The constants of the plain form are among them: numba's cache looks at a kernel's own file only, and what that takes
+from another file would stay as it was when the kernel was compiled.
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,7 +17,8 @@ from bstcad.optics.bspline import halfway, interpolated
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import Interface
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels.beam import Beam, Table, floats
+from bstcad.optics.kernels import records
+from bstcad.optics.kernels.records import Beam, Cells, Faces, Fates, Losses, Pixels, Rules, Table, Tilted, floats
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Status
@@ -35,99 +33,6 @@ PEAK = 100.0  # largest error over these: the outermost spans are the least exac
 KEPT = 16  # tables at a time
 SLOWER = 0.5  # light whose errors a table of twice the sides does not divide by 1 / SLOWER has an edge
 OF_A_TABLE = 0.0, 0.0, 0.0, 0.0, math.inf, 1.0, 0.0, 0, 0.0  # first fields of the Beam of a table
-
-
-class Rules(NamedTuple):
-    """The constants of the plain form; all are floats, so that a parallel kernel takes them as one tuple."""
-
-    newton_steps: float  # interfaces.NEWTON_STEPS
-    approach_steps: float  # interfaces.APPROACH_STEPS
-    level: float  # interfaces.LEVEL
-    flattest: float  # interfaces.FLATTEST
-    along: float  # interfaces.ALONG
-    skimming: float  # interfaces.SKIMMING
-    equator: float  # surfaces.EQUATOR
-    grazing: float  # rays.GRAZING
-
-
-class Fates(NamedTuple):
-    """The status of lost rays: rays.Status as the kernel writes it."""
-
-    missed_front: float
-    missed_back: float
-    reflected: float  # rays that the law of the net does not let through
-    turned: float  # away from the screen
-
-
-class Tilted(NamedTuple):
-    """A tilted plane as numbers, in the frame in which light begins along +z; z from the net's plane is `throw`."""
-
-    x: float  # place of the point C that it is turned about (mm), from which x and y on the plane count
-    y: float
-    n_x: float  # the normal, with the light that the plane is there for
-    n_y: float
-    n_z: float
-    x_x: float  # the axis of x
-    x_y: float
-    x_z: float
-    y_x: float  # the axis of y
-    y_y: float
-    y_z: float
-
-
-class Faces(NamedTuple):
-    """The lens and the screen as numbers, in the frame in which light begins along +z (see `faces`)."""
-
-    reflects: int  # 1: the net is a mirror
-    curvature: float  # curvature of the front (1/mm)
-    conic_constant: float  # conic constant of the front
-    index: float  # before the net over that behind it, the law's η
-    front_x: float  # outlines.Limits of the front's clear aperture (mm, mm, mm²)
-    front_y: float
-    front_r2: float
-    limit_x: float  # and of the back's
-    limit_y: float
-    limit_r2: float
-    gap: float  # from the plane where the rays begin to the plane the net's heights are measured from (mm)
-    m: int  # control points along x
-    n: int  # and along y
-    x: float  # the net's corner (mm)
-    y: float
-    per_x: float  # control points per mm
-    per_y: float
-    steepest_x: float  # interfaces.NetBounds of the net
-    steepest_y: float
-    lowest: float
-    tolerance: float
-    near: float
-    throw: float  # from the net's plane to the screen, of a tilted one to its middle (mm)
-    rules: Rules
-    fates: Fates
-
-
-class Cells(NamedTuple):
-    """n x n cells with a ray in each."""
-
-    n: int
-    key: np.uint64  # key of the jitter
-    width: float  # size of a cell (mm)
-    height: float
-    half_x: float  # half extent of the window (mm)
-    half_y: float
-    stride: np.uint64  # sampling.STRIDE
-    mix_1: np.uint64  # sampling.MIX_1
-    mix_2: np.uint64  # sampling.MIX_2
-
-
-class Pixels(NamedTuple):
-    """The screen's edges (mm) and its pixels per mm."""
-
-    left: float
-    right: float
-    bottom: float
-    top: float
-    per_x: float
-    per_y: float
 
 
 def rules() -> Rules:
@@ -158,26 +63,10 @@ def faces(
     return numbers, _tilted(plane, sense, -sense if law.reverses else sense)
 
 
-class Losses(NamedTuple):
-    """Losses of faces and glass: the share that each face lets through at cosines k / (n - 1), k = 0 … n - 1.
-
-    At a face into the denser medium, or at a mirror, the cosine is that of incidence, else that of refraction: in these
-    the share is smooth, and linear interpolation of it right to 1e-7.
-    """
-
-    told: int  # 0: there are none
-    front: np.ndarray
-    back: np.ndarray
-    coefficient: float  # coefficient of absorption (1/mm)
-
-
-NO_LOSSES = Losses(0, np.ones(2), np.ones(2), 0.0)
-
-
 def losses(lens: Lens) -> Losses:
     """The lens's losses as numbers, by the plain forms of losses.py."""
     if lens.losses is None:
-        return NO_LOSSES
+        return records.NO_LOSSES
     *front, back = (_table(interface) for interface in lens.interfaces)
     glass = [loss.coefficient for i in lens.interfaces for loss in i.losses if loss.in_glass]
     return Losses(1, front[0] if front else back, back, float(sum(glass)))

@@ -65,22 +65,22 @@ def bend(u, m):
 
 
 @njit(inline="always")
+def _row(net, at, b0, b2, q0, q2):
+    """Value, slope and second difference along v of the three control points from `at` on, by weights of neighbours."""
+    middle = net[at + np.uint64(1)]
+    low, high = middle - net[at], net[at + np.uint64(2)] - middle
+    return middle - b0 * low + b2 * high, q0 * low + q2 * high, high - low
+
+
+@njit(inline="always")
 def sag(net, m, n, u, v):
     """(h, ∂h/∂u, ∂h/∂v) as sums over differences of neighbouring heights; net (m, n) is flat (bspline.evaluate)."""
     i, a0, a2, p0, p2 = basis(u, m)
     j, b0, b2, q0, q2 = basis(v, n)
     at = np.uint64(i * n + j)  # unsigned: no test for an index from the end
-    middle = net[at + np.uint64(1)]
-    low, high = middle - net[at], net[at + np.uint64(2)] - middle
-    f0, g0 = middle - b0 * low + b2 * high, q0 * low + q2 * high
-    at += np.uint64(n)
-    middle = net[at + np.uint64(1)]
-    low, high = middle - net[at], net[at + np.uint64(2)] - middle
-    f1, g1 = middle - b0 * low + b2 * high, q0 * low + q2 * high
-    at += np.uint64(n)
-    middle = net[at + np.uint64(1)]
-    low, high = middle - net[at], net[at + np.uint64(2)] - middle
-    f2, g2 = middle - b0 * low + b2 * high, q0 * low + q2 * high
+    f0, g0, _ = _row(net, at, b0, b2, q0, q2)
+    f1, g1, _ = _row(net, at + np.uint64(n), b0, b2, q0, q2)
+    f2, g2, _ = _row(net, at + np.uint64(2 * n), b0, b2, q0, q2)
     low, high = f1 - f0, f2 - f1
     return f1 - a0 * low + a2 * high, p0 * low + p2 * high, g1 - a0 * (g1 - g0) + a2 * (g2 - g1)
 
@@ -92,17 +92,9 @@ def curved(net, m, n, u, v):
     j, b0, b2, q0, q2 = basis(v, n)
     c_u, c_v = bend(u, m), bend(v, n)
     at = np.uint64(i * n + j)
-    middle = net[at + np.uint64(1)]
-    low, high = middle - net[at], net[at + np.uint64(2)] - middle
-    f0, g0, k0 = middle - b0 * low + b2 * high, q0 * low + q2 * high, high - low
-    at += np.uint64(n)
-    middle = net[at + np.uint64(1)]
-    low, high = middle - net[at], net[at + np.uint64(2)] - middle
-    f1, g1, k1 = middle - b0 * low + b2 * high, q0 * low + q2 * high, high - low
-    at += np.uint64(n)
-    middle = net[at + np.uint64(1)]
-    low, high = middle - net[at], net[at + np.uint64(2)] - middle
-    f2, g2, k2 = middle - b0 * low + b2 * high, q0 * low + q2 * high, high - low
+    f0, g0, k0 = _row(net, at, b0, b2, q0, q2)
+    f1, g1, k1 = _row(net, at + np.uint64(n), b0, b2, q0, q2)
+    f2, g2, k2 = _row(net, at + np.uint64(2 * n), b0, b2, q0, q2)
     low, high = f1 - f0, f2 - f1
     h, h_u, h_uu = f1 - a0 * low + a2 * high, p0 * low + p2 * high, c_u * (high - low)
     low, high = g1 - g0, g2 - g1
