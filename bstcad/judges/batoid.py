@@ -16,9 +16,7 @@ import numpy as np
 
 from bstcad.judges import faces
 from bstcad.judges.faces import Face, FaceError, Traced
-from bstcad.optics import sampling
 from bstcad.optics.channels import Channel, places
-from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import Reflect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
@@ -26,8 +24,7 @@ from bstcad.optics.measure import a_side
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Rays, axes
 from bstcad.optics.tilted import Tilted
-from bstcad.optics.trace import clear_window, launch_strips
-from bstcad.optics.wavefront_error import followed, from_reference
+from bstcad.optics.trace import launch_strips
 
 BEYOND = 0.125  # of a face's width: margin of its grid beyond the rim, where the search for a ray may begin
 ARCS = 4096  # corners of the polygon of an outline with round corners
@@ -119,50 +116,6 @@ def through(lens: Lens, known: Sequence[Placed], rays: Rays) -> Any:
             theirs.toCoordSys(batoid.CoordSys())
         batoid.obscure(_outside(interface.outline), theirs)
     return theirs
-
-
-@dataclass(frozen=True)
-class PathsApart:
-    """How far two traces of the same rays are apart, at most."""
-
-    path: float  # mm, optical path from source to plane
-    place: float  # mm, on the plane
-    rays: int  # that both traces bring there
-
-
-def paths_apart(lens: Lens, source: Emitter, z: float, n: int = 128) -> PathsApart:
-    """batoid against bstcad: places and optical paths on a plane z (mm), n x n rays of a point or of parallel light.
-
-    The clear apertures of the lens have to keep one and a half pitches inside the rims of its nets.  batoid's rays
-    count their path from where they start: at the point, or on the plane before the lens on which ours start.
-    """
-    import batoid
-
-    lens, source = lens.plain(), source.central
-    area = clear_window(source, lens)
-    rays = source.rays(*sampling.grid(area, n), lens.entrance.z, area.area / n**2)
-    ours, path, _ = followed(source, lens, rays, z)
-    theirs = through(lens, surfaces(lens), _flat(rays))
-    batoid.intersect(batoid.Plane(), theirs, _frame((0.0, 0.0, z)))
-    both = (ours.alive & (rays.flux > 0)).numpy().ravel() & ~theirs.failed & ~theirs.vignetted
-    x, y, _ = (p.numpy().ravel() for p in ours.position)
-    ahead = theirs.t - _before_reference(source, rays, lens.entrance.z)
-    off = np.abs(ahead - path.numpy().ravel()), np.hypot(theirs.x - x, theirs.y - y)
-    return PathsApart(*(float(apart[both].max()) for apart in off), rays=int(both.sum()))
-
-
-def _flat(rays: Rays) -> Rays:
-    """The same rays in one row."""
-    position, direction = (part.reshape(3, -1) for part in (rays.position, rays.direction))
-    return replace(rays, position=position, direction=direction)
-
-
-def _before_reference(source: Emitter, rays: Rays, z: float) -> np.ndarray:
-    """Path (mm) of each ray, from its start, that ours leave out: to the reference of `wavefront_error.followed`.
-
-    That is the plane across parallel light, or the sphere about a point, through where the axis meets the plane z.
-    """
-    return -from_reference(source, z, rays, rays.sense).numpy().ravel()
 
 
 def cannot(lens: Lens, channels: Sequence[Channel]) -> str:

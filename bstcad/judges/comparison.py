@@ -27,6 +27,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, measure
 from bstcad.scene.errors import MachineError, SceneError, nearest
+from bstcad.scene.target import overlap
 from bstcad.verify.verdict import Check
 
 JUDGES = {"batoid": "bstcad.judges.batoid", "mitsuba": "bstcad.judges.mitsuba"}
@@ -228,12 +229,5 @@ def coarse(screen: Screen) -> Screen:
 
 def resampled(picture: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """A picture on (rows, columns) other pixels of the same rectangle, with the flux that falls into each."""
-    down, across = (_overlap(n, k) for n, k in zip(picture.shape, shape, strict=True))
-    return down @ picture @ across.T
-
-
-def _overlap(n: int, k: int) -> np.ndarray:
-    """(k, n) share of each of n equal cells of a line in each of k cells."""
-    edges, old = np.arange(k + 1) / k * n, np.arange(n)
-    low, high = np.maximum(edges[:-1, None], old), np.minimum(edges[1:, None], old + 1)
-    return np.maximum(high - low, 0.0)
+    down, across = (overlap(n, k) * (n / k) for n, k in zip(picture.shape, shape, strict=True))
+    return down @ (across @ picture.T).T

@@ -32,6 +32,7 @@ from bstcad.scene.new_scene import templates
 from bstcad.scene.scene import Scene, load
 from tests.benchmarks.cold import TEMPLATES
 from tests.cad.test_trimming import plate
+from tests.judges.paths import paths_apart
 from tests.report.test_exports import read_zemax
 from tests.tracing import launch
 
@@ -130,7 +131,7 @@ EXACT = 0.9  # of the net's width: there, within one and a half pitches of its r
 def test_rays_land_where_batoid_has_them(sphere):
     """Which tells an index from one that is off by 2e-7 (tests/judges/test_optical_path.py)."""
     [channel] = sphere.scene.channels()
-    apart = batoid.paths_apart(channel.through(sphere.lens), channel.source, sphere.scene.target.z)
+    apart = paths_apart(channel.through(sphere.lens), channel.source, sphere.scene.target.z)
     print(f"\n{apart.rays} rays, a metre's throw: {apart.place:.1e} mm apart", end="")
     assert apart.rays > 5000 and apart.place < RMS
 

@@ -14,6 +14,7 @@ from bstcad.optics.wavefront import NM
 from bstcad.optics.wavefront_error import followed
 from tests.benchmarks.beam_shaper import BeamShaper
 from tests.benchmarks.cold import TEMPLATES, generate
+from tests.judges.paths import paths_apart
 
 pytestmark = pytest.mark.bench
 
@@ -44,12 +45,10 @@ def test_a_template_keeps_its_errors(made):
 
 
 def test_batoid_finds_the_same_places_and_paths(made):
-    from bstcad.judges import batoid
-
     name, scene, lens, _ = made
     (channel, *_) = scene.channels()
     for target in scene.targets:
-        apart = batoid.paths_apart(channel.through(lens), channel.source, target.z)
+        apart = paths_apart(channel.through(lens), channel.source, target.z)
         print(name, target.z, apart)
         assert apart.rays > 1000 and apart.place < LANDING and apart.path < PATH
 

@@ -12,6 +12,7 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Plane, Sphere
 from tests.judges.lenses import MIRROR, waved
+from tests.judges.paths import paths_apart
 
 PATH, PLACE = 1e-6, 1e-9  # mm: a nanometre of path, a picometre of place
 SCREEN = 120.0  # mm
@@ -38,19 +39,19 @@ def batoid():
 
 @pytest.mark.parametrize("name", SOURCES)
 def test_batoid_agrees_on_paths_and_places_through_two_nets(batoid, name):
-    found = batoid.paths_apart(two_nets(), SOURCES[name], SCREEN)
+    found = paths_apart(two_nets(), SOURCES[name], SCREEN)
     assert found.path < PATH and found.place < PLACE and found.rays > 5000
 
 
 @pytest.mark.parametrize("front", [Plane(10.0), Sphere(10.0, 0.01)], ids=lambda front: front.kind)
 def test_batoid_agrees_through_one_net(batoid, front):
-    found = batoid.paths_apart(two_nets().with_front(front), BEAM, SCREEN)
+    found = paths_apart(two_nets().with_front(front), BEAM, SCREEN)
     assert found.path < PATH and found.place < PLACE
 
 
 def test_batoid_agrees_on_a_mirror(batoid):
     lamp = Point((0.5, 1.0, 90.0), profile="uniform", half_angle=5.0)
-    found = batoid.paths_apart(replace(MIRROR, outline=Rectangle(17.0, 17.0)), lamp, 400.0)
+    found = paths_apart(replace(MIRROR, outline=Rectangle(17.0, 17.0)), lamp, 400.0)
     assert found.path < PATH and found.place < PLACE
 
 
@@ -66,6 +67,6 @@ def test_a_wrong_lens_shows(batoid, monkeypatch, wrong):
         return honest(glass, batoid.surfaces(glass.with_back(back)), rays)
 
     monkeypatch.setattr(batoid, "through", through)
-    found = batoid.paths_apart(lens, BEAM, SCREEN)
+    found = paths_apart(lens, BEAM, SCREEN)
     assert found.path > PATH
     assert wrong != "turned" or found.place > PLACE
