@@ -27,7 +27,7 @@ the fractional power, or at a lower η.  Hot pixels count in powers, averages an
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -148,12 +148,4 @@ class FlatTop:
     ) -> FlatTop:
         """Of a picture whose pixels are so wide and high (mm); inside: their shares within the profile."""
         found = top_hat(picture, pixel, inside, on_picture=on_picture)
-        return cls(
-            key=key,
-            uniformity=found.uniformity,
-            plateau_uniformity=found.plateau_uniformity,
-            flatness=found.flatness,
-            fractional_power=found.fractional_power,
-            edge_steepness=found.edge_steepness,
-            efficiency=float(found.efficiency),
-        )
+        return cls(key, **{each.name: float(getattr(found, each.name)) for each in fields(cls) if each.name != "key"})

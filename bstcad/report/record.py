@@ -22,8 +22,8 @@ from pydantic import ConfigDict, FailFast, Field, TypeAdapter, ValidationError
 from pydantic_core import from_json, to_json, to_jsonable_python
 from typing_extensions import TypedDict
 
+from bstcad.analysis.cost import lifted, unlit
 from bstcad.analysis.light import Blur, FinestDetail, finest_detail
-from bstcad.analysis.missed_light import lifted, unlit
 from bstcad.analysis.steepness import Steepness
 from bstcad.analysis.top_hat import FlatTop
 from bstcad.judges.comparison import Judge

@@ -24,7 +24,6 @@ NOT_BUILT = {  # words that a scene may well have: the feature that each asks fo
     **dict.fromkeys(("rayfile", "ray_file", "rayset", "ray_set"), "files of measured rays are"),
     **dict.fromkeys(("diffraction", "coherent", "interference"), "wave optics is"),
     **dict.fromkeys(("scatter", "scattering", "bsdf", "haze"), "scattering is"),
-    "unreachable": "a choice of where the target may stay dark is",
 }
 # A key of the target at the beginning of a sentence, or in its middle; and one that says which of several it is.
 THE_TARGET, ONE_TARGET = re.compile(r"^target(?=[.:])|(?<=\s)target(?=\.[a-z])"), re.compile(r"target\[\d+\]")

@@ -327,7 +327,7 @@ def photo(given: Picture | str, gamma: float | None = None, invert: bool = False
     low, white = _second_bytes(image, given.data) if deep else None, _white(image)
     turned = UPRIGHT.get(image.getexif().get(ExifTags.Base.Orientation))
     stated = (power(gamma), None) if gamma is not None else _meaning(image, given.data)
-    curve, profile = stated or (_usual_curve(image), None)
+    curve, profile = stated or (power(1.0) if image.mode == "F" else from_srgb, None)  # floats are light
     other, assumed, several = None, "", bool(getattr(image, "is_animated", False))
     if stated is None and deep and getattr(image, "tag_v2", {}).get(DESCRIPTION) != IRRADIANCE:
         other = from_srgb if image.mode == "F" else power(1.0)
@@ -339,11 +339,6 @@ def photo(given: Picture | str, gamma: float | None = None, invert: bool = False
         given.name, image, curve, profile=profile, low=low, white=white, other_curve=other, assumed=assumed,
         several=several,
     )  # fmt: skip
-
-
-def _usual_curve(image: Image.Image) -> Curve:
-    """The curve of a file that states none: floats are light, whole numbers sRGB."""
-    return power(1.0) if image.mode == "F" else from_srgb
 
 
 def photo_size(given: Picture | str) -> tuple[int, int]:

@@ -15,11 +15,10 @@ from typing import Literal
 import numpy as np
 import torch
 from scipy import fft
-from scipy.linalg import solve_banded
 from scipy.ndimage import fourier_gaussian
 from scipy.stats import norm
 
-from bstcad.optics.bspline import BSplineSurface, basis_matrix
+from bstcad.optics.bspline import BSplineSurface, interpolated
 from bstcad.optics.channels import Channel
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import Interface
@@ -402,11 +401,7 @@ def as_net(face: Surface, outline: Outline) -> BSplineSurface:
     rim = BEYOND * rim if bool(face.reaches(there, torch.zeros_like(there))) else rim
     inwards = (rim / r.clamp(min=rim)).clamp(max=1.0)
     sag = face.sag_and_slope(inwards * x, inwards * y)[0] - face.z
-    matrix, bands = basis_matrix(np.arange(FACE, dtype=float), FACE), np.zeros((3, FACE))
-    for k in (-1, 0, 1):  # its diagonals as LAPACK takes them
-        bands[1 - k, max(k, 0) : FACE + min(k, 0)] = matrix.diagonal(k)
-    along_x = solve_banded((1, 1), bands, sag.numpy())
-    return replace(level, heights=torch.from_numpy(solve_banded((1, 1), bands, along_x.T).T.copy()))
+    return replace(level, heights=torch.from_numpy(interpolated(sag.numpy())))
 
 
 def _raised(face: str, field: np.ndarray, setup: Setup, by: float) -> Setup:

@@ -35,7 +35,11 @@ from scipy.optimize import brentq, minimize
 from scipy.stats import binomtest
 from threadpoolctl import threadpool_limits
 
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.kernels.reductions import dot
+from bstcad.optics.lens import Lens
+from bstcad.optics.wavefront import Wave
+from bstcad.optics.wavefront_error import exit_pupil, moved_pupil, residual, wavefront_error
 from bstcad.report.tolerances import WIDEST, Sensitivity
 from bstcad.tolerance.grades import GRADES, USUAL, limit
 from bstcad.tolerance.perturbations import Perturbation, Setup, draws, kinds, perturbed, trials
@@ -43,6 +47,8 @@ from bstcad.tolerance.perturbations import Perturbation, Setup, draws, kinds, pe
 Progress = Callable[[str, int, int, str], None]
 # Calls work(shared, item) of each item, somewhere: the results, in the order of the items.
 Spread = Callable[[Callable[[Any, Any], Any], Any, Sequence[Any]], Iterator[Any]]
+
+RAYS = 192  # rays a side of the light whose wavefront is studied
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
 
@@ -95,8 +101,46 @@ class Pictures:
         return _norm(self.of(amounts))
 
 
+@dataclass(frozen=True, eq=False)
+class Wavefronts:
+    """Wavefront errors of a setup with errors, in waves of the main wavelength; its first channel is of that line.
+
+    The OPD of a ray, by its place on the plane before the lens, is nearly linear in the errors, and its RMS is a norm,
+    as RRMSD is that of a picture: the same model superposes it.  The wanted wave stays in the room; piston and tilt
+    are removed anew for each lens, so that a lens may aim its light elsewhere.
+    """
+
+    setup: Setup
+    perturbations: tuple[Perturbation, ...]
+    wave: Wave
+    wavelength: float  # nm
+    rays: int = RAYS  # a side
+
+    figure = "wavefront RMS"
+
+    def of(self, amounts: Sequence[float]) -> np.ndarray:
+        """(rays²,) OPD without piston and tilt, times the root of each ray's share of the flux: its norm is the RMS."""
+        setup = perturbed(self.setup, self.perturbations, amounts)
+        source, lens = _main(setup)
+        pupil = exit_pupil(source, lens, self.wave.z, self.rays)
+        if setup.placed is not None:
+            pupil = moved_pupil(pupil, setup.placed, self.wave.z)
+        return residual(pupil, self.wave, self.wavelength).ravel().numpy()
+
+    @property
+    def designed(self) -> float:
+        """RMS (waves) of the setup as it is, by as many rays as a report's."""
+        return wavefront_error(*_main(self.setup), self.wave).without_tilt.rms
+
+
+def _main(setup: Setup) -> tuple[Emitter, Lens]:
+    """The light of the main line, and the lens as it meets it."""
+    channel = setup.channels[0]
+    return channel.source, channel.through(setup.lens)
+
+
 class Traced(Protocol):
-    """What is traced of a setup with errors: Pictures, or Wavefronts (wavefronts.py)."""
+    """What is traced of a setup with errors: Pictures, or Wavefronts."""
 
     setup: Setup
     perturbations: tuple[Perturbation, ...]

@@ -26,8 +26,7 @@ from bstcad.scene.target import Target
 from bstcad.tolerance import study as studies
 from bstcad.tolerance.grades import GRADES, perturbations, start_of, whole_table
 from bstcad.tolerance.perturbations import Kind, Setup, perturbed, trials
-from bstcad.tolerance.study import Pictures, Progress, Spread, Study, Yield, here, share_of
-from bstcad.tolerance.wavefronts import Wavefronts
+from bstcad.tolerance.study import Pictures, Progress, Spread, Study, Wavefronts, Yield, here, share_of
 from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, Nominal
 
 TUBES = 1031  # a side, a channel: their error is the same in every trial

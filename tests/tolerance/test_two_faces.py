@@ -35,7 +35,7 @@ from bstcad.tolerance.perturbations import (
     perturbed,
     random_field,
 )
-from bstcad.tolerance.wavefronts import Wavefronts
+from bstcad.tolerance.study import Wavefronts
 from tests.lenses import net
 
 N, LINE, BACK, SEEN = 1.5, 500.0, 12.0, 40.0  # index, nm, vertex of the back, plane of the wave (mm)
