@@ -27,10 +27,11 @@ from bstcad.optics.measure import Effort
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sides import both
 from bstcad.optics.surfaces import Sphere
+from bstcad.report.figure_jobs import NoPictures
 from bstcad.scene.blank import as_front, net_extent
 from bstcad.scene.errors import SceneError
 from bstcad.sweep.plan import plan
-from tests.conftest import draws_nothing, verify_with
+from tests.conftest import verify_with
 
 # --- the choices ------------------------------------------------------------------------------------------------------
 
@@ -322,11 +323,18 @@ COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which f
 }
 
 
+class Words(NoPictures):
+    """The words of the data sheet, and no pictures."""
+
+    def sheet(self, sheet):
+        assert all(sheet.tables.values())
+
+
 @pytest.fixture(scope="module", autouse=True)
 def quick():
     """Few rays and tubes, and no figures."""
     with pytest.MonkeyPatch.context() as patch:
-        draws_nothing(patch)
+        patch.setattr("bstcad.commands.Pictures", Words)
         verify_with(patch, EFFORT)
         for where, figures in COARSE.items():
             for name, figure in figures.items():
