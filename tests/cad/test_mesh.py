@@ -91,6 +91,10 @@ def test_facets_larger_than_what_they_have_to_follow_are_seen_to_miss_it():
     error = chordal_error(lens_mesh(lens, 16), lens)
     assert 0.5 * swing < error < 1.01 * swing
     assert mesh.fitting(lens, 2 * swing)[0] == mesh.COARSEST < mesh.fitting(lens, 0.2 * swing)[0]
+    heights = torch.zeros((129, 129), dtype=torch.float64)
+    heights[67, 66] = 1e-3  # one point, which lies beside the middles of facets and edges
+    lens = lens_of(net(heights), Plane(8.0))
+    assert 0.4e-3 < chordal_error(lens_mesh(lens, 16), lens) < 0.6e-3
 
 
 def test_the_chordal_error_of_a_sphere_is_the_sagitta_and_of_a_round_wall_that_of_its_polygon():

@@ -11,7 +11,7 @@ from scipy.interpolate import BSpline, NdBSpline
 
 from bstcad.optics import bspline
 from bstcad.optics.bspline import Spans, curvature_bounds, principal, slope_bounds, span_places
-from tests.lenses import rough
+from tests.lenses import net, rough
 
 NETS = (5, 6, 7, 33, 513)
 M = 9
@@ -153,6 +153,9 @@ def test_no_place_exceeds_the_bounds_of_its_span():
         (jet.slope.view(9, 9, M - 2, M - 2).amax((0, 1)), slope_bounds(NET)),
     ):
         assert bool(((worst <= bound + 1e-12) | (worst <= 0)).all())
+    for sag in (lambda x, y: 0.05 * x**2, lambda x, y: 0.05 * y**2):
+        inner = curvature_bounds(net(sag, half=(2.0, 3.0)), 1.0)[2:-2, 2:-2]
+        torch.testing.assert_close(inner, torch.full_like(inner, 0.1), rtol=0, atol=1e-9)
 
 
 def test_what_spans_add_to_the_net_is_the_transpose_of_what_they_take():

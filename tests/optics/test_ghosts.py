@@ -10,7 +10,7 @@ from bstcad.optics.channels import Channel
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.losses import Absorption, Coating, Fresnel, Losses
+from bstcad.optics.losses import Absorption, Coating, Fresnel, Losses, reflectance
 from bstcad.optics.measure import Effort, measure
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.point import Point
@@ -82,6 +82,14 @@ def test_a_wedge_throws_its_ghost_where_geometry_has_it(front):
     x4 = x3 + (throw - 10.0 - z3) * math.tan(leaves)
     assert float(landed.position[0]) == pytest.approx(x4, abs=1e-9)
     assert float(landed.position[1]) == pytest.approx(0.0, abs=1e-12)
+    first, *inside = (_reflected(k * wedge) for k in range(4))  # from the glass, but for normal incidence
+    assert float(out.flux) == pytest.approx((1 - first) * inside[0] * inside[1] * (1 - inside[2]), rel=1e-9)
+
+
+def _reflected(angle):
+    """R of a bare face that light meets from the glass."""
+    cosines = math.cos(angle), math.sqrt(1 - (N * math.sin(angle)) ** 2)
+    return float(reflectance(N, 1.0, *(torch.tensor(c, dtype=torch.float64) for c in cosines)))
 
 
 # --- in a measurement -------------------------------------------------------------------------------------------------
