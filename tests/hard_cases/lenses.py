@@ -16,7 +16,6 @@ from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Landed, Rays
 from bstcad.optics.receivers import LevelPlane
-from tests.lenses import SQUARE, N, bundle, lens_of, places, uniform, wavy  # noqa: F401
 from tests.tracing import from_first_net_plain
 
 DTYPES = pytest.mark.parametrize("dtype", (torch.float32, torch.float64), ids=("float32", "float64"))
