@@ -1,7 +1,4 @@
-"""The cadquery scripts among the templates: each runs on a small design and writes valid solids.
-
-`flanged_lens.py` is a command of the README, see test_readme.
-"""
+"""The cadquery scripts among the templates: each runs on a small design and writes valid solids."""
 
 import runpy
 import shutil
@@ -51,6 +48,12 @@ def test_a_lens_in_its_housing_with_its_led(design):
     lens, housing, led = (made[name] if name == "lens" else made[name].val() for name in ("lens", "housing", "led"))
     for one, other in ((lens, housing), (led, housing), (lens, led)):
         assert one.intersect(other).Volume() < 1e-6  # nothing is inside something else
+
+
+def test_a_flange_is_one_with_the_lens(design):
+    run("flanged_lens.py", design.folder)
+    [part] = written(design.folder / "flanged_lens.step")
+    assert part.Volume() > exact_volume(design.lens)
 
 
 def test_nine_lenses_on_a_plate(design):

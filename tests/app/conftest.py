@@ -101,17 +101,24 @@ def shared(tmp_path_factory):
     own.end()
 
 
-@pytest.fixture(scope="module")
-def chromium():
-    """Chromium without a window."""
+@contextlib.contextmanager
+def launched():
+    """Chromium without a window, as the system has it."""
     if CHROMIUM is None:
-        pytest.skip("no Chromium here")
+        pytest.skip("there is no Chromium here; on Debian: sudo apt install chromium")
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as found:
         browser = found.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
         yield browser
         browser.close()
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    """Chromium of all tests of a file."""
+    with launched() as browser:
+        yield browser
 
 
 def open_scene(page, own: Served, name: str) -> Path:

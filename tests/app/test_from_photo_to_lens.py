@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 from bstcad import commands
+from bstcad import folder as folders
 from bstcad.app import design_process
 from bstcad.app.design_runs import Run
 from bstcad.report import record
@@ -14,7 +15,7 @@ from bstcad.scene import new_scene
 from bstcad.scene.scene import load
 from tests.app.asking import bench
 
-SIZES = {(80, 120): "120xphoto", (120, 80): "120xphoto"}  # mm, as the page asks for a photo of those proportions
+SIZES = ((80, 120), (120, 80))  # mm
 FEW = {"lens.back.control_points": "33", "target.pixels": "24", "tailoring.rays": "96"}  # made in a second or two
 
 
@@ -41,7 +42,7 @@ def own(tmp_path, monkeypatch):
 def with_scene(own, light, size):
     """Click 1, the file, after the light's card was chosen: the name of the scene."""
     picture = own.ask("/api/picture", photo(*size)).json["picture"]
-    return own.ask("/api/scenes", {"light": light, "picture": picture, "size": SIZES[size]}).json["name"]
+    return own.ask("/api/scenes", {"light": light, "picture": picture, "size": "120xphoto"}).json["name"]
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -74,7 +75,7 @@ def test_plate_and_picture_take_the_proportions_of_a_photo_that_is_there(own, cr
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # a process would end with its file
 @pytest.mark.parametrize(("light", "size"), [("laser", (80, 120)), ("lamp", (120, 80))])
-def test_a_photo_is_a_verified_lens_in_four_requests(own, light, size):
+def test_a_photo_is_a_verified_lens_in_four_requests(own, light, size, tmp_path):
     name = with_scene(own, light, size)
     for key, words in FEW.items():
         assert own.ask(f"/api/scene/{name}/change", {"key": key, "words": words}).status == 200
@@ -88,5 +89,9 @@ def test_a_photo_is_a_verified_lens_in_four_requests(own, light, size):
     report = record.read(own.folder / name / "report.json")
     assert [check.name for check in report.checks if not check.passed] == []
     assert commands.verify(own.folder / name / "lens.step").passed
+    if light == "laser":  # the lens of the command, to the last bit
+        commands.generate(load(own.folder / name / "scene.toml"), tmp_path / "alone", drawing=commands.NoPictures)
+        lenses = [folders.read_nominal(place)[1].lens for place in (own.folder / name, tmp_path / "alone")]
+        assert np.array_equal(*(lens.back.control_points() for lens in lenses))
     again = own.ask(f"/api/design/{name}/edit", {}).json["name"]  # and its scene, with the comments that it had
     assert "# the wall, on which" in own.workspace.opened(again).text

@@ -11,8 +11,6 @@ let number = 0, sent = {}, waiting = null, busy = false, dragging = null, viewer
 const wrong = new Map(); // what a person typed that is no value: by key, the words and the sentence
 const closed = new Set(); // locks, by their keys
 let impossible = {}; // by key and choice, why this scene cannot have it
-const log = (globalThis.previewLog = []); // milliseconds from each change to its preview, for measurements
-let changedAt = null;
 
 // ---- the form ----
 
@@ -57,7 +55,6 @@ function replaceForm(html) {
 function change(given) {
   if (given.words !== undefined && given.key === sent.key && given.words === sent.words) return; // a slider says it twice
   sent = given;
-  changedAt = performance.now();
   waiting = given;
   if (!busy) send();
 }
@@ -247,7 +244,7 @@ element("quality").addEventListener("change", ({ target }) => change({ key: "tai
 // ---- the preview ----
 
 async function preview() {
-  const mine = ++number, began = changedAt ?? performance.now();
+  const mine = ++number;
   element("targets").classList.add("waiting");
   element("status").className = "";
   element("status").textContent = "A new preview is on its way …";
@@ -261,7 +258,6 @@ async function preview() {
   }
   if (mine !== number || told.replaced) return;
   show(told);
-  log.push(performance.now() - began);
   if (told.refused) return;
   findImpossible(mine);
   for (let stage = 1; stage < 4; stage++) {
