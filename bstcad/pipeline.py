@@ -19,7 +19,6 @@ from bstcad.baselines import integration, paper
 from bstcad.folder import Made
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.goal import Goal
-from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.reach import GRAZING, grazing_of, spread_at, unreached
 from bstcad.optics.sides import both
@@ -132,6 +131,8 @@ def design(
     driver = Driver(progress, began, **limits, interrupted=interrupted, save=save, look=look, record=record)
     precision = getattr(torch, knobs.precision)
     lens = scene.flat_lens(knobs.levels[0], dtype=precision, device=device, as_wide_as=knobs.levels[-1])
+    if not scene.lens.back.optimise:  # nothing refines it on the way
+        lens = lens.with_back(lens.back.refined(scene.lens.back.net))
     if start is None:
         driver.end("loading")  # the libraries, the scene and the files it names
     followed = (
@@ -189,8 +190,7 @@ def posed(scene: Scene, task: Task) -> Task:
     lens = scene.flat_lens(REACH_NET)
     if not lens.shapes_both or not task.several:
         return task
-    aimed, bare = task.aimed(lens)
-    demand = demands(aimed, aimed.heaviest.through(bare))
+    demand = demands(task, task.heaviest.through(lens))
     sentences = tuple(demand.sentences(scene.lens.back.z - scene.lens.front.z))
     if refused(demand):
         raise SceneError(f"target: {'; '.join(sentences[1:])}")
@@ -219,8 +219,6 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
     channels = scene.with_source_scaled(0.0).channels()
     light = max(channels, key=lambda channel: channel.weight)  # stage 1 reckons with it alone
     lens, grazing = light.through(scene.flat_lens(REACH_NET)), GRAZING
-    goal = replace(goal, receiver=imaged(lens.behind, goal.receiver))
-    lens = replace(lens, behind=())
     if refracts := lens.passes.largest_turn(light.index) is not None:
         grazing = grazing_of(light.index, [each.index for each in channels], spread_at(scene.source, lens))
     part = reachable(light.source, lens, goal, grazing=grazing)
@@ -283,8 +281,8 @@ def _compared(making: Making, task: Task, lens: Lens, before: int) -> Making:
 
 
 def steepness(source: Emitter, lens: Lens, goal: Goal, sent: TransportMap) -> Steepness:
-    """The slope that the light of a goal needs of the back, by the map of stage 1."""
-    at_back, screen = sent.plane == "back", imaged(lens.behind, goal.receiver)
+    """The slope that the light of a goal needs of the last tailored face, by the map of stage 1."""
+    at_back, screen = sent.plane == "back", imaged(lens, goal.receiver)
     return needed(source, lens, screen, goal.picture, x=sent.x, y=sent.y, places=sent.source, at_back=at_back)
 
 
@@ -317,17 +315,15 @@ def _stage1(
         raise KeyboardInterrupt  # there is nothing to show
     name, stage, _ = PROCEDURES[task.knobs.method]
     like = lens.like
-    if scene.lens.front.shaped:  # whose light behind the lens is one of numpy: a second of work on the CPU
+    if scene.lens.front.shaped:  # whose light between both faces is one of numpy: a second of work on the CPU
         stage, lens = two_faces.steps, lens.to(like.dtype, "cpu")
-    aimed, bare = task.aimed(lens)
-    last = driver.run(stage(aimed, bare, state), aimed, lambda state: Saved(driver.record, state), lambda: driver.wish)
-    lens = replace(last.lens, behind=lens.behind).to(like.dtype, like.device)
+    last = driver.run(stage(task, lens, state), task, lambda state: Saved(driver.record, state), lambda: driver.wish)
+    lens = replace(last.lens, behind=lens.behind, shaped=lens.shaped).to(like.dtype, like.device)
     check_front(lens, scene)
     bounds = held(lens, task.bounds, task.least)
     if bounds is None:
         check_thickness(lens, scene)
-    judged = None if lens.behind else last.judged  # which knows nothing of what is behind the lens
-    rrmsd = reached(lens, task.rrmsd(lens) if judged is None else judged)
+    rrmsd = reached(lens, task.rrmsd(lens) if last.judged is None else last.judged)
     driver.end(name, rrmsd)
     if bounds is not None:
         driver.progress(BOUNDED, 0, 1, "")
@@ -341,16 +337,12 @@ def _stage1(
     if compare and not driver.hurry:
         precision = compare_precisions(task, lens)
         driver.end(COMPARED)
-    return Followed(
-        Parameters.of(lens), last.mapping, transport_of(last, lens, aimed.goals[0].receiver), precision, rrmsd=rrmsd
-    )
-
-
-def transport_of(last: Step, lens: Lens, screen: Screen) -> TransportMap:
-    """The map that a last step of stage 1 followed, inverted."""
+    screen = task.goals[0].receiver
     if last.places is None:
-        return slope_map.sent_from_entrance(last.mapping, lens, screen)
-    return slope_map.sent_from(last.places, screen)
+        sent = slope_map.sent_from_entrance(last.mapping, lens, screen)
+    else:
+        sent = slope_map.sent_from(last.places, screen)
+    return Followed(Parameters.of(lens), last.mapping, sent, precision, rrmsd=rrmsd)
 
 
 def _stage2(

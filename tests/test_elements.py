@@ -11,15 +11,15 @@ import torch
 import bstcad
 from bstcad import commands
 from bstcad.judges.comparison import compare
-from bstcad.optics.irradiance import Screen
+from bstcad.optics.interfaces import Interface, Refract
 from bstcad.optics.media import refractive_index
 from bstcad.optics.motion import Motion
-from bstcad.optics.rays import Rays
+from bstcad.optics.rays import Rays, Status
 from bstcad.optics.receivers import LevelPlane, TiltedPlane
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.tilted import Tilted
 from bstcad.optics.trace import across
-from bstcad.optics.unfolding import image
+from bstcad.optics.unfolding import image, imaged
 from bstcad.report.figure_jobs import side_view
 from bstcad.scene.elements import Mirror, Window, interfaces
 from bstcad.scene.errors import SceneError
@@ -122,6 +122,19 @@ def test_a_plate_brings_the_image_nearer(folds):
     )
     real, seen = (LevelPlane(z).land(across(rays, behind)), image(behind, LevelPlane(z)).land(rays))
     torch.testing.assert_close(real.position, seen.position, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("plane", [LevelPlane(60.0), TiltedPlane((-40.0, 5.0, 70.0), (5.0, 35.0))])
+@pytest.mark.parametrize("window", [(), ("window",)])
+def test_light_out_of_the_glass_lands_where_it_is_sent(plane, window):
+    """Through a flat back, and past a window to first order in the angle."""
+    back = Interface(Plane(10.0), bstcad.Circle(300.0), Refract(1.5, 1.0), Status.VIGNETTED)
+    behind = (back, *interfaces([made(kind, z=30.0, thickness=0.01, index=1.5) for kind in window], 1, 587.6))
+    rays = random_rays(z=2.0)
+    x, y = torch.from_numpy(np.random.default_rng(1).uniform(-40, 0, (2, 400)))
+    sent = replace(rays, direction=image(behind, plane).way_to(rays, torch.stack([x, y])))
+    landed = plane.land(across(sent, behind))
+    torch.testing.assert_close(landed.position, torch.stack([x, y]), rtol=0, atol=1e-2 if window else 1e-9)
 
 
 # --- scenes -----------------------------------------------------------------------------------------------------------
@@ -271,7 +284,5 @@ def test_a_lens_that_is_moved_leaves_them_where_they_are(folder):
 
 
 def test_a_screen_of_an_image_is_the_screen_where_nothing_is_behind():
-    from bstcad.optics.unfolding import imaged
-
-    screen = Screen(100.0, (-5.0, 5.0), (-5.0, 5.0), 8)
-    assert imaged((), screen) is screen
+    scene = bstcad.load(DISK)
+    assert imaged(scene.flat_lens(9), screen := scene.target.screen) is screen

@@ -16,7 +16,7 @@ from bstcad.analysis.shape import ripple
 from bstcad.optics import sampling
 from bstcad.optics.channels import Channel, points
 from bstcad.optics.emitters import Emitter
-from bstcad.optics.interfaces import cross, intersect
+from bstcad.optics.interfaces import cross, deflect, intersect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import IMAGE_PLACES, detail_width, images, tubes_of, tubes_picture
@@ -26,7 +26,6 @@ from bstcad.optics.receivers import Receiver
 from bstcad.optics.trace import (
     across,
     clear_window,
-    from_first_net,
     launch_strips,
     to_first_net,
     trace,
@@ -98,8 +97,8 @@ CORNERS = tuple((u, v) for u in (-1, 0, 1) for v in (-1, 0, 1))  # places on an 
 WHOLE = 0.99  # part of the clear aperture: light that reaches so far fills the face
 
 
-def used(source: Emitter, lens: Lens) -> tuple[Outline | None, ...]:
-    """Smallest circle or rectangle about the axis (mm) that holds all light on each face of the solid, in its order.
+def used(source: Emitter, lens: Lens) -> dict[str, Outline | None]:
+    """Smallest circle or rectangle about the axis (mm) that holds all light on each face of the solid that it meets.
 
     None: the light fills the face's clear aperture.  Only light that gets through all faces counts; of an extended
     source the light of its middle and of the ends of its extent.
@@ -109,8 +108,9 @@ def used(source: Emitter, lens: Lens) -> tuple[Outline | None, ...]:
         a, b = source.extent.half_extent
         elements = [source.element(a * u, b * v) for u, v in CORNERS if not (source.extent.is_round and u and v)]
     hits = torch.cat([_hits(element.central, lens) for element in elements], dim=2)
-    pairs = zip(hits[lens.solid], lens.interfaces[lens.solid], strict=True)
-    return tuple(_patch(face, interface.outline) for face, interface in pairs)
+    of_solid, apertures = hits[lens.solid], dict(zip(("front", "back"), lens.apertures, strict=True))
+    numbers = {face: list(lens.passes.numbers_of(face)) for face in lens.passes.faces}
+    return {face: _patch(torch.cat([*of_solid[k]], dim=1), apertures[face]) for face, k in numbers.items()}
 
 
 def _hits(source: Emitter, lens: Lens) -> Tensor:
@@ -213,7 +213,7 @@ class Margins:
     """The worst of all rays that carry light to the back face."""
 
     tir_margin_deg: float | None  # critical angle minus angle of incidence (degrees), < 0: reflected; None: no such ray
-    newton_slope_min: float | None  # |F'(t)| at the back face, the denominator of Newton's step; 1 head on, 0 grazing
+    newton_slope_min: float | None  # |F'(t)| at a tailored face, the denominator of Newton's step; 1 head on, 0 grazing
     non_finite: int  # count of control points, hits and landings that are not finite
 
 
@@ -221,29 +221,29 @@ class Margins:
 def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, n: int = MARGIN_RAYS) -> Margins:
     """Margins over n x n stratified rays a channel; the k points of an extended source share n x n rays.
 
-    cos θ = (d_z - d_x z_x - d_y z_y) / sqrt(1 + z_x² + z_y²) at the back face, total reflection at sin θ = 1 / n;
-    F(t) = z(t) - sag(x(t), y(t)), F' = d_z - d_x z_x - d_y z_y.
+    cos θ = (d_z - d_x z_x - d_y z_y) / sqrt(1 + z_x² + z_y²) where light leaves the glass, total reflection at
+    sin θ = 1 / n; F(t) = z(t) - sag(x(t), y(t)), F' = d_z - d_x z_x - d_y z_y at each face from the first net on.
     """
     margin, slope, n = math.inf, math.inf, math.ceil(n / math.sqrt(points(channels)))
     wrong = sum(int((~torch.isfinite(net.heights)).sum()) for net in lens.nets)
     for channel in channels:
         through = channel.through(lens)
-        number = through.number_of("back")
-        last = through.interfaces[number]
-        critical = math.inf if last.law.reverses else math.degrees(math.asin(min(1.0 / last.law.eta, 1.0)))
         for rays in launch_strips(channel.source, through, n, seed):
-            coming = to_first_net(rays, through)
-            at_last = across(coming, through.interfaces[through.freeform[0] : number])
-            met, z_x, z_y = intersect(last.surface, at_last, last.outline, last.status_if_missed)
-            dx, dy, dz = met.direction
-            along = met.sense * (dz - dx * z_x - dy * z_y)
-            meets = met.alive & (met.flux > 0)
-            wrong += int((~torch.isfinite(met.position)).any(0)[meets].sum())
-            if bool(meets.any()):
-                cosine = (along / torch.sqrt(1 + z_x * z_x + z_y * z_y))[meets].clamp(-1.0, 1.0)
-                margin = min(margin, critical - float(torch.rad2deg(torch.arccos(cosine)).max()))
-                slope = min(slope, float(along.abs()[meets].min()))
-            landed = from_first_net(coming, through, screen.plane)
+            rays = to_first_net(rays, through)
+            for face in through.interfaces[through.freeform[0] : through.solid.stop]:
+                met, z_x, z_y = intersect(face.surface, rays, face.outline, face.status_if_missed)
+                dx, dy, dz = met.direction
+                along = met.sense * (dz - dx * z_x - dy * z_y)
+                meets = met.alive & (met.flux > 0)
+                wrong += int((~torch.isfinite(met.position)).any(0)[meets].sum())
+                if bool(meets.any()):
+                    slope = min(slope, float(along.abs()[meets].min()))
+                if bool(meets.any()) and face.law.eta > 1:
+                    cosine = (along / torch.sqrt(1 + z_x * z_x + z_y * z_y))[meets].clamp(-1.0, 1.0)
+                    critical = math.degrees(math.asin(1.0 / face.law.eta))
+                    margin = min(margin, critical - float(torch.rad2deg(torch.arccos(cosine)).max()))
+                rays = deflect(met, z_x, z_y, face.law, level=face.surface.level).rays
+            landed = screen.plane.land(across(rays, through.behind))
             wrong += int((~torch.isfinite(landed.position)).any(0)[landed.alive].sum())
     return Margins(None if math.isinf(margin) else margin, None if math.isinf(slope) else slope, wrong)
 

@@ -34,6 +34,7 @@ from bstcad.optics.rays import Rays
 from bstcad.optics.receivers import Receiver
 from bstcad.optics.sides import Sides, both
 from bstcad.optics.trace import clear_window, to_first_net
+from bstcad.optics.unfolding import seen_from_last_net
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring import slope_map
 from bstcad.tailoring.machinability import moved_clear
@@ -81,10 +82,10 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
     area, n = clear_window(source, exact), knobs.rays // 2 * 2 + 1  # odd: one ray is through the middle
     x, y = sampling.grid(area, n)
     coming = to_first_net(source.rays(x, y, exact.entrance.z, area.area / n**2), exact)
-    aim = slope_map.aim_points(mapping, exact, screen, x=x, y=y)
+    aim, plane = slope_map.aim_points(mapping, exact, screen, x=x, y=y), seen_from_last_net(exact, screen.plane)
     for _ in range(STARTS):
         start = exact.back.z
-        points = march(coming, aim, screen.plane, law=exact.last_freeform.law, z=start, first=first)
+        points = march(coming, aim, plane, law=exact.last_freeform.law, z=start, first=first)
         back = fitted(exact.back, points, lit(points, coming, exact), knobs.levels)
         exact = moved_clear(exact.with_back(back), z, task.least)
         if exact.back.z == start:

@@ -32,6 +32,7 @@ class Lens:
 
     A lens refracts: light travels along +z, enters through the front and leaves through the back.  A mirror reflects
     at its back: light comes from above, along -z, and leaves along +z; its front is the rear of the plate, and dark.
+    A second-surface mirror reflects at its front, and light crosses its back twice.
     What light does at which face stands in `passes`, and a face that it meets twice is two of the interfaces.
     Whoever follows light walks `interfaces`; whoever searches surfaces goes by `freeform`.
     """
@@ -107,8 +108,8 @@ class Lens:
 
     @property
     def shapes_both(self) -> bool:
-        """Does tailoring shape front and back of the solid?"""
-        return self.shapes("front") and self.shapes("back")
+        """Does tailoring shape front and back of the solid, which light crosses one after the other?"""
+        return self.shapes("front") and self.shapes("back") and not self.passes.reflects
 
     def shaping(self, *faces: Face) -> Lens:
         """Return the same lens, of which tailoring shapes these faces of the solid, in the order of the light."""

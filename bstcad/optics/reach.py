@@ -31,7 +31,7 @@ STEEPEST = math.tan(math.radians(70))  # slope; no tool reaches a steeper one, w
 
 
 def largest_deflection(index: float, grazing: float = GRAZING) -> float:
-    """The angle (rad) by which a face turns a ray that leaves it at `grazing` (rad) from the normal."""
+    """The angle (rad) by which a face turns a ray at `grazing` (rad) from the normal in air."""
     return grazing - math.asin(math.sin(grazing) / index)
 
 
@@ -84,9 +84,14 @@ def slopes_towards(at_face: Rays, out: Tensor, law: Law) -> tuple[Tensor, Tensor
     along = d[0] * out[0] + d[1] * out[1] + d[2] * out[2]
     most = math.pi if law.reverses else largest_deflection(max(law.eta, 1 / law.eta))
     out = torch.where(along < math.cos(most), _turned(d, out, along, most), out)
-    normal = (at_face.sense if law.eta >= 1 else -at_face.sense) * (law.eta * d - out)
+    normal = normal_towards(at_face, out, law)
     height = torch.maximum(normal[2], torch.sqrt(normal[0] ** 2 + normal[1] ** 2) / STEEPEST)
     return -normal[0] / height, -normal[1] / height
+
+
+def normal_towards(at_face: Rays, out: Tensor, law: Law) -> Tensor:
+    """±(η d - d'): the normal (3, …), of any length, of a face that turns each ray into the direction d' of `out`."""
+    return (at_face.sense if law.eta >= 1 else -at_face.sense) * (law.eta * at_face.direction - out)
 
 
 def kept_from_reflection(
@@ -120,13 +125,15 @@ def room(at_face: Rays, aim: Tensor, plane: Receiver, law: Law, grazing: float =
     The least of three: d · d' less the cosine of the largest deflection; n_z - |(n_x, n_y)| / STEEPEST of the normal
     n = η d - d'; and the cosine to the receiver's normal with which the light meets it from before.
     """
-    d, out, along = directions(at_face, aim, plane)
-    normal = at_face.sense * (law.eta * d - out)
+    _, out, along = directions(at_face, aim, plane)
+    normal = normal_towards(at_face, out, law)
     upright = normal[2] - torch.sqrt(normal[0] ** 2 + normal[1] ** 2) / STEEPEST
     n_x, n_y, n_z = plane.normal(aim)
     onwards = (-at_face.sense if law.reverses else at_face.sense) * (n_x * out[0] + n_y * out[1] + n_z * out[2])
     least = torch.minimum(upright, onwards)
-    return least if law.reverses else torch.minimum(least, along - math.cos(largest_deflection(law.eta, grazing)))
+    if law.reverses:
+        return least
+    return torch.minimum(least, along - math.cos(largest_deflection(max(law.eta, 1 / law.eta), grazing)))
 
 
 def unreached(picture: np.ndarray, part: np.ndarray, angle: float | None) -> dict[str, float | None]:

@@ -1,8 +1,9 @@
-"""Receivers where a lens sees them: past the windows and in the flat mirrors behind it.
+"""Receivers where a tailored face sees them: through a flat face of the lens, past windows and in flat mirrors.
 
 Stage 1 aims from the last tailored face straight at the receiver.  Behind flat mirrors it aims at the receiver's mirror
 image, which is exact.  A plate of thickness t and index n brings the image nearer by t (1 - 1 / n), to first order in
-the angle; stage 2, which traces all interfaces, does the rest.
+the angle; stage 2, which traces all interfaces, does the rest.  Light that is still in the glass leaves it through a
+flat face: towards each place it takes the way that Snell's law has it take (`BehindGlass`).
 """
 
 from __future__ import annotations
@@ -10,13 +11,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import torch
+from torch import Tensor
+
 from bstcad.optics.interfaces import Interface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.rays import Vector
+from bstcad.optics.rays import Rays, Vector
 from bstcad.optics.receivers import LevelPlane, Plane, Receiver, dot
+from bstcad.optics.surfaces import sag
 from bstcad.optics.tilted import Tilted
 
+STEPS = 12  # to the place of a flat face from which light goes to a place of a receiver; each is a tenth as long, or so
 STRAIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -68,13 +74,60 @@ class Image(Plane):
         return LevelPlane(z) if self.frame == STRAIGHT and (c_x, c_y) == (o_x, o_y) else self
 
 
-def image(behind: Sequence[Interface], plane: Receiver) -> Receiver:
-    """Return where a lens sees a plane by way of these interfaces, whose surfaces are flat; the plane itself: of none.
+@dataclass(frozen=True)
+class BehindGlass(Receiver):
+    """A receiver at which light aims that is still in the glass, and leaves it through a level face."""
 
-    Light leaves the lens along +z.
+    rest: Receiver
+    z: float  # mm; of the face
+    eta: float  # index of the glass over that behind it
+
+    @property
+    def middle(self) -> Vector:
+        """The point in the middle of the receiver (mm)."""
+        return self.rest.middle
+
+    def path(self, rays: Rays) -> tuple[Tensor, Tensor]:
+        """(way along each ray behind the face to the receiver (mm), status)."""
+        return self.rest.path(rays)
+
+    def places(self, rays: Rays) -> Sequence[Tensor]:
+        """x and y of rays that are on the receiver."""
+        return self.rest.places(rays)
+
+    def point(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The points in space (mm) of places on the receiver."""
+        return self.rest.point(x, y)
+
+    def normal(self, aim: Tensor) -> Sequence[Tensor | float]:
+        """The unit normal of the receiver in each of these places (2, …)."""
+        return self.rest.normal(aim)
+
+    def way_to(self, rays: Rays, aim: Tensor) -> Tensor:
+        """(3, …) the unit vectors along which rays in the glass go to places (2, …) of the receiver.
+
+        From where the straight way meets the face the light goes on to the place; before the face it comes along
+        (s_x / η, s_y / η), s its direction behind, from somewhere else on the face: so again, until both agree.
+        """
+        below, way = rays.above(self.z), self.rest.way_to(rays, aim)
+        for _ in range(STEPS):
+            at = replace(rays, position=rays.position - below / way[2] * way)
+            out = self.rest.way_to(at, aim)
+            sines = out[:2] / torch.sqrt((out * out).sum(0)) / self.eta
+            way = torch.cat([sines, (torch.sign(out[2]) * torch.sqrt(1 - (sines * sines).sum(0)))[None]])
+        return way
+
+
+def image(behind: Sequence[Interface], plane: Receiver) -> Receiver:
+    """Return where light before these interfaces, whose surfaces are flat, sees a receiver; itself: of none.
+
+    Light leaves the lens along +z, and a receiver behind elements is a plane.
     """
     if not behind:
         return plane
+    if sum(not interface.law.reverses for interface in behind) % 2:  # the first leads out of the glass
+        face, *beyond = behind
+        return BehindGlass(image(beyond, plane), float(sag(face.surface, 0.0, 0.0)), face.law.eta)
     seen = Image.of(plane)
     leaves: Tilted | None = None  # the face through which light, followed backwards, has come into a plate
     for interface in reversed(behind):
@@ -90,9 +143,16 @@ def image(behind: Sequence[Interface], plane: Receiver) -> Receiver:
     return seen.plain()
 
 
-def imaged(behind: Sequence[Interface], screen: Screen) -> Screen:
-    """Return a screen on the image of its plane; the screen itself where nothing is behind the lens."""
-    return replace(screen, surface=image(behind, screen.plane)) if behind else screen
+def seen_from_last_net(lens: Lens, plane: Receiver) -> Receiver:
+    """Return a receiver where light behind the last net of a lens sees it; itself where it meets nothing else."""
+    return image(lens.interfaces[lens.freeform[-1] + 1 :], plane)
+
+
+def imaged(lens: Lens, screen: Screen) -> Screen:
+    """Return a screen on such a receiver."""
+    plane = screen.plane
+    seen = seen_from_last_net(lens, plane)
+    return screen if seen is plane else replace(screen, surface=seen)
 
 
 def seen_by(lens: Lens, screen: Screen) -> Receiver:

@@ -69,8 +69,8 @@ class Sheet:
         return prescription(self.scene, self.lens, self.shape)
 
     @cached_property
-    def apertures(self) -> list[Outline | None]:
-        """Clear apertures that the light needs, of the front, if light meets it, and of the back; None: all of it."""
+    def apertures(self) -> dict[str, Outline | None]:
+        """Clear apertures that the light needs of the faces that it meets; None: all of it."""
         return used(self.scene.source, self.lens)
 
     @property
@@ -81,7 +81,8 @@ class Sheet:
             mount=self.mount, light=self.scene.source, passed=self.passed,
             asked=self.scene.limits_light,
             pairs=list(zip(self.scene.targets, self.figures, strict=True)), across=across, walls=wall_words,
-            apertures=[_aperture(patch, self.lens.outline) for patch in self.apertures], kinds_of_holes=kinds_of_holes,
+            apertures={face: _aperture(patch, self.lens.outline) for face, patch in self.apertures.items()},
+            kinds_of_holes=kinds_of_holes,
             limits={face: settings_of(self.scene.tolerance, f"{face}.form").get("limit") for face in ("front", "back")},
         )  # fmt: skip
 
@@ -128,7 +129,7 @@ def page(sheet: Sheet) -> Figure:
     paper.line([(ASIDE, TABLE), (ASIDE, high)], THIN)
     faces = {"front": _form(sheet), "back": "freeform"}
     views = part_views.Views(
-        sheet.lens, sheet.mount or Mount(), sheet.order.origin, used=sheet.apertures[-1],
+        sheet.lens, sheet.mount or Mount(), sheet.order.origin, used=sheet.apertures["back"],
         names=tuple((f"{sheet.lens.passes.name(face).capitalize()}: {form}", form) for face, form in faces.items()),
     )  # fmt: skip
     scale = part_views.draw(paper, views, left=left, low=TABLE, right=ASIDE, high=high)

@@ -21,9 +21,8 @@ from bstcad.optics import media
 from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
 from bstcad.optics.sides import both
-from bstcad.optics.unfolding import imaged
 from bstcad.report.record import LeftOut, Making
-from bstcad.scene.effects import Absorption, Effect, Fresnel, losses, named, reflection_of
+from bstcad.scene.effects import Absorption, Effect, Fresnel, Ghost, losses, named, reflection_of
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.machinability import moved_clear
 from bstcad.tailoring.slope_fit import Fit
@@ -43,8 +42,7 @@ def coarse_lens(scene: Scene) -> Lens:
     channel = _central(scene)
     lens = channel.through(scene.flat_lens(NET))
     picture = _coarse(scene.target.irradiance(), PIXELS)
-    screen = imaged(lens.behind, replace(scene.target.screen, pixels=picture.shape[::-1]))
-    behind, lens = lens.behind, replace(lens, behind=())
+    screen = replace(scene.target.screen, pixels=picture.shape[::-1])
     if scene.lens.front.free:
         from bstcad.tailoring.stage1 import shaped_front  # with scipy.optimize, a tenth of a second to load
 
@@ -63,7 +61,7 @@ def coarse_lens(scene: Scene) -> Lens:
         grid = face_grid(channel.source, lens, window, 2 * NET)
         lens = sloped(lens, wanted, grid, Fit(bending=1e-2, steps=20, degree=3), unlit=0.0)
         lens = moved_clear(lens, z, scene.lens.min_thickness)
-    return replace(lens, behind=behind)
+    return lens
 
 
 def _coarse(picture: np.ndarray, most: int) -> np.ndarray:
@@ -103,14 +101,16 @@ def left_out(scene: Scene, lens: Lens, picture: np.ndarray) -> tuple[LeftOut, ..
     reference = Reference.of(
         lens, _central(scene), scene.target.screen, picture=picture, control_points=math.prod(both(scene.lens.back.net))
     )
-    found = list(_lens(scene, reference) if lens.passes.enters else _mirror(scene, reference))
+    found = [*_of_glass(scene, reference), *_of_mirror(scene, reference)]
     found += _size(scene, reference)
     found.append(_entry("diffraction", reference.diffraction(), "of the whole aperture"))
     found.append(_entry("stray light", None, "it depends on the finish of the faces"))
     return tuple(sorted(found, key=lambda entry: -(entry.rrmsd_change or 0.0)))
 
 
-def _lens(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
+def _of_glass(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
+    if not scene.lens.passes.enters:
+        return
     bare = Fresnel(kind="fresnel")
     if reflection_of(scene.effects) is None:
         yield _entry("fresnel", reference.change([_central(scene, bare)]), simulate_by=BY_FRESNEL)
@@ -118,15 +118,17 @@ def _lens(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
         yield _absorption(scene, reference)
     if len(scene.source.lines) == 1:
         yield _dispersion(scene, reference)
-    if not any(effect.kind == "ghost" for effect in scene.effects):
+    if not scene.lens.passes.reflects and named(scene.effects, Ghost) is None:
         reflecting = _central(scene, *(() if named(scene.effects, Fresnel) else (bare,)))
         yield _entry(
             "ghost", reference.ghost(reflecting), "roughly, since it may gather to a spot", '[[effects]] kind = "ghost"'
         )
 
 
-def _mirror(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
-    if named(scene.effects, Fresnel) is None:
+def _of_mirror(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
+    if not scene.lens.passes.reflects:
+        return
+    if not scene.lens.passes.enters and named(scene.effects, Fresnel) is None:
         aluminium = _central(scene, Fresnel(kind="fresnel"))
         yield _entry("reflectance", reference.change([aluminium]), "of aluminium", BY_FRESNEL)
     yield _entry("shadows", None, "they depend on the lamp's housing")

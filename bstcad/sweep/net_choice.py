@@ -179,7 +179,7 @@ def moved(scene: Scene) -> float:
     radius, target = scene.lens.tool_radius, scene.target
     if radius is None:
         return math.inf
-    turn = scene.lens.passes.deflection("back", scene.index)
+    turn = max(scene.lens.passes.deflection(face, scene.index) for face in scene.lens.shaped)
     throw = abs(target.screen.plane.per_radian(scene.lens.back.z)) * turn / radius
     return throw * math.sqrt(math.prod(scene.lens.cells)) * math.sqrt(math.prod(target.screen.per_unit))
 

@@ -27,7 +27,7 @@ from bstcad.tailoring.light_behind import LightBehind
 from bstcad.tailoring.run import Task, silent
 from bstcad.tailoring.slope_map import corners_of, lit_window
 from bstcad.tailoring.stage2 import coarsened
-from bstcad.tailoring.two_faces import Aims, front_map
+from bstcad.tailoring.two_faces import front_map
 
 CELLS, PIXELS = 64, 128  # a side
 ITERATIONS = 100
@@ -89,6 +89,7 @@ class Demand:
 
 def demands(task: Task, lens: Lens) -> Demand:
     """The gentler demand of a task, or that of its own solution; lens: the blank, both of its faces free."""
+    task = task.aimed(lens)
     tried = [_of(_small(task, solution), lens) for solution in _solutions(task)]
     best, light = min(tried, key=lambda one: one[0].rank)
     if refused(best):
@@ -133,7 +134,7 @@ def _turn(task: Task, lens: Lens, light: LightBehind) -> float:
     """The largest angle (degrees) between the ray that comes to the front and its way to the back."""
     front, source = lens.shaping("front"), task.heaviest.source
     back = light.meeting(lens.back)
-    wanted = front_map(source, front, lit_window(source, front), Aims(light.picture, back), n=CELLS, places=None)
+    wanted = front_map(source, front, lit_window(source, front), light.picture, back=back, n=CELLS, places=None)
     lit = corners_of(light.picture)
     x, y = (torch.from_numpy(q[lit]) for q in wanted.places)
     way = torch.from_numpy(back[:, lit]) - torch.stack([x, y, lens.front.sag_and_slope(x, y)[0]])

@@ -54,7 +54,7 @@ from bstcad.optics.reach import wanted_slopes
 from bstcad.optics.receivers import Receiver
 from bstcad.optics.trace import behind, through
 from bstcad.optics.tubes import Tubes, arriving, rays_to
-from bstcad.optics.unfolding import image
+from bstcad.optics.unfolding import seen_from_last_net
 from bstcad.optics.wavefront import NM, Wave
 from bstcad.optics.wavefront_error import from_reference
 from bstcad.tailoring.source_image import Blur, Spread, blurred, blurs, bordered, unseen
@@ -333,7 +333,7 @@ def local_weight(source: Emitter, lens: Lens, target: np.ndarray, screen: Screen
     logarithm = np.where(seen, np.log(np.maximum(irradiance, MOST**-4)), 0.0)
     weight = np.clip(np.exp(-0.5 * gaussian_filter(logarithm, SMOOTH)), 1 / MOST, MOST)
     if number == lens.freeform[-1] and onwards[0].law.eta > 1:
-        plane = image(lens.behind[max(0, number - lens.solid.stop + 1) :], screen.plane)
+        plane = seen_from_last_net(lens, screen.plane)
         farther = _farther(at_net, landed.position, plane, law=onwards[0].law, seen=seen)
         if farther is not None:
             weight = weight / np.exp(gaussian_filter(np.log(farther), SMOOTH))

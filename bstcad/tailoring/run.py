@@ -145,16 +145,14 @@ class Task:
         """The same task with the light of the whole source."""
         return replace(self, channels=self.grown[-1], grown=()) if self.grown else self
 
-    def aimed(self, lens: Lens) -> tuple[Task, Lens]:
-        """Return the task and the lens of stage 1, which aims straight at the receivers.
+    def refined(self, lens: Lens, sides: Sides) -> Lens:
+        """The lens with the control points that its nets have where a back has so many."""
+        pairs = zip(lens.nets, self.sides(lens, sides), strict=True)
+        return lens.with_nets(net.refined(own) for net, own in pairs)
 
-        Nothing is behind the lens, and the receivers are where it sees them; where there is nothing, both as they are.
-        """
-        if not lens.behind:
-            return self, lens
-        channels = tuple(replace(c, around=(c.through(lens).before, ())) for c in self.channels)
-        goals = tuple(replace(goal, receiver=imaged(lens.behind, goal.receiver)) for goal in self.goals)
-        return replace(self, channels=channels, goals=goals), replace(lens, behind=())
+    def aimed(self, lens: Lens) -> Task:
+        """The task with its receivers where the last net of a lens sees them, at which stage 1 aims."""
+        return replace(self, goals=tuple(replace(goal, receiver=imaged(lens, goal.receiver)) for goal in self.goals))
 
     def rrmsd(self, lens: Lens, effort: Effort | None = None) -> float:
         """RRMSD by rays on the CPU, without the bias of the tubes that tailor the lens; the largest of several.

@@ -22,6 +22,7 @@ from bstcad.optics.rays import Rays
 from bstcad.optics.reach import wanted_slopes
 from bstcad.optics.receivers import Receiver
 from bstcad.optics.trace import across
+from bstcad.optics.unfolding import seen_from_last_net
 from bstcad.tailoring.merit import Spectrum
 
 BLOCK = 1 << 22  # points whose slopes and residuals are held at a time: 0.3 GB
@@ -151,8 +152,9 @@ def monomials(surface: BSplineSurface, degree: int) -> list[Tensor]:
 def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, plane: Receiver, repeats: int = 3) -> Lens:
     """The lens whose last net sends `rays` (…) to `aim` (2, …) mm on the plane, by a least-squares fit of slopes.
 
-    Repeated, because the sag moves the hits.  Behind the net the light meets nothing else.
+    Repeated, because the sag moves the hits.
     """
+    plane = seen_from_last_net(lens, plane)
     coming = across(rays, lens.interfaces[: lens.freeform[-1]])
     for _ in range(repeats):
         face = lens.last_freeform

@@ -1,4 +1,4 @@
-"""The transport map that a surface can follow: optimal transport from points of a net (the back) to its slopes.
+"""The transport map that a surface can follow: optimal transport from points of a net to its slopes.
 
 Wang et al. 2023 carry source points to target points; that map is a gradient only in the paraxial limit, and off axis
 the part of it that no surface can follow is lost in stage 1.  Here the same transport problem is posed in the
@@ -8,8 +8,9 @@ needs the slope p(b, t) that the law of its interface gives in closed form.  Wit
     y = σ (p(b, t) - ∇g(b)),    ∇g(b) ≈ p(b, m)
 
 hardly depends on b for a fixed t; g is nearly the surface that gathers all light in m.  The optimal map b -> y is ∇φ of
-a convex φ, so that σ y + ∇g are slopes of a surface.  σ = 1 where light refracts.  A mirror turns light the other way
-than its slope: there σ = -1, so that the rays of neighbouring places do not cross on their way.  The remaining
+a convex φ, so that σ y + ∇g are slopes of a surface.  σ = 1 where light leaves the glass.  A mirror, and a face where
+light enters, turn it the other way than their slope: there σ = -1, so that the rays of neighbouring places do not cross
+on their way.  Past what is behind the net light aims at the target's image (optics/unfolding.py).  The remaining
 dependence on b, of the order of t - m, enters through the b that the previous round assigned to each t; at the fixed
 point the surface solves the Monge-Ampère problem of this very system, off axis, near field and behind a curved front
 alike, whatever g is.
@@ -41,6 +42,7 @@ from bstcad.optics.receivers import Receiver
 from bstcad.optics.sides import Sides, both
 from bstcad.optics.trace import across, clear_window, gets_through
 from bstcad.optics.tubes import rays_to
+from bstcad.optics.unfolding import imaged
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit, blocks, fit_slopes
 from bstcad.transport.bfm import Step
@@ -135,21 +137,38 @@ def slope_map(
 
     window: `lit_window` of the lens.  hasty: with g in a fifth of its time; the fixed point is the same.
     """
-    side = max(window.width, window.height)
-    grid = face_grid(source, lens, Rectangle(side, side), n * SUBCELLS)
-    rho = grid.density.cpu().double().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3))
-    t_x, t_y = pixel_corners(screen)
-    b_x, b_y = previous.places if previous else (np.zeros_like(t_x), np.zeros_like(t_y))
-    sign = -1.0 if lens.last_freeform.law.reverses else 1.0
+    grid, screen, law = square_grid(source, lens, window, n), imaged(lens, screen), lens.last_freeform.law
+    t = pixel_corners(screen)
+    b = previous.places if previous else tuple(map(np.zeros_like, t))
     net = gathering(grid, lens, screen.plane, centroid(picture, screen), hasty=hasty)
-    needed = _needed(grid, lens, screen.plane, b=(b_x, b_y), t=(t_x, t_y))
-    _, *g = net.relative_sag_and_slope(*(torch.from_numpy(p) for p in (b_x, b_y)))
-    y_x, y_y = (sign * (p - own.numpy()) for p, own in zip(needed, g, strict=True))
+    needed = wanted_slopes(rays_at(grid, b), torch.from_numpy(np.stack(t)), screen.plane, law)
+    sign = -1.0 if law.reverses or law.eta < 1 else 1.0
+    found = transport_slopes(grid, picture, net, needed, places=b, sign=sign, n=n, **solver)
+    return found if previous else replace(found, moved=math.nan)
+
+
+def square_grid(source: Emitter, lens: Lens, window: Rectangle, n: int) -> FaceGrid:
+    """`face_grid` of a square around a window, of SUBCELLS cells each way for each of n x n of the transport."""
+    side = max(window.width, window.height)
+    return face_grid(source, lens, Rectangle(side, side), n * SUBCELLS)
+
+
+def transport_slopes(
+    grid: FaceGrid, picture: np.ndarray, net: BSplineSurface, needed: tuple[Tensor, Tensor],
+    places: tuple[np.ndarray, np.ndarray], *, sign: float, n: int, **solver,
+) -> SlopeMap:  # fmt: skip
+    """The map of the light of a `square_grid` to the slopes that are needed for each corner of a picture's pixels.
+
+    net: g; places: b (mm) of each corner in the round before, for which the slopes are.
+    """
+    side = grid.window.width
+    rho = grid.density.cpu().double().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3))
+    _, *g = net.relative_sag_and_slope(*(torch.from_numpy(p) for p in places))
+    y_x, y_y = (sign * (p - own).numpy() for p, own in zip(needed, g, strict=True))
     sigma, frame = spread_density(picture, (y_x, y_y), n)
     mapping = solve(light_density(rho, side), sigma, Frame((0.0, 0.0), side), frame, **solver)
-    places = mapping.inverse(y_x, y_y)
-    moved = _moved(picture, (b_x, b_y), places) / (side / 2) if previous else math.nan
-    return SlopeMap(mapping, net, sign, places=places, moved=moved)
+    now = mapping.inverse(y_x, y_y)
+    return SlopeMap(mapping, net, sign, places=now, moved=_moved(picture, places, now) / (side / 2))
 
 
 def _moved(picture: np.ndarray, before: tuple[np.ndarray, np.ndarray], now: tuple[np.ndarray, np.ndarray]) -> float:
@@ -210,13 +229,17 @@ def gathering(
     x, y, _ = faces.position
     aim = torch.stack([torch.full_like(x, m) for m in middle])
     z_x, z_y = wanted_slopes(faces, aim, plane, lens.last_freeform.law)
+    lit = grid.density[thin] > 0
+    able = room(faces, aim, plane, law=lens.last_freeform.law) >= 0  # of the others the slope is a makeshift
+    return fit_gathering(grid, (x, y, z_x, z_y, lit), fit if bool(able[lit].all()) else ROUGHLY)
+
+
+def fit_gathering(grid: FaceGrid, samples: tuple[Tensor, ...], fit: Fit) -> BSplineSurface:
+    """The net of GATHERING points a side over a grid with the slopes of samples (x, y, z_x, z_y, weight)."""
     half_x, half_y = (REACH * size / 2 for size in (grid.window.width, grid.window.height))
     flat = torch.zeros((GATHERING, GATHERING), dtype=torch.float64)
     net = BSplineSurface(0.0, flat, (-half_x, half_x), (-half_y, half_y))
-    lit = grid.density[thin] > 0
-    able = room(faces, aim, plane, law=lens.last_freeform.law) >= 0  # of the others the slope is a makeshift
-    samples = (p.reshape(-1).cpu().double() for p in (x, y, z_x, z_y, lit))
-    return fit_slopes(net, *samples, fit=fit if bool(able[lit].all()) else ROUGHLY)
+    return fit_slopes(net, *(p.reshape(-1).cpu().double() for p in samples), fit=fit)
 
 
 def between(grid: FaceGrid, values: Tensor, b: tuple) -> Tensor:
@@ -236,14 +259,6 @@ def rays_at(grid: FaceGrid, b: tuple) -> Rays:
     position = torch.stack([torch.from_numpy(b[0]), torch.from_numpy(b[1]), sag])
     direction = torch.stack([d_x, d_y, d_z]) / torch.sqrt(d_x * d_x + d_y * d_y + d_z * d_z)
     return replace(grid.at_face, position=position, direction=direction)
-
-
-def _needed(grid: FaceGrid, lens: Lens, plane: Receiver, b: tuple, t: tuple) -> tuple[np.ndarray, np.ndarray]:
-    """p(b, t): the slopes that send the light at b (mm) to t (mm) on the plane."""
-    rays = rays_at(grid, b)
-    aim = torch.stack([torch.from_numpy(t[0]), torch.from_numpy(t[1])])
-    p = wanted_slopes(rays, aim, plane, lens.last_freeform.law)
-    return p[0].numpy(), p[1].numpy()
 
 
 def sent_from(places: tuple[np.ndarray, np.ndarray], screen: Screen) -> TransportMap:
@@ -289,17 +304,6 @@ def corners_of(picture: np.ndarray) -> np.ndarray:
 
 
 @torch.no_grad()
-def source_density(source: Emitter, lens: Lens, n: int) -> tuple[Density, Frame]:
-    """The flux that gets through both faces, on n x n cells of a square in the plane of the first vertex."""
-    area = clear_window(source, lens)
-    side = max(area.width, area.height)
-    x, y = (t.to(lens.like.device) for t in sampling.grid(Rectangle(side, side), n * SUBCELLS))
-    flux = source.irradiance(x, y, lens.entrance.z)
-    flux = flux * gets_through(source.rays(x, y, lens.entrance.z, 1.0), lens)
-    flux = flux.cpu().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3))
-    return light_density(flux, side), Frame((0.0, 0.0), side)
-
-
 def map_to_target(
     source: Emitter,
     lens: Lens,
@@ -309,23 +313,31 @@ def map_to_target(
     iterations: int,
     progress: Callable[[Step], None],
 ) -> Mapping:
-    """The transport map from the plane of the front's vertex (mm) to the target (mm), on n x n cells.
+    """The transport map from the plane of the first vertex (mm) to the target (mm), on n x n cells.
 
-    To a tilted target the map leads in the coordinates of the level plane through its middle, on which each place is
-    where the front's vertex sees it: in those of the plane itself the map would be nowhere near a gradient of heights.
+    Only the light that gets through all faces counts.  To a tilted target the map leads in the coordinates of the level
+    plane through its middle, on which each place is where the front's vertex sees it: in those of the plane itself the
+    map would be nowhere near a gradient of heights.
     """
-    density, source_frame = source_density(source, lens, n)
+    screen = imaged(lens, screen)
+    area = clear_window(source, lens)
+    side = max(area.width, area.height)
+    x, y = (t.to(lens.like.device) for t in sampling.grid(Rectangle(side, side), n * SUBCELLS))
+    flux = source.irradiance(x, y, lens.entrance.z)
+    flux = flux * gets_through(source.rays(x, y, lens.entrance.z, 1.0), lens)
+    density = light_density(flux.cpu().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3)), side)
     if not screen.plane.is_level:
         wanted, frame = spread_density(picture, screen.plane.seen(*pixel_corners(screen), lens.front.z), n)
     else:
         width, height = screen.x[1] - screen.x[0], screen.y[1] - screen.y[0]
         wanted = Density.from_picture(picture, n, width=width, height=height, floor=TARGET_FLOOR)
         frame = Frame(((screen.x[0] + screen.x[1]) / 2, (screen.y[0] + screen.y[1]) / 2), max(width, height))
-    return solve(density, wanted, source_frame, frame, iterations=iterations, progress=progress)
+    return solve(density, wanted, Frame((0.0, 0.0), side), frame, iterations=iterations, progress=progress)
 
 
 def sent_from_entrance(mapping: Mapping, lens: Lens, screen: Screen) -> TransportMap:
     """The inverse of such a map at corners of the target's pixels."""
+    screen = imaged(lens, screen)
     corners = pixel_corners(screen)
     if not screen.plane.is_level:
         corners = screen.plane.seen(*corners, lens.front.z)
@@ -334,7 +346,7 @@ def sent_from_entrance(mapping: Mapping, lens: Lens, screen: Screen) -> Transpor
 
 def aim_points(mapping: Mapping, lens: Lens, screen: Screen, x: Tensor, y: Tensor) -> Tensor:
     """(2, …) the points on the screen (mm) to which the map sends the points (x, y) (mm)."""
-    sent = mapping(x.detach().cpu().double().numpy(), y.detach().cpu().double().numpy())
+    screen, sent = imaged(lens, screen), mapping(*(p.detach().cpu().double().numpy() for p in (x, y)))
     if not screen.plane.is_level:
         sent = screen.plane.from_seen(*sent, lens.front.z)
     return torch.stack([torch.from_numpy(np.ascontiguousarray(s)) for s in sent]).to(x)

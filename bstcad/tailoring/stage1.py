@@ -85,7 +85,7 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[S
     yield replace(last, state=None, judged=judged)
     if not doubtful(task, first, judged, last.state):
         return
-    other, mapping = follow_aims(task, lens.with_front(first.front))
+    other, mapping = follow_aims(task, first.with_last_net(lens.nets[-1]))
     value = task.rrmsd(other)
     better = value < np.nan_to_num(judged, nan=np.inf)  # NaN: no light on the target
     if better and task.used(other) >= KEPT_LIGHT * task.used(first):
@@ -105,7 +105,7 @@ def doubtful(task: Task, lens: Lens, judged: float, state: SlopeRound) -> bool:
 
 
 def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[Step]:
-    """Rounds of transport map (back face to slopes) and slope fit, each from the sag and the map of the round before.
+    """Rounds of transport map (last net to slopes) and slope fit, each from the sag and the map of the round before.
 
     All but the last two work on coarse grids and nets, where they cost next to nothing; they end once they are settled.
     """
@@ -121,7 +121,7 @@ def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> It
             task.tidy()
         turn = max(turn + 1, knobs.rounds - FINE_ROUNDS if wanted.moved <= SETTLED else 0)
         yield Step(
-            partial(lens.refined, knobs.levels[-1]),
+            partial(task.refined, lens, knobs.levels[-1]),
             SlopeRound(turn, Parameters.of(lens), wanted),
             mapping=wanted.mapping,
             places=wanted.places,
@@ -138,7 +138,7 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[
     def progress(s: TransportStep) -> None:
         task.progress("stage 1", turn, knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
 
-    lens = lens.refined(m)
+    lens = task.refined(lens, m)
     window = lit_window(source, lens)
     wanted = slope_map(
         source, lens, window, picture=goal.picture, screen=goal.receiver, n=coarse, previous=wanted,
@@ -161,23 +161,18 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
     knobs, goal, z = task.knobs, task.goals[0], lens.back.z
     for turn in range(AIMS):
         n, m = (COARSEST_GRID, knobs.levels[0]) if turn < AIMS - 1 else (knobs.transport_grid, knobs.levels[-1])
-        lens = lens.refined(m)
+        lens = task.refined(lens, m)
         rays, wanted, mapping = aimed_rays(
             task.heaviest.source,
             lens,
             goal.picture,
             screen=goal.receiver,
             n=n,
-            side=aimed(max(both(m)), knobs.rays),
+            side=min(3 * max(both(m)), max(2 * max(both(m)), knobs.rays)),  # many may leave through the sides
             iterations=knobs.transport_iterations,
         )
         lens = moved_clear(tailor_to_aim(lens, rays, wanted, goal.receiver.plane), z, task.least, task.bounds)
     return lens, mapping
-
-
-def aimed(m: int, rays: int) -> int:
-    """Rays a side for m control points; more than two a control cell, since many may leave through the sides."""
-    return min(3 * m, max(2 * m, rays))
 
 
 def aimed_rays(

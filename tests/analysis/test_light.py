@@ -88,7 +88,7 @@ class TestUsed:
     WIDE = Rectangle(24.0, 24.0)
 
     def faces(self, source, outline=WIDE, **more):
-        return used(source, lens_of(front=Plane(10.0), outline=outline, z=20.0, m=9, **more))
+        return tuple(used(source, lens_of(front=Plane(10.0), outline=outline, z=20.0, m=9, **more)).values())
 
     @pytest.mark.parametrize("aperture", [Circle(5.0), Rectangle(8.0, 4.0), Circle(12.0)])
     def test_a_beam_meets_both_faces_of_a_plate_as_it_is(self, aperture):
