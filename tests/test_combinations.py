@@ -52,7 +52,7 @@ def beam(**more):
     """Parallel light over the lens; before a mirror it starts above."""
 
     def source(chosen):
-        start = {"z": BEFORE} if chosen["front"] == "mirror" else {}
+        start = {"z": BEFORE} if "mirror" in chosen["front"] else {}
         return {"source": {"kind": "collimated", "aperture": rim(chosen), **start, **more}}
 
     return source
@@ -60,7 +60,7 @@ def beam(**more):
 
 def lamp(**more):
     def source(chosen):
-        position = [0.0, 0.0, BEFORE if chosen["front"] == "mirror" else -BEFORE]
+        position = [0.0, 0.0, BEFORE if "mirror" in chosen["front"] else -BEFORE]
         return {"source": {"kind": "point", "profile": "lambertian", "position": position, **more}}
 
     return source
@@ -112,7 +112,7 @@ def elements(where, **more):
     """A window or a mirror; before a lens the light comes from below, before a mirror from above."""
 
     def element(chosen):
-        z = 20.0 if where == "behind" or chosen["front"] == "mirror" else -20.0
+        z = 20.0 if where == "behind" or "mirror" in chosen["front"] else -20.0
         return {where: [{"kind": "window", "z": z, "outline": {"shape": "circle", "diameter": 60.0}} | more]}
 
     return element
@@ -164,6 +164,7 @@ CHOICES = {
         "spline file": spline_file,
         "tailored spline": front(kind="bspline", optimise=True),
         "mirror": front(kind="plane") | {"lens.back.reflect": True, "lens.material": None},
+        "mirror behind glass": front(kind="bspline", optimise=True, reflect=True),
     },
     "net": {"one number": {}, "pair": pair, "chosen": {"lens.back.control_points": None}},
     "effects": {
@@ -216,10 +217,11 @@ REFUSED = (  # the least sets of values that no scene has together
     {("rim", "circle"), ("net", "pair")},
     *({("elements", "fold mirror behind"), ("wavefront", wave)} for wave in ("plane", "sphere")),
     *({("front", "mirror"), ("effects", effect)} for effect in ("coating", "absorption", "ghost")),
+    {("front", "mirror behind glass"), ("effects", "ghost")},
 )
 NAMED = {  # the key of a choice, as the sentence of a refusal has it
     "light": "source.", "wavefront": "wavefront", "rim": "lens.outline", "net": "lens.back.control_points",
-    "front": "lens.back.reflect", "effects": "effects[0]", "elements": "behind",
+    "front": ".reflect", "effects": "effects[0]", "elements": "behind",
 }  # fmt: skip
 
 

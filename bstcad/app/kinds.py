@@ -277,11 +277,16 @@ def _start(data: Table) -> float | None:
     source, (front, back) = table_at("source", data), (table_at(f"lens.{face}", data) for face in ("front", "back"))
     if not _numbers(front.get("z"), back.get("z")):
         return None
-    if back.get("reflect") is not True:
+    if not is_mirror(data):
         return None if front["z"] > 0 else front["z"] - FAR
     before = source.get("z", source.get("position", [None])[-1:])
     before = before[0] if isinstance(before, list) and before else before
     return before if _numbers(before) else back["z"] + FAR
+
+
+def is_mirror(data: Table) -> bool:
+    """Does a face of the lens reflect the light?"""
+    return any(table_at(f"lens.{face}", data).get("reflect") is True for face in ("front", "back"))
 
 
 def _position(data: Table) -> list[float] | None:
@@ -290,7 +295,7 @@ def _position(data: Table) -> list[float] | None:
 
 
 def _plane(data: Table) -> float | None:
-    return _start(data) if table_at("lens.back", data).get("reflect") is True else None
+    return _start(data) if is_mirror(data) else None
 
 
 STARTS: Mapping[str, Callable[[Table], Any]] = {"source.position": _position, "source.z": _plane}

@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from html import escape
 from typing import Any
 
+from bstcad.app.kinds import is_mirror
+
 WIDE, HIGH, AXIS = 640, 250, 108  # of the drawing, and where its axis is
 LAMP, LENS, WALL = 60, 210, 560  # places along the axis
 LENS_HALF, WALL_HALF = 58, 78  # half heights
@@ -23,7 +25,7 @@ def svg(data: Mapping[str, Any]) -> str:
     if not all(isinstance(table, Mapping) for table in (lens, source, *targets)) or not targets:
         return ""
     front, back = _number(lens, "front", "z"), _number(lens, "back", "z")
-    mirror = isinstance(lens.get("back"), Mapping) and lens["back"].get("reflect") is True
+    mirror = is_mirror(data)
     parts = [*_light(source, mirror), *(_mirror() if mirror else _glass()), *_walls(targets)]
     z = _number(targets[0], "z")
     away = None if None in (z, back) else z - back

@@ -1,8 +1,8 @@
 """The passes of light through a solid: which of its faces it meets, in which order, and by which law each turns it.
 
 All that depends on them is asked here: does light enter the solid, from which side does it come, where does it leave,
-what are the faces called.  A lens has a pass at each face, a mirror one at its back; a Mangin mirror has three, since
-light crosses its front once on the way to the back and once on the way out.
+what are the faces called.  A lens has a pass at each face, a mirror one at its back; a second-surface mirror has three,
+since light crosses its back once on the way to the front, which reflects it, and once on the way out.
 """
 
 from __future__ import annotations
@@ -57,7 +57,17 @@ class Passes:
     @property
     def reflects(self) -> bool:
         """Does a face reflect the light?"""
-        return any(law is Reflect for _, law in self.steps)
+        return self.mirror is not None
+
+    @property
+    def mirror(self) -> Face | None:
+        """The face that reflects the light; None: none does."""
+        return next((face for face, law in self.steps if law is Reflect), None)
+
+    @property
+    def crossed(self) -> tuple[Face, ...]:
+        """The faces that light goes through, each once, in its order."""
+        return tuple(dict.fromkeys(face for face, law in self.steps if law is Refract))
 
     @property
     def sense(self) -> int:
@@ -103,3 +113,4 @@ class Passes:
 
 LENS = Passes((Pass("front", Refract), Pass("back", Refract)))
 MIRROR = Passes((Pass("back", Reflect),))
+SECOND_SURFACE = Passes((Pass("back", Refract), Pass("front", Reflect), Pass("back", Refract)))

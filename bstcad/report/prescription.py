@@ -79,7 +79,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "clear": lens.clear and tuple(map(asdict, lens.clear)),  # apertures of front and back; None: no mount
         "front": _own(front) | _face(scene.lens.front.kind, lens.front_vertex, numbers) | fitted,
         "back": _face("bspline", vertex(lens), {}),
-        "reflects": lens.reflects,  # is it a mirror, whose back is the face that light meets?
+        "reflects": lens.reflects,  # is it a mirror?
         "net": _net(lens.back),
         **({"front_net": _net(front), "front_asked": scene.lens.front.z} if lens.shapes("front") else {}),
         "back_asked": scene.lens.back.z,  # z at which the scene has the back's vertex
@@ -145,7 +145,9 @@ def scene_text(scene: Scene, lens: Lens) -> str:
 
 
 def _passes(record: Mapping[str, Any]) -> passes.Passes:
-    return passes.MIRROR if record["reflects"] else passes.LENS
+    """The passes of light; the index of a mirror that light does not enter is 1."""
+    mirror = passes.MIRROR if record["index"] == 1 else passes.SECOND_SURFACE
+    return mirror if record["reflects"] else passes.LENS
 
 
 def sections(record: Mapping[str, Any]) -> dict[str, Rows]:
@@ -297,7 +299,7 @@ def _origin(lens: Lens, vertex: float, bare: bool = True) -> str:
     if lens.passes.sense < 0:  # its light comes from above
         if vertex < 0:
             return f"{axis}, {mm(-vertex)} mm before the vertex of the mirror, on the light's side"
-        rear = "the vertex of the rear"
+        rear = f"the vertex of the {lens.passes.name('front')}"
         between = f"{mm(abs(front))} mm {'behind' if front > 0 else 'in front of'} {rear}" if front else f"at {rear}"
         return f"{axis}, {between}"
     if front > 0:

@@ -41,7 +41,7 @@ OF_PLAN = {  # kind of a plan's verdict: style of the terminal
     "blurred": "bold red", "beyond": "bold red", "open": "bold yellow", "within": "bold green", "no limit": "bold cyan",
     "not predicted": "bold yellow",
 }  # fmt: skip
-OF_GLASS = ("lost through the sides", "total internal reflection")  # lines of the ledger that a mirror cannot have
+OF_GLASS = ("lost through the sides", "total internal reflection")  # lines of the ledger that few mirrors have
 ESTIMATED = (
     "Estimated on a coarse lens; most figures are good to a factor of two. RRMSD: what the effect alone gives a {} "
     "that is perfect without it; that of a real one changes by less. Blur: diameter of the spot that a point of the "
@@ -102,7 +102,7 @@ def machine(facts: Mapping[str, Any]) -> Rows:
 
 def ledger(flux: Mapping[str, float], of: str) -> dict[str, float]:
     """The lines of a ledger as people read them."""
-    lines = {line: part for line, part in flux.items() if of == "lens" or line not in OF_GLASS}
+    lines = {line: part for line, part in flux.items() if of == "lens" or part or line not in OF_GLASS}
     return {line.replace("the lens", f"the {of}"): part for line, part in lines.items()}
 
 

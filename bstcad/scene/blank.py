@@ -18,7 +18,7 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag
 from bstcad.optics.key import Key
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
-from bstcad.optics.passes import LENS, MIRROR, Face, Passes
+from bstcad.optics.passes import LENS, MIRROR, SECOND_SURFACE, Face, Passes
 from bstcad.optics.sides import Sides, both, coarser, in_proportion, plain
 from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Surface, Toroid
 from bstcad.runs import files
@@ -165,6 +165,7 @@ class _Front:
     outline: Circle | None = None
     given: GivenNet | None = None  # the net of a freeform front, or the one that its tailoring starts from
     shaped = False  # is it a net that tailoring shapes?
+    reflect: bool = False
 
     @property
     def surface(self) -> Surface:
@@ -339,9 +340,12 @@ class NetFront(_Front):
         ),
         BeforeValidator(lambda given: tuple(given) if isinstance(given, list) else given),  # as strict reading asks
     ] = None
+    reflect: Annotated[
+        bool, Key("A mirror: light comes along -z through the back, and leaves through the back.", example=True)
+    ] = False
     kind: Annotated[Literal["bspline"], Key("A freeform face: of an earlier design, or tailored.")] = "bspline"
 
-    written = leaving_out(optimise=False)
+    written = leaving_out(optimise=False, reflect=False)
     __pydantic_config__ = STRICT
 
     @property
@@ -366,6 +370,8 @@ class NetFront(_Front):
 
     def complaints(self, outline: Outline) -> Iterator[str]:
         """It is of nothing, or of a lens of another outline; a net may also end at the sides of a rectangle."""
+        if self.reflect and not self.optimise:
+            yield "reflect: tailoring begins with the face that reflects; add optimise = true"
         if self.file is None:
             if not self.optimise:
                 yield 'file: missing, and the front is not tailored; add file = "outputs/earlier", or optimise = true'
@@ -510,7 +516,8 @@ class Bounds:
 class LensBlank(Record):
     """The lens before tailoring: light enters through the front and leaves through the back.
 
-    A mirror is a plate whose back, its upper face, reflects; its front is the rear of the plate.
+    A mirror is a plate whose back, its upper face, reflects; its front is the rear of the plate.  Where the front
+    reflects, light crosses the back on its way to it and on its way out.
     """
 
     material: Annotated[str | None, Key("Name on refractiveindex.info; or give the index.")] = None
@@ -534,7 +541,7 @@ class LensBlank(Record):
     @property
     def passes(self) -> Passes:
         """The faces that light meets, in its order, and what each does to it."""
-        return MIRROR if self.back.reflect else LENS
+        return MIRROR if self.back.reflect else SECOND_SURFACE if self.front.reflect else LENS
 
     @property
     def optic(self) -> str:
@@ -641,6 +648,8 @@ class LensBlank(Record):
     def complaints(self) -> Iterator[str]:
         """Everything that is wrong with the table by itself."""
         given = [name for name in ("material", "index") if getattr(self, name) is not None]
+        if self.front.reflect and self.back.reflect:
+            yield "lens.front.reflect: the back reflects all light before (lens.back.reflect); remove one of the two"
         if not self.passes.enters and given:
             yield f"lens: light does not enter a mirror (lens.back.reflect), so it has no {given[0]}; remove it"
         if self.passes.enters and len(given) != 1:

@@ -112,14 +112,14 @@ def complaints(effects: Effects, lens: LensBlank) -> Iterator[str]:
                 f"{key}.name: no effect is called {effect.name!r} here; let the script that has it call "
                 f"bstcad.effect({effect.name!r}, …) first, or install its package"
             )
-        if not glass and effect.kind in ("absorption", "ghost"):
-            no_glass = "light does not enter a mirror (lens.back.reflect)"
-            yield f"{key}: {no_glass}, so it has no {effect.kind}; remove the table"
+        if {"absorption": not glass, "ghost": lens.passes.reflects}.get(effect.kind):
+            why = "light goes back to where it came from" if glass else "light does not enter a mirror"
+            yield f"{key}: {why} (lens.{lens.passes.mirror}.reflect), so it has no {effect.kind}; remove the table"
         if not glass and getattr(effect, "coating", None) is not None:
             bare = "a mirror's face (lens.back.reflect) is bare metal"
             yield f"{key}.coating: {bare}; remove it, or name the metal by {key}.metal"
         if not lens.passes.reflects and getattr(effect, "metal", None) is not None:
-            yield f"{key}.metal: is for a mirror (lens.back.reflect); remove it"
+            yield f"{key}.metal: is for a mirror (lens.back.reflect, lens.front.reflect); remove it"
         if effect.kind == "absorption" and effect.coefficient is None and lens.material is None:
             yield f"{key}.coefficient: missing, and lens.index names no material; add it in 1/mm, or give lens.material"
 

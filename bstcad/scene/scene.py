@@ -445,9 +445,10 @@ def _of_goals(scene: Scene) -> Iterator[str]:
     pictures, shaped = len(different), lens.shaped
     goals = pictures + (wave is not None)
     if goals < len(shaped):
+        idle, busy = shaped
         yield (
-            "lens.front.optimise: one picture is the back's work alone, and the front stays as it is; add a second "
-            "[[target]] or a [wavefront], or set lens.back.optimise = false to have the front tailored instead"
+            f"lens.{idle}.optimise: one picture is the {busy}'s work alone, and the {idle} stays as it is; add a "
+            "second [[target]] or a [wavefront], or set lens.back.optimise = false to have the front tailored alone"
         )
     if goals > len(shaped):
         faces, remedy = "two tailored faces, which meet", "state what matters by weight, or ask for less"

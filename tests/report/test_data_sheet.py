@@ -238,7 +238,7 @@ def test_clear_apertures_lie_within_the_part_s_faces(name):
     views = views_of(made)
     along_y, along_x = (cut.front_ends[1] for cut in views.cuts)
     rooms = (along_x, along_y), views.rim.half_extent
-    for patch, room in zip(used(made.scene.source, made.lens), rooms, strict=True):
+    for patch, room in zip(used(made.scene.source, made.lens).values(), rooms, strict=True):
         assert patch is None or np.all(np.array(patch.half_extent) <= np.array(room) + 1e-9)
 
 
