@@ -19,7 +19,6 @@ from PIL import Image
 import bstcad
 from bstcad import cli, commands
 from bstcad import folder as folders
-from bstcad.cad import step_writing
 from bstcad.optics.bspline import knots
 from bstcad.optics.measure import Effort
 from bstcad.report import report
@@ -197,9 +196,8 @@ class TestGenerate:
         again = commands.verify(moved)
         assert (again.rrmsd, again.passed) == (made.rrmsd, made.passed)
 
-    @pytest.mark.parametrize(("place", "name"), [(step_writing, "lens_shape"), (report, "write_html")])
     def test_a_failure_while_it_is_written_keeps_the_design_and_resume_writes_the_same(
-        self, place, name, small_scene, quick, monkeypatch, tmp_path
+        self, small_scene, quick, monkeypatch, tmp_path
     ):
         """One sentence names the folder; with --resume nothing is tailored again."""
         verify_with(monkeypatch, POOR)
@@ -209,7 +207,7 @@ class TestGenerate:
             raise ValueError("lens: the back lies -0.2 mm above the front at (1, 2) mm; move the front down")
 
         with monkeypatch.context() as broken, pytest.raises(ValueError, match="move the front down") as raised:
-            broken.setattr(place, name, fails)
+            broken.setattr(report, "write_html", fails)
             commands.generate(scene, tmp_path / "out", device="cpu")
         kept, resumed = raised.value.__notes__
         assert f"the finished design is kept in {tmp_path / 'out-unwritten'}" in kept and "--resume" in resumed
@@ -304,15 +302,10 @@ class TestVerify:
         suite = ElementTree.parse(poor / "report.junit.xml").getroot()[0]
         assert {case.get("name") for case in suite.iter("testcase") if case.find("failure") is not None} == failed
 
-    def test_the_exit_code_of_a_design_that_passes(self, proved, capsys):
-        code, out, err = run(capsys, "verify", proved)
-        assert code == 0 and "PASSED" in out and "RRMSD" in out and str(proved) in out and err == ""
-
     DAMAGES = {
         "no scene": (lambda d: (d / "scene.toml").unlink(), "scene.toml: no such scene file"),
         "no step": (lambda d: (d / "lens.step").unlink(), "lens.step: cannot be read"),
         "no mesh": (lambda d: (d / "lens.stl").unlink(), "lens.stl: cannot be read"),
-        "no design": (lambda d: (d / "design.npz").unlink(), "design.npz: cannot be read"),
         "a truncated design": (lambda d: os.truncate(d / "design.npz", 9000), "design.npz: cannot be read"),
         "a truncated step": (lambda d: os.truncate(d / "lens.step", 90_000), "read as text: the file is truncated"),
         "a truncated mesh": (lambda d: os.truncate(d / "lens.stl", 90_000), "lens.stl: 90000 bytes"),
@@ -326,7 +319,6 @@ class TestVerify:
             ),
             "lens.min_thickness",
         ),
-        "an empty folder": (lambda d: (shutil.rmtree(d), d.mkdir()), "no such scene file"),
     }
 
     @pytest.mark.parametrize("damage", DAMAGES)
@@ -396,13 +388,6 @@ class TestAFileByItself:
         assert "1.19 g/cm³ that the file states" in found.part["Mass"]
         assert list(tmp_path.iterdir()) == [path]  # looking writes nothing
 
-    def test_fails_where_it_is_broken(self, small_design, tmp_path, capsys):
-        text = (small_design.folder / "lens.step").read_text()
-        path = tmp_path / "part.step"
-        path.write_text(re.sub(r"(ORIENTED_EDGE\('',\*,\*,#\d+,)\.T\.", r"\1.F.", text, count=1))
-        code, out, err = run(capsys, "verify", path)
-        assert code == 1 and "FAILED" in out and err == ""
-
     def test_in_a_design_s_folder_it_is_only_looked_at(self, small_design, capsys):
         """The folder stays as it is, byte by byte, also where a check of the design itself would fail."""
 
@@ -416,9 +401,8 @@ class TestAFileByItself:
         assert code == 0 and "PASSED" in out and "RRMSD" not in out and err == ""
         assert files() == before
 
-    @pytest.mark.parametrize("name", ["lens.stl", "design.npz"])
-    def test_another_kind_of_file_is_one_sentence(self, small_design, capsys, name):
-        code, out, err = run(capsys, "verify", small_design.folder / name)
+    def test_another_kind_of_file_is_one_sentence(self, small_design, capsys):
+        code, out, err = run(capsys, "verify", small_design.folder / "lens.stl")
         assert code == 2 and out == "" and "not a STEP file" in err and err.count("\n") == 1
 
 

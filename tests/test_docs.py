@@ -16,6 +16,7 @@ import pytest
 import skimage.data
 import skimage.io
 import tomli_w
+import typer
 
 import bstcad
 from bstcad import cli, commands
@@ -39,8 +40,9 @@ PAGES = [
     ROOT / "docs" / "reference" / "files.md",
 ]
 RUN = [page for page in PAGES if any(block.kind != "toml" for block in blocks(page))]
-LONG = {  # some seconds and more: make bench runs their blocks, and make docs those of tutorials
-    "measured-part", "time-and-accuracy", "tolerances", "two-faces", "part-with-flange", "led", "your-photo",
+LONG = {  # make bench runs the blocks of these pages, and make docs those of tutorials; other tests do what they do
+    "measured-part", "time-and-accuracy", "tolerances", "two-faces", "part-with-flange", "led", "your-photo", "effects",
+    "first-lens", "reading-the-report", "machinable", "mirror", "failed-picture", "white-light", "cadquery",
 }  # fmt: skip
 FENCES = re.compile(r"^```(\S+)", re.M)
 
@@ -114,18 +116,14 @@ def copied(contents, folder, variables, tick):
 
 
 def run_command(words):
-    """A command of a page, in this process."""
+    """A command of a page, in this process; `make` would run this test again."""
     program, *arguments = words
-    if program == "make":  # the targets exist; running them here would run this test again
-        done = subprocess.run(["make", "-n", *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-    elif program == "bstcad":
+    if program == "bstcad":
         assert cli.run(arguments) == 0, shlex.join(words)
         if arguments[0] == "new":
             path = Path(f"{arguments[1]}.toml")
             make_small(path, path)
-    else:
-        assert program == "python", shlex.join(words)
+    elif program == "python":
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(sys, "argv", arguments)
             runpy.run_path(arguments[0], run_name="__main__")
@@ -141,6 +139,23 @@ def test_its_blocks_run_one_after_the_other(page, workplace):
                 run_command(words)
         elif block.kind == "python":
             exec(compile(block.text, f"{page.name}:{block.line}", "exec"), {"__name__": "page"})
+
+
+@pytest.mark.parametrize("page", RUN, ids=name_of)
+def test_its_commands_and_scripts_are_there(page):
+    """Each command takes the options that it is given; targets of make and scripts are there; Python compiles."""
+    known = typer.main.get_command(cli.app).commands
+    for block in blocks(page):
+        if block.kind == "python":
+            compile(block.text, f"{page.name}:{block.line}", "exec")
+        for program, first, *rest in block.commands if block.kind == "sh" else ():
+            if program == "bstcad":
+                command = known[first]
+                command.make_parser(command.context_class(command)).parse_args(rest)
+            elif program == "make":
+                assert subprocess.run(["make", "-n", first, *rest], cwd=ROOT, stdout=subprocess.DEVNULL).returncode == 0
+            else:
+                assert program == "python" and (ROOT / first).is_file()
 
 
 def merged(base, given):
