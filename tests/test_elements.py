@@ -21,6 +21,7 @@ from bstcad.optics.tilted import Tilted
 from bstcad.optics.trace import across
 from bstcad.optics.unfolding import image, imaged
 from bstcad.report.figure_jobs import side_view
+from bstcad.report.light_figures import View
 from bstcad.scene.elements import Mirror, Window, interfaces
 from bstcad.scene.errors import SceneError
 from bstcad.tolerance.perturbations import Setup
@@ -266,6 +267,15 @@ def test_the_side_view_draws_their_faces(folder):
     rays = np.zeros((1, 7, 3))
     drawn = [line for axes in side_view(again.lens, rays, [again.scene.target.screen]).axes for line in axes.lines]
     assert sum(line.get_gid() == "element" for line in drawn) == 2 * 3
+
+
+def test_figures_say_that_a_folded_target_is_seen_in_the_mirror(folder):
+    """Light comes back along -z: from behind the target, looking towards the lens, x would grow to the left."""
+    scene = bstcad.open(folder).scene
+    views = [View.of(scene.changed({"target.seen_from": side})) for side in ("lens", "behind")]
+    assert all("fold mirror" in view.words for view in views)
+    assert ["grows to the left" in view.words for view in views] == [True, False]
+    assert not View.of(scene.changed({"behind": [], "target.z": 500.0, "target.tilt": None})).folded
 
 
 def test_a_lens_that_is_moved_leaves_them_where_they_are(folder):

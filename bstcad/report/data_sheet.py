@@ -79,7 +79,7 @@ class Sheet:
         return tables(
             "data_sheet.txt.j2", lens=self.record, passes=self.lens.passes, order=self.order, shape=self.shape,
             mount=self.mount, light=self.scene.source, passed=self.passed,
-            asked=self.scene.limits_light,
+            asked=self.scene.limits_light, folded=self.scene.folded,
             pairs=list(zip(self.scene.targets, self.figures, strict=True)), across=across, walls=wall_words,
             apertures={face: _aperture(patch, self.lens.outline) for face, patch in self.apertures.items()},
             kinds_of_holes=kinds_of_holes,

@@ -44,9 +44,11 @@ if TYPE_CHECKING:
 
 Extent = tuple[float, float]  # (min, max) in mm
 
-SEEN = {
-    "lens": "Seen from the {optic}, looking along +z: x grows to the left",
-    "behind": "Seen from behind the screen, looking towards the {optic}: x grows to the right",
+SEEN = {  # (target.seen_from, does the light come back along -z, by an odd number of fold mirrors?)
+    ("lens", False): "Seen from the {optic}, looking along +z: x grows to the left",
+    ("behind", False): "Seen from behind the screen, looking towards the {optic}: x grows to the right",
+    ("lens", True): "Seen from the {optic} in the fold mirror, looking along +z: x grows to the left",
+    ("behind", True): "Seen from the fold mirror, looking along -z: x grows to the right",
 }
 LIT = 0.01  # a pixel is lit where the target exceeds this part of its maximum
 HEADROOM = 1.06  # the scale ends above the brightest there is, so that even light is not as white as the paper
@@ -82,6 +84,7 @@ class View:
     y: Extent
     seen_from: str  # lens | behind
     optic: str = "lens"  # or "mirror"
+    folded: bool = False  # does the light come to the target along -z?
     receiver: Receiver = LevelPlane(0.0)  # receiver on which its x and y are measured
     number: int = 0  # number of the target among several, by which its figures are named
 
@@ -89,7 +92,10 @@ class View:
     def of(cls, scene: Scene, number: int = 0) -> View:
         """The view of a scene's target, the first of several or another."""
         target = scene.targets[number]
-        return cls(target.x, target.y, target.seen_from, optic=scene.optic, receiver=target.screen.plane, number=number)
+        return cls(
+            target.x, target.y, target.seen_from, optic=scene.optic, folded=scene.folded,
+            receiver=target.screen.plane, number=number,
+        )  # fmt: skip
 
     @property
     def labels(self) -> tuple[str, str]:
@@ -99,7 +105,7 @@ class View:
     @property
     def words(self) -> str:
         """The side from which the target is seen, as a sentence without its stop."""
-        return SEEN[self.seen_from].format(optic=self.optic)
+        return SEEN[self.seen_from, self.folded].format(optic=self.optic)
 
     def note(self, figure: Figure, more: str = "", first: str = "") -> None:
         """A footnote: `first`, the side from which the target is seen, `more`, and the tilt of its plane."""

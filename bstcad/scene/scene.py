@@ -235,6 +235,11 @@ class Scene(Record):
         return self.lens.optic
 
     @property
+    def folded(self) -> bool:
+        """Does the light come to the targets along -z, by an odd number of mirrors behind the lens?"""
+        return elements.turns(self.behind) < 0
+
+    @property
     def index(self) -> float:
         """The lens's refractive index at the source's main wavelength; 1 for a mirror, which light does not enter."""
         return self.lens.index_at(self.source.main_wavelength)
