@@ -30,7 +30,6 @@ KERNELS: dict[str, dict[str, str | Callable[..., Any]]] = {
     "trace.land": {"cpu": "forward.land"},  # the whole way of single rays
     "tubes.collect": {"cpu": "clip.Clip.apply"},
     "reductions.dot": {"cpu": "reductions.dot_of_arrays"},
-    "reductions.add": {"cpu": "reductions.add_to_array"},
 }
 DTYPES = (torch.float32, torch.float64)
 # The kernels of the whole way know the equations of these kinds of Surface, and of no others.

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bstcad.optics.kernels.reductions import add, dot, total
+from bstcad.optics.kernels.reductions import dot, total
 
 Problem = Callable[[list[Tensor]], tuple[float, list[Tensor], float]]
 
@@ -209,12 +209,12 @@ def _inverse_hessian_times(g: Tensor, pairs: Sequence[tuple[Tensor, Tensor, floa
     q, shares = g.clone(), []
     for change, turn, curvature in reversed(pairs):
         shares.append(dot(change, q) / curvature)
-        add(q, -shares[-1], turn)
+        q += -shares[-1] * turn
     if pairs:
         _, turn, curvature = pairs[-1]
         q *= curvature / dot(turn, turn)
     for (change, turn, curvature), share in zip(pairs, reversed(shares), strict=True):
-        add(q, share - dot(turn, q) / curvature, change)
+        q += (share - dot(turn, q) / curvature) * change
     return q
 
 

@@ -91,27 +91,6 @@ def _dot(a, b, sums):
         sums[c] = part
 
 
-def add(a: Tensor, factor: float, b: Tensor) -> None:
-    """a += factor b, in place and without gradient: rounded as torch rounds a product and then a sum, in one pass."""
-    if fast := ops.kernel("reductions.add", a):
-        fast(a, factor, b)
-    else:
-        a += factor * b
-
-
-def add_to_array(a: Tensor, factor: float, b: Tensor) -> None:
-    """`add` on the CPU."""
-    own = a.numpy()
-    _add(own, own.dtype.type(factor), b.detach().numpy())
-
-
-@compiled(parallel=True)
-def _add(a, factor, b):
-    for c in prange(PARTS):
-        for k in range(c * a.size // PARTS, (c + 1) * a.size // PARTS):
-            a[k] += factor * b[k]
-
-
 @njit(inline="always")
 def clear(own, touched, first, last):
     """Make rows first … last - 1 of a part ready to be added to; touched (2,): the rows that are, none at first."""

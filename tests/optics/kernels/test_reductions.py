@@ -72,13 +72,3 @@ def test_parts_that_reach_some_rows_and_parts_that_reach_none():
             own[c, first:last] += c
             expected[first:last] += c
     assert np.array_equal(reductions.merged(own, touched), expected)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_add_rounds_as_torch_does(dtype):
-    """L-BFGS magnifies rounding: a product and a sum, each rounded, and not a fused step of both."""
-    generator = torch.Generator().manual_seed(5)
-    a, b = (torch.randn(100_003, generator=generator, dtype=dtype) for _ in range(2))
-    wanted = a + 0.1 * b
-    reductions.add(a, 0.1, b)
-    assert torch.equal(a, wanted)
