@@ -1,12 +1,10 @@
 """No name leads out of the folders, no answer tells where they are, no request breaks the server, no change is lost."""
 
-import contextlib
 import io
 import json
 import os
 import re
 import shutil
-import threading
 import time
 import zipfile
 from pathlib import Path
@@ -276,31 +274,6 @@ def test_a_fault_of_the_program_is_a_sentence_and_the_terminal_has_the_rest(own,
 
 
 # ---- changes ---------------------------------------------------------------------------------------------------------
-
-
-def test_two_windows_that_change_different_keys_lose_nothing(own, monkeypatch):
-    """Each change is made of the text that the other left, also while both are under way."""
-    plain, both = scene_text.changed, threading.Barrier(2)
-
-    def changed(*given):
-        with contextlib.suppress(threading.BrokenBarrierError):
-            both.wait(0.3)  # until the other has read the text, if it can
-        return plain(*given)
-
-    monkeypatch.setattr(scene_text, "changed", changed)
-    answers = []
-
-    def work(key, words):
-        answers.append(own.ask("/api/scene/small/change", {"key": key, "words": words}).status)
-
-    threads = [threading.Thread(target=work, args=each) for each in (("target.pixels", "59"), ("title", "mine"))]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert answers == [200] * 2
-    data = scene_text.tables(own.workspace.opened("small").text)
-    assert (data["target"]["pixels"], data.get("title")) == (59, "mine")
 
 
 def test_a_change_is_told_and_saved_as_the_workspace_has_it(own):

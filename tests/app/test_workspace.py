@@ -5,6 +5,7 @@ import os
 import threading
 import time
 import tomllib
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -188,6 +189,27 @@ def test_what_no_scene_file_can_hold_is_not_taken(own, text):
     with pytest.raises(SceneError, match="^small: "):
         own.change("small", text)
     assert tree(own.scenes) == {"small.toml": SMALL.encode()}
+
+
+def test_threads_that_change_a_scene_at_once_lose_nothing(own):
+    """Each appends its own lines, reading what is there first."""
+    ready = threading.Barrier(4)
+
+    def work(k):
+        ready.wait()
+        for n in range(25):
+            own.edit("small", lambda text, n=n: text + f"# {k}: {n}\n")
+
+    threads = [threading.Thread(target=work, args=(k,)) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    lines = own.opened("small").text.removeprefix(SMALL).splitlines()
+    assert sorted(lines) == sorted(f"# {k}: {n}" for k in range(4) for n in range(25))
+    for k in range(4):
+        mine = [int(line.rpartition(" ")[2]) for line in lines if line.startswith(f"# {k}:")]
+        assert all(a < b for a, b in pairwise(mine))
 
 
 def test_a_change_that_cannot_be_made_leaves_the_text(own):
