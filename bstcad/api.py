@@ -13,7 +13,7 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,9 @@ from PIL import Image
 
 from bstcad import commands, pipeline
 from bstcad import folder as folders
+from bstcad.commands import OwnCheck, OwnSection
 from bstcad.folder import Made, same_front
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, tubes_picture
 from bstcad.optics.sides import both, in_words, plain
@@ -32,7 +34,7 @@ from bstcad.optics.surfaces import Surface
 from bstcad.report import record
 from bstcad.report.drawing import png
 from bstcad.report.light_figures import View, irradiance_triptych
-from bstcad.report.record import BY_HAND, Contents, Making, Report, rrmsds
+from bstcad.report.record import BY_HAND, Making, Report, rrmsds
 from bstcad.report.units import number, quantity
 from bstcad.runs import files, processes
 from bstcad.runs import progress as progresses
@@ -40,11 +42,7 @@ from bstcad.scene.blank import FEWEST_ROUND
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene, load
 from bstcad.transport.mapping import TransportMap
-from bstcad.verify.checks import Proof
-from bstcad.verify.verdict import Check
 
-OwnCheck = Callable[[Proof, Path], Iterable[Check]]
-OwnSection = Callable[[Contents], tuple[str, str]]
 SAME = 1e-9  # of an index, and of the net's width
 GLANCE = 521  # ray tubes a side of a picture that is only looked at
 
@@ -246,11 +244,11 @@ class Design:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with files.held(folder), progresses.shown(progress) as shown:
             limit = self.scene.tailoring.max_time if self.report is None else None  # else its time was long ago
-            additions = commands.Additions(checks, sections)
             self._made = self._made.told()
             self.report = commands.write(
-                self._made, folder, progress=shown, effort=effort, limit=limit, additions=additions
-            )
+                self._made, folder, progress=shown, effort=effort, limit=limit, own_checks=checks,
+                own_sections=sections,
+            )  # fmt: skip
         self.folder = folder.resolve()
         return self.report
 
@@ -266,17 +264,16 @@ class Design:
         programs not written here that trace it too, "batoid" and "mitsuba", or a judge of one's own
         (bstcad.judges.comparison.OwnJudge).  All want a design that was written.  checks, sections: as in `write`.
         """
-        additions = commands.Additions(checks, sections)
         with progresses.shown(progress) as shown:
             if self._has_files() or measured or folder or against:
                 self.report = commands.verify(
                     self._own_folder(), against=[against] if isinstance(against, str) else against,
                     measured=measured and Path(measured).expanduser(), place=folder and Path(folder).expanduser(),
-                    progress=shown, effort=effort, additions=additions,
+                    progress=shown, effort=effort, own_checks=checks, own_sections=sections,
                 )  # fmt: skip
             else:
                 self._made = self._made.told()
-                self.report = commands.prove(self._made, progress=shown, effort=effort, additions=additions)
+                self.report = commands.prove(self._made, progress=shown, effort=effort, own_checks=checks)
         return self.report
 
     def tolerance(
@@ -322,8 +319,7 @@ class Design:
         """The folder with the files of this very design."""
         if not self._has_files():
             raise SceneError(f"{self.scene.name}: has no files yet, which that takes; write the design to a folder")
-        scene, nominal = folders.read_nominal(self.folder)
-        if not self._made.is_lens_of(Made(scene, nominal.lens, nominal.goals)):
+        if not self._made.is_lens_of(folders.read_nominal(self.folder)[1]):
             raise SceneError(f"{self.folder}: holds another design by now; write this one to a folder of its own")
         return self.folder
 
@@ -381,39 +377,33 @@ def _fitting(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
     lens, shape = replace(lens.plain(), losses=None, clear=None), tuple(lens.back.heights.shape)
     if len(shape) != 2:
         raise SceneError(f"with_lens: its back has heights of shape {shape}; give m along x and n along y, (m, n)")
-    if not bool(torch.isfinite(lens.back.heights).all()) or not math.isfinite(lens.back.z):
-        raise SceneError("with_lens: heights of its back are not finite; give numbers in mm")
     _check_same("outline", lens.outline, scene.lens.outline)
     _check_same("way of light", lens.passes.words, scene.lens.passes.words)
     if lens.passes.enters and not math.isclose(lens.index, scene.index, rel_tol=SAME):
         _check_same("index", lens.index, scene.index)
     if lens.back.shape != both(scene.lens.back.net):
         scene = scene.changed({"lens.back.control_points": plain(lens.back.shape), "tailoring.levels": None})
-    net = scene.flat_lens(lens.back.shape).back
-    for axis, own, theirs in (("x", lens.back.x, net.x), ("y", lens.back.y, net.y)):
-        if not np.allclose(own, theirs, rtol=0, atol=SAME * (theirs[1] - theirs[0])):
-            _check_same(f"extent of its net along {axis} (mm)", own, theirs)
-    if scene.lens.front.shaped and lens.front.is_net:
-        scene, lens = _fitting_front(lens, scene)
+    shapes_front = scene.lens.front.shaped and lens.front.is_net
+    if shapes_front and lens.front.shape != both(scene.lens.nets()[1]):
+        scene = scene.changed({"lens.front.control_points": plain(lens.front.shape), "lens.front.file": None})
+    flat = scene.flat_lens(lens.back.shape)
+    back = _on_net(lens.back, flat.back, "back")
+    if shapes_front:
+        lens = lens.with_front(_on_net(lens.front, flat.front, "front"))
     elif not same_front(lens.front, front):
         scene = scene.changed({"lens.front": lens.front})
         lens = lens.with_front(scene.lens.front_surface)  # a net stands for a surface of one's own
-    back = replace(lens.back, x=net.x, y=net.y)
     return scene, scene.assembled(replace(lens, back=back, index=scene.index))
 
 
-def _fitting_front(lens: Lens, scene: Scene) -> tuple[Scene, Lens]:
-    """A lens whose front stays one that is tailored, and the scene with its number of points; SceneError as below."""
-    front, points = lens.front, lens.front.shape
-    if not bool(torch.isfinite(front.heights).all()) or not math.isfinite(front.z):
-        raise SceneError("with_lens: heights of its front are not finite; give numbers in mm")
-    if points != both(scene.lens.nets()[1]):
-        scene = scene.changed({"lens.front.control_points": plain(points), "lens.front.file": None})
-    net = scene.flat_lens(scene.lens.back.net).front
-    for axis, own, theirs in (("x", front.x, net.x), ("y", front.y, net.y)):
+def _on_net(face: BSplineSurface, net: BSplineSurface, name: str) -> BSplineSurface:
+    """A face with the ends of the scene's net; SceneError if its heights are not finite, or its net is another."""
+    if not bool(torch.isfinite(face.heights).all()) or not math.isfinite(face.z):
+        raise SceneError(f"with_lens: heights of its {name} are not finite; give numbers in mm")
+    for axis, own, theirs in (("x", face.x, net.x), ("y", face.y, net.y)):
         if not np.allclose(own, theirs, rtol=0, atol=SAME * (theirs[1] - theirs[0])):
-            _check_same(f"extent of its front's net along {axis} (mm)", own, theirs)
-    return scene, lens.with_front(replace(front, x=net.x, y=net.y))
+            _check_same(f"extent of its {name}'s net along {axis} (mm)", own, theirs)
+    return replace(face, x=net.x, y=net.y)
 
 
 def _check_same(name: str, own: Any, theirs: Any) -> None:

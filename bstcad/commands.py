@@ -15,7 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -58,23 +58,15 @@ from bstcad.sweep.estimates import diagnosis, left_out
 from bstcad.sweep.net_choice import with_net
 from bstcad.tailoring.run import Look, Progress, silent, unseen
 from bstcad.verify import checks
-from bstcad.verify.checks import Nominal, Proof
+from bstcad.verify.checks import Proof
 from bstcad.verify.verdict import Check, verdict
 
 BEHIND, LEAST = 2.0, 0.5  # seconds of a run with a time limit: behind the last rays; at least for rays
 
 Drawing = Callable[..., Pictures]  # from (scene, submit): NoPictures for a folder without figures
-
-
-@dataclass(frozen=True)
-class Additions:
-    """Checks and sections of the report that a script adds to those of bstcad."""
-
-    checks: Sequence[Callable[[Proof, Path], Iterable[Check]]] = ()  # of a proof and the folder that holds the files
-    sections: Sequence[Callable[[Contents], tuple[str, str]]] = ()  # (heading, HTML without scripts) of report.html
-
-
-NO_ADDITIONS = Additions()
+# What a script adds to a report: checks of a proof and the folder of its files; (heading, HTML without scripts).
+OwnCheck = Callable[[Proof, Path], Iterable[Check]]
+OwnSection = Callable[[Contents], tuple[str, str]]
 
 
 # --- generate ---------------------------------------------------------------------------------------------------------
@@ -141,7 +133,7 @@ def place_for(folder: Path, stopped: str) -> Path:
 
 def write(
     made: Made, folder: Path, *, progress: Progress = silent, effort: Effort | None = None, limit: float | None = None,
-    drawing: Drawing | None = None, additions: Additions = NO_ADDITIONS,
+    drawing: Drawing | None = None, own_checks: Sequence[OwnCheck] = (), own_sections: Sequence[OwnSection] = (),
 ) -> Report:  # fmt: skip
     """Write a design to `folder`, in the place of an earlier one, and prove it from the written files.
 
@@ -157,7 +149,7 @@ def write(
         (drawing or Pictures)(made.scene, processes.submit) as drawn,
     ):
         made, proof = _written_and_proved(
-            made, building, drawn, additions, progress=progress, effort=effort, limit=limit
+            made, building, drawn, own_checks, progress=progress, effort=effort, limit=limit
         )
         proven = time.perf_counter()
         irradiances = tuple(light.picture for light in proof.lights)
@@ -172,29 +164,29 @@ def write(
         contents = replace(_contents(made, proof, estimates), order=order)
         drawn.begin(draw_convergence, contents)
         sheet = drawn.data_sheet()
-        _write_report(made, proof.lens, contents, building, drawn=drawn, sheet=sheet, sections=additions.sections)
+        _write_report(made, proof.lens, contents, building, drawn=drawn, sheet=sheet, sections=own_sections)
         progress("report", 1, 1, "")
     return Report(contents, irradiances, notes=tuple(exported.notes))
 
 
 def prove(
-    made: Made, *, progress: Progress = silent, effort: Effort | None = None, additions: Additions = NO_ADDITIONS
+    made: Made, *, progress: Progress = silent, effort: Effort | None = None, own_checks: Sequence[OwnCheck] = ()
 ) -> Report:
     """Prove a design by temporary files."""
     processes.begin()
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place, _nothing_left_running():
         drawn = NoPictures(made.scene, processes.submit)
-        made, proof = _written_and_proved(made, Path(place), drawn, additions, progress=progress, effort=effort)
+        made, proof = _written_and_proved(made, Path(place), drawn, own_checks, progress=progress, effort=effort)
     contents = _contents(made, proof, _left_out(made, proof))
     return Report(contents, tuple(light.picture for light in proof.lights))
 
 
 def _written_and_proved(
-    made: Made, place: Path, drawn: Pictures, additions: Additions, *, progress: Progress, effort: Effort | None,
-    limit: float | None = None,
+    made: Made, place: Path, drawn: Pictures, own_checks: Sequence[OwnCheck], *, progress: Progress,
+    effort: Effort | None, limit: float | None = None,
 ) -> tuple[Made, Proof]:  # fmt: skip
     """Write the geometry and prove it; the design with these two stages, and its proof.  limit: see `write`."""
-    made = made.told()
+    made = replace(made.told(), stored=None)  # design.npz is written anew
     processes.return_freed()  # the second process needs it for the solid
     began = time.perf_counter()
     progress("write", 0, 1, "STEP, STL, 3MF")
@@ -209,8 +201,7 @@ def _written_and_proved(
         if limit is not None:
             effort, left = effort or FULL, limit - BEHIND - made.making.seconds_total - (written - began)
             effort = replace(effort, seconds=min(effort.seconds, max(left, LEAST)))
-        nominal = folders.nominal(made.scene, made.lens, made.goals)
-        proof = _proof(made, nominal, place, drawn, additions=additions, effort=effort, progress=progress)
+        proof = _proof(made, place, drawn, own_checks=own_checks, effort=effort, progress=progress)
         for work in meanwhile:
             work.result()
     verified = time.perf_counter()
@@ -222,7 +213,7 @@ def _written_and_proved(
 
 
 def _proof(
-    made: Made, nominal: Nominal, folder: Path, drawn: Pictures, *, additions: Additions, effort: Effort | None,
+    made: Made, folder: Path, drawn: Pictures, *, own_checks: Sequence[OwnCheck], effort: Effort | None,
     progress: Progress,
 ) -> Proof:  # fmt: skip
     """The proof of the files in a folder, with the pictures of its light begun."""
@@ -231,10 +222,10 @@ def _proof(
     def draw(light: Light, lines: tuple[Line, ...], number: int) -> None:
         drawn.begin(draw_light, made.goals[number].picture, light, lines, number=number)
 
-    proof = checks.verify(folder, nominal, processes.submit, known=drawn.lens, lit=draw, effort=effort)
+    proof = checks.verify(folder, made, processes.submit, known=drawn.lens, lit=draw, effort=effort)
     if proof.wavefront is not None:
         drawn.begin(draw_wavefront, proof.wavefront)
-    added = (check for of_script in additions.checks for check in of_script(proof, folder))
+    added = (check for of_script in own_checks for check in of_script(proof, folder))
     proof = replace(proof, checks=(*proof.checks, *added))
     progress("verify", 1, 1, "RRMSD " + ", ".join(f"{light.rrmsd:.4f}" for light in proof.lights))
     return proof
@@ -282,7 +273,7 @@ def refusals(where: str = "") -> Iterator[None]:
 def verify(
     path: Path, *, against: Sequence[Any] = (), measured: Path | None = None, progress: Progress = silent,
     effort: Effort | None = None, place: Path | None = None, drawing: Drawing | None = None,
-    additions: Additions = NO_ADDITIONS,
+    own_checks: Sequence[OwnCheck] = (), own_sections: Sequence[OwnSection] = (),
 ) -> Report | Examined:  # fmt: skip
     """Prove a design again from the files of its folder, and write its report anew; or look at one STEP file alone.
 
@@ -300,18 +291,18 @@ def verify(
     if place is not None and measured is None:
         raise SceneError(f"{place}: is for the report of a made part; give its points with --measured CLOUD")
     with folders.amending(path, place) as amended:
-        made, nominal = _read(path)
+        made = read(path)
         with refusals():  # before anything that takes time
-            cloud, part = measured and clouds.load(measured, nominal.lens.apertures[1]), None
+            cloud, part = measured and clouds.load(measured, made.lens.apertures[1]), None
         with (drawing or Pictures)(made.scene, processes.submit) as drawn:
             with refusals(f"{path}: "):
-                proof = _proof(made, nominal, path, drawn, additions=additions, effort=effort, progress=progress)
+                proof = _proof(made, path, drawn, own_checks=own_checks, effort=effort, progress=progress)
             drawn.solid(proof.lens)
             judged: list[Compared] = []
-            for number, goal in enumerate(nominal.goals):
+            for number, goal in enumerate(made.goals):
                 by_others = comparison.against(
-                    against, proof.lens, nominal.channels, goal.receiver, target=goal.picture, seed=nominal.seed,
-                    progress=progress, key=goal.key if goal.suffix else "",
+                    against, proof.lens, made.channels, goal.receiver, target=goal.picture,
+                    seed=made.scene.tailoring.seed, progress=progress, key=goal.key if goal.suffix else "",
                 )  # fmt: skip
                 drawn.begin(draw_judges, by_others, number=number)
                 judged += by_others
@@ -324,10 +315,10 @@ def verify(
             drawn.begin(draw_convergence, contents)
             write = partial(
                 _write_report, made, proof.lens, studied=tolerances.of_folder(path, made.scene.optic), drawn=drawn,
-                sections=additions.sections,
+                sections=own_sections,
             )  # fmt: skip
             if cloud is not None:
-                part = _made_part(cloud, proof, nominal, effort=effort, progress=progress)
+                part = _made_part(cloud, proof, made, effort=effort, progress=progress)
                 for number, light in enumerate(proof.lights):
                     drawn.begin(draw_part, part, light.picture, number=number)
                 own = Path() if place is not None else Path("measured") / _name_of(cloud, path)
@@ -360,20 +351,16 @@ def examine(path: Path) -> Examined:
 
 def read(folder: Path) -> Made:
     """The design in a folder, with its making from report.json."""
-    return _read(folder)[0]
-
-
-def _read(folder: Path) -> tuple[Made, Nominal]:
     scene, nominal = folders.read_nominal(folder)
     making, sent = record.making(folder / "report.json"), folders.read_transport(folder, scene)
-    return Made(scene, nominal.lens, nominal.goals, making, transport=sent), nominal
+    return Made(scene, nominal.lens, nominal.goals, making, transport=sent, stored=nominal.stored)
 
 
-def _made_part(cloud: Cloud, proof: Proof, nominal: Nominal, *, effort: Effort | None, progress: Progress) -> MadePart:
+def _made_part(cloud: Cloud, proof: Proof, made: Made, *, effort: Effort | None, progress: Progress) -> MadePart:
     """The made part that was measured as `cloud`."""
     progress("made part", 0, 1, "from its cloud")
     with refusals():
-        found = made_part.judge(cloud, proof.lens, nominal, effort)
+        found = made_part.judge(cloud, proof.lens, made, effort)
     progress("made part", 1, 1, "")
     return found
 
@@ -436,7 +423,7 @@ def _sheet(
 
 def _write_report(
     made: Made, lens: Lens, contents: Contents, folder: Path, *, drawn: Pictures, sheet: bytes | None,
-    studied: str = "", sections: Sequence[Callable[[Contents], tuple[str, str]]] = (),
+    studied: str = "", sections: Sequence[OwnSection] = (),
 ) -> None:  # fmt: skip
     """The report as JSON, HTML and JUnit's XML, prescription.txt, figures/ and datasheet.pdf.
 

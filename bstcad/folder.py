@@ -28,9 +28,7 @@ from bstcad.cad import mesh as meshes
 from bstcad.cad.mesh import SILVER, Label
 from bstcad.optics import quadrature
 from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
-from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import FULL
 from bstcad.optics.sides import Sides, both, scaled
 from bstcad.optics.surfaces import Surface
 from bstcad.report.prescription import scene_text
@@ -47,17 +45,13 @@ from bstcad.verify.checks import Nominal
 SCENE, DESIGN, PART = "scene.toml", "design.npz", "part.step"
 FRONT_KNOTS = ("front_knots_x", "front_knots_y")  # in design.npz, of a front that is tailored
 PROVEN = (SCENE, DESIGN, "lens.step", "lens.stl", PART, FRONT)  # the files that a verification reads
-ROUGH = 0.01  # standard error of a draft's RRMSD, relative to it, at which the proof ends
 AGAIN = "generate the design again"
 
 
 @dataclass(frozen=True)
-class Made:
-    """A designed lens, as a folder holds it."""
+class Made(Nominal):
+    """A designed lens, as a folder holds it: on the CPU, its goals of the pixels that light can reach."""
 
-    scene: scenes.Scene
-    lens: Lens  # float64, on the CPU
-    goals: tuple[Goal, ...]  # their pictures of the pixels that light can reach
     making: Making = Making()  # stages, history and machine, for the report
     device: str = "cpu"  # of the design
     transport: TransportMap | None = None  # the map of stage 1; None for a lens of the user's own, or if not known
@@ -68,7 +62,7 @@ class Made:
         """The same with all that a report tells."""
         return self if self.compared is None else replace(self, making=self.compared(), compared=None)
 
-    def is_lens_of(self, other: Made) -> bool:
+    def is_lens_of(self, other: Nominal) -> bool:
         """Is it the same lens, to the last bit, for the same light and picture?"""
         return (
             same_front(self.lens.front, other.lens.front)
@@ -90,24 +84,17 @@ def same_front(one: Surface, other: Surface) -> bool:
 # --- sizes said before ------------------------------------------------------------------------------------------------
 
 LARGE = 100e6  # bytes of lens.step from which on they are said before a design
-STATEMENT = len("# = CARTESIAN_POINT('',(,,));\n") + len("#,")  # besides numbers; and the reference to it
+POINT = 83  # bytes of the statement of a control point and of one reference to it, without its two numbers
 REST = 103_000, 1600  # bytes of the other statements, and of those along the rim for each control point of a side
 
 
 def step_size(scene: scenes.Scene, net: Sides | None = None) -> float:
-    """Bytes of lens.step, to a few per cent: one statement and one reference a control point, 16 to 18 digits a number.
+    """Bytes of lens.step, to a few per cent: one statement and one reference a control point.
 
     net: control points a side, or along x and along y; None: those of the scene.
     """
-    half = scene.lens.outline.half_extent
-    digits = [np.mean([len(f"{x:.14f}") for x in np.linspace(-end, end, 101)]) for end in half]
-    digits.append(len(f"{scene.lens.back.z:.14f}"))
-
-    def of_net(net: Sides) -> float:
-        m, n = both(net)
-        return m * n * (STATEMENT + 2 * len(str(m * n)) + math.fsum(digits)) + REST[1] * (m + n) / 2
-
-    return math.fsum(map(of_net, scene.lens.nets(net))) + REST[0]
+    nets = map(both, scene.lens.nets(net))
+    return sum(m * n * (POINT + 2 * len(str(m * n))) + REST[1] * (m + n) / 2 for m, n in nets) + REST[0]
 
 
 def said_of_sizes(scene: scenes.Scene) -> str:
@@ -325,7 +312,7 @@ def kept_until_written(design: Made, folder: Path) -> Iterator[None]:
 
 
 def _keep(design: Made, folder: Path) -> Path:
-    """Keep a design; its place.  OSError."""
+    """Keep a design beside its folder, or else among temporary files; its place.  OSError."""
 
     def kept_in(place: Path) -> Path:
         with replacing(place) as building:
@@ -337,12 +324,7 @@ def _keep(design: Made, folder: Path) -> Path:
     try:
         return kept_in(beside)
     except OSError:
-        refuge = Path(tempfile.mkdtemp(prefix="bstcad-"))
-    try:
-        return kept_in(refuge / beside.name)
-    except BaseException:
-        refuge.rmdir()
-        raise
+        return kept_in(Path(tempfile.mkdtemp(prefix="bstcad-"), beside.name))
 
 
 def _kept(folder: Path) -> Iterator[Path]:
@@ -355,10 +337,10 @@ def _kept(folder: Path) -> Iterator[Path]:
 def _holds(kept: Path, design: Made) -> bool:
     """Does a folder hold this design?"""
     try:
-        scene, nominal = read_nominal(kept)
+        _, nominal = read_nominal(kept)
     except Exception:  # zipfile and numpy each raise their own for a damaged file
         return False
-    return design.is_lens_of(Made(scene, nominal.lens, nominal.goals))
+    return design.is_lens_of(nominal)
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
@@ -383,7 +365,7 @@ def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
         stored.append(found[numbered("target", k)])
         if not stored[k].sum() > 0 or not goals[k].picture.sum() > 0:
             raise SceneError(f"{folder / DESIGN}: the {goal.key} is all black; {AGAIN}")
-    return scene, nominal(scene, _lens(scene, found), goals, stored)
+    return scene, Nominal(scene, _lens(scene, found), tuple(goals), stored=tuple(stored))
 
 
 def read_irradiances(folder: Path, scene: scenes.Scene) -> tuple[np.ndarray, ...]:
@@ -444,29 +426,3 @@ def _surface(net: np.ndarray, z: float) -> BSplineSurface:
     if not np.array_equal(z + (net[..., 2] - z), net[..., 2]):  # where the two differ much in size a bit would be lost
         z = 0.0
     return BSplineSurface.from_control_points(net, z)
-
-
-def nominal(
-    scene: scenes.Scene, lens: Lens, goals: Sequence[Goal], stored: Sequence[np.ndarray] | None = None
-) -> Nominal:  # fmt: skip
-    """The design that the files are held to.
-
-    goals: with the scene's own pictures; stored: what design.npz has in their place, None: these.
-    """
-    return Nominal(
-        lens=lens,
-        goals=tuple(goals),
-        stored=tuple(goal.picture for goal in goals) if stored is None else tuple(stored),
-        channels=scene.judging_channels(),
-        accept=scene.accept,
-        seed=scene.tailoring.seed,
-        mesh_tolerance=scene.mesh_tolerance,
-        mesh_asked=scene.output.mesh_tolerance is not None,
-        ghost=scene.ghost,
-        mount=scene.mount,
-        blank=scene.lens,
-        part=scene.part.of(scene.lens),
-        draw=scene.draw,
-        accuracy=ROUGH if scene.tailoring.quality == "draft" else FULL.accuracy,
-        wave=scene.wavefront,
-    )

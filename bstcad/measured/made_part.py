@@ -82,7 +82,7 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
             where=f"it is {scale:.5f} times the design", id="made-scale",
         ),
         Check.at_most(
-            "made part: decentre in the frame of the cloud", math.hypot(x, y), nominal.accept.decentre, "mm",
+            "made part: decentre in the frame of the cloud", math.hypot(x, y), nominal.scene.accept.decentre, "mm",
             where=f"x {x:+.4g} mm, y {y:+.4g} mm", id="made-decentre",
         ),
         *(
@@ -90,7 +90,7 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
             for goal, (light, high) in zip(nominal.goals, lights, strict=True)
             for check in (
                 Check.at_most(
-                    f"made part: RRMSD predicted{goal.suffix}", light.rrmsd, nominal.accept.rrmsd, id="made-rrmsd"
+                    f"made part: RRMSD predicted{goal.suffix}", light.rrmsd, nominal.scene.accept.rrmsd, id="made-rrmsd"
                 ),
                 Check.at_most(
                     f"made part: RRMSD, were all that the points leave open against it{goal.suffix}", high, None,
@@ -116,14 +116,15 @@ def _predicted(light: Light, high: float) -> dict[str, float | None]:
 
 def _wavefront(lens: Lens, nominal: Nominal) -> Iterator[Check]:
     """The check of the wavefront behind the made lens, where one is asked for."""
-    if nominal.wave is None:
+    wave, asked = nominal.scene.wavefront, nominal.scene.accept.wavefront
+    if wave is None:
         return
     light, value, none = nominal.heaviest, math.nan, ""
     try:
-        value = wavefront_error(light.source.central, light.through(lens), nominal.wave).without_tilt.rms
+        value = wavefront_error(light.source.central, light.through(lens), wave).without_tilt.rms
     except ValueError as error:
         none = str(error)
-    name, asked = f"made part: {WAVEFRONT}, predicted", nominal.accept.wavefront
+    name = f"made part: {WAVEFRONT}, predicted"
     yield Check.at_most(name, value, asked, unit="waves", where=none, id="made-wavefront")
 
 
@@ -179,11 +180,11 @@ def _covered(lens: Lens, points: np.ndarray) -> float:
 
 def _light(lens: Lens, form: Form, nominal: Nominal, goal: Goal, *, effort: Effort) -> tuple[Light, float]:
     """(light of the lens with the form error, RRMSD with the remaining uncertainty added, mean of both signs)."""
-    draw = np.random.default_rng(nominal.seed).normal(size=form.spread.shape)
+    draw = np.random.default_rng(nominal.scene.tailoring.seed).normal(size=form.spread.shape)
 
     def of(form: Form) -> Light:
         made = replace(lens, back=form.on(lens.back))
-        how = {"effort": effort, "ghost": nominal.ghost, "draw": nominal.draw}
+        how = {"effort": effort, "ghost": nominal.scene.ghost, "draw": nominal.scene.draw}
         return measure(made, nominal.channels, goal.receiver, goal.picture, **how)
 
     light = of(form)

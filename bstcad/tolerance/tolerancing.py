@@ -46,7 +46,7 @@ def tolerance(
     """
     with folders.amending(folder) as amended:
         scene, nominal = read_nominal(folder)
-        if nominal.ghost is not None:
+        if scene.ghost is not None:
             raise SceneError("[[effects]] ghost: tolerances do not follow stray light yet; remove it from scene.toml")
         pictures, limit = _pictures(scene, nominal, grade, tubes), scene.accept.rrmsd or DEFAULT_RRMSD_LIMIT
         goals = [("accept.rrmsd", each, limit, _rrmsd(nominal, each)) for each in pictures]
@@ -102,7 +102,7 @@ def _rrmsd(nominal: Nominal, pictures: Pictures) -> float:
     """Of the design on the screen of these pictures, by rays."""
     return measure(
         nominal.lens, nominal.channels, pictures.setup.screen, pictures.target,
-        effort=nominal.effort(Effort(witness=False)), draw=nominal.draw,
+        effort=nominal.effort(Effort(witness=False)), draw=nominal.scene.draw,
     ).rrmsd  # fmt: skip
 
 

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,25 +24,13 @@ from bstcad.optics import quadrature
 from bstcad.optics.channels import Channel
 from bstcad.optics.goal import Goal, worst
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import (
-    FULL,
-    RESOLVED,
-    Draw,
-    Effort,
-    GhostLight,
-    Light,
-    Line,
-    lines_apart,
-    measure,
-    tubes_of,
-)
+from bstcad.optics.measure import FULL, RESOLVED, Effort, Light, Line, lines_apart, measure, tubes_of
 from bstcad.optics.outlines import Outline
-from bstcad.optics.wavefront import Wave
 from bstcad.optics.wavefront_error import WavefrontError, wavefront_error
 from bstcad.runs.processes import Overdue, Submit, end, here, result, return_freed
 from bstcad.scene.blank import LensBlank
-from bstcad.scene.mount import Mount, Part, as_cut
-from bstcad.scene.scene import Accept
+from bstcad.scene.mount import as_cut
+from bstcad.scene.scene import Accept, Scene
 from bstcad.step_text import part21
 from bstcad.verify import text_checks
 from bstcad.verify.verdict import Check
@@ -58,6 +47,7 @@ APERTURE_DIFFERENCE = 1e-3  # mm; of a front whose edge is not level the scene k
 CUT_EXCUSE = 1e-3  # of the light: a mount that cuts away less is no reason for a picture that fails
 MAX_ON_FLANGE = 1e-3  # of the light that gets through the lens; no wall of a flange is to stand in the way of more
 WAVEFRONT = "wavefront error, RMS in waves, piston and tilt removed"
+ROUGH = 0.01  # standard error of a draft's RRMSD, relative to it, at which the proof ends
 FLOOR = 0.1  # of the wavefront error that is allowed: rounding that adds more leaves the verdict open
 LIMIT, LIMIT_PER_MB = 120.0, 3.0  # s that OCC may take over a file, and more for each MB; it needs a hundredth of them
 GRID = ", on a grid four times finer than the net"
@@ -67,21 +57,16 @@ GRID = ", on a grid four times finer than the net"
 class Nominal:
     """The design that the files are held to."""
 
+    scene: Scene
     lens: Lens  # float64
-    goals: tuple[Goal, ...]
-    stored: tuple[np.ndarray, ...]  # their pictures as design.npz has them
-    channels: tuple[Channel, ...]
-    accept: Accept
-    seed: int
-    mesh_tolerance: float = 1e-3  # mm; how far the facets of the mesh may lie from the lens
-    mesh_asked: bool = True  # by the scene; else the mesh with the most triangles is fine enough
-    ghost: GhostLight | None = None  # how light reflected twice in the lens is followed; None: it is left out
-    mount: Mount | None = None  # how the lens is held in part.step; None: there is none
-    blank: LensBlank | None = None  # with the bounds on its back, if there are any
-    part: Part = field(default_factory=Part)  # whose facts lens.step should state besides the shape
-    draw: Draw | None = None  # how points of an extended source are drawn; None: it is a point
-    accuracy: float = FULL.accuracy  # of the RRMSD: its standard error, as a part of it, that is asked for
-    wave: Wave | None = None  # that the light behind the lens is to be; None: none is asked for
+    goals: tuple[Goal, ...]  # with the scene's own pictures
+    # pictures of the goals as design.npz has them; None: those of `goals`
+    stored: tuple[np.ndarray, ...] | None = field(default=None, kw_only=True)
+
+    @cached_property
+    def channels(self) -> tuple[Channel, ...]:
+        """The light of the scene, of an extended source by other points than tailoring knows."""
+        return self.scene.judging_channels()
 
     @property
     def heaviest(self) -> Channel:
@@ -90,8 +75,9 @@ class Nominal:
 
     def effort(self, given: Effort | None = None) -> Effort:
         """The rays and tubes of a measurement of this design, a draft's with fewer; given: a limit, None: no limit."""
-        given = given or FULL
-        return replace(given, seed=self.seed, accuracy=max(given.accuracy, self.accuracy))
+        given, tailoring = given or FULL, self.scene.tailoring
+        accuracy = ROUGH if tailoring.quality == "draft" else FULL.accuracy
+        return replace(given, seed=tailoring.seed, accuracy=max(given.accuracy, accuracy))
 
 
 @dataclass(frozen=True)
@@ -152,11 +138,11 @@ def verify(
     effort = replace(effort, seed=effort.seed + VERIFY_SEED, seconds=effort.seconds / len(nominal.goals))
     path = (folder / "lens.step").absolute()
     lens = submit("bstcad.verify.step_checks.lens", path, nominal.lens.index, nominal.lens.passes)
-    mount = nominal.mount
+    mount, part = nominal.scene.mount, nominal.scene.part.of(nominal.scene.lens)
     seen = mount and submit("bstcad.verify.step_checks.lens_of_part", folder.absolute(), nominal.lens, mount)
-    step_job = "bstcad.verify.step_checks.check", path, nominal.lens, nominal.accept.form, effort.points
+    step_job = "bstcad.verify.step_checks.check", path, nominal.lens, nominal.scene.accept.form, effort.points
     of_step = submit(*step_job)
-    part_job = "bstcad.verify.step_checks.check_part", folder.absolute(), nominal.lens, mount, nominal.part
+    part_job = "bstcad.verify.step_checks.check_part", folder.absolute(), nominal.lens, mount, part
     of_part = mount and submit(*part_job)
     try:
         text = part21.read_lens(path)  # its sentences say more than OCC's
@@ -181,7 +167,7 @@ def verify(
     cut = as_cut(lens, mount)
     shape = describe(cut, effort.places) | {"volume": whole.volume} | _ripples_in_light(as_made, nominal)
     stability = _stability(as_made, nominal, lights, shape)
-    machined, at_bounds = of_bounds(cut, nominal.blank, shape)
+    machined, at_bounds = of_bounds(cut, nominal.scene.lens, shape)
     meets = f"{'enters' if lens.passes.enters else 'meets'} the {lens.passes.optic}"
     goals = [(goal, each, goal.suffix) for goal, each in zip(nominal.goals, lights, strict=True)]
     degrees = math.nan if stability["tir_margin_deg"] is None else stability["tir_margin_deg"]
@@ -189,7 +175,7 @@ def verify(
     checks = (
         *text_checks.of_lens(text, nominal.lens),
         *text_checks.measures(text.properties, whole, lens.outline),
-        *text_checks.of_part(text, nominal.part),
+        *text_checks.of_part(text, part),
         *_result(of_step, path, lambda: submit(*step_job)),
         *(_result(of_part, folder / "part.step", lambda: submit(*part_job)) if of_part else ()),
         *of_aperture,
@@ -197,8 +183,8 @@ def verify(
         *_of_ripple(shape),
         sealed,
         *_facets(mesh, lens, shape["volume"], nominal),
-        *map(_picture, nominal.goals, nominal.stored),
-        *(c for _, each, of in goals for c in _of_light(each, nominal.accept, meets, of=of, why=why)),
+        *map(_picture, nominal.goals, nominal.stored or [goal.picture for goal in nominal.goals]),
+        *(c for _, each, of in goals for c in _of_light(each, nominal.scene.accept, meets, of=of, why=why)),
         *of_wavefront,
         *([margin] if lens.passes.enters else []),
         Check.at_most("values that are not finite", stability["non_finite"], 0, id="finite"),
@@ -212,18 +198,10 @@ def verify(
 
 def _lit(lens: Lens, nominal: Nominal, goal: Goal, effort: Effort) -> tuple[Light, tuple[Line, ...]]:
     """The light that the lens throws on a target, and that of each line of a spectrum; ValueError if there is none."""
-    light = measure(
-        lens,
-        nominal.channels,
-        goal.receiver,
-        goal.picture,
-        effort=effort,
-        ghost=nominal.ghost,
-        draw=nominal.draw,
-        whole=goal.whole,
-    )
+    how = {"effort": effort, "ghost": nominal.scene.ghost, "draw": nominal.scene.draw, "whole": goal.whole}
+    light = measure(lens, nominal.channels, goal.receiver, goal.picture, **how)
     if not light.rrmsd >= 0:
-        name = "lens.step" if nominal.mount is None else "part.step"
+        name = "lens.step" if nominal.scene.mount is None else "part.step"
         raise ValueError(f"{name}: none of its light falls on {goal.words}; write it again, or check scene.toml")
     n = max(LINE_TUBES, tubes_of(lens))
     return light, lines_apart(lens, nominal.channels, goal.receiver, target=goal.picture, n=n)
@@ -243,7 +221,7 @@ def _as_made(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> tuple[
 
     Where there is no such part, which other checks say, it is lens.step's with the apertures that the part was to have.
     """
-    designed, flange = nominal.lens, nominal.mount.flange
+    designed, flange = nominal.lens, nominal.scene.mount.flange
     try:
         lens = replace(_as_shaped(_result(read, folder / "part.step"), designed), outline=bare.outline)
         checks = [_aperture(*each) for each in zip(("front", "back"), lens.apertures, designed.apertures, strict=True)]
@@ -274,7 +252,7 @@ def _stability(
     lens: Lens, nominal: Nominal, lights: Sequence[Light], shape: dict
 ) -> dict[str, float | int | None]:  # fmt: skip
     """How far the lens is from where its numbers would go wrong; angles in degrees, curvature in 1/mm."""
-    least = margins(nominal.channels, lens, nominal.goals[0].receiver, nominal.seed + VERIFY_SEED)
+    least = margins(nominal.channels, lens, nominal.goals[0].receiver, nominal.scene.tailoring.seed + VERIFY_SEED)
     keys = (f"{face}radius_min_{kind}" for face in ("", "front_") for kind in ("concave", "convex"))
     radii = [shape[key] for key in keys if shape.get(key)]
     return {
@@ -332,15 +310,13 @@ def _ripples_in_light(lens: Lens, nominal: Nominal) -> dict[str, float]:
 
 
 def of_bounds(
-    lens: Lens, asked: LensBlank | None, shape: Mapping[str, float | None]
+    lens: Lens, asked: LensBlank, shape: Mapping[str, float | None]
 ) -> tuple[list[Check], dict[str, AtBound]]:
     """Checks of the bounds that a scene puts on its tailored faces, and which of the bounds these meet, by key.
 
     The bounds are tool_radius, max_slope and the thicknesses of [lens]; shape: of the re-read lens.  A front that is
     tailored is held to them as the back is, seen from outside: a tool has to fit into its valleys.
     """
-    if asked is None:
-        return [], {}
     checks, found = [], {}
     radius, degrees, kind = asked.tool_radius, asked.max_slope, "convex" if asked.mould else "concave"
     if radius is not None or degrees is not None:
@@ -389,8 +365,8 @@ def _facets(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> l
     Facets of the area A (mm²) within the tolerance (mm) enclose a volume that is off by no more than A times it.
     """
     size = float(np.abs(mesh.vertices).max(initial=0.0))
-    tolerance, finest = nominal.mesh_tolerance, len(mesh.faces) >= 0.9 * meshes.MOST
-    limit = None if finest and not nominal.mesh_asked else tolerance
+    tolerance, finest = nominal.scene.mesh_tolerance, len(mesh.faces) >= 0.9 * meshes.MOST
+    limit = None if finest and nominal.scene.output.mesh_tolerance is None else tolerance
     enclosed, area = meshes.volume_and_area(mesh)
     off, error = abs(enclosed / volume - 1), meshes.chordal_error(mesh, lens)
     off_faces, rounding = meshes.vertex_error(mesh, lens), VERTEX_ROUNDING * size
@@ -437,11 +413,12 @@ def _of_light(
 
 def _of_wavefront(lens: Lens, nominal: Nominal) -> tuple[WavefrontError | None, list[Check]]:
     """The wavefront through the re-read lens against the wave asked for, and its checks; nothing if none is."""
-    if nominal.wave is None:
+    wave, asked = nominal.scene.wavefront, nominal.scene.accept.wavefront
+    if wave is None:
         return None, []
-    light, asked = nominal.heaviest, nominal.accept.wavefront
+    light = nominal.heaviest
     try:
-        error = wavefront_error(light.source.central, light.through(lens), nominal.wave)
+        error = wavefront_error(light.source.central, light.through(lens), wave)
     except ValueError as none:  # a lens that misses the wave is written all the same, and fails
         return None, [Check.at_most(WAVEFRONT, math.nan, asked, "waves", where=str(none), id="wavefront")]
     most = None if asked is None else FLOOR * asked

@@ -29,7 +29,7 @@ from skimage.data import astronaut
 
 from bstcad.cad import mesh as meshes
 from bstcad.cad import step_reading, step_writing
-from bstcad.folder import Made, nominal, write_geometry
+from bstcad.folder import Made, write_geometry
 from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort
@@ -225,7 +225,7 @@ def _reading(read: Callable[[Path], Any], m: int) -> Work:
 def _proof(m: int = NET, pixels: int = PIXELS) -> Work:
     made = _made(m, pixels)
     place = _written(m)
-    wanted = nominal(made.scene, made.lens, made.goals)
+    wanted = checks.Nominal(made.scene, made.lens, made.goals)
     return partial(checks.verify, Path(place.name), wanted, effort=PROOF)
 
 

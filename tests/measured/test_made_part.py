@@ -77,7 +77,7 @@ def as_designed(lens):
 
 def test_a_decentre_of_ten_micrometres_is_found_to_a_tenth_and_fails_where_less_is_asked(nominal, same_light):
     """So do inches, by name."""
-    strict = replace(nominal, accept=nominal.accept.model_copy(update={"decentre": 0.005}))
+    strict = replace(nominal, scene=nominal.scene.changed({"accept.decentre": 0.005}))
     part = judged(as_designed(nominal.lens) + [0.01, 0.0, 0.0], strict, unit="inches")
     assert (part.facts["alignment"]["dx"], part.facts["alignment"]["dy"]) == pytest.approx((0.01, 0.0), abs=1e-4)
     faults = failed(part)

@@ -53,8 +53,8 @@ def nominal(small_design, few):
     [goal] = found.goals
     target = goal.picture.reshape(12, 4, 16, 4).sum((1, 3))
     target *= 1 + 0.08 * (-1.0) ** np.add.outer(np.arange(12), np.arange(16))
-    accept = replace_model(found.accept, rrmsd=0.2, efficiency=0.999)
-    return replace(with_picture(found, target, receiver=replace(goal.receiver, pixels=(16, 12))), accept=accept)
+    found = with_picture(found, target, receiver=replace(goal.receiver, pixels=(16, 12)))
+    return other_limits(found, rrmsd=0.2, efficiency=0.999)
 
 
 def with_picture(nominal, picture, **changes):
@@ -63,8 +63,10 @@ def with_picture(nominal, picture, **changes):
     return replace(nominal, goals=goals, stored=(picture,))
 
 
-def replace_model(model, **changes):
-    return model.model_copy(update=changes)
+def changed(nominal, name, **changes):
+    """The same with other entries of a table of its scene."""
+    table = getattr(nominal.scene, name).model_copy(update=changes)
+    return replace(nominal, scene=nominal.scene.model_copy(update={name: table}))
 
 
 def failing(proof):
@@ -285,13 +287,13 @@ def test_a_changed_mesh_fails_by_name(folder, nominal, change):
     assert STLS[change] <= failing(proof)
 
 
-@pytest.mark.parametrize(("most", "asked", "fails"), [(10, False, False), (10, True, True), (10**9, False, True)])
+@pytest.mark.parametrize(("most", "asked", "fails"), [(10, None, False), (10, 1e-6, True), (10**9, 1e-6, True)])
 def test_a_mesh_too_coarse_fails_unless_nobody_asked_for_a_finer_one_than_there_may_be(
     folder, nominal, monkeypatch, most, asked, fails
 ):
     monkeypatch.setattr(meshes, "MOST", most)
     mesh = meshes.read_stl(folder / "lens.stl")
-    found = checks._facets(mesh, nominal.lens, 1e9, replace(nominal, mesh_tolerance=1e-9, mesh_asked=asked))
+    found = checks._facets(mesh, nominal.lens, 1e9, changed(nominal, "output", mesh_tolerance=asked))
     [chord] = [check for check in found if check.id == "mesh-chord"]
     assert chord.value > 1e-6 and chord.passed is not fails
     [said] = re.findall(r"no mesh has over \d+ triangles, which come within some (.*) mm; allow", chord.where) or [None]
@@ -308,24 +310,20 @@ def other_front(nominal):
 
 
 def other_limits(nominal, **changes):
-    return replace(nominal, accept=replace_model(nominal.accept, **changes))
+    return changed(nominal, "accept", **changes)
 
 
 def narrower_screen(nominal, right=10.0):
     """Two thirds of the screen and its target: the rest of the light falls beside."""
     screen = replace(nominal.goals[0].receiver, x=(-30.0, right))
-    accept = replace_model(nominal.accept, rrmsd=9)
-    return replace(with_picture(nominal, np.ones((12, 16)), receiver=screen), accept=accept)
+    return other_limits(with_picture(nominal, np.ones((12, 16)), receiver=screen), rrmsd=9)
 
 
 DESIGNS = {
     "the target by 1 %": (lambda n: replace(n, stored=(1.01 * n.goals[0].picture,)), {"target"}),
     "the front's curvature by 1e-9": (other_front, {"front-curvature"}),
     "RRMSD asked for: 1e-6": (lambda n: other_limits(n, rrmsd=1e-6), {"rrmsd"}),
-    "thickness asked for: 9.9 mm": (
-        lambda n: replace(n, blank=replace_model(n.blank, min_thickness=9.9)),
-        {"thickness"},
-    ),
+    "thickness asked for: 9.9 mm": (lambda n: changed(n, "lens", min_thickness=9.9), {"thickness"}),
     "light beside the screen": (narrower_screen, {"efficiency"}),
     "most of the light beside the screen": (
         lambda n: narrower_screen(other_limits(n, light_on_target=0.5), -5.0),
@@ -347,13 +345,13 @@ def test_a_ripple_fails_a_lens_by_what_the_light_feels_of_it(nominal):
     for height, fails in ((1e-6, False), (1e-2, True)):
         lens = replace(nominal.lens, back=replace(back, heights=back.heights + height * torch.from_numpy(noise)))
         light = measure.measure(lens, nominal.channels, nominal.goals[0].receiver, nominal.goals[0].picture, effort=FEW)
-        found = {c.id: c.passed for c in checks._of_light(light, nominal.accept)}
+        found = {c.id: c.passed for c in checks._of_light(light, nominal.scene.accept)}
         assert found["rrmsd"] is not fails
         shape_of = shape.describe(lens) | checks._ripples_in_light(lens, nominal)
         (stated,) = checks._of_ripple(shape_of)
         assert stated.id == "ripple" and stated.passed and stated.limit is None
         slopes.append(stated.value)
-    assert slopes[1] > 1e-4 and shape_of["ripple_rrmsd"] > nominal.accept.rrmsd
+    assert slopes[1] > 1e-4 and shape_of["ripple_rrmsd"] > nominal.scene.accept.rrmsd
 
 
 NOISES = [  # "rrmsd", its standard error, accept.rrmsd, does the noise pass?
@@ -432,7 +430,7 @@ def test_the_rays_are_none_that_tailoring_saw(folder, nominal, monkeypatch):
 
     monkeypatch.setattr(measure, "simulate", heard)
     checks.verify(folder, nominal)
-    assert len(set(seeds)) == measure.SETS and min(seeds) > nominal.seed + 1000
+    assert len(set(seeds)) == measure.SETS and min(seeds) > nominal.scene.tailoring.seed + 1000
 
 
 def test_every_judged_check_is_seen_to_fail_above(folder, nominal):

@@ -63,7 +63,7 @@ def test_each_light_is_that_of_its_own_screen(two):
     light, other = two.proof.lights
     assert two.proof.light is max(light, other, key=lambda each: each.rrmsd) and two.proof.wavefront is None
     nominal = folders.read_nominal(two.folder)[1]
-    effort = replace(nominal.effort(quick_effort()), seed=nominal.seed + checks.VERIFY_SEED)
+    effort = replace(nominal.effort(quick_effort()), seed=nominal.scene.tailoring.seed + checks.VERIFY_SEED)
     for goal, found in zip(nominal.goals, two.proof.lights, strict=True):
         alone = bstcad.measure(two.proof.lens, nominal.channels, goal.receiver, goal.picture, effort=effort)
         assert np.array_equal(alone.picture, found.picture) and alone.rrmsd == found.rrmsd
@@ -74,7 +74,7 @@ def test_accept_holds_for_each_target(two):
     """A limit between the two figures fails the worse one alone."""
     low, high = sorted(light.rrmsd for light in two.proof.lights)
     nominal = folders.read_nominal(two.folder)[1]
-    between = replace(nominal, accept=nominal.accept.model_copy(update={"rrmsd": (low + high) / 2}))
+    between = replace(nominal, scene=nominal.scene.changed({"accept.rrmsd": (low + high) / 2}))
     proof = checks.verify(two.folder, between, effort=quick_effort())
     assert not proof.passed
     failed = [check.name for check in proof.checks if not check.passed]
@@ -117,7 +117,7 @@ def test_a_file_whose_front_is_flat_is_no_lens_of_two_nets(two, tmp_path):
     text = part21.read_lens(tmp_path / "lens.step")
     failed = {check.name for check in text_checks.of_lens(text, two.made.lens) if not check.passed}
     assert failed == {"STEP text: control points of the front"}
-    nominal = folders.nominal(two.made.scene, two.made.lens, two.made.goals)
+    nominal = checks.Nominal(two.made.scene, two.made.lens, two.made.goals)
     proof = checks.verify(tmp_path, nominal, effort=quick_effort())
     failed = {check.name for check in proof.checks if not check.passed}
     assert "form: re-read front face against the optimised one" in failed and proof.lens.shaped is None

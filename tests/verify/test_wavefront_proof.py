@@ -39,7 +39,9 @@ def one(tmp_path_factory):
 
 def judged(lens, nominal, **accept):
     """The wavefront of a lens, and its two checks by other limits by name."""
-    nominal = replace(nominal, accept=nominal.accept.model_copy(update=accept))
+    scene = nominal.scene
+    limits = scene.accept.model_copy(update=accept)
+    nominal = replace(nominal, scene=scene.model_copy(update={"accept": limits}))
     error, found = checks._of_wavefront(lens, nominal)
     return error, {check.name: check for check in found}
 
@@ -61,7 +63,7 @@ def test_without_a_limit_both_values_are_stated(one):
 
 def test_a_wavefront_beyond_its_limit_fails(one):
     nominal, rms = folders.read_nominal(one.folder)[1], one.proof.wavefront.without_tilt.rms
-    assert nominal.wave == one.made.scene.wavefront
+    assert nominal.scene.wavefront == one.made.scene.wavefront
     _, found = judged(one.proof.lens, nominal, wavefront=0.99 * rms)
     assert not found[RMS].passed and found[FLOOR].passed and found[FLOOR].limit == pytest.approx(0.099 * rms)
     _, found = judged(one.proof.lens, nominal, wavefront=1.01 * rms)
@@ -75,7 +77,8 @@ def test_a_limit_that_rounding_hides_fails_by_the_floor(one):
 
 
 def test_a_wave_that_no_light_meets_fails_and_has_no_figures(one):
-    nominal = replace(folders.read_nominal(one.folder)[1], wave=ZernikeWave((0.0,), 1.0, z=60.0, centre=(500.0, 0.0)))
+    nominal, beside = folders.read_nominal(one.folder)[1], ZernikeWave((0.0,), 1.0, z=60.0, centre=(500.0, 0.0))
+    nominal = replace(nominal, scene=nominal.scene.model_copy(update={"wavefront": beside}))
     error, found = judged(one.proof.lens, nominal)
     assert error is None and found.keys() == {RMS} and not found[RMS].passed
     assert found[RMS].value is None and "no light comes to where the wavefront is stated" in found[RMS].where
@@ -84,7 +87,7 @@ def test_a_wave_that_no_light_meets_fails_and_has_no_figures(one):
 def test_a_flat_plate_leaves_parallel_light_parallel():
     """A plain lens: parallel light through level faces has no error but rounding."""
     made = made_of(scene_of(**ONE), front=0.0, back=0.0)
-    error, found = judged(made.lens, folders.nominal(made.scene, made.lens, made.goals), wavefront=1e-6)
+    error, found = judged(made.lens, checks.Nominal(made.scene, made.lens, made.goals), wavefront=1e-6)
     assert found[RMS].passed and found[FLOOR].passed
     assert error.without_piston.rms < 1e-8 and error.angle_max < 1e-6
 
@@ -93,7 +96,7 @@ def test_a_mounted_lens_is_measured_as_it_is_made(tmp_path):
     """The rim of the mount cuts away light that the bare lens lets through."""
     made = made_of(scene_of(**ONE, mount={"datum": "front", "rim": {"shape": "circle", "diameter": 6.4}}))
     folders.write_geometry(made, tmp_path)()
-    proof = checks.verify(tmp_path, folders.nominal(made.scene, made.lens, made.goals), effort=quick_effort())
+    proof = checks.verify(tmp_path, checks.Nominal(made.scene, made.lens, made.goals), effort=quick_effort())
     bare = wavefront_error(made.scene.source, replace(made.lens, clear=None), made.scene.wavefront)
     cut = wavefront_error(made.scene.source, made.lens, made.scene.wavefront)
     assert proof.wavefront.flux == pytest.approx(cut.flux, abs=1e-4) and proof.wavefront.flux < 0.95 * bare.flux
@@ -102,7 +105,7 @@ def test_a_mounted_lens_is_measured_as_it_is_made(tmp_path):
 def test_waves_are_those_of_the_main_line():
     source = CHANGES["source"] | {"wavelength": [[633.0, 1.0], [520.0, 3.0], [450.0, 1.0]]}
     made = made_of(scene_of(**ONE, source=source))
-    heaviest = folders.nominal(made.scene, made.lens, made.goals).heaviest
+    heaviest = checks.Nominal(made.scene, made.lens, made.goals).heaviest
     assert heaviest.source == made.scene.source.central and heaviest.source.wavelength == 520.0
 
 
@@ -138,4 +141,4 @@ def test_a_scene_without_a_wave_has_nothing_of_it(small_design):
     assert [check["name"] for check in small_design.report["checks"] if "wavefront" in check["name"]] == []
     page = (small_design.folder / "report.html").read_text(encoding="utf-8")
     assert "Wavefront" not in page and not (small_design.folder / "figures" / "wavefront.png").exists()
-    assert folders.read_nominal(small_design.folder)[1].wave is None
+    assert folders.read_nominal(small_design.folder)[1].scene.wavefront is None
