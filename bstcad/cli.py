@@ -6,7 +6,6 @@ Exit codes: 0 every check passed, 1 lens written but a check failed, 2 wrong inp
 from __future__ import annotations
 
 import contextlib
-import errno
 import gc
 import glob
 import json
@@ -31,7 +30,7 @@ with signals.ending_at_once():  # from the first libraries on, a quarter of a se
     from rich.text import Text
 
     from bstcad.runs import files, processes, progress
-    from bstcad.runs.files import SentenceError
+    from bstcad.runs.files import SceneError, note, sentence_of
     from bstcad.step_text import beginning
 
 if TYPE_CHECKING:
@@ -44,24 +43,12 @@ INTERRUPTED, BROKEN = 130, 70  # exit codes: Ctrl-C; a fault of bstcad itself
 NOTHING_KEPT = "there was no lens yet, and nothing is kept"
 NOTHING_MORE = "nothing more is written"  # said by commands other than generate
 OFTEN, SELDOM = 1.0, 30.0  # seconds between two lines of progress of a sweep: on a terminal, in a file
-SITES = (
-    Path(__file__).parent / "site",
-    Path(__file__).parent.parent / "docs" / "_build" / "html",
-)  # of a wheel, of sources
 EXPORTS = ", ".join(files.EXPORTS)
-NO_MEMORY = (  # Python, torch, the system and the loader of libraries each say it in their own way
-    "not enough memory", "out of memory", "bad_alloc", "cannot allocate memory", "can't allocate memory",
-    "failed to map segment", "can't start new thread",
-)  # fmt: skip
 MEANT = {  # by words that are no commands
     **dict.fromkeys(("design", "make", "run", "build", "create", "optimise", "optimize"), "generate"),
     **dict.fromkeys(("check", "prove", "test", "report", "measure"), "verify"),
     **dict.fromkeys(("view", "draw", "render", "display"), "show"),
 }
-
-
-class InputError(SentenceError):
-    """Wrong arguments of a command."""
 
 
 class Stopped(Exception):
@@ -138,12 +125,12 @@ def engine() -> ModuleType:
 
 
 def path_meant(path: str | Path) -> Path:
-    """The path with ~ replaced, which no shell saw in -o=~/x; InputError for a name that libraries cannot take."""
+    """The path with ~ replaced, which no shell saw in -o=~/x; SceneError for a name that libraries cannot take."""
     path = Path(os.path.expanduser(path))
     try:
         str(Path(os.getcwd(), path)).encode()  # also of an absolute path: libraries fail without a working folder
     except UnicodeEncodeError:
-        raise InputError(f"{str(path)!r}: its name is no UTF-8 text; give a path whose name is") from None
+        raise SceneError(f"{str(path)!r}: its name is no UTF-8 text; give a path whose name is") from None
     return path
 
 
@@ -151,51 +138,45 @@ def design_folder(path: str | Path) -> Path:
     """The folder of a design, or a file."""
     path = path_meant(path)
     if not path.exists():
-        raise InputError(f"{path}: no such folder; give a design's folder, such as outputs/thu")
+        raise SceneError(f"{path}: no such folder; give a design's folder, such as outputs/thu")
     return path
 
 
 def load_scene(path: Path, settings: list[str] | None, quality: str | None = None) -> Scene:
     """The scene with the command line's changes."""
-    check_front(path, settings)
     from bstcad.scene.scene import load
 
-    overrides: dict[str, Any] = {}
+    return load(path, overrides(settings, quality))
+
+
+def overrides(settings: list[str] | None, quality: str | None) -> dict[str, Any]:
+    """The command line's changes of a scene, by key."""
+    found: dict[str, Any] = {}
     for setting in settings or []:
         key, equals, value = setting.partition("=")
         if not equals:
-            raise InputError(f"--set {setting}: has no value; write --set KEY=VALUE, such as --set target.pixels=128")
-        overrides[key.strip()] = value.strip()
-    if quality is not None:
-        overrides["tailoring.quality"] = quality
-    return load(path, overrides)
-
-
-def check_front(path: Path, settings: list[str] | None) -> None:
-    """Refuse a front's file that does not begin as STEP before libraries load; `load_scene` finds other faults."""
-    from bstcad.scene import dotted_keys, scene_file
-
-    try:
-        _, data = scene_file.read(path)
-        for key, _, value in (setting.partition("=") for setting in settings or []):
-            dotted_keys.override(data, key.strip(), scene_file.toml_value(value.strip()), key)
-        given = [file for _, file in dotted_keys.tables_at(data, "lens.front.file")]
-    except SentenceError:
-        return
-    for file in given:
-        if isinstance(file, str) and file.lower().endswith((".step", ".stp")):
-            beginning.check(path.parent / os.path.expanduser(file), "lens.front.file: ")
+            raise SceneError(f"--set {setting}: has no value; write --set KEY=VALUE, such as --set target.pixels=128")
+        found[key.strip()] = value.strip()
+    return found if quality is None else found | {"tailoring.quality": quality}
 
 
 def warn(scene: Scene, where: str = "") -> None:
     """Print the warnings of a scene on stderr; where: before each, where there are several scenes."""
     for warning in scene.warnings():
-        print(f"bstcad: warning: {where}{warning}", file=sys.stderr)
+        note_on_stderr(f"warning: {where}{warning}")
 
 
-def say_of_net(line: str) -> None:
-    """Print on stderr which net is chosen."""
+def note_on_stderr(line: str) -> None:
+    """Print a line on stderr: which net is chosen, how large a file will be, what a batch will do."""
     print(f"bstcad: {line}", file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def slow_progress() -> Iterator[progress.Report]:
+    """The progress of a sweep: a text that stays comes again after OFTEN seconds, or SELDOM into a file."""
+    terminal = Console(stderr=True)
+    with progress.watch(terminal) as watched:
+        yield progress.Throttled(watched, OFTEN if terminal.is_terminal else SELDOM)
 
 
 def words(names: str | None) -> list[str]:
@@ -211,11 +192,11 @@ def conclude(report: Contents | Examined, path: Path, verbose: bool) -> int:
     return 0 if report.passed else 1
 
 
-def say(summary: Any, path: Path) -> None:
-    """Print a summary and the path of the files.  Without a terminal, each paragraph is one line."""
+def say(summary: Any, where: object) -> None:
+    """Print a summary and where the files are.  Without a terminal, each paragraph is one line."""
     console = Console()
     console.print(summary, soft_wrap=not console.is_terminal)
-    console.print(f"Files: {path}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"Files: {where}", markup=False, highlight=False, soft_wrap=True)
 
 
 # --- arguments and options --------------------------------------------------------------------------------------------
@@ -237,7 +218,6 @@ def place(metavar: str, words: str, *names: str) -> Any:
 
 
 Version = option(bool, None, "Print the version and leave.", "--version", callback=_version, is_eager=True)
-# Of several commands.
 SceneFile = argument(Path, "SCENE", "The scene file (TOML); see templates/.", parser=path_meant)
 Folder = argument(Path, "DIR", "A design's folder.", parser=design_folder)
 Output = place("DIR", "Of the files (default: one in outputs/).", "--output", "-o")
@@ -246,11 +226,9 @@ Quality = option(str | None, "Q", "draft, standard, fine or paper: more time, le
 Verbose = option(bool, None, "List every check with its value and limit.", "--verbose")
 Workers = option(int | None, "N", "Spread the work over so many processes here.")
 Scheduler = option(str | None, "URL", "Spread the work over the workers of this dask scheduler.")
-# Of generate and plan.
 Device = option(str, "D", "auto (the CPU), cpu, or cuda: unmeasured yet.")
 Resume = option(bool, None, "Go on with the design that was stopped or killed in this folder.", "--resume")
 AsJson = option(bool, None, "For programs: the same as JSON.", "--json")
-# Of new.
 Name = argument(str | None, "NAME", "Of the scene; NAME.toml is written.")
 Picture = option(Path | None, "FILE", "The picture that a plate is to throw on a wall.")
 Light = option(str | None, "L", "That the plate is for: sun, laser, lamp or led (laser).")
@@ -258,16 +236,13 @@ Size = option(str | None, "MM", "Of the plate: 80, width x height, 80x60, or pho
 Distance = option(str | None, "MM", "To the wall (5 times the size; in the sun 2.5 times).")
 Template = option(str | None, "T", "Copy this template instead; see --list.")
 Listed = option(bool, None, "List the templates.", "--list")
-# Of app.
 Opened = argument(Path | None, "SCENE|DIR", "A scene file, a design's folder, or a folder of both.", parser=path_meant)
 Port = option(int, "N", "On loopback (0: a free one).", min=0, max=65535)
 Browser = option(bool, None, "Open the page in the browser.", "--browser/--no-browser")
-# Of verify.
 Written = argument(Path, "DIR|STEP", "A design's folder, or a STEP file by itself.", parser=design_folder)
 Measured = place("CLOUD", "Measured points of a made part, to judge it too.")
 PartReport = place("DIR", "Write that part's report there alone.", "--output", "-o")
 Against = option(str | None, "NAMES", "Have other programs trace it too: batoid, mitsuba, or batoid,mitsuba.")
-# Of tolerance, export and show.
 Grade = option(
     str | None, "G", "moulded, diamond-turned or precise, for all that the scene states no [\\[tolerance]] of."
 )
@@ -278,7 +253,6 @@ Kinds = option(str | None, "NAMES", f"{EXPORTS}, or several with commas between.
 Points = option(int | None, "N", "Points along the wider side of grids (default: control points; of zemax its knots).")
 Png = place("FILE", "A picture to write.", "--png", "-o")
 ReachPng = place("FILE", "Draw the target, and the part of it that light can reach; a second one into FILE_2.", "--png")
-# Of tradeoff, batch and keys.
 Budget = option(
     float, "S",
     "Seconds that all runs together may take, judging included, on however many machines: a run predicted not to fit "
@@ -305,7 +279,6 @@ def generate(
     device: Device = "auto", resume: Resume = False, verbose: Verbose = False,
 ) -> int:  # fmt: skip
     """Design a lens for a scene, write it, and verify the written files."""
-    check_front(scene, settings)
     with loading():
         processes.begin()  # it loads its libraries while this process loads others
         wanted = load_scene(scene, settings, quality)
@@ -313,9 +286,9 @@ def generate(
     files.check_free(folder)
     commands = engine()
     warn(wanted)
-    wanted = commands.settled(wanted, say_of_net)
+    wanted = commands.settled(wanted, note_on_stderr)
     if commands.folders.step_size(wanted) >= commands.folders.LARGE:
-        print(f"bstcad: {commands.folders.said_of_sizes(wanted)}", file=sys.stderr)
+        note_on_stderr(commands.folders.said_of_sizes(wanted))
     with progress.watch(Console(stderr=True)) as watched:
         report = commands.generate(wanted, folder, device=device, progress=watched, began=STARTED, resume=resume)
     print(*report.notes, sep="\n", end="\n" if report.notes else "")
@@ -342,7 +315,7 @@ def plan(scene: SceneFile, settings: Settings = None, as_json: AsJson = False, p
     warn(wanted)
     wanted, choice = with_net(wanted)
     if choice is not None:
-        say_of_net(choice.line)
+        note_on_stderr(choice.line)
     given = wanted, scene.read_text(encoding="utf-8-sig"), [setting.partition("=")[0] for setting in settings or []]
     drawn = () if png is None else reach_drawn(wanted)
     parts = planned(*given)
@@ -378,7 +351,7 @@ def new(
         print("\n".join(f"{key:{max(map(len, known))}}  {title}" for key, title in known.items()))
         return 0
     if name is None:
-        raise InputError("missing argument 'NAME'; give a name for the scene, or --list")
+        raise SceneError("missing argument 'NAME'; give a name for the scene, or --list")
     written = new_scene.new_scene(
         name, Path(), picture=picture, light=light, size=size, distance=distance, template=template
     )
@@ -395,7 +368,7 @@ def workbench(given: Opened = None, port: Port = 0, browser: Browser = True) -> 
         with loading():
             from bstcad.app import server
     except ImportError as error:
-        raise InputError(f"{error.name} is not installed; pip install 'bstcad[app]' brings it") from None
+        raise SceneError(f"{error.name} is not installed; pip install 'bstcad[app]' brings it") from None
     import webbrowser
 
     seen = sys.stdout.isatty() and browser
@@ -431,7 +404,7 @@ def tolerance(
 ) -> int:  # fmt: skip
     """Say how exactly a lens must be made, mounted and lit: sensitivities, trials, yield."""
     if wanted is not None and not 0 < wanted < 100:
-        raise InputError(f"--yield {wanted:g}: give the percent of lenses that are to pass, such as 90")
+        raise SceneError(f"--yield {wanted:g}: give the percent of lenses that are to pass, such as 90")
     commands = engine()
     from bstcad.report.tolerances import summary
     from bstcad.tolerance import tolerancing
@@ -455,7 +428,7 @@ def tolerance(
 def export(folder: Folder, kinds: Kinds = None, points: Points = None) -> int:
     """Write a lens for the shop: tables, Zemax's grid sag, a cloud for turning, the outline, previews, the sheet."""
     if kinds is None:
-        raise InputError(f"--as is missing; give what to write: {EXPORTS}")
+        raise SceneError(f"--as is missing; give what to write: {EXPORTS}")
     written = engine().export(folder, words(kinds), points)
     print(*written.notes, "Files: " + ", ".join(map(str, written.paths)), sep="\n")
     return 0
@@ -465,9 +438,7 @@ def export(folder: Folder, kinds: Kinds = None, points: Points = None) -> int:
 def show(folder: Folder, png: Png = None) -> int:
     """Show a lens at work: rays coloured by their flux, and the screen with its picture."""
     if png is not None and (png.suffix.lower() != ".png" or png.is_dir()):
-        raise InputError(f"--png {png}: is no name of a PNG; give one such as light.png")
-    if png is not None and not png.absolute().parent.is_dir():
-        raise InputError(f"--png {png}: there is no folder {png.parent}; make it first")
+        raise SceneError(f"--png {png}: is no name of a PNG; give one such as light.png")
     commands = engine()
     with contextlib.suppress(*([KeyboardInterrupt] if png is None else [])):  # one way to close a window
         commands.show(folder, png)
@@ -490,7 +461,7 @@ def tradeoff(
 ) -> int:  # fmt: skip
     """Show the price of accuracy in time: run a scene with one knob turned at a time; goes on where it was stopped."""
     if not 0 < budget < 1e7:
-        raise InputError(f"--budget {budget:g}: is not possible; give the seconds that the runs may take, such as 600")
+        raise SceneError(f"--budget {budget:g}: is not possible; give the seconds that the runs may take, such as 600")
     with loading():
         wanted = load_scene(scene, settings, quality)
         from bstcad.runs import cluster
@@ -499,21 +470,13 @@ def tradeoff(
 
     warn(wanted)
     folder = output or path_meant(Path("outputs") / f"{wanted.name}-tradeoff")
-    terminal = Console(stderr=True)
-    with cluster.asked_for(scheduler) as machines, progress.watch(terminal) as watched:
-        table = sweeping.tradeoff(
-            wanted, folder, budget=budget, progress=watched, pause=OFTEN if terminal.is_terminal else SELDOM,
-            machines=machines,
-        )  # fmt: skip
+    with cluster.asked_for(scheduler) as machines, slow_progress() as watched:
+        table = sweeping.tradeoff(wanted, folder, budget=budget, progress=watched, machines=machines)
     say(results.summary(table), folder)
     return 0 if table.lenses else 1
 
 
-@app.command(
-    epilog=examples(
-        "batch templates/disk.toml 'scenes/*.toml' -o outputs/many", "batch scenes/*.toml --quality draft --workers 2"
-    )
-)
+@app.command(epilog=examples("batch 'scenes/*.toml' -o many", "batch a.toml b.toml --quality draft --workers 2"))
 def batch(
     scenes: Scenes, output: Output = None, settings: Settings = None, quality: Quality = None, workers: Workers = None,
     scheduler: Scheduler = None, verbose: Verbose = False,
@@ -521,28 +484,18 @@ def batch(
     """Design many lenses, each into its own folder; those that are finished already are left as they are."""
     paths, folder = scene_paths(scenes), output or path_meant(Path("outputs"))
     if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file; give another folder with -o")
+        raise SceneError(f"{folder}: is a file; give another folder with -o")
     with loading():
-        from bstcad.report.report import check_lines
         from bstcad.runs import cluster
         from bstcad.sweep import batch as batches
 
         cluster.check(scheduler, workers)
-        wanted = [_wanted(path, settings, quality) for path in paths]
-    terminal = Console(stderr=True)
-    with cluster.asked_for(scheduler) as found, progress.watch(terminal) as watched:
-        rows = batches.batch(
-            wanted, folder, workers=workers, cluster=found, progress=watched,
-            pause=OFTEN if terminal.is_terminal else SELDOM,
-            say=lambda sentence: print(f"bstcad: {sentence}", file=sys.stderr),
-        )  # fmt: skip
-    console = Console()
-    console.print(batches.summary(rows), soft_wrap=not console.is_terminal)
-    for row in rows:
-        if row.checks_failed or (verbose and row.finished):
-            for line in check_lines(batches.checks(row, folder), verbose, f"{row.scene}: "):
-                console.print(line, soft_wrap=not console.is_terminal)
-    print(f"Files: {folder / 'batch.csv'}, batch.json; the report of each design: {folder}/NAME/report.html")
+        changes = overrides(settings, quality)
+        wanted = [_wanted(path, changes) for path in paths]
+    with cluster.asked_for(scheduler) as found, slow_progress() as watched:
+        rows = batches.batch(wanted, folder, workers=workers, cluster=found, progress=watched, say=note_on_stderr)
+    reports = f"the report of each design: {folder}/NAME/report.html"
+    say(batches.summary(rows, folder, verbose), f"{folder / 'batch.csv'}, batch.json; {reports}")
     return batches.exit_code(rows)
 
 
@@ -553,19 +506,19 @@ def scene_paths(patterns: list[str]) -> list[Path]:
         path = path_meant(Path(pattern))
         paths = [path] if path.exists() else [Path(name) for name in sorted(glob.glob(str(path), recursive=True))]
         if not paths and glob.has_magic(pattern):
-            raise InputError(f"{pattern}: no file is named so; give scene files, such as templates/*.toml")
+            raise SceneError(f"{pattern}: no file is named so; give scene files, such as templates/*.toml")
         for each in paths or [path]:
             found.setdefault(each.resolve(), each)
     return list(found.values())
 
 
-def _wanted(path: Path, settings: list[str] | None, quality: str | None) -> Wanted:
+def _wanted(path: Path, changes: dict[str, Any]) -> Wanted:
     """The scene of a file, or the sentence on its fault."""
-    from bstcad.scene.errors import SceneError
+    from bstcad.scene.scene import load
     from bstcad.sweep.batch import Wanted
 
     try:
-        scene = load_scene(path, settings, quality)
+        scene = load(path, changes)
     except (SceneError, OSError) as error:
         return Wanted(str(path), None, sentence_of(error))
     warn(scene, f"{path}: ")
@@ -581,22 +534,22 @@ def keys(key: KeyName = None) -> int:
     from bstcad.scene.errors import nearest
     from bstcad.scene.schema import rows
 
-    asked, names = re.sub(r"\[\d*\]", "", key or ""), [row.key.replace("[]", "") for row in rows()]
-    table = Table(*("key", "unit", "range", "default", "meaning"), box=None, pad_edge=False)
-    console = Console()
-    for row, name in zip(rows(), names, strict=True):
-        if not asked or f"{name}.".startswith(f"{asked}."):
-            meaning = f"{', '.join(row.kinds)}: {row.meaning}".removeprefix(": ")
-            cells = row.key, row.unit, row.range, row.default, meaning
-            table.add_row(*map(Text, cells))
-            if not console.is_terminal:
-                print("\t".join(cells))
-    if not table.rows:
-        parent = asked
+    asked = re.sub(r"\[\d*\]", "", key or "")
+    known = [(row.key.replace("[]", ""), row) for row in rows()]
+    chosen = [row for name, row in known if not asked or f"{name}.".startswith(f"{asked}.")]
+    if not chosen:
+        names, parent = {name for name, _ in known}, asked
         while parent and parent not in names:
             parent = parent.rpartition(".")[0]
-        known = sorted({name for name in names if name.rpartition(".")[0] == parent})
-        raise InputError(f"{key}: unknown key; {nearest(asked, known, 'the keys here are')}")
+        beside = sorted(name for name in names if name.rpartition(".")[0] == parent)
+        raise SceneError(f"{key}: unknown key; {nearest(asked, beside, 'the keys here are')}")
+    console, table = Console(), Table(*("key", "unit", "range", "default", "meaning"), box=None, pad_edge=False)
+    for row in chosen:
+        meaning = f"{', '.join(row.kinds)}: {row.meaning}".removeprefix(": ")
+        cells = row.key, row.unit, row.range, row.default, meaning
+        table.add_row(*map(Text, cells))
+        if not console.is_terminal:
+            print("\t".join(cells))
     if console.is_terminal:
         console.print(table)
     return 0
@@ -620,47 +573,33 @@ def schema() -> int:
 @app.command(epilog=examples("docs tutorials/first-lens", "docs check-rrmsd"))
 def docs(topic: Topic = None) -> int:
     """Open the documentation, complete without a network; of a check or a remark print its section."""
-    from bstcad.report import explained, manual
+    from bstcad.report import manual
 
-    topics = {name.partition("#")[2]: name for name in explained.sections()}
-    site = next((place for place in SITES if (place / "index.html").is_file()), None)
-    if topic in topics:
-        print(explained.read_in_a_terminal(topics[topic]))
-        if site is not None:
-            print(f"Documentation: {site / 'reference' / topics[topic].replace('#', '.html#')}")
-        return 0
-    name = manual.FIRST if topic is None else manual.name_of(topic)
-    if name is None:
+    topics = {name.partition("#")[2]: name for name in manual.sections()}
+    page = topics.get(topic) or (manual.FIRST if topic is None else manual.name_of(topic))
+    if page is None:
         from bstcad.scene.errors import nearest
 
         known = nearest(topic, [*topics, *manual.pages()], "known are")
-        raise InputError(f"{topic}: no page, check or remark is named so; {known}")
-    if site is None:
+        raise SceneError(f"{topic}: no page, check or remark is named so; {known}")
+    site = manual.site()
+    if topic in topics:
+        print(manual.section(page))
+        page = f"reference/{page}"
+    elif site is None:
         print("bstcad: the pages are not built here (make docs builds them); this is their text", file=sys.stderr)
-        _read(manual.first() if topic is None else manual.page(name))
-        return 0
-    print(f"Documentation: {site / name}.html")
-    if sys.stdout.isatty():
-        import webbrowser
+        manual.show(manual.first() if topic is None else manual.page(page))
+    if site is not None:
+        name, mark, label = page.partition("#")
+        print(f"Documentation: {site / name}.html{mark}{label}")
+        if sys.stdout.isatty() and not label:
+            import webbrowser
 
-        webbrowser.open((site / f"{name}.html").as_uri())
+            webbrowser.open((site / f"{name}.html").as_uri())
     return 0
 
 
-def _read(text: str) -> None:
-    """Show Markdown: rendered, in a pager, on a terminal; else as it is."""
-    from rich.markdown import Markdown
-
-    console = Console()
-    if not console.is_terminal:
-        print(text, end="")
-        return
-    os.environ.setdefault("LESS", "-R")  # this option has less show bold and colour
-    with console.pager(styles=True):
-        console.print(Markdown(text))
-
-
-# --- the program, and errors in one sentence --------------------------------------------------------------------------
+# --- the program ------------------------------------------------------------------------------------------------------
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -669,17 +608,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     code = run(arguments)
     processes.end()
     gc.freeze()  # the system takes the memory back; a last walk over millions of objects would take a second
-    if code >= 128:  # a signal: threads may still compute, for which Python would wait
-        leave_at_once(code)
-    sys.exit(code)
-
-
-def leave_at_once(code: int) -> None:
-    """End this process with an exit code, whatever its threads do."""
+    if code < 128:
+        sys.exit(code)
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):  # a terminal that is gone
             stream.flush()
-    os._exit(code)
+    os._exit(code)  # a signal: threads may still compute, for which Python would wait
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
@@ -706,41 +640,6 @@ def _say(sentence: str, code: int) -> int:
     with contextlib.suppress(OSError):  # a terminal that is gone
         print(f"bstcad: {sentence}", file=sys.stderr)
     return code
-
-
-def note(error: BaseException) -> str:
-    """The notes of an error, such as how to go on."""
-    return "; ".join(getattr(error, "__notes__", ()))
-
-
-def _command(error: BaseException) -> str:
-    """The command whose arguments typer refused."""
-    context = getattr(error, "ctx", None)
-    return f"bstcad {context.info_name}" if context and context.parent else "bstcad"
-
-
-def sentence_of(error: BaseException) -> str | None:
-    """The sentence for a user whose input is wrong; None if the error is not about the input."""
-    if hasattr(error, "format_message"):  # typer's own: an unknown option, a missing argument
-        text = error.format_message().splitlines()[0].rstrip(".").replace(". Did", "; did")
-        return text[:1].lower() + text[1:] + ("" if text.endswith("?") else f"; see {_command(error)} --help")
-    if isinstance(error, SentenceError):
-        return str(error)
-    by_words = isinstance(error, RuntimeError | ImportError) and any(words in str(error).lower() for words in NO_MEMORY)
-    if by_words or isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
-        return (
-            "the memory of this machine is too little for that; free some, or give fewer lens.back.control_points, "
-            "target.pixels or tailoring.rays"
-        )
-    if not isinstance(error, OSError):
-        return None
-    if not error.filename:
-        try:
-            os.getcwd()
-        except OSError:
-            return "the working folder was deleted; go to another one (cd) and try again"
-    where = f"{error.filename}: " if error.filename else ""
-    return f"{where}{error.strerror or error}; check that the path exists, may be written and has space left"
 
 
 if __name__ == "__main__":

@@ -299,7 +299,7 @@ def test_a_sweep_has_its_folder_budget_and_settings(monkeypatch, tmp_path, capsy
 
 def test_docs_explains_a_check_and_names_its_page(capsys, monkeypatch, tmp_path):
     (tmp_path / "index.html").write_text("built")
-    monkeypatch.setattr(cli, "SITES", (tmp_path / "none", tmp_path))
+    monkeypatch.setattr(manual, "SITES", (tmp_path / "none", tmp_path))
     assert cli.run(["docs", "check-rrmsd"]) == 0
     out = capsys.readouterr().out
     assert out.startswith("### ") and "accept.rrmsd" in out
@@ -314,7 +314,7 @@ def test_docs_explains_a_check_and_names_its_page(capsys, monkeypatch, tmp_path)
 
 def test_docs_without_built_pages_shows_their_text(capsys, monkeypatch, tmp_path):
     """From the sources; of a copy without them the pages of checks and remarks."""
-    monkeypatch.setattr(cli, "SITES", (tmp_path,))
+    monkeypatch.setattr(manual, "SITES", (tmp_path,))
     assert cli.run(["docs"]) == 0
     out, err = capsys.readouterr()
     assert out.startswith("# bstcad\n") and "make docs builds them" in err

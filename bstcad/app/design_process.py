@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from bstcad.runs import files, processes, signals
-from bstcad.runs.files import SentenceError
+from bstcad.runs.files import SentenceError, note
 
 JOB, SCENE, CLOUD = "job.json", "scene.toml", "cloud"  # a measured part's points, with the ending of their kind
 WORDS, LIGHT, STATE = "progress.jsonl", "light.png", "state.json"
@@ -36,6 +36,8 @@ SPREAD_POINTS = 16  # of a source of some size, that the picture is taken by
 class State:
     """How a run stands."""
 
+    __pydantic_config__ = {"extra": "forbid", "strict": True, "allow_inf_nan": False}  # of a file that is read
+
     state: str  # running | finished | stopped | refused | failed
     process: int = 0  # its number, while it runs
     began: float = 0.0  # seconds since 1970
@@ -44,21 +46,9 @@ class State:
     folder: str = ""  # the name of the folder that holds the lens, if there is one
     sentence: str = ""  # why it stopped, was refused or failed
 
-    def is_sound(self) -> bool:
-        """Has each field, read from a file, a value of its kind, which JSON can hold?"""
-        numbers = (self.began, *([] if self.rrmsd is None else [self.rrmsd]))
-        texts = (self.state, self.folder, self.sentence)
-        known = type(self.process) is int and (self.passed is None or isinstance(self.passed, bool))
-        return known and all(map(is_finite, numbers)) and all(isinstance(text, str) for text in texts)
-
     def put(self, run: Path) -> None:
         """Write it into a run's folder."""
         files.put(run / STATE, json.dumps(asdict(self)).encode())
-
-
-def is_finite(value: object) -> bool:
-    """Is a value of JSON a number that a page can take?"""
-    return type(value) in (int, float) and abs(value) < 1e300
 
 
 class Words:
@@ -142,13 +132,13 @@ def tolerance(job: Mapping[str, Any], place: Path, output: Path, resume: bool) -
 
 def tradeoff(job: Mapping[str, Any], place: Path, output: Path, resume: bool) -> State:
     """The price of accuracy in time, into the folder NAME-tradeoff beside the design; job: budget (s)."""
+    from bstcad.runs.progress import Throttled
     from bstcad.scene.scene import load
     from bstcad.sweep import tradeoff as sweeping
 
     folder = output.with_name(f"{output.name}-tradeoff")
-    found = sweeping.tradeoff(
-        load(output / SCENE), folder, budget=job["budget"], progress=Words(place / WORDS), pause=EACH
-    )
+    told = Throttled(Words(place / WORDS), EACH)
+    found = sweeping.tradeoff(load(output / SCENE), folder, budget=job["budget"], progress=told)
     return State("finished", passed=bool(found.lenses), folder=folder.name)
 
 
@@ -187,14 +177,14 @@ def main(folder: str, output: str, *options: str) -> int:
 
 def _ended(error: BaseException) -> State:
     """How a run ended that wrote no lens."""
-    note = "; ".join(getattr(error, "__notes__", ()))
+    said = note(error)
     if signals.ended() or isinstance(error, KeyboardInterrupt):
-        kept = "the design so far is kept" if "is kept" in note else "nothing is kept"
+        kept = "the design so far is kept" if "is kept" in said else "nothing is kept"
         return State("stopped", sentence=kept)
     if isinstance(error, SentenceError):
-        return State("refused", sentence="; ".join(filter(None, (str(error), note))))
+        return State("refused", sentence="; ".join(filter(None, (str(error), said))))
     words = f"{type(error).__name__}: {files.first_line(error)}"
-    return State("failed", sentence="; ".join(filter(None, (files.one_line(words), note))))
+    return State("failed", sentence="; ".join(filter(None, (files.one_line(words), said))))
 
 
 if __name__ == "__main__":

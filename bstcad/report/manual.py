@@ -1,32 +1,43 @@
 """The documentation as Markdown for a terminal, where bstcad came without built pages.
 
 A page is called by its path without ".md", such as "tutorials/first-lens"; what Sphinx alone understands is left out.
+
+checks.md and remarks.md beside this file have a section for each check and remark: a label "(check-rrmsd)=" of the id,
+a heading "###", a line of the sentences as they stand in a report, in which "…" stands for any text, and paragraphs.
 """
 
 from __future__ import annotations
 
+import os
 import re
 from functools import cache
 from pathlib import Path
 from posixpath import dirname, join, normpath
 
-from bstcad.report import explained
-
 PLACES = (Path(__file__).parents[1] / "manual", Path(__file__).parents[2] / "docs")  # in a wheel, in sources
+SITES = (Path(__file__).parents[1] / "site", Path(__file__).parents[2] / "docs/_build/html")  # of built pages, alike
 FIRST = "index"  # name of the first page
+PAGES = ("checks", "remarks")  # pages of sections, without ".md"
+SECTION = re.compile(r"^\(([\w-]+)\)=\n+(### .+?)(?=\n+^(?:\([\w-]+\)=$|#{1,2} )|\s*\Z)", re.M | re.S)
+TO_A_SECTION = re.compile(r"\[([^]]+)\]\((?:\w+\.md)?#([\w-]+)\)")
 DIRECTIVE = re.compile(r"^```\{.*?^```$\n?", re.M | re.S)
 CARD = re.compile(r"^:::\{grid-item-card\} ([^\n]+)\n:link: (\S+)\n:link-type: doc\n(.*?)^:::$\n?", re.M | re.S)
 LEFT_OUT = re.compile(r"^(?::{3,}.*|:[\w-]+: .*|\([\w-]+\)=)\n", re.M)
 LINK = re.compile(r"(?<!!)\[([^]]+)\]\((?!https?:)([^)#\s]*?)(?:\.md)?(?:#[\w-]+)?\)")
 
 
+def site() -> Path | None:
+    """The folder of the built pages; None where they are not built."""
+    return next((place for place in SITES if (place / f"{FIRST}.html").is_file()), None)
+
+
 @cache
 def pages() -> dict[str, Path]:
     """The files of all pages by their names; the pages of checks and remarks are always there."""
-    place = next((place for place in PLACES if (place / f"{FIRST}.md").is_file()), None)
-    paths = [] if place is None else [path for path in sorted(place.rglob("*.md")) if "_build" not in path.parts]
+    place = next((place for place in PLACES if (place / f"{FIRST}.md").is_file()), PLACES[-1])
+    paths = [path for path in sorted(place.rglob("*.md")) if "_build" not in path.parts]
     found = {path.relative_to(place).with_suffix("").as_posix(): path for path in paths if _title(path)}
-    return found | {f"reference/{page}": Path(explained.__file__).with_name(f"{page}.md") for page in explained.PAGES}
+    return found | {f"reference/{page}": Path(__file__).with_name(f"{page}.md") for page in PAGES}
 
 
 def name_of(topic: str) -> str | None:
@@ -52,6 +63,32 @@ def first() -> str:
     """The first page, and a list of all others."""
     others = "\n".join(f"- `bstcad docs {name}`: {_title(path)}" for name, path in pages().items() if name != FIRST)
     return "\n".join(([page(FIRST)] if FIRST in pages() else ["# bstcad\n"]) + ["## All pages\n", others, ""])
+
+
+@cache
+def sections() -> dict[str, str]:
+    """All sections, markdown from the heading on, by page and label: "checks#check-rrmsd"; in the pages' order."""
+    texts = {page: pages()[f"reference/{page}"].read_text(encoding="utf-8") for page in PAGES}
+    return {f"{page}#{label}": text for page, whole in texts.items() for label, text in SECTION.findall(whole)}
+
+
+def section(name: str) -> str:
+    """A section whose links to other sections are names for `bstcad docs`: "[check](checks.md#check-rrmsd)"."""
+    return TO_A_SECTION.sub(r"\1 (bstcad docs \2)", sections()[name])
+
+
+def show(text: str) -> None:
+    """Show Markdown: rendered, in a pager, on a terminal; else as it is."""
+    from rich.console import Console
+    from rich.markdown import Markdown
+
+    console = Console()
+    if not console.is_terminal:
+        print(text, end="")
+        return
+    os.environ.setdefault("LESS", "-R")  # this option has less show bold and colour
+    with console.pager(styles=True):
+        console.print(Markdown(text))
 
 
 def _card(found: re.Match[str]) -> str:

@@ -6,6 +6,7 @@ A folder that somebody sent may hold a pipe, a device, a terabyte of nothing or 
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import math
 import os
@@ -25,6 +26,10 @@ OURS = ("report.json", "lens.step", "scene.toml")  # files that only a design's 
 EXPORTS = ("sag", "points", "zemax", "turning", "dxf", "svg", "preview", "datasheet")
 LARGEST = 600_000_000  # bytes of an archive: a net of 2049 x 2049 and pictures of 4096 x 4096
 HEADER = 4096  # bytes of an array's header, and to spare
+NO_MEMORY = (  # Python, torch, the system and the loader of libraries each say it in their own way
+    "not enough memory", "out of memory", "bad_alloc", "cannot allocate memory", "can't allocate memory",
+    "failed to map segment", "can't start new thread",
+)  # fmt: skip
 
 
 # --- errors -----------------------------------------------------------------------------------------------------------
@@ -58,6 +63,41 @@ def _cut(text: str) -> str:
 def first_line(error: BaseException) -> str:
     """The first line of an error's text, to be quoted within a sentence."""
     return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+
+
+def note(error: BaseException) -> str:
+    """The notes of an error, such as how to go on."""
+    return "; ".join(getattr(error, "__notes__", ()))
+
+
+def _command(error: BaseException) -> str:
+    """The command whose arguments typer refused."""
+    context = getattr(error, "ctx", None)
+    return f"bstcad {context.info_name}" if context and context.parent else "bstcad"
+
+
+def sentence_of(error: BaseException) -> str | None:
+    """The sentence for a user whose input is wrong; None if the error is not about the input."""
+    if hasattr(error, "format_message"):  # typer's own: an unknown option, a missing argument
+        text = error.format_message().splitlines()[0].rstrip(".").replace(". Did", "; did")
+        return text[:1].lower() + text[1:] + ("" if text.endswith("?") else f"; see {_command(error)} --help")
+    if isinstance(error, SentenceError):
+        return str(error)
+    by_words = isinstance(error, RuntimeError | ImportError) and any(words in str(error).lower() for words in NO_MEMORY)
+    if by_words or isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
+        return (
+            "the memory of this machine is too little for that; free some, or give fewer lens.back.control_points, "
+            "target.pixels or tailoring.rays"
+        )
+    if not isinstance(error, OSError):
+        return None
+    if not error.filename:
+        try:
+            os.getcwd()
+        except OSError:
+            return "the working folder was deleted; go to another one (cd) and try again"
+    where = f"{error.filename}: " if error.filename else ""
+    return f"{where}{error.strerror or error}; check that the path exists, may be written and has space left"
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------

@@ -31,11 +31,8 @@ def fault(data: bytes) -> str | None:
     return None
 
 
-def check(path: Path, before: str = "") -> None:
-    """SceneError in one sentence unless a file begins as STEP; what is no file or cannot be read, others refuse.
-
-    before: the key of a scene that names the file, before the sentence.
-    """
+def check(path: Path) -> None:
+    """SceneError in one sentence unless a file begins as STEP; what is no file or cannot be read, others refuse."""
     try:
         if not stat.S_ISREG(path.stat().st_mode):
             return
@@ -44,4 +41,4 @@ def check(path: Path, before: str = "") -> None:
     except OSError:
         return
     if found is not None:
-        raise SceneError(f"{before}{path}: {found}")
+        raise SceneError(f"{path}: {found}")

@@ -22,11 +22,12 @@ import psutil
 import bstcad
 from bstcad import folder as folders
 from bstcad.pipeline import Saved, purpose
+from bstcad.report.report import check_lines
 from bstcad.runs import environment, files, processes
 from bstcad.runs.checkpoint import Keeper
 from bstcad.runs.cluster import Answer, Cluster, Machines
 from bstcad.runs.processes import Ending
-from bstcad.runs.progress import Report, Throttled
+from bstcad.runs.progress import Report
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene, load
 from bstcad.sweep import cold_run
@@ -136,7 +137,7 @@ def design_elsewhere(contents: Mapping[str, bytes]) -> tuple[Ending, dict[str, b
 
 def batch(
     wanted: Sequence[Wanted], folder: Path, *, workers: int | None = None, cluster: Cluster | None = None,
-    progress: Report = lambda *told: None, pause: float = 1.0, say: Callable[[str], None] = lambda sentence: None,
+    progress: Report = lambda *told: None, say: Callable[[str], None] = lambda sentence: None,
 ) -> list[Row]:  # fmt: skip
     """Design each scene into folder/NAME; a row for each, in their order.
 
@@ -161,7 +162,7 @@ def batch(
                 f"{f'; {done} finished before' if done else ''}"
             )
             try:
-                _design_all(rows, left, folder, machines, told=Throttled(progress, pause), others=others)
+                _design_all(rows, left, folder, machines, told=progress, others=others)
             except BaseException as error:
                 many = f"{sum(row.finished for row in rows)} of {len(rows)} designs are finished in {folder}"
                 error.add_note(f"{many}; the same command goes on from there")
@@ -195,7 +196,7 @@ def _outset(wanted: Sequence[Wanted], folder: Path, earlier: Sequence[Row]) -> I
 
 def _design_all(
     rows: list[Row], left: Mapping[int, Scene], folder: Path, machines: Machines, *,
-    told: Throttled, others: Sequence[Row],
+    told: Report, others: Sequence[Row],
 ) -> None:  # fmt: skip
     """Design the scenes that are left, put their rows in place, and write batch.json whenever a design has ended."""
     waiting, under_way, here = list(left), [], isinstance(machines, LocalPool)
@@ -280,11 +281,6 @@ def write(rows: Sequence[Row], folder: Path) -> None:
     cold_run.put_table(folder / "batch.csv", COLUMNS, (dict(row) | text for row, text in zip(rows, texts, strict=True)))
 
 
-def checks(row: Row, folder: Path) -> tuple[Check, ...]:
-    """The checks of the design that the batch's folder holds."""
-    return tuple(Check(**check) for check in _report(row, folder)["checks"])
-
-
 def _report(row: Row, folder: Path) -> dict[str, Any]:
     return json.loads((folder / row.name / "report.json").read_text(encoding="utf-8"))
 
@@ -296,15 +292,21 @@ def exit_code(rows: Sequence[Row]) -> int:
     return int(any(row.status == BROKEN or row.checks_failed for row in rows))
 
 
-def summary(rows: Sequence[Row]) -> Group:
-    """A line a design: its verdict, RRMSD and seconds, or why there is no lens."""
+def summary(rows: Sequence[Row], folder: Path, verbose: bool = False) -> Group:
+    """A line a design: its verdict, RRMSD and seconds, or why there is no lens; then the checks that failed.
+
+    verbose: all checks.
+    """
     from rich.console import Group
     from rich.text import Text
 
-    wide, lines = max(map(len, VERDICTS)), []
+    wide, lines, checked = max(map(len, VERDICTS)), [], []
     for row in rows:
         figures = f"RRMSD {row.rrmsd:.4f}  {row.seconds:5.0f} s  " if row.finished else ""
         reason = f": {row.reason}" if row.reason else ""
         status = f"{row.status.upper():{wide}}", STYLES.get(row.status, "bold red")
         lines.append(Text.assemble(status, f"  {figures}{row.scene}{reason}"))
-    return Group(*lines)
+        if row.checks_failed or (verbose and row.finished):
+            checks = [Check(**check) for check in _report(row, folder)["checks"]]
+            checked += check_lines(checks, verbose, f"{row.scene}: ")
+    return Group(*lines, *checked)

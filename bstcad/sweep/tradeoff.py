@@ -25,23 +25,12 @@ from bstcad.folder import SCENE, scene_files
 from bstcad.optics.sides import Sides, both, scaled
 from bstcad.runs import environment, files
 from bstcad.runs.cluster import Answer, Machines
-from bstcad.runs.progress import Report, Throttled
+from bstcad.runs.progress import Report
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import PRESETS
 from bstcad.scene.scene import Scene
 from bstcad.sweep import cold_run, results
-from bstcad.sweep.cold_run import (
-    FAILED,
-    NOT_RUN,
-    REFERENCE,
-    LocalPool,
-    Run,
-    Settings,
-    Stored,
-    Value,
-    as_text,
-    settings,
-)
+from bstcad.sweep.cold_run import LocalPool, Run, Settings, Stored, Value, as_text, settings
 from bstcad.sweep.net_choice import with_net
 from bstcad.sweep.prediction import STARTED, usual
 from bstcad.sweep.results import Calibration, Place, Preset, Table, TableKnob, front, halving
@@ -250,13 +239,12 @@ class RunFile(Stored):
 
 def tradeoff(
     scene: Scene, folder: Path, *, budget: float, progress: Report = lambda *told: None,
-    machines: Machines | None = None, effort: cold_run.Effort = REFERENCE, pause: float = 1.0,
+    machines: Machines | None = None, effort: cold_run.Effort = cold_run.REFERENCE,
 ) -> Table:  # fmt: skip
     """Run the most important runs that the budget allows, and write tradeoff.csv, .json, .png and .html.
 
-    machines: where the runs take place; None: here.  effort: of the reference that judges.  pause: seconds between two
-    calls of progress while its text stays.  The two tables are written after each run, so that they are there however
-    a sweep ends.
+    machines: where the runs take place; None: here.  effort: of the reference that judges.  The two tables are written
+    after each run, so that they are there however a sweep ends.
     """
     scene = scene.changed({"tailoring.accuracy": None, "tailoring.max_time": None})  # which end a design early
     base, _ = with_net(scene)
@@ -268,7 +256,7 @@ def tradeoff(
             place.mkdir(parents=True, exist_ok=True)
         for name, data in contents.items():
             files.put(folder / "scene" / name, data)
-        search = _Search(base, budget, folder, Throttled(progress, pause))
+        search = _Search(base, budget, folder, progress)
         try:
             search.run(machines, contents, effort)
         except BaseException as error:
@@ -340,7 +328,7 @@ class _Search:
 
     def _ended(self, answer: Answer) -> None:
         _, predicted = self._under_way.pop(answer.key)
-        failed = {"status": FAILED, "reason": answer.reason, "version": environment.version()}
+        failed = {"status": cold_run.FAILED, "reason": answer.reason, "version": environment.version()}
         run = answer.value or Run(settings=answer.key, **failed)
         self.runs[answer.key] = run.model_copy(update={"predicted_seconds": predicted, "where": answer.where})
         kept = (run for run in self.runs.values() if run.cost_seconds)  # others did not take place, and are tried again
@@ -350,7 +338,7 @@ class _Search:
     def table(self) -> Table:
         """The table of the runs so far, and of those that are left; it is written, too."""
         waiting = [
-            Run(settings=point, status=NOT_RUN, where="", predicted_seconds=self._predicted(point), **UNKNOWN)
+            Run(settings=point, status=cold_run.NOT_RUN, where="", predicted_seconds=self._predicted(point), **UNKNOWN)
             for point in self._order
             if point not in self.runs
         ]
@@ -433,7 +421,7 @@ def table(
         versions=of_all.versions if of_all else {},
         reference={
             "rays": sorted({run.rays for run in runs if run.rays}),
-            "what": JUDGE.format(REFERENCE.accuracy, _judged_on(scene)),
+            "what": JUDGE.format(cold_run.REFERENCE.accuracy, _judged_on(scene)),
         },
         calibration=Calibration(
             seconds=statistics.median(unit) if unit else None, lowest=min(unit, default=None),

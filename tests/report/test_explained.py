@@ -6,15 +6,19 @@ from pathlib import Path
 
 import pytest
 
-from bstcad.report import explained
-from bstcad.report.explained import PAGES, sections
+from bstcad.report import manual
+from bstcad.report.manual import PAGES, sections
 from bstcad.scene.schema import rows
 
-PACKAGE = Path(explained.__file__).parents[1]
+PACKAGE = Path(manual.__file__).parents[1]
 PARAGRAPHS = {
     "checks": ("**Measures**", "**Limit**", "**Why**", "**When it fails**"),
     "remarks": ("**Means**", "**Why**", "**What to do**"),
 }
+
+
+def _page(name):
+    return manual.pages()[f"reference/{name}"].read_text(encoding="utf-8")
 
 
 def ids(page):
@@ -59,7 +63,7 @@ def test_each_line_of_a_report_is_explained(small_design):
 @pytest.mark.parametrize("page", PAGES)
 class TestPages:
     def test_labels_are_short_and_of_one_section_each(self, page):
-        labels = re.findall(r"^\((.+)\)=$", explained._page(page), re.M)
+        labels = re.findall(r"^\((.+)\)=$", _page(page), re.M)
         assert len(labels) == len(set(labels)) > 20
         assert {f"{page}#{label}" for label in labels} <= sections().keys()  # none is overlooked
         kind = page.removesuffix("s")
@@ -74,14 +78,14 @@ class TestPages:
             assert all(paragraph.endswith(".") for paragraph in paragraphs), id
 
     def test_links_lead_to_sections(self, page):
-        links = re.findall(r"\]\((\w+)\.md#([\w-]+)\)", explained._page(page))
+        links = re.findall(r"\]\((\w+)\.md#([\w-]+)\)", _page(page))
         assert links and [link for link in links if "#".join(link) not in sections()] == []
 
 
 def test_keys_of_the_scene_are_known():
     known = {row.key.replace("[]", "") for row in rows()} | {"mount.flange", "lens.front", "lens.outline"}
     tables = {key.partition(".")[0] for key in known}
-    quoted = re.findall(r"`(\w+(?:\.\w+)+)(?: = [^`]*)?`", "".join(map(explained._page, PAGES)))
+    quoted = re.findall(r"`(\w+(?:\.\w+)+)(?: = [^`]*)?`", "".join(map(_page, PAGES)))
     files = ("step", "npz", "toml", "json", "html", "txt", "pdf", "csv", "stl", "xml")
     keys = [key for key in quoted if key.partition(".")[0] in tables and not key.endswith(files)]
     assert len(keys) > 50 and [key for key in keys if key not in known] == []

@@ -9,7 +9,6 @@ import sys
 import numpy as np
 import pytest
 
-from bstcad import cli
 from bstcad.runs.files import SceneError
 from bstcad.step_text import beginning, part21
 from tests.step_text.test_part21 import NET, SIMPLE, text
@@ -68,19 +67,3 @@ def test_verify_refuses_such_a_file_before_libraries_load(tmp_path):
     code = f"import sys\nfrom bstcad import cli\ncode = cli.run(['verify', sys.argv[1]])\n{LOADED}"
     done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "x.step")], capture_output=True, text=True)
     assert done.stdout == "2 []\n" and done.stderr.count("\n") == 1
-
-
-def test_a_front_of_such_a_file_is_refused_before_libraries_load(tmp_path):
-    (tmp_path / "x.step").write_bytes(b"solid x\n")
-    (tmp_path / "a.toml").write_text('lens.front = { kind = "bspline", file = "y.step" }')
-    arguments = "['generate', sys.argv[1], '--set', 'lens.front.file=x.step']"
-    code = f"import sys\nfrom bstcad import cli\ncode = cli.run({arguments})\n{LOADED}"
-    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.toml")], capture_output=True, text=True)
-    assert done.stdout == "2 []\n" and "bstcad: lens.front.file: " in done.stderr
-    assert "x.step: not a STEP file" in done.stderr and done.stderr.count("\n") == 1
-
-
-@pytest.mark.parametrize("scene", ["lens = 3", "lens.front.file = 3", "lens.front.file = 'gone.step'", "[["])
-def test_other_faults_of_a_scene_are_left_to_its_own_checks(tmp_path, scene):
-    (tmp_path / "a.toml").write_text(scene)
-    cli.check_front(tmp_path / "a.toml", ["lens.front.z=1", "no value"])
