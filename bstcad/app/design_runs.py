@@ -6,6 +6,7 @@ that starts finds runs that an earlier server began, whether they still run, end
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -19,8 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from bstcad import folder as folders
-from bstcad.app.design_process import JOB, JOBS, LIGHT, STATE, WORDS, State, is_finite
+from bstcad.app.design_process import JOB, JOBS, LIGHT, STATE, WORDS, State
 from bstcad.app.workspace import NAME
+from bstcad.report.record import of_json
 from bstcad.runs import files
 from bstcad.runs.processes import command_of
 from bstcad.scene.errors import SceneError
@@ -128,10 +130,9 @@ class Run:
 
     def _stated(self) -> State:
         try:
-            found = State(**json.loads(self.read(STATE)))
-        except (ValueError, TypeError, RecursionError):
+            return of_json(self.read(STATE), State)
+        except ValueError:
             return NONE
-        return found if found.is_sound() else NONE
 
     def read(self, name: str) -> bytes:
         """The bytes of a file of the run; b"" if there is none, or it lies outside of the folder of the designs."""
@@ -184,8 +185,8 @@ def _read(line: str) -> list[Any] | None:
         at, stage, done, total, text = json.loads(line)
     except (ValueError, TypeError, RecursionError):
         return None
-    known = all(map(is_finite, (at, done, total))) and isinstance(stage, str) and isinstance(text, str)
-    return [at, stage, done, total, text] if known else None
+    numbers = (type(value) in (int, float) and abs(value) < 1e300 for value in (at, done, total))  # for a page
+    return [at, stage, done, total, text] if all(numbers) and {type(stage), type(text)} == {str} else None
 
 
 def begin_design(scene: Scene, design: Path, text: str = "") -> Run:
@@ -204,19 +205,12 @@ def all_runs(designs: Path) -> list[Run]:
     found = []
     for kind in JOBS:
         for path in sorted(designs.glob(f".*.{kind}-run")) if designs.is_dir() else ():
-            name = path.name[1 : -len(f".{kind}-run")]
-            own = NAME.fullmatch(name) and _is_within(path / STATE, designs) and _is_within(designs / name, designs)
-            if own and (path / STATE).is_file():
-                found.append(Run(designs / name, kind))
+            run = Run(designs / path.name[1 : -len(f".{kind}-run")], kind)
+            with contextlib.suppress(ValueError):  # a link leads out of the folder
+                files.within(run.design, designs)
+                if NAME.fullmatch(run.design.name) and run.read(STATE):
+                    found.append(run)
     return found
-
-
-def _is_within(path: Path, folder: Path) -> bool:
-    try:
-        files.within(path, folder)
-    except ValueError:
-        return False
-    return True
 
 
 def end(runs: list[Run]) -> list[Run]:

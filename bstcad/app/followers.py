@@ -3,6 +3,8 @@
 A beam that fills the lens goes on filling it; a lens that is moved or made thicker keeps its distance to the wall; and
 light of another profile gets the width that this profile has.  With a closed lock, width and height keep their
 proportions.  Nothing follows a wrong entry.  In the text of a scene each key can still be set by itself.
+
+The choices of a form that a scene cannot have are found by trying them, each with the reason.
 """
 
 from __future__ import annotations
@@ -12,9 +14,10 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from bstcad.app.form import LOCKS
-from bstcad.app.kinds import extent, table_at
+from bstcad.app.form import LOCKS, form
+from bstcad.app.kinds import are_numbers, extent, table_at, value_at
 from bstcad.app.scene_text import changed, same, tables
+from bstcad.app.words import typed
 from bstcad.runs.files import SentenceError
 
 SHAPES = {"lens.outline": "source.aperture"}  # an outline, and the outline that follows where both are alike
@@ -24,6 +27,7 @@ WIDTHS = {  # the key that states the width of a profile, by the kind of source 
     ("point", "gaussian"): "half_angle_1e2",
     ("point", "uniform"): "half_angle",
 }
+SAFE = ("rotate", "fit", "seen_from", "sample")  # they change the picture alone, and reading a photo takes long
 
 
 def take_change(
@@ -35,11 +39,14 @@ def take_change(
     text of the scene, from which followers are computed, so that a wrong entry in between leaves no trace in them.
     """
     alone = changed(text, key, value)
-    before = tables(text if sound is None else sound)
-    for changes in (with_followers(before, key, value, locked=locked), _with_aperture(before, key, value)):
+    now = tables(text)
+    before = now if sound is None else tables(sound)
+    of_an_aperture = key == "lens.outline.shape" and table_at("source.aperture", before)  # it needs that shape, too
+    aperture = {"source.aperture.shape": value} if of_an_aperture else {}
+    for changes in (with_followers(before, key, value, locked=locked), aperture):
         others = {other: own for other, own in changes.items() if other != key}
-        if not others or not _untouched(before, tables(text), others):
-            continue
+        if not others or not all(same(value_at(other, before), value_at(other, now)) for other in others):
+            continue  # a key that would follow has another value than the latest valid scene
         try:
             together = alone
             for other, own in others.items():
@@ -47,7 +54,7 @@ def take_change(
         except SentenceError:
             continue
         if is_sound(together):
-            return together, tuple(other for other in others if not same(_at(tables(text), other), others[other]))
+            return together, tuple(other for other in others if not same(value_at(other, now), others[other]))
         if is_sound(alone):
             break
     return alone, ()
@@ -62,37 +69,26 @@ def with_followers(data: Mapping[str, Any], key: str, value: Any, locked: bool =
     for leader, follower in SHAPES.items():
         for each, own in [*changes.items()]:
             table, name = each.rpartition(".")[::2]
-            if table == leader and _at(data, leader) == _at(data, follower) is not None:
+            if table == leader and value_at(leader, data) == value_at(follower, data) is not None:
                 changes[f"{follower}.{name}"] = copy.deepcopy(own)
-    if key == MOVED and _number(value) and _number(before := _at(data, key)):
+    if key == MOVED and are_numbers(value) and are_numbers(before := value_at(key, data)):
         targets = data.get("target")
         names = [f"target[{k}].z" for k in range(len(targets))] if isinstance(targets, list) else ["target.z"]
-        changes |= {name: _rounded(z + value - before) for name in names if _number(z := _at(data, name))}
+        changes |= {name: _rounded(z + value - before) for name in names if are_numbers(z := value_at(name, data))}
     return changes | (_of_profile(data, value) if key == "source.profile" else {})
-
-
-def _untouched(before: Mapping[str, Any], now: Mapping[str, Any], keys: Mapping[str, Any]) -> bool:
-    """Do the keys have the values of the latest valid scene still?"""
-    return all(same(_at(before, key), _at(now, key)) for key in keys)
 
 
 def _locked(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
     """Return the other side of a table, in the ratio to this one that it has; {} where one of them has no length."""
     place, _, name = key.rpartition(".")
     other = f"{place}.{LOCKS.get(name, '')}"
-    was, its = _at(data, key), _at(data, other)
-    if _number(value) and _number(was) and _number(its) and was and value > 0:
+    was, its = value_at(key, data), value_at(other, data)
+    if are_numbers(value, was, its) and was and value > 0:
         return {other: _rounded(its * value / was)}
     if not (_is_range(value) and _is_range(was) and _is_range(its)):
         return {}
     ratio, middle = (value[1] - value[0]) / (was[1] - was[0]), (its[0] + its[1]) / 2
     return {other: [_rounded(middle + ratio * (end - middle)) for end in its]}
-
-
-def _with_aperture(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
-    """Return the changes where an outline of another shape needs an aperture of that shape, too."""
-    has_aperture = key == "lens.outline.shape" and table_at("source.aperture", dict(data))
-    return {key: value, "source.aperture.shape": value} if has_aperture else {key: value}
 
 
 def _of_profile(data: Mapping[str, Any], profile: Any) -> dict[str, Any]:
@@ -115,27 +111,46 @@ def _width(data: Mapping[str, Any], source: Mapping[str, Any], name: str) -> flo
         return None
     if name == "radius_1e2":
         return max(sizes) / 2
-    position, front = source.get("position"), _at(data, "lens.front.z")
+    position, front = source.get("position"), value_at("lens.front.z", data)
     start = position[-1] if isinstance(position, list) and position else 0.0
-    if not (_number(start) and _number(front)) or front == start:
+    if not are_numbers(start, front) or front == start:
         return None
     return round(math.degrees(math.atan(math.hypot(*sizes) / 2 / abs(front - start))), 1)
 
 
-def _at(data: Any, key: str) -> Any:
-    """Return the value of a dotted key; None if it is not there."""
-    place, _, name = key.rpartition(".")
-    return (table_at(place, data) if place else data).get(name)
-
-
-def _number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
-
-
 def _is_range(value: Any) -> bool:
-    return isinstance(value, list | tuple) and len(value) == 2 and all(map(_number, value)) and value[1] > value[0]
+    return isinstance(value, list | tuple) and len(value) == 2 and are_numbers(*value) and value[1] > value[0]
 
 
 def _rounded(value: float) -> float:
     """Return a number without the last digits of a sum."""
     return float(f"{value:.10g}")
+
+
+# ---- choices that a scene cannot have --------------------------------------------------------------------------------
+
+
+def impossible(text: str, fault: Callable[[str], str | None]) -> dict[str, dict[str, str]]:
+    """Return, by key and choice, why a valid scene would be refused with it; {} for a scene that is wrong itself.
+
+    fault: the sentence that refuses the scene of a text; None for a valid one.
+    """
+    if fault(text) is not None:
+        return {}
+    found: dict[str, dict[str, str]] = {}
+    for field in form(tables(text)).fields():
+        if field.control != "choice" or field.key.rpartition(".")[2] in SAFE:
+            continue
+        for choice in field.choices:
+            if choice != field.value and (why := _refusal(text, field.key, choice, fault)) is not None:
+                found.setdefault(field.key, {})[choice] = why
+    return found
+
+
+def _refusal(text: str, key: str, choice: str, fault: Callable[[str], str | None]) -> str | None:
+    """Return the sentence that refuses a scene with another choice; None: it is possible."""
+    try:
+        value = typed(key, choice, tables(text))
+        return fault(take_change(text, key, value, is_sound=lambda each: fault(each) is None)[0])
+    except SentenceError as refusal:
+        return str(refusal)

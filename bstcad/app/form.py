@@ -12,11 +12,14 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from bstcad.app.kinds import alternatives, choices, new_table, of_kinds, plain, records_at
 from bstcad.app.words import as_words, number
 from bstcad.scene.schema import TAGS, Node, records, rows, schema, tags
+
+if TYPE_CHECKING:
+    import jinja2
 
 FIRST: tuple[Mapping[str, str], ...] = (  # what most people change: a key and its words, of several the one that is set
     {
@@ -299,30 +302,33 @@ def slider(field: Field) -> Slider | None:
     return Slider(*(f"{each:.12g}" for each in (*ends, step, value)), middle)
 
 
-def html(form: Form, errors: Mapping[str, str]) -> str:
+def html(form: Form, errors: Mapping[str, str], has_docs: bool = True) -> str:
     """The form as HTML, to be put into a page: no script, no style, and a sentence of `errors` beside its key.
 
     A control has its key as data-key and name, a slider data-key alone.  A button has data-key, and as data-value the
     JSON of what `scene_text.changed` sets there; null takes it out.  A sentence on no key of the form is at the top.
+    has_docs: is the documentation there, to which sections lead?
     """
     known = [*(field.key for field in form.first), *(key for section in form.sections for key in _keys(section))]
     placed: dict[str, list[str]] = {}
     for key, sentence in errors.items():
         placed.setdefault(_nearest(key, known), []).append(sentence)
     wrong = [section for section in form.sections if _keys(section) & {*placed}]  # they are open
-    return _template().render(form=form, placed=placed, wrong=wrong, slider=slider)
+    template = environment().get_template("form.html.j2")
+    return template.render(form=form, placed=placed, wrong=wrong, slider=slider, has_docs=has_docs)
 
 
 @functools.cache
-def _template() -> Any:
+def environment() -> jinja2.Environment:
+    """The templates of this folder; all text is escaped, since names and scenes are a user's."""
     import jinja2
 
-    environment = jinja2.Environment(
+    found = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True, lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )  # fmt: skip
-    environment.filters |= {"id": html_id, "json": functools.partial(json.dumps, default=str)}
-    return environment.get_template("form.html.j2")
+    found.filters |= {"id": html_id, "json": functools.partial(json.dumps, default=str)}
+    return found
 
 
 def _keys(group: Group) -> set[str]:

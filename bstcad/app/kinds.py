@@ -47,11 +47,18 @@ def table_at(place: str, data: Any) -> dict[str, Any]:
     return data if isinstance(data, dict) else {}
 
 
+def value_at(key: str, data: Any) -> Any:
+    """The value of a dotted key of a scene's tables; None if it is not there."""
+    place, _, name = key.rpartition(".")
+    return (table_at(place, data) if place else data).get(name)
+
+
 def records_at(place: str, data: Table) -> list[Node]:
     """The records that the table at a dotted key may be; the kinds of the tables that hold it are as in `data`."""
     union, outer = [schema()], ""
     for name, number in STEP.findall(place):
-        union = [inner for record in of_kinds(union, table_at(outer, data)) for inner in _records(record, name)]
+        known = of_kinds(union, table_at(outer, data))
+        union = [inner for record in known for inner in records(record["properties"].get(name, {}))]
         outer = f"{outer}.{name}".lstrip(".") + (f"[{number}]" if number else "")
     return union
 
@@ -130,10 +137,6 @@ def _hashable(table: Table) -> dict[str, str]:
     return {name: value for name, value in table.items() if isinstance(value, str)}
 
 
-def _records(record: Node, name: str) -> list[Node]:
-    return records(record["properties"].get(name, {}))
-
-
 # ---- tables ----------------------------------------------------------------------------------------------------------
 
 
@@ -170,7 +173,9 @@ def new_table(key: str, data: Table) -> dict[str, Any]:
     name, others = plain(key), data.get(plain(key))
     others = [part for part in (others if isinstance(others, list) else [others]) if isinstance(part, dict)]
     if name == "target" and others:
-        return _next_target(others[-1], table_at("lens.back", data))
+        z, start = others[-1].get("z"), _z(data, "lens.back")
+        further = {"z": start + FURTHER * (z - start)} if are_numbers(z, start) else {}
+        return {**others[-1], **further}
     union = records_at(key, data)
     node: Node = node_at(key, data) or {}
     like = table_at(LIKE.get(name, ("", 0.0))[0], data)
@@ -179,14 +184,6 @@ def new_table(key: str, data: Table) -> dict[str, Any]:
     free = [kind for kind in shapes if not any(kind.items() <= _hashable(part).items() for part in others)]
     kind = next((each for each in (*wanted, *free) if each in shapes), shapes[0])
     return _completed(key, union[shapes.index(kind)], {}, data)
-
-
-def _next_target(target: Table, back: Table) -> dict[str, Any]:
-    """A target behind another one."""
-    z, start = (part.get("z") for part in (target, back))
-    if not all(isinstance(each, int | float) for each in (z, start)):
-        return dict(target)
-    return {**target, "z": start + FURTHER * (z - start)}
 
 
 def _completed(place: str, record: Node, kept: Table, data: Table) -> dict[str, Any]:
@@ -201,7 +198,7 @@ def _completed(place: str, record: Node, kept: Table, data: Table) -> dict[str, 
             table[name] = kept[name]
         elif name in needed and name not in table:
             table[name] = _made(f"{place}.{name}", node, data)
-        elif (made := STARTS.get(f"{place}.{name}", _nothing)(data)) is not None:
+        elif (start := STARTS.get(f"{place}.{name}")) and (made := start(data)) is not None:
             table[name] = made
     kind = "".join(tags(record).values())
     return BESIDES.get((plain(place), kind), {}) | table
@@ -233,55 +230,47 @@ MEASURES: Mapping[str, Callable[[tuple[float, float]], float]] = {  # of an outl
 def extent(table: Table) -> tuple[float, float] | None:
     """The extent of an outline, or of a target, along x and y."""
     ends = [table.get(axis) for axis in "xy"]
-    if all(isinstance(pair, list) and len(pair) == 2 and _numbers(*pair) for pair in ends):
+    if all(isinstance(pair, list) and len(pair) == 2 and are_numbers(*pair) for pair in ends):
         return ends[0][1] - ends[0][0], ends[1][1] - ends[1][0]
-    if _numbers(table.get("width"), table.get("height")):
+    if are_numbers(table.get("width"), table.get("height")):
         return table["width"], table["height"]
     for name, times in (("diameter", 1.0), ("radius", 2.0), ("radius_1e2", 2.0)):
-        if _numbers(table.get(name)):
+        if are_numbers(table.get(name)):
             return times * table[name], times * table[name]
     return None
 
 
-def _numbers(*values: Any) -> bool:
-    return all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
+def are_numbers(*values: Any) -> bool:
+    """Are they all numbers that a lens can have?"""
+    return all(type(value) in (int, float) and abs(value) < 1e300 for value in values)
 
 
-def _z(place: str, times: float = 1.0, more: float = 0.0) -> Callable[[Table], float | None]:
-    """z of a table, so many times and so much further."""
-
-    def found(data: Table) -> float | None:
-        z = table_at(place, data).get("z")
-        return times * z + more if _numbers(z) else None
-
-    return found
+def _z(data: Table, place: str, times: float = 1.0, more: float = 0.0) -> float | None:
+    """z of a table, so many times and so much further; None where it has none."""
+    z = table_at(place, data).get("z")
+    return times * z + more if are_numbers(z) else None
 
 
-def _focus(data: Table) -> list[float] | None:
-    z = _z("target", times=2.0)(data)
+def _on_axis(z: float | None) -> list[float] | None:
     return None if z is None else [0.0, 0.0, z]
 
 
 def _circle(data: Table) -> float | None:
-    """Of the holes of a flange, half way between lens and rim."""
+    """Diameter of the circle of a flange's holes, half way between lens and rim."""
     sizes = extent(table_at("lens.outline", data)), extent(table_at("mount.flange.outline", data))
     return None if None in sizes else (min(sizes[0]) + min(sizes[1])) / 2
 
 
-def _nothing(data: Table) -> None:
-    """Of a key that no table needs."""
-
-
 def _start(data: Table) -> float | None:
     """z where light has to start that does not come from z = 0, before the lens: to a mirror it comes from above."""
-    source, (front, back) = table_at("source", data), (table_at(f"lens.{face}", data) for face in ("front", "back"))
-    if not _numbers(front.get("z"), back.get("z")):
+    source, front, back = table_at("source", data), _z(data, "lens.front"), _z(data, "lens.back")
+    if front is None or back is None:
         return None
     if not is_mirror(data):
-        return None if front["z"] > 0 else front["z"] - FAR
+        return None if front > 0 else front - FAR
     before = source.get("z", source.get("position", [None])[-1:])
     before = before[0] if isinstance(before, list) and before else before
-    return before if _numbers(before) else back["z"] + FAR
+    return before if are_numbers(before) else back + FAR
 
 
 def is_mirror(data: Table) -> bool:
@@ -289,19 +278,13 @@ def is_mirror(data: Table) -> bool:
     return any(table_at(f"lens.{face}", data).get("reflect") is True for face in ("front", "back"))
 
 
-def _position(data: Table) -> list[float] | None:
-    z = _start(data)
-    return None if z is None else [0.0, 0.0, z]
-
-
-def _plane(data: Table) -> float | None:
-    return _start(data) if is_mirror(data) else None
-
-
-STARTS: Mapping[str, Callable[[Table], Any]] = {"source.position": _position, "source.z": _plane}
+STARTS: Mapping[str, Callable[[Table], Any]] = {  # where light starts, of sources that need it stated
+    "source.position": lambda data: _on_axis(_start(data)),
+    "source.z": lambda data: _start(data) if is_mirror(data) else None,
+}
 PLACES: Mapping[str, Callable[[Table], Any]] = {
-    "wavefront.z": _z("target"),
-    "wavefront.focus": _focus,
-    "mount.flange.z": _z("lens.front", more=0.5),
+    "wavefront.z": lambda data: _z(data, "target"),
+    "wavefront.focus": lambda data: _on_axis(_z(data, "target", times=2.0)),
+    "mount.flange.z": lambda data: _z(data, "lens.front", more=0.5),
     "mount.flange.screws.circle": _circle,
 }

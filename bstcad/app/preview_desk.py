@@ -11,14 +11,13 @@ import contextlib
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bstcad.app.preview import SETTLED, Outdated, Preview, preview
+from bstcad.app.preview import AT_ONCE, SETTLED, Outdated, preview
 from bstcad.runs import processes
-from bstcad.scene.errors import SceneError
 from bstcad.scene.new_scene import Plate
 from bstcad.scene.scene import Scene, of_text
 from bstcad.scene.scene_file import tables
@@ -134,27 +133,15 @@ class PreviewDesk:
     def _unanswered(self) -> list[Request]:
         return [request for request in self._requests.values() if not request.done]
 
-    def _outdated(self, request: Request) -> Callable[[], bool]:
-        """Is the request replaced, or has another one fewer answers?"""
-
-        def found() -> bool:
-            had = len(request.answers)
-            others = list(self._requests.values())
-            return request.replaced or self._ended or any(not o.done and len(o.answers) < had for o in others)
-
-        return found
-
     def _serve(self, request: Request) -> None:
         """Make the next answer of a request; left without, it is made again later if it is still wanted."""
         stage = STAGES[len(request.answers)]
         try:
-            found: Any = getattr(self, f"_{stage}")(request, self._outdated(request))
+            found = self._made(request, stage)
         except Outdated:
             request.plan = None
             return
-        except SceneError as refusal:
-            found = refusal
-        except Exception as fault:  # a preview that fails must not end the thread
+        except Exception as fault:  # a refusal, or a fault: a preview that fails must not end the thread
             found = fault
         processes.return_freed()  # sizes change from preview to preview: holes that nothing fits in would add up
         with self._news:
@@ -163,34 +150,30 @@ class PreviewDesk:
             request.answers += [(each, found) for each in (STAGES if failed else (stage,))]
             self._news.notify_all()
 
-    def _preview(self, request: Request, outdated: Callable[[], bool]) -> Preview:
-        return preview(request.scene, outdated=outdated)
+    def _made(self, request: Request, stage: str) -> Any:
+        """The answer of a stage: a preview, or entries of `plan --json`, behind the effects the `net` that is chosen.
 
-    def _settled(self, request: Request, outdated: Callable[[], bool]) -> Preview:
-        return preview(request.scene, pains=SETTLED, outdated=outdated)
+        Outdated once the request is replaced, or another one has fewer answers.
+        """
 
-    def _effects(self, request: Request, outdated: Callable[[], bool]) -> dict[str, Any]:
-        """The entries of `plan --json` on effects; `net`: which is chosen where the scene states none, in a line."""
-        return self._planned(request, outdated)
-
-    def _predicted(self, request: Request, outdated: Callable[[], bool]) -> dict[str, Any]:
-        """The entries of `plan --json` on predictions."""
-        if request.plan is None:
-            self._planned(request, outdated)
-        return next(request.plan)
-
-    def _planned(self, request: Request, outdated: Callable[[], bool]) -> dict[str, Any]:
-        """Begin the plan of a request: its first part."""
+        def outdated() -> bool:
+            had, others = len(request.answers), list(self._requests.values())
+            return request.replaced or self._ended or any(not o.done and len(o.answers) < had for o in others)
 
         def tick() -> None:
             if outdated():
                 raise Outdated
 
-        tick()
-        scene, choice = with_net(request.scene)
-        tick()
-        request.plan = plan(scene, request.text, tick=tick)
-        return next(request.plan) | {"net": None if choice is None else choice.line}
+        if stage in ("preview", "settled"):
+            return preview(request.scene, AT_ONCE if stage == "preview" else SETTLED, outdated)
+        effects = None
+        if request.plan is None:  # or its work was given up
+            tick()
+            scene, choice = with_net(request.scene)
+            tick()
+            request.plan = plan(scene, request.text, tick=tick)
+            effects = next(request.plan) | {"net": None if choice is None else choice.line}
+        return effects if stage == "effects" else next(request.plan)
 
 
 def first_scene() -> Scene:

@@ -11,7 +11,7 @@ from bstcad.report.figure_jobs import light_path_of
 from bstcad.report.light_figures import View
 from bstcad.report.record import LEFT_OUT, LeftOut, changes
 from bstcad.report.rendering import data_url, turnable
-from bstcad.report.units import duration, number, percent, quantity
+from bstcad.report.units import Rows, duration, number, quantity, tables
 from bstcad.sweep.prediction import Interval
 
 CELLS = 96  # of the lens to be turned, a side
@@ -19,10 +19,6 @@ CELLS = 96  # of the lens to be turned, a side
 # templates: of a back that is lit up to its rim (0.007), and of one dark in places (0.43), where it bends on.
 SPREAD, DARK_SPREAD = 0.03, 0.45
 LIT = 0.99  # share of the back that light passes, from which on it counts as lit up to its rim
-# Both follow the number of control points, of which a preview has few: a plate had a smallest radius of 7.9 mm in the
-# quick preview, of 2.6 mm in the settled one, and of 1.1 mm as a draft.
-OF_DESIGN = "known once the lens is designed: more control points bend it more sharply"
-ASTRAY = 0.002  # of the light; a line of the ledger with less is not told
 
 
 def of_preview(found: Preview) -> dict[str, Any]:
@@ -46,27 +42,11 @@ def of_preview(found: Preview) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def figures(found: Preview) -> list[list[str]]:
-    """[name, value] of the light and the shape of a lens."""
-    shape, optic = found.shape, found.scene.optic
-    astray = [
-        f"{line.replace('the lens', f'the {optic}')} {percent(part)}"
-        for line, part in found.flux.items()
-        if line != "on target" and part > ASTRAY
-    ]
-    apart = f"± {quantity((SPREAD if found.lit >= LIT else DARK_SPREAD) * shape['sag_pv'], 'mm')}"
-    rows = [
-        ["Light on the target", f"{percent(found.flux['on target'])} of the source's"],
-        ["Lost", ", ".join(astray) or "hardly any"],
-        ["Thickness on the axis", quantity(shape["centre_thickness"], "mm")],
-        [
-            "Thinnest and thickest",
-            f"{quantity(shape['thickness_min'], 'mm')}, {quantity(shape['thickness_max'], 'mm')}, each {apart}",
-        ],
-        ["Relief of the back", f"{quantity(shape['sag_pv'], 'mm')} {apart}"],
-        ["Smallest radius, steepest slope", OF_DESIGN],
-    ]
-    return rows
+def figures(found: Preview) -> Rows:
+    """(name, value) of the light and the shape of a lens."""
+    apart, optic = SPREAD if found.lit >= LIT else DARK_SPREAD, found.scene.optic
+    shown = tables("preview_figures.txt.j2", flux=found.flux, shape=found.shape, optic=optic, apart=apart)
+    return shown["figures"]
 
 
 def of_plan(plan: Mapping[str, Any]) -> dict[str, Any]:

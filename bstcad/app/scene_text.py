@@ -21,14 +21,14 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT, Item, Table
 
-from bstcad.app.kinds import STEP, cast, node_at, of_kind, table_at
+from bstcad.app.kinds import STEP, cast, node_at, of_kind, records_at, table_at
 from bstcad.app.words import as_words as as_words
 from bstcad.app.words import braced, quoted
 from bstcad.app.words import shown as shown
 from bstcad.app.words import typed as typed
 from bstcad.scene import scene_file
 from bstcad.scene.errors import SceneError
-from bstcad.scene.schema import TAGS, Node, records, schema
+from bstcad.scene.schema import TAGS, schema
 
 ALIGNED = 2  # spaces before a comment: where there are more, comments stand in a column, which is kept
 
@@ -406,9 +406,6 @@ def _has_header(path: Steps, value: Any) -> bool:
 
 def _rank(path: Steps) -> int:
     """The place of a key among those that its table may have: its kind comes first, then all in the schema's order."""
-    union: list[Node] = [schema()]
-    for step in path[:-1]:
-        if isinstance(step, str):
-            union = [inner for record in union for inner in records(record["properties"].get(step, {}))]
+    union = records_at(".".join(step for step in path[:-1] if isinstance(step, str)), {})
     names = [*TAGS, *(name for record in union for name in record["properties"])]
     return names.index(path[-1]) if path[-1] in names else len(names)

@@ -6,22 +6,17 @@ Nothing of a scene lives here alone: texts lie in the workspace, runs in their f
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import re
 import secrets
 import signal
-import socket
 import sys
 import traceback
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
-import jinja2
-import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect, Request
@@ -32,13 +27,12 @@ from starlette.staticfiles import StaticFiles
 import bstcad
 from bstcad import folder as folders
 from bstcad.app import crop, design_runs, form, preview_json, scene_text, sketch
-from bstcad.app.choices import impossible
-from bstcad.app.connections import HeadersInTime
+from bstcad.app.connections import bound, uvicorn_server
 from bstcad.app.design_runs import WRITTEN, Run
-from bstcad.app.followers import take_change
+from bstcad.app.followers import impossible, take_change
 from bstcad.app.guard import POLICY, SANDBOX, Guard
 from bstcad.app.preview_desk import STAGES, PreviewDesk
-from bstcad.app.preview_desk import Request as Asked
+from bstcad.app.preview_desk import Request as PreviewRequest
 from bstcad.app.workspace import LARGEST_UPLOAD, Workspace
 from bstcad.report import manual, record
 from bstcad.report.light_figures import View, dark_triptych
@@ -51,13 +45,11 @@ from bstcad.scene.picture import SAMPLES
 from bstcad.scene.scene_file import DOTS
 from bstcad.scene.schema import rows
 
+Asked = Mapping[str, Any]  # table of JSON that a page sends
 PATIENCE = 20.0  # seconds that an answer is waited for; then the page asks again
 UPLOAD = "/api/picture"
 LARGER = rf"{UPLOAD}|/api/design/[^/]+/measured"  # where more may be sent
-STATIC, SITES = (
-    Path(__file__).parent / "static",
-    (Path(__file__).parents[1] / "site", Path(__file__).parents[2] / "docs/_build/html"),
-)
+STATIC = Path(__file__).parent / "static"
 SHOWN = {".html": "text/html", ".json": "application/json", ".png": "image/png", ".pdf": "application/pdf"}
 RRMSD = (
     "RRMSD states how far the light is from the picture: the root mean square of the difference, over that of the "
@@ -65,7 +57,8 @@ RRMSD = (
 )
 KEYS_PAGE = "reference/scene-keys"  # page of the documentation that is made of the schema
 MOST_SOUND = 31  # scenes, besides the latest, whose latest valid text is kept
-SLOWEST = 1  # seconds that open requests have when the server ends
+# Files that people come for, which a list begins with.
+FIRST_FILES = ("lens.step", "part.step", "report.html", "datasheet.pdf", "lens.stl", "lens.3mf")
 CLOUDS = ((b"ply", ".ply"), (b"solid", ".stl"))  # how files of measured points begin
 
 
@@ -76,48 +69,48 @@ class Workbench:
         self.workspace, self.desk = workspace, PreviewDesk()
         self.started: list[Run] = []  # by this server
         self._sound: dict[str, str] = {}  # the latest valid text of each scene of late, from which keys follow
-        self._pages = jinja2.Environment(
-            loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True,
-            lstrip_blocks=True, undefined=jinja2.StrictUndefined,
-        )  # fmt: skip
         scene, design = "/api/scene/{name}", "/api/design/{name}"
-        routes = [
-            Route("/", self.start_page),
-            Route("/scene/{name}", self.scene_page),
-            Route("/design/{name}", self.design_page),
-            Route("/compare", self.compare_page),
-            Route("/solid_view.js", lambda request: FileResponse(VIEWER, media_type="text/javascript")),
-            Route("/api/scenes", self.add_scene, methods=["POST"]),
-            Route(UPLOAD, self.keep_picture, methods=["POST"]),
-            Route(scene, self.scene_state),
-            Route(f"{scene}/change", self.change_scene, methods=["POST"]),
-            Route(f"{scene}/photo.png", self.photo),
-            Route(f"{scene}/proportions", self.take_proportions, methods=["POST"]),
-            Route(f"{scene}/impossible", self.impossible_choices),
-            Route(f"{scene}/save", self.save_scene, methods=["POST"]),
-            Route(f"{scene}/drop", self.drop_changes, methods=["POST"]),
-            Route(f"{scene}/preview", self.preview, methods=["POST"]),
-            Route(f"{scene}/answer", self.answer),
-            Route(f"{scene}/make", self.make, methods=["POST"]),
-            Route(f"{design}/run", self.follow),
-            Route(f"{design}/light.png", self.light),
-            Route(f"{design}/irradiance-dark.png", self.dark_figure),
-            Route(f"{design}/stop", self.stop, methods=["POST"]),
-            Route(f"{design}/go-on", self.go_on, methods=["POST"]),
-            Route(f"{design}/edit", self.edit, methods=["POST"]),
-            Route(f"{design}/tolerance", self.tolerance, methods=["POST"]),
-            Route(f"{design}/tradeoff", self.tradeoff, methods=["POST"]),
-            Route(f"{design}/measured", self.measured, methods=["POST"]),
-            Route("/design/{name}/all.zip", self.all_files),
-            Route("/design/{name}/files/{path:path}", self.one_file),
-        ]
+        looked_at = {
+            "/": self.start_page,
+            "/scene/{name}": self.scene_page,
+            "/design/{name}": self.design_page,
+            "/compare": self.compare_page,
+            "/solid_view.js": lambda request: FileResponse(VIEWER, media_type="text/javascript"),
+            scene: self.scene_state,
+            f"{scene}/photo.png": self.photo,
+            f"{scene}/impossible": self.impossible_choices,
+            f"{scene}/answer": self.answer,
+            f"{design}/run": self.follow,
+            f"{design}/light.png": self.light,
+            f"{design}/irradiance-dark.png": self.dark_figure,
+            "/design/{name}/all.zip": self.all_files,
+            "/design/{name}/files/{path:path}": self.one_file,
+        }
+        sent = {
+            UPLOAD: self.keep_picture,
+            f"{scene}/drop": self.drop_changes,
+            f"{design}/stop": self.stop,
+            f"{design}/go-on": self.go_on,
+            f"{design}/edit": self.edit,
+            f"{design}/measured": self.measured,
+            "/api/scenes": _of_json(self.add_scene),
+            f"{scene}/change": _of_json(self.change_scene),
+            f"{scene}/proportions": _of_json(self.take_proportions),
+            f"{scene}/save": _of_json(self.save_scene),
+            f"{scene}/preview": _of_json(self.preview),
+            f"{scene}/make": _of_json(self.make),
+            f"{design}/tolerance": _of_json(self.tolerance),
+            f"{design}/tradeoff": _of_json(self.tradeoff),
+        }
+        routes = [Route(path, answer) for path, answer in looked_at.items()]
+        routes += [Route(path, answer, methods=["POST"]) for path, answer in sent.items()]
         handlers = {
             SentenceError: self._refused, OSError: self._unusable, ClientDisconnect: self._broken_off,
             Exception: self._failed, 404: self._no_page,
         }  # fmt: skip
         self.app = Starlette(routes=routes, exception_handlers=handlers)
         self.app.mount("/static", StaticFiles(directory=STATIC))
-        site = next((place for place in SITES if (place / "index.html").is_file()), None)
+        site = manual.site()
         self.has_docs = site is not None or manual.FIRST in manual.pages()
         if site is not None:
             self.app.mount("/docs", _Site(directory=site, html=True))
@@ -175,7 +168,7 @@ class Workbench:
 
     def _page(self, template: str, status: int = 200, **values: Any) -> HTMLResponse:
         common = {"version": bstcad.__version__, "has_docs": self.has_docs, "rrmsd_words": RRMSD}
-        return HTMLResponse(self._pages.get_template(template).render(**common, **values), status_code=status)
+        return HTMLResponse(form.environment().get_template(template).render(**common, **values), status_code=status)
 
     # ---- pages ----
 
@@ -224,8 +217,9 @@ class Workbench:
         if known is None and run.state.state == "none":
             raise SceneError(f"{name}: there is no such design; choose one of the list")
         names = self.workspace.file_names(name) if folder.is_dir() else []
+        names.sort(key=lambda each: FIRST_FILES.index(each) if each in FIRST_FILES else len(FIRST_FILES))
         return self._page(
-            "design.html.j2", title=name, name=name, report=known, files=_sorted(names),
+            "design.html.j2", title=name, name=name, report=known, files=names,
             rrmsd=record.rrmsds(known) if known else "", doubts=doubts(known) if known else (), run=self._news(run),
             jobs={kind: self._news(Run(folder, kind)) for kind in ("tolerance", "tradeoff", "measured")},
             has_light="figures/irradiance.png" in names,
@@ -244,15 +238,13 @@ class Workbench:
 
     # ---- scenes ----
 
-    async def add_scene(self, request: Request) -> Response:
+    def add_scene(self, _: str, asked: Asked) -> dict[str, Any]:
         """A new scene file: {light, size as of `bstcad new`, and picture, sample or text} or {template}."""
-        asked = await _json(request)
         known = {key: str(asked[key]) for key in ("sample", "text", "template") if asked.get(key)}
         image = str(asked["picture"]) if asked.get("picture") else None
         light = str(asked.get("light") or next(iter(new_scene.LIGHTS)))
         size = str(asked["size"])[:40] if asked.get("size") and "template" not in known else None
-        name = await run_in_threadpool(lambda: self.workspace.add(light, image=image, size=size, **known))
-        return JSONResponse({"name": name})
+        return {"name": self.workspace.add(light, image=image, size=size, **known)}
 
     async def keep_picture(self, request: Request) -> Response:
         """Keep an uploaded picture, the body of the request; its name here."""
@@ -272,20 +264,17 @@ class Workbench:
         try:
             data = scene_text.tables(opened.text)
         except SceneError as fault:
-            return told | {"form": None, "error": {"key": "", "sentence": str(fault), "line": _line(str(fault))}}
+            at = re.search(r"at line (\d+)", str(fault))
+            error = {"key": "", "sentence": str(fault), "line": int(at[1]) if at else None}
+            return told | {"form": None, "error": error}
         error = self._fault(name, opened.text)
         if error is None:
             self._sound = {**dict([*self._sound.items()][-MOST_SOUND:]), name: opened.text}
         shown = form.form(data)
         told["design"] = data.get("name") if isinstance(data.get("name"), str) else name
         errors = {error["key"]: error["sentence"]} if error else {}
-        return told | {"form": self._linked(form.html(shown, errors)), "error": error, "sketch": sketch.svg(data)}
-
-    def _linked(self, html: str) -> str:
-        """The form's links to the documentation as the server has it; without it none."""
-        if self.has_docs:
-            return html.replace('<a href="reference/', '<a target="_blank" rel="noopener" href="/docs/reference/')
-        return re.sub(r'<p><a href="reference/[^<]*</a></p>', "", html)
+        page = form.html(shown, errors, self.has_docs)
+        return told | {"form": page, "error": error, "sketch": sketch.svg(data)}
 
     def _fault(self, name: str, text: str) -> dict[str, Any] | None:
         """The fault of a scene: its key, the sentence of the terminal, and the line."""
@@ -297,39 +286,31 @@ class Workbench:
             return {"key": key, "sentence": sentence, "line": line_of(key, toml_positions(text))}
         return None
 
-    async def change_scene(self, request: Request) -> Response:
+    def change_scene(self, name: str, asked: Asked) -> dict[str, Any]:
         """Another text, {text}, or another value as a person typed it, {key, words}; {key, value} as JSON has it.
 
         {locked: true}: the other side of a target or a lens keeps its ratio to the one that is changed.  The answer's
         `followed` names the keys that changed besides.
         """
-        asked, name = await _json(request), request.path_params["name"]
-        followed: tuple[str, ...] = ()
+        followed: list[str] = []
 
         def with_value(text: str) -> str:
-            nonlocal followed
-            text, followed = self._with_value(name, text, asked)
+            key, data = str(_given(asked, "key")), scene_text.tables(text)
+            if key.count(".") > DOTS:
+                raise SceneError(f"{key[:20]}…: is no key of a scene; reload the page")
+            value = asked["value"] if "value" in asked else scene_text.typed(key, str(_given(asked, "words")), data)
+            text, others = take_change(
+                text, key, value, is_sound=lambda each: self._fault(name, each) is None, sound=self._sound.get(name),
+                locked=asked.get("locked") is True,
+            )  # fmt: skip
+            followed.extend(others)
             return text
 
-        def changed() -> dict[str, Any]:
-            if "text" in asked:
-                self.workspace.change(name, str(asked["text"]).replace("\r\n", "\n"))
-            else:
-                self.workspace.edit(name, with_value)
-            return self._state(name) | {"followed": followed}
-
-        return JSONResponse(await run_in_threadpool(changed))
-
-    def _with_value(self, name: str, text: str, asked: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
-        """Return the text of a scene with another value, and the keys that followed."""
-        key, data = str(_given(asked, "key")), scene_text.tables(text)
-        if key.count(".") > DOTS:
-            raise SceneError(f"{key[:20]}…: is no key of a scene; reload the page")
-        value = asked["value"] if "value" in asked else scene_text.typed(key, str(_given(asked, "words")), data)
-        return take_change(
-            text, key, value, is_sound=lambda each: self._fault(name, each) is None, sound=self._sound.get(name),
-            locked=asked.get("locked") is True,
-        )  # fmt: skip
+        if "text" in asked:
+            self.workspace.change(name, str(asked["text"]).replace("\r\n", "\n"))
+        else:
+            self.workspace.edit(name, with_value)
+        return self._state(name) | {"followed": followed}
 
     def photo(self, request: Request) -> Response:
         """The photo of a target, ?key, whole and small: a frame is dragged over it."""
@@ -337,9 +318,9 @@ class Workbench:
         scene = self.workspace.scene(name, self.workspace.opened(name).text)
         return Response(crop.small_photo(crop.target_of(scene, key)), media_type="image/png")
 
-    async def take_proportions(self, request: Request) -> Response:
+    def take_proportions(self, name: str, asked: Asked) -> dict[str, Any]:
         """Give plate and picture the proportions of a target's photo: {key of the target}."""
-        key, name = str((await _json(request)).get("key") or "target"), request.path_params["name"]
+        key = str(asked.get("key") or "target")
 
         def with_proportions(text: str) -> str:
             target = crop.target_of(self.workspace.scene(name, text), key)
@@ -347,11 +328,8 @@ class Workbench:
                 text = scene_text.changed(text, other, value)
             return text
 
-        def changed() -> dict[str, Any]:
-            self.workspace.edit(name, with_proportions)
-            return self._state(name)
-
-        return JSONResponse(await run_in_threadpool(changed))
+        self.workspace.edit(name, with_proportions)
+        return self._state(name)
 
     def impossible_choices(self, request: Request) -> Response:
         """The choices of the form that this scene cannot have: {key: {choice: why}}."""
@@ -359,11 +337,10 @@ class Workbench:
         text = self.workspace.opened(name).text
         return JSONResponse(impossible(text, lambda each: (self._fault(name, each) or {}).get("sentence")))
 
-    async def save_scene(self, request: Request) -> Response:
+    def save_scene(self, name: str, asked: Asked) -> dict[str, Any]:
         """Put the text into the scene file; {anyway: true} over another program's."""
-        asked, name = await _json(request), request.path_params["name"]
         self.workspace.save(name, anyway=bool(asked.get("anyway")))
-        return JSONResponse(await run_in_threadpool(self._state, name))
+        return self._state(name)
 
     def drop_changes(self, request: Request) -> Response:
         """Forget the changes that are not saved."""
@@ -372,29 +349,24 @@ class Workbench:
 
     # ---- previews ----
 
-    async def preview(self, request: Request) -> Response:
+    def preview(self, name: str, asked: Asked) -> dict[str, Any]:
         """The preview of the scene as it is: {page, number}.  {replaced: true} where the page asked again meanwhile."""
-        asked, name = await _json(request), request.path_params["name"]
         text = self.workspace.opened(name).text
+        page, number = str(_given(asked, "page"))[:40], _whole(_given(asked, "number"))
+        asking = PreviewRequest(page, number, self.workspace.scene(name, text), text)
+        self.desk.ask(asking)
+        return self._answered(asking, 0)
 
-        def made() -> dict[str, Any]:
-            page, number = str(_given(asked, "page"))[:40], _whole(_given(asked, "number"))
-            asking = Asked(page, number, self.workspace.scene(name, text), text)
-            self.desk.ask(asking)
-            return self._told(asking, 0)
-
-        return JSONResponse(await run_in_threadpool(made))
-
-    async def answer(self, request: Request) -> Response:
+    def answer(self, request: Request) -> Response:
         """A later answer to a request of a page: ?page, number and stage; {} if there is none yet."""
         query = request.query_params
         number, stage = _whole(_given(query, "number")), _whole(_given(query, "stage"))
         asked = self.desk.last(_given(query, "page"))
         if asked is None or asked.number != number or not 0 <= stage < len(STAGES):
             return JSONResponse({"replaced": True})
-        return JSONResponse(await run_in_threadpool(self._told, asked, stage))
+        return JSONResponse(self._answered(asked, stage))
 
-    def _told(self, asked: Asked, stage: int) -> dict[str, Any]:
+    def _answered(self, asked: PreviewRequest, stage: int) -> dict[str, Any]:
         answer = self.desk.answer(asked, stage, PATIENCE)
         if answer is None:
             return {"replaced": True} if asked.replaced else {}
@@ -413,20 +385,16 @@ class Workbench:
 
     # ---- designs ----
 
-    async def make(self, request: Request) -> Response:
+    def make(self, name: str, asked: Asked) -> dict[str, Any]:
         """Save the scene and design it, in a process of its own: {page, which waits for no preview now}; its name."""
-        asked = await _json(request)
         self.desk.forget(str(asked.get("page")))
-        return await run_in_threadpool(self._make, request.path_params["name"])
-
-    def _make(self, name: str) -> Response:
         text = self.workspace.opened(name).text
         scene = self.workspace.scene(name, text)
         self.workspace.save(name)
         folder = self.workspace.design(scene.name)
         folder.parent.mkdir(parents=True, exist_ok=True)
         self.started.append(design_runs.begin_design(scene, folder, text))
-        return JSONResponse({"design": scene.name})
+        return {"design": scene.name}
 
     def _run(self, request: Request) -> Run:
         kind = request.query_params.get("kind", design_runs.DESIGN)
@@ -484,44 +452,39 @@ class Workbench:
         source = folder if (folder / "scene.toml").is_file() else Run(folder).place
         return JSONResponse({"name": self.workspace.adopt(name, source, Run(folder).place / WRITTEN)})
 
-    async def tolerance(self, request: Request) -> Response:
+    def tolerance(self, name: str, asked: Asked) -> dict[str, Any]:
         """How exactly the lens must be made: {grade, yield in percent}, each perhaps absent."""
-        asked = await _json(request)
         wanted = asked.get("yield")
         share = None if wanted in (None, "") else _number(wanted, "yield") / 100
         if share is not None and not 0 < share < 1:
             raise SceneError(f"yield: {100 * share:g} % is not between 0 and 100 %; give one such as 90")
-        job = {"grade": asked.get("grade") or None, "yield": share}
-        return await run_in_threadpool(self._begin, request, "tolerance", job)
+        return self._begin(name, "tolerance", {"grade": asked.get("grade") or None, "yield": share})
 
-    async def tradeoff(self, request: Request) -> Response:
+    def tradeoff(self, name: str, asked: Asked) -> dict[str, Any]:
         """The price of accuracy in time: {budget in seconds}."""
-        budget = _number((await _json(request)).get("budget") or 600, "budget")
+        budget = _number(asked.get("budget") or 600, "budget")
         if not 1 <= budget <= 86_400:
             raise SceneError(f"budget: {budget:g} s is not between 1 s and a day; give seconds, such as 600")
-        self.workspace.design(f"{request.path_params['name']}-tradeoff")  # where its files go
-        return await run_in_threadpool(self._begin, request, "tradeoff", {"budget": budget})
+        self.workspace.design(f"{name}-tradeoff")  # where its files go
+        return self._begin(name, "tradeoff", {"budget": budget})
 
     async def measured(self, request: Request) -> Response:
         """Judge a made part by its measured points, the body of the request."""
-        data = await request.body()
+        data, name = await request.body(), request.path_params["name"]
         ending = next((ending for start, ending in CLOUDS if data[:80].lstrip().lower().startswith(start)), ".csv")
         if ending == ".csv" and b"\0" in data[:200]:
             ending = ".stl"  # a binary one
-        return await run_in_threadpool(self._begin, request, "measured", contents={f"cloud{ending}": data})
+        contents = {f"cloud{ending}": data}
+        return JSONResponse(await run_in_threadpool(self._begin, name, "measured", contents=contents))
 
     def _begin(
-        self,
-        request: Request,
-        kind: str,
-        job: Mapping[str, Any] | None = None,
-        contents: Mapping[str, bytes] | None = None,
-    ) -> Response:
-        run = Run(self.workspace.design(request.path_params["name"]), kind)
-        self.workspace.file(run.design.name, "lens.step")
+        self, name: str, kind: str, job: Asked | None = None, contents: Mapping[str, bytes] | None = None
+    ) -> dict[str, Any]:  # fmt: skip
+        run = Run(self.workspace.design(name), kind)
+        self.workspace.file(name, "lens.step")
         run.begin(job, contents)
         self.started.append(run)
-        return JSONResponse({})
+        return {}
 
     # ---- files ----
 
@@ -555,18 +518,22 @@ class _Site(StaticFiles):
         return answer
 
 
-async def _json(request: Request) -> dict[str, Any]:
-    """The body of a request as a table of JSON.  SceneError."""
-    try:
-        found = json.loads(await request.body() or b"{}")
-    except (ValueError, RecursionError):
-        found = None
-    if not isinstance(found, dict):
-        raise SceneError("the request is no table of JSON; reload the page")
-    return found
+def _of_json(work: Callable[[str, Asked], dict[str, Any]]) -> Callable[[Request], Awaitable[Response]]:
+    """Answer requests by work(name in the address, table of JSON in the body), which is done in a thread."""
+
+    async def answer(request: Request) -> Response:
+        try:
+            asked = json.loads(await request.body() or b"{}")
+        except (ValueError, RecursionError):
+            asked = None
+        if not isinstance(asked, dict):
+            raise SceneError("the request is no table of JSON; reload the page")
+        return JSONResponse(await run_in_threadpool(work, request.path_params.get("name", ""), asked))
+
+    return answer
 
 
-def _given(table: Mapping[str, Any], name: str) -> Any:
+def _given(table: Asked, name: str) -> Any:
     """What a request states.  SceneError."""
     if name not in table:
         raise SceneError(f"{name}: is missing in the request; reload the page")
@@ -591,39 +558,25 @@ def _number(given: Any, key: str) -> float:
 
 def _zipped(name: str, paths: list[tuple[str, Path]]) -> Iterator[bytes]:
     """A ZIP archive of files in a folder of that name, piece by piece."""
-    sink = _Sink()
-    with zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED) as archive:
+    written = _Written()
+    with zipfile.ZipFile(written, "w", zipfile.ZIP_DEFLATED) as archive:
         for each, path in paths:
             with path.open("rb") as source, archive.open(f"{name}/{each}", "w", force_zip64=True) as target:
                 while piece := source.read(1 << 20):
                     target.write(piece)
-                    yield sink.taken()
-    yield sink.taken()
+                    yield bytes(written)
+                    written.clear()
+    yield bytes(written)
 
 
-class _Sink(io.RawIOBase):
-    """A file that is written only, and taken away in between."""
+class _Written(bytearray):
+    """What a ZIP archive has written since it was sent last."""
 
-    def __init__(self) -> None:
-        self._held = bytearray()
-
-    def writable(self) -> bool:
-        return True
-
-    def write(self, data: Any) -> int:
-        self._held += data
+    def write(self, data: bytes) -> int:
+        self.extend(data)
         return len(data)
 
-    def taken(self) -> bytes:
-        """The bytes since the last time."""
-        held, self._held = bytes(self._held), bytearray()
-        return held
-
-
-def _sorted(names: list[str]) -> list[str]:
-    """First the files that people come for."""
-    first = ("lens.step", "part.step", "report.html", "datasheet.pdf", "lens.stl", "lens.3mf")
-    return [*(name for name in first if name in names), *(name for name in names if name not in first)]
+    def flush(self) -> None: ...
 
 
 def _flat(table: Mapping[str, Any], at: str = "") -> dict[str, str]:
@@ -638,50 +591,6 @@ def _flat(table: Mapping[str, Any], at: str = "") -> dict[str, str]:
         else:
             found[key] = json.dumps(value, ensure_ascii=False)
     return found
-
-
-def _line(sentence: str) -> int | None:
-    """The line that a sentence on wrong TOML names."""
-    found = re.search(r"at line (\d+)", sentence)
-    return int(found[1]) if found else None
-
-
-# ---- the server ------------------------------------------------------------------------------------------------------
-
-
-@contextlib.contextmanager
-def bound(port: int) -> Iterator[socket.socket]:
-    """A socket on loopback; port 0: a free one.  SceneError if the port is taken."""
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as own:
-        own.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            own.bind(("127.0.0.1", port))
-        except OSError as error:
-            raise SceneError(f"--port {port}: cannot be had ({error.strerror}); give another one, or none") from None
-        own.listen()  # a browser that comes before the server answers waits
-        yield own
-
-
-def uvicorn_server(app: Any, ends: Callable[[], None] = lambda: None) -> uvicorn.Server:
-    """The server of an application, which writes nothing to the terminal; ends: called when a signal ends it."""
-    config = uvicorn.Config(
-        app, log_level="critical", access_log=False, server_header=False, lifespan="off", ws="none",
-        http=HeadersInTime, timeout_graceful_shutdown=SLOWEST,
-    )  # fmt: skip
-    return _Server(config, ends)
-
-
-class _Server(uvicorn.Server):
-    """A server that wakes the requests that wait, as soon as it is to end."""
-
-    def __init__(self, config: uvicorn.Config, ends: Callable[[], None]) -> None:
-        super().__init__(config)
-        self._ends = ends
-
-    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Hear a signal."""
-        self._ends()
-        super().handle_exit(sig, frame)
 
 
 def serve(given: Path | None, port: int, say: Callable[[str], None], show: Callable[[str], Any]) -> None:

@@ -87,8 +87,8 @@ class Workbench:
         except SentenceError as refusal:
             self._say(str(refusal))
             return
-        self.preview = found
-        self._show(preview_json.of_preview(found))
+        told, page = preview_json.of_preview(found), form.environment().get_template("widget.html.j2").module
+        self.preview, self._light.value, self._said.value = found, page.light(told), page.figures(told)
 
     # ---- what is seen ----
 
@@ -120,20 +120,6 @@ class Workbench:
 
     def _say(self, sentence: str) -> None:
         self._said.value = f"<p role='alert'><b>{html.escape(sentence)}</b></p>"
-
-    def _show(self, told: dict[str, Any]) -> None:
-        """The light on each target beside the picture that is asked for, and the figures."""
-        style = "width:250px;image-rendering:auto;background:#000"
-        pictures = [
-            f'<img alt="Light through the lens" style="{style}" src="{each["light"]}"> '
-            f'<img alt="The picture that is asked for" style="{style}" src="{each["wanted"]}">'
-            f"<br>RRMSD {each['rrmsd']} on {' × '.join(map(str, each['pixels']))} pixels"
-            for each in told["targets"]
-        ]
-        self._light.value = "<br>".join(pictures)
-        rows = "".join(f"<tr><th>{html.escape(a)}</th><td>{html.escape(b)}</td></tr>" for a, b in told["figures"])
-        remarks = "".join(f"<li>{html.escape(sentence)}</li>" for sentence in told["remarks"])
-        self._said.value = f"<table>{rows}</table><ul>{remarks}</ul>"
 
     def _repr_mimebundle_(self, **options: Any) -> Any:
         """For a notebook: the widgets."""

@@ -190,10 +190,8 @@ class Workspace:
         key, value = next(((key, value) for key, value in wanted.items() if value), ("", None))
         with self._changing:
             name = self._free_name(template or light)
-            if template is None:
-                new_scene.new_scene(name, self.scenes, picture=given, light=light, size=size)
-            else:
-                new_scene.new_scene(name, self.scenes, template=template)
+            start = {"template": template} if template else {"picture": given, "light": light, "size": size}
+            new_scene.new_scene(name, self.scenes, **start)
             if key and (template or given is None):
                 self._show(name, key, value, plate=None if template else new_scene.Plate.of(light, size))
         return name

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from bstcad.app.choices import impossible
-from bstcad.app.followers import take_change
+from bstcad.app.followers import impossible, take_change
 from bstcad.app.form import form
 from bstcad.app.scene_text import changed, typed
 from bstcad.runs.files import SentenceError

@@ -11,7 +11,7 @@ from bstcad import pipeline
 from bstcad.analysis.shape import describe
 from bstcad.app.preview import SETTLED, Outdated, preview
 from bstcad.app.preview_desk import STAGES, PreviewDesk, Request
-from bstcad.app.preview_json import DARK_SPREAD, LIT, OF_DESIGN, SPREAD, figures
+from bstcad.app.preview_json import DARK_SPREAD, LIT, SPREAD, figures
 from bstcad.optics.measure import tubes_picture
 from bstcad.report.units import quantity
 from bstcad.scene.errors import SceneError
@@ -43,7 +43,7 @@ def test_a_preview_is_near_the_finished_draft(name, lit):
     assert found.flux["on target"] > 0.9
     told, spread = dict(figures(found)), SPREAD if lit else DARK_SPREAD
     assert (found.lit >= LIT) is lit
-    assert told["Smallest radius, steepest slope"] == OF_DESIGN and not any("tool" in name for name in told)
+    assert told["Smallest radius, steepest slope"].startswith("known once") and not any("tool" in name for name in told)
     shape, finished = found.shape, describe(made.lens, 65)
     for key in ("thickness_min", "thickness_max", "sag_pv"):
         assert abs(shape[key] - finished[key]) < spread * shape["sag_pv"]
