@@ -302,7 +302,7 @@ def slider(field: Field) -> Slider | None:
     return Slider(*(f"{each:.12g}" for each in (*ends, step, value)), middle)
 
 
-def html(form: Form, errors: Mapping[str, str], has_docs: bool = True) -> str:
+def html(form: Form, errors: Mapping[str, str], has_docs: bool = False) -> str:
     """The form as HTML, to be put into a page: no script, no style, and a sentence of `errors` beside its key.
 
     A control has its key as data-key and name, a slider data-key alone.  A button has data-key, and as data-value the

@@ -327,7 +327,7 @@ def first_pose(face: Face, cloud: np.ndarray) -> tuple[Pose, float]:
 def exchanged_axes(face: Face, cloud: np.ndarray, kept: float) -> tuple[np.ndarray, str] | None:
     """(matrix (3, 3), words) of an exchange of axes by which the cloud fits far better than `kept` mm; None: none."""
     sample, fitting = _sample(cloud)[:: SAMPLE // FEW], []
-    for matrix, words in sorted(_exchanges(), key=_changes):
+    for matrix, words in sorted(_exchanges(), key=lambda exchange: _rarity(exchange[0])):
         turned = sample @ matrix.T
         pose, distance = _best(face, turned, [np.zeros(2), _middle(turned)], FEW_STEPS)
         if distance < BETTER * kept:
@@ -349,9 +349,8 @@ def _exchanges() -> Iterator[tuple[np.ndarray, str]]:
             yield matrix, ", ".join(f"{'xyz'[k]} is {'-' * (signs[k] < 0)}{'xyz'[order[k]]}" for k in changed)
 
 
-def _changes(exchange: tuple[np.ndarray, str]) -> int:
-    """How rare a mistake is: axes that move, and twice those that are reversed."""
-    matrix, _ = exchange
+def _rarity(matrix: np.ndarray) -> int:
+    """The rarity of a mistake: axes that move, and twice those that are reversed."""
     return int((np.diag(matrix) == 0).sum() + 2 * (matrix < 0).sum())
 
 

@@ -16,12 +16,12 @@ import scipy.fft
 import scipy.sparse
 import torch
 from scipy.optimize import linprog
-from scipy.sparse.linalg import LinearOperator, cg, splu
+from scipy.sparse.linalg import LinearOperator, cg
 from scipy.special import eval_jacobi
 
 from bstcad.analysis.shape import least_squares
 from bstcad.measured.alignment import Alignment, Face, Pose, root_mean_square, sampled
-from bstcad.optics.bspline import BSplineSurface, basis_matrix
+from bstcad.optics.bspline import BSplineSurface, basis_matrix, interpolated
 from bstcad.optics.lens import Lens
 
 DEGREE = 2  # of the polynomial
@@ -46,7 +46,7 @@ class Form:
     """A fitted form error, δz(x, y) over the net of a lens: a polynomial, a random field, and a small motion."""
 
     face: Face
-    polynomial: np.ndarray = field(repr=False)  # (3, 3) coefficients of Legendre products, x along the first axis
+    polynomial: np.ndarray = field(repr=False)  # (6,) coefficients of the columns of _legendre
     rest: BSplineSurface = field(repr=False)  # the random field
     spread: np.ndarray = field(repr=False)  # (m, m) standard deviation of each cosine amplitude of its net, mm
     noise: float  # of the points, RMS (mm)
@@ -54,28 +54,22 @@ class Form:
 
     def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """δz (mm) at (x, y) in mm, as aligned by least squares."""
-        in_x, in_y = _legendre(self.face.lens.back, x, y)
-        smooth = np.einsum("ni,ij,nj->n", in_x, self.polynomial, in_y, optimize=True)
+        smooth = _legendre(self.face.lens.back, x, y) @ self.polynomial
         z, z_x, z_y = sampled(self.face.lens.back, x, y)
         moved = self.face.columns(np.stack([x, y, z], axis=1), np.stack([-z_x, -z_y, np.ones_like(z)], axis=1))
         return smooth + sampled(self.rest, x, y)[0] + moved @ self.motion
 
     def on(self, surface: BSplineSurface) -> BSplineSurface:
-        """`surface` with this form error, by least squares on the finer of both nets."""
+        """`surface` with this form error, which the finer of both nets has at the places of its control points."""
         sides = [
             own if rest <= own else max(rest, min(REFINED * own, NETS[1]))
             for rest, own in zip(self.rest.shape, surface.shape, strict=True)
         ]
         finer = surface.refined((sides[0], sides[1]))
-        along = [np.linspace(0, count - 1, 4 * count) for count in finer.shape]
-        in_x, in_y = (basis_matrix(u, count) for u, count in zip(along, finer.shape, strict=True))
-        over_x, over_y = (splu((rows.T @ rows).tocsc()).solve for rows in (in_x, in_y))
-        ends = zip(along, finer.shape, (finer.x, finer.y), strict=True)
-        x, y = (low + u / (count - 1) * (high - low) for u, count, (low, high) in ends)
+        x, y = (np.linspace(*ends, count) for ends, count in zip((finer.x, finer.y), finer.shape, strict=True))
         strips = (np.meshgrid(part, y, indexing="ij") for part in np.array_split(x, STRIPS))
         values = np.concatenate([self.at(x.ravel(), y.ravel()).reshape(x.shape) for x, y in strips])
-        own = over_x(in_x.T @ over_y(in_y.T @ values.T).T)
-        return replace(finer, heights=finer.heights + torch.from_numpy(own))
+        return replace(finer, heights=finer.heights + torch.from_numpy(interpolated(values)))
 
     def drawn(self, draw: np.ndarray, sign: float = 1.0) -> Form:
         """A sample of the posterior by (m, m) normal numbers; sign: 1 or -1, of the difference from the mean."""
@@ -94,9 +88,7 @@ def fitted(face: Face, alignment: Alignment) -> Form:
     """The form error of a cloud on its face."""
     back, points, n = face.lens.back, alignment.points, len(alignment.points)
     x, y = np.ascontiguousarray(points[:, :2].T)
-    i, j = np.array([(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]).T
-    in_x, in_y = _legendre(back, x, y)
-    smooth = in_x[:, i] * in_y[:, j]
+    smooth = _legendre(back, x, y)
     motions = face.columns(points, alignment.normals / alignment.normals[:, 2:]) @ alignment.motions
     both = np.column_stack([face.height(points), motions])
     coefficients = np.linalg.solve(smooth.T @ smooth, smooth.T @ both)
@@ -107,8 +99,7 @@ def fitted(face: Face, alignment: Alignment) -> Form:
     net = BSplineSurface(0.0, torch.zeros(m, m, dtype=torch.float64), *sides)
     u, v = ((t - low) / (high - low) * (m - 1) for t, (low, high) in zip((x, y), sides, strict=True))
     heights, spread, noise, motion = _field(net, _rows(u, v, m), both[:, 0], both[:, 1:], reach=face.reach)
-    polynomial = np.zeros((DEGREE + 1, DEGREE + 1))
-    polynomial[i, j] = coefficients[:, 0] - coefficients[:, 1:] @ motion
+    polynomial = coefficients[:, 0] - coefficients[:, 1:] @ motion
     rest = replace(net, heights=torch.from_numpy(heights))
     return Form(face, polynomial, rest, spread, noise=noise, motion=alignment.motions @ motion)
 
@@ -119,10 +110,11 @@ def frequencies(net: BSplineSurface) -> np.ndarray:
     return np.hypot(half[0][:, None], half[1][None, :])
 
 
-def _legendre(back: BSplineSurface, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 3) values of the Legendre polynomials of x and of y (mm), which run from -1 to 1 over the net."""
+def _legendre(back: BSplineSurface, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """(n, 6) products of Legendre polynomials of x and of y (mm) up to DEGREE, which run from -1 to 1 over the net."""
     across = (2 * (t - low) / (high - low) - 1 for t, (low, high) in zip((x, y), (back.x, back.y), strict=True))
-    return tuple(np.polynomial.legendre.legvander(t, DEGREE) for t in across)
+    i, j = np.indices((DEGREE + 1, DEGREE + 1))
+    return np.polynomial.legendre.legvander2d(*across, (DEGREE, DEGREE))[:, (i + j <= DEGREE).ravel()]
 
 
 def _field(

@@ -15,7 +15,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import torch
@@ -25,7 +24,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import Surface, sag
 from bstcad.report.grid_sag import FEWEST, MOST, GridSag, Throw, axes, table_note
-from bstcad.report.units import paragraphs
+from bstcad.report.units import environment, paragraphs
 from bstcad.runs import files
 from bstcad.scene.mount import Mount
 
@@ -253,34 +252,14 @@ def svg(outline: Outline, mount: Mount | None = None, label: Label = UNNAMED) ->
     a, b = (half + MARGIN + BEYOND * (mount is not None) for half in whole.half_extent)
     right = max([a, *(x + ADVANCE * len(line) + MARGIN for x, _, line in texts)])
     low = min([-b, *(y - MARGIN for _, y, _ in texts)])
-    size = {"width": f"{right + a:.12g}mm", "height": f"{b - low:.12g}mm"}
-    view = f"{-a:.12g} {-b:.12g} {right + a:.12g} {b - low:.12g}"
-    root = ElementTree.Element("svg", xmlns="http://www.w3.org/2000/svg", **size, viewBox=view)
-    if texts:
-        ElementTree.SubElement(root, "title").text = texts[0][2]
-    for layer in dict.fromkeys(layer for layer, _, _ in pieces):
-        group = ElementTree.SubElement(root, "g", {"id": layer.lower().replace("_", "-"), **STYLES.get(layer, EDGES)})
-        for kind, at in ((kind, at) for on, kind, at in pieces if on == layer):
-            _add_element(group, kind, at)
-    ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="unicode") + "\n"
-
-
-def _add_element(group: ElementTree.Element, kind: str, at: tuple[Any, ...]) -> None:
-    """Add a piece to its group; in SVG y points down."""
-    match kind:
-        case "circle":
-            name, numbers = "circle", {"cx": at[0], "cy": -at[1], "r": at[2]}
-        case "box":
-            name, numbers = "rect", {"x": -at[0], "y": -at[1], "width": 2 * at[0], "height": 2 * at[1]}
-            numbers |= {"rx": at[2]} if at[2] else {}
-        case "line":
-            start = (CHAIN[0] - math.dist(at[:2], at[2:])) / 2 % sum(CHAIN)  # puts a dash in the middle
-            name, numbers = "line", {"x1": at[0], "y1": -at[1], "x2": at[2], "y2": -at[3], "stroke-dashoffset": start}
-        case "text":
-            name, numbers = "text", {"x": at[0], "y": -at[1]}
-    element = ElementTree.SubElement(group, name, {key: f"{_plain(value):.15g}" for key, value in numbers.items()})
-    element.text = at[2] if kind == "text" else None
+    layers: dict[str, list[tuple[str, tuple[Any, ...]]]] = {}
+    for layer, kind, at in pieces:
+        layers.setdefault(layer, []).append((kind, at))
+    return environment().get_template("outline.svg.j2").render(
+        layers=layers, left=-a, top=-b, width=right + a, height=b - low, title=texts[0][2] if texts else "",
+        styles=STYLES, edges=EDGES, n=lambda value: f"{_plain(value):.15g}",
+        dash=lambda at: (CHAIN[0] - math.dist(at[:2], at[2:])) / 2 % sum(CHAIN),  # puts a dash in the middle
+    ) + "\n"  # fmt: skip
 
 
 def words(outline: Outline, mount: Mount, label: Label) -> list[str]:

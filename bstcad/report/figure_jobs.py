@@ -83,7 +83,8 @@ class Pictures:
 
     def solid(self, lens: Lens) -> None:
         """Begin the 3-D picture."""
-        self._jobs.append(self._vtk.submit(rendering.draw_solid, meshes.lens_mesh(lens, CELLS)))
+        mesh = meshes.lens_mesh(lens, CELLS)
+        self._jobs.append(self._vtk.submit(lambda: {"lens": rendering.lens_picture(mesh)}))
 
     def lens(self, lens: Lens) -> None:
         """Begin the maps of the lens and its rays."""
@@ -200,16 +201,12 @@ def surface_maps(lens: Lens, steepest: float, face: str = "back") -> Figure:
     panels = figure.subplots(1, 3, sharey=True)
     place = {"extent": (x[0], x[-1], y[0], y[-1]), "origin": "lower", "interpolation_stage": "data"}
     panels[0].set_ylabel("y (mm)")
-    for axes, values, label, title in (
-        (
-            panels[0],
-            scale * height,
-            unit,
-            f"Height{', best plane removed' if tilted else ''}: PV {scale * pv:.3g} {unit}",
-        ),
-        (panels[1], slope, "degrees", f"Slope: up to {steepest:.3g}°"),
-        (panels[2], bend, "1/m", "Mean curvature, + bends towards +z"),
-    ):
+    heading = f"Height{', best plane removed' if tilted else ''}: PV {scale * pv:.3g} {unit}"
+    maps = (
+        (scale * height, unit, heading), (slope, "degrees", f"Slope: up to {steepest:.3g}°"),
+        (bend, "1/m", "Mean curvature, + bends towards +z"),
+    )  # fmt: skip
+    for axes, (values, label, title) in zip(panels, maps, strict=True):
         signed = axes is panels[2]
         shades = {"cmap": steps("PuOr", 82), "vmin": -edge, "vmax": edge} if signed else {"cmap": steps("cividis", 82)}
         shown = axes.imshow(values, **place, **shades)

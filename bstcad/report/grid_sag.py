@@ -27,7 +27,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.surfaces import Surface, sag
 from bstcad.optics.trace import launch_strips, trace
-from bstcad.report.units import environment
+from bstcad.report.units import number
 
 FEWEST, MOST = 3, 4097  # points a side of a table
 LEAST_OF_ZEMAX = 5  # points a side: "the nx and ny values must be no smaller than 5" (OpticStudio's help, Grid Sag)
@@ -59,7 +59,6 @@ class Moved:
 
     def __str__(self) -> str:
         """Both lengths in mm and in pixels."""
-        number = environment().filters["number"]
         pixels = f"{number(self.rms / self.pixel)} and {number(self.most / self.pixel)} target pixels"
         return f"{number(self.rms)} mm RMS, {number(self.most)} mm at most ({pixels})"
 
@@ -190,17 +189,11 @@ def _is_flush(x: np.ndarray, y: np.ndarray, outline: Outline) -> bool:
 
 
 def on_grid(face: BSplineSurface, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-    """(z, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y) (mm, 1, 1, 1/mm) of a face at each pair of x and y (mm) within its net.
+    """(z - face.z, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y) (mm, 1, 1, 1/mm) of a face at each pair of x and y (mm) within its net.
 
     z = Σ_i Σ_j B_i(u(x)) B_j(v(y)) h_ij (Wang et al. 2023, Eq. 2) is a product of three matrices on a grid, and each
     derivative is the same product with derivatives of one or both bases.
     """
-    heights, *slopes = _relative(face, x, y)
-    return (face.z + heights, *slopes)
-
-
-def _relative(face: BSplineSurface, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-    """`on_grid` with heights over the plane face.z."""
     bases = []
     for at, (low, _), pitch, m in zip((x, y), (face.x, face.y), face.pitch, face.shape, strict=True):
         u = np.clip((at - low) / pitch, 0.0, m - 1.0)
@@ -234,15 +227,11 @@ def moved(lens: Lens, other: Lens, throw: Throw) -> Moved | None:
     return max(found, key=lambda each: each.rms / each.pixel, default=None)
 
 
-def with_face(lens: Lens, face: Surface, other: Surface) -> Lens:
-    """The lens with another surface in place of one of its two faces."""
-    return lens.with_back(other) if face is lens.back else lens.with_front(other)
-
-
 def moved_by(lens: Lens, face: Surface, patches: Patches, throw: Throw) -> Moved | None:
     """How far the light of a lens moves if these patches stand for one of its faces; None: it comes to no target."""
     plain = replace(lens, losses=None).shaping("back")
-    return moved(plain, with_face(plain, face, patches), throw)
+    other = plain.with_back(patches) if face is lens.back else plain.with_front(patches)
+    return moved(plain, other, throw)
 
 
 # ---- the file --------------------------------------------------------------------------------------------------------
@@ -273,7 +262,7 @@ class GridSag:
     @classmethod
     def _at(cls, lens: Lens, face: BSplineSurface, at: tuple[np.ndarray, np.ndarray], throw: Throw | None) -> GridSag:
         """The grid of these x and y."""
-        found = cls(face, Grid(*at, _relative(face, *at)), None)
+        found = cls(face, Grid(*at, on_grid(face, *at)), None)
         return found if throw is None else replace(found, moved=moved_by(lens, face, found.patches, throw))
 
     @property

@@ -399,7 +399,11 @@ def lines_apart(target: np.ndarray, irradiance: np.ndarray, lines: Sequence[Line
 
 def primary(wavelength: float) -> np.ndarray:
     """Linear sRGB (3,) of one line (nm); colours that no screen shows have negative parts, which are left out."""
-    xyz = [sum(_lobe(wavelength, *lobe) for lobe in lobes) for lobes in LOBES]
+    xyz = [
+        sum(weight * np.exp(-0.5 * ((wavelength - centre) / (below if wavelength < centre else above)) ** 2)
+            for weight, centre, below, above in lobes)
+        for lobes in LOBES
+    ]  # fmt: skip
     return np.maximum(TO_SRGB @ np.array(xyz), 0.0)
 
 
@@ -414,11 +418,6 @@ def balanced(pictures: Sequence[np.ndarray], wavelengths: Sequence[float], share
     alone = np.asarray(shares, dtype=np.float64)[:, None]
     weights = np.where(white > 1e-6 * white.max(initial=0.0), parts / np.where(white > 0, white, 1.0), alone)
     return np.tensordot(np.array(pictures), weights, axes=(0, 0))
-
-
-def _lobe(wavelength: float, weight: float, centre: float, below: float, above: float) -> float:
-    width = below if wavelength < centre else above
-    return weight * float(np.exp(-0.5 * ((wavelength - centre) / width) ** 2))
 
 
 # --- other programs, made parts ---------------------------------------------------------------------------------------

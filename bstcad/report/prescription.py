@@ -27,7 +27,7 @@ from bstcad.optics.bspline import DEGREE, BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.media import density
 from bstcad.optics.surfaces import Surface, sag
-from bstcad.report.units import Rows, mm, tables
+from bstcad.report.units import Rows, paragraphs, tables
 from bstcad.scene.blank import FITTED
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
@@ -294,21 +294,8 @@ def _volume(lens: Lens, whole: WholePart | None) -> float | None:
 
 def _origin(lens: Lens, vertex: float, bare: bool = True) -> str:
     """The position of axis and front, seen from the point (0, 0, 0) of the file; vertex: z of the back's."""
-    front = lens.front_vertex
-    axis = f"on the axis of the {lens.passes.optic}" + " (the middle of its outline)" * bare
-    if lens.passes.sense < 0:  # its light comes from above
-        if vertex < 0:
-            return f"{axis}, {mm(-vertex)} mm before the vertex of the mirror, on the light's side"
-        rear = f"the vertex of the {lens.passes.name('front')}"
-        between = f"{mm(abs(front))} mm {'behind' if front > 0 else 'in front of'} {rear}" if front else f"at {rear}"
-        return f"{axis}, {between}"
-    if front > 0:
-        return f"{axis}, {mm(front)} mm before the vertex of the front, on the light's side"
-    if front == 0:
-        return f"{axis}, at the vertex of the front"
-    if vertex >= 0:
-        return f"{axis}, in the lens, {mm(-front)} mm behind the vertex of the front"
-    return f"{axis}, {mm(-vertex)} mm behind the vertex of the back"
+    at = {"passes": lens.passes, "front": lens.front_vertex, "vertex": vertex, "bare": bare}
+    return "".join(paragraphs("part_words.txt.j2", "origin", **at))
 
 
 def _front_radius(lens: Lens) -> float | None:

@@ -279,20 +279,16 @@ def contents_of(
     precede.  estimates: of the effects that are left out.  diagnosis: convergence, remaining_error and bounds.
     """
     known = {key: value for key, value in vars(making).items() if value is not None}
-    goal, light, dark = goals[proof.worst], proof.light, proof.light.leak
+    goal, light, figures = goals[proof.worst], proof.light, figures_of(goals, proof.lights)
     contents = Contents(
         **{**circumstances, **known},
         **diagnosis,
+        **{key: getattr(figures[proof.worst], name) for key, name in OF_WORST.items()},
         name=scene.name,
         title=scene.title,
         verdict=verdict(proof.passed, (), scene.limits_light),
         passed=proof.passed,
-        goals=figures_of(goals, proof.lights),
-        rrmsd=light.rrmsd,
-        rrmsd_tent=light.tent,
-        rrmsd_noise=light.standard_error,
-        light_on_target=light.flux["on target"],
-        efficiency=light.efficiency,
+        goals=figures,
         flux=light.flux,
         checks=proof.checks,
         prescription=prescription(scene, lens, proof.shape),
@@ -303,8 +299,6 @@ def contents_of(
         seed=scene.tailoring.seed,
         rrmsd_whole=light.rrmsd_whole,
         unreachable=_unreached(scene, goal),
-        leak=dark and dark.share,
-        contrast=dark and dark.contrast,
         optic=scene.optic,
         quality=scene.tailoring.quality,
         rrmsd_asked=scene.accept.rrmsd,

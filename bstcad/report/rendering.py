@@ -65,11 +65,6 @@ LEAST = 1e-9  # range (mm, or a slope) of values that are all equal
 _drawing: list[subprocess.Popen] = []  # the processes that draw now
 
 
-def draw_solid(mesh: Mesh) -> dict[str, bytes | None]:
-    """The 3-D picture of a report by its name."""
-    return {"lens": lens_picture(mesh)}
-
-
 def lens_picture(mesh: Mesh) -> bytes | None:
     """PNG of the solid in matt clay, seen from the back surface's side, on a transparent background.
 

@@ -16,7 +16,7 @@ from bstcad.optics.goal import suffix_of
 from bstcad.optics.sides import in_words
 from bstcad.report.prescription import WAYS, order_rows
 from bstcad.report.record import LEFT_OUT, Contents, Examined, LeftOut, bounds, changes
-from bstcad.report.units import Remark, Rows, about, bound, environment, number, percent, quantity, tables
+from bstcad.report.units import Remark, Rows, about, bound, environment, paragraphs, quantity, tables
 from bstcad.report.units import remarks as written
 from bstcad.runs import files
 from bstcad.verify.verdict import NO_LIMIT, Check
@@ -42,24 +42,6 @@ OF_PLAN = {  # kind of a plan's verdict: style of the terminal
     "not predicted": "bold yellow",
 }  # fmt: skip
 OF_GLASS = ("lost through the sides", "total internal reflection")  # lines of the ledger that few mirrors have
-ESTIMATED = (
-    "Estimated on a coarse lens; most figures are good to a factor of two. RRMSD: what the effect alone gives a {} "
-    "that is perfect without it; that of a real one changes by less. Blur: diameter of the spot that a point of the "
-    "picture becomes. ?: not known."
-)
-IMAGE = (
-    "Through each place of the {optic} the source throws an image of itself, {width} {unit} ({pixels} pixels) wide on "
-    "the target. The target blurred by this image has an RRMSD of {rrmsd}; a {optic} comes below that as far as it "
-    "sharpens coarser detail beforehand."
-)
-UNREACHABLE = (
-    "{area} of the target, with {light} of its light, cannot be lit; the {optic} will be for the rest. --png FILE "
-    "draws it."
-)
-TURNED = "A face of this index turns light by less than {angle:.3g} degrees, or reflects it."
-INTERVALS = (
-    "In brackets what nine of ten designs keep to. Seconds: from the command to its end, with nothing else running."
-)
 
 
 # --- words ------------------------------------------------------------------------------------------------------------
@@ -250,7 +232,7 @@ def plan_effects(plan: Mapping[str, Any], title: str, optic: str) -> Group:
     lines = [*early, Text(title, "bold"), simulated]
     for goal in plan["goals"]:
         lines += _of_target(goal, suffix_of(goal["key"]), optic)
-    lines.append(Text(" ".join(filter(None, (ESTIMATED.format(optic), plan.get("caveat"))))))
+    lines.append(Text(" ".join((*paragraphs("plan.txt.j2", "estimated", optic=optic), plan.get("caveat", ""))).strip()))
     if remedies.row_count:
         lines += [Text(), Text("To have it simulated, write in the scene:"), remedies]
     return Group(*lines)
@@ -272,14 +254,8 @@ def _of_target(plan: Mapping[str, Any], of: str, optic: str) -> Iterator[Rendera
         detail = (f", {entry.detail}" if entry.detail else "", "dim")
         left_out.add_row(Text.assemble(LEFT_OUT[entry.kind], detail), *changes(entry))
     yield left_out
-    if beyond := plan.get("unreachable"):
-        yield Text(UNREACHABLE.format(**{k: percent(beyond[k]) for k in ("area", "light")}, optic=optic))
-        if beyond["angle"] is not None:
-            yield Text(TURNED.format(**beyond))
-        yield Text()
-    if plan["blur"] is not None:
-        image = {key: number(plan["blur"][key]) for key in ("width", "pixels", "rrmsd")}
-        yield Text(IMAGE.format(**image, unit=plan["blur"]["unit"], optic=optic))
+    for sentence in paragraphs("plan.txt.j2", "light", goal=plan, optic=optic):
+        yield Text(sentence)
         yield Text()
 
 
@@ -299,7 +275,7 @@ def plan_predictions(plan: Mapping[str, Any]) -> Group:
         intervals = (map(about, entry[key]) for key in ("seconds", "rrmsd", "memory_gb"))
         cells = (Text.assemble(likely, (f" ({low} to {high})", "dim")) for low, likely, high in intervals)
         table.add_row(Text(name), *cells)
-    return Group(Text(), *head, table, Text(" ".join((*plan["notes"], INTERVALS))))
+    return Group(Text(), *head, table, Text(" ".join((*plan["notes"], *paragraphs("plan.txt.j2", "intervals")))))
 
 
 def _table(first: str, *others: str) -> Table:

@@ -18,7 +18,7 @@ from bstcad.optics.reach import unreached
 from bstcad.optics.sides import both, scaled
 from bstcad.pipeline import reachable_part
 from bstcad.report.record import simulated, too_steep
-from bstcad.report.units import about, number, quantity, two_digits
+from bstcad.report.units import paragraphs
 from bstcad.scene.blank import LARGEST_NET
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.scene import Scene
@@ -28,9 +28,6 @@ from bstcad.sweep.net_choice import gain
 from bstcad.sweep.prediction import FLOWN, QUALITIES, UNDONE, Interval, fly, of_net, predictions
 from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT
 
-MINUTE = 60.0  # s
-NOTABLE = 0.01  # RRMSD by the source's image that is worth a sentence
-COARSE = 10.0  # images of the source beside each other on a target: where there are fewer, a plan says so
 ALONE = "The lens is one for this target alone, by its back alone: one of several goals or faces turns light otherwise."
 
 
@@ -82,43 +79,25 @@ def verdict(scene: Scene, found: Mapping[str, Any]) -> dict[str, str] | None:
     targets = zip(scene.targets, found["goals"], strict=True)
     images = [(each["blur"]["rrmsd"], each["blur"]["width"], target) for target, each in targets if each["blur"]]
     blurred, width, target = max(images, key=lambda image: image[0], default=(0.0, 0.0, scene.target))
-    wide, unit = max(high - low for low, high in (target.x, target.y)), target.unit
-    least, most = (number(two_digits(value)) for value in (UNDONE * blurred, blurred))
+    wide = max(high - low for low, high in (target.x, target.y))
+    likely: Any = found.get("not_predicted")
     if UNDONE * blurred > allowed:
-        permits = "" if asked is None else f", where {number(asked)} is allowed"
-        sentence = (
-            f"The picture will be blurred: through each place of the {scene.optic} the source throws an image of "
-            f"itself {about(width, unit)} wide on the target, which is {quantity(wide, unit)} wide. The RRMSD will be "
-            f"{least} to {most} whatever the {scene.optic}{permits}. Take a smaller source, "
-            f"one further before the {scene.optic}, a target nearer behind it, or a coarser picture."
-        )
-        return {"kind": "blurred", "sentence": sentence}
-    if "predicted" not in found:
+        kind = "blurred"
+    elif "predicted" not in found:
         return None
-    if found["predicted"] is None:
-        text = f"No RRMSD is predicted: {found.get('not_predicted')}."
-        if blurred > NOTABLE:
-            text += f" The source's image, {about(width, unit)} wide on the target, makes one of {least} to {most}."
-        return {"kind": "not predicted", "sentence": text}
-    quality = scene.tailoring.quality if scene.tailoring.quality in QUALITIES else "standard"
-    (low, likely, high), (_, time, _) = (found["predicted"][quality][key] for key in ("rrmsd", "seconds"))
-    took = about(time, "s") if time < 2 * MINUTE else about(time / MINUTE, "minutes")
-    text = f"An RRMSD of about {about(likely)} in about {took}, in {quality} quality"
-    if asked is None:
-        kept = f"[accept] rrmsd = {two_digits(high):g}"
-        kind, words = "no limit", f"none is asked; nine of ten designs would keep {kept}"
-    elif high <= asked:
-        kind, words = "within", f"{number(asked)} is allowed"
-    elif low > asked:
-        kind, words = "beyond", f"{number(asked)} is allowed, and will hardly be reached"
+    elif found["predicted"] is None:
+        kind = "not predicted"
     else:
-        kind, words = "open", f"{number(asked)} is allowed, and {about(low)} to {about(high)} may come out"
-    if COARSE * width > wide:
-        words += (
-            f". The source's image on the target is {about(width, unit)} wide, and the target {quantity(wide, unit)}: "
-            "finer detail is lost"
-        )
-    return {"kind": kind, "sentence": f"{text}; {words}."}
+        quality = scene.tailoring.quality if scene.tailoring.quality in QUALITIES else "standard"
+        (low, _, high), (_, seconds, _) = (found["predicted"][quality][key] for key in ("rrmsd", "seconds"))
+        likely = {"quality": quality, "seconds": seconds, "rrmsd": found["predicted"][quality]["rrmsd"]}
+        kind = "no limit" if asked is None else "within" if high <= asked else "beyond" if low > asked else "open"
+    image = {"rrmsd": blurred, "least": UNDONE * blurred, "width": width, "target": wide}
+    [sentence] = paragraphs(
+        "plan.txt.j2", "verdict", kind=kind, image=image | {"unit": target.unit, "optic": scene.optic}, asked=asked,
+        likely=likely,
+    )  # fmt: skip
+    return {"kind": kind, "sentence": sentence}
 
 
 def _effects(scene: Scene, lens: Lens, key: str) -> dict[str, Any]:
@@ -144,16 +123,13 @@ def reach_drawn(scene: Scene) -> tuple[bytes, ...]:
             "--png: draws what light can reach by way of a tailored back, and here the front is tailored; leave it "
             "out: `bstcad generate` says first what such a lens cannot do"
         )
-    return tuple(
-        png(reach_picture(each.target.irradiance(), _reached_part(each), View.of(each))) for each in scene.each_alone()
-    )
-
-
-def _reached_part(scene: Scene) -> np.ndarray:
-    """(rows, columns) True in the pixels that light can reach."""
-    [goal] = scene.goals
-    part, _ = reachable_part(scene, goal)
-    return np.ones(goal.picture.shape, dtype=bool) if part is None else part
+    found = []
+    for alone in scene.each_alone():
+        [goal] = alone.goals
+        part, _ = reachable_part(alone, goal)
+        lit = np.ones(goal.picture.shape, dtype=bool) if part is None else part
+        found.append(png(reach_picture(goal.picture, lit, View.of(alone))))
+    return tuple(found)
 
 
 def _asked(key: str, at: Mapping[str, int], keys: Sequence[str]) -> dict[str, Any]:
