@@ -44,7 +44,7 @@ def test_three_targets_go_through_their_file_unchanged(three, tmp_path):
     again = through_its_files(three, tmp_path)
     assert again == three == three.changed({}) and again.toml() == three.toml()
     assert [target.z for target in three.targets] == [100.0, 200.0, 400.0] and three.target is three.targets[0]
-    assert [target.weight for target in three.targets] == [1.0, 2.5, 1.0]
+    assert [goal.weight for goal in three.goals] == [1.0, 2.5, 1.0]
     assert three.targets[1].outline == Circle(14.0)  # given by its diameter
     tables = tomllib.loads(three.toml())["target"]
     assert [table.get("weight") for table in tables] == [None, 2.5, None]
