@@ -22,7 +22,7 @@ def svg(data: Mapping[str, Any]) -> str:
     front, back, wall = _number("front.z", lens), _number("back.z", lens), _number("z", targets[0])
     return environment().get_template("sketch.svg.j2").render(
         mirror=is_mirror(data),
-        point=source.get("kind") == "point", walls=len(targets), outline=_across(lens.get("outline")),
+        point=source.get("kind") != "collimated", walls=len(targets), outline=_across(lens.get("outline")),
         distance=_between(back, wall), thickness=_between(front, back),
         width=_range(targets[0].get("x")), height=_range(targets[0].get("y")),
     )  # fmt: skip

@@ -40,7 +40,7 @@ class Lens:
     front: Surface
     back: Surface
     outline: Outline  # both faces of the solid end on it
-    index: float  # refractive index at the design wavelength; of a mirror it does not matter
+    index: float  # refractive index at the design wavelength; of a mirror that no light enters it does not matter
     reflects: bool = False  # does a face reflect?  Without `way` True says a mirror, False a lens
     losses: Dimming | None = None  # losses at its faces and in its glass; None: no flux is lost there
     clear: tuple[Outline, Outline] | None = None  # apertures of front and back that pass light; None: the outline

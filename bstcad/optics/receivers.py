@@ -29,6 +29,7 @@ class Receiver(ABC):
     """Where light is collected; x and y are its own coordinates."""
 
     unit: str = "mm"  # the unit of x and y
+    light: str = "irradiance"  # light of a pixel over its area; over its solid angle it is radiant intensity
     tilt: tuple[float, float] | None = None  # tilt of a plane about x, then y (degrees); None: it is level, or no plane
     names: tuple[str, str] = ("x", "y")  # the names of its axes
     axes: tuple[Vector, Vector, Vector] | None = None  # e_x, e_y and n for the kernels; None: it has no kernel
@@ -143,7 +144,7 @@ class Moved(Receiver):
     motion: Motion
 
     def __post_init__(self) -> None:
-        for name in ("unit", "names", "where", "per_radian", "areas"):  # which no motion changes
+        for name in ("unit", "light", "names", "where", "per_radian", "areas"):  # which no motion changes
             object.__setattr__(self, name, getattr(self.rest, name))
 
     @property

@@ -85,7 +85,7 @@ def whole_kernel(
 
 
 def to_first_net(rays: Rays, lens: Lens) -> Rays:
-    """Rays from the source on their way to the first freeform interface; of a lens with one net that is the back."""
+    """Rays from the source on their way to the first freeform interface."""
     return across(rays, lens.interfaces[: lens.freeform[0]])
 
 

@@ -107,4 +107,5 @@ def flat_tops(scene: Scene, proof: Proof) -> Iterator[FlatTop]:
             inside = drawing(target).light  # the share of each pixel, of shapes with an edge
             if target.profile.shape == "super_gaussian":
                 inside = (inside >= FLAT * inside.max()).astype(float)
-            yield FlatTop.of(key, light.picture, pixel, inside, on_picture=light.flux["on target"])
+            areas = 1.0 if target.screen.areas is None else target.screen.areas
+            yield FlatTop.of(key, light.picture / areas, pixel, inside, on_picture=light.flux["on target"])

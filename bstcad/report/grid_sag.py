@@ -53,14 +53,15 @@ class Throw:
 class Moved:
     """How far the light of a lens moves on a target if another surface stands for one of its faces."""
 
-    rms: float  # mm, weighted by flux
-    most: float  # mm
-    pixel: float  # mm, shorter side of a pixel of the target
+    rms: float  # weighted by flux, as the others in `unit`
+    most: float
+    pixel: float  # the shorter side of a pixel of the target
+    unit: str  # of the target's x and y
 
     def __str__(self) -> str:
-        """Both lengths in mm and in pixels."""
+        """Both distances in their unit and in pixels."""
         pixels = f"{number(self.rms / self.pixel)} and {number(self.most / self.pixel)} target pixels"
-        return f"{number(self.rms)} mm RMS, {number(self.most)} mm at most ({pixels})"
+        return f"{number(self.rms)} {self.unit} RMS, {number(self.most)} {self.unit} at most ({pixels})"
 
 
 @dataclass(frozen=True)
@@ -223,7 +224,7 @@ def moved(lens: Lens, other: Lens, throw: Throw) -> Moved | None:
             square, weight = square + float(total(flux * apart)), weight + float(total(flux))
             most = max(most, float(apart.max())) if apart.numel() else most  # a strip may launch no rays
         pixel = min((screen.x[1] - screen.x[0]) / screen.columns, (screen.y[1] - screen.y[0]) / screen.rows)
-        found += [Moved((square / weight) ** 0.5, most**0.5, pixel)] if weight else []
+        found += [Moved((square / weight) ** 0.5, most**0.5, pixel, screen.plane.unit)] if weight else []
     return max(found, key=lambda each: each.rms / each.pixel, default=None)
 
 

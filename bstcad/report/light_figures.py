@@ -61,7 +61,6 @@ CUTS = {"centre": BLUE, "brightest place": VERMILION}
 ACROSS = 4  # pictures of spectral lines in a row
 PANEL, TALLEST = 2.4, 4.8  # inches: width of such a picture, and at most its height
 DENSE = 300  # outliers whose dots need to be small
-MEAN_LIT, PERCENT_LIT = "irradiance / mean lit", "% of mean lit irradiance"
 FORM_UNITS = ((1e-3, 1e3, "µm"), (0.0, 1e6, "nm"))  # (from this many mm on, times, written)
 BINS = 60  # bins of the histogram of trials
 SHOWN = 3  # number of the worst trials
@@ -101,6 +100,16 @@ class View:
     def labels(self) -> tuple[str, str]:
         """The names of the receiver's axes, with their unit."""
         return self.receiver.labels
+
+    @property
+    def mean_lit(self) -> str:
+        """The label of a scale in units of the mean of the lit pixels."""
+        return f"{self.receiver.light} / mean lit"
+
+    @property
+    def percent_lit(self) -> str:
+        """The label of a scale in percent of that mean."""
+        return f"% of mean lit {self.receiver.light}"
 
     @property
     def words(self) -> str:
@@ -193,8 +202,7 @@ def _signed(axes: Axes, values: np.ndarray, view: View, *, most: float, title: s
 
 
 def _side_by_side(
-    pictures: Mapping[str, np.ndarray], difference: str, view: View, *, height: float, label: str = MEAN_LIT,
-    spot: float = SPOT,
+    pictures: Mapping[str, np.ndarray], difference: str, view: View, *, height: float, spot: float = SPOT,
 ) -> tuple[Figure, np.ndarray]:  # fmt: skip
     """A figure and its axes: pictures by title on one scale of grey, and the last minus the one before it, signed.
 
@@ -209,8 +217,8 @@ def _side_by_side(
     signed = _signed(panels[-1], error, view, most=_largest(error, spot), title=difference)
     panels[0].set_ylabel(view.labels[1])
     beyond = "max" if last.max() > top else "neither"
-    figure.colorbar(shown, ax=panels[:-1], label=label, fraction=0.04, pad=0.015, extend=beyond)
-    figure.colorbar(signed, ax=panels[-1], label=PERCENT_LIT, fraction=0.08, pad=0.03, extend="both")
+    figure.colorbar(shown, ax=panels[:-1], label=view.mean_lit, fraction=0.04, pad=0.015, extend=beyond)
+    figure.colorbar(signed, ax=panels[-1], label=view.percent_lit, fraction=0.08, pad=0.03, extend="both")
     return figure, panels
 
 
@@ -286,15 +294,14 @@ def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) 
     target, irradiance = view.irradiance(target), view.irradiance(irradiance)
     simulated = "Simulated through the lens" if view.optic == "lens" else "Simulated by the mirror"
     pictures, height = {"Target": target, simulated: irradiance}, 1.3 + 2.8 * view.proportion
-    figure, panels = _side_by_side(
-        pictures, "Simulated − target", view, height=height, label="irradiance / mean lit irradiance"
-    )
+    figure, panels = _side_by_side(pictures, "Simulated − target", view, height=height)
     for axes in panels[:2]:
         for cut in cuts(irradiance, view):
             _mark(axes, cut, view)
     view.note(
         figure,
-        "  Grey as an eye or a camera would see it (sRGB); the scale is linear in irradiance.\n"
+        "  Grey as an eye or a camera would see it (sRGB); the scale is linear in "
+        f"{view.receiver.light}.\n"
         "Marks at the edges: the cuts through the centre (blue) and through the brightest place (vermilion, ringed).",
     )
     return figure
@@ -332,7 +339,7 @@ def ghost_picture(target: np.ndarray, ghost: np.ndarray, view: View) -> Figure:
     top = HEADROOM * float(np.percentile(share, RARE)) or 1.0
     shown = _grey(axes, share, view, top=top, title=f"The ghost alone: up to {number(float(share.max()))} %")
     axes.set_ylabel(view.labels[1])
-    figure.colorbar(shown, ax=axes, label=PERCENT_LIT, extend="max" if share.max() > top else "neither")
+    figure.colorbar(shown, ax=axes, label=view.percent_lit, extend="max" if share.max() > top else "neither")
     view.note(figure)
     return figure
 
@@ -355,7 +362,7 @@ def cross_section(target: np.ndarray, irradiance: np.ndarray, view: View) -> Fig
             axes.plot(place, irradiance[line] / unit, color=CUTS[cut.name], linewidth=1.0, label="simulated")
             axes.set_title(f"Through the {cut.name}, along {axis} ({where})", color=CUTS[cut.name])
             axes.set(xlabel=f"{axis} ({of})", xlim=ends)
-        pair[0].set_ylabel(MEAN_LIT)
+        pair[0].set_ylabel(view.mean_lit)
     panels[0][0].set_ylim(bottom=0.0)
     figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
     view.note(figure)
@@ -472,8 +479,8 @@ def made_part(made: MadePart, designed: np.ndarray, view: View) -> Figure:
     signed = _signed(changed, change, view, most=_largest(change), title="Made − designed light")
     slim = {"fraction": 0.046, "pad": 0.03}
     figure.colorbar(shown, ax=face, label=f"{written} along the normal", **slim)
-    figure.colorbar(drawn, ax=light, label=MEAN_LIT, **slim)
-    figure.colorbar(signed, ax=changed, label=PERCENT_LIT, extend="both", **slim)
+    figure.colorbar(drawn, ax=light, label=view.mean_lit, **slim)
+    figure.colorbar(signed, ax=changed, label=view.percent_lit, extend="both", **slim)
     said = "Left: form error of the back face after alignment, + out of the glass, from outside with x to the right."
     view.note(figure, first=f"{said}{dots}\n")
     return figure
@@ -538,7 +545,7 @@ def worst_trials(
     for axes in (panels[0, 0], panels[1, 1]):
         axes.set_ylabel(view.labels[1])
     slim = {"fraction": 0.03, "pad": 0.015}
-    figure.colorbar(lit, ax=panels[0], label=MEAN_LIT, **slim)
-    figure.colorbar(changed, ax=panels[1], label=PERCENT_LIT, extend="both", **slim)
+    figure.colorbar(lit, ax=panels[0], label=view.mean_lit, **slim)
+    figure.colorbar(changed, ax=panels[1], label=view.percent_lit, extend="both", **slim)
     view.note(figure)
     return figure

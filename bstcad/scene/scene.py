@@ -59,7 +59,7 @@ FINEST = 4 * SINGLE  # of the largest coordinate: no tolerance of a mesh is fine
 class Accept(Record):
     """Limits of the checks in the report; None: the check only states its value."""
 
-    rrmsd: Annotated[float | None, Key("Greatest RRMSD of the irradiance.", "", 1e-6, 10.0, of_light=True)] = None
+    rrmsd: Annotated[float | None, Key("Greatest RRMSD of the light on a target.", "", 1e-6, 10.0, of_light=True)] = None
     form: Annotated[float, Key("Greatest distance of lens.step from the tailored surface.", "mm", 1e-12, 1.0)] = 1e-6
     efficiency: Annotated[
         float | None,

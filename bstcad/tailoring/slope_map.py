@@ -114,14 +114,14 @@ def lit_window(source: Emitter, lens: Lens, n: int = 128) -> Rectangle:
 class SlopeMap:
     """b -> y = ∇φ(b) by transport; the wanted slope at b is σ y + ∇g(b)."""
 
-    mapping: Mapping  # back-face points (mm) -> y (dimensionless)
+    mapping: Mapping  # points of the last freeform face (mm) -> y (dimensionless)
     gathering: BSplineSurface  # g
     sign: float  # σ
     places: tuple[np.ndarray, np.ndarray]  # b (mm) for each corner of the target's pixels, (columns + 1, rows + 1)
     moved: float  # RMS change of those of the lit pixels since the round before / half of the window; NaN: no round
 
     def slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """(∂z/∂x, ∂z/∂y) wanted at points (n,) of the back face (mm)."""
+        """(∂z/∂x, ∂z/∂y) wanted at points (n,) of the last freeform face (mm)."""
         sent = self.mapping(x.cpu().double().numpy(), y.cpu().double().numpy())
         beyond = (torch.from_numpy(np.ascontiguousarray(s)).to(x) for s in sent)
         _, *gathering = self.gathering.relative_sag_and_slope(x.cpu().double(), y.cpu().double())

@@ -177,4 +177,4 @@ def test_the_report_of_a_design_says_it(small_design):
     said = small_design.report["given_up"]
     page = (small_design.folder / "report.html").read_text(encoding="utf-8")
     assert said and all(sentence in page for sentence in said)
-    assert page.index("<h2>Remarks</h2>") < page.index("Irradiance on the target")
+    assert page.index("<h2>Remarks</h2>") < page.index("Light on the target")
