@@ -439,6 +439,8 @@ def show(folder: Folder, png: Png = None) -> int:
     """Show a lens at work: rays coloured by their flux, and the screen with its picture."""
     if png is not None and (png.suffix.lower() != ".png" or png.is_dir()):
         raise SceneError(f"--png {png}: is no name of a PNG; give one such as light.png")
+    if png is not None and not png.absolute().parent.is_dir():
+        raise SceneError(f"--png {png}: there is no folder {png.parent}; make it first")
     commands = engine()
     with contextlib.suppress(*([KeyboardInterrupt] if png is None else [])):  # one way to close a window
         commands.show(folder, png)

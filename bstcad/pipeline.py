@@ -481,8 +481,9 @@ def check_thickness(lens: Lens, scene: Scene) -> None:
             f"lens.front.z: the back that this target needs would cross the front by {-thinnest:.3g} mm; "
             f"lower the front by more than that, move the target's light apart or make the lens smaller"
         )
-    if not scene.clearance(reach := lens.front.z + thickest) > 0:
+    room, key = scene.clearance(reach := lens.front.z + thickest)
+    if not room > 0:
         raise SceneError(
-            f"target.z: the back that this target needs would reach it, at z = {reach:.4g}; move the target further "
-            f"along +z or lower the front"
+            f"{key}: the back that this target needs would reach it, at z = {reach:.4g}; move it further along +z or "
+            f"lower the front"
         )

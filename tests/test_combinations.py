@@ -112,7 +112,7 @@ def elements(where, **more):
     """A window or a mirror; before a lens the light comes from below, before a mirror from above."""
 
     def element(chosen):
-        z = 20.0 if where == "behind" or "mirror" in chosen["front"] else -20.0
+        z = 30.0 if where == "behind" else 20.0 if "mirror" in chosen["front"] else -20.0
         return {where: [{"kind": "window", "z": z, "outline": {"shape": "circle", "diameter": 60.0}} | more]}
 
     return element

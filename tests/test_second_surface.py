@@ -47,6 +47,7 @@ def test_its_proof_through_the_file_knows_all_passes(folder):
     assert "Mirror face: light meets it" in text and "Back: light enters and leaves" in text
 
 
+@pytest.mark.bench  # batoid comes with the extra `judges`
 def test_batoid_sees_the_same_picture(folder):
     design = bstcad.open(folder)
     target, channels = design.scene.target, design.scene.judging_channels()

@@ -3,8 +3,8 @@
 A kernel has the values of its plain form to rounding, and takes the same tensors: the caller asks for one by name and
 runs the plain form where there is none, as on a GPU.  A kernel for a GPU is one more entry of a row and serves this one
 function.  Whatever the device, the blur by the image of a source, stage 1's transport, the map between two faces, the
-bounds and checks of a net's shape, and the rays by which a design is judged run on the CPU; the cosine transform of stage 2 is scipy's on the CPU and
-a product of matrices elsewhere.
+bounds and checks of a net's shape, and the rays by which a design is judged run on the CPU; the cosine transform of
+stage 2 is scipy's on the CPU and a product of matrices elsewhere.
 """
 
 from __future__ import annotations

@@ -59,7 +59,7 @@ FINEST = 4 * SINGLE  # of the largest coordinate: no tolerance of a mesh is fine
 class Accept(Record):
     """Limits of the checks in the report; None: the check only states its value."""
 
-    rrmsd: Annotated[float | None, Key("Greatest RRMSD of the light on a target.", "", 1e-6, 10.0, of_light=True)] = None
+    rrmsd: Annotated[float | None, Key("Greatest RRMSD of light on a target.", "", 1e-6, 10.0, of_light=True)] = None
     form: Annotated[float, Key("Greatest distance of lens.step from the tailored surface.", "mm", 1e-12, 1.0)] = 1e-6
     efficiency: Annotated[
         float | None,
@@ -278,11 +278,12 @@ class Scene(Record):
         before = tuple(replace(interface, status_if_missed=Status.MISSED_FRONT) for interface in met)
         return before, elements.interfaces(self.behind, 1, wavelength)
 
-    def clearance(self, highest: float) -> float:
-        """How far (mm) what follows passes a lens that reaches up to z = highest (mm); negative: it cuts it."""
-        room = [elements.lowest(self.behind) - highest] if self.behind else []
+    def clearance(self, highest: float) -> tuple[float, str]:
+        """How far (mm) what follows passes a lens up to z = highest (mm), negative where it cuts it; and its key."""
+        room = [(elements.lowest(self.behind) - highest, "behind[0].z")] if self.behind else []
         if not self.way.is_folded:
-            room += (target.clearance(self.lens, highest) for target in self.targets)
+            for target, key in zip(self.targets, self.target_keys, strict=True):
+                room.append((target.clearance(self.lens, highest), f"{key}.z"))
         return min(room)
 
     def flat_lens(
@@ -452,7 +453,7 @@ def _of_goals(scene: Scene) -> Iterator[str]:
     if goals < len(shaped):
         idle, busy = shaped
         yield (
-            f"lens.{idle}.optimise: one picture is the {busy}'s work alone, and the {idle} stays as it is; add a "
+            f"lens.{idle}.optimise: one picture is the {busy}'s work, and the {idle} hardly changes; add a "
             "second [[target]] or a [wavefront], or set lens.back.optimise = false to have the front tailored alone"
         )
     if goals > len(shaped):

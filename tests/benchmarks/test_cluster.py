@@ -13,6 +13,7 @@ import threading
 import time
 
 import distributed
+import psutil
 import pytest
 
 from bstcad import commands
@@ -22,7 +23,6 @@ from bstcad.sweep import batch as batches
 from bstcad.sweep.batch import Wanted
 from bstcad.tolerance import tolerancing
 from tests.benchmarks.cold import TEMPLATES
-from tests.sweep.test_cold_run import runs_under_way, wait_until
 
 pytestmark = pytest.mark.bench
 LETTERS = TEMPLATES / "thu.toml"
@@ -92,6 +92,18 @@ def losing(kills, lose):
     killer.start()
     yield
     killer.join()
+
+
+def runs_under_way(parent):
+    """The processes below a process that run the command line."""
+    return [p for p in psutil.Process(parent).children(recursive=True) if "bstcad.cli" in p.cmdline()]
+
+
+def wait_until(true, seconds):
+    until = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < until
+        time.sleep(0.05)
 
 
 def lose_one(address, keep):

@@ -147,7 +147,7 @@ class TestHtml:
         for verdict, report in (("pass", REPORT), ("remarks", remarked), ("fail", failing())):
             assert f'<div class="verdict {verdict}">' in page_of(tmp_path, report)
         page = page_of(tmp_path, remarked)
-        assert "✓ PASSED WITH REMARKS" in page and page.index("The lens is thick.") < page.index("<h2>Irradiance")
+        assert "✓ PASSED WITH REMARKS" in page and page.index("The lens is thick.") < page.index("<h2>Light on")
         assert printed(remarked).startswith("PASSED WITH REMARKS: Letters\nRemark: The lens is thick.\n")
 
     def test_where_no_limit_was_asked_neither_a_pass_nor_a_fail_is_said(self, tmp_path):
