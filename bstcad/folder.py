@@ -252,7 +252,7 @@ def write_geometry(design: Made, folder: Path, submit: Submit = here) -> Callabl
 
 def label(scene: scenes.Scene) -> Label:
     """Name and colour of a mesh of the scene's lens."""
-    if scene.optic == "mirror":
+    if not scene.lens.passes.enters:
         return Label(scene.name, scene.title, "mirror", SILVER)
     return Label(scene.name, scene.title, scene.lens.material or "glass")
 

@@ -125,10 +125,14 @@ def test_a_plate_brings_the_image_nearer(folds):
     torch.testing.assert_close(real.position, seen.position, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("plane", [LevelPlane(60.0), TiltedPlane((-40.0, 5.0, 70.0), (5.0, 35.0))])
-@pytest.mark.parametrize("window", [(), ("window",)])
+NEAR, LEVEL, LEANING = LevelPlane(14.0), LevelPlane(60.0), TiltedPlane((-40.0, 5.0, 70.0), (5.0, 35.0))
+
+
+@pytest.mark.parametrize(
+    "plane, window", [(NEAR, ()), (LEVEL, ()), (LEANING, ()), (LEVEL, ("window",)), (LEANING, ("window",))]
+)
 def test_light_out_of_the_glass_lands_where_it_is_sent(plane, window):
-    """Through a flat back, and past a window to first order in the angle."""
+    """Through a flat back, of a plane that is near in less air than glass, and past a window to first order."""
     back = Interface(Plane(10.0), bstcad.Circle(300.0), Refract(1.5, 1.0), Status.VIGNETTED)
     behind = (back, *interfaces([made(kind, z=30.0, thickness=0.01, index=1.5) for kind in window], 1, 587.6))
     rays = random_rays(z=2.0)

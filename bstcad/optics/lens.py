@@ -84,8 +84,8 @@ class Lens:
 
     @property
     def deflection(self) -> float:
-        """The angle by which its back deflects a ray, over the slope angle of the back, both small."""
-        return self.passes.deflection("back", self.index)
+        """The largest angle by which a face of it deflects a ray, over the slope angle of the face, both small."""
+        return max(self.passes.deflection(face, self.index) for face in self.passes.faces)
 
     def number_of(self, face: Face) -> int:
         """Return which of the interfaces a face of the solid is first; ValueError for one that no light meets."""

@@ -22,7 +22,8 @@ from bstcad.optics.receivers import LevelPlane, Plane, Receiver, dot
 from bstcad.optics.surfaces import sag
 from bstcad.optics.tilted import Tilted
 
-STEPS = 12  # to the place of a flat face from which light goes to a place of a receiver; each is a tenth as long, or so
+STEPS = 8  # steps of Newton's method to the place of a flat face from which light goes to a place of a receiver
+TINY = 1e-300  # instead of 0, as a divisor
 STRAIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -106,15 +107,23 @@ class BehindGlass(Receiver):
     def way_to(self, rays: Rays, aim: Tensor) -> Tensor:
         """(3, …) the unit vectors along which rays in the glass go to places (2, …) of the receiver.
 
-        From where the straight way meets the face the light goes on to the place; before the face it comes along
-        (s_x / η, s_y / η), s its direction behind, from somewhere else on the face: so again, until both agree.
+        From a place of the face the light goes on along s to the receiver, d behind it, and before the face it comes
+        along i = (s_x / η, s_y / η) through t of glass from another place of the face.  Newton's method makes both one:
+        as the place moves by 1, the other one moves back by k = t s_z / (η d i_z) across the plane of incidence, and
+        by k (s_z / i_z)² in it.
         """
         below, way = rays.above(self.z), self.rest.way_to(rays, aim)
+        at = rays.position - below / way[2] * way
         for _ in range(STEPS):
-            at = replace(rays, position=rays.position - below / way[2] * way)
-            out = self.rest.way_to(at, aim)
-            sines = out[:2] / torch.sqrt((out * out).sum(0)) / self.eta
+            out = self.rest.way_to(replace(rays, position=at), aim)
+            length = torch.sqrt((out * out).sum(0))
+            sines = out[:2] / length / self.eta
             way = torch.cat([sines, (torch.sign(out[2]) * torch.sqrt(1 - (sines * sines).sum(0)))[None]])
+            apart = rays.position - below / way[2] * way - at
+            back, bent = (below / (self.eta * length * way[2])).abs(), (out[2] / length / way[2]) ** 2
+            radial = torch.cat([sines, torch.zeros_like(sines[:1])])
+            within = radial * ((radial * apart).sum(0) / (radial * radial).sum(0).clamp_min(TINY))
+            at = at + (apart - within) / (1 + back) + within / (1 + back * bent)
         return way
 
 

@@ -113,8 +113,10 @@ def complaints(effects: Effects, lens: LensBlank) -> Iterator[str]:
                 f"bstcad.effect({effect.name!r}, …) first, or install its package"
             )
         if {"absorption": not glass, "ghost": lens.passes.reflects}.get(effect.kind):
-            why = "light goes back to where it came from" if glass else "light does not enter a mirror"
-            yield f"{key}: {why} (lens.{lens.passes.mirror}.reflect), so it has no {effect.kind}; remove the table"
+            by = f"(lens.{lens.passes.mirror}.reflect)"
+            bare = f"light does not enter a mirror {by}, so it has no {effect.kind}"
+            why = f"ghosts of a mirror behind glass {by} are not simulated" if glass else bare
+            yield f"{key}: {why}; remove the table"
         if not glass and getattr(effect, "coating", None) is not None:
             bare = "a mirror's face (lens.back.reflect) is bare metal"
             yield f"{key}.coating: {bare}; remove it, or name the metal by {key}.metal"

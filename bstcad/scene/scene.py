@@ -450,7 +450,7 @@ def _of_goals(scene: Scene) -> Iterator[str]:
             different.append(alike)
     pictures, shaped = len(different), lens.shaped
     goals = pictures + (wave is not None)
-    if goals < len(shaped):
+    if goals < len(shaped) and not lens.passes.reflects:  # light crosses the other face of such a mirror twice
         idle, busy = shaped
         yield (
             f"lens.{idle}.optimise: one picture is the {busy}'s work, and the {idle} hardly changes; add a "

@@ -118,7 +118,9 @@ def _of_glass(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
         yield _absorption(scene, reference)
     if len(scene.source.lines) == 1:
         yield _dispersion(scene, reference)
-    if not scene.lens.passes.reflects and named(scene.effects, Ghost) is None:
+    if scene.lens.passes.reflects:
+        yield _entry("ghost", None, "ghosts of a mirror behind glass are not simulated")
+    elif named(scene.effects, Ghost) is None:
         reflecting = _central(scene, *(() if named(scene.effects, Fresnel) else (bare,)))
         yield _entry(
             "ghost", reference.ghost(reflecting), "roughly, since it may gather to a spot", '[[effects]] kind = "ghost"'
