@@ -271,8 +271,8 @@ def write_design(design: Made, irradiances: Sequence[np.ndarray], folder: Path) 
     and reachable_2, and so on.
     reachable (rows, columns): 1 in the pixels that light can reach; no such array where it reaches all that are to be
     lit.  The transport map, if known (TransportMap): transport_x (c,) and transport_y (r,), mm on the target;
-    transport_back or transport_entrance (c, r, 2), x and y (mm) where the light for them passes the back, or the
-    plane of the first vertex.
+    transport_back or transport_entrance (c, r, 2), x and y (mm) where the light for them meets the last tailored face
+    (the back; the front where it is tailored alone, and of a mirror behind glass), or the plane of the first vertex.
     """
     (m, n), front, sent = design.lens.back.shape, design.lens.front, design.transport
     parts = ((k, goal.reachable) for k, goal in enumerate(design.goals))

@@ -1,6 +1,7 @@
 """The table in docs/how-to/two-faces.md: the sixteen basic systems of Anthonissen et al. 2021, each as a small scene.
 
-Eight lenses and four mirrors are designed; for the other four a mirror has one face too few, which the scene says.
+Eight lenses and four mirrors are designed; for the other four a mirror in air has one face too few, which the
+scene says.
 """
 
 from __future__ import annotations

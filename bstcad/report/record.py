@@ -378,7 +378,7 @@ def remarks(report: Contents, scene: Scene, goals: Sequence[Goal], irradiances: 
 
 
 def too_steep(found: Steepness) -> list[str]:
-    """The light that would need a steeper back than a height over a plane carries; nothing if hardly any does."""
+    """The light that would need a steeper face than a height over a plane carries; nothing if hardly any does."""
     sent = {"steep_share": found.share, "steepest_deg": found.steepest}
     return [remark.text for remark in written("remarks.txt.j2", "steep", sent=sent)]
 

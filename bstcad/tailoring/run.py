@@ -202,7 +202,8 @@ class Step:
     make: Callable[[], Lens] | None  # the best lens so far, in the form to go on with; None: there is none yet
     state: Any = None  # the stage goes on from here with this alone; None: it cannot be left here
     mapping: Mapping | None = None  # stage 1: the transport map that the lens follows
-    # of a map from the back: the places there (mm) for each corner of the target's pixels, (columns + 1, rows + 1)
+    # places (mm) on the last tailored face for each corner of the target's pixels, x and y, (columns + 1, rows + 1);
+    # None: the map of `mapping` begins elsewhere
     places: tuple[np.ndarray, np.ndarray] | None = None
     progress: tuple[str, int, int, str] | None = None  # stage, done, total, text
     rrmsd: float | None = None  # of the lens, by the rays that tailor it

@@ -262,7 +262,10 @@ def rays_at(grid: FaceGrid, b: tuple) -> Rays:
 
 
 def sent_from(places: tuple[np.ndarray, np.ndarray], screen: Screen) -> TransportMap:
-    """The map by the places of the back (mm) for the target's pixel corners, each (columns + 1, rows + 1)."""
+    """Return the map by places (mm) on the last tailored face for the target's pixel corners.
+
+    places: x and y, each (columns + 1, rows + 1).  The plane of the map is called "back", of a front as well.
+    """
     x, y = (np.linspace(*ends, n + 1) for ends, n in ((screen.x, screen.columns), (screen.y, screen.rows)))
     i, j = nodes(screen.columns), nodes(screen.rows)
     source = np.stack([place[np.ix_(i, j)] for place in places], axis=-1)

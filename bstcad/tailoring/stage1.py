@@ -38,7 +38,7 @@ COARSE = (Fit(bending=1e-2, steps=40, degree=3), 0.0)  # stiff: it also extrapol
 FINE = (Fit(), 1e-2)  # there it holds on to the coarse face
 FINE_ROUNDS = 2  # the last ones, on half of the transport's grid and on all of it
 # The other way is tried from this RRMSD on, and where the map has not settled: where in the last round the places of
-# the target moved by more than this share of the back face.  (Found: at most 0.016 where more rounds gain nothing.)
+# the target moved by more than this share of the face.  (Found: at most 0.016 where more rounds gain nothing.)
 RETRY_ABOVE, UNSETTLED = 0.25, 0.025
 SETTLED = 0.01  # of the same share: the coarse rounds end where the places moved by less
 LIT = 1026  # cells a side, at most, each of which is asked whether light meets it: each costs the search for a ray

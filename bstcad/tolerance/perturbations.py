@@ -49,8 +49,8 @@ class Setup:
     def pivot(self, part: str) -> Vector:
         """Point about which a part ("lens", "source", "screen") tilts.
 
-        Of the lens half way between its faces' vertices (of a mirror the vertex), of the source the weighted mean of
-        its points or the middle of its aperture, of the screen its middle.
+        Of the lens half way between its faces' vertices (of a mirror in air the vertex), of the source the weighted
+        mean of its points or the middle of its aperture, of the screen its middle.
         """
         if part == "screen":
             return self.screen.middle
@@ -217,12 +217,12 @@ def _shapes(setup: Setup, material: str | None) -> Iterator[Kind]:
     """Errors of the lens's shape, glass and temperature, and of the wavelength."""
     optic, refracts = setup.lens.passes.optic, setup.lens.passes.enters
     if refracts:
-        yield Kind("lens.thickness", "thickness of the lens", "mm", _thicker)
+        yield Kind("lens.thickness", f"thickness of the {optic}", "mm", _thicker)
         yield Kind("lens.index", "refractive index", "", lambda setup, by: setup.with_indices(lambda n: n + by))
         yield Kind("lens.front_power", "sag of the front at its rim", "mm", _front_power)
     yield Kind("lens.scale", f"scale of the {optic} (shrinkage)", "", lambda s, by: s.with_lens_scaled(1 + by))
     if material in THERMAL and refracts:
-        yield Kind("temperature", f"temperature of the lens ({material})", "K", partial(_warmer, material))
+        yield Kind("temperature", f"temperature of the {optic} ({material})", "K", partial(_warmer, material))
     if material is not None and refracts and _disperses(material, setup):
         yield Kind("wavelength", "wavelength of the light", "nm", partial(_redder, material))
 
@@ -286,9 +286,9 @@ def _larger(setup: Setup, by: float) -> Setup:
 
 
 def _alignments(lens: Lens) -> Iterator[Kind]:
-    """Wedge of two refracting faces, and decentre of the front, which of a plane does nothing."""
+    """Wedge of the two faces that light meets, and decentre of the front, which of a plane does nothing."""
     for axis, name in enumerate("xy" if "front" in lens.passes.faces else ""):
-        words = f"wedge of the lens, the tilt of its back about {name} to the front"
+        words = f"wedge of the {lens.passes.optic}, the tilt of its back about {name} to the front"
         yield Kind(f"lens.wedge_{name}", words, "deg", partial(_wedged, axis))
         if not lens.front.level:
             words = f"decentre of the front in {name} to the back"

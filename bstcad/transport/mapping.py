@@ -85,8 +85,10 @@ class TransportMap:
     x: np.ndarray  # (c,) mm on the target plane, ascending, float64
     y: np.ndarray  # (r,) mm on the target plane, ascending, float64
     source: np.ndarray  # (c, r, 2) float32, x and y (mm) in the scene's frame where the light for (x, y) passes `plane`
-    # "back": the back face.  "entrance": the plane z = const through the vertex of the face that light meets first,
-    # where Wang et al.'s own map begins (tailoring.method "adam" and "integration", strong lenses near the source)
+    # "back": the last tailored face in the order of the light, which is the front of a lens whose front is tailored
+    # alone and of a mirror behind glass.  "entrance": the plane z = const through the vertex of the face that
+    # light meets first, where Wang et al.'s own map begins (tailoring.method "adam" and "integration", strong lenses
+    # near the source)
     plane: str
 
     @property

@@ -137,7 +137,7 @@ DESIGNS: dict[str, Hard] = {
     "source 500 mm before": Hard("disk", {"source.position": [0.0, 0.0, -485.0]}, rrmsd=0.02, bench=True),
     "index 1.05": Hard(  # more rounds come nearer to the picture, with less of the light
         "disk", {**_PICTURE, "lens.index": 1.05}, rrmsd=0.19, efficiency=0.95, rough={"tailoring.rounds": 3},
-        says=(CHANGED, MISSED, MISSES, SIDES), perhaps=(OUTSIDE, "would need a back steeper"),
+        says=(CHANGED, MISSED, MISSES, SIDES), perhaps=(OUTSIDE, "would need a face steeper"),
     ),
     "index 1.05, a target it cannot reach": Hard(  # without a surface for it each round ends elsewhere
         "disk", {"lens.index": 1.05}, rrmsd=0.6, efficiency=0.9, rough={"tailoring.rounds": 3},
@@ -159,7 +159,7 @@ DESIGNS: dict[str, Hard] = {
     ),
     "two faces, rays that cross": Hard(
         "disk", _two_faces(6.0, _even(100.0, 3.2), _even(150.0, 3.2, text="AB"), width=14.0), rrmsd=0.65,
-        efficiency=0.8, told=(CROSSED,), says=(MISSED, MISSED, "back steeper than", OUTSIDE, OUTSIDE),
+        efficiency=0.8, told=(CROSSED,), says=(MISSED, MISSED, "face steeper than", OUTSIDE, OUTSIDE),
         perhaps=(CLOSE, LIFTED, STEEP, DARK), bench=True,
     ),
     "two faces, rays that all cross": Hard(
@@ -169,7 +169,7 @@ DESIGNS: dict[str, Hard] = {
     ),
     "two faces, more than a front can turn": Hard(
         "disk", _two_faces(6.0, _even(150.0, 9.0), width=24.0, wavefront={"kind": "plane", "z": 150.0}), rrmsd=2.0,
-        efficiency=0.95, told=(IN_GLASS,), says=(MISSED, DARK, "back steeper than"),
+        efficiency=0.95, told=(IN_GLASS,), says=(MISSED, DARK, "face steeper than"),
         perhaps=(CHANGED, OUTSIDE, CLOSE, LIFTED, STEEP, "The facets of"), bench=True,
     ),
     "back through the front": Hard("thu", {"lens.front.z": 16.0}, rrmsd=0.2, says=(MOVED, MISSED, LIFTED)),
