@@ -22,6 +22,7 @@ import torch
 
 import bstcad
 from bstcad import commands
+from bstcad.analysis.steepness import Steepness
 from bstcad.app.preview import Pains, preview
 from bstcad.optics.measure import Effort
 from bstcad.optics.outlines import Circle, Rectangle
@@ -31,6 +32,7 @@ from bstcad.report.figure_jobs import NoPictures
 from bstcad.scene.blank import as_front, net_extent
 from bstcad.scene.errors import SceneError
 from bstcad.sweep.plan import plan
+from bstcad.sweep.prediction import Pilot, fly, made_small, of_quality, usual
 from tests.conftest import verify_with
 
 # --- the choices ------------------------------------------------------------------------------------------------------
@@ -332,11 +334,28 @@ class Words(NoPictures):
         assert all(sheet.tables.values())
 
 
+FLOWN = 3  # of so many scenes one has a real pilot; each has the small scene that a pilot designs
+
+
+def piloted():
+    """`fly` for some scenes: a pilot is one more design, of the same choices."""
+    scenes = itertools.count()
+
+    def pilot(scene, quality, tick):
+        small, factor = made_small(of_quality(scene, quality))
+        if next(scenes) % FLOWN == 0:
+            return fly(scene, quality, tick)
+        return Pilot(small, usual(small), 0.1, factor=factor, detail=0.0, blurred=0.0, steep=Steepness(0.0, 0.0))
+
+    return pilot
+
+
 @pytest.fixture(scope="module", autouse=True)
 def quick():
     """Few rays and tubes, and no figures."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bstcad.commands.Pictures", Words)
+        patch.setattr("bstcad.sweep.plan.fly", piloted())
         verify_with(patch, EFFORT)
         for where, figures in COARSE.items():
             for name, figure in figures.items():

@@ -104,7 +104,7 @@ def test_a_back_that_would_reach_the_front_or_the_target_is_refused():
     lens = near.flat_lens(near.lens.back.net)
     with pytest.raises(SceneError, match=r"^lens\.front\.z: .* cross the front by 0\.5 mm; lower the front"):
         pipeline.check_thickness(lens.with_back(lens.back.moved(lens.front.z - 0.5)), near)
-    with pytest.raises(SceneError, match=r"^target\.z: .* reach it, at z = 24\.5; move the target further"):
+    with pytest.raises(SceneError, match=r"^target\.z: .* reach it, at z = 24\.5; move it further"):
         pipeline.check_thickness(lens.with_back(lens.back.moved(24.5)), near)
     pipeline.check_thickness(lens.with_back(lens.back.moved(23.5)), near)
 

@@ -447,7 +447,8 @@ def test_a_tilted_plane_passes_the_lens_by_so_much(outline, tilt):
     turns = np.linspace(0.0, 2 * np.pi, 3601)
     rim = (12.0 * np.cos(turns), 12.0 * np.sin(turns)) if outline.is_round else outline.places()
     highest = max(scene.target.screen.plane.height((x, y, 25.0)) for x, y in zip(*rim, strict=True))
-    assert scene.clearance(25.0) == pytest.approx(-highest, rel=1e-5)
+    room, key = scene.clearance(25.0)
+    assert room == pytest.approx(-highest, rel=1e-5) and key == "target.z"
 
 
 @pytest.mark.parametrize(("path", "changes", "part"), [
