@@ -64,7 +64,7 @@ from bstcad.verify.verdict import Check, verdict
 BEHIND, LEAST = 2.0, 0.5  # seconds of a run with a time limit: behind the last rays; at least for rays
 
 Drawing = Callable[..., Pictures]  # from (scene, submit): NoPictures for a folder without figures
-# What a script adds to a report: checks of a proof and the folder of its files; (heading, HTML without scripts).
+# Additions of a script to a report: checks of a proof and the folder of its files; (heading, HTML without scripts).
 OwnCheck = Callable[[Proof, Path], Iterable[Check]]
 OwnSection = Callable[[Contents], tuple[str, str]]
 

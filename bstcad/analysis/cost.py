@@ -173,9 +173,9 @@ def _octaves(error: np.ndarray, per_unit: float) -> list[dict[str, Any]]:
 # --- where the light misses its target --------------------------------------------------------------------------------
 # A target and an irradiance of one sum, (rows, columns) with row 0 at y max.
 
-DARK = 0.01  # of the picture's mean: darker is dark
-UNLIT = 0.1  # of the target's irradiance: a pixel with less of it was left dark
-PATCH = 5e-3  # of the lit area: less of it left dark is not worth a sentence
+DARK = 0.01  # share of the picture's mean below which a pixel is dark
+UNLIT = 0.1  # share of the target's irradiance below which a pixel was left dark
+PATCH = 5e-3  # share of the lit area left dark, below which no sentence says so
 
 
 def unlit(target: np.ndarray, irradiance: np.ndarray, screen: Screen) -> dict[str, Any]:

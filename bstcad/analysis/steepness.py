@@ -38,10 +38,11 @@ def needed(
     source: Emitter, lens: Lens, screen: Screen, picture: np.ndarray, *, x: np.ndarray, y: np.ndarray,
     places: np.ndarray, at_back: bool = True,
 ) -> Steepness:  # fmt: skip
-    """By the places (c, r, 2) (mm) on the face where the light passes for points x (c,) by y (r,) (mm) of the screen.
+    """Return the steepness by the places (c, r, 2) (mm) on the face through which light goes to points of the screen.
 
-    screen: where light behind the face sees it (unfolding.imaged); picture: the irradiance that is wanted there (rows,
-    columns), row 0 = y max.  at_back False: the places lie on the plane of the first vertex.
+    x (c,), y (r,): these points (mm).  screen: where light behind the face sees it (unfolding.imaged).
+    picture: (rows, columns) the irradiance that is wanted there, row 0 = y max.  at_back False: the places lie on the
+    plane of the first vertex.
     """
     i, j = (np.unique(np.linspace(0, n - 1, min(n, MOST)).round().astype(int)) for n in (len(x), len(y)))
     x, y, places = x[i], y[j], places[np.ix_(i, j)]

@@ -36,7 +36,7 @@ SPREAD_POINTS = 16  # of a source of some size, that the picture is taken by
 class State:
     """How a run stands."""
 
-    __pydantic_config__ = {"extra": "forbid", "strict": True, "allow_inf_nan": False}  # of a file that is read
+    __pydantic_config__ = {"extra": "forbid", "strict": True, "allow_inf_nan": False}  # rules for reading a file
 
     state: str  # running | finished | stopped | refused | failed
     process: int = 0  # its number, while it runs

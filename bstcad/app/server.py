@@ -570,7 +570,7 @@ def _zipped(name: str, paths: list[tuple[str, Path]]) -> Iterator[bytes]:
 
 
 class _Written(bytearray):
-    """What a ZIP archive has written since it was sent last."""
+    """Bytes that a ZIP archive has written and that are yet to be sent."""
 
     def write(self, data: bytes) -> int:
         self.extend(data)

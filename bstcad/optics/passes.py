@@ -104,7 +104,7 @@ class Passes:
         return face if Refract in laws else "mirror face" if laws else "rear"
 
     def role(self, face: Face) -> str:
-        """What light does at a face, in words."""
+        """Say what light does at a face."""
         crossings = [k for k in self.numbers_of(face) if self.steps[k].law is Refract]
         ends = {0: "enters", len(self.steps) - 1: "leaves"}
         does = " and ".join(ends[k] for k in crossings if k in ends)

@@ -303,7 +303,7 @@ class Recess(Surface):
         return self.face
 
     def __post_init__(self) -> None:
-        for name in ("z", "kind", "curvature", "conic_constant", "conic", "parameters"):  # those of the optical part
+        for name in ("z", "kind", "curvature", "conic_constant", "conic", "parameters"):  # facts of the optical part
             object.__setattr__(self, name, getattr(self.face, name))
 
     @property

@@ -56,7 +56,7 @@ class Moved:
     rms: float  # weighted by flux, as the others in `unit`
     most: float
     pixel: float  # the shorter side of a pixel of the target
-    unit: str  # of the target's x and y
+    unit: str  # unit of the target's x and y
 
     def __str__(self) -> str:
         """Both distances in their unit and in pixels."""

@@ -15,7 +15,7 @@ from pathlib import Path
 from posixpath import dirname, join, normpath
 
 PLACES = (Path(__file__).parents[1] / "manual", Path(__file__).parents[2] / "docs")  # in a wheel, in sources
-SITES = (Path(__file__).parents[1] / "site", Path(__file__).parents[2] / "docs/_build/html")  # of built pages, alike
+SITES = (Path(__file__).parents[1] / "site", Path(__file__).parents[2] / "docs/_build/html")  # folders of built pages
 FIRST = "index"  # name of the first page
 PAGES = ("checks", "remarks")  # pages of sections, without ".md"
 SECTION = re.compile(r"^\(([\w-]+)\)=\n+(### .+?)(?=\n+^(?:\([\w-]+\)=$|#{1,2} )|\s*\Z)", re.M | re.S)

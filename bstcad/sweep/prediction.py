@@ -225,7 +225,7 @@ def usual(scene: Scene) -> Seconds:
     first += transport * sum((grid / GRID) ** 2 for grid in grids) * knobs.transport_iterations / ITERATIONS
     fits = [fitted for level in knobs.levels[-2:] for fitted in scene.lens.nets(level)]
     first += FIT * sum(math.prod(both(fitted)) for fitted in fits) / POINTS**2
-    each, begun = CALLED + VARIABLE * net, JUDGING * pixels ** (2 / 3)  # of an evaluation, and of a round
+    each, begun = CALLED + VARIABLE * net, JUDGING * pixels ** (2 / 3)  # seconds of an evaluation and a round
     if scene.source.extent is not None:
         each, begun = each + BLUR * pixels, begun + IMAGES
     launched = sum((tubes / TUBES) ** 2 for tubes, _ in sheets)

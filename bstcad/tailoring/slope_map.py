@@ -230,7 +230,7 @@ def gathering(
     aim = torch.stack([torch.full_like(x, m) for m in middle])
     z_x, z_y = wanted_slopes(faces, aim, plane, lens.last_freeform.law)
     lit = grid.density[thin] > 0
-    able = room(faces, aim, plane, law=lens.last_freeform.law) >= 0  # of the others the slope is a makeshift
+    able = room(faces, aim, plane, law=lens.last_freeform.law) >= 0  # elsewhere the slope is a makeshift
     return fit_gathering(grid, (x, y, z_x, z_y, lit), fit if bool(able[lit].all()) else ROUGHLY)
 
 

@@ -140,7 +140,7 @@ def _main(setup: Setup) -> tuple[Emitter, Lens]:
 
 
 class Traced(Protocol):
-    """What is traced of a setup with errors: Pictures, or Wavefronts."""
+    """Protocol of what is traced of a setup with errors: Pictures, or Wavefronts."""
 
     setup: Setup
     perturbations: tuple[Perturbation, ...]
