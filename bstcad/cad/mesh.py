@@ -418,10 +418,13 @@ def read_stl(path: str | Path) -> Mesh:
         raise ValueError(f"{path.name}: a corner is not finite; write it again")
     corners = np.ascontiguousarray(corners) + np.float32(0)  # -0 becomes 0
     bits = corners.view(np.uint32)
-    _, first, same = np.unique((bits * ODD).sum(axis=1), return_index=True, return_inverse=True)
-    if not np.array_equal(bits[first[same]], bits):  # two corners of one key, which no surface has by accident
-        _, first, same = np.unique(bits, axis=0, return_index=True, return_inverse=True)
-    return Mesh(corners[first].astype(np.float64), same.reshape(-1, 3))
+    key = bits[:, 0] * ODD[0] + bits[:, 1] * ODD[1] + bits[:, 2] * ODD[2]
+    unique, same = np.unique(key, return_inverse=True)
+    vertices = np.empty((len(unique), 3), np.float32)
+    vertices[same] = corners
+    if not np.array_equal(vertices[same], corners):  # two corners of one key, which no surface has by accident
+        vertices, same = np.unique(corners, axis=0, return_inverse=True)
+    return Mesh(vertices.astype(np.float64), same.reshape(-1, 3))
 
 
 # ---- 3MF -----------------------------------------------------------------------------------------------------------

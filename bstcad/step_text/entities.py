@@ -20,9 +20,11 @@ MAX_DIGITS = 64  # characters of a number; 17 digits, a sign and an exponent are
 
 NAME = r"[1-9]\d{0,17}"  # an entity's number: one of 64 bits
 REAL = r"[-+]?\d+\.\d*(?:E[-+]?\d+)?"
-COORDINATE = rf"[-+]?\d{{1,{MAX_DIGITS}}}\.\d{{0,{MAX_DIGITS}}}(?:E[-+]?\d{{1,4}})?"
+COORDINATE = rf"[-+]?\d{{1,{MAX_DIGITS}}}+\.\d{{0,{MAX_DIGITS}}}+(?:E[-+]?\d{{1,4}}+)?"
 BLANKS = bytes(code for code in range(256) if chr(code).isspace())
-STRING = re.compile(r"'[^']*(?:''[^']*)*'|/\*.*?(?:\*/|\Z)", re.DOTALL)  # or a comment, in which a quote means nothing
+STRING = re.compile(  # a string or a comment, after all text and empty strings before it, which cost no call
+    r"((?:[^'/]++|''(?!')|/(?!\*))*+)('[^']*(?:''[^']*)*'|/\*.*?(?:\*/|\Z)|'|\Z)", re.DOTALL
+)
 POINT = re.compile(rf"(?<=;)#({NAME})=CARTESIAN_POINT\('\d*',\(({COORDINATE},{COORDINATE},{COORDINATE})\)\);")
 STATEMENT = re.compile(rf"#({NAME})=([A-Z][A-Z_0-9]*)?(\(.*\))", re.DOTALL)
 TOKENS = re.compile(  # tokens without blanks: separators, references, numbers, strings, enumerations, keywords
@@ -69,12 +71,13 @@ def without_blanks(text: str) -> tuple[str, list[str]]:
     strings: list[str] = []
 
     def numbered(hit: re.Match[str]) -> str:
-        if hit[0].startswith("/*"):
-            return ""
-        if hit[0] == "''":
+        before, token = hit.groups()
+        if token.startswith("/*"):
+            return before
+        if len(token) < 3:  # an empty string, the end, or a quote that nothing closes
             return hit[0]
-        strings.append(hit[0][1:-1])
-        return f"'{len(strings) - 1}'"
+        strings.append(token[1:-1])
+        return f"{before}'{len(strings) - 1}'"
 
     data = STRING.sub(numbered, text)
     return data.encode("latin-1", "replace").translate(None, BLANKS).decode("latin-1"), strings
