@@ -26,6 +26,10 @@ STRING = re.compile(  # a string or a comment, after all text and empty strings 
     r"((?:[^'/]++|''(?!')|/(?!\*))*+)('[^']*(?:''[^']*)*'|/\*.*?(?:\*/|\Z)|'|\Z)", re.DOTALL
 )
 POINT = re.compile(rf"(?<=;)#({NAME})=CARTESIAN_POINT\('\d*',\(({COORDINATE},{COORDINATE},{COORDINATE})\)\);")
+WRITTEN = re.compile(  # points in a row as OCC writes them, nine tenths of a file, which need no second look
+    rf"(?<=;\n)((?:#[1-9]\d{{0,14}}+ = CARTESIAN_POINT\('',\({COORDINATE},\s*+{COORDINATE},\s*+{COORDINATE}\)\);\n)++)"
+)
+TAKEN = "\0"  # stands where points were taken out of the text
 STATEMENT = re.compile(rf"#({NAME})=([A-Z][A-Z_0-9]*)?(\(.*\))", re.DOTALL)
 TOKENS = re.compile(  # tokens without blanks: separators, references, numbers, strings, enumerations, keywords
     r"[(),;]++|(?:#\d{1,20}+,)++|#\d{1,20}+(?=[)=])=?|'\d*+'|\.[A-Z_0-9]++\.|[$*](?=[,)])|!?[A-Z_][A-Z_0-9]{0,99}+(?=\()"
@@ -83,20 +87,29 @@ def without_blanks(text: str) -> tuple[str, list[str]]:
     return data.encode("latin-1", "replace").translate(None, BLANKS).decode("latin-1"), strings
 
 
-def read_entities(data: str, strings: Sequence[str]) -> Entities:
-    """Read the statements of the DATA section."""
+def read_entities(text: str) -> tuple[str, Entities]:
+    """Read a STEP file: (its text without blanks and points, the entities of its DATA section)."""
+    parts = [text] if TAKEN in text else WRITTEN.split(text)
+    data, strings = without_blanks(TAKEN.join(parts[::2]))
     start, end = data.find("DATA;"), data.rfind("ENDSEC;")
+    if data.count(TAKEN, start, end) != len(parts) // 2:  # some stand in a string, a comment or another section
+        parts = [text]
+        data, strings = without_blanks(text)
+        start, end = data.find("DATA;"), data.rfind("ENDSEC;")
     if not 0 <= start < end:
         raise damaged("it has no DATA section")
-    parts = POINT.split(data[start + len("DATA") : end])  # from its semicolon on
+    written = "".join(parts[1::2])[1:-4].replace(" = CARTESIAN_POINT('',(", ",").replace("));\n#", ",")
+    table = np.fromstring(written, dtype=np.float64, sep=",").reshape(-1, 4)  # numbers below 1e15 are exact
+    section = data[start + len("DATA") : end]  # from its semicolon on
+    parts = POINT.split(section.replace(TAKEN, "") if written else section)
     rest, names, values = "".join(parts[::3]), parts[1::3], parts[2::3]
     *texts, tail = rest[1:].split(";")
     hits = [STATEMENT.fullmatch(each) for each in texts]
     if tail or not hits or None in hits:
         raise damaged("a statement is no entity")
     _check_tokens(rest, hits)
-    numbers = np.fromstring(",".join(names), dtype=np.int64, sep=",")
-    xyz = np.fromstring(",".join(values), dtype=np.float64, sep=",").reshape(-1, 3)
+    numbers = np.concatenate([table[:, 0].astype(np.int64), np.fromstring(",".join(names), dtype=np.int64, sep=",")])
+    xyz = np.concatenate([table[:, 1:], np.fromstring(",".join(values), dtype=np.float64, sep=",").reshape(-1, 3)])
     known = np.sort(np.concatenate([numbers, np.array([hit[1] for hit in hits], dtype=np.int64)]))
     if not (np.diff(known) > 0).all():
         raise damaged("two entities share a number")
@@ -109,7 +122,8 @@ def read_entities(data: str, strings: Sequence[str]) -> Entities:
     if np.abs(xyz).max(initial=0.0) > MAX_COORDINATE:
         raise ValueError(f"a CARTESIAN_POINT is over {MAX_COORDINATE:g} away; write the file again")
     order = np.argsort(numbers)
-    return Entities({hit[1]: (hit[2] or "COMPLEX", hit[3]) for hit in hits}, strings, numbers[order], xyz[order])
+    bodies = {hit[1]: (hit[2] or "COMPLEX", hit[3]) for hit in hits}
+    return data, Entities(bodies, strings, numbers[order], xyz[order])
 
 
 def damaged(fault: str) -> ValueError:

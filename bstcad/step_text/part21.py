@@ -24,7 +24,7 @@ from bstcad.runs import files
 from bstcad.runs.files import one_line
 from bstcad.step_text import beginning
 from bstcad.step_text.assembly import placement_of, products_of
-from bstcad.step_text.entities import NAME, REAL, Entities, damaged, read_entities, without_blanks
+from bstcad.step_text.entities import NAME, REAL, Entities, damaged, read_entities
 from bstcad.step_text.placement import Placement, unmoved
 
 MAX_BYTES = 600_000_000  # of a file: 2049 x 2049 control points, 130 bytes each with all references to them
@@ -164,8 +164,7 @@ def _parse(text: bytes) -> StepText:
         raise ValueError(fault)
     if b"END-ISO-10303-21;" not in text[-200:]:
         raise ValueError("the file is truncated (no END-ISO-10303-21 at its end); write or copy it again")
-    data, strings = without_blanks(text.decode("latin-1"))  # Part 21 is ASCII; latin-1 never fails
-    entities = read_entities(data, strings)
+    data, entities = read_entities(text.decode("latin-1"))  # Part 21 is ASCII; latin-1 never fails
     lengths, angles = (_units(kind, entities) for kind in ("LENGTH", "PLANE_ANGLE"))
     if len(lengths) != 1:
         raise ValueError(f"{len(lengths)} units of length ({', '.join(lengths)}); export it in millimetres only")
@@ -181,7 +180,7 @@ def _parse(text: bytes) -> StepText:
         product=_product(entities),
         unit=unit,
         angle=", ".join(angles) or "radian",
-        schema=_schema(data, strings),
+        schema=_schema(data, entities.strings),
         solids=len(solids),
         faces=len(_shell_faces(entities)),
         surface=surface,
