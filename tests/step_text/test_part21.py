@@ -43,6 +43,12 @@ def test_the_surface_is_read_as_it_stands():
         assert full.tolist() == [0, 0, 0, 1, 2, 2, 2]
 
 
+@pytest.mark.parametrize(("begin", "end"), [("/*;\n", "*/"), ("#70 = TEXT(';\n", "');\n")])
+def test_points_within_a_comment_or_a_string_are_no_points(begin, end):
+    found = part21.parse(text(product=PRODUCT + begin + POINTS + end))  # else two entities would share a number
+    assert np.array_equal(found.surface.control_points, NET)
+
+
 def test_names_units_and_schema():
     found = part21.parse(text())
     assert found.product == "it's #1; (a 鏡) lens"
