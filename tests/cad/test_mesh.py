@@ -190,16 +190,21 @@ def test_a_3mf_states_millimetres_the_mesh_a_name_and_a_colour_and_is_the_same_t
     assert again.is_watertight and again.volume == pytest.approx(volume_and_area(made)[0], rel=1e-9)
 
 
-def test_corners_of_one_key_stay_apart(tmp_path, monkeypatch):
-    """An STL file may be made so that two corners have one key."""
-    monkeypatch.setattr(mesh, "ODD", np.zeros(3, np.uint64))
-    corners = np.random.default_rng(0).random((60, 3), dtype=np.float32)[np.arange(120) // 2]
-    triangles = np.zeros(40, mesh.STL_TRIANGLE)
-    triangles["corners"] = corners.reshape(-1, 3, 3)
+def test_corners_that_are_made_to_collide_are_welded_all_the_same(tmp_path):
+    """A hash table may be attacked: of random corners those that ask for one 16th of its places, each twice."""
+    corners = np.random.default_rng(0).random((400_000, 3), dtype=np.float32)
+    factors = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0xD6E8FEB86659FD93], np.uint64)
+    key = (corners.view(np.uint32) * factors).sum(axis=1, dtype=np.uint64)
+    alike = corners[((key ^ (key >> np.uint64(32))) & np.uint64((1 << 16) - 1)) < 1 << 12]
+    alike = np.repeat(alike[: len(alike) // 3 * 3], 2, axis=0)
+    assert not len(mesh._welded(alike.view(np.uint32))[1])
+    triangles = np.zeros(len(alike) // 3, mesh.STL_TRIANGLE)
+    triangles["corners"] = alike.reshape(-1, 3, 3)
     path = tmp_path / "alike.stl"
     path.write_bytes(bytes(80) + len(triangles).to_bytes(4, "little") + triangles.tobytes())
     read = mesh.read_stl(path)
-    assert len(read.vertices) == 60 and (read.vertices[read.faces.ravel()] == corners).all()
+    assert len(read.vertices) == len(alike) // 2
+    assert (read.vertices[read.faces.ravel()] == alike).all()
 
 
 def test_vertices_in_single_precision_lie_on_the_steepest_of_faces():
