@@ -124,7 +124,7 @@ def small_design(small_scene, tmp_path_factory):
 
 
 def pictures(*kinds):
-    """For `drawing`: of a report's pictures those of these kinds alone, by the names of the methods of Pictures."""
+    """Let `drawing` draw these kinds of a report's pictures alone, by the names of the methods of Pictures."""
     from bstcad.report.figure_jobs import Pictures
 
     every = ("solid", "lens", "light", "numbers", "sheet", "judges", "part")
@@ -132,7 +132,7 @@ def pictures(*kinds):
 
 
 def flat_pictures():
-    """For `drawing`: all pictures of a report but the 3-D one, over which VTK takes two seconds."""
+    """Let `drawing` draw all pictures of a report but the 3-D one, over which VTK takes two seconds."""
     return pictures("lens", "light", "numbers", "sheet", "judges", "part")
 
 
@@ -150,7 +150,7 @@ def pixels_of_all(path, pixels):
 
 
 def quick_effort():
-    """As many tubes and rays as it takes to resolve the small design, and few points where files are compared."""
+    """Return an effort of few points, with the tubes and rays that resolve the small design."""
     from bstcad.optics.measure import Effort
 
     return Effort(512, places=129, points=4096)

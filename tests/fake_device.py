@@ -26,7 +26,7 @@ import bstcad
 SECOND = torch.device("cuda", 0)
 PACKAGE = str(Path(bstcad.__file__).parent)
 CROSSING = {"copy_", "set_", "__deepcopy__"}  # operations that take tensors of two devices
-TO_HOST = {"numpy", "__array__", "__dlpack__", "data_ptr"}  # what only a CPU tensor has
+TO_HOST = {"numpy", "__array__", "__dlpack__", "data_ptr"}  # names that only a CPU tensor has
 GLUED = {"cat", "stack", "concat", "hstack", "vstack"}  # a tensor of no dimensions is no number to them
 
 

@@ -200,7 +200,7 @@ def positional(tree):
 
 
 def test_calls_name_their_arguments():
-    """From the fifth on: no reader sees a swapped pair among more."""
+    """Arguments have names from the fifth on: no reader sees a swapped pair among more."""
     free = {*NAMELESS, *compiled_functions()}
     assert offenders(positional, allowed=lambda file, name: name.rpartition(".")[2] in free or name in free) == {}
 

@@ -250,7 +250,7 @@ def test_progress_is_few_lines_that_show_the_end_or_bars_with_the_merit():
     )),
 ])  # fmt: skip
 def test_ctrl_c_ends_at_once_while_libraries_load_and_is_heard_by_one_process_only(library, tmp_path):
-    """As a terminal sends it, to both processes, when this one begins to load a library: some swallow it half-way."""
+    """A terminal sends the signal to both processes while this one loads a library: some libraries swallow it."""
     code = (
         "import os, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # the suite may be deaf
         "class Press:\n"
@@ -313,7 +313,7 @@ def test_docs_explains_a_check_and_names_its_page(capsys, monkeypatch, tmp_path)
 
 
 def test_docs_without_built_pages_shows_their_text(capsys, monkeypatch, tmp_path):
-    """From the sources; of a copy without them the pages of checks and remarks."""
+    """The text comes from the sources; a copy without them has the pages of checks and remarks."""
     monkeypatch.setattr(manual, "SITES", (tmp_path,))
     assert cli.run(["docs"]) == 0
     out, err = capsys.readouterr()

@@ -334,7 +334,7 @@ class Words(NoPictures):
         assert all(sheet.tables.values())
 
 
-FLOWN = 3  # of so many scenes one has a real pilot; each has the small scene that a pilot designs
+FLOWN = 3  # number of scenes of which one has a real pilot; each has the small scene that a pilot designs
 
 
 def piloted():

@@ -83,7 +83,7 @@ def folder(small_design, quick, tmp_path):
 
 @pytest.fixture
 def poor(folder, monkeypatch):
-    """The same, verified with so few tubes that only its noise is judged badly: fast, for what fails before."""
+    """Return the design verified with so few tubes that only its noise fails: fast, for checks that fail before."""
     verify_with(monkeypatch, POOR)
     return folder
 
@@ -96,7 +96,7 @@ def proof(small_design):
 
 @pytest.fixture
 def proved(folder, proof, monkeypatch):
-    """The same, whoever proves it: for tests of what comes after."""
+    """Return the design, whoever proves it, for tests of later steps."""
     monkeypatch.setattr(checks, "verify", lambda *given, **more: proof)
     return folder
 
@@ -264,7 +264,7 @@ class TestGenerate:
 
 class TestVerify:
     def test_a_moved_folder_gets_the_verdict_it_was_born_with(self, folder, small_design):
-        """And keeps what only the run that designed it knows."""
+        """The folder keeps the facts that only its own run knows."""
         before = contents(folder)
         again = commands.verify(folder).facts
         for key in JUDGED:

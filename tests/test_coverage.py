@@ -110,8 +110,8 @@ focus = [0.0, 0.0, 300.0]
 class System:
     """A row of the table, by lens or mirror, for parallel light or a point."""
 
-    row: str  # its first cell
-    tables: tuple[str, ...]  # that go into LENS, one after the other
+    row: str  # first cell of the row
+    tables: tuple[str, ...]  # tables of the scene that go into LENS, one after the other
 
     @property
     def tables_of_file(self):
@@ -148,7 +148,8 @@ DESIGNED = {
     "mirror, beam, far": System(FAR_ROW, (MIRROR, FAR_ASIDE)),
     "mirror, point, far": System(FAR_ROW, (MIRROR, LAMP_ABOVE, FAR_ASIDE)),
 }
-DAILY = ("lens, point, far", "lens, beam, plane", "lens, point, focus", "mirror, beam, far")  # of each row
+# One system of each row, designed daily.
+DAILY = ("lens, point, far", "lens, beam, plane", "lens, point, focus", "mirror, beam, far")
 COMPROMISES = {
     "mirror, beam, plane": System(PLANE_ROW, (MIRROR, PLANE)),
     "mirror, point, plane": System(PLANE_ROW, (MIRROR, LAMP_ABOVE, PLANE)),
@@ -157,7 +158,7 @@ COMPROMISES = {
 }
 ONE_FACE, TWO_FACES = 0.03, 0.15  # RRMSD: up to 0.008 and 0.102 are found
 WAVES = 0.3  # RMS without tilt: up to 0.17 are found
-ON_TARGET = 0.95  # of the light that leaves the lens
+ON_TARGET = 0.95  # smallest fraction on the target of the light that leaves the lens
 QUICK = Effort(rays=512, accuracy=0.0, witness=False)  # rays a side
 
 

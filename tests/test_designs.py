@@ -47,7 +47,7 @@ def made(small_design):
 
 @pytest.fixture
 def fresh(made):
-    """The same, with nothing known of earlier tests."""
+    """Forget the designs of earlier tests."""
     return bstcad.Design(made._made)
 
 
@@ -219,7 +219,7 @@ class TestWrite:
         assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"] and fresh.folder is None
 
     def test_what_cannot_be_written_is_kept_and_opened_again(self, fresh, small_design, quick, tmp_path, monkeypatch):
-        """Of two designs neither takes the other's place; what is written at last is kept no longer."""
+        """Two designs do not take each other's place; a design that is written at last is kept no longer."""
 
         def full(*given, **more):
             raise OSError(28, "No space left on device", str(tmp_path / "out"))
@@ -289,7 +289,7 @@ class TestVerify:
 
 
 class TestJudged:
-    """What the commands say of a design that was written, a script may ask it for."""
+    """Judgements of a written design by a script, as the commands make them."""
 
     def test_an_unknown_judge_is_refused(self, folder):
         with pytest.raises(bstcad.SceneError, match="--against zemax"):
@@ -328,14 +328,14 @@ class TestOpen:
         assert opened.solid().isValid()
 
     def test_a_net_far_below_its_blank_is_exact_too(self, folder):
-        """Where z of the blank and of the net differ much, z + (net - z) is not the net: its last bit is lost."""
+        """Heights z of blank and net that differ much: z + (net - z) is not the net, since its last bit is lost."""
         kept = arrays(folder)
         kept["control_points"][..., 2] = np.random.default_rng(0).uniform(0.01, 5.0, (33, 33))
         np.savez_compressed(folder / "design.npz", **kept)
         assert np.array_equal(bstcad.open(folder).lens.back.control_points(), kept["control_points"])
 
     def test_it_writes_the_same_design_again(self, folder, quick, tmp_path):
-        """In the place of an earlier design, of which nothing stays."""
+        """An earlier design in the folder is replaced, and nothing of it stays."""
         shutil.copytree(folder, tmp_path / "copy")
         (tmp_path / "copy" / "stale.txt").write_text("old")
         bstcad.open(folder).write(tmp_path / "copy", progress=False)

@@ -37,7 +37,8 @@ QUALITIES = {
     "fine": {"tailoring.stage2_iterations": 2, "lens.back.control_points": 65},  # two levels
     "paper": {"tailoring.levels": [17, 33], "tailoring.stage1_iterations": 4, "tailoring.stage2_iterations": 3},
 }
-SAME = {"draft": 1e-6, "paper": 1e-4}  # of the relief: where stage 1's solvers end; a few steps of Adam in float32
+# Largest difference as a fraction of the relief: by the ends of stage 1's solvers; by a few steps of Adam in float32.
+SAME = {"draft": 1e-6, "paper": 1e-4}
 
 # A design besides the mirror and the paper's procedure below; the others are run by `make bench`.
 QUICK = ("beam_shaper", "draft")
@@ -107,7 +108,7 @@ OF_A_KIND = ("led", "white_logo")  # a source of some size and a spectrum; beams
     ],
 )
 def test_merit_and_gradient_are_those_of_the_cpu(template):
-    """Of stage 2, whose line searches make more of a last bit than a design can be compared by."""
+    """Merits are compared, since line searches of stage 2 make more of a last bit than a design can be compared by."""
     same_merit_and_gradient(scene(template, "draft"))
 
 
@@ -135,7 +136,7 @@ def evaluated(wanted, heights):
 
 @pytest.mark.parametrize("quality", [pytest.param("standard", marks=pytest.mark.bench), "paper"])
 def test_resume_brings_everything_back_to_the_device(quality, tmp_path):
-    """From a state of every stage, as a file has it."""
+    """States of every stage are read as from a file."""
     wanted, kept = scene(TEMPLATES[0].with_name("portrait.toml"), quality), []
 
     def save(state):
@@ -189,7 +190,7 @@ def test_a_kernel_of_the_gpu_is_an_entry_of_the_table(monkeypatch):
     assert all(calls.values())
 
 
-MIXES = {  # what CUDA refuses
+MIXES = {  # operations on mixed devices that CUDA refuses
     "a sum": lambda gpu, cpu: gpu + cpu,
     "a CPU tensor made of a number of the GPU": lambda gpu, cpu: torch.ones_like(cpu) * gpu[0],
     "a mask": lambda gpu, cpu: torch.where(cpu > 0, gpu, gpu),

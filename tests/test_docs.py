@@ -184,7 +184,7 @@ def test_its_blocks_are_of_kinds_that_are_run_or_output(page):
 
 
 def test_every_key_of_a_scene_has_an_example():
-    """In the page of keys: from the templates, from the pages, or from the key's own record."""
+    """The page of keys has examples from the templates, from the pages, or from the key's own record."""
     from reference_pages import examples_of_keys
 
     from bstcad.scene.schema import rows

@@ -110,7 +110,7 @@ def test_a_level_mirror_has_a_level_image():
 
 @pytest.mark.parametrize("folds", [0, 1])
 def test_a_plate_brings_the_image_nearer(folds):
-    """By t (1 - 1 / n) to first order in the angle, on either side of a mirror."""
+    """The image moves by t (1 - 1 / n) to first order in the angle, on either side of a mirror."""
     plate = {"z": 20.0, "thickness": 6.0, "index": 1.5}
     elements = [made("mirror", z=90.0)] * folds + [made("window", **plate)]
     behind = interfaces(elements, 1, 587.6)

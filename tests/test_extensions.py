@@ -64,7 +64,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def design(scene, tmp_path_factory):
-    """Its design, written."""
+    """Return the design of the scene, written."""
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
         design = bstcad.design(scene, progress=False)
@@ -275,7 +275,7 @@ class Oval(Emitter):
 
 @pytest.mark.filterwarnings("ignore:Pydantic serializer")  # no file says of which kind such a source is
 def test_light_of_an_emitter_of_its_own_is_spread_evenly(scene, tmp_path, monkeypatch):
-    """By design, proof and report: an oval beam, much brighter in its middle, on an even square."""
+    """Design, proof and report know it: an oval beam, much brighter in its middle, on an even square."""
     draws_nothing(monkeypatch)
     asked = scene.changed({"target.x": [-20.0, 20.0], "target.y": [-20.0, 20.0], "target.outline": None})
     oval = asked.model_copy(update={"source": Oval(5.0, 8.0)})
@@ -288,7 +288,7 @@ def test_light_of_an_emitter_of_its_own_is_spread_evenly(scene, tmp_path, monkey
 
 
 def test_an_emitter_of_its_own_answers_or_declines_in_a_sentence(scene):
-    """Its sizes and place follow from its class; errors that would move its light are refused, and others are not."""
+    """Sizes and position follow from its class; errors that would move its light are refused, and others are not."""
     oval = scene.model_copy(update={"source": Oval(5.0, 8.0)})
     setup = Setup(scene.flat_lens(33), oval.channels(), scene.target.screen)
     assert (oval.source.lumens, oval.source.wider(0.1)) == (None, None)
@@ -315,7 +315,7 @@ def test_a_merit_of_its_own_is_refused_for_several_goals(scene):
 
 
 def test_a_merit_of_its_own_is_made_less_than_by_rrmsd(scene):
-    """Of a letter on black, which 33 x 33 control points cannot draw: what is left over can be had in two ways."""
+    """A letter on black, which 33 x 33 control points cannot draw, leaves an error that each merit shares out."""
     scene = scene.changed({"target.uniform": None, "target.outline": None, "target.text": "L"})
 
     def relative(picture, target):
@@ -440,7 +440,7 @@ def test_a_share_that_is_no_tensor_is_named(scene):
 
 
 def test_an_installed_package_brings_an_effect_along(scene, tmp_path):
-    """By its entry point, when the scene file is read in another process."""
+    """The entry point is found when the scene file is read in another process."""
     (tmp_path / "dusty_lenses.py").write_text(
         "class Dust:\n    def __init__(self, nm): pass\n    def share(self, cos_in, cos_out, path): return cos_in\n"
     )

@@ -88,7 +88,7 @@ def test_the_dome_is_in_the_scene_and_in_the_step_file_of_its_design(dome):
 
 
 def test_tolerances_of_a_domed_lens_move_its_dome(dome):
-    """Its form alone changes by a net in its place, which keeps the outline; a larger lens has a larger one."""
+    """A form error is a net in the dome's place, which keeps the outline; a larger lens has a larger outline."""
     _, nominal = read_nominal(dome.folder)
     setup = perturbations.Setup(nominal.lens, nominal.channels, nominal.goals[0].receiver)
     rough = perturbations.form_error(nominal.lens, 4.0, 0, "front").apply(setup, 0.0).lens
@@ -123,7 +123,7 @@ def test_the_given_front_is_in_every_file(behind_another, small_design):
 
 
 def test_it_reads_back_to_the_last_bit_without_the_earlier_design(behind_another):
-    """From its own copy of the net."""
+    """The folder has a copy of the net."""
     scene, nominal = read_nominal(behind_another.folder)
     assert scene == behind_another.scene and scene.lens.front.given.shape == (33, 33)
     assert torch.equal(nominal.lens.front.heights, behind_another.scene.lens.front.surface.heights)
@@ -132,7 +132,7 @@ def test_it_reads_back_to_the_last_bit_without_the_earlier_design(behind_another
 
 
 def test_both_numbers_of_the_conic_are_found(conic):
-    """They are in the scene that goes with the design, which has nothing left to search for, and in the STEP file."""
+    """The scene of the design has them and nothing left to search for, and so has the STEP file."""
     front = load(conic.folder / "scene.toml").lens.front
     assert front.free == () and front.optimise is False
     assert (front.curvature, front.conic_constant) != (0.002, -0.5)

@@ -19,7 +19,7 @@ BEFORE = Path(__file__).parent / "data" / "before_goals.zip"  # "one" target and
 
 @pytest.mark.parametrize(("name", "keys"), [("one", ["target"]), ("two", ["target[0]", "target[1]"])])
 def test_a_folder_whose_report_has_no_goals_opens_and_is_verified(name, keys, tmp_path):
-    """Its report told the first target apart; of two the second is the worse one."""
+    """The old report kept the first target apart; the second of the two is the worse one."""
     with zipfile.ZipFile(BEFORE) as archive:
         archive.extractall(tmp_path)
     folder = tmp_path / name

@@ -82,7 +82,7 @@ def _tensors(*values):
 
 
 def _along_z(solid, x, y):
-    """Where a line along z at (x, y) meets a solid's faces."""
+    """Return the heights (mm) at which a line along z at (x, y) meets a solid's faces."""
     line = cq.Edge.makeLine(cq.Vector(x, y, -1e3), cq.Vector(x, y, 1e3))
     return [v.Center() for v in solid.intersect(line).Vertices()]
 
@@ -124,7 +124,7 @@ def test_lenses_on_a_workplane(design):
 
 
 def test_generate_lens_in_python(design, quick, tmp_path, capsys):
-    """What a script copies from generate_lens.py, with a knob turned."""
+    """A script copies the function of generate_lens.py, with a setting changed."""
     made = runpy.run_path(str(TEMPLATES.parent / "generate_lens.py"))
     solid = made["generate_lens"](quick_scene(design, tmp_path), tmp_path / "lens", **{"target.z": 510.0})
     assert solid.isValid() and bstcad.open(tmp_path / "lens").scene.target.z == 510.0

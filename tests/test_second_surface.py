@@ -56,7 +56,7 @@ def test_batoid_sees_the_same_picture(folder):
 
 
 def test_stage_1_aims_through_the_flat_back():
-    """By the face that reflects alone: the wall shows the letter upright before stage 2."""
+    """The reflecting face alone is shaped: the wall shows the letter upright before stage 2."""
     scene = scene_of(**{"lens.back.optimise": False, "tailoring.levels": [17, 33], "tailoring.stage2_iterations": 1})
     design = bstcad.design(scene, progress=False)
     assert not design.lens.back.heights.any() and design.lens.back.shape == (33, 33)

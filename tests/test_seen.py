@@ -17,9 +17,9 @@ from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.trace import trace
 from bstcad.scene.scene import load
 
-SIDE = 24  # of what the person makes out, each way
+SIDE = 24  # number of pixels a side that the person makes out
 RAYS = 500  # each way
-GEOMETRY = {  # on one axis; the wall as large as an arm
+GEOMETRY = {  # changes of the scene: everything on one axis; the wall as large as an arm
     "name": "f",
     "lens.back.control_points": 33,
     "lens.outline": {"shape": "rectangle", "width": 20.0, "height": 20.0},
@@ -34,7 +34,7 @@ GEOMETRY = {  # on one axis; the wall as large as an arm
     "tailoring.transport_grid": 64,
     "tailoring.stage2_iterations": 40,
 }
-VIEWERS = {"lens": (0.0, 0.0, 1.0), "behind": (0.0, 0.0, -1.0)}  # where each looks
+VIEWERS = {"lens": (0.0, 0.0, 1.0), "behind": (0.0, 0.0, -1.0)}  # directions in which each viewer looks
 
 
 def letter() -> np.ndarray:

@@ -12,7 +12,7 @@ from bstcad.report.figure_jobs import MILLIONTHS, corners
 
 @pytest.fixture(scope="module")
 def shown(small_design):
-    """What there is to see of the small design."""
+    """Return the scene of `bstcad show` for the small design."""
     return commands.light_path_in(small_design.folder)
 
 
@@ -32,7 +32,7 @@ def test_rays_go_from_the_lamp_over_both_faces_to_the_screen_and_carry_the_light
 
 
 def test_where_rays_land_the_picture_is_lit(shown):
-    """By the corners that the picture is drawn between: it is neither turned nor mirrored against the rays."""
+    """The corners between which the picture is drawn neither turn nor mirror it against the rays."""
     (rows, columns), landed = shown.pictures[0].shape, shown.rays[:, -1]
     [screen] = shown.screens
     corner, along_x, along_y = screen[3], screen[2] - screen[3], screen[0] - screen[3]

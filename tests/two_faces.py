@@ -27,11 +27,12 @@ CHANGES = {
     ],
 }  # fmt: skip
 
-SMALL = CHANGES | {  # to be tailored, in a few seconds
+SMALL = CHANGES | {  # changes of a scene that is tailored in a few seconds
     "lens.tool_radius": None, "lens.max_slope": None, "lens.front.control_points": 17, "lens.back.control_points": 25,
     "tailoring": {"quality": "draft", "rays": 64, "transport_grid": 32, "rounds": 3, "stage2_iterations": 30},
 }  # fmt: skip
-WITH_WAVE = {"target": CHANGES["target"][:1], "wavefront": {"kind": "plane", "z": 60.0}}  # of a picture and a wave
+# Changes of a scene with a picture and a wave.
+WITH_WAVE = {"target": CHANGES["target"][:1], "wavefront": {"kind": "plane", "z": 60.0}}
 
 
 def bent(net, size, along=(2.0, 3.0)):

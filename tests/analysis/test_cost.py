@@ -7,7 +7,7 @@ from bstcad.analysis.cost import TILE, ControlCells, ending, masks, remaining
 
 
 class TestEnding:
-    """Of curves of stage 2, a point a second, after the picture and stage 1."""
+    """Curves of stage 2, a point a second, after the picture and stage 1."""
 
     STAGES = [(1.0, None), (3.0, 0.4), (100.0, 0.05)]  # picture, stage 1, stage 2
 
@@ -45,7 +45,7 @@ class TestEnding:
 
 
 class TestRemaining:
-    """Of errors put in a known place and of waves of a known length."""
+    """Errors in a known position, and waves of a known length."""
 
     SHAPE = (96, 128)
     RAMP = np.linspace(1.0, 2.0, 96 * 128).reshape(96, 128)
@@ -97,7 +97,7 @@ class TestRemaining:
 
 
 class TestControlCells:
-    """Of an even plate of 32 x 32 cells before 64 x 64 pixels."""
+    """An even plate of 32 x 32 cells before 64 x 64 pixels."""
 
     NOISE = np.random.default_rng(0).random((64, 64))
 
@@ -112,7 +112,7 @@ class TestControlCells:
         assert floors == pytest.approx([0.0, size], abs=1e-6)
 
     def test_more_cells_leave_less_and_enough_of_them_nothing(self):
-        """As many cells as tiles make an even picture, as many as pixels any; to rounding."""
+        """Cells as many as tiles make an even picture, cells as many as pixels any picture, to rounding."""
         assert self.cells(4, np.ones((64, 64))).floor(1.01) == self.cells(32, self.NOISE).floor(2.02) == 0.0
         floors = [self.cells(32, self.NOISE[:50]).floor(finer) for finer in (0.2, 0.5, 1.0, 1.5)]
         assert floors == sorted(floors, reverse=True) and 0 < floors[-1] < floors[0] < 1

@@ -84,7 +84,7 @@ class TestDrawnRays:
 
 
 class TestUsed:
-    GRID = 0.01  # of the light's width: its rays lie on a grid
+    GRID = 0.01  # spacing of the grid of rays, as a fraction of the width of the light
     WIDE = Rectangle(24.0, 24.0)
 
     def faces(self, source, outline=WIDE, **more):
@@ -214,7 +214,7 @@ class TestBlur:
         assert even_image(extent).width() == pytest.approx(width, rel=1e-6)
 
     def test_the_finest_detail_is_the_source_s_image_on_pixels_and_shrinks_with_the_distance(self):
-        """Of 10 mm and pixels of 2 mm; the nearer target is in fact lit with so small an image."""
+        """A source of 10 mm and pixels of 2 mm: the nearer target is in fact lit with so small an image."""
         here = self.of(self.disc(1.0))
         found = finest_detail(here.pixels, self.plate(), self.SCREEN, "source.diameter = 1 mm")
         assert found.width == pytest.approx(math.sqrt(10**2 + 4 / 3 * 2**2), rel=0.01)

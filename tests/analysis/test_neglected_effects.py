@@ -120,7 +120,7 @@ def test_diffraction_is_as_wide_as_wavelength_times_way_over_aperture():
 
 class TestPictures:
     def test_a_field_of_cells_is_linear_between_their_middles(self):
-        """And even beyond the outermost middles."""
+        """The field is linear outside the outermost middles, too."""
         found = zoomed(np.arange(3.0) + 10 * np.arange(2.0)[:, None], (4, 12))
         np.testing.assert_allclose(found[:, 1], [-0.0, 2.5, 7.5, 10.0], atol=1e-12)
         np.testing.assert_allclose(np.diff(found[0]), [0, *[0.125, *[0.25] * 7, 0.125], 0], atol=1e-12)

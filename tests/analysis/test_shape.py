@@ -78,7 +78,7 @@ def test_thickness_counts_from_a_curved_front_and_is_negative_where_faces_cross(
 
 
 def test_only_the_inside_of_the_edge_is_searched_for_the_thinnest_place():
-    """Of 1 + x / 5 mm of glass the half disc over x > 0 has 1 mm and more, and less than none where it is moved to."""
+    """A wedge of 1 + x / 5 mm is 1 mm or thicker over the half disc x > 0, and thinner where the disc is moved to."""
     lens = lens_of(lambda x, y: x / 5 + 0 * y, SQUARE, z=9.0)
     turn = np.linspace(-np.pi / 2, np.pi / 2, 301)
     half = np.stack([4 * np.cos(turn), 4 * np.sin(turn)], axis=1)
@@ -126,7 +126,7 @@ def test_the_slope_energy_of_a_mode_lies_in_its_octave():
 
 @pytest.mark.parametrize("k", [(50, 20), (40, 45), (10, 40)])
 def test_height_and_slope_of_a_ripple_are_those_of_the_face(k):
-    """Of one cosine in the highest octave, by points all over the face; a kink along the rim of the net is none."""
+    """One cosine in the highest octave, by points all over the face; a kink along the rim of the net is no ripple."""
     heights = np.outer(*(np.cos(i * np.pi * (np.arange(M) + 0.5) / M) for i in k))
     face = BSplineSurface(20.0, torch.from_numpy(1e-3 * heights), (-10.0, 10.0), (-7.0, 7.0))
     at = np.random.default_rng(0).uniform(-0.95, 0.95, (2, 40_000))
@@ -143,7 +143,7 @@ class TestSurvey:
 
     M, HALF = 41, 5.0
     WHOLE, ROUND = Rectangle(10.0, 10.0), Circle(4.4)
-    SIDE = 1e-12  # of a span, by which a knot is approached from one side
+    SIDE = 1e-12  # distance from which a knot is approached from one side, as a fraction of a span
 
     def rough(self, outline, heights=None):
         """A back of waves as short as its net can hold: its second derivatives jump at every knot."""

@@ -33,7 +33,7 @@ def found(half, at_back=True):
 
 @pytest.mark.parametrize("at_back", [True, False])
 def test_light_that_is_made_parallel_needs_a_wall(at_back):
-    """From θ in the glass to the axis the normal n d - d' stands at atan2(n sin θ, n cos θ - 1)."""
+    """Light at the angle θ in the glass needs the normal n d - d', which stands at atan2(n sin θ, n cos θ - 1)."""
     share, steep = found(1e-3, at_back)
     inner = share[1:-1, 1:-1]  # on the rim of the light it is not asked
     theta = np.arctan(HALF * np.hypot(*inner.T) / HEIGHT)

@@ -11,7 +11,7 @@ from scipy.special import gammainc
 
 from bstcad.analysis.top_hat import FINEST, FlatTop, plateau_uniformity, top_hat
 
-PIXELS, HALF = 600, 4.0  # of a square screen, and its half width (mm)
+PIXELS, HALF = 600, 4.0  # number of pixels a side of a square screen, and half its width (mm)
 PITCH = 2 * HALF / PIXELS
 AT = (np.arange(PIXELS) + 0.5) * PITCH - HALF
 R = np.hypot(AT, AT[:, None])
@@ -84,7 +84,7 @@ def test_a_hot_pixel_is_neither_the_maximum_nor_the_plateau():
 
 
 def test_two_plateaus_have_the_width_of_the_brighter_ones_peak():
-    """Of the two the one above half of E_max counts, however large the other is."""
+    """The plateau above half of E_max counts, however large the other one is."""
     steps = np.where(R < 1.0, 1.0, 0.3) + 0.01 * np.random.default_rng(1).standard_normal(R.shape)
     assert plateau_uniformity(steps, 1.0) == pytest.approx(math.sqrt(8 * math.log(2)) * 0.01, rel=0.1)
 

@@ -42,14 +42,14 @@ def png(width, height, rows=None):
 
 @dataclass
 class Answer:
-    """What came back."""
+    """The status, headers and body of an answer."""
 
     status: int = 0
     headers: list[tuple[str, str]] = field(default_factory=list)
     body: bytes = b""
-    starts: int = 0  # of answers: one
+    starts: int = 0  # number of answers that were begun: one
     taken: int = 0  # bytes of the request's body that were asked for
-    error: BaseException | None = None  # that the application raised besides
+    error: BaseException | None = None  # exception that the application raised besides
 
     def __getitem__(self, name):
         """A header; "" if there is none."""

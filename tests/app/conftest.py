@@ -54,7 +54,7 @@ class Served:
 
     folder: Path
     process: subprocess.Popen
-    address: str  # with the token
+    address: str  # URL of the workbench, with the token
 
     @property
     def root(self) -> str:
@@ -131,7 +131,7 @@ def open_scene(page, own: Served, name: str) -> Path:
 
 
 class Faults(list):
-    """What a page complained of: errors of its script, and requests to other places."""
+    """Complaints of a page: errors of its script, and requests to other hosts."""
 
 
 @pytest.fixture

@@ -29,7 +29,7 @@ sys.path.append(str(ROOT / "docs" / "_ext"))
 
 
 def steps(found: Form, key: str):
-    """What a person may do in a form on the way to a key: (key, value) for `changed`."""
+    """Return the entries that a person may make in a form before a key: (key, value) for `changed`."""
     groups = [*found.additions, *(addition for group in found.groups() for addition in group.additions)]
     for addition in groups:
         if f"{key}.".startswith(f"{plain(addition.key)}."):
@@ -41,7 +41,7 @@ def steps(found: Form, key: str):
 
 
 def ways_to(row, text, left=4):
-    """Whether some steps lead from a text to a form that has the key of a row, with its meaning."""
+    """Return True if some steps lead from a text to a form that has the key of a row, with its meaning."""
     found = form(tomllib.loads(text))
     key = row.key.replace("[]", "")
     if row.range in ("table", "tables"):

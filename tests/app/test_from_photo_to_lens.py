@@ -1,4 +1,4 @@
-"""From a photo that is not square to a verified lens: the requests of four clicks, without a browser, by few points."""
+"""A photo that is not square becomes a verified lens: the requests of four clicks, without a browser, by few points."""
 
 import io
 

@@ -1,4 +1,4 @@
-"""Nobody but the person at the terminal is answered, and nothing is taken that is too large or no picture."""
+"""The server answers the person at the terminal alone, and takes nothing that is too large or no picture."""
 
 import asyncio
 import contextlib
@@ -146,7 +146,7 @@ def test_a_wrong_token_in_the_address_sets_no_cookie(own):
 
 
 def test_only_a_page_is_opened_by_the_token(own):
-    """It is no second way in: a form of another page could have it in its address."""
+    """The token is no second way in: a form of another page could have it in its address."""
     assert refused(own.ask(f"/api/scenes?token={TOKEN}", {}, cookie=None), "token")
     assert own.workspace.scene_names() == ["small"]
 

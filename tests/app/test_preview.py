@@ -32,7 +32,7 @@ BENCH = pytest.mark.bench
     ("name", "lit"), [("caustic_portrait", True), pytest.param("mirror", True, marks=BENCH), ("off_axis", False)]
 )
 def test_a_preview_is_near_the_finished_draft(name, lit):
-    """By its light, and by its thickness within what is said; no radius, slope or tool is told of its few points.
+    """The light and the thickness are near; radius, slope and tool are not stated by so few points.
 
     Where light passes all of the back the two are nearer than where dark corners bend on.
     """

@@ -40,7 +40,7 @@ def keys_for(data):
 
 
 def overridden(data, key, value):
-    """What `changed` has to make: as `override` does, but lists of tables are lists, and no list is empty."""
+    """Return the text that `changed` has to make: `override`, but lists of tables are lists, and no list is empty."""
     wanted = copy.deepcopy(data)
     override(wanted, key, value, key)
     for name in ("before", "behind", "effects", "tolerance"):

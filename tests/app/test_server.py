@@ -64,7 +64,7 @@ def tells(own, answer, up):
 
 @pytest.mark.parametrize("up", UP)
 def test_no_name_leads_out_of_the_folders(own, up):
-    """In any route, for any name: nothing of the outside is sent, and nothing is written."""
+    """Any route and any name: no file outside the folders is sent or written."""
     up, before = up.replace("{outside}", str(own.outside)), tree(own.outside)
     asked = [(path, method) for path, method in routes(own.workbench) if "{name}" in path]
     assert len(asked) > 20
@@ -159,7 +159,7 @@ def test_no_answer_about_a_faulty_scene_tells_where_the_folders_are(own, monkeyp
 
 
 def test_what_a_run_says_is_told_without_folders(own):
-    """On the page of its design, too."""
+    """The page of the design shows no folder either."""
     run = Run(own.folder / "made")
     run.place.mkdir()
     sentence = f"{own.folder}/made: the finished design is kept in {own.folder}/made-unwritten"
@@ -186,7 +186,7 @@ def test_each_section_leads_to_the_documentation_built_or_not(own):
 
 
 def test_the_figure_of_a_design_follows_dark_mode(own, small_design):
-    """Its ground and letters change; a design whose arrays are gone has the usual figure."""
+    """Background and letters change; a design whose arrays are missing has the usual figure."""
     shutil.copytree(small_design.folder, own.folder / "real")
     usual, dark = (
         np.asarray(Image.open(io.BytesIO(own.ask(address).body)).convert("RGB")).astype(int)
@@ -228,7 +228,7 @@ WRONG = [
 
 @pytest.mark.parametrize("asked", WRONG, ids=lambda asked: ascii(asked)[:40])
 def test_no_table_of_json_breaks_the_server_or_the_scene(own, monkeypatch, asked):
-    """It is refused in a sentence, or taken; then the page can be opened and the change be dropped."""
+    """Any table is refused in a sentence or accepted; then the page opens, and the change can be dropped."""
     monkeypatch.setattr(server, "PATIENCE", 0.01)
     for path in READS_JSON:
         answer = own.ask(path, json.dumps(asked))

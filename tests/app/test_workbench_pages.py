@@ -100,7 +100,7 @@ def test_a_change_is_seen_in_every_window_and_kept_beside_the_file_until_it_is_s
 
 
 def test_a_wrong_entry_stays_in_its_field_and_no_lens_is_made_of_it(open_page, shared, capsys):
-    """Its sentence is the terminal's, it stands where the entry is, and no figure of the scene before stays."""
+    """The message is the terminal's, it stands beside the entry, and no figure of the scene before stays."""
     page = open_page(shared.address)
     path = open_scene(page, shared, "wrong")
     type_into(page, "target.z", "2")

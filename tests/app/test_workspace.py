@@ -60,7 +60,7 @@ def own(tmp_path):
 
 
 def anew(own):
-    """The same folders for another server, after the first was killed."""
+    """Return the same folders for another server, after the first one was killed."""
     return Workspace(own.scenes, own.designs)
 
 
@@ -293,7 +293,7 @@ def test_sentences_have_no_folders_of_this_machine(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("home", ["/", "", "relative"])
 def test_a_home_at_the_root_takes_no_slash_from_a_sentence(own, monkeypatch, home):
-    """As in a container whose user has no home."""
+    """Containers may have a user without a home folder."""
     monkeypatch.setenv("HOME", home)
     sentence = "PNG/JPEG, ~ relative/x, /tmp/x, one / the other"
     assert anew(own).without_paths(sentence) == sentence
@@ -342,7 +342,7 @@ GIVEN = {"image": png(30, 20), "sample": "camera", "text": 'A "b" \\ é\nC'}
 
 
 def shown(own, what):
-    """What `add` is given for one of GIVEN."""
+    """Return the argument of `add` for one of GIVEN."""
     return {what: own.keep(GIVEN[what]) if what == "image" else GIVEN[what]}
 
 
@@ -371,7 +371,7 @@ def test_a_new_scene_of_each_light_shows_what_is_given(own, light, what):
 
 @pytest.mark.parametrize("template", ["thu", "disk", "two_pictures", "beam_shaper", "caustic_portrait"])
 def test_a_template_shows_what_is_given(own, template):
-    """In the first of several targets; everything else stays as it is."""
+    """The first of several targets shows it; everything else stays as it is."""
     plain = load(own.path(own.add("laser", template=template)))
     assert plain.name == f"my-{template}"
     for n, what in enumerate(GIVEN, start=2):
@@ -465,7 +465,7 @@ def test_the_scene_of_a_design_is_a_new_scene_with_its_pictures(own, tmp_path):
 
 
 def test_comments_survive_the_way_through_a_design(own):
-    """By the text of the design's run, or by its scene file where that is the same scene still."""
+    """The text of the design's run keeps them, or its scene file where that is the same scene still."""
     name = own.add("sun", text="HI")
     text = own.opened(name).text
     folder = own.designs / name

@@ -52,7 +52,7 @@ class Known:
         return to_first_net(self.source.rays(x, y, self.front.z, 1.0), lens)
 
     def aims(self, coming):
-        """Where the face sends them (2, n, n) mm, and where they meet it."""
+        """Return the points (2, n, n) (mm) to which the face sends the rays, and where the rays meet the face."""
         at, z_x, z_y = intersect(self.face, coming, WIDE, Status.VIGNETTED)
         landed = self.plane.to(deflect(at, z_x, z_y, self.law).rays)
         assert landed.alive.all()

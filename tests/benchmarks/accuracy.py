@@ -1,4 +1,4 @@
-"""What accuracy costs in time, recorded piece by piece in docs/accuracy.json and written to docs/accuracy.md and .png.
+"""The price of accuracy in time, recorded in pieces in docs/accuracy.json and written to docs/accuracy.md and .png.
 
 make accuracy                                         records what is missing or of another version, and writes
 python -m tests.benchmarks.accuracy --list            the pieces, how long each takes, and when it was recorded
@@ -55,15 +55,15 @@ SCENES = {  # template: what it is
     "caustic_letters": "Letters, on axis, 100 mm (the peers' case)",
 }
 PEER = "caustic_portrait"  # the scene of Mitsuba's caustic optimisation
-FIGURES = {PEER: "accuracy.png", "thu": "accuracy-letters.png"}  # by sweep, in docs/
+FIGURES = {PEER: "accuracy.png", "thu": "accuracy-letters.png"}  # names of the figures in docs/, by sweep
 QUALITIES = ("draft", "standard", "fine", "paper", "stage 1", "integration")
-QUIET = 0.1  # of all cores: what other programs may take while something is recorded
+QUIET = 0.1  # largest fraction of all cores that other programs may take during a recording
 BUSY = "; **the machine was busy with other work**: seconds are too long by an unknown factor, CPU seconds by less"
 SWEPT = ROOT / "outputs" / "accuracy"  # records of the runs of sweeps, from which one that was stopped goes on
 SLOW = {  # qualities that take minutes, and how many
     "thu": {"fine": 2, "paper": 4}, "portrait": {"fine": 2, "paper": 12}, "caustic_portrait": {"paper": 4},
 }  # fmt: skip
-BESIDE = {  # what else a table has: the settings of a standard design that it is, by scene
+BESIDE = {  # further rows of a table: changes of a standard design, by scene
     "stage 1": dict.fromkeys(("thu", "portrait"), ("tailoring.stage2_iterations=0",)),
     "integration": {
         "thu": ("tailoring.method=integration",),
@@ -91,7 +91,7 @@ class Piece:
     slow: bool = False  # not recorded anew unless it is named
 
     def find(self, known: Record) -> Record | None:
-        """Its record."""
+        """Return the record of a piece."""
         return reduce(lambda at, key: at.get(key, {}), self.place, known) or None
 
     def keep(self, known: Record, record: Record) -> None:
@@ -125,7 +125,7 @@ def warm_up(scene: str, quality: str) -> None:
 
 
 def designed(scene: str, quality: str, settings: Sequence[str] = ()) -> Record:
-    """What a table says of one design."""
+    """Return the figures of one design that a table states."""
     warm_up(scene, "paper" if quality == "paper" else "draft")
     with tempfile.TemporaryDirectory() as place:
         run = generate(scene, Path(place) / scene, f"tailoring.quality={quality}", *settings)
@@ -147,14 +147,14 @@ def designed(scene: str, quality: str, settings: Sequence[str] = ()) -> Record:
 
 
 def judged(lens: Lens, pixels: int) -> Record:
-    """What the judge of all designs, ray tubes without noise, finds of a lens for PEER on so many pixels a side."""
+    """Return the RRMSD by ray tubes, without noise, of a lens for PEER on a given number of pixels a side."""
     scene = load(TEMPLATES / f"{PEER}.toml", {"target.pixels": pixels})
     light = measure(lens, scene.channels(), scene.target.screen, scene.target.irradiance(), REFERENCE)
     return {"rrmsd": light.rrmsd, "rrmsd_noise": light.standard_error, "on_target": light.flux["on target"]}
 
 
 def swept(scene: str, budget: float) -> Record:
-    """What `bstcad tradeoff` finds within a budget of seconds."""
+    """Return the result of `bstcad tradeoff` within a budget of seconds."""
     folder, path = SWEPT / scene, TEMPLATES / f"{scene}.toml"
     command = [sys.executable, "-m", "bstcad.cli", "tradeoff", str(path), "--budget", f"{budget:g}", "-o", str(folder)]
     subprocess.run(command, check=True)
@@ -213,7 +213,7 @@ def with_heights(heights: np.ndarray) -> Lens:
 
 
 def grown() -> Record:
-    """How the cost of each stage grows."""
+    """Return the growth of the cost of each stage."""
     return {"series": [growth.facts(series, growth.measured(series)) for series in growth.SERIES]}
 
 

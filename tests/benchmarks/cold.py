@@ -22,12 +22,12 @@ class Run:
 
     folder: Path
     code: int
-    said: str  # on stderr
+    said: str  # text of the command on stderr
     seconds: float
-    cpu_seconds: float  # of all its processes and threads
+    cpu_seconds: float  # CPU seconds of all processes and threads
 
     def report(self) -> dict[str, Any]:
-        """Its report.json; an error with the last of what it said where there is none."""
+        """Return report.json; raise an error with the last lines of the command where there is none."""
         path = self.folder / "report.json"
         if not path.is_file():
             raise SystemExit(f"{self.folder.name}: exit {self.code}\n{self.said[-2000:]}")

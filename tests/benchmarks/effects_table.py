@@ -1,4 +1,4 @@
-"""What each effect costs: designs of one scene with each effect alone, in turn with one that has none, as a table.
+"""The cost of each effect: designs of one scene with each effect alone, in turn with one that has none, as a table.
 
 make effects                    into docs/effects.md, a quarter of an hour
 python -m tests.benchmarks.effects_table --runs 1

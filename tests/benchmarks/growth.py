@@ -1,4 +1,4 @@
-"""How the cost of each stage grows: CPU seconds and memory while one thing grows and all others stay.
+"""The growth of each stage's cost: CPU seconds and memory while one quantity grows and all others stay.
 
 CPU seconds are of all threads.  What a design leaves to a second process, writing and reading STEP, is done in this
 one.  Memory is the most that was held on the way over what was held before; where the system does not tell, there is
@@ -50,9 +50,10 @@ EVALUATION = "evaluation of stage 2"
 SMALL = {"lens.back.control_points": 65, "target.pixels": 256, "tailoring.quality": "draft"}
 NET, TUBES, PIXELS = 257, 1024, 512  # a side, of what does not grow
 A_CHANNEL = 256  # tubes a side, of each of many channels
-PROOF = Effort(1024)  # of a proof while nets and pixels grow: always as many tubes
+PROOF = Effort(1024)  # effort of a proof while nets and pixels grow: always the same number of tubes
 REPEATS, ENOUGH = 5, 1.0  # calls of which the least counts, or as many as take so many CPU seconds
-STATUS, FORGET = Path("/proc/self/status"), Path("/proc/self/clear_refs")  # on Linux: memory, and its peak reset
+# Files of Linux: memory of the process, and the reset of its peak.
+STATUS, FORGET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 Work = Callable[[], Any]
 
 
@@ -61,19 +62,19 @@ class Series:
     """A stage while one thing grows."""
 
     stage: str
-    driver: str  # what grows
+    driver: str  # name of the quantity that grows
     sizes: tuple[int, ...]
     work: Callable[[int], Work]  # sets up the work of a size
     expected: tuple[float, float]  # between which the exponent of CPU seconds over its range is to lie
-    most: float  # times the CPU seconds that the last step may take, over as many times as there are more of it
-    power: int = 2  # how many of it there are: sizes to this power
+    most: float  # largest ratio of CPU seconds of the last step, over the ratio of the quantity
+    power: int = 2  # exponent by which the size gives the number: sizes to this power
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What a size took."""
+    """CPU seconds and memory of one size."""
 
-    number: int  # of what grows
+    number: int  # number of the things that grow
     cpu_seconds: float
     memory_mb: float | None  # over what was held before; None: the system does not tell
 
@@ -87,7 +88,7 @@ def exponent(costs: Sequence[Cost], of: str = "cpu_seconds") -> float | None:
 
 
 def last_step(costs: Sequence[Cost]) -> float:
-    """What the last step takes over what the one before took, as a part of how many times more there are."""
+    """Return the ratio of the last two sizes' costs, over the ratio of their numbers."""
     before, after = costs[-2:]
     return after.cpu_seconds / before.cpu_seconds / (after.number / before.number)
 
@@ -139,7 +140,7 @@ def _design() -> tuple[Scene, Lens]:
 
 
 def lens_of(m: int) -> Lens:
-    """The same lens on m x m control points."""
+    """Return the same lens on m x m control points."""
     lens = _design()[1]
     return replace(lens, back=lens.back.refined(m))
 
@@ -252,7 +253,7 @@ SERIES = (
 
 
 def facts(series: Series, costs: Sequence[Cost]) -> Mapping[str, Any]:
-    """What a table needs of a series, for docs/accuracy.json."""
+    """Return the facts of a series for a table of docs/accuracy.json."""
     return {
         "stage": series.stage, "driver": series.driver, "sizes": list(series.sizes), "power": series.power,
         "cpu_seconds": [cost.cpu_seconds for cost in costs], "memory_mb": [cost.memory_mb for cost in costs],

@@ -40,19 +40,20 @@ from scipy.interpolate import BSpline, PPoly
 from scipy.stats import qmc
 
 SETS = 8  # scramblings: they tell a standard error to a quarter of it
-POINTS = 1 << 22  # of each scrambling; of 2^19, most beside the target, the error was five times that of the jackknife
-MAX_POINTS = 1 << 25  # of each scrambling, where the standard error asks for more than POINTS
-ACCURACY = 0.01  # of the RRMSD: standard error at which no more points are traced
+# Points of each scrambling; with 2^19 the error beside the target was five times that of the jackknife.
+POINTS = 1 << 22
+MAX_POINTS = 1 << 25  # largest number of points of each scrambling, where the standard error needs more than POINTS
+ACCURACY = 0.01  # standard error over RRMSD at which no more points are traced
 CELLS = 256  # along x and y, by which points are drawn where there is light
 CHUNK = 1 << 15  # points that are in memory at a time, of each scrambling
 EDGE_POINTS = 1024  # along each edge of a face: the chord of a circle is off by 1e-6 of its radius
-BINS = 1024  # of y, by which the segments of a border are looked up
+BINS = 1024  # bins of y, by which the segments of a border are looked up
 SAME = 1e-6  # mm by which a surface may differ from its equation, or part.step from lens.step
 LEDGER = (
     "on target", "off target", "lost through the sides", "total internal reflection", "reflected at the faces",
     "absorbed in the glass", "absorbed by the mirror", "stopped beside a window or mirror",
 )  # fmt: skip
-PAGES = {  # of refractiveindex.info: (n, k)
+PAGES = {  # (n, k) by pages of refractiveindex.info
     "PMMA": ("organic/poly_methyl_methacrylate/Szczurowski", "organic/poly_methyl_methacrylate/Zhang-Mitsubishi"),
     "PC": ("organic/polycarbonate/Sultanova", "organic/polycarbonate/Zhang"),
     "N-BK7": ("specs/SCHOTT-optical/N-BK7", "specs/SCHOTT-optical/N-BK7"),
@@ -127,7 +128,7 @@ class Light(NamedTuple):
     sense: float  # 1: light goes along n; -1: against it, down to a mirror
     profile: int  # 0 uniform, 1 gaussian, 2 lambertian
     width: float  # gaussian: 1/e² radius (mm), or its tangent of a point; uniform point: cosine of the half angle
-    peak: float  # what the profile is multiplied by, so that the whole flux is 1
+    peak: float  # factor of the profile, so that the whole flux is 1
     round_aperture: bool
     aperture: np.ndarray  # (2,) half extents (mm); of a circle both its radius
     round_extent: bool
@@ -732,7 +733,7 @@ def paired(pictures, target):
 
 
 class Draw(NamedTuple):
-    """Where points are drawn on the first face: a density that is constant in cells of x times that of y."""
+    """Points drawn on the first face: a density that is constant in cells of x times that of y."""
 
     ends: np.ndarray  # (2, CELLS + 1) of the cells along x and y (mm)
     below: np.ndarray  # (2, CELLS + 1) part of the points that lies below them

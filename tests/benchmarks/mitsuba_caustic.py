@@ -31,8 +31,8 @@ import numpy as np  # noqa: E402
 
 PIXELS, VERTICES, UPSAMPLINGS = 128, 512, 4  # a side; a side; doublings of the height map
 ITERATIONS, PHOTONS, RATE = 1000, 32, 3e-5  # PHOTONS: a pixel, for the gradient; twice as many for the picture
-REFINED = (0.7, 0.9)  # of the iterations: from there on twice the photons, half the rate
-HIGHEST = 0.01  # of the height map, in halves of the plate
+REFINED = (0.7, 0.9)  # fractions of the iterations at which the photons are doubled and the rate is halved
+HIGHEST = 0.01  # largest height of the height map, in halves of the plate
 FIELD = 45.0  # degrees, of the camera
 THREADS = 2
 SEEN, LOOKS = 1024, 4  # photons a pixel with which Mitsuba judges the end of its run; so many times
@@ -44,14 +44,14 @@ class Case:
     """A caustic scene in Mitsuba's unit of length, half the plate."""
 
     index: float
-    distance: float  # from the exit face to the screen
+    distance: float  # distance from the exit face to the screen (mm)
     half: float  # half the width of the picture, which is in the middle of the screen
     target: np.ndarray  # (PIXELS, PIXELS) irradiance, row 0 = y max, column 0 = x min
     unit: float  # mm
 
     @classmethod
     def of(cls, path: Path) -> Case:
-        """From a scene file with a square plate in parallel light, on axis."""
+        """Read a scene file with a square plate in parallel light, on axis."""
         from bstcad.scene.scene import load
 
         scene = load(path)

@@ -82,7 +82,7 @@ def frame(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.where((out > 0.6) & (out < 0.85), 1.05, 0.05)
 
 
-PATTERNS = {  # on the square from -1 to 1 along x (to the right) and y (up)
+PATTERNS = {  # patterns on the square from -1 to 1 along x (to the right) and y (up)
     "many strokes": strokes,
     "frame": frame,
     "checks": lambda x, y: np.where((np.floor(4 * x) + np.floor(4 * y)) % 2, 1.0, 0.15),

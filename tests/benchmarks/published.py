@@ -35,7 +35,7 @@ from tests.benchmarks.independent import judge
 
 RECORDED, PAGE, PICTURES = (ROOT / "docs" / name for name in ("published.json", "published.md", "published"))
 TEXT, SCENES = Path(__file__).with_name("published.md.j2"), Path(__file__).with_name("published_scenes")
-SUN = "sun-picture"  # its picture is not in the repository
+SUN = "sun-picture"  # name of the scene whose picture is not in the repository
 SUN_SIDE, SUN_INSIDE = 256, 212  # pixels; the picture in its black border
 SIDE, COLOURS = 256, 64  # pixels a side of each of the two pictures of a scene; grey levels
 GAP = 4  # pixels between them

@@ -72,7 +72,7 @@ def test_designs_are_the_same_wherever_they_are_made(small_scene, tmp_path, caps
 
 
 def timed(call, runs, capsys):
-    """What each of the runs comes to; its seconds are printed."""
+    """Run each job and return the results; their seconds are printed."""
     for name, arguments in runs.items():
         began = time.perf_counter()
         yield call(*arguments)

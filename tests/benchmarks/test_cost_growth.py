@@ -1,4 +1,4 @@
-"""How the cost of each stage grows, held to what its algorithm says, and kernels beside plain torch: `make bench`.
+"""Growth of each stage's cost, held to its algorithm, and kernels beside plain torch: `make bench`.
 
 Exponents over a factor of 63 or more of what grows, the last step by itself (where constant parts hide least), and two
 ratios; all of them from one run, none in seconds.
@@ -24,7 +24,7 @@ from tests.tracing import from_first_net_plain, launch
 
 pytestmark = pytest.mark.bench
 NAMES = {f"{series.stage}, {series.driver}": series for series in SERIES}
-MEMORY = 1.15  # of memory, over all that grows: nothing is held for pairs of anything
+MEMORY = 1.15  # largest exponent of memory, over all that grows: nothing is held for pairs of anything
 
 
 @cache

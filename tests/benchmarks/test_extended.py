@@ -1,4 +1,4 @@
-"""What tailoring for a source of some size is worth: against doing nothing, and against feedback in the same time.
+"""Gain of tailoring for an extended source: against doing nothing, and against feedback in the same time.
 
 Classic feedback corrects the target of a point-source design by the ratio of what is wanted to what the real source
 makes, round after round: T_k+1 = T_k (T / E_k)^p (van Cittert's iteration in logarithms).  Time is that of the

@@ -20,10 +20,10 @@ from tests.benchmarks.cold import TEMPLATES, generate
 from tests.benchmarks.independent import POINTS, judge
 
 pytestmark = pytest.mark.bench
-AGREED = 0.01  # of the independent RRMSD
+AGREED = 0.01  # largest difference of the RRMSDs, as a fraction of the independent RRMSD
 SIGMAS = 2.5  # combined standard errors, where these are more than that
 FEW, MOST = 1 << 18, 1 << 23  # points of each scrambling through small lenses: the first pass, and in all
-FLUX = 1e-3  # of the source's light
+FLUX = 1e-3  # largest difference of fluxes, as a fraction of the source's light
 DRAFT = "tailoring.quality=draft"
 SMALL = ("lens.back.control_points=129", "target.pixels=128")
 ROUND = "{shape='circle', diameter=9.0}"
@@ -83,7 +83,7 @@ SCENES = {  # name: (template, changes)
 
 
 PAPER_FIGURES = {"thu": 0.1254, "portrait": 0.1217}  # Wang et al. 2023, on an RTX A4000
-BOUNDS = {  # of the RRMSD of templates at full size
+BOUNDS = {  # largest RRMSD of templates at full size
     "thu": 0.03, "portrait": 0.045, "off_axis": 0.05, "mirror": 0.05, "caustic_portrait": 0.04, "caustic_letters": 0.04,
     "portrait_draft": 0.15,
 }  # fmt: skip

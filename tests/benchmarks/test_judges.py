@@ -1,4 +1,4 @@
-"""What programs not written here make of lenses as their STEP files hold them; run by `make bench`.
+"""Judgements of programs that were not written here on lenses in their STEP files; run by `make bench`.
 
 batoid and mitsuba look at whole pictures of every template, batoid at single rays, mitsuba at Fresnel's losses and the
 ghost; gmsh opens the file by an OpenCASCADE of its own, and optiland evaluates an exported grid.
@@ -40,7 +40,8 @@ pytestmark = pytest.mark.bench
 
 # ---- lenses as their files hold them ---------------------------------------------------------------------------------
 
-SPHERE = {  # of disk: a metre's throw; off the axis in x and in y, so that it is no mirror image of itself
+# Changes of disk: a throw of a metre, off the axis in x and in y, so that the scene is no mirror image of itself.
+SPHERE = {
     "lens.back.control_points": 65, "target.z": 1000.0, "target.pixels": 64, "tailoring.quality": "draft",
     "source": {
         "kind": "point", "position": [0.4, -0.3, 0.0], "wavelength": 587.6, "profile": "uniform", "half_angle": 22.0,
@@ -103,7 +104,7 @@ def test_other_programs_agree(template, tmp_path):
 
 
 def test_the_grid_sag_for_zemax_is_optiland_s_spline():
-    """At each point of the grid, above the vertex, to 1e-9 mm; the knots run from 0 to 1 there."""
+    """Heights above the vertex agree to 1e-9 mm at each point of the grid; the knots run from 0 to 1 there."""
     pytest.importorskip("optiland", reason="pip install 'bstcad[judges]'")
     from optiland.coordinate_system import CoordinateSystem
     from optiland.geometries.nurbs.nurbs_geometry import NurbsGeometry
@@ -125,11 +126,12 @@ def test_the_grid_sag_for_zemax_is_optiland_s_spline():
 
 RMS = 1e-6  # mm, at a throw of a metre
 RAYS = 200  # a side
-EXACT = 0.9  # of the net's width: there, within one and a half pitches of its rim, batoid's back is the spline itself
+# Fraction of the net's width within which batoid's back is the spline itself: up to 1.5 pitches from the rim.
+EXACT = 0.9
 
 
 def test_rays_land_where_batoid_has_them(sphere):
-    """Which tells an index from one that is off by 2e-7 (tests/judges/test_optical_path.py)."""
+    """The landings show an index that is off by 2e-7 (tests/judges/test_optical_path.py)."""
     [channel] = sphere.scene.channels()
     apart = paths_apart(channel.through(sphere.lens), channel.source, sphere.scene.target.z)
     print(f"\n{apart.rays} rays, a metre's throw: {apart.place:.1e} mm apart", end="")
@@ -163,8 +165,8 @@ def test_the_ghost_lands_where_batoid_has_it(sphere):
 
 # ---- the solid, by gmsh ----------------------------------------------------------------------------------------------
 
-EQUAL = 1e-12  # of the volume, where it is summed between the knot lines
-ROUGHLY = 1e-4  # as gmsh itself sums it, over each face as one piece
+EQUAL = 1e-12  # largest relative difference of volumes that are summed between the knot lines
+ROUGHLY = 1e-4  # largest relative difference of gmsh's own volume, which sums each face as one piece
 
 
 @pytest.fixture
@@ -227,13 +229,13 @@ def test_it_opens_the_file_with_equal_volume(gmsh, tmp_path):
 # ---- losses and ghost, by mitsuba ------------------------------------------------------------------------------------
 
 PHOTONS = 8_000_000
-REPETITIONS = 8  # of the ghost, each with a share of the photons
+REPETITIONS = 8  # number of repetitions of the ghost, each with a share of the photons
 TUBES = 1031
 SIGMAS = 4
 
 
 def test_the_ghost_is_mitsubas(sphere):
-    """Its flux over all of the target, and where it falls alone: on pixels two away from any that others light."""
+    """Flux over all of the target, and over the pixels two or more away from any that other light falls on."""
     lens, screen = sphere, sphere.scene.target.screen
     channels = mitsuba.light(lens.lens, lens.scene.channels())
     theirs = np.concatenate(

@@ -26,7 +26,7 @@ def test_the_time_given_is_kept(tmp_path):
 
 
 def test_memory_does_not_grow_with_the_control_points(tmp_path):
-    """At fixed tubes: 129 against 513 control points a side, of which the mesh and STEP file take their part."""
+    """Tubes are fixed: 129 against 513 control points a side, of which the mesh and STEP file take their part."""
     rough = "tailoring.quality=draft", "tailoring.rays=1026"
     few, many = (designed(tmp_path / str(m), *rough, f"lens.back.control_points={m}")[0] for m in (129, 513))
     assert many["rrmsd"] <= 0.15
@@ -46,7 +46,7 @@ TWO_FACES = {
 
 
 def test_two_nets_for_two_pictures_take_less_than_6_gb(tmp_path):
-    """At its peak, with writing and proof."""
+    """The peak includes writing and proof."""
     report, _ = designed(tmp_path, *(f"{key}={as_toml(value)}" for key, value in TWO_FACES.items()))
     stages = [stage["name"] for stage in report["stages"]]
     assert "stage 2, 2048² tubes" in stages

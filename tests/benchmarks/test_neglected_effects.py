@@ -26,7 +26,9 @@ TUBES, FEWER, MANY = 2062, 515, 8  # a side, and for each of many channels; of 1
 SAMPLES, LINES = 12, 6  # points of a source that is given a size, lines of a spectrum that is given a width
 FACTOR = 2.0
 NOTHING = {"flux_change": 1e-3, "rrmsd_change": 2e-3, "blur_pixels": 0.05}  # differences of pictures below it are noise
-ROUGH = {("disk", "ghost", "rrmsd_change")}  # that ghost gathers to a spot, 0.0024; the coarse lens spreads it, 0.0005
+# (scene, effect, figure) that a coarse lens cannot estimate: the ghost gathers to a spot, 0.0024; the coarse lens
+# spreads it, 0.0005.
+ROUGH = {("disk", "ghost", "rrmsd_change")}
 
 
 def scaled(picture, target):
@@ -67,7 +69,7 @@ def picture_of(scene, lens, channels):
 
 
 def with_ghost(scene, lens, before):
-    """What the ghost adds to a picture of light of which the faces take nothing."""
+    """Return the picture with the ghost of light of which the faces take nothing."""
     channels = switched_on(scene, "fresnel") if not scene.effects else scene.channels()
     screen = scene.target.screen
     straight = tubes_picture(lens, channels, screen, 257).numpy().sum()
@@ -75,7 +77,7 @@ def with_ghost(scene, lens, before):
 
 
 def truths(scene, lens, kinds):
-    """By kind: (flux change, RRMSD between the pictures, RRMSD with the effect minus without)."""
+    """Return by kind (flux change, RRMSD between the pictures, RRMSD with the effect minus without)."""
     target = scene.target.irradiance()
     before = picture_of(scene, lens, scene.channels())
     own = difference(scaled(before, target), target)

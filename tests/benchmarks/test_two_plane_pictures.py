@@ -25,7 +25,7 @@ from bstcad.scene.scene import load
 from bstcad.scene.target import Target, drawing
 from tests.benchmarks.cold import generate
 
-WORDS = {20.0: "OPTICS\nEXPRESS", 100.0: "LIGHT\nCONTROL"}  # by mm behind the exit face
+WORDS = {20.0: "OPTICS\nEXPRESS", 100.0: "LIGHT\nCONTROL"}  # words by distance behind the exit face (mm)
 LETTERS, GROUND = 0.75, 0.50  # pixel values
 TUBES = 3001  # a side, for the light of the written lens
 DECODINGS = {  # irradiance of pixel values, white 1, and the inverse, which goes on above white

@@ -13,7 +13,7 @@ from bstcad.runs import processes
 from bstcad.scene.scene import load
 from tests.benchmarks.cold import ROOT, TEMPLATES
 
-WEIGHTS = (1e-4, 1e-2, 1.0, 100.0)  # of (RMS / λ)²; that of RRMSD² is 1
+WEIGHTS = (1e-4, 1e-2, 1.0, 100.0)  # weights of (RMS / λ)²; the weight of RRMSD² is 1
 FACES = {"front and back": {}, "back": {"lens.front": {"kind": "plane", "z": 0.0}}}  # changes of the template
 SMALL = {"lens.back.control_points": 129, "target.pixels": 128, "tailoring.rays": 512}
 

@@ -29,7 +29,7 @@ CIRCLE, ROUNDED = (wire(RIMS[name]) for name in ("circle", "rounded"))
 
 
 def taken(rim, lean, z):
-    """What draft and bevel take off walls of the height z above a plane front (mm³): slices by Simpson, exact."""
+    """Return the volume (mm³) that draft and bevel take off walls of height z above a plane front."""
     tangent = np.tan(np.radians(lean.angle))
 
     def area(off):
@@ -71,7 +71,7 @@ def lean_of(face, places=9):
      ("nearly flat", "rounded"), ("conic", "rectangle"), ("freeform", "rounded")],
 )  # fmt: skip
 def test_it_is_a_closed_solid_whose_walls_lean_by_the_draft(front, rim, tmp_path):
-    """In space, in the faces' planes, and as another reader of the file sees it."""
+    """The walls lean in space, in the faces' planes, and for another reader of the file."""
     lens, path = plate(front), tmp_path / "leaning.step"
     solid, names = named_solid(lens, wire(RIMS[rim]), [(0.5, 0.3, 1.0)], LEAN)
     sides = {"circle": 2, "rectangle": 4, "rounded": 8}[rim]
@@ -126,7 +126,8 @@ def test_a_circle_with_a_turned_front_has_cones_and_circles():
 SLOT = cq.Workplane("XY").slot2D(7.0, 4.0).wires().val()
 BEAN = cq.Workplane("XY").spline([(3.5, 0), (2, 2.5), (-1, 1.6), (-3.4, 0.4), (-1, -2.2), (2.2, -2)], periodic=True)
 KITE = cq.Wire.makePolygon([cq.Vector(*p, 0) for p in ((-4, 0), (0, -3), (3, 0), (0, 1))], close=True)
-WAIST = np.array([2.0, np.sqrt(3.1**2 - 2.0**2)]) / 3.1 * (3.1 - 1.6, 1.6)  # where arcs of 1.6 and of 1.5 mm touch
+# Point at which arcs of 1.6 and of 1.5 mm touch.
+WAIST = np.array([2.0, np.sqrt(3.1**2 - 2.0**2)]) / 3.1 * (3.1 - 1.6, 1.6)
 PEANUT = (cq.Workplane("XY").moveTo(WAIST[0], -WAIST[1]).threePointArc((3.6, 0), tuple(WAIST))
           .threePointArc((0, np.sqrt(3.1**2 - 4) - 1.5), (-WAIST[0], WAIST[1])).threePointArc((-3.6, 0), tuple(-WAIST))
           .threePointArc((0, 1.5 - np.sqrt(3.1**2 - 4)), (WAIST[0], -WAIST[1])).close().wires().val())  # fmt: skip

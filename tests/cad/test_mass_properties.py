@@ -30,7 +30,7 @@ def values(found):
 
 
 def by_occ(shape, precise=1e-7):
-    """As OCC integrates: for small nets, since 17 x 17 control points take seconds and 65 x 65 a minute."""
+    """Integrate by OCC: for small nets, since 17 x 17 control points take seconds and 65 x 65 a minute."""
     solid, surface = GProp_GProps(), GProp_GProps()
     BRepGProp.VolumePropertiesGK_s(shape.wrapped, solid, precise, False, False, True)
     BRepGProp.SurfaceProperties_s(shape.wrapped, surface, precise)
@@ -38,7 +38,7 @@ def by_occ(shape, precise=1e-7):
 
 
 def cut(lens, *given):
-    """Of a lens cut to a wire, with holes."""
+    """Return a lens cut to a wire, with holes."""
     return of_solid(named_solid(lens, *given)[0])
 
 
@@ -110,7 +110,7 @@ BODIES = {  # walls of every kind that is known: planes, cones, tori, spheres, c
 
 @pytest.mark.parametrize("kind", BODIES)
 def test_a_lens_in_a_body_is_both(kind):
-    """What the body has beside the lens is OCC's, of simple faces alone."""
+    """OCC integrates the body beside the lens, which has simple faces alone."""
     lens, body = plate("convex"), BODIES[kind]()
     around = by_occ(body.val().cut(cq.Workplane("XY").box(10, 8, 20).val()))
     found, own = of_solid(mounted(body, [Placed(lens)]).solid), of_lens(lens)

@@ -23,7 +23,7 @@ def disc(low, high, radius=RADIUS):
 
 
 def ring(low, high):
-    """What a disc around the lens has in volume beside it (mm³)."""
+    """Return the volume of a disc around the lens, without the lens (mm³)."""
     return (np.pi * RADIUS**2 - 80.0) * (high - low)
 
 
@@ -91,7 +91,7 @@ OUTLINES = [Round(shape="circle", diameter=26.0), Box(shape="rectangle", width=2
 @pytest.mark.parametrize("outline", OUTLINES)
 @pytest.mark.parametrize("draft", [0.0, 10.0])
 def test_a_flange_s_bevels_are_at_45_degrees_whatever_its_walls_lean(outline, draft):
-    """By the faces' normals, and by the volume of slices that shrink as wall and bevels say."""
+    """Normals of the faces, and the volume of slices that shrink with the wall and the bevels."""
     bevel, thick = 0.3, 1.5
     plate = body(Flange(outline=outline, z=16.5, thickness=thick, draft=draft, bevel=bevel)).val()
     angles = {round(float(np.degrees(np.arcsin(face.normalAt().z))), 6) + 0.0 for face in plate.Faces()}
@@ -116,7 +116,7 @@ def test_a_flange_s_bevels_are_at_45_degrees_whatever_its_walls_lean(outline, dr
     Box(shape="rectangle", width=20.0, height=16.0, corner_radius=corner) for corner in (0.0, 2.0)
 )])  # fmt: skip
 def test_every_face_of_a_flanged_lens_has_its_name_in_step(outline, draft, bevel):
-    """As the solid has them: OCC's writer turns the left-handed walls of a taper, and had left them unnamed."""
+    """OCC's writer turns the left-handed walls of a taper, and had left them unnamed."""
     part = mounted(body(Flange(outline=outline, z=1.2, thickness=1.3, draft=draft, bevel=bevel, holes=((7, 4, 1),))),
                    [Placed(plate("concave"))])  # fmt: skip
     text = b"".join(step_writing.encoded(part.solid, "part", faces=part.faces)).decode()

@@ -82,7 +82,7 @@ def test_a_moved_lens_passes_and_its_placement_is_stated(make_lens, tmp_path, mo
 
 @pytest.mark.parametrize(("unit", "name", "size"), [("INCH", "inch", 25.4), ("M", "metre", 1e3)])
 def test_a_lens_in_another_unit_passes_in_mm(make_lens, tmp_path, unit, name, size):
-    """By both readers; a design's own folder takes millimetres alone."""
+    """Both readers convert it; a design's own folder takes millimetres alone."""
     from OCP.IFSelect import IFSelect_RetDone
     from OCP.Interface import Interface_Static
     from OCP.STEPControl import STEPControl_AsIs, STEPControl_Writer

@@ -1,4 +1,4 @@
-"""What lens.step says besides the shape: re-read by OCC, and from the text where OCC is known to err."""
+"""Statements of lens.step besides the shape: re-read by OCC, and from the text where OCC is known to err."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ def test_the_solid_is_valid_tight_of_the_lens_s_volume_and_faces_out(lens):
 
 
 def test_the_borders_lie_on_the_front(lens):
-    """In space and by way of the patch, at the same parameter."""
+    """Points of the curves in space and in the patch agree, at the same parameter."""
     front, patch = lens.front, front_patch(lens)
     far = 3e-10 if isinstance(front, Sphere) else 0.0  # mm; PARABOLA, and the digits of a far centre
     near = walls.RIM if front.is_net and lens.outline.is_round else 1e-11  # mm
@@ -120,7 +120,7 @@ def test_the_borders_of_a_rectangle_s_back_are_the_net_s_own(make_lens):
 
 
 def test_the_file_is_sound_and_the_front_is_read_back(lens, tmp_path):
-    """By OCC and by the reader of the text."""
+    """OCC reads it, and so does the reader of the text."""
     step_writing.write_lens(lens, tmp_path / "lens.step", "lens")
     reread, text = step_reading.read(tmp_path / "lens.step"), part21.read(tmp_path / "lens.step")
     faces, edges = (6, 12) if isinstance(lens.outline, Rectangle) else (4, 6)

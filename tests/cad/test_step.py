@@ -1,4 +1,4 @@
-"""What is written is what was designed: checked by OCC, by our own parser and by scipy, from the file."""
+"""The written lens is the designed lens: checked from the file by OCC, by our own parser and by scipy."""
 
 from __future__ import annotations
 

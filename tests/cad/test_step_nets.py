@@ -14,7 +14,7 @@ M = 67  # control points a side: more than patches.FEW in all
 
 
 def statements(text: str) -> list[str]:
-    """What each entity says, in the file's order, each reference by what it refers to if that is a point."""
+    """Return the text of each entity in the file's order, with each point in place of the reference to it."""
     said = dict(re.findall(r"#(\d+)=(.*?);", re.sub(r"\s+", "", text[text.index("DATA;") + 5 :])))
     others = {name: f"#{k}" for k, name in enumerate(n for n, body in said.items() if "CARTESIAN_POINT" not in body)}
     return [re.sub(r"#(\d+)", lambda hit: others.get(hit[1]) or said[hit[1]], said[name]) for name in others]

@@ -58,7 +58,7 @@ def stadium(spline=True):
 
 
 def uses(solid):
-    """Of each edge (by its number among them) the directions in which faces use it, of a seam both."""
+    """Return for each edge (by its number) the directions in which faces use it; a seam has both."""
     found, known = {}, TopTools_IndexedMapOfShape()
     for face in solid.Faces():
         edges = TopExp_Explorer(face.wrapped, TopAbs_EDGE)
@@ -90,7 +90,7 @@ def volume_under(lens, x0, y0, radius):
 
 
 def occ_volume(solid, to=1e-6):
-    """By OCC, nearly as exactly as it can, or to so much of itself (mm³)."""
+    """Integrate the volume by OCC (mm³), nearly as exactly as it can, or to a given relative error."""
     found = GProp_GProps()
     BRepGProp.VolumePropertiesGK_s(solid.wrapped, found, to)
     return found.Mass()
@@ -115,7 +115,7 @@ def test_it_is_a_closed_solid_whose_edges_lie_on_all_they_bound(front, tmp_path)
 
 @pytest.mark.parametrize("front", FRONTS)
 def test_its_volume_is_that_of_calculus(front):
-    """To which a wall that looked inwards would add instead of taking away."""
+    """A wall that looked inwards would add volume instead of taking it away."""
     lens = plate(front)
     disc = cq.Workplane("XY").circle(3.5).wires().val()
     solid = lens_solid(lens, disc, HOLES)

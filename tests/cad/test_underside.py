@@ -107,7 +107,7 @@ def test_wires_stay_in_the_plane_around_the_front():
 
 @pytest.mark.parametrize("z", [None, 1.0, -1.0], ids=["flush", "higher", "lower"])
 def test_a_flange_holds_it(z, tmp_path):
-    """Its lower face in the plane of the underside, above it or below."""
+    """The flange's lower face lies in the plane of the underside, above it or below."""
     made = lens()
     level = made.front.around.z + (z or 0.0)
     flange = Flange(outline=Round(shape="circle", diameter=60.0), z=level, thickness=2.5)

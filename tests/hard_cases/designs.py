@@ -32,7 +32,7 @@ MISSES, SIDES, OUTSIDE = "misses the lens", "leaves through the sides", "that le
 LIFTED, DARK = "are lifted: ", "is left dark"
 MOVED, CHANGED = "the back was moved by", "tailoring moved the vertex of the back"
 MISSED, STEEP = "The RRMSD", "as steep as"
-CLOSE = "Some light meets the back"  # so short of total internal reflection, or beyond
+CLOSE = "Some light meets the back"  # beginning of the remark on light next to total internal reflection, or past it
 # What two faces cannot do, as it is said before stage 2.
 CROSSED, IN_GLASS = (
     "would have to cross between the lens and the nearest target",
@@ -44,18 +44,19 @@ CROSSED, IN_GLASS = (
 class Hard:
     """One design, and what became of it once in a rough draft, with room: another order of a sum is another RRMSD."""
 
-    template: str  # in templates/, without ".toml"
+    template: str  # name of the template, without ".toml"
     changes: Mapping[str, Any]  # dotted keys, as --set
     picture: Callable[[], np.ndarray] | None = None  # (SIDE, SIDE) from 0 to 1
-    sizes: Mapping[str, Any] = field(default_factory=dict)  # what it is about, and so is not made smaller
+    # Changes of the scene that make the case, which stay at full size.
+    sizes: Mapping[str, Any] = field(default_factory=dict)
     refused: str = ""  # the sentence, of a design that cannot be
-    rrmsd: float = 0.01  # at most
-    efficiency: float = 0.99  # at least
-    says: tuple[str, ...] = (MISSES, SIDES)  # in report["given_up"], and nothing else
+    rrmsd: float = 0.01  # largest RRMSD
+    efficiency: float = 0.99  # smallest efficiency
+    says: tuple[str, ...] = (MISSES, SIDES)  # beginnings of the remarks in report["given_up"], and of no others
     told: tuple[str, ...] = ()  # before stage 2
     perhaps: tuple[str, ...] = ()  # may be said beside them: so near the limit that another machine says it
     bench: bool = False  # run by `make bench` alone: half a minute, as easy as others, or one of tailoring's own tests
-    rough: Mapping[str, Any] = field(default_factory=dict)  # for time, in a rough draft
+    rough: Mapping[str, Any] = field(default_factory=dict)  # changes of the scene that save time in a rough draft
 
 
 def one_pixel() -> np.ndarray:

@@ -114,7 +114,7 @@ def refracted(direction: np.ndarray, normal: np.ndarray, eta: Decimal) -> np.nda
 
 
 def landing(start: Sequence, direction: Sequence, lens: Lens, z: float) -> tuple[Decimal, Decimal]:
-    """Where the ray from `start` along `direction` (any length) meets the plane z behind the lens (mm)."""
+    """Return the point (mm) at which the ray from `start` along `direction` (any length) meets the plane z."""
     with localcontext(prec=DIGITS):
         index, at, along = number(lens.index), vector(start), unit(vector(direction))
         for face, eta in ((Face(lens.front), 1 / index), (Face(lens.back), index)):

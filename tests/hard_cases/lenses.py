@@ -25,7 +25,7 @@ NAMES = {torch.float32: "float32", torch.float64: "float64"}
 
 @contextmanager
 def tracing(engine: str) -> Iterator[Callable[[Rays, Lens, float], Landed]]:
-    """From the glass to the screen: plain torch; plain torch on the fused spline; the fused back face."""
+    """Trace from the glass to the screen: plain torch; plain torch on the fused spline; the fused back face."""
     form = trace.from_first_net if engine == "fused" else from_first_net_plain
     with mock.patch.object(ops, "ENABLED", ops.ENABLED and engine != "plain"):
         yield lambda rays, lens, z: form(rays, lens, LevelPlane(z))
@@ -41,7 +41,7 @@ def engines(source, lens: Lens, x, y, z: float) -> Iterator[tuple[str, Landed]]:
 
 
 def examples(count: int) -> settings:
-    """Of a law: the same numbers in every run, and no clock."""
+    """Return hypothesis settings of a law: the same numbers in every run, and no clock."""
     quiet = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
     return settings(max_examples=count, derandomize=True, deadline=None, suppress_health_check=quiet)
 

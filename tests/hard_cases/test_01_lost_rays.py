@@ -132,7 +132,7 @@ def test_a_lost_corner_takes_its_four_tubes_and_changes_no_other(form, where):
 
 @DTYPES
 def test_a_lost_ray_lights_no_pixel(dtype):
-    """Its landing may be anything: neither picture nor gradient of the others knows of it."""
+    """A lost ray may land anywhere: neither picture nor gradient of the others depend on it."""
     screen = Screen(Z, (-100.0, 100.0), (-100.0, 100.0), 12)
     lens = lens_of(wavy(dtype))
     landed = trace.trace(good(dtype), lens, LevelPlane(Z))

@@ -108,7 +108,7 @@ def test_along_the_axis_at_the_equator(curvature, dtype, holds):
 @DTYPES
 @pytest.mark.parametrize("dz", [0.0, 1e-300, 1e-13, -1e-13, 1e-7, -1e-7, 1e-3, -1e-3, -0.3])
 def test_rays_along_a_level_back_are_flagged(dz, engine, dtype):
-    """In the glass below a level face: parallel to it, nearly so on either side, and away from it."""
+    """Rays in the glass below a level face: parallel to it, nearly so on either side, and away from it."""
     back = net(m=9, half=12.0, dtype=dtype)
     for depth in (5.0, 1e-3, 1e-9):
         rays = bundle((0.0, 0.0, 20.0 - depth), (1.0, 0.2, dz), dtype)

@@ -107,7 +107,7 @@ def test_a_parser_that_is_not_occ_finds_the_same_net_and_each_edge_twice(holds, 
 
 
 def test_occ_finds_the_volume(holds, written):
-    """By its adaptive integral, asked for 1e-5.
+    """OCC's adaptive integral is asked for 1e-5.
 
     Over a trimmed round face that is good to 5e-4 only, whatever is asked; there OCC's mesh is the judge.
     """
@@ -142,7 +142,7 @@ def test_our_mesh_is_closed_at_each_deflection(holds, written, tmp_path, cells):
 
 @pytest.mark.parametrize("deflection", (0.3, 0.02))
 def test_occ_meshes_the_solid_closed_at_each_deflection(holds, written, tmp_path, deflection):
-    """As a CAD program would, from the file."""
+    """The mesh is made from the file, as a CAD program would make it."""
     shape = written.reread.shape
     BRepTools.Clean_s(shape)
     BRepMesh_IncrementalMesh(shape, deflection, False, 0.5, True)  # mm, not relative; rad; in threads

@@ -133,7 +133,7 @@ def test_no_number_is_no_number_and_nothing_worse(evaluate, dtype):
 
 
 def test_the_forward_kernel_at_knots_and_corners():
-    """Its own spline, on a buried net: the same fates and landings as the plain form's."""
+    """The kernel's own spline, on a net in glass: fates and landings are the plain form's."""
     m, half = 9, 10.0
     heights = buried(m, torch.float64)
     heights *= 0.2

@@ -71,7 +71,7 @@ def test_sag_and_slope_have_all_their_digits(curvature, dtype, holds):
 @DTYPES
 @pytest.mark.parametrize("source", [Point(), Collimated(Circle(12.0))], ids=("point", "collimated"))
 def test_no_curvature_is_the_plane_to_the_bit(source, dtype):
-    """By closed form and kernels: a sphere of curvature 0 or too small for any sag traces as the plane does."""
+    """Closed form and kernels: a sphere of curvature 0, or too small for any sag, traces as the plane does."""
     x, y = (p[:150] * 0.5 for p in disc(dtype))
     fronts = (Plane(15.0), Sphere(15.0, 0.0), Sphere(15.0, -0.0))
     plane, *others = ([found.position for _, found in engines(source, lens_of(wavy(dtype), front), x, y, 300.0)]

@@ -66,7 +66,7 @@ def off(position, truth) -> float:
 
 
 def unit(lens: Lens, throw: float, dtype) -> float:
-    """What half a unit in the last place moves a landing (mm): that of a direction or of a slope, and that of a place.
+    """Return the shift of a landing (mm) by half a unit in the last place: of a direction or slope, and of a position.
 
     A direction turns a ray by itself, slopes are differences of heights over a pitch; the steepest ray is some 35° off
     the axis, where a turn moves the landing by throw / cos², less than twice the throw.

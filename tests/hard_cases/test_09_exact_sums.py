@@ -24,7 +24,7 @@ from bstcad.optics.surfaces import Plane
 from tests.tracing import simulated
 
 HITS = 20_000_000
-SINGLE = 1 << 16  # of them one by one, behind one ray that carries all the others: its flux is above 2^24
+SINGLE = 1 << 16  # number of single rays behind one ray that carries all the others: its flux is above 2^24
 SCREEN = Screen(100.0, (-50.0, 50.0), (-50.0, 50.0), 5)  # pixel (2, 2): |x|, |y| < 10
 ROUND = torch.finfo(torch.float64).eps / 2
 
@@ -34,7 +34,7 @@ FORMS = pytest.mark.parametrize("compiled", (True, False), ids=("compiled", "pla
 
 @pytest.fixture(autouse=True)
 def plain(request, monkeypatch):
-    """Where a test asks for the plain form, no kernel serves."""
+    """Switch all kernels off where a test asks for the plain form."""
     if "compiled" in request.fixturenames and not request.getfixturevalue("compiled"):
         monkeypatch.setattr(ops, "ENABLED", False)
 
@@ -48,7 +48,7 @@ def carried(dtype, count=SINGLE) -> torch.Tensor:
 
 @PRECISION
 def test_a_traced_pixel_counts_twenty_million_rays(holds, dtype):
-    """From the source through a slab into one pixel; none is kept, and 1 / 20 007 729 is no short binary number.
+    """Rays go from the source through a slab into one pixel; 1 / 20 007 729 is no short binary number.
 
     Adding n equal numbers rounds each time in the same direction, by ROUND of the sum at most; a part adds n / PARTS.
     """

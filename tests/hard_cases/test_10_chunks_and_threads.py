@@ -88,7 +88,7 @@ def of_two_faces(dtype) -> dict[str, torch.Tensor]:
 
 
 def by_rays(found: Simulation) -> dict[str, torch.Tensor]:
-    """What a simulation says."""
+    """Return the results of a simulation."""
     flux = torch.tensor([*found.flux.values()], dtype=torch.float64)
     return {"image, box": found.box, "image, tent": found.tent, "flux": flux}
 
@@ -113,7 +113,7 @@ def image_and_gradient(dtype=torch.float64) -> dict[str, torch.Tensor]:
 
 
 def everything() -> dict[str, torch.Tensor]:
-    """And what else of a design is shared among threads."""
+    """Return the other results of a design that are shared among threads."""
     back = lens().back
     x, y = sampling.grid(Rectangle(20.0, 20.0), 300)
     flat = (p.reshape(-1) for p in (x, y, 0.3 * torch.sqrt(1.5 + x / 7), 0.001 * x * y, x * x))  # no polynomial
@@ -164,7 +164,7 @@ def test_threads_of_one_process_change_no_bit(threads):
 
 
 def test_strips_and_bands(holds, monkeypatch):
-    """The same rays and tubes in other portions: 90 000 roundings of 1.1e-16 at most, of either sign."""
+    """Rays and tubes in other portions: 90 000 roundings of 1.1e-16 at most, of either sign."""
     images = {}
     for portion, rows in ((sampling.STRIP, tubes.BAND), (7 * RAYS, 38)):
         monkeypatch.setattr(sampling, "STRIP", portion)
@@ -209,7 +209,7 @@ def test_one_thread_and_other_strips_make_the_same_design(threads, monkeypatch, 
 
 
 def test_any_number_of_threads_makes_the_same_two_faces(threads):
-    """For a picture and a wave, by more corners than one thread of torch takes: 32 768."""
+    """A picture and a wave have more corners than one thread of torch takes: 32 768."""
     quick = {"tailoring": two_faces.SMALL["tailoring"] | {"rays": 200, "rounds": 2, "stage2_iterations": 12}}
     scene, found = load(DISK, two_faces.SMALL | two_faces.WITH_WAVE | quick), []
     for n in (1, 4):
@@ -218,7 +218,7 @@ def test_any_number_of_threads_makes_the_same_two_faces(threads):
     assert all(np.array_equal(*each) for other in found[1:] for each in zip(found[0], other, strict=True))
 
 
-PROCESSORS = {  # what BLAS, torch and numba take the processor for
+PROCESSORS = {  # environment variables by which BLAS, torch and numba take the processor for another one
     "as it is": {}, "MKL_CBWR=COMPATIBLE": {"MKL_CBWR": "COMPATIBLE"}, "MKL_CBWR=AVX2": {"MKL_CBWR": "AVX2"},
     "torch without vector units": {"ATEN_CPU_CAPABILITY": "default"}, "any, to numba": {"NUMBA_CPU_NAME": "generic"},
 }  # fmt: skip

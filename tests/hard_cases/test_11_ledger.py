@@ -24,7 +24,7 @@ from bstcad.optics.surfaces import Sphere
 from tests.tracing import from_first_net_plain, launch, simulated, simulated_plain, stratified
 
 SOURCE = Point(position=(1.0, -2.0, 3.0), profile="gaussian", half_angle_1e2=30.0)
-LINES = {  # of the ledger, and the fates that end in it
+LINES = {  # fates of rays by line of the ledger
     "on target": (Status.ALIVE,),
     "off target": (Status.ALIVE, Status.TURNED_BACK),
     "missed the lens": (Status.MISSED_FRONT,),
@@ -102,7 +102,7 @@ def test_every_ray_is_in_its_line(holds, dtype):
 
 @FORMS
 def test_the_ledger_of_a_simulation(holds, form):
-    """What was not launched missed the lens: those lines sum to 1."""
+    """Rays that were not launched missed the lens: those lines sum to 1."""
     found, rays = form(SOURCE, lens(), SMALL, RAYS, 0), traced(torch.float64)
     wanted = counted(rays, SMALL)
     wanted["missed the lens"] += 1 - math.fsum(wanted.values())
@@ -120,7 +120,7 @@ PICTURES = {
 @FORMS
 @pytest.mark.parametrize("light", PICTURES)
 def test_nothing_is_piled_on_the_border(holds, monkeypatch, light, form):
-    """The same rays in the same pixels; tubes are cut at the border, which leaves rounding of a few tubes' flux."""
+    """Rays are in the same pixels; tubes are cut at the border, which leaves rounding of a few tubes' flux."""
     monkeypatch.setattr(ops, "ENABLED", form is simulated)
     small, large = (PICTURES[light](screen, form) for screen in (SMALL, LARGE))
     assert float(large.sum()) > 1.1 * float(small.sum())  # light does leave the small screen

@@ -91,7 +91,7 @@ def test_back_and_forth_comes_to_rest(target):
 
 
 def test_newton_that_stalls_says_plateau():
-    """From a potential that folds everywhere no step may gain: the one in hand is kept."""
+    """Newton's method begins at a potential that folds everywhere, so that no step may gain: the first one is kept."""
     source, target = SOURCES["disc"], Density.from_values(TARGETS["speckle"][0]).lifted(FLOOR)
     start = 3.0 * RANDOM.standard_normal((N, N))
     phi, errors, reason = climb([(source, target)], start, steps=50, tolerance=0.0)

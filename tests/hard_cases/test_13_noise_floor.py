@@ -66,7 +66,7 @@ def by_strata(form, n: int, seed: int, dtype) -> torch.Tensor:
 
 
 def slope(errors: list[float], numbers: list[int]) -> float:
-    """Of log error over log number of rays."""
+    """Return the slope of log error over log number of rays."""
     return float(np.polyfit(np.log(numbers), np.log(errors), 1)[0])
 
 
@@ -90,7 +90,7 @@ def test_the_error_of_rays_falls_with_its_power(holds, name, rays, form, power, 
 
 
 def light(target: torch.Tensor) -> Light:
-    """What verification finds of the plate, held to `target`."""
+    """Return the light of the plate by a verification, compared with `target`."""
     return measure(plate(), (Channel(SOURCE, plate().index),), SCREEN, target.numpy(), Effort(256))
 
 

@@ -53,7 +53,7 @@ SCENES = {  # (scene, what makes it small)
 
 
 def design_with_checkpoints(folder, name="one face"):
-    """In a process that is to be killed: a small design, with a checkpoint at every step and --resume."""
+    """Make a small design in a process that is to be killed, with a checkpoint at every step and --resume."""
     commands.Keeper = functools.partial(commands.Keeper, every=0.0)
     checkpoint.SHARE = 1e9  # no pause, however long the writing takes
     rendering.lens_picture = lambda mesh: None
@@ -158,7 +158,7 @@ def full_disk(size):
 
 
 def test_a_full_disk_is_a_sentence_and_loses_nothing(small_scene, tmp_path, monkeypatch):
-    """With 60 kB neither the checkpoint nor lens.step fits; with 0.5 MB these do, and lens.stl does not.
+    """A disk of 60 kB holds neither the checkpoint nor lens.step; one of 0.5 MB holds these, but not lens.stl.
 
     How the command line says it: tests/test_cli.py.  Going on from a checkpoint is what the test above does.
     """

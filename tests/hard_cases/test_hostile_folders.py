@@ -44,7 +44,7 @@ def hole(path, size):
 
 @contextlib.contextmanager
 def spending(what, bound, holds):
-    """What the block holds in memory at most is a figure; as Python and numpy count it, whatever came before."""
+    """Record the memory that the block holds at most, as Python and numpy count it."""
     tracemalloc.start()
     try:
         yield
@@ -103,7 +103,7 @@ def net(folder, data, method=zipfile.ZIP_DEFLATED):
 
 
 SHAPE = r"design\.npz: cannot be read .*is not \(33, 33, 3\) numbers.*; generate"
-FILES = {  # how a file of the folder is changed, and the sentence
+FILES = {  # changes of a file of the folder, and the sentence of the refusal
     "a STEP file of gigabytes": (lambda f: hole(f / "lens.step", 2 * GIGABYTE), r"lens\.step: .*over 600 MB"),
     "an archive of gigabytes": (lambda f: hole(f / "design.npz", 3 * GIGABYTE), r"holds over 3\.\d+ MB"),
     "an STL that claims 2 GB": (

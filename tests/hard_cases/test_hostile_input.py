@@ -26,9 +26,10 @@ from bstcad.scene.target import Target
 from bstcad.step_text import part21
 from tests.hard_cases import fuzz
 
-SECONDS = 10.0  # of the processor for one input; machines differ by a factor of ten at most
-MEGABYTES = 2000.0  # of addresses that inputs may take: a picture of 64 million pixels in colour is 600
-LEAST_PASSED = 0.05  # of the inputs: changes too coarse would be refused at the door and try nothing behind it
+SECONDS = 10.0  # largest CPU seconds of one input; machines differ by a factor of ten at most
+MEGABYTES = 2000.0  # largest address space of an input (MB): a picture of 64 million pixels in colour takes 600
+# Smallest fraction of inputs that pass: coarse changes would be refused at the door and try nothing behind it.
+LEAST_PASSED = 0.05
 LONGEST = 700  # characters of a sentence
 
 
@@ -74,18 +75,18 @@ def step_reader(path, _):
     assert all(word.isprintable() and len(word) <= LONGEST for word in words), words
 
 
-READERS = {  # what reads, a file of a seed and a good STEP text, and how many sentences it has at least
+READERS = {  # reader, seed file, good STEP text, and least number of sentences
     "part21": (step_reader, lambda random, step: fuzz.file_of(random, step, "latin-1"), 6),
     "scene": (scene_reader, lambda random, step: fuzz.file_of(random, random.choice(fuzz.scenes())), 25),
     "picture": (picture_reader, lambda random, step: fuzz.picture(random), 6),
 }
 
-OUTSIDE = (  # what a process changes outside itself, beside files that it opens to write
+OUTSIDE = (  # events by which a process changes something outside itself, beside files that it opens to write
     "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate", "os.chmod", "os.system",
     "os.exec", "os.fork", "os.posix_spawn", "subprocess.Popen", "socket.connect", "pickle.find_class", "shutil.rmtree",
 )  # fmt: skip
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
-looking = []  # by the reader that it names
+looking = []  # names of the readers that look at present
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +119,7 @@ def bounded():
 
 
 def is_one_sentence(error):
-    """With a remedy, of the reader's own."""
+    """Return True if an error is one sentence with a remedy, of the reader's own."""
     text = str(error)
     alien = re.search(r"Traceback|pydantic|Exceeds the limit|\bline \d+, in\b", text)
     remedy = "; " in text or "did you mean" in text
@@ -173,7 +174,7 @@ AROUND = (
 
 @pytest.mark.parametrize("size", [MEGABYTE // 20, pytest.param(MEGABYTE, marks=pytest.mark.bench)])
 def test_no_pattern_of_the_step_reader_takes_the_square_of_a_text(size, small_step, holds):
-    """With a twentieth of a megabyte, where the square is 1/400 of it; of one piece, in the data or in the header."""
+    """Repetitive texts of 0.05 MB, where a square law takes 1/400 of the time; in one piece, in data or header."""
     worst = 0.0
     for piece in PIECES:
         for before, behind in AROUND:

@@ -29,8 +29,8 @@ from bstcad.scene.scene import SceneError
 from tests.conftest import draws_nothing, verify_with
 from tests.hard_cases import fuzz
 
-SECONDS = 10.0  # of the processor, for one file
-NOISE = "standard error of that RRMSD, times five"  # of few rays: no matter of the file
+SECONDS = 10.0  # largest CPU seconds for one file
+NOISE = "standard error of that RRMSD, times five"  # check that fails by the few rays of the test, whatever the file
 
 
 @pytest.fixture

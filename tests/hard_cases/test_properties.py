@@ -99,7 +99,7 @@ def test_all_light_is_accounted_for(source, depth, curvature, outline, z, seed):
 @given(SOURCES, DEPTH, CURVATURE, st.floats(0.0, 0.15), SEEDS)
 @examples(40)
 def test_a_hit_lies_on_its_face_and_ahead(source, depth, curvature, ripple, seed):
-    """At both faces: F = 0 to rounding, the path there is forwards, along the ray, inside the outline."""
+    """Hits at both faces: F = 0 to rounding, the path is forwards, along the ray, inside the outline."""
     x, y = uniform((2, 200), seed, -11.0, 11.0)
     lens = lens_with(depth, curvature, ripple=ripple)
     rays = source.rays(x, y, 15.0, 1.0)

@@ -1,4 +1,4 @@
-"""How far two traces of the same rays are apart: batoid's and ours, of places and optical paths."""
+"""Distance between two traces of the same rays, batoid's and ours, in position and optical path."""
 
 from dataclasses import replace
 from typing import NamedTuple

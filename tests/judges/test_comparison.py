@@ -42,7 +42,7 @@ class TestStandIn:
 
     @pytest.fixture
     def judge(self, monkeypatch):
-        """Its attributes may be changed; numpy is a distribution that has a version."""
+        """Return a judge whose attributes may be changed; numpy is a distribution that has a version."""
 
         def trace(glass, channels, screen, rays, seed):
             picture, random = tubes_picture(glass, channels, screen, 256).numpy(), np.random.default_rng(seed)

@@ -101,7 +101,7 @@ NO_DATA = ("Bad", "No Data", "NaN", "-nan(ind)", "-1.#IND00", "n/a", "---", "NoD
 
 @pytest.mark.parametrize(("separator", "heading"), [(" ", ""), (";", "x;y;z\n")])
 def test_lines_without_data_are_counted_and_left_out(tmp_path, separator, heading):
-    """By the words of instruments, and by an empty height where the separator shows it."""
+    """Instruments write words, or an empty height where the separator shows it."""
     words = NO_DATA[: 9 if separator == " " else 10]
     rows = [f"{x:.6f}{separator}{y:.6f}{separator}{z:.6f}" for x, y, z in GOOD]
     for k, word in enumerate(words):

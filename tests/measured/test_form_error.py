@@ -77,7 +77,7 @@ def test_pvr_of_a_smooth_error_is_its_pv_and_of_noise_three_times_its_rms():
 
 
 class TestForm:
-    """Of a cloud in the frame of the design, with 0.5 \u00b5m of form error and 10 nm of noise."""
+    """A cloud in the frame of the design, with 0.5 µm of form error and 10 nm of noise."""
 
     NOISE = 1e-5  # mm
 

@@ -76,7 +76,7 @@ def as_designed(lens):
 
 
 def test_a_decentre_of_ten_micrometres_is_found_to_a_tenth_and_fails_where_less_is_asked(nominal, same_light):
-    """So do inches, by name."""
+    """A cloud in inches fails by name."""
     strict = replace(nominal, scene=nominal.scene.changed({"accept.decentre": 0.005}))
     part = judged(as_designed(nominal.lens) + [0.01, 0.0, 0.0], strict, unit="inches")
     assert (part.facts["alignment"]["dx"], part.facts["alignment"]["dy"]) == pytest.approx((0.01, 0.0), abs=1e-4)
@@ -188,7 +188,7 @@ def test_the_report_has_a_made_part_where_one_was_asked_for(small_design, nomina
 
 
 def test_many_parts_of_one_design_are_judged_beside_it(small_design, nominal, tmp_path, quick, capsys):
-    """By the command and in Python; the design's folder stays as it is to the last bit, and the map is the form."""
+    """The command and Python agree; the design's folder stays as it is to the last bit, and the map is the form."""
     folder, place = shutil.copytree(small_design.folder, tmp_path / "design"), tmp_path / "serial-17"
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     given, found = tmp_path / "cloud.csv", cloud(with_form_error(nominal.lens, 1e-4, 2.0), 5000, 1e-5)

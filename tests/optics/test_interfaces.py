@@ -79,7 +79,7 @@ def test_a_window_before_a_lens_and_a_fold_mirror_behind_it_are_data():
 
 
 def test_a_system_is_simulated_as_its_rays_and_its_tubes_are_traced():
-    """By plain rays, since no one kernel traces it whole, and by fused tubes: the same light in the same places."""
+    """Plain rays, since no one kernel traces the whole system, and fused tubes: the same light on the same pixels."""
     lens = replace(Lens(Sphere(0.0, 0.01), net(6.0, 0.2), SQUARE, N), before=WINDOW, behind=FOLD)
     screen = Screen(10.0, (-40.0, 40.0), (-40.0, 40.0), 8)
     source = Point((1.0, -2.0, -60.0), profile="uniform", half_angle=7.0)
@@ -138,7 +138,7 @@ def test_a_mangin_mirror_is_simulated_as_its_tubes_are_traced():
 
 
 def test_the_metal_of_a_mangin_mirror_is_met_from_the_glass():
-    """At normal incidence the face reflects |(m - n) / (m + n)|², and light crosses a bare front before and behind."""
+    """The face reflects |(m - n) / (m + n)|² at normal incidence, and light crosses a bare front before and after."""
     metal, flat = 1.2 + 6.0j, [net(z, 0.0) for z in (0.0, 6.0)]
     lens = Lens(*flat, SQUARE, N, way=MANGIN, losses=Losses(Fresnel(587.6, metal=metal)))
     rays = Collimated(Rectangle(4.0, 4.0)).rays(*stratified(Rectangle(4.0, 4.0), 4, 0), 0.0, 1.0)
@@ -189,7 +189,7 @@ def test_the_gradient_through_two_nets_is_finite_differences():
 
 
 def test_beyond_a_net_the_gradient_is_that_of_its_rim():
-    """Where the front sends light past the back's net: sag and slopes do not change across the rim."""
+    """The front sends light past the back's net: sag and slopes do not change across the rim."""
     lens = replace(TWO, back=replace(TWO.back, x=(-5.0, 5.0), y=(-5.25, 5.25))).unbounded()
     rays, way = rays_of(SOURCE, lens, size=18.0), torch.cos(torch.arange(21.0)).double()
 

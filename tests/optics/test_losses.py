@@ -1,4 +1,4 @@
-"""What takes flux on the way: Fresnel against Maxwell's boundary conditions, energy that adds up, gradients."""
+"""Losses of flux along rays: Fresnel against Maxwell's boundary conditions, energy that adds up, gradients."""
 
 import math
 from dataclasses import replace
@@ -85,7 +85,7 @@ def test_a_plate_takes_by_beer_lambert_and_by_fresnel(degrees):
 @pytest.mark.parametrize("source", SOURCES, ids=("collimated", "point"))
 @pytest.mark.parametrize("losses", (BARE, ALL, Losses(None, Absorption(0.02))), ids=("fresnel", "all", "absorption"))
 def test_the_gradient_of_the_merit_is_that_of_differences_losses_and_all(source, losses):
-    """Of a small net, in a random direction; so nothing of an effect's own gradient is left out."""
+    """A small net, in a random direction: no part of an effect's own gradient is left out."""
     lens = rough_lens(m=9, heights=0.05, losses=None)
     channel = Channel(source, N, losses=losses)
     goal = Goal("target", SCREEN, np.random.default_rng(1).random(SCREEN.shape) + 0.5)

@@ -67,7 +67,7 @@ def test_a_paraboloid_gathers_parallel_light_in_its_focus():
 
 @pytest.mark.parametrize("conic_constant", [-0.4, 0.0])
 def test_an_ellipsoid_takes_light_from_one_focus_to_the_other(conic_constant):
-    """Of a conic of revolution: R / (1 ± e) from the vertex, e² = -k; of a sphere both are its centre."""
+    """Foci of a conic of revolution lie R / (1 ± e) from the vertex, e² = -k; a sphere has both in its centre."""
     radius, e = 50.0, math.sqrt(-conic_constant)
     near, far = Z + radius / (1 + e), Z + radius / (1 - e)
     x = torch.linspace(-9, 9, 13, dtype=torch.float64)
@@ -115,7 +115,7 @@ def test_light_downwards_is_light_upwards_seen_in_a_mirror(law, surface):
 
 @pytest.mark.parametrize("light", LIGHTS)
 def test_tubes_hold_the_light_that_rays_carry(light):
-    """By the fused picture and by the corners, traced one by one; the screen takes all of it."""
+    """The fused picture and the corners, traced one by one, agree; the screen takes all of the light."""
     scene = LIGHTS[light], mirror(bumpy()), Screen(120.0, (-900.0, 900.0), (-900.0, 900.0), 8)
     rays = simulated(*scene, 800, 1)
     for found in (picture(*scene, 160), launch_tubes(*scene[:2], 160).picture(*scene[1:])):
@@ -134,7 +134,7 @@ def test_the_rays_to_points_of_the_mirror_meet_them(light):
 
 
 def test_light_from_below_does_not_pass_for_light_from_above():
-    """Its rear is dark: a ray that comes up to the face meets it from behind."""
+    """The rear of the mirror is dark: a ray that comes up to the face meets it from behind."""
     rays = beam((0.0, 0.1, 1.0), 1)
     wrong = trace(replace(rays, sense=-1), mirror(bumpy()), LevelPlane(120.0))
     assert not wrong.alive.any()

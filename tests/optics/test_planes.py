@@ -50,7 +50,7 @@ def coming_through(light):
 
 @pytest.mark.parametrize("tilt", [(30.0, 0.0), (0.0, 30.0), TILT, (-80.0, 75.0)])
 def test_the_axes_are_those_of_space_turned_about_x_then_about_y(tilt):
-    """By scipy: lower-case letters turn about fixed axes, one after the other, right-handed."""
+    """scipy's lower-case letters turn about fixed axes, one after the other, right-handed."""
     axes = np.array(TiltedPlane((1.0, 2.0, 3.0), tilt).axes)
     assert axes == pytest.approx(Rotation.from_euler("xy", tilt, degrees=True).as_matrix().T, abs=1e-15)
     assert np.cross(axes[0], axes[1]) == pytest.approx(axes[2], abs=1e-15)
@@ -103,7 +103,7 @@ def test_rays_that_lead_away_from_it_are_lost():
 
 @ALL
 def test_the_gradient_of_the_merit_is_its_derivative(light):
-    """By central differences, on the tilted screen."""
+    """Central differences on the tilted screen agree."""
     source, reflects = LIGHTS[light]
     lens = optic(0.05, reflects)
     goal = Goal("target", SCREEN, np.ones(SCREEN.shape))

@@ -13,7 +13,7 @@ from tests import lenses
 from tests.exact_volume import integral
 from tests.lenses import half_over, net
 
-A, B, C = 0.3, -0.2, 1.7  # of a tilted plane
+A, B, C = 0.3, -0.2, 1.7  # slopes and height (mm) of a tilted plane
 OUTLINES = [Rectangle(16.0, 14.0), Circle(6.5)]
 
 
@@ -63,7 +63,7 @@ def test_a_cap_has_the_area_of_its_height(curvature):
     ("outline", "face"), CASES, ids=lambda each: getattr(each, "shape", "") or f"{each.kind} {getattr(each, 'm', '')}"
 )
 def test_face_and_wall_hold_the_exact_volume(outline, face):
-    """By the divergence theorem, with the integral of the control points as the other way; they share no point."""
+    """The divergence theorem, and the integral of the control points as the other method, which share no point."""
     border = outline_border(outline, face)
     both = of_face(face, border, 2.0) + of_wall(face, border, 2.0)
     assert both.volume == pytest.approx(integral(face, outline) + 2.0 * outline.area, rel=1e-9)

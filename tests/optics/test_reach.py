@@ -1,4 +1,4 @@
-"""Where a face can send light: the critical angle, the slope of a mirror, tilted planes, and the law itself."""
+"""Reach of a face: the critical angle, the slope of a mirror, tilted planes, and the law itself."""
 
 import math
 from dataclasses import replace
@@ -75,7 +75,7 @@ def test_slopes_that_would_reflect_all_are_turned_back_to_grazing_light(law, sen
 )
 @pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (0.3, -0.1, math.sqrt(0.9))], ids=["along the axis", "oblique"])
 def test_what_is_within_reach_is_what_snells_law_brings_there(plane, direction):
-    """Where there is room, the wanted slope sends the ray to its aim and it leaves short of GRAZING; elsewhere not."""
+    """Targets within reach have a slope that sends the ray to its aim short of GRAZING; others have none."""
     line = torch.linspace(-600.0, 600.0, 41, dtype=torch.float64)
     aim = torch.stack([t.reshape(-1) for t in torch.meshgrid(line, line, indexing="ij")])
     rays = ray(direction, n=aim.shape[1])

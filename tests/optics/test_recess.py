@@ -48,7 +48,7 @@ def test_inside_it_is_its_optical_part_and_beyond_a_plane_through_the_rim(face):
 
 
 def test_a_ray_crosses_the_dome_inside_its_outline_alone():
-    """From its centre rays go on as they were; a micron beyond the rim they are lost."""
+    """Rays from the centre go on undeflected; a micron outside the rim they are lost."""
     r = torch.tensor([0.0, 5.0, EDGE - 1e-6, EDGE + 1e-6, 20.0], dtype=torch.float64)
     rays = Point().rays(r * RADIUS / PLANE, 0 * r, RADIUS, 1.0)  # through r of the underside's plane
     behind = to_first_net(rays, lens())
@@ -63,7 +63,7 @@ def test_a_ray_crosses_the_dome_inside_its_outline_alone():
 @pytest.mark.parametrize("rays", ["kernel", "plain"])
 @pytest.mark.parametrize("half_angle", [None, 60.0])
 def test_the_light_beside_the_dome_is_a_line_of_the_ledger(rays, half_angle):
-    """Of a Lambertian point r² / (r² + d²) crosses a disc at the distance d, over sin² of the cone's half angle."""
+    """A Lambertian point sends r² / (r² + d²) through a disc at the distance d, over sin² of the cone's half angle."""
 
     def within(r):
         whole = 1.0 if half_angle is None else math.sin(math.radians(half_angle)) ** 2

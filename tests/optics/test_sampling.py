@@ -1,4 +1,4 @@
-"""Where rays start: each cell its point, each seed its own points."""
+"""Starts of rays: each cell has its point, each seed its own points."""
 
 import numpy as np
 import pytest

@@ -41,13 +41,13 @@ def crossing_error(rays, x, y, z):
 
 @pytest.mark.parametrize("radius", [30.0, 60.0])
 def test_an_ellipsoid_brings_a_parallel_beam_to_its_far_focus(radius):
-    """Of eccentricity 1 / n: k = -1 / n², and the focus lies R n / (n - 1) behind the vertex, in the glass."""
+    """An ellipsoid of eccentricity 1 / n has k = -1 / n² and its focus R n / (n - 1) behind the vertex, in glass."""
     rays = behind(Conic(15.0, 1 / radius, -1 / N**2))
     assert crossing_error(rays, 0.0, 0.0, 15.0 + radius * N / (N - 1)) < 1e-9  # mm
 
 
 def test_a_hyperboloid_makes_the_light_of_its_far_focus_parallel():
-    """Of eccentricity n: k = -n², from a point R / (n - 1) before the vertex."""
+    """A hyperboloid of eccentricity n: k = -n², from a point R / (n - 1) before the vertex."""
     radius = 10.0
     rays = behind(Conic(15.0, 1 / radius, -(N**2)), Point((0.0, 0.0, 15.0 - radius / (N - 1))))
     assert float(rays.direction[:2].abs().max()) < 1e-12

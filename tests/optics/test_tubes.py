@@ -95,7 +95,7 @@ def test_the_fused_form_is_the_plain_one_with_its_gradient():
 
 @FORMS
 def test_an_edge_through_the_corners_of_pixels_has_the_gradient_of_its_neighbours(form):
-    """Its pieces there have no length, but the derivatives of their ends have; central differences agree to O(h)."""
+    """Pieces at a corner have no length, but the derivatives of their ends have; central differences agree to O(h)."""
     n, h = 4, 1e-6
     even = torch.linspace(0.3, 6.7, n + 1, dtype=torch.float64)  # the diagonals with x = y meet whole numbers
     corner, flux = torch.stack(torch.meshgrid(even, even, indexing="ij")), torch.ones((n, n), dtype=torch.float64)

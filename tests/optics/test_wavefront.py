@@ -69,7 +69,7 @@ def test_orthonormal_on_the_disc():
 
 
 def test_high_orders_keep_their_digits():
-    """On the rim R_n^m(1) = 1, and Z_231 = sqrt(21) R_20^0 or sqrt(42) cos or sin."""
+    """Values on the rim are known: R_n^m(1) = 1, and Z_231 = sqrt(21) R_20^0 or sqrt(42) cos or sin."""
     turn = torch.tensor([0.0, 0.3, 2.0], dtype=torch.float64)
     n, m = noll(231)
     wanted = math.sqrt(2 * (n + 1)) * (torch.cos(m * turn) if m > 0 else torch.sin(-m * turn))
@@ -127,7 +127,7 @@ def test_a_sphere_leads_through_its_focus():
 
 
 def test_a_path_from_far_off_keeps_its_digits():
-    """From 1e8 mm a sphere is r² / 2 R deep; 1e-18 mm of the next term."""
+    """A sphere of 1e8 mm is r² / 2 R deep; the next term is 1e-18 mm."""
     x, y = places()
     far = beyond(torch.stack([x, y, torch.zeros_like(x)]), (0.0, 0.0, -1e8))
     torch.testing.assert_close(far, (x * x + y * y) / 2e8, rtol=1e-13, atol=0)

@@ -19,11 +19,12 @@ from bstcad.judges.comparison import Judge
 from bstcad.report import prescription, record, rendering, report
 from tests.app.conftest import launched
 
-LENS = "The lens in three dimensions, seen from the side of its back surface."  # for those who cannot see it
+# Text of the lens's picture for those who cannot see it.
+LENS = "The lens in three dimensions, seen from the side of its back surface."
 LEGIBLE = 4.5  # contrast of small text, WCAG 2.2, 1.4.3
 LARGEST = 6_000_000  # bytes of a report
 MOVED = {"dx": 1e-5, "dy": -2e-5, "dz": 3e-3, "rotation_x": 1e-4, "rotation_y": -1e-4, "rotation_z": 9e-5}
-PART = {  # as a made part is told of in report.json
+PART = {  # entry of a made part in report.json
     "cloud": "cloud.csv", "points": 40000, "left_out": {"off the face": 12}, "deviation_map": ["deviation.npz"],
     "outliers": {"points": 40, "share": 1e-3, "above": 39, "farthest": 0.1}, "scale": 1.0,
     "alignment": MOVED | {"undetermined": []}, "minimum_zone": MOVED | {"width": 7e-4},
@@ -285,7 +286,7 @@ def bench(at_work, tmp_path_factory):
 
 
 def settled(page):
-    """What is seen once the pictures on the walls are decoded: two looks at it are alike."""
+    """Return the picture of a page whose pictures on the walls are decoded: two shots of it are alike."""
     now = seen(page)
     for _ in range(PATIENCE // 50):
         page.wait_for_timeout(50)
@@ -296,7 +297,7 @@ def settled(page):
 
 
 def kinds(pixels):
-    """Where rays, glass, and the white and the black of a wall are seen."""
+    """Return the pixels in which rays, glass, and the white and the black of a wall are seen."""
     red, green, blue, opacity = np.moveaxis(pixels, 2, 0)
     grey, opaque = np.ptp(pixels[..., :3], axis=2) < 12, opacity == 255
     return {

@@ -105,7 +105,7 @@ def lens_of(scene):
 
 
 def ordered(scene, lens, shape):
-    """What is sent of a lens whose files are written, and gone again."""
+    """Return the data of a lens whose files are written, and deleted again."""
     with tempfile.TemporaryDirectory() as place:
         said, folder = scene.part.of(scene.lens), Path(place)
         (folder / "lens.step").write_bytes(b"ISO-10303-21;")  # of which nothing but its digest is asked
@@ -174,7 +174,7 @@ def area(body):
 
 @pytest.mark.parametrize("name", MOUNTED)
 def test_a_section_is_the_solid_s(name):
-    """Where OCC finds the solid of part.step is where the polygons of the cut lie, and nowhere else."""
+    """The solid of part.step, by OCC, lies where the polygons of the section lie, and nowhere else."""
     made = sheet(name)
     mount, views, random = made.mount or Mount(), views_of(made), np.random.default_rng(1)
     whole = lens_of(scene_of(name))
@@ -257,7 +257,7 @@ def test_what_is_stated_stands_there_and_what_is_not_is_said():
 
 @pytest.mark.filterwarnings("error")
 def test_each_number_of_a_front_stands_on_the_sheet_and_in_the_prescription():
-    """Of a kind with numbers of its own, such as a biconic's."""
+    """Kinds with numbers of their own, such as a biconic, state them, too."""
     numbers = {"curvature_x": 0.02, "curvature_y": -0.01, "conic_constant_x": -0.75, "conic_constant_y": 1.25}
     made = replace(sheet("square"))
     made.record["front"] = prescription._face("biconic", 15.0, numbers) | {"within": 1e-6}

@@ -187,7 +187,7 @@ def entities_of(outline, mount):
 
 
 def area(entity):
-    """Of a closed curve (mm²); an arc of a polyline from a vertex to the next has the bulge tan(angle / 4)."""
+    """Return the area of a closed curve (mm²); an arc between two vertices has the bulge tan(angle / 4)."""
     if entity.dxftype() == "CIRCLE":
         return math.pi * entity.dxf.radius**2
     assert entity.closed
@@ -239,7 +239,7 @@ def svg_of(outline, mount):
 
 
 def svg_area(shape):
-    """Of a circle, or of a rectangle whose corners are quarters of circles (mm²)."""
+    """Return the area of a circle, or of a rectangle whose corners are quarters of circles (mm²)."""
     if shape.tag.endswith("}circle"):
         return math.pi * float(shape.get("r")) ** 2
     corner = float(shape.get("rx", 0.0))

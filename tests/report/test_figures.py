@@ -1,4 +1,4 @@
-"""What a figure shows is what it was given: right way up, in mm, with the stated numbers."""
+"""Figures show the given data: right way up, in mm, with the stated numbers."""
 
 import io
 from dataclasses import replace
@@ -94,7 +94,7 @@ class TestIrradianceTriptych:
         assert ticks[1] - ticks[0] == pytest.approx(ticks[2] - ticks[1])
 
     def test_a_hot_spot_on_even_light_shows(self):
-        """Of four pixels among 16 384, 1.3 times as bright; and the paper is whiter than even light."""
+        """Four pixels among 16 384 are 1.3 times as bright; and the paper is whiter than even light."""
         even = np.ones((128, 128))
         spotted = even.copy()
         spotted[10:12, 20:22] = 1.3

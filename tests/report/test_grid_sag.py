@@ -93,7 +93,7 @@ def test_a_mirror_is_judged_by_its_own_light():
 
 
 def test_a_large_grid_ends_at_the_knots_beyond_the_rim(monkeypatch):
-    """It has a quarter of the points; so has the grid of a net whose rim lies elsewhere between the knots."""
+    """The large grid has a quarter of the points, wherever the rim lies between the knots."""
     monkeypatch.setattr(grid_sag, "FLUSH", 33 * 25 - 1)
     for lens in (wavy(), wavy(past=1.8)):
         each = GridSag.of(lens, lens.back, None, BEAM)

@@ -83,7 +83,7 @@ def test_the_resolved_scene_makes_the_same_lens_to_the_last_bit(free, tmp_path):
 
 
 def test_the_papers_scene_stays_as_it_is(free):
-    """It finds front and back together: only the search itself gives that lens again."""
+    """Front and back are found together: only the search itself gives that lens again."""
     paper = load(DISK, FREE | {"tailoring.quality": "paper"})
     assert resolved(paper, free.lens) == paper
 
@@ -126,7 +126,7 @@ def test_the_mass_is_known_where_the_density_is(small_design, material, mass):
     {"lens.front.curvature": 0.03, "lens.min_thickness": 8.0},  # more than half of the blank
 ], ids=str)  # fmt: skip
 def test_a_front_that_is_found_is_one_that_the_scene_may_have(changes):
-    """At either end of what the search may try, and that is no small part of what is possible."""
+    """Fronts at either end of the search are valid, and the search covers no small part of the valid range."""
     scene = load(DISK, FREE | changes)
     rim = math.hypot(*scene.lens.outline.farthest)
     low, high = (_of_sag(sag, rim, 0.0) for sag in scene.rim_sags)

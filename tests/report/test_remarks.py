@@ -1,4 +1,4 @@
-"""What was given up is said with its figure, and nothing is said where nothing was given up."""
+"""Remarks state with their figures the wishes that were given up, and nothing else."""
 
 import copy
 from dataclasses import replace

@@ -143,7 +143,7 @@ def path(small_design):
 
 @pytest.fixture(scope="module")
 def light(path):
-    """What a page is told of it."""
+    """Return the light that a page is given."""
     return json.loads(rendering.turnable(lens(Plane(15.0), OUTLINES[0]), path))
 
 

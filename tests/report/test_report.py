@@ -64,7 +64,7 @@ SHAPE = {"centre_thickness": 12.0, "thickness_min": 5.8, "radius_min_concave": 8
 
 
 def contents(report):
-    """Its record; the figures of its goal are those of the whole."""
+    """Return the record of a report; the figures of its one goal are those of the whole."""
     figures = {name: report[key] for key, name in OF_WORST.items() if key in report}
     return of_json(json.dumps(report | {"goals": [goal | figures for goal in report["goals"]]}))
 
@@ -85,7 +85,7 @@ def failing():
 
 
 def printed(report, verbose=False):
-    """What the terminal shows, 120 columns wide."""
+    """Return the text on the terminal, 120 columns wide."""
     console = Console(file=io.StringIO(), width=120)
     console.print(reports.summary(contents(report), verbose))
     return console.file.getvalue()
@@ -124,7 +124,7 @@ def test_each_fact_has_its_words_on_the_page_and_first_figures_on_the_terminal(t
 class TestHtml:
 
     def test_a_page_runs_one_script_of_ours_or_none(self, tmp_path):
-        """By the browser's own rule, which tells scripts apart by their hashes."""
+        """The browser's own rule tells scripts apart by their hashes."""
         path = tmp_path / "report.html"
         reports.write_html(CONTENTS, {"lens": PNG}, path, solid='{"values": ""}')
         data, script = re.findall(r"<script(.*?)>(.*?)</script>", path.read_text(encoding="utf-8"), re.S)
@@ -170,7 +170,7 @@ class TestHtml:
         assert "PASSED" not in page and "FAIL" not in page_of(tmp_path, REPORT)
 
 
-WORDS = [  # of a number, by units
+WORDS = [  # names of units beside a number
     (units.quantity, (3.2e-7, "mm"), "0.32 nm"), (units.quantity, (1e-14, "mm"), "< 0.001 pm"),
     (units.quantity, (0.00173, "mm"), "1.73 µm"), (units.quantity, (-12.345, "mm"), "−12.3 mm"),
     (units.quantity, (0.0, "mm"), "0 mm"), (units.quantity, (17.2238, "deg"), "17.2°"),

@@ -19,7 +19,7 @@ def add(shared, number):
 
 @pytest.fixture(scope="module")
 def address():
-    """Of a scheduler with two workers, threads of this process."""
+    """Return the address of a scheduler with two workers, threads of this process."""
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=2, processes=False, dashboard_address="127.0.0.1:0"
     ) as local:

@@ -1,4 +1,4 @@
-"""What is read is bounded, what is written stays where it is, and one run at a time works in a folder."""
+"""Reading is bounded, writing stays in its folder, and one run at a time works in a folder."""
 
 from __future__ import annotations
 

@@ -99,7 +99,7 @@ def test_a_script_that_guards_nothing_is_not_run_twice(tmp_path):
 
 
 def test_what_a_run_leaves_to_be_cleared_up_is_not_told():
-    """Its end is abrupt: not one of its semaphores is given back by itself."""
+    """The run ends abruptly: not one of its semaphores is given back by itself."""
     code = "import os; from bstcad.runs.processes import submit; submit('os.getpid').result(); os._exit(0)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)  # until all are gone
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

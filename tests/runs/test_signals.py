@@ -64,7 +64,7 @@ def _heard():
 @pytest.mark.bench
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_in_the_middle_it_flushes_a_checkpoint_and_resume_goes_on(number, scene, tmp_path):
-    """As `kill`, a supervisor or a terminal that is closed sends it, the last to every process of the group."""
+    """The signal comes from `kill`, a supervisor or a closed terminal, the last to every process of the group."""
     stopped = generate(scene, tmp_path / "lens")
     for line in stopped.stdout:
         if line.startswith("stage 2"):

@@ -204,7 +204,7 @@ def test_a_front_that_comes_too_near_to_the_back_is_refused():
     ((0.02, -0.05), Toroid(15.0, 0.02, -0.05)), ((0.1, 0.0), Toroid(15.0, 0.1, 0.0)),
 ])  # fmt: skip
 def test_the_net_of_a_toroid_lies_within_a_nanometre(outline, curvatures, same):
-    """Of two equal curvatures on the sphere, too; its vertex is at z to the bit."""
+    """A toroid of two equal curvatures lies on the sphere, too; its vertex is at z to the bit."""
     scene = load(DISK).changed({"lens.outline": outline, "lens.front": Toroid(15.0, *curvatures)})
     net = scene.lens.front_surface
     x, y = torch.linspace(-8.0, 8.0, 301, dtype=torch.float64), torch.linspace(-8.0, 8.0, 300, dtype=torch.float64)

@@ -47,7 +47,7 @@ def test_an_even_shape_has_its_area_to_the_last_digits(shape, pixels):
 
 
 def test_a_disc_has_the_share_of_each_pixel_at_its_rim():
-    """By the integral of its height above each pixel's lower side."""
+    """Expected values are the integral of its height above each pixel's lower side."""
     columns, rows = 10, 8
     light = made("disc").light((columns, rows), SIZE)
     for row, column in np.ndindex(rows, columns):

@@ -220,7 +220,7 @@ def thu():
 
 @pytest.mark.parametrize("key", Accept.model_fields)
 def test_each_limit_but_those_of_form_and_place_is_one_of_the_light(thu, key):
-    """By which a verdict knows whether a limit was asked of the light."""
+    """A verdict knows by this whether the scene has a limit on the light."""
     free = {name: None for name in Accept.model_fields}
     asked = thu.model_copy(update={"accept": Accept.model_construct(**free | {key: 0.1})})
     assert asked.limits_light == (key not in ("form", "decentre"))

@@ -70,7 +70,7 @@ def test_an_outline_lets_its_area_through(outline, pixels):
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF"])
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_every_orientation_of_a_camera_is_made_upright(kind, orientation):
-    """By Pillow's own transposition."""
+    """Pillow's own transposition gives the same."""
     exif = Image.Exif()
     exif[0x0112] = orientation
     stored = np.random.default_rng(0).integers(0, 2, (16, 24)).repeat(4, 0).repeat(4, 1).astype(np.uint8) * 255

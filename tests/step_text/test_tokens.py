@@ -1,4 +1,4 @@
-"""What no STEP file may hold is refused in one sentence with its statement; what Part 21 permits is read."""
+"""Texts that no STEP file may hold are refused in one sentence with the statement; all that Part 21 permits is read."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ SCENES = {}
 
 
 def record(base, point):
-    """What a run with these settings comes to."""
+    """Return the result of a run with these settings."""
     if REFUSED in point:
         return Run(settings=point, status=FAILED, reason="ended by SIGKILL", seconds=7.0, cost_seconds=8.0)
     SCENES[base.toml()] = base

@@ -52,7 +52,7 @@ def test_every_kind_of_design_has_one(name):
 
 
 def test_sunlight_parts_over_all_that_is_seen():
-    """Of the sun's divergence, light from 400 to 700 nm counts; of a laser's a line of 10 nm."""
+    """Light of the sun's divergence counts from 400 to 700 nm; a laser's light counts as a line of 10 nm."""
     scene = load(TEMPLATES / "sun_caustic.toml", {"target.pixels": 64, "lens.back.control_points": 65})
     lens = coarse_lens(scene)
 

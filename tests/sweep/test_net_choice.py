@@ -93,7 +93,7 @@ def test_an_oblong_plate_gets_square_cells():
 
 
 def test_cells_are_those_of_the_light_that_a_pixel_asks_for():
-    """Of an even beam a pixel's light comes from its share of the lens; of a Gaussian beam dim light is wide."""
+    """A pixel's light comes from its share of the lens in an even beam; in a Gaussian beam dim light is wide."""
     lens = coarse_lens(PLATE)
     light = cells_of_a_mm2(PLATE, lens)
     arrives = float(tubes_picture(lens, PLATE.channels(), PLATE.target.screen, 257).sum())

@@ -94,7 +94,7 @@ SCENES = {
 
 
 def test_a_pilot_that_waited_for_the_compiler_is_designed_again(tiny, monkeypatch):
-    """Its seconds were those of the first design after an installation: 52 predicted where 17 were found."""
+    """The first design after an installation waits for the compiler: 52 s were predicted where 17 s were found."""
     calls, waits, design = [], [True, False, False], prediction.pipeline.design
 
     def compiling(*given, **how):

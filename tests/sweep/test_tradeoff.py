@@ -22,7 +22,7 @@ FILES = ("tradeoff.csv", "tradeoff.json", "tradeoff.html", "tradeoff.png")
 
 @pytest.fixture(autouse=True)
 def quick_figures(monkeypatch):
-    """What figures show stands in test_results.py."""
+    """Replace the figures, which test_results.py looks at."""
     monkeypatch.setattr(results, "tradeoff_figure", lambda table: None)
     monkeypatch.setattr(results, "png", lambda figure: b"PNG")
 

@@ -151,7 +151,7 @@ def test_a_lens_with_room_stays_as_it_is():
 
 
 def test_the_back_is_moved_as_the_last_resort(monkeypatch):
-    """Where bending does not do: here it is hardly begun."""
+    """The back moves if bending does not suffice: the bending has hardly begun in this test."""
     monkeypatch.setattr(machinability, "REPAIR", 1)
     lens = crossing(Rectangle(8.0, 8.0))
     found = kept(lens, Bounds(thinnest=0.5))

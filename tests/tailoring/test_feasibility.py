@@ -1,4 +1,4 @@
-"""What two faces cannot do is known before the long stages: by figures that geometry gives, and in one sentence."""
+"""Two faces that are impossible are refused before the long stages: by figures of geometry, in one sentence."""
 
 import math
 

@@ -51,7 +51,7 @@ def test_the_conic_constant_alone():
 
 
 def test_both_together():
-    """From a plane, where the conic constant has no effect."""
+    """The search starts from a plane, where the conic constant has no effect."""
 
     def merit(front):
         return 1e4 * (front.curvature - 0.02) ** 2 + (front.conic_constant + 1.5) ** 2 + 1.0

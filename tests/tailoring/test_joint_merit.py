@@ -111,7 +111,7 @@ def test_the_plain_form_is_the_fused_one(name, monkeypatch):
 
 
 def test_the_hard_cases_are_hard():
-    """In one light is lost on its way; in another one the faces are nearer to each other than they may be."""
+    """Light is lost on its path in one case; in another one the faces are nearer to each other than they may be."""
     for (landed,) in merit_of(BOWL).landing(BOWL).on_goals:
         assert 0.02 < 1 - float(landed.alive.double().mean()) < 0.5
     assert excess(FACES, TOUCHING).worst > 0

@@ -41,7 +41,7 @@ def free():
 
 @pytest.fixture(scope="module")
 def bound():
-    """The same for a tool of 50 mm."""
+    """Return a design whose back is bounded by a tool of 50 mm."""
     return design(load(DISK, TINY | {"lens.tool_radius": 50.0}), device="cpu")
 
 
@@ -67,7 +67,7 @@ def rough(outline=WHOLE):
 
 
 def test_the_gradient_for_a_back_alone_is_that_of_finite_differences():
-    """By all bounds at once; test_clearance.py has each of them, for both faces and for a front."""
+    """All bounds act at once; test_clearance.py has each of them, for both faces and for a front."""
     lens, bounds, step = rough(Circle(1.5)), Bounds(0.3, 0.4, 0.5, 2.0, 3.5, 2.5), 1e-6
     found = excess(lens, bounds)
     way = torch.randn(9, 9, generator=torch.Generator().manual_seed(1), dtype=torch.float64)

@@ -18,7 +18,7 @@ def bowl(parameters):
 
 
 def ended(problem, method, evaluations):
-    """Where a minimisation stands at its end."""
+    """Return the last state of a minimisation."""
     *_, last = minimise(problem, method, evaluations)
     return last
 

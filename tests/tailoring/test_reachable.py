@@ -69,7 +69,7 @@ def radii(scene):
 
 
 def test_parallel_light_reaches_a_disc(wide):
-    """Of the radius L tan δ and at most half the lens more, since its edge sends light there."""
+    """The disc has the radius L tan δ and at most half the lens more, since its edge sends light there."""
     scene = load(wide)
     part, edge = part_of(scene)
     radius, r = 200.0 * math.tan(largest_deflection(1.4936)), radii(scene)
@@ -177,7 +177,7 @@ def test_a_design_lights_its_part_without_total_reflection(designed):
 
 
 def test_a_verification_keeps_to_the_part(designed):
-    """And compares the stored target with the scene's on that part."""
+    """The verification compares the stored target with the scene's on that part."""
     folder, _ = designed
     before = json.loads((folder / "report.json").read_text())
     assert cli.run(["verify", str(folder)]) == 0

@@ -80,7 +80,7 @@ def test_a_minimiser_goes_on_from_every_step(minimiser, tmp_path):
 
 
 def heights_of(made):
-    """Of the nets of a lens, and the planes that they are measured from."""
+    """Return the nets of a lens, and the planes from which their heights are measured."""
     return [t for net in made.lens.nets for t in (net.heights, torch.tensor(net.z))]
 
 

@@ -28,7 +28,8 @@ from bstcad.tailoring.stage2 import Problem, improved, search, steps, variables_
 from tests import lenses
 
 N, M, HALF, EVALUATIONS = 1.5, 33, 10.0, 40
-SQUARE, BEAM = Rectangle(2 * HALF, 2 * HALF), Collimated(Rectangle(1.9 * HALF, 1.9 * HALF))  # its rim moves on the back
+# Square outline, and the beam inside it: the rim of the light moves on the back.
+SQUARE, BEAM = Rectangle(2 * HALF, 2 * HALF), Collimated(Rectangle(1.9 * HALF, 1.9 * HALF))
 SCREEN = Screen(120.0, (-12.1, 12.0), (-12.2, 12.1), 48)  # no corner of a tube lies on a pixel's border
 
 
@@ -52,7 +53,7 @@ FRONTS = {  # a lens, and the light that meets it
 }  # fmt: skip
 ABOVE = Collimated(Rectangle(1.9 * HALF, 1.9 * HALF), z=250.0)  # a beam that comes down
 MANGIN = Passes((Pass("front", Refract), Pass("back", Reflect), Pass("front", Refract)))
-BODIES = {  # of mirrors: light comes down to the back, whose front is dark; but up to a Mangin mirror's front
+BODIES = {  # bodies of mirrors: light comes down to the back, whose front is dark; but up to a Mangin mirror's front
     "two mirrors": (  # after the second light goes down, past the first, to z = -60
         Lens(
             Plane(-5.0), net(0.0), SQUARE, 1.0, reflects=True,

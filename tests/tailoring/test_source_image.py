@@ -81,14 +81,14 @@ def of_point(source):
 
 @pytest.mark.parametrize("name", SOURCES)
 def test_the_blurred_light_is_the_sum_over_the_points(name):
-    """By images alone, against rays from many points: a quarter at most of what the source's size changes."""
+    """Images alone, against rays from many points: a quarter at most of the change by the source's size."""
     source = SOURCES[name]
     rays, (found,) = by_rays(source), shown(merit(source))
     assert off(rays, found) < 0.25 * off(rays, of_point(source))
 
 
 def test_a_source_of_next_to_no_size_is_a_point():
-    """Its merit, too, but for light beyond the border, which here is on the wider screen that light is blurred from."""
+    """The merit is a point's, too, but for light outside the border, which the wider screen of the blur holds."""
     tiny = replace(SOURCES["disc"], diameter=1e-6)
     plain = Merit.of(spread(tiny).centre, lens(), 60, GOALS, 0.0)
     one, two = (each(each.landing(lens())) for each in (merit(tiny, overshoot=0.0), plain))
@@ -119,7 +119,7 @@ TWO = (*GOALS, Goal("target[1]", FURTHER, np.full(FURTHER.shape, 1 / 2400), weig
 
 
 def test_each_of_several_goals_is_blurred_by_images_of_its_own():
-    """Its picture is that for the goal alone, and not that of a point."""
+    """The picture of each goal is the picture of that goal alone, and not that of a point."""
     source = SOURCES["disc"]
     for goal, found in zip(TWO, shown(merit(source, goals=TWO)), strict=True):
         [alone] = shown(merit(source, goals=(goal,)))

@@ -21,7 +21,8 @@ TINY = SMALL | {
     "tailoring.stage2_iterations": 24,
     "tailoring.source_points": 12,
 }
-TWINS = SMALL | {"tailoring.stage2_iterations": 1}  # they are compared before
+# Changes of the scene for the comparison of float32 with float64, which comes before more evaluations.
+TWINS = SMALL | {"tailoring.stage2_iterations": 1}
 WIDE = TINY | {"source.diameter": 1.2}  # 80 mm before the back, 475 mm behind it: an image of 7 mm of 60
 
 
@@ -45,7 +46,7 @@ def test_the_size_of_the_source_is_made_up_for(compensated):
 
 
 def test_it_tells_what_each_size_costs(compensated):
-    """In place of stage 2; the rays between the stages see what points of no tailoring see."""
+    """Stage 2 is replaced; the rays between the stages see the source's points, which no tailoring sees."""
     found, rrmsd = compensated
     stages = [stage for stage in found.making.stages if stage.name.startswith("stage ")]
     assert [stage.name for stage in stages] == [

@@ -136,7 +136,7 @@ def test_time_that_is_up_ends_stage_2_with_the_best_so_far():
 
 
 def test_what_comes_after_is_given_the_time_that_this_machine_needs():
-    """Of 100 s a machine of pace 1 leaves 10 s over, one three times slower 30 s, and what the next step takes."""
+    """A machine of pace 1 keeps 10 s of 100 s, one three times slower 30 s, and the time of the next step."""
     now = [0.0]
     driver = Driver(began=0.0, limit=100.0, reserve=10.0, clock=lambda: now[0])
 
@@ -209,7 +209,7 @@ def test_states_are_saved_until_the_user_has_enough():
 
 
 def halved(task):
-    """The same task with its channel twice, each with half of the weight."""
+    """Return the same task with its channel twice, each with half of the weight."""
     [channel] = task.channels
     return replace(task, channels=(replace(channel, weight=0.5),) * 2)
 

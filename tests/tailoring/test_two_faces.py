@@ -52,7 +52,7 @@ def merit_of(lens, source=BEAM, wave=None, n=40, weights=(1.0, 2.0)):
 
 
 def test_a_goal_twice_is_the_goal_once():
-    """By the kernels as far as the receiver, and by those that end behind the lens."""
+    """Kernels end at the receiver, or behind the lens."""
     lens, goal = bumpy(), Goal("target", NEAR, picture(0), 5.0)
     once, twice = (Merit.of((Channel(BEAM, N),), lens, 40, goals, 0.03) for goals in ([goal], [goal, goal]))
     for value, other in zip(once(once.landing(lens)), twice(twice.landing(lens)), strict=True):

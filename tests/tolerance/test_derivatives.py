@@ -28,7 +28,7 @@ from bstcad.tolerance.perturbations import THERMAL, Setup, kinds
 TUBES, WEIGHTS = 257, 8
 MATERIAL = "PMMA"
 SMALL, TURNED = 1e-4, 5e-4  # mm and degrees
-STEPS = {  # of the differences, in the unit of each kind: no light moves by more than a hundredth of a pixel
+STEPS = {  # steps of the differences, in the unit of each kind: no light moves by more than a hundredth of a pixel
     **{f"{part}.{kind}": SMALL for part in ("lens", "source") for kind in ("decentre_x", "decentre_y", "axial")},
     **{f"screen.{kind}": 5 * SMALL for kind in ("decentre_x", "decentre_y", "axial")},
     **{f"{part}.tilt_{axis}": TURNED for part in ("lens", "source", "screen") for axis in "xy"},

@@ -1,4 +1,4 @@
-"""What is off follows from a grade and from what the scene says of it."""
+"""Errors follow from a grade and from the tables of the scene."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_a_scene_keeps_its_tables(small_scene, tmp_path):
 
 
 def test_a_form_error_of_the_front_moves_light_and_is_made(small_design, setup, monkeypatch):
-    """As much as one of the back about does, whose light it bends as an interface of the same index."""
+    """The front moves about as much light as the back does, as an interface of the same index."""
     front, back = (form_error(setup.lens, 2.5, 0, face) for face in ("front", "back"))
     nominal = setup.picture(257)
     moved = [np.linalg.norm(kind.apply(setup, 1e-4).picture(257) - nominal) for kind in (front, back)]

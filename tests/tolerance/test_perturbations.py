@@ -1,4 +1,4 @@
-"""What is off does to the light what physics says; and what moves everything does nothing."""
+"""Errors change the light as physics says; an error that moves everything changes nothing."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_what_scales_everything_changes_nothing(setup, picture):
 
 
 def test_a_plate_that_is_tilted_shifts_a_beam_as_snell_says():
-    """By t sin θ (1 - cos θ / (n cos θ')) for a plate of thickness t."""
+    """A plate of thickness t shifts the beam by t sin θ (1 - cos θ / (n cos θ'))."""
     plate, screen = plate_of(33), Screen(100.0, (-8.0, 8.0), (-8.0, 8.0), (64, 64))
     setup = Setup(plate, (Channel(Collimated(Circle(4.0), z=0.0), plate.index),), screen)
     theta, n = np.radians(5.0), plate.index

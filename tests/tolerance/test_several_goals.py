@@ -79,7 +79,7 @@ def test_a_wave_without_a_limit_fails_no_lens(unlimited):
 
 
 def test_each_target_is_studied_as_by_itself(alone, several):
-    """The same trials of the same lens: no figure of the first target changes by a bit."""
+    """Trials of the same lens are the same: no figure of the first target changes by a bit."""
     _, found = several
     first = found.targets[0]
     assert (first.rrmsd, first.rrmsd_trials, first.rrmsd_full) == (alone.rrmsd, alone.rrmsd_trials, alone.rrmsd_full)

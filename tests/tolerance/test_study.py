@@ -99,7 +99,7 @@ def test_superposed_pictures_stand_up_to_full_traces(found):
 
 
 def test_derivatives_are_those_of_smaller_steps(pictures, found):
-    """By differences a fifth as far, for each error that matters."""
+    """Differences by a fifth of the step agree, for each error that matters."""
     sizes = np.linalg.norm(found.model.first, axis=1)
     for k in np.flatnonzero(sizes > 0.1 * sizes.max()):
         step = np.zeros(len(sizes))

@@ -114,7 +114,7 @@ def test_a_decentred_front_tilts_light_by_its_power_times_the_decentre(axis):
 
 
 def test_a_decentred_front_is_that_front_elsewhere():
-    """As a net moved in its place, behind it the same back."""
+    """The front's net moves, and the back behind it stays."""
     setup = lit(Sphere(2.0, 0.02), bowl(), light=Collimated(Circle(8.0), z=0.0, wavelength=LINE))
     net = as_net(setup.lens.front, setup.lens.outline)
     x, y = (tuple(end + by for end in side) for side, by in ((net.x, 0.05), (net.y, 0.0)))
@@ -171,7 +171,7 @@ def test_form_of_either_face_shifts_the_wavefront_by_n_less_one_times_it():
 
 
 def test_superposed_wavefronts_stand_up_to_full_traces():
-    """Of a plate, whose light is a plane wave: forms of both faces add up as squares do."""
+    """A plate has a plane wave as its light: form errors of both faces add up as squares do."""
     setup = lit(Plane(8.0), light=Collimated(Circle(8.0), z=0.0, wavelength=LINE))
     forms = [form_error(setup.lens, 6.0, seed, face) for seed, face in ((0, "back"), (1, "back"), (0, "front"))]
     errors = (*(Perturbation(kind, 1e-4, "field") for kind in forms), Perturbation(kinds(setup)["lens.wedge_x"], 0.1))

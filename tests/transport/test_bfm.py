@@ -105,7 +105,7 @@ def brute_force(phi):
 @pytest.mark.parametrize("n", [4, 9, 32])
 @pytest.mark.parametrize("scale", [0.0, 1.0, 300.0, 1e5])
 def test_c_transform_is_the_minimum_over_all_pairs(n, scale):
-    """At the largest scale every slope is steeper than the grid is wide, so that the rim is chosen."""
+    """Every slope is steeper than the grid is wide at the largest scale, so that the rim is chosen."""
     phi = scale * np.random.default_rng(n).normal(size=(n, n))
     np.testing.assert_allclose(c_transform(phi), brute_force(phi), rtol=1e-14, atol=1e-11)  # rounding of values near n²
 

@@ -181,7 +181,7 @@ print([bool(np.array_equal(one, two)) for one, two in zip(*found)])
 
 
 def test_one_thread_and_two_agree_to_the_last_digit():
-    """In a process that may have two threads however few cores the machine has."""
+    """A second process may have two threads however few cores the machine has."""
     two = os.environ | {"NUMBA_NUM_THREADS": "2"}
     done = subprocess.run([sys.executable, "-c", BITS], env=two, capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "[True, True]", done.stderr

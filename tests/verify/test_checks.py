@@ -58,13 +58,13 @@ def nominal(small_design, few):
 
 
 def with_picture(nominal, picture, **changes):
-    """The same for another picture, which is stored as well."""
+    """Return the nominal with another picture, which is stored as well."""
     goals = tuple(replace(goal, picture=picture, **changes) for goal in nominal.goals)
     return replace(nominal, goals=goals, stored=(picture,))
 
 
 def changed(nominal, name, **changes):
-    """The same with other entries of a table of its scene."""
+    """Return the nominal with other entries of a table of its scene."""
     table = getattr(nominal.scene, name).model_copy(update=changes)
     return replace(nominal, scene=nominal.scene.model_copy(update={name: table}))
 
@@ -140,7 +140,7 @@ def moved_path(text, by):
     return text[: hit.start()] + f"{float(hit.group()) + by:.14f}" + text[hit.end() :]
 
 
-STEP = {  # what is changed: (how, the checks that see it)
+STEP = {  # faults by name: (how the file is changed, the checks that see it)
     "a control point by 1 nm": (lambda t: moved_control_point(t, 1e-6), {"control-points", "normals"}),
     "a control point by 30 nm": (
         lambda t: moved_control_point(t, 3e-5), {"control-points", "normals", "form", "mesh-vertices"},
@@ -169,7 +169,7 @@ def test_a_changed_step_file_fails_by_name(folder, nominal, change):
 
 
 def test_a_lens_out_of_its_place_fails_in_the_folder_of_its_design(folder, nominal):
-    """With the turn and the shift; the rest of its form is held to the design in the lens's own frame."""
+    """The check states turn and shift; the form is compared with the design in the lens's own frame."""
     path, place = folder / "lens.step", cadquery.Location(cadquery.Vector(0, 0, 5), cadquery.Vector(0, 0, 1), 90)
     solid = cadquery.Shape.cast(step_reading.solid(path))
     cadquery.Assembly(name="whole").add(solid, name="lens", loc=place).export(str(path))
@@ -253,7 +253,7 @@ def without_one(found):
 
 
 def one_vertex(found):
-    """The same vertex in every triangle that has it: closed, and in volume too little to see."""
+    """Move one vertex in every triangle that has it: the mesh stays closed, and its volume hardly changes."""
     corners = found["corners"].reshape(-1, 3).copy()
     corners[(corners == corners[corners[:, 2].argmax()]).all(axis=1), 2] += 0.01
     found["corners"] = corners.reshape(-1, 3, 3)

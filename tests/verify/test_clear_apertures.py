@@ -33,7 +33,7 @@ from tests.lenses import net
 BOX = {"shape": "rectangle", "width": 6.4, "height": 5.6, "corner_radius": 1.5}
 CUT = {"datum": "front", "rim": {"shape": "circle", "diameter": 9.0}}
 FLANGE = {"outline": {"shape": "circle", "diameter": 20.0}, "z": 16.0, "thickness": 1.0}
-MOUNTS = {  # of the small scene: 8 x 6 mm, a front of curvature 0.002 at z = 15, a back at 25
+MOUNTS = {  # mounts of the small scene: 8 x 6 mm, a front of curvature 0.002 at z = 15, a back at 25
     "a flange, draft and bevel": {
         "datum": "flange",
         "rim": BOX,
@@ -101,7 +101,7 @@ def _along(wire):
 
 
 def inside(corners, places):
-    """Which places (2, n) a polygon encloses: an odd number of its sides is crossed on the way along +x."""
+    """Return True for the points (2, n) inside a polygon: a line along +x crosses an odd number of its sides."""
     x, y = places
     odd = np.zeros(x.shape, bool)
     for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):

@@ -1,4 +1,4 @@
-"""What is said of an LED's lens: the light that arrives first, then all that the scene asked for and did not get.
+"""Remarks on the lens of an LED: the light that arrives first, then each wish of the scene that was not reached.
 
 A Lambertian source 9.4 mm before a round lens of 20 mm, and 800 x 500 mm of a wall off its axis: half of the light
 misses the lens, and no back nearer than 10 mm to the front can bend the rest so far.

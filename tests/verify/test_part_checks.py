@@ -109,7 +109,7 @@ def test_a_flange_that_cuts_the_rim_leaves_the_lens_and_says_why(design, tmp_pat
 
 
 def test_a_bevel_that_occ_cannot_build_is_a_sentence(design):
-    """It is wider than the corner that it runs around; a scene is refused for it."""
+    """The bevel is wider than the corner that it runs around; a scene is refused for it."""
     mount = design.scene.changed({"mount": MOUNT}).mount
     outline = mount.flange.outline.model_copy(update={"corner_radius": 0.05})
     flange = mount.flange.model_copy(update={"outline": outline, "bevel": 0.9, "draft": 5.0})
@@ -146,7 +146,7 @@ ROUNDED = {"shape": "rectangle", "width": 7.0, "height": 5.0, "corner_radius": 1
     (MOUNT | {"rim": ROUNDED}, Rectangle(7.0, 5.0), True),
 ])  # fmt: skip
 def test_a_part_passes_by_itself(design, tmp_path, mount, outline, plane):
-    """Its outline is that of its back, whatever walls are around it; of a bare lens the walls are judged, too."""
+    """The outline is that of the back, whatever walls are around it; the walls of a bare lens are checked, too."""
     lens = replace(design.lens, front=Plane(design.lens.front.z)) if plane else design.lens
     scene = design.scene.changed({"mount": mount})
     said = scene.part.of(scene.lens)
@@ -195,7 +195,7 @@ def test_the_words_of_a_part_by_itself_are_those_of_the_whole(written):
 
 
 def test_walls_that_meet_leave_the_lens_and_say_why(design, tmp_path):
-    """Of a bevel that a scene is not refused for: it leaves no wall below the lowest place of the tailored back."""
+    """The bevel, for which a scene is not refused, leaves no wall below the lowest point of the tailored back."""
     thin = design.lens.back.z - design.lens.front.z + float(min(design.lens.back.sags(design.lens.outline)))
     mount = design.scene.changed({"mount": {"draft": 1.0, "bevel": 1.0}}).mount.model_copy(update={"bevel": thin})
     mounting.write_if_it_fits(design.lens, mount, tmp_path / "part.step", "met", design.scene.part)

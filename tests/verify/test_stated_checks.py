@@ -1,4 +1,4 @@
-"""What a STEP file states of itself: each statement is found out where it is wrong, and told where it is missing."""
+"""Statements of a STEP file: each one that is wrong fails a check, and each one that is missing is reported."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def of(quantity, unit):
     return change
 
 
-WRONG = {  # what is changed: (how, the check that sees it, its words)
+WRONG = {  # faults by name: (how the file is changed, the check that sees it, its words)
     "area": (lambda t: re.sub(r"(?<=AREA_MEASURE\()\s*[-+.E\d]+", "1800.0", t), "stated area",
              r"the file states 1800 mm², its faces give \d{4}\.\d+ mm²"),
     "volume in other digits": (lambda t: re.sub(r"(?<=VOLUME_MEASURE\()\s*\d", "9", t), "stated volume", "9"),

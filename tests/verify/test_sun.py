@@ -13,7 +13,7 @@ SMALL = {
     "lens.back.control_points": 33, "target.pixels": 32, "tailoring.rays": 192, "tailoring.transport_grid": 64,
     "tailoring.stage2_iterations": 10, "output.mesh_tolerance": 0.05,
 }  # fmt: skip
-SUN = math.radians(0.53) / 2  # its angular radius
+SUN = math.radians(0.53) / 2  # angular radius of the sun (rad)
 
 
 @pytest.fixture(scope="module")

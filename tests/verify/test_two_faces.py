@@ -100,7 +100,7 @@ def changed(net, by=1e-6):
 
 @pytest.mark.parametrize("face", ["front", "back"])
 def test_a_face_that_is_off_by_a_nanometre_in_one_control_point_is_found(two, face):
-    """By both readers, each by its net and OCC by the surface, too."""
+    """Both readers find it by the net, and OCC by the surface, too."""
     lens, path = two.made.lens, two.folder / "lens.step"
     other = replace(lens, **{face: changed(getattr(lens, face))})
     failed = {c.name for c in text_checks.of_lens(part21.read_lens(path), other) if not c.passed}
@@ -111,7 +111,7 @@ def test_a_face_that_is_off_by_a_nanometre_in_one_control_point_is_found(two, fa
 
 
 def test_a_file_whose_front_is_flat_is_no_lens_of_two_nets(two, tmp_path):
-    """Its net is missing for either reader, and the rest of the proof goes on."""
+    """The net is missing for either reader, and the rest of the proof goes on."""
     lens = replace(two.made.lens, front=bstcad.Plane(8.0), shaped=None)
     folders.write_geometry(replace(two.made, lens=lens), tmp_path)()
     text = part21.read_lens(tmp_path / "lens.step")
@@ -153,7 +153,7 @@ def test_bounds_hold_for_both_faces(two):
 
 
 def test_a_mounted_lens_has_both_nets_in_its_part(tmp_path):
-    """In the frame of the front's vertex, which is not the plane that its heights are counted from."""
+    """Heights of the front are counted from another plane than the frame of its vertex."""
     made = made_of(scene_of(mount=MOUNT))
     vertex = made.lens.front_vertex
     assert vertex == pytest.approx(8.06, abs=0.01) and made.lens.front.z == 8.0

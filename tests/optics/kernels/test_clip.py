@@ -119,7 +119,7 @@ def caustic(n, m):
 
 
 def test_a_caustic_keeps_its_flux_and_its_gradient():
-    """In several parts and strips, each of which walks the edges it shares with its neighbours by itself."""
+    """Several parts and strips each walk the edges that they share with their neighbours by themselves."""
     n, m, shape = 210, 190, (48, 56)
     assert reductions.parts(n * m) > 1 and n > 3 * clip.STRIP
     corner = 4.4 * caustic(n, m)
@@ -141,7 +141,7 @@ def signed_area(corner):
 
 
 def test_even_tubes_of_one_density_have_no_edges_inside():
-    """Where two triangles have the same density nothing is walked: the picture is its outline, exact to rounding."""
+    """Edges between two triangles of the same density are not walked: the picture is its outline, exact to rounding."""
     corner = even(24, 24, low=2.25, high=8.25)
     image, _ = tubes.collect(corner, torch.full((24, 24), 36 / 24**2, dtype=torch.float64), SHAPE)
     line = torch.tensor([0, 0, 0.75, 1, 1, 1, 1, 1, 0.25, 0, 0, 0, 0], dtype=torch.float64)

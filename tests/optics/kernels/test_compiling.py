@@ -50,7 +50,7 @@ def test_a_chosen_place_counts_and_nothing_there_is_removed(files, tmp_path):
 
 
 def test_a_kernel_keeps_its_code_there():
-    """And other users of numba in this process keep theirs where they had it."""
+    """Other users of numba in this process keep their code where they had it."""
     before = numba.config.CACHE_DIR
 
     def twice(x):
@@ -85,7 +85,7 @@ def lens(cliff):
 
 
 def seen(cliff):
-    """What comes out of all kernels that know constants of the plain form."""
+    """Return the results of all kernels that know constants of the plain form."""
     now = lens(cliff)
     box = simulated(SOURCE, now, SCREEN, 64, 0).box
     tubes = launch_tubes(SOURCE, now, 32)

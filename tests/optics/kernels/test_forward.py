@@ -144,7 +144,7 @@ SMOOTH = ("point, plane", "point, sphere", "point, conic", "mirror, gaussian, ti
 
 @pytest.mark.parametrize("name", SMOOTH)
 def test_light_without_a_closed_form_is_traced_by_a_table(name):
-    """Of light whose closed form is known: by the table it has the same rays within the table's error, and RRMSD."""
+    """Light whose closed form is known has the same rays by a table, within the table's error, and the same RRMSD."""
     known, lens, _ = SCENES[name]
     light = Unknown(known)
     x, y = (p.reshape(-1) for p in stratified(window(known, lens), 150, 0))
