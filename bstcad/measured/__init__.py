@@ -1,1 +1,1 @@
-"""A made part: a cloud of measured points aligned with the lens, its deviation, and the light that it will throw."""
+"""Judge made parts: align a measured cloud with the lens, fit its form error, and predict the light."""

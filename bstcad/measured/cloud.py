@@ -1,4 +1,4 @@
-"""Clouds of measured points: text of x, y, z (point_text.py) and the vertices of PLY and STL files (point_mesh.py)."""
+"""Read clouds of measured points from text (point_text.py) and from PLY and STL files (point_mesh.py)."""
 
 from __future__ import annotations
 
@@ -9,70 +9,73 @@ from pathlib import Path
 import numpy as np
 
 from bstcad.measured.point_mesh import read_mesh
-from bstcad.measured.point_text import ASKED, INCH, Points, read_text
+from bstcad.measured.point_text import INCH, INPUT_HINT, MeasuredPoints, read_text
 from bstcad.optics.outlines import Outline
 from bstcad.runs import files
 
-LARGEST = 1_000_000_000  # bytes
-FEWEST = 100  # points, for six degrees of freedom and a form beside them
-MESHES = (".ply", ".stl")
-# 1 mm in each unit.  The extent of a cloud may be half of the lens's, or more with its fixture.
-UNITS = {"inches": 1 / INCH, "metres": 1e-3, "micrometres": 1e3}
-ALIKE = (0.3, 1.7)  # extents of a cloud over the lens's, in the right unit
+MAX_FILE_SIZE = 1_000_000_000  # bytes
+MIN_POINTS = 100  # minimum number of points: six degrees of freedom and a form are fitted to them
+MESH_SUFFIXES = (".ply", ".stl")
+UNITS = {"inches": 1 / INCH, "metres": 1e-3, "micrometres": 1e3}  # 1 mm in each unit
+PLAUSIBLE_RATIOS = (0.3, 1.7)  # extent of a cloud over that of the lens: half of a lens, or a lens with its fixture
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """Measured points before any alignment."""
+    """Measured points before alignment."""
 
-    points: np.ndarray = field(repr=False)  # (n, 3) mm
-    unit: str  # of the file by the extent of the points: "mm" or "inches"
+    points: np.ndarray = field(repr=False)  # positions of the points (n, 3), mm, in the frame of the instrument
+    unit: str  # unit of the file, inferred from the extent of the points: "mm" or "inches"
     path: Path
-    sha256: str = ""  # of the file
-    without_data: int = 0  # points of the file without a height or another coordinate, which are left out
-    columns: str = ""  # which columns were taken, where its heading names nominal and actual ones
+    sha256: str = ""  # hash of the file
+    without_data: int = 0  # number of points of the file that lack a coordinate and are left out
+    columns: str = ""  # names of the columns that were read, if the heading names nominal and actual ones
 
 
 def load(path: Path, outline: Outline) -> Cloud:
-    """The cloud of a lens of that outline; ValueError says in a sentence what is wrong with it."""
+    """Read the cloud of a lens with this outline; raise ValueError, with a sentence, if the file is not usable."""
     try:
         found, data = _read(path)
-        points, unit = in_millimetres(found.places, outline)
+        points, unit = in_millimetres(found.positions, outline)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     digest = hashlib.sha256(data).hexdigest()
     return Cloud(points, unit, path, digest, without_data=found.without_data, columns=found.columns)
 
 
-def _read(path: Path) -> tuple[Points, bytes]:
-    """(the points of a file, in mm if its heading names a unit; its bytes)."""
+def _read(path: Path) -> tuple[MeasuredPoints, bytes]:
+    """Return the points of a file, in mm if its heading names a unit, and the file's bytes."""
     try:
-        data = files.contents(path, LARGEST)
+        data = files.contents(path, MAX_FILE_SIZE)
     except ValueError as error:
         raise ValueError(f"cannot be read ({error}); give the path of a measured cloud") from None
     if not data.strip():
-        raise ValueError(f"is empty; {ASKED}")
+        raise ValueError(f"is empty; {INPUT_HINT}")
     ending = path.suffix.lower()
-    found = read_mesh(data, ending) if ending in MESHES else read_text(data)
-    if len(found.places) < FEWEST:
+    found = read_mesh(data, ending) if ending in MESH_SUFFIXES else read_text(data)
+    if len(found.positions) < MIN_POINTS:
         without = f" and {found.without_data} without data" if found.without_data else ""
-        raise ValueError(f"holds {len(found.places)} points{without}, too few; measure {FEWEST} or more, better 10 000")
+        raise ValueError(
+            f"holds {len(found.positions)} points{without}, which are too few; measure at least {MIN_POINTS}, "
+            "preferably 10 000"
+        )
     return found, data
 
 
 def in_millimetres(points: np.ndarray, outline: Outline) -> tuple[np.ndarray, str]:
-    """(the points in mm, the unit they came in): "mm" or "inches".
+    """Return the points in mm, and the unit of the input, "mm" or "inches".
 
-    ValueError for a cloud whose extent fits no unit of a machine shop.
+    Raises ValueError if the extent of the cloud fits the lens in neither unit.
     """
-    low, high = np.percentile(points, (1, 99), axis=0)  # a few stray points are no extent
+    low, high = np.percentile(points, (1, 99), axis=0)  # ignores stray points
     extent, width = float((high - low).max()), 2 * max(outline.half_extent)
-    if ALIKE[0] <= extent / width <= 5 * ALIKE[1]:
+    smallest, largest = PLAUSIBLE_RATIOS
+    if smallest <= extent / width <= 5 * largest:
         return points, "mm"
-    unit = next((unit for unit, size in UNITS.items() if ALIKE[0] <= extent / width / size <= ALIKE[1]), None)
+    unit = next((unit for unit, size in UNITS.items() if smallest <= extent / width / size <= largest), None)
     if unit == "inches":
         return points * INCH, unit
-    covered = f"where the lens is {width:.3g} mm wide"
+    lens_width = f"and the lens is {width:.3g} mm wide"
     if unit:
-        raise ValueError(f"its points cover {extent:.3g} {covered}, as if they were in {unit}; give them in mm")
-    raise ValueError(f"its points cover {extent:.3g} mm {covered}; give a cloud of its back face, in mm")
+        raise ValueError(f"its points cover {extent:.3g} {lens_width}, as if they were in {unit}; give them in mm")
+    raise ValueError(f"its points cover {extent:.3g} mm {lens_width}; give a cloud of its back face, in mm")

@@ -1,9 +1,9 @@
-"""The form error as a spline, separated from the noise of the measurement, and its figures.
+"""Fit the form error of a made face as a spline, separate it from measurement noise, and state its figures.
 
-The deviation is a polynomial and a random field, a spline on a net of the lens's extent whose cosine amplitudes c_k are
-Gaussian with a variance S that depends on the frequency alone; the points add white noise σ².  S (by quarter octaves)
-and σ are estimated from the points themselves, and the form is the posterior mean: of all linear estimates of heights,
-slopes and curvatures the one with the least error.  The posterior can be sampled.
+The deviation is modelled as a polynomial plus a random field.  The field is a spline on a net over the lens whose
+cosine amplitudes c_k are Gaussian with a variance S that depends only on the frequency; the points add white noise of
+variance σ².  S (by quarter octaves) and σ are estimated from the points.  The form error is the posterior mean, which
+among all linear estimates of heights, slopes and curvatures has the minimum error.  The posterior can be sampled.
 """
 
 from __future__ import annotations
@@ -20,181 +20,184 @@ from scipy.sparse.linalg import LinearOperator, cg
 from scipy.special import eval_jacobi
 
 from bstcad.analysis.shape import least_squares
-from bstcad.measured.alignment import Alignment, Face, Pose, root_mean_square, sampled
+from bstcad.measured.alignment import Alignment, Face, Pose, root_mean_square, sample_surface
 from bstcad.optics.bspline import BSplineSurface, basis_matrix, interpolated
 from bstcad.optics.lens import Lens
 
-DEGREE = 2  # of the polynomial
-MARGIN = 0.2  # of the side, of the field's net beyond the face, since cosines have zero slope at its ends
-PER_CELL = 6.0  # points in a cell of the net, in the mean
-NETS = (9, 513)  # control points a side, fewest and most
-REFINED = 4  # times the control points a side of the lens's net, at most: nets of this kind are not nested
-QUARTER = 4  # bands an octave
-ROUNDS = 8  # between field and spectrum
-SETTLED = 3  # rounds before the spectrum weighs the motions
-STEPS, ENOUGH = 30, 1e-4  # of conjugate gradients; of the residual
-SURE = 3.0  # standard deviations above noise, for a band of frequencies to hold form
-SILENT = 1e-4  # of the noise: variance of a band below SURE
-LOOSE = 0.001  # of the half width: a motion of that uncertainty by the relief stays zero
-FOLLOWED = 6  # bands whose slope is extrapolated into the noise
-QUIET = 1e-3  # of the deviation: least noise
-STRIPS = 32  # of a net's points, sampled one after the other, so that memory holds them
+POLYNOMIAL_DEGREE = 2
+NET_MARGIN = 0.2  # margin of the field's net around the face, in sides, because cosines have zero slope at its ends
+POINTS_PER_CELL = 6.0  # mean number of points in a cell of the net
+NET_LIMITS = (9, 513)  # minimum and maximum number of control points per side
+MAX_REFINEMENT = 4  # maximum ratio of control points per side to the net of the lens, since the nets are not nested
+BANDS_PER_OCTAVE = 4
+SPECTRUM_ROUNDS = 8  # alternating estimates of field and spectrum
+FIRST_MOTION_ROUND = 3  # round from which the spectrum is good enough to weight the motions
+MAX_CG_STEPS, CG_TOLERANCE = 30, 1e-4  # maximum steps of conjugate gradients, and relative tolerance of the residual
+DETECTION_SIGMAS = 3.0  # excess over noise, in standard deviations, at which a band of frequencies contains form
+UNDETECTED_VARIANCE = 1e-4  # variance of a band without detected form, relative to the noise
+MAX_RELIEF_UNCERTAINTY = 0.001  # uncertainty by fine relief, in half widths, above which a motion stays zero
+EXTRAPOLATION_BANDS = 6  # number of bands whose slope is extrapolated into the noise
+MIN_NOISE_RATIO = 1e-3  # lower bound of the noise relative to the deviation
+SAMPLING_STRIPS = 32  # number of strips in which a net is sampled, which bounds the memory
 
 
 @dataclass(frozen=True)
-class Form:
-    """A fitted form error, δz(x, y) over the net of a lens: a polynomial, a random field, and a small motion."""
+class FormError:
+    """Fitted form error δz(x, y) over the net of a lens: a polynomial, a random field, and a small rigid motion."""
 
     face: Face
-    polynomial: np.ndarray = field(repr=False)  # (6,) coefficients of the columns of _legendre
-    rest: BSplineSurface = field(repr=False)  # the random field
-    spread: np.ndarray = field(repr=False)  # (m, m) standard deviation of each cosine amplitude of its net, mm
-    noise: float  # of the points, RMS (mm)
-    motion: np.ndarray  # (6,) in Face.columns' units, of the fine relief against the alignment, which form errors bias
+    polynomial: np.ndarray = field(repr=False)  # coefficients (6,) of the columns of _legendre, mm
+    random_field: BSplineSurface = field(repr=False)
+    spread: np.ndarray = field(repr=False)  # standard deviations (m, m) of the field's cosine amplitudes, mm
+    noise: float  # RMS noise of the points, mm
+    motion: np.ndarray  # motion (6,) of the fine relief against the alignment (biased by form), units of Face.columns
 
     def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """δz (mm) at (x, y) in mm, as aligned by least squares."""
+        """Return δz (mm) at (x, y) in mm, relative to the alignment by least squares."""
         smooth = _legendre(self.face.lens.back, x, y) @ self.polynomial
-        z, z_x, z_y = sampled(self.face.lens.back, x, y)
+        z, z_x, z_y = sample_surface(self.face.lens.back, x, y)
         moved = self.face.columns(np.stack([x, y, z], axis=1), np.stack([-z_x, -z_y, np.ones_like(z)], axis=1))
-        return smooth + sampled(self.rest, x, y)[0] + moved @ self.motion
+        return smooth + sample_surface(self.random_field, x, y)[0] + moved @ self.motion
 
-    def on(self, surface: BSplineSurface) -> BSplineSurface:
-        """`surface` with this form error, which the finer of both nets has at the places of its control points."""
+    def add_to(self, surface: BSplineSurface) -> BSplineSurface:
+        """Return `surface` plus this form error, interpolated at the control points of the finer of both nets."""
         sides = [
-            own if rest <= own else max(rest, min(REFINED * own, NETS[1]))
-            for rest, own in zip(self.rest.shape, surface.shape, strict=True)
+            own if count <= own else max(count, min(MAX_REFINEMENT * own, NET_LIMITS[1]))
+            for count, own in zip(self.random_field.shape, surface.shape, strict=True)
         ]
         finer = surface.refined((sides[0], sides[1]))
         x, y = (np.linspace(*ends, count) for ends, count in zip((finer.x, finer.y), finer.shape, strict=True))
-        strips = (np.meshgrid(part, y, indexing="ij") for part in np.array_split(x, STRIPS))
+        strips = (np.meshgrid(part, y, indexing="ij") for part in np.array_split(x, SAMPLING_STRIPS))
         values = np.concatenate([self.at(x.ravel(), y.ravel()).reshape(x.shape) for x, y in strips])
         return replace(finer, heights=finer.heights + torch.from_numpy(interpolated(values)))
 
-    def drawn(self, draw: np.ndarray, sign: float = 1.0) -> Form:
-        """A sample of the posterior by (m, m) normal numbers; sign: 1 or -1, of the difference from the mean."""
+    def posterior_sample(self, draw: np.ndarray, sign: float = 1.0) -> FormError:
+        """Return a sample of the posterior; draw: normal numbers (m, m); sign: ±1, by which they are multiplied."""
         change = torch.from_numpy(scipy.fft.idctn(draw * self.spread, norm="ortho"))
-        return replace(self, rest=replace(self.rest, heights=self.rest.heights + sign * change))
+        return replace(self, random_field=replace(self.random_field, heights=self.random_field.heights + sign * change))
 
     def band(self, low: float, high: float) -> BSplineSurface:
-        """The part of the field between two spatial frequencies (1/mm)."""
-        frequency = frequencies(self.rest)
-        amplitude = scipy.fft.dctn(self.rest.heights.numpy(), norm="ortho")
-        kept = np.where((frequency > low) & (frequency <= high), amplitude, 0.0)
-        return replace(self.rest, heights=torch.from_numpy(scipy.fft.idctn(kept, norm="ortho")))
+        """Return the part of the field between two spatial frequencies (1/mm)."""
+        frequency = frequencies(self.random_field)
+        amplitude = scipy.fft.dctn(self.random_field.heights.numpy(), norm="ortho")
+        selected = np.where((frequency > low) & (frequency <= high), amplitude, 0.0)
+        return replace(self.random_field, heights=torch.from_numpy(scipy.fft.idctn(selected, norm="ortho")))
 
 
-def fitted(face: Face, alignment: Alignment) -> Form:
-    """The form error of a cloud on its face."""
+def fit_form_error(face: Face, alignment: Alignment) -> FormError:
+    """Fit the form error of a face to an aligned cloud."""
     back, points, n = face.lens.back, alignment.points, len(alignment.points)
     x, y = np.ascontiguousarray(points[:, :2].T)
     smooth = _legendre(back, x, y)
     motions = face.columns(points, alignment.normals / alignment.normals[:, 2:]) @ alignment.motions
-    both = np.column_stack([face.height(points), motions])
-    coefficients = np.linalg.solve(smooth.T @ smooth, smooth.T @ both)
-    both -= smooth @ coefficients
-    sides = [(low - MARGIN * (high - low), high + MARGIN * (high - low)) for low, high in (back.x, back.y)]
+    targets = np.column_stack([face.height(points), motions])
+    coefficients = np.linalg.solve(smooth.T @ smooth, smooth.T @ targets)
+    targets -= smooth @ coefficients
+    sides = [(low - NET_MARGIN * (high - low), high + NET_MARGIN * (high - low)) for low, high in (back.x, back.y)]
     covered = face.lens.outline.area / np.prod([high - low for low, high in sides])
-    m = scipy.fft.next_fast_len(int(np.clip(np.sqrt(n / PER_CELL / covered), *NETS)), real=True)
+    m = scipy.fft.next_fast_len(int(np.clip(np.sqrt(n / POINTS_PER_CELL / covered), *NET_LIMITS)), real=True)
     net = BSplineSurface(0.0, torch.zeros(m, m, dtype=torch.float64), *sides)
     u, v = ((t - low) / (high - low) * (m - 1) for t, (low, high) in zip((x, y), sides, strict=True))
-    heights, spread, noise, motion = _field(net, _rows(u, v, m), both[:, 0], both[:, 1:], reach=face.reach)
+    heights, spread, noise, motion = _field(net, _basis_rows(u, v, m), targets[:, 0], targets[:, 1:], reach=face.reach)
     polynomial = coefficients[:, 0] - coefficients[:, 1:] @ motion
-    rest = replace(net, heights=torch.from_numpy(heights))
-    return Form(face, polynomial, rest, spread, noise=noise, motion=alignment.motions @ motion)
+    random_field = replace(net, heights=torch.from_numpy(heights))
+    return FormError(face, polynomial, random_field, spread, noise=noise, motion=alignment.motions @ motion)
 
 
 def frequencies(net: BSplineSurface) -> np.ndarray:
-    """(m, m) spatial frequency (1/mm) of each cosine of a net."""
+    """Return the spatial frequencies (m, m), 1/mm, of the cosines of a net."""
     half = [np.arange(count) / (2 * count * pitch) for count, pitch in zip(net.shape, net.pitch, strict=True)]
     return np.hypot(half[0][:, None], half[1][None, :])
 
 
 def _legendre(back: BSplineSurface, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """(n, 6) products of Legendre polynomials of x and of y (mm) up to DEGREE, which run from -1 to 1 over the net."""
+    """Return the products (n, 6) of Legendre polynomials of x and y up to POLYNOMIAL_DEGREE; net: [-1, 1] each way."""
     across = (2 * (t - low) / (high - low) - 1 for t, (low, high) in zip((x, y), (back.x, back.y), strict=True))
-    i, j = np.indices((DEGREE + 1, DEGREE + 1))
-    return np.polynomial.legendre.legvander2d(*across, (DEGREE, DEGREE))[:, (i + j <= DEGREE).ravel()]
+    i, j = np.indices((POLYNOMIAL_DEGREE + 1, POLYNOMIAL_DEGREE + 1))
+    products = np.polynomial.legendre.legvander2d(*across, (POLYNOMIAL_DEGREE, POLYNOMIAL_DEGREE))
+    return products[:, (i + j <= POLYNOMIAL_DEGREE).ravel()]
 
 
 def _field(
     net: BSplineSurface, rows: scipy.sparse.csr_array, off: np.ndarray, motions: np.ndarray, *, reach: float
 ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-    """(heights (m, m), standard deviation of each cosine amplitude, noise, motion) of the random field.
+    """Return heights (m, m), standard deviations of the cosine amplitudes, noise and motion of the random field.
 
-    motions: (n, k) changes by the motions of the alignment, without polynomials.  Their amounts follow by generalised
-    least squares: the field leaves V⁻¹ off σ² of off, V the covariance of field and noise together.
+    motions: changes (n, k) by the motions of the alignment, without polynomials.  Their amounts follow by generalised
+    least squares: the residual of the field's fit to `off` is σ² V⁻¹ off, V the covariance of field plus noise.
     """
-    (m, _), n = net.shape, len(off)  # a square net of its own
+    (m, _), n = net.shape, len(off)  # the net is square
     gram = (rows.T @ rows).tocsr()
     band, bands = _bands(frequencies(net))
     modes = np.bincount(band.ravel(), minlength=bands)
     per_mode = n / m**2 * np.multiply.outer(_gram_symbol(m), _gram_symbol(m))
     level = np.bincount(band.ravel(), (1 / per_mode).ravel(), bands) / modes
-    quiet = QUIET**2 * float(off @ off) / n + 1e-24
-    noise2, variance = 0.25 * float(off @ off) / n + quiet, np.full((m, m), float(off @ off) / n)
+    min_variance = MIN_NOISE_RATIO**2 * float(off @ off) / n + 1e-24
+    noise2, variance = 0.25 * float(off @ off) / n + min_variance, np.full((m, m), float(off @ off) / n)
     motion, amplitude, energies = np.zeros(motions.shape[1]), np.zeros((m, m)), None
 
     def posterior(values: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
-        return _mean(gram, rows.T @ values, variance, noise2=noise2, per_mode=per_mode, start=start)
+        return _posterior_mean(gram, rows.T @ values, variance, noise2=noise2, per_mode=per_mode, start=start)
 
-    for turn in range(ROUNDS):
-        if turn == SETTLED:
-            alone = motions - np.stack([rows @ _heights(posterior(column)) for column in motions.T], axis=1)
-            motion = _motion(motions, off, alone, noise2=noise2, reach=reach)
-        still = off - motions @ motion
-        amplitude = posterior(still, amplitude)
-        left = still - rows @ _heights(amplitude)
-        shrunk = 1 + noise2 / (per_mode * variance)  # true amplitude over its posterior mean
+    for turn in range(SPECTRUM_ROUNDS):
+        if turn == FIRST_MOTION_ROUND:
+            whitened = motions - np.stack([rows @ _heights(posterior(column)) for column in motions.T], axis=1)
+            motion = _motion_by_relief(motions, off, whitened, noise2=noise2, reach=reach)
+        aligned_off = off - motions @ motion
+        amplitude = posterior(aligned_off, amplitude)
+        residual = aligned_off - rows @ _heights(amplitude)
+        shrunk = 1 + noise2 / (per_mode * variance)  # ratio of the true amplitude to its posterior mean
         energy = np.bincount(band.ravel(), ((shrunk * amplitude) ** 2 * per_mode / noise2).ravel(), bands) / modes
         energies = energy if energies is None else (energies + energy) / 2
         free = max(n - float((1 / shrunk).sum()), 0.05 * n)
-        noise2 = float(np.sqrt(noise2 * max(float(left @ left) / free, quiet)))
+        noise2 = float(np.sqrt(noise2 * max(float(residual @ residual) / free, min_variance)))
         variance = _variances(energies, modes, level * noise2)[band]
     amplitude = posterior(off - motions @ motion, amplitude)
     spread = 1 / (per_mode / noise2 + 1 / variance)
     return _heights(amplitude).reshape(m, m), np.sqrt(spread), float(np.sqrt(noise2)), motion
 
 
-def _motion(motions: np.ndarray, off: np.ndarray, alone: np.ndarray, *, noise2: float, reach: float) -> np.ndarray:
-    """The motion by generalised least squares; alone: V⁻¹ σ² times each column of motions."""
-    normal = alone.T @ motions / noise2
+def _motion_by_relief(
+    motions: np.ndarray, off: np.ndarray, whitened: np.ndarray, *, noise2: float, reach: float
+) -> np.ndarray:
+    """Return the motion by generalised least squares; whitened: σ² V⁻¹ motions."""
+    normal = whitened.T @ motions / noise2
     size, directions = np.linalg.eigh((normal + normal.T) / 2)
-    sure = size > 1 / (LOOSE * reach) ** 2  # determined by fine relief
-    return directions[:, sure] @ (directions[:, sure].T @ (alone.T @ off) / noise2 / size[sure])
+    detected = size > 1 / (MAX_RELIEF_UNCERTAINTY * reach) ** 2  # determined by fine relief
+    return directions[:, detected] @ (directions[:, detected].T @ (whitened.T @ off) / noise2 / size[detected])
 
 
 def _variances(energy: np.ndarray, modes: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Variance of the form in each band, from its energy over the noise's there.
+    """Estimate the variance of the form in each band from its energy relative to the noise.
 
-    Bands below the noise continue the last bands above it as a power of the frequency, as polished and turned faces do,
-    but not above the limit of detection.
+    Bands below the noise continue the last bands above it by a power law of the frequency, which polished and turned
+    faces follow, but stay below the limit of detection.
     """
-    least = SURE * np.sqrt(2 / modes)
-    sure = energy > 1 + least
-    variance = np.where(sure, np.maximum(energy - 1, 0.0), SILENT) * noise
-    last = np.flatnonzero(sure)[-FOLLOWED:]
-    beyond = np.arange(len(energy)) > (last[-1] if len(last) else len(energy))
-    if len(last) == FOLLOWED and beyond.any():
+    least = DETECTION_SIGMAS * np.sqrt(2 / modes)
+    detected = energy > 1 + least
+    variance = np.where(detected, np.maximum(energy - 1, 0.0), UNDETECTED_VARIANCE) * noise
+    last = np.flatnonzero(detected)[-EXTRAPOLATION_BANDS:]
+    higher = np.arange(len(energy)) > (last[-1] if len(last) else len(energy))
+    if len(last) == EXTRAPOLATION_BANDS and higher.any():
         slope, _ = np.polyfit(last, np.log(variance[last]), 1)
-        onward = np.exp(np.minimum(slope, 0.0) * (np.flatnonzero(beyond) - last.mean()) + np.log(variance[last]).mean())
-        variance[beyond] = np.clip(onward, SILENT * noise[beyond], (least * noise)[beyond])
+        trend = np.exp(np.minimum(slope, 0.0) * (np.flatnonzero(higher) - last.mean()) + np.log(variance[last]).mean())
+        variance[higher] = np.clip(trend, UNDETECTED_VARIANCE * noise[higher], (least * noise)[higher])
     return variance
 
 
 def _heights(amplitude: np.ndarray) -> np.ndarray:
-    """(m²,) from cosine amplitudes (m, m)."""
+    """Return heights (m²,) from cosine amplitudes (m, m)."""
     return scipy.fft.idctn(amplitude, norm="ortho").ravel()
 
 
-def _mean(
-    gram: scipy.sparse.csr_array, seen: np.ndarray, variance: np.ndarray, *, noise2: float, per_mode: np.ndarray,
+def _posterior_mean(
+    gram: scipy.sparse.csr_array, right_side: np.ndarray, variance: np.ndarray, *, noise2: float, per_mode: np.ndarray,
     start: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
-    """Posterior mean (m, m) of the amplitudes c, by conjugate gradients.
+    """Return the posterior mean (m, m) of the amplitudes c, by conjugate gradients.
 
-    (1 + sqrt(S) Cᵀ G C sqrt(S) / σ²) c / sqrt(S) = sqrt(S) Cᵀ b / σ², in c / root: divided on both sides by the square
-    root of its diagonal for evenly spread points.
+    (1 + sqrt(S) Cᵀ G C sqrt(S) / σ²) c / sqrt(S) = sqrt(S) Cᵀ b / σ² is solved for c / root, after preconditioning
+    with the square root of its diagonal for evenly spaced points.
     """
     m, even = len(variance), 1 + variance * per_mode / noise2
     root = np.sqrt(variance / even)
@@ -205,14 +208,14 @@ def _mean(
         return (scaled / even + root * relief / noise2).ravel()
 
     operator = LinearOperator((m * m, m * m), matvec=product, dtype=np.float64)
-    right = (root * scipy.fft.dctn(seen.reshape(m, m), norm="ortho") / noise2).ravel()
+    right = (root * scipy.fft.dctn(right_side.reshape(m, m), norm="ortho") / noise2).ravel()
     guess = None if start is None else (start / root).ravel()
-    scaled_mean, _ = cg(operator, right, guess, rtol=ENOUGH, maxiter=STEPS)
+    scaled_mean, _ = cg(operator, right, guess, rtol=CG_TOLERANCE, maxiter=MAX_CG_STEPS)
     return root * scaled_mean.reshape(m, m)
 
 
-def _rows(u: np.ndarray, v: np.ndarray, m: int) -> scipy.sparse.csr_array:
-    """(n, m²) the nine products of each point."""
+def _basis_rows(u: np.ndarray, v: np.ndarray, m: int) -> scipy.sparse.csr_array:
+    """Return the matrix (n, m²) of the nine products of basis functions at each point."""
     in_u, in_v = basis_matrix(u, m), basis_matrix(v, m)
     n = len(u)
     columns = in_u.indices.reshape(n, 3, 1) * m + in_v.indices.reshape(n, 1, 3)
@@ -221,72 +224,72 @@ def _rows(u: np.ndarray, v: np.ndarray, m: int) -> scipy.sparse.csr_array:
 
 
 def _gram_symbol(m: int) -> np.ndarray:
-    """Σ B(u)² of a cosine sampled evenly: (66 + 52 cos ω + 2 cos 2ω) / 120, quadratic splines."""
+    """Return the symbol of the Gram matrix of quadratic B-splines: (66 + 52 cos ω + 2 cos 2ω) / 120."""
     w = np.pi * np.arange(m) / m
     return (66 + 52 * np.cos(w) + 2 * np.cos(2 * w)) / 120
 
 
 def _bands(frequency: np.ndarray) -> tuple[np.ndarray, int]:
-    """(band of each cosine, number of bands): quarters of octaves, without empty ones."""
+    """Return the band (a quarter octave) of each cosine, and the number of bands that are not empty."""
     least = frequency[frequency > 0].min()
-    quarters = np.floor(QUARTER * np.log2(np.maximum(frequency, least) / least)).astype(int)
+    quarters = np.floor(BANDS_PER_OCTAVE * np.log2(np.maximum(frequency, least) / least)).astype(int)
     _, packed = np.unique(quarters, return_inverse=True)
     return packed.reshape(frequency.shape), int(packed.max()) + 1
 
 
 # --- figures of a deviation -------------------------------------------------------------------------------------------
 
-GRID = 301  # points each way at which a fitted form is sampled
-ZERNIKE_ORDER = 10  # n + |m| up to this: the 36 terms of the fringe set
-FITTED = 50_000  # points of the fit of these
-MAP = ("deviation.npz", "deviation.csv")  # the files of the map
-FINEST = 2.0  # pitches of the form's net: the shortest period in it
+MAP_POINTS = 301  # number of points each way of the deviation map
+ZERNIKE_ORDER = 10  # maximum n + |m| of the 36 terms of the fringe set
+ZERNIKE_FIT_POINTS = 50_000  # approximate number of points to which the terms are fitted
+MAP_FILES = ("deviation.npz", "deviation.csv")  # file names of the deviation map
+SHORTEST_PERIOD = 2.0  # shortest period of a form error, in pitches of its net
 
 
 @dataclass(frozen=True)
 class Band:
-    """The part of a form error in a band of periods."""
+    """Part of a form error in a band of periods."""
 
-    period: tuple[float, float] | None  # longest and shortest (mm); None: the polynomial, which has none
-    rms: float  # mm
-    slope_rms: float  # rad
+    period: tuple[float, float] | None  # longest and shortest period, mm; None: the polynomial
+    rms: float  # RMS height, mm
+    slope_rms: float  # RMS slope, rad
 
 
 @dataclass(frozen=True)
 class Deviation:
-    """A made face against the designed one, along the normal, + out of the glass; lengths in mm."""
+    """Deviation of a made face from the design along the normal, positive outside the glass; lengths in mm."""
 
-    pv: float  # of the points
-    pvr: float  # of the points: PV of the best 36 Zernike terms, and three times the RMS of the rest (Evans 2009)
-    rms: float  # of the points
-    form_pv: float  # of the fitted form
-    form_rms: float
-    slope_rms: float  # rad; of the fitted form
-    noise: float  # of the points, RMS
-    worst: tuple[float, float]  # x, y (mm) of the farthest point
+    pv: float  # peak to valley of the points
+    pvr: float  # robust PV of the points: PV of 36 Zernike terms plus three times the RMS residual (Evans 2009)
+    rms: float  # RMS of the points
+    form_pv: float  # peak to valley of the fitted form
+    form_rms: float  # RMS of the fitted form
+    slope_rms: float  # RMS slope of the fitted form, rad
+    noise: float  # RMS noise of the points
+    worst: tuple[float, float]  # x, y of the point with the largest deviation
     bands: tuple[Band, ...]
-    x: np.ndarray = field(repr=False)  # (GRID,) mm
-    y: np.ndarray = field(repr=False)
-    form: np.ndarray = field(repr=False)  # (rows y, columns x) of the fitted form, NaN outside the outline
+    x: np.ndarray = field(repr=False)  # coordinates of the map's columns (MAP_POINTS,)
+    y: np.ndarray = field(repr=False)  # coordinates of the map's rows (MAP_POINTS,)
+    form: np.ndarray = field(repr=False)  # map of the fitted form (rows y, columns x), NaN outside the outline
 
 
 def map_files(made: Deviation) -> dict[str, bytes]:
-    """The deviation map as files by name: x, y and deviation (rows y, columns x) in mm, NaN outside the outline."""
+    """Return the deviation map as files by name: x, y, deviation (rows y, columns x) in mm, NaN outside the outline."""
     packed, (x, y) = io.BytesIO(), (part.ravel() for part in np.meshgrid(made.x, made.y))
     np.savez_compressed(packed, x=made.x, y=made.y, deviation=made.form)
     rows = "\n".join(map("{:.6f},{:.6f},{:.9g}".format, x, y, made.form.ravel()))
-    return dict(zip(MAP, (packed.getvalue(), f"x [mm],y [mm],deviation [mm]\n{rows}\n".encode()), strict=True))
+    return dict(zip(MAP_FILES, (packed.getvalue(), f"x [mm],y [mm],deviation [mm]\n{rows}\n".encode()), strict=True))
 
 
-def deviation(lens: Lens, alignment: Alignment, form: Form) -> Deviation:
-    """The figures of a cloud on its lens."""
-    axes = [np.linspace(-a, a, GRID) for a in lens.outline.half_extent]
+def deviation(lens: Lens, alignment: Alignment, form: FormError) -> Deviation:
+    """Return the figures of a made face."""
+    axes = [np.linspace(-a, a, MAP_POINTS) for a in lens.outline.half_extent]
     x, y = np.meshgrid(*axes)
     inside = lens.outline.contains(torch.from_numpy(x), torch.from_numpy(y)).numpy()
     x, y = x[inside], y[inside]
-    _, z_x, z_y = sampled(lens.back, x, y)
-    cosine = 1 / np.sqrt(1 + z_x**2 + z_y**2)  # of the normal against z
-    off, half = form.at(x, y), min(form.rest.pitch) / 4
+    _, z_x, z_y = sample_surface(lens.back, x, y)
+    cosine = 1 / np.sqrt(1 + z_x**2 + z_y**2)  # cosine of the angle between normal and z
+    off, half = form.at(x, y), min(form.random_field.pitch) / 4
     off_x, off_y = ((form.at(x + a, y + b) - form.at(x - a, y - b)) / (2 * half) for a, b in ((half, 0.0), (0.0, half)))
     form_map = np.full(inside.shape, np.nan)
     form_map[inside] = along_normal = cosine * off
@@ -300,36 +303,36 @@ def deviation(lens: Lens, alignment: Alignment, form: Form) -> Deviation:
     )  # fmt: skip
 
 
-def _octaves(form: Form, x: np.ndarray, y: np.ndarray, total: np.ndarray) -> tuple[Band, ...]:
-    """The rest of the (3, n) total, then the random field by octaves of its period, the longest first."""
-    shortest = FINEST * max(form.rest.pitch)
-    period = 2 * max(high - low for low, high in (form.rest.x, form.rest.y))  # of the slowest cosine
-    bands = [_band(None, total - sampled(form.rest, x, y))]
+def _octaves(form: FormError, x: np.ndarray, y: np.ndarray, total: np.ndarray) -> tuple[Band, ...]:
+    """Split the total (3, n) into the part besides the random field, and the field by octaves, longest period first."""
+    shortest = SHORTEST_PERIOD * max(form.random_field.pitch)
+    period = 2 * max(high - low for low, high in (form.random_field.x, form.random_field.y))  # of the first cosine
+    bands = [_band(None, total - sample_surface(form.random_field, x, y))]
     while period > shortest:
         finest = np.inf if period / 2 <= shortest else 2 / period
-        bands.append(_band((period, period / 2), sampled(form.band(1 / period, finest), x, y)))
+        bands.append(_band((period, period / 2), sample_surface(form.band(1 / period, finest), x, y)))
         period = period / 2
     return tuple(bands)
 
 
 def _band(period: tuple[float, float] | None, part: np.ndarray) -> Band:
-    """Of (3, n) heights (mm) and slopes (rad)."""
+    """Return the figures of heights (mm) and slopes (rad), (3, n)."""
     return Band(period, root_mean_square(part[0]), float(np.sqrt(np.mean(part[1] ** 2 + part[2] ** 2))))
 
 
 def robust_pv(points: np.ndarray, distances: np.ndarray) -> float:
-    """PV of a 36-term Zernike fit, and three times the RMS of the rest (Evans, Opt. Eng. 48, 043605, 2009)."""
+    """Return PV of a 36-term Zernike fit plus three times the RMS residual (Evans, Opt. Eng. 48, 043605, 2009)."""
     radius = float(np.hypot(points[:, 0], points[:, 1]).max())
     terms = zernike(points[:, 0] / radius, points[:, 1] / radius)
-    some = slice(None, None, 1 + len(points) // FITTED)
+    some = slice(None, None, 1 + len(points) // ZERNIKE_FIT_POINTS)
     fit = terms @ least_squares(terms[some], distances[some])
     return float(np.ptp(fit)) + 3 * root_mean_square(distances - fit)
 
 
 def zernike(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """(n, 36) the fringe set on the unit circle: all terms with n + |m| <= 10.
+    """Return the fringe set (n, 36) on the unit circle: all Zernike terms with n + |m| <= 10.
 
-    R(r) = (-1)^k r^m P_k^(m, 0)(1 - 2 r²), k = (n - m) / 2, with Jacobi's polynomials P.
+    R(r) = (-1)^k r^m P_k^(m, 0)(1 - 2 r²), k = (n - m) / 2, with Jacobi polynomials P.
     """
     radius, angle = np.hypot(x, y), np.arctan2(y, x)
     terms = []
@@ -343,40 +346,40 @@ def zernike(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 # --- the minimum zone -------------------------------------------------------------------------------------------------
 
-ZONE_OFF = 1e-3  # of the minimum zone: points lie outside by less
-ZONE_POINTS = 400  # in the first linear program, and that join it at a time
-ZONE_ROUNDS = 30
+ZONE_TOLERANCE = 1e-3  # relative tolerance by which points may lie outside the minimum zone
+ZONE_CHUNK = 400  # number of points in the first linear program, and added to it in each round
+MAX_ZONE_ROUNDS = 30
 
 
 def minimum_zone(face: Face, alignment: Alignment) -> tuple[float, Pose]:
-    """(width in mm, pose removed from the cloud) of the narrowest zone between two envelopes of spheres on the design.
+    """Return width (mm) and pose of the narrowest zone between two envelopes of spheres about the design.
 
-    Its width is twice the largest distance, least by a motion (Chebyshev): min t, |d_i + n_i · motion| <= t for all
-    points, from the alignment by least squares, over the motions that the face determines.  Few points decide it: the
-    linear program begins with those of the largest distances, and takes in those that its solution leaves outside,
-    until they lie outside by less than ZONE_OFF of the width.
+    The width is twice the largest distance, minimised over the motions that the face determines (Chebyshev):
+    min t subject to |d_i + n_i · motion| <= t for all points, starting from the alignment by least squares.  Few points
+    are active: the linear program begins with the largest distances, and points outside its solution are added until
+    none lies outside by more than ZONE_TOLERANCE.
     """
     columns = face.columns(alignment.points, alignment.normals) @ alignment.motions
     distances, motion = alignment.distances, np.zeros(alignment.motions.shape[1])
     chosen = _farthest(distances)
-    for _ in range(ZONE_ROUNDS):
+    for _ in range(MAX_ZONE_ROUNDS):
         motion, half = _chebyshev(columns[chosen], distances[chosen])
-        left = distances + columns @ motion
-        if np.abs(left).max() <= half * (1 + ZONE_OFF):
+        residual = distances + columns @ motion
+        if np.abs(residual).max() <= half * (1 + ZONE_TOLERANCE):
             break
-        chosen = np.union1d(chosen, _farthest(left))
+        chosen = np.union1d(chosen, _farthest(residual))
     width = 2 * float(np.abs(distances + columns @ motion).max())
-    return width, alignment.pose.after(alignment.motions @ motion, face.reach)
+    return width, alignment.pose.compose(alignment.motions @ motion, face.reach)
 
 
 def _farthest(distances: np.ndarray) -> np.ndarray:
-    """Indices of the farthest points on either side."""
-    count = min(ZONE_POINTS // 2, len(distances))
+    """Return the indices of the farthest points on each side."""
+    count = min(ZONE_CHUNK // 2, len(distances))
     return np.union1d(np.argpartition(distances, -count)[-count:], np.argpartition(distances, count - 1)[:count])
 
 
 def _chebyshev(columns: np.ndarray, distances: np.ndarray) -> tuple[np.ndarray, float]:
-    """(motion, largest distance) of these points alone, solved in units of their largest distance."""
+    """Return motion and largest distance of these points, solved in units of their largest distance."""
     unit = max(float(np.abs(distances).max()), 1e-12)
     size = np.abs(columns).max(axis=0)
     scaled, ones = columns / size, np.ones((len(columns), 1))

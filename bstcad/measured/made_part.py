@@ -1,4 +1,4 @@
-"""Judgement of a made part: from a cloud of its back face to its form error, its predicted light, and checks."""
+"""Judge a made part by a cloud of its back face: form error, predicted light, and checks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bstcad.analysis import shape
 from bstcad.measured import alignment as aligning
 from bstcad.measured.alignment import Alignment, Face, Pose
 from bstcad.measured.cloud import Cloud
-from bstcad.measured.form_error import Deviation, Form, deviation, fitted, minimum_zone
+from bstcad.measured.form_error import Deviation, FormError, deviation, fit_form_error, minimum_zone
 from bstcad.optics.goal import Goal, worst
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, Light, measure
@@ -21,65 +21,66 @@ from bstcad.optics.wavefront_error import wavefront_error
 from bstcad.verify.checks import WAVEFRONT, Nominal
 from bstcad.verify.verdict import Check
 
-FARTHEST = 3e-3  # of the half width, RMS after alignment: a part beyond is of another design
-RELIEF = 0.5  # of the design's fine relief: a part with less is of another design
-COARSE = 4  # degree of the polynomial that is no fine relief: parts of one optical power share it
-NO_RELIEF = 3e-5  # of the half width, RMS: a face with less fine relief is not recognised by it
-SCALE = 2e-4  # off 1: size of thermal expansion
-SURE = 3.0  # times its uncertainty, for a scale to be off
-COVERED = 0.8  # of the face: elsewhere the form is a guess
-IN_A_CELL = 20  # mean points in a cell of the grid that tells the measured share of the face
-SAMPLED = 20_000  # points for the fine relief
-OUTLIERS = 0.1  # of the points near the face: with more, face and outliers cannot be told apart
+MAX_RMS_DISTANCE = 3e-3  # RMS distance after alignment, in half widths, above which a part is of another design
+MIN_RELIEF = 0.5  # fine relief relative to the design below which a part is of another design
+COARSE_DEGREE = 4  # degree of the polynomial that is not fine relief: parts of equal optical power share it
+MIN_DESIGN_RELIEF = 3e-5  # RMS fine relief, in half widths, that a design needs to be recognised by it
+SCALE_TOLERANCE = 2e-4  # tolerance of the scale, about a thermal expansion
+SCALE_SIGMAS = 3.0  # tolerance of the scale, in standard uncertainties, if that is larger
+MIN_COVERAGE = 0.8  # minimum fraction of the face that is measured; elsewhere the form is a guess
+POINTS_PER_CELL = 20  # mean number of points in a cell of the grid from which the coverage is counted
+RELIEF_POINTS = 20_000  # maximum number of points from which the fine relief is estimated
+MAX_OUTLIER_FRACTION = 0.1  # fraction of outliers near the face above which face and outliers are indistinguishable
 
 
 @dataclass(frozen=True, eq=False)
 class MadePart:
-    """Result of a cloud of a made part."""
+    """Judgement of a made part."""
 
     checks: tuple[Check, ...]
     facts: dict[str, Any]  # entry `measured` of report.json
     deviation: Deviation
-    # predicted on each target, (rows, columns), row 0 = y max, with the target's sum
+    # Predicted pictures, one for each target (rows, columns), row 0 = y max, with the sum of the target.
     irradiances: tuple[np.ndarray, ...] = field(repr=False)
-    outliers: np.ndarray = field(repr=False)  # (n, 3) mm on the design, left out of the fit
+    outliers: np.ndarray = field(repr=False)  # points left out of the fit (n, 3), mm, in the frame of the design
 
 
 def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = None) -> MadePart:
-    """The made part of a lens by the cloud of its back face; ValueError if the cloud is not of that face.
+    """Judge a made part by the cloud of its back face; raise ValueError if the cloud cannot be aligned with that face.
 
-    lens: as re-read from the STEP file.  effort: of a measurement of its light.
+    lens: the lens as re-read from the STEP file.  effort: effort of the measurement of its light.
     """
-    lens = replace(lens, outline=lens.apertures[1])  # where a mount cuts the rim, the part has no face beyond
+    lens = replace(lens, outline=lens.apertures[1])  # if a mount cuts the rim, the face ends there
     face = Face.of(lens)
     try:
-        placed, axes = _aligned(face, cloud.points)
+        alignment, axes = _align(face, cloud.points)
     except ValueError as error:
         raise ValueError(f"{cloud.path}: {error}") from None
-    form = fitted(face, placed)
-    deviates = deviation(lens, placed, form)
-    least = replace(nominal.effort(effort), witness=False)
-    lights = [_light(lens, form, nominal, goal, effort=least) for goal in nominal.goals]
-    scale, uncertainty = aligning.scale(face, placed)
-    x, y, _ = placed.pose.shift
+    form = fit_form_error(face, alignment)
+    figures = deviation(lens, alignment, form)
+    cheap = replace(nominal.effort(effort), witness=False)
+    lights = [_light(lens, form, nominal, goal, effort=cheap) for goal in nominal.goals]
+    scale, uncertainty = aligning.scale(face, alignment)
+    x, y, _ = alignment.pose.shift
     checks = (
         Check.true(
             "made part: the cloud is in mm", cloud.unit == "mm", f"its extent is the lens's in {cloud.unit}",
             id="made-unit",
         ),
         Check.true("made part: the axes of the cloud are the design's", not axes, axes, id="made-axes"),
-        *_of_this_lens(face, placed),
+        *_identity_checks(face, alignment),
         Check.at_least(
-            "made part: share of the face that was measured", _covered(lens, placed.points), COVERED,
+            "made part: measured fraction of the face", _coverage(lens, alignment.points), MIN_COVERAGE,
             id="made-covered",
         ),
         Check.at_most(
-            "made part: outliers among the points of the face, as a share", placed.outlier_share, OUTLIERS,
-            where="clean the part and measure it again", id="made-outliers",
+            "made part: fraction of outliers among the points of the face", alignment.outlier_fraction,
+            MAX_OUTLIER_FRACTION, where="clean the part and measure it again", id="made-outliers",
         ),
         Check.at_most(
-            "made part: scale of the cloud, off 1", abs(scale - 1), max(SCALE, SURE * uncertainty),
-            where=f"it is {scale:.5f} times the design", id="made-scale",
+            "made part: error of the scale of the cloud", abs(scale - 1),
+            max(SCALE_TOLERANCE, SCALE_SIGMAS * uncertainty), where=f"it is {scale:.5f} times the design",
+            id="made-scale",
         ),
         Check.at_most(
             "made part: decentre in the frame of the cloud", math.hypot(x, y), nominal.scene.accept.decentre, "mm",
@@ -93,135 +94,138 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
                     f"made part: RRMSD predicted{goal.suffix}", light.rrmsd, nominal.scene.accept.rrmsd, id="made-rrmsd"
                 ),
                 Check.at_most(
-                    f"made part: RRMSD, were all that the points leave open against it{goal.suffix}", high, None,
+                    f"made part: RRMSD predicted, with the uncertainty of the form{goal.suffix}", high, None,
                     id="made-rrmsd-high",
                 ),
             )
         ),
-        *_wavefront(replace(lens, back=form.on(lens.back)), nominal),
+        *_wavefront(replace(lens, back=form.add_to(lens.back)), nominal),
     )  # fmt: skip
-    facts = _facts(face, placed, deviates, cloud) | {"scale": scale, "passed": all(check.passed for check in checks)}
+    facts = _facts(face, alignment, figures, cloud) | {"scale": scale, "passed": all(check.passed for check in checks)}
     predicted = [_predicted(*found) for found in lights]
     facts |= predicted[worst(each["rrmsd_predicted"] for each in predicted)]
     facts["goals"] = [{"key": goal.key} | of for goal, of in zip(nominal.goals, predicted, strict=True)]
     irradiances = tuple(light.picture for light, _ in lights)
-    return MadePart(checks, facts, deviates, irradiances=irradiances, outliers=placed.outliers)
+    return MadePart(checks, facts, figures, irradiances=irradiances, outliers=alignment.outliers)
 
 
 def _predicted(light: Light, high: float) -> dict[str, float | None]:
-    """RRMSD of a light, and with all that the points leave open against it; None: none of it falls on the target."""
+    """Return the RRMSD without and with the uncertainty of the form; None if no light falls on the target."""
     found = {"rrmsd_predicted": light.rrmsd, "rrmsd_high": high}
     return {key: value if math.isfinite(value) else None for key, value in found.items()}
 
 
 def _wavefront(lens: Lens, nominal: Nominal) -> Iterator[Check]:
-    """The check of the wavefront behind the made lens, where one is asked for."""
-    wave, asked = nominal.scene.wavefront, nominal.scene.accept.wavefront
+    """Yield the check of the wavefront behind the made lens, if the scene states a wavefront."""
+    wave, limit = nominal.scene.wavefront, nominal.scene.accept.wavefront
     if wave is None:
         return
-    light, value, none = nominal.heaviest, math.nan, ""
+    light, value, failure = nominal.heaviest, math.nan, ""
     try:
         value = wavefront_error(light.source.central, light.through(lens), wave).without_tilt.rms
     except ValueError as error:
-        none = str(error)
+        failure = str(error)
     name = f"made part: {WAVEFRONT}, predicted"
-    yield Check.at_most(name, value, asked, unit="waves", where=none, id="made-wavefront")
+    yield Check.at_most(name, value, limit, unit="waves", where=failure, id="made-wavefront")
 
 
-def _aligned(face: Face, points: np.ndarray) -> tuple[Alignment, str]:
-    """(the alignment, the exchange of axes in words, "" if the cloud fits as it is)."""
-    pose, kept = aligning.first_pose(face, points)
-    if kept > aligning.NEAR * face.reach and (exchange := aligning.exchanged_axes(face, points, kept)):
+def _align(face: Face, points: np.ndarray) -> tuple[Alignment, str]:
+    """Return the alignment and the exchange of axes it needs, in words ("" if the cloud fits as it is)."""
+    pose, distance = aligning.first_pose(face, points)
+    poor = distance > aligning.START_TOLERANCE * face.reach
+    if poor and (exchange := aligning.find_axis_exchange(face, points, distance)):
         matrix, words = exchange
-        turned = points @ matrix.T
-        placed = aligning.aligned(face, turned, aligning.first_pose(face, turned)[0])
-        if all(check.passed for check in _of_this_lens(face, placed)):
-            return placed, f"{words}{': the face is flipped' if matrix[2, 2] < 0 else ''}"
-    return aligning.aligned(face, points, pose), ""
+        exchanged = points @ matrix.T
+        alignment = aligning.align(face, exchanged, aligning.first_pose(face, exchanged)[0])
+        if all(check.passed for check in _identity_checks(face, alignment)):
+            return alignment, f"{words}{': the face is flipped' if matrix[2, 2] < 0 else ''}"
+    return aligning.align(face, points, pose), ""
 
 
-def _of_this_lens(face: Face, placed: Alignment) -> tuple[Check, Check]:
-    """Is it a part of this design, by its distance from it and by the relief that makes its picture?"""
-    share, limit = _relief(face, placed.points), FARTHEST * face.reach
+def _identity_checks(face: Face, alignment: Alignment) -> tuple[Check, Check]:
+    """Return the checks that the part is of this design: its distance, and the fine relief that forms the picture."""
+    relief, limit = _relief(face, alignment.points), MAX_RMS_DISTANCE * face.reach
     other = "the cloud is of another lens or of another face"
     return (
         Check.at_most(
-            "made part: distance from the design after alignment, RMS", placed.rms, limit, "mm", where=other,
+            "made part: distance from the design after alignment, RMS", alignment.rms, limit, "mm", where=other,
             id="made-distance",
         ),
         Check.at_least(
-            "made part: fine relief of the face, as a part of the design's", 1.0 if share is None else share,
-            None if share is None else RELIEF, where=other, id="made-relief",
+            "made part: fine relief of the face, relative to the design", 1.0 if relief is None else relief,
+            None if relief is None else MIN_RELIEF, where=other, id="made-relief",
         ),
     )  # fmt: skip
 
 
 def _relief(face: Face, points: np.ndarray) -> float | None:
-    """Share of the design's fine relief in the made face, by regression; None: the design has no fine relief."""
-    points = points[np.random.default_rng(0).permutation(len(points))[:SAMPLED]]
+    """Return the fine relief of the made face relative to the design, by regression; None if the design has none."""
+    points = points[np.random.default_rng(0).permutation(len(points))[:RELIEF_POINTS]]
     x, y = (points[:, :2] / face.reach).T
-    columns = np.stack([x**i * y**j for i in range(COARSE + 1) for j in range(COARSE + 1 - i)], axis=1)
+    columns = np.stack([x**i * y**j for i in range(COARSE_DEGREE + 1) for j in range(COARSE_DEGREE + 1 - i)], axis=1)
     off = face.height(points)
     sag = points[:, 2] - off
     fine, change = (part - columns @ shape.least_squares(columns, part) for part in (sag - sag.mean(), off))
-    if aligning.root_mean_square(fine) <= NO_RELIEF * face.reach:
+    if aligning.root_mean_square(fine) <= MIN_DESIGN_RELIEF * face.reach:
         return None
     return 1 + float(fine @ change / (fine @ fine))
 
 
-def _covered(lens: Lens, points: np.ndarray) -> float:
-    """The share of equal cells over the outline that hold points."""
-    cells = int(np.clip(np.sqrt(len(points) / IN_A_CELL), 4, 64))
+def _coverage(lens: Lens, points: np.ndarray) -> float:
+    """Return the fraction of equal cells over the outline that contain points."""
+    cells = int(np.clip(np.sqrt(len(points) / POINTS_PER_CELL), 4, 64))
     edges = [np.linspace(-a, a, cells + 1) for a in lens.outline.half_extent]
-    held = np.histogram2d(points[:, 0], points[:, 1], bins=edges)[0] > 0
+    measured = np.histogram2d(points[:, 0], points[:, 1], bins=edges)[0] > 0
     middles = np.meshgrid(*((edge[:-1] + edge[1:]) / 2 for edge in edges), indexing="ij")
-    return float(held[lens.outline.depth(*middles) >= 0].mean())
+    return float(measured[lens.outline.depth(*middles) >= 0].mean())
 
 
-def _light(lens: Lens, form: Form, nominal: Nominal, goal: Goal, *, effort: Effort) -> tuple[Light, float]:
-    """(light of the lens with the form error, RRMSD with the remaining uncertainty added, mean of both signs)."""
+def _light(lens: Lens, form: FormError, nominal: Nominal, goal: Goal, *, effort: Effort) -> tuple[Light, float]:
+    """Return the light of the lens with the form error, and the RRMSD with the uncertainty of the form added.
+
+    The latter is the quadratic mean of two samples of the posterior, of opposite signs.
+    """
     draw = np.random.default_rng(nominal.scene.tailoring.seed).normal(size=form.spread.shape)
 
-    def of(form: Form) -> Light:
-        made = replace(lens, back=form.on(lens.back))
-        how = {"effort": effort, "ghost": nominal.scene.ghost, "draw": nominal.scene.draw}
-        return measure(made, nominal.channels, goal.receiver, goal.picture, **how)
+    def light_with(form: FormError) -> Light:
+        made = replace(lens, back=form.add_to(lens.back))
+        options = {"effort": effort, "ghost": nominal.scene.ghost, "draw": nominal.scene.draw}
+        return measure(made, nominal.channels, goal.receiver, goal.picture, **options)
 
-    light = of(form)
-    return light, max(
-        light.rrmsd, math.hypot(*(of(form.drawn(draw, sign)).rrmsd for sign in (1.0, -1.0))) / math.sqrt(2)
-    )
+    light = light_with(form)
+    samples = (light_with(form.posterior_sample(draw, sign)).rrmsd for sign in (1.0, -1.0))
+    return light, max(light.rrmsd, math.hypot(*samples) / math.sqrt(2))
 
 
-def _facts(face: Face, placed: Alignment, deviates: Deviation, cloud: Cloud) -> dict[str, Any]:
-    """The entries of `measured` in report.json; lengths in mm, angles in degrees, slopes in rad."""
-    figures = {key: value for key, value in asdict(deviates).items() if key not in ("x", "y", "form", "worst")}
-    apart, (width, pose) = face.distance(placed.outliers)[0], minimum_zone(face, placed)
+def _facts(face: Face, alignment: Alignment, error: Deviation, cloud: Cloud) -> dict[str, Any]:
+    """Return the entries of `measured` in report.json; lengths in mm, angles in degrees, slopes in rad."""
+    figures = {key: value for key, value in asdict(error).items() if key not in ("x", "y", "form", "worst")}
+    distances, (width, pose) = face.distance(alignment.outliers)[0], minimum_zone(face, alignment)
     return {
         "cloud": cloud.path.name,
         "sha256": cloud.sha256,
         "unit": cloud.unit,
         "columns": cloud.columns,
-        "points": len(placed.points),
+        "points": len(alignment.points),
         "left_out": {
             "without data": cloud.without_data,
-            "outside the outline": placed.outside,
-            "off the face": placed.off_face,
+            "outside the outline": alignment.outside,
+            "off the face": alignment.off_face,
         },
         "outliers": {
-            "points": len(apart),
-            "share": placed.outlier_share,
-            "above": int((apart > 0).sum()),
-            "farthest": float(np.abs(apart).max(initial=0.0)),
+            "points": len(distances),
+            "share": alignment.outlier_fraction,
+            "above": int((distances > 0).sum()),
+            "farthest": float(np.abs(distances).max(initial=0.0)),
         },
-        "alignment": _removed(placed.pose) | {"undetermined": list(placed.undetermined)},
-        "minimum_zone": {"width": width, **_removed(pose)},
+        "alignment": _pose_entries(alignment.pose) | {"undetermined": list(alignment.undetermined)},
+        "minimum_zone": {"width": width, **_pose_entries(pose)},
         **figures,
-        "worst_at": list(deviates.worst),
+        "worst_at": list(error.worst),
     }
 
 
-def _removed(pose: Pose) -> dict[str, float]:
-    """Pose of the part in its cloud."""
+def _pose_entries(pose: Pose) -> dict[str, float]:
+    """Return the pose of the part in its cloud as entries of report.json."""
     keys = ("dx", "dy", "dz", "rotation_x", "rotation_y", "rotation_z")
     return dict(zip(keys, map(float, (*pose.shift, *pose.angles)), strict=True))

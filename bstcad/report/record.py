@@ -27,7 +27,7 @@ from bstcad.analysis.light import Blur, FinestDetail, finest_detail
 from bstcad.analysis.steepness import Steepness
 from bstcad.analysis.top_hat import FlatTop
 from bstcad.judges.comparison import Judge
-from bstcad.measured.form_error import MAP
+from bstcad.measured.form_error import MAP_FILES
 from bstcad.measured.made_part import MadePart
 from bstcad.optics.goal import Goal, worst
 from bstcad.optics.irradiance import Screen
@@ -324,7 +324,7 @@ def _unreached(scene: Scene, goal: Goal) -> dict[str, float | None] | None:
 
 def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:
     """The contents with a made part, whose checks join the verdict; place: path of its folder from the report's."""
-    measured = part.facts | {"deviation_map": [f"{place}{name}" for name in MAP]}
+    measured = part.facts | {"deviation_map": [f"{place}{name}" for name in MAP_FILES]}
     passed, checks = contents.passed and part.facts["passed"], (*contents.checks, *part.checks)
     contents = replace(contents, checks=checks, passed=passed, measured=measured)
     return _remarked(contents, *written("remarks.txt.j2", "outliers", share=part.facts["outliers"]["share"]))

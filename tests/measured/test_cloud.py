@@ -34,16 +34,16 @@ def zygo(heights, pixel):
 
 WRONG = {
     "two columns": (lines(GOOD[:, :2], ","), "line 1 holds 2 numbers; give x, y and z in mm"),
-    "infinite": (lines(GOOD, ",") + "\n1,inf,3", "line 201: y = inf mm is beyond 1000000 mm"),
-    "a placeholder": (lines(GOOD, " ") + "\n1 2 -1e10", "leave out what was not measured"),
-    "decimal commas": ("x,y,z\n" + lines(GOOD, ",").replace(".", ","), "line 2 holds 6 fields where its heading"),
+    "infinite": (lines(GOOD, ",") + "\n1,inf,3", "line 201: y = inf mm exceeds 1000000 mm"),
+    "a placeholder": (lines(GOOD, " ") + "\n1 2 -1e10", "leave out points that were not measured"),
+    "decimal commas": ("x,y,z\n" + lines(GOOD, ",").replace(".", ","), "line 2 holds 6 fields, but its heading"),
     "nominal alone": ("X_nom,Y_nom,Z_nom\n" + lines(GOOD, ","), "its heading, 'X_nom,Y_nom,Z_nom', names nominal"),
     "pixels": ("Zygo XYZ Data File - Format 2\n#\n0 0 No Data\n0 1 16025.3\n#", "header states no width of a pixel"),
     "a zip archive": (b"PK\x03\x04" + bytes(50), "is a zip archive, such as X3P"),
     "half of UTF-16": ("x,y,z\n".encode("utf-16") + b"1", "is no text in UTF-16"),
-    "more columns": (lines(np.hstack([GOOD, GOOD]), ","), "holds 6 columns, and no heading says which are x, y and z"),
+    "more columns": (lines(np.hstack([GOOD, GOOD]), ","), "holds 6 columns, but no heading names x, y and z"),
     "x twice": ("x,y,z,x\n" + lines(GOOD[:, [0, 1, 2, 0]], ","), "names x, y or z twice"),
-    "another unit": ("x [ft],y [ft],z [ft]\n" + lines(GOOD, ","), "'x[ft]', has a unit that is not known; give mm"),
+    "another unit": ("x [ft],y [ft],z [ft]\n" + lines(GOOD, ","), "'x[ft]', has an unknown unit; give mm"),
     "metres": (lines(GOOD / 1000, ","), "as if they were in metres; give them in mm"),
     "no text": (bytes(range(256)), "is no text"),
 }
@@ -149,7 +149,7 @@ def test_vertices_of_meshes_are_points(tmp_path, ending):
     found = clouds.load(path, ROUND).points
     assert len(found) == len(mesh.vertices) and np.linalg.norm(found, axis=1) == pytest.approx(4.0, abs=1e-6)
     path.write_bytes(path.read_bytes()[:150])
-    with pytest.raises(ValueError, match="its header does not end|promises 1280 triangles, and 1.32 follow"):
+    with pytest.raises(ValueError, match="its header does not end|declares 1280 triangles, but 1.32 follow"):
         clouds.load(path, ROUND)
 
 
@@ -178,9 +178,9 @@ def test_a_ply_file_is_held_to_what_its_header_promises(tmp_path, order):
     found = clouds.load(path, ROUND)
     assert found.points == pytest.approx(np.unique(GOOD, axis=0), abs=1e-8)
     wrong = {
-        "promises 1000000000 points, and": ply(order, 10**9),  # 28 GB
-        "promises 999999999999999999 rows of element 'face', and 2 follow": ply(order, faces=10**18 - 1),
-        "promises 2 rows of element 'face', and 1 follow": ply(order, triangles=1),
+        "declares 1000000000 points, but": ply(order, 10**9),  # 28 GB
+        "declares 999999999999999999 rows of element 'face', but 2 follow": ply(order, faces=10**18 - 1),
+        "declares 2 rows of element 'face', but 1 follow": ply(order, triangles=1),
         "follow": ply(order, more=b"1 2 3\n"),
         "is no PLY file that can be read ('element vertex -5' in its header)": ply(order, -5),
     }
@@ -200,7 +200,7 @@ def test_points_of_a_ply_file_without_data_or_far_off_are_told_as_in_text(tmp_pa
     found = clouds.load(path, ROUND)
     assert len(found.points) == 200 and found.without_data == 2
     path.write_text(head + "\n".join([*rows, "1 2 nan", "1 2 1e9"]))
-    with pytest.raises(ValueError, match=r"point 202: z = 1e\+09 mm is beyond"):
+    with pytest.raises(ValueError, match=r"point 202: z = 1e\+09 mm exceeds"):
         clouds.load(path, ROUND)
     path.write_text(head + "\n".join([*rows, "1 2 nan", "1 2"]))
     with pytest.raises(ValueError, match="its point 202 is not three numbers"):
@@ -213,5 +213,5 @@ def test_a_broken_stl_of_text_is_told_by_its_corners(tmp_path):
     found = clouds.load(path, ROUND).points
     assert len(found) == 162
     path.write_text(path.read_text().rsplit("vertex", 1)[0])
-    with pytest.raises(ValueError, match="it has 320 triangles, and 959 corners follow"):
+    with pytest.raises(ValueError, match="it has 320 triangles, but 959 corners"):
         clouds.load(path, ROUND)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from bstcad.measured.alignment import Face, aligned, sampled, scale, unmoved
-from bstcad.measured.form_error import deviation, fitted, map_files, minimum_zone, robust_pv, zernike
+from bstcad.measured.alignment import Face, align, identity_pose, sample_surface, scale
+from bstcad.measured.form_error import deviation, fit_form_error, map_files, minimum_zone, robust_pv, zernike
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
 from bstcad.optics.surfaces import Plane
@@ -23,7 +23,7 @@ def lens():
 
 def test_the_minimum_zone_is_that_of_all_points(lens):
     face = Face.of(lens)
-    found = aligned(face, points(with_form_error(lens, 5e-4, 2.0), 3000), unmoved(face))
+    found = align(face, points(with_form_error(lens, 5e-4, 2.0), 3000), identity_pose(face))
     width, _ = minimum_zone(face, found)
     columns, one = face.columns(found.points, found.normals), np.ones((len(found.points), 1))
     exact = linprog(
@@ -43,14 +43,14 @@ def test_a_known_error_has_a_known_zone(lens):
     given[:, 2] += ripple * radius**6 * np.cos(6 * angle)
     face = Face.of(lens)
     normal_z = 1 / np.sqrt(1 + 0.2**2)
-    width, _ = minimum_zone(face, aligned(face, given, unmoved(face)))
+    width, _ = minimum_zone(face, align(face, given, identity_pose(face)))
     assert 2 * ripple * normal_z * 0.93 < width < 2 * ripple
 
 
 def test_an_alignment_never_mirrors(lens):
     mirrored = replace(lens, back=replace(lens.back, heights=lens.back.heights.flip(0)))
     face = Face.of(lens)
-    found = aligned(face, points(mirrored, 3000), unmoved(face))
+    found = align(face, points(mirrored, 3000), identity_pose(face))
     assert np.linalg.det(found.pose.rotation) == pytest.approx(1.0) and found.rms > 0.01
 
 
@@ -91,25 +91,25 @@ class TestForm:
     def placed(cls, lens, made):
         face, given = Face.of(lens), points(made, 8000)
         given[:, 2] += np.random.default_rng(3).normal(0.0, cls.NOISE, len(given))
-        return face, aligned(face, given, unmoved(face))
+        return face, align(face, given, identity_pose(face))
 
     def test_the_spline_is_the_form_error_on_any_net(self, lens, made, placed):
         """`on` adds the heights of `at`; a sample of the posterior differs by as much either way."""
-        form = fitted(*placed)
+        form = fit_form_error(*placed)
         x, y, _ = points(lens, 500, seed=9).T
-        with_it, error = form.on(lens.back), form.at(x, y)
-        assert with_it.m >= max(lens.back.m, form.rest.m) and form.noise == pytest.approx(self.NOISE, rel=0.1)
-        on_net = sampled(with_it, x, y)[0] - sampled(lens.back, x, y)[0]
+        with_it, error = form.add_to(lens.back), form.at(x, y)
+        assert with_it.m >= max(lens.back.m, form.random_field.m) and form.noise == pytest.approx(self.NOISE, rel=0.1)
+        on_net = sample_surface(with_it, x, y)[0] - sample_surface(lens.back, x, y)[0]
         assert np.sqrt(np.mean((on_net - error) ** 2)) < 1e-3 * error.std()
-        true = sampled(made.back, x, y)[0] - sampled(lens.back, x, y)[0]
+        true = sample_surface(made.back, x, y)[0] - sample_surface(lens.back, x, y)[0]
         assert np.sqrt(np.mean((error - true) ** 2)) < 0.05 * true.std()
         draw = np.random.default_rng(0).normal(size=form.spread.shape)
-        more, less = (form.drawn(draw, sign).at(x, y) for sign in (1.0, -1.0))
+        more, less = (form.posterior_sample(draw, sign).at(x, y) for sign in (1.0, -1.0))
         np.testing.assert_allclose((more + less) / 2, error, atol=1e-12)
         assert 0 < (more - error).std() < self.NOISE
 
     def test_bands_are_waves_of_their_periods_and_the_map_holds_the_form(self, lens, placed):
-        found = deviation(lens, placed[1], fitted(*placed))
+        found = deviation(lens, placed[1], fit_form_error(*placed))
         assert found.bands[0].period is None
         for longer, shorter in zip(found.bands[1:], found.bands[2:], strict=False):
             assert longer.period[1] == shorter.period[0] and longer.period[0] == 2 * longer.period[1]
@@ -120,5 +120,5 @@ class TestForm:
     def test_a_scale_is_seen_beside_the_six_motions(self, lens):
         face = Face.of(lens)
         grown = (points(lens, 4000) - face.pivot) * 1.0005 + face.pivot
-        value, uncertainty = scale(face, aligned(face, grown, unmoved(face)))
+        value, uncertainty = scale(face, align(face, grown, identity_pose(face)))
         assert value == pytest.approx(1.0005, abs=2e-5) and uncertainty < 2e-4

@@ -14,7 +14,7 @@ from bstcad import cli, commands
 from bstcad import folder as folders
 from bstcad.measured import cloud as clouds
 from bstcad.measured import made_part
-from bstcad.measured.alignment import Face, aligned, first_pose
+from bstcad.measured.alignment import Face, align, first_pose
 from bstcad.optics.measure import measure
 from bstcad.report.figure_jobs import NoPictures
 from bstcad.verify import checks
@@ -91,7 +91,7 @@ def test_the_pose_of_the_part_is_found_and_points_of_other_faces_are_counted(nom
     below = cloud(replace(nominal.lens, back=nominal.lens.back.moved(nominal.lens.back.z - 8.0)), 1500)
     face = Face.of(nominal.lens)
     everything = np.vstack([back, below])
-    found = aligned(face, everything, first_pose(face, everything)[0])
+    found = align(face, everything, first_pose(face, everything)[0])
     assert found.pose.shift == pytest.approx(SHIFT, abs=1e-6) and found.pose.angles == pytest.approx(TURN, abs=1e-5)
     assert found.rms < 1e-9 and found.off_face >= 1400 and found.outside < 100 and found.undetermined == ()
 
@@ -101,7 +101,7 @@ def test_motions_that_a_flat_face_does_not_determine_are_left_alone(nominal):
     flat = replace(lens, back=replace(lens.back, heights=torch.zeros_like(lens.back.heights)))
     face = Face.of(flat)
     given = points(flat, 5000) + [0.0, 0.0, 0.3] + np.random.default_rng(0).normal(0, 1e-4, (5000, 3)) * [0, 0, 1]
-    found = aligned(face, given, first_pose(face, given)[0])
+    found = align(face, given, first_pose(face, given)[0])
     assert set(found.undetermined) == {"shift in x", "shift in y", "rotation about z"}
     assert found.pose.shift == pytest.approx([0, 0, 0.3], abs=1e-5)
 
@@ -114,8 +114,8 @@ AXES = "the axes of the cloud are the design's"
 FAULTS = {  # a cloud of a lens, the check that fails, words of its sentence
     "swapped axes": (lambda lens: as_designed(lens)[:, [1, 0, 2]], AXES, "x is y, y is x"),
     "a flipped face": (lambda lens: as_designed(lens) * [1, 1, -1], AXES, "z is -z: the face is flipped"),
-    "a scale of 1.001": (lambda lens: 1.001 * as_designed(lens), "scale of the cloud, off 1", "times the design"),
-    "half a face": (lambda lens: half(as_designed(lens)), "share of the face that was measured", ""),
+    "a scale of 1.001": (lambda lens: 1.001 * as_designed(lens), "error of the scale of the cloud", "times the design"),
+    "half a face": (lambda lens: half(as_designed(lens)), "measured fraction of the face", ""),
     "another lens": (
         lambda lens: cloud(with_form_error(lens, 0.05, 1.5), 5000), "distance from the design after alignment, RMS",
         "the cloud is of another lens",

@@ -8,8 +8,8 @@ import pytest
 from bstcad import folder as folders
 from bstcad.measured import cloud as clouds
 from bstcad.measured import made_part
-from bstcad.measured.alignment import Face, aligned, first_pose
-from bstcad.measured.form_error import deviation, fitted
+from bstcad.measured.alignment import Face, align, first_pose
+from bstcad.measured.form_error import deviation, fit_form_error
 from bstcad.optics.measure import Effort
 from bstcad.report.record import with_part
 from bstcad.report.units import environment
@@ -33,12 +33,12 @@ def clean(nominal):
 
 def on_face(lens, found):
     face = Face.of(lens)
-    return face, aligned(face, found, first_pose(face, found)[0])
+    return face, align(face, found, first_pose(face, found)[0])
 
 
 def figures(lens, found):
     face, placed = on_face(lens, found)
-    return deviation(lens, placed, fitted(face, placed)), placed
+    return deviation(lens, placed, fit_form_error(face, placed)), placed
 
 
 @pytest.mark.parametrize(("share", "sides"), [(0.001, DUST), (0.05, SLIPS)], ids=["dust", "slips"])
@@ -76,7 +76,7 @@ def test_a_defect_that_covers_an_area_is_form(nominal, clean, defect):
     dusty, dust = dirty(given, 0.01, DUST)
     _, placed = on_face(lens, dusty)
     out = {tuple(point) for point in np.round(placed.outliers[:, :2], 3)}
-    hit = np.array([tuple(point) in out for point in np.round(placed.pose.undone(dusty)[:, :2], 3)])
+    hit = np.array([tuple(point) in out for point in np.round(placed.pose.to_design(dusty)[:, :2], 3)])
     deep = (np.abs(off) > 1e-4) & ~dust
     assert deep.sum() > 40 and hit[deep].mean() <= 0.03 and hit[~deep & ~dust].mean() < 1e-3
     assert hit[dust].mean() > 0.95
@@ -90,7 +90,7 @@ def test_outliers_are_counted_and_remarked_and_too_many_fail(nominal, clean):
     few, some, many = map(judged, (0.001, 0.03, 0.2))
     assert few.facts["passed"] and some.facts["passed"]
     assert [check.name for check in many.checks if not check.passed] == [
-        "made part: outliers among the points of the face, as a share"
+        "made part: fraction of outliers among the points of the face"
     ]
     assert some.facts["outliers"] == {
         "points": len(some.outliers), "share": pytest.approx(0.03, rel=0.03), "above": len(some.outliers),
