@@ -1,7 +1,10 @@
-"""The task of tailoring, the steps of its stages, and the driver that goes through them.
+"""The task of a design, the steps that its stages yield, and the driver that runs the stages.
 
-The stages yield steps (`Step`) and know nothing of time; the driver notes it, has states saved, reports progress, and
-does not ask for the next step once there is a reason to end.
+Tailoring has two stages (Wang et al. 2023).  Stage 1 computes the transport map from source to target and fits the
+surface to it (stage1.py; two_faces.py where the front is freeform too).  Stage 2 starts from that surface and minimises
+the error of the traced irradiance (stage2.py); stage 3 takes its place for a source of finite size.  A stage is an
+iterator of `Step`s and knows nothing of time.  The driver takes the steps, measures time, saves states, reports
+progress, and stops when there is a reason to end.
 """
 
 from __future__ import annotations
@@ -31,28 +34,28 @@ from bstcad.transport.mapping import Mapping
 
 @dataclass(frozen=True)
 class NetParameters:
-    """The plane and the heights of one freeform interface."""
+    """Reference plane and control-point heights of one freeform interface."""
 
-    z: float  # the plane that its heights are measured from (mm)
-    heights: Tensor  # (m, n) mm
+    z: float  # plane from which the heights are measured (mm)
+    heights: Tensor  # control points (m, n), mm above the plane
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """All that tells a lens from the blank that it was tailored from."""
+    """Parameters that tailoring changes: a blank and these determine the lens."""
 
-    nets: tuple[NetParameters, ...]  # in the order of Lens.freeform
-    front: dict[str, float | Tensor]  # by name, such as curvature (1/mm); none of a plane or of a net
-    back: float  # mm, the plane of the back, which is moved though its heights may be given
+    nets: tuple[NetParameters, ...]  # freeform interfaces, in the order of Lens.freeform
+    front: dict[str, float | Tensor]  # values by name, such as curvature (1/mm); empty for a plane or a net
+    back: float  # z of the plane of the back (mm); tailoring moves it even where the heights are given
 
     @classmethod
     def of(cls, lens: Lens) -> Parameters:
-        """The parameters of a lens."""
+        """Return the parameters of a lens."""
         front = {} if lens.front.is_net else lens.front.parameters()
         return cls(tuple(NetParameters(net.z, net.heights) for net in lens.nets), front, lens.back.z)
 
     def applied(self, lens: Lens) -> Lens:
-        """The lens with these parameters, on its own device."""
+        """Return `lens` with these parameters, on the device of `lens`."""
         like = lens.like
         lens = lens.with_front(lens.front.with_parameters(**self.front).to(like.dtype, like.device))
         lens = lens.with_back(lens.back.moved(self.back))
@@ -62,109 +65,112 @@ class Parameters:
 
 @dataclass(frozen=True)
 class Judged:
-    """A lens and its figures by the measure of the whole design: all pixels, all goals, all of the light."""
+    """A lens with its figures for the whole design: all pixels, all goals, and the light of the whole source."""
 
     rrmsd: float  # RRMSD by `Task.rrmsd`
-    figure: float  # root of the merit of all goals (merit.py): the RRMSD itself where no wave is asked for
+    figure: float  # square root of the merit of all goals (merit.py); equal to the RRMSD without a wavefront goal
     lens: Parameters
 
     def beats(self, other: Judged) -> bool:
-        """Is this lens better than another by more than the errors of judging?"""
-        return WORSE * self.figure < (math.inf if math.isnan(other.figure) else other.figure)  # NaN: no light arrives
+        """Return True if this lens is better than another by more than the error of the figures."""
+        theirs = math.inf if math.isnan(other.figure) else other.figure  # NaN: no light arrives
+        return SIGNIFICANT_RATIO * self.figure < theirs
 
 
-WORSE = 1.05  # ratio of two figures that is no error of judging: BETWEEN knows an RRMSD to some 5 %
-BEST = "back to the best lens before"  # the name of a part of a design
-WAVE_TUBES = 256  # a side, by which the wavefront of a lens between the stages is judged
-EVALUATED = 4.7e6  # tubes a second of pace 1, with the gradient of the merit
+SIGNIFICANT_RATIO = 1.05  # smallest ratio of two figures that is significant: STAGE_EFFORT has errors of 5 %
+BEST = "back to the best lens before"  # name of a stage in the record
+WAVEFRONT_TUBES = 256  # tubes a side for the wavefront error of a lens between the stages
+EVALUATED = 4.7e6  # tubes traced per second, with the gradient of the merit, on a machine of pace 1
 JUDGING = 0.5  # seconds that `Task.rrmsd` takes on a machine of pace 1
-# Of a lens between the stages, for a target of PIXELS a side: to some 5 %.  A target of p pixels a side takes
-# (p / PIXELS)^⅔ times as many rays a side: the error of the product of two pictures of n² stratified rays falls as
-# (p / n)³ / p.
-BETWEEN, PIXELS = Effort(rays=724, accuracy=0, witness=False), 512
-ASKED = Effort(rays=2048, accuracy=0.01, witness=False)  # the same where it ends at an accuracy, or tells bounds' cost
-COUNTED = Effort(rays=128, accuracy=1.0, witness=False)  # to tell how much light arrives
+# Rays for the RRMSD of a lens between the stages, to some 5 % for a target of STAGE_EFFORT_PIXELS pixels a side.  The
+# error of the product of two pictures of n² stratified rays falls as (p / n)³ / p, so a target of p pixels a side takes
+# (p / STAGE_EFFORT_PIXELS)^⅔ times as many rays a side.
+STAGE_EFFORT, STAGE_EFFORT_PIXELS = Effort(rays=724, accuracy=0, witness=False), 512
+FINE_EFFORT = Effort(rays=2048, accuracy=0.01, witness=False)  # rays where a scene has an accuracy or bounds
+FLUX_EFFORT = Effort(rays=128, accuracy=1.0, witness=False)  # rays for the flux on the target alone
 
 Progress = Callable[[str, int, int, str], None]  # stage, done, total, text
-MEMORY = 4.0  # seconds of work after which a pace measured before is forgotten
+PACE_MEMORY = 4.0  # seconds of work over which the pace of the machine is averaged
 
 
 def silent(stage: str, done: int, total: int, text: str) -> None:
-    """A progress that says nothing."""
+    """Report no progress; the default `Progress`."""
 
 
 @dataclass(frozen=True)
 class Edge:
-    """The light at the edge of what can be reached, which must not be reflected."""
+    """Light at the edge of the reachable part of a target, which is close to total internal reflection."""
 
-    light: Channel  # of the source's middle, at the line with most of the flux
-    angle: float  # from the normal (rad), at which it may leave the last face at most
+    light: Channel  # channel of the centre of the source with most of the flux
+    angle: float  # largest angle to the normal at which light may leave the last face (rad)
 
 
 @dataclass(frozen=True)
 class Task:
-    """Light, goals and knobs of a design."""
+    """Everything that the stages need to know of a design: light, goals, settings and bounds."""
 
-    channels: tuple[Channel, ...]  # the light
-    goals: tuple[Goal, ...]  # stage 1 of one face follows the first
-    knobs: Tailoring  # with every key set
-    least: float = 0.0  # thickness of the glass everywhere (mm)
-    free: tuple[str, ...] = ()  # the parameters of the front that tailoring searches for
-    rim_sags: tuple[float, float] = (-math.inf, math.inf)  # that such a front may have (mm)
-    progress: Progress = silent  # told of the progress within a step
-    tidy: Callable[[], None] = lambda: None  # called where freed memory has not the sizes that are needed next
-    grown: tuple[tuple[Channel, ...], ...] = ()  # points of the source, as it grows to its size; () of a point
-    bounds: Bounds | None = None  # on the tailored faces; None: they may have any shape
-    spreads: tuple[Spread, ...] = ()  # the same source in each of these sizes, about its middle
-    edge: Edge | None = None  # of a target that is cut to what light can reach; None: light can reach all of it
-    # of a picture (rows, columns) and the target, both of sum 1 or less, what stage 2 makes least; None: RRMSD²
+    channels: tuple[Channel, ...]  # light of the source; for a source of finite size, of its centre
+    goals: tuple[Goal, ...]  # targets; stage 1 with one freeform face uses the first alone
+    knobs: Tailoring  # settings of the scene's [tailoring], all set
+    least: float = 0.0  # minimum thickness of the glass everywhere (mm)
+    free: tuple[str, ...] = ()  # names of the parameters of the front that are optimised
+    rim_sags: tuple[float, float] = (-math.inf, math.inf)  # range of the sag at the rim of such a front (mm)
+    progress: Progress = silent  # receives the progress within a step
+    tidy: Callable[[], None] = lambda: None  # returns freed memory to the system between large allocations
+    grown: tuple[tuple[Channel, ...], ...] = ()  # sampled light of the source at each size of stage 3; () for a point
+    bounds: Bounds | None = None  # bounds on the shape of the tailored faces; None: no bounds
+    spreads: tuple[Spread, ...] = ()  # source at each size of stage 3, for its blur
+    edge: Edge | None = None  # light at the edge of a target cut to its reachable part; None: all of it is reachable
+    # function of a picture (rows, columns) and of the target, both of sum <= 1, that stage 2 minimises; None: RRMSD²
     merit: Callable[[Tensor, Tensor], Tensor] | None = None
-    wave: Wave | None = None  # that the light behind the lens shall be; None: any
-    hasty: bool = False  # for a preview: one round a stage, no lens judged, and no way tried that costs much
-    solution: float | None = None  # σ of light_behind.py; None: the gentler one
-    floor: float = 0.0  # of its mean, to which stage 1 of two faces lifts the furthest picture
-    front_sides: Callable[[Sides], Sides | None] = lambda sides: None  # of a tailored front, by those of the back
+    wave: Wave | None = None  # wavefront that the light shall have behind the lens; None: no such goal
+    hasty: bool = False  # preview: one round a stage, no RRMSD by rays, no costly alternative
+    solution: float | None = None  # sign σ of light_behind.py, +1 or -1; None: the one with the smaller angles
+    floor: float = 0.0  # irradiance, relative to the mean, to which stage 1 of two faces raises the furthest picture
+    front_sides: Callable[[Sides], Sides | None] = lambda sides: None  # front's control points, by those of the back
 
     @property
     def heaviest(self) -> Channel:
-        """The channel with most of the light; stage 1 reckons with it alone."""
+        """Channel with most of the light; stage 1 uses it alone."""
         return max(self.channels, key=lambda channel: channel.weight)
 
     @property
     def several(self) -> bool:
-        """Is there another goal than one picture?"""
+        """True if there is more than one picture, or a wavefront goal."""
         return len(self.goals) > 1 or self.wave is not None
 
     def sides(self, lens: Lens, sides: Sides) -> tuple[Sides, ...]:
-        """Control points of each of the lens's nets where a back has so many."""
+        """Return the numbers of control points of each net of a lens whose back has `sides`."""
         front = self.front_sides(sides)
         return tuple(sides if k == lens.number_of("back") or front is None else front for k in lens.freeform)
 
     @property
     def whole(self) -> Task:
-        """The same task with the light of the whole source."""
+        """Task with the sampled light of the whole source in place of that of its centre."""
         return replace(self, channels=self.grown[-1], grown=()) if self.grown else self
 
     def refined(self, lens: Lens, sides: Sides) -> Lens:
-        """The lens with the control points that its nets have where a back has so many."""
+        """Return the lens with its nets refined to the numbers of control points that go with `sides` on the back."""
         pairs = zip(lens.nets, self.sides(lens, sides), strict=True)
         return lens.with_nets(net.refined(own) for net, own in pairs)
 
     def aimed(self, lens: Lens) -> Task:
-        """The task with its receivers where the last net of a lens sees them, at which stage 1 aims."""
+        """Return the task with its receivers imaged through the surfaces behind the last net; stage 1 aims there."""
         return replace(self, goals=tuple(replace(goal, receiver=imaged(lens, goal.receiver)) for goal in self.goals))
 
     def rrmsd(self, lens: Lens, effort: Effort | None = None) -> float:
-        """RRMSD by rays on the CPU, without the bias of the tubes that tailor the lens; the largest of several.
+        """Return the RRMSD by independent rays on the CPU, the largest over the goals; NaN without light on a target.
 
-        effort: None: ASKED where the design hangs on the figure, else the few rays of BETWEEN.
+        Tubes that tailored the lens would underestimate it.  effort: rays to use; None: FINE_EFFORT for a scene with an
+        accuracy or bounds, else STAGE_EFFORT.
         """
         if effort is None and (self.knobs.accuracy is not None or self.bounds is not None):
-            effort = ASKED
+            effort = FINE_EFFORT
         if effort is None:
-            largest = max(goal.picture.size for goal in self.goals)
-            effort = replace(BETWEEN, rays=round(BETWEEN.rays * (largest / PIXELS**2) ** (1 / 3)))
-        draw = self.spreads[-1].draw if self.spreads and not self.grown else None  # not of its middle alone
+            pixels = max(goal.picture.size for goal in self.goals)
+            rays = STAGE_EFFORT.rays * (pixels / STAGE_EFFORT_PIXELS**2) ** (1 / 3)
+            effort = replace(STAGE_EFFORT, rays=round(rays))
+        draw = self.spreads[-1].draw if self.spreads and not self.grown else None  # whole source
         lens = lens.plain()
         values = [
             rrmsd_by_rays(lens, self.channels, goal.receiver, target=goal.picture, effort=effort, draw=draw)
@@ -173,98 +179,98 @@ class Task:
         return math.nan if any(map(math.isnan, values)) else max(values)
 
     def judged(self, lens: Lens, rrmsd: float) -> Judged:
-        """The lens, of this RRMSD by `rrmsd`, as the whole design is judged."""
+        """Return the lens with its figure of merit, given its RRMSD by `rrmsd`."""
         figure = rrmsd
         if self.wave is not None:
-            merit = Merit.of(self.channels, lens, WAVE_TUBES, goals=(), overshoot=0.0, wave=self.wave)
+            merit = Merit.of(self.channels, lens, WAVEFRONT_TUBES, goals=(), overshoot=0.0, wave=self.wave)
             square, pictures = float(merit(merit.landing(lens))[0]), sum(goal.weight for goal in self.goals)
             figure = math.sqrt((pictures * rrmsd**2 + self.wave.weight * square) / (pictures + self.wave.weight))
         return Judged(rrmsd, figure, Parameters.of(lens))
 
     def better(self, latest: Lens, before: Lens) -> tuple[Lens, Judged]:
-        """Return the better of two lenses, and its figures, by as many rays as tell them apart; if in doubt the latest.
+        """Return the better of two lenses and its figures by FINE_EFFORT; `latest` if they differ too little.
 
-        BETWEEN does not resolve an RRMSD below 0.01 or so: by it a lens of 0.0070 looked better than one of 0.0048.
+        STAGE_EFFORT does not resolve an RRMSD below about 0.01: it ranked a lens of 0.0070 before one of 0.0048.
         """
-        now, then = (self.judged(lens, self.rrmsd(lens, ASKED)) for lens in (latest, before))
+        now, then = (self.judged(lens, self.rrmsd(lens, FINE_EFFORT)) for lens in (latest, before))
         return (before, then) if then.beats(now) else (latest, now)
 
     def used(self, lens: Lens) -> float:
-        """Part of the light that enters the lens which falls on the first target."""
+        """Return the fraction of the light entering the lens that falls on the first target."""
         goal = self.goals[0]
-        return measure(lens.plain(), self.channels, goal.receiver, target=goal.picture, effort=COUNTED).used
+        return measure(lens.plain(), self.channels, goal.receiver, target=goal.picture, effort=FLUX_EFFORT).used
 
 
 @dataclass(frozen=True)
 class Step:
-    """The state of a stage; the driver decides whether it goes on."""
+    """State of a stage after one of its steps; the driver decides whether the stage goes on."""
 
-    make: Callable[[], Lens] | None  # the best lens so far, in the form to go on with; None: there is none yet
-    state: Any = None  # the stage goes on from here with this alone; None: it cannot be left here
-    mapping: Mapping | None = None  # stage 1: the transport map that the lens follows
-    # places (mm) on the last tailored face for each corner of the target's pixels, x and y, (columns + 1, rows + 1);
-    # None: the map of `mapping` begins elsewhere
+    make: Callable[[], Lens] | None  # function that makes the best lens so far; None: there is no lens yet
+    state: Any = None  # record from which the stage can resume here; None: it cannot
+    mapping: Mapping | None = None  # transport map that the lens follows (stage 1)
+    # points (mm) of the last tailored face whose light goes to the corners of the target's pixels, x and y, each
+    # (columns + 1, rows + 1); None: the map of `mapping` begins on another surface
     places: tuple[np.ndarray, np.ndarray] | None = None
     progress: tuple[str, int, int, str] | None = None  # stage, done, total, text
-    rrmsd: float | None = None  # of the lens, by the rays that tailor it
-    judged: float | None = None  # of the lens, by `Task.rrmsd`
-    whole: bool = True  # is it judged by all of the light, and not by that of a smaller source?
-    work: float = 0.0  # seconds that the step takes on a machine of pace 1; 0: nobody knows
-    skipped: bool = False  # was the step left out, because its gradient was not finite?
-    part: str = ""  # which part of the design is under way, for the list of its times; "": none has begun
-    ends: bool = False  # the part, with this step
-    reason: str = ""  # why the stage ends with this step, if it does: "evaluations", "plateau" or "accuracy"
+    rrmsd: float | None = None  # RRMSD of the lens by the tubes or rays that tailor it
+    judged: float | None = None  # RRMSD of the lens by `Task.rrmsd`
+    whole: bool = True  # True if `judged` is for the whole source, False for a smaller one
+    work: float = 0.0  # seconds that the step takes on a machine of pace 1; 0: unknown
+    skipped: bool = False  # True if the step was left out because merit or gradient was not finite
+    part: str = ""  # name of the part of the design under way, for the list of times; "": none has begun
+    ends: bool = False  # True if the part ends with this step
+    reason: str = ""  # reason to end the stage here: "evaluations", "plateau" or "accuracy"; "": none
 
     @property
     def lens(self) -> Lens:
-        """The best lens so far."""
+        """Best lens so far."""
         return self.make()
 
 
 def never() -> bool:
-    """No one asks tailoring to end."""
+    """Return False: no user interrupts the design."""
     return False
 
 
 def forget(state: Any) -> None:
-    """States are not saved anywhere."""
+    """Save no state; the default of `Driver.save`."""
 
 
 Look = Callable[[Callable[[], Lens]], None]  # called with the function that makes the best lens so far
 
 
 def unseen(make: Callable[[], Lens]) -> None:
-    """Nobody looks at the lens while it is tailored."""
+    """Show no lens; the default `Look`."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Time and RRMSD of one stage."""
+    """Time and RRMSD of one stage, or of one part of it."""
 
     name: str
     seconds: float
-    rrmsd: float | None  # after it
-    cpu_seconds: float | None = None  # of all processors; None: nobody counted
+    rrmsd: float | None  # RRMSD of the lens after it; None: not measured
+    cpu_seconds: float | None = None  # CPU time, summed over the processors; None: not measured
 
 
 @dataclass(frozen=True)
 class Record:
-    """Stages and history of a design so far."""
+    """Record of a design so far: times of its stages and convergence history."""
 
     stages: tuple[Stage, ...] = ()
     history: tuple[tuple[float, float], ...] = ()  # (seconds since the start, RRMSD)
-    skipped: int = 0  # steps left out because their gradient was not finite
-    seconds: float = 0.0  # since the start, of all runs together
-    cpu_seconds: float = 0.0  # of all processors, since a driver was made, of all runs together
+    skipped: int = 0  # number of steps left out because merit or gradient was not finite
+    seconds: float = 0.0  # time since the start, summed over all runs that resumed the design
+    cpu_seconds: float = 0.0  # CPU time since a driver was made, summed over processors and runs
 
 
 class Driver:
-    """The driver of one design.
+    """Driver of the stages of one design: keeps the time, the record and the best lens.
 
-    limit: seconds from the start to the end of the whole run, including the work after tailoring, which takes `reserve`
-    seconds on a machine of pace 1.  interrupted: has the user asked for the best lens so far?  save: called with each
-    state from which the design could resume.  look: called as soon as the lens has come to an RRMSD.  record: of the
-    earlier runs that this one resumes.
+    limit: seconds for the whole run, including the work after tailoring, which takes `reserve` seconds on a machine of
+    pace 1.  interrupted: returns True once the user wants the best lens so far.  save: called with each state from
+    which the design can resume.  look: called after each step that has an RRMSD.  record: the record of the earlier
+    runs that this one resumes.
     """
 
     def __init__(
@@ -282,41 +288,42 @@ class Driver:
         processor: Callable[[], float] = time.process_time,
     ) -> None:
         self.progress, self.interrupted, self.save, self.look = progress, interrupted, save, look
-        self.pace = 1.0  # how many times longer work takes here than on a machine of pace 1, as measured of late
-        self.stopped = ""  # what ended tailoring: "evaluations", "plateau", "accuracy", "time" or "interrupt"
+        self.pace = 1.0  # recent time of work here over its time on a machine of pace 1
+        self.stopped = ""  # reason why tailoring ended: "evaluations", "plateau", "accuracy", "time" or "interrupt"
         self._limit, self._reserve, self._clock, self._before = limit, reserve, clock, record
         self._began = clock() if began is None else began
-        self._step = 0.0  # seconds that the last evaluation took; the next one will take as long
-        self._last = clock()  # end of the last step
+        self._step = 0.0  # seconds of the last evaluation, the estimate for the next
+        self._last = clock()  # time at the end of the last step
         self._processor, self._spent = processor, processor()
         self.best: Judged | None = None  # best lens at the ends of the parts of the stage under way
         self._record = record
 
     @property
     def record(self) -> Record:
-        """Stages and history so far."""
+        """Record of the stages and the history so far."""
         seconds, cpu = self._clock() - self._began, self._processor() - self._spent
         return replace(self._record, seconds=self._before.seconds + seconds, cpu_seconds=self._before.cpu_seconds + cpu)
 
     @property
     def hurry(self) -> str:
-        """Why tailoring has to end with the best so far: "interrupt", "time" (the rest is needed afterwards) or ""."""
+        """Reason to end now with the best lens so far: "interrupt", "time" (the rest is reserved) or ""."""
         late = self.record.seconds + self._step > self._limit - self.pace * self._reserve
         return self.wish or ("time" if late else "")
 
     @property
     def wish(self) -> str:
-        """The same for a stage that runs whole, however long it takes: "interrupt" or ""."""
+        """Reason to end a stage that has no time limit of its own: "interrupt" or ""."""
         return "interrupt" if self.interrupted() else ""
 
     def run(
         self, steps: Iterator[Step], task: Task, saved: Callable[[Any], Any], why: Callable[[], str],
         best: Judged | None = None,
     ) -> Step:  # fmt: skip
-        """Go through a stage until it ends or `why` says why it has to; its last step.
+        """Run a stage until it ends or `why` returns a reason to end it; return its last step.
 
-        saved: the state to save, from that of a step.  best: the best lens before; afterwards `self.best` is the best
-        at the ends of all parts.  A part sees fewer pixels or less light, and may end with a lens that is worse.
+        saved: makes the state to save from the state of a step.  best: the best lens before the stage; afterwards
+        `self.best` is the best at the end of any part.  A part may use fewer pixels or a smaller source, and so may end
+        with a lens that is worse.
         """
         self._last, self.best = self._clock(), best
         for step in steps:
@@ -333,14 +340,14 @@ class Driver:
         return step
 
     def _compare(self, step: Step, task: Task) -> None:
-        """Note the lens of a step if it is the best so far."""
+        """Update `self.best` with the lens of a step."""
         if step.judged is not None and step.whole:
             latest = task.judged(step.lens, step.judged)
             if self.best is None or math.isnan(self.best.figure) or latest.figure < self.best.figure:
                 self.best = latest
 
     def _take(self, step: Step, saved: Callable[[Any], Any]) -> str:
-        """Note a step; why the stage ends with it, if it does."""
+        """Record a step; return the reason if the stage ends with it, else ""."""
         now = self._clock()
         if step.work:
             self.measure(now - self._last, step.work)
@@ -361,23 +368,23 @@ class Driver:
         return step.reason
 
     def measure(self, seconds: float, expected: float) -> None:
-        """Update the pace by work that took `seconds` here and would take `expected` seconds on a machine of pace 1.
+        """Update the pace by work that took `seconds` here and takes `expected` seconds on a machine of pace 1.
 
-        A busy machine changes its pace: a piece of work weighs seconds / MEMORY against all work before it.
+        The pace of a busy machine changes: work counts with the weight seconds / PACE_MEMORY against all before it.
         """
-        share = min(1.0, seconds / MEMORY)
+        share = min(1.0, seconds / PACE_MEMORY)
         self.pace += share * (seconds / expected - self.pace)
 
     def note(self, value: float) -> None:
-        """One point of the history."""
+        """Append a point to the history."""
         record = self.record
         self._record = replace(record, history=(*record.history, (record.seconds, value)))
 
     def end(self, name: str, value: float | None = None) -> None:
-        """End a part of the design; its time runs from the end of the part before."""
+        """Record the end of a part of the design, whose time began at the end of the part before."""
         record = self.record
         spent = sum(stage.seconds for stage in record.stages)
-        cpu = None  # of the first part: most of it was over when this driver was made
+        cpu = None  # unknown for the first part: most of it was over when this driver was made
         if record.stages:
             cpu = record.cpu_seconds - sum(stage.cpu_seconds or 0.0 for stage in record.stages)
         self._record = replace(record, stages=(*record.stages, Stage(name, record.seconds - spent, value, cpu)))

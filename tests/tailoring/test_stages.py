@@ -60,7 +60,7 @@ def test_stage_1_goes_another_way_where_the_first_one_fails():
     task = replace(task, least=0.5)
     *_, first = stage1.follow_slopes(task, lens)
     first, other = task.rrmsd(first.lens), task.rrmsd(stage1.follow_aims(task, lens)[0])
-    assert first > stage1.RETRY_ABOVE and other < 0.7 * first
+    assert first > stage1.RETRY_RRMSD and other < 0.7 * first
     assert task.rrmsd(followed(task, lens)) == other
 
 
@@ -71,7 +71,7 @@ def test_the_map_settles_where_the_slopes_change_much_with_the_place():
     task, lens = small("disk", **ends, **outline, **{"target.z": "60.0"})
     rounds = [step.state for step in stage1.follow_slopes(task, lens)]
     assert rounds[-1].round == task.knobs.rounds > len(rounds)  # the coarse rounds ended once they had settled
-    assert rounds[-1].wanted.moved < 0.1 * stage1.SETTLED
+    assert rounds[-1].wanted.moved < 0.1 * stage1.SETTLED_CHANGE
 
 
 def test_stage_1_goes_no_way_that_loses_the_light():
@@ -80,8 +80,8 @@ def test_stage_1_goes_no_way_that_loses_the_light():
     task, lens = small("disk", **outline, **{"lens.index": "1.05", "tailoring.rounds": "3"})
     *_, first = stage1.follow_slopes(task, lens)
     other, _ = stage1.follow_aims(task, lens)
-    assert first.state.wanted.moved > stage1.UNSETTLED and task.rrmsd(other) < task.rrmsd(first.lens)
-    assert task.used(other) < stage1.KEPT_LIGHT * task.used(first.lens)
+    assert first.state.wanted.moved > stage1.RETRY_CHANGE and task.rrmsd(other) < task.rrmsd(first.lens)
+    assert task.used(other) < stage1.MIN_FLUX_RATIO * task.used(first.lens)
     assert torch.equal(followed(task, lens).back.heights, first.lens.back.heights)
 
 
