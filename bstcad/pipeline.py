@@ -30,8 +30,8 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import Tailoring
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import slope_map, stage1, stage2, two_faces
-from bstcad.tailoring.feasibility import demands, refused
-from bstcad.tailoring.grazing import cleared
+from bstcad.tailoring.feasibility import find_demand, is_infeasible
+from bstcad.tailoring.grazing import without_reflection
 from bstcad.tailoring.machinability import BOUNDED, held, kept, moved_clear
 from bstcad.tailoring.reachable import reachable
 from bstcad.tailoring.run import (
@@ -61,7 +61,7 @@ PROCEDURES = {  # tailoring.method: (name of the first stage, the first stage, s
     "integration": ("integration", integration.steps, stage2.steps),  # of no evaluations
 }
 Stage1State = stage1.SlopeRound | paper.Level | two_faces.FrontRound
-Stage2State = stage2.TubeSearch | paper.RaySearch | stage2.Grown
+Stage2State = stage2.TubeSearch | paper.RaySearch | stage2.Stage3State
 SIGNS = {"convex": 1.0, "concave": -1.0}  # tailoring.solution
 DEVICES = ("auto", "cpu", "cuda")
 COMPARED = "float32 beside float64"  # the name of that stage
@@ -175,7 +175,7 @@ def within_reach(scene: Scene, progress: Progress) -> tuple[tuple[Goal, ...], Ed
 def task_of(scene: Scene, goals: Sequence[Goal], knobs: Tailoring, edge: Edge | None, **more: Any) -> Task:
     """The task of a scene; goals, edge: as `within_reach` has them.  more: fields of Task that no scene tells."""
     light = scene.with_source_scaled(0.0).channels()
-    sizes = stage2.SIZES if scene.source.extent and knobs.method != "integration" else ()
+    sizes = stage2.SOURCE_SIZES if scene.source.extent and knobs.method != "integration" else ()
     scaled = [scene.with_source_scaled(share) for share, _ in sizes]
     return Task(
         light, tuple(goals), knobs, least=scene.lens.min_thickness, free=scene.lens.front.free,
@@ -190,9 +190,9 @@ def posed(scene: Scene, task: Task) -> Task:
     lens = scene.flat_lens(REACH_NET)
     if not lens.shapes_both or not task.several:
         return task
-    demand = demands(task, task.heaviest.through(lens))
+    demand = find_demand(task, task.heaviest.through(lens))
     sentences = tuple(demand.sentences(scene.lens.back.z - scene.lens.front.z))
-    if refused(demand):
+    if is_infeasible(demand):
         raise SceneError(f"target: {'; '.join(sentences[1:])}")
     for sentence in sentences:
         task.progress("reach", 0, 0, sentence)
@@ -401,7 +401,7 @@ def _handed_on(task: Task, driver: Driver, last: Step, before: Sequence[Judged])
 def _mended(task: Task, lens: Lens) -> Lens:
     """The lens with no light reflected at the edge of its reach, with its faces clear of each other, within bounds."""
     if task.edge is not None:
-        lens = cleared(lens, task.edge)
+        lens = without_reflection(lens, task.edge)
     bounds = held(lens, task.bounds, task.least)
     if not lens.shapes("front"):  # where no light falls stage 2 is free to bend the back
         lens = moved_clear(lens, lens.back.z, task.least, bounds)

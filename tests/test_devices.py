@@ -47,7 +47,7 @@ QUICK = ("beam_shaper", "draft")
 @pytest.fixture(autouse=True)
 def _briefly_compared(monkeypatch):
     """Each design looks at float32 beside float64: by one evaluation here, which takes the way of all."""
-    monkeypatch.setattr(stage2, "COMPARED", 1)
+    monkeypatch.setattr(stage2, "COMPARED_EVALUATIONS", 1)
 
 
 BOUNDED = ("machinable_letters", "paper")  # the paper's procedure knows no bounds on the back

@@ -25,7 +25,7 @@ import torch
 from bstcad.runs import files
 from bstcad.runs.files import SceneError
 
-MAGIC = b"bstcad checkpoint 7\n"  # to be raised whenever a record of a state, or the purpose, changes its fields
+MAGIC = b"bstcad checkpoint 8\n"  # to be raised whenever a record of a state, or the purpose, changes its fields
 DIGEST = 65  # bytes of the line with the SHA-256
 LARGEST = 8 << 30  # bytes; 2049 x 2049 control points need 1 GB
 SHARE = 0.02  # the most of the run's time that checkpoints may take

@@ -29,7 +29,7 @@ from bstcad.scene.scene import Scene
 from bstcad.sweep.cold_run import REPEATS, kernel, timed
 from bstcad.tailoring.run import JUDGING, Task
 from bstcad.tailoring.slope_map import SUBCELLS
-from bstcad.tailoring.stage2 import blurred_sheets, shares_of, sheets
+from bstcad.tailoring.stage2 import round_shares, sheet_sizes, stage3_sheet_sizes
 
 Interval = tuple[float, float, float]  # low, likely, high
 QUALITIES = ("draft", "standard", "fine")
@@ -242,8 +242,8 @@ def rounds(scene: Scene) -> tuple[tuple[int, int], ...]:
     knobs = scene.tailoring.resolved(scene.lens.back.net)
     if scene.source.extent is not None:
         columns, rows = zip(*(target.columns_rows for target in scene.targets), strict=True)
-        return tuple(blurred_sheets(knobs, (max(columns), max(rows))))
-    return tuple(sheets(knobs, shares_of(Task((), scene.goals, knobs, wave=scene.wavefront))))
+        return tuple(stage3_sheet_sizes(knobs, (max(columns), max(rows))))
+    return tuple(sheet_sizes(knobs, round_shares(Task((), scene.goals, knobs, wave=scene.wavefront))))
 
 
 def memory_gb(scene: Scene) -> float:

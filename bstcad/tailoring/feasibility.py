@@ -1,14 +1,15 @@
-"""Whether a lens of two freeform faces can serve all of its goals, found before the long stages, on coarse grids.
+"""Feasibility of two freeform faces: a check on coarse grids, before the long stages, that they can meet all goals.
 
-The light behind the lens follows from its goals (light_behind.py), and from it the places of the back and the angles
-by which the front turns light towards them.  Three things can forbid it: rays that would have to cross between lens and
-target, light that would have to leave the back outside of the lens, and a turn that no front can give.
+The goals determine the rays behind the lens (light_behind.py).  These determine where the light meets the back, and by
+which angle the front has to turn it towards these points.  A design is infeasible for one of three reasons: rays would
+have to cross between lens and target, light would have to leave the back outside of the outline, or the front would
+have to turn light by more than refraction can.
 
-A front can turn light by 48 degrees at an index of 1.49, but a back that turns it back by as much is a wall, and faces
-that start as walls stay so.  Where the front would have to turn light by more than GENTLE, stage 1 therefore lifts the
-dark parts of the furthest picture, which take the light furthest aside; stage 2 has the picture as it is.  (Two faces
-6 mm apart that have to turn by 38 degrees for a square and letters: RRMSD 0.34 and 0.63 after 100 evaluations of each
-round without, 0.37 and 0.48 with it.)
+At an index of 1.49 a front can turn light by 48 degrees.  A back that turns it back by as much is nearly vertical, and
+faces that start so stay so.  Where the front would have to turn light by more than MAX_GENTLE_TURN, stage 1 therefore
+raises the dark parts of the furthest picture, which cause the largest turns; stage 2 uses the picture itself.  (Two
+faces 6 mm apart that have to turn light by 38 degrees, for a square and letters: RRMSD 0.34 and 0.63 after 100
+evaluations of each round without, 0.37 and 0.48 with it.)
 """
 
 from __future__ import annotations
@@ -26,82 +27,82 @@ from bstcad.tailoring import light_behind
 from bstcad.tailoring.light_behind import LightBehind
 from bstcad.tailoring.run import Task, silent
 from bstcad.tailoring.slope_map import corners_of, lit_window
-from bstcad.tailoring.stage2 import coarsened
+from bstcad.tailoring.stage2 import with_pixels
 from bstcad.tailoring.two_faces import front_map
 
-CELLS, PIXELS = 64, 128  # a side
-ITERATIONS = 100
-MOST = 0.5  # of the light, that may be beyond what two faces can do
-SAID = 1e-3  # of the light: what fails for less of it is not said
-GENTLE = 30.0  # degrees
-FLOORS = (0.1, 0.2, 0.4, 1.0)  # of its mean, to which the furthest picture is lifted for stage 1: the first that serves
-SOLUTIONS = {1.0: "convex", -1.0: "concave"}
+TRIAL_CELLS, TRIAL_PIXELS = 64, 128  # cells and pixels a side of the coarse grids
+TRIAL_ITERATIONS = 100  # iterations of the coarse maps
+MAX_UNSERVED = 0.5  # largest fraction of the light that two faces may fail to serve
+REPORTED_FRACTION = 1e-3  # smallest fraction of the light that is reported as not served
+MAX_GENTLE_TURN = 30.0  # largest turn at the front without a floor under the furthest picture (degrees)
+FLOORS = (0.1, 0.2, 0.4, 1.0)  # floors to try, relative to the mean of the furthest picture; the first that suffices
+SOLUTION_NAMES = {1.0: "convex", -1.0: "concave"}  # names by the sign σ
 
 
 @dataclass(frozen=True)
 class Demand:
-    """What the goals ask of a lens, by one of the two solutions."""
+    """Angles and losses that the goals require of a lens, for one of the two solutions."""
 
-    solution: float  # σ of light_behind.py
-    angle: float  # degrees; the largest from the axis at which light leaves the lens
-    mean_angle: float  # degrees; RMS of the same
-    crossed: float  # part of the light whose rays would cross between lens and target
-    outside: float  # part of the light that would leave the back outside of the lens
-    turn: float  # degrees; the largest by which the front turns light; NaN: nobody asked
-    limit: float  # degrees; the largest by which a front can turn light
-    floor: float = 0.0  # of its mean, to which stage 1 lifts the furthest picture
-    lifted_turn: float = math.nan  # degrees; the largest turn then
+    solution: float  # sign σ of light_behind.py
+    angle: float  # largest angle to the axis at which light leaves the lens (degrees)
+    rms_angle: float  # RMS of this angle over the rays (degrees)
+    crossed: float  # fraction of the light whose rays would cross between lens and target
+    outside: float  # fraction of the light that would leave the back outside of the outline
+    turn: float  # largest angle by which the front turns light (degrees); NaN: not computed
+    limit: float  # largest angle by which a front can turn light (degrees)
+    floor: float = 0.0  # irradiance, relative to the mean, to which stage 1 raises the furthest picture
+    lifted_turn: float = math.nan  # largest turn with this floor (degrees)
 
     @property
     def rank(self) -> tuple[float, float]:
-        """Less is better: what cannot be served, then the angles."""
+        """Sort key, smallest for the best solution: the fraction not served, then the angles."""
         lost = self.crossed + self.outside
-        return (lost if lost > SAID else 0.0), self.mean_angle
+        return (lost if lost > REPORTED_FRACTION else 0.0), self.rms_angle
 
     def sentences(self, thickness: float) -> Iterator[str]:
-        """What the lens has to do, and what it cannot; thickness: of its middle (mm)."""
+        """Yield a sentence on the angles, then one per failure with its remedy; thickness: centre thickness (mm)."""
         yield (
-            f"{SOLUTIONS[self.solution]} solution: light leaves the lens at up to {self.angle:.3g} degrees from the "
-            f"axis, and the front turns it by up to {self.turn:.3g} degrees"
+            f"{SOLUTION_NAMES[self.solution]} solution: light leaves the lens at up to {self.angle:.3g} degrees from "
+            f"the axis, and the front turns it by up to {self.turn:.3g} degrees"
         )
         if self.floor:
             yield (
-                f"tailoring starts from a furthest target whose dark parts have {100 * self.floor:g} % of its mean: "
-                f"for that the front turns light by up to {self.lifted_turn:.3g} degrees"
+                f"stage 1 raises the dark parts of the furthest target to {100 * self.floor:g} % of its mean "
+                f"irradiance, so that the front turns light by up to {self.lifted_turn:.3g} degrees only"
             )
-        if self.crossed > SAID:
+        if self.crossed > REPORTED_FRACTION:
             yield (
                 f"rays of {100 * self.crossed:.3g} % of the light would have to cross between the lens and the nearest "
-                "target; there the further goals are met as far as rays that do not cross allow: bring the nearest "
-                "target closer to the lens, or move the others further away"
+                "target, and there the further targets are met only approximately; bring the nearest target closer to "
+                "the lens, or move the others further away"
             )
-        if self.outside > SAID:
+        if self.outside > REPORTED_FRACTION:
             yield (
                 f"{100 * self.outside:.3g} % of the light would have to leave the back outside of lens.outline; "
                 "make the targets smaller, or the lens wider"
             )
         if self.turn > self.limit:
             yield (
-                f"the front would have to turn light by {self.turn:.3g} degrees, and can turn it by {self.limit:.3g} "
-                f"degrees at most; make the lens thicker than {thickness:.3g} mm"
+                f"the front would have to turn light by {self.turn:.3g} degrees, but refraction turns it by at most "
+                f"{self.limit:.3g} degrees; make the lens thicker than {thickness:.3g} mm"
             )
 
 
-def demands(task: Task, lens: Lens) -> Demand:
-    """The gentler demand of a task, or that of its own solution; lens: the blank, both of its faces free."""
+def find_demand(task: Task, lens: Lens) -> Demand:
+    """Return the demand of the task's solution, or else of the better one; lens: the blank, with both faces free."""
     task = task.aimed(lens)
-    tried = [_of(_small(task, solution), lens) for solution in _solutions(task)]
-    best, light = min(tried, key=lambda one: one[0].rank)
-    if refused(best):
+    solutions = [_demand(_trial_task(task, solution), lens) for solution in _solutions(task)]
+    best, light = min(solutions, key=lambda one: one[0].rank)
+    if is_infeasible(best):
         return best
-    best = replace(best, turn=_turn(task, lens, light))
+    best = replace(best, turn=_largest_turn(task, lens, light))
     lifted = [replace(best, lifted_turn=best.turn)]
     for floor in FLOORS if len(task.goals) > 1 and task.wave is None else ():
-        if lifted[-1].lifted_turn <= GENTLE:
+        if lifted[-1].lifted_turn <= MAX_GENTLE_TURN:
             break
-        _, light = _of(_small(replace(task, floor=floor), best.solution), lens)
-        lifted.append(replace(best, floor=floor, lifted_turn=_turn(task, lens, light)))
-    return min(lifted, key=lambda each: max(GENTLE, each.lifted_turn))
+        _, light = _demand(_trial_task(replace(task, floor=floor), best.solution), lens)
+        lifted.append(replace(best, floor=floor, lifted_turn=_largest_turn(task, lens, light)))
+    return min(lifted, key=lambda each: max(MAX_GENTLE_TURN, each.lifted_turn))
 
 
 def _solutions(task: Task) -> tuple[float, ...]:
@@ -110,31 +111,32 @@ def _solutions(task: Task) -> tuple[float, ...]:
     return (1.0,) if task.wave is not None else (1.0, -1.0)
 
 
-def _small(task: Task, solution: float) -> Task:
-    knobs = task.knobs.model_copy(update={"transport_grid": CELLS, "transport_iterations": ITERATIONS})
-    return replace(coarsened(task, PIXELS), knobs=knobs, solution=solution, progress=silent)
+def _trial_task(task: Task, solution: float) -> Task:
+    knobs = task.knobs.model_copy(update={"transport_grid": TRIAL_CELLS, "transport_iterations": TRIAL_ITERATIONS})
+    return replace(with_pixels(task, TRIAL_PIXELS), knobs=knobs, solution=solution, progress=silent)
 
 
-def _of(task: Task, lens: Lens) -> tuple[Demand, LightBehind]:
-    light = light_behind.of_task(task)
+def _demand(task: Task, lens: Lens) -> tuple[Demand, LightBehind]:
+    """Return the demand of a task with a solution, without the turn, and the light behind the lens that can be had."""
+    light = light_behind.light_for_task(task)
     angle = np.degrees(np.arccos(light.direction[2].clip(-1, 1)))[corners_of(light.picture)]
-    crossed = light.crossed(lens.back)
+    crossed = light.crossed_fraction(lens.back)
     near = min(task.goals, key=lambda goal: goal.receiver.plane.throw(0.0))
-    served = light_behind.uncrossed(light, near.receiver, lens.back, CELLS)
-    asked = Demand(
+    served = light_behind.without_crossings(light, near.receiver, lens.back, TRIAL_CELLS)
+    demand = Demand(
         task.solution, float(angle.max()), float(np.sqrt((angle**2).mean())), crossed=crossed,
-        outside=served.beyond(lens.back, lens.apertures[1].scaled(1 + 1e-3).contains),
+        outside=served.fraction_outside(lens.back, lens.apertures[1].scaled(1 + 1e-3).contains),
         turn=math.nan, limit=math.degrees(largest_deflection(lens.index)),
     )  # fmt: skip
-    return asked, served
+    return demand, served
 
 
 @torch.no_grad()
-def _turn(task: Task, lens: Lens, light: LightBehind) -> float:
-    """The largest angle (degrees) between the ray that comes to the front and its way to the back."""
+def _largest_turn(task: Task, lens: Lens, light: LightBehind) -> float:
+    """Return the largest angle (degrees) between a ray before the front and the same ray in the glass."""
     front, source = lens.shaping("front"), task.heaviest.source
-    back = light.meeting(lens.back)
-    wanted = front_map(source, front, lit_window(source, front), light.picture, back=back, n=CELLS, places=None)
+    back = light.intersect(lens.back)
+    wanted = front_map(source, front, lit_window(source, front), light.picture, back=back, n=TRIAL_CELLS, places=None)
     lit = corners_of(light.picture)
     x, y = (torch.from_numpy(q[lit]) for q in wanted.places)
     way = torch.from_numpy(back[:, lit]) - torch.stack([x, y, lens.front.sag_and_slope(x, y)[0]])
@@ -143,6 +145,6 @@ def _turn(task: Task, lens: Lens, light: LightBehind) -> float:
     return math.degrees(math.acos(max(-1.0, min(1.0, float(cosine.min())))))
 
 
-def refused(demand: Demand) -> bool:
-    """Is too much of the light beyond what two faces can do?"""
-    return demand.outside + demand.crossed > MOST
+def is_infeasible(demand: Demand) -> bool:
+    """Return True if two faces would fail to serve more than the fraction MAX_UNSERVED of the light."""
+    return demand.outside + demand.crossed > MAX_UNSERVED

@@ -1,23 +1,24 @@
-"""The light that a lens with two freeform faces has to send out: one ray through each place of a target.
+"""The rays behind a lens with two freeform faces, computed from its goals: one ray through each point of a target.
 
-Behind a lens the rays of a point or of parallel light are normal to wavefronts (Malus and Dupin; Born and Wolf,
-Principles of Optics, section 3.1.2), so that their direction cosines on a plane A are the gradient of an eikonal there.
-Which eikonal, is told by a wave that is asked for (`of_wave`), or by a picture on a second plane B (`between_targets`):
-the light that crosses A at p shall meet B at t.  With the direction cosines along A
+Behind a lens the rays of a point source or of collimated light are normal to wavefronts (theorem of Malus and Dupin;
+Born and Wolf, Principles of Optics, section 3.1.2).  So their direction cosines on a plane A are the gradient of an
+eikonal.  The eikonal follows from a wavefront goal (`light_of_wave`), or from a picture on a second plane B
+(`between_targets`): light that crosses A at p shall meet B at t.  Let c be the direction cosines along A, and m the
+centroid of B's light.  Then
 
     c(p, t) = (t - p) / |t - p|,    y = σ (c(p, t) - c(p, m)),
 
-m the centroid of B's light, y hardly depends on p for a fixed t, and p -> y is the gradient of a convex function: the
-optimal map from A's picture to that of B, whose pixels are seen in these coordinates.  The remaining dependence on p
-enters through the p that the previous round assigned to each t, as in slope_map.py.  σ = 1 is the convex solution, in
-which no two rays cross between the planes; in the concave one, σ = -1, all of them do.  A is the nearest
-target, or, where its picture has clearly more contrast, the furthest one: then light is followed against its way.
-Where either picture has clearly more contrast, as letters on black have, the rays are those through its own pixels: the
-black ones are then without light to the last bit, whatever the map does in the gaps between letters.
+hardly depends on p for a fixed t, and p -> y is the gradient of a convex function: the optimal transport map from the
+picture on A to the picture on B in the coordinates y.  The remaining dependence on p enters through the p that the
+previous round assigned to each t, as in slope_map.py.  In the convex solution, σ = 1, no two rays cross between the
+planes; in the concave solution, σ = -1, all do.  A is the nearest target, or the furthest one if the picture of the
+nearest has clearly more contrast: then rays are followed backwards.  If either picture has clearly more contrast, such
+as letters on black, the rays are those through its pixels.  Its black pixels then get no light at all, whatever the
+map does in the gaps between letters.
 
-Followed back from the nearest target, rays may cross before they come to the lens: then no lens can send them.  Light
-of the convex solution does so where B asks for light much denser than A, by more than the distances A-B and lens-A
-allow (an eigenvalue of ∂t/∂p above 1 + |AB| / |lens A|).  `uncrossed` has the nearest light that does not.
+Between lens and nearest target the rays may cross, and then no lens can send them.  In the convex solution this happens
+where the light on B is much denser than on A, by more than the distances A-B and lens-A allow (an eigenvalue of ∂t/∂p
+above 1 + |AB| / |lens A|).  `without_crossings` returns the nearest rays that do not cross.
 """
 
 from __future__ import annotations
@@ -45,105 +46,105 @@ from bstcad.tailoring.slope_map import centroid, pixel_corners, spread_density
 from bstcad.transport.bfm import Step
 from bstcad.transport.mapping import places_in, solve
 
-ROUNDS, COARSE_SHARE, COARSEST = 3, 4, 64  # of the map between two planes: the last one on all cells
-SEARCH = 40  # steps to the place of a stated wave that sends light to a place of the target
-FOUND = 1e-9  # mm
-DIM = 0.02  # of the mean: the picture that is followed is lifted to it; a hole in it would be a hole in the map
-# Pixels: the picture that is followed is blurred so far, and less and less once the map is found.  A portrait whose
-# dark parts border on bright ones leaves Newton's method at a mass error of 0.06 to 0.25 without, and of 0.003 so.
+MAP_ROUNDS, COARSE_DIVISOR, MIN_CELLS = 3, 4, 64  # rounds of the map; cells of the coarse ones: n // 4, minimum
+MAX_ITERATIONS = 40  # largest number of iterations for the point of a wave whose ray meets a given point of the target
+CONVERGED = 1e-9  # change at which these iterations have converged (mm)
+SOURCE_FLOOR = 0.02  # floor under the map's source picture, relative to the mean: a hole would be one in the map
+# Standard deviations (pixels) of the blur of the source picture, reduced in turn once the map is found.  For a portrait
+# with dark beside bright parts Newton's method ends at a mass error of 0.06 to 0.25 without, and of 0.003 with them.
 BLURS = (4.0, 2.0, 1.0)
-FINER = 2  # cells of the map between two planes for one of the transport's grid: a letter's stroke makes much of a face
-FALLING = (0.1, 0.03, 0.01, 0.003)  # of the mean: floors of the other one, where it has holes
-SHARPER = 1.5  # times the contrast of the other picture: from then on light is followed to the pixels of that one
-MEETING = 8  # Newton steps back to a face
-CROSSED = 1e-4  # of the light, whose rays may cross before they come to the lens, as rounding leaves
+FINE_FACTOR = 2  # cells of the last map per cell of the transport's grid a side: letters cover much of a face
+TARGET_FLOORS = (0.1, 0.03, 0.01, 0.003)  # floors under the target picture, relative to its mean, lowered in turn
+CONTRAST_RATIO = 1.5  # ratio of contrasts above which the rays are those through the pixels of the sharper picture
+NEWTON_STEPS = 8  # Newton iterations for the intersection with a face
+CROSSING_TOLERANCE = 1e-4  # fraction of the light whose rays may cross, as rounding leaves it
 
 Grid = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
 class LightBehind:
-    """Rays behind the lens through the corners of the pixels of a target, near or far, or of equal parts of them."""
+    """Rays behind the lens, through the corners of the pixels of a target or of equal parts of these pixels."""
 
-    place: np.ndarray  # (3, c + 1, r + 1) mm in space, x first
-    direction: np.ndarray  # (3, c + 1, r + 1) unit vectors
-    picture: np.ndarray  # (r, c) the light between each four of them, row 0 = y max
+    position: np.ndarray  # (3, c + 1, r + 1) points of the rays in space (mm), x first
+    direction: np.ndarray  # (3, c + 1, r + 1) unit vectors along the rays
+    picture: np.ndarray  # (r, c) flux of the tube between each four rays, row 0 = y max
 
-    def turned(self) -> LightBehind:
-        """The same rays in the opposite order, both ways."""
-        place, direction = (v[:, ::-1, ::-1].copy() for v in (self.place, self.direction))
-        return replace(self, place=place, direction=direction, picture=self.picture[::-1, ::-1])
+    def reversed(self) -> LightBehind:
+        """Return these rays with both of their indices reversed."""
+        position, direction = (v[:, ::-1, ::-1].copy() for v in (self.position, self.direction))
+        return replace(self, position=position, direction=direction, picture=self.picture[::-1, ::-1])
 
-    def on(self, plane: Receiver) -> Grid:
-        """x and y (mm) along a plane at which its rays cross it."""
+    def positions_on(self, plane: Receiver) -> Grid:
+        """Return x and y (mm) on a plane where the rays cross it, (c + 1, r + 1) each."""
         *along, normal = plane.frame
         centre = np.array(plane.middle)
-        off = centre.reshape(3, 1, 1) - self.place
-        off = _along(normal, off) / _along(normal, self.direction) * self.direction - off
-        return tuple(_along(axis, off) + c for axis, c in zip(along, plane.origin, strict=True))
+        off = centre.reshape(3, 1, 1) - self.position
+        off = _dot(normal, off) / _dot(normal, self.direction) * self.direction - off
+        return tuple(_dot(axis, off) + c for axis, c in zip(along, plane.origin, strict=True))
 
-    def places_of(self, screen: Screen, values: np.ndarray) -> np.ndarray:
-        """(k, columns + 1, rows + 1) at the corners of a screen's pixels: values (k, c + 1, r + 1) of its rays."""
-        x, y = self.on(screen.plane)
+    def sampled_at(self, screen: Screen, values: np.ndarray) -> np.ndarray:
+        """Interpolate values (k, c + 1, r + 1) at the rays to the corners of a screen, (k, columns + 1, rows + 1)."""
+        x, y = self.positions_on(screen.plane)
         if float((x[1:] - x[:-1]).mean()) < 0:
             x, y, values = x[::-1, ::-1], y[::-1, ::-1], values[:, ::-1, ::-1]
-        return _between(values, *places_in(x, y, *pixel_corners(screen)))
+        return _bilinear(values, *places_in(x, y, *pixel_corners(screen)))
 
-    def meeting(self, surface: Surface) -> np.ndarray:
-        """(3, c + 1, r + 1) where each ray, followed back, meets a surface (mm)."""
-        (x, y, z), (dx, dy, dz) = (torch.from_numpy(v) for v in (self.place, self.direction))
+    def intersect(self, surface: Surface) -> np.ndarray:
+        """Return the points (3, c + 1, r + 1) where the rays, traced backwards, meet a surface (mm)."""
+        (x, y, z), (dx, dy, dz) = (torch.from_numpy(v) for v in (self.position, self.direction))
         path = (surface.z - z) / dz
-        for _ in range(MEETING):
+        for _ in range(NEWTON_STEPS):
             h, z_x, z_y = surface.sag_and_slope(x + path * dx, y + path * dy)
             path = path - (z + path * dz - h) / (dz - z_x * dx - z_y * dy)
         return torch.stack([x + path * dx, y + path * dy, z + path * dz]).numpy()
 
-    def crossed(self, surface: Surface) -> float:
-        """Part of the light whose neighbouring rays cross between a surface and the target."""
-        return float(self._flux[_folds(*self.meeting(surface)[:2])].sum())
+    def crossed_fraction(self, surface: Surface) -> float:
+        """Return the fraction of the light whose neighbouring rays cross between a surface and the target."""
+        return float(self._flux[_inverted(*self.intersect(surface)[:2])].sum())
 
-    def beyond(self, surface: Surface, contains: Callable[[Tensor, Tensor], Tensor]) -> float:
-        """Part of the light that meets a surface outside of what `contains` says of (x, y) in mm."""
-        x, y = (torch.from_numpy(p) for p in self.meeting(surface)[:2])
+    def fraction_outside(self, surface: Surface, contains: Callable[[Tensor, Tensor], Tensor]) -> float:
+        """Return the fraction of the light that meets a surface where `contains(x, y)`, in mm, is False."""
+        x, y = (torch.from_numpy(p) for p in self.intersect(surface)[:2])
         outside = (~contains(x, y)).double().numpy()
-        share = (outside[1:, 1:] + outside[1:, :-1] + outside[:-1, 1:] + outside[:-1, :-1]) / 4  # of each quad
+        share = (outside[1:, 1:] + outside[1:, :-1] + outside[:-1, 1:] + outside[:-1, :-1]) / 4  # fraction of a quad
         return float((self._flux * share).sum())
 
-    def leaving(self, surface: Surface, x: Tensor, y: Tensor) -> Tensor:
-        """(3, …) the directions in which light has to leave a surface at points (…) mm; beyond the light as at its rim.
+    def directions_at(self, surface: Surface, x: Tensor, y: Tensor) -> Tensor:
+        """Return the directions (3, m, n) in which light has to leave a surface at points x and y, (m, n) in mm.
 
-        Linear on the Delaunay triangles of the places where rays meet the surface: where those of two bright parts of
-        a picture leave a gap, the directions change evenly across it, whatever the order of the rays.
-        x, y: two-dimensional; of more rays than points as many as those are taken, evenly.
+        They are interpolated linearly on the Delaunay triangles of the points where the rays meet the surface, so that
+        they vary linearly across the gap between two bright parts of a picture.  Outside the light they are those of
+        the nearest ray.  If there are more rays than points, as many are used, evenly spaced.
         """
         every = np.ix_(
-            range(3), *(np.linspace(0, m - 1, min(m, max(x.shape)), dtype=int) for m in self.place.shape[1:])
+            range(3), *(np.linspace(0, m - 1, min(m, max(x.shape)), dtype=int) for m in self.position.shape[1:])
         )
-        few = replace(self, place=self.place[every], direction=self.direction[every])
-        met, directions = few.meeting(surface)[:2].reshape(2, -1).T, few.direction.reshape(3, -1).T
+        few = replace(self, position=self.position[every], direction=self.direction[every])
+        met, directions = few.intersect(surface)[:2].reshape(2, -1).T, few.direction.reshape(3, -1).T
         at = np.stack([p.cpu().double().numpy().reshape(-1) for p in (x, y)], axis=-1)
-        with threadpool_limits(1, "blas"):  # LAPACK takes a 2 x 2 matrix of each triangle: its threads wait for cores
+        with threadpool_limits(1, "blas"):  # LAPACK takes a 2 x 2 matrix of each triangle: one thread is faster
             found = LinearNDInterpolator(met, directions)(at)
-        beyond = np.isnan(found[:, 0])
-        found[beyond] = directions[cKDTree(met).query(at[beyond])[1]]
+        outside = np.isnan(found[:, 0])
+        found[outside] = directions[cKDTree(met).query(at[outside])[1]]
         found = torch.from_numpy(found.T.reshape(3, *x.shape).copy())
         return (found / torch.sqrt((found * found).sum(0))).to(x)
 
     @property
     def _flux(self) -> np.ndarray:
-        """(c, r) of each quad, x first."""
+        """Flux of the tube between each four rays, (c, r), x first."""
         return self.picture[::-1].T
 
 
-def of_task(task: Task) -> LightBehind:
-    """The light through the nearest target that meets the wave of a task, or that through it and the furthest one."""
+def light_for_task(task: Task) -> LightBehind:
+    """Return the rays for the goals of a task: nearest target and wavefront, or nearest and furthest target."""
     near, *_, far = sorted((*task.goals, *task.goals), key=lambda goal: goal.receiver.plane.throw(0.0))
     if any(goal.receiver.plane.frame is None for goal in (near, far)):
-        raise SceneError("target: light through several targets is followed between planes alone; make each a plane")
+        raise SceneError("target: a design for several targets needs planes; make each target a plane")
     n = task.knobs.transport_grid
     if task.wave is not None:
         parts = max(1, round(n / max(near.receiver.shape)))
-        return of_wave(near.receiver, near.picture, task.wave, wavelength=task.heaviest.source.wavelength, parts=parts)
+        return light_of_wave(near.receiver, near.picture, task.wave, wavelength=task.heaviest.source.wavelength, parts=parts)
 
     def progress(s: Step) -> None:
         task.progress("stage 1", 0, task.knobs.rounds, f"between the targets, {s.grid}² cells")
@@ -155,42 +156,45 @@ def of_task(task: Task) -> LightBehind:
 
 
 def corners(screen: Screen, parts: int) -> Grid:
-    """x and y (mm) on the screen of the corners of so many parts of its pixels each way, x first."""
+    """Return x and y (mm) on a screen of the corners of its pixels cut into parts x parts, x first."""
     return tuple(pixel_corners(replace(screen, pixels=(parts * screen.columns, parts * screen.rows))))
 
 
-def parted(picture: np.ndarray, parts: int) -> np.ndarray:
-    """A picture with each pixel's light shared out evenly among so many parts of it each way."""
+def subdivide(picture: np.ndarray, parts: int) -> np.ndarray:
+    """Return a picture with each pixel cut into parts x parts of equal flux."""
     return np.kron(picture, np.ones((parts, parts)) / parts**2)
 
 
 def in_space(plane: Receiver, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """(3, …) the points (mm) of places of a receiver."""
+    """Return the points (3, …) in space (mm) at x and y (…) on a receiver."""
     return np.stack(plane.point(x, y))
 
 
-def _along(vector: Vector, of: np.ndarray) -> np.ndarray:
+def _dot(vector: Vector, of: np.ndarray) -> np.ndarray:
     return vector[0] * of[0] + vector[1] * of[1] + vector[2] * of[2]
 
 
-def of_wave(screen: Screen, picture: np.ndarray, wave: Wave, *, wavelength: float, parts: int) -> LightBehind:
-    """The light that is a wave, through the places of a screen; wavelength: nm."""
-    place, picture = in_space(screen.plane, *corners(screen, parts)), parted(picture, parts)
+def light_of_wave(screen: Screen, picture: np.ndarray, wave: Wave, *, wavelength: float, parts: int) -> LightBehind:
+    """Return the rays of a wave through the pixels of a screen, cut into parts x parts; wavelength: nm.
+
+    SceneError if rays of the wave cross before the screen.
+    """
+    place, picture = in_space(screen.plane, *corners(screen, parts)), subdivide(picture, parts)
     if isinstance(wave, SphericalWave):  # each ray is the line through the focus
         way = _unit(place - np.array(wave.focus).reshape(3, 1, 1))
         return LightBehind(place, way * np.where(way[2] < 0, -1.0, 1.0), picture)
     x, y = (torch.from_numpy(p) for p in place[:2])
     below = torch.from_numpy(wave.z - place[2])
     direction = wave.directions(x, y, wavelength)
-    for _ in range(SEARCH):  # the place of the wave's plane whose ray goes there
+    for _ in range(MAX_ITERATIONS):  # iterate the point of the wave's plane whose ray goes there
         path = below / direction[2]
         there = x + path * direction[0], y + path * direction[1]
         before, direction = direction, wave.directions(*there, wavelength)
-        if not bool(((direction - before).abs() * below.abs().max() > FOUND).any()):
+        if not bool(((direction - before).abs() * below.abs().max() > CONVERGED).any()):
             return LightBehind(place, direction.numpy(), picture)
     raise SceneError(
-        f"wavefront.z: rays of the wave at z = {wave.z:g} cross on their way to the target; move the wavefront's plane "
-        "nearer to it, or make the coefficients smaller"
+        f"wavefront.z: rays of the wave at z = {wave.z:g} cross before the target; move the wavefront's plane nearer "
+        "to the target, or make the coefficients smaller"
     )
 
 
@@ -198,89 +202,88 @@ def between_targets(
     near: tuple[Screen, np.ndarray], far: tuple[Screen, np.ndarray], n: int, *, sign: float = 1.0, iterations: int = 40,
     progress: Callable[[Step], None] | None = None,
 ) -> LightBehind:  # fmt: skip
-    """The light through two pictures, (screen, (rows, columns) of any sum) each, by transport on n x n cells.
+    """Return the rays through two pictures by transport on n x n cells.
 
-    sign: σ, 1 for the convex solution and -1 for the concave one.  Light through the pixels of the near picture is
-    followed to the far one, or against its way where the near picture has clearly more contrast: maps to pictures with
-    holes are found more safely than maps from such.  The rays are about as close as the cells; of a picture of much
-    contrast closer, for its bright pixels have to tell the other picture's detail.
+    near, far: (screen, picture (rows, columns) of any sum).  sign: σ, 1 for the convex and -1 for the concave solution.
+    The map leads from the near to the far picture, or back if the near one has clearly more contrast: a map to a
+    picture with holes converges more safely than a map from it.  The rays are about as dense as the cells, and denser
+    for a picture of high contrast, whose bright pixels have to resolve the other picture.
     """
     contrasts = [float((p**2).mean() / p.mean() ** 2) for _, p in (near, far)]
-    against = contrasts[0] > SHARPER * contrasts[1]  # is light followed against its way, from far to near?
+    against = contrasts[0] > CONTRAST_RATIO * contrasts[1]  # True: rays are followed backwards, from far to near
     (screen, picture), (behind, wanted) = (far, near) if against else (near, far)
-    own, *pictures = (
-        np.maximum(p, DIM * p.mean()) for p in (picture, *(gaussian_filter(picture, b, mode="nearest") for b in BLURS))
-    )
+    smooth = (gaussian_filter(picture, width, mode="nearest") for width in BLURS)
+    own, *pictures = (np.maximum(p, SOURCE_FLOOR * p.mean()) for p in (picture, *smooth))
     along = screen.plane.frame[:2]
 
     def cosines(p: np.ndarray, t: np.ndarray) -> Grid:
         way = _unit(t - p)
-        return _along(along[0], way), _along(along[1], way)
+        return _dot(along[0], way), _dot(along[1], way)
 
     t = in_space(behind.plane, *pixel_corners(behind))
     m = in_space(behind.plane, *(np.array(c) for c in centroid(wanted, behind))).reshape(3, 1, 1)
     p = in_space(screen.plane, *(np.full_like(t[0], sum(ends) / 2) for ends in (screen.x, screen.y)))
-    for turn in range(ROUNDS):
-        last = turn == ROUNDS - 1
-        cells = FINER * n if last else max(COARSEST, n // COARSE_SHARE)
+    for turn in range(MAP_ROUNDS):
+        last = turn == MAP_ROUNDS - 1
+        cells = FINE_FACTOR * n if last else max(MIN_CELLS, n // COARSE_DIVISOR)
         y = tuple(sign * (c - g) for c, g in zip(cosines(p, t), cosines(p, m), strict=True))
         (rho, frame), *others = (spread_density(each, tuple(pixel_corners(screen)), cells) for each in pictures)
         sharper = [other for other, _ in others] if last else []
         sigma, seen = spread_density(wanted, y, cells)
         mapping = solve(
-            rho, sigma, frame, seen, sharper=sharper, iterations=iterations, falling=FALLING, progress=progress
+            rho, sigma, frame, seen, sharper=sharper, iterations=iterations, falling=TARGET_FLOORS, progress=progress
         )
         p = in_space(screen.plane, *mapping.inverse(*y))
-    if max(contrasts) > SHARPER * min(contrasts):
+    if max(contrasts) > CONTRAST_RATIO * min(contrasts):
         parts = max(1, round(n * math.sqrt(max(contrasts)) / max(behind.shape)))
         place = in_space(behind.plane, *corners(behind, parts))
         i, j = np.meshgrid(*(np.arange(parts * pixels + 1) / parts for pixels in behind.shape[::-1]), indexing="ij")
-        way = _unit(place - in_space(screen.plane, *mapping.inverse(*_between(np.stack(y), i, j))))
-        light = LightBehind(place, -way if against else way, parted(wanted / wanted.sum(), parts))
-        return light.turned() if sign < 0 and not against else light
+        way = _unit(place - in_space(screen.plane, *mapping.inverse(*_bilinear(np.stack(y), i, j))))
+        light = LightBehind(place, -way if against else way, subdivide(wanted / wanted.sum(), parts))
+        return light.reversed() if sign < 0 and not against else light
     parts = max(1, round(n / max(screen.shape)))
     place, there = in_space(screen.plane, *corners(screen, parts)), mapping(*corners(screen, parts))
-    i, j = places_in(*(sign * c for c in y), *(sign * c for c in there))  # which increase with t
-    way = _unit(in_space(behind.plane, *_between(np.stack(pixel_corners(behind)), i, j)) - place)
-    return LightBehind(place, way, parted(own / own.sum(), parts))
+    i, j = places_in(*(sign * c for c in y), *(sign * c for c in there))  # both increase with t
+    way = _unit(in_space(behind.plane, *_bilinear(np.stack(pixel_corners(behind)), i, j)) - place)
+    return LightBehind(place, way, subdivide(own / own.sum(), parts))
 
 
 def _unit(way: np.ndarray) -> np.ndarray:
-    """(3, …) the unit vectors along vectors."""
+    """Return vectors (3, …) scaled to length 1."""
     return way / np.sqrt((way * way).sum(0))
 
 
-def uncrossed(light: LightBehind, screen: Screen, surface: Surface, n: int) -> LightBehind:
-    """The light itself, or the nearest to it of which no rays cross between a level surface and the screen.
+def without_crossings(light: LightBehind, screen: Screen, surface: Surface, n: int) -> LightBehind:
+    """Return `light`, or if its rays cross between a surface and the screen the nearest light that does not.
 
-    It sends each place of the surface as much light, by the optimal map from the screen, which crosses no rays.
+    Its flux on the surface is the same; the rays follow the optimal transport map from the screen, which crosses none.
     """
-    if light.crossed(surface) <= CROSSED:
+    if light.crossed_fraction(surface) <= CROSSING_TOLERANCE:
         return light
-    b_x, b_y, b_z = light.meeting(surface)
-    rho, frame = spread_density(light.picture, light.on(screen.plane), n)
+    b_x, b_y, b_z = light.intersect(surface)
+    rho, frame = spread_density(light.picture, light.positions_on(screen.plane), n)
     sigma, seen = spread_density(light.picture, (b_x, b_y), n)
-    mapping, there = solve(rho, sigma, frame, seen), light.on(screen.plane)
-    b = np.stack([*mapping(*there), np.full(light.place.shape[1:], float(b_z.mean()))])
+    mapping, there = solve(rho, sigma, frame, seen), light.positions_on(screen.plane)
+    b = np.stack([*mapping(*there), np.full(light.position.shape[1:], float(b_z.mean()))])
     place = in_space(screen.plane, *there)
-    return replace(light, place=place, direction=_unit(place - b))
+    return replace(light, position=place, direction=_unit(place - b))
 
 
 # ---- grids of places -------------------------------------------------------------------------------------------------
 
 
-def _folds(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Which quads of a grid of places are turned over."""
+def _inverted(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return True for each quad of a grid of points that is inverted, (m - 1, n - 1)."""
     return (x[1:, 1:] - x[:-1, :-1]) * (y[:-1, 1:] - y[1:, :-1]) - (x[:-1, 1:] - x[1:, :-1]) * (
         y[1:, 1:] - y[:-1, :-1]
     ) <= 0
 
 
-def _between(values: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray:
-    """Values (k, m, n) of the corners of a grid at real places among them, bilinear."""
+def _bilinear(values: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+    """Interpolate values (k, m, n) on a grid bilinearly at fractional indices i and j."""
     row = np.clip(i.astype(int), 0, values.shape[-2] - 2)
     column = np.clip(j.astype(int), 0, values.shape[-1] - 2)
     a, b = i - row, j - column
-    here = (1 - b) * values[:, row, column] + b * values[:, row, column + 1]
-    below = (1 - b) * values[:, row + 1, column] + b * values[:, row + 1, column + 1]
-    return (1 - a) * here + a * below
+    first = (1 - b) * values[:, row, column] + b * values[:, row, column + 1]
+    second = (1 - b) * values[:, row + 1, column] + b * values[:, row + 1, column + 1]
+    return (1 - a) * first + a * second

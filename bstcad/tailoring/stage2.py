@@ -1,11 +1,17 @@
-"""Stages 2 and 3: the irradiance itself, by ray tubes.
+"""Stage 2 and stage 3: minimise the error of the traced irradiance, starting from the surface of stage 1.
 
-Each evaluation traces the same corners of a sheet of tubes, so that the merit is smooth and without noise, and a gain
-on it is a gain for the lens.  In the Sobolev variable (merit.py) L-BFGS needs some hundred evaluations where Adam on
-raw control points needs thousands.
+As in Wang et al. 2023, the merit function of stage 2 is the relative root mean square difference between the target
+irradiance E and the traced irradiance E^s, pixel by pixel (squared, with penalties; merit.py):
 
-Stage 3 is for a source of some size, in place of stage 2: the same search by the light of the source's middle, blurred
-by its image (source_image.py); first of a small source, then of a larger one, at last of the source as it is.
+    RRMSD = sqrt(Σ_ij |E^s_ij - E_ij|² / Σ_ij E_ij²).
+
+The paper traces random rays.  Here each evaluation traces the corners of a fixed sheet of flux tubes and integrates
+their flux over the pixels exactly, so that the merit is smooth and without noise.  The variables are the heights of
+the control points of all nets, in a Sobolev variable (merit.py) in which L-BFGS needs some hundred evaluations where
+Adam on the heights needs thousands.  A stage consists of rounds with more and more tubes.
+
+Stage 3 takes the place of stage 2 for a source of finite size.  It traces the light of the centre of the source and
+blurs the picture by the image of the source (source_image.py), in rounds of increasing source size.
 """
 
 from __future__ import annotations
@@ -35,149 +41,150 @@ from bstcad.tailoring.reachable import coarse
 from bstcad.tailoring.run import EVALUATED, Parameters, Step, Task
 from bstcad.tailoring.source_image import Spread
 
-Shares = tuple[tuple[float, float], ...]  # (tubes a side, evaluations) of each round, as shares of the knobs
-ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))
-# The same where even the last round has fewer than DENSE tubes a control cell each way.  The first ones then bend the
-# net between the tubes where they see nothing, which the last one has to mend.  (Found, for 1025 control points by two
-# tubes a cell: the portrait ends at 0.018 where it would end at 0.020 by the shares above in the same time.)
-SPARSE, DENSE = ((1 / 2, 0.40), (3 / 4, 0.35), (1.0, 0.25)), 2.5
-# For several goals: two nets have twice the freedom to bend between the tubes.
-JOINT = ((2 / 3, 0.45), (1.0, 0.35), (4 / 3, 0.2))
-# Two pictures take twice the evaluations of one, and more in proportion to the side of a net of more than OF_SIDE
-# control points: the variable leaves the Hessian a power of the Laplacian.  (Letters before a portrait, 769 points:
-# RRMSD 0.057 and 0.062 after 196 evaluations in three rounds, 0.047 and 0.057 after 309 in these two.)
-PICTURES, OF_SIDE = ((2 / 3, 1.4), (4 / 3, 0.7)), 513
-# Where RRMSD is above FAR_OFF on LARGE pixels, which a net that is only too coarse for the picture gets right, light
-# has to move far: (pixels along the longer side, tubes a side, evaluations) of the rounds before those, the last of
-# which comes again after the first of those; and how many times the evaluations those have then.
-COARSE, MORE = ((32, 256, 60), (64, 384, 60)), 1.5
-# Factor of the evaluations where those are one round, which then comes last, since no stage may end with a round that
-# sees few pixels.  (A draft of a plate bound to 2 mm: RRMSD 0.264 by 1.5 times, 0.236 by 3, but 0.408 if 60 evaluations
-# on 64 pixels come last.)
-MORE_ALONE = 3.0
-LARGE, FAR_OFF = 16, 0.04
-SEEN, BY = 16, 8  # places a side of the lens, and points of a source, by which the width of its image is measured
-FEW = 30  # evaluations: fewer make one round, since each has its own start to pay for
-NET = 65  # control points along the longer side, at most: the comparison shall cost a fraction of a second
-TUBES = 128  # a side
-COMPARED = 6  # evaluations in each precision
-# (of the source, evaluations), as shares of all; what its images leave out is measured anew in each round
-SIZES = ((1 / 3, 1 / 8), (2 / 3, 1 / 8), (1.0, 1 / 4), (1.0, 1 / 4), (1.0, 1 / 4))
-A_CELL, A_PIXEL = 2.0, 1.1  # tubes a control cell and a pixel a side, at least: what is finer the source's image blurs
+Shares = tuple[tuple[float, float], ...]  # (tubes a side, evaluations) of each round, as fractions of the settings
+DENSE_ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))
+# Rounds where even the last one has fewer than DENSE_TUBES tubes a control cell each way.  The first rounds then bend
+# the net between the tubes, which the last one has to correct.  (1025 control points, two tubes a cell: the portrait
+# ends at an RRMSD of 0.018, and at 0.020 with the rounds above in the same time.)
+SPARSE_ROUNDS, DENSE_TUBES = ((1 / 2, 0.40), (3 / 4, 0.35), (1.0, 0.25)), 2.5
+# Rounds for a picture and a wavefront: two nets have twice the freedom to bend between the tubes.
+WAVEFRONT_ROUNDS = ((2 / 3, 0.45), (1.0, 0.35), (4 / 3, 0.2))
+# Rounds for several pictures, and the control points a side above which their evaluations grow in proportion to the
+# side: the Hessian in the Sobolev variable is then still a power of the Laplacian.  (Letters before a portrait, 769
+# points a side: RRMSD 0.057 and 0.062 after 196 evaluations in three rounds, 0.047 and 0.057 after 309 in these two.)
+PICTURES_ROUNDS, PICTURES_SIDE = ((2 / 3, 1.4), (4 / 3, 0.7)), 513
+# Coarse rounds, (pixels along the longer side, tubes a side, evaluations), and the factor of the evaluations of the
+# other rounds with them.  They come first where light has to move far, and the last one again after the first of the
+# others.  The sign is an RRMSD above FAR_OFF_RRMSD on LARGE_PIXELS pixels, which no net is too coarse for.
+COARSE_ROUNDS, EVALUATION_FACTOR = ((32, 256, 60), (64, 384, 60)), 1.5
+# Factor of the evaluations where the others are one round.  It then comes last, since a stage must not end with few
+# pixels.  (A draft of a plate bound to 2 mm: RRMSD 0.264 with a factor of 1.5, 0.236 with 3, but 0.408 if 60
+# evaluations on 64 pixels come last.)
+SINGLE_ROUND_FACTOR = 3.0
+LARGE_PIXELS, FAR_OFF_RRMSD = 16, 0.04
+IMAGE_POSITIONS, IMAGE_POINTS = 16, 8  # positions a side on the lens, and points of the source, for its image
+MIN_EVALUATIONS = 30  # evaluations below which a stage has one round: each round costs a start
+COMPARED_NET = 65  # largest number of control points a side in `compare_precisions`, for speed
+COMPARED_TUBES = 128  # tubes a side in `compare_precisions`
+COMPARED_EVALUATIONS = 6  # evaluations in each precision in `compare_precisions`
+# Rounds of stage 3, (size of the source, evaluations), as fractions of the whole.  Each measures the residual of the
+# image of the source again (source_image.py).
+SOURCE_SIZES = ((1 / 3, 1 / 8), (2 / 3, 1 / 8), (1.0, 1 / 4), (1.0, 1 / 4), (1.0, 1 / 4))
+TUBES_PER_CELL, TUBES_PER_PIXEL = 2.0, 1.1  # smallest numbers of tubes a side in stage 3: the blur hides finer detail
 
 
 @dataclass(frozen=True)
-class Round:
-    """One round of a stage: its light, tubes and evaluations."""
+class TubeRound:
+    """Light, tubes and evaluations of one round of stage 2 or 3."""
 
-    task: Task  # its channels are the light of this round
-    tubes: int  # a side of the sheet of each channel
+    task: Task  # task whose channels are the light of this round
+    tubes: int  # tubes a side in the sheet of each channel
     evaluations: int
-    stage: str = "stage 2"  # of which it is a part
-    pixels: int | None = None  # along the longer side, that it sees instead of the target's
-    spread: Spread | None = None  # of a source of some size, whose points the task's channels are
-    share: float = 1.0  # size of the source in this round, as a part of its full size
+    stage: str = "stage 2"  # name of the stage
+    pixels: int | None = None  # pixels along the longer side of a coarse target; None: those of the target
+    spread: Spread | None = None  # source of finite size, sampled by the channels of `task`; None: a point
+    share: float = 1.0  # size of the source in this round, as a fraction of its full size
 
     @property
     def name(self) -> str:
-        """For the list of times."""
+        """Name of the round in the list of times."""
         sheets = len(self.task.channels if self.spread is None else self.spread.centre)
         tubes = f"{self.tubes}² tubes" if sheets == 1 else f"{sheets} × {self.tubes}² tubes"
         return ", ".join([self.stage, *([f"{self.pixels} pixels"] if self.pixels else []), tubes])
 
     def merit(self, lens: Lens) -> Merit:
-        """By tubes launched for a lens."""
-        task = self.task if self.pixels is None else coarsened(self.task, self.pixels)
+        """Return the merit of this round, with tubes launched for `lens`."""
+        task = self.task if self.pixels is None else with_pixels(self.task, self.pixels)
         return Merit.of(
             task.channels if self.spread is None else self.spread.centre, lens, self.tubes, task.goals,
-            overshoot=_pull(task, lens), wave=task.wave, own=task.merit, spread=self.spread,
+            overshoot=_overshoot_weight(task, lens), wave=task.wave, own=task.merit, spread=self.spread,
             seed=None if task.hasty else task.knobs.seed,
         )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Place:
-    """Which search of a stage is under way."""
+class SearchPosition:
+    """Position of a search within its stage."""
 
-    round: int
-    done: int  # evaluations before this search
-    round_end: int  # evaluations at the end of this round
-    goal_by_tubes: float  # RRMSD by its own tubes at which it asks whether the accuracy is reached
-    sheet_from: Parameters  # of the lens that the tubes were launched for
-    search_from: Parameters  # of the lens that this search started from
+    round: int  # number of the round, from 0
+    done: int  # evaluations of the stage before this search
+    round_end: int  # evaluations of the stage at the end of this round
+    goal_by_tubes: float  # RRMSD by the tubes of the round at which rays check whether the accuracy is reached
+    sheet_from: Parameters  # lens for which the tubes were launched
+    search_from: Parameters  # lens from which this search started
 
 
 @dataclass(frozen=True)
 class TubeSearch:
-    """Where a stage by tubes stands between two steps of a search."""
+    """State of stage 2 between two steps of a search."""
 
-    place: Place
-    best: Best  # of this search
+    place: SearchPosition
+    best: Best  # best point of this search
     search: Search
 
 
 def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Iterator[Step]:
-    """Stage 2: rounds with fewer tubes first, if there are enough evaluations for them, and all tubes in the last.
+    """Yield the steps of stage 2: rounds of few tubes first, if the evaluations allow, and all tubes in the last.
 
-    The error is large at first, and few tubes resolve it as well as many; the last round corrects the finer errors.
+    The error is large at first, and few tubes resolve it as well as many.  The last round corrects the finer errors.
     """
-    coarse, fine = coarse_rounds(task, lens), tuple(sheets(task.knobs, shares_of(task)))
-    times = 1.0 if not coarse else MORE if len(fine) > 1 else MORE_ALONE
-    first, *others = (Round(task, tubes, round(times * count)) for tubes, count in fine)
+    coarse, fine = coarse_rounds(task, lens), tuple(sheet_sizes(task.knobs, round_shares(task)))
+    times = 1.0 if not coarse else EVALUATION_FACTOR if len(fine) > 1 else SINGLE_ROUND_FACTOR
+    first, *others = (TubeRound(task, tubes, round(times * count)) for tubes, count in fine)
     again = coarse[-1:] if others else ()
     return run_rounds((*coarse, first, *again, *others), lens, state)
 
 
-def coarse_rounds(task: Task, lens: Lens) -> tuple[Round, ...]:
-    """Rounds by few pixels, tubes and control points for a lens after stage 1 whose picture is wrong at large, or ().
+def coarse_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
+    """Return the rounds with few pixels, tubes and control points for a lens after stage 1, or () if it is close.
 
-    Where the map has not come to rest, near a lamp or a wall, light has to move far: many evaluations at first, but
-    each costs a thirtieth, and the tubes need not tell the cells of the lens's own net.
+    If the map has not settled, as for a lamp or a wall close by, light has to move far.  This takes many evaluations,
+    but each costs a thirtieth, and the tubes need not resolve the cells of the lens's own net.
     """
-    most = min(max(task.goals[0].receiver.shape) - 1, task.knobs.side // 2)  # pixels that the net can tell
-    rounds = [Round(task, tubes, evaluations, pixels=pixels) for pixels, tubes, evaluations in COARSE if pixels <= most]
+    limit = min(max(task.goals[0].receiver.shape) - 1, task.knobs.side // 2)  # pixels that the net can resolve
+    rounds = [TubeRound(task, tubes, count, pixels=pixels) for pixels, tubes, count in COARSE_ROUNDS if pixels <= limit]
     if not rounds or task.merit is not None or task.several or task.hasty or not task.knobs.stage2_iterations:
-        return ()  # of several goals: two nets bend between so few tubes
-    seen, tubes = coarsened(task, LARGE), COARSE[0][1]
+        return ()  # several goals: two nets would bend between so few tubes
+    seen, tubes = with_pixels(task, LARGE_PIXELS), COARSE_ROUNDS[0][1]
     [goal] = seen.goals
-    far_off = rrmsd_by_tubes(lens.plain(), seen.channels, goal.receiver, target=goal.picture, n=tubes) > FAR_OFF
+    far_off = rrmsd_by_tubes(lens.plain(), seen.channels, goal.receiver, target=goal.picture, n=tubes) > FAR_OFF_RRMSD
     return tuple(rounds) if far_off else ()
 
 
-def coarsened(task: Task, pixels: int) -> Task:
-    """The task with at most so many pixels along the longer side."""
+def with_pixels(task: Task, pixels: int) -> Task:
+    """Return the task with its targets resampled to at most `pixels` along the longer side."""
     return replace(task, goals=tuple(coarse(goal, pixels) for goal in task.goals))
 
 
-def shares_of(task: Task) -> Shares | None:
-    """The rounds of several goals, and of a preview; None: of one goal."""
+def round_shares(task: Task) -> Shares | None:
+    """Return the rounds for several goals or a preview; None: the default for one goal."""
     if task.hasty:
         return ((1.0, 1.0),)
     if len(task.goals) == 1:
-        return JOINT if task.several else None
-    larger = max(1.0, task.knobs.side / OF_SIDE)
-    return tuple((tubes, larger * share) for tubes, share in PICTURES)
+        return WAVEFRONT_ROUNDS if task.several else None
+    larger = max(1.0, task.knobs.side / PICTURES_SIDE)
+    return tuple((tubes, larger * share) for tubes, share in PICTURES_ROUNDS)
 
 
-def sheets(knobs: Tailoring, shares: Shares | None = None) -> Iterator[tuple[int, int]]:
-    """(tubes a side, evaluations) of each round; no fewer tubes than control points: they could not tell them apart."""
-    shares = shares or (ROUNDS if knobs.rays >= DENSE * knobs.side else SPARSE)
-    if knobs.stage2_iterations < FEW:
+def sheet_sizes(knobs: Tailoring, shares: Shares | None = None) -> Iterator[tuple[int, int]]:
+    """Yield (tubes a side, evaluations) of each round; fewer tubes than control points could not determine these."""
+    shares = shares or (DENSE_ROUNDS if knobs.rays >= DENSE_TUBES * knobs.side else SPARSE_ROUNDS)
+    if knobs.stage2_iterations < MIN_EVALUATIONS:
         shares = ((1.0, 1.0),)
     least = min(knobs.rays, knobs.side)
     for tubes, share in shares:
         yield max(round(tubes * knobs.rays), least), round(share * knobs.stage2_iterations)
 
 
-def run_rounds(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = None) -> Iterator[Step]:
-    """A stage, one round after the other, or on from a state of it.
+def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None = None) -> Iterator[Step]:
+    """Yield the steps of a stage, round by round, from its start or from a saved state on.
 
-    Ends when the evaluations are spent, on a plateau of the last round, or when its light reaches the accuracy asked
-    for, as `Task.rrmsd` finds it by rays.
+    The stage ends when its evaluations are used up, on a plateau of the last round, or when the RRMSD by rays
+    (`Task.rrmsd`) reaches tailoring.accuracy with the light of the last round.
     """
     accuracy = rounds[0].task.knobs.accuracy
     begin = Parameters.of(lens)
-    place = state.place if state else Place(0, 0, 0, accuracy or 0.0, sheet_from=begin, search_from=begin)
+    place = state.place if state else SearchPosition(0, 0, 0, accuracy or 0.0, sheet_from=begin, search_from=begin)
     total = sum(each.evaluations for each in rounds)
     if state is None:
         yield Step(lambda: lens)
@@ -195,7 +202,7 @@ def run_rounds(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = N
                 place = replace(place, search_from=Parameters.of(lens))
             begun = place.search_from.applied(lens)
             task.tidy()
-            variables = variables_of(task, begun, now.pixels)  # which takes some memory: before the sheet does
+            variables = variables_of(task, begun, now.pixels)  # before the sheet: they need much memory for a while
             if merit is None:
                 merit = now.merit(launched)
                 task.tidy()
@@ -208,26 +215,26 @@ def run_rounds(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = N
             lens, state, judged = step.lens, None, None
             place, reason = replace(place, done=place.done + reached.best.evaluations), reached.reason
             if reason == "accuracy" and (judged := task.rrmsd(lens)) > accuracy:
-                # the tubes flatter a little: ask more of them
+                # tubes underestimate the RRMSD a little: lower their goal
                 place = replace(place, goal_by_tubes=place.goal_by_tubes * accuracy / judged)
-                reason = "evaluations"  # so it will have been, if none are left
+                reason = "evaluations"  # the reason if none are left
             elif reason != "evaluations":
                 break
-        del merit, problem  # else two sheets would stand beside each other
+        del merit, problem  # free the sheet before the next one is made
         judged = None if task.hasty else judged or task.rrmsd(lens)
-        whole = task.channels == rounds[-1].task.channels  # is this all of the light, and not of a smaller source?
+        whole = task.channels == rounds[-1].task.channels  # True: the light of the source at full size
         if judged is not None and accuracy is not None and judged <= accuracy:
-            reason = "accuracy"  # by rays: a round may end there though its own goal, by tubes, is not reached
+            reason = "accuracy"  # reached by rays, though perhaps not by tubes
         reason = reason if number == len(rounds) - 1 or (reason == "accuracy" and whole) else ""
         yield Step(lambda lens=lens: lens, judged=judged, whole=whole, part=part, ends=True, reason=reason)
         if reason:
             return
 
 
-def _pull(task: Task, lens: Lens) -> float:
-    """Weight of light beyond the border (1 / pixel²); less for a source whose image is w pixels wide.
+def _overshoot_weight(task: Task, lens: Lens) -> float:
+    """Return the weight of light outside the target (1 / pixel²), smaller if the image of the source is w pixels wide.
 
-    Within w of the border some light falls outside whatever the lens does, and to be pulled in would blur the edge.
+    Within w of the border some light falls outside for any lens, and pulling it in would blur the edge.
     """
     overshoot = task.knobs.overshoot
     if points(task.channels) == 1:
@@ -235,28 +242,28 @@ def _pull(task: Task, lens: Lens) -> float:
     few, light = task.channels, task.heaviest
     if task.spreads:
         source = replace(task.spreads[-1].source, wavelength=light.source.wavelength)
-        few = channels_of(source, lambda _: light.index, BY)  # whose second moments are those of all points
-    return overshoot / (1 + max(images(few, lens, goal.receiver, SEEN).width() for goal in task.goals) ** 2)
+        few = channels_of(source, lambda _: light.index, IMAGE_POINTS)  # points with the second moments of the source
+    return overshoot / (1 + max(images(few, lens, goal.receiver, IMAGE_POSITIONS).width() for goal in task.goals) ** 2)
 
 
 def _search(
-    now: Round, problem: Problem, variables: NetVariables, place: Place, *, total: int,
+    now: TubeRound, problem: Problem, variables: NetVariables, place: SearchPosition, *, total: int,
     state: TubeSearch | None,
 ) -> Iterator[tuple[Reached, Step]]:  # fmt: skip
-    """One run of the minimiser from the lens of a problem, or on from a saved state; it also ends at the goal.
+    """Yield one run of the minimiser from the lens of a problem, or from a saved state on; it also ends at the goal.
 
     total: evaluations of all rounds.
     """
     lens, evaluations = problem.lens, place.round_end - place.done
-    work = 0.0  # the first step has other work before it: its time is not known
+    work = 0.0  # unknown for the first step, which includes other work
     for reached in search(lens, problem, variables, evaluations=evaluations, state=state):
         best, reason = reached.best, reached.reason
-        step = Step(partial(improved, lens, variables, best), work=work, skipped=reached.skipped)
+        step = Step(partial(with_best_nets, lens, variables, best), work=work, skipped=reached.skipped)
         if not reached.skipped:
-            done = min(place.done + best.evaluations, total)  # a line search may run over a little
-            of_few = f" on {now.pixels} pixels" if now.pixels else ""
-            of_few += f", with {100 * now.share:.0f} % of the source's size" if now.share < 1 else ""
-            step = replace(step, progress=(now.stage, done, total, f"RRMSD {best.figure:.4f}{of_few}"))
+            done = min(place.done + best.evaluations, total)  # a line search may exceed the limit
+            detail = f" on {now.pixels} pixels" if now.pixels else ""
+            detail += f", with {100 * now.share:.0f} % of the source's size" if now.share < 1 else ""
+            step = replace(step, progress=(now.stage, done, total, f"RRMSD {best.figure:.4f}{detail}"))
             if now.pixels is None:
                 step = replace(step, rrmsd=best.figure)
                 reason = "accuracy" if best.figure <= place.goal_by_tubes else reason
@@ -268,20 +275,20 @@ def _search(
 
 @dataclass(frozen=True)
 class Problem:
-    """Merit and gradients in all freeform interfaces for a fixed sheet of tubes a channel.
+    """Merit of stage 2 and its gradients in the heights of all nets, for a fixed sheet of tubes per channel.
 
-    The fused kernels keep only where each corner lands, not its path: memory is some 100 bytes a corner and does not
-    grow with control points.
+    The fused kernels store the landing point of each corner, not its path.  Memory is some 100 bytes a corner and does
+    not grow with the number of control points.
     """
 
     lens: Lens
     merit: Merit
-    bounds: Bounds | None = None  # on the tailored faces; the excess over them adds to the merit
-    bound_weight: float = 0.0  # of the excess
-    grazing: Grazing | None = None  # keeps light at the edge of its reach from total reflection
+    bounds: Bounds | None = None  # bounds on the tailored faces; the excess over them is penalised
+    bound_weight: float = 0.0  # weight of this penalty
+    grazing: Grazing | None = None  # penalty against total internal reflection
 
     def __call__(self, heights: Sequence[Tensor]) -> tuple[float, list[Tensor], float]:
-        """(merit, ∂merit/∂heights of each net, RRMSD) at the heights of the nets (mm)."""
+        """Return the merit, ∂merit/∂heights of each net (1/mm) and the RRMSD at the heights of the nets (mm)."""
         leaves = [h.detach().requires_grad_() for h in heights]
         lens = self.lens.with_heights(leaves)
         merit, rrmsd = self.merit(self.merit.landing(lens))
@@ -300,7 +307,7 @@ class Problem:
 
 
 def variables_of(task: Task, lens: Lens, pixels: int | None = None) -> NetVariables:
-    """The variable of each freeform interface, for the light of the task; pixels: by nets of about as many cells."""
+    """Return the variables of stage 2 for the nets of a lens; pixels: for coarser nets of about as many cells."""
     nets = lens.nets
     if pixels is not None:
         lens = lens.with_nets(net.refined(coarser(net.shape, pixels + 1)) for net in nets)
@@ -321,7 +328,7 @@ def variables_of(task: Task, lens: Lens, pixels: int | None = None) -> NetVariab
 
 
 def _mean(weights: Iterable[Tensor]) -> Tensor:
-    """The geometric mean of the weights for several goals; of one itself."""
+    """Return the geometric mean of the weights of several goals."""
     first, *others = weights
     if not others:
         return first
@@ -336,11 +343,11 @@ def search(
     evaluations: int,
     state: TubeSearch | None = None,
 ) -> Iterator[Reached]:
-    """L-BFGS on the heights of all nets, from those of `lens`, in one block of Sobolev variables c a net."""
+    """Run L-BFGS on the heights of all nets from those of `lens` on, in one block of variables c per net."""
     start = [net.heights for net in lens.nets]
 
     def in_c(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
-        heights = _moved(start, variables, [c.detach() for c in parameters])
+        heights = _heights_at(start, variables, [c.detach() for c in parameters])
         merit, gradients, rrmsd = problem(heights)
         return merit, variables.adjoint(gradients), rrmsd
 
@@ -348,15 +355,15 @@ def search(
     return minimise(in_c, method, evaluations, state.best if state else Best())
 
 
-def improved(lens: Lens, variables: NetVariables, best: Best) -> Lens:
-    """The lens with the best nets of a search that began at it; itself if every value of that was not finite."""
+def with_best_nets(lens: Lens, variables: NetVariables, best: Best) -> Lens:
+    """Return `lens` with the best nets of a search that began at it; `lens` itself if no value was finite."""
     if not best.parameters:
         return lens
-    return lens.with_heights(_moved([net.heights for net in lens.nets], variables, best.parameters))
+    return lens.with_heights(_heights_at([net.heights for net in lens.nets], variables, best.parameters))
 
 
-def _moved(start: Sequence[Tensor], variables: NetVariables, c: Sequence[Tensor]) -> list[Tensor]:
-    """The heights (mm) of each net at c."""
+def _heights_at(start: Sequence[Tensor], variables: NetVariables, c: Sequence[Tensor]) -> list[Tensor]:
+    """Return the heights (mm) of each net at c."""
     return [h + change for h, change in zip(start, variables.heights(c), strict=True)]
 
 
@@ -364,18 +371,18 @@ Stage2 = Callable[[Task, Lens, Any], Iterator[Step]]
 
 
 @dataclass(frozen=True)
-class Grown:
-    """Where stage 3 stands between two steps of a search."""
+class Stage3State:
+    """State of stage 3 between two steps of a search."""
 
     grown: TubeSearch
 
 
 def with_stage3(before: Stage2 | None, task: Task, lens: Lens, state: Any = None) -> Iterator[Step]:
-    """Stage 3, or on from a state of it; before it a stage 2 for the source's middle, unless that is None.
+    """Yield the steps of stage 3, from its start or a saved state on, after the stage `before` unless that is None.
 
-    The lens after stage 2 is judged by the light of the whole source.
+    `before` tailors for the centre of the source; its lens is rated with the light of the whole source.
     """
-    if before is not None and not isinstance(state, Grown):
+    if before is not None and not isinstance(state, Stage3State):
         for last in before(task, lens, state):
             if last.ends:
                 whole = task.whole
@@ -386,82 +393,84 @@ def with_stage3(before: Stage2 | None, task: Task, lens: Lens, state: Any = None
     if before is None:
         rounds = (*coarse_rounds(task, lens), *rounds)
     for step in run_rounds(rounds, lens, state and state.grown):
-        yield replace(step, state=step.state and Grown(step.state))
+        yield replace(step, state=step.state and Stage3State(step.state))
 
 
-def stage3_rounds(task: Task) -> tuple[Round, ...]:
-    """One for each of SIZES."""
+def stage3_rounds(task: Task) -> tuple[TubeRound, ...]:
+    """Return the rounds of stage 3, one per source size in SOURCE_SIZES."""
     lights = (
         replace(task, channels=channels, grown=(), spreads=(spread,))
         for channels, spread in zip(task.grown, task.spreads, strict=True)
     )
     if task.hasty:
         *_, light = lights
-        return (Round(light, task.knobs.rays, task.knobs.stage2_iterations, stage="stage 3", spread=light.spreads[0]),)
+        count = task.knobs.stage2_iterations
+        return (TubeRound(light, task.knobs.rays, count, stage="stage 3", spread=light.spreads[0]),)
     screens = [goal.receiver for goal in task.goals]
-    counts = blurred_sheets(task.knobs, (max(each.columns for each in screens), max(each.rows for each in screens)))
+    counts = stage3_sheet_sizes(task.knobs, (max(each.columns for each in screens), max(each.rows for each in screens)))
     return tuple(
-        Round(light, tubes, evaluations, stage="stage 3", spread=spread, share=share)
-        for light, spread, (tubes, evaluations), (share, _) in zip(lights, task.spreads, counts, SIZES, strict=True)
+        TubeRound(light, tubes, count, stage="stage 3", spread=spread, share=share)
+        for light, spread, (tubes, count), (share, _) in zip(lights, task.spreads, counts, SOURCE_SIZES, strict=True)
     )
 
 
-def blurred_sheets(knobs: Tailoring, pixels: tuple[int, int]) -> Iterator[tuple[int, int]]:
-    """(tubes a side, evaluations) of each round for a source of some size; pixels: columns and rows.
+def stage3_sheet_sizes(knobs: Tailoring, pixels: tuple[int, int]) -> Iterator[tuple[int, int]]:
+    """Yield (tubes a side, evaluations) of each round of stage 3; pixels: columns and rows of the target.
 
     A sheet of n tubes a side has n √(m_x / m_y) along x and n √(m_y / m_x) along y over a net of m_x x m_y points.
     """
-    total = knobs.stage2_iterations * (2 if knobs.stage2_iterations < FEW else 1)  # each is cheap, and all have a start
+    few = knobs.stage2_iterations < MIN_EVALUATIONS
+    total = knobs.stage2_iterations * (2 if few else 1)  # each round costs a start
     (m_x, m_y), (columns, rows) = both(knobs.levels[-1]), pixels
     oblong = math.sqrt(m_x / m_y)
-    a_pixel = A_PIXEL * max(columns / oblong, rows * oblong)
-    tubes = min(knobs.rays, math.ceil(max(A_CELL * knobs.side, a_pixel)))
-    for _, share in SIZES:
+    a_pixel = TUBES_PER_PIXEL * max(columns / oblong, rows * oblong)
+    tubes = min(knobs.rays, math.ceil(max(TUBES_PER_CELL * knobs.side, a_pixel)))
+    for _, share in SOURCE_SIZES:
         yield tubes, round(share * total)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """How two twins of a lens part, tailored in float32 and in float64."""
+    """Differences between two copies of a lens, one tailored in float32, the other in float64."""
 
-    control_points: int  # along the longer side
-    merit: float  # relative difference before the first step
-    gradient: float  # the same, of its norm
-    evaluations: int  # of each
-    rrmsd_float64: float  # after them, both judged by the same tubes in float64
+    control_points: int  # control points along the longer side
+    merit: float  # relative difference of the merit at the start
+    gradient: float  # relative difference of the gradient at the start, by norms
+    evaluations: int  # evaluations of each
+    rrmsd_float64: float  # RRMSD at the end, by the same tubes in float64 for both
     rrmsd_float32: float
-    heights: float  # mm; largest difference of a control point
+    heights: float  # largest difference of a control point (mm)
 
 
 def compare_precisions(task: Task, lens: Lens) -> Comparison:
-    """Tailor `lens` to the irradiance in both precisions, by the same tubes and the same number of evaluations.
+    """Run a short stage 2 from `lens` in both precisions, with the same tubes and the same number of evaluations.
 
-    Rounding decides where a line search ends; the two may part by more than rounding and be equally good.
+    Rounding decides where a line search ends, so the results may differ by more than rounding and be equally good.
     """
-    lens = lens.with_nets(net.refined(coarser(net.shape, NET)) for net in lens.nets)
+    lens = lens.with_nets(net.refined(coarser(net.shape, COMPARED_NET)) for net in lens.nets)
     (merit, gradient, single), (exact, wanted, double) = (
-        _tried(task, lens.to(d)) for d in (torch.float32, torch.float64)
+        _tailor_briefly(task, lens.to(d)) for d in (torch.float32, torch.float64)
     )
-    n, goal = round(a_side(task.channels) * (TUBES + 1)), task.goals[0]
+    n, goal = round(a_side(task.channels) * (COMPARED_TUBES + 1)), task.goals[0]
     rrmsd = [rrmsd_by_tubes(end, task.channels, goal.receiver, target=goal.picture, n=n) for end in (single, double)]
     pairs = zip(single.nets, double.nets, strict=True)
     return Comparison(
         control_points=max(max(net.shape) for net in lens.nets),
         merit=abs(merit / exact - 1),
         gradient=float((gradient - wanted).norm() / wanted.norm()),
-        evaluations=COMPARED,
+        evaluations=COMPARED_EVALUATIONS,
         rrmsd_float64=rrmsd[1],
         rrmsd_float32=rrmsd[0],
         heights=max(float((a.heights - b.heights).abs().max()) for a, b in pairs),
     )
 
 
-def _tried(task: Task, lens: Lens) -> tuple[float, Tensor, Lens]:
-    """(merit and gradient at the start, the lens after COMPARED evaluations in its own precision, in float64)."""
-    n = min(TUBES, task.knobs.rays)
+def _tailor_briefly(task: Task, lens: Lens) -> tuple[float, Tensor, Lens]:
+    """Return merit and gradient at the start, and the lens after COMPARED_EVALUATIONS in its precision, in float64."""
+    n = min(COMPARED_TUBES, task.knobs.rays)
     merit = Merit.of(task.channels, lens, n, task.goals[:1], overshoot=task.knobs.overshoot, own=task.merit)
     problem, variables = Problem(lens, merit), variables_of(task, lens)
     value, gradients, _ = problem([net.heights for net in lens.nets])
-    *_, last = search(lens, problem, variables, COMPARED)
+    *_, last = search(lens, problem, variables, COMPARED_EVALUATIONS)
     flat = torch.cat([g.reshape(-1).double().cpu() for g in gradients])
-    return value, flat, improved(lens, variables, last.best).plain()
+    return value, flat, with_best_nets(lens, variables, last.best).plain()

@@ -94,7 +94,7 @@ def follow(task: Task, lens: Lens, state: FrontRound | None) -> Iterator[Step]:
     task = task.aimed(lens)
     knobs, z, done, wanted = task.knobs, lens.back.z, 0, None
     near = min(task.goals, key=lambda goal: goal.receiver.plane.throw(0.0))
-    light = light_behind.uncrossed(light_behind.of_task(task), near.receiver, lens.back, knobs.transport_grid)
+    light = light_behind.without_crossings(light_behind.light_for_task(task), near.receiver, lens.back, knobs.transport_grid)
     if state is not None:
         lens, done, wanted, b = state.lens.applied(lens), state.round, state.wanted, state.back
     turn = min(done, knobs.rounds - 1)
@@ -124,8 +124,8 @@ def _round(
 ) -> tuple[Lens, SlopeMap, Grid]:  # fmt: skip
     """One round: the lens, the map that its front follows, and b(t)."""
     source, front = task.heaviest.source, lens.shaping("front")
-    window, back = lit_window(source, front), light.meeting(lens.back)
-    through = light.places_of(task.goals[0].receiver, back[:2])
+    window, back = lit_window(source, front), light.intersect(lens.back)
+    through = light.sampled_at(task.goals[0].receiver, back[:2])
 
     def progress(s: TransportStep) -> None:
         task.progress("stage 1", turn, task.knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
@@ -139,7 +139,7 @@ def _round(
     window = lit_window(source, lens)
     grid = face_grid(source, lens, window, own[-1])
     law = lens.last_freeform.law
-    out = light.leaving(lens.back, *sampling.grid(window, grid.shape))
+    out = light.directions_at(lens.back, *sampling.grid(window, grid.shape))
     slopes = kept_from_reflection(grid.at_face, slopes_towards(grid.at_face, out, law), law)
     x, y = (p.reshape(-1) for p in sampling.grid(window, grid.shape))
     back, lit, (how, unlit) = lens.back, (grid.density > 0).reshape(-1), fit

@@ -35,7 +35,7 @@ ROUND = 30  # evaluations of stage 2 a round of feedback, from the lens of the r
 def task_of(scene):
     """The task of a scene as `pipeline.design` has it, and the blank."""
     knobs = scene.tailoring.resolved(scene.lens.back.control_points)
-    scaled = [scene.with_source_scaled(share) for share, _ in stage2.SIZES]
+    scaled = [scene.with_source_scaled(share) for share, _ in stage2.SOURCE_SIZES]
     light, least = scene.with_source_scaled(0.0).channels(), scene.lens.min_thickness
     task = Task(
         light, scene.goals, knobs, least, grown=tuple(each.channels() for each in scaled),

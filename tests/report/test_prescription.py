@@ -17,7 +17,7 @@ from bstcad.pipeline import design, resolved
 from bstcad.report import prescription as prescriptions
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
-from bstcad.tailoring.stage1 import _of_sag
+from bstcad.tailoring.stage1 import _curvature_of_sag
 from tests.conftest import DISK, SMALL
 
 FREE = {
@@ -129,7 +129,7 @@ def test_a_front_that_is_found_is_one_that_the_scene_may_have(changes):
     """Fronts at either end of the search are valid, and the search covers no small part of the valid range."""
     scene = load(DISK, FREE | changes)
     rim = math.hypot(*scene.lens.outline.farthest)
-    low, high = (_of_sag(sag, rim, 0.0) for sag in scene.rim_sags)
+    low, high = (_curvature_of_sag(sag, rim, 0.0) for sag in scene.rim_sags)
     low, high = min(low, scene.lens.front.curvature), max(high, scene.lens.front.curvature)
     for curvature in (low, high):
         scene.changed({"lens.front.curvature": curvature})

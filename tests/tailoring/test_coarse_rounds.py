@@ -61,7 +61,7 @@ def made(states):
 
 def test_they_bring_light_far(made, monkeypatch):
     assert [name[:18] for name in names(made)] == ["stage 2, 32 pixels", "stage 2, 128² tube"]
-    monkeypatch.setattr(stage2, "FAR_OFF", float("inf"))
+    monkeypatch.setattr(stage2, "FAR_OFF_RRMSD", float("inf"))
     without = design(near(), device="cpu", later=True)
     assert len(names(without)) == 1
     assert rrmsd(made) < 0.4 * rrmsd(without)
@@ -71,8 +71,8 @@ def test_a_stage_hands_on_its_best_lens(monkeypatch):
     """A stage that ends with a round on 32 pixels, by which a letter on 64 pixels gets worse."""
 
     def steps(task, lens, state=None):
-        coarse, [(tubes, evaluations)] = stage2.coarse_rounds(task, lens), stage2.sheets(task.knobs)
-        return stage2.run_rounds((*coarse, stage2.Round(task, tubes, evaluations), *coarse[-1:]), lens, state)
+        coarse, [(tubes, evaluations)] = stage2.coarse_rounds(task, lens), stage2.sheet_sizes(task.knobs)
+        return stage2.run_rounds((*coarse, stage2.TubeRound(task, tubes, evaluations), *coarse[-1:]), lens, state)
 
     monkeypatch.setitem(pipeline.PROCEDURES, "least-squares", ("stage 1", stage1.steps, steps))
     made = design(near().changed({"target.image": None, "target.text": "T"}), device="cpu", later=True)

@@ -23,7 +23,7 @@ from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Task
 from bstcad.tailoring.source_image import Images, Spread, _biquadratic, blurs, bordered, unseen
-from bstcad.tailoring.stage2 import Problem, _pull
+from bstcad.tailoring.stage2 import Problem, _overshoot_weight
 from tests.lenses import net
 
 INDEX, SIZE = 1.5, 2.4
@@ -178,5 +178,5 @@ def test_a_few_points_tell_how_wide_the_image_is(name):
     source = SOURCES[name]
     light, knobs = channels_of(source, lambda nm: INDEX, 64), Tailoring(overshoot=0.03)
     task = Task(light, GOALS, knobs, spreads=(spread(source),))
-    by_all = _pull(replace(task, spreads=()), lens())
-    assert _pull(task, lens()) == pytest.approx(by_all, rel=0.02) and by_all < 0.02
+    by_all = _overshoot_weight(replace(task, spreads=()), lens())
+    assert _overshoot_weight(task, lens()) == pytest.approx(by_all, rel=0.02) and by_all < 0.02

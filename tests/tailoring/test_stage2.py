@@ -58,8 +58,8 @@ def test_it_tells_what_each_size_costs(compensated):
 
 def test_the_source_grows_to_its_size():
     scene = load(DISK, WIDE)
-    sizes = [share for share, _ in stage2.SIZES]
-    assert sizes == sorted(sizes) and sizes[-1] == 1 and sum(share for _, share in stage2.SIZES) == pytest.approx(1)
+    sizes = [share for share, _ in stage2.SOURCE_SIZES]
+    assert sizes == sorted(sizes) and sizes[-1] == 1 and sum(share for _, share in stage2.SOURCE_SIZES) == pytest.approx(1)
     whole, middle = scene.channels(), scene.source.position
     for share in sizes:
         for channel, other in zip(scene.with_source_scaled(share).channels(), whole, strict=True):
@@ -72,7 +72,7 @@ def test_the_source_grows_to_its_size():
 def task_of(scene):
     """The task of a scene as `pipeline.design` has it."""
     knobs = scene.tailoring.resolved(33)
-    light, scaled = scene.with_source_scaled(0.0).channels(), [scene.with_source_scaled(s) for s, _ in stage2.SIZES]
+    light, scaled = scene.with_source_scaled(0.0).channels(), [scene.with_source_scaled(s) for s, _ in stage2.SOURCE_SIZES]
     return pipeline.Task(
         light, scene.goals, knobs, grown=tuple(each.channels() for each in scaled),
         spreads=tuple(Spread(each.source, light, each.draw) for each in scaled),
@@ -93,7 +93,7 @@ def found():
 
 
 def test_the_twins_agree_to_what_single_precision_keeps(found):
-    assert found["control_points"] == 33 and found["evaluations"] == stage2.COMPARED
+    assert found["control_points"] == 33 and found["evaluations"] == stage2.COMPARED_EVALUATIONS
     assert 0 < found["merit"] < 1e-4  # sums of 2^16 tubes, each with some 1e-6 of the lens's size in its corners
     assert 0 < found["gradient"] < 1e-2
     assert found["rrmsd_float32"] == pytest.approx(found["rrmsd_float64"], rel=0.2)  # two line searches, equally good

@@ -71,7 +71,7 @@ def test_the_waves_term_is_the_measured_error():
 
 def shown(light, screen):
     """The picture on a screen, by the quads of the light."""
-    there = torch.from_numpy(np.stack(light.on(screen.plane)))
+    there = torch.from_numpy(np.stack(light.positions_on(screen.plane)))
     flux = torch.from_numpy(np.ascontiguousarray(light.picture[::-1].T))
     return collect(screen.pixels_of(there), flux, screen.shape)[0].numpy()
 
@@ -81,7 +81,7 @@ def test_even_light_between_squares_is_affine(sign):
     far = Screen(630.0, (-18.0, 18.0), (-18.0, 18.0), 24)  # far off: there the cost is nearly quadratic
     even = np.full((24, 24), 1 / 576)
     light = light_behind.between_targets((NEAR, even), (far, even), 64, sign=sign)
-    x, y, _ = light.place
+    x, y, _ = light.position
     for place, across in ((x, light.direction[0]), (y, light.direction[1])):
         assert np.abs(600.0 * across / light.direction[2] - (sign * 2 - 1) * place).max() < 0.1
 
@@ -99,7 +99,7 @@ def test_the_light_makes_both_pictures(sign, sharper, tilt):
     first, second = (p / p.sum() for p in (waves if sharper == "near" else waves[::-1]))
     light = light_behind.between_targets((near, first), (far, second), 128, sign=sign)
     assert np.abs((light.direction**2).sum(0) - 1).max() < 1e-12 and light.direction[2].min() > 0.8
-    assert light.crossed(Plane(29.0)) == 0  # the order of its rays is that of their places near by
+    assert light.crossed_fraction(Plane(29.0)) == 0  # the order of its rays is that of their places near by
     for screen, wanted in ((near, first), (far, second)):
         off = (shown(light, screen) - wanted)[2:-2, 2:-2]  # light of the outermost cells lands a little beside
         assert np.sqrt((off**2).sum() / (wanted**2).sum()) < 0.05
@@ -117,7 +117,7 @@ def test_bright_letters_and_a_grey_picture_are_both_shown(sign, place):
         near, far = far, near
     goals = sorted(((near, letters), (far, grey)), key=lambda goal: goal[0].z)
     light = light_behind.between_targets(*goals, 128, sign=sign)
-    assert light.crossed(Plane(29.0)) == 0
+    assert light.crossed_fraction(Plane(29.0)) == 0
     assert np.abs(shown(light, near) - letters).max() < 1e-12  # no light in the black gap
     off, wanted = (p.reshape(16, 4, 16, 4).sum((1, 3)) for p in (shown(light, far) - grey, grey))
     assert np.sqrt((off**2).sum() / (wanted**2).sum()) < 0.03
@@ -133,8 +133,8 @@ def test_directions_in_a_gap_change_evenly_from_the_one_side_to_the_other():
     light = light_behind.LightBehind(np.stack([x, y, np.zeros_like(x)]), direction, np.ones((31, 31)) / 961)
     where = [torch.from_numpy(p) for p in np.meshgrid(np.linspace(-3, 3, 32), np.linspace(-5, 5, 32), indexing="ij")]
     edge = 4.0 + 8 / 31
-    for rays in (light, light.turned()):
-        found = rays.leaving(Plane(0.0), *where)
+    for rays in (light, light.reversed()):
+        found = rays.directions_at(Plane(0.0), *where)
         assert float((found[0] / found[2] + 0.1 / edge * where[0] / 0.99**0.5).abs().max()) < 1e-9
 
 
@@ -147,10 +147,10 @@ def test_directions_in_a_gap_change_evenly_from_the_one_side_to_the_other():
     ids=["converging", "diverging"],
 )
 def test_light_of_a_spherical_wave_goes_through_its_focus(wave, screen):
-    light = light_behind.of_wave(screen, picture(0), wave, wavelength=600.0, parts=1)
+    light = light_behind.light_of_wave(screen, picture(0), wave, wavelength=600.0, parts=1)
     focus = np.array(wave.focus).reshape(3, 1, 1)
-    path = (focus[2] - light.place[2]) / light.direction[2]
-    assert np.abs(light.place + path * light.direction - focus).max() < 1e-9 and light.direction[2].min() > 0
+    path = (focus[2] - light.position[2]) / light.direction[2]
+    assert np.abs(light.position + path * light.direction - focus).max() < 1e-9 and light.direction[2].min() > 0
 
 
 def test_crossings_before_the_target_are_removed():
@@ -159,9 +159,9 @@ def test_crossings_before_the_target_are_removed():
     dark[:, :24] = 1.0
     light = light_behind.between_targets((near, dark[:, ::-1] / dark.sum()), (far, dark / dark.sum()), 64)
     back = Plane(0.0)
-    assert light.crossed(back) > 0.05
-    assert light_behind.uncrossed(light, near, back, 64).crossed(back) < 1e-3
-    assert light_behind.uncrossed(light, near, Plane(59.9), 64) is light
+    assert light.crossed_fraction(back) > 0.05
+    assert light_behind.without_crossings(light, near, back, 64).crossed_fraction(back) < 1e-3
+    assert light_behind.without_crossings(light, near, Plane(59.9), 64) is light
 
 
 # ---- small designs ---------------------------------------------------------------------------------------------------
@@ -216,7 +216,7 @@ def test_a_front_alone_makes_a_picture(tmp_path):
 def test_a_wave_whose_rays_cross_before_the_target_is_refused():
     wave = ZernikeWave((0.0, 0.0, 0.0, -300.0), 8.0, 30.0)
     with pytest.raises(SceneError, match="rays of the wave at z = 30 cross"):
-        light_behind.of_wave(Screen(400.0, (-9.0, 9.0), (-9.0, 9.0), 8), picture(0), wave, wavelength=600.0, parts=1)
+        light_behind.light_of_wave(Screen(400.0, (-9.0, 9.0), (-9.0, 9.0), 8), picture(0), wave, wavelength=600.0, parts=1)
 
 
 def test_targets_that_cut_through_each_other_are_refused(tmp_path):
