@@ -144,7 +144,8 @@ def light_for_task(task: Task) -> LightBehind:
     n = task.knobs.transport_grid
     if task.wave is not None:
         parts = max(1, round(n / max(near.receiver.shape)))
-        return light_of_wave(near.receiver, near.picture, task.wave, wavelength=task.heaviest.source.wavelength, parts=parts)
+        wavelength = task.heaviest.source.wavelength
+        return light_of_wave(near.receiver, near.picture, task.wave, wavelength=wavelength, parts=parts)
 
     def progress(s: Step) -> None:
         task.progress("stage 1", 0, task.knobs.rounds, f"between the targets, {s.grid}² cells")

@@ -32,8 +32,8 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays
 from bstcad.optics.reach import kept_from_reflection, slopes_towards
 from bstcad.scene.quality import COARSEST_GRID
-from bstcad.tailoring import light_behind, stage1
-from bstcad.tailoring.light_behind import LightBehind
+from bstcad.tailoring import stage1
+from bstcad.tailoring.light_behind import LightBehind, light_for_task, without_crossings
 from bstcad.tailoring.machinability import moved_clear
 from bstcad.tailoring.run import Parameters, Step, Task
 from bstcad.tailoring.slope_fit import Fit, fit_slopes
@@ -94,7 +94,8 @@ def follow(task: Task, lens: Lens, state: FrontRound | None) -> Iterator[Step]:
     task = task.aimed(lens)
     knobs, z, done, wanted = task.knobs, lens.back.z, 0, None
     near = min(task.goals, key=lambda goal: goal.receiver.plane.throw(0.0))
-    light = light_behind.without_crossings(light_behind.light_for_task(task), near.receiver, lens.back, knobs.transport_grid)
+    light = light_for_task(task)
+    light = without_crossings(light, near.receiver, lens.back, knobs.transport_grid)
     if state is not None:
         lens, done, wanted, b = state.lens.applied(lens), state.round, state.wanted, state.back
     turn = min(done, knobs.rounds - 1)

@@ -59,7 +59,8 @@ def test_it_tells_what_each_size_costs(compensated):
 def test_the_source_grows_to_its_size():
     scene = load(DISK, WIDE)
     sizes = [share for share, _ in stage2.SOURCE_SIZES]
-    assert sizes == sorted(sizes) and sizes[-1] == 1 and sum(share for _, share in stage2.SOURCE_SIZES) == pytest.approx(1)
+    assert sizes == sorted(sizes) and sizes[-1] == 1
+    assert sum(share for _, share in stage2.SOURCE_SIZES) == pytest.approx(1)
     whole, middle = scene.channels(), scene.source.position
     for share in sizes:
         for channel, other in zip(scene.with_source_scaled(share).channels(), whole, strict=True):
@@ -72,7 +73,8 @@ def test_the_source_grows_to_its_size():
 def task_of(scene):
     """The task of a scene as `pipeline.design` has it."""
     knobs = scene.tailoring.resolved(33)
-    light, scaled = scene.with_source_scaled(0.0).channels(), [scene.with_source_scaled(s) for s, _ in stage2.SOURCE_SIZES]
+    light = scene.with_source_scaled(0.0).channels()
+    scaled = [scene.with_source_scaled(share) for share, _ in stage2.SOURCE_SIZES]
     return pipeline.Task(
         light, scene.goals, knobs, grown=tuple(each.channels() for each in scaled),
         spreads=tuple(Spread(each.source, light, each.draw) for each in scaled),

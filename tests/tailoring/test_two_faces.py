@@ -216,7 +216,8 @@ def test_a_front_alone_makes_a_picture(tmp_path):
 def test_a_wave_whose_rays_cross_before_the_target_is_refused():
     wave = ZernikeWave((0.0, 0.0, 0.0, -300.0), 8.0, 30.0)
     with pytest.raises(SceneError, match="rays of the wave at z = 30 cross"):
-        light_behind.light_of_wave(Screen(400.0, (-9.0, 9.0), (-9.0, 9.0), 8), picture(0), wave, wavelength=600.0, parts=1)
+        screen = Screen(400.0, (-9.0, 9.0), (-9.0, 9.0), 8)
+        light_behind.light_of_wave(screen, picture(0), wave, wavelength=600.0, parts=1)
 
 
 def test_targets_that_cut_through_each_other_are_refused(tmp_path):
