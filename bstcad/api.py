@@ -38,7 +38,7 @@ from bstcad.report.record import BY_HAND, Making, Report, rrmsds
 from bstcad.report.units import number, quantity
 from bstcad.runs import files, processes
 from bstcad.runs import progress as progresses
-from bstcad.scene.blank import FEWEST_ROUND
+from bstcad.scene.blank import MIN_ROUND_POINTS
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene, load
 from bstcad.transport.mapping import TransportMap
@@ -151,7 +151,7 @@ class Design:
             raise SceneError(
                 f"with_heights: takes (m, n) real numbers in mm, such as lens.back.heights, not {given}"
             ) from None
-        m, n = (max(count, FEWEST_ROUND) for count in found.shape)
+        m, n = (max(count, MIN_ROUND_POINTS) for count in found.shape)
         net = self.scene.flat_lens((m, n)).back
         back = replace(net, z=self.lens.back.z, heights=torch.from_numpy(found.astype(np.float64)))
         return self.with_lens(replace(self.lens, back=back))

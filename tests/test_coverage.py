@@ -198,14 +198,14 @@ def test_a_system_of_the_table_is_designed(name, loaded):
 def test_a_mirror_for_two_goals_is_said_to_be_a_compromise(name, loaded):
     [said] = loaded(COMPROMISES[name]).warnings()
     assert said == (
-        "wavefront: 2 goals for one tailored face, which meets them only as far as least squares by their weights go; "
-        "a mirror has no second face, so state what matters by weight"
+        "wavefront: one tailored face cannot meet 2 goals exactly, only by weighted least squares; a mirror has no "
+        "second face, so set the weights"
     )
 
 
 def test_a_lens_with_too_few_faces_is_told_which_to_add(loaded):
     [said] = loaded(System("", (PLANE,))).warnings()
-    assert said.endswith('; have the front tailored too, lens.front = { kind = "bspline", z = 0, optimise = true }')
+    assert said.endswith('; tailor the front too, lens.front = { kind = "bspline", z = 0, optimise = true }')
     front_alone = "[lens.front]\nkind = 'bspline'\nz = 0.0\noptimise = true\n[lens.back]\noptimise = false\n"
     [said] = loaded(System("", (front_alone, PLANE))).warnings()
     assert said.endswith("; remove lens.back.optimise = false")

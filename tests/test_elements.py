@@ -156,7 +156,7 @@ WRONG = {
     "edge-on": (FOLDED | {"target.tilt": [0.0, -60.0]}, r"target\.tilt: by way of the mirrors.*edge-on"),
     "steep": ({"behind": [FOLD | {"tilt": [0.0, 50.0]}]}, r"behind\[0\]\.tilt.*40"),
     "unknown key": ({"before": [WINDOW | {"coating": 1.0}]}, r"before\[0\]\.coating"),
-    "wavefront": (FOLDED | {"wavefront": {"kind": "plane", "z": 60.0}}, r"wavefront: is asked for behind the lens"),
+    "wavefront": (FOLDED | {"wavefront": {"kind": "plane", "z": 60.0}}, r"wavefront: .*mirror in \[\[behind\]\]"),
 }  # fmt: skip
 
 

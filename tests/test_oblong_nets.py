@@ -198,9 +198,9 @@ def test_what_is_wrong_and_what_is_doubted():
     scene = bstcad.load("templates/caustic_portrait.toml").changed(PLATE)
     [_] = scene.warnings()  # of a cropped picture
     _, doubt = sorted(scene.changed({"lens.back.control_points": 33}).warnings(), reverse=True)
-    assert doubt.startswith("lens.back.control_points: cells of 1.43 x 0.357 mm; [65, 17] makes them square")
+    assert doubt.startswith("lens.back.control_points: the net's cells are 1.43 x 0.357 mm; [65, 17] makes")
     disc = {"lens.outline": {"shape": "circle", "radius": 5.0}, "source.aperture": {"shape": "circle", "radius": 5.0}}
-    with pytest.raises(SceneError, match=r"a round lens \(lens.outline\) takes a square net, not one of 65 x 17"):
+    with pytest.raises(SceneError, match=r"a round lens \(lens.outline\) needs a square net, not 65 x 17"):
         scene.changed(disc)
     with pytest.raises(SceneError, match="tailoring.levels: must end with"):
         scene.changed({"tailoring.levels": [17, 33]})

@@ -29,7 +29,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.surfaces import EQUATOR, Surface, sag, sampled
 from bstcad.runs import files
-from bstcad.scene.scene import SINGLE
+from bstcad.scene.scene import FLOAT32_ROUNDING
 
 COARSEST = 16  # cells each way
 MOST = 2_000_000  # triangles of a mesh by default: 100 MB of STL
@@ -181,7 +181,7 @@ def fitting(lens: Lens, tolerance: float, most: int | None = None) -> tuple[int,
 
 def aimed(lens: Lens, tolerance: float) -> float:
     """The chordal error (mm) that keeps the tolerance once float32 has rounded the corners."""
-    return max(0.1 * tolerance, min(GOAL * tolerance, tolerance - 2 * SINGLE * reach(lens)))
+    return max(0.1 * tolerance, min(GOAL * tolerance, tolerance - 2 * FLOAT32_ROUNDING * reach(lens)))
 
 
 def reach(lens: Lens) -> float:

@@ -66,7 +66,7 @@ from bstcad.cad.step_reading import parts_of, silence
 from bstcad.optics import quadrature
 from bstcad.optics.lens import Lens
 from bstcad.optics.quadrature import MassProperties
-from bstcad.scene.mount import GLASS, METAL, Part
+from bstcad.scene.mount import LENS_COLOUR, MIRROR_COLOUR, Part
 
 if TYPE_CHECKING:
     import cadquery
@@ -95,7 +95,7 @@ def write_lens(
     part: the file states its facts; None: a colour.  properties: those of the lens, where they are known already.
     ValueError if the lens's faces bound no solid.
     """
-    part = part or Part(colour=GLASS if lens.passes.enters else METAL)
+    part = part or Part(colour=LENS_COLOUR if lens.passes.enters else MIRROR_COLOUR)
     shape, faces = lens_shape(lens)
     write(shape, path, name, part, faces=faces, properties=properties or quadrature.of_lens(lens))
 

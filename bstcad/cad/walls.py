@@ -37,7 +37,7 @@ from bstcad.cad import patches, wires
 from bstcad.cad.wires import Curve, Piece
 from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
 from bstcad.optics.surfaces import Plane, Surface, sag, sampled
-from bstcad.scene.mount import MOST_DRAFT, STEEPEST
+from bstcad.scene.mount import MAX_DRAFT, MIN_CLOSING
 
 TOLERANCE = 1e-7  # mm, of every face, edge and vertex
 RIM = 1e-8  # mm; how far an edge may leave the exact one
@@ -274,9 +274,9 @@ class Draft:
     bevel: float = 0.0  # mm along z, taken at 45 degrees off their edge with the front
 
     def __post_init__(self) -> None:
-        if not 0 <= self.angle <= MOST_DRAFT:
+        if not 0 <= self.angle <= MAX_DRAFT:
             raise ValueError(
-                f"draft: {self.angle:g} degrees is not between 0 and {MOST_DRAFT:g}; choose an angle in between"
+                f"draft: {self.angle:g} degrees is not between 0 and {MAX_DRAFT:g}; choose an angle in between"
             )
         if not 0 <= self.bevel < math.inf:
             raise ValueError(f"bevel: {self.bevel:g} mm; give none, 0, or more")
@@ -332,12 +332,12 @@ class LeaningPiece:
             height, *slopes = sampled(self.front, *(start + tangent * depth[:, None] * inwards).T)
             closing = 1 + tangent * (np.stack(slopes, axis=1) * inwards).sum(axis=1)  # mm a mm of depth
             least = np.minimum(least, closing)
-            step = (z - depth - height) / np.maximum(closing, STEEPEST)
+            step = (z - depth - height) / np.maximum(closing, MIN_CLOSING)
             depth = depth + step
             if np.abs(step).max() <= EXACT * (1 + np.abs(z).max()):
                 break
         worst = int(least.argmin())
-        if not least[worst] > STEEPEST or not np.abs(step).max() <= TOLERANCE:
+        if not least[worst] > MIN_CLOSING or not np.abs(step).max() <= TOLERANCE:
             name, angle = ("bevel", 45.0) if tangent == 1 else ("draft", self.draft.angle)
             raise ValueError(
                 "{}: at ({:.4g}, {:.4g}) mm the front is too steep for a wall that leans by {:g} degrees to meet it; "

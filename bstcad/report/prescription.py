@@ -28,7 +28,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.media import density
 from bstcad.optics.surfaces import Surface, sag
 from bstcad.report.units import Rows, paragraphs, tables
-from bstcad.scene.blank import FITTED
+from bstcad.scene.blank import FIT_TOLERANCE
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
 from bstcad.scene.schema import FileContent
@@ -65,7 +65,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
     front, material = lens.front, scene.lens.material
     own = scene.lens.front.designed(front).surface.plain().parameters()  # heights, if it is a net
     numbers = ({"curvature": 0.0} if front.level else {}) | {n: v for n, v in own.items() if isinstance(v, float)}
-    fitted = {"within": FITTED} if front.is_net and scene.lens.front.kind != "bspline" else {}  # mm
+    fitted = {"within": FIT_TOLERANCE} if front.is_net and scene.lens.front.kind != "bspline" else {}  # mm
     heavy = density(material) if material else None
     held = ((each.name, getattr(scene.source, each.name)) for each in fields(scene.source))
     files = {name: value.name for name, value in held if isinstance(value, FileContent)}

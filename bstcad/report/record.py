@@ -307,7 +307,7 @@ def contents_of(
         stability=proof.stability,
         blur=proof.blur,
         finest_detail=_finest_detail(scene, proof, goal.receiver, estimates),
-        picture=scene.of_pictures(),
+        picture=scene.picture_remarks(),
         lines=tuple(Line(line.wavelength, line.share, rrmsd(goal.picture, line.picture)) for line in proof.lines),
         estimates=estimates,
         flat_tops=tuple(flat_tops(scene, proof)),

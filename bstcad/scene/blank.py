@@ -1,4 +1,4 @@
-"""The lens before tailoring: its outline, its front, its back, and the bounds that the back keeps to."""
+"""The lens before tailoring: outline, front, back, and the bounds on its tailored faces."""
 
 from __future__ import annotations
 
@@ -30,26 +30,26 @@ from bstcad.step_text.placement import own_frame
 if TYPE_CHECKING:  # which loads numba
     from bstcad.optics.bspline import BSplineSurface
 
-# Largest and least (1 + k) c² r² of a conic at the rim: a sphere that stands upright has 1; below the least, a cone.
-UPRIGHT, CONE = 0.85, -7.0
-STEEP_NET = 60.0  # degrees; steepest slope at the rim of a surface for which a net stands
-STEEPEST = 80.0  # degrees; steepest slope at the rim of a front with an outline of its own, a height over a plane
-FLATTEST = 1e-3  # mm; least sag of such a front at its rim, by which its edge is one
-LEAST_BESIDE = 1e-2  # mm; least distance between the outline of a front and that of the lens
+# Range of (1 + k) c² r² of a conic at the rim: 1 has a vertical tangent; below the minimum it is nearly a cone.
+MIN_CONIC_BEND, MAX_CONIC_BEND = -7.0, 0.85
+MAX_FITTED_SLOPE = 60.0  # degrees; steepest slope at the rim of a surface to which a net is fitted
+MAX_RECESS_SLOPE = 80.0  # degrees; steepest slope at the rim of a front with an outline of its own
+MIN_RECESS_SAG = 1e-3  # mm; smallest sag of such a front at its rim, so that it has an edge
+MIN_RECESS_GAP = 1e-2  # mm; smallest distance between the outline of a front and that of the lens
 CONIC_CONSTANTS = (-1e3, 1e3)
 INDICES = (1.01, 5.0)  # range of the refractive index
-BOUNDS = ("tool_radius", "max_slope", "max_thickness", "edge_thickness")  # the keys of LensBlank that bound the back
+BOUNDS = ("tool_radius", "max_slope", "max_thickness", "edge_thickness")  # keys of LensBlank that bound tailored faces
 
-NET_FILE = "front.npz"  # the copy of a given net beside a design
+NET_FILE = "front.npz"  # file name of the copy of a given net beside a design
 NET_REMEDY = "give the folder of a design, its design.npz or its lens.step"
-LEVEL = 1e-9  # sine of the angle between a side of a net and an axis of the file; a larger one is a turn
-UNIFORM = 1e-9  # mm; a net further from uniform in x and y is not one of ours
-ROUNDING = 1e-12  # mm; a net whose vertex is so near to zero is measured from there already
-LARGEST_NET = 2049  # control points a side
-FITTED = 1e-6  # mm; largest distance of a net from the surface for which it stands: a toroid, or one of one's own
-FITS = (33, 65, 129, 257, 513, 1025)  # control points a side of such a net, tried in turn
-OBLONG = 1.5  # a cell of the net longer than so many times its width is doubted
-FEWEST_ROUND = 6  # control points a side; a net of 5 has no two spans to reach past the rim of a round lens
+AXIS_TOLERANCE = 1e-9  # sine of the angle between a side of a net and an axis of the file; a larger one is a turn
+UNIFORM_TOLERANCE = 1e-9  # mm; largest deviation of a net from uniform spacing in x and y
+VERTEX_TOLERANCE = 1e-12  # mm; a net whose vertex is this near to z = 0 is not shifted
+MAX_CONTROL_POINTS = 2049  # control points per side of a net
+FIT_TOLERANCE = 1e-6  # mm; largest distance between a fitted net and its surface (a toroid, or a user's own)
+FIT_SIZES = (33, 65, 129, 257, 513, 1025)  # control points per side of a fitted net, tried in turn
+MAX_CELL_RATIO = 1.5  # ratio of length and width of a cell of the net above which the scene is doubted
+MIN_ROUND_POINTS = 6  # control points per side; a net of 5 has no two spans to spare outside a round rim
 
 Outlined = Annotated[Rectangle | Circle, Field(discriminator="shape")]
 
@@ -59,24 +59,24 @@ Outlined = Annotated[Rectangle | Circle, Field(discriminator="shape")]
 
 @dataclass(frozen=True)
 class GivenNet(FileContent):
-    """A B-spline surface with its vertex at z = 0; the scene keeps it whole, so that a design can be repeated."""
+    """A B-spline surface with its vertex at z = 0; the scene holds its heights, so that a design can be repeated."""
 
     name = NET_FILE
     shape: tuple[int, int]  # control points along x and along y
-    x: tuple[float, float]  # extent (mm)
-    y: tuple[float, float]
-    data: bytes = field(repr=False)  # heights (m, n) over the vertex (mm), x along the first axis, as float64
+    x: tuple[float, float]  # extent along x, mm, in the frame of the lens
+    y: tuple[float, float]  # extent along y, mm
+    data: bytes = field(repr=False)  # heights of the control points above the vertex, (m, n), mm, float64
 
     @classmethod
     def of(cls, surface: BSplineSurface) -> GivenNet:
-        """The net of a surface, wherever that lies."""
+        """Return the net of a surface, which may lie at any z."""
         resting = surface.plain().moved(0.0)
         vertex = resting.from_vertex()
-        heights = (vertex if abs(vertex.z) > ROUNDING else resting).heights
+        heights = (vertex if abs(vertex.z) > VERTEX_TOLERANCE else resting).heights
         return cls(surface.shape, tuple(surface.x), tuple(surface.y), heights.numpy().astype("<f8").tobytes())
 
     def surface(self, z: float) -> BSplineSurface:
-        """The surface with its vertex at z (mm)."""
+        """Return the surface with its vertex at z (mm)."""
         from bstcad.optics.bspline import BSplineSurface
 
         heights = np.frombuffer(self.data, "<f8").reshape(self.shape).astype(np.float64)
@@ -84,16 +84,16 @@ class GivenNet(FileContent):
 
     @property
     def copy(self) -> bytes:
-        """An .npz file that `read_net` reads as this net: control_points (m, n, 3) in mm."""
+        """Content of an .npz file that `read_net` reads as this net: control_points (m, n, 3) in mm."""
         file = io.BytesIO()
         np.savez_compressed(file, control_points=self.surface(0.0).control_points())
         return file.getvalue()
 
 
 def read_net(path: Path) -> GivenNet:
-    """The back face of the design at `path`; SceneError if there is none, or it is damaged.
+    """Read the back face of the design at `path`; SceneError if there is none, or it is damaged.
 
-    That of a STEP file lies as the file places it, of which the shift along z is of no matter.
+    A face of a STEP file keeps its position in x and y; its shift along z is dropped.
     """
     from bstcad.optics.bspline import SMALLEST_NET, BSplineSurface
 
@@ -102,14 +102,15 @@ def read_net(path: Path) -> GivenNet:
     if not os.path.lexists(path):
         raise SceneError(f"lens.front.file: {name} not found; {NET_REMEDY}, relative to the scene file")
     try:
-        net = _net_of_step(path) if path.suffix.lower() in (".step", ".stp") else files.net(path, LARGEST_NET)
-    except Exception as error:  # numpy, zipfile, zlib and tokenize each raise their own for a damaged file
+        net = _net_of_step(path) if path.suffix.lower() in (".step", ".stp") else files.net(path, MAX_CONTROL_POINTS)
+    except Exception as error:  # numpy, zipfile, zlib and tokenize raise errors of their own for a damaged file
         raise SceneError(f"lens.front.file: {name} cannot be read ({files.first_line(error)}); {NET_REMEDY}") from None
     shape = net.shape[:2]
     axes = (np.linspace(net[0, 0, i], net[-1, -1, i], count) for i, count in enumerate(shape))
     uniform = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    if min(shape) < SMALLEST_NET or not np.isfinite(net).all() or not np.abs(net[..., :2] - uniform).max() <= UNIFORM:
-        raise SceneError(f"lens.front.file: {name} holds no net of a design; {NET_REMEDY}")
+    deviation = np.abs(net[..., :2] - uniform).max()
+    if min(shape) < SMALLEST_NET or not np.isfinite(net).all() or not deviation <= UNIFORM_TOLERANCE:
+        raise SceneError(f"lens.front.file: {name} does not hold the net of a design; {NET_REMEDY}")
     return GivenNet.of(BSplineSurface.from_control_points(net, 0.0))
 
 
@@ -118,24 +119,24 @@ def _net_of_step(path: Path) -> np.ndarray:
 
     text = part21.read(path)
     if text.solids != 1:
-        raise ValueError(f"{text.solids} solids in it, and a lens is one")
+        raise ValueError(f"it has {text.solids} solids, and a lens is one solid")
     surface, shape = text.surface, text.surface.control_points.shape[:2]
-    ours = (np.array_equal(full, knots(m)) for full, m in zip(surface.full_knots, shape, strict=True))
-    if surface.degrees != (2, 2) or not all(ours):
+    uniform = (np.array_equal(full, knots(m)) for full, m in zip(surface.full_knots, shape, strict=True))
+    if surface.degrees != (2, 2) or not all(uniform):
         raise ValueError("its freeform face has other knots than bstcad's")
     return _along_axes(surface.control_points)
 
 
 def _along_axes(net: np.ndarray) -> np.ndarray:
-    """A net (m, n, 3) as a height over x and y, with x rising along its first axis and y along its second.
+    """Return a net (m, n, 3) with x increasing along its first axis and y along its second.
 
-    ValueError if its lens is turned so that the axis is not along z, or the sides of the net not along x and y.
+    ValueError if the axis of its lens is not along z, or the sides of the net are not along x and y.
     """
     frame = own_frame(net)
     sines = np.abs(frame.rotation)
-    if not (np.abs(sines - sines.round()).max() <= LEVEL and sines[2, 2] > 0.5):
-        over = "a front is a height over x and y, and the sides of its net lie along them"
-        raise ValueError(f"its lens is {frame.turn_words}, and {over}: export it unturned")
+    if not (np.abs(sines - sines.round()).max() <= AXIS_TOLERANCE and sines[2, 2] > 0.5):
+        needed = "the axis of a front must be along z, and the sides of its net along x and y"
+        raise ValueError(f"its lens is {frame.turn_words}, but {needed}: export it without that turn")
     along = np.abs(net[-1, 0, :2] - net[0, 0, :2])
     net = net.transpose(1, 0, 2) if along[1] > along[0] else net
     for axis in (0, 1):
@@ -143,18 +144,18 @@ def _along_axes(net: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(net)
 
 
-Z = Key("Where it crosses the axis, its vertex.", "mm", *COORDINATES, example=8.0)
+Z = Key("Position of the vertex on the axis.", "mm", *COORDINATES, example=8.0)
 CURVATURE = Key("Curvature at the vertex; positive bends towards +z.", "1/mm", -1e3, 1e3)
 OUTLINE = Key(
-    "Outline of its own, inside the lens's: the lens's underside around it is a plane through its rim.",
+    "Outline of the front, inside the lens's; the lens around it ends in a plane through the front's rim.",
     example={"shape": "circle", "diameter": 10.0},
 )
-OPTIMISE = Key("Parameters that tailoring finds: true for all of them, or a list of names.")
+OPTIMISE = Key("Parameters that tailoring finds: true for all, or a list of names.")
 NetFile = from_file(GivenNet, read_net, "file = 'outputs/earlier'")
 
 
 def _some(*names: str) -> Any:
-    """The type of `optimise`: false, true for all of these parameters, or a list of them."""
+    """Return the type of `optimise`: false, true for all of these parameters, or a list of them."""
     listed = Annotated[tuple[Literal[names], ...], BeforeValidator(tuple), Tag("list")]
     tag = Discriminator(lambda given: "list" if isinstance(given, list | tuple) else "flag")
     return Annotated[Annotated[bool, Tag("flag")] | listed, tag]
@@ -163,64 +164,64 @@ def _some(*names: str) -> Any:
 class _Front:
     optimise: bool | tuple[str, ...] = False
     outline: Circle | None = None
-    given: GivenNet | None = None  # the net of a freeform front, or the one that its tailoring starts from
-    shaped = False  # is it a net that tailoring shapes?
+    given: GivenNet | None = None  # net of a freeform front, with which its tailoring starts; None: no file
+    shaped = False  # True for a net that tailoring shapes
     reflect: bool = False
 
     @property
     def surface(self) -> Surface:
-        """The surface in the terms of optics."""
+        """The surface of optics."""
         return self.optical if self.outline is None else Recess(self.optical, self.outline)
 
     @property
     def optical(self) -> Surface:
-        """The surface without an outline of its own."""
+        """The surface of optics without an outline of its own."""
         of, _ = FRONTS[self.kind]
         return of(**{each.name: getattr(self, each.name) for each in fields(of)})
 
     def traced(self, outline: Outline) -> Surface:
-        """Return the surface that a lens of this outline has: the front's own, or the net that stands for it."""
+        """Return the surface as a lens of this outline has it: the front's own, or a net fitted to it."""
         return self.surface
 
     @property
     def fixed(self) -> bool:
-        """Is nothing of it left for tailoring to find?"""
+        """True if tailoring does not change the front."""
         return not (self.free or self.shaped)
 
     @property
     def free(self) -> tuple[str, ...]:
-        """The parameters of the surface that tailoring is to find, by name."""
+        """Names of the parameters of the surface that tailoring finds."""
         names = tuple(self.surface.parameters()) if self.optimise else ()
         return names if self.optimise is True else tuple(name for name in names if name in self.optimise)
 
     def designed(self, surface: Surface) -> Self:
-        """The same front with the parameters of this surface, and nothing left to find."""
+        """Return the front with the parameters of this surface, all of them fixed."""
         return replace(self, **surface.plain().parameters(), optimise=False) if self.free else self
 
     def complaints(self, outline: Outline) -> Iterator[str]:
-        """Everything that keeps the front from a lens of this outline, each as "key: sentence"."""
+        """Yield the faults of the front for a lens of this outline, each as "key: sentence"."""
         own, half = self.outline, min(outline.half_extent)
         if own is None:
             return
-        if not own.radius <= half - LEAST_BESIDE:
-            size = f"{2 * own.radius:g} mm, and the lens is {2 * half:g} mm wide"
-            yield f"outline.diameter: {size}; make it smaller, or leave the outline out"
+        if not own.radius <= half - MIN_RECESS_GAP:
+            size = f"{2 * own.radius:g} mm is too large, as the lens is {2 * half:g} mm wide"
+            yield f"outline.diameter: {size}; make it smaller, or remove the outline"
         if self.free:
-            yield "optimise: a front with an outline of its own keeps its shape; leave out one of the two"
+            yield "optimise: a front with an outline of its own cannot be optimised; remove one of the two"
         reached = self.optical.reaches(*(torch.tensor(p, dtype=torch.float64) for p in own.farthest))
         _, slope, _ = self.optical.relative_sag_and_slope(*(torch.tensor(p, dtype=torch.float64) for p in own.farthest))
         steep = math.degrees(math.atan(abs(float(slope)))) if bool(reached) else 90.0
-        if not steep <= STEEPEST:
-            stands = "does not reach it" if steep == 90.0 else f"stands at {steep:.3g} degrees there"
-            why = f"the {self.kind} {stands}, and a height over a plane carries {STEEPEST:g}"
-            yield f"outline.diameter: at its rim, {own.radius:g} mm from the axis, {why}; make the outline smaller"
-        if not max(map(abs, self.surface.sags(own))) >= FLATTEST:
-            yield f"outline: a front so flat (curvature {self.curvature:g} 1/mm) has no edge of its own; leave it out"
+        if not steep <= MAX_RECESS_SLOPE:
+            ends = f"ends nearer to the axis than its rim, at {own.radius:g} mm"
+            slope = f"has a slope of {steep:.3g} degrees at its rim, and {MAX_RECESS_SLOPE:g} is the maximum"
+            yield f"outline.diameter: the {self.kind} {ends if steep == 90.0 else slope}; make the outline smaller"
+        if not max(map(abs, self.surface.sags(own))) >= MIN_RECESS_SAG:
+            yield f"outline: a front of curvature {self.curvature:g} 1/mm is too flat to have an edge; remove outline"
 
 
 @dataclass(frozen=True)
 class PlaneFront(_Front):
-    """z = const."""
+    """A plane, z = const."""
 
     z: Annotated[float, Z]
     kind: Annotated[Literal["plane"], Key("A plane across the axis.")] = "plane"
@@ -230,7 +231,7 @@ class PlaneFront(_Front):
 
 @dataclass(frozen=True)
 class SphereFront(_Front):
-    """A sphere; of curvature 0 it is a plane."""
+    """A sphere; a plane if the curvature is 0."""
 
     z: Annotated[float, Z]
     curvature: Annotated[float, CURVATURE] = 0.0
@@ -241,76 +242,77 @@ class SphereFront(_Front):
     __pydantic_config__ = STRICT
 
     def complaints(self, outline: Outline) -> Iterator[str]:
-        """It ends inside the lens."""
+        """Yield the faults; a sphere must reach the rim of the lens."""
         yield from super().complaints(outline)
         if self.outline is not None:
             return
         if not bool(self.surface.reaches(*(torch.tensor(p, dtype=torch.float64) for p in outline.farthest))):
             rim, radius = math.hypot(*outline.farthest), 1 / abs(self.curvature)
-            remedy = "make it smaller, or give lens.front an outline of its own"
-            yield f"curvature: a sphere of radius {radius:g} mm ends before the rim, at {rim:g} mm; {remedy}"
+            remedy = "make the curvature smaller, or give lens.front an outline of its own"
+            yield f"curvature: a sphere of radius {radius:g} mm does not reach the rim, at {rim:g} mm; {remedy}"
 
 
 @dataclass(frozen=True)
 class ConicFront(_Front):
-    """A conic that is turned about the axis."""
+    """A conic of revolution about the axis."""
 
     z: Annotated[float, Z]
     curvature: Annotated[float, CURVATURE] = 0.0
     conic_constant: Annotated[float, Key("0 is a sphere, -1 a paraboloid.", "", *CONIC_CONSTANTS)] = 0.0
     outline: Annotated[Circle | None, OUTLINE] = None
     optimise: Annotated[_some("curvature", "conic_constant"), OPTIMISE] = False
-    kind: Annotated[Literal["conic"], Key("A conic turned about the axis.")] = "conic"
+    kind: Annotated[Literal["conic"], Key("A conic of revolution about the axis.")] = "conic"
 
     __pydantic_config__ = STRICT
 
     def complaints(self, outline: Outline) -> Iterator[str]:
-        """It ends in the lens or nearly, is nearly a cone, or its shape does not depend on its free parameter."""
+        """Yield the faults: a conic too steep at the rim, nearly a cone, or independent of its free parameter."""
         yield from super().complaints(outline)
         outline = self.outline or outline
         rim = sum(p * p for p in outline.farthest) ** 0.5
         bend = (1 + self.conic_constant) * (self.curvature * rim) ** 2
         conic = f"a conic of constant {self.conic_constant:g} and radius {1 / (self.curvature or 1):g} mm"
-        if bend > UPRIGHT:
-            yield f"curvature: {conic} ends or stands nearly upright {rim:g} mm from the axis; make it smaller"
-        if bend < CONE:
+        if bend > MAX_CONIC_BEND:
+            yield f"curvature: {conic} ends or is too steep {rim:g} mm from the axis; make the curvature smaller"
+        if bend < MIN_CONIC_BEND:
             yield f"conic_constant: {conic} is nearly a cone {rim:g} mm from the axis; give a constant nearer to -1"
         if self.free == ("conic_constant",) and self.curvature == 0:
-            yield "optimise: a front of curvature 0 has one shape for all conic constants; give a curvature, or true"
+            same = "a front of curvature 0 has the same shape with all conic constants"
+            yield f"optimise: {same}; give a curvature, or write optimise = true"
 
 
 class _FittedFront(_Front):
-    """A front for which the lens has a net within FITTED; its curvatures are curvature_x and curvature_y."""
+    """A front that the lens approximates by a net, with curvatures curvature_x and curvature_y."""
 
     def traced(self, outline: Outline) -> Surface:
-        """Return the net that stands for it, its vertex at z."""
+        """Return the net within FIT_TOLERANCE of the surface, its vertex at z."""
         return _net_of(self.surface, outline)
 
     def complaints(self, outline: Outline) -> Iterator[str]:
-        """It ends before the rim, or stands too steeply there for a net."""
+        """Yield the faults: a surface that does not reach the rim, or is too steep there for a net."""
         x, y = map(torch.from_numpy, outline.places())
         _, z_x, z_y = self.surface.relative_sag_and_slope(x, y)
         slope = math.degrees(math.atan(float(torch.hypot(z_x, z_y).max())))
-        if slope <= STEEP_NET and bool(self.surface.reaches(x, y).all()):
+        if slope <= MAX_FITTED_SLOPE and bool(self.surface.reaches(x, y).all()):
             return
         half = dict(zip(("curvature_x", "curvature_y"), outline.half_extent, strict=True))
         name = max(half, key=lambda name: abs(getattr(self, name)) * half[name])
-        why = f"ends before the rim, or is steeper than {STEEP_NET:g} degrees there; make the curvature smaller"
-        yield f"{name}: a radius of {1 / abs(getattr(self, name)):g} mm {why}"
+        why = f"does not reach the rim, or is steeper than {MAX_FITTED_SLOPE:g} degrees there"
+        yield f"{name}: a toroid of radius {1 / abs(getattr(self, name)):g} mm {why}; make the curvature smaller"
 
 
 @dataclass(frozen=True)
 class ToroidFront(_FittedFront):
-    """A toroid, of another curvature along x than along y."""
+    """A toroid, with different curvatures along x and y."""
 
     z: Annotated[float, Z]
     curvature_x: Annotated[
         float, Key("Curvature along x at the vertex; positive bends towards +z.", "1/mm", -1e3, 1e3, example=0.02)
     ] = 0.0
     curvature_y: Annotated[
-        float, Key("Curvature along y; the circle along x is turned about its centre.", "1/mm", -1e3, 1e3, example=0.01)
+        float, Key("Curvature along y, of the circle on which the arc along x turns.", "1/mm", -1e3, 1e3, example=0.01)
     ] = 0.0
-    kind: Annotated[Literal["toroid"], Key("A toroid; of one curvature 0 a cylinder.")] = "toroid"
+    kind: Annotated[Literal["toroid"], Key("A toroid; a cylinder if one curvature is 0.")] = "toroid"
 
     __pydantic_config__ = STRICT
 
@@ -322,35 +324,34 @@ def _net_of(surface: Surface, outline: Outline) -> BSplineSurface:
 
 @dataclass(frozen=True)
 class NetFront(_Front):
-    """A freeform front: the back of an earlier design, moved along z, or one that is tailored, from there or flat."""
+    """A freeform front: the back of an earlier design, moved along z, or a net that is tailored."""
 
     z: Annotated[float, Z]
     file: Annotated[
         NetFile | None, Key("Folder of a design, its design.npz or its lens.step.", example="outputs/earlier")
     ] = None
-    optimise: Annotated[bool, Key("It is tailored, from the net of the file, or else flat.", example=True)] = False
+    optimise: Annotated[
+        bool, Key("The front is tailored, starting with the net of the file, or flat without one.", example=True)
+    ] = False
     control_points: Annotated[
         OneOrTwo | None,
         Key(
-            "Control points along each side, or [along x, along y]; as many as the back's if absent.",
-            "",
-            5,
-            LARGEST_NET,
-            example=513,
+            "Control points along each side, or [along x, along y]; those of the back if absent.", "",
+            5, MAX_CONTROL_POINTS, example=513,
         ),
-        BeforeValidator(lambda given: tuple(given) if isinstance(given, list) else given),  # as strict reading asks
-    ] = None
+        BeforeValidator(lambda given: tuple(given) if isinstance(given, list) else given),  # strict: a tuple
+    ] = None  # fmt: skip
     reflect: Annotated[
-        bool, Key("A mirror: light comes along -z through the back, and leaves through the back.", example=True)
+        bool, Key("A mirror: light enters along -z through the back, and leaves through the back.", example=True)
     ] = False
-    kind: Annotated[Literal["bspline"], Key("A freeform face: of an earlier design, or tailored.")] = "bspline"
+    kind: Annotated[Literal["bspline"], Key("A freeform face of an earlier design, or a tailored one.")] = "bspline"
 
     written = leaving_out(optimise=False, reflect=False)
     __pydantic_config__ = STRICT
 
     @property
     def surface(self) -> Surface:
-        """The surface in the terms of optics; flat before it is tailored."""
+        """The surface of optics; a plane before tailoring if there is no file."""
         return Plane(self.z) if self.file is None else self.file.surface(self.z)
 
     @property
@@ -360,48 +361,51 @@ class NetFront(_Front):
 
     @property
     def shaped(self) -> bool:
-        """Is it a net that tailoring shapes?"""
+        """True if tailoring shapes the net."""
         return self.optimise
 
     @property
     def free(self) -> tuple[str, ...]:
-        """None by name: it has its heights."""
+        """No names: a net has heights instead of parameters."""
         return ()
 
     def complaints(self, outline: Outline) -> Iterator[str]:
-        """It is of nothing, or of a lens of another outline; a net may also end at the sides of a rectangle."""
+        """Yield the faults: no file and not tailored, or a net of a lens with another outline.
+
+        A net may end two spans outside the outline, or at the sides of a rectangle.
+        """
         if self.reflect and not self.optimise:
-            yield "reflect: tailoring begins with the face that reflects; add optimise = true"
+            yield "reflect: the face that reflects must be tailored; add optimise = true"
         if self.file is None:
             if not self.optimise:
                 yield 'file: missing, and the front is not tailored; add file = "outputs/earlier", or optimise = true'
-            yield from (f"control_points: {complaint}" for complaint in of_net(outline, self.control_points))
+            yield from (f"control_points: {complaint}" for complaint in net_complaints(outline, self.control_points))
             return
         if self.control_points is not None:
-            yield "control_points: the front has those of its file; remove one of the two"
+            yield "control_points: the file gives the control points of the front; remove one of the two"
         own, sides = net_extent(outline, self.file.shape), outline.half_extent
         for name, ends, half, side in zip("xy", (self.file.x, self.file.y), own, sides, strict=True):
             middle = (ends[0] + ends[1]) / 2
-            if abs(middle) > UNIFORM and abs(ends[1] - ends[0] - 2 * half) <= 4 * UNIFORM:
-                place = f"its net lies about {name} = {middle:.6g} mm and not about the axis"
-                yield f"file: {place}; export the lens centred on its axis, or give its design"
+            if abs(middle) > UNIFORM_TOLERANCE and abs(ends[1] - ends[0] - 2 * half) <= 4 * UNIFORM_TOLERANCE:
+                position = f"its net is centred at {name} = {middle:.6g} mm and not on the axis"
+                yield f"file: {position}; export the lens centred on its axis, or give its design"
                 continue
             known = (half,) if outline.is_round else (half, side)
-            if min(max(abs(ends[0] + end), abs(ends[1] - end)) for end in known) > UNIFORM:
+            if min(max(abs(ends[0] + end), abs(ends[1] - end)) for end in known) > UNIFORM_TOLERANCE:
                 covers = f"{name} = {ends[0]:g} to {ends[1]:g} mm, and not {-half:g} to {half:g} mm"
                 yield f"file: its net covers {covers}; give a design of the same outline"
 
 
-FRONTS = {  # by their kind: the surface of optics, and the record
+FRONTS = {  # surface of optics and record of each kind of front
     "plane": (Plane, PlaneFront), "sphere": (Sphere, SphereFront), "conic": (Conic, ConicFront),
     "toroid": (Toroid, ToroidFront),
 }  # fmt: skip
 
 
 def as_front(value: Any, outline: Outline | None = None) -> Any:
-    """The front of a scene that is a surface of optics; any other value stays as it is.
+    """Return the front of a scene for a surface of optics; return any other value as it is.
 
-    outline: of the lens, for a surface of another kind than a scene has: it becomes a net within FITTED.
+    outline: outline of the lens, inside which a net is fitted to a surface of a kind that a scene does not have.
     """
     if not hasattr(value, "relative_sag_and_slope"):
         return value
@@ -412,49 +416,50 @@ def as_front(value: Any, outline: Outline | None = None) -> Any:
         own = {} if value.outline is None else {"outline": value.outline}
         return front(value.z, **value.parameters(), **own)
     if outline is None:
-        raise ValueError(f"a scene has no {value.kind}; give it by scene.changed, which fits a net to it")
+        raise ValueError(f"a scene cannot hold a {value.kind}; use scene.changed, which fits a net to it")
     return as_front(fitted(value, outline))
 
 
 def fitted(surface: Surface, outline: Outline) -> BSplineSurface:
-    """The net of least size that lies within FITTED of a surface inside the outline; SceneError if there is none."""
+    """Fit the smallest net within FIT_TOLERANCE of a surface inside the outline; SceneError if there is none."""
     from bstcad.optics.bspline import BSplineSurface
 
-    for m in FITS:
+    for m in FIT_SIZES:
         half_x, half_y = net_extent(outline, m)
         net = BSplineSurface.fitted(surface, (-half_x, half_x), (-half_y, half_y), m)
         along = (torch.linspace(-half, half, 2 * m + 1, dtype=torch.float64) for half in outline.half_extent)
         x, y = torch.meshgrid(*along, indexing="ij")
         inside = outline.contains(x, y)
-        off = (net.sag_and_slope(x, y)[0] - surface.plain().sag_and_slope(x, y)[0])[inside].abs().max()
-        if off <= FITTED:
+        error = (net.sag_and_slope(x, y)[0] - surface.plain().sag_and_slope(x, y)[0])[inside].abs().max()
+        if error <= FIT_TOLERANCE:
             return net
     raise SceneError(
-        f"lens.front: {FITS[-1]} x {FITS[-1]} control points come within {float(off):.2g} mm of the {surface.kind}, "
-        f"and {FITTED:g} mm are allowed; give a smoother surface, finite to ±{half_x:g} mm in x and ±{half_y:g} mm in y"
+        f"lens.front: a net of {m} x {m} control points deviates from the {surface.kind} by {float(error):.2g} mm, and "
+        f"{FIT_TOLERANCE:g} mm is the maximum; give a smoother surface, finite to ±{half_x:g} mm in x and "
+        f"±{half_y:g} mm in y"
     )
 
 
 def net_extent(outline: Outline, net: Sides) -> tuple[float, float]:
-    """Half the width of a net in x and y (mm): it reaches two spans past the rim of the lens.
+    """Return half the width of a net in x and y (mm): it extends two spans past the rim of the lens.
 
-    So x(t) is linear all over the lens.  In the end spans x(t) is quadratic, and the slope z'(t) / x'(t) a Möbius
-    function of t, whose derivative grows eightfold inwards across 1.5 control points, whatever the heights: the light's
-    rim would be too bright, and dark beside it.  A net of 5 has no spans to spare.
+    Then x(t) is linear inside the rim.  In the end spans x(t) is quadratic, and the slope z'(t) / x'(t) a Möbius
+    function of t: its derivative grows eightfold inwards across 1.5 control points, for any heights.  The rim of the
+    light would be too bright, with a dark line beside it.  A net of 5 control points has no spans to spare.
     """
     reach = ((m - 1) / (m - 5) if m > 5 else 1.0 for m in both(net))
-    half_x, half_y = (share * half for share, half in zip(reach, outline.half_extent, strict=True))
+    half_x, half_y = (factor * half for factor, half in zip(reach, outline.half_extent, strict=True))
     return half_x, half_y
 
 
-def of_net(outline: Outline, points: Sides | None) -> Iterator[str]:
-    """Complaints about the number of control points of a net over an outline; None: they are chosen later."""
-    m, n = both(points or FEWEST_ROUND)
+def net_complaints(outline: Outline, points: Sides | None) -> Iterator[str]:
+    """Complain of the number of control points of a net over an outline; None: it is chosen later."""
+    m, n = both(points or MIN_ROUND_POINTS)
     if outline.is_round and m != n:
-        yield f"a round lens (lens.outline) takes a square net, not one of {m} x {n}; give one number"
-    if outline.is_round and m < FEWEST_ROUND:
-        few = f"{m} are too few for a round lens, whose net reaches two spans beyond its rim"
-        yield f"{few}; give {FEWEST_ROUND} or more"
+        yield f"a round lens (lens.outline) needs a square net, not {m} x {n} control points; give one number"
+    if outline.is_round and m < MIN_ROUND_POINTS:
+        few = f"{m} is too few for a round lens, whose net extends two spans past its rim"
+        yield f"{few}; give {MIN_ROUND_POINTS} or more"
 
 
 Front = Annotated[
@@ -467,33 +472,30 @@ Front = Annotated[
 
 
 class Back(Record):
-    """The freeform face before tailoring: a flat B-spline net at z; not optimised it stays so."""
+    """The back before tailoring: a flat B-spline net at z, which stays flat if it is not optimised."""
 
     kind: Annotated[Literal["bspline"], Key("The freeform face that bstcad finds.")] = "bspline"
-    z: Annotated[float, Key("Place of the flat face before tailoring.", "mm", *COORDINATES, example=20.0)]
+    z: Annotated[float, Key("Position of the flat face before tailoring.", "mm", *COORDINATES, example=20.0)]
     control_points: Annotated[
         OneOrTwo | None,
         Key(
-            "Control points of the net along each side, or [along x, along y]; chosen if absent.",
-            "",
-            5,
-            2049,
-            example=257,
+            "Control points of the net along each side, or [along x, along y]; bstcad chooses them if absent.", "",
+            5, MAX_CONTROL_POINTS, example=257,
         ),
-    ] = None
+    ] = None  # fmt: skip
     reflect: Annotated[bool, Key("A mirror: light comes along -z and goes back along +z.")] = False
     optimise: Annotated[
-        bool, Key("It is tailored; false: it stays flat, and the front is tailored alone.", example=False)
+        bool, Key("The back is tailored; false: it stays flat, and only the front is tailored.", example=False)
     ] = True
 
     written = leaving_out(optimise=True)
 
     @property
     def net(self) -> Sides:
-        """Control points a side, or along x and along y if these differ; SceneError where they are left out."""
+        """Control points per side, or along x and along y if these differ; SceneError if they are not given."""
         if self.control_points is None:
             raise SceneError(
-                "lens.back.control_points: left out, and nothing has chosen it yet; use bstcad.design, or give a number"
+                "lens.back.control_points: missing, and not chosen yet; use bstcad.design, or give a number"
             )
         return plain(self.control_points)
 
@@ -502,22 +504,22 @@ class Back(Record):
 class Bounds:
     """Bounds on tailored faces everywhere inside the outline; None: unbounded.
 
-    Valleys and ridges are those of the back, which a tool sees from +z; a front's tool sees them from -z.
+    A tool cuts the back from +z and the front from -z; valleys and ridges are meant as the tool sees them.
     """
 
-    concave: float | None = None  # largest curvature of a valley (1/mm), of the back one towards +z
-    convex: float | None = None  # of a ridge (1/mm)
-    slope: float | None = None  # steepest |∇z|
-    thinnest: float = 0.0  # mm; between front and back, along the axis
-    thickest: float | None = None  # mm
-    edge: float | None = None  # mm; least thickness along the rim
+    concave: float | None = None  # maximum curvature of a valley, 1/mm
+    convex: float | None = None  # maximum curvature of a ridge, 1/mm
+    slope: float | None = None  # maximum |∇z|
+    thinnest: float = 0.0  # minimum thickness along z, mm
+    thickest: float | None = None  # maximum thickness along z, mm
+    edge: float | None = None  # minimum thickness along the rim, mm
 
 
 class LensBlank(Record):
     """The lens before tailoring: light enters through the front and leaves through the back.
 
-    A mirror is a plate whose back, its upper face, reflects; its front is the rear of the plate.  Where the front
-    reflects, light crosses the back on its way to it and on its way out.
+    A mirror is a plate whose back, its upper face, reflects; its front is the rear of the plate.  If the front
+    reflects, light crosses the back before and after the front.
     """
 
     material: Annotated[str | None, Key("Name on refractiveindex.info; or give the index.")] = None
@@ -528,40 +530,40 @@ class LensBlank(Record):
         Back, Key("The face that is tailored.", example={"kind": "bspline", "z": 20.0, "control_points": 257})
     ]
     tool_radius: Annotated[
-        float | None, Key("Least radius of a tailored face's valleys, where a tool fits in.", "mm", 1e-6, 1e9)
+        float | None, Key("Minimum radius of the valleys of a tailored face: that of the tool.", "mm", 1e-6, 1e9)
     ] = None
     mould: Annotated[bool, Key("The tool cuts a mould: tool_radius bounds the ridges.", example=True)] = False
     max_slope: Annotated[
-        float | None, Key("Steepest angle of a tailored face against z = const.", "degrees", 1e-3, 89.0)
+        float | None, Key("Maximum angle of a tailored face to the plane z = const.", "degrees", 1e-3, 89.0)
     ] = None
-    min_thickness: Annotated[float, Key("Least thickness along z; faces make way to keep it.", "mm", *LENGTHS)] = 0.5
-    max_thickness: Annotated[float | None, Key("Greatest thickness along z.", "mm", *LENGTHS)] = None
-    edge_thickness: Annotated[float | None, Key("Least thickness along the rim.", "mm", *LENGTHS)] = None
+    min_thickness: Annotated[float, Key("Minimum thickness along z; faces move to keep it.", "mm", *LENGTHS)] = 0.5
+    max_thickness: Annotated[float | None, Key("Maximum thickness along z.", "mm", *LENGTHS)] = None
+    edge_thickness: Annotated[float | None, Key("Minimum thickness along the rim.", "mm", *LENGTHS)] = None
 
     @property
     def passes(self) -> Passes:
-        """The faces that light meets, in its order, and what each does to it."""
+        """Sequence of the faces that light meets, and how each bends it."""
         return MIRROR if self.back.reflect else SECOND_SURFACE if self.front.reflect else LENS
 
     @property
     def optic(self) -> str:
-        """ "lens" or "mirror"."""
+        """Kind of the optic: "lens" or "mirror"."""
         return self.passes.optic
 
     def index_at(self, wavelength: float) -> float:
-        """The refractive index at a wavelength (nm); 1 where light does not enter the solid."""
+        """Return the refractive index at a wavelength (nm); 1 if light does not enter the solid."""
         if not self.passes.enters:
             return 1.0
         return refractive_index(self.material, wavelength) if self.index is None else self.index
 
     @property
     def bounded_by(self) -> tuple[str, ...]:
-        """The keys that bound the tailored faces."""
+        """Keys of the scene that bound the tailored faces."""
         return tuple(key for key in BOUNDS if getattr(self, key) is not None)
 
     @property
     def bounds(self) -> Bounds | None:
-        """The bounds that the faces keep to while they are tailored; None: none is asked for."""
+        """Bounds on the tailored faces; None if the scene has none."""
         if not self.bounded_by:
             return None
         curvature = None if self.tool_radius is None else 1 / self.tool_radius
@@ -581,19 +583,19 @@ class LensBlank(Record):
 
     @property
     def front_surface(self) -> Surface:
-        """The front as the lens has it, before tailoring."""
+        """The front before tailoring, as kernels trace it."""
         return self.front.traced(self.outline)
 
     @property
     def shaped(self) -> tuple[Face, ...]:
-        """The faces that tailoring shapes, in the order of the light."""
+        """Faces that tailoring shapes, in the order of the light."""
         tailored = {"front": self.front.shaped, "back": self.back.optimise}
         return tuple(face for face in self.passes.faces if tailored[face])
 
     def front_net(self, net: Sides) -> Sides | None:
-        """Control points of a freeform front beside a back with those of `net`; None: the front has few numbers.
+        """Return the control points of a freeform front for a back of `net`; None if the front is no net.
 
-        A front that tailoring shapes keeps its proportion to the back, such as both once have; a given one has its own.
+        A tailored front keeps the scene's ratio of control points to the back; a fixed net keeps its own number.
         """
         if not self.front.shaped:
             front = self.front.given or self.front_surface
@@ -601,18 +603,18 @@ class LensBlank(Record):
         own = self.front.given.shape if self.front.given else self.front.control_points
         if own is None:
             return net
-        if self.back.control_points is None:  # the proportion is not known yet
+        if self.back.control_points is None:  # the ratio is not known yet
             return coarser(plain(own), max(both(net)))
         return in_proportion(net, of=self.back.net, to=plain(own))
 
     def nets(self, net: Sides | None = None) -> tuple[Sides, ...]:
-        """Control points of the freeform faces: of the back, `net` or as the scene has it, then of the front."""
+        """Return the control points of the back (default: the scene's), then those of a freeform front."""
         back = net or self.back.net
         front = self.front_net(back)
         return (back,) if front is None else (back, front)
 
     def flat_front(self, net: Sides, as_wide_as: Sides | None = None) -> Surface:
-        """The front before tailoring, beside a back with control points of `net`; as_wide_as: as Scene.flat_lens."""
+        """Return the front before tailoring for a back of `net`; as_wide_as: see Scene.flat_lens."""
         if not self.front.shaped:
             return self.front_surface
         if self.front.given is not None:
@@ -625,55 +627,54 @@ class LensBlank(Record):
 
     @property
     def cells(self) -> tuple[float, float]:
-        """Width and height of a cell of the net (mm)."""
+        """Width and height of a cell of the back's net (mm)."""
         half_x, half_y = net_extent(self.outline, self.back.net)
         m, n = both(self.back.net)
         return 2 * half_x / (m - 1), 2 * half_y / (n - 1)
 
     def doubts(self) -> Iterator[str]:
-        """Oblong cells: along their longer side the net carries less detail than it could with as many points."""
+        """Doubt oblong cells: with square cells the same number of control points carries finer detail."""
         if self.back.control_points is None:
             return
         (width, height), (m, n) = self.cells, both(self.back.net)
-        if max(width, height) <= OBLONG * min(width, height):
+        if max(width, height) <= MAX_CELL_RATIO * min(width, height):
             return
         even = math.sqrt(width * height)
         better = [round((points - 1) * side / even) + 1 for points, side in ((m, width), (n, height))]
-        if min(better) >= FEWEST_ROUND and max(better) <= LARGEST_NET:
+        if min(better) >= MIN_ROUND_POINTS and max(better) <= MAX_CONTROL_POINTS:
             yield (
-                f"lens.back.control_points: cells of {width:.3g} x {height:.3g} mm; {better} makes them square with as "
-                "many points"
+                f"lens.back.control_points: the net's cells are {width:.3g} x {height:.3g} mm; {better} makes them "
+                "square with as many control points"
             )
 
     def complaints(self) -> Iterator[str]:
-        """Everything that is wrong with the table by itself."""
+        """Yield the faults of the table."""
         given = [name for name in ("material", "index") if getattr(self, name) is not None]
         if self.front.reflect and self.back.reflect:
-            yield "lens.front.reflect: the back reflects all light before (lens.back.reflect); remove one of the two"
+            yield "lens.front.reflect: no light reaches the front, as lens.back.reflect is true; remove one of the two"
         if not self.passes.enters and given:
-            yield f"lens: light does not enter a mirror (lens.back.reflect), so it has no {given[0]}; remove it"
+            yield f"lens.{given[0]}: light does not enter a mirror (lens.back.reflect); remove this key"
         if self.passes.enters and len(given) != 1:
             yield 'lens: needs exactly one of material and index; give for example material = "PMMA"'
-        of_back = of_net(self.outline, self.back.control_points)
+        of_back = net_complaints(self.outline, self.back.control_points)
         yield from (f"lens.back.control_points: {complaint}" for complaint in of_back)
         if not self.back.optimise and not self.front.shaped:
             tailored = f'lens.front = {{ kind = "bspline", z = {self.front.z:g}, optimise = true }}'
-            yield f"lens.back.optimise: false leaves no face to tailor; write {tailored}, or remove it"
+            yield f"lens.back.optimise: false leaves no face to tailor; write {tailored}, or remove this key"
         yield from (f"lens.front.{complaint}" for complaint in self.front.complaints(self.outline))
-        (falls, rises), least, most = self.front_sags, self.min_thickness, self.max_thickness
-        highest = "thinnest place" if self.front.surface.is_net else "rim"
-        for where, front in (("centre", self.front.z), (highest, self.front.z + rises)):
-            if not self.back.z - front >= least:
-                thick = f"{self.back.z - front:g} mm thick at its {where}, and lens.min_thickness asks for {least:g} mm"
-                yield f"lens.back.z: the lens is {thick}; move the back to z = {front + least:g} or further"
+        (lowest, highest), thinnest, thickest = self.front_sags, self.min_thickness, self.max_thickness
+        rim = "thinnest point" if self.front.surface.is_net else "rim"
+        for where, front in (("centre", self.front.z), (rim, self.front.z + highest)):
+            if not self.back.z - front >= thinnest:
+                thick = f"{self.back.z - front:g} mm thick at its {where}, and lens.min_thickness is {thinnest:g} mm"
+                yield f"lens.back.z: the lens is {thick}; move the back to z = {front + thinnest:g} or further"
         if self.mould and self.tool_radius is None:
-            yield "lens.mould: says whose valleys lens.tool_radius is for, and there is none; add it, or remove mould"
+            yield "lens.mould: has no effect without lens.tool_radius; add that key, or remove mould"
         for key in ("min_thickness", "edge_thickness"):
-            if most is not None and most < (getattr(self, key) or 0.0):
-                asked = f"lens.{key} asks for {getattr(self, key):g} mm"
-                yield f"lens.max_thickness: {most:g} mm, and {asked}; allow more, or ask for less"
-        if most is not None and most - least < rises - falls:
-            thick = (
-                f"{least:g} mm at its thinnest place under a flat back the lens is {least + rises - falls:.6g} mm thick"
-            )
-            yield f"lens.max_thickness: {most:g} mm, and {thick} at its thickest, since its front is curved; allow more"
+            if thickest is not None and thickest < (getattr(self, key) or 0.0):
+                less = f"{thickest:g} mm is less than lens.{key} = {getattr(self, key):g} mm"
+                yield f"lens.max_thickness: {less}; make it larger, or the other smaller"
+        if thickest is not None and thickest - thinnest < highest - lowest:
+            thick = f"{thinnest:g} mm at its thinnest point and {thinnest + highest - lowest:.6g} mm at its thickest"
+            why = f"{thickest:g} mm is too small: with its curved front and a flat back the lens is {thick}"
+            yield f"lens.max_thickness: {why}; make it larger"

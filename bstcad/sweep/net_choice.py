@@ -28,7 +28,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.sides import Sides, both, coarser, in_words, spread
 from bstcad.optics.tubes import area_of, collect, launch_tubes
 from bstcad.report.units import about, two_digits
-from bstcad.scene.blank import LARGEST_NET
+from bstcad.scene.blank import MAX_CONTROL_POINTS
 from bstcad.scene.scene import Scene
 from bstcad.sweep.estimates import coarse_lens
 from bstcad.sweep.prediction import UNDONE, blurred, memory_gb, usual
@@ -189,7 +189,7 @@ def nets(scene: Scene) -> list[Sides]:
     half_x, half_y = scene.lens.outline.half_extent
     if max(half_x, half_y) <= NEARLY * min(half_x, half_y):
         return list(SQUARE)
-    return [coarser(spread(points, half_x, half_y), LARGEST_NET) for points in SQUARE]
+    return [coarser(spread(points, half_x, half_y), MAX_CONTROL_POINTS) for points in SQUARE]
 
 
 @torch.no_grad()

@@ -19,7 +19,7 @@ from bstcad.optics.sides import both, scaled
 from bstcad.pipeline import reachable_part
 from bstcad.report.record import simulated, too_steep
 from bstcad.report.units import paragraphs
-from bstcad.scene.blank import LARGEST_NET
+from bstcad.scene.blank import MAX_CONTROL_POINTS
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.scene import Scene
 from bstcad.sweep.cold_run import rounded
@@ -157,7 +157,7 @@ def outlook(scene: Scene, lenses: Sequence[Lens], tick: Callable[[], None] = lam
     predicted, steep = predictions(scene, pilots), pilots[FLOWN[-1]].steep
     found |= {"predicted": predicted, "notes": [*too_steep(steep), *_ends_early(scene, predicted)]}
     net = scaled(scene.lens.back.net, 2)
-    if max(both(net)) <= LARGEST_NET:
+    if max(both(net)) <= MAX_CONTROL_POINTS:
         finer = of_net(scene, net)
         found["finer"] = {"control_points": net, "predicted": predictions(finer, pilots, gain(scene, finer, lenses))}
     return found

@@ -31,7 +31,7 @@ from bstcad.optics.sides import both, coarser
 from bstcad.optics.trace import clear_window, trace
 from bstcad.scene.blank import CONIC_CONSTANTS
 from bstcad.scene.quality import COARSEST_GRID
-from bstcad.scene.scene import INSIDE
+from bstcad.scene.scene import SEARCH_RANGE
 from bstcad.tailoring.machinability import moved_clear
 from bstcad.tailoring.merit import landing
 from bstcad.tailoring.reachable import coarse
@@ -298,7 +298,7 @@ def _curvature_of_sag(h: float, r: float, k: float) -> float:
     p = 1 + k
     if p == 0:
         return 2 * h / (r * r)
-    most = INSIDE * r / math.sqrt(abs(p))
+    most = SEARCH_RANGE * r / math.sqrt(abs(p))
     h = max(-most, min(h, most))
     return 2 * h / (r * r + p * h * h)
 

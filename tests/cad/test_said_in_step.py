@@ -11,7 +11,7 @@ from bstcad.cad import step_reading, step_writing
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.quadrature import of_lens
-from bstcad.scene.mount import GLASS, Part
+from bstcad.scene.mount import LENS_COLOUR, Part
 from bstcad.step_text import part21
 from bstcad.verify.text_checks import of_part
 from tests.cad.conftest import encoded
@@ -88,11 +88,11 @@ def test_what_is_not_said_is_not_written(lens, tmp_path):
 
 
 def test_older_programs_get_ap214(lens, tmp_path):
-    part = Part(material="PMMA", density=1.19, colour=GLASS, schema="AP214")
+    part = Part(material="PMMA", density=1.19, colour=LENS_COLOUR, schema="AP214")
     step_writing.write_lens(lens, tmp_path / "lens.step", "lens", part)
     text, said = part21.read(tmp_path / "lens.step"), read(tmp_path / "lens.step")
     assert text.schema.startswith("AUTOMOTIVE_DESIGN") and text.closed
-    assert (said.faces[:2], said.colour, said.material) == (["back", "front"], GLASS, "PMMA")
+    assert (said.faces[:2], said.colour, said.material) == (["back", "front"], LENS_COLOUR, "PMMA")
     assert said.density == pytest.approx(1.19, rel=1e-12)
     step_writing.write_lens(lens, tmp_path / "lens.step", "lens")  # nothing of it stays in the process
     assert part21.read(tmp_path / "lens.step").schema.startswith("AP242")
@@ -128,7 +128,7 @@ def test_the_same_lens_is_the_same_file(lens, monkeypatch):
 def test_the_lens_of_a_design_says_what_its_scene_does(small_design):
     """PMMA, whose density is known."""
     said = read(small_design.folder / "lens.step")
-    assert (said.material, said.density, said.colour) == ("PMMA", pytest.approx(1.19), GLASS)
+    assert (said.material, said.density, said.colour) == ("PMMA", pytest.approx(1.19), LENS_COLOUR)
     assert said.faces == ["back", "front", *["rim"] * 4] and said.tolerances == []
     reread = step_reading.lens(step_reading.read(small_design.folder / "lens.step"), 1.5)
     assert said.volume == pytest.approx(of_lens(reread).volume, rel=1e-12)

@@ -29,7 +29,7 @@ from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.scene.scene import MESH
+from bstcad.scene.scene import MESH_TOLERANCE
 from bstcad.step_text import part21
 from bstcad.verify import checks, step_checks
 from tests.exact_volume import exact_volume
@@ -119,7 +119,7 @@ def test_occ_finds_the_volume(holds, written):
 @pytest.mark.parametrize("cells", (64, 256, None))
 def test_our_mesh_is_closed_at_each_deflection(holds, written, tmp_path, cells):
     """None: as output.mesh_tolerance asks by default.  The volume is off by area times deflection at most."""
-    asked = cells or meshes.fitting(written.lens, MESH)[0]
+    asked = cells or meshes.fitting(written.lens, MESH_TOLERANCE)[0]
     meshes.write_stl(meshes.lens_mesh(written.lens, asked), tmp_path / "lens.stl")
     found = meshes.read_stl(tmp_path / "lens.stl")
     assert meshes.is_closed(found) and len(found.faces) > 0
@@ -134,7 +134,7 @@ def test_our_mesh_is_closed_at_each_deflection(holds, written, tmp_path, cells):
     of = f"of {cells} cells" if cells else "by default"
     holds(f"STL {of}: volume", off, deflection * written.area / written.volume, "of it")
     if cells is None and asked < meshes.finest(written.lens):
-        holds("STL by default: chordal error", deflection, MESH, "mm")
+        holds("STL by default: chordal error", deflection, MESH_TOLERANCE, "mm")
     if cells == 64:
         other = trimesh.load_mesh(tmp_path / "lens.stl")
         assert other.is_watertight and other.is_winding_consistent and other.body_count == 1

@@ -160,10 +160,10 @@ def placed(earlier, place):
 @pytest.mark.parametrize(
     ("place", "sentence"),
     [
-        (((1e-6, 0, 0),), "its net lies about x = 1e-06 mm and not about the axis; export the lens centred"),
-        (((0, 3, 0),), "its net lies about y = 3 mm and not about the axis"),
-        (((0, 0, 0), (1, 0, 0), 90), r"cannot be read \(its lens is turned by 90° about x, and a front is a height"),
-        (((0, 0, 0), (0, 0, 1), 30), "its lens is turned by 30° about z, and"),
+        (((1e-6, 0, 0),), "its net is centred at x = 1e-06 mm and not on the axis; export the lens centred"),
+        (((0, 3, 0),), "its net is centred at y = 3 mm and not on the axis"),
+        (((0, 0, 0), (1, 0, 0), 90), r"cannot be read \(its lens is turned by 90° about x, but the axis"),
+        (((0, 0, 0), (0, 0, 1), 30), "its lens is turned by 30° about z, but"),
     ],
 )
 def test_a_placement_that_is_no_front_is_refused(earlier, place, sentence):
@@ -194,7 +194,7 @@ def test_a_net_follows_a_bowl_to_the_rim_where_it_reaches_past_it():
 def test_a_front_that_comes_too_near_to_the_back_is_refused():
     face = a_face(z=15.0)
     high = BSplineSurface(15.0, 60.0 * face.heights, face.x, face.y)
-    with pytest.raises(SceneError, match=re.escape("lens.back.z: the lens is") + ".* thick at its thinnest place"):
+    with pytest.raises(SceneError, match=re.escape("lens.back.z: the lens is") + ".* thick at its thinnest point"):
         load(DISK).changed({"lens.front": high})
 
 
@@ -223,9 +223,9 @@ def test_a_toroid_stands_in_its_scene_with_both_curvatures(tmp_path):
 
 
 @pytest.mark.parametrize(("keys", "sentence"), [
-    ({"curvature_x": 0.13}, "curvature_x: a radius of 7.69231 mm ends before the rim, or is steeper than 60"),
-    ({"curvature_y": -0.11}, "curvature_y: a radius of 9.09091 mm .* make the curvature smaller"),
-    ({"curvature_x": 0.08, "curvature_y": 0.1}, "curvature_y: a radius of 10 mm"),  # at the corners
+    ({"curvature_x": 0.13}, "curvature_x: a toroid of radius 7.69231 mm .* steeper than 60"),
+    ({"curvature_y": -0.11}, "curvature_y: a toroid of radius 9.09091 mm .* make the curvature smaller"),
+    ({"curvature_x": 0.08, "curvature_y": 0.1}, "curvature_y: a toroid of radius 10 mm"),  # at the corners
     ({"optimise": True}, "optimise: unknown key"),
 ])  # fmt: skip
 def test_a_toroid_that_no_lens_can_have_is_refused_by_its_key(keys, sentence):

@@ -148,7 +148,7 @@ def test_warnings_and_remarks_name_their_target(three):
     scene = three.changed({"target[0].x": [-0.1, 0.1], "target[0].y": [-0.1, 0.1]})
     assert any(w.startswith("target[0].x: 0.2 mm wide; are these metres?") for w in scene.warnings())
     [compromise] = three.warnings()
-    assert compromise.startswith("target: 3 goals for two tailored faces, which meet them only as far as least squares")
+    assert compromise.startswith("target: two tailored faces cannot meet 3 goals exactly")
 
 
 def test_a_picture_that_parallel_light_repeats_is_one_goal():
@@ -156,7 +156,7 @@ def test_a_picture_that_parallel_light_repeats_is_one_goal():
     assert len(scene.targets) == 2 and scene.warnings() == ()
     for change in ({"wavefront.direction": [0.1, 0.0, 1.0]}, {"target[1].profile.radius": 5.0}):
         [compromise] = scene.changed(change).warnings()
-        assert compromise.startswith("target: 3 goals for two tailored faces")
+        assert compromise.startswith("target: two tailored faces cannot meet 3 goals")
 
 
 @pytest.mark.parametrize(("more", "key"), [
@@ -169,7 +169,7 @@ def test_methods_for_one_picture_refuse_several_goals(three, more, key):
     wave = {"wavefront": {"kind": "plane", "z": 1200.0}}
     for goals, number in (({"target": three.targets}, 3), (wave, 2)):
         with pytest.raises(
-            SceneError, match=f"^{key} serves one picture alone, and the scene has {number} goals; choos"
+            SceneError, match=f"^{key} works for one picture, and the scene has {number} goals; choos"
         ):
             one.changed(goals | more)
 

@@ -84,15 +84,15 @@ def test_a_given_net_may_be_where_tailoring_starts(disk, tmp_path):
     (DISK, {"lens.front": FLAT | {"optimise": ["heights"]}}, "lens.front.optimise: ['heights'] is neither true nor"),
     (DISK, {"lens.front": FLAT | {"control_points": 4}}, "lens.front.control_points: 4 is not between 5 and 2049"),
     (DISK, {"lens.front": FLAT | {"control_points": [9, 17]}, "lens.outline": {"shape": "circle", "radius": 8.0}},
-     "lens.front.control_points: a round lens (lens.outline) takes a square net, not one of 9 x 17; give one number"),
+     "lens.front.control_points: a round lens (lens.outline) needs a square net, not 9 x 17"),
     (DISK, {"lens.front": FLAT | {"control_points": 5}, "lens.outline": {"shape": "circle", "radius": 8.0}},
-     "lens.front.control_points: 5 are too few for a round lens"),
+     "lens.front.control_points: 5 is too few for a round lens"),
     (DISK, {"lens.back.optimise": False, "lens.front": {"kind": "sphere", "z": 15.0, "optimise": True}},
      "lens.back.optimise: false leaves no face to tailor"),
     (MIRROR, {"lens.front": FLAT | {"z": 0.0}}, "lens.front.optimise: the front of a mirror is the rear of its plate"),
     (MIRROR, {"lens.back.optimise": False}, "lens.back.optimise: false leaves no face to tailor"),
-    (MIRROR, {"lens.front": FLAT | {"reflect": True}, "lens.material": "PMMA"}, "lens.front.reflect: the back"),
-    (DISK, {"lens.front": FLAT | {"optimise": False, "reflect": True}}, "lens.front.reflect: tailoring begins with"),
+    (MIRROR, {"lens.front": FLAT | {"reflect": True}, "lens.material": "PMMA"}, "lens.front.reflect: no light"),
+    (DISK, {"lens.front": FLAT | {"optimise": False, "reflect": True}}, "lens.front.reflect: the face that reflects"),
     (DISK, {"lens.front": FLAT | {"reflect": True}, "lens.index": None, "lens.material": None}, "lens: needs exactly"),
     (DISK, {"lens.front": FLAT, "tailoring.method": "integration"},
      "lens.front.optimise: point-by-point integration finds no freeform front; remove it, or choose another"),
@@ -106,7 +106,7 @@ def test_what_cannot_be_is_refused(path, changes, sentence):
 
 def test_a_given_net_has_the_control_points_of_its_file(disk):
     scene = disk.changed({"lens.front": a_net(disk)})
-    with pytest.raises(SceneError, match=r"^lens\.front\.control_points: the front has those of its file; remove one"):
+    with pytest.raises(SceneError, match=r"^lens\.front\.control_points: .*file"):
         scene.changed({"lens.front.control_points": 33, "lens.front.optimise": True})
 
 
