@@ -1,7 +1,7 @@
 """The procedure of the paper: both stages by Adam on raw control points (Wang et al. 2023, sections 2.3 and 3).
 
-It is the baseline that the other qualities are measured against.  Where the paper gives no number the choice is
-stated here or in quality.py: steps a level, a rate that falls to zero in each, and the learning rate of stage 2.
+It is the baseline of the other qualities.  Where the paper gives no number, the choice is stated here or in quality.py:
+steps a level, learning rates that fall to zero in each level, and the learning rate of stage 2.
 """
 
 from __future__ import annotations
@@ -31,30 +31,30 @@ from bstcad.tailoring.run import Parameters, Step, Task
 from bstcad.transport.bfm import Step as TransportStep
 from bstcad.transport.mapping import Mapping
 
-RATES = {33: 0.02, 129: 0.004, 513: 0.008}  # mm a step, by control points a side (section 3.2)
-FRONT_RATES = {  # a step, of the front's parameters
+STAGE1_RATES = {33: 0.02, 129: 0.004, 513: 0.008}  # mm a step, by control points a side (section 3.2)
+FRONT_RATES = {  # change of the front's parameters a step
     "curvature": 0.001,  # 1/mm (section 3.2)
-    "conic_constant": 0.02,  # not in the paper, whose fronts are spheres
+    "conic_constant": 0.02,  # chosen here, since the fronts of the paper are spheres
 }
-STAGE2_RATE = 2e-4  # mm a step; not stated in the paper
-RAYS_PER_CONTROL_POINT = 8  # each way, at most: the coarsest net needs no million rays
+STAGE2_RATE = 2e-4  # mm a step; chosen here, since the paper does not state it
+MAX_RAYS_PER_CONTROL_POINT = 8  # in each direction, to save rays on the coarsest net
 
 
 @dataclass(frozen=True)
 class Level:
-    """Where stage 1 stands between two steps on one of its nets."""
+    """State of stage 1 between two steps on one of its nets."""
 
     level: int
     mapping: Mapping
-    lens: Parameters  # from which this level began
+    lens: Parameters  # parameters at the start of this level
     best: Best
     search: AdamState
 
 
 def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Step]:
-    """Stage 1, one net after another, along one map from the front's vertex plane to the target; or on from a state."""
+    """Run stage 1, or resume it, on one net after another, with one map from the front's vertex plane to the target."""
     knobs, lens, each = task.knobs, task.heaviest.through(lens), task.knobs.stage1_iterations
-    area = clear_window(task.heaviest.source, lens)  # of the blank
+    area = clear_window(task.heaviest.source, lens)  # of the flat blank
     if state is None:
         mapping = transport(task, lens)
         yield Step(None, part="transport", ends=True)
@@ -80,35 +80,35 @@ def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Step]
 
 
 def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: Level | None) -> Iterator[Reached]:
-    """Stage 1 on the net of `lens`, or on from a state: min Σ |P_t - P|² by the heights and the free front."""
-    n = min(task.knobs.rays, RAYS_PER_CONTROL_POINT * max(lens.back.shape))
+    """Run stage 1 on the net of `lens`, or resume: min Σ |P_t - P|² over the heights and the free front."""
+    n = min(task.knobs.rays, MAX_RAYS_PER_CONTROL_POINT * max(lens.back.shape))
     x, y = (t.to(lens.like) for t in sampling.grid(area, n))
     rays = task.heaviest.source.rays(x, y, lens.entrance.z, area.area / n**2)
     screen, shape = task.goals[0].receiver, lens.front.parameters()
     aim = slope_map.aim_points(mapping, lens, screen, x=x, y=y)
     start = [lens.back.heights, *(torch.as_tensor(shape[name]).to(lens.back.heights) for name in task.free)]
-    nearest = min(RATES, key=lambda m: abs(m - max(lens.back.shape)))
+    nearest = min(STAGE1_RATES, key=lambda m: abs(m - max(lens.back.shape)))
 
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
         leaves = [p.detach().clone().requires_grad_() for p in parameters]
         merit = landing(trace(rays, with_parameters(lens, leaves, task.free), screen.plane), aim)
         return float(merit.detach()), list(torch.autograd.grad(merit, leaves)), float("nan")
 
-    steps, rates = task.knobs.stage1_iterations, [RATES[nearest], *(FRONT_RATES[name] for name in task.free)]
+    steps, rates = task.knobs.stage1_iterations, [STAGE1_RATES[nearest], *(FRONT_RATES[name] for name in task.free)]
     method = adam(start, rates, steps, state and state.search)
     return minimise(problem, method, steps, state.best if state else Best())
 
 
 def _improved(lens: Lens, best: Best, free: tuple[str, ...], net: Sides) -> Lens:
-    """The best lens that a level from `lens` has come to, on a net of so many control points."""
-    if best.parameters:  # else not one value was finite
+    """Return the best lens of a level that starts from `lens`, refined to a net of so many control points."""
+    if best.parameters:  # empty if no value was finite
         heights, *shape = best.parameters
         lens = with_parameters(lens, [heights, *map(float, shape)], free)
     return lens.refined(net)
 
 
 def transport(task: Task, lens: Lens) -> Mapping:
-    """The map from the front's vertex plane to the target, for a blank lens."""
+    """Return the map from the front's vertex plane to the target, for a blank lens."""
     knobs, goal = task.knobs, task.goals[0]
 
     def progress(s: TransportStep) -> None:
@@ -125,12 +125,12 @@ def transport(task: Task, lens: Lens) -> Mapping:
     )
 
 
-def as_seen_by_tent(target: Tensor) -> Tensor:
-    """A picture whose light lies evenly in each pixel, after tent binning: [1, 6, 1] / 8 along both axes.
+def tent_average(target: Tensor) -> Tensor:
+    """Return a picture of even flux in each pixel after tent binning: [1, 6, 1] / 8 along both axes.
 
-    Comparing with this instead of the sharp picture lets a perfect lens have merit zero.
+    In comparison with it, instead of the sharp picture, a perfect lens has merit zero.
     """
-    for _ in range(2):  # each turn takes one axis and swaps the two
+    for _ in range(2):  # each pass filters one axis and transposes
         target = torch.nn.functional.pad(target, (1, 1))
         target = ((target[:, :-2] + 6 * target[:, 1:-1] + target[:, 2:]) / 8).T
     return target.contiguous()
@@ -138,20 +138,20 @@ def as_seen_by_tent(target: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class TentMerit:
-    """RRMSD² of rays by tent binning (Wang et al. 2023, Eq. 15), plus the pull of merit.py; summed over channels."""
+    """RRMSD² of rays by tent binning (Wang et al. 2023, Eq. 15), plus the overshoot term of merit.py, over channels."""
 
     channels: tuple[Channel, ...]
     screen: Screen
-    target: Tensor  # (rows, columns) as seen by the tent, its flux summing to 1 before that
+    target: Tensor  # (rows, columns) picture of flux 1 after tent binning
     overshoot: float
 
     @classmethod
     def of(cls, channels: tuple[Channel, ...], screen: Screen, target: Tensor, overshoot: float) -> TentMerit:
-        """The merit for a sharp target picture."""
-        return cls(channels, screen, as_seen_by_tent(target / total(target)), overshoot)
+        """Return the merit function for a sharp target picture."""
+        return cls(channels, screen, tent_average(target / total(target)), overshoot)
 
     def __call__(self, landed: tuple[Landed, ...]) -> tuple[Tensor, Tensor]:
-        """(merit, RRMSD against the target as the tent sees it) of the landed rays of each channel."""
+        """Return (merit, RRMSD against the tent-binned target) of the landed rays of each channel."""
         flux = weighted_sum(self.channels, (total(landed_flux(rays).double()) for rays in landed))
         images, beyond = zip(*(collect(rays, self.screen) for rays in landed), strict=True)
         image, outside = weighted_sum(self.channels, images), weighted_sum(self.channels, beyond)
@@ -161,15 +161,15 @@ class TentMerit:
 
 @dataclass(frozen=True)
 class RaySearch:
-    """Where stage 2 stands between two steps."""
+    """State of stage 2 between two steps."""
 
-    lens: Parameters  # from which it began
+    lens: Parameters  # parameters at the start of stage 2
     best: Best
     search: AdamState
 
 
 def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[Step]:
-    """Stage 2: freshly sampled random rays in each step; or further from a state."""
+    """Run stage 2, with new random rays in each step; resume from a state."""
     knobs, goal, start = task.knobs, task.goals[0], lens if state is None else state.lens.applied(lens)
     target = torch.from_numpy(goal.picture).to(lens.like.device)
     merit = TentMerit.of(task.channels, goal.receiver, target, knobs.overshoot)
@@ -194,7 +194,7 @@ def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[S
 
 
 def random_bundles(channels: tuple[Channel, ...], lens: Lens, count: int, seed: int) -> tuple[Rays, ...]:
-    """`count` independent random rays of each channel through the clear part of the vertex plane."""
+    """Return `count` independent random rays of each channel through the clear part of the vertex plane."""
     like = {"dtype": lens.like.dtype, "device": lens.like.device}
 
     def bundle(channel: Channel) -> Rays:
@@ -206,7 +206,7 @@ def random_bundles(channels: tuple[Channel, ...], lens: Lens, count: int, seed: 
 
 
 def with_parameters(lens: Lens, parameters: list[Any], free: tuple[str, ...] = ()) -> Lens:
-    """The lens with these heights, and behind them the free parameters of the front in this order."""
+    """Return the lens with these heights and the free parameters of the front, which follow in this order."""
     heights, *shape = parameters
     front = lens.front.with_parameters(**dict(zip(free, shape, strict=True)))
     return lens.with_front(front).with_back(lens.back.with_parameters(heights=heights))
@@ -215,12 +215,12 @@ def with_parameters(lens: Lens, parameters: list[Any], free: tuple[str, ...] = (
 def tailor_to_irradiance(
     lens: Lens, bundles: Iterator[tuple[Rays, ...]], merit: TentMerit, steps: int, state: RaySearch | None = None
 ) -> Iterator[Reached]:
-    """Stage 2: min RRMSD by the tent, with freshly sampled random rays in each step (Eq. 15)."""
+    """Minimise the RRMSD of tent binning, with new random rays in each step (Eq. 15)."""
 
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
         leaf = parameters[0].detach().clone().requires_grad_()
-        tried, pairs = with_parameters(lens, [leaf]), zip(merit.channels, next(bundles), strict=True)
-        square, rrmsd = merit(tuple(trace(rays, channel.through(tried), merit.screen.plane) for channel, rays in pairs))
+        trial, pairs = with_parameters(lens, [leaf]), zip(merit.channels, next(bundles), strict=True)
+        square, rrmsd = merit(tuple(trace(rays, channel.through(trial), merit.screen.plane) for channel, rays in pairs))
         (gradient,) = torch.autograd.grad(square.sqrt(), leaf)
         return float(square.detach().sqrt()), [gradient], float(rrmsd)
 

@@ -1,8 +1,9 @@
-"""What a key of a scene means: it stands on the field of the record that the key is read into.
+"""Keys of a scene: meaning, unit and range, stated on the field of the record into which the key is read.
 
     radius: Annotated[float, Key("Radius.", "mm", 1e-3, 1e6)]
 
-pydantic checks the range as it reads a scene; its JSON schema and `bstcad keys` are made of keys too (scene/schema.py).
+pydantic checks the range when it reads a scene.  The JSON schema and `bstcad keys` are made from the keys as well
+(scene/schema.py).
 """
 
 from __future__ import annotations
@@ -13,18 +14,18 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Key:
-    """Meaning, unit and range of a field; a range holds for each number of a list, of a list of lists for the first."""
+    """Meaning, unit and range of a field; the range holds for each number of a list, the first of each inner list."""
 
-    meaning: str  # one sentence
-    unit: str = ""  # "": a pure number or a word
-    least: float | None = None  # None: the field holds no number
+    meaning: str  # meaning, one sentence
+    unit: str = ""  # unit; "": a pure number or a word
+    least: float | None = None  # lower end of the range; None: the field holds no number
     most: float | None = None
-    example: Any = None  # value of a key that every scene has to give
+    example: Any = None  # example value of a key that every scene must state
     remedy: str = ""  # advice on a number out of range; "": choose one in between
-    of_light: bool = False  # is it a limit of the light, which a verdict asks for?
+    of_light: bool = False  # True for a limit on the light, which a verdict requires
 
     def in_range(self, value: Any) -> Any:
-        """The value of a field, if all of its numbers are in the range; else ValueError, a sentence."""
+        """Return the value of a field if all its numbers are in range; otherwise raise ValueError with a sentence."""
         for number in _numbers(value):
             if not self.least <= number <= self.most:
                 unit = f" {self.unit}" if self.unit else ""
@@ -35,14 +36,14 @@ class Key:
         return value
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> dict[str, Any]:
-        """The validation of the field: its type, then the range; pydantic calls it."""
+        """Return the pydantic schema of the field: its type, then its range."""
         if self.least is None:
             return handler(source)
         check = {"type": "no-info", "function": self.in_range}
         return {"type": "function-after", "function": check, "schema": handler(source)}
 
     def __get_pydantic_json_schema__(self, core: Any, handler: Any) -> dict[str, Any]:
-        """The JSON schema of the field; pydantic calls it."""
+        """Return the JSON schema of the field, for pydantic."""
         schema = handler(core) | {"description": self.meaning, "unit": self.unit or "none"}
         if self.least is not None:
             _bound(schema, self)
@@ -50,14 +51,14 @@ class Key:
 
 
 def _numbers(value: Any) -> list[float]:
-    """The numbers of a field's value: itself, each of a list, the first of each list in a list."""
+    """Return the numbers of a field's value: the number itself, each of a list, the first of each inner list."""
     if isinstance(value, tuple):
         return [number for part in value for number in _numbers(part[0] if isinstance(part, tuple) else part)]
     return [value] if isinstance(value, int | float) and not isinstance(value, bool) else []
 
 
 def _bound(schema: dict[str, Any], key: Key, listed: bool = False) -> None:
-    """Put the range to the numbers of a JSON schema, as `_numbers` takes them."""
+    """Add the range to the numbers of a JSON schema that `_numbers` selects."""
     if schema.get("type") in ("number", "integer"):
         schema |= {"minimum": key.least, "maximum": key.most}
     inner = [*schema.get("prefixItems", ()), *([schema["items"]] if isinstance(schema.get("items"), dict) else [])]

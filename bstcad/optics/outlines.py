@@ -13,49 +13,49 @@ from torch import Tensor
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.key import Key
 
-# Read by the scene: an unknown key in a file is an error, a tensor may stand where a number is tailored, and a record
-# that was made in Python is checked, too.
+# Configuration of records that are read from a scene: an unknown key is an error, a tensor may replace a number that
+# is tailored, and a record built in Python is validated as well.
 STRICT = {"extra": "forbid", "arbitrary_types_allowed": True, "revalidate_instances": "always"}
-# (a, b, r²) of an outline in mm, mm and mm²: inside it max(|x| - a, 0)² + max(|y| - b, 0)² <= r².  All outlines are
-# boxes with round corners, of which a circle (a = b = 0) and a rectangle (r = 0) are the extremes.
+# (a, b, r²) of an outline in mm, mm and mm²: the interior is max(|x| - a, 0)² + max(|y| - b, 0)² <= r².  All outlines
+# are boxes with round corners; a circle (a = b = 0) and a rectangle (r = 0) are the limiting cases.
 Limits = tuple[float, float, float]
-SIDES = (1e-3, 1e6)  # mm; of an outline in a scene
-PLACES = 720  # number of `places` on a rim: on its arcs together, and about as many on its straight sides together
+SIZE_RANGE = (1e-3, 1e6)  # range of the size of an outline in a scene, mm
+RIM_POINTS = 720  # number of rim points on the arcs together, and about as many on the straight sides together
 
 
 class _Box:
-    """The part of all outlines that follows from their limits."""
+    """Methods of all outlines that follow from their limits."""
 
     limits: Limits
-    is_round = False  # is it a circle?
+    is_round = False  # True for a circle
 
     def contains(self, x: Tensor, y: Tensor) -> Tensor:
-        """True where (x, y) (mm) lies inside or on the rim."""
+        """Return True where (x, y) (mm) lies inside or on the rim."""
         return inside(self.limits, x, y)
 
     def depth(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Distance (mm) of places inside from the rim, with a minus sign that of places outside."""
+        """Return the distance (mm) of points from the rim, positive inside and negative outside."""
         a, b, r2 = self.limits
         x, y = np.abs(x) - a, np.abs(y) - b
         return math.sqrt(r2) - np.hypot(np.maximum(x, 0.0), np.maximum(y, 0.0)) - np.minimum(np.maximum(x, y), 0.0)
 
     def reach(self, n_x: float, n_y: float) -> float:
-        """The largest n · p over the places p inside (mm)."""
+        """Return the largest n · p over the points p inside (mm)."""
         a, b, r2 = self.limits
         return a * abs(n_x) + b * abs(n_y) + math.sqrt(r2) * math.hypot(n_x, n_y)
 
     def places(self) -> tuple[np.ndarray, np.ndarray]:
-        """x and y (mm) of places along the rim, not in its order."""
+        """Return x and y (mm) of points along the rim, in no particular order."""
         a, b, r2 = self.limits
-        r, turn, flat = math.sqrt(r2), np.arange(PLACES) * 2 * np.pi / PLACES, np.linspace(-1, 1, PLACES // 4 + 1)
-        x, y = np.cos(turn), np.sin(turn)
+        turn, flat = np.arange(RIM_POINTS) * 2 * np.pi / RIM_POINTS, np.linspace(-1, 1, RIM_POINTS // 4 + 1)
+        r, x, y = math.sqrt(r2), np.cos(turn), np.sin(turn)
         sides = [(flat * a, 0 * flat + end * (b + r)) for end in (-1, 1) if a]
         sides += [(0 * flat + end * (a + r), flat * b) for end in (-1, 1) if b]
         sides.append((np.sign(x) * a + r * x, np.sign(y) * b + r * y))
         return tuple(np.concatenate(each) for each in zip(*sides, strict=True))
 
     def inwards(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where places of the rim (mm) move as it shrinks by 1 mm: along the normal, sharp corners on their mitres."""
+        """Return the shift (mm) of rim points for an inset of 1 mm: along the normal, at corners along the mitre."""
         a, b, r2 = self.limits
         if r2 == 0:
             return -x / a, -y / b
@@ -65,10 +65,10 @@ class _Box:
 
 @dataclass(frozen=True)
 class Rectangle(_Box):
-    """|x| <= width / 2 and |y| <= height / 2, centred on the axis."""
+    """Rectangle |x| <= width / 2 and |y| <= height / 2, centred on the axis."""
 
-    width: Annotated[float, Key("Extent along x.", "mm", *SIDES, example=12.0)]
-    height: Annotated[float, Key("Extent along y.", "mm", *SIDES, example=12.0)]
+    width: Annotated[float, Key("Extent along x.", "mm", *SIZE_RANGE, example=12.0)]
+    height: Annotated[float, Key("Extent along y.", "mm", *SIZE_RANGE, example=12.0)]
     shape: Annotated[Literal["rectangle"], Key("A rectangle centred on the axis.")] = "rectangle"
 
     __pydantic_config__ = STRICT
@@ -80,46 +80,46 @@ class Rectangle(_Box):
 
     @property
     def farthest(self) -> tuple[float, float]:
-        """A point (x, y) of the rim that is farthest from the axis (mm): a corner."""
+        """Point (x, y) of the rim that is farthest from the axis (mm): a corner."""
         return self.half_extent
 
     @property
     def limits(self) -> Limits:
-        """See `Limits`."""
+        """Limits (a, b, r²)."""
         return self.width / 2, self.height / 2, 0.0
 
     @property
     def area(self) -> float:
-        """Area (mm²)."""
+        """Area, mm²."""
         return self.width * self.height
 
     @property
     def words(self) -> str:
-        """Its size: "24 x 10 mm"."""
+        """Size in words: "24 x 10 mm"."""
         return f"{self.width:.6g} x {self.height:.6g} mm"
 
     def map_square(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        """Where (mm) the points (a, b) of the square from -1 to 1 lie, its rim on that of the outline."""
+        """Map points (a, b) of the square from -1 to 1 onto the outline (mm), rim to rim."""
         return a * (self.width / 2), b * (self.height / 2)
 
     def scaled(self, by: float) -> Rectangle:
-        """The same shape, larger by a factor."""
+        """Return the outline scaled by a factor."""
         return Rectangle(by * self.width, by * self.height)
 
     def inset(self, by: float) -> Rectangle:
-        """The outline inside a margin of this width (mm)."""
+        """Return the outline reduced by a margin of this width (mm)."""
         return Rectangle(self.width - 2 * by, self.height - 2 * by)
 
 
 @dataclass(frozen=True)
 class Rounded(Rectangle):
-    """A rectangle with corners of a radius of at most half its width and half its height."""
+    """A rectangle with rounded corners, of a radius of at most half the width and half the height."""
 
-    corner_radius: float = 0.0  # mm
+    corner_radius: float = 0.0  # radius of the corners, mm
 
     @property
     def farthest(self) -> tuple[float, float]:
-        """A point (x, y) of the rim that is farthest from the axis (mm): on the arc, in line with its centre."""
+        """Point (x, y) of the rim that is farthest from the axis (mm): on the arc, in line with its centre."""
         a, b, _ = self.limits
         d = math.hypot(a, b)
         if not d:
@@ -128,45 +128,45 @@ class Rounded(Rectangle):
 
     @property
     def limits(self) -> Limits:
-        """See `Limits`."""
+        """Limits (a, b, r²)."""
         r = self.corner_radius
         return self.width / 2 - r, self.height / 2 - r, r * r
 
     @property
     def area(self) -> float:
-        """Area (mm²)."""
+        """Area, mm²."""
         return self.width * self.height - (4 - math.pi) * self.corner_radius**2
 
     @property
     def words(self) -> str:
-        """Its size: "24 x 10 mm with corners of 3 mm"."""
+        """Size in words: "24 x 10 mm with corners of 3 mm"."""
         return f"{super().words} with corners of {self.corner_radius:.4g} mm"
 
     def map_square(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        """Each concentric ring of the rectangle's map is moved towards the axis, onto a ring with corners as round."""
+        """Map points (a, b) of the square from -1 to 1 onto the outline (mm), ring by ring, with corners as round."""
         ring = torch.maximum(a.abs(), b.abs()).clamp(min=1e-300)
-        x, y = a.abs() / ring * (self.width / 2), b.abs() / ring * (self.height / 2)  # on the rim of the rectangle
+        x, y = a.abs() / ring * (self.width / 2), b.abs() / ring * (self.height / 2)  # on the rectangle's rim
         c, d, r2 = self.limits
         along, square = x * c + y * d, x * x + y * y
-        # the farther of the places t (x, y) with |t (x, y) - (c, d)| = r, the centre of the corner's circle
+        # farther solution t (x, y) of |t (x, y) - (c, d)| = r, with (c, d) the centre of the corner's circle
         t = (along + torch.sqrt((along * along - square * (c * c + d * d - r2)).clamp(min=0))) / square
         t = torch.where((x > c) & (y > d) & (t * x > c) & (t * y > d), t, torch.ones_like(t))
         return a * (self.width / 2) * t, b * (self.height / 2) * t
 
     def scaled(self, by: float) -> Rounded:
-        """The same shape, larger by a factor."""
+        """Return the outline scaled by a factor."""
         return Rounded(by * self.width, by * self.height, corner_radius=by * self.corner_radius)
 
     def inset(self, by: float) -> Rounded:
-        """The outline inside a margin of this width (mm)."""
+        """Return the outline reduced by a margin of this width (mm)."""
         return Rounded(self.width - 2 * by, self.height - 2 * by, corner_radius=max(self.corner_radius - by, 0.0))
 
 
 @dataclass(frozen=True)
 class Circle(_Box):
-    """x² + y² <= radius², centred on the axis."""
+    """Circle x² + y² <= radius², centred on the axis."""
 
-    radius: Annotated[float, Key("Radius; or give the diameter.", "mm", *SIDES, example=12.0)]
+    radius: Annotated[float, Key("Radius; or give the diameter.", "mm", *SIZE_RANGE, example=12.0)]
     shape: Annotated[Literal["circle"], Key("A circle centred on the axis.")] = "circle"
 
     __pydantic_config__ = STRICT
@@ -180,26 +180,26 @@ class Circle(_Box):
 
     @property
     def farthest(self) -> tuple[float, float]:
-        """A point (x, y) of the rim that is farthest from the axis (mm)."""
+        """Point (x, y) of the rim that is farthest from the axis (mm)."""
         return self.radius, 0.0
 
     @property
     def limits(self) -> Limits:
-        """See `Limits`."""
+        """Limits (a, b, r²)."""
         return 0.0, 0.0, self.radius**2
 
     @property
     def area(self) -> float:
-        """Area (mm²)."""
+        """Area, mm²."""
         return torch.pi * self.radius**2
 
     @property
     def words(self) -> str:
-        """Its size: "Ø24 mm"."""
+        """Size in words: "Ø24 mm"."""
         return f"Ø{2 * self.radius:.6g} mm"
 
     def map_square(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        """By the concentric map, which keeps areas (Shirley and Chiu 1997)."""
+        """Map points (a, b) of the square from -1 to 1 onto the disc (mm), equal-area (Shirley and Chiu 1997)."""
         steep = b.abs() > a.abs()
         long, short = torch.where(steep, b, a), torch.where(steep, a, b)
         turn = (math.pi / 4) * short / torch.where(long == 0, torch.ones_like(long), long)
@@ -207,22 +207,22 @@ class Circle(_Box):
         return torch.where(steep, across, along), torch.where(steep, along, across)
 
     def scaled(self, by: float) -> Circle:
-        """The same shape, larger by a factor."""
+        """Return the outline scaled by a factor."""
         return Circle(by * self.radius)
 
     def inset(self, by: float) -> Circle:
-        """The outline inside a margin of this width (mm)."""
+        """Return the outline reduced by a margin of this width (mm)."""
         return Circle(self.radius - by)
 
 
 Outline = Rectangle | Circle
-EVERYWHERE = Circle(math.inf)  # an outline that loses no ray
+EVERYWHERE = Circle(math.inf)  # unlimited aperture, which no ray misses
 
 
 def inside(limits: Limits, x: Tensor, y: Tensor, beyond: float = 0.0) -> Tensor:
-    """True where (x, y) (mm) lies inside the outline of these limits, on its rim or `beyond` mm outside it."""
+    """Return True where (x, y) (mm) lies inside the outline of these limits or at most `margin` mm outside it."""
     a, b, r2 = limits
-    with torch.no_grad():  # in place: it is asked of every ray
+    with torch.no_grad():  # in place, since every ray is tested
         x, y = x.abs().sub_(a).clamp_(min=0), y.abs().sub_(b).clamp_(min=0)
         square = x.mul_(x) + y.mul_(y)
     return square.sqrt() <= math.sqrt(r2) + beyond if beyond else square <= r2

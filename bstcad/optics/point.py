@@ -1,4 +1,4 @@
-"""Light of a point, or of a disc or a rectangle of points."""
+"""Light of a point source, or of a disc or a rectangle of point sources."""
 
 from __future__ import annotations
 
@@ -21,23 +21,24 @@ from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays, Vector, tilt_of
 from bstcad.optics.wavefront import beyond
 
-SIDES = "diameter", "width", "height"  # sizes of a disc or rectangle that shines
-HALF_SPACE = math.pi / 2  # rad; the edge of light that fills all directions on the lens's side
-WIDEST = math.radians(89.0)  # widest cone whose edge counts on planes
+SIZE_KEYS = "diameter", "width", "height"  # scene keys of the size of an emitting disc or rectangle
+HALF_SPACE = math.pi / 2  # rad, half angle of light that fills the half space on the side of the lens
+MAX_CONE_HALF_ANGLE = math.radians(89.0)  # rad, half angle below which the edge of a cone is a curve on planes
 
 
 @dataclass(frozen=True)
 class Point(Emitter):
-    """Rays from one point into the half space on the lens's side of it.
+    """Rays from one point into the half space on the side of the lens.
 
-    gaussian: irradiance on z = const falls as exp(-2 r² / w²), w = distance · tan(half_angle_1e2);
-    lambertian: radiant intensity cos(theta), up to half_angle if there is one; uniform: constant up to half_angle.
-    Tilted, all that is turned about the point, plane and half space included (`_tilted_irradiance`); what no longer
-    goes to the lens's side misses the lens.  A disc or a rectangle lies across the axis, each point such a source.
+    gaussian: irradiance on z = const ∝ exp(-2 r² / w²), w = distance · tan(half_angle_1e2); lambertian: radiant
+    intensity ∝ cos θ, up to half_angle if there is one; uniform: constant radiant intensity up to half_angle.
+    A tilt rotates the whole distribution about the point, with its plane and half space (`_tilted_irradiance`); light
+    that then leaves the side of the lens misses it.  A disc or a rectangle is perpendicular to the axis and consists
+    of such point sources.
     """
 
     position: Annotated[
-        tuple[float, float, float], Key("Place of the point, or of a disc's middle.", "mm", -1e8, 1e8)
+        tuple[float, float, float], Key("Position of the point, or of the disc's centre.", "mm", -1e8, 1e8)
     ] = (0.0, 0.0, 0.0)
     wavelength: WavelengthKey = 587.6
     profile: Annotated[Literal["gaussian", "lambertian", "uniform"], Key("Radiant intensity over the angle.")] = (
@@ -55,12 +56,12 @@ class Point(Emitter):
     half_angle: Annotated[
         float | None, Key("Angle from the axis at which a uniform or lambertian profile ends.", "degrees", 1e-3, 90.0)
     ] = None
-    diameter: Annotated[float | None, Key("Diameter of a disc that shines, simulated.", "mm", 0.0, 1e6)] = None
+    diameter: Annotated[float | None, Key("Diameter of an emitting disc, simulated.", "mm", 0.0, 1e6)] = None
     width: Annotated[
-        float | None, Key("Width of a rectangle that shines, along its own x.", "mm", 0.0, 1e6, example=1.0)
+        float | None, Key("Width of an emitting rectangle, along its x axis.", "mm", 0.0, 1e6, example=1.0)
     ] = None
     height: Annotated[
-        float | None, Key("Height of a rectangle that shines, along its own y.", "mm", 0.0, 1e6, example=1.0)
+        float | None, Key("Height of an emitting rectangle, along its y axis.", "mm", 0.0, 1e6, example=1.0)
     ] = None
     tilt: Annotated[
         tuple[float, float] | None, Key("Tilt about x and y.", "degrees", -180.0, 180.0, example=[0.0, 10.0])
@@ -71,38 +72,38 @@ class Point(Emitter):
     __pydantic_config__ = STRICT
     size_key, simple, start_key = "diameter", "a point", "position"
     widths = MappingProxyType({"gaussian": "half_angle_1e2", "uniform": "half_angle", "lambertian": "half_angle"})
-    unbounded = "lambertian"  # it lights the half space
+    unbounded = "lambertian"  # without half_angle a lambertian fills the half space
 
     @property
     def begins(self) -> float:
-        """The plane z (mm) of its middle."""
+        """z (mm) of the centre."""
         return self.position[2]
 
     def nearest(self, upwards: bool) -> float:
-        """z (mm) of the place of the point, disc or rectangle that is nearest to a lens above it, or below it."""
+        """Return z (mm) of the point of the source that is nearest to a lens above it, or below it."""
         reach = 0.0 if self.extent is None else self.extent.reach(*(axis[2] for axis in self.axes[:2]))
         return self.position[2] + (reach if upwards else -reach)
 
     def complaints(self, z: float, optic: str) -> Iterator[str]:
-        """A disc or a rectangle that is not described, or that is larger than its distance from the lens."""
+        """Yield faults: a disc or rectangle with missing sizes, or one larger than its distance from the lens."""
         given = [name for name in ("width", "height") if getattr(self, name) is not None]
         if given and self.diameter is not None:
             yield f"diameter: the source also has a {given[0]}; give a diameter, or width and height"
         for other in {"width", "height"} - set(given) if given else ():
             yield f"{other}: missing, and a source with a {given[0]} needs it; add it in mm"
-        sizes = {name: getattr(self, name) or 0.0 for name in SIDES}
+        sizes = {name: getattr(self, name) or 0.0 for name in SIZE_KEYS}
         name, distance = max(sizes, key=sizes.get), abs(z - self.position[2])
         if self.extent is not None and not sizes[name] <= distance:
             far = f"the {distance:g} mm from the source to the {optic}"
             yield f"{name}: {sizes[name]:g} mm is more than {far}; make the source smaller or move it away"
 
     def reference(self, place: Tensor, z: float, sense: int) -> Tensor:
-        """Path (mm) to places (3, …), counted from the plane z, from the sphere about it through that on the axis."""
+        """Return the path (mm) to points (3, …) from the sphere about the source through the origin of the plane z."""
         x, y, start = self.position
         return beyond(place, (x, y, start - z))
 
     def words(self, origin: float) -> str:
-        """Return place, profile, cone and sizes for a data sheet; origin: z (mm) from which the sheet measures."""
+        """Return position, profile, cone and sizes for a data sheet; origin: z (mm) from which the sheet measures."""
         x, y, z = self.position
         place = ", ".join(f"{round(p, 3) + 0.0:.9g}" for p in (x, y, z - origin)).replace("-", "−")
         angle = self.half_angle or self.half_angle_1e2
@@ -111,60 +112,60 @@ class Point(Emitter):
         return ", ".join([f"point at ({place}) mm", LAWS[self.profile], *sizes])
 
     def sizes(self) -> Iterator[tuple[str, float, str]]:
-        """Its diameter, width and height, if it has any."""
-        yield from ((key, size, "mm") for key in SIDES if (size := getattr(self, key)))
+        """Yield diameter, width and height, as far as stated."""
+        yield from ((key, size, "mm") for key in SIZE_KEYS if (size := getattr(self, key)))
 
     @property
     def turns_alike(self) -> bool:
-        """Is it a point or a disc?"""
+        """True for a point or a disc."""
         return self.extent is None or self.extent.is_round
 
     def moved(self, motion: Motion, entrance: float) -> Point:
-        """The point after a motion."""
+        """Return the point source after a motion."""
         tilt = self.tilt if not motion.turns else tilt_of(motion.frame((self.axes[2],))[0])
         return replace(self, position=motion.point(self.position), tilt=tilt)
 
     def wider(self, by: float) -> Point | None:
-        """The point with the tangent of its cone larger by a share; None: it has no cone."""
+        """Return the source with the tangent of its cone larger by the fraction `by`; None: it has no cone."""
         name = "half_angle_1e2" if self.half_angle_1e2 else "half_angle"
         if not (angle := getattr(self, name)):
             return None
         return replace(self, **{name: math.degrees(math.atan((1 + by) * math.tan(math.radians(angle))))})
 
     def larger(self, by: float, about: Vector) -> Point:
-        """The point further from another one by a share of its distance."""
+        """Return the source at a distance from a point larger by the fraction `by`."""
         middle = np.array(about)
         return replace(self, position=tuple((middle + (1 + by) * (np.array(self.position) - middle)).tolist()))
 
     @property
     def extent(self) -> Outline | None:
-        """The disc or rectangle that shines (mm); None: a point."""
+        """Emitting disc or rectangle (mm); None: a point."""
         if self.diameter:
             return Circle(self.diameter / 2)
         return Rectangle(self.width or 0.0, self.height or 0.0) if self.width or self.height else None
 
     @property
     def central(self) -> Point:
-        """The point in its middle, at its main line."""
+        """Point source at the centre, at the main wavelength."""
         return replace(self, wavelength=self.main_wavelength, diameter=None, width=None, height=None)
 
     def scaled(self, share: float) -> Point:
-        """The same source with a share of its diameter, width and height."""
-        sizes = {name: getattr(self, name) for name in SIDES}
+        """Return the source with diameter, width and height multiplied by `share`."""
+        sizes = {name: getattr(self, name) for name in SIZE_KEYS}
         return replace(self, **{name: share * size if share and size else None for name, size in sizes.items()})
 
     def element(self, x: float, y: float) -> Point:
-        """The point at (x, y) of its extent (mm)."""
+        """Return the point source at (x, y) of the extent (mm)."""
         e_x, e_y, _ = self.axes
         place = tuple(p + x * a + y * b for p, a, b in zip(self.position, e_x, e_y, strict=True))
         return replace(self, position=place, diameter=None, width=None, height=None)
 
     def irradiance(self, x: Tensor, y: Tensor, z: float) -> Tensor:
-        """E(x, y) (1/mm²) on the plane z; all the light sent to its side is 1.
+        """Return E(x, y) (1/mm²) on the plane z; the flux into the half space is 1.
 
         gaussian: 2 / (π w²) exp(-2 r² / w²).  lambertian: I = cos θ / (π sin² θ_max) and E = I cos θ / d², so
         E = D² / (π sin² θ_max d⁴) with D the distance of the plane and d that of the point.  uniform:
-        I = 1 / (2π (1 - cos θ_max)), E = I D / d³.  Beyond θ_max both are dark.
+        I = 1 / (2π (1 - cos θ_max)), E = I D / d³.  Outside θ_max both are zero.
         """
         distance = abs(z - self.position[2])
         if self.tilted:
@@ -184,23 +185,23 @@ class Point(Emitter):
 
     @property
     def edge(self) -> float:
-        """The angle from the axis (rad) at which a uniform or lambertian profile ends: π / 2 lights the half space."""
+        """Half angle (rad) at which a uniform or lambertian profile ends; π / 2: the half space."""
         return HALF_SPACE if self.half_angle is None or self.profile == "gaussian" else math.radians(self.half_angle)
 
     @property
     def is_cone(self) -> bool:
-        """Has its light an edge, on planes before it too?"""
-        return self.edge < WIDEST
+        """True if the light has an edge on planes before the lens."""
+        return self.edge < MAX_CONE_HALF_ANGLE
 
     def towards(self, z: float) -> Vector:
-        """Its axis, its light's way to the plane z, in a frame in which that plane is ahead along +z."""
+        """Return the axis of the light towards the plane z, in a frame in which that plane lies ahead along +z."""
         n, sense = self.axes[2], 1 if self.position[2] <= z else -1
         return sense * n[0], sense * n[1], n[2]
 
     def _tilted_irradiance(self, x: Tensor, y: Tensor, distance: float, axis: Vector) -> Tensor:
-        """E of a tilted source at (x, y) from its foot on a plane at the distance D; c = n · (x, y, D) = d cos θ.
+        """Return E of a tilted source at (x, y) from its foot on a plane at distance D; c = n · (x, y, D) = d cos θ.
 
-        E = I(θ) D / d³, and nothing where c <= 0.  lambertian: I = cos θ / (π sin² θ_max), E = D c / (π sin² θ_max d⁴);
+        E = I(θ) D / d³, and zero where c <= 0.  lambertian: I = cos θ / (π sin² θ_max), E = D c / (π sin² θ_max d⁴);
         uniform: I constant, both where cos θ >= cos θ_max.  gaussian: on its own planes E ∝ exp(-2 tan² θ / t²),
         t = tan(half_angle_1e2), so I = 2 / (π t²) exp(-2 tan² θ / t²) / cos³ θ, and
         E = 2 D / (π t² c³) exp(-2 (d² - c²) / (t² c²)).
@@ -224,7 +225,7 @@ class Point(Emitter):
         return torch.where(ahead, e, torch.zeros_like(e))
 
     def beam(self, z: float) -> Beam:
-        """`irradiance` on the plane z (mm) as numbers."""
+        """Return the parameters of `irradiance` on the plane z (mm) for the kernels."""
         x, y, from_z = floats(self.position)
         distance, round_ = abs(z - from_z), (0.0, 0.0)
         if self.tilted:
@@ -243,7 +244,7 @@ class Point(Emitter):
         return Beam(x, y, *round_, reach2, *law, distance, distance, *ALONG_Z)
 
     def _tilted_law(self, distance: float) -> tuple[float, float, int, float]:
-        """(peak, fall, power, least) of `_tilted_irradiance`."""
+        """Return (peak, fall, power, smallest cosine) of `_tilted_irradiance`."""
         if self.profile == "gaussian":
             t2 = math.tan(math.radians(self.half_angle_1e2)) ** 2
             return 2 * distance / (math.pi * t2), 2 / t2, 0, 0.0
@@ -253,17 +254,17 @@ class Point(Emitter):
         return distance / (2 * math.pi * (1 - math.cos(self.edge))), 0.0, 3, least
 
     def window(self, outline: Outline, z: float, sags: tuple[float, ...]) -> Rectangle:
-        """The rectangle of the plane z that holds every ray that can meet the first surface inside its outline.
+        """Return the rectangle of the plane z that holds all rays that can meet the first surface in its outline.
 
-        The surface lies between that plane and those at `sags` (mm) from it: one that bends towards the source is seen
-        under a wider angle, one that bends away may be seen shifted from an offset source.
+        The surface lies between that plane and those at `sags` (mm) from it.  A surface that bends towards the source
+        is seen at a wider angle; one that bends away may be seen shifted by a source off the axis.
         """
         distance = abs(z - self.position[2])
         offsets = [abs(p) for p in self.position[:2]]
         half = list(outline.half_extent)
         for sag in sags:
             away = sag if z > self.position[2] else -sag
-            w = distance / max(distance + away, 1e-3 * distance)  # a point at h is seen at p + w (h - p)
+            w = distance / max(distance + away, 1e-3 * distance)  # a point at h appears at p + w (h - p)
             seen = (w * h + abs(1 - w) * p for h, p in zip(outline.half_extent, offsets, strict=True))
             half = [max(h, s) for h, s in zip(half, seen, strict=True)]
         if self.is_cone:
@@ -271,7 +272,7 @@ class Point(Emitter):
         return Rectangle(2 * half[0], 2 * half[1])
 
     def _cone_slopes(self, z: float) -> tuple[float, float]:
-        """The largest |dx/dz| and |dy/dz| of a cone's rays to the plane z; infinite if it runs along that.
+        """Return the largest |dx/dz| and |dy/dz| of the cone's rays to the plane z; inf if a ray is parallel to it.
 
         X = dx/dz ends where the line of all Y touches the cone: (1 + X²) sin² θ_max = (n_x - n_z X)².
         """
@@ -286,14 +287,14 @@ class Point(Emitter):
         return tuple((abs(a * z) + root) / (z * z - sin2) for a, root in zip((x, y), roots, strict=True))
 
     def spot(self, z: float) -> tuple[Outline | None, tuple[float, float]]:
-        """(outline, centre in mm) of the light on the plane z, None where it has no edge: a cone's disc."""
+        """Return (disc of the cone, centre in mm) on the plane z; disc None: the light has no edge."""
         centre = self.position[:2]
         if not self.is_cone or self.tilted:
             return None, centre
         return Circle(abs(z - self.position[2]) * math.tan(self.edge)), centre
 
     def rays(self, x: Tensor, y: Tensor, z: float, area: float) -> Rays:
-        """Rays from the point through (x, y) of the plane z."""
+        """Return rays from the point through (x, y) of the plane z."""
         start_x, start_y, start_z = self.position
         towards = torch.stack([x - start_x, y - start_y, torch.full_like(x, z - start_z)])
         direction = towards / torch.sqrt(towards[0] ** 2 + towards[1] ** 2 + towards[2] ** 2)

@@ -1,11 +1,11 @@
-"""The start of rays: points in a rectangle, by grid, stratified (jittered) or at random.
+"""Sample points of rays and sources: grids, stratified (jittered) points and random points of a rectangle.
 
-Each function gives (x, y) in mm over `window` (centred on the axis); every point stands for the same area.
-`in_pairs` is for sources that are more than a point: few points over an outline, each as good as another; `rim` is of
-the outline itself.
+Each of these functions returns (x, y) in mm over `window` (centred on the axis); every point represents the same area.
+`in_pairs` and `scattered` return points of equal weight over the outline of an extended source; `rim` returns points
+along an outline.
 
-The jitter of a cell is a number of its own, not the next of a sequence: SplitMix64 (Steele, Lea and Flood 2014) of the
-cell's place, so that any thread can start anywhere and gets the same points.
+The jitter of a cell is a hash of its number, SplitMix64 (Steele, Lea and Flood 2014), instead of the next number of a
+sequence, so that every thread obtains the same points.
 """
 
 from __future__ import annotations
@@ -21,14 +21,15 @@ from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.outlines import Outline, Rectangle
 from bstcad.optics.sides import Sides, both
 
-STRIP = 1 << 18  # points a strip, about
-STRIDE = 0x9E3779B97F4A7C15  # 2^64 over the golden ratio
+POINTS_PER_STRIP = 1 << 18  # approximate number of points in a strip of rows
+STRIDE = 0x9E3779B97F4A7C15  # increment of SplitMix64: 2^64 over the golden ratio
 MIX_1, MIX_2 = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
-GOLDEN, TURN = 0.6180339887498949, 0.7548776662466927  # 1/g of g² = g + 1 and of g³ = g + 1
+# 1/g of g² = g + 1, the step of a golden lattice; 1/g of g³ = g + 1, the shift of a lattice from draw to draw
+GOLDEN_RATIO, DRAW_SHIFT = 0.6180339887498949, 0.7548776662466927
 
 
 def grid(window: Rectangle, sides: Sides, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
-    """Centres of equal cells, so many a side or along x and along y, each (along x, along y)."""
+    """Return the centres of equal cells, this many a side or (along x, along y); x and y are (along x, along y)."""
     along_x, along_y = ((torch.arange(n, dtype=dtype) + 0.5) / n - 0.5 for n in both(sides))
     x, y = torch.meshgrid(along_x * window.width, along_y * window.height, indexing="ij")
     return x.contiguous(), y.contiguous()
@@ -37,8 +38,8 @@ def grid(window: Rectangle, sides: Sides, dtype: torch.dtype = torch.float64) ->
 def stratified_strips(
     window: Rectangle, n: int, seed: int, dtype: torch.dtype = torch.float64
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """A random point in each of n x n equal cells, some rows of them at a time: any number fits memory and cache."""
-    rows = max(1, STRIP // n)
+    """Yield a random point in each of n x n equal cells, a strip of rows at a time, which fits the cache."""
+    rows = max(1, POINTS_PER_STRIP // n)
     for first in range(0, n, rows):
         i = np.arange(first, min(first + rows, n))[:, None]
         j = np.arange(n)
@@ -49,64 +50,64 @@ def stratified_strips(
 
 
 def key(seed: int) -> int:
-    """A hash of the seed, 64 bits; those of neighbouring seeds have nothing in common."""
+    """Return a 64-bit hash of the seed; hashes of neighbouring seeds are independent."""
     return int(_mix(np.array([(seed + STRIDE) % (1 << 64)], dtype=np.uint64))[0])
 
 
 def jitter(key: int, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two numbers in (0, 1), multiples of 2^-33, for each cell: SplitMix64's 64 bits, the upper and the lower half."""
+    """Return two numbers in (0, 1), multiples of 2^-33, for each cell: the upper and lower 32 bits of SplitMix64."""
     bits = _mix(np.uint64(key) + cell.astype(np.uint64) * np.uint64(STRIDE))
     return tuple((half + 0.5) * 2.0**-32 for half in (bits >> np.uint64(32), bits & np.uint64(0xFFFFFFFF)))
 
 
 def _mix(z: np.ndarray) -> np.ndarray:
-    """SplitMix64's finaliser: every bit of z changes each bit of the result with probability 1/2."""
+    """Apply the finaliser of SplitMix64: every bit of z changes each bit of the result with probability 1/2."""
     z = (z ^ (z >> np.uint64(30))) * np.uint64(MIX_1)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(MIX_2)
     return z ^ (z >> np.uint64(31))
 
 
 def random(window: Rectangle, count: int, seed: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
-    """`count` independent uniform points, each (count,)."""
+    """Return `count` independent uniform points, x and y (count,)."""
     points = torch.rand((2, count), generator=torch.Generator().manual_seed(seed), dtype=dtype) - 0.5
     return points[0] * window.width, points[1] * window.height
 
 
 def in_pairs(outline: Outline, pairs: int, draw: int = 0) -> list[tuple[float, float]]:
-    """Points (x, y) spread evenly over an outline, each with its opposite behind it, so that their mean is zero.
+    """Return points (x, y) evenly over an outline, each followed by its reflection in the centre: their mean is 0.
 
-    Numbers k of a golden lattice, a = (k + 1/2) / pairs and b = (k φ + turn) mod 1, cover one half: of a rectangle as
-    (a, 2 b - 1), of a disc as the sunflower's spiral, r² = a, ψ = π b.  Each draw turns it on.  From two pairs on the
-    second moments, too, are made the outline's own (by hundredths a point of a rectangle may lie beyond it for that):
-    32 points of a disc leave two thirds of the noise of 128 random ones at a hard edge, a fifth at a soft one.
+    A golden lattice, a = (k + 1/2) / pairs and b = (k φ + shift) mod 1 for k = 0, 1, …, covers one half: of a rectangle
+    as (a, 2 b - 1), of a disc as the sunflower spiral r² = a, ψ = π b.  The shift depends on `draw`.  From two pairs on
+    the second moments equal those of the outline, for which a point of a rectangle may lie outside it by hundredths of
+    its size.  32 points of a disc have 2/3 of the noise of 128 random ones at a hard edge, 1/5 at a soft one.
     """
     half_x, half_y = outline.half_extent
-    lattice = [((k + 0.5) / pairs, (0.5 + draw * TURN + k * GOLDEN) % 1.0) for k in range(pairs)]
+    lattice = [((k + 0.5) / pairs, (0.5 + draw * DRAW_SHIFT + k * GOLDEN_RATIO) % 1.0) for k in range(pairs)]
     if outline.is_round:
         points = [(math.sqrt(a) * math.cos(math.pi * b), math.sqrt(a) * math.sin(math.pi * b)) for a, b in lattice]
-        points = _with_moment(points, 1 / 4)
+        points = _with_second_moment(points, 1 / 4)
     else:
-        points = _with_moment([(a, 2 * b - 1) for a, b in lattice], 1 / 3)
+        points = _with_second_moment([(a, 2 * b - 1) for a, b in lattice], 1 / 3)
     return [(sign * half_x * x, sign * half_y * y) for x, y in points for sign in (1, -1)]
 
 
 def scattered(outline: Outline, count: int, seed: int) -> list[tuple[float, float]]:
-    """Points (x, y) over an outline, each spread evenly over all of it from seed to seed: their sums have no bias.
+    """Return points (x, y) over an outline, each uniformly distributed over seeds, so that sums over them are unbiased.
 
-    A golden lattice of `count` points, a = k / count and b = k φ, moved by two random numbers modulo 1
+    A golden lattice of `count` points, a = k / count and b = k φ, shifted by two random numbers modulo 1
     (Cranley and Patterson 1976); on a disc r² = a, ψ = 2 π b.
     """
     (move_a,), (move_b,) = jitter(key(seed), np.zeros(1, np.int64))
     half_x, half_y = outline.half_extent
-    lattice = [((k / count + move_a) % 1.0, (k * GOLDEN + move_b) % 1.0) for k in range(count)]
+    lattice = [((k / count + move_a) % 1.0, (k * GOLDEN_RATIO + move_b) % 1.0) for k in range(count)]
     if outline.is_round:
         polar = ((math.sqrt(a), 2 * math.pi * b) for a, b in lattice)
         return [(half_x * r * math.cos(turn), half_y * r * math.sin(turn)) for r, turn in polar]
     return [(half_x * (2 * a - 1), half_y * (2 * b - 1)) for a, b in lattice]
 
 
-def _with_moment(points: list[tuple[float, float]], moment: float) -> list[tuple[float, float]]:
-    """The points with mean x² = mean y² = moment and mean x y = 0: y leans against x, then both are stretched."""
+def _with_second_moment(points: list[tuple[float, float]], moment: float) -> list[tuple[float, float]]:
+    """Return the points sheared and scaled to mean x² = mean y² = moment and mean x y = 0."""
     n = len(points)
     if n < 2:
         return points
@@ -117,16 +118,16 @@ def _with_moment(points: list[tuple[float, float]], moment: float) -> list[tuple
 
 
 def rim(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
-    """4 n points along the rim, the first and the last the same (mm)."""
+    """Return 4 n points (mm) along the rim; the first equals the last."""
     turn = torch.linspace(0, 2 * torch.pi, 4 * n, dtype=torch.float64)
     c, s = elementary(torch.cos, turn), elementary(torch.sin, turn)
     a, b = outline.half_extent
-    if not outline.is_round:  # the circle pushed out onto the square
+    if not outline.is_round:  # project the circle onto the square
         reach = torch.maximum(c.abs(), s.abs())
         c, s = c / reach, s / reach
     x, y = a * c, b * s
     a, b, r2 = outline.limits
-    if not outline.is_round and r2:  # and in again onto the arcs of its corners
+    if not outline.is_round and r2:  # project the corners onto their arcs
         p, q = (x.abs() - a).clamp(min=0), (y.abs() - b).clamp(min=0)
         far = torch.hypot(p, q)
         back = torch.where((p > 0) & (q > 0), 1 - math.sqrt(r2) / far.clamp(min=1e-300), torch.zeros_like(far))

@@ -1,4 +1,4 @@
-"""A plane or a sphere in any place: c |p - V|² = 2 N · (p - V), V its vertex, N the unit normal there, N_z > 0.
+"""A plane or a sphere in any position: c |p - V|² = 2 N · (p - V), V its vertex, N the unit normal there, N_z > 0.
 
 Windows and mirrors around a lens have such faces.  With u = (x, y) - (V_x, V_y) the height h over the plane z = V_z is
 the smaller root of c h² - 2 N_z h + f = 0, f = c u² - 2 (N_x u_x + N_y u_y), written as f / (N_z + sqrt(N_z² - c f)),
@@ -25,59 +25,59 @@ Face = Plane | Sphere
 
 @dataclass(frozen=True)
 class Tilted(Surface):
-    """A plane or a sphere whose vertex lies beside the axis of the lens, or whose normal there leans against it."""
+    """A plane or a sphere with its vertex off the axis of the lens, or its normal there inclined to the axis."""
 
-    z: float  # V_z (mm)
-    place: tuple[float, float]  # V_x and V_y (mm)
-    unit: Vector  # N
-    bend: float = 0.0  # c (1/mm); positive bends towards +z
+    z: float  # V_z, mm
+    place: tuple[float, float]  # (V_x, V_y), mm
+    unit: Vector  # unit normal N at the vertex
+    bend: float = 0.0  # curvature c, 1/mm; positive: concave towards +z
 
     kind: ClassVar[str] = "tilted"
-    curvature = conic_constant = None  # it is no surface of revolution about the axis of the lens
+    curvature = conic_constant = None  # not a surface of revolution about the axis of the lens
 
     @classmethod
     def of(cls, surface: Face | Tilted) -> Tilted:
-        """Return a plane or a sphere as one."""
+        """Return a plane or a sphere as a surface of this class."""
         if isinstance(surface, Tilted):
             return surface
         return cls(float(surface.z), (0.0, 0.0), (0.0, 0.0, 1.0), float(surface.curvature))
 
     @property
     def vertex(self) -> Vector:
-        """V (mm)."""
+        """Vertex V (mm)."""
         return (*self.place, self.z)
 
     def moved_by(self, motion: Motion) -> Tilted:
-        """Return the surface after a rigid motion that turns it by less than a right angle."""
+        """Return the surface after a rigid motion with a rotation of less than a right angle."""
         (unit,), (x, y, z) = motion.frame((self.unit,)), motion.point(self.vertex)
         return replace(self, z=z, place=(x, y), unit=unit)
 
     def _from_vertex(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(u_x, u_y, f)."""
+        """Return (u_x, u_y, f)."""
         (n_x, n_y, _), (v_x, v_y) = self.unit, self.place
         x, y = x - v_x, y - v_y
         return x, y, self.bend * (x * x + y * y) - 2 * (n_x * x + n_y * y)
 
     def _cos2(self, f: Tensor) -> Tensor:
-        """N_z² - c f, the square of the normal's third component."""
+        """Return N_z² - c f, the square of the z component of the normal."""
         return self.unit[2] ** 2 - self.bend * f
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(h, ∂h/∂x, ∂h/∂y) at (x, y), ∂h/∂x = (c u_x - N_x) / (N_z - c h); beyond its rim numbers without meaning."""
+        """Return (h, ∂h/∂x, ∂h/∂y) at (x, y), ∂h/∂x = (c u_x - N_x) / (N_z - c h); meaningless outside the rim."""
         x, y, f = self._from_vertex(x, y)
         cos2 = self._cos2(f)
-        root = torch.sqrt(torch.where(cos2 > EQUATOR, cos2, torch.full_like(cos2, EQUATOR)))  # guarded before the root
+        root = torch.sqrt(torch.where(cos2 > EQUATOR, cos2, torch.full_like(cos2, EQUATOR)))  # no NaN in the gradient
         n_x, n_y, n_z = self.unit
         return f / (n_z + root), (self.bend * x - n_x) / root, (self.bend * y - n_y) / root
 
     def reaches(self, x: Tensor, y: Tensor) -> Tensor:
-        """True where there is a point of the surface over (x, y)."""
+        """Return True where the surface has a point over (x, y)."""
         return self._cos2(self._from_vertex(x, y)[2]) > EQUATOR
 
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
-        """(s in mm, met): path along rays from (x, y) of the plane z = V_z to the surface.
+        """Return (path s in mm, hit) along rays from (x, y) of the plane z = V_z to the surface.
 
-        c s² - 2 g s + f = 0, g = N · d - c u · d; of the two roots that near the vertex, s = f / (g ± sqrt(g² - c f)).
+        c s² - 2 g s + f = 0, g = N · d - c u · d; the root near the vertex is s = f / (g ± sqrt(g² - c f)).
         """
         (n_x, n_y, n_z), (dx, dy, dz) = self.unit, direction
         x, y, f = self._from_vertex(x, y)
@@ -89,11 +89,11 @@ class Tilted(Surface):
         return s, ok & (self.bend * s * dz < n_z)
 
     def sags(self, outline: Outline) -> tuple[float, float]:
-        """The lowest and the highest height (mm) over the plane z inside the outline, to the places on its rim."""
+        """Return the lowest and the highest height (mm) over the plane z inside the outline, from points of its rim."""
         x, y = (torch.from_numpy(np.append(p, 0.0)) for p in outline.places())
         h = self.relative_sag_and_slope(x, y)[0]
         return min(float(h.min()), 0.0), max(float(h.max()), 0.0)
 
     def height_above(self, point: Vector) -> float:
-        """N · (p - V): how far (mm) a point stands above the tangent plane of the vertex."""
+        """Return N · (p - V), the height (mm) of a point above the tangent plane of the vertex."""
         return math.fsum(n * (p - v) for n, p, v in zip(self.unit, point, self.vertex, strict=True))

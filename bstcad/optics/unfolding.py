@@ -1,9 +1,9 @@
-"""Receivers where a tailored face sees them: through a flat face of the lens, past windows and in flat mirrors.
+"""Images of receivers as a tailored face sees them: through a flat face of the lens, windows and flat mirrors.
 
-Stage 1 aims from the last tailored face straight at the receiver.  Behind flat mirrors it aims at the receiver's mirror
-image, which is exact.  A plate of thickness t and index n brings the image nearer by t (1 - 1 / n), to first order in
-the angle; stage 2, which traces all interfaces, does the rest.  Light that is still in the glass leaves it through a
-flat face: towards each place it takes the way that Snell's law has it take (`BehindGlass`).
+Stage 1 aims straight from the last tailored face to the image of the receiver.  The image in flat mirrors is exact.
+A plate of thickness t and index n moves the image nearer by t (1 - 1 / n), to first order in the angle; stage 2, which
+traces all interfaces, corrects the rest.  Light inside the glass leaves it through a flat face, and its direction to
+each point of the receiver follows from Snell's law (`BehindGlass`).
 """
 
 from __future__ import annotations
@@ -22,18 +22,19 @@ from bstcad.optics.receivers import LevelPlane, Plane, Receiver, dot
 from bstcad.optics.surfaces import sag
 from bstcad.optics.tilted import Tilted
 
-STEPS = 8  # steps of Newton's method to the place of a flat face from which light goes to a place of a receiver
-TINY = 1e-300  # instead of 0, as a divisor
-STRAIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+# Newton iterations for the point of a flat face through which light goes to a given point of the receiver
+NEWTON_ITERATIONS = 8
+TINY = 1e-300  # smallest divisor
+SPACE_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True)
 class Image(Plane):
-    """The image of a plane, on which its places keep their coordinates."""
+    """Image of a plane, on which points keep their coordinates."""
 
-    centre: Vector  # C (mm)
-    at: tuple[float, float]  # o: the coordinates of C on the plane
-    vectors: tuple[Vector, Vector, Vector]  # e_x, e_y and the normal, which points away from where light comes from
+    centre: Vector  # centre C of the image, mm
+    at: tuple[float, float]  # coordinates o of C on the plane
+    vectors: tuple[Vector, Vector, Vector]  # (e_x, e_y, normal directed away from the incident light)
 
     @classmethod
     def of(cls, plane: Receiver) -> Image:
@@ -44,17 +45,17 @@ class Image(Plane):
 
     @property
     def frame(self) -> tuple[Vector, Vector, Vector]:
-        """e_x, e_y and n; no kernel knows them, which takes planes by `axes`."""
+        """Axes (e_x, e_y, n); the kernels use `axes`, which an image lacks."""
         return self.vectors
 
     @property
     def origin(self) -> tuple[float, float]:
-        """o."""
+        """Coordinates o of the centre."""
         return self.at
 
     @property
     def middle(self) -> Vector:
-        """C (mm)."""
+        """Centre C (mm)."""
         return self.centre
 
     def in_mirror(self, mirror: Tilted) -> Image:
@@ -70,75 +71,75 @@ class Image(Plane):
         return replace(self, centre=tuple(c + w for c, w in zip(self.centre, way, strict=True)))
 
     def plain(self) -> Receiver:
-        """Return a level plane with the axes of space as such, else itself."""
+        """Return a level plane with the axes of space as LevelPlane, else itself."""
         (c_x, c_y, z), (o_x, o_y) = self.centre, self.origin
-        return LevelPlane(z) if self.frame == STRAIGHT and (c_x, c_y) == (o_x, o_y) else self
+        return LevelPlane(z) if self.frame == SPACE_AXES and (c_x, c_y) == (o_x, o_y) else self
 
 
 @dataclass(frozen=True)
 class BehindGlass(Receiver):
-    """A receiver at which light aims that is still in the glass, and leaves it through a level face."""
+    """A receiver for light that is still in the glass and leaves it through a flat face, z = const."""
 
     rest: Receiver
-    z: float  # mm; of the face
-    eta: float  # index of the glass over that behind it
+    z: float  # plane of the face, mm
+    eta: float  # index of the glass over the index behind the face
 
     @property
     def middle(self) -> Vector:
-        """The point in the middle of the receiver (mm)."""
+        """Point at the centre of the receiver (mm)."""
         return self.rest.middle
 
     def path(self, rays: Rays) -> tuple[Tensor, Tensor]:
-        """(way along each ray behind the face to the receiver (mm), status)."""
+        """Return (path along each ray behind the face to the receiver (mm), status)."""
         return self.rest.path(rays)
 
     def places(self, rays: Rays) -> Sequence[Tensor]:
-        """x and y of rays that are on the receiver."""
+        """Return x and y of rays that are on the receiver."""
         return self.rest.places(rays)
 
     def point(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The points in space (mm) of places on the receiver."""
+        """Return the points in space (mm) of coordinates on the receiver."""
         return self.rest.point(x, y)
 
     def normal(self, aim: Tensor) -> Sequence[Tensor | float]:
-        """The unit normal of the receiver in each of these places (2, …)."""
+        """Return the unit normals of the receiver at coordinates (2, …)."""
         return self.rest.normal(aim)
 
     def way_to(self, rays: Rays, aim: Tensor) -> Tensor:
-        """(3, …) the unit vectors along which rays in the glass go to places (2, …) of the receiver.
+        """Return the unit vectors (3, …) along which rays in the glass reach coordinates (2, …) of the receiver.
 
-        From a place of the face the light goes on along s to the receiver, d behind it, and before the face it comes
-        along i = (s_x / η, s_y / η) through t of glass from another place of the face.  Newton's method makes both one:
-        as the place moves by 1, the other one moves back by k = t s_z / (η d i_z) across the plane of incidence, and
-        by k (s_z / i_z)² in it.
+        Behind a point of the face the light goes along s over the distance d to the receiver.  By Snell's law it comes
+        along i = (s_x / η, s_y / η) through the thickness t of glass, which meets the face at a second point.  Newton's
+        method makes the two points equal: as the first moves by 1, the second moves back by k = t s_z / (η d i_z)
+        across the plane of incidence, and by k (s_z / i_z)² in it.
         """
         below, way = rays.above(self.z), self.rest.way_to(rays, aim)
         at = rays.position - below / way[2] * way
-        for _ in range(STEPS):
+        for _ in range(NEWTON_ITERATIONS):
             out = self.rest.way_to(replace(rays, position=at), aim)
             length = torch.sqrt((out * out).sum(0))
             sines = out[:2] / length / self.eta
             way = torch.cat([sines, (torch.sign(out[2]) * torch.sqrt(1 - (sines * sines).sum(0)))[None]])
-            apart = rays.position - below / way[2] * way - at
+            residual = rays.position - below / way[2] * way - at
             back, bent = (below / (self.eta * length * way[2])).abs(), (out[2] / length / way[2]) ** 2
             radial = torch.cat([sines, torch.zeros_like(sines[:1])])
-            within = radial * ((radial * apart).sum(0) / (radial * radial).sum(0).clamp_min(TINY))
-            at = at + (apart - within) / (1 + back) + within / (1 + back * bent)
+            within = radial * ((radial * residual).sum(0) / (radial * radial).sum(0).clamp_min(TINY))
+            at = at + (residual - within) / (1 + back) + within / (1 + back * bent)
         return way
 
 
 def image(behind: Sequence[Interface], plane: Receiver) -> Receiver:
-    """Return where light before these interfaces, whose surfaces are flat, sees a receiver; itself: of none.
+    """Return the image of a receiver by interfaces with flat surfaces; the receiver itself if there are none.
 
     Light leaves the lens along +z, and a receiver behind elements is a plane.
     """
     if not behind:
         return plane
-    if sum(not interface.law.reverses for interface in behind) % 2:  # the first leads out of the glass
+    if sum(not interface.law.reverses for interface in behind) % 2:  # the first interface is the exit from the glass
         face, *beyond = behind
         return BehindGlass(image(beyond, plane), float(sag(face.surface, 0.0, 0.0)), face.law.eta)
     seen = Image.of(plane)
-    leaves: Tilted | None = None  # the face through which light, followed backwards, has come into a plate
+    leaves: Tilted | None = None  # exit face of a plate, while the light is followed backwards
     for interface in reversed(behind):
         face = Tilted.of(interface.surface)
         if interface.law.reverses:
@@ -153,24 +154,24 @@ def image(behind: Sequence[Interface], plane: Receiver) -> Receiver:
 
 
 def seen_from_last_net(lens: Lens, plane: Receiver) -> Receiver:
-    """Return a receiver where light behind the last net of a lens sees it; itself where it meets nothing else."""
+    """Return the image of a receiver behind the last net of a lens; the receiver itself if no interface follows."""
     return image(lens.interfaces[lens.freeform[-1] + 1 :], plane)
 
 
 def imaged(lens: Lens, screen: Screen) -> Screen:
-    """Return a screen on such a receiver."""
+    """Return the screen with its image behind the last net of a lens as its receiver."""
     plane = screen.plane
     seen = seen_from_last_net(lens, plane)
     return screen if seen is plane else replace(screen, surface=seen)
 
 
 def seen_by(lens: Lens, screen: Screen) -> Receiver:
-    """Return the receiver of a screen where a lens sees it."""
+    """Return the image of a screen's receiver behind the lens."""
     return image(lens.behind, screen.plane)
 
 
 def per_radian(lens: Lens, screen: Screen) -> float:
-    """Return how far, in a screen's unit, light moves on it as it leaves the back of a lens turned by a radian."""
+    """Return the shift on a screen, in its unit, per radian by which light is deflected at the back of a lens."""
     return seen_by(lens, screen).per_radian(lens.back.z)
 
 

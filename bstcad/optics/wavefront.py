@@ -1,12 +1,12 @@
-"""Wavefronts that are asked for behind a lens: plane, spherical, or stated by Zernike coefficients.
+"""Goal wavefronts behind a lens: plane, spherical, or stated by Zernike coefficients.
 
-A wave is told by its eikonal W (mm) on a level plane z, up to a constant: the optical path from the source to each
-place (x, y) of it.  Light behind the lens is in air, so the eikonal equation |∇W| = 1 gives the rays: W_x and W_y are
-two of the direction cosines, and d = (W_x, W_y, sqrt(1 - W_x² - W_y²)) leads along +z (Born and Wolf, Principles of
-Optics, section 3.1).
+A wave is stated by its eikonal W (mm) on a level plane z, up to a constant: the optical path from the source to each
+point (x, y) of the plane.  Light behind the lens is in air, so that by the eikonal equation |∇W| = 1 W_x and W_y are
+two of the direction cosines of the rays, and d = (W_x, W_y, sqrt(1 - W_x² - W_y²)) points along +z (Born and Wolf,
+Principles of Optics, section 3.1).
 
-Sign: where W is larger the path is longer, and the wavefront lags behind; where W is smaller it runs ahead.  So rays go
-towards larger W; a diverging wave has W > 0 around its axis, like a positive Noll 4, and a converging one W < 0.
+Sign: where W is larger the path is longer, and the wavefront lags behind; where W is smaller it runs ahead.  Rays go
+towards larger W: a diverging wave has W > 0 around its axis, like a positive Noll 4, and a converging one W < 0.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from bstcad.optics.key import Key
 from bstcad.optics.outlines import STRICT, Circle
 from bstcad.optics.rays import Vector
 
-NM = 1e-6  # mm
-IN_PLANE = 1e-3  # mm; a focus nearer to the plane is on it
-ALONG = math.radians(89.0)  # rays that lean further from the axis run along the plane
-SAMPLES = 129  # a side of a Zernike circle, at which its steepest ray is looked for
+NM = 1e-6  # millimetres per nanometre
+MIN_FOCUS_DISTANCE = 1e-3  # mm, smallest distance of a focus from the plane
+ALONG = math.radians(89.0)  # rad, angle to the axis above which a ray counts as parallel to the plane
+SAMPLES_PER_SIDE = 129  # grid points a side of a Zernike circle, at which the largest slope is searched
 Place = tuple[float, float]
 
 Z = Key("Plane behind the lens on which the wavefront is stated and measured.", "mm", -1e8, 1e8, example=40.0)
@@ -35,16 +35,16 @@ WEIGHT = Key("Weight of the wavefront against the pictures.", "", 0.0, 1e9, exam
 
 
 class _Wave:
-    """What waves have in common."""
+    """Methods that all waves share."""
 
     z: float
 
     def contains(self, x: Tensor, y: Tensor) -> Tensor:
-        """True at places (mm) of the plane for which the wave is stated: everywhere."""
+        """Return True at points (mm) of the plane for which the wave is stated: everywhere."""
         return torch.ones_like(x, dtype=torch.bool)
 
     def complaints(self, back: float) -> Iterator[str]:
-        """Everything that keeps the wave from a lens whose back is at that z (mm), each as "key: sentence"."""
+        """Yield reasons, as "key: sentence", why the wave does not suit a lens whose back is at z = `back` (mm)."""
         if not self.z > back:
             behind = f"the plane at z = {self.z:g} is not behind the back at z = {back:g}"
             yield f"z: {behind}; move it further along +z"
@@ -52,7 +52,7 @@ class _Wave:
 
 @dataclass(frozen=True)
 class PlaneWave(_Wave):
-    """W = n_x x + n_y y, n the direction as a unit vector: parallel light."""
+    """Plane wave W = n_x x + n_y y, with n the unit vector of the direction: parallel light."""
 
     z: Annotated[float, Z]
     direction: Annotated[
@@ -65,32 +65,32 @@ class PlaneWave(_Wave):
 
     @property
     def normal(self) -> Vector:
-        """The direction as a unit vector."""
+        """Unit vector of the direction."""
         length = math.hypot(*self.direction)
         x, y, z = (part / length for part in self.direction)
         return x, y, z
 
     def path(self, x: Tensor, y: Tensor, wavelength: float) -> Tensor:
-        """W (mm) at places (mm) of the plane, zero on the axis; the wavelength (nm) does not matter."""
+        """Return W (mm) at points (mm) of the plane, zero on the axis; independent of the wavelength (nm)."""
         n_x, n_y, _ = self.normal
         return n_x * x + n_y * y
 
     def directions(self, x: Tensor, y: Tensor, wavelength: float) -> Tensor:
-        """(3, …) unit vectors of the rays through places (mm) of the plane; the wavelength (nm) does not matter."""
+        """Return unit vectors (3, …) of the rays at points (mm) of the plane; independent of the wavelength (nm)."""
         return torch.stack([torch.full_like(x, part) for part in self.normal])
 
     def complaints(self, back: float) -> Iterator[str]:
-        """A direction that does not lead away from the lens."""
+        """Yield, besides the common reasons, a direction that does not lead away from the lens."""
         yield from super().complaints(back)
         if not self.direction[2] > math.cos(ALONG) * math.hypot(*self.direction):
-            yield "direction: does not lead along +z, away from the lens; give one such as [0.0, 0.0, 1.0]"
+            yield "direction: it does not point along +z, away from the lens; give one such as [0.0, 0.0, 1.0]"
 
 
 @dataclass(frozen=True)
 class SphericalWave(_Wave):
-    """W = ∓ (|p - f| - |o - f|), p = (x, y, z), f the focus, o where the axis meets the plane: a sphere about f.
+    """Spherical wave W = ∓ (|p - f| - |o - f|), p = (x, y, z), f the focus, o the point of the axis on the plane.
 
-    The upper sign, rays towards the focus, is that of a focus behind the plane; from one before it they diverge.
+    The upper sign holds for a focus behind the plane, to which rays converge; from a focus before it they diverge.
     """
 
     focus: Annotated[
@@ -105,37 +105,37 @@ class SphericalWave(_Wave):
 
     @property
     def centre(self) -> Vector:
-        """The focus from where the axis meets the plane (mm)."""
+        """Focus relative to the point of the axis on the plane (mm)."""
         return self.focus[0], self.focus[1], self.focus[2] - self.z
 
     @property
     def sense(self) -> int:
-        """+1 for light that comes from the focus, -1 for light that goes there."""
+        """Sense of the light: +1 from the focus, -1 towards the focus."""
         return 1 if self.centre[2] < 0 else -1
 
     def path(self, x: Tensor, y: Tensor, wavelength: float) -> Tensor:
-        """W (mm) at places (mm) of the plane, zero on the axis; the wavelength (nm) does not matter."""
+        """Return W (mm) at points (mm) of the plane, zero on the axis; independent of the wavelength (nm)."""
         return self.sense * beyond(torch.stack([x, y, torch.zeros_like(x)]), self.centre)
 
     def directions(self, x: Tensor, y: Tensor, wavelength: float) -> Tensor:
-        """(3, …) unit vectors of the rays through places (mm) of the plane; the wavelength (nm) does not matter."""
+        """Return unit vectors (3, …) of the rays at points (mm) of the plane; independent of the wavelength (nm)."""
         f_x, f_y, f_z = self.centre
         from_focus = torch.stack([x - f_x, y - f_y, torch.full_like(x, -f_z)])
         return self.sense * from_focus / length(from_focus)
 
     def complaints(self, back: float) -> Iterator[str]:
-        """A focus in the plane, where a sphere has no wavefront."""
+        """Yield, besides the common reasons, a focus in the plane, where a sphere has no wavefront."""
         yield from super().complaints(back)
-        if not abs(self.centre[2]) >= IN_PLANE:
-            yield f"focus: lies in the plane at z = {self.z:g}; move one of them along z"
+        if not abs(self.centre[2]) >= MIN_FOCUS_DISTANCE:
+            yield f"focus: it lies in the plane at z = {self.z:g}; move one of the two along z"
 
 
 @dataclass(frozen=True)
 class ZernikeWave(_Wave):
-    """W = λ Σ_j c_j Z_j((x - c_x) / a, (y - c_y) / a): Noll's orthonormal polynomials (zernike.py), j = 1, 2, 3, ….
+    """Wave W = λ Σ_j c_j Z_j((x - c_x) / a, (y - c_y) / a), Noll's orthonormal polynomials (zernike.py), j = 1, 2, ….
 
-    c_j are waves RMS over the circle of radius a about (c_x, c_y); outside it nothing is asked for, and `path` and
-    `directions` go on with the polynomials, as far as these have rays.
+    c_j are waves RMS over the circle of radius a about (c_x, c_y).  The wave is not stated outside the circle, where
+    `path` and `directions` extrapolate the polynomials as far as these have rays.
     """
 
     coefficients: Annotated[
@@ -151,47 +151,47 @@ class ZernikeWave(_Wave):
     __pydantic_config__ = STRICT
 
     def contains(self, x: Tensor, y: Tensor) -> Tensor:
-        """True at places (mm) of the plane for which the wave is stated: inside the circle."""
+        """Return True at points (mm) of the plane for which the wave is stated: inside the circle."""
         return Circle(self.radius).contains(x - self.centre[0], y - self.centre[1])
 
     def path(self, x: Tensor, y: Tensor, wavelength: float) -> Tensor:
-        """W (mm) at places (mm) of the plane, for a wavelength (nm)."""
+        """Return W (mm) at points (mm) of the plane, for a wavelength (nm)."""
         return self._eikonal(x, y, wavelength)[0]
 
     def directions(self, x: Tensor, y: Tensor, wavelength: float) -> Tensor:
-        """(3, …) unit vectors of the rays through places (mm) of the plane, for a wavelength (nm)."""
+        """Return unit vectors (3, …) of the rays at points (mm) of the plane, for a wavelength (nm)."""
         _, w_x, w_y = self._eikonal(x, y, wavelength)
         cos2 = 1 - w_x * w_x - w_y * w_y
-        cos = torch.sqrt(torch.where(cos2 > 0, cos2, torch.ones_like(cos2)))  # where no ray is, any length does
+        cos = torch.sqrt(torch.where(cos2 > 0, cos2, torch.ones_like(cos2)))  # any value where no ray exists
         return torch.stack([w_x, w_y, cos])
 
     def steepest(self, wavelength: float) -> float:
-        """The largest |∇W| on the circle, for a wavelength (nm): the sine of the angle of its steepest ray."""
-        line = torch.linspace(-self.radius, self.radius, SAMPLES, dtype=torch.float64)
+        """Return the largest |∇W| on the circle, for a wavelength (nm): the sine of the largest ray angle."""
+        line = torch.linspace(-self.radius, self.radius, SAMPLES_PER_SIDE, dtype=torch.float64)
         x, y = torch.meshgrid(self.centre[0] + line, self.centre[1] + line, indexing="ij")
         _, w_x, w_y = self._eikonal(x, y, wavelength)
         return float(torch.hypot(w_x, w_y)[self.contains(x, y)].max())
 
     def _eikonal(self, x: Tensor, y: Tensor, wavelength: float) -> tuple[Tensor, Tensor, Tensor]:
-        """(W in mm, ∂W/∂x, ∂W/∂y)."""
+        """Return (W in mm, ∂W/∂x, ∂W/∂y)."""
         x, y = (x - self.centre[0]) / self.radius, (y - self.centre[1]) / self.radius
         w, w_x, w_y = (wavelength * NM * part for part in zernike.series(self.coefficients, x, y))
         return w, w_x / self.radius, w_y / self.radius
 
     def complaints(self, back: float) -> Iterator[str]:
-        """No coefficient at all."""
+        """Yield, besides the common reasons, a missing list of coefficients."""
         yield from super().complaints(back)
         if not self.coefficients:
-            yield "coefficients: none is in it; give some, such as [0.0, 0.0, 0.0, 1.5], or kind = 'plane'"
+            yield "coefficients: the list is empty; give some, such as [0.0, 0.0, 0.0, 1.5], or kind = 'plane'"
 
 
 Wave = PlaneWave | SphericalWave | ZernikeWave
 
 
 def beyond(place: Tensor, centre: Vector) -> Tensor:
-    """|p - c| - |c| (mm) of places p (3, …) and a centre c (mm): by how much p is further from c than the origin is.
+    """Return |p - c| - |c| (mm) for points p (3, …) and a centre c (mm): path from the sphere about c through 0.
 
-    As (p² - 2 p · c) / (|p - c| + |c|), which keeps its digits however far off the centre is.
+    It is computed as (p² - 2 p · c) / (|p - c| + |c|), which keeps its digits for a distant centre.
     """
     x, y, z = place
     c_x, c_y, c_z = centre
@@ -200,5 +200,5 @@ def beyond(place: Tensor, centre: Vector) -> Tensor:
 
 
 def length(vector: Tensor) -> Tensor:
-    """|v| of (3, …)."""
+    """Return |v| of vectors (3, …)."""
     return torch.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])

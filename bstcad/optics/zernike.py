@@ -19,38 +19,37 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-PART = 1 << 13  # places at a time: their harmonics stay in the cache
-Complex = tuple[Tensor, Tensor]  # real and imaginary part, by themselves: torch's complex numbers take longer
+POINTS_PER_CHUNK = 1 << 13  # points evaluated at a time, whose harmonics fit the cache
+Complex = tuple[Tensor, Tensor]  # real and imaginary part, apart since torch's complex numbers are slower
 Harmonic = tuple[Complex, Complex, Complex]  # V_n^m and its derivatives in x and in y
 
 
 def noll(j: int) -> tuple[int, int]:
-    """(n, m) of Z_j, j = 1, 2, 3, …; m > 0: cos mθ, m < 0: sin |m|θ.  Noll 1976, Table I."""
+    """Return (n, m) of Z_j, j = 1, 2, 3, …; m > 0: cos mθ, m < 0: sin |m|θ.  Noll 1976, Table I."""
     n = (math.isqrt(8 * j - 7) - 1) // 2
-    place = j - n * (n + 1) // 2  # 1 … n + 1 among the terms of degree n
+    place = j - n * (n + 1) // 2  # number 1 … n + 1 among the terms of degree n
     m = 2 * (place // 2) if n % 2 == 0 else 2 * ((place - 1) // 2) + 1
     return n, m if j % 2 == 0 else -m
 
 
 def series(coefficients: Sequence[float], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """(f, ∂f/∂x, ∂f/∂y) of f = Σ_j c_j Z_j, j = 1, 2, …, at places x, y in radii of the disc; shaped like x.
+    """Return (f, ∂f/∂x, ∂f/∂y) of f = Σ_j c_j Z_j, j = 1, 2, …, at points x, y in radii of the disc; shaped like x.
 
-    Differentiable in x and y.  Outside the disc the polynomials go on, and soon grow.
+    Differentiable in x and y.  The polynomials are also evaluated outside the disc, where they soon grow.
     """
-    parts = [
-        _series(coefficients, *part) for part in zip(x.reshape(-1).split(PART), y.reshape(-1).split(PART), strict=True)
-    ]
+    chunks = (p.reshape(-1).split(POINTS_PER_CHUNK) for p in (x, y))
+    parts = [_series(coefficients, *chunk) for chunk in zip(*chunks, strict=True)]
     f, f_x, f_y = (torch.cat(part).view(x.shape) for part in zip(*parts, strict=True))
     return f, f_x, f_y
 
 
 def _series(coefficients: Sequence[float], x: Tensor, y: Tensor) -> list[Tensor]:
-    """`series` at some places (n,)."""
+    """Return `series` at points (n,)."""
     wanted = {noll(j): c for j, c in enumerate(coefficients, start=1) if c}
     zero = torch.zeros_like(x)
     sums = [zero, zero, zero]
-    before: dict[int, Harmonic] = {}  # those of degree n - 2, by m
-    last: dict[int, Harmonic] = {}  # and of degree n - 1
+    before: dict[int, Harmonic] = {}  # harmonics of degree n - 2, by m
+    last: dict[int, Harmonic] = {}  # harmonics of degree n - 1, by m
     for n in range(1 + max((degree for degree, _ in wanted), default=-1)):
         now = {m: _harmonic((x, y), n, m, known=(before, last)) for m in range(n % 2, n + 1, 2)}
         for m, harmonic in now.items():
@@ -63,7 +62,7 @@ def _series(coefficients: Sequence[float], x: Tensor, y: Tensor) -> list[Tensor]
 
 
 def _harmonic(zeta: Complex, n: int, m: int, known: tuple[dict[int, Harmonic], dict[int, Harmonic]]) -> Harmonic:
-    """V_n^m, m >= 0, from those of degrees n - 2 and n - 1, by m."""
+    """Return V_n^m, m >= 0, from the harmonics of degrees n - 2 and n - 1, by m."""
     (x, y), (before, last), zero = zeta, known, torch.zeros_like(zeta[0])
     if n == 0:
         return (torch.ones_like(x), zero), (zero, zero), (zero, zero)

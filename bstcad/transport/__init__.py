@@ -1,4 +1,4 @@
-"""Which ray goes where: the optimal map from a source density to a target density.  Knows nothing of lenses."""
+"""Optimal transport from a source density to a target density on the unit square, independent of lenses."""
 
 from bstcad.transport.bfm import Step, Transport, back_and_forth
 from bstcad.transport.density import Density

@@ -1,25 +1,25 @@
 """The back-and-forth method: optimal transport for the cost |x - y|²/2 between two densities on one grid.
 
 Jacobs and Leger 2020, "A fast approach to optimal transport: the back-and-forth method", Numerische Mathematik 146.
-source rho on x, target nu on y, potentials psi(x) and phi(y):
+Source rho on x, target nu on y, potentials psi(x) and phi(y):
 
     J(phi) = ∫ phi dnu + ∫ phi^c drho,   T = id - ∇phi^c,   H1 gradient  (-Δ)^-1 (nu - T_# rho)
 
-and likewise for psi; each is raised in turn, and c-transforms pass between them.  The grid itself limits the
-accuracy: c-transforms send cell centres to cell centres, so the method comes to rest at a mass error of a few per
-cent, which ray tubes (monge_ampere.py) then take down.
+and likewise for psi.  Gradient ascent on phi and psi alternates; a c-transform converts one into the other.  The grid
+limits the accuracy: c-transforms map cell centres to cell centres, so the mass error levels off at a few per cent,
+which the flux tubes of monge_ampere.py then reduce.
 
-The c-transform, exact and linear in the number of cells: phi^c(x) = min_y |x - y|²/2 - phi(y) = |x|²/2 - v*(x) with
-v(y) = |y|²/2 - phi(y) is a Legendre transform, and that separates: v*(x1, x2) = max_y2 [x2 y2 + max_y1 (x1 y1 -
-v(y1, y2))].  Each line needs the lower convex hull of its n values and one monotone walk (Lucet 1997, Numerical
-Algorithms 16).  Which corner of the hull is best from which x on follows from the slope of the side before it, so the
-walk has no condition to guess wrong.
+The c-transform is exact and linear in the number of cells: phi^c(x) = min_y |x - y|²/2 - phi(y) = |x|²/2 - v*(x) with
+v(y) = |y|²/2 - phi(y) is a Legendre transform, which separates: v*(x1, x2) = max_y2 [x2 y2 + max_y1 (x1 y1 -
+v(y1, y2))].  Each line needs the lower convex hull of its n values and one monotone pass (Lucet 1997, Numerical
+Algorithms 16).  The slope of the hull edge before a vertex gives the x from which that vertex is the maximiser, so the
+pass has no branch that depends on the data.
 
 Poisson's equation (Hockney 1965, "A fast direct solution of Poisson's equation using Fourier analysis", Journal of the
-ACM 12): -Δ is the five-point Laplacian on n x n cells with zero normal derivative.  In the cosine series of the second
-axis it is, for the k-th term, the tridiagonal D + s_k with D the second difference along the first axis and
-s_k = 4 sin²(πk/2n).  Lines of n cells are transformed where they lie in memory, and the elimination runs along them,
-so nothing is ever read across lines.
+ACM 12): -Δ is the five-point Laplacian on n x n cells with zero normal derivative.  For the k-th term of the cosine
+series along the second axis it is the tridiagonal matrix D + s_k, with D the second difference along the first axis and
+s_k = 4 sin²(πk/2n).  The transforms run along contiguous lines of n cells, and the elimination treats neighbouring
+columns together, so that memory is never read across lines.
 
 Cell units throughout: cell centres at i + 1/2, i = 0 … n-1, and potentials over the square of the cell side.
 """
@@ -35,36 +35,39 @@ from numba import njit, prange
 
 from bstcad.transport.density import BLOCKS, Density, inner, pushforward, threads, threads_for
 
-LINES = 8  # transformed together: eight doubles fill the cache line that their transpose is written to
-COARSEST = 32  # cells a side where the ladder of grids begins
-FIRST_STEP = 1.0  # sigma on the coarsest grid; 1 is Newton's step between two even densities
-LEAST_STEP = 0.25  # sigma each finer grid begins with at least: the last refusals on a coarse grid were its own noise
-GROW, SHRINK, HALVE = 1.25, 0.8, 0.5  # sigma after too cautious, too bold and refused steps
-BOLD, CAUTIOUS = 0.25, 0.75  # Armijo-Goldstein bounds on (gain of J) / (sigma |∇J|²)
-STALL = 0.005  # relative fall of the mass error over PATIENCE iterations below which it is a plateau
-PATIENCE = 5
-COOLINGS = 1  # step halvings before a plateau stops the iteration: the mass error settles at a height set by sigma
+LINES_PER_BLOCK = 8  # lines transformed together: eight doubles fill a cache line of the transposed output
+MIN_CELLS = 32  # cells a side of the coarsest grid
+FIRST_STEP = 1.0  # sigma on the coarsest grid; 1 is Newton's step between two uniform densities
+# Smallest initial sigma on a finer grid: rejections at the end of a coarse grid are due to that grid's noise
+MIN_FIRST_STEP = 0.25
+STEP_INCREASE, STEP_DECREASE, REFUSED_STEP_FACTOR = 1.25, 0.8, 0.5  # factors of sigma after short, long, rejected steps
+MIN_GAIN_RATIO, MAX_GAIN_RATIO = 0.25, 0.75  # Armijo-Goldstein bounds of (gain of J) / (sigma |∇J|²)
+# Relative decrease of the mass error over PLATEAU_ITERATIONS iterations below which the solve is on a plateau
+PLATEAU_TOLERANCE = 0.005
+PLATEAU_ITERATIONS = 5
+STEP_HALVINGS = 1  # halvings of sigma before a plateau stops the solve: the final mass error depends on sigma
 
 
 def half_square(n: int) -> np.ndarray:
-    """|x|²/2 at the cell centres, cell units, (n, n)."""
+    """Return |x|²/2 at the cell centres, cell units, (n, n)."""
     q = 0.5 * (np.arange(n) + 0.5) ** 2
     return q[:, None] + q[None, :]
 
 
 def legendre(v: np.ndarray) -> np.ndarray:
-    """v*(x) = max_y x·y - v(y) over the cell centres, (n, n) -> (n, n), cell units; exact on the grid."""
+    """Return v*(x) = max_y x·y - v(y) over the cell centres, (n, n) -> (n, n), cell units; exact on the grid."""
     partial, whole = np.empty_like(v), np.empty_like(v)
-    _transform_lines(v, partial, -1.0, BLOCKS)  # over y2: [x2, y1]
-    _transform_lines(partial, whole, 1.0, BLOCKS)  # over y1: [x1, x2]
+    _transform_lines(v, partial, -1.0, BLOCKS)  # maximise over y2: [x2, y1]
+    _transform_lines(partial, whole, 1.0, BLOCKS)  # maximise over y1: [x1, x2]
     return whole
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _line(v, out, hull, slope, first):
-    """out[i] = max_j (i + 1/2)(j + 1/2) - v[j]; hull, slope (n) and first (n + 1): scratch.
+    """Compute out[i] = max_j (i + 1/2)(j + 1/2) - v[j]; hull, slope (n) and first (n + 1) are scratch.
 
-    hull: corners of the lower hull; slope: of the side before each; first[i]: the last corner to be best from i on.
+    hull: vertices of the lower hull; slope: of the edge before each; first[i]: the last vertex that is optimal from i
+    on.
     """
     n = v.size
     top = 0
@@ -87,14 +90,14 @@ def _line(v, out, hull, slope, first):
 
 @njit(cache=True, nogil=True, parallel=True)
 def _transform_lines(v, out, sign, blocks):
-    """out = sign x (transform of each row of v), transposed."""
+    """Compute out = sign x (transform of each row of v), transposed."""
     n = v.shape[0]
     for block in prange(blocks):
         hull, slope, first = np.empty(n, np.int64), np.empty(n), np.empty(n + 1, np.int64)
-        done = np.empty((LINES, n))
+        done = np.empty((LINES_PER_BLOCK, n))
         end = (block + 1) * n // blocks
-        for r in range(block * n // blocks, end, LINES):
-            lines = min(LINES, end - r)
+        for r in range(block * n // blocks, end, LINES_PER_BLOCK):
+            lines = min(LINES_PER_BLOCK, end - r)
             for k in range(lines):
                 _line(v[r + k], done[k], hull, slope, first)
             for i in range(n):
@@ -103,16 +106,16 @@ def _transform_lines(v, out, sign, blocks):
 
 
 class Poisson:
-    """(-Δ)^-1 with zero normal derivative; the constant is free, and taken such that the mean is zero."""
+    """Inverse Laplacian (-Δ)^-1 with zero normal derivative; the solution has mean zero."""
 
     def __init__(self, n: int):
-        """n: cells a side."""
-        self.symbol = 4.0 * np.sin(0.5 * np.pi * np.arange(n) / n) ** 2  # (n,) s_k
+        """Factorise the equation on n x n cells."""
+        self.symbol = 4.0 * np.sin(0.5 * np.pi * np.arange(n) / n) ** 2  # s_k, (n,)
         self.pivots = _pivots(self.symbol)
         self.keep, self.share = np.ones(n), np.zeros(n)
 
     def solve(self, r: np.ndarray) -> np.ndarray:
-        """g with -Δg = r - mean(r), mean(g) = 0; cell units, (n, n) both."""
+        """Return g with -Δg = r - mean(r), mean(g) = 0; cell units, r and g (n, n)."""
         workers = threads_for(r.shape[0])
         series = scipy.fft.dct(r, axis=1, workers=workers)
         series[:, 0] -= series[:, 0].mean()
@@ -122,22 +125,22 @@ class Poisson:
 
 
 class PoissonWithoutCheckerboard(Poisson):
-    """(-Δ)^-1 (1 - D_x D_y / 16), D the second differences: the checkerboard, where both are 4, maps to zero.
+    """Inverse (-Δ)^-1 (1 - D_x D_y / 16), D the second differences; the checkerboard, where both are 4, maps to zero.
 
-    With s_y for D_y it is ((1 + s_y²/16) / (D_x + s_y)) - s_y/16: one elimination again.
+    With s_y for D_y it is ((1 + s_y²/16) / (D_x + s_y)) - s_y/16, again one elimination.
     """
 
     def __init__(self, n: int):
-        """n: cells a side."""
+        """Factorise the equation on n x n cells."""
         super().__init__(n)
         self.keep, self.share = 1.0 + self.symbol**2 / 16.0, self.symbol / 16.0
 
 
 def _pivots(s: np.ndarray) -> np.ndarray:
-    """(n, n): the inverse pivots of D + s_k, row i for the i-th cell of the line, column k for the k-th term.
+    """Return the inverse pivots (n, n) of D + s_k: row i for the i-th cell of the line, column k for the k-th term.
 
-    A pivot is 1 + e with e_i = s + e_(i-1) / (1 + e_(i-1)), positive terms only; the last one, at the rim, is e.
-    For k = 0 that is zero: the line's end is set to zero, and the mean taken out afterwards.
+    A pivot is 1 + e with e_i = s + e_(i-1) / (1 + e_(i-1)), positive terms only; the last one, at the boundary, is e.
+    For k = 0 it is zero: the end of the line is set to zero, and the mean is subtracted afterwards.
     """
     n = s.size
     pivots, e = np.empty((n, n)), s.copy()
@@ -150,7 +153,7 @@ def _pivots(s: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True, parallel=True)
 def _eliminate(r, g, pivots, keep, share, blocks):
-    """r -> keep (D + s)^-1 r - share r in place, each column a line; g: scratch."""
+    """Replace r by keep (D + s)^-1 r - share r, each column a line; g: scratch."""
     n = r.shape[0]
     for block in prange(blocks):
         lo, hi = block * n // blocks, (block + 1) * n // blocks
@@ -169,27 +172,27 @@ def _eliminate(r, g, pivots, keep, share, blocks):
 
 @dataclass(frozen=True)
 class Step:
-    """Where a solve stands; handed to `progress`."""
+    """State of a solve, passed to `progress`."""
 
-    grid: int  # cells a side
-    iteration: int  # on this grid, from 1
-    mass_error: float  # mean |pushforward - target|, both of mean 1
-    stage: str  # "back-and-forth" | "tubes"
+    grid: int  # cells a side of the current grid
+    iteration: int  # number of the iteration on this grid, from 1
+    mass_error: float  # mean |pushforward - target|, both densities of mean 1
+    stage: str  # method: "back-and-forth" | "tubes"
 
 
 @dataclass(frozen=True)
 class Transport:
-    """A pair of potentials on the unit square, (n, n) at cell centres, and how the solve went.
+    """A pair of potentials on the unit square, (n, n) at cell centres, and the history of the solve.
 
-    x - ∇psi(x) maps source to target, y - ∇phi(y) target to source; the solver holds phi, and psi = phi^c exactly.
+    x - ∇psi(x) maps source to target, y - ∇phi(y) target to source; the solver stores phi, and psi = phi^c exactly.
     """
 
-    phi: np.ndarray  # (n, n), on the target side
-    psi: np.ndarray  # (n, n), on the source side, phi^c
+    phi: np.ndarray  # potential on the target side, (n, n)
+    psi: np.ndarray  # potential on the source side, phi^c, (n, n)
     mass_error: tuple[float, ...]  # mean |pushforward - target| before each iteration and at the end, finest grid
     dual: tuple[float, ...]  # Kantorovich value after each iteration on the finest grid; rises to W2²/2
-    iterations: int  # on the finest grid
-    reason: str  # why the solve stopped: "converged" | "plateau" | "iterations"
+    iterations: int  # number of iterations on the finest grid
+    reason: str  # reason of the end of the solve: "converged" | "plateau" | "iterations"
 
 
 def back_and_forth(
@@ -200,18 +203,18 @@ def back_and_forth(
     tolerance: float = 1e-3,
     progress: Callable[[Step], None] | None = None,
 ) -> Transport:
-    """Potentials between two densities on one grid; neither needs to be positive.  Coarser grids are solved first.
+    """Return potentials between two densities on one grid, solved on coarser grids first; neither needs to be positive.
 
-    iterations: the limit on each grid.  tolerance: mass error at which the solve has converged.
+    iterations: maximum on each grid.  tolerance: mass error at which the solve has converged.
     """
     if source.n != target.n:
         raise ValueError(f"source and target must lie on one grid, got {source.n} and {target.n} cells a side")
     sigma = FIRST_STEP
-    grids = ladder(source, target, COARSEST)
+    grids = ladder(source, target, MIN_CELLS)
     phi = np.zeros((grids[0][0].n, grids[0][0].n))
     for rho, nu in grids:
         phi = phi if phi.shape[0] == rho.n else prolong(phi)
-        sigma = max(sigma, LEAST_STEP)
+        sigma = max(sigma, MIN_FIRST_STEP)
         with threads(rho.n):
             phi, psi, sigma, errors, duals, reason = _ascend(
                 rho, nu, phi, sigma, iterations=iterations, tolerance=tolerance, progress=progress
@@ -223,17 +226,17 @@ def back_and_forth(
 
 
 def prolong(phi: np.ndarray) -> np.ndarray:
-    """Cell units, (m, m) -> (2m, 2m): bilinear between cell centres, zero normal derivative at the rim."""
+    """Interpolate bilinearly, (m, m) -> (2m, 2m) in cell units, with zero normal derivative at the boundary."""
     for axis in (0, 1):
         p = np.moveaxis(phi, axis, 0)
         before, after = np.concatenate([p[:1], p[:-1]]), np.concatenate([p[1:], p[-1:]])
         fine = np.stack([0.75 * p + 0.25 * before, 0.75 * p + 0.25 * after], axis=1)
         phi = np.moveaxis(fine.reshape(2 * p.shape[0], p.shape[1]), 0, axis)
-    return np.ascontiguousarray(4.0 * phi)  # over the square of a cell side half as long
+    return np.ascontiguousarray(4.0 * phi)  # in units of a cell side half as long
 
 
 def ladder(source: Density, target: Density, coarsest: int) -> list[tuple[Density, Density]]:
-    """The pair on ever finer grids, coarsest first, by halving as long as n is even and above `coarsest`."""
+    """Return the pair on a sequence of grids, coarsest first, halved while n is even and above `coarsest`."""
     rungs = [(source, target)]
     while rungs[0][0].n % 2 == 0 and rungs[0][0].n > coarsest:
         rungs.insert(0, (rungs[0][0].halved(), rungs[0][1].halved()))
@@ -241,15 +244,15 @@ def ladder(source: Density, target: Density, coarsest: int) -> list[tuple[Densit
 
 
 def _ascend(source, target, phi, sigma, *, iterations, tolerance, progress):
-    """Solve on one grid.  In v = |y|²/2 - phi and u = |x|²/2 - psi a c-transform is `legendre` and T = ∇u, S = ∇v."""
+    """Solve on one grid.  With v = |y|²/2 - phi, u = |x|²/2 - psi a c-transform is `legendre`, and T = ∇u, S = ∇v."""
     n, rho, nu = source.n, source.values, target.values
     half, poisson = half_square(n), Poisson(n)
     u = legendre(half - phi)
     v = legendre(u)
     dual = _dual(u, v, rho, nu)
     errors, duals, reason = [], [], "iterations"
-    forth = back = sigma  # a step size for each side: the sharper density bears only the smaller
-    ceiling, since, coolings = np.inf, 0, 0
+    forth = back = sigma  # one step size per side: the sharper density allows only the smaller
+    ceiling, since, halvings = np.inf, 0, 0
     for iteration in range(1, iterations + 1):
         v, u, forth, dual, error = _half_step(v, u, rho, nu, poisson=poisson, sigma=min(forth, ceiling), dual=dual)
         errors.append(error)
@@ -260,40 +263,41 @@ def _ascend(source, target, phi, sigma, *, iterations, tolerance, progress):
         duals.append(dual / n**2)
         if progress is not None:
             progress(Step(n, iteration, error, "back-and-forth"))
-        if iteration - since > PATIENCE and min(errors[-PATIENCE:]) > (1 - STALL) * min(errors[since:-PATIENCE]):
-            if coolings == COOLINGS:
+        before, latest = errors[since:-PLATEAU_ITERATIONS], errors[-PLATEAU_ITERATIONS:]
+        if iteration - since > PLATEAU_ITERATIONS and min(latest) > (1 - PLATEAU_TOLERANCE) * min(before):
+            if halvings == STEP_HALVINGS:
                 reason = "plateau"
                 break
-            ceiling, since, coolings = 0.5 * min(forth, back), iteration, coolings + 1
+            ceiling, since, halvings = 0.5 * min(forth, back), iteration, halvings + 1
     u = legendre(v)
     errors.append(float(np.abs(pushforward(rho, u) - nu).mean()))
     return half - v, half - u, min(forth, back), errors, duals, reason
 
 
 def _half_step(a, b, rho, nu, *, poisson, sigma, dual):
-    """Raise the potential of `a` (with b = a*, whose gradient carries rho towards nu); refuse a step that lowers J."""
+    """Raise the potential of `a` (b = a*, whose gradient maps rho towards nu); reject a step that lowers J."""
     r = nu - pushforward(rho, b)
     error = float(np.abs(r).mean())
     g = poisson.solve(r)
-    tried = legendre(a - sigma * g)
-    kept = legendre(tried)  # the double transform: never lowers J
-    gain = _dual(tried, kept, rho, nu) - dual
+    trial = legendre(a - sigma * g)
+    conjugate = legendre(trial)  # the double transform never lowers J
+    gain = _dual(trial, conjugate, rho, nu) - dual
     share = gain / (sigma * inner(g, r) / r.size + 1e-300)
     if gain < 0.0:
-        return a, b, sigma * HALVE, dual, error
-    if share > CAUTIOUS:
-        sigma *= GROW
-    elif share < BOLD:
-        sigma *= SHRINK
-    return kept, tried, sigma, dual + gain, error
+        return a, b, sigma * REFUSED_STEP_FACTOR, dual, error
+    if share > MAX_GAIN_RATIO:
+        sigma *= STEP_INCREASE
+    elif share < MIN_GAIN_RATIO:
+        sigma *= STEP_DECREASE
+    return conjugate, trial, sigma, dual + gain, error
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc"})
 def _dual(u, v, rho, nu):
-    """∫ psi drho + ∫ phi dnu, cell units."""
+    """Return ∫ psi drho + ∫ phi dnu, cell units."""
     n = u.shape[0]
     total = 0.0
-    for i in range(n):  # a sum for each row first: fewer digits are lost
+    for i in range(n):  # sum each row first, for accuracy
         row = 0.0
         for j in range(n):
             half = 0.5 * ((i + 0.5) ** 2 + (j + 0.5) ** 2)

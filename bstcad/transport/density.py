@@ -1,6 +1,6 @@
-"""Densities on the unit square: source and target of a transport, and how the gradient of a potential moves them.
+"""Densities on the unit square, source and target of a transport, and their pushforward by the gradient of a potential.
 
-Compiled loops over a grid share their work in BLOCKS, and a compiled sum stands in for BLAS, so that no bit depends on
+Compiled loops over a grid are divided into BLOCKS, and a compiled sum replaces BLAS, so that results do not depend on
 the number of threads.
 """
 
@@ -15,31 +15,31 @@ import numpy as np
 from numba import njit, prange
 from scipy.sparse import csr_array
 
-BLOCKS = 8  # independent blocks of a loop; fixed, so that no sum depends on the number of threads
-ONE_THREAD = 128  # cells a side
+BLOCKS = 8  # number of independent blocks of a loop, fixed so that no sum depends on the number of threads
+MAX_SINGLE_THREAD_CELLS = 128  # largest grid, in cells a side, solved by one thread
 
 
 @dataclass(frozen=True)
 class Density:
-    """rho >= 0 on [0, 1]², piecewise constant on n x n cells, mean 1.  Zero is allowed (outside a disc, say)."""
+    """Density rho >= 0 on [0, 1]², piecewise constant on n x n cells, of mean 1; zeros are allowed."""
 
     values: np.ndarray  # (n, n) float64, [ix, iy]: cell ix along x, iy along y; mean 1
 
     @property
     def n(self) -> int:
-        """Cells a side."""
+        """Number of cells a side."""
         return self.values.shape[0]
 
     @classmethod
     def from_values(cls, values: np.ndarray, *, floor: float = 0.0) -> Density:
-        """Cell averages (n, n), [ix, iy]; `floor` as in `from_picture`, over the whole square."""
+        """Return the density of cell averages (n, n), [ix, iy]; `floor` as in `from_picture`, over the whole square."""
         return _normalised(np.asarray(values, dtype=float), np.ones(np.shape(values)), floor, "density")
 
     @classmethod
     def from_function(
         cls, function: Callable[[np.ndarray, np.ndarray], np.ndarray], n: int, *, samples: int = 4, floor: float = 0.0
     ) -> Density:
-        """Cell averages of function(x, y) on [0, 1]² from samples x samples midpoints a cell."""
+        """Return the density of function(x, y) on [0, 1]², averaged over samples x samples midpoints a cell."""
         q = (np.arange(n * samples) + 0.5) / (n * samples)
         fine = np.broadcast_to(function(q[:, None], q[None, :]), (q.size, q.size)).astype(float)
         return cls.from_values(fine.reshape(n, samples, n, samples).mean(axis=(1, 3)), floor=floor)
@@ -48,19 +48,19 @@ class Density:
     def from_picture(
         cls, picture: np.ndarray, n: int, *, width: float = 1.0, height: float = 1.0, floor: float = 0.0
     ) -> Density:
-        """Resample a grey picture by exact pixel-cell overlap areas.
+        """Resample a grey picture by exact overlap areas of pixels and cells.
 
-        picture: (rows, columns), row 0 = y max, column 0 = x min; its pixels span width x height (any unit), which
-        sits centred in the square of its longer side, so both axes keep one scale and the rest of the square is zero.
-        floor: where the picture is darker than floor x its mean it is lifted to that (1e-3 … 1e-2 is usual);
-        brighter regions stay as they are.
+        picture: (rows, columns), row 0 = y max, column 0 = x min.  Its pixels span width x height (any unit), centred
+        in the square of the longer side, so that both axes have one scale; the rest of the square is zero.
+        floor: smallest value inside the picture relative to its mean, to which darker cells are raised (1e-3 … 1e-2 is
+        usual); brighter cells are unchanged.
         """
         grey = np.asarray(picture, dtype=float)
         if grey.ndim != 2 or grey.size == 0:
             raise ValueError(f"picture: expected rows x columns of grey values, got shape {grey.shape}")
         if not (width > 0 and height > 0):
             raise ValueError(f"picture: its rectangle must have a positive width and height, got {width} x {height}")
-        _refuse(grey, "picture")
+        _check_values(grey, "picture")
         side = max(width, height)
         along_x = _overlaps(n, grey.shape[1], width / side)
         along_y = _overlaps(n, grey.shape[0], height / side)
@@ -68,21 +68,21 @@ class Density:
         return _normalised(values, np.outer(along_x.sum(axis=1), along_y.sum(axis=1)), floor, "picture")
 
     def halved(self) -> Density:
-        """The same density on n/2 x n/2 cells (means of 2 x 2; n even)."""
+        """Return the density on n/2 x n/2 cells (means of 2 x 2; n even)."""
         m = self.n // 2
         return Density(self.values.reshape(m, 2, m, 2).mean(axis=(1, 3)))
 
     def lifted(self, floor: float) -> Density:
-        """At least floor x mean everywhere on the square."""
+        """Return the density raised to at least floor x mean everywhere on the square."""
         if self.values.min() >= floor:
             return self
         return _normalised(self.values, np.ones(self.values.shape), floor, "density")
 
 
 def _overlaps(n: int, pixels: int, extent: float) -> csr_array:
-    """(n, pixels): the fraction of each of n cells of [0, 1] covered by each pixel of the centred interval `extent`.
+    """Return the fractions (n, pixels) of n cells of [0, 1] covered by each pixel of the centred interval `extent`.
 
-    Sparse: the rounding of a product of full matrices depends on the number of threads.
+    The matrix is sparse, since the rounding of a product of dense matrices depends on the number of threads.
     """
     edges = (0.5 + extent * (np.arange(pixels + 1) / pixels - 0.5)) * n
     cells = np.arange(n)[:, None]
@@ -90,17 +90,17 @@ def _overlaps(n: int, pixels: int, extent: float) -> csr_array:
 
 
 def _normalised(values: np.ndarray, cover: np.ndarray, floor: float, name: str) -> Density:
-    """Lift to floor x (mean over the support), scale to mean 1.  cover: fraction of each cell inside the support."""
+    """Raise to floor x (mean over the support) and scale to mean 1; cover: fraction of each cell inside the support."""
     if values.ndim != 2 or values.shape[0] != values.shape[1] or values.shape[0] < 4:
         raise ValueError(f"{name}: expected an n x n grid with n >= 4, got shape {values.shape}")
-    _refuse(values, name)
-    scaled = values / values.max()  # no overflow in the sums below
+    _check_values(values, name)
+    scaled = values / values.max()  # avoids overflow in the sums below
     raised = np.maximum(scaled, floor * scaled.mean() / cover.mean() * cover)
     return Density(raised / raised.mean())
 
 
-def _refuse(values: np.ndarray, name: str) -> None:
-    """ValueError unless the values are finite, not negative and not all zero."""
+def _check_values(values: np.ndarray, name: str) -> None:
+    """Raise ValueError unless the values are finite, not negative and not all zero."""
     if not np.isfinite(values).all() or values.min() < 0:
         raise ValueError(f"{name}: every value must be finite and not negative")
     if values.max() == 0:
@@ -108,14 +108,14 @@ def _refuse(values: np.ndarray, name: str) -> None:
 
 
 def pushforward(density: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """(∇u)_# density on the same n x n grid; u at cell centres in cell units.  Conserves the sum to rounding.
+    """Return (∇u)_# density on the same n x n grid; u at cell centres in cell units.  The sum is conserved to rounding.
 
-    The map is taken at the corners of each cell and is bilinear inside; the image of a cell is cut into pieces of at
-    most half a cell each way, and each piece is laid down as a box of its own extent, by exact overlap areas.
+    The map is evaluated at the corners of each cell and is bilinear inside.  The image of a cell is divided into pieces
+    of at most half a cell each way, and each piece is added as a box of its own extent, by exact overlap areas.
     """
     n = density.shape[0]
     x, y = gradient_at_corners(u)
-    parts = np.empty((BLOCKS, n + 1, n + 1))  # a row and a column to spare; pages of rows out of reach stay unused
+    parts = np.empty((BLOCKS, n + 1, n + 1))  # one spare row and column; rows that receive nothing use no memory
     reach = np.empty((BLOCKS, 2), np.int64)
     _splat(density, x, y, parts, reach)
     out = np.zeros((n, n))
@@ -125,7 +125,7 @@ def pushforward(density: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 
 def gradient_at_corners(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """∇u at the (n + 1)² cell corners from u at the n² centres, cell units; linear to the rim, kept in the square."""
+    """Return ∇u at the (n + 1)² cell corners from u at the n² centres, cell units; clipped at the rim."""
     n = u.shape[0]
     x, y = np.empty((n + 1, n + 1)), np.empty((n + 1, n + 1))
     _gradient(u, x, y)
@@ -139,10 +139,10 @@ def gradient_at_corners(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def spread(flux: np.ndarray, x: np.ndarray, y: np.ndarray, n: int, parts: tuple[int, int]) -> np.ndarray:
-    """(n, n) flux on the cells of a square when (k, l) pixels have their corners x, y (k + 1, l + 1) there, in cells.
+    """Return the flux (n, n) in the cells of a square from pixels with corners x, y (k + 1, l + 1), in cells.
 
-    Each pixel's flux is cut into parts[0] x parts[1] equal parts at bilinear points; the four cells with the nearest
-    centres share each part.  Flux beyond the rim counts for the cell at the rim.
+    The flux (k, l) of each pixel is divided into parts[0] x parts[1] equal parts at bilinear points; the four cells
+    with the nearest centres receive each part.  Flux outside the square is added to the cell at the rim.
     """
     out = np.zeros((n, n))
     _spread(flux, x, y, *parts, out)
@@ -155,7 +155,7 @@ def _spread(flux, x, y, along_x, along_y, out):
     for k in range(flux.shape[0]):
         for m in range(flux.shape[1]):
             part = flux[k, m] / (along_x * along_y)
-            if part == 0.0:  # also where the corners of black pixels lie nowhere
+            if part == 0.0:  # black pixels may have corners that are not finite
                 continue
             for i in range(along_x):
                 a = (i + 0.5) / along_x
@@ -164,7 +164,7 @@ def _spread(flux, x, y, along_x, along_y, out):
                 for j in range(along_y):
                     b = (j + 0.5) / along_y
                     px, py = (1 - b) * x0 + b * x1 - 0.5, (1 - b) * y0 + b * y1 - 0.5
-                    if not abs(px) + abs(py) < np.inf:  # light that lies nowhere: no density comes of it
+                    if not abs(px) + abs(py) < np.inf:  # flux at a position that is not finite: no density
                         out[0, 0] = np.nan
                         continue
                     px, py = min(max(px, 0.0), n - 1.0), min(max(py, 0.0), n - 1.0)
@@ -188,7 +188,7 @@ def _gradient(u, x, y):
 
 @njit(cache=True, nogil=True)
 def _rows_reached(x):
-    """First and last + 1 of the rows of pixels that boxes centred between these corners can touch."""
+    """Return the first and last + 1 of the rows of pixels that boxes centred between these corners can touch."""
     n = x.shape[1] - 1
     least, most = float(n), 0.0
     for i in range(x.shape[0]):
@@ -199,10 +199,10 @@ def _rows_reached(x):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath={"contract"})
 def _splat(rho, x, y, parts, reach):
-    """parts[block]: what the cells of one block of rows send, laid down between the two rows of reach[block]."""
+    """Add the images of the cells of one block of rows to parts[block], between the two rows of reach[block]."""
     n, blocks = rho.shape[0], parts.shape[0]
     for turn in prange(blocks):
-        block = 2 * turn % blocks + 2 * turn // blocks  # even ones, then odd ones: a share of every region each
+        block = 2 * turn % blocks + 2 * turn // blocks  # even, then odd blocks: every region for each thread
         begin, end = block * n // blocks, (block + 1) * n // blocks
         lo, hi = _rows_reached(x[begin : end + 1])
         reach[block, 0], reach[block, 1] = lo, hi
@@ -214,7 +214,7 @@ def _splat(rho, x, y, parts, reach):
             for j in range(n):
                 if rho[i, j] > 0.0:
                     _lay_cell(out, n, rho[i, j], x, y, i, j)
-        for i in range(lo, hi):  # flux that rounding has laid beyond the rim
+        for i in range(lo, hi):  # flux placed outside the rim by rounding
             out[i, n - 1] += out[i, n]
         if hi > n:
             for j in range(n):
@@ -224,7 +224,7 @@ def _splat(rho, x, y, parts, reach):
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def _lay_cell(out, n, mass, x, y, i, j):
     """Add the pieces of the image of cell (i, j) to out (n + 1, n + 1)."""
-    # sides of the image (e: along i, f: along j) and its twist (t)
+    # edge vectors of the image (e: along i, f: along j) and its twist (t)
     x0, y0 = x[i, j], y[i, j]
     ex, ey = x[i + 1, j] - x0, y[i + 1, j] - y0
     fx, fy = x[i, j + 1] - x0, y[i, j + 1] - y0
@@ -233,10 +233,10 @@ def _lay_cell(out, n, mass, x, y, i, j):
     p = int(2.0 * max(max(abs(ex), abs(ex + tx)), max(abs(ey), abs(ey + ty)))) + 1
     q = int(2.0 * max(max(abs(fx), abs(fx + tx)), max(abs(fy), abs(fy + ty)))) + 1
     da, db = 1.0 / p, 1.0 / q
-    # sides of the box of a piece: at most 1, so that it falls on two pixels each way at most
+    # sides of the box of a piece: at most 1, so that it covers at most two pixels each way
     wx = min(1.0, max(1e-6, abs(ex + 0.5 * tx) * da + abs(fx + 0.5 * tx) * db))
     wy = min(1.0, max(1e-6, abs(ey + 0.5 * ty) * da + abs(fy + 0.5 * ty) * db))
-    right, high = n - wx, n - wy  # where a box that begins further on is pushed back to
+    right, high = n - wx, n - wy  # largest start of a box inside the grid
     per_x, per_y = 1.0 / wx, 1.0 / wy
     least_x, least_y = 1.0 - per_x, 1.0 - per_y
     m = mass * da * db
@@ -251,11 +251,11 @@ def _lay_cell(out, n, mass, x, y, i, j):
             px = min(max(left + b * along_x, 0.0), right)
             py = min(max(low + b * along_y, 0.0), high)
             row, column = np.floor(px), np.floor(py)
-            f = max(0.0, (px - row) * per_x + least_x)  # the part that reaches the next row
+            f = max(0.0, (px - row) * per_x + least_x)  # fraction in the next row
             g = max(0.0, (py - column) * per_y + least_y)
             far = m * f
             near = m - far
-            r, c = np.uint64(np.int64(row)), np.uint64(np.int64(column))  # unsigned: no test for indices from the end
+            r, c = np.uint64(np.int64(row)), np.uint64(np.int64(column))  # unsigned: no wrap-around check of indices
             out[r, c] += near - near * g
             out[r, c + one] += near * g
             out[r + one, c] += far - far * g
@@ -263,8 +263,8 @@ def _lay_cell(out, n, mass, x, y, i, j):
 
 
 def threads_for(n: int) -> int:
-    """Threads that pay on n x n cells: small grids finish before a second thread has woken up on a busy machine."""
-    return 1 if n <= ONE_THREAD else min(2, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    """Return the number of threads for n x n cells; on a small grid a second thread starts too late to help."""
+    return 1 if n <= MAX_SINGLE_THREAD_CELLS else min(2, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
 
 
 @contextmanager
@@ -279,14 +279,14 @@ def threads(n: int) -> Iterator[None]:
 
 
 def inner(a: np.ndarray, b: np.ndarray) -> float:
-    """Σ a b over the cells, (n, m) both.  Compiled: the threads of BLAS spin while they wait for a busy core."""
+    """Return Σ a b over the cells, a and b (n, m); compiled, since waiting BLAS threads block a busy core."""
     return float(_inner(a, b))
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _inner(a, b):
     total = 0.0
-    for i in range(a.shape[0]):  # a sum for each row first: fewer digits are lost
+    for i in range(a.shape[0]):  # sum each row first, for accuracy
         row = 0.0
         for j in range(a.shape[1]):
             row += a[i, j] * b[i, j]

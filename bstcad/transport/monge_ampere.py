@@ -1,15 +1,15 @@
-"""Newton's method on the Monge-Ampère equation, written for ray tubes: it takes a map below the grid's own error.
+"""Newton's method on the Monge-Ampère equation of flux tubes, which removes the grid error of a coarse map.
 
-With S = ∇v = y - ∇phi the map from target to source, the flux that reaches target pixel p is the flux that the source
-sends through the pixel's tube, F_p = ∫_{S(p)} rho, and F_p has to be nu_p.  S is kept at pixel corners (averaged
-differences of phi, zero normal derivative, so the rim of the square maps to itself) and is bilinear inside.  The
+With S = ∇v = y - ∇phi the map from target to source, the flux into target pixel p is the flux that the source sends
+through the pixel's tube, F_p = ∫_{S(p)} rho, and the equation is F_p = nu_p.  S is stored at pixel corners (averaged
+differences of phi, zero normal derivative, so that the rim of the square maps to itself) and is bilinear inside.  The
 linearisation
 
     -div(rho cof(D²v) ∇eta) = nu - F
 
 is elliptic while v is convex; it is solved by conjugate gradients with the Poisson solve as preconditioner.
-Writing it on the target side resolves the edges of the picture exactly, lets the source be zero outside a disc, and
-needs the target positive.
+On the target side the equation resolves the edges of the picture exactly, and the source may be zero outside a disc;
+the target must be positive.
 """
 
 from __future__ import annotations
@@ -23,32 +23,34 @@ from scipy.ndimage import gaussian_filter
 from bstcad.transport.bfm import PoissonWithoutCheckerboard, Step, prolong
 from bstcad.transport.density import Density, inner, threads
 
-SOFTENING = 0.2  # added to both eigenvalues of rho cof(D²v): Newton steps stay small in dark, nearly folded regions
-SMOOTHING = 1.0  # cells: Gaussian blur of phi that takes out the grid noise of the coarser solution
-GRADIENT_STEPS, GRADIENT_FALL = 15, 0.1  # conjugate gradients: the most steps, the fall of the residual at the end
-SHORTEST = 0.05  # shortest fraction of a Newton step that is tried
-ENOUGH = 0.9  # a step that leaves more than this of the mass error is the last
-ROUGH, SLOW, PATIENT = 0.005, 0.98, 3  # above that mass error a step may leave SLOW; PATIENT times as many are taken
+SOFTENING = 0.2  # added to both eigenvalues of rho cof(D²v), to limit Newton steps in dark, nearly folded regions
+SMOOTHING = 1.0  # cells, width of the Gaussian blur of phi that removes the noise of the coarser grid
+CG_ITERATIONS, CG_TOLERANCE = 15, 0.1  # conjugate gradients: maximum number of iterations, relative tolerance
+MIN_STEP = 0.05  # smallest fraction of a Newton step in the line search
+MAX_ERROR_RATIO = 0.9  # ratio of the mass errors after and before a step above which the solve stops
+ROUGH_MASS_ERROR = 0.005  # mass error above which the two limits below replace MAX_ERROR_RATIO and the number of steps
+MAX_ROUGH_ERROR_RATIO = 0.98  # ratio of the mass errors after and before a step above which the solve stops
+MAX_STEPS_FACTOR = 3  # factor of the maximum number of steps
 
 
 class MongeAmpere:
-    """The equation on one grid: n x n target pixels, source density looked up bilinearly, cell units."""
+    """Monge-Ampère equation on one grid of n x n target pixels, the source interpolated bilinearly; cell units."""
 
     def __init__(self, source: Density, target: Density):
-        """Both on one grid."""
+        """Prepare the equation for two densities on one grid."""
         self.rho, self.nu = source.values, target.values
-        # differences averaged to corners are blind to the checkerboard: keep it out of the steps
+        # differences averaged to corners do not see the checkerboard, so the steps must not contain it
         self.poisson = PoissonWithoutCheckerboard(source.n)
 
     def flux(self, phi: np.ndarray) -> np.ndarray:
-        """F (n, n): source flux through the tube of each target pixel; signed, so a fold counts against."""
+        """Return F (n, n), the source flux through the tube of each target pixel; folded tubes count negative."""
         x, y = corners(phi)
         out = np.empty_like(phi)
         _flux(self.rho, x, y, out)
         return out
 
     def newton(self, phi: np.ndarray, r: np.ndarray, smoothed: np.ndarray | None = None) -> np.ndarray:
-        """eta with -div((rho cof(D²v) + softening) ∇eta) = r, roughly; smoothed: r after the preconditioner."""
+        """Return eta with -div((rho cof(D²v) + softening) ∇eta) ≈ r; smoothed: preconditioned r."""
         n = phi.shape[0]
         metric, p, q = np.empty((n + 1, n + 1, 3)), np.empty((n + 1, n + 1)), np.empty((n + 1, n + 1))
         _metric(self.rho, *corners(phi), metric, SOFTENING)
@@ -57,11 +59,11 @@ class MongeAmpere:
         z = self.poisson.solve(r) if smoothed is None else smoothed
         d = z.copy()
         rz = first = inner(r, z)
-        for _ in range(GRADIENT_STEPS):
-            if rz <= GRADIENT_FALL**2 * first:
+        for _ in range(CG_ITERATIONS):
+            if rz <= CG_TOLERANCE**2 * first:
                 break
             _apply(metric, d, p, q, image)
-            _follow(eta, r, d, image, rz / inner(d, image))
+            _update(eta, r, d, image, rz / inner(d, image))
             z = self.poisson.solve(r)
             rz, last = inner(r, z), rz
             d *= rz / last
@@ -70,7 +72,7 @@ class MongeAmpere:
 
 
 def corners(phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """S = y - ∇phi at the (n + 1)² pixel corners, cell units, from phi (n, n) in cell units."""
+    """Return S = y - ∇phi at the (n + 1)² pixel corners from phi (n, n), both in cell units."""
     n = phi.shape[0]
     x, y = np.empty((n + 1, n + 1)), np.empty((n + 1, n + 1))
     _corners(phi, x, y)
@@ -86,10 +88,10 @@ def climb(
     progress: Callable[[Step], None] | None = None,
     smoothing: float = SMOOTHING,
 ) -> tuple[np.ndarray, list[float], str]:
-    """Newton on each rung of (source, target), from phi (cell units) on the first.
+    """Apply Newton's method on each grid of (source, target), from phi (cell units) on the first.
 
-    smoothing: width (cells) of the Gaussian blur of phi before each.  Returns phi (cell units), the mass errors on the
-    last rung and why it stopped there.
+    smoothing: width (cells) of the Gaussian blur of phi before each grid.  Returns phi (cell units), the mass errors on
+    the last grid and the reason why it stopped there.
     """
     for k, (source, target) in enumerate(ladder):
         if k:
@@ -106,38 +108,38 @@ def _newton_steps(tubes, phi, *, steps, tolerance, progress):
     r = tubes.nu - tubes.flux(phi)
     smoothed = tubes.poisson.solve(r)
     errors, reason = [float(np.abs(r).mean())], "iterations"
-    for k in range(PATIENT * steps):
-        if errors[-1] <= tolerance or (k >= steps and errors[-1] <= ROUGH):
+    for k in range(MAX_STEPS_FACTOR * steps):
+        if errors[-1] <= tolerance or (k >= steps and errors[-1] <= ROUGH_MASS_ERROR):
             break
         found = _line_search(tubes, phi, r, smoothed=smoothed, eta=tubes.newton(phi, r, smoothed))
         error = np.inf if found is None else float(np.abs(found[1]).mean())
-        if error > errors[-1]:  # H^-1 and L2 may fall while more light goes astray
+        if error > errors[-1]:  # the mass error may rise although the residual falls in H^-1 and L2
             reason = "plateau"
             break
         phi, r, smoothed = found
         errors.append(error)
         if progress is not None:
             progress(Step(phi.shape[0], k + 1, errors[-1], "tubes"))
-        if errors[-1] > (SLOW if errors[-1] > ROUGH else ENOUGH) * errors[-2]:
+        if errors[-1] > (MAX_ROUGH_ERROR_RATIO if errors[-1] > ROUGH_MASS_ERROR else MAX_ERROR_RATIO) * errors[-2]:
             reason = "plateau"
             break
     return phi, errors, "converged" if errors[-1] <= tolerance else reason
 
 
 def _line_search(tubes, phi, r, *, smoothed, eta):
-    """The longest of 1, 1/2, 1/4 … of the step that lowers the residual in H^-1 and does not raise it in L2.
+    """Return (phi, its residual, preconditioned residual) after the longest accepted of 1, 1/2, 1/4 … of a step.
 
-    phi, the residual there and its solve by the preconditioner; None where no step does.
+    A step is accepted if it lowers the residual in H^-1 and does not raise it in L2; None: no step is.
     """
     norm, square = _dual_norm(r, smoothed), inner(r, r)
     step = 1.0
-    while step >= SHORTEST:
-        tried = phi + step * eta
-        left = tubes.nu - tubes.flux(tried)
+    while step >= MIN_STEP:
+        trial = phi + step * eta
+        left = tubes.nu - tubes.flux(trial)
         if inner(left, left) < 1.1 * square:
             smoothed = tubes.poisson.solve(left)
             if _dual_norm(left, smoothed) < (1 - 0.02 * step) * norm:
-                return tried, left, smoothed
+                return trial, left, smoothed
         step *= 0.5
     return None
 
@@ -147,16 +149,16 @@ def _dual_norm(r: np.ndarray, smoothed: np.ndarray) -> float:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _look(rho, x, y, last):
-    """Bilinear between cell centres, constant beyond the outer ones; cell units.  last: the float below n - 1."""
+def _interpolate(rho, x, y, last):
+    """Interpolate bilinearly between cell centres, constant outside them; cell units.  last: the float below n - 1."""
     x = min(max(x - 0.5, 0.0), last)
     y = min(max(y - 0.5, 0.0), last)
     row, column = np.floor(x), np.floor(y)
     a, b = x - row, y - column
-    i, j, one = np.uint64(np.int64(row)), np.uint64(np.int64(column)), np.uint64(1)  # no test for indices from the end
-    here = rho[i, j] + b * (rho[i, j + one] - rho[i, j])
+    i, j, one = np.uint64(np.int64(row)), np.uint64(np.int64(column)), np.uint64(1)  # no wrap-around check of indices
+    density = rho[i, j] + b * (rho[i, j + one] - rho[i, j])
     below = rho[i + one, j] + b * (rho[i + one, j + one] - rho[i + one, j])
-    return here + a * (below - here)
+    return density + a * (below - density)
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -173,7 +175,7 @@ def _corners(phi, x, y):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath={"contract"})
 def _flux(rho, x, y, out):
-    """∫ rho |dS| over each bilinear tube, by midpoints at most half a source cell apart (400 a side at most)."""
+    """Integrate rho |dS| over each bilinear tube by midpoints at most half a source cell apart, at most 400 a side."""
     n = out.shape[0]
     last = np.nextafter(n - 1.0, 0.0)
     for i in prange(n):
@@ -195,13 +197,13 @@ def _flux(rho, x, y, out):
                 for _ in range(q):
                     b += db
                     area = (ex + b * tx) * along_y - (ey + b * ty) * along_x
-                    total += _look(rho, left + b * along_x, low + b * along_y, last) * area
+                    total += _interpolate(rho, left + b * along_x, low + b * along_y, last) * area
             out[i, j] = total * (da * db)
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def _metric(rho, x, y, metric, softening):
-    """rho cof(D²v) + softening at pixel corners, kept positive: (xx, xy, yy) in the last axis."""
+    """Compute rho cof(D²v) + softening at pixel corners, kept positive: (xx, xy, yy) in the last axis."""
     n = x.shape[0] - 1
     last = np.nextafter(n - 1.0, 0.0)
     for k in prange(n + 1):
@@ -214,15 +216,15 @@ def _metric(rho, x, y, metric, softening):
             vxy = 0.5 * ((x[i, d] - x[i, c]) / (d - c) + (y[b, j] - y[a, j]) / (b - a))
             most = 0.99 * np.sqrt(vxx * vyy)
             vxy = min(max(vxy, -most), most)
-            here = _look(rho, x[i, j], y[i, j], last)
-            metric[i, j, 0] = here * vyy + softening
-            metric[i, j, 1] = -here * vxy
-            metric[i, j, 2] = here * vxx + softening
+            density = _interpolate(rho, x[i, j], y[i, j], last)
+            metric[i, j, 0] = density * vyy + softening
+            metric[i, j, 1] = -density * vxy
+            metric[i, j, 2] = density * vxx + softening
 
 
 @njit(cache=True, nogil=True)
-def _follow(eta, r, d, image, step):
-    """One step of conjugate gradients along d."""
+def _update(eta, r, d, image, step):
+    """Update solution and residual by a step of conjugate gradients along d."""
     n = eta.shape[0]
     for i in range(n):
         for j in range(n):
@@ -232,7 +234,7 @@ def _follow(eta, r, d, image, step):
 
 @njit(cache=True, nogil=True, parallel=True)
 def _apply(metric, eta, p, q, out):
-    """out = -div(metric ∇eta); gradients at corners, no flux through the rim; p, q: scratch."""
+    """Compute out = -div(metric ∇eta); gradients at corners, no flux through the rim; p, q: scratch."""
     n = eta.shape[0]
     for k in prange(n + 1):
         i = np.int64(k)

@@ -7,7 +7,7 @@ import torch
 
 from bstcad import pipeline
 from bstcad.baselines import integration
-from bstcad.baselines.integration import FINE, fit_heights, march
+from bstcad.baselines.integration import FINEST_FIT, fit_heights, march
 from bstcad.optics import sampling
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import Reflect, Refract, deflect, intersect
@@ -136,7 +136,7 @@ def test_the_net_is_as_near_to_points_as_splines_of_third_order_are():
     wave, inner = 0.2 * torch.sin(0.4 * x) * torch.cos(0.3 * y), torch.maximum(x.abs(), y.abs()) < 8.0
 
     def error(m):
-        sag, _, _ = fit_heights(net(m=m), x, y, wave, *FINE).relative_sag_and_slope(x, y)
+        sag, _, _ = fit_heights(net(m=m), x, y, wave, *FINEST_FIT).relative_sag_and_slope(x, y)
         return float((sag - wave)[inner].abs().max())
 
     assert error(65) < error(33) / 6 and error(65) < 1e-5  # mm

@@ -10,7 +10,15 @@ import pytest
 
 from bstcad.transport import Density
 from bstcad.transport.bfm import half_square, legendre
-from bstcad.transport.density import ONE_THREAD, gradient_at_corners, inner, pushforward, spread, threads, threads_for
+from bstcad.transport.density import (
+    MAX_SINGLE_THREAD_CELLS,
+    gradient_at_corners,
+    inner,
+    pushforward,
+    spread,
+    threads,
+    threads_for,
+)
 
 
 def test_picture_keeps_mass_by_area_for_sizes_that_do_not_divide():
@@ -157,12 +165,12 @@ def test_black_pixels_may_lie_nowhere():
 
 def test_small_grids_use_one_and_the_number_is_put_back():
     before = numba.get_num_threads()
-    with threads(ONE_THREAD):
+    with threads(MAX_SINGLE_THREAD_CELLS):
         assert numba.get_num_threads() == 1
-    with pytest.raises(KeyError), threads(ONE_THREAD):
+    with pytest.raises(KeyError), threads(MAX_SINGLE_THREAD_CELLS):
         raise KeyError
     assert numba.get_num_threads() == before
-    assert threads_for(ONE_THREAD + 1) <= numba.config.NUMBA_NUM_THREADS
+    assert threads_for(MAX_SINGLE_THREAD_CELLS + 1) <= numba.config.NUMBA_NUM_THREADS
 
 
 BITS = """
