@@ -1,7 +1,7 @@
-"""Size of every error: of three grades of making, mounting and lighting, and of the scene's [[tolerance]] tables.
+"""Set the limits of all errors, from three grades of manufacture and alignment and from the [[tolerance]] tables.
 
-Grades are round numbers of the order that makers state for moulded plastic, for diamond-turned and for precision optics
-of some 20 mm, not those of a standard or of one shop: put your own in their place.
+The grades are round numbers of the magnitude that manufacturers state for moulded plastic, diamond-turned and precision
+optics of some 20 mm.  They follow no standard and no particular shop; replace them by your own.
 """
 
 from __future__ import annotations
@@ -15,42 +15,42 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import FORM, NONE, OF_TWO_FACES, RIPPLE, Tolerance, settings_of
 from bstcad.tolerance.perturbations import Kind, Perturbation, Setup, form_error, kinds, ripple
 
-USUAL = "diamond-turned"
-MODES = 3  # independent fields, normal in their amounts, that add up to the form error of a trial
+DEFAULT_GRADE = "diamond-turned"
+FORM_MODES = 3  # number of independent random fields, with normal amounts, whose sum is the form error of a trial
 
 
 @dataclass(frozen=True)
-class Grade:
-    """± limits of all errors; of form and ripple RMS."""
+class ToleranceGrade:
+    """Limits (±) of all errors; RMS for form and ripple."""
 
     words: str
-    decentre: float  # mm, of lens, front and source, and along the axis
-    tilt: float  # degrees, clocking and wedge too
-    screen: float  # its shift over its width, and along the axis over its distance
-    thickness: float  # mm
-    index: float
-    front_power: float  # mm of sag at the rim
-    scale: float
+    decentre: float  # shift of lens, front and source across and along the axis, mm
+    tilt: float  # tilt, clocking and wedge, degrees
+    screen: float  # shift of the screen relative to its width, and along the axis relative to its distance
+    thickness: float  # thickness at the centre, mm
+    index: float  # refractive index
+    front_power: float  # sag of the front at its rim, mm
+    scale: float  # relative size of the lens
     temperature: float  # K
     wavelength: float  # nm
-    source: float  # size and angle of the source, relative
-    form: float  # mm RMS
-    form_length: float  # correlation length over the lens's width
-    ripple: float  # mm RMS
-    period: float  # mm, of the ripple
+    source: float  # size and cone angle of the source, relative
+    form: float  # form error, mm RMS
+    form_length: float  # correlation length of the form error relative to the width of the lens
+    ripple: float  # ripple, mm RMS
+    period: float  # period of the ripple, mm
 
 
 GRADES = {
-    "moulded": Grade(
+    "moulded": ToleranceGrade(
         "moulded plastic", decentre=0.05, tilt=0.1, screen=1e-3, thickness=0.05, index=5e-4, front_power=2e-3,
         scale=1e-3, temperature=10.0, wavelength=5.0, source=0.05, form=5e-4, form_length=0.15, ripple=2e-5, period=1.0,
     ),
-    "diamond-turned": Grade(
+    "diamond-turned": ToleranceGrade(
         "diamond-turned, screwed together", decentre=0.02, tilt=0.03, screen=3e-4, thickness=0.02, index=2e-4,
         front_power=3e-4, scale=1e-4, temperature=3.0, wavelength=2.0, source=0.02, form=1e-4, form_length=0.15,
         ripple=5e-6, period=0.5,
     ),
-    "precise": Grade(
+    "precise": ToleranceGrade(
         "precise, aligned when mounted", decentre=0.005, tilt=0.005, screen=1e-4, thickness=0.005, index=5e-5,
         front_power=5e-5, scale=2e-5, temperature=1.0, wavelength=0.5, source=0.005, form=3e-5, form_length=0.15,
         ripple=2e-6, period=0.5,
@@ -58,8 +58,8 @@ GRADES = {
 }  # fmt: skip
 
 
-def limit(kind: Kind, grade: Grade, setup: Setup) -> float:
-    """± of a kind of error, in its unit."""
+def grade_limit(kind: Kind, grade: ToleranceGrade, setup: Setup) -> float:
+    """Return the limit (±) that a grade sets for a kind of error, in the unit of the kind."""
     part, _, error = kind.name.partition(".")
     if part == "screen" and kind.unit == "mm":
         screen, z = setup.screen, setup.pivot("lens")[2]
@@ -73,72 +73,73 @@ def limit(kind: Kind, grade: Grade, setup: Setup) -> float:
     return grade.source if part == "source" else getattr(grade, error or part)
 
 
-def whole_table(table: Sequence[Tolerance], grade: str | None = None) -> tuple[Tolerance, ...]:
-    """The tables of a scene behind their grade; `grade` precedes the grade that the tables state for all errors."""
+def graded_table(table: Sequence[Tolerance], grade: str | None = None) -> tuple[Tolerance, ...]:
+    """Return the tables of a scene, preceded by one with the grade; `grade` overrides the grade that they state."""
     if grade is None:
-        return Tolerance(grade=USUAL), *table
+        return Tolerance(grade=DEFAULT_GRADE), *table
     if grade not in GRADES:
-        raise SceneError(f"--grade {grade}: there is no such grade; give one of {', '.join(GRADES)}")
-    named = (e if e.name else e.model_copy(update={"grade": None}) for e in table)
-    return Tolerance(grade=grade), *named
+        raise SceneError(f"--grade {grade}: unknown grade; give one of {', '.join(GRADES)}")
+    others = (e if e.name else e.model_copy(update={"grade": None}) for e in table)
+    return Tolerance(grade=grade), *others
 
 
-def start_of(table: Sequence[Tolerance]) -> str:
-    """Grade of all errors that a whole table does not name; "none": they are zero."""
+def base_grade(table: Sequence[Tolerance]) -> str:
+    """Return the grade of the errors that a graded table does not name; "none" if they are zero."""
     return settings_of([entry for entry in table if entry.name is None], "")["grade"]
 
 
 def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None = None) -> tuple[Perturbation, ...]:
-    """All errors of the setup by a whole table.
+    """Return all errors of the setup, sized by a graded table.
 
-    Errors that the lens's net is too coarse for are left out, unless the table names them; those of one face against
-    the other are off only where it does.  Raises SceneError, in a sentence, for tables of errors that do not exist.
+    Errors that need a finer net than the lens has are left out unless the table names them.  Errors of one face
+    relative to the other are included only if the table names them.  Raises SceneError for unknown errors.
     """
     errors = []
     for kind in kinds(setup, material).values():
-        told = settings_of(table, kind.name)
-        left_out = kind.name.startswith(OF_TWO_FACES) and not _named(table, kind.name)
-        if told.get("grade") != NONE and not left_out:
-            size = told["limit"] if "limit" in told else limit(kind, GRADES[told["grade"]], setup)
-            errors.append(Perturbation(kind, size, told.get("distribution", "normal"), told.get("cost", 1.0)))
-    errors += _of_faces(setup.lens, table)
+        values = settings_of(table, kind.name)
+        left_out = kind.name.startswith(OF_TWO_FACES) and not _names_error(table, kind.name)
+        if values.get("grade") != NONE and not left_out:
+            stated = "limit" in values
+            size = values["limit"] if stated else grade_limit(kind, GRADES[values["grade"]], setup)
+            errors.append(Perturbation(kind, size, values.get("distribution", "normal"), values.get("cost", 1.0)))
+    errors += _face_errors(setup.lens, table)
     for k, entry in enumerate(table[1:]):
-        none = entry.name and settings_of(table, entry.name).get("grade") == NONE
-        if entry.name and not none and entry.name.startswith(OF_TWO_FACES) and "front" not in setup.lens.passes.faces:
-            only = "is of a lens that refracts at two faces, and a mirror has one face"
-            raise SceneError(f"tolerance[{k}].name: {entry.name!r} {only}; remove that table")
-        if entry.name and not none and not any(entry.covers(error.kind.name) for error in errors):
+        off = entry.name and settings_of(table, entry.name).get("grade") == NONE
+        if entry.name and not off and entry.name.startswith(OF_TWO_FACES) and "front" not in setup.lens.passes.faces:
+            reason = "is an error of a lens with two faces, but a mirror has one face"
+            raise SceneError(f"tolerance[{k}].name: {entry.name!r} {reason}; remove that table")
+        if entry.name and not off and not any(entry.covers(error.kind.name) for error in errors):
             raise SceneError(
-                f"tolerance[{k}].name: {entry.name!r} changes nothing here, or the scene does not say by how much "
-                "(a lens.material does, of temperature and wavelength); remove that table"
+                f"tolerance[{k}].name: {entry.name!r} has no effect in this scene, or its effect is unknown "
+                "(temperature and wavelength need lens.material); remove that table"
             )
     if not errors:
-        raise SceneError('tolerance: nothing can be off; give a grade other than "none", or name errors with a limit')
+        raise SceneError('tolerance: all errors are zero; give a grade other than "none", or name errors with a limit')
     return tuple(errors)
 
 
-def _named(table: Sequence[Tolerance], error: str) -> bool:
-    """Does a table name it?"""
+def _names_error(table: Sequence[Tolerance], error: str) -> bool:
+    """Return True if a table names the error."""
     return any(entry.name and entry.covers(error) for entry in table)
 
 
-def _of_faces(lens: Lens, table: Sequence[Tolerance]) -> Iterator[Perturbation]:
-    """Form errors and ripple; of the front if the table names it: that takes twice as long to trace."""
+def _face_errors(lens: Lens, table: Sequence[Tolerance]) -> Iterator[Perturbation]:
+    """Yield form errors and ripple; those of the front only if the table names them, since they double the time."""
     for name in (*FORM, *RIPPLE):
-        told, by_name = settings_of(table, name), _named(table, name)
+        values, by_name = settings_of(table, name), _names_error(table, name)
         face = name.partition(".")[0]
-        if told.get("grade") == NONE or face not in lens.optical_faces or not (by_name or face == "back"):
+        if values.get("grade") == NONE or face not in lens.optical_faces or not (by_name or face == "back"):
             continue
-        grade, cost = GRADES[told.get("grade", USUAL)], told.get("cost", 1.0)
+        grade, cost = GRADES[values.get("grade", DEFAULT_GRADE)], values.get("cost", 1.0)
         try:
             if name in RIPPLE:
-                kind = ripple(lens, told.get("period", grade.period), told.get("pattern", "spiral"))
-                yield Perturbation(kind, told.get("limit", grade.ripple), told.get("distribution", "normal"), cost)
+                kind = ripple(lens, values.get("period", grade.period), values.get("pattern", "spiral"))
+                yield Perturbation(kind, values.get("limit", grade.ripple), values.get("distribution", "normal"), cost)
                 continue
-            length = told.get("correlation_length", grade.form_length * 2 * min(lens.outline.half_extent))
-            size = told.get("limit", grade.form) / math.sqrt(MODES)
-            for seed in range(MODES):
+            length = values.get("correlation_length", grade.form_length * 2 * min(lens.outline.half_extent))
+            size = values.get("limit", grade.form) / math.sqrt(FORM_MODES)
+            for seed in range(FORM_MODES):
                 yield Perturbation(form_error(lens, length, seed, face), size, "field", cost)
-        except ValueError as error:  # finer than the net
+        except ValueError as error:  # the net is too coarse
             if by_name:
                 raise SceneError(f"tolerance: {name}: {error}") from error

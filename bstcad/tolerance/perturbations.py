@@ -1,7 +1,7 @@
-"""Errors in how a lens is made, mounted and lit: kinds by name with their effect on a setup, distributions, and trials.
+"""Errors of manufacture, alignment and illumination: their effect on a setup, their distributions, and random trials.
 
-A setup is traced in the lens's own frame.  Decentres and tilts are those of a part against all that stays; a lens tilts
-about its middle, a source about itself, a screen about its own middle.
+A setup is traced in the frame of the lens.  Decentres and tilts move one part relative to all others.  A lens tilts
+about its middle, a source about itself, and a screen about its own middle.
 """
 
 from __future__ import annotations
@@ -39,18 +39,18 @@ from bstcad.scene.errors import SceneError
 
 @dataclass(frozen=True)
 class Setup:
-    """Lens, light and screen to be traced; lengths in mm."""
+    """Lens, light and screen; lengths in mm, in the frame of the lens."""
 
     lens: Lens
     channels: tuple[Channel, ...]
     screen: Screen
-    placed: Motion | None = None  # of the lens in the room, where a wanted wave stays; None: it is where it was
+    lens_motion: Motion | None = None  # motion of the lens in the room, in which a wanted wave is fixed; None: none
 
     def pivot(self, part: str) -> Vector:
-        """Point about which a part ("lens", "source", "screen") tilts.
+        """Return the point about which a part ("lens", "source", "screen") tilts.
 
-        Of the lens half way between its faces' vertices (of a mirror in air the vertex), of the source the weighted
-        mean of its points or the middle of its aperture, of the screen its middle.
+        Lens: midpoint of the vertices of its faces; mirror in air: its vertex.  Source: weighted mean of its points,
+        or the middle of its aperture.  Screen: its middle.
         """
         if part == "screen":
             return self.screen.middle
@@ -62,23 +62,23 @@ class Setup:
         return tuple(mean.tolist())
 
     def picture(self, tubes: int) -> np.ndarray:
-        """(rows, columns) flux in each pixel of the screen, row 0 = y max, by tubes x tubes a channel."""
+        """Return the flux in each pixel of the screen (rows, columns), row 0 = y max, by tubes x tubes per channel."""
         return tubes_picture(self.lens, self.channels, self.screen, tubes, over_the_back=True).cpu().numpy()
 
     def moved(self, part: str, motion: Motion) -> Setup:
-        """With its lens, source or screen moved; seen from a moved lens, all else moves the other way."""
+        """Return the setup with a part moved.  In the frame of a moved lens, everything else moves inversely."""
         if part == "lens":
             around = self.moved("source", motion.inverse).moved("screen", motion.inverse)._with_elements(motion.inverse)
-            return replace(around, placed=motion if self.placed is None else self.placed.after(motion))
+            return replace(around, lens_motion=motion if self.lens_motion is None else self.lens_motion.after(motion))
         if part == "screen":
             return replace(self, screen=self.screen.moved(motion))
         try:
             return self.with_sources(lambda source: source.moved(motion, self.lens.entrance.z))
-        except NotImplementedError as error:  # an emitter of one's own
-            raise SceneError(f"tolerance: {error}, or name errors with which it stays where it is") from None
+        except NotImplementedError as error:  # a user-defined emitter
+            raise SceneError(f"tolerance: {error}, or name only errors that do not move it") from None
 
     def _with_elements(self, motion: Motion) -> Setup:
-        """With the faces of windows and mirrors around the lens moved; their rims stay about the axis of the lens."""
+        """Return the setup with the faces of windows and mirrors moved; their rims stay about the axis of the lens."""
         if not (self.lens.before or self.lens.behind):
             return self
 
@@ -90,16 +90,16 @@ class Setup:
         return replace(self, lens=lens, channels=tuple(replace(c, around=around) for c, around in own))
 
     def with_sources(self, change: Callable[[Emitter], Emitter]) -> Setup:
-        """With each channel's source changed."""
+        """Return the setup with the source of each channel changed."""
         return replace(self, channels=tuple(replace(c, source=change(c.source)) for c in self.channels))
 
     def with_indices(self, change: Callable[[float], float]) -> Setup:
-        """With each refractive index of the lens changed."""
+        """Return the setup with each refractive index of the lens changed."""
         channels = tuple(replace(c, index=change(c.index)) for c in self.channels)
         return replace(self, lens=replace(self.lens, index=change(self.lens.index)), channels=channels)
 
     def with_lens_scaled(self, factor: float) -> Setup:
-        """With its lens larger by a factor about its pivot."""
+        """Return the setup with its lens scaled by a factor about its pivot."""
         lens, (_, _, about) = self.lens, self.pivot("lens")
         faces = {"front": lens.front.scaled(factor, about), "back": lens.back.scaled(factor, about)}
         clear = lens.clear and tuple(aperture.scaled(factor) for aperture in lens.clear)
@@ -108,62 +108,62 @@ class Setup:
 
 # --- distributions and trials -----------------------------------------------------------------------------------------
 
-SIGMAS = 2.0  # limit of a normal distribution in its standard deviations before the cut at the limit
+CUTOFF_SIGMAS = 2.0  # limit of a truncated normal distribution, in standard deviations before truncation
 
 
 @dataclass(frozen=True)
 class Kind:
     """One kind of error."""
 
-    name: str  # as in scene files: "lens.decentre_x"
-    words: str  # as in a report
-    unit: str  # of its amounts; "" for a ratio
-    apply: Callable[[Setup, float], Setup]  # (as designed, amount) -> as made
+    name: str  # name in scene files, such as "lens.decentre_x"
+    words: str  # name in reports
+    unit: str  # unit of its amounts; "" for a ratio
+    apply: Callable[[Setup, float], Setup]  # (setup as designed, amount) -> setup with the error
 
 
 @dataclass(frozen=True)
 class Perturbation:
-    """One kind of error with its distribution about nominal."""
+    """One kind of error with its distribution about zero."""
 
     kind: Kind
-    limit: float  # ± (unit of the kind); of a random field its mean RMS
+    limit: float  # limit (±) in the unit of the kind; mean RMS of a random field
     distribution: Literal["normal", "uniform", "field"] = "normal"
-    cost: float = 1.0  # of holding the limit, relative to the other errors
+    cost: float = 1.0  # cost of keeping the limit, relative to the other errors
 
     @property
     def sigma(self) -> float:
         """Standard deviation.
 
-        normal: cut at its limit, L = a s with a = 2: σ² = s² (1 - 2 a φ(a) / (2 Φ(a) - 1)); field: a mode of a random
-        field, normal and not cut.
+        normal: truncated at L = a s, a = 2: σ² = s² (1 - 2 a φ(a) / (2 Φ(a) - 1)).  field: one mode of a random field,
+        normal and not truncated.
         """
-        cut = 1 - 2 * SIGMAS * norm.pdf(SIGMAS) / (2 * norm.cdf(SIGMAS) - 1)
-        ratios = {"uniform": 1 / math.sqrt(3), "field": 1.0, "normal": math.sqrt(cut) / SIGMAS}
+        cut = 1 - 2 * CUTOFF_SIGMAS * norm.pdf(CUTOFF_SIGMAS) / (2 * norm.cdf(CUTOFF_SIGMAS) - 1)
+        ratios = {"uniform": 1 / math.sqrt(3), "field": 1.0, "normal": math.sqrt(cut) / CUTOFF_SIGMAS}
         return self.limit * ratios[self.distribution]
 
-    def amounts(self, even: np.ndarray) -> np.ndarray:
-        """Amounts from numbers that are even in [0, 1), by the inverse of the distribution."""
+    def amounts(self, uniform: np.ndarray) -> np.ndarray:
+        """Return amounts from uniform numbers in [0, 1), by the inverse of the cumulative distribution."""
         if self.distribution == "uniform":
-            return self.limit * (2 * even - 1)
+            return self.limit * (2 * uniform - 1)
         if self.distribution == "field":
-            return self.limit * norm.ppf(np.clip(even, 1e-12, None))
-        low = norm.cdf(-SIGMAS)
-        return self.limit * (norm.ppf(low + even * (1 - 2 * low)) / SIGMAS)
+            return self.limit * norm.ppf(np.clip(uniform, 1e-12, None))
+        low = norm.cdf(-CUTOFF_SIGMAS)
+        return self.limit * (norm.ppf(low + uniform * (1 - 2 * low)) / CUTOFF_SIGMAS)
 
 
 def trials(perturbations: Sequence[Perturbation], seed: int, numbers: Iterable[int]) -> np.ndarray:
-    """Amounts (trials, n) of the trials of these numbers, in the kinds' units; they depend on seed and number alone."""
-    even = [np.random.default_rng((seed, number)).random(len(perturbations)) for number in numbers]
-    return draws(perturbations, np.stack(even))
+    """Return the amounts (trials, n) of numbered trials, in the kinds' units; they depend only on seed and number."""
+    uniform = [np.random.default_rng((seed, number)).random(len(perturbations)) for number in numbers]
+    return draws(perturbations, np.stack(uniform))
 
 
-def draws(perturbations: Sequence[Perturbation], even: np.ndarray) -> np.ndarray:
-    """Amounts (…, n) from numbers (…, n) that are even in [0, 1)."""
-    return np.stack([p.amounts(even[..., k]) for k, p in enumerate(perturbations)], axis=-1)
+def draws(perturbations: Sequence[Perturbation], uniform: np.ndarray) -> np.ndarray:
+    """Return amounts (…, n) from uniform numbers (…, n) in [0, 1)."""
+    return np.stack([p.amounts(uniform[..., k]) for k, p in enumerate(perturbations)], axis=-1)
 
 
-def perturbed(setup: Setup, perturbations: Sequence[Perturbation], amounts: Sequence[float]) -> Setup:
-    """The setup with these amounts, in the order of the perturbations; shapes before motions, also of a face."""
+def perturb(setup: Setup, perturbations: Sequence[Perturbation], amounts: Sequence[float]) -> Setup:
+    """Apply amounts (n,), in the order of the perturbations, to a setup; errors of shape before motions."""
     pairs = [(p.kind, float(a)) for p, a in zip(perturbations, amounts, strict=True) if a]
     motions = ("lens.decentre", "lens.tilt", "lens.axial", "lens.clocking", "source.", "screen.", "front.decentre")
     for kind, amount in sorted(pairs, key=lambda pair: pair[0].name.startswith(motions)):
@@ -173,11 +173,12 @@ def perturbed(setup: Setup, perturbations: Sequence[Perturbation], amounts: Sequ
 
 # --- the kinds with one amount ----------------------------------------------------------------------------------------
 
-BAND = 20.0  # nm to either side of each line, over which the material's index must be known
-# (expansion 1/K, dn/dT 1/K) at room temperature.  PMMA: Baeumer, Handbook of Plastic Optics (2nd ed. 2010), table 5.1;
+INDEX_MARGIN = 20.0  # distance (nm) on each side of a line within which the material's index must be known
+# Thermal expansion (1/K) and dn/dT (1/K) at room temperature.
+# PMMA: Baeumer, Handbook of Plastic Optics (2nd ed. 2010), table 5.1.
 # N-BK7: Schott's data sheet (α from -30 to 70 °C; Δn_rel/ΔT at 546 nm, 20 to 40 °C).
-THERMAL = {"PMMA": (6.5e-5, -1.05e-4), "N-BK7": (7.1e-6, 3.0e-6)}
-MOTIONS = (  # error, words, axis, is it a turn?
+THERMAL_COEFFICIENTS = {"PMMA": (6.5e-5, -1.05e-4), "N-BK7": (7.1e-6, 3.0e-6)}
+MOTIONS = (  # (error, words, axis, True for a rotation)
     ("decentre_x", "decentre of the {} in x", 0, False),
     ("decentre_y", "decentre of the {} in y", 1, False),
     ("axial", "{} along the axis", 2, False),
@@ -188,74 +189,75 @@ MOTIONS = (  # error, words, axis, is it a turn?
 
 
 def kinds(setup: Setup, material: str | None = None) -> dict[str, Kind]:
-    """All errors of a setup that have one amount, but those without effect there or of an unknown material."""
+    """Return all errors of a setup that have one amount, except those without effect and of an unknown material."""
     found = (*_motions(setup), *_shapes(setup, material), *_lights(setup), *_alignments(setup.lens))
     return {kind.name: kind for kind in found}
 
 
 def _motions(setup: Setup) -> Iterator[Kind]:
-    """Shifts along and turns about x, y and z of lens, source and screen."""
-    sources, hidden = [channel.source for channel in setup.channels], {"source.clocking"}
+    """Yield the shifts along, and rotations about, x, y and z of lens, source and screen."""
+    sources, without_effect = [channel.source for channel in setup.channels], {"source.clocking"}
     if all(source.shifts_alike for source in sources):
-        hidden.add("source.axial")  # parallel light does not change along the axis
+        without_effect.add("source.axial")  # parallel light is the same along the axis
     if not all(source.turns_alike for source in sources):
-        hidden.add("lens.clocking")  # round light hides that of the source; other light cannot be turned
+        without_effect.add("lens.clocking")  # without effect in round light; other light cannot be rotated
     for part in ("lens", "source", "screen"):
         name = setup.lens.passes.optic if part == "lens" else part
         for error, words, axis, turns in MOTIONS:
-            if f"{part}.{error}" not in hidden:
-                moves = partial(_moved, part, axis, turns)
+            if f"{part}.{error}" not in without_effect:
+                moves = partial(_move_part, part, axis, turns)
                 yield Kind(f"{part}.{error}", words.format(name), "deg" if turns else "mm", moves)
 
 
-def _moved(part: str, axis: int, turns: bool, setup: Setup, by: float) -> Setup:
+def _move_part(part: str, axis: int, turns: bool, setup: Setup, by: float) -> Setup:
     amounts = tuple(by if k == axis else 0.0 for k in range(3))
     return setup.moved(part, Motion.of(turn=amounts, about=setup.pivot(part)) if turns else Motion.of(shift=amounts))
 
 
 def _shapes(setup: Setup, material: str | None) -> Iterator[Kind]:
-    """Errors of the lens's shape, glass and temperature, and of the wavelength."""
+    """Yield the errors of the lens's shape, glass and temperature, and of the wavelength."""
     optic, refracts = setup.lens.passes.optic, setup.lens.passes.enters
     if refracts:
-        yield Kind("lens.thickness", f"thickness of the {optic}", "mm", _thicker)
+        yield Kind("lens.thickness", f"thickness of the {optic}", "mm", _change_thickness)
         yield Kind("lens.index", "refractive index", "", lambda setup, by: setup.with_indices(lambda n: n + by))
-        yield Kind("lens.front_power", "sag of the front at its rim", "mm", _front_power)
+        yield Kind("lens.front_power", "sag of the front at its rim", "mm", _change_front_power)
     yield Kind("lens.scale", f"scale of the {optic} (shrinkage)", "", lambda s, by: s.with_lens_scaled(1 + by))
-    if material in THERMAL and refracts:
-        yield Kind("temperature", f"temperature of the {optic} ({material})", "K", partial(_warmer, material))
+    if material in THERMAL_COEFFICIENTS and refracts:
+        warm = partial(_change_temperature, material)
+        yield Kind("temperature", f"temperature of the {optic} ({material})", "K", warm)
     if material is not None and refracts and _disperses(material, setup):
-        yield Kind("wavelength", "wavelength of the light", "nm", partial(_redder, material))
+        yield Kind("wavelength", "wavelength of the light", "nm", partial(_change_wavelength, material))
 
 
-def _thicker(setup: Setup, by: float) -> Setup:
+def _change_thickness(setup: Setup, by: float) -> Setup:
     back = setup.lens.back
     return replace(setup, lens=replace(setup.lens, back=back.moved(back.z + by)))
 
 
-def _front_power(setup: Setup, by: float) -> Setup:
-    """A front whose rim stands higher by so much (mm): c + 2 by / R², R the farthest from the axis."""
+def _change_front_power(setup: Setup, by: float) -> Setup:
+    """Raise the rim of the front by an amount (mm): curvature c + 2 by / R², R the largest distance from the axis."""
     front = setup.lens.front
     rim2 = sum(p * p for p in (front.outline or setup.lens.outline).farthest)
     return replace(setup, lens=replace(setup.lens, front=front.bent(2 * by / rim2)))
 
 
-def _warmer(material: str, setup: Setup, by: float) -> Setup:
-    expansion, of_index = THERMAL[material]
+def _change_temperature(material: str, setup: Setup, by: float) -> Setup:
+    expansion, of_index = THERMAL_COEFFICIENTS[material]
     return setup.with_lens_scaled(1 + expansion * by).with_indices(lambda n: n + of_index * by)
 
 
 def _disperses(material: str, setup: Setup) -> bool:
-    """Is the material's index known around each line of the light?"""
+    """Return True if the material's index is known around each line of the light."""
     try:
         for nm in {channel.source.wavelength for channel in setup.channels}:
-            refractive_index(material, nm - BAND), refractive_index(material, nm + BAND)
+            refractive_index(material, nm - INDEX_MARGIN), refractive_index(material, nm + INDEX_MARGIN)
     except ValueError:
         return False
     return True
 
 
-def _redder(material: str, setup: Setup, by: float) -> Setup:
-    """Every line of the light longer by so much (nm); losses at faces and in the glass stay."""
+def _change_wavelength(material: str, setup: Setup, by: float) -> Setup:
+    """Add an amount (nm) to the wavelength of each line; losses at faces and in the glass do not change."""
 
     def change(channel: Channel) -> Channel:
         nm = channel.source.wavelength
@@ -266,19 +268,19 @@ def _redder(material: str, setup: Setup, by: float) -> Setup:
 
 
 def _lights(setup: Setup) -> Iterator[Kind]:
-    """Errors of the cone and of the size of point sources."""
+    """Yield the errors of cone angle and size of point sources."""
     sources = [channel.source for channel in setup.channels]
     if any(source.wider(0.0) for source in sources):
-        yield Kind("source.angle", "width of the source's cone, relative", "", _wider)
+        yield Kind("source.angle", "width of the source's cone, relative", "", _change_cone)
     if len({source.place for source in sources}) > 1 and all(source.larger(0.0, source.place) for source in sources):
-        yield Kind("source.size", "size of the source, relative", "", _larger)
+        yield Kind("source.size", "size of the source, relative", "", _change_size)
 
 
-def _wider(setup: Setup, by: float) -> Setup:
+def _change_cone(setup: Setup, by: float) -> Setup:
     return setup.with_sources(lambda source: source.wider(by))
 
 
-def _larger(setup: Setup, by: float) -> Setup:
+def _change_size(setup: Setup, by: float) -> Setup:
     return setup.with_sources(lambda source: source.larger(by, setup.pivot("source")))
 
 
@@ -286,157 +288,158 @@ def _larger(setup: Setup, by: float) -> Setup:
 
 
 def _alignments(lens: Lens) -> Iterator[Kind]:
-    """Wedge of the two faces that light meets, and decentre of the front, which of a plane does nothing."""
+    """Yield the wedge between two refracting faces, and the decentre of a front that is not plane."""
     for axis, name in enumerate("xy" if "front" in lens.passes.faces else ""):
-        words = f"wedge of the {lens.passes.optic}, the tilt of its back about {name} to the front"
-        yield Kind(f"lens.wedge_{name}", words, "deg", partial(_wedged, axis))
+        words = f"wedge of the {lens.passes.optic}: tilt of its back about {name} relative to the front"
+        yield Kind(f"lens.wedge_{name}", words, "deg", partial(_tilt_back, axis))
         if not lens.front.level:
-            words = f"decentre of the front in {name} to the back"
-            yield Kind(f"front.decentre_{name}", words, "mm", partial(_front_decentred, axis))
+            words = f"decentre of the front in {name} relative to the back"
+            yield Kind(f"front.decentre_{name}", words, "mm", partial(_decentre_front, axis))
 
 
-def _front_decentred(axis: int, setup: Setup, by: float) -> Setup:
-    """With the front shifted, and the lens's rim with it; the back stays in the room.
+def _decentre_front(axis: int, setup: Setup, by: float) -> Setup:
+    """Shift the front and the rim of the lens (mm); the back stays fixed in the room.
 
-    A lens is traced in the frame of its front, so its back shifts the other way and the whole lens with the front.
-    The net grows, straight on, by as many control points as it takes to reach the rim: inside, the face stays as it is.
+    A lens is traced in the frame of its front.  Therefore the back shifts inversely, and the whole lens moves with the
+    front.  The net is extended linearly to reach the rim; inside, the face does not change.
     """
     back, side = setup.lens.back, "xy"[axis]
     (low, high), pitch = getattr(back, side), back.pitch[axis]
-    short = setup.lens.outline.half_extent[axis] + abs(by) - min(-low, high)
-    more = max(0, math.ceil(short / pitch))
+    missing = setup.lens.outline.half_extent[axis] + abs(by) - min(-low, high)
+    more = max(0, math.ceil(missing / pitch))
     heights = np.pad(back.heights, [(more * (k == axis),) * 2 for k in (0, 1)], "reflect", reflect_type="odd")
     ends = low - more * pitch - by, high + more * pitch - by
-    stays = replace(back, heights=torch.from_numpy(heights), **{side: ends})
+    fixed = replace(back, heights=torch.from_numpy(heights), **{side: ends})
     shift = tuple(by if k == axis else 0.0 for k in range(3))
-    return replace(setup, lens=setup.lens.with_back(stays)).moved("lens", Motion.of(shift=shift))
+    return replace(setup, lens=setup.lens.with_back(fixed)).moved("lens", Motion.of(shift=shift))
 
 
-def _wedged(axis: int, setup: Setup, by: float) -> Setup:
-    """With the back turned about its vertex v; front, rim and all else stay.
+def _tilt_back(axis: int, setup: Setup, by: float) -> Setup:
+    """Rotate the back about its vertex v (degrees); front, rim and everything else stay fixed.
 
-    A point p = v + (x, y, ζ) of the turned face was at v + q, q = Rᵀ (p - v), before.  There the face lies as high as
-    its tangent plane over (x, y) says, which is off by curvature · (turn · sag)², 1 nm at a tenth of a degree:
+    A point p = v + (x, y, ζ) of the rotated face was at v + q before, q = Rᵀ (p - v).  There the face is replaced by
+    its tangent plane at (x, y), with an error of curvature · (angle · sag)², 1 nm at a tenth of a degree:
     q_z = h - h_v + ∇h · ((q_x, q_y) - (x, y)), linear in ζ.
     """
     back = setup.lens.back
     turn = Motion.of(turn=tuple(by if k == axis else 0.0 for k in range(3))).inverse.rotation.tolist()
-    x, y = _points(back)
+    x, y = _control_points(back)
     h, h_x, h_y = back.relative_sag_and_slope(x, y)
     vertex = float(back.from_vertex().z) - back.z
     level = [row[0] * x + row[1] * y for row in turn]  # q of ζ = 0
     rise = h - vertex + h_x * (level[0] - x) + h_y * (level[1] - y) - level[2]
     along = turn[2][2] - h_x * turn[0][2] - h_y * turn[1][2]
-    return replace(setup, lens=setup.lens.with_back(_higher(back, (vertex + rise / along - h).numpy())))
+    return replace(setup, lens=setup.lens.with_back(_add_heights(back, (vertex + rise / along - h).numpy())))
 
 
 # --- errors of the form of a face, as heights of its control net ------------------------------------------------------
-# Control points with the values of a field make its spline but for (pitch / length)², so a field must be smooth over a
-# few control cells.
+# A spline whose control points have the values of a field differs from it by (pitch / length)².  A field must therefore
+# be smooth over a few control cells.
 
-FRONT = 100  # added to the seeds of the front's form: other fields than the back has
-FACE = 513  # control points a side of the net of a plane or a conic with a form error
-SPARE = 6  # of these control points on each side of a round outline, beyond the rim
-BEYOND = 1.03  # of the rim's radius: such a net follows its face up to there, which is far enough not to matter inside
-SMOOTH = 4.0  # control cells in a correlation length or a period, at least
+FRONT_SEED_OFFSET = 100  # offset of the seeds of the front's form, whose fields differ from those of the back
+NET = 513  # control points per side of the net that replaces a plane or a conic with a form error
+FACE_MARGIN = 6  # number of these control points on each side outside a round outline
+FACE_REACH = 1.03  # radius up to which such a net follows its face, in rim radii; the inside is unaffected beyond it
+MIN_CELLS = 4.0  # minimum number of control cells in a correlation length or a period
 
 
 def form_error(lens: Lens, correlation_length: float, seed: int, face: str = "back") -> Kind:
-    """A random field on the back or the front; amounts are its RMS (mm)."""
+    """Return a random field on the back or the front as a kind of error; amounts are its RMS (mm)."""
     net, outline = _net(lens, face)
-    field = random_field(net, correlation_length, seed + FRONT * (face == "front"), inside(outline, net))
+    seed_of_face = seed + FRONT_SEED_OFFSET * (face == "front")
+    field = random_field(net, correlation_length, seed_of_face, inside_outline(outline, net))
     words = f"form of the {face}, correlated over {correlation_length:.3g} mm (draw {seed})"
-    return Kind(f"{face}.form_{seed}", words, "mm RMS", partial(_raised, face, field))
+    return Kind(f"{face}.form_{seed}", words, "mm RMS", partial(_add_form, face, field))
 
 
 def ripple(lens: Lens, period: float, pattern: Literal["raster", "spiral"]) -> Kind:
-    """Tool marks sin(2π s / period) on the back; amounts are their RMS (mm).
+    """Return tool marks sin(2π s / period) on the back as a kind of error; amounts are their RMS (mm).
 
-    s is x for a raster, the distance from the axis for the spiral of a diamond tool, whose turns are nearly circles.
-    period (mm).  ValueError if the net is too coarse for it.
+    s is x for a raster, and the distance from the axis for the spiral of a diamond tool (whose turns are almost
+    circles).  Raises ValueError if the net is too coarse for the period (mm).
     """
-    _resolved(lens.back, period, "a ripple's period")
+    _require_resolution(lens.back, period, "a ripple's period")
     x, y = (np.linspace(*side, m) for side, m in zip((lens.back.x, lens.back.y), lens.back.shape, strict=True))
     s = np.broadcast_to(x[:, None], (len(x), len(y))) if pattern == "raster" else np.hypot(x[:, None], y[None, :])
-    field = _of_rms_one(np.sin(2 * np.pi * s / period), inside(lens.outline, lens.back))
+    field = _normalise(np.sin(2 * np.pi * s / period), inside_outline(lens.outline, lens.back))
     words = f"{pattern} ripple of the back, period {period:g} mm"
-    return Kind("back.ripple", words, "mm RMS", partial(_raised, "back", field))
+    return Kind("back.ripple", words, "mm RMS", partial(_add_form, "back", field))
 
 
 def random_field(surface: BSplineSurface, correlation_length: float, seed: int, where: np.ndarray) -> np.ndarray:
-    """(m, n) a Gaussian random field of RMS 1 and mean 0 over `where`, of covariance exp(-(r / correlation_length)²).
+    """Draw a Gaussian random field (m, n) with RMS 1 and mean 0 over `where`, covariance exp(-(r / length)²).
 
-    White noise drawn with the seed, smoothed by a Gaussian of standard deviation correlation_length (mm) / 2; the
-    covariance is wider by √2.  ValueError if the net is too coarse for it.
+    White noise is smoothed by a Gaussian of standard deviation correlation_length (mm) / 2; the covariance is wider by
+    √2.  Raises ValueError if the net is too coarse.
     """
-    _resolved(surface, correlation_length, "a correlation length")
+    _require_resolution(surface, correlation_length, "a correlation length")
     cells = [correlation_length / 2 / pitch for pitch in surface.pitch]
     margin = [int(np.ceil(4 * c)) for c in cells]
-    shape = [m + 2 * k for m, k in zip(surface.shape, margin, strict=True)]  # without an effect of borders
+    shape = [m + 2 * k for m, k in zip(surface.shape, margin, strict=True)]  # the margin avoids effects of the boundary
     noise = fft.rfftn(np.random.default_rng(seed).standard_normal(shape))
     noise = fft.irfftn(fourier_gaussian(noise, cells, n=shape[-1]), shape)  # 20 times as fast as gaussian_filter
     inner = tuple(slice(k, k + m) for k, m in zip(margin, surface.shape, strict=True))
-    return _of_rms_one(noise[inner], where)
+    return _normalise(noise[inner], where)
 
 
-def inside(outline: Outline, net: BSplineSurface) -> np.ndarray:
-    """(m, n) True for control points of a face inside the outline."""
-    return outline.contains(*_points(net)).numpy()
+def inside_outline(outline: Outline, net: BSplineSurface) -> np.ndarray:
+    """Return a mask (m, n) of the control points of a face inside the outline."""
+    return outline.contains(*_control_points(net)).numpy()
 
 
 def as_net(face: Surface, outline: Outline) -> BSplineSurface:
-    """A plane, a sphere or a conic as a net of FACE control points a side; a net as it is.
+    """Convert a plane, a sphere or a conic into a net of NET control points per side; return a net unchanged.
 
-    It interpolates the face over each control point.  In its end spans a spline of uniform control points follows a
-    curve poorly: of a disc they lie beyond the rim, where the net becomes level; of a rectangle they lie at its sides.
+    The net interpolates the face at each control point.  In its end spans a uniform spline follows a curve poorly.  For
+    a round outline these lie outside the rim, where the net becomes level; for a rectangle they lie at its sides.
     """
     if face.is_net:
         return face
-    wide = (FACE - 1) / (FACE - 1 - 2 * SPARE) if outline.is_round else 1.0
+    wide = (NET - 1) / (NET - 1 - 2 * FACE_MARGIN) if outline.is_round else 1.0
     half_x, half_y = (half * wide for half in outline.half_extent)
-    level = BSplineSurface(face.z, torch.zeros((FACE, FACE), dtype=torch.float64), (-half_x, half_x), (-half_y, half_y))
-    x, y = _points(level)
+    level = BSplineSurface(face.z, torch.zeros((NET, NET), dtype=torch.float64), (-half_x, half_x), (-half_y, half_y))
+    x, y = _control_points(level)
     rim, r = math.hypot(*outline.farthest), torch.hypot(x, y)
-    there = torch.full((1,), BEYOND * rim, dtype=torch.float64)
-    rim = BEYOND * rim if bool(face.reaches(there, torch.zeros_like(there))) else rim
+    edge = torch.full((1,), FACE_REACH * rim, dtype=torch.float64)
+    rim = FACE_REACH * rim if bool(face.reaches(edge, torch.zeros_like(edge))) else rim
     inwards = (rim / r.clamp(min=rim)).clamp(max=1.0)
     sag = face.sag_and_slope(inwards * x, inwards * y)[0] - face.z
     return replace(level, heights=torch.from_numpy(interpolated(sag.numpy())))
 
 
-def _raised(face: str, field: np.ndarray, setup: Setup, by: float) -> Setup:
+def _add_form(face: str, field: np.ndarray, setup: Setup, by: float) -> Setup:
     net, _ = _net(setup.lens, face)
     own = {"clear": setup.lens.apertures} if getattr(setup.lens, face).outline is not None else {}
-    return replace(setup, lens=replace(setup.lens, **{face: _higher(net, by * field)}, **own))
+    return replace(setup, lens=replace(setup.lens, **{face: _add_heights(net, by * field)}, **own))
 
 
 def _net(lens: Lens, face: str) -> tuple[BSplineSurface, Outline]:
-    """The optical part of a face as a net, and its outline."""
+    """Return the optical part of a face as a net, and its outline."""
     surface = getattr(lens, face)
     outline = surface.outline or lens.outline
     return as_net(surface.optical, outline), outline
 
 
-def _higher(net: BSplineSurface, heights: np.ndarray) -> BSplineSurface:
+def _add_heights(net: BSplineSurface, heights: np.ndarray) -> BSplineSurface:
     return replace(net, heights=net.heights + torch.from_numpy(heights).to(net.heights))
 
 
-def _points(net: BSplineSurface) -> tuple[torch.Tensor, torch.Tensor]:
-    """(m, n) x and y of the control points (mm)."""
+def _control_points(net: BSplineSurface) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return x and y (m, n) of the control points (mm)."""
     ends = zip((net.x, net.y), net.shape, strict=True)
     x, y = (torch.linspace(*side, m, dtype=torch.float64) for side, m in ends)
     return torch.meshgrid(x, y, indexing="ij")
 
 
-def _resolved(surface: BSplineSurface, length: float, words: str) -> None:
-    least = SMOOTH * max(surface.pitch)
+def _require_resolution(surface: BSplineSurface, length: float, words: str) -> None:
+    least = MIN_CELLS * max(surface.pitch)
     if length < least:
         raise ValueError(
-            f"{words} of {length:g} mm is too fine for {in_words(surface.shape)} control points, which carry "
-            f"{least:.3g} mm and more; give a longer one, or a lens of more control points"
+            f"{words} of {length:g} mm is too fine for {in_words(surface.shape)} control points, which can represent "
+            f"{least:.3g} mm or more; give a longer one, or a lens with more control points"
         )
 
 
-def _of_rms_one(field: np.ndarray, where: np.ndarray) -> np.ndarray:
+def _normalise(field: np.ndarray, where: np.ndarray) -> np.ndarray:
     field = field - field[where].mean()
     return field / np.sqrt(np.mean(field[where] ** 2))

@@ -23,7 +23,7 @@ from bstcad.optics.outlines import Circle
 from bstcad.optics.point import Point
 from bstcad.optics.rays import Rays
 from bstcad.optics.tubes import collect
-from bstcad.tolerance.perturbations import THERMAL, Setup, kinds
+from bstcad.tolerance.perturbations import THERMAL_COEFFICIENTS, Setup, kinds
 
 TUBES, WEIGHTS = 257, 8
 MATERIAL = "PMMA"
@@ -136,7 +136,7 @@ def made(setup: Setup, amounts: dict[str, torch.Tensor]) -> Lens:
     lens, (channel,) = setup.lens, setup.channels
     (_, _, middle), line = setup.pivot("lens"), channel.source.wavelength
     dispersion = (refractive_index(MATERIAL, line + 1) - refractive_index(MATERIAL, line - 1)) / 2
-    expansion, of_index = THERMAL[MATERIAL]
+    expansion, of_index = THERMAL_COEFFICIENTS[MATERIAL]
     index = channel.index + amounts["lens.index"] + dispersion * amounts["wavelength"]
     index = index + of_index * amounts["temperature"]
     factor = 1 + amounts["lens.scale"] + expansion * amounts["temperature"]

@@ -13,7 +13,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import Name, Tolerance
 from bstcad.scene.scene import load
 from bstcad.tolerance import tolerancing
-from bstcad.tolerance.grades import MODES, perturbations, start_of, whole_table
+from bstcad.tolerance.grades import FORM_MODES, base_grade, graded_table, perturbations
 from bstcad.tolerance.perturbations import as_net, form_error, kinds
 
 SAID = (
@@ -26,7 +26,7 @@ SAID = (
 
 
 def by_name(setup, table, grade=None):
-    return {p.kind.name: p for p in perturbations(setup, whole_table(table, grade), "PMMA")}
+    return {p.kind.name: p for p in perturbations(setup, graded_table(table, grade), "PMMA")}
 
 
 def test_a_table_changes_what_it_says_and_nothing_else(setup):
@@ -35,14 +35,14 @@ def test_a_table_changes_what_it_says_and_nothing_else(setup):
     assert (tilted.limit, tilted.distribution, tilted.cost) == (0.01, "uniform", 3.0)
     assert (found["lens.tilt_y"].limit, found["lens.tilt_y"].cost) == (0.1, 3.0)  # the later goes before, of the width
     assert plain.keys() - found.keys() == {"screen.tilt_x", "screen.tilt_y"}
-    assert found.keys() - plain.keys() == {f"front.form_{k}" for k in range(MODES)}
-    assert found["front.form_0"].limit == pytest.approx(6e-5 / MODES**0.5)
+    assert found.keys() - plain.keys() == {f"front.form_{k}" for k in range(FORM_MODES)}
+    assert found["front.form_0"].limit == pytest.approx(6e-5 / FORM_MODES**0.5)
     same = plain.keys() & found.keys() - {"lens.tilt_x", "lens.tilt_y"}
     assert all(plain[name].limit == found[name].limit for name in same)
 
 
 def test_a_grade_of_the_command_line_goes_before_the_one_of_the_table(setup):
-    assert start_of(whole_table(SAID)) == "precise" and start_of(whole_table(())) == "diamond-turned"
+    assert base_grade(graded_table(SAID)) == "precise" and base_grade(graded_table(())) == "diamond-turned"
     found = by_name(setup, SAID, "moulded")
     assert found["lens.thickness"].limit == 0.05 and found["lens.tilt_x"].limit == 0.01
 
@@ -55,12 +55,12 @@ def test_only_what_is_named_can_be_off_without_a_grade(setup):
 @pytest.mark.parametrize(
     ("table", "sentence"),
     [
-        ((Tolerance(name="source.size", limit=0.1),), r"tolerance\[0\].name: 'source.size' changes nothing here"),
+        ((Tolerance(name="source.size", limit=0.1),), r"tolerance\[0\].name: 'source.size' has no effect"),
         (
             (Tolerance(name="back.ripple", period=0.1),),
             "tolerance: back.ripple: a ripple's period of 0.1 mm is too fine",
         ),
-        ((Tolerance(grade="none"),), "tolerance: nothing can be off"),
+        ((Tolerance(grade="none"),), "tolerance: all errors are zero"),
     ],
 )
 def test_what_cannot_be_is_a_sentence(setup, table, sentence):

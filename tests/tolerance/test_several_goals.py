@@ -135,5 +135,5 @@ def test_it_is_written_read_and_said(several, capsys, monkeypatch):
 @pytest.mark.parametrize("limits", [{"accept.rrmsd": 1e-4}, {"accept.rrmsd": 5.0, "accept.wavefront": 1e-3}])
 def test_a_design_that_misses_a_limit_itself_is_told(small_design, goals, tmp_path, limits):
     folder = folder_of(small_design, tmp_path / "small", goals | limits)
-    with pytest.raises(SceneError, match=f"^{list(limits)[-1]}: the design itself is at "):
+    with pytest.raises(SceneError, match=f"^{list(limits)[-1]}: the design itself has "):
         tolerancing.tolerance(folder, **FEW, wanted=0.9)

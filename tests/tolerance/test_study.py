@@ -24,9 +24,9 @@ from bstcad.report.record import of_json
 from bstcad.report.report import BEGIN, END
 from bstcad.runs.cluster import Cluster
 from bstcad.tolerance import study, tolerancing
-from bstcad.tolerance.grades import perturbations, whole_table
+from bstcad.tolerance.grades import graded_table, perturbations
 from bstcad.tolerance.perturbations import trials
-from bstcad.tolerance.study import Pictures, gram, here, main_axes, product
+from bstcad.tolerance.study import TargetPictures, gram, principal_axes, product, run_locally
 from tests.conftest import quick_effort
 
 TUBES, FULL = 257, 40
@@ -35,7 +35,7 @@ TUBES, FULL = 257, 40
 @pytest.fixture(scope="module")
 def pictures(small_design, setup):
     _, nominal = read_nominal(small_design.folder)
-    return Pictures(setup, perturbations(setup, whole_table(()), "PMMA"), nominal.goals[0].picture, TUBES)
+    return TargetPictures(setup, perturbations(setup, graded_table(()), "PMMA"), nominal.goals[0].picture, TUBES)
 
 
 @pytest.fixture(scope="module")
@@ -56,13 +56,13 @@ def test_pictures_two_at_a_time_are_those_of_one(pictures, layer, monkeypatch):
         busy.append(z)
         most.append(len(busy))
         try:
-            return pictures.of(z)
+            return pictures.vector(z)
         finally:
             busy.pop()
 
-    found = list(here(of, pictures, amounts))
+    found = list(run_locally(of, pictures, amounts))
     assert max(most) == {"omp": 2, "workqueue": 1}[layer]
-    assert all(np.array_equal(a, pictures.of(z)) for a, z in zip(found, amounts, strict=True))
+    assert all(np.array_equal(a, pictures.vector(z)) for a, z in zip(found, amounts, strict=True))
 
 
 def test_after_an_interrupt_nobody_waits_for_a_picture_under_way():
@@ -76,7 +76,7 @@ def test_after_an_interrupt_nobody_waits_for_a_picture_under_way():
             ended.append(item)
         return item
 
-    found = here(work, None, [0, 1, 2, 3, 4])
+    found = run_locally(work, None, [0, 1, 2, 3, 4])
     assert (next(found), next(found)) == (0, 1) and began.wait(10.0)
     with pytest.raises(KeyboardInterrupt):
         found.throw(KeyboardInterrupt())
@@ -104,12 +104,12 @@ def test_derivatives_are_those_of_smaller_steps(pictures, found):
     for k in np.flatnonzero(sizes > 0.1 * sizes.max()):
         step = np.zeros(len(sizes))
         step[k] = 0.1 * found.model.sigmas[k]
-        near = (pictures.of(step) - pictures.of(-step)) / 0.2
+        near = (pictures.vector(step) - pictures.vector(-step)) / 0.2
         assert np.linalg.norm(near - found.model.first[k]) < 0.01 * sizes[k] + 1e-9, pictures.perturbations[k].kind.name
 
 
 def test_tolerances_for_a_yield_keep_it(found):
-    loose, kept = study.loosest(found, 0.8)
+    loose, kept = study.loosest_limits(found, 0.8)
     low, _, high = kept
     assert low - 0.005 <= 0.8 <= high + 0.005
     assert len({round(new.limit / old.limit, 6) for new, old in zip(loose, found.perturbations, strict=True)}) > 3
@@ -117,7 +117,7 @@ def test_tolerances_for_a_yield_keep_it(found):
 
 def test_adjusting_the_screen_never_makes_it_worse(found):
     assert (found.adjusted <= found.linear[:FULL] + 1e-12).all()
-    assert found.share(found.adjusted)[1] >= found.share(found.linear[:FULL])[1]
+    assert found.fraction_within(found.adjusted)[1] >= found.fraction_within(found.linear[:FULL])[1]
 
 
 def test_the_screen_can_be_adjusted_where_it_is_no_error(pictures):
@@ -131,7 +131,7 @@ def test_the_screen_can_be_adjusted_where_it_is_no_error(pictures):
     assert (found.adjusted[raised] - nominal < 0.5 * (found.linear[:10][raised] - nominal)).all()
     assert {s.name for s in found.sensitivities} == {"lens.decentre_x", "lens.decentre_y"}
     assert sum(s.share for s in found.sensitivities) == pytest.approx(1.0)
-    loose, _ = study.loosest(found, 0.8)
+    loose, _ = study.loosest_limits(found, 0.8)
     assert len(loose) == 2
 
 
@@ -145,7 +145,7 @@ def test_products_and_main_axes_are_those_of_matrices():
     a, known = rows(), gram(rows())
     np.testing.assert_allclose(known, a @ a.T, rtol=0, atol=1e-9)
     np.testing.assert_allclose(product(a.T[:9], known), a.T[:9] @ (a @ a.T), rtol=0, atol=1e-8)
-    values, axes = main_axes(known)
+    values, axes = principal_axes(known)
     assert (np.diff(values) <= 0).all()
     np.testing.assert_allclose(axes.T @ axes, np.eye(7), rtol=0, atol=1e-14)
     np.testing.assert_allclose((axes * values) @ axes.T, known, rtol=0, atol=1e-10 * values[0])
@@ -158,7 +158,7 @@ def test_no_bit_depends_on_the_number_of_threads():
             torch.set_num_threads(count)
             with threadpool_limits(count):
                 known = gram(rows(60, 2_001))
-                values, axes = main_axes(known)
+                values, axes = principal_axes(known)
                 found.append((known, values, axes, product(rows(60, 60), axes)))
     finally:
         torch.set_num_threads(before)
@@ -241,7 +241,7 @@ def test_no_bit_depends_on_how_many_workers_trace(pictures):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["--grade", "fine"], "--grade fine: there is no such grade; give one of moulded, diamond-turned, precise"),
+        (["--grade", "fine"], "--grade fine: unknown grade; give one of moulded, diamond-turned, precise"),
         (["--yield", "120"], "--yield 120: give the percent of lenses that are to pass, such as 90"),
         (["--workers", "2", "--scheduler", "tcp://127.0.0.1:9"], "give one of the two"),
     ],

@@ -24,15 +24,15 @@ from bstcad.optics.wavefront_error import exit_pupil, moved_pupil
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import Tolerance
 from bstcad.tolerance import study
-from bstcad.tolerance.grades import perturbations, whole_table
+from bstcad.tolerance.grades import graded_table, perturbations
 from bstcad.tolerance.perturbations import (
     Perturbation,
     Setup,
     as_net,
     form_error,
-    inside,
+    inside_outline,
     kinds,
-    perturbed,
+    perturb,
     random_field,
 )
 from bstcad.tolerance.study import Wavefronts
@@ -57,7 +57,7 @@ def seen(setup, n=64):
     """The light behind the lens, in the room."""
     (channel,) = setup.channels
     pupil = exit_pupil(channel.source, channel.through(setup.lens), SEEN, n)
-    return pupil if setup.placed is None else moved_pupil(pupil, setup.placed, SEEN)
+    return pupil if setup.lens_motion is None else moved_pupil(pupil, setup.lens_motion, SEEN)
 
 
 def leans(setup):
@@ -88,7 +88,7 @@ def test_a_wedge_turns_light_by_n_less_one_times_the_wedge(axis, other, sign):
 def test_a_wedge_turns_the_back_about_its_vertex(axis):
     before = lit(Sphere(2.0, 0.02), bowl())
     after = kinds(before)[f"lens.wedge_{axis}"].apply(before, 0.1)
-    assert after.lens.front == before.lens.front and after.screen == before.screen and after.placed is None
+    assert after.lens.front == before.lens.front and after.screen == before.screen and after.lens_motion is None
     x, y = torch.meshgrid(*[torch.linspace(-11, 11, 23, dtype=torch.float64)] * 2, indexing="ij")
     points = torch.stack([x, y, before.lens.back.sag_and_slope(x, y)[0]]).reshape(3, -1).T.tolist()
     vertex = (0.0, 0.0, before.lens.back.from_vertex().z)
@@ -141,7 +141,7 @@ def test_a_lens_decentred_beyond_its_net_is_a_part(setup, tmp_path):
     assert (tmp_path / "trial.step").stat().st_size > 10_000
     form = Perturbation(form_error(setup.lens, 2.5, 0), 1e-4, "field")  # of the net that it was
     errors = (Perturbation(kinds(setup)["front.decentre_x"], 1.0), form)
-    assert perturbed(setup, errors, [0.8, 1e-4]).lens.back.shape == (35, 33)
+    assert perturb(setup, errors, [0.8, 1e-4]).lens.back.shape == (35, 33)
 
 
 # ---- form of either face, and the wavefront --------------------------------------------------------------------------
@@ -156,10 +156,10 @@ def test_form_of_either_face_shifts_the_wavefront_by_n_less_one_times_it():
     flat = net(None, 8.0, 65, 12.5)
     setup, by = lit(flat, light=Collimated(Circle(8.0), z=0.0, wavelength=LINE)), 1e-5  # mm: 1e-2 waves
     front, back = form_error(setup.lens, 6.0, 0, "front"), form_error(setup.lens, 6.0, 100, "back")  # one field
-    sooner, later = (waves(setup, kind).of([by]) for kind in (front, back))
+    sooner, later = (waves(setup, kind).vector([by]) for kind in (front, back))
     assert np.linalg.norm(sooner + later) < 2e-3 * np.linalg.norm(later)
     pupil = seen(setup)
-    field = random_field(flat, 6.0, 100, inside(setup.lens.outline, flat))
+    field = random_field(flat, 6.0, 100, inside_outline(setup.lens.outline, flat))
     bent = replace(flat, heights=torch.from_numpy(by * field))
     x, y = (p[pupil.alive] for p in (pupil.x, pupil.y))
     form = bent.relative_sag_and_slope(x, y)[0].numpy()
@@ -176,8 +176,8 @@ def test_superposed_wavefronts_stand_up_to_full_traces():
     forms = [form_error(setup.lens, 6.0, seed, face) for seed, face in ((0, "back"), (1, "back"), (0, "front"))]
     errors = (*(Perturbation(kind, 1e-4, "field") for kind in forms), Perturbation(kinds(setup)["lens.wedge_x"], 0.1))
     goal = Wavefronts(setup, errors, PlaneWave(SEEN), LINE, rays=64)
-    assert goal.designed < 1e-9
-    found = study.study(goal, 0.1, 3, goal.designed, linear=2000, full=5)
+    assert goal.design_rms < 1e-9
+    found = study.study(goal, 0.1, 3, goal.design_rms, linear=2000, full=5)
     assert found.disagreement.max() < 5e-3
     changes = {s.name: s.rrmsd_change for s in found.sensitivities}
     assert changes["lens.wedge_x"] < 1e-3 * changes["back.form_0"]  # tilts the wave, and tilt is removed
@@ -198,9 +198,11 @@ def test_the_wanted_wave_stays_in_the_room(wave):
     there = {"sphere": {"focus": (0.5, -0.1, 150.0)}, "zernike": {"centre": (0.2, -0.1)}}.get(wave.kind, {})
     kind = kinds(setup)["lens.index"]
     before, after = waves(setup, kind, wave), waves(moved, kind, replace(wave, **there))
-    assert moved.placed is not None
-    np.testing.assert_allclose(after.of([0.0]), before.of([0.0]), rtol=0, atol=1e-6 * np.linalg.norm(before.of([0.0])))
-    assert before.designed == pytest.approx(np.linalg.norm(before.of([0.0])), rel=0.02)
+    assert moved.lens_motion is not None
+    np.testing.assert_allclose(
+        after.vector([0.0]), before.vector([0.0]), rtol=0, atol=1e-6 * np.linalg.norm(before.vector([0.0]))
+    )
+    assert before.design_rms == pytest.approx(np.linalg.norm(before.vector([0.0])), rel=0.02)
 
 
 def test_motions_follow_each_other():
@@ -220,7 +222,9 @@ NAMED = (
 
 
 def test_one_face_against_the_other_is_off_only_where_a_table_names_it(setup):
-    plain, found = ({p.kind.name: p for p in perturbations(setup, whole_table(table), "PMMA")} for table in ((), NAMED))
+    plain, found = (
+        {p.kind.name: p for p in perturbations(setup, graded_table(table), "PMMA")} for table in ((), NAMED)
+    )
     assert found.keys() - plain.keys() == {
         f"{kind}_{axis}" for kind in ("lens.wedge", "front.decentre") for axis in "xy"
     }
@@ -233,11 +237,11 @@ def test_one_face_against_the_other_is_off_only_where_a_table_names_it(setup):
 @pytest.mark.parametrize("name", ["lens.wedge_x", "front.form"])
 def test_a_mirror_has_no_second_face(setup, name):
     mirror = replace(setup, lens=replace(setup.lens, reflects=True))
-    with pytest.raises(SceneError, match=rf"tolerance\[0\].name: '{name}' is of a lens that refracts at two faces"):
-        perturbations(mirror, whole_table((Tolerance(name=name, limit=1e-3),)))
-    assert perturbations(mirror, whole_table((Tolerance(name=name, grade="none"),)))
+    with pytest.raises(SceneError, match=rf"tolerance\[0\].name: '{name}' is an error of a lens with two faces"):
+        perturbations(mirror, graded_table((Tolerance(name=name, limit=1e-3),)))
+    assert perturbations(mirror, graded_table((Tolerance(name=name, grade="none"),)))
 
 
 def test_a_plane_front_is_not_decentred():
-    with pytest.raises(SceneError, match=r"tolerance\[0\].name: 'front.decentre' changes nothing here"):
-        perturbations(lit(Plane(8.0)), whole_table(NAMED[1:2]))
+    with pytest.raises(SceneError, match=r"tolerance\[0\].name: 'front.decentre' has no effect"):
+        perturbations(lit(Plane(8.0)), graded_table(NAMED[1:2]))
