@@ -32,7 +32,7 @@ from bstcad.scene.scene import Scene
 from bstcad.tailoring import slope_map, stage1, stage2, two_faces
 from bstcad.tailoring.feasibility import find_demand, is_infeasible
 from bstcad.tailoring.grazing import without_reflection
-from bstcad.tailoring.machinability import BOUNDED, held, kept, moved_clear
+from bstcad.tailoring.machinability import BOUNDS_STAGE, active_bounds, enforce_bounds, place_back
 from bstcad.tailoring.reachable import reachable
 from bstcad.tailoring.run import (
     BEST,
@@ -320,19 +320,19 @@ def _stage1(
     last = driver.run(stage(task, lens, state), task, lambda state: Saved(driver.record, state), lambda: driver.wish)
     lens = replace(last.lens, behind=lens.behind, shaped=lens.shaped).to(like.dtype, like.device)
     check_front(lens, scene)
-    bounds = held(lens, task.bounds, task.least)
+    bounds = active_bounds(lens, task.bounds, task.least)
     if bounds is None:
         check_thickness(lens, scene)
     rrmsd = reached(lens, task.rrmsd(lens) if last.judged is None else last.judged)
     driver.end(name, rrmsd)
     if bounds is not None:
-        driver.progress(BOUNDED, 0, 1, "")
+        driver.progress(BOUNDS_STAGE, 0, 1, "")
         if lens.shapes("front"):  # stage 2 takes a move into account, but makes none itself
-            lens = moved_clear(lens, lens.back.z, task.least, bounds)
-        lens = kept(lens, bounds)
+            lens = place_back(lens, lens.back.z, task.least, bounds)
+        lens = enforce_bounds(lens, bounds)
         check_thickness(lens, scene)
         rrmsd = possible(scene, task.rrmsd(lens))
-        driver.end(f"{BOUNDED}, after stage 1", rrmsd)
+        driver.end(f"{BOUNDS_STAGE}, after stage 1", rrmsd)
     precision = None
     if compare and not driver.hurry:
         precision = compare_precisions(task, lens)
@@ -380,8 +380,8 @@ def _handed_on(task: Task, driver: Driver, last: Step, before: Sequence[Judged])
     mended, value = _mended(task, lens), last.judged
     if task.hasty:
         return mended
-    if held(lens, task.bounds, task.least) is not None:
-        driver.end(BOUNDED, value := task.rrmsd(mended))
+    if active_bounds(lens, task.bounds, task.least) is not None:
+        driver.end(BOUNDS_STAGE, value := task.rrmsd(mended))
     elif value is not None and (_moved(lens, mended) or not last.whole):
         value = task.rrmsd(mended)
     if value is None or task.knobs.method == "adam":
@@ -402,10 +402,10 @@ def _mended(task: Task, lens: Lens) -> Lens:
     """The lens with no light reflected at the edge of its reach, with its faces clear of each other, within bounds."""
     if task.edge is not None:
         lens = without_reflection(lens, task.edge)
-    bounds = held(lens, task.bounds, task.least)
+    bounds = active_bounds(lens, task.bounds, task.least)
     if not lens.shapes("front"):  # where no light falls stage 2 is free to bend the back
-        lens = moved_clear(lens, lens.back.z, task.least, bounds)
-    return lens if bounds is None else kept(lens, bounds)
+        lens = place_back(lens, lens.back.z, task.least, bounds)
+    return lens if bounds is None else enforce_bounds(lens, bounds)
 
 
 def _moved(lens: Lens, other: Lens) -> bool:

@@ -36,7 +36,7 @@ from bstcad.optics.trace import clear_window, to_first_net
 from bstcad.optics.unfolding import seen_from_last_net
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring import slope_map
-from bstcad.tailoring.machinability import moved_clear
+from bstcad.tailoring.machinability import place_back
 from bstcad.tailoring.run import Step, Task
 from bstcad.tailoring.slope_fit import conjugate_gradients, monomials, wanted_slopes, with_polynomial
 from bstcad.transport.mapping import Mapping
@@ -86,7 +86,7 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
         start = exact.back.z
         points = march(coming, aim, plane, law=exact.last_freeform.law, z=start, first=first)
         back = fit_net(exact.back, points, lit_points(points, coming, exact), knobs.levels)
-        exact = moved_clear(exact.with_back(back), z, task.least)
+        exact = place_back(exact.with_back(back), z, task.least)
         if exact.back.z == start:
             break
     return lens.with_back(exact.back.with_parameters(heights=exact.back.heights.to(lens.back.heights)))

@@ -24,9 +24,9 @@ from bstcad.optics.sides import both
 from bstcad.report.record import LeftOut, Making
 from bstcad.scene.effects import Absorption, Effect, Fresnel, Ghost, losses, named, reflection_of
 from bstcad.scene.scene import Scene
-from bstcad.tailoring.machinability import moved_clear
+from bstcad.tailoring.machinability import place_back
 from bstcad.tailoring.slope_fit import Fit
-from bstcad.tailoring.slope_map import face_grid, lit_window, slope_map, sloped
+from bstcad.tailoring.slope_map import face_grid, fit_to_map, lit_window, slope_map
 from bstcad.verify.checks import AtBound
 
 # --- a coarse lens ----------------------------------------------------------------------------------------------------
@@ -59,8 +59,8 @@ def coarse_lens(scene: Scene) -> Lens:
             channel.source, lens, window, picture, screen=screen, n=CELLS, previous=wanted, iterations=STEPS
         )
         grid = face_grid(channel.source, lens, window, 2 * NET)
-        lens = sloped(lens, wanted, grid, Fit(bending=1e-2, steps=20, degree=3), unlit=0.0)
-        lens = moved_clear(lens, z, scene.lens.min_thickness)
+        lens = fit_to_map(lens, wanted, grid, Fit(bending=1e-2, steps=20, degree=3), unlit=0.0)
+        lens = place_back(lens, z, scene.lens.min_thickness)
     return lens
 
 

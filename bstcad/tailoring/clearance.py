@@ -1,13 +1,12 @@
-"""The thickness of the glass between two nets, and its excess over bounds, everywhere inside the outline.
+"""The penalty on the thickness of the glass between two freeform faces, everywhere inside the outline.
 
-Where the front is tailored, no move of the back along z makes up for a lens that is too thin: both faces make the
-picture, and the light on its way from one to the other has changed by the time it gets there.  So the faces make way
-for each other, by a penalty in the heights of both.
+If the front is tailored, a lens that is too thin cannot be corrected by a move of the back along z: both faces shape
+the light, and a move changes where the light of the front meets the back.  So the heights of both faces are penalised.
 
-In a cell of a grid no coarser than either net, each face depends on four by four control points at most and lies
-between the lowest and the highest of them.  Tiles of many cells are ruled out by these in one pass over the nets, and
-where that does not do for all, single cells; in the others the thickness is looked at by the faces themselves, at
-places a quarter of a cell apart.  (By numpy, in one thread: that is less work than to wake another.)
+In a cell of a grid no coarser than either net, each face depends on at most four by four control points, and lies
+between the lowest and the highest of them.  By this bound tiles of many cells are excluded in one pass over the nets,
+and then single cells.  In the cells left, the thickness is computed at points a quarter of a cell apart.  (Numpy, in
+one thread: the work is too small for more.)
 """
 
 from __future__ import annotations
@@ -27,35 +26,34 @@ from bstcad.optics.outlines import inside
 from bstcad.optics.sampling import rim
 from bstcad.scene.blank import Bounds
 
-MARGIN = 0.01  # of a bound, by which the penalty begins before it
-RIM = 1025  # times four: points along the rim
-WINDOW = 4  # control points along each axis that a cell may depend on: those of two spans
-TILE = 16  # cells along each axis that are looked at together
-ROUNDING = 1e-9  # of a cell: nets that are as fine as the cells shall not make them finer
+MARGIN = 0.01  # distance from a bound at which the penalty begins, relative to the bound
+RIM_POINTS = 1025  # points along a quarter of the rim
+WINDOW = 4  # control points along each axis on which a cell may depend: those of two knot spans
+TILE_CELLS = 16  # cells along each axis in a tile
+ROUNDING = 1e-9  # rounding of the number of cells, so that nets as fine as the cells do not add one
 
 
 def unit(lens: Lens, bounds: Bounds) -> float:
-    """max(thinnest, MARGIN |z_back - z_front|), the length (mm) that excess of thickness is relative to.
+    """Return max(thinnest, MARGIN |z_back - z_front|), the unit of the excess of thickness (mm).
 
-    It stays as it is while the heights of the faces change, so that the penalty has the gradient that it says.
+    It does not depend on the heights of the faces, and so has no part in the gradient.
     """
     return max(bounds.thinnest, MARGIN * abs(lens.back.z - lens.front.z)) or 1.0
 
 
 def clearance(lens: Lens, bounds: Bounds) -> tuple[float, dict[int, Tensor], float]:
-    """(mean square, gradients (1/mm), worst) of the thickness t beyond its bounds.
+    """Return (penalty, its gradients (1/mm), largest excess) of the thickness t over its bounds.
 
-    The gradients are in the heights of front and back, by the number of the face; none where no place is near.
-
-    e = max(thinnest - t, t - thickest) / unit everywhere, and e = (edge - t) / unit along the rim.  The mean is over
-    all places of the grid of max(e + MARGIN, 0)², the worst the largest e; -MARGIN if no place is nearer to a bound.
-    The lens is of two nets in one precision; sums go in fixed parts, so no bit depends on the number of threads.
+    The excess is e = max(thinnest - t, t - thickest) / unit everywhere, and e = (edge - t) / unit along the rim.  The
+    penalty is the mean of max(e + MARGIN, 0)² over all points of the grid.  The largest excess is -MARGIN if no point
+    is closer to a bound.  The gradients are in the heights of front and back, by the number of the face; {} if no point
+    is close.  Both nets have the same precision.  Sums have fixed parts: no bit depends on the number of threads.
     """
     length, square, worst = unit(lens, bounds), 0.0, -MARGIN
-    faces = {lens.number_of("front"): (lens.front, -1.0), lens.number_of("back"): (lens.back, 1.0)}  # and their ∂t / ∂z
+    faces = {lens.number_of("front"): (lens.front, -1.0), lens.number_of("back"): (lens.back, 1.0)}  # (net, ∂t / ∂z)
     gradients: dict[int, Tensor] = {}
-    for x, y, share, least in _places(lens, bounds, MARGIN * length):
-        relative, thicker = _beyond(lens, x, y, replace(bounds, thinnest=least))
+    for x, y, share, thinnest in _points_near_bounds(lens, bounds, MARGIN * length):
+        relative, thicker = _excess(lens, x, y, replace(bounds, thinnest=thinnest))
         relative, worst = relative / length, max(worst, float(relative.max()) / length)
         near = relative > -MARGIN
         if not near.any():
@@ -69,21 +67,21 @@ def clearance(lens: Lens, bounds: Bounds) -> tuple[float, dict[int, Tensor], flo
     return square, gradients, worst
 
 
-def _places(lens: Lens, bounds: Bounds, margin: float) -> Iterator[tuple[Tensor, Tensor, float, float]]:
-    """x and y (mm) of places that may come within `margin` mm of a bound, their share in the mean, the least thickness.
+def _points_near_bounds(lens: Lens, bounds: Bounds, margin: float) -> Iterator[tuple[Tensor, Tensor, float, float]]:
+    """Yield x and y (mm) of points that may be within `margin` mm of a bound, the weight of one, the minimum thickness.
 
-    The share is that of one place; those of the rim have a mean of their own.
+    Points of the rim have a mean of their own.
     """
-    grid = Cells.over(lens)
+    grid = CellGrid.over(lens)
     for x, y in grid.near(lens, bounds, margin):
-        yield x, y, 1 / grid.places, bounds.thinnest
+        yield x, y, 1 / grid.points, bounds.thinnest
     if bounds.edge is not None:
-        x, y = (p.to(lens.like) for p in rim(lens.outline, RIM))
+        x, y = (p.to(lens.like) for p in rim(lens.outline, RIM_POINTS))
         yield x, y, 1 / len(x), max(bounds.thinnest, bounds.edge)
 
 
-def _beyond(lens: Lens, x: Tensor, y: Tensor, bounds: Bounds) -> tuple[Tensor, Tensor]:
-    """How far (mm) the thickness is beyond the nearer of its bounds, and 1 where that is the greatest one, else -1."""
+def _excess(lens: Lens, x: Tensor, y: Tensor, bounds: Bounds) -> tuple[Tensor, Tensor]:
+    """Return the excess (mm) over the nearer bound of the thickness, and 1 if that is the maximum, -1 otherwise."""
     front, back = (evaluate(net.heights, *net.along_net(x, y))[0] for net in (lens.front, lens.back))
     glass = (lens.back.z - lens.front.z) + back - front
     thin = bounds.thinnest - glass
@@ -92,15 +90,15 @@ def _beyond(lens: Lens, x: Tensor, y: Tensor, bounds: Bounds) -> tuple[Tensor, T
 
 
 @dataclass(frozen=True)
-class Cells:
-    """A grid over the bounding box of an outline, whose cells are no wider than a span of either net."""
+class CellGrid:
+    """Grid over the bounding box of an outline, with cells no wider than a knot span of either net."""
 
-    count: tuple[int, int]  # along x and along y
-    half: tuple[float, float]  # of the box (mm)
+    count: tuple[int, int]  # number of cells along x and along y
+    half: tuple[float, float]  # half width and height of the box (mm)
 
     @classmethod
-    def over(cls, lens: Lens) -> Cells:
-        """For both nets of a lens."""
+    def over(cls, lens: Lens) -> CellGrid:
+        """Make the grid for both nets of a lens."""
         half, pitches = lens.outline.half_extent, zip(lens.front.pitch, lens.back.pitch, strict=True)
         pairs = zip(half, pitches, strict=True)
         x, y = (max(1, math.ceil(2 * side / min(pitch) - ROUNDING)) for side, pitch in pairs)
@@ -113,14 +111,14 @@ class Cells:
         return 2 * half_x / x, 2 * half_y / y
 
     @property
-    def places(self) -> int:
-        """Number of places at which the thickness counts, if it is near a bound there."""
+    def points(self) -> int:
+        """Number of points of the grid at which the thickness counts."""
         return math.prod(self.count) * len(QUARTERS) ** 2
 
     def near(self, lens: Lens, bounds: Bounds, margin: float) -> Iterator[tuple[Tensor, Tensor]]:
-        """x and y (mm) of the places inside the outline whose cell may come within `margin` mm of a bound, in parts.
+        """Yield x and y (mm) of the points in cells that may be within `margin` mm of a bound, inside the outline.
 
-        The rim is inside: a cell that it crosses counts as far as half a cell's diagonal beyond it.
+        Points up to half of a cell's diagonal outside count too, so that the rim is covered.
         """
         reach = math.hypot(*self.size) / 2
         for cells in torch.from_numpy(self._near(lens, bounds, margin)).split(SPANS):
@@ -128,48 +126,49 @@ class Cells:
             s = torch.tensor(QUARTERS, dtype=torch.float64)
             x, y = self._at((i + s[:, None, None], j + s[:, None]), 0.0)
             x, y = (p.reshape(-1) for p in torch.broadcast_tensors(x, y))
-            held = inside(lens.outline.limits, x, y, reach)
-            if held.any():
-                yield x[held].to(lens.like), y[held].to(lens.like)
+            within = inside(lens.outline.limits, x, y, reach)
+            if within.any():
+                yield x[within].to(lens.like), y[within].to(lens.like)
 
     def _near(self, lens: Lens, bounds: Bounds, margin: float) -> np.ndarray:
-        """(n, 2) numbers along x and along y of the cells that are near by the control points they depend on."""
-        front, back = ((net.heights.detach().cpu().numpy(), self._begins(net)) for net in (lens.front, lens.back))
-        apart = lens.back.z - lens.front.z
-        for extremes in (_of_tiles, _of_cells):
-            near = apart + extremes(*back, np.minimum) - extremes(*front, np.maximum) < bounds.thinnest + margin
+        """Return indices (n, 2) of the cells that may be within `margin` of a bound, by their control points."""
+        front, back = ((net.heights.detach().cpu().numpy(), self._first_points(net)) for net in (lens.front, lens.back))
+        distance = lens.back.z - lens.front.z
+        for extremes in (_tile_extremes, _cell_extremes):
+            near = distance + extremes(*back, np.minimum) - extremes(*front, np.maximum) < bounds.thinnest + margin
             if bounds.thickest is not None:
-                near |= apart + extremes(*back, np.maximum) - extremes(*front, np.minimum) > bounds.thickest - margin
+                near |= distance + extremes(*back, np.maximum) - extremes(*front, np.minimum) > bounds.thickest - margin
             if not near.any():
                 break
         return np.argwhere(near)
 
     def _at(self, cells: Sequence[Tensor], s: float) -> tuple[Tensor, Tensor]:
-        """x and y (mm) of the same place in some cells."""
+        """Return x and y (mm) of the points at the fraction s of each of some cells."""
         x, y = ((k + s) * size - half for k, size, half in zip(cells, self.size, self.half, strict=True))
         return x, y
 
-    def _begins(self, net: BSplineSurface) -> list[np.ndarray]:
-        """The first of the WINDOW control points that each cell depends on, along x and along y."""
+    def _first_points(self, net: BSplineSurface) -> list[np.ndarray]:
+        """Return the index of the first of the WINDOW control points of each cell, along x and along y."""
         left = [torch.arange(k, dtype=torch.float64) for k in self.count]
         along = zip(net.along_net(*self._at(left, 0.0)), net.shape, strict=True)
         return [span(u, m)[0].long().clamp(max=m - WINDOW).numpy() for u, m in along]
 
 
-def _of_tiles(heights: np.ndarray, begins: Sequence[np.ndarray], extreme: np.ufunc) -> np.ndarray:
-    """The lowest (np.minimum) or highest (np.maximum) of the heights that each tile of cells depends on (mm)."""
+def _tile_extremes(heights: np.ndarray, begins: Sequence[np.ndarray], extreme: np.ufunc) -> np.ndarray:
+    """Return the lowest (np.minimum) or highest (np.maximum) control point of each tile of cells (mm)."""
     for axis, begin in enumerate(begins):
-        windows = [slice(part[0], part[-1] + WINDOW) for part in np.split(begin, range(TILE, len(begin), TILE))]
+        tiles = np.split(begin, range(TILE_CELLS, len(begin), TILE_CELLS))
+        windows = [slice(tile[0], tile[-1] + WINDOW) for tile in tiles]
         parts = (heights[window] if axis == 0 else heights[:, window] for window in windows)
         heights = np.stack([extreme.reduce(part, axis) for part in parts], axis)
     return heights
 
 
-def _of_cells(heights: np.ndarray, begins: Sequence[np.ndarray], extreme: np.ufunc) -> np.ndarray:
-    """The same of each cell."""
+def _cell_extremes(heights: np.ndarray, begins: Sequence[np.ndarray], extreme: np.ufunc) -> np.ndarray:
+    """Return the lowest (np.minimum) or highest (np.maximum) control point of each cell (mm)."""
     for axis, begin in enumerate(begins):
         heights = np.moveaxis(heights, axis, 0)
-        for step in (1, 2):  # of two neighbours, then of four
+        for step in (1, 2):  # extremes of two neighbours, then of four
             heights = extreme(heights[:-step], heights[step:])
         heights = np.moveaxis(heights[begin], 0, axis)
     return heights

@@ -28,7 +28,7 @@ from bstcad.optics.rays import Rays
 from bstcad.tailoring.merit import SobolevVariable
 from bstcad.tailoring.minimise import lbfgs, minimise
 from bstcad.tailoring.run import Edge
-from bstcad.tailoring.slope_map import between, face_grid, lit_window, rays_at
+from bstcad.tailoring.slope_map import face_grid, interpolate, lit_window, rays_at
 
 PENALTY_WEIGHT = 100.0  # weight of the penalty relative to RRMSD²
 MAX_CELLS = 257  # largest number of cells a side of the grid from which the light is interpolated
@@ -57,7 +57,7 @@ class Grazing:
         axes = zip((net.x, net.y), net.pitch, net.shape, strict=True)
         x, y = np.meshgrid(*(low + pitch * _span_points(m) for (low, _), pitch, m in axes), indexing="ij")
         inside = (np.abs(x) <= window.width / 2) & (np.abs(y) <= window.height / 2)
-        light = np.where(inside, between(grid, grid.density[None], (x, y))[0].numpy(), 0.0)
+        light = np.where(inside, interpolate(grid, grid.density[None], (x, y))[0].numpy(), 0.0)
         share = torch.from_numpy(maximum_filter(light, 5))  # spans that are lit in part count whole
         rays, eta = rays_at(grid, (x, y)), seen.last_freeform.law.eta
         return cls(net, rays, share / total(share), eta=eta, angle=edge.angle)

@@ -1,13 +1,13 @@
-"""Bounds (scene/blank.py) that the tailored faces keep to, and the room that they leave to each other.
+"""Bounds on the tailored faces (scene/blank.py): curvature, slope and thickness, in stage 1, in stage 2 and at the end.
 
-A back that would come too near to the front, or cross it, is moved along +z as a whole: the slopes of a face make the
-picture, its height hardly does, and the rounds of stage 1 take the change into account.  A front that is tailored makes
-the picture together with the glass behind it: there the least thickness is a bound of the faces like the others
-(clearance.py), even where the scene has none, and the back is moved only where bending both faces does not do.
+A back that would come too near to the front, or cross it, is moved along +z as a whole: its slopes shape the light, its
+height hardly does, and the next rounds of stage 1 take the move into account.  If the front is tailored, a move changes
+the picture.  Then the minimum thickness is a bound like the others (clearance.py), even if the scene has none, and the
+back is moved only if a change of both faces does not suffice.
 
-Stage 2 adds to its merit the mean of the squared excess over the bounds, on a grid of knot spans four times finer than
-the net.  Few spans reach a bound, and a difference of control points tells which; the others cost nothing.  The excess
-that is left then is taken away by the same penalty alone, which hardly changes the picture (`kept`).
+Stage 2 adds to its merit the mean squared excess over the bounds, on a grid four times finer than the knot spans.  Few
+spans are near a bound; differences of control points show which, and the others cost nothing.  The remaining excess is
+removed by minimising this penalty alone, which hardly changes the picture (`enforce_bounds`).
 """
 
 from __future__ import annotations
@@ -36,99 +36,97 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.sampling import rim
 from bstcad.scene.blank import Bounds
 from bstcad.scene.errors import SceneError
-from bstcad.tailoring.clearance import MARGIN, RIM, clearance
+from bstcad.tailoring.clearance import MARGIN, RIM_POINTS, clearance
 from bstcad.tailoring.merit import SobolevVariable
 from bstcad.tailoring.minimise import lbfgs, minimise
 
-PLACES = 513  # points each way at which the thickness is looked at
-RELIEF_SPARE = 0.02  # of the relief of the back, which stage 2 may still take
-BOUNDED = "bounds on the back"  # name of a part of a design
-SPARE = 1e-3  # of a bound, kept for the digits of a file and for places in between
-# Of the mean squared excess, relative to the bound, beside RRMSD²: in a stage's last round, the one before and so on,
-# and in its only one.  (A heavy one from the start holds the search to where it began: the small lens of the tests,
-# bound to 50 mm where it would take 20, ends at 0.015 by 1000 throughout, and at 0.0033 by 10.)
-WEIGHTS, ALONE = (1000.0, 100.0, 10.0), 100.0
-REPAIR = 100  # evaluations of the penalty alone, at most
-HALVINGS = 10  # of the way from a lens that exceeds the bounds to a lens that keeps to them
+THICKNESS_POINTS = 513  # points a side at which the thickness is computed
+RELIEF_RESERVE = 0.02  # additional thickness for the changes of stage 2, relative to the sag range (PV) of the back
+BOUNDS_STAGE = "bounds on the back"  # name of a stage in the record
+BOUND_RESERVE = 1e-3  # distance to a bound, relative to it, for the rounding of files and points between the grid's
+# Weights of the mean squared relative excess, relative to RRMSD²: in the last round of a stage, the one before and so
+# on, and in an only round.  (A large weight from the start keeps the search near its start: the small lens of the
+# tests, with a minimum radius of 50 mm where it would take 20, ends at 0.015 with 1000 throughout, at 0.0033 with 10.)
+ROUND_WEIGHTS, ONLY_WEIGHT = (1000.0, 100.0, 10.0), 100.0
+REPAIR_EVALUATIONS = 100  # largest number of evaluations of the penalty alone
+BISECTIONS = 10  # bisection steps between a lens that exceeds the bounds and one that does not
 
 
 @torch.no_grad()
-def moved_clear(lens: Lens, z: float, least: float, bounds: Bounds | None = None) -> Lens:
-    """The lens with its back's plane at `z` (mm), or as little behind it as leaves `least` mm of glass everywhere.
+def place_back(lens: Lens, z: float, least: float, bounds: Bounds | None = None) -> Lens:
+    """Return the lens with the plane of its back at `z` (mm), or just so far behind that the glass is `least` mm thick.
 
-    With bounds, the rim's least thickness and the greatest thickness anywhere hold, too; where they exclude each other
-    the back exceeds both by the same length.
+    With bounds, the minimum thickness at the rim and the maximum thickness are met too.  If they exclude each other,
+    the back violates both by the same length.
     """
-    x, y = thickness_places(lens)
+    x, y = thickness_points(lens)
     relative = lens.back.relative_sag_and_slope(x, y)[0]
     glass = z - lens.front.z + relative - lens.front.relative_sag_and_slope(x, y)[0]
     relief = float(relative.max() - relative.min())
     if bounds is None:
         thinnest = float(glass.min())
         if thinnest < least:
-            z += least - thinnest + RELIEF_SPARE * relief
+            z += least - thinnest + RELIEF_RESERVE * relief
         return lens.with_back(lens.back.moved(z))
-    x, y = on_rim(lens)
+    x, y = rim_points(lens)
     edge = z + lens.back.relative_sag_and_slope(x, y)[0] - lens.front.sag_and_slope(x, y)[0]
     short = max(least, bounds.thinnest or least) - float(torch.minimum(glass.min(), edge.min()))
     if bounds.edge is not None:
         short = max(short, bounds.edge - float(edge.min()))
     room = math.inf if bounds.thickest is None else bounds.thickest - float(torch.maximum(glass.max(), edge.max()))
-    spare = min(RELIEF_SPARE * relief, max(room - short, 0.0) / 2)
+    spare = min(RELIEF_RESERVE * relief, max(room - short, 0.0) / 2)
     shift = max(short + spare, 0.0) + min(room - spare, 0.0) if short <= room else (short + room) / 2
     return lens.with_back(lens.back.moved(z + shift))
 
 
-def thickness_places(lens: Lens) -> tuple[Tensor, Tensor]:
-    """Points inside the outline (mm) at which the thickness is looked at."""
-    x, y = torch.meshgrid(
-        *(torch.linspace(-half, half, PLACES, dtype=torch.float64) for half in lens.outline.half_extent), indexing="ij"
-    )
+def thickness_points(lens: Lens) -> tuple[Tensor, Tensor]:
+    """Return x and y (mm) of the points inside the outline at which the thickness is computed."""
+    axes = (torch.linspace(-half, half, THICKNESS_POINTS, dtype=torch.float64) for half in lens.outline.half_extent)
+    x, y = torch.meshgrid(*axes, indexing="ij")
     inside = lens.outline.contains(x, y)
     return tuple(p[inside].to(lens.like) for p in (x, y))
 
 
-def on_rim(lens: Lens) -> tuple[Tensor, Tensor]:
-    """Points along the rim (mm) at which the thickness is looked at."""
-    return tuple(p.to(lens.like) for p in rim(lens.outline, RIM))
+def rim_points(lens: Lens) -> tuple[Tensor, Tensor]:
+    """Return x and y (mm) of the points along the rim at which the thickness is computed."""
+    return tuple(p.to(lens.like) for p in rim(lens.outline, RIM_POINTS))
 
 
-def weight(number: int, rounds: int) -> float:
-    """Weight of the excess in one of the rounds."""
-    return ALONE if rounds == 1 else WEIGHTS[min(rounds - 1 - number, len(WEIGHTS) - 1)]
+def round_weight(number: int, rounds: int) -> float:
+    """Return the weight of the excess in a round of a stage."""
+    return ONLY_WEIGHT if rounds == 1 else ROUND_WEIGHTS[min(rounds - 1 - number, len(ROUND_WEIGHTS) - 1)]
 
 
-def held(lens: Lens, asked: Bounds | None, least: float) -> Bounds | None:
-    """The bounds that the tailored faces of a lens keep to: those asked for; None: there are none.
+def active_bounds(lens: Lens, bounds: Bounds | None, least: float) -> Bounds | None:
+    """Return the bounds on the tailored faces: those of the scene; None: there are none.
 
-    Where the front is tailored, `least` mm of glass is a bound even if none is asked for.
+    If the front is tailored, a thickness of at least `least` mm is a bound even if the scene has none.
     """
-    return Bounds(thinnest=least) if asked is None and lens.shapes("front") else asked
+    return Bounds(thinnest=least) if bounds is None and lens.shapes("front") else bounds
 
 
 @dataclass(frozen=True)
 class Excess:
-    """The excess of the tailored faces of a lens over bounds."""
+    """Excess of the tailored faces of a lens over their bounds."""
 
-    mean_square: float  # over the places of each face, relative to the bounds and from MARGIN before them on
-    gradients: tuple[Tensor, ...]  # of that in the heights (1/mm), (m, n) of each of Lens.nets
+    mean_square: float  # penalty: mean square over each face, relative to the bounds, from MARGIN before them on
+    gradients: tuple[Tensor, ...]  # gradients of the penalty in the heights (1/mm), (m, n) for each of Lens.nets
     worst: float  # largest excess, relative to its bound; negative: there is none
 
 
 def excess(lens: Lens, bounds: Bounds) -> Excess:
-    """The excess of curvature, slope and thickness everywhere inside the outline; other faces stay as they are.
+    """Return the excess of curvature, slope and thickness everywhere inside the outline.
 
     E = Σ_f mean max(q_f / b_f - 1 + MARGIN, 0)² over the tailored faces f and the bounds b_f > 0 on their quantities
-    q_f, plus that of the thickness.  A tool comes to the back from +z, where a valley of radius R is a curvature
-    κ = 1 / R of z.  It comes to the front from -z and sees the heights -z, whose curvatures are those of z with the
-    other sign: there a valley, which bulges into the glass, is a ridge of z, κ = -1 / R.  A slope |∇z| is the same
-    from both sides.
+    q_f, plus the penalty on the thickness.  A tool reaches the back from +z, where a valley of radius R has the
+    curvature κ = 1 / R of z.  It reaches the front from -z, where the heights are -z and curvatures change their sign:
+    a valley of the front, which bulges into the glass, is a ridge of z, κ = -1 / R.  |∇z| is the same from both sides.
 
-    The sums go in fixed parts: no bit depends on the number of threads.
+    Sums have fixed parts: no bit depends on the number of threads.
     """
     nets = {k: net.to(torch.float64) for k, net in zip(lens.freeform, lens.nets, strict=True)}
     square, worst = 0.0, -MARGIN
-    gradients = {k: net.heights.new_zeros(()).expand_as(net.heights) for k, net in nets.items()}  # of no memory
+    gradients = {k: net.heights.new_zeros(()).expand_as(net.heights) for k, net in nets.items()}
     for squared, own, far in _parts(lens, nets, bounds):
         square, worst = square + squared, max(worst, far)
         gradients |= {k: gradients[k] + own[k] for k in own.keys() & nets.keys()}
@@ -141,29 +139,29 @@ Part = tuple[float, dict[int, Tensor], float]  # mean square, gradients by the n
 
 
 def _parts(lens: Lens, nets: dict[int, BSplineSurface], bounds: Bounds) -> Iterator[Part]:
-    """The excess of the shape of each tailored face, then that of the thickness; nets: in float64, by their numbers."""
+    """Yield the excess of each tailored face, then that of the thickness; nets: in float64, by face number."""
     if (bounds.concave, bounds.convex, bounds.slope) != (None, None, None):
-        for k, from_above in _from_above(lens, bounds).items():
-            squared, gradient, worst = _of_shape(nets[k], lens.outline, from_above)
+        for k, from_above in _bounds_from_above(lens, bounds).items():
+            squared, gradient, worst = _shape_excess(nets[k], lens.outline, from_above)
             yield squared, {k: gradient}, worst
     if lens.shapes("front"):
         yield clearance(lens.to(torch.float64), bounds)
     elif bounds.thickest is not None and (back := lens.number_of("back")) in nets:
-        squared, gradient, worst = _of_thickness(lens.with_back(nets[back]), bounds)
+        squared, gradient, worst = _thickness_excess(lens.with_back(nets[back]), bounds)
         yield squared, {back: gradient}, worst
 
 
-def _from_above(lens: Lens, bounds: Bounds) -> dict[int, Bounds]:
-    """The bounds on z(x, y) as seen from +z of each tailored face of the solid, by its number."""
+def _bounds_from_above(lens: Lens, bounds: Bounds) -> dict[int, Bounds]:
+    """Return the bounds on z(x, y), seen from +z, for each tailored face, by its number."""
     front = replace(bounds, concave=bounds.convex, convex=bounds.concave)
     faces: dict[Face, Bounds] = {"back": bounds, "front": front}
     return {lens.number_of(face): own for face, own in faces.items() if lens.shapes(face)}
 
 
-def _of_shape(net: BSplineSurface, outline: Outline, bounds: Bounds) -> tuple[float, Tensor, float]:
-    """(mean square, gradient, worst) of curvature and slope of a face beyond its bounds."""
+def _shape_excess(net: BSplineSurface, outline: Outline, bounds: Bounds) -> tuple[float, Tensor, float]:
+    """Return (penalty, its gradient, largest excess) of curvature and slope of a face over its bounds."""
     square, worst, gradient = 0.0, -MARGIN, torch.zeros_like(net.heights)
-    for spans, reached, bound, quantity in _near(net, outline, bounds):
+    for spans, reached, bound, quantity in _spans_near_bounds(net, outline, bounds):
         leaf = spans.heights.detach().requires_grad_()
         relative = torch.where(reached, quantity(replace(spans, heights=leaf).jet(QUARTERS)) / bound - 1, -MARGIN)
         squared = total(torch.relu(relative + MARGIN) ** 2)
@@ -173,35 +171,35 @@ def _of_shape(net: BSplineSurface, outline: Outline, bounds: Bounds) -> tuple[fl
     return square / count, gradient / count, worst
 
 
-def _near(
+def _spans_near_bounds(
     net: BSplineSurface, outline: Outline, bounds: Bounds
 ) -> Iterator[tuple[Spans, Tensor, float, Callable[[Jet], Tensor]]]:
-    """Spans that may come near a bound, some at a time: which places the outline holds, the bound, its quantity."""
-    for bound, most, quantity in (
+    """Yield spans that may be near a bound, in blocks: spans, points inside the outline, bound, quantity."""
+    for bound, upper_limit, quantity in (
         (bounds.concave, partial(curvature_bounds, net, 1.0), lambda jet: jet.curvatures[0]),
         (bounds.convex, partial(curvature_bounds, net, -1.0), lambda jet: -jet.curvatures[1]),
         (bounds.slope, partial(slope_bounds, net), lambda jet: jet.slope),
     ):
         if bound is None:
             continue
-        near = torch.nonzero(most() > (1 - MARGIN) * bound)
+        near = torch.nonzero(upper_limit() > (1 - MARGIN) * bound)
         for i, j in (part.T for part in near.split(SPANS) if len(part)):
             yield Spans.of(net, i, j), reached_by(net, outline, i=i, j=j, s=QUARTERS), bound, quantity
 
 
-def _of_thickness(lens: Lens, bounds: Bounds) -> tuple[float, Tensor, float]:
-    """(mean square, gradient, worst) of the thickness beyond its bounds.
+def _thickness_excess(lens: Lens, bounds: Bounds) -> tuple[float, Tensor, float]:
+    """Return (penalty, its gradient, largest excess) of the thickness over its bounds, for a lens with one net.
 
-    As parts of the room between them, or of the back's relief where that is less: a shift along z then keeps to both.
+    The unit is the difference of the bounds, or the sag range of the back if less, so that a shift along z meets both.
     """
-    x, y = thickness_places(lens)
+    x, y = thickness_points(lens)
     heights = lens.back.relative_sag_and_slope(x, y)[0]
     room = min(bounds.thickest - bounds.thinnest, float(heights.max() - heights.min())) or 1.0
     leaf = lens.back.heights.detach().requires_grad_()
     back, square, worst = replace(lens.back, heights=leaf), 0.0, -MARGIN
     for x, y, least in (
-        (*thickness_places(lens), bounds.thinnest),
-        (*on_rim(lens), max(bounds.thinnest, bounds.edge or 0.0)),
+        (*thickness_points(lens), bounds.thinnest),
+        (*rim_points(lens), max(bounds.thinnest, bounds.edge or 0.0)),
     ):
         glass = back.sag_and_slope(x, y)[0] - lens.front.sag_and_slope(x, y)[0]
         relative = torch.maximum(glass - bounds.thickest, least - glass) / room
@@ -210,42 +208,42 @@ def _of_thickness(lens: Lens, bounds: Bounds) -> tuple[float, Tensor, float]:
     return float(square.detach()), *torch.autograd.grad(square, leaf), worst
 
 
-def kept(lens: Lens, bounds: Bounds) -> Lens:
-    """The lens with its tailored faces bent and its back moved as little as it takes to keep to the bounds everywhere.
+def enforce_bounds(lens: Lens, bounds: Bounds) -> Lens:
+    """Return the lens with its tailored faces and the position of its back changed as little as the bounds require.
 
-    By the penalty alone, in the variables of stage 2; if REPAIR evaluations do not suffice, by faces with less relief.
-    Where the front is tailored, the back is moved only if bending both faces does not do: that changes the picture.
-    SceneError if even a flat back exceeds a bound.
+    The penalty alone is minimised, in the variables of stage 2.  If REPAIR_EVALUATIONS do not suffice, the faces get
+    flatter.  If the front is tailored, the back is moved only where changes of the faces do not suffice, since a move
+    changes the picture.  SceneError if even a flat back exceeds a bound.
     """
-    for place in (_as_it_is, _placed) if lens.shapes("front") else (_placed,):
+    for place in (_unmoved, _with_back_moved) if lens.shapes("front") else (_with_back_moved,):
         lens = place(lens, bounds)
         if not _exceeds(lens, bounds):
             return lens
-        bent = place(_bent(lens, bounds), bounds)
+        bent = place(_reduce_excess(lens, bounds), bounds)
         if not _exceeds(bent, bounds):
             return _nearest(lens, bent, bounds, place)
         lens = bent
-    flat = _placed(_flat(lens, bounds), bounds)
+    flat = _with_back_moved(_flat(lens, bounds), bounds)
     if _exceeds(flat, bounds):
         raise SceneError(
-            "lens.max_thickness: with this front not even a flat back keeps to it and to lens.edge_thickness; "
-            "allow more, or ask for less at the edge"
+            "lens.max_thickness: with this front, not even a flat back meets lens.max_thickness and "
+            "lens.edge_thickness; raise the first or lower the second"
         )
-    return _nearest(lens, flat, bounds, _placed)
+    return _nearest(lens, flat, bounds, _with_back_moved)
 
 
 def _nearest(wanted: Lens, known: Lens, bounds: Bounds, place: Callable[[Lens, Bounds], Lens]) -> Lens:
-    """The lens nearest to `wanted`, which exceeds the bounds, on the way to `known`, which keeps to them."""
+    """Return the lens nearest to `wanted`, which exceeds the bounds, on the line to `known`, which meets them."""
     start = _heights(wanted)
-    ways = [there - here for there, here in zip(_heights(known), start, strict=True)]
+    changes = [end - begin for end, begin in zip(_heights(known), start, strict=True)]
     low, high = 0.0, 1.0
-    for _ in range(HALVINGS):
-        share = (low + high) / 2
-        tried = place(wanted.with_heights(h + share * way for h, way in zip(start, ways, strict=True)), bounds)
-        if _exceeds(tried, bounds):
-            low = share
+    for _ in range(BISECTIONS):
+        fraction = (low + high) / 2
+        trial = place(wanted.with_heights(h + fraction * d for h, d in zip(start, changes, strict=True)), bounds)
+        if _exceeds(trial, bounds):
+            low = fraction
         else:
-            high, known = share, tried
+            high, known = fraction, trial
     return known
 
 
@@ -254,25 +252,25 @@ def _heights(lens: Lens) -> list[Tensor]:
 
 
 def _flat(lens: Lens, bounds: Bounds) -> Lens:
-    """The lens with its tailored faces flat."""
-    faces, nets = _from_above(lens, bounds), zip(lens.freeform, _heights(lens), strict=True)
+    """Return the lens with its tailored faces flat."""
+    faces, nets = _bounds_from_above(lens, bounds), zip(lens.freeform, _heights(lens), strict=True)
     return lens.with_heights(torch.zeros_like(h) if k in faces else h for k, h in nets)
 
 
-def _as_it_is(lens: Lens, bounds: Bounds) -> Lens:
+def _unmoved(lens: Lens, bounds: Bounds) -> Lens:
     return lens
 
 
-def _placed(lens: Lens, bounds: Bounds) -> Lens:
-    return moved_clear(lens, lens.back.z, bounds.thinnest, bounds)
+def _with_back_moved(lens: Lens, bounds: Bounds) -> Lens:
+    return place_back(lens, lens.back.z, bounds.thinnest, bounds)
 
 
 def _exceeds(lens: Lens, bounds: Bounds) -> bool:
-    return excess(lens, bounds).worst > -SPARE
+    return excess(lens, bounds).worst > -BOUND_RESERVE
 
 
-def _bent(lens: Lens, bounds: Bounds) -> Lens:
-    """The first lens of the penalty's search that exceeds no bound, or else the one that exceeds them least."""
+def _reduce_excess(lens: Lens, bounds: Bounds) -> Lens:
+    """Minimise the penalty; return the first lens that exceeds no bound, or else the one with the smallest penalty."""
     start = _heights(lens)
     variables = [SobolevVariable.of(net, torch.ones_like(net.heights)) for net in lens.nets]
 
@@ -284,7 +282,7 @@ def _bent(lens: Lens, bounds: Bounds) -> Lens:
         gradients = [v.adjoint(g) for v, g in zip(variables, over.gradients, strict=True)]
         return over.mean_square, gradients, over.worst
 
-    for reached in minimise(in_c, lbfgs([v.zero() for v in variables], REPAIR), REPAIR):
-        if reached.best.figure <= -SPARE:
+    for reached in minimise(in_c, lbfgs([v.zero() for v in variables], REPAIR_EVALUATIONS), REPAIR_EVALUATIONS):
+        if reached.best.figure <= -BOUND_RESERVE:
             break
     return at(reached.best.parameters)

@@ -1,28 +1,28 @@
-"""The merit that stages 2 and 3 make least, and their variable, in which it is nearly round.
+"""The merit function of stages 2 and 3, and the Sobolev variable, in which its Hessian is close to the identity.
 
-The merit is the mean over the goals, by their weights w, of RRMSD² of a picture and of the square of the RMS wavefront
-error in waves:
+The merit is the weighted mean over the goals, of RRMSD² for a picture and of the squared RMS wavefront error in waves:
 
-    M = (Σ_k w_k RRMSD_k² + w (RMS / λ)²) / (Σ_k w_k + w),
+    M = (Σ_k w_k RRMSD_k² + w (RMS / λ)²) / (Σ_k w_k + w).
 
-and beside it the mean over the pictures of a pull on light outside of a target and of the light that is lost.  Pixels
-give no gradient to light that has left the target; the pull is `overshoot` (1 / pixel²) times the mean square of its
-distance from the border in pixels.  Pictures, pulls and losses are sums over the channels of the light; of a source of
-some size the light of its middle, blurred (source_image.py).  The RMS is that of the optical path S of each ray to the
-wave's plane less the wave's own W there (wavefront_error.py), without piston.
+Two terms are added, averaged over the pictures: a penalty on light outside the target, and the fraction of the light
+that is lost.  Light outside the target changes no pixel and so has no gradient; the penalty is `overshoot` (1 / pixel²)
+times the mean square of its distance from the border in pixels.  Pictures and both terms are sums over the channels of
+the light.  For a source of finite size they are those of its centre, blurred (source_image.py).  The wavefront error
+of a ray is its optical path S to the plane of the wave less the phase W of the wave there (wavefront_error.py),
+without piston.
 
-A change δz of the last face moves the light by the throw L times its slope and so changes the irradiance by about
-E L Δδz; with dA_t = (e / E) dA_b, e the flux density on the back face, the squared error is
+A change δz of the last face moves the light by the throw L times its slope, and so changes the irradiance by about
+E L Δδz.  With dA_t = (e / E) dA_b, e the flux density on the back face, the squared error is
 
     ∫ δE² dA_t  =  L² ∫ e E (Δδz)² dA_b.
 
-Its Hessian is Δ e E Δ, so in c with δz = Δ^-1 E^-1/2 c it would be the unit matrix for a beam of even e.  The pixels
-average out detail finer than they are, which makes a weaker power of Δ better: 0.5 by measurement, since letters gain
-by a still weaker one and portraits by a stronger one.  The weight E^-1/2 halves the evaluations that a picture with
-dark parts takes.  Δ is diagonal in the cosine transform of the net.
+The Hessian is Δ e E Δ.  In the variable c with δz = Δ^-1 E^-1/2 c it is the identity for a beam of uniform e.  Pixels
+average over finer detail, which makes a weaker power of Δ better: 0.5 by measurement (letters are best with a still
+weaker power, portraits with a stronger one).  The weight E^-1/2 halves the evaluations for pictures with dark parts.
+Δ is diagonal in the cosine transform of the net.
 
-L is no constant near the critical angle: there dθ' = η cos θ / cos θ' dθ grows without bound, and a place of the face
-moves its light many times further than most places do.  The weight falls by as much there, and is left alone elsewhere.
+Near the critical angle L is not constant: dθ' = η cos θ / cos θ' dθ grows without bound, and some points of the face
+move their light many times further than most.  There the weight is divided by the excess of L.
 """
 
 from __future__ import annotations
@@ -57,43 +57,43 @@ from bstcad.optics.tubes import Tubes, arriving, rays_to
 from bstcad.optics.unfolding import seen_from_last_net
 from bstcad.optics.wavefront import NM, Wave
 from bstcad.optics.wavefront_error import from_reference
-from bstcad.tailoring.source_image import Blur, Spread, blurred, blurs, bordered, unseen
+from bstcad.tailoring.source_image import BlurOperator, Spread, blur_error, blurred, blurs, with_border
 
-EXPONENT = 0.5  # of the Laplacian
-OF_COARSE = 0.75  # the same for coarse cells, which are wider than a pixel
-BLUR = 1.0  # pixels; irradiance for the weight
-SMOOTH = 1.5  # control points; of the weight's logarithm
-MOST = 4.0  # weights are clamped to [1 / MOST, MOST]
-FAR, FARTHEST = 3.0, 96.0  # times the median throw: from there on the weight falls with the throw, and no further
-STEP = 1e-6  # of the distance to the target: step of the difference quotients of the throw
-EVERY = 8  # control points, at one of which the throw is looked at first: few lenses throw that far anywhere
+LAPLACIAN_POWER = 0.5  # power of the Laplacian in the variable
+COARSE_LAPLACIAN_POWER = 0.75  # power of the Laplacian for coarse cells, which are wider than a pixel
+TARGET_BLUR = 1.0  # standard deviation of the blur of the target for the weight (pixels)
+WEIGHT_SMOOTHING = 1.5  # standard deviation of the smoothing of the weight's logarithm (control points)
+MAX_LOCAL_WEIGHT = 4.0  # largest local weight; the smallest is 1 / MAX_LOCAL_WEIGHT
+MIN_THROW, MAX_THROW = 3.0, 96.0  # range of the throw over its median in which the weight falls with the throw
+THROW_STEP = 1e-6  # step of the difference quotients of the throw, relative to the distance to the target
+THROW_STRIDE = 8  # stride of the control points that are checked first: few lenses have a large throw anywhere
 
 
 def landing(rays: Landed, aim: Tensor) -> Tensor:
-    """Mean of |P_t - P|² over the rays that land (mm²); Wang et al. 2023, Eq. 14, as a mean."""
+    """Return the mean of |P_t - P|² over the rays that land (mm²); Wang et al. 2023, Eq. 14, as a mean."""
     lit = rays.alive & (rays.flux > 0)
     miss = (rays.position[0] - aim[0]) ** 2 + (rays.position[1] - aim[1]) ** 2
     return total(torch.where(lit, miss, torch.zeros_like(miss))) / lit.sum()
 
 
 class Landings(NamedTuple):
-    """Where the corners of the tubes get to."""
+    """Rays through the corners of the tubes, traced to the goals."""
 
-    on_goals: tuple[tuple[Landed, ...], ...]  # of each goal and sheet
-    behind: tuple[Rays, Tensor] | None = None  # of the first sheet behind the lens, and their optical path there (mm)
+    on_goals: tuple[tuple[Landed, ...], ...]  # landing points for each goal and sheet
+    behind: tuple[Rays, Tensor] | None = None  # rays of the first sheet behind the lens, and their optical path (mm)
 
 
 @dataclass(frozen=True, eq=False)
 class Merit:
-    """The merit of pictures and of a wave, exact for ray tubes; it is differentiable in the heights of all nets."""
+    """Merit of pictures and of a wavefront, exact for flux tubes, and differentiable in the heights of all nets."""
 
-    light: RayTubes  # of a source of some size: that of its middle
+    light: RayTubes  # tubes of a point source, or of the centre of a source
     goals: tuple[Goal, ...]
-    overshoot: float  # weight of light beyond the border of a target (1 / pixel²)
-    wave: Wave | None = None  # of which the tubes' first channel is measured; None: none is asked for
-    own: Callable[[Tensor, Tensor], Tensor] | None = None  # of picture and target, in place of RRMSD²
-    blurs: tuple[tuple[Blur, ...], ...] = ()  # of each goal and channel; (): the source is a point
-    left_out: tuple[Tensor, ...] = ()  # (rows, columns) of each goal's picture, by the images; (): nobody measured it
+    overshoot: float  # weight of light outside the border of a target (1 / pixel²)
+    wave: Wave | None = None  # wavefront goal, for the first channel; None: there is none
+    own: Callable[[Tensor, Tensor], Tensor] | None = None  # function of picture and target in place of RRMSD²
+    blurs: tuple[tuple[BlurOperator, ...], ...] = ()  # blur by goal and channel; (): the source is a point
+    left_out: tuple[Tensor, ...] = ()  # error of the blur in each picture, (rows, columns); (): not measured
 
     @classmethod
     def of(
@@ -101,10 +101,10 @@ class Merit:
         wave: Wave | None = None, own: Callable[[Tensor, Tensor], Tensor] | None = None, spread: Spread | None = None,
         seed: int | None = None,
     ) -> Merit:  # fmt: skip
-        """By sheets of n x n tubes launched for `lens`.
+        """Make the merit with sheets of n x n tubes launched for `lens`, one per channel.
 
-        spread: of a source of some size, whose middle's light the channels are.  seed: of the rays by which is measured
-        what its images leave out, which takes most of a second a goal; None: nobody does.
+        spread: source of finite size, whose centre `channels` are the light of.  seed: seed of the rays that measure
+        the error of the blur, which takes almost a second per goal; None: not measured.
         """
         light = RayTubes.launched(_from_source(lens, wave), channels, n)
         merit = cls(light, tuple(goals), overshoot, wave=wave, own=own)
@@ -117,58 +117,58 @@ class Merit:
         with torch.no_grad():
             seen = [merit.picture(k, landed)[0] for k, landed in enumerate(merit.landing(lens).on_goals)]
         missed = (
-            unseen(image, spread.draw, exact, goal.receiver, border=blur.border, seed=seed)
+            blur_error(image, spread.draw, exact, goal.receiver, border=blur.border, seed=seed)
             for image, goal, (blur, *_) in zip(seen, merit.goals, merit.blurs, strict=True)
         )
         return replace(merit, left_out=tuple(missed))
 
     @property
     def tubes(self) -> int:
-        """The number of tubes in an evaluation."""
+        """Number of tubes that an evaluation traces."""
         return len(self.goals) * sum(sheet.flux.numel() for sheet in self.light.sheets)
 
     @cached_property
     def targets(self) -> tuple[Tensor, ...]:
-        """(rows, columns) the picture of each goal, where the light is; one alone may have any sum."""
+        """Target picture of each goal, (rows, columns), on the device of the light; a single one is normalised."""
         pictures = tuple(torch.from_numpy(goal.picture).to(self.light.sheets[0].flux.device) for goal in self.goals)
         return tuple(picture / total(picture) for picture in pictures) if self._is_one else pictures
 
     @property
     def _is_one(self) -> bool:
-        """Is there one picture, and nothing else?"""
+        """True if the goal is one picture alone."""
         return len(self.goals) == 1 and self.wave is None
 
     def landing(self, lens: Lens) -> Landings:
-        """Where the corners of each sheet meet the receivers; one receiver alone the kernels take in the same go."""
+        """Trace the corners of each sheet to the receivers; for a single receiver in one call of the kernels."""
         if self._is_one:
             return Landings((self.light.landing(lens, self.goals[0].receiver),))
         lens, pairs = _from_source(lens, self.wave), zip(self.light.channels, self.light.sheets, strict=True)
-        ways = [_ways(c.source, sheet, c.through(lens), self.wave is not None) for c, sheet in pairs]
+        ways = [_traced_corners(c.source, sheet, c.through(lens), self.wave is not None) for c, sheet in pairs]
         on_goals = tuple(tuple(goal.receiver.plane.land(rays) for rays, _ in ways) for goal in self.goals)
         return Landings(on_goals, None if self.wave is None else ways[0])
 
     def __call__(self, landings: Landings) -> tuple[Tensor, Tensor]:
-        """(merit, the largest RRMSD of the light on a target) of the landed corners."""
+        """Return the merit of the landed corners, and the largest RRMSD of the normalised pictures."""
         pictures = sum(goal.weight for goal in self.goals)
         whole = pictures + (self.wave.weight if self.wave else 0.0)
         merit, worst = 0.0, torch.zeros(())
         for k, (goal, landed) in enumerate(zip(self.goals, landings.on_goals, strict=True)):
-            off, pull, lost, rrmsd = self._of_goal(k, landed)
+            off, pull, lost, rrmsd = self._goal_terms(k, landed)
             if self._is_one:
                 return off + pull + lost, rrmsd
             merit = merit + goal.weight / whole * off + goal.weight / pictures * (pull + lost)
             worst = torch.maximum(worst.to(rrmsd), rrmsd)
         if self.wave is not None:
-            merit = merit + self.wave.weight / whole * self._of_wave(*landings.behind)
+            merit = merit + self.wave.weight / whole * self._wavefront_error(*landings.behind)
         return merit, worst
 
     def picture(self, k: int, landed: Sequence[Landed]) -> tuple[Tensor, Tensor]:
-        """(picture of a goal, pull on light outside), both over the light that faces and glass leave."""
+        """Return the picture of goal k and the penalty on light outside, both relative to the transmitted light."""
         channels, screen = self.light.channels, self.goals[k].receiver
         pairs = list(zip(self.light.sheets, landed, strict=True))
-        # left of it by faces and glass: darker everywhere is no worse
+        # flux after the losses at faces and in the glass: a picture that is darker everywhere is no worse
         left = weighted_sum(channels, (total(sheet.carried(corners)) for sheet, corners in pairs))
-        seen = bordered(screen, self.blurs[k][0].border) if self.blurs else screen
+        seen = with_border(screen, self.blurs[k][0].border) if self.blurs else screen
         images, beyond = zip(*(sheet.collect(corners, seen) for sheet, corners in pairs), strict=True)
         outside = weighted_sum(channels, beyond)
         if not self.blurs:
@@ -176,8 +176,8 @@ class Merit:
         smooth = (blurred(one / left, blur) for one, blur in zip(images, self.blurs[k], strict=True))
         return weighted_sum(channels, smooth), self.overshoot * (outside / left)
 
-    def _of_goal(self, k: int, landed: Sequence[Landed]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """RRMSD² of a picture, or what stands in its place; the pull on light outside, the light lost; RRMSD."""
+    def _goal_terms(self, k: int, landed: Sequence[Landed]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return RRMSD² of goal k (or `own`), the penalty on light outside, the fraction lost, and the RRMSD."""
         channels, sheets, target = self.light.channels, self.light.sheets, self.targets[k]
         image, pull = self.picture(k, landed)
         if self.left_out:
@@ -186,45 +186,45 @@ class Merit:
         off = total((image - target) ** 2) / size if self.own is None else self.own(image, target)
         pairs = zip(sheets, landed, strict=True)
         arrived = weighted_sum(channels, (total(arriving(sheet.flux, corners)) for sheet, corners in pairs))
-        # total reflection has no gradient, but must not be a gain
+        # light lost has no gradient, but to lose it must not lower the merit
         lost = 1 - arrived / weighted_sum(channels, (total(sheet.flux) for sheet in sheets))
-        shown = image.detach() / total(image.detach())
-        return off, pull, lost, (total((shown - target) ** 2) / size).sqrt()
+        normalised = image.detach() / total(image.detach())
+        return off, pull, lost, (total((normalised - target) ** 2) / size).sqrt()
 
-    def _of_wave(self, rays: Rays, path: Tensor) -> Tensor:
-        """(RMS / λ)² of the optical path differences without piston, by the flux around each corner."""
+    def _wavefront_error(self, rays: Rays, path: Tensor) -> Tensor:
+        """Return (RMS / λ)² of the optical path differences without piston, weighted by the flux around each corner."""
         wavelength = self.light.channels[0].source.wavelength
         above = rays.above(self.wave.z)
         way = -above / torch.where(rays.alive, rays.direction[2], torch.ones_like(above))
         x, y = (p + way * d for p, d in zip(rays.position[:2], rays.direction[:2], strict=True))
         held = rays.alive & self.wave.contains(x.detach(), y.detach())
-        flux = torch.where(held, _at_corners(self.light.sheets[0].flux), torch.zeros_like(x))
+        flux = torch.where(held, _corner_flux(self.light.sheets[0].flux), torch.zeros_like(x))
         opd = (path + way - self.wave.path(x, y, wavelength)) / (wavelength * NM)
         opd = torch.where(held, opd, torch.zeros_like(opd))
         share = flux / total(flux)
-        piston = total(share * opd).detach()  # the mean makes the sum least: there is no gradient in it
+        piston = total(share * opd).detach()  # no gradient: the mean minimises the sum
         return total(share * (opd - piston) ** 2)
 
 
 def _from_source(lens: Lens, wave: Wave | None) -> Lens:
-    """The lens, whose tubes begin at the source where paths are to be measured."""
+    """Return the lens with tubes launched from the source if optical paths are needed."""
     if wave is None or not lens.freeform[0]:
         return lens
     return replace(lens, shaped=(0, *lens.freeform))
 
 
-def _ways(source: Emitter, sheet: Tubes, lens: Lens, measured: bool) -> tuple[Rays, Tensor | None]:
-    """The corners of a sheet behind a lens, whose outline counts in the flux; with the path to there if measured."""
+def _traced_corners(source: Emitter, sheet: Tubes, lens: Lens, measured: bool) -> tuple[Rays, Tensor | None]:
+    """Trace the corners of a sheet through a lens; return the rays, and their optical path (mm) if `measured`."""
     lens = lens.unbounded()
     rays, path = sheet.coming, None
     for interface in lens.interfaces[lens.freeform[0] :]:
         there = behind(rays, interface)
-        if measured and path is None:  # of light from the source: `Merit.of` sees to that
+        if measured and path is None:  # the rays come from the source, see `_from_source`
             index = 1.0 if interface.law.reverses else interface.law.n_in
             path = index * from_reference(source, lens.entrance.z, there, rays.sense)
         elif measured:
             off = torch.stack([*there.position[:2], there.above(rays.z)]) - rays.position
-            square = torch.where(there.alive, (off * off).sum(0), torch.ones_like(path))  # no root of zero: no gradient
+            square = torch.where(there.alive, (off * off).sum(0), torch.ones_like(path))  # sqrt(0) has no gradient
             path = path + index * torch.sqrt(square)
         if measured and not interface.law.reverses:
             index = interface.law.n_out
@@ -232,8 +232,8 @@ def _ways(source: Emitter, sheet: Tubes, lens: Lens, measured: bool) -> tuple[Ra
     return rays, path
 
 
-def _at_corners(flux: Tensor) -> Tensor:
-    """(m + 1, n + 1) the flux of the tubes (m, n) shared out among their corners."""
+def _corner_flux(flux: Tensor) -> Tensor:
+    """Return the flux of tubes (m, n) divided among their corners, (m + 1, n + 1)."""
     m, n = flux.shape
     shared = flux.new_zeros((m + 1, n + 1))
     for i in (0, 1):
@@ -244,79 +244,80 @@ def _at_corners(flux: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class SobolevVariable:
-    """Heights h (m, n) in mm as a function of c (m, n): h = p C^T (λ^-e · C (w c) C^T) C, e the exponent.
+    """Sobolev variable: heights h (m, n) in mm as a function of c (m, n), h = p C^T (λ^-e · C (w c) C^T) C.
 
-    C is the orthonormal cosine transform; λ_ij = 4 - 2 cos(π i / m) - 2 cos(π j / n) is the Laplacian on the
-    net, zero for the piston; p the (mean) pitch in mm.
+    C is the orthonormal cosine transform; λ_ij = 4 - 2 cos(π i / m) - 2 cos(π j / n) the Laplacian on the net, with
+    λ^-e = 0 for the piston; e the exponent; p the mean pitch in mm.
     """
 
-    weight: Tensor  # (m, n) w, a local step size
-    scale: Tensor  # (m, n) p λ^-e
+    weight: Tensor  # local step size w, (m, n)
+    scale: Tensor  # p λ^-e, (m, n)
 
     @classmethod
-    def of(cls, surface: BSplineSurface, weight: Tensor, exponent: float = EXPONENT) -> SobolevVariable:
-        """For the net of a surface."""
+    def of(cls, surface: BSplineSurface, weight: Tensor, exponent: float = LAPLACIAN_POWER) -> SobolevVariable:
+        """Make the variable for the net of a surface."""
         x, y = map(laplacian, surface.shape)
         energy = x[:, None] + y
-        # by numpy, in one thread: torch rounds a power in another way where a thread's share ends
+        # numpy, in one thread: torch rounds a power differently where the work of a thread ends
         power = torch.from_numpy(np.power(torch.where(energy > 0, energy, math.inf).numpy(), -exponent))
         scale = math.sqrt(math.prod(surface.pitch)) * power
         return cls(weight.to(surface.heights), scale.to(surface.heights))
 
     def zero(self) -> Tensor:
-        """c of no change."""
+        """Return c = 0, no change of the heights."""
         return torch.zeros_like(self.weight)
 
     def heights(self, c: Tensor) -> Tensor:
-        """h of c (mm)."""
+        """Return the heights h (mm) at c."""
         return inverse_cosine(self.scale * cosine(self.weight * c))
 
     def adjoint(self, g: Tensor) -> Tensor:
-        """The transpose of `heights`: from a gradient in the control points to one in c."""
+        """Apply the transpose of `heights`: from a gradient in the control points to one in c."""
         return self.weight * inverse_cosine(self.scale * cosine(g))
 
 
 @dataclass(frozen=True)
 class CoarseVariable:
-    """Heights h (m, n) in mm of a net by the variable of a coarser net over the same face: h = P h'(c) Q^T.
+    """Heights h (m, n) in mm of a net as a function of the variable c of a coarser net: h = P h'(c) Q^T.
 
-    P (m, m') and Q (n, n') carry a spline to the finer net.  (The long cosines of the finer net itself have no slope at
-    its rim, and would make one there by ripples all over it.)
+    P (m, m') and Q (n, n') insert knots, so that h is the same spline on the finer net.  (The long cosines of the finer
+    net itself have zero slope at its rim, and would make a slope there by ripples all over the net.)
     """
 
     coarse: SobolevVariable
-    along_x: csr_array  # P
-    along_y: csr_array  # Q
+    along_x: csr_array  # matrix P
+    along_y: csr_array  # matrix Q
 
     @classmethod
     def of(cls, surface: BSplineSurface, coarse: BSplineSurface, weight: Tensor) -> CoarseVariable:
-        """For the net of a surface by a coarser one, with the weight at the coarser one's control points."""
+        """Make the variable for the net of `surface`; weight: (m', n') at the control points of `coarse`."""
         across = (carrier(few, many) for few, many in zip(coarse.shape, surface.shape, strict=True))
-        return cls(SobolevVariable.of(coarse, weight, OF_COARSE), *across)
+        return cls(SobolevVariable.of(coarse, weight, COARSE_LAPLACIAN_POWER), *across)
 
     def zero(self) -> Tensor:
-        """c of no change."""
+        """Return c = 0, no change of the heights."""
         return self.coarse.zero()
 
     def heights(self, c: Tensor) -> Tensor:
-        """h of c (mm)."""
-        return _between(self.along_x, self.coarse.heights(c), self.along_y)
+        """Return the heights h (mm) at c."""
+        return _apply_both(self.along_x, self.coarse.heights(c), self.along_y)
 
     def adjoint(self, g: Tensor) -> Tensor:
-        """The transpose of `heights`: from a gradient in the control points to one in c."""
-        return self.coarse.adjoint(_between(self.along_x.T, g, self.along_y.T))
+        """Apply the transpose of `heights`: from a gradient in the control points to one in c."""
+        return self.coarse.adjoint(_apply_both(self.along_x.T, g, self.along_y.T))
 
 
-def _between(left: csr_array, t: Tensor, right: csr_array) -> Tensor:
-    """left t right^T; by scipy, in one thread, whose sums have one order."""
+def _apply_both(left: csr_array, t: Tensor, right: csr_array) -> Tensor:
+    """Return left t right^T by scipy, in one thread, whose sums have a fixed order."""
     within = np.ascontiguousarray((left @ t.cpu().numpy()).T)
     return torch.from_numpy(np.ascontiguousarray((right @ within).T)).to(t)
 
 
 def local_weight(source: Emitter, lens: Lens, target: np.ndarray, screen: Screen, number: int | None = None) -> Tensor:
-    """w = (E / mean E)^-1/2 at each control point, E the target's irradiance where its light lands, smoothed.
+    """Return the weight w = (E / mean E)^-1/2 at each control point (m, n), smoothed and clamped.
 
-    1 where the light does not land on the screen.  number: of the interface, which is a net; None: the back.
+    E is the irradiance of the target where the light of the control point lands; w = 1 where it misses the screen.
+    number: index of the freeform interface in the lens; None: the back.
     """
     number = lens.number_of("back") if number is None else number
     net, onwards = lens.interfaces[number].surface, lens.unbounded().interfaces[number:]
@@ -328,39 +329,39 @@ def local_weight(source: Emitter, lens: Lens, target: np.ndarray, screen: Screen
         landed = through(at_net, onwards, screen.plane)
     column, row = (p.cpu().double().numpy() for p in screen.pixel(*landed.position))
     seen = landed.alive.cpu().numpy() & (column > 0) & (column < screen.columns) & (row > 0) & (row < screen.rows)
-    picture = gaussian_filter(target / target.mean(), BLUR)
+    picture = gaussian_filter(target / target.mean(), TARGET_BLUR)
     irradiance = map_coordinates(picture, [row - 0.5, column - 0.5], order=1, mode="nearest")
-    logarithm = np.where(seen, np.log(np.maximum(irradiance, MOST**-4)), 0.0)
-    weight = np.clip(np.exp(-0.5 * gaussian_filter(logarithm, SMOOTH)), 1 / MOST, MOST)
+    logarithm = np.where(seen, np.log(np.maximum(irradiance, MAX_LOCAL_WEIGHT**-4)), 0.0)
+    weight = np.exp(-0.5 * gaussian_filter(logarithm, WEIGHT_SMOOTHING)).clip(1 / MAX_LOCAL_WEIGHT, MAX_LOCAL_WEIGHT)
     if number == lens.freeform[-1] and onwards[0].law.eta > 1:
         plane = seen_from_last_net(lens, screen.plane)
-        farther = _farther(at_net, landed.position, plane, law=onwards[0].law, seen=seen)
-        if farther is not None:
-            weight = weight / np.exp(gaussian_filter(np.log(farther), SMOOTH))
+        throw = _excess_throw(at_net, landed.position, plane, law=onwards[0].law, seen=seen)
+        if throw is not None:
+            weight = weight / np.exp(gaussian_filter(np.log(throw), WEIGHT_SMOOTHING))
     return torch.from_numpy(weight)
 
 
-def _farther(at_net: Rays, aim: Tensor, plane: Receiver, law: Law, seen: np.ndarray) -> np.ndarray | None:
-    """(m, m) the throw where it is more than FAR times its median, over that; else 1.  None: 1 everywhere.
+def _excess_throw(at_net: Rays, aim: Tensor, plane: Receiver, law: Law, seen: np.ndarray) -> np.ndarray | None:
+    """Return the throw over MIN_THROW times its median (m, n), at least 1; None if it is 1 everywhere.
 
-    The throw is the largest singular value of ∂t/∂p (mm), p(b, t) the slopes that send light to a place t: the inverse
-    of the smallest one of ∂p/∂t.
+    The throw is the largest singular value of ∂t/∂p (mm), p(b, t) the slopes that send light from b to the target point
+    t; it is the inverse of the smallest singular value of ∂p/∂t.
     """
-    for some in (slice(None, None, EVERY), slice(None)):
+    for some in (slice(None, None, THROW_STRIDE), slice(None)):
         rays = replace(at_net, **{key: getattr(at_net, key)[..., some, some] for key in ("position", "direction")})
         t, lit = aim[..., some, some], seen[some, some]
         if not lit.any():
             return None
-        step = STEP * torch.sqrt((t**2).sum(0) + plane.per_radian(at_net.z) ** 2).max()
-        here, *there = (
+        step = THROW_STEP * torch.sqrt((t**2).sum(0) + plane.per_radian(at_net.z) ** 2).max()
+        centre, *shifted = (
             torch.stack(wanted_slopes(rays, t + step * torch.tensor(way).to(t).view(2, 1, 1), plane, law))
             for way in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
         )
-        (a, b), (c, d) = ((p - here) / step for p in there)
+        (a, b), (c, d) = ((p - centre) / step for p in shifted)
         square, det = a * a + b * b + c * c + d * d, a * d - b * c
         largest = (square + torch.sqrt((square * square - 4 * det * det).clamp(min=0))) / 2
         throw = (largest.sqrt() / det.abs().clamp(min=1e-300)).cpu().double().numpy()
-        farther = np.where(lit, throw / (FAR * np.median(throw[lit])), 1.0).clip(1.0, FARTHEST / FAR)
+        farther = np.where(lit, throw / (MIN_THROW * np.median(throw[lit])), 1.0).clip(1.0, MAX_THROW / MIN_THROW)
         if not (farther > 1).any():
             return None
     return farther
@@ -368,35 +369,35 @@ def _farther(at_net: Rays, aim: Tensor, plane: Receiver, law: Law, seen: np.ndar
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Heights h (m, n) of a net as a function of the Sobolev variable c: h = C^T (c · scale) C; Σ c² is mean |∇h|²."""
+    """Sobolev variable of the slope fit: heights h = C^T (c · scale) C of a net (m, n), with Σ c² = mean |∇h|²."""
 
-    energy: Tensor  # (m, n) slope energy of each cosine (1/mm²), zero for the piston
-    scale: Tensor  # (m, n) sqrt(m n / energy), zero for the piston
+    energy: Tensor  # slope energy of each cosine (1/mm²), (m, n), zero for the piston
+    scale: Tensor  # sqrt(m n / energy), (m, n), zero for the piston
 
     @classmethod
     def of(cls, surface: BSplineSurface) -> Spectrum:
-        """For the net of a surface."""
+        """Make the variable for the net of a surface."""
         x, y = (laplacian(count) / pitch**2 for count, pitch in zip(surface.shape, surface.pitch, strict=True))
         energy = x[:, None] + y
         scale = math.sqrt(energy.numel()) * torch.where(energy > 0, energy, math.inf) ** -0.5
         return cls(energy.to(surface.heights), scale.to(surface.heights))
 
     def heights(self, c: Tensor) -> Tensor:
-        """h of c (mm)."""
+        """Return the heights h (mm) at c."""
         return inverse_cosine(c * self.scale)
 
     def adjoint(self, g: Tensor) -> Tensor:
-        """The transpose of `heights`: from a gradient in the control points to one in c."""
+        """Apply the transpose of `heights`: from a gradient in the control points to one in c."""
         return cosine(g) * self.scale
 
 
 def laplacian(m: int) -> Tensor:
-    """(m,) 2 - 2 cos(π i / m): the factor of each cosine under the second difference along one axis."""
+    """Return 2 - 2 cos(π i / m), (m,): the eigenvalues of the second difference along one axis."""
     return 2 - 2 * elementary(torch.cos, math.pi * torch.arange(m, dtype=torch.float64) / m)
 
 
 def cosine(t: Tensor) -> Tensor:
-    """The orthonormal cosine transform (type II) along both axes."""
+    """Apply the orthonormal cosine transform (type II) along both axes."""
     if t.device.type == "cpu":
         return torch.from_numpy(scipy.fft.dctn(t.numpy(), norm="ortho", workers=torch.get_num_threads()))
     x, y = (_matrix(count).to(t) for count in t.shape)
@@ -404,7 +405,7 @@ def cosine(t: Tensor) -> Tensor:
 
 
 def inverse_cosine(t: Tensor) -> Tensor:
-    """The inverse of `cosine`, which is its transpose."""
+    """Apply the inverse of `cosine`, which is its transpose."""
     if t.device.type == "cpu":
         return torch.from_numpy(scipy.fft.idctn(t.numpy(), norm="ortho", workers=torch.get_num_threads()))
     x, y = (_matrix(count).to(t) for count in t.shape)

@@ -1,8 +1,8 @@
-"""Minimisers: a method queries values of the merit, so that whoever evaluates may as well stop.
+"""Minimisers (Adam, L-BFGS) as generators, which can be stopped after any evaluation and resumed between steps.
 
 A problem maps a list of parameter tensors to (merit, gradients, a figure such as RRMSD).  A method (`adam`, `lbfgs`)
-is a generator that yields a `Query` and is sent its `Evaluation`.  `minimise` brings the two together and says after
-each evaluation where the minimisation stands; nothing has to be done to end it there.
+is a generator that yields a `Query` and is sent its `Evaluation`.  `minimise` runs a method on a problem and yields the
+state after each evaluation; to stop, do not ask for the next one.
 """
 
 from __future__ import annotations
@@ -24,51 +24,51 @@ Problem = Callable[[list[Tensor]], tuple[float, list[Tensor], float]]
 
 @dataclass(frozen=True)
 class Best:
-    """The best of the evaluations so far."""
+    """Best evaluation so far, and the counts of evaluations."""
 
     merit: float = math.inf
-    figure: float = math.nan  # of it, as the problem tells it beside the merit: RRMSD, or the worst excess
+    figure: float = math.nan  # figure that the problem returns beside the merit: RRMSD, or the largest excess
     latest: float = math.nan  # figure of the last evaluation
-    parameters: tuple[Tensor, ...] = ()  # none while not one value was finite
+    parameters: tuple[Tensor, ...] = ()  # parameters of the best evaluation; () if no value was finite
     evaluations: int = 0
-    skipped: int = 0  # of them, because merit or gradient was not finite
+    skipped: int = 0  # evaluations whose merit or gradient was not finite
 
 
 @dataclass(frozen=True)
 class Query:
-    """Where a method wants to know the merit."""
+    """Request of a method for the merit at some parameters."""
 
     parameters: list[Tensor]
-    state: Any = None  # with which the method would ask this again, and go on as now; None: not from here
+    state: Any = None  # state from which the method makes this request again; None: it cannot resume here
 
 
 @dataclass(frozen=True)
 class Evaluation:
     """The answer to a query."""
 
-    merit: float  # infinite, and the gradients zero, if one of them was not finite
+    merit: float  # merit; infinite, with zero gradients, if merit or gradient was not finite
     gradients: list[Tensor]
-    best: Best  # this evaluation included
+    best: Best  # best evaluation, this one included
 
 
-Method = Generator[Query, Evaluation, str]  # returns why it has nothing more to ask
+Method = Generator[Query, Evaluation, str]  # returns the reason why it ends
 
 
 @dataclass(frozen=True)
 class Reached:
-    """Where a minimisation stands after an evaluation."""
+    """State of a minimisation after an evaluation."""
 
     best: Best
-    parameters: list[Tensor] | None  # where the method would go next
-    state: Any = None  # with which, and with `best`, the method goes on from here; None: it cannot be left here
-    skipped: bool = False  # was this evaluation of no use?
-    reason: str = ""  # why it ends here, if it does: "evaluations", or the method's own reason
+    parameters: list[Tensor] | None  # parameters of the next query; None: the method has ended
+    state: Any = None  # state from which, with `best`, the method can resume; None: it cannot resume here
+    skipped: bool = False  # True if merit or gradient of this evaluation was not finite
+    reason: str = ""  # reason to end here: "evaluations", or that of the method; "": none
 
 
 def minimise(problem: Problem, method: Method, evaluations: int, best: Best = Best()) -> Iterator[Reached]:
-    """Answer the method's queries until it has none left or the evaluations are spent.
+    """Answer the queries of a method until it ends or the evaluations are used up; yield the state after each.
 
-    A value that is not finite is counted, not used.  `best`: of the evaluations before the method's state.
+    A value that is not finite is counted and not used.  best: the best of the evaluations before the method's state.
     """
     if best.evaluations >= evaluations:
         return
@@ -95,21 +95,21 @@ def minimise(problem: Problem, method: Method, evaluations: int, best: Best = Be
 
 @dataclass(frozen=True)
 class AdamState:
-    """Where Adam stands between two steps."""
+    """State of Adam between two steps."""
 
-    step: int  # evaluations before
-    taken: int  # steps, of which some may have been left out
+    step: int  # number of evaluations so far
+    taken: int  # number of steps taken, without those left out
     parameters: tuple[Tensor, ...]
-    mean: tuple[Tensor, ...]  # of the gradient
-    square: tuple[Tensor, ...]  # mean of its square
+    mean: tuple[Tensor, ...]  # running mean of the gradient
+    square: tuple[Tensor, ...]  # running mean of its square
 
 
 def adam(start: list[Tensor], rates: list[float], steps: int, state: AdamState | None = None) -> Method:
-    """Kingma and Ba 2014, one learning rate a parameter tensor; a step with a non-finite gradient is left out.
+    """Run Adam (Kingma and Ba 2014) with one learning rate per parameter tensor; leave out non-finite gradients.
 
-    The rates fall to zero within `steps`, as half a cosine: Adam's steps do not shrink with the gradient, and at a
-    constant rate the control points go on jumping by as much as the rate.  Its queries never end; the query after the
-    last evaluation is the result: with fresh random rays in each step the best merit is only the luckiest draw.
+    The rates fall to zero within `steps` as half a cosine: Adam's steps do not shrink with the gradient, and at a
+    constant rate the control points keep jumping by about that rate.  The method never ends.  Its result is the query
+    after the last evaluation: with new random rays in each step the best merit is a matter of chance.
     """
     parameters = [p.clone() for p in (start if state is None else state.parameters)]
     optimiser = torch.optim.Adam([{"params": [p], "lr": r} for p, r in zip(parameters, rates, strict=True)])
@@ -123,8 +123,8 @@ def adam(start: list[Tensor], rates: list[float], steps: int, state: AdamState |
         moments = [optimiser.state[p] for p in parameters if optimiser.state[p]]
         mean, square = (tuple(m[name].clone() for m in moments) for name in ("exp_avg", "exp_avg_sq"))
         taken = int(moments[0]["step"]) if moments else 0
-        held = tuple(p.clone() for p in parameters)  # Adam works in place
-        state = AdamState(step, taken, held, mean=mean, square=square)
+        copies = tuple(p.clone() for p in parameters)  # Adam works in place
+        state = AdamState(step, taken, copies, mean=mean, square=square)
         evaluation = yield Query(list(state.parameters), state)
         if math.isfinite(evaluation.merit):
             for p, g in zip(parameters, evaluation.gradients, strict=True):
@@ -132,42 +132,41 @@ def adam(start: list[Tensor], rates: list[float], steps: int, state: AdamState |
             optimiser.step()
 
 
-MEMORY = 12  # steps that L-BFGS remembers
-BLOCK = 10  # of its steps, after which it is asked whether it still gains
-PLATEAU = 0.005  # of the merit; less in a block is not worth its time
-ARMIJO, WOLFE = 1e-4, 0.9  # c1, c2 of the strong Wolfe conditions
-SEARCH = 20  # trials along a line, at most
+LBFGS_MEMORY = 12  # number of steps whose changes L-BFGS keeps
+PLATEAU_STEPS = 10  # number of steps between two checks for a plateau
+PLATEAU_GAIN = 0.005  # relative decrease of the merit in these steps below which it is on a plateau
+ARMIJO, WOLFE = 1e-4, 0.9  # constants c1 and c2 of the strong Wolfe conditions
+MAX_LINE_TRIALS = 20  # largest number of trials along a line
 
-Values = Generator[Query, Evaluation, tuple[float, Tensor]]  # the merit somewhere, and its gradient there
+Values = Generator[Query, Evaluation, tuple[float, Tensor]]  # returns the merit and its gradient
 
 
 @dataclass(frozen=True)
 class Search:
-    """Where L-BFGS stands between two steps."""
+    """State of L-BFGS between two steps."""
 
     x: Tensor
     value: float
     gradient: Tensor
     pairs: tuple[tuple[Tensor, Tensor, float], ...] = ()  # (change of x, of the gradient, their product), oldest first
     steps: int = 0
-    before: float = math.inf  # the best merit when this block of steps began
+    before: float = math.inf  # best merit at the last check for a plateau
 
 
 def lbfgs(start: list[Tensor], evaluations: int, state: Search | None = None) -> Method:
-    """Limited-memory BFGS with a strong Wolfe line search (Nocedal and Wright 2006, algorithms 7.5, 3.5 and 3.6).
+    """Run limited-memory BFGS with a strong Wolfe line search (Nocedal and Wright 2006, algorithms 7.5, 3.5, 3.6).
 
-    Ends on a "plateau": BLOCK steps that gained less than PLATEAU of the merit, though more than that could still be
-    taken within so many evaluations, or no way down at all.  It can be left between two steps, and goes on from a
-    state to the same end.  (torch.optim has the same method, but loads a compiler for it that takes longer than a
-    draft's stage 2.)
+    Returns "plateau" if PLATEAU_STEPS steps lowered the merit by less than the fraction PLATEAU_GAIN, while more than
+    as many of the `evaluations` are left, or if there is no direction of descent.  Resumed from a state between two
+    steps it ends with the same result.  (The L-BFGS of torch.optim loads a compiler, which takes longer than a draft.)
     """
-    sizes, best, standing = [p.numel() for p in start], None, None
+    sizes, best, resumable = [p.numel() for p in start], None, None
 
     def at(x: Tensor) -> Values:
-        nonlocal best, standing
+        nonlocal best, resumable
         parts = [part.view(p.shape) for part, p in zip(x.split(sizes), start, strict=True)]
-        evaluation = yield Query(parts, standing)
-        best, standing = evaluation.best, None
+        evaluation = yield Query(parts, resumable)
+        best, resumable = evaluation.best, None
         return evaluation.merit, torch.cat([g.reshape(-1) for g in evaluation.gradients])
 
     search = state
@@ -176,70 +175,72 @@ def lbfgs(start: list[Tensor], evaluations: int, state: Search | None = None) ->
         search = Search(x, *(yield from at(x)))
         search = replace(search, before=best.merit)
     while True:
-        standing = search
-        ahead = yield from _step(at, search)
-        if ahead is None:
+        resumable = search
+        following = yield from _step(at, search)
+        if following is None:
             return "plateau"
-        search = ahead
-        if search.steps % BLOCK == 0:
-            if evaluations - best.evaluations > BLOCK and best.merit > (1 - PLATEAU) * search.before:
+        search = following
+        if search.steps % PLATEAU_STEPS == 0:
+            if evaluations - best.evaluations > PLATEAU_STEPS and best.merit > (1 - PLATEAU_GAIN) * search.before:
                 return "plateau"
             search = replace(search, before=best.merit)
 
 
 def _step(at: Callable[[Tensor], Values], search: Search) -> Generator[Query, Evaluation, Search | None]:
-    """One step; None if there is no way down."""
+    """Take one step; return None if there is no direction of descent."""
     x, value, g, pairs = search.x, search.value, search.gradient, search.pairs
-    way = -_inverse_hessian_times(g, pairs)
-    slope = dot(g, way)
+    direction = -_inverse_hessian_times(g, pairs)
+    slope = dot(g, direction)
     if not slope < 0:
         return None
     first = 1.0 if pairs else min(1.0, 1.0 / float(total(g.abs())))
-    trial = yield from _strong_wolfe(partial(_along, at, x, way), Trial(0.0, value, slope, g), first)
+    trial = yield from _strong_wolfe(partial(_along, at, x, direction), LinePoint(0.0, value, slope, g), first)
     if not trial.value < value:
         return None
-    change, turn = trial.step * way, trial.gradient - g
-    if (curvature := dot(change, turn)) > 1e-10 * math.sqrt(dot(change, change) * dot(turn, turn)):
-        pairs = (*pairs, (change, turn, curvature))[-MEMORY:]
-    return Search(x + change, trial.value, trial.gradient, pairs=pairs, steps=search.steps + 1, before=search.before)
+    s, y = trial.step * direction, trial.gradient - g
+    if (curvature := dot(s, y)) > 1e-10 * math.sqrt(dot(s, s) * dot(y, y)):
+        pairs = (*pairs, (s, y, curvature))[-LBFGS_MEMORY:]
+    return Search(x + s, trial.value, trial.gradient, pairs=pairs, steps=search.steps + 1, before=search.before)
 
 
 def _inverse_hessian_times(g: Tensor, pairs: Sequence[tuple[Tensor, Tensor, float]]) -> Tensor:
-    """The two loops: pairs are (change of x, change of the gradient, their product), oldest first."""
-    q, shares = g.clone(), []
-    for change, turn, curvature in reversed(pairs):
-        shares.append(dot(change, q) / curvature)
-        q += -shares[-1] * turn
+    """Return H g by the two-loop recursion (algorithm 7.4); pairs: (s, y, s · y), oldest first."""
+    q, alphas = g.clone(), []
+    for s, y, curvature in reversed(pairs):
+        alphas.append(dot(s, q) / curvature)
+        q += -alphas[-1] * y
     if pairs:
-        _, turn, curvature = pairs[-1]
-        q *= curvature / dot(turn, turn)
-    for (change, turn, curvature), share in zip(pairs, reversed(shares), strict=True):
-        q += (share - dot(turn, q) / curvature) * change
+        _, y, curvature = pairs[-1]
+        q *= curvature / dot(y, y)
+    for (s, y, curvature), alpha in zip(pairs, reversed(alphas), strict=True):
+        q += (alpha - dot(y, q) / curvature) * s
     return q
 
 
 @dataclass(frozen=True)
-class Trial:
-    """One place along a line."""
+class LinePoint:
+    """Merit and gradient at a point of a line search."""
 
     step: float
     value: float
-    slope: float  # along the line
+    slope: float  # derivative along the line
     gradient: Tensor
 
 
-Along = Callable[[float], Generator[Query, Evaluation, Trial]]
+Along = Callable[[float], Generator[Query, Evaluation, LinePoint]]
 
 
-def _along(at: Callable[[Tensor], Values], x: Tensor, way: Tensor, step: float) -> Generator[Query, Evaluation, Trial]:
-    value, gradient = yield from at(x + step * way)
-    return Trial(step, value, dot(gradient, way), gradient)
+def _along(
+    at: Callable[[Tensor], Values], x: Tensor, direction: Tensor, step: float
+) -> Generator[Query, Evaluation, LinePoint]:
+    value, gradient = yield from at(x + step * direction)
+    return LinePoint(step, value, dot(gradient, direction), gradient)
 
 
-def _strong_wolfe(along: Along, start: Trial, step: float) -> Generator[Query, Evaluation, Trial]:
-    """A place with f <= f0 + c1 a f0' and |f'| <= c2 |f0'|, or after SEARCH trials the best one."""
+def _strong_wolfe(along: Along, start: LinePoint, step: float) -> Generator[Query, Evaluation, LinePoint]:
+    """Return a point with f <= f0 + c1 a f0' and |f'| <= c2 |f0'|, or the best of MAX_LINE_TRIALS (3.5)."""
     before = start
-    for _ in range(SEARCH):
+    for _ in range(MAX_LINE_TRIALS):
         trial = yield from along(step)
         if trial.value > start.value + ARMIJO * step * start.slope or trial.value >= before.value:
             return (yield from _zoom(along, start, before, trial))
@@ -248,20 +249,20 @@ def _strong_wolfe(along: Along, start: Trial, step: float) -> Generator[Query, E
         if trial.slope >= 0:
             return (yield from _zoom(along, start, trial, before))
         nearest, farthest = step + 0.01 * (step - before.step), 10.0 * step
-        lowest = _lowest_of_cubic(before, trial)
-        step = min(max(lowest, nearest), farthest) if lowest > step else farthest  # none ahead: it goes on falling
+        lowest = _cubic_minimum(before, trial)
+        step = min(max(lowest, nearest), farthest) if lowest > step else farthest  # else no minimum ahead
         before = trial
     return before
 
 
-def _zoom(along: Along, start: Trial, low: Trial, high: Trial) -> Generator[Query, Evaluation, Trial]:
-    """A place as `_strong_wolfe` looks for, between two places that enclose it; `low` is the lower."""
-    for _ in range(SEARCH):
-        edge = 0.1 * abs(high.step - low.step)  # stay clear of both ends
+def _zoom(along: Along, start: LinePoint, low: LinePoint, high: LinePoint) -> Generator[Query, Evaluation, LinePoint]:
+    """Return a point as `_strong_wolfe` does, between two points that bracket it; `low` has the lower merit (3.6)."""
+    for _ in range(MAX_LINE_TRIALS):
+        margin = 0.1 * abs(high.step - low.step)  # distance to keep from both ends
         nearest, farthest = sorted((low.step, high.step))
-        if not nearest < nearest + edge < farthest:  # a merit that jumps there: no number is left between them
+        if not nearest < nearest + margin < farthest:  # the merit jumps: no number is left between them
             break
-        step = min(max(_lowest_of_cubic(low, high), nearest + edge), farthest - edge)
+        step = min(max(_cubic_minimum(low, high), nearest + margin), farthest - margin)
         trial = yield from along(step)
         if trial.value > start.value + ARMIJO * step * start.slope or trial.value >= low.value:
             high = trial
@@ -274,15 +275,15 @@ def _zoom(along: Along, start: Trial, low: Trial, high: Trial) -> Generator[Quer
     return low
 
 
-def _lowest_of_cubic(a: Trial, b: Trial) -> float:
-    """The step at which the cubic through values and slopes of two places is lowest (equation 3.59), or halfway."""
-    halfway, apart = (a.step + b.step) / 2, a.step - b.step
+def _cubic_minimum(a: LinePoint, b: LinePoint) -> float:
+    """Return the step that minimises the cubic through values and slopes at two points (Eq. 3.59), or the midpoint."""
+    halfway, distance = (a.step + b.step) / 2, a.step - b.step
     if not all(map(math.isfinite, (a.value, b.value, a.slope, b.slope))):
         return halfway
-    d1 = a.slope + b.slope - 3 * (a.value - b.value) / apart
+    d1 = a.slope + b.slope - 3 * (a.value - b.value) / distance
     square = d1 * d1 - a.slope * b.slope
     if square < 0:
         return halfway
-    d2 = math.copysign(math.sqrt(square), -apart)
-    below = b.slope - a.slope + 2 * d2
-    return b.step + apart * (b.slope + d2 - d1) / below if below else halfway
+    d2 = math.copysign(math.sqrt(square), -distance)
+    divisor = b.slope - a.slope + 2 * d2
+    return b.step + distance * (b.slope + d2 - d1) / divisor if divisor else halfway

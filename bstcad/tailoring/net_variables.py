@@ -1,21 +1,21 @@
-"""The variables of stage 2 for all nets of a lens at once.
+"""The variables of stage 2 for all nets of a lens together.
 
-Two faces of a lens in parallel or point light work nearly alike: light from the place q of the front, which meets the
-back at b(q), moves on a plane behind the lens by much the same for a slope of either face, and the merit in the heights
-of the two nets is a long narrow valley.  But a change of the front alone, h(q), that the back repeats where its light
-arrives,
+For a point source or collimated light the two faces of a lens act nearly alike.  Let light from the point q of the
+front meet the back at b(q).  Its landing point on a plane behind the lens moves by nearly the same amount for a slope
+of either face, so that the merit in the heights of the two nets is a long narrow valley.  But a change h(q) of the
+front that the back repeats where the light arrives,
 
     δz_front(q) = h(q),    δz_back(b(q)) = κ h(q),    κ = (n d_z - d_z,in) / (n d_z - d_z,out),
 
-d_z the cosines of the ray with the axis in the glass, before and behind it, leaves all optical paths as they are, to
-the first order: the light behind the lens keeps its wavefront, and its rays only bring another part of the source's
-light.  So the two blocks of the variable c are
+leaves all optical paths unchanged to first order.  Here d_z, d_z,in and d_z,out are the cosines of the ray with the
+axis in the glass, before and behind the lens.  The light behind the lens keeps its wavefront, and only its irradiance
+changes.  So the two blocks of the variable c are
 
     δz_front = f S_front c_1,    δz_back = S_back c_2 + R δz_front,
 
-S as in merit.py, R the interpolation of κ h along the light: c_1 changes which light goes where behind the lens, c_2
-the wavefront.  Two photographs end at an RRMSD of 0.061 and 0.057 after 98 evaluations, and at 0.071 and 0.063 with a
-block a net.
+with S as in merit.py, and R the interpolation of κ h along the rays: c_1 changes the irradiance behind the lens, c_2
+the wavefront.  Two photographs end at an RRMSD of 0.061 and 0.057 after 98 evaluations, and at 0.071 and 0.063 with
+independent blocks.
 """
 
 from __future__ import annotations
@@ -38,53 +38,53 @@ from bstcad.optics.trace import across, behind
 from bstcad.tailoring.merit import CoarseVariable, SobolevVariable
 from bstcad.transport.mapping import places_in
 
-SHARE = 0.2  # of the scale at which both blocks move the pictures as far, by measurement
-# Control points of the back over which q is smoothed.  In a gap between two parts of the light, where few rays fall and
-# some cross, q(b) jumps from point to point: R then drew ripples of 0.07 mm into the back, that no ray tube saw.
-SMOOTH = 3.0
-TAPS = 4  # control points of the front each way from which one of the back takes its share
+SCALE_FRACTION = 0.2  # f relative to the scale at which both blocks move the pictures equally far, by measurement
+# Standard deviation of the smoothing of q(b), in control points of the back.  In a gap between two parts of the light,
+# where few rays fall and some cross, q(b) jumps: without smoothing R makes ripples of 0.07 mm between the tubes.
+POSITION_SMOOTHING = 3.0
+INTERPOLATION_POINTS = 4  # control points of the front, each way, in the interpolation at one of the back
 
 
 @dataclass(frozen=True)
 class NetVariables:
-    """Heights (mm) of the nets of a lens as a function of one block c a net."""
+    """Heights (mm) of the nets of a lens as a function of one block of variables c per net."""
 
     blocks: tuple[SobolevVariable | CoarseVariable, ...]
-    along: csr_array | None = None  # R: (points of the back, points of the front); None: each net has its block alone
-    scale: float = 1.0  # f
+    along: csr_array | None = None  # matrix R, (points of the back, points of the front); None: independent blocks
+    scale: float = 1.0  # factor f
 
     def zeros(self) -> list[Tensor]:
-        """c of no change."""
+        """Return c = 0, no change of the heights."""
         return [block.zero() for block in self.blocks]
 
     def heights(self, c: Sequence[Tensor]) -> list[Tensor]:
-        """The change of the heights of each net (mm) at c."""
+        """Return the change of the heights of each net (mm) at c."""
         parts = [block.heights(at) for block, at in zip(self.blocks, c, strict=True)]
         if self.along is None:
             return parts
         front, back = self.scale * parts[0], parts[1]
-        return [front, back + _times(self.along, front, back)]
+        return [front, back + _multiply(self.along, front, back)]
 
     def adjoint(self, g: Sequence[Tensor]) -> list[Tensor]:
-        """The transpose of `heights`: from gradients in the control points to those in c."""
+        """Apply the transpose of `heights`: from gradients in the control points to those in c."""
         if self.along is not None:
             front, back = g
-            g = [self.scale * (front + _times(self.along.T, back, front)), back]
+            g = [self.scale * (front + _multiply(self.along.T, back, front)), back]
         return [block.adjoint(part) for block, part in zip(self.blocks, g, strict=True)]
 
 
-def _times(matrix: csr_array, t: Tensor, like: Tensor) -> Tensor:
-    """By scipy, in one thread, whose sums have one order."""
+def _multiply(matrix: csr_array, t: Tensor, like: Tensor) -> Tensor:
+    """Return matrix t by scipy, in one thread, whose sums have a fixed order."""
     return torch.from_numpy(matrix @ t.cpu().double().numpy().reshape(-1)).reshape(like.shape).to(like)
 
 
 @torch.no_grad()
 def along_light(source: Emitter, lens: Lens, goals: Sequence[Goal]) -> tuple[csr_array, float]:
-    """R and f for a lens with two nets.
+    """Return R and f for a lens with two nets.
 
-    f is SHARE of the scale that makes both blocks move the pictures as far: by the paraxial shifts T / (n m_b) and
-    d_k / m_k of the light from q, T the thickness, d_k the ways from the back to the planes, m_b and m_k the
-    magnifications of b(q) and of the picture.
+    f is SCALE_FRACTION times the scale at which both blocks move the pictures equally far, by the paraxial shifts
+    T / (n m_b) and d_k / m_k of the light from q.  T is the thickness, d_k the distance from the back to plane k, and
+    m_b and m_k are the magnifications of b(q) and of picture k.
     """
     front, back = lens.nets
     q = torch.stack(torch.meshgrid(*_control_points(front), indexing="ij"))
@@ -110,11 +110,11 @@ def along_light(source: Emitter, lens: Lens, goals: Sequence[Goal]) -> tuple[csr
     ]
     weights = [goal.weight for goal in goals]
     mean = math.sqrt(sum(w * s * s for w, s in zip(weights, shifts, strict=True)) / sum(weights))
-    return csr_array(carried), SHARE * abs(mean / own)
+    return csr_array(carried), SCALE_FRACTION * abs(mean / own)
 
 
 def _control_points(net: BSplineSurface) -> list[Tensor]:
-    """x and y (mm) of its control points, evenly apart."""
+    """Return x and y (mm) of the control points of a net, evenly spaced."""
     return [torch.linspace(*ends, m, dtype=torch.float64) for ends, m in zip((net.x, net.y), net.shape, strict=True)]
 
 
@@ -123,7 +123,7 @@ def _array(t: Tensor) -> np.ndarray:
 
 
 def _magnification(q: np.ndarray, places: Sequence[np.ndarray], lit: np.ndarray) -> float:
-    """The mean of ∂x/∂q_x and ∂y/∂q_y of places (2, …), by least squares over the light."""
+    """Return the mean of ∂x/∂q_x and ∂y/∂q_y of points (2, …), by least squares over the lit ones."""
 
     def along(p: np.ndarray, at: np.ndarray) -> float:
         p, at = p[lit] - p[lit].mean(), at[lit] - at[lit].mean()
@@ -134,22 +134,22 @@ def _magnification(q: np.ndarray, places: Sequence[np.ndarray], lit: np.ndarray)
 
 
 def _smoothed(at: np.ndarray) -> np.ndarray:
-    """By a Gaussian of SMOOTH; beyond the rim it goes on as steeply as within."""
-    wide = math.ceil(4 * SMOOTH)
+    """Smooth by a Gaussian of POSITION_SMOOTHING, with linear trends continued across the rim."""
+    wide = math.ceil(4 * POSITION_SMOOTHING)
     padded = np.pad(at, wide, mode="reflect", reflect_type="odd")
-    return gaussian_filter(padded, SMOOTH)[wide:-wide, wide:-wide]
+    return gaussian_filter(padded, POSITION_SMOOTHING)[wide:-wide, wide:-wide]
 
 
 def _interpolation(row: np.ndarray, column: np.ndarray, sides: tuple[int, int]) -> csr_array:
-    """(places, control points): a net's heights at real rows and columns among its control points."""
-    (i, a), (j, b) = (_taps(p.reshape(-1), m) for p, m in zip((row, column), sides, strict=True))
+    """Return the matrix (points, control points) that interpolates a net at fractional rows and columns."""
+    (i, a), (j, b) = (_cubic_weights(p.reshape(-1), m) for p, m in zip((row, column), sides, strict=True))
     values, columns = a[:, :, None] * b[:, None, :], i[:, :, None] * sides[1] + j[:, None, :]
-    starts = np.arange(0, values.size + 1, TAPS**2)
+    starts = np.arange(0, values.size + 1, INTERPOLATION_POINTS**2)
     return csr_array((values.reshape(-1), columns.reshape(-1), starts), shape=(row.size, sides[0] * sides[1]))
 
 
-def _taps(at: np.ndarray, m: int) -> tuple[np.ndarray, np.ndarray]:
-    """(k, TAPS) indices and weights of the cubic convolution (Keys 1981, a = -1/2) at real places (k,) among m."""
+def _cubic_weights(at: np.ndarray, m: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return indices and weights (k, 4) of the cubic convolution (Keys 1981, a = -1/2) at positions (k,) among m."""
     first = np.minimum(at.astype(int), m - 2)
     t = at - first
     weights = np.stack([

@@ -1,14 +1,14 @@
-"""The part of a target that a design can light, found before it.
+"""The reachable part of a target, which a design can light, computed before the design.
 
-Where a place of the face can send its light is known in closed form (optics/reach.py).  Which place sends which light
-is for the transport map to say, and a map may ask more of a place than the best place for an aim would have to do.  So
-three questions are asked, each dearer than the one before and only where that leaves doubts:
+Each point of the face reaches a part of the target that is known in closed form (optics/reach.py).  But the transport
+map decides which point lights which aim, and the point that it assigns to an aim is not always one that reaches it.  So
+three checks follow each other, each more expensive and only made if the one before is inconclusive:
 
-1. Can every lit place of the face light every lit part of the target?  Then no map asks too much.
-2. Can the place do it that lies in the face as the aim lies in the target?  Maps do not cross their light, and come
-   near to this one.
-3. What remains when coarse maps are made, each for that part of the target which the map before could light, beginning
-   with what any place can light?
+1. Every lit point of the face reaches all of the lit target: then any map is feasible.
+2. Each aim is reached from the point at the same relative position in the face: transport maps do not cross rays, and
+   are close to this map.
+3. Coarse maps are computed, each for the part of the target that the last one could light.  The first is for the part
+   that any point of the face reaches.
 """
 
 from __future__ import annotations
@@ -35,79 +35,81 @@ from bstcad.tailoring.slope_map import (
     FaceGrid,
     corners_of,
     face_grid,
+    fit_to_map,
     lit_window,
     pixel_corners,
     rays_at,
     slope_map,
-    sloped,
 )
 
-PLACES, EACH = 33, 4  # cells a side of the face whose rays are known; each such cell's light is sent to all aims
-BOX = 5  # aims a side of the rectangle around all that is lit, to which all places send light first
-AIMS = 64  # pixels of the longer side of the target, at most, at whose corners the reach is looked at
-NET, CELLS, STEPS = 33, 64, 40  # a side of the coarse maps; iterations of each
-ROUNDS = 6  # of coarse maps, at most
-STEADY = 1e-3  # of the light: a round that changes less is the last
-COARSE = Fit(bending=1e-2, steps=40, degree=3)
+FACE_CELLS, FACE_STRIDE = 33, 4  # cells a side of the face, and stride of those whose light is tried for all aims
+BOX_AIMS = 5  # aims a side, in the rectangle around the lit target, of the first check
+MAX_AIMS = 64  # largest number of pixels along the longer side of the target at whose corners the reach is computed
+COARSE_NET, COARSE_CELLS, COARSE_ITERATIONS = 33, 64, 40  # size and iterations of the coarse maps
+MAX_ROUNDS = 6  # largest number of coarse maps
+SETTLED_FRACTION = 1e-3  # change of the reachable light at which the rounds end, as a fraction of all light
+COARSE_FIT = Fit(bending=1e-2, steps=40, degree=3)  # fit of the face to a coarse map
 
 
 @torch.no_grad()
 def reachable(source: Emitter, lens: Lens, goal: Goal, grazing: float = GRAZING) -> np.ndarray | None:
-    """(rows, columns) True in the pixels that a design can light; None: all that the picture wants to be lit.
+    """Return True for each pixel that a design can light, (rows, columns); None if it can light all of the picture.
 
-    lens: the blank, with the front that it will have.
+    lens: the blank, with its final front.  grazing: largest angle at which light may leave the face (rad).
     """
-    screen, picture, shown = goal.receiver, goal.picture, coarse(goal)
-    few, small = shown.receiver, shown.picture
-    grid = face_grid(source, lens, lit_window(source, lens, PLACES), PLACES)
+    screen, picture, small_goal = goal.receiver, goal.picture, resampled(goal)
+    few, small = small_goal.receiver, small_goal.picture
+    grid = face_grid(source, lens, lit_window(source, lens, FACE_CELLS), FACE_CELLS)
     lit = [corner[corners_of(small)] for corner in pixel_corners(few)]
-    around = np.meshgrid(*(np.linspace(aims.min(), aims.max(), BOX) for aims in lit), indexing="ij")
+    around = np.meshgrid(*(np.linspace(aims.min(), aims.max(), BOX_AIMS) for aims in lit), indexing="ij")
     plane, law = seen_from_last_net(lens, screen.plane), lens.last_freeform.law
-    if float(from_each(grid, around, plane, law, grazing=grazing).min()) >= 0:
+    if float(reach_from_each(grid, around, plane, law, grazing=grazing).min()) >= 0:
         return None
-    ordered, aims = rays_at(grid, in_order(grid, lit)), torch.from_numpy(np.stack(lit))
+    ordered, aims = rays_at(grid, same_order(grid, lit)), torch.from_numpy(np.stack(lit))
     if float(room(ordered, aims, plane, law=law, grazing=grazing).min()) >= 0:
         return None
-    found = _inside(from_each(grid, pixel_corners(few), plane, law, grazing=grazing).amax(0), screen, few)
-    wanted, lens = None, lens.refined(NET)
-    for turn in range(ROUNDS):
+    found = _inside(reach_from_each(grid, pixel_corners(few), plane, law, grazing=grazing).amax(0), screen, few)
+    wanted, lens = None, lens.refined(COARSE_NET)
+    for turn in range(MAX_ROUNDS):
         if not picture[found].sum() > 0:
             break
         window = lit_window(source, lens)
-        part = coarse(goal.restricted(found)).picture
-        wanted = slope_map(source, lens, window, part, screen=few, n=CELLS, previous=wanted, iterations=STEPS)
-        grid = face_grid(source, lens, window, 2 * NET)
+        part = resampled(goal.restricted(found)).picture
+        wanted = slope_map(
+            source, lens, window, part, screen=few, n=COARSE_CELLS, previous=wanted, iterations=COARSE_ITERATIONS
+        )
+        grid = face_grid(source, lens, window, 2 * COARSE_NET)
         aims, rays = torch.from_numpy(np.stack(pixel_corners(few))), rays_at(grid, wanted.places)
         before, found = found, _inside(room(rays, aims, plane, law=law, grazing=grazing), screen, few)
-        if turn and picture[before ^ found].sum() <= STEADY:
+        if turn and picture[before ^ found].sum() <= SETTLED_FRACTION:
             break
-        lens = sloped(lens, wanted, grid, COARSE, unlit=0.0)
+        lens = fit_to_map(lens, wanted, grid, COARSE_FIT, unlit=0.0)
     return found if (picture[~found] > 0).any() else None
 
 
-def coarse(goal: Goal, most: int = AIMS) -> Goal:
-    """The goal with at most so many pixels along the longer side, each of the mean light of those it holds."""
+def resampled(goal: Goal, pixels: int = MAX_AIMS) -> Goal:
+    """Return the goal resampled to at most `pixels` pixels along the longer side, by means over the pixels."""
     screen, picture = goal.receiver, goal.picture
-    shrunk = max(1.0, max(screen.shape) / most)
+    shrunk = max(1.0, max(screen.shape) / pixels)
     rows, columns = (max(round(n / shrunk), 1) for n in screen.shape)
     whole = (0.0, 0.0, screen.columns, screen.rows)
     small = average(lambda box: picture[box[1] : box[3], box[0] : box[2]], whole[2:], whole, (columns, rows))
     return replace(goal, receiver=replace(screen, pixels=(columns, rows)), picture=small, reachable=None, whole=None)
 
 
-def from_each(grid: FaceGrid, aims: Sequence[np.ndarray], plane: Receiver, law: Law, grazing: float) -> Tensor:
-    """(places, …) the room (optics.reach.room) of lit places of the face to send light to aims, x and y (…) mm."""
-    t, some = torch.from_numpy(np.stack(aims)), grid.density[::EACH, ::EACH] > 0
+def reach_from_each(grid: FaceGrid, aims: Sequence[np.ndarray], plane: Receiver, law: Law, grazing: float) -> Tensor:
+    """Return `optics.reach.room` of the lit points of the face for aims x and y (…) mm, as (points, …)."""
+    t, some = torch.from_numpy(np.stack(aims)), grid.density[::FACE_STRIDE, ::FACE_STRIDE] > 0
     position, direction = (
-        v[:, ::EACH, ::EACH][:, some][..., None, None].expand(-1, -1, *t.shape[1:]).double()
+        v[:, ::FACE_STRIDE, ::FACE_STRIDE][:, some][..., None, None].expand(-1, -1, *t.shape[1:]).double()
         for v in (grid.at_face.position, grid.at_face.direction)
     )
     rays = replace(grid.at_face, position=position, direction=direction)
     return room(rays, t[:, None].expand(-1, *position.shape[1:]), plane, law=law, grazing=grazing)
 
 
-def in_order(grid: FaceGrid, aims: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
-    """Places (mm) that lie in the lit window of the face as aims, x and y (mm), lie in the rectangle around these."""
+def same_order(grid: FaceGrid, aims: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
+    """Return the points (mm) of the lit window at the relative positions of aims x and y (mm) in their rectangle."""
     ends = [(along.min(), along.max()) for along in aims]
     sizes = grid.window.width, grid.window.height
     return tuple(
@@ -116,7 +118,7 @@ def in_order(grid: FaceGrid, aims: Sequence[np.ndarray]) -> tuple[np.ndarray, ..
 
 
 def _inside(corners: Tensor, screen: Screen, few: Screen) -> np.ndarray:
-    """(rows, columns) the screen's pixels at all of whose corners a function of the corners of `few` is positive."""
+    """Return True for the pixels of a screen, (rows, columns), where a function at the corners of `few` is positive."""
     where = np.meshgrid(
         *(np.linspace(0, a, n + 1) for a, n in ((few.columns, screen.columns), (few.rows, screen.rows))), indexing="ij"
     )

@@ -1,8 +1,8 @@
-"""The slope fit: the surface whose slopes send each ray where it should go.
+"""The slope fit of stage 1: the surface whose slopes send each ray to its aim, by linear least squares.
 
-Wang et al. 2023 minimise Σ |P_t - P|² by Adam (paper.py).  With the hit on the back face known, the normal that a ray
-needs follows from Snell's law in closed form, and since the spline is linear in its heights the best fit of the slopes
-is a linear least-squares problem: a few preconditioned conjugate-gradient steps.
+Wang et al. 2023 minimise Σ |P_t - P|² by Adam (baselines/paper.py).  For a ray that meets the face at a known point,
+the normal that sends it to its aim follows from Snell's law in closed form.  The spline is linear in its heights, so
+the best fit of the slopes is a linear least-squares problem: a few preconditioned conjugate-gradient steps.
 """
 
 from __future__ import annotations
@@ -25,25 +25,26 @@ from bstcad.optics.trace import across
 from bstcad.optics.unfolding import seen_from_last_net
 from bstcad.tailoring.merit import Spectrum
 
-BLOCK = 1 << 22  # points whose slopes and residuals are held at a time: 0.3 GB
-INDEPENDENT = 1e-12  # of a monomial's squared slopes: less than that is rounding
+BLOCK_POINTS = 1 << 22  # number of points whose slopes and residuals are in memory together: 0.3 GB
+DEPENDENCE_TOLERANCE = 1e-12  # fraction of a monomial's squared slopes below which the rest of it is rounding
 
 
 @dataclass(frozen=True)
 class Fit:
     """Settings of a slope fit."""
 
-    bending: float = 1e-4  # weight of (spacing · curvature)² beside slope²: decides where no ray falls
-    steps: int = 8  # of conjugate gradients
-    degree: int = 0  # of a polynomial that is fitted first and goes on smoothly where no ray falls
+    bending: float = 1e-4  # weight of (spacing · curvature)² relative to slope²; shapes the parts without rays
+    steps: int = 8  # number of conjugate-gradient steps
+    degree: int = 0  # degree of a polynomial that is fitted first, and extrapolates where no ray falls; 0: none
 
 
 def fit_slopes(
     surface: BSplineSurface, x: Tensor, y: Tensor, z_x: Tensor, z_y: Tensor, weight: Tensor, fit: Fit = Fit()
 ) -> BSplineSurface:
-    """Least squares: min Σ w |∇h(x, y) - (z_x, z_y)|² + small bending, by conjugate gradients in the Sobolev variable.
+    """Return the surface that minimises Σ w |∇h(x, y) - (z_x, z_y)|² and a small bending energy.
 
-    x, y (mm), wanted slopes and weights are (n,); starts from the surface's own heights.
+    Conjugate gradients in the variable of `Spectrum`, from the surface's own heights on.  x, y (mm), the slopes
+    z_x, z_y and the weights are (n,).
     """
     pitch_x, pitch_y = surface.pitch
     u, v = surface.along_net(x, y)
@@ -61,7 +62,7 @@ def fit_slopes(
         return z_x[some] - now_x, z_y[some] - now_y
 
     def adjoint(of: Callable[[slice], tuple[Tensor, Tensor]]) -> Tensor:
-        """The transpose of `slopes`, weighted, of slopes at some points at a time."""
+        """Apply the weighted transpose of `slopes`, block by block."""
         g = torch.zeros_like(start)
         for some in blocks(len(u)):
             r_x, r_y = of(some)
@@ -82,20 +83,20 @@ def fit_slopes(
 
 
 def blocks(count: int) -> Iterator[slice]:
-    """So many points, BLOCK of them at a time."""
-    for first in range(0, count, BLOCK):
-        yield slice(first, first + BLOCK)
+    """Yield slices of at most BLOCK_POINTS points that cover `count`."""
+    for first in range(0, count, BLOCK_POINTS):
+        yield slice(first, first + BLOCK_POINTS)
 
 
 def conjugate_gradients(normal: Callable[[Tensor], Tensor], x: Tensor, residual: Tensor, steps: int) -> Tensor:
-    """x after so many steps towards normal(x) = b, normal symmetric and positive; residual: b - normal(x) at the start.
+    """Return x after `steps` steps towards normal(x) = b, with `normal` symmetric and positive.
 
-    Ends earlier where rounding alone is left: below that a step would divide noise by noise.
+    residual: b - normal(x) at the start.  The steps end earlier if the residual is rounding alone.
     """
     p, rho = residual, total(residual**2)
-    enough = rho * torch.finfo(rho.dtype).eps ** 2
+    tolerance = rho * torch.finfo(rho.dtype).eps ** 2
     for _ in range(steps):
-        if not rho > enough:
+        if not rho > tolerance:
             break
         q = normal(p)
         alpha = rho / total(p * q)
@@ -113,11 +114,10 @@ def with_polynomial(
     wanted: tuple[Tensor, ...],
     weight: Tensor,
 ) -> Tensor:
-    """start + Σ b_k monomial_k with the b that make Σ w |slopes - wanted|² smallest, by modified Gram-Schmidt.
+    """Return start + Σ b_k monomial_k with the b that minimise Σ w |slopes - wanted|², by modified Gram-Schmidt.
 
-    Each monomial is made orthogonal, by its weighted slopes (or other samples), to those before it, and then
-    takes its part of the residual.  (LAPACK's solvers for this divide their sums among threads; nine columns need
-    none.)
+    Each monomial is made orthogonal to those before it, by its weighted slopes (or other samples).  (LAPACK's solvers
+    divide their sums among threads, which changes their rounding.)
     """
     root = weight.sqrt()
 
@@ -133,7 +133,7 @@ def with_polynomial(
             shared = total(q_k * q)
             q, h = q - shared * q_k, h - shared * h_k
         length = total(q * q)
-        if not length > INDEPENDENT * before:  # where the lit places do not tell it from the others
+        if not length > DEPENDENCE_TOLERANCE * before:  # dependent on the others at the lit points
             continue
         q, h = q / length.sqrt(), h / length.sqrt()
         basis.append((q, h))
@@ -143,16 +143,16 @@ def with_polynomial(
 
 
 def monomials(surface: BSplineSurface, degree: int) -> list[Tensor]:
-    """Heights of (nearly) x^i y^j, 1 <= i + j <= degree, x and y from -1 to 1 across the net."""
+    """Return heights of nearly x^i y^j, 1 <= i + j <= degree, x and y from -1 to 1 across the net."""
     x, y = (torch.linspace(-1.0, 1.0, count).to(surface.heights) for count in surface.shape)
     powers = ((i, j) for i in range(degree + 1) for j in range(degree + 1 - i) if i + j > 0)
     return [x[:, None] ** i * y[None, :] ** j for i, j in powers]
 
 
 def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, plane: Receiver, repeats: int = 3) -> Lens:
-    """The lens whose last net sends `rays` (…) to `aim` (2, …) mm on the plane, by a least-squares fit of slopes.
+    """Return the lens whose last net sends `rays` (…) to `aim` (2, …) mm on the plane, by fits of the slopes.
 
-    Repeated, because the sag moves the hits.
+    repeats: number of fits; each changes the sag, and so the points where the rays meet the face.
     """
     plane = seen_from_last_net(lens, plane)
     coming = across(rays, lens.interfaces[: lens.freeform[-1]])

@@ -1,28 +1,29 @@
-"""The transport map that a surface can follow: optimal transport from points of a net to its slopes.
+"""The transport map of stage 1: optimal transport from points of a face to its slopes, a map that a surface can follow.
 
-Wang et al. 2023 carry source points to target points; that map is a gradient only in the paraxial limit, and off axis
-the part of it that no surface can follow is lost in stage 1.  Here the same transport problem is posed in the
-coordinates in which a surface *is* a gradient.  A ray that meets the back face at b and shall reach the target point t
-needs the slope p(b, t) that the law of its interface gives in closed form.  With m the centroid of the target's light,
+The map of Wang et al. 2023 leads from source points to target points.  It is a gradient in the paraxial limit only; off
+axis, the part of it that no surface can follow is lost in stage 1.  Here the same transport problem is solved in
+coordinates in which a surface is a gradient.  A ray that meets the last freeform face at b and shall reach the target
+point t needs the slope p(b, t), which follows from Snell's law or the law of reflection in closed form.  With m the
+centroid of the light on the target,
 
     y = σ (p(b, t) - ∇g(b)),    ∇g(b) ≈ p(b, m)
 
-hardly depends on b for a fixed t; g is nearly the surface that gathers all light in m.  The optimal map b -> y is ∇φ of
-a convex φ, so that σ y + ∇g are slopes of a surface.  σ = 1 where light leaves the glass.  A mirror, and a face where
-light enters, turn it the other way than their slope: there σ = -1, so that the rays of neighbouring places do not cross
-on their way.  Past what is behind the net light aims at the target's image (optics/unfolding.py).  The remaining
-dependence on b, of the order of t - m, enters through the b that the previous round assigned to each t; at the fixed
-point the surface solves the Monge-Ampère problem of this very system, off axis, near field and behind a curved front
-alike, whatever g is.
+hardly depends on b for a fixed t; g is nearly the surface that focuses all light on m.  The optimal transport map
+b -> y is ∇φ of a convex φ, so that σ y + ∇g are the slopes of a surface.  σ = 1 where light leaves the glass.  Mirrors,
+and faces where light enters the glass, turn light against their slope: there σ = -1, so that rays of neighbouring
+points do not cross.  If there are surfaces behind the net, light is aimed at the image of the target through them
+(optics/unfolding.py).  The remaining dependence on b, of the order of t - m, enters through the b that the previous
+round assigned to each t.  At the fixed point the surface solves the Monge-Ampère problem of the system, off axis, in
+the near field and behind a curved front alike, for any g.
 
-Beside it stands their own map, from the front's vertex plane to the target, and with it the aim of each ray: stage 1
-falls back on it, and the baselines follow it.
+`map_to_target` and `aim_points` are the map of the paper, from the vertex plane of the front to the target, and the aim
+of each ray.  Stage 1 falls back on them, and the baselines follow them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,23 +50,23 @@ from bstcad.transport.bfm import Step
 from bstcad.transport.density import Density, spread
 from bstcad.transport.mapping import Frame, Mapping, TransportMap, nodes, solve
 
-SUBCELLS = 2  # of a transport cell each way, on the source side: rims inside a cell
-SUBPIXELS = 8  # parts of a pixel in each transport cell, each way; at least one a pixel, where it spans several cells
-FLOOR = 1e-3  # of the mean slope density: flux that may be spent on black parts
-GATHERING, SAMPLES = 33, 96  # control points a side of g, and about as many places each way that it is fitted to
-REACH = (GATHERING - 1) / (GATHERING - 5)  # of g over the window: its end spans lie beyond
-GATHERED = Fit(bending=1e-3, steps=40, degree=5)
-ROUGHLY = Fit(steps=0, degree=2)  # a paraboloid, where no face gathers the light
-QUICKLY, FEWER = Fit(steps=0, degree=5), 32  # g in a fifth of the time: a polynomial, by fewer places
-TARGET_FLOOR = 1e-3  # of the mean: flux that the map may spend on black parts
+SUBCELLS = 2  # samples of the light in a transport cell, each way: a rim may cross the cell
+SUBPIXELS = 8  # parts of a pixel per transport cell, each way; at least one part per pixel
+SLOPE_FLOOR = 1e-3  # floor under the slope density, relative to its mean, that the solver needs in black parts
+GATHERING_NET, GATHERING_SAMPLES = 33, 96  # control points a side of g, and samples a side for its fit
+GATHERING_WIDTH = (GATHERING_NET - 1) / (GATHERING_NET - 5)  # width of g over the window's: end spans lie outside
+GATHERING_FIT = Fit(bending=1e-3, steps=40, degree=5)  # fit of g
+PARABOLOID_FIT = Fit(steps=0, degree=2)  # fit of g by a paraboloid, where no face focuses the light
+PREVIEW_FIT, PREVIEW_SAMPLES = Fit(steps=0, degree=5), 32  # fit and samples of g in a preview, in a fifth of the time
+TARGET_FLOOR = 1e-3  # floor under the irradiance of the target, relative to its mean
 
 
 @dataclass(frozen=True)
 class FaceGrid:
-    """Cell centres of a rectangle of the last freeform face, and the light that meets it there."""
+    """Rays and flux density at the cell centres of a rectangle of the last freeform face."""
 
-    window: Rectangle  # in x and y, centred (mm)
-    at_face: Rays  # (3, m, n): position on the face, direction before it
+    window: Rectangle  # rectangle in x and y about the axis (mm)
+    at_face: Rays  # (3, m, n) rays before the face: position on the face, direction of incidence
     density: Tensor  # (m, n) flux per mm² of the x-y plane
 
     @property
@@ -77,10 +78,10 @@ class FaceGrid:
 
 @torch.no_grad()
 def face_grid(source: Emitter, lens: Lens, window: Rectangle, cells: Sides) -> FaceGrid:
-    """The ray that meets the last freeform face in the middle of each cell, so many a side or along x and along y.
+    """Return the rays that meet the last freeform face at the centres of `cells` cells of a window.
 
-    Its flux density is the source's on the vertex plane of the first surface times |∂q/∂b|, q where the ray crosses
-    that plane, less the losses at the faces and in the glass, with the present back.
+    The flux density is that of the source on the vertex plane of the first surface, times |∂q/∂b|, where the ray
+    through b crosses that plane at q; less the losses at the faces and in the glass, with the present back.
     """
     x, y = (t.to(lens.like.device) for t in sampling.grid(window, cells))
     number = lens.freeform[-1]
@@ -97,13 +98,13 @@ def face_grid(source: Emitter, lens: Lens, window: Rectangle, cells: Sides) -> F
 
 
 def lit_window(source: Emitter, lens: Lens, n: int = 128) -> Rectangle:
-    """The rectangle of the last freeform face that light meets, with two cells to spare; SceneError if none does."""
+    """Return the rectangle of the last freeform face that light meets, with a margin; SceneError if there is none."""
     half_x, half_y = lens.last_freeform.outline.half_extent
     grid = face_grid(source, lens, Rectangle(2 * half_x, 2 * half_y), n)
     lit = grid.density > 0
     if not bool(lit.any()):
         raise SceneError(
-            "source: no ray from it to the back face was found; move it away from the front, or the back nearer to it"
+            "source: no ray of it reaches the back; move the source away from the front, or the back nearer to it"
         )
     x, y, _ = grid.at_face.position
     reach = ((float(p.abs()[lit].max()) + 2.5 * 2 * half / n, half) for p, half in ((x, half_x), (y, half_y)))
@@ -112,20 +113,20 @@ def lit_window(source: Emitter, lens: Lens, n: int = 128) -> Rectangle:
 
 @dataclass(frozen=True)
 class SlopeMap:
-    """b -> y = ∇φ(b) by transport; the wanted slope at b is σ y + ∇g(b)."""
+    """Transport map b -> y = ∇φ(b); the slope needed at b is σ y + ∇g(b)."""
 
-    mapping: Mapping  # points of the last freeform face (mm) -> y (dimensionless)
-    gathering: BSplineSurface  # g
-    sign: float  # σ
-    places: tuple[np.ndarray, np.ndarray]  # b (mm) for each corner of the target's pixels, (columns + 1, rows + 1)
-    moved: float  # RMS change of those of the lit pixels since the round before / half of the window; NaN: no round
+    mapping: Mapping  # map from points of the last freeform face (mm) to y (dimensionless)
+    gathering: BSplineSurface  # surface g
+    sign: float  # sign σ, 1 or -1
+    places: tuple[np.ndarray, np.ndarray]  # b (mm) for the corners of the target's pixels, (columns + 1, rows + 1)
+    moved: float  # RMS change of `places` at lit pixels since the last round, in half windows; NaN: first round
 
     def slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """(∂z/∂x, ∂z/∂y) wanted at points (n,) of the last freeform face (mm)."""
+        """Return the slopes (∂z/∂x, ∂z/∂y) needed at points x, y (n,) of the last freeform face (mm)."""
         sent = self.mapping(x.cpu().double().numpy(), y.cpu().double().numpy())
-        beyond = (torch.from_numpy(np.ascontiguousarray(s)).to(x) for s in sent)
+        mapped = (torch.from_numpy(np.ascontiguousarray(s)).to(x) for s in sent)
         _, *gathering = self.gathering.relative_sag_and_slope(x.cpu().double(), y.cpu().double())
-        z_x, z_y = (self.sign * s + g.to(x) for s, g in zip(beyond, gathering, strict=True))
+        z_x, z_y = (self.sign * s + g.to(x) for s, g in zip(mapped, gathering, strict=True))
         return z_x, z_y
 
 
@@ -133,9 +134,10 @@ def slope_map(
     source: Emitter, lens: Lens, window: Rectangle, picture: np.ndarray, screen: Screen, n: int,
     previous: SlopeMap | None, hasty: bool = False, **solver,
 ) -> SlopeMap:  # fmt: skip
-    """One round: transport on n x n cells for the sag of `lens`, with b(t) of the round before (the axis at first).
+    """Return the map of one round, by transport on n x n cells for the sag of `lens`.
 
-    window: `lit_window` of the lens.  hasty: with g in a fifth of its time; the fixed point is the same.
+    previous: map of the last round, which gives b(t); None: b = 0.  window: `lit_window` of the lens.
+    hasty: fit g in a fifth of the time; the fixed point is the same.  solver: further arguments of transport's `solve`.
     """
     grid, screen, law = square_grid(source, lens, window, n), imaged(lens, screen), lens.last_freeform.law
     t = pixel_corners(screen)
@@ -168,26 +170,24 @@ def transport_slopes(
     sigma, frame = spread_density(picture, (y_x, y_y), n)
     mapping = solve(light_density(rho, side), sigma, Frame((0.0, 0.0), side), frame, **solver)
     now = mapping.inverse(y_x, y_y)
-    return SlopeMap(mapping, net, sign, places=now, moved=_moved(picture, places, now) / (side / 2))
+    return SlopeMap(mapping, net, sign, places=now, moved=_rms_change(picture, places, now) / (side / 2))
 
 
-def _moved(picture: np.ndarray, before: tuple[np.ndarray, np.ndarray], now: tuple[np.ndarray, np.ndarray]) -> float:
-    """RMS distance (mm) between two places of each corner of the lit pixels."""
+def _rms_change(picture: np.ndarray, before: Sequence[np.ndarray], now: Sequence[np.ndarray]) -> float:
+    """Return the RMS distance (mm) between two positions of the corners of the lit pixels."""
     lit = corners_of(picture)
     x, y = ((a - b)[lit] for a, b in zip(now, before, strict=True))
     return float(np.sqrt(np.mean(x * x + y * y)))
 
 
-def sloped(
+def fit_to_map(
     lens: Lens, wanted: SlopeMap, grid: FaceGrid, fit: Fit, unlit: float, parts: int = 1, grazing: float = GRAZING
 ) -> Lens:
-    """The lens whose last net has the wanted slopes where light meets it, by least squares; it keeps its vertex.
+    """Return the lens whose last net is fitted to the slopes of a map by least squares; its vertex stays.
 
-    A map may send some light beyond what the face reaches, into the black around a picture: that light has to leave at
-    `grazing` (rad).
-
-    Where no light falls the slopes it has now are wanted with the weight `unlit`; zero leaves that part to the bending.
-    parts: places at which slopes are wanted in each cell of the grid, each way.
+    A map may send a little light further than the face can, into the black around a picture; that light leaves at the
+    angle `grazing` (rad).  Points without light count with the weight `unlit` and their present slopes; for 0 the
+    bending energy alone shapes them.  parts: points per cell of the grid, each way.
     """
     m, n = grid.shape
     places = sampling.grid(grid.window, (parts * m, parts * n))
@@ -199,9 +199,9 @@ def sloped(
         _, *now = net.relative_sag_and_slope(x[some], y[some])
         arriving = rays_at(grid, tuple(p[some].cpu().double().numpy() for p in (x, y)))
         slopes = (s.cpu().double() for s in wanted.slopes(x[some], y[some]))
-        kept = kept_from_reflection(arriving, tuple(slopes), lens.last_freeform.law, grazing)
-        for z, sent, own in zip((z_x, z_y), kept, now, strict=True):
-            z[some] = torch.where(lit[some], sent.to(x), own)
+        slopes = kept_from_reflection(arriving, tuple(slopes), lens.last_freeform.law, grazing)
+        for z, needed, own in zip((z_x, z_y), slopes, now, strict=True):
+            z[some] = torch.where(lit[some], needed.to(x), own)
     weight = torch.where(lit, 1.0, unlit).to(x)
     return lens.with_last_net(
         fit_slopes(net, x, y, z_x=z_x, z_y=z_y, weight=weight, fit=fit).from_vertex().moved(net.z)
@@ -209,7 +209,7 @@ def sloped(
 
 
 def centroid(picture: np.ndarray, screen: Screen) -> tuple[float, float]:
-    """The centroid (mm) of the light of a picture, row 0 = y max."""
+    """Return the centroid (mm) of the light of a picture, row 0 = y max."""
     sums = picture.sum(0), picture.sum(1)[::-1]
     share_x, share_y = (float(((np.arange(len(s)) + 0.5) * s).sum() / s.sum()) / len(s) for s in sums)
     (left, right), (low, high) = screen.x, screen.y
@@ -219,31 +219,31 @@ def centroid(picture: np.ndarray, screen: Screen) -> tuple[float, float]:
 def gathering(
     grid: FaceGrid, lens: Lens, plane: Receiver, middle: tuple[float, float], hasty: bool = False
 ) -> BSplineSurface:  # fmt: skip
-    """g: the net of GATHERING points a side with slopes nearest to p(b, m) over the lit part of a grid.
+    """Return g, the net of GATHERING_NET points a side whose slopes fit p(b, m) best over the lit part of a grid.
 
-    With the sag frozen p(b, m) is a gradient but for a curl of the order ∂p/∂z x y; ∇g is one.
+    With the sag fixed, p(b, m) is a gradient but for a curl of the order ∂p/∂z x y.
     """
-    most, fit = (FEWER, QUICKLY) if hasty else (SAMPLES, GATHERED)
-    thin = tuple(slice(step // 2, None, step) for step in (max(1, n // most) for n in grid.shape))
+    count, fit = (PREVIEW_SAMPLES, PREVIEW_FIT) if hasty else (GATHERING_SAMPLES, GATHERING_FIT)
+    thin = tuple(slice(step // 2, None, step) for step in (max(1, n // count) for n in grid.shape))
     faces = replace(grid.at_face, **{k: getattr(grid.at_face, k)[(..., *thin)] for k in ("position", "direction")})
     x, y, _ = faces.position
     aim = torch.stack([torch.full_like(x, m) for m in middle])
     z_x, z_y = wanted_slopes(faces, aim, plane, lens.last_freeform.law)
     lit = grid.density[thin] > 0
-    able = room(faces, aim, plane, law=lens.last_freeform.law) >= 0  # elsewhere the slope is a makeshift
-    return fit_gathering(grid, (x, y, z_x, z_y, lit), fit if bool(able[lit].all()) else ROUGHLY)
+    reaches = room(faces, aim, plane, law=lens.last_freeform.law) >= 0  # elsewhere the slope is a placeholder
+    return fit_gathering(grid, (x, y, z_x, z_y, lit), fit if bool(reaches[lit].all()) else PARABOLOID_FIT)
 
 
 def fit_gathering(grid: FaceGrid, samples: tuple[Tensor, ...], fit: Fit) -> BSplineSurface:
-    """The net of GATHERING points a side over a grid with the slopes of samples (x, y, z_x, z_y, weight)."""
-    half_x, half_y = (REACH * size / 2 for size in (grid.window.width, grid.window.height))
-    flat = torch.zeros((GATHERING, GATHERING), dtype=torch.float64)
+    """Fit a net of GATHERING_NET points a side over a grid to the slopes of samples (x, y, z_x, z_y, weight)."""
+    half_x, half_y = (GATHERING_WIDTH * size / 2 for size in (grid.window.width, grid.window.height))
+    flat = torch.zeros((GATHERING_NET, GATHERING_NET), dtype=torch.float64)
     net = BSplineSurface(0.0, flat, (-half_x, half_x), (-half_y, half_y))
     return fit_slopes(net, *(p.reshape(-1).cpu().double() for p in samples), fit=fit)
 
 
-def between(grid: FaceGrid, values: Tensor, b: tuple) -> Tensor:
-    """Values (k, m, n) of the cells of a grid at points b (…) mm, bilinear, (k, …); beyond the outer cells constant."""
+def interpolate(grid: FaceGrid, values: Tensor, b: tuple) -> Tensor:
+    """Interpolate values (k, m, n) at cell centres to points b (…) mm, bilinear, constant outside; return (k, …)."""
     sizes = (grid.window.width, grid.window.height)
     x, y = (torch.from_numpy(p) / (size / 2) for p, size in zip(b, sizes, strict=True))
     where = torch.stack([y, x], dim=-1)  # -1 to 1 across the window; the last axis of the values comes first
@@ -254,17 +254,17 @@ def between(grid: FaceGrid, values: Tensor, b: tuple) -> Tensor:
 
 
 def rays_at(grid: FaceGrid, b: tuple) -> Rays:
-    """The light that meets the face at points b (mm); direction and sag are bilinear between the grid's."""
-    sag, d_x, d_y, d_z = between(grid, torch.cat([grid.at_face.position[2:], grid.at_face.direction]), b)
+    """Return the rays that meet the face at points b (mm), with sag and direction interpolated in the grid."""
+    sag, d_x, d_y, d_z = interpolate(grid, torch.cat([grid.at_face.position[2:], grid.at_face.direction]), b)
     position = torch.stack([torch.from_numpy(b[0]), torch.from_numpy(b[1]), sag])
     direction = torch.stack([d_x, d_y, d_z]) / torch.sqrt(d_x * d_x + d_y * d_y + d_z * d_z)
     return replace(grid.at_face, position=position, direction=direction)
 
 
 def sent_from(places: tuple[np.ndarray, np.ndarray], screen: Screen) -> TransportMap:
-    """Return the map by places (mm) on the last tailored face for the target's pixel corners.
+    """Return the map for the corners of the target's pixels, given as points (mm) of the last tailored face.
 
-    places: x and y, each (columns + 1, rows + 1).  The plane of the map is called "back", of a front as well.
+    places: x and y, each (columns + 1, rows + 1).  The plane of the map is named "back" even if the face is the front.
     """
     x, y = (np.linspace(*ends, n + 1) for ends, n in ((screen.x, screen.columns), (screen.y, screen.rows)))
     i, j = nodes(screen.columns), nodes(screen.rows)
@@ -273,35 +273,35 @@ def sent_from(places: tuple[np.ndarray, np.ndarray], screen: Screen) -> Transpor
 
 
 def pixel_corners(screen: Screen) -> list[np.ndarray]:
-    """x and y of the corners of its pixels, each (columns + 1, rows + 1), x first (mm)."""
+    """Return x and y (mm) of the corners of the pixels, each (columns + 1, rows + 1), x first."""
     sides = np.linspace(*screen.x, screen.columns + 1), np.linspace(*screen.y, screen.rows + 1)
     return np.meshgrid(*sides, indexing="ij")
 
 
 def spread_density(picture: np.ndarray, corners: tuple[np.ndarray, np.ndarray], n: int) -> tuple[Density, Frame]:
-    """A picture whose pixels have their corners there, on n x n cells of the smallest square around its lit part."""
+    """Resample a picture with the given pixel corners on n x n cells of the smallest square around its lit part."""
     lit = corners_of(picture)
     low, high = (np.array([f(c[lit]) for c in corners]) for f in (np.min, np.max))
     frame = Frame(tuple((low + high) / 2), float((high - low).max()))
     flux = np.ascontiguousarray(picture[::-1].T)  # row 0 is y max
     parts = tuple(max(1, round(SUBPIXELS * n / pixels)) for pixels in flux.shape)
     x, y = (np.ascontiguousarray(n * c) for c in frame.to_unit(*corners))
-    return Density.from_values(spread(flux, x, y, n=n, parts=parts), floor=FLOOR), frame
+    return Density.from_values(spread(flux, x, y, n=n, parts=parts), floor=SLOPE_FLOOR), frame
 
 
 def light_density(values: np.ndarray, side: float) -> Density:
-    """The density of the light on cells of a square of this side (mm); SceneError if it falls between them."""
+    """Return the density of light in cells of a square of `side` mm; SceneError if it falls between the samples."""
     if not values.any():
         raise SceneError(
-            "source: its light at the lens is narrower than a cell of the transport's grid "
-            f"({side / len(values):.3g} mm); make the sides of lens.outline more alike, or give a larger "
+            "source: its light at the lens is narrower than a cell of the transport grid "
+            f"({side / len(values):.3g} mm); make the sides of lens.outline more alike, or raise "
             "tailoring.transport_grid"
         )
     return Density.from_values(values)
 
 
 def corners_of(picture: np.ndarray) -> np.ndarray:
-    """(columns + 1, rows + 1), x first: the pixel corners of all that is not black."""
+    """Return True at the corners of all pixels that are not black, (columns + 1, rows + 1), x first."""
     lit = np.pad(picture[::-1].T > 0, 1)  # row 0 is y max
     return lit[1:, 1:] | lit[1:, :-1] | lit[:-1, 1:] | lit[:-1, :-1]
 
@@ -316,11 +316,10 @@ def map_to_target(
     iterations: int,
     progress: Callable[[Step], None],
 ) -> Mapping:
-    """The transport map from the plane of the first vertex (mm) to the target (mm), on n x n cells.
+    """Return the transport map of the paper, from the vertex plane of the front (mm) to the target (mm).
 
-    Only the light that gets through all faces counts.  To a tilted target the map leads in the coordinates of the level
-    plane through its middle, on which each place is where the front's vertex sees it: in those of the plane itself the
-    map would be nowhere near a gradient of heights.
+    It is solved on n x n cells, for the light that passes all faces.  A tilted target is projected from the vertex of
+    the front onto the level plane through its centre: in its own coordinates the map would be far from a gradient.
     """
     screen = imaged(lens, screen)
     area = clear_window(source, lens)
@@ -339,7 +338,7 @@ def map_to_target(
 
 
 def sent_from_entrance(mapping: Mapping, lens: Lens, screen: Screen) -> TransportMap:
-    """The inverse of such a map at corners of the target's pixels."""
+    """Return the inverse of the map of `map_to_target` at the corners of the target's pixels."""
     screen = imaged(lens, screen)
     corners = pixel_corners(screen)
     if not screen.plane.is_level:
@@ -348,7 +347,7 @@ def sent_from_entrance(mapping: Mapping, lens: Lens, screen: Screen) -> Transpor
 
 
 def aim_points(mapping: Mapping, lens: Lens, screen: Screen, x: Tensor, y: Tensor) -> Tensor:
-    """(2, …) the points on the screen (mm) to which the map sends the points (x, y) (mm)."""
+    """Return the points of the screen (2, …) mm to which the map of `map_to_target` sends points x, y (…) mm."""
     screen, sent = imaged(lens, screen), mapping(*(p.detach().cpu().double().numpy() for p in (x, y)))
     if not screen.plane.is_level:
         sent = screen.plane.from_seen(*sent, lens.front.z)

@@ -1,17 +1,19 @@
-"""Light of a source of some size: the light of its middle, blurred by an image of the source that varies slowly.
+"""The picture of a source of finite size: the picture of its centre, blurred by a slowly varying image of the source.
 
-All rays through one place of the back share its slope.  Where the light of the source's middle lands at t through a
-place, that of its point s lands at t + δ(t, s), and δ changes slowly from place to place, however rough the face is:
+All rays through one point of the back are refracted by the same slope.  If the light of the centre of the source lands
+at t through this point, the light of its point s lands at t + δ(t, s), and δ varies slowly over the target, however
+rough the face is.  So with the picture E_0 of the centre
 
-    E(t) = ∫ K(t', t - t') E_0(t') dt',     K(t', ·) the density of δ(t', s) over the points s of the source.
+    E(t) = ∫ K(t', t - t') E_0(t') dt',     K(t', ·) the density of δ(t', s) over the points s of the source,
 
-So one sheet of tubes is traced and cut at pixels, that of E_0, instead of one for each of many points.  Between nodes
-t_n over the screen K is interpolated by hats a_n, K(t', ·) = Σ_n a_n(t') K_n, which makes E = Σ_n K_n * (a_n E_0), a
-few Fourier transforms.  K_n is the image through that place of the back whose light lands nearest to t_n: δ and flux
-there are biquadratic in s through 3 x 3 points of the source, and stand for as many points as a smooth image needs.
+which takes one sheet of tubes instead of one for each of many points.  K is interpolated between nodes t_n over the
+screen by hat functions a_n, K(t', ·) = Σ_n a_n(t') K_n.  Then E = Σ_n K_n * (a_n E_0), a few Fourier transforms; this
+operator is B.  K_n is the image of the source through the point of the back whose light lands nearest to t_n.  There δ
+and the flux are biquadratic in s through 3 x 3 points of the source, evaluated at as many points as a smooth image
+needs.
 
-What this leaves out is small and changes slowly while a lens is tailored.  It is measured at the start of a round, by
-rays from points of the source, and stays in the merit as a constant picture: E = B E_0 + (E_rays - B E_0 of the start).
+The error of this model is small and varies slowly during tailoring.  Rays from points of the source measure it at the
+start of a round, and it is added as a constant picture: E = B E_0 + (E_rays - B E_0 at the start).
 """
 
 from __future__ import annotations
@@ -36,51 +38,51 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import in_pairs
 
-NODES = 5  # a side, from border to border of the screen, between which images are interpolated
-PLACES = 32  # a side of the back, through which they are looked for
-APART = 0.7  # of the source's half width and height: distance of the 3 x 3 points whose light is traced
-PAIRS = 256  # of points that make a smooth image
-FINER = 5  # an odd number
-SIDE = 1448  # rays a side of each of the two sets that tell what the images leave out
-POINTS = 256  # of the source in each set
-SMOOTH = 0.15  # of the image's reach in pixels: standard deviation by which that picture is smoothed
-ROOM, BYTES = 2 << 30, 8  # bytes of the transforms of all images, and of each at a place
-LEAST_BORDER = 16  # pixels
-SEED = 500_009  # added to the seed: rays that no judge sees
+NODES = 5  # nodes a side, from border to border of the screen
+IMAGE_GRID = 32  # points a side of the back, through which the images of the source are traced
+POINT_DISTANCE = 0.7  # distance of the 3 x 3 points of the source from its centre, in half widths
+IMAGE_PAIRS = 256  # pairs of points of the source in an image
+PIXEL_PARTS = 5  # parts of a pixel a side in the images; odd
+ERROR_RAYS = 1448  # rays a side in each of the two sets that measure the error of the blur
+ERROR_POINTS = 256  # points of the source in each set
+ERROR_SMOOTHING = 0.15  # standard deviation of the smoothing of this error, in radii of the image
+MAX_BYTES, VALUE_BYTES = 2 << 30, 8  # limit for the transforms of all images, and size of one value (bytes)
+MIN_BORDER = 16  # smallest border (pixels)
+SEED_OFFSET = 500_009  # offset of the seed, so that these rays differ from those that verify the lens
 
 
 @dataclass(frozen=True)
 class Spread:
-    """A source of some size about its middle."""
+    """Source of finite size, with the light of its centre."""
 
-    source: Emitter  # of this size
-    centre: tuple[Channel, ...]  # the light of its middle, one channel a line
-    draw: Draw  # of its points
+    source: Emitter
+    centre: tuple[Channel, ...]  # light of the centre of the source, one channel per spectral line
+    draw: Draw  # function that draws points of the source
 
 
 @dataclass(frozen=True, eq=False)
-class Blur:
-    """B: from the light of the source's middle on a screen with a border to that of the whole source on the screen."""
+class BlurOperator:
+    """Operator B from the picture of the source's centre, on a screen with a border, to that of the whole source."""
 
-    border: int  # pixels around the screen, whose light reaches onto it
-    hats: tuple[np.ndarray, np.ndarray]  # (nodes, rows + 2 border), (nodes, columns + 2 border)
-    spectra: np.ndarray  # (nodes, nodes, …) Fourier transform of each K_n
-    size: tuple[int, int]  # of the transforms
+    border: int  # width of the border whose light is blurred onto the screen (pixels)
+    hats: tuple[np.ndarray, np.ndarray]  # hat functions, (nodes, rows + 2 border) and (nodes, columns + 2 border)
+    spectra: np.ndarray  # Fourier transforms of the images K_n, (nodes, nodes, …)
+    size: tuple[int, int]  # size of the transforms
 
     def forward(self, light: np.ndarray) -> np.ndarray:
-        """(rows, columns) of light (rows + 2 border, columns + 2 border)."""
-        waves = scipy.fft.rfft2(self._shared(light), self.size)
+        """Apply B to light (rows + 2 border, columns + 2 border); return a picture (rows, columns)."""
+        waves = scipy.fft.rfft2(self._times_hats(light), self.size)
         return self._inside(scipy.fft.irfft2((waves * self.spectra).sum((0, 1)), self.size))
 
     def adjoint(self, g: np.ndarray) -> np.ndarray:
-        """The transpose of `forward`."""
+        """Apply the transpose of `forward`."""
         waves = scipy.fft.rfft2(np.pad(g, self.border), self.size)
         back = scipy.fft.irfft2(waves * self.spectra.conj(), self.size)
         rows, columns = (side + 2 * self.border for side in g.shape)
-        return self._shared(back[..., :rows, :columns]).sum((0, 1))
+        return self._times_hats(back[..., :rows, :columns]).sum((0, 1))
 
-    def _shared(self, light: np.ndarray) -> np.ndarray:
-        """Light (…, rows, columns) times the hats of each node."""
+    def _times_hats(self, light: np.ndarray) -> np.ndarray:
+        """Return light (…, rows, columns) times the hat function of each node."""
         down, across = self.hats
         return light * down[:, None, :, None] * across[None, :, None, :]
 
@@ -89,11 +91,11 @@ class Blur:
         return wide[p : rows - p, p : columns - p]
 
 
-class _Blurred(torch.autograd.Function):
-    """B of a picture, differentiable in it."""
+class _BlurFunction(torch.autograd.Function):
+    """Operator B as a differentiable function."""
 
     @staticmethod
-    def forward(ctx: Any, light: Tensor, blur: Blur) -> Tensor:
+    def forward(ctx: Any, light: Tensor, blur: BlurOperator) -> Tensor:
         ctx.blur = blur
         return torch.from_numpy(blur.forward(light.detach().cpu().numpy()).copy()).to(light.device)
 
@@ -103,13 +105,13 @@ class _Blurred(torch.autograd.Function):
         return torch.from_numpy(ctx.blur.adjoint(g.cpu().numpy())).to(g.device), None
 
 
-def blurred(light: Tensor, blur: Blur) -> Tensor:
-    """B of the light (rows + 2 border, columns + 2 border) of a source's middle, differentiable in it."""
-    return _Blurred.apply(light, blur)
+def blurred(light: Tensor, blur: BlurOperator) -> Tensor:
+    """Blur the picture of the source's centre, (rows + 2 border, columns + 2 border); differentiable."""
+    return _BlurFunction.apply(light, blur)
 
 
-def bordered(screen: Screen, border: int) -> Screen:
-    """The screen with so many pixels more on each side."""
+def with_border(screen: Screen, border: int) -> Screen:
+    """Return the screen with `border` more pixels on each side."""
     per_x, per_y = screen.per_unit
     x, y = screen.x, screen.y
     return replace(
@@ -119,26 +121,27 @@ def bordered(screen: Screen, border: int) -> Screen:
 
 
 @dataclass(frozen=True, eq=False)
-class Images:
-    """Images of a source through places of the back, about where the light of its middle lands."""
+class SourceImages:
+    """Images of the source through points of the back, relative to the landing point of the centre's light."""
 
-    at: Tensor  # (2, places) where that is, in pixels: columns, rows
-    offset: Tensor  # (2, 9, places) δ of 3 x 3 points of the source, in pixels
-    share: Tensor  # (9, places) flux of each over that of the middle
+    at: Tensor  # (2, points) landing points of the centre's light (column, row) in pixels
+    offset: Tensor  # (2, 9, points) displacement δ of 3 x 3 points of the source, in pixels
+    share: Tensor  # (9, points) flux of each of these over that of the centre
 
     @classmethod
-    def of(cls, source: Emitter, channel: Channel, lens: Lens, screen: Screen) -> Images:
-        """Through the places that light of the middle and of all nine points gets through."""
+    def of(cls, source: Emitter, channel: Channel, lens: Lens, screen: Screen) -> SourceImages:
+        """Trace the images through the points of the back that the light of all ten source points passes."""
         a, b = source.extent.half_extent
-        points = [(i * APART, j * APART) for j in (-1, 0, 1) for i in (-1, 0, 1)]
+        points = [(i * POINT_DISTANCE, j * POINT_DISTANCE) for j in (-1, 0, 1) for i in (-1, 0, 1)]
         nine = (replace(source.element(a * u, b * v), wavelength=channel.source.wavelength) for u, v in points)
-        pixel, flux = seen_through([channel, *(replace(channel, source=one) for one in nine)], lens, screen, n=PLACES)
+        ten = [channel, *(replace(channel, source=one) for one in nine)]
+        pixel, flux = seen_through(ten, lens, screen, n=IMAGE_GRID)
         seen = (flux > 0).all(0)
         pixel, flux = pixel[..., seen].cpu(), flux[:, seen].cpu()
         return cls(pixel[:, 0], pixel[:, 1:] - pixel[:, :1], flux[1:] / flux[0])
 
     def nearest(self, column: float, row: float) -> tuple[Tensor, Tensor]:
-        """(offset (2, 9), share (9,)) of the image that lies nearest; of a point if none is seen."""
+        """Return offset (2, 9) and share (9,) of the image nearest to a pixel; those of a point source if none."""
         if not self.at.shape[1]:
             return torch.zeros(2, 9, dtype=torch.float64), torch.ones(9, dtype=torch.float64)
         place = int(torch.argmin((self.at[0] - column) ** 2 + (self.at[1] - row) ** 2))
@@ -146,88 +149,88 @@ class Images:
 
 
 def _biquadratic(points: Sequence[tuple[float, float]]) -> Tensor:
-    """(9, points) weights of the values at the 3 x 3 points: Lagrange's polynomials in both coordinates."""
+    """Return the weights (9, points) of the 3 x 3 values: Lagrange polynomials in both coordinates."""
+    d = POINT_DISTANCE
     axes = [
-        (u * (u - APART) / (2 * APART**2), 1 - (u / APART) ** 2, u * (u + APART) / (2 * APART**2))
+        (u * (u - d) / (2 * d**2), 1 - (u / d) ** 2, u * (u + d) / (2 * d**2))
         for u in torch.tensor(points, dtype=torch.float64).T
     ]
     return torch.stack([along * across for across in axes[1] for along in axes[0]])
 
 
-def blurs(spread: Spread, lens: Lens, screen: Screen) -> tuple[Blur, ...]:
-    """B of each channel of the spread, for a lens; all of one border."""
+def blurs(spread: Spread, lens: Lens, screen: Screen) -> tuple[BlurOperator, ...]:
+    """Return B for each channel of a source and a lens, all with the same border."""
     unit = Circle(1.0) if spread.source.extent.is_round else Rectangle(2.0, 2.0)
-    dots = _biquadratic(in_pairs(unit, PAIRS))
+    dots = _biquadratic(in_pairs(unit, IMAGE_PAIRS))
     nodes = [[k / (NODES - 1) * side for k in range(NODES)] for side in screen.shape]
     kernels = []
     for channel in spread.centre:
-        seen = Images.of(spread.source, channel, lens, screen)
+        seen = SourceImages.of(spread.source, channel, lens, screen)
         near = [seen.nearest(column, row) for row in nodes[0] for column in nodes[1]]
         kernels.append([tuple((part[..., None] * dots).sum(-2) for part in image) for image in near])
     reach = max(float(offset.abs().max()) for images in kernels for offset, _ in images)
     border = min(math.ceil(reach) + 2, widest(screen, len(kernels)))
-    return tuple(_blur(images, screen, border) for images in kernels)
+    return tuple(_operator(images, screen, border) for images in kernels)
 
 
 def widest(screen: Screen, lines: int) -> int:
-    """The widest border (pixels) of the transforms: no wider than the screen, and of ROOM bytes for all lines.
+    """Return the largest border (pixels): no wider than the screen, and within MAX_BYTES bytes for all spectral lines.
 
-    Light that is shifted by more than the screen's width comes from beside it.  Near a tilted plane that some light
-    grazes, images would have no end.
+    At a tilted target that some light grazes, the images have no bound of their own.
     """
-    side = math.sqrt(ROOM / (lines * NODES**2 * BYTES))
-    return max(min(max(screen.shape), int((side - max(screen.shape)) / 4)), LEAST_BORDER)
+    side = math.sqrt(MAX_BYTES / (lines * NODES**2 * VALUE_BYTES))
+    return max(min(max(screen.shape), int((side - max(screen.shape)) / 4)), MIN_BORDER)
 
 
-def _blur(images: Sequence[tuple[Tensor, Tensor]], screen: Screen, border: int) -> Blur:
-    """From the dots of each node: offset (2, dots) in pixels, share (dots,) of the middle's flux density.
+def _operator(images: Sequence[tuple[Tensor, Tensor]], screen: Screen, border: int) -> BlurOperator:
+    """Make B from the image at each node: offset (2, dots) in pixels, share (dots,) of the centre's flux density.
 
-    Each dot is shared by a tent among parts of a pixel, FINER a side, whose own blur does not count.
+    A tent function distributes each dot over parts of a pixel, PIXEL_PARTS a side, whose blur is negligible.
     """
     hats = tuple(_hats(side, border) for side in screen.shape)
     side = 2 * border + 1
     size = tuple(scipy.fft.next_fast_len(hat.shape[1] + side, real=True) for hat in hats)
-    own = Screen(0.0, (-side / 2, side / 2), (-side / 2, side / 2), FINER * side)
+    own = Screen(0.0, (-side / 2, side / 2), (-side / 2, side / 2), PIXEL_PARTS * side)
     spectra = np.zeros((len(images), size[0], size[1] // 2 + 1), dtype=complex)
     for spectrum, (offset, share) in zip(spectra, images, strict=True):
         down = offset * torch.tensor([[1.0], [-1.0]])  # rows count downwards
         dots = Landed(down.contiguous(), share / share.numel(), torch.zeros(share.shape, dtype=torch.uint8))
-        waves = scipy.fft.rfft(_about_zero(tent(dots, own).numpy(), FINER * size[1], axis=1))
-        waves = scipy.fft.fft(_about_zero(waves[:, : spectrum.shape[1]], FINER * size[0], axis=0), axis=0)
+        waves = scipy.fft.rfft(_about_zero(tent(dots, own).numpy(), PIXEL_PARTS * size[1], axis=1))
+        waves = scipy.fft.fft(_about_zero(waves[:, : spectrum.shape[1]], PIXEL_PARTS * size[0], axis=0), axis=0)
         spectrum[:] = waves[np.arange(size[0]) - size[0] * (np.arange(size[0]) >= (size[0] + 1) // 2)]
-    return Blur(border, hats, spectra.reshape(NODES, NODES, *spectra.shape[1:]), size)
+    return BlurOperator(border, hats, spectra.reshape(NODES, NODES, *spectra.shape[1:]), size)
 
 
 def _about_zero(values: np.ndarray, n: int, axis: int) -> np.ndarray:
-    """An odd number of values along an axis, with zeros to n behind them, turned so that the middle one is first."""
+    """Pad an odd number of values along an axis with zeros to n, and roll them so that the middle one is first."""
     odd = values.shape[axis]
     return np.roll(np.pad(values, [(0, n - odd if k == axis else 0) for k in (0, 1)]), -(odd // 2), axis)
 
 
 def _hats(side: int, border: int) -> np.ndarray:
-    """(NODES, side + 2 border) hats about NODES places from border to border, constant beyond the outer ones."""
-    place = np.clip((np.arange(-border, side + border) + 0.5) / side, 0, 1) * (NODES - 1)
-    return np.maximum(0, 1 - np.abs(place - np.arange(NODES)[:, None]))
+    """Return the hat functions (NODES, side + 2 border) of NODES nodes, constant outside the outer ones."""
+    position = np.clip((np.arange(-border, side + border) + 0.5) / side, 0, 1) * (NODES - 1)
+    return np.maximum(0, 1 - np.abs(position - np.arange(NODES)[:, None]))
 
 
 @torch.no_grad()
-def unseen(by_images: Tensor, draw: Draw, lens: Lens, screen: Screen, *, border: int, seed: int) -> Tensor:
-    """(rows, columns) of the picture, what the images leave out, by two sets of rays; nothing where noise hides it.
+def blur_error(by_images: Tensor, draw: Draw, lens: Lens, screen: Screen, *, border: int, seed: int) -> Tensor:
+    """Return the error of B in a picture, (rows, columns), measured by two sets of rays; 0 if noise hides it.
 
-    by_images: the picture by them, over the light that faces and glass leave; border: theirs.
+    by_images: the picture B E_0, relative to the transmitted light; border: the border of B.
 
-    d_i = E_i - B E_0 of two sets share what is left out, and no noise: of their mean, smoothed, the share
-    d_1 · d_2 / |(d_1 + d_2) / 2|² is taken.
+    The differences d_i = E_i - B E_0 of both sets contain the same error and independent noise.  Their smoothed mean is
+    therefore scaled by d_1 · d_2 / |(d_1 + d_2) / 2|².
     """
-    here, off = by_images.cpu(), []
+    picture, errors = by_images.cpu(), []
     for k in range(2):
-        points = draw(POINTS, seed + SEED + k)
-        n = max(1, round(a_side(points) * SIDE))
-        rays = simulated(lens, points, screen, n=n, seed=seed + SEED + k)
+        points = draw(ERROR_POINTS, seed + SEED_OFFSET + k)
+        n = max(1, round(a_side(points) * ERROR_RAYS))
+        rays = simulated(lens, points, screen, n=n, seed=seed + SEED_OFFSET + k)
         left = sum(rays.flux[line] for line in ("on target", "off target", "total internal reflection"))
-        missed = (rays.box / left - here).numpy() if left > 0 else np.zeros(here.shape)
-        off.append(gaussian_filter(missed, SMOOTH * (border - 2)))
-    mean = (off[0] + off[1]) / 2
+        error = (rays.box / left - picture).numpy() if left > 0 else np.zeros(picture.shape)
+        errors.append(gaussian_filter(error, ERROR_SMOOTHING * (border - 2)))
+    mean = (errors[0] + errors[1]) / 2
     noisy = float((mean**2).sum())
-    share = max(float((off[0] * off[1]).sum()), 0.0) / noisy if noisy > 0 else 0.0
+    share = max(float((errors[0] * errors[1]).sum()), 0.0) / noisy if noisy > 0 else 0.0
     return (torch.from_numpy(mean) * share).to(by_images.device)

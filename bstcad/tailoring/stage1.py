@@ -32,12 +32,12 @@ from bstcad.optics.trace import clear_window, trace
 from bstcad.scene.blank import CONIC_CONSTANTS
 from bstcad.scene.quality import COARSEST_GRID
 from bstcad.scene.scene import SEARCH_RANGE
-from bstcad.tailoring.machinability import moved_clear
+from bstcad.tailoring.machinability import place_back
 from bstcad.tailoring.merit import landing
-from bstcad.tailoring.reachable import coarse
+from bstcad.tailoring.reachable import resampled
 from bstcad.tailoring.run import Parameters, Step, Task
 from bstcad.tailoring.slope_fit import Fit, tailor_to_aim
-from bstcad.tailoring.slope_map import SlopeMap, aim_points, face_grid, lit_window, map_to_target, slope_map, sloped
+from bstcad.tailoring.slope_map import SlopeMap, aim_points, face_grid, fit_to_map, lit_window, map_to_target, slope_map
 from bstcad.transport.bfm import Step as TransportStep
 from bstcad.transport.mapping import Mapping
 
@@ -108,7 +108,7 @@ def doubtful(task: Task, lens: Lens, judged: float, state: SlopeRound) -> bool:
     The RRMSD counts at no more pixels than the net has control points: no method shows finer detail.
     """
     goal = task.goals[0]
-    few = coarse(goal, most=max(both(task.knobs.levels[-1])))
+    few = resampled(goal, pixels=max(both(task.knobs.levels[-1])))
     if judged > RETRY_RRMSD and few.receiver.shape != goal.receiver.shape:
         judged = replace(task, goals=(few,)).rrmsd(lens)
     return not judged <= RETRY_RRMSD or state.wanted.moved > RETRY_CHANGE  # NaN: no light on the target
@@ -127,7 +127,7 @@ def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> It
     while turn < knobs.rounds:
         if turn >= done:
             lens, wanted = _round(task, lens, wanted, turn)
-            lens = moved_clear(lens, z, task.least, task.bounds)  # the next round takes the move into account
+            lens = place_back(lens, z, task.least, task.bounds)  # the next round takes the move into account
             task.tidy()
         turn = max(turn + 1, knobs.rounds - FINE_ROUNDS if wanted.moved <= SETTLED_CHANGE else 0)
         yield Step(
@@ -142,7 +142,7 @@ def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> It
 def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[Lens, SlopeMap]:
     """Run one round; return the lens and the map that it follows."""
     knobs, source, goal, left = task.knobs, task.heaviest.source, task.goals[0], task.knobs.rounds - turn
-    coarse = max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left - 1, 2))
+    cells = max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left - 1, 2))
     m = knobs.levels[max(-left, -len(knobs.levels))] if left <= FINE_ROUNDS else knobs.levels[0]
 
     def progress(s: TransportStep) -> None:
@@ -151,14 +151,14 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[
     lens = task.refined(lens, m)
     window = lit_window(source, lens)
     wanted = slope_map(
-        source, lens, window, picture=goal.picture, screen=goal.receiver, n=coarse, previous=wanted,
+        source, lens, window, picture=goal.picture, screen=goal.receiver, n=cells, previous=wanted,
         iterations=knobs.transport_iterations, progress=progress, hasty=task.hasty,
     )  # fmt: skip
     sides = [min(2 * points, knobs.rays) for points in both(m)]
     parts = math.ceil(max(sides) / MAX_RAY_CELLS)
     grid = face_grid(source, lens, window, (math.ceil(sides[0] / parts), math.ceil(sides[1] / parts)))
     grazing = GRAZING if task.edge is None else task.edge.angle
-    return sloped(lens, wanted, grid, *(FINE if left <= FINE_ROUNDS else COARSE), parts, grazing), wanted
+    return fit_to_map(lens, wanted, grid, *(FINE if left <= FINE_ROUNDS else COARSE), parts, grazing), wanted
 
 
 def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
@@ -181,7 +181,7 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
             side=min(3 * max(both(m)), max(2 * max(both(m)), knobs.rays)),  # many rays may leave through the sides
             iterations=knobs.transport_iterations,
         )
-        lens = moved_clear(tailor_to_aim(lens, rays, wanted, goal.receiver.plane), z, task.least, task.bounds)
+        lens = place_back(tailor_to_aim(lens, rays, wanted, goal.receiver.plane), z, task.least, task.bounds)
     return lens, mapping
 
 

@@ -33,11 +33,11 @@ from bstcad.optics.sides import both, coarser
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.grazing import Grazing
-from bstcad.tailoring.machinability import excess, held, weight
+from bstcad.tailoring.machinability import active_bounds, excess, round_weight
 from bstcad.tailoring.merit import CoarseVariable, Merit, SobolevVariable, local_weight
 from bstcad.tailoring.minimise import Best, Reached, Search, lbfgs, minimise
 from bstcad.tailoring.net_variables import NetVariables, along_light
-from bstcad.tailoring.reachable import coarse
+from bstcad.tailoring.reachable import resampled
 from bstcad.tailoring.run import EVALUATED, Parameters, Step, Task
 from bstcad.tailoring.source_image import Spread
 
@@ -153,7 +153,7 @@ def coarse_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
 
 def with_pixels(task: Task, pixels: int) -> Task:
     """Return the task with its targets resampled to at most `pixels` along the longer side."""
-    return replace(task, goals=tuple(coarse(goal, pixels) for goal in task.goals))
+    return replace(task, goals=tuple(resampled(goal, pixels) for goal in task.goals))
 
 
 def round_shares(task: Task) -> Shares | None:
@@ -189,7 +189,7 @@ def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None
     if state is None:
         yield Step(lambda: lens)
     for number in range(place.round, len(rounds)):
-        now, bound_weight = rounds[number], weight(number, len(rounds))
+        now, bound_weight = rounds[number], round_weight(number, len(rounds))
         task, part = now.task, now.name
         if state is None:
             place = replace(place, round=number, round_end=place.done + now.evaluations, sheet_from=Parameters.of(lens))
@@ -206,7 +206,7 @@ def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None
             if merit is None:
                 merit = now.merit(launched)
                 task.tidy()
-            bounds = held(begun, task.bounds, task.least)
+            bounds = active_bounds(begun, task.bounds, task.least)
             problem = Problem(begun, merit, bounds, bound_weight, grazing=grazing)
             for reached, step in _search(now, problem, variables, place, total=total, state=state):
                 yield replace(step, part=part)

@@ -1,16 +1,16 @@
-"""Stage 1 of a lens whose front is freeform: the front brings the light to its places on the back, which turns it.
+"""Stage 1 of a lens with two freeform faces: the front sends the light to its points on the back, which turns it.
 
-Let the light behind the lens be known (light_behind.py): through each place t of a target one ray, which
-followed back meets the back face at b(t).  The front has to send each b(t) its light: a transport in slope coordinates
-as in slope_map.py, from points q of the front to the slopes p(q, b) that Snell's law asks for there,
+The rays behind the lens are known (light_behind.py): one through each point t of a target, which traced backwards meets
+the back at b(t).  The front has to send the light of t to b(t).  This is a transport problem in slope coordinates as in
+slope_map.py, from points q of the front to the slopes p(q, b) that follow from Snell's law,
 
     y = -(p(q, b) - ∇g(q)),    ∇g(q) ≈ p(q, r(q)) - r(q) ∂p/∂b,
 
-r the affine map that stretches the front's light over that of the back: y hardly depends on q for a fixed b.  (The
-sign: a front turns light against its slope.)  The back then has to turn each ray that arrives into the wanted
-direction, which is a matter of its slopes alone: of two congruences of rays with eikonals Φ in the glass and Φ' behind
-it every level set of n Φ - Φ' is such a face.  The back moves b(t), and so the rounds repeat, each from the faces and
-the places of the round before.
+with r the affine map that stretches the light on the front over that on the back, so that y hardly depends on q for a
+fixed b.  (The sign: a front turns light against its slope.)  Then the back is fitted to the slopes that turn each
+arriving ray into its direction behind the lens.  Such a face exists: if Φ is the eikonal of the rays in the glass and
+Φ' that of the rays behind it, each level set of n Φ - Φ' is one.  A new back changes b(t), and so the rounds repeat,
+each from the faces and the points of the last round.
 """
 
 from __future__ import annotations
@@ -34,63 +34,63 @@ from bstcad.optics.reach import kept_from_reflection, slopes_towards
 from bstcad.scene.quality import COARSEST_GRID
 from bstcad.tailoring import stage1
 from bstcad.tailoring.light_behind import LightBehind, light_for_task, without_crossings
-from bstcad.tailoring.machinability import moved_clear
+from bstcad.tailoring.machinability import place_back
 from bstcad.tailoring.run import Parameters, Step, Task
 from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.tailoring.slope_map import (
-    GATHERED,
-    SAMPLES,
+    GATHERING_FIT,
+    GATHERING_SAMPLES,
     FaceGrid,
     SlopeMap,
     corners_of,
     face_grid,
     fit_gathering,
+    fit_to_map,
     lit_window,
     rays_at,
-    sloped,
     square_grid,
     transport_slopes,
 )
 from bstcad.transport.bfm import Step as TransportStep
 
-NUDGE = 1e-4  # of the thickness: step of the difference quotients of the slopes
-# Of these rounds the last one is on all of the transport's grid and of the nets, the others on half of the grid and on
-# the last net but one, until both faces fit each other.  (After two such rounds alone, two photographs have half as
-# much error again by blocks of 4 and of 32 pixels.)
+DIFFERENCE_STEP = 1e-4  # step of the difference quotients of the slopes, relative to the thickness
+# Number of fine rounds: the last one on the full grid and nets, the others on half of the grid and the second finest
+# nets, until both faces fit each other.  (With two, two photographs have 1.5 times the error by blocks of 4 to 32
+# pixels.)
 FINE_ROUNDS = 4
-SETTLED = 0.003  # half widths of the front, RMS: the coarse rounds end where places moved by less
+SETTLED_CHANGE = 0.003  # RMS change of q(t), in half widths of the front, below which the coarse rounds end
 
 Grid = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
 class FrontRound:
-    """Where the stage stands between two rounds."""
+    """State of stage 1 with two freeform faces between two rounds."""
 
-    round: int  # of those that are done
+    round: int  # number of rounds done
     lens: Parameters
-    wanted: SlopeMap  # that the front follows; its places are q(t) (mm) of the rays behind the lens
-    back: Grid  # b(t) (mm) through those of target[0]
+    wanted: SlopeMap  # map of the front; its places are q(t) (mm) for the rays behind the lens
+    back: Grid  # points b(t) (mm) of the back for the pixel corners of the first target
 
 
 def steps(task: Task, lens: Lens, state: FrontRound | None = None) -> Iterator[Step]:
-    """Stage 1 of a lens with a freeform front, or further from a state: its rounds.
+    """Yield the steps of stage 1 for a lens with a freeform front, from its start or from a saved state on.
 
-    For one goal, and where light does not cross two tailored faces one after the other, the last net does all the work.
+    With one goal, or if light does not cross both faces in succession, stage 1 tailors the last net alone (stage1.py).
     """
     lens = task.heaviest.through(lens)
     if not (lens.shapes_both and task.several):
         alone = replace(task.refined(lens, task.knobs.levels[-1]), shaped=lens.freeform[-1:])
         yield from stage1.steps(task, alone, state)
         return
-    for last in follow(task, lens, state):
+    for last in follow_rays(task, lens, state):
         yield last
     if not task.hasty:
         yield replace(last, state=None, judged=task.rrmsd(last.lens))
 
 
-def follow(task: Task, lens: Lens, state: FrontRound | None) -> Iterator[Step]:
-    """The rounds; all but FINE_ROUNDS work on coarse grids and nets, and end once they are settled."""
+def follow_rays(task: Task, lens: Lens, state: FrontRound | None) -> Iterator[Step]:
+    """Yield a step per round; all but FINE_ROUNDS use coarse grids and nets, and end once the map settles."""
     task = task.aimed(lens)
     knobs, z, done, wanted = task.knobs, lens.back.z, 0, None
     near = min(task.goals, key=lambda goal: goal.receiver.plane.throw(0.0))
@@ -110,9 +110,9 @@ def follow(task: Task, lens: Lens, state: FrontRound | None) -> Iterator[Step]:
             fit = stage1.FINE if fine else stage1.COARSE
             places = None if wanted is None else wanted.places
             lens, wanted, b = _round(task, lens, light, places, turn=turn, cells=cells, fit=fit)
-            lens = moved_clear(lens, z, task.least, task.bounds)
+            lens = place_back(lens, z, task.least, task.bounds)
             task.tidy()
-        turn = max(turn + 1, knobs.rounds - FINE_ROUNDS if wanted.moved <= SETTLED else 0)
+        turn = max(turn + 1, knobs.rounds - FINE_ROUNDS if wanted.moved <= SETTLED_CHANGE else 0)
         yield Step(
             partial(task.refined, lens, knobs.levels[-1]), FrontRound(turn, Parameters.of(lens), wanted, b),
             mapping=wanted.mapping, places=b, progress=("stage 1", turn, knobs.rounds, ""),
@@ -123,7 +123,7 @@ def _round(
     task: Task, lens: Lens, light: LightBehind, places: Grid | None, *, turn: int, cells: int,
     fit: tuple[Fit, float],
 ) -> tuple[Lens, SlopeMap, Grid]:  # fmt: skip
-    """One round: the lens, the map that its front follows, and b(t)."""
+    """Run one round; return the lens, the map of its front, and b(t) for the pixel corners of the first target."""
     source, front = task.heaviest.source, lens.shaping("front")
     window, back = lit_window(source, front), light.intersect(lens.back)
     through = light.sampled_at(task.goals[0].receiver, back[:2])
@@ -136,7 +136,7 @@ def _round(
         iterations=task.knobs.transport_iterations, progress=progress,
     )  # fmt: skip
     own = [min(2 * max(net.shape), task.knobs.rays) for net in lens.nets]
-    lens = lens.with_front(sloped(front, wanted, face_grid(source, front, window, own[0]), *fit).front)
+    lens = lens.with_front(fit_to_map(front, wanted, face_grid(source, front, window, own[0]), *fit).front)
     window = lit_window(source, lens)
     grid = face_grid(source, lens, window, own[-1])
     law = lens.last_freeform.law
@@ -154,10 +154,11 @@ def front_map(
     source: Emitter, lens: Lens, window: Rectangle, picture: np.ndarray, back: np.ndarray, n: int,
     places: Grid | None, **solver,
 ) -> SlopeMap:  # fmt: skip
-    """The slopes of the front that send the light to its places on the back, by transport on n x n cells.
+    """Return the map of the front that sends the light to its points on the back, by transport on n x n cells.
 
-    lens: its front alone is free; picture: (r, c) the light between each four rays, row 0 = y max; back: (3, c + 1, r +
-    1) b of each ray (mm); places: its q in the round before.  The map's own places are q.
+    lens: the lens with only its front free.  picture: (r, c) flux between each four rays, row 0 = y max.
+    back: (3, c + 1, r + 1) points b of the rays (mm).  places: their q in the last round; None: r inverted.
+    The `places` of the result are the new q.
     """
     grid, lit = square_grid(source, lens, window, n), corners_of(picture)
     low, high = (np.array([f(p[lit]) for p in back[:2]]) for f in (np.min, np.max))
@@ -172,31 +173,31 @@ def front_map(
 
 
 def _slopes_at(rays: Rays, aims: Tensor, lens: Lens) -> tuple[Tensor, Tensor]:
-    """The slopes that send rays at the front to aims (3, …) mm in space."""
-    way = aims - _in_space(rays)
-    return slopes_towards(rays, way / torch.sqrt((way * way).sum(0)), lens.last_freeform.law)
+    """Return the slopes of the front that send rays to points (3, …) mm in space."""
+    path = aims - _in_space(rays)
+    return slopes_towards(rays, path / torch.sqrt((path * path).sum(0)), lens.last_freeform.law)
 
 
 def _in_space(rays: Rays) -> Tensor:
-    """(3, …) the rays' places in space (mm)."""
+    """Return the positions of the rays in space, (3, …) mm."""
     return torch.stack([*rays.position[:2], rays.above(0.0)])
 
 
 def _gathering(grid: FaceGrid, lens: Lens, back: Tensor, stretch: np.ndarray, shift: np.ndarray) -> BSplineSurface:
-    """g of the module's docstring, as a net of GATHERING points a side over the lit part of a grid."""
-    thin = tuple(slice(step // 2, None, step) for step in (max(1, n // SAMPLES) for n in grid.shape))
+    """Return g of the module's docstring, a net of GATHERING_NET points a side over the lit part of a grid."""
+    thin = tuple(slice(step // 2, None, step) for step in (max(1, n // GATHERING_SAMPLES) for n in grid.shape))
     faces = replace(grid.at_face, **{k: getattr(grid.at_face, k)[(..., *thin)] for k in ("position", "direction")})
     x, y, z = _in_space(faces).cpu().double()
     height = float(total(back[2]) / back[2].numel())
     reference = torch.stack([stretch[0] * x + shift[0], stretch[1] * y + shift[1], torch.full_like(x, height)])
     lit = grid.density[thin] > 0
     z_x, z_y = _slopes_at(faces, reference, lens)
-    step = NUDGE * (height - float(total(z) / z.numel()))
+    step = DIFFERENCE_STEP * (height - float(total(z) / z.numel()))
     quotient = 0.0
-    for axis, here in enumerate((z_x, z_y)):  # ∂p/∂b, a number: the mean over the light
+    for axis, slope in enumerate((z_x, z_y)):  # ∂p/∂b, one number: its mean over the light
         nudge = torch.zeros((3, 1, 1), dtype=reference.dtype)
         nudge[axis] = step
-        there = _slopes_at(faces, reference + nudge, lens)[axis]
-        quotient += float(total((there - here)[lit]) / lit.sum()) / (2 * step)
+        shifted = _slopes_at(faces, reference + nudge, lens)[axis]
+        quotient += float(total((shifted - slope)[lit]) / lit.sum()) / (2 * step)
     wanted = (p - r * quotient for p, r in zip((z_x, z_y), reference[:2], strict=True))
-    return fit_gathering(grid, (x, y, *wanted, lit), GATHERED)
+    return fit_gathering(grid, (x, y, *wanted, lit), GATHERING_FIT)

@@ -20,8 +20,8 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Sphere
 from bstcad.scene.blank import Bounds
 from bstcad.tailoring import machinability
-from bstcad.tailoring.clearance import MARGIN, Cells, clearance, unit
-from bstcad.tailoring.machinability import excess, held, kept
+from bstcad.tailoring.clearance import MARGIN, CellGrid, clearance, unit
+from bstcad.tailoring.machinability import active_bounds, enforce_bounds, excess
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.stage2 import Problem
 from tests.lenses import half_over, net
@@ -75,7 +75,7 @@ def test_the_gradients_are_those_of_finite_differences(shaped, name, outline):
 def test_no_place_is_overlooked(outline):
     """The mean over all places of the grid, none of them ruled out."""
     lens, bounds = rough(outline), BOUNDS["thickness"]
-    grid, length, edge = Cells.over(lens), unit(lens, bounds), replace(bounds, edge=None)
+    grid, length, edge = CellGrid.over(lens), unit(lens, bounds), replace(bounds, edge=None)
     places = torch.tensor(QUARTERS, dtype=torch.float64)
     x, y = (
         ((torch.arange(n)[:, None] + places) * size - half).flatten()
@@ -119,8 +119,9 @@ def test_only_a_tailored_front_needs_a_bound_where_none_is_asked():
     asked = Bounds(slope=0.5, thinnest=0.3)
     both, front, back = (rough(shaped=shaped) for shaped in ((0, 1), (0,), None))
     assert [lens.shapes("front") for lens in (both, front, back)] == [True, True, False]
-    assert held(both, None, 0.5) == held(front, None, 0.5) == Bounds(thinnest=0.5)
-    assert held(back, None, 0.5) is None and held(back, asked, 0.5) == held(both, asked, 0.5) == asked
+    assert active_bounds(both, None, 0.5) == active_bounds(front, None, 0.5) == Bounds(thinnest=0.5)
+    assert active_bounds(back, None, 0.5) is None
+    assert active_bounds(back, asked, 0.5) == active_bounds(both, asked, 0.5) == asked
     assert not replace(both, reflects=True, shaped=None).shapes("front")
 
 
@@ -138,7 +139,7 @@ def crossing(outline, z=3.0, sides=(33, 21), shaped=(0, 1)):
 def test_faces_that_would_cross_make_way_for_each_other(shaped, outline):
     lens, bounds = crossing(outline, shaped=shaped), Bounds(thinnest=0.5)
     assert thickness_range(lens)[0] < 0
-    found = kept(lens, bounds)
+    found = enforce_bounds(lens, bounds)
     assert 0.5 <= thickness_range(found)[0] < 0.52  # bent no further than it takes
     assert found.back.z == lens.back.z  # no move
     for k, (after, before) in enumerate(zip((found.front, found.back), (lens.front, lens.back), strict=True)):
@@ -147,20 +148,20 @@ def test_faces_that_would_cross_make_way_for_each_other(shaped, outline):
 
 def test_a_lens_with_room_stays_as_it_is():
     lens = crossing(WHOLE, z=9.0)
-    assert kept(lens, Bounds(thinnest=0.5)) is lens
+    assert enforce_bounds(lens, Bounds(thinnest=0.5)) is lens
 
 
 def test_the_back_is_moved_as_the_last_resort(monkeypatch):
     """The back moves if bending does not suffice: the bending has hardly begun in this test."""
-    monkeypatch.setattr(machinability, "REPAIR", 1)
+    monkeypatch.setattr(machinability, "REPAIR_EVALUATIONS", 1)
     lens = crossing(Rectangle(8.0, 8.0))
-    found = kept(lens, Bounds(thinnest=0.5))
+    found = enforce_bounds(lens, Bounds(thinnest=0.5))
     assert found.back.z > lens.back.z and thickness_range(found)[0] >= 0.5
 
 
 def test_both_faces_are_bent_to_all_bounds():
     bounds = Bounds(concave=0.4, convex=0.5, slope=0.45, thinnest=0.6, thickest=4.5, edge=1.0)
-    found = kept(crossing(Rectangle(8.0, 8.0)), bounds)
+    found = enforce_bounds(crossing(Rectangle(8.0, 8.0)), bounds)
     assert excess(found, bounds).worst < 0
     assert 0.6 <= thickness_range(found)[0] <= thickness_range(found)[1] <= 4.5
 
@@ -170,7 +171,7 @@ def test_the_merit_of_two_faces_has_the_penalty_in_both():
     screen = Screen(120.0, (-12.1, 12.0), (-12.2, 12.1), 16)
     beam = Channel(Collimated(Rectangle(7.0, 7.0)), 1.5)
     merit = Merit.of((beam,), lens, 40, [Goal("target", screen, np.ones(screen.shape))], 0.03)
-    bounds = held(lens, None, 0.5)
+    bounds = active_bounds(lens, None, 0.5)
     free, bound = Problem(lens, merit), Problem(lens, merit, bounds, 100.0)
     start, over = [n.heights for n in lens.nets], excess(lens, bounds)
     (value, gradients, rrmsd), (more, own, same) = free(start), bound(start)

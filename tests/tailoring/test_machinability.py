@@ -19,7 +19,7 @@ from bstcad.report import record
 from bstcad.scene.blank import Bounds
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
-from bstcad.tailoring.machinability import RELIEF_SPARE, excess, kept, moved_clear
+from bstcad.tailoring.machinability import RELIEF_RESERVE, enforce_bounds, excess, place_back
 from tests import lenses
 from tests.conftest import DISK, SMALL, quick_effort
 
@@ -113,7 +113,7 @@ def test_the_report_says_so_from_the_file(bound):
     ids=("slope", "mould", "thickest", "edge"),
 )
 def test_each_bound_is_kept_to_where_the_free_lens_does_not(asked, kept_to, free):
-    assert not kept_to(free.lens) and kept_to(kept(free.lens, load(DISK, TINY | asked).lens.bounds))
+    assert not kept_to(free.lens) and kept_to(enforce_bounds(free.lens, load(DISK, TINY | asked).lens.bounds))
 
 
 def test_a_design_keeps_to_a_range_of_thickness():
@@ -133,14 +133,14 @@ def test_a_bound_that_no_lens_meets_with_its_light_on_the_target_is_refused():
 def test_where_bending_does_not_help_the_back_gets_flatter():
     """A random net for a tool as large as a house: what is left is nearly flat, and keeps to it."""
     bounds = Bounds(concave=1e-4, convex=1e-4)
-    lens = kept(rough(), bounds)
+    lens = enforce_bounds(rough(), bounds)
     assert excess(lens, bounds).worst < 0 and float(lens.back.heights.std()) < 0.01
 
 
 def test_a_front_that_no_flat_back_clears_is_refused():
     lens = replace(rough(), front=Sphere(0.0, 0.2))
     with pytest.raises(SceneError, match=r"^lens\.max_thickness: .* not even a flat back"):
-        kept(lens, Bounds(thinnest=1.0, thickest=1.5))
+        enforce_bounds(lens, Bounds(thinnest=1.0, thickest=1.5))
 
 
 def lens(front, outline=lenses.SQUARE, slope=0.3):
@@ -151,19 +151,19 @@ def lens(front, outline=lenses.SQUARE, slope=0.3):
     ("front", "outline"), [(Plane(18.0), lenses.SQUARE), (Sphere(18.0, 0.02), Circle(7.0))], ids=("plane", "sphere")
 )
 def test_it_keeps_the_least_thickness(front, outline):
-    moved = moved_clear(lens(front, outline), 20.0, 0.5)
+    moved = place_back(lens(front, outline), 20.0, 0.5)
     relief = 2 * 0.3 * outline.half_extent[0]
-    spare = describe(moved)["thickness_min"] - 0.5 - RELIEF_SPARE * relief
+    spare = describe(moved)["thickness_min"] - 0.5 - RELIEF_RESERVE * relief
     assert moved.back.z > 20.0 and abs(spare) < 2e-3  # mm; the round rim lies between the points looked at
 
 
 def test_a_lens_with_room_stays_where_it_was():
     roomy = lens(Plane(10.0))
-    stays = moved_clear(roomy, 20.0, 0.5)
+    stays = place_back(roomy, 20.0, 0.5)
     assert stays.back.z == 20.0 and torch.equal(stays.back.heights, roomy.back.heights)
 
 
 def test_it_comes_back_when_it_needs_less():
     flat = lens(Plane(18.0), slope=0.0)
     far = replace(flat, back=replace(flat.back, z=30.0))
-    assert moved_clear(far, 20.0, 0.5).back.z == 20.0
+    assert place_back(far, 20.0, 0.5).back.z == 20.0

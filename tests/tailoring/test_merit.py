@@ -115,7 +115,7 @@ def test_a_mode_is_scaled_by_its_laplacian(i, j):
     mode = torch.cos(i * u)[:, None] * torch.cos(j * u)
     even = SobolevVariable.of(FLAT, torch.ones((M, M), dtype=torch.float64))
     energy = 4 - 2 * math.cos(math.pi * i / M) - 2 * math.cos(math.pi * j / M)
-    torch.testing.assert_close(even.heights(mode), 0.5 * energy**-merit.EXPONENT * mode, rtol=0, atol=1e-12)
+    torch.testing.assert_close(even.heights(mode), 0.5 * energy**-merit.LAPLACIAN_POWER * mode, rtol=0, atol=1e-12)
 
 
 def test_steps_are_longer_where_the_picture_is_dark():
@@ -135,7 +135,7 @@ def test_black_and_unlit_parts_have_a_bounded_weight():
     picture = np.zeros((64, 64))
     picture[10, 10] = 1.0
     weight = local_weight(Collimated(Rectangle(16.0, 16.0)), lens, picture, Screen(100.0, (-8.0, 0.0), (-8.0, 8.0), 64))
-    assert float(weight.max()) == merit.MOST and float(weight.min()) >= 1 / merit.MOST
+    assert float(weight.max()) == merit.MAX_LOCAL_WEIGHT and float(weight.min()) >= 1 / merit.MAX_LOCAL_WEIGHT
     assert float(weight[-8:].mean()) == pytest.approx(1.0, abs=1e-6)  # what lands beside the screen
 
 

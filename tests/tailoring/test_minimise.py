@@ -152,13 +152,13 @@ def test_a_line_search_ends_at_a_jump_of_the_merit():
     def along(step):
         evaluation = yield Query([torch.tensor([step])])
         seen.append(step)
-        return of_lbfgs.Trial(step, evaluation.merit, 1e9, flat)
+        return of_lbfgs.LinePoint(step, evaluation.merit, 1e9, flat)
 
-    start, low = of_lbfgs.Trial(0.0, 0.0, -1.0, flat), of_lbfgs.Trial(1.0, -1.0, -1.0, flat)
-    zoom = of_lbfgs._zoom(along, start, low, of_lbfgs.Trial(2.0, 1e9, 1e9, flat))
+    start, low = of_lbfgs.LinePoint(0.0, 0.0, -1.0, flat), of_lbfgs.LinePoint(1.0, -1.0, -1.0, flat)
+    zoom = of_lbfgs._zoom(along, start, low, of_lbfgs.LinePoint(2.0, 1e9, 1e9, flat))
     next(zoom)
     with pytest.raises(StopIteration) as end:
         while True:
             zoom.send(Evaluation(1e9, [flat], Best()))
     assert end.value.value is low
-    assert 10 < len(seen) < of_lbfgs.SEARCH and min(seen) > 1.0
+    assert 10 < len(seen) < of_lbfgs.MAX_LINE_TRIALS and min(seen) > 1.0

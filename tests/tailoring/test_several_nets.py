@@ -21,7 +21,7 @@ from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
 from bstcad.optics.surfaces import Plane
 from bstcad.scene.quality import Tailoring
-from bstcad.tailoring.machinability import held, kept
+from bstcad.tailoring.machinability import active_bounds, enforce_bounds
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Parameters, Task
 from bstcad.tailoring.stage2 import Problem, search, steps, variables_of, with_best_nets
@@ -141,7 +141,7 @@ def test_stage_2_keeps_the_least_thickness_and_finds_the_picture():
     near = replace(lens, back=lens.back.moved(0.6))
     (*_, free), (*_, bound) = (steps(replace(task, least=least), near) for least in (0.01, 0.55))
     assert thickness_range(free.lens)[0] < 0.545 and task.rrmsd(free.lens) < 0.05
-    found = kept(bound.lens, held(bound.lens, None, 0.55))
+    found = enforce_bounds(bound.lens, active_bounds(bound.lens, None, 0.55))
     assert thickness_range(found)[0] >= 0.55 and found.back.z == 0.6
     assert task.rrmsd(found) < 0.06  # 0.045, and 0.037
 
@@ -149,6 +149,6 @@ def test_stage_2_keeps_the_least_thickness_and_finds_the_picture():
 def test_every_free_net_has_its_entry():
     lens = Lens(lenses.net(z=15.0, m=9), lenses.net(m=9), SQUARE, N, shaped=(0, 1))
     shaped = lens.with_heights((torch.rand((9, 9), dtype=torch.float64), torch.rand((17, 17), dtype=torch.float64)))
-    kept = Parameters.of(shaped)
-    assert [entry.z for entry in kept.nets] == [15.0, 20.0] and kept.front == {}
-    assert kept.applied(lens) == shaped
+    parameters = Parameters.of(shaped)
+    assert [entry.z for entry in parameters.nets] == [15.0, 20.0] and parameters.front == {}
+    assert parameters.applied(lens) == shaped

@@ -14,7 +14,7 @@ from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit
-from bstcad.tailoring.slope_map import corners_of, face_grid, lit_window, slope_map, sloped
+from bstcad.tailoring.slope_map import corners_of, face_grid, fit_to_map, lit_window, slope_map
 from tests.lenses import SQUARE, N, net
 from tests.tracing import simulated
 
@@ -53,7 +53,7 @@ def slope_error(name, cells):
         window = lit_window(source, lens)
         wanted = slope_map(source, lens, window, made.box.numpy(), screen, cells, wanted, iterations=40)
         grid = face_grid(source, lens, window, 66)
-        lens = sloped(lens, wanted, grid, Fit(), 0.0)
+        lens = fit_to_map(lens, wanted, grid, Fit(), 0.0)
     x, y, _ = grid.at_face.position
     inner = torch.maximum(x.abs(), y.abs()) < 0.4 * grid.window.width
     x, y = x[inner], y[inner]

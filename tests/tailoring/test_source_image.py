@@ -22,7 +22,7 @@ from bstcad.optics.surfaces import Sphere
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Task
-from bstcad.tailoring.source_image import Images, Spread, _biquadratic, blurs, bordered, unseen
+from bstcad.tailoring.source_image import SourceImages, Spread, _biquadratic, blur_error, blurs, with_border
 from bstcad.tailoring.stage2 import Problem, _overshoot_weight
 from tests.lenses import net
 
@@ -98,11 +98,11 @@ def test_a_source_of_next_to_no_size_is_a_point():
 
 def test_flux_is_kept():
     """A blur moves light; what leaves a screen that holds all of it is nothing."""
-    wide = bordered(SCREEN, 60)
+    wide = with_border(SCREEN, 60)
     spreading = spread(SOURCES["disc"])
     [blur] = blurs(spreading, lens(), wide)
-    light = RayTubes.launched(lens(), spreading.centre, 60).picture(lens(), bordered(wide, blur.border)).numpy()
-    share = Images.of(SOURCES["disc"], spreading.centre[0], lens(), wide).share
+    light = RayTubes.launched(lens(), spreading.centre, 60).picture(lens(), with_border(wide, blur.border)).numpy()
+    share = SourceImages.of(SOURCES["disc"], spreading.centre[0], lens(), wide).share
     assert blur.forward(light).sum() / light.sum() == pytest.approx(float(share.mean()), rel=0.02)
 
 
@@ -142,7 +142,7 @@ def test_what_the_images_leave_out_is_measured_by_rays():
     source = SOURCES["disc"]
     rays, half = by_rays(source), merit(replace(source, diameter=SIZE / 2))
     [found] = shown(half)
-    mended = found + unseen(found, spread(source).draw, lens(), SCREEN, border=half.blurs[0][0].border, seed=3)
+    mended = found + blur_error(found, spread(source).draw, lens(), SCREEN, border=half.blurs[0][0].border, seed=3)
     assert off(rays, mended) < 0.5 * off(rays, found)
 
 
@@ -160,13 +160,13 @@ def test_nine_points_make_every_biquadratic():
 def test_light_that_no_place_shows_is_not_blurred():
     """Nothing gets through: the images are those of a point."""
     nowhere = replace(SOURCES["disc"], position=(500.0, 0.0, 5.9))
-    offset, share = Images.of(nowhere, spread(nowhere).centre[0], lens(), SCREEN).nearest(0.0, 0.0)
+    offset, share = SourceImages.of(nowhere, spread(nowhere).centre[0], lens(), SCREEN).nearest(0.0, 0.0)
     assert not offset.any() and bool((share == 1).all())
 
 
 def test_a_rectangle_of_light_casts_a_rectangle():
     """Free space would be a pinhole: the images of the chip's corners stand apart as its sides do."""
-    seen = Images.of(CHIP, spread(CHIP).centre[0], lens(), SCREEN)
+    seen = SourceImages.of(CHIP, spread(CHIP).centre[0], lens(), SCREEN)
     nine = seen.offset.mean(-1)
     wide, high = float((nine[0, 5] - nine[0, 3]).abs()), float((nine[1, 7] - nine[1, 1]).abs())
     assert wide / high == pytest.approx(SIZE, rel=0.1) and Rectangle(SIZE, 1.0) == CHIP.extent

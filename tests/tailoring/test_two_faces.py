@@ -62,7 +62,7 @@ def test_a_goal_twice_is_the_goal_once():
 def test_the_waves_term_is_the_measured_error():
     lens, wave = bumpy(), WAVES["zernike"]
     merit = merit_of(lens, wave=wave, n=256)
-    term = float(merit._of_wave(*merit.landing(lens).behind))
+    term = float(merit._wavefront_error(*merit.landing(lens).behind))
     assert term**0.5 == pytest.approx(wavefront_error(BEAM, lens, wave, 512).without_piston.rms, rel=0.01)
 
 
