@@ -14,7 +14,7 @@ import torch
 
 import bstcad
 from bstcad.analysis.shape import thickness_range
-from bstcad.analysis.steepness import Steepness, needed
+from bstcad.analysis.steepness import Steepness, needed_steepness
 from bstcad.baselines import integration, paper
 from bstcad.folder import Made
 from bstcad.optics.emitters import Emitter
@@ -283,7 +283,7 @@ def _compared(making: Making, task: Task, lens: Lens, before: int) -> Making:
 def steepness(source: Emitter, lens: Lens, goal: Goal, sent: TransportMap) -> Steepness:
     """The slope that the light of a goal needs of the last tailored face, by the map of stage 1."""
     at_back, screen = sent.plane == "back", imaged(lens, goal.receiver)
-    return needed(source, lens, screen, goal.picture, x=sent.x, y=sent.y, places=sent.source, at_back=at_back)
+    return needed_steepness(source, lens, screen, goal.picture, x=sent.x, y=sent.y, places=sent.source, at_back=at_back)
 
 
 def _making(followed: Followed, went: Record, stopped: str, steep: Steepness) -> Making:

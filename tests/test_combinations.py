@@ -313,7 +313,7 @@ COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which f
         "FACE_CELLS": 17, "MAX_AIMS": 24, "COARSE_CELLS": 16, "COARSE_ITERATIONS": 10, "MAX_ROUNDS": 1,
     },
     "tailoring.feasibility": {"TRIAL_CELLS": 24, "TRIAL_PIXELS": 32, "TRIAL_ITERATIONS": 20},
-    "analysis.light": {"MOUNT_RAYS": 96, "FEWEST": 16, "MARGIN_RAYS": 64, "NEEDED_RAYS": 65},
+    "analysis.light": {"MOUNT_RAYS": 96, "MIN_MOUNT_RAYS": 16, "MARGIN_RAYS": 64, "NEEDED_RAYS": 65},
     "analysis.light.blur": {"__defaults__": (12,)},
     "analysis.neglected_effects": {"PLACES": 24, "GHOSTS": 32},
     "analysis.shape": {"GRID": 257},

@@ -1,9 +1,9 @@
-"""The cost and the remaining error of a finished design: what its end cost, where its error sits.
+"""The cost and the remaining error of a finished design.
 
-- `ending`: the end of the convergence curve, taken for a power law;
+- `ending`: the end of the convergence curve, fitted by a power law;
 - `remaining`: the squared error by parts of the target and by octaves of its cosine transform;
-- `unlit` and `lifted`: lit parts of a target that stay dark, and dark parts that are lit;
-- `ControlCells`: the cells of a control net that light each pixel, and the least error that they leave.
+- `unlit` and `lifted`: lit parts of a target that stay dark, and dark parts that get light;
+- `ControlCells`: the cells of a control net that light each pixel, and the lower bound of the error that they allow.
 """
 
 from __future__ import annotations
@@ -21,37 +21,37 @@ from bstcad.optics.irradiance import Screen
 
 # --- the end of the convergence curve ---------------------------------------------------------------------------------
 
-LAST = 1.1  # times the RRMSD at the end: from there on it is "the last tenth of the error"
-LATELY = 0.5  # of the time that the irradiance has been tailored for: so far back the power law is fitted
-FEW = 5  # points: fewer give no power
-GOOD = 0.9  # R² of a line in logarithms that is one
-PAYS = 10.0  # times the time: half of the error for more than that is no offer
+LAST_TENTH_RATIO = 1.1  # RRMSD over that at the end, below which it is "the last tenth of the error"
+FITTED_FRACTION = 0.5  # last fraction of the time of tailoring to the irradiance, to which the power law is fitted
+MIN_POINTS = 5  # smallest number of points for a fit
+MIN_R_SQUARED = 0.9  # smallest R² of a line in logarithms that counts as a power law
+MAX_HALVING = 10.0  # largest factor of the time for half of the error that is reported
 
 Curve = Sequence[tuple[float, float]]  # (seconds since the start, RRMSD)
 Stages = Sequence[tuple[float, float | None]]  # one after the other: (seconds, RRMSD after it if judged)
 
 
 @dataclass(frozen=True)
-class Ending:
-    """The end of a convergence curve; RRMSD by the rays or tubes that tailor, as each evaluation has it.
+class ConvergenceEnd:
+    """End of a convergence curve; RRMSD by the rays or tubes that tailor, at each evaluation.
 
-    Near its end the curve is taken for RRMSD ∝ t^-p, t the time of all evaluations: half of the error takes 2^(1/p)
+    Near its end the curve is fitted by RRMSD ∝ t^-p, t the time of all evaluations: half of the error takes 2^(1/p)
     times as long in all.
     """
 
-    rrmsd: float  # at the end
-    last_tenth_seconds: float  # since it was above LAST times that for the last time
+    rrmsd: float  # RRMSD at the end
+    last_tenth_seconds: float  # time since the RRMSD was last above LAST_TENTH_RATIO times its final value
     last_tenth: float  # `last_tenth_seconds` over the time from the start to the end of the curve
-    power: float | None  # p, zero if the curve does not fall; None: too few points
-    fit: float | None  # R² of that line, of logarithms
-    halving: float | None  # 2^(1/p); None: no line fits, or it is more than PAYS
+    power: float | None  # exponent p, zero if the curve does not fall; None: too few points
+    fit: float | None  # R² of the line in logarithms
+    halving: float | None  # factor 2^(1/p) of the time; None: no line fits, or it is more than MAX_HALVING
 
 
-def ending(history: Curve, stages: Stages, since: float = 0.0) -> Ending | None:
-    """The end of a design's history; None if the irradiance was never tailored.
+def ending(history: Curve, stages: Stages, since: float = 0.0) -> ConvergenceEnd | None:
+    """Return the end of a design's history; None if no stage tailored the irradiance.
 
-    stages: their judgements are in the history too, by other tubes than the points around them.
-    since: seconds since the start at which the design took up the light that it has at the end.
+    stages: stages whose RRMSD by rays is in the history too, and is left out.
+    since: time (s) from the start at which the design began to use the light that it has at the end.
     """
     ends = np.cumsum([seconds for seconds, _ in stages])
     judged = {value for _, value in stages if value is not None}
@@ -59,36 +59,38 @@ def ending(history: Curve, stages: Stages, since: float = 0.0) -> Ending | None:
     if not len(points):
         return None
     seconds, values = points.T
-    last = float(np.median(values[-max(1, len(values) // 20) :]))  # where each evaluation has rays of its own, of a few
-    above = np.flatnonzero(values > LAST * last)
+    last = float(np.median(values[-max(1, len(values) // 20) :]))  # median: random rays scatter
+    above = np.flatnonzero(values > LAST_TENTH_RATIO * last)
     took = float(seconds[-1] - (seconds[above[-1]] if len(above) else 0.0))
-    power, fit = _power(*_lately(seconds, values, ends, since))
+    power, fit = _fit_power(*_last_points(seconds, values, ends, since))
     halving = None
-    if power and fit is not None and fit >= GOOD and power * np.log2(PAYS) >= 1:
+    if power and fit is not None and fit >= MIN_R_SQUARED and power * np.log2(MAX_HALVING) >= 1:
         halving = 2 ** (1 / power)
-    return Ending(last, took, took / float(seconds[-1]), power, fit=fit, halving=halving)
+    return ConvergenceEnd(last, took, took / float(seconds[-1]), power, fit=fit, halving=halving)
 
 
-def _lately(seconds: np.ndarray, values: np.ndarray, ends: np.ndarray, since: float) -> tuple[np.ndarray, np.ndarray]:
-    """(time, values) of the last points, since tailoring began and within the last stage.
+def _last_points(
+    seconds: np.ndarray, values: np.ndarray, ends: np.ndarray, since: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (time, values) of the last points, since `since` and within the last stage.
 
-    Each evaluation of a stage counts as long as the median one, whatever else the machine did meanwhile.
+    Each evaluation of a stage counts with the median time, so that other work of the machine has no effect.
     """
     stage = np.searchsorted(ends, seconds)
     steps = np.zeros(len(seconds))
     for each in np.unique(stage):
-        there = stage == each
-        own = np.diff(seconds[there])
+        members = stage == each
+        own = np.diff(seconds[members])
         before = ends[each - 1] if each else 0.0
-        steps[there] = np.median(own) if len(own) else seconds[there][0] - before
+        steps[members] = np.median(own) if len(own) else seconds[members][0] - before
     time = np.cumsum(np.where(seconds > since, steps, 0.0))
-    chosen = (time >= (1 - LATELY) * time[-1]) & (stage == stage[-1]) & (time > 0)
+    chosen = (time >= (1 - FITTED_FRACTION) * time[-1]) & (stage == stage[-1]) & (time > 0)
     return time[chosen], values[chosen]
 
 
-def _power(time: np.ndarray, values: np.ndarray) -> tuple[float | None, float | None]:
-    """(p, R²) of values ∝ time^-p by least squares of the logarithms."""
-    if len(time) < FEW:
+def _fit_power(time: np.ndarray, values: np.ndarray) -> tuple[float | None, float | None]:
+    """Fit values ∝ time^-p by least squares of the logarithms; return (p, R²)."""
+    if len(time) < MIN_POINTS:
         return None, None
     x, y = np.log(time), np.log(values)
     x, y = x - x.mean(), y - y.mean()
@@ -96,21 +98,20 @@ def _power(time: np.ndarray, values: np.ndarray) -> tuple[float | None, float | 
     return max(0.0, float(-slope)), float(slope**2 * (x * x).sum() / spread) if spread > 0 else 0.0
 
 
-# --- where the error sits ---------------------------------------------------------------------------------------------
+# --- parts of the target and octaves with the error -------------------------------------------------------------------
 
-RIM = 64  # a side of the target over the width of its rim
-STEEP = 0.9  # quantile of the gradient from which on a pixel lies at an edge …
-SLIGHT = 0.02  # … if the gradient exceeds this part of the brightest pixel's irradiance a pixel
-TENTH = 0.1  # quantile of the irradiance up to which, and from whose counterpart on, a pixel is dark or bright
+RIM_RATIO = 64  # side of the target over the width of its rim
+EDGE_QUANTILE = 0.9  # quantile of the gradient above which a pixel is at an edge
+MIN_EDGE_GRADIENT = 0.02  # smallest gradient at an edge, per pixel, relative to the brightest pixel
+TONE_QUANTILE = 0.1  # quantile of the irradiance below which a pixel is dark; bright above 1 - TONE_QUANTILE
 
 
 def remaining(picture: np.ndarray, target: np.ndarray, per_unit: tuple[float, float]) -> dict[str, Any]:
-    """Where a picture (rows, columns) differs from a target of the same sum.
+    """Return the squared error of a picture (rows, columns) by parts and octaves of a target of the same sum.
 
-    per_unit: pixels along x and y in a unit of the receiver.
-
-    parts: [{name: of `masks`, error: share of the squared error, pixels: share of the target's pixels}].
-    octaves: as `_octaves` has them.
+    per_unit: pixels along x and y per unit of the receiver.
+    parts: [{name: name in `masks`, error: fraction of the squared error, pixels: fraction of the target's pixels}].
+    octaves: see `_octaves`.
     """
     square = (picture - target) ** 2
     whole = float(square.sum()) or 1.0
@@ -122,44 +123,45 @@ def remaining(picture: np.ndarray, target: np.ndarray, per_unit: tuple[float, fl
 
 
 def masks(target: np.ndarray) -> dict[str, np.ndarray]:
-    """The pixels (rows, columns) of each part; a pixel belongs to the first part whose condition it meets.
+    """Return the pixels (rows, columns) of each part; a pixel belongs to the first part whose condition it meets.
 
-    rim: the outermost 1/64 of the side, one pixel at least, at all four sides.  edges: the tenth of all pixels in which
-    the target changes most from pixel to pixel (central differences), if it changes by 2 % of its brightest pixel.
-    darkest and brightest: the tenth of all pixels, and those as dark or as bright as the last of them.  rest.
+    rim: the outermost 1/64 of the side, at least one pixel, at all four sides.  edges: the tenth of all pixels where
+    the gradient (central differences) is largest, if it is at least 2 % of the brightest pixel per pixel.
+    darkest, brightest: the tenth of all pixels, and all that equal the last of them.  rest: all others.
     """
     steep = np.hypot(*np.gradient(target))
-    dark, bright = np.quantile(target, (TENTH, 1 - TENTH))
-    lit = target > dark  # nowhere of an even target, which has no dark and no bright pixel
-    tried = {
+    dark, bright = np.quantile(target, (TONE_QUANTILE, 1 - TONE_QUANTILE))
+    lit = target > dark  # False throughout a uniform target, which has no dark and no bright pixel
+    conditions = {
         "rim": np.logical_or.outer(*map(_outermost, target.shape)),
-        "edges": steep >= max(np.quantile(steep, STEEP), SLIGHT * target.max()),
+        "edges": steep >= max(np.quantile(steep, EDGE_QUANTILE), MIN_EDGE_GRADIENT * target.max()),
         "darkest": ~lit & lit.any(),
         "brightest": (target >= bright) & lit,
         "rest": np.ones(target.shape, dtype=bool),
     }
-    first = np.argmax(np.stack(list(tried.values())), axis=0)
-    return {name: first == number for number, name in enumerate(tried)}
+    first = np.argmax(np.stack(list(conditions.values())), axis=0)
+    return {name: first == number for number, name in enumerate(conditions)}
 
 
 def _outermost(side: int) -> np.ndarray:
-    """Is a pixel along a side within the width of the rim?"""
+    """Return True for the pixels along a side that belong to the rim."""
     along = np.arange(side)
-    return np.minimum(along, side - 1 - along) < max(1, round(side / RIM))
+    return np.minimum(along, side - 1 - along) < max(1, round(side / RIM_RATIO))
 
 
 def _octaves(error: np.ndarray, per_unit: float) -> list[dict[str, Any]]:
-    """Energy of the cosine transform (orthonormal: Parseval) by the length of the wave vector, from coarse to fine.
+    """Return the energy of the cosine transform (orthonormal: Parseval) by octaves of the wave vector, coarse to fine.
 
-    Of each octave: frequency (from, below, in cycles a pixel; the finest goes on to 0.71, along the diagonals), period
-    (on the target, in its unit, the coarse end first), error (share of the squared error).  The mean is in no octave,
-    as both pictures have one sum.  A cosine transform is not periodic and makes nothing of opposite sides that differ.
+    frequency: lower and upper limit in cycles per pixel (the finest octave extends to 0.71, along the diagonals).
+    period: on the target, in its unit, the coarse end first.  error: fraction of the squared error.  The mean is in no
+    octave, as both pictures have the same sum.  The cosine transform is not periodic, so a difference between opposite
+    sides adds no high frequencies.
     """
     energy = dctn(error, norm="ortho") ** 2
     along = (np.arange(side) / (2 * side) for side in error.shape)
     frequency = np.hypot(*np.meshgrid(*along, indexing="ij"))
-    energy[0, 0] = 0.0  # rounding: both have one sum
-    count = math.ceil(math.log2(max(error.shape)))  # down to half a wave over the longer side
+    energy[0, 0] = 0.0  # rounding: both pictures have the same sum
+    count = math.ceil(math.log2(max(error.shape)))  # octaves down to half a period over the longer side
     number = np.clip(np.floor(np.log2(np.maximum(frequency, 1e-9) * 4)), 1 - count, 0).astype(int)
     whole = float(energy.sum()) or 1.0
     sums = np.bincount((number + count - 1).ravel(), energy.ravel(), count) / whole
@@ -170,23 +172,24 @@ def _octaves(error: np.ndarray, per_unit: float) -> list[dict[str, Any]]:
     ]
 
 
-# --- where the light misses its target --------------------------------------------------------------------------------
-# A target and an irradiance of one sum, (rows, columns) with row 0 at y max.
+# --- unlit and lifted parts -------------------------------------------------------------------------------------------
+# Target and irradiance have the same sum, (rows, columns), row 0 at y max.
 
-DARK = 0.01  # share of the picture's mean below which a pixel is dark
-UNLIT = 0.1  # share of the target's irradiance below which a pixel was left dark
-PATCH = 5e-3  # share of the lit area left dark, below which no sentence says so
+DARK_LEVEL = 0.01  # irradiance relative to the mean below which a pixel of the target is dark
+UNLIT_LEVEL = 0.1  # irradiance relative to the target below which a lit pixel counts as unlit
+MIN_UNLIT_FRACTION = 5e-3  # smallest unlit fraction of the lit area that is reported
 
 
 def unlit(target: np.ndarray, irradiance: np.ndarray, screen: Screen) -> dict[str, Any]:
-    """The share of the lit part that gets hardly any light, and the place of its largest patch; {} for next to none.
+    """Return the fraction of the lit area that stays dark, and the position of the largest such patch; {} if small.
 
-    place: least and largest x, least and largest y, in words.
+    share: the fraction.  place: the ranges of x and y, as text.
     """
-    lit = target > DARK * target.mean()
-    dark = lit & (irradiance < UNLIT * target)
+    lit = target > DARK_LEVEL * target.mean()
+    dark = lit & (irradiance < UNLIT_LEVEL * target)
     share = float(dark.sum() / lit.sum())
-    if share < PATCH or target[dark].sum() < PATCH * target.sum():  # which a rim of pixels that are lit in part is not
+    least = MIN_UNLIT_FRACTION
+    if share < least or target[dark].sum() < least * target.sum():  # less: pixels of a rim, partly lit
         return {}
     patches, count = scipy.ndimage.label(dark, np.ones((3, 3)))
     largest = 1 + np.argmax(scipy.ndimage.sum_labels(dark, patches, range(1, count + 1)))
@@ -199,51 +202,51 @@ def unlit(target: np.ndarray, irradiance: np.ndarray, screen: Screen) -> dict[st
 
 
 def lifted(target: np.ndarray, irradiance: np.ndarray) -> dict[str, float]:
-    """The light on the dark parts of the target, of all light, and its level, of the mean irradiance.
+    """Return the light on the dark parts of the target (fraction of all), and its level (relative to the mean).
 
-    A smooth face cannot part its light without a seam.
+    A smooth face cannot divide its light without some light in between.
     """
-    dark = target < DARK * target.mean()
+    dark = target < DARK_LEVEL * target.mean()
     light = float((irradiance - target)[dark].sum() / target.sum())
     return {"light": light, "level": float(irradiance[dark].mean() / target.mean()) if dark.any() else 0.0}
 
 
 # --- cells of the control net -----------------------------------------------------------------------------------------
 
-TILE = 16  # pixels a side
+TILE_PIXELS = 16  # side of a tile (pixels)
 
 
 @dataclass(frozen=True, eq=False)
 class ControlCells:
-    """The squares of the knots that light each pixel; a cell stands for one control point.
+    """Number of cells of the control net that light each pixel; there is one cell per control point.
 
-    Where the light of k cells falls on a tile of the target, the net has k numbers to shape it with: of the tile's
-    cosines it can make about k, the coarsest first.  The energy of the others is the least error to be had there.
+    Where the light of k cells falls on a tile of the target, k control points shape it, and can make about k cosines of
+    the tile, the coarsest first.  The energy of the other cosines is a lower bound of the squared error.
     """
 
-    a_pixel: np.ndarray = field(repr=False)  # (rows, columns) cells that light it, row 0 = y max
-    target: np.ndarray = field(repr=False)  # (rows, columns)
+    a_pixel: np.ndarray = field(repr=False)  # number of cells that light each pixel, (rows, columns), row 0 = y max
+    target: np.ndarray = field(repr=False)  # target picture, (rows, columns)
 
     def floor(self, finer: float = 1.0) -> float:
-        """RRMSD that is left if each tile has as many of its lowest cosines as cells light it.
+        """Return the RRMSD if each tile has as many of its lowest cosines as cells light it.
 
-        finer: times as many control points a side.
+        finer: factor of the number of control points a side.
         """
         tiles, cells = (_tiles(picture) for picture in (self.target, self.a_pixel))
         energy = dctn(tiles, axes=(1, 2), norm="ortho").reshape(len(tiles), -1)[:, COARSE_TO_FINE] ** 2
-        made = np.floor(np.minimum(finer**2 * cells.sum((1, 2)), TILE**2)).astype(int)
-        left = np.where(np.arange(TILE**2) >= made[:, None], energy, 0.0)
+        made = np.floor(np.minimum(finer**2 * cells.sum((1, 2)), TILE_PIXELS**2)).astype(int)
+        left = np.where(np.arange(TILE_PIXELS**2) >= made[:, None], energy, 0.0)
         whole = float((tiles**2).sum())
-        return math.sqrt(float(left.sum()) / whole) if whole else 0.0  # a part of a picture may be dark
+        return math.sqrt(float(left.sum()) / whole) if whole else 0.0  # a part of a picture can be dark
 
 
 def _tiles(picture: np.ndarray) -> np.ndarray:
-    """(number, TILE, TILE); the last row and column of tiles are filled up from the border."""
-    rows, columns = (-side % TILE for side in picture.shape)
+    """Cut a picture into tiles (number, rows, columns); the last ones are padded with the values at the border."""
+    rows, columns = (-side % TILE_PIXELS for side in picture.shape)
     whole = np.pad(picture, ((0, rows), (0, columns)), mode="edge")
-    parts = whole.reshape(whole.shape[0] // TILE, TILE, whole.shape[1] // TILE, TILE)
-    return parts.transpose(0, 2, 1, 3).reshape(-1, TILE, TILE)
+    parts = whole.reshape(whole.shape[0] // TILE_PIXELS, TILE_PIXELS, whole.shape[1] // TILE_PIXELS, TILE_PIXELS)
+    return parts.transpose(0, 2, 1, 3).reshape(-1, TILE_PIXELS, TILE_PIXELS)
 
 
-# The cosines of a tile by the length of their wave vectors.
-COARSE_TO_FINE = np.argsort(np.hypot(*np.indices((TILE, TILE))).ravel(), kind="stable")
+# Order of the cosines of a tile by the length of their wave vectors
+COARSE_TO_FINE = np.argsort(np.hypot(*np.indices((TILE_PIXELS, TILE_PIXELS))).ravel(), kind="stable")

@@ -1,4 +1,4 @@
-"""The light through a lens: rays to draw, the apertures that light needs, losses at a mount, margins, and blur."""
+"""Light through a lens: rays for figures, clear apertures needed, losses at a mount, margins of the trace, blur."""
 
 from __future__ import annotations
 
@@ -35,30 +35,30 @@ from bstcad.optics.unfolding import per_radian, seen_by
 
 
 def _at_interfaces(rays: Rays, lens: Lens) -> list[Rays]:
-    """The rays from the source, and behind each interface of the lens."""
-    found = [rays]
+    """Return the rays from the source, and those behind each interface of the lens."""
+    stops = [rays]
     for interface in lens.interfaces:
-        found.append(cross(found[-1], interface).rays)
-    return found
+        stops.append(cross(stops[-1], interface).rays)
+    return stops
 
 
 # --- rays for figures -------------------------------------------------------------------------------------------------
 
-FAN = 15  # rays
-LINES = 33  # lines of the ray mapping, each way
+FAN_RAYS = 15  # number of rays in `fan`
+GRID_LINES = 33  # number of grid lines in `ray_map`, each way
 
 
 def fan(source: Emitter, lens: Lens, plane: Receiver) -> np.ndarray:
-    """Polylines (rays, k, 3) in mm in y = 0: source, each surface on the way, the plane; only rays that arrive."""
+    """Return polylines (rays, k, 3) in mm, launched in y = 0: source, each surface, the plane; rays that arrive."""
     half = clear_window(source, lens).width / 2
-    x = torch.linspace(-0.98 * half, 0.98 * half, FAN, dtype=torch.float64)
+    x = torch.linspace(-0.98 * half, 0.98 * half, FAN_RAYS, dtype=torch.float64)
     return _polylines(source.rays(x, torch.zeros_like(x), lens.entrance.z, 1.0), lens, plane)[0]
 
 
 def bundle(source: Emitter, lens: Lens, plane: Receiver, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Polylines of rays through n x n cells of the light, and the flux (rays,) with which each arrives.
+    """Return polylines (rays, k, 3) in mm of rays through n x n cells of the beam, and their flux (rays,) on arrival.
 
-    Each ray carries the flux of its cell; the source's whole flux is 1.
+    Each ray carries the flux of its cell; the total flux of the source is 1.
     """
     area = clear_window(source, lens)
     x, y = (p.reshape(-1).to(torch.float64) for p in sampling.grid(area, n))
@@ -66,7 +66,7 @@ def bundle(source: Emitter, lens: Lens, plane: Receiver, n: int) -> tuple[np.nda
 
 
 def _polylines(rays: Rays, lens: Lens, plane: Receiver) -> tuple[np.ndarray, np.ndarray]:
-    """Polylines (rays, k, 3) in mm of the rays that arrive, and their flux there."""
+    """Return polylines (rays, k, 3) in mm of the rays that arrive at the plane, and their flux there."""
     stops = _at_interfaces(rays, lens)
     stops.append(landed := plane.to(stops[-1]))
     corners = torch.stack([torch.stack([*stop.position[:2], stop.above(0.0)]) for stop in stops])
@@ -75,12 +75,12 @@ def _polylines(rays: Rays, lens: Lens, plane: Receiver) -> tuple[np.ndarray, np.
 
 
 def ray_map(source: Emitter, lens: Lens, plane: Receiver) -> tuple[np.ndarray, np.ndarray]:
-    """A regular grid on the front's vertex plane, and its landing points on the plane: each (k, k, 2) in mm.
+    """Return a regular grid on the vertex plane of the front, and its landing points on the plane, (k, k, 2) mm each.
 
-    NaN where there is no light or the ray is lost.
+    NaN without light, and where the ray is lost.
     """
     area = clear_window(source, lens)
-    line = torch.linspace(-0.499, 0.499, LINES, dtype=torch.float64)
+    line = torch.linspace(-0.499, 0.499, GRID_LINES, dtype=torch.float64)
     x, y = torch.meshgrid(line * area.width, line * area.height, indexing="ij")
     landed = trace(source.rays(x, y, lens.entrance.z, 1.0), lens, plane)
     start, end = torch.stack([x, y], dim=-1), landed.position.permute(1, 2, 0).clone()
@@ -89,32 +89,32 @@ def ray_map(source: Emitter, lens: Lens, plane: Receiver) -> tuple[np.ndarray, n
     return start.numpy(), end.numpy()
 
 
-# --- the clear aperture that light needs of each face -----------------------------------------------------------------
+# --- clear apertures needed -------------------------------------------------------------------------------------------
 
-NEEDED_RAYS = 513  # a side of the grid of rays
-ROUND = 1.01  # light is round if it reaches no farther than this times its half width, and its half height
-CORNERS = tuple((u, v) for u in (-1, 0, 1) for v in (-1, 0, 1))  # places on an extended source, in halves of its extent
-WHOLE = 0.99  # part of the clear aperture: light that reaches so far fills the face
+NEEDED_RAYS = 513  # rays a side
+ROUND_RATIO = 1.01  # largest radius of the light over its half width and half height at which it counts as round
+EXTENT_POINTS = tuple((u, v) for u in (-1, 0, 1) for v in (-1, 0, 1))  # points of an extended source, in half extents
+FULL_APERTURE = 0.99  # extent of the light, relative to the clear aperture, from which on it fills the face
 
 
 def used(source: Emitter, lens: Lens) -> dict[str, Outline | None]:
-    """Smallest circle or rectangle about the axis (mm) that holds all light on each face of the solid that it meets.
+    """Return the clear aperture (mm) needed on each face: the smallest circle or rectangle that holds all light.
 
-    None: the light fills the face's clear aperture.  Only light that gets through all faces counts; of an extended
-    source the light of its middle and of the ends of its extent.
+    None: the light fills the clear aperture of the face.  Only light that passes all faces counts.  An extended source
+    is represented by its centre and the ends of its extent.
     """
     elements = [source]
     if source.extent is not None:
         a, b = source.extent.half_extent
-        elements = [source.element(a * u, b * v) for u, v in CORNERS if not (source.extent.is_round and u and v)]
+        elements = [source.element(a * u, b * v) for u, v in EXTENT_POINTS if not (source.extent.is_round and u and v)]
     hits = torch.cat([_hits(element.central, lens) for element in elements], dim=2)
     of_solid, apertures = hits[lens.solid], dict(zip(("front", "back"), lens.apertures, strict=True))
     numbers = {face: list(lens.passes.numbers_of(face)) for face in lens.passes.faces}
-    return {face: _patch(torch.cat([*of_solid[k]], dim=1), apertures[face]) for face, k in numbers.items()}
+    return {face: _aperture(torch.cat([*of_solid[k]], dim=1), apertures[face]) for face, k in numbers.items()}
 
 
 def _hits(source: Emitter, lens: Lens) -> Tensor:
-    """x and y (faces, 2, n) (mm) on each face of the rays that get through all faces."""
+    """Return x and y (faces, 2, n) mm on each face of the rays that pass all faces."""
     area = clear_window(source, lens)
     line = torch.linspace(-0.5, 0.5, NEEDED_RAYS, dtype=torch.float64) * (1 - 1e-9)
     x, y = (p.reshape(-1) for p in torch.meshgrid(line * area.width, line * area.height, indexing="ij"))
@@ -123,27 +123,27 @@ def _hits(source: Emitter, lens: Lens) -> Tensor:
     return torch.stack([rays.position[:2, through] for rays in behind])
 
 
-def _patch(hits: Tensor, aperture: Outline) -> Outline | None:
-    """Shape that holds the hits (2, n) on a face of that clear aperture."""
+def _aperture(hits: Tensor, aperture: Outline) -> Outline | None:
+    """Return the smallest outline that holds points (2, n) of a face; None if they fill its clear aperture."""
     if not hits.numel():
         return Circle(0.0)
     half_x, half_y = (float(part.abs().max()) for part in hits)
     radius = float(torch.hypot(*hits).max())
-    patch = Circle(radius) if radius <= ROUND * min(half_x, half_y) else Rectangle(2 * half_x, 2 * half_y)
+    patch = Circle(radius) if radius <= ROUND_RATIO * min(half_x, half_y) else Rectangle(2 * half_x, 2 * half_y)
     a, b = aperture.half_extent
     alike = aperture.is_round or not patch.is_round
-    return None if alike and half_x >= WHOLE * a and half_y >= WHOLE * b else patch
+    return None if alike and half_x >= FULL_APERTURE * a and half_y >= FULL_APERTURE * b else patch
 
 
-# --- the light that a ripple moves ------------------------------------------------------------------------------------
+# --- light displaced by a ripple --------------------------------------------------------------------------------------
 
 
 @torch.no_grad()
 def rrmsd_of_ripple(channel: Channel, lens: Lens, screen: Screen, face: Literal["front", "back"]) -> float:
     """Return the RRMSD between the pictures of a lens with and without the ripple of a face; 0 without a ripple.
 
-    channel: of a point of the source.  The ripple fades towards the rim, and so does its light; a small one's RRMSD is
-    proportional to its height.
+    channel: light of one point of the source.  `Ripple.heights` fade towards the rim; the RRMSD, which is proportional
+    to a small height, is divided by this factor.
     """
     net = getattr(lens, face)
     waves = ripple(net)
@@ -155,74 +155,74 @@ def rrmsd_of_ripple(channel: Channel, lens: Lens, screen: Screen, face: Literal[
     return difference(after, before) / waves.fading
 
 
-# --- the light that a mount blocks ------------------------------------------------------------------------------------
+# --- light blocked by a mount -----------------------------------------------------------------------------------------
 
-MOUNT_RAYS = 512  # a side of the grid of rays, shared by all channels
-FEWEST = 48  # a side, of one channel
+MOUNT_RAYS = 512  # rays a side, divided among the channels
+MIN_MOUNT_RAYS = 48  # smallest number of rays a side for one channel
 
 
 @dataclass(frozen=True)
 class MountLosses:
-    """Shares of light that a mount blocks."""
+    """Fractions of the light that a mount blocks."""
 
-    cut: float  # share, missing the clear apertures, of the light that gets through both faces of the uncut lens
-    on_flange: float  # share, meeting a wall of the flange's opening, of the light through the clear apertures
+    cut: float  # fraction of the light through both faces of the uncut lens that misses the clear apertures
+    on_flange: float  # fraction of the light through the clear apertures that meets a wall of the flange's opening
 
 
 @torch.no_grad()
 def mount_losses(lens: Lens, channels: Sequence[Channel], flange: tuple[float, float] | None = None) -> MountLosses:
-    """Losses of a lens with clear apertures.  flange: z (mm) of both ends of its opening; None without a flange."""
+    """Return the losses of a lens at its mount; flange: z (mm) of both ends of its opening; None: no flange."""
     uncut = passing = blocked = 0.0
-    n = max(FEWEST, math.ceil(MOUNT_RAYS / math.sqrt(len(channels))))
+    n = max(MIN_MOUNT_RAYS, math.ceil(MOUNT_RAYS / math.sqrt(len(channels))))
     for channel in channels:
         own = replace(channel.through(lens), losses=None)
         bare = replace(own, clear=None)
         area = window(channel.source, bare)
         x, y = sampling.grid(area, n)
         rays = channel.source.rays(x, y, own.entrance.z, channel.weight * area.area / n**2)
-        solid = slice(own.solid.start, own.solid.stop + 1)  # the light before, in and behind it
+        solid = slice(own.solid.start, own.solid.stop + 1)  # rays before, in and behind the solid
         whole, through = _at_interfaces(rays, bare)[solid][-1], _at_interfaces(rays, own)[solid]
         out = through[-1]
         uncut += float(whole.flux[whole.alive].sum())
         passing += float(out.flux[out.alive].sum())
         if flange is not None:
-            blocked += float(out.flux[out.alive & _meets(through, own.apertures[1], flange)].sum())
+            blocked += float(out.flux[out.alive & _misses_opening(through, own.apertures[1], flange)].sum())
     return MountLosses(1 - passing / uncut if uncut else 0.0, blocked / passing if passing else 0.0)
 
 
-def _meets(rays: Sequence[Rays], rim: Outline, planes: Iterable[float]) -> Tensor:
-    """Is a ray outside the rim on one of the planes, before the first face or behind the last?"""
+def _misses_opening(rays: Sequence[Rays], rim: Outline, planes: Iterable[float]) -> Tensor:
+    """Return True for rays outside the rim on one of the planes, before the first face or behind the last."""
     first, (coming, *_, leaving) = rays[1], rays
-    beyond = torch.zeros_like(leaving.alive)
+    outside = torch.zeros_like(leaving.alive)
     for z in planes:
         for at, end in ((coming, first), (leaving, None)):
-            way = -at.above(z) / torch.where(at.direction[2] == 0, torch.full_like(at.flux, 1e-300), at.direction[2])
-            x, y, _ = at.position + way * at.direction
-            between = (way > 0) if end is None else (way > 0) & (at.sense * end.above(z) > 0)
-            beyond |= between & ~rim.contains(x, y)
-    return beyond
+            path = -at.above(z) / torch.where(at.direction[2] == 0, torch.full_like(at.flux, 1e-300), at.direction[2])
+            x, y, _ = at.position + path * at.direction
+            between = (path > 0) if end is None else (path > 0) & (at.sense * end.above(z) > 0)
+            outside |= between & ~rim.contains(x, y)
+    return outside
 
 
 # --- margins of the trace ---------------------------------------------------------------------------------------------
 
-MARGIN_RAYS = 512  # a side of the window
+MARGIN_RAYS = 512  # rays a side
 
 
 @dataclass(frozen=True)
 class Margins:
-    """The worst of all rays that carry light to the back face."""
+    """Worst cases over all rays that carry light to the back."""
 
     tir_margin_deg: float | None  # critical angle minus angle of incidence (degrees), < 0: reflected; None: no such ray
-    newton_slope_min: float | None  # |F'(t)| at a tailored face, the denominator of Newton's step; 1 head on, 0 grazing
-    non_finite: int  # count of control points, hits and landings that are not finite
+    newton_slope_min: float | None  # |F'(t)| at a tailored face, the divisor of Newton's step: 1 normal, 0 grazing
+    non_finite: int  # number of control points, hits and landing points that are not finite
 
 
 @torch.no_grad()
 def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, n: int = MARGIN_RAYS) -> Margins:
-    """Margins over n x n stratified rays a channel; the k points of an extended source share n x n rays.
+    """Return the margins over n x n stratified rays per channel; the points of an extended source share n x n rays.
 
-    cos θ = (d_z - d_x z_x - d_y z_y) / sqrt(1 + z_x² + z_y²) where light leaves the glass, total reflection at
-    sin θ = 1 / n; F(t) = z(t) - sag(x(t), y(t)), F' = d_z - d_x z_x - d_y z_y at each face from the first net on.
+    cos θ = (d_z - d_x z_x - d_y z_y) / sqrt(1 + z_x² + z_y²) where light leaves the glass; total internal reflection at
+    sin θ = 1 / n.  F(t) = z(t) - sag(x(t), y(t)), F' = d_z - d_x z_x - d_y z_y at each face from the first net on.
     """
     margin, slope, n = math.inf, math.inf, math.ceil(n / math.sqrt(points(channels)))
     wrong = sum(int((~torch.isfinite(net.heights)).sum()) for net in lens.nets)
@@ -250,30 +250,30 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
 
 # --- blur by an extended source ---------------------------------------------------------------------------------------
 
-REACH = 2.5  # times the wider of lens and picture: the nearest target for a plate a tenth as thick as wide
-WORTH = 0.9  # part of the width that a nearer target has to come below, or the report does not name it
+MIN_DISTANCE_RATIO = 2.5  # smallest target distance over the width of lens or picture (plate a tenth as thick as wide)
+MAX_NEARER_RATIO = 0.9  # largest width of the detail on a nearer target, relative to that on this one, that is reported
 
 
 @dataclass(frozen=True)
 class Blur:
-    """The source's image on the target, a mean over the lens, weighted by flux.
+    """Image of the source on the target: the mean over the lens, weighted by flux.
 
-    No lens shows detail much finer than the image; but a lens may overlay many such images, so that their sum is nearer
-    to the target than the blurred target is.
+    No lens shows detail much finer than this image.  But a lens can superpose many such images so that their sum is
+    closer to the target than the blurred target is.
     """
 
-    width: float  # diameter of the even disc with the same rms distance from the centroid, in `unit`
-    pixels: float  # the width in pixels
-    rrmsd: float  # between the target and the target convolved with the mean image
+    width: float  # diameter of the uniform disc with the same RMS distance from the centroid, in `unit`
+    pixels: float  # width in pixels
+    rrmsd: float  # RRMSD between the target and the target convolved with the mean image
     unit: str = "mm"  # unit of the receiver
 
 
 def blur(
     channels: Sequence[Channel], lens: Lens, screen: Screen, target: np.ndarray, n: int = IMAGE_PLACES
 ) -> Blur | None:
-    """The blur by a source whose points are the channels, at its first line; None for a point source.
+    """Return the blur by the source that the channels sample, at its first spectral line.
 
-    None, too, where none of its light gets through the lens, so that there is no image.
+    None for a point source, and if none of the light passes the lens.
     """
     if points(channels) == 1:
         return None
@@ -286,39 +286,40 @@ def blur(
 
 @dataclass(frozen=True)
 class FinestDetail:
-    """The least width of a point of the picture, whatever the lens: the source's image, sampled by pixels.
+    """Smallest width of a point of the picture for any lens: the image of the source, sampled by pixels.
 
-    w = √(D² + 4/3 p²), where D is the diameter of the source's image and p the side of a pixel
+    w = √(D² + 4/3 p²), where D is the diameter of the image of the source and p the side of a pixel
     (optics.measure.detail_width).  D is proportional to the distance L from the lens to the target: D = 2 L
-    tan(δ / 2) for parallel light of divergence δ through a thin plate, D = d L / l for a source of diameter d at the
-    distance l before it.  On a target at L' it is D L' / L.  The limit by the net of control points is not included.
+    tan(δ / 2) for collimated light of divergence δ through a thin plate, and D = d L / l for a source of diameter d at
+    the distance l before it.  At a distance L' it is D L' / L.  The resolution of the control net is not included.
     """
 
-    width: float  # w, in `unit`
-    source_image: float  # D, in `unit`
-    pixel: float  # p, in `unit`
-    distance: float  # mm; L
-    nearer_distance: float | None  # mm; L' of a nearer target that a lens can light with the same picture; None: no L'
-    nearer_width: float | None  # w on that target, in `unit`
-    of: str  # the size of the source: its key in the scene, or an assumption
-    assumed: bool  # the scene does not state the size
+    width: float  # width w, in `unit`
+    source_image: float  # diameter D, in `unit`
+    pixel: float  # side p, in `unit`
+    distance: float  # distance L (mm)
+    nearer_distance: float | None  # distance L' (mm) of a nearer target that can have the same picture; None: no gain
+    nearer_width: float | None  # width w on that target, in `unit`
+    of: str  # size of the source: its key in the scene, or the assumption
+    assumed: bool  # True if the scene does not state the size
     unit: str = "mm"  # unit of the receiver
 
 
 def finest_detail(source_image: float, lens: Lens, screen: Screen, of: str, assumed: bool = False) -> FinestDetail:
-    """The finest detail on a target where the image of a source of the size `of` is `source_image` pixels wide."""
+    """Return the finest detail on a target where the image of the source (size: `of`) is `source_image` pixels wide."""
     distance, pixel = abs(seen_by(lens, screen).throw(lens.back.z)), _pixel(screen)
     grows = distance == abs(per_radian(lens, screen))  # with the distance; an image over angles keeps its width
     sizes = (*(2 * half for half in lens.outline.half_extent), *(high - low for low, high in (screen.x, screen.y)))
-    nearer, image = REACH * max(sizes), source_image * pixel
-    here, there = (detail_width(image * share, pixel) for share in (1.0, nearer / distance))
-    worth = there < WORTH * here and grows and not lens.behind
+    nearer, image = MIN_DISTANCE_RATIO * max(sizes), source_image * pixel
+    width, narrower = (detail_width(image * scale, pixel) for scale in (1.0, nearer / distance))
+    gains = narrower < MAX_NEARER_RATIO * width and grows and not lens.behind
     return FinestDetail(
-        here, image, pixel, distance, nearer_distance=nearer if worth else None, nearer_width=there if worth else None,
+        width, image, pixel, distance, nearer_distance=nearer if gains else None,
+        nearer_width=narrower if gains else None,
         of=of, assumed=assumed, unit=screen.plane.unit,
     )  # fmt: skip
 
 
 def _pixel(screen: Screen) -> float:
-    """The side of a pixel, of a square of its area, in the unit of the receiver."""
+    """Return the side of a square with the area of a pixel, in the unit of the receiver."""
     return 1 / math.sqrt(math.prod(screen.per_unit))

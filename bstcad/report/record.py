@@ -204,7 +204,7 @@ class Contents:
     given_up: tuple[str, ...] = ()  # remarks: sentences on wishes of the scene that the design does not fulfil
     remarks: tuple[str, ...] = ()  # the id of each of these sentences
     estimates: tuple[LeftOut, ...] = ()  # changes by effects that are not simulated, the largest first
-    # the end of the convergence curve, as analysis.cost.Ending has it; None: there is no curve
+    # the end of the convergence curve, as analysis.cost.ConvergenceEnd has it; None: there is no curve
     convergence: Mapping[str, Size | None] | None = None
     # where the error sits: parts [{name, error, pixels}] (parts of the squared error, and of the pixels), octaves
     # [{frequency (cycles a pixel), period (in the target's unit), error}],

@@ -22,7 +22,7 @@ import psutil
 import torch
 from scipy.ndimage import gaussian_filter
 
-from bstcad.analysis.cost import TILE, ControlCells
+from bstcad.analysis.cost import TILE_PIXELS, ControlCells
 from bstcad.optics.interfaces import cross
 from bstcad.optics.lens import Lens
 from bstcad.optics.sides import Sides, both, coarser, in_words, spread
@@ -201,7 +201,7 @@ def cells_of_a_mm2(scene: Scene, lens: Lens) -> ControlCells:
     """
     light = max(scene.with_source_scaled(0.0).channels(), key=lambda channel: channel.weight)
     lens, screen, target = light.through(lens), scene.target.screen, scene.target.irradiance()
-    tiles = replace(screen, pixels=tuple(-(-n // TILE) for n in screen.pixels))
+    tiles = replace(screen, pixels=tuple(-(-n // TILE_PIXELS) for n in screen.pixels))
     tubes = launch_tubes(light.source, lens, TUBES)
     x, y = cross(tubes.coming, lens.interfaces[lens.freeform[0]]).rays.position[:2]
     landed = tubes.landing(lens, screen.plane)
@@ -215,7 +215,7 @@ def cells_of_a_mm2(scene: Scene, lens: Lens) -> ControlCells:
     per_flux = np.where(flux > DIM * flux.mean(), area / np.maximum(flux, 1e-300), mean)  # mm² of a unit of flux
     whole = float(flux.sum())
     rows, columns = target.shape
-    over_pixels = np.kron(per_flux, np.ones((TILE, TILE)))[:rows, :columns]
+    over_pixels = np.kron(per_flux, np.ones((TILE_PIXELS, TILE_PIXELS)))[:rows, :columns]
     return ControlCells(whole * target * over_pixels, target)
 
 
@@ -228,7 +228,7 @@ def rrmsd(light: ControlCells, scene: Scene, image: float = 0.0) -> float:
     factor, rest = BY_QUALITY.get(scene.tailoring.quality, BY_QUALITY["standard"])
     width, height = scene.lens.cells
     finer = 1 / math.sqrt(width * height)
-    other_tiles = tuple(slice(TILE // 2 if side > TILE // 2 else 0, None) for side in light.target.shape)
+    other_tiles = tuple(slice(TILE_PIXELS // 2 if side > TILE_PIXELS // 2 else 0, None) for side in light.target.shape)
     between = replace(light, a_pixel=light.a_pixel[other_tiles], target=light.target[other_tiles])
     floors = (FLOOR * light.floor(finer), FLOOR * between.floor(finer))
     halved = (HALVED * light.floor(finer / 2), HALVED * between.floor(finer / 2))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bstcad.analysis.cost import TILE, ControlCells, ending, masks, remaining
+from bstcad.analysis.cost import TILE_PIXELS, ControlCells, ending, masks, remaining
 
 
 class TestEnding:
@@ -106,7 +106,7 @@ class TestControlCells:
 
     def test_a_wave_needs_the_cells_that_its_cosine_takes(self):
         """A quarter of the cosines, those of up to 2√(64 / π) = 9.03 half waves a tile."""
-        x = (np.arange(64) + 0.5) / TILE * np.pi
+        x = (np.arange(64) + 0.5) / TILE_PIXELS * np.pi
         floors = [self.cells(32, np.tile(1 + 0.5 * np.cos(k * x), (64, 1))).floor() for k in (8, 10)]
         size = 0.5**0.5 * 0.5 / (1 + 0.125) ** 0.5
         assert floors == pytest.approx([0.0, size], abs=1e-6)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.analysis.light import FAN, LINES, blur, bundle, fan, finest_detail, margins, ray_map, used
+from bstcad.analysis.light import FAN_RAYS, GRID_LINES, blur, bundle, fan, finest_detail, margins, ray_map, used
 from bstcad.optics.channels import Channel
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
@@ -48,7 +48,7 @@ class TestDrawnRays:
     @SOURCES
     def test_the_fan_runs_from_the_source_over_both_faces_to_the_target(self, source):
         rays, (front, back) = fan(source, self.ROUGH, self.TARGET), (self.ROUGH.front, self.ROUGH.back)
-        assert rays.shape[1:] == (4, 3) and FAN - 2 <= len(rays) <= FAN  # an outermost ray may be vignetted
+        assert rays.shape[1:] == (4, 3) and FAN_RAYS - 2 <= len(rays) <= FAN_RAYS  # an outermost ray may be vignetted
         start = source.position if source is self.LAMP else [*rays[0, 1, :2], source.start(front.z)]
         assert np.array_equal(rays[0, 0], start)
         for stop, face in ((1, front), (2, back)):
@@ -60,7 +60,7 @@ class TestDrawnRays:
         steep = lens_of(lambda x, y: 2.0 * x, Plane(-10.0))  # beyond the critical angle everywhere
         assert fan(self.BEAM, steep, self.TARGET).shape == (0, 4, 3)
         near = fan(Point((0.0, 0.0, -2.0)), lens_of(front=Plane(0.0)), self.TARGET)  # the sides take the outer rays
-        assert 0 < len(near) <= FAN and np.isfinite(near).all()
+        assert 0 < len(near) <= FAN_RAYS and np.isfinite(near).all()
 
     def test_a_bundle_carries_the_light_that_arrives(self):
         ways, flux = bundle(self.BEAM, lens_of(), self.TARGET, 100)
@@ -70,7 +70,7 @@ class TestDrawnRays:
     def test_a_flat_plate_maps_a_beam_onto_itself(self, index):
         start, end = ray_map(self.BEAM, lens_of(index=index), self.TARGET)
         lit = np.isfinite(start).all(axis=-1)
-        assert start.shape == end.shape == (LINES, LINES, 2) and lit.mean() == pytest.approx(np.pi / 4, abs=0.1)
+        assert start.shape == end.shape == (GRID_LINES, GRID_LINES, 2) and lit.mean() == pytest.approx(np.pi / 4, abs=0.1)
         assert np.abs(end - start)[lit].max() < self.EXACT and np.hypot(*start[lit].T).max() <= 6.0
 
     def test_without_bending_a_lamp_casts_a_shadow_in_proportion(self):
@@ -79,7 +79,7 @@ class TestDrawnRays:
         lamp = np.array(self.LAMP.position)
         straight = lamp[:2] + (start - lamp[:2]) * (self.TARGET.z - lamp[2]) / (2.0 - lamp[2])
         lit = np.isfinite(end).all(axis=-1)
-        assert lit.sum() > 0.8 * LINES**2 and np.abs(end - straight)[lit].max() < 1e-8
+        assert lit.sum() > 0.8 * GRID_LINES**2 and np.abs(end - straight)[lit].max() < 1e-8
         assert np.array_equal(np.isnan(start), np.isnan(end))  # a lost ray is drawn on neither side
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bstcad.analysis.steepness import LIMIT, needed
+from bstcad.analysis.steepness import MAX_SLOPE_DEG, needed_steepness
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
@@ -28,7 +28,8 @@ def found(half, at_back=True):
     ends = np.linspace(-1, 1, PIXELS + 1)
     share = np.stack(np.meshgrid(ends, ends, indexing="ij"), axis=-1)
     places = HALF * share * (1.0 if at_back else 12.0 / HEIGHT)  # the same rays on the plane of the dome's vertex
-    return share, needed(Point(), LENS, screen, EVEN, x=half * ends, y=half * ends, places=places, at_back=at_back)
+    x = y = half * ends
+    return share, needed_steepness(Point(), LENS, screen, EVEN, x=x, y=y, places=places, at_back=at_back)
 
 
 @pytest.mark.parametrize("at_back", [True, False])
@@ -40,7 +41,7 @@ def test_light_that_is_made_parallel_needs_a_wall(at_back):
     angle = np.degrees(np.arctan2(N * np.sin(theta), N * np.cos(theta) - 1))
     turned = np.cos(theta) > 1 / N  # else it lies beyond what a face turns
     assert steep.steepest == pytest.approx(angle[turned].max(), abs=1e-3) and steep.steepest > 89
-    assert steep.share == pytest.approx((angle[turned] > LIMIT).mean(), abs=1e-6) and 0.1 < steep.share < 0.9
+    assert steep.share == pytest.approx((angle[turned] > MAX_SLOPE_DEG).mean(), abs=1e-6) and 0.1 < steep.share < 0.9
 
 
 def test_light_that_goes_straight_on_needs_no_more_than_its_own_angle():
@@ -52,5 +53,6 @@ def test_light_that_goes_straight_on_needs_no_more_than_its_own_angle():
 def test_a_dark_target_needs_nothing():
     screen = Screen(FAR, (-1.0, 1.0), (-1.0, 1.0), PIXELS)
     ends = np.linspace(-1, 1, PIXELS + 1)
-    none = needed(Point(), LENS, screen, 0 * EVEN, x=ends, y=ends, places=np.zeros((PIXELS + 1, PIXELS + 1, 2)))
+    places = np.zeros((PIXELS + 1, PIXELS + 1, 2))
+    none = needed_steepness(Point(), LENS, screen, 0 * EVEN, x=ends, y=ends, places=places)
     assert none.share == none.steepest == 0.0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.special import gammainc
 
-from bstcad.analysis.top_hat import FINEST, FlatTop, plateau_uniformity, top_hat
+from bstcad.analysis.top_hat import MAX_BINS, FlatTop, plateau_uniformity, top_hat
 
 PIXELS, HALF = 600, 4.0  # number of pixels a side of a square screen, and half its width (mm)
 PITCH = 2 * HALF / PIXELS
@@ -25,7 +25,7 @@ def numbers(picture, **more):
 def test_a_disc_is_flat_even_and_upright():
     found = numbers(7.0 * DISC)
     assert (found.maximum, found.flatness, found.uniformity, found.edge_steepness) == (7.0, 1.0, 0.0, 0.0)
-    assert found.fractional_power == 1.0 and found.plateau_uniformity <= 1 / FINEST
+    assert found.fractional_power == 1.0 and found.plateau_uniformity <= 1 / MAX_BINS
     assert found.clip_level_area == pytest.approx(math.pi * RADIUS**2, rel=1e-3)  # whole pixels
     assert found.power == found.clip_level_power == pytest.approx(7.0 * found.clip_level_area)
     assert found.average == pytest.approx(7.0) and found.efficiency is None
@@ -80,7 +80,7 @@ def test_a_hot_pixel_is_neither_the_maximum_nor_the_plateau():
     hot = DISC.copy()
     hot[PIXELS // 2, PIXELS // 3] = 1e6
     found = numbers(hot)
-    assert found.maximum == 1.0 and found.edge_steepness == 0.0 and found.plateau_uniformity <= 1 / FINEST
+    assert found.maximum == 1.0 and found.edge_steepness == 0.0 and found.plateau_uniformity <= 1 / MAX_BINS
 
 
 def test_two_plateaus_have_the_width_of_the_brighter_ones_peak():
@@ -101,7 +101,7 @@ def test_efficiency_is_the_share_of_the_light_inside_the_outline():
     [
         (0 * DISC, {}, "no light"),
         (-DISC, {}, "no light"),
-        (np.where(DISC, np.nan, 0.0), {}, "not finite; put 0"),
+        (np.where(DISC, np.nan, 0.0), {}, "not finite; give 0"),
         (DISC, {"eta": 0.1, "epsilon": 0.1}, "0 < epsilon < eta < 1"),
     ],
 )
