@@ -1,7 +1,7 @@
-"""The shape of a lens in the numbers that a machine shop asks for; lengths in mm, angles in degrees.
+"""Shape of a lens in the figures that a machine shop needs; lengths in mm, angles in degrees.
 
-Radii and slopes of a face are taken on a grid four times finer than its net.  Curvature jumps at the knots, so each
-knot span is sampled by itself, up to its ends, at optics.bspline.QUARTERS inside the outline; slopes on the rim too.
+Radii and slopes of a face are computed on a grid four times finer than its net.  Curvature jumps at the knots, so each
+knot span is sampled up to its ends, at optics.bspline.QUARTERS inside the outline.  Slopes are computed on the rim too.
 """
 
 from __future__ import annotations
@@ -21,47 +21,47 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.sampling import rim
 
-GRID = 1025  # points each way of the grid for thickness, and along a quarter of the rim
-ROUNDING = 1e-13  # of the heights
-RIPPLE = 2.0  # slope energy of a net's highest octave over that of the octave below, at most, of a net without ripple
-AT_BOUND = 0.97  # of a bound: a point beyond counts as at the bound (the penalty of tailoring begins at 0.99)
-FLAT, FLATTEST = 1e-9, 1e9  # 1/mm: less curvature is rounding; mm: the radius reported for it
-RIM_ROUNDING = 1e-9  # of the outline's size: where the net ends at the rim, its last points are on the rim
+GRID_POINTS = 1025  # points a side of the grid for thickness, and along a quarter of the rim
+HEIGHT_ROUNDING = 1e-13  # rounding of the heights, relative to the largest
+SMOOTH_RATIO = 2.0  # largest ratio of the slope energies of the two highest octaves of a net without ripple
+AT_BOUND = 0.97  # fraction of a bound above which a point counts as at the bound (the penalty begins at 0.99)
+FLAT, FLATTEST = 1e-9, 1e9  # curvature below which a face is flat (1/mm), and the radius reported for it (mm)
+RIM_ROUNDING = 1e-9  # relative rounding of the outline, so that the last points of a net that ends there are inside
 
 
-def describe(lens: Lens, grid: int = GRID) -> dict[str, float | None]:
-    """Thickness, relief, slope, radii and departure from the best sphere of the back face; mm and degrees.
+def describe(lens: Lens, grid: int = GRID_POINTS) -> dict[str, float | None]:
+    """Return thickness, sag range, slope, radii and departure from the best sphere of the back; mm and degrees.
 
-    A radius is None if the back bends that way nowhere.  Of a front that is tailored the same by keys front_…, seen
-    from outside as the back is: its valleys are concave.
+    A radius is None if the back has no such curvature.  Keys front_… are those of a tailored front, seen from outside
+    like the back: its valleys are concave.
     """
     x, y = _points(lens.outline, grid)
     front, back = _sags(lens, x, y)
     thickness, (front_vertex, back_vertex) = back - front, _sags(lens, *torch.zeros(2, 1, dtype=torch.float64))
     edge, flat = thickness[: 4 * grid], (x.numpy(), y.numpy())
-    of_front = _of_face(lens.front, survey_front(lens), (*flat, front)) if lens.shapes("front") else {}
+    of_front = _face_figures(lens.front, survey_front(lens), (*flat, front)) if lens.shapes("front") else {}
     return {
         "centre_thickness": float((back_vertex - front_vertex)[0]),
         "edge_thickness_min": float(edge.min()),
         "edge_thickness_max": float(edge.max()),
         "thickness_min": float(thickness.min()),
         "thickness_max": float(thickness.max()),
-        **_of_face(lens.back, survey(lens), (*flat, back)),
+        **_face_figures(lens.back, survey(lens), (*flat, back)),
         **{f"front_{key}": value for key, value in of_front.items()},
     }
 
 
-def _of_face(net: BSplineSurface, bends: Survey, places: tuple[np.ndarray, np.ndarray, np.ndarray]) -> dict[str, Any]:
-    """The figures of one freeform face; places: x, y and z (mm) of points all over it."""
+def _face_figures(net: BSplineSurface, bends: Survey, points: tuple[np.ndarray, ...]) -> dict[str, Any]:
+    """Return the figures of one freeform face; points: x, y and z (mm) of points all over it."""
     concave, convex = (bend.largest if bend.largest < FLATTEST else None for bend in (bends.concave, bends.convex))
     octaves, waves = slope_octaves(net), ripple(net)
     top = octaves[-1] / octaves.sum() if octaves.sum() > 0 else 0.0
     return {
-        "sag_pv": float(np.ptp(places[2])),
+        "sag_pv": float(np.ptp(points[2])),
         "slope_max_deg": bends.slope.largest,
         "radius_min_concave": concave,
         "radius_min_convex": convex,
-        "departure_best_sphere": departure(*places),
+        "departure_best_sphere": departure(*points),
         "slope_energy_top_octave": float(top),
         "ripple_height": waves.height,
         "ripple_slope": waves.slope,
@@ -69,18 +69,18 @@ def _of_face(net: BSplineSurface, bends: Survey, places: tuple[np.ndarray, np.nd
 
 
 def thickness_range(lens: Lens, edge: np.ndarray | None = None) -> tuple[float, float]:
-    """Least and largest thickness (mm along z).  edge: as in `heights`."""
+    """Return the minimum and maximum thickness along z (mm); edge: as in `heights`."""
     front, back = heights(lens, edge)
     glass = back - front
     return float(glass.min()), float(glass.max())
 
 
 def heights(lens: Lens, edge: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """z (mm) of the front and of the back at points all over the outline, the rim included.
+    """Return z (mm) of the front and of the back at points all over the outline, including the rim.
 
-    edge: corners (n, 2) in mm of a polygon, once around, instead of the outline, for a lens that was cut from it.
+    edge: corners (n, 2) in mm of a polygon, once around, in place of the outline, for a lens that was cut smaller.
     """
-    return _sags(lens, *(_points(lens.outline, GRID) if edge is None else _points_in(edge)))
+    return _sags(lens, *(_points(lens.outline, GRID_POINTS) if edge is None else _points_in(edge)))
 
 
 def _sags(lens: Lens, x: Tensor, y: Tensor) -> tuple[np.ndarray, np.ndarray]:
@@ -88,48 +88,48 @@ def _sags(lens: Lens, x: Tensor, y: Tensor) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _points(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
-    """x and y (mm) of 4 n points of the rim, and of a grid inside the outline."""
+    """Return x and y (mm) of 4 n points of the rim, and of an n x n grid inside the outline."""
     return tuple(torch.cat(pair) for pair in zip(rim(outline, n), inside(outline, n), strict=True))
 
 
 def _points_in(polygon: np.ndarray) -> tuple[Tensor, Tensor]:
-    """x and y (mm) of the corners (n, 2) of a polygon, and of a grid inside it."""
+    """Return x and y (mm) of the corners (n, 2) of a polygon, and of a grid inside it."""
     import shapely
 
-    axes = (np.linspace(low, high, GRID) for low, high in zip(polygon.min(0), polygon.max(0), strict=True))
+    axes = (np.linspace(low, high, GRID_POINTS) for low, high in zip(polygon.min(0), polygon.max(0), strict=True))
     x, y = (axis.ravel() for axis in np.meshgrid(*axes))
     area = shapely.Polygon(polygon)
     shapely.prepare(area)
-    held = shapely.contains_xy(area, x, y)
+    within = shapely.contains_xy(area, x, y)
     return tuple(
-        torch.from_numpy(np.concatenate([corner, axis[held]])) for corner, axis in zip(polygon.T, (x, y), strict=True)
+        torch.from_numpy(np.concatenate([corner, axis[within]])) for corner, axis in zip(polygon.T, (x, y), strict=True)
     )
 
 
 def inside(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
-    """x and y (mm) of those points of an n x n grid over the bounding box that lie inside the outline."""
+    """Return x and y (mm) of the points of an n x n grid over the bounding box that are inside the outline."""
     axes = (torch.linspace(-half, half, n, dtype=torch.float64) for half in outline.half_extent)
     x, y = torch.meshgrid(*axes, indexing="ij")
-    held = outline.contains(x, y)
-    return (x.reshape(-1), y.reshape(-1)) if bool(held.all()) else (x[held], y[held])
+    within = outline.contains(x, y)
+    return (x.reshape(-1), y.reshape(-1)) if bool(within.all()) else (x[within], y[within])
 
 
 @dataclass(frozen=True, eq=False)
 class Ripple:
-    """Waves of a face whose control points go up and down in turn."""
+    """Ripple of a face: waves from control point to control point."""
 
-    heights: np.ndarray  # (m, n) mm, of the control points; they fade towards the rim of the net
-    height: float  # mm RMS over the face, where they do not fade
-    slope: float  # rad RMS over the face, where they do not fade
+    heights: np.ndarray  # ripple of the control points (m, n), mm; fades towards the rim of the net
+    height: float  # RMS height over the face, without the fading (mm)
+    slope: float  # RMS slope over the face, without the fading (rad)
     fading: float  # RMS of the factor by which `heights` fade
 
 
 def ripple(face: BSplineSurface) -> Ripple:
-    """Return what the highest octave of a net holds beyond a smooth net's.
+    """Return the ripple of a face: the part of its highest octave that a smooth net does not have.
 
-    The octaves are those of the net under a Hann window, sin² from rim to rim: without it the cosine transform takes a
-    smooth net for one with a kink along its rim, whose highest octave may have some hundred µrad.  The part
-    1 - RIPPLE E' / E of the highest octave's slope energy E counts, where E' is that of the octave below.  The mean
+    The octaves are those of the net times a Hann window, sin² from rim to rim.  (Without it the cosine transform sees a
+    kink along the rim of a smooth net, and its highest octave may have some hundred µrad.)  With E the slope energy of
+    the highest octave and E' that of the octave below, the fraction 1 - SMOOTH_RATIO E' / E counts as ripple.  The mean
     squares over the face follow from the overlaps of the basis functions of degree 2 and of their slopes.
     """
     fading = np.outer(*(np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 2 for count in face.shape))
@@ -138,7 +138,7 @@ def ripple(face: BSplineSurface) -> Ripple:
     energy, octave = _energy(face, waves), _octave(face)
     waves[(octave != 0) | (energy == 0)] = 0.0
     top, below = energy[octave == 0].sum(), energy[octave == 1].sum()
-    share = max(0.0, 1 - RIPPLE * below / top) if top > 0 else 0.0
+    share = max(0.0, 1 - SMOOTH_RATIO * below / top) if top > 0 else 0.0
     turns = [np.cos(np.pi * np.arange(count) / count) for count in face.shape]
     (of_x, of_y), (along_x, along_y) = (
         [(16 + 13 * turn + turn**2) / 30 for turn in turns],
@@ -153,18 +153,18 @@ def ripple(face: BSplineSurface) -> Ripple:
 
 
 def slope_octaves(face: BSplineSurface) -> np.ndarray:
-    """Slope energy of the control net by octaves of frequency, coarse to fine (mm², squared steps).
+    """Return the slope energy of the control net by octaves of frequency, coarse to fine (mm², squared differences).
 
-    Σ λ |ĥ|² over the cosine transform ĥ of the net without its best cubic polynomial (a tilt has no even
-    continuation), λ the Laplacian; octave k holds the frequencies whose larger index lies in (m / 2^(k+1), m / 2^k],
-    m the control points along the longer side and an index along the shorter one counted up to m, too.
+    It is Σ λ |ĥ|² over the cosine transform ĥ of the net without its best cubic polynomial (a tilt has no even
+    continuation), λ the Laplacian.  Octave k has the frequencies whose larger index is in (m / 2^(k+1), m / 2^k], m the
+    number of control points along the longer side; indices along the shorter side are scaled to m.
     """
     energy, octave = _energy(face, scipy.fft.dctn(_without_cubic(face), norm="ortho")), _octave(face)
     return np.array([energy[octave == k].sum() for k in reversed(range(int(np.log2(max(face.shape)))))])
 
 
 def _without_cubic(face: BSplineSurface) -> np.ndarray:
-    """(m, n) heights (mm) of the control points without their best cubic polynomial."""
+    """Return the heights (m, n) of the control points minus their best cubic polynomial (mm)."""
     u, v = (np.linspace(-1, 1, count) for count in face.shape)
     columns = np.stack([np.outer(u**i, v**j).ravel() for i in range(4) for j in range(4 - i)], axis=1)
     h = face.heights.detach().cpu().double().numpy().ravel()
@@ -172,25 +172,25 @@ def _without_cubic(face: BSplineSurface) -> np.ndarray:
 
 
 def _energy(face: BSplineSurface, waves: np.ndarray) -> np.ndarray:
-    """(m, n) slope energy (mm², squared steps) of the cosines of a net, by their amplitudes; 0 where it is rounding."""
+    """Return the slope energy (m, n) of the cosines of a net, by their amplitudes (mm²); 0 where it is rounding."""
     along_x, along_y = (2 - 2 * np.cos(np.pi * np.arange(count) / count) for count in face.shape)
     energy = (along_x[:, None] + along_y) * waves**2
-    rounding = ROUNDING * (abs(face.z) + float(face.heights.abs().max()))
+    rounding = HEIGHT_ROUNDING * (abs(face.z) + float(face.heights.abs().max()))
     return np.where(energy < rounding**2, 0.0, energy)
 
 
 def _octave(face: BSplineSurface) -> np.ndarray:
-    """(m, n) number of the octave of each cosine of a net, from the highest octave, 0, down."""
+    """Return the number of the octave of each cosine of a net, (m, n); 0 is the highest octave."""
     m = max(face.shape)
     larger = np.maximum(*(index * (m / count) for index, count in zip(np.indices(face.shape), face.shape, strict=True)))
     return np.floor(np.log2(m / np.maximum(larger, 0.5))).astype(int)
 
 
 def least_squares(columns: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Coefficients (k,) of columns (n, k) by least squares for values (n,).
+    """Return the least-squares coefficients (k,) of columns (n, k) for values (n,).
 
-    By the normal equations of columns scaled to one length, and once more for the residual: as exact as by singular
-    values for columns that are not nearly dependent, and several times as fast.
+    The normal equations of columns scaled to length 1 are solved, and again for the residual.  For columns that are not
+    nearly dependent this is as accurate as singular values, and several times faster.
     """
     lengths = np.sqrt(np.einsum("ij,ij->j", columns, columns))
     normal = columns.T @ columns / np.outer(lengths, lengths)
@@ -201,10 +201,10 @@ def least_squares(columns: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def departure(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> float:
-    """Peak to valley (mm) of a face against its best sphere, which may be a plane.
+    """Return the peak-to-valley departure (mm) of a face from its best sphere, which may be a plane.
 
-    Least squares of P = h - k (x² + y² + h²) - a x - b y - d, h = z - mean: zero on a sphere of curvature 2 k / n,
-    n² = 1 + a² + b² - 4 k d, from which a point is 2 P / (n + sqrt(n² - 4 k P)) away (Pratt 1987).
+    Least squares of P = h - k (x² + y² + h²) - a x - b y - d, h = z - mean.  P = 0 is a sphere of curvature 2 k / n,
+    n² = 1 + a² + b² - 4 k d, at the distance 2 P / (n + sqrt(n² - 4 k P)) from a point (Pratt 1987).
     """
     h = z - z.mean()
     columns = np.stack([x**2 + y**2 + h**2, x, y, np.ones_like(x)], axis=1)
@@ -219,24 +219,24 @@ def departure(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class Extreme:
-    """The extreme of a quantity over a face."""
+    """Extreme of a quantity over a face."""
 
-    largest: float
-    where: str
-    at_bound: float  # share of the area that is at the bound; 0 without a bound
+    largest: float  # largest value
+    where: str  # position, as text
+    at_bound: float  # fraction of the area that is at the bound; 0 without a bound
 
 
 @dataclass(frozen=True)
 class Survey:
-    """The extremes of a face, seen from outside the lens."""
+    """Extremes of a face, seen from outside the lens."""
 
-    concave: Extreme  # the smallest principal radius of a valley (mm), as `largest`; FLATTEST if there is no valley
-    convex: Extreme  # the same of a ridge
-    slope: Extreme  # the steepest angle of the tangent plane against z = const (degrees)
+    concave: Extreme  # smallest principal radius of a valley (mm), in `largest`; FLATTEST if there is no valley
+    convex: Extreme  # smallest principal radius of a ridge (mm), in `largest`; FLATTEST if there is no ridge
+    slope: Extreme  # largest angle of the tangent plane to z = const (degrees)
 
 
 def survey(lens: Lens, concave: float | None = None, convex: float | None = None, slope: float | None = None) -> Survey:
-    """Survey the back of a lens.  concave, convex: bounds on radii (mm); slope: bound on the angle (degrees)."""
+    """Find the extremes of the back; concave, convex: bounds on radii (mm); slope: bound on the angle (degrees)."""
     lens = lens.plain()
     x, y, along_x, along_y = _grid(lens.back)
     near = (
@@ -248,7 +248,7 @@ def survey(lens: Lens, concave: float | None = None, convex: float | None = None
     found, place, count = spline.largest_bending(net, (along_x, along_y), (x, y), limits=limits, bounds=near)
     each = math.prod(lens.back.pitch) / len(QUARTERS) ** 2 / lens.outline.area
     valley, ridge, steep = (
-        Extreme(float(value), _at(x.flat[i], y.flat[j]), min(each * float(n), 1.0))
+        Extreme(float(value), _position_text(x.flat[i], y.flat[j]), min(each * float(n), 1.0))
         for value, (i, j), n in zip(found, place, count, strict=True)
     )
     return Survey(_radius(valley), _radius(ridge), _angle(lens, steep))
@@ -257,19 +257,19 @@ def survey(lens: Lens, concave: float | None = None, convex: float | None = None
 def survey_front(
     lens: Lens, concave: float | None = None, convex: float | None = None, slope: float | None = None
 ) -> Survey:  # fmt: skip
-    """Survey the front of a lens, a net: seen from outside, from below, a ridge towards +z is a valley."""
+    """Find the extremes of a freeform front; from outside, from -z, a ridge of z is a valley."""
     found = survey(replace(lens, back=lens.front), concave=convex, convex=concave, slope=slope)
     return Survey(concave=found.convex, convex=found.concave, slope=found.slope)
 
 
 def _grid(back: BSplineSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(x, y) (spans, places) mm of QUARTERS of each span, and the weights for spline.largest_bending."""
+    """Return x and y (spans, points) mm of QUARTERS of each span, and the weights for spline.largest_bending."""
     spans = [torch.arange(count - 2) for count in back.shape]
     x, y = (at.reshape(len(QUARTERS), -1).T.contiguous().numpy() for at in span_places(back, *spans, QUARTERS))
     scaled = []
     for span, count, pitch in zip(spans, back.shape, back.pitch, strict=True):
         by_quarter = [torch.stack([torch.stack(order) for order in weights(span, count, s)]) for s in QUARTERS]
-        of_unit = torch.stack(by_quarter).permute(3, 0, 1, 2)  # by span, quarter, derivative, control point
+        of_unit = torch.stack(by_quarter).permute(3, 0, 1, 2)  # (span, quarter, derivative, control point)
         scale = torch.tensor([1.0, 1 / pitch, 1 / pitch**2], dtype=torch.float64)[:, None]
         scaled.append((of_unit * scale).reshape(len(span), len(QUARTERS), 9).contiguous().numpy())
     return x, y, *scaled
@@ -280,15 +280,15 @@ def _radius(bend: Extreme) -> Extreme:
 
 
 def _angle(lens: Lens, slope: Extreme) -> Extreme:
-    """The angle in degrees, of the rim too: it may be steeper between the points of the grid."""
-    x, y = rim(lens.outline, GRID)
+    """Return the extreme as an angle in degrees, including the rim between the points of the grid."""
+    x, y = rim(lens.outline, GRID_POINTS)
     _, z_x, z_y = lens.back.sag_and_slope(x, y)
     steep = torch.hypot(z_x, z_y)
-    if (most := float(steep.max())) > slope.largest:
+    if (largest := float(steep.max())) > slope.largest:
         at = int(steep.argmax())
-        slope = replace(slope, largest=most, where=_at(float(x[at]), float(y[at])))
+        slope = replace(slope, largest=largest, where=_position_text(float(x[at]), float(y[at])))
     return replace(slope, largest=math.degrees(math.atan(slope.largest)))
 
 
-def _at(x: float, y: float) -> str:
+def _position_text(x: float, y: float) -> str:
     return f"at ({x:.4g}, {y:.4g}) mm"
