@@ -264,7 +264,7 @@ def difference(changed: np.ndarray, before: np.ndarray) -> float:
 def _trace_through(
     lens: Lens, channel: Channel, screen: Screen, places: tuple[Tensor, Tensor]
 ) -> tuple[Landed, Tensor]:
-    """Trace light through points of the last face; return where it lands, with flux 1 before losses, and its density."""
+    """Trace light through points of the last face; return where it lands (flux 1 before losses), and its density."""
     lens, source = channel.through(lens), channel.source
     p, q, _ = rays_to(source, lens, *places)
     rays = source.rays(p, q, lens.entrance.z, 1.0)
