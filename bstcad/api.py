@@ -29,7 +29,7 @@ from bstcad.folder import Made, same_front
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, tubes_picture
-from bstcad.optics.sides import both, in_words, plain
+from bstcad.optics.sides import as_pair, simplified, size_text
 from bstcad.optics.surfaces import Surface
 from bstcad.report import record
 from bstcad.report.drawing import png
@@ -345,7 +345,7 @@ class Design:
         glass = self.scene.lens.material or "glass"
         return (
             f"{across} of {glass} (index {lens.index:.5g}), {quantity(thick, 'mm')} thick on the axis, "
-            f"{in_words(lens.back.shape)} control points"
+            f"{size_text(lens.back.shape)} control points"
         )
 
     def _worth(self) -> str:
@@ -381,11 +381,11 @@ def _fitting(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
     _check_same("way of light", lens.passes.words, scene.lens.passes.words)
     if lens.passes.enters and not math.isclose(lens.index, scene.index, rel_tol=SAME):
         _check_same("index", lens.index, scene.index)
-    if lens.back.shape != both(scene.lens.back.net):
-        scene = scene.changed({"lens.back.control_points": plain(lens.back.shape), "tailoring.levels": None})
+    if lens.back.shape != as_pair(scene.lens.back.net):
+        scene = scene.changed({"lens.back.control_points": simplified(lens.back.shape), "tailoring.levels": None})
     shapes_front = scene.lens.front.shaped and lens.front.is_net
-    if shapes_front and lens.front.shape != both(scene.lens.nets()[1]):
-        scene = scene.changed({"lens.front.control_points": plain(lens.front.shape), "lens.front.file": None})
+    if shapes_front and lens.front.shape != as_pair(scene.lens.nets()[1]):
+        scene = scene.changed({"lens.front.control_points": simplified(lens.front.shape), "lens.front.file": None})
     flat = scene.flat_lens(lens.back.shape)
     back = _on_net(lens.back, flat.back, "back")
     if shapes_front:

@@ -29,7 +29,7 @@ from bstcad.cad.mesh import SILVER, Label
 from bstcad.optics import quadrature
 from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
 from bstcad.optics.lens import Lens
-from bstcad.optics.sides import Sides, both, scaled
+from bstcad.optics.sides import Sides, as_pair, scaled
 from bstcad.optics.surfaces import Surface
 from bstcad.report.prescription import scene_text
 from bstcad.report.record import Making
@@ -93,7 +93,7 @@ def step_size(scene: scenes.Scene, net: Sides | None = None) -> float:
 
     net: control points a side, or along x and along y; None: those of the scene.
     """
-    nets = map(both, scene.lens.nets(net))
+    nets = map(as_pair, scene.lens.nets(net))
     return sum(m * n * (POINT + 2 * len(str(m * n))) + REST[1] * (m + n) / 2 for m, n in nets) + REST[0]
 
 
@@ -102,7 +102,7 @@ def said_of_sizes(scene: scenes.Scene) -> str:
     net = scene.lens.back.net
     fewer = scaled(net, 0.5)
     here, half = (f"{step_size(scene, points) / 1e6:.3g} MB" for points in (net, fewer))
-    m, n = both(net)
+    m, n = as_pair(net)
     return (
         f"lens.step will take about {here} for {m} x {n} control points; lens.back.control_points = "
         f"{list(fewer) if isinstance(fewer, tuple) else fewer} would take {half}"
@@ -349,9 +349,9 @@ def _holds(kept: Path, design: Made) -> bool:
 def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
     """Scene and nominal design of a folder; SceneError if design.npz or scene.toml is missing or damaged."""
     scene = scenes.load(folder / SCENE)
-    shapes = {"control_points": (*both(scene.lens.back.net), 3), "front_curvature": ()}
+    shapes = {"control_points": (*as_pair(scene.lens.back.net), 3), "front_curvature": ()}
     if scene.lens.front.shaped:
-        shapes["front_control_points"] = (*both(scene.lens.nets()[1]), 3)
+        shapes["front_control_points"] = (*as_pair(scene.lens.nets()[1]), 3)
     held = files.names(folder / DESIGN)
     for k, target in enumerate(scene.targets):
         shapes[numbered("target", k)] = target.columns_rows[::-1]
@@ -393,7 +393,7 @@ def read_transport(folder: Path, scene: scenes.Scene) -> TransportMap | None:
 def _arrays(folder: Path, shapes: Mapping[str, tuple[int, ...]], scene: scenes.Scene) -> dict[str, np.ndarray]:
     """Arrays of finite numbers out of the design.npz of a scene."""
     path, pixels = folder / DESIGN, sum(math.prod(target.columns_rows) for target in scene.targets)
-    points = sum(math.prod(both(net)) for net in scene.lens.nets())
+    points = sum(math.prod(as_pair(net)) for net in scene.lens.nets())
     try:
         found = files.arrays(path, shapes, 25 * points + 17 * pixels + 3_000_000)  # with the arrays that are not read
     except Exception as error:  # numpy, zipfile, zlib and tokenize each raise their own for a damaged file

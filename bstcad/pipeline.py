@@ -21,8 +21,8 @@ from bstcad.optics.emitters import Emitter
 from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
 from bstcad.optics.reach import GRAZING, grazing_of, spread_at, unreached
-from bstcad.optics.sides import both
-from bstcad.optics.unfolding import imaged
+from bstcad.optics.sides import as_pair
+from bstcad.optics.unfolding import image_screen
 from bstcad.report.record import Making, Point
 from bstcad.report.record import Stage as StageRecord
 from bstcad.runs import processes
@@ -282,7 +282,7 @@ def _compared(making: Making, task: Task, lens: Lens, before: int) -> Making:
 
 def steepness(source: Emitter, lens: Lens, goal: Goal, sent: TransportMap) -> Steepness:
     """The slope that the light of a goal needs of the last tailored face, by the map of stage 1."""
-    at_back, screen = sent.plane == "back", imaged(lens, goal.receiver)
+    at_back, screen = sent.plane == "back", image_screen(lens, goal.receiver)
     return needed_steepness(source, lens, screen, goal.picture, x=sent.x, y=sent.y, places=sent.source, at_back=at_back)
 
 
@@ -431,7 +431,7 @@ def reserve(scene: Scene) -> float:
     """Seconds that writing, proving and reporting will take on two cores."""
     pixels = sum(math.prod(target.columns_rows) for target in scene.targets) / 512**2
     nets = scene.lens.nets()
-    points = sum(math.prod(both(net)) for net in nets) / 513**2
+    points = sum(math.prod(as_pair(net)) for net in nets) / 513**2
     witnesses = len(scene.targets) * (len(nets) - 1)
     return FIXED + PER_NET * points + PER_PICTURE * pixels + PER_WITNESS * witnesses
 

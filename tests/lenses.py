@@ -11,7 +11,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline, Rectangle
 from bstcad.optics.rays import Rays
-from bstcad.optics.sides import Sides, both
+from bstcad.optics.sides import Sides, as_pair
 from bstcad.optics.surfaces import Sphere, Surface
 
 N = 1.488
@@ -28,9 +28,9 @@ def net(
 ) -> BSplineSurface:
     """Return the net whose control points stand sag(x, y) mm above z; a tensor: these heights; None: a plane."""
     ends = half if isinstance(half, tuple) else (half, half)
-    heights = sag if isinstance(sag, Tensor) else torch.zeros(both(m), dtype=torch.float64)
+    heights = sag if isinstance(sag, Tensor) else torch.zeros(as_pair(m), dtype=torch.float64)
     if callable(sag):
-        x, y = (torch.linspace(-e, e, count, dtype=torch.float64) for e, count in zip(ends, both(m), strict=True))
+        x, y = (torch.linspace(-e, e, count, dtype=torch.float64) for e, count in zip(ends, as_pair(m), strict=True))
         heights = heights + sag(x[:, None], y[None, :])
     return BSplineSurface(z, heights.to(dtype), (-ends[0], ends[0]), (-ends[1], ends[1]))
 
@@ -44,7 +44,7 @@ def half_over(outline: Outline, m: int) -> tuple[float, float]:
 
 def rough(size: float, seed: int = 0, z: float = 20.0, m: Sides = 17, half: Half = 10.0) -> BSplineSurface:
     """Return a net of normally distributed heights, `size` mm RMS."""
-    heights = size * torch.randn(both(m), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    heights = size * torch.randn(as_pair(m), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     return net(heights, z, half=half)
 
 

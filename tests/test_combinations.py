@@ -26,7 +26,7 @@ from bstcad.analysis.steepness import Steepness
 from bstcad.app.preview import Pains, preview
 from bstcad.optics.measure import Effort
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.sides import both
+from bstcad.optics.sides import as_pair
 from bstcad.optics.surfaces import Sphere
 from bstcad.report.figure_jobs import NoPictures
 from bstcad.scene.blank import as_front, net_extent
@@ -386,7 +386,7 @@ def faults(chosen, folder):
     assert all(np.isfinite(picture).all() for pictures in seen.pictures for picture in pictures)
     assert {"simulated", "left_out", "blur"} <= set(told) and "predicted" in predicted
     assert again.report.rrmsd == pytest.approx(report.rrmsd, rel=1e-3)
-    assert again.lens.back.shape == both(again.scene.lens.back.net)
+    assert again.lens.back.shape == as_pair(again.scene.lens.back.net)
     failed = [check for check in report.checks if not check.passed]
     return [
         f"{check.name}: {check.value} ({check.limit}) {check.where}"

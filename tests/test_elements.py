@@ -17,9 +17,9 @@ from bstcad.optics.motion import Motion
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.receivers import LevelPlane, TiltedPlane
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.tilted import Tilted
+from bstcad.optics.tilted import TiltedSurface
 from bstcad.optics.trace import across
-from bstcad.optics.unfolding import image, imaged
+from bstcad.optics.unfolding import image, image_screen
 from bstcad.report.figure_jobs import side_view
 from bstcad.report.light_figures import View
 from bstcad.scene.elements import Mirror, Window, interfaces
@@ -69,7 +69,7 @@ def made(kind, **keys):
 def test_rays_meet_a_tilted_face_on_its_equation(bend, sense):
     """c |p - V|² = 2 N · (p - V) at the end p of the way along the ray, and the height and slopes are those of p."""
     tilt = Motion.of(turn=(12.0, -20.0, 0.0), about=(1.0, 2.0, 30.0), shift=(3.0, -1.0, 0.5))
-    face = Tilted.of(Sphere(30.0, bend)).moved_by(tilt)
+    face = TiltedSurface.of(Sphere(30.0, bend)).moved_by(tilt)
     rays = random_rays(sense=sense, z=0.0 if sense > 0 else 60.0)
     [first] = interfaces([made("mirror", z=30.0)], sense, 587.6)
     at = across(rays, (replace(first, surface=face),))
@@ -86,7 +86,7 @@ def test_rays_meet_a_tilted_face_on_its_equation(bend, sense):
 @pytest.mark.parametrize("surface", [Plane(3.0), Sphere(3.0, 0.01)])
 def test_a_face_on_the_axis_is_the_plane_or_the_sphere(surface):
     x, y = torch.meshgrid(*[torch.linspace(-9, 9, 7, dtype=torch.float64)] * 2, indexing="ij")
-    for ours, theirs in zip(Tilted.of(surface).sag_and_slope(x, y), surface.sag_and_slope(x, y), strict=True):
+    for ours, theirs in zip(TiltedSurface.of(surface).sag_and_slope(x, y), surface.sag_and_slope(x, y), strict=True):
         torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-14)
 
 
@@ -137,7 +137,7 @@ def test_light_out_of_the_glass_lands_where_it_is_sent(plane, window):
     behind = (back, *interfaces([made(kind, z=30.0, thickness=0.01, index=1.5) for kind in window], 1, 587.6))
     rays = random_rays(z=2.0)
     x, y = torch.from_numpy(np.random.default_rng(1).uniform(-40, 0, (2, 400)))
-    sent = replace(rays, direction=image(behind, plane).way_to(rays, torch.stack([x, y])))
+    sent = replace(rays, direction=image(behind, plane).vector_to(rays, torch.stack([x, y])))
     landed = plane.land(across(sent, behind))
     torch.testing.assert_close(landed.position, torch.stack([x, y]), rtol=0, atol=1e-2 if window else 1e-9)
 
@@ -299,4 +299,4 @@ def test_a_lens_that_is_moved_leaves_them_where_they_are(folder):
 
 def test_a_screen_of_an_image_is_the_screen_where_nothing_is_behind():
     scene = bstcad.load(DISK)
-    assert imaged(scene.flat_lens(9), screen := scene.target.screen) is screen
+    assert image_screen(scene.flat_lens(9), screen := scene.target.screen) is screen

@@ -107,7 +107,7 @@ class Cylinder(Receiver):
         status = rays.lose(~inside, Status.TURNED_BACK)
         return torch.where(inside, (torch.sqrt((b * b - a * c).clamp(min=0)) - b) / a, 0.0), status
 
-    def places(self, rays):
+    def coordinates(self, rays):
         return self.radius * torch.atan2(rays.position[0], rays.above(0.0)), rays.position[1]
 
     def point(self, x, y):
@@ -169,7 +169,7 @@ class Directions(Receiver):
         status = rays.lose(~(c < 0), Status.TURNED_BACK)
         return torch.where(c < 0, torch.sqrt((b * b - c).clamp(min=0)) - b, 0.0), status
 
-    def places(self, rays):
+    def coordinates(self, rays):
         x, y, z = (*rays.position[:2], rays.above(0.0))
         return torch.rad2deg(torch.atan2(x, z)), torch.rad2deg(torch.asin(y / self.radius))
 
@@ -291,7 +291,7 @@ def test_an_emitter_of_its_own_answers_or_declines_in_a_sentence(scene):
     """Sizes and position follow from its class; errors that would move its light are refused, and others are not."""
     oval = scene.model_copy(update={"source": Oval(5.0, 8.0)})
     setup = Setup(scene.flat_lens(33), oval.channels(), scene.target.screen)
-    assert (oval.source.lumens, oval.source.wider(0.1)) == (None, None)
+    assert (oval.source.lumens, oval.source.with_wider_cone(0.1)) == (None, None)
     assert "source.axial" not in (known := kinds(setup)) and "lens.clocking" not in known and "source.size" not in known
     known["lens.thickness"].apply(setup, 0.1)
     with pytest.raises(SceneError, match="^tolerance: the emitter Oval .* moved"):

@@ -17,7 +17,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.point import Point
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.sides import coarser, plain, scaled, side, spread
+from bstcad.optics.sides import coarser, scaled, side, simplified, spread
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.tubes import launch_tubes
 from bstcad.scene.errors import SceneError
@@ -137,7 +137,7 @@ def test_a_net_of_more_points_is_the_same_surface():
 
 
 def test_sides():
-    assert plain((7, 7)) == 7 and plain((7, 5)) == (7, 5) and side((512, 128)) == 256
+    assert simplified((7, 7)) == 7 and simplified((7, 5)) == (7, 5) and side((512, 128)) == 256
     assert coarser(257, 33) == 33 and coarser(257, 999) == 257 and coarser((513, 129), 33) == (33, 9)
     assert coarser((33, 513), 129) == (9, 129) and coarser((65, 9), 33) == (33, 5)  # no fewer than a spline has
     assert scaled((65, 17), 2) == (129, 33) and spread(256, 4.0, 1.0) == (512, 128) and spread(256, 1.0, 1.0) == 256

@@ -14,7 +14,7 @@ from torch import Tensor
 from bstcad.analysis.neglected_effects import difference
 from bstcad.analysis.shape import ripple
 from bstcad.optics import sampling
-from bstcad.optics.channels import Channel, points
+from bstcad.optics.channels import Channel, points_per_line
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import cross, deflect, intersect
 from bstcad.optics.irradiance import Screen
@@ -31,7 +31,7 @@ from bstcad.optics.trace import (
     trace,
     window,
 )
-from bstcad.optics.unfolding import per_radian, seen_by
+from bstcad.optics.unfolding import image_from_lens, per_radian
 
 
 def _at_interfaces(rays: Rays, lens: Lens) -> list[Rays]:
@@ -224,7 +224,7 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
     cos θ = (d_z - d_x z_x - d_y z_y) / sqrt(1 + z_x² + z_y²) where light leaves the glass; total internal reflection at
     sin θ = 1 / n.  F(t) = z(t) - sag(x(t), y(t)), F' = d_z - d_x z_x - d_y z_y at each face from the first net on.
     """
-    margin, slope, n = math.inf, math.inf, math.ceil(n / math.sqrt(points(channels)))
+    margin, slope, n = math.inf, math.inf, math.ceil(n / math.sqrt(points_per_line(channels)))
     wrong = sum(int((~torch.isfinite(net.heights)).sum()) for net in lens.nets)
     for channel in channels:
         through = channel.through(lens)
@@ -275,7 +275,7 @@ def blur(
 
     None for a point source, and if none of the light passes the lens.
     """
-    if points(channels) == 1:
+    if points_per_line(channels) == 1:
         return None
     found = images(channels, lens, screen, n)
     if not found.flux.any():
@@ -307,7 +307,7 @@ class FinestDetail:
 
 def finest_detail(source_image: float, lens: Lens, screen: Screen, of: str, assumed: bool = False) -> FinestDetail:
     """Return the finest detail on a target where the image of the source (size: `of`) is `source_image` pixels wide."""
-    distance, pixel = abs(seen_by(lens, screen).throw(lens.back.z)), _pixel(screen)
+    distance, pixel = abs(image_from_lens(lens, screen).throw(lens.back.z)), _pixel(screen)
     grows = distance == abs(per_radian(lens, screen))  # with the distance; an image over angles keeps its width
     sizes = (*(2 * half for half in lens.outline.half_extent), *(high - low for low, high in (screen.x, screen.y)))
     nearer, image = MIN_DISTANCE_RATIO * max(sizes), source_image * pixel

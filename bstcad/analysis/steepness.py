@@ -55,7 +55,7 @@ def needed_steepness(
         coming = across(source.rays(p, q, lens.entrance.z, 1.0), before)
         at, _, _ = intersect(face.surface, coming, face.outline, face.status_if_missed)
     aim = torch.stack(torch.meshgrid(torch.from_numpy(x), torch.from_numpy(y), indexing="ij"))
-    out, eta = screen.plane.way_to(at, aim), face.law.eta
+    out, eta = screen.plane.vector_to(at, aim), face.law.eta
     out = out / torch.sqrt((out * out).sum(0))
     normal = normal_towards(at, out, face.law)
     angle = torch.rad2deg(torch.atan2(torch.hypot(normal[0], normal[1]), normal[2]))

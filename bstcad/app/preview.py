@@ -23,7 +23,7 @@ from bstcad.folder import Made
 from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import a_side, seen_through, simulated, tubes_picture
-from bstcad.optics.sides import both, coarser
+from bstcad.optics.sides import as_pair, coarser
 from bstcad.optics.tubes import corners, middle
 from bstcad.report.light_figures import rrmsd
 from bstcad.scene.scene import Scene
@@ -112,14 +112,14 @@ def made_small(scene: Scene, pains: Pains) -> Scene:
     share, times = (SEVERAL, TIMES) if several else (1.0, 1)
     most = round(share * pains.net)
     net = scene.lens.back.control_points or most
-    if max(both(net)) > most:
+    if max(as_pair(net)) > most:
         net = coarser(net, most)
     evaluations = times * (pains.evaluations if scene.source.extent is None else pains.blurred)
     changes: dict[str, Any] = dict.fromkeys(f"tailoring.{key}" for key in ("method", "accuracy", "max_time"))
     changes |= {
         "lens.back.control_points": net,
         "tailoring.quality": "draft",
-        "tailoring.levels": [coarser(net, COARSE_NET), net] if max(both(net)) > 1.5 * COARSE_NET else None,
+        "tailoring.levels": [coarser(net, COARSE_NET), net] if max(as_pair(net)) > 1.5 * COARSE_NET else None,
         "tailoring.rays": round(share * pains.tubes),
         "tailoring.transport_grid": CELLS,
         "tailoring.stage2_iterations": evaluations,

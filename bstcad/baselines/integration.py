@@ -31,9 +31,9 @@ from bstcad.optics.interfaces import ALONG, Law
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays
 from bstcad.optics.receivers import Receiver
-from bstcad.optics.sides import Sides, both
+from bstcad.optics.sides import Sides, as_pair
 from bstcad.optics.trace import clear_window, to_first_net
-from bstcad.optics.unfolding import seen_from_last_net
+from bstcad.optics.unfolding import image_from_last_net
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring import slope_map
 from bstcad.tailoring.machinability import place_back
@@ -81,7 +81,7 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
     area, n = clear_window(source, exact), knobs.rays // 2 * 2 + 1  # odd: one ray through the centre
     x, y = sampling.grid(area, n)
     coming = to_first_net(source.rays(x, y, exact.entrance.z, area.area / n**2), exact)
-    aim, plane = slope_map.aim_points(mapping, exact, screen, x=x, y=y), seen_from_last_net(exact, screen.plane)
+    aim, plane = slope_map.aim_points(mapping, exact, screen, x=x, y=y), image_from_last_net(exact, screen.plane)
     for _ in range(MAX_STARTS):
         start = exact.back.z
         points = march(coming, aim, plane, law=exact.last_freeform.law, z=start, first=first)
@@ -206,11 +206,11 @@ def fit_net(surface: BSplineSurface, points: SurfacePoints, used: Tensor, levels
     surface, n = surface.refined(nets[0]), used.shape[-1]
     surface = replace(surface, heights=torch.zeros_like(surface.heights))
     for net, (bending, count, degree) in zip(nets, ways, strict=True):
-        m = max(both(net))
+        m = max(as_pair(net))
         every = 1 if bending == FINEST_FIT[0] else max(1, n // (POINTS_PER_CELL * m))
         some = used[::every, ::every]
         x, y, z = (p[::every, ::every][some] for p in points.position)
-        cells = math.prod(points * every / n for points in both(net))  # cells of the net per point
+        cells = math.prod(points * every / n for points in as_pair(net))  # cells of the net per point
         surface = fit_heights(surface.refined(net), x, y, z=z, bending=bending / cells, count=count, degree=degree)
     return surface
 

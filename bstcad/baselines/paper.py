@@ -28,7 +28,7 @@ from bstcad.tailoring import slope_map
 from bstcad.tailoring.merit import landing
 from bstcad.tailoring.minimise import AdamState, Best, Reached, adam, minimise
 from bstcad.tailoring.run import Parameters, Step, Task
-from bstcad.transport.bfm import Step as TransportStep
+from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Mapping
 
 STAGE1_RATES = {33: 0.02, 129: 0.004, 513: 0.008}  # mm a step, by control points a side (section 3.2)

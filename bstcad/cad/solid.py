@@ -27,7 +27,7 @@ from bstcad.cad.walls import RIM, SLIM, TOLERANCE, UPRIGHT, Draft, Named, Rail, 
 from bstcad.cad.wires import Curve, Piece
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
-from bstcad.optics.sides import both, coarser
+from bstcad.optics.sides import as_pair, coarser
 from bstcad.optics.surfaces import Plane, sag
 from bstcad.scene.mount import parting
 
@@ -102,7 +102,7 @@ def coarse_copy(lens: Lens, m: int) -> Lens:
     stretch = (m - 1) / (m - 1 - 2 * SPARE)
     reach = (max(-low, high) for low, high in (lens.back.x, lens.back.y))
     ends = [half if end <= half else stretch * half for half, end in zip(lens.outline.half_extent, reach, strict=True)]
-    spans = zip(ends, both(coarser(lens.back.shape, m)), (lens.back.x, lens.back.y), strict=True)
+    spans = zip(ends, as_pair(coarser(lens.back.shape, m)), (lens.back.x, lens.back.y), strict=True)
     x, y = np.meshgrid(*(np.clip(np.linspace(-end, end, k), *span) for end, k, span in spans), indexing="ij")
     heights = torch.from_numpy(sag(lens.back, x, y) - lens.back.z)
     return replace(lens, back=BSplineSurface(lens.back.z, heights, *((-end, end) for end in ends)))

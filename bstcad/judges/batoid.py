@@ -16,14 +16,14 @@ import numpy as np
 
 from bstcad.judges import faces
 from bstcad.judges.faces import Face, FaceError, Traced
-from bstcad.optics.channels import Channel, places
+from bstcad.optics.channels import Channel, source_numbers
 from bstcad.optics.interfaces import Reflect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import a_side
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Rays, axes
-from bstcad.optics.tilted import Tilted
+from bstcad.optics.tilted import TiltedSurface
 from bstcad.optics.trace import launch_strips
 
 BEYOND = 0.125  # of a face's width: margin of its grid beyond the rim, where the search for a ray may begin
@@ -64,12 +64,12 @@ def placed(face: Face) -> Placed:
 def surfaces(lens: Lens) -> tuple[Placed, ...]:
     """The faces that light meets, in its order, those of windows and mirrors around the lens too."""
     return tuple(
-        _tilted(surface) if isinstance(surface, Tilted) else placed(faces.face(surface, lens.outline))
+        _tilted(surface) if isinstance(surface, TiltedSurface) else placed(faces.face(surface, lens.outline))
         for surface in (interface.surface for interface in lens.interfaces)
     )
 
 
-def _tilted(surface: Tilted) -> Placed:
+def _tilted(surface: TiltedSurface) -> Placed:
     """A plane or a sphere in any place as batoid has it; nothing is compared with it."""
     import batoid
 
@@ -112,7 +112,7 @@ def through(lens: Lens, known: Sequence[Placed], rays: Rays) -> Any:
         else:
             media = (batoid.ConstMedium(n) for n in (interface.law.n_in, interface.law.n_out))
             batoid.refract(at.surface, theirs, *media, coordSys=at.frame)
-        if isinstance(interface.surface, Tilted):  # its outline is that along z
+        if isinstance(interface.surface, TiltedSurface):  # its outline is that along z
             theirs.toCoordSys(batoid.CoordSys())
         batoid.obscure(_outside(interface.outline), theirs)
     return theirs
@@ -135,7 +135,7 @@ def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, se
     halves, count = np.zeros((2, *screen.shape)), 0
     sense = lens.passes.sense * (-1) ** sum(interface.law.reverses for interface in lens.interfaces[lens.solid.start :])
     for half, picture in enumerate(halves):
-        for channel, place in zip(channels, places(channels), strict=True):
+        for channel, place in zip(channels, source_numbers(channels), strict=True):
             glass, landed, launched = channel.through(lens), np.zeros(screen.shape), 0.0
             for strip in launch_strips(channel.source, glass, n, seed + half + 2 * place):
                 x, y, arrived = land(through(glass, known, strip), screen, sense)

@@ -27,7 +27,7 @@ from trimesh import Trimesh
 
 from bstcad.judges import faces
 from bstcad.judges.faces import Face, FaceError, Traced
-from bstcad.optics.channels import Channel, points
+from bstcad.optics.channels import Channel, points_per_line
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import Screen
@@ -61,7 +61,7 @@ def cannot(lens: Lens, channels: Sequence[Channel]) -> str:
         return "it builds a lens or a mirror, and light takes another way through this solid"
     if (first := channels[0].source).kind not in LAMPS:
         return f"Mitsuba has no lamp for the light of {type(first).__name__}"
-    if first.parallel and points(channels) > 1:
+    if first.parallel and points_per_line(channels) > 1:
         return "parallel light of many directions starts from a plate for each, which would stand in each other's light"
     if lens.passes.sense < 0 and first.parallel:
         return "a parallel beam that comes down to a mirror starts from a plate, which would stand in the light"

@@ -28,11 +28,11 @@ from torch import Tensor
 
 from bstcad.optics import ops
 from bstcad.optics.outlines import Outline, inside
-from bstcad.optics.sides import FEWEST, Sides, both, side
+from bstcad.optics.sides import MIN_SIDE, Sides, as_pair, side
 from bstcad.optics.surfaces import Surface
 
 DEGREE = 2  # order 3
-SMALLEST_NET = FEWEST  # control points a side: two end spans and one inner span
+SMALLEST_NET = MIN_SIDE  # control points a side: two end spans and one inner span
 SPANS = 1 << 14  # looked at together: their numbers stay in the cache
 QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # places in a span along x and y, where bounds on the back are held to it and
 # where figures of it are taken: a grid four times finer than the net, with both sides of each knot
@@ -274,9 +274,9 @@ class BSplineSurface(Surface):
 
     def refined(self, sides: Sides) -> BSplineSurface:
         """The same surface on so many control points a side, or along x and along y; by least squares along each."""
-        if both(sides) == self.shape:
+        if as_pair(sides) == self.shape:
             return self
-        in_x, in_y = both(sides)
+        in_x, in_y = as_pair(sides)
         heights = carried(self.heights.detach().cpu().double().numpy(), in_x)
         heights = np.ascontiguousarray(carried(np.ascontiguousarray(heights.T), in_y).T)
         return replace(self, heights=torch.from_numpy(heights).to(self.heights))

@@ -52,19 +52,19 @@ def channels_of(source: Emitter, index: Callable[[float], float], points: int, d
         )
         return tuple(Channel(light, index(nm), share) for light, nm, share in lights)
     return _sample_extent(
-        source, index, lambda share, k: sampling.in_pairs(source.extent, max(1, round(share * points / 2)), draw + k)
+        source, index, lambda share, k: sampling.point_pairs(source.extent, max(1, round(share * points / 2)), draw + k)
     )
 
 
 def drawn_channels(source: Emitter, index: Callable[[float], float], points: int, seed: int) -> tuple[Channel, ...]:
     """Return channels at random points of an extended source; the mean of their images over seeds is exact.
 
-    points: number of sample points of all lines together, at least one a line (sampling.scattered).
+    points: number of sample points of all lines together, at least one a line (sampling.shifted_lattice).
     """
     return _sample_extent(
         source,
         index,
-        lambda share, k: sampling.scattered(source.extent, max(1, round(share * points)), (seed << 8) + k),
+        lambda share, k: sampling.shifted_lattice(source.extent, max(1, round(share * points)), (seed << 8) + k),
     )
 
 
@@ -78,7 +78,7 @@ def _sample_extent(source: Emitter, index: Callable[[float], float], places_of: 
     return tuple(elements)
 
 
-def merged(channels: Sequence[Channel]) -> tuple[Channel, ...]:
+def merge_wavelengths(channels: Sequence[Channel]) -> tuple[Channel, ...]:
     """Return the channels with those that differ only in wavelength merged, as a mirror without losses allows."""
     alike: dict[Channel, list[Channel]] = {}
     for channel in channels:
@@ -91,7 +91,7 @@ def merged(channels: Sequence[Channel]) -> tuple[Channel, ...]:
     )
 
 
-def places(channels: Sequence[Channel]) -> tuple[int, ...]:
+def source_numbers(channels: Sequence[Channel]) -> tuple[int, ...]:
     """Return for each channel the number, from 0, of its source among the different sources of its line."""
     numbers = [0] * len(channels)
     for members in _lines(channels):
@@ -101,9 +101,9 @@ def places(channels: Sequence[Channel]) -> tuple[int, ...]:
     return tuple(numbers)
 
 
-def points(channels: Sequence[Channel]) -> int:
+def points_per_line(channels: Sequence[Channel]) -> int:
     """Return the largest number of sample points of a line; 1 for a simple source."""
-    return max(places(channels)) + 1
+    return max(source_numbers(channels)) + 1
 
 
 def _lines(channels: Sequence[Channel]) -> list[list[int]]:

@@ -81,7 +81,7 @@ class Collimated(Emitter):
             yield "divergence", self.divergence, "degrees"
 
     @property
-    def turns_alike(self) -> bool:
+    def is_rotation_invariant(self) -> bool:
         """True if the aperture is round, as the cone is."""
         return self.aperture.is_round
 

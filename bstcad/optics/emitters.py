@@ -134,20 +134,20 @@ class Emitter(ABC):
         yield from ()
 
     @property
-    def turns_alike(self) -> bool:
+    def is_rotation_invariant(self) -> bool:
         """True if a turn about its axis leaves the light unchanged; otherwise `moved` cannot apply such a turn."""
         return False
 
     @property
-    def shifts_alike(self) -> bool:
+    def is_shift_invariant(self) -> bool:
         """True if a shift along the axis of the lens leaves the light unchanged."""
         return self.parallel and not self.tilted
 
-    def wider(self, by: float) -> Emitter | None:
+    def with_wider_cone(self, by: float) -> Emitter | None:
         """Return the simple source with the tangent of its cone larger by the fraction `by`; None: it has no cone."""
         return None
 
-    def larger(self, by: float, about: Vector) -> Emitter | None:
+    def moved_away(self, by: float, about: Vector) -> Emitter | None:
         """Return the simple source at a distance from a point larger by the fraction `by`; None: it has no position."""
         return None
 

@@ -187,7 +187,7 @@ class Lens:
         """Return the lens with unlimited apertures of the solid: no ray misses its faces."""
         return replace(self, outline=EVERYWHERE, clear=(EVERYWHERE, EVERYWHERE))
 
-    def grown(self, by: float) -> Lens:
+    def with_apertures_scaled(self, by: float) -> Lens:
         """Return the lens with the clear apertures of the solid larger by a factor."""
         return replace(self, clear=tuple(aperture.scaled(by) for aperture in self.apertures))
 

@@ -33,13 +33,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics.channels import Channel, places, points, weighted_sum
+from bstcad.optics.channels import Channel, points_per_line, source_numbers, weighted_sum
 from bstcad.optics.irradiance import Leak, Screen, efficiency, leak, rrmsd, tent
 from bstcad.optics.kernels.reductions import dot, total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed
-from bstcad.optics.sampling import in_pairs
+from bstcad.optics.sampling import point_pairs
 from bstcad.optics.trace import UNDERSIDE, Ghost, Simulation, simulate, through, whole_kernel
 from bstcad.optics.tubes import SHEET, Tubes, area_of, arriving, corners, launch_tubes, middle, picture, rays_to
 
@@ -482,7 +482,7 @@ def lines_apart(
 
 def simulated(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, seed: int) -> Simulation:
     """The picture and the ledger by n x n stratified rays a channel; other ones at each point of an extended source."""
-    pairs = zip(channels, places(channels), strict=True)
+    pairs = zip(channels, source_numbers(channels), strict=True)
     return simulate([(c.weight, c.source, c.through(lens), seed + SETS * k) for c, k in pairs], screen, n)
 
 
@@ -493,7 +493,7 @@ def _joined(picture: Tensor, ghost: Ghost | None) -> Tensor:
 
 def a_side(channels: Sequence[Channel]) -> float:
     """k^-1/2, by which the tubes or rays a side are fewer at each of k points of a source: as many in all."""
-    k = points(channels)
+    k = points_per_line(channels)
     return k**-RAYS if k > 1 else 1
 
 
@@ -543,7 +543,7 @@ class Images:
 
 def even_image(extent: Outline) -> Images:
     """The image of an evenly bright disc or rectangle, its extent in pixels."""
-    offset = torch.tensor(in_pairs(extent, EVEN), dtype=torch.float64).T[..., None]
+    offset = torch.tensor(point_pairs(extent, EVEN), dtype=torch.float64).T[..., None]
     return Images(offset, torch.full(offset.shape[1:], 1 / (2 * EVEN), dtype=torch.float64))
 
 

@@ -106,7 +106,7 @@ def _dispersion(material: Any, quantity: str, extent: object) -> Dispersion | No
     return Dispersion(shortest, longest, lambda wavelength: float(value(wavelength / 1000.0, unit="um")))
 
 
-def plain(name: str) -> str:
+def normalise_name(name: str) -> str:
     """Return a name without case and punctuation: 'n-bk7', 'NBK7' and 'N-BK7' are one."""
     return "".join(letter for letter in name.casefold() if letter.isalnum())
 
@@ -120,7 +120,7 @@ def find(name: str) -> str | None:
     known = pages()
     if name in known:
         return name
-    wanted = [plain(part) for part in name.split("/")]
+    wanted = [normalise_name(part) for part in name.split("/")]
     if len(name) > 2 * MAX_NAME_LENGTH or len(wanted) > 3 or not all(wanted):
         return None
     named = [page for page in known if _matches(page.split("/"), wanted)]
@@ -137,7 +137,7 @@ def find(name: str) -> str | None:
 
 def _matches(names: list[str], wanted: list[str]) -> bool:
     """Return True if the last of the names match the wanted names."""
-    return all(plain(a) == b for a, b in zip(reversed(names), reversed(wanted), strict=False))
+    return all(normalise_name(a) == b for a, b in zip(reversed(names), reversed(wanted), strict=False))
 
 
 def _list_pages(names: list[str]) -> str:
@@ -238,9 +238,10 @@ ALIASES = {
 
 
 def _by_name(media: tuple[Medium, ...]) -> dict[str, Medium]:
-    """Return the media by their names and aliases, as `plain` normalises them."""
-    named = {plain(medium.name): medium for medium in media}
-    return named | {plain(alias): named[plain(name)] for alias, name in ALIASES.items() if plain(name) in named}
+    """Return the media by their names and aliases, as `normalise_name` writes them."""
+    named = {normalise_name(medium.name): medium for medium in media}
+    aliases = ((normalise_name(alias), normalise_name(name)) for alias, name in ALIASES.items())
+    return named | {alias: named[name] for alias, name in aliases if name in named}
 
 
 _MEDIA, _METALS = _by_name(MEDIA), _by_name(METALS)
@@ -248,14 +249,14 @@ _MEDIA, _METALS = _by_name(MEDIA), _by_name(METALS)
 
 def medium(material: str) -> Medium:
     """Return the transparent medium of this name; ValueError, with the nearest names, if there is none."""
-    if plain(material) in _METALS:
+    if normalise_name(material) in _METALS:
         raise ValueError(f"{material!r} is a metal, which light does not pass; choose for example 'PMMA'")
-    return _MEDIA.get(plain(material)) or _page(material, MEDIA)
+    return _MEDIA.get(normalise_name(material)) or _page(material, MEDIA)
 
 
 def metal(material: str) -> Medium:
     """Return the metal, or else the medium, of this name; ValueError, with the nearest names, if there is none."""
-    return (_METALS | _MEDIA).get(plain(material)) or _page(material, METALS)
+    return (_METALS | _MEDIA).get(normalise_name(material)) or _page(material, METALS)
 
 
 def _page(material: str, expected: tuple[Medium, ...]) -> Medium:
@@ -265,8 +266,9 @@ def _page(material: str, expected: tuple[Medium, ...]) -> Medium:
         return Medium(page, page, nominal={medium.page: medium.nominal for medium in MEDIA}.get(page))
     cut = material if len(material) <= MAX_NAME_LENGTH else f"{material[:MAX_NAME_LENGTH]}…"
     shorts = [medium.name for medium in expected]
-    known = {plain(name): name for name in (*shorts, *(alias for alias, name in ALIASES.items() if name in shorts))}
-    near = [known[n] for n in difflib.get_close_matches(plain(cut), known, n=1)] or nearest(material)
+    aliases = (alias for alias, name in ALIASES.items() if name in shorts)
+    known = {normalise_name(name): name for name in (*shorts, *aliases)}
+    near = [known[n] for n in difflib.get_close_matches(normalise_name(cut), known, n=1)] or nearest(material)
     hint = f"did you mean {' or '.join(map(repr, near))}?"
     if not near:
         otherwise = "; or give the index itself" if expected is MEDIA else ""

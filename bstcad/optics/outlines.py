@@ -44,7 +44,7 @@ class _Box:
         a, b, r2 = self.limits
         return a * abs(n_x) + b * abs(n_y) + math.sqrt(r2) * math.hypot(n_x, n_y)
 
-    def places(self) -> tuple[np.ndarray, np.ndarray]:
+    def rim_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Return x and y (mm) of points along the rim, in no particular order."""
         a, b, r2 = self.limits
         turn, flat = np.arange(RIM_POINTS) * 2 * np.pi / RIM_POINTS, np.linspace(-1, 1, RIM_POINTS // 4 + 1)
@@ -54,7 +54,7 @@ class _Box:
         sides.append((np.sign(x) * a + r * x, np.sign(y) * b + r * y))
         return tuple(np.concatenate(each) for each in zip(*sides, strict=True))
 
-    def inwards(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def inset_direction(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the shift (mm) of rim points for an inset of 1 mm: along the normal, at corners along the mitre."""
         a, b, r2 = self.limits
         if r2 == 0:
@@ -219,10 +219,10 @@ Outline = Rectangle | Circle
 EVERYWHERE = Circle(math.inf)  # unlimited aperture, which no ray misses
 
 
-def inside(limits: Limits, x: Tensor, y: Tensor, beyond: float = 0.0) -> Tensor:
+def inside(limits: Limits, x: Tensor, y: Tensor, margin: float = 0.0) -> Tensor:
     """Return True where (x, y) (mm) lies inside the outline of these limits or at most `margin` mm outside it."""
     a, b, r2 = limits
     with torch.no_grad():  # in place, since every ray is tested
         x, y = x.abs().sub_(a).clamp_(min=0), y.abs().sub_(b).clamp_(min=0)
         square = x.mul_(x) + y.mul_(y)
-    return square.sqrt() <= math.sqrt(r2) + beyond if beyond else square <= r2
+    return square.sqrt() <= math.sqrt(r2) + margin if margin else square <= r2

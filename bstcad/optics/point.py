@@ -19,7 +19,7 @@ from bstcad.optics.key import Key
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays, Vector, tilt_of
-from bstcad.optics.wavefront import beyond
+from bstcad.optics.wavefront import path_from_sphere
 
 SIZE_KEYS = "diameter", "width", "height"  # scene keys of the size of an emitting disc or rectangle
 HALF_SPACE = math.pi / 2  # rad, half angle of light that fills the half space on the side of the lens
@@ -100,7 +100,7 @@ class Point(Emitter):
     def reference(self, place: Tensor, z: float, sense: int) -> Tensor:
         """Return the path (mm) to points (3, …) from the sphere about the source through the origin of the plane z."""
         x, y, start = self.position
-        return beyond(place, (x, y, start - z))
+        return path_from_sphere(place, (x, y, start - z))
 
     def words(self, origin: float) -> str:
         """Return position, profile, cone and sizes for a data sheet; origin: z (mm) from which the sheet measures."""
@@ -116,7 +116,7 @@ class Point(Emitter):
         yield from ((key, size, "mm") for key in SIZE_KEYS if (size := getattr(self, key)))
 
     @property
-    def turns_alike(self) -> bool:
+    def is_rotation_invariant(self) -> bool:
         """True for a point or a disc."""
         return self.extent is None or self.extent.is_round
 
@@ -125,14 +125,14 @@ class Point(Emitter):
         tilt = self.tilt if not motion.turns else tilt_of(motion.frame((self.axes[2],))[0])
         return replace(self, position=motion.point(self.position), tilt=tilt)
 
-    def wider(self, by: float) -> Point | None:
+    def with_wider_cone(self, by: float) -> Point | None:
         """Return the source with the tangent of its cone larger by the fraction `by`; None: it has no cone."""
         name = "half_angle_1e2" if self.half_angle_1e2 else "half_angle"
         if not (angle := getattr(self, name)):
             return None
         return replace(self, **{name: math.degrees(math.atan((1 + by) * math.tan(math.radians(angle))))})
 
-    def larger(self, by: float, about: Vector) -> Point:
+    def moved_away(self, by: float, about: Vector) -> Point:
         """Return the source at a distance from a point larger by the fraction `by`."""
         middle = np.array(about)
         return replace(self, position=tuple((middle + (1 + by) * (np.array(self.position) - middle)).tolist()))

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 NO_LOSSES: Mapping[str, Tensor] = MappingProxyType({})
-GRAZING = 1e-9  # largest cosine to the axis of a ray that counts as parallel to the screen
+MIN_AXIAL_COSINE = 1e-9  # largest cosine to the axis of a ray that counts as parallel to the screen
 
 
 class Status(IntEnum):

@@ -62,7 +62,7 @@ def spread_at(source: Emitter, lens: Lens) -> float:
 
 def directions(at_face: Rays, aim: Tensor, plane: Receiver) -> tuple[Tensor, Tensor, Tensor]:
     """(d, d', d · d') of rays at a face and towards aims (2, …) on the receiver, both unit vectors (3, …)."""
-    out = plane.way_to(at_face, aim)
+    out = plane.vector_to(at_face, aim)
     d, out = at_face.direction, out / torch.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
     return d, out, d[0] * out[0] + d[1] * out[1] + d[2] * out[2]
 

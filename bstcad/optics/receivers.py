@@ -20,7 +20,7 @@ from torch import Tensor
 
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Outline
-from bstcad.optics.rays import GRAZING, Landed, Rays, Status, Vector, axes, clocked
+from bstcad.optics.rays import MIN_AXIAL_COSINE, Landed, Rays, Status, Vector, axes, clocked
 
 Array = Any  # numpy array, torch tensor or number
 
@@ -64,7 +64,7 @@ class Receiver(ABC):
         """Return (path along each ray to the receiver (mm), zero for rays that miss it; status)."""
 
     @abstractmethod
-    def places(self, rays: Rays) -> Sequence[Tensor]:
+    def coordinates(self, rays: Rays) -> Sequence[Tensor]:
         """Return x and y of rays that are on the receiver."""
 
     @abstractmethod
@@ -87,7 +87,7 @@ class Receiver(ABC):
         parts = replace(rays, position=rays.position.unbind(0), direction=rays.direction.unbind(0))
         path, status = self.path(parts)
         there = (p + path * d for p, d in zip(parts.position, parts.direction, strict=True))
-        at = self.places(replace(parts, position=tuple(there)))
+        at = self.coordinates(replace(parts, position=tuple(there)))
         return Landed(torch.stack(tuple(at)), rays.flux, status, rays.taken)
 
     def to(self, rays: Rays) -> Rays:
@@ -95,14 +95,14 @@ class Receiver(ABC):
         path, status = self.path(rays)
         return replace(rays, position=rays.position + path * rays.direction, status=status)
 
-    def way_to(self, rays: Rays, aim: Tensor) -> Tensor:
+    def vector_to(self, rays: Rays, aim: Tensor) -> Tensor:
         """Return the vectors (3, …) from the rays' positions to coordinates (2, …) of the receiver (mm)."""
         x, y, z = self.point(*aim)
         return torch.stack([x - rays.position[0], y - rays.position[1], z - rays.above(0.0)])
 
     def clearance(self, outline: Outline, z: float) -> float:
         """Return the distance (mm) along +z from an outline on the plane z to it; -inf: a part does not face it."""
-        x, y = (torch.as_tensor(p, dtype=torch.float64) for p in outline.places())
+        x, y = (torch.as_tensor(p, dtype=torch.float64) for p in outline.rim_points())
         along = torch.stack([torch.zeros_like(x), torch.zeros_like(x), torch.ones_like(x)])
         start = torch.stack([x, y, torch.zeros_like(x)])
         rays = Rays(start, along, torch.ones_like(x), torch.zeros(x.shape, dtype=torch.uint8), z=z)
@@ -121,14 +121,14 @@ class Receiver(ABC):
         """Return areas or solid angles of the (rows, columns) cells of x by y, of mean 1; None: they are equal."""
         return None
 
-    def seen(self, x: Array, y: Array, eye: float) -> tuple[Array, Array]:
+    def to_level_plane(self, x: Array, y: Array, eye: float) -> tuple[Array, Array]:
         """Project coordinates from the eye (0, 0, eye) onto the level plane through the centre; points in mm."""
         p_x, p_y, p_z = self.point(x, y)
         grown = self.throw(eye) / (p_z - eye)
         return grown * p_x, grown * p_y
 
-    def from_seen(self, q_x: Array, q_y: Array, eye: float) -> tuple[Array, Array]:
-        """Return the coordinates whose projection by `seen` is given."""
+    def from_level_plane(self, q_x: Array, q_y: Array, eye: float) -> tuple[Array, Array]:
+        """Return the coordinates whose projection by `to_level_plane` is given."""
         x, y = (torch.as_tensor(q, dtype=torch.float64) for q in (q_x, q_y))
         way = torch.stack([x, y, torch.full_like(x, self.throw(eye))])
         status = torch.zeros(x.shape, dtype=torch.uint8)
@@ -156,9 +156,9 @@ class MovedReceiver(Receiver):
         """Return (path along each ray to the receiver (mm), zero for rays that miss it; status)."""
         return self.rest.path(self._back(rays))
 
-    def places(self, rays: Rays) -> Sequence[Tensor]:
+    def coordinates(self, rays: Rays) -> Sequence[Tensor]:
         """Return x and y of rays that are on the receiver."""
-        return self.rest.places(self._back(rays))
+        return self.rest.coordinates(self._back(rays))
 
     def point(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
         """Return the points in space (mm) of coordinates on the receiver."""
@@ -186,8 +186,8 @@ def _rotate(motion: Motion, vector: Sequence[Array]) -> tuple[Array, Array, Arra
     return tuple(dot(row, vector) for row in motion.rotation.tolist())
 
 
-class Plane(Receiver):
-    """Plane P = C + (x - o_x) e_x + (y - o_y) e_y, n · (p - C) = 0, with centre C of coordinates o."""
+class PlaneReceiver(Receiver):
+    """PlaneReceiver P = C + (x - o_x) e_x + (y - o_y) e_y, n · (p - C) = 0, with centre C of coordinates o."""
 
     def height(self, point: Vector) -> float:
         """Return the height n · (p - C) (mm) of a point above the plane, negative on the side of the incident light."""
@@ -202,7 +202,7 @@ class Plane(Receiver):
         (e_x, e_y, _), (o_x, o_y) = self.frame, self.origin
         return tuple(c + (x - o_x) * a + (y - o_y) * b for c, a, b in zip(self.middle, e_x, e_y, strict=True))
 
-    def places(self, rays: Rays) -> Sequence[Tensor]:
+    def coordinates(self, rays: Rays) -> Sequence[Tensor]:
         """Return x and y (mm) of rays that are on the plane."""
         offset, (e_x, e_y, _), (o_x, o_y) = self._from_centre(rays), self.frame, self.origin
         return o_x + dot(e_x, offset), o_y + dot(e_y, offset)
@@ -221,7 +221,7 @@ class Plane(Receiver):
         """Return (path along each ray to the plane (mm), zero for rays that miss it; status)."""
         rise, above = self._advance(rays)
         ahead = rise if rays.sense > 0 else -rise
-        status = rays.lose(ahead <= GRAZING, Status.TURNED_BACK)
+        status = rays.lose(ahead <= MIN_AXIAL_COSINE, Status.TURNED_BACK)
         lands = status == Status.ALIVE
         rise = torch.where(lands, rise, torch.ones_like(rise))
         return torch.where(lands, -above / rise, torch.zeros_like(rise)), status
@@ -232,8 +232,8 @@ class Plane(Receiver):
 
 
 @dataclass(frozen=True)
-class LevelPlane(Plane):
-    """Plane z = const, with the x and y of space."""
+class LevelPlane(PlaneReceiver):
+    """PlaneReceiver z = const, with the x and y of space."""
 
     z: float  # z of the plane, mm
 
@@ -248,7 +248,7 @@ class LevelPlane(Plane):
     def _advance(self, rays: Rays) -> tuple[Tensor, Tensor]:
         return rays.direction[2], rays.above(self.z)
 
-    def places(self, rays: Rays) -> Sequence[Tensor]:
+    def coordinates(self, rays: Rays) -> Sequence[Tensor]:
         """Return x and y (mm) of rays that are on the plane."""
         return rays.position[:2]
 
@@ -256,13 +256,13 @@ class LevelPlane(Plane):
         """Return the points in space (mm) of coordinates on the plane."""
         return x, y, 0.0 * x + self.z
 
-    def way_to(self, rays: Rays, aim: Tensor) -> Tensor:
+    def vector_to(self, rays: Rays, aim: Tensor) -> Tensor:
         """Return the vectors (3, …) from the rays' positions to coordinates (2, …) of the plane (mm)."""
         return torch.stack([aim[0] - rays.position[0], aim[1] - rays.position[1], -rays.above(self.z)])
 
 
 @dataclass(frozen=True)
-class TiltedPlane(Plane):
+class TiltedPlane(PlaneReceiver):
     """A tilted plane through C, with x and y measured on it (mm): o = (c_x, c_y).
 
     The axes are those of space, rotated first about the x axis by α and then about the y axis by β, right-handed:
@@ -284,15 +284,15 @@ class TiltedPlane(Plane):
         """Centre C (mm)."""
         return self.centre
 
-    def from_seen(self, q_x: Array, q_y: Array, eye: float) -> tuple[Array, Array]:
-        """Return the coordinates whose projection by `seen` is given."""
+    def from_level_plane(self, q_x: Array, q_y: Array, eye: float) -> tuple[Array, Array]:
+        """Return the coordinates whose projection by `to_level_plane` is given."""
         (e_x, e_y, n), (c_x, c_y, c_z) = self.axes, self.centre
         throw = c_z - eye
         path = -self.height((0.0, 0.0, eye)) / (n[0] * q_x + n[1] * q_y + n[2] * throw)
         off = path * q_x - c_x, path * q_y - c_y, (path - 1) * throw
         return c_x + dot(e_x, off), c_y + dot(e_y, off)
 
-    def way_to(self, rays: Rays, aim: Tensor) -> Tensor:
+    def vector_to(self, rays: Rays, aim: Tensor) -> Tensor:
         """Return the vectors (3, …) from the rays' positions to coordinates (2, …) of the plane (mm)."""
         (e_x, e_y, _), offset = self.axes, self._from_centre(rays)
         x, y = aim[0] - self.centre[0], aim[1] - self.centre[1]

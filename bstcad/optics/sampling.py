@@ -1,8 +1,8 @@
 """Sample points of rays and sources: grids, stratified (jittered) points and random points of a rectangle.
 
 Each of these functions returns (x, y) in mm over `window` (centred on the axis); every point represents the same area.
-`in_pairs` and `scattered` return points of equal weight over the outline of an extended source; `rim` returns points
-along an outline.
+`point_pairs` and `shifted_lattice` return points of equal weight over the outline of an extended source; `rim` returns
+points along an outline.
 
 The jitter of a cell is a hash of its number, SplitMix64 (Steele, Lea and Flood 2014), instead of the next number of a
 sequence, so that every thread obtains the same points.
@@ -19,10 +19,10 @@ from torch import Tensor
 
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.outlines import Outline, Rectangle
-from bstcad.optics.sides import Sides, both
+from bstcad.optics.sides import Sides, as_pair
 
 POINTS_PER_STRIP = 1 << 18  # approximate number of points in a strip of rows
-STRIDE = 0x9E3779B97F4A7C15  # increment of SplitMix64: 2^64 over the golden ratio
+SPLITMIX_INCREMENT = 0x9E3779B97F4A7C15  # increment of SplitMix64: 2^64 over the golden ratio
 MIX_1, MIX_2 = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
 # 1/g of g² = g + 1, the step of a golden lattice; 1/g of g³ = g + 1, the shift of a lattice from draw to draw
 GOLDEN_RATIO, DRAW_SHIFT = 0.6180339887498949, 0.7548776662466927
@@ -30,7 +30,7 @@ GOLDEN_RATIO, DRAW_SHIFT = 0.6180339887498949, 0.7548776662466927
 
 def grid(window: Rectangle, sides: Sides, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
     """Return the centres of equal cells, this many a side or (along x, along y); x and y are (along x, along y)."""
-    along_x, along_y = ((torch.arange(n, dtype=dtype) + 0.5) / n - 0.5 for n in both(sides))
+    along_x, along_y = ((torch.arange(n, dtype=dtype) + 0.5) / n - 0.5 for n in as_pair(sides))
     x, y = torch.meshgrid(along_x * window.width, along_y * window.height, indexing="ij")
     return x.contiguous(), y.contiguous()
 
@@ -43,20 +43,20 @@ def stratified_strips(
     for first in range(0, n, rows):
         i = np.arange(first, min(first + rows, n))[:, None]
         j = np.arange(n)
-        jitter_x, jitter_y = jitter(key(seed), i * n + j)
+        jitter_x, jitter_y = jitter(hash_seed(seed), i * n + j)
         x = (jitter_x + i) * (window.width / n) - window.width / 2
         y = (jitter_y + j) * (window.height / n) - window.height / 2
         yield torch.from_numpy(x).to(dtype), torch.from_numpy(y).to(dtype)
 
 
-def key(seed: int) -> int:
+def hash_seed(seed: int) -> int:
     """Return a 64-bit hash of the seed; hashes of neighbouring seeds are independent."""
-    return int(_mix(np.array([(seed + STRIDE) % (1 << 64)], dtype=np.uint64))[0])
+    return int(_mix(np.array([(seed + SPLITMIX_INCREMENT) % (1 << 64)], dtype=np.uint64))[0])
 
 
 def jitter(key: int, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return two numbers in (0, 1), multiples of 2^-33, for each cell: the upper and lower 32 bits of SplitMix64."""
-    bits = _mix(np.uint64(key) + cell.astype(np.uint64) * np.uint64(STRIDE))
+    bits = _mix(np.uint64(key) + cell.astype(np.uint64) * np.uint64(SPLITMIX_INCREMENT))
     return tuple((half + 0.5) * 2.0**-32 for half in (bits >> np.uint64(32), bits & np.uint64(0xFFFFFFFF)))
 
 
@@ -73,7 +73,7 @@ def random(window: Rectangle, count: int, seed: int, dtype: torch.dtype = torch.
     return points[0] * window.width, points[1] * window.height
 
 
-def in_pairs(outline: Outline, pairs: int, draw: int = 0) -> list[tuple[float, float]]:
+def point_pairs(outline: Outline, pairs: int, draw: int = 0) -> list[tuple[float, float]]:
     """Return points (x, y) evenly over an outline, each followed by its reflection in the centre: their mean is 0.
 
     A golden lattice, a = (k + 1/2) / pairs and b = (k φ + shift) mod 1 for k = 0, 1, …, covers one half: of a rectangle
@@ -91,13 +91,13 @@ def in_pairs(outline: Outline, pairs: int, draw: int = 0) -> list[tuple[float, f
     return [(sign * half_x * x, sign * half_y * y) for x, y in points for sign in (1, -1)]
 
 
-def scattered(outline: Outline, count: int, seed: int) -> list[tuple[float, float]]:
+def shifted_lattice(outline: Outline, count: int, seed: int) -> list[tuple[float, float]]:
     """Return points (x, y) over an outline, each uniformly distributed over seeds, so that sums over them are unbiased.
 
     A golden lattice of `count` points, a = k / count and b = k φ, shifted by two random numbers modulo 1
     (Cranley and Patterson 1976); on a disc r² = a, ψ = 2 π b.
     """
-    (move_a,), (move_b,) = jitter(key(seed), np.zeros(1, np.int64))
+    (move_a,), (move_b,) = jitter(hash_seed(seed), np.zeros(1, np.int64))
     half_x, half_y = outline.half_extent
     lattice = [((k / count + move_a) % 1.0, (k * GOLDEN_RATIO + move_b) % 1.0) for k in range(count)]
     if outline.is_round:

@@ -8,50 +8,50 @@ from __future__ import annotations
 import math
 
 Sides = int | tuple[int, int]
-FEWEST = 5  # smallest number of control points along a side of a net
+MIN_SIDE = 5  # smallest number of control points along a side of a net
 
 
-def both(sides: Sides) -> tuple[int, int]:
+def as_pair(sides: Sides) -> tuple[int, int]:
     """Return the pair (along x, along y)."""
     return (sides, sides) if isinstance(sides, int) else sides
 
 
-def plain(sides: Sides) -> Sides:
+def simplified(sides: Sides) -> Sides:
     """Return one number if both sides are equal, else the pair."""
-    x, y = both(sides)
+    x, y = as_pair(sides)
     return x if x == y else (x, y)
 
 
-def in_words(sides: Sides) -> str:
+def size_text(sides: Sides) -> str:
     """Return the numbers in words: "257" or "512 x 128"."""
-    return " x ".join(map(str, both(sides))) if isinstance(sides, tuple) else str(sides)
+    return " x ".join(map(str, as_pair(sides))) if isinstance(sides, tuple) else str(sides)
 
 
 def side(net: Sides) -> int:
     """Return the control points a side of the square net with the same number of control points."""
-    return round(math.sqrt(math.prod(both(net))))
+    return round(math.sqrt(math.prod(as_pair(net))))
 
 
 def scaled(net: Sides, share: float) -> Sides:
     """Return a net with `share` times the spans in each direction."""
-    x, y = (max(round(share * (points - 1)) + 1, FEWEST) for points in both(net))
-    return plain((x, y))
+    x, y = (max(round(share * (points - 1)) + 1, MIN_SIDE) for points in as_pair(net))
+    return simplified((x, y))
 
 
 def in_proportion(net: Sides, of: Sides, to: Sides) -> Sides:
     """Return `to` with its spans multiplied in each direction by the ratio of the spans of `net` to those of `of`."""
-    each = zip(both(net), both(of), both(to), strict=True)
-    x, y = (max(round((m - 1) * (t - 1) / (o - 1)) + 1, FEWEST) for m, o, t in each)
-    return plain((x, y))
+    each = zip(as_pair(net), as_pair(of), as_pair(to), strict=True)
+    x, y = (max(round((m - 1) * (t - 1) / (o - 1)) + 1, MIN_SIDE) for m, o, t in each)
+    return simplified((x, y))
 
 
 def coarser(net: Sides, longer: int) -> Sides:
     """Return a net of the same span shape with `longer` control points on its longer side; `net` if that is finer."""
-    most = max(both(net))
+    most = max(as_pair(net))
     return net if longer >= most else scaled(net, (longer - 1) / (most - 1))
 
 
 def spread(count: int, x: float, y: float) -> Sides:
     """Return about count² cells in proportion to x and y: n_x / n_y = x / y."""
     root = math.sqrt(x / y)
-    return plain((max(round(count * root), 1), max(round(count / root), 1)))
+    return simplified((max(round(count * root), 1), max(round(count / root), 1)))

@@ -274,7 +274,7 @@ class Toroid(Surface):
 
     def sags(self, outline: Outline) -> tuple[float, float]:
         """Return the lowest and the highest sag (mm) at the rim of the outline, and zero."""
-        h = self.plain().relative_sag_and_slope(*map(torch.from_numpy, outline.places()))[0]
+        h = self.plain().relative_sag_and_slope(*map(torch.from_numpy, outline.rim_points()))[0]
         return min(float(h.min()), 0.0), max(float(h.max()), 0.0)
 
     def parameters(self) -> dict[str, float | Tensor]:

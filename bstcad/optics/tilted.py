@@ -24,7 +24,7 @@ Face = Plane | Sphere
 
 
 @dataclass(frozen=True)
-class Tilted(Surface):
+class TiltedSurface(Surface):
     """A plane or a sphere with its vertex off the axis of the lens, or its normal there inclined to the axis."""
 
     z: float  # V_z, mm
@@ -36,9 +36,9 @@ class Tilted(Surface):
     curvature = conic_constant = None  # not a surface of revolution about the axis of the lens
 
     @classmethod
-    def of(cls, surface: Face | Tilted) -> Tilted:
+    def of(cls, surface: Face | TiltedSurface) -> TiltedSurface:
         """Return a plane or a sphere as a surface of this class."""
-        if isinstance(surface, Tilted):
+        if isinstance(surface, TiltedSurface):
             return surface
         return cls(float(surface.z), (0.0, 0.0), (0.0, 0.0, 1.0), float(surface.curvature))
 
@@ -47,7 +47,7 @@ class Tilted(Surface):
         """Vertex V (mm)."""
         return (*self.place, self.z)
 
-    def moved_by(self, motion: Motion) -> Tilted:
+    def moved_by(self, motion: Motion) -> TiltedSurface:
         """Return the surface after a rigid motion with a rotation of less than a right angle."""
         (unit,), (x, y, z) = motion.frame((self.unit,)), motion.point(self.vertex)
         return replace(self, z=z, place=(x, y), unit=unit)
@@ -90,7 +90,7 @@ class Tilted(Surface):
 
     def sags(self, outline: Outline) -> tuple[float, float]:
         """Return the lowest and the highest height (mm) over the plane z inside the outline, from points of its rim."""
-        x, y = (torch.from_numpy(np.append(p, 0.0)) for p in outline.places())
+        x, y = (torch.from_numpy(np.append(p, 0.0)) for p in outline.rim_points())
         h = self.relative_sag_and_slope(x, y)[0]
         return min(float(h.min()), 0.0), max(float(h.max()), 0.0)
 

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics import irradiance, ops, sampling
-from bstcad.optics.channels import Channel, places, weighted_sum
+from bstcad.optics.channels import Channel, source_numbers, weighted_sum
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import Interface, Loss, Reflect, Refract, cross, intersect
 from bstcad.optics.irradiance import Screen
@@ -305,7 +305,7 @@ def ghost_light(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int,
     n = min(n, GHOST_RAYS)
     parts = [
         _ghost_of_channel(c, c.through(lens), screen, n=n, seed=seed + k)
-        for c, k in zip(channels, places(channels), strict=True)
+        for c, k in zip(channels, source_numbers(channels), strict=True)
     ]
     flux = {line: weighted_sum(channels, (part.flux[line] for part in parts)) for line in parts[0].flux}
     return Ghost(weighted_sum(channels, (part.picture for part in parts)), flux)

@@ -25,7 +25,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed, Rays, Status, joined
 from bstcad.optics.receivers import LevelPlane, Receiver
-from bstcad.optics.sides import Sides, both, spread
+from bstcad.optics.sides import Sides, as_pair, spread
 from bstcad.optics.trace import behind, from_first_net, gets_through, whole_kernel
 
 ALL = slice(None)
@@ -144,7 +144,8 @@ def _tubes(source: Emitter, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tube
     light, lit = source.rays(x, y, z, 1.0), None
     light = replace(light, flux=torch.ones_like(light.flux))
     inside, ways = source.irradiance(x, y, z) > 0, [light]  # ways: before each interface
-    interfaces, edges = lens.unbounded().interfaces, lens.grown(1 + INWARDS).interfaces  # grown: room for rounding
+    interfaces = lens.unbounded().interfaces
+    edges = lens.with_apertures_scaled(1 + INWARDS).interfaces  # margin for rounding
     first, back = lens.freeform[0], lens.number_of("back")
     end = lens.solid.stop if lens.solid.stop > back + 1 else back  # light may meet the front again behind the back
     for k in range(max(first, end)):
@@ -180,7 +181,7 @@ def _over_the_beam(source: Emitter, lens: Lens, n: int) -> _Sheet | None:
     if spot is None:
         return None
     count = _proportioned(lens, spot, n)
-    n_x, n_y = both(count)
+    n_x, n_y = as_pair(count)
     ends = (slice(0, 1), ALL), (slice(n_x, None), ALL), (ALL, slice(0, 1)), (ALL, slice(n_y, None))
     sides = zip(*(corners(spot, count, *end) for end in ends), strict=True)
     rim = (
@@ -204,7 +205,7 @@ def _over_the_back(source: Emitter, lens: Lens, n: int, few: int) -> _Sheet:
     """
     from scipy.interpolate import RectBivariateSpline  # with much else, which a plan has no use for
 
-    n_x, n_y = both(_proportioned(lens, lens.apertures[1], n))
+    n_x, n_y = as_pair(_proportioned(lens, lens.apertures[1], n))
     few_x, few_y = min(n_x, few), min(n_y, few)
     x, y, _ = rays_to(source, lens, *corners(lens.apertures[1], (few_x, few_y)))
     middle = tuple(float(total(p) / p.numel()) for p in (x, y))
@@ -249,7 +250,7 @@ def _getting_through(source: Emitter, lens: Lens, x: Tensor, y: Tensor) -> Tenso
 
 def corners(shape: Outline, sides: Sides, rows: slice = ALL, columns: slice = ALL) -> tuple[Tensor, Tensor]:
     """The corners of so many tubes, which cover a shape to its rim; x along the first axis (mm)."""
-    along_x, along_y = (torch.linspace(-1, 1, n + 1, dtype=torch.float64) for n in both(sides))
+    along_x, along_y = (torch.linspace(-1, 1, n + 1, dtype=torch.float64) for n in as_pair(sides))
     return shape.map_square(*torch.meshgrid(along_x[rows], along_y[columns], indexing="ij"))
 
 

@@ -18,9 +18,9 @@ from bstcad.optics.interfaces import Interface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays, Vector
-from bstcad.optics.receivers import LevelPlane, Plane, Receiver, dot
+from bstcad.optics.receivers import LevelPlane, PlaneReceiver, Receiver, dot
 from bstcad.optics.surfaces import sag
-from bstcad.optics.tilted import Tilted
+from bstcad.optics.tilted import TiltedSurface
 
 # Newton iterations for the point of a flat face through which light goes to a given point of the receiver
 NEWTON_ITERATIONS = 8
@@ -29,7 +29,7 @@ SPACE_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True)
-class Image(Plane):
+class Image(PlaneReceiver):
     """Image of a plane, on which points keep their coordinates."""
 
     centre: Vector  # centre C of the image, mm
@@ -58,7 +58,7 @@ class Image(Plane):
         """Centre C (mm)."""
         return self.centre
 
-    def in_mirror(self, mirror: Tilted) -> Image:
+    def in_mirror(self, mirror: TiltedSurface) -> Image:
         """Return the mirror image."""
         n = mirror.unit
         e_x, e_y, across = (_reflected(v, n) for v in self.frame)
@@ -93,9 +93,9 @@ class BehindGlass(Receiver):
         """Return (path along each ray behind the face to the receiver (mm), status)."""
         return self.rest.path(rays)
 
-    def places(self, rays: Rays) -> Sequence[Tensor]:
+    def coordinates(self, rays: Rays) -> Sequence[Tensor]:
         """Return x and y of rays that are on the receiver."""
-        return self.rest.places(rays)
+        return self.rest.coordinates(rays)
 
     def point(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the points in space (mm) of coordinates on the receiver."""
@@ -105,7 +105,7 @@ class BehindGlass(Receiver):
         """Return the unit normals of the receiver at coordinates (2, …)."""
         return self.rest.normal(aim)
 
-    def way_to(self, rays: Rays, aim: Tensor) -> Tensor:
+    def vector_to(self, rays: Rays, aim: Tensor) -> Tensor:
         """Return the unit vectors (3, …) along which rays in the glass reach coordinates (2, …) of the receiver.
 
         Behind a point of the face the light goes along s over the distance d to the receiver.  By Snell's law it comes
@@ -113,10 +113,10 @@ class BehindGlass(Receiver):
         method makes the two points equal: as the first moves by 1, the second moves back by k = t s_z / (η d i_z)
         across the plane of incidence, and by k (s_z / i_z)² in it.
         """
-        below, way = rays.above(self.z), self.rest.way_to(rays, aim)
+        below, way = rays.above(self.z), self.rest.vector_to(rays, aim)
         at = rays.position - below / way[2] * way
         for _ in range(NEWTON_ITERATIONS):
-            out = self.rest.way_to(replace(rays, position=at), aim)
+            out = self.rest.vector_to(replace(rays, position=at), aim)
             length = torch.sqrt((out * out).sum(0))
             sines = out[:2] / length / self.eta
             way = torch.cat([sines, (torch.sign(out[2]) * torch.sqrt(1 - (sines * sines).sum(0)))[None]])
@@ -139,9 +139,9 @@ def image(behind: Sequence[Interface], plane: Receiver) -> Receiver:
         face, *beyond = behind
         return BehindGlass(image(beyond, plane), float(sag(face.surface, 0.0, 0.0)), face.law.eta)
     seen = Image.of(plane)
-    leaves: Tilted | None = None  # exit face of a plate, while the light is followed backwards
+    leaves: TiltedSurface | None = None  # exit face of a plate, while the light is followed backwards
     for interface in reversed(behind):
-        face = Tilted.of(interface.surface)
+        face = TiltedSurface.of(interface.surface)
         if interface.law.reverses:
             seen = seen.in_mirror(face)
         elif leaves is None:
@@ -153,26 +153,26 @@ def image(behind: Sequence[Interface], plane: Receiver) -> Receiver:
     return seen.plain()
 
 
-def seen_from_last_net(lens: Lens, plane: Receiver) -> Receiver:
+def image_from_last_net(lens: Lens, plane: Receiver) -> Receiver:
     """Return the image of a receiver behind the last net of a lens; the receiver itself if no interface follows."""
     return image(lens.interfaces[lens.freeform[-1] + 1 :], plane)
 
 
-def imaged(lens: Lens, screen: Screen) -> Screen:
+def image_screen(lens: Lens, screen: Screen) -> Screen:
     """Return the screen with its image behind the last net of a lens as its receiver."""
     plane = screen.plane
-    seen = seen_from_last_net(lens, plane)
+    seen = image_from_last_net(lens, plane)
     return screen if seen is plane else replace(screen, surface=seen)
 
 
-def seen_by(lens: Lens, screen: Screen) -> Receiver:
+def image_from_lens(lens: Lens, screen: Screen) -> Receiver:
     """Return the image of a screen's receiver behind the lens."""
     return image(lens.behind, screen.plane)
 
 
 def per_radian(lens: Lens, screen: Screen) -> float:
     """Return the shift on a screen, in its unit, per radian by which light is deflected at the back of a lens."""
-    return seen_by(lens, screen).per_radian(lens.back.z)
+    return image_from_lens(lens, screen).per_radian(lens.back.z)
 
 
 def _reflected(v: Vector, n: Vector) -> Vector:

@@ -24,9 +24,9 @@ from bstcad.optics.key import Key
 from bstcad.optics.outlines import STRICT, Circle
 from bstcad.optics.rays import Vector
 
-NM = 1e-6  # millimetres per nanometre
+MM_PER_NM = 1e-6  # millimetres per nanometre
 MIN_FOCUS_DISTANCE = 1e-3  # mm, smallest distance of a focus from the plane
-ALONG = math.radians(89.0)  # rad, angle to the axis above which a ray counts as parallel to the plane
+MAX_RAY_ANGLE = math.radians(89.0)  # rad, angle to the axis above which a ray counts as parallel to the plane
 SAMPLES_PER_SIDE = 129  # grid points a side of a Zernike circle, at which the largest slope is searched
 Place = tuple[float, float]
 
@@ -82,7 +82,7 @@ class PlaneWave(_Wave):
     def complaints(self, back: float) -> Iterator[str]:
         """Yield, besides the common reasons, a direction that does not lead away from the lens."""
         yield from super().complaints(back)
-        if not self.direction[2] > math.cos(ALONG) * math.hypot(*self.direction):
+        if not self.direction[2] > math.cos(MAX_RAY_ANGLE) * math.hypot(*self.direction):
             yield "direction: it does not point along +z, away from the lens; give one such as [0.0, 0.0, 1.0]"
 
 
@@ -115,7 +115,7 @@ class SphericalWave(_Wave):
 
     def path(self, x: Tensor, y: Tensor, wavelength: float) -> Tensor:
         """Return W (mm) at points (mm) of the plane, zero on the axis; independent of the wavelength (nm)."""
-        return self.sense * beyond(torch.stack([x, y, torch.zeros_like(x)]), self.centre)
+        return self.sense * path_from_sphere(torch.stack([x, y, torch.zeros_like(x)]), self.centre)
 
     def directions(self, x: Tensor, y: Tensor, wavelength: float) -> Tensor:
         """Return unit vectors (3, …) of the rays at points (mm) of the plane; independent of the wavelength (nm)."""
@@ -175,7 +175,7 @@ class ZernikeWave(_Wave):
     def _eikonal(self, x: Tensor, y: Tensor, wavelength: float) -> tuple[Tensor, Tensor, Tensor]:
         """Return (W in mm, ∂W/∂x, ∂W/∂y)."""
         x, y = (x - self.centre[0]) / self.radius, (y - self.centre[1]) / self.radius
-        w, w_x, w_y = (wavelength * NM * part for part in zernike.series(self.coefficients, x, y))
+        w, w_x, w_y = (wavelength * MM_PER_NM * part for part in zernike.series(self.coefficients, x, y))
         return w, w_x / self.radius, w_y / self.radius
 
     def complaints(self, back: float) -> Iterator[str]:
@@ -188,7 +188,7 @@ class ZernikeWave(_Wave):
 Wave = PlaneWave | SphericalWave | ZernikeWave
 
 
-def beyond(place: Tensor, centre: Vector) -> Tensor:
+def path_from_sphere(place: Tensor, centre: Vector) -> Tensor:
     """Return |p - c| - |c| (mm) for points p (3, …) and a centre c (mm): path from the sphere about c through 0.
 
     It is computed as (p² - 2 p · c) / (|p - c| + |c|), which keeps its digits for a distant centre.

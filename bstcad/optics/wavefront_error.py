@@ -32,7 +32,7 @@ from bstcad.optics.motion import Motion
 from bstcad.optics.rays import Rays
 from bstcad.optics.receivers import LevelPlane, dot
 from bstcad.optics.trace import behind, clear_window
-from bstcad.optics.wavefront import NM, Wave, length
+from bstcad.optics.wavefront import MM_PER_NM, Wave, length
 
 RAYS_PER_SIDE = 512  # rays a side of the light before the lens
 MAX_MAP_CELLS = 256  # largest number of cells a side of the map
@@ -47,7 +47,7 @@ class ExitPupil:
     x: Tensor  # (n, n) x of the rays on the plane, mm
     y: Tensor  # (n, n) y of the rays on the plane, mm
     direction: Tensor  # (3, n, n) unit vectors of the rays
-    path: Tensor  # (n, n) optical path to the plane, mm, from the reference of `followed`
+    path: Tensor  # (n, n) optical path to the plane, mm, from the reference of `optical_path`
     flux: Tensor  # (n, n) fraction of the source's flux, after losses at faces and in glass
     alive: Tensor  # (n, n) bool, False for lost rays and rays without flux, whose other numbers are meaningless
     rounding: float  # bound of the rounding error of `path`, mm
@@ -64,14 +64,15 @@ def exit_pupil(source: Emitter, lens: Lens, z: float, n: int = RAYS_PER_SIDE) ->
     rows = max(1, RAYS_PER_BAND // n)
     parts = []
     for band_x, band_y in zip(x.split(rows), y.split(rows), strict=True):
-        rays, path, rounding = followed(source, lens, source.rays(band_x, band_y, lens.entrance.z, area.area / n**2), z)
+        rays = source.rays(band_x, band_y, lens.entrance.z, area.area / n**2)
+        rays, path, rounding = optical_path(source, lens, rays, z)
         parts.append((rays.position[:2], rays.direction, path, rays.flux, rays.alive & (rays.flux > 0), rounding))
     *columns, roundings = zip(*parts, strict=True)
     (x, y), direction, path, flux, alive = (torch.cat(column, dim=-2) for column in columns)
     return ExitPupil(x, y, direction, path=path, flux=flux, alive=alive, rounding=max(roundings))
 
 
-def moved_pupil(pupil: ExitPupil, motion: Motion, z: float) -> ExitPupil:
+def move_pupil(pupil: ExitPupil, motion: Motion, z: float) -> ExitPupil:
     """Return the light of a pupil on the plane z (mm) after a motion, again on the plane z.
 
     It is the light of a moved lens in the frame of the goal wave.
@@ -86,7 +87,7 @@ def moved_pupil(pupil: ExitPupil, motion: Motion, z: float) -> ExitPupil:
     )
 
 
-def followed(source: Emitter, lens: Lens, rays: Rays, z: float) -> tuple[Rays, Tensor, float]:
+def optical_path(source: Emitter, lens: Lens, rays: Rays, z: float) -> tuple[Rays, Tensor, float]:
     """Return (rays from the source on the plane z, their optical path (mm), bound of its rounding error (mm)).
 
     Let o be the point of the axis on the vertex plane of the first surface.  Paths start at the plane through o
@@ -97,7 +98,7 @@ def followed(source: Emitter, lens: Lens, rays: Rays, z: float) -> tuple[Rays, T
     for interface in lens.interfaces:
         there = behind(rays, interface)
         if path is None:
-            path = index * from_reference(source, lens.entrance.z, there, sense)
+            path = index * path_from_reference(source, lens.entrance.z, there, sense)
         else:
             path = path + index * _between(rays, there)
             longest += index * _longest(_between(rays, there), there)
@@ -109,7 +110,7 @@ def followed(source: Emitter, lens: Lens, rays: Rays, z: float) -> tuple[Rays, T
     return landed, path + ahead * last, ROUNDINGS_PER_SEGMENT * torch.finfo(torch.float64).eps * longest
 
 
-def from_reference(source: Emitter, z: float, rays: Rays, sense: int) -> Tensor:
+def path_from_reference(source: Emitter, z: float, rays: Rays, sense: int) -> Tensor:
     """Return the path (mm) of rays to the first surface from their reference; z: its vertex, sense: of the light."""
     place = torch.stack([*rays.position[:2], rays.above(z)])
     return source.reference(place, z, sense)
@@ -128,7 +129,7 @@ def _longest(way: Tensor, rays: Rays) -> float:
 
 
 @dataclass(frozen=True)
-class Figures:
+class OpdSize:
     """RMS and peak-to-valley of an OPD, in waves."""
 
     rms: float  # RMS weighted by flux, waves
@@ -141,8 +142,8 @@ class WavefrontError:
 
     z: float  # plane of the comparison, mm
     wavelength: float  # main wavelength, nm
-    without_piston: Figures
-    without_tilt: Figures  # OPD without piston and tilt
+    without_piston: OpdSize
+    without_tilt: OpdSize  # OPD without piston and tilt
     tilt: tuple[float, float]  # tilt removed, µrad: inclination of the light towards +x and +y relative to the goal
     angle_rms: float  # RMS angle between rays and goal rays, weighted by flux, tilt included, µrad
     angle_max: float  # largest angle between rays and goal rays, µrad
@@ -166,12 +167,12 @@ def wavefront_error(source: Emitter, lens: Lens, wave: Wave, n: int = RAYS_PER_S
     off = pupil.direction[:, seen] - wave.directions(x, y, nm)
     measured = float(total(pupil.flux[seen]))
     level = flat - fit.at(x, y)
-    unit, angle = 1 / (nm * NM), 2e6 * torch.asin((length(off) / 2).clamp(max=1))
+    unit, angle = 1 / (nm * MM_PER_NM), 2e6 * torch.asin((length(off) / 2).clamp(max=1))
     slopes = [p - tilt for p, tilt in zip(off[:2], fit.slopes, strict=True)]
     along_x, along_y, seen_map = _map(x, y, level, slopes=slopes, cells=min(MAX_MAP_CELLS, n // 2))
     return WavefrontError(
         wave.z, nm,
-        *(Figures(unit * _rms(part, share), unit * float(part.max() - part.min())) for part in (flat, level)),
+        *(OpdSize(unit * _rms(part, share), unit * float(part.max() - part.min())) for part in (flat, level)),
         tilt=(1e6 * fit.slopes[0], 1e6 * fit.slopes[1]), angle_rms=_rms(angle, share), angle_max=float(angle.max()),
         floor=unit * pupil.rounding, flux=measured, rays=len(x), x=along_x, y=along_y, opd=unit * seen_map,
     )  # fmt: skip
@@ -185,7 +186,7 @@ def residual(pupil: ExitPupil, wave: Wave, nm: float) -> Tensor:
     """
     seen, flat, fit, share = _compare(pupil, wave, nm)
     weighted = torch.zeros_like(pupil.path)
-    weighted[seen] = (flat - fit.at(pupil.x[seen], pupil.y[seen])) * share.sqrt() / (nm * NM)
+    weighted[seen] = (flat - fit.at(pupil.x[seen], pupil.y[seen])) * share.sqrt() / (nm * MM_PER_NM)
     return weighted
 
 

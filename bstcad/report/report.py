@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bstcad.optics.goal import suffix_of
-from bstcad.optics.sides import in_words
+from bstcad.optics.sides import size_text
 from bstcad.report.prescription import WAYS, order_rows
 from bstcad.report.record import LEFT_OUT, Contents, Examined, LeftOut, bounds, changes
 from bstcad.report.units import Remark, Rows, about, bound, environment, paragraphs, quantity, tables
@@ -269,7 +269,7 @@ def plan_predictions(plan: Mapping[str, Any]) -> Group:
         return Group(Text(), Text(f"Seconds, RRMSD and memory are not predicted: {plan['not_predicted']}."))
     rows, finer = dict(plan["predicted"]), plan["finer"]
     if finer is not None:
-        rows[f"standard, {in_words(finer['control_points'])} control points"] = finer["predicted"]["standard"]
+        rows[f"standard, {size_text(finer['control_points'])} control points"] = finer["predicted"]["standard"]
     table = _table("on this machine", "seconds", "RRMSD", "memory (GB)")
     for name, entry in rows.items():
         intervals = (map(about, entry[key]) for key in ("seconds", "rrmsd", "memory_gb"))

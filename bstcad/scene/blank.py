@@ -19,7 +19,7 @@ from bstcad.optics.key import Key
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.passes import LENS, MIRROR, SECOND_SURFACE, Face, Passes
-from bstcad.optics.sides import Sides, both, coarser, in_proportion, plain
+from bstcad.optics.sides import Sides, as_pair, coarser, in_proportion, simplified
 from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Surface, Toroid
 from bstcad.runs import files
 from bstcad.scene.errors import SceneError
@@ -290,7 +290,7 @@ class _FittedFront(_Front):
 
     def complaints(self, outline: Outline) -> Iterator[str]:
         """Yield the faults: a surface that does not reach the rim, or is too steep there for a net."""
-        x, y = map(torch.from_numpy, outline.places())
+        x, y = map(torch.from_numpy, outline.rim_points())
         _, z_x, z_y = self.surface.relative_sag_and_slope(x, y)
         slope = math.degrees(math.atan(float(torch.hypot(z_x, z_y).max())))
         if slope <= MAX_FITTED_SLOPE and bool(self.surface.reaches(x, y).all()):
@@ -447,14 +447,14 @@ def net_extent(outline: Outline, net: Sides) -> tuple[float, float]:
     function of t: its derivative grows eightfold inwards across 1.5 control points, for any heights.  The rim of the
     light would be too bright, with a dark line beside it.  A net of 5 control points has no spans to spare.
     """
-    reach = ((m - 1) / (m - 5) if m > 5 else 1.0 for m in both(net))
+    reach = ((m - 1) / (m - 5) if m > 5 else 1.0 for m in as_pair(net))
     half_x, half_y = (factor * half for factor, half in zip(reach, outline.half_extent, strict=True))
     return half_x, half_y
 
 
 def net_complaints(outline: Outline, points: Sides | None) -> Iterator[str]:
     """Complain of the number of control points of a net over an outline; None: it is chosen later."""
-    m, n = both(points or MIN_ROUND_POINTS)
+    m, n = as_pair(points or MIN_ROUND_POINTS)
     if outline.is_round and m != n:
         yield f"a round lens (lens.outline) needs a square net, not {m} x {n} control points; give one number"
     if outline.is_round and m < MIN_ROUND_POINTS:
@@ -497,7 +497,7 @@ class Back(Record):
             raise SceneError(
                 "lens.back.control_points: missing, and not chosen yet; use bstcad.design, or give a number"
             )
-        return plain(self.control_points)
+        return simplified(self.control_points)
 
 
 @dataclass(frozen=True)
@@ -599,13 +599,13 @@ class LensBlank(Record):
         """
         if not self.front.shaped:
             front = self.front.given or self.front_surface
-            return plain(front.shape) if isinstance(front, GivenNet) or front.is_net else None
+            return simplified(front.shape) if isinstance(front, GivenNet) or front.is_net else None
         own = self.front.given.shape if self.front.given else self.front.control_points
         if own is None:
             return net
         if self.back.control_points is None:  # the ratio is not known yet
-            return coarser(plain(own), max(both(net)))
-        return in_proportion(net, of=self.back.net, to=plain(own))
+            return coarser(simplified(own), max(as_pair(net)))
+        return in_proportion(net, of=self.back.net, to=simplified(own))
 
     def nets(self, net: Sides | None = None) -> tuple[Sides, ...]:
         """Return the control points of the back (default: the scene's), then those of a freeform front."""
@@ -622,21 +622,21 @@ class LensBlank(Record):
         from bstcad.optics.bspline import BSplineSurface
 
         half_x, half_y = net_extent(self.outline, self.front_net(as_wide_as or net))
-        heights = torch.zeros(both(self.front_net(net)), dtype=torch.float64)
+        heights = torch.zeros(as_pair(self.front_net(net)), dtype=torch.float64)
         return BSplineSurface(self.front.z, heights, (-half_x, half_x), (-half_y, half_y))
 
     @property
     def cells(self) -> tuple[float, float]:
         """Width and height of a cell of the back's net (mm)."""
         half_x, half_y = net_extent(self.outline, self.back.net)
-        m, n = both(self.back.net)
+        m, n = as_pair(self.back.net)
         return 2 * half_x / (m - 1), 2 * half_y / (n - 1)
 
     def doubts(self) -> Iterator[str]:
         """Doubt oblong cells: with square cells the same number of control points carries finer detail."""
         if self.back.control_points is None:
             return
-        (width, height), (m, n) = self.cells, both(self.back.net)
+        (width, height), (m, n) = self.cells, as_pair(self.back.net)
         if max(width, height) <= MAX_CELL_RATIO * min(width, height):
             return
         even = math.sqrt(width * height)

@@ -19,7 +19,7 @@ from bstcad.optics.key import Key
 from bstcad.optics.media import refractive_index
 from bstcad.optics.rays import Status, Vector, axes
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.tilted import Tilted
+from bstcad.optics.tilted import TiltedSurface
 from bstcad.optics.unfolding import Image, image
 from bstcad.scene.blank import INDICES, LensBlank, Outlined
 from bstcad.scene.errors import about
@@ -73,7 +73,7 @@ class Window(Record):
         if not self.tilt and not thinnest > 0:
             yield f"{key}.curvature: the faces of the window cross each other inside its outline; make it thicker"
 
-    def faces(self) -> tuple[Plane | Sphere | Tilted, ...]:
+    def faces(self) -> tuple[Plane | Sphere | TiltedSurface, ...]:
         """Both faces, the lower one first."""
         return _placed(self, self.z + self.thickness / 2)
 
@@ -112,7 +112,7 @@ class Mirror(Record):
         """Nothing is wrong with the table by itself."""
         yield from ()
 
-    def faces(self) -> tuple[Plane | Sphere | Tilted, ...]:
+    def faces(self) -> tuple[Plane | Sphere | TiltedSurface, ...]:
         """The face."""
         return _placed(self, self.z)
 
@@ -126,14 +126,14 @@ Elements = tuple[Element, ...]
 Around = tuple[tuple[Interface, ...], tuple[Interface, ...]]  # before and behind the lens
 
 
-def _placed(element: Window | Mirror, middle: float) -> tuple[Plane | Sphere | Tilted, ...]:
+def _placed(element: Window | Mirror, middle: float) -> tuple[Plane | Sphere | TiltedSurface, ...]:
     """The faces of an element that is tilted about the point of the axis at z = middle (mm)."""
-    made: list[Plane | Sphere | Tilted] = []
+    made: list[Plane | Sphere | TiltedSurface] = []
     for z, c in zip(element.vertices, element.curvatures, strict=True):
         if element.tilt and any(element.tilt):
             n = axes(element.tilt)[2]
             x, y, rise = (part * (z - middle) for part in n)
-            made.append(Tilted(middle + rise, (x, y), n, c))
+            made.append(TiltedSurface(middle + rise, (x, y), n, c))
         else:
             made.append(Sphere(z, c) if c else Plane(z))
     return tuple(made)

@@ -204,7 +204,7 @@ class Mount(Record):
         """Return z (mm) in the scene at which draft begins: at the flange's lower face, or below the back's rim."""
         if self.flange is not None:
             return self.flange.z
-        return parting(lens.back, lens.front, *self.rim_of(lens.outline).outline.places())
+        return parting(lens.back, lens.front, *self.rim_of(lens.outline).outline.rim_points())
 
     def _inset(self, rim: Outline, front: Surface, top: float) -> float:
         """Return the largest distance (mm) by which draft and bevel move the edge of the front inwards.
@@ -212,8 +212,8 @@ class Mount(Record):
         A line of the wall from (p, top) goes down to the front, inwards along m by tan(draft) per mm of depth; the
         bevel cuts its end at 45 degrees.  The intersection is that of cad.walls.LeaningPiece.ends, found by iteration.
         """
-        (x, y), tangent = rim.places(), math.tan(math.radians(self.draft))
-        m_x, m_y = rim.inwards(x, y)
+        (x, y), tangent = rim.rim_points(), math.tan(math.radians(self.draft))
+        m_x, m_y = rim.inset_direction(x, y)
         largest = (1 - MIN_CLEAR_APERTURE) * min(rim.half_extent)
 
         def front_at(inwards: np.ndarray) -> np.ndarray:
@@ -249,7 +249,7 @@ def complaints(mount: Mount, lens: LensBlank) -> Iterator[str]:
             size = f"{shape.corner_radius:g} mm is not less than {half:g} mm, half the width"
             yield f"mount.{key}.corner_radius: {size}; make it smaller"
     rim = mount.rim_of(lens.outline)
-    if (lens.outline.depth(*rim.outline.places()) < -1e-9).any():
+    if (lens.outline.depth(*rim.outline.rim_points()) < -1e-9).any():
         yield "mount.rim: extends past lens.outline; make it smaller, or the lens larger"
     if (own := lens.front.outline) and not _inradius(rim) > own.radius:
         yield f"mount.rim: cuts the front, whose outline is {own.words}; make the rim larger"
@@ -267,7 +267,7 @@ def _wall_complaints(mount: Mount, lens: LensBlank, rim: Round | Box) -> Iterato
     top, above, remedy = lens.back.z, "back", "move the back up"
     if mount.flange is not None:
         top, above, remedy = mount.flange.z, "flange", "move the flange up, or set draft and bevel of mount.flange"
-    front = sag(lens.front.surface, *rim.outline.places())
+    front = sag(lens.front.surface, *rim.outline.rim_points())
     wall = top - front.max()
     if not wall > 0:
         level = f"the {above} is at z = {top:g} mm, and the rim of the front reaches z = {front.max():.4g} mm"
@@ -295,8 +295,8 @@ def _inradius(shape: Round | Box) -> float:
 
 def _steepest_descent(front: Surface, rim: Outline) -> float:
     """Return the steepest descent of a front inwards from the rim (mm per mm)."""
-    x, y = rim.places()
-    m_x, m_y = rim.inwards(x, y)
+    x, y = rim.rim_points()
+    m_x, m_y = rim.inset_direction(x, y)
     _, z_x, z_y = sampled(front, x, y)
     return -float((z_x * m_x + z_y * m_y).min())
 
@@ -316,9 +316,9 @@ def _flange_complaints(flange: Flange, lens: LensBlank, rim: Round | Box) -> Ite
         two = f"two bevels of {flange.bevel:g} mm leave no wall of a plate {flange.thickness:g} mm thick"
         yield f"{key}.bevel: {two}; make it smaller"
     yield from _corner_complaints(f"{key}.outline", flange.outline, taken)
-    if not flange.outline.outline.depth(*rim.outline.places()).min() >= MIN_WEB + taken:
+    if not flange.outline.outline.depth(*rim.outline.rim_points()).min() >= MIN_WEB + taken:
         yield f"{key}.outline: must extend {MIN_WEB + taken:.3g} mm past the rim of the lens everywhere; make it larger"
-    front = lens.front.z if lens.front.free else sag(lens.front.surface, *rim.outline.places())
+    front = lens.front.z if lens.front.free else sag(lens.front.surface, *rim.outline.rim_points())
     low, high = float(np.min(front)), float(np.max(front))
     if upper <= high or flange.z >= lens.back.z:
         extents = f"the flange is from z = {flange.z:g} to {upper:g} mm, the wall from {high:.6g} to {lens.back.z:g} mm"

@@ -8,7 +8,7 @@ from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 from bstcad.optics.key import Key
-from bstcad.optics.sides import FEWEST, Sides, both, coarser, side
+from bstcad.optics.sides import MIN_SIDE, Sides, as_pair, coarser, side
 from bstcad.scene.blank import LensBlank
 from bstcad.scene.schema import OneOrTwo, Record
 
@@ -104,18 +104,18 @@ class Tailoring(Record):
         if (self.method or preset["method"]) == "integration":
             preset["stage2_iterations"] = 0
         if self.quality != "paper":  # no net follows a finer map, which folds in corners
-            preset["transport_grid"] = min(preset["transport_grid"], max(2 * (max(both(net)) - 1), COARSEST_GRID))
+            preset["transport_grid"] = min(preset["transport_grid"], max(2 * (max(as_pair(net)) - 1), COARSEST_GRID))
         given = self.model_dump(exclude_none=True, exclude={"levels"})
         return Tailoring.model_validate(preset | given)
 
     def complaints(self, lens: LensBlank) -> Iterator[str]:
         """Levels that do not lead to the net, and keys that the method cannot keep to."""
         levels, stated = self.levels, lens.back.control_points is not None
-        net = lens.back.net if stated else (levels or (FEWEST,))[-1]
-        most = max(both(net))
+        net = lens.back.net if stated else (levels or (MIN_SIDE,))[-1]
+        most = max(as_pair(net))
         if levels is not None and levels[-1:] not in ((net,), (most,)):
             yield f"tailoring.levels: must end with the back's control_points, {most}; add it at the end"
-        if any(max(both(coarse)) >= max(both(fine)) for coarse, fine in pairwise(levels or ())):
+        if any(max(as_pair(coarse)) >= max(as_pair(fine)) for coarse, fine in pairwise(levels or ())):
             yield f"tailoring.levels: {list(levels)} does not grow; list the nets from coarse to fine"
         who, other = WHOLE.get(self.resolved(net).method, ("", ""))
         for name in ("accuracy", "max_time"):
@@ -134,7 +134,7 @@ class Tailoring(Record):
 
 def coarse_to_fine(net: Sides) -> tuple[Sides, ...]:
     """Nets of 33, 129 and 513 control points (along the longer side) as far as clearly coarser, then the net itself."""
-    most = max(both(net))
+    most = max(as_pair(net))
     return (*(coarser(net, m) for m in (33, 129, 513) if 1.5 * m < most), net)
 
 

@@ -22,7 +22,7 @@ import tomli_w
 import torch
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_serializer, model_validator
 
-from bstcad.optics.channels import Channel, channels_of, drawn_channels, merged
+from bstcad.optics.channels import Channel, channels_of, drawn_channels, merge_wavelengths
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.goal import Goal
@@ -31,8 +31,8 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
-from bstcad.optics.sides import Sides, both
-from bstcad.optics.wavefront import ALONG, PlaneWave, SphericalWave, Wave, ZernikeWave
+from bstcad.optics.sides import Sides, as_pair
+from bstcad.optics.wavefront import MAX_RAY_ANGLE, PlaneWave, SphericalWave, Wave, ZernikeWave
 from bstcad.runs import files
 from bstcad.scene import effects, elements, lighting, mount, picture, scene_file
 from bstcad.scene.blank import LensBlank, as_front, net_extent
@@ -303,7 +303,7 @@ class Scene(Record):
         from bstcad.optics.bspline import BSplineSurface  # loads numba, which a scene alone does not need
 
         half_x, half_y = net_extent(self.lens.outline, as_wide_as or net)
-        heights = torch.zeros(both(net), dtype=dtype, device=device)
+        heights = torch.zeros(as_pair(net), dtype=dtype, device=device)
         back = BSplineSurface(self.lens.back.z, heights, (-half_x, half_x), (-half_y, half_y))
         lens = Lens(
             self.lens.flat_front(net, as_wide_as).to(heights.dtype, device), back, self.lens.outline, self.index,
@@ -346,7 +346,7 @@ class Scene(Record):
         losses = {nm: effects.losses(self.effects, self.lens, nm) for nm in lines}
         around = {nm: self.around(nm) for nm in lines}
         own = ((c, c.source.wavelength) for c in channels)
-        return merged([replace(c, losses=losses[nm], around=around[nm]) for c, nm in own])
+        return merge_wavelengths([replace(c, losses=losses[nm], around=around[nm]) for c, nm in own])
 
     def with_source_scaled(self, share: float) -> Self:
         """Return the scene with the size of its source times `share`; 0 makes it a point or a parallel beam."""
@@ -432,7 +432,7 @@ def _wavefront_complaints(wave: Wave | None, source: Emitter, lens: LensBlank, a
         sizes = " and ".join(f"source.{key}" for key, _, _ in source.sizes())
         yield f"wavefront: light of an extended source ({sizes}) has no single wavefront; make it {source.simple}"
     yield from (f"wavefront.{complaint}" for complaint in wave.complaints(lens.back.z))
-    if isinstance(wave, ZernikeWave) and not wave.steepest(source.main_wavelength) < math.sin(ALONG):
+    if isinstance(wave, ZernikeWave) and not wave.steepest(source.main_wavelength) < math.sin(MAX_RAY_ANGLE):
         yield "wavefront.coefficients: the wave is too steep to have rays; make them smaller, or the radius larger"
 
 

@@ -20,7 +20,7 @@ from bstcad.analysis.neglected_effects import Change, Reference
 from bstcad.optics import media
 from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
-from bstcad.optics.sides import both
+from bstcad.optics.sides import as_pair
 from bstcad.report.record import LeftOut, Making
 from bstcad.scene.effects import Absorption, Effect, Fresnel, Ghost, losses, named, reflection_of
 from bstcad.scene.scene import Scene
@@ -98,9 +98,8 @@ def left_out(scene: Scene, lens: Lens, picture: np.ndarray) -> tuple[LeftOut, ..
 
     picture: (rows, columns) flux in each pixel, of the target or as the lens throws it.
     """
-    reference = Reference.of(
-        lens, _central(scene), scene.target.screen, picture=picture, control_points=math.prod(both(scene.lens.back.net))
-    )
+    screen, points = scene.target.screen, math.prod(as_pair(scene.lens.back.net))
+    reference = Reference.of(lens, _central(scene), screen, picture=picture, control_points=points)
     found = [*_of_glass(scene, reference), *_of_mirror(scene, reference)]
     found += _size(scene, reference)
     found.append(_entry("diffraction", reference.diffraction(), "of the whole aperture"))

@@ -25,7 +25,7 @@ from scipy.ndimage import gaussian_filter
 from bstcad.analysis.cost import TILE_PIXELS, ControlCells
 from bstcad.optics.interfaces import cross
 from bstcad.optics.lens import Lens
-from bstcad.optics.sides import Sides, both, coarser, in_words, spread
+from bstcad.optics.sides import Sides, as_pair, coarser, size_text, spread
 from bstcad.optics.tubes import area_of, collect, launch_tubes
 from bstcad.report.units import about, two_digits
 from bstcad.scene.blank import MAX_CONTROL_POINTS
@@ -84,8 +84,8 @@ class Choice:
                 other = self.possible[self.number + step]
                 less, longer = map(about, other.over(chosen))
                 factors = f"about {less} times the RRMSD in {longer} times the time"
-                around.append(f"{word}, {in_words(other.net)}, would come to {factors}")
-        return "; ".join(filter(None, (f"{in_words(chosen.net)} control points are chosen", *around, self.limit)))
+                around.append(f"{word}, {size_text(other.net)}, would come to {factors}")
+        return "; ".join(filter(None, (f"{size_text(chosen.net)} control points are chosen", *around, self.limit)))
 
     def facts(self) -> dict[str, Any]:
         """The choice for JSON, each net by its RRMSD and time over those of the chosen one."""
@@ -114,7 +114,7 @@ def with_net(scene: Scene) -> tuple[Scene, Choice | None]:
 
 def chosen(scene: Scene) -> Choice:
     """The choice for a scene without a net; of several targets that which asks for the finest one."""
-    return max((_chosen(each) for each in scene.each_alone()), key=lambda choice: math.prod(both(choice.net)))
+    return max((_chosen(each) for each in scene.each_alone()), key=lambda choice: math.prod(as_pair(choice.net)))
 
 
 def _chosen(scene: Scene) -> Choice:

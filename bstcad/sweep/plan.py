@@ -15,7 +15,7 @@ from bstcad.analysis.light import blur
 from bstcad.optics.goal import worst
 from bstcad.optics.lens import Lens
 from bstcad.optics.reach import unreached
-from bstcad.optics.sides import both, scaled
+from bstcad.optics.sides import as_pair, scaled
 from bstcad.pipeline import reachable_part
 from bstcad.report.record import simulated, too_steep
 from bstcad.report.units import paragraphs
@@ -157,7 +157,7 @@ def outlook(scene: Scene, lenses: Sequence[Lens], tick: Callable[[], None] = lam
     predicted, steep = predictions(scene, pilots), pilots[FLOWN[-1]].steep
     found |= {"predicted": predicted, "notes": [*too_steep(steep), *_ends_early(scene, predicted)]}
     net = scaled(scene.lens.back.net, 2)
-    if max(both(net)) <= MAX_CONTROL_POINTS:
+    if max(as_pair(net)) <= MAX_CONTROL_POINTS:
         finer = of_net(scene, net)
         found["finer"] = {"control_points": net, "predicted": predictions(finer, pilots, gain(scene, finer, lenses))}
     return found

@@ -23,7 +23,7 @@ from bstcad.analysis.light import blur
 from bstcad.analysis.steepness import Steepness
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, rrmsd_by_rays
-from bstcad.optics.sides import Sides, both, coarser
+from bstcad.optics.sides import Sides, as_pair, coarser
 from bstcad.scene.quality import COARSEST_GRID
 from bstcad.scene.scene import Scene
 from bstcad.sweep.cold_run import REPEATS, kernel, timed
@@ -110,7 +110,7 @@ def of_quality(scene: Scene, quality: str) -> Scene:
 def made_small(scene: Scene) -> tuple[Scene, float]:
     """The scene of a pilot, and the pixels a side of the scene over those of the pilot."""
     net, (pixels, points, tubes) = scene.lens.back.net, LARGEST
-    knobs, spans = scene.tailoring.resolved(net), max(both(net)) - 1
+    knobs, spans = scene.tailoring.resolved(net), max(as_pair(net)) - 1
     widest = max(max(target.columns_rows) for target in scene.targets)
     factor = max(min(max(widest / pixels, spans / (points - 1)), spans / (FEWEST_POINTS - 1)), 1.0)
     changes = {
@@ -224,7 +224,7 @@ def usual(scene: Scene) -> Seconds:
     first += BETWEEN if scene.lens.front.shaped else 0.0
     first += transport * sum((grid / GRID) ** 2 for grid in grids) * knobs.transport_iterations / ITERATIONS
     fits = [fitted for level in knobs.levels[-2:] for fitted in scene.lens.nets(level)]
-    first += FIT * sum(math.prod(both(fitted)) for fitted in fits) / POINTS**2
+    first += FIT * sum(math.prod(as_pair(fitted)) for fitted in fits) / POINTS**2
     each, begun = CALLED + VARIABLE * net, JUDGING * pixels ** (2 / 3)  # seconds of an evaluation and a round
     if scene.source.extent is not None:
         each, begun = each + BLUR * pixels, begun + IMAGES
@@ -264,7 +264,7 @@ def proved(scene: Scene) -> float:
 
 
 def _points(scene: Scene) -> float:
-    return sum(math.prod(both(net)) for net in scene.lens.nets()) / POINTS**2
+    return sum(math.prod(as_pair(net)) for net in scene.lens.nets()) / POINTS**2
 
 
 def _pixels(scene: Scene) -> float:

@@ -22,7 +22,7 @@ from typing import Any
 
 import bstcad
 from bstcad.folder import SCENE, scene_files
-from bstcad.optics.sides import Sides, both, scaled
+from bstcad.optics.sides import Sides, as_pair, scaled
 from bstcad.runs import environment, files
 from bstcad.runs.cluster import Answer, Machines
 from bstcad.runs.progress import Report
@@ -87,7 +87,7 @@ def knobs(scene: Scene) -> tuple[Knob, ...]:
         Knob("evaluations", "Evaluations of stage 2", shares("stage2_iterations", (1 / 8, 1 / 4, HALF, 1, 2, 4))),
         Knob("tubes", "Rays a side" if adam else "Ray tubes a side",
              shares("rays", (1 / 4, HALF, ROOT, 1, 1 / ROOT, 2))),
-        Knob("control_points", "Control points a side", _choices(NET_KEY, own, sorted(nets, key=both))),
+        Knob("control_points", "Control points a side", _choices(NET_KEY, own, sorted(nets, key=as_pair))),
         Knob("adam", "Adam on control points, by rays", _adam(known.quality == "paper") if _by_paper(scene) else {}),
         Knob("precision", "Precision", _choices("tailoring.precision", known.precision, ("float32", "float64"))),
         Knob("pixels", "Pixels tailored to", _pixels(scene)),
@@ -127,7 +127,7 @@ def _numbers(key: str, own: int, values: Iterable[int], limits: tuple[int, int] 
 
 def _possible(net: Sides) -> bool:
     """Is the net among those that are tried?"""
-    return NETS[0] <= max(both(net)) <= NETS[1]
+    return NETS[0] <= max(as_pair(net)) <= NETS[1]
 
 
 def _pixels(scene: Scene) -> Points:

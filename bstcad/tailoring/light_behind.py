@@ -43,8 +43,8 @@ from bstcad.optics.wavefront import SphericalWave, Wave
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.run import Task
 from bstcad.tailoring.slope_map import centroid, pixel_corners, spread_density
-from bstcad.transport.bfm import Step
-from bstcad.transport.mapping import places_in, solve
+from bstcad.transport.bfm import TransportStep
+from bstcad.transport.mapping import grid_coordinates, solve
 
 MAP_ROUNDS, COARSE_DIVISOR, MIN_CELLS = 3, 4, 64  # rounds of the map; cells of the coarse ones: n // 4, minimum
 MAX_ITERATIONS = 40  # largest number of iterations for the point of a wave whose ray meets a given point of the target
@@ -88,7 +88,7 @@ class LightBehind:
         x, y = self.positions_on(screen.plane)
         if float((x[1:] - x[:-1]).mean()) < 0:
             x, y, values = x[::-1, ::-1], y[::-1, ::-1], values[:, ::-1, ::-1]
-        return _bilinear(values, *places_in(x, y, *pixel_corners(screen)))
+        return _bilinear(values, *grid_coordinates(x, y, *pixel_corners(screen)))
 
     def intersect(self, surface: Surface) -> np.ndarray:
         """Return the points (3, c + 1, r + 1) where the rays, traced backwards, meet a surface (mm)."""
@@ -147,7 +147,7 @@ def light_for_task(task: Task) -> LightBehind:
         wavelength = task.heaviest.source.wavelength
         return light_of_wave(near.receiver, near.picture, task.wave, wavelength=wavelength, parts=parts)
 
-    def progress(s: Step) -> None:
+    def progress(s: TransportStep) -> None:
         task.progress("stage 1", 0, task.knobs.rounds, f"between the targets, {s.grid}² cells")
 
     return between_targets(
@@ -201,7 +201,7 @@ def light_of_wave(screen: Screen, picture: np.ndarray, wave: Wave, *, wavelength
 
 def between_targets(
     near: tuple[Screen, np.ndarray], far: tuple[Screen, np.ndarray], n: int, *, sign: float = 1.0, iterations: int = 40,
-    progress: Callable[[Step], None] | None = None,
+    progress: Callable[[TransportStep], None] | None = None,
 ) -> LightBehind:  # fmt: skip
     """Return the rays through two pictures by transport on n x n cells.
 
@@ -244,7 +244,7 @@ def between_targets(
         return light.reversed() if sign < 0 and not against else light
     parts = max(1, round(n / max(screen.shape)))
     place, there = in_space(screen.plane, *corners(screen, parts)), mapping(*corners(screen, parts))
-    i, j = places_in(*(sign * c for c in y), *(sign * c for c in there))  # both increase with t
+    i, j = grid_coordinates(*(sign * c for c in y), *(sign * c for c in there))  # both increase with t
     way = _unit(in_space(behind.plane, *_bilinear(np.stack(pixel_corners(behind)), i, j)) - place)
     return LightBehind(place, way, subdivide(own / own.sum(), parts))
 

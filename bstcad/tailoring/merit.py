@@ -54,9 +54,9 @@ from bstcad.optics.reach import wanted_slopes
 from bstcad.optics.receivers import Receiver
 from bstcad.optics.trace import behind, through
 from bstcad.optics.tubes import Tubes, arriving, rays_to
-from bstcad.optics.unfolding import seen_from_last_net
-from bstcad.optics.wavefront import NM, Wave
-from bstcad.optics.wavefront_error import from_reference
+from bstcad.optics.unfolding import image_from_last_net
+from bstcad.optics.wavefront import MM_PER_NM, Wave
+from bstcad.optics.wavefront_error import path_from_reference
 from bstcad.tailoring.source_image import BlurOperator, Spread, blur_error, blurred, blurs, with_border
 
 LAPLACIAN_POWER = 0.5  # power of the Laplacian in the variable
@@ -199,7 +199,7 @@ class Merit:
         x, y = (p + way * d for p, d in zip(rays.position[:2], rays.direction[:2], strict=True))
         held = rays.alive & self.wave.contains(x.detach(), y.detach())
         flux = torch.where(held, _corner_flux(self.light.sheets[0].flux), torch.zeros_like(x))
-        opd = (path + way - self.wave.path(x, y, wavelength)) / (wavelength * NM)
+        opd = (path + way - self.wave.path(x, y, wavelength)) / (wavelength * MM_PER_NM)
         opd = torch.where(held, opd, torch.zeros_like(opd))
         share = flux / total(flux)
         piston = total(share * opd).detach()  # no gradient: the mean minimises the sum
@@ -221,7 +221,7 @@ def _traced_corners(source: Emitter, sheet: Tubes, lens: Lens, measured: bool) -
         there = behind(rays, interface)
         if measured and path is None:  # the rays come from the source, see `_from_source`
             index = 1.0 if interface.law.reverses else interface.law.n_in
-            path = index * from_reference(source, lens.entrance.z, there, rays.sense)
+            path = index * path_from_reference(source, lens.entrance.z, there, rays.sense)
         elif measured:
             off = torch.stack([*there.position[:2], there.above(rays.z)]) - rays.position
             square = torch.where(there.alive, (off * off).sum(0), torch.ones_like(path))  # sqrt(0) has no gradient
@@ -334,7 +334,7 @@ def local_weight(source: Emitter, lens: Lens, target: np.ndarray, screen: Screen
     logarithm = np.where(seen, np.log(np.maximum(irradiance, MAX_LOCAL_WEIGHT**-4)), 0.0)
     weight = np.exp(-0.5 * gaussian_filter(logarithm, WEIGHT_SMOOTHING)).clip(1 / MAX_LOCAL_WEIGHT, MAX_LOCAL_WEIGHT)
     if number == lens.freeform[-1] and onwards[0].law.eta > 1:
-        plane = seen_from_last_net(lens, screen.plane)
+        plane = image_from_last_net(lens, screen.plane)
         throw = _excess_throw(at_net, landed.position, plane, law=onwards[0].law, seen=seen)
         if throw is not None:
             weight = weight / np.exp(gaussian_filter(np.log(throw), WEIGHT_SMOOTHING))

@@ -36,7 +36,7 @@ from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
 from bstcad.optics.trace import across, behind
 from bstcad.tailoring.merit import CoarseVariable, SobolevVariable
-from bstcad.transport.mapping import places_in
+from bstcad.transport.mapping import grid_coordinates
 
 SCALE_FRACTION = 0.2  # f relative to the scale at which both blocks move the pictures equally far, by measurement
 # Standard deviation of the smoothing of q(b), in control points of the back.  In a gap between two parts of the light,
@@ -98,7 +98,7 @@ def along_light(source: Emitter, lens: Lens, goals: Sequence[Goal]) -> tuple[csr
     if any(np.unique(at[lit > 0]).size < 2 for at in q.numpy()):  # a narrow beam and few control points
         lit = _array(out.alive)
     places = [_array(p) for p in out.position[:2]]
-    row, column = places_in(*places, *(p.numpy() for p in torch.meshgrid(*_control_points(back), indexing="ij")))
+    row, column = grid_coordinates(*places, *(p.numpy() for p in torch.meshgrid(*_control_points(back), indexing="ij")))
     row, column = (_smoothed(at) for at in (row, column))
     carried = _interpolation(row, column, q.shape[1:]) @ diags_array(np.where(lit, factor, 1.0).reshape(-1))
 

@@ -28,7 +28,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.reach import GRAZING, room
 from bstcad.optics.receivers import Receiver
-from bstcad.optics.unfolding import seen_from_last_net
+from bstcad.optics.unfolding import image_from_last_net
 from bstcad.scene.target import average
 from bstcad.tailoring.slope_fit import Fit
 from bstcad.tailoring.slope_map import (
@@ -62,7 +62,7 @@ def reachable(source: Emitter, lens: Lens, goal: Goal, grazing: float = GRAZING)
     grid = face_grid(source, lens, lit_window(source, lens, FACE_CELLS), FACE_CELLS)
     lit = [corner[corners_of(small)] for corner in pixel_corners(few)]
     around = np.meshgrid(*(np.linspace(aims.min(), aims.max(), BOX_AIMS) for aims in lit), indexing="ij")
-    plane, law = seen_from_last_net(lens, screen.plane), lens.last_freeform.law
+    plane, law = image_from_last_net(lens, screen.plane), lens.last_freeform.law
     if float(reach_from_each(grid, around, plane, law, grazing=grazing).min()) >= 0:
         return None
     ordered, aims = rays_at(grid, same_order(grid, lit)), torch.from_numpy(np.stack(lit))

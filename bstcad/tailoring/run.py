@@ -23,7 +23,7 @@ from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, measure, rrmsd_by_rays
 from bstcad.optics.sides import Sides
-from bstcad.optics.unfolding import imaged
+from bstcad.optics.unfolding import image_screen
 from bstcad.optics.wavefront import Wave
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
@@ -156,7 +156,8 @@ class Task:
 
     def aimed(self, lens: Lens) -> Task:
         """Return the task with its receivers imaged through the surfaces behind the last net; stage 1 aims there."""
-        return replace(self, goals=tuple(replace(goal, receiver=imaged(lens, goal.receiver)) for goal in self.goals))
+        goals = (replace(goal, receiver=image_screen(lens, goal.receiver)) for goal in self.goals)
+        return replace(self, goals=tuple(goals))
 
     def rrmsd(self, lens: Lens, effort: Effort | None = None) -> float:
         """Return the RRMSD by independent rays on the CPU, the largest over the goals; NaN without light on a target.

@@ -22,7 +22,7 @@ from bstcad.optics.rays import Rays
 from bstcad.optics.reach import wanted_slopes
 from bstcad.optics.receivers import Receiver
 from bstcad.optics.trace import across
-from bstcad.optics.unfolding import seen_from_last_net
+from bstcad.optics.unfolding import image_from_last_net
 from bstcad.tailoring.merit import Spectrum
 
 BLOCK_POINTS = 1 << 22  # number of points whose slopes and residuals are in memory together: 0.3 GB
@@ -154,7 +154,7 @@ def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, plane: Receiver, repeats:
 
     repeats: number of fits; each changes the sag, and so the points where the rays meet the face.
     """
-    plane = seen_from_last_net(lens, plane)
+    plane = image_from_last_net(lens, plane)
     coming = across(rays, lens.interfaces[: lens.freeform[-1]])
     for _ in range(repeats):
         face = lens.last_freeform

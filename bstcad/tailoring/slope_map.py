@@ -40,13 +40,13 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays
 from bstcad.optics.reach import GRAZING, kept_from_reflection, room, wanted_slopes
 from bstcad.optics.receivers import Receiver
-from bstcad.optics.sides import Sides, both
+from bstcad.optics.sides import Sides, as_pair
 from bstcad.optics.trace import across, clear_window, gets_through
 from bstcad.optics.tubes import rays_to
-from bstcad.optics.unfolding import imaged
+from bstcad.optics.unfolding import image_screen
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit, blocks, fit_slopes
-from bstcad.transport.bfm import Step
+from bstcad.transport.bfm import TransportStep
 from bstcad.transport.density import Density, spread
 from bstcad.transport.mapping import Frame, Mapping, TransportMap, nodes, solve
 
@@ -87,7 +87,7 @@ def face_grid(source: Emitter, lens: Lens, window: Rectangle, cells: Sides) -> F
     number = lens.freeform[-1]
     q_x, q_y, at_face = rays_to(source, lens, x=x, y=y, number=number)
     coming = across(source.rays(q_x, q_y, lens.entrance.z, 1.0), lens.interfaces[:number])
-    steps = tuple(side / n for side, n in zip((window.width, window.height), both(cells), strict=True))
+    steps = tuple(side / n for side, n in zip((window.width, window.height), as_pair(cells), strict=True))
     xx, xy = torch.gradient(q_x, spacing=steps)
     yx, yy = torch.gradient(q_y, spacing=steps)
     through = lens.last_freeform.outline.contains(x, y) & coming.alive & at_face.alive
@@ -139,7 +139,7 @@ def slope_map(
     previous: map of the last round, which gives b(t); None: b = 0.  window: `lit_window` of the lens.
     hasty: fit g in a fifth of the time; the fixed point is the same.  solver: further arguments of transport's `solve`.
     """
-    grid, screen, law = square_grid(source, lens, window, n), imaged(lens, screen), lens.last_freeform.law
+    grid, screen, law = square_grid(source, lens, window, n), image_screen(lens, screen), lens.last_freeform.law
     t = pixel_corners(screen)
     b = previous.places if previous else tuple(map(np.zeros_like, t))
     net = gathering(grid, lens, screen.plane, centroid(picture, screen), hasty=hasty)
@@ -314,14 +314,14 @@ def map_to_target(
     screen: Screen,
     n: int,
     iterations: int,
-    progress: Callable[[Step], None],
+    progress: Callable[[TransportStep], None],
 ) -> Mapping:
     """Return the transport map of the paper, from the vertex plane of the front (mm) to the target (mm).
 
     It is solved on n x n cells, for the light that passes all faces.  A tilted target is projected from the vertex of
     the front onto the level plane through its centre: in its own coordinates the map would be far from a gradient.
     """
-    screen = imaged(lens, screen)
+    screen = image_screen(lens, screen)
     area = clear_window(source, lens)
     side = max(area.width, area.height)
     x, y = (t.to(lens.like.device) for t in sampling.grid(Rectangle(side, side), n * SUBCELLS))
@@ -329,7 +329,7 @@ def map_to_target(
     flux = flux * gets_through(source.rays(x, y, lens.entrance.z, 1.0), lens)
     density = light_density(flux.cpu().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3)), side)
     if not screen.plane.is_level:
-        wanted, frame = spread_density(picture, screen.plane.seen(*pixel_corners(screen), lens.front.z), n)
+        wanted, frame = spread_density(picture, screen.plane.to_level_plane(*pixel_corners(screen), lens.front.z), n)
     else:
         width, height = screen.x[1] - screen.x[0], screen.y[1] - screen.y[0]
         wanted = Density.from_picture(picture, n, width=width, height=height, floor=TARGET_FLOOR)
@@ -339,16 +339,16 @@ def map_to_target(
 
 def sent_from_entrance(mapping: Mapping, lens: Lens, screen: Screen) -> TransportMap:
     """Return the inverse of the map of `map_to_target` at the corners of the target's pixels."""
-    screen = imaged(lens, screen)
+    screen = image_screen(lens, screen)
     corners = pixel_corners(screen)
     if not screen.plane.is_level:
-        corners = screen.plane.seen(*corners, lens.front.z)
+        corners = screen.plane.to_level_plane(*corners, lens.front.z)
     return replace(sent_from(mapping.inverse(*corners), screen), plane="entrance")
 
 
 def aim_points(mapping: Mapping, lens: Lens, screen: Screen, x: Tensor, y: Tensor) -> Tensor:
     """Return the points of the screen (2, …) mm to which the map of `map_to_target` sends points x, y (…) mm."""
-    screen, sent = imaged(lens, screen), mapping(*(p.detach().cpu().double().numpy() for p in (x, y)))
+    screen, sent = image_screen(lens, screen), mapping(*(p.detach().cpu().double().numpy() for p in (x, y)))
     if not screen.plane.is_level:
-        sent = screen.plane.from_seen(*sent, lens.front.z)
+        sent = screen.plane.from_level_plane(*sent, lens.front.z)
     return torch.stack([torch.from_numpy(np.ascontiguousarray(s)) for s in sent]).to(x)

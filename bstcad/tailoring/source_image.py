@@ -36,7 +36,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Draw, a_side, seen_through, simulated
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Landed
-from bstcad.optics.sampling import in_pairs
+from bstcad.optics.sampling import point_pairs
 
 NODES = 5  # nodes a side, from border to border of the screen
 IMAGE_GRID = 32  # points a side of the back, through which the images of the source are traced
@@ -161,7 +161,7 @@ def _biquadratic(points: Sequence[tuple[float, float]]) -> Tensor:
 def blurs(spread: Spread, lens: Lens, screen: Screen) -> tuple[BlurOperator, ...]:
     """Return B for each channel of a source and a lens, all with the same border."""
     unit = Circle(1.0) if spread.source.extent.is_round else Rectangle(2.0, 2.0)
-    dots = _biquadratic(in_pairs(unit, IMAGE_PAIRS))
+    dots = _biquadratic(point_pairs(unit, IMAGE_PAIRS))
     nodes = [[k / (NODES - 1) * side for k in range(NODES)] for side in screen.shape]
     kernels = []
     for channel in spread.centre:

@@ -27,7 +27,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays
 from bstcad.optics.reach import GRAZING
-from bstcad.optics.sides import both, coarser
+from bstcad.optics.sides import as_pair, coarser
 from bstcad.optics.trace import clear_window, trace
 from bstcad.scene.blank import CONIC_CONSTANTS
 from bstcad.scene.quality import COARSEST_GRID
@@ -38,7 +38,7 @@ from bstcad.tailoring.reachable import resampled
 from bstcad.tailoring.run import Parameters, Step, Task
 from bstcad.tailoring.slope_fit import Fit, tailor_to_aim
 from bstcad.tailoring.slope_map import SlopeMap, aim_points, face_grid, fit_to_map, lit_window, map_to_target, slope_map
-from bstcad.transport.bfm import Step as TransportStep
+from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Mapping
 
 COARSE = (Fit(bending=1e-2, steps=40, degree=3), 0.0)  # fit, weight of unlit points: stiff, extrapolates there
@@ -108,7 +108,7 @@ def doubtful(task: Task, lens: Lens, judged: float, state: SlopeRound) -> bool:
     The RRMSD counts at no more pixels than the net has control points: no method shows finer detail.
     """
     goal = task.goals[0]
-    few = resampled(goal, pixels=max(both(task.knobs.levels[-1])))
+    few = resampled(goal, pixels=max(as_pair(task.knobs.levels[-1])))
     if judged > RETRY_RRMSD and few.receiver.shape != goal.receiver.shape:
         judged = replace(task, goals=(few,)).rrmsd(lens)
     return not judged <= RETRY_RRMSD or state.wanted.moved > RETRY_CHANGE  # NaN: no light on the target
@@ -154,7 +154,7 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[
         source, lens, window, picture=goal.picture, screen=goal.receiver, n=cells, previous=wanted,
         iterations=knobs.transport_iterations, progress=progress, hasty=task.hasty,
     )  # fmt: skip
-    sides = [min(2 * points, knobs.rays) for points in both(m)]
+    sides = [min(2 * points, knobs.rays) for points in as_pair(m)]
     parts = math.ceil(max(sides) / MAX_RAY_CELLS)
     grid = face_grid(source, lens, window, (math.ceil(sides[0] / parts), math.ceil(sides[1] / parts)))
     grazing = GRAZING if task.edge is None else task.edge.angle
@@ -178,7 +178,7 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
             goal.picture,
             screen=goal.receiver,
             n=n,
-            side=min(3 * max(both(m)), max(2 * max(both(m)), knobs.rays)),  # many rays may leave through the sides
+            side=min(3 * max(as_pair(m)), max(2 * max(as_pair(m)), knobs.rays)),  # many may leave through the sides
             iterations=knobs.transport_iterations,
         )
         lens = place_back(tailor_to_aim(lens, rays, wanted, goal.receiver.plane), z, task.least, task.bounds)

@@ -25,11 +25,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bstcad.optics.channels import channels_of, points
+from bstcad.optics.channels import channels_of, points_per_line
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import a_side, images, rrmsd_by_tubes
-from bstcad.optics.sides import both, coarser
+from bstcad.optics.sides import as_pair, coarser
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.grazing import Grazing
@@ -237,7 +237,7 @@ def _overshoot_weight(task: Task, lens: Lens) -> float:
     Within w of the border some light falls outside for any lens, and pulling it in would blur the edge.
     """
     overshoot = task.knobs.overshoot
-    if points(task.channels) == 1:
+    if points_per_line(task.channels) == 1:
         return overshoot
     few, light = task.channels, task.heaviest
     if task.spreads:
@@ -421,7 +421,7 @@ def stage3_sheet_sizes(knobs: Tailoring, pixels: tuple[int, int]) -> Iterator[tu
     """
     few = knobs.stage2_iterations < MIN_EVALUATIONS
     total = knobs.stage2_iterations * (2 if few else 1)  # each round costs a start
-    (m_x, m_y), (columns, rows) = both(knobs.levels[-1]), pixels
+    (m_x, m_y), (columns, rows) = as_pair(knobs.levels[-1]), pixels
     oblong = math.sqrt(m_x / m_y)
     a_pixel = TUBES_PER_PIXEL * max(columns / oblong, rows * oblong)
     tubes = min(knobs.rays, math.ceil(max(TUBES_PER_CELL * knobs.side, a_pixel)))

@@ -51,7 +51,7 @@ from bstcad.tailoring.slope_map import (
     square_grid,
     transport_slopes,
 )
-from bstcad.transport.bfm import Step as TransportStep
+from bstcad.transport.bfm import TransportStep
 
 DIFFERENCE_STEP = 1e-4  # step of the difference quotients of the slopes, relative to the thickness
 # Number of fine rounds: the last one on the full grid and nets, the others on half of the grid and the second finest

@@ -29,9 +29,9 @@ from bstcad.optics.media import refractive_index
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Vector
-from bstcad.optics.sides import in_words
+from bstcad.optics.sides import size_text
 from bstcad.optics.surfaces import Surface
-from bstcad.optics.tilted import Tilted
+from bstcad.optics.tilted import TiltedSurface
 from bstcad.scene.errors import SceneError
 
 # --- the setup --------------------------------------------------------------------------------------------------------
@@ -83,7 +83,7 @@ class Setup:
             return self
 
         def moved(interfaces: tuple[Interface, ...]) -> tuple[Interface, ...]:
-            return tuple(replace(i, surface=Tilted.of(i.surface).moved_by(motion)) for i in interfaces)
+            return tuple(replace(i, surface=TiltedSurface.of(i.surface).moved_by(motion)) for i in interfaces)
 
         lens = replace(self.lens, before=moved(self.lens.before), behind=moved(self.lens.behind))
         own = ((c, c.around and (moved(c.around[0]), moved(c.around[1]))) for c in self.channels)
@@ -197,9 +197,9 @@ def kinds(setup: Setup, material: str | None = None) -> dict[str, Kind]:
 def _motions(setup: Setup) -> Iterator[Kind]:
     """Yield the shifts along, and rotations about, x, y and z of lens, source and screen."""
     sources, without_effect = [channel.source for channel in setup.channels], {"source.clocking"}
-    if all(source.shifts_alike for source in sources):
+    if all(source.is_shift_invariant for source in sources):
         without_effect.add("source.axial")  # parallel light is the same along the axis
-    if not all(source.turns_alike for source in sources):
+    if not all(source.is_rotation_invariant for source in sources):
         without_effect.add("lens.clocking")  # without effect in round light; other light cannot be rotated
     for part in ("lens", "source", "screen"):
         name = setup.lens.passes.optic if part == "lens" else part
@@ -270,18 +270,19 @@ def _change_wavelength(material: str, setup: Setup, by: float) -> Setup:
 def _lights(setup: Setup) -> Iterator[Kind]:
     """Yield the errors of cone angle and size of point sources."""
     sources = [channel.source for channel in setup.channels]
-    if any(source.wider(0.0) for source in sources):
+    if any(source.with_wider_cone(0.0) for source in sources):
         yield Kind("source.angle", "width of the source's cone, relative", "", _change_cone)
-    if len({source.place for source in sources}) > 1 and all(source.larger(0.0, source.place) for source in sources):
+    extended = len({source.place for source in sources}) > 1
+    if extended and all(source.moved_away(0.0, source.place) for source in sources):
         yield Kind("source.size", "size of the source, relative", "", _change_size)
 
 
 def _change_cone(setup: Setup, by: float) -> Setup:
-    return setup.with_sources(lambda source: source.wider(by))
+    return setup.with_sources(lambda source: source.with_wider_cone(by))
 
 
 def _change_size(setup: Setup, by: float) -> Setup:
-    return setup.with_sources(lambda source: source.larger(by, setup.pivot("source")))
+    return setup.with_sources(lambda source: source.moved_away(by, setup.pivot("source")))
 
 
 # --- one face against the other ---------------------------------------------------------------------------------------
@@ -435,7 +436,7 @@ def _require_resolution(surface: BSplineSurface, length: float, words: str) -> N
     least = MIN_CELLS * max(surface.pitch)
     if length < least:
         raise ValueError(
-            f"{words} of {length:g} mm is too fine for {in_words(surface.shape)} control points, which can represent "
+            f"{words} of {length:g} mm is too fine for {size_text(surface.shape)} control points, which can represent "
             f"{least:.3g} mm or more; give a longer one, or a lens with more control points"
         )
 

@@ -39,7 +39,7 @@ from bstcad.optics.emitters import Emitter
 from bstcad.optics.kernels.reductions import dot
 from bstcad.optics.lens import Lens
 from bstcad.optics.wavefront import Wave
-from bstcad.optics.wavefront_error import exit_pupil, moved_pupil, residual, wavefront_error
+from bstcad.optics.wavefront_error import exit_pupil, move_pupil, residual, wavefront_error
 from bstcad.report.tolerances import WIDEST, Sensitivity
 from bstcad.tolerance.grades import DEFAULT_GRADE, GRADES, grade_limit
 from bstcad.tolerance.perturbations import MOTIONS, Perturbation, Setup, draws, kinds, perturb, trials
@@ -124,7 +124,7 @@ class Wavefronts:
         source, lens = _main_channel(setup)
         pupil = exit_pupil(source, lens, self.wave.z, self.rays)
         if setup.lens_motion is not None:
-            pupil = moved_pupil(pupil, setup.lens_motion, self.wave.z)
+            pupil = move_pupil(pupil, setup.lens_motion, self.wave.z)
         return residual(pupil, self.wave, self.wavelength).ravel().numpy()
 
     @property

@@ -171,7 +171,7 @@ def _eliminate(r, g, pivots, keep, share, blocks):
 
 
 @dataclass(frozen=True)
-class Step:
+class TransportStep:
     """State of a solve, passed to `progress`."""
 
     grid: int  # cells a side of the current grid
@@ -201,7 +201,7 @@ def back_and_forth(
     *,
     iterations: int = 40,
     tolerance: float = 1e-3,
-    progress: Callable[[Step], None] | None = None,
+    progress: Callable[[TransportStep], None] | None = None,
 ) -> Transport:
     """Return potentials between two densities on one grid, solved on coarser grids first; neither needs to be positive.
 
@@ -262,7 +262,7 @@ def _ascend(source, target, phi, sigma, *, iterations, tolerance, progress):
         u, v, back, dual, _ = _half_step(u, v, nu, rho, poisson=poisson, sigma=min(back, ceiling), dual=dual)
         duals.append(dual / n**2)
         if progress is not None:
-            progress(Step(n, iteration, error, "back-and-forth"))
+            progress(TransportStep(n, iteration, error, "back-and-forth"))
         before, latest = errors[since:-PLATEAU_ITERATIONS], errors[-PLATEAU_ITERATIONS:]
         if iteration - since > PLATEAU_ITERATIONS and min(latest) > (1 - PLATEAU_TOLERANCE) * min(before):
             if halvings == STEP_HALVINGS:

@@ -10,9 +10,9 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike
 
-from bstcad.transport.bfm import Step, Transport, back_and_forth, half_square, ladder, legendre
+from bstcad.transport.bfm import Transport, TransportStep, back_and_forth, half_square, ladder, legendre
 from bstcad.transport.density import Density, gradient_at_corners
-from bstcad.transport.monge_ampere import ROUGH_MASS_ERROR, MongeAmpere, climb, corners
+from bstcad.transport.monge_ampere import ROUGH_MASS_ERROR, MongeAmpere, corners, newton_on_grids
 
 # Smallest density of the target relative to its mean: the gradient of a convex function cannot avoid a hole
 FLOOR = 1e-3
@@ -115,7 +115,7 @@ def solve(
     tolerance: float = 2e-3,
     falling: tuple[float, ...] = FALLING_FLOORS,
     sharper: Sequence[Density] = (),
-    progress: Callable[[Step], None] | None = None,
+    progress: Callable[[TransportStep], None] | None = None,
 ) -> Mapping:
     """Return the optimal map: back-and-forth on a coarse grid, then Newton's method on flux tubes up to the finest.
 
@@ -127,7 +127,7 @@ def solve(
     sharper: sources of increasing detail, for which Newton's method continues on the last grid while the mass error
     stays below ROUGH_MASS_ERROR; `mapping.source` is the last source for which it does.
     """
-    newton = partial(climb, steps=NEWTON_STEPS, tolerance=tolerance, progress=progress)
+    newton = partial(newton_on_grids, steps=NEWTON_STEPS, tolerance=tolerance, progress=progress)
 
     def climbed(floor: float) -> tuple[np.ndarray, list[float], str]:
         grids = ladder(source, target.lifted(floor), BACK_AND_FORTH_CELLS)
@@ -273,7 +273,9 @@ def _invert(phi, sx, sy, gx, gy, px, py, out):
             out[0, k], out[1, k] = tp, tq
 
 
-def places_in(grid_x: np.ndarray, grid_y: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def grid_coordinates(
+    grid_x: np.ndarray, grid_y: np.ndarray, x: np.ndarray, y: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the real (row, column) of points x, y (m, n) in a grid of points (mm); outside points at its rim."""
     per_mm = (max(grid_x.shape) - 1) / max(np.ptp(grid_x), np.ptp(grid_y))
     out = np.empty((2, *x.shape))

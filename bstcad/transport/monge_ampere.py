@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit, prange
 from scipy.ndimage import gaussian_filter
 
-from bstcad.transport.bfm import PoissonWithoutCheckerboard, Step, prolong
+from bstcad.transport.bfm import PoissonWithoutCheckerboard, TransportStep, prolong
 from bstcad.transport.density import Density, inner, threads
 
 SOFTENING = 0.2  # added to both eigenvalues of rho cof(D²v), to limit Newton steps in dark, nearly folded regions
@@ -79,13 +79,13 @@ def corners(phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return x, y
 
 
-def climb(
+def newton_on_grids(
     ladder: Sequence[tuple[Density, Density]],
     phi: np.ndarray,
     *,
     steps: int,
     tolerance: float,
-    progress: Callable[[Step], None] | None = None,
+    progress: Callable[[TransportStep], None] | None = None,
     smoothing: float = SMOOTHING,
 ) -> tuple[np.ndarray, list[float], str]:
     """Apply Newton's method on each grid of (source, target), from phi (cell units) on the first.
@@ -119,7 +119,7 @@ def _newton_steps(tubes, phi, *, steps, tolerance, progress):
         phi, r, smoothed = found
         errors.append(error)
         if progress is not None:
-            progress(Step(phi.shape[0], k + 1, errors[-1], "tubes"))
+            progress(TransportStep(phi.shape[0], k + 1, errors[-1], "tubes"))
         if errors[-1] > (MAX_ROUGH_ERROR_RATIO if errors[-1] > ROUGH_MASS_ERROR else MAX_ERROR_RATIO) * errors[-2]:
             reason = "plateau"
             break

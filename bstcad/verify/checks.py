@@ -242,7 +242,7 @@ def _as_made(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> tuple[
 
 def _aperture(name: str, measured: Outline, designed: Outline) -> Check:
     """The largest distance between the rim of a face's clear aperture and that of the designed one."""
-    off = max(float(np.abs(a.depth(*b.places())).max()) for a, b in ((measured, designed), (designed, measured)))
+    off = max(float(np.abs(a.depth(*b.rim_points())).max()) for a, b in ((measured, designed), (designed, measured)))
     where = f"the part has {measured.words}, the lens was tailored for {designed.words}; generate the design again"
     name = f"part.step: clear aperture of the {name}, from the mount's"
     return Check.at_most(name, off, APERTURE_DIFFERENCE, unit="mm", where=where, id="clear-aperture")

@@ -56,7 +56,7 @@ class Known:
         at, z_x, z_y = intersect(self.face, coming, WIDE, Status.VIGNETTED)
         landed = self.plane.to(deflect(at, z_x, z_y, self.law).rays)
         assert landed.alive.all()
-        return torch.stack(tuple(self.plane.places(landed))), at
+        return torch.stack(tuple(self.plane.coordinates(landed))), at
 
     def error(self, n, first="x"):
         """Largest distance (mm) along z of the points that come of its own map from the face itself."""

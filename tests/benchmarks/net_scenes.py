@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from skimage import data
 
 from bstcad.optics.measure import Effort, rrmsd_by_rays
-from bstcad.optics.sides import both, coarser, spread
+from bstcad.optics.sides import as_pair, coarser, spread
 from bstcad.pipeline import design
 from bstcad.scene.scene import Scene, load
 from tests.benchmarks.cold import TEMPLATES
@@ -140,7 +140,7 @@ def main() -> None:
             known = json.loads(FIGURES.read_text()) if FIGURES.exists() else {}
             known.setdefault(size, {}).setdefault(case.name, {})[str(side)] = found
             FIGURES.write_text(json.dumps(known, indent=1, sort_keys=True) + "\n")
-            print(size, case.name, both(scene.lens.back.net), found, flush=True)
+            print(size, case.name, as_pair(scene.lens.back.net), found, flush=True)
 
 
 if __name__ == "__main__":

@@ -10,8 +10,8 @@ import tomli_w
 import torch
 
 from bstcad import folder as folders
-from bstcad.optics.wavefront import NM
-from bstcad.optics.wavefront_error import followed
+from bstcad.optics.wavefront import MM_PER_NM
+from bstcad.optics.wavefront_error import optical_path
 from tests.benchmarks.beam_shaper import BeamShaper
 from tests.benchmarks.cold import TEMPLATES, generate
 from tests.judges.paths import paths_apart
@@ -87,11 +87,11 @@ def test_the_beam_shaper_is_the_quadrature_s(made):
     share = flux / flux.sum()
     for target in scene.targets:
         rays = source.rays(x, y, lens.entrance.z, 1.0)
-        ours, path, _ = followed(source, lens, rays, target.z)
+        ours, path, _ = optical_path(source, lens, rays, target.z)
         assert bool(ours.alive.all())
         lands = torch.from_numpy(shaper.lands_at(r.numpy()))
         off = (ours.position[:2] - lands / r * torch.stack([x, y])).square().sum(0)
-        opd = (path - shaper.path(target.z)) / (633.0 * NM)
+        opd = (path - shaper.path(target.z)) / (633.0 * MM_PER_NM)
         opd = opd - (share * opd).sum()
         rms = float((share * opd.square()).sum().sqrt())
         print(target.z, "OPD", rms, "waves RMS; lands", float((share * off).sum().sqrt()), "mm RMS beside")

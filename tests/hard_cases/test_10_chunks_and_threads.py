@@ -166,8 +166,8 @@ def test_threads_of_one_process_change_no_bit(threads):
 def test_strips_and_bands(holds, monkeypatch):
     """Rays and tubes in other portions: 90 000 roundings of 1.1e-16 at most, of either sign."""
     images = {}
-    for portion, rows in ((sampling.STRIP, tubes.BAND), (7 * RAYS, 38)):
-        monkeypatch.setattr(sampling, "STRIP", portion)
+    for portion, rows in ((sampling.POINTS_PER_STRIP, tubes.BAND), (7 * RAYS, 38)):
+        monkeypatch.setattr(sampling, "POINTS_PER_STRIP", portion)
         monkeypatch.setattr(tubes, "BAND", rows)
         found = by_rays(simulated_plain(SOURCE, lens(), SCREEN, RAYS, 0))
         found |= {"image, tubes": tubes.picture(SOURCE, lens(), SCREEN, TUBES)}
@@ -200,7 +200,7 @@ def test_compiled_or_not(holds, monkeypatch, dtype):
 
 def test_one_thread_and_other_strips_make_the_same_design(threads, monkeypatch, small_design, small_scene):
     """The control points to the last bit."""
-    monkeypatch.setattr(sampling, "STRIP", 5000)
+    monkeypatch.setattr(sampling, "POINTS_PER_STRIP", 5000)
     monkeypatch.setattr(tubes, "BAND", 32)
     threads(1)
     found = pipeline.design(small_scene, device="cpu").lens.back.control_points()

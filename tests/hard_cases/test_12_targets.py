@@ -15,9 +15,9 @@ from PIL import Image
 from bstcad import pipeline
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
-from bstcad.transport import Density, Step, back_and_forth, mass_error, solve
+from bstcad.transport import Density, TransportStep, back_and_forth, mass_error, solve
 from bstcad.transport.mapping import FLOOR, NEWTON_STEPS
-from bstcad.transport.monge_ampere import MAX_STEPS_FACTOR, climb
+from bstcad.transport.monge_ampere import MAX_STEPS_FACTOR, newton_on_grids
 from tests.conftest import DISK, SMALL
 
 N = 64
@@ -80,7 +80,7 @@ def test_an_unequal_mass_changes_no_bit(factor):
 @pytest.mark.parametrize("target", ("islands", "every other pixel", "speckle", "one hot pixel"))
 def test_back_and_forth_comes_to_rest(target):
     """Asked for no error at all and given 5000 iterations: a plateau of 5 is found within some 20, thrice."""
-    seen: list[Step] = []
+    seen: list[TransportStep] = []
     found = back_and_forth(
         SOURCES["disc"], Density.from_values(TARGETS[target][0]), iterations=5000, tolerance=0.0, progress=seen.append
     )
@@ -94,7 +94,7 @@ def test_newton_that_stalls_says_plateau():
     """Newton's method begins at a potential that folds everywhere, so that no step may gain: the first one is kept."""
     source, target = SOURCES["disc"], Density.from_values(TARGETS["speckle"][0]).lifted(FLOOR)
     start = 3.0 * RANDOM.standard_normal((N, N))
-    phi, errors, reason = climb([(source, target)], start, steps=50, tolerance=0.0)
+    phi, errors, reason = newton_on_grids([(source, target)], start, steps=50, tolerance=0.0)
     assert reason == "plateau" and len(errors) < 50
     assert np.isfinite(phi).all() and np.isfinite(errors).all() and all(np.diff(errors) <= 0)
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from bstcad.optics import sampling
 from bstcad.optics.trace import clear_window
-from bstcad.optics.wavefront_error import followed, from_reference
+from bstcad.optics.wavefront_error import optical_path, path_from_reference
 
 
 class PathsApart(NamedTuple):
@@ -29,12 +29,12 @@ def paths_apart(lens, source, z, n=128):
     lens, source = lens.plain(), source.central
     area = clear_window(source, lens)
     rays = source.rays(*sampling.grid(area, n), lens.entrance.z, area.area / n**2)
-    ours, path, _ = followed(source, lens, rays, z)
+    ours, path, _ = optical_path(source, lens, rays, z)
     in_a_row = replace(rays, position=rays.position.reshape(3, -1), direction=rays.direction.reshape(3, -1))
     theirs = judge.through(lens, judge.surfaces(lens), in_a_row)
     batoid.intersect(batoid.Plane(), theirs, batoid.CoordSys(origin=[0.0, 0.0, z]))
     both = (ours.alive & (rays.flux > 0)).numpy().ravel() & ~theirs.failed & ~theirs.vignetted
-    left_out = -from_reference(source, lens.entrance.z, rays, rays.sense)
+    left_out = -path_from_reference(source, lens.entrance.z, rays, rays.sense)
     x, y, _ = (p.numpy().ravel() for p in ours.position)
     off = theirs.t - (left_out + path).numpy().ravel(), np.hypot(theirs.x - x, theirs.y - y)
     return PathsApart(*(float(np.abs(each[both]).max()) for each in off), rays=int(both.sum()))

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bstcad.optics.channels import Channel, channels_of, merged, places
+from bstcad.optics.channels import Channel, channels_of, merge_wavelengths, source_numbers
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.outlines import Circle
 from bstcad.optics.point import Point
-from bstcad.optics.sampling import scattered
+from bstcad.optics.sampling import shifted_lattice
 
 LINES = ((486.1, 1.0), (587.6, 2.0), (656.3, 1.0))
 DISC = Point((1.0, -2.0, 3.0), profile="uniform", half_angle=40.0, diameter=2.0)
@@ -97,24 +97,24 @@ def test_each_line_has_its_share_of_points_in_pairs():
 
 
 def test_lines_that_nothing_tells_apart_are_one_channel():
-    alike = merged(channels_of(Point(wavelength=LINES), lambda nm: 1.0, 8))
+    alike = merge_wavelengths(channels_of(Point(wavelength=LINES), lambda nm: 1.0, 8))
     assert len(alike) == 1 and alike[0].weight == 1.0 and alike[0].source == Point(wavelength=587.6)
     apart = channels_of(Point(wavelength=LINES), index, 8)
-    assert merged(apart) == apart
+    assert merge_wavelengths(apart) == apart
 
 
 @pytest.mark.parametrize("source", [DISC, SUN, replace(DISC, diameter=None, width=2.0, height=0.5)], ids=str)
 def test_drawn_points_are_spread_evenly_from_seed_to_seed(source):
     """One point a draw: over 2000 draws its mean is the middle, its second moments those of the extent (to 4 sigma)."""
-    drawn = np.array([scattered(source.extent, 1, seed)[0] for seed in range(2000)]) / source.extent.half_extent
+    drawn = np.array([shifted_lattice(source.extent, 1, seed)[0] for seed in range(2000)]) / source.extent.half_extent
     moment = 1 / 4 if isinstance(source.extent, Circle) else 1 / 3
     assert np.abs(drawn.mean(0)).max() < 4 * math.sqrt(moment / 2000)
     np.testing.assert_allclose((drawn[:, :, None] * drawn[:, None, :]).mean(0), moment * np.eye(2), atol=0.03)
-    assert len(set(scattered(source.extent, 64, 1)) | set(scattered(source.extent, 64, 2))) == 128
+    assert len(set(shifted_lattice(source.extent, 64, 1)) | set(shifted_lattice(source.extent, 64, 2))) == 128
 
 
 def test_places_are_counted_line_by_line():
     channels = channels_of(replace(DISC, wavelength=LINES), index, 16)
-    assert sorted(places(channels)) == sorted([*range(8), *range(4), *range(4)])
-    assert places([Channel(Point(), 1.5, 0.5)] * 2) == (0, 0)
-    assert places(channels_of(Point(wavelength=LINES), index, 8)) == (0, 0, 0)
+    assert sorted(source_numbers(channels)) == sorted([*range(8), *range(4), *range(4)])
+    assert source_numbers([Channel(Point(), 1.5, 0.5)] * 2) == (0, 0)
+    assert source_numbers(channels_of(Point(wavelength=LINES), index, 8)) == (0, 0, 0)

@@ -119,7 +119,7 @@ class TestNames:
 
     @pytest.mark.parametrize("name", [*SHORT, *ALIASES, *(m.name for m in METALS)])
     def test_every_short_name_resolves(self, name):
-        medium = media._METALS.get(media.plain(name)) or media.medium(name)
+        medium = media._METALS.get(media.normalise_name(name)) or media.medium(name)
         assert medium.page in media.pages() and (medium.absorption or medium.page) in media.pages()
         assert medium.data.index.covers(550.0)
 

@@ -39,7 +39,7 @@ def test_limits_say_the_same_as_contains(outline):
 
 @pytest.mark.parametrize("outline", OUTLINES, ids=str)
 def test_it_reaches_as_far_as_its_rim(outline):
-    x, y = outline.places()
+    x, y = outline.rim_points()
     for n_x, n_y in ((1.0, 0.0), (0.0, -2.0), (0.6, 0.8), (-3.0, 1.0)):
         assert outline.reach(n_x, n_y) == pytest.approx((n_x * x + n_y * y).max(), rel=1e-4)
 
@@ -48,8 +48,8 @@ def test_it_reaches_as_far_as_its_rim(outline):
 def test_an_inset_leaves_what_is_so_deep_inside(outline):
     x, y = (np.random.default_rng(0).random((2, 5000)) - 0.5) * 30
     assert np.array_equal(outline.inset(1.5).depth(x, y) >= 0, outline.depth(x, y) >= 1.5)
-    p, q = outline.places()
-    m, n = outline.inwards(p, q)
+    p, q = outline.rim_points()
+    m, n = outline.inset_direction(p, q)
     assert np.abs(outline.inset(1.5).depth(p + 1.5 * m, q + 1.5 * n)).max() < 1e-12
     assert np.abs(outline.depth(p, q)).max() < 1e-12 and np.hypot(p, q).max() == pytest.approx(
         math.hypot(*outline.farthest)

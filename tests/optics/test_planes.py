@@ -72,7 +72,7 @@ def test_rays_land_on_the_plane(light, z):
     assert int(there.sum()) > 500 and float(off[there].abs().max()) < 1e-9
     way = torch.linalg.cross(landed.position - leaving.position, leaving.direction, dim=0)
     assert float(way[:, there].abs().max()) < 1e-9
-    places = torch.stack(plane.places(landed))[:, there]
+    places = torch.stack(plane.coordinates(landed))[:, there]
     wanted = torch.stack([landed.position[0], landed.position[1], landed.above(0.0)])[:, there]
     found = torch.tensor([plane.point(*place) for place in places.T.tolist()], dtype=torch.float64).T
     assert float((found - wanted).abs().max()) < (1e-9 if z == 0 else 1e-8)  # of 1e6 mm a double holds 1e-10
@@ -81,13 +81,13 @@ def test_rays_land_on_the_plane(light, z):
 @pytest.mark.parametrize("eye", [0.0, -50.0])
 def test_a_place_is_seen_where_the_line_to_it_meets_the_level_plane(eye):
     plane, (x, y) = TiltedPlane((30.0, -5.0, 300.0), TILT), np.random.default_rng(0).uniform(-90, 90, (2, 50))
-    q_x, q_y = plane.seen(x, y, eye)
+    q_x, q_y = plane.to_level_plane(x, y, eye)
     p_x, p_y, p_z = plane.point(x, y)
     assert q_x / (300.0 - eye) == pytest.approx(p_x / (p_z - eye)) and q_y / (300.0 - eye) == pytest.approx(
         p_y / (p_z - eye)
     )
-    assert np.stack(plane.from_seen(q_x, q_y, eye)) == pytest.approx(np.stack([x, y]), abs=1e-10)
-    assert plane.seen(30.0, -5.0, eye) == pytest.approx((30.0, -5.0))  # the middle stays
+    assert np.stack(plane.from_level_plane(q_x, q_y, eye)) == pytest.approx(np.stack([x, y]), abs=1e-10)
+    assert plane.to_level_plane(30.0, -5.0, eye) == pytest.approx((30.0, -5.0))  # the middle stays
 
 
 def test_rays_that_lead_away_from_it_are_lost():

@@ -41,7 +41,7 @@ def test_stratified_has_exactly_one_point_a_cell_in_its_place():
 
 def test_the_jitter_is_splitmix64():
     """The first numbers of the published generator from the state 1234567, which steps by STRIDE before each."""
-    state = 1234567 + sampling.STRIDE * np.arange(1, 6, dtype=object)
+    state = 1234567 + sampling.SPLITMIX_INCREMENT * np.arange(1, 6, dtype=object)
     numbers = sampling._mix(np.array([s % (1 << 64) for s in state], dtype=np.uint64))
     assert numbers.tolist() == [
         6457827717110365317, 3203168211198807973, 9817491932198370423, 4593380528125082431, 16408922859458223821,
@@ -52,7 +52,7 @@ def test_the_jitter_is_uniform_and_independent():
     """Along the row, across rows, between x and y, and between seeds that differ by one: all of 16 x 16 alike."""
     n = 400
     cell = np.arange(n * n).reshape(n, n)
-    (x, y), (other, _) = sampling.jitter(sampling.key(0), cell), sampling.jitter(sampling.key(1), cell)
+    (x, y), (other, _) = sampling.jitter(sampling.hash_seed(0), cell), sampling.jitter(sampling.hash_seed(1), cell)
     assert min(x.min(), y.min()) > 0 and max(x.max(), y.max()) < 1
     pairs = {"x, y": (x, y), "row": (x[:, 1:], x[:, :-1]), "column": (y[1:], y[:-1]), "seed": (x, other)}
     for name, (a, b) in pairs.items():

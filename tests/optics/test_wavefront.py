@@ -8,7 +8,7 @@ import torch
 
 from bstcad.optics import sampling
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.wavefront import PlaneWave, SphericalWave, ZernikeWave, beyond
+from bstcad.optics.wavefront import PlaneWave, SphericalWave, ZernikeWave, path_from_sphere
 from bstcad.optics.zernike import noll, series
 
 NM = 632.8
@@ -129,7 +129,7 @@ def test_a_sphere_leads_through_its_focus():
 def test_a_path_from_far_off_keeps_its_digits():
     """A sphere of 1e8 mm is r² / 2 R deep; the next term is 1e-18 mm."""
     x, y = places()
-    far = beyond(torch.stack([x, y, torch.zeros_like(x)]), (0.0, 0.0, -1e8))
+    far = path_from_sphere(torch.stack([x, y, torch.zeros_like(x)]), (0.0, 0.0, -1e8))
     torch.testing.assert_close(far, (x * x + y * y) / 2e8, rtol=1e-13, atol=0)
 
 

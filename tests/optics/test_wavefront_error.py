@@ -11,7 +11,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
-from bstcad.optics.wavefront import PlaneWave, SphericalWave, ZernikeWave, beyond
+from bstcad.optics.wavefront import PlaneWave, SphericalWave, ZernikeWave, path_from_sphere
 from bstcad.optics.wavefront_error import exit_pupil, wavefront_error
 from tests.lenses import net
 
@@ -86,7 +86,7 @@ def test_a_shift_of_the_focus_is_the_difference_of_two_distances():
     found = wavefront_error(source, lens, replace(wave, focus=(0.0, 0.0, 20.0 + F + dz)), 256)
     x, y = torch.from_numpy(found.x)[None, :], torch.from_numpy(found.y)[:, None]
     place = torch.stack([*torch.broadcast_tensors(x, y), torch.zeros(y.shape[0], x.shape[1], dtype=torch.float64)])
-    near, far = (beyond(place, (0.0, 0.0, z - 30.0)) for z in (20.0 + F, 20.0 + F + dz))
+    near, far = (path_from_sphere(place, (0.0, 0.0, z - 30.0)) for z in (20.0 + F, 20.0 + F + dz))
     exact = ((far - near) / WAVE).numpy()
     lit = ~np.isnan(found.opd)
     off = (found.opd - exact)[lit]

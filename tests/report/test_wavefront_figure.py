@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bstcad.optics.wavefront_error import Figures, WavefrontError
+from bstcad.optics.wavefront_error import OpdSize, WavefrontError
 from bstcad.report.drawing import png
 from bstcad.report.wavefront_figure import wavefront_map
 from tests.report.test_figures import pixel_at
@@ -12,7 +12,7 @@ from tests.report.test_figures import pixel_at
 X, Y = np.linspace(-8.0, 8.0, 65), np.linspace(-4.0, 12.0, 65)
 INSIDE = np.hypot(X, Y[:, None] - 4.0) < 7.5
 ERROR = WavefrontError(
-    40.0, 632.8, Figures(0.4, 2.0), Figures(0.123, 0.87), tilt=(12.0, -3.0), angle_rms=21.0, angle_max=77.0,
+    40.0, 632.8, OpdSize(0.4, 2.0), OpdSize(0.123, 0.87), tilt=(12.0, -3.0), angle_rms=21.0, angle_max=77.0,
     floor=5.6e-11, flux=0.9, rays=1000, x=X, y=Y, opd=np.where(INSIDE, 0.05 * X + 0 * Y[:, None], np.nan),
 )  # fmt: skip
 

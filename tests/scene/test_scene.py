@@ -445,7 +445,7 @@ def test_a_tilted_plane_passes_the_lens_by_so_much(outline, tilt):
     scene = load(THU, {"target.x": [-9.0, 9.0], "target.y": [-9.0, 9.0], "target.z": 60.0, "target.tilt": [20.0, tilt]})
     scene = scene.changed({"lens.outline": outline})
     turns = np.linspace(0.0, 2 * np.pi, 3601)
-    rim = (12.0 * np.cos(turns), 12.0 * np.sin(turns)) if outline.is_round else outline.places()
+    rim = (12.0 * np.cos(turns), 12.0 * np.sin(turns)) if outline.is_round else outline.rim_points()
     highest = max(scene.target.screen.plane.height((x, y, 25.0)) for x, y in zip(*rim, strict=True))
     room, key = scene.clearance(25.0)
     assert room == pytest.approx(-highest, rel=1e-5) and key == "target.z"
@@ -476,7 +476,7 @@ def test_what_is_held_against_an_outline_is_the_wire_that_is_built(outline):
     edges, outline = wire(outline).Edges(), outline.outline
     found = [edge.positionAt(t) for edge in edges for t in np.linspace(0, 1, 9)]
     assert np.abs(outline.depth(np.array([p.x for p in found]), np.array([p.y for p in found]))).max() < 1e-12
-    x, y = outline.places()
+    x, y = outline.rim_points()
     assert np.abs(outline.depth(x, y)).max() < 1e-12 and (outline.depth(x / 2, y / 2) > 0).all()
     assert (outline.depth(1.1 * x, 1.1 * y) < 0).all()
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numba.core.event import Event, EventStatus, broadcast
 
-from bstcad.optics.sides import both
+from bstcad.optics.sides import as_pair
 from bstcad.scene.scene import load
 from bstcad.scene.target import FEWEST
 from bstcad.sweep import prediction
@@ -33,7 +33,7 @@ def pilot(scene, *, slower=1.0, factor=4.0):
 
 def test_a_pilot_has_a_quarter_of_the_net_the_pixels_and_the_tubes():
     small, factor = made_small(THU)
-    assert factor == 4 and both(small.lens.back.net) == (129, 129) and small.target.columns_rows == (128, 128)
+    assert factor == 4 and as_pair(small.lens.back.net) == (129, 129) and small.target.columns_rows == (128, 128)
     assert small.tailoring.rays == THU.tailoring.resolved(513).rays / 4
 
 

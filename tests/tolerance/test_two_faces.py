@@ -20,7 +20,7 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.wavefront import PlaneWave, SphericalWave, ZernikeWave
-from bstcad.optics.wavefront_error import exit_pupil, moved_pupil
+from bstcad.optics.wavefront_error import exit_pupil, move_pupil
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import Tolerance
 from bstcad.tolerance import study
@@ -57,7 +57,7 @@ def seen(setup, n=64):
     """The light behind the lens, in the room."""
     (channel,) = setup.channels
     pupil = exit_pupil(channel.source, channel.through(setup.lens), SEEN, n)
-    return pupil if setup.lens_motion is None else moved_pupil(pupil, setup.lens_motion, SEEN)
+    return pupil if setup.lens_motion is None else move_pupil(pupil, setup.lens_motion, SEEN)
 
 
 def leans(setup):

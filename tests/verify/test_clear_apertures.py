@@ -67,7 +67,7 @@ def test_the_light_is_that_of_rays_through_the_faces_of_the_part(design, name, t
     found = step_checks.lens_of_part(tmp_path, lens, mount)
     for measured, designed in zip(found.apertures, lens.apertures, strict=True):
         assert type(measured) is type(designed)
-        assert np.abs(measured.depth(*designed.places())).max() < 1e-4
+        assert np.abs(measured.depth(*designed.rim_points())).max() < 1e-4
     around, screen = polygons(tmp_path / "part.step"), replace(design.scene.target.screen, pixels=8)
     wide = found.apertures[0].half_extent[0] < 0.98 * found.apertures[1].half_extent[0]
     for source in (design.scene.source, Collimated(Rectangle(9.0, 7.0))):

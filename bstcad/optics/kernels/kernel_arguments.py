@@ -39,7 +39,7 @@ def rules() -> Rules:
     """The constants of the plain form, as they are now."""
     steps = (interfaces.NEWTON_STEPS, interfaces.APPROACH_STEPS)
     least = (interfaces.LEVEL, interfaces.FLATTEST, interfaces.ALONG, interfaces.SKIMMING)
-    return Rules(*floats([*steps, *least, surfaces.EQUATOR, rays.GRAZING]))
+    return Rules(*floats([*steps, *least, surfaces.EQUATOR, rays.MIN_AXIAL_COSINE]))
 
 
 def faces(
@@ -139,7 +139,8 @@ def _tilted(plane: Receiver | None, before: int, behind: int) -> Tilted | None:
 def cells(window: Rectangle, n: int, seed: int) -> Cells:
     """n x n cells of a window centred on the axis."""
     width, height = window.width / n, window.height / n
-    key, *mixing = map(np.uint64, (sampling.key(seed), sampling.STRIDE, sampling.MIX_1, sampling.MIX_2))
+    mixing = sampling.SPLITMIX_INCREMENT, sampling.MIX_1, sampling.MIX_2
+    key, *mixing = map(np.uint64, (sampling.hash_seed(seed), *mixing))
     return Cells(n, key, width, height, window.width / 2, window.height / 2, *mixing)
 
 

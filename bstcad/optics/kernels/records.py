@@ -72,7 +72,7 @@ class Rules(NamedTuple):
     along: float  # interfaces.ALONG
     skimming: float  # interfaces.SKIMMING
     equator: float  # surfaces.EQUATOR
-    grazing: float  # rays.GRAZING
+    grazing: float  # rays.MIN_AXIAL_COSINE
 
 
 class Fates(NamedTuple):
