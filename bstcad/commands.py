@@ -33,7 +33,7 @@ from bstcad.measured.cloud import Cloud
 from bstcad.measured.form_error import map_files
 from bstcad.measured.made_part import MadePart
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import FULL, Effort, Light, Line
+from bstcad.optics.measure import FULL, Effort, Light, SpectralLine
 from bstcad.pipeline import Saved, design, purpose
 from bstcad.report import data_sheet, exports, prescription, record, rendering, report, tolerances
 from bstcad.report.data_sheet import Sheet
@@ -219,7 +219,7 @@ def _proof(
     """The proof of the files in a folder, with the pictures of its light begun."""
     progress("verify", 0, 1, "from the written files")
 
-    def draw(light: Light, lines: tuple[Line, ...], number: int) -> None:
+    def draw(light: Light, lines: tuple[SpectralLine, ...], number: int) -> None:
         drawn.begin(draw_light, made.goals[number].picture, light, lines, number=number)
 
     proof = checks.verify(folder, made, processes.submit, known=drawn.lens, lit=draw, effort=effort)

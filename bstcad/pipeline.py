@@ -20,7 +20,7 @@ from bstcad.folder import Made
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
-from bstcad.optics.reach import GRAZING, grazing_of, spread_at, unreached
+from bstcad.optics.reach import MAX_EXIT_ANGLE, grazing_of, spread_at, unreached
 from bstcad.optics.sides import as_pair
 from bstcad.optics.unfolding import image_screen
 from bstcad.report.record import Making, Point
@@ -218,7 +218,7 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
         return None, None
     channels = scene.with_source_scaled(0.0).channels()
     light = max(channels, key=lambda channel: channel.weight)  # stage 1 reckons with it alone
-    lens, grazing = light.through(scene.flat_lens(REACH_NET)), GRAZING
+    lens, grazing = light.through(scene.flat_lens(REACH_NET)), MAX_EXIT_ANGLE
     if refracts := lens.passes.largest_turn(light.index) is not None:
         grazing = grazing_of(light.index, [each.index for each in channels], spread_at(scene.source, lens))
     part = reachable(light.source, lens, goal, grazing=grazing)

@@ -32,7 +32,7 @@ from bstcad.optics.irradiance import Screen, landed_flux
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed
-from bstcad.optics.trace import clear_window, follow_ghost, trace
+from bstcad.optics.trace import clear_window, trace, trace_ghost
 from bstcad.optics.tubes import rays_to
 from bstcad.optics.unfolding import per_radian
 
@@ -170,7 +170,7 @@ class Reference:
         area = clear_window(source, lens)
         rays = source.rays(*sampling.grid(area, GHOST_RAYS), lens.entrance.z, area.area / GHOST_RAYS**2)
         straight = float(landed_flux(trace(rays, lens, self.screen.plane)).sum())
-        landed = self.screen.plane.land(follow_ghost(rays, lens)[0])
+        landed = self.screen.plane.land(trace_ghost(rays, lens)[0])
         flux = torch.where(landed.alive, landed.flux, torch.zeros_like(landed.flux)).numpy() / straight
         cells = self._landing(flux, self.screen.pixels_of(landed.position).numpy())
         share, cells = float(cells.sum()), scipy.ndimage.gaussian_filter(cells, GHOST_SMOOTHING, mode="nearest")

@@ -15,7 +15,7 @@ import scipy.fft
 import torch
 from torch import Tensor
 
-from bstcad.optics.bspline import QUARTERS, BSplineSurface, span_places, weights
+from bstcad.optics.bspline import QUARTERS, BSplineSurface, span_points, weights
 from bstcad.optics.kernels import spline
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
@@ -265,7 +265,7 @@ def survey_front(
 def _grid(back: BSplineSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return x and y (spans, points) mm of QUARTERS of each span, and the weights for spline.largest_bending."""
     spans = [torch.arange(count - 2) for count in back.shape]
-    x, y = (at.reshape(len(QUARTERS), -1).T.contiguous().numpy() for at in span_places(back, *spans, QUARTERS))
+    x, y = (at.reshape(len(QUARTERS), -1).T.contiguous().numpy() for at in span_points(back, *spans, QUARTERS))
     scaled = []
     for span, count, pitch in zip(spans, back.shape, back.pitch, strict=True):
         by_quarter = [torch.stack([torch.stack(order) for order in weights(span, count, s)]) for s in QUARTERS]

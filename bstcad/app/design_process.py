@@ -83,12 +83,12 @@ class Glance:
     def _draw(self, lens: Any) -> None:
         from PIL import Image
 
-        from bstcad.optics.measure import a_side, tubes_picture
+        from bstcad.optics.measure import side_factor, tubes_picture
         from bstcad.report.light_figures import View
 
         scene, target = self._scene, self._scene.target
         channels = scene.channels(SPREAD_POINTS) if scene.source.extent else scene.channels()
-        screen, n = target.screen, max(round(TUBES * a_side(channels)), 64)
+        screen, n = target.screen, max(round(TUBES * side_factor(channels)), 64)
         light, wanted = tubes_picture(lens.plain(), channels, screen, n).numpy(), target.irradiance()
         if not light.sum() > 0:
             return

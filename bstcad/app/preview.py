@@ -22,7 +22,7 @@ from bstcad.analysis.shape import describe
 from bstcad.folder import Made
 from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import a_side, seen_through, simulated, tubes_picture
+from bstcad.optics.measure import landing_pixels, side_factor, simulated, tubes_picture
 from bstcad.optics.sides import as_pair, coarser
 from bstcad.optics.tubes import corners, middle
 from bstcad.report.light_figures import rrmsd
@@ -137,7 +137,7 @@ def _lit(scene: Scene, made: Made) -> Preview:
     for goal in made.goals:
         light = _picture(scene, lens, goal)
         pictures.append((goal.picture, light * (goal.picture.sum() / max(light.sum(), 1e-300))))
-    rays = max(round(a_side(channels) * RAYS), 8)
+    rays = max(round(side_factor(channels) * RAYS), 8)
     ledger = simulated(lens, channels, scene.target.screen, n=rays, seed=SEED).flux
     images = [blur(channels, lens, target.screen, target.irradiance(), n=IMAGE_PLACES) for target in scene.targets]
     return Preview(
@@ -149,7 +149,7 @@ def _lit(scene: Scene, made: Made) -> Preview:
 def _lit_share(scene: Scene, lens: Lens) -> float:
     """The share of the back, up to its rim, through which light of one point of the source passes."""
     x, y = (middle(ends).reshape(-1) for ends in corners(lens.apertures[1], IMAGE_PLACES))
-    _, flux = seen_through(scene.channels()[:1], lens, scene.target.screen, IMAGE_PLACES)
+    _, flux = landing_pixels(scene.channels()[:1], lens, scene.target.screen, IMAGE_PLACES)
     inside = lens.apertures[1].contains(x, y)
     clear = lens.apertures[1].area / lens.outline.area  # of a mount, less than all
     return clear * float((flux[0] > 0)[inside].double().mean())

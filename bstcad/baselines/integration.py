@@ -27,7 +27,7 @@ from torch import Tensor
 from bstcad.baselines.paper import transport
 from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface, evaluate, net_gradient
-from bstcad.optics.interfaces import ALONG, Law
+from bstcad.optics.interfaces import TANGENCY_TOLERANCE, Law
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays
 from bstcad.optics.receivers import Receiver
@@ -168,7 +168,7 @@ class _Grid:
     def meet(self, point: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
         """Return (intersections of rays with planes of these normals through points (3, rays, lines) mm, hit)."""
         along = _dot(normal, self.direction)
-        ok = self.rays.sense * along > ALONG * torch.sqrt(_dot(normal, normal))
+        ok = self.rays.sense * along > TANGENCY_TOLERANCE * torch.sqrt(_dot(normal, normal))
         path = _dot(normal, point - self.origin) / torch.where(ok, along, torch.ones_like(along))
         return torch.where(ok, self.origin + path * self.direction, point), ok
 

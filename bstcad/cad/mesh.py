@@ -27,7 +27,7 @@ from numba import njit
 from bstcad.optics import tubes
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
-from bstcad.optics.surfaces import EQUATOR, Surface, sag, sampled
+from bstcad.optics.surfaces import MIN_COS2, Surface, sag, sampled
 from bstcad.runs import files
 from bstcad.scene.scene import FLOAT32_ROUNDING
 
@@ -263,11 +263,11 @@ def _numbers(surface: Surface) -> tuple[FaceNumbers, np.ndarray]:
         bend = (1 + k) * c * c
         ends2 = face.outline.radius**2 if face.outline else math.inf
         return FaceNumbers(
-            float(face.z), c, bend, equator=EQUATOR, x=0.0, y=0.0, per_x=0.0, per_y=0.0, per_detail=per_detail,
+            float(face.z), c, bend, equator=MIN_COS2, x=0.0, y=0.0, per_x=0.0, per_y=0.0, per_detail=per_detail,
             ends2=ends2,
         ), np.zeros((0, 0))  # fmt: skip
     corner, per_mm = (float(face.x[0]), float(face.y[0])), (1 / pitch for pitch in face.pitch)
-    numbers = FaceNumbers(float(face.z), 0.0, 0.0, EQUATOR, *corner, *per_mm, per_detail, math.inf)
+    numbers = FaceNumbers(float(face.z), 0.0, 0.0, MIN_COS2, *corner, *per_mm, per_detail, math.inf)
     return numbers, face.heights.contiguous().numpy()
 
 
@@ -280,7 +280,7 @@ class FaceNumbers(NamedTuple):
     z: float  # z0 (mm)
     curvature: float  # 1/mm
     bend: float  # (1 + k) c² (1/mm²), k the conic constant
-    equator: float  # surfaces.EQUATOR
+    equator: float  # surfaces.MIN_COS2
     x: float  # the net's corner (mm)
     y: float
     per_x: float  # control points per mm

@@ -28,7 +28,7 @@ from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shape
 from bstcad.cad import step_reading
 from bstcad.cad.step_reading import StepLens, parts_of
 from bstcad.optics import quadrature
-from bstcad.optics.quadrature import EDGE_PARTS, LEVEL, POINTS, Border, MassProperties, Sums
+from bstcad.optics.quadrature import EDGE_PARTS, MIN_RELATIVE_DX, POINTS, Border, MassProperties, Sums
 
 if TYPE_CHECKING:
     import cadquery
@@ -131,7 +131,7 @@ def _image(edge: TopoDS_Edge, face: TopoDS_Face) -> tuple[np.ndarray, ...]:
     curves = [curve] if BRep_Tool.Degenerated_s(edge) else [curve, BRepAdaptor_Curve(edge)]
     t, weight = _gauss_points(edge, curves)
     u, v, du, dv = _evaluated(curve, t, gp_Pnt2d(), gp_Vec2d())
-    moves = np.abs(du) > LEVEL * np.hypot(du, dv)
+    moves = np.abs(du) > MIN_RELATIVE_DX * np.hypot(du, dv)
     return u[moves], v[moves], (weight * du)[moves]
 
 

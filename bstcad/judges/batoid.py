@@ -20,7 +20,7 @@ from bstcad.optics.channels import Channel, source_numbers
 from bstcad.optics.interfaces import Reflect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import a_side
+from bstcad.optics.measure import side_factor
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Rays, axes
 from bstcad.optics.tilted import TiltedSurface
@@ -130,7 +130,7 @@ def light(lens: Lens, channels: Sequence[Channel]) -> tuple[Channel, ...]:
 
 def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int) -> Traced:
     """The picture on a screen by that many stratified rays, in two halves."""
-    n = max(1, round(a_side(channels) * math.sqrt(rays / 2)))
+    n = max(1, round(side_factor(channels) * math.sqrt(rays / 2)))
     known = surfaces(lens)
     halves, count = np.zeros((2, *screen.shape)), 0
     sense = lens.passes.sense * (-1) ** sum(interface.law.reverses for interface in lens.interfaces[lens.solid.start :])

@@ -153,7 +153,7 @@ def compare(
     total = float(target.sum())
     theirs, first, second = (_scaled(picture, total) for picture in (traced.picture, *traced.halves))
     difference = _difference(theirs, ours.picture, target)
-    noise = math.hypot(_difference(first, second, target) / 2, ours.picture_off)
+    noise = math.hypot(_difference(first, second, target) / 2, ours.picture_error)
     over_noise, limit = difference / max(noise, EXACT), AGREE * (1 + 3 / math.sqrt(_effective_pixels(first - second)))
     on_target, on_target_ours = float(traced.picture.sum()), ours.flux.get("on target", 0.0)
     of = f", {key}" if key else ""

@@ -21,7 +21,7 @@ from scipy.special import eval_jacobi
 
 from bstcad.analysis.shape import least_squares
 from bstcad.measured.alignment import Alignment, Face, Pose, root_mean_square, sample_surface
-from bstcad.optics.bspline import BSplineSurface, basis_matrix, interpolated
+from bstcad.optics.bspline import BSplineSurface, basis_matrix, interpolating_net
 from bstcad.optics.lens import Lens
 
 POLYNOMIAL_DEGREE = 2
@@ -69,7 +69,7 @@ class FormError:
         x, y = (np.linspace(*ends, count) for ends, count in zip((finer.x, finer.y), finer.shape, strict=True))
         strips = (np.meshgrid(part, y, indexing="ij") for part in np.array_split(x, SAMPLING_STRIPS))
         values = np.concatenate([self.at(x.ravel(), y.ravel()).reshape(x.shape) for x, y in strips])
-        return replace(finer, heights=finer.heights + torch.from_numpy(interpolated(values)))
+        return replace(finer, heights=finer.heights + torch.from_numpy(interpolating_net(values)))
 
     def posterior_sample(self, draw: np.ndarray, sign: float = 1.0) -> FormError:
         """Return a sample of the posterior; draw: normal numbers (m, m); sign: ±1, by which they are multiplied."""

@@ -1,15 +1,15 @@
-"""The B-spline surface of Wang et al. 2023: order 3, uniform clamped knots, control points uniform in x and y.
+"""B-spline surface of Wang et al. 2023: order 3, uniform clamped knots, control points uniform in x and y.
 
-Only the heights z of the control points are free.  Because they are uniform in x and y, x(t) is the identity shifted by
-1/2 inside and quadratic in the two end spans, so t(x) has a closed form and a ray needs no search for its parameter.
-Nine products a point.
+Only the heights z of the control points are free.  Because these are uniform in x and y, x(t) is the identity shifted
+by 1/2 in the inner spans and quadratic in the two end spans.  So t(x) has a closed form, no search for the parameter of
+a point is needed, and a height is the sum of nine products.
 Source: Wang et al. 2023, "B-spline freeform surface tailoring for prescribed irradiance", Eqs. 2 and 6-13.
 
 A net has m control points along x and n along y.  The basis is written in u = (m - 1) (x - x_min) / (x_max - x_min),
-the distance along the net in control-point spacings, 0 <= u <= m - 1, and likewise in v along y.  Slope and curvature
-are exact in each knot span, up to the knots on either side of it: in span (i, j) the surface is one biquadratic piece
-of nine control points, s in [0, 1] is the place within it, and second derivatives jump at the knots, so that bounds on
-them look at each span by itself.
+the distance along the net in control-point spacings, 0 <= u <= m - 1, and likewise in v along y.  In span (i, j) the
+surface is one biquadratic piece of nine control points, and s in [0, 1] is the position within it.  Slope and curvature
+are exact in each knot span, up to the knots on either side.  Second derivatives jump at the knots, so that their bounds
+are computed for each span separately.
 """
 
 from __future__ import annotations
@@ -31,20 +31,21 @@ from bstcad.optics.outlines import Outline, inside
 from bstcad.optics.sides import MIN_SIDE, Sides, as_pair, side
 from bstcad.optics.surfaces import Surface
 
-DEGREE = 2  # order 3
-SMALLEST_NET = MIN_SIDE  # control points a side: two end spans and one inner span
-SPANS = 1 << 14  # looked at together: their numbers stay in the cache
-QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # places in a span along x and y, where bounds on the back are held to it and
-# where figures of it are taken: a grid four times finer than the net, with both sides of each knot
+DEGREE = 2  # degree of the basis functions (order 3)
+SMALLEST_NET = MIN_SIDE  # minimum control points per side: two end spans and one inner span
+SPANS_AT_A_TIME = 1 << 14  # spans evaluated at a time, so that their numbers stay in the cache
+# Positions in a span along x and y at which slope and curvature of the back are limited and reported: a grid four times
+# finer than the net, with both sides of each knot.
+QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 def knots(m: int) -> np.ndarray:
-    """{0, 0, 0, 1, 2, …, m-3, m-2, m-2, m-2}: the full knot vector of m control points, shape (m + 3,)."""
+    """Return {0, 0, 0, 1, 2, …, m-3, m-2, m-2, m-2}: the full knot vector of m control points, shape (m + 3,)."""
     return np.concatenate([[0.0, 0.0], np.arange(m - 1, dtype=float), [m - 2.0, m - 2.0]])
 
 
 def parameter(u: Tensor, m: int) -> Tensor:
-    """t(u) for u in [0, m-1]; Wang et al. 2023, Eq. 13.
+    """Return t(u) for u in [0, m-1]; Wang et al. 2023, Eq. 13.
 
     t = 2 - sqrt(4 - 2u), u - 1/2, m - 4 + sqrt(4 - 2(m - 1 - u)) in the first, inner and last span.
     """
@@ -53,28 +54,28 @@ def parameter(u: Tensor, m: int) -> Tensor:
 
 
 def span(u: Tensor, m: int) -> tuple[Tensor, Tensor]:
-    """(k, s), t(u) = k + s: the span, and the place in it, which has not the rounding of a t as large as m."""
+    """Return (k, s), t(u) = k + s: the span and the position in it, without the rounding of a t as large as m."""
     first, last = u < 1.5, u > m - 2.5
     end = torch.where(first, u, m - 1 - u)  # distance from the nearer end
     root = torch.sqrt(4.0 - 2.0 * torch.where(first | last, end, torch.ones_like(u)))  # guarded before the root
     inner = u - 0.5
-    k = inner.detach().nan_to_num(0.0).floor().clamp(0, m - 3)  # an index must be in range, whatever u is
+    k = inner.detach().nan_to_num(0.0).floor().clamp(0, m - 3)  # a valid index for every u
     k = torch.where(first, 0.0, torch.where(last, m - 3.0, k)).to(u.dtype)
     return k, torch.where(first, 2.0 - root, torch.where(last, root - 1.0, inner - k))
 
 
 def position(t: Tensor, m: int) -> Tensor:
-    """u(t) = 2t - t²/2, t + 1/2, or its mirror image in the last span: the inverse of `parameter`."""
+    """Return u(t) = 2t - t²/2, t + 1/2, or its mirror image in the last span: the inverse of `parameter`."""
     end = m - 2.0 - t
     return torch.where(t < 1, 2 * t - t * t / 2, torch.where(end < 1, m - 1 - 2 * end + end * end / 2, t + 0.5))
 
 
 def basis(u: Tensor, m: int) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:
-    """The three non-zero basis functions at u and their derivatives in u; Wang et al. 2023, Eqs. 8-12.
+    """Return the three non-zero basis functions at u and their derivatives in u; Wang et al. 2023, Eqs. 8-12.
 
     With s = t - k and q = 1 - s in span k: B_k = a q², B_{k+2} = b s², B_{k+1} = 1 - B_k - B_{k+2}, where a = 1 in
-    the first span, b = 1 in the last and both are 1/2 otherwise (the four corner functions; as printed, B_{m-1} and the
-    first piece of B_{m-2} run the wrong way, their true form is the mirror image of B_0 and B_1).  Since the control
+    the first span, b = 1 in the last and both are 1/2 otherwise (the four corner functions; the paper prints B_{m-1}
+    and the first piece of B_{m-2} reversed, the correct form is the mirror image of B_0 and B_1).  Since the control
     points are uniform, du/dt = Σ i B'_i = 2 (a q + b s).
 
     Returns (k, (B_k, B_{k+1}, B_{k+2}), (dB/du …)), each shaped like u.
@@ -90,12 +91,12 @@ def basis(u: Tensor, m: int) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], tup
 
 
 def evaluate_plain(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """(h, ∂h/∂u, ∂h/∂v) of Σ_i Σ_j B_i(u) B_j(v) h_ij: the nine non-zero products (Wang et al. 2023, Eqs. 2 and 6)."""
+    """Return (h, ∂h/∂u, ∂h/∂v), h = Σ_i Σ_j B_i(u) B_j(v) h_ij, by nine products (Wang et al. 2023, Eqs. 2 and 6)."""
     m, n = heights.shape
     ku, wu, du = basis(u, m)
     kv, wv, dv = basis(v, n)
     corner = ku * n + kv
-    net = heights.reshape(-1).double()  # so that the adjoint sums in float64: float32 sums stop growing at 2^24 rays
+    net = heights.reshape(-1).double()  # the adjoint sums in float64: float32 sums stop growing at 2^24 rays
     h = h_u = h_v = torch.zeros_like(u)
     for i in range(3):
         for j in range(3):
@@ -107,16 +108,16 @@ def evaluate_plain(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tenso
 
 
 def evaluate(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """`evaluate_plain`, by the fused kernel where it takes these tensors (same values to rounding)."""
+    """Return `evaluate_plain`, by the fused kernel where it takes these tensors (same values to rounding)."""
     if fast := ops.kernel("bspline.evaluate", heights, u, v):
         return fast(heights, *torch.broadcast_tensors(u, v))
     return evaluate_plain(heights, u, v)
 
 
 def net_gradient(heights: Tensor, u: Tensor, v: Tensor, seeds: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-    """(m, n) the adjoint of `evaluate`: gradient in the heights of Σ g h + g_u ∂h/∂u + g_v ∂h/∂v, seeds (g, g_u, g_v).
+    """Return the gradient (m, n) of Σ g h + g_u ∂h/∂u + g_v ∂h/∂v in the heights, seeds (g, g_u, g_v).
 
-    It is the same for all heights; the argument gives the net's size, type and device.
+    This adjoint of `evaluate` does not depend on the heights; they give the net's size, type and device.
     """
     if fast := ops.kernel("bspline.net_gradient", heights, u, v):
         return fast(heights, u, v, seeds)
@@ -127,7 +128,7 @@ def net_gradient(heights: Tensor, u: Tensor, v: Tensor, seeds: tuple[Tensor, Ten
 
 
 def basis_matrix(u: np.ndarray, m: int, derivative: int = 0) -> scipy.sparse.csr_matrix:
-    """Row r holds the basis functions (or their first derivative in u) at u[r]: banded, shape (len(u), m)."""
+    """Return the banded matrix (len(u), m) whose row r holds the basis functions, or their derivative, at u[r]."""
     points = torch.as_tensor(np.asarray(u, dtype=np.float64))
     k, *weights = basis(points, m)
     columns = (k[:, None] + torch.arange(3)).numpy()
@@ -136,19 +137,19 @@ def basis_matrix(u: np.ndarray, m: int, derivative: int = 0) -> scipy.sparse.csr
     return scipy.sparse.csr_matrix((values.ravel(), columns.ravel(), rows), shape=(len(points), m))
 
 
-def carried(values: np.ndarray, fine: int) -> np.ndarray:
-    """The coefficients (m, …) of a spline on `fine` control points, with least change of the spline: (fine, …).
+def resample(values: np.ndarray, fine: int) -> np.ndarray:
+    """Resample the coefficients (m, …) of a spline to `fine` control points, (fine, …), by least squares.
 
-    These knot vectors are not nested, so the finer net is the least-squares fit at eight points a span of the finer
-    net; in two dimensions apply it along each axis.  Both matrices are banded: the work grows as the net does.
+    The knot vectors are not nested, so the spline is fitted at eight points per span of the finer net; in two
+    dimensions apply it along each axis.  Both matrices are banded: the work grows in proportion to the net.
     """
     coarse, u = len(values), np.linspace(0.0, 1.0, 8 * (fine - 2) + 1)
     on_fine, on_coarse = basis_matrix(u * (fine - 1), fine), basis_matrix(u * (coarse - 1), coarse)
     return _least_squares(on_fine, (on_fine.T @ on_coarse) @ values)
 
 
-def interpolated(values: np.ndarray) -> np.ndarray:
-    """The control points (m, n) of the spline that has these values at the places of its control points."""
+def interpolating_net(values: np.ndarray) -> np.ndarray:
+    """Return the control points (m, n) of the spline that interpolates values (m, n) at its control points."""
     for m in values.shape:
         basis, bands = basis_matrix(np.arange(m), m), np.zeros((3, m))
         for k in (1, 0, -1):
@@ -157,23 +158,23 @@ def interpolated(values: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(values)
 
 
-def halfway(net: np.ndarray) -> np.ndarray:
-    """The values (2 m - 1, 2 n - 1) of the spline at the places of its control points and half way between them."""
+def midpoint_values(net: np.ndarray) -> np.ndarray:
+    """Return the values (2 m - 1, 2 n - 1) of a spline at its control points and at the midpoints between them."""
     for m in net.shape:
         net = (basis_matrix(np.arange(2 * m - 1) / 2, m) @ net).T
     return net
 
 
 @lru_cache(maxsize=16)
-def carrier(coarse: int, fine: int) -> scipy.sparse.csr_array:
-    """The matrix (fine, coarse) of `carried`, but for what falls off below rounding: a band around its diagonal."""
-    whole = carried(np.eye(coarse), fine)
+def resampling_matrix(coarse: int, fine: int) -> scipy.sparse.csr_array:
+    """Return the matrix (fine, coarse) of `resample`, without entries below rounding: a band around the diagonal."""
+    whole = resample(np.eye(coarse), fine)
     return scipy.sparse.csr_array(np.where(np.abs(whole) > np.finfo(whole.dtype).eps, whole, 0.0))
 
 
 def _least_squares(basis: scipy.sparse.csr_matrix, projected: np.ndarray) -> np.ndarray:
-    """The solution c of B^T B c = projected, B the basis at some points, (points, m)."""
-    normal, m = basis.T @ basis, basis.shape[1]  # banded; a dense solver's rounding depends on its number of threads
+    """Solve B^T B c = projected for c, B the basis at some points, (points, m)."""
+    normal, m = basis.T @ basis, basis.shape[1]  # banded: rounding of a dense solver depends on the number of threads
     bands = np.zeros((DEGREE + 1, m))
     for k in range(DEGREE + 1):
         bands[DEGREE - k, k:] = normal.diagonal(k)
@@ -184,11 +185,11 @@ def _least_squares(basis: scipy.sparse.csr_matrix, projected: np.ndarray) -> np.
 class BSplineSurface(Surface):
     """z = z0 + Σ_i Σ_j B_i(u(x)) B_j(v(y)) h_ij.
 
-    Heights are kept relative to the plane z0 so that float32 resolves nanometres.
+    Heights are stored relative to the plane z0 so that float32 resolves nanometres.
     """
 
     z: float  # z0, the plane the heights are measured from (mm)
-    heights: Tensor  # (m, n) mm, x along the first axis
+    heights: Tensor  # heights of the control points (m, n), mm, x along the first axis
     x: tuple[float, float]  # extent of the net in x: first and last control point (mm)
     y: tuple[float, float]  # extent of the net in y (mm)
     kind: Literal["bspline"] = "bspline"
@@ -197,21 +198,21 @@ class BSplineSurface(Surface):
 
     @classmethod
     def from_control_points(cls, net: np.ndarray, z: float | None = None) -> BSplineSurface:
-        """The surface of a control net (m, n, 3) in mm, heights measured from z or else from the mean of the net."""
+        """Return the surface of a control net (m, n, 3) in mm; heights are measured from z (default: their mean)."""
         z = float(net[..., 2].mean()) if z is None else z
         x, y = ((float(net[0, 0, i]), float(net[-1, -1, i])) for i in (0, 1))
         return cls(z, torch.from_numpy(net[..., 2] - z), x, y)
 
     @classmethod
     def fitted(cls, surface: Surface, x: tuple[float, float], y: tuple[float, float], m: int) -> BSplineSurface:
-        """The net of m x m control points over x and y (mm) nearest to a surface, by least squares along each axis.
+        """Fit a net of m x m control points over x and y (mm) to a surface by least squares along each axis.
 
-        B^T B H C^T C = B^T Z C: Z are the surface's heights at four points a span each way, B and C the basis along
-        x and y.  Only spans count in which x(t) is linear, all but the first and the last: there the error falls with
-        the third power of the spacing, in an end span with the second.  The outermost control points go on evenly.
+        B^T B H C^T C = B^T Z C: Z are the surface's heights at four points per span along each axis, B and C the basis
+        along x and y.  The first and the last span are left out: x(t) is quadratic there, and the error falls as the
+        second power of the spacing, elsewhere as the third.  The outermost control points are extrapolated.
         """
         u = np.linspace(1.5, m - 2.5, 4 * (m - 4) + 1)
-        basis = basis_matrix(u, m)[:, 1:-1]  # the first and the last control point end with their spans
+        basis = basis_matrix(u, m)[:, 1:-1]  # the first and the last control point act on the end spans only
         along = (torch.from_numpy(low + (high - low) * u / (m - 1)) for low, high in (x, y))
         heights = surface.plain().relative_sag_and_slope(*torch.meshgrid(*along, indexing="ij"))[0].numpy()
         for _ in range(2):  # along x, then along y
@@ -222,29 +223,29 @@ class BSplineSurface(Surface):
 
     @property
     def detail(self) -> float:
-        """Width of its smooth pieces (mm): a knot span."""
+        """Width of the smooth pieces of the surface (mm): a knot span."""
         return min(self.pitch)
 
     def from_vertex(self) -> BSplineSurface:
-        """The same surface, its heights measured from where it crosses the axis."""
+        """Return the surface with heights measured from its vertex, the point on the axis."""
         axis = torch.zeros(1, dtype=self.heights.dtype, device=self.heights.device)
         vertex = float(self.relative_sag_and_slope(axis, axis)[0])
         return replace(self, z=self.z + vertex, heights=self.heights - vertex)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(m, n): numbers of control points along x and along y."""
+        """Numbers (m, n) of control points along x and along y."""
         m, n = self.heights.shape
         return m, n
 
     @property
     def m(self) -> int:
-        """Control points along x; of a square net along y, too."""
+        """Number of control points along x; for a square net, also along y."""
         return self.shape[0]
 
     @property
     def side(self) -> int:
-        """Control points a side of the square net of as many."""
+        """Control points per side of a square net with as many points."""
         return side(self.shape)
 
     @property
@@ -254,17 +255,17 @@ class BSplineSurface(Surface):
         return (self.x[1] - self.x[0]) / (m - 1), (self.y[1] - self.y[0]) / (n - 1)
 
     def along_net(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """(u, v) of points (mm), in control-point spacings; a point beyond the net is moved to its rim."""
+        """Return (u, v) of points (mm) in control-point spacings; a point outside the net is moved to its rim."""
         (m, n), (pitch_x, pitch_y) = self.shape, self.pitch
         return ((x - self.x[0]) / pitch_x).clamp(0, m - 1), ((y - self.y[0]) / pitch_y).clamp(0, n - 1)
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; a point beyond the net is moved to its rim."""
+        """Return (z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; a point outside the net is moved to its rim."""
         h, h_u, h_v = evaluate(self.heights, *self.along_net(x, y))
         return h, h_u / self.pitch[0], h_v / self.pitch[1]
 
     def control_points(self) -> np.ndarray:
-        """The control net (m, n, 3) in mm, float64, x along the first axis."""
+        """Return the control net (m, n, 3) in mm, float64, x along the first axis."""
         m, n = self.shape
         net = np.empty((m, n, 3))
         net[..., 0] = np.linspace(*self.x, m)[:, None]
@@ -273,65 +274,65 @@ class BSplineSurface(Surface):
         return net
 
     def refined(self, sides: Sides) -> BSplineSurface:
-        """The same surface on so many control points a side, or along x and along y; by least squares along each."""
+        """Resample the surface to a number of control points per side, or along x and y (`resample`)."""
         if as_pair(sides) == self.shape:
             return self
         in_x, in_y = as_pair(sides)
-        heights = carried(self.heights.detach().cpu().double().numpy(), in_x)
-        heights = np.ascontiguousarray(carried(np.ascontiguousarray(heights.T), in_y).T)
+        heights = resample(self.heights.detach().cpu().double().numpy(), in_x)
+        heights = np.ascontiguousarray(resample(np.ascontiguousarray(heights.T), in_y).T)
         return replace(self, heights=torch.from_numpy(heights).to(self.heights))
 
     def sags(self, outline: Outline) -> tuple[float, float]:
-        """Lowest and highest of the heights that the surface inside the outline depends on (mm), and of zero."""
+        """Return the minimum and maximum (mm) of zero and the heights that act on the surface inside the outline."""
         (pitch_x, pitch_y), net = self.pitch, self.control_points()
         x, y = (np.maximum(np.abs(net[..., i]) - 2 * pitch, 0.0) for i, pitch in enumerate((pitch_x, pitch_y)))
         heights = self.heights.detach().cpu()[outline.contains(torch.from_numpy(x), torch.from_numpy(y))]
         return min(float(heights.min()), 0.0), max(float(heights.max()), 0.0)
 
     def scaled(self, factor: float, about: float) -> BSplineSurface:
-        """Return the surface larger by a factor about the point of the axis at z = `about` (mm)."""
+        """Return the surface scaled by a factor about the point of the axis at z = `about` (mm)."""
         (x0, x1), (y0, y1), z = self.x, self.y, about + factor * (self.z - about)
         ends = {"x": (factor * x0, factor * x1), "y": (factor * y0, factor * y1)}
         return replace(self, z=z, heights=factor * self.heights, **ends)
 
     def bent(self, curvature: float) -> BSplineSurface:
-        """Return the surface higher by curvature r² / 2 (mm): so much more curvature (1/mm) at its vertex."""
+        """Return the surface plus curvature r² / 2 (mm), which adds `curvature` (1/mm) at its vertex."""
         x, y = (torch.linspace(*ends, m).to(self.heights) for ends, m in zip((self.x, self.y), self.shape, strict=True))
         return replace(self, heights=self.heights + curvature / 2 * (x[:, None] ** 2 + y[None, :] ** 2))
 
     def parameters(self) -> dict[str, Tensor]:
-        """The heights (mm)."""
+        """Return the heights (mm)."""
         return {"heights": self.heights}
 
     def plain(self) -> BSplineSurface:
-        """The same surface with its heights in float64 on the CPU, without gradient."""
+        """Return the surface with heights in float64 on the CPU, without gradient."""
         return replace(self, heights=self.heights.detach().to("cpu", torch.float64))
 
 
 @dataclass(frozen=True)
 class Jet:
-    """Derivatives of z(x, y) at places of knot spans, each (k, k, spans): by the place in x, that in y, the span."""
+    """Derivatives of z(x, y) at k x k positions of each knot span, each (k, k, spans): position in x, in y, span."""
 
-    z_x: Tensor
-    z_y: Tensor
-    z_xx: Tensor  # 1/mm
-    z_xy: Tensor
-    z_yy: Tensor
+    z_x: Tensor  # ∂z/∂x
+    z_y: Tensor  # ∂z/∂y
+    z_xx: Tensor  # ∂²z/∂x² (1/mm)
+    z_xy: Tensor  # ∂²z/∂x∂y (1/mm)
+    z_yy: Tensor  # ∂²z/∂y² (1/mm)
 
     @property
     def slope(self) -> Tensor:
-        """|∇z|, the tangent of the angle against z = const."""
+        """Slope |∇z|, the tangent of the angle to z = const."""
         square = self.z_x * self.z_x + self.z_y * self.z_y
         return torch.sqrt(square.clamp_min(torch.finfo(square.dtype).tiny))  # guarded before the root
 
     @property
     def curvatures(self) -> tuple[Tensor, Tensor]:
-        """(most concave, least concave) principal curvature (1/mm)."""
+        """Principal curvatures (1/mm), the larger (more concave) one first."""
         return principal(self.z_x, self.z_y, z_xx=self.z_xx, z_xy=self.z_xy, z_yy=self.z_yy)
 
 
 def principal(z_x: Tensor, z_y: Tensor, z_xx: Tensor, z_xy: Tensor, z_yy: Tensor) -> tuple[Tensor, Tensor]:
-    """The two principal curvatures of z(x, y), H ± sqrt(H² - K), positive where it is a valley towards +z (1/mm).
+    """Return the principal curvatures of z(x, y), H ± sqrt(H² - K) (1/mm), positive if concave towards +z.
 
     H = ((1 + z_y²) z_xx - 2 z_x z_y z_xy + (1 + z_x²) z_yy) / (2 n³), K = (z_xx z_yy - z_xy²) / n⁴, n² = 1 + |∇z|².
     """
@@ -343,9 +344,9 @@ def principal(z_x: Tensor, z_y: Tensor, z_xx: Tensor, z_xy: Tensor, z_yy: Tensor
 
 
 def weights(span: Tensor, m: int, s: float) -> tuple[tuple[Tensor, Tensor, Tensor], ...]:
-    """The three non-zero basis functions, and their first and second derivatives in u, at s of each span (int64).
+    """Return the three non-zero basis functions and their first two derivatives in u at s of each span (int64).
 
-    As `basis` has them; du/dt = 2 (a q + b s), d²u/dt² = 2 (b - a).
+    The functions are those of `basis`; du/dt = 2 (a q + b s), d²u/dt² = 2 (b - a).
     """
     a = torch.where(span == 0, 1.0, 0.5).double()
     b = torch.where(span == m - 3, 1.0, 0.5).double()
@@ -358,24 +359,24 @@ def weights(span: Tensor, m: int, s: float) -> tuple[tuple[Tensor, Tensor, Tenso
 
 @dataclass(frozen=True)
 class Spans:
-    """Some knot spans of a net."""
+    """Selected knot spans of a net, with their control points."""
 
     shape: tuple[int, int]  # control points of the net along x and along y
-    pitch: tuple[float, float]  # mm
-    i: Tensor  # (n,) int64, along x
-    j: Tensor  # along y
-    heights: Tensor  # (9, n) of the control points of each (mm), x first
+    pitch: tuple[float, float]  # spacing of the control points along x and along y (mm)
+    i: Tensor  # numbers of the spans along x, (n,) int64
+    j: Tensor  # numbers of the spans along y, (n,) int64
+    heights: Tensor  # heights of the nine control points of each span, (9, n) mm, x along the slower index
 
     @classmethod
     def of(cls, surface: BSplineSurface, i: Tensor, j: Tensor) -> Spans:
-        """These spans of a surface."""
+        """Select the spans (i, j) of a surface."""
         (_, n), net = surface.shape, surface.heights.reshape(-1)
         corner = i * n + j
         heights = torch.stack([net[corner + (a * n + b)] for a in range(3) for b in range(3)])
         return cls(surface.shape, surface.pitch, i=i, j=j, heights=heights)
 
     def jet(self, s: Sequence[float]) -> Jet:
-        """At the places s x s of each; differentiable in the heights."""
+        """Return the derivatives at positions s x s of each span, differentiable in the heights."""
         pitch_x, pitch_y = self.pitch
         along_x, along_y = (
             self._weights(index, count, s) for index, count in zip((self.i, self.j), self.shape, strict=True)
@@ -391,12 +392,12 @@ class Spans:
         )
 
     def _weights(self, index: Tensor, count: int, s: Sequence[float]) -> list[list[Tensor]]:
-        """[derivative][basis function]: (places, spans), of a basis of `count`."""
-        each = [weights(index, count, place) for place in s]
+        """Return [derivative][basis function] (positions, spans) of a basis of `count` functions."""
+        each = [weights(index, count, at) for at in s]
         return [[torch.stack([w[order][k] for w in each]).to(self.heights) for k in range(3)] for order in range(3)]
 
     def scattered(self, gradient: Tensor) -> Tensor:
-        """(m, n) the transpose of taking `heights`: no control point is added to twice at a time, in any order."""
+        """Add a gradient in `heights` (9, n) to the net (m, n); the result does not depend on the order of the sum."""
         m, n = self.shape
         net, corner = torch.zeros(m * n).to(gradient), self.i * n + self.j
         for k, part in enumerate(gradient):
@@ -409,53 +410,53 @@ def _mean(w: Sequence[Tensor], values: Sequence[Tensor]) -> Tensor:
     return w[0] * values[0] + w[1] * values[1] + w[2] * values[2]
 
 
-def span_places(surface: BSplineSurface, i: Tensor, j: Tensor, s: Sequence[float]) -> tuple[Tensor, Tensor]:
-    """x and y (mm) of the same places, (k, 1, spans) and (1, k, spans)."""
+def span_points(surface: BSplineSurface, i: Tensor, j: Tensor, s: Sequence[float]) -> tuple[Tensor, Tensor]:
+    """Return x (k, 1, spans) and y (1, k, spans) (mm) of positions s x s in spans (i, j)."""
     at = torch.tensor(list(s), dtype=torch.float64, device=i.device)[:, None]
     u, v = (position(index + at, count) for index, count in zip((i, j), surface.shape, strict=True))
     pitch_x, pitch_y = surface.pitch
     return (surface.x[0] + pitch_x * u)[:, None], (surface.y[0] + pitch_y * v)[None]
 
 
-def reached_by(surface: BSplineSurface, outline: Outline, i: Tensor, j: Tensor, s: Sequence[float]) -> Tensor:
-    """(k, k, spans): does the outline hold the place, or does its rim pass within half a span's diagonal of it?"""
-    x, y = span_places(surface, i, j, s)
+def near_outline(surface: BSplineSurface, outline: Outline, i: Tensor, j: Tensor, s: Sequence[float]) -> Tensor:
+    """Return True (k, k, spans) for positions inside the outline or within half a span's diagonal of its rim."""
+    x, y = span_points(surface, i, j, s)
     return inside(outline.limits, x, y, math.hypot(*surface.pitch) / 2)
 
 
 def curvature_bounds(surface: BSplineSurface, sign: float) -> Tensor:
-    """(m - 2, n - 2) an upper bound of the principal curvatures of sign · z in each span (1/mm), where it is positive.
+    """Return an upper bound (m - 2, n - 2) of the positive principal curvatures of sign · z in each span (1/mm).
 
-    Second derivatives are means of differences of the control points, in an end span of 1/4 to 2 times those.  A
-    principal curvature is at most the eigenvalue of the Hessian, where that is positive, and the eigenvalue grows with
-    both diagonal entries and with the magnitude of the other.
+    Second derivatives are weighted means of second differences of the control points, in an end span of 1/4 to 2 times
+    those differences.  A positive principal curvature is at most the larger eigenvalue of the Hessian, which grows with
+    both diagonal entries and with the magnitude of the mixed one.
     """
     d_x, d_y = _differences(surface)
     pitch_x, pitch_y = surface.pitch
     xx, yy = sign * (d_x[1:] - d_x[:-1]) / pitch_x, sign * (d_y[:, 1:] - d_y[:, :-1]) / pitch_y
     for end in (xx[0], xx[-1], yy[:, 0], yy[:, -1]):
         end.copy_(torch.maximum(2 * end, end / 4))
-    xx, yy = _most(xx, 1, 3), _most(yy, 0, 3)
-    xy = _most(_most(((d_x[:, 1:] - d_x[:, :-1]) / pitch_y).abs(), 0, 2), 1, 2)
+    xx, yy = _window_max(xx, 1, 3), _window_max(yy, 0, 3)
+    xy = _window_max(_window_max(((d_x[:, 1:] - d_x[:, :-1]) / pitch_y).abs(), 0, 2), 1, 2)
     return (xx + yy) / 2 + torch.sqrt(((xx - yy) / 2) ** 2 + xy**2)
 
 
 def slope_bounds(surface: BSplineSurface) -> Tensor:
-    """(m - 2, n - 2) an upper bound of |∇z| in each span; slopes are means of differences of the control points."""
+    """Return an upper bound (m - 2, n - 2) of |∇z| in each span: slopes are means of slopes of the control net."""
     d_x, d_y = (d.abs() for d in _differences(surface))
-    return torch.sqrt(_most(_most(d_x, 0, 2), 1, 3) ** 2 + _most(_most(d_y, 0, 3), 1, 2) ** 2)
+    return torch.sqrt(_window_max(_window_max(d_x, 0, 2), 1, 3) ** 2 + _window_max(_window_max(d_y, 0, 3), 1, 2) ** 2)
 
 
 def _differences(surface: BSplineSurface) -> tuple[Tensor, Tensor]:
-    """Differences of neighbouring heights over their distance along x, (m - 1, n), and along y, (m, n - 1)."""
+    """Return the slopes of the legs of the control net along x, (m - 1, n), and along y, (m, n - 1)."""
     h, (pitch_x, pitch_y) = surface.heights.detach(), surface.pitch
     return (h[1:] - h[:-1]) / pitch_x, (h[:, 1:] - h[:, :-1]) / pitch_y
 
 
-def _most(t: Tensor, axis: int, count: int) -> Tensor:
-    """The largest of each `count` neighbours along an axis."""
-    left = t.shape[axis] - count + 1
-    most = t.narrow(axis, 0, left)
+def _window_max(t: Tensor, axis: int, count: int) -> Tensor:
+    """Return the maximum of each `count` neighbours along an axis."""
+    length = t.shape[axis] - count + 1
+    largest = t.narrow(axis, 0, length)
     for k in range(1, count):
-        most = torch.maximum(most, t.narrow(axis, k, left))
-    return most
+        largest = torch.maximum(largest, t.narrow(axis, k, length))
+    return largest

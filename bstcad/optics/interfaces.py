@@ -1,15 +1,15 @@
-"""Interfaces: where light changes its way, as data.
+"""Optical interfaces: the surfaces at which light is refracted or reflected.
 
 An interface is a surface, the outline inside which it lies, and a law: refraction between two media, or reflection.
-`cross` takes rays to it and behind it.  It is the only place in plain torch where the laws stand; a lens is an ordered
-sequence of interfaces (lens.py), and whoever follows light walks that sequence.
+`cross` takes rays to an interface and through it.  The laws are implemented here once in plain torch; a lens is an
+ordered sequence of interfaces (lens.py), and every trace walks that sequence.
 
 A ray meets a spline at the root of F(s) = z(s) - sag(x(s), y(s)) (mm), s the path along the ray (mm).  `first_root` is
 written for light along +z, which comes from below the face, where F < 0; for light along -z (`Rays.sense`) F, d_z and
-all heights change their sign.  F' = d_z - ∇sag · (d_x, d_y), and no slope of the face is steeper than its control
-legs.  Where that keeps F' positive the ray crosses the face once, and Newton's method finds where.  A ray that is
-*steep* to the face may cross it several times: light leaves the glass at the first crossing, so it is led there from
-below, by steps too short to pass it, before Newton's method takes over.
+all heights change their sign.  F' = d_z - ∇sag · (d_x, d_y), and no slope of the face exceeds the steepest leg of its
+control net.  If this bound keeps F' positive, the ray crosses the face once, and Newton's method finds the crossing.  A
+ray that is *steep* to the face may cross it several times.  Light leaves the glass at the first crossing, so the search
+approaches it from below, by steps too short to pass it, before Newton's method takes over.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.surfaces import Surface
 
-SKIMMING = 1e-3  # cosine of refraction below which the gradient grows no more (see `Refract.turned`)
-ALONG = 1e-6  # |F'|, the cosine to the surface times its norm, at or below which a ray runs along it and meets nothing
-NEWTON_STEPS = 20  # a smooth lens needs 3 to 5; a ray that has not converged by then misses
-APPROACH_STEPS = 200  # a ray that has not come near the face by then runs along it, and misses
-LEVEL = 1e-2  # |d_z| of a steep ray at or below which it leaves through a side
-FLATTEST = 1e-3  # |F'| below which a Newton step is that of 1e-3, with its sign
-QUICK = 3  # Newton steps after which rays outside the net are checked for; most have arrived by then
-NEAR = 1e-5  # part of the net's half width, so little below the face an approach ends
+MIN_COS_REFRACTION = 1e-3  # lower bound of cos θ' in the gradient of Snell's law (see `Refract`)
+TANGENCY_TOLERANCE = 1e-6  # largest |F'| at which a ray counts as tangent to the surface and does not meet it
+NEWTON_STEPS = 20  # maximum number of Newton steps; a smooth lens needs 3 to 5; a ray without a root then misses
+APPROACH_STEPS = 200  # maximum number of steps of the approach; a ray that is not near the face then misses it
+SIDE_EXIT_COSINE = 1e-2  # largest |d_z| at which a steep ray leaves through a side
+MIN_NEWTON_DERIVATIVE = 1e-3  # lower bound of |F'| as the divisor of a Newton step; its sign is kept
+STEPS_BEFORE_RIM_CHECK = 3  # Newton steps before rays outside the net are looked for; most rays have converged by then
+APPROACH_DISTANCE = 1e-5  # distance below the face at which an approach ends, as a fraction of the net's half width
 
 
 @dataclass(frozen=True)
@@ -41,24 +41,24 @@ class Refract:
     """Snell's law as vectors: d' = η d + (cos θ' - η cos θ) N, η = n_in / n_out, N the unit normal along the light.
 
     cos² θ' = 1 - η² (1 - cos² θ) <= 0 is total internal reflection; rays that meet the surface from behind
-    (cos θ <= 0) also count as that.  Neither has a gradient.  That of the others grows towards the critical angle as
-    d cos θ' = η² cos θ / cos θ' d cos θ, and is capped there: cos θ' counts as SKIMMING at least, in this derivative
-    and nowhere else.
+    (cos θ <= 0) also count as totally reflected.  Neither has a gradient.  The gradient of the other rays grows towards
+    the critical angle as d cos θ' = η² cos θ / cos θ' d cos θ.  It is capped there: in this derivative, and nowhere
+    else, cos θ' is at least MIN_COS_REFRACTION.
     """
 
     n_in: float  # refractive index before the interface
-    n_out: float  # and behind it
+    n_out: float  # refractive index behind the interface
 
     status_if_blocked = Status.TOTAL_REFLECTION  # status of rays that the law does not let through
-    reverses = False  # does light turn back along z?
+    reverses = False  # True if the light reverses its sense along z
 
     @property
     def eta(self) -> float:
-        """The direction's factor η."""
+        """Return η = n_in / n_out, the factor of the old direction in the new one."""
         return self.n_in / self.n_out
 
-    def turned(self, cos_in: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(a, cos θ', stopped): the new direction is η d + a N; stopped: True where no light goes on."""
+    def deflection(self, cos_in: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return (a, cos θ', blocked): the new direction is η d + a N; blocked is True where no light goes on."""
         eta = self.eta
         cos2 = 1 - eta * eta * (1 - cos_in * cos_in)
         total = cos2 <= 0
@@ -68,72 +68,72 @@ class Refract:
 
 @dataclass(frozen=True)
 class Reflect:
-    """The law of reflection: d' = d - 2 cos θ N, N the unit normal along the light; rays from behind are lost."""
+    """Law of reflection: d' = d - 2 cos θ N, N the unit normal along the light; rays from behind are lost."""
 
     eta = 1.0
     status_if_blocked = Status.TURNED_BACK
     reverses = True
 
-    def turned(self, cos_in: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(a, cos θ', stopped): the new direction is d + a N."""
+    def deflection(self, cos_in: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return (a, cos θ', blocked): the new direction is d + a N."""
         return -2 * cos_in, cos_in, cos_in <= 0
 
 
 def _capped_root(cos2: Tensor) -> Tensor:
-    """cos = sqrt(cos²) > 0 with the derivative 1 / (2 max(cos, SKIMMING)): the same sign, never more than that."""
+    """Return cos = sqrt(cos²) > 0, with the derivative 1 / (2 max(cos, MIN_COS_REFRACTION))."""
     cos = torch.sqrt(cos2.detach())
-    return cos + (cos2 - cos2.detach()) / (2 * cos.clamp(min=SKIMMING))
+    return cos + (cos2 - cos2.detach()) / (2 * cos.clamp(min=MIN_COS_REFRACTION))
 
 
 Law = Refract | Reflect
 
 
 class Loss(Protocol):
-    """A loss of a ray's flux at an interface, or on the way to it (losses.py)."""
+    """Loss of a ray's flux at an interface, or on the path to it (losses.py)."""
 
-    line: str  # line of the ledger under which that part is counted
-    in_glass: bool  # it acts on the way to the interface; else at the interface
-    fused: bool  # the kernels know it: exp(-coefficient · path) in the glass, at the interface the angle alone
+    line: str  # line of the ledger under which the lost flux is counted
+    in_glass: bool  # True if the loss acts on the path to the interface, False if at the interface
+    fused: bool  # True if kernels apply it: exp(-coefficient · path) in glass, a function of the angle at an interface
 
     def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
-        """The part that goes on, from the cosines of incidence and refraction and the path before the face (mm)."""
+        """Return the transmitted fraction, from the cosines of incidence and refraction and the path before (mm)."""
 
 
 @dataclass(frozen=True)
 class Interface:
-    """One surface on the way of the light."""
+    """One surface on the path of the light, with its clear aperture, law and losses."""
 
     surface: Surface
-    outline: Outline  # light that meets the surface outside is lost
+    outline: Outline  # clear aperture; light that meets the surface outside it is lost
     law: Law
-    status_if_missed: Status  # status of rays that do not meet it
-    losses: tuple[Loss, ...] = ()  # in the order of the light; none: the paper's lossless refraction
+    status_if_missed: Status  # status of rays that do not meet the surface inside the outline
+    losses: tuple[Loss, ...] = ()  # losses in the order of the light; (): the paper's lossless refraction
 
 
 @dataclass(frozen=True)
 class Hit:
     """Rays that have crossed an interface; the cosines hold for those still alive."""
 
-    rays: Rays  # on the surface, with their new directions
+    rays: Rays  # rays on the surface, with their new directions
     cos_in: Tensor  # cosine of the angle of incidence
     cos_out: Tensor  # cosine of the angle of refraction or reflection
 
 
 def cross(rays: Rays, interface: Interface) -> Hit:
-    """Rays to an interface and behind it: those that meet its surface inside the outline, turned by its law."""
+    """Trace rays to an interface and through it: refract or reflect those that meet it inside the outline."""
     at, z_x, z_y = intersect(interface.surface, rays, interface.outline, interface.status_if_missed)
     hit = deflect(at, z_x, z_y, interface.law, level=interface.surface.level)
     if not interface.losses:
         return hit
     return replace(
-        hit, rays=dimmed(hit.rays, hit.cos_in, hit.cos_out, path=_path(rays, hit.rays), losses=interface.losses)
+        hit, rays=apply_losses(hit.rays, hit.cos_in, hit.cos_out, path=_path(rays, hit.rays), losses=interface.losses)
     )
 
 
-def dimmed(rays: Rays, cos_in: Tensor, cos_out: Tensor, path: Tensor, losses: Sequence[Loss]) -> Rays:
-    """Rays behind an interface after its losses; path: before it (mm).
+def apply_losses(rays: Rays, cos_in: Tensor, cos_out: Tensor, path: Tensor, losses: Sequence[Loss]) -> Rays:
+    """Return rays behind an interface after its losses; path: length of the ray in front of it (mm).
 
-    Only rays that go on lose flux: the flux of the others is counted whole, under their status.
+    Only rays that go on lose flux.  The flux of a lost ray is counted whole, under its status.
     """
     goes_on, flux, taken = rays.alive, rays.flux, dict(rays.taken)
     one = torch.ones_like(cos_in)
@@ -146,14 +146,14 @@ def dimmed(rays: Rays, cos_in: Tensor, cos_out: Tensor, path: Tensor, losses: Se
 
 
 def _path(before: Rays, behind: Rays) -> Tensor:
-    """The path of rays from one place to another (mm); √3 for lost rays."""
-    here = torch.stack([*behind.position[:2], behind.above(before.z)])
-    way = torch.where(behind.alive, here - before.position, torch.ones_like(here))  # no root of zero: no gradient
-    return torch.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
+    """Return the path length between two positions of the same rays (mm); √3 for lost rays."""
+    end = torch.stack([*behind.position[:2], behind.above(before.z)])
+    step = torch.where(behind.alive, end - before.position, torch.ones_like(end))  # the root of zero has no gradient
+    return torch.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
 
 
 def deflect(at: Rays, z_x: Tensor, z_y: Tensor, law: Law, level: bool = False) -> Hit:
-    """Rays on a surface of these slopes, behind it.  level: the surface is a plane z = const, and its slopes zero."""
+    """Refract or reflect rays at a surface with these slopes.  level: the surface is a plane z = const."""
     if at.axial and level:  # normal incidence
         one = torch.ones_like(z_x)
         if not law.reverses:
@@ -163,7 +163,7 @@ def deflect(at: Rays, z_x: Tensor, z_y: Tensor, law: Law, level: bool = False) -
     dx, dy, dz = torch.where(at.alive, at.direction, torch.ones_like(at.direction))
     along = dz - dx * z_x - dy * z_y
     cos_in = (along if at.sense > 0 else -along) * norm
-    eta, (bend, cos_out, stopped) = law.eta, law.turned(cos_in)
+    eta, (bend, cos_out, stopped) = law.eta, law.deflection(cos_in)
     shift = bend * norm if at.sense > 0 else -bend * norm
     direction = torch.stack([eta * dx - shift * z_x, eta * dy - shift * z_y, eta * dz + shift])
     status = at.lose(stopped, law.status_if_blocked)
@@ -173,12 +173,12 @@ def deflect(at: Rays, z_x: Tensor, z_y: Tensor, law: Law, level: bool = False) -
 
 
 def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) -> tuple[Rays, Tensor, Tensor]:
-    """Move the rays to the surface; those that do not meet it inside the outline are lost as `missed`.
+    """Move the rays to the surface; those that do not meet it inside the outline are lost with the status `missed`.
 
     F(s) = z(s) - sag(x(s), y(s)) = 0.  The root is found without gradient; then one differentiable Newton step,
-    s = s* - F(s*) / F'(s*) with F' held, carries the implicit gradient ds = -dF / F' (Wang, C. 2022 after Griewank).
-    The path s counts from the surface's base plane: it is as short as the sag, so that neither a source far off nor a
-    scene far from its origin costs digits.
+    s = s* - F(s*) / F'(s*) with constant F', adds the implicit gradient ds = -dF / F' (Wang, C. 2022 after Griewank).
+    The path s is measured from the surface's base plane.  It is then as short as the sag, so that neither a distant
+    source nor a scene far from its origin loses digits.
 
     Returns (rays at the surface, ∂z/∂x, ∂z/∂y there).
     """
@@ -189,135 +189,136 @@ def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) ->
         return replace(rays, position=torch.stack([x, y, h]), z=surface.z, status=status), z_x, z_y
 
     start, s, meets = _plane_and_root(surface, rays)
-    # double where: a ray without a root takes no step, and whatever it is, none of it reaches the others' gradients
+    # double where: a ray without a root takes no step, and its values reach no gradient of other rays
     x, y, z = torch.where(meets, start + s * rays.direction, torch.zeros_like(start))
     h, z_x, z_y = surface.relative_sag_and_slope(x, y)
     dx, dy, dz = rays.direction.detach()
-    ok = meets & ((dz - z_x.detach() * dx - z_y.detach() * dy).abs() > ALONG)
+    ok = meets & ((dz - z_x.detach() * dx - z_y.detach() * dy).abs() > TANGENCY_TOLERANCE)
     rise_x, rise_y = slopes_beyond(surface, x, y, z_x=z_x, z_y=z_y) if surface.is_net else (z_x, z_y)
     slope = dz - rise_x.detach() * dx - rise_y.detach() * dy
     step = torch.where(ok, z - h, torch.zeros_like(h)) / torch.where(ok, slope, torch.ones_like(slope))
     before = torch.stack([*rays.position[:2], rays.above(surface.z)])
     position = torch.where(ok, torch.stack([x, y, z]) - step * rays.direction, before)
     x, y = (torch.where(ok, p, torch.zeros_like(p)) for p in position[:2])
-    _, z_x, z_y = surface.relative_sag_and_slope(x, y)  # the slope moves with the hit
-    there = ok & surface.reaches(x, y) & outline.contains(x, y)
-    return replace(rays, position=position, z=surface.z, status=rays.lose(~there, missed)), z_x, z_y
+    _, z_x, z_y = surface.relative_sag_and_slope(x, y)  # slopes as differentiable functions of the hit
+    met = ok & surface.reaches(x, y) & outline.contains(x, y)
+    return replace(rays, position=position, z=surface.z, status=rays.lose(~met, missed)), z_x, z_y
 
 
 def _plane_and_root(surface: Surface, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
-    """(where the rays cross the base plane (3, …), path s from there to the surface, meets); no gradient in s."""
+    """Return (points on the base plane (3, …), path s from there to the surface, meets); s has no gradient."""
     dz = rays.direction[2]
-    way = -rays.above(surface.z) / torch.where(dz.abs() > 1e-12, dz, torch.full_like(dz, 1e-12))
-    start = torch.stack([*(rays.position[:2] + way * rays.direction[:2]), torch.zeros_like(dz)])
+    path = -rays.above(surface.z) / torch.where(dz.abs() > 1e-12, dz, torch.full_like(dz, 1e-12))
+    start = torch.stack([*(rays.position[:2] + path * rays.direction[:2]), torch.zeros_like(dz)])
     with torch.no_grad():
         if surface.is_net:
-            known = net_bounds(surface, dz.dtype, rays.sense)
-            s, meets = first_root(surface, start, way, rays=rays, known=known)
+            bounds = net_bounds(surface, dz.dtype, rays.sense)
+            s, meets = first_root(surface, start, path, rays=rays, bounds=bounds)
         else:
             s, meets = surface.crossing(start[0], start[1], rays.direction, rays.sense)
-            meets = meets & (way + s >= 0)  # only the forward root counts
+            meets = meets & (path + s >= 0)  # only the forward root counts
     return start, s, meets
 
 
 class NetBounds(NamedTuple):
-    """Bounds of a net as a whole."""
+    """Bounds of a net's slopes and heights, and tolerances of the search for its crossing by rays."""
 
-    steepest_x: float  # no |∂z/∂x| of the surface is larger
-    steepest_y: float
-    lowest: float  # no height is lower along the light (mm, from the surface's plane)
-    tolerance: float  # |F| at which a root is found (mm)
-    near: float  # -F at which an approach ends (mm)
+    steepest_x: float  # upper bound of |∂z/∂x| on the surface
+    steepest_y: float  # upper bound of |∂z/∂y| on the surface
+    lowest: float  # lower bound of the heights, counted along the light (mm, from the surface's plane)
+    tolerance: float  # |F| at or below which the root search stops (mm)
+    near: float  # -F at or below which an approach ends (mm)
 
 
 def net_bounds(surface: BSplineSurface, dtype: torch.dtype, sense: int = 1) -> NetBounds:
-    """Each slope is a mean of those of the control legs; sags and positions are of the order of the half width."""
+    """Return the bounds of a net: each slope is a weighted mean of the slopes of the legs of its control net."""
     h, (pitch_x, pitch_y) = surface.heights.detach(), surface.pitch
     half = max(abs(end) for end in (*surface.x, *surface.y))
     lowest = float(h.min()) if sense > 0 else -float(h.max())
     return NetBounds(
         float(h.diff(dim=0).abs().max()) / pitch_x, float(h.diff(dim=1).abs().max()) / pitch_y, lowest,
-        tolerance=64 * half * torch.finfo(dtype).eps, near=NEAR * half,
+        tolerance=64 * half * torch.finfo(dtype).eps, near=APPROACH_DISTANCE * half,
     )  # fmt: skip
 
 
 def first_root(
-    surface: BSplineSurface, start: Tensor, way: Tensor, rays: Rays, known: NetBounds
+    surface: BSplineSurface, start: Tensor, path: Tensor, rays: Rays, bounds: NetBounds
 ) -> tuple[Tensor, Tensor]:
-    """(s, meets): path of live rays to the surface from where they cross its plane, `start` (3, …) mm; forward only.
+    """Return (s, meets): path s (mm) of live rays from their points `start` (3, …) on the base plane to the surface.
 
-    They come to it by `way` mm of path.  Those that are steep to the surface must begin in the glass.
+    path: length (mm) from the position of each ray to `start`; roots behind the position do not count.  Rays that are
+    steep to the surface must begin in the glass.
     """
     dx, dy, dz = rays.direction
-    steep = rays.alive & ~((dz if rays.sense > 0 else -dz) > known.steepest_x * dx.abs() + known.steepest_y * dy.abs())
+    rise = dz if rays.sense > 0 else -dz
+    steep = rays.alive & ~(rise > bounds.steepest_x * dx.abs() + bounds.steepest_y * dy.abs())
     s, meets = _newton(
-        surface, start, rays.direction, s=torch.zeros_like(dz), wanted=rays.alive & ~steep, tolerance=known.tolerance
+        surface, start, rays.direction, s=torch.zeros_like(dz), searched=rays.alive & ~steep, tolerance=bounds.tolerance
     )
     if bool(steep.any()):
-        few = steep.nonzero(as_tuple=True)
-        before, direction = _only(rays.position, few), _only(rays.direction, few)
+        index = steep.nonzero(as_tuple=True)
+        before, direction = _select(rays.position, index), _select(rays.direction, index)
         before[2] += rays.z - surface.z
-        below, arrived = _approach(surface, before, direction, known=known, sense=rays.sense)
-        below, arrived = below - way[few], arrived & (direction[2].abs() > LEVEL)
+        below, arrived = _approach(surface, before, direction, bounds=bounds, sense=rays.sense)
+        below, arrived = below - path[index], arrived & (direction[2].abs() > SIDE_EXIT_COSINE)
         if bool(arrived.any()):
             root, met = _newton(
-                surface, _only(start, few), direction, s=below, wanted=arrived, tolerance=known.tolerance
+                surface, _select(start, index), direction, s=below, searched=arrived, tolerance=bounds.tolerance
             )
-            s[few] = root
-            meets[few] = met & ((root - below).abs() <= known.near / FLATTEST)  # else it runs along the face
-    return s, meets & (way + s >= -known.tolerance)  # a ray may begin on the face, as near as rounding allows
+            s[index] = root
+            meets[index] = met & ((root - below).abs() <= bounds.near / MIN_NEWTON_DERIVATIVE)  # else tangent
+    return s, meets & (path + s >= -bounds.tolerance)  # a ray may begin on the face, to rounding
 
 
-def _only(vectors: Tensor, few: tuple[Tensor, ...]) -> Tensor:
-    """(3, k): those of (3, …) at the places `few`."""
-    return vectors[(slice(None), *few)]
+def _select(vectors: Tensor, index: tuple[Tensor, ...]) -> Tensor:
+    return vectors[(slice(None), *index)]
 
 
 def _newton(
-    surface: BSplineSurface, start: Tensor, direction: Tensor, s: Tensor, wanted: Tensor, tolerance: float,
+    surface: BSplineSurface, start: Tensor, direction: Tensor, s: Tensor, searched: Tensor, tolerance: float,
     steps: int = NEWTON_STEPS,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """(s*, meets) for the rays `wanted`, from the paths s beyond the plane; the stop is |F| in mm, per ray."""
+    """Return (s*, meets) of the `searched` rays by Newton's method from s; each stops at |F| <= tolerance (mm)."""
     dx, dy, dz = direction
-    meets = torch.zeros_like(wanted)
+    meets = torch.zeros_like(searched)
     for step in range(steps):
         x, y = start[0] + s * dx, start[1] + s * dy
         h, z_x, z_y = surface.relative_sag_and_slope(x, y)
         residual = s * dz - h
-        meets = wanted & (residual.abs() <= tolerance)
-        searching = wanted & ~meets
-        left = int(searching.sum())
-        if left == 0:
+        meets = searched & (residual.abs() <= tolerance)
+        searching = searched & ~meets
+        remaining = int(searching.sum())
+        if remaining == 0:
             break
-        if 2 * left < s.numel():  # few go on: alone, so that one ray without a root does not hold up all others
-            few = searching.nonzero(as_tuple=True)
-            at = (_only(start, few), _only(direction, few), s[few], wanted[few])
-            s[few], meets[few] = _newton(surface, *at, tolerance, steps - step)
+        if 2 * remaining < s.numel():  # continue with these alone: one ray without a root must not delay all others
+            index = searching.nonzero(as_tuple=True)
+            rest = (_select(start, index), _select(direction, index), s[index], searched[index])
+            s[index], meets[index] = _newton(surface, *rest, tolerance, steps - step)
             break
-        if step + NEWTON_STEPS - steps >= QUICK:
+        if step + NEWTON_STEPS - steps >= STEPS_BEFORE_RIM_CHECK:
             z_x, z_y = slopes_beyond(surface, x, y, z_x=z_x, z_y=z_y)
         slope = dz - z_x * dx - z_y * dy
-        floor = torch.where(slope < 0, -FLATTEST, FLATTEST).to(slope.dtype)  # keeps the sign
-        slope = torch.where(slope.abs() > FLATTEST, slope, floor)
+        floor = torch.where(slope < 0, -MIN_NEWTON_DERIVATIVE, MIN_NEWTON_DERIVATIVE).to(slope.dtype)  # keeps the sign
+        slope = torch.where(slope.abs() > MIN_NEWTON_DERIVATIVE, slope, floor)
         s = s - torch.where(searching, residual, torch.zeros_like(s)) / slope
     return s, meets
 
 
 def slopes_beyond(surface: BSplineSurface, x: Tensor, y: Tensor, z_x: Tensor, z_y: Tensor) -> tuple[Tensor, Tensor]:
-    """The slopes with which the sag goes on beyond the net: none across the rim."""
+    """Return the slopes of the sag as it is continued outside the net: zero across the rim."""
     in_x, in_y = ((p >= ends[0]) & (p <= ends[1]) for p, ends in ((x, surface.x), (y, surface.y)))
     return torch.where(in_x, z_x, torch.zeros_like(z_x)), torch.where(in_y, z_y, torch.zeros_like(z_y))
 
 
 def _approach(
-    surface: BSplineSurface, begin: Tensor, direction: Tensor, known: NetBounds, sense: int
+    surface: BSplineSurface, begin: Tensor, direction: Tensor, bounds: NetBounds, sense: int
 ) -> tuple[Tensor, Tensor]:
-    """(s, arrived): path from `begin` to just below the first crossing ahead.
+    """Return (s, arrived): path from `begin` to just below the first crossing ahead.
 
-    F changes by at most |d_z| + |∇sag · (d_x, d_y)| per mm of path: a step of -F over the bound of that passes no root.
+    F changes by at most |d_z| + |∇sag · (d_x, d_y)| per mm of path: a step of -F over its upper bound passes no root.
     """
     dx, dy, dz = direction
-    rate = dz.abs() + known.steepest_x * dx.abs() + known.steepest_y * dy.abs()
+    rate = dz.abs() + bounds.steepest_x * dx.abs() + bounds.steepest_y * dy.abs()
     s = torch.zeros_like(dz)
     under_way, arrived = torch.ones_like(s, dtype=torch.bool), torch.zeros_like(s, dtype=torch.bool)
     for step in range(APPROACH_STEPS):
@@ -325,11 +326,11 @@ def _approach(
         residual = sense * (z - surface.relative_sag_and_slope(x, y)[0])
         if step == 0:
             under_way = residual < 0  # a ray that starts behind the face has left the glass already
-        arrived |= under_way & (residual >= -known.near)
-        gone = ((x > surface.x[1]) & (dx > 0)) | ((x < surface.x[0]) & (dx < 0))
-        gone |= (sense * z < known.lowest) & (sense * dz <= 0)
-        gone |= ((y > surface.y[1]) & (dy > 0)) | ((y < surface.y[0]) & (dy < 0))
-        under_way = under_way & ~arrived & ~gone
+        arrived |= under_way & (residual >= -bounds.near)
+        left = ((x > surface.x[1]) & (dx > 0)) | ((x < surface.x[0]) & (dx < 0))
+        left |= (sense * z < bounds.lowest) & (sense * dz <= 0)
+        left |= ((y > surface.y[1]) & (dy > 0)) | ((y < surface.y[0]) & (dy < 0))
+        under_way = under_way & ~arrived & ~left
         if not bool(under_way.any()):
             break
         s = torch.where(under_way, s - residual / rate, s)

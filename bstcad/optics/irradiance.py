@@ -1,8 +1,8 @@
-"""From landed rays to an irradiance picture and a flux ledger.
+"""Irradiance pictures and flux ledgers from the landing points of rays.
 
-A picture is (rows, columns), row 0 = y max, column 0 = x min.  `tent` shares a ray among the four nearest pixel
-centres (differentiable, for tailoring); `box` gives it to the pixel it falls into (as a detector does, for judging the
-result).  Both sum in float64: float32 sums stop growing at 2^24 rays.
+A picture is (rows, columns), row 0 = y max, column 0 = x min.  `tent` distributes a ray over the four nearest pixel
+centres (differentiable, for tailoring); `box` adds it to the pixel it falls into (as a detector does, for
+verification).  Both sum in float64: float32 sums stop growing at 2^24 rays.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from bstcad.optics.motion import Motion
 from bstcad.optics.rays import Landed, Status, axes, clocked, clocking_of, tilt_of
 from bstcad.optics.receivers import LevelPlane, Receiver, TiltedPlane
 
-ROUNDING = 1e-12  # rounding, as a part of the light on a target
-DARK = 1e-6  # part of a target's brightest pixel; a pixel that wants no more wants no light
+ROUNDING = 1e-12  # fraction of the light on a target that counts as rounding
+DARK_LEVEL = 1e-6  # largest value of a dark pixel of a target, as a fraction of its brightest pixel
 
 
 @dataclass(frozen=True)
 class Screen:
-    """A rectangle of a level or tilted plane, or of another receiver, divided into columns x rows of pixels."""
+    """Rectangle of a level or tilted plane, or of another receiver, divided into columns x rows of pixels."""
 
-    z: float  # mm; of a tilted screen at its middle
-    x: tuple[float, float]  # in the unit of the receiver, of planes mm
-    y: tuple[float, float]  # the same
-    pixels: int | tuple[int, int]  # along both sides, or (columns, rows)
-    tilt: tuple[float, float] | None = None  # about x, then about y (degrees; receivers.TiltedPlane); None: level
-    clocking: float = 0.0  # then about its own normal (degrees)
-    surface: Receiver | None = None  # which it is a part of; None: the plane of z, tilt and clocking
+    z: float  # height of the plane (mm), of a tilted plane at the centre of the screen
+    x: tuple[float, float]  # extent in x, in the unit of the receiver (mm on planes)
+    y: tuple[float, float]  # extent in y, in the unit of the receiver
+    pixels: int | tuple[int, int]  # pixels along each side, or (columns, rows)
+    tilt: tuple[float, float] | None = None  # rotation about x, then about y (°; receivers.TiltedPlane); None: level
+    clocking: float = 0.0  # rotation about the normal, after the tilt (°)
+    surface: Receiver | None = None  # receiver that the screen is a part of; None: the plane of z, tilt and clocking
 
     @property
     def middle(self) -> tuple[float, float, float]:
-        """Its middle in space (mm)."""
+        """Centre of the screen in space (mm)."""
         if self.surface is not None:
             return self.surface.middle
         return sum(self.x) / 2, sum(self.y) / 2, self.z
 
     @property
     def plane(self) -> Receiver:
-        """The plane, or the receiver of another form, on which light lands."""
+        """Receiver on which light lands: a plane, or the receiver of another form."""
         if self.surface is not None:
             return self.surface
         if self.tilt is None and self.clocking == 0:
@@ -53,7 +53,7 @@ class Screen:
         return TiltedPlane(self.middle, self.tilt or (0.0, 0.0), self.clocking)
 
     def moved(self, motion: Motion) -> Screen:
-        """The screen after a motion; its pixels stay those that they are."""
+        """Return the screen after a motion, with the same pixels."""
         if self.surface is not None:
             return replace(self, surface=self.surface.moved(motion))
         middle = motion.point(self.middle)
@@ -67,61 +67,61 @@ class Screen:
 
     @property
     def columns(self) -> int:
-        """Pixels along x."""
+        """Number of pixels along x."""
         return self.pixels if isinstance(self.pixels, int) else self.pixels[0]
 
     @property
     def rows(self) -> int:
-        """Pixels along y."""
+        """Number of pixels along y."""
         return self.pixels if isinstance(self.pixels, int) else self.pixels[1]
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, columns), as a picture on it has."""
+        """Shape (rows, columns) of a picture on the screen."""
         return self.rows, self.columns
 
     @property
     def per_unit(self) -> tuple[float, float]:
-        """Columns along x and rows along y in a unit of the receiver."""
+        """Columns and rows per unit of the receiver."""
         return self.columns / (self.x[1] - self.x[0]), self.rows / (self.y[1] - self.y[0])
 
     @property
     def areas(self) -> np.ndarray | None:
-        """Areas or solid angles of the pixels (rows, columns), of mean 1; None: they are equal."""
+        """Relative areas or solid angles of the pixels (rows, columns), of mean 1; None: all are equal."""
         return self.plane.areas(self.x, self.y, self.shape)
 
     def pixel(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """(column, row) of (x, y), as real numbers: pixel i reaches from i to i + 1."""
+        """Return (column, row) of (x, y) as real numbers: pixel i extends from i to i + 1."""
         per_x, per_y = self.per_unit
         return (x - self.x[0]) * per_x, (self.y[1] - y) * per_y
 
     def pixels_of(self, position: Tensor) -> Tensor:
-        """(2, …) the same of positions (2, …), in two passes over them."""
-        aside = (2, *[1] * (position.ndim - 1))
+        """Return columns and rows (2, …) of positions (2, …), in two passes over memory."""
+        shape = (2, *[1] * (position.ndim - 1))
         per_x, per_y = self.per_unit
-        corner = torch.tensor((self.x[0], self.y[1]), dtype=position.dtype, device=position.device).view(aside)
-        per_unit = torch.tensor((per_x, -per_y), dtype=position.dtype, device=position.device).view(aside)
+        corner = torch.tensor((self.x[0], self.y[1]), dtype=position.dtype, device=position.device).view(shape)
+        per_unit = torch.tensor((per_x, -per_y), dtype=position.dtype, device=position.device).view(shape)
         return (position - corner).mul_(per_unit)
 
     def contains(self, x: Tensor, y: Tensor) -> Tensor:
-        """True where (x, y) is on the screen."""
+        """Return True where (x, y) is on the screen."""
         return (x >= self.x[0]) & (x <= self.x[1]) & (y >= self.y[0]) & (y <= self.y[1])
 
 
 def landed_flux(rays: Landed) -> Tensor:
-    """The flux of each ray, zero for those that were lost on the way."""
+    """Return the flux of each ray, zero for lost rays."""
     return torch.where(rays.alive, rays.flux, torch.zeros_like(rays.flux))
 
 
 def tent(rays: Landed, screen: Screen) -> Tensor:
-    """Flux a pixel by linear (tent) binning, float64: differentiable (Wang et al. 2023, section 2.3)."""
+    """Return the flux per pixel by linear (tent) binning, float64, differentiable (Wang et al. 2023, section 2.3)."""
     return collect(rays, screen)[0]
 
 
 def collect(rays: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
-    """(tent picture, Σ flux · (distance beyond the border in pixels)²), both float64 and differentiable in the landing.
+    """Return (tent picture, Σ flux · (distance outside the border in pixels)²), float64, differentiable in the landing.
 
-    Binning gives no gradient to a ray that has left the screen; the second sum does.
+    Binning gives no gradient to a ray outside the screen; the second sum does.
     """
     flux = landed_flux(rays)
     if (fast := ops.kernel("irradiance.collect", rays.position, flux)) and not flux.requires_grad:
@@ -132,10 +132,10 @@ def collect(rays: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
 
 
 def collect_plain(position: Tensor, flux: Tensor, screen: Screen) -> tuple[Tensor, Tensor]:
-    """`collect` in plain torch: each ray's four shares, those beyond the border dropped."""
+    """Run `collect` in plain torch: four weights per ray, without those outside the border."""
     column, row = (p.reshape(-1) for p in screen.pixel(position[0].double(), position[1].double()))
     flux, (rows, columns) = flux.reshape(-1).double(), screen.shape
-    beyond = (column - column.clamp(0, columns)) ** 2 + (row - row.clamp(0, rows)) ** 2
+    outside = (column - column.clamp(0, columns)) ** 2 + (row - row.clamp(0, rows)) ** 2
     column, row = column - 0.5, row - 0.5
     image = torch.zeros(rows * columns, dtype=torch.float64, device=flux.device)
     j, i = column.detach().floor(), row.detach().floor()
@@ -145,11 +145,11 @@ def collect_plain(position: Tensor, flux: Tensor, screen: Screen) -> tuple[Tenso
             inside = (i + di >= 0) & (i + di < rows) & (j + dj >= 0) & (j + dj < columns)
             index = torch.where(inside, (i + di) * columns + (j + dj), torch.zeros_like(i)).long()
             image = image.index_add(0, index, torch.where(inside, weight, torch.zeros_like(weight)))
-    return image.view(screen.shape), total(flux * beyond)
+    return image.view(screen.shape), total(flux * outside)
 
 
 def box(rays: Landed, screen: Screen) -> Tensor:
-    """Flux that truly falls into each pixel, float64."""
+    """Return the flux that falls into each pixel, float64, without gradient."""
     column, row = screen.pixel(rays.position[0], rays.position[1])
     inside = rays.alive & screen.contains(rays.position[0], rays.position[1])
     rows, columns = screen.shape
@@ -161,26 +161,26 @@ def box(rays: Landed, screen: Screen) -> Tensor:
 
 
 def rrmsd(irradiance: Tensor, target: Tensor) -> Tensor:
-    """sqrt(Σ |E_s - E|² / Σ E²), E_s scaled to the target's sum (Wang et al. 2023, Eq. 15)."""
+    """Return sqrt(Σ |E_s - E|² / Σ E²), E_s scaled to the target's sum (Wang et al. 2023, Eq. 15)."""
     scaled = irradiance * (total(target) / total(irradiance))
     return torch.sqrt(total((scaled - target) ** 2) / total(target**2))
 
 
 @dataclass(frozen=True)
 class Leak:
-    """The light on the dark pixels D of a target, those in which it wants no more than DARK times its brightest."""
+    """Light on the dark pixels D of a target: those at or below DARK_LEVEL times the brightest pixel."""
 
-    share: float  # Σ_D E / Σ E: of the light that falls on the target
-    # mean of E over the other pixels, divided by mean of E over D; None: no light falls on D but for rounding
+    share: float  # Σ_D E / Σ E, fraction of the light on the target that falls on D
+    # Mean of E over the other pixels divided by the mean of E over D; None: the light on D is rounding.
     contrast: float | None
 
 
 def leak(irradiance: np.ndarray, target: np.ndarray) -> Leak | None:
-    """The leak of a picture E (rows, columns), on any scale, against a target; None if no pixel of that is dark.
+    """Return the leak of a picture E (rows, columns) of any scale; None if the target has no dark pixel.
 
-    The share is linear in E: noise of zero mean in E leaves its expectation as it is.
+    The share is linear in E: noise of zero mean does not change its expectation.
     """
-    dark = target <= DARK * target.max()
+    dark = target <= DARK_LEVEL * target.max()
     if not dark.any():
         return None
     share = math.fsum(irradiance[dark]) / math.fsum(irradiance.ravel())
@@ -188,7 +188,7 @@ def leak(irradiance: np.ndarray, target: np.ndarray) -> Leak | None:
     return Leak(share, float(lit * dark.sum() / share) if share > ROUNDING else None)
 
 
-LEDGER = {
+LEDGER = {  # reasons of loss by line of the ledger
     "missed the lens": (Status.MISSED_FRONT,),
     "lost through the sides": (Status.VIGNETTED,),
     "total internal reflection": (Status.TOTAL_REFLECTION,),
@@ -196,7 +196,7 @@ LEDGER = {
 
 
 def ledger(rays: Landed, screen: Screen) -> dict[str, float]:
-    """The flux of these rays by fate; the lines sum to all that they carry."""
+    """Return the flux of rays by fate; the lines sum to their total flux."""
     flux = rays.flux.double()
     on_screen = screen.contains(rays.position[0], rays.position[1])
     lines = {
@@ -209,7 +209,7 @@ def ledger(rays: Landed, screen: Screen) -> dict[str, float]:
 
 
 def efficiency(flux: dict[str, float]) -> float:
-    """Flux inside the target over flux that leaves the back face."""
+    """Return the flux inside the target over the flux that leaves the back face."""
     inside, outside = (flux[f"{side} target"] + flux.get(f"ghost {side} target", 0.0) for side in ("on", "off"))
-    leaves = inside + outside
-    return inside / leaves if leaves > 0 else 0.0
+    leaving = inside + outside
+    return inside / leaving if leaving > 0 else 0.0

@@ -1,10 +1,10 @@
-"""The functions of optics that have a kernel, by device: the one place where a plain form gives way to a faster one.
+"""Registry of the functions of optics that have a kernel, by device.
 
-A kernel has the values of its plain form to rounding, and takes the same tensors: the caller asks for one by name and
-runs the plain form where there is none, as on a GPU.  A kernel for a GPU is one more entry of a row and serves this one
-function.  Whatever the device, the blur by the image of a source, stage 1's transport, the map between two faces, the
-bounds and checks of a net's shape, and the rays by which a design is judged run on the CPU; the cosine transform of
-stage 2 is scipy's on the CPU and a product of matrices elsewhere.
+A kernel returns the values of its plain form to rounding and takes the same tensors.  The caller requests it by name
+and runs the plain form where there is none, as on a GPU.  A kernel for a GPU is one more entry of a row and serves that
+one function.  On every device some computations run on the CPU: the blur by the image of a source, stage 1's transport,
+the map between two faces, the bounds and checks of a net's shape, and the rays by which a design is verified.  The
+cosine transform of stage 2 is scipy's on the CPU and a product of matrices elsewhere.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from typing import Any
 import torch
 from torch import Tensor
 
-ENABLED = True  # tests of the plain forms turn all kernels off
-# Kernels by function and type of device: callables, or their names in bstcad.optics.kernels, which is loaded by need.
+ENABLED = True  # False turns all kernels off, for tests of the plain forms
+# Kernels by function and type of device: callables, or their names in bstcad.optics.kernels, loaded at first use.
 KERNELS: dict[str, dict[str, str | Callable[..., Any]]] = {
     "bspline.evaluate": {"cpu": "spline.BSplineSag.apply"},
     "bspline.net_gradient": {"cpu": "spline.net_gradient"},
     "irradiance.collect": {"cpu": "splat.Splat.apply"},
     "trace.behind": {"cpu": "crossing.behind"},
     "trace.through": {"cpu": "crossing.landed"},
-    "trace.simulate": {"cpu": "forward.simulate"},  # the whole way, from the source to the receiver
-    "trace.land": {"cpu": "forward.land"},  # the whole way of single rays
+    "trace.simulate": {"cpu": "forward.simulate"},  # the whole path, from the source to the receiver
+    "trace.land": {"cpu": "forward.land"},  # the whole path of single rays
     "tubes.collect": {"cpu": "clip.Clip.apply"},
     "reductions.dot": {"cpu": "reductions.dot_of_arrays"},
 }
 DTYPES = (torch.float32, torch.float64)
-# The kernels of the whole way know the equations of these kinds of Surface, and of no others.
-KINDS = {"bspline": "net", "plane": "revolved", "sphere": "revolved", "conic": "revolved"}
-# The sequences of interfaces that they trace: (of KINDS, does it reflect?) each.
-WHOLE = [("net", True)], [("revolved", False), ("net", False)]
+# Form of the equation by kind of Surface; the kernels of the whole path implement no others.
+SURFACE_FORMS = {"bspline": "net", "plane": "revolved", "sphere": "revolved", "conic": "revolved"}
+# Sequences of interfaces that these kernels trace, each interface as (its form, True if it reflects).
+WHOLE_PATHS = [("net", True)], [("revolved", False), ("net", False)]
 
 
 def kernel(name: str, *tensors: Tensor) -> Callable[..., Any] | None:
@@ -49,8 +49,8 @@ def kernel(name: str, *tensors: Tensor) -> Callable[..., Any] | None:
 
 def whole_kernel(name: str, interfaces: Sequence[Any]) -> Callable[..., Any] | None:
     """Return the kernel that traces rays across all of these Interfaces: a mirror, or a front and a net; or None."""
-    given = [(KINDS.get(interface.surface.kind), interface.law.reverses) for interface in interfaces]
-    if given not in WHOLE or not all(loss.fused for interface in interfaces for loss in interface.losses):
+    path = [(SURFACE_FORMS.get(interface.surface.kind), interface.law.reverses) for interface in interfaces]
+    if path not in WHOLE_PATHS or not all(loss.fused for interface in interfaces for loss in interface.losses):
         return None
     return kernel(name, interfaces[-1].surface.heights)
 

@@ -1,12 +1,12 @@
-"""Reach: where a face can send light, in closed form.
+"""Reach of a face: the points to which it can deflect light, in closed form.
 
-A face of relative index η = n / n' > 1 turns a ray by θ' - θ, sin θ' = η sin θ.  The angle grows with θ, and at the
-critical angle, sin θ = 1 / η, where light leaves along the face, it is 90° - asin(1 / η): 48° at η = 1.4936.  A place
-of the face can send its light towards an aim if the angle between the two directions is less than that of a ray which
-leaves at GRAZING, and if the normal that the law asks for, parallel to η d - d', stands in a slope of at most STEEPEST.
-A mirror is bound by its slope alone.
+A face of relative index η = n / n' > 1 deflects a ray by θ' - θ, sin θ' = η sin θ.  The deflection grows with θ.  At
+the critical angle, sin θ = 1 / η, light leaves along the face and the deflection is 90° - asin(1 / η): 48° at η =
+1.4936.  A point of the face can send its light to an aim if the deflection is at most that of a ray that leaves at
+MAX_EXIT_ANGLE, and if the normal required by Snell's law, parallel to η d - d', belongs to a slope of at most
+MAX_SLOPE.  A mirror is limited by its slope alone.
 
-Which of the places sends its light there is for a map to say (tailoring/reachable.py).
+A transport map assigns the points of the face to the aims (tailoring/reachable.py).
 """
 
 from __future__ import annotations
@@ -26,28 +26,29 @@ from bstcad.optics.rays import Rays
 from bstcad.optics.receivers import Receiver
 from bstcad.optics.tubes import rays_to
 
-GRAZING = math.radians(85)  # from the normal, in air; 0.2° from the critical angle in PMMA
-STEEPEST = math.tan(math.radians(70))  # slope; no tool reaches a steeper one, which makes the lens as thick as wide
+MAX_EXIT_ANGLE = math.radians(85)  # largest angle of refraction in air (rad), at 0.2° from the critical angle in PMMA
+MAX_SLOPE = math.tan(math.radians(70))  # largest slope: no tool machines a steeper one; lens as thick as wide
 
 
-def largest_deflection(index: float, grazing: float = GRAZING) -> float:
-    """The angle (rad) by which a face turns a ray at `grazing` (rad) from the normal in air."""
+def largest_deflection(index: float, grazing: float = MAX_EXIT_ANGLE) -> float:
+    """Return the angle (rad) by which a face deflects a ray that leaves at `grazing` (rad) from the normal in air."""
     return grazing - math.asin(math.sin(grazing) / index)
 
 
 def grazing_of(index: float, others: Iterable[float], spread: float = 0.0) -> float:
-    """The angle (rad) to the normal, GRAZING at most, at which light may leave so that no other light is reflected.
+    """Return the largest exit angle (rad), at most MAX_EXIT_ANGLE, at which no other light is totally reflected.
 
-    others: relative indices for other lines of the light, of which the greatest meets its critical angle first; spread:
-    angle (rad) in the glass between a ray and the others that meet the face at the same place.
+    others: relative indices at the other wavelengths; the largest index reaches its critical angle first.  spread:
+    largest angle (rad) in the glass between a ray and the other rays that meet the face at the same point.
     """
-    steepest = math.asin(math.sin(GRAZING) / max((index, *others)))  # incidence of the line that is bent most
-    return math.asin(index * math.sin(max(steepest - spread, 0.0)))
+    largest = math.asin(math.sin(MAX_EXIT_ANGLE) / max((index, *others)))  # incidence at the wavelength deflected most
+    return math.asin(index * math.sin(max(largest - spread, 0.0)))
 
 
 def spread_at(source: Emitter, lens: Lens) -> float:
-    """The largest angle (rad) before the last freeform face, at its middle, between light from the middle of a source
-    and light from the ends of its extent; 0 for a point.
+    """Return the angle (rad) that an extended source subtends in front of the last freeform face; 0 for a point.
+
+    It is the largest angle at the centre of the face between light from the centre of the source and from its ends.
     """
     if source.extent is None:
         return 0.0
@@ -61,84 +62,85 @@ def spread_at(source: Emitter, lens: Lens) -> float:
 
 
 def directions(at_face: Rays, aim: Tensor, plane: Receiver) -> tuple[Tensor, Tensor, Tensor]:
-    """(d, d', d · d') of rays at a face and towards aims (2, …) on the receiver, both unit vectors (3, …)."""
+    """Return (d, d', d · d'): unit vectors (3, …) along rays at a face and from it to aims (2, …) on the receiver."""
     out = plane.vector_to(at_face, aim)
     d, out = at_face.direction, out / torch.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
     return d, out, d[0] * out[0] + d[1] * out[1] + d[2] * out[2]
 
 
 def wanted_slopes(at_face: Rays, aim: Tensor, plane: Receiver, law: Law) -> tuple[Tensor, Tensor]:
-    """(∂z/∂x, ∂z/∂y) that send each ray towards aim (2, …) on the receiver, as `slopes_towards` has it."""
+    """Return the slopes (∂z/∂x, ∂z/∂y) that send each ray to an aim (2, …) on the receiver (see `slopes_towards`)."""
     _, out, _ = directions(at_face, aim, plane)
     return slopes_towards(at_face, out, law)
 
 
 def slopes_towards(at_face: Rays, out: Tensor, law: Law) -> tuple[Tensor, Tensor]:
-    """(∂z/∂x, ∂z/∂y) that turn each ray into the direction d' of `out`, unit vectors (3, …).
+    """Return the slopes (∂z/∂x, ∂z/∂y) that deflect each ray into the direction d' of `out`, unit vectors (3, …).
 
-    Both laws say that η d - d' is parallel to the normal (-z_x, -z_y, 1), d and d' the directions before the face and
-    behind it; into glass, η < 1, it is antiparallel.  Where no face can do that, the slope turns the ray towards the
-    same side, as far as a ray that meets or leaves it at GRAZING, and is no steeper than STEEPEST.
+    By both laws η d - d' is parallel to the normal (-z_x, -z_y, 1), with d and d' the directions in front of the face
+    and behind it; into glass, η < 1, it is antiparallel.  If no face can deflect a ray so far, the slope deflects it
+    towards the same side by the largest angle, that of a ray which meets or leaves the face at MAX_EXIT_ANGLE.  No
+    slope is steeper than MAX_SLOPE.
     """
     d = at_face.direction
     along = d[0] * out[0] + d[1] * out[1] + d[2] * out[2]
-    most = math.pi if law.reverses else largest_deflection(max(law.eta, 1 / law.eta))
-    out = torch.where(along < math.cos(most), _turned(d, out, along, most), out)
+    largest = math.pi if law.reverses else largest_deflection(max(law.eta, 1 / law.eta))
+    out = torch.where(along < math.cos(largest), _at_angle(d, out, along, largest), out)
     normal = normal_towards(at_face, out, law)
-    height = torch.maximum(normal[2], torch.sqrt(normal[0] ** 2 + normal[1] ** 2) / STEEPEST)
+    height = torch.maximum(normal[2], torch.sqrt(normal[0] ** 2 + normal[1] ** 2) / MAX_SLOPE)
     return -normal[0] / height, -normal[1] / height
 
 
 def normal_towards(at_face: Rays, out: Tensor, law: Law) -> Tensor:
-    """±(η d - d'): the normal (3, …), of any length, of a face that turns each ray into the direction d' of `out`."""
+    """Return ±(η d - d'): the normal (3, …), of any length, of a face that deflects each ray into d' = `out`."""
     return (at_face.sense if law.eta >= 1 else -at_face.sense) * (law.eta * at_face.direction - out)
 
 
-def kept_from_reflection(
-    at_face: Rays, slopes: tuple[Tensor, Tensor], law: Law, grazing: float = GRAZING
+def limit_refraction(
+    at_face: Rays, slopes: tuple[Tensor, Tensor], law: Law, grazing: float = MAX_EXIT_ANGLE
 ) -> tuple[Tensor, Tensor]:
-    """Slopes (∂z/∂x, ∂z/∂y) at which no ray leaves a refracting face further than `grazing` (rad) from the normal.
+    """Limit slopes (∂z/∂x, ∂z/∂y) so that no angle of refraction at a face into air exceeds `grazing` (rad).
 
-    A normal that stands too far from the ray is turned towards it, in their common plane; all others stay.
+    A normal at too large an angle to the ray is rotated towards it in their common plane; other slopes do not change.
     """
     if law.reverses or law.eta <= 1:
         return slopes
     z_x, z_y = slopes
-    d, most = at_face.sense * at_face.direction, math.asin(math.sin(grazing) / law.eta)
+    d, largest = at_face.sense * at_face.direction, math.asin(math.sin(grazing) / law.eta)
     normal = torch.stack([-z_x, -z_y, torch.ones_like(z_x)]) / torch.sqrt(1 + z_x * z_x + z_y * z_y)
     along = d[0] * normal[0] + d[1] * normal[1] + d[2] * normal[2]
-    turned = _turned(d, normal, along, most)
-    beyond = (along < math.cos(most)) & (turned[2] > 0)
-    return torch.where(beyond, -turned[0] / turned[2], z_x), torch.where(beyond, -turned[1] / turned[2], z_y)
+    limit = _at_angle(d, normal, along, largest)
+    exceeds = (along < math.cos(largest)) & (limit[2] > 0)
+    return torch.where(exceeds, -limit[0] / limit[2], z_x), torch.where(exceeds, -limit[1] / limit[2], z_y)
 
 
-def _turned(d: Tensor, towards: Tensor, along: Tensor, angle: float) -> Tensor:
-    """Unit vectors (3, …) at an angle (rad) to d, in its plane with others; along: the product d · towards of both."""
+def _at_angle(d: Tensor, towards: Tensor, along: Tensor, angle: float) -> Tensor:
+    """Return unit vectors (3, …) at an angle (rad) to d in the plane of d and `towards`; along: d · towards."""
     across = towards - along * d
     across = across / torch.sqrt(across[0] ** 2 + across[1] ** 2 + across[2] ** 2).clamp(min=1e-12)
     return math.cos(angle) * d + math.sin(angle) * across
 
 
-def room(at_face: Rays, aim: Tensor, plane: Receiver, law: Law, grazing: float = GRAZING) -> Tensor:
-    """How far (a cosine) each ray is from the end of what a slope of the face can do to it: negative beyond.
+def reach_margin(at_face: Rays, aim: Tensor, plane: Receiver, law: Law, grazing: float = MAX_EXIT_ANGLE) -> Tensor:
+    """Return the margin of each ray (a cosine) to the limits of what the face can do; negative: out of reach.
 
-    The least of three: d · d' less the cosine of the largest deflection; n_z - |(n_x, n_y)| / STEEPEST of the normal
-    n = η d - d'; and the cosine to the receiver's normal with which the light meets it from before.
+    It is the minimum of three: d · d' minus the cosine of the largest deflection; n_z - |(n_x, n_y)| / MAX_SLOPE of the
+    normal n = η d - d'; and the cosine between the light and the receiver's normal on the side of the lens.
     """
     _, out, along = directions(at_face, aim, plane)
     normal = normal_towards(at_face, out, law)
-    upright = normal[2] - torch.sqrt(normal[0] ** 2 + normal[1] ** 2) / STEEPEST
+    upright = normal[2] - torch.sqrt(normal[0] ** 2 + normal[1] ** 2) / MAX_SLOPE
     n_x, n_y, n_z = plane.normal(aim)
     onwards = (-at_face.sense if law.reverses else at_face.sense) * (n_x * out[0] + n_y * out[1] + n_z * out[2])
-    least = torch.minimum(upright, onwards)
+    margin = torch.minimum(upright, onwards)
     if law.reverses:
-        return least
-    return torch.minimum(least, along - math.cos(largest_deflection(max(law.eta, 1 / law.eta), grazing)))
+        return margin
+    return torch.minimum(margin, along - math.cos(largest_deflection(max(law.eta, 1 / law.eta), grazing)))
 
 
 def unreached(picture: np.ndarray, part: np.ndarray, angle: float | None) -> dict[str, float | None]:
-    """What lies outside of the part of a target that can be lit: its share of the area, and of the light of a picture.
+    """Return the fractions of area and light of a picture that lie outside the reachable part of the target.
 
-    angle: the largest (degrees) by which a face turns light (Passes.largest_turn).
+    angle: largest deflection (degrees) of the face (Passes.largest_turn), copied to the result.
     """
     return {"area": float(1 - part.mean()), "light": float(picture[~part].sum() / picture.sum()), "angle": angle}

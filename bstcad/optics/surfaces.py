@@ -1,7 +1,7 @@
 """Plane, sphere, conic and toroid.  The docstring of a surface is its equation.
 
-Every surface, the B-spline too (bspline.py), answers the questions of `Surface`, so that tracing asks for no class:
-a plane is a surface of curvature zero, a sphere a conic of conic constant zero.
+Every surface, including the B-spline (bspline.py), implements `Surface`, so that tracing does not depend on its class.
+A plane is a surface of curvature zero, and a sphere is a conic of conic constant zero.
 """
 
 from __future__ import annotations
@@ -17,66 +17,66 @@ from torch import Tensor
 
 from bstcad.optics.outlines import STRICT, Circle, Outline
 
-EQUATOR = 1e-6  # least 1 - (1 + k) c² r², for a sphere cos² of its slope's angle: below it a surface is too steep
+MIN_COS2 = 1e-6  # smallest 1 - (1 + k) c² r², for a sphere cos² of its slope's angle; below it a surface is too steep
 
 
 class Surface(ABC):
-    """A height z over (x, y); lengths in mm."""
+    """Surface given by its height z over (x, y); lengths in mm."""
 
-    z: float  # where it crosses the axis, or for a net the plane that its heights are measured from
+    z: float  # height of the vertex on the axis, or for a net of the plane its heights are measured from (mm)
     kind: str
-    is_net = False  # is it a B-spline net, with `heights`?
-    level = False  # is it z = const, so that light along the axis meets it head on?
+    is_net = False  # True for a B-spline net, which has `heights`
+    level = False  # True for a plane z = const, which light along the axis meets at normal incidence
     curvature: float | Tensor  # curvature at the vertex of a surface of revolution (1/mm), > 0 towards +z
     conic_constant: float | Tensor  # conic constant of a surface of revolution
-    detail = math.inf  # width (mm) of its smooth pieces
-    outline: Circle | None = None  # outline of the optical part, a plane around it; None: all of it is optical
+    detail = math.inf  # width of the smooth pieces of the surface (mm)
+    outline: Circle | None = None  # outline of the optical part, with a plane around it; None: all of it is optical
 
     @property
     def optical(self) -> Surface:
-        """Its optical part."""
+        """Optical part of the surface."""
         return self
 
     @property
     def around(self) -> Surface:
-        """What lies at the rim of a lens that is larger than its outline: the plane around it, else itself."""
+        """Surface at the rim of a lens that is larger than the optical part: the plane around it, else the surface."""
         return self
 
     @abstractmethod
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(height over the plane z, ∂z/∂x, ∂z/∂y) at (x, y)."""
+        """Return (height over the plane z in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm."""
 
     def sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(z, ∂z/∂x, ∂z/∂y) at (x, y)."""
+        """Return (z in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm."""
         h, z_x, z_y = self.relative_sag_and_slope(x, y)
         return self.z + h, z_x, z_y
 
     def reaches(self, x: Tensor, y: Tensor) -> Tensor:
-        """True where there is a point of the surface over (x, y)."""
+        """Return True where the surface has a point over (x, y)."""
         return torch.ones_like(x, dtype=torch.bool)
 
     @abstractmethod
     def sags(self, outline: Outline) -> tuple[float, float]:
-        """The lowest and the highest height (mm) over the plane z inside the outline, zero included."""
+        """Return the lowest and the highest height (mm) over the plane z inside the outline, zero included."""
 
     def parameters(self) -> dict[str, float | Tensor]:
-        """The shape parameters that tailoring may change, by name, without the place z."""
+        """Return the shape parameters that tailoring may change, by name, without the position z."""
         return {}
 
     def with_parameters(self, **values: float | Tensor) -> Self:
-        """The same surface with other values of some of its parameters."""
+        """Return the surface with other values of some of its parameters."""
         return replace(self, **values)
 
     def moved(self, z: float) -> Self:
-        """The same surface from another plane z."""
+        """Return the surface moved along the axis to a position z (mm)."""
         return replace(self, z=z)
 
     def scaled(self, factor: float, about: float) -> Surface:
-        """Return the surface larger by a factor about the point of the axis at z = `about` (mm)."""
+        """Return the surface scaled by a factor about the point of the axis at z = `about` (mm)."""
         raise self.unknown
 
     def bent(self, curvature: float) -> Surface:
-        """Return the surface with so much more curvature (1/mm) at its vertex."""
+        """Return the surface with `curvature` (1/mm) added at its vertex."""
         raise self.unknown
 
     def conic(self) -> tuple[float, float]:
@@ -85,21 +85,21 @@ class Surface(ABC):
 
     @property
     def unknown(self) -> ValueError:
-        """The refusal of a surface that is neither a net nor a plane, a sphere or a conic."""
-        return ValueError(f"the {self.kind} has no conic constant; give it by scene.changed, which fits a net to it")
+        """Error for a surface that is not a net, a plane, a sphere or a conic."""
+        return ValueError(f"the {self.kind} has no conic constant; pass it to scene.changed, which fits a net to it")
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Self:
-        """The same surface with its tensors in another precision or on another device; numbers stay numbers."""
-        there = {n: v.to(dtype=dtype, device=device) for n, v in self.parameters().items() if isinstance(v, Tensor)}
-        return replace(self, **there) if there else self
+        """Return the surface with its tensors in another precision or on another device; numbers stay numbers."""
+        moved = {n: v.to(dtype=dtype, device=device) for n, v in self.parameters().items() if isinstance(v, Tensor)}
+        return replace(self, **moved) if moved else self
 
     def plain(self) -> Self:
-        """The same surface in float64 on the CPU, without gradient; single numbers are Python's."""
+        """Return the surface in float64 on the CPU, without gradient; scalars become Python floats."""
         return replace(self, z=float(self.z), **{name: float(value) for name, value in self.parameters().items()})
 
 
 def sampled(surface: Surface, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """z (mm), ∂z/∂x and ∂z/∂y of a surface at points (mm), numpy arrays of one shape or numbers, in float64."""
+    """Return z (mm), ∂z/∂x and ∂z/∂y of a surface at points (mm), arrays of one shape or numbers, in float64."""
     x, y = (np.require(p, float, ["C", "W"]) for p in np.broadcast_arrays(x, y))
     values = surface.plain().sag_and_slope(*(torch.from_numpy(p.ravel()) for p in (x, y)))
     z, z_x, z_y = (value.numpy().reshape(x.shape) for value in values)
@@ -107,20 +107,20 @@ def sampled(surface: Surface, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray, n
 
 
 def sag(surface: Surface, x: Any, y: Any) -> np.ndarray:
-    """z (mm) of a surface at points (mm), as `sampled` has it."""
+    """Return z (mm) of a surface at points (mm), as `sampled` does."""
     return sampled(surface, x, y)[0]
 
 
 class _Revolved(Surface):
-    """Surfaces of revolution: c = `curvature`, k = `conic_constant`."""
+    """Surface of revolution: c = `curvature`, k = `conic_constant`."""
 
     @property
     def level(self) -> bool:
-        """Is it z = const, so that light along the axis meets it head on?"""
+        """True for a plane z = const, which light along the axis meets at normal incidence."""
         return not isinstance(self.curvature, Tensor) and self.curvature == 0
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; beyond the rim of the surface finite numbers without meaning.
+        """Return (z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; finite, but without meaning, outside the rim.
 
         ∂z/∂x = c x / sqrt(1 - (1 + k) c² r²).
         """
@@ -130,16 +130,16 @@ class _Revolved(Surface):
         return c * r2 / (1 + root), c * x / root, c * y / root
 
     def reaches(self, x: Tensor, y: Tensor) -> Tensor:
-        """True where there is a point of the surface over (x, y); a rim where it stands upright does not count."""
-        return self._cos2(x * x + y * y) > EQUATOR
+        """Return True where the surface has a point over (x, y) and is not vertical."""
+        return self._cos2(x * x + y * y) > MIN_COS2
 
     def scaled(self, factor: float, about: float) -> Self:
-        """Return the surface larger by a factor about the point of the axis at z = `about` (mm)."""
+        """Return the surface scaled by a factor about the point of the axis at z = `about` (mm)."""
         moved = self.moved(about + factor * (self.z - about))
         return moved.with_parameters(curvature=self.curvature / factor) if self.curvature else moved
 
     def bent(self, curvature: float) -> Surface:
-        """Return the surface with so much more curvature (1/mm) at its vertex; a plane becomes a sphere."""
+        """Return the surface with `curvature` (1/mm) added at its vertex; a plane becomes a sphere."""
         curvature = self.curvature + curvature
         return self.with_parameters(curvature=curvature) if self.curvature else Sphere(self.z, curvature)
 
@@ -151,23 +151,23 @@ class _Revolved(Surface):
         return 1 - self.curvature * self.curvature * (1 + self.conic_constant) * r2
 
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
-        """(s in mm, met): path along rays from (x, y) of the plane z0 to the part of the surface around its vertex.
+        """Return (s in mm, met): path along rays from (x, y) on the plane z0 to the surface around its vertex.
 
-        a s² - 2 g s + c r² = 0, a = c (1 + k d_z²), g = d_z - c (x d_x + y d_y), solved as
-        s = c r² / (g + sqrt(g² - a c r²)): of the two roots that where a ray comes from below, d_z > ∇z · (d_x, d_y).
-        sense: -1 for light along -z, which comes from above; then it is the other root.
+        a s² - 2 g s + c r² = 0, a = c (1 + k d_z²), g = d_z - c (x d_x + y d_y), is solved as
+        s = c r² / (g + sqrt(g² - a c r²)), the root at which a ray comes from below, d_z > ∇z · (d_x, d_y).
+        sense: -1 for light along -z, which comes from above and takes the other root.
         """
         c, (dx, dy, dz) = self.curvature, direction
         f = c * (x * x + y * y)
         g = dz - c * (x * dx + y * dy)
         k = g * g - c * (1 + self.conic_constant * dz * dz) * f
-        below = g + sense * torch.sqrt(torch.where(k > 0, k, torch.ones_like(k)))
-        ok = (k > 0) & (sense * below > 1e-6)
-        s = f / torch.where(ok, below, torch.ones_like(below))
-        return s, ok & ((1 + self.conic_constant) * c * s * dz < 1)  # the other half, or the other sheet, is none of it
+        divisor = g + sense * torch.sqrt(torch.where(k > 0, k, torch.ones_like(k)))
+        ok = (k > 0) & (sense * divisor > 1e-6)
+        s = f / torch.where(ok, divisor, torch.ones_like(divisor))
+        return s, ok & ((1 + self.conic_constant) * c * s * dz < 1)  # excludes the far half and the other sheet
 
     def sags(self, outline: Outline) -> tuple[float, float]:
-        """Zero and the sag where the outline is farthest from the axis (mm), the lower one first."""
+        """Return zero and the sag where the outline is farthest from the axis (mm), the lower one first."""
         x, y = (torch.tensor(p, dtype=torch.float64) for p in outline.farthest)
         rim = float(self.plain().relative_sag_and_slope(x, y)[0])
         return min(rim, 0.0), max(rim, 0.0)
@@ -185,12 +185,12 @@ class Plane(_Revolved):
     curvature = conic_constant = 0.0
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm: all zero."""
+        """Return (z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm: all zero."""
         zero = torch.zeros_like(x)
         return zero, zero, zero
 
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
-        """(s in mm, met): where rays through (x, y) of the plane z0 meet the surface, as path from there: at once."""
+        """Return (s in mm, met) for rays from (x, y) on the plane z0: zero, and True."""
         return torch.zeros_like(x), torch.ones_like(x, dtype=torch.bool)
 
 
@@ -198,7 +198,7 @@ class Plane(_Revolved):
 class Sphere(_Revolved):
     """z = z0 + c r² / (1 + sqrt(1 - c² r²)), r² = x² + y²; c may be zero (a plane).
 
-    This form (Wang et al. 2023, Eq. 16) keeps its digits where R - sqrt(R² - r²) loses all of them.
+    This form (Wang et al. 2023, Eq. 16) avoids the cancellation in R - sqrt(R² - r²).
     """
 
     z: float  # vertex (mm)
@@ -210,7 +210,7 @@ class Sphere(_Revolved):
     conic_constant = 0.0
 
     def parameters(self) -> dict[str, float | Tensor]:
-        """The curvature (1/mm)."""
+        """Return the curvature (1/mm)."""
         return {"curvature": self.curvature}
 
 
@@ -218,8 +218,8 @@ class Sphere(_Revolved):
 class Conic(_Revolved):
     """z = z0 + c r² / (1 + sqrt(1 - (1 + k) c² r²)), r² = x² + y²; on it c r² - 2 (z - z0) + (1 + k) c (z - z0)² = 0.
 
-    k = 0: a sphere; -1 < k < 0: an ellipsoid, its long axis the lens's; k = -1: a paraboloid; k < -1: a hyperboloid;
-    k > 0: an ellipsoid, its short axis the lens's.
+    k = 0: a sphere; -1 < k < 0: an ellipsoid with its long axis on the axis of the lens; k = -1: a paraboloid; k < -1:
+    a hyperboloid; k > 0: an ellipsoid with its short axis on the axis of the lens.
     """
 
     z: float  # vertex (mm)
@@ -230,7 +230,7 @@ class Conic(_Revolved):
     __pydantic_config__ = STRICT
 
     def parameters(self) -> dict[str, float | Tensor]:
-        """The curvature (1/mm) and the conic constant."""
+        """Return the curvature (1/mm) and the conic constant."""
         return {"curvature": self.curvature, "conic_constant": self.conic_constant}
 
 
@@ -250,7 +250,7 @@ class Toroid(Surface):
     __pydantic_config__ = STRICT
 
     def _profile(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(1 - c_x² x², 1 - c_y f, ((1 - c_y f)² - c_y² y²)): the first and the last are positive inside its rim."""
+        """Return (1 - c_x² x², 1 - c_y f, (1 - c_y f)² - c_y² y²); the first and the last are positive in the rim."""
         c = self.curvature_x
         cos2 = 1 - c * c * x * x
         f = c * x * x / (1 + _root(cos2))
@@ -258,9 +258,9 @@ class Toroid(Surface):
         return cos2, left, left * left - (self.curvature_y * y) ** 2
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; beyond the rim of the surface finite numbers without meaning.
+        """Return (z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; finite, but without meaning, outside the rim.
 
-        In the form z - z0 = (f (2 - c_y f) + c_y y²) / (1 + sqrt((1 - c_y f)² - c_y² y²)) it keeps its digits.
+        The form z - z0 = (f (2 - c_y f) + c_y y²) / (1 + sqrt((1 - c_y f)² - c_y² y²)) avoids cancellation.
         """
         cos2, left, g = self._profile(x, y)
         c_x, c_y, along, root = self.curvature_x, self.curvature_y, _root(cos2), _root(g)
@@ -268,9 +268,9 @@ class Toroid(Surface):
         return h, left * c_x * x / along / root, c_y * y / root
 
     def reaches(self, x: Tensor, y: Tensor) -> Tensor:
-        """True where there is a point of the surface over (x, y); a rim where it stands upright does not count."""
+        """Return True where the surface has a point over (x, y) and is not vertical."""
         cos2, left, g = self._profile(x, y)
-        return (cos2 > EQUATOR) & (g > EQUATOR) & (left > 0)
+        return (cos2 > MIN_COS2) & (g > MIN_COS2) & (left > 0)
 
     def sags(self, outline: Outline) -> tuple[float, float]:
         """Return the lowest and the highest sag (mm) at the rim of the outline, and zero."""
@@ -278,28 +278,28 @@ class Toroid(Surface):
         return min(float(h.min()), 0.0), max(float(h.max()), 0.0)
 
     def parameters(self) -> dict[str, float | Tensor]:
-        """The curvatures along x and y (1/mm)."""
+        """Return the curvatures along x and y (1/mm)."""
         return {"curvature_x": self.curvature_x, "curvature_y": self.curvature_y}
 
 
 def _root(square: Tensor) -> Tensor:
-    """Return the square root, guarded where the surface stands upright."""
-    return torch.sqrt(torch.where(square > EQUATOR, square, torch.full_like(square, EQUATOR)))
+    """Return the square root, limited where the surface is vertical."""
+    return torch.sqrt(torch.where(square > MIN_COS2, square, torch.full_like(square, MIN_COS2)))
 
 
 @dataclass(frozen=True)
 class Recess(Surface):
-    """z = that of a surface of revolution inside a circle, and beyond it that of its rim, a plane z = const.
+    """Surface of revolution inside a circle, continued outside by the plane z = const through its rim.
 
-    Such as the dome over an LED in a flat underside, or a bulge of one.  Light is traced to the optical part alone.
+    Examples are the dome over an LED in a flat underside, or a bulge of it.  Light is traced to the optical part alone.
     """
 
-    face: Sphere | Conic  # the optical part
+    face: Sphere | Conic  # optical part
     outline: Circle  # outline of the optical part, about the axis
 
     @property
     def optical(self) -> Sphere | Conic:
-        """Its optical part."""
+        """Optical part of the surface."""
         return self.face
 
     def __post_init__(self) -> None:
@@ -308,42 +308,42 @@ class Recess(Surface):
 
     @property
     def around(self) -> Plane:
-        """The plane through its rim."""
-        falls, rises = self.face.sags(self.outline)
-        return Plane(float(self.z) + falls + rises)  # one of which is zero
+        """Plane through the rim of the optical part."""
+        low, high = self.face.sags(self.outline)
+        return Plane(float(self.z) + low + high)  # one of the two is zero
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm."""
-        inside, none = self.outline.contains(x, y), torch.zeros_like(x)
+        """Return (z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm."""
+        inside, zero = self.outline.contains(x, y), torch.zeros_like(x)
         h, z_x, z_y = self.face.relative_sag_and_slope(x, y)
         rim = torch.full_like(h, sum(self.face.sags(self.outline)))
-        return torch.where(inside, h, rim), torch.where(inside, z_x, none), torch.where(inside, z_y, none)
+        return torch.where(inside, h, rim), torch.where(inside, z_x, zero), torch.where(inside, z_y, zero)
 
     def sags(self, outline: Outline) -> tuple[float, float]:
-        """Zero and the sag of the optical part where that, or the outline, ends, the lower one first."""
+        """Return zero and the sag (mm) at the end of the optical part or of the outline, the lower one first."""
         smaller = math.hypot(*outline.farthest) < self.outline.radius
         return self.face.sags(outline if smaller else self.outline)
 
     def with_parameters(self, **values: float | Tensor) -> Recess:
-        """The same with another optical part."""
+        """Return the surface with other parameters of its optical part."""
         return replace(self, face=self.face.with_parameters(**values))
 
     def moved(self, z: float) -> Recess:
-        """The same with its vertex at another z (mm)."""
+        """Return the surface with its vertex at z (mm)."""
         return replace(self, face=self.face.moved(z))
 
     def scaled(self, factor: float, about: float) -> Recess:
-        """Return the surface and its outline larger by a factor about the point of the axis at z = `about` (mm)."""
+        """Return the surface and its outline scaled by a factor about the point of the axis at z = `about` (mm)."""
         return Recess(self.face.scaled(factor, about), self.outline.scaled(factor))
 
     def bent(self, curvature: float) -> Recess:
-        """Return the surface with so much more curvature (1/mm) at its vertex."""
+        """Return the surface with `curvature` (1/mm) added at its vertex."""
         return replace(self, face=self.face.bent(curvature))
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Recess:
-        """The same with its tensors in another precision or on another device."""
+        """Return the surface with its tensors in another precision or on another device."""
         return replace(self, face=self.face.to(dtype, device))
 
     def plain(self) -> Recess:
-        """The same in float64 on the CPU, without gradient."""
+        """Return the surface in float64 on the CPU, without gradient."""
         return replace(self, face=self.face.plain())

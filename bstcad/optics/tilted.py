@@ -18,7 +18,7 @@ from torch import Tensor
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Vector
-from bstcad.optics.surfaces import EQUATOR, Plane, Sphere, Surface
+from bstcad.optics.surfaces import MIN_COS2, Plane, Sphere, Surface
 
 Face = Plane | Sphere
 
@@ -66,13 +66,13 @@ class TiltedSurface(Surface):
         """Return (h, ∂h/∂x, ∂h/∂y) at (x, y), ∂h/∂x = (c u_x - N_x) / (N_z - c h); meaningless outside the rim."""
         x, y, f = self._from_vertex(x, y)
         cos2 = self._cos2(f)
-        root = torch.sqrt(torch.where(cos2 > EQUATOR, cos2, torch.full_like(cos2, EQUATOR)))  # no NaN in the gradient
+        root = torch.sqrt(torch.where(cos2 > MIN_COS2, cos2, torch.full_like(cos2, MIN_COS2)))  # no NaN in the gradient
         n_x, n_y, n_z = self.unit
         return f / (n_z + root), (self.bend * x - n_x) / root, (self.bend * y - n_y) / root
 
     def reaches(self, x: Tensor, y: Tensor) -> Tensor:
         """Return True where the surface has a point over (x, y)."""
-        return self._cos2(self._from_vertex(x, y)[2]) > EQUATOR
+        return self._cos2(self._from_vertex(x, y)[2]) > MIN_COS2
 
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
         """Return (path s in mm, hit) along rays from (x, y) of the plane z = V_z to the surface.
@@ -84,7 +84,7 @@ class TiltedSurface(Surface):
         g = n_x * dx + n_y * dy + n_z * dz - self.bend * (x * dx + y * dy)
         k = g * g - self.bend * f
         below = g + sense * torch.sqrt(torch.where(k > 0, k, torch.ones_like(k)))
-        ok = (k > 0) & (sense * below > EQUATOR)
+        ok = (k > 0) & (sense * below > MIN_COS2)
         s = f / torch.where(ok, below, torch.ones_like(below))
         return s, ok & (self.bend * s * dz < n_z)
 

@@ -1,9 +1,9 @@
-"""Ray tubes: a sheet of rays whose quads carry the light between them, cut exactly at the pixel borders.
+"""Flux tubes: a grid of rays whose quads carry the light between them, cut exactly at the pixel borders.
 
-The corners of a grid of tubes are traced to the screen.  A tube of flux F lands on two triangles with F / 2
-each, spread evenly over their areas, and each pixel takes the part that falls into it.  The picture has no noise: its
-error is that of the linear interpolation between the corners and falls as the square of their distance.  It is
-differentiable in the landing points, whereas the counting of rays in a pixel is not.
+The corners of a grid of tubes are traced to the screen.  A tube of flux F lands on two triangles with F / 2 each,
+spread evenly over their areas, and each pixel takes the fraction that falls into it.  The picture has no noise: its
+error is the error of linear interpolation between the corners and falls as the square of their distance.  The picture
+is differentiable in the landing points, whereas the count of rays in a pixel is not.
 """
 
 from __future__ import annotations
@@ -26,115 +26,113 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed, Rays, Status, joined
 from bstcad.optics.receivers import LevelPlane, Receiver
 from bstcad.optics.sides import Sides, as_pair, spread
-from bstcad.optics.trace import behind, from_first_net, gets_through, whole_kernel
+from bstcad.optics.trace import behind, from_first_net, is_transmitted, whole_kernel
 
 ALL = slice(None)
-SHEET = 256  # tubes a side of the sheet through which finer ones are interpolated
-INWARDS = 1e-9  # relative shrink towards the middle: corners on the rim of the light are counted as lit
-BAND = 256  # rows of tubes at most traced at a time for a picture alone; even, since the diagonals alternate
-IN_BAND = 1 << 19  # tubes at most in these rows: of more columns fewer rows, so that memory does not grow
-CACHED = 1 << 17  # rays that plain torch takes at a time: a megabyte of each quantity
-PARTS = 4  # parts of a tube on the rim of the light, each way
-THINNEST = 1e-9  # pixel²: a triangle of less area gives all its flux to the pixel of its centre, without gradient
-COARSE = 65  # points a side of the grid on which the rays to given points are found first
-REVERSE_STEPS = 30  # at most, to find those rays
-ARRIVED = 1e-8  # distance from its point at which a ray is found, as a part of the grid's extent
-DIFFERENCE = 1e-6  # step of the difference quotients, as a part of the grid's extent
-SINGULAR = 0.1  # Broyden's update is skipped where its divisor is less than this times the square of the step
+SHEET_TUBES = 256  # tubes per side of the sheet from which finer sheets are interpolated
+RIM_SHRINK = 1e-9  # relative shrink towards the centre, so that corners on the rim of the light count as lit
+MAX_BAND_ROWS = 256  # maximum rows of tubes traced at a time for a picture; even, since the diagonals alternate
+MAX_BAND_TUBES = 1 << 19  # maximum tubes traced at a time for a picture, which limits its memory
+MAX_RAYS = 1 << 17  # maximum rays traced at a time in plain torch: a megabyte per quantity
+PARTS_PER_SIDE = 4  # parts per side of a tube that is partly lit
+MIN_TRIANGLE_AREA = 1e-9  # smallest area of a triangle that is cut (pixel²); a smaller one falls into one pixel
+COARSE_POINTS = 65  # points per side of the coarse grid on which the rays to given points are found first
+MAX_BROYDEN_STEPS = 30  # maximum number of Broyden steps of that search
+RAY_TOLERANCE = 1e-8  # distance from its point at which a ray counts as found, as a fraction of the grid's extent
+DIFFERENCE_STEP = 1e-6  # step of the difference quotients, as a fraction of the grid's extent
+MIN_BROYDEN_DIVISOR = 0.1  # smallest divisor of Broyden's update over the square of the step; below: no update
 
 
 @dataclass(frozen=True)
 class Tubes:
-    """The light on its way to the first freeform interface, as tubes between neighbouring rays."""
+    """Flux tubes in front of the first freeform interface, each between four neighbouring rays."""
 
-    coming: Rays  # (3, rows + 1, columns + 1) the corners; their flux is the share that faces and glass leave
-    flux: Tensor  # (rows, columns) launched in each tube, as a fraction of the source's
+    rays: Rays  # rays at the corners (3, rows + 1, columns + 1); flux: the fraction that faces and glass leave
+    flux: Tensor  # flux launched in each tube (rows, columns), as a fraction of the source's
 
     def landing(self, lens: Lens, plane: Receiver) -> Landed:
-        """Where the corners meet the receiver; the outline counts in the flux, so that no corner is lost to it."""
-        return from_first_net(self.coming, lens.unbounded(), plane)
+        """Trace the corners to the receiver; the outlines already count in the flux, so that no corner is lost."""
+        return from_first_net(self.rays, lens.unbounded(), plane)
 
     def collect(self, corners: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
-        """(picture, outside): flux that falls into each pixel, row 0 = y max; and Σ flux · (pixels beyond the border)².
+        """Return (flux in each pixel, row 0 = y max; Σ flux · (pixels outside the border)²).
 
-        Tubes with a lost corner carry nothing.
+        A tube with a lost corner carries no flux.
         """
-        return collect(screen.pixels_of(corners.position.double()), self.whole(corners), screen.shape)
+        return collect(screen.pixels_of(corners.position.double()), self.arriving_flux(corners), screen.shape)
 
-    def carried(self, corners: Landed) -> Tensor:
-        """(rows, columns) flux that faces and glass leave each tube, whether it arrives or not."""
+    def transmitted_flux(self, corners: Landed) -> Tensor:
+        """Return the flux that faces and glass leave each tube (rows, columns), whether it arrives or not."""
         return self.flux * middle(corners.flux) if corners.taken else self.flux
 
-    def whole(self, corners: Landed) -> Tensor:
-        """(rows, columns) flux that arrives: of tubes whose corners all arrive, zero of the others."""
-        return arriving(self.carried(corners), corners)
+    def arriving_flux(self, corners: Landed) -> Tensor:
+        """Return the flux of each tube whose corners all arrive (rows, columns); zero for the others."""
+        return arriving_flux(self.transmitted_flux(corners), corners)
 
     def picture(self, lens: Lens, screen: Screen) -> Tensor:
-        """(rows, columns) flux that falls into each pixel, row 0 = y max."""
+        """Return the flux in each pixel (rows, columns), row 0 = y max."""
         return self.collect(self.landing(lens, screen.plane), screen)[0]
 
 
 @torch.no_grad()
 def launch_tubes(source: Emitter, lens: Lens, n: int) -> Tubes:
-    """n x n tubes that hold all the light which gets through both faces of the lens.
+    """Launch n x n tubes that hold all the light which gets through both faces of the lens.
 
-    Across a net of another number of control points along x than along y there are about as many, in the proportion of
-    its spans under the light.
-    The sheet is spread over the beam's cross-section if all of that gets through, else over the back face: its rim is
-    the rim of the light.  A tube in which only part of the light gets through carries that part, spread over all of it.
+    If the net has different numbers of control points along x and y, about n² tubes are launched, in the proportion of
+    its spans under the light.  The sheet covers the beam's cross-section if all of the beam gets through, else the back
+    face; its rim is the rim of the light.  A partly lit tube carries the flux of its lit part, spread over all of it.
     """
     sheet = _sheet(source, lens, n)
     flux: list[Tensor] = []
 
-    def coming() -> Iterator[Rays]:
-        for rows in _bands(sheet.count, _few_rows(n)):
+    def bands() -> Iterator[Rays]:
+        for rows in _bands(sheet.count, _rows_at_a_time(n)):
             band = _tubes(source, lens, *sheet.rows(rows), sheet.cut)
             flux.append(band.flux)
-            yield band.coming
+            yield band.rays
 
-    whole = joined(coming(), sheet.count + 1, shared=1)
-    if not whole.taken:  # all of them still have the share 1: told once
-        whole = replace(whole, flux=whole.flux[:1, :1].clone().expand(whole.flux.shape))
-    return Tubes(whole, torch.cat(flux))
+    rays = joined(bands(), sheet.count + 1, shared=1)
+    if not rays.taken:  # all fluxes are still 1: store one number
+        rays = replace(rays, flux=rays.flux[:1, :1].clone().expand(rays.flux.shape))
+    return Tubes(rays, torch.cat(flux))
 
 
 @torch.no_grad()
 def picture(
-    source: Emitter, lens: Lens, screen: Screen, n: int, few: int = SHEET, over_the_back: bool = False
+    source: Emitter, lens: Lens, screen: Screen, n: int, few: int = SHEET_TUBES, over_the_back: bool = False
 ) -> Tensor:
-    """(rows, columns) flux in each pixel by n x n tubes (`launch_tubes`), band by band: memory does not grow with n².
+    """Return the flux in each pixel (rows, columns) by n x n tubes (`launch_tubes`), in bands to limit the memory.
 
-    few: tubes a side of the sheet through which finer ones are interpolated, where the lens cuts the beam.
-    over_the_back: spread them there even where the lens cuts nothing, so that pictures of lenses that differ little err
-    alike, whether they cut the beam or just do not.
+    few: tubes per side of the sheet from which finer sheets are interpolated, where the lens cuts the beam.
+    over_the_back: spread the tubes over the back face even where the lens does not cut the beam.  Pictures of lenses
+    that differ little then have similar errors, whether or not they just cut the beam.
     """
     sheet = _sheet(source, lens, n, few=few, over_the_back=over_the_back)
-    whole = torch.zeros(screen.shape, dtype=torch.float64, device=lens.like.device)
-    for rows in _bands(sheet.count, min(BAND, 2 * max(1, IN_BAND // (2 * n)))):
-        x, y = (p + INWARDS * (middle - p) for p, middle in zip(sheet.rows(rows), sheet.middle, strict=True))
-        whole = whole + _tubes(source, lens, x=x, y=y, cut=sheet.cut).picture(lens, screen)
-    return whole.clamp(min=0)  # a black pixel may be off by rounding
+    flux = torch.zeros(screen.shape, dtype=torch.float64, device=lens.like.device)
+    for rows in _bands(sheet.count, min(MAX_BAND_ROWS, 2 * max(1, MAX_BAND_TUBES // (2 * n)))):
+        x, y = (p + RIM_SHRINK * (middle - p) for p, middle in zip(sheet.rows(rows), sheet.middle, strict=True))
+        flux = flux + _tubes(source, lens, x=x, y=y, cut=sheet.cut).picture(lens, screen)
+    return flux.clamp(min=0)  # rounding may make a black pixel negative
 
 
 @dataclass(frozen=True)
 class _Sheet:
-    """Where the corners of tubes cross the vertex plane of the first surface."""
+    """Points at which the corners of tubes cross the vertex plane of the first surface."""
 
-    rows: Callable[[slice], tuple[Tensor, Tensor]]  # (x, y) of some rows of them (mm)
-    count: int  # rows of tubes, along x
-    middle: tuple[float, float]  # middle of all (mm)
-    cut: bool  # does the lens cut the beam?
+    rows: Callable[[slice], tuple[Tensor, Tensor]]  # (x, y) of the corners in a slice of rows (mm)
+    count: int  # number of rows of tubes, along x
+    middle: tuple[float, float]  # centre of all corners (mm)
+    cut: bool  # True if the lens cuts the beam
 
 
 def _bands(count: int, size: int) -> Iterator[slice]:
-    """The rows of corners of `size` rows of tubes at a time, of so many in all."""
+    """Yield the rows of corners of bands of `size` rows of tubes, `count` rows in total."""
     for first in range(0, count, size):
         yield slice(first, min(first + size, count) + 1)
 
 
-def _few_rows(columns: int) -> int:
-    """Rows of a sheet that plain torch takes at a time."""
-    return max(1, CACHED // columns)
+def _rows_at_a_time(columns: int) -> int:
+    return max(1, MAX_RAYS // columns)
 
 
 def _tubes(source: Emitter, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes:
@@ -143,22 +141,22 @@ def _tubes(source: Emitter, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tube
     x, y = x.to(like), y.to(like)
     light, lit = source.rays(x, y, z, 1.0), None
     light = replace(light, flux=torch.ones_like(light.flux))
-    inside, ways = source.irradiance(x, y, z) > 0, [light]  # ways: before each interface
+    inside, rays = source.irradiance(x, y, z) > 0, [light]  # rays: in front of each interface
     interfaces = lens.unbounded().interfaces
-    edges = lens.with_apertures_scaled(1 + INWARDS).interfaces  # margin for rounding
+    edges = lens.with_apertures_scaled(1 + RIM_SHRINK).interfaces  # margin for rounding
     first, back = lens.freeform[0], lens.number_of("back")
     end = lens.solid.stop if lens.solid.stop > back + 1 else back  # light may meet the front again behind the back
     for k in range(max(first, end)):
-        ways.append(cross(ways[k], interfaces[k]).rays)
-        if k < end and k != back:  # the sheet ends at the back's rim by itself
-            inside = inside & edges[k].outline.contains(*ways[-1].position[:2])
+        rays.append(cross(rays[k], interfaces[k]).rays)
+        if k < end and k != back:  # the sheet itself ends at the back's rim
+            inside = inside & edges[k].outline.contains(*rays[-1].position[:2])
     if cut:
-        lit = inside & ways[end].alive
-    return Tubes(ways[first], _density(source, lens, x=x, y=y, lit=lit) * area)
+        lit = inside & rays[end].alive
+    return Tubes(rays[first], _density(source, lens, x=x, y=y, lit=lit) * area)
 
 
 def _density(source: Emitter, lens: Lens, x: Tensor, y: Tensor, lit: Tensor | None) -> Tensor:
-    """Flux a mm² of the vertex plane that each tube carries; `lit`: which corners are, None: all of them."""
+    """Return each tube's flux per mm² of the vertex plane; lit: True for corners that are lit, None: all are."""
     density = source.irradiance(middle(x), middle(y), lens.entrance.z)
     if lit is not None:
         count = middle(lit.to(density))
@@ -169,13 +167,13 @@ def _density(source: Emitter, lens: Lens, x: Tensor, y: Tensor, lit: Tensor | No
     return density.double()
 
 
-def _sheet(source: Emitter, lens: Lens, n: int, few: int = SHEET, over_the_back: bool = False) -> _Sheet:
-    """The sheet over the beam if all of that gets through and none is asked for over the back."""
+def _sheet(source: Emitter, lens: Lens, n: int, few: int = SHEET_TUBES, over_the_back: bool = False) -> _Sheet:
+    """Return the sheet over the beam if all of the beam gets through, else or on request the sheet over the back."""
     return (None if over_the_back else _over_the_beam(source, lens, n)) or _over_the_back(source, lens, n, few)
 
 
 def _over_the_beam(source: Emitter, lens: Lens, n: int) -> _Sheet | None:
-    """A sheet over all of the beam; None if the lens cuts it."""
+    """Return a sheet over all of the beam; None if the lens cuts it."""
     z = lens.entrance.z
     spot, centre = source.spot(z)
     if spot is None:
@@ -185,10 +183,10 @@ def _over_the_beam(source: Emitter, lens: Lens, n: int) -> _Sheet | None:
     ends = (slice(0, 1), ALL), (slice(n_x, None), ALL), (ALL, slice(0, 1)), (ALL, slice(n_y, None))
     sides = zip(*(corners(spot, count, *end) for end in ends), strict=True)
     rim = (
-        at + (1 - INWARDS) * torch.cat([p.reshape(-1) for p in side]) for side, at in zip(sides, centre, strict=True)
+        at + (1 - RIM_SHRINK) * torch.cat([p.reshape(-1) for p in side]) for side, at in zip(sides, centre, strict=True)
     )
     rim_x, rim_y = (p.to(lens.like) for p in rim)
-    if not bool(gets_through(source.rays(rim_x, rim_y, z, 1.0), lens).all()):
+    if not bool(is_transmitted(source.rays(rim_x, rim_y, z, 1.0), lens).all()):
         return None
 
     def rows(band: slice) -> tuple[Tensor, Tensor]:
@@ -199,11 +197,11 @@ def _over_the_beam(source: Emitter, lens: Lens, n: int) -> _Sheet | None:
 
 
 def _over_the_back(source: Emitter, lens: Lens, n: int, few: int) -> _Sheet:
-    """A sheet whose rim meets the rim of the back face; on a fine grid by splines through a coarse one.
+    """Return a sheet whose rim meets the rim of the back face; a fine one is interpolated from a coarse one by splines.
 
-    Only the rim has to lie well: a tube may lie anywhere as long as its flux is that of its own quad.
+    Only the rim must be exact: a tube may lie anywhere as long as it has the flux of its own quad.
     """
-    from scipy.interpolate import RectBivariateSpline  # with much else, which a plan has no use for
+    from scipy.interpolate import RectBivariateSpline  # slow to import, and not needed for a plan
 
     n_x, n_y = as_pair(_proportioned(lens, lens.apertures[1], n))
     few_x, few_y = min(n_x, few), min(n_y, few)
@@ -211,14 +209,14 @@ def _over_the_back(source: Emitter, lens: Lens, n: int, few: int) -> _Sheet:
     middle = tuple(float(total(p) / p.numel()) for p in (x, y))
     if (few_x, few_y) == (n_x, n_y):
         return _Sheet(lambda band: (x[band], y[band]), n_x, middle, cut=True)
-    places = [np.linspace(0, 1, k + 1) for k in (few_x, few_y)]
+    coarse = [np.linspace(0, 1, k + 1) for k in (few_x, few_y)]
     fine_x, fine_y = (np.linspace(0, 1, k + 1) for k in (n_x, n_y))
-    through = [RectBivariateSpline(*places, p.cpu().numpy(), s=0) for p in (x, y)]
-    return _Sheet(lambda band: tuple(torch.from_numpy(p(fine_x[band], fine_y)) for p in through), n_x, middle, cut=True)
+    splines = [RectBivariateSpline(*coarse, p.cpu().numpy(), s=0) for p in (x, y)]
+    return _Sheet(lambda band: tuple(torch.from_numpy(p(fine_x[band], fine_y)) for p in splines), n_x, middle, cut=True)
 
 
 def _proportioned(lens: Lens, light: Outline, n: int) -> Sides:
-    """n a side; over an oblong net about n² in the proportion of the spans of it that an outline holds each way."""
+    """Return the tubes per side: n, or over an oblong net about n² in the proportion of its spans inside `light`."""
     net = lens.nets[-1]
     if net.shape[0] == net.shape[1]:
         return n
@@ -226,36 +224,36 @@ def _proportioned(lens: Lens, light: Outline, n: int) -> Sides:
 
 
 def _quads(p: Tensor, where: Tensor) -> tuple[Tensor, ...]:
-    """One coordinate of the corners of the tubes at `where`, each (n,), row by row."""
+    """Return one coordinate of the four corners of the tubes where `where` is True, each (n,), row by row."""
     row, column = where.nonzero(as_tuple=True)
     return p[row, column], p[row, column + 1], p[row + 1, column], p[row + 1, column + 1]
 
 
 def _partly_lit(source: Emitter, lens: Lens, x: tuple[Tensor, ...], y: tuple[Tensor, ...]) -> Tensor:
-    """Mean flux density (1/mm²) of the light that gets through, over PARTS x PARTS parts of each tube of `_quads`."""
-    inner = torch.tensor([(k + 0.5) / PARTS for k in range(PARTS)], dtype=x[0].dtype, device=x[0].device)
+    """Return the mean flux density (1/mm²) of transmitted light over PARTS_PER_SIDE² parts of each tube of `_quads`."""
+    inner = ((torch.arange(PARTS_PER_SIDE) + 0.5) / PARTS_PER_SIDE).to(x[0])
     a, b = (t.reshape(-1, 1) for t in torch.meshgrid(inner, inner, indexing="ij"))
     p, q = (((1 - a) * ((1 - b) * c[0] + b * c[1]) + a * ((1 - b) * c[2] + b * c[3])).reshape(-1) for c in (x, y))
-    return _getting_through(source, lens, p, q).view(PARTS**2, -1).mean(0)
+    return _getting_through(source, lens, p, q).view(PARTS_PER_SIDE**2, -1).mean(0)
 
 
 def _getting_through(source: Emitter, lens: Lens, x: Tensor, y: Tensor) -> Tensor:
-    """Flux density (n,) (1/mm²) at points of the first vertex's plane (n,), zero where the lens cuts the light."""
-    behind = LevelPlane(lens.back.z + 1.0)  # a plane behind the lens, whichever
-    if lens.losses is None and (fast := whole_kernel("trace.land", source, lens, behind)):
-        landed = fast(source, lens, behind, x=x.double(), y=y.double())
+    """Return the flux density (n,) (1/mm²) at points of the first plane, zero where the lens cuts the light."""
+    receiver = LevelPlane(lens.back.z + 1.0)  # any plane behind the lens
+    if lens.losses is None and (fast := whole_kernel("trace.land", source, lens, receiver)):
+        landed = fast(source, lens, receiver, x=x.double(), y=y.double())
         return landed.flux * ((landed.status != int(Status.MISSED_FRONT)) & (landed.status != int(Status.VIGNETTED)))
-    return source.irradiance(x, y, lens.entrance.z) * gets_through(source.rays(x, y, lens.entrance.z, 1.0), lens)
+    return source.irradiance(x, y, lens.entrance.z) * is_transmitted(source.rays(x, y, lens.entrance.z, 1.0), lens)
 
 
 def corners(shape: Outline, sides: Sides, rows: slice = ALL, columns: slice = ALL) -> tuple[Tensor, Tensor]:
-    """The corners of so many tubes, which cover a shape to its rim; x along the first axis (mm)."""
+    """Return (x, y) (mm) of the corners of a grid of tubes that covers a shape to its rim; x along the first axis."""
     along_x, along_y = (torch.linspace(-1, 1, n + 1, dtype=torch.float64) for n in as_pair(sides))
     return shape.map_square(*torch.meshgrid(along_x[rows], along_y[columns], indexing="ij"))
 
 
-def arriving(flux: Tensor, corners: Landed) -> Tensor:
-    """The flux of each tube whose corners all arrive, zero for the others."""
+def arriving_flux(flux: Tensor, corners: Landed) -> Tensor:
+    """Return the flux of each tube whose corners all arrive; zero for the others."""
     alive = corners.alive
     if bool(alive.all()):
         return flux
@@ -264,7 +262,7 @@ def arriving(flux: Tensor, corners: Landed) -> Tensor:
 
 
 def area_of(x: Tensor, y: Tensor) -> Tensor:
-    """Area of each quad: half the cross product of its diagonals."""
+    """Return the area of each quad: half the cross product of its diagonals."""
     return ((x[1:, 1:] - x[:-1, :-1]) * (y[:-1, 1:] - y[1:, :-1])
             - (x[:-1, 1:] - x[1:, :-1]) * (y[1:, 1:] - y[:-1, :-1])).abs() / 2  # fmt: skip
 
@@ -273,37 +271,37 @@ def area_of(x: Tensor, y: Tensor) -> Tensor:
 def rays_to(
     source: Emitter, lens: Lens, x: Tensor, y: Tensor, number: int | None = None
 ) -> tuple[Tensor, Tensor, Rays]:
-    """The rays that meet an interface of the lens at the points (x, y) (rows, columns) mm.
+    """Find the rays that meet an interface of the lens at the points (x, y), a grid (rows, columns) in mm.
 
-    Returns where they cross the vertex plane of the first surface (mm), and the rays at the interface, before they
-    cross it.  number: of the interface; None: the back.  The points are neighbours on a grid.
+    number: number of the interface; None: the back.  Returns x and y (mm) at which the rays cross the vertex plane of
+    the first surface, and the rays at the interface, in front of it.
 
-    By Broyden's method from a Jacobian of difference quotients; on a fine grid with start and Jacobian from a coarse
-    one.
+    Broyden's method is used, from a Jacobian of difference quotients; on a fine grid start and Jacobian come from a
+    coarse one.
     """
     x, y = (p.to(lens.like.device) for p in (x, y))
     number = lens.number_of("back") if number is None else number
     face = lens.interfaces[number].surface
     z = face.relative_sag_and_slope(x.to(lens.like), y.to(lens.like))[0].double()
     extent = float(torch.maximum(x.max() - x.min(), y.max() - y.min()))
-    way = replace(lens.to(x.dtype).unbounded(), losses=None)  # alone; in float32 a net would lie beside x and y
-    before = way.interfaces[:number]
+    path = replace(lens.to(x.dtype).unbounded(), losses=None)  # in the precision of x and y
+    before = path.interfaces[:number]
 
     def arrive(p: Tensor, q: Tensor, height: Tensor) -> Rays:
-        bands = range(0, len(p), rows := _few_rows(p.shape[1]))
-        return joined((arrive_few(*(t[first : first + rows] for t in (p, q, height))) for first in bands), len(p))
+        bands = range(0, len(p), rows := _rows_at_a_time(p.shape[1]))
+        return joined((arrive_band(*(t[first : first + rows] for t in (p, q, height))) for first in bands), len(p))
 
-    def arrive_few(p: Tensor, q: Tensor, height: Tensor) -> Rays:
-        coming = functools.reduce(behind, before, source.rays(p, q, lens.entrance.z, 1.0))
-        ahead = (coming.sense * coming.direction[2]).clamp(min=1e-3)
-        path = coming.sense * (height - coming.above(face.z)) / ahead
-        return replace(coming, position=coming.position + path * coming.direction)
+    def arrive_band(p: Tensor, q: Tensor, height: Tensor) -> Rays:
+        rays = functools.reduce(behind, before, source.rays(p, q, lens.entrance.z, 1.0))
+        ahead = (rays.sense * rays.direction[2]).clamp(min=1e-3)
+        s = rays.sense * (height - rays.above(face.z)) / ahead
+        return replace(rays, position=rays.position + s * rays.direction)
 
     def jacobian(p: Tensor, q: Tensor, height: Tensor) -> list[Tensor]:
-        """∂(hit) / ∂(p, q), inverted: [xx, xy, yx, yy]."""
-        step = DIFFERENCE * extent
-        beside = [torch.cat(turns) for turns in ((p + step, p - step, p, p), (q, q, q + step, q - step))]
-        right, left, above, below = arrive(*beside, height.repeat(4, 1)).position.chunk(4, dim=1)
+        """Return the inverse of ∂(hit) / ∂(p, q): [xx, xy, yx, yy]."""
+        step = DIFFERENCE_STEP * extent
+        shifted = [torch.cat(t) for t in ((p + step, p - step, p, p), (q, q, q + step, q - step))]
+        right, left, above, below = arrive(*shifted, height.repeat(4, 1)).position.chunk(4, dim=1)
         one, two = right - left, above - below
         xx, yx, xy, yy = (d / (2 * step) for d in (one[0], one[1], two[0], two[1]))
         det = xx * yy - xy * yx
@@ -311,71 +309,72 @@ def rays_to(
         return [yy / det, -xy / det, -yx / det, xx / det]
 
     p, q, inverse, last = x, y, None, None
-    # along the axis x and y are the answer
-    if max(x.shape) > 2 * COARSE and not arrive(x[:1, :1], y[:1, :1], z[:1, :1]).axial:
-        some = tuple(torch.linspace(0, n - 1, min(n, COARSE)).round().long() for n in x.shape)
-        few = torch.meshgrid(*some, indexing="ij")
-        c_p, c_q, _ = rays_to(source, lens, x=x[few], y=y[few], number=number)
-        inverse = [_between(some, x.shape, t) for t in jacobian(c_p, c_q, z[few])]
-        p, q = (_between(some, x.shape, t) for t in (c_p, c_q))
-    for _ in range(REVERSE_STEPS):
+    # for light along the axis, x and y are the solution
+    if max(x.shape) > 2 * COARSE_POINTS and not arrive(x[:1, :1], y[:1, :1], z[:1, :1]).axial:
+        lines = tuple(torch.linspace(0, n - 1, min(n, COARSE_POINTS)).round().long() for n in x.shape)
+        coarse = torch.meshgrid(*lines, indexing="ij")
+        c_p, c_q, _ = rays_to(source, lens, x=x[coarse], y=y[coarse], number=number)
+        inverse = [_interpolate(lines, x.shape, t) for t in jacobian(c_p, c_q, z[coarse])]
+        p, q = (_interpolate(lines, x.shape, t) for t in (c_p, c_q))
+    for _ in range(MAX_BROYDEN_STEPS):
         hit = arrive(p, q, z)
         off_x, off_y = x - hit.position[0], y - hit.position[1]
-        wrong = torch.where(hit.alive, torch.maximum(off_x.abs(), off_y.abs()), torch.zeros_like(x))
-        if not bool(wrong.any()):
-            break  # along the axis, say, where the start is the answer
+        error = torch.where(hit.alive, torch.maximum(off_x.abs(), off_y.abs()), torch.zeros_like(x))
+        if not bool(error.any()):
+            break  # the start is the solution, as for light along the axis
         if last is not None:
-            step, (was_x, was_y) = last
-            inverse = _improved(inverse, step, (was_x - off_x, was_y - off_y))
+            step, (last_x, last_y) = last
+            inverse = _broyden_update(inverse, step, (last_x - off_x, last_y - off_y))
         xx, xy, yx, yy = inverse = inverse or jacobian(p, q, z)
         step = xx * off_x + xy * off_y, yx * off_x + yy * off_y
         p, q, last = p + step[0], q + step[1], (step, (off_x, off_y))
-        if float(wrong.max()) <= ARRIVED * extent:
+        if float(error.max()) <= RAY_TOLERANCE * extent:
             break
     position = torch.stack([x, y, z])
-    status = hit.lose(wrong > 1e3 * ARRIVED * extent, Status.VIGNETTED)
+    status = hit.lose(error > 1e3 * RAY_TOLERANCE * extent, Status.VIGNETTED)
     return p, q, replace(hit, position=position, z=face.z, status=status)
 
 
-def _improved(inverse: list[Tensor], step: tuple[Tensor, Tensor], moved: tuple[Tensor, Tensor]) -> list[Tensor]:
-    """Broyden's update of each inverse Jacobian B, so that B moved = step, moved: the last step of the hit."""
+def _broyden_update(inverse: list[Tensor], step: tuple[Tensor, Tensor], shift: tuple[Tensor, Tensor]) -> list[Tensor]:
+    """Return Broyden's update of each inverse Jacobian B, so that B shift = step; shift: the last step of the hit."""
     xx, xy, yx, yy = inverse
-    (s_x, s_y), (m_x, m_y) = step, moved
+    (s_x, s_y), (m_x, m_y) = step, shift
     off_x, off_y = s_x - (xx * m_x + xy * m_y), s_y - (yx * m_x + yy * m_y)
     row_x, row_y = s_x * xx + s_y * yx, s_x * xy + s_y * yy  # stepᵀ B
     scale = row_x * m_x + row_y * m_y
-    small = scale.abs() <= SINGULAR * (s_x * s_x + s_y * s_y)
+    small = scale.abs() <= MIN_BROYDEN_DIVISOR * (s_x * s_x + s_y * s_y)
     scale = torch.where(small, torch.full_like(scale, torch.inf), scale)
     off_x, off_y = off_x / scale, off_y / scale
     return [xx + off_x * row_x, xy + off_x * row_y, yx + off_y * row_x, yy + off_y * row_y]
 
 
-def _between(some: tuple[Tensor, Tensor], shape: tuple[int, ...], t: Tensor) -> Tensor:
-    """(rows, columns) linear interpolation along both axes of t, given in `some` rows and columns."""
-    for known, n in zip(some, shape, strict=True):  # each turn takes one axis and swaps the two
-        wanted = torch.arange(n)
-        right = torch.searchsorted(known, wanted, right=True).clamp(1, len(known) - 1)
-        share = ((wanted - known[right - 1]).double() / (known[right] - known[right - 1])).to(t)
+def _interpolate(lines: tuple[Tensor, Tensor], shape: tuple[int, ...], t: Tensor) -> Tensor:
+    """Interpolate t linearly along both axes to (rows, columns); lines: rows and columns at which t is given."""
+    for known, n in zip(lines, shape, strict=True):  # each iteration takes one axis and transposes t
+        index = torch.arange(n)
+        right = torch.searchsorted(known, index, right=True).clamp(1, len(known) - 1)
+        fraction = ((index - known[right - 1]).double() / (known[right] - known[right - 1])).to(t)
         right = right.to(t.device)
-        t = (torch.lerp(t[right - 1], t[right], share[:, None])).T
+        t = (torch.lerp(t[right - 1], t[right], fraction[:, None])).T
     return t.contiguous()
 
 
 def collect(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """(picture (rows, columns), outside) of tubes; corner (2, n + 1, m + 1) in pixels: column, row; flux (n, m).
+    """Return (picture (rows, columns), outside) of tubes.
 
-    outside is Σ flux · (mean square of the corners' distance beyond the border, in pixels): a pull for light that no
-    pixel sees.
+    corner: (column, row) of the corners in pixels, (2, n + 1, m + 1).  flux: flux of the tubes, (n, m).
+    outside: Σ flux · (mean square of the corners' distance outside the border, in pixels), which has a gradient where
+    the light falls on no pixel.
     """
     if corner.dtype == torch.float64 and (fast := ops.kernel("tubes.collect", corner)):
-        return fast(corner, flux, shape, THINNEST)
+        return fast(corner, flux, shape, MIN_TRIANGLE_AREA)
     return collect_plain(corner, flux, shape)
 
 
 def collect_plain(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """`collect` in plain torch, by Green's theorem (see clip.py): the edges are split at all pixel borders.
+    """Run `collect` in plain torch, by Green's theorem (see clip.py): the edges are split at all pixel borders.
 
-    On a GPU `index_add` adds up in no fixed order, so that the last bits change from run to run.
+    On a GPU `index_add` sums in no fixed order, so that the last bits change from run to run.
     """
     off = sum((p - p.clamp(0, size)) ** 2 for p, size in zip(corner, reversed(shape), strict=True))
     outside = total(flux * middle(off))
@@ -384,13 +383,13 @@ def collect_plain(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple
     flux = torch.cat([flux.reshape(-1) / 2] * 2)
     area = ((second - first)[0] * (third - first)[1] - (third - first)[0] * (second - first)[1]) / 2
     cell = torch.stack([p.detach().floor() for p in (first, second, third)])
-    whole = (cell == cell[0]).all(0).all(0) | (area.detach().abs() < THINNEST)
+    whole = (cell == cell[0]).all(0).all(0) | (area.detach().abs() < MIN_TRIANGLE_AREA)
     sums = torch.zeros(rows * (columns + 1), dtype=corner.dtype, device=corner.device)
 
     column, row = ((first + second + third) / 3).detach().floor()
-    at = whole & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-    index = (row * (columns + 1) + column)[at].long()
-    sums = sums.index_add(0, index, flux[at]).index_add(0, index + 1, -flux[at])
+    on_screen = whole & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    index = (row * (columns + 1) + column)[on_screen].long()
+    sums = sums.index_add(0, index, flux[on_screen]).index_add(0, index + 1, -flux[on_screen])
 
     weight = -(flux / torch.where(whole, torch.ones_like(area), area))[~whole]
     for start, end in ((first, second), (second, third), (third, first)):
@@ -398,15 +397,15 @@ def collect_plain(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple
         a, d = start[:, ~whole][:, edge], (end - start)[:, ~whole][:, edge]
         middle_x = a[0] + (s_0 + s_1) / 2 * d[0]
         share = weight[edge] * (s_1 - s_0) * d[1]
-        seen = (row >= 0) & (row < rows) & (column < columns)
-        beyond = torch.where(column < 0, torch.zeros_like(middle_x), middle_x - column)[seen]
-        index = (row * (columns + 1) + column.clamp(min=0))[seen].long()
-        sums = sums.index_add(0, index, share[seen] * (1 - beyond)).index_add(0, index + 1, share[seen] * beyond)
+        counted = (row >= 0) & (row < rows) & (column < columns)
+        share, offset = share[counted], torch.where(column < 0, torch.zeros_like(middle_x), middle_x - column)[counted]
+        index = (row * (columns + 1) + column.clamp(min=0))[counted].long()
+        sums = sums.index_add(0, index, share * (1 - offset)).index_add(0, index + 1, share * offset)
     return sums.view(rows, columns + 1).cumsum(1)[:, :columns], outside
 
 
 def _triangles(corner: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The three corners (2, 2 n m) of both triangles of each quad; the diagonal changes from quad to quad."""
+    """Return the three corners (2, 2 n m) of both triangles of each quad; the diagonal alternates between quads."""
     p0, p1, p2, p3 = corner[:, :-1, :-1], corner[:, 1:, :-1], corner[:, 1:, 1:], corner[:, :-1, 1:]
     i, j = (torch.arange(k, device=corner.device) for k in p0.shape[1:])
     even = ((i[:, None] + j) % 2 == 0).expand_as(p0)
@@ -416,11 +415,11 @@ def _triangles(corner: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _pieces(start: Tensor, end: Tensor, sizes: tuple[int, int]) -> tuple[Tensor, ...]:
-    """(edge, s at its start, s at its end, column, row) of each piece between pixel borders; s from 0 to 1 on the edge.
+    """Return (edge, s at its start, s at its end, column, row) of each piece of an edge between pixel borders.
 
-    What lies before the first or behind the last border of the screen (columns, rows) is not split any further.  The
-    pixel follows from the borders crossed so far: where an edge meets the corner of a pixel a piece has no length, so
-    that rounding decides where its middle lies, but the derivatives of its ends count for the pixel that it is in.
+    s runs from 0 to 1 along the edge.  Outside the screen (columns, rows) edges are not split.  The pixel of a piece
+    follows from the borders crossed before it.  Its midpoint would not do: where an edge meets the corner of a pixel a
+    piece has no length, and rounding would decide on its pixel, while the derivatives of its ends still count.
     """
     edges = torch.arange(start.shape[1], device=start.device)
     edge, s, kind = [edges], [torch.zeros_like(start[0])], [torch.full_like(edges, -1)]
@@ -439,7 +438,7 @@ def _pieces(start: Tensor, end: Tensor, sizes: tuple[int, int]) -> tuple[Tensor,
     order = torch.argsort(s.detach(), stable=True)
     order = order[torch.argsort(edge[order], stable=True)]
     edge, s, kind = edge[order], s[order], kind[order]
-    begins = (kind == -1).nonzero(as_tuple=True)[0]  # an edge's first piece: at s = 0, and before all others there
+    begins = (kind == -1).nonzero(as_tuple=True)[0]  # first piece of each edge, sorted first at s = 0
     pixel = []
     for axis in (0, 1):
         crossed = (kind == axis).cumsum(0)
@@ -449,5 +448,5 @@ def _pieces(start: Tensor, end: Tensor, sizes: tuple[int, int]) -> tuple[Tensor,
 
 
 def middle(corner: Tensor) -> Tensor:
-    """Mean of the four corners of each quad."""
+    """Return the mean of the four corners of each quad."""
     return (corner[1:, 1:] + corner[1:, :-1] + corner[:-1, 1:] + corner[:-1, :-1]) / 4

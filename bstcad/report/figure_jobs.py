@@ -20,7 +20,7 @@ from bstcad.cad import mesh as meshes
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Light, Line
+from bstcad.optics.measure import Light, SpectralLine
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Surface
 from bstcad.optics.wavefront_error import WavefrontError
@@ -146,7 +146,7 @@ def draw_transport(source: Emitter, lens: Lens, screen: Screen, view: View) -> P
     return {numbered("transport", view.number): png(transport_map(*ray_map(source, lens, screen.plane), view))}
 
 
-def draw_light(target: np.ndarray, light: Light, lines: Sequence[Line], view: View) -> Pngs:
+def draw_light(target: np.ndarray, light: Light, lines: Sequence[SpectralLine], view: View) -> Pngs:
     """The pictures of the light; one of the ghost and of the lines of a spectrum if there are any."""
     found = light.picture
     pictures = {

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bstcad.optics.measure import Line
+from bstcad.optics.measure import SpectralLine
 from bstcad.optics.receivers import LevelPlane, Receiver
 from bstcad.report.drawing import (
     BLUE,
@@ -373,7 +373,7 @@ def cross_section(target: np.ndarray, irradiance: np.ndarray, view: View) -> Fig
 
 
 @styled
-def lines_apart(target: np.ndarray, irradiance: np.ndarray, lines: Sequence[Line], view: View) -> Figure:
+def lines_apart(target: np.ndarray, irradiance: np.ndarray, lines: Sequence[SpectralLine], view: View) -> Figure:
     """All lines together in colour, then the picture that each of them makes by itself.
 
     target, irradiance by all lines, and pictures: (rows, columns) in coordinates, one sum.

@@ -15,7 +15,7 @@ from bstcad.scene.schema import Record
 
 if TYPE_CHECKING:
     from bstcad.optics.losses import Losses
-    from bstcad.optics.measure import GhostLight
+    from bstcad.optics.measure import GhostTracer
 
 METAL = "Al"  # of a mirror, unless a scene names another
 PACKAGES = "bstcad.effects"  # group of entry points by which an installed package brings effects along
@@ -141,7 +141,7 @@ def reflection_of(effects: Effects) -> Fresnel | None:
     return named(effects, Fresnel) or bare
 
 
-def ghost(effects: Effects) -> GhostLight | None:
+def ghost(effects: Effects) -> GhostTracer | None:
     """How light is followed that is reflected twice inside the lens; None: it is left out."""
     if named(effects, Ghost) is None:
         return None

@@ -47,7 +47,7 @@ from bstcad.scene.schema import FILE, FileContent, Record, contents, of_model
 from bstcad.scene.target import Target, Targets, coplanar
 
 if TYPE_CHECKING:
-    from bstcad.optics.measure import Draw, GhostLight
+    from bstcad.optics.measure import Draw, GhostTracer
 
 MESH_TOLERANCE = 1e-3  # mm; default distance of mesh facets from a lens of up to 100 mm
 IMAGE_KEY = re.compile(r"target(\[\d+\])?\.image")  # dotted keys of images
@@ -355,7 +355,7 @@ class Scene(Record):
         return self.model_copy(update={"source": self.source.scaled(share)})
 
     @property
-    def ghost(self) -> GhostLight | None:
+    def ghost(self) -> GhostTracer | None:
         """Function that traces the light reflected twice inside the lens; None if the scene names no ghost."""
         return effects.ghost(self.effects)
 

@@ -203,9 +203,9 @@ def cells_of_a_mm2(scene: Scene, lens: Lens) -> ControlCells:
     lens, screen, target = light.through(lens), scene.target.screen, scene.target.irradiance()
     tiles = replace(screen, pixels=tuple(-(-n // TILE_PIXELS) for n in screen.pixels))
     tubes = launch_tubes(light.source, lens, TUBES)
-    x, y = cross(tubes.coming, lens.interfaces[lens.freeform[0]]).rays.position[:2]
+    x, y = cross(tubes.rays, lens.interfaces[lens.freeform[0]]).rays.position[:2]
     landed = tubes.landing(lens, screen.plane)
-    flux, corners = tubes.whole(landed), tiles.pixels_of(landed.position.double())
+    flux, corners = tubes.arriving_flux(landed), tiles.pixels_of(landed.position.double())
     area = torch.where(flux > 0, area_of(x, y).double(), torch.zeros_like(flux))
     area, flux = (
         gaussian_filter(collect(corners, carried, tiles.shape)[0].cpu().numpy().clip(0), 1.0, mode="nearest")

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics.bspline import QUARTERS, SPANS, BSplineSurface, evaluate, net_gradient, span
+from bstcad.optics.bspline import QUARTERS, SPANS_AT_A_TIME, BSplineSurface, evaluate, net_gradient, span
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import inside
@@ -121,7 +121,7 @@ class CellGrid:
         Points up to half of a cell's diagonal outside count too, so that the rim is covered.
         """
         reach = math.hypot(*self.size) / 2
-        for cells in torch.from_numpy(self._near(lens, bounds, margin)).split(SPANS):
+        for cells in torch.from_numpy(self._near(lens, bounds, margin)).split(SPANS_AT_A_TIME):
             i, j = cells[inside(lens.outline.limits, *self._at(cells.T, 0.5), 2 * reach)].T
             s = torch.tensor(QUARTERS, dtype=torch.float64)
             x, y = self._at((i + s[:, None, None], j + s[:, None]), 0.0)

@@ -22,12 +22,12 @@ from torch import Tensor
 
 from bstcad.optics.bspline import (
     QUARTERS,
-    SPANS,
+    SPANS_AT_A_TIME,
     BSplineSurface,
     Jet,
     Spans,
     curvature_bounds,
-    reached_by,
+    near_outline,
     slope_bounds,
 )
 from bstcad.optics.kernels.reductions import total
@@ -183,8 +183,8 @@ def _spans_near_bounds(
         if bound is None:
             continue
         near = torch.nonzero(upper_limit() > (1 - MARGIN) * bound)
-        for i, j in (part.T for part in near.split(SPANS) if len(part)):
-            yield Spans.of(net, i, j), reached_by(net, outline, i=i, j=j, s=QUARTERS), bound, quantity
+        for i, j in (part.T for part in near.split(SPANS_AT_A_TIME) if len(part)):
+            yield Spans.of(net, i, j), near_outline(net, outline, i=i, j=j, s=QUARTERS), bound, quantity
 
 
 def _thickness_excess(lens: Lens, bounds: Bounds) -> tuple[float, Tensor, float]:

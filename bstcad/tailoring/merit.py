@@ -40,7 +40,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from bstcad.optics.bspline import BSplineSurface, carrier
+from bstcad.optics.bspline import BSplineSurface, resampling_matrix
 from bstcad.optics.channels import Channel, weighted_sum
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.goal import Goal
@@ -53,7 +53,7 @@ from bstcad.optics.rays import Landed, Rays
 from bstcad.optics.reach import wanted_slopes
 from bstcad.optics.receivers import Receiver
 from bstcad.optics.trace import behind, through
-from bstcad.optics.tubes import Tubes, arriving, rays_to
+from bstcad.optics.tubes import Tubes, arriving_flux, rays_to
 from bstcad.optics.unfolding import image_from_last_net
 from bstcad.optics.wavefront import MM_PER_NM, Wave
 from bstcad.optics.wavefront_error import path_from_reference
@@ -167,7 +167,7 @@ class Merit:
         channels, screen = self.light.channels, self.goals[k].receiver
         pairs = list(zip(self.light.sheets, landed, strict=True))
         # flux after the losses at faces and in the glass: a picture that is darker everywhere is no worse
-        left = weighted_sum(channels, (total(sheet.carried(corners)) for sheet, corners in pairs))
+        left = weighted_sum(channels, (total(sheet.transmitted_flux(corners)) for sheet, corners in pairs))
         seen = with_border(screen, self.blurs[k][0].border) if self.blurs else screen
         images, beyond = zip(*(sheet.collect(corners, seen) for sheet, corners in pairs), strict=True)
         outside = weighted_sum(channels, beyond)
@@ -185,7 +185,7 @@ class Merit:
         size = total(target**2)
         off = total((image - target) ** 2) / size if self.own is None else self.own(image, target)
         pairs = zip(sheets, landed, strict=True)
-        arrived = weighted_sum(channels, (total(arriving(sheet.flux, corners)) for sheet, corners in pairs))
+        arrived = weighted_sum(channels, (total(arriving_flux(sheet.flux, corners)) for sheet, corners in pairs))
         # light lost has no gradient, but to lose it must not lower the merit
         lost = 1 - arrived / weighted_sum(channels, (total(sheet.flux) for sheet in sheets))
         normalised = image.detach() / total(image.detach())
@@ -216,7 +216,7 @@ def _from_source(lens: Lens, wave: Wave | None) -> Lens:
 def _traced_corners(source: Emitter, sheet: Tubes, lens: Lens, measured: bool) -> tuple[Rays, Tensor | None]:
     """Trace the corners of a sheet through a lens; return the rays, and their optical path (mm) if `measured`."""
     lens = lens.unbounded()
-    rays, path = sheet.coming, None
+    rays, path = sheet.rays, None
     for interface in lens.interfaces[lens.freeform[0] :]:
         there = behind(rays, interface)
         if measured and path is None:  # the rays come from the source, see `_from_source`
@@ -291,7 +291,7 @@ class CoarseVariable:
     @classmethod
     def of(cls, surface: BSplineSurface, coarse: BSplineSurface, weight: Tensor) -> CoarseVariable:
         """Make the variable for the net of `surface`; weight: (m', n') at the control points of `coarse`."""
-        across = (carrier(few, many) for few, many in zip(coarse.shape, surface.shape, strict=True))
+        across = (resampling_matrix(few, many) for few, many in zip(coarse.shape, surface.shape, strict=True))
         return cls(SobolevVariable.of(coarse, weight, COARSE_LAPLACIAN_POWER), *across)
 
     def zero(self) -> Tensor:

@@ -26,7 +26,7 @@ from bstcad.optics.goal import Goal
 from bstcad.optics.interfaces import Law
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.reach import GRAZING, room
+from bstcad.optics.reach import MAX_EXIT_ANGLE, reach_margin
 from bstcad.optics.receivers import Receiver
 from bstcad.optics.unfolding import image_from_last_net
 from bstcad.scene.target import average
@@ -52,7 +52,7 @@ COARSE_FIT = Fit(bending=1e-2, steps=40, degree=3)  # fit of the face to a coars
 
 
 @torch.no_grad()
-def reachable(source: Emitter, lens: Lens, goal: Goal, grazing: float = GRAZING) -> np.ndarray | None:
+def reachable(source: Emitter, lens: Lens, goal: Goal, grazing: float = MAX_EXIT_ANGLE) -> np.ndarray | None:
     """Return True for each pixel that a design can light, (rows, columns); None if it can light all of the picture.
 
     lens: the blank, with its final front.  grazing: largest angle at which light may leave the face (rad).
@@ -66,7 +66,7 @@ def reachable(source: Emitter, lens: Lens, goal: Goal, grazing: float = GRAZING)
     if float(reach_from_each(grid, around, plane, law, grazing=grazing).min()) >= 0:
         return None
     ordered, aims = rays_at(grid, same_order(grid, lit)), torch.from_numpy(np.stack(lit))
-    if float(room(ordered, aims, plane, law=law, grazing=grazing).min()) >= 0:
+    if float(reach_margin(ordered, aims, plane, law=law, grazing=grazing).min()) >= 0:
         return None
     found = _inside(reach_from_each(grid, pixel_corners(few), plane, law, grazing=grazing).amax(0), screen, few)
     wanted, lens = None, lens.refined(COARSE_NET)
@@ -80,7 +80,7 @@ def reachable(source: Emitter, lens: Lens, goal: Goal, grazing: float = GRAZING)
         )
         grid = face_grid(source, lens, window, 2 * COARSE_NET)
         aims, rays = torch.from_numpy(np.stack(pixel_corners(few))), rays_at(grid, wanted.places)
-        before, found = found, _inside(room(rays, aims, plane, law=law, grazing=grazing), screen, few)
+        before, found = found, _inside(reach_margin(rays, aims, plane, law=law, grazing=grazing), screen, few)
         if turn and picture[before ^ found].sum() <= SETTLED_FRACTION:
             break
         lens = fit_to_map(lens, wanted, grid, COARSE_FIT, unlit=0.0)
@@ -98,14 +98,14 @@ def resampled(goal: Goal, pixels: int = MAX_AIMS) -> Goal:
 
 
 def reach_from_each(grid: FaceGrid, aims: Sequence[np.ndarray], plane: Receiver, law: Law, grazing: float) -> Tensor:
-    """Return `optics.reach.room` of the lit points of the face for aims x and y (…) mm, as (points, …)."""
+    """Return `optics.reach.reach_margin` of the lit points of the face for aims x and y (…) mm, as (points, …)."""
     t, some = torch.from_numpy(np.stack(aims)), grid.density[::FACE_STRIDE, ::FACE_STRIDE] > 0
     position, direction = (
         v[:, ::FACE_STRIDE, ::FACE_STRIDE][:, some][..., None, None].expand(-1, -1, *t.shape[1:]).double()
         for v in (grid.at_face.position, grid.at_face.direction)
     )
     rays = replace(grid.at_face, position=position, direction=direction)
-    return room(rays, t[:, None].expand(-1, *position.shape[1:]), plane, law=law, grazing=grazing)
+    return reach_margin(rays, t[:, None].expand(-1, *position.shape[1:]), plane, law=law, grazing=grazing)
 
 
 def same_order(grid: FaceGrid, aims: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:

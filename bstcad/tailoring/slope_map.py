@@ -38,10 +38,10 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays
-from bstcad.optics.reach import GRAZING, kept_from_reflection, room, wanted_slopes
+from bstcad.optics.reach import MAX_EXIT_ANGLE, limit_refraction, reach_margin, wanted_slopes
 from bstcad.optics.receivers import Receiver
 from bstcad.optics.sides import Sides, as_pair
-from bstcad.optics.trace import across, clear_window, gets_through
+from bstcad.optics.trace import across, clear_window, is_transmitted
 from bstcad.optics.tubes import rays_to
 from bstcad.optics.unfolding import image_screen
 from bstcad.scene.errors import SceneError
@@ -181,8 +181,9 @@ def _rms_change(picture: np.ndarray, before: Sequence[np.ndarray], now: Sequence
 
 
 def fit_to_map(
-    lens: Lens, wanted: SlopeMap, grid: FaceGrid, fit: Fit, unlit: float, parts: int = 1, grazing: float = GRAZING
-) -> Lens:
+    lens: Lens, wanted: SlopeMap, grid: FaceGrid, fit: Fit, unlit: float, parts: int = 1,
+    grazing: float = MAX_EXIT_ANGLE,
+) -> Lens:  # fmt: skip
     """Return the lens whose last net is fitted to the slopes of a map by least squares; its vertex stays.
 
     A map may send a little light further than the face can, into the black around a picture; that light leaves at the
@@ -199,7 +200,7 @@ def fit_to_map(
         _, *now = net.relative_sag_and_slope(x[some], y[some])
         arriving = rays_at(grid, tuple(p[some].cpu().double().numpy() for p in (x, y)))
         slopes = (s.cpu().double() for s in wanted.slopes(x[some], y[some]))
-        slopes = kept_from_reflection(arriving, tuple(slopes), lens.last_freeform.law, grazing)
+        slopes = limit_refraction(arriving, tuple(slopes), lens.last_freeform.law, grazing)
         for z, needed, own in zip((z_x, z_y), slopes, now, strict=True):
             z[some] = torch.where(lit[some], needed.to(x), own)
     weight = torch.where(lit, 1.0, unlit).to(x)
@@ -230,7 +231,7 @@ def gathering(
     aim = torch.stack([torch.full_like(x, m) for m in middle])
     z_x, z_y = wanted_slopes(faces, aim, plane, lens.last_freeform.law)
     lit = grid.density[thin] > 0
-    reaches = room(faces, aim, plane, law=lens.last_freeform.law) >= 0  # elsewhere the slope is a placeholder
+    reaches = reach_margin(faces, aim, plane, law=lens.last_freeform.law) >= 0  # elsewhere the slope is a placeholder
     return fit_gathering(grid, (x, y, z_x, z_y, lit), fit if bool(reaches[lit].all()) else PARABOLOID_FIT)
 
 
@@ -326,7 +327,7 @@ def map_to_target(
     side = max(area.width, area.height)
     x, y = (t.to(lens.like.device) for t in sampling.grid(Rectangle(side, side), n * SUBCELLS))
     flux = source.irradiance(x, y, lens.entrance.z)
-    flux = flux * gets_through(source.rays(x, y, lens.entrance.z, 1.0), lens)
+    flux = flux * is_transmitted(source.rays(x, y, lens.entrance.z, 1.0), lens)
     density = light_density(flux.cpu().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3)), side)
     if not screen.plane.is_level:
         wanted, frame = spread_density(picture, screen.plane.to_level_plane(*pixel_corners(screen), lens.front.z), n)

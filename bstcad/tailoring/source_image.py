@@ -33,7 +33,7 @@ from bstcad.optics.channels import Channel
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import Screen, tent
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Draw, a_side, seen_through, simulated
+from bstcad.optics.measure import Draw, landing_pixels, side_factor, simulated
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import point_pairs
@@ -135,7 +135,7 @@ class SourceImages:
         points = [(i * POINT_DISTANCE, j * POINT_DISTANCE) for j in (-1, 0, 1) for i in (-1, 0, 1)]
         nine = (replace(source.element(a * u, b * v), wavelength=channel.source.wavelength) for u, v in points)
         ten = [channel, *(replace(channel, source=one) for one in nine)]
-        pixel, flux = seen_through(ten, lens, screen, n=IMAGE_GRID)
+        pixel, flux = landing_pixels(ten, lens, screen, n=IMAGE_GRID)
         seen = (flux > 0).all(0)
         pixel, flux = pixel[..., seen].cpu(), flux[:, seen].cpu()
         return cls(pixel[:, 0], pixel[:, 1:] - pixel[:, :1], flux[1:] / flux[0])
@@ -225,7 +225,7 @@ def blur_error(by_images: Tensor, draw: Draw, lens: Lens, screen: Screen, *, bor
     picture, errors = by_images.cpu(), []
     for k in range(2):
         points = draw(ERROR_POINTS, seed + SEED_OFFSET + k)
-        n = max(1, round(a_side(points) * ERROR_RAYS))
+        n = max(1, round(side_factor(points) * ERROR_RAYS))
         rays = simulated(lens, points, screen, n=n, seed=seed + SEED_OFFSET + k)
         left = sum(rays.flux[line] for line in ("on target", "off target", "total internal reflection"))
         error = (rays.box / left - picture).numpy() if left > 0 else np.zeros(picture.shape)

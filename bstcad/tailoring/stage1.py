@@ -26,7 +26,7 @@ from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays
-from bstcad.optics.reach import GRAZING
+from bstcad.optics.reach import MAX_EXIT_ANGLE
 from bstcad.optics.sides import as_pair, coarser
 from bstcad.optics.trace import clear_window, trace
 from bstcad.scene.blank import CONIC_CONSTANTS
@@ -157,7 +157,7 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[
     sides = [min(2 * points, knobs.rays) for points in as_pair(m)]
     parts = math.ceil(max(sides) / MAX_RAY_CELLS)
     grid = face_grid(source, lens, window, (math.ceil(sides[0] / parts), math.ceil(sides[1] / parts)))
-    grazing = GRAZING if task.edge is None else task.edge.angle
+    grazing = MAX_EXIT_ANGLE if task.edge is None else task.edge.angle
     return fit_to_map(lens, wanted, grid, *(FINE if left <= FINE_ROUNDS else COARSE), parts, grazing), wanted
 
 

@@ -28,7 +28,7 @@ from torch import Tensor
 from bstcad.optics.channels import channels_of, points_per_line
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import a_side, images, rrmsd_by_tubes
+from bstcad.optics.measure import images, rrmsd_by_tubes, side_factor
 from bstcad.optics.sides import as_pair, coarser
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
@@ -451,7 +451,7 @@ def compare_precisions(task: Task, lens: Lens) -> Comparison:
     (merit, gradient, single), (exact, wanted, double) = (
         _tailor_briefly(task, lens.to(d)) for d in (torch.float32, torch.float64)
     )
-    n, goal = round(a_side(task.channels) * (COMPARED_TUBES + 1)), task.goals[0]
+    n, goal = round(side_factor(task.channels) * (COMPARED_TUBES + 1)), task.goals[0]
     rrmsd = [rrmsd_by_tubes(end, task.channels, goal.receiver, target=goal.picture, n=n) for end in (single, double)]
     pairs = zip(single.nets, double.nets, strict=True)
     return Comparison(

@@ -30,7 +30,7 @@ from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays
-from bstcad.optics.reach import kept_from_reflection, slopes_towards
+from bstcad.optics.reach import limit_refraction, slopes_towards
 from bstcad.scene.quality import COARSEST_GRID
 from bstcad.tailoring import stage1
 from bstcad.tailoring.light_behind import LightBehind, light_for_task, without_crossings
@@ -141,7 +141,7 @@ def _round(
     grid = face_grid(source, lens, window, own[-1])
     law = lens.last_freeform.law
     out = light.directions_at(lens.back, *sampling.grid(window, grid.shape))
-    slopes = kept_from_reflection(grid.at_face, slopes_towards(grid.at_face, out, law), law)
+    slopes = limit_refraction(grid.at_face, slopes_towards(grid.at_face, out, law), law)
     x, y = (p.reshape(-1) for p in sampling.grid(window, grid.shape))
     back, lit, (how, unlit) = lens.back, (grid.density > 0).reshape(-1), fit
     _, *own = back.relative_sag_and_slope(x, y)

@@ -18,7 +18,7 @@ from scipy import fft
 from scipy.ndimage import fourier_gaussian
 from scipy.stats import norm
 
-from bstcad.optics.bspline import BSplineSurface, interpolated
+from bstcad.optics.bspline import BSplineSurface, interpolating_net
 from bstcad.optics.channels import Channel
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import Interface
@@ -405,7 +405,7 @@ def as_net(face: Surface, outline: Outline) -> BSplineSurface:
     rim = FACE_REACH * rim if bool(face.reaches(edge, torch.zeros_like(edge))) else rim
     inwards = (rim / r.clamp(min=rim)).clamp(max=1.0)
     sag = face.sag_and_slope(inwards * x, inwards * y)[0] - face.z
-    return replace(level, heights=torch.from_numpy(interpolated(sag.numpy())))
+    return replace(level, heights=torch.from_numpy(interpolating_net(sag.numpy())))
 
 
 def _add_form(face: str, field: np.ndarray, setup: Setup, by: float) -> Setup:

@@ -24,7 +24,7 @@ from bstcad.optics import quadrature
 from bstcad.optics.channels import Channel
 from bstcad.optics.goal import Goal, worst
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import FULL, RESOLVED, Effort, Light, Line, lines_apart, measure, tubes_of
+from bstcad.optics.measure import FULL, RESOLVED, Effort, Light, SpectralLine, measure, spectral_lines, tubes_of
 from bstcad.optics.outlines import Outline
 from bstcad.optics.wavefront_error import WavefrontError, wavefront_error
 from bstcad.runs.processes import Overdue, Submit, end, here, result, return_freed
@@ -99,7 +99,7 @@ class Proof:
     stability: dict[str, float | int | None]
     # blur by the source's size, None: it has none, and lines of a spectrum: on the target with the largest RRMSD
     blur: Blur | None = None
-    lines: tuple[Line, ...] = ()
+    lines: tuple[SpectralLine, ...] = ()
     at_bounds: dict[str, AtBound] | None = None  # the bounds met, by key; None: no bounds
     # of the light, against the one asked for; None: none was, or no light comes to where it is stated
     wavefront: WavefrontError | None = None
@@ -125,7 +125,7 @@ def verify(
     nominal: Nominal,
     submit: Submit = here,
     known: Callable[[Lens], None] = lambda lens: None,
-    lit: Callable[[Light, tuple[Line, ...], int], None] = lambda light, lines, number: None,
+    lit: Callable[[Light, tuple[SpectralLine, ...], int], None] = lambda light, lines, number: None,
     effort: Effort | None = None,
 ) -> Proof:
     """Check lens.step and lens.stl in `folder` against the design; ValueError if one of them cannot be read at all.
@@ -196,7 +196,7 @@ def verify(
     )  # fmt: skip
 
 
-def _lit(lens: Lens, nominal: Nominal, goal: Goal, effort: Effort) -> tuple[Light, tuple[Line, ...]]:
+def _lit(lens: Lens, nominal: Nominal, goal: Goal, effort: Effort) -> tuple[Light, tuple[SpectralLine, ...]]:
     """The light that the lens throws on a target, and that of each line of a spectrum; ValueError if there is none."""
     how = {"effort": effort, "ghost": nominal.scene.ghost, "draw": nominal.scene.draw, "whole": goal.whole}
     light = measure(lens, nominal.channels, goal.receiver, goal.picture, **how)
@@ -204,7 +204,7 @@ def _lit(lens: Lens, nominal: Nominal, goal: Goal, effort: Effort) -> tuple[Ligh
         name = "lens.step" if nominal.scene.mount is None else "part.step"
         raise ValueError(f"{name}: none of its light falls on {goal.words}; write it again, or check scene.toml")
     n = max(LINE_TUBES, tubes_of(lens))
-    return light, lines_apart(lens, nominal.channels, goal.receiver, target=goal.picture, n=n)
+    return light, spectral_lines(lens, nominal.channels, goal.receiver, target=goal.picture, n=n)
 
 
 def _as_shaped(lens: Lens, designed: Lens) -> Lens:
@@ -404,7 +404,7 @@ def _of_light(
     ]
     if tubes is not None:
         name = f"picture by ray tubes, off the one by rays{of}"
-        checks.insert(2, Check.at_most(name, tubes.off, tubes.limit, id="tubes"))
+        checks.insert(2, Check.at_most(name, tubes.difference, tubes.limit, id="tubes"))
     if light.leak:
         name = f"light where the target is dark, of all on the target{of}"
         checks.append(Check.at_most(name, light.leak.share, accept.leak, id="leak"))

@@ -15,7 +15,7 @@ import pytest
 from scipy.signal import fftconvolve
 
 from bstcad.analysis.light import blur
-from bstcad.optics.measure import a_side, images, measure, tubes_picture
+from bstcad.optics.measure import images, measure, side_factor, tubes_picture
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage1, stage2
 from bstcad.tailoring.run import Driver, Task
@@ -61,7 +61,8 @@ def feedback(task, lens, power, seconds):
     target = wanted = goal.picture
     few = task.knobs.model_copy(update={"stage2_iterations": ROUND})
     while time.process_time() - began < seconds:
-        made = tubes_picture(lens, whole.channels, goal.receiver, round(2 * a_side(whole.channels) * task.knobs.rays))
+        tubes = round(2 * side_factor(whole.channels) * task.knobs.rays)
+        made = tubes_picture(lens, whole.channels, goal.receiver, tubes)
         made = made.numpy() * (wanted.sum() / float(made.sum()))
         target = target * np.clip(wanted / np.maximum(made, 1e-6 * wanted.max()), 0.2, 5.0) ** power
         target = target / target.sum()

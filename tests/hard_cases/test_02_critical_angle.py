@@ -18,7 +18,7 @@ import torch
 
 from bstcad.optics import tubes
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.interfaces import SKIMMING, Refract, deflect
+from bstcad.optics.interfaces import MIN_COS_REFRACTION, Refract, deflect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.outlines import Circle
 from bstcad.optics.point import Point
@@ -77,16 +77,16 @@ def test_the_gradient_is_the_derivative_up_to_its_cap(offset, dtype, holds):
     everything = [*torch.autograd.grad(deflect(rays, *slopes, Refract(N, 1.0)).rays.direction.sum(), (way, slopes),
                                        materialize_grads=True), g_way, g_slopes]  # fmt: skip
     assert all(torch.isfinite(g).all() for g in everything)
-    cap = N * N / SKIMMING
+    cap = N * N / MIN_COS_REFRACTION
     # a slope turns the normal by less than itself, and the normal enters with η cos θ and cos θ' besides: 4 η
     holds(f"largest derivative, {NAMES[dtype]}", max(largest(g) for g in everything), 2 * cap + 4 * N)
     if not after.alive[0]:
         assert not any(g.any() for g in everything)
         return
     cosine = math.sqrt(max(float(cosine_squared(way)), 0.0))
-    expected = N * N * float(way[2].detach()) / max(cosine, SKIMMING)
-    # cos² is known to 2 units, and the derivative is divided by its root: relative 1 / max(cos², SKIMMING²)
-    error = abs(float(g_way[2]) / expected - 1) * max(cosine, SKIMMING) ** 2
+    expected = N * N * float(way[2].detach()) / max(cosine, MIN_COS_REFRACTION)
+    # cos² is known to 2 units, and the derivative is divided by its root: relative 1 / max(cos², MIN_COS_REFRACTION²)
+    error = abs(float(g_way[2]) / expected - 1) * max(cosine, MIN_COS_REFRACTION) ** 2
     holds(f"derivative against the rule, times cos² θ', {NAMES[dtype]}", error, 4 * eps(dtype))
 
 
@@ -119,15 +119,16 @@ def test_the_back_face_keeps_to_the_same_rule_in_every_form(spread, holds):
         assert {int(s) for s in landed.status.unique()} <= {Status.ALIVE, Status.TOTAL_REFLECTION, Status.VIGNETTED}
         gradients.append(largest(g) / int(landed.alive.sum()))
         found[engine] = landed.status, g
-    # per ray: a slope turns d' by 2 η² / SKIMMING at most, and the landing moves by throw / ez² < 1e3 / 0.1² of that;
-    # a control point has a share of 2 slopes of less than 2 / pitch
-    bound = 2 * N * N / SKIMMING * 1e5 * 2 * 2 / back.pitch[0]
+    # per ray: a slope turns d' by at most 2 η² / MIN_COS_REFRACTION, and the landing moves by throw / ez² < 1e3 / 0.1²
+    # of that angle; a control point acts on two slopes, by less than 2 / pitch each
+    bound = 2 * N * N / MIN_COS_REFRACTION * 1e5 * 2 * 2 / back.pitch[0]
     holds("gradient of a landing in a control point, over its cap", max(gradients) / bound, 1.0)
     if spread == 1e-5:  # where the cap sets in; nearer the angle one form reflects other rays than the other
         (status, plain), (other, fused) = found["plain"], found["fused"]
         assert torch.equal(status, other)
-        # cos θ' > SKIMMING is known to 1e-16 / SKIMMING², and below that it hardly counts
-        figure, bound = "fused gradient against plain torch at the angle, float64", 100 * eps(plain.dtype) / SKIMMING**2
+        # cos θ' > MIN_COS_REFRACTION is known to 1e-16 / MIN_COS_REFRACTION², and below that it hardly counts
+        figure = "fused gradient against plain torch at the angle, float64"
+        bound = 100 * eps(plain.dtype) / MIN_COS_REFRACTION**2
         holds(figure, largest(plain - fused) / largest(plain), bound)
 
 
@@ -144,7 +145,7 @@ def test_tubes_across_the_angle(dtype, holds):
     corners = sheet.landing(lens, LevelPlane(screen.z))
     through = corners.alive
     some = through[1:, 1:] | through[1:, :-1] | through[:-1, 1:] | through[:-1, :-1]
-    whole, border = float(sheet.whole(corners).sum()), float(sheet.flux[some].sum())
+    whole, border = float(sheet.arriving_flux(corners).sum()), float(sheet.flux[some].sum())
     # 400² stratified rays: a rim of 400 cells of which half a cell is random
     assert whole - 1e-3 <= leaves <= border + 1e-3
     picture, outside = sheet.collect(corners, screen)

@@ -166,9 +166,9 @@ def test_threads_of_one_process_change_no_bit(threads):
 def test_strips_and_bands(holds, monkeypatch):
     """Rays and tubes in other portions: 90 000 roundings of 1.1e-16 at most, of either sign."""
     images = {}
-    for portion, rows in ((sampling.POINTS_PER_STRIP, tubes.BAND), (7 * RAYS, 38)):
+    for portion, rows in ((sampling.POINTS_PER_STRIP, tubes.MAX_BAND_ROWS), (7 * RAYS, 38)):
         monkeypatch.setattr(sampling, "POINTS_PER_STRIP", portion)
-        monkeypatch.setattr(tubes, "BAND", rows)
+        monkeypatch.setattr(tubes, "MAX_BAND_ROWS", rows)
         found = by_rays(simulated_plain(SOURCE, lens(), SCREEN, RAYS, 0))
         found |= {"image, tubes": tubes.picture(SOURCE, lens(), SCREEN, TUBES)}
         for name, image in found.items():
@@ -201,7 +201,7 @@ def test_compiled_or_not(holds, monkeypatch, dtype):
 def test_one_thread_and_other_strips_make_the_same_design(threads, monkeypatch, small_design, small_scene):
     """The control points to the last bit."""
     monkeypatch.setattr(sampling, "POINTS_PER_STRIP", 5000)
-    monkeypatch.setattr(tubes, "BAND", 32)
+    monkeypatch.setattr(tubes, "MAX_BAND_ROWS", 32)
     threads(1)
     found = pipeline.design(small_scene, device="cpu").lens.back.control_points()
     with np.load(small_design.folder / "design.npz") as wanted:

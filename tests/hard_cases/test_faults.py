@@ -23,11 +23,11 @@ def by_the_usual_formula(surface, x, y):
 LINES = {**irradiance.LEDGER, "lost through the sides": (Status.MISSED_FRONT,)}
 FAULTS = {
     "refraction has no cap": (
-        interfaces, "SKIMMING", 1e-30,
+        interfaces, "MIN_COS_REFRACTION", 1e-30,
         lambda: test_02_critical_angle.test_the_gradient_is_the_derivative_up_to_its_cap(0.0, DOUBLE, held),
     ),
     "a sphere goes on at its equator": (
-        surfaces, "EQUATOR", -1e9,
+        surfaces, "MIN_COS2", -1e9,
         lambda: test_03_grazing.test_along_the_axis_at_the_equator(0.1, DOUBLE, held),
     ),
     "a sag cancels": (

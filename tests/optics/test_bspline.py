@@ -10,7 +10,7 @@ import torch
 from scipy.interpolate import BSpline, NdBSpline
 
 from bstcad.optics import bspline
-from bstcad.optics.bspline import Spans, curvature_bounds, principal, slope_bounds, span_places
+from bstcad.optics.bspline import Spans, curvature_bounds, principal, slope_bounds, span_points
 from tests.lenses import net, rough
 
 NETS = (5, 6, 7, 33, 513)
@@ -79,8 +79,8 @@ def test_basis_matrix_rows_evaluate_the_net(m):
 
 @pytest.mark.parametrize(("coarse", "fine"), [(5, 6), (9, 33), (33, 129), (7, 64)])
 def test_a_finer_net_keeps_planes(coarse, fine):
-    assert np.abs(bspline.carried(np.ones(coarse), fine) - 1).max() < 1e-12
-    assert np.abs(bspline.carried(np.linspace(-1, 1, coarse), fine) - np.linspace(-1, 1, fine)).max() < 1e-12
+    assert np.abs(bspline.resample(np.ones(coarse), fine) - 1).max() < 1e-12
+    assert np.abs(bspline.resample(np.linspace(-1, 1, coarse), fine) - np.linspace(-1, 1, fine)).max() < 1e-12
 
 
 def test_a_finer_net_changes_a_smooth_surface_little():
@@ -89,10 +89,10 @@ def test_a_finer_net_changes_a_smooth_surface_little():
     coarse, fine = 33, 129
     line = np.linspace(0, 2 * np.pi, coarse)
     heights = torch.as_tensor(np.sin(line)[:, None] * np.cos(line)[None, :])
-    carried = torch.as_tensor(bspline.carried(bspline.carried(heights.numpy(), fine).T, fine).T)
+    fitted = torch.as_tensor(bspline.resample(bspline.resample(heights.numpy(), fine).T, fine).T)
     at = torch.rand((2, 4000), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     before = bspline.evaluate_plain(heights, *(at * (coarse - 1)))
-    after = bspline.evaluate_plain(carried.contiguous(), *(at * (fine - 1)))
+    after = bspline.evaluate_plain(fitted.contiguous(), *(at * (fine - 1)))
     assert float((after[0] - before[0]).abs().max()) < 1e-4  # of amplitude 1; measured 5e-5, in the end spans
     slope_error = after[1] * (fine - 1) - before[1] * (coarse - 1)
     assert float(slope_error.abs().max()) < 2e-2  # of slopes up to 2 pi; measured 1e-2
@@ -134,7 +134,7 @@ def test_the_derivatives_are_those_of_the_surface():
     s, e = (0.2, 0.5, 0.9), 1e-6
     spans = all_spans(NET)
     jet = spans.jet(s)
-    x, y = torch.broadcast_tensors(*span_places(NET, spans.i, spans.j, s))
+    x, y = torch.broadcast_tensors(*span_points(NET, spans.i, spans.j, s))
     flat = (x.flatten(), y.flatten())
     _, z_x, z_y = (t.view_as(x) for t in NET.sag_and_slope(*flat))
     assert float((jet.z_x - z_x).abs().max()) < 1e-13 and float((jet.z_y - z_y).abs().max()) < 1e-13

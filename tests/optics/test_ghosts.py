@@ -16,7 +16,7 @@ from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.point import Point
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Plane
-from bstcad.optics.trace import OFF, ON, follow_ghost, ghost, ghost_light
+from bstcad.optics.trace import OFF, ON, ghost, ghost_light, trace_ghost
 from tests.lenses import bundle, lens_of, tilted, wavy
 
 EXACT = 1e-12
@@ -35,7 +35,7 @@ def plate(losses=BARE, index=N, thickness=4.0, outline=EVERYWHERE):
 @pytest.mark.parametrize("index", [1.33, 1.5, 1.9])
 def test_at_normal_incidence_a_plate_sends_t_r_r_t(index):
     r = ((index - 1) / (index + 1)) ** 2
-    out, _ = follow_ghost(bundle((1.0, 2.0, 0.0), (0.0, 0.0, 1.0)), plate(index=index))
+    out, _ = trace_ghost(bundle((1.0, 2.0, 0.0), (0.0, 0.0, 1.0)), plate(index=index))
     assert float(out.flux) == pytest.approx((1 - r) ** 2 * r * r, rel=EXACT)
     assert bool(out.alive) and out.sense == 1
     # nor is it moved
@@ -44,7 +44,7 @@ def test_at_normal_incidence_a_plate_sends_t_r_r_t(index):
 
 def test_glass_absorbs_along_three_ways_through_it():
     rays, a, t = bundle((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), 0.02, 4.0
-    clear, dim = (follow_ghost(rays, plate(Losses(Fresnel(WAVELENGTH), glass)))[0] for glass in (None, Absorption(a)))
+    clear, dim = (trace_ghost(rays, plate(Losses(Fresnel(WAVELENGTH), glass)))[0] for glass in (None, Absorption(a)))
     assert float(dim.flux / clear.flux) == pytest.approx(math.exp(-3 * a * t), rel=EXACT)
 
 
@@ -57,7 +57,7 @@ def test_beyond_the_critical_angle_all_is_reflected():
         assert float(down.losses[-1].share(cos, cos, torch.zeros(()))) == 1.0
     cos = torch.tensor(math.cos(math.radians(41.0)), dtype=torch.float64)  # short of 41.81
     assert 0 < float(down.losses[-1].share(cos, cos, torch.zeros(()))) < 1
-    _, total = follow_ghost(bundle((0.0, 0.0, -10.0), (0.0, 0.0, 1.0)), lens)
+    _, total = trace_ghost(bundle((0.0, 0.0, -10.0), (0.0, 0.0, 1.0)), lens)
     assert bool(total)
 
 
@@ -70,7 +70,7 @@ def test_a_wedge_throws_its_ghost_where_geometry_has_it(front):
     wedge, thickness, x0, throw = math.radians(5.0), 4.0, 1.0, 500.0
     slope = -math.tan(wedge)  # the back falls along +x; its normal leans by A towards +x
     lens = Lens(front, tilted(slope, 10.0 + thickness, half=60.0), EVERYWHERE, N, losses=BARE)
-    out, _ = follow_ghost(bundle((x0, 0.0, 0.0), (0.0, 0.0, 1.0)), lens)
+    out, _ = trace_ghost(bundle((x0, 0.0, 0.0), (0.0, 0.0, 1.0)), lens)
     landed = LevelPlane(throw).to(out)
 
     z1 = thickness + slope * x0  # over the front

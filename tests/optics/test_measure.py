@@ -11,7 +11,7 @@ from bstcad.optics import measure as measuring
 from bstcad.optics.channels import Channel
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.measure import Effort, apart, lines_apart, measure, tubes_picture
+from bstcad.optics.measure import Effort, measure, spectral_lines, squared_distance, tubes_picture
 from bstcad.optics.outlines import Circle
 from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Sphere
@@ -52,7 +52,7 @@ def test_the_standard_error_is_the_scatter(noise):
     random, pattern = np.random.default_rng(3), 0.1 * (-1.0) ** np.arange(400)
     drawn = torch.from_numpy(1 + pattern + noise * random.standard_normal((500, 8, 400)))
     flat = torch.ones(400, dtype=torch.float64)
-    found, stated = np.array([apart(tuple(pictures), flat) for pictures in drawn]).T
+    found, stated = np.array([squared_distance(tuple(pictures), flat) for pictures in drawn]).T
     assert found.mean() == pytest.approx(0.01, abs=4 * found.std() / math.sqrt(500))
     assert 0.9 < math.sqrt((stated**2).mean()) / found.std() < 1.3
 
@@ -75,26 +75,26 @@ def test_a_witness_fails_a_trace_that_is_truly_off(monkeypatch):
     channels = (Channel(LAMP, 1.5),)
     wanted = tubes_picture(LENS, channels, SCREEN, 1026).numpy() * board(0.005)
     right = measure(LENS, channels, SCREEN, wanted, Effort(rays=512))
-    assert right.rrmsd == pytest.approx(0.005, rel=0.1) and right.witness.off < right.witness.limit < 0.003
+    assert right.rrmsd == pytest.approx(0.005, rel=0.1) and right.witness.difference < right.witness.limit < 0.003
     off = (Channel(LAMP, 1.504),)
     monkeypatch.setattr(measuring, "tubes_picture", lambda lens, _, *rest: tubes_picture(lens, off, *rest))
     wrong = measure(LENS, channels, SCREEN, wanted, Effort(rays=512)).witness
-    assert wrong.limit < wrong.off < 0.008
+    assert wrong.limit < wrong.difference < 0.008
 
 
 @pytest.mark.parametrize("error", [0.005, 0.01, 0.02])  # RRMSD of the lens
-@pytest.mark.parametrize("apart", [0.0, 0.6])  # of the RRMSD: by which rays and tubes truly differ
-def test_a_witness_is_right_in_both_directions(error, apart):
+@pytest.mark.parametrize("difference", [0.0, 0.6])  # of the RRMSD: by which rays and tubes truly differ
+def test_a_witness_is_right_in_both_directions(error, difference):
     """Tubes whose own error is the RRMSD at first and falls as n^-1.6; patterns without noise that do not overlap."""
     flat, random = np.ones((64, 64)), np.random.default_rng(1)
     of_lens, of_tubes, of_fault = (error * (p - p.mean()) / p.std() for p in random.standard_normal((3, 64, 64)))
-    boxes = [torch.from_numpy(flat + of_lens + apart * of_fault)] * 8
+    boxes = [torch.from_numpy(flat + of_lens + difference * of_fault)] * 8
 
     def by_tubes(n):
         return torch.from_numpy(flat + of_lens + (1031 / n) ** 1.6 * of_tubes)
 
-    witness = measuring._compared(boxes, by_tubes, torch.from_numpy(flat), rrmsd_by_rays=error, first=1031)
-    assert (witness.off <= witness.limit) == (apart == 0)
+    witness = measuring._compare(boxes, by_tubes, torch.from_numpy(flat), rrmsd_by_rays=error, first=1031)
+    assert (witness.difference <= witness.limit) == (difference == 0)
     assert 2000 < witness.tubes < 4200 and witness.limit == pytest.approx(error / 2, rel=0.1)
 
 
@@ -106,7 +106,7 @@ def test_the_picture_is_as_near_to_the_lens_s_own_as_it_says():
         measure(LENS, (Channel(LAMP, 1.5),), screen, flat, Effort(rays=rays, accuracy=0.0)) for rays in (128, 1024)
     )
     off = np.linalg.norm(few.picture - many.picture) / np.linalg.norm(flat)
-    assert off == pytest.approx(few.picture_off, rel=0.5)
+    assert off == pytest.approx(few.picture_error, rel=0.5)
 
 
 def test_where_no_light_falls_there_is_no_figure():
@@ -121,11 +121,11 @@ def test_the_lines_of_a_spectrum_apart_sum_to_the_light_of_all():
         Channel(replace(BEAM, wavelength=656.3), 1.488, 0.75),
         Channel(replace(BEAM, wavelength=486.1), 1.5, 0.25),
     )
-    lines = lines_apart(LENS, channels, SCREEN, target(), 64)
+    lines = spectral_lines(LENS, channels, SCREEN, target(), 64)
     assert [line.wavelength for line in lines] == [486.1, 656.3]
     assert [line.share for line in lines] == [0.25, 0.75]
     for line, channel in zip(lines, reversed(channels), strict=True):
         alone = tubes_picture(LENS, (channel,), SCREEN, 64).numpy()
         np.testing.assert_allclose(line.picture, alone * (target().sum() / alone.sum()), rtol=0, atol=1e-12)
     assert np.abs(lines[0].picture - lines[1].picture).max() > 1e-3 * target().max()  # dispersion
-    assert lines_apart(LENS, channels[:1], SCREEN, target(), 64) == ()
+    assert spectral_lines(LENS, channels[:1], SCREEN, target(), 64) == ()

@@ -10,12 +10,12 @@ import torch
 from bstcad.optics.goal import restricted
 from bstcad.optics.interfaces import Reflect, Refract, deflect
 from bstcad.optics.reach import (
-    GRAZING,
-    STEEPEST,
+    MAX_EXIT_ANGLE,
+    MAX_SLOPE,
     grazing_of,
-    kept_from_reflection,
     largest_deflection,
-    room,
+    limit_refraction,
+    reach_margin,
     wanted_slopes,
 )
 from bstcad.optics.receivers import LevelPlane, TiltedPlane
@@ -45,7 +45,7 @@ def test_a_ring_about_the_largest_deflection_is_half_within_reach():
     for off, reached in ((-1e-3, True), (1e-3, False)):
         radius = DISTANCE * math.tan(math.radians(most + off))
         ring = radius * torch.stack([torch.cos(turned), torch.sin(turned)])
-        rest = room(ray(n=12), ring, LevelPlane(DISTANCE), GLASS)
+        rest = reach_margin(ray(n=12), ring, LevelPlane(DISTANCE), GLASS)
         assert ((rest >= 0) == reached).all()
 
 
@@ -56,15 +56,15 @@ def test_slopes_that_would_reflect_all_are_turned_back_to_grazing_light(law, sen
     generator = torch.Generator().manual_seed(3)
     z_x, z_y = 1.2 * torch.randn((2, 400), dtype=torch.float64, generator=generator)
     rays = ray((0.2, -0.1, sense * math.sqrt(0.95)), sense=sense, n=400)
-    kept = kept_from_reflection(rays, (z_x, z_y), law)
+    kept = limit_refraction(rays, (z_x, z_y), law)
     before, after = (deflect(rays, *slopes, law) for slopes in ((z_x, z_y), kept))
     moved = (kept[0] != z_x) | (kept[1] != z_y)
     assert after.rays.alive.all()
     if law is not GLASS:
         assert not moved.any()
         return
-    assert 0.1 < moved.double().mean() < 0.9 and (before.cos_out[~moved] >= math.cos(GRAZING) - 1e-9).all()
-    assert after.cos_out[moved] == pytest.approx(math.cos(GRAZING), abs=1e-9)
+    assert 0.1 < moved.double().mean() < 0.9 and (before.cos_out[~moved] >= math.cos(MAX_EXIT_ANGLE) - 1e-9).all()
+    assert after.cos_out[moved] == pytest.approx(math.cos(MAX_EXIT_ANGLE), abs=1e-9)
     d = rays.direction[:, moved]
     normals = [torch.stack([-x[moved], -y[moved], torch.ones_like(x[moved])]) for x, y in ((z_x, z_y), kept)]
     assert torch.linalg.cross(d, normals[0], dim=0).mul(normals[1]).sum(0).abs().max() < 1e-9
@@ -75,40 +75,40 @@ def test_slopes_that_would_reflect_all_are_turned_back_to_grazing_light(law, sen
 )
 @pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (0.3, -0.1, math.sqrt(0.9))], ids=["along the axis", "oblique"])
 def test_what_is_within_reach_is_what_snells_law_brings_there(plane, direction):
-    """Targets within reach have a slope that sends the ray to its aim short of GRAZING; others have none."""
+    """Targets within reach have a slope that sends the ray to its aim short of MAX_EXIT_ANGLE; others have none."""
     line = torch.linspace(-600.0, 600.0, 41, dtype=torch.float64)
     aim = torch.stack([t.reshape(-1) for t in torch.meshgrid(line, line, indexing="ij")])
     rays = ray(direction, n=aim.shape[1])
-    inside = room(rays, aim, plane, GLASS) > 1e-9
+    inside = reach_margin(rays, aim, plane, GLASS) > 1e-9
     z_x, z_y = wanted_slopes(rays, aim, plane, GLASS)
     hit = deflect(rays, z_x, z_y, GLASS)
     way = hit.rays.direction
     point = torch.stack(plane.point(*aim))
     arrives = ((way * point).sum(0) / point.norm(dim=0)) > 1 - 1e-12
     assert 0.05 < inside.double().mean() < 0.9
-    assert arrives[inside].all() and (hit.cos_out[inside] >= math.cos(GRAZING) - 1e-9).all()
-    assert not (arrives & ~inside & hit.rays.alive & (hit.cos_out > math.cos(GRAZING) + 1e-9)).any()
+    assert arrives[inside].all() and (hit.cos_out[inside] >= math.cos(MAX_EXIT_ANGLE) - 1e-9).all()
+    assert not (arrives & ~inside & hit.rays.alive & (hit.cos_out > math.cos(MAX_EXIT_ANGLE) + 1e-9)).any()
 
 
 def test_a_mirror_reaches_as_far_as_its_slope():
     """Light from above, thrown back by a slope of s: it leaves under twice the angle."""
-    steepest = math.degrees(math.atan(STEEPEST))
+    steepest = math.degrees(math.atan(MAX_SLOPE))
     down = ray((0.0, 0.0, -1.0), sense=-1, n=3)
-    rest = room(down, at(0.0, 60.0, 89.0), LevelPlane(DISTANCE), Reflect())
+    rest = reach_margin(down, at(0.0, 60.0, 89.0), LevelPlane(DISTANCE), Reflect())
     assert (rest >= 0).all() and steepest > 45.0  # twice 45° is level: all that lies above is within reach
     behind = LevelPlane(-DISTANCE)  # the mirror
-    assert float(room(down, at(10.0)[:, :1].expand(2, 3), behind, Reflect()).max()) < 0
+    assert float(reach_margin(down, at(10.0)[:, :1].expand(2, 3), behind, Reflect()).max()) < 0
 
 
 def test_other_lines_and_a_source_of_some_size_take_from_the_reach():
     """No other line may be reflected where the main one leaves, nor light that comes aslant to it."""
-    assert grazing_of(INDEX, [INDEX]) == pytest.approx(GRAZING, abs=1e-12)
+    assert grazing_of(INDEX, [INDEX]) == pytest.approx(MAX_EXIT_ANGLE, abs=1e-12)
     blue = 1.51
     angle = grazing_of(INDEX, [INDEX, blue])
-    assert math.sin(angle) / INDEX * blue == pytest.approx(math.sin(GRAZING))
+    assert math.sin(angle) / INDEX * blue == pytest.approx(math.sin(MAX_EXIT_ANGLE))
     aslant = grazing_of(INDEX, [INDEX], spread=math.radians(0.1))
     inside = math.asin(math.sin(aslant) / INDEX) + math.radians(0.1)
-    assert INDEX * math.sin(inside) == pytest.approx(math.sin(GRAZING))
+    assert INDEX * math.sin(inside) == pytest.approx(math.sin(MAX_EXIT_ANGLE))
 
 
 def test_a_picture_keeps_its_light_on_the_part_within_reach():

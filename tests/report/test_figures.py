@@ -14,7 +14,7 @@ from bstcad.analysis.shape import describe
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Line
+from bstcad.optics.measure import SpectralLine
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.report import drawing, figure_jobs, light_figures
@@ -251,7 +251,7 @@ def test_each_line_has_its_colour_and_where_all_are_alike_the_light_is_grey(wave
 @pytest.mark.parametrize("count", (2, 7))
 def test_the_figure_has_a_picture_of_all_lines_and_one_of_each(count):
     target = np.ones((10, 20))
-    lines = [Line(450.0 + 30 * k, 1 / count, target * (1 + 0.1 * k)) for k in range(count)]
+    lines = [SpectralLine(450.0 + 30 * k, 1 / count, target * (1 + 0.1 * k)) for k in range(count)]
     figure = lines_apart(target, 1.02 * target, lines, LENS)
     shown = [axes.get_title(loc="left") for axes in figure.axes if axes.get_visible()]
     assert len(shown) == count + 1 and shown[0] == "All lines" and "450 nm" in shown[1]

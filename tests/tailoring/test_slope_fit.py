@@ -12,7 +12,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
-from bstcad.optics.reach import STEEPEST, largest_deflection, wanted_slopes
+from bstcad.optics.reach import MAX_SLOPE, largest_deflection, wanted_slopes
 from bstcad.optics.receivers import LevelPlane, TiltedPlane
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import to_first_net, trace
@@ -61,9 +61,9 @@ def test_an_aim_that_no_face_can_reach_turns_the_ray_as_far_as_one_can(index, re
     out = deflect(at_face, z_x, z_y, Refract(index, 1.0)).rays
     turned = torch.acos((out.direction * at_face.direction).sum(0))
     asked = math.atan(math.hypot(reach, 0.2 * reach) / 480.0)
-    assert out.alive.all() and float(steepness.max()) <= STEEPEST * (1 + 1e-12)
+    assert out.alive.all() and float(steepness.max()) <= MAX_SLOPE * (1 + 1e-12)
     assert (out.direction[0] > 0).all() and (out.direction[1] < 0).all()
-    if asked > largest_deflection(index) + 0.02 and float(steepness.max()) < 0.99 * STEEPEST:
+    if asked > largest_deflection(index) + 0.02 and float(steepness.max()) < 0.99 * MAX_SLOPE:
         torch.testing.assert_close(turned, torch.full_like(turned, largest_deflection(index)), rtol=0, atol=1e-9)
 
 

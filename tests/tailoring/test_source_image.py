@@ -15,7 +15,7 @@ from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import RayTubes, apart, simulated
+from bstcad.optics.measure import RayTubes, simulated, squared_distance
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Sphere
@@ -71,7 +71,7 @@ def by_rays(source, sets=6):
 
 def off(pictures, other):
     """RRMSD of a picture from that of independent ones, without their noise."""
-    return math.sqrt(max(apart(pictures, other / total(other))[0], 0.0))
+    return math.sqrt(max(squared_distance(pictures, other / total(other))[0], 0.0))
 
 
 def of_point(source):

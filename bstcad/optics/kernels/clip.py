@@ -1,21 +1,21 @@
 """Fused CPU kernels (numba) behind `tubes.collect`: triangles of light, cut exactly at the pixel borders.
 
-A triangle of flux F and signed area A has the density F / A.  What of it falls into pixel (i, j) follows from Green's
-theorem as a line integral along its edges,
+A triangle of flux F and signed area A has the density F / A.  By Green's theorem its flux in pixel (i, j) is a line
+integral along its edges,
 
     I_ij = F / A ∮ clip(j + 1 - y, 0, 1) dx   over the parts of the edges in column i,
 
-so an edge is walked from pixel border to pixel border.  Its share goes to the pixel it crosses and, as one number, to
-all pixels below that one; a running sum down the columns ends it.  The two triangles beside an edge run through it in
-opposite senses: it is walked once, with the difference of their densities.  A triangle that lies in one pixel or has no
-area gives its flux to a pixel and is not walked around, nor is one that lies beside the screen or nowhere; what is not
-walked around has the density 0 for its edges, so that neither its density nor its corners reach its neighbours.
+so each edge is followed from pixel border to pixel border.  A piece of it adds to the pixel it crosses and, as one
+number, to all pixels below; a running sum down the columns completes the picture.  The two triangles beside an edge
+traverse it in opposite senses, so it is followed once, with the difference of their densities.  Some triangles are not
+followed: one that lies in one pixel or has no area gives its flux to a pixel, and one outside the screen or with an
+invalid corner gives none.  Their edges get the density 0, so that they do not affect their neighbours.
 
-With G = ∂L/∂I and H(x, y) = ∫_y^∞ G dy the adjoint needs of each edge Φ = ∫ H dx (for ∂L/∂A) and ∫ (1 - s) G ds,
-∫ s G ds (an edge that moves by δ across its normal n sweeps the area δ · n ds).  They are the same for both triangles.
+With G = ∂L/∂I and H(x, y) = ∫_y^∞ G dy the adjoint needs for each edge Φ = ∫ H dx (for ∂L/∂A) and ∫ (1 - s) G ds,
+∫ s G ds (an edge that moves by δ sweeps the area δ · n ds, n its normal).  They are the same for both triangles.
 
-All in pixels, x along columns, y down the rows.  Columns come first in the sums, as x does in a sheet of tubes: the
-rows of tubes that one part takes reach few of them.
+All lengths are in pixels, x along columns, y down the rows.  Columns come first in the sums, as x does in a sheet of
+tubes: the rows of tubes that one part takes reach few of them.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from torch import Tensor
 from bstcad.optics.kernels import reductions
 from bstcad.optics.kernels.compiling import compiled
 
-FARTHEST = 1e15  # pixels; a corner that lands farther away has no digits left to be cut by
-NEVER = 1e300  # the next border of a walk that crosses no more borders of a kind
-WIDE = 1e6  # pixels; a wider triangle may round its way into any column
-STRIP = 16  # rows of tubes whose gradient one thread takes at a time
+MAX_DISTANCE = 1e15  # largest coordinate of a corner (pixels); farther away a pixel is below its rounding
+NO_BORDER = 1e300  # s of the next border of an edge that crosses no more borders along an axis
+MAX_WIDTH = 1e6  # largest width of a row of tubes (pixels) whose columns are known; rounding may reach any other
+STRIP = 16  # rows of tubes whose gradient one thread computes at a time
 
-ON, NOWHERE = 0, 16  # state of a corner: on the screen; farther than FARTHEST, or not a number
-LEFT, RIGHT, ABOVE, BELOW = 1, 2, 4, 8  # or beyond one or two of its borders
+ON, INVALID = 0, 16  # state of a corner: on the screen; outside MAX_DISTANCE or not a number
+LEFT, RIGHT, ABOVE, BELOW = 1, 2, 4, 8  # bits of the state of a corner outside one or two borders of the screen
 
 inlined = njit(forceinline=True, error_model="numpy")
 
@@ -45,87 +45,87 @@ inlined = njit(forceinline=True, error_model="numpy")
 
 
 @inlined
-def place_of(x, y, columns, rows):
-    """(column, row, where) of a point; -1 is all before the screen, `columns` and `rows` are all behind it."""
+def pixel_at(x, y, columns, rows):
+    """Return (column, row, state) of a point; -1, `columns` and `rows` are the cells outside the screen."""
     if 0.0 <= x < columns and 0.0 <= y < rows:
         return int(x), int(y), ON
-    if not abs(x) + abs(y) < FARTHEST:
-        return 0, 0, NOWHERE
+    if not abs(x) + abs(y) < MAX_DISTANCE:
+        return 0, 0, INVALID
     i, j = int(math.floor(min(max(x, -1.0), float(columns)))), int(math.floor(min(max(y, -1.0), float(rows))))
     return i, j, LEFT * (i < 0) + RIGHT * (i >= columns) + ABOVE * (j < 0) + BELOW * (j >= rows)
 
 
 @inlined
 def corner_at(corner, k, r, columns, rows):
-    """(x, y, column, row, where) of one corner."""
+    """Return (x, y, column, row, state) of one corner."""
     x, y = corner[0, k, r], corner[1, k, r]
-    i, j, where = place_of(x, y, columns, rows)
-    return x, y, i, j, where
+    i, j, state = pixel_at(x, y, columns, rows)
+    return x, y, i, j, state
 
 
 @inlined
 def same_cell(a, b):
-    """Do two corners lie in one pixel, or in one of the cells beyond the screen?"""
+    """Return True if two corners lie in one pixel or in one cell outside the screen."""
     return a[2] == b[2] and a[3] == b[3]
 
 
 @inlined
 def in_one_cell(a, b, c):
-    """Do the three corners lie in one pixel, or in one of the cells beyond the screen?"""
+    """Return True if three corners lie in one pixel or in one cell outside the screen."""
     return same_cell(a, b) and same_cell(a, c)
 
 
 @inlined
-def all_beside(a, b, c):
-    """Do the three corners lie on one side of the screen, beyond it, or is one of them nowhere?"""
-    return (a[4] & b[4] & c[4]) | ((a[4] | b[4] | c[4]) & NOWHERE) != 0
+def misses_screen(a, b, c):
+    """Return True if three corners lie outside one side of the screen, or one of them is invalid."""
+    return (a[4] & b[4] & c[4]) | ((a[4] | b[4] | c[4]) & INVALID) != 0
 
 
 @inlined
 def area_of(a, b, c):
-    """Signed (pixel²)."""
+    """Return the signed area of a triangle (pixel²)."""
     return 0.5 * ((b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1]))
 
 
 @inlined
-def beyond(p, size):
-    """Signed distance beyond the border."""
+def outside(p, size):
+    """Return the signed distance of a coordinate outside the border."""
     return p - min(max(p, 0.0), size)
 
 
 @inlined
-def half_square_off(a, b, c, d, columns, rows):
-    """Half the sum of the corners' squared distances beyond the border."""
-    off = beyond(a[0], columns) ** 2 + beyond(b[0], columns) ** 2
-    off += beyond(c[0], columns) ** 2 + beyond(d[0], columns) ** 2
-    off += beyond(a[1], rows) ** 2 + beyond(b[1], rows) ** 2
-    off += beyond(c[1], rows) ** 2 + beyond(d[1], rows) ** 2
-    return 0.5 * off
+def half_square_outside(a, b, c, d, columns, rows):
+    """Return half the sum of the corners' squared distances outside the border."""
+    square = outside(a[0], columns) ** 2 + outside(b[0], columns) ** 2
+    square += outside(c[0], columns) ** 2 + outside(d[0], columns) ** 2
+    square += outside(a[1], rows) ** 2 + outside(b[1], rows) ** 2
+    square += outside(c[1], rows) ** 2 + outside(d[1], rows) ** 2
+    return 0.5 * square
 
 
-# --- the walk along one edge ------------------------------------------------------------------------------------------
+# --- along one edge ---------------------------------------------------------------------------------------------------
 
 
 @inlined
-def _first(start, cell, d, size):
-    """(step, s of the next border, s from border to border) along one axis; beyond the screen is one cell."""
+def _first_border(start, cell, d, size):
+    """Return (step, s of the next border, s between borders) along one axis; outside the screen is one cell."""
     if d > 0.0 and cell < size:
         return 1, (cell + 1 - start) / d, 1.0 / d
     if d < 0.0 and cell >= 0:
         return -1, (cell - start) / d, -1.0 / d
-    return 0, NEVER, NEVER
+    return 0, NO_BORDER, NO_BORDER
 
 
 @inlined
-def _crossed(cell, step, size, reached, over):
-    """(cell, s of the next border) behind the border at s = `reached`."""
+def _next_border(cell, step, size, s, spacing):
+    """Return (cell, s of the next border) behind the border at s."""
     cell += step
-    return cell, NEVER if (cell < 0 or cell >= size) else reached + over
+    return cell, NO_BORDER if (cell < 0 or cell >= size) else s + spacing
 
 
 @inlined
 def _one_border(a, b):
-    """s at the border between the neighbouring pixels of a and b."""
+    """Return s at the border between the neighbouring pixels of a and b."""
     if a[2] != b[2]:
         return (max(a[2], b[2]) - a[0]) / (b[0] - a[0])
     return (max(a[3], b[3]) - a[1]) / (b[1] - a[1])
@@ -133,7 +133,7 @@ def _one_border(a, b):
 
 @inlined
 def _add_piece(sums, i, j, share, middle):
-    """A piece of an edge in pixel (i, j), with its middle at y = `middle`."""
+    """Add a piece of an edge in pixel (i, j), with its midpoint at y = `middle`."""
     below = middle - j
     sums[i, j] += share * (1.0 - below)
     sums[i, j + 1] += share * below
@@ -141,7 +141,7 @@ def _add_piece(sums, i, j, share, middle):
 
 @inlined
 def add_edge(sums, a, b, density):
-    """Adds ∫ clip(j + 1 - y, 0, 1) dx of an edge, times a density; sums (columns, rows + 1), before the running sum."""
+    """Add ∫ clip(j + 1 - y, 0, 1) dx along an edge, times a density, to sums (columns, rows + 1)."""
     if density == 0.0:
         return
     if a[4] | b[4] == ON:
@@ -155,19 +155,19 @@ def add_edge(sums, a, b, density):
             _add_piece(sums, a[2], a[3], s * share, a[1] + 0.5 * s * dy)
             _add_piece(sums, b[2], b[3], (1.0 - s) * share, a[1] + 0.5 * (1.0 + s) * dy)
             return
-    _add_walk(sums, a, b, density)
+    _add_long_edge(sums, a, b, density)
 
 
 @njit(error_model="numpy")
-def _add_walk(sums, a, b, density):
-    """`add_edge` across any number of borders."""
+def _add_long_edge(sums, a, b, density):
+    """Run `add_edge` across any number of borders."""
     columns, rows = sums.shape[0], sums.shape[1] - 1
     ax, ay, i, j, _ = a
     dx, dy = b[0] - ax, b[1] - ay
     if dx == 0.0:
         return
-    step_x, next_x, over_x = _first(ax, i, dx, columns)
-    step_y, next_y, over_y = _first(ay, j, dy, rows)
+    step_x, next_x, spacing_x = _first_border(ax, i, dx, columns)
+    step_y, next_y, spacing_y = _first_border(ay, j, dy, rows)
     s = 0.0
     while True:
         end = min(next_x, next_y, 1.0)
@@ -181,44 +181,44 @@ def _add_walk(sums, a, b, density):
             return
         s = end
         if next_x < next_y:
-            i, next_x = _crossed(i, step_x, columns, next_x, over_x)
+            i, next_x = _next_border(i, step_x, columns, next_x, spacing_x)
         else:
-            j, next_y = _crossed(j, step_y, rows, next_y, over_y)
+            j, next_y = _next_border(j, step_y, rows, next_y, spacing_y)
 
 
 @inlined
-def _of_piece(g, below_g, i, j, middle):
-    """(G, mean H) of a piece of an edge in pixel (i, j), with its middle at y = `middle`."""
+def _piece_values(g, below_g, i, j, middle):
+    """Return (G, mean H) of a piece of an edge in pixel (i, j), with its midpoint at y = `middle`."""
     value = g[i, j]
     return value, below_g[i, j + 1] + (j + 1 - middle) * value
 
 
 @inlined
 def along_edge(g, below_g, a, b):
-    """(∫ H dx, ∫ (1 - s) G ds, ∫ s G ds) along an edge; g (columns, rows), below_g sums it from a row on."""
+    """Return (∫ H dx, ∫ (1 - s) G ds, ∫ s G ds) along an edge; below_g: sums of g (columns, rows) from each row on."""
     if a[4] | b[4] == ON:
         borders = abs(a[2] - b[2]) + abs(a[3] - b[3])
         dx, dy = b[0] - a[0], b[1] - a[1]
         if borders == 0:
-            value, h = _of_piece(g, below_g, a[2], a[3], a[1] + 0.5 * dy)
+            value, h = _piece_values(g, below_g, a[2], a[3], a[1] + 0.5 * dy)
             return h * dx, 0.5 * value, 0.5 * value
         if borders == 1:
             s = _one_border(a, b)
-            one, phi_one = _of_piece(g, below_g, a[2], a[3], a[1] + 0.5 * s * dy)
-            two, phi_two = _of_piece(g, below_g, b[2], b[3], a[1] + 0.5 * (1.0 + s) * dy)
+            one, phi_one = _piece_values(g, below_g, a[2], a[3], a[1] + 0.5 * s * dy)
+            two, phi_two = _piece_values(g, below_g, b[2], b[3], a[1] + 0.5 * (1.0 + s) * dy)
             whole, second = s * one + (1.0 - s) * two, 0.5 * (s * s * one + (1.0 - s) * (1.0 + s) * two)
             return (s * phi_one + (1.0 - s) * phi_two) * dx, whole - second, second
-    return _along_walk(g, below_g, a, b)
+    return _along_long_edge(g, below_g, a, b)
 
 
 @njit(error_model="numpy")
-def _along_walk(g, below_g, a, b):
-    """`along_edge` across any number of borders."""
+def _along_long_edge(g, below_g, a, b):
+    """Run `along_edge` across any number of borders."""
     columns, rows = g.shape
     ax, ay, i, j, _ = a
     dx, dy = b[0] - ax, b[1] - ay
-    step_x, next_x, over_x = _first(ax, i, dx, columns)
-    step_y, next_y, over_y = _first(ay, j, dy, rows)
+    step_x, next_x, spacing_x = _first_border(ax, i, dx, columns)
+    step_y, next_y, spacing_y = _first_border(ay, j, dy, rows)
     s = phi = whole = second = 0.0
     while True:
         end = min(next_x, next_y, 1.0)
@@ -228,7 +228,7 @@ def _along_walk(g, below_g, a, b):
                 phi += length * below_g[i, 0]
             else:
                 middle = 0.5 * (s + end)
-                value, h = _of_piece(g, below_g, i, j, ay + middle * dy)
+                value, h = _piece_values(g, below_g, i, j, ay + middle * dy)
                 phi += length * h
                 whole += length * value
                 second += length * middle * value
@@ -236,40 +236,40 @@ def _along_walk(g, below_g, a, b):
             return phi * dx, whole - second, second
         s = end
         if next_x < next_y:
-            i, next_x = _crossed(i, step_x, columns, next_x, over_x)
+            i, next_x = _next_border(i, step_x, columns, next_x, spacing_x)
         else:
-            j, next_y = _crossed(j, step_y, rows, next_y, over_y)
+            j, next_y = _next_border(j, step_y, rows, next_y, spacing_y)
 
 
 @inlined
-def _give(sums, i, j, flux):
+def _add_to_pixel(sums, i, j, flux):
     sums[i, j] += flux
     sums[i, j + 1] -= flux
 
 
 @inlined
 def _density(sums, thinnest, a, b, c, flux):
-    """Flux per area of a triangle that is walked around; 0 of another, which gives its flux to a pixel instead."""
-    if all_beside(a, b, c) or flux == 0.0:
+    """Return the flux per area of a triangle; add the flux of one that is not followed to a pixel, and return 0."""
+    if misses_screen(a, b, c) or flux == 0.0:
         return 0.0
-    i, j, where = a[2], a[3], a[4]
+    i, j, state = a[2], a[3], a[4]
     if not in_one_cell(a, b, c):
         area = area_of(a, b, c)
         if abs(area) >= thinnest:
             return flux / area
-        i, j, where = place_of((a[0] + b[0] + c[0]) / 3.0, (a[1] + b[1] + c[1]) / 3.0, sums.shape[0], sums.shape[1] - 1)
-    if where == ON:
-        _give(sums, i, j, flux)
+        i, j, state = pixel_at((a[0] + b[0] + c[0]) / 3.0, (a[1] + b[1] + c[1]) / 3.0, sums.shape[0], sums.shape[1] - 1)
+    if state == ON:
+        _add_to_pixel(sums, i, j, flux)
     return 0.0
 
 
 @njit(error_model="numpy")
 def _add_row(sums, thinnest, corner, flux, k, upper):
-    """Row k of tubes, and the edges between it and the row before; upper (m,): the densities on that side of them.
+    """Add row k of tubes and the edges between it and the row before, whose densities `upper` (m,) holds.
 
     Corners 0 and 3 of a tube lie in row k, 1 and 2 in row k + 1; the tube before shares 0 and 1.  Its triangles are 012
     and 023, or 013 and 123 where the diagonal runs the other way.  Returns Σ flux · (mean square of the corners'
-    distance beyond the border), and leaves in `upper` the densities for the next row.
+    distance outside the border), and stores in `upper` the densities for the next row.
     """
     columns, rows = sums.shape[0], sums.shape[1] - 1
     c0, c1 = corner_at(corner, k, 0, columns, rows), corner_at(corner, k + 1, 0, columns, rows)
@@ -277,9 +277,9 @@ def _add_row(sums, thinnest, corner, flux, k, upper):
     for r in range(flux.shape[1]):
         c3, c2 = corner_at(corner, k, r + 1, columns, rows), corner_at(corner, k + 1, r + 1, columns, rows)
         half, odd = 0.5 * flux[k, r], (k + r) & 1
-        where = c0[4] | c1[4] | c2[4] | c3[4]
-        if where == ON and in_one_cell(c0, c1, c2) and same_cell(c0, c3):
-            _give(sums, c0[2], c0[3], flux[k, r])
+        state = c0[4] | c1[4] | c2[4] | c3[4]
+        if state == ON and in_one_cell(c0, c1, c2) and same_cell(c0, c3):
+            _add_to_pixel(sums, c0[2], c0[3], flux[k, r])
             first = second = 0.0
         elif odd:
             first, second = _density(sums, thinnest, c0, c1, c3, half), _density(sums, thinnest, c1, c2, c3, half)
@@ -289,8 +289,8 @@ def _add_row(sums, thinnest, corner, flux, k, upper):
             add_edge(sums, c2, c0, first - second)
         add_edge(sums, c0, c1, first - before)
         add_edge(sums, c0, c3, upper[r] - (first if odd else second))
-        if where != ON and half != 0.0:
-            far += half * half_square_off(c0, c1, c2, c3, columns, rows)
+        if state != ON and half != 0.0:
+            far += half * half_square_outside(c0, c1, c2, c3, columns, rows)
         upper[r], before, c0, c1 = second if odd else first, second, c3, c2
     add_edge(sums, c0, c1, -before)
     return far
@@ -298,7 +298,7 @@ def _add_row(sums, thinnest, corner, flux, k, upper):
 
 @njit
 def _add_end(sums, corner, k, upper):
-    """The edges behind the last row of tubes."""
+    """Add the edges behind the last row of tubes."""
     columns, rows = sums.shape[0], sums.shape[1] - 1
     for r in range(upper.size):
         a, b = corner_at(corner, k, r, columns, rows), corner_at(corner, k, r + 1, columns, rows)
@@ -307,7 +307,7 @@ def _add_end(sums, corner, k, upper):
 
 @njit
 def _clear_columns(own, touched, x):
-    """Clear the columns that triangles between corners at x can reach; a walk's last step may be rounded beyond."""
+    """Clear the columns that triangles between corners at x can reach, with a margin for rounding."""
     low, high = math.inf, -math.inf
     for k in range(x.shape[0]):
         for r in range(x.shape[1]):
@@ -315,7 +315,7 @@ def _clear_columns(own, touched, x):
                 low = x[k, r]
             if x[k, r] > high:
                 high = x[k, r]
-    if high - low < WIDE:
+    if high - low < MAX_WIDTH:
         low, high = max(low - 1.0, 0.0), min(high + 2.0, float(own.shape[0]))
     else:
         low, high = 0.0, float(own.shape[0])
@@ -324,22 +324,22 @@ def _clear_columns(own, touched, x):
 
 
 @compiled(parallel=True)
-def _clip(corner, flux, thinnest, sums, touched, outside):
-    """Both triangles of each tube; corner (2, n + 1, m + 1), flux (n, m), sums (parts, columns, rows + 1).
+def _clip(corner, flux, thinnest, sums, touched, far):
+    """Add both triangles of each tube; corner (2, n + 1, m + 1), flux (n, m), sums (parts, columns, rows + 1).
 
-    outside (parts,): Σ flux · (mean square of the corners' distance beyond the border).
+    far (parts,): Σ flux · (mean square of the corners' distance outside the border).
     """
     n, m = flux.shape
     count = sums.shape[0]
     share = (n + count - 1) // count
     for c in prange(count):
         first, last = c * share, min(n, (c + 1) * share)
-        outside[c] = 0.0
+        far[c] = 0.0
         if first < last:
             _clear_columns(sums[c], touched[c], corner[0, first : last + 1])
             upper = np.zeros(m)
             for k in range(first, last):
-                outside[c] += _add_row(sums[c], thinnest, corner, flux, k, upper)
+                far[c] += _add_row(sums[c], thinnest, corner, flux, k, upper)
             _add_end(sums[c], corner, last, upper)
 
 
@@ -347,19 +347,19 @@ def _clip(corner, flux, thinnest, sums, touched, outside):
 
 
 @inlined
-def _is_walked(thinnest, a, b, c):
-    return not (all_beside(a, b, c) or in_one_cell(a, b, c)) and abs(area_of(a, b, c)) >= thinnest
+def _is_followed(thinnest, a, b, c):
+    return not (misses_screen(a, b, c) or in_one_cell(a, b, c)) and abs(area_of(a, b, c)) >= thinnest
 
 
 @inlined
 def _reversed(edge):
-    """The integrals of `along_edge` from b to a."""
+    """Return the integrals of `along_edge` from b to a."""
     return -edge[0], edge[2], edge[1]
 
 
 @inlined
 def _triangle_adjoint(a, b, c, ab, bc, ca, flux):
-    """(gradient in the six coordinates, gradient in the flux) of a triangle that is walked around, by its edges."""
+    """Return (gradient in the six coordinates, gradient in the flux) of a triangle from the integrals of its edges."""
     area = area_of(a, b, c)
     phi, w = ab[0] + bc[0] + ca[0], flux / area
     mean = phi / area
@@ -375,23 +375,23 @@ def _triangle_adjoint(a, b, c, ab, bc, ca, flux):
 
 @inlined
 def _mean(g, a, b, c):
-    """G where a triangle that is not walked around gives its flux to."""
+    """Return G at the pixel that takes the flux of a triangle which is not followed."""
     columns, rows = g.shape
-    if all_beside(a, b, c):
+    if misses_screen(a, b, c):
         return 0.0
-    i, j, where = a[2], a[3], a[4]
+    i, j, state = a[2], a[3], a[4]
     if not in_one_cell(a, b, c):
-        i, j, where = place_of((a[0] + b[0] + c[0]) / 3.0, (a[1] + b[1] + c[1]) / 3.0, columns, rows)
-    return g[i, j] if where == ON else 0.0
+        i, j, state = pixel_at((a[0] + b[0] + c[0]) / 3.0, (a[1] + b[1] + c[1]) / 3.0, columns, rows)
+    return g[i, j] if state == ON else 0.0
 
 
 @njit(error_model="numpy")
-def _integrate_row(g, below_g, thinnest, corner, flux, k, in_flux, walked, known, edges):
-    """Puts `along_edge` of the edges of the triangles of row k that are walked around into `edges`.
+def _integrate_row(g, below_g, thinnest, corner, flux, k, in_flux, flags, known, edges):
+    """Store `along_edge` of the edges of the triangles of row k that are followed in `edges`.
 
-    walked (m, 3): which of a tube's triangles are, and whether it reaches beyond the screen.  edges: upper, lower,
-    across (m, 3) and side (m + 1, 3) with the edges 03, 12, the diagonals, and 01.  Those of `upper` that are known
-    (m,) from the row before stay as they are; afterwards `known` says which of `lower` are.
+    flags (m, 3): True for the first and the second triangle of a tube if it is followed, and for a tube that extends
+    outside the screen.  edges: upper, lower, across (m, 3) and side (m + 1, 3), for the edges 03, 12, the diagonals and
+    01.  known (m,): True for edges of `upper` that the row before has computed; on return, for those of `lower`.
     """
     columns, rows = g.shape
     upper, lower, across, side = edges
@@ -400,12 +400,12 @@ def _integrate_row(g, below_g, thinnest, corner, flux, k, in_flux, walked, known
     for r in range(flux.shape[1]):
         c3, c2 = corner_at(corner, k, r + 1, columns, rows), corner_at(corner, k + 1, r + 1, columns, rows)
         odd, first, second = (k + r) & 1, False, False
-        where = c0[4] | c1[4] | c2[4] | c3[4]
-        in_one = where == ON and in_one_cell(c0, c1, c2) and same_cell(c0, c3)
+        state = c0[4] | c1[4] | c2[4] | c3[4]
+        in_one = state == ON and in_one_cell(c0, c1, c2) and same_cell(c0, c3)
         if not in_one and (flux[k, r] != 0.0 or in_flux):
-            first = _is_walked(thinnest, c0, c1, c3 if odd else c2)
-            second = _is_walked(thinnest, c1 if odd else c0, c2, c3)
-        walked[r, 0], walked[r, 1], walked[r, 2] = first, second, where != ON
+            first = _is_followed(thinnest, c0, c1, c3 if odd else c2)
+            second = _is_followed(thinnest, c1 if odd else c0, c2, c3)
+        flags[r, 0], flags[r, 1], flags[r, 2] = first, second, state != ON
         if first and not known_01:
             side[r, 0], side[r, 1], side[r, 2] = along_edge(g, below_g, c0, c1)
         if (first if odd else second) and not known[r]:
@@ -422,15 +422,15 @@ def _integrate_row(g, below_g, thinnest, corner, flux, k, in_flux, walked, known
 
 
 @njit(error_model="numpy")
-def _add_row_adjoint(corner, flux, k, walked, edges, d_corner, d_flux):
-    """Adds the gradient of the triangles of row k that are walked around, from the integrals along their edges."""
+def _add_row_adjoint(corner, flux, k, flags, edges, d_corner, d_flux):
+    """Add the gradient of the triangles of row k that are followed, from the integrals along their edges."""
     upper, lower, across, side = edges
     ax, ay, bx, by = corner[0, k], corner[1, k], corner[0, k + 1], corner[1, k + 1]
-    x0 = y0 = x1 = y1 = 0.0  # the gradient in corners 0 and 1, so far
+    x0 = y0 = x1 = y1 = 0.0  # sums of the gradient in corners 0 and 1
     m = flux.shape[1]
     for r in range(m):
         x2 = y2 = x3 = y3 = mean = 0.0
-        first, second = walked[r, 0], walked[r, 1]
+        first, second = flags[r, 0], flags[r, 1]
         if first or second:
             half, odd = 0.5 * flux[k, r], (k + r) & 1
             c0, c1, c2, c3 = (ax[r], ay[r]), (bx[r], by[r]), (bx[r + 1], by[r + 1]), (ax[r + 1], ay[r + 1])
@@ -468,34 +468,35 @@ def _add_row_adjoint(corner, flux, k, walked, edges, d_corner, d_flux):
 
 
 @njit
-def _add_rest_of_row(g, corner, flux, k, walked, g_outside, d_corner, d_flux):
-    """Adds the gradient of the triangles that are not walked around, and of the light beyond the border."""
+def _add_rest_of_row(g, corner, flux, k, flags, g_far, d_corner, d_flux):
+    """Add the gradient of the triangles that are not followed, and of the light outside the border."""
     columns, rows = g.shape
     for r in range(flux.shape[1]):
-        if walked[r, 2] and flux[k, r] != 0.0:
-            by = g_outside * 0.5 * flux[k, r]
+        if flags[r, 2] and flux[k, r] != 0.0:
+            weight = g_far * 0.5 * flux[k, r]
             for i in range(k, k + 2):
                 for j in range(r, r + 2):
-                    d_corner[0, i, j] += by * beyond(corner[0, i, j], columns)
-                    d_corner[1, i, j] += by * beyond(corner[1, i, j], rows)
+                    d_corner[0, i, j] += weight * outside(corner[0, i, j], columns)
+                    d_corner[1, i, j] += weight * outside(corner[1, i, j], rows)
         if d_flux.size > 0:
             c0, c1 = corner_at(corner, k, r, columns, rows), corner_at(corner, k + 1, r, columns, rows)
             c3, c2 = corner_at(corner, k, r + 1, columns, rows), corner_at(corner, k + 1, r + 1, columns, rows)
             odd, mean = (k + r) & 1, 0.0
-            if not walked[r, 0]:
+            if not flags[r, 0]:
                 mean += _mean(g, c0, c1, c3 if odd else c2)
-            if not walked[r, 1]:
+            if not flags[r, 1]:
                 mean += _mean(g, c1 if odd else c0, c2, c3)
-            if walked[r, 2]:
-                mean += g_outside * half_square_off(c0, c1, c2, c3, columns, rows)
+            if flags[r, 2]:
+                mean += g_far * half_square_outside(c0, c1, c2, c3, columns, rows)
             d_flux[k, r] += 0.5 * mean
 
 
 @compiled(parallel=True)
-def clip_adjoint(corner, flux, thinnest, g, below_g, g_outside, d_corner, d_flux):
-    """Adds to d_corner; first the even strips of rows of tubes, then the odd ones: no two threads write one corner.
+def clip_adjoint(corner, flux, thinnest, g, below_g, g_far, d_corner, d_flux):
+    """Add the gradient in the corners to d_corner, and store the gradient in the flux in d_flux (n, m) or (0, 0).
 
-    d_flux (n, m) takes the gradient in the flux, if this is not empty; g (columns, rows), below_g (columns, rows + 1).
+    g (columns, rows), below_g (columns, rows + 1).  The even strips of rows of tubes are computed first, then the odd
+    ones, so that no two threads write one corner.
     """
     n, m = flux.shape
     strips = (n + STRIP - 1) // STRIP
@@ -503,19 +504,19 @@ def clip_adjoint(corner, flux, thinnest, g, below_g, g_outside, d_corner, d_flux
         for half_c in prange((strips - parity + 1) // 2):
             first = (2 * half_c + parity) * STRIP
             upper, lower, across, side = np.empty((m, 3)), np.empty((m, 3)), np.empty((m, 3)), np.empty((m + 1, 3))
-            walked, known, in_flux = np.empty((m, 3), np.bool_), np.zeros(m, np.bool_), d_flux.size > 0
+            flags, known, in_flux = np.empty((m, 3), np.bool_), np.zeros(m, np.bool_), d_flux.size > 0
             for k in range(first, min(n, first + STRIP)):
                 edges = upper, lower, across, side
-                _integrate_row(g, below_g, thinnest, corner, flux, k, in_flux, walked, known, edges)
-                _add_row_adjoint(corner, flux, k, walked, edges, d_corner, d_flux)
-                _add_rest_of_row(g, corner, flux, k, walked, g_outside, d_corner, d_flux)
+                _integrate_row(g, below_g, thinnest, corner, flux, k, in_flux, flags, known, edges)
+                _add_row_adjoint(corner, flux, k, flags, edges, d_corner, d_flux)
+                _add_rest_of_row(g, corner, flux, k, flags, g_far, d_corner, d_flux)
                 upper, lower = lower, upper
 
 
 class Clip(torch.autograd.Function):
-    """(corner (2, n + 1, m + 1) in pixels, flux (n, m), (rows, columns), thinnest in pixel²) -> (image, outside).
+    """Map (corner (2, n + 1, m + 1), flux (n, m), (rows, columns), thinnest) to (image, Σ far), as `tubes.collect`.
 
-    Gradient in the corners and in the flux.
+    Lengths are in pixels.  The gradient is taken in the corners and in the flux.
     """
 
     @staticmethod
@@ -523,15 +524,15 @@ class Clip(torch.autograd.Function):
         ctx.save_for_backward(corner, flux)
         ctx.thinnest = thinnest
         (rows, columns), count = shape, reductions.parts(flux.numel())
-        (sums, touched), outside = reductions.buffers(count, columns, rows + 1), np.zeros(count)
+        (sums, touched), far = reductions.buffers(count, columns, rows + 1), np.zeros(count)
         tubes = corner.detach().contiguous().numpy(), flux.detach().contiguous().numpy()
-        _clip(*tubes, thinnest, sums, touched, outside)
+        _clip(*tubes, thinnest, sums, touched, far)
         image = reductions.merged(sums, touched).cumsum(1)[:, :rows]
-        return torch.from_numpy(image.T.copy()), torch.tensor(outside.sum())
+        return torch.from_numpy(image.T.copy()), torch.tensor(far.sum())
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, g: Tensor, g_outside: Tensor):  # noqa: D102
+    def backward(ctx, g: Tensor, g_far: Tensor):  # noqa: D102
         corner, flux = ctx.saved_tensors
         g = g.numpy().T.copy()
         below = np.zeros((g.shape[0], g.shape[1] + 1))
@@ -540,6 +541,6 @@ class Clip(torch.autograd.Function):
         d_flux = torch.empty(flux.shape if ctx.needs_input_grad[1] else (0, 0), dtype=torch.float64)
         clip_adjoint(
             corner.detach().contiguous().numpy(), flux.detach().contiguous().numpy(), ctx.thinnest, g, below,
-            float(g_outside), d_corner.numpy(), d_flux.numpy(),
+            float(g_far), d_corner.numpy(), d_flux.numpy(),
         )  # fmt: skip
         return d_corner, d_flux if ctx.needs_input_grad[1] else None, None, None

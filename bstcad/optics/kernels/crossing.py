@@ -1,14 +1,14 @@
-"""Fused CPU kernels (numba) behind `trace.through`: rays across a spline face, to a screen or on, and the adjoint.
+"""Fused CPU kernels (numba) behind `trace.through` and `trace.behind`: rays across a spline face, and the adjoint.
 
-The plain torch form stays the reference.  Rays go in blocks (forward.py).  The forward pass keeps each ray's path to
-the face; from it the adjoint finds hit and slopes again.
+The plain torch form is the reference.  Rays are processed in blocks (forward.py).  The forward pass stores each ray's
+path to the face; the adjoint computes hit and slopes from it again.
 
 With the ray x + t d, the face's normal n = (-p, -q, 1) of its slopes p and q, and F(t) = z - sag, the hit X moves by
 
-    dX = dx + t dd + d dt,   dt = (dsag - n · (dx + t dd)) / (n · d),   dp = S_xx dX_x + S_xy dX_y, dq alike,
+    dX = dx + t dd + d dt,   dt = (dsag - n · (dx + t dd)) / (n · d),   dp = S_xx dX_x + S_xy dX_y, dq likewise,
 
 and the direction behind the face is e = η d + s n, s(p, q, n · d) by the law.  The adjoint is the transpose of this.
-It is taken in the net, and in x and d only where these need a gradient.
+It is computed for the net, and for x and d where these need a gradient.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from bstcad.optics.interfaces import Interface, dimmed, net_bounds
+from bstcad.optics.interfaces import Interface, apply_losses, net_bounds
 from bstcad.optics.kernels import kernel_arguments, reductions
 from bstcad.optics.kernels.compiling import compiled
 from bstcad.optics.kernels.forward import (
@@ -52,20 +52,20 @@ from bstcad.optics.kernels.forward import (
     to_net,
     to_screen,
 )
-from bstcad.optics.kernels.records import Faces, Tilted
+from bstcad.optics.kernels.records import Faces, TiltedScreen
 from bstcad.optics.kernels.spline import curved, net_of, scatter
 from bstcad.optics.rays import Landed, Rays, Status
 from bstcad.optics.receivers import Receiver
 
-# The adjoint also keeps of a block: ∂L/∂ of landing or hit and direction, of path and cosine of incidence, and second
-# derivatives of the sag.
+# Further offsets in `work` for the adjoint: ∂L/∂ of landing or hit and direction, of path and cosine of incidence, and
+# second derivatives of the sag.
 G_X, G_Y, G_PATH, G_COSINE, H_XX, H_XY, H_YY, G_Z, G_DX, G_DY, G_DZ = (WORK + BLOCK * k for k in range(11))
 MORE = WORK + 11 * BLOCK
 
 
 @njit(error_model="numpy")
 def _load(position, direction, status, first, count, work):
-    """The rays first … first + count - 1; z counts from where positions do."""
+    """Load rays first … first + count - 1 into `work`."""
     for r in range(count):
         at = first + r
         work[X + r], work[Y + r], work[Z + r] = position[0, at], position[1, at], position[2, at]
@@ -75,11 +75,11 @@ def _load(position, direction, status, first, count, work):
 
 @compiled()
 def _cross(net, faces, tilted, lands, position, direction, status, out, path, cosine, first, last):
-    """Rays first … last - 1 meet the face and are refracted or reflected.
+    """Trace rays first … last - 1 to the face and refract or reflect them.
 
-    out: (2, n) where they land (mm) if `lands` is True; if it is None (6, n), hit (mm) and direction behind the face.
-    path (n,) mm to the face; status (n,) their fate, which is changed; cosine (n,) of the angle of incidence, or empty
-    where nobody asks for it.
+    lands: True: out (2, n) receives the landing points (mm); None: out (6, n) receives hit (mm) and direction behind
+    the face.  path (n,) receives the path to the face (mm), status (n,) is updated, and cosine receives the cosine of
+    the angle of incidence, (n,), or nothing if it is empty.
     """
     work, active = np.empty(WORK), np.empty(BLOCK, np.uint32)
     for begin in range(first, last, BLOCK):
@@ -115,7 +115,7 @@ def _cross(net, faces, tilted, lands, position, direction, status, out, path, co
 
 @njit(error_model="numpy")
 def _store_directions(count, work, first, direction, out):
-    """Height of the hit and direction behind the face; a lost ray keeps its direction."""
+    """Store the height of the hit and the direction behind the face; a lost ray keeps its direction."""
     for r in range(count):
         at, alive = first + r, work[FATE + r] == 0.0
         out[2, at] = work[Z + r] if alive else 0.0
@@ -128,8 +128,8 @@ def _store_directions(count, work, first, direction, out):
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def _meet_again(net, faces, path, first, count, work):
-    """Place, slopes and second derivatives of the sag where the rays met the face."""
+def _restore_hit(net, faces, path, first, count, work):
+    """Compute the hit from the path, and there sag, slopes and second derivatives of the face."""
     last_u, last_v = faces.m - 1.0, faces.n - 1.0
     for r in range(count):
         x, y = work[X + r] + path[first + r] * work[DX + r], work[Y + r] + path[first + r] * work[DY + r]
@@ -147,7 +147,7 @@ def _meet_again(net, faces, path, first, count, work):
 
 @njit(inline="always")
 def _at_level(faces, at, e, h, gx, gy):
-    """(∂L/∂direction behind the face, ∂L/∂hit, ∂L/∂path to it) of a landing on a level screen, the slopes held."""
+    """Return ∂L/∂(direction behind the face), ∂L/∂hit and ∂L/∂path of a landing on a level screen, at fixed slopes."""
     ex, ey, ez = e
     ez = min(ez, -faces.rules.grazing) if faces.reflects else max(ez, faces.rules.grazing)
     a, b, far = ex / ez, ey / ez, (faces.throw - h) / ez
@@ -157,7 +157,7 @@ def _at_level(faces, at, e, h, gx, gy):
 
 @njit(inline="always")
 def _at_tilted(faces, tilted, at, e, h, gx, gy):
-    """`_at_level` of a tilted one.
+    """Return the gradients of `_at_level` for a tilted screen.
 
     The landing moves by u · (dP - n (e · dP) / (n · e)) along each axis u of the screen, dP = dp + far de.
     """
@@ -173,8 +173,8 @@ def _at_tilted(faces, tilted, at, e, h, gx, gy):
 
 
 @njit(inline="always")
-def _as_given(at, work, r):
-    """`_at_level` of rays that go on: the gradients in hit and direction come from behind the face."""
+def _behind_face(at, work, r):
+    """Return the gradients of `_at_level` for rays that go on: those in hit and direction are given in `work`."""
     g_x, g_y, g_z = work[G_X + r], work[G_Y + r], work[G_Z + r]
     g_e = (work[G_DX + r], work[G_DY + r], work[G_DZ + r])
     return g_e, (g_x, g_y, g_z), g_x * at[3] + g_y * at[4] + g_z * at[5]
@@ -182,12 +182,12 @@ def _as_given(at, work, r):
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _chain(faces, tilted, lands, count, work, path, d_rays, first):
-    """∂L/∂(sag, slopes at the hit), in place of Z and slopes: the chain rule through screen, law and implicit hit.
+    """Replace Z and slopes in `work` by ∂L/∂(sag, slopes) at the hit, by the chain rule through screen, law and hit.
 
-    d_rays: None, or (6, n) for ∂L/∂(position, direction) of the rays first … first + count - 1 before the face; path
-    (n,): to it.
+    d_rays: None, or (6, n), which receives ∂L/∂(position, direction) of rays first … first + count - 1 before the face.
+    path (n,): path to the face (mm).
     """
-    eta, skimming = faces.index, faces.rules.skimming
+    eta, min_cos = faces.index, faces.rules.min_cos
     for r in range(count):
         p, q, h = work[SLOPE_X + r], work[SLOPE_Y + r], work[SAG + r]
         dx, dy, dz = work[DX + r], work[DY + r], work[DZ + r]
@@ -198,11 +198,11 @@ def _chain(faces, tilted, lands, count, work, path, d_rays, first):
         if faces.reflects:
             cos_out, s = cos_in, -2.0 * along * norm2
         else:
-            cos_out = math.sqrt(max(1.0 - eta * eta * (1.0 - cos_in * cos_in), 0.0))  # rounds anew
+            cos_out = math.sqrt(max(1.0 - eta * eta * (1.0 - cos_in * cos_in), 0.0))  # rounding may make it negative
             s = norm * cos_out - eta * along * norm2
         at, e = (work[X + r], work[Y + r], 0.0, dx, dy, dz), (eta * dx - s * p, eta * dy - s * q, eta * dz + s)
         if lands is None:
-            (g_ex, g_ey, g_ez), g_hit, g_t = _as_given(at, work, r)
+            (g_ex, g_ey, g_ez), g_hit, g_t = _behind_face(at, work, r)
         elif tilted is None:
             (g_ex, g_ey, g_ez), g_hit, g_t = _at_level(faces, at, e, h, work[G_X + r], work[G_Y + r])
         else:
@@ -210,10 +210,10 @@ def _chain(faces, tilted, lands, count, work, path, d_rays, first):
         g_s = g_ez - p * g_ex - q * g_ey
         # ds/dp with N = norm: d cos_in = -N dx - p N² cos_in, d cos_out = η² cos_in / cos_out · d cos_in
         in_p, in_q = norm * dx + p * norm2 * cos_in, norm * dy + q * norm2 * cos_in
-        if faces.reflects:  # s = -2 (d · N) N_z, with no such term
+        if faces.reflects:  # s = -2 (d · N) N_z does not depend on cos_out
             turn, s_p, s_q, fall = 0.0, 0.0, 0.0, 2.0 * norm2
         else:
-            turn, fall = eta * eta * cos_in / max(cos_out, skimming), eta * norm2
+            turn, fall = eta * eta * cos_in / max(cos_out, min_cos), eta * norm2
             s_p, s_q = -norm * (p * norm2 * cos_out + turn * in_p), -norm * (q * norm2 * cos_out + turn * in_q)
         s_p += fall * (2.0 * p * norm2 * along + dx)
         s_q += fall * (2.0 * q * norm2 * along + dy)
@@ -225,14 +225,14 @@ def _chain(faces, tilted, lands, count, work, path, d_rays, first):
             g_sag = g_t / along
         else:
             t, k, alive = path[first + r], first + r, work[FATE + r] == 0.0
-            # beyond the net sag and slopes stay those of its rim: they do not change across it
+            # outside the net, sag and slopes are constant across its rim
             in_x, in_y = 0.0 < work[U + r] < faces.m - 1.0, 0.0 < work[V + r] < faces.n - 1.0
             by_x = work[H_XX + r] * g_p + work[H_XY + r] * g_q if in_x else 0.0
             by_y = work[H_XY + r] * g_p + work[H_YY + r] * g_q if in_y else 0.0
             rise_x, rise_y = p if in_x else 0.0, q if in_y else 0.0
             g_sag = (g_t + by_x * dx + by_y * dy) / (dz - rise_x * dx - rise_y * dy)
             d_x, d_y, d_z = g_hit[0] + by_x + rise_x * g_sag, g_hit[1] + by_y + rise_y * g_sag, g_hit[2] - g_sag
-            # along n by s and the cosine; along d by the path, which is t |d|
+            # g_n: along n, from s and the cosine; g_d: along d, from the path t |d|
             g_n, g_d = g_s * (norm2 * turn - fall) + work[G_COSINE + r] * norm, t * work[G_PATH + r]
             d_rays[0, k], d_rays[1, k], d_rays[2, k] = (d_x, d_y, d_z) if alive else (0.0, 0.0, 0.0)
             d_rays[3, k] = t * d_x + eta * g_ex - g_n * p + g_d * dx if alive else 0.0
@@ -258,17 +258,17 @@ def _load_gradient(lands, g, more, first, count, work):
 def _cross_adjoint(
     net, faces, tilted, lands, position, direction, status, path, g, more, d_rays, first, last, own, touched
 ):
-    """Adds to `own` (m, n) the gradient in the net of Σ g · out of the rays first … last - 1 (see reductions.py).
+    """Add to `own` (m, n) the gradient of Σ g · out of rays first … last - 1 in the net (see reductions.py).
 
-    g: like `out` of `_cross`.  more (2, n): the gradients in path and cosine of incidence, or (2, 0) if there are none.
-    d_rays: None, or (6, n) for the gradient in positions and directions.
+    g: gradient in `out` of `_cross`.  more: gradients in path and cosine of incidence (2, n), or (2, 0).  d_rays: None,
+    or (6, n), which receives the gradient in positions and directions.
     """
     work = np.empty(MORE)
     for begin in range(first, last, BLOCK):
         count = min(BLOCK, last - begin)
         _load(position, direction, status, begin, count, work)
         _load_gradient(lands, g, more, begin, count, work)
-        _meet_again(net, faces, path, begin, count, work)
+        _restore_hit(net, faces, path, begin, count, work)
         _chain(faces, tilted, lands, count, work, path, d_rays, begin)
         for r in range(count):
             g_h, g_u, g_v = work[Z + r], work[SLOPE_X + r], work[SLOPE_Y + r]
@@ -277,34 +277,34 @@ def _cross_adjoint(
 
 
 class Crossing(NamedTuple):
-    """Numbers of a crossing beside the net and the rays."""
+    """Parameters of a crossing besides the net and the rays."""
 
-    faces: Faces  # numbers, of which those of the front do not count
-    tilted: Tilted | None  # the screen's tilt
-    lands: bool  # on the screen? else rays go on behind the face
-    loses: bool  # does the face take flux? then path and angle of incidence are asked for
+    faces: Faces  # numbers of the face; the fields of the front are unused
+    tilted: TiltedScreen | None  # tilted screen; None: level
+    lands: bool  # True if rays land on the screen, False if they go on behind the face
+    lossy: bool  # True if the face has losses, which need path and angle of incidence
 
 
 class Cross(torch.autograd.Function):
-    """(heights, position (3, n), direction (3, n), status (n,), crossing) -> (out, status, path, cos θ).
+    """Map (heights, position (3, n), direction (3, n), status (n,), crossing) to (out, status, path, cos θ).
 
-    out: the landing (2, n) mm, or hit (mm) and direction behind the face (6, n) where the rays go on.  path (n,) mm to
-    the face and cos θ (n,) of incidence there have a gradient, and cos θ values, if `crossing.loses`.  Gradient in
-    heights, positions and directions, in each that needs it.
+    out: landing points (2, n) mm, or for rays that go on hit (mm) and direction behind the face (6, n).  path (n,) to
+    the face (mm) and cos θ (n,) of incidence have a gradient if `crossing.lossy`; otherwise cos θ is empty.  The
+    gradient is taken in heights, positions and directions, where needed.
     """
 
     @staticmethod
     def forward(ctx, heights: Tensor, position: Tensor, direction: Tensor, status: Tensor, crossing: Crossing):  # noqa: D102
         n = status.numel()
         out = torch.empty((2 if crossing.lands else 6, n), dtype=position.dtype)
-        path, cosine = torch.empty(n, dtype=torch.float64), torch.ones(n if crossing.loses else 0, dtype=torch.float64)
+        path, cosine = torch.empty(n, dtype=torch.float64), torch.ones(n if crossing.lossy else 0, dtype=torch.float64)
         fate = status.clone()
-        held = [net_of(heights), *_numbers(crossing), *(t.numpy() for t in (position.detach(), direction.detach()))]
+        inputs = [net_of(heights), *_numbers(crossing), *(t.numpy() for t in (position.detach(), direction.detach()))]
         results = [t.numpy() for t in (fate, out, path, cosine)]
-        reductions.on_threads(lambda first, last: _cross(*held, *results, first, last), reductions.shares(n, BLOCK))
+        reductions.on_threads(lambda first, last: _cross(*inputs, *results, first, last), reductions.shares(n, BLOCK))
         ctx.save_for_backward(heights, position, direction, fate, path)
         ctx.crossing = crossing
-        ctx.mark_non_differentiable(fate, *(() if crossing.loses else (path, cosine)))
+        ctx.mark_non_differentiable(fate, *(() if crossing.lossy else (path, cosine)))
         ctx.set_materialize_grads(False)
         return out, fate, path, cosine
 
@@ -322,56 +322,56 @@ class Cross(torch.autograd.Function):
         d_rays = torch.empty((6, n), dtype=position.dtype) if any(ctx.needs_input_grad[1:3]) else None
         shares = reductions.shares(n, BLOCK)
         buffers = reductions.buffers(len(shares), *heights.shape)
-        held = [net_of(heights), *_numbers(ctx.crossing)]
-        held += [t.detach().numpy() for t in (position, direction, fate, path, g)]
-        held += [more, None if d_rays is None else d_rays.numpy()]
+        inputs = [net_of(heights), *_numbers(ctx.crossing)]
+        inputs += [t.detach().numpy() for t in (position, direction, fate, path, g)]
+        inputs += [more, None if d_rays is None else d_rays.numpy()]
         tasks = [(*share, own, rows) for share, own, rows in zip(shares, *buffers, strict=True)]
-        reductions.on_threads(lambda *task: _cross_adjoint(*held, *task), tasks)
+        reductions.on_threads(lambda *task: _cross_adjoint(*inputs, *task), tasks)
         d_position, d_direction = (None, None) if d_rays is None else (d_rays[:3], d_rays[3:])
         return torch.from_numpy(reductions.merged(*buffers)).to(heights.dtype), d_position, d_direction, None, None
 
 
-def _numbers(crossing: Crossing) -> tuple[Faces, Tilted | None, bool | None]:
-    """The arguments of the kernels; None is a type of its own to numba, which leaves out the other branches."""
+def _numbers(crossing: Crossing) -> tuple[Faces, TiltedScreen | None, bool | None]:
+    """Return the arguments of the kernels; None is a type of its own in numba, which compiles no branch for it."""
     return crossing.faces, crossing.tilted, True if crossing.lands else None
 
 
 def landed(rays: Rays, interface: Interface, plane: Receiver) -> Landed:
-    """Rays across a net and on to the plane: `interfaces.cross` and `Receiver.land`."""
-    at, left = _across(rays, interface, plane)
-    return Landed(at, left.flux, left.status, left.taken)
+    """Trace rays across a net to the receiver, as `interfaces.cross` and `Receiver.land` do."""
+    position, traced = _across(rays, interface, plane)
+    return Landed(position, traced.flux, traced.status, traced.taken)
 
 
 def behind(rays: Rays, interface: Interface) -> Rays:
-    """Rays across a net: those of `interfaces.cross`."""
-    out, left = _across(rays, interface, None)
-    position, direction = upright(out, rays.sense).split(3)
+    """Trace rays across a net, as `interfaces.cross` does."""
+    out, traced = _across(rays, interface, None)
+    position, direction = reflect_z(out, rays.sense).split(3)
     sense = -rays.sense if interface.law.reverses else rays.sense
-    return replace(left, position=position, direction=direction, z=interface.surface.z, axial=False, sense=sense)
+    return replace(traced, position=position, direction=direction, z=interface.surface.z, axial=False, sense=sense)
 
 
 def _across(rays: Rays, interface: Interface, plane: Receiver | None) -> tuple[Tensor, Rays]:
-    """(out of `Cross`, the rays with flux and status as behind the face)."""
+    """Return (out of `Cross`, rays with flux and status behind the face but their old position and direction)."""
     shape, heights, lossy = rays.status.shape, interface.surface.heights, bool(interface.losses)
     if rays.axial and interface.status_if_missed == Status.MISSED_FRONT:
-        rays = _begun_before(rays, interface)
-    ways = (upright(t, rays.sense).reshape(3, -1).contiguous() for t in (rays.position, rays.direction))
+        rays = _start_below_net(rays, interface)
+    vectors = (reflect_z(t, rays.sense).reshape(3, -1).contiguous() for t in (rays.position, rays.direction))
     crossing = Crossing(*kernel_arguments.faces(interface, plane, rays.sense, rays.z), plane is not None, lossy)
     out, status, path, cos_in = Cross.apply(
-        -heights if rays.sense < 0 else heights, *ways, rays.status.reshape(-1), crossing
+        -heights if rays.sense < 0 else heights, *vectors, rays.status.reshape(-1), crossing
     )
-    left = replace(rays, status=status.view(shape))
+    traced = replace(rays, status=status.view(shape))
     if lossy:
         cos_in, path = cos_in.view(shape), path.view(shape)
-        left = dimmed(left, cos_in, interface.law.turned(cos_in)[1], path=path, losses=interface.losses)
-    return out.view(len(out), *shape), left
+        traced = apply_losses(traced, cos_in, interface.law.deflection(cos_in)[1], path=path, losses=interface.losses)
+    return out.view(len(out), *shape), traced
 
 
-def _begun_before(rays: Rays, interface: Interface) -> Rays:
-    """Light along the axis from a source, begun before all of a net.
+def _start_below_net(rays: Rays, interface: Interface) -> Rays:
+    """Move the start of light along the axis to a plane in front of all of a net.
 
-    Where such a beam begins is a matter of convention: interfaces.intersect meets the net without a look at it, and the
-    kernels, which find no way back, would lose the light where a deep net reaches further.
+    The start of such a beam is arbitrary, and interfaces.intersect does not use it.  The kernels only find roots ahead
+    of the start, and would lose light where a deep net extends further.
     """
     surface, sense = interface.surface, rays.sense
     lowest = net_bounds(surface, torch.float64, sense).lowest
@@ -381,8 +381,8 @@ def _begun_before(rays: Rays, interface: Interface) -> Rays:
     return replace(rays, z=rays.z - sense * short)
 
 
-def upright(vectors: Tensor, sense: int) -> Tensor:
-    """Vectors (3 k, …) as kernels know them, or back again: light along -z is seen in the mirror z -> -z."""
+def reflect_z(vectors: Tensor, sense: int) -> Tensor:
+    """Convert vectors (3 k, …) to the frame of the kernels, or back: reflect them by z -> -z for light along -z."""
     if sense > 0:
         return vectors
     flip = torch.tensor([1.0, 1.0, -1.0] * (len(vectors) // 3), dtype=vectors.dtype)

@@ -1,10 +1,10 @@
-"""Fused CPU kernel (numba) behind `trace.simulate`: stratified rays from the source to pixels, none kept.
+"""Fused CPU kernel (numba) behind `trace.simulate`: stratified rays from the source to pixels, without storing them.
 
-Each part (see reductions.py) takes rows of cells and carries them, in blocks, through the steps of the plain torch
-form, which stays the reference: launch, front face, back face, screen, pixel.  A block stays in the first-level cache
-(`work`: BLOCK numbers of each quantity, at the place of its name).  Steps without a table run in vector registers; in
-the search for the back face all rays of a block take a Newton step in turn, so that none waits for its own last one.
-Arithmetic is float64 whatever the net's precision; memory is a pair of pictures a part, however many rays there are.
+Each part (see reductions.py) takes rows of cells and traces them in blocks through the steps of the plain torch form,
+which is the reference: launch, front face, back face, screen, pixel.  A block stays in the first-level cache (`work`
+holds BLOCK numbers of each quantity, from the offset of its name on).  Steps without a table run in vector registers.
+In the search for the back face all rays of a block take a Newton step in turn, so that the steps of different rays
+overlap.  Arithmetic is float64 for every precision of the net; memory is a pair of pictures per part.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Status
 from bstcad.optics.receivers import Receiver
 
-BLOCK = 256  # rays
-# Where each quantity begins in `work`; constants, so that the compiler sees that they do not overlap.
+BLOCK = 256  # rays in a block
+# Offset of each quantity in `work`; constants, so that the compiler sees that they do not overlap.
 X, Y, Z, DX, DY, DZ, FLUX, FATE, S, SAG, SLOPE_X, SLOPE_Y, U, V, U_S, V_S = (BLOCK * k for k in range(16))
-COS_FRONT, COS_BACK, PATH = (BLOCK * k for k in range(16, 19))  # told only where faces and glass take flux
+COS_FRONT, COS_BACK, PATH = (BLOCK * k for k in range(16, 19))  # offsets used only where there are losses
 WORK = 19 * BLOCK
 
 
 @njit(error_model="numpy")
-def cosines(place, count, work):
-    """Cosine of the angle of incidence at the slopes held in `work`, to `place` in it."""
+def cosines(offset, count, work):
+    """Store the cosine of the angle of incidence at the slopes in `work`, from `offset` on."""
     for r in range(count):
         p, q = work[SLOPE_X + r], work[SLOPE_Y + r]
         along = work[DZ + r] - p * work[DX + r] - q * work[DY + r]
-        work[place + r] = along / math.sqrt(1.0 + p * p + q * q)
+        work[offset + r] = along / math.sqrt(1.0 + p * p + q * q)
 
 
 @njit(error_model="numpy")
 def refract(eta, reflected, count, work):
-    """Snell's law at the slopes held in `work`: `interfaces.Refract`."""
+    """Refract rays at the slopes in `work` by Snell's law: `interfaces.Refract`."""
     for r in range(count):
         p, q = work[SLOPE_X + r], work[SLOPE_Y + r]
         dx, dy, dz = work[DX + r], work[DY + r], work[DZ + r]
@@ -65,7 +65,7 @@ def refract(eta, reflected, count, work):
 
 @njit(error_model="numpy")
 def reflect(turned, count, work):
-    """The law of reflection at the slopes held in `work`: `interfaces.Reflect`."""
+    """Reflect rays at the slopes in `work`: `interfaces.Reflect`."""
     for r in range(count):
         p, q = work[SLOPE_X + r], work[SLOPE_Y + r]
         dx, dy, dz = work[DX + r], work[DY + r], work[DZ + r]
@@ -80,8 +80,8 @@ def reflect(turned, count, work):
 
 @njit(error_model="numpy")
 def first_root(net, faces, x, y, z, dx, dy, dz):
-    """(s, found): path of a ray steep to the net to its first crossing (see interfaces.py); z from its plane."""
-    last_u, last_v, flattest = faces.m - 1.0, faces.n - 1.0, faces.rules.flattest
+    """Return (s, found): path of a ray steep to the net to its first crossing (interfaces.py); z: over its plane."""
+    last_u, last_v, floor = faces.m - 1.0, faces.n - 1.0, faces.rules.min_derivative
     u, v, u_s, v_s = (x - faces.x) * faces.per_x, (y - faces.y) * faces.per_y, dx * faces.per_x, dy * faces.per_y
     rate = abs(dz) + faces.steepest_x * abs(dx) + faces.steepest_y * abs(dy)
     s = below = 0.0
@@ -92,12 +92,12 @@ def first_root(net, faces, x, y, z, dx, dy, dz):
         residual, slope = z + s * dz - h, dz - h_u * u_s - h_v * v_s
         if arrived:
             if abs(residual) <= faces.tolerance:
-                return s, abs(s - below) <= faces.near / flattest
-            s -= residual / (slope if abs(slope) > flattest else (-flattest if slope < 0.0 else flattest))
+                return s, abs(s - below) <= faces.near / floor
+            s -= residual / (slope if abs(slope) > floor else (-floor if slope < 0.0 else floor))
             continue
-        gone = (a > last_u and u_s > 0.0) or (a < 0.0 and u_s < 0.0) or (z + s * dz < faces.lowest and dz <= 0.0)
-        gone |= (b > last_v and v_s > 0.0) or (b < 0.0 and v_s < 0.0)
-        if gone or step >= faces.rules.approach_steps or (step == 0 and not residual < 0.0):
+        left = (a > last_u and u_s > 0.0) or (a < 0.0 and u_s < 0.0) or (z + s * dz < faces.lowest and dz <= 0.0)
+        left |= (b > last_v and v_s > 0.0) or (b < 0.0 and v_s < 0.0)
+        if left or step >= faces.rules.approach_steps or (step == 0 and not residual < 0.0):
             break
         arrived, below = residual >= -faces.near, s
         s -= residual / rate
@@ -106,7 +106,7 @@ def first_root(net, faces, x, y, z, dx, dy, dz):
 
 @njit(error_model="numpy")
 def start_search(net, faces, count, work):
-    """The start of the search, as path from the net's plane: zero, but for rays that are steep to the net."""
+    """Store the start of the search as path from the net's plane: zero, except for rays that are steep to the net."""
     for r in range(count):
         work[S + r] = 0.0
     for r in range(count):
@@ -116,12 +116,12 @@ def start_search(net, faces, count, work):
             z = work[Z + r] - faces.gap
             s, found = first_root(net, faces, work[X + r], work[Y + r], z, dx, dy, dz)
             work[S + r] = s + z / dz
-            work[FATE + r] = 0.0 if found and abs(dz) > faces.rules.level else faces.fates.missed_back
+            work[FATE + r] = 0.0 if found and abs(dz) > faces.rules.side_exit else faces.fates.missed_back
 
 
 @njit(error_model="numpy")
 def to_net(faces, count, work):
-    """To the plane the net's heights are measured from; u, v there and ∂u/∂s, ∂v/∂s along the ray."""
+    """Move rays to the plane of the net's heights; store u, v there and ∂u/∂s, ∂v/∂s along the ray."""
     for r in range(count):
         dx, dy = work[DX + r], work[DY + r]
         start = (faces.gap - work[Z + r]) / work[DZ + r]
@@ -133,17 +133,17 @@ def to_net(faces, count, work):
 
 @njit(error_model="numpy", fastmath={"contract"})
 def search(net, faces, count, work, active):
-    """Path s from the net's plane to the back by Newton steps, each for all still searching: `interfaces._newton`.
+    """Find the path s from the net's plane to the back by Newton steps of all rays in turn: `interfaces._newton`.
 
-    `work` ends with s after a ray's last step, and with sag and slopes (in u and v) before it.
+    On return `work` holds s after a ray's last step, and sag and slopes (in u and v) before that step.
     """
-    last_u, last_v, flattest = faces.m - 1.0, faces.n - 1.0, faces.rules.flattest
+    last_u, last_v, floor = faces.m - 1.0, faces.n - 1.0, faces.rules.min_derivative
     searching = 0
     for r in range(count):
         active[searching] = r
         searching += (work[FATE + r] == 0.0) & (work[FLUX + r] > 0.0)
     for _ in range(int(faces.rules.newton_steps)):
-        still = 0
+        remaining = 0
         for a in range(searching):
             r = active[a]
             s, u_s, v_s, dz = work[S + r], work[U_S + r], work[V_S + r], work[DZ + r]
@@ -153,37 +153,37 @@ def search(net, faces, count, work, active):
                 u, v = min(max(u, 0.0), last_u), min(max(v, 0.0), last_v)
             h, h_u, h_v = sag(net, faces.m, faces.n, u, v)
             residual, slope = s * dz - h, dz - h_u * u_s - h_v * v_s
-            if out_u or out_v:  # beyond the net the sag goes on level across the rim
+            if out_u or out_v:  # outside the net the sag is constant across the rim
                 slope += (h_u * u_s if out_u else 0.0) + (h_v * v_s if out_v else 0.0)
-            if abs(slope) < flattest:
-                slope = -flattest if slope < 0.0 else flattest  # keeps the sign
+            if abs(slope) < floor:
+                slope = -floor if slope < 0.0 else floor  # keeps the sign
             work[S + r] = s - residual / slope
             work[SAG + r], work[SLOPE_X + r], work[SLOPE_Y + r] = h, h_u, h_v
-            active[still] = r
-            # along the axis one step is exact: x and y do not move
-            still += not (abs(residual) <= faces.tolerance or (u_s == 0.0 and v_s == 0.0))
-        searching = still
+            active[remaining] = r
+            # for light along the axis one step is exact, since x and y are constant
+            remaining += not (abs(residual) <= faces.tolerance or (u_s == 0.0 and v_s == 0.0))
+        searching = remaining
     for a in range(searching):
         work[FATE + active[a]] = faces.fates.missed_back
 
 
 @njit(error_model="numpy")
 def at_back(faces, count, work):
-    """Move to the back face; those that meet it outside its clear aperture, from behind them or along it are lost."""
+    """Move rays to the back face; lose those outside its clear aperture, with the hit behind them or tangent to it."""
     for r in range(count):
         s, dx, dy, dz = work[S + r], work[DX + r], work[DY + r], work[DZ + r]
         x, y = work[X + r] + s * dx, work[Y + r] + s * dy
         p, q = work[SLOPE_X + r] * faces.per_x, work[SLOPE_Y + r] * faces.per_y
         work[X + r], work[Y + r], work[SLOPE_X + r], work[SLOPE_Y + r] = x, y, p, q
         inside = beyond2(x, y, faces.limit_x, faces.limit_y) <= faces.limit_r2
-        there = inside & (work[Z + r] + s >= -faces.tolerance) & (abs(dz - p * dx - q * dy) > faces.rules.along)
+        met = inside & (work[Z + r] + s >= -faces.tolerance) & (abs(dz - p * dx - q * dy) > faces.rules.tangency)
         fate = work[FATE + r]
-        work[FATE + r] = fate if there | (fate != 0.0) else faces.fates.missed_back
+        work[FATE + r] = fate if met | (fate != 0.0) else faces.fates.missed_back
 
 
 @njit(error_model="numpy")
 def to_tilted(faces, tilted, count, work):
-    """`to_screen` for a tilted screen."""
+    """Move rays from the back face to a tilted screen: `TiltedPlane.land`."""
     grazing, turned = faces.rules.grazing, faces.fates.turned
     for r in range(count):
         dx, dy, dz = work[DX + r], work[DY + r], work[DZ + r]
@@ -200,7 +200,7 @@ def to_tilted(faces, tilted, count, work):
 
 @njit(error_model="numpy")
 def to_screen(faces, tilted, count, work):
-    """From the back face to the screen, and the place on it: as `TiltedPlane.land` has it."""
+    """Move rays from the back face to the screen; store x and y on it."""
     if tilted is not None:
         to_tilted(faces, tilted, count, work)
         return
@@ -215,16 +215,16 @@ def to_screen(faces, tilted, count, work):
         work[FATE + r] = fate if ahead | (fate != 0.0) else turned
 
 
-# The flux by Status (alive ones: on the screen), that which lands beside the screen, the number of rays, and the flux
-# that faces and glass take.
+# Length of the ledger: flux by Status (alive: on the screen), flux outside the screen, number of rays, and flux lost at
+# faces and in glass.
 LINES = 9
-BESIDE, COUNT, BY_FACES, BY_GLASS = 5, 6, 7, 8
-PARTS = 8  # that the rays are summed in, each into pictures of its own: to clear and to add these takes time, too
+BESIDE, COUNT, BY_FACES, BY_GLASS = 5, 6, 7, 8  # indices in the ledger, after those of Status
+RAY_PARTS = 8  # number of partial sums of the rays; each has its own pictures, which take time to clear and to add
 
 
 @njit(error_model="numpy")
 def _points(cells, i, j, count, work):
-    """The points of cells (i, j), …, (i, j + count - 1): `sampling.stratified_strips`."""
+    """Store the points of cells (i, j), …, (i, j + count - 1): `sampling.stratified_strips`."""
     for r in range(count):
         z = cells.key + np.uint64(i * cells.n + j + r) * cells.stride
         z = (z ^ (z >> np.uint64(30))) * cells.mix_1
@@ -238,7 +238,7 @@ def _points(cells, i, j, count, work):
 
 @njit(error_model="numpy")
 def _launch(beam, count, work):
-    """Flux density and direction of the rays through the points: `source.irradiance`, `source.rays`."""
+    """Store flux density and direction of the rays through the points: `source.irradiance`, `source.rays`."""
     for r in range(count):
         x, y = work[X + r] - beam.x, work[Y + r] - beam.y
         r2 = x * x + y * y
@@ -263,7 +263,7 @@ def _launch(beam, count, work):
 
 @njit(error_model="numpy")
 def _tilt(beam, count, work):
-    """Flux density of the rays of a tilted point source, in place of the one for light along z."""
+    """Replace the flux density for light along z by that of a tilted point source."""
     for r in range(count):
         x, y = work[X + r] - beam.x, work[Y + r] - beam.y
         d2 = x * x + y * y + beam.distance * beam.distance
@@ -282,7 +282,7 @@ def _tilt(beam, count, work):
 
 @njit(error_model="numpy")
 def _look_up(peak, table, count, work):
-    """Flux density and direction of the rays through the points by the splines of a table."""
+    """Store flux density and direction of the rays through the points from the splines of a table."""
     last_u, last_v = table.m - 1.0, table.n - 1.0
     for r in range(count):
         u = min(max((work[X + r] - table.x) * table.per_x, 0.0), last_u)
@@ -297,8 +297,8 @@ def _look_up(peak, table, count, work):
 
 @njit(error_model="numpy")
 def _meet_front(faces, axial, count, work):
-    """To the front face: `interfaces.intersect` with `Conic.crossing`, or with the sag for rays along the axis."""
-    c, conic, equator = faces.curvature, 1.0 + faces.conic_constant, faces.rules.equator
+    """Move rays to the front: `interfaces.intersect` with `Conic.crossing`, or with the sag for rays along the axis."""
+    c, conic, min_cos2 = faces.curvature, 1.0 + faces.conic_constant, faces.rules.min_cos2
     for r in range(count):
         x, y, dx, dy, dz = work[X + r], work[Y + r], work[DX + r], work[DY + r], work[DZ + r]
         met = True
@@ -307,15 +307,15 @@ def _meet_front(faces, axial, count, work):
             f = c * (x * x + y * y)
             g = dz - c * (x * dx + y * dy)
             k = g * g - c * (1.0 + faces.conic_constant * dz * dz) * f
-            below = g + math.sqrt(k if k > 0.0 else 1.0)
-            ok = (k > 0.0) & (below > 1e-6)
-            s = f / (below if ok else 1.0)
+            divisor = g + math.sqrt(k if k > 0.0 else 1.0)
+            ok = (k > 0.0) & (divisor > 1e-6)
+            s = f / (divisor if ok else 1.0)
             met = ok & (conic * c * s * dz < 1.0)
             x, y, z = x + s * dx, y + s * dy, s * dz
         r2 = x * x + y * y
         k = 1.0 - conic * c * c * r2
-        root = math.sqrt(max(k, equator))
-        inside = (k > equator) & (beyond2(x, y, faces.front_x, faces.front_y) <= faces.front_r2)
+        root = math.sqrt(max(k, min_cos2))
+        inside = (k > min_cos2) & (beyond2(x, y, faces.front_x, faces.front_y) <= faces.front_r2)
         work[X + r], work[Y + r] = x, y
         work[Z + r] = c * r2 / (1.0 + root) if axial else z
         work[SLOPE_X + r], work[SLOPE_Y + r] = c * x / root, c * y / root
@@ -323,10 +323,10 @@ def _meet_front(faces, axial, count, work):
 
 
 @njit
-def _fly(net, beam, faces, tilted, losses, count, work, active):
-    """From points on the plane of the first vertex to landings, flux densities and fates.
+def _trace(net, beam, faces, tilted, losses, count, work, active):
+    """Trace rays through points on the plane of the first vertex to the screen; store landing, flux density and fate.
 
-    losses: where there are any, the cosines of incidence and the path in the glass are kept for `_dim`.
+    losses: if there are any, the cosines of incidence and the path in the glass are stored for `_dim`.
     """
     if beam.table.m > 0:
         _look_up(beam.peak, beam.table, count, work)
@@ -334,7 +334,7 @@ def _fly(net, beam, faces, tilted, losses, count, work, active):
         _launch(beam, count, work)
     if beam.tilted == 1 and beam.distance > 0.0:
         _tilt(beam, count, work)
-    if faces.reflects:  # no face was met before: rays begin at the source
+    if faces.reflects:  # there is no front: rays start at the source
         for r in range(count):
             work[FATE + r] = 0.0
             work[Z + r] = -beam.start
@@ -345,17 +345,17 @@ def _fly(net, beam, faces, tilted, losses, count, work, active):
                 work[Y + r] -= beam.start * (work[DY + r] / work[DZ + r])
     else:
         _meet_front(faces, beam.distance == 0.0 and beam.tilted == 0, count, work)
-        if losses.told:
+        if losses.present:
             cosines(COS_FRONT, count, work)
         refract(1.0 / faces.index, faces.fates.reflected, count, work)
     start_search(net, faces, count, work)
-    if losses.told:
+    if losses.present:
         for r in range(count):
             work[PATH + r] = work[Z + r]
     to_net(faces, count, work)
     search(net, faces, count, work, active)
     at_back(faces, count, work)
-    if losses.told:  # the direction in the glass is a unit vector: the path is the rise over its z
+    if losses.present:  # the direction in the glass is a unit vector: the path is the rise over its z
         for r in range(count):
             rise = faces.gap + work[S + r] * work[DZ + r] - work[PATH + r]
             work[PATH + r] = rise / work[DZ + r]
@@ -369,7 +369,7 @@ def _fly(net, beam, faces, tilted, losses, count, work, active):
 
 @njit(error_model="numpy")
 def _count(pixels, count, work, box, tent, lines):
-    """Box and tent picture and the ledger: `irradiance.box`, `tent` and `ledger`."""
+    """Add rays to box picture, tent picture and ledger: `irradiance.box`, `tent` and `ledger`."""
     rows, columns = box.shape
     for r in range(count):
         f = work[FLUX + r]
@@ -389,7 +389,7 @@ def _count(pixels, count, work, box, tent, lines):
             lines[BESIDE] += f
         x -= 0.5
         y -= 0.5
-        if not (-1.0 < x < columns and -1.0 < y < rows):  # also refuses NaN
+        if not (-1.0 < x < columns and -1.0 < y < rows):  # also excludes NaN
             continue
         i, j = int(math.floor(y)), int(math.floor(x))
         right, below = f * (x - j), y - i
@@ -408,7 +408,7 @@ def _count(pixels, count, work, box, tent, lines):
 
 @njit(error_model="numpy")
 def _share(table, cosine):
-    """The part that a face lets through, by linear interpolation over equal steps of the cosine from 0 to 1."""
+    """Interpolate the transmission of a face linearly in the cosine; table: at equal steps from 0 to 1."""
     at = min(max(cosine, 0.0), 1.0) * (table.size - 1)
     k = min(int(at), table.size - 2)
     return table[k] + (at - k) * (table[k + 1] - table[k])
@@ -416,7 +416,7 @@ def _share(table, cosine):
 
 @njit(error_model="numpy")
 def _dim(faces, losses, count, work, lines):
-    """The flux that faces and glass leave each ray, and the flux that they take: `interfaces.dimmed`."""
+    """Reduce the flux of each ray by its losses, and add these to the ledger: `interfaces.apply_losses`."""
     for r in range(count):
         flux, fate = work[FLUX + r], work[FATE + r]
         if not flux > 0.0:
@@ -429,7 +429,7 @@ def _dim(faces, losses, count, work, lines):
             left = flux * math.exp(-losses.coefficient * work[PATH + r])
             lines[BY_GLASS] += flux - left
             flux, cosine = left, work[COS_BACK + r]
-            if not faces.reflects:  # cosine of refraction, in which the table is smooth up to the critical angle
+            if not faces.reflects:  # the table depends on the cosine of refraction (see `records.LossTables`)
                 cosine = math.sqrt(max(1.0 - faces.index * faces.index * (1.0 - cosine * cosine), 0.0))
             left = flux * _share(losses.back, cosine)
             lines[BY_FACES] += flux - left
@@ -439,15 +439,15 @@ def _dim(faces, losses, count, work, lines):
 
 @compiled()
 def _rows(net, beam, faces, tilted, losses, cells, pixels, first, step, box, tent, lines):
-    """A part of the simulation: each step-th row of cells from the first, added to sums of its own."""
+    """Simulate a part of the light: every step-th row of cells from `first` on, added to sums of its own."""
     work, active, part = np.empty(WORK), np.empty(BLOCK, np.uint32), np.empty(LINES)
     for i in range(first, cells.n, step):
         for j in range(0, cells.n, BLOCK):
             count = min(BLOCK, cells.n - j)
             _points(cells, i, j, count, work)
-            _fly(net, beam, faces, tilted, losses, count, work, active)
-            part[:] = 0.0  # by blocks: a long sum of equal numbers is rounded the same way each time
-            if losses.told:
+            _trace(net, beam, faces, tilted, losses, count, work, active)
+            part[:] = 0.0  # partial sums by blocks: in one long sum of equal numbers rounding errors add up
+            if losses.present:
                 _dim(faces, losses, count, work, part)
             _count(pixels, count, work, box, tent, part)
             for k in range(LINES):
@@ -456,13 +456,13 @@ def _rows(net, beam, faces, tilted, losses, cells, pixels, first, step, box, ten
 
 @compiled()
 def _rays(net, beam, faces, tilted, losses, x, y, landing, flux, fate):
-    """Landing (2, n), flux and fate of the rays through given points (n,)."""
+    """Store landing (2, n), flux and fate of the rays through given points (n,)."""
     work, active = np.empty(WORK), np.empty(BLOCK, np.uint32)
     for first in range(0, x.size, BLOCK):
         count = min(BLOCK, x.size - first)
         for r in range(count):
             work[X + r], work[Y + r] = x[first + r], y[first + r]
-        _fly(net, beam, faces, tilted, losses, count, work, active)
+        _trace(net, beam, faces, tilted, losses, count, work, active)
         for r in range(count):
             landing[0, first + r], landing[1, first + r] = work[X + r], work[Y + r]
             flux[first + r], fate[first + r] = work[FLUX + r], np.uint8(work[FATE + r])
@@ -471,15 +471,15 @@ def _rays(net, beam, faces, tilted, losses, x, y, landing, flux, fate):
 def simulate(
     lights: Sequence[tuple[float, Emitter, Lens, int, Rectangle]], screen: Screen, n: int
 ) -> tuple[Tensor, Tensor, dict[str, float], int]:
-    """(box picture, tent picture, ledger, number of rays) of n x n stratified rays of each light.
+    """Return (box picture, tent picture, ledger, number of rays) by n x n stratified rays of each light.
 
-    lights: (weight, source, lens, seed, window) each; the window lies on the plane of the first vertex (mm).  Flux is a
-    fraction of that of all sources, whose weights sum to 1.
+    lights: (weight, source, lens, seed, window) per light, the window on the plane of the first vertex (mm).  Flux is a
+    fraction of the flux of all sources, whose weights sum to 1.
     """
-    count = PARTS
+    count = RAY_PARTS
     box, tent, lines = (np.zeros((count, *shape)) for shape in (screen.shape, screen.shape, (LINES,)))
     pixels = kernel_arguments.pixels(screen)
-    many = len(lights) >= count  # each part takes whole lights, else a share of the rows of each
+    many = len(lights) >= count  # each part takes whole lights, otherwise some rows of each light
 
     def part(c: int) -> None:
         for arguments in scenes[c::count] if many else scenes:
@@ -496,36 +496,35 @@ def simulate(
 
 
 def _taken(lens: Lens) -> dict[str, int]:
-    """The place of each line of the ledger in the kernel's counts, in the order in which light meets these losses."""
+    """Return the index of each line of losses in the kernel's ledger, in the order in which light meets the losses."""
     losses = (loss for interface in lens.interfaces for loss in interface.losses)
     return {loss.line: BY_GLASS if loss.in_glass else BY_FACES for loss in losses}
 
 
 def _scenes(lights, plane: Receiver, n: int) -> Iterator[tuple[Any, ...]]:
-    """Net, beam, faces, tilt of the screen, losses and cells of each light; lenses that are alike are told once."""
-    known: tuple[Lens, tuple[Any, ...]] | None = None
+    """Yield net, beam, faces, tilt of the screen, losses and cells of each light; equal lenses are converted once."""
+    last: tuple[Lens, tuple[Any, ...]] | None = None
     for weight, source, lens, seed, window in lights:
-        if known is None or not _alike(lens, known[0]):
-            known = lens, (_scene(source, lens, plane), kernel_arguments.losses(lens))
-        (net, _, faces, tilted), losses = known[1]
+        if last is None or not _is_same(lens, last[0]):
+            last = lens, (_scene(source, lens, plane), kernel_arguments.losses(lens))
+        (net, _, faces, tilted), losses = last[1]
         cells, beam = kernel_arguments.cells(window, n, seed), kernel_arguments.beam(source, lens)
         beam = beam._replace(peak=beam.peak * weight * cells.width * cells.height)  # flux of a ray, not its density
         yield net, beam, faces, tilted, losses, cells
 
 
-def _alike(one: Lens, other: Lens) -> bool:
-    """Are these one lens, as light of one wavelength meets it?"""
-    ours, theirs = one.interfaces, other.interfaces
-    return len(ours) == len(theirs) and all(
+def _is_same(one: Lens, other: Lens) -> bool:
+    """Return True if two lenses have the same surfaces, outlines, laws (so one wavelength) and losses."""
+    return len(one.interfaces) == len(other.interfaces) and all(
         a.surface is b.surface and (a.outline, a.law, a.losses) == (b.outline, b.law, b.losses)
-        for a, b in zip(ours, theirs, strict=True)
+        for a, b in zip(one.interfaces, other.interfaces, strict=True)
     )
 
 
 def land(source: Emitter, lens: Lens, plane: Receiver, x: Tensor, y: Tensor) -> Landed:
-    """Rays through (x, y) of the plane of the first vertex, each (n,) float64, on `plane`; flux in 1/mm² there.
+    """Trace rays through (x, y) of the first vertex's plane, each (n,) float64, to `plane`; flux: density at (x, y).
 
-    `trace.trace` of `source.rays(x, y, lens.entrance.z, 1.0)`, but that rays without flux may end anyhow.
+    It is `trace.trace` of `source.rays(x, y, lens.entrance.z, 1.0)`, except for the fate of rays without flux.
     """
     scene = *_scene(source, lens, plane), NO_LOSSES
     landing, flux, fate = np.empty((2, x.numel())), np.empty(x.numel()), np.empty(x.numel(), np.uint8)
@@ -537,7 +536,7 @@ def land(source: Emitter, lens: Lens, plane: Receiver, x: Tensor, y: Tensor) -> 
 
 
 def _scene(source: Emitter, lens: Lens, plane: Receiver) -> tuple[Any, ...]:
-    """Net, beam, faces and tilt of the screen, as the kernels take them; a mirror's light begins along -z."""
+    """Return net, beam, faces and tilt of the screen for the kernels; light along -z is reflected by z -> -z."""
     (*front, net), z = lens.interfaces, lens.entrance.z
     heights = net.surface.heights
     faces = kernel_arguments.faces(net, plane, lens.passes.sense, z, *front)

@@ -1,7 +1,7 @@
-"""How the numbers that a fused kernel takes (records.py) follow from lens, light, cells and screen.
+"""Conversion of lens, light, cells and screen to the numbers that a fused kernel takes (records.py).
 
-The constants of the plain form are among them: numba's cache looks at a kernel's own file only, and what that takes
-from another file would stay as it was when the kernel was compiled.
+The constants of the plain form are passed as numbers too: a cached kernel would not notice that a constant imported
+from a file outside this folder has changed.
 """
 
 from __future__ import annotations
@@ -13,70 +13,70 @@ import numpy as np
 import torch
 
 from bstcad.optics import interfaces, rays, sampling, surfaces
-from bstcad.optics.bspline import halfway, interpolated
+from bstcad.optics.bspline import interpolating_net, midpoint_values
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import Interface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import records
-from bstcad.optics.kernels.records import Beam, Cells, Faces, Fates, Losses, Pixels, Rules, Table, Tilted, floats
+from bstcad.optics.kernels.records import Beam, Faces, Fates, LightTable, LossTables, Pixels, RayCells, Rules, floats
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Status
 from bstcad.optics.receivers import Receiver
 
-NODES = 4097  # places of a table of a face's transmission
-SIDES = 65, 129, 257, 513  # control points a side of a table, tried in turn
-EXACT = 1e-5  # largest RMS of a table's relative error in the irradiance: far below that of any picture …
-DARK = 1e-4  # … where the irradiance is above this part of the largest
-STRAIGHT = 1e-8  # largest RMS of a table's error in the slopes of rays
-PEAK = 100.0  # largest error over these: the outermost spans are the least exact
-KEPT = 16  # tables at a time
-SLOWER = 0.5  # light whose errors a table of twice the sides does not divide by 1 / SLOWER has an edge
-OF_A_TABLE = 0.0, 0.0, 0.0, 0.0, math.inf, 1.0, 0.0, 0, 0.0  # first fields of the Beam of a table
+TRANSMISSION_NODES = 4097  # nodes of a table of a face's transmission
+TABLE_SIDES = 65, 129, 257, 513  # control points per side of a table of light, tried in this order
+IRRADIANCE_TOLERANCE = 1e-5  # largest RMS of a table's relative error in the irradiance, far below any picture's
+MIN_IRRADIANCE = 1e-4  # irradiance over its maximum below which the error counts relative to this value
+SLOPE_TOLERANCE = 1e-8  # largest RMS of a table's error in the slopes of rays
+PEAK_TO_RMS = 100.0  # largest error of a table over these tolerances: the outermost spans are the least exact
+MAX_TABLES = 16  # tables of light in the cache
+MAX_ERROR_RATIO = 0.5  # largest ratio of the errors of a table and of the one before; above it the light has an edge
+TABLE_BEAM = 0.0, 0.0, 0.0, 0.0, math.inf, 1.0, 0.0, 0, 0.0  # first fields of a Beam that is given by a table
 
 
 def rules() -> Rules:
-    """The constants of the plain form, as they are now."""
+    """Return the current constants of the plain form."""
     steps = (interfaces.NEWTON_STEPS, interfaces.APPROACH_STEPS)
-    least = (interfaces.LEVEL, interfaces.FLATTEST, interfaces.ALONG, interfaces.SKIMMING)
-    return Rules(*floats([*steps, *least, surfaces.EQUATOR, rays.MIN_AXIAL_COSINE]))
+    search = (interfaces.SIDE_EXIT_COSINE, interfaces.MIN_NEWTON_DERIVATIVE, interfaces.TANGENCY_TOLERANCE)
+    return Rules(*floats([*steps, *search, interfaces.MIN_COS_REFRACTION, surfaces.MIN_COS2, rays.MIN_AXIAL_COSINE]))
 
 
 def faces(
     interface: Interface, plane: Receiver | None, sense: int, start: float, front: Interface | None = None
-) -> tuple[Faces, Tilted | None]:
-    """The net of an interface, the screen behind it and the front before it, if there are any, as numbers.
+) -> tuple[Faces, records.TiltedScreen | None]:
+    """Return the numbers of a net, of the front before it and the screen behind it, if any, and of the screen's tilt.
 
-    The kernels know light along +z: where it comes along -z (sense -1) all numbers are those of the scene seen in the
-    mirror z -> -z, and so have to be the heights and the rays (crossing.upright).  start: the plane that the
-    positions of the rays count from (mm).
+    The kernels trace light along +z.  If light comes along -z (sense -1), all numbers describe the scene reflected by
+    z -> -z, as the heights and the rays must (crossing.reflect_z).  start: z of the plane that the positions of the
+    rays are measured from (mm).
     """
     surface, law = interface.surface, interface.law
-    bent = (front.surface.curvature, front.surface.conic_constant) if front else (0.0, 0.0)
+    conic = (front.surface.curvature, front.surface.conic_constant) if front else (0.0, 0.0)
     limits = [limit for i in (front or interface, interface) for limit in i.outline.limits]
     net = [surface.x[0], surface.y[0], *(1 / pitch for pitch in surface.pitch)]
-    known, throw = interfaces.net_bounds(surface, torch.float64, sense), plane.middle[2] if plane is not None else 0.0
-    face = floats([*bent, law.eta, *limits, sense * (surface.z - start)])
-    net = floats([*net, *known, sense * (throw - surface.z)])
+    bounds, throw = interfaces.net_bounds(surface, torch.float64, sense), plane.middle[2] if plane is not None else 0.0
+    face = floats([*conic, law.eta, *limits, sense * (surface.z - start)])
+    net = floats([*net, *bounds, sense * (throw - surface.z)])
     fates = [Status.MISSED_FRONT, interface.status_if_missed, law.status_if_blocked, Status.TURNED_BACK]
     numbers = Faces(int(law.reverses), *face, *surface.shape, *net, rules(), Fates(*floats(fates)))
     return numbers, _tilted(plane, sense, -sense if law.reverses else sense)
 
 
-def losses(lens: Lens) -> Losses:
-    """The lens's losses as numbers, by the plain forms of losses.py."""
+def losses(lens: Lens) -> LossTables:
+    """Return the losses of a lens as numbers, from the plain forms of losses.py."""
     if lens.losses is None:
         return records.NO_LOSSES
     *front, back = (_table(interface) for interface in lens.interfaces)
     glass = [loss.coefficient for i in lens.interfaces for loss in i.losses if loss.in_glass]
-    return Losses(1, front[0] if front else back, back, float(sum(glass)))
+    return LossTables(1, front[0] if front else back, back, float(sum(glass)))
 
 
 def _table(interface: Interface) -> np.ndarray:
-    """The share that a face lets through, over the cosine (see `Losses`)."""
-    cosine, law = torch.linspace(0, 1, NODES, dtype=torch.float64), interface.law
+    """Return the transmission of a face at equal steps of the cosine (see `LossTables`)."""
+    cosine, law = torch.linspace(0, 1, TRANSMISSION_NODES, dtype=torch.float64), interface.law
     cos_in = cosine if law.eta <= 1 else torch.sqrt(1 - (1 - cosine * cosine) / law.eta**2)
-    cos_out = law.turned(cos_in)[1] if law.eta <= 1 else cosine
+    cos_out = law.deflection(cos_in)[1] if law.eta <= 1 else cosine
     share = torch.ones_like(cosine)
     for loss in interface.losses:
         if not loss.in_glass:
@@ -85,26 +85,26 @@ def _table(interface: Interface) -> np.ndarray:
 
 
 def beam(source: Emitter, lens: Lens, tables: bool = True) -> Beam | None:
-    """The light of a source on the plane of the first vertex of a lens; None: the plain form traces it.
+    """Return the light of a source on the plane of the first vertex of a lens; None: the plain form traces it.
 
-    tables: may it be a table?
+    tables: allow a table of the light if no formula is known.
     """
     first, aperture = lens.entrance, lens.interfaces[0].outline
-    found = source.beam(first.z)
-    if found is None and tables:
-        return _tabled(source, source.window(aperture, first.z, first.sags(aperture)), first.z)
-    return found
+    formula = source.beam(first.z)
+    if formula is None and tables:
+        return _table_of_light(source, source.window(aperture, first.z, first.sags(aperture)), first.z)
+    return formula
 
 
-@functools.lru_cache(maxsize=KEPT)  # 6 MB each at most
+@functools.lru_cache(maxsize=MAX_TABLES)  # at most 6 MB each
 @torch.no_grad()
-def _tabled(source: Emitter, window: Rectangle, z: float) -> Beam | None:
-    """The light by the coarsest table that is right half way between its points; None: none of SIDES is.
+def _table_of_light(source: Emitter, window: Rectangle, z: float) -> Beam | None:
+    """Return the coarsest table of the light that is accurate midway between its points; None: none of TABLE_SIDES is.
 
-    It holds what the source says of its light on the plane z (mm), at the places of the control points of splines.
+    The table holds splines through the source's irradiance and ray slopes at points of the plane z (mm).
     """
     last = math.inf
-    for side in SIDES:
+    for side in TABLE_SIDES:
         along = np.linspace(-0.5, 0.5, 2 * side - 1)
         x, y = (torch.from_numpy(p) for p in np.meshgrid(along * window.width, along * window.height, indexing="ij"))
         rays = source.rays(x, y, z, 1.0)
@@ -112,38 +112,38 @@ def _tabled(source: Emitter, window: Rectangle, z: float) -> Beam | None:
         if not bool(rays.alive.all() & (ahead > 0).all()):
             return None
         values = [part.numpy() for part in (rays.flux, *(rays.direction[:2] / ahead))]
-        nets = [interpolated(known[::2, ::2]) for known in values]
-        scales = EXACT * (values[0] + DARK * values[0].max()), STRAIGHT, STRAIGHT
-        triples = zip(nets, values, scales, strict=True)
-        off = [(halfway(net) - known) / scale for net, known, scale in triples]
-        error = max(max(np.sqrt(np.mean(part**2)), np.abs(part).max() / PEAK) for part in off)
+        nets = [interpolating_net(known[::2, ::2]) for known in values]
+        irradiance_scale = IRRADIANCE_TOLERANCE * (values[0] + MIN_IRRADIANCE * values[0].max())
+        triples = zip(nets, values, (irradiance_scale, SLOPE_TOLERANCE, SLOPE_TOLERANCE), strict=True)
+        errors = [(midpoint_values(net) - known) / scale for net, known, scale in triples]
+        error = max(max(np.sqrt(np.mean(part**2)), np.abs(part).max() / PEAK_TO_RMS) for part in errors)
         if error <= 1.0:
             size = window.width, window.height
             corner = [*(-s / 2 for s in size), *((side - 1) / s for s in size)]
-            table = Table(side, side, *corner, *(net.ravel() for net in nets))
-            return Beam(*OF_A_TABLE, start=float(starts), tilted=1, n_x=0.0, n_y=0.0, n_z=1.0, least=0.0, table=table)
-        if not error < SLOWER * last:
+            table = LightTable(side, side, *corner, *(net.ravel() for net in nets))
+            return Beam(*TABLE_BEAM, start=float(starts), tilted=1, n_x=0.0, n_y=0.0, n_z=1.0, least=0.0, table=table)
+        if not error < MAX_ERROR_RATIO * last:
             return None
         last = error
     return None
 
 
-def _tilted(plane: Receiver | None, before: int, behind: int) -> Tilted | None:
-    """A tilted plane as numbers, None for a level one; before, behind: the light's way along z at the last face."""
+def _tilted(plane: Receiver | None, before: int, behind: int) -> records.TiltedScreen | None:
+    """Return a tilted plane as numbers, None for a level one; before, behind: sense of the light at the last face."""
     if plane is None or plane.is_level:
         return None
     along_x, along_y, normal = ((*axis[:2], before * axis[2]) for axis in plane.axes)
-    return Tilted(*floats([*plane.middle[:2], *(behind * n for n in normal), *along_x, *along_y]))
+    return records.TiltedScreen(*floats([*plane.middle[:2], *(behind * n for n in normal), *along_x, *along_y]))
 
 
-def cells(window: Rectangle, n: int, seed: int) -> Cells:
-    """n x n cells of a window centred on the axis."""
+def cells(window: Rectangle, n: int, seed: int) -> RayCells:
+    """Return n x n cells of a window centred on the axis."""
     width, height = window.width / n, window.height / n
     mixing = sampling.SPLITMIX_INCREMENT, sampling.MIX_1, sampling.MIX_2
     key, *mixing = map(np.uint64, (sampling.hash_seed(seed), *mixing))
-    return Cells(n, key, width, height, window.width / 2, window.height / 2, *mixing)
+    return RayCells(n, key, width, height, window.width / 2, window.height / 2, *mixing)
 
 
 def pixels(screen: Screen) -> Pixels:
-    """The screen as numbers."""
+    """Return the screen as numbers."""
     return Pixels(*floats([*screen.x, *screen.y, *screen.per_unit]))

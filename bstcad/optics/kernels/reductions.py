@@ -1,12 +1,12 @@
-"""Sums and functions in fixed parts: no bit of a result depends on the number of threads.
+"""Sums and functions in fixed parts, whose results do not depend on the number of threads, to the last bit.
 
-Rounding follows the order of a sum, and the line searches of tailoring amplify rounding into another lens of the same
-merit.  So what many rays add to (a net, a picture) is summed in parts whose number depends on nothing but the number of
-rays; threads take the parts, and the parts are added up in their order.  Neighbouring rays touch only a few rows of
-the net or the picture: a part clears a row when it first touches it, and only touched rows are merged.
+Rounding depends on the order of a sum, and the line searches of tailoring amplify rounding into a different lens of the
+same merit.  So a net or picture to which many rays add is summed in parts whose number depends only on the number of
+rays; threads compute the parts, and the parts are added in their order.  Neighbouring rays touch only a few rows of the
+net or the picture: a part clears a row when it first touches it, and only touched rows are merged.
 
-A product of dense matrices is such a sum that BLAS divides as it likes, and exp, sin and cos may round otherwise in the
-last few numbers of a thread's share than in the others.
+BLAS divides products of dense matrices by the number of threads, so they are avoided.  exp, sin and cos may round
+differently for the last few numbers of a thread's part.
 """
 
 from __future__ import annotations
@@ -24,31 +24,31 @@ from torch import Tensor
 from bstcad.optics import ops
 from bstcad.optics.kernels.compiling import compiled
 
-PARTS = 16  # at most; a power of two, so that two, four or eight threads have the same to do
-LEAST = 1 << 14  # rays or tubes a part
-ROW = 4096  # numbers that one thread sums
-ELEMENTARY = 1024  # numbers whose exp, sin or cos one thread takes: torch divides no fewer than 2048
+PARTS = 16  # maximum number of parts; a power of two, so that two, four or eight threads have equal work
+MIN_PART = 1 << 14  # minimum number of rays or tubes in a part
+ROW = 4096  # numbers summed by one thread
+ELEMENTARY = 1024  # numbers whose exp, sin or cos one thread computes: torch divides no fewer than 2048
 
 
 def parts(n: int) -> int:
-    """The number of parts of n rays: 1, 2, 4 … PARTS."""
-    return min(PARTS, 1 << max(0, (n // LEAST).bit_length() - 1))
+    """Return the number of parts of n rays: 1, 2, 4 … PARTS."""
+    return min(PARTS, 1 << max(0, (n // MIN_PART).bit_length() - 1))
 
 
 def total(t: Tensor) -> Tensor:
-    """Σ t, differentiable: torch shares one long sum among its threads, but not the sum of a row."""
+    """Return Σ t, differentiable: torch divides one long sum among its threads, but not the sum of a row."""
     flat = t.reshape(-1)
     whole = flat.numel() // ROW * ROW
     return flat[:whole].view(-1, ROW).sum(1).sum() + flat[whole:].sum()
 
 
 def quotient(t: Tensor, whole: Tensor) -> Tensor:
-    """t / whole, a number, differentiable in both: torch's own gradient in the number is one long sum."""
+    """Return t / whole for a scalar `whole`, differentiable in both, with all sums in fixed parts."""
     return Quotient.apply(t, whole)
 
 
 class Quotient(torch.autograd.Function):
-    """(t, whole) -> t / whole, with the gradient in the number `whole` as a sum in fixed parts."""
+    """Map (t, scalar whole) to t / whole; the gradient in `whole` is a sum in fixed parts, unlike torch's own."""
 
     @staticmethod
     def forward(ctx, t: Tensor, whole: Tensor):  # noqa: D102
@@ -63,20 +63,20 @@ class Quotient(torch.autograd.Function):
 
 
 def elementary(function: Callable[[Tensor], Tensor], t: Tensor) -> Tensor:
-    """exp, sin, cos … of each number of t, differentiable: by the same vector code for the same number, always."""
+    """Apply exp, sin, cos … to each number of t, differentiable, with the same rounding for any number of threads."""
     if t.device.type != "cpu" or t.numel() <= ELEMENTARY:
         return function(t)
     return torch.cat([function(part) for part in t.reshape(-1).split(ELEMENTARY)]).view(t.shape)
 
 
 def dot(a: Tensor, b: Tensor) -> float:
-    """Σ a b of two vectors, in float64; without gradient."""
+    """Return Σ a b of two vectors in float64, without gradient."""
     fast = ops.kernel("reductions.dot", a)
     return fast(a, b) if fast else float(total(a * b))
 
 
 def dot_of_arrays(a: Tensor, b: Tensor) -> float:
-    """`dot` on the CPU, as a sum of PARTS sums."""
+    """Return `dot` on the CPU, as a sum of PARTS sums."""
     sums = np.empty(PARTS)
     _dot(a.detach().numpy(), b.detach().numpy(), sums)
     return float(sums.sum())
@@ -93,7 +93,7 @@ def _dot(a, b, sums):
 
 @njit(inline="always")
 def clear(own, touched, first, last):
-    """Make rows first … last - 1 of a part ready to be added to; touched (2,): the rows that are, none at first."""
+    """Clear those of rows first … last - 1 of a part outside the range `touched` (2,), and extend the range."""
     if first < touched[0] or last > touched[1]:
         _widen(own, touched, first, last)
 
@@ -119,16 +119,16 @@ def _merge(own, touched, out):
 
 
 def shares(n: int, block: int) -> list[tuple[int, int]]:
-    """(first, last + 1) of the rays of each part, cut between blocks."""
+    """Return (first, last + 1) of the rays of each part, divided between blocks."""
     count, blocks = parts(n), -(-n // block)
     ends = [min(n, k * blocks // count * block) for k in range(count + 1)]
     return list(zip(ends, ends[1:], strict=False))
 
 
 def on_threads(work: Callable[..., None], tasks: Sequence[tuple[Any, ...]]) -> None:
-    """work(*task) of each task, as many at once as torch has threads.
+    """Call work(*task) for each task, on as many Python threads as torch has.
 
-    Python's threads: such kernels hold no lock, and without numba's own they compile in half the time.
+    The kernels release Python's lock, and without numba's own threads they compile in half the time.
     """
     threads = torch.get_num_threads()
     if len(tasks) == 1 or threads == 1:
@@ -140,18 +140,18 @@ def on_threads(work: Callable[..., None], tasks: Sequence[tuple[Any, ...]]) -> N
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Threads that stay: to start them anew takes longer than the work on a draft's few rays."""
+    """Return the pool of threads; to start threads takes longer than the few rays of a preview."""
     return ThreadPoolExecutor(threads)
 
 
 def buffers(count: int, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """(own (count, rows, columns), touched (count, 2)): a buffer of each part, and the rows of it that are in use."""
-    own = torch.empty((count, rows, columns), dtype=torch.float64)  # numpy's would take huge pages, and clear them
+    """Return (own (count, rows, columns), touched (count, 2)): a buffer for each part, and the range of used rows."""
+    own = torch.empty((count, rows, columns), dtype=torch.float64)  # numpy would use huge pages, which are cleared
     return own.numpy(), np.zeros((count, 2), np.int64)
 
 
 def merged(own: np.ndarray, touched: np.ndarray) -> np.ndarray:
-    """(rows, columns): the parts, added up in their order."""
+    """Return the sum (rows, columns) of the parts, added in their order."""
     out = np.zeros(own.shape[1:])
     _merge(own, touched, out)
     return out

@@ -1,6 +1,6 @@
-"""Fused CPU kernels (numba) behind `irradiance.collect`: rays splatted onto pixels, and the adjoint of that.
+"""Fused CPU kernels (numba) behind `irradiance.collect`: bilinear splatting of rays onto pixels, and its adjoint.
 
-The plain torch form stays the reference: these give the same values to rounding, several times faster.
+The plain torch form is the reference: the kernels give the same values to rounding, several times faster.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from torch import Tensor
 from bstcad.optics.kernels import reductions
 from bstcad.optics.kernels.compiling import compiled
 
-CHUNK = 4096  # rays a task: its coordinates and results stay in the second-level cache
+CHUNK = 4096  # rays per task, whose coordinates and results stay in the second-level cache
 
 
 @compiled(parallel=True)
 def _splat(position, flux, frame, image, touched, outside):
-    """Bilinear splat onto pixel centres, image (parts, rows, columns), and outside (parts,)."""
+    """Splat rays bilinearly onto pixel centres; image (parts, rows, columns), outside (parts,)."""
     n = flux.size
     count, rows, columns = image.shape
     share = (n + count - 1) // count
     for c in prange(count):
         own = image[c]
-        beyond = 0.0
+        far = 0.0
         for r in range(c * share, min(n, (c + 1) * share)):
             f = float(flux[r])
             if f == 0.0:
@@ -34,10 +34,10 @@ def _splat(position, flux, frame, image, touched, outside):
             x = (float(position[0, r]) - frame[0]) * frame[1]
             y = (frame[2] - float(position[1, r])) * frame[3]
             off_x, off_y = x - min(max(x, 0.0), columns), y - min(max(y, 0.0), rows)
-            beyond += f * (off_x * off_x + off_y * off_y)
+            far += f * (off_x * off_x + off_y * off_y)
             x -= 0.5
             y -= 0.5
-            if not (-1.0 < x < columns and -1.0 < y < rows):  # also refuses NaN
+            if not (-1.0 < x < columns and -1.0 < y < rows):  # also excludes NaN
                 continue
             i, j = int(math.floor(y)), int(math.floor(x))
             wy, wx = y - i, x - j
@@ -52,12 +52,12 @@ def _splat(position, flux, frame, image, touched, outside):
                     own[i + 1, j] += f * wy * (1 - wx)
                 if j + 1 < columns:
                     own[i + 1, j + 1] += f * wy * wx
-        outside[c] = beyond
+        outside[c] = far
 
 
 @compiled(parallel=True)
 def _splat_adjoint(position, flux, frame, g, g_outside, d_position):
-    """Gradient in the positions; g (rows, columns) is the gradient in each pixel, g_outside that in the pull."""
+    """Compute the gradient in the positions from g (rows, columns), in the pixels, and g_outside, in `outside`."""
     rows, columns = g.shape
     n = flux.size
     for c in prange((n + CHUNK - 1) // CHUNK):
@@ -86,9 +86,9 @@ def _splat_adjoint(position, flux, frame, g, g_outside, d_position):
 
 
 class Splat(torch.autograd.Function):
-    """(position (2, n) mm, flux (n,), frame, shape) -> (image (rows, columns), outside); gradient in the position.
+    """Map (position (2, n) mm, flux (n,), frame, shape) to (image (rows, columns), outside), as `irradiance.collect`.
 
-    frame: x_min (mm), columns per mm, y_max (mm), rows per mm.
+    frame: x_min (mm), columns per mm, y_max (mm), rows per mm.  The gradient is taken in the position.
     """
 
     @staticmethod

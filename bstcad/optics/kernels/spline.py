@@ -1,8 +1,8 @@
-"""Fused CPU kernels (numba) behind `bspline.evaluate` and its adjoints, and the spline as other kernels take it.
+"""Fused CPU kernels (numba) behind `bspline.evaluate` and its adjoints, and the spline functions of other kernels.
 
-The plain torch forms stay the reference: these give the same values to rounding, several times faster, because each
-point's nine products stay in registers and the adjoint scatters into one net a part instead of nine index_put passes.
-`largest_bending` is behind the figures of a back (analysis/shape.py), with `bspline.Jet` as its plain form.
+The plain torch forms are the reference: the kernels give the same values to rounding, several times faster, because
+each point's nine products stay in registers and the adjoint adds to one net per part instead of nine index_put passes.
+`largest_bending` gives the largest slope and curvatures of a back (analysis/shape.py); its plain form is `bspline.Jet`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from bstcad.optics.kernels import reductions
 from bstcad.optics.kernels.compiling import compiled
 from bstcad.optics.kernels.reductions import on_threads
 
-CHUNK = 4096  # points a task: its coordinates and results stay in the second-level cache
+CHUNK = 4096  # points per task, whose coordinates and results stay in the second-level cache
 
 
 def _flat(t: Tensor) -> np.ndarray:
@@ -26,7 +26,7 @@ def _flat(t: Tensor) -> np.ndarray:
 
 
 def net_of(heights: Tensor) -> np.ndarray:
-    """The heights as the kernels take them: flat, float64."""
+    """Return the heights for the kernels: flat, float64."""
     return _flat(heights.detach().double())
 
 
@@ -35,7 +35,7 @@ def net_of(heights: Tensor) -> np.ndarray:
 
 @njit(error_model="numpy", fastmath={"contract"})
 def basis(u, m):
-    """(k, B_k, B_{k+2}, -dB_k/du, dB_{k+2}/du) at u; B_{k+1} is 1 less both (bspline.basis)."""
+    """Return (k, B_k, B_{k+2}, -dB_k/du, dB_{k+2}/du) at u; B_{k+1} = 1 - B_k - B_{k+2} (bspline.basis)."""
     if 1.5 <= u <= m - 2.5:
         k = int(u - 0.5)
         s = u - 0.5 - k
@@ -54,7 +54,7 @@ def basis(u, m):
 
 @njit(error_model="numpy", fastmath={"contract"})
 def bend(u, m):
-    """d²B_k/du² = d²B_{k+2}/du² = a b r³ / 2 at u (see `basis`)."""
+    """Return d²B_k/du² = d²B_{k+2}/du² = a b r³ / 2 at u (see `basis`)."""
     if 1.5 <= u <= m - 2.5:
         return 1.0
     k, s = (0, 2.0 - math.sqrt(4.0 - 2.0 * u)) if u < 1.5 else (m - 3, math.sqrt(4.0 - 2.0 * (m - 1 - u)) - 1.0)
@@ -66,7 +66,7 @@ def bend(u, m):
 
 @njit(inline="always")
 def _row(net, at, b0, b2, q0, q2):
-    """Value, slope and second difference along v of the three control points from `at` on, by weights of neighbours."""
+    """Return value, slope and second difference along v of the three control points from index `at` on."""
     middle = net[at + np.uint64(1)]
     low, high = middle - net[at], net[at + np.uint64(2)] - middle
     return middle - b0 * low + b2 * high, q0 * low + q2 * high, high - low
@@ -74,10 +74,10 @@ def _row(net, at, b0, b2, q0, q2):
 
 @njit(inline="always")
 def sag(net, m, n, u, v):
-    """(h, ∂h/∂u, ∂h/∂v) as sums over differences of neighbouring heights; net (m, n) is flat (bspline.evaluate)."""
+    """Return (h, ∂h/∂u, ∂h/∂v) as sums over differences of neighbouring heights; net (m, n) flat (bspline.evaluate)."""
     i, a0, a2, p0, p2 = basis(u, m)
     j, b0, b2, q0, q2 = basis(v, n)
-    at = np.uint64(i * n + j)  # unsigned: no test for an index from the end
+    at = np.uint64(i * n + j)  # unsigned, so that no negative index is tested for
     f0, g0, _ = _row(net, at, b0, b2, q0, q2)
     f1, g1, _ = _row(net, at + np.uint64(n), b0, b2, q0, q2)
     f2, g2, _ = _row(net, at + np.uint64(2 * n), b0, b2, q0, q2)
@@ -87,7 +87,7 @@ def sag(net, m, n, u, v):
 
 @njit(inline="always")
 def curved(net, m, n, u, v):
-    """(h, ∂h/∂u, ∂h/∂v, ∂²h/∂u², ∂²h/∂u∂v, ∂²h/∂v²), as `sag`."""
+    """Return (h, ∂h/∂u, ∂h/∂v, ∂²h/∂u², ∂²h/∂u∂v, ∂²h/∂v²), as `sag` does."""
     i, a0, a2, p0, p2 = basis(u, m)
     j, b0, b2, q0, q2 = basis(v, n)
     c_u, c_v = bend(u, m), bend(v, n)
@@ -104,7 +104,7 @@ def curved(net, m, n, u, v):
 
 @njit(inline="always")
 def scatter(own, touched, u, v, g, g_u, g_v):
-    """The transpose of `sag`: adds a point's gradients to its nine control points; own (m, n), see reductions.py."""
+    """Add a point's gradients to its nine control points, the transpose of `sag`; own (m, n): see reductions.py."""
     m, n = own.shape
     i, a0, a2, p0, p2 = basis(u, m)
     j, b0, b2, q0, q2 = basis(v, n)
@@ -126,7 +126,7 @@ def scatter(own, touched, u, v, g, g_u, g_v):
 
 @njit(error_model="numpy", inline="always")
 def beyond2(x, y, limit_x, limit_y):
-    """(mm²) the left side of `outlines.inside`, to be held against r²; NaN of NaN."""
+    """Return the left side of `outlines.inside` (mm²), to be compared with r²; NaN for NaN."""
     p, q = abs(x) - limit_x, abs(y) - limit_y
     p, q = 0.0 if p < 0.0 else p, 0.0 if q < 0.0 else q
     return p * p + q * q
@@ -145,7 +145,7 @@ def _evaluate(net, m, n, u, v, h, h_u, h_v):
 
 @compiled(parallel=True)
 def _adjoint_in_net(u, v, g, g_u, g_v, d_net, touched):
-    """d_net (parts, m, n) in float64: each part's own sum, so no two threads write one cell (see reductions.py)."""
+    """Add the gradient in the net to d_net (parts, m, n), float64, a separate sum for each part (see reductions.py)."""
     n = u.size
     count = d_net.shape[0]
     share = (n + count - 1) // count
@@ -166,14 +166,14 @@ def _adjoint_in_places(net, m, n, u, v, g, g_u, g_v, d_u, d_v):
 
 
 def net_gradient(heights: Tensor, u: Tensor, v: Tensor, seeds: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-    """(m, n) the gradient in the heights of Σ g h + g_u ∂h/∂u + g_v ∂h/∂v at (u, v), the seeds (g, g_u, g_v) held."""
+    """Return the gradient (m, n) of Σ g h + g_u ∂h/∂u + g_v ∂h/∂v at (u, v) in the heights, seeds (g, g_u, g_v)."""
     d_net, touched = reductions.buffers(reductions.parts(u.numel()), *heights.shape)
     _adjoint_in_net(_flat(u), _flat(v), *map(_flat, seeds), d_net, touched)
     return torch.from_numpy(reductions.merged(d_net, touched)).to(heights.dtype)
 
 
 class BSplineSag(torch.autograd.Function):
-    """(heights, u, v) -> (h, ∂h/∂u, ∂h/∂v); gradients in all three inputs, once differentiable."""
+    """Map (heights, u, v) to (h, ∂h/∂u, ∂h/∂v); gradients in all three inputs, once differentiable."""
 
     @staticmethod
     def forward(ctx, heights: Tensor, u: Tensor, v: Tensor):  # noqa: D102
@@ -196,65 +196,67 @@ class BSplineSag(torch.autograd.Function):
         return d_heights, d_u, d_v
 
 
-KINDS = 3  # concave curvature, convex curvature, |∇z|
-PARTS = 16  # shares of the rows of spans
+QUANTITIES = 3  # number of quantities: concave curvature, convex curvature, |∇z|
+ROW_PARTS = 16  # parts of the rows of spans, one per task
 
 
 def largest_bending(
     net: np.ndarray, along: tuple[np.ndarray, np.ndarray], at: tuple[np.ndarray, np.ndarray],
     limits: tuple[float, float, float], bounds: tuple[float, float, float],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """(largest, its place as its index along x and along y, how many are at the bound), (3,), (3, 2), (3,), of KINDS.
+    """Return the maxima (3,), their indices along x and y (3, 2) and the numbers of points at the bounds (3,).
 
-    net: (m, n) heights (mm).  along: (m - 2, places, 9) weights of a span's three control points in value, first (1/mm)
-    and second derivative (1/mm²) along x, and (n - 2, places, 9) along y.  at: (spans, places) x, and y (mm).
-    limits: Outline.limits.  Places outside them do not count; a curvature is below 0 where no place bends that way.
+    The three are concave curvature, convex curvature (1/mm) and |∇z|; a curvature is negative if no point is bent that
+    way.  net: (m, n) heights (mm).  along: (m - 2, points, 9) weights of a span's three control points in value, first
+    (1/mm) and second derivative (1/mm²) along x, and (n - 2, points, 9) along y.  at: x and y of the points (mm), each
+    (spans, points).  limits: Outline.limits; points outside do not count.
     """
     spans = len(net) - 2
-    ends = [spans * part // PARTS for part in range(PARTS + 1)]
-    found = np.full((PARTS, KINDS), -math.inf)
-    place, count = np.zeros((PARTS, KINDS, 2), np.int64), np.zeros((PARTS, KINDS), np.int64)
+    ends = [spans * part // ROW_PARTS for part in range(ROW_PARTS + 1)]
+    found = np.full((ROW_PARTS, QUANTITIES), -math.inf)
+    index = np.zeros((ROW_PARTS, QUANTITIES, 2), np.int64)
+    count = np.zeros((ROW_PARTS, QUANTITIES), np.int64)
     limits, bounds = np.array(limits), np.array([*bounds[:2], bounds[2] ** 2])
     on_threads(
         _largest,
         [
-            (net, *along, *at, limits, bounds, first, last, found[part], place[part], count[part])
+            (net, *along, *at, limits, bounds, first, last, found[part], index[part], count[part])
             for part, (first, last) in enumerate(zip(ends, ends[1:], strict=False))
         ],
     )
-    first = found.argmax(0)  # the first of equal values, in whichever part
-    kinds = np.arange(KINDS)
+    first = found.argmax(0)  # part with the first of equal values
+    kinds = np.arange(QUANTITIES)
     values = found[first, kinds]
     values[2] = math.sqrt(max(values[2], 0.0))
-    return values, place[first, kinds], count.sum(0)
+    return values, index[first, kinds], count.sum(0)
 
 
 @njit(inline="always")
 def _across(net, a, i, j):
-    """Value, first and second derivative along x of the three control points of span i in column j, by weights a."""
+    """Return value, first and second derivative along x of the control points of span i in column j, by weights a."""
     h0, h1, h2 = net[i, j], net[i + 1, j], net[i + 2, j]
     value, first = a[0] * h0 + a[1] * h1 + a[2] * h2, a[3] * h0 + a[4] * h1 + a[5] * h2
     return value, first, a[6] * h0 + a[7] * h1 + a[8] * h2
 
 
 @compiled(error_model="numpy")
-def _largest(net, along_x, along_y, x, y, limits, bounds, first, last, found, place, count):
-    """The figures of spans first … last - 1 along x, slopes squared."""
-    spans, places = y.shape  # spans and places of a line of spans along y
-    reach_x, reach_y, reach2 = limits
+def _largest(net, along_x, along_y, x, y, limits, bounds, first, last, found, index, count):
+    """Compute the results of `largest_bending` for spans first … last - 1 along x, with squared slopes."""
+    spans, points = y.shape
+    limit_x, limit_y, limit_r2 = limits
     for i in range(first, last):
-        for p in range(places):
+        for p in range(points):
             at_x = x[i, p]
-            if not beyond2(at_x, 0.0, reach_x, reach_y) <= reach2:
+            if not beyond2(at_x, 0.0, limit_x, limit_y) <= limit_r2:
                 continue
             a = along_x[i, p]
             v0, d0, e0 = _across(net, a, i, 0)
             v1, d1, e1 = _across(net, a, i, 1)
             for j in range(spans):
                 v2, d2, e2 = _across(net, a, i, j + 2)
-                for q in range(places):
+                for q in range(points):
                     at_y = y[j, q]
-                    if not beyond2(at_x, at_y, reach_x, reach_y) <= reach2:
+                    if not beyond2(at_x, at_y, limit_x, limit_y) <= limit_r2:
                         continue
                     b = along_y[j, q]
                     z_x = b[0] * d0 + b[1] * d1 + b[2] * d2
@@ -270,11 +272,11 @@ def _largest(net, along_x, along_y, x, y, limits, bounds, first, last, found, pl
                     scale = 1.0 / (n2 * math.sqrt(n2))
                     concave, convex = (spread + mean) * scale, (spread - mean) * scale
                     if concave > found[0]:
-                        found[0], place[0, 0], place[0, 1] = concave, i * places + p, j * places + q
+                        found[0], index[0, 0], index[0, 1] = concave, i * points + p, j * points + q
                     if convex > found[1]:
-                        found[1], place[1, 0], place[1, 1] = convex, i * places + p, j * places + q
+                        found[1], index[1, 0], index[1, 1] = convex, i * points + p, j * points + q
                     if steep > found[2]:
-                        found[2], place[2, 0], place[2, 1] = steep, i * places + p, j * places + q
+                        found[2], index[2, 0], index[2, 1] = steep, i * points + p, j * points + q
                     count[0] += concave >= bounds[0]
                     count[1] += convex >= bounds[1]
                     count[2] += steep >= bounds[2]

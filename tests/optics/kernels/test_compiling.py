@@ -65,16 +65,16 @@ SOURCE, SCREEN = Point((0.0, 0.0, -40.0), "lambertian"), Screen(400.0, (-80.0, 8
 CHANGED = {  # constant: (where it stands, a value that no ray can fail to feel)
     "NEWTON_STEPS": (interfaces, 1),
     "APPROACH_STEPS": (interfaces, 0),
-    "LEVEL": (interfaces, 1.0),
-    "FLATTEST": (interfaces, 50.0),
-    "ALONG": (interfaces, 2.0),
-    "SKIMMING": (interfaces, 50.0),
-    "EQUATOR": (surfaces, 0.9999),
+    "SIDE_EXIT_COSINE": (interfaces, 1.0),
+    "MIN_NEWTON_DERIVATIVE": (interfaces, 50.0),
+    "TANGENCY_TOLERANCE": (interfaces, 2.0),
+    "MIN_COS_REFRACTION": (interfaces, 50.0),
+    "MIN_COS2": (surfaces, 0.9999),
     "MIN_AXIAL_COSINE": (rays, 0.9999),
     "SPLITMIX_INCREMENT": (sampling, 3),
     "MIX_1": (sampling, 3),
     "MIX_2": (sampling, 3),
-    "THINNEST": (tubes, 1e9),
+    "MIN_TRIANGLE_AREA": (tubes, 1e9),
 }
 
 
@@ -98,7 +98,7 @@ def seen(cliff):
 
 @pytest.mark.parametrize("name", CHANGED)
 def test_a_compiled_kernel_follows_the_plain_form(name, monkeypatch):
-    cliff = 8.0 if name in ("APPROACH_STEPS", "LEVEL") else 0.0
+    cliff = 8.0 if name in ("APPROACH_STEPS", "SIDE_EXIT_COSINE") else 0.0
     before = seen(cliff)
     assert torch.equal(seen(cliff), before)
     module, value = CHANGED[name]

@@ -13,7 +13,7 @@ from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import forward
 from bstcad.optics.kernels.forward import land
-from bstcad.optics.kernels.kernel_arguments import DARK, EXACT
+from bstcad.optics.kernels.kernel_arguments import IRRADIANCE_TOLERANCE, MIN_IRRADIANCE
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
@@ -149,18 +149,19 @@ def test_light_without_a_closed_form_is_traced_by_a_table(name):
     light = Unknown(known)
     x, y = (p.reshape(-1) for p in stratified(window(known, lens), 150, 0))
     found, plain = (land(source, lens, LevelPlane(400.0), x, y) for source in (light, known))
-    lit = plain.flux > DARK * plain.flux.max()
+    lit = plain.flux > MIN_IRRADIANCE * plain.flux.max()
     off = found.flux[lit] / plain.flux[lit] - 1
-    assert lit.sum() > 3000 and off.abs().max() < 100 * EXACT and off.square().mean().sqrt() < 1.5 * EXACT
+    assert lit.sum() > 3000 and off.abs().max() < 100 * IRRADIANCE_TOLERANCE
+    assert off.square().mean().sqrt() < 1.5 * IRRADIANCE_TOLERANCE
     there = lit & plain.alive & found.alive
     assert (found.status[lit] == plain.status[lit]).double().mean() > 0.999  # a ray on a rim may end on either side
     near = there & (plain.position.abs() < 400.0).all(0)
     assert near.sum() > 1000 and (found.position - plain.position)[:, near].abs().max() < 1e-4  # mm
     assert whole_kernel("trace.simulate", light, lens, SCREEN.plane) is forward.simulate
     ours, theirs = (simulated(source, lens, SCREEN, 300, seed=5) for source in (light, known))
-    assert ours.flux == pytest.approx(theirs.flux, abs=EXACT)
+    assert ours.flux == pytest.approx(theirs.flux, abs=IRRADIANCE_TOLERANCE)
     apart = float((ours.tent - theirs.tent).norm() / theirs.tent.norm())
-    assert apart < 3 * EXACT  # added to an RRMSD of 0.003 in quadrature: 5e-5 of it
+    assert apart < 3 * IRRADIANCE_TOLERANCE  # added to an RRMSD of 0.003 in quadrature: 5e-5 of it
 
 
 def test_light_with_an_edge_and_of_few_rays_is_traced_by_the_plain_form():

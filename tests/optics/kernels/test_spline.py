@@ -8,7 +8,7 @@ import torch
 
 from bstcad.analysis import shape
 from bstcad.optics import bspline, irradiance, ops
-from bstcad.optics.bspline import QUARTERS, Spans, span_places
+from bstcad.optics.bspline import QUARTERS, Spans, span_points
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import spline
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
@@ -85,7 +85,7 @@ def test_collect_and_its_gradients(layout, dtype):
 def test_largest_and_where_and_how_many(m, outline):
     surface = rough(0.3, m, 1.0, m, (3.0, 2.0))
     i, j = (index.flatten() for index in torch.meshgrid(torch.arange(m - 2), torch.arange(m - 2), indexing="ij"))
-    jet, (x, y) = Spans.of(surface, i, j).jet(QUARTERS), span_places(surface, i, j, QUARTERS)
+    jet, (x, y) = Spans.of(surface, i, j).jet(QUARTERS), span_points(surface, i, j, QUARTERS)
     held = outline.contains(x, y).broadcast_to(jet.slope.shape)
     most, least = jet.curvatures
     grid = shape._grid(surface)
