@@ -76,7 +76,7 @@ def test_all_light_goes_through_the_dome_and_lands(dome):
     level = dome.report["prescription"]["front"]["around"]
     assert level == pytest.approx((12**2 - 8.5**2) ** 0.5, abs=1e-12)
     text = (dome.folder / "prescription.txt").read_text()
-    assert "outline of its own" in text and f"z = {level!r} mm" in text
+    assert "outline of the face" in text and f"z = {level!r} mm" in text
 
 
 def test_the_dome_is_in_the_scene_and_in_the_step_file_of_its_design(dome):

@@ -94,7 +94,7 @@ def _aperture(patch: Outline | None, outline: Outline) -> str:
         return float(rounded_up(value * (1 - SLACK)))
 
     if patch is None:
-        return "all of it"
+        return "the whole face"
     if patch.is_round:
         return f"\u00d8e {mm(up(2 * patch.radius))} mm"
     sides = zip(patch.half_extent, outline.half_extent, strict=True)
@@ -194,8 +194,8 @@ def _title_block(paper: Paper, sheet: Sheet, scale: str) -> None:
     paper.line([(left, level), (right, level)], 0.25)
     notes = (
         f"SHA-256 of {order.file}:", order.sha256[:32], order.sha256[32:],
-        f"{order.file} is exact and holds; dimensions here are rounded",
-        f"bstcad {sheet.version}" + "; lens.step: the lens before it was cut and held" * (sheet.mount is not None),
+        f"{order.file} is exact and binding; dimensions here are rounded",
+        f"bstcad {sheet.version}" + "; lens.step: the lens without cut and mount" * (sheet.mount is not None),
     )  # fmt: skip
     for k, note in enumerate(notes):
         paper.text(left + 1.8, level - 3.3 - 2.95 * k, note, NOTES, room=room)

@@ -1,9 +1,9 @@
-"""report.json as a record: its fields are the keys of the file, which is read back strictly, by type and range.
+"""report.json as a record: its fields are the keys of the file.
 
-It is put together from a design, its proof and its diagnosis, with remarks on them.
+The record is assembled from a design, its verification and its diagnosis, with remarks.
 
-Records are built from computed values, without validation; only `read` checks: an unknown key, a missing one,
-a string for a number or a number out of range refuse the whole file in one sentence.
+Records are built from computed values without validation; only `read` validates, by type and range.  An unknown or
+missing key, a string instead of a number or a number out of range refuse the whole file, with one sentence.
 """
 
 from __future__ import annotations
@@ -48,26 +48,26 @@ if TYPE_CHECKING:
     from bstcad.optics.emitters import Emitter
 
 BY_HAND = "by hand"  # Making.stopped of a lens that was changed after it was designed, or comes from elsewhere
-LARGEST = 20_000_000  # bytes of a report; ten thousand evaluations fill one
-LONGEST = 1000  # characters of a string in it
+MAX_REPORT_BYTES = 20_000_000  # size limit of a report that is read; ten thousand evaluations reach it
+MAX_STRING_LENGTH = 1000  # characters of a string in a report that is read
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-LEFT_OUT = {  # LeftOut.kind: in words
+LEFT_OUT = {  # LeftOut.kind: name of the effect in the report
     "fresnel": "Fresnel reflection",
     "reflectance": "reflectance below 1",
     "absorption": "absorption in the glass",
     "dispersion": "dispersion",
     "source size": "size of the source",
-    "ghost": "ghosts, light reflected twice inside the lens",
+    "ghost": "ghosts (light reflected twice inside the lens)",
     "shadows": "shadows of the source and of the mirror on itself",
     "stray light": "stray light",
     "diffraction": "diffraction",
 }
-NOTHING = 1e-4  # change of the light, and of RRMSD, below which an effect changes nothing
-SHARP = 5e-3  # pixels; a smaller blur is none
+NEGLIGIBLE_CHANGE = 1e-4  # change of the flux (fraction of 1) or of the RRMSD below which the report shows a dash
+NEGLIGIBLE_BLUR = 5e-3  # pixels, below which the report shows a dash
 
-# Keys of a report whose figures are those of the worst of its goals, and what they are called there.
-OF_WORST = {key: key for key in ("rrmsd", "rrmsd_tent", "light_on_target", "efficiency", "leak", "contrast")}
-OF_WORST["rrmsd_noise"] = "rrmsd_standard_error"
+# Keys of a report whose values are those of its worst goal, and their names in GoalFigures.
+WORST_GOAL_KEYS = {key: key for key in ("rrmsd", "rrmsd_tent", "light_on_target", "efficiency", "leak", "contrast")}
+WORST_GOAL_KEYS["rrmsd_noise"] = "rrmsd_standard_error"
 
 Scalar = str | float | int | bool | None
 Seconds = Annotated[float, Field(ge=0, le=1e9)]
@@ -78,58 +78,58 @@ Record = TypeVar("Record")
 class Stage:
     """One stage of the design."""
 
-    name: str  # such as stage 2
+    name: str  # name of the stage, such as stage 2
     seconds: Seconds  # wall time
-    rrmsd: Rrmsd | None = None  # after it
-    cpu_seconds: Seconds | None = None  # seconds of all processors; None: another process had a part in it, or unknown
+    rrmsd: Rrmsd | None = None  # RRMSD after the stage
+    cpu_seconds: Seconds | None = None  # CPU time; None: unknown, or another process took part
 
 
 @dataclass(frozen=True)
 class Point:
     """One point of the convergence curve."""
 
-    seconds: Seconds  # since the start
-    rrmsd: Rrmsd  # by the tubes of the stage
+    seconds: Seconds  # time since the start
+    rrmsd: Rrmsd  # RRMSD by the tubes of the stage
 
 
 class PrecisionTest(TypedDict):
-    """float32 beside float64 on the scene's own merit, as tailoring.stage2.Comparison has it."""
+    """float32 against float64 on the merit function of the scene; see tailoring.stage2.Comparison."""
 
-    control_points: int  # a side
-    merit: Size  # relative difference before the first step
-    gradient: Size  # relative difference of its norm
-    evaluations: int  # evaluations of each precision
-    rrmsd_float64: Rrmsd  # after them
-    rrmsd_float32: Rrmsd  # after as many evaluations
-    heights: Size  # mm; largest difference of a control point
+    control_points: int  # control points per side
+    merit: Size  # relative difference of the merit before the first step
+    gradient: Size  # relative difference of the gradient's norm before the first step
+    evaluations: int  # evaluations in each precision
+    rrmsd_float64: Rrmsd  # RRMSD after the evaluations in float64
+    rrmsd_float32: Rrmsd  # RRMSD after the evaluations in float32
+    heights: Size  # largest difference of a control point after them (mm)
 
 
 @dataclass(frozen=True)
 class Line:
-    """The light of one line of a spectrum by itself."""
+    """The light of one spectral line alone."""
 
     wavelength: Size  # nm
-    share: Share  # part of all light
-    rrmsd: Rrmsd  # RRMSD of its picture against the target
+    share: Share  # fraction of all light
+    rrmsd: Rrmsd  # RRMSD of the line's picture against the target
 
 
 @dataclass(frozen=True)
 class Making:
-    """How a lens was designed; None: nothing is known, as of a design whose earlier report is gone."""
+    """Course of a design; None: unknown, for a design whose earlier report is missing."""
 
-    seconds_total: Seconds = 0.0  # to the verified lens
+    seconds_total: Seconds = 0.0  # time from the command to the verified lens
     stages: tuple[Stage, ...] = ()
     history: tuple[Point, ...] = ()
     machine: Mapping[str, Scalar] | None = None
     versions: Mapping[str, str] | None = None  # versions of the libraries
-    # grid, iterations, mass error, reason to stop, and of analysis.steepness the share and the steepest slope (degrees)
+    # grid, iterations, mass error, reason to stop; fraction of light and largest slope (degrees) of analysis.steepness
     transport: Mapping[str, Scalar] | None = None
-    skipped_steps: int | None = None  # left out because their gradient was not finite
-    stopped: str | None = None  # the reason why tailoring ended
+    skipped_steps: int | None = None  # number of steps skipped because their gradient was not finite
+    stopped: str | None = None  # reason why tailoring ended
     twins: PrecisionTest | None = None
 
     def followed_by(self, *last: Stage) -> Making:
-        """The same with these stages last, instead of any of their names before."""
+        """Return this record with these stages at the end, which replace earlier stages of the same names."""
         names = [stage.name for stage in last]
         again = sum(stage.seconds for stage in self.stages if stage.name in names)
         seconds = self.seconds_total - again + sum(stage.seconds for stage in last)
@@ -139,121 +139,121 @@ class Making:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """An effect that is not simulated, and its change (analysis.neglected_effects.Change); None: not known."""
+    """An effect that is not simulated, and its estimated change (analysis.neglected_effects.Change); None: unknown."""
 
-    kind: str  # a word of LEFT_OUT
-    flux_change: float | None  # change of the flux, as a part of 1
-    rrmsd_change: float | None  # absolute
-    blur_pixels: float | None  # full width on the target
-    detail: str = ""  # the assumption of the estimate, or why nothing is known
-    simulate_by: str = ""  # the line of a scene file that has it simulated; nothing: bstcad does not
-    assumed: bool = False  # is its size an example which neither the scene nor nature states?
+    kind: str  # key of LEFT_OUT
+    flux_change: float | None  # change of the flux on the target, fraction of 1
+    rrmsd_change: float | None  # RRMSD of a lens that would be perfect without the effect
+    blur_pixels: float | None  # full width of the blur on the target (pixels)
+    detail: str = ""  # assumption of the estimate, or reason why nothing is known
+    simulate_by: str = ""  # line of a scene file that simulates the effect; empty: bstcad cannot simulate it
+    assumed: bool = False  # True if the size is an example that neither the scene nor nature states
 
 
 @dataclass(frozen=True)
 class Contents:
-    """All of report.json: a field a key, in its order."""
+    """Content of report.json: one field per key, in the order of the file."""
 
     __pydantic_config__ = STRICT
 
     name: str  # name of the design and of its folder
     title: str  # title of the scene
-    # see passed and given_up; "no limit was asked": every check passed, and the scene sets no limit on the light
+    # verdict by `passed` and `given_up`; "no limit was asked": all checks passed, no limit on the light in the scene
     verdict: Literal["passed", "passed with remarks", "no limit was asked", "failed"]
-    passed: bool  # every check
-    # figures of the light on each target; those outside of this list are of the target with the largest RRMSD
+    passed: bool  # True if every check passed
+    # figures of the light on each target; figures outside this list are for the target with the largest RRMSD
     goals: Annotated[tuple[GoalFigures, ...], Field(min_length=1, max_length=100), FailFast()]
-    rrmsd: Rrmsd  # RRMSD of the irradiance against the target, by the flux into each pixel
-    rrmsd_tent: Rrmsd | None  # by linear binning
+    rrmsd: Rrmsd  # RRMSD of the irradiance against the target, by the flux in each pixel
+    rrmsd_tent: Rrmsd | None  # RRMSD by linear binning
     rrmsd_noise: Annotated[float, Field(ge=0, le=1e3)]  # standard error of rrmsd
-    light_on_target: Share  # part of the source's flux
+    light_on_target: Share  # fraction of the source's flux on the target
     efficiency: Share  # flux on the target over flux that leaves the back face
-    flux: Mapping[str, Share]  # where the source's flux goes; sums to 1
+    flux: Mapping[str, Share]  # flux ledger: fractions of the source's flux, with sum 1
     prescription: Mapping[str, Any]  # every surface as it was designed
-    seconds_total: Seconds  # from the command to the verified lens
-    stages: Annotated[tuple[Stage, ...], Field(max_length=100), FailFast()]  # in their order
-    history: Annotated[tuple[Point, ...], Field(max_length=1_000_000), FailFast()]  # the convergence curve
-    checks: Annotated[tuple[Check, ...], Field(max_length=1000), FailFast()]  # in their order in the report
-    effects: Mapping[str, tuple[str, ...]]  # simulated, left_out
+    seconds_total: Seconds  # time from the command to the verified lens
+    stages: Annotated[tuple[Stage, ...], Field(max_length=100), FailFast()]  # stages in their order
+    history: Annotated[tuple[Point, ...], Field(max_length=1_000_000), FailFast()]  # convergence curve
+    checks: Annotated[tuple[Check, ...], Field(max_length=1000), FailFast()]  # checks in their order in the report
+    effects: Mapping[str, tuple[str, ...]]  # names of effects under the keys simulated and left_out
     machine: Mapping[str, Scalar]  # processors, memory, threads, device
     versions: Mapping[str, str]  # versions of the libraries, by name
     seed: int  # seed of every random choice
-    version: str | None = None  # version of bstcad, which wrote it
-    rrmsd_whole: Rrmsd | None = None  # against the whole picture, of which light can reach a part; None: it reaches all
-    # what light cannot reach: area (of the target, as a part of it), light (of the picture), angle (degrees by which a
-    # face of the index turns light before it reflects it; None: of a mirror); None: nothing
+    version: str | None = None  # version of bstcad that wrote the report
+    rrmsd_whole: Rrmsd | None = None  # RRMSD against the whole picture if light reaches only a part; None: all of it
+    # unreachable part of the target: area (fraction of the target), light (fraction of the picture), angle (degrees;
+    # largest deflection by a face of the index; None: a mirror); None: light reaches all of it
     unreachable: Mapping[str, Size | None] | None = None
-    leak: Share | None = None  # part of the target's light that is on its dark pixels; None: no dark
-    contrast: Size | None = None  # mean irradiance of the lit pixels over that of the dark ones; None: or without leak
-    optic: Literal["lens", "mirror"] = "lens"  # the kind of the design
+    leak: Share | None = None  # fraction of the light on the target that is on its dark pixels; None: no dark pixels
+    contrast: Size | None = None  # mean irradiance of lit pixels over that of dark ones; None: no dark pixels, no leak
+    optic: Literal["lens", "mirror"] = "lens"  # kind of the design
     quality: str | None = None  # tailoring.quality
-    # grid, iterations, mass error, reason to stop, and of analysis.steepness the share and the steepest slope (degrees)
+    # grid, iterations, mass error, reason to stop; fraction of light and largest slope (degrees) of analysis.steepness
     transport: Mapping[str, Scalar] | None = None
-    skipped_steps: Annotated[int, Field(ge=0)] | None = None  # steps left out since their gradient was not finite
-    stopped: str | None = None  # the reason why tailoring ended
-    twins: PrecisionTest | None = None  # None: there was no time for it
-    rrmsd_asked: Size | None = None  # None: the scene asks for none
-    rays_traced: int | None = None  # by the proof, in all
+    skipped_steps: Annotated[int, Field(ge=0)] | None = None  # number of steps with a gradient that is not finite
+    stopped: str | None = None  # reason why tailoring ended
+    twins: PrecisionTest | None = None  # None: there was no time for the test
+    rrmsd_asked: Size | None = None  # accept.rrmsd of the scene; None: no limit
+    rays_traced: int | None = None  # number of all rays of the verification
     shape: Mapping[str, float | None] | None = None  # thickness, radii (mm), slope (degrees), volume (mm³) …
-    # margins: to total reflection (degrees), of Newton's method, largest curvature (1/mm), values that are not finite
+    # margin to total reflection (degrees) and of Newton's method, largest curvature (1/mm), number of non-finite values
     stability: Mapping[str, float | int | None] | None = None
-    blur: Blur | None = None  # by the source's size; None: it has no size
-    finest_detail: FinestDetail | None = None  # how wide a point of the picture becomes
-    lines: tuple[Line, ...] = ()  # lines of a spectrum; none: it has one line
+    blur: Blur | None = None  # blur by the source's size; None: a point source or parallel light
+    finest_detail: FinestDetail | None = None  # width of a point of the picture on the target
+    lines: tuple[Line, ...] = ()  # lines of the spectrum; empty: one line
     picture: tuple[str, ...] = ()  # sentences on how the picture was read: first of several, tones, transparency, fit
-    given_up: tuple[str, ...] = ()  # remarks: sentences on wishes of the scene that the design does not fulfil
-    remarks: tuple[str, ...] = ()  # the id of each of these sentences
+    given_up: tuple[str, ...] = ()  # text of the remarks
+    remarks: tuple[str, ...] = ()  # ids of the remarks, in the order of given_up
     estimates: tuple[LeftOut, ...] = ()  # changes by effects that are not simulated, the largest first
-    # the end of the convergence curve, as analysis.cost.ConvergenceEnd has it; None: there is no curve
+    # end of the convergence curve, fields of analysis.cost.ConvergenceEnd; None: there is no curve
     convergence: Mapping[str, Size | None] | None = None
-    # where the error sits: parts [{name, error, pixels}] (parts of the squared error, and of the pixels), octaves
-    # [{frequency (cycles a pixel), period (in the target's unit), error}],
-    # outside (part of the light beside the target)
+    # distribution of the remaining error: parts [{name, error, pixels}] (fractions of the squared error and of the
+    # pixels), octaves [{frequency (cycles per pixel), period (in the target's unit), error}], outside (fraction of the
+    # light beside the target)
     remaining_error: Mapping[str, Any] | None = None
-    # the bounds on the tailored faces: asked {key of [lens]: value}, at {key: part of the faces that is at the bound;
-    # None: of a thickness that is}, tightest {key: place, in words}, both or front (true where not the back alone is
-    # tailored); None: none is asked
+    # bounds on the tailored faces: asked {key of [lens]: value}, at {key: fraction of the faces at the bound; None: a
+    # thickness at the bound}, tightest {key: position, in words}, both or front (true if not only the back is
+    # tailored); None: the scene has no bounds
     bounds: Mapping[str, Any] | None = None
-    judges: tuple[Judge, ...] = ()  # by --against
-    # a made part by its cloud, as measured.made_part has it: points, alignment, pv, rms, rrmsd_predicted, passed …
+    judges: tuple[Judge, ...] = ()  # results of other programs (--against)
+    # made part by its cloud, keys of measured.made_part: points, alignment, pv, rms, rrmsd_predicted, passed …
     measured: Mapping[str, Any] | None = None
-    order: Order | None = None  # for a machine shop
+    order: Order | None = None  # order for a machine shop
     flat_tops: tuple[FlatTop, ...] = ()  # figures of the targets with a flat profile
-    wavefront: WavefrontFigures | None = None  # None: none is asked for, or no light comes to where it is stated
+    wavefront: WavefrontFigures | None = None  # None: no requested wave, or no light on its plane
 
     @property
     def worst(self) -> GoalFigures:
-        """The figures of the target with the largest RRMSD."""
+        """Figures of the target with the largest RRMSD."""
         return self.goals[worst(goal.rrmsd for goal in self.goals)]
 
     @property
     def making(self) -> Making:
-        """How the lens was designed."""
+        """Course of the design."""
         return Making(**{entry.name: getattr(self, entry.name) for entry in fields(Making)})
 
     @property
     def remarked(self) -> tuple[Remark, ...]:
-        """The remarks with their ids, which an older report lacks."""
+        """Remarks with their ids; an older report has no ids."""
         return tuple(starmap(Remark, zip_longest(self.remarks, self.given_up, fillvalue="")))
 
     def facts(self) -> dict[str, Any]:
-        """The entries of report.json as plain values, in their order; those that are not known are no keys."""
-        found = {key: value for key, value in plain(self).items() if key in STATED or value not in (None, [])}
+        """Return the entries of report.json as plain values, in their order, without unknown ones (but KEYS_KEPT)."""
+        found = {key: value for key, value in plain(self).items() if key in KEYS_KEPT or value not in (None, [])}
         for judge in found.get("judges", ()):
-            if not judge["target"]:  # which judges name where there are several
+            if not judge["target"]:  # only named if there are several targets
                 del judge["target"]
         return found
 
 
-ALL = tuple(entry.name for entry in fields(Contents))
-KEYS = ALL[: ALL.index("seed") + 1]  # keys of every report.json, in this order
-# keys though nothing is known
-STATED = {*KEYS, "leak", "contrast", "optic", "twins", "rrmsd_asked", "given_up", "remarks"}
+ALL_KEYS = tuple(entry.name for entry in fields(Contents))
+KEYS = ALL_KEYS[: ALL_KEYS.index("seed") + 1]  # keys of every report.json, in this order
+# keys that a report.json has even if the value is null or empty
+KEYS_KEPT = {*KEYS, "leak", "contrast", "optic", "twins", "rrmsd_asked", "given_up", "remarks"}
 
 
 @dataclass(frozen=True)
 class Examined:
-    """`bstcad verify` of a STEP file by itself."""
+    """Result of `bstcad verify` for a STEP file by itself."""
 
     name: str
     title: str
@@ -261,29 +261,30 @@ class Examined:
     passed: bool
     checks: tuple[Check, ...]
     part: Mapping[str, str]  # rows of name and value (prescription.part)
-    placement: Mapping[str, Any] | None = None  # where the lens lies in the file (Placement.facts); None: unmoved
-    remarked: tuple[Remark, ...] = ()  # these as in Contents: nothing is known without a design
+    placement: Mapping[str, Any] | None = None  # position of the lens in the file (Placement.facts); None: not moved
+    # the fields below are those of Contents, empty without a design
+    remarked: tuple[Remark, ...] = ()
     bounds: Mapping[str, Any] | None = None
 
 
-# --- put together from a design, its proof and its diagnosis ----------------------------------------------------------
+# --- assembled from a design, its verification and its diagnosis ------------------------------------------------------
 
 
 def contents_of(
     scene: Scene, lens: Lens, goals: Sequence[Goal], proof: Proof, *, making: Making,
     circumstances: Mapping[str, Any], estimates: tuple[LeftOut, ...], diagnosis: Mapping[str, Any],
 ) -> Contents:  # fmt: skip
-    """The contents of report.json.
+    """Return the contents of report.json.
 
-    lens: as designed.  circumstances: version, machine and versions of libraries now, which those of its making
-    precede.  estimates: of the effects that are left out.  diagnosis: convergence, remaining_error and bounds.
+    lens: as designed.  circumstances: version, machine and versions of libraries now; known ones in `making` replace
+    them.  estimates: effects that are not simulated.  diagnosis: convergence, remaining_error and bounds.
     """
     known = {key: value for key, value in vars(making).items() if value is not None}
     goal, light, figures = goals[proof.worst], proof.light, figures_of(goals, proof.lights)
     contents = Contents(
         **{**circumstances, **known},
         **diagnosis,
-        **{key: getattr(figures[proof.worst], name) for key, name in OF_WORST.items()},
+        **{key: getattr(figures[proof.worst], name) for key, name in WORST_GOAL_KEYS.items()},
         name=scene.name,
         title=scene.title,
         verdict=verdict(proof.passed, (), scene.limits_light),
@@ -323,7 +324,7 @@ def _unreached(scene: Scene, goal: Goal) -> dict[str, float | None] | None:
 
 
 def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:
-    """The contents with a made part, whose checks join the verdict; place: path of its folder from the report's."""
+    """Return the contents with a made part and its checks.  place: path of its folder, relative to the report's."""
     measured = part.facts | {"deviation_map": [f"{place}{name}" for name in MAP_FILES]}
     passed, checks = contents.passed and part.facts["passed"], (*contents.checks, *part.checks)
     contents = replace(contents, checks=checks, passed=passed, measured=measured)
@@ -331,7 +332,7 @@ def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:
 
 
 def _remarked(contents: Contents, *more: Remark) -> Contents:
-    """The contents with more remarks, and the verdict that follows."""
+    """Return the contents with more remarks, and the verdict that follows."""
     every, asked = (*contents.remarked, *more), contents.verdict != NO_LIMIT
     ids, texts = (tuple(part) for part in zip(*every, strict=True)) if every else ((), ())
     return replace(contents, given_up=texts, remarks=ids, verdict=verdict(contents.passed, texts, asked))
@@ -340,7 +341,7 @@ def _remarked(contents: Contents, *more: Remark) -> Contents:
 def _finest_detail(
     scene: Scene, proof: Proof, screen: Screen, estimates: tuple[LeftOut, ...]
 ) -> FinestDetail | None:  # fmt: skip
-    """The detail that the source allows: of the scene's size, or of the size that the estimates assume of a point."""
+    """Return the finest detail by the size of the source in the scene, or by the size that the estimates assume."""
     if proof.blur:
         of = ", ".join(f"source.{key} = {size}" for key, size in extent(scene.source))
         return finest_detail(proof.blur.pixels, proof.lens, screen, of)
@@ -351,23 +352,26 @@ def _finest_detail(
 
 
 def simulated(scene: Scene) -> Rows:
-    """The physics that is simulated for a scene: words, and the key of the scene that asks for it."""
+    """Return the simulated effects: name, and the key of the scene that requests the effect."""
     return tables("simulated.txt.j2", scene=scene, extent=list(extent(scene.source)), names=LEFT_OUT)["simulated"]
 
 
 def extent(source: Emitter) -> Iterator[tuple[str, str]]:
-    """The keys that give a source a size, each with the size in words."""
+    """Yield the keys that give a source a size, each with the size in words."""
     yield from ((key, f"{size:g} {unit}") for key, size, unit in source.sizes())
 
 
 # --- remarks ----------------------------------------------------------------------------------------------------------
-# A remark is a sentence with its figure for each wish of the scene that a design does not fulfil, checked or not.  A
-# lens may be right to the last nanometre and still lose light, or be thicker than drawn, because the scene left no
-# other way; who reads only "passed" or "failed" should not have to search the tables for that.
+# A remark names a request of the scene that the design does not fulfil, with its figure, whether a check judges it or
+# not.  A lens may be exact to a nanometre and still lose light, or be thicker than drawn, because the scene allows
+# nothing better; a reader of "passed" should not have to search the tables for that.
 
 
 def remarks(report: Contents, scene: Scene, goals: Sequence[Goal], irradiances: Sequence[np.ndarray]) -> list[Remark]:
-    """Remarks on a report, by the irradiance on each target, of its picture's sum; the most important first."""
+    """Return the remarks on a report, the most important first.
+
+    irradiances: one per goal, normalised to the sum of its picture.
+    """
     allowed = DEFAULT_RRMSD_LIMIT if report.rrmsd_asked is None else report.rrmsd_asked
     pairs = list(zip(goals, irradiances, strict=True))
     return written(
@@ -378,26 +382,26 @@ def remarks(report: Contents, scene: Scene, goals: Sequence[Goal], irradiances: 
 
 
 def too_steep(found: Steepness) -> list[str]:
-    """The light that would need a steeper face than a height over a plane carries; nothing if hardly any does."""
+    """Return the remark on light that needs a steeper face than a height z(x, y) can have; empty if negligible."""
     sent = {"steep_share": found.share, "steepest_deg": found.steepest}
     return [remark.text for remark in written("remarks.txt.j2", "steep", sent=sent)]
 
 
 def bounds(found: Mapping[str, Any] | None) -> str:
-    """The bounds on faces ([lens] tool_radius, max_slope, thicknesses), and which are met where."""
+    """Return a sentence on the bounds on faces ([lens] tool_radius, max_slope, thicknesses) and where they are met."""
     return "".join(paragraphs("remarks.txt.j2", "bounds", found=found))
 
 
-# --- from and to a file -----------------------------------------------------------------------------------------------
+# --- files ------------------------------------------------------------------------------------------------------------
 
 
 def read(path: Path) -> Contents:
-    """The record of a report.json; ValueError, a sentence, if there is none, or it is damaged or of another program."""
-    return read_as(Contents, path, "bstcad verify writes it anew")
+    """Read a report.json; ValueError, one sentence, if it is missing, damaged or by another program."""
+    return read_as(Contents, path, "run bstcad verify to write it again")
 
 
 def making(path: Path) -> Making:
-    """The making of the lens of a report.json; an empty one if the file is gone or damaged."""
+    """Read the course of the design from a report.json; an empty record if the file is missing or damaged."""
     try:
         return read(path).making
     except ValueError:
@@ -405,30 +409,30 @@ def making(path: Path) -> Making:
 
 
 def read_as(kind: type[Record], path: Path, remedy: str) -> Record:
-    """The record of this kind in a JSON file; ValueError, one sentence."""
+    """Read a record of this kind from a JSON file; ValueError, one sentence, if it is not valid."""
     try:
-        return of_json(files.contents(path, LARGEST), kind)
+        return of_json(files.contents(path, MAX_REPORT_BYTES), kind)
     except ValueError as error:
         raise ValueError(f"{path}: cannot be read ({error}); {remedy}") from None
 
 
 def of_json(data: bytes | str, kind: type[Record] = Contents) -> Record:
-    """The record of this kind in JSON; ValueError names the first entry that does not fit."""
+    """Parse a record of this kind from JSON; ValueError names the first entry that is not valid."""
     try:
-        found = _adapter(kind).validate_json(_renewed(data))
+        found = _adapter(kind).validate_json(_upgraded(data))
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False, include_context=False)[0]
         raise ValueError(": ".join(filter(None, (".".join(map(str, first["loc"])), first["msg"])))) from None
-    if not _legible(plain(found)):
-        raise ValueError("it holds text that is no line of a report")
+    if not _is_printable(plain(found)):
+        raise ValueError("it contains text that is too long or not printable")
     return found
 
 
-def _renewed(data: bytes | str) -> bytes | str:
-    """A report.json or tolerance.json with the keys of today.
+def _upgraded(data: bytes | str) -> bytes | str:
+    """Return a report.json or tolerance.json of an earlier version with the present keys.
 
-    One of before may have estimates of what limits the design, may tell the first of several targets apart, and has z
-    for the places of targets.
+    An earlier file may have a key `limits`, may keep the first of several targets separately, and has z instead of
+    `where` as the position of a target.
     """
     try:
         facts = from_json(data)
@@ -442,16 +446,16 @@ def _renewed(data: bytes | str) -> bytes | str:
         prescribed["targets"] = [prescribed.pop("target"), *prescribed.pop("further_targets", ())]
         place = LevelPlane(prescribed["targets"][0]["z"]).where()
         alone = {"key": "target", "where": place, "weight": 1.0} | {
-            name: facts.get(key) for key, name in OF_WORST.items()
+            name: facts.get(key) for key, name in WORST_GOAL_KEYS.items()
         }
         goals = facts["goals"] = facts.pop("targets", [alone])
         stated = goals[worst(goal["rrmsd"] for goal in goals)]
-        facts |= {key: stated[name] for key, name in OF_WORST.items()}
+        facts |= {key: stated[name] for key, name in WORST_GOAL_KEYS.items()}
         if measured:
             predicted = {key: measured.get(key) for key in ("rrmsd_predicted", "rrmsd_high")}
             measured["goals"] = measured.pop("targets", [{"key": "target"} | predicted])
         return to_json(facts)
-    except (AttributeError, KeyError, TypeError, ValueError):  # no report: that is for the caller to say
+    except (AttributeError, KeyError, TypeError, ValueError):  # not a report: the caller reports the error
         return data
 
 
@@ -460,28 +464,31 @@ def _adapter(kind: type[Record]) -> TypeAdapter[Record]:
     return TypeAdapter(kind)
 
 
-def _legible(value: Any) -> bool:
-    """Is every string in it short and printable, so that it steers no terminal?  A scene's own text may have lines."""
+def _is_printable(value: Any) -> bool:
+    """Return True if every string is short and printable, so that it cannot control a terminal.
+
+    The prescription is exempt, since text in a scene may have several lines.
+    """
     if isinstance(value, str):
-        return len(value) <= LONGEST and value.isprintable()
+        return len(value) <= MAX_STRING_LENGTH and value.isprintable()
     if isinstance(value, dict):
-        return all(_legible(key) and (key == "prescription" or _legible(part)) for key, part in value.items())
-    return not isinstance(value, list) or all(map(_legible, value))
+        return all(_is_printable(key) and (key == "prescription" or _is_printable(part)) for key, part in value.items())
+    return not isinstance(value, list) or all(map(_is_printable, value))
 
 
 def plain(value: Any) -> Any:
-    """A record as dicts, lists, text, bools, ints, floats and None."""
+    """Return a record as dicts, lists, strings, bools, ints, floats and None."""
     return to_jsonable_python(value, fallback=lambda numbers: numbers.tolist(), inf_nan_mode="constants")
 
 
 def write_json(report: Contents, path: str | Path) -> None:
-    """Write report.json: one record a line, numbers to 12 digits; ValueError names a number that is not finite."""
+    """Write report.json: one record per line, numbers with 12 digits; ValueError names a number that is not finite."""
     lines = ",\n".join(f"  {_line(key)}: {_block(_rounded(value, key))}" for key, value in report.facts().items())
     files.put(Path(path), f"{{\n{lines}\n}}\n".encode())
 
 
 def _rounded(value: Any, where: str) -> Any:
-    """Floats to DIGITS, but for the prescription, which keeps the designed numbers; `where`: in the report."""
+    """Round floats to DIGITS, except in the prescription, which keeps designed numbers.  where: key in the report."""
     if isinstance(value, dict):
         return {key: _rounded(part, f"{where}.{key}") for key, part in value.items()}
     if isinstance(value, list):
@@ -489,7 +496,7 @@ def _rounded(value: Any, where: str) -> Any:
     if not isinstance(value, float):
         return value
     if not math.isfinite(value):
-        remedy = "a report holds finite numbers, and null for what was not measured"
+        remedy = "a report needs finite numbers, or null for a value that was not measured"
         raise ValueError(f"report: {where!r} is {value}; {remedy}")
     return value if where.startswith("prescription.") else float(f"{value:.{DIGITS}g}")
 
@@ -499,7 +506,7 @@ def _line(value: Any) -> str:
 
 
 def _block(value: Any) -> str:
-    """JSON of a top-level value: a line for each entry of a dict and for each record of a list."""
+    """Return JSON of a top-level value: one line per entry of a dict and per record of a list."""
     if isinstance(value, dict) and value:
         return "{\n" + ",\n".join(f"    {_line(key)}: {_line(part)}" for key, part in value.items()) + "\n  }"
     if isinstance(value, list) and value and isinstance(value[0], dict):
@@ -512,32 +519,32 @@ def _block(value: Any) -> str:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Report:
-    """The worth of a design's files, traced through the geometry re-read from lens.step.
+    """Result of a verification, traced through the geometry read back from lens.step.
 
     Every key of report.json is an attribute, such as `rrmsd`, `checks` or `flux` (fields of Contents); `facts` are all
     of them as plain values.
     """
 
     contents: Contents
-    irradiances: tuple[np.ndarray, ...]  # on each target (rows, columns), row 0 = y max, with the target's sum
-    # the made part that this verification was given: facts, outliers (n, 3), irradiances as predicted, and deviation,
-    # whose x, y and form (rows y, columns x; mm, + out of the glass, NaN outside) are the deviation map; None: none
+    irradiances: tuple[np.ndarray, ...]  # irradiance on each target (rows, columns), row 0 = y max, the target's sum
+    # made part of this verification: facts, outliers (n, 3), predicted irradiances, and the deviation map with x, y and
+    # form (rows y, columns x; mm, + out of the glass, NaN outside); None: there is none
     measured: Any = None
-    notes: tuple[str, ...] = ()  # sentences on the exported files, which stand in their sidecars, too
+    notes: tuple[str, ...] = ()  # sentences on the exported files, also in their sidecar files
 
     @property
     def irradiance(self) -> np.ndarray:
-        """On the target with the largest RRMSD."""
+        """Irradiance on the target with the largest RRMSD (rows, columns)."""
         return self.irradiances[worst(goal.rrmsd for goal in self.contents.goals)]
 
     @property
     def facts(self) -> dict[str, Any]:
-        """All of report.json."""
+        """Entries of report.json as plain values."""
         return self.contents.facts()
 
     def __getattr__(self, key: str) -> Any:
-        """A field of the record."""
-        if key.startswith("_") or key == "contents":  # which copying and unpickling ask for too early
+        """Return a field of the record."""
+        if key.startswith("_") or key == "contents":  # copying and unpickling request these before they exist
             raise AttributeError(key)
         return getattr(self.contents, key)
 
@@ -545,7 +552,7 @@ class Report:
         return sorted({*super().__dir__(), *vars(self.contents)})
 
     def __repr__(self) -> str:
-        """The verdict and the two figures that matter most; then each remark and each check that failed."""
+        """Return the verdict, RRMSD and light on the target; then each failed check and each remark."""
         failed = (check for check in self.checks if not check.passed)
         return "\n  ".join(
             [
@@ -558,17 +565,17 @@ class Report:
 
 
 def rrmsds(report: Contents) -> str:
-    """The RRMSD on each target, in their order."""
+    """Return the RRMSD on each target, in their order."""
     return ", ".join(number(each.rrmsd) for each in report.goals)
 
 
 def changes(entry: LeftOut) -> tuple[str, str, str]:
-    """The change of the light on the target, of RRMSD and of blur by an effect; a dash for nothing, "?": not known."""
+    """Return the change of flux on the target, of RRMSD and of blur by an effect; "—": negligible, "?": unknown."""
     flux, rrmsd, blur = entry.flux_change, entry.rrmsd_change, entry.blur_pixels
     if rrmsd is None:
         return "?", "?", "?"
     return (
-        f"{'+' if flux > 0 else '−'}{percent(min(abs(flux), 1.0))}" if abs(flux) >= NOTHING else "—",
-        number(rrmsd) if rrmsd >= NOTHING else "—",
-        f"{number(blur)} pixels" if blur >= SHARP else "—",
+        f"{'+' if flux > 0 else '−'}{percent(min(abs(flux), 1.0))}" if abs(flux) >= NEGLIGIBLE_CHANGE else "—",
+        number(rrmsd) if rrmsd >= NEGLIGIBLE_CHANGE else "—",
+        f"{number(blur)} pixels" if blur >= NEGLIGIBLE_BLUR else "—",
     )

@@ -128,7 +128,7 @@ def contents(name, **more):
         "effects": {"simulated": (), "left_out": ()}, "machine": {}, "versions": {}, "seed": 0,
     }  # fmt: skip
     known |= more
-    figures = {name: known.get(key) for key, name in record.OF_WORST.items()}
+    figures = {name: known.get(key) for key, name in record.WORST_GOAL_KEYS.items()}
     return record.Contents(name=name, **known, goals=(GoalFigures("target", "z = 500 mm", 1.0, **figures),))
 
 

@@ -28,10 +28,10 @@ WHITE = 65_000
 
 
 # What a report may say was given up, by words of its sentence.
-MISSES, SIDES, OUTSIDE = "misses the lens", "leaves through the sides", "that leaves the lens falls outside"
-LIFTED, DARK = "are lifted: ", "is left dark"
-MOVED, CHANGED = "the back was moved by", "tailoring moved the vertex of the back"
-MISSED, STEEP = "The RRMSD", "as steep as"
+MISSES, SIDES, OUTSIDE = "misses the lens", "is lost through the sides", "that leaves the lens falls outside"
+LIFTED, DARK = "are too bright: ", "is left dark"
+MOVED, CHANGED = "The back was moved by", "Tailoring moved the vertex of the back"
+MISSED, STEEP = "The RRMSD", "has slopes up to"
 CLOSE = "Some light meets the back"  # beginning of the remark on light next to total internal reflection, or past it
 # What two faces cannot do, as it is said before stage 2.
 CROSSED, IN_GLASS = (

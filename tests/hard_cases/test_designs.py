@@ -29,7 +29,7 @@ ROUGH = {
     "tailoring.transport_grid": 64,
     "tailoring.stage2_iterations": 10,
 }
-LEFT_OUT = "Left out: "
+LEFT_OUT = "Not simulated: "
 
 
 def marked(name):

@@ -229,7 +229,7 @@ def test_the_table_of_the_part_has_every_hole_at_its_place():
         "Ø2 mm at x, y = 0, −11",
     ]  # fmt: skip
     told = dict(rows)
-    assert (told["Lens cut to"], told["Flange"][:14], told["from, to"]) == ("Ø15 mm", "26 × 24.5, R3 ", "z = 0, 1.5 mm")
+    assert (told["Lens cut to"], told["Flange"][:14], told["Flange, from, to"]) == ("Ø15 mm", "26 × 24.5, R3 ", "z = 0, 1.5 mm")
 
 
 @pytest.mark.parametrize("name", MOUNTED)

@@ -225,11 +225,11 @@ def test_words_say_what_it_is():
     said = [line.dxf.text for line in found["TEXT"]]
     assert said[0] == 'lamp: A disc, "even" & <bright>'
     for words in ("RIM: %%c15, cut from %%c20", "26 x 24.5, R3, 1.5 thick", "4 x %%c2.2 on %%c26, one at 45%%d",
-                  "1 x %%c0.9, 1 x %%c1.3", "inwards by 1%%d", "bevelled by 0.2"):  # fmt: skip
+                  "1 x %%c0.9, 1 x %%c1.3", "walls: 1%%d", "edges: 0.2"):  # fmt: skip
         assert sum(words in line for line in said) == 1
     assert all(line.dxf.insert.y < -24.5 / 2 for line in found["TEXT"])  # below the part
     rim, draft, bevel = list(exports.words(Circle(10.0), Mount(draft=2.0, bevel=0.15), LABEL))[2:]
-    assert rim == "RIM: Ø20" and "by 2° from this" in draft and "by 0.15, not drawn" in bevel
+    assert rim == "RIM: Ø20" and ": 2°, inwards" in draft and "0.15, not drawn" in bevel
 
 
 def svg_of(outline, mount):

@@ -58,11 +58,11 @@ def test_what_is_not_stated_is_said_and_a_mirror_s_rear_is_no_optical_face(tmp_p
 @pytest.mark.parametrize(("z", "place"), [
     (3.0, "3 mm behind the vertex of the rear"), (0.0, "at the vertex of the rear"),
     (-2.0, "2 mm in front of the vertex of the rear"),
-    (-9.0, "4 mm before the vertex of the mirror, on the light's side"),
+    (-9.0, "4 mm in front of the vertex of the mirror, on the source's side"),
 ])  # fmt: skip
 def test_the_origin_of_a_mirror_is_seen_from_its_own_faces(z, place):
     mirror = replace(plate(Plane(z), z + 5.0), reflects=True)
-    assert order._origin(mirror, z + 5.0) == f"on the axis of the mirror (the middle of its outline), {place}"
+    assert order._origin(mirror, z + 5.0) == f"on the axis of the mirror (the centre of its outline), {place}"
 
 
 def test_a_concave_front_bounds_the_tool_and_a_part_that_could_not_be_built_is_told(tmp_path):
@@ -70,7 +70,7 @@ def test_a_concave_front_bounds_the_tool_and_a_part_that_could_not_be_built_is_t
     said = sent(scene, tmp_path)
     assert said.tool_radius == pytest.approx(1 / 0.06)  # the back bends less
     assert said.file == "lens.step" and said.unbuilt and said.origin == 0.0
-    assert ("part.step", "could not be built: the failed check says why") in order.order_rows(said)
+    assert ("part.step", "could not be built; the failed check states why") in order.order_rows(said)
 
 
 def test_a_conic_front_is_looked_at_as_far_as_its_rim():
@@ -132,8 +132,8 @@ CONCAVE = "{}, concave, radius 40 mm{}; its vertex is at z = 15 mm"
 FACTS = [
     ({}, {
         "Overall size": "24 × 16 × 5 mm (x, y, z)", "Outline": "rectangle, 24 × 16 mm",
-        "Lies at": "x = ±12, y = ±8, z = 15 to 20 mm", "Front": "plane at z = 15 mm", "Centre thickness": "5 mm",
-        "Edge thickness": "5 to 5 mm", "Volume": "1.92 cm³", "Mass": "1.92 g for each g/cm³ of density",
+        "Extent": "x = ±12, y = ±8, z = 15 to 20 mm", "Front": "plane at z = 15 mm", "Centre thickness": "5 mm",
+        "Edge thickness": "5 to 5 mm", "Volume": "1.92 cm³", "Mass": "1.92 g times the density in g/cm³",
         "Smallest radii of the back": "concave none, convex none",
     }),
     ({"front": Plane(10.0), "heights": 3 * SLOPE}, {  # a back that rises by a quarter
@@ -142,9 +142,9 @@ FACTS = [
     }),
     ({"front": Sphere(15.0, 0.02), "outline": Circle(10.0)}, {
         "Front": "sphere, convex, radius 50 mm; its vertex is at z = 15 mm", "Outline": "round, diameter 20 mm",
-        "Lies at": "x = ±10, y = ±10, z = 15 to 20 mm", "Edge thickness": "3.99 to 3.99 mm",  # 5 - 50 + √2400
+        "Extent": "x = ±10, y = ±10, z = 15 to 20 mm", "Edge thickness": "3.99 to 3.99 mm",  # 5 - 50 + √2400
     }),
-    (conic(0.0), {"Front": CONCAVE.format("sphere", ""), "Lies at": "x = ±10, y = ±10, z = 13.73 to 20 mm"}),
+    (conic(0.0), {"Front": CONCAVE.format("sphere", ""), "Extent": "x = ±10, y = ±10, z = 13.73 to 20 mm"}),
     (conic(2.0), {"Front": CONCAVE.format("ellipsoid", ", conic constant 2")}),
     (conic(-1.0), {"Front": CONCAVE.format("paraboloid", ", conic constant -1"), "Edge thickness": "6.25 to 6.25 mm"}),
     (conic(-2.25), {"Front": CONCAVE.format("hyperboloid", ", conic constant -2.25")}),
@@ -153,10 +153,10 @@ FACTS = [
         "Volume": "1.92 cm³",
     }),
     *(({"front": Plane(z), "back_z": z + 5.0}, {
-        "Origin of the file": f"on the axis of the lens (the middle of its outline), {place}",
+        "Origin of the file": f"on the axis of the lens (the centre of its outline), {place}",
     }) for z, place in (
-        (3.0, "3 mm before the vertex of the front, on the light's side"), (0.0, "at the vertex of the front"),
-        (-2.0, "in the lens, 2 mm behind the vertex of the front"), (-9.0, "4 mm behind the vertex of the back"),
+        (3.0, "3 mm in front of the vertex of the front, on the source's side"), (0.0, "at the vertex of the front"),
+        (-2.0, "inside the lens, 2 mm behind the vertex of the front"), (-9.0, "4 mm behind the vertex of the back"),
     )),
 ]  # fmt: skip
 
@@ -165,4 +165,4 @@ FACTS = [
 def test_the_facts_of_a_part(made, facts):
     found = order.part(plate(**made))
     assert {name: found[name] for name in facts} == facts
-    assert order.part(plate(), stated=1.18)["Mass"].startswith("2.266 g, by the density of 1.18 g/cm³")
+    assert order.part(plate(), stated=1.18)["Mass"].startswith("2.266 g, for the density of 1.18 g/cm³")

@@ -80,12 +80,12 @@ SAID = [  # changes of the facts, of the scene; the remarks in their order, and 
         "unreachable": ["2.0 %", "70 degrees", "0.1."]}),
     # 0.03 is stated and 0.1 allowed: an effect of 0.031 makes √(0.03² + 0.031²) of it
     (effects(left_out("fresnel", 0.031, by='[[effects]] kind = "fresnel"'), left_out("absorption", 0.029)), {}, {
-        "left-out": ["Fresnel reflection", "0.031", "stated 0.03", '[[effects]] kind = "fresnel"']}),
+        "left-out": ["Fresnel reflection", "0.031", " 0.03.", '[[effects]] kind = "fresnel"']}),
     (effects(left_out("fresnel", 0.11), rrmsd=0.2, rrmsd_asked=0.1), {}, {
-        "rrmsd": ["0.2"], "left-out": ["0.11", "0.1 that is allowed"]}),
+        "rrmsd": ["0.2"], "left-out": ["0.11", " 0.1."]}),
     (effects(left_out("fresnel", 0.09), rrmsd=0.2, rrmsd_asked=0.1), {}, {"rrmsd": ["0.2"]}),
     (effects(ASSUMED), {}, {"source-size": [
-        "a cone of 0.1 degrees, which the scene does not state", "0.06", "stated 0.03", "source.divergence in",
+        "a cone of 0.1 degrees, which the scene does not state", "0.06", " 0.03.", "source.divergence in",
         "source.real_divergence"]}),
     (effects(replace(ASSUMED, rrmsd_change=0.006, assumed=False)), {}, {}),
     (BLURRED | {"rrmsd": 0.5}, {}, {"rrmsd": ["0.5"], "source-too-large": [

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from bstcad.report import report as reports
 from bstcad.report import units
-from bstcad.report.record import OF_WORST, of_json
+from bstcad.report.record import WORST_GOAL_KEYS, of_json
 from bstcad.verify.verdict import Check
 
 PICTURES = (
@@ -65,7 +65,7 @@ SHAPE = {"centre_thickness": 12.0, "thickness_min": 5.8, "radius_min_concave": 8
 
 def contents(report):
     """Return the record of a report; the figures of its one goal are those of the whole."""
-    figures = {name: report[key] for key, name in OF_WORST.items() if key in report}
+    figures = {name: report[key] for key, name in WORST_GOAL_KEYS.items() if key in report}
     return of_json(json.dumps(report | {"goals": [goal | figures for goal in report["goals"]]}))
 
 
@@ -94,19 +94,19 @@ def printed(report, verbose=False):
 CURVE = {"last_tenth_seconds": 4.0, "last_tenth": 0.4, "halving": None, "power": 0.01}
 GONE = {"on target": 0.338, "off target": 0.008, "missed the lens": 0.469, "lost through the sides": 0.185}
 SAID = [  # changes of REPORT: words of the page; do they stand on the terminal, too?
-    ({"rrmsd_asked": None}, "No RRMSD was asked (accept.rrmsd): the verdict does not judge it.", True),
-    ({"rrmsd": 0.0099}, "not resolved: standard error 0.002", True),  # less than five standard errors
-    ({"flux": GONE}, "missed the lens 46.9 %, sides 18.5 %, beside the target 0.80 %", True),
+    ({"rrmsd_asked": None}, "(accept.rrmsd), so the verdict does not judge it.", True),
+    ({"rrmsd": 0.0099}, "; not resolved: the standard error 0.002", True),  # less than five standard errors
+    ({"flux": GONE}, "missed the lens 46.9 %, lost through the sides 18.5 %, beside the target 0.80 %", True),
     ({"leak": 0.012, "contrast": 85.0}, "lit pixels are 85 times as bright", True),
-    ({"finest_detail": DETAIL}, "0.53 degrees; with the target 250 mm instead of 600 mm from the lens: 2.4 mm", True),
+    ({"finest_detail": DETAIL}, "0.53 degrees); it would be 2.4 mm with the target 250 mm instead of 600 mm from the lens", True),
     ({"finest_detail": DETAIL | ALONE | {"assumed": True}}, "0.53 degrees, which the scene does not state", True),
-    ({"finest_detail": DETAIL | {"source_image": 0.1}}, "by the pixels; the source's image is 0.1 mm wide (so", True),
+    ({"finest_detail": DETAIL | {"source_image": 0.1}}, "by the pixels; the image of the source is 0.1 mm wide (so", True),
     ({"shape": SHAPE}, "smallest convex radius none", True),
     ({"prescription": {"outline": {"radius": 7.5, "shape": "circle"}}}, "Ø 15 mm", True),
     ({"title": "[red]Letters[/red]"}, "[red]Letters[/red]", True),
     ({"blur": {"width": 50.2, "pixels": 6.03, "rrmsd": 0.114}}, "50.2 mm or 6.03 pixels wide", False),
     ({"machine": {"device": "NVIDIA X"}}, "a GPU adds up in no fixed order", False),
-    ({"convergence": CURVE | {"halving": 5.66}}, "about 5.7 times the evaluations' time", False),
+    ({"convergence": CURVE | {"halving": 5.66}}, "about 5.7 times the time of the evaluations", False),
     ({"picture": ["target.image: the first", "target.fit: cropped"]}, "image: the first; target.fit: cropped.", False),
 ]
 
@@ -154,7 +154,7 @@ class TestHtml:
         checks = [REPORT["checks"][0] | {"limit": None}, *REPORT["checks"][1:]]
         report = REPORT | {"verdict": "no limit was asked", "rrmsd_asked": None, "checks": checks}
         first, second, *_ = printed(report).splitlines()
-        assert first == "NO LIMIT WAS ASKED: Letters" and second.startswith("Remark: No limit on the light was asked")
+        assert first == "NO LIMIT WAS ASKED: Letters" and second.startswith("Remark: The scene sets no limit on the light")
         page = page_of(tmp_path, report)
         assert '<div class="verdict plain"><strong>? NO LIMIT WAS ASKED' in page and "PASSED" not in page
         suite = etree.fromstring(reports.junit(contents(report)))[0]
@@ -215,13 +215,13 @@ class TestSummary:
         assert (verdict, remark) == ("FAILED: Letters", "Remark: The lens is thick. [remark-vertex-moved]")
         assert failed == "FAIL [/] thinnest place (at [red](1, 2) mm): 0.7 mm, limit ≥ 1 mm"
         assert explained.startswith("bstcad docs NAME") and passed.startswith("2 checks passed")
-        assert any(line.startswith("RRMSD, re-read STEP") for line in figures)
+        assert any(line.startswith("RRMSD against the target") for line in figures)
 
     def test_terminal_and_page_show_the_same_first_figures(self, tmp_path):
         outline = {"width": 16.0, "height": 12.5, "shape": "rectangle"}
         report = REPORT | {"shape": SHAPE, "prescription": {"outline": outline}}
         rows = reports.first_figures(contents(report))
-        assert ("Size of the lens", "16 × 12.5 mm", "12 mm thick at the centre, thinnest place 5.8 mm") in rows
+        assert ("Size of the lens", "16 × 12.5 mm", "thickness 12 mm at the centre, minimum 5.8 mm") in rows
         text, page = printed(report), page_of(tmp_path, report)
         assert len(rows) == 5 and len(text.splitlines()) == 7  # the verdict before them, the number of checks after
         for name, value, remark in rows:
@@ -270,7 +270,7 @@ def test_each_check_of_a_written_design_is_a_case(small_design):
 
 
 @pytest.mark.parametrize(("value", "words"), [
-    (0.7, "0.7 mm where ≥ 1 mm was asked"), (None, "could not be measured where 1 mm was asked"),
+    (0.7, "0.7 mm, limit ≥ 1 mm"), (None, "could not be measured, limit 1 mm"),
 ])  # fmt: skip
 def test_a_failure_says_what_was_found_and_what_was_asked(value, words):
     report = failing()

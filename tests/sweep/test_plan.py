@@ -140,13 +140,13 @@ def blurred(rrmsd):
 
 
 VERDICTS = [
-    (0.1, predicted(0.02, 0.03, 0.04), "within", "An RRMSD of about 0.03 in about 30 s, in standard qualit"),
-    (0.1, predicted(0.08, 0.12, 0.15), "open", "0.1 is allowed, and 0.08 to 0.15 may come out."),
-    (0.1, predicted(0.2, 0.3, 0.4), "beyond", "0.1 is allowed, and will hardly be reached."),
-    (None, predicted(0.02, 0.03, 0.04), "no limit", "nine of ten designs would keep [accept] rrmsd = 0.0"),
+    (0.1, predicted(0.02, 0.03, 0.04), "within", "an RRMSD of about 0.03 after about 30 s, in standard qualit"),
+    (0.1, predicted(0.08, 0.12, 0.15), "open", "the limit is 0.1, and the result will probably lie between 0.08 and 0.15."),
+    (0.1, predicted(0.2, 0.3, 0.4), "beyond", "the limit is 0.1 and will probably not be reached."),
+    (None, predicted(0.02, 0.03, 0.04), "no limit", "designs would pass with [accept] rrmsd = 0.0"),
     (0.1, {"predicted": None, "not_predicted": "too odd", "goals": [{"blur": None}]}, "not predicted", "too odd."),
-    (0.1, blurred(0.3), "blurred", "The RRMSD will be 0.15 to 0.3 whatever"),
-    (None, blurred(0.6), "blurred", "to 0.6 whatever the lens. Take"),
+    (0.1, blurred(0.3), "blurred", "The RRMSD will be 0.15 to 0.3 for any lens; the limit is 0.1."),
+    (None, blurred(0.6), "blurred", "to 0.6 for any lens. Use"),
     (0.5, blurred(0.3), None, ""),
 ]
 
@@ -169,8 +169,8 @@ def test_a_chip_that_blurs_the_picture_is_said_first(tmp_path, capsys, monkeypat
     path.write_text(scene.toml(), encoding="utf-8")
     assert cli.run(["plan", str(path)]) == 0
     out = " ".join(capsys.readouterr().out.split())
-    assert out.startswith("PLAN: The picture will be blurred: through each place of the lens")
-    assert re.search(r"throws an image of itself, [\d.]+ mm \([\d.]+ pixels\) wide on the target", out)
+    assert out.startswith("PLAN: The picture will be blurred: ")
+    assert re.search(r"an image of the source on the target, [\d.]+ mm \([\d.]+ pixels\) wide", out)
 
 
 class TestCommand:

@@ -175,8 +175,8 @@ def test_a_script_s_cut_passes_by_itself(design, tmp_path):
     assert all(check.passed for check in examined.checks)
     assert found.outline.half_extent == pytest.approx((2.5, 2.0), abs=1e-7)
     said = part(found, whole)
-    assert said["Outline"].startswith("that of the back: x = −1 to 2.5, y = −1 to 2 mm with cut corners")
-    assert said["Overall size"].startswith("3.5 × 3 × ") and said["Lies at"].startswith("x = −1 to 2.5, y = −1 to 2, z")
+    assert said["Outline"].startswith("back: x = −1 to 2.5, y = −1 to 2 mm with cut corners")
+    assert said["Overall size"].startswith("3.5 × 3 × ") and said["Extent"].startswith("x = −1 to 2.5, y = −1 to 2, z")
 
 
 def test_the_words_of_a_part_by_itself_are_those_of_the_whole(written):
@@ -191,7 +191,7 @@ def test_the_words_of_a_part_by_itself_are_those_of_the_whole(written):
     box = cadquery.Solid(solid).BoundingBox()
     size = [float(each) for each in said["Overall size"].removesuffix(" mm (x, y, z)").split(" × ")]
     assert size == pytest.approx((box.xlen, box.ylen, box.zlen), abs=1e-3) and size[0] > 17.9
-    assert said["Outline"].startswith("that of the back: rectangle, 8 × 6 mm; around it other walls")
+    assert said["Outline"].startswith("back: rectangle, 8 × 6 mm; around it are other walls")
 
 
 def test_walls_that_meet_leave_the_lens_and_say_why(design, tmp_path):

@@ -247,14 +247,14 @@ def test_the_page_and_the_terminal_show_each_target(two):
         assert f"<strong>{each.key}</strong>" in page
     assert "Maps of the front surface" in page and "Steepest slope of the front" in page
     rows = {name: value for name, value, _ in report.first_figures(two.report.contents)}
-    assert "RRMSD, re-read STEP, target[0]" in rows and "RRMSD, re-read STEP, target[1]" in rows
+    assert "RRMSD against target[0]" in rows and "RRMSD against target[1]" in rows
     assert repr(two.report).count("RRMSD 0.") == 1 and ", 0." in repr(two.report).splitlines()[0]
 
 
 def test_prescription_and_data_sheet_have_both_nets(two):
     text = (two.folder / "prescription.txt").read_text()
     assert "33 x 33" in text and "65 x 65" in text and "Both freeform faces are exact in lens.step" in text
-    assert "target[0]" in text and "target[1]" in text and "asked (lens.front.z)          8 mm" in text
+    assert "target[0]" in text and "target[1]" in text and "requested (lens.front.z)      8 mm" in text
     sheet = commands._sheet_again(two.made, two.folder)
     front, body, back, purpose = list(sheet.tables.values())[:4]
     assert [name for name, _ in front] == [name for name, _ in back]
