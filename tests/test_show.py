@@ -56,7 +56,7 @@ def test_the_picture_has_the_screen_the_lens_and_the_rays(small_design, tmp_path
         pytest.skip("this machine cannot draw in 3-D")
     pixels = np.asarray(Image.open(tmp_path / "light.png").convert("RGB")).astype(int)
     assert pixels.shape == (*rendering.WINDOW[::-1], 3)
-    right = np.arange(pixels.shape[1]) > pixels.shape[1] * rendering.SHARES[0] / sum(rendering.SHARES)
+    right = np.arange(pixels.shape[1]) > pixels.shape[1] * rendering.VIEW_WIDTHS[0] / sum(rendering.VIEW_WIDTHS)
     assert 1e-3 < ((pixels.min(axis=2) > 100) & right).mean() < 0.1  # the lit disc, through rays before it
     warm = (pixels[..., 0] - pixels[..., 2] > 60) & (pixels[..., 0] > 90)
     assert warm[:, ~right].mean() > 0.02 and warm[:, right].mean() > 0.02  # rays, in both views

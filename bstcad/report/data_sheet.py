@@ -1,6 +1,6 @@
-"""The data sheet of a part, after ISO 10110-1 and -10: drawing, tables, title block and light on one A4, as a PDF.
+"""Data sheet of a part, after ISO 10110-1 and -10: drawing, tables, title block and light on one A4 page, as PDF.
 
-data_sheet.txt.j2 holds the words of its tables.  A design drawn twice gives equal bytes: the only date is the scene's.
+data_sheet.txt.j2 has the text of the tables.  Equal designs give equal bytes: the only date is that of the scene.
 """
 
 from __future__ import annotations
@@ -31,51 +31,51 @@ from bstcad.scene.scene import Scene
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-WIDTH, HEIGHT = 297.0, 210.0  # mm, A4
-FRAME = (20.0, 10.0, 287.0, 200.0)  # left, low, right, high (ISO 5457)
-TABLE, TITLE, ASIDE = 60.5, 205.0, 226.0  # upper edge of the tables, left edge of the title block and of the light
-ROW, SMALL, HEADING = 3.57, 2.3, 2.6  # mm: a line of a table, its letters, and those of headings
-PIXELS = 256  # of a picture of the light, along its longer side at most
-SLACK = 1e-4  # of a clear aperture's size, by which rounding up may fall short
+WIDTH, HEIGHT = 297.0, 210.0  # size of the page, A4 (mm)
+FRAME = (20.0, 10.0, 287.0, 200.0)  # left, lower, right and upper edge of the frame (mm, ISO 5457)
+TABLE_TOP, TITLE_LEFT, LIGHT_LEFT = 60.5, 205.0, 226.0  # edges of tables, title block and column of the light (mm)
+ROW_HEIGHT, TABLE_FONT, HEADING_FONT = 3.57, 2.3, 2.6  # height of a table row, font sizes of rows and headings (mm)
+MAX_PIXELS = 256  # pixels along the longer side of a picture of the light
+APERTURE_TOLERANCE = 1e-4  # relative amount by which a printed clear aperture may be too small
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Sheet:
-    """All that a data sheet is drawn from."""
+    """Content of a data sheet."""
 
     scene: Scene
     designed: Lens
-    shape: Mapping[str, float | None]  # of the lens as it is cut, and the volume of lens.step
-    order: Order  # for the shop, with the file that the sheet belongs to
-    target: np.ndarray  # (rows, columns) in coordinates, one sum: of the target that comes first, which is drawn
-    irradiance: np.ndarray
+    shape: Mapping[str, float | None]  # shape of the lens inside its mount's rim, and the volume of lens.step
+    order: Order  # order for the shop, with the file that the sheet belongs to
+    target: np.ndarray  # picture of the first target (rows, columns), in coordinates
+    irradiance: np.ndarray  # irradiance on the first target (rows, columns), with the same sum
     figures: Sequence[GoalFigures]  # figures of the light on each target
-    passed: bool  # every check
-    version: str  # of the program
+    passed: bool  # True if every check passed
+    version: str  # version of the program
 
     @property
     def mount(self) -> Mount | None:
-        """Of a lens that is held in part.step."""
+        """Mount of the lens in part.step; None: there is none."""
         return self.scene.mount if self.order.file == PART else None
 
     @cached_property
     def lens(self) -> Lens:
-        """Within the rim of its mount."""
+        """Lens inside the rim of its mount."""
         return as_cut(self.designed, self.mount)
 
     @cached_property
     def record(self) -> dict[str, Any]:
-        """The prescription of the lens within the rim."""
+        """Prescription of the lens inside the rim."""
         return prescription(self.scene, self.lens, self.shape)
 
     @cached_property
     def apertures(self) -> dict[str, Outline | None]:
-        """Clear apertures that the light needs of the faces that it meets; None: all of it."""
+        """Clear apertures that the light uses, by face; None: the whole face."""
         return used(self.scene.source, self.lens)
 
     @property
     def tables(self) -> dict[str, Rows]:
-        """Its tables by their headings: front, body, back, purpose, and of a part the mount."""
+        """Tables by their headings: front, body, back, source and target, and the mount of a part."""
         return tables(
             "data_sheet.txt.j2", lens=self.record, passes=self.lens.passes, order=self.order, shape=self.shape,
             mount=self.mount, light=self.scene.source, passed=self.passed,
@@ -88,10 +88,10 @@ class Sheet:
 
 
 def _aperture(patch: Outline | None, outline: Outline) -> str:
-    """Size of a clear aperture, rounded up to three digits."""
+    """Return the size of a clear aperture in words, rounded up to three digits."""
 
     def up(value: float) -> float:
-        return float(rounded_up(value * (1 - SLACK)))
+        return float(rounded_up(value * (1 - APERTURE_TOLERANCE)))
 
     if patch is None:
         return "the whole face"
@@ -105,7 +105,7 @@ def _aperture(patch: Outline | None, outline: Outline) -> str:
 
 
 def draw(sheet: Sheet) -> bytes:
-    """The sheet as PDF."""
+    """Return the sheet as PDF."""
     import matplotlib
     from matplotlib.backends.backend_pdf import FigureCanvasPdf
 
@@ -118,36 +118,36 @@ def draw(sheet: Sheet) -> bytes:
 
 @styled
 def page(sheet: Sheet) -> Figure:
-    """The whole page, A4."""
+    """Draw the whole page."""
     from matplotlib.figure import Figure
 
     paper = Paper.of(figure := Figure(figsize=(WIDTH / 25.4, HEIGHT / 25.4), facecolor="white"))
     left, low, right, high = FRAME
     paper.line([(left, low), (right, low), (right, high), (left, high), (left, low), (right, low)], 0.7)
-    paper.line([(left, TABLE), (right, TABLE)], THICK)
-    paper.line([(TITLE, low), (TITLE, TABLE)], THICK)
-    paper.line([(ASIDE, TABLE), (ASIDE, high)], THIN)
+    paper.line([(left, TABLE_TOP), (right, TABLE_TOP)], THICK)
+    paper.line([(TITLE_LEFT, low), (TITLE_LEFT, TABLE_TOP)], THICK)
+    paper.line([(LIGHT_LEFT, TABLE_TOP), (LIGHT_LEFT, high)], THIN)
     faces = {"front": _form(sheet), "back": "freeform"}
     views = part_views.Views(
         sheet.lens, sheet.mount or Mount(), sheet.order.origin, used=sheet.apertures["back"],
         names=tuple((f"{sheet.lens.passes.name(face).capitalize()}: {form}", form) for face, form in faces.items()),
     )  # fmt: skip
-    scale = part_views.draw(paper, views, left=left, low=TABLE, right=ASIDE, high=high)
+    scale = part_views.draw(paper, views, left=left, low=TABLE_TOP, right=LIGHT_LEFT, high=high)
     *columns, purpose, mount = [*sheet.tables.items(), None][:5]
     for k, (heading, rows) in enumerate(columns):
-        _column(paper, left + k * (TITLE - left) / 3, heading, rows)
+        _column(paper, left + k * (TITLE_LEFT - left) / 3, heading, rows)
     _title_block(paper, sheet, part_views.scale_words(scale))
-    start, pitch = ASIDE + 2.4, 3.05 if mount else 3.4
-    paper.text(start, high - 5.4, purpose[0], HEADING, weight="bold")
+    start, pitch = LIGHT_LEFT + 2.4, 3.05 if mount else 3.4
+    paper.text(start, high - 5.4, purpose[0], HEADING_FONT, weight="bold")
     y = _beside(paper, purpose[1], _light(paper, sheet, high - 9.4), pitch)
     if mount:
-        paper.text(start, y - 1.9, mount[0], HEADING, weight="bold")
+        paper.text(start, y - 1.9, mount[0], HEADING_FONT, weight="bold")
         _beside(paper, mount[1], y - 6.4, pitch)
     return figure
 
 
 def _form(sheet: Sheet) -> str:
-    """The front's form in short; convex (CX) of a front whose centre lies behind it, along +z (ISO 10110-10)."""
+    """Return the form of the front in a few words; convex (CX) if its centre of curvature lies along +z."""
     front = sheet.record["front"]
     radii = {name.removeprefix("radius"): radius for name, radius in front.items() if name[:6] == "radius" and radius}
     words = [f"R{way} {abs(radius):.5g} {'CX' if radius > 0 else 'CC'}" for way, radius in radii.items()]
@@ -155,31 +155,31 @@ def _form(sheet: Sheet) -> str:
 
 
 def _column(paper: Paper, left: float, heading: str, rows: Rows) -> None:
-    """One column of the tables of ISO 10110."""
-    right, y = left + (TITLE - FRAME[0]) / 3, TABLE - 4.2
+    """Draw one column of the tables of ISO 10110."""
+    right, y = left + (TITLE_LEFT - FRAME[0]) / 3, TABLE_TOP - 4.2
     start, end = left + 1.8, right - 1.8
     if left > FRAME[0]:
-        paper.line([(left, FRAME[1]), (left, TABLE)], 0.25)
-    paper.text(start, y, heading, HEADING, room=end - start, weight="bold")
+        paper.line([(left, FRAME[1]), (left, TABLE_TOP)], 0.25)
+    paper.text(start, y, heading, HEADING_FONT, room=end - start, weight="bold")
     paper.line([(left, y - 1.7), (right, y - 1.7)])
     for k, (name, value) in enumerate(rows, start=1):
-        level = y - 1.7 - k * ROW
-        paper.text(start, level, name, SMALL, room=23.0, color=GREY)
-        paper.text(start + 23.6, level, value, SMALL, room=end - start - 23.6)
+        level = y - 1.7 - k * ROW_HEIGHT
+        paper.text(start, level, name, TABLE_FONT, room=23.0, color=GREY)
+        paper.text(start + 23.6, level, value, TABLE_FONT, room=end - start - 23.6)
 
 
 def _title_block(paper: Paper, sheet: Sheet, scale: str) -> None:
-    """Name, title, author and date (ISO 7200), scale and projection, and the STEP file that the sheet belongs to."""
-    scene, part, order, left, right = sheet.scene, sheet.scene.part, sheet.order, TITLE, FRAME[2]
+    """Draw name, title, author and date (ISO 7200), scale and projection, and the STEP file of the sheet."""
+    scene, part, order, left, right = sheet.scene, sheet.scene.part, sheet.order, TITLE_LEFT, FRAME[2]
     room = right - left - 3.6
-    paper.text(left + 1.8, TABLE - 5.6, scene.name, 4.2, room=room, weight="bold")
-    for k, line in enumerate(wrapped(scene.title or f"freeform {scene.optic}", SMALL, room, 2)):
-        paper.text(left + 1.8, TABLE - 10.2 - 3.3 * k, line, SMALL, room=room)
+    paper.text(left + 1.8, TABLE_TOP - 5.6, scene.name, 4.2, room=room, weight="bold")
+    for k, line in enumerate(wrapped(scene.title or f"freeform {scene.optic}", TABLE_FONT, room, 2)):
+        paper.text(left + 1.8, TABLE_TOP - 10.2 - 3.3 * k, line, TABLE_FONT, room=room)
     cells = (
         (("Part no.", part.number), ("Drawn by", part.author), ("Organisation", part.organisation)),
         (("Date", part.date), ("Scale", scale), ("Unit", "mm"), ("Sheet", "1/1"), ("Projection", " ")),
     )
-    level, tall = TABLE - 16.2, 9.0
+    level, tall = TABLE_TOP - 16.2, 9.0
     for row in cells:
         edges = np.linspace(left, right, len(row) + 1)
         paper.line([(left, level), (right, level)], 0.25)
@@ -202,11 +202,11 @@ def _title_block(paper: Paper, sheet: Sheet, scale: str) -> None:
 
 
 def _light(paper: Paper, sheet: Sheet, y: float) -> float:
-    """Target and irradiance below y; the y of the row below them."""
-    start, end, view = ASIDE + 2.4, FRAME[2] - 2.4, View.of(sheet.scene)
+    """Draw target and irradiance below y; return the y of the row below them (mm)."""
+    start, end, view = LIGHT_LEFT + 2.4, FRAME[2] - 2.4, View.of(sheet.scene)
     width = (end - start - 2.4) / 2
     tall = min(width * (view.y[1] - view.y[0]) / (view.x[1] - view.x[0]), 44.0)
-    target, irradiance = _few(sheet.target), _few(sheet.irradiance)
+    target, irradiance = _reduced(sheet.target), _reduced(sheet.irradiance)
     top, y = brightest(target, irradiance), y - tall
     for k, (name, values) in enumerate((("Target", target), (f"Traced through {sheet.order.file}", irradiance))):
         left = start + k * (width + 2.4)
@@ -219,20 +219,20 @@ def _light(paper: Paper, sheet: Sheet, y: float) -> float:
     return y - 9.0
 
 
-def _few(picture: np.ndarray) -> np.ndarray:
-    """The picture on at most PIXELS along its longer side, each the mean of whole pixels."""
+def _reduced(picture: np.ndarray) -> np.ndarray:
+    """Return the picture with at most MAX_PIXELS along its longer side, each the mean of a block of pixels."""
     from PIL import Image
 
-    return np.asarray(Image.fromarray(picture.astype(np.float32)).reduce(-(-max(picture.shape) // PIXELS)))
+    return np.asarray(Image.fromarray(picture.astype(np.float32)).reduce(-(-max(picture.shape) // MAX_PIXELS)))
 
 
 def _beside(paper: Paper, rows: Rows, y: float, pitch: float) -> float:
-    """Names and values beside the drawing from y downwards, as far as there is room; y of the next row."""
-    start, end = ASIDE + 2.4, FRAME[2] - 2.4
+    """Write rows beside the drawing from y downwards, as far as there is room; return the y of the next row (mm)."""
+    start, end = LIGHT_LEFT + 2.4, FRAME[2] - 2.4
     for name, value in rows:
         lines = wrapped(value, NOTES, end - start - 17.0, 3)
-        if y - pitch * len(lines) < TABLE:
-            paper.text(start, y, "The rest: see the file", NOTES, color=GREY)
+        if y - pitch * len(lines) < TABLE_TOP:
+            paper.text(start, y, "More: see the STEP file", NOTES, color=GREY)
             break
         paper.text(start, y, name, NOTES, room=16.4, color=GREY)
         for line in lines:

@@ -1,7 +1,7 @@
-"""The drawing of every figure of a report: one style, and PNG files of a bounded size.
+"""Drawing of the figures of a report: one style, and PNG files of limited size.
 
-Figures are made through matplotlib's object interface (no window, no global state) and their colours hold for
-colour-blind readers.
+Figures use the object interface of matplotlib (no window, no global state) and colours that colour-blind readers can
+distinguish.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import numpy as np
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-BLUE, VERMILION, GREEN = "#0072b2", "#d55e00", "#009e73"  # of Okabe and Ito
+BLUE, VERMILION, GREEN = "#0072b2", "#d55e00", "#009e73"  # colours of Okabe and Ito
 GREY, GLASS = "#6b6b6b", "#d6e8f2"
-DARK, LIGHT = "#14181c", "#e6eaee"  # ground and letters of a page in dark mode
+DARK, LIGHT = "#14181c", "#e6eaee"  # background and text of a page in dark mode
 STYLE: dict[str, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9.0,
@@ -43,13 +43,13 @@ STYLE: dict[str, Any] = {
     "grid.linewidth": 0.5,
 }
 DPI = 144
-MARGIN = 0.06  # inches around a picture
-HEAVIEST = 300_000  # bytes of one PNG
-FEW_COLOURS = 600  # 256 of them look the same
+MARGIN = 0.06  # margin around a picture (inches)
+MAX_PNG_BYTES = 300_000  # size of a PNG above which it is drawn with fewer pixels
+MAX_PALETTE_COLOURS = 600  # number of colours up to which a palette of 256 shows no difference
 
 
 def styled(draw: Callable[..., Any]) -> Callable[..., Any]:
-    """Run `draw` under STYLE, whatever the user's matplotlibrc says."""
+    """Run `draw` with STYLE, whatever the user's matplotlibrc states."""
 
     @functools.wraps(draw)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
@@ -62,7 +62,7 @@ def styled(draw: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def new_figure(width: float, height: float, layout: str = "constrained") -> Figure:
-    """An empty figure, width x height inches."""
+    """Return an empty figure, width x height (inches)."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout=layout, facecolor="white")
@@ -71,21 +71,21 @@ def new_figure(width: float, height: float, layout: str = "constrained") -> Figu
 
 
 def footnote(figure: Figure, text: str) -> None:
-    """A line in grey under a figure."""
+    """Write a grey line under a figure."""
     figure.supxlabel(text, x=0.01, ha="left", fontsize=8, color=GREY)
 
 
 @styled
 def png(figure: Figure, ground: str = "#ffffff") -> bytes:
-    """The figure as PNG bytes on its ground, margins trimmed; drawn coarser where it would exceed HEAVIEST."""
+    """Return the figure as PNG bytes without margins; with fewer pixels if it would exceed MAX_PNG_BYTES."""
     picture = _encode(figure, DPI, ground)
-    if len(picture) > HEAVIEST:
-        picture = _encode(figure, DPI * 0.95 * (HEAVIEST / len(picture)) ** 0.5, ground)
+    if len(picture) > MAX_PNG_BYTES:
+        picture = _encode(figure, DPI * 0.95 * (MAX_PNG_BYTES / len(picture)) ** 0.5, ground)
     return picture
 
 
 def darkened(figure: Figure) -> Figure:
-    """Return the figure with light letters and axes on a dark ground; its pictures stay as they are."""
+    """Change the figure to light text and axes on a dark background, with the same pictures, and return it."""
     from matplotlib.text import Text
 
     figure.set_facecolor(DARK)
@@ -100,32 +100,32 @@ def darkened(figure: Figure) -> Figure:
 
 
 def _encode(figure: Figure, dpi: float, ground: str) -> bytes:
-    """PNG bytes at `dpi` without alpha; with a palette where so few colours occur that it cannot be told apart."""
+    """Return PNG bytes at `dpi` without alpha, with a palette if the figure has at most MAX_PALETTE_COLOURS colours."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image, ImageChops, ImageOps
 
     figure.set_dpi(dpi)
     canvas = FigureCanvasAgg(figure)
-    canvas.draw()  # once: a tight box by matplotlib would draw everything twice
+    canvas.draw()  # a tight bounding box by matplotlib would draw everything twice
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     drawn = ImageChops.difference(picture, Image.new("RGB", picture.size, ground)).getbbox()
     picture = ImageOps.expand(picture.crop(drawn), round(MARGIN * dpi), ground)
     small = io.BytesIO()
-    if picture.getcolors(FEW_COLOURS) is not None:
+    if picture.getcolors(MAX_PALETTE_COLOURS) is not None:
         picture = picture.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     picture.save(small, "PNG", compress_level=6)
     return small.getvalue()
 
 
 def steps(name: str, count: int) -> Any:
-    """A colour map in `count` equal steps: the eye loses nothing, a PNG becomes a third as large."""
+    """Return a colour map in `count` equal steps: no visible loss, and PNG files a third as large."""
     import matplotlib
 
     return matplotlib.colormaps[name].resampled(count)
 
 
 def round_up(value: float) -> float:
-    """The next 1, 2 or 5 times a power of ten, so that a colour scale ends on a plain number."""
+    """Return the next 1, 2 or 5 times a power of ten, so that a colour scale ends on a plain number."""
     if value <= 0.0:
         return 1.0
     decade = 10.0 ** np.floor(np.log10(value))

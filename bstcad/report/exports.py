@@ -1,9 +1,9 @@
-"""Files of `bstcad export` and `[output] export`, by their kinds: tables, drawings of the outline, preview meshes.
+"""Files of `bstcad export` and `[output] export`, by kind: tables, drawings of the outline, preview meshes.
 
 Tables are text: the first line names the columns, lengths in mm.  Drawings show the outline of a bare lens, or the part
-that [mount] makes of it, seen from the back: x to the right, y up, mm.  Each kind of edge is closed curves on a layer
-(DXF) or in a group (SVG) of its own; centre marks and words are on others, so that a saw or a laser can leave them out.
-Draft narrows the flange upwards; its lower, wider edge is drawn.
+with its [mount], seen from the back: x to the right, y up, mm.  Each kind of edge is a set of closed curves on its own
+layer (DXF) or in its own group (SVG).  Centre marks and text are on other layers, so that a saw or a laser can omit
+them.  Draft narrows the flange upwards; the drawing shows its lower, wider edge.
 """
 
 from __future__ import annotations
@@ -23,64 +23,64 @@ from bstcad.cad.mesh import UNNAMED, Label, preview_files
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import Surface, sag
-from bstcad.report.grid_sag import FEWEST, MOST, GridSag, Throw, axes, table_note
+from bstcad.report.grid_sag import MAX_POINTS, MIN_POINTS, GridSag, Throw, axes, table_note
 from bstcad.report.units import environment, paragraphs
 from bstcad.runs import files
 from bstcad.scene.mount import Mount
 
-SIDECAR = ".txt"  # ending of a file that states how far the light moves by the interpolation of another
-SHEET = "datasheet"  # drawn by the caller, from the report beside the lens
+SIDECAR = ".txt"  # suffix of a file that states the shift of the light by the interpolation of a table
+SHEET = "datasheet"  # kind of export that the caller draws, from the report beside the lens
 
 OUTLINE, RIM, FLANGE, SCREWS, HOLES = "OUTLINE", "RIM", "FLANGE", "SCREW_HOLES", "HOLES"
 CENTRES, TEXT = "CENTRES", "TEXT"
-BEYOND = 1.5  # mm by which a centre mark exceeds its edge
-MARGIN = 3.0  # mm around the drawing in the SVG
-EDGE, THIN = 0.25, 0.13  # mm, widths of lines (ISO 128)
-CHAIN = (4.0, 0.8, 0.4, 0.8)  # mm of line, gap, dot, gap of a centre line
-LETTER = 1.8  # mm, height of a capital (ISO 3098)
-FONT = LETTER / 0.72  # mm, of a font with such capitals
-COLUMNS = 60  # characters in a line of words
-ADVANCE = 0.56 * FONT  # mm, mean width of a letter at most
-QUARTER_TURN = math.tan(math.pi / 8)  # bulge of an arc of 90 degrees: tan of a quarter of its angle
+OVERSHOOT = 1.5  # length of a centre mark outside its edge (mm)
+MARGIN = 3.0  # margin around the drawing in the SVG (mm)
+EDGE, THIN = 0.25, 0.13  # widths of lines (mm, ISO 128)
+CHAIN = (4.0, 0.8, 0.4, 0.8)  # lengths of dash, gap, dot and gap of a centre line (mm)
+CAPITAL_HEIGHT = 1.8  # height of a capital (mm, ISO 3098)
+FONT_SIZE = CAPITAL_HEIGHT / 0.72  # font size with such capitals (mm)
+MAX_LINE_LENGTH = 60  # characters per line of text
+LETTER_WIDTH = 0.56 * FONT_SIZE  # upper bound of the mean width of a letter (mm)
+QUARTER_TURN_BULGE = math.tan(math.pi / 8)  # bulge of an arc of 90 degrees: tan of a quarter of its angle
 EDGES = {"fill": "none", "stroke": "black", "stroke-width": f"{EDGE:g}"}
-STYLES = {  # of the groups in the SVG but those of edges
+STYLES = {  # attributes of the groups in the SVG, except those of edges
     CENTRES: {
         "fill": "none", "stroke": "#c00000", "stroke-width": f"{THIN:g}",
         "stroke-dasharray": " ".join(f"{part:g}" for part in CHAIN),
     },
-    TEXT: {"font-family": "Helvetica, Arial, sans-serif", "font-size": f"{FONT:g}"},
+    TEXT: {"font-family": "Helvetica, Arial, sans-serif", "font-size": f"{FONT_SIZE:g}"},
 }  # fmt: skip
-DXF_SIGNS = str.maketrans({"Ø": "%%c", "°": "%%d", "×": "x"})  # which every font of a CAD system has
+DXF_SIGNS = str.maketrans({"Ø": "%%c", "°": "%%d", "×": "x"})  # replacements that every font of a CAD system has
 
-# Layer; kind; numbers (mm) of a circle (x, y, radius), of a box about the axis (half width, half height, radius of its
-# corners) and of a line (both ends), or a text (x, y, line).
+# (layer, kind, numbers): numbers (mm) are x, y, radius of a circle; half width, half height and corner radius of a box
+# around the axis; both ends of a line; or x, y and the string of a text.
 Piece = tuple[str, str, tuple[Any, ...]]
 
 
 @dataclass(frozen=True)
 class Exported:
-    """Files that were written."""
+    """Written files."""
 
     paths: list[Path]
-    notes: list[str]  # sentences on grids and tables: how far the light moves by their interpolation
+    notes: list[str]  # sentences on the shift of the light by the interpolation of grids and tables
 
 
 def export(
     lens: Lens, kinds: Sequence[str], folder: Path, points: int | None = None, label: Label = UNNAMED,
     mount: Mount | None = None, throw: Throw | None = None,
 ) -> Exported:  # fmt: skip
-    """Write the files of these kinds, but SHEET, to the folder, each whole or not at all.
+    """Write the files of these kinds, except SHEET, to the folder, each completely or not at all.
 
-    points: along the wider side of grids, by default as many as the net of the back has, and for OpticStudio the knots
-    of the net; label: name of meshes and of a part; mount: drawings show the part that it makes; None: the lens's
-    outline; throw: the light by which grids and tables are judged; None: they are not.
-    ValueError names the kind or number that is not possible.
+    points: points along the wider side of grids; by default the number of control points of the back, and for
+    OpticStudio the knots of the net.  label: name of meshes and of a part.  mount: mount of the part in drawings; None:
+    drawings show the outline of the lens.  throw: light that measures the error of grids and tables; None: no
+    measurement.  ValueError names a kind or number that is not possible.
     """
     for kind in kinds:
         if kind not in files.EXPORTS:
-            raise ValueError(f"'{kind}' is nothing that can be exported; give one of {', '.join(files.EXPORTS)}")
-    if points is not None and not FEWEST <= points <= MOST:
-        raise ValueError(f"{points} points a side are not possible; give {FEWEST} to {MOST}")
+            raise ValueError(f"'{kind}' cannot be exported; give one of {', '.join(files.EXPORTS)}")
+    if points is not None and not MIN_POINTS <= points <= MAX_POINTS:
+        raise ValueError(f"{points} points per side are not possible; give {MIN_POINTS} to {MAX_POINTS}")
     lens, written, notes = lens.plain(), [], []
     for kind in dict.fromkeys(kinds):
         for name, data in _files(kind, lens, points, label=label, mount=mount, throw=throw):
@@ -94,17 +94,17 @@ def export(
 def _files(
     kind: str, lens: Lens, points: int | None, *, label: Label, mount: Mount | None, throw: Throw | None
 ) -> Iterator[tuple[str, str | bytes]]:  # fmt: skip
-    """(name, data) of each file of a kind."""
-    count = min(max(lens.back.shape), MOST) if points is None else points
+    """Yield (name, data) of each file of a kind."""
+    count = min(max(lens.back.shape), MAX_POINTS) if points is None else points
     match kind:
         case "sag":
             yield "sag.csv", sag_table(lens, count)
-            yield from _said("sag", lens, count, throw)
+            yield from _sidecar("sag", lens, count, throw)
         case "points":
             yield "points-front.csv", points_table(lens, lens.front, count)
             yield "points-back.csv", points_table(lens, lens.back, count)
-            yield from _said("points", lens, count, throw)
-        case "zemax":  # of a front that is no net prescription.txt has the numbers
+            yield from _sidecar("points", lens, count, throw)
+        case "zemax":  # for a front that is not a net, prescription.txt has the numbers
             for name, face in (("zemax-back", lens.back), ("zemax-front", lens.front)):
                 if face.is_net:
                     grid = GridSag.of(lens, face, points, throw)
@@ -126,13 +126,13 @@ def _files(
 
 
 def sag_table(lens: Lens, points: int) -> str:
-    """CSV of both faces at the same points inside the outline: x, y, z of the front, z of the back."""
+    """Return a CSV table of both faces at the same points inside the outline: x, y, z of the front, z of the back."""
     x, y = _inside(lens, points)
     return _csv(x_mm=x, y_mm=y, front_z_mm=sag(lens.front, x, y), back_z_mm=sag(lens.back, x, y))
 
 
 def points_table(lens: Lens, face: Surface, points: int) -> str:
-    """CSV of points of a face inside the outline with its unit normals, which point out of the lens."""
+    """Return a CSV table of points of a face inside the outline with unit normals, which point out of the lens."""
     x, y = _inside(lens, points)
     z, z_x, z_y = (t.numpy() for t in face.plain().sag_and_slope(torch.from_numpy(x), torch.from_numpy(y)))
     length = np.sqrt(1 + z_x * z_x + z_y * z_y) * (1.0 if face is lens.back else -1.0)
@@ -140,25 +140,26 @@ def points_table(lens: Lens, face: Surface, points: int) -> str:
 
 
 def turning_cloud(lens: Lens, points: int, face: Surface | None = None) -> str:
-    """CSV for diamond turning with a slow tool: radius, angle from +x towards +y, height of a face over its vertex.
+    """Return a CSV table for slow-tool diamond turning: radius, angle from +x towards +y, height over the vertex.
 
-    face: None is the back.  Heights are along +z, so that those of the front count into the glass.
+    face: None is the back.  Heights are along +z, which for the front is into the glass.
 
-    Rings of equal spacing, `points` from the axis to the farthest point of the outline, each with as many angles as
-    the outermost ring needs for that spacing; points outside the outline are left out.  The tool's radius is not in it.
+    There are `points` rings of equal spacing from the axis to the farthest point of the outline.  Each ring has the
+    number of angles that the outermost ring needs for the same spacing.  Points outside the outline are omitted.  The
+    table has no compensation of the tool's radius.
     """
     ring = np.linspace(0.0, float(np.hypot(*lens.outline.farthest)), points)
     count = round(2 * np.pi * (points - 1))
     radius, angle = (p.ravel() for p in np.meshgrid(ring, np.arange(count) * 360.0 / count, indexing="ij"))
     x, y = radius * np.cos(np.radians(angle)), radius * np.sin(np.radians(angle))
-    inside = lens.outline.contains(*(torch.from_numpy(p * (1 - 1e-12)) for p in (x, y))).numpy()  # and on its rim
+    inside = lens.outline.contains(*(torch.from_numpy(p * (1 - 1e-12)) for p in (x, y))).numpy()  # or on the rim
     face = face or lens.back
     height = sag(face, x[inside], y[inside]) - sag(face, 0.0, 0.0)
     return _csv(radius_mm=radius[inside], angle_deg=angle[inside], sag_mm=height)
 
 
-def _said(name: str, lens: Lens, points: int, throw: Throw | None) -> Iterator[tuple[str, str]]:
-    """(name, text) of the sidecar of a table of sags, for each face that is a net."""
+def _sidecar(name: str, lens: Lens, points: int, throw: Throw | None) -> Iterator[tuple[str, str]]:
+    """Yield (name, text) of the sidecar of a table of sags, with a sentence for each face that is a net."""
     sentences = []
     for side, face in (("front", lens.front), ("back", lens.back)):
         if throw is not None and face.is_net:
@@ -169,7 +170,7 @@ def _said(name: str, lens: Lens, points: int, throw: Throw | None) -> Iterator[t
 
 
 def _inside(lens: Lens, points: int) -> tuple[np.ndarray, np.ndarray]:
-    """x and y (mm) of the points of a grid that lie inside the outline."""
+    """Return x and y (mm) of the points of a grid inside the outline."""
     x, y = (p.ravel() for p in np.meshgrid(*axes(lens.outline, points), indexing="ij"))
     inside = lens.outline.contains(torch.from_numpy(x), torch.from_numpy(y)).numpy()
     return x[inside], y[inside]
@@ -186,7 +187,7 @@ def _csv(**columns: np.ndarray) -> str:
 
 
 def drawing(outline: Outline, mount: Mount | None, label: Label) -> list[Piece]:
-    """A lens of that outline in its mount with marks and words; mount None: the outline alone."""
+    """Return the pieces of a drawing: lens and mount with centre marks and text; mount None: only the outline."""
     if mount is None:
         return [_edge(OUTLINE, outline)]
     rim, flange = mount.rim_of(outline).outline, mount.flange
@@ -197,32 +198,33 @@ def drawing(outline: Outline, mount: Mount | None, label: Label) -> list[Piece]:
             edges += [(layer, Circle(d / 2), _plain(x), _plain(y)) for x, y, d in holes]
     pieces = [_edge(*edge) for edge in edges]
     for _, shape, x, y in edges[flange is not None :]:
-        a, b = (half + BEYOND for half in shape.half_extent)
+        a, b = (half + OVERSHOOT for half in shape.half_extent)
         pieces += [(CENTRES, "line", (x - a, y, x + a, y)), (CENTRES, "line", (x, y - b, x, y + b))]
     if radius := pitch_radius(mount):
         pieces.append((CENTRES, "circle", (0.0, 0.0, radius)))
     a, b = edges[flange is not None][1].half_extent
-    lines = [part for line in words(outline, mount, label) for part in textwrap.wrap(line, COLUMNS)]
-    at = [(-a - BEYOND, -b - BEYOND - (2 + 1.5 * k) * FONT) for k in range(len(lines))]
+    lines = [part for line in words(outline, mount, label) for part in textwrap.wrap(line, MAX_LINE_LENGTH)]
+    at = [(-a - OVERSHOOT, -b - OVERSHOOT - (2 + 1.5 * k) * FONT_SIZE) for k in range(len(lines))]
     return [*pieces, *((TEXT, "text", (*place, line)) for place, line in zip(at, lines, strict=True))]
 
 
 def _edge(layer: str, outline: Outline, x: float = 0.0, y: float = 0.0) -> Piece:
-    """A closed curve; only circles lie off the axis."""
+    """Return a closed curve with centre (x, y); only circles may have another centre than the axis."""
     if outline.is_round:
         return layer, "circle", (x, y, outline.radius)
     return layer, "box", (*outline.half_extent, math.sqrt(outline.limits[2]))
 
 
 def dxf(outline: Outline, mount: Mount | None = None, label: Label = UNNAMED) -> str:
-    """DXF R2010 in mm: circles, and closed polylines whose rounded corners are arcs."""
+    """Return a DXF R2010 drawing in mm: circles, and closed polylines whose rounded corners are arcs."""
     import ezdxf
 
     document, pieces = ezdxf.new("R2010", units=ezdxf.units.MM), drawing(outline, mount, label)
     document.linetypes.add("CENTER", [sum(CHAIN), *(part * (-1) ** k for k, part in enumerate(CHAIN))])
-    looks = {CENTRES: {"color": 1, "linetype": "CENTER"}}
+    attributes = {CENTRES: {"color": 1, "linetype": "CENTER"}}
     for layer in dict.fromkeys(layer for layer, _, _ in pieces):
-        document.layers.add(layer, lineweight=round(100 * (THIN if layer in STYLES else EDGE)), **looks.get(layer, {}))
+        weight = round(100 * (THIN if layer in STYLES else EDGE))
+        document.layers.add(layer, lineweight=weight, **attributes.get(layer, {}))
     space = document.modelspace()
     for layer, kind, at in pieces:
         on = {"layer": layer}
@@ -234,23 +236,23 @@ def dxf(outline: Outline, mount: Mount | None = None, label: Label = UNNAMED) ->
             case "line":
                 space.add_line(at[:2], at[2:], dxfattribs=on)
             case "text":
-                space.add_text(at[2].translate(DXF_SIGNS), height=LETTER, dxfattribs=on | {"insert": at[:2]})
+                space.add_text(at[2].translate(DXF_SIGNS), height=CAPITAL_HEIGHT, dxfattribs=on | {"insert": at[:2]})
     text = io.StringIO()
     document.write(text)
     return text.getvalue()
 
 
 def svg(outline: Outline, mount: Mount | None = None, label: Label = UNNAMED) -> str:
-    """The same drawing in true size.
+    """Return the drawing as SVG in true size.
 
-    Not by ezdxf's SVG backend, which turns circles into splines and letters into curves, rounds to a millionth of the
-    page and has no groups (ezdxf 1.4.5).
+    The SVG backend of ezdxf 1.4.5 is not used: it converts circles to splines and text to curves, rounds to a millionth
+    of the page and has no groups.
     """
     pieces = drawing(outline, mount, label)
     texts = [at for _, kind, at in pieces if kind == "text"]
     whole = outline if mount is None else (mount.flange.outline if mount.flange else mount.rim_of(outline)).outline
-    a, b = (half + MARGIN + BEYOND * (mount is not None) for half in whole.half_extent)
-    right = max([a, *(x + ADVANCE * len(line) + MARGIN for x, _, line in texts)])
+    a, b = (half + MARGIN + OVERSHOOT * (mount is not None) for half in whole.half_extent)
+    right = max([a, *(x + LETTER_WIDTH * len(line) + MARGIN for x, _, line in texts)])
     low = min([-b, *(y - MARGIN for _, y, _ in texts)])
     layers: dict[str, list[tuple[str, tuple[Any, ...]]]] = {}
     for layer, kind, at in pieces:
@@ -258,17 +260,17 @@ def svg(outline: Outline, mount: Mount | None = None, label: Label = UNNAMED) ->
     return environment().get_template("outline.svg.j2").render(
         layers=layers, left=-a, top=-b, width=right + a, height=b - low, title=texts[0][2] if texts else "",
         styles=STYLES, edges=EDGES, n=lambda value: f"{_plain(value):.15g}",
-        dash=lambda at: (CHAIN[0] - math.dist(at[:2], at[2:])) / 2 % sum(CHAIN),  # puts a dash in the middle
+        dash=lambda at: (CHAIN[0] - math.dist(at[:2], at[2:])) / 2 % sum(CHAIN),  # places a dash at the middle
     ) + "\n"  # fmt: skip
 
 
 def words(outline: Outline, mount: Mount, label: Label) -> list[str]:
-    """Sizes of the part in words."""
+    """Return the text of a drawing on the sizes of the part, one string per line."""
     return paragraphs("outline.txt.j2", "words", lens=outline, mount=mount, label=label, across=across)
 
 
 def across(outline: Outline) -> str:
-    """Ø15, or 26 × 24, R3 (mm)."""
+    """Return the size of an outline (mm), such as Ø15 or 26 × 24, R3."""
     if outline.is_round:
         return f"Ø{2 * outline.radius:.6g}"
     corner = math.sqrt(outline.limits[2])
@@ -276,7 +278,10 @@ def across(outline: Outline) -> str:
 
 
 def pitch_radius(mount: Mount) -> float | None:
-    """Radius (mm) of the circle of screws where it lies within the flange; beyond it would look like an edge."""
+    """Return the radius (mm) of the pitch circle of the screws, or None if it is not inside the flange.
+
+    Outside the flange the circle would look like an edge.
+    """
     screws = mount.flange and mount.flange.screws
     if not screws or 2 * min(mount.flange.outline.outline.half_extent) <= screws.circle:
         return None
@@ -284,8 +289,8 @@ def pitch_radius(mount: Mount) -> float | None:
 
 
 def _corners(a: float, b: float, r: float) -> list[tuple[float, float, float]]:
-    """x, y (mm) and bulge of a box's corners or of the ends of its arcs, counterclockwise from (-x, -y)."""
-    p, q, turn = a - r, b - r, QUARTER_TURN
+    """Return x, y (mm) and bulge of a box's corners or of the ends of its arcs, counterclockwise from (-x, -y)."""
+    p, q, turn = a - r, b - r, QUARTER_TURN_BULGE
     if not r:
         return [(-a, -b, 0.0), (a, -b, 0.0), (a, b, 0.0), (-a, b, 0.0)]
     return [(-p, -b, 0.0), (p, -b, turn), (a, -q, 0.0), (a, q, turn), (p, b, 0.0), (-p, b, turn), (-a, q, 0.0),
@@ -293,5 +298,5 @@ def _corners(a: float, b: float, r: float) -> list[tuple[float, float, float]]:
 
 
 def _plain(value: float) -> float:
-    """To 1e-12 mm: without the remainder of a cosine of 90 degrees, and no -0."""
+    """Round to 1e-12 mm, which removes the rounding error of cos 90° and the sign of -0."""
     return round(value, 12) + 0.0

@@ -1,4 +1,4 @@
-"""The pictures of a report, drawn by a second process while this one goes on; those of the lens, its flux and its rays.
+"""Jobs that draw the pictures of a report in a second process, and the figures of the lens, its rays and its design.
 
 Each figure is a function from plain values to a matplotlib Figure.  Maps have row 0 at y min; axes are in mm.
 """
@@ -50,22 +50,22 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-CELLS, SHOWN_CELLS = 320, 200  # of the mesh in the 3-D picture, and of a lens at work, each way
-RAYS = 28  # each way, over the light that gets through the lens
+CELLS, LIGHT_PATH_CELLS = 320, 200  # cells per axis of the mesh in the 3-D picture, and in the view with rays
+RAYS = 28  # rays per axis over the light through the lens
 MILLIONTHS = 1e6
 MAP_POINTS = 401  # samples of a surface map along each axis
-ROUNDING = 1e-6  # a map that varies less than this part of its size is flat and gets no contour lines
+ROUNDING = 1e-6  # relative variation of a map below which it is flat and has no contours
 
-Submit = Callable[..., Future]  # submit(function, *arguments): has it called by the second process
+Submit = Callable[..., Future]  # submit(function, *arguments) calls the function in the second process
 Pngs = dict[str, bytes]  # pictures by name
 
 
 class Pictures:
-    """Figures and data sheet of a scene's design, begun one by one and waited for together."""
+    """Jobs that draw the figures and the data sheet of a design; `result` waits for all of them."""
 
     def __init__(self, scene: Scene, submit: Submit) -> None:
         self._scene, self._submit = scene, submit
-        self._vtk = ThreadPoolExecutor(1)  # waits for VTK, which draws in a process of its own
+        self._vtk = ThreadPoolExecutor(1)  # waits for VTK, which draws in its own process
         self._jobs: list[Future] = []
         self._sheet: Future | None = None
 
@@ -73,34 +73,34 @@ class Pictures:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
-        if kind is not None:  # a Ctrl-C, or a fault: VTK would take seconds
+        if kind is not None:  # Ctrl-C or an error: VTK would take seconds
             rendering.stop()
         self._vtk.shutdown(cancel_futures=kind is not None)
 
     def begin(self, draw: Callable[..., Pngs], *given: Any, number: int = 0) -> None:
-        """Begin the pictures that draw(*given, view) makes; number: of the target that the view is of."""
+        """Start a job that draws draw(*given, view); number: index of the target of the view."""
         self._jobs.append(self._submit(draw, *given, View.of(self._scene, number)))
 
     def solid(self, lens: Lens) -> None:
-        """Begin the 3-D picture."""
+        """Start the job that draws the 3-D picture."""
         mesh = meshes.lens_mesh(lens, CELLS)
         self._jobs.append(self._vtk.submit(lambda: {"lens": rendering.lens_picture(mesh)}))
 
     def lens(self, lens: Lens) -> None:
-        """Begin the maps of the lens and its rays."""
+        """Start the jobs that draw the maps of the lens and its rays."""
         source, screens = self._scene.source.central, [target.screen for target in self._scene.targets]
         self.begin(draw_lens, source, lens, screens)
         for k, screen in enumerate(screens):
             self.begin(draw_transport, source, lens, screen, number=k)
 
     def sheet(self, sheet: Sheet) -> None:
-        """Begin the data sheet of a part."""
+        """Start the job that draws the data sheet of a part."""
         self._sheet = self._submit(data_sheet.draw, sheet)
 
     def result(self) -> dict[str, bytes | None]:
-        """PNG bytes by name; None for the 3-D picture on a machine that cannot draw it.
+        """Return PNG bytes by name; None for the 3-D picture if the machine cannot draw it.
 
-        A second process that died takes its pictures along: a proven lens is worth more.
+        If the second process died, its pictures are missing, since the verified lens is still valid.
         """
         pictures: dict[str, bytes | None] = {"lens": None}
         for job in self._jobs:
@@ -109,14 +109,14 @@ class Pictures:
         return pictures
 
     def data_sheet(self) -> bytes | None:
-        """PDF; None if there is none, or the process that drew it died."""
+        """Return the PDF; None if there is no data sheet, or the second process died."""
         with contextlib.suppress(BrokenExecutor):
             return None if self._sheet is None else self._sheet.result()
         return None
 
 
 class NoPictures(Pictures):
-    """No pictures, for a design whose figures are not wanted."""
+    """Figure jobs that draw nothing, for a design without figures."""
 
     def begin(self, draw: Callable[..., Pngs], *given: Any, number: int = 0) -> None:
         """Draw nothing."""
@@ -129,7 +129,7 @@ class NoPictures(Pictures):
 
 
 def draw_lens(source: Emitter, lens: Lens, screens: Sequence[Screen], view: View) -> Pngs:
-    """The pictures of the lens but the 3-D one, with its rays to the screens; the front's surface if it is tailored."""
+    """Return the pictures of the lens except the 3-D one: maps of each tailored face, and the rays to the screens."""
     farthest = max(screens, key=lambda screen: screen.plane.throw(0.0))
     of_front = {}
     if lens.shapes("front"):
@@ -142,12 +142,12 @@ def draw_lens(source: Emitter, lens: Lens, screens: Sequence[Screen], view: View
 
 
 def draw_transport(source: Emitter, lens: Lens, screen: Screen, view: View) -> Pngs:
-    """The map of the light from the source to a screen."""
+    """Return the picture of the map from the source to a screen."""
     return {numbered("transport", view.number): png(transport_map(*ray_map(source, lens, screen.plane), view))}
 
 
 def draw_light(target: np.ndarray, light: Light, lines: Sequence[SpectralLine], view: View) -> Pngs:
-    """The pictures of the light; one of the ghost and of the lines of a spectrum if there are any."""
+    """Return the pictures of the light, and if there are any, of the ghost and of the lines of a spectrum."""
     found = light.picture
     pictures = {
         "irradiance": light_figures.irradiance_triptych(target, found, view),
@@ -161,12 +161,12 @@ def draw_light(target: np.ndarray, light: Light, lines: Sequence[SpectralLine], 
 
 
 def draw_wavefront(error: WavefrontError, view: View) -> Pngs:
-    """The map of a wavefront error, which is of the lens and of no target."""
+    """Return the map of a wavefront error, which does not depend on a target."""
     return {"wavefront": png(wavefront_map(error))}
 
 
 def draw_convergence(report: Contents, view: View) -> Pngs:
-    """The convergence of a design, if it has a history."""
+    """Return the convergence curve of a design, if it has a history."""
     if not report.history:
         return {}
     return {"convergence": png(convergence(report.history, report.stages, report.rrmsd_noise))}
@@ -177,11 +177,11 @@ def draw_convergence(report: Contents, view: View) -> Pngs:
 
 @styled
 def surface_maps(lens: Lens, steepest: float, face: str = "back") -> Figure:
-    """Samples of a freeform face inside the outline: height, slope angle, mean curvature (optics.curvature.principal).
+    """Draw height, slope angle and mean curvature (optics.curvature.principal) of a freeform face inside the outline.
 
-    steepest: slope of the face (degrees), which the samples would miss.  face: "back" or "front".
+    steepest: largest slope of the face (degrees), which the samples may miss.  face: "back" or "front".
 
-    The best plane is taken off the height where it hides the rest (its PV exceeds that of the remainder).
+    The best plane is subtracted from the height if its PV exceeds that of the remainder.
     """
     x, y, sag, slope_x, slope_y = _sample(lens, getattr(lens, face))
     columns = np.stack([np.ones_like(sag), *np.meshgrid(x, y)], axis=-1)
@@ -204,7 +204,7 @@ def surface_maps(lens: Lens, steepest: float, face: str = "back") -> Figure:
     heading = f"Height{', best plane removed' if tilted else ''}: PV {scale * pv:.3g} {unit}"
     maps = (
         (scale * height, unit, heading), (slope, "degrees", f"Slope: up to {steepest:.3g}°"),
-        (bend, "1/m", "Mean curvature, + bends towards +z"),
+        (bend, "1/m", "Mean curvature (+: bends towards +z)"),
     )  # fmt: skip
     for axes, (values, label, title) in zip(panels, maps, strict=True):
         signed = axes is panels[2]
@@ -220,7 +220,7 @@ def surface_maps(lens: Lens, steepest: float, face: str = "back") -> Figure:
 
 
 def _sample(lens: Lens, face: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """x (n,), y (n,) and sag (mm), ∂z/∂x, ∂z/∂y (n, n) of a face, row 0 = y min, NaN outside the outline."""
+    """Return x (n,), y (n,) and sag (mm), ∂z/∂x, ∂z/∂y (n, n) of a face, row 0 = y min, NaN outside the outline."""
     reach_x, reach_y = lens.outline.half_extent
     x = torch.linspace(-reach_x, reach_x, MAP_POINTS, dtype=torch.float64)
     y = torch.linspace(-reach_y, reach_y, MAP_POINTS, dtype=torch.float64)
@@ -232,9 +232,9 @@ def _sample(lens: Lens, face: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 @styled
 def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> Figure:
-    """The lens cut along y = 0 with rays (n_rays, n_points, 3) in mm projected on x-z: close, and the whole path.
+    """Draw the section of the lens at y = 0 with rays (n_rays, n_points, 3) in mm projected on x-z: close, and whole.
 
-    A screen that is not level is drawn too, as its edges are seen along y, and all screens of several.
+    If there are several screens or one that is tilted, they are drawn in the same projection.
     """
     figure = new_figure(11.0, 3.4)
     close, whole = figure.subplots(1, 2, width_ratios=(1, 1.9))
@@ -255,7 +255,7 @@ def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> F
     low, high = rim_z.min(), rim_z.max()
     close.set(xlim=(low - reach * 0.5, high + reach * 0.5), ylim=(-1.25 * reach, 1.25 * reach))
     close.set(title=f"{lens.passes.optic.capitalize()}, cut along y = 0", aspect="equal")
-    whole.set_title("Whole path, source to target (axes not to one scale)")
+    whole.set_title("Whole path, source to target (axes at different scales)")
     several = len(screens) > 1
     drawn = [screen for screen in screens if several or not screen.plane.is_level]
     for screen in drawn:
@@ -270,7 +270,7 @@ def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> F
 
 @styled
 def transport_map(source: np.ndarray, image: np.ndarray, view: View) -> Figure:
-    """Lines of a regular grid (k, k, 2) on the source (mm) beside their images (k, k, 2) on the target."""
+    """Draw the lines of a regular grid (k, k, 2) on the source (mm) and their images (k, k, 2) on the target."""
     figure = new_figure(8.2, 4.1)
     level = LevelPlane(0.0).labels
     sides = (("Regular grid on the source", source, level), ("The same lines on the target", image, view.labels))
@@ -288,7 +288,7 @@ def transport_map(source: np.ndarray, image: np.ndarray, view: View) -> Figure:
 
 @styled
 def convergence(history: Sequence[Point], stages: Sequence[Stage], noise: float) -> Figure:
-    """RRMSD against seconds since the start; each stage is a band as wide as it took, the standard error a line."""
+    """Draw the RRMSD against the seconds since the start, with the ends of the stages and the standard error."""
     seconds = np.array([point.seconds for point in history], dtype=float)
     values = np.array([point.rrmsd for point in history], dtype=float)
     figure = new_figure(5.2, 3.2)
@@ -296,9 +296,9 @@ def convergence(history: Sequence[Point], stages: Sequence[Stage], noise: float)
     axes.plot(seconds, values, color=BLUE, marker="." if len(values) < 100 else "", markersize=4)
     axes.set(yscale="log", xlabel="time (s)", ylabel="RRMSD")
     axes.set_title(f"RRMSD: {values[0]:.2g} at the start, {values[-1]:.2g} at the end", pad=16)
-    resolved = noise > values.min() / 20  # else it is far below the curve
-    axes.set_ylim(0.7 * min(values.min(), noise if resolved else np.inf), 1.2 * values.max())
-    if resolved:
+    visible = noise > values.min() / 20  # otherwise it is far below the curve
+    axes.set_ylim(0.7 * min(values.min(), noise if visible else np.inf), 1.2 * values.max())
+    if visible:
         axes.axhline(noise, color=GREY, linestyle="--", linewidth=0.9)
         right_end = axes.get_yaxis_transform()
         axes.text(0.99, noise * 1.05, "standard error", transform=right_end, ha="right", color=GREY, fontsize=8)
@@ -307,7 +307,7 @@ def convergence(history: Sequence[Point], stages: Sequence[Stage], noise: float)
     axes.set_xlim(0.0, last)
     for stage, start, end in zip(stages, ends, ends[1:], strict=False):
         axes.axvline(end, color=GREY, linewidth=0.6, linestyle=":")
-        if end - start > 0.0165 * len(stage.name) * last:  # there is room for its name above the frame
+        if end - start > 0.0165 * len(stage.name) * last:  # its name fits above the frame
             above = {"transform": axes.get_xaxis_transform(), "ha": "center", "color": GREY, "fontsize": 8}
             axes.text((start + end) / 2, 1.015, stage.name, **above)
     plain_ticks(axes.yaxis, *axes.get_ylim())
@@ -321,16 +321,16 @@ def convergence(history: Sequence[Point], stages: Sequence[Stage], noise: float)
 def light_path_of(
     scene: Scene, lens: Lens, pictures: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> LightPath | None:  # fmt: skip
-    """The lens, rays through it and their pictures for `bstcad show`; None if no light arrives at the furthest target.
+    """Return lens, rays and pictures for `bstcad show`; None if no light reaches the furthest target.
 
-    pictures: of each target of the scene what is wanted, and the irradiance, (rows, columns).
+    pictures: (target, irradiance) of each target of the scene, (rows, columns) each.
     """
     source, screens = scene.source.central, [target.screen for target in scene.targets]
     rays, flux = bundle(source, lens, max(screens, key=lambda screen: screen.plane.throw(0.0)).plane, RAYS)
     if not len(rays):
         return None
-    mesh = meshes.lens_mesh(lens, SHOWN_CELLS)
-    of = "of the middle of the source" if scene.source.extent is not None else "of the source"
+    mesh = meshes.lens_mesh(lens, LIGHT_PATH_CELLS)
+    of = "from the centre of the source" if scene.source.extent is not None else "from the source"
     return LightPath(
         vertices=mesh.vertices,
         faces=mesh.faces,
@@ -347,15 +347,15 @@ def light_path_of(
 
 
 def _sizes(screens: Sequence[Screen]) -> str:
-    """How large the targets are, and where they lie."""
-    told = (
+    """Return the sizes and positions of the targets in words."""
+    sizes = (
         f"{number(x[1] - x[0])} × {number(y[1] - y[0])} {plane.unit} at {plane.where()}"
         for plane, x, y in ((screen.plane, screen.x, screen.y) for screen in screens)
     )
-    return f"Target{'s' * (len(screens) > 1)} {', '.join(told)}"
+    return f"Target{'s' * (len(screens) > 1)} {', '.join(sizes)}"
 
 
 def corners(screen: Screen) -> np.ndarray:
-    """The corners of a screen in space (4, 3), mm: once around from x min, y min."""
+    """Return the corners of a screen in space (4, 3), mm, in order around it from x min, y min."""
     around = [screen.plane.point(x, y) for y, x in product(screen.y, screen.x)]
     return np.array(around)[[0, 1, 3, 2]]

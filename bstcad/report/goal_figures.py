@@ -1,4 +1,4 @@
-"""The figures of each goal in report.json: the light on each target, flat tops, and the wavefront."""
+"""Figures of each goal in report.json: the light on each target, flat tops, and the wavefront."""
 
 from __future__ import annotations
 
@@ -16,62 +16,62 @@ from bstcad.scene.scene import Scene
 from bstcad.scene.target import drawing
 from bstcad.verify.checks import Proof
 
-Share = Annotated[float, Field(ge=-1e-6, le=1 + 1e-6)]  # part of 1, but for the rounding of a sum
+Share = Annotated[float, Field(ge=-1e-6, le=1 + 1e-6)]  # fraction of 1, with the rounding error of a sum
 Size = Annotated[float, Field(ge=0, le=1e12)]
 Rrmsd = Annotated[float, Field(gt=0, le=1e3)]
 
 
 @dataclass(frozen=True)
 class GoalFigures:
-    """The light on a target."""
+    """Light on a target."""
 
     key: str  # target, or target[0], target[1], … of several
-    where: str  # place of its receiver, in words
+    where: str  # position of its receiver, in words
     weight: Size  # weight of its squared error among all goals
-    rrmsd: Rrmsd  # RRMSD by the flux into each pixel
+    rrmsd: Rrmsd  # RRMSD by the flux in each pixel
     rrmsd_standard_error: Annotated[float, Field(ge=0, le=1e3)]  # standard error of rrmsd, by independent sets of rays
     rrmsd_tent: Rrmsd | None  # RRMSD by linear binning
-    light_on_target: Share  # part of the source's flux
+    light_on_target: Share  # fraction of the source's flux on the target
     efficiency: Share  # flux on the target over flux that leaves the back face
-    leak: Share | None  # part of the light on the target that is on its dark pixels; None: it has none
-    contrast: Size | None  # mean irradiance of the lit pixels over that of the dark ones; None: or without leak
+    leak: Share | None  # fraction of the light on the target that is on its dark pixels; None: no dark pixels
+    contrast: Size | None  # mean irradiance of lit pixels over that of dark ones; None: no dark pixels, no leak
     unit: str = "mm"  # unit of x and y on its receiver
 
     @property
     def resolved(self) -> bool:
-        """Is the RRMSD at least five times its standard error?"""
+        """True if the RRMSD is at least five times its standard error."""
         return self.rrmsd >= RESOLVED * self.rrmsd_standard_error
 
     @property
     def suffix(self) -> str:
-        """Behind a name: which of several targets it is."""
+        """Suffix of a name, such as ", target[1]"; empty if there is one target."""
         return suffix_of(self.key)
 
     @property
     def words(self) -> str:
-        """The target in a sentence."""
+        """Name of the target in a sentence: "the target" or "target[1]"."""
         return words_of(self.key)
 
 
 @dataclass(frozen=True)
 class WavefrontFigures:
-    """The wavefront behind the lens against the one asked for; waves are those of `wavelength` in air."""
+    """Wavefront behind the lens against the requested one; waves are those of `wavelength` in air."""
 
-    z: float  # mm, the plane on which both are compared
+    z: float  # plane on which the wavefronts are compared (mm)
     wavelength: Size  # nm
-    rms: Size  # waves, each ray by its flux
-    pv: Size  # waves, greatest less least of all rays
-    rms_with_tilt: Size  # waves, piston alone removed
-    tilt_urad: tuple[float, float]  # tilt removed: light that leans towards +x and towards +y of the wanted light
-    angle_rms_urad: Size  # RMS angle between rays and wanted rays, each ray by its flux; tilt included
-    angle_max_urad: Size  # largest angle between rays and wanted rays
-    floor: Size  # waves that rounding may add to the RMS
-    flux: Share  # part of the source's flux that is measured
+    rms: Size  # RMS error, weighted by flux (waves)
+    pv: Size  # peak to valley over all rays (waves)
+    rms_with_tilt: Size  # RMS error with only piston removed (waves)
+    tilt_urad: tuple[float, float]  # removed tilt towards +x and towards +y, relative to the requested light (µrad)
+    angle_rms_urad: Size  # RMS angle between rays and requested rays, weighted by flux, with tilt (µrad)
+    angle_max_urad: Size  # largest angle between rays and requested rays (µrad)
+    floor: Size  # upper bound of the rounding error of the RMS (waves)
+    flux: Share  # fraction of the source's flux that is measured
     removed: Literal["piston and tilt"] = "piston and tilt"  # terms that are removed before rms and pv
 
     @classmethod
     def of(cls, error: WavefrontError) -> WavefrontFigures:
-        """The figures of a measurement, whose flux is a sum over a grid: at the edge of a beam it may go beyond 1."""
+        """Return the figures of a measurement; its flux, a sum over a grid, may exceed 1 by the edge of a beam."""
         return cls(
             error.z, error.wavelength, error.without_tilt.rms, error.without_tilt.pv,
             rms_with_tilt=error.without_piston.rms, tilt_urad=error.tilt, angle_rms_urad=error.angle_rms,
@@ -80,7 +80,7 @@ class WavefrontFigures:
 
 
 def figures_of(goals: Sequence[Goal], lights: Sequence[Light]) -> tuple[GoalFigures, ...]:
-    """The light on each target."""
+    """Return the figures of the light on each target."""
     return tuple(
         GoalFigures(
             goal.key,
@@ -100,11 +100,11 @@ def figures_of(goals: Sequence[Goal], lights: Sequence[Light]) -> tuple[GoalFigu
 
 
 def flat_tops(scene: Scene, proof: Proof) -> Iterator[FlatTop]:
-    """The figures of each target with a profile that is flat, if light falls on it."""
+    """Yield the figures of each target with a flat profile, if light falls on it."""
     for key, target, light in zip(scene.target_keys, scene.targets, proof.lights, strict=True):
         if target.profile is not None and target.profile.shape != "gaussian" and light.picture.any():
             pixel = tuple(side / n for side, n in zip(target.size, target.columns_rows, strict=True))
-            inside = drawing(target).light  # the share of each pixel, of shapes with an edge
+            inside = drawing(target).light  # covered fraction of each pixel, for a shape with an edge
             if target.profile.shape == "super_gaussian":
                 inside = (inside >= FLAT * inside.max()).astype(float)
             areas = 1.0 if target.screen.areas is None else target.screen.areas

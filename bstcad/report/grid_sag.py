@@ -1,11 +1,11 @@
-"""Zemax OpticStudio's grid sag of a net: its points, its file, and how far the light moves by it.
+"""Grid sag of a net for Zemax OpticStudio: its points, its file, and the shift of the light by its interpolation.
 
-OpticStudio interpolates between the points of a grid by bicubic Hermite patches.  A net is one biquadratic piece in
-each knot span (optics/bspline.py), and the patch over the four corners of a span is that piece: a grid whose points are
-the knots, and perhaps points between them, is exact.  In the end spans x(t) is quadratic, and the net is no polynomial
-in x; there a grid through all knots is made finer until the light moves by less than BOUND.
+OpticStudio interpolates between the points of a grid by bicubic Hermite patches.  A net is one biquadratic polynomial
+in each knot span (optics/bspline.py), and the patch over the four corners of a span equals this polynomial.  A grid
+whose points are the knots, and perhaps points between them, is therefore exact.  In the end spans x(t) is quadratic,
+and the net is not a polynomial in x; there the grid is refined until the light moves by less than MAX_SHIFT.
 
-`Patches` is the surface that such a program has.  Rays through it and through the lens show how far the light moves.
+`Patches` is the surface that such a program interpolates.  Rays through it and through the lens give the shift.
 """
 
 from __future__ import annotations
@@ -29,39 +29,39 @@ from bstcad.optics.surfaces import Surface, sag
 from bstcad.optics.trace import launch_strips, trace
 from bstcad.report.units import number
 
-FEWEST, MOST = 3, 4097  # points a side of a table
-LEAST_OF_ZEMAX = 5  # points a side: "the nx and ny values must be no smaller than 5" (OpticStudio's help, Grid Sag)
-BOUND = 0.1  # target pixels that light may move by a grid of our own density
-PARTS = (1, 2, 4, 8, 16)  # grid cells a knot span
-FLUSH = 1_050_000  # points of a grid that ends at the rim, at most; larger ones end at the knots beyond it, with fewer
-RAYS = 192  # a side, by which the light is compared
-RIM_ROUNDING = 1e-9  # distance by which a knot may miss the rim, as a part of a pitch
-NEWTON = 12  # steps to where a ray meets the patches; smooth faces need 5
-STEEP = 1e-6  # smallest rise of a ray over a face, by which a step of Newton's method is divided
-MET = 1e-9  # mm from the face: the ray has met it before the last step
+MIN_POINTS, MAX_POINTS = 3, 4097  # points per side of a table
+MIN_ZEMAX_POINTS = 5  # points per side: "the nx and ny values must be no smaller than 5" (OpticStudio, Grid Sag)
+MAX_SHIFT = 0.1  # largest shift of the light by a grid of default density (target pixels)
+CELLS_PER_SPAN = (1, 2, 4, 8, 16)  # grid cells per knot span, tried in this order
+MAX_FLUSH_POINTS = 1_050_000  # points up to which a grid ends at the rim; a larger one ends at the knots outside it
+RAYS = 192  # rays per side for the comparison of the light
+RIM_ROUNDING = 1e-9  # distance between a knot and the rim that counts as zero (pitches of the net)
+NEWTON_STEPS = 12  # steps of Newton's method to the intersection with the patches; smooth faces need 5
+MIN_DERIVATIVE = 1e-6  # lower bound of the derivative by which a step of Newton's method is divided
+HIT_TOLERANCE = 1e-9  # distance from the face at the last step below which a ray has met it (mm)
 
 
 @dataclass(frozen=True)
 class Throw:
-    """The light by which a grid is judged."""
+    """Light that measures the error of a grid."""
 
-    source: Emitter  # a point or a parallel beam of one line
+    source: Emitter  # point source or parallel beam of one wavelength
     screens: tuple[Screen, ...]
 
 
 @dataclass(frozen=True)
-class Moved:
-    """How far the light of a lens moves on a target if another surface stands for one of its faces."""
+class Shift:
+    """Shift of the light of a lens on a target by an approximation of one of its faces."""
 
-    rms: float  # weighted by flux, as the others in `unit`
-    most: float
-    pixel: float  # the shorter side of a pixel of the target
-    unit: str  # unit of the target's x and y
+    rms: float  # RMS shift, weighted by flux (in `unit`)
+    maximum: float  # largest shift (in `unit`)
+    pixel: float  # shorter side of a pixel of the target (in `unit`)
+    unit: str  # unit of x and y on the target
 
     def __str__(self) -> str:
-        """Both distances in their unit and in pixels."""
-        pixels = f"{number(self.rms / self.pixel)} and {number(self.most / self.pixel)} target pixels"
-        return f"{number(self.rms)} {self.unit} RMS, {number(self.most)} {self.unit} at most ({pixels})"
+        """Return both shifts in their unit and in pixels."""
+        pixels = f"{number(self.rms / self.pixel)} and {number(self.maximum / self.pixel)} target pixels"
+        return f"{number(self.rms)} {self.unit} RMS, {number(self.maximum)} {self.unit} at most ({pixels})"
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Grid:
 
     x: np.ndarray  # (nx,) mm, equally spaced
     y: np.ndarray  # (ny,) mm
-    values: tuple[np.ndarray, ...]  # z, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y (mm, 1, 1, 1/mm), each (nx, ny)
+    values: tuple[np.ndarray, ...]  # z, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y (mm, 1, 1, 1/mm), (nx, ny) each
 
     @property
     def step(self) -> tuple[float, float]:
@@ -82,29 +82,29 @@ class Grid:
 class Patches(Surface):
     """z = Σ over the corners of a cell of H(s) H(t) z + …: bicubic Hermite patches between the points of a grid.
 
-    s and t from 0 to 1 across a cell, H0 = (1 + 2 s)(1 - s)², its slope's K0 = s (1 - s)², and H1(s) = H0(1 - s),
-    K1(s) = -K0(1 - s); z_x goes with K H, z_y with H K, z_xy with K K, each times the cell's sides.
+    s and t run from 0 to 1 across a cell.  H0 = (1 + 2 s)(1 - s)² and H1(s) = H0(1 - s) belong to heights,
+    K0 = s (1 - s)² and K1(s) = -K0(1 - s) to slopes: z_x has the factor K H, z_y H K, z_xy K K, times the cell's sides.
     """
 
-    z: float  # the plane that the heights are measured from (mm)
+    z: float  # plane from which the heights are measured (mm)
     grid: Grid
     kind: Literal["patches"] = "patches"
 
     @property
     def detail(self) -> float:
-        """Width of its smooth pieces (mm): a cell."""
+        """Width of the smooth pieces (mm): one cell."""
         return min(self.grid.step)
 
     @classmethod
     def through(cls, face: Surface, x: np.ndarray, y: np.ndarray) -> Patches:
-        """The bicubic spline through the heights of a face alone, as a program has it that reads a table of sags."""
+        """Return the bicubic spline through the heights of a face, as a program interpolates a table of sags."""
         heights = sag(face, x[:, None], y[None, :]) - float(face.z)
         spline = RectBivariateSpline(x, y, heights, kx=min(3, len(x) - 1), ky=min(3, len(y) - 1))
         slopes = (spline(x, y, dx=i, dy=j) for i, j in ((1, 0), (0, 1), (1, 1)))
         return cls(float(face.z), Grid(x, y, (heights, *slopes)))
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; a point beyond the grid is moved to its rim."""
+        """Return (z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; a point outside the grid is moved to its rim."""
         (dx, dy), columns = self.grid.step, len(self.grid.y)
         i, along = _in_cell(x, self.grid.x, dx)
         j, across = _in_cell(y, self.grid.y, dy)
@@ -119,20 +119,20 @@ class Patches(Surface):
         return h, h_x, h_y
 
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
-        """(s in mm, met): path along rays from (x, y) of the plane z0 to the surface, by Newton's method.
+        """Return (s in mm, hit): path along rays from (x, y) in the plane z0 to the surface, by Newton's method.
 
         F(s) = s d_z - h(x + s d_x, y + s d_y), s ← s - F / F'.
         """
         dx, dy, dz = direction
         s = torch.zeros_like(x)
-        for _ in range(NEWTON):
+        for _ in range(NEWTON_STEPS):
             h, h_x, h_y = self.relative_sag_and_slope(x + s * dx, y + s * dy)
             off, rise = s * dz - h, dz - h_x * dx - h_y * dy
-            s = s - off / torch.where(rise.abs() > STEEP, rise, torch.full_like(rise, STEEP))
-        return s, off.abs() < MET
+            s = s - off / torch.where(rise.abs() > MIN_DERIVATIVE, rise, torch.full_like(rise, MIN_DERIVATIVE))
+        return s, off.abs() < HIT_TOLERANCE
 
     def sags(self, outline: Outline) -> tuple[float, float]:
-        """Lowest and highest of the heights of its points (mm), and of zero."""
+        """Return the lowest and the highest height of the points and of zero (mm)."""
         heights = self.grid.values[0]
         return min(float(heights.min()), 0.0), max(float(heights.max()), 0.0)
 
@@ -141,7 +141,7 @@ Shapes = tuple[tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]], ...]
 
 
 def _in_cell(at: Tensor, nodes: np.ndarray, step: float) -> tuple[Tensor, Shapes]:
-    """(the cell of each point, [height or slope][corner]: (Hermite function, its derivative in s))."""
+    """Return the cell of each point, and by [height or slope][corner] the Hermite function and its derivative in s."""
     place = ((at - float(nodes[0])) / step).clamp(0.0, len(nodes) - 1.0)
     cell = place.detach().nan_to_num(0.0).floor().clamp(0, len(nodes) - 2)
     s = place - cell
@@ -156,9 +156,9 @@ def _in_cell(at: Tensor, nodes: np.ndarray, step: float) -> tuple[Tensor, Shapes
 
 
 def axes(outline: Outline, points: int, least: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """x and y (mm) of a grid over the outline's bounding box, nearly square cells, centred on the axis.
+    """Return x and y (mm) of a grid over the outline's bounding box, with nearly square cells, centred on the axis.
 
-    points: along the wider side, both ends included; least: along each side.
+    points: number along the wider side, both ends included.  least: smallest number along each side.
     """
     a, b = outline.half_extent
     spacing = 2 * max(a, b) / (points - 1)
@@ -167,10 +167,10 @@ def axes(outline: Outline, points: int, least: int = 2) -> tuple[np.ndarray, np.
 
 
 def through_knots(face: BSplineSurface, outline: Outline, parts: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """x and y (mm) of a grid through all knots near the outline's bounding box, a knot span being `parts` cells.
+    """Return x and y (mm) of a grid through all knots near the outline's bounding box, `parts` cells per knot span.
 
-    None: there is none.  With one cell a span it ends at the knots between the end spans, which are one and a half
-    pitches long, and has to cover the box within them.
+    None: no such grid is possible.  A grid with one cell per span excludes the end spans, which are one and a half
+    pitches long; the box has to lie inside it.
     """
     found = []
     for (low, _), pitch, m, half in zip((face.x, face.y), face.pitch, face.shape, outline.half_extent, strict=True):
@@ -184,13 +184,13 @@ def through_knots(face: BSplineSurface, outline: Outline, parts: int) -> tuple[n
 
 
 def _is_flush(x: np.ndarray, y: np.ndarray, outline: Outline) -> bool:
-    """Does a grid end at the outline's bounding box?  The rim of most nets lies on a knot, or half between two."""
+    """Return True if a grid ends at the outline's bounding box; most nets have a knot, or half a span, at the rim."""
     box = zip((x, y), outline.half_extent, strict=True)
     return all(max(abs(at[0] + half), abs(at[-1] - half)) < RIM_ROUNDING * (at[1] - at[0]) for at, half in box)
 
 
 def on_grid(face: BSplineSurface, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-    """(z - face.z, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y) (mm, 1, 1, 1/mm) of a face at each pair of x and y (mm) within its net.
+    """Return (z - face.z, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y) (mm, 1, 1, 1/mm) of a face at each pair of x and y (mm) in its net.
 
     z = Σ_i Σ_j B_i(u(x)) B_j(v(y)) h_ij (Wang et al. 2023, Eq. 2) is a product of three matrices on a grid, and each
     derivative is the same product with derivatives of one or both bases.
@@ -209,30 +209,30 @@ def on_grid(face: BSplineSurface, x: np.ndarray, y: np.ndarray) -> tuple[np.ndar
 
 
 @torch.no_grad()
-def moved(lens: Lens, other: Lens, throw: Throw) -> Moved | None:
-    """How far the light of `other` lands from that of `lens`, on the target where that is the most pixels.
+def shift_between(lens: Lens, other: Lens, throw: Throw) -> Shift | None:
+    """Return the shift between the light of two lenses on the target where it is largest in pixels.
 
-    None: no light comes to a target.
+    None: no light reaches a target.
     """
     found = []
     for screen in throw.screens:
-        square = weight = most = 0.0
+        square = weight = largest = 0.0
         for rays in launch_strips(throw.source, lens, RAYS, 0):
             one, two = (trace(rays, each, screen.plane) for each in (lens, other))
             flux = torch.where(one.alive & two.alive, one.flux, torch.zeros_like(one.flux))
-            apart = torch.where(flux > 0, ((two.position - one.position) ** 2).sum(0), torch.zeros_like(flux))
-            square, weight = square + float(total(flux * apart)), weight + float(total(flux))
-            most = max(most, float(apart.max())) if apart.numel() else most  # a strip may launch no rays
+            squares = torch.where(flux > 0, ((two.position - one.position) ** 2).sum(0), torch.zeros_like(flux))
+            square, weight = square + float(total(flux * squares)), weight + float(total(flux))
+            largest = max(largest, float(squares.max())) if squares.numel() else largest  # a strip may launch no rays
         pixel = min((screen.x[1] - screen.x[0]) / screen.columns, (screen.y[1] - screen.y[0]) / screen.rows)
-        found += [Moved((square / weight) ** 0.5, most**0.5, pixel, screen.plane.unit)] if weight else []
+        found += [Shift((square / weight) ** 0.5, largest**0.5, pixel, screen.plane.unit)] if weight else []
     return max(found, key=lambda each: each.rms / each.pixel, default=None)
 
 
-def moved_by(lens: Lens, face: Surface, patches: Patches, throw: Throw) -> Moved | None:
-    """How far the light of a lens moves if these patches stand for one of its faces; None: it comes to no target."""
+def shift_by_patches(lens: Lens, face: Surface, patches: Patches, throw: Throw) -> Shift | None:
+    """Return the shift of the light if these patches replace one face of a lens; None: no light reaches a target."""
     plain = replace(lens, losses=None).shaping("back")
     other = plain.with_back(patches) if face is lens.back else plain.with_front(patches)
-    return moved(plain, other, throw)
+    return shift_between(plain, other, throw)
 
 
 # ---- the file --------------------------------------------------------------------------------------------------------
@@ -240,42 +240,42 @@ def moved_by(lens: Lens, face: Surface, patches: Patches, throw: Throw) -> Moved
 
 @dataclass(frozen=True)
 class GridSag:
-    """A grid for OpticStudio, and how far the light moves by it."""
+    """Grid for OpticStudio, and the shift of the light by its interpolation."""
 
     face: BSplineSurface
     grid: Grid
-    moved: Moved | None  # None: there is no light to judge it by, or none comes to the target
+    shift: Shift | None  # None: not measured, or no light reaches the target
 
     @classmethod
     def of(cls, lens: Lens, face: BSplineSurface, points: int | None = None, throw: Throw | None = None) -> GridSag:
-        """The grid of so many points along the wider side of the outline's bounding box, or by default of the knots."""
+        """Return a grid with this number of points along the wider side of the outline, or by default at the knots."""
         if points is not None:
-            return cls._at(lens, face, axes(lens.outline, max(points, LEAST_OF_ZEMAX), LEAST_OF_ZEMAX), throw)
-        grids = [at for parts in PARTS if (at := through_knots(face, lens.outline, parts)) is not None]
-        flush = [(x, y) for x, y in grids[:2] if _is_flush(x, y, lens.outline) and len(x) * len(y) <= FLUSH]
+            return cls._at(lens, face, axes(lens.outline, max(points, MIN_ZEMAX_POINTS), MIN_ZEMAX_POINTS), throw)
+        grids = [at for parts in CELLS_PER_SPAN if (at := through_knots(face, lens.outline, parts)) is not None]
+        flush = [(x, y) for x, y in grids[:2] if _is_flush(x, y, lens.outline) and len(x) * len(y) <= MAX_FLUSH_POINTS]
         best = None
         for at in (*flush, *grids):
             best = cls._at(lens, face, at, throw)
-            if best.moved is None or best.moved.most <= BOUND * best.moved.pixel:
+            if best.shift is None or best.shift.maximum <= MAX_SHIFT * best.shift.pixel:
                 return best
-        return best or cls.of(lens, face, min(2 * max(face.shape), MOST), throw)
+        return best or cls.of(lens, face, min(2 * max(face.shape), MAX_POINTS), throw)
 
     @classmethod
     def _at(cls, lens: Lens, face: BSplineSurface, at: tuple[np.ndarray, np.ndarray], throw: Throw | None) -> GridSag:
-        """The grid of these x and y."""
+        """Return the grid at these x and y (mm)."""
         found = cls(face, Grid(*at, on_grid(face, *at)), None)
-        return found if throw is None else replace(found, moved=moved_by(lens, face, found.patches, throw))
+        return found if throw is None else replace(found, shift=shift_by_patches(lens, face, found.patches, throw))
 
     @property
     def patches(self) -> Patches:
-        """The surface that OpticStudio has by it."""
+        """Surface that OpticStudio interpolates from the grid."""
         return Patches(self.face.z, self.grid)
 
     def text(self) -> str:
-        """The file (.DAT).
+        """Return the text of the file (.DAT).
 
-        Header: nx ny, spacings in x and y, unit (0: mm), decentre in x and y.  Then a line a point, from (-x, +y) along
-        +x and downwards: sag over the vertex, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y, all exact, and 0: there is data.
+        Header: nx ny, spacings in x and y, unit (0: mm), decentre in x and y.  Then one line per point, from (-x, +y)
+        along +x and downwards: sag over the vertex, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y, all exact, and 0 (there is data).
         """
         (x, y), (dx, dy) = (self.grid.x, self.grid.y), self.grid.step
         vertex = float(sag(self.face, 0.0, 0.0)) - self.face.z
@@ -288,20 +288,20 @@ class GridSag:
         return text.getvalue()
 
     def note(self, name: str) -> str:
-        """A sentence on the file of this name."""
+        """Return a sentence on the file of this name."""
         (dx, dy), grid = self.grid.step, self.grid
-        size = f"{name}: {len(grid.x)} x {len(grid.y)} points, {dx:.6g} x {dy:.6g} mm apart"
-        if self.moved is None:
+        size = f"{name}: {len(grid.x)} x {len(grid.y)} points, spacing {dx:.6g} x {dy:.6g} mm"
+        if self.shift is None:
             return f"{size}."
-        coarse = self.moved.most > BOUND * self.moved.pixel
-        advice = "; leave out --points for a grid through the knots" if coarse else ""
-        return f"{size}; by bicubic interpolation of them the light moves on the target by {self.moved}{advice}."
+        coarse = self.shift.maximum > MAX_SHIFT * self.shift.pixel
+        advice = "; omit --points for a grid through the knots" if coarse else ""
+        return f"{size}; bicubic interpolation moves the light on the target by {self.shift}{advice}."
 
 
 def table_note(lens: Lens, face: Surface, name: str, *, points: int, throw: Throw) -> str:
-    """A sentence on a table of sags: how far the light moves by a bicubic spline through the heights of its grid."""
-    by = moved_by(lens, face, Patches.through(face, *axes(lens.outline, points)), throw)
+    """Return a sentence on the shift of the light by a bicubic spline through the heights of a table of sags."""
+    by = shift_by_patches(lens, face, Patches.through(face, *axes(lens.outline, points)), throw)
     if by is None:
-        return f"{name}: no light comes to the target."
-    coarse = "; zemax-back.dat and lens.step are exact" if by.most > BOUND * by.pixel else ""
-    return f"{name}: by a bicubic spline through its heights the light moves on the target by {by}{coarse}."
+        return f"{name}: no light reaches the target."
+    coarse = "; zemax-back.dat and lens.step are exact" if by.maximum > MAX_SHIFT * by.pixel else ""
+    return f"{name}: a bicubic spline through its heights moves the light on the target by {by}{coarse}."

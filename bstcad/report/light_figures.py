@@ -1,7 +1,7 @@
-"""Figures of the light on the target, as a person sees it who stands where the scene says.
+"""Figures of the light on the target, as seen from the side that the scene states.
 
-From the lens, along +z with y up, x grows to the left.  Grey is what an eye or a camera would see (sRGB), while scales
-of irradiance are linear.  Pictures are (rows, columns) in coordinates, row 0 at y max, all of the target's sum.
+Seen from the lens, along +z with y up, x grows to the left.  Grey tones are those of an eye or a camera (sRGB), and the
+scales of irradiance are linear.  Pictures are (rows, columns) in coordinates, row 0 at y max, with the target's sum.
 """
 
 from __future__ import annotations
@@ -44,26 +44,26 @@ if TYPE_CHECKING:
 
 Extent = tuple[float, float]  # (min, max) in mm
 
-SEEN = {  # (target.seen_from, does the light come back along -z, by an odd number of fold mirrors?)
+SEEN = {  # (target.seen_from, True if the light travels along -z after an odd number of fold mirrors): sentence
     ("lens", False): "Seen from the {optic}, looking along +z: x grows to the left",
     ("behind", False): "Seen from behind the screen, looking towards the {optic}: x grows to the right",
     ("lens", True): "Seen from the {optic} in the fold mirror, looking along +z: x grows to the left",
     ("behind", True): "Seen from the fold mirror, looking along -z: x grows to the right",
 }
-LIT = 0.01  # a pixel is lit where the target exceeds this part of its maximum
-HEADROOM = 1.06  # the scale ends above the brightest there is, so that even light is not as white as the paper
-GLARING = 2.0  # multiple of the target's maximum: up to here the scale follows a hot spot …
-RARE = 99.9  # … and beyond it this percentile of the irradiance
-SPOT = 0.1  # part of the largest difference: the scale reaches as far at least, or even light would look torn
-TONES = 128  # the eye loses nothing, a PNG becomes a third as large
-MARK = 0.045  # part of a picture's side, by which the ends of a cut reach into it
-CUTS = {"centre": BLUE, "brightest place": VERMILION}
-ACROSS = 4  # pictures of spectral lines in a row
-PANEL, TALLEST = 2.4, 4.8  # inches: width of such a picture, and at most its height
-DENSE = 300  # outliers whose dots need to be small
-FORM_UNITS = ((1e-3, 1e3, "µm"), (0.0, 1e6, "nm"))  # (from this many mm on, times, written)
+LIT = 0.01  # fraction of the target's maximum above which a pixel is lit
+HEADROOM = 1.06  # end of the grey scale over the brightest value, so that even light differs from white paper
+MAX_GLARE = 2.0  # multiple of the target's maximum up to which the scale includes a hot spot
+GLARE_PERCENTILE = 99.9  # percentile of the irradiance at the end of the scale if a hot spot exceeds MAX_GLARE
+MIN_SCALE = 0.1  # smallest end of a scale of differences, as a fraction of the largest difference
+TONES = 128  # number of grey tones: no visible loss, and PNG files a third as large
+MARK_LENGTH = 0.045  # length of the marks of a cut, as a fraction of the picture's side
+CUTS = {"centre": BLUE, "brightest point": VERMILION}  # position of a cut: colour
+COLUMNS = 4  # pictures of spectral lines per row
+PANEL_WIDTH, MAX_PANEL_HEIGHT = 2.4, 4.8  # size of such a picture (inches)
+MANY_OUTLIERS = 300  # number of outliers from which their dots are small
+FORM_UNITS = ((1e-3, 1e3, "µm"), (0.0, 1e6, "nm"))  # (smallest size in mm, factor, unit as written)
 BINS = 60  # bins of the histogram of trials
-SHOWN = 3  # number of the worst trials
+MAX_WORST_TRIALS = 3  # number of the worst trials that are drawn
 # The 1931 standard observer as sums of Gaussians with two widths: weight, centre, width below and above it (nm).
 # Wyman, Sloan and Shirley, Journal of Computer Graphics Techniques 2(2), 2013, multi-lobe fit.
 LOBES = (
@@ -77,19 +77,19 @@ TO_SRGB = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.05
 
 @dataclass(frozen=True)
 class View:
-    """Where the target lies and from where it is seen."""
+    """Position of a target, and the side from which it is seen."""
 
     x: Extent
     y: Extent
     seen_from: str  # lens | behind
-    optic: str = "lens"  # or "mirror"
-    folded: bool = False  # does the light come to the target along -z?
-    receiver: Receiver = LevelPlane(0.0)  # receiver on which its x and y are measured
-    number: int = 0  # number of the target among several, by which its figures are named
+    optic: str = "lens"  # lens | mirror
+    folded: bool = False  # True if the light reaches the target along -z
+    receiver: Receiver = LevelPlane(0.0)  # receiver on which x and y are measured
+    number: int = 0  # index of the target, used in the names of its figures
 
     @classmethod
     def of(cls, scene: Scene, number: int = 0) -> View:
-        """The view of a scene's target, the first of several or another."""
+        """Return the view of a target of the scene."""
         target = scene.targets[number]
         return cls(
             target.x, target.y, target.seen_from, optic=scene.optic, folded=scene.folded,
@@ -98,41 +98,41 @@ class View:
 
     @property
     def labels(self) -> tuple[str, str]:
-        """The names of the receiver's axes, with their unit."""
+        """Labels of the receiver's axes, with their unit."""
         return self.receiver.labels
 
     @property
     def mean_lit(self) -> str:
-        """The label of a scale in units of the mean of the lit pixels."""
-        return f"{self.receiver.light} / mean lit"
+        """Label of a scale relative to the mean of the lit pixels."""
+        return f"{self.receiver.light} / mean of lit pixels"
 
     @property
     def percent_lit(self) -> str:
-        """The label of a scale in percent of that mean."""
-        return f"% of mean lit {self.receiver.light}"
+        """Label of a scale in percent of the mean of the lit pixels."""
+        return "% of mean of lit pixels"
 
     @property
     def words(self) -> str:
-        """The side from which the target is seen, as a sentence without its stop."""
+        """Sentence on the side from which the target is seen, without a full stop."""
         return SEEN[self.seen_from, self.folded].format(optic=self.optic)
 
     def note(self, figure: Figure, more: str = "", first: str = "") -> None:
-        """A footnote: `first`, the side from which the target is seen, `more`, and the tilt of its plane."""
+        """Write a footnote: `first`, the side from which the target is seen, `more`, and the tilt of its plane."""
         tilt = self.receiver.tilt
         plane = f"\nThe target plane is tilted by {turned(tilt)}; x and y are measured on it." if tilt else ""
         footnote(figure, f"{first}{self.words}.{more}{plane}")
 
     @property
     def proportion(self) -> float:
-        """Height over width, as far as a row of pictures should follow it."""
+        """Height over width of the target, limited to the range that suits a row of pictures."""
         return min(max((self.y[1] - self.y[0]) / (self.x[1] - self.x[0]), 0.55), 1.6)
 
     def picture(self, values: np.ndarray) -> np.ndarray:
-        """An array in coordinates (column 0 = x min), mirrored if the target is seen from the lens."""
+        """Return an array in coordinates (column 0 = x min), mirrored if the target is seen from the lens."""
         return values[:, ::-1] if self.seen_from == "lens" else values
 
     def tones(self, light: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-        """Return flux in each pixel as grey tones, in coordinates, on the scale of what is wanted."""
+        """Return the flux in each pixel as grey tones, in coordinates, on a scale for the picture `wanted`."""
         return tones(self.irradiance(light), self.irradiance(wanted))
 
     def irradiance(self, flux: np.ndarray) -> np.ndarray:
@@ -142,29 +142,29 @@ class View:
 
     @property
     def across(self) -> Extent:
-        """x at the left and at the right."""
+        """Values of x at the left and at the right edge."""
         return self.x[::-1] if self.seen_from == "lens" else self.x
 
 
 def lit_mean(target: np.ndarray) -> float:
-    """Mean of the target over its lit pixels, those above 1 % of its maximum (a floor under black is not lit)."""
+    """Return the mean of the target over its lit pixels, those above LIT times its maximum."""
     return float(target[target > LIT * target.max()].mean())
 
 
 def rrmsd(target: np.ndarray, irradiance: np.ndarray) -> float:
-    """sqrt(Σ (E_s - E)² / Σ E²); Wang et al. 2023, the merit of stage 2."""
+    """sqrt(Σ (E_s - E)² / Σ E²), the merit function of stage 2; Wang et al. 2023."""
     return float(np.sqrt(np.sum((irradiance - target) ** 2) / np.sum(target**2)))
 
 
 def brightest(target: np.ndarray, irradiance: np.ndarray) -> float:
-    """The end of a scale for both: above the brightest pixel of either, unless a few pixels glare."""
-    most = float(target.max())
-    glare = min(float(irradiance.max()), GLARING * most)
-    return HEADROOM * max(most, glare, float(np.percentile(irradiance, RARE)))
+    """Return the end of a scale for both pictures: above the brightest pixel, unless it is a hot spot."""
+    peak = float(target.max())
+    glare = min(float(irradiance.max()), MAX_GLARE * peak)
+    return HEADROOM * max(peak, glare, float(np.percentile(irradiance, GLARE_PERCENTILE)))
 
 
 def tones(irradiance: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Irradiance as bytes (rows, columns) that a screen has to be sent, white at the scale's end."""
+    """Return irradiance as sRGB bytes (rows, columns), white at the end of the scale."""
     light = to_srgb(np.clip(irradiance / brightest(target, irradiance), 0.0, 1.0))
     return np.rint(255 * np.clip(light, 0.0, 1.0)).astype(np.uint8)
 
@@ -174,7 +174,7 @@ def tones(irradiance: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 @cache
 def seen_grey() -> ListedColormap:
-    """From irradiance, 0 to 1, to the grey that a screen has to be sent."""
+    """Return a colour map from irradiance, 0 to 1, to grey in sRGB."""
     from matplotlib.colors import ListedColormap
 
     tones = np.round(to_srgb(np.linspace(0.0, 1.0, 16 * TONES)) * (TONES - 1)) / (TONES - 1)
@@ -182,7 +182,7 @@ def seen_grey() -> ListedColormap:
 
 
 def draw_picture(axes: Axes, values: np.ndarray, view: View, **shades: Any) -> Any:
-    """Draw `values`, in coordinates, as they are seen, in a frame."""
+    """Draw `values`, in coordinates, from the side of the view, in a frame."""
     axes.set_xlabel(view.labels[0])
     axes.spines[:].set(visible=True, color=GREY, linewidth=0.6)
     place = {"extent": (*view.across, *view.y), "origin": "upper", "interpolation_stage": "data"}
@@ -190,23 +190,23 @@ def draw_picture(axes: Axes, values: np.ndarray, view: View, **shades: Any) -> A
 
 
 def _grey(axes: Axes, values: np.ndarray, view: View, *, top: float, title: str) -> Any:
-    """Draw irradiance, from 0 to `top`."""
+    """Draw irradiance on a grey scale from 0 to `top`."""
     axes.set_title(title)
     return draw_picture(axes, values, view, cmap=seen_grey(), vmin=0.0, vmax=top)
 
 
 def _signed(axes: Axes, values: np.ndarray, view: View, *, most: float, title: str) -> Any:
-    """Draw differences in percent, from -most to most."""
+    """Draw differences in percent, on a scale from -most to most."""
     axes.set_title(title)
     return draw_picture(axes, values, view, cmap=steps("RdBu_r", 41), vmin=-most, vmax=most)
 
 
 def _side_by_side(
-    pictures: Mapping[str, np.ndarray], difference: str, view: View, *, height: float, spot: float = SPOT,
+    pictures: Mapping[str, np.ndarray], difference: str, view: View, *, height: float, spot: float = MIN_SCALE,
 ) -> tuple[Figure, np.ndarray]:  # fmt: skip
-    """A figure and its axes: pictures by title on one scale of grey, and the last minus the one before it, signed.
+    """Return a figure and its axes: pictures by title on one grey scale, and the last minus the one before it.
 
-    The first is the target.  height: of the figure (inches).  spot: as in `_largest`.
+    The first picture is the target.  height: height of the figure (inches).  spot: see `_largest`.
     """
     target, before, last = (list(pictures.values())[k] for k in (0, -2, -1))
     unit, top = lit_mean(target), max(brightest(target, picture) for picture in pictures.values())
@@ -216,20 +216,20 @@ def _side_by_side(
         shown = _grey(axes, picture / unit, view, top=top / unit, title=title)
     signed = _signed(panels[-1], error, view, most=_largest(error, spot), title=difference)
     panels[0].set_ylabel(view.labels[1])
-    beyond = "max" if last.max() > top else "neither"
-    figure.colorbar(shown, ax=panels[:-1], label=view.mean_lit, fraction=0.04, pad=0.015, extend=beyond)
+    extend = "max" if last.max() > top else "neither"
+    figure.colorbar(shown, ax=panels[:-1], label=view.mean_lit, fraction=0.04, pad=0.015, extend=extend)
     figure.colorbar(signed, ax=panels[-1], label=view.percent_lit, fraction=0.08, pad=0.03, extend="both")
     return figure, panels
 
 
-def _largest(values: np.ndarray, spot: float = SPOT) -> float:
-    """The end of a scale of differences: their 99.5th percentile, or at least `spot` of the largest difference."""
+def _largest(values: np.ndarray, spot: float = MIN_SCALE) -> float:
+    """Return the end of a scale of differences: their 99.5th percentile, or `spot` times the largest if that is more."""
     size = np.abs(values)
     return round_up(max(float(np.percentile(size, 99.5)), spot * float(size.max())))
 
 
 def plain_ticks(axis: Any, low: float, high: float) -> None:
-    """Ticks of a logarithmic axis at 1, 2, 5 times powers of ten, closer within a decade, written as plain numbers."""
+    """Set ticks of a logarithmic axis at 1, 2, 5 times powers of ten, closer within a decade, as plain numbers."""
     from matplotlib.ticker import LogLocator, NullLocator
 
     close = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9)
@@ -239,7 +239,7 @@ def plain_ticks(axis: Any, low: float, high: float) -> None:
 
 
 def _pixel_centres(extent: Extent, pixels: int) -> np.ndarray:
-    """Centres of `pixels` equal pixels over `extent`, ascending (mm)."""
+    """Return the centres of `pixels` equal pixels over `extent`, ascending (mm)."""
     return extent[0] + (np.arange(pixels) + 0.5) * (extent[1] - extent[0]) / pixels
 
 
@@ -248,17 +248,17 @@ def _pixel_centres(extent: Extent, pixels: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Cut:
-    """Where the irradiance is cut: a row and a column of the picture in coordinates."""
+    """Cut through the irradiance along a row and a column of the picture in coordinates."""
 
-    name: str  # name in CUTS
+    name: str  # key of CUTS
     row: int
     column: int
-    x: float  # middle of the column, in the receiver's unit
-    y: float  # middle of the row
+    x: float  # centre of the column, in the receiver's unit
+    y: float  # centre of the row, in the receiver's unit
 
 
 def cuts(irradiance: np.ndarray, view: View) -> list[Cut]:
-    """Through the centre of the target, and through the brightest pixel of its irradiance."""
+    """Return cuts through the centre of the target and through the brightest pixel of its irradiance."""
     rows, columns = irradiance.shape
     along_x, along_y = _pixel_centres(view.x, columns), _pixel_centres(view.y, rows)[::-1]
     places = ((rows // 2, columns // 2), divmod(int(irradiance.argmax()), columns))
@@ -269,27 +269,27 @@ def cuts(irradiance: np.ndarray, view: View) -> list[Cut]:
 
 
 def _mark(axes: Axes, cut: Cut, view: View) -> None:
-    """The ends of a cut's row and column at the edges of a picture; a ring where it is brightest."""
+    """Mark the ends of a cut at the edges of a picture, and the brightest point by a ring."""
     style = {"color": CUTS[cut.name], "linewidth": 1.6, "solid_capstyle": "butt", "gid": cut.name}
     for (low, high), along_x in ((view.x, True), (view.y, False)):
-        reach = MARK * (high - low)
+        reach = MARK_LENGTH * (high - low)
         for ends in ((low, low + reach), (high - reach, high)):
             axes.plot(*((ends, (cut.y, cut.y)) if along_x else ((cut.x, cut.x), ends)), **style)
-    if cut.name == "brightest place":
+    if cut.name == "brightest point":
         axes.plot(cut.x, cut.y, "o", markersize=7, markerfacecolor="none", markeredgecolor=CUTS[cut.name], gid="ring")
     axes.set(xlim=view.across, ylim=view.y)
 
 
 def dark_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) -> bytes:
-    """The irradiance's figure as a PNG for a page in dark mode."""
+    """Return the figure of the irradiance as a PNG for a page in dark mode."""
     return png(darkened(irradiance_triptych(target, irradiance, view)), ground=DARK)
 
 
 @styled
 def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) -> Figure:
-    """Target, simulated and their signed difference in percent of the mean lit irradiance.
+    """Draw target, simulated irradiance and their difference in percent of the mean of the lit pixels.
 
-    target, irradiance: (rows, columns) in coordinates, one sum.
+    target, irradiance: (rows, columns) in coordinates, with equal sums.
     """
     target, irradiance = view.irradiance(target), view.irradiance(irradiance)
     simulated = "Simulated through the lens" if view.optic == "lens" else "Simulated by the mirror"
@@ -300,18 +300,17 @@ def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) 
             _mark(axes, cut, view)
     view.note(
         figure,
-        "  Grey as an eye or a camera would see it (sRGB); the scale is linear in "
-        f"{view.receiver.light}.\n"
-        "Marks at the edges: the cuts through the centre (blue) and through the brightest place (vermilion, ringed).",
+        f"  Grey tones as an eye or a camera sees them (sRGB); the scale is linear in {view.receiver.light}.\n"
+        "Marks at the edges: cuts through the centre (blue) and through the brightest point (vermilion, ring).",
     )
     return figure
 
 
 @styled
 def reach_picture(target: np.ndarray, reachable: np.ndarray, view: View) -> Figure:
-    """The target, and that part of it which light can reach, the rest in vermilion.
+    """Draw the target, and its reachable part with the rest in vermilion.
 
-    target, reachable: (rows, columns) in coordinates; reachable is True where light gets to.
+    target, reachable: (rows, columns) in coordinates; reachable is True where light can reach the target.
     """
     from matplotlib.colors import ListedColormap
 
@@ -323,20 +322,20 @@ def reach_picture(target: np.ndarray, reachable: np.ndarray, view: View) -> Figu
         _grey(axes, target, view, top=top, title=title)
     draw_picture(panels[1], np.where(reachable, np.nan, 1.0), view, cmap=ListedColormap([VERMILION]), alpha=0.6)
     panels[0].set_ylabel(view.labels[1])
-    view.note(figure, "  In vermilion: no face of this index or slope sends light there.")
+    view.note(figure, "  Vermilion: no face of this index and of slopes up to 70 degrees sends light there.")
     return figure
 
 
 @styled
 def ghost_picture(target: np.ndarray, ghost: np.ndarray, view: View) -> Figure:
-    """The light that was reflected twice inside the lens, in percent of the mean lit irradiance.
+    """Draw the light that is reflected twice inside the lens, in percent of the mean of the lit pixels.
 
-    ghost: (rows, columns) in coordinates, of the irradiance that has the target's sum.
+    ghost: (rows, columns) in coordinates, normalised as the irradiance that has the target's sum.
     """
     share = 100.0 * view.irradiance(ghost) / lit_mean(view.irradiance(target))
     figure = new_figure(5.6, 4.6, layout="compressed")
     axes = figure.subplots()
-    top = HEADROOM * float(np.percentile(share, RARE)) or 1.0
+    top = HEADROOM * float(np.percentile(share, GLARE_PERCENTILE)) or 1.0
     shown = _grey(axes, share, view, top=top, title=f"The ghost alone: up to {number(float(share.max()))} %")
     axes.set_ylabel(view.labels[1])
     figure.colorbar(shown, ax=axes, label=view.percent_lit, extend="max" if share.max() > top else "neither")
@@ -346,7 +345,7 @@ def ghost_picture(target: np.ndarray, ghost: np.ndarray, view: View) -> Figure:
 
 @styled
 def cross_section(target: np.ndarray, irradiance: np.ndarray, view: View) -> Figure:
-    """Target and simulated irradiance along rows and columns: through the centre, and through the brightest place."""
+    """Draw target and simulated irradiance along cuts through the centre and through the brightest point."""
     target, irradiance = view.irradiance(target), view.irradiance(irradiance)
     unit = lit_mean(target)
     along_x, along_y = _pixel_centres(view.x, target.shape[1]), _pixel_centres(view.y, target.shape[0])[::-1]
@@ -374,17 +373,17 @@ def cross_section(target: np.ndarray, irradiance: np.ndarray, view: View) -> Fig
 
 @styled
 def lines_apart(target: np.ndarray, irradiance: np.ndarray, lines: Sequence[SpectralLine], view: View) -> Figure:
-    """All lines together in colour, then the picture that each of them makes by itself.
+    """Draw the picture of all spectral lines in colour, then the picture of each line alone.
 
-    target, irradiance by all lines, and pictures: (rows, columns) in coordinates, one sum.
+    target, irradiance by all lines, and pictures: (rows, columns) in coordinates, with equal sums.
     """
     even = view.irradiance(target)
     unit = lit_mean(even)
     top = brightest(even, view.irradiance(irradiance)) / unit
-    rows = -(-(1 + len(lines)) // ACROSS)
-    tall = PANEL * (view.y[1] - view.y[0]) / (view.x[1] - view.x[0])
-    figure = new_figure(11.0, 0.6 + rows * (0.6 + min(tall, TALLEST)), layout="compressed")
-    panels = figure.subplots(rows, ACROSS, sharey=True, sharex=True, squeeze=False).ravel()
+    rows = -(-(1 + len(lines)) // COLUMNS)
+    tall = PANEL_WIDTH * (view.y[1] - view.y[0]) / (view.x[1] - view.x[0])
+    figure = new_figure(11.0, 0.6 + rows * (0.6 + min(tall, MAX_PANEL_HEIGHT)), layout="compressed")
+    panels = figure.subplots(rows, COLUMNS, sharey=True, sharex=True, squeeze=False).ravel()
     alone = [view.irradiance(line.picture) for line in lines]
     colours = balanced(alone, *([getattr(line, name) for line in lines] for name in ("wavelength", "share")))
     draw_picture(panels[0], to_srgb(np.clip(colours / unit / top, 0.0, 1.0)), view)
@@ -394,18 +393,18 @@ def lines_apart(target: np.ndarray, irradiance: np.ndarray, lines: Sequence[Spec
         _grey(axes, picture / unit, view, top=top, title=title)
     for axes in panels[1 + len(lines) :]:
         axes.set_visible(False)
-    for axes in panels[::ACROSS]:
+    for axes in panels[::COLUMNS]:
         axes.set_ylabel(view.labels[1])
     view.note(
         figure,
-        "  In colour as a camera balanced to the source's white sees it: where it is not grey, the lines "
-        "part.\nIn grey: the light of one line alone, on the same scale.",
+        "  In colour, as a camera with white balance for the source: the lines differ where it is not grey.\n"
+        "In grey: the light of one line alone, on the same scale.",
     )
     return figure
 
 
 def primary(wavelength: float) -> np.ndarray:
-    """Linear sRGB (3,) of one line (nm); colours that no screen shows have negative parts, which are left out."""
+    """Return linear sRGB (3,) of one wavelength (nm), with negative components set to zero."""
     xyz = [
         sum(weight * np.exp(-0.5 * ((wavelength - centre) / (below if wavelength < centre else above)) ** 2)
             for weight, centre, below, above in lobes)
@@ -415,10 +414,10 @@ def primary(wavelength: float) -> np.ndarray:
 
 
 def balanced(pictures: Sequence[np.ndarray], wavelengths: Sequence[float], shares: Sequence[float]) -> np.ndarray:
-    """(rows, columns, 3): red, green and blue irradiance of light whose lines' pictures (rows, columns) have one sum.
+    """Return linear red, green and blue (rows, columns, 3) of lines whose pictures (rows, columns) have equal sums.
 
-    Each colour is divided by its amount where all lines are alike, so that light of the source's own white is grey;
-    a colour that no line has takes the mean of all.
+    Each component is divided by its value for the source's spectrum, so that light of this spectrum is grey.  A
+    component that no line has is the mean over all lines.
     """
     parts = np.array([share * primary(nm) for nm, share in zip(wavelengths, shares, strict=True)])  # (lines, 3)
     white = parts.sum(0)
@@ -431,13 +430,13 @@ def balanced(pictures: Sequence[np.ndarray], wavelengths: Sequence[float], share
 
 
 def draw_judges(judges: Sequence[Compared], view: View) -> dict[str, bytes]:
-    """The pictures by other programs, as far as they served, as PNG bytes by name."""
+    """Return the pictures by other programs, without those that declined, as PNG bytes by name."""
     return {each.judge.figure: png(judged_picture(each, view)) for each in judges if not each.judge.declined}
 
 
 @styled
 def judged_picture(compared: Compared, view: View) -> Figure:
-    """Target, bstcad's picture, the judge's and the signed difference of these two, in % of the mean lit irradiance."""
+    """Draw target, bstcad's picture, the other program's and the difference, in % of the mean of the lit pixels."""
     name = compared.judge.name
     pictures = {"Target": compared.target} | {
         f"By {by} (RRMSD {rrmsd(compared.target, picture):.3g})": picture
@@ -450,39 +449,39 @@ def judged_picture(compared: Compared, view: View) -> Figure:
 
 
 def draw_part(made: MadePart, designed: np.ndarray, view: View) -> dict[str, bytes]:
-    """The picture of a made part as PNG bytes by name; designed: irradiance."""
+    """Return the figure of a made part as PNG bytes by name.  designed: irradiance of the design."""
     return {numbered("made_part", view.number): png(made_part(made, designed, view))}
 
 
 @styled
 def made_part(made: MadePart, designed: np.ndarray, view: View) -> Figure:
-    """The fitted form error, the light of the made part, and the difference of this light from the designed light."""
+    """Draw the fitted form error, the light of the made part, and its difference from the designed light."""
     x, y, form = made.deviation.x, made.deviation.y, made.deviation.form
     designed, predicted = view.irradiance(designed), view.irradiance(made.irradiances[view.number])
     outliers, unit = made.outliers[:, :2], lit_mean(designed)
-    most, pv = float(np.nanmax(np.abs(form))), float(np.nanmax(form) - np.nanmin(form))
-    _, times, written = next(rung for rung in FORM_UNITS if most >= rung[0])
+    largest, pv = float(np.nanmax(np.abs(form))), float(np.nanmax(form) - np.nanmin(form))
+    _, factor, unit_name = next(rung for rung in FORM_UNITS if largest >= rung[0])
     figure = new_figure(11.0, 1.3 + 2.8 * view.proportion, layout="compressed")
     face, light, changed = figure.subplots(1, 3)
     place = {"extent": (x[0], x[-1], y[0], y[-1]), "origin": "lower", "interpolation_stage": "data"}
-    edge = round_up(times * most)
-    shown = face.imshow(times * form, cmap=steps("RdBu_r", 41), vmin=-edge, vmax=edge, **place)
+    edge = round_up(factor * largest)
+    shown = face.imshow(factor * form, cmap=steps("RdBu_r", 41), vmin=-edge, vmax=edge, **place)
     face.set(title=f"Made − designed, PV {quantity(pv, 'mm')}", xlabel="x (mm)", ylabel="y (mm)")
     face.spines[:].set_visible(False)
     dots = ""
     if len(outliers):
-        face.plot(*outliers.T, ".", color="black", markersize=3.0 if len(outliers) < DENSE else 1.0, markeredgewidth=0)
-        many = f"s: the {len(outliers)} outliers that were" if len(outliers) > 1 else ": the outlier that was"
+        face.plot(*outliers.T, ".", color="black", markersize=3.0 if len(outliers) < MANY_OUTLIERS else 1.0, markeredgewidth=0)
+        many = f"s: {len(outliers)} outliers, which are" if len(outliers) > 1 else ": an outlier, which is"
         dots = f"  Black dot{many} left out."
     change, top = 100.0 * (predicted - designed) / unit, brightest(designed, predicted) / unit
     drawn = _grey(light, predicted / unit, view, top=top, title="Light of the made part, predicted")
     signed = _signed(changed, change, view, most=_largest(change), title="Made − designed light")
     slim = {"fraction": 0.046, "pad": 0.03}
-    figure.colorbar(shown, ax=face, label=f"{written} along the normal", **slim)
+    figure.colorbar(shown, ax=face, label=f"{unit_name} along the normal", **slim)
     figure.colorbar(drawn, ax=light, label=view.mean_lit, **slim)
     figure.colorbar(signed, ax=changed, label=view.percent_lit, extend="both", **slim)
-    said = "Left: form error of the back face after alignment, + out of the glass, from outside with x to the right."
-    view.note(figure, first=f"{said}{dots}\n")
+    left = "Left: form error of the back face after alignment, + out of the glass, seen from outside, x to the right."
+    view.note(figure, first=f"{left}{dots}\n")
     return figure
 
 
@@ -491,9 +490,9 @@ def made_part(made: MadePart, designed: np.ndarray, view: View) -> Figure:
 
 @styled
 def histogram(design: float, limit: float, linear: np.ndarray, full: np.ndarray, adjusted: np.ndarray) -> Figure:
-    """How many trials come to which RRMSD, a bin, as a part of all of their kind.
+    """Draw histograms of the RRMSD of trials, in percent of the trials of each kind.
 
-    linear: by superposed pictures; full: of fewer trials, by full traces; adjusted: of these, with the screen adjusted.
+    linear: trials by superposed pictures; full: trials by full traces; adjusted: these with the screen adjusted.
     """
     figure = new_figure(7.6, 3.1)
     axes = figure.subplots()
@@ -502,17 +501,17 @@ def histogram(design: float, limit: float, linear: np.ndarray, full: np.ndarray,
     low, high = min(low, limit), max(high, limit) if limit < 2 * high else high
     room = 0.03 * (high - low)
     bins = np.linspace(low - room, high + room, BINS + 1)
-    few = bins[:: BINS // 20]  # fewer trials, wider bins
-    for values, edges, look in (
+    wide_bins = bins[:: BINS // 20]  # for fewer trials
+    for values, edges, style in (
         (linear, bins, {"fill": True, "color": BLUE, "alpha": 0.55, "label": f"{len(linear)} trials"}),
-        (full, few, {"color": VERMILION, "linewidth": 2.6, "label": f"{len(full)} by full traces"}),
-        (adjusted, few, {"color": GREEN, "linewidth": 1.1, "label": f"{len(adjusted)} with the screen adjusted"}),
+        (full, wide_bins, {"color": VERMILION, "linewidth": 2.6, "label": f"{len(full)} by full traces"}),
+        (adjusted, wide_bins, {"color": GREEN, "linewidth": 1.1, "label": f"{len(adjusted)} with the screen adjusted"}),
     ):
         counts, _ = np.histogram(np.clip(values, edges[0], edges[-1]), edges)
-        axes.stairs(100.0 * counts / len(values) * (len(edges) - 1) / BINS, edges, **look)
+        axes.stairs(100.0 * counts / len(values) * (len(edges) - 1) / BINS, edges, **style)
     for place, name, line in ((design, "as designed", ":"), (limit, "limit", "--")):
         axes.axvline(place, color=GREY, linestyle=line, linewidth=1.0, label=f"{name} {place:.3g}")
-    axes.set(xlabel="RRMSD", ylabel="% of the trials, a bin", xlim=(bins[0], bins[-1]))
+    axes.set(xlabel="RRMSD", ylabel="% of the trials per bin", xlim=(bins[0], bins[-1]))
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
@@ -521,16 +520,16 @@ def histogram(design: float, limit: float, linear: np.ndarray, full: np.ndarray,
 def worst_trials(
     design: float, nominal: np.ndarray, worst: Sequence[tuple[int, float, np.ndarray]], view: View, of: str = ""
 ) -> Figure:
-    """The light as designed, beside it the light of the worst trials, and below each trial its difference.
+    """Draw the light as designed, the light of the worst trials, and below each trial the difference.
 
-    worst: number, RRMSD and picture (rows, columns) in coordinates, with the target's sum, of each.  of: ", target[0]",
-    where there are several.
+    worst: (number, RRMSD, picture) of each trial; picture (rows, columns) in coordinates, with the target's sum.
+    of: suffix such as ", target[0]" if there are several targets.
     """
     nominal = view.irradiance(nominal)
-    worst = [(number, value, view.irradiance(picture)) for number, value, picture in worst[:SHOWN]]
+    worst = [(number, value, view.irradiance(picture)) for number, value, picture in worst[:MAX_WORST_TRIALS]]
     unit = lit_mean(nominal)
     figure = new_figure(11.0, 1.0 + 4.6 * view.proportion, layout="compressed")
-    panels = figure.subplots(2, 1 + SHOWN, sharex=True, sharey=True, squeeze=False)
+    panels = figure.subplots(2, 1 + MAX_WORST_TRIALS, sharex=True, sharey=True, squeeze=False)
     top = max(brightest(nominal, picture) for _, _, picture in worst) / unit
     off = [100.0 * (picture - nominal) / unit for _, _, picture in worst]
     most = _largest(np.array(off), 0.0)

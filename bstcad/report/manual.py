@@ -1,9 +1,9 @@
-"""The documentation as Markdown for a terminal, where bstcad came without built pages.
+"""Documentation as Markdown for a terminal, for an installation without built pages.
 
-A page is called by its path without ".md", such as "tutorials/first-lens"; what Sphinx alone understands is left out.
+The name of a page is its path without ".md", such as "tutorials/first-lens".  Directives of Sphinx are removed.
 
-checks.md and remarks.md beside this file have a section for each check and remark: a label "(check-rrmsd)=" of the id,
-a heading "###", a line of the sentences as they stand in a report, in which "…" stands for any text, and paragraphs.
+checks.md and remarks.md beside this file have a section for each check and remark: a label "(check-rrmsd)=" with the
+id, a heading "###", a line with the text in a report, in which "…" stands for any text, and paragraphs.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from posixpath import dirname, join, normpath
 
-PLACES = (Path(__file__).parents[1] / "manual", Path(__file__).parents[2] / "docs")  # in a wheel, in sources
+PLACES = (Path(__file__).parents[1] / "manual", Path(__file__).parents[2] / "docs")  # folders in a wheel, in sources
 SITES = (Path(__file__).parents[1] / "site", Path(__file__).parents[2] / "docs/_build/html")  # folders of built pages
 FIRST = "index"  # name of the first page
 PAGES = ("checks", "remarks")  # pages of sections, without ".md"
@@ -27,13 +27,13 @@ LINK = re.compile(r"(?<!!)\[([^]]+)\]\((?!https?:)([^)#\s]*?)(?:\.md)?(?:#[\w-]+
 
 
 def site() -> Path | None:
-    """The folder of the built pages; None where they are not built."""
+    """Return the folder of the built pages; None: they are not built."""
     return next((place for place in SITES if (place / f"{FIRST}.html").is_file()), None)
 
 
 @cache
 def pages() -> dict[str, Path]:
-    """The files of all pages by their names; the pages of checks and remarks are always there."""
+    """Return the files of all pages by their names; the pages of checks and remarks always exist."""
     place = next((place for place in PLACES if (place / f"{FIRST}.md").is_file()), PLACES[-1])
     paths = [path for path in sorted(place.rglob("*.md")) if "_build" not in path.parts]
     found = {path.relative_to(place).with_suffix("").as_posix(): path for path in paths if _title(path)}
@@ -41,14 +41,14 @@ def pages() -> dict[str, Path]:
 
 
 def name_of(topic: str) -> str | None:
-    """The name of a page by its name or by the last part of it; None if there is none, or several."""
+    """Return the name of a page by its name or by the last part of it; None: no page, or several."""
     name = topic.removesuffix(".md")
     ending = [each for each in pages() if each.endswith(f"/{name}")]
     return name if name in pages() else ending[0] if len(ending) == 1 else None
 
 
 def page(name: str) -> str:
-    """The Markdown of a page; links to other pages are names for `bstcad docs`."""
+    """Return the Markdown of a page, in which links to other pages are names for `bstcad docs`."""
 
     def linked(found: re.Match[str]) -> str:
         other = normpath(join(dirname(name), found[2])) if found[2] else ""
@@ -60,25 +60,25 @@ def page(name: str) -> str:
 
 
 def first() -> str:
-    """The first page, and a list of all others."""
+    """Return the first page, and a list of all others."""
     others = "\n".join(f"- `bstcad docs {name}`: {_title(path)}" for name, path in pages().items() if name != FIRST)
     return "\n".join(([page(FIRST)] if FIRST in pages() else ["# bstcad\n"]) + ["## All pages\n", others, ""])
 
 
 @cache
 def sections() -> dict[str, str]:
-    """All sections, markdown from the heading on, by page and label: "checks#check-rrmsd"; in the pages' order."""
+    """Return all sections, Markdown from the heading on, by page and label such as "checks#check-rrmsd", in order."""
     texts = {page: pages()[f"reference/{page}"].read_text(encoding="utf-8") for page in PAGES}
     return {f"{page}#{label}": text for page, whole in texts.items() for label, text in SECTION.findall(whole)}
 
 
 def section(name: str) -> str:
-    """A section whose links to other sections are names for `bstcad docs`: "[check](checks.md#check-rrmsd)"."""
+    """Return a section, in which links such as "[check](checks.md#check-rrmsd)" are names for `bstcad docs`."""
     return TO_A_SECTION.sub(r"\1 (bstcad docs \2)", sections()[name])
 
 
 def show(text: str) -> None:
-    """Show Markdown: rendered, in a pager, on a terminal; else as it is."""
+    """Show Markdown: rendered in a pager on a terminal, otherwise as plain text."""
     from rich.console import Console
     from rich.markdown import Markdown
 
@@ -86,7 +86,7 @@ def show(text: str) -> None:
     if not console.is_terminal:
         print(text, end="")
         return
-    os.environ.setdefault("LESS", "-R")  # this option has less show bold and colour
+    os.environ.setdefault("LESS", "-R")  # with this option `less` shows bold and colour
     with console.pager(styles=True):
         console.print(Markdown(text))
 

@@ -1,11 +1,11 @@
 """Drawing of a part on its data sheet, in mm of paper: a plan from the side of the back, and two sections.
 
-All views have one scale of the standard series (ISO 5455), in first-angle projection (ISO 128-30): the plan, which is
-the view from the right, along -z, stands left of the section that is seen along +x.  Within the rim it is a map of
-heights; around that stand flange and holes.  Lines, arrows and dimensions follow ISO 128 and ISO 129-1, in black, so
-that a copy of a copy can be read.  matplotlib draws them: the drawing add-on of ezdxf 1.4.5, which renders DIMENSION
-entities on such a page, fills the hole of "Ø" and turns letters into curves, so that nobody can search the page or
-copy the SHA-256 from it.
+All views have one scale of the standard series (ISO 5455), in first-angle projection (ISO 128-30).  The plan, which is
+the view from the right, along -z, is left of the section that is seen along +x.  Inside the rim it is a map of heights;
+flange and holes are around it.  Lines, arrows and dimensions follow ISO 128 and ISO 129-1, in black, so that a copy of
+a copy is legible.  They are drawn with matplotlib.  The drawing add-on of ezdxf 1.4.5 renders DIMENSION entities on
+such a page, but it fills the hole of "Ø" and converts text to curves, so that a reader cannot search the page or copy
+the SHA-256 from it.
 """
 
 from __future__ import annotations
@@ -33,28 +33,28 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-POINT = 25.4 / 72  # mm
-THICK, THIN = 0.5, 0.18  # mm; visible edges, all other lines
-ARROW, SLIM = 2.2, 0.36  # mm: length of an arrow's head, and half its width
-OVER = 1.2  # mm by which an extension line exceeds its dimension line
-OFF = 0.7  # mm between a line and its text, or the part and its extension line
-TAIL = 4.5  # mm of a dimension line beyond the measured length
-LETTERS, NOTES, NUMBERS = 2.5, 2.1, 1.9  # mm: letters of dimensions, of leaders and notes, of heights on contours
-CHAIN = (0, (14, 2.5, 2, 2.5))  # of a centre line, in its widths
+POINT = 25.4 / 72  # typographic point (mm)
+THICK, THIN = 0.5, 0.18  # line widths of visible edges and of all other lines (mm)
+ARROW_LENGTH, ARROW_HALF_WIDTH = 2.2, 0.36  # size of an arrow head (mm)
+OVERSHOOT = 1.2  # length of an extension line past its dimension line (mm)
+GAP = 0.7  # distance between a line and its text, or between the part and an extension line (mm)
+TAIL = 4.5  # length of a dimension line outside the measured length (mm)
+LETTERS, NOTES, NUMBERS = 2.5, 2.1, 1.9  # font sizes of dimensions, of leaders and notes, of numbers on contours (mm)
+CHAIN = (0, (14, 2.5, 2, 2.5))  # dashes and gaps of a centre line, in line widths
 FAMILY = STYLE["font.family"]
-SMALLER = 0.8  # times their size texts are where they have little room
-UNKNOWN = "\u25a1"  # a box, for a letter that the font lacks
-MAP_POINTS, SECTION_POINTS = 241, 401  # of the map of heights, each way; along each face of a section
-LEVELS = 18  # contour lines at most
-CALLS = ((1, 1), (-1, -1), (1, -1))  # corners of the plan, right and up, for notes on kinds of holes
-SAME = 5e-4  # mm: dimensions that read alike
-AXES = 7.0  # mm: length of the arrows of the frame
-# Room on paper (mm): left of the plan, between it and the first section, between the sections, right of the last;
+MIN_FONT_SCALE = 0.8  # smallest scale of a text that has little room; a longer text is cut
+UNKNOWN = "\u25a1"  # box for a character that the font lacks
+MAP_POINTS, SECTION_POINTS = 241, 401  # points of the map of heights per axis, and of each face of a section
+MAX_CONTOURS = 18  # largest number of contour lines
+NOTE_CORNERS = ((1, 1), (-1, -1), (1, -1))  # corners of the plan (right, up) for the notes on kinds of holes
+EQUAL_DIMENSIONS = 5e-4  # difference below which two dimensions print the same number (mm)
+AXIS_LENGTH = 7.0  # length of the arrows of the coordinate frame (mm)
+# Margins on paper (mm): left of the plan, between it and the first section, between the sections, right of the last;
 # above all views, and below them.
-SIDES, HEAD, FOOT = (17.0, 26.0, 21.0, 9.0), 17.0, 22.0
+SIDE_MARGINS, TOP_MARGIN, BOTTOM_MARGIN = (17.0, 26.0, 21.0, 9.0), 17.0, 22.0
 RIGHT, UP, DOWN = np.array([1.0, 0.0]), np.array([0.0, 1.0]), np.array([0.0, -1.0])
 
-Point = Pair = tuple[float, float]  # x, y on paper; or z, u in a section; or a value at its lower and upper end (mm)
+Point = Pair = tuple[float, float]  # x, y on paper; z, u in a section; or the lower and upper end of an interval (mm)
 
 
 # --- paper ------------------------------------------------------------------------------------------------------------
@@ -62,13 +62,13 @@ Point = Pair = tuple[float, float]  # x, y on paper; or z, u in a section; or a 
 
 @dataclass(frozen=True, eq=False)
 class Paper:
-    """A sheet of paper; every coordinate in mm from its lower left corner."""
+    """Sheet of paper; all coordinates in mm from its lower left corner."""
 
     axes: Axes
 
     @classmethod
     def of(cls, figure: Figure) -> Paper:
-        """The whole figure as paper."""
+        """Return the whole figure as paper."""
         width, height = figure.get_size_inches() * 25.4
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set_axis_off()
@@ -76,38 +76,38 @@ class Paper:
         return cls(axes)
 
     def line(self, points: Sequence[Any], width: float = THIN, **style: Any) -> None:
-        """A line through points (x, y)."""
+        """Draw a line through points (x, y)."""
         given = {"color": "black", "solid_capstyle": "butt", "dash_capstyle": "butt", "solid_joinstyle": "miter"}
         self.axes.plot(*np.asarray(points, dtype=float).T, linewidth=width / POINT, **(given | style))
 
     def axis(self, start: Point, end: Point) -> None:
-        """A centre line."""
+        """Draw a centre line."""
         self.line([start, end], linestyle=CHAIN, color=GREY, zorder=1.5)
 
     def area(self, points: Sequence[Any], **style: Any) -> None:
-        """A filled polygon without an edge."""
+        """Draw a filled polygon without an edge."""
         self.axes.fill(*np.asarray(points, dtype=float).T, **({"linewidth": 0} | style))
 
     def text(
         self, x: float, y: float, text: str, size: float = LETTERS, *, room: float | None = None, **style: Any
     ) -> None:
-        """Text with an em of `size` mm; made smaller, then cut, where `room` (mm) is too narrow for it."""
+        """Write text with an em of `size` mm; if it is wider than `room` (mm), it is made smaller, then cut."""
         text = drawable(text)
         if room is not None:
             text, size = fitted(text, size, room, style.get("weight") == "bold")
         self.axes.text(x, y, text, fontsize=size / POINT, parse_math=False, **({"va": "baseline"} | style))
 
     def arrow(self, tip: Point, towards: Point, color: str = "black", **style: Any) -> None:
-        """A slim filled head at `tip` that points along `towards`, a unit vector."""
-        ahead, aside = ARROW * np.array(towards), SLIM * np.array([-towards[1], towards[0]])
+        """Draw a filled arrow head at `tip` that points along `towards`, a unit vector."""
+        ahead, aside = ARROW_LENGTH * np.array(towards), ARROW_HALF_WIDTH * np.array([-towards[1], towards[0]])
         self.area([tip, tip - ahead + aside, tip - ahead - aside], color=color, **style)
 
     def dimension(
         self, ends: tuple[float, float], level: float, feet: tuple[float, float], text: str, upright: bool = False
     ) -> None:
-        """A dimension along x between two ends, its line at y = level; upright: along y at x = level, read from right.
+        """Draw a dimension along x between two ends, its line at y = level.
 
-        feet: y (upright: x) of the part at these ends.
+        upright: along y, its line at x = level, read from the right.  feet: y (upright: x) of the part at the ends.
         """
 
         def at(along: float, beside: float) -> Point:
@@ -116,27 +116,27 @@ class Paper:
         low, high = ends
         for end, foot in zip(ends, feet, strict=True):
             sense = np.sign(level - foot)
-            self.line([at(end, foot + sense * OFF), at(end, level + sense * OVER)])
+            self.line([at(end, foot + sense * GAP), at(end, level + sense * OVERSHOOT)])
         wide, gap = width_of(text, LETTERS), high - low
-        within, tail = (1, 0.0) if gap >= 2 * ARROW + 1 else (-1, TAIL)  # arrows from inside or from outside
-        shelf, above = gap < wide + 1, level - OFF if upright else level + OFF
-        self.line([at(low - tail, level), at(high + (ARROW + 1 + wide if shelf else tail), level)])
-        self.arrow(at(low, level), at(-within, 0))
-        self.arrow(at(high, level), at(within, 0))
+        inwards, tail = (1, 0.0) if gap >= 2 * ARROW_LENGTH + 1 else (-1, TAIL)  # arrows from inside or from outside
+        shelf, above = gap < wide + 1, level - GAP if upright else level + GAP
+        self.line([at(low - tail, level), at(high + (ARROW_LENGTH + 1 + wide if shelf else tail), level)])
+        self.arrow(at(low, level), at(-inwards, 0))
+        self.arrow(at(high, level), at(inwards, 0))
         turned = {"rotation": 90, "rotation_mode": "anchor"} if upright else {}
-        place = high + ARROW + 1 if shelf else (low + high) / 2
+        place = high + ARROW_LENGTH + 1 if shelf else (low + high) / 2
         self.text(*at(place, above), text, ha="left" if shelf else "center", **turned)
 
     def leader(self, tip: Point, to: Point, text: str, sense: int) -> None:
-        """A note on a shelf that begins at `to` and runs to the right (sense 1) or left (-1), its arrow at `tip`."""
+        """Draw a note with an arrow at `tip`; its shelf begins at `to` and runs right (sense 1) or left (-1)."""
         (x, y), ahead = to, np.subtract(tip, to)
         self.line([tip, to, (x + sense * (width_of(text, NOTES) + 1.0), y)])
         self.arrow(tip, tuple(ahead / max(np.hypot(*ahead), 1e-9)))
         ground = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}  # covers extension lines
-        self.text(x + 0.5 * sense, y + OFF, text, NOTES, ha="left" if sense > 0 else "right", bbox=ground)
+        self.text(x + 0.5 * sense, y + GAP, text, NOTES, ha="left" if sense > 0 else "right", bbox=ground)
 
     def first_angle(self, x: float, y: float, size: float) -> None:
-        """The symbol of first-angle projection (ISO 5456-2): a cone's frustum, and the view from its left beside it."""
+        """Draw the symbol of first-angle projection (ISO 5456-2): frustum of a cone, and its view from the left."""
         half, end = size / 2, x + 1.4 * size
         centre = end + 0.4 * size + half
         self.line([(x, y - half / 2), (end, y - half), (end, y + half), (x, y + half / 2), (x, y - half / 2)], 0.3)
@@ -148,7 +148,7 @@ class Paper:
 
 
 def drawable(text: str) -> str:
-    """The text with a box for every letter that the font lacks, which every machine has."""
+    """Return the text with a box for each character that the font lacks; every machine has this font."""
     return "".join(c if ord(c) in _letters() else UNKNOWN for c in text)
 
 
@@ -160,7 +160,7 @@ def _letters() -> frozenset[int]:
 
 
 def width_of(text: str, size: float, bold: bool = False) -> float:
-    """Width (mm) of a line of text whose em is `size` mm."""
+    """Return the width (mm) of a line of text whose em is `size` mm."""
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import text_to_path
 
@@ -169,8 +169,8 @@ def width_of(text: str, size: float, bold: bool = False) -> float:
 
 
 def fitted(text: str, size: float, room: float, bold: bool = False) -> tuple[str, float]:
-    """(text, size) for a room of that width (mm): down to SMALLER of its size, then cut at its end."""
-    size *= max(SMALLER, min(1.0, room / max(width_of(text, size, bold), 1e-9)))
+    """Return (text, size) for a width (mm): scaled down to MIN_FONT_SCALE at least, then cut at its end."""
+    size *= max(MIN_FONT_SCALE, min(1.0, room / max(width_of(text, size, bold), 1e-9)))
     if width_of(text, size, bold) > room * (1 + 1e-9):
         while text and width_of(f"{text}\u2026", size, bold) > room:
             text = text[:-1]
@@ -179,7 +179,7 @@ def fitted(text: str, size: float, room: float, bold: bool = False) -> tuple[str
 
 
 def wrapped(text: str, size: float, room: float, most: int) -> list[str]:
-    """The text in at most `most` lines of that width (mm), broken between words; the last line is cut where printed."""
+    """Return the text in at most `most` lines of a width (mm), broken between words; the last line may be longer."""
     lines = [""]
     for word in drawable(text).split():
         longer = f"{lines[-1]} {word}".strip()
@@ -191,7 +191,7 @@ def wrapped(text: str, size: float, room: float, most: int) -> list[str]:
 
 
 def closed(outline: Outline) -> np.ndarray:
-    """Points (n, 2) (mm) around an outline, the first again at the end."""
+    """Return points (n, 2) (mm) around an outline, with the first point again at the end."""
     (a, b, r2), turn = outline.limits, np.linspace(0, 2 * np.pi, 361)
     cos, sin, r = np.cos(turn), np.sin(turn), math.sqrt(r2)
     points = np.stack([np.sign(cos) * a + r * cos, np.sign(sin + 1e-12) * b + r * sin], axis=1)
@@ -205,27 +205,26 @@ def closed(outline: Outline) -> np.ndarray:
 class Profile:
     """Cross-section of a part: polygons (z, u) in mm, u along the cut, in the frame of the part's file.
 
-    Along the middle of a straight side and on a circle draft leans walls within the plane of the cut, so that two
-    dimensions are enough.
+    The cut meets each wall at right angles, so that its draft lies in the plane of the cut.
     """
 
-    bodies: tuple[np.ndarray, ...]  # (n, 2) each, the first point again at the end
-    back: Pair  # z of the back's ends
-    front: Pair
-    front_ends: Pair  # u where the front ends
-    behind: tuple[np.ndarray, ...]  # (2, 2) each: edges of the flange's planes, seen behind its holes
+    bodies: tuple[np.ndarray, ...]  # polygons (n, 2), with the first point again at the end
+    back: Pair  # z at the ends of the back
+    front: Pair  # z at the ends of the front
+    front_ends: Pair  # u at the ends of the front
+    behind: tuple[np.ndarray, ...]  # edges (2, 2) of the flange's planes, visible behind its holes
 
     @property
     def ends(self) -> tuple[Pair, Pair]:
-        """(least and largest z, least and largest u) of all bodies."""
+        """Intervals of z and of u over all bodies."""
         every = np.concatenate(self.bodies)
         return tuple(zip(every.min(0).tolist(), every.max(0).tolist(), strict=True))
 
 
 def profile(lens: Lens, mount: Mount, upright: bool, origin: float = 0.0) -> Profile:
-    """Section of a lens in its mount, which have to fit; upright: along y at x = 0, else along x at y = 0.
+    """Return the section of a lens in its mount; upright: along y at x = 0, else along x at y = 0.
 
-    origin: z in the scene's frame (mm) that is 0 in the part's file.
+    Lens and mount have to fit.  origin: z of the file's origin in the frame of the scene (mm).
     """
 
     def height(surface: Surface, u: np.ndarray) -> np.ndarray:
@@ -257,10 +256,10 @@ def profile(lens: Lens, mount: Mount, upright: bool, origin: float = 0.0) -> Pro
 def _flange(
     flange: Flange, half: float, upright: bool, low: float
 ) -> tuple[list[shapely.Polygon], shapely.Geometry, list[np.ndarray]]:
-    """The flange's section on either side of the rim without its holes, these, and the edges of its planes."""
+    """Return the sections of the flange on both sides of the rim, its holes, and the edges of its planes."""
     high, lean, b = low + flange.thickness, math.tan(math.radians(flange.draft)), flange.bevel
     reach = flange.outline.outline.half_extent[upright]
-    foot, head = reach - lean * b, reach - lean * (flange.thickness - b)  # ends of the leaning wall
+    foot, head = reach - lean * b, reach - lean * (flange.thickness - b)  # ends of the wall with draft
     wall = [(high, half), (high, head - b), (high - b, head), (low + b, foot), (low, foot - b), (low, half)]
     holes = []
     for x, y, diameter in flange.all_holes():
@@ -273,7 +272,7 @@ def _flange(
 
 
 def _wall(front: Callable[[float], float], z: float, half: float, mount: Mount) -> np.ndarray:
-    """The lens's own wall from z downwards to the front, points (z, |u|): it leans, and ends in a bevel."""
+    """Return points (z, |u|) of the lens's wall from z down to the front, with draft and bevel."""
     lean = math.tan(math.radians(mount.draft))
     depth = _depth(front, z, half, lean) - mount.bevel
     chain = [(z, half), (z - depth, half - lean * depth)]
@@ -284,7 +283,7 @@ def _wall(front: Callable[[float], float], z: float, half: float, mount: Mount) 
 
 
 def _depth(front: Callable[[float], float], z: float, u: float, lean: float) -> float:
-    """Depth (mm) below (z, u) at which a wall that leans inwards by `lean`, mm a mm, meets the front."""
+    """Return the depth (mm) below (z, u) at which a wall with draft `lean` (mm per mm, inwards) meets the front."""
     if not lean:
         return z - front(u)
     return brentq(lambda depth: z - depth - front(u - lean * depth), 0.0, u / lean)
@@ -295,13 +294,13 @@ def _depth(front: Callable[[float], float], z: float, u: float, lean: float) -> 
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """A part to be drawn, in the frame of its file; mm."""
+    """Part that is drawn, in the frame of its file; mm."""
 
-    lens: Lens  # within the rim
-    mount: Mount  # Mount() of a bare lens
-    origin: float  # z in the scene's frame that is 0 in the file
-    used: Outline | None  # clear aperture of the back; None: all of it
-    names: tuple[tuple[str, str], tuple[str, str]]  # of the front and of the back: long, short
+    lens: Lens  # lens inside the rim
+    mount: Mount  # Mount() for a bare lens
+    origin: float  # z of the file's origin in the frame of the scene
+    used: Outline | None  # clear aperture of the back; None: the whole face
+    names: tuple[tuple[str, str], tuple[str, str]]  # names of front and back: (long, short) each
 
     @cached_property
     def cuts(self) -> tuple[Profile, Profile]:
@@ -310,7 +309,7 @@ class Views:
 
     @property
     def rim(self) -> Outline:
-        """Rim of the lens in the part."""
+        """Rim of the lens inside the part."""
         return self.mount.rim_of(self.lens.outline).outline
 
     @property
@@ -320,61 +319,61 @@ class Views:
 
     @property
     def vertices(self) -> tuple[float, float]:
-        """z (mm) where front and back cross the axis."""
+        """Positions z of front and back on the axis (mm)."""
         return self.lens.front_vertex - self.origin, float(sag(self.lens.back, 0.0, 0.0)) - self.origin
 
 
 @dataclass(frozen=True)
-class Placed:
-    """Coordinates of a view (mm) on paper (mm)."""
+class PaperFrame:
+    """Map from coordinates of a view (mm) to coordinates on paper (mm)."""
 
     scale: float
-    x: float  # of the view's origin on paper
+    x: float  # position of the view's origin on paper
     y: float
 
     def __call__(self, points: Any) -> np.ndarray:
-        """Points (n, 2), or one."""
+        """Return points (n, 2), or one point, on paper."""
         return (self.x, self.y) + self.scale * np.asarray(points, dtype=float)
 
 
 def scale_for(views: Views, width: float, height: float) -> float:
-    """The largest scale of the series 1, 2, 5, 10 … at which all views fit on paper of that size (mm)."""
+    """Return the largest scale of the series 1, 2, 5, 10 … at which all views fit on paper of this size (mm)."""
     a, b = views.outermost.half_extent
     wide = 2 * a + sum(np.ptp(cut.ends[0]) for cut in views.cuts)
-    most = min((width - sum(SIDES)) / wide, (height - HEAD - FOOT) / (2 * max(a, b)))
+    most = min((width - sum(SIDE_MARGINS)) / wide, (height - TOP_MARGIN - BOTTOM_MARGIN) / (2 * max(a, b)))
     decade = 10.0 ** np.floor(np.log10(most))
     return float(max(step * decade for step in (1, 2, 5) if step * decade <= most * (1 + 1e-9)))
 
 
 def scale_words(scale: float) -> str:
-    """5:1, 1:1, 1:20."""
+    """Return a scale in words: 5:1, 1:1, 1:20."""
     return f"{scale:.6g}:1" if scale >= 1 else f"1:{1 / scale:.6g}"
 
 
 def draw(paper: Paper, views: Views, *, left: float, low: float, right: float, high: float) -> float:
-    """All views side by side in that part of the paper (mm); the scale."""
+    """Draw all views side by side in a part of the paper (mm); return the scale."""
     scale = scale_for(views, right - left, high - low)
     a, b = views.outermost.half_extent
     wide, reach = 2 * scale * a, scale * max(a, b)
     thick = [scale * np.ptp(cut.ends[0]) for cut in views.cuts]
-    spare = (right - left - sum(SIDES) - wide - sum(thick)) / 6
-    middle = low + FOOT + reach + max(0.0, (high - low - HEAD - FOOT - 2 * reach) / 2)
-    x = left + spare + SIDES[0]
-    _plan(paper, views, Placed(scale, x + wide / 2, middle))
-    x += wide + SIDES[1] + 2 * spare
+    spare = (right - left - sum(SIDE_MARGINS) - wide - sum(thick)) / 6
+    middle = low + BOTTOM_MARGIN + reach + max(0.0, (high - low - TOP_MARGIN - BOTTOM_MARGIN - 2 * reach) / 2)
+    x = left + spare + SIDE_MARGINS[0]
+    _plan(paper, views, PaperFrame(scale, x + wide / 2, middle))
+    x += wide + SIDE_MARGINS[1] + 2 * spare
     note = f"origin of x, y, z: {origin(views)}"
     paper.text(x - 15.5, middle - reach - 20.5, note, NOTES, room=right - 2 - (x - 15.5), color=VERMILION)
     _section(paper, views, 0, scale, left=x, middle=middle)
-    _section(paper, views, 1, scale, left=x + thick[0] + SIDES[2] + 2 * spare, middle=middle)
+    _section(paper, views, 1, scale, left=x + thick[0] + SIDE_MARGINS[2] + 2 * spare, middle=middle)
     return scale
 
 
 def origin(views: Views) -> str:
-    """Position of the point (0, 0, 0) of the file on the axis, from the nearer face."""
+    """Return the position of the file's origin on the axis in words, relative to the nearer face."""
     names = map(views.lens.passes.name, ("front", "back"))
     near, name = min(zip(views.vertices, names, strict=True), key=lambda face: abs(face[0]))
     if not near:
-        return f"where the axis meets the {name}"
+        return f"at the vertex of the {name}"
     at = f"on the axis, {mm(abs(near))} mm to the {'left' if near > 0 else 'right'} of the {name}"
     return f"{at}, in the flange's lower face" if views.mount.datum == "flange" else at
 
@@ -382,8 +381,8 @@ def origin(views: Views) -> str:
 # --- the plan ---------------------------------------------------------------------------------------------------------
 
 
-def _plan(paper: Paper, views: Views, at: Placed) -> None:
-    """The part as seen along -z, x to the right and y up, its back with contour lines."""
+def _plan(paper: Paper, views: Views, at: PaperFrame) -> None:
+    """Draw the part as seen along -z, x to the right and y up, with contour lines of the back."""
     outer, x, y = views.outermost, at.x, at.y
     a, b = (at.scale * half for half in outer.half_extent)
     step = _contours(paper, views, at)
@@ -398,7 +397,7 @@ def _plan(paper: Paper, views: Views, at: Placed) -> None:
         _around(paper, views, views.mount.flange, at)
     paper.axis((x - a - 3, y), (x + a + 3, y))
     paper.axis((x, y - b - 3), (x, y + b + 3))
-    _frame(paper, (x, y), ("x", "y"), min(AXES, a, b))
+    _frame(paper, (x, y), ("x", "y"), min(AXIS_LENGTH, a, b))
     for letter, along, seen, reach in (("A", UP, RIGHT, b), ("B", RIGHT, DOWN, a)):  # planes of the sections
         for sense in (-1, 1):
             start, middle = ((x, y) + sense * (reach + off) * along for off in (3.2, 4.9))
@@ -413,18 +412,18 @@ def _plan(paper: Paper, views: Views, at: Placed) -> None:
         paper.dimension((y - b, y + b), x - a - 11, (x - a, x - a), mm(outer.height), upright=True)
     face = views.lens.passes.name("back").capitalize()
     paper.text(x, y + b + 12, f"{face}, seen along \u2212z", ha="center", weight="bold")
-    note = f"contours of z every {step}" if step else "no contours: the back is level"
+    note = f"contours of z every {step}" if step else "no contours: the back is flat"
     paper.text(x, y - b - 17, note, NOTES, ha="center", color=BLUE)
 
 
-def _around(paper: Paper, views: Views, flange: Flange, at: Placed) -> None:
-    """Flange and holes around the lens, with notes on rim and holes."""
+def _around(paper: Paper, views: Views, flange: Flange, at: PaperFrame) -> None:
+    """Draw flange and holes around the lens, with notes on rim and holes."""
     outer = views.outermost
     over, under = (at.y + sense * (at.scale * outer.half_extent[1] + 6.2) for sense in (1, -1))  # y of notes
     paper.line(at(closed(outer)), THICK, zorder=5)
     lean = math.tan(math.radians(flange.draft))
-    if taken := flange.thickness * lean + flange.bevel * (1 - lean):
-        paper.line(at(closed(outer.inset(taken))), 0.25, zorder=5)  # the edge of its upper face
+    if inset := flange.thickness * lean + flange.bevel * (1 - lean):
+        paper.line(at(closed(outer.inset(inset))), 0.25, zorder=5)  # edge of the upper face
     u, v = views.rim.half_extent
     part = 0.5**0.5 if views.rim.is_round else 0.5
     tip = at((-part * u, part * v))
@@ -436,7 +435,7 @@ def _around(paper: Paper, views: Views, flange: Flange, at: Placed) -> None:
         for ahead in (diameter / 2 + 1.5 / at.scale) * np.stack([RIGHT, UP]):
             paper.line(at([(x, y) - ahead, (x, y) + ahead]), color=GREY, zorder=1.5)
 
-    for (text, holes), (right, up) in zip(kinds_of_holes(views.mount), CALLS, strict=False):
+    for (text, holes), (right, up) in zip(kinds_of_holes(views.mount), NOTE_CORNERS, strict=False):
         x, y, diameter = max(holes, key=lambda hole, corner=(right, up): np.dot(hole[:2], corner))
         tip = at((x, y) + 0.5**0.5 * diameter / 2 * np.array([right, up]))
         shelf = at.x + right * max(right * (tip[0] - at.x), 6.5), over if up > 0 else under
@@ -444,7 +443,7 @@ def _around(paper: Paper, views: Views, flange: Flange, at: Placed) -> None:
 
 
 def kinds_of_holes(mount: Mount) -> Iterator[tuple[str, list[tuple[float, float, float]]]]:
-    """Each kind of holes through the flange: its note, and x, y and diameter (mm) of its holes."""
+    """Yield each kind of holes through the flange: its note, and x, y and diameter (mm) of its holes."""
     flange = mount.flange
     if flange is not None and (screws := flange.screws) is not None:
         yield f"{screws.count} \u00d7 \u00d8{mm(screws.diameter)} on \u00d8{mm(screws.circle)}", list(screws.holes())
@@ -454,8 +453,8 @@ def kinds_of_holes(mount: Mount) -> Iterator[tuple[str, list[tuple[float, float,
         yield f"{len(alike)} \u00d7 " * (len(alike) > 1) + f"\u00d8{mm(diameter)}", alike
 
 
-def _contours(paper: Paper, views: Views, at: Placed) -> str:
-    """Draw the lines of equal z; their step in words, "" if there are none."""
+def _contours(paper: Paper, views: Views, at: PaperFrame) -> str:
+    """Draw contours of z; return their step in words, "" if there are none."""
     x, y = (np.linspace(-end, end, MAP_POINTS) for end in views.rim.half_extent)
     grid_x, grid_y = np.meshgrid(x, y)
     z = sag(views.lens.back, grid_x, grid_y) - views.origin
@@ -463,7 +462,7 @@ def _contours(paper: Paper, views: Views, at: Placed) -> str:
     low, high = float(np.nanmin(z)), float(np.nanmax(z))
     if not high - low > 1e-9 * max(1.0, abs(low), abs(high)):
         return ""
-    step = round_up((high - low) / LEVELS)
+    step = round_up((high - low) / MAX_CONTOURS)
     levels = step * np.arange(np.ceil(low / step), np.floor(high / step) + 1)
     decimals = max(0, -int(np.floor(np.log10(step) + 1e-9)))
     on_paper = at.x + at.scale * x, at.y + at.scale * y
@@ -472,7 +471,7 @@ def _contours(paper: Paper, views: Views, at: Placed) -> str:
     edges = [edge for edge in (views.rim, views.used) if edge is not None]
     for label in paper.axes.clabel(drawn, fmt=f"%.{decimals}f", fontsize=size, inline=False, zorder=3):
         off = np.abs(np.subtract(label.get_position(), (at.x, at.y)))
-        clear = [*off, np.hypot(*off) - AXES, *(at.scale * abs(edge.depth(*off / at.scale)) for edge in edges)]
+        clear = [*off, np.hypot(*off) - AXIS_LENGTH, *(at.scale * abs(edge.depth(*off / at.scale)) for edge in edges)]
         if min(clear) < width_of(label.get_text(), NUMBERS) / 2 + 0.5:  # it would cover an axis, the frame or an edge
             label.remove()
         label.set_bbox(ground)
@@ -483,10 +482,10 @@ def _contours(paper: Paper, views: Views, at: Placed) -> str:
 
 
 def _section(paper: Paper, views: Views, which: int, scale: float, *, left: float, middle: float) -> None:
-    """A section, z to the right, its lowest z at `left`; which: 0 is x = 0, with y up, 1 is y = 0, with x up."""
+    """Draw a section, z to the right, its lowest z at `left`; which: 0 for x = 0 with y up, 1 for y = 0 with x up."""
     cut, half = views.cuts[which], [scale * half for half in views.outermost.half_extent]
     (lowest, highest), _ = cut.ends
-    at, right = Placed(scale, left - scale * lowest, middle), left + scale * (highest - lowest)
+    at, right = PaperFrame(scale, left - scale * lowest, middle), left + scale * (highest - lowest)
     reach, sense = half[1 - which], views.lens.passes.sense
     for body in cut.bodies:  # cut material: a tone, and thin lines at 45 degrees (ISO 128-50)
         paper.area(at(body), facecolor=GLASS, hatch="//", edgecolor=GREY, zorder=0.5)
@@ -504,11 +503,11 @@ def _section(paper: Paper, views: Views, which: int, scale: float, *, left: floa
         name = next((name for name in names if width_of(name, LETTERS) <= room), names[-1])
         paper.text(beside, middle + room / 2 + 1, name, room=room, **turned)
     inside = left - 16 <= at.x <= right + 3
-    _frame(paper, (at.x if inside else left - 15.5, middle), ("z", "yx"[which]), min(AXES, reach))
+    _frame(paper, (at.x if inside else left - 15.5, middle), ("z", "yx"[which]), min(AXIS_LENGTH, reach))
     if which == 1:
         _walls(paper, views, at, reach)
         return
-    start = left - 15.5 if sense > 0 else right + 10  # an arrow with the light, to the face it meets
+    start = left - 15.5 if sense > 0 else right + 10  # arrow in the direction of the light
     end, y = start + sense * 8.5, middle - 9
     paper.line([(start, y), (end - sense, y)], 0.25, color=VERMILION)
     paper.arrow((end, y), sense * RIGHT, VERMILION)
@@ -516,9 +515,9 @@ def _section(paper: Paper, views: Views, which: int, scale: float, *, left: floa
 
 
 def _thicknesses(
-    views: Views, which: int, at: Placed, reach: float
+    views: Views, which: int, at: PaperFrame, reach: float
 ) -> Iterator[tuple[tuple[float, float], float, tuple[float, float]]]:  # fmt: skip
-    """Dimensions along z, of the edge or of the flange, its position and the whole: z (mm), level and feet on paper."""
+    """Yield dimensions along z of edge or flange and of the whole part: z (mm), level and feet on paper."""
     cut, flange, (front, back) = views.cuts[which], views.mount.flange, views.vertices
     middle, top, foot = at.y, at.y + reach, at.y - reach
     if flange is None:
@@ -530,14 +529,14 @@ def _thicknesses(
             yield ((front, low), top + 5, (middle, top)) if front < low else ((low, front), top + 5, (top, middle))
             return
         yield (low, high), top + 5, (top, top)
-        if max(abs(lowest - front), abs(highest - back)) > SAME:
+        if max(abs(lowest - front), abs(highest - back)) > EQUAL_DIMENSIONS:
             yield (lowest, highest), foot - 6, (middle, middle)
     if which == 0:
         yield (front, back), foot - 13, (middle, middle)
 
 
-def _walls(paper: Paper, views: Views, at: Placed, reach: float) -> None:
-    """Draft and bevel of the lens's own walls, beside the lower end of the cut, and of the flange's, below it."""
+def _walls(paper: Paper, views: Views, at: PaperFrame, reach: float) -> None:
+    """Write draft and bevel of the lens's walls beside the lower end of the cut, and those of the flange below it."""
     mount, cut, flange = views.mount, views.cuts[1], views.mount.flange
     if words := wall_words(mount):
         tip = at((cut.front[0], cut.front_ends[0]))
@@ -548,14 +547,14 @@ def _walls(paper: Paper, views: Views, at: Placed, reach: float) -> None:
 
 
 def wall_words(walls: Mount | Flange) -> str:
-    """Draft and bevel as a drawing names them, "" without both."""
+    """Return draft and bevel in the words of a drawing, "" without both."""
     draft, bevel = f"draft {walls.draft:g}\u00b0", f"{walls.bevel:g} \u00d7 45\u00b0"
     return ", ".join([draft] * bool(walls.draft) + [bevel] * bool(walls.bevel))
 
 
 def _frame(paper: Paper, at: Point, names: tuple[str, str], size: float) -> None:
-    """The frame of the file with its origin there: arrows to the right and up, with their names."""
-    for towards, name, off in ((RIGHT, names[0], (OFF, 0.6)), (UP, names[1], (0.8, -0.6))):
+    """Draw the coordinate frame of the file with its origin at `at`: arrows to the right and up, with their names."""
+    for towards, name, off in ((RIGHT, names[0], (GAP, 0.6)), (UP, names[1], (0.8, -0.6))):
         tip = at + size * towards
         paper.line([at, tip - towards], 0.35, color=VERMILION, zorder=6)
         paper.arrow(tip, towards, VERMILION, zorder=6)

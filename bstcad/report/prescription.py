@@ -1,13 +1,13 @@
-"""A lens and its part in figures: the prescription, the order for a shop, and the facts of a STEP file alone.
+"""Numbers of a lens and its part: the prescription, the order for a shop, and the facts of a STEP file by itself.
 
-The prescription is every surface as it was designed, with source and target, to the last bit: not the numbers of the
-scene, whose radius may have been free and whose back may have had to move, and not rounded:
+The prescription states every surface as it was designed, with source and target, with all digits.  These may differ
+from the numbers of the scene, whose radius may be free and whose back may be moved:
 
-    the lens:    front at its vertex, glass, back at its vertex (where each crosses the axis)
-    the signs:   light travels along +z; a radius is positive if its centre lies further along +z than its vertex
+    lens:    front at its vertex, glass, back at its vertex (intersections with the axis)
+    signs:   light travels along +z; a radius is positive if the centre of curvature is on the +z side of the vertex
 
 The order is one record for datasheet.pdf, report.html and report.json.  Its sizes, volume and mass are those of the
-file that is sent, as it was read back: part.step of a scene with a mount.  Lengths are in mm, angles in degrees,
+file for the shop, as it was read back: part.step for a scene with a mount.  Lengths in mm, angles in degrees,
 wavelengths in nm.
 """
 
@@ -36,53 +36,56 @@ from bstcad.scene.schema import FileContent
 if TYPE_CHECKING:
     from bstcad.cad.solid_properties import WholePart
 
-MOVED = 1e-3  # of the thickness that was drawn; by less the vertex moves in stage 2 anyhow
-WAYS = {  # of the light
+MIN_SHIFT = 1e-3  # smallest shift of the back's vertex that scene.toml mentions, as a fraction of the thickness
+LIGHT_DIRECTIONS = {  # kind of the optic: direction of the light in words
     "lens": "Light travels along +z",
-    "mirror": "Light comes down to the mirror along -z and leaves it along +z",
+    "mirror": "Light travels to the mirror along -z and leaves it along +z",
 }
 TEXT = """\
 Prescription of {name}
 
 Lengths in mm, angles in degrees, wavelengths in nm.  The axis is x = y = 0.
-{way}.
-A radius is positive if its centre lies further along +z than the vertex.
+{direction}.
+A radius is positive if the centre of curvature lies on the +z side of the vertex.
 {exact}
 """
-EXACT = (  # of a lens with one tailored face, and with two
+EXACT = (  # sentences for one tailored face and for two
     "The freeform back is exact in lens.step, and its control points are in design.npz.",
     "Both freeform faces are exact in lens.step, and their control points are in design.npz.",
 )
 SHEET, PART, LENS = "datasheet.pdf", "part.step", "lens.step"
-DATUMS = {"front": "the vertex of the front", "flange": "the lower face of the flange"}  # mount.datum: z = 0 is there
-FILLED = 1e-3  # of an outline's area; an edge that leaves no more of it out is its own
+DATUMS = {"front": "the vertex of the front", "flange": "the lower face of the flange"}  # mount.datum: position of z = 0
+EDGE_TOLERANCE = 1e-3  # fraction of an outline's area outside an edge below which the edge equals the outline
 
-Place = tuple[float, float, float]
+Point = tuple[float, float, float]
 
 
 def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str, Any]:
-    """Of `lens` as it was designed for `scene`; shape: of bstcad.analysis.shape, and the volume."""
+    """Return the prescription of a lens that was designed for a scene.
+
+    shape: facts by bstcad.analysis.shape.describe, and the volume.
+    """
     front, material = lens.front, scene.lens.material
     own = scene.lens.front.designed(front).surface.plain().parameters()  # heights, if it is a net
     numbers = ({"curvature": 0.0} if front.level else {}) | {n: v for n, v in own.items() if isinstance(v, float)}
     fitted = {"within": FIT_TOLERANCE} if front.is_net and scene.lens.front.kind != "bspline" else {}  # mm
     heavy = density(material) if material else None
-    held = ((each.name, getattr(scene.source, each.name)) for each in fields(scene.source))
-    files = {name: value.name for name, value in held if isinstance(value, FileContent)}
+    values = ((each.name, getattr(scene.source, each.name)) for each in fields(scene.source))
+    files = {name: value.name for name, value in values if isinstance(value, FileContent)}
     return {
         "name": scene.name,
         "title": scene.title,
-        "wavelength": scene.source.main_wavelength,  # of several lines the main one
+        "wavelength": scene.source.main_wavelength,  # main line of a spectrum
         "material": material,  # None: only the index is known, or it is a mirror
         "index": lens.index,
         "outline": asdict(lens.outline),
-        "clear": lens.clear and tuple(map(asdict, lens.clear)),  # apertures of front and back; None: no mount
+        "clear": lens.clear and tuple(map(asdict, lens.clear)),  # clear apertures of front and back; None: no mount
         "front": _own(front) | _face(scene.lens.front.kind, lens.front_vertex, numbers) | fitted,
         "back": _face("bspline", vertex(lens), {}),
-        "reflects": lens.reflects,  # is it a mirror?
+        "reflects": lens.reflects,  # True for a mirror
         "net": _net(lens.back),
         **({"front_net": _net(front), "front_asked": scene.lens.front.z} if lens.shapes("front") else {}),
-        "back_asked": scene.lens.back.z,  # z at which the scene has the back's vertex
+        "back_asked": scene.lens.back.z,  # position of the back's vertex in the scene
         "centre_thickness": shape["centre_thickness"],
         "edge_thickness": (shape["edge_thickness_min"], shape["edge_thickness_max"]),
         "volume": shape["volume"],  # mm³
@@ -94,26 +97,26 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
 
 
 def _net(face: BSplineSurface) -> dict[str, Any]:
-    """The net of a face that is tailored."""
+    """Return the net of a tailored face."""
     return {
-        "control_points": face.shape,  # along x and y
+        "control_points": face.shape,  # numbers along x and y
         "degree": DEGREE,
         "knots": _knots(face.shape),
-        "x": face.x,  # between which the net lies; beyond the rim of a round lens
+        "x": face.x,  # extent of the net, which for a round lens reaches outside the rim
         "y": face.y,
     }
 
 
 def _knots(shape: tuple[int, int]) -> str:
-    """The knots in either direction, or along x and along y where these differ."""
+    """Return the knots in words: once for both directions, or along x and along y if they differ."""
     each = [f"0, 0, 0, 1, 2, …, {m - 3}, {m - 2}, {m - 2}, {m - 2}" for m in shape]
     return each[0] if each[0] == each[1] else f"{each[0]} along x; {each[1]} along y"
 
 
 def _face(kind: str, z: float, numbers: Mapping[str, float]) -> dict[str, Any]:
-    """A surface that crosses the axis at z; curvature, radius and conic constant are None where it has none.
+    """Return a surface with its vertex at z; curvature, radius and conic constant are None if it has none.
 
-    numbers: its shape; each curvature is followed by its radius, such as curvature_x by radius_x, None of a plane.
+    numbers: parameters of its shape.  Each curvature adds its radius, such as radius_x for curvature_x; None: a plane.
     """
     curvatures = {name: value for name, value in numbers.items() if name.startswith("curvature")}
     radii = {name.replace("curvature", "radius"): 1 / c if c else None for name, c in curvatures.items()}
@@ -122,7 +125,7 @@ def _face(kind: str, z: float, numbers: Mapping[str, float]) -> dict[str, Any]:
 
 
 def _own(front: Surface) -> dict[str, Any]:
-    """Of a front with an outline of its own: that, and z of the plane around it."""
+    """Return the outline of a front that has its own, and z of the plane around it."""
     return {} if front.outline is None else {"outline": asdict(front.outline), "around": front.around.z}
 
 
@@ -131,35 +134,35 @@ def _known(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def vertex(lens: Lens) -> float:
-    """z (mm) where the back crosses the axis."""
+    """Return the position z of the back on the axis (mm)."""
     return float(sag(lens.back, 0.0, 0.0))
 
 
 def scene_text(scene: Scene, lens: Lens) -> str:
-    """scene.toml beside `lens`, from which the same lens is designed again, with a note on the z of its back."""
+    """Return the text of scene.toml in a design's folder, with a note if the back was moved."""
     drawn = scene.lens.back.z - scene.lens.front.z
-    if not abs(vertex(lens) - scene.lens.back.z) > MOVED * drawn:
+    if not abs(vertex(lens) - scene.lens.back.z) > MIN_SHIFT * drawn:
         return scene.toml()
-    stands = f"as designed, the vertex of the back stands at z = {vertex(lens)!r} mm; it started at lens.back.z below"
-    return f"# {stands}\n{scene.toml()}"
+    note = f"as designed, the vertex of the back is at z = {vertex(lens)!r} mm; it started at lens.back.z below"
+    return f"# {note}\n{scene.toml()}"
 
 
 def _passes(record: Mapping[str, Any]) -> passes.Passes:
-    """The passes of light; the index of a mirror that light does not enter is 1."""
+    """Return the passes of light; a mirror that light does not enter has the index 1."""
     mirror = passes.MIRROR if record["index"] == 1 else passes.SECOND_SURFACE
     return mirror if record["reflects"] else passes.LENS
 
 
 def sections(record: Mapping[str, Any]) -> dict[str, Rows]:
-    """The prescription in words, by headings; numbers in full."""
+    """Return the rows of a prescription by their headings; numbers with all digits."""
     return tables("prescription.txt.j2", lens=record, passes=_passes(record))
 
 
 def text(record: Mapping[str, Any]) -> str:
-    """prescription.txt."""
+    """Return the text of prescription.txt."""
     name = f"{record['name']}: {record['title']}" if record["title"] else record["name"]
-    way = WAYS[_passes(record).optic]
-    head = TEXT.format(name=name, way=way, exact=EXACT["front_net" in record])
+    direction = LIGHT_DIRECTIONS[_passes(record).optic]
+    head = TEXT.format(name=name, direction=direction, exact=EXACT["front_net" in record])
     parts = (f"\n{heading}\n" + "".join(f"    {name:<30}{value}\n" for name, value in rows)
              for heading, rows in sections(record).items())  # fmt: skip
     return head + "".join(parts)
@@ -170,38 +173,38 @@ def text(record: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Order:
-    """The file for a shop and its facts; lengths in mm, coordinates of the file; None: not stated, or not known."""
+    """File for a shop and its facts; lengths in mm, coordinates of the file; None: not stated, or unknown."""
 
-    file: str  # with the geometry: part.step of a scene with a mount, else lens.step
-    sha256: str  # of that file, in hexadecimal digits
-    low: Place  # least x, y and z
-    high: Place  # largest x, y and z
-    volume: float | None  # mm³; None: of faces that nothing here integrates
-    material: str | None  # in words
+    file: str  # name of the file with the geometry: part.step for a scene with a mount, else lens.step
+    sha256: str  # SHA-256 of that file, hexadecimal
+    low: Point  # smallest x, y and z
+    high: Point  # largest x, y and z
+    volume: float | None  # mm³; None: some faces cannot be integrated
+    material: str | None  # name of the material in words
     density: float | None  # g/cm³
-    datum: str  # where z = 0 lies, in words
+    datum: str  # position of z = 0, in words
     origin: float  # z of the file's origin in the scene's frame
     freeform: tuple[str, ...]  # names of the freeform faces
-    optical: tuple[str, ...]  # names of the faces that light meets
-    tool_radius: float | None  # smallest concave radius of the optical faces; None: none of them is concave
-    back_profile: float | None  # width of the tolerance zone of a face's profile (ISO 1101)
-    front_profile: float | None  # the same of the front (mm)
-    thickness_tolerance: float | None  # ± of the centre thickness
-    roughness: float | None  # Ra of the optical faces, at most (nm)
-    coating: str | None  # of the optical faces
-    unbuilt: bool  # does the scene ask for a part.step that could not be built?
-    size: Place  # outer sizes along x, y and z
+    optical: tuple[str, ...]  # names of the optical faces
+    tool_radius: float | None  # smallest concave radius of the optical faces; None: no concave face
+    back_profile: float | None  # profile tolerance of the back (ISO 1101)
+    front_profile: float | None  # profile tolerance of the front (ISO 1101)
+    thickness_tolerance: float | None  # tolerance ± of the centre thickness
+    roughness: float | None  # largest Ra of the optical faces (nm)
+    coating: str | None  # coating of the optical faces
+    unbuilt: bool  # True if the scene has a mount, but part.step could not be built
+    size: Point  # outer sizes along x, y and z
     mass: float | None  # g
 
 
 def order_of(
     scene: Scene, lens: Lens, shape: Mapping[str, Any], folder: Path,
-    found: tuple[Place, Place, float | None] | None = None,
+    found: tuple[Point, Point, float | None] | None = None,
 ) -> Order:  # fmt: skip
-    """The order of a design in a folder.
+    """Return the order of a design in a folder.
 
-    shape: of the lens as it is cut, as report.json has it, and the volume of lens.step.  found: part.step as
-    `measured`; None: there is none.
+    shape: facts of the lens inside its mount's rim, as in report.json, and the volume of lens.step.  found: size and
+    volume of part.step by `measured`; None: there is no part.step.
     """
     mount, stated = scene.mount if found else None, scene.part.of(scene.lens)
     low, high, volume = found or (*_corners(lens, None), shape["volume"])
@@ -233,37 +236,37 @@ def order_of(
     )
 
 
-def measured(path: Path) -> tuple[Place, Place, float | None]:
-    """(least, largest x, y and z (mm), volume (mm³)) of the part in a STEP file, re-read by OCC.
+def measured(path: Path) -> tuple[Point, Point, float | None]:
+    """Return smallest and largest x, y and z (mm) and volume (mm³) of the part in a STEP file, read by OCC.
 
-    The volume is None where the part has faces that nothing here integrates.
+    The volume is None if some faces cannot be integrated.
     """
-    from bstcad.verify import step_checks  # the first process need not load OCC
+    from bstcad.verify import step_checks  # loads OCC, which the first process does not need
 
     lens, whole = step_checks.whole_part(path)
     return *_corners(lens, whole), _volume(lens, whole)
 
 
 def order_rows(order: Order) -> Rows:
-    """The block "What to order" of report.html."""
+    """Return the rows of the section "What to order" of report.html."""
     return tables("order.txt.j2", order=order)["order"]
 
 
 def part(
     lens: Lens, whole: WholePart | None = None, stated: float | None = None, placement: Mapping[str, Any] | None = None
 ) -> dict[str, str]:  # fmt: skip
-    """The facts of a part that a STEP file holds, in the order in which a machine is set up; no design is needed.
+    """Return the facts of a part in a STEP file, in the order of the set-up of a machine; no design is needed.
 
-    whole: the walls around the lens, if it is not bare: then its outline only holds the edge of its back.
+    whole: walls around the lens; then the lens's outline only encloses the edge of its back.  None: a bare lens.
     stated: density (g/cm³) in the file; None: the file states none, or several.
-    placement: of the lens in the file (its words); None: its own frame is that of the file.
+    placement: placement of the lens in the file, in words; None: the frame of the lens is that of the file.
     """
-    import shapely  # a twentieth of a second, which a design need not pay
+    import shapely  # takes 0.05 s, which a design does not need
 
     shape, lies = describe(lens), list(zip(*_corners(lens, whole), strict=True))
     vertex = lens.front_vertex + shape["centre_thickness"]
     edge, outline = None if whole is None else whole.edge, lens.outline
-    fills = edge is None or outline.is_round or shapely.Polygon(edge).area > (1 - FILLED) * outline.area
+    fills = edge is None or outline.is_round or shapely.Polygon(edge).area > (1 - EDGE_TOLERANCE) * outline.area
     found = tables(
         "step_part.txt.j2", lens=lens, shape=shape, lies=lies, vertex=vertex, whole=whole is not None,
         origin=_origin(lens, vertex, whole is None), fills=fills,
@@ -274,8 +277,8 @@ def part(
     return dict(found["part"])
 
 
-def _corners(lens: Lens, whole: WholePart | None) -> tuple[Place, Place]:
-    """The least and the largest x, y and z (mm) of a part."""
+def _corners(lens: Lens, whole: WholePart | None) -> tuple[Point, Point]:
+    """Return the smallest and the largest x, y and z (mm) of a part."""
     half = np.array(lens.outline.half_extent)
     edge = np.array([-half, half]) if whole is None else whole.edge
     faces = np.concatenate(heights(lens, None if whole is None else edge))
@@ -286,22 +289,22 @@ def _corners(lens: Lens, whole: WholePart | None) -> tuple[Place, Place]:
 
 
 def _volume(lens: Lens, whole: WholePart | None) -> float | None:
-    """Of a part (mm³); None: it has faces that nothing here integrates."""
+    """Return the volume of a part (mm³); None: some faces cannot be integrated."""
     if whole is None:
         return quadrature.of_lens(lens).volume
     return None if whole.properties is None else whole.properties.volume
 
 
 def _origin(lens: Lens, vertex: float, bare: bool = True) -> str:
-    """The position of axis and front, seen from the point (0, 0, 0) of the file; vertex: z of the back's."""
+    """Return the position of the file's origin relative to axis and faces, in words.  vertex: z of the back."""
     at = {"passes": lens.passes, "front": lens.front_vertex, "vertex": vertex, "bare": bare}
     return "".join(paragraphs("part_words.txt.j2", "origin", **at))
 
 
 def _front_radius(lens: Lens) -> float | None:
-    """The smallest concave radius (mm) of the front, which is seen from below; None: of none, or a mirror's rear.
+    """Return the smallest concave radius (mm) of the front, seen from outside; None: not concave, or a mirror's rear.
 
-    Of a conic the meridional radius, R (1 - k c² r²)^(3/2), which falls towards the rim for k > 0.
+    For a conic this is the meridional radius, R (1 - k c² r²)^(3/2), which decreases towards the rim for k > 0.
     """
     front = lens.front
     if "front" not in lens.passes.faces:

@@ -1,8 +1,8 @@
-"""Three-dimensional pictures: the lens in clay, the lens at work in its light, and the lens that a reader can turn.
+"""Three-dimensional pictures: a still of the lens in clay, the lens with its rays, and a model that a reader can rotate.
 
-VTK ends the whole process (segmentation fault, not an exception) where it finds neither a display nor EGL nor OSMesa,
-and writes its complaints straight to the terminal.  A design that took minutes must not die of its picture, so this
-file runs itself as a script, which draws arrays of a file into a PNG or a window.
+Without a display, EGL or OSMesa, VTK ends the whole process by a segmentation fault and writes its messages to the
+terminal.  To protect the design, this file runs itself as a script in another process.  The script reads arrays from a
+file and draws them into a PNG or a window.
 """
 
 from __future__ import annotations
@@ -29,46 +29,46 @@ if TYPE_CHECKING:
     from bstcad.optics.outlines import Outline
     from bstcad.optics.surfaces import Surface
 
-PATIENCE = 120.0  # seconds a picture may take
-FEATURE_ANGLE = 35.0  # degrees; an edge sharper than this is drawn sharp
+PATIENCE = 120.0  # timeout of a picture (seconds)
+FEATURE_ANGLE = 35.0  # angle between facets above which their edge is drawn sharp (degrees)
 
-# The lens in clay: a picture of SIZE pixels.
-SIZE = (1120, 800)
+# The lens in clay.
+SIZE = (1120, 800)  # size of the picture (pixels)
 CLAY = "#d3d9e0"
-LIGHTS = (((-1.0, 0.5, 0.7), 0.8), ((0.5, -1.0, 0.35), 0.5), ((0.1, -0.2, 1.0), 0.25))  # (towards the light, intensity)
-FINISH = {"ambient": 0.12, "diffuse": 0.9, "specular": 0.2, "specular_power": 30.0}  # of the clay
-EYE = (0.75, -1.5, 1.7)  # where it is seen from, off its centre in diagonals of its bounding box
-VIEW_ANGLE = 26.0  # degrees, from the lower to the upper edge
+LIGHTS = (((-1.0, 0.5, 0.7), 0.8), ((0.5, -1.0, 0.35), 0.5), ((0.1, -0.2, 1.0), 0.25))  # (direction to the light, intensity)
+FINISH = {"ambient": 0.12, "diffuse": 0.9, "specular": 0.2, "specular_power": 30.0}  # surface of the clay
+EYE = (0.75, -1.5, 1.7)  # position of the eye relative to the centre, in diagonals of the bounding box
+VIEW_ANGLE = 26.0  # vertical angle of view (degrees)
 
-# The lens at work, of two views: the lens from near by, all of the way.
-WINDOW = (1920, 1080)  # pixels
-SHARES = (5, 9)  # of the width
+# The lens with its rays, in two views: the lens close up, and the whole path.
+WINDOW = (1920, 1080)  # size of the window (pixels)
+VIEW_WIDTHS = (5, 9)  # relative widths of the two views
 GROUND, INK, SOFT = "#0e1116", "#e6eaee", "#8b96a1"
 GLASS, METAL, LAMP = "#b9d4ea", "#9aa3ad", "#fff3c4"
-DARKEST = 0.35  # of the colours of flux: the least of it is still seen on the dark ground
-ASIDE = (0.95, 0.42, 0.62)  # towards the eye: sideways, up, and along the axis to the picture's side
-NEAR = (0.9, 0.5, 0.75)  # towards the eye, from near by the lens, whose back faces it
-TITLE = 46  # letters of a line of it
-PATH_ANGLE = 24.0  # degrees, from the lower to the upper edge
-FILLED, ROOM = 0.88, 0.6  # of a view: all of the way, and a lens with room for its rays
-BEFORE = 0.8  # opacity of a screen that light goes on behind
-AHEAD, EACH = 2.0, 5  # from near by: diagonals of the lens that rays are drawn for, and every fifth ray
+DARKEST = 0.35  # start of the colour map of flux, so that the smallest flux is visible on the dark background
+ASIDE = (0.95, 0.42, 0.62)  # direction to the eye: sideways, up, and along the axis to the picture's side
+NEAR = (0.9, 0.5, 0.75)  # direction to the eye in the close view, which faces the back
+TITLE_WIDTH = 46  # letters per line of the title
+PATH_ANGLE = 24.0  # vertical angle of view (degrees)
+PATH_FILL, LENS_FILL = 0.88, 0.6  # fraction of a view that the whole path fills, and the lens with room for its rays
+SCREEN_OPACITY = 0.8  # opacity of a screen in front of another one
+RAY_REACH, RAY_STEP = 2.0, 5  # close view: length of the rays outside the lens (diagonals); every fifth ray is drawn
 
-# The lens to be turned.
-FINE, COARSE = 256, 64  # cells each way of a net, and of a surface that is one smooth piece
-MOST_RAYS = 200  # that are sent with it
-TENTHS_OF_MICRONS, PARTS = 4, 3  # decimals of a place in mm, and of a flux
-STEPS = 65535  # of a number, over its range
-LEAST = 1e-9  # range (mm, or a slope) of values that are all equal
+# The model that a reader can rotate.
+FINE, COARSE = 256, 64  # cells per axis of a net, and of a surface without knots
+MAX_RAYS = 200  # largest number of rays in the model
+POSITION_DECIMALS, FLUX_DECIMALS = 4, 3  # decimals of a position (mm), and of a relative flux
+STEPS = 65535  # integer steps over the range of a number
+MIN_RANGE = 1e-9  # smallest range of values that are all equal (mm, or a slope)
 
 
-_drawing: list[subprocess.Popen] = []  # the processes that draw now
+_drawing: list[subprocess.Popen] = []  # processes that are drawing
 
 
 def lens_picture(mesh: Mesh) -> bytes | None:
-    """PNG of the solid in matt clay, seen from the back surface's side, on a transparent background.
+    """Return a PNG of the solid in matt clay, seen from the side of the back, on a transparent background.
 
-    None where this machine cannot draw in 3-D (no display, no EGL, no OSMesa): the report then says so.
+    None: this machine cannot draw in 3-D (no display, EGL or OSMesa).
     """
     with tempfile.TemporaryDirectory() as folder:
         picture = Path(folder, "lens.png")
@@ -77,7 +77,7 @@ def lens_picture(mesh: Mesh) -> bytes | None:
 
 
 def draw(path: LightPath, picture: Path | None) -> bool:
-    """Write `picture` (PNG), or open a window until it is closed; False where this machine cannot."""
+    """Write `picture` (PNG), or show a window until the user closes it; False if this machine cannot draw in 3-D."""
     given = vars(path).items()
     arrays = {name: np.asarray(value) for name, value in given if not isinstance(value, tuple)}
     arrays |= {f"{name} {k}": each for name, value in given if isinstance(value, tuple) for k, each in enumerate(value)}
@@ -85,13 +85,13 @@ def draw(path: LightPath, picture: Path | None) -> bool:
 
 
 def _run(arrays: Mapping[str, np.ndarray], picture: str, patience: float | None) -> bool:
-    """Have this file draw `arrays` as a script; did it end well, within `patience` seconds?"""
+    """Run this file as a script that draws `arrays`; return True if it ended without error within `patience` seconds."""
     with tempfile.TemporaryDirectory() as folder:
         given = Path(folder, "arrays.npz")
         np.savez(given, **arrays)
         # -P keeps this folder, with its report.py and units.py, off the import path.
         command = [sys.executable, "-P", __file__, str(given), picture]
-        # pyvista need not open a window first to see whether it can: if it cannot, that process ends.
+        # With this variable pyvista does not test first whether it can open a window; if not, the process ends.
         env = os.environ | {"ALLOW_PLOTTING": "true"}
         try:
             with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=env) as drawing:
@@ -106,24 +106,24 @@ def _run(arrays: Mapping[str, np.ndarray], picture: str, patience: float | None)
 
 
 def stop() -> None:
-    """End the processes that draw: nobody waits for their pictures any more."""
+    """End the processes that are drawing."""
     for drawing in tuple(_drawing):
         drawing.kill()
 
 
 def main(arrays: str, picture: str) -> None:
-    """Draw what `arrays` (npz) holds, a mesh or a LightPath: into `picture` (PNG), or in a window if that is empty."""
+    """Draw the mesh or LightPath in `arrays` (npz) into `picture` (PNG), or in a window if `picture` is empty."""
     with np.load(arrays, allow_pickle=False) as found:
-        told: dict[str, Any] = {name: value if value.ndim else value.item() for name, value in found.items()}
-    if "rays" not in told:
+        values: dict[str, Any] = {name: value if value.ndim else value.item() for name, value in found.items()}
+    if "rays" not in values:
         from PIL import Image
 
-        image = Image.fromarray(clay(told["vertices"], told["faces"]))
+        image = Image.fromarray(clay(values["vertices"], values["faces"]))
         image.crop(image.getchannel("A").getbbox()).save(picture)
         return
-    for name in [name for name in told if " " in name]:  # one of several, in their order
-        told[name.split()[0]] = (*told.get(name.split()[0], ()), told.pop(name))
-    plotter = plotter_of(LightPath(**told), off_screen=bool(picture))
+    for name in [name for name in values if " " in name]:  # elements of a tuple, in their order
+        values[name.split()[0]] = (*values.get(name.split()[0], ()), values.pop(name))
+    plotter = plotter_of(LightPath(**values), off_screen=bool(picture))
     if picture:
         plotter.screenshot(picture)
     else:
@@ -131,14 +131,14 @@ def main(arrays: str, picture: str) -> None:
 
 
 def clay(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """RGBA image (rows, columns, 4) of the triangles `faces` (n, 3) on `vertices` (k, 3) in mm, back surface up."""
+    """Return an RGBA image (rows, columns, 4) of the triangles `faces` (n, 3) on `vertices` (k, 3) in mm, back up."""
     import pyvista
 
     centre = (vertices.min(0) + vertices.max(0)) / 2
     reach = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     plotter = pyvista.Plotter(off_screen=True, window_size=list(SIZE), lighting="none")
     plotter.add_mesh(pyvista.PolyData.from_regular_faces(vertices.astype(np.float32), faces), color=CLAY, **FINISH)
-    # The relief is shallow: the key light grazes the back surface; the fill keeps the sides readable.
+    # The relief is shallow, so the key light grazes the back surface; the fill light keeps the sides visible.
     _add_lights(plotter, ((centre + 10 * reach * np.array(towards), bright) for towards, bright in LIGHTS), centre)
     plotter.camera_position = centre + reach * np.array(EYE), centre, (0.0, 0.0, 1.0)
     plotter.camera.view_angle = VIEW_ANGLE
@@ -154,7 +154,7 @@ def _solid(vertices: np.ndarray, faces: np.ndarray) -> Any:
 
 
 def _add_lights(plotter: Any, lights: Iterable[tuple[Any, float]], centre: Any) -> None:
-    """Lamps, (position, intensity), that shine towards the centre."""
+    """Add lights, (position, intensity) each, that shine towards the centre."""
     import pyvista
 
     for position, intensity in lights:
@@ -163,32 +163,32 @@ def _add_lights(plotter: Any, lights: Iterable[tuple[Any, float]], centre: Any) 
         plotter.add_light(light)
 
 
-# --- the lens at work -------------------------------------------------------------------------------------------------
+# --- the lens with its rays -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class LightPath:
-    """The solid, rays coloured by their flux, and the screens with their pictures, mm."""
+    """Solid, rays coloured by their flux, and screens with their pictures; lengths in mm."""
 
-    vertices: np.ndarray  # (n, 3), of the lens
-    faces: np.ndarray  # (k, 3), vertices of its triangles
-    rays: np.ndarray  # (rays, stops, 3), from the source over the faces to the furthest screen
-    flux: np.ndarray  # (rays,) that each arrives with, in millionths of the source's light
-    screens: tuple[np.ndarray, ...]  # (4, 3), corners of each: (x min, y min), (x max, y min), (x max, y max), …
-    pictures: tuple[np.ndarray, ...]  # (rows, columns) uint8, tones of the irradiance on each; row 0 at y max
-    lamp: np.ndarray  # (0 or 1, 3), a point source
-    seen_along: int  # +1: the picture is seen from where the light comes from, along +z; -1: from behind the screen
+    vertices: np.ndarray  # vertices of the lens, (n, 3)
+    faces: np.ndarray  # vertex indices of its triangles, (k, 3)
+    rays: np.ndarray  # points of each ray from the source over the faces to the furthest screen, (rays, points, 3)
+    flux: np.ndarray  # flux of each ray at its end, (rays,), in millionths of the source's light
+    screens: tuple[np.ndarray, ...]  # corners of each screen, (4, 3): (x min, y min), (x max, y min), (x max, y max), …
+    pictures: tuple[np.ndarray, ...]  # tones of the irradiance on each screen, (rows, columns) uint8, row 0 at y max
+    lamp: np.ndarray  # position of a point source, (1, 3), or (0, 3)
+    seen_along: int  # +1: the picture is seen along +z, from the side of the source; -1: from behind the screen
     mirror: bool
     title: str
-    words: str  # a caption of a line or two
+    words: str  # caption of one or two lines
 
 
 def plotter_of(path: LightPath, off_screen: bool) -> Any:
-    """A pyvista plotter: at the left the lens from near by, at the right all of the way, true to scale."""
+    """Return a pyvista plotter with two views: the lens close up at the left, the whole path at the right, to scale."""
     import pyvista
 
     plotter = pyvista.Plotter(
-        shape=(1, 2), col_weights=list(SHARES), off_screen=off_screen, window_size=list(WINDOW), border=False,
+        shape=(1, 2), col_weights=list(VIEW_WIDTHS), off_screen=off_screen, window_size=list(WINDOW), border=False,
         lighting="none", title=f"bstcad: {path.title}",
     )  # fmt: skip
     plotter.set_background(GROUND)
@@ -203,32 +203,32 @@ def plotter_of(path: LightPath, off_screen: bool) -> Any:
         )  # fmt: skip
     *near, last = sorted(zip(path.screens, path.pictures, strict=True), key=lambda pair: pair[0][:, 2].mean())
     for screen, picture in near:
-        _add_screen(plotter, screen, picture, BEFORE)
+        _add_screen(plotter, screen, picture, SCREEN_OPACITY)
     _add_screen(plotter, *last)
-    _say(plotter, path.words, (0.02, 0.03), size=10, colour=SOFT)
+    _add_text(plotter, path.words, (0.02, 0.03), size=10, colour=SOFT)
     everything = np.concatenate([path.vertices, path.rays.reshape(-1, 3), *path.screens])
-    _frame(plotter, everything, path, np.multiply(ASIDE, [1, 1, -path.seen_along]), filled=FILLED)
+    _frame(plotter, everything, path, np.multiply(ASIDE, [1, 1, -path.seen_along]), filled=PATH_FILL)
     plotter.subplot(0, 0)
     _add_lens(plotter, solid, path)
-    _add_rays(plotter, _near(path), path.flux[::EACH], 0.8)
-    title = textwrap.wrap(path.title, TITLE, max_lines=2, placeholder=" …")
-    _say(plotter, "\n".join(title), (0.03, 0.97 - 0.03 * len(title)), size=13, colour=INK)
-    _frame(plotter, path.vertices, path, np.array(NEAR), filled=ROOM)
+    _add_rays(plotter, _close_rays(path), path.flux[::RAY_STEP], 0.8)
+    title = textwrap.wrap(path.title, TITLE_WIDTH, max_lines=2, placeholder=" …")
+    _add_text(plotter, "\n".join(title), (0.03, 0.97 - 0.03 * len(title)), size=13, colour=INK)
+    _frame(plotter, path.vertices, path, np.array(NEAR), filled=LENS_FILL)
     plotter.enable_anti_aliasing("ssaa")
     return plotter
 
 
-def _say(plotter: Any, words: str, place: tuple[float, float], size: int, colour: str) -> None:
+def _add_text(plotter: Any, words: str, place: tuple[float, float], size: int, colour: str) -> None:
     import matplotlib
 
-    font = Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")  # has more letters than VTK's own
+    font = Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")  # has more characters than VTK's own font
     plotter.add_text(words, position=place, viewport=True, font_size=size, color=colour, font_file=str(font))
 
 
-def _near(path: LightPath) -> np.ndarray:
-    """Some of the rays, as far as they are seen from near by the lens."""
-    reach = AHEAD * np.linalg.norm(np.ptp(path.vertices, axis=0))
-    rays = path.rays[::EACH].copy()
+def _close_rays(path: LightPath) -> np.ndarray:
+    """Return every RAY_STEP-th ray, cut at the distance RAY_REACH from the lens."""
+    reach = RAY_REACH * np.linalg.norm(np.ptp(path.vertices, axis=0))
+    rays = path.rays[::RAY_STEP].copy()
     for end, before in ((0, 1), (-1, -2)):
         way = rays[:, end] - rays[:, before]
         long = np.linalg.norm(way, axis=1, keepdims=True)
@@ -237,11 +237,11 @@ def _near(path: LightPath) -> np.ndarray:
 
 
 def _add_lens(plotter: Any, solid: Any, path: LightPath) -> None:
-    """The solid under two lamps, of glass, through which the rays are seen, or of metal; and a lamp before it."""
+    """Add the solid, of transparent glass or of metal, with two lights, and a point source in front of it."""
     import pyvista
 
-    look = {"color": METAL, "specular": 0.4} if path.mirror else {"color": GLASS, "specular": 0.9, "opacity": 0.42}
-    plotter.add_mesh(solid, ambient=0.15, diffuse=0.75, specular_power=40, **look)
+    material = {"color": METAL, "specular": 0.4} if path.mirror else {"color": GLASS, "specular": 0.9, "opacity": 0.42}
+    plotter.add_mesh(solid, ambient=0.15, diffuse=0.75, specular_power=40, **material)
     only = {"boundary_edges": False, "non_manifold_edges": False, "manifold_edges": False}
     edges = solid.extract_feature_edges(FEATURE_ANGLE, **only)
     if edges.n_cells:
@@ -253,7 +253,7 @@ def _add_lens(plotter: Any, solid: Any, path: LightPath) -> None:
 
 
 def _add_rays(plotter: Any, rays: np.ndarray, flux: np.ndarray, opacity: float) -> Any:
-    """Lines in the colours of their flux; the mapper of the colours."""
+    """Add rays as lines in the colours of their flux; return the mapper of the colours."""
     import pyvista
     from matplotlib import colormaps
     from matplotlib.colors import ListedColormap
@@ -271,7 +271,7 @@ def _add_rays(plotter: Any, rays: np.ndarray, flux: np.ndarray, opacity: float) 
 
 
 def _add_screen(plotter: Any, screen: np.ndarray, picture: np.ndarray, opacity: float = 1.0) -> None:
-    """A picture at its place, and its frame; screen, picture: as LightPath has them."""
+    """Add the picture on a screen, and its frame.  screen, picture: see LightPath."""
     import pyvista
 
     quad = pyvista.PolyData(screen.astype(np.float32), faces=[4, 0, 1, 2, 3])
@@ -284,7 +284,7 @@ def _add_screen(plotter: Any, screen: np.ndarray, picture: np.ndarray, opacity: 
 
 
 def _frame(plotter: Any, points: np.ndarray, path: LightPath, towards: np.ndarray, filled: float) -> None:
-    """Have all of the points in the view, y up, from the side that the screen is not off to."""
+    """Set the camera so that all points are in the view, y up, from the side away from the screen."""
     towards = _clear_of_screen(path, towards)
     right = np.cross([0.0, 1.0, 0.0], towards)
     right /= np.linalg.norm(right)
@@ -294,7 +294,7 @@ def _frame(plotter: Any, points: np.ndarray, path: LightPath, towards: np.ndarra
     half = np.array([half * WINDOW[0] * (wide - left) / (WINDOW[1] * (high - low)), half])
     seen = points @ axes.T
     middle, far = (seen.min(axis=0) + seen.max(axis=0)) / 2, 0.0
-    for _ in range(20):  # near points look larger, so that the middle of the view shifts as the eye draws near
+    for _ in range(20):  # near points look larger, so that the centre of the view depends on the distance of the eye
         across, ahead = seen[:, :2] - middle[:2], seen[:, 2:]
         far = float((ahead + np.abs(across) / half).max())
         spread = across / (far - ahead)
@@ -308,43 +308,43 @@ def _frame(plotter: Any, points: np.ndarray, path: LightPath, towards: np.ndarra
 
 
 def _clear_of_screen(path: LightPath, towards: np.ndarray) -> np.ndarray:
-    """The direction towards the eye (a unit vector), on the side that the screen is not off to."""
+    """Return the direction to the eye (a unit vector) on the side away from the screen."""
     off = path.screens[0][:, 0].mean() - path.vertices[:, 0].mean()
     return towards * [-1 if off > 0 else 1, 1, 1] / np.linalg.norm(towards)
 
 
-# --- the lens to be turned --------------------------------------------------------------------------------------------
+# --- the model that a reader can rotate -------------------------------------------------------------------------------
 
 
 def turnable(lens: Lens, path: LightPath | None = None, cells: int = FINE) -> str:
-    """The JSON that solid_view.js reads: lengths in mm, and the lamps of the picture in clay; `path`: its light too.
+    """Return the JSON for solid_view.js: lengths in mm, the lights of the picture in clay, and the light of `path`.
 
-    cells: of a net each way, even; fewer for a preview that is sent again and again (256: 0.9 MB, 96: 0.2 MB).
+    cells: cells of a net per axis, even; fewer for a preview that is sent often (256: 0.9 MB, 96: 0.2 MB).
 
-    "" of faces that are not finite everywhere, as a damaged file may have them.  solid_view.js draws in plain WebGL,
-    which every browser has: a solid of one material needs a shader of twenty lines, not a library of 0.6 to 1 MB.  The
-    slopes are the surface's own, not the triangles', so that the shading is as fine as the lens at any distance.
+    The result is "" if a face is not finite everywhere, as in a damaged file.  solid_view.js draws in plain WebGL,
+    since a solid of one material needs a shader of twenty lines, not a library of 0.6 to 1 MB.  The slopes are those of
+    the surface, not of the triangles, so that the shading is exact at any distance.
 
-    values: base64 of 16-bit numbers, low byte first, each a part of its range.  For each face the places x, y, z of
-    (cells + 1)² nodes and their slopes along x and y; then x, y, z of the front and z of the back around the rim.
-    With a path what `_light` tells.
+    The key `values` is base64 of 16-bit integers, low byte first, each a fraction of its range.  For each face these
+    are the positions x, y, z of (cells + 1)² nodes and their slopes along x and y; then x, y, z of the front and z of
+    the back around the rim.  A path adds the keys of `_light`.
     """
     from bstcad.cad.mesh import nodes, rim
     from bstcad.optics.surfaces import sampled
 
     def at_nodes(surface: Surface) -> np.ndarray:
-        """x, y, z (mm), ∂z/∂x and ∂z/∂y of a face at its nodes: (5, cells + 1, cells + 1)."""
+        """Return x, y, z (mm), ∂z/∂x and ∂z/∂y of a face at its nodes, (5, cells + 1, cells + 1)."""
         x, y = nodes(surface.outline or lens.outline, min(COARSE, cells) if math.isinf(surface.detail) else cells)
         return np.stack([x, y, *sampled(surface.optical, x, y)])
 
     def on_rim(outline: Outline, cells: int) -> np.ndarray:
-        """x and y (mm) of the nodes once around an outline: (2, 4 cells)."""
+        """Return x and y (mm) of the nodes once around an outline, (2, 4 cells)."""
         x, y = nodes(outline, cells)
         at = rim(np.arange(x.size).reshape(x.shape))
         return np.stack([x.ravel()[at], y.ravel()[at]])
 
     def around(plane: Surface, inner: Outline) -> Iterator[np.ndarray]:
-        """The quarters of a plane between an outline and that of the lens, as `at_nodes` has faces."""
+        """Yield the quarters of a plane between an outline and that of the lens, in the form of `at_nodes`."""
         begin, end = (on_rim(outline, COARSE)[:, None] for outline in (inner, lens.outline))
         places = begin + np.linspace(0, 1, COARSE + 1)[:, None] * (end - begin)
         for k in range(4):
@@ -360,16 +360,16 @@ def turnable(lens: Lens, path: LightPath | None = None, cells: int = FINE) -> st
     places = np.concatenate([*(face[:3].reshape(3, -1) for face in faces), wall[:3], wall[[0, 1, 3]]], axis=1)
     if not np.isfinite(places).all():
         return ""
-    low, size = places.min(axis=1), np.maximum(np.ptp(places, axis=1), LEAST)
-    told, values = [], []
+    low, size = places.min(axis=1), np.maximum(np.ptp(places, axis=1), MIN_RANGE)
+    shapes, values = [], []
     for number, face in enumerate(faces):
-        steepest = max(float(np.abs(face[3:]).max()), LEAST)
-        told.append({"cells": face.shape[1] - 1, "up": -1 if number else 1, "steepest": steepest})
+        steepest = max(float(np.abs(face[3:]).max()), MIN_RANGE)
+        shapes.append({"cells": face.shape[1] - 1, "up": -1 if number else 1, "steepest": steepest})
         values += [_steps(face[k], low[k], size[k]) for k in range(3)]
         values += [_steps(face[k], -steepest, 2 * steepest) for k in (3, 4)]
     values += [_steps(wall[k], low[min(k, 2)], size[min(k, 2)]) for k in range(4)]
     numbers = base64.b64encode(np.concatenate(values).tobytes()).decode()
-    shape = {"low": low.tolist(), "size": size.tolist(), "faces": told, "rim": wall.shape[1]}
+    shape = {"low": low.tolist(), "size": size.tolist(), "faces": shapes, "rim": wall.shape[1]}
     lit = {"eye": EYE, "angle": VIEW_ANGLE, "clay": [int(CLAY[k : k + 2], 16) / 255 for k in (1, 3, 5)]}
     lit |= {"lamps": [direction for direction, _ in LIGHTS], "bright": [intensity for _, intensity in LIGHTS]}
     light = {} if path is None else _light(path)
@@ -377,29 +377,29 @@ def turnable(lens: Lens, path: LightPath | None = None, cells: int = FINE) -> st
 
 
 def _light(path: LightPath) -> dict[str, Any]:
-    """A light path as JSON has it: places in mm.
+    """Return a light path as JSON values; positions in mm.
 
-    rays: some of them, each its stops from the source over the faces to the furthest screen; flux: of each, that of
-    the brightest is 1.  screens: the corners as LightPath has them, and the picture as a data URL, row 0 at y max.
-    lamp: the place of a point source, if it is one.  aside: towards the eye that sees all of the way, y up.
+    rays: at most MAX_RAYS rays, each with its points from the source over the faces to the furthest screen.  flux: flux
+    of each ray, 1 for the brightest.  screens: corners as in LightPath, and the picture as a data URL, row 0 at y max.
+    lamp: position of a point source, or empty.  aside: direction to the eye for the whole path, y up.
     """
-    every = math.ceil(len(path.rays) / MOST_RAYS) | 1  # odd, or of an even grid they would all lie in a few columns
+    every = math.ceil(len(path.rays) / MAX_RAYS) | 1  # odd, since an even step would take only some columns of the grid
     rays, flux = path.rays[::every], path.flux[::every] / path.flux.max()
     return {
-        "rays": np.round(rays, TENTHS_OF_MICRONS).tolist(),
-        "flux": np.round(flux, PARTS).tolist(),
+        "rays": np.round(rays, POSITION_DECIMALS).tolist(),
+        "flux": np.round(flux, FLUX_DECIMALS).tolist(),
         "screens": [
-            {"corners": np.round(screen, TENTHS_OF_MICRONS).tolist(), "picture": data_url(picture)}
+            {"corners": np.round(screen, POSITION_DECIMALS).tolist(), "picture": data_url(picture)}
             for screen, picture in zip(path.screens, path.pictures, strict=True)
         ],
-        "lamp": np.round(path.lamp, TENTHS_OF_MICRONS).tolist(),
+        "lamp": np.round(path.lamp, POSITION_DECIMALS).tolist(),
         "mirror": bool(path.mirror),
         "aside": _clear_of_screen(path, np.multiply(ASIDE, [1, 1, -path.seen_along])).tolist(),
     }
 
 
 def data_url(picture: np.ndarray) -> str:
-    """Tones (rows, columns) uint8 as a PNG that a page holds."""
+    """Return tones (rows, columns) uint8 as a PNG in a data URL."""
     from PIL import Image
 
     png = io.BytesIO()
@@ -408,7 +408,7 @@ def data_url(picture: np.ndarray) -> str:
 
 
 def _steps(values: np.ndarray, low: float, size: float) -> np.ndarray:
-    """16-bit numbers: which part of the range from `low` on each value is at."""
+    """Return values as 16-bit integers, as fractions of the range from `low` to `low + size`."""
     return np.rint((values.ravel() - low) * (STEPS / size)).astype("<u2")
 
 

@@ -1,6 +1,6 @@
-"""The report of a design for people: report.html, a few lines for the terminal, and report.junit.xml for build servers.
+"""Report of a design for people: report.html, a summary on the terminal, and report.junit.xml for build servers.
 
-All of them show the record of report.json (record.Contents), or a plan's; none of them measures anything.
+All of them show the record of report.json (record.Contents) or the record of a plan, without any computation.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from bstcad.optics.goal import suffix_of
 from bstcad.optics.sides import size_text
-from bstcad.report.prescription import WAYS, order_rows
+from bstcad.report.prescription import LIGHT_DIRECTIONS, order_rows
 from bstcad.report.record import LEFT_OUT, Contents, Examined, LeftOut, bounds, changes
 from bstcad.report.units import Remark, Rows, about, bound, environment, paragraphs, quantity, tables
 from bstcad.report.units import remarks as written
@@ -27,72 +27,69 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 Figure = tuple[str, str, str]  # name, value, remark
-BEGIN, END = "<!-- tolerances -->", "<!-- end of tolerances -->"  # about the section on tolerances
-NO_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")  # XML 1.0 has no such characters
-POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # a browser fetches nothing, runs one script
+BEGIN, END = "<!-- tolerances -->", "<!-- end of tolerances -->"  # comments around the section on tolerances
+NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")  # characters that XML 1.0 forbids
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # a browser loads nothing and runs one script
 VIEWER = Path(__file__).with_name("solid_view.js")
-BADGES = {  # report["verdict"]: (sign, style of the page, of the terminal)
+BADGES = {  # verdict of a report: (sign, style on the page, style on the terminal)
     "passed": ("✓", "pass", "bold green"),
     "passed with remarks": ("✓", "remarks", "bold yellow"),
     NO_LIMIT: ("?", "plain", "bold cyan"),
     "failed": ("✗", "fail", "bold red"),
 }
-OF_PLAN = {  # kind of a plan's verdict: style of the terminal
+PLAN_STYLES = {  # kind of a plan's verdict: style on the terminal
     "blurred": "bold red", "beyond": "bold red", "open": "bold yellow", "within": "bold green", "no limit": "bold cyan",
     "not predicted": "bold yellow",
 }  # fmt: skip
-OF_GLASS = ("lost through the sides", "total internal reflection")  # lines of the ledger that few mirrors have
+GLASS_LINES = ("lost through the sides", "total internal reflection")  # lines of the ledger that few mirrors have
 
 
 # --- words ------------------------------------------------------------------------------------------------------------
 
 
 def explanation(report: Contents | Examined) -> str:
-    """The verdict in sentences: how many checks passed or failed, and doubts on the RRMSD."""
+    """Return the verdict in sentences: number of passed or failed checks, and doubts on the RRMSD."""
     count, failed = len(report.checks), sum(not check.passed for check in report.checks)
     text = f"{failed} of {count} checks failed." if failed else f"All {count} checks passed."
     if report.verdict == NO_LIMIT:
-        text = f"All {count} checks passed; none of them is a limit that the scene sets on the light."
+        text = f"All {count} checks passed, but none of them has a limit on the light from the scene."
     return " ".join((text, *(doubt.text for doubt in doubts(report))))
 
 
 def doubts(report: Contents | Examined) -> list[Remark]:
-    """Sentences on the RRMSD: that the scene sets no limit on it or on the light, that it is not resolved."""
+    """Return sentences beside the verdict: the scene sets no limit, or the RRMSD is not resolved."""
     if isinstance(report, Examined):
         return []
     return written("verdict.txt.j2", "doubts", report=report)
 
 
 def check_line(check: Check) -> str:
-    """A check with its location, value and limit, in a line: "thinnest place (at (1, 2) mm): 0.7 mm, limit ≥ 1 mm"."""
+    """Return a check with position, value and limit: "smallest thickness (at (1, 2) mm): 0.7 mm, limit ≥ 1 mm"."""
     limit = f", limit {bound(check)}" if check.limit is not None else ""
     where = f" ({check.where})" if check.where else ""
     return f"{check.name}{where}: {quantity(check.value, check.unit)}{limit}"
 
 
 def machine(facts: Mapping[str, Any]) -> Rows:
-    """The machine's facts in words, those that are known; of a design on a GPU, that it cannot be had again exactly."""
+    """Return the known facts of the machine in words; for a GPU, a note that its result cannot be reproduced exactly."""
     known = {key: value for key, value in facts.items() if value is not None}
     sizes = {
         key: f"{value:.3g} GB" for key, value in known.items() if key.endswith("_gb") and not isinstance(value, str)
     }
     rows = [(key.removesuffix("_gb").replace("_", " "), str(value)) for key, value in (known | sizes).items()]
     if facts.get("device", "cpu") != "cpu":
-        rows.append(("once more", "another lens of the same merit: a GPU adds up in no fixed order"))
+        rows.append(("same run again", "gives another lens of equal merit, since a GPU sums in no fixed order"))
     return rows
 
 
 def ledger(flux: Mapping[str, float], of: str) -> dict[str, float]:
-    """The lines of a ledger as people read them."""
-    lines = {line: part for line, part in flux.items() if of == "lens" or part or line not in OF_GLASS}
+    """Return the lines of a flux ledger with the kind of the optic, `of`, in their names."""
+    lines = {line: part for line, part in flux.items() if of == "lens" or part or line not in GLASS_LINES}
     return {line.replace("the lens", f"the {of}"): part for line, part in lines.items()}
 
 
 def first_figures(report: Contents | Examined) -> list[Figure]:
-    """The figures that a reader looks for first, as the terminal and report.html show them.
-
-    A STEP file by itself has those of the part alone.
-    """
+    """Return the first figures of the terminal and of report.html; for a STEP file by itself, those of the part."""
     if isinstance(report, Examined):
         return [(name, value, "") for name, value in report.part.items()]
     rows = tables("first_figures.txt.j2", report=report)["first"]
@@ -107,12 +104,12 @@ def write_html(
     prescription: Mapping[str, Rows] | None = None, solid: str = "", tolerances: str = "",
     sections: Sequence[tuple[str, str]] = (),
 ) -> None:  # fmt: skip
-    """Write report.html, one file: pictures (PNG bytes by name) and styles inside, nothing fetched.
+    """Write report.html, one file that contains pictures and styles and loads nothing.
 
-    A picture that is None or absent is left out; for the lens a sentence says so.  scene: the resolved TOML text.
-    prescription: as bstcad.report.prescription puts it in words.  solid: as bstcad.report.rendering tells the lens,
-    for a reader to turn it; none: a page without any script.  tolerances: as bstcad.report.tolerances has them.
-    sections: (heading, HTML) of a script of the user.
+    figures: PNG bytes by name; a picture that is None or absent is omitted, with a sentence for the 3-D picture.
+    scene: TOML text with all defaults.  prescription: rows by bstcad.report.prescription.sections.  solid: JSON by
+    bstcad.report.rendering.turnable; empty: a page without a script.  tolerances: HTML by bstcad.report.tolerances.
+    sections: (heading, HTML) by a script of the user.
     """
     from markupsafe import Markup
 
@@ -133,17 +130,15 @@ def write_html(
             ledger=ledger(report.flux, report.optic),
             bounds=bounds(report.bounds),
             optic=report.optic,
-            way=WAYS[report.optic],
+            direction=LIGHT_DIRECTIONS[report.optic],
             order=report.order and order_rows(report.order),
             changes=changes,
             names=LEFT_OUT,
             prescription=prescription,
             scene=scene,
-            tolerances=Markup(f"{BEGIN}\n{tolerances}{END}\n"),  # a page of this program
-            solid=Markup(solid),  # numbers and names of ours
-            sections=[
-                (heading, Markup(text)) for heading, text in sections
-            ],  # the page's policy allows no script in it
+            tolerances=Markup(f"{BEGIN}\n{tolerances}{END}\n"),  # safe: written by this program
+            solid=Markup(solid),  # safe: written by this program
+            sections=[(heading, Markup(text)) for heading, text in sections],  # POLICY allows no script in it
             viewer=Markup(viewer),
             policy=f"{POLICY}; script-src {allowed}; base-uri 'none'",
         )
@@ -152,35 +147,35 @@ def write_html(
 
 
 def encoded(pictures: Mapping[str, bytes | None]) -> dict[str, str]:
-    """PNG bytes by name as a page holds them: in base64."""
+    """Return pictures (PNG bytes by name) in base64, without those that are None."""
     return {key: base64.b64encode(picture).decode() for key, picture in pictures.items() if picture}
 
 
 def junit(report: Contents) -> bytes:
-    """The checks of a design as a suite, each a test case; a check that is stated, not judged, passes.
+    """Return the checks of a design as a JUnit suite, one test case per check; a check without a limit passes.
 
-    The time of the suite is that of the verification; remarks stand in its output.  Where no limit was asked, the
-    checks without a limit are skipped: neither passed nor failed.
+    The time of the suite is that of the verification, and its output contains the remarks.  If the verdict is
+    NO_LIMIT, checks without a limit are skipped: neither passed nor failed.
     """
     unjudged = [check for check in report.checks if report.verdict == NO_LIMIT and check.limit is None]
     text = environment().get_template("junit.xml.j2").render(report=report, unjudged=unjudged)
-    return NO_XML.sub("�", text).encode()
+    return NOT_IN_XML.sub("�", text).encode()
 
 
 # --- terminal ---------------------------------------------------------------------------------------------------------
 
 
 def summary(report: Contents | Examined, verbose: bool = False) -> Group:
-    """Verdict, remarks, first figures, failed checks and the number of passed ones; verbose: every check.
+    """Return verdict, remarks, first figures, failed checks and the number of passed ones, for `rich.print`.
 
-    For `rich.print`, a paragraph a line.
+    verbose: with every check.
     """
     from rich.console import Group
     from rich.text import Text
 
     lines = [Text.assemble((report.verdict.upper(), BADGES[report.verdict][2]), f": {report.title or report.name}")]
-    said = (*doubts(report), *report.remarked) if report.verdict == NO_LIMIT else (*report.remarked, *doubts(report))
-    lines += [Text.assemble(f"Remark: {remark.text}", named(remark)) for remark in said]
+    remarks = [*doubts(report), *report.remarked] if report.verdict == NO_LIMIT else [*report.remarked, *doubts(report)]
+    lines += [Text.assemble(f"Remark: {remark.text}", topic_tag(remark)) for remark in remarks]
     figures = first_figures(report)
     wide = max((len(name) for name, _, _ in figures), default=0)
     lines += [Text(f"{name:{wide}}  {value}{remark and f' ({remark})'}") for name, value, remark in figures]
@@ -188,25 +183,25 @@ def summary(report: Contents | Examined, verbose: bool = False) -> Group:
     passed = sum(check.passed for check in report.checks)
     lines += check_lines(report.checks, verbose)
     lines.append(Text(f"{passed} checks passed{'' if verbose else '; --verbose lists them'}."))
-    if said or verbose or passed < len(report.checks):
-        lines.append(Text("bstcad docs NAME explains the check or the remark of that [NAME].", "dim"))
+    if remarks or verbose or passed < len(report.checks):
+        lines.append(Text("The command `bstcad docs NAME` explains the check or remark that ends in [NAME].", "dim"))
     return Group(*lines)
 
 
 def check_lines(checks: Sequence[Check], verbose: bool, of: str = "") -> Iterator[Text]:
-    """A line for each failed check, verbose: then for each passed one; of: the design's name before the check's."""
+    """Yield a line per failed check, with `verbose` also per passed check.  of: prefix of the check's name."""
     from rich.text import Text
 
     for check in sorted(checks, key=lambda check: check.passed):
         if not check.passed:
-            yield Text.assemble(("FAIL", "bold red"), f" {of}{check_line(check)}", named(check))
+            yield Text.assemble(("FAIL", "bold red"), f" {of}{check_line(check)}", topic_tag(check))
         elif verbose:
-            judged = "stated" if check.limit is None else "pass"
-            yield Text.assemble(f"{judged} {of}{check_line(check)}", named(check))
+            outcome = "stated" if check.limit is None else "pass"
+            yield Text.assemble(f"{outcome} {of}{check_line(check)}", topic_tag(check))
 
 
-def named(line: Check | Remark) -> tuple[str, str]:
-    """The name by which `bstcad docs` explains a check or a remark, and its style; nothing where it explains none."""
+def topic_tag(line: Check | Remark) -> tuple[str, str]:
+    """Return the name for `bstcad docs` in brackets, and its style; empty if no page explains the line."""
     return line.topic and f" [{line.topic}]", "dim"
 
 
@@ -214,15 +209,15 @@ def named(line: Check | Remark) -> tuple[str, str]:
 
 
 def plan_effects(plan: Mapping[str, Any], title: str, optic: str) -> Group:
-    """Tables of the effects that are simulated and left out, from the entries of `plan --json`.
+    """Return tables of effects that are simulated and not simulated, from the entries of `plan --json`.
 
-    The verdict comes first where they decide it.
+    The verdict comes first if the effects decide it.
     """
     from rich.console import Group
     from rich.table import Table
     from rich.text import Text
 
-    simulated, remedies = _table("simulated", "<asked for by"), Table.grid(padding=(0, 2))
+    simulated, remedies = _table("simulated", "<requested by"), Table.grid(padding=(0, 2))
     for item in plan["simulated"]:
         simulated.add_row(Text(item["what"]), Text(item["asked_by"]))
     for entry in (LeftOut(**entry) for entry in plan["left_out"]):
@@ -234,22 +229,22 @@ def plan_effects(plan: Mapping[str, Any], title: str, optic: str) -> Group:
         lines += _of_target(goal, suffix_of(goal["key"]), optic)
     lines.append(Text(" ".join((*paragraphs("plan.txt.j2", "estimated", optic=optic), plan.get("caveat", ""))).strip()))
     if remedies.row_count:
-        lines += [Text(), Text("To have it simulated, write in the scene:"), remedies]
+        lines += [Text(), Text("To simulate an effect, write in the scene:"), remedies]
     return Group(*lines)
 
 
 def _verdict(plan: Mapping[str, Any]) -> Iterator[Text]:
-    """Yield the verdict of a plan, as the terminal shows it."""
+    """Yield the verdict of a plan for the terminal."""
     from rich.text import Text
 
-    yield Text.assemble(("PLAN: ", OF_PLAN[plan["verdict"]["kind"]]), plan["verdict"]["sentence"])
+    yield Text.assemble(("PLAN: ", PLAN_STYLES[plan["verdict"]["kind"]]), plan["verdict"]["sentence"])
 
 
 def _of_target(plan: Mapping[str, Any], of: str, optic: str) -> Iterator[RenderableType]:
-    """What a plan says of the light of one target; of: ", target[1]" where there are several."""
+    """Yield a plan's estimates and sentences on one target.  of: suffix such as ", target[1]" if there are several."""
     from rich.text import Text
 
-    left_out = _table(f"left out{of}", "light on target", "RRMSD", "blur")
+    left_out = _table(f"not simulated{of}", "light on target", "RRMSD", "blur")
     for entry in (LeftOut(**entry) for entry in plan["left_out"]):
         detail = (f", {entry.detail}" if entry.detail else "", "dim")
         left_out.add_row(Text.assemble(LEFT_OUT[entry.kind], detail), *changes(entry))
@@ -260,7 +255,7 @@ def _of_target(plan: Mapping[str, Any], of: str, optic: str) -> Iterator[Rendera
 
 
 def plan_predictions(plan: Mapping[str, Any]) -> Group:
-    """Seconds, RRMSD and memory of each quality, and of the standard quality with more control points."""
+    """Return seconds, RRMSD and memory of each quality, and of the standard quality with more control points."""
     from rich.console import Group
     from rich.text import Text
 
@@ -279,7 +274,7 @@ def plan_predictions(plan: Mapping[str, Any]) -> Group:
 
 
 def _table(first: str, *others: str) -> Table:
-    """A table whose first column and those named with "<" are flush left."""
+    """Return an empty table whose first column, and those whose heading begins with "<", are left-justified."""
     from rich import box
     from rich.table import Table
 

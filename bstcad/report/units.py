@@ -1,4 +1,4 @@
-"""Numbers for people, in the unit that suits their size, exact ones for a shop; and the templates that show them."""
+"""Numbers as text, in a unit that suits their size or with all digits, and the templates that show them."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from jinja2 import Environment
 
 Rows = list[tuple[str, str]]  # name, value
-DIGITS = 12  # significant digits that a number is taken to have
-LADDERS = {  # unit: (from this size on, times, written) downwards
+DIGITS = 12  # significant digits of a number before it is printed
+LADDERS = {  # unit: (smallest size, factor, unit as written), in descending order
     "mm": ((0.1, 1.0, "mm"), (1e-3, 1e3, "µm"), (1e-8, 1e6, "nm"), (0.0, 1e9, "pm")),
     "deg": ((0.01, 1.0, "°"), (0.0, 3600.0, "″")),
     "rad": ((0.1, 1.0, "rad"), (1e-4, 1e3, "mrad"), (0.0, 1e6, "µrad")),
@@ -27,7 +27,7 @@ SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def number(value: float | bool | None) -> str:
-    """Three significant digits, whole numbers whole: 0.0284, 5.8, 6512, 3.2 × 10⁻⁷; yes or no; none."""
+    """Return a number with three significant digits, integers in full: 0.0284, 5.8, 6512, 3.2 × 10⁻⁷; yes, no, none."""
     if value is None:
         return "none"
     if isinstance(value, bool | np.bool_):
@@ -45,30 +45,30 @@ def number(value: float | bool | None) -> str:
 
 
 def two_digits(value: float) -> float:
-    """An estimate, rounded to two digits."""
+    """Round an estimate to two digits."""
     return float(f"{value:.2g}")
 
 
 def about(value: float, unit: str = "") -> str:
-    """An estimate in two digits."""
+    """Return an estimate with two digits and its unit."""
     return quantity(two_digits(value), unit)
 
 
 def quantity(value: float | bool | None, unit: str) -> str:
-    """`value` in the unit that suits its size: 3e-7 mm is 0.3 nm; below a thousandth of the smallest unit only that."""
+    """Return a value in a unit that suits its size (3e-7 mm: 0.3 nm); below 0.001 of the smallest unit "< 0.001 pm"."""
     unit = {"°": "deg", "degrees": "deg", "1": ""}.get(unit, unit)
     if value is None or isinstance(value, bool | np.bool_) or not unit:
         return number(value)
     rungs = LADDERS.get(unit, ((0.0, 1.0, unit),))
     rung = next(rung for rung in rungs if abs(value) >= rung[0]) if value else rungs[0]
-    scaled = float(f"{value * rung[1]:.{DIGITS}g}")  # 1e-6 mm times 1e6 is 1 nm, not 0.9999999999999999 nm
+    scaled = float(f"{value * rung[1]:.{DIGITS}g}")  # 1e-6 mm is 1 nm, not 0.9999999999999999 nm
     if rung is rungs[-1] and len(rungs) > 1 and 0 < abs(scaled) < 1e-3:
         return f"< {quantity(1e-3 / rung[1], unit)}"
     return f"{number(scaled)}{'' if rung[2] in '°″' else ' '}{rung[2]}"
 
 
 def percent(part: float) -> str:
-    """A part of 1 in percent; never rounded to 0 % or 100 % unless it is."""
+    """Return a fraction in percent, rounded to 0 % or 100 % only if it is exactly 0 or 1."""
     if part in (0.0, 1.0):
         return f"{100 * part:g} %"
     off = min(abs(part), abs(1.0 - part)) * 100.0
@@ -78,7 +78,7 @@ def percent(part: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """8.6 s, 71 s as 1 min 11 s, 1 h 2 min."""
+    """Return a time such as 8.6 s, 1 min 11 s or 1 h 2 min."""
     if seconds < 59.95:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)
@@ -86,7 +86,7 @@ def duration(seconds: float) -> str:
 
 
 def bound(check: Check) -> str:
-    """A check's limit with its sense, which the outcome tells: passed below it or failed above it is an upper one."""
+    """Return the limit of a check with ≤ or ≥, which follows from value and outcome (passed below: an upper limit)."""
     value, limit, unit = check.value, check.limit, check.unit
     if limit is None:
         return ""
@@ -97,7 +97,7 @@ def bound(check: Check) -> str:
 
 
 def amount(value: float, unit: str, signed: bool = False) -> str:
-    """A tolerance or an error in its unit, such as "mm RMS", "deg" or "nm", scaled to suit its size."""
+    """Return a tolerance or an error in a unit such as "mm RMS", "deg" or "nm", scaled to suit its size."""
     length, _, kind = unit.partition(" ")
     text = quantity(value, length) if length in ("mm", "deg") else f"{number(value)} {unit}".strip()
     text = f"{text} {kind}".strip() if length == "mm" else text
@@ -105,23 +105,23 @@ def amount(value: float, unit: str, signed: bool = False) -> str:
 
 
 def exact(value: float) -> str:
-    """Every digit that tells this number from its neighbours; a whole number without its point."""
+    """Return a number with all digits of its float64 value, an integer without a decimal point."""
     return str(int(value)) if value == int(value) and abs(value) < 1e15 else repr(float(value))
 
 
 def mm(value: float) -> str:
-    """A length in mm to a micrometre, without trailing zeros: 4.379, −0.5, 0."""
+    """Return a length in mm, rounded to 0.001 mm, without trailing zeros: 4.379, −0.5, 0."""
     return f"{value:.3f}".rstrip("0").rstrip(".").replace("-", "−") if abs(value) >= 5e-4 else "0"
 
 
 def interval(ends: Sequence[float]) -> str:
-    """Two ends (mm), as ±12 where they lie alike about 0, else as 15 to 20."""
+    """Return an interval (mm): ±12 if it is symmetric about 0, else 15 to 20."""
     low, high = ends
     return f"±{mm(high)}" if mm(-low) == mm(high) else f"{mm(low)} to {mm(high)}"
 
 
 def rounded_up(value: float) -> str:
-    """The next number of three digits that is not smaller, never in powers of ten."""
+    """Return a positive number rounded up to three digits, without an exponent."""
     if not value > 0:
         return "0"
     last = math.floor(math.log10(value)) - 2
@@ -130,13 +130,13 @@ def rounded_up(value: float) -> str:
 
 
 def turned(tilt: Sequence[float], number: Callable[[float], str] = number) -> str:
-    """A tilt by angles in degrees about x and then about y."""
+    """Return a tilt in words: angles in degrees about x, then about y."""
     turns = (f"{number(angle)} degrees about {axis}" for angle, axis in zip(tilt, "xy", strict=True) if angle)
     return ", then ".join(turns) or "none"
 
 
 def stated(value: Any) -> str:
-    """A value of a scene in a line: yes or no, a number by every digit, a list, a table by its keys."""
+    """Return a value of a scene in a line: yes or no, a number with all digits, a list, a table with its keys."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
@@ -150,9 +150,9 @@ def stated(value: Any) -> str:
 # --- templates --------------------------------------------------------------------------------------------------------
 
 
-@cache  # a process compiles each template once: 0.6 CPU seconds
+@cache  # compiling the templates takes 0.6 s of CPU time
 def environment() -> Environment:
-    """The templates of this folder; all text is escaped, since titles, names and scenes are a user's."""
+    """Return the templates of this folder; all text is escaped, since titles, names and scenes come from users."""
     import jinja2
 
     found = jinja2.Environment(
@@ -167,21 +167,21 @@ def environment() -> Environment:
 
 @cache
 def _plain_text() -> Environment:
-    """The same templates unescaped."""
+    """Return the templates without escapes, for plain text."""
     return environment().overlay(autoescape=False)
 
 
 def prepare() -> None:
-    """Compile all templates, in a thread that has the time: while this one waits for OCC to read a file."""
+    """Compile all templates; called in a thread that would wait for OCC to read a file."""
     for templates in (environment(), _plain_text()):
         for name in templates.list_templates(extensions=["j2"]):
             templates.get_template(name)
 
 
 def tables(template: str, **values: Any) -> dict[str, Rows]:
-    """The tables that a template writes, by their headings: a line "# heading" before each, then "name | value" rows.
+    """Return the tables of a template by their headings.
 
-    A row without a value is left out.
+    A template writes a line "# heading", then rows "name | value"; a row without a value is omitted.
     """
     found: dict[str, Rows] = {}
     for line in _plain_text().get_template(template).render(**values).splitlines():
@@ -194,23 +194,23 @@ def tables(template: str, **values: Any) -> dict[str, Rows]:
 
 
 def paragraphs(template: str, macro: str, **values: Any) -> list[str]:
-    """The paragraphs that a macro of a template writes, each in a line."""
+    """Return the paragraphs that a macro of a template writes, one string each."""
     text = str(getattr(_plain_text().get_template(template).module, macro)(**values))
     return [line for part in text.split("\n\n") if (line := re.sub("[ \n]+", " ", part).strip(" "))]
 
 
 class Remark(NamedTuple):
-    """A sentence of a report."""
+    """A remark of a report."""
 
-    id: str  # its section in remarks.md without "remark-", such as "dark"; empty: of a report that knows none
+    id: str  # label of its section in remarks.md without "remark-", such as "dark"; empty in older reports
     text: str
 
     @property
     def topic(self) -> str:
-        """The name by which `bstcad docs` explains it; empty: none does."""
+        """Name of the page for `bstcad docs`; empty: there is none."""
         return self.id and f"remark-{self.id}"
 
 
 def remarks(template: str, macro: str, **values: Any) -> list[Remark]:
-    """The same where each begins with its id: "(dark) A part …"."""
+    """Return the remarks that a macro of a template writes, each as a paragraph with its id: "(dark) A part …"."""
     return [Remark(*text.removeprefix("(").split(") ", 1)) for text in paragraphs(template, macro, **values)]

@@ -1,4 +1,4 @@
-"""The figure of a wavefront error: its map over the exit pupil, and cuts through it."""
+"""Figure of a wavefront error: map over its plane, and cuts through the map."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ if TYPE_CHECKING:
 
     from bstcad.optics.wavefront_error import WavefrontError
 
-LOOKING = "Seen from behind, looking towards the lens: x grows to the right.  + is light that comes late."
+LOOKING = "Seen from behind, looking towards the lens: x grows to the right.  +: the light arrives late."
 REMOVED = "piston and tilt removed"
 
 
 @styled
 def wavefront_map(error: WavefrontError) -> Figure:
-    """OPD in waves over the light on its plane z, without piston and tilt, and cuts through its middle."""
+    """Draw the OPD in waves on its plane z, without piston and tilt, and cuts through its centre."""
     figure = new_figure(9.0, 4.3)
     face, cut = figure.subplots(1, 2, width_ratios=(1.15, 1.0))
     edge = round_up(float(np.nanmax(np.abs(error.opd))))
@@ -42,7 +42,7 @@ def wavefront_map(error: WavefrontError) -> Figure:
 
 
 def _cuts(axes: Axes, error: WavefrontError, edge: float) -> None:
-    """Along x and along y through the middle of the map."""
+    """Draw cuts along x and along y through the centre of the map."""
     row, column = (len(along) // 2 for along in (error.y, error.x))
     for along, line, colour, name in (
         (error.x, error.opd[row], BLUE, f"along x (y = {error.y[row]:.3g} mm)"),
@@ -50,15 +50,15 @@ def _cuts(axes: Axes, error: WavefrontError, edge: float) -> None:
     ):
         axes.plot(along, line, color=colour, linewidth=1.0, label=name)
     axes.axhline(0.0, color=GREY, linewidth=0.6)
-    axes.set(xlabel="mm", ylabel="waves", ylim=(-edge, edge), title="Cuts through the middle")
+    axes.set(xlabel="mm", ylabel="waves", ylim=(-edge, edge), title="Cuts through the centre")
     axes.legend(loc="upper center")
 
 
 def words(error: WavefrontError) -> str:
-    """What was removed, the angles between rays and wanted rays, and the floor, in a line."""
+    """Return a line on the removed tilt, the angles between rays and requested rays, and the rounding error."""
     piston, (along_x, along_y) = error.without_piston, error.tilt
     return (
-        f"Removed: tilt of ({number(along_x)}, {number(along_y)}) µrad; with it RMS {number(piston.rms)} waves.  "
-        f"Residual angles: RMS {number(error.angle_rms)} µrad, at most {number(error.angle_max)} µrad.  "
-        f"Floor of rounding: {number(error.floor)} waves."
+        f"Removed tilt: ({number(along_x)}, {number(along_y)}) µrad; with this tilt RMS {number(piston.rms)} waves.  "
+        f"Angles to the requested rays: RMS {number(error.angle_rms)} µrad, maximum {number(error.angle_max)} µrad.  "
+        f"Rounding error: {number(error.floor)} waves."
     )

@@ -17,7 +17,7 @@ from bstcad.folder import read_nominal
 from bstcad.optics.measure import Effort, measure
 from bstcad.report import tolerances
 from bstcad.report.drawing import png
-from bstcad.report.light_figures import SHOWN, View, histogram, worst_trials
+from bstcad.report.light_figures import MAX_WORST_TRIALS, View, histogram, worst_trials
 from bstcad.report.tolerances import Grade, Inverse, TargetStudy, Tolerances, Trial, WavefrontStudy
 from bstcad.runs import files
 from bstcad.scene.errors import SceneError
@@ -194,7 +194,7 @@ def _disagreement(study: Study) -> dict[str, float]:
 
 def _figures(scene: Scene, pictures: TargetPictures, study: Study, own: Study) -> dict[str, bytes]:
     """Draw the figures of the report's section for the first target, whose study is `own`; study: the worst target."""
-    numbers = study.worst[:SHOWN]
+    numbers = study.worst[:MAX_WORST_TRIALS]
     amounts = trials(study.perturbations, study.seed, numbers)
     worst = [(k, float(own.full[k]), pictures.light(z)) for k, z in zip(numbers, amounts, strict=True)]
     nominal = pictures.light(np.zeros(len(study.perturbations)))

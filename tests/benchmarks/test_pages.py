@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from bstcad.report.drawing import HEAVIEST
+from bstcad.report.drawing import MAX_PNG_BYTES
 from bstcad.scene.scene import load
 from tests.benchmarks import accuracy, published
 from tests.benchmarks.mitsuba_caustic import VERTICES, control_net
@@ -30,7 +30,7 @@ def test_every_piece_is_recorded_with_its_circumstances_and_pictures():
         pictures.append(published.PICTURES / f"{name}.png")
         assert Image.open(pictures[-1]).size == (2 * published.SIDE + published.GAP, published.SIDE)
         assert found["stated"] == pytest.approx(found["rrmsd"], rel=0.01) and found["error"] < 0.01 * found["rrmsd"]
-    assert list(PUBLISHED) == list(published.CASES) and all(path.stat().st_size < HEAVIEST for path in pictures)
+    assert list(PUBLISHED) == list(published.CASES) and all(path.stat().st_size < MAX_PNG_BYTES for path in pictures)
 
 
 def test_mitsuba_the_paper_and_the_knobs_stand_on_the_axes_of_one_figure():

@@ -183,7 +183,7 @@ def test_an_earlier_report_that_does_not_fit_is_not_believed(quick_folder, holds
     for text in REPORTS.values():
         path.write_text(text())
         assert record.making(path) == Making()
-        with pytest.raises(ValueError, match="report.json: cannot be read .*; bstcad verify writes it anew"):
+        with pytest.raises(ValueError, match="report.json: cannot be read .*; run bstcad verify"):
             record.read(path)
     path.write_text(REPORTS["huge"]())
     with spending("report.json of anything", 300.0, holds):

@@ -168,7 +168,7 @@ def test_the_report_has_a_made_part_where_one_was_asked_for(small_design, nomina
         "points", "alignment", "pv", "rms", "slope_rms", "rrmsd_predicted", "passed", "outliers",
     } <= written["measured"].keys()  # fmt: skip
     assert [check["name"] for check in written["checks"] if check["name"].startswith(PART)]
-    assert "outliers (2.0 % of the points near the face) stand alone" in " ".join(page.split())
+    assert "(2.0 % of the points near the face) are outliers" in " ".join(page.split())
     assert report["verdict"] == "passed with remarks" and "are outliers" in report["given_up"][-1]
     assert (
         "RRMSD, made part" in page
@@ -196,8 +196,8 @@ def test_many_parts_of_one_design_are_judged_beside_it(small_design, nominal, tm
     given.write_text("\n".join(["ID;X nom;Y nom;Z nom;X act;Y act;Z act", *rows]).replace(".", ","))
     assert cli.run(["verify", str(folder), "--measured", str(given), "-o", str(place)]) == 0
     out, page = capsys.readouterr().out, (place / "report.html").read_text()
-    assert f"Files: {place}" in out and "of its actual columns X act, Y act, Z act; 100 without data left out" in out
-    assert "its actual columns X act, Y act, Z act; left out: 100 without data" in " ".join(page.split())
+    assert f"Files: {place}" in out and "values, X act, Y act, Z act; 100 points without data left out" in out
+    assert "columns of measured values X act, Y act, Z act; left out: 100 without data" in " ".join(page.split())
     report = bstcad.open(folder).verify(measured=given, folder=place, progress=False)
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
     written = json.loads((place / "report.json").read_text())

@@ -119,7 +119,7 @@ def test_the_command_and_the_scene_write_every_kind_and_the_design_still_proves(
     assert all(str(folder / name) in out for name in written)
     for name in ("sag", "points", "zemax-back"):  # what the sidecars state, the terminal says
         [sentence] = (folder / f"{name}.txt").read_text().splitlines()
-        assert sentence in out and "the light moves on the target by" in sentence
+        assert sentence in out and "the light on the target by" in sentence
     assert (folder / "datasheet.pdf").read_bytes() == sheet  # as generate drew it
     design = bstcad.open(folder)
     x, y, (z, *_) = read_zemax((folder / "zemax-back.dat").read_text())
@@ -131,9 +131,9 @@ def test_the_command_and_the_scene_write_every_kind_and_the_design_still_proves(
 @pytest.mark.parametrize(
     "arguments, words",
     [
-        (["--as", "iges"], "'iges' is nothing that can be exported; give one of sag, points"),
+        (["--as", "iges"], "'iges' cannot be exported; give one of sag, points"),
         ([], "--as is missing; give what to write"),
-        (["--as", "sag", "--points", "2"], "2 points a side are not possible; give 3 to 4097"),
+        (["--as", "sag", "--points", "2"], "2 points per side are not possible; give 3 to 4097"),
         (["--as", "datasheet"], "report.json: cannot be read"),  # whose figures it quotes
     ],
 )
@@ -266,7 +266,7 @@ def test_dxf_and_svg_have_each_edge_closed_on_its_layer_in_true_size(case):
     reach = max(abs(float(line.get(end))) for line in groups["centres"] for end in ("x1", "y2") if line.get(end))
     assert left < -reach and top < -reach / 2 and left + width > reach
     assert all(top < float(line.get("y")) < top + height for line in groups["text"])
-    assert all(len(line.text) <= exports.COLUMNS for line in groups["text"])
+    assert all(len(line.text) <= exports.MAX_LINE_LENGTH for line in groups["text"])
 
 
 def test_y_points_up_in_the_svg_and_its_words_are_those_of_the_dxf():

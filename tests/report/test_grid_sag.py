@@ -15,7 +15,7 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Plane, sag
 from bstcad.report import grid_sag
-from bstcad.report.grid_sag import BOUND, GridSag, Throw, moved_by, table_note
+from bstcad.report.grid_sag import MAX_SHIFT, GridSag, Throw, shift_by_patches, table_note
 from tests.report.test_exports import read_zemax
 
 OUTLINE, THROW = Rectangle(8.0, 6.0), 200.0  # mm
@@ -52,13 +52,13 @@ def test_the_light_moves_as_far_as_is_stated(points):
     at = grid.grid.x, grid.grid.y
     assert [each[-1] for each in at] == pytest.approx([4.0, 3.0]) == [-each[0] for each in at]  # as large as the lens
     if points is None:  # through the knots, with one point between two: nothing moves
-        assert off.max() < 1e-9 and grid.moved.most < 1e-9 and [len(each) for each in at] == [33, 25]
-        assert "leave out --points" not in grid.note("a.dat")
+        assert off.max() < 1e-9 and grid.shift.maximum < 1e-9 and [len(each) for each in at] == [33, 25]
+        assert "omit --points" not in grid.note("a.dat")
     else:
-        assert grid.moved.rms == pytest.approx(np.sqrt((off**2).mean()), rel=0.1)  # by 1500 points
-        assert grid.moved.most == pytest.approx(off.max(), rel=0.3)
-        assert ("leave out --points" in grid.note("a.dat")) == (grid.moved.most > BOUND * grid.moved.pixel)
-        assert grid.moved.pixel == 0.25 and f"{points} x" in grid.note("a.dat")
+        assert grid.shift.rms == pytest.approx(np.sqrt((off**2).mean()), rel=0.1)  # by 1500 points
+        assert grid.shift.maximum == pytest.approx(off.max(), rel=0.3)
+        assert ("omit --points" in grid.note("a.dat")) == (grid.shift.maximum > MAX_SHIFT * grid.shift.pixel)
+        assert grid.shift.pixel == 0.25 and f"{points} x" in grid.note("a.dat")
 
 
 @pytest.mark.parametrize("outline", [OUTLINE, Circle(3.0)], ids=lambda outline: outline.shape)
@@ -68,8 +68,8 @@ def test_where_the_lens_reaches_into_the_end_spans_the_grid_gets_finer(outline):
     grid = GridSag.of(lens, lens.back, throw=replace(BEAM, source=Collimated(outline)))
     cells = np.array(lens.back.pitch) / grid.grid.step
     assert cells == pytest.approx(cells.round()) and cells[0] >= 2
-    assert 0 < grid.moved.most <= BOUND * grid.moved.pixel
-    assert moved_by(lens, lens.back, GridSag.of(lens, lens.back, 21).patches, BEAM).rms > 10 * grid.moved.rms
+    assert 0 < grid.shift.maximum <= MAX_SHIFT * grid.shift.pixel
+    assert shift_by_patches(lens, lens.back, GridSag.of(lens, lens.back, 21).patches, BEAM).rms > 10 * grid.shift.rms
 
 
 def test_light_of_a_point_and_a_face_before_it_are_judged_too():
@@ -77,10 +77,10 @@ def test_light_of_a_point_and_a_face_before_it_are_judged_too():
     lens = wavy()
     lens = replace(lens, front=lens.back.moved(1.0), back=Plane(4.0))
     throw = Throw(Point((0.0, 0.0, -30.0), half_angle=5.0, profile="uniform"), BEAM.screens)
-    exact, coarse = (GridSag.of(lens, lens.front, points, throw).moved for points in (None, 21))
-    assert exact.most < 1e-9 < 1e-3 < coarse.rms < coarse.most
+    exact, coarse = (GridSag.of(lens, lens.front, points, throw).shift for points in (None, 21))
+    assert exact.maximum < 1e-9 < 1e-3 < coarse.rms < coarse.maximum
     beside = replace(throw, source=Point((300.0, 0.0, -30.0), half_angle=1.0, profile="uniform"))
-    assert GridSag.of(lens, lens.front, 21, beside).moved is None
+    assert GridSag.of(lens, lens.front, 21, beside).shift is None
     assert "no light comes to the target" in table_note(lens, lens.front, "sag.csv", points=21, throw=beside)
 
 
@@ -88,16 +88,16 @@ def test_a_mirror_is_judged_by_its_own_light():
     """A slope that is off by δ turns reflected light by 2 δ: four times as far as through a lens of index 1.5."""
     through = replace(wavy(), index=1.5)
     mirror = replace(through, front=Plane(-2.0), reflects=True)
-    moved = [moved_by(lens, lens.back, GridSag.of(lens, lens.back, 21).patches, BEAM) for lens in (through, mirror)]
+    moved = [shift_by_patches(lens, lens.back, GridSag.of(lens, lens.back, 21).patches, BEAM) for lens in (through, mirror)]
     assert moved[1].rms == pytest.approx(4 * moved[0].rms, rel=0.02)
 
 
 def test_a_large_grid_ends_at_the_knots_beyond_the_rim(monkeypatch):
     """The large grid has a quarter of the points, wherever the rim lies between the knots."""
-    monkeypatch.setattr(grid_sag, "FLUSH", 33 * 25 - 1)
+    monkeypatch.setattr(grid_sag, "MAX_FLUSH_POINTS", 33 * 25 - 1)
     for lens in (wavy(), wavy(past=1.8)):
         each = GridSag.of(lens, lens.back, None, BEAM)
-        assert (len(each.grid.x), len(each.grid.y)) == (18, 14) and each.moved.most < 1e-9
+        assert (len(each.grid.x), len(each.grid.y)) == (18, 14) and each.shift.maximum < 1e-9
         assert 4.0 < each.grid.x[-1] < 4.0 + each.grid.step[0] and each.grid.x[0] == pytest.approx(-each.grid.x[-1])
 
 
@@ -105,7 +105,7 @@ def test_a_narrow_lens_has_the_five_points_that_opticstudio_asks_for():
     lens = wavy((21, 9), outline=Rectangle(8.0, 0.5))
     for points in (None, 9):
         grid = GridSag.of(lens, lens.back, points)
-        assert len(grid.grid.y) >= 5 and len(grid.grid.x) >= 5 and grid.moved is None
+        assert len(grid.grid.y) >= 5 and len(grid.grid.x) >= 5 and grid.shift is None
         x, y, (z, *_) = read_zemax(grid.text())
         assert x[-1] >= 4.0 - 1e-9 and y[-1] >= 0.25 - 1e-9
         assert np.abs(z + sag(lens.back, 0.0, 0.0) - sag(lens.back, *np.meshgrid(x, y))).max() < 1e-12

@@ -92,7 +92,7 @@ def test_a_back_that_moved_says_where_it_stands(free, tmp_path):
     scene = free.scene.changed({"lens.back.z": 24.0})
     z = prescriptions.vertex(free.lens)
     text = prescriptions.scene_text(scene, free.lens)
-    assert text.startswith("# as designed, the vertex of the back stands at z = ") and repr(z) in text.splitlines()[0]
+    assert text.startswith("# as designed, the vertex of the back is at z = ") and repr(z) in text.splitlines()[0]
     (tmp_path / "scene.toml").write_text(text, encoding="utf-8")
     assert load(tmp_path / "scene.toml").lens.back.z == 24.0
     said = prescriptions.text(prescriptions.prescription(scene, free.lens, SHAPE))

@@ -58,7 +58,7 @@ WRONG = {  # key of report.json: values that are none of ours
 def test_a_report_with_an_entry_that_does_not_fit_is_refused_in_one_sentence(tmp_path, key, value):
     path = tmp_path / "report.json"
     path.write_text(json.dumps(TOLD["report"] | {key: value}))
-    with pytest.raises(ValueError, match="report.json: cannot be read .*; bstcad verify writes it anew") as refused:
+    with pytest.raises(ValueError, match="report.json: cannot be read .*; run bstcad verify") as refused:
         record.read(path)
     assert str(refused.value).isprintable() and len(str(refused.value)) < 400
     assert record.making(path) == Making()

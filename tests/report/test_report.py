@@ -98,14 +98,14 @@ SAID = [  # changes of REPORT: words of the page; do they stand on the terminal,
     ({"rrmsd": 0.0099}, "; not resolved: the standard error 0.002", True),  # less than five standard errors
     ({"flux": GONE}, "missed the lens 46.9 %, lost through the sides 18.5 %, beside the target 0.80 %", True),
     ({"leak": 0.012, "contrast": 85.0}, "lit pixels are 85 times as bright", True),
-    ({"finest_detail": DETAIL}, "0.53 degrees); it would be 2.4 mm with the target 250 mm instead of 600 mm from the lens", True),
+    ({"finest_detail": DETAIL}, "degrees); it would be 2.4 mm with the target 250 mm instead of 600 mm from", True),
     ({"finest_detail": DETAIL | ALONE | {"assumed": True}}, "0.53 degrees, which the scene does not state", True),
-    ({"finest_detail": DETAIL | {"source_image": 0.1}}, "by the pixels; the image of the source is 0.1 mm wide (so", True),
+    ({"finest_detail": DETAIL | {"source_image": 0.1}}, "pixels; the image of the source is 0.1 mm wide (so", True),
     ({"shape": SHAPE}, "smallest convex radius none", True),
     ({"prescription": {"outline": {"radius": 7.5, "shape": "circle"}}}, "Ø 15 mm", True),
     ({"title": "[red]Letters[/red]"}, "[red]Letters[/red]", True),
     ({"blur": {"width": 50.2, "pixels": 6.03, "rrmsd": 0.114}}, "50.2 mm or 6.03 pixels wide", False),
-    ({"machine": {"device": "NVIDIA X"}}, "a GPU adds up in no fixed order", False),
+    ({"machine": {"device": "NVIDIA X"}}, "a GPU sums in no fixed order", False),
     ({"convergence": CURVE | {"halving": 5.66}}, "about 5.7 times the time of the evaluations", False),
     ({"picture": ["target.image: the first", "target.fit: cropped"]}, "image: the first; target.fit: cropped.", False),
 ]
@@ -154,7 +154,7 @@ class TestHtml:
         checks = [REPORT["checks"][0] | {"limit": None}, *REPORT["checks"][1:]]
         report = REPORT | {"verdict": "no limit was asked", "rrmsd_asked": None, "checks": checks}
         first, second, *_ = printed(report).splitlines()
-        assert first == "NO LIMIT WAS ASKED: Letters" and second.startswith("Remark: The scene sets no limit on the light")
+        assert first == "NO LIMIT WAS ASKED: Letters" and second.startswith("Remark: The scene sets no limit")
         page = page_of(tmp_path, report)
         assert '<div class="verdict plain"><strong>? NO LIMIT WAS ASKED' in page and "PASSED" not in page
         suite = etree.fromstring(reports.junit(contents(report)))[0]
@@ -205,7 +205,7 @@ class TestSummary:
         assert short.startswith("PASSED: Letters\n") and short.endswith("\n3 checks passed; --verbose lists them.\n")
         assert not any(check["name"] + ":" in short for check in REPORT["checks"])
         assert "\npass form of the STEP: 0.3 nm, limit ≤ 1 nm [check-form]\n" in long and "FAIL" not in long
-        assert long.count("\npass ") == 3 and "\n3 checks passed.\nbstcad docs NAME explains" in long
+        assert long.count("\npass ") == 3 and "\n3 checks passed.\n" in long and "bstcad docs NAME" in long
 
     def test_a_failed_check_is_shown_once_with_value_limit_and_place_after_the_first_figures(self):
         report = failing() | {"given_up": ["The lens is thick."], "remarks": ["vertex-moved"]}
@@ -214,7 +214,7 @@ class TestSummary:
         verdict, remark, *figures, failed, passed, explained = lines
         assert (verdict, remark) == ("FAILED: Letters", "Remark: The lens is thick. [remark-vertex-moved]")
         assert failed == "FAIL [/] thinnest place (at [red](1, 2) mm): 0.7 mm, limit ≥ 1 mm"
-        assert explained.startswith("bstcad docs NAME") and passed.startswith("2 checks passed")
+        assert "bstcad docs NAME" in explained and passed.startswith("2 checks passed")
         assert any(line.startswith("RRMSD against the target") for line in figures)
 
     def test_terminal_and_page_show_the_same_first_figures(self, tmp_path):

@@ -29,7 +29,7 @@ def test_the_figure_says_its_numbers_and_what_was_removed():
     figure = wavefront_map(ERROR)
     title, foot = figure.axes[0].get_title(loc="left"), figure.get_supxlabel()
     assert title == "OPD at z = 40 mm, piston and tilt removed:\nRMS 0.123 waves, PV 0.87 waves"
-    for words in ("tilt of (12, −3) µrad; with it RMS 0.4 waves", "RMS 21 µrad, at most 77 µrad", "5.6 × 10⁻¹¹ waves"):
+    for words in ("tilt: (12, −3) µrad", "RMS 0.4 waves", "RMS 21 µrad, maximum 77 µrad", "5.6 × 10⁻¹¹ waves"):
         assert words in foot
     assert any(axes.get_ylabel() == "waves of 632.8 nm" for axes in figure.axes)
 

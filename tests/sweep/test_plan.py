@@ -110,7 +110,7 @@ def test_the_reach_of_each_target_is_drawn_and_of_two_faces_refused(tmp_path, ca
     png = tmp_path / "reach.png"
     assert cli.run(["plan", str(tmp_path / "two.toml"), "--png", str(png)]) == 0
     out = " ".join(capsys.readouterr().out.split())
-    assert "left out, target[0]" in out and "left out, target[1]" in out and plans.ALONE in out
+    assert "not simulated, target[0]" in out and "not simulated, target[1]" in out and plans.ALONE in out
     first, second = (png.with_stem(stem).read_bytes() for stem in ("reach", "reach_2"))
     assert first.startswith(b"\x89PNG") and second.startswith(b"\x89PNG") and first != second
     both = tmp_path / "both.png"
@@ -141,7 +141,7 @@ def blurred(rrmsd):
 
 VERDICTS = [
     (0.1, predicted(0.02, 0.03, 0.04), "within", "an RRMSD of about 0.03 after about 30 s, in standard qualit"),
-    (0.1, predicted(0.08, 0.12, 0.15), "open", "the limit is 0.1, and the result will probably lie between 0.08 and 0.15."),
+    (0.1, predicted(0.08, 0.12, 0.15), "open", "0.1, and the result will probably lie between 0.08 and 0.15."),
     (0.1, predicted(0.2, 0.3, 0.4), "beyond", "the limit is 0.1 and will probably not be reached."),
     (None, predicted(0.02, 0.03, 0.04), "no limit", "designs would pass with [accept] rrmsd = 0.0"),
     (0.1, {"predicted": None, "not_predicted": "too odd", "goals": [{"blur": None}]}, "not predicted", "too odd."),

@@ -261,7 +261,7 @@ def test_prescription_and_data_sheet_have_both_nets(two):
     assert dict(front)["Form"] == "B-spline of degree 2, 33 × 33"
     assert "RRMSD" in dict(purpose)["target[1]"] and body
     order = prescription.order_of(two.made.scene, two.made.lens, two.facts["shape"], two.folder)
-    assert order.freeform == ("back", "front") and "8.06 mm before the vertex of the front" in order.datum
+    assert order.freeform == ("back", "front") and "8.06 mm in front of the vertex of the front" in order.datum
     radii = two.facts["shape"]["radius_min_concave"], two.facts["shape"]["front_radius_min_concave"]
     assert order.tool_radius == pytest.approx(min(radii), rel=1e-9)
 
