@@ -177,7 +177,7 @@ def through_knots(face: BSplineSurface, outline: Outline, parts: int) -> tuple[n
         places = np.arange(m - 3) + 1.5 if parts == 1 else np.arange(parts * (m - 1) + 1) / parts  # x(t) = t + 1/2
         first = np.searchsorted(places, (-half - low) / pitch + RIM_ROUNDING, "right") - 1
         last = np.searchsorted(places, (half - low) / pitch - RIM_ROUNDING, "left")
-        if first < 0 or last >= len(places) or not LEAST_OF_ZEMAX <= last - first + 1 <= MOST:
+        if first < 0 or last >= len(places) or not MIN_ZEMAX_POINTS <= last - first + 1 <= MAX_POINTS:
             return None
         found.append(low + pitch * places[first : last + 1])
     return found[0], found[1]

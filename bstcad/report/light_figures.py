@@ -223,7 +223,7 @@ def _side_by_side(
 
 
 def _largest(values: np.ndarray, spot: float = MIN_SCALE) -> float:
-    """Return the end of a scale of differences: their 99.5th percentile, or `spot` times the largest if that is more."""
+    """Return the end of a scale of differences: their 99.5th percentile, at least `spot` times the largest."""
     size = np.abs(values)
     return round_up(max(float(np.percentile(size, 99.5)), spot * float(size.max())))
 
@@ -470,7 +470,8 @@ def made_part(made: MadePart, designed: np.ndarray, view: View) -> Figure:
     face.spines[:].set_visible(False)
     dots = ""
     if len(outliers):
-        face.plot(*outliers.T, ".", color="black", markersize=3.0 if len(outliers) < MANY_OUTLIERS else 1.0, markeredgewidth=0)
+        size = 3.0 if len(outliers) < MANY_OUTLIERS else 1.0
+        face.plot(*outliers.T, ".", color="black", markersize=size, markeredgewidth=0)
         many = f"s: {len(outliers)} outliers, which are" if len(outliers) > 1 else ": an outlier, which is"
         dots = f"  Black dot{many} left out."
     change, top = 100.0 * (predicted - designed) / unit, brightest(designed, predicted) / unit

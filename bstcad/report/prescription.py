@@ -54,7 +54,7 @@ EXACT = (  # sentences for one tailored face and for two
     "Both freeform faces are exact in lens.step, and their control points are in design.npz.",
 )
 SHEET, PART, LENS = "datasheet.pdf", "part.step", "lens.step"
-DATUMS = {"front": "the vertex of the front", "flange": "the lower face of the flange"}  # mount.datum: position of z = 0
+DATUMS = {"front": "the vertex of the front", "flange": "the lower face of the flange"}  # mount.datum: plane z = 0
 EDGE_TOLERANCE = 1e-3  # fraction of an outline's area outside an edge below which the edge equals the outline
 
 Point = tuple[float, float, float]

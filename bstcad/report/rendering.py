@@ -1,4 +1,4 @@
-"""Three-dimensional pictures: a still of the lens in clay, the lens with its rays, and a model that a reader can rotate.
+"""Three-dimensional pictures: the lens in clay, the lens with its rays, and a model that a reader can rotate.
 
 Without a display, EGL or OSMesa, VTK ends the whole process by a segmentation fault and writes its messages to the
 terminal.  To protect the design, this file runs itself as a script in another process.  The script reads arrays from a
@@ -35,7 +35,7 @@ FEATURE_ANGLE = 35.0  # angle between facets above which their edge is drawn sha
 # The lens in clay.
 SIZE = (1120, 800)  # size of the picture (pixels)
 CLAY = "#d3d9e0"
-LIGHTS = (((-1.0, 0.5, 0.7), 0.8), ((0.5, -1.0, 0.35), 0.5), ((0.1, -0.2, 1.0), 0.25))  # (direction to the light, intensity)
+LIGHTS = (((-1.0, 0.5, 0.7), 0.8), ((0.5, -1.0, 0.35), 0.5), ((0.1, -0.2, 1.0), 0.25))  # (direction, intensity)
 FINISH = {"ambient": 0.12, "diffuse": 0.9, "specular": 0.2, "specular_power": 30.0}  # surface of the clay
 EYE = (0.75, -1.5, 1.7)  # position of the eye relative to the centre, in diagonals of the bounding box
 VIEW_ANGLE = 26.0  # vertical angle of view (degrees)
@@ -85,7 +85,7 @@ def draw(path: LightPath, picture: Path | None) -> bool:
 
 
 def _run(arrays: Mapping[str, np.ndarray], picture: str, patience: float | None) -> bool:
-    """Run this file as a script that draws `arrays`; return True if it ended without error within `patience` seconds."""
+    """Run this file as a script that draws `arrays`; return True if it succeeded within `patience` seconds."""
     with tempfile.TemporaryDirectory() as folder:
         given = Path(folder, "arrays.npz")
         np.savez(given, **arrays)

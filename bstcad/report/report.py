@@ -71,7 +71,7 @@ def check_line(check: Check) -> str:
 
 
 def machine(facts: Mapping[str, Any]) -> Rows:
-    """Return the known facts of the machine in words; for a GPU, a note that its result cannot be reproduced exactly."""
+    """Return the known facts of the machine in words; for a GPU, with a note that another run gives another lens."""
     known = {key: value for key, value in facts.items() if value is not None}
     sizes = {
         key: f"{value:.3g} GB" for key, value in known.items() if key.endswith("_gb") and not isinstance(value, str)
