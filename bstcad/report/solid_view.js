@@ -1,25 +1,27 @@
 "use strict";
-// Puts a lens that can be turned in the place of its picture.  The picture stays where this cannot draw, and on paper.
-// Nothing moves by itself, so there is nothing to still for those who asked for less motion.
+// Replaces the picture of a lens by a model that can be rotated.  The picture stays if WebGL 2 is missing, and on paper.
+// There is no animation, so a request for reduced motion needs no action.
 //
-// A page that draws a lens again and again calls solidView.begin(figure, solid) once, with what rendering.turnable
-// tells of the lens, and then update(solid) of what that returned.  With rays there are two framings: look("lens"),
-// from near by, z up, and look("way"), all of the way of the light with its walls, true to scale, y up.  The pictures
-// on walls are data URLs, which the page's policy has to allow (img-src data:).
+// A page calls solidView.begin(figure, solid) once with the JSON of rendering.turnable, and update(solid) of the result
+// for each new lens.  With rays there are two framings: look("lens") is the close view, z up; look("way") is the whole
+// path of the light with its walls (the screens), to scale, y up.  The pictures on walls are data URLs, which the
+// policy of the page has to allow (img-src data:).
 globalThis.solidView = (() => {
-  const STEP = Math.PI / 36, NEARER = 1.25, FARTHEST = 0.6, NEAREST = 8, CLOSE = 1.5, FILLED = 0.92;
-  const UPRIGHT = 1.55, MOST_PIXELS = 2; // radians; device pixels a pixel of the page
-  const SOME = 2, AHEAD = 2; // from near by: every second ray, for two diagonals of the lens
-  const ROOM = 0.5, BESIDE = 1.5; // that much of them is in view, and a lamp that is so near to the middle
-  const FAR = 2.4; // the eye from the middle of all of the way, in its diagonals
-  const FAINTEST = 0.35, SPARSE = 0.75, DENSE = 0.4; // opacity of a ray without flux, and of all near by and on the way
-  const BEFORE = 0.8; // opacity of a wall that light goes on behind
-  const GLASS = [0.62, 0.75, 0.88], SHARP = 0.82; // a colour; the cosine of the least turn that makes an edge
-  const RAY = 0, BORDER = 1, EDGE = 2, LAMP = 3; // lines: of light, around a wall, of glass; and a dot
-  const LINE = 9; // numbers of a line: its ends, the opacity at them, and what it is
+  // rotation per key press (radians); zoom factor per key press; limits of zoom and shift; largest zoom and filled
+  // fraction of the first view
+  const STEP = Math.PI / 36, ZOOM_STEP = 1.25, MIN_ZOOM = 0.6, MAX_ZOOM = 8, MAX_HOME_ZOOM = 1.5, FILLED = 0.92;
+  const MAX_TILT = 1.55, MAX_PIXEL_RATIO = 2; // largest elevation of the eye (radians); device pixels per CSS pixel
+  const RAY_STEP = 2, RAY_REACH = 2; // close view: every second ray; length outside the lens, in diagonals of the lens
+  const VISIBLE_REACH = 0.5, LAMP_REACH = 1.5; // length of rays inside the view; largest distance of a lamp inside it
+  const EYE_DISTANCE = 2.4; // distance of the eye from the centre of the whole path, in diagonals of the path
+  const MIN_OPACITY = 0.35, CLOSE_OPACITY = 0.75, PATH_OPACITY = 0.4; // rays without flux; close view; whole path
+  const SCREEN_OPACITY = 0.8; // opacity of a wall in front of another one
+  const GLASS = [0.62, 0.75, 0.88], SHARP_COSINE = 0.82; // colour of glass; cosine of the smallest angle of an edge
+  const RAY = 0, BORDER = 1, EDGE = 2, LAMP = 3; // kinds of lines: ray, border of a wall, edge of the lens, point source
+  const LINE = 9; // numbers per line: both ends, the opacity at both, and the kind
 
   // Positions in mm, seen from `distance` along the last of the axes (right, up, towards the eye); `focal` is
-  // 1 / tan(half the angle); `range` is how near and how far from the eye something is drawn.
+  // 1 / tan(half the angle of view); `range` is the nearest and the farthest distance that is drawn.
   const SIGHT = `#version 300 es
     precision highp float;
     uniform vec3 axes[3], centre;
@@ -41,13 +43,13 @@ globalThis.solidView = (() => {
       facing = turned(normal);
       gl_Position = drawnAt(seen);
     }`,
-  // The same clay under the same lamps as in the picture; or glass, the less clear the more it is seen aslant.
+  // Clay with the lights of the picture; or glass, whose opacity increases with the angle of view.
   `#version 300 es
     precision highp float;
     in vec3 seen, facing;
     uniform vec3 clay, lamps[3], bright, finish;
     uniform float gloss;
-    uniform vec2 veil; // opacity: seen head on, and aslant
+    uniform vec2 veil; // opacity at normal view, and at grazing view
     out vec4 colour;
     void main() {
       vec3 normal = normalize(facing), eye = normalize(-seen), light = finish.x * clay;
@@ -63,14 +65,14 @@ globalThis.solidView = (() => {
       colour = vec4(min(light, 1.0), 1.0) * min(mix(veil.x, veil.y, slant * slant) + shone, 1.0);
     }`];
 
-  // A line is a strip as wide in pixels as what it is; a browser's own lines are one pixel wide on any display.
+  // A line is a strip with the width of its kind in pixels, since WebGL lines are one device pixel wide.
   const LINES = [`${SIGHT}
     layout(location = 0) in vec3 begin;
     layout(location = 1) in vec3 end;
     layout(location = 2) in vec3 look;
     uniform vec2 pixels;
     uniform float ratio;
-    const float WIDTHS[4] = float[4](1.2, 1.6, 1.2, 9.0); // of the page's pixels
+    const float WIDTHS[4] = float[4](1.2, 1.6, 1.2, 9.0); // widths in CSS pixels, by kind
     const vec3 COLOURS[4] = vec3[4](
       vec3(0.93, 0.46, 0.05), vec3(0.55, 0.59, 0.63), vec3(0.42, 0.53, 0.64), vec3(1.0, 0.70, 0.05));
     out vec4 ink;
@@ -78,7 +80,7 @@ globalThis.solidView = (() => {
     out float thick;
     void main() {
       vec3 a = seenAt(begin), b = seenAt(end);
-      gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // nowhere: all of it is behind the eye
+      gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // outside the view: the whole line is behind the eye
       if (max(-a.z, -b.z) <= range.x) return;
       if (-a.z < range.x) a = mix(b, a, (range.x + b.z) / (b.z - a.z));
       if (-b.z < range.x) b = mix(a, b, (range.x + a.z) / (a.z - b.z));
@@ -90,7 +92,7 @@ globalThis.solidView = (() => {
       int kind = int(look.z);
       bool last = gl_VertexID > 1;
       thick = WIDTHS[kind] * ratio / 2.0;
-      float along = kind == 3 ? thick + 1.0 : 0.0; // a lamp is round
+      float along = kind == 3 ? thick + 1.0 : 0.0; // a lamp is a disc
       off = vec2(last ? along : -along, gl_VertexID % 2 == 0 ? thick + 1.0 : -thick - 1.0);
       vec4 drawn = last ? q : p;
       gl_Position = vec4(drawn.xy + (way * off.x + vec2(-way.y, way.x) * off.y) * 2.0 / pixels, drawn.z, 1.0);
@@ -104,7 +106,7 @@ globalThis.solidView = (() => {
     out vec4 colour;
     void main() { colour = ink * clamp(thick + 0.5 - length(off), 0.0, 1.0); }`];
 
-  // Row 0 of a picture, which a texture begins with, is at the last two corners.
+  // Row 0 of a picture is the first of a texture, and lies at the last two corners.
   const WALL = [`${SIGHT}
     uniform vec3 corners[4];
     out vec2 at;
@@ -120,7 +122,7 @@ globalThis.solidView = (() => {
     out vec4 colour;
     void main() { colour = vec4(texture(picture, at).rgb, 1.0) * opacity; }`];
 
-  // Triangles of the faces and of the wall between their rims, six numbers a corner: place and normal.
+  // Returns the triangles of the faces and of the side wall; six numbers per vertex: position and normal.
   function meshOf(solid) {
     const bytes = Uint8Array.from(atob(solid.values), (letter) => letter.charCodeAt(0));
     const values = new Uint16Array(bytes.buffer);
@@ -140,7 +142,7 @@ globalThis.solidView = (() => {
       for (let i = 0; i < face.cells; i++) {
         for (let j = 0; j < face.cells; j++) {
           const a = first + i * side + j, b = a + side, c = b + 1, d = a + 1;
-          const rising = i < face.cells / 2 === j < face.cells / 2; // along the diagonal that points to the middle
+          const rising = i < face.cells / 2 === j < face.cells / 2; // the diagonal that points to the centre
           const two = rising ? [a, b, c, a, c, d] : [a, b, d, b, c, d]; // counterclockwise from above
           mesh.triangles.push(...(face.up > 0 ? two : two.reverse()));
         }
@@ -161,19 +163,19 @@ globalThis.solidView = (() => {
     return mesh;
   }
 
-  // Every so many rays, up to `longest` mm before and behind the lens.
+  // Returns the lines of every `every`-th ray, cut at `longest` mm in front of and behind the lens.
   function raysOf(solid, every, longest, opacity) {
-    const lines = [], afar = solid.lamp.length ? 1 : 0; // opacity where the light begins: it fades in if from no lamp
+    const lines = [], begins = solid.lamp.length ? 1 : 0; // opacity at the start: parallel light fades in
     solid.rays.forEach((stops, ray) => {
       if (ray % every) return;
-      const tone = opacity * (FAINTEST + (1 - FAINTEST) * solid.flux[ray]), last = stops.length - 2;
+      const tone = opacity * (MIN_OPACITY + (1 - MIN_OPACITY) * solid.flux[ray]), last = stops.length - 2;
       for (let k = 0; k <= last; k++) {
         const [begin, end] = [stops[k], stops[k + 1]];
         const share = longest / Math.hypot(...end.map((part, axis) => part - begin[axis])), cut = share < 1;
         const from = (place, other) => place.map((part, axis) => part + share * (other[axis] - part));
         const first = k === 0 && cut ? from(end, begin) : begin, final = k === last && cut ? from(begin, end) : end;
-        // It fades where it is cut, and is faint on the wall, where the picture is to be seen.
-        lines.push(...first, ...final, k ? tone : cut ? 0 : tone * afar, k < last ? tone : cut ? 0 : tone / 2, RAY);
+        // A ray fades where it is cut, and is faint on the wall, so that the picture is visible.
+        lines.push(...first, ...final, k ? tone : cut ? 0 : tone * begins, k < last ? tone : cut ? 0 : tone / 2, RAY);
       }
     });
     return lines;
@@ -182,7 +184,7 @@ globalThis.solidView = (() => {
   const lampOf = (solid) => solid.lamp.flatMap((place) => [...place, ...place, 1, 1, LAMP]);
   const bordersOf = ({ corners }) => corners.flatMap((at, k) => [...at, ...corners[(k + 1) % 4], 1, 1, BORDER]);
 
-  // Where the faces of the lens meet its wall, and corners of that.
+  // Returns the edges between the faces and the side wall, and the sharp edges of the wall.
   function edgesOf({ rim }) {
     const lines = [], add = (a, b) => lines.push(...a, ...b, 0.9, 0.9, EDGE);
     rim.forEach(([low, high], k) => {
@@ -190,43 +192,45 @@ globalThis.solidView = (() => {
       add(low, after);
       add(high, rim[(k + 1) % rim.length][1]);
       const [a, b] = [[low[0] - before[0], low[1] - before[1]], [after[0] - low[0], after[1] - low[1]]];
-      if (a[0] * b[0] + a[1] * b[1] < SHARP * Math.hypot(...a) * Math.hypot(...b)) add(low, high);
+      if (a[0] * b[0] + a[1] * b[1] < SHARP_COSINE * Math.hypot(...a) * Math.hypot(...b)) add(low, high);
     });
     return lines;
   }
 
-  const seenThrough = (solid) => Boolean(solid.rays) && !solid.mirror; // by itself a lens is of clay
+  const isGlass = (solid) => Boolean(solid.rays) && !solid.mirror; // a lens without rays is of clay
 
-  // What is drawn, and seen from where: the lens by itself, among rays that go on, or with walls at the end of them.
+  // Returns the drawn objects and the position of the eye: the lens alone, with its rays, or the whole path with walls.
   function framingOf(solid, mesh, look) {
     const reach = Math.hypot(...solid.size), distance = reach * Math.hypot(...solid.eye);
-    const centre = solid.low.map((low, k) => low + solid.size[k] / 2), glass = seenThrough(solid);
+    const centre = solid.low.map((low, k) => low + solid.size[k] / 2), glass = isGlass(solid);
     const range = [distance - 0.55 * reach, distance + 0.55 * reach];
     const alone = { look, eye: solid.eye, centre, distance, range, glass, walls: [], lines: [], points: [] };
     if (!solid.rays) return withExtent(alone, mesh);
     const edges = glass ? edgesOf(mesh) : [];
     if (look === "lens") {
-      const near = ([x, y, z]) => Math.hypot(x - centre[0], y - centre[1], z - centre[2]) < BESIDE * reach;
-      const begun = raysOf(solid, SOME, ROOM * reach, 1).filter((part, k) => k % LINE < 6);
+      const near = ([x, y, z]) => Math.hypot(x - centre[0], y - centre[1], z - centre[2]) < LAMP_REACH * reach;
+      const begun = raysOf(solid, RAY_STEP, VISIBLE_REACH * reach, 1).filter((part, k) => k % LINE < 6);
       return withExtent({
-        ...alone, range: [0.05 * reach, distance + (AHEAD + 0.6) * reach],
+        ...alone, range: [0.05 * reach, distance + (RAY_REACH + 0.6) * reach],
         points: [...begun, ...solid.lamp.filter(near).flat()],
-        lines: [...edges, ...raysOf(solid, SOME, AHEAD * reach, SPARSE), ...lampOf(solid)],
+        lines: [...edges, ...raysOf(solid, RAY_STEP, RAY_REACH * reach, CLOSE_OPACITY), ...lampOf(solid)],
       }, mesh);
     }
     const points = [solid.rays, solid.screens.map((screen) => screen.corners), solid.lamp].flat(Infinity);
     const ends = solid.low.map((low, axis) => [low, low + solid.size[axis]]);
     points.forEach((part, k) => ends[k % 3].push(part));
     const [low, high] = [Math.min, Math.max].map((choose) => ends.map((parts) => choose(...parts)));
-    const whole = Math.hypot(...high.map((end, axis) => end - low[axis])); // a ball of this width holds all of it
+    const whole = Math.hypot(...high.map((end, axis) => end - low[axis])); // diameter of a sphere around the whole path
     return withExtent({
-      ...alone, eye: solid.aside, centre: low.map((end, axis) => (end + high[axis]) / 2), distance: FAR * whole,
-      range: [(FAR - 0.55) * whole, (FAR + 0.55) * whole], walls: solid.screens, points,
-      lines: [...edges, ...solid.screens.flatMap(bordersOf), ...raysOf(solid, 1, Infinity, DENSE), ...lampOf(solid)],
+      ...alone, eye: solid.aside, centre: low.map((end, axis) => (end + high[axis]) / 2), distance: EYE_DISTANCE * whole,
+      range: [(EYE_DISTANCE - 0.55) * whole, (EYE_DISTANCE + 0.55) * whole], walls: solid.screens, points,
+      lines: [
+        ...edges, ...solid.screens.flatMap(bordersOf), ...raysOf(solid, 1, Infinity, PATH_OPACITY), ...lampOf(solid),
+      ],
     }, mesh);
   }
 
-  // How far to each side the solid and the other points of a framing are seen from its eye, at a focal length of 1.
+  // Adds the extent of all points of a framing in the view from its eye, at a focal length of 1.
   function withExtent(framing, mesh) {
     const { look, eye, centre, distance } = framing, axes = axesOf(look, ...anglesOf(look, eye));
     let [left, right, lowest, highest] = [Infinity, -Infinity, Infinity, -Infinity];
@@ -238,18 +242,18 @@ globalThis.solidView = (() => {
         [lowest, highest] = [Math.min(lowest, y), Math.max(highest, y)];
       }
     }
-    if (framing.walls.length) { // as far to both sides: what is long would be turned out of a view off the middle
+    if (framing.walls.length) { // symmetric, since a long path would rotate out of a view that is not centred
       [right, highest] = [Math.max(right, -left), Math.max(highest, -lowest)];
       [left, lowest] = [-right, -highest];
     }
     return { ...framing, extent: { left, right, lowest, highest } };
   }
 
-  // The view from the framing's eye with all of it in the middle; not so near that a turn would cut much off.
+  // Returns the first view of a framing, centred, with a zoom that is small enough for rotation.
   function homeOf({ look, eye, extent: { left, right, lowest, highest } }, focal, canvas) {
     const [around, above] = anglesOf(look, eye);
-    const ratio = canvas.clientHeight / canvas.clientWidth || 1; // 1: it is not shown yet
-    const nearer = Math.min(CLOSE, (2 * FILLED) / focal / Math.max((right - left) * ratio, highest - lowest));
+    const ratio = canvas.clientHeight / canvas.clientWidth || 1; // 1: the canvas is not visible yet
+    const nearer = Math.min(MAX_HOME_ZOOM, (2 * FILLED) / focal / Math.max((right - left) * ratio, highest - lowest));
     const half = (nearer * focal) / 2;
     return { around, above, nearer, x: -half * ratio * (left + right), y: -half * (lowest + highest) };
   }
@@ -266,9 +270,9 @@ globalThis.solidView = (() => {
     return gl.getProgramParameter(program, gl.LINK_STATUS) ? program : null;
   }
 
-  // Draws solids one after the other, in the same few buffers and textures; null where there is no WebGL 2.
+  // Returns a painter that draws solids in the same buffers and textures; null without WebGL 2.
   function painter(canvas, redraw) {
-    const wanted = { antialias: true, stencil: true, preserveDrawingBuffer: true }; // the last: it may be printed
+    const wanted = { antialias: true, stencil: true, preserveDrawingBuffer: true }; // the last for printing
     const gl = canvas.getContext("webgl2", wanted);
     const programs = gl && [SOLID, LINES, WALL].map((texts) => programOf(gl, texts));
     if (!programs?.every(Boolean)) return null;
@@ -283,7 +287,7 @@ globalThis.solidView = (() => {
     };
     const [solidArray, linesArray, noArray] = [1, 2, 3].map(() => gl.createVertexArray());
     const [corners, lines] = [gl.createBuffer(), gl.createBuffer()];
-    const parts = (array, buffer, stride, sizes) => { // numbers that follow each other in a buffer
+    const parts = (array, buffer, stride, sizes) => { // attributes that follow each other in a buffer
       gl.bindVertexArray(array);
       gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
       sizes.forEach((size, index) => {
@@ -302,10 +306,10 @@ globalThis.solidView = (() => {
     gl.enable(gl.DEPTH_TEST);
     gl.depthFunc(gl.LEQUAL);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    gl.polygonOffset(1, 1); // of walls: their borders lie before them
+    gl.polygonOffset(1, 1); // for walls, so that their borders are in front
 
     let count = 0, focal = 1, framing = null, mesh = null, solid = null;
-    const hung = []; // a texture of each wall, and the picture that it has or waits for
+    const hung = []; // texture of each wall, and the picture that it shows or loads
     const hang = (picture, k) => {
       if (!hung[k]) {
         hung[k] = { texture: gl.createTexture() };
@@ -317,10 +321,10 @@ globalThis.solidView = (() => {
       }
       const wall = hung[k];
       if (wall.picture === picture) return;
-      wall.picture = picture; // the one before stays until this is decoded
+      wall.picture = picture; // the previous picture stays until this one is decoded
       const image = new Image();
       image.onload = () => {
-        if (wall.picture !== picture || !gl.isTexture(wall.texture)) return; // another came, or the context was lost
+        if (wall.picture !== picture || !gl.isTexture(wall.texture)) return; // a newer picture, or no context
         gl.bindTexture(gl.TEXTURE_2D, wall.texture);
         gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, image);
         gl.generateMipmap(gl.TEXTURE_2D);
@@ -336,10 +340,10 @@ globalThis.solidView = (() => {
       pour(corners, mesh.corners);
       gl.bindVertexArray(solidArray);
       gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, new Uint32Array(mesh.triangles), gl.DYNAMIC_DRAW);
-      const start = axesOf("lens", ...anglesOf("lens", solid.eye)); // lamps stay with the eye: a turn shows new shades
+      const start = axesOf("lens", ...anglesOf("lens", solid.eye)); // lights move with the eye
       send(ofSolid, {
         lamps: solid.lamps.flatMap((lamp) => through(start, lamp)), bright: solid.bright, gloss: solid.specular_power,
-        clay: seenThrough(solid) ? GLASS : solid.clay, finish: [solid.ambient, solid.diffuse, solid.specular],
+        clay: isGlass(solid) ? GLASS : solid.clay, finish: [solid.ambient, solid.diffuse, solid.specular],
       });
       const pictures = (solid.screens ?? []).map((screen) => screen.picture);
       for (const { texture } of hung.splice(pictures.length)) gl.deleteTexture(texture);
@@ -355,7 +359,7 @@ globalThis.solidView = (() => {
 
     const drawSolid = (veil, hidden) => {
       send(ofSolid, { veil });
-      gl.enable(gl.CULL_FACE); // or the far wall's rim would shine through along the edge before it
+      gl.enable(gl.CULL_FACE); // otherwise the rim of the far wall would be visible along the near edge
       gl.cullFace(hidden);
       gl.bindVertexArray(solidArray);
       gl.drawElements(gl.TRIANGLES, count, gl.UNSIGNED_INT, 0);
@@ -370,12 +374,12 @@ globalThis.solidView = (() => {
       gl.depthMask(true);
       gl.depthFunc(gl.LEQUAL);
     };
-    // The far side of the glass, the rays behind its near side, that side, and the rays before it (drawn by `draw`).
+    // Draws the far side of the glass, the rays behind its near side, and the near side; `draw` adds the other rays.
     const drawClear = () => {
       gl.depthMask(false);
       drawSolid([0.25, 0.5], gl.FRONT);
       gl.depthMask(true);
-      gl.enable(gl.STENCIL_TEST); // 1 where the glass is seen
+      gl.enable(gl.STENCIL_TEST); // 1 where the glass is visible
       gl.stencilOp(gl.KEEP, gl.KEEP, gl.REPLACE);
       gl.stencilFunc(gl.ALWAYS, 1, 1);
       gl.colorMask(false, false, false, false);
@@ -390,18 +394,18 @@ globalThis.solidView = (() => {
       gl.disable(gl.CULL_FACE);
       gl.enable(gl.POLYGON_OFFSET_FILL);
       gl.bindVertexArray(noArray);
-      const along = (axis, { corners }) => dot(axis, corners[0]) + dot(axis, corners[2]); // of its middle, twice
+      const along = (axis, { corners }) => dot(axis, corners[0]) + dot(axis, corners[2]); // centre, twice
       const last = Math.max(...framing.walls.map((wall) => along([0, 0, 1], wall)));
       const farthestFirst = [...framing.walls].sort((a, b) => along(axes[2], a) - along(axes[2], b));
       for (const wall of farthestFirst) {
         gl.bindTexture(gl.TEXTURE_2D, hung[framing.walls.indexOf(wall)].texture);
-        send(ofWall, { corners: wall.corners.flat(), opacity: along([0, 0, 1], wall) < last ? BEFORE : 1 });
+        send(ofWall, { corners: wall.corners.flat(), opacity: along([0, 0, 1], wall) < last ? SCREEN_OPACITY : 1 });
         gl.drawArrays(gl.TRIANGLE_FAN, 0, 4);
       }
       gl.disable(gl.POLYGON_OFFSET_FILL);
     };
     const draw = (view) => {
-      const ratio = Math.min(window.devicePixelRatio || 1, MOST_PIXELS);
+      const ratio = Math.min(window.devicePixelRatio || 1, MAX_PIXEL_RATIO);
       const wide = Math.round(canvas.clientWidth * ratio), high = Math.round(canvas.clientHeight * ratio);
       if (!wide || !high || gl.isContextLost()) return;
       if (canvas.width !== wide || canvas.height !== high) Object.assign(canvas, { width: wide, height: high });
@@ -424,7 +428,7 @@ globalThis.solidView = (() => {
     return { take, frame, draw };
   }
 
-  // From the picture's x, y, z, where z is up, to those that a framing has up: y up for all of the way.
+  // Returns the angles (azimuth, elevation) of an eye; z is up in the close view, y in the whole path.
   const anglesOf = (look, eye) => {
     const [x, y, z] = look === "way" ? [eye[2], eye[0], eye[1]] : eye;
     return [Math.atan2(y, x), Math.atan2(z, Math.hypot(x, y))];
@@ -432,7 +436,7 @@ globalThis.solidView = (() => {
   const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
   const through = (axes, lamp) => axes.map((axis) => dot(axis, lamp) / Math.hypot(...lamp));
 
-  // What is right, up and towards the eye, for one that stands `above` the level, turned `around` what is up (radians).
+  // Returns the axes right, up and towards the eye, for the elevation `above` and the azimuth `around` (radians).
   function axesOf(look, around, above) {
     const [c, s, level, up] = [Math.cos(around), Math.sin(around), Math.cos(above), Math.sin(above)];
     const axes = [[-s, c, 0], [-up * c, -up * s, level], [level * c, level * s, up]];
@@ -440,7 +444,7 @@ globalThis.solidView = (() => {
   }
 
   function begin(figure, solid) {
-    const canvas = figure.querySelector("canvas"), views = {}, homes = {}; // by their framing
+    const canvas = figure.querySelector("canvas"), views = {}, homes = {}; // current and first view by framing
     let view = null, home = null, waiting = false, painted = null, look = "lens";
     const between = (low, value, high) => Math.min(Math.max(value, low), high);
     const draw = () => {
@@ -450,21 +454,21 @@ globalThis.solidView = (() => {
     };
     const turn = (right, up) => {
       view.around -= right;
-      view.above = between(-UPRIGHT, view.above - up, UPRIGHT);
+      view.above = between(-MAX_TILT, view.above - up, MAX_TILT);
     };
     const shift = (right, up) => {
-      view.x = between(-NEAREST, view.x + right, NEAREST);
-      view.y = between(-NEAREST, view.y + up, NEAREST);
+      view.x = between(-MAX_ZOOM, view.x + right, MAX_ZOOM);
+      view.y = between(-MAX_ZOOM, view.y + up, MAX_ZOOM);
     };
     const zoom = (factor) => {
-      const farthest = FARTHEST * Math.min(1, home.nearer);
-      const nearer = between(farthest, view.nearer * factor, NEAREST), ratio = nearer / view.nearer;
+      const farthest = MIN_ZOOM * Math.min(1, home.nearer);
+      const nearer = between(farthest, view.nearer * factor, MAX_ZOOM), ratio = nearer / view.nearer;
       Object.assign(view, { nearer, x: view.x * ratio, y: view.y * ratio });
     };
     const actions = {
       ArrowLeft: () => turn(-STEP, 0), ArrowRight: () => turn(STEP, 0),
       ArrowUp: () => turn(0, STEP), ArrowDown: () => turn(0, -STEP),
-      "+": () => zoom(NEARER), "=": () => zoom(NEARER), "-": () => zoom(1 / NEARER),
+      "+": () => zoom(ZOOM_STEP), "=": () => zoom(ZOOM_STEP), "-": () => zoom(1 / ZOOM_STEP),
       Home: () => { Object.assign(view, home); },
     };
     const act = (key) => {
@@ -478,40 +482,40 @@ globalThis.solidView = (() => {
     figure.addEventListener("click", (event) => act(event.target.dataset.key));
     canvas.addEventListener("dblclick", () => act("Home"));
     canvas.addEventListener("wheel", (event) => {
-      if (!event.ctrlKey) return; // without it the page scrolls
+      if (!event.ctrlKey) return; // without Ctrl the page scrolls
       event.preventDefault();
       zoom(Math.exp(-between(-50, event.deltaY, 50) / 100));
       draw();
     }, { passive: false });
 
-    // One finger or the mouse turns, with shift it moves; two fingers zoom, and move too.
-    const held = new Map();
+    // One finger or the mouse rotates, with Shift it moves; two fingers zoom and move.
+    const pointers = new Map();
     const spread = () => {
-      const [a, b] = [...held.values()];
+      const [a, b] = [...pointers.values()];
       return Math.hypot(a.x - b.x, a.y - b.y) || 1;
     };
     canvas.addEventListener("pointerdown", (event) => {
       if (event.button !== 0) return;
       canvas.setPointerCapture(event.pointerId);
-      held.set(event.pointerId, { x: event.clientX, y: event.clientY });
+      pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
     });
     canvas.addEventListener("pointermove", (event) => {
-      const before = held.get(event.pointerId);
+      const before = pointers.get(event.pointerId);
       if (!before) return;
-      const apart = held.size === 2 && spread();
+      const distance = pointers.size === 2 && spread();
       const [right, up] = [event.clientX - before.x, before.y - event.clientY];
-      held.set(event.pointerId, { x: event.clientX, y: event.clientY });
-      if (event.shiftKey || held.size === 2) {
-        shift((2 * right) / canvas.clientWidth / held.size, (2 * up) / canvas.clientHeight / held.size);
+      pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+      if (event.shiftKey || pointers.size === 2) {
+        shift((2 * right) / canvas.clientWidth / pointers.size, (2 * up) / canvas.clientHeight / pointers.size);
       } else turn((right * Math.PI) / canvas.clientWidth, (up * Math.PI) / canvas.clientWidth);
-      if (apart) zoom(spread() / apart);
+      if (distance) zoom(spread() / distance);
       draw();
     });
     for (const end of ["pointerup", "pointercancel"]) {
-      canvas.addEventListener(end, (event) => held.delete(event.pointerId));
+      canvas.addEventListener(end, (event) => pointers.delete(event.pointerId));
     }
 
-    // The view of what is shown now: what the person changed of it stays, the rest follows the solid and the canvas.
+    // Sets the view of the present framing: changes by the user stay, the rest follows the solid and the canvas.
     const frame = () => {
       const name = solid.rays ? look : "lens", before = homes[name];
       [home, view] = [painted.frame(name), views[name] ??= {}];
@@ -520,7 +524,7 @@ globalThis.solidView = (() => {
       draw();
     };
     const show = () => {
-      figure.classList.add("drawn"); // first: a canvas that is not shown has no size
+      figure.classList.add("drawn"); // first, since a hidden canvas has no size
       painted = painter(canvas, draw);
       if (!painted) return figure.classList.remove("drawn");
       painted.take(solid);
@@ -532,7 +536,7 @@ globalThis.solidView = (() => {
     });
     canvas.addEventListener("webglcontextrestored", show);
     show();
-    const drawing = () => painted && figure.classList.contains("drawn"); // else it waits until the context comes back
+    const drawing = () => painted && figure.classList.contains("drawn"); // otherwise wait until the context is restored
     if (painted) new ResizeObserver(() => drawing() && frame()).observe(canvas);
     return {
       update: (other) => {

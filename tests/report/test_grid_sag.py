@@ -88,8 +88,8 @@ def test_a_mirror_is_judged_by_its_own_light():
     """A slope that is off by δ turns reflected light by 2 δ: four times as far as through a lens of index 1.5."""
     through = replace(wavy(), index=1.5)
     mirror = replace(through, front=Plane(-2.0), reflects=True)
-    grids = [GridSag.of(lens, lens.back, 21) for lens in (through, mirror)]
-    moved = [shift_by_patches(lens, lens.back, grid.patches, BEAM) for lens, grid in zip((through, mirror), grids, strict=True)]
+    lenses = through, mirror
+    moved = [shift_by_patches(lens, lens.back, GridSag.of(lens, lens.back, 21).patches, BEAM) for lens in lenses]
     assert moved[1].rms == pytest.approx(4 * moved[0].rms, rel=0.02)
 
 
