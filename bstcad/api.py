@@ -34,7 +34,7 @@ from bstcad.optics.surfaces import Surface
 from bstcad.report import record
 from bstcad.report.drawing import png
 from bstcad.report.light_figures import View, irradiance_triptych
-from bstcad.report.record import BY_HAND, Making, Report, rrmsds
+from bstcad.report.record import BY_HAND, DesignCourse, Report, rrmsds
 from bstcad.report.units import number, quantity
 from bstcad.runs import files, processes
 from bstcad.runs import progress as progresses
@@ -130,7 +130,7 @@ class Design:
         """
         scene, lens = _fitting(lens, self._made.scene, self.lens.front)
         made = replace(
-            self._made, scene=scene, lens=scene.as_mounted(lens), making=Making(stopped=BY_HAND), transport=None,
+            self._made, scene=scene, lens=scene.as_mounted(lens), making=DesignCourse(stopped=BY_HAND), transport=None,
             compared=None,
         )  # fmt: skip
         return Design(made)

@@ -36,14 +36,14 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, Effort, Light, SpectralLine
 from bstcad.pipeline import Saved, design, purpose
 from bstcad.report import data_sheet, exports, prescription, record, rendering, report, tolerances
-from bstcad.report.data_sheet import Sheet
+from bstcad.report.data_sheet import DataSheet
 from bstcad.report.exports import Exported
 from bstcad.report.figure_jobs import NoPictures, Pictures, draw_convergence, draw_light, draw_wavefront, light_path_of
 from bstcad.report.goal_figures import GoalFigures, figures_of
 from bstcad.report.grid_sag import Throw
 from bstcad.report.light_figures import draw_judges, draw_part
 from bstcad.report.prescription import SHEET, Order
-from bstcad.report.record import Contents, Examined, LeftOut, Report, Stage, contents_of, with_part
+from bstcad.report.record import Contents, Examined, LeftOut, Report, StageRecord, contents_of, with_part
 from bstcad.report.rendering import LightPath
 from bstcad.report.tolerances import Tolerances
 from bstcad.report.units import prepare
@@ -160,7 +160,7 @@ def write(
         progress("report", 0, 1, "")
         estimates = _left_out(made, proof)  # while the pictures are drawn
         drawn.result()
-        made = replace(made, making=made.making.followed_by(Stage("report", time.perf_counter() - proven)))
+        made = replace(made, making=made.making.with_stages(StageRecord("report", time.perf_counter() - proven)))
         contents = replace(_contents(made, proof, estimates), order=order)
         drawn.begin(draw_convergence, contents)
         sheet = drawn.data_sheet()
@@ -206,10 +206,10 @@ def _written_and_proved(
             work.result()
     verified = time.perf_counter()
     last = (
-        Stage("write", written - began),
-        Stage("verify", verified - written, max(light.rrmsd for light in proof.lights)),
+        StageRecord("write", written - began),
+        StageRecord("verify", verified - written, max(light.rrmsd for light in proof.lights)),
     )
-    return replace(made, making=made.making.followed_by(*last)), proof
+    return replace(made, making=made.making.with_stages(*last)), proof
 
 
 def _proof(
@@ -413,9 +413,9 @@ def _order(made: Made, shape: Mapping[str, Any], folder: Path) -> Order:
 
 def _sheet(
     made: Made, proof: Proof | Contents, figures: Sequence[GoalFigures], irradiance: np.ndarray, *, order: Order
-) -> Sheet:
+) -> DataSheet:
     """The data sheet of a design, by its proof or by its report; it shows the light on the target that comes first."""
-    return Sheet(
+    return DataSheet(
         scene=made.scene, designed=made.lens, shape=proof.shape, order=order, target=made.goals[0].picture,
         irradiance=irradiance, figures=figures, passed=proof.passed, version=bstcad.__version__,
     )  # fmt: skip
@@ -489,7 +489,7 @@ def _export(made: Made, kinds: Sequence[str], folder: Path, points: int | None =
     )
 
 
-def _sheet_again(made: Made, folder: Path) -> Sheet:
+def _sheet_again(made: Made, folder: Path) -> DataSheet:
     """The data sheet of a finished design, by its report."""
     with refusals():
         known = record.read(folder / "report.json")

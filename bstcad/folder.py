@@ -32,7 +32,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.sides import Sides, as_pair, scaled
 from bstcad.optics.surfaces import Surface
 from bstcad.report.prescription import scene_text
-from bstcad.report.record import Making
+from bstcad.report.record import DesignCourse
 from bstcad.runs import files
 from bstcad.runs.files import MachineError, SceneError
 from bstcad.runs.processes import Submit, here, runs
@@ -52,11 +52,11 @@ AGAIN = "generate the design again"
 class Made(Nominal):
     """A designed lens, as a folder holds it: on the CPU, its goals of the pixels that light can reach."""
 
-    making: Making = Making()  # stages, history and machine, for the report
+    making: DesignCourse = DesignCourse()  # stages, history and machine, for the report
     device: str = "cpu"  # of the design
     transport: TransportMap | None = None  # the map of stage 1; None for a lens of the user's own, or if not known
     # what `making` is with float32 beside float64, which only a report tells; None: it has it, or nothing is to be told
-    compared: Callable[[], Making] | None = None
+    compared: Callable[[], DesignCourse] | None = None
 
     def told(self) -> Made:
         """The same with all that a report tells."""

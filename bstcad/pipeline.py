@@ -23,8 +23,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.reach import MAX_EXIT_ANGLE, grazing_of, spread_at, unreached
 from bstcad.optics.sides import as_pair
 from bstcad.optics.unfolding import image_screen
-from bstcad.report.record import Making, Point
-from bstcad.report.record import Stage as StageRecord
+from bstcad.report.record import CurvePoint, DesignCourse, StageRecord
 from bstcad.runs import processes
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import Tailoring
@@ -271,7 +270,7 @@ def check_front(lens: Lens, scene: Scene) -> None:
         raise SceneError(f"lens.front.optimise: with the front that the target needs, {error}") from None
 
 
-def _compared(making: Making, task: Task, lens: Lens, before: int) -> Making:
+def _compared(making: DesignCourse, task: Task, lens: Lens, before: int) -> DesignCourse:
     """The record with float32 beside float64, for the lens of stage 1, behind so many stages."""
     began, cpu = time.perf_counter(), time.process_time()
     twins = asdict(compare_precisions(task, lens))
@@ -286,13 +285,13 @@ def steepness(source: Emitter, lens: Lens, goal: Goal, sent: TransportMap) -> St
     return needed_steepness(source, lens, screen, goal.picture, x=sent.x, y=sent.y, places=sent.source, at_back=at_back)
 
 
-def _making(followed: Followed, went: Record, stopped: str, steep: Steepness) -> Making:
+def _making(followed: Followed, went: Record, stopped: str, steep: Steepness) -> DesignCourse:
     """The record of a tailoring for the report."""
     solved = followed.mapping.transport
-    return Making(
+    return DesignCourse(
         seconds_total=went.seconds,
         stages=tuple(StageRecord(**asdict(stage)) for stage in went.stages),
-        history=tuple(Point(*entry) for entry in went.history),
+        history=tuple(CurvePoint(*entry) for entry in went.history),
         transport={
             "grid": followed.mapping.source.n,
             "iterations": solved.iterations,

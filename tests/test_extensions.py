@@ -22,7 +22,7 @@ from bstcad.optics.rays import Rays, Status
 from bstcad.optics.receivers import Receiver
 from bstcad.optics.surfaces import sag
 from bstcad.report import record
-from bstcad.report.data_sheet import Sheet
+from bstcad.report.data_sheet import DataSheet
 from bstcad.report.figure_jobs import light_path_of
 from bstcad.report.light_figures import View
 from bstcad.report.units import about
@@ -218,7 +218,7 @@ def test_light_over_directions_is_stated_in_degrees(scene, tmp_path, monkeypatch
     page = (tmp_path / "far" / "report.html").read_text(encoding="utf-8")
     finest = contents.remaining_error["octaves"][-1]["period"]
     assert about(detail.width, "degrees") in page and about(finest[0], "degrees") in page
-    sheet = Sheet(
+    sheet = DataSheet(
         scene=far, designed=design.lens, shape=contents.shape, order=contents.order, target=design.target,
         irradiance=design.target, figures=contents.goals, passed=True, version="1",
     )  # fmt: skip

@@ -20,7 +20,7 @@ from bstcad.report import part_views
 from bstcad.report.drawing import GREY, styled
 from bstcad.report.exports import across
 from bstcad.report.goal_figures import GoalFigures
-from bstcad.report.light_figures import View, brightest, seen_grey
+from bstcad.report.light_figures import View, brightest, srgb_grey
 from bstcad.report.part_views import NOTES, THICK, THIN, Paper, kinds_of_holes, wall_words, wrapped
 from bstcad.report.prescription import PART, Order, prescription
 from bstcad.report.units import Rows, mm, rounded_up, tables
@@ -40,7 +40,7 @@ APERTURE_TOLERANCE = 1e-4  # relative amount by which a printed clear aperture m
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Sheet:
+class DataSheet:
     """Content of a data sheet."""
 
     scene: Scene
@@ -104,7 +104,7 @@ def _aperture(patch: Outline | None, outline: Outline) -> str:
 # --- the page ---------------------------------------------------------------------------------------------------------
 
 
-def draw(sheet: Sheet) -> bytes:
+def draw(sheet: DataSheet) -> bytes:
     """Return the sheet as PDF."""
     import matplotlib
     from matplotlib.backends.backend_pdf import FigureCanvasPdf
@@ -117,7 +117,7 @@ def draw(sheet: Sheet) -> bytes:
 
 
 @styled
-def page(sheet: Sheet) -> Figure:
+def page(sheet: DataSheet) -> Figure:
     """Draw the whole page."""
     from matplotlib.figure import Figure
 
@@ -146,7 +146,7 @@ def page(sheet: Sheet) -> Figure:
     return figure
 
 
-def _form(sheet: Sheet) -> str:
+def _form(sheet: DataSheet) -> str:
     """Return the form of the front in a few words; convex (CX) if its centre of curvature lies along +z."""
     front = sheet.record["front"]
     radii = {name.removeprefix("radius"): radius for name, radius in front.items() if name[:6] == "radius" and radius}
@@ -168,7 +168,7 @@ def _column(paper: Paper, left: float, heading: str, rows: Rows) -> None:
         paper.text(start + 23.6, level, value, TABLE_FONT, room=end - start - 23.6)
 
 
-def _title_block(paper: Paper, sheet: Sheet, scale: str) -> None:
+def _title_block(paper: Paper, sheet: DataSheet, scale: str) -> None:
     """Draw name, title, author and date (ISO 7200), scale and projection, and the STEP file of the sheet."""
     scene, part, order, left, right = sheet.scene, sheet.scene.part, sheet.order, TITLE_LEFT, FRAME[2]
     room = right - left - 3.6
@@ -201,7 +201,7 @@ def _title_block(paper: Paper, sheet: Sheet, scale: str) -> None:
         paper.text(left + 1.8, level - 3.3 - 2.95 * k, note, NOTES, room=room)
 
 
-def _light(paper: Paper, sheet: Sheet, y: float) -> float:
+def _light(paper: Paper, sheet: DataSheet, y: float) -> float:
     """Draw target and irradiance below y; return the y of the row below them (mm)."""
     start, end, view = LIGHT_LEFT + 2.4, FRAME[2] - 2.4, View.of(sheet.scene)
     width = (end - start - 2.4) / 2
@@ -212,7 +212,7 @@ def _light(paper: Paper, sheet: Sheet, y: float) -> float:
         left = start + k * (width + 2.4)
         inset = paper.axes.figure.add_axes((left / WIDTH, y / HEIGHT, width / WIDTH, tall / HEIGHT))
         shown = np.round(255 * np.clip(values / top, 0, 1)) / 255
-        inset.imshow(view.picture(shown), cmap=seen_grey(), vmin=0, vmax=1, interpolation="none", aspect="auto")
+        inset.imshow(view.picture(shown), cmap=srgb_grey(), vmin=0, vmax=1, interpolation="none", aspect="auto")
         inset.set(xticks=[], yticks=[])
         inset.spines[:].set(visible=True, color=GREY, linewidth=0.4)
         paper.text(left, y - 3.2, name, NOTES, room=width)

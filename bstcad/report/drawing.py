@@ -84,7 +84,7 @@ def png(figure: Figure, ground: str = "#ffffff") -> bytes:
     return picture
 
 
-def darkened(figure: Figure) -> Figure:
+def darken(figure: Figure) -> Figure:
     """Change the figure to light text and axes on a dark background, with the same pictures, and return it."""
     from matplotlib.text import Text
 

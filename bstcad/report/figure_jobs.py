@@ -25,7 +25,7 @@ from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Surface
 from bstcad.optics.wavefront_error import WavefrontError
 from bstcad.report import data_sheet, light_figures, rendering
-from bstcad.report.data_sheet import Sheet
+from bstcad.report.data_sheet import DataSheet
 from bstcad.report.drawing import (
     BLUE,
     GLASS,
@@ -39,9 +39,9 @@ from bstcad.report.drawing import (
     styled,
 )  # fmt: skip
 from bstcad.report.light_figures import View, plain_ticks
-from bstcad.report.record import Contents, Point, Stage
+from bstcad.report.record import Contents, CurvePoint, StageRecord
 from bstcad.report.rendering import LightPath
-from bstcad.report.units import number, turned
+from bstcad.report.units import number, tilt_words
 from bstcad.report.wavefront_figure import wavefront_map
 from bstcad.scene.scene import Scene
 from bstcad.scene.target import numbered
@@ -93,7 +93,7 @@ class Pictures:
         for k, screen in enumerate(screens):
             self.begin(draw_transport, source, lens, screen, number=k)
 
-    def sheet(self, sheet: Sheet) -> None:
+    def sheet(self, sheet: DataSheet) -> None:
         """Start the job that draws the data sheet of a part."""
         self._sheet = self._submit(data_sheet.draw, sheet)
 
@@ -124,7 +124,7 @@ class NoPictures(Pictures):
     def solid(self, lens: Lens) -> None:
         """Draw nothing."""
 
-    def sheet(self, sheet: Sheet) -> None:
+    def sheet(self, sheet: DataSheet) -> None:
         """Draw nothing."""
 
 
@@ -156,7 +156,7 @@ def draw_light(target: np.ndarray, light: Light, lines: Sequence[SpectralLine], 
     if light.ghost is not None:
         pictures["ghost"] = light_figures.ghost_picture(target, light.ghost, view)
     if lines:
-        pictures["lines"] = light_figures.lines_apart(target, found, lines, view)
+        pictures["lines"] = light_figures.spectral_lines(target, found, lines, view)
     return {numbered(name, view.number): png(picture) for name, picture in pictures.items()}
 
 
@@ -263,7 +263,7 @@ def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> F
         whole.fill(edges[:, 2], edges[:, 0], facecolor="none", edgecolor=GREY, linewidth=1.0, gid="screen")
     if drawn:
         tilt = drawn[0].plane.tilt
-        one = f"Grey: the target, its plane tilted by {turned(tilt)}." if tilt else "Grey: the target."
+        one = f"Grey: the target, its plane tilted by {tilt_words(tilt)}." if tilt else "Grey: the target."
         footnote(figure, "Grey: the targets." if several else one)
     return figure
 
@@ -287,7 +287,7 @@ def transport_map(source: np.ndarray, image: np.ndarray, view: View) -> Figure:
 
 
 @styled
-def convergence(history: Sequence[Point], stages: Sequence[Stage], noise: float) -> Figure:
+def convergence(history: Sequence[CurvePoint], stages: Sequence[StageRecord], noise: float) -> Figure:
     """Draw the RRMSD against the seconds since the start, with the ends of the stages and the standard error."""
     seconds = np.array([point.seconds for point in history], dtype=float)
     values = np.array([point.rrmsd for point in history], dtype=float)

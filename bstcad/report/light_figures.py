@@ -21,7 +21,7 @@ from bstcad.report.drawing import (
     GREEN,
     GREY,
     VERMILION,
-    darkened,
+    darken,
     footnote,
     new_figure,
     png,
@@ -29,7 +29,7 @@ from bstcad.report.drawing import (
     steps,
     styled,
 )
-from bstcad.report.units import number, quantity, turned
+from bstcad.report.units import number, quantity, tilt_words
 from bstcad.scene.picture import to_srgb
 from bstcad.scene.target import numbered
 
@@ -119,7 +119,7 @@ class View:
     def note(self, figure: Figure, more: str = "", first: str = "") -> None:
         """Write a footnote: `first`, the side from which the target is seen, `more`, and the tilt of its plane."""
         tilt = self.receiver.tilt
-        plane = f"\nThe target plane is tilted by {turned(tilt)}; x and y are measured on it." if tilt else ""
+        plane = f"\nThe target plane is tilted by {tilt_words(tilt)}; x and y are measured on it." if tilt else ""
         footnote(figure, f"{first}{self.words}.{more}{plane}")
 
     @property
@@ -173,7 +173,7 @@ def tones(irradiance: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 @cache
-def seen_grey() -> ListedColormap:
+def srgb_grey() -> ListedColormap:
     """Return a colour map from irradiance, 0 to 1, to grey in sRGB."""
     from matplotlib.colors import ListedColormap
 
@@ -192,7 +192,7 @@ def draw_picture(axes: Axes, values: np.ndarray, view: View, **shades: Any) -> A
 def _grey(axes: Axes, values: np.ndarray, view: View, *, top: float, title: str) -> Any:
     """Draw irradiance on a grey scale from 0 to `top`."""
     axes.set_title(title)
-    return draw_picture(axes, values, view, cmap=seen_grey(), vmin=0.0, vmax=top)
+    return draw_picture(axes, values, view, cmap=srgb_grey(), vmin=0.0, vmax=top)
 
 
 def _signed(axes: Axes, values: np.ndarray, view: View, *, most: float, title: str) -> Any:
@@ -282,7 +282,7 @@ def _mark(axes: Axes, cut: Cut, view: View) -> None:
 
 def dark_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) -> bytes:
     """Return the figure of the irradiance as a PNG for a page in dark mode."""
-    return png(darkened(irradiance_triptych(target, irradiance, view)), ground=DARK)
+    return png(darken(irradiance_triptych(target, irradiance, view)), ground=DARK)
 
 
 @styled
@@ -372,7 +372,7 @@ def cross_section(target: np.ndarray, irradiance: np.ndarray, view: View) -> Fig
 
 
 @styled
-def lines_apart(target: np.ndarray, irradiance: np.ndarray, lines: Sequence[SpectralLine], view: View) -> Figure:
+def spectral_lines(target: np.ndarray, irradiance: np.ndarray, lines: Sequence[SpectralLine], view: View) -> Figure:
     """Draw the picture of all spectral lines in colour, then the picture of each line alone.
 
     target, irradiance by all lines, and pictures: (rows, columns) in coordinates, with equal sums.

@@ -202,7 +202,7 @@ def closed(outline: Outline) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Profile:
+class CrossSection:
     """Cross-section of a part: polygons (z, u) in mm, u along the cut, in the frame of the part's file.
 
     The cut meets each wall at right angles, so that its draft lies in the plane of the cut.
@@ -221,7 +221,7 @@ class Profile:
         return tuple(zip(every.min(0).tolist(), every.max(0).tolist(), strict=True))
 
 
-def profile(lens: Lens, mount: Mount, upright: bool, origin: float = 0.0) -> Profile:
+def profile(lens: Lens, mount: Mount, upright: bool, origin: float = 0.0) -> CrossSection:
     """Return the section of a lens in its mount; upright: along y at x = 0, else along x at y = 0.
 
     Lens and mount have to fit.  origin: z of the file's origin in the frame of the scene (mm).
@@ -246,7 +246,7 @@ def profile(lens: Lens, mount: Mount, upright: bool, origin: float = 0.0) -> Pro
     if mount.flange is not None:
         sides, holes, behind = _flange(mount.flange, half, upright, mount.flange.z - origin)
         whole = shapely.union_all([whole, *sides]) - holes
-    return Profile(
+    return CrossSection(
         bodies=tuple(shapely.get_coordinates(part.exterior) for part in getattr(whole, "geoms", [whole])),
         back=(float(back[0]), float(back[-1])), front=(float(front[0]), float(front[-1])), front_ends=ends,
         behind=tuple(behind),
@@ -303,7 +303,7 @@ class Views:
     names: tuple[tuple[str, str], tuple[str, str]]  # names of front and back: (long, short) each
 
     @cached_property
-    def cuts(self) -> tuple[Profile, Profile]:
+    def cuts(self) -> tuple[CrossSection, CrossSection]:
         """Sections at x = 0 and at y = 0."""
         return tuple(profile(self.lens, self.mount, upright, self.origin) for upright in (True, False))
 

@@ -47,7 +47,7 @@ from bstcad.verify.verdict import NO_LIMIT, Check, verdict
 if TYPE_CHECKING:
     from bstcad.optics.emitters import Emitter
 
-BY_HAND = "by hand"  # Making.stopped of a lens that was changed after it was designed, or comes from elsewhere
+BY_HAND = "by hand"  # DesignCourse.stopped of a lens that was changed after it was designed, or comes from elsewhere
 MAX_REPORT_BYTES = 20_000_000  # size limit of a report that is read; ten thousand evaluations reach it
 MAX_STRING_LENGTH = 1000  # characters of a string in a report that is read
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
@@ -75,7 +75,7 @@ Record = TypeVar("Record")
 
 
 @dataclass(frozen=True)
-class Stage:
+class StageRecord:
     """One stage of the design."""
 
     name: str  # name of the stage, such as stage 2
@@ -85,7 +85,7 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class Point:
+class CurvePoint:
     """One point of the convergence curve."""
 
     seconds: Seconds  # time since the start
@@ -105,7 +105,7 @@ class PrecisionTest(TypedDict):
 
 
 @dataclass(frozen=True)
-class Line:
+class SpectralLine:
     """The light of one spectral line alone."""
 
     wavelength: Size  # nm
@@ -114,12 +114,12 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Making:
+class DesignCourse:
     """Course of a design; None: unknown, for a design whose earlier report is missing."""
 
     seconds_total: Seconds = 0.0  # time from the command to the verified lens
-    stages: tuple[Stage, ...] = ()
-    history: tuple[Point, ...] = ()
+    stages: tuple[StageRecord, ...] = ()
+    history: tuple[CurvePoint, ...] = ()
     machine: Mapping[str, Scalar] | None = None
     versions: Mapping[str, str] | None = None  # versions of the libraries
     # grid, iterations, mass error, reason to stop; fraction of light and largest slope (degrees) of analysis.steepness
@@ -128,7 +128,7 @@ class Making:
     stopped: str | None = None  # reason why tailoring ended
     twins: PrecisionTest | None = None
 
-    def followed_by(self, *last: Stage) -> Making:
+    def with_stages(self, *last: StageRecord) -> DesignCourse:
         """Return this record with these stages at the end, which replace earlier stages of the same names."""
         names = [stage.name for stage in last]
         again = sum(stage.seconds for stage in self.stages if stage.name in names)
@@ -171,8 +171,8 @@ class Contents:
     flux: Mapping[str, Share]  # flux ledger: fractions of the source's flux, with sum 1
     prescription: Mapping[str, Any]  # every surface as it was designed
     seconds_total: Seconds  # time from the command to the verified lens
-    stages: Annotated[tuple[Stage, ...], Field(max_length=100), FailFast()]  # stages in their order
-    history: Annotated[tuple[Point, ...], Field(max_length=1_000_000), FailFast()]  # convergence curve
+    stages: Annotated[tuple[StageRecord, ...], Field(max_length=100), FailFast()]  # stages in their order
+    history: Annotated[tuple[CurvePoint, ...], Field(max_length=1_000_000), FailFast()]  # convergence curve
     checks: Annotated[tuple[Check, ...], Field(max_length=1000), FailFast()]  # checks in their order in the report
     effects: Mapping[str, tuple[str, ...]]  # names of effects under the keys simulated and left_out
     machine: Mapping[str, Scalar]  # processors, memory, threads, device
@@ -199,7 +199,7 @@ class Contents:
     stability: Mapping[str, float | int | None] | None = None
     blur: Blur | None = None  # blur by the source's size; None: a point source or parallel light
     finest_detail: FinestDetail | None = None  # width of a point of the picture on the target
-    lines: tuple[Line, ...] = ()  # lines of the spectrum; empty: one line
+    lines: tuple[SpectralLine, ...] = ()  # lines of the spectrum; empty: one line
     picture: tuple[str, ...] = ()  # sentences on how the picture was read: first of several, tones, transparency, fit
     given_up: tuple[str, ...] = ()  # text of the remarks
     remarks: tuple[str, ...] = ()  # ids of the remarks, in the order of given_up
@@ -227,12 +227,12 @@ class Contents:
         return self.goals[worst(goal.rrmsd for goal in self.goals)]
 
     @property
-    def making(self) -> Making:
+    def making(self) -> DesignCourse:
         """Course of the design."""
-        return Making(**{entry.name: getattr(self, entry.name) for entry in fields(Making)})
+        return DesignCourse(**{entry.name: getattr(self, entry.name) for entry in fields(DesignCourse)})
 
     @property
-    def remarked(self) -> tuple[Remark, ...]:
+    def all_remarks(self) -> tuple[Remark, ...]:
         """Remarks with their ids; an older report has no ids."""
         return tuple(starmap(Remark, zip_longest(self.remarks, self.given_up, fillvalue="")))
 
@@ -263,7 +263,7 @@ class Examined:
     part: Mapping[str, str]  # rows of name and value (prescription.part)
     placement: Mapping[str, Any] | None = None  # position of the lens in the file (Placement.facts); None: not moved
     # the fields below are those of Contents, empty without a design
-    remarked: tuple[Remark, ...] = ()
+    all_remarks: tuple[Remark, ...] = ()
     bounds: Mapping[str, Any] | None = None
 
 
@@ -271,7 +271,7 @@ class Examined:
 
 
 def contents_of(
-    scene: Scene, lens: Lens, goals: Sequence[Goal], proof: Proof, *, making: Making,
+    scene: Scene, lens: Lens, goals: Sequence[Goal], proof: Proof, *, making: DesignCourse,
     circumstances: Mapping[str, Any], estimates: tuple[LeftOut, ...], diagnosis: Mapping[str, Any],
 ) -> Contents:  # fmt: skip
     """Return the contents of report.json.
@@ -309,12 +309,12 @@ def contents_of(
         blur=proof.blur,
         finest_detail=_finest_detail(scene, proof, goal.receiver, estimates),
         picture=scene.picture_remarks(),
-        lines=tuple(Line(line.wavelength, line.share, rrmsd(goal.picture, line.picture)) for line in proof.lines),
+        lines=tuple(SpectralLine(k.wavelength, k.share, rrmsd(goal.picture, k.picture)) for k in proof.lines),
         estimates=estimates,
         flat_tops=tuple(flat_tops(scene, proof)),
         wavefront=proof.wavefront and WavefrontFigures.of(proof.wavefront),
     )
-    return _remarked(contents, *remarks(contents, scene, goals, [each.picture for each in proof.lights]))
+    return _with_remarks(contents, *remarks(contents, scene, goals, [each.picture for each in proof.lights]))
 
 
 def _unreached(scene: Scene, goal: Goal) -> dict[str, float | None] | None:
@@ -328,12 +328,12 @@ def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:
     measured = part.facts | {"deviation_map": [f"{place}{name}" for name in MAP_FILES]}
     passed, checks = contents.passed and part.facts["passed"], (*contents.checks, *part.checks)
     contents = replace(contents, checks=checks, passed=passed, measured=measured)
-    return _remarked(contents, *written("remarks.txt.j2", "outliers", share=part.facts["outliers"]["share"]))
+    return _with_remarks(contents, *written("remarks.txt.j2", "outliers", share=part.facts["outliers"]["share"]))
 
 
-def _remarked(contents: Contents, *more: Remark) -> Contents:
+def _with_remarks(contents: Contents, *more: Remark) -> Contents:
     """Return the contents with more remarks, and the verdict that follows."""
-    every, asked = (*contents.remarked, *more), contents.verdict != NO_LIMIT
+    every, asked = (*contents.all_remarks, *more), contents.verdict != NO_LIMIT
     ids, texts = (tuple(part) for part in zip(*every, strict=True)) if every else ((), ())
     return replace(contents, given_up=texts, remarks=ids, verdict=verdict(contents.passed, texts, asked))
 
@@ -400,12 +400,12 @@ def read(path: Path) -> Contents:
     return read_as(Contents, path, "run bstcad verify to write it again")
 
 
-def making(path: Path) -> Making:
+def making(path: Path) -> DesignCourse:
     """Read the course of the design from a report.json; an empty record if the file is missing or damaged."""
     try:
         return read(path).making
     except ValueError:
-        return Making()
+        return DesignCourse()
 
 
 def read_as(kind: type[Record], path: Path, remedy: str) -> Record:

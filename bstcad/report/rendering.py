@@ -118,7 +118,7 @@ def main(arrays: str, picture: str) -> None:
     if "rays" not in values:
         from PIL import Image
 
-        image = Image.fromarray(clay(values["vertices"], values["faces"]))
+        image = Image.fromarray(draw_clay(values["vertices"], values["faces"]))
         image.crop(image.getchannel("A").getbbox()).save(picture)
         return
     for name in [name for name in values if " " in name]:  # elements of a tuple, in their order
@@ -130,7 +130,7 @@ def main(arrays: str, picture: str) -> None:
         plotter.show()
 
 
-def clay(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def draw_clay(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return an RGBA image (rows, columns, 4) of the triangles `faces` (n, 3) on `vertices` (k, 3) in mm, back up."""
     import pyvista
 

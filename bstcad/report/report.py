@@ -121,7 +121,7 @@ def write_html(
         .get_template("report.html.j2")
         .render(
             report=report,
-            pictures=encoded(figures),
+            pictures=base64_images(figures),
             badge=BADGES[report.verdict],
             explanation=explanation(report),
             first_figures=first_figures(report),
@@ -146,7 +146,7 @@ def write_html(
     files.put(Path(path), page.encode())
 
 
-def encoded(pictures: Mapping[str, bytes | None]) -> dict[str, str]:
+def base64_images(pictures: Mapping[str, bytes | None]) -> dict[str, str]:
     """Return pictures (PNG bytes by name) in base64, without those that are None."""
     return {key: base64.b64encode(picture).decode() for key, picture in pictures.items() if picture}
 
@@ -174,7 +174,9 @@ def summary(report: Contents | Examined, verbose: bool = False) -> Group:
     from rich.text import Text
 
     lines = [Text.assemble((report.verdict.upper(), BADGES[report.verdict][2]), f": {report.title or report.name}")]
-    remarks = [*doubts(report), *report.remarked] if report.verdict == NO_LIMIT else [*report.remarked, *doubts(report)]
+    remarks = [*report.all_remarks, *doubts(report)]
+    if report.verdict == NO_LIMIT:
+        remarks = [*doubts(report), *report.all_remarks]
     lines += [Text.assemble(f"Remark: {remark.text}", topic_tag(remark)) for remark in remarks]
     figures = first_figures(report)
     wide = max((len(name) for name, _, _ in figures), default=0)

@@ -17,7 +17,7 @@ from pydantic import Field
 from typing_extensions import TypedDict
 
 from bstcad.report.record import STRICT, Rrmsd, Share, Size, plain, read_as
-from bstcad.report.report import BEGIN, END, encoded
+from bstcad.report.report import BEGIN, END, base64_images
 from bstcad.report.units import about, amount, environment, paragraphs, percent
 from bstcad.runs import files
 
@@ -186,7 +186,7 @@ def section(found: Tolerances, pictures: Mapping[str, bytes], optic: str) -> str
     """Return HTML of a study.  pictures: PNG bytes by the names in FIGURES."""
     return environment().get_template("tolerances.html.j2").render(
         study=found, errors=errors(found), worst_errors=worst_errors, little=MIN_FRACTION, widest=WIDEST, optic=optic,
-        pictures=encoded({key: picture for key, picture in pictures.items() if key in FIGURES}),
+        pictures=base64_images({key: picture for key, picture in pictures.items() if key in FIGURES}),
     )  # fmt: skip
 
 

@@ -129,22 +129,22 @@ def rounded_up(value: float) -> str:
     return f"{units * 10**last:.{max(0, -last)}f}"
 
 
-def turned(tilt: Sequence[float], number: Callable[[float], str] = number) -> str:
+def tilt_words(tilt: Sequence[float], number: Callable[[float], str] = number) -> str:
     """Return a tilt in words: angles in degrees about x, then about y."""
     turns = (f"{number(angle)} degrees about {axis}" for angle, axis in zip(tilt, "xy", strict=True) if angle)
     return ", then ".join(turns) or "none"
 
 
-def stated(value: Any) -> str:
+def scene_value(value: Any) -> str:
     """Return a value of a scene in a line: yes or no, a number with all digits, a list, a table with its keys."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
         return exact(value)
     if isinstance(value, Mapping):
-        sizes = (f"{key} {stated(part)}" for key, part in value.items() if key != "shape")
+        sizes = (f"{key} {scene_value(part)}" for key, part in value.items() if key != "shape")
         return ", ".join([value["shape"], *sizes] if "shape" in value else sizes)
-    return ", ".join(map(stated, value)) if isinstance(value, list | tuple) else str(value).replace("\n", " ")
+    return ", ".join(map(scene_value, value)) if isinstance(value, list | tuple) else str(value).replace("\n", " ")
 
 
 # --- templates --------------------------------------------------------------------------------------------------------
@@ -160,7 +160,7 @@ def environment() -> Environment:
         undefined=jinja2.StrictUndefined,
     )  # fmt: skip
     filters = (about, amount, bound, duration, exact, interval, mm, number, percent, quantity, rounded_up)
-    found.filters |= {f.__name__: f for f in (*filters, stated, turned)}
+    found.filters |= {f.__name__: f for f in (*filters, scene_value, tilt_words)}
     found.globals["exact"] = exact
     return found
 

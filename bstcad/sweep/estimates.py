@@ -21,7 +21,7 @@ from bstcad.optics import media
 from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
 from bstcad.optics.sides import as_pair
-from bstcad.report.record import LeftOut, Making
+from bstcad.report.record import DesignCourse, LeftOut
 from bstcad.scene.effects import Absorption, Effect, Fresnel, Ghost, losses, named, reflection_of
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.machinability import place_back
@@ -196,7 +196,7 @@ SIZES = "stage 3, "  # how the stages of a design begin that are for one size of
 
 
 def diagnosis(
-    scene: Scene, making: Making, lens: Lens, *, picture: np.ndarray, target: np.ndarray, efficiency: float,
+    scene: Scene, making: DesignCourse, lens: Lens, *, picture: np.ndarray, target: np.ndarray, efficiency: float,
     at_bounds: Mapping[str, AtBound] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Return of a design the entries convergence, remaining_error and bounds of report.json (record.Contents).

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from bstcad.report.drawing import BLUE, GREY, VERMILION, new_figure, png, styled
 from bstcad.report.light_figures import plain_ticks
-from bstcad.report.report import encoded, machine
+from bstcad.report.report import base64_images, machine
 from bstcad.report.units import about, duration, environment, number
 from bstcad.runs import files
 from bstcad.scene.scene import Scene
@@ -289,7 +289,7 @@ def write_page(table: Table, scene: Scene, folder: Path) -> None:
         (folder / "tradeoff.png").unlink(missing_ok=True)
     text = environment().from_string(TEMPLATE.read_text(encoding="utf-8")).render(
         table=table, scene=scene.toml(), machine=machine(table.machine), verdict=verdict(table),
-        picture=encoded({"": picture}).get(""),
+        picture=base64_images({"": picture}).get(""),
         runs=sorted(table.lenses, key=lambda run: run.rrmsd if table.errors_alone else run.seconds),
     )  # fmt: skip
     files.put(folder / "tradeoff.html", text.encode())

@@ -124,7 +124,7 @@ def contents(name, **more):
     known = {
         "title": "A small disc", "verdict": "passed", "passed": True, "rrmsd": 0.02, "rrmsd_tent": None,
         "rrmsd_noise": 1e-4, "light_on_target": 0.9, "efficiency": 0.95, "flux": {"on target": 0.9},
-        "prescription": {}, "seconds_total": 3.0, "stages": (), "history": (record.Point(1.0, 0.5),), "checks": (),
+        "prescription": {}, "seconds_total": 3.0, "stages": (), "history": (record.CurvePoint(1.0, 0.5),), "checks": (),
         "effects": {"simulated": (), "left_out": ()}, "machine": {}, "versions": {}, "seed": 0,
     }  # fmt: skip
     known |= more

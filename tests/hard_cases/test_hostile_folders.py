@@ -26,7 +26,7 @@ from bstcad import commands
 from bstcad import folder as folders
 from bstcad.optics.measure import Effort
 from bstcad.report import record
-from bstcad.report.record import Making
+from bstcad.report.record import DesignCourse
 from bstcad.scene.picture import Picture, read_picture
 from bstcad.scene.scene import SceneError, load
 from tests.conftest import DISK, SMALL, draws_nothing, flat_pictures, verify_with
@@ -182,14 +182,14 @@ def test_an_earlier_report_that_does_not_fit_is_not_believed(quick_folder, holds
     path = quick_folder / "report.json"
     for text in REPORTS.values():
         path.write_text(text())
-        assert record.making(path) == Making()
+        assert record.making(path) == DesignCourse()
         with pytest.raises(ValueError, match="report.json: cannot be read .*; run bstcad verify"):
             record.read(path)
     path.write_text(REPORTS["huge"]())
     with spending("report.json of anything", 300.0, holds):
         record.making(path)
     path.write_text(REPORTS["passed"]())
-    found, kept = commands.verify(quick_folder).facts, [field.name for field in dataclasses.fields(Making)]
+    found, kept = commands.verify(quick_folder).facts, [field.name for field in dataclasses.fields(DesignCourse)]
     assert {name for name in kept if found.get(name)} == {"machine", "versions"}
     assert "python" in found["versions"] and found["machine"]["cores"]
     written = json.loads(path.read_text())

@@ -27,7 +27,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Light
 from bstcad.report import data_sheet, part_views, prescription
-from bstcad.report.data_sheet import Sheet
+from bstcad.report.data_sheet import DataSheet
 from bstcad.report.drawing import GLASS
 from bstcad.report.goal_figures import figures_of
 from bstcad.report.part_views import Views
@@ -86,7 +86,7 @@ def sheet(name):
     scene = scene_of(name)
     lens, target = lens_of(scene), scene.target.irradiance()
     shape = describe(lens, 65) | {"volume": exact_volume(lens)}
-    return Sheet(
+    return DataSheet(
         scene=scene, designed=lens, shape=shape, order=ordered(scene, lens, shape), target=target, irradiance=target,
         figures=figures_of(scene.goals, [LIGHT] * len(scene.targets)), passed=True, version="0.1",
     )  # fmt: skip

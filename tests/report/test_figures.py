@@ -24,11 +24,11 @@ from bstcad.report.light_figures import (
     balanced,
     cross_section,
     irradiance_triptych,
-    lines_apart,
     lit_mean,
     primary,
+    spectral_lines,
 )
-from bstcad.report.record import Point, Stage
+from bstcad.report.record import CurvePoint, StageRecord
 from bstcad.scene.picture import to_srgb
 
 X, Y = (0.0, 400.0), (-100.0, 200.0)
@@ -220,8 +220,9 @@ def test_transport_map_draws_each_line_both_ways(view):
 
 
 def test_convergence_has_its_points_stages_and_floor():
-    history = [Point(2.0 + i, 0.5 * 0.8**i) for i in range(10)]
-    axes = figure_jobs.convergence(history, [Stage("transport", 1.5), Stage("stage 2", 10.0, 0.07)], 0.01).axes[0]
+    history = [CurvePoint(2.0 + i, 0.5 * 0.8**i) for i in range(10)]
+    stages = [StageRecord("transport", 1.5), StageRecord("stage 2", 10.0, 0.07)]
+    axes = figure_jobs.convergence(history, stages, 0.01).axes[0]
     curve, *lines = (line.get_xydata() for line in axes.lines)
     assert curve[:, 1] == pytest.approx([point.rrmsd for point in history])
     assert [line[0, 0] for line in lines if line[0, 0] == line[1, 0]] == pytest.approx([1.5, 11.5])  # stages' ends
@@ -252,6 +253,6 @@ def test_each_line_has_its_colour_and_where_all_are_alike_the_light_is_grey(wave
 def test_the_figure_has_a_picture_of_all_lines_and_one_of_each(count):
     target = np.ones((10, 20))
     lines = [SpectralLine(450.0 + 30 * k, 1 / count, target * (1 + 0.1 * k)) for k in range(count)]
-    figure = lines_apart(target, 1.02 * target, lines, LENS)
+    figure = spectral_lines(target, 1.02 * target, lines, LENS)
     shown = [axes.get_title(loc="left") for axes in figure.axes if axes.get_visible()]
     assert len(shown) == count + 1 and shown[0] == "All lines" and "450 nm" in shown[1]

@@ -81,7 +81,7 @@ def test_light_of_a_point_and_a_face_before_it_are_judged_too():
     assert exact.maximum < 1e-9 < 1e-3 < coarse.rms < coarse.maximum
     beside = replace(throw, source=Point((300.0, 0.0, -30.0), half_angle=1.0, profile="uniform"))
     assert GridSag.of(lens, lens.front, 21, beside).shift is None
-    assert "no light comes to the target" in table_note(lens, lens.front, "sag.csv", points=21, throw=beside)
+    assert "no light reaches the target" in table_note(lens, lens.front, "sag.csv", points=21, throw=beside)
 
 
 def test_a_mirror_is_judged_by_its_own_light():

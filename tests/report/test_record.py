@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bstcad.report import record, tolerances
-from bstcad.report.record import KEYS, Contents, Making, of_json
+from bstcad.report.record import KEYS, Contents, DesignCourse, of_json
 from tests.report.test_report import CONTENTS, REPORT
 
 GOLDEN = {  # files as the first version wrote them, with every entry that a report may have
@@ -61,7 +61,7 @@ def test_a_report_with_an_entry_that_does_not_fit_is_refused_in_one_sentence(tmp
     with pytest.raises(ValueError, match="report.json: cannot be read .*; run bstcad verify") as refused:
         record.read(path)
     assert str(refused.value).isprintable() and len(str(refused.value)) < 400
-    assert record.making(path) == Making()
+    assert record.making(path) == DesignCourse()
 
 
 def test_a_missing_key_is_named():

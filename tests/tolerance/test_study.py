@@ -179,7 +179,7 @@ def studied(small_design, tmp_path_factory):
 
 def test_the_command_writes_what_it_found_and_a_trial_as_a_part(small_design, studied, capsys):
     folder, said = studied
-    assert "Yield, RRMSD up to" in said and "of 10 full traces" in said and "loosest" in said
+    assert "Yield for an RRMSD up to" in said and "of 10 full traces" in said and "loosest" in said
     facts = json.loads((folder / "tolerance.json").read_text())
     assert {"yield", "limit", "trials", "sensitivities", "worst"} <= set(facts)
     assert facts["version"] == bstcad.__version__
