@@ -179,18 +179,18 @@ def _title_block(paper: Paper, sheet: DataSheet, scale: str) -> None:
         (("Part no.", part.number), ("Drawn by", part.author), ("Organisation", part.organisation)),
         (("Date", part.date), ("Scale", scale), ("Unit", "mm"), ("Sheet", "1/1"), ("Projection", " ")),
     )
-    level, tall = TABLE_TOP - 16.2, 9.0
+    level, height = TABLE_TOP - 16.2, 9.0
     for row in cells:
         edges = np.linspace(left, right, len(row) + 1)
         paper.line([(left, level), (right, level)], 0.25)
         for edge in edges[1:-1]:
-            paper.line([(edge, level - tall), (edge, level)])
+            paper.line([(edge, level - height), (edge, level)])
         for edge, (name, value) in zip(edges, row, strict=False):
             space = edges[1] - left - 2.4
             paper.text(edge + 1.2, level - 2.6, name, 1.8, room=space, color=GREY)
             paper.text(edge + 1.2, level - 7.2, value or "\u2014", 3.0, room=space)
-        level -= tall
-    paper.first_angle(edges[-2] + 2.6, level + tall - 5.9, 3.2)
+        level -= height
+    paper.first_angle(edges[-2] + 2.6, level + height - 5.9, 3.2)
     paper.line([(left, level), (right, level)], 0.25)
     notes = (
         f"SHA-256 of {order.file}:", order.sha256[:32], order.sha256[32:],
@@ -205,14 +205,14 @@ def _light(paper: Paper, sheet: DataSheet, y: float) -> float:
     """Draw target and irradiance below y; return the y of the row below them (mm)."""
     start, end, view = LIGHT_LEFT + 2.4, FRAME[2] - 2.4, View.of(sheet.scene)
     width = (end - start - 2.4) / 2
-    tall = min(width * (view.y[1] - view.y[0]) / (view.x[1] - view.x[0]), 44.0)
+    height = min(width * (view.y[1] - view.y[0]) / (view.x[1] - view.x[0]), 44.0)
     target, irradiance = _reduced(sheet.target), _reduced(sheet.irradiance)
-    top, y = brightest(target, irradiance), y - tall
+    top, y = brightest(target, irradiance), y - height
     for k, (name, values) in enumerate((("Target", target), (f"Traced through {sheet.order.file}", irradiance))):
         left = start + k * (width + 2.4)
-        inset = paper.axes.figure.add_axes((left / WIDTH, y / HEIGHT, width / WIDTH, tall / HEIGHT))
-        shown = np.round(255 * np.clip(values / top, 0, 1)) / 255
-        inset.imshow(view.picture(shown), cmap=srgb_grey(), vmin=0, vmax=1, interpolation="none", aspect="auto")
+        inset = paper.axes.figure.add_axes((left / WIDTH, y / HEIGHT, width / WIDTH, height / HEIGHT))
+        tones = np.round(255 * np.clip(values / top, 0, 1)) / 255
+        inset.imshow(view.picture(tones), cmap=srgb_grey(), vmin=0, vmax=1, interpolation="none", aspect="auto")
         inset.set(xticks=[], yticks=[])
         inset.spines[:].set(visible=True, color=GREY, linewidth=0.4)
         paper.text(left, y - 3.2, name, NOTES, room=width)

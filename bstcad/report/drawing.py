@@ -108,8 +108,8 @@ def _encode(figure: Figure, dpi: float, ground: str) -> bytes:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()  # a tight bounding box by matplotlib would draw everything twice
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    drawn = ImageChops.difference(picture, Image.new("RGB", picture.size, ground)).getbbox()
-    picture = ImageOps.expand(picture.crop(drawn), round(MARGIN * dpi), ground)
+    box = ImageChops.difference(picture, Image.new("RGB", picture.size, ground)).getbbox()
+    picture = ImageOps.expand(picture.crop(box), round(MARGIN * dpi), ground)
     small = io.BytesIO()
     if picture.getcolors(MAX_PALETTE_COLOURS) is not None:
         picture = picture.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)

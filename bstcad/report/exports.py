@@ -81,14 +81,14 @@ def export(
             raise ValueError(f"'{kind}' cannot be exported; give one of {', '.join(files.EXPORTS)}")
     if points is not None and not MIN_POINTS <= points <= MAX_POINTS:
         raise ValueError(f"{points} points per side are not possible; give {MIN_POINTS} to {MAX_POINTS}")
-    lens, written, notes = lens.plain(), [], []
+    lens, paths, notes = lens.plain(), [], []
     for kind in dict.fromkeys(kinds):
         for name, data in _files(kind, lens, points, label=label, mount=mount, throw=throw):
             files.put(folder / name, data.encode("utf-8") if isinstance(data, str) else data)
-            written.append(folder / name)
+            paths.append(folder / name)
             if name.endswith(SIDECAR):
                 notes.append(str(data).strip())
-    return Exported(written, notes)
+    return Exported(paths, notes)
 
 
 def _files(

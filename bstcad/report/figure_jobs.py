@@ -209,11 +209,11 @@ def surface_maps(lens: Lens, steepest: float, face: str = "back") -> Figure:
     for axes, (values, label, title) in zip(panels, maps, strict=True):
         signed = axes is panels[2]
         shades = {"cmap": steps("PuOr", 82), "vmin": -edge, "vmax": edge} if signed else {"cmap": steps("cividis", 82)}
-        shown = axes.imshow(values, **place, **shades)
+        map_image = axes.imshow(values, **place, **shades)
         axes.set(xlabel="x (mm)", title=title)
         axes.spines[:].set_visible(False)
         extend = "both" if signed else "neither"
-        bar = figure.colorbar(shown, ax=axes, label=label, fraction=0.046, pad=0.03, extend=extend)
+        bar = figure.colorbar(map_image, ax=axes, label=label, fraction=0.046, pad=0.03, extend=extend)
         if not signed and np.nanmax(values) - np.nanmin(values) > ROUNDING * (1 + np.nanmax(np.abs(values))):
             bar.add_lines(axes.contour(x, y, values, 10, colors="white", linewidths=0.35))
     return figure
@@ -257,12 +257,12 @@ def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> F
     close.set(title=f"{lens.passes.optic.capitalize()}, cut along y = 0", aspect="equal")
     whole.set_title("Whole path, source to target (axes at different scales)")
     several = len(screens) > 1
-    drawn = [screen for screen in screens if several or not screen.plane.is_level]
-    for screen in drawn:
+    visible = [screen for screen in screens if several or not screen.plane.is_level]
+    for screen in visible:
         edges = corners(screen)
         whole.fill(edges[:, 2], edges[:, 0], facecolor="none", edgecolor=GREY, linewidth=1.0, gid="screen")
-    if drawn:
-        tilt = drawn[0].plane.tilt
+    if visible:
+        tilt = visible[0].plane.tilt
         one = f"Grey: the target, its plane tilted by {tilt_words(tilt)}." if tilt else "Grey: the target."
         footnote(figure, "Grey: the targets." if several else one)
     return figure

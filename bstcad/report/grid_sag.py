@@ -127,9 +127,9 @@ class Patches(Surface):
         s = torch.zeros_like(x)
         for _ in range(NEWTON_STEPS):
             h, h_x, h_y = self.relative_sag_and_slope(x + s * dx, y + s * dy)
-            off, rise = s * dz - h, dz - h_x * dx - h_y * dy
-            s = s - off / torch.where(rise.abs() > MIN_DERIVATIVE, rise, torch.full_like(rise, MIN_DERIVATIVE))
-        return s, off.abs() < HIT_TOLERANCE
+            residual, rise = s * dz - h, dz - h_x * dx - h_y * dy
+            s = s - residual / torch.where(rise.abs() > MIN_DERIVATIVE, rise, torch.full_like(rise, MIN_DERIVATIVE))
+        return s, residual.abs() < HIT_TOLERANCE
 
     def sags(self, outline: Outline) -> tuple[float, float]:
         """Return the lowest and the highest height of the points and of zero (mm)."""

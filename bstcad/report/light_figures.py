@@ -213,11 +213,11 @@ def _side_by_side(
     figure = new_figure(11.0, height, layout="compressed")
     panels, error = figure.subplots(1, len(pictures) + 1, sharey=True), 100.0 * (last - before) / unit
     for axes, (title, picture) in zip(panels, pictures.items(), strict=False):
-        shown = _grey(axes, picture / unit, view, top=top / unit, title=title)
+        image = _grey(axes, picture / unit, view, top=top / unit, title=title)
     signed = _signed(panels[-1], error, view, most=_largest(error, spot), title=difference)
     panels[0].set_ylabel(view.labels[1])
     extend = "max" if last.max() > top else "neither"
-    figure.colorbar(shown, ax=panels[:-1], label=view.mean_lit, fraction=0.04, pad=0.015, extend=extend)
+    figure.colorbar(image, ax=panels[:-1], label=view.mean_lit, fraction=0.04, pad=0.015, extend=extend)
     figure.colorbar(signed, ax=panels[-1], label=view.percent_lit, fraction=0.08, pad=0.03, extend="both")
     return figure, panels
 
@@ -336,9 +336,9 @@ def ghost_picture(target: np.ndarray, ghost: np.ndarray, view: View) -> Figure:
     figure = new_figure(5.6, 4.6, layout="compressed")
     axes = figure.subplots()
     top = HEADROOM * float(np.percentile(share, GLARE_PERCENTILE)) or 1.0
-    shown = _grey(axes, share, view, top=top, title=f"The ghost alone: up to {number(float(share.max()))} %")
+    image = _grey(axes, share, view, top=top, title=f"The ghost alone: up to {number(float(share.max()))} %")
     axes.set_ylabel(view.labels[1])
-    figure.colorbar(shown, ax=axes, label=view.percent_lit, extend="max" if share.max() > top else "neither")
+    figure.colorbar(image, ax=axes, label=view.percent_lit, extend="max" if share.max() > top else "neither")
     view.note(figure)
     return figure
 
@@ -381,8 +381,8 @@ def spectral_lines(target: np.ndarray, irradiance: np.ndarray, lines: Sequence[S
     unit = lit_mean(even)
     top = brightest(even, view.irradiance(irradiance)) / unit
     rows = -(-(1 + len(lines)) // COLUMNS)
-    tall = PANEL_WIDTH * (view.y[1] - view.y[0]) / (view.x[1] - view.x[0])
-    figure = new_figure(11.0, 0.6 + rows * (0.6 + min(tall, MAX_PANEL_HEIGHT)), layout="compressed")
+    height = PANEL_WIDTH * (view.y[1] - view.y[0]) / (view.x[1] - view.x[0])
+    figure = new_figure(11.0, 0.6 + rows * (0.6 + min(height, MAX_PANEL_HEIGHT)), layout="compressed")
     panels = figure.subplots(rows, COLUMNS, sharey=True, sharex=True, squeeze=False).ravel()
     alone = [view.irradiance(line.picture) for line in lines]
     colours = balanced(alone, *([getattr(line, name) for line in lines] for name in ("wavelength", "share")))
@@ -465,7 +465,7 @@ def made_part(made: MadePart, designed: np.ndarray, view: View) -> Figure:
     face, light, changed = figure.subplots(1, 3)
     place = {"extent": (x[0], x[-1], y[0], y[-1]), "origin": "lower", "interpolation_stage": "data"}
     edge = round_up(factor * largest)
-    shown = face.imshow(factor * form, cmap=steps("RdBu_r", 41), vmin=-edge, vmax=edge, **place)
+    image = face.imshow(factor * form, cmap=steps("RdBu_r", 41), vmin=-edge, vmax=edge, **place)
     face.set(title=f"Made − designed, PV {quantity(pv, 'mm')}", xlabel="x (mm)", ylabel="y (mm)")
     face.spines[:].set_visible(False)
     dots = ""
@@ -475,11 +475,11 @@ def made_part(made: MadePart, designed: np.ndarray, view: View) -> Figure:
         many = f"s: {len(outliers)} outliers, which are" if len(outliers) > 1 else ": an outlier, which is"
         dots = f"  Black dot{many} left out."
     change, top = 100.0 * (predicted - designed) / unit, brightest(designed, predicted) / unit
-    drawn = _grey(light, predicted / unit, view, top=top, title="Light of the made part, predicted")
+    light_image = _grey(light, predicted / unit, view, top=top, title="Light of the made part, predicted")
     signed = _signed(changed, change, view, most=_largest(change), title="Made − designed light")
     slim = {"fraction": 0.046, "pad": 0.03}
-    figure.colorbar(shown, ax=face, label=f"{unit_name} along the normal", **slim)
-    figure.colorbar(drawn, ax=light, label=view.mean_lit, **slim)
+    figure.colorbar(image, ax=face, label=f"{unit_name} along the normal", **slim)
+    figure.colorbar(light_image, ax=light, label=view.mean_lit, **slim)
     figure.colorbar(signed, ax=changed, label=view.percent_lit, extend="both", **slim)
     left = "Left: form error of the back face after alignment, + out of the glass, seen from outside, x to the right."
     view.note(figure, first=f"{left}{dots}\n")
@@ -532,12 +532,12 @@ def worst_trials(
     figure = new_figure(11.0, 1.0 + 4.6 * view.proportion, layout="compressed")
     panels = figure.subplots(2, 1 + MAX_WORST_TRIALS, sharex=True, sharey=True, squeeze=False)
     top = max(brightest(nominal, picture) for _, _, picture in worst) / unit
-    off = [100.0 * (picture - nominal) / unit for _, _, picture in worst]
-    most = _largest(np.array(off), 0.0)
+    differences = [100.0 * (picture - nominal) / unit for _, _, picture in worst]
+    most = _largest(np.array(differences), 0.0)
     lit = _grey(panels[0, 0], nominal / unit, view, top=top, title=f"As designed{of} (RRMSD {design:.3g})")
-    for (above, below), (trial, value, picture), apart in zip(panels[:, 1:].T, worst, off, strict=False):
+    for (above, below), (trial, value, picture), difference in zip(panels[:, 1:].T, worst, differences, strict=False):
         _grey(above, picture / unit, view, top=top, title=f"Trial {trial} (RRMSD {value:.3g})").axes.set_xlabel("")
-        changed = _signed(below, apart, view, most=most, title=f"Trial {trial} − as designed")
+        changed = _signed(below, difference, view, most=most, title=f"Trial {trial} − as designed")
     for axes in (panels[1, 0], *panels[:, 1 + len(worst) :].ravel()):
         axes.set_visible(False)
     panels[0, 0].tick_params(labelbottom=True)

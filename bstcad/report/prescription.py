@@ -69,7 +69,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
     own = scene.lens.front.designed(front).surface.plain().parameters()  # heights, if it is a net
     numbers = ({"curvature": 0.0} if front.level else {}) | {n: v for n, v in own.items() if isinstance(v, float)}
     fitted = {"within": FIT_TOLERANCE} if front.is_net and scene.lens.front.kind != "bspline" else {}  # mm
-    heavy = density(material) if material else None
+    rho = density(material) if material else None
     values = ((each.name, getattr(scene.source, each.name)) for each in fields(scene.source))
     files = {name: value.name for name, value in values if isinstance(value, FileContent)}
     return {
@@ -89,7 +89,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "centre_thickness": shape["centre_thickness"],
         "edge_thickness": (shape["edge_thickness_min"], shape["edge_thickness_max"]),
         "volume": shape["volume"],  # mm³
-        "mass": None if heavy is None else shape["volume"] * heavy / 1000,  # g; None: no density is known
+        "mass": None if rho is None else shape["volume"] * rho / 1000,  # g; None: no density is known
         "source": _known(asdict(scene.source) | files),
         **{name: [_known(e.model_dump(mode="json")) for e in found] for name, found in scene.elements if found},
         "targets": [_known(target.model_dump(mode="json")) for target in scene.targets],

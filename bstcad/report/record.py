@@ -333,9 +333,9 @@ def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:
 
 def _with_remarks(contents: Contents, *more: Remark) -> Contents:
     """Return the contents with more remarks, and the verdict that follows."""
-    every, asked = (*contents.all_remarks, *more), contents.verdict != NO_LIMIT
+    every, limited = (*contents.all_remarks, *more), contents.verdict != NO_LIMIT
     ids, texts = (tuple(part) for part in zip(*every, strict=True)) if every else ((), ())
-    return replace(contents, given_up=texts, remarks=ids, verdict=verdict(contents.passed, texts, asked))
+    return replace(contents, given_up=texts, remarks=ids, verdict=verdict(contents.passed, texts, limited))
 
 
 def _finest_detail(

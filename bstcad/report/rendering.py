@@ -230,9 +230,9 @@ def _close_rays(path: LightPath) -> np.ndarray:
     reach = RAY_REACH * np.linalg.norm(np.ptp(path.vertices, axis=0))
     rays = path.rays[::RAY_STEP].copy()
     for end, before in ((0, 1), (-1, -2)):
-        way = rays[:, end] - rays[:, before]
-        long = np.linalg.norm(way, axis=1, keepdims=True)
-        rays[:, end] = rays[:, before] + way * np.minimum(1.0, reach / np.maximum(long, 1e-12))
+        segment = rays[:, end] - rays[:, before]
+        length = np.linalg.norm(segment, axis=1, keepdims=True)
+        rays[:, end] = rays[:, before] + segment * np.minimum(1.0, reach / np.maximum(length, 1e-12))
     return rays
 
 
@@ -309,8 +309,8 @@ def _frame(plotter: Any, points: np.ndarray, path: LightPath, towards: np.ndarra
 
 def _clear_of_screen(path: LightPath, towards: np.ndarray) -> np.ndarray:
     """Return the direction to the eye (a unit vector) on the side away from the screen."""
-    off = path.screens[0][:, 0].mean() - path.vertices[:, 0].mean()
-    return towards * [-1 if off > 0 else 1, 1, 1] / np.linalg.norm(towards)
+    offset = path.screens[0][:, 0].mean() - path.vertices[:, 0].mean()
+    return towards * [-1 if offset > 0 else 1, 1, 1] / np.linalg.norm(towards)
 
 
 # --- the model that a reader can rotate -------------------------------------------------------------------------------

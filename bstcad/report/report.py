@@ -179,8 +179,8 @@ def summary(report: Contents | Examined, verbose: bool = False) -> Group:
         remarks = [*doubts(report), *report.all_remarks]
     lines += [Text.assemble(f"Remark: {remark.text}", topic_tag(remark)) for remark in remarks]
     figures = first_figures(report)
-    wide = max((len(name) for name, _, _ in figures), default=0)
-    lines += [Text(f"{name:{wide}}  {value}{remark and f' ({remark})'}") for name, value, remark in figures]
+    name_width = max((len(name) for name, _, _ in figures), default=0)
+    lines += [Text(f"{name:{name_width}}  {value}{remark and f' ({remark})'}") for name, value, remark in figures]
     lines += map(Text, filter(None, [bounds(report.bounds)]))
     passed = sum(check.passed for check in report.checks)
     lines += check_lines(report.checks, verbose)

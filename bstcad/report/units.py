@@ -71,10 +71,10 @@ def percent(part: float) -> str:
     """Return a fraction in percent, rounded to 0 % or 100 % only if it is exactly 0 or 1."""
     if part in (0.0, 1.0):
         return f"{100 * part:g} %"
-    off = min(abs(part), abs(1.0 - part)) * 100.0
-    if off < 0.0005:
+    distance = min(abs(part), abs(1.0 - part)) * 100.0
+    if distance < 0.0005:
         return "< 0.001 %" if part < 0.5 else "> 99.999 %"
-    return f"{100 * part:.{min(3, max(1, 1 - math.floor(math.log10(off))))}f} %"
+    return f"{100 * part:.{min(3, max(1, 1 - math.floor(math.log10(distance))))}f} %"
 
 
 def duration(seconds: float) -> str:

@@ -28,14 +28,14 @@ def wavefront_map(error: WavefrontError) -> Figure:
     pitch = (error.x[1] - error.x[0]) / 2
     ends = error.x[0] - pitch, error.x[-1] + pitch, error.y[0] - pitch, error.y[-1] + pitch
     shades = {"cmap": steps("RdBu_r", 41), "vmin": -edge, "vmax": edge}
-    shown = face.imshow(error.opd, extent=ends, origin="lower", interpolation_stage="data", **shades)
+    image = face.imshow(error.opd, extent=ends, origin="lower", interpolation_stage="data", **shades)
     figures = error.without_tilt
     face.set(xlabel="x (mm)", ylabel="y (mm)")
     face.set_title(
         f"OPD at z = {error.z:g} mm, {REMOVED}:\nRMS {number(figures.rms)} waves, PV {number(figures.pv)} waves"
     )
     face.spines[:].set_visible(False)
-    figure.colorbar(shown, ax=face, label=f"waves of {error.wavelength:g} nm", fraction=0.046, pad=0.03)
+    figure.colorbar(image, ax=face, label=f"waves of {error.wavelength:g} nm", fraction=0.046, pad=0.03)
     _cuts(cut, error, edge)
     footnote(figure, f"{LOOKING}\n{words(error)}")
     return figure
