@@ -139,10 +139,10 @@ def page(sheet: DataSheet) -> Figure:
     _title_block(paper, sheet, part_views.scale_words(scale))
     start, pitch = LIGHT_LEFT + 2.4, 3.05 if mount else 3.4
     paper.text(start, high - 5.4, purpose[0], HEADING_FONT, weight="bold")
-    y = _beside(paper, purpose[1], _light(paper, sheet, high - 9.4), pitch)
+    y = _write_rows(paper, purpose[1], _light(paper, sheet, high - 9.4), pitch)
     if mount:
         paper.text(start, y - 1.9, mount[0], HEADING_FONT, weight="bold")
-        _beside(paper, mount[1], y - 6.4, pitch)
+        _write_rows(paper, mount[1], y - 6.4, pitch)
     return figure
 
 
@@ -155,7 +155,6 @@ def _form(sheet: DataSheet) -> str:
 
 
 def _column(paper: Paper, left: float, heading: str, rows: Rows) -> None:
-    """Draw one column of the tables of ISO 10110."""
     right, y = left + (TITLE_LEFT - FRAME[0]) / 3, TABLE_TOP - 4.2
     start, end = left + 1.8, right - 1.8
     if left > FRAME[0]:
@@ -193,10 +192,12 @@ def _title_block(paper: Paper, sheet: DataSheet, scale: str) -> None:
     paper.first_angle(edges[-2] + 2.6, level + height - 5.9, 3.2)
     paper.line([(left, level), (right, level)], 0.25)
     notes = (
-        f"SHA-256 of {order.file}:", order.sha256[:32], order.sha256[32:],
+        f"SHA-256 of {order.file}:",
+        order.sha256[:32],
+        order.sha256[32:],
         f"{order.file} is exact and binding; dimensions here are rounded",
         f"bstcad {sheet.version}" + "; lens.step: the lens without cut and mount" * (sheet.mount is not None),
-    )  # fmt: skip
+    )
     for k, note in enumerate(notes):
         paper.text(left + 1.8, level - 3.3 - 2.95 * k, note, NOTES, room=room)
 
@@ -226,7 +227,7 @@ def _reduced(picture: np.ndarray) -> np.ndarray:
     return np.asarray(Image.fromarray(picture.astype(np.float32)).reduce(-(-max(picture.shape) // MAX_PIXELS)))
 
 
-def _beside(paper: Paper, rows: Rows, y: float, pitch: float) -> float:
+def _write_rows(paper: Paper, rows: Rows, y: float, pitch: float) -> float:
     """Write rows beside the drawing from y downwards, as far as there is room; return the y of the next row (mm)."""
     start, end = LIGHT_LEFT + 2.4, FRAME[2] - 2.4
     for name, value in rows:

@@ -45,11 +45,13 @@ QUARTER_TURN_BULGE = math.tan(math.pi / 8)  # bulge of an arc of 90 degrees: tan
 EDGES = {"fill": "none", "stroke": "black", "stroke-width": f"{EDGE:g}"}
 STYLES = {  # attributes of the groups in the SVG, except those of edges
     CENTRES: {
-        "fill": "none", "stroke": "#c00000", "stroke-width": f"{THIN:g}",
+        "fill": "none",
+        "stroke": "#c00000",
+        "stroke-width": f"{THIN:g}",
         "stroke-dasharray": " ".join(f"{part:g}" for part in CHAIN),
     },
     TEXT: {"font-family": "Helvetica, Arial, sans-serif", "font-size": f"{FONT_SIZE:g}"},
-}  # fmt: skip
+}
 DXF_SIGNS = str.maketrans({"Ø": "%%c", "°": "%%d", "×": "x"})  # replacements that every font of a CAD system has
 
 # (layer, kind, numbers): numbers (mm) are x, y, radius of a circle; half width, half height and corner radius of a box
@@ -93,8 +95,7 @@ def export(
 
 def _files(
     kind: str, lens: Lens, points: int | None, *, label: Label, mount: Mount | None, throw: Throw | None
-) -> Iterator[tuple[str, str | bytes]]:  # fmt: skip
-    """Yield (name, data) of each file of a kind."""
+) -> Iterator[tuple[str, str | bytes]]:
     count = min(max(lens.back.shape), MAX_POINTS) if points is None else points
     match kind:
         case "sag":

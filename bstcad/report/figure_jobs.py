@@ -37,7 +37,7 @@ from bstcad.report.drawing import (
     round_up,
     steps,
     styled,
-)  # fmt: skip
+)
 from bstcad.report.light_figures import View, plain_ticks
 from bstcad.report.record import Contents, CurvePoint, StageRecord
 from bstcad.report.rendering import LightPath
@@ -203,9 +203,10 @@ def surface_maps(lens: Lens, steepest: float, face: str = "back") -> Figure:
     panels[0].set_ylabel("y (mm)")
     heading = f"Height{', best plane removed' if tilted else ''}: PV {scale * pv:.3g} {unit}"
     maps = (
-        (scale * height, unit, heading), (slope, "degrees", f"Slope: up to {steepest:.3g}°"),
+        (scale * height, unit, heading),
+        (slope, "degrees", f"Slope: up to {steepest:.3g}°"),
         (bend, "1/m", "Mean curvature (+: bends towards +z)"),
-    )  # fmt: skip
+    )
     for axes, (values, label, title) in zip(panels, maps, strict=True):
         signed = axes is panels[2]
         shades = {"cmap": steps("PuOr", 82), "vmin": -edge, "vmax": edge} if signed else {"cmap": steps("cividis", 82)}
@@ -318,9 +319,7 @@ def convergence(history: Sequence[CurvePoint], stages: Sequence[StageRecord], no
 # --- a lens at work ---------------------------------------------------------------------------------------------------
 
 
-def light_path_of(
-    scene: Scene, lens: Lens, pictures: Sequence[tuple[np.ndarray, np.ndarray]]
-) -> LightPath | None:  # fmt: skip
+def light_path_of(scene: Scene, lens: Lens, pictures: Sequence[tuple[np.ndarray, np.ndarray]]) -> LightPath | None:
     """Return lens, rays and pictures for `bstcad show`; None if no light reaches the furthest target.
 
     pictures: (target, irradiance) of each target of the scene, (rows, columns) each.

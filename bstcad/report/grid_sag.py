@@ -262,7 +262,6 @@ class GridSag:
 
     @classmethod
     def _at(cls, lens: Lens, face: BSplineSurface, at: tuple[np.ndarray, np.ndarray], throw: Throw | None) -> GridSag:
-        """Return the grid at these x and y (mm)."""
         found = cls(face, Grid(*at, on_grid(face, *at)), None)
         return found if throw is None else replace(found, shift=shift_by_patches(lens, face, found.patches, throw))
 

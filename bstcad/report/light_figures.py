@@ -190,13 +190,11 @@ def draw_picture(axes: Axes, values: np.ndarray, view: View, **shades: Any) -> A
 
 
 def _grey(axes: Axes, values: np.ndarray, view: View, *, top: float, title: str) -> Any:
-    """Draw irradiance on a grey scale from 0 to `top`."""
     axes.set_title(title)
     return draw_picture(axes, values, view, cmap=srgb_grey(), vmin=0.0, vmax=top)
 
 
 def _signed(axes: Axes, values: np.ndarray, view: View, *, most: float, title: str) -> Any:
-    """Draw differences in percent, on a scale from -most to most."""
     axes.set_title(title)
     return draw_picture(axes, values, view, cmap=steps("RdBu_r", 41), vmin=-most, vmax=most)
 
@@ -406,10 +404,12 @@ def spectral_lines(target: np.ndarray, irradiance: np.ndarray, lines: Sequence[S
 def primary(wavelength: float) -> np.ndarray:
     """Return linear sRGB (3,) of one wavelength (nm), with negative components set to zero."""
     xyz = [
-        sum(weight * np.exp(-0.5 * ((wavelength - centre) / (below if wavelength < centre else above)) ** 2)
-            for weight, centre, below, above in lobes)
+        sum(
+            weight * np.exp(-0.5 * ((wavelength - centre) / (below if wavelength < centre else above)) ** 2)
+            for weight, centre, below, above in lobes
+        )
         for lobes in LOBES
-    ]  # fmt: skip
+    ]
     return np.maximum(TO_SRGB @ np.array(xyz), 0.0)
 
 

@@ -248,9 +248,11 @@ def profile(lens: Lens, mount: Mount, upright: bool, origin: float = 0.0) -> Cro
         whole = shapely.union_all([whole, *sides]) - holes
     return CrossSection(
         bodies=tuple(shapely.get_coordinates(part.exterior) for part in getattr(whole, "geoms", [whole])),
-        back=(float(back[0]), float(back[-1])), front=(float(front[0]), float(front[-1])), front_ends=ends,
+        back=(float(back[0]), float(back[-1])),
+        front=(float(front[0]), float(front[-1])),
+        front_ends=ends,
         behind=tuple(behind),
-    )  # fmt: skip
+    )
 
 
 def _flange(
@@ -394,7 +396,7 @@ def _plan(paper: Paper, views: Views, at: PaperFrame) -> None:
         inset = at.scale * corner * (1 - 0.5**0.5)
         paper.leader((x + a - inset, y - b + inset), (x + a + 2.0, y - b - 3.0), f"R{mm(corner)}", 1)
     if views.mount.flange is not None:
-        _around(paper, views, views.mount.flange, at)
+        _draw_flange(paper, views, views.mount.flange, at)
     paper.axis((x - a - 3, y), (x + a + 3, y))
     paper.axis((x, y - b - 3), (x, y + b + 3))
     _frame(paper, (x, y), ("x", "y"), min(AXIS_LENGTH, a, b))
@@ -416,7 +418,7 @@ def _plan(paper: Paper, views: Views, at: PaperFrame) -> None:
     paper.text(x, y - b - 17, note, NOTES, ha="center", color=BLUE)
 
 
-def _around(paper: Paper, views: Views, flange: Flange, at: PaperFrame) -> None:
+def _draw_flange(paper: Paper, views: Views, flange: Flange, at: PaperFrame) -> None:
     """Draw flange and holes around the lens, with notes on rim and holes."""
     outer = views.outermost
     over, under = (at.y + sense * (at.scale * outer.half_extent[1] + 6.2) for sense in (1, -1))  # y of notes
@@ -516,7 +518,7 @@ def _section(paper: Paper, views: Views, which: int, scale: float, *, left: floa
 
 def _thicknesses(
     views: Views, which: int, at: PaperFrame, reach: float
-) -> Iterator[tuple[tuple[float, float], float, tuple[float, float]]]:  # fmt: skip
+) -> Iterator[tuple[tuple[float, float], float, tuple[float, float]]]:
     """Yield dimensions along z of edge or flange and of the whole part: z (mm), level and feet on paper."""
     cut, flange, (front, back) = views.cuts[which], views.mount.flange, views.vertices
     middle, top, foot = at.y, at.y + reach, at.y - reach

@@ -80,7 +80,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "index": lens.index,
         "outline": asdict(lens.outline),
         "clear": lens.clear and tuple(map(asdict, lens.clear)),  # clear apertures of front and back; None: no mount
-        "front": _own(front) | _face(scene.lens.front.kind, lens.front_vertex, numbers) | fitted,
+        "front": _own_outline(front) | _face(scene.lens.front.kind, lens.front_vertex, numbers) | fitted,
         "back": _face("bspline", vertex(lens), {}),
         "reflects": lens.reflects,  # True for a mirror
         "net": _net(lens.back),
@@ -90,14 +90,13 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "edge_thickness": (shape["edge_thickness_min"], shape["edge_thickness_max"]),
         "volume": shape["volume"],  # mm³
         "mass": None if rho is None else shape["volume"] * rho / 1000,  # g; None: no density is known
-        "source": _known(asdict(scene.source) | files),
-        **{name: [_known(e.model_dump(mode="json")) for e in found] for name, found in scene.elements if found},
-        "targets": [_known(target.model_dump(mode="json")) for target in scene.targets],
+        "source": _without_none(asdict(scene.source) | files),
+        **{name: [_without_none(e.model_dump(mode="json")) for e in found] for name, found in scene.elements if found},
+        "targets": [_without_none(target.model_dump(mode="json")) for target in scene.targets],
     }
 
 
 def _net(face: BSplineSurface) -> dict[str, Any]:
-    """Return the net of a tailored face."""
     return {
         "control_points": face.shape,  # numbers along x and y
         "degree": DEGREE,
@@ -124,12 +123,12 @@ def _face(kind: str, z: float, numbers: Mapping[str, float]) -> dict[str, Any]:
     return {"kind": kind, "vertex": (0.0, 0.0, z)} | none | numbers | radii
 
 
-def _own(front: Surface) -> dict[str, Any]:
+def _own_outline(front: Surface) -> dict[str, Any]:
     """Return the outline of a front that has its own, and z of the plane around it."""
     return {} if front.outline is None else {"outline": asdict(front.outline), "around": front.around.z}
 
 
-def _known(table: Mapping[str, Any]) -> dict[str, Any]:
+def _without_none(table: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in table.items() if value is not None}
 
 
@@ -163,8 +162,10 @@ def text(record: Mapping[str, Any]) -> str:
     name = f"{record['name']}: {record['title']}" if record["title"] else record["name"]
     direction = LIGHT_DIRECTIONS[_passes(record).optic]
     head = TEXT.format(name=name, direction=direction, exact=EXACT["front_net" in record])
-    parts = (f"\n{heading}\n" + "".join(f"    {name:<30}{value}\n" for name, value in rows)
-             for heading, rows in sections(record).items())  # fmt: skip
+    parts = (
+        f"\n{heading}\n" + "".join(f"    {name:<30}{value}\n" for name, value in rows)
+        for heading, rows in sections(record).items()
+    )
     return head + "".join(parts)
 
 
@@ -254,7 +255,7 @@ def order_rows(order: Order) -> Rows:
 
 def part(
     lens: Lens, whole: WholePart | None = None, stated: float | None = None, placement: Mapping[str, Any] | None = None
-) -> dict[str, str]:  # fmt: skip
+) -> dict[str, str]:
     """Return the facts of a part in a STEP file, in the order of the set-up of a machine; no design is needed.
 
     whole: walls around the lens; then the lens's outline only encloses the edge of its back.  None: a bare lens.

@@ -338,9 +338,7 @@ def _with_remarks(contents: Contents, *more: Remark) -> Contents:
     return replace(contents, given_up=texts, remarks=ids, verdict=verdict(contents.passed, texts, limited))
 
 
-def _finest_detail(
-    scene: Scene, proof: Proof, screen: Screen, estimates: tuple[LeftOut, ...]
-) -> FinestDetail | None:  # fmt: skip
+def _finest_detail(scene: Scene, proof: Proof, screen: Screen, estimates: tuple[LeftOut, ...]) -> FinestDetail | None:
     """Return the finest detail by the size of the source in the scene, or by the size that the estimates assume."""
     if proof.blur:
         of = ", ".join(f"source.{key} = {size}" for key, size in extent(scene.source))

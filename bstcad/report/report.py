@@ -236,7 +236,6 @@ def plan_effects(plan: Mapping[str, Any], title: str, optic: str) -> Group:
 
 
 def _verdict(plan: Mapping[str, Any]) -> Iterator[Text]:
-    """Yield the verdict of a plan for the terminal."""
     from rich.text import Text
 
     yield Text.assemble(("PLAN: ", PLAN_STYLES[plan["verdict"]["kind"]]), plan["verdict"]["sentence"])

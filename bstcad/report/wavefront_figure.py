@@ -42,7 +42,6 @@ def wavefront_map(error: WavefrontError) -> Figure:
 
 
 def _cuts(axes: Axes, error: WavefrontError, edge: float) -> None:
-    """Draw cuts along x and along y through the centre of the map."""
     row, column = (len(along) // 2 for along in (error.y, error.x))
     for along, line, colour, name in (
         (error.x, error.opd[row], BLUE, f"along x (y = {error.y[row]:.3g} mm)"),
