@@ -397,7 +397,7 @@ class TestAFileByItself:
 
         before = files()
         code, out, err = run(capsys, "verify", small_design.folder / "lens.step")
-        assert all(value in out for value in ("8 × 6 × ", "convex, radius 500 mm", "15 mm before the vertex of the"))
+        assert all(value in out for value in ("8 × 6 × ", "convex, radius 500 mm", "15 mm in front of the vertex"))
         assert code == 0 and "PASSED" in out and "RRMSD" not in out and err == ""
         assert files() == before
 

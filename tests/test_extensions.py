@@ -224,7 +224,7 @@ def test_light_over_directions_is_stated_in_degrees(scene, tmp_path, monkeypatch
     )  # fmt: skip
     [words] = [dict(rows) for rows in sheet.tables.values() if "Picture" in dict(rows)]
     assert words["Size"].startswith("40 × 80 degrees") and words["Screen"] == f"{place} in lens.step"
-    assert words["It covers"] == "h ±20, v ±40 degrees"
+    assert words["Extent"] == "h ±20, v ±40 degrees"
     view = View.of(far)
     assert view.labels == ("h (degrees)", "v (degrees)") and np.ptp(view.tones(design.target, design.target)) == 0
     shown = light_path_of(far, design.lens, [(design.target, design.target)])

@@ -105,7 +105,7 @@ class PrecisionTest(TypedDict):
 
 
 @dataclass(frozen=True)
-class SpectralLine:
+class LineFigures:
     """The light of one spectral line alone."""
 
     wavelength: Size  # nm
@@ -199,7 +199,7 @@ class Contents:
     stability: Mapping[str, float | int | None] | None = None
     blur: Blur | None = None  # blur by the source's size; None: a point source or parallel light
     finest_detail: FinestDetail | None = None  # width of a point of the picture on the target
-    lines: tuple[SpectralLine, ...] = ()  # lines of the spectrum; empty: one line
+    lines: tuple[LineFigures, ...] = ()  # lines of the spectrum; empty: one line
     picture: tuple[str, ...] = ()  # sentences on how the picture was read: first of several, tones, transparency, fit
     given_up: tuple[str, ...] = ()  # text of the remarks
     remarks: tuple[str, ...] = ()  # ids of the remarks, in the order of given_up
@@ -309,7 +309,7 @@ def contents_of(
         blur=proof.blur,
         finest_detail=_finest_detail(scene, proof, goal.receiver, estimates),
         picture=scene.picture_remarks(),
-        lines=tuple(SpectralLine(k.wavelength, k.share, rrmsd(goal.picture, k.picture)) for k in proof.lines),
+        lines=tuple(LineFigures(k.wavelength, k.share, rrmsd(goal.picture, k.picture)) for k in proof.lines),
         estimates=estimates,
         flat_tops=tuple(flat_tops(scene, proof)),
         wavefront=proof.wavefront and WavefrontFigures.of(proof.wavefront),
