@@ -65,8 +65,8 @@ def design(
     for warning in scene.warnings():
         warnings.warn(warning, stacklevel=2)
     processes.keep_freed()
-    with progresses.shown(progress) as shown:
-        scene = commands.settled(scene, lambda line: shown("control points", 1, 1, line))
+    with progresses.for_script(progress) as shown:
+        scene = commands.with_default_net(scene, lambda line: shown("control points", 1, 1, line))
         return Design(pipeline.design(scene, device=device, progress=shown, began=began, merit=merit, later=True))
 
 
@@ -131,7 +131,7 @@ class Design:
         scene, lens = _fitting(lens, self._made.scene, self.lens.front)
         made = replace(
             self._made, scene=scene, lens=scene.as_mounted(lens), making=DesignCourse(stopped=BY_HAND), transport=None,
-            compared=None,
+            precision_comparison=None,
         )  # fmt: skip
         return Design(made)
 
@@ -193,7 +193,7 @@ class Design:
         from bstcad.cad.solid import named_solid
         from bstcad.cad.walls import Draft
 
-        with commands.refusals():
+        with commands.scene_errors():
             if body is None:
                 return named_solid(self.lens, trim, holes, Draft(*walls))
             return mounting.mounted(body, [mounting.Placed(self.lens, trim, holes, draft=Draft(*walls))])
@@ -218,7 +218,7 @@ class Design:
 
         if self.scene.mount is None:
             raise SceneError(f"{self.scene.name}: has no [mount]; add one to the scene, or give solid() a body")
-        with commands.refusals():
+        with commands.scene_errors():
             return mounting.part_of(self.lens, self.scene.mount).solid
 
     def export(self, *kinds: str, points: int | None = None) -> list[Path]:
@@ -242,9 +242,9 @@ class Design:
         folder = Path(folder).expanduser()
         files.check_free(folder)
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with files.held(folder), progresses.shown(progress) as shown:
+        with files.exclusive(folder), progresses.for_script(progress) as shown:
             limit = self.scene.tailoring.max_time if self.report is None else None  # else its time was long ago
-            self._made = self._made.told()
+            self._made = self._made.with_report_data()
             self.report = commands.write(
                 self._made, folder, progress=shown, effort=effort, limit=limit, own_checks=checks,
                 own_sections=sections,
@@ -264,7 +264,7 @@ class Design:
         programs not written here that trace it too, "batoid" and "mitsuba", or a judge of one's own
         (bstcad.judges.comparison.OwnJudge).  All want a design that was written.  checks, sections: as in `write`.
         """
-        with progresses.shown(progress) as shown:
+        with progresses.for_script(progress) as shown:
             if self._has_files() or measured or folder or against:
                 self.report = commands.verify(
                     self._own_folder(), against=[against] if isinstance(against, str) else against,
@@ -272,7 +272,7 @@ class Design:
                     progress=shown, effort=effort, own_checks=checks, own_sections=sections,
                 )  # fmt: skip
             else:
-                self._made = self._made.told()
+                self._made = self._made.with_report_data()
                 self.report = commands.prove(self._made, progress=shown, effort=effort, own_checks=checks)
         return self.report
 
@@ -287,7 +287,7 @@ class Design:
         script may ask for below `if __name__ == "__main__":`; scheduler: of a dask cluster, whose workers do it.
         """
         folder = self._own_folder()
-        with progresses.shown(progress) as shown:
+        with progresses.for_script(progress) as shown:
             return commands.tolerance(
                 folder, grade=grade, wanted=wanted, seed=seed, workers=workers, scheduler=scheduler, progress=shown
             ).facts()
@@ -427,7 +427,7 @@ def mounted(
     from bstcad.cad import mounting
     from bstcad.cad.walls import Draft
 
-    with commands.refusals():
+    with commands.scene_errors():
         walls = Draft(draft, bevel)
         lenses = [
             mounting.Placed(getattr(one, "lens", one), trim, holes, at=_place(at), draft=walls) for one, at in placed

@@ -1,7 +1,7 @@
-"""The commands for a lens, each one function: generate, verify, tolerance, export, show.
+"""The commands for a lens, one function each: generate, verify, tolerance, export, show.
 
 `generate` designs, writes and proves a lens; `verify` proves it again from its files.  The command line and `Design`
-call these functions and add no work of their own.
+only call these functions.
 """
 
 from __future__ import annotations
@@ -61,10 +61,11 @@ from bstcad.verify import checks
 from bstcad.verify.checks import Proof
 from bstcad.verify.verdict import Check, verdict
 
-BEHIND, LEAST = 2.0, 0.5  # seconds of a run with a time limit: behind the last rays; at least for rays
+# Seconds of a run with a time limit that are reserved for the report, and the least time for the proof's rays.
+REPORT_TIME, MIN_RAY_TIME = 2.0, 0.5
 
-Drawing = Callable[..., Pictures]  # from (scene, submit): NoPictures for a folder without figures
-# Additions of a script to a report: checks of a proof and the folder of its files; (heading, HTML without scripts).
+Drawing = Callable[..., Pictures]  # called with (scene, submit); NoPictures draws no figures
+# Additions of a script to a report: checks, from a proof and the folder of its files; (heading, HTML without scripts).
 OwnCheck = Callable[[Proof, Path], Iterable[Check]]
 OwnSection = Callable[[Contents], tuple[str, str]]
 
@@ -78,32 +79,32 @@ def generate(
 ) -> Report:  # fmt: skip
     """Design a lens, write it to `folder` and prove it from the written files.
 
-    began (time.perf_counter(), default now) is when the time of the report and of tailoring.max_time starts.
-    While it designs it leaves a checkpoint beside the folder now and then, and goes on from there if asked to `resume`.
-    After a Ctrl-C meanwhile the best lens so far is written, never over an earlier design: see `place_for`.
-    effort: of the proof; None: all that it may need.  drawing: of its figures; None: Pictures.  look: called now and
-    then with the function that makes the best lens so far.
+    began: start of the times in the report and of tailoring.max_time (time.perf_counter(); default: now).
+    During the design a checkpoint is written beside the folder at intervals; with `resume` the design continues from
+    it.  After a Ctrl-C the best lens so far is written, never over an earlier finished design: see `output_folder`.
+    effort: effort of the proof; None: no limit.  drawing: figures of the report; None: Pictures.  look: called at
+    intervals with the function that makes the best lens so far.
     """
-    scene = settled(scene, lambda line: progress("control points", 1, 1, line))
+    scene = with_default_net(scene, lambda line: progress("control points", 1, 1, line))
     path, say = files.beside(folder, "checkpoint"), lambda text: progress("checkpoint", 0, 0, text)
     keeper = Keeper(path, purpose(scene, device), say, kind=Saved)
     processes.begin()
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with files.held(folder):
+    with files.exclusive(folder):
         folders.tidy(folder)
-        state = keeper.found() if resume else None
+        state = keeper.load() if resume else None
         if resume and state is None:
-            keeper.say("there is none to go on from; the design begins anew")
+            keeper.say("there is no checkpoint; the design starts from the beginning")
         if not resume and keeper.path.exists():
-            keeper.say("the design that was stopped here begins anew; --resume would go on with it")
-        with _nothing_lost(keeper, refused=(SceneError,)), signals.first_interrupt_is_a_wish() as wished:
+            keeper.say("a stopped design is here; it starts from the beginning, since --resume is not given")
+        with _checkpoint_on_error(keeper, refused=(SceneError,)), signals.stop_on_interrupt() as wished:
             found = design(
                 scene, device=device, progress=progress, began=began, save=keeper, start=state, interrupted=wished,
                 look=look,
             )  # fmt: skip
-        with _nothing_lost(keeper):
+        with _checkpoint_on_error(keeper):
             report = write(
-                found, place_for(folder, found.making.stopped), progress=progress, effort=effort,
+                found, output_folder(folder, found.making.stopped), progress=progress, effort=effort,
                 limit=scene.tailoring.max_time, drawing=drawing,
             )  # fmt: skip
         if found.making.stopped == "interrupt":
@@ -113,16 +114,16 @@ def generate(
     return report
 
 
-def settled(scene: Scene, say: Callable[[str], None] = lambda line: None) -> Scene:
-    """Return the scene with a net, which is chosen where it states none; `say` is told which, and what others give."""
+def with_default_net(scene: Scene, say: Callable[[str], None] = lambda line: None) -> Scene:
+    """Return the scene with its net, or with a chosen one if it states none; `say` gets a line on that choice."""
     scene, choice = with_net(scene)
     if choice is not None:
         say(choice.line)
     return scene
 
 
-def place_for(folder: Path, stopped: str) -> Path:
-    """The folder of a design: an unfinished design goes beside a finished one, never in its place."""
+def output_folder(folder: Path, stopped: str) -> Path:
+    """Return the folder to which a design is written: an unfinished design never replaces a finished one."""
     if stopped != "interrupt" or not (folder / "report.json").exists():
         return folder
     if record.making(folder / "report.json").stopped == "interrupt":
@@ -135,22 +136,19 @@ def write(
     made: Made, folder: Path, *, progress: Progress = silent, effort: Effort | None = None, limit: float | None = None,
     drawing: Drawing | None = None, own_checks: Sequence[OwnCheck] = (), own_sections: Sequence[OwnSection] = (),
 ) -> Report:  # fmt: skip
-    """Write a design to `folder`, in the place of an earlier one, and prove it from the written files.
+    """Write a design to `folder`, replacing an earlier one, and prove it from the written files.
 
-    limit: seconds that design and proof may take together; None: the proof takes its time.  Of a design that cannot be
-    written or proved, whatever the reason, design.npz and the scene are kept in a folder beside, which the error's note
-    names.
+    limit: seconds that design and proof may take together; None: no limit.  If the design cannot be written or proved,
+    design.npz and the scene are kept in a folder beside it, which the error's note names.
     """
     processes.begin()
     with (
-        folders.kept_until_written(made, folder),
+        folders.kept_if_unwritten(made, folder),
         folders.replacing(folder) as building,
-        _nothing_left_running(),
+        _second_process_ended(),
         (drawing or Pictures)(made.scene, processes.submit) as drawn,
     ):
-        made, proof = _written_and_proved(
-            made, building, drawn, own_checks, progress=progress, effort=effort, limit=limit
-        )
+        made, proof = _write_and_prove(made, building, drawn, own_checks, progress=progress, effort=effort, limit=limit)
         proven = time.perf_counter()
         irradiances = tuple(light.picture for light in proof.lights)
         folders.write_design(made, irradiances, building)
@@ -172,37 +170,37 @@ def write(
 def prove(
     made: Made, *, progress: Progress = silent, effort: Effort | None = None, own_checks: Sequence[OwnCheck] = ()
 ) -> Report:
-    """Prove a design by temporary files."""
+    """Prove a design from temporary files."""
     processes.begin()
-    with tempfile.TemporaryDirectory(prefix="bstcad-") as place, _nothing_left_running():
+    with tempfile.TemporaryDirectory(prefix="bstcad-") as place, _second_process_ended():
         drawn = NoPictures(made.scene, processes.submit)
-        made, proof = _written_and_proved(made, Path(place), drawn, own_checks, progress=progress, effort=effort)
+        made, proof = _write_and_prove(made, Path(place), drawn, own_checks, progress=progress, effort=effort)
     contents = _contents(made, proof, _left_out(made, proof))
     return Report(contents, tuple(light.picture for light in proof.lights))
 
 
-def _written_and_proved(
+def _write_and_prove(
     made: Made, place: Path, drawn: Pictures, own_checks: Sequence[OwnCheck], *, progress: Progress,
     effort: Effort | None, limit: float | None = None,
 ) -> tuple[Made, Proof]:  # fmt: skip
-    """Write the geometry and prove it; the design with these two stages, and its proof.  limit: see `write`."""
-    made = replace(made.told(), stored=None)  # design.npz is written anew
-    processes.return_freed()  # the second process needs it for the solid
+    """Write the geometry and prove it; return the design with these two stages, and its proof.  limit: see `write`."""
+    made = replace(made.with_report_data(), stored=None)  # design.npz is written again
+    processes.return_freed()  # the second process needs the memory for the solid
     began = time.perf_counter()
     progress("write", 0, 1, "STEP, STL, 3MF")
-    drawn.solid(made.lens)  # as designed, so that it can be drawn while OCC writes and reads the file
-    with refusals(f"{made.scene.name}: "):  # the tailored faces bound no solid: nothing that a shop could open
+    drawn.solid(made.lens)  # as designed, to be drawn while OCC writes and reads the file
+    with scene_errors(f"{made.scene.name}: "):  # raised if the tailored faces do not bound a solid
         write_3mf = folders.write_geometry(made, place, processes.submit)
     processes.return_freed()
     with ThreadPoolExecutor(1) as beside:
-        meanwhile = [beside.submit(work) for work in (write_3mf, prepare)]
+        parallel = [beside.submit(work) for work in (write_3mf, prepare)]
         progress("write", 1, 1, "")
         written = time.perf_counter()
         if limit is not None:
-            effort, left = effort or FULL, limit - BEHIND - made.making.seconds_total - (written - began)
-            effort = replace(effort, seconds=min(effort.seconds, max(left, LEAST)))
-        proof = _proof(made, place, drawn, own_checks=own_checks, effort=effort, progress=progress)
-        for work in meanwhile:
+            effort, left = effort or FULL, limit - REPORT_TIME - made.making.seconds_total - (written - began)
+            effort = replace(effort, seconds=min(effort.seconds, max(left, MIN_RAY_TIME)))
+        proof = _prove_files(made, place, drawn, own_checks=own_checks, effort=effort, progress=progress)
+        for work in parallel:
             work.result()
     verified = time.perf_counter()
     last = (
@@ -212,11 +210,11 @@ def _written_and_proved(
     return replace(made, making=made.making.with_stages(*last)), proof
 
 
-def _proof(
+def _prove_files(
     made: Made, folder: Path, drawn: Pictures, *, own_checks: Sequence[OwnCheck], effort: Effort | None,
     progress: Progress,
 ) -> Proof:  # fmt: skip
-    """The proof of the files in a folder, with the pictures of its light begun."""
+    """Prove the files in a folder and start drawing the pictures of the light."""
     progress("verify", 0, 1, "from the written files")
 
     def draw(light: Light, lines: tuple[SpectralLine, ...], number: int) -> None:
@@ -232,10 +230,10 @@ def _proof(
 
 
 @contextlib.contextmanager
-def _nothing_lost(keeper: Keeper, refused: tuple[type[Exception], ...] = ()) -> Iterator[None]:
-    """Whatever ends a design, its state is on disk, and the error's note says how to go on.
+def _checkpoint_on_error(keeper: Keeper, refused: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+    """Write a checkpoint if an error or a signal ends the block; the error's note says how to resume.
 
-    refused: errors of a scene that would be refused again, whose state is of no use.
+    refused: errors of an invalid scene, after which the checkpoint is deleted.
     """
     try:
         yield
@@ -243,14 +241,14 @@ def _nothing_lost(keeper: Keeper, refused: tuple[type[Exception], ...] = ()) -> 
         keeper.withdraw()
         raise
     except BaseException as error:
-        if note := keeper.kept():
+        if note := keeper.keep_at_exit():
             error.add_note(note)
         raise
 
 
 @contextlib.contextmanager
-def _nothing_left_running() -> Iterator[None]:
-    """After an error the second process may still be writing into a folder that is about to go."""
+def _second_process_ended() -> Iterator[None]:
+    """End the second process after an error, since it may still write to a folder that is about to be removed."""
     try:
         yield
     except BaseException:
@@ -259,8 +257,8 @@ def _nothing_left_running() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def refusals(where: str = "") -> Iterator[None]:
-    """A ValueError in the block refuses the input: SceneError, its sentence behind `where`."""
+def scene_errors(where: str = "") -> Iterator[None]:
+    """Raise a ValueError of the block as a SceneError, with `where` before its sentence."""
     try:
         yield
     except ValueError as error:
@@ -275,28 +273,28 @@ def verify(
     effort: Effort | None = None, place: Path | None = None, drawing: Drawing | None = None,
     own_checks: Sequence[OwnCheck] = (), own_sections: Sequence[OwnSection] = (),
 ) -> Report | Examined:  # fmt: skip
-    """Prove a design again from the files of its folder, and write its report anew; or look at one STEP file alone.
+    """Prove a design again from the files of its folder and rewrite its report; or examine a single STEP file.
 
-    against: programs not written here that are to trace it too, by their names (judges.comparison.JUDGES), or objects
-    that have the three functions of a judge.
-    measured: a cloud of points of a made part, which is then judged too.  Its report goes to `place`, and the design's
-    folder stays as it is; or into that folder, and also to its measured/CLOUD, which no later verification touches but
-    one of the same cloud.
+    against: other programs that also trace the lens, by their names (judges.comparison.JUDGES) or as objects with the
+    three functions of a judge.
+    measured: cloud of measured points of a made part, which is judged, too.  Its report is written to `place`, and the
+    design's folder does not change; without `place`, to the design's folder and its subfolder measured/CLOUD, which
+    only a verification of the same cloud rewrites.
     """
     against = comparison.chosen(against)
     if path.is_file() and (against or measured):
-        raise SceneError(f"{path}: a STEP file alone says no light to judge it by; give the design's folder")
+        raise SceneError(f"{path}: a STEP file states no light by which to judge it; give the design's folder")
     if path.is_file():
         return examine(path)
     if place is not None and measured is None:
         raise SceneError(f"{place}: is for the report of a made part; give its points with --measured CLOUD")
     with folders.amending(path, place) as amended:
         made = read(path)
-        with refusals():  # before anything that takes time
+        with scene_errors():  # before the slow steps
             cloud, part = measured and clouds.load(measured, made.lens.apertures[1]), None
         with (drawing or Pictures)(made.scene, processes.submit) as drawn:
-            with refusals(f"{path}: "):
-                proof = _proof(made, path, drawn, own_checks=own_checks, effort=effort, progress=progress)
+            with scene_errors(f"{path}: "):
+                proof = _prove_files(made, path, drawn, own_checks=own_checks, effort=effort, progress=progress)
             drawn.solid(proof.lens)
             judged: list[Compared] = []
             for number, goal in enumerate(made.goals):
@@ -333,9 +331,9 @@ def verify(
 
 
 def examine(path: Path) -> Examined:
-    """Look at one STEP file by itself: its checks and its part, without a design."""
+    """Examine a single STEP file: its checks and its part, without a design."""
     beginning.check(path)
-    with refusals(f"{path}: "):
+    with scene_errors(f"{path}: "):
         found = checks.examine(path, processes.submit)
     passed = all(check.passed for check in found.checks)
     stated = [check.value for check in found.checks if check.id == "stated-density"]
@@ -350,39 +348,39 @@ def examine(path: Path) -> Examined:
 
 
 def read(folder: Path) -> Made:
-    """The design in a folder, with its making from report.json."""
+    """Read the design in a folder, with its history from report.json."""
     scene, nominal = folders.read_nominal(folder)
     making, sent = record.making(folder / "report.json"), folders.read_transport(folder, scene)
     return Made(scene, nominal.lens, nominal.goals, making, transport=sent, stored=nominal.stored)
 
 
 def _made_part(cloud: Cloud, proof: Proof, made: Made, *, effort: Effort | None, progress: Progress) -> MadePart:
-    """The made part that was measured as `cloud`."""
+    """Judge the made part that was measured as `cloud`."""
     progress("made part", 0, 1, "from its cloud")
-    with refusals():
+    with scene_errors():
         found = made_part.judge(cloud, proof.lens, made, effort)
     progress("made part", 1, 1, "")
     return found
 
 
 def _name_of(cloud: Cloud, folder: Path) -> str:
-    """The folder in measured/ of a design for a cloud: by its file's name, but never that of another cloud."""
+    """Return the folder in measured/ of a design for a cloud: the name of its file, with a number if it is taken."""
     stem = re.sub(r"[^\w.-]", "_", cloud.path.stem).strip(".") or "cloud"
     for k in itertools.count(1):
         name = stem if k == 1 else f"{stem}-{k}"
-        if not (place := folder / "measured" / name).exists():
+        if not (path := folder / "measured" / name).exists():
             return name
-        with contextlib.suppress(ValueError):  # of a report that is gone or damaged
-            if (record.read(place / "report.json").measured or {}).get("sha256") == cloud.sha256:
+        with contextlib.suppress(ValueError):  # raised if the report is missing or damaged
+            if (record.read(path / "report.json").measured or {}).get("sha256") == cloud.sha256:
                 return name
-    raise AssertionError("there is a number for every cloud")
+    raise AssertionError("itertools.count ended")
 
 
 # --- the report -------------------------------------------------------------------------------------------------------
 
 
 def _contents(made: Made, proof: Proof, estimates: tuple[LeftOut, ...]) -> Contents:
-    """The contents of report.json; estimates: of the effects that are left out."""
+    """Return the contents of report.json.  estimates: estimates of the effects that are left out."""
     scene = made.scene
     alone, goal, light = scene.each_alone()[proof.worst], made.goals[proof.worst], proof.light
     diagnosed = diagnosis(
@@ -396,17 +394,17 @@ def _contents(made: Made, proof: Proof, estimates: tuple[LeftOut, ...]) -> Conte
 
 
 def _left_out(made: Made, proof: Proof) -> tuple[LeftOut, ...]:
-    """The effects that are left out, by the light on the target with the largest RRMSD."""
+    """Return the effects that are left out, by the light on the target with the largest RRMSD."""
     return left_out(made.scene.each_alone()[proof.worst], proof.lens, proof.light.picture)
 
 
 def _order(made: Made, shape: Mapping[str, Any], folder: Path) -> Order:
-    """The order for a shop of the design in a folder; shape: as report.json has it."""
+    """Return the order for a shop of the design in a folder.  shape: shape of the lens as in report.json."""
     mount, path = made.scene.mount, (folder / folders.PART).absolute()
     try:
-        asked = mount and path.is_file() and processes.submit(prescription.measured, path)
-        found = processes.result(asked, checks.time_limit(path)) if asked else None
-    except (BrokenExecutor, ValueError, processes.Overdue):  # a damaged part, which a check tells: the lens is sent
+        job = mount and path.is_file() and processes.submit(prescription.measured, path)
+        found = processes.result(job, checks.time_limit(path)) if job else None
+    except (BrokenExecutor, ValueError, processes.Overdue):  # a damaged part, which a check reports: order the lens
         found = None
     return prescription.order_of(made.scene, made.lens, shape, folder, found=found)
 
@@ -414,7 +412,7 @@ def _order(made: Made, shape: Mapping[str, Any], folder: Path) -> Order:
 def _sheet(
     made: Made, proof: Proof | Contents, figures: Sequence[GoalFigures], irradiance: np.ndarray, *, order: Order
 ) -> DataSheet:
-    """The data sheet of a design, by its proof or by its report; it shows the light on the target that comes first."""
+    """Return the data sheet of a design from its proof or its report; it shows the light on the first target."""
     return DataSheet(
         scene=made.scene, designed=made.lens, shape=proof.shape, order=order, target=made.goals[0].picture,
         irradiance=irradiance, figures=figures, passed=proof.passed, version=bstcad.__version__,
@@ -425,9 +423,9 @@ def _write_report(
     made: Made, lens: Lens, contents: Contents, folder: Path, *, drawn: Pictures, sheet: bytes | None,
     studied: str = "", sections: Sequence[OwnSection] = (),
 ) -> None:  # fmt: skip
-    """The report as JSON, HTML and JUnit's XML, prescription.txt, figures/ and datasheet.pdf.
+    """Write the report as JSON, HTML and JUnit XML, with prescription.txt, figures/ and datasheet.pdf.
 
-    lens: as it was read back.  studied: the page's section on tolerances.  sheet: the PDF.
+    lens: the lens as read back.  studied: HTML of the page's section on tolerances.  sheet: the PDF.
     """
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     pictures = drawn.result()
@@ -447,32 +445,33 @@ def _write_report(
     record.write_json(contents, folder / "report.json")
 
 
-# --- of a finished design ---------------------------------------------------------------------------------------------
+# --- a finished design ------------------------------------------------------------------------------------------------
 
 
 def tolerance(
     folder: Path, *, grade: str | None = None, wanted: float | None = None, seed: int = 0, workers: int | None = None,
     scheduler: str | None = None, progress: Progress = silent,
 ) -> Tolerances:  # fmt: skip
-    """How exactly a lens must be made, mounted and lit: the record of tolerance.json, which is written.
+    """Study how accurately a lens must be made, mounted and lit; write tolerance.json and return its record.
 
-    grade: for all that the scene states no tolerance of.  wanted: the yield (0 to 1) that the loosest tolerances are to
-    keep.  workers: processes to spread the traces over; scheduler: of a dask cluster, whose workers do it.
+    grade: grade of all tolerances that the scene does not state.  wanted: yield (0 to 1) for which the loosest
+    tolerances are found.  workers: number of processes for the traces.  scheduler: address of a dask scheduler, whose
+    workers do them instead.
     """
-    from bstcad.tolerance import tolerancing  # which the other commands need not load
+    from bstcad.tolerance import tolerancing  # loaded late, since the other commands do not need it
 
     if wanted is not None and not 0 < wanted < 1:
-        raise SceneError(f"wanted: {wanted:g} is not between 0 and 1; give the part of lenses that are to pass")
-    with cluster.asked_for(scheduler, workers) as found:
+        raise SceneError(f"wanted: {wanted:g} is not between 0 and 1; give the fraction of lenses that must pass")
+    with cluster.connect(scheduler, workers) as found:
         spread = None if found is None else found.spread
         return tolerancing.tolerance(folder, grade=grade, seed=seed, wanted=wanted, progress=progress, spread=spread)
 
 
 def export(folder: Path, kinds: Sequence[str], points: int | None = None) -> Exported:
-    """Write files for the shop into a design's folder, see bstcad.report.exports."""
+    """Write files for a shop to a design's folder, see bstcad.report.exports."""
     with folders.amending(folder) as amended:
         made = read(folder)
-        with refusals("export: "):
+        with scene_errors("export: "):
             written = _export(made, kinds, amended, points)
         if exports.SHEET in kinds:
             written.paths.append(amended / SHEET)
@@ -481,7 +480,7 @@ def export(folder: Path, kinds: Sequence[str], points: int | None = None) -> Exp
 
 
 def _export(made: Made, kinds: Sequence[str], folder: Path, points: int | None = None) -> Exported:
-    """Write the files of these kinds of a design into a folder."""
+    """Write the files of some kinds of a design to a folder."""
     scene, lens = made.scene, made.lens
     throw = Throw(scene.source.central, tuple(target.screen for target in scene.targets))
     return exports.export(
@@ -490,37 +489,37 @@ def _export(made: Made, kinds: Sequence[str], folder: Path, points: int | None =
 
 
 def _sheet_again(made: Made, folder: Path) -> DataSheet:
-    """The data sheet of a finished design, by its report."""
-    with refusals():
+    """Return the data sheet of a finished design from its report."""
+    with scene_errors():
         known = record.read(folder / "report.json")
     if known.shape is None or not (folder / "lens.step").is_file():
-        raise SceneError(f"{folder}: its report or lens.step is gone or damaged; bstcad verify, or generate, writes it")
+        raise SceneError(f"{folder}: its report or lens.step is missing or damaged; run bstcad verify, or generate")
     irradiances, order = folders.read_irradiances(folder, made.scene), _order(made, known.shape, folder)
     return _sheet(made, known, known.goals, irradiances[0], order=order)
 
 
 def show(folder: Path, png: Path | None) -> None:
-    """Write the picture of a design at work to `png`, or open a window with it and wait until it is closed."""
-    on_linux = sys.platform.startswith("linux")  # which says by its environment whether there is a display
+    """Draw a lens with its rays and its picture: write it to `png`, or open a window and wait until it is closed."""
+    on_linux = sys.platform.startswith("linux")  # on Linux the environment tells if there is a display
     if png is None and on_linux and not any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))):
-        raise MachineError("this machine has no display to open a window on; give --png FILE for a picture")
+        raise MachineError("this machine has no display for a window; give --png FILE to write a picture")
     path = light_path_in(folder)
     if png is None:
         if not rendering.draw(path, None):
-            raise MachineError("no window could be opened here; give --png FILE for a picture")
+            raise MachineError("no window could be opened; give --png FILE to write a picture")
         return
-    with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
-        drawn = Path(place, "light.png")
+    with tempfile.TemporaryDirectory(prefix="bstcad-") as temporary:
+        drawn = Path(temporary, "light.png")
         if not rendering.draw(path, drawn):
-            raise MachineError("this machine cannot draw in three dimensions: it has no display, EGL or OSMesa")
+            raise MachineError("this machine cannot draw in three dimensions; install a display, EGL or OSMesa")
         files.put(png, drawn.read_bytes())
 
 
 def light_path_in(folder: Path) -> LightPath:
-    """The lens of a folder, rays through it and their pictures; SceneError if no light arrives."""
+    """Return the lens of a folder, rays through it and their pictures.  SceneError if no light arrives."""
     scene, nominal = folders.read_nominal(folder)
     wanted, found = (goal.picture for goal in nominal.goals), folders.read_irradiances(folder, scene)
     found = light_path_of(scene, nominal.lens, [*zip(wanted, found, strict=True)])
     if found is None:
-        raise SceneError(f"{folder}: no light of this design arrives at the target; there is nothing to show")
+        raise SceneError(f"{folder}: no light reaches the target; there is nothing to show")
     return found

@@ -1,7 +1,7 @@
-"""The folder of a design: written beside its place, moved there whole, and read back to the last bit.
+"""The folder of a design: written completely or not at all, and read back to the last bit.
 
-The old folder stays unharmed until the new one is complete: the new one is built under a temporary name beside it and
-flushed to disk; then the two change places in one step.
+A new folder is built under a temporary name beside the old one and flushed to disk; then the two are exchanged in one
+step.  The old folder stays intact until then.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from bstcad.report.prescription import scene_text
 from bstcad.report.record import DesignCourse
 from bstcad.runs import files
 from bstcad.runs.files import MachineError, SceneError
-from bstcad.runs.processes import Submit, here, runs
+from bstcad.runs.processes import Submit, is_alive, run_here
 from bstcad.scene import scene as scenes
 from bstcad.scene.blank import NET_FILE as FRONT
 from bstcad.scene.target import numbered
@@ -43,27 +43,28 @@ from bstcad.transport.mapping import TransportMap, nodes
 from bstcad.verify.checks import Nominal
 
 SCENE, DESIGN, PART = "scene.toml", "design.npz", "part.step"
-FRONT_KNOTS = ("front_knots_x", "front_knots_y")  # in design.npz, of a front that is tailored
+FRONT_KNOTS = ("front_knots_x", "front_knots_y")  # names in design.npz for a tailored front
 PROVEN = (SCENE, DESIGN, "lens.step", "lens.stl", PART, FRONT)  # the files that a verification reads
-AGAIN = "generate the design again"
+REMEDY = "generate the design again"
 
 
 @dataclass(frozen=True)
 class Made(Nominal):
-    """A designed lens, as a folder holds it: on the CPU, its goals of the pixels that light can reach."""
+    """Designed lens as a folder stores it: on the CPU, with goals restricted to the pixels that light can reach."""
 
     making: DesignCourse = DesignCourse()  # stages, history and machine, for the report
-    device: str = "cpu"  # of the design
-    transport: TransportMap | None = None  # the map of stage 1; None for a lens of the user's own, or if not known
-    # what `making` is with float32 beside float64, which only a report tells; None: it has it, or nothing is to be told
-    compared: Callable[[], DesignCourse] | None = None
+    device: str = "cpu"  # device of the design: "cpu" or "cuda"
+    transport: TransportMap | None = None  # map of stage 1; None for a lens of the user's own, or if unknown
+    # Returns `making` with the comparison of float32 and float64 that the report prints; None if there is none to make.
+    precision_comparison: Callable[[], DesignCourse] | None = None
 
-    def told(self) -> Made:
-        """The same with all that a report tells."""
-        return self if self.compared is None else replace(self, making=self.compared(), compared=None)
+    def with_report_data(self) -> Made:
+        """Return this design with the comparison of precisions that the report prints."""
+        compare = self.precision_comparison
+        return self if compare is None else replace(self, making=compare(), precision_comparison=None)
 
     def is_lens_of(self, other: Nominal) -> bool:
-        """Is it the same lens, to the last bit, for the same light and picture?"""
+        """Return True if the lens is the same, to the last bit, for the same light and pictures."""
         return (
             same_front(self.lens.front, other.lens.front)
             and np.array_equal(self.lens.back.control_points(), other.lens.back.control_points())
@@ -73,49 +74,49 @@ class Made(Nominal):
 
 
 def same_front(one: Surface, other: Surface) -> bool:
-    """The same surface, to the last bit?"""
-    if one.is_net and other.is_net:  # whatever the plane that their heights are measured from
+    """Return True if two fronts are equal to the last bit."""
+    if one.is_net and other.is_net:  # independent of the plane from which their heights are measured
         return np.array_equal(one.control_points(), other.control_points())
     both = [{"z": front.z, **front.parameters()} for front in (one.plain(), other.plain())]
     same = (one.kind, one.outline) == (other.kind, other.outline) and both[0].keys() == both[1].keys()
     return same and all(np.array_equal(both[0][key], both[1][key]) for key in both[0])
 
 
-# --- sizes said before ------------------------------------------------------------------------------------------------
+# --- estimates of file sizes ------------------------------------------------------------------------------------------
 
-LARGE = 100e6  # bytes of lens.step from which on they are said before a design
-POINT = 83  # bytes of the statement of a control point and of one reference to it, without its two numbers
-REST = 103_000, 1600  # bytes of the other statements, and of those along the rim for each control point of a side
+LARGE_STEP = 100e6  # size of lens.step from which on it is printed before a design (bytes)
+BYTES_PER_POINT = 83  # bytes of a control point's statement and of one reference to it, without their two numbers
+REST = 103_000, 1600  # bytes of all other statements: constant part, and part per control point of a side
 
 
 def step_size(scene: scenes.Scene, net: Sides | None = None) -> float:
-    """Bytes of lens.step, to a few per cent: one statement and one reference a control point.
+    """Return the size of lens.step in bytes, to a few per cent: one statement and one reference per control point.
 
-    net: control points a side, or along x and along y; None: those of the scene.
+    net: control points per side, or along x and along y; None: those of the scene.
     """
     nets = map(as_pair, scene.lens.nets(net))
-    return sum(m * n * (POINT + 2 * len(str(m * n))) + REST[1] * (m + n) / 2 for m, n in nets) + REST[0]
+    return sum(m * n * (BYTES_PER_POINT + 2 * len(str(m * n))) + REST[1] * (m + n) / 2 for m, n in nets) + REST[0]
 
 
-def said_of_sizes(scene: scenes.Scene) -> str:
-    """How large lens.step will be, and with half as many control points a side."""
+def size_sentence(scene: scenes.Scene) -> str:
+    """Return a sentence on the size of lens.step, now and with half as many control points per side."""
     net = scene.lens.back.net
     fewer = scaled(net, 0.5)
-    here, half = (f"{step_size(scene, points) / 1e6:.3g} MB" for points in (net, fewer))
+    full, half = (f"{step_size(scene, points) / 1e6:.3g} MB" for points in (net, fewer))
     m, n = as_pair(net)
     return (
-        f"lens.step will take about {here} for {m} x {n} control points; lens.back.control_points = "
-        f"{list(fewer) if isinstance(fewer, tuple) else fewer} would take {half}"
+        f"lens.step will have about {full} for {m} x {n} control points; lens.back.control_points = "
+        f"{list(fewer) if isinstance(fewer, tuple) else fewer} would give {half}"
     )
 
 
-# --- in place of an earlier folder ------------------------------------------------------------------------------------
+# --- replacing an earlier folder --------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
 def replacing(folder: Path) -> Iterator[Path]:
-    """A temporary sibling of `folder` that takes its place when the block ends without an error."""
-    folder = folder.resolve()  # "." has no name, and a link is to lead to the new design
+    """Yield a temporary folder that replaces `folder` when the block ends without an error."""
+    folder = folder.resolve()  # "." has no name; a link must lead to the new design
     folder.parent.mkdir(parents=True, exist_ok=True)
     tidy(folder)
     building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-{os.getpid()}-", dir=folder.parent))
@@ -127,12 +128,12 @@ def replacing(folder: Path) -> Iterator[Path]:
             if path.is_file():
                 _flush(path)
         if not (folder.exists() and _exchange(building, folder)):
-            if folder.exists():  # a process that is killed between two renames leaves the old folder to `tidy`
+            if folder.exists():  # if the process is killed between two renames, `tidy` restores the old folder
                 folder.rename(old)
             os.replace(building, folder)
         _flush(folder.parent)
     except OSError as error:
-        if error.filename is None or str(building) in str(error.filename):  # the user knows no temporary name
+        if error.filename is None or str(building) in str(error.filename):  # users do not know the temporary name
             error.filename = str(folder)
         raise
     finally:
@@ -143,20 +144,20 @@ def replacing(folder: Path) -> Iterator[Path]:
 
 
 def _exchange(one: Path, other: Path) -> bool:
-    """Let two folders change places in one step; False where the system cannot (Linux can: renameat2)."""
-    here, swap = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+    """Exchange two folders in one step; return False if the system cannot (Linux can, by renameat2)."""
+    at, swap = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
     rename = getattr(ctypes.CDLL(None), "renameat2", None)
-    return rename is not None and rename(here, os.fsencode(one), here, os.fsencode(other), swap) == 0
+    return rename is not None and rename(at, os.fsencode(one), at, os.fsencode(other), swap) == 0
 
 
 def tidy(folder: Path) -> None:
-    """Remove the temporary folders of killed processes beside `folder`; put back a design that one had moved aside."""
+    """Remove the temporary folders of killed processes beside `folder`; restore a design that one had moved."""
     folder = folder.resolve()
     with contextlib.suppress(OSError):
         files.beside(folder, "checkpoint.new").unlink()
     for path in folder.parent.glob(f".{glob.escape(folder.name)}-*"):
         found = re.fullmatch(r"(\d+)-[^-]*(-old)?", path.name[len(folder.name) + 2 :])
-        if found is None or runs(int(found.group(1))):
+        if found is None or is_alive(int(found.group(1))):
             continue
         if found.group(2) and not folder.exists():
             path.rename(folder)
@@ -174,14 +175,13 @@ def _flush(path: Path) -> None:
 
 @contextlib.contextmanager
 def amending(folder: Path, place: Path | None = None) -> Iterator[Path]:
-    """A temporary folder whose files go into a design's folder when the block ends without an error.
+    """Yield a temporary folder whose files are moved to a design's folder when the block ends without an error.
 
-    place: a folder for a made part of the design, which the temporary folder replaces instead; SceneError if it holds
-    other files.  SceneError, and no file goes anywhere, if another design or other files came into the design's folder
-    meanwhile.
+    place: folder for the report of a made part, which the temporary folder replaces instead; SceneError if it contains
+    other files.  SceneError, and nothing is written, if the design in `folder` has changed meanwhile.
     """
     if place is not None:
-        files.check_free(place, files.PART, "a made part's")
+        files.check_free(place, files.MADE_PART_FILES, "a made part's")
     before = _stamps(folder)
     with tempfile.TemporaryDirectory(prefix="bstcad-") if place is None else replacing(place) as building:
         try:
@@ -190,8 +190,8 @@ def amending(folder: Path, place: Path | None = None) -> Iterator[Path]:
             if _stamps(folder) == before:
                 raise
         if _stamps(folder) != before:
-            came = "another design came there while this one was verified"
-            raise SceneError(f"{folder}: {came}; nothing is written, verify it again")
+            changed = "its design was replaced while it was being verified"
+            raise SceneError(f"{folder}: {changed}; nothing is written, verify it again")
         for path in sorted(Path(building).rglob("*")) if place is None else ():
             if path.is_dir():
                 files.folder_in_place(folder / path.relative_to(building))
@@ -200,12 +200,13 @@ def amending(folder: Path, place: Path | None = None) -> Iterator[Path]:
 
 
 def _stamps(folder: Path) -> list[tuple[object, ...]]:
-    """Device and inode of the folder; of each file of PROVEN its size and time, too."""
+    """Return device and inode of the folder and of each file of PROVEN, and the size and time of the files."""
     found: list[tuple[object, ...]] = []
     for path in (folder, *(folder / name for name in PROVEN)):
         with contextlib.suppress(OSError):
-            it = path.stat()
-            found.append((path, it.st_dev, it.st_ino, *((it.st_size, it.st_mtime_ns) if path != folder else ())))
+            stat = path.stat()
+            content = (stat.st_size, stat.st_mtime_ns) if path != folder else ()
+            found.append((path, stat.st_dev, stat.st_ino, *content))
     return found
 
 
@@ -213,27 +214,27 @@ def _stamps(folder: Path) -> list[tuple[object, ...]]:
 
 
 def scene_files(scene: scenes.Scene) -> dict[str, bytes]:
-    """scene.toml and the files that it names, by file name; a folder of them loads to the same scene."""
+    """Return scene.toml and the files that it names, by file name; a folder with them loads the same scene."""
     return {SCENE: scene.toml().encode()} | {name: content.copy for name, content in scene.files.items()}
 
 
 def hash_of(contents: Mapping[str, bytes]) -> str:
-    """SHA-256 of files by name."""
+    """Return the SHA-256 of the names and contents of files."""
     digest = hashlib.sha256()
     for name, data in sorted(contents.items()):
         digest.update(name.encode() + data)
     return digest.hexdigest()
 
 
-def write_geometry(design: Made, folder: Path, submit: Submit = here) -> Callable[[], None]:
+def write_geometry(design: Made, folder: Path, submit: Submit = run_here) -> Callable[[], None]:
     """Write lens.step, lens.stl, part.step of a mount, and the scene with the files that it names.
 
-    Returns the function that writes lens.3mf: no proof reads that file, so that a thread can write it meanwhile.
-    submit: bstcad.runs.processes.submit has the second process write STEP, while this one writes meshes.
+    Return the function that writes lens.3mf.  The proof does not read that file, so a thread can write it later.
+    submit: with bstcad.runs.processes.submit the second process writes STEP, while this one writes the meshes.
     """
     scene, lens = design.scene, design.lens
     stated = scene.name, scene.part.of(scene.lens)
-    sums = quadrature.of_lens(lens)  # here, where its kernels are loaded
+    sums = quadrature.of_lens(lens)  # in this process, whose kernels are loaded
     written = [submit("bstcad.cad.step_writing.write_lens", lens, (folder / "lens.step").absolute(), *stated, sums)]
     if mount := scene.mount:
         work = "bstcad.cad.mounting.write_if_it_fits"
@@ -246,33 +247,34 @@ def write_geometry(design: Made, folder: Path, submit: Submit = here) -> Callabl
         for step in written:
             step.result()
     except BrokenExecutor as error:
-        raise MachineError("OCC broke down over this solid, or its memory ran out; free some and try again") from error
+        raise MachineError("OCC crashed on this solid or ran out of memory; free some memory and try again") from error
     return partial(meshes.write_3mf, mesh, folder / "lens.3mf", label(scene))
 
 
 def label(scene: scenes.Scene) -> Label:
-    """Name and colour of a mesh of the scene's lens."""
+    """Return name, title, material and colour for a mesh of the scene's lens."""
     if not scene.lens.passes.enters:
         return Label(scene.name, scene.title, "mirror", SILVER)
     return Label(scene.name, scene.title, scene.lens.material or "glass")
 
 
 def _write_scene(design: Made, folder: Path) -> None:
-    """scene.toml with the designed numbers of the front, and the files that it names."""
+    """Write scene.toml, with the designed parameters of the front, and the files that it names."""
     contents = scene_files(design.scene) | {SCENE: scene_text(design.scene, design.lens).encode()}
     for name, data in contents.items():
         (folder / name).write_bytes(data)
 
 
 def write_design(design: Made, irradiances: Sequence[np.ndarray], folder: Path) -> None:
-    """design.npz: the optimised surfaces, the pictures, and the scene's text.
+    """Write design.npz: the optimised surfaces, the pictures, and the scene's text.
 
-    irradiances: on each target; (): they are not traced.  The arrays of the second target are target_2, irradiance_2
-    and reachable_2, and so on.
-    reachable (rows, columns): 1 in the pixels that light can reach; no such array where it reaches all that are to be
-    lit.  The transport map, if known (TransportMap): transport_x (c,) and transport_y (r,), mm on the target;
-    transport_back or transport_entrance (c, r, 2), x and y (mm) where the light for them meets the last tailored face
-    (the back; the front where it is tailored alone, and of a mirror behind glass), or the plane of the first vertex.
+    irradiances: one (rows, columns) per target; () if they are not traced.  The arrays of the second target are
+    target_2, irradiance_2, reachable_2, and so on.  reachable (rows, columns) is 1 in the pixels that light can reach;
+    it is absent if light reaches all pixels that are to be lit.
+    The transport map, if known (TransportMap): transport_x (c,) and transport_y (r,), mm on the target, and
+    transport_back or transport_entrance (c, r, 2), the points x, y (mm) at which the light for them meets the last
+    tailored face (the back; the front if it alone is tailored, or for a mirror behind glass), or the plane of the
+    first vertex.
     """
     (m, n), front, sent = design.lens.back.shape, design.lens.front, design.transport
     parts = ((k, goal.reachable) for k, goal in enumerate(design.goals))
@@ -294,51 +296,51 @@ def write_design(design: Made, irradiances: Sequence[np.ndarray], folder: Path) 
 
 
 @contextlib.contextmanager
-def kept_until_written(design: Made, folder: Path) -> Iterator[None]:
-    """A design that cannot be written to `folder` is kept beside it, or, if that fails, among temporary files.
+def kept_if_unwritten(design: Made, folder: Path) -> Iterator[None]:
+    """Keep a design that cannot be written to `folder`: in a folder beside it, or else among temporary files.
 
-    Its scene and design.npz are kept, without the irradiance, which is not traced; the error's note says where.
+    The scene and design.npz are kept, without the irradiance, which is not traced.  The error's note names the folder.
     """
     try:
         yield
     except Exception as error:
-        with contextlib.suppress(OSError, MemoryError):  # no room anywhere: the error itself matters more
-            place = _keep(design, folder)
-            error.add_note(f"the finished design is kept in {place}, which bstcad.open and bstcad export read")
+        with contextlib.suppress(OSError, MemoryError):  # no space anywhere: the original error matters more
+            kept = _keep(design, folder)
+            error.add_note(f"the finished design is kept in {kept}; bstcad.open and bstcad export can read it")
         raise
-    for place in itertools.takewhile(Path.exists, _kept(folder)):
-        if _holds(place, design):
-            shutil.rmtree(place, ignore_errors=True)
+    for path in itertools.takewhile(Path.exists, _spare_folders(folder)):
+        if _contains(path, design):
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def _keep(design: Made, folder: Path) -> Path:
-    """Keep a design beside its folder, or else among temporary files; its place.  OSError."""
+    """Write a design to a folder beside its own, or else among temporary files; return that folder.  OSError."""
 
-    def kept_in(place: Path) -> Path:
-        with replacing(place) as building:
+    def write_to(path: Path) -> Path:
+        with replacing(path) as building:
             _write_scene(design, building)
             write_design(design, (), building)
-        return place
+        return path
 
-    beside = next(place for place in _kept(folder) if not place.exists() or _holds(place, design))
+    beside = next(path for path in _spare_folders(folder) if not path.exists() or _contains(path, design))
     try:
-        return kept_in(beside)
+        return write_to(beside)
     except OSError:
-        return kept_in(Path(tempfile.mkdtemp(prefix="bstcad-"), beside.name))
+        return write_to(Path(tempfile.mkdtemp(prefix="bstcad-"), beside.name))
 
 
-def _kept(folder: Path) -> Iterator[Path]:
-    """The folders beside `folder` for designs that could not be written to it, in their order."""
+def _spare_folders(folder: Path) -> Iterator[Path]:
+    """Iterate over the folders beside `folder` for designs that could not be written to it."""
     folder = folder.resolve()
     for k in itertools.count(1):
         yield folder.with_name(f"{folder.name}-unwritten{'' if k == 1 else f'-{k}'}")
 
 
-def _holds(kept: Path, design: Made) -> bool:
-    """Does a folder hold this design?"""
+def _contains(folder: Path, design: Made) -> bool:
+    """Return True if a folder contains this design."""
     try:
-        _, nominal = read_nominal(kept)
-    except Exception:  # zipfile and numpy each raise their own for a damaged file
+        _, nominal = read_nominal(folder)
+    except Exception:  # zipfile and numpy raise various errors for a damaged file
         return False
     return design.is_lens_of(nominal)
 
@@ -347,15 +349,18 @@ def _holds(kept: Path, design: Made) -> bool:
 
 
 def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
-    """Scene and nominal design of a folder; SceneError if design.npz or scene.toml is missing or damaged."""
+    """Return the scene and the nominal design of a folder.
+
+    SceneError if design.npz or scene.toml is missing or damaged.
+    """
     scene = scenes.load(folder / SCENE)
     shapes = {"control_points": (*as_pair(scene.lens.back.net), 3), "front_curvature": ()}
     if scene.lens.front.shaped:
         shapes["front_control_points"] = (*as_pair(scene.lens.nets()[1]), 3)
-    held = files.names(folder / DESIGN)
+    names = files.names(folder / DESIGN)
     for k, target in enumerate(scene.targets):
         shapes[numbered("target", k)] = target.columns_rows[::-1]
-        if (name := numbered("reachable", k)) in held:
+        if (name := numbered("reachable", k)) in names:
             shapes[name] = target.columns_rows[::-1]
     found = _arrays(folder, shapes | dict.fromkeys(_numbers(scene.lens.front_surface), ()), scene)
     goals, stored = [], []
@@ -364,22 +369,22 @@ def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
         goals.append(goal.restricted(None if part is None else part > 0))
         stored.append(found[numbered("target", k)])
         if not stored[k].sum() > 0 or not goals[k].picture.sum() > 0:
-            raise SceneError(f"{folder / DESIGN}: the {goal.key} is all black; {AGAIN}")
+            raise SceneError(f"{folder / DESIGN}: the {goal.key} is all black; {REMEDY}")
     return scene, Nominal(scene, _lens(scene, found), tuple(goals), stored=tuple(stored))
 
 
 def read_irradiances(folder: Path, scene: scenes.Scene) -> tuple[np.ndarray, ...]:
-    """The irradiance through the written lens on each target; SceneError if design.npz is damaged."""
+    """Return the irradiance through the written lens on each target.  SceneError if design.npz is damaged."""
     shapes = {numbered("irradiance", k): target.columns_rows[::-1] for k, target in enumerate(scene.targets)}
     arrays = _arrays(folder, shapes, scene)
     found = tuple(arrays[name] for name in shapes)
     if not all(each.min() >= 0 and each.sum() > 0 for each in found):
-        raise SceneError(f"{folder / DESIGN}: its irradiance is none; {AGAIN}")
+        raise SceneError(f"{folder / DESIGN}: its irradiance is zero or negative; {REMEDY}")
     return found
 
 
 def read_transport(folder: Path, scene: scenes.Scene) -> TransportMap | None:
-    """The transport map of a design, None if design.npz has none; SceneError if it is damaged."""
+    """Return the transport map of a design; None if design.npz has none.  SceneError if it is damaged."""
     columns, rows = (nodes(n).size for n in scene.target.columns_rows)
     names = files.names(folder / DESIGN)
     for plane in ("back", "entrance"):
@@ -391,26 +396,26 @@ def read_transport(folder: Path, scene: scenes.Scene) -> TransportMap | None:
 
 
 def _arrays(folder: Path, shapes: Mapping[str, tuple[int, ...]], scene: scenes.Scene) -> dict[str, np.ndarray]:
-    """Arrays of finite numbers out of the design.npz of a scene."""
+    """Return arrays of finite numbers from the design.npz of a scene."""
     path, pixels = folder / DESIGN, sum(math.prod(target.columns_rows) for target in scene.targets)
     points = sum(math.prod(as_pair(net)) for net in scene.lens.nets())
     try:
-        found = files.arrays(path, shapes, 25 * points + 17 * pixels + 3_000_000)  # with the arrays that are not read
-    except Exception as error:  # numpy, zipfile, zlib and tokenize each raise their own for a damaged file
-        raise SceneError(f"{path}: cannot be read ({files.first_line(error)}); {AGAIN}") from None
+        found = files.arrays(path, shapes, 25 * points + 17 * pixels + 3_000_000)  # with arrays not read here
+    except Exception as error:  # numpy, zipfile, zlib and tokenize raise various errors for a damaged file
+        raise SceneError(f"{path}: cannot be read ({files.first_line(error)}); {REMEDY}") from None
     for name, shape in shapes.items():
         if not np.isfinite(found[name]).all():
-            raise SceneError(f"{path}: {name} is not {shape} finite numbers; {AGAIN}")
+            raise SceneError(f"{path}: {name} is not an array of {shape} finite numbers; {REMEDY}")
     return found
 
 
 def _numbers(front: Surface) -> dict[str, float]:
-    """Parameters of a front with few of them, by their names in design.npz."""
+    """Return the parameters of an analytic front by their names in design.npz."""
     return {f"front_{name}": value for name, value in front.plain().parameters().items() if isinstance(value, float)}
 
 
 def _lens(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
-    """The designed lens, to the last bit, from its control nets (m, n, 3) in mm and the numbers of its front."""
+    """Return the designed lens, to the last bit, from its control nets (m, n, 3) in mm and its front's parameters."""
     blank = scene.lens
     front = blank.front_surface
     if blank.front.shaped:
@@ -422,7 +427,7 @@ def _lens(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
 
 
 def _surface(net: np.ndarray, z: float) -> BSplineSurface:
-    """The surface of a control net (m, n, 3) in mm, to the last bit, its heights measured from z if they can be."""
-    if not np.array_equal(z + (net[..., 2] - z), net[..., 2]):  # where the two differ much in size a bit would be lost
+    """Return the surface of a control net (m, n, 3) in mm, to the last bit, with heights from z if possible."""
+    if not np.array_equal(z + (net[..., 2] - z), net[..., 2]):  # rounding would change the control points
         z = 0.0
     return BSplineSurface.from_control_points(net, z)

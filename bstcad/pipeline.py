@@ -113,7 +113,7 @@ def design(
     merit: of a picture and the target, what stages 2 and 3 make least; None: RRMSD².
     look: called now and then with the function that makes the best lens so far.
     hasty: as a preview, see `Task.hasty`; the scene itself says how small it is.
-    later: float32 is compared with float64 when a report asks for it (`Made.told`), and not where none is made.
+    later: float32 is compared with float64 only when a report asks for it (`Made.with_report_data`).
     """
     began = time.perf_counter() if began is None else began
     if merit is not None and (len(scene.targets) > 1 or scene.wavefront is not None):
@@ -152,7 +152,7 @@ def design(
     making = _making(followed, driver.record, stopped, steep)
     return Made(
         resolved(scene, lens), scene.as_mounted(lens), goals, making, device=device, transport=followed.transport,
-        compared=partial(_compared, making, task, after_stage1, stages) if later else None,
+        precision_comparison=partial(_compared, making, task, after_stage1, stages) if later else None,
     )  # fmt: skip
 
 

@@ -39,7 +39,7 @@ class FakeCommands(types.ModuleType):
         progress("stage 1", 2, 2, "RRMSD 0.25")
         return self._report()
 
-    def settled(self, scene, say):
+    def with_default_net(self, scene, say):
         return scene
 
     def verify(self, path, progress, against, **asked):
@@ -80,7 +80,7 @@ def test_the_exit_code_is_the_verdict_and_every_check_is_listed_when_asked(comma
 def test_a_large_file_is_said_before_the_design(commands, capsys, points, size):
     assert cli.run(["generate", THU, "--set", f"lens.back.control_points={points}"]) == 0
     before, stage, _ = capsys.readouterr().err.partition("stage 1")
-    assert stage and (re.search(f"lens.step will take {size}", before) if size else "lens.step" not in before)
+    assert stage and (re.search(f"lens.step will have {size}", before) if size else "lens.step" not in before)
 
 
 def test_options_reach_the_commands(commands, tmp_path):
@@ -107,13 +107,13 @@ def test_options_reach_the_commands(commands, tmp_path):
         (["generate", THU, "--set", "pixels"], "--set pixels: has no value"),
         (["generate", THU, "--set", "target.pixel=3"], "did you mean 'pixels'?"),
         (["generate", THU, "-o", THU], "is a file; give another folder"),
-        (["generate", THU, "-o", THU + "/x"], "cannot be made"),
-        (["generate", THU, "-o", str(ROOT)], "holds files that are not a design's"),
+        (["generate", THU, "-o", THU + "/x"], "cannot be created"),
+        (["generate", THU, "-o", str(ROOT)], "contains files that are not a design's"),
         (["verify", "none"], "none: no such folder"),
         (["verify"], "missing argument"),
-        (["generate", "a\udcff.toml"], "its name is no UTF-8 text"),
-        (["verify", "a\udcff"], "its name is no UTF-8 text; give a path whose name is"),
-        (["tradeoff", THU, "--budget", "0"], "--budget 0: is not possible"),
+        (["generate", "a\udcff.toml"], "its name is not UTF-8 text"),
+        (["verify", "a\udcff"], "its name is not UTF-8 text; rename it"),
+        (["tradeoff", THU, "--budget", "0"], "--budget 0: is not between"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -135,7 +135,7 @@ def test_an_older_design_survives_wrong_input(commands, tmp_path):
     assert cli.run(["generate", THU]) == 0  # an earlier design may be replaced
 
 
-TOO_LITTLE = "the memory of this machine is too little for that"
+TOO_LITTLE = "this machine has too little memory for this design"
 FAULTS = (  # (error of a command, exit code, words of the last line)
     (KeyboardInterrupt(), 130, "bstcad: stopped; there was no lens yet, and nothing is kept"),
     (OSError(28, "No space left on device", "outputs/thu"), 2, "outputs/thu: No space left"),
@@ -163,7 +163,7 @@ def test_a_fault_is_one_sentence_and_a_traceback_if_it_is_ours(commands, capsys,
 
 def test_an_interrupted_plan_does_not_speak_of_a_lens(capsys, monkeypatch):
     monkeypatch.setattr(cli, "load_scene", lambda *given: signal.raise_signal(signal.SIGINT))
-    monkeypatch.setattr(signals, "ending_at_once", contextlib.nullcontext)
+    monkeypatch.setattr(signals, "exit_on_signal", contextlib.nullcontext)
     assert cli.run(["plan", THU]) == 130
     assert capsys.readouterr().err == "bstcad: stopped; nothing more is written\n"
 
@@ -173,14 +173,14 @@ def test_paths_that_lead_nowhere_are_one_sentence(commands, capsys, monkeypatch,
     (tmp_path / "b").symlink_to("a")
     for folder in ("a", "a/x"):
         assert cli.run(["generate", THU, "-o", folder]) == 2
-        assert f"{folder}: leads by its links back to itself; give another folder" in capsys.readouterr().err
+        assert f"{folder}: is a link that leads back to itself; give another folder" in capsys.readouterr().err
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
     for arguments in (["generate", THU], ["generate", "x.toml"], ["verify", "x"], ["verify", str(tmp_path)]):
         assert cli.run(arguments) == 2
         said = capsys.readouterr().err
-        assert said == "bstcad: the working folder was deleted; go to another one (cd) and try again\n"
+        assert said == "bstcad: the working folder was deleted; change to another folder (cd) and try again\n"
     monkeypatch.chdir(tmp_path)
     assert commands.calls == []
 

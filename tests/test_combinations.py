@@ -23,7 +23,7 @@ import torch
 import bstcad
 from bstcad import commands
 from bstcad.analysis.steepness import Steepness
-from bstcad.app.preview import Pains, preview
+from bstcad.app.preview import PreviewSize, preview
 from bstcad.optics.measure import Effort
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sides import as_pair
@@ -291,7 +291,7 @@ TRIPLES = "light", "rim", "front"
 # --- a scene from its plan to its files and back ----------------------------------------------------------------------
 
 EFFORT = Effort(96, places=33, points=64)
-HASTY = Pains(pixels=24, net=17, tubes=36, rounds=1, evaluations=2, blurred=1)
+HASTY = PreviewSize(pixels=24, net=17, tubes=36, rounds=1, evaluations=2, blurred=1)
 MAY_FAIL = (  # checks by the beginning of their names, the choices under which they may fail, and why that is true
     ("wavefront", {}, "one net has no two goals"),
     (r"part\.step", {"mount": "flange"}, "a back that is steep is cut by the plane of the flange"),
@@ -317,7 +317,7 @@ COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which f
     "analysis.light.blur": {"__defaults__": (12,)},
     "analysis.neglected_effects": {"FACE_POINTS": 24, "GHOST_RAYS": 32},
     "analysis.shape": {"GRID_POINTS": 257},
-    "app.preview": {"IMAGE_PLACES": 6, "CELLS": 16, "RAYS": 32, "SHAPE": 33},
+    "app.preview": {"IMAGE_POINTS": 6, "TRANSPORT_CELLS": 16, "LEDGER_RAYS": 32, "SHAPE_POINTS": 33},
     "sweep.estimates": {"NET": 17, "CELLS": 16, "PIXELS": 24, "FRONT_NET": 9, "STEPS": 5},
     "sweep.net_choice": {"TUBES": 64},
     "sweep.prediction": {

@@ -56,7 +56,7 @@ def contents(folder):
 @pytest.fixture
 def quick(monkeypatch):
     """No pictures, no second process, few points; tubes and rays as many as made the small design."""
-    monkeypatch.setattr(commands.processes, "submit", commands.processes.here)
+    monkeypatch.setattr(commands.processes, "submit", commands.processes.run_here)
     draws_nothing(monkeypatch)
     verify_with(monkeypatch, quick_effort())
 
@@ -67,7 +67,7 @@ def dying(*works):
     def submit(work, *arguments):
         name = work if isinstance(work, str) else f"{work.__module__}.{work.__name__}"
         if not name.startswith(works):
-            return commands.processes.here(work, *arguments)
+            return commands.processes.run_here(work, *arguments)
         broken = Future()
         broken.set_exception(BrokenExecutor("it died"))
         return broken
@@ -220,7 +220,7 @@ class TestGenerate:
 
     def test_a_second_process_that_dies_over_the_solid_is_one_sentence(self, small_scene, quick, monkeypatch, tmp_path):
         monkeypatch.setattr(commands.processes, "submit", dying("bstcad.cad.step_writing.write_lens"))
-        with pytest.raises(MachineError, match="OCC broke down over this solid") as broken:
+        with pytest.raises(MachineError, match="OCC crashed on this solid") as broken:
             commands.generate(small_scene.changed(HASTY), tmp_path / "out", device="cpu")
         assert "--resume" in broken.value.__notes__[-1]
         assert {path.name for path in tmp_path.iterdir()} == {".out.checkpoint", "out-unwritten"}
@@ -246,7 +246,7 @@ class TestGenerate:
         def submit(work, *arguments):
             name = work if isinstance(work, str) else f"{work.__module__}.{work.__name__}"
             hangs = name.startswith("bstcad.verify.step_checks")
-            return Future() if hangs else commands.processes.here(work, *arguments)
+            return Future() if hangs else commands.processes.run_here(work, *arguments)
 
         monkeypatch.setattr(commands.processes, "submit", submit)
         monkeypatch.setattr(commands.checks, "LIMIT", 0.1)
@@ -374,7 +374,7 @@ class TestVerify:
         monkeypatch.setattr(checks, "verify", meanwhile)
         code, out, err = run(capsys, "verify", folder)
         assert code == 2 and out == "" and err.count("\n") == 1
-        assert "another design came there while this one was verified; nothing is written" in err
+        assert "its design was replaced while it was being verified; nothing is written" in err
         assert [contents(place) for place in places] == before
 
 

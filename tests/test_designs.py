@@ -214,7 +214,7 @@ class TestLeak:
 class TestWrite:
     def test_files_that_are_not_a_design_s_stay(self, fresh, tmp_path):
         (tmp_path / "letter.txt").write_text("dear")
-        with pytest.raises(bstcad.SceneError, match="holds files that are not a design's; give a new folder"):
+        with pytest.raises(bstcad.SceneError, match="contains files that are not a design's; give a new folder"):
             fresh.write(tmp_path, progress=False)
         assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"] and fresh.folder is None
 
@@ -239,7 +239,7 @@ class TestWrite:
         assert {path.name for path in tmp_path.iterdir()} == {"out", "out-unwritten-2"}
 
     def test_a_run_that_designs_into_the_folder_is_waited_for(self, fresh, tmp_path):
-        with files.held(tmp_path / "out"), pytest.raises(bstcad.SceneError, match="is being designed by another run"):
+        with files.exclusive(tmp_path / "out"), pytest.raises(bstcad.SceneError, match="is in use by another run"):
             fresh.write(tmp_path / "out", progress=False)
         assert list(tmp_path.iterdir()) == [] and fresh.folder is None
 
@@ -366,7 +366,9 @@ class TestOpen:
         with pytest.raises(bstcad.SceneError, match="no such scene file"):
             bstcad.open(tmp_path)
 
-    @pytest.mark.parametrize(("value", "sentence"), [(np.nan, "finite numbers"), (0.0, "its irradiance is none")])
+    @pytest.mark.parametrize(
+        ("value", "sentence"), [(np.nan, "finite numbers"), (0.0, "its irradiance is zero or negative")]
+    )
     def test_an_irradiance_that_is_none_is_a_sentence(self, folder, value, sentence):
         kept = arrays(folder)
         kept["irradiance"][:] = value

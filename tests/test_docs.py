@@ -21,7 +21,7 @@ import typer
 import bstcad
 from bstcad import cli, commands
 from bstcad.optics.surfaces import sag
-from bstcad.runs.processes import Ending
+from bstcad.runs.processes import ExitStatus
 from bstcad.scene.scene import load
 from bstcad.sweep import batch
 from bstcad.sweep import tradeoff as sweeping
@@ -112,7 +112,7 @@ def workplace(prepared, tmp_path, monkeypatch):
 def copied(contents, folder, variables, tick):
     """A design of a batch, which has processes of its own otherwise."""
     shutil.copytree("outputs/disk", folder)
-    return Ending(0, 1.0, 1.0, "")
+    return ExitStatus(0, 1.0, 1.0, "")
 
 
 def run_command(words):

@@ -66,10 +66,10 @@ def test_float32_is_compared_when_a_report_asks_for_it():
     now, later = (pipeline.design(small("disk", **few), later=later) for later in (False, True))
     assert torch.equal(later.lens.back.heights, now.lens.back.heights)
     assert later.making.twins is None and pipeline.COMPARED not in [stage.name for stage in later.making.stages]
-    told = later.told()
+    told = later.with_report_data()
     assert told.making.twins == now.making.twins
     assert [stage.name for stage in told.making.stages] == [stage.name for stage in now.making.stages]
-    assert told.told() is told and now.told() is now
+    assert told.with_report_data() is told and now.with_report_data() is now
 
 
 def test_float32_comes_close_to_float64():

@@ -1,6 +1,6 @@
-"""Connections of browsers: the socket on loopback and uvicorn's server, which ends at once when it is to end.
+"""Connections of browsers: the socket on loopback, and a uvicorn server that shuts down without delay.
 
-A connection is closed where a request's headers do not come to an end: uvicorn would wait forever.
+A connection is closed if the headers of a request do not end in time; uvicorn alone would wait forever.
 """
 
 from __future__ import annotations
@@ -18,39 +18,39 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from bstcad.scene.errors import SceneError
 
-SLOWEST = 1  # seconds that open requests have when the server ends
-HEADERS_WITHIN = 10.0  # seconds from the beginning of a connection, or of a further request on it, to the headers' end
+SHUTDOWN_TIMEOUT = 1  # seconds that open requests have to finish when the server ends
+HEADERS_TIMEOUT = 10.0  # seconds from the start of a connection, or of its next request, to the end of the headers
 
 
 class HeadersInTime(H11Protocol):
-    """A connection that waits HEADERS_WITHIN for the headers of a request, however many bytes come meanwhile.
+    """A connection that closes unless all headers of a request arrive within HEADERS_TIMEOUT.
 
-    A connection on which no further request begins is closed by uvicorn itself (timeout_keep_alive).
+    Single bytes do not restart the timeout.  uvicorn itself closes idle connections (timeout_keep_alive).
     """
 
     _deadline: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to wait for the first request."""
+        """Start the timeout of the first request."""
         super().connection_made(transport)
         self._wait()
 
     def data_received(self, data: bytes) -> None:
-        """Go on with a request, or begin to wait for a further one."""
+        """Receive data of a request; start the timeout of the next request once this one is complete."""
         super().data_received(data)
         self._wait()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Wait no longer."""
+        """Cancel the timeout."""
         super().connection_lost(exc)
         self._stop_waiting()
 
     def _wait(self) -> None:
-        """Wait where no request has all its headers; begun once, so that a byte now and then gains no time."""
+        """Start the timeout if no request has all its headers; a running timeout is not restarted."""
         if self.conn.their_state is not h11.IDLE:
             self._stop_waiting()
         elif self._deadline is None:
-            self._deadline = self.loop.call_later(HEADERS_WITHIN, self._close)
+            self._deadline = self.loop.call_later(HEADERS_TIMEOUT, self._close)
 
     def _stop_waiting(self) -> None:
         if self._deadline is not None:
@@ -65,34 +65,34 @@ class HeadersInTime(H11Protocol):
 
 @contextlib.contextmanager
 def bound(port: int) -> Iterator[socket.socket]:
-    """A socket on loopback; port 0: a free one.  SceneError if the port is taken."""
+    """Listen on a port of the loopback address; port 0 takes a free one.  SceneError if the port is taken."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as own:
         own.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             own.bind(("127.0.0.1", port))
         except OSError as error:
-            raise SceneError(f"--port {port}: cannot be had ({error.strerror}); give another one, or none") from None
-        own.listen()  # a browser that comes before the server answers waits
+            raise SceneError(f"--port {port}: is not available ({error.strerror}); give another or none") from None
+        own.listen()  # browsers that connect before the server runs are queued
         yield own
 
 
 def uvicorn_server(app: Any, ends: Callable[[], None] = lambda: None) -> uvicorn.Server:
-    """The server of an application, which writes nothing to the terminal; ends: called when a signal ends it."""
+    """Return a server of an application that prints nothing; `ends` is called when a signal ends it."""
     config = uvicorn.Config(
         app, log_level="critical", access_log=False, server_header=False, lifespan="off", ws="none",
-        http=HeadersInTime, timeout_graceful_shutdown=SLOWEST,
+        http=HeadersInTime, timeout_graceful_shutdown=SHUTDOWN_TIMEOUT,
     )  # fmt: skip
     return _Server(config, ends)
 
 
 class _Server(uvicorn.Server):
-    """A server that wakes the requests that wait, as soon as it is to end."""
+    """A server that wakes waiting requests as soon as a signal asks it to end."""
 
     def __init__(self, config: uvicorn.Config, ends: Callable[[], None]) -> None:
         super().__init__(config)
         self._ends = ends
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Hear a signal."""
+        """Handle a signal."""
         self._ends()
         super().handle_exit(sig, frame)

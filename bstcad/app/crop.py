@@ -1,4 +1,4 @@
-"""The photo of a target on the page: small, for a frame over it, and its proportions for plate and picture."""
+"""The photo of a target on the page: a small copy on which a crop is drawn, and its proportions."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.scene.target import Target, shown_size
 
-SIDE = 480  # pixels of the longer side of the photo on the page
+MAX_SIDE = 480  # largest side of the photo on the page (pixels)
 
 
 def target_of(scene: Scene, key: str) -> Target:
-    """Return the target of a key, target or target[1].  SceneError where there is none, or it has no photo."""
+    """Return the target at a key such as target or target[1].  SceneError if it does not exist or has no photo."""
     found = dict(zip(scene.target_keys, scene.targets, strict=True)).get(key)
     if found is None or (found.image is None and found.sample is None):
         raise SceneError(f"{key[:40]}: has no photo; give it an image or a sample")
@@ -28,19 +28,19 @@ def small_photo(target: Target) -> bytes:
     given = target.sample if target.image is None else target.image
     with picture.decoding(getattr(given, "name", given)):
         image = picture.photo(given).image
-        if image.mode.startswith(("I", "F")):  # more than 8 bits: to the brightest
+        if image.mode.startswith(("I", "F")):  # more than 8 bits: scale by the brightest pixel
             image = image.point(lambda value: value * (255 / max(image.getextrema()[1], 1e-300))).convert("L")
         image = image.convert("RGB")
-        image.thumbnail((SIDE, SIDE))
+        image.thumbnail((MAX_SIDE, MAX_SIDE))
     written = io.BytesIO()
     image.save(written, "png")
     return written.getvalue()
 
 
 def in_proportions(data: Mapping[str, Any], key: str, target: Target) -> dict[str, Any]:
-    """Return the changes, by key, that give plate and picture the proportions of a target's photo.
+    """Return the changes, by key, that give the plate and the picture the proportions of a target's photo.
 
-    The longer sides stay as they are; so does the plate where it is round, or where it serves several targets.
+    The longer sides keep their lengths.  A round plate, and a plate with several targets, keeps its shape.
     """
     shown = shown_size(target)
     sides = [each / max(shown) for each in shown]

@@ -1,9 +1,9 @@
-"""A run of the workbench in a process of its own, which outlives page and server: a design, or work on a finished one.
+"""A job of the workbench in its own process, which outlives page and server: a design, or work on a finished design.
 
-python -m bstcad.app.design_process FOLDER DESIGN [--resume] does the job of FOLDER/job.json.  Everything that the page
-shows lies in that folder too: a line for each word of progress, a picture of the light through the best lens so far,
-and how the run stands.  SIGINT ends a design with the best lens so far, SIGTERM at once with a checkpoint; then, and
-after a SIGKILL, `--resume` ends in the same lens, to the last bit.
+python -m bstcad.app.design_process FOLDER DESIGN [--resume] does the job of FOLDER/job.json.  The process writes into
+FOLDER what the page shows: the lines of progress, a picture of the light through the best lens so far, and the state.
+SIGINT ends a design with the best lens so far; SIGTERM ends it at once with a checkpoint.  After SIGTERM or SIGKILL,
+`--resume` continues to the same lens, to the last bit.
 """
 
 from __future__ import annotations
@@ -23,62 +23,64 @@ from typing import Any
 from bstcad.runs import files, processes, signals
 from bstcad.runs.files import SentenceError, note
 
-JOB, SCENE, CLOUD = "job.json", "scene.toml", "cloud"  # a measured part's points, with the ending of their kind
-WORDS, LIGHT, STATE = "progress.jsonl", "light.png", "state.json"
-LARGEST = 1_000_000  # bytes of a job
-SIZE = 512  # pixels of the picture of the light, at most
-TUBES = 521  # ray tubes a side, by which it is taken
-EACH, SHARE = 2.0, 0.03  # seconds between two pictures, at least; the most of the time that they may take
-SPREAD_POINTS = 16  # of a source of some size, that the picture is taken by
+JOB, SCENE = "job.json", "scene.toml"  # input files of a run
+CLOUD = "cloud"  # stem of the file with the measured points; the ending tells the format
+PROGRESS, LIGHT, STATE = "progress.jsonl", "light.png", "state.json"
+MAX_JOB_SIZE = 1_000_000  # bytes of job.json
+MAX_PICTURE_SIDE = 512  # longer side of the picture of the light (pixels)
+TUBES_PER_SIDE = 521  # ray tubes per side for that picture
+MIN_INTERVAL = 2.0  # shortest time between two pictures (s)
+MAX_TIME_FRACTION = 0.03  # largest fraction of the run's time that the pictures may take
+SOURCE_POINTS = 16  # points that represent an extended source in the picture
 
 
 @dataclass(frozen=True)
 class State:
-    """How a run stands."""
+    """State of a run, as state.json has it."""
 
     __pydantic_config__ = {"extra": "forbid", "strict": True, "allow_inf_nan": False}  # rules for reading a file
 
     state: str  # running | finished | stopped | refused | failed
-    process: int = 0  # its number, while it runs
+    process: int = 0  # process id while the run is running, else 0
     began: float = 0.0  # seconds since 1970
-    passed: bool | None = None
+    passed: bool | None = None  # True if all checks passed; None if none were made
     rrmsd: float | None = None
-    folder: str = ""  # the name of the folder that holds the lens, if there is one
-    sentence: str = ""  # why it stopped, was refused or failed
+    folder: str = ""  # name of the folder with the result; "" without one
+    sentence: str = ""  # reason why the run stopped, was refused or failed
 
     def put(self, run: Path) -> None:
-        """Write it into a run's folder."""
+        """Write the state into a run's folder."""
         files.put(run / STATE, json.dumps(asdict(self)).encode())
 
 
-class Words:
-    """The progress of a run, a line of JSON each: seconds since 1970, stage, done, total and text."""
+class ProgressFile:
+    """Progress function that appends lines of JSON to a file: [seconds since 1970, stage, done, total, text]."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("a", encoding="utf-8")
 
     def __call__(self, stage: str, done: int, total: int, text: str) -> None:
-        """As runs.progress.Report."""
-        with contextlib.suppress(OSError):  # a full disk does not end a design
+        """Append one line."""
+        with contextlib.suppress(OSError):  # a full disk must not end a design
             self._file.write(json.dumps([round(time.time(), 3), stage, done, total, text]) + "\n")
             self._file.flush()
 
 
-class Glance:
-    """Draws the light through the best lens so far, now and then."""
+class LightSnapshot:
+    """Callback that draws the light through the best lens so far, at intervals."""
 
     def __init__(self, scene: Any, path: Path) -> None:
         self._scene, self._path, self._due = scene, path, time.monotonic()
 
     def __call__(self, make: Callable[[], Any]) -> None:
-        """Called with the function that makes the lens."""
+        """Draw the light of the lens that `make` returns, if a picture is due."""
         if time.monotonic() < self._due:
             return
         began = time.monotonic()
-        with contextlib.suppress(Exception):  # a picture to look at, which the design does not need
+        with contextlib.suppress(Exception):  # the design does not depend on this picture
             self._draw(make())
         ended = time.monotonic()
-        self._due = ended + max(EACH, (ended - began) / SHARE)
+        self._due = ended + max(MIN_INTERVAL, (ended - began) / MAX_TIME_FRACTION)
 
     def _draw(self, lens: Any) -> None:
         from PIL import Image
@@ -87,14 +89,14 @@ class Glance:
         from bstcad.report.light_figures import View
 
         scene, target = self._scene, self._scene.target
-        channels = scene.channels(SPREAD_POINTS) if scene.source.extent else scene.channels()
-        screen, n = target.screen, max(round(TUBES * side_factor(channels)), 64)
+        channels = scene.channels(SOURCE_POINTS) if scene.source.extent else scene.channels()
+        screen, n = target.screen, max(round(TUBES_PER_SIDE * side_factor(channels)), 64)
         light, wanted = tubes_picture(lens.plain(), channels, screen, n).numpy(), target.irradiance()
         if not light.sum() > 0:
             return
         view, scaled = View.of(scene), light * (wanted.sum() / light.sum())
         image = Image.fromarray(view.picture(view.tones(scaled, wanted)).copy())
-        image.thumbnail((SIZE, SIZE))
+        image.thumbnail((MAX_PICTURE_SIDE, MAX_PICTURE_SIDE))
         written = io.BytesIO()
         image.save(written, "png")
         files.put(self._path, written.getvalue())
@@ -110,44 +112,44 @@ def design(job: Mapping[str, Any], place: Path, output: Path, resume: bool) -> S
 
     scene = load(place / SCENE)
     report = commands.generate(
-        scene, output, progress=Words(place / WORDS), began=time.perf_counter(), resume=resume,
-        look=Glance(scene, place / LIGHT),
+        scene, output, progress=ProgressFile(place / PROGRESS), began=time.perf_counter(), resume=resume,
+        look=LightSnapshot(scene, place / LIGHT),
     )  # fmt: skip
     found = report.contents
     if report.stopped != "interrupt":
         return State("finished", passed=found.passed, rrmsd=found.rrmsd, folder=output.name)
-    lens = commands.place_for(output, "interrupt").name
+    lens = commands.output_folder(output, "interrupt").name
     return State(
         "stopped", passed=found.passed, rrmsd=found.rrmsd, folder=lens, sentence="ended with the best lens so far"
     )
 
 
 def tolerance(job: Mapping[str, Any], place: Path, output: Path, resume: bool) -> State:
-    """How exactly the lens must be made, mounted and lit; job: grade, and yield (0 to 1), each perhaps None."""
+    """Study the tolerances of a finished design.  job: grade and yield (0 to 1), either may be None."""
     from bstcad import commands
 
-    commands.tolerance(output, grade=job.get("grade"), wanted=job.get("yield"), progress=Words(place / WORDS))
+    commands.tolerance(output, grade=job.get("grade"), wanted=job.get("yield"), progress=ProgressFile(place / PROGRESS))
     return State("finished", folder=output.name)
 
 
 def tradeoff(job: Mapping[str, Any], place: Path, output: Path, resume: bool) -> State:
-    """The price of accuracy in time, into the folder NAME-tradeoff beside the design; job: budget (s)."""
+    """Study the trade-off of time against accuracy, in the folder NAME-tradeoff beside the design.  job: budget (s)."""
     from bstcad.runs.progress import Throttled
     from bstcad.scene.scene import load
     from bstcad.sweep import tradeoff as sweeping
 
     folder = output.with_name(f"{output.name}-tradeoff")
-    told = Throttled(Words(place / WORDS), EACH)
-    found = sweeping.tradeoff(load(output / SCENE), folder, budget=job["budget"], progress=told)
+    throttled = Throttled(ProgressFile(place / PROGRESS), MIN_INTERVAL)
+    found = sweeping.tradeoff(load(output / SCENE), folder, budget=job["budget"], progress=throttled)
     return State("finished", passed=bool(found.lenses), folder=folder.name)
 
 
 def measured(job: Mapping[str, Any], place: Path, output: Path, resume: bool) -> State:
-    """Judge a made part by its measured points, whose file lies in the run's folder."""
+    """Judge a made part by the file of measured points in the run's folder."""
     from bstcad import commands
 
     [cloud] = place.glob(f"{CLOUD}.*")
-    found = commands.verify(output, measured=cloud, progress=Words(place / WORDS)).contents
+    found = commands.verify(output, measured=cloud, progress=ProgressFile(place / PROGRESS)).contents
     part = found.measured or {}
     return State("finished", passed=part.get("passed"), rrmsd=part.get("rrmsd_predicted"), folder=output.name)
 
@@ -159,15 +161,15 @@ JOBS = {work.__name__: work for work in (design, tolerance, tradeoff, measured)}
 
 
 def main(folder: str, output: str, *options: str) -> int:
-    """Do the job of a run's folder, and keep there how it ended; the exit code."""
+    """Do the job of a run's folder and write its final state there; return the exit code."""
     place, began = Path(folder), time.time()
     State("running", os.getpid(), began).put(place)
     try:
-        with signals.endings():
-            job = json.loads(files.contents(place / JOB, LARGEST))
+        with signals.raise_terminated():
+            job = json.loads(files.contents(place / JOB, MAX_JOB_SIZE))
             ended = JOBS[job["kind"]](job, place, Path(output), "--resume" in options)
     except BaseException as error:
-        ended = _ended(error)
+        ended = _final_state(error)
         if ended.state == "failed":
             traceback.print_exc()
     replace(ended, began=began).put(place)
@@ -175,16 +177,16 @@ def main(folder: str, output: str, *options: str) -> int:
     return 0 if ended.state == "finished" else 1
 
 
-def _ended(error: BaseException) -> State:
-    """How a run ended that wrote no lens."""
-    said = note(error)
-    if signals.ended() or isinstance(error, KeyboardInterrupt):
-        kept = "the design so far is kept" if "is kept" in said else "nothing is kept"
-        return State("stopped", sentence=kept)
+def _final_state(error: BaseException) -> State:
+    """Return the state of a run that an error or a signal ended."""
+    notes = note(error)
+    if signals.termination() or isinstance(error, KeyboardInterrupt):
+        sentence = "the design so far is kept" if "is kept" in notes else "nothing is kept"
+        return State("stopped", sentence=sentence)
     if isinstance(error, SentenceError):
-        return State("refused", sentence="; ".join(filter(None, (str(error), said))))
+        return State("refused", sentence="; ".join(filter(None, (str(error), notes))))
     words = f"{type(error).__name__}: {files.first_line(error)}"
-    return State("failed", sentence="; ".join(filter(None, (files.one_line(words), said))))
+    return State("failed", sentence="; ".join(filter(None, (files.one_line(words), notes))))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Runs in processes of their own: begun, followed, stopped and gone on with by the files of their folders.
+"""Runs in their own processes, which the server starts, follows, stops and resumes through files.
 
-A run belongs to the folder of its design: .NAME.KIND-run beside it holds the job, its progress and its state.  A server
-that starts finds runs that an earlier server began, whether they still run, ended meanwhile, or were killed.
+A run belongs to a design: the folder .NAME.KIND-run beside the design's folder holds the job, its progress and its
+state.  A new server finds the runs of an earlier one, whether they still run, have ended, or were killed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from bstcad import folder as folders
-from bstcad.app.design_process import JOB, JOBS, LIGHT, STATE, WORDS, State
+from bstcad.app.design_process import JOB, JOBS, LIGHT, PROGRESS, STATE, State
 from bstcad.app.workspace import NAME
 from bstcad.report.record import of_json
 from bstcad.runs import files
@@ -28,34 +28,37 @@ from bstcad.runs.processes import command_of
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 
-DESIGN = "design"  # the kind of a run that designs a lens; others are work on a finished design
-LARGEST = 50_000_000  # bytes of progress
-WRITTEN = "written.toml"  # file of a run: the scene as its page had it, comments and all
-GRACE = 1.0  # seconds that the server waits for runs to keep their checkpoints when it ends; they go on with it alone
-START = 30.0  # seconds that the process of a run has to start
-LOST = "its process was killed, or the memory of this machine was too little for it"
-NONE = State("none")
+DESIGN = "design"  # kind of a run that designs a lens; the other kinds work on a finished design
+MAX_PROGRESS_SIZE = 50_000_000  # bytes of a run's largest file
+SCENE_TEXT = "written.toml"  # file of a run: the text of the scene on the page, with its comments
+ENDING_TIMEOUT = 1.0  # seconds that an ending server waits for runs to write checkpoints; they finish without it, too
+START_TIMEOUT = 30.0  # seconds that the process of a run has to start
+PROCESS_LOST = "its process was killed, or this machine had too little memory for it"
+NO_RUN = State("none")
 
 
 @dataclass(frozen=True)
 class Run:
-    """The run of a kind that belongs to a design, there or not."""
+    """Run of one kind that belongs to a design; it need not exist."""
 
-    design: Path  # its folder
-    kind: str = DESIGN  # of JOBS
+    design: Path  # folder of the design
+    kind: str = DESIGN  # key of JOBS
 
     @property
     def place(self) -> Path:
         """The folder of the run."""
         return files.beside(self.design, f"{self.kind}-run")
 
-    # ---- begun and ended ----
+    # ---- start and stop ----
 
     def begin(self, job: Mapping[str, Any] | None = None, contents: Mapping[str, bytes] | None = None) -> None:
-        """Begin it anew in a process of its own; contents: files for it.  SceneError if it is under way."""
+        """Start the run in its own process, without an earlier state.  contents: files for it, by name.
+
+        SceneError if it is already running.
+        """
         if self.state.state == "running":
-            raise SceneError(f"{self.design.name}: this is under way already; wait for its end, or stop it")
-        if self.place.is_symlink() or self.place.is_file():  # somebody's; what a link leads to stays as it is
+            raise SceneError(f"{self.design.name}: the {self.kind} is already running; wait until it ends, or stop it")
+        if self.place.is_symlink() or self.place.is_file():  # not ours; the target of a link stays as it is
             self.place.unlink()
         shutil.rmtree(self.place, ignore_errors=True)
         self.place.mkdir(parents=True)
@@ -65,18 +68,18 @@ class Run:
         self._start()
 
     def go_on(self) -> None:
-        """Go on with a run that was stopped or killed, a design from its checkpoint."""
+        """Resume a run that was stopped or killed; a design continues from its checkpoint."""
         if not self.read(JOB):
-            raise SceneError(f"{self.design.name}: has no run to go on with; begin it anew")
+            raise SceneError(f"{self.design.name}: there is no run to resume; start a new one")
         if self.state.state != "running":
             for path in self.place.iterdir():
-                if path.is_symlink():  # nothing is written through it
+                if path.is_symlink():  # never write through a link
                     path.unlink()
             self._start("--resume")
 
     def _start(self, *options: str) -> None:
-        """Start the process, in a session of its own: a Ctrl-C in the terminal is not meant for it."""
-        source = str(Path(__file__).parents[2])  # it runs these sources
+        """Start the process in its own session, so that a Ctrl-C in the terminal does not reach it."""
+        source = str(Path(__file__).parents[2])  # the process runs these sources
         paths = os.pathsep.join(filter(None, (source, os.environ.get("PYTHONPATH"))))
         with (self.place / "process.log").open("ab") as log:
             process = subprocess.Popen(
@@ -84,66 +87,65 @@ class Run:
                 stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
                 env=os.environ | {"PYTHONPATH": paths},
             )  # fmt: skip
-        self._await(process)
+        self._wait_for_start(process)
 
-    def _await(self, process: subprocess.Popen) -> None:
-        """Wait until the process has stated that it runs; it alone writes its state."""
-        until = time.monotonic() + START
-        while self._stated().process != process.pid and time.monotonic() < until:
+    def _wait_for_start(self, process: subprocess.Popen) -> None:
+        """Wait until the process has written that it runs; only the process writes its state."""
+        until = time.monotonic() + START_TIMEOUT
+        while self._written_state().process != process.pid and time.monotonic() < until:
             if process.poll() is not None:  # it has ended already
-                if self._stated() == NONE:
-                    State("failed", sentence="its process did not start; process.log in its folder says why").put(
-                        self.place
-                    )
+                if self._written_state() == NO_RUN:
+                    failed = State("failed", sentence="its process did not start; process.log in its folder says why")
+                    failed.put(self.place)
                 return
             time.sleep(0.01)
 
     def signal(self, number: signal.Signals) -> None:
-        """Send its process a signal, if it runs: SIGINT ends a design with the best lens so far, SIGTERM at once."""
+        """Send a signal to the running process: SIGINT ends a design with the best lens so far, SIGTERM at once."""
         state = self.state
         if state.state == "running":
             os.kill(state.process, number)
 
-    # ---- followed ----
+    # ---- state and progress ----
 
     @property
     def state(self) -> State:
-        """How it stands."""
-        stated = self._stated()
+        """Current state of the run."""
+        stated = self._written_state()
         if stated.state in ("stopped", "failed") and self._finished_elsewhere():
             return replace(stated, state="finished", folder=self.design.name, sentence="")
-        if stated.state != "running" or self._lives(stated.process):
+        if stated.state != "running" or self._is_own_process(stated.process):
             return stated
-        again = self._stated()  # it may have ended between the two looks
+        again = self._written_state()  # it may have ended since the first reading
         if again.state != "running":
             return again
-        return replace(again, state="stopped", process=0, sentence=LOST)
+        return replace(again, state="stopped", process=0, sentence=PROCESS_LOST)
 
     @property
-    def ending(self) -> str:
-        """How it ended, or is about to, after the server asked it to."""
+    def final_sentence(self) -> str:
+        """Sentence for the terminal about a run that the ending server has stopped."""
         state, name = self.state, f"{self.design.name}: the {self.kind}"
         if state.state == "running":
-            return f"{name} is being stopped, and keeps what it has; bstcad app in this folder goes on with it"
-        kept = f"{state.sentence}; " if state.sentence else ""
-        return f"{name} is {state.state}; {kept}bstcad app in this folder shows it"
+            return f"{name} is stopping and keeps its results so far; run bstcad app in this folder to resume it"
+        reason = f"{state.sentence}; " if state.sentence else ""
+        return f"{name} is {state.state}; {reason}run bstcad app in this folder to see it"
 
-    def _stated(self) -> State:
+    def _written_state(self) -> State:
         try:
             return of_json(self.read(STATE), State)
         except ValueError:
-            return NONE
+            return NO_RUN
 
     def read(self, name: str) -> bytes:
-        """The bytes of a file of the run; b"" if there is none, or it lies outside of the folder of the designs."""
+        """Return the bytes of a file of the run; b"" if it does not exist or a link leads outside the designs."""
         try:
             place = self.place
-            return files.contents(files.within(place / name, place.parent), LARGEST)
+            return files.contents(files.within(place / name, place.parent), MAX_PROGRESS_SIZE)
         except ValueError:
             return b""
 
     def _finished_elsewhere(self) -> bool:
-        """Did another program, such as `bstcad generate --resume`, go on with this design to its end?"""
+        """Return True if another program, such as `bstcad generate --resume`, has finished this design."""
         if self.kind != DESIGN or files.beside(self.design, "checkpoint").exists():
             return False
         try:
@@ -151,23 +153,23 @@ class Run:
         except OSError:
             return False
 
-    def _lives(self, process: int) -> bool:
-        """Is that process the one of this run?  The system gives the numbers of ended processes to others."""
+    def _is_own_process(self, process: int) -> bool:
+        """Return True if the process belongs to this run; the system reuses the ids of ended processes."""
         return str(self.place) in command_of(process)
 
     def news(self, since: int) -> dict[str, Any]:
-        """Its state, and the lines of its progress from number `since` on.
+        """Return the state and the lines of progress from line `since` on, for the page.
 
         A line is [seconds since 1970, stage, done, total, text].
         """
         state = self.state
-        lines = self.read(WORDS).decode("utf-8", "replace").split("\n")[:-1]
-        told = [found for line in lines[max(since, 0) :] if (found := _read(line)) is not None]
+        lines = self.read(PROGRESS).decode("utf-8", "replace").split("\n")[:-1]
+        progress = [found for line in lines[max(since, 0) :] if (found := _read(line)) is not None]
         resumable = state.state in ("stopped", "failed") and self.kind == DESIGN
-        stamp = {"light": self._stamp(LIGHT), "next": len(lines), "now": time.time()}
-        return asdict(state) | stamp | {"lines": told, "resumable": resumable, "kind": self.kind}
+        stamp = {"light": self._modification_time(LIGHT), "next": len(lines), "now": time.time()}
+        return asdict(state) | stamp | {"lines": progress, "resumable": resumable, "kind": self.kind}
 
-    def _stamp(self, name: str) -> str:
+    def _modification_time(self, name: str) -> str:
         try:
             return str((self.place / name).stat().st_mtime_ns)
         except OSError:
@@ -175,38 +177,38 @@ class Run:
 
     @property
     def light(self) -> bytes:
-        """The PNG of the light through the best lens so far; b"" before there is one."""
+        """PNG of the light through the best lens so far; b"" before the first one."""
         return self.read(LIGHT)
 
 
 def _read(line: str) -> list[Any] | None:
-    """A line of progress; None for one that a full disk or a kill has cut."""
+    """Return a line of progress; None for a line that a full disk or a kill has cut."""
     try:
         at, stage, done, total, text = json.loads(line)
     except (ValueError, TypeError, RecursionError):
         return None
-    numbers = (type(value) in (int, float) and abs(value) < 1e300 for value in (at, done, total))  # for a page
+    numbers = (type(value) in (int, float) and abs(value) < 1e300 for value in (at, done, total))
     return [at, stage, done, total, text] if all(numbers) and {type(stage), type(text)} == {str} else None
 
 
 def begin_design(scene: Scene, design: Path, text: str = "") -> Run:
-    """Design a scene into a folder, and keep the text that it was made of.
+    """Start the design of a scene into a folder; `text` of the scene file is kept with the run.
 
-    SceneError where that folder is another's, or a run is under way.
+    SceneError if the folder holds other files, or a run is already running.
     """
     files.check_free(design)
     run = Run(design)
-    run.begin(contents=folders.scene_files(scene) | {WRITTEN: text.encode()})
+    run.begin(contents=folders.scene_files(scene) | {SCENE_TEXT: text.encode()})
     return run
 
 
 def all_runs(designs: Path) -> list[Run]:
-    """The runs in a folder of designs, under way or ended."""
+    """Return the runs in a folder of designs, running or ended."""
     found = []
     for kind in JOBS:
         for path in sorted(designs.glob(f".*.{kind}-run")) if designs.is_dir() else ():
             run = Run(designs / path.name[1 : -len(f".{kind}-run")], kind)
-            with contextlib.suppress(ValueError):  # a link leads out of the folder
+            with contextlib.suppress(ValueError):  # a link that leads out of the folder
                 files.within(run.design, designs)
                 if NAME.fullmatch(run.design.name) and run.read(STATE):
                     found.append(run)
@@ -214,7 +216,7 @@ def all_runs(designs: Path) -> list[Run]:
 
 
 def end(runs: list[Run]) -> list[Run]:
-    """Have runs end before the server ends, each with its checkpoint; those that ran."""
+    """Stop running runs, each with its checkpoint, and return them; the server is about to end."""
     running = [run for run in runs if run.state.state == "running"]
     for run in running:
         run.signal(signal.SIGTERM)
@@ -222,8 +224,8 @@ def end(runs: list[Run]) -> list[Run]:
 
 
 def endings(running: list[Run]) -> list[str]:
-    """Wait a moment for runs that were asked to end; a sentence on each, for the terminal."""
-    until = time.monotonic() + GRACE
+    """Wait up to ENDING_TIMEOUT for runs that are stopping; return a sentence on each for the terminal."""
+    until = time.monotonic() + ENDING_TIMEOUT
     while any(run.state.state == "running" for run in running) and time.monotonic() < until:
         time.sleep(0.1)
-    return [run.ending for run in running]
+    return [run.final_sentence for run in running]

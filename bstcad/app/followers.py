@@ -1,10 +1,10 @@
-"""Keys that follow another one, so that a change of one number leaves a scene that a person would draw.
+"""Keys that follow another key, so that one change on the page leaves a sensible scene.
 
-A beam that fills the lens goes on filling it; a lens that is moved or made thicker keeps its distance to the wall; and
-light of another profile gets the width that this profile has.  With a closed lock, width and height keep their
-proportions.  Nothing follows a wrong entry.  In the text of a scene each key can still be set by itself.
+A beam that fills the lens keeps filling it.  A lens that is moved or made thicker keeps its distance from the wall.
+A beam with another profile gets a width of that profile.  With a closed lock, width and height keep their ratio.
+No key follows an invalid value.  In the text of a scene each key can still be set by itself.
 
-The choices of a form that a scene cannot have are found by trying them, each with the reason.
+`impossible_choices` tries the choices of a form and returns those that the scene cannot have, with the reasons.
 """
 
 from __future__ import annotations
@@ -14,74 +14,76 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from bstcad.app.form import LOCKS, form
+from bstcad.app.form import LOCKED_SIDES, form
 from bstcad.app.kinds import are_numbers, extent, table_at, value_at
-from bstcad.app.scene_text import changed, same, tables
+from bstcad.app.scene_text import changed, is_same, tables
 from bstcad.app.words import typed
 from bstcad.runs.files import SentenceError
 
-SHAPES = {"lens.outline": "source.aperture"}  # an outline, and the outline that follows where both are alike
-MOVED = "lens.back.z"  # the plane from which targets keep their distance
-WIDTHS = {  # the key that states the width of a profile, by the kind of source and the profile
+SHAPES = {"lens.outline": "source.aperture"}  # outline: the outline that follows it while both are equal
+BACK_PLANE = "lens.back.z"  # key of the plane from which targets keep their distance
+WIDTHS = {  # key of the beam's width, by (kind of the source, profile)
     ("collimated", "gaussian"): "radius_1e2",
     ("point", "gaussian"): "half_angle_1e2",
     ("point", "uniform"): "half_angle",
 }
-SAFE = ("rotate", "fit", "seen_from", "sample")  # they change the picture alone, and reading a photo takes long
+PICTURE_KEYS = ("rotate", "fit", "seen_from", "sample")  # keys of the picture, not tried, since reading a photo is slow
 
 
 def take_change(
-    text: str, key: str, value: Any, *, is_sound: Callable[[str], bool], sound: str | None = None, locked: bool = False
-) -> tuple[str, tuple[str, ...]]:
+    text: str, key: str, value: Any, *, is_valid: Callable[[str], bool], valid_text: str | None = None,
+    locked: bool = False,
+) -> tuple[str, tuple[str, ...]]:  # fmt: skip
     """Return a scene's text with another value of a key, and the keys that followed.
 
-    is_sound: is a text a valid scene?  Keys follow only where the scene is valid with them.  sound: the latest valid
-    text of the scene, from which followers are computed, so that a wrong entry in between leaves no trace in them.
+    is_valid: returns True for the text of a valid scene; keys follow only if the resulting scene is valid.
+    valid_text: the latest valid text, from which followers are computed, so that an invalid value in between does not
+    affect them; None: the text itself.  locked: see `with_followers`.
     """
     alone = changed(text, key, value)
     now = tables(text)
-    before = now if sound is None else tables(sound)
-    of_an_aperture = key == "lens.outline.shape" and table_at("source.aperture", before)  # it needs that shape, too
+    before = now if valid_text is None else tables(valid_text)
+    of_an_aperture = key == "lens.outline.shape" and table_at("source.aperture", before)  # it needs the same shape
     aperture = {"source.aperture.shape": value} if of_an_aperture else {}
     for changes in (with_followers(before, key, value, locked=locked), aperture):
         others = {other: own for other, own in changes.items() if other != key}
-        if not others or not all(same(value_at(other, before), value_at(other, now)) for other in others):
-            continue  # a key that would follow has another value than the latest valid scene
+        if not others or not all(is_same(value_at(other, before), value_at(other, now)) for other in others):
+            continue  # a key that would follow has changed since the latest valid scene
         try:
             together = alone
             for other, own in others.items():
                 together = changed(together, other, own)
         except SentenceError:
             continue
-        if is_sound(together):
-            return together, tuple(other for other in others if not same(value_at(other, now), others[other]))
-        if is_sound(alone):
+        if is_valid(together):
+            return together, tuple(other for other in others if not is_same(value_at(other, now), others[other]))
+        if is_valid(alone):
             break
     return alone, ()
 
 
 def with_followers(data: Mapping[str, Any], key: str, value: Any, locked: bool = False) -> dict[str, Any]:
-    """Return the changes, by key, that a change of one key makes in the tables of a scene; that key is the first.
+    """Return all changes, by key, that follow from a change of one key in the tables of a scene, that key first.
 
-    locked: the other side of a target or an outline keeps its ratio to the side that is changed.
+    locked: the other side of a target or an outline keeps its ratio to the changed side.
     """
-    changes = {key: value} | (_locked(data, key, value) if locked else {})
+    changes = {key: value} | (_other_side(data, key, value) if locked else {})
     for leader, follower in SHAPES.items():
         for each, own in [*changes.items()]:
             table, name = each.rpartition(".")[::2]
             if table == leader and value_at(leader, data) == value_at(follower, data) is not None:
                 changes[f"{follower}.{name}"] = copy.deepcopy(own)
-    if key == MOVED and are_numbers(value) and are_numbers(before := value_at(key, data)):
+    if key == BACK_PLANE and are_numbers(value) and are_numbers(before := value_at(key, data)):
         targets = data.get("target")
         names = [f"target[{k}].z" for k in range(len(targets))] if isinstance(targets, list) else ["target.z"]
         changes |= {name: _rounded(z + value - before) for name in names if are_numbers(z := value_at(name, data))}
-    return changes | (_of_profile(data, value) if key == "source.profile" else {})
+    return changes | (_profile_widths(data, value) if key == "source.profile" else {})
 
 
-def _locked(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
-    """Return the other side of a table, in the ratio to this one that it has; {} where one of them has no length."""
+def _other_side(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
+    """Return the change of the other side of a table at the same ratio; {} if one of the sides has no length."""
     place, _, name = key.rpartition(".")
-    other = f"{place}.{LOCKS.get(name, '')}"
+    other = f"{place}.{LOCKED_SIDES.get(name, '')}"
     was, its = value_at(key, data), value_at(other, data)
     if are_numbers(value, was, its) and was and value > 0:
         return {other: _rounded(its * value / was)}
@@ -91,8 +93,8 @@ def _locked(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
     return {other: [_rounded(middle + ratio * (end - middle)) for end in its]}
 
 
-def _of_profile(data: Mapping[str, Any], profile: Any) -> dict[str, Any]:
-    """Return the widths of a profile: the one that it has is made of the lens, those of other profiles go."""
+def _profile_widths(data: Mapping[str, Any], profile: Any) -> dict[str, Any]:
+    """Return the changes of a beam's widths for a profile: its own is set by the lens, those of others are removed."""
     source = table_at("source", data)
     kind = source.get("kind")
     wanted = WIDTHS.get((kind, profile))
@@ -105,7 +107,7 @@ def _of_profile(data: Mapping[str, Any], profile: Any) -> dict[str, Any]:
 
 
 def _width(data: Mapping[str, Any], source: Mapping[str, Any], name: str) -> float | None:
-    """Return the width of a profile that fills the lens: a radius (mm), or the half angle of its corners (degrees)."""
+    """Return the width of a beam that fills the lens: a radius (mm), or the half angle to its corners (degrees)."""
     sizes = extent(table_at("lens.outline", data))
     if sizes is None:
         return None
@@ -123,23 +125,23 @@ def _is_range(value: Any) -> bool:
 
 
 def _rounded(value: float) -> float:
-    """Return a number without the last digits of a sum."""
+    """Return a number without the rounding errors of a sum: ten significant digits."""
     return float(f"{value:.10g}")
 
 
 # ---- choices that a scene cannot have --------------------------------------------------------------------------------
 
 
-def impossible(text: str, fault: Callable[[str], str | None]) -> dict[str, dict[str, str]]:
-    """Return, by key and choice, why a valid scene would be refused with it; {} for a scene that is wrong itself.
+def impossible_choices(text: str, fault: Callable[[str], str | None]) -> dict[str, dict[str, str]]:
+    """Return, by key and choice, the reason why the scene would be refused with it; {} for an invalid scene.
 
-    fault: the sentence that refuses the scene of a text; None for a valid one.
+    fault: returns the sentence that refuses the scene of a text; None for a valid one.
     """
     if fault(text) is not None:
         return {}
     found: dict[str, dict[str, str]] = {}
     for field in form(tables(text)).fields():
-        if field.control != "choice" or field.key.rpartition(".")[2] in SAFE:
+        if field.control != "choice" or field.key.rpartition(".")[2] in PICTURE_KEYS:
             continue
         for choice in field.choices:
             if choice != field.value and (why := _refusal(text, field.key, choice, fault)) is not None:
@@ -148,9 +150,9 @@ def impossible(text: str, fault: Callable[[str], str | None]) -> dict[str, dict[
 
 
 def _refusal(text: str, key: str, choice: str, fault: Callable[[str], str | None]) -> str | None:
-    """Return the sentence that refuses a scene with another choice; None: it is possible."""
+    """Return the sentence that refuses a scene with another choice; None if the choice is possible."""
     try:
         value = typed(key, choice, tables(text))
-        return fault(take_change(text, key, value, is_sound=lambda each: fault(each) is None)[0])
+        return fault(take_change(text, key, value, is_valid=lambda each: fault(each) is None)[0])
     except SentenceError as refusal:
         return str(refusal)

@@ -1,6 +1,6 @@
-"""The form of a scene: a field for each key that its tables have or may have, as the schema describes it, and as HTML.
+"""The form of a scene, as records and as HTML: a field for each key that its tables have or may have, by the schema.
 
-What a scene has not, such as a wavefront or a second target, is an addition: a button that puts the table there.
+A table that the scene lacks, such as a wavefront or a second target, is an addition: a button that adds the table.
 """
 
 from __future__ import annotations
@@ -14,41 +14,44 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from bstcad.app.kinds import alternatives, choices, new_table, of_kinds, plain, records_at
+from bstcad.app.kinds import alternatives, choices, matching_records, new_table, records_at, value_at, without_numbers
 from bstcad.app.words import as_words, number
 from bstcad.scene.schema import TAGS, Node, records, rows, schema, tags
 
 if TYPE_CHECKING:
     import jinja2
 
-FIRST: tuple[Mapping[str, str], ...] = (  # what most people change: a key and its words, of several the one that is set
+# Fields that most people change, with their labels by key.  Of several keys in one row the one that is set is shown.
+MAIN_FIELDS: tuple[Mapping[str, str], ...] = (
     {
-        "target.image": "Picture", "target.text": "Letters as the picture", "target.sample": "Sample as the picture",
-        "target.uniform": "Even light, no picture", "target.profile.shape": "Shape of light, no picture",
+        "target.image": "Picture: image file", "target.text": "Picture: letters", "target.sample": "Picture: sample",
+        "target.uniform": "Uniform light instead of a picture", "target.profile.shape": "Shape of the light spot",
     },
-    {"target.z": "Place of the wall (z)"},
-    {"target.x": "Picture on the wall, its ends in x"},
-    {"target.y": "Picture on the wall, its ends in y"},
+    {"target.z": "Position of the wall (z)"},
+    {"target.x": "Picture on the wall: left and right edge (x)"},
+    {"target.y": "Picture on the wall: lower and upper edge (y)"},
     {"lens.outline.shape": "Outline of the lens"},
     {
         "lens.outline.width": "Width of the lens", "lens.outline.diameter": "Diameter of the lens",
         "lens.outline.radius": "Radius of the lens",
     },
     {"lens.outline.height": "Height of the lens"},
-    {"lens.back.z": "Back of the lens (z)"},
+    {"lens.back.z": "Position of the back face at its centre (z)"},
     {"lens.material": "Material", "lens.index": "Refractive index"},
-    {"source.kind": "Light"},
+    {"source.kind": "Light source"},
     {"source.wavelength": "Wavelength"},
-    {"target.seen_from": "Seen from"},
-    {"target.rotate": "Turned by"},
-    {"target.fit": "Crop or pad"},
-    {"target.gamma": "Brightness of the picture's tones (gamma)"},
+    {"target.seen_from": "Side of the wall from which the picture is seen"},
+    {"target.rotate": "Rotation of the picture"},
+    {"target.fit": "Fit of a picture with other proportions"},
+    {"target.gamma": "Gamma of the picture"},
     {"tailoring.quality": "Quality"},
 )  # fmt: skip
-LOCKS = {"x": "y", "y": "x", "width": "height", "height": "width"}  # a side, and the one that a closed lock moves
-ASKED_FOR = ("mount",)  # tables that mean something by being there, even without a key
-MANY = 1000  # tables of a list that has no limit
-STEPS, ROUND = 100, (5, 2, 1)  # of a slider, at least; and the figures that a step may have
+THICKNESS = "Thickness at the centre"  # label of lens.back.z for a front face at z = 0
+LOCKED_SIDES = {"x": "y", "y": "x", "width": "height", "height": "width"}  # side: the other side, which a lock changes
+OPTIONAL_TABLES = ("mount",)  # tables that have a meaning even if they are empty
+MAX_TABLES = 1000  # tables in a list without a limit of its own
+MIN_STEPS = 100  # smallest number of steps of a slider
+STEP_DIGITS = (5, 2, 1)  # digits that a step of a slider may have
 
 Control = Literal["number", "pair", "numbers", "choice", "check", "text", "lines"]
 Table = Mapping[str, Any]
@@ -59,27 +62,27 @@ Table = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Field:
-    """A key of a scene; its texts are as a person types them (words.as_words)."""
+    """Field of a key; values are texts as a person types them (words.as_words)."""
 
-    key: str  # dotted, a table of a list by its number
+    key: str  # dotted key; tables of a list have numbers: target[1].z
     label: str
-    unit: str  # "": it has none
-    least: float | None  # the range; None: it has none
-    most: float | None
-    meaning: str  # a sentence
-    default: str  # "": it has none
+    unit: str  # "" without a unit
+    minimum: float | None  # smallest value; None without a limit
+    maximum: float | None  # largest value; None without a limit
+    meaning: str  # description of the key, a sentence
+    default: str  # "" without a default
     example: str
     control: Control
-    choices: tuple[str, ...]  # of a choice, or of a text that lists some
-    value: str  # "": it is absent
-    given: bool  # it is set
+    choices: tuple[str, ...]  # values of a choice, or of the items of a text
+    value: str  # "" if the key is not set
+    is_set: bool
     required: bool
-    page: str  # of the documentation, from its first page
+    page: str  # address in the documentation, relative to its first page
 
 
 @dataclass(frozen=True)
 class Addition:
-    """A table that may come, and with which keys (scene_text.changed)."""
+    """Table that a button adds: its key, the button's label, and its keys and values (for scene_text.changed)."""
 
     key: str
     label: str
@@ -88,48 +91,48 @@ class Addition:
 
 @dataclass(frozen=True)
 class Group:
-    """A table of a scene, a list of tables, or a section's keys without a table."""
+    """Fields of a table or of a list of tables; or the keys of a section that are in no table."""
 
-    key: str  # "": name and title
+    key: str  # dotted key of the table; "" for name and title
     label: str
     meaning: str
     page: str
     fields: tuple[Field, ...]
-    groups: tuple[Group, ...]  # tables in it
+    groups: tuple[Group, ...]  # inner tables
     additions: tuple[Addition, ...]
-    removable: bool  # the scene does without it
+    removable: bool  # True if the scene is complete without the table
 
-    def every(self) -> Iterator[Group]:
-        """It, and all groups in it."""
+    def walk(self) -> Iterator[Group]:
+        """Iterate over this group and all inner groups."""
         yield self
         for group in self.groups:
-            yield from group.every()
+            yield from group.walk()
 
 
 @dataclass(frozen=True)
-class Form:
-    """All fields of a scene; those of `first` are not among the sections'."""
+class SceneForm:
+    """All fields of a scene."""
 
-    first: tuple[Field, ...]
-    sections: tuple[Group, ...]  # in the schema's order
-    additions: tuple[Addition, ...]  # of sections
+    first: tuple[Field, ...]  # the main fields, which the sections do not repeat
+    sections: tuple[Group, ...]  # all other fields, in the order of the schema
+    additions: tuple[Addition, ...]  # sections that may be added
 
     def in_rows(self) -> Iterator[tuple[Field, ...]]:
-        """The first fields one by one, but two sides that a lock may join together."""
+        """Iterate over the rows of the main fields: single fields, or two sides that a lock can join."""
         left = [*self.first]
         while left:
             field = left.pop(0)
-            place, _, name = field.key.rpartition(".")
-            joined = left and name in LOCKS and left[0].key == f"{place}.{LOCKS[name]}"
+            table, _, name = field.key.rpartition(".")
+            joined = left and name in LOCKED_SIDES and left[0].key == f"{table}.{LOCKED_SIDES[name]}"
             yield (field, left.pop(0)) if joined else (field,)
 
     def groups(self) -> Iterator[Group]:
-        """All groups, those in others too."""
+        """Iterate over all groups, inner ones included."""
         for section in self.sections:
-            yield from section.every()
+            yield from section.walk()
 
     def fields(self) -> Iterator[Field]:
-        """All fields."""
+        """Iterate over all fields."""
         yield from self.first
         for group in self.groups():
             yield from group.fields
@@ -138,35 +141,37 @@ class Form:
 # ---- from a scene's tables to a form ---------------------------------------------------------------------------------
 
 
-def form(data: Table) -> Form:
-    """The form of a scene's tables, which need not be valid."""
+def form(data: Table) -> SceneForm:
+    """Return the form of a scene's tables, which need not be valid."""
     whole = _group("", schema(), data, data)
-    names = replace(whole, label="name and title", groups=(), additions=(), page=_page("name"))
+    names = replace(whole, label="name and title", groups=(), additions=(), page=_docs_page("name"))
     sections = (names, *whole.groups)
-    known = {field.key: field for group in whole.every() for field in group.fields}
-    several = "target[0]" in {group.key for group in whole.every()}
+    known = {field.key: field for group in whole.walk() for field in group.fields}
+    several = "target[0]" in {group.key for group in whole.walk()}
     first = []
-    for labels in FIRST:
+    for labels in MAIN_FIELDS:
         found = []
         for key, label in labels.items():
             if several and key.startswith("target."):
-                key, label = key.replace("target", "target[0]", 1), f"{label} ({_words('target[0]')})"
+                key, label = key.replace("target", "target[0]", 1), f"{label} ({_label('target[0]')})"
+            elif key == "lens.back.z" and value_at("lens.front.z", data) == 0:
+                label = THICKNESS
             found += [replace(known[key], label=label)] if key in known else []
-        first += sorted(found, key=lambda field: not field.given)[:1]
+        first += sorted(found, key=lambda field: not field.is_set)[:1]
     taken = {field.key for field in first}
-    return Form(tuple(first), tuple(_less(section, taken) for section in sections), whole.additions)
+    return SceneForm(tuple(first), tuple(_without(section, taken) for section in sections), whole.additions)
 
 
-def _less(group: Group, taken: set[str]) -> Group:
-    """A group without some fields."""
+def _without(group: Group, taken: set[str]) -> Group:
+    """Return a group without the fields of some keys."""
     left = tuple(field for field in group.fields if field.key not in taken)
-    return replace(group, fields=left, groups=tuple(_less(inner, taken) for inner in group.groups))
+    return replace(group, fields=left, groups=tuple(_without(inner, taken) for inner in group.groups))
 
 
 def _group(key: str, node: Node, table: Table, data: Table, removable: bool = False) -> Group:
-    """The group of a table at a key; of no known kind, it has only the field that tells the kind."""
+    """Return the group of the table at a key; if its kind is unknown, only the field of the kind."""
     union = records_at(key, data)
-    kinds = of_kinds(union, table)
+    kinds = matching_records(union, table)
     tag, nodes = tags(union[0]), kinds[0]["properties"]
     order = sorted(nodes, key=lambda name: name not in tag) if len(kinds) == 1 else [*tag]
     required = {*kinds[0].get("required", ()), *(tag if len(union) > 1 else ())}
@@ -177,42 +182,41 @@ def _group(key: str, node: Node, table: Table, data: Table, removable: bool = Fa
         if not may_be:
             options = [tags(each)[name] for each in union] if name in tag else choices(inner)
             fields.append(_field(at, inner, table, options, required=name in required))
-        elif most := _most(inner):
-            groups.append(_list(at, inner, value, data, most=most))
+        elif maximum := _max_tables(inner):
+            groups.append(_list(at, inner, value, data, maximum=maximum))
         elif isinstance(value, dict):
             groups.append(_group(at, inner, value, data, removable=name not in required))
-        elif at in ASKED_FOR or len(may_be) > 1 or may_be[0].get("required"):
-            additions.append(Addition(at, f"Add {_words(at)}", new_table(at, data)))
-        else:  # a table that is there without being written
+        elif at in OPTIONAL_TABLES or len(may_be) > 1 or may_be[0].get("required"):
+            additions.append(Addition(at, f"Add {_label(at)}", new_table(at, data)))
+        else:  # a table that exists by default
             groups.append(_group(at, inner, {}, data))
     parts = {"fields": tuple(fields), "groups": tuple(groups), "additions": tuple(additions)}
-    return Group(key, _words(key), node.get("description", ""), _page(key), **parts, removable=removable)
+    return Group(key, _label(key), node.get("description", ""), _docs_page(key), **parts, removable=removable)
 
 
-def _list(key: str, node: Node, value: Any, data: Table, most: int) -> Group:
-    """The group of a list of tables; of one that may stand alone, such as a target, it is the table's own."""
-    given = [part if isinstance(part, dict) else {} for part in (value if isinstance(value, list) else [value])]
-    given = given if value else []
-    behind = f"{key}[{len(given)}]"
-    label = f"Add {'another ' if given else ''}{_words(key).removesuffix('s')}"
-    more = (Addition(behind, label, new_table(behind, data)),) if len(given) < most else ()
-    if len(given) == 1 and node.get("type") != "array":
-        alone = _group(key, node, given[0], data)
+def _list(key: str, node: Node, value: Any, data: Table, maximum: int) -> Group:
+    """Return the group of a list of tables; if the only table needs no list, such as a target, the table's group."""
+    tables = [part if isinstance(part, dict) else {} for part in (value if isinstance(value, list) else [value])]
+    tables = tables if value else []
+    behind = f"{key}[{len(tables)}]"
+    label = f"Add {'another ' if tables else ''}{_label(key).removesuffix('s')}"
+    more = (Addition(behind, label, new_table(behind, data)),) if len(tables) < maximum else ()
+    if len(tables) == 1 and node.get("type") != "array":
+        alone = _group(key, node, tables[0], data)
         return replace(alone, additions=(*alone.additions, *more))
-    groups = tuple(_group(f"{key}[{k}]", {}, part, data, removable=True) for k, part in enumerate(given))
-    return Group(
-        key, _words(key), node["description"], _page(key), fields=(), groups=groups, additions=more, removable=False
-    )
+    groups = tuple(_group(f"{key}[{k}]", {}, part, data, removable=True) for k, part in enumerate(tables))
+    page, meaning = _docs_page(key), node["description"]
+    return Group(key, _label(key), meaning, page, fields=(), groups=groups, additions=more, removable=False)
 
 
-def _most(node: Node) -> int:
-    """How many tables a list may have; 0: the node is none."""
+def _max_tables(node: Node) -> int:
+    """Return the largest number of tables that a list may have; 0 if the node is no list of tables."""
     lists = [form for form in alternatives(node) if form.get("type") == "array" and records(form)]
-    return lists[0].get("maxItems", MANY) if lists else 0
+    return lists[0].get("maxItems", MAX_TABLES) if lists else 0
 
 
 def _field(key: str, node: Node, table: Table, options: list[Any], required: bool) -> Field:
-    """The field of a key of a table."""
+    """Return the field of a key of a table."""
     name = key.rpartition(".")[2]
     inner = [node, *(part for form in alternatives(node) for part in (form, *form.get("prefixItems", ())))]
     inner += [form["items"] for form in alternatives(node) if isinstance(form.get("items"), dict)]
@@ -221,18 +225,19 @@ def _field(key: str, node: Node, table: Table, options: list[Any], required: boo
     if control == "text" and any(form.get("type") == "boolean" for form in alternatives(node)):
         options = [True, False, *options]
     return Field(
-        key, label=_words(key), unit=node["unit"] if node["unit"] != "none" else "",
-        least=ends.get("minimum"), most=ends.get("maximum"),
-        meaning=_kinds_told().get(plain(key), node["description"]),
+        key, label=_label(key), unit=node["unit"] if node["unit"] != "none" else "",
+        minimum=ends.get("minimum"), maximum=ends.get("maximum"),
+        meaning=_kind_meanings().get(without_numbers(key), node["description"]),
         default=as_words(node["default"]) if "default" in node else "",
         example=as_words(node["examples"][0]) if "examples" in node else "",
         control=control, choices=tuple(map(as_words, options)) if control != "check" else (),
-        value="" if value is None else as_words(value), given=value is not None, required=required, page=_page(key),
+        value="" if value is None else as_words(value), is_set=value is not None, required=required,
+        page=_docs_page(key),
     )  # fmt: skip
 
 
 def _control(node: Node, value: Any) -> Control:
-    """With what a value is entered; it depends on the value where a number or a list may stand."""
+    """Return the control that edits a value; it depends on the value if the key takes a number or a list."""
     if "enum" in node or "const" in node:
         return "check" if node.get("const") is True else "choice"
     forms = {form.get("type"): form for form in alternatives(node)}
@@ -250,21 +255,21 @@ def _control(node: Node, value: Any) -> Control:
 
 
 @functools.cache
-def _kinds_told() -> Mapping[str, str]:
-    """The sentences of the keys that tell a kind, with those of all kinds."""
-    return {plain(row.key): row.meaning for row in rows() if row.key.rpartition(".")[2] in TAGS}
+def _kind_meanings() -> Mapping[str, str]:
+    """Return the descriptions, by key, of the keys that state a kind, with the meanings of all kinds."""
+    return {without_numbers(row.key): row.meaning for row in rows() if row.key.rpartition(".")[2] in TAGS}
 
 
-def _words(key: str) -> str:
-    """The last part of a key in plain words: control points, target 2."""
+def _label(key: str) -> str:
+    """Return the last part of a key as words: control points, target 2."""
     name, _, number = key.rpartition(".")[2].rstrip("]").partition("[")
     return f"{name.replace('1e2', '1/e²').replace('_', ' ')} {int(number) + 1 if number else ''}".rstrip()
 
 
-def _page(key: str) -> str:
-    """The place of a key in the documentation, from its first page: a table, or the keys that are in none."""
+def _docs_page(key: str) -> str:
+    """Return the address of a key in the documentation, relative to its first page: the section of its table."""
     alone = [name for name, node in schema()["properties"].items() if not records(node)]
-    table = plain(key).partition(".")[0]
+    table = without_numbers(key).partition(".")[0]
     return f"reference/scene-keys.html#keys-{alone[0] if table in alone else table}"
 
 
@@ -273,54 +278,55 @@ def _page(key: str) -> str:
 
 @dataclass(frozen=True)
 class Slider:
-    """The ends and the step of a slider, as HTML has numbers."""
+    """Range and step of a slider, as HTML writes numbers."""
 
-    least: str
-    most: str
+    minimum: str
+    maximum: str
     step: str
     value: str
-    middle: str = ""  # of a pair, whose width the slider has: both ends move about it
+    middle: str = ""  # centre of a pair, whose width the slider sets; "" for a number
 
 
 def slider(field: Field) -> Slider | None:
-    """A slider from half to double the number of a field, or the width of its pair; None: it has no such number."""
+    """Return a slider from half to twice the number of a field, or the width of its pair; None without a number."""
     words, middle = field.value or field.default or field.example, ""
     value = number(words) if field.control == "number" else None
     if field.control == "pair":
         ends = [number(part) for part in words.replace(";", ",").split(",")]
         if len(ends) == 2 and None not in ends:
             value, middle = ends[1] - ends[0], f"{(ends[0] + ends[1]) / 2:.12g}"
-    if not value or field.least is None or field.most is None:
+    if not value or field.minimum is None or field.maximum is None:
         return None
     low, high = sorted((value / 2, 2 * value))
-    low, high = max(low, field.least), min(high, field.most)
+    low, high = max(low, field.minimum), min(high, field.maximum)
     if not low < high:
         return None
-    ten = 10.0 ** math.floor(math.log10((high - low) / STEPS))
-    step = next(figure * ten for figure in ROUND if figure * ten * STEPS <= high - low)
+    ten = 10.0 ** math.floor(math.log10((high - low) / MIN_STEPS))
+    step = next(figure * ten for figure in STEP_DIGITS if figure * ten * MIN_STEPS <= high - low)
     ends = math.ceil(low / step) * step, math.floor(high / step) * step
     return Slider(*(f"{each:.12g}" for each in (*ends, step, value)), middle)
 
 
-def html(form: Form, errors: Mapping[str, str], has_docs: bool = False) -> str:
-    """The form as HTML, to be put into a page: no script, no style, and a sentence of `errors` beside its key.
+def html(form: SceneForm, errors: Mapping[str, str], has_docs: bool = False) -> str:
+    """Return the form as HTML for a page, without script and style.
 
-    A control has its key as data-key and name, a slider data-key alone.  A button has data-key, and as data-value the
-    JSON of what `scene_text.changed` sets there; null takes it out.  A sentence on no key of the form is at the top.
-    has_docs: is the documentation there, to which sections lead?
+    A control has its key as data-key and name, a slider as data-key only.  A button has data-key, and in data-value the
+    JSON of the value that `scene_text.changed` sets; null removes the table.
+    errors: sentences by key, which are shown beside their controls, or at the top without a control.
+    has_docs: True if the documentation is available, to which the sections link.
     """
     known = [*(field.key for field in form.first), *(key for section in form.sections for key in _keys(section))]
     placed: dict[str, list[str]] = {}
     for key, sentence in errors.items():
-        placed.setdefault(_nearest(key, known), []).append(sentence)
-    wrong = [section for section in form.sections if _keys(section) & {*placed}]  # they are open
+        placed.setdefault(_owner(key, known), []).append(sentence)
+    wrong = [section for section in form.sections if _keys(section) & {*placed}]  # shown open
     template = environment().get_template("form.html.j2")
     return template.render(form=form, placed=placed, wrong=wrong, slider=slider, has_docs=has_docs)
 
 
 @functools.cache
 def environment() -> jinja2.Environment:
-    """The templates of this folder; all text is escaped, since names and scenes are a user's."""
+    """Return the templates of this folder; all text is escaped, since names and scenes come from users."""
     import jinja2
 
     found = jinja2.Environment(
@@ -332,17 +338,17 @@ def environment() -> jinja2.Environment:
 
 
 def _keys(group: Group) -> set[str]:
-    """The keys of a group's tables and fields."""
-    return {key for each in group.every() for key in (each.key, *(field.key for field in each.fields)) if key}
+    """Return the keys of a group's tables and fields."""
+    return {key for each in group.walk() for key in (each.key, *(field.key for field in each.fields)) if key}
 
 
 def html_id(key: str) -> str:
-    """The id of a key's control; those of what belongs to it go on behind."""
+    """Return the id of a key's control; ids of related elements have a suffix."""
     return "key-" + re.sub(r"[^a-z0-9_]+", "-", key.lower()).strip("-")
 
 
-def _nearest(key: str, known: Iterable[str]) -> str:
-    """The field or the group that a sentence on a key belongs to: its own, or one that holds it; "": none."""
+def _owner(key: str, known: Iterable[str]) -> str:
+    """Return the key of the field or of the innermost group to which a sentence on a key belongs; "" if none."""
     alike = {other.replace("[0]", ""): other for other in known} | {other: other for other in known}
     while key:
         if found := alike.get(key) or alike.get(key.replace("[0]", "")):

@@ -1,8 +1,8 @@
-"""The guard before every request: any web page, and any program here, can talk to a server on loopback.
+"""The guard before every request, since any web page and any local program can talk to a server on loopback.
 
-A request is let in if its Host is this server's (or a foreign name has been pointed here), its Origin, where there is
-one, is this server's (or another page sends it), and it has the token of this start, from the address that the terminal
-prints or from the cookie which that sets.  Bodies are counted while they arrive.
+A request is accepted if all of this holds: its Host is this server (a foreign name may point here); its Origin, if
+any, is this server (another page may send it); and it has the token of this start, from the address that the terminal
+prints or from the cookie that this address sets.  The size of a body is checked while it arrives.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
 Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 
-LARGEST_BODY = 4_000_000  # bytes: a scene file, as JSON
+MAX_BODY_SIZE = 4_000_000  # bytes of a body, enough for a scene file as JSON
 POLICY = (
     "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; base-uri 'none'; form-action 'self'; "
     "frame-ancestors 'none'"
@@ -37,35 +37,35 @@ HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Content-Security-Policy": POLICY,
 }
-OWN = ("same-origin", "none")  # pages, by Sec-Fetch-Site: this server's own, or an address that a person typed
-WHY_NOT = {
+OWN_SITES = ("same-origin", "none")  # accepted Sec-Fetch-Site: pages of this server, or an address that a person typed
+REFUSALS = {
     "host": "This address is not the workbench's; open the one that the terminal shows.",
-    "origin": "Another web page asked for this; the workbench answers its own pages alone.",
-    "token": "The workbench was started anew, or this address is incomplete: open the one that the terminal shows. "
-    "Nothing is lost: scenes and designs lie in their folders.",
-    "size": "This is too large to be sent here.",
+    "origin": "Another web page sent this request; the workbench answers only its own pages.",
+    "token": "The workbench was restarted, or this address is incomplete; open the one that the terminal shows. "
+    "Nothing is lost: scenes and designs are in their folders.",
+    "size": "The request is too large; send a smaller file.",
 }
 
 
 class TooLarge(Exception):
-    """A body holds more bytes than it may."""
+    """The body of a request exceeds its limit."""
 
 
 class Guard:
-    """ASGI middleware around the application of one start."""
+    """ASGI middleware that protects the application of one start."""
 
     def __init__(self, app: Any, port: int, token: str, larger: tuple[str, int] = ("", 0)) -> None:
-        """larger: an expression for the paths to which more may be sent, and how many bytes."""
+        """Guard `app`.  larger: regular expression of the paths with larger bodies, and their limit in bytes."""
         self._app, self._token, self._larger = app, token, larger
-        self.cookie = f"bstcad-{port}"  # cookies know no ports
+        self.cookie = f"bstcad-{port}"  # browsers share cookies between ports
         self._hosts = {f"{name}:{port}" for name in ("127.0.0.1", "localhost")}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, or hand it on."""
+        """Refuse a request, or pass it to the application."""
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
-        if scope["type"] != "http":  # the workbench has no sockets
+        if scope["type"] != "http":  # the workbench uses no web sockets
             await send({"type": "websocket.close", "code": 1008})
             return
         send = _with_headers(send)
@@ -73,12 +73,12 @@ class Guard:
         if refused is not None:
             await refused(scope, receive, send)
             return
-        most = self._larger[1] if re.fullmatch(self._larger[0], scope["path"]) else LARGEST_BODY
+        limit = self._larger[1] if re.fullmatch(self._larger[0], scope["path"]) else MAX_BODY_SIZE
         length = Headers(scope=scope).get("content-length", "")
-        if length.isdecimal() and int(length) > most:
+        if length.isdecimal() and int(length) > limit:
             await _refusal("size", 413)(scope, receive, send)
             return
-        body = _Body(receive, send, most)
+        body = _Body(receive, send, limit)
         try:
             await self._app(scope, body.receive, body.send)
         except TooLarge:
@@ -86,7 +86,7 @@ class Guard:
                 await _refusal("size", 413)(scope, receive, send)
 
     def _refusal(self, scope: Scope) -> Response | None:
-        """Why a request is not let in; None: it is."""
+        """Return the refusal of a request, or the redirect of an address with a token; None to let it in."""
         headers = Headers(scope=scope)
         if headers.get("host", "") not in self._hosts:
             return _refusal("host", 403)
@@ -94,11 +94,11 @@ class Guard:
         if origin is not None and origin.removeprefix("http://") not in self._hosts:
             return _refusal("origin", 403)
         given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
-        if scope["method"] == "GET" and given and self._is_token(given):  # followed from the terminal, wherever that is
-            answer = _onward(scope["path"], from_own=site in OWN)
+        if scope["method"] == "GET" and given and self._is_token(given):  # a link followed from any terminal
+            answer = _redirect(scope["path"], from_own=site in OWN_SITES)
             answer.set_cookie(self.cookie, self._token, httponly=True, samesite="strict", path="/")
             return answer
-        if site not in OWN:
+        if site not in OWN_SITES:
             return _refusal("origin", 403)
         if not self._is_token(cookie_parser(headers.get("cookie", "")).get(self.cookie, "")):
             return _refusal("token", 403)
@@ -109,30 +109,30 @@ class Guard:
 
 
 def _refusal(why: str, code: int) -> Response:
-    return PlainTextResponse(WHY_NOT[why], status_code=code)
+    return PlainTextResponse(REFUSALS[why], status_code=code)
 
 
-def _onward(path: str, from_own: bool) -> Response:
-    """To the same page without the token in its address.
+def _redirect(path: str, from_own: bool) -> Response:
+    """Return an answer that leads to the same page without the token in its address.
 
-    A redirect goes on counting as the first page's: one from a terminal in a web page ends in a page that is asked for
-    from elsewhere, and without the strict cookie.  So a page of our own leads on from there.
+    Browsers count a redirect as a request of the page that began it.  From a terminal in a web page it would arrive as
+    a foreign request without the strict cookie, so there a page of our own leads on.
     """
-    place = quote("/" + path.lstrip("/"))  # //name would be another server; no quotation mark is left
+    address = quote("/" + path.lstrip("/"))  # //name would be another server; no quotation mark is left
     if from_own:
-        return RedirectResponse(place, status_code=303)
-    return HTMLResponse(f'<!doctype html><title>bstcad</title><meta http-equiv="refresh" content="0;url={place}">')
+        return RedirectResponse(address, status_code=303)
+    return HTMLResponse(f'<!doctype html><title>bstcad</title><meta http-equiv="refresh" content="0;url={address}">')
 
 
 class _Body:
-    """A request and its answer, of which there is none once the body holds more bytes than it may."""
+    """The body of a request, with a limit, and the answer, which is dropped once the limit is exceeded."""
 
-    def __init__(self, receive: Receive, send: Send, most: int) -> None:
-        self._receive, self._send, self._left = receive, send, most
+    def __init__(self, receive: Receive, send: Send, limit: int) -> None:
+        self._receive, self._send, self._left = receive, send, limit
         self.answered = False
 
     async def receive(self) -> MutableMapping[str, Any]:
-        """The next part of the body.  TooLarge."""
+        """Return the next part of the body.  TooLarge if the limit is exceeded."""
         message = await self._receive()
         self._left -= len(message.get("body", b""))
         if self._left < 0:
@@ -140,14 +140,14 @@ class _Body:
         return message
 
     async def send(self, message: MutableMapping[str, Any]) -> None:
-        """Answer, unless the body is too large: starlette answers every error before it hands it on."""
+        """Send the answer, unless the body is too large: starlette answers every error before it raises it."""
         if self._left >= 0:
             self.answered = True
             await self._send(message)
 
 
 def _with_headers(send: Send) -> Send:
-    """Answers with the policy of their pages."""
+    """Return a function that sends answers with HEADERS."""
 
     async def sent(message: MutableMapping[str, Any]) -> None:
         if message["type"] == "http.response.start":

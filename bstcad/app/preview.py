@@ -1,8 +1,7 @@
-"""A preview of a scene: the light that its lens will throw, in about a second, by the steps of a design made small.
+"""A preview of a scene: the light of its lens after about a second, from a reduced design.
 
-The preview is a hasty design (`Task.hasty`) of the same scene with fewer pixels, control points, ray tubes and
-evaluations, so that a pixel has as many control cells and tubes as it has in a draft.  It shows no detail that is finer
-than its pixels.
+The preview is a quick design (`Task.hasty`) of the same scene with fewer pixels, control points, ray tubes and
+evaluations.  A pixel has as many control cells and tubes as in a draft.  Detail finer than its pixels is not shown.
 """
 
 from __future__ import annotations
@@ -31,134 +30,134 @@ from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Progress
 from bstcad.tailoring.source_image import Spread
 
-COARSE_NET = 33  # of the first rounds of stage 1
-CELLS = 48  # of the transport, a side
-SEVERAL, TIMES = 0.5, 3  # of several goals: each of these times this, and times the evaluations
-OF_A_POINT = 3  # rounds of stage 1, at least, for the light of a point
-SEEN = 2.5  # ray tubes a pixel and side, by which the picture is taken: others than those that tailored the lens
-RAYS = 160  # a side, by which light that goes astray is counted
-SHAPE = 129  # points a side, at which the thickness is looked at
-IMAGE_PLACES = 16  # a side of the back, through each of which the source is seen
-SEED = 77  # of those rays
+COARSE_NET = 33  # control points per side in the first rounds of stage 1
+TRANSPORT_CELLS = 48  # cells per side of the transport map
+GOALS_SIZE_FACTOR = 0.5  # factor on pixels, net and tubes for a scene of several goals
+GOALS_EVALUATIONS_FACTOR = 3  # factor on the evaluations for a scene of several goals
+MIN_POINT_ROUNDS = 3  # smallest number of rounds of stage 1 for a point source
+TUBES_PER_PIXEL = 2.5  # ray tubes per pixel and side for the picture, independent of those that tailored the lens
+LEDGER_RAYS = 160  # rays per side for the ledger of the light
+SHAPE_POINTS = 129  # points per side for the thickness
+IMAGE_POINTS = 16  # points per side of the back for the images of the source
+SEED = 77  # seed of the ledger's rays
 
 
 @dataclass(frozen=True)
-class Pains:
-    """How much work goes into a preview."""
+class PreviewSize:
+    """Size of a preview's computation."""
 
-    pixels: int  # of a picture's longer side
-    net: int  # control points along the longer side; of small factors, by which cosine transforms are quick
-    tubes: int  # a side
-    rounds: int  # of stage 1
-    evaluations: int  # of stage 2
-    blurred: int  # the same of a source of some size, each of which takes twice as long
+    pixels: int  # pixels along the longer side of a picture
+    net: int  # control points along the longer side; small prime factors make the cosine transforms fast
+    tubes: int  # ray tubes per side
+    rounds: int  # rounds of stage 1
+    evaluations: int  # evaluations of stage 2 for a point source
+    blurred: int  # evaluations of stage 2 for an extended source, each twice as slow
 
 
-AT_ONCE = Pains(pixels=72, net=180, tubes=240, rounds=2, evaluations=12, blurred=8)
-SETTLED = Pains(pixels=128, net=320, tubes=384, rounds=4, evaluations=50, blurred=30)
+QUICK = PreviewSize(pixels=72, net=180, tubes=240, rounds=2, evaluations=12, blurred=8)
+REFINED = PreviewSize(pixels=128, net=320, tubes=384, rounds=4, evaluations=50, blurred=30)
 
 
 class Outdated(Exception):
-    """The scene has changed meanwhile: nobody waits for this preview any more."""
+    """The preview is no longer needed, since the scene has changed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Preview:
-    """A lens made small, its light, and the figures of both."""
+    """Lens of a reduced design, its light, and their figures."""
 
-    scene: Scene  # made small
+    scene: Scene  # reduced scene
     lens: Lens
-    pictures: tuple[tuple[np.ndarray, np.ndarray], ...]  # of each target (wanted, irradiance), both (rows, columns)
-    flux: dict[str, float]  # the ledger of the light; its lines sum to 1
-    shape: dict[str, float | None]  # of the lens, by the keys of report.json
-    source_images: tuple[Blur | None, ...]  # the source's image on each target; None of a point
-    lit: float  # share of the back, up to its rim, through which light of one point of the source passes
-    remarks: tuple[str, ...]  # on the scene, and on light that cannot get where it is wanted
-    seconds: float = math.nan
+    pictures: tuple[tuple[np.ndarray, np.ndarray], ...]  # (target, irradiance) per target, both (rows, columns)
+    flux: dict[str, float]  # ledger of the light: fractions that sum to 1
+    shape: dict[str, float | None]  # shape of the lens, by the keys of report.json
+    source_images: tuple[Blur | None, ...]  # image of the source on each target; None for a point
+    lit_fraction: float  # fraction of the back's area, up to its rim, that the central point of the source lights
+    remarks: tuple[str, ...]  # warnings of the scene, and remarks on light that cannot reach the target
+    seconds: float = math.nan  # time of the preview (s)
 
     @property
     def rrmsds(self) -> tuple[float, ...]:
-        """Of each target, on the pixels of the preview."""
+        """RRMSD on each target, by the pixels of the preview."""
         return tuple(rrmsd(target, picture) for target, picture in self.pictures)
 
 
-def preview(scene: Scene, pains: Pains = AT_ONCE, outdated: Callable[[], bool] = lambda: False) -> Preview:
-    """The preview of a scene.  SceneError where a design would be refused; Outdated once `outdated` says so.
+def preview(scene: Scene, size: PreviewSize = QUICK, outdated: Callable[[], bool] = lambda: False) -> Preview:
+    """Return the preview of a scene, which depends on the scene only, not on earlier previews.
 
-    It depends on the scene alone.  (From the map of a preview before, stage 1 would need a round less, 0.1 s for
-    collimated light; but then the picture keeps some of the scene before.)
+    SceneError if a design would be refused; Outdated once `outdated` returns True.
     """
     began, remarks = time.perf_counter(), list(scene.warnings())
-    small = made_small(scene, pains)
-    made = pipeline.design(small, progress=_listening(outdated, remarks), later=True, hasty=True)
-    return replace(_lit(small, made), remarks=tuple(remarks), seconds=time.perf_counter() - began)
+    small = reduced_scene(scene, size)
+    made = pipeline.design(small, progress=_progress(outdated, remarks), later=True, hasty=True)
+    return replace(_evaluate(small, made), remarks=tuple(remarks), seconds=time.perf_counter() - began)
 
 
-def _listening(outdated: Callable[[], bool], remarks: list[str]) -> Progress:
-    """A progress that raises Outdated, and collects remarks on light that cannot get where it is wanted."""
+def _progress(outdated: Callable[[], bool], remarks: list[str]) -> Progress:
+    """Return a progress function that raises Outdated and collects remarks on light that cannot reach the target."""
 
-    def told(stage: str, done: int, total: int, text: str) -> None:
+    def report(stage: str, done: int, total: int, text: str) -> None:
         if outdated():
             raise Outdated
         if stage == "reach":
             remarks.append(text)
 
-    return told
+    return report
 
 
-def made_small(scene: Scene, pains: Pains) -> Scene:
-    """The scene with the pixels, control points and knobs of a preview; its method is that of this program."""
+def reduced_scene(scene: Scene, size: PreviewSize) -> Scene:
+    """Return the scene with the pixels, control points and settings of a preview, and bstcad's own method."""
     several = len(scene.targets) > 1 or scene.wavefront is not None
-    share, times = (SEVERAL, TIMES) if several else (1.0, 1)
-    most = round(share * pains.net)
-    net = scene.lens.back.control_points or most
-    if max(as_pair(net)) > most:
-        net = coarser(net, most)
-    evaluations = times * (pains.evaluations if scene.source.extent is None else pains.blurred)
+    size_factor, evaluations_factor = (GOALS_SIZE_FACTOR, GOALS_EVALUATIONS_FACTOR) if several else (1.0, 1)
+    max_net = round(size_factor * size.net)
+    net = scene.lens.back.control_points or max_net
+    if max(as_pair(net)) > max_net:
+        net = coarser(net, max_net)
+    evaluations = evaluations_factor * (size.evaluations if scene.source.extent is None else size.blurred)
     changes: dict[str, Any] = dict.fromkeys(f"tailoring.{key}" for key in ("method", "accuracy", "max_time"))
     changes |= {
         "lens.back.control_points": net,
         "tailoring.quality": "draft",
         "tailoring.levels": [coarser(net, COARSE_NET), net] if max(as_pair(net)) > 1.5 * COARSE_NET else None,
-        "tailoring.rays": round(share * pains.tubes),
-        "tailoring.transport_grid": CELLS,
+        "tailoring.rays": round(size_factor * size.tubes),
+        "tailoring.transport_grid": TRANSPORT_CELLS,
         "tailoring.stage2_iterations": evaluations,
-        "tailoring.rounds": max(pains.rounds, 0 if scene.source.parallel else OF_A_POINT),
+        "tailoring.rounds": max(size.rounds, 0 if scene.source.parallel else MIN_POINT_ROUNDS),
     }
     for key, target in zip(scene.target_keys, scene.targets, strict=True):
-        factor = max(max(target.columns_rows) / (share * pains.pixels), 1.0)
+        factor = max(max(target.columns_rows) / (size_factor * size.pixels), 1.0)
         changes[f"{key}.pixels"] = target.fewer_pixels(factor)
     return scene.changed(changes)
 
 
-def _lit(scene: Scene, made: Made) -> Preview:
-    """The preview of a lens: its light by fresh tubes, of a source of some size by its images, and its figures."""
+def _evaluate(scene: Scene, made: Made) -> Preview:
+    """Return the preview of a lens: its light, traced by independent tubes or by images of the source, and figures."""
     pictures, channels, lens = [], scene.channels(), made.lens
     for goal in made.goals:
         light = _picture(scene, lens, goal)
         pictures.append((goal.picture, light * (goal.picture.sum() / max(light.sum(), 1e-300))))
-    rays = max(round(side_factor(channels) * RAYS), 8)
+    rays = max(round(side_factor(channels) * LEDGER_RAYS), 8)
     ledger = simulated(lens, channels, scene.target.screen, n=rays, seed=SEED).flux
-    images = [blur(channels, lens, target.screen, target.irradiance(), n=IMAGE_PLACES) for target in scene.targets]
+    images = [blur(channels, lens, target.screen, target.irradiance(), n=IMAGE_POINTS) for target in scene.targets]
     return Preview(
-        scene, lens, tuple(pictures), flux=ledger, shape=describe(lens, SHAPE),
-        source_images=tuple(images), lit=_lit_share(scene, lens), remarks=(),
+        scene, lens, tuple(pictures), flux=ledger, shape=describe(lens, SHAPE_POINTS),
+        source_images=tuple(images), lit_fraction=_lit_fraction(scene, lens), remarks=(),
     )  # fmt: skip
 
 
-def _lit_share(scene: Scene, lens: Lens) -> float:
-    """The share of the back, up to its rim, through which light of one point of the source passes."""
-    x, y = (middle(ends).reshape(-1) for ends in corners(lens.apertures[1], IMAGE_PLACES))
-    _, flux = landing_pixels(scene.channels()[:1], lens, scene.target.screen, IMAGE_PLACES)
+def _lit_fraction(scene: Scene, lens: Lens) -> float:
+    """Return the fraction of the back's area, up to its rim, that the central point of the source lights."""
+    x, y = (middle(ends).reshape(-1) for ends in corners(lens.apertures[1], IMAGE_POINTS))
+    _, flux = landing_pixels(scene.channels()[:1], lens, scene.target.screen, IMAGE_POINTS)
     inside = lens.apertures[1].contains(x, y)
-    clear = lens.apertures[1].area / lens.outline.area  # of a mount, less than all
+    clear = lens.apertures[1].area / lens.outline.area  # below 1 with a mount
     return clear * float((flux[0] > 0)[inside].double().mean())
 
 
 @torch.no_grad()
 def _picture(scene: Scene, lens: Lens, goal: Goal) -> np.ndarray:
-    """(rows, columns) of the light on the receiver of a goal."""
-    n = round(SEEN * max(goal.receiver.shape))
+    """Return the light on the receiver of a goal, (rows, columns)."""
+    n = round(TUBES_PER_PIXEL * max(goal.receiver.shape))
     if not scene.source.extent:
         return tubes_picture(lens, scene.channels(), goal.receiver, n).numpy()
     spread = Spread(scene.source, scene.with_source_scaled(0.0).channels(), scene.draw)

@@ -1,4 +1,4 @@
-"""A preview, a plan and a finished design as the page gets them: pictures, figures in words, and the solid to turn."""
+"""JSON of previews and plans for the page: pictures, formatted figures, and the solid to be turned."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from bstcad.report.rendering import data_url, turnable
 from bstcad.report.units import Rows, duration, number, quantity, tables
 from bstcad.sweep.prediction import Interval
 
-CELLS = 96  # of the lens to be turned, a side
-# Largest difference of a finished lens's thicknesses and relief from the preview's, as a part of the relief, among ten
-# templates: of a back that is lit up to its rim (0.007), and of one dark in places (0.43), where it bends on.
-SPREAD, DARK_SPREAD = 0.03, 0.45
-LIT = 0.99  # share of the back that light passes, from which on it counts as lit up to its rim
+SOLID_CELLS = 96  # cells per side of the solid to be turned
+# Error of the preview's thicknesses and relief, as a fraction of the relief.  The largest differences from finished
+# lenses among ten templates are 0.007 for a back that is lit up to its rim, and 0.43 for a back with dark areas.
+SHAPE_ERROR, DARK_SHAPE_ERROR = 0.03, 0.45
+MIN_LIT_FRACTION = 0.99  # fraction of the back's area from which on it counts as lit up to its rim
 
 
 def of_preview(found: Preview) -> dict[str, Any]:
-    """The pictures on each target, the lens with its light, and figures."""
+    """Return the pictures on each target, the lens with its light, and the figures."""
     path = light_path_of(found.scene, found.lens, found.pictures)
     seen = [(*pair, image) for pair, image in zip(found.pictures, found.source_images, strict=True)]
     views = [View.of(found.scene, k) for k in range(len(found.pictures))]
@@ -38,19 +38,19 @@ def of_preview(found: Preview) -> dict[str, Any]:
     ]  # fmt: skip
     return {
         "seconds": round(found.seconds, 3), "targets": targets, "figures": figures(found),
-        "remarks": list(found.remarks), "solid": json.loads(turnable(found.lens, path, cells=CELLS) or "null"),
+        "remarks": list(found.remarks), "solid": json.loads(turnable(found.lens, path, cells=SOLID_CELLS) or "null"),
     }  # fmt: skip
 
 
 def figures(found: Preview) -> Rows:
-    """(name, value) of the light and the shape of a lens."""
-    apart, optic = SPREAD if found.lit >= LIT else DARK_SPREAD, found.scene.optic
+    """Return the figures of a lens's light and shape as rows (name, value)."""
+    apart, optic = SHAPE_ERROR if found.lit_fraction >= MIN_LIT_FRACTION else DARK_SHAPE_ERROR, found.scene.optic
     shown = tables("preview_figures.txt.j2", flux=found.flux, shape=found.shape, optic=optic, apart=apart)
     return shown["figures"]
 
 
 def of_plan(plan: Mapping[str, Any]) -> dict[str, Any]:
-    """The effects that are left out, a row each."""
+    """Return the effects that are left out, a row each, with the chosen net and the verdict."""
     rows = [
         [" ".join(filter(None, (LEFT_OUT[entry.kind], entry.detail and f"({entry.detail})"))), *changes(entry), of]
         for goal in plan["goals"]
@@ -62,16 +62,16 @@ def of_plan(plan: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def of_predictions(plan: Mapping[str, Any]) -> dict[str, Any]:
-    """Seconds and RRMSD of each quality as predicted, or why they are not."""
+    """Return the predicted seconds and RRMSD of each quality, or the reason why there is no prediction."""
     if plan["predicted"] is None:
         none = {"not_predicted": plan["not_predicted"], "notes": [], "qualities": {}}
         return none | {"verdict": plan["verdict"] if plan["verdict"]["kind"] == "blurred" else None}
-    known = {quality: told(each["seconds"], each["rrmsd"]) for quality, each in plan["predicted"].items()}
+    known = {quality: quality_words(each["seconds"], each["rrmsd"]) for quality, each in plan["predicted"].items()}
     return {"not_predicted": None, "notes": plan["notes"], "qualities": known, "verdict": plan["verdict"]}
 
 
-def told(seconds: Interval, rrmsd: Interval) -> dict[str, str]:
-    """Return a quality in words, with the ranges that nine of ten designs keep to."""
+def quality_words(seconds: Interval, rrmsd: Interval) -> dict[str, str]:
+    """Return the prediction of a quality in words, with the 90 % intervals."""
     (least, likely, most), (low, error, high) = seconds, rrmsd
     span = f"{duration(least)} to {duration(most)}; RRMSD {number(low)} to {number(high)}"
     return {"seconds": duration(likely), "rrmsd": number(error), "range": f"nine of ten designs: {span}"}

@@ -1,7 +1,7 @@
-"""A drawing of a scene from the side, with its dimensions: light, lens and wall, as the keys of its text have them.
+"""A side view of a scene with its dimensions: light, lens and wall, by the keys of its text.
 
-It is drawn by what stands in the text, right or wrong, and is not to scale: lens and wall are each drawn in a size that
-can be seen.  An element with data-of belongs to the keys that begin so, and lights up while one of them is changed.
+The text need not be valid, and the drawing is not to scale.  An element with data-of belongs to all keys with that
+prefix and is highlighted while one of them is edited.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from bstcad.app.kinds import are_numbers, is_mirror, value_at
 
 
 def svg(data: Mapping[str, Any]) -> str:
-    """The drawing as an SVG element; "" where the tables have no lens or no target."""
+    """Return the drawing as an SVG element; "" without a lens, a source or a target."""
     lens, target, source = (data.get(name) for name in ("lens", "target", "source"))
     targets = target if isinstance(target, list) else [target]
     if not all(isinstance(table, Mapping) for table in (lens, source, *targets)) or not targets:
@@ -34,12 +34,12 @@ def _number(key: str, data: Any) -> float | None:
 
 
 def _between(start: float | None, end: float | None) -> str:
-    """The distance of two places along z in words; "" where one of them is not known."""
+    """Return a distance along z as text; "" if one of the positions is unknown."""
     return "" if start is None or end is None else f"{end - start:.6g} mm"
 
 
 def _across(outline: Any) -> str:
-    """The size of an outline in words."""
+    """Return the size of an outline as text."""
     width, height, radius, diameter = (_number(key, outline) for key in ("width", "height", "radius", "diameter"))
     if width is not None and height is not None:
         return f"{width:g} × {height:g} mm"
@@ -48,6 +48,6 @@ def _across(outline: Any) -> str:
 
 
 def _range(ends: Any) -> str:
-    """How long a range is."""
+    """Return the length of a range as text."""
     known = isinstance(ends, list) and len(ends) == 2 and are_numbers(*ends)
     return f"{ends[1] - ends[0]:.6g} mm" if known else ""

@@ -1,9 +1,9 @@
-"""The preview of a scene in a notebook: widgets that change it, the light that follows, and the scene as it then is.
+"""The workbench of a notebook: widgets that change a scene, with a preview of its light.
 
     bench = bstcad.workbench("my-lens.toml")   # shown by the cell
     design = bstcad.design(bench.scene)
 
-Widgets talk to the notebook's own kernel, wherever that runs; a page in a frame would talk to this machine alone.
+Widgets talk to the notebook's kernel, on whatever machine it runs; a page in a frame would need the local machine.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from bstcad.scene import scene_file
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene, load, of_text
 
-WIDE = "180px"  # of a description
+DESCRIPTION_WIDTH = "180px"  # width of a widget's label
 
 
 def workbench(scene: Scene | str | os.PathLike[str]) -> Workbench:
-    """A scene, or a scene file, to be changed in a notebook while its preview follows.  SceneError."""
+    """Return the workbench of a scene or a scene file, to be shown in a notebook.  SceneError for an invalid scene."""
     return Workbench(scene)
 
 
 class Workbench:
-    """The widgets of a scene; `scene` is the scene as it is now, `text` its file's text."""
+    """Widgets of a scene; `scene` is the current scene, `text` the text of its file."""
 
     def __init__(self, scene: Scene | str | os.PathLike[str]) -> None:
         try:
@@ -44,20 +44,23 @@ class Workbench:
         self._path = None if isinstance(scene, Scene) else Path(scene).expanduser()
         self.scene = scene if isinstance(scene, Scene) else load(self._path)
         self.text = self.scene.toml() if self._path is None else scene_file.read(self._path)[0]
-        self.preview: Preview | None = None  # of the scene, if one could be made
+        self.preview: Preview | None = None  # latest preview; None before the first
         self._number, self._lock = 0, threading.Lock()
-        self._said, self._light = ipywidgets.HTML(), ipywidgets.HTML()
-        found = form.form(scene_text.tables(self.text)).first  # the keys that most people need
+        self._message, self._light = ipywidgets.HTML(), ipywidgets.HTML()
+        found = form.form(scene_text.tables(self.text)).first
         self.controls = {field.key: self._control(field) for field in found}
         self.box = ipywidgets.HBox(
-            [ipywidgets.VBox([self._light, self._said]), ipywidgets.VBox(list(self.controls.values()))]
+            [ipywidgets.VBox([self._light, self._message]), ipywidgets.VBox(list(self.controls.values()))]
         )
         self.refresh()
 
     def set(self, key: str, value: Any) -> None:
-        """Change a value by its dotted key, as the widgets do, and show the preview.  SceneError; then it stays."""
+        """Set a value by its dotted key, as the widgets do, and show the preview.
+
+        SceneError for an invalid scene; the value then stays unchanged.
+        """
         changes = with_followers(scene_text.tables(self.text), key, value)
-        if self._path is None:  # a scene holds its pictures, and its text only names them
+        if self._path is None:  # a scene object contains its pictures; its text only names them
             self.scene = self.scene.changed(changes)
             self.text = self.scene.toml()
         else:
@@ -68,7 +71,7 @@ class Workbench:
         self.refresh()
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the scene to a file, comments and all, the pictures of a scene that came as an object beside it."""
+        """Write the scene to a file with its comments; a scene given as an object also writes its pictures there."""
         path = Path(path).expanduser()
         beside = folders.scene_files(self.scene) if self._path is None else {}
         for name, data in (beside | {folders.SCENE: self.text.encode()}).items():
@@ -76,7 +79,7 @@ class Workbench:
         return path
 
     def refresh(self) -> None:
-        """Make the preview of the scene, unless a later change comes meanwhile."""
+        """Make and show the preview of the scene, unless a later change replaces it."""
         with self._lock:
             self._number += 1
             mine = self._number
@@ -87,27 +90,27 @@ class Workbench:
         except SentenceError as refusal:
             self._say(str(refusal))
             return
-        told, page = preview_json.of_preview(found), form.environment().get_template("widget.html.j2").module
-        self.preview, self._light.value, self._said.value = found, page.light(told), page.figures(told)
+        shown, page = preview_json.of_preview(found), form.environment().get_template("widget.html.j2").module
+        self.preview, self._light.value, self._message.value = found, page.light(shown), page.figures(shown)
 
-    # ---- what is seen ----
+    # ---- widgets ----
 
     def _control(self, field: form.Field) -> Any:
         widgets, words = self._widgets, f"{field.label}{f' ({field.unit})' if field.unit else ''}"
-        told = {"description": words, "tooltip": field.meaning, "style": {"description_width": WIDE}}
+        common = {"description": words, "tooltip": field.meaning, "style": {"description_width": DESCRIPTION_WIDTH}}
         span = form.slider(field)
         if field.control == "choice":
             options = list(dict.fromkeys(["", *field.choices, field.value]))
-            control = widgets.Dropdown(options=options, value=field.value, **told)
+            control = widgets.Dropdown(options=options, value=field.value, **common)
         elif span is not None:
             control = widgets.FloatSlider(
-                value=float(span.value), min=float(span.least), max=float(span.most), step=float(span.step),
-                continuous_update=False, readout_format=".5g", **told,
+                value=float(span.value), min=float(span.minimum), max=float(span.maximum), step=float(span.step),
+                continuous_update=False, readout_format=".5g", **common,
             )  # fmt: skip
         elif field.control == "check":
-            control = widgets.Checkbox(value=(field.value or field.default) == "true", indent=False, **told)
+            control = widgets.Checkbox(value=(field.value or field.default) == "true", indent=False, **common)
         else:
-            control = widgets.Text(value=field.value, continuous_update=False, **told)
+            control = widgets.Text(value=field.value, continuous_update=False, **common)
         control.observe(lambda change: self._changed(field.key, change["new"]), names="value")
         return control
 
@@ -119,8 +122,8 @@ class Workbench:
             self._say(str(refusal))
 
     def _say(self, sentence: str) -> None:
-        self._said.value = f"<p role='alert'><b>{html.escape(sentence)}</b></p>"
+        self._message.value = f"<p role='alert'><b>{html.escape(sentence)}</b></p>"
 
     def _repr_mimebundle_(self, **options: Any) -> Any:
-        """For a notebook: the widgets."""
+        """Return the widgets in the formats that a notebook asks for."""
         return self.box._repr_mimebundle_(**options)

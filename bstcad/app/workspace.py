@@ -1,8 +1,8 @@
-"""The folders that the workbench works in: scene files with what is not saved yet, pictures, and finished designs.
+"""The folders of the workbench: scene files with their unsaved changes, pictures, and finished designs.
 
-A scene is called by the stem of its file, a design by its folder's name; no path goes to the page.  The text of a scene
-that is being edited lies in a hidden file beside the scene file, so that neither a closed page nor a killed server
-loses a change; `save` puts it into the scene file, unless another program wrote that meanwhile.
+The name of a scene is the stem of its file, the name of a design that of its folder; the pages get no paths.  The text
+of a scene that is being edited is in a hidden file beside the scene file, so that no change is lost when a page is
+closed or the server is killed.  `save` copies it to the scene file, unless another program has changed that file.
 """
 
 from __future__ import annotations
@@ -26,121 +26,121 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.scene.schema import contents
 
-NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")  # of a scene or a design: no path, no hidden file
-PICTURES = "pictures"  # the folder of uploads, beside the scenes
-UNSAVED = "unsaved"  # kind of the hidden file
+NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")  # name of a scene or a design: no path, no hidden file
+PICTURES = "pictures"  # folder of uploads, beside the scenes
+UNSAVED = "unsaved"  # kind of the hidden file with unsaved changes
 LARGEST_UPLOAD = 100_000_000  # bytes
-DESIGN = ("report.json", "design.npz")  # files of which one tells a design's folder
+DESIGN_FILES = ("report.json", "design.npz")  # files by which a design's folder is recognised
 
 
 @dataclass(frozen=True)
-class Opened:
-    """A scene as it is being edited."""
+class OpenScene:
+    """Scene that is being edited."""
 
     name: str
-    text: str
-    saved: bool  # does the scene file hold this text?
+    text: str  # text with all changes
+    saved: bool  # True if the scene file has this text
 
     @property
     def revision(self) -> str:
-        """A name for this very text."""
+        """Identifier of this text, a hash."""
         return hashlib.sha256(self.text.encode()).hexdigest()[:16]
 
 
 class Workspace:
-    """The folder of the scene files and the folder of the designs; one thread at a time changes a scene."""
+    """Folder of the scene files and folder of the designs; one thread at a time changes a scene."""
 
     def __init__(self, scene_folder: Path, designs: Path) -> None:
         self.scenes, self.designs = scene_folder.resolve(), designs.resolve()
         self._changing = threading.RLock()
-        self._folders = _told(self.scenes, self.designs, Path.cwd(), Path(os.path.expanduser("~")))
+        self._folders = _folder_pattern(self.scenes, self.designs, Path.cwd(), Path(os.path.expanduser("~")))
 
     @classmethod
     def of(cls, given: Path | None, usual: Path = Path("outputs")) -> tuple[Workspace, str]:
-        """The workspace of the command's argument, and the page that it opens.
+        """Return the workspace for the command's argument, and the page that it opens.
 
-        None: scenes and designs lie in `usual`.  A scene file: it and its neighbours, designs in `usual`.  A design's
-        folder: it and its neighbours.  Another folder: scenes and designs lie there.
+        None: scenes and designs in `usual`.  A scene file: the scenes of its folder, designs in `usual`.  A design's
+        folder: scenes and designs of its parent.  Another folder: scenes and designs in it.
         """
         if given is None:
             return cls(usual, usual), "/"
         if given.is_file():
             if given.suffix != ".toml" or not NAME.fullmatch(given.stem):
-                raise SceneError(f"{given}: is no scene file; give a TOML file, such as my-lens.toml, or a folder")
+                raise SceneError(f"{given}: is not a scene file; give a TOML file, such as my-lens.toml, or a folder")
             return cls(given.parent, usual), f"/scene/{given.stem}"
         if not given.is_dir():
-            raise SceneError(f"{given}: no such scene file or folder; give one that is there, or nothing")
-        if any((given / name).is_file() for name in DESIGN):
+            raise SceneError(f"{given}: no such scene file or folder; give an existing one, or nothing")
+        if any((given / name).is_file() for name in DESIGN_FILES):
             given = given.resolve()
             if not NAME.fullmatch(given.name):
-                raise SceneError(f"{given}: is no name of a design; call the folder by letters, digits, '-' and '_'")
+                raise SceneError(f"{given}: is not a name of a design; use letters, digits, '-' and '_' for the folder")
             return cls(given.parent, given.parent), f"/design/{given.name}"
         return cls(given, given), "/"
 
     def without_paths(self, sentence: str) -> str:
-        """A sentence for the page, without the folders of this machine."""
+        """Return a sentence for the page, without the folders of this machine."""
         return self._folders.sub(lambda found: "" if found[0][-1] in "/\\" else "this folder", sentence)
 
     # ---- scenes ----
 
     def scene_names(self) -> list[str]:
-        """The scene files, the latest first."""
+        """Return the names of the scenes, the latest first."""
         paths = self.scenes.glob("*.toml") if self.scenes.is_dir() else ()
         known = [path for path in paths if NAME.fullmatch(path.stem) and self._is_own(path) and path.is_file()]
         return [path.stem for path in sorted(known, key=lambda path: -path.stat().st_mtime)]
 
     def path(self, name: str) -> Path:
-        """The file of a scene; SceneError for a name that is none, or a link that leads out of the workspace."""
+        """Return the file of a scene.  SceneError for an invalid name, or a link that leads out of the workspace."""
         if not NAME.fullmatch(name):
-            raise SceneError(f"{name!r}: is no name of a scene; give letters, digits, '-' and '_'")
+            raise SceneError(f"{name!r}: is not a name of a scene; use letters, digits, '-' and '_'")
         path = self.scenes / f"{name}.toml"
         self._own(path)
         self._own(files.beside(path, UNSAVED))
         return path
 
     def _own(self, path: Path) -> Path:
-        """Return the path without its links.  SceneError if they lead out of the workspace's folders."""
+        """Return the path with links resolved.  SceneError if they lead out of the workspace's folders."""
         try:
             return files.within(path, self.scenes, self.designs)
         except ValueError as error:
-            raise SceneError(f"{path.name}: {error}; put there what it leads to") from None
+            raise SceneError(f"{path.name}: {error}; replace the link by its target") from None
 
     def _is_own(self, path: Path) -> bool:
-        """Is the path none that leads out of the workspace's folders?"""
+        """Return True if no link leads the path out of the workspace's folders."""
         try:
             self._own(path)
         except SceneError:
             return False
         return True
 
-    def opened(self, name: str) -> Opened:
-        """A scene with the changes that are not saved yet.  SceneError if there is no such file."""
+    def opened(self, name: str) -> OpenScene:
+        """Return a scene with its unsaved changes.  SceneError if there is no such file."""
         path = self.path(name)
         with self._changing:
             unsaved = files.beside(path, UNSAVED)
             if not unsaved.is_file():
-                return Opened(name, self._text(path), saved=True)
+                return OpenScene(name, self._text(path), saved=True)
             text = self._text(unsaved).partition("\n")[2]
-            return Opened(name, text, saved=path.is_file() and text == self._text(path))
+            return OpenScene(name, text, saved=path.is_file() and text == self._text(path))
 
-    def change(self, name: str, text: str) -> Opened:
-        """Take the text of a scene, right or wrong, as the one being edited."""
-        path, data = self.path(name), _encoded(name, _unix(text))
+    def change(self, name: str, text: str) -> OpenScene:
+        """Store a text, valid or not, as the unsaved text of a scene."""
+        path, data = self.path(name), _encoded(name, _with_unix_ends(text))
         if len(data) > scene_file.LARGEST_FILE:
-            raise SceneError(f"{name}: holds over {scene_file.LARGEST_FILE / 1e6:g} MB, which is no scene; shorten it")
+            raise SceneError(f"{name}: is larger than {scene_file.LARGEST_FILE / 1e6:g} MB; shorten it")
         with self._changing:
             unsaved = files.beside(path, UNSAVED)
             before = self._text(unsaved).partition("\n")[0] if unsaved.is_file() else _digest(self._text(path))
-            files.put(unsaved, f"{before}\n".encode(), data)  # first the hash of the file as it was when editing began
+            files.put(unsaved, f"{before}\n".encode(), data)  # first line: hash of the file before editing
             return self.opened(name)
 
-    def edit(self, name: str, by: Callable[[str], str]) -> Opened:
-        """Make another text of the one being edited; no other change comes in between."""
+    def edit(self, name: str, by: Callable[[str], str]) -> OpenScene:
+        """Replace the text of a scene by a function of it; no other change comes in between."""
         with self._changing:
             return self.change(name, by(self.opened(name).text))
 
-    def save(self, name: str, anyway: bool = False) -> Opened:
-        """Put the text into the scene file.  SceneError if another program wrote the file since editing began."""
+    def save(self, name: str, anyway: bool = False) -> OpenScene:
+        """Write the text to the scene file.  SceneError if another program has changed it since editing began."""
         path = self.path(name)
         with self._changing:
             unsaved = files.beside(path, UNSAVED)
@@ -149,40 +149,40 @@ class Workspace:
                 now = _digest(self._text(path)) if path.is_file() else ""
                 if not anyway and now not in (before, _digest(text)):
                     raise SceneError(
-                        f"{path.name}: was changed by another program since it was opened here; "
-                        "save again to replace it, or drop the changes made here"
+                        f"{path.name}: was changed by another program after you opened it here; "
+                        "save again to replace it, or discard your changes"
                     )
-                files.put(path, _as_written(path, text))
+                files.put(path, _encoded_as(path, text))
                 unsaved.unlink()
             return self.opened(name)
 
-    def drop(self, name: str) -> Opened:
-        """Forget the changes that are not saved."""
+    def drop(self, name: str) -> OpenScene:
+        """Discard the unsaved changes."""
         with self._changing:
             files.beside(self.path(name), UNSAVED).unlink(missing_ok=True)
         return self.opened(name)
 
     def scene(self, name: str, text: str) -> Scene:
-        """The scene that a text makes, its files relative to the scene file.  SceneError."""
+        """Return the scene of a text, with files relative to the scene file.  SceneError if it is invalid."""
         return self._loaded(self.path(name), text)
 
     def _loaded(self, path: Path, text: str) -> Scene:
-        """The scene that a text makes in the place of a file, whose links may not lead out of the workspace."""
+        """Return the scene of a text as if it were in a file; links may not lead out of the workspace."""
         bounds = (self.scenes, self.designs)
         return scenes.of_text(text, scene_file.tables(text, Path(path.name)), path, bounds=bounds)
 
     def _text(self, path: Path) -> str:
-        """The text of a file of the workspace, as _text."""
+        """Return the text of a file inside the workspace."""
         return _text(self._own(path))
 
     def add(
         self, light: str, image: str | None = None, sample: str | None = None, text: str | None = None,
         template: str | None = None, size: str | None = None,
     ) -> str:  # fmt: skip
-        """Write a new scene file for a light of `bstcad new`, or by a template; the scene's name.
+        """Write a new scene file for a light of `bstcad new`, or from a template; return the scene's name.
 
-        image: the name of an upload.  size: of the plate, as `bstcad new` takes it.
-        What is given takes the place of a template's picture, the first of several.
+        image: name of an upload.  size: size of the plate, as in `bstcad new`.
+        An image, sample or text replaces the picture of a template, on its first target.
         """
         self.scenes.mkdir(parents=True, exist_ok=True)
         given = None if image is None else self.upload(image).relative_to(self.scenes)
@@ -197,7 +197,7 @@ class Workspace:
         return name
 
     def _show(self, name: str, key: str, value: str, plate: new_scene.Plate | None) -> None:
-        """Write another picture into a new scene file, which an error leaves no trace of; plate: that it is of."""
+        """Replace the picture of a new scene file, which an error removes.  plate: plate of the scene, if any."""
         path = self.path(name)
         try:
             text = self._text(path)
@@ -205,17 +205,17 @@ class Workspace:
             key = f"target[0].{key}" if isinstance(targets, list) and len(targets) > 1 else f"target.{key}"
             text = changed(text, key, value)
             if plate is not None and (blurred := plate.blurred(self.scene(name, text))) is not None:
-                text = changed(plate.text(name, blurred=blurred), key, value)  # its limit is for this picture
+                text = changed(plate.text(name, blurred=blurred), key, value)  # the limit depends on the picture
             files.put(path, _encoded(name, text))
         except BaseException:
             path.unlink()
             raise
 
     def adopt(self, design: str, folder: Path, written: Path | None = None) -> str:
-        """A new scene file for the scene in a folder, with the files that it names; the scene's name.
+        """Write a new scene file for the scene in a folder, with the files that it names; return the scene's name.
 
-        written: a file with the text that the scene was made of.  Its comments stay, or those of the scene file of the
-        design's name, where that makes the same scene still.
+        written: file with the original text of the scene.  Its comments are preserved, or those of the scene file with
+        the design's name, provided that the file still describes the same scene.
         """
         text = self._text(folder / "scene.toml")
         loaded = self._loaded(folder / "scene.toml", text)
@@ -228,15 +228,15 @@ class Workspace:
                 return name
             for key, content in contents(loaded):
                 if isinstance(content, picture.Picture):
-                    place = f"{PICTURES}/{self.keep(content.data)}"
+                    file = f"{PICTURES}/{self.keep(content.data)}"
                 else:
-                    files.put(self.scenes / (place := f"{name}-{content.name}"), content.copy)
-                text = changed(text, key if len(loaded.targets) > 1 else key.replace("target[0]", "target"), place)
+                    files.put(self.scenes / (file := f"{name}-{content.name}"), content.copy)
+                text = changed(text, key if len(loaded.targets) > 1 else key.replace("target[0]", "target"), file)
             files.put(self.path(name), changed(text, "name", name).encode())
         return name
 
     def _commented(self, scene: Scene, paths: list[Path]) -> str | None:
-        """Return the text of the first file that makes a scene, whose number of control points may be chosen anew."""
+        """Return the text of the first file that describes the scene, with or without its number of control points."""
         alike = [scene, scene.changed({"lens.back.control_points": None})]
         for path in paths:
             with contextlib.suppress(SentenceError):
@@ -246,70 +246,70 @@ class Workspace:
         return None
 
     def _free_name(self, kind: str) -> str:
-        """my-KIND, or my-KIND-2 and so on: of neither a scene nor a design that is there."""
+        """Return the first of my-KIND, my-KIND-2, and so on that names no existing scene or design."""
         stem, number = f"my-{picture.safe_name(kind)[:70].rstrip('.') or 'lens'}", 1
         name = stem
-        while any(os.path.lexists(path) for path in self._of(name)):
+        while any(os.path.lexists(path) for path in self._paths(name)):
             number += 1
             name = f"{stem}-{number}"
         return name
 
-    def _of(self, name: str) -> tuple[Path, Path, Path]:
-        """What may be there by a name: a scene, its changes, though somebody took the scene away, and a design."""
+    def _paths(self, name: str) -> tuple[Path, Path, Path]:
+        """Return the paths that a name may occupy: the scene, its unsaved changes, and the design."""
         path = self.scenes / f"{name}.toml"
         return path, path.with_name(f".{path.name}.{UNSAVED}"), self.designs / name
 
     # ---- pictures ----
 
     def keep(self, data: bytes) -> str:
-        """Keep an uploaded picture, whatever its file was called; its name here.  SceneError if it is none."""
+        """Store an uploaded picture under a name by its hash, and return the name.  SceneError if it is no picture."""
         folder = self.scenes / PICTURES
         name = f"{hashlib.sha256(data).hexdigest()[:12]}{picture.kind_of(data)}"
         with picture.decoding("the picture"):
-            picture.photo(picture.Picture(name, data))  # its pixels, too
+            picture.photo(picture.Picture(name, data))  # decode all pixels
         with self._changing:
             self._own(folder).mkdir(parents=True, exist_ok=True)
             files.put(self._own(folder) / name, data)
         return name
 
     def upload(self, name: str) -> Path:
-        """The file of an upload.  SceneError if there is none of that name."""
+        """Return the file of an upload.  SceneError if there is no such upload."""
         path = self.scenes / PICTURES / name
         if not NAME.fullmatch(name) or not path.is_file():
-            raise SceneError(f"{name!r}: no such picture was uploaded; give the picture again")
+            raise SceneError(f"{name!r}: no such picture was uploaded; upload the picture again")
         self._own(path)
         return path
 
     # ---- designs ----
 
     def design_names(self) -> list[str]:
-        """The folders of finished designs, the latest first."""
+        """Return the names of finished designs, the latest first."""
         folders = self.designs.iterdir() if self.designs.is_dir() else ()
         named = (path for path in folders if NAME.fullmatch(path.name) and self._is_own(path))
-        known = [path for path in named if (path / DESIGN[0]).is_file()]
+        known = [path for path in named if (path / DESIGN_FILES[0]).is_file()]
         return [path.name for path in sorted(known, key=lambda path: -path.stat().st_mtime)]
 
     def design(self, name: str) -> Path:
-        """The folder of a design, finished or not; SceneError for a name that is none, or a link that leads out."""
+        """Return the folder of a design, which need not exist.  SceneError for an invalid name or link."""
         if not NAME.fullmatch(name):
-            raise SceneError(f"{name!r}: is no name of a design; give letters, digits, '-' and '_'")
+            raise SceneError(f"{name!r}: is not a name of a design; use letters, digits, '-' and '_'")
         self._own(self.designs / name)
         return self.designs / name
 
     def file(self, design: str, name: str) -> Path:
-        """A file of a design by its name within the folder; SceneError if it is none, or leads out of it."""
+        """Return a file of a design by its name.  SceneError if it does not exist, or leads out of the folder."""
         folder = self.design(design).resolve()
         try:
             path = (folder / name).resolve()
             known = path.is_relative_to(folder) and path.is_file()
-        except (OSError, ValueError, RuntimeError):  # a name too long or with a NUL, links that lead back to themselves
+        except (OSError, ValueError, RuntimeError):  # name too long or with a NUL; endless links
             known = False
         if not known or _hidden(Path(name)) or _hidden(path.relative_to(folder)):
-            raise SceneError(f"{name!r}: is no file of the design {design}; choose one of its list")
+            raise SceneError(f"{name!r}: is not a file of the design {design}; choose one from its list")
         return path
 
     def file_names(self, design: str) -> list[str]:
-        """The files of a design, those of folders in it too, but hidden ones and links."""
+        """Return the names of a design's files, also in inner folders, without hidden files and links."""
         folder = self.design(design)
         paths = (path for path in sorted(folder.rglob("*")) if path.is_file() and not path.is_symlink())
         names = (path.relative_to(folder) for path in paths)
@@ -317,7 +317,7 @@ class Workspace:
 
 
 def _renamed(text: str, name: str) -> str:
-    """Return a scene's text whose comments name another scene."""
+    """Return a scene's text with a new name in the commands of its comments."""
     before = str(tables(text).get("name"))
     for words in (f"bstcad generate {before}.toml", f"bstcad plan {before}.toml", f"outputs/{before}"):
         text = re.sub(rf"{re.escape(words)}(?![\w-])", words.replace(before, name), text)
@@ -325,54 +325,54 @@ def _renamed(text: str, name: str) -> str:
 
 
 def _hidden(name: Path) -> bool:
-    """Is a file hidden, or leads its name out of the folder?"""
+    """Return True if a part of the path is hidden, or is '..'."""
     return any(part.startswith(".") for part in name.parts)
 
 
-def _told(*folders: Path) -> re.Pattern:
-    """An expression for folders as sentences have them, with the separator behind."""
+def _folder_pattern(*folders: Path) -> re.Pattern:
+    """Return a regular expression for folders in sentences, with the separator that follows."""
     known = [folder for folder in folders if folder.is_absolute()]
-    both = {each for folder in known for each in (folder, folder.resolve()) if each.parent != each}
-    forms = {form for each in both for form in (str(each), each.as_posix(), repr(str(each))[1:-1])}
+    paths = {each for folder in known for each in (folder, folder.resolve()) if each.parent != each}
+    forms = {form for each in paths for form in (str(each), each.as_posix(), repr(str(each))[1:-1])}
     any_of = "|".join(map(re.escape, sorted(forms, key=len, reverse=True)))
     return re.compile(rf"(?<![\w.])(?:{any_of})(?:[/\\]+|(?![\w-]))")
 
 
 def _text(path: Path) -> str:
-    """The text of a scene file, without its mark of UTF-8, its lines ending in a line feed.  SceneError."""
+    """Return the text of a scene file, without a byte order mark and with Unix line ends.  SceneError."""
     try:
-        return _unix(files.contents(path, 2 * scene_file.LARGEST_FILE).decode("utf-8-sig"))
+        return _with_unix_ends(files.contents(path, 2 * scene_file.LARGEST_FILE).decode("utf-8-sig"))
     except UnicodeDecodeError:
-        raise SceneError(f"{path.name}: is not UTF-8 text; give a TOML file") from None
+        raise SceneError(f"{path.name}: is not UTF-8 text; choose a TOML file") from None
     except ValueError as error:
         raise SceneError(f"{path.name}: cannot be read ({error}); choose another scene") from None
 
 
-def _as_written(path: Path, text: str) -> bytes:
-    """A text with the mark and the ends of lines that the file there has."""
+def _encoded_as(path: Path, text: str) -> bytes:
+    """Return a text encoded with the byte order mark and the line ends of the file that it replaces."""
     try:
         before = files.contents(path, 2 * scene_file.LARGEST_FILE)
-    except ValueError:  # it is gone, or no scene any more
+    except ValueError:  # no such file, or no scene any more
         before = b""
-    if _is_windows(before):
+    if _has_windows_ends(before):
         text = text.replace("\n", "\r\n")
     return (codecs.BOM_UTF8 if before.startswith(codecs.BOM_UTF8) else b"") + text.encode()
 
 
 def _encoded(name: str, text: str) -> bytes:
-    """A text in UTF-8.  SceneError."""
+    """Return a text in UTF-8.  SceneError if that is not possible."""
     try:
         return text.encode()
     except UnicodeEncodeError:
-        raise SceneError(f"{name}: holds half a character; write the text again in UTF-8") from None
+        raise SceneError(f"{name}: contains half a character; write the text again in UTF-8") from None
 
 
-def _unix(text: str) -> str:
-    """A text whose lines all end as Windows has them, with plain ends; TOML takes them for the same."""
-    return text.replace("\r\n", "\n") if _is_windows(text.encode(errors="replace")) else text
+def _with_unix_ends(text: str) -> str:
+    """Return a text with Unix line ends if all its lines have those of Windows."""
+    return text.replace("\r\n", "\n") if _has_windows_ends(text.encode(errors="replace")) else text
 
 
-def _is_windows(data: bytes) -> bool:
+def _has_windows_ends(data: bytes) -> bool:
     return 0 < data.count(b"\r\n") == data.count(b"\n") == data.count(b"\r")
 
 

@@ -1,8 +1,8 @@
 """Checkpoints: the state of tailoring in one file beside the output folder, so that no work is lost.
 
-A checkpoint is complete or absent: it is written under another name, flushed to disk and renamed.  The file holds
-numbers and text only: a line with the format's version, a line with the SHA-256 of the rest, and an npz archive of the
-arrays, in which the array `tree` is the JSON text of everything else.
+A checkpoint is complete or absent: it is written under another name, flushed to disk and renamed.  The file contains
+only numbers and text: a line with the version of the format, a line with the SHA-256 of the rest, and an npz archive of
+the arrays, in which the array `tree` is the JSON text of everything else.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ import torch
 from bstcad.runs import files
 from bstcad.runs.files import SceneError
 
-MAGIC = b"bstcad checkpoint 8\n"  # to be raised whenever a record of a state, or the purpose, changes its fields
-DIGEST = 65  # bytes of the line with the SHA-256
-LARGEST = 8 << 30  # bytes; 2049 x 2049 control points need 1 GB
-SHARE = 0.02  # the most of the run's time that checkpoints may take
+MAGIC = b"bstcad checkpoint 8\n"  # version; raise it when a record of a state, or the purpose, changes its fields
+DIGEST_SIZE = 65  # bytes of the line with the SHA-256
+MAX_SIZE = 8 << 30  # largest size of a checkpoint (bytes); 2049 x 2049 control points need 1 GB
+MAX_TIME_FRACTION = 0.02  # largest fraction of the run's time that checkpoints may take
 
-Purpose = dict[str, Any]  # the design that a checkpoint belongs to: numbers, text, None, lists and dicts of them
+Purpose = dict[str, Any]  # description of the checkpoint's design: numbers, text, None, lists and dicts of them
 # A state is a record: a frozen dataclass of numbers, text, None, arrays, tensors, tuples, mappings and such records.
 
 
@@ -38,49 +38,49 @@ Purpose = dict[str, Any]  # the design that a checkpoint belongs to: numbers, te
 
 
 def write(path: Path, purpose: Purpose, state: Any) -> None:
-    """Put a checkpoint of a design (`purpose`) at `path`, whole or not at all; OSError."""
+    """Write a checkpoint of a design (`purpose`) to `path`, completely or not at all.  OSError."""
     arrays: dict[str, np.ndarray] = {}
     tree = json.dumps([purpose, state], default=partial(_packed, arrays))
-    with files.whole(path) as file:  # no copy of the state in memory
-        file.write(MAGIC + bytes(DIGEST))
+    with files.atomic_file(path) as file:  # without a copy of the state in memory
+        file.write(MAGIC + bytes(DIGEST_SIZE))
         np.savez(file, tree=np.frombuffer(tree.encode(), dtype=np.uint8), **arrays)  # type: ignore[arg-type]
-        file.seek(len(MAGIC) + DIGEST)
+        file.seek(len(MAGIC) + DIGEST_SIZE)
         digest = hashlib.file_digest(file, "sha256").hexdigest()
         file.seek(len(MAGIC))
         file.write(digest.encode() + b"\n")
 
 
 def read(path: Path, kind: type, device: str = "cpu") -> tuple[Purpose, Any]:
-    """(purpose, state) of the checkpoint at `path`, the state of a kind, its tensors on a device; SceneError.
+    """Return (purpose, state) of a checkpoint; the state is a `kind`, its tensors are on a device.
 
-    Mappings come back as dicts, lists as tuples.
+    Mappings are returned as dicts, lists as tuples.  SceneError if the file is no checkpoint of this version.
     """
     try:
-        content = files.contents(path, LARGEST)
+        content = files.contents(path, MAX_SIZE)
     except ValueError as error:
         raise SceneError(f"{path}: cannot be read ({error}); start without --resume") from error
-    begin = len(MAGIC) + DIGEST
+    begin = len(MAGIC) + DIGEST_SIZE
     magic, digest, body = content[: len(MAGIC)], content[len(MAGIC) : begin], content[begin:]
     if magic != MAGIC:
         found = repr(magic.partition(b"\n")[0].decode("latin-1"))
-        raise SceneError(f"{path}: is no checkpoint of this version ({found}); start without --resume")
+        raise SceneError(f"{path}: is not a checkpoint of this version ({found}); start without --resume")
     if digest != hashlib.sha256(body).hexdigest().encode() + b"\n":
-        raise SceneError(f"{path}: is damaged (its checksum does not fit); start without --resume")
+        raise SceneError(f"{path}: is damaged (its checksum is wrong); start without --resume")
     try:
         if any(part.compress_type for part in zipfile.ZipFile(io.BytesIO(body)).infolist()):
-            raise ValueError  # we write none: it could unpack to any size
+            raise ValueError  # compressed data could unpack to any size; we write none
         with np.load(io.BytesIO(body), allow_pickle=False) as arrays:
             unpacked = partial(_unpacked, arrays, _records(kind, {}), device)
             purpose, state = json.loads(arrays["tree"].tobytes(), object_hook=unpacked)
         if not isinstance(state, kind):
             raise TypeError
-    except Exception as error:  # a foreign file with a right checksum
-        raise SceneError(f"{path}: is no checkpoint of bstcad's; start without --resume") from error
+    except Exception as error:  # a foreign file with a valid checksum
+        raise SceneError(f"{path}: is not a checkpoint of bstcad; start without --resume") from error
     return purpose, state
 
 
 def _packed(arrays: dict[str, np.ndarray], value: Any) -> dict[str, Any]:
-    """A value that JSON does not have: {"@array": its name in `arrays`}, {"@module.Class": fields}, or a mapping."""
+    """Encode a value that JSON lacks: {"@array": name in `arrays`}, {"@module.Class": fields}, or a mapping."""
     if isinstance(value, torch.Tensor):
         return {"@tensor": _packed(arrays, value.detach().cpu().numpy())["@array"]}
     if isinstance(value, np.ndarray):
@@ -92,7 +92,7 @@ def _packed(arrays: dict[str, np.ndarray], value: Any) -> dict[str, Any]:
 
 
 def _unpacked(arrays: Mapping[str, np.ndarray], records: Mapping[str, type], device: str, found: dict) -> Any:
-    """The inverse of `_packed`, from the innermost value outwards; records: classes by name."""
+    """Decode a value of `_packed`; called from the innermost value outwards.  records: classes by name."""
     (kind, content), *_ = [*found.items(), ("", None)]
     if kind == "@array":
         return arrays[content]
@@ -108,7 +108,7 @@ def _as_tuples(value: Any) -> Any:
 
 
 def _records(kind: Any, known: dict[str, type]) -> dict[str, type]:
-    """The dataclasses that an annotated type names, by their names, and those that their fields name."""
+    """Add the dataclasses in an annotated type, and in their fields, to `known` by name; return `known`."""
     if isinstance(kind, type) and is_dataclass(kind) and _name(kind) not in known:
         known[_name(kind)] = kind
         for hint in get_type_hints(kind).values():
@@ -127,86 +127,86 @@ def _name(kind: Any) -> str:
 
 @dataclass
 class Keeper:
-    """Holds the latest state of a design and writes it to disk now and then."""
+    """Latest state of a design, which is written to disk at intervals."""
 
     path: Path
     purpose: Purpose
     say: Callable[[str], None] = print  # called with a sentence when writing fails
-    every: float = 10.0  # seconds between two checkpoints, at least
-    latest: Any = None
-    kind: type = dict  # of the states
+    interval: float = 10.0  # shortest time between two checkpoints (s)
+    latest: Any = None  # latest state
+    kind: type = dict  # class of the states
 
     def __post_init__(self) -> None:
-        self._written: Any = None  # the state in the file
-        self._own = False  # did this run write the file?
-        self._due = time.monotonic() + self.every
+        self._written: Any = None  # state in the file
+        self._own = False  # True once this run has written the file
+        self._due = time.monotonic() + self.interval
 
     def __call__(self, state: Any) -> None:
-        """Take a state from which the design could go on; the caller may not change it afterwards."""
+        """Store a state from which the design can continue; the caller must not change it afterwards."""
         self.latest = state
         if time.monotonic() >= self._due:
             self.flush()
 
     def flush(self) -> bool:
-        """Write the latest state; is a checkpoint on disk?  A full disk does not end a design."""
+        """Write the latest state; return True if a checkpoint is on disk.  A full disk does not end a design."""
         if self.latest is not None and (self.latest is not self._written or not self.path.exists()):
             began = time.monotonic()
             try:
                 write(self.path, self.purpose, self.latest)
             except (OSError, MemoryError) as error:
                 reason = getattr(error, "strerror", None) or "not enough memory"
-                self.say(f"{self.path}: cannot be written ({reason}); the design goes on without a checkpoint")
+                self.say(f"{self.path}: cannot be written ({reason}); the design continues without a checkpoint")
             else:
                 self._written, self._own = self.latest, True
             ended = time.monotonic()
-            self._due = ended + max(self.every, (ended - began) / SHARE)
+            self._due = ended + max(self.interval, (ended - began) / MAX_TIME_FRACTION)
         return self._written is not None and self.path.exists()
 
-    def kept(self) -> str:
-        """At the end of a run keep the latest state: beside the folder, else among the system's temporary files.
+    def keep_at_exit(self) -> str:
+        """Write the latest state at the end of a run, beside the folder or else among temporary files.
 
-        A sentence for the user: how to go on.  "" without a state.
+        Return a sentence for the user on how to resume; "" without a state.
         """
         self.say = lambda text: None
         if self.flush():
-            return "the design so far is kept; the same command with --resume goes on from there"
+            return "the design so far is kept; run the same command with --resume to continue it"
         if self.latest is None:
             return ""
-        place = Path(tempfile.mkdtemp(prefix="bstcad-")) / self.path.name.removeprefix(".")
+        path = Path(tempfile.mkdtemp(prefix="bstcad-")) / self.path.name.removeprefix(".")
         try:
-            write(place, self.purpose, self.latest)
+            write(path, self.purpose, self.latest)
         except (OSError, MemoryError):
-            place.parent.rmdir()
-            return "there was no room for the design so far, neither beside the folder nor among temporary files"
-        return f"the design so far is kept in {place}; move it to {self.path} and --resume goes on from there"
+            path.parent.rmdir()
+            return "the design so far is lost: there is no space beside the folder or for temporary files"
+        return f"the design so far is kept in {path}; move it to {self.path} and use --resume to continue it"
 
-    def found(self) -> Any:
-        """The state to go on from, None without a checkpoint; SceneError for a checkpoint of another design."""
+    def load(self) -> Any:
+        """Return the state to resume from; None without a checkpoint.  SceneError if it is of another design."""
         if not self.path.exists():
             return None
         purpose, state = read(self.path, self.kind, self.purpose.get("device", "cpu"))
         for key, then, now in _differences(purpose, self.purpose):
             raise SceneError(
                 f"{self.path}: is of another design ({key} was {then}, now it is {now}); "
-                "give the scene as it was, or start without --resume"
+                "use the original scene, or start without --resume"
             )
         self.latest = self._written = state
         return state
 
     def remove(self) -> None:
-        """The design is written: the checkpoint goes."""
+        """Delete the checkpoint, since the design has been written."""
         self.latest = self._written = None
         self.path.unlink(missing_ok=True)
 
     def withdraw(self) -> None:
-        """The scene is refused: the checkpoint of this run goes, that of an earlier run stays."""
+        """Delete the checkpoint of this run, since the scene is refused; one of an earlier run stays."""
         self.latest = None
         if self._own:
             self.remove()
 
 
 def _differences(then: Any, now: Any, key: str = "") -> Iterator[tuple[str, str, str]]:
-    """Dotted keys under which two trees differ, with both values."""
+    """Iterate over the differences of two trees: (dotted key, value then, value now)."""
     if isinstance(then, dict) and isinstance(now, dict):
         for name in sorted(then.keys() | now.keys()):
             yield from _differences(then.get(name), now.get(name), f"{key}.{name}" if key else name)

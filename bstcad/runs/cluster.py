@@ -1,7 +1,7 @@
-"""Work for other processes and other machines, handed out by a scheduler of dask.distributed.
+"""Jobs for other processes and other machines, distributed by a scheduler of dask.distributed.
 
-Each worker has bstcad installed, of the same version, and does one piece of work at a time.  The scheduler gives the
-work of a lost worker to another worker.
+Each worker has the same version of bstcad and does one job at a time.  The scheduler gives the jobs of a lost worker to
+another worker.
 """
 
 from __future__ import annotations
@@ -17,42 +17,42 @@ from typing import Any, Protocol
 from bstcad.runs import environment, signals
 from bstcad.runs.files import MachineError, SceneError, first_line
 
-PATIENCE = 30.0  # seconds for the scheduler to answer, and for the first worker to come
-LOOK = 0.5  # seconds between two looks whether some work has ended
-RETRIES = 2  # of work over which a worker raised an error
-MOST_WORKERS = 1000
-HERE = "here"  # where work is done on this machine; elsewhere the address of a worker
+CONNECTION_TIMEOUT = 30.0  # seconds until the scheduler answers, and until the first worker is there
+POLL_INTERVAL = 0.5  # seconds between two checks whether a job has ended
+RETRIES = 2  # retries of a job after an error of a worker
+MAX_WORKERS = 1000
+THIS_MACHINE = "here"  # `Answer.where` of a job on this machine; of others it is the address of the worker
 
-_one_at_a_time = threading.Lock()  # of a worker process, whatever its number of threads
+_one_at_a_time = threading.Lock()  # limits a worker process to one job, whatever its number of threads
 
 
 @dataclass(frozen=True)
 class Answer:
-    """The result of a piece of work."""
+    """Result of a job."""
 
-    key: Any  # under which the work was started
-    where: str  # HERE, or the address of the worker (of the scheduler, where no worker answered)
+    key: Any  # key with which the job was started
+    where: str  # THIS_MACHINE, or the address of the worker (of the scheduler, if no worker answered)
     value: Any = None
-    reason: str = ""  # why there is no value, in words
+    reason: str = ""  # reason why there is no value
 
 
 class Machines(Protocol):
-    """Processes that do work."""
+    """Processes that do jobs."""
 
     @property
-    def room(self) -> int:
-        """Pieces of work at a time."""
+    def capacity(self) -> int:
+        """Number of jobs that run at the same time."""
 
     def start(self, key: Any, work: Callable[..., Any], *arguments: Any) -> None:
-        """Begin a piece of work."""
+        """Start the job work(*arguments)."""
 
     def next(self, tick: Callable[[], None]) -> Answer:
-        """Wait for a piece of work that has ended."""
+        """Wait for the next job that ends; `tick` is called meanwhile."""
 
 
 @contextlib.contextmanager
-def asked_for(scheduler: str | None, workers: int | None = None) -> Iterator[Cluster | None]:
-    """The workers of a scheduler, or `workers` processes here, which end with the block; None without either."""
+def connect(scheduler: str | None, workers: int | None = None) -> Iterator[Cluster | None]:
+    """Yield the workers of a scheduler, or `workers` local processes that end with the block; None without either."""
     check(scheduler, workers)
     with contextlib.ExitStack() as stack:
         address = scheduler
@@ -62,19 +62,19 @@ def asked_for(scheduler: str | None, workers: int | None = None) -> Iterator[Clu
 
 
 def check(scheduler: str | None, workers: int | None) -> None:
-    """SceneError for impossible values of these options."""
+    """Raise SceneError for invalid values of these options."""
     if scheduler is not None and workers is not None:
-        raise SceneError("--workers: are started on this machine, and --scheduler has its own; give one of the two")
-    if workers is not None and not 1 <= workers <= MOST_WORKERS:
-        raise SceneError(f"--workers {workers}: is not between 1 and {MOST_WORKERS}; give a number of processes")
+        raise SceneError("--workers and --scheduler: exclude each other; give one of the two")
+    if workers is not None and not 1 <= workers <= MAX_WORKERS:
+        raise SceneError(f"--workers {workers}: is not between 1 and {MAX_WORKERS}; give a number of processes")
 
 
 @contextlib.contextmanager
 def _local(workers: int) -> Iterator[str]:
-    """The address of a scheduler with worker processes on this machine, which share its cores."""
+    """Yield the address of a local scheduler with worker processes, which share the cores."""
     distributed = _library("--workers")
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place, contextlib.ExitStack() as stack:
-        with signals.unheard_by_children():
+        with signals.ignored_by_children():
             started = distributed.LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1",
                 dashboard_address="127.0.0.1:0", memory_limit=0, local_directory=place,
@@ -85,21 +85,21 @@ def _local(workers: int) -> Iterator[str]:
 
 
 class Cluster:
-    """The workers of a scheduler at an address such as tcp://10.0.0.1:8786."""
+    """Workers of a scheduler at an address such as tcp://10.0.0.1:8786."""
 
-    def __init__(self, address: str, patience: float = PATIENCE) -> None:
+    def __init__(self, address: str, patience: float = CONNECTION_TIMEOUT) -> None:
         self._distributed, self.address = _library("--scheduler"), address
-        self._keys: dict[Any, Any] = {}  # by future
+        self._keys: dict[Any, Any] = {}  # key of a job by its future
         try:
             self._client = self._distributed.Client(address, timeout=patience, set_as_default=False)
-        except (OSError, ValueError) as error:  # of which a timeout is one
+        except (OSError, ValueError) as error:  # a timeout is an OSError
             raise SceneError(
                 f"--scheduler {address}: no scheduler answers ({first_line(error)}); start one with dask scheduler"
             ) from None
         try:
             self._client.wait_for_workers(1, timeout=patience)
         except (OSError, self._distributed.TimeoutError):
-            self._client.close(timeout=LOOK)
+            self._client.close(timeout=POLL_INTERVAL)
             raise SceneError(
                 f"--scheduler {address}: has no workers; start one on each machine with dask worker {address}"
             ) from None
@@ -109,58 +109,58 @@ class Cluster:
 
     def __exit__(self, *error: object) -> None:
         self._client.cancel(list(self._keys))
-        self._client.close(timeout=LOOK)
+        self._client.close(timeout=POLL_INTERVAL)
 
     @property
-    def room(self) -> int:
-        """The number of workers now, or 1 where all are lost: one may come back."""
+    def capacity(self) -> int:
+        """Current number of workers; 1 if all are lost, since one may come back."""
         return max(len(self._client.scheduler_info(n_workers=-1)["workers"]), 1)  # all of them, not the first five
 
     def start(self, key: Any, work: Callable[..., Any], *arguments: Any) -> None:
-        """Have work(*arguments) done by a worker."""
+        """Start the job work(*arguments) on a worker."""
         self._check()
         version = environment.version()
         future = self._client.submit(answer, version, key, work, *arguments, pure=False, retries=RETRIES)
         self._keys[future] = key
 
     def next(self, tick: Callable[[], None] = lambda: None) -> Answer:
-        """Wait for the next answer; `tick` is called meanwhile.  MachineError if the scheduler goes away."""
+        """Wait for the next answer; `tick` is called meanwhile.  MachineError if the scheduler is lost."""
         return self._ended(self._keys, tick)
 
     def _ended(self, futures: Collection[Any], tick: Callable[[], None] = lambda: None) -> Answer:
-        """The answer of the first of these futures that is done."""
+        """Wait for the first of these futures that is done, and return its answer."""
         while True:
             for future in [future for future in futures if future.done()]:
                 return self._answer(self._keys.pop(future), future)
             tick()
             self._check()
             with contextlib.suppress(TimeoutError, self._distributed.TimeoutError), self._client.as_current():
-                self._distributed.wait(list(futures), timeout=LOOK, return_when="FIRST_COMPLETED")
+                self._distributed.wait(list(futures), timeout=POLL_INTERVAL, return_when="FIRST_COMPLETED")
 
     def spread(self, work: Callable[[Any, Any], Any], shared: Any, items: Sequence[Any]) -> Iterator[Any]:
-        """work(shared, item) of each item, in their order; MachineError if a worker fails.
+        """Iterate over work(shared, item) of each item, in order.  MachineError if a worker fails.
 
-        `shared` is sent once.  The scheduler keeps it, unlike scattered data, so that it outlives lost workers.
+        `shared` is sent once.  The scheduler stores it, unlike scattered data, so that it outlives lost workers.
         """
         import dask
 
         with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 GB"}):
-            held = self._client.submit(lambda value: value, shared, pure=False)
+            stored = self._client.submit(lambda value: value, shared, pure=False)
         for item in items:
-            self.start(None, work, held, item)
+            self.start(None, work, stored, item)
         for future in list(self._keys):
             answered = self._ended([future])
             if answered.reason:
-                raise MachineError(f"{self.address}: a worker could not do its part ({answered.reason})")
+                raise MachineError(f"{self.address}: a worker failed ({answered.reason})")
             yield answered.value
 
     def _check(self) -> None:
         if self._client.status != "running":
-            raise MachineError(f"--scheduler {self.address}: the scheduler is gone; start it again")
+            raise MachineError(f"--scheduler {self.address}: the scheduler has ended; start it again")
 
     def _answer(self, key: Any, future: Any) -> Answer:
-        if future.status == "cancelled":  # by a scheduler that was started again
-            raise MachineError(f"--scheduler {self.address}: the scheduler has lost its work; give the command again")
+        if future.status == "cancelled":  # the scheduler was restarted
+            raise MachineError(f"--scheduler {self.address}: the scheduler has lost its jobs; run the command again")
         if future.status == "error":
             error = future.exception()
             return Answer(key, self.address, reason=f"{type(error).__name__}: {first_line(error)}")
@@ -168,13 +168,13 @@ class Cluster:
 
 
 def answer(wanted: str, key: Any, work: Callable[..., Any], *arguments: Any) -> Answer:
-    """Do the work in a worker, if its bstcad is of the version `wanted`."""
+    """Do a job on a worker, provided that its bstcad has the version `wanted`."""
     from distributed import get_worker
 
     with _one_at_a_time:
         where, version = get_worker().address, environment.version()
         if version != wanted:
-            reason = f"{where} has another version of bstcad, {version}; install {wanted} there"
+            reason = f"{where} has version {version} of bstcad; install {wanted} there"
             return Answer(key, where, reason=reason)
         return Answer(key, where, work(*arguments))
 

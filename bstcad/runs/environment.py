@@ -1,4 +1,4 @@
-"""The circumstances of a design: its machine, and the versions of bstcad, Python and the libraries."""
+"""Machine of a design, and the versions of bstcad, Python and the libraries."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LIBRARIES = (
 
 
 def circumstances(device: str) -> dict[str, Any]:
-    """The version of bstcad, the machine, and the versions of Python and the libraries."""
+    """Return the version of bstcad, the machine, and the versions of Python and the libraries, for report.json."""
     return {
         "version": bstcad.__version__,
         "machine": {
@@ -36,26 +36,26 @@ def circumstances(device: str) -> dict[str, Any]:
         },
         "versions": {
             "python": platform.python_version(),
-            "bstcad": bstcad.__version__,  # it may run from its source tree, beside an installed one
+            "bstcad": bstcad.__version__,  # the metadata may be those of another, installed version
             **{name: _version(name) for name in LIBRARIES},
         },
     }
 
 
 def cores() -> int:
-    """The number of processors that this process may use."""
+    """Return the number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def threads(sharers: int) -> dict[str, str]:
-    """Environment variables by which `sharers` processes share the cores."""
-    share = str(max(1, cores() // sharers))
-    return {"OMP_NUM_THREADS": share, "NUMBA_NUM_THREADS": share}
+    """Return environment variables that divide the cores among `sharers` processes."""
+    number = str(max(1, cores() // sharers))
+    return {"OMP_NUM_THREADS": number, "NUMBA_NUM_THREADS": number}
 
 
 @cache
 def version() -> str:
-    """The program's number and a hash of its sources."""
+    """Return bstcad's version with a hash of its sources."""
     package, digest = Path(bstcad.__file__).parent, hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
         digest.update(str(path.relative_to(package)).encode() + path.read_bytes())
@@ -63,12 +63,12 @@ def version() -> str:
 
 
 def _peak_memory() -> float | None:
-    """The peaks of both processes (GB), which need not coincide, as a sum."""
+    """Return the sum of the peaks of this and the second process (GB), which need not coincide; None if unknown."""
     try:
-        both = processes.peak_memory(), processes.submit(processes.peak_memory).result()
+        peaks = processes.peak_memory(), processes.submit(processes.peak_memory).result()
     except BrokenExecutor:
         return None
-    return None if None in both else sum(both)
+    return None if None in peaks else sum(peaks)
 
 
 def _version(name: str) -> str:
@@ -79,7 +79,7 @@ def _version(name: str) -> str:
 
 
 def _processor() -> str:
-    """The processor's name where the system tells it, else its architecture."""
+    """Return the processor's name if the system reports it, else its architecture."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

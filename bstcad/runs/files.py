@@ -1,6 +1,6 @@
-"""Files: reading is bounded, writing follows no links, a folder has one run at a time; errors are one sentence.
+"""Files: reading is limited in size, writing follows no links, a folder has one run at a time, errors are one sentence.
 
-A folder that somebody sent may hold a pipe, a device, a terabyte of nothing or a link to another file of the reader's.
+A folder from elsewhere may contain a pipe, a device, a terabyte of zeros, or a link to a private file.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from typing import IO, TYPE_CHECKING
 if TYPE_CHECKING:
     import numpy as np
 
-LONGEST = 600  # characters of a sentence that quotes a file
-PART = ("deviation.npz",)  # a file that only the folder of a made part has
-OURS = ("report.json", "lens.step", "scene.toml")  # files that only a design's folder has
-# Kinds of files for a shop, as `bstcad export --as` and the scene's output.export name them.
+MAX_SENTENCE = 600  # largest length of a sentence that quotes a file (characters)
+MADE_PART_FILES = ("deviation.npz",)  # files that only the folder of a made part has
+DESIGN_FILES = ("report.json", "lens.step", "scene.toml")  # files that only a design's folder has
+# Kinds of files for a shop, as in `bstcad export --as` and the scene's output.export.
 EXPORTS = ("sag", "points", "zemax", "turning", "dxf", "svg", "preview", "datasheet")
-LARGEST = 600_000_000  # bytes of an archive: a net of 2049 x 2049 and pictures of 4096 x 4096
-HEADER = 4096  # bytes of an array's header, and to spare
-NO_MEMORY = (  # Python, torch, the system and the loader of libraries each say it in their own way
+MAX_ARCHIVE_SIZE = 600_000_000  # bytes of an archive, enough for a net of 2049 x 2049 and pictures of 4096 x 4096
+MAX_HEADER_SIZE = 4096  # bytes of an array's header, with a margin
+NO_MEMORY = (  # words of Python, torch, the system and the dynamic loader for a lack of memory
     "not enough memory", "out of memory", "bad_alloc", "cannot allocate memory", "can't allocate memory",
     "failed to map segment", "can't start new thread",
 )  # fmt: skip
@@ -36,49 +36,49 @@ NO_MEMORY = (  # Python, torch, the system and the loader of libraries each say 
 
 
 class SentenceError(Exception):
-    """An error whose text is one sentence for the user: the fault, its place and the remedy."""
+    """Error whose text is one sentence for the user: the subject, the fault and the remedy."""
 
 
 class SceneError(SentenceError, ValueError):
-    """A scene, or another input, that cannot be used."""
+    """A scene or another input is invalid."""
 
     def __init__(self, sentence: object = "") -> None:
         super().__init__(one_line(sentence))
 
 
 class MachineError(SentenceError, RuntimeError):
-    """This machine could not do the work though the scene is right."""
+    """The machine could not do the work, although the scene is valid."""
 
 
 def one_line(text: object) -> str:
-    """The text without characters that break a line or steer a terminal; the middle of a long text is left out."""
+    """Return a text without control characters; the middle of a long text is left out."""
     text = _cut(str(text))
     return text if text.isprintable() else _cut("".join(c if c.isprintable() else repr(c)[1:-1] for c in text))
 
 
 def _cut(text: str) -> str:
-    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]}…{text[1 - LONGEST // 2 :]}"
+    return text if len(text) <= MAX_SENTENCE else f"{text[: MAX_SENTENCE // 2]}…{text[1 - MAX_SENTENCE // 2 :]}"
 
 
 def first_line(error: BaseException) -> str:
-    """The first line of an error's text, to be quoted within a sentence."""
+    """Return the first line of an error's text, to be quoted within a sentence."""
     return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
 
 
 def note(error: BaseException) -> str:
-    """The notes of an error, such as how to go on."""
+    """Return the notes of an error, such as a sentence on how to resume."""
     return "; ".join(getattr(error, "__notes__", ()))
 
 
 def _command(error: BaseException) -> str:
-    """The command whose arguments typer refused."""
+    """Return the command whose arguments typer refused."""
     context = getattr(error, "ctx", None)
     return f"bstcad {context.info_name}" if context and context.parent else "bstcad"
 
 
 def sentence_of(error: BaseException) -> str | None:
-    """The sentence for a user whose input is wrong; None if the error is not about the input."""
-    if hasattr(error, "format_message"):  # typer's own: an unknown option, a missing argument
+    """Return the sentence for the user about an error of the input or the machine; None for a fault of bstcad."""
+    if hasattr(error, "format_message"):  # an error of typer: an unknown option, a missing argument
         text = error.format_message().splitlines()[0].rstrip(".").replace(". Did", "; did")
         return text[:1].lower() + text[1:] + ("" if text.endswith("?") else f"; see {_command(error)} --help")
     if isinstance(error, SentenceError):
@@ -86,7 +86,7 @@ def sentence_of(error: BaseException) -> str | None:
     by_words = isinstance(error, RuntimeError | ImportError) and any(words in str(error).lower() for words in NO_MEMORY)
     if by_words or isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
         return (
-            "the memory of this machine is too little for that; free some, or give fewer lens.back.control_points, "
+            "this machine has too little memory for this design; free some, or reduce lens.back.control_points, "
             "target.pixels or tailoring.rays"
         )
     if not isinstance(error, OSError):
@@ -95,95 +95,95 @@ def sentence_of(error: BaseException) -> str | None:
         try:
             os.getcwd()
         except OSError:
-            return "the working folder was deleted; go to another one (cd) and try again"
+            return "the working folder was deleted; change to another folder (cd) and try again"
     where = f"{error.filename}: " if error.filename else ""
-    return f"{where}{error.strerror or error}; check that the path exists, may be written and has space left"
+    return f"{where}{error.strerror or error}; check that the path exists, is writable and has free space"
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
 def contents(path: Path, largest: int) -> bytes:
-    """The bytes of a file; ValueError says why it cannot be read: it is none, or holds over `largest` bytes.
+    """Return the bytes of a file.  ValueError with the reason if it cannot be read or exceeds `largest` bytes.
 
-    Asked before it is opened: a pipe does not end, nor do some files of /proc that say they are empty.
+    The kind and size are checked before opening: a pipe may never end, nor may files of /proc with a size of 0.
     """
     try:
         found = path.stat()
         if not stat.S_ISREG(found.st_mode):
             raise ValueError("it is a folder" if stat.S_ISDIR(found.st_mode) else "it is a pipe or a device")
         if found.st_size > largest:
-            raise ValueError(f"it holds over {largest / 1e6:.4g} MB")
+            raise ValueError(f"it is larger than {largest / 1e6:.4g} MB")
         if found.st_size == 0:
             return b""
         with path.open("rb") as file:
-            return file.read(found.st_size)  # no more than stat states: a buffer of that size is made at once
+            return file.read(found.st_size)  # limited, since a larger argument would allocate a larger buffer
     except OSError as error:
         raise ValueError(error.strerror or type(error).__name__) from error
 
 
 def within(path: Path, *folders: Path) -> Path:
-    """Return the path without its links; ValueError if they lead out of these folders, or back to themselves."""
+    """Return the path with links resolved.  ValueError if they lead out of these folders, or back to themselves."""
     try:
         found = path.resolve()
-        endless = found.is_symlink()  # the newer pathlib; the older raises
+        endless = found.is_symlink()  # newer versions of pathlib; older ones raise
     except (OSError, RuntimeError):
         endless = True
     if endless:
-        raise ValueError("leads by its links back to itself")
+        raise ValueError("is a link that leads back to itself")
     if not any(found.is_relative_to(folder) for folder in folders):
-        raise ValueError(f"leads by links out of the folder {folders[0].name}")
+        raise ValueError(f"is a link that leads out of the folder {folders[0].name}")
     return found
 
 
 def arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], largest: int) -> dict[str, np.ndarray]:
-    """Arrays of float64 from an .npz archive of at most `largest` bytes, by name, as the shapes say.
+    """Return arrays of float64 with the given shapes, by name, from an .npz archive of at most `largest` bytes.
 
-    An archive may unfold to a million times its size, and an array's header may claim any: both are held to the shape
-    before memory is spent.  Raises whatever zipfile and numpy raise for a damaged one.
+    An archive may unpack to a million times its size, and an array's header may claim any size: both are checked
+    against the shape before memory is allocated.  Raises the errors of zipfile and numpy for a damaged archive.
     """
     with zipfile.ZipFile(io.BytesIO(contents(path, largest))) as archive:
         return {name: _array(archive, name, shape) for name, shape in shapes.items()}
 
 
 def names(path: Path) -> list[str]:
-    """The names of the arrays in an .npz archive; [] for other files."""
+    """Return the names of the arrays in an .npz archive; [] for other files."""
     try:
-        with zipfile.ZipFile(io.BytesIO(contents(path, LARGEST))) as archive:
+        with zipfile.ZipFile(io.BytesIO(contents(path, MAX_ARCHIVE_SIZE))) as archive:
             return [name.removesuffix(".npy") for name in archive.namelist()]
     except (ValueError, zipfile.BadZipFile):
         return []
 
 
 def net(path: Path, most: int) -> np.ndarray:
-    """control_points (m, n, 3) as float64 from an .npz archive, m, n at most `most`; raises as `arrays` does."""
-    with zipfile.ZipFile(io.BytesIO(contents(path, LARGEST))) as archive:
+    """Return control_points (m, n, 3) as float64 from an .npz archive, m and n at most `most`; errors as `arrays`."""
+    with zipfile.ZipFile(io.BytesIO(contents(path, MAX_ARCHIVE_SIZE))) as archive:
         with archive.open("control_points.npy") as file:
             (m, n, *_), _ = _header(file, "control_points")
         return _array(archive, "control_points", (min(m, most), min(n, most), 3))
 
 
 def _array(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    import numpy as np  # loaded with the first array: --help quotes files, too
+    import numpy as np  # loaded late, since --help needs this module without numpy
 
     member = archive.getinfo(f"{name}.npy")
-    known = member.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # which unpack no more than they state
-    if member.file_size > 8 * math.prod(shape) + HEADER or not known:
-        raise ValueError(f"{name} holds {member.file_size} bytes, more than {shape} numbers")
+    known = member.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # unpack to the stated size
+    if member.file_size > 8 * math.prod(shape) + MAX_HEADER_SIZE or not known:
+        raise ValueError(f"{name} has {member.file_size} bytes, more than {shape} numbers")
     file = io.BytesIO(archive.read(member))
     found, kind = _header(file, name)
     if found != shape or kind not in "fiu":
-        raise ValueError(f"{name} is not {shape} numbers, as scene.toml asks")
+        raise ValueError(f"{name} is not an array of {shape} numbers, as scene.toml requires")
     file.seek(0)
     return np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
 
 
 def _header(file: IO[bytes], name: str) -> tuple[tuple[int, ...], str]:
-    """Shape and kind of the numbers of an array in numpy's format."""
+    """Return the shape and the kind of numbers of an array in numpy's format."""
     import numpy as np
 
     if np.lib.format.read_magic(file) != (1, 0):
-        raise ValueError(f"{name} is no array of this program")
+        raise ValueError(f"{name} is not an array written by bstcad")
     shape, _, numbers = np.lib.format.read_array_header_1_0(file)
     return shape, numbers.kind
 
@@ -191,33 +191,33 @@ def _header(file: IO[bytes], name: str) -> tuple[tuple[int, ...], str]:
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
-def check_free(folder: Path, ours: Sequence[str] = OURS, whose: str = "a design's") -> None:
-    """SceneError unless a design may take the folder: a new one, empty, or an earlier design's.
+def check_free(folder: Path, ours: Sequence[str] = DESIGN_FILES, whose: str = "a design's") -> None:
+    """Raise SceneError unless a design may use the folder: a new or empty folder, or one of an earlier design.
 
-    ours: files of which one tells whose folder it is.
+    ours: files by which such a folder is recognised.  whose: owner of the folder in the sentence.
     """
     try:
         folder.resolve()
-    except (OSError, RuntimeError):  # the newer pathlib, the older
-        raise SceneError(f"{folder}: leads by its links back to itself; give another folder") from None
+    except (OSError, RuntimeError):  # newer and older versions of pathlib
+        raise SceneError(f"{folder}: is a link that leads back to itself; give another folder") from None
     if folder.exists() and not folder.is_dir():
         raise SceneError(f"{folder}: is a file; give another folder")
     if folder.is_dir() and any(folder.iterdir()) and not any((folder / name).exists() for name in ours):
-        raise SceneError(f"{folder}: holds files that are not {whose}; give a new folder")
+        raise SceneError(f"{folder}: contains files that are not {whose}; give a new folder")
     parent = next(parent for parent in folder.absolute().parents if parent.exists())
     if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise SceneError(f"{folder}: cannot be made, since {parent} may not be written; give another folder")
+        raise SceneError(f"{folder}: cannot be created, since {parent} is not writable; give another folder")
 
 
 def put(path: Path, *parts: bytes | memoryview) -> None:
-    """Write a file whole over an older one, or not at all; a link gives way, and its target stays as it is."""
-    with whole(path) as file:
+    """Write a file completely, or leave the older one; a link is replaced, and its target stays as it is."""
+    with atomic_file(path) as file:
         file.writelines(parts)
 
 
 @contextlib.contextmanager
-def whole(path: Path) -> Iterator[io.BufferedRandom]:
-    """A file to be written and read, which takes its place, as that of `put` does, when the block ends."""
+def atomic_file(path: Path) -> Iterator[io.BufferedRandom]:
+    """Yield a temporary file to write and read, which replaces the file at `path` when the block ends."""
     new = path.with_name(f".{path.name.removeprefix('.')}.new")
     new.unlink(missing_ok=True)
     try:
@@ -233,7 +233,7 @@ def whole(path: Path) -> Iterator[io.BufferedRandom]:
 
 
 def folder_in_place(path: Path) -> Path:
-    """The folder at `path`, made if there is none; a link gives way."""
+    """Return the folder at `path`, created if necessary; a link is replaced."""
     if path.is_symlink():
         path.unlink()
     path.mkdir(exist_ok=True)
@@ -241,40 +241,40 @@ def folder_in_place(path: Path) -> Path:
 
 
 def beside(folder: Path, kind: str) -> Path:
-    """The hidden file of a kind, "lock" or "checkpoint", beside an output folder."""
+    """Return the path of a hidden file beside an output folder; kind: such as "lock" or "checkpoint"."""
     folder = folder.resolve()
     return folder.with_name(f".{folder.name}.{kind}")
 
 
 @contextlib.contextmanager
-def held(folder: Path) -> Iterator[None]:
-    """Keep other runs out of an output folder within the block; SceneError if another run works there.
+def exclusive(folder: Path) -> Iterator[None]:
+    """Lock an output folder against other runs within the block.  SceneError if another run uses it.
 
-    The system takes the lock off with the end of its process: the file that a killed run leaves behind locks nothing.
+    The system releases the lock when its process ends, so the lock file of a killed run locks nothing.
     """
-    from filelock import FileLock, Timeout  # a quarter of a second, which --help need not pay
+    from filelock import FileLock, Timeout  # loaded late: it takes a quarter of a second
 
     path = beside(folder, "lock")
-    if path.is_symlink():  # somebody's: its target stays as it is
+    if path.is_symlink():  # not ours; its target stays as it is
         path.unlink()
     lock = FileLock(path)
     try:
         lock.acquire(blocking=False)
     except Timeout:
         raise SceneError(
-            f"{folder}: is being designed by another run ({_holder(path)}); wait for it or give another folder with -o"
+            f"{folder}: is in use by another run ({_lock_owner(path)}); wait for it, or give another folder with -o"
         ) from None
-    with contextlib.suppress(OSError):  # on a full disk the file names no process
+    with contextlib.suppress(OSError):  # on a full disk the file contains no process id
         path.write_text(str(os.getpid()))
     try:
         yield
     finally:
-        path.unlink(missing_ok=True)  # before the release: the next run makes a new file
+        path.unlink(missing_ok=True)  # before the release, since the next run creates a new file
         lock.release()
 
 
-def _holder(path: Path) -> str:
+def _lock_owner(path: Path) -> str:
     try:
         return f"process {int(path.read_text()[:20])}"
     except (OSError, ValueError):
-        return "of a process unknown"
+        return "unknown process"

@@ -1,8 +1,8 @@
-"""Processes beside this one: the second process, for OCC and for drawing, and bstcad commands as child processes.
+"""Other processes: the second process, which runs OCC and draws figures, and bstcad commands as child processes.
 
-While the lens is still being tailored, the second process loads OCC; a damaged file that makes OCC end its process does
-not end the user's.  It starts at the first `submit`, imports nothing of the user's script, serves all designs of a
-session, and ends after a long idle time.  No process outlives its parent.
+The second process loads OCC while the lens is still being tailored.  A damaged file that crashes OCC does not end the
+user's process.  The second process starts at the first `submit`, imports nothing of the user's script, serves all
+designs of a session, and ends after IDLE_TIMEOUT.  No process outlives its parent.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bstcad.runs.signals import TERMINAL, unheard_by_children
+from bstcad.runs.signals import TERMINAL_SIGNALS, ignored_by_children
 
-LOOK = 0.5  # seconds between two looks for the parent
+PARENT_INTERVAL = 0.5  # seconds between two checks whether the parent is alive
 
 
-def runs(process: int) -> bool:
-    """Is there a process of this number?"""
+def is_alive(process: int) -> bool:
+    """Return True if a process with this id exists."""
     import psutil
 
     try:
@@ -41,7 +41,7 @@ def runs(process: int) -> bool:
 
 
 def command_of(process: int) -> tuple[str, ...]:
-    """The words of the command line of a process; () if there is none of that number, or it has ended already."""
+    """Return the command line of a process by its id; () if it does not exist or has ended."""
     import psutil
 
     try:
@@ -52,11 +52,11 @@ def command_of(process: int) -> tuple[str, ...]:
 
 
 def _end_with(parent: int, end: Callable[[], Any]) -> None:
-    """Call `end`, which ends this process, as soon as the process that started this one is gone."""
+    """Call `end`, which ends this process, as soon as its parent has ended."""
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(LOOK)
+            time.sleep(PARENT_INTERVAL)
         end()
 
     threading.Thread(target=watch, daemon=True).start()
@@ -64,87 +64,89 @@ def _end_with(parent: int, end: Callable[[], Any]) -> None:
 
 # --- the second process -----------------------------------------------------------------------------------------------
 
-IDLE = 300.0  # seconds without work after which it ends
-NEEDED = (
+IDLE_TIMEOUT = 300.0  # seconds without work after which the second process ends
+PRELOADED = (  # modules that the second process loads at its start
     "bstcad.cad.step_writing",
     "bstcad.verify.step_checks",
     "bstcad.report.figure_jobs",
     "matplotlib.backends.backend_agg",
     "matplotlib.backends.backend_pdf",
 )
-NO_LEAK = "1000000000000000"  # bytes; loky would take a solid in memory for a leak and end the process
+# Memory limit of loky in bytes: by default it would mistake a solid in memory for a leak and end the process.
+MEMORY_LEAK_LIMIT = "1000000000000000"
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # glibc's names for mallopt (malloc.h)
-KEPT, LARGE = (1 << 31) - 1, 1 << 27  # bytes: of all that is kept, and of an array that is not
+MAX_KEPT = (1 << 31) - 1  # largest total of freed memory that stays with the process (bytes)
+MAX_KEPT_ARRAY = 1 << 27  # largest freed array that stays with the process (bytes)
 
-# A function, or its name "module.function" where to import it would load OCC into this process.
+# Function, or its name "module.function" if importing it would load OCC into this process.
 Work = str | Callable[..., Any]
 Submit = Callable[..., Future]  # submit(work, *arguments) -> the Future of work(*arguments)
 _process: Executor | None = None
-_second = False  # is this the second process?
+_is_second = False  # True in the second process
 
 
 def submit(work: Work, *arguments: Any) -> Future:
-    """Have the function `work` called by the second process.
+    """Call the function `work` in the second process; calls run one after the other.
 
-    Calls are done one after the other.  A result raises BrokenExecutor if the process died over it.  Where the system
-    allows no second process, a thread of this one does the work.
+    The Future raises BrokenExecutor if the process died during the call.  If the system allows no second process, a
+    thread does the work.
     """
     global _process
     if _process is not None:
         try:
             return _process.submit(_call, work, *arguments)
-        except BrokenExecutor:  # it died over earlier work, whose result tells so
+        except BrokenExecutor:  # the process died during earlier work, whose Future reports it
             end()
     _process = _start()
-    with unheard_by_children():
+    with ignored_by_children():
         return _process.submit(_call, work, *arguments)
 
 
 class Overdue(TimeoutError):
-    """A work of the second process that took too long; the process has been ended."""
+    """Work of the second process exceeded its time limit; the process has been ended."""
 
 
 def result(work: Future, limit: float) -> Any:
-    """The result of a work of the second process; Overdue if it is not there after `limit` seconds."""
+    """Return the result of a call in the second process; Overdue if it takes more than `limit` seconds."""
     try:
         return work.result(limit)
     except TimeoutError as error:
-        if work.done():  # the work itself raised it
+        if work.done():  # raised by the work itself
             raise
         end()
         raise Overdue(f"not ended after {limit:.3g} s") from error
 
 
-def here(work: Work, *arguments: Any) -> Future:
-    """Call a function in this process: a finished Future."""
+def run_here(work: Work, *arguments: Any) -> Future:
+    """Call a function in this process and return a finished Future; a substitute for `submit`."""
     done: Future = Future()
     done.set_result(_call(work, *arguments))
     return done
 
 
 def begin() -> None:
-    """Start the second process, if it does not run yet, and have it load its libraries; a second or two of its own."""
+    """Start the second process, unless it runs, and let it load its libraries, which takes a second or two."""
     if _process is None:
-        submit(load, *NEEDED)
+        submit(load, *PRELOADED)
 
 
 def load(*modules: str) -> None:
-    """Load modules; an error comes again at the first use of its module."""
+    """Import modules; an import error is raised again at the first use of the module."""
     gc.disable()
     for module in modules:
         with contextlib.suppress(Exception):
             importlib.import_module(module)
-    gc.freeze()  # a million objects that stay: no collection walks over them
+    gc.freeze()  # a million permanent objects, which the garbage collector can skip
     gc.enable()
 
 
 def is_second() -> bool:
-    """Is this the second process?  It may end without ending the user's."""
-    return _second
+    """Return True in the second process, which may end without ending the user's process."""
+    return _is_second
 
 
 def end() -> None:
-    """End the second process at once, also while it works."""
+    """End the second process at once, even while it works."""
     global _process
     ended, _process = _process, None
     if ended is not None:
@@ -163,18 +165,20 @@ def _start() -> Executor:
     from loky import ProcessPoolExecutor
 
     atexit.register(end)
-    # loky begins with its resource tracker, whose warnings of semaphores that a killed run left would follow our words
+    # loky's resource tracker would print warnings about the semaphores of killed runs after our own output
     quiet = ",".join(filter(None, (os.environ.get("PYTHONWARNINGS"), "ignore:resource_tracker:UserWarning")))
-    environment = {"LOKY_MAX_MEMORY_LEAK_SIZE": NO_LEAK}
+    environment = {"LOKY_MAX_MEMORY_LEAK_SIZE": MEMORY_LEAK_LIMIT}
     try:
-        with unheard_by_children(), _variable("PYTHONWARNINGS", quiet):
-            return ProcessPoolExecutor(1, timeout=IDLE, initializer=_serve, initargs=(os.getpid(),), env=environment)
+        with ignored_by_children(), _environment_variable("PYTHONWARNINGS", quiet):
+            return ProcessPoolExecutor(
+                1, timeout=IDLE_TIMEOUT, initializer=_serve, initargs=(os.getpid(),), env=environment
+            )
     except OSError:  # no shared memory for its queues
         return ThreadPoolExecutor(1)
 
 
 @contextlib.contextmanager
-def _variable(name: str, value: str) -> Iterator[None]:
+def _environment_variable(name: str, value: str) -> Iterator[None]:
     """Set an environment variable within the block."""
     before = os.environ.get(name)
     os.environ[name] = value
@@ -186,10 +190,10 @@ def _variable(name: str, value: str) -> Iterator[None]:
 
 
 def _serve(parent: int) -> None:
-    """Ignore the signals of the parent, and end with it: a killed parent shuts nothing down."""
-    global _second
-    _second = True
-    for number in (*TERMINAL, signal.SIGTERM):
+    """Ignore the parent's signals and end with the parent, which cannot shut this process down when it is killed."""
+    global _is_second
+    _is_second = True
+    for number in (*TERMINAL_SIGNALS, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     _end_with(parent, lambda: os._exit(1))
 
@@ -198,8 +202,11 @@ def _serve(parent: int) -> None:
 
 
 def peak_memory() -> float | None:
-    """Peak memory of this process (GB); None where the system does not tell.  psutil has no peak on Linux."""
-    with contextlib.suppress(OSError, StopIteration):  # on Linux getrusage counts the process that started this one
+    """Return the peak memory of this process (GB); None if the system does not report it.
+
+    psutil has no peak on Linux.
+    """
+    with contextlib.suppress(OSError, StopIteration):  # on Linux getrusage includes the parent process
         lines = Path("/proc/self/status").read_text().splitlines()
         return int(next(line for line in lines if line.startswith("VmHWM:")).split()[1]) * 1024 / 1e9
     try:
@@ -211,21 +218,20 @@ def peak_memory() -> float | None:
 
 
 def keep_freed() -> None:
-    """Let up to 2 GB of freed memory stay with this process, in arrays of up to 128 MiB; without glibc nothing
-    changes.
+    """Let up to 2 GB of freed memory stay with this process, in arrays of up to 128 MiB; needs glibc.
 
-    glibc returns every freed array of more than 32 MiB to the system, which hands the next one out page by page,
-    cleared: an eighth of the time of an evaluation of a few million tubes.  Arrays of more than 128 MiB, as many more
-    tubes have, would leave holes that no other one fits in, of a third of all memory.
+    By default glibc returns freed arrays of more than 32 MiB to the system, which clears each new array page by page:
+    an eighth of the time of an evaluation of a few million tubes.  Freed arrays of more than 128 MiB would fragment a
+    third of all memory.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
-        mallopt(TRIM_THRESHOLD, KEPT)
-        mallopt(MMAP_THRESHOLD, LARGE)
+        mallopt(TRIM_THRESHOLD, MAX_KEPT)
+        mallopt(MMAP_THRESHOLD, MAX_KEPT_ARRAY)
 
 
 def return_freed() -> None:
-    """Give freed memory back to the system, before work that needs other sizes of it; without glibc nothing happens."""
+    """Return freed memory to the system, before work with arrays of other sizes; needs glibc."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
@@ -233,25 +239,25 @@ def return_freed() -> None:
 
 # --- commands in child processes --------------------------------------------------------------------------------------
 
-TICK = 0.02  # seconds between two looks whether the child has ended
-GRACE = 5.0  # seconds that a child has to end after SIGTERM
-PARENT = "BSTCAD_PARENT"  # environment variable of a child: the number of the process that started it
+POLL_INTERVAL = 0.02  # seconds between two checks whether the child has ended
+TERMINATION_TIMEOUT = 5.0  # seconds that a child has to end after SIGTERM
+PARENT = "BSTCAD_PARENT"  # environment variable of a child: process id of its parent
 
 
 @dataclass(frozen=True)
-class Ending:
-    """How a child ended."""
+class ExitStatus:
+    """Exit status of a child process."""
 
-    code: int  # exit code; -n: signal n ended it
+    code: int  # exit code; -n if signal n ended the child
     seconds: float
-    cpu_seconds: float  # of the child, of all processes that it started, and of others that ended meanwhile
+    cpu_seconds: float  # CPU time of the child and its own children, and of other children that ended meanwhile
     stderr: str
 
     @property
     def reason(self) -> str:
-        """Why there is no result, in a sentence."""
+        """Sentence that says why the child gave no result."""
         if self.code < 0:
-            memory = "; the memory of this machine may be too little for it" if self.code == -signal.SIGKILL else ""
+            memory = "; this machine may have too little memory for it" if self.code == -signal.SIGKILL else ""
             return f"ended by {signal.Signals(-self.code).name}{memory}"
         lines = [line for line in self.stderr.splitlines() if line.startswith("bstcad: ") and "warning: " not in line]
         return lines[-1].removeprefix("bstcad: ") if lines else f"exit code {self.code}"
@@ -262,12 +268,12 @@ def run(
     limit: float = float("inf"),
     tick: Callable[[], None] = lambda: None,
     environment: Mapping[str, str] | None = None,
-) -> Ending:
-    """`bstcad` with these arguments, killed after `limit` seconds.
+) -> ExitStatus:
+    """Run `bstcad` with these arguments in a child process, which is killed after `limit` seconds.
 
-    tick: called while the child works; an exception from it ends the child.  environment: variables besides ours.
+    tick: called while the child works; its exception ends the child.  environment: additional variables.
     """
-    source = str(Path(__file__).parents[2])  # the child runs these sources, wherever it starts
+    source = str(Path(__file__).parents[2])  # the child runs these sources
     paths = os.pathsep.join(filter(None, (source, os.environ.get("PYTHONPATH"))))
     with tempfile.TemporaryFile() as stderr:
         began, others = time.perf_counter(), _cpu_seconds_of_children()
@@ -281,18 +287,18 @@ def run(
                 if time.perf_counter() > began + limit:
                     os.killpg(child.pid, signal.SIGKILL)
                 tick()
-                time.sleep(TICK)
+                time.sleep(POLL_INTERVAL)
         finally:
             if child.returncode is None:
                 _end(child)
         seconds = time.perf_counter() - began
         stderr.seek(0)
         spent = _cpu_seconds_of_children() - others
-        return Ending(child.returncode, seconds, spent, stderr.read().decode(errors="replace"))
+        return ExitStatus(child.returncode, seconds, spent, stderr.read().decode(errors="replace"))
 
 
 def _cpu_seconds_of_children() -> float:
-    """Of those that have ended, and of all processes that they started."""
+    """Return the CPU time of ended child processes and of their children."""
     times = os.times()
     return times.children_user + times.children_system
 
@@ -302,12 +308,12 @@ def _end(child: subprocess.Popen) -> None:
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(child.pid, number)
         with contextlib.suppress(subprocess.TimeoutExpired):
-            child.wait(GRACE)
+            child.wait(TERMINATION_TIMEOUT)
             return
 
 
 def end_with_parent() -> None:
-    """In a child of `run`: have its process group end when its parent is gone.  Elsewhere nothing."""
+    """End the process group of a child of `run` when its parent has ended; do nothing in other processes."""
     parent = os.environ.pop(PARENT, None)
     if parent is not None and os.getpgrp() == os.getpid():
         _end_with(int(parent), lambda: os.killpg(0, signal.SIGKILL))

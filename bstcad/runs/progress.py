@@ -1,6 +1,6 @@
-"""Progress of long work: bars on a terminal or in a notebook, plain lines anywhere else.
+"""Progress of long work: bars on a terminal or in a notebook, plain lines elsewhere.
 
-All are context managers that hand out one function, progress(stage, done, total, text); `text` is the merit.
+Each display is a context manager that yields a function progress(stage, done, total, text); `text` is the merit.
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-Report = Callable[[str, int, int, str], None]
-PAUSE = 3.0  # seconds between two plain lines of a stage
-REDRAWN = 0.2  # seconds between two drawings in a notebook
+ProgressFunction = Callable[[str, int, int, str], None]
+LINE_INTERVAL = 3.0  # seconds between two plain lines of a stage
+REDRAW_INTERVAL = 0.2  # seconds between two drawings in a notebook
 
 
 class Throttled:
-    """A progress function that passes on a new text at once, and a repeated one after a pause (s)."""
+    """Progress function that passes on a new text at once, and a repeated text only after a pause (s)."""
 
-    def __init__(self, progress: Report, pause: float) -> None:
+    def __init__(self, progress: ProgressFunction, pause: float) -> None:
         self._progress, self._pause, self._last = progress, pause, ("", -math.inf)
 
     def __call__(self, stage: str, done: int, total: int, text: str) -> None:
-        """As `Report`."""
+        """Pass the progress on, unless its text is repeated within the pause."""
         now = time.perf_counter()
         if text != self._last[0] or now - self._last[1] >= self._pause:
             self._last = text, now
             self._progress(stage, done, total, text)
 
 
-def watch(console: Console) -> AbstractContextManager[Report]:
-    """Bars if `console` is a terminal, else lines."""
+def watch(console: Console) -> AbstractContextManager[ProgressFunction]:
+    """Display bars if `console` is a terminal, else lines."""
     return bars(console) if console.is_terminal else lines(console)
 
 
-def shown(wanted: bool = True) -> AbstractContextManager[Report]:
-    """For a script: bars in a terminal or a notebook; nothing elsewhere, or if not wanted."""
+def for_script(wanted: bool = True) -> AbstractContextManager[ProgressFunction]:
+    """Display bars for a script in a terminal or a notebook; nothing elsewhere, or if not `wanted`."""
     display, console = _notebook(), Console(stderr=True)
     if wanted and display is not None:
         return cells(display)
@@ -51,7 +51,7 @@ def shown(wanted: bool = True) -> AbstractContextManager[Report]:
 
 
 def _notebook() -> Callable[..., Any] | None:
-    """IPython's `display` in a notebook; None elsewhere."""
+    """Return IPython's `display` in a notebook; None elsewhere."""
     if "IPython" not in sys.modules:
         return None
     from IPython import get_ipython
@@ -61,8 +61,8 @@ def _notebook() -> Callable[..., Any] | None:
 
 
 @contextmanager
-def bars(console: Console) -> Iterator[Report]:
-    """One bar a stage, with the merit and the time left; the bars of past stages stay."""
+def bars(console: Console) -> Iterator[ProgressFunction]:
+    """Display one bar per stage, with the merit and the time left; bars of past stages stay."""
     columns = (
         TextColumn("{task.description:<12}"),
         BarColumn(bar_width=30),
@@ -85,9 +85,9 @@ def bars(console: Console) -> Iterator[Report]:
 
 
 @contextmanager
-def cells(display: Callable[..., Any], clock: Callable[[], float] = time.monotonic) -> Iterator[Report]:
-    """The bars of a notebook: a table below the cell, a row a stage, drawn anew a few times a second."""
-    began: dict[str, float] = {}  # by stage
+def cells(display: Callable[..., Any], clock: Callable[[], float] = time.monotonic) -> Iterator[ProgressFunction]:
+    """Display a table with one row per stage below a notebook's cell, redrawn every REDRAW_INTERVAL."""
+    began: dict[str, float] = {}  # start time by stage
     rows: dict[str, str] = {}
     handle = display({"text/html": "", "text/plain": ""}, raw=True, display_id=True)
     drawn = clock()
@@ -99,7 +99,7 @@ def cells(display: Callable[..., Any], clock: Callable[[], float] = time.monoton
             f'<tr><td>{html.escape(stage)}</td><td><progress max="{max(total, 1)}" value="{done}"></progress></td>'
             f"<td>{now - began.setdefault(stage, now):.1f} s</td><td>{html.escape(text)}</td></tr>"
         )
-        if done >= total or now - drawn >= REDRAWN:
+        if done >= total or now - drawn >= REDRAW_INTERVAL:
             drawn = now
             show()
 
@@ -112,17 +112,17 @@ def cells(display: Callable[..., Any], clock: Callable[[], float] = time.monoton
 
 
 @contextmanager
-def lines(console: Console, clock: Callable[[], float] = time.monotonic) -> Iterator[Report]:
-    """A line when a stage starts, every few seconds, and when it ends."""
-    began: dict[str, float] = {}
-    due: dict[str, float] = {}  # when the next line of a stage may come
+def lines(console: Console, clock: Callable[[], float] = time.monotonic) -> Iterator[ProgressFunction]:
+    """Print a line when a stage starts, every LINE_INTERVAL, and when it ends."""
+    began: dict[str, float] = {}  # start time by stage
+    due: dict[str, float] = {}  # earliest time of a stage's next line
 
     def report(stage: str, done: int, total: int, text: str) -> None:
         now, ends = clock(), done >= total > 0
         begun, next_line = began.setdefault(stage, now), due.get(stage, now)
         if now < next_line and not (ends and next_line < math.inf):
             return
-        due[stage] = math.inf if ends else now + PAUSE
+        due[stage] = math.inf if ends else now + LINE_INTERVAL
         left = (now - begun) * (total - done) / done if done else 0.0
         when = f"{now - begun:.1f} s" if ends else f"{left:.0f} s left" if left else ""
         parts = (f"{stage}: {done}/{total}" if total else stage, text, when)

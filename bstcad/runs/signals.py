@@ -1,7 +1,7 @@
 """Signals that end a run.
 
-While a lens is tailored, the first Ctrl-C (SIGINT) asks for the best lens so far; any other ends the run at once, and
-so do SIGTERM and SIGHUP: a SIGKILL may follow.  The design so far is kept in each case (commands.generate).
+While a lens is tailored, the first Ctrl-C (SIGINT) requests the best lens so far; a second one ends the run at once, as
+do SIGTERM and SIGHUP, after which a SIGKILL may follow.  In each case a checkpoint is kept (commands.generate).
 """
 
 from __future__ import annotations
@@ -12,15 +12,16 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 
-ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))  # no SIGHUP on Windows
-TERMINAL = (signal.SIGINT, *ENDING[1:])  # that a terminal sends to every process of its group
-_heard: list[int] = []  # of ENDING, since `endings` began
-_starting: list[object] = []  # one for each process that is being started
-_late: list[int] = []  # signals that came meanwhile to a block of `ending_at_once`
+# Signals that terminate a run; Windows has no SIGHUP.
+TERMINATION_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+TERMINAL_SIGNALS = (signal.SIGINT, *TERMINATION_SIGNALS[1:])  # signals that a terminal sends to its whole process group
+_received: list[int] = []  # termination signals since `raise_terminated` began
+_starting: list[object] = []  # one item for each process that is being started
+_delayed: list[int] = []  # signals that arrived in a block of `exit_on_signal` while a process was being started
 
 
-class Ended(BaseException):
-    """SIGTERM or SIGHUP."""
+class Terminated(BaseException):
+    """The run is ended by SIGTERM or SIGHUP."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -28,100 +29,108 @@ class Ended(BaseException):
 
     @property
     def name(self) -> str:
-        """As the system calls it: SIGTERM."""
+        """Name of the signal, such as SIGTERM."""
         return signal.Signals(self.number).name
 
 
-def ended() -> Ended | None:
-    """The signal that ended this run, even if its exception was lost in a destructor or replaced by another one."""
-    return Ended(_heard[0]) if _heard else None
+def termination() -> Terminated | None:
+    """Return the signal that terminated this run, even if its exception was lost or replaced; None without one."""
+    return Terminated(_received[0]) if _received else None
 
 
 @contextlib.contextmanager
-def endings() -> Iterator[None]:
-    """SIGTERM and SIGHUP raise Ended once: a second one does not interrupt keeping.  Ignored signals stay ignored."""
+def raise_terminated() -> Iterator[None]:
+    """Raise Terminated on the first SIGTERM or SIGHUP in the block; later ones do not interrupt the clean-up.
 
-    def hear(number: int, frame: object) -> None:
-        _heard.append(number)
-        if len(_heard) == 1:
-            raise Ended(number)
+    Ignored signals stay ignored.
+    """
 
-    _heard.clear()
-    with _heard_by(hear, *(number for number in ENDING if signal.getsignal(number) != signal.SIG_IGN)):  # nohup
+    def handle(number: int, frame: object) -> None:
+        _received.append(number)
+        if len(_received) == 1:
+            raise Terminated(number)
+
+    _received.clear()
+    numbers = [n for n in TERMINATION_SIGNALS if signal.getsignal(n) != signal.SIG_IGN]  # nohup ignores SIGHUP
+    with _handled_by(handle, *numbers):
         yield
 
 
 @contextlib.contextmanager
-def first_interrupt_is_a_wish() -> Iterator[Callable[[], bool]]:
-    """Within the block the first Ctrl-C makes the yielded function true; the second raises KeyboardInterrupt."""
+def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
+    """Yield a function that returns True after a first Ctrl-C in the block; a second one raises KeyboardInterrupt.
+
+    The function raises Terminated if such an exception was lost.
+    """
     pressed: list[int] = []
 
-    def hear(number: int, frame: object) -> None:
+    def handle(number: int, frame: object) -> None:
         if pressed:
             raise KeyboardInterrupt
         pressed.append(number)
         print("\nbstcad: stopping with the best lens so far; press Ctrl-C again to stop at once", file=sys.stderr)
 
-    def wished() -> bool:
-        if lost := ended():
+    def stop_requested() -> bool:
+        if lost := termination():
             raise lost
         return bool(pressed)
 
-    with _heard_by(hear, signal.SIGINT):
-        yield wished
+    with _handled_by(handle, signal.SIGINT):
+        yield stop_requested
 
 
 @contextlib.contextmanager
-def unheard_by_children() -> Iterator[None]:
-    """Processes started in the block ignore the signals of a terminal; this process hears them after the block.
+def ignored_by_children() -> Iterator[None]:
+    """Make processes that start in the block ignore the signals of a terminal; this process gets them after the block.
 
-    Meanwhile the signals are blocked, where the system can: one that came would be lost to the handler that ignores it.
+    In the block the signals are blocked, if the system can do that; otherwise they would be ignored and lost.
     """
     masks = hasattr(signal, "pthread_sigmask")
-    held = signal.pthread_sigmask(signal.SIG_BLOCK, TERMINAL) if masks else ()
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, TERMINAL_SIGNALS) if masks else ()
     _starting.append(start := object())
     try:
-        with _heard_by(signal.SIG_IGN, *TERMINAL):
+        with _handled_by(signal.SIG_IGN, *TERMINAL_SIGNALS):
             yield
     finally:
         _starting.remove(start)
         if masks:
-            signal.pthread_sigmask(signal.SIG_SETMASK, held)
-        if _late:
-            _end_at_once(_late[0])
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if _delayed:
+            _exit(_delayed[0])
 
 
 @contextlib.contextmanager
-def ending_at_once() -> Iterator[None]:
-    """Within the block, in which libraries load, a signal ends this process at once, with a sentence.
+def exit_on_signal() -> Iterator[None]:
+    """End this process at once, with a sentence, on a signal in the block, in which libraries load.
 
-    Some libraries swallow the exception of a signal while they load, and stay half loaded; to wait for all of them can
-    take ten seconds on a busy machine.  Nothing has been written yet.
+    Some libraries swallow the exception of a signal while they load and stay half loaded.  Loading all of them can take
+    ten seconds on a busy machine.  Nothing has been written yet.
     """
-    numbers = [n for n in (signal.SIGINT, *ENDING) if signal.getsignal(n) not in (signal.SIG_IGN, signal.SIG_DFL)]
-    with _heard_by(_end_at_once, *numbers):
+    default = (signal.SIG_IGN, signal.SIG_DFL)
+    numbers = [n for n in (signal.SIGINT, *TERMINATION_SIGNALS) if signal.getsignal(n) not in default]
+    with _handled_by(_exit, *numbers):
         yield
 
 
-def _end_at_once(number: int, frame: object = None) -> None:
-    if _starting:  # a process that is half started would complain of it
-        _late.append(number)
+def _exit(number: int, frame: object = None) -> None:
+    if _starting:  # a half-started process would print an error
+        _delayed.append(number)
         return
     interrupted = number == signal.SIGINT
-    how = "stopped" if interrupted else f"ended by {Ended(number).name}"
-    with contextlib.suppress(OSError):  # a terminal that is gone
+    how = "stopped" if interrupted else f"ended by {Terminated(number).name}"
+    with contextlib.suppress(OSError):  # the terminal may be gone
         os.write(2, f"bstcad: {how} at its start; nothing was written\n".encode())
     os._exit(128 + number)
 
 
 @contextlib.contextmanager
-def _heard_by(hear: Callable[[int, object], None] | signal.Handlers, *numbers: int) -> Iterator[None]:
-    """`hear` handles these signals within the block."""
+def _handled_by(handle: Callable[[int, object], None] | signal.Handlers, *numbers: int) -> Iterator[None]:
+    """Install a handler for some signals within the block."""
     before = {}
     try:
         for number in numbers:
-            before[number] = signal.signal(number, hear)
-    except ValueError:  # not the main thread, which alone hears signals
+            before[number] = signal.signal(number, handle)
+    except ValueError:  # only the main thread can handle signals
         pass
     try:
         yield

@@ -26,8 +26,8 @@ from bstcad.report.report import check_lines
 from bstcad.runs import environment, files, processes
 from bstcad.runs.checkpoint import Keeper
 from bstcad.runs.cluster import Answer, Cluster, Machines
-from bstcad.runs.processes import Ending
-from bstcad.runs.progress import Report
+from bstcad.runs.processes import ExitStatus
+from bstcad.runs.progress import ProgressFunction
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene, load
 from bstcad.sweep import cold_run
@@ -98,7 +98,7 @@ class Wanted:
 
 def design(
     contents: Mapping[str, bytes], folder: Path, variables: Mapping[str, str], tick: Callable[[], None] = lambda: None
-) -> Ending:
+) -> ExitStatus:
     """Design a scene into a folder, from the checkpoint of this very design beside it, if there is any.
 
     contents: the scene and its pictures, by file name.  variables: of the environment.  A process that was killed is
@@ -118,12 +118,12 @@ def design(
 def _has_checkpoint(scene: Scene, folder: Path) -> bool:
     keeper = Keeper(files.beside(folder, "checkpoint"), purpose(scene, "auto"), kind=Saved)
     try:
-        return keeper.found() is not None
+        return keeper.load() is not None
     except SceneError:
         return False
 
 
-def design_elsewhere(contents: Mapping[str, bytes]) -> tuple[Ending, dict[str, bytes]]:
+def design_elsewhere(contents: Mapping[str, bytes]) -> tuple[ExitStatus, dict[str, bytes]]:
     """On a worker: how the design went, and the files of its folder by their paths in it."""
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         folder = Path(place) / "design"
@@ -137,7 +137,7 @@ def design_elsewhere(contents: Mapping[str, bytes]) -> tuple[Ending, dict[str, b
 
 def batch(
     wanted: Sequence[Wanted], folder: Path, *, workers: int | None = None, cluster: Cluster | None = None,
-    progress: Report = lambda *told: None, say: Callable[[str], None] = lambda sentence: None,
+    progress: ProgressFunction = lambda *told: None, say: Callable[[str], None] = lambda sentence: None,
 ) -> list[Row]:  # fmt: skip
     """Design each scene into folder/NAME; a row for each, in their order.
 
@@ -145,7 +145,7 @@ def batch(
     are designed instead.  say: is told a sentence before the work.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with files.held(folder / "batch.json"), contextlib.ExitStack() as stack:
+    with files.exclusive(folder / "batch.json"), contextlib.ExitStack() as stack:
         earlier = read(folder)
         rows = list(_outset(wanted, folder, earlier))
         names = {row.name for row in rows if row.status != REFUSED}
@@ -157,7 +157,7 @@ def batch(
             machines = cluster or stack.enter_context(LocalPool(min(workers or max(1, at_a_time), len(left))))
             done, place = sum(row.finished for row in rows), "the cluster" if cluster else "this machine"
             say(
-                f"{len(left)} design{'s' * (len(left) > 1)}, {min(machines.room, len(left))} at a time on {place}, "
+                f"{len(left)} design{'s' * (len(left) > 1)}, {min(machines.capacity, len(left))} at a time on {place}, "
                 f"each with up to {most:.1f} GB of memory"
                 f"{f'; {done} finished before' if done else ''}"
             )
@@ -196,19 +196,19 @@ def _outset(wanted: Sequence[Wanted], folder: Path, earlier: Sequence[Row]) -> I
 
 def _design_all(
     rows: list[Row], left: Mapping[int, Scene], folder: Path, machines: Machines, *,
-    told: Report, others: Sequence[Row],
+    told: ProgressFunction, others: Sequence[Row],
 ) -> None:  # fmt: skip
     """Design the scenes that are left, put their rows in place, and write batch.json whenever a design has ended."""
     waiting, under_way, here = list(left), [], isinstance(machines, LocalPool)
     # So many processes share the cores; variables that are set stay as they are.
-    share = {name: value for name, value in environment.threads(machines.room).items() if name not in os.environ}
+    share = {name: value for name, value in environment.threads(machines.capacity).items() if name not in os.environ}
 
     def tick() -> None:
         done = len(left) - len(waiting) - len(under_way)
         told("batch", done, len(left), ", ".join(rows[k].name for k in under_way))
 
     while waiting or under_way:
-        while waiting and len(under_way) < machines.room:
+        while waiting and len(under_way) < machines.capacity:
             under_way.append(k := waiting.pop(0))
             contents = folders.scene_files(left[k])
             if here:
@@ -227,7 +227,7 @@ def _ended(row: Row, answer: Answer, folder: Path, here: bool) -> Row:
     row = row.changed(where=answer.where)
     if answer.reason:
         return row.changed(status=BROKEN, reason=answer.reason)
-    ending: Ending = answer.value if here else answer.value[0]
+    ending: ExitStatus = answer.value if here else answer.value[0]
     if ending.code not in (0, 1):
         status = REFUSED if ending.code == 2 else BROKEN
         return row.changed(status=status, reason=ending.reason, seconds=ending.seconds)
@@ -249,7 +249,7 @@ def _ended(row: Row, answer: Answer, folder: Path, here: bool) -> Row:
 
 def _put(contents: Mapping[str, bytes], folder: Path) -> None:
     """A design that was made elsewhere, in the place of an earlier one."""
-    with files.held(folder), folders.replacing(folder) as building:
+    with files.exclusive(folder), folders.replacing(folder) as building:
         for name, data in contents.items():
             path = building / name
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -259,7 +259,7 @@ def _put(contents: Mapping[str, bytes], folder: Path) -> None:
 def _design_in(folder: Path) -> str:
     """SHA-256 of the design in a folder; "" if there is none."""
     try:
-        data = files.contents(folder / "design.npz", files.LARGEST)
+        data = files.contents(folder / "design.npz", files.MAX_ARCHIVE_SIZE)
     except ValueError:
         return ""
     return hashlib.sha256(data).hexdigest() if (folder / "report.json").is_file() else ""

@@ -36,7 +36,7 @@ from bstcad.optics.measure import Effort, measure
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import Plane
 from bstcad.runs import environment, files, processes
-from bstcad.runs.cluster import HERE, Answer
+from bstcad.runs.cluster import THIS_MACHINE, Answer
 from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.scene import Scene, load
 from bstcad.tailoring.merit import Merit
@@ -107,7 +107,7 @@ class LocalPool:
     """
 
     def __init__(self, room: int) -> None:
-        self.room = room
+        self.capacity = room
         self._threads, self._ends = ThreadPoolExecutor(room), threading.Event()
         self._keys: dict[Future, Any] = {}
 
@@ -128,8 +128,8 @@ class LocalPool:
             for future in wait(self._keys, timeout=LOOK, return_when=FIRST_COMPLETED).done:
                 key, error = self._keys.pop(future), future.exception()
                 if error is not None:
-                    return Answer(key, HERE, reason=f"{type(error).__name__}: {error}")
-                return Answer(key, HERE, future.result())
+                    return Answer(key, THIS_MACHINE, reason=f"{type(error).__name__}: {error}")
+                return Answer(key, THIS_MACHINE, future.result())
             tick()
 
     def _tick(self) -> None:
@@ -217,7 +217,7 @@ class Run(Stored):
     reason: str = ""  # why it failed
     label: str = ""  # in words: "Ray tubes a side: 768"
     knobs: tuple[str, ...] = ()  # keys of the knobs that it is a point of; "base": of all
-    where: str = HERE  # or the address of a worker; "": nowhere
+    where: str = THIS_MACHINE  # or the address of a worker; "": nowhere
     seconds: float | None = 0.0  # of the whole command
     cpu_seconds: float | None = 0.0  # of the command and of all processes that it started
     kernel_seconds: float | None = 0.0  # of the calibration kernel, before this run
@@ -249,7 +249,7 @@ class Run(Stored):
     @property
     def comparable(self) -> bool:
         """Do its seconds compare?  Seconds of this machine do, since its runs follow each other."""
-        return self.done and self.where == HERE
+        return self.done and self.where == THIS_MACHINE
 
 
 def carry_out(

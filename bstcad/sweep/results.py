@@ -20,8 +20,8 @@ from bstcad.runs import files
 from bstcad.scene.scene import Scene
 from bstcad.sweep.cold_run import (
     FAILED,
-    HERE,
     NOT_RUN,
+    THIS_MACHINE,
     HistoryPoint,
     Run,
     Stored,
@@ -141,7 +141,7 @@ class Table(Stored):
     @property
     def elsewhere(self) -> bool:
         """Did a run take place on another machine?"""
-        return any(run.where not in (HERE, "") for run in self.runs)
+        return any(run.where not in (THIS_MACHINE, "") for run in self.runs)
 
 
 def front(runs: Iterable[Run]) -> list[Run]:

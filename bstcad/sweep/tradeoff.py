@@ -25,7 +25,7 @@ from bstcad.folder import SCENE, scene_files
 from bstcad.optics.sides import Sides, as_pair, scaled
 from bstcad.runs import environment, files
 from bstcad.runs.cluster import Answer, Machines
-from bstcad.runs.progress import Report
+from bstcad.runs.progress import ProgressFunction
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import PRESETS
 from bstcad.scene.scene import Scene
@@ -238,7 +238,7 @@ class RunFile(Stored):
 
 
 def tradeoff(
-    scene: Scene, folder: Path, *, budget: float, progress: Report = lambda *told: None,
+    scene: Scene, folder: Path, *, budget: float, progress: ProgressFunction = lambda *told: None,
     machines: Machines | None = None, effort: cold_run.Effort = cold_run.REFERENCE,
 ) -> Table:  # fmt: skip
     """Run the most important runs that the budget allows, and write tradeoff.csv, .json, .png and .html.
@@ -251,7 +251,7 @@ def tradeoff(
     contents = scene_files(base)
     check_free(folder, contents)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with files.held(folder):
+    with files.exclusive(folder):
         for place in (folder / "scene", folder / "runs"):
             place.mkdir(parents=True, exist_ok=True)
         for name, data in contents.items():
@@ -289,7 +289,7 @@ def check_free(folder: Path, contents: Mapping[str, bytes]) -> None:
 class _Search:
     """A sweep under way."""
 
-    def __init__(self, base: Scene, budget: float, folder: Path, progress: Report) -> None:
+    def __init__(self, base: Scene, budget: float, folder: Path, progress: ProgressFunction) -> None:
         self._base, self._budget, self._folder, self._progress = base, budget, folder, progress
         self._knobs = knobs(base)
         self._order, self._work = run_order(base, self._knobs), cache(partial(work_of, base))
@@ -317,7 +317,7 @@ class _Search:
                 cold_run.warm_up(contents, lambda: self._progress("warm-up", 0, 0, "kernels are compiled, files read"))
                 machines = stack.enter_context(LocalPool(1))
             while True:
-                while len(self._under_way) < machines.room and (point := self._choice()) is not None:
+                while len(self._under_way) < machines.capacity and (point := self._choice()) is not None:
                     # The first run is never ended for time: without it there is nothing.
                     limit = self._left() + OVER * self._budget if self.runs or self._under_way else math.inf
                     self._under_way[point] = time.perf_counter(), self._predicted(point)

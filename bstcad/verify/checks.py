@@ -27,7 +27,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, RESOLVED, Effort, Light, SpectralLine, measure, spectral_lines, tubes_of
 from bstcad.optics.outlines import Outline
 from bstcad.optics.wavefront_error import WavefrontError, wavefront_error
-from bstcad.runs.processes import Overdue, Submit, end, here, result, return_freed
+from bstcad.runs.processes import Overdue, Submit, end, result, return_freed, run_here
 from bstcad.scene.blank import LensBlank
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Accept, Scene
@@ -123,7 +123,7 @@ class Proof:
 def verify(
     folder: Path,
     nominal: Nominal,
-    submit: Submit = here,
+    submit: Submit = run_here,
     known: Callable[[Lens], None] = lambda lens: None,
     lit: Callable[[Light, tuple[SpectralLine, ...], int], None] = lambda light, lines, number: None,
     effort: Effort | None = None,
@@ -263,7 +263,7 @@ def _stability(
     }
 
 
-def examine(path: Path, submit: Submit = here) -> ExaminedFile:
+def examine(path: Path, submit: Submit = run_here) -> ExaminedFile:
     """Check a STEP file by itself; ValueError if it holds no lens."""
     return _result(submit("bstcad.verify.step_checks.examine", path.absolute()), path)
 

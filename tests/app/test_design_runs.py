@@ -50,19 +50,19 @@ def test_a_run_whose_process_was_killed_is_stopped_and_can_be_gone_on_with(tmp_p
     run = Run(tmp_path / "made", UNKNOWN)
     run.place.mkdir(parents=True)
     State("running", process=2**22 + 1).put(run.place)
-    assert run.state.state == "stopped" and run.state.sentence == design_runs.LOST
-    with pytest.raises(ValueError, match="begin it anew"):
+    assert run.state.state == "stopped" and run.state.sentence == design_runs.PROCESS_LOST
+    with pytest.raises(ValueError, match="start a new one"):
         run.go_on()
 
 
 def test_a_run_that_ends_with_the_server_is_said_as_it_is(tmp_path, monkeypatch):
     """The server waits a moment for its runs; what they keep, they keep without it."""
-    monkeypatch.setattr(design_runs, "GRACE", 0.0)
+    monkeypatch.setattr(design_runs, "ENDING_TIMEOUT", 0.0)
     run = Run(tmp_path / "small")
     run.place.mkdir()
     State("stopped", sentence="nothing is kept").put(run.place)
-    assert "the design is stopped; nothing is kept" in run.ending
+    assert "the design is stopped; nothing is kept" in run.final_sentence
     State("running", process=os.getpid()).put(run.place)
-    monkeypatch.setattr(Run, "_lives", lambda self, process: True)
+    monkeypatch.setattr(Run, "_is_own_process", lambda self, process: True)
     [said] = design_runs.endings([run])
-    assert "is being stopped" in said and "nothing" not in said
+    assert "is stopping" in said and "nothing" not in said

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from bstcad.app.followers import impossible, take_change
+from bstcad.app.followers import impossible_choices, take_change
 from bstcad.app.form import form
 from bstcad.app.scene_text import changed, typed
 from bstcad.runs.files import SentenceError
@@ -28,12 +28,12 @@ def fault(text):
     return None
 
 
-def is_sound(text):
+def is_valid(text):
     return fault(text) is None
 
 
 def take(text, key, words, **options):
-    return take_change(text, key, typed(key, words, tomllib.loads(text)), is_sound=is_sound, **options)
+    return take_change(text, key, typed(key, words, tomllib.loads(text)), is_valid=is_valid, **options)
 
 
 def target(text):
@@ -60,14 +60,14 @@ def test_y_follows_x_only_with_a_closed_lock():
     ("lens.outline.diameter", "1e-9", "source.aperture.radius"),
 ])  # fmt: skip
 def test_a_wrong_entry_changes_no_other_field_and_leaves_no_trace(key, wrong, other):
-    text, followed = take(SMALL, key, wrong, sound=SMALL, locked=True)
+    text, followed = take(SMALL, key, wrong, valid_text=SMALL, locked=True)
     assert text == changed(SMALL, key, typed(key, wrong, tomllib.loads(SMALL))) and followed == ()
-    assert not is_sound(text)
+    assert not is_valid(text)
     mended = {"target.x": "-4; 4", "lens.back.z": "5", "lens.outline.diameter": "14"}[key]
-    at_once, after = (take(*given, mended, sound=SMALL, locked=True)[0] for given in ((SMALL, key), (text, key)))
+    at_once, after = (take(*given, mended, valid_text=SMALL, locked=True)[0] for given in ((SMALL, key), (text, key)))
     assert after == at_once
     own = changed(text, other, 9.0 if other != "target.y" else [-9.0, 9.0])  # what a person changed meanwhile stays
-    assert changed(take(own, key, mended, sound=SMALL, locked=True)[0], key, None) == changed(own, key, None)
+    assert changed(take(own, key, mended, valid_text=SMALL, locked=True)[0], key, None) == changed(own, key, None)
 
 
 @pytest.mark.parametrize("name", TEXTS)
@@ -75,10 +75,10 @@ def test_a_choice_that_is_offered_is_possible_or_told_why_not(name, monkeypatch)
     """Each is typed as the page sends it; what is not possible is greyed, all else makes a valid scene."""
     monkeypatch.setattr(effects, "_KNOWN", {})  # of other tests of this process
     text = TEXTS[name]
-    greyed, data = impossible(text, fault), tomllib.loads(text)
+    greyed, data = impossible_choices(text, fault), tomllib.loads(text)
     for field in form(data).fields():
         for choice in field.choices if field.control == "choice" and field.key.rpartition(".")[2] != "sample" else ():
-            done = fault(take(text, field.key, choice, sound=text)[0])
+            done = fault(take(text, field.key, choice, valid_text=text)[0])
             assert done == greyed.get(field.key, {}).get(choice), (field.key, choice)
     usual = {"two_pictures": {"tailoring.quality": {"paper"}, "tailoring.method": {"adam", "integration"}}}
     usual["mirror"] = {"lens.front.kind": {"bspline"}}

@@ -15,9 +15,9 @@ import tomli_w
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bstcad.app.form import FIRST, Field, Form, form, html, html_id, slider
-from bstcad.app.kinds import new_table, plain
-from bstcad.app.scene_text import changed, same, typed
+from bstcad.app.form import MAIN_FIELDS, Field, SceneForm, form, html, html_id, slider
+from bstcad.app.kinds import new_table, without_numbers
+from bstcad.app.scene_text import changed, is_same, typed
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import _validated
 from bstcad.scene.schema import rows, toml
@@ -28,15 +28,15 @@ DATA = {name: tomllib.loads(text) for name, text in TEXTS.items()}
 sys.path.append(str(ROOT / "docs" / "_ext"))
 
 
-def steps(found: Form, key: str):
+def steps(found: SceneForm, key: str):
     """Return the entries that a person may make in a form before a key: (key, value) for `changed`."""
     groups = [*found.additions, *(addition for group in found.groups() for addition in group.additions)]
     for addition in groups:
-        if f"{key}.".startswith(f"{plain(addition.key)}."):
+        if f"{key}.".startswith(f"{without_numbers(addition.key)}."):
             yield addition.key, addition.value
     for field in found.fields():
         table, _, name = field.key.rpartition(".")
-        if name in ("kind", "shape") and f"{key}.".startswith(f"{plain(table)}."):
+        if name in ("kind", "shape") and f"{key}.".startswith(f"{without_numbers(table)}."):
             yield from ((field.key, choice) for choice in field.choices if choice != field.value)
 
 
@@ -45,9 +45,9 @@ def ways_to(row, text, left=4):
     found = form(tomllib.loads(text))
     key = row.key.replace("[]", "")
     if row.range in ("table", "tables"):
-        if any(plain(group.key) == key and group.meaning in (row.meaning, "") for group in found.groups()):
+        if any(without_numbers(group.key) == key and group.meaning in (row.meaning, "") for group in found.groups()):
             return True
-    elif any(plain(field.key) == key and field.meaning == row.meaning for field in found.fields()):
+    elif any(without_numbers(field.key) == key and field.meaning == row.meaning for field in found.fields()):
         return True
     return left > 0 and any(ways_to(row, changed(text, *step), left - 1) for step in steps(found, key))
 
@@ -60,18 +60,18 @@ def test_every_key_can_be_reached():
 def test_a_field_says_what_the_schema_says_and_what_the_scene_has(name):
     told = {}
     for row in rows():
-        told.setdefault(plain(row.key), []).append(row)
+        told.setdefault(without_numbers(row.key), []).append(row)
     found = form(DATA[name])
     assert max(Counter(field.key for field in found.fields()).values()) == 1
     for field in found.fields():
-        [row, *_] = [row for row in told[plain(field.key)] if row.meaning == field.meaning]
+        [row, *_] = [row for row in told[without_numbers(field.key)] if row.meaning == field.meaning]
         assert field.unit == row.unit.replace("none", "")
-        assert field.least is None or row.range.startswith(f"{field.least:g}" if field.least < 1e4 else "1")
+        assert field.minimum is None or row.range.startswith(f"{field.minimum:g}" if field.minimum < 1e4 else "1")
         assert field.required == (row.default == "required")
         default = "" if field.required else row.default
         assert field.default == default or toml(typed(field.key, field.default, DATA[name])) == default
         assert field.control != "choice" or " | ".join(field.choices) in row.range
-        assert field.given == (field.value != "")
+        assert field.is_set == (field.value != "")
         typed_again = typed(field.key, field.value, DATA[name])
         assert field.value == "" or changed(TEXTS[name], field.key, typed_again) == TEXTS[name]
 
@@ -88,7 +88,7 @@ def values(table, prefix=""):
 
 @pytest.mark.parametrize("name", DATA)
 def test_every_value_of_a_scene_is_in_its_form(name):
-    assert {field.key for field in form(DATA[name]).fields() if field.given} == {*values(DATA[name])}
+    assert {field.key for field in form(DATA[name]).fields() if field.is_set} == {*values(DATA[name])}
 
 
 @pytest.mark.parametrize("name", DATA)
@@ -99,24 +99,24 @@ def test_what_is_added_is_there_and_goes_again(name):
         new = {group.key: group for group in form(tomllib.loads(text)).groups()}
         key = addition.key if addition.key in new else addition.key.replace("[0]", "")
         assert new[key].removable
-        if plain(addition.key) != "target.profile":  # which replaces the picture
+        if without_numbers(addition.key) != "target.profile":  # which replaces the picture
             left = tomllib.loads(changed(text, addition.key, None))
             one = {name: part[0] if name == "target" and len(part) == 1 else part for name, part in left.items()}
-            assert same(left, DATA[name]) or same(one, DATA[name])
+            assert is_same(left, DATA[name]) or is_same(one, DATA[name])
 
 
 def test_the_first_fields_are_keys_and_follow_the_kind():
-    known = {plain(row.key): row for row in rows()}
-    assert all(key in known and label for labels in FIRST for key, label in labels.items())
+    known = {without_numbers(row.key): row for row in rows()}
+    assert all(key in known and label for labels in MAIN_FIELDS for key, label in labels.items())
     labels = {name: {field.label: field for field in form(data).first} for name, data in DATA.items()}
-    assert {"Width of the lens", "Height of the lens", "Place of the wall (z)", "Quality"} <= labels["disk"].keys()
+    assert {"Width of the lens", "Height of the lens", "Position of the wall (z)", "Quality"} <= labels["disk"].keys()
     assert labels["beam_shaper"]["Diameter of the lens"].value == "15"
     assert labels["led"]["Radius of the lens"].value == "12" and "Width of the lens" not in labels["led"]
     assert labels["beam_shaper"]["Refractive index"].key == "lens.index"
-    assert labels["two_pictures"]["Place of the wall (z) (target 1)"].key == "target[0].z"
-    assert labels["disk"]["Even light, no picture"].control == "check"
+    assert labels["two_pictures"]["Position of the wall (z) (target 1)"].key == "target[0].z"
+    assert labels["disk"]["Uniform light instead of a picture"].control == "check"
     assert labels["white_logo"]["Wavelength"].control == "lines"
-    assert all(10 <= len(first) <= len(FIRST) for first in labels.values())
+    assert all(10 <= len(first) <= len(MAIN_FIELDS) for first in labels.values())
 
 
 def test_a_field_leads_to_its_section_of_the_documentation():
@@ -127,7 +127,7 @@ def test_a_field_leads_to_its_section_of_the_documentation():
         for field in form(data).fields():
             page, anchor = field.page.split("#")
             keys = re.findall(r"^\| `([^`]+)`", sections[anchor], re.M)
-            assert page == "reference/scene-keys.html" and plain(field.key) in map(plain, keys)
+            assert page == "reference/scene-keys.html" and without_numbers(field.key) in map(without_numbers, keys)
 
 
 # ---- HTML ------------------------------------------------------------------------------------------------------------
@@ -167,19 +167,19 @@ class Sound(HTMLParser):
         self.words[self.found[-1][1].get("id") if self.found else None] += len(data.strip())
 
 
-def is_sound(text, found):
+def is_valid(text, found):
     """Assert what holds of every form's HTML; its elements."""
-    sound = Sound(text)
-    ids = Counter(attrs["id"] for _, attrs, _ in sound.found if "id" in attrs)
+    valid_text = Sound(text)
+    ids = Counter(attrs["id"] for _, attrs, _ in valid_text.found if "id" in attrs)
     assert max(ids.values()) == 1
-    labelled = {attrs["for"] for tag, attrs, _ in sound.found if tag == "label"}
+    labelled = {attrs["for"] for tag, attrs, _ in valid_text.found if tag == "label"}
     controls = {}
-    for tag, attrs, outside in sound.found:
+    for tag, attrs, outside in valid_text.found:
         if tag in ("input", "select", "textarea"):
             assert attrs.get("id") in labelled or attrs["aria-label"]
             assert "name" not in attrs or attrs["name"] == attrs["data-key"]
             for other in attrs.get("aria-describedby", "").split():
-                assert other in ids and (other.endswith("-error") or sound.words[other])
+                assert other in ids and (other.endswith("-error") or valid_text.words[other])
             controls[attrs["data-key"]] = attrs
         if tag == "button":
             locks = attrs.get("data-locks", "").split()
@@ -187,13 +187,13 @@ def is_sound(text, found):
         assert tag != "legend" or outside[-1] == "fieldset"
     assert controls.keys() == {field.key for field in found.fields()}
     assert labelled == {html_id(key) for key in controls}
-    return sound.found
+    return valid_text.found
 
 
 @pytest.mark.parametrize("name", DATA)
 def test_the_html_is_sound(name):
     found = form(DATA[name])
-    elements = is_sound(html(found, {}), found)
+    elements = is_valid(html(found, {}), found)
     assert not [attrs for _, attrs, _ in elements if "aria-invalid" in attrs or attrs.get("role") == "alert"]
     pressed = [attrs for tag, attrs, _ in elements if tag == "button"]
     buttons = {attrs["data-key"]: json.loads(attrs["data-value"]) for attrs in pressed if "data-key" in attrs}
@@ -220,7 +220,7 @@ def test_a_sentence_stands_at_its_key_or_at_the_top():
         "zzz": "unknown & new", "effects[0].kind": "list", "target": "all",
     }  # fmt: skip
     text = html(found, errors)
-    elements = is_sound(text, found)
+    elements = is_valid(text, found)
     alerts = [attrs.get("id") for _, attrs, _ in elements if attrs.get("role") == "alert"]
     assert sorted(map(str, alerts)) == sorted([
         "None", "key-target-0-z-error", "key-target-1-x-error", "key-lens-outline-table-error",
@@ -231,23 +231,23 @@ def test_a_sentence_stands_at_its_key_or_at_the_top():
     assert invalid == {key: f"{html_id(key)}-help {html_id(key)}-error" for key in ("target[0].z", "target[1].x")}
     opened = {attrs["data-section"] for tag, attrs, _ in elements if tag == "details" and "open" in attrs}
     assert opened == {"target", "lens", "effects"}
-    is_sound(html(form(DATA["disk"]), {"target[0].z": "one"}), form(DATA["disk"]))
+    is_valid(html(form(DATA["disk"]), {"target[0].z": "one"}), form(DATA["disk"]))
     assert "key-target-z-error" in html(form(DATA["disk"]), {"target[0].z": "one"})
 
 
 @given(st.floats(1e-3, 1e6) | st.floats(-1e6, -1e-3), st.floats(-1e8, 0.0), st.floats(0.0, 1e8))
-def test_a_slider_goes_from_half_to_double_within_the_range(value, least, most):
+def test_a_slider_goes_from_half_to_double_within_the_range(value, minimum, maximum):
     field = Field(
-        "target.z", "z", unit="mm", least=least, most=most, meaning="", default="", example="", control="number",
-        choices=(), value=repr(value), given=True, required=True, page="",
+        "target.z", "z", unit="mm", minimum=minimum, maximum=maximum, meaning="", default="", example="",
+        control="number", choices=(), value=repr(value), is_set=True, required=True, page="",
     )  # fmt: skip
     if (found := slider(field)) is None:
-        assert not least < value < most or most < value / 2 or abs(value) * 1e-9 > most - least
+        assert not minimum < value < maximum or maximum < value / 2 or abs(value) * 1e-9 > maximum - minimum
         return
-    low, high, step = (float(each) for each in (found.least, found.most, found.step))
+    low, high, step = (float(each) for each in (found.minimum, found.maximum, found.step))
     near = 1e-9 * abs(value)
     assert min(value / 2, 2 * value) - near <= low < high <= max(value / 2, 2 * value) + near
-    assert least - near <= low and high <= most + near
+    assert minimum - near <= low and high <= maximum + near
     assert 50 <= (high - low) / step <= 260 and float(found.value) == pytest.approx(value, rel=1e-9)
 
 
@@ -269,7 +269,7 @@ def test_a_wrong_scene_has_a_form_too(draw):
         name = draw.draw(st.sampled_from([*table, "kind", "profile", "target", "effects", "new"]))
         table[name] = draw.draw(ODD)
     found, text = form(data), tomli_w.dumps(data)
-    is_sound(html(found, {"lens": "wrong"}), found)
+    is_valid(html(found, {"lens": "wrong"}), found)
     field = draw.draw(st.sampled_from([*found.fields()]))
     additions = [*found.additions, *(addition for group in found.groups() for addition in group.additions)]
     done = [(each.key, each.value) for each in additions] + [(field.key, choice) for choice in field.choices]

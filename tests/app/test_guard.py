@@ -16,7 +16,7 @@ from PIL import Image
 
 from bstcad.app import guard, server
 from bstcad.app.design_runs import Run
-from bstcad.app.guard import LARGEST_BODY, WHY_NOT, Guard
+from bstcad.app.guard import MAX_BODY_SIZE, REFUSALS, Guard
 from bstcad.app.preview_desk import PreviewDesk
 from bstcad.app.workspace import LARGEST_UPLOAD, Workspace
 from tests.app.asking import HOST, MB, PORT, TOKEN, Asking, bench, chunk, made, png, routes, tree
@@ -38,7 +38,7 @@ def change(ask, **headers):
 
 def refused(answer, why):
     """Is it refused for that reason, with nothing of the folder in it?"""
-    return (answer.status, answer.text) == (403, WHY_NOT[why]) and not answer["set-cookie"]
+    return (answer.status, answer.text) == (403, REFUSALS[why]) and not answer["set-cookie"]
 
 
 # ---- who is let in ---------------------------------------------------------------------------------------------------
@@ -229,22 +229,22 @@ def endless(part=b"\xff" * MB, most=200):
 def test_what_states_that_it_is_too_large_is_not_read_at_all(own, path):
     before = tree(own.folder)
     answer = own.ask(path, endless(), content_length=str(200 * MB))
-    assert (answer.status, answer.text, answer.taken) == (413, WHY_NOT["size"], 0)
+    assert (answer.status, answer.text, answer.taken) == (413, REFUSALS["size"], 0)
     assert tree(own.folder) == before
 
 
 @pytest.mark.parametrize("length", [None, "10", "²"])
 @pytest.mark.parametrize("path", ["/api/picture", "/api/scenes"])
 def test_what_is_too_large_without_saying_so_is_read_no_further_than_the_limit(own, path, length):
-    before, most = tree(own.folder), LARGEST_UPLOAD if path == "/api/picture" else LARGEST_BODY
+    before, most = tree(own.folder), LARGEST_UPLOAD if path == "/api/picture" else MAX_BODY_SIZE
     answer = own.ask(path, endless(), content_length=length, transfer_encoding="chunked")
-    assert (answer.status, answer.text, answer.starts) == (413, WHY_NOT["size"], 1)
+    assert (answer.status, answer.text, answer.starts) == (413, REFUSALS["size"], 1)
     assert most < answer.taken <= most + MB
     assert tree(own.folder) == before
 
 
 def test_a_body_of_just_the_limit_is_taken(own):
-    fits, over = (b" " * (LARGEST_BODY - 2 + more) + b"{}" for more in (0, 1))
+    fits, over = (b" " * (MAX_BODY_SIZE - 2 + more) + b"{}" for more in (0, 1))
     assert own.ask("/api/scene/small/save", fits).status == 200
     assert own.ask("/api/scene/small/save", over).status == 413
 
@@ -252,7 +252,7 @@ def test_a_body_of_just_the_limit_is_taken(own):
 def test_a_picture_may_be_larger_than_a_scene(own):
     file = io.BytesIO()
     Image.effect_noise((2100, 2100), 60).save(file, "bmp")
-    assert len(file.getvalue()) > LARGEST_BODY
+    assert len(file.getvalue()) > MAX_BODY_SIZE
     [name] = own.ask("/api/picture", file.getvalue()).json.values()
     assert (own.folder / "pictures" / name).read_bytes() == file.getvalue()
 

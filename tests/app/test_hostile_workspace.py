@@ -181,8 +181,8 @@ def asked(path, method, names, bodies):
 @pytest.fixture
 def own(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    monkeypatch.setattr(server, "PATIENCE", 0.0)
-    monkeypatch.setattr(Run, "_await", lambda self, process: None)
+    monkeypatch.setattr(server, "ANSWER_TIMEOUT", 0.0)
+    monkeypatch.setattr(Run, "_wait_for_start", lambda self, process: None)
     begun = []
     monkeypatch.setattr(design_runs.subprocess, "Popen", lambda *given, **more: begun.append(given))
     outside(tmp_path / "outside")
@@ -221,7 +221,7 @@ def test_a_link_made_after_the_list_is_not_followed(own):
     (own.folder / "made").symlink_to(own.outside / "design")
     for path in ("", "/files/lens.step", "/files/report.json", "/all.zip"):
         answer = own.ask(f"/design/made{path}")
-        assert answer.status == 400 and SECRET not in answer.text and "leads by links out of" in answer.text, path
+        assert answer.status == 400 and SECRET not in answer.text and "leads out of" in answer.text, path
 
 
 def test_links_within_the_workspace_are_served(own):
@@ -241,7 +241,7 @@ def test_a_picture_that_the_scene_names_beside_the_workspace_is_the_persons_own(
         assert own.ask("/api/scene/small/change", {"text": text}).json["error"] is None
     (own.folder / "away").symlink_to(own.outside)
     text = SMALL.replace("uniform = true", 'image = "away/photo.png"')
-    assert "leads by links out of" in own.ask("/api/scene/small/change", {"text": text}).json["error"]["sentence"]
+    assert "leads out of" in own.ask("/api/scene/small/change", {"text": text}).json["error"]["sentence"]
 
 
 @pytest.mark.parametrize("path", ["/api/picture", "/api/scene/small/change", "/api/design/made/measured"])
@@ -257,12 +257,12 @@ def test_an_upload_that_breaks_off_is_a_line_and_leaves_nothing(own, capsys, pat
     answer = own.ask(path, b"", "POST", receive=receive)
     assert answer.error is None and answer.status < 500
     said = capsys.readouterr().err
-    assert "Traceback" not in said and len(said.splitlines()) == 1 and f"{path}: was broken off" in said
+    assert "Traceback" not in said and len(said.splitlines()) == 1 and f"{path}: the browser broke off" in said
     assert tree(own.folder) == before and own.begun == []
 
 
 def test_unfinished_headers_are_closed(own, monkeypatch):
-    monkeypatch.setattr(connections, "HEADERS_WITHIN", 0.4)
+    monkeypatch.setattr(connections, "HEADERS_TIMEOUT", 0.4)
     with server.bound(0) as listening:
         port = listening.getsockname()[1]
         running = server.uvicorn_server(own.workbench.app)

@@ -9,9 +9,9 @@ import pytest
 
 from bstcad import pipeline
 from bstcad.analysis.shape import describe
-from bstcad.app.preview import SETTLED, Outdated, preview
-from bstcad.app.preview_desk import STAGES, PreviewDesk, Request
-from bstcad.app.preview_json import DARK_SPREAD, LIT, SPREAD, figures
+from bstcad.app.preview import REFINED, Outdated, preview
+from bstcad.app.preview_desk import STAGES, PreviewDesk, PreviewRequest
+from bstcad.app.preview_json import DARK_SHAPE_ERROR, MIN_LIT_FRACTION, SHAPE_ERROR, figures
 from bstcad.optics.measure import tubes_picture
 from bstcad.report.units import quantity
 from bstcad.scene.errors import SceneError
@@ -41,13 +41,15 @@ def test_a_preview_is_near_the_finished_draft(name, lit):
     light = tubes_picture(made.lens, scene.channels(), scene.target.screen, 301).numpy()
     assert apart(found.pictures[0][1], light * (made.goals[0].picture.sum() / light.sum())) < NEAR
     assert found.flux["on target"] > 0.9
-    told, spread = dict(figures(found)), SPREAD if lit else DARK_SPREAD
-    assert (found.lit >= LIT) is lit
-    assert told["Smallest radius, steepest slope"].startswith("known once") and not any("tool" in name for name in told)
+    shown, spread = dict(figures(found)), SHAPE_ERROR if lit else DARK_SHAPE_ERROR
+    assert (found.lit_fraction >= MIN_LIT_FRACTION) is lit
+    assert shown["Smallest radius, steepest slope"].startswith("known once") and not any(
+        "tool" in name for name in shown
+    )
     shape, finished = found.shape, describe(made.lens, 65)
     for key in ("thickness_min", "thickness_max", "sag_pv"):
         assert abs(shape[key] - finished[key]) < spread * shape["sag_pv"]
-    assert told["Relief of the back"].endswith(f"± {quantity(spread * shape['sag_pv'], 'mm')}")
+    assert shown["Relief of the back"].endswith(f"± {quantity(spread * shape['sag_pv'], 'mm')}")
 
 
 def test_a_preview_depends_on_the_scene_alone():
@@ -89,23 +91,23 @@ def test_the_desk_answers_the_newest_request_of_each_page_in_order():
     desk = PreviewDesk()
     scene = load("templates/disk.toml", {"lens.back.control_points": 33, "target.pixels": 16})
     try:
-        first = Request("one", 1, scene)
+        first = PreviewRequest("one", 1, scene)
         desk.ask(first)
-        newer, other = Request("one", 2, scene.changed({"target.z": 150.0})), Request("two", 1, scene)
+        newer, other = PreviewRequest("one", 2, scene.changed({"target.z": 150.0})), PreviewRequest("two", 1, scene)
         desk.ask(newer)
         desk.ask(other)
         assert desk.answer(first, 0, 60.0) is None and first.replaced
         for request in (other, newer):
             stage, found = desk.answer(request, 0, 60.0)
             assert stage == "preview" and found.scene.target.z == request.scene.target.z
-        late = Request("one", 1, scene)  # which came after a newer one
+        late = PreviewRequest("one", 1, scene)  # which came after a newer one
         desk.ask(late)
         assert late.replaced and not newer.replaced
         assert [desk.answer(newer, k, 120.0)[0] for k in range(len(STAGES))] == list(STAGES)
         settled = newer.answers[1][1]
-        assert np.array_equal(settled.pictures[0][1], preview(newer.scene, pains=SETTLED).pictures[0][1])
+        assert np.array_equal(settled.pictures[0][1], preview(newer.scene, size=REFINED).pictures[0][1])
         assert set(newer.answers[3][1]["predicted"]) == {"draft", "standard", "fine"}
-        refused = Request("three", 1, scene.changed({"target.x": [9e4, 9.1e4]}))
+        refused = PreviewRequest("three", 1, scene.changed({"target.x": [9e4, 9.1e4]}))
         desk.ask(refused)
         assert isinstance(desk.answer(refused, 0, 60.0)[1], SceneError) and refused.done
         desk.forget("two")
@@ -117,7 +119,7 @@ def test_the_desk_answers_the_newest_request_of_each_page_in_order():
 def test_a_desk_that_closes_wakes_who_waits_for_an_answer(monkeypatch):
     """Ctrl-C would else wait for them, and cut them off."""
     monkeypatch.setattr(PreviewDesk, "_work", lambda self: None)
-    desk, request = PreviewDesk(), Request("a", 1, None)
+    desk, request = PreviewDesk(), PreviewRequest("a", 1, None)
     desk.ask(request)
     waiting = threading.Thread(target=desk.answer, args=(request, 3, 60.0))
     waiting.start()

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bstcad.app.kinds import new_table, node_at, records_at, table_at
-from bstcad.app.scene_text import as_words, changed, pieces, same, typed
+from bstcad.app.scene_text import as_words, changed, is_same, pieces, typed
 from bstcad.app.words import number
 from bstcad.scene.dotted_keys import override
 from bstcad.scene.errors import SceneError
@@ -81,8 +81,8 @@ def test_a_text_is_changed_as_its_tables_are(name):
                     changed(text, key, value)
                 continue
             found = changed(text, key, value)
-            assert same(tomllib.loads(found), wanted), (key, value)
-            assert (found == text) == same(wanted, data), (key, value)
+            assert is_same(tomllib.loads(found), wanted), (key, value)
+            assert (found == text) == is_same(wanted, data), (key, value)
             kept = comments(found)
             assert value is None or key not in dict(leaves(data)) or all(each in kept for each in comments(text)), key
             count += 1
@@ -133,7 +133,7 @@ def test_changes_one_after_another_keep_the_law(name, draw):
         if not isinstance(wanted.get("target"), dict | list):
             continue
         text = changed(text, key, value)
-        assert same(tomllib.loads(text), wanted), key
+        assert is_same(tomllib.loads(text), wanted), key
         assert "\r\n" not in text or text.count("\r\n") == text.count("\n")
 
 
@@ -256,7 +256,7 @@ def test_another_kind_has_its_keys_and_those_it_needs(name):
             assert not record.get("oneOf") or len({"radius", "diameter"} & new.keys()) == 1
             assert (found == text) == (old.get(tag) == kind)
             both = [key for key in old if key in new and key != tag]
-            assert all(same(old[key], new[key]) for key in both)
+            assert all(is_same(old[key], new[key]) for key in both)
             assert comments(found) or not comments(text)
 
 
@@ -340,13 +340,13 @@ def test_words_are_values(key):
     ("target.z", "far", "target.z: 'far' is not a number; write one, such as 1000"),
     ("target.z", "1.00,000.5", "target.z: '1.00,000.5' is not a number; write one, such as 1000"),
     ("target.z", "1e999", "target.z: '1e999' is not a number; write one, such as 1000"),
-    ("target.x", "5", "target.x: 1 values where 2 belong; write them such as -200, 200"),
-    ("target.x", "1; a", "target.x: 'a' is not a number; write 2 of them, such as -200, 200"),
+    ("target.x", "5", "target.x: 1 values are given, but 2 are needed; write 2, such as -200, 200"),
+    ("target.x", "1; a", "target.x: 'a' is not a number; write 2 numbers, such as -200, 200"),
     ("target.pixels", "12.5", "target.pixels: '12.5' is not a whole number; write one, such as 512"),
     ("target.seen_from", "behnd", "target.seen_from: 'behnd' is not possible; did you mean 'behind'?"),
-    ("lens.back.reflect", "maybe", "lens.back.reflect: 'maybe' is neither true nor false; write one of the two"),
+    ("lens.back.reflect", "maybe", "lens.back.reflect: 'maybe' is neither true nor false; write true or false"),
     ("source.wavelength", "[[486, 1], 5]", "is not a number; write one, such as 587.6"),
-    ("mount.flange.holes", "14 0 3", "holes: '14 0 3' is not such a list; write it such as [[14.0, 0.0, 3.2]]"),
+    ("mount.flange.holes", "14 0 3", "'14 0 3' is not a list of the right form; write a list such as [[14"),
     ("lens.outline", "round", "lens.outline: 'round' is not a table; write it in braces, such as { height = 24.0,"),
     ("lens.bak", "1", "lens.bak: unknown key; did you mean 'back'?"),
 ])  # fmt: skip
@@ -360,12 +360,12 @@ def test_words_that_are_no_value_are_told_so(key, words, sentence):
 def test_a_value_is_typed_as_it_is_shown(name):
     data = tomllib.loads(TEXTS[name])
     for key, value in leaves(data):
-        assert same(typed(key, as_words(value), data), value), key
+        assert is_same(typed(key, as_words(value), data), value), key
     for row in rows():
         node = node_at(row.key.replace("[]", "[0]"), data)
         if node is not None and not records(node):
             for value in (*node.get("examples", ()), *([node["default"]] if node.get("default", "") != "" else ())):
-                assert same(typed(row.key.replace("[]", "[0]"), as_words(value), data), value), row.key
+                assert is_same(typed(row.key.replace("[]", "[0]"), as_words(value), data), value), row.key
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False))

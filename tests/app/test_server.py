@@ -123,7 +123,7 @@ def test_a_design_is_not_begun_over_files_of_another_kind(own):
     (own.folder / "small").mkdir()
     (own.folder / "small/thesis.txt").write_text("years of work")
     answer = own.ask("/api/scene/small/make", {})
-    assert answer.status == 400 and "holds files that are not a design's" in answer.json["sentence"]
+    assert answer.status == 400 and "contains files that are not a design's" in answer.json["sentence"]
     assert str(own.outside) not in answer.text
 
 
@@ -147,7 +147,7 @@ FAULTS = {
 
 @pytest.mark.parametrize("what", FAULTS)
 def test_no_answer_about_a_faulty_scene_tells_where_the_folders_are(own, monkeypatch, what):
-    monkeypatch.setattr(server, "PATIENCE", 0.01)
+    monkeypatch.setattr(server, "ANSWER_TIMEOUT", 0.01)
     (own.folder / "faulty.toml").write_text(FAULTS[what])
     (own.folder / "pictures").mkdir()
     for path, method in (each for each in routes(own.workbench) if "/scene/" in each[0]):
@@ -164,7 +164,7 @@ def test_what_a_run_says_is_told_without_folders(own):
     run.place.mkdir()
     sentence = f"{own.folder}/made: the finished design is kept in {own.folder}/made-unwritten"
     State("failed", folder="made", sentence=sentence).put(run.place)
-    design_process.Words(run.place / design_process.WORDS)("reach", 0, 1, f"{own.folder}/x.png is dark")
+    design_process.ProgressFile(run.place / design_process.PROGRESS)("reach", 0, 1, f"{own.folder}/x.png is dark")
     news = own.ask("/api/design/made/run")
     assert news.json["sentence"] == "made: the finished design is kept in made-unwritten"
     assert news.json["lines"][0][4] == "x.png is dark"
@@ -205,7 +205,7 @@ def test_a_preview_that_fails_is_told_without_folders(own, monkeypatch, stage):
     fault = FileNotFoundError(2, "No such file or directory", str(own.folder / "pictures/x.png"))
     monkeypatch.setattr(own.workbench.desk, "answer", lambda *_: (stage, fault))
     answer = own.ask("/api/scene/small/preview", {"page": "p", "number": 1})
-    assert answer.status == 200 and f"no {stage} could be made" in answer.json["refused"]
+    assert answer.status == 200 and f"the {stage} failed" in answer.json["refused"]
     assert str(own.outside) not in answer.text
 
 
@@ -229,7 +229,7 @@ WRONG = [
 @pytest.mark.parametrize("asked", WRONG, ids=lambda asked: ascii(asked)[:40])
 def test_no_table_of_json_breaks_the_server_or_the_scene(own, monkeypatch, asked):
     """Any table is refused in a sentence or accepted; then the page opens, and the change can be dropped."""
-    monkeypatch.setattr(server, "PATIENCE", 0.01)
+    monkeypatch.setattr(server, "ANSWER_TIMEOUT", 0.01)
     for path in READS_JSON:
         answer = own.ask(path, json.dumps(asked))
         assert answer.status in (200, 400) and answer.error is None, (path, answer.status, answer.error)
@@ -245,7 +245,7 @@ def test_no_table_of_json_breaks_the_server_or_the_scene(own, monkeypatch, asked
      "?page=p&number=1&stage=-1", "?since=x", "?since=-5", "?since=1e9", "?kind=", "?since=99999999999999999999"],
 )  # fmt: skip
 def test_no_query_breaks_the_server(own, monkeypatch, query):
-    monkeypatch.setattr(server, "PATIENCE", 0.01)
+    monkeypatch.setattr(server, "ANSWER_TIMEOUT", 0.01)
     own.ask("/api/scene/small/preview", {"page": "p", "number": 1})
     for path in ("/api/scene/small/answer", "/api/design/made/run"):
         answer = own.ask(f"{path}{query}")
@@ -332,9 +332,7 @@ def test_a_page_of_a_design_has_no_origin(own, name):
     assert own.ask(f"/design/made/files/{name}?download")["content-disposition"].startswith("attachment")
 
 
-@pytest.mark.parametrize(
-    "name", ["a.svg", "a.htm", "a.xhtml", "a.mjs", "a.HTML", "a", "a.html.gz"]
-)
+@pytest.mark.parametrize("name", ["a.svg", "a.htm", "a.xhtml", "a.mjs", "a.HTML", "a", "a.html.gz"])
 def test_other_files_of_a_design_are_kept_not_shown(own, name):
     (own.folder / "made" / name).write_text("<script>alert(1)</script>")
     answer = own.ask(f"/design/made/files/{name}")

@@ -11,7 +11,7 @@ import skimage.data
 from PIL import Image
 
 import bstcad
-from bstcad.app.preview import AT_ONCE, SETTLED
+from bstcad.app.preview import QUICK, REFINED
 from bstcad.optics.surfaces import sag
 from tests.app.conftest import begin
 
@@ -49,8 +49,8 @@ def test_the_tutorial_names_what_stands_on_the_pages():
     words = " ".join(path.read_text(encoding="utf-8") for path in files)
     named = {" ".join(found.split()) for found in re.findall(r"(?<![*\w])\*([^*]+)\*(?!\*)", text)}
     assert len(named) > 20 and [name for name in sorted(named) if name not in words] == []
-    for words, pains in (("preview", AT_ONCE), ("settled preview", SETTLED)):
-        assert f"| {words} | {pains.pixels} at most | {pains.net} at most | {pains.evaluations} |" in text
+    for words, size in (("preview", QUICK), ("settled preview", REFINED)):
+        assert f"| {words} | {size.pixels} at most | {size.net} at most | {size.evaluations} |" in text
 
 
 # ---- the steps of the tutorial ---------------------------------------------------------------------------------------

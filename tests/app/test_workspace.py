@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from bstcad.app import workspace as module
 from bstcad.app.design_runs import Run
 from bstcad.app.scene_text import changed
-from bstcad.app.workspace import Opened, Workspace
+from bstcad.app.workspace import OpenScene, Workspace
 from bstcad.scene import new_scene, scene_file
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
@@ -70,20 +70,20 @@ def anew(own):
 def test_changes_survive_a_killed_server_and_leave_the_file(own):
     text = SMALL.replace("100.0", "120.0")
     own.change("small", text)
-    assert anew(own).opened("small") == Opened("small", text, saved=False)
+    assert anew(own).opened("small") == OpenScene("small", text, saved=False)
     assert own.path("small").read_text() == SMALL
     anew(own).change("small", "this is [[ no TOML = ")  # right or wrong
     assert anew(own).opened("small").text == "this is [[ no TOML = "
     assert own.path("small").read_text() == SMALL
     anew(own).drop("small")
-    assert own.opened("small") == Opened("small", SMALL, saved=True)
+    assert own.opened("small") == OpenScene("small", SMALL, saved=True)
     assert tree(own.scenes) == {"small.toml": SMALL.encode()}
 
 
 def test_a_saved_text_is_in_the_file_and_nowhere_else(own):
     text = SMALL.replace("# mm", "# Millimetre, µm")
     own.change("small", text)
-    assert anew(own).save("small") == Opened("small", text, saved=True)
+    assert anew(own).save("small") == OpenScene("small", text, saved=True)
     assert tree(own.scenes) == {"small.toml": text.encode()}
     assert anew(own).save("small").text == text  # there is nothing to do
 
@@ -154,7 +154,7 @@ def test_dropping_takes_the_other_programs_text_and_the_same_change_is_no_quarre
 def test_changes_outlive_their_file(own):
     own.change("small", SMALL + "# mine\n")
     own.path("small").unlink()
-    assert anew(own).opened("small") == Opened("small", SMALL + "# mine\n", saved=False)
+    assert anew(own).opened("small") == OpenScene("small", SMALL + "# mine\n", saved=False)
     with pytest.raises(SceneError, match="changed by another program"):
         own.save("small")
     own.save("small", anyway=True)
@@ -215,7 +215,7 @@ def test_threads_that_change_a_scene_at_once_lose_nothing(own):
 def test_a_change_that_cannot_be_made_leaves_the_text(own):
     with pytest.raises(SceneError):
         own.edit("small", lambda text: changed(text, "target[7].z", 1.0))
-    assert own.opened("small") == Opened("small", SMALL, saved=True)
+    assert own.opened("small") == OpenScene("small", SMALL, saved=True)
 
 
 # ---- names -----------------------------------------------------------------------------------------------------------
@@ -264,7 +264,7 @@ def test_a_designs_files_are_those_in_its_folder(own, tmp_path):
         "key.txt", "linked/key.txt", "linked", "loop/x", "pipe", ".hidden", ".folder/x.txt", "shown", "", "figures",
         "figures/../../small.toml", str(folder / ".hidden"), "lens.step\0", "x" * 5000, "lens.step/x", "\\etc",
     ):  # fmt: skip
-        with pytest.raises(SceneError, match="is no file of the design made"):
+        with pytest.raises(SceneError, match="is not a file of the design made"):
             own.file("made", name)
 
 
@@ -532,5 +532,5 @@ def test_what_is_neither_scene_nor_folder_is_refused(tmp_path):
     (tmp_path / "two words/report.json").write_text("{}")
     os.mkfifo(tmp_path / "pipe.toml")
     for name in ("notes.txt", "two words.toml", ".hidden.toml", "two words", "none.toml", "none", "pipe.toml"):
-        with pytest.raises(SceneError, match="; (give|call)"):
+        with pytest.raises(SceneError, match="; (give|use)"):
             Workspace.of(tmp_path / name)

@@ -82,7 +82,7 @@ def timed(call, runs, capsys):
 
 def on(workers):
     """A cluster of so many worker processes; of none: None."""
-    return cluster.asked_for(None, workers or None)
+    return cluster.connect(None, workers or None)
 
 
 @contextlib.contextmanager

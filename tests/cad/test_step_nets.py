@@ -44,4 +44,4 @@ def test_the_size_said_before_is_that_of_the_file(tmp_path, m):
     scene = load("templates/thu.toml", {"lens.back.control_points": m})
     step_writing.write_lens(scene.flat_lens(m), tmp_path / "lens.step", scene.name)
     assert folder.step_size(scene) == pytest.approx((tmp_path / "lens.step").stat().st_size, rel=0.03)
-    assert f"{m // 2 + 1} would" in folder.said_of_sizes(scene)
+    assert f"{m // 2 + 1} would" in folder.size_sentence(scene)

@@ -54,8 +54,8 @@ SCENES = {  # (scene, what makes it small)
 
 def design_with_checkpoints(folder, name="one face"):
     """Make a small design in a process that is to be killed, with a checkpoint at every step and --resume."""
-    commands.Keeper = functools.partial(commands.Keeper, every=0.0)
-    checkpoint.SHARE = 1e9  # no pause, however long the writing takes
+    commands.Keeper = functools.partial(commands.Keeper, interval=0.0)
+    checkpoint.MAX_TIME_FRACTION = 1e9  # no pause, however long the writing takes
     rendering.lens_picture = lambda mesh: None
     scene = load(*SCENES[name])
     print("ready", flush=True)
@@ -109,7 +109,7 @@ def intact(folder, digest):
 
 def test_ctrl_c_writes_the_best_so_far_and_resume_ends_the_same(tmp_path, monkeypatch, capsys, holds, small_design):
     """The command line itself, with its own checkpoints, against the design that nobody disturbed."""
-    monkeypatch.setattr(commands.processes, "submit", commands.processes.here)
+    monkeypatch.setattr(commands.processes, "submit", commands.processes.run_here)
     draws_nothing(monkeypatch)
     verify_with(monkeypatch, Effort(256))
     scene, folder = tmp_path / "small.toml", tmp_path / "lens"
@@ -126,7 +126,7 @@ def test_ctrl_c_writes_the_best_so_far_and_resume_ends_the_same(tmp_path, monkey
     assert cli.run(["generate", str(scene), "-o", str(folder)]) == 130
     said = capsys.readouterr().err
     assert "stopping with the best lens so far" in said
-    assert said.splitlines()[-1].endswith("the same command with --resume goes on from there")
+    assert said.splitlines()[-1].endswith("run the same command with --resume to continue it")
     report = json.loads((folder / "report.json").read_text())
     assert report["stopped"] == "interrupt" and report["stability"]["non_finite"] == 0
     assert CONTENTS - DRAWN <= {p.name for p in folder.iterdir()} <= CONTENTS
@@ -138,9 +138,9 @@ def test_ctrl_c_writes_the_best_so_far_and_resume_ends_the_same(tmp_path, monkey
 
 
 def test_an_unfinished_design_does_not_take_the_place_of_a_finished_one(small_design, tmp_path):
-    assert commands.place_for(small_design.folder, "evaluations") == small_design.folder
-    assert commands.place_for(small_design.folder, "interrupt").name == "small-unfinished"
-    assert commands.place_for(tmp_path / "new", "interrupt") == tmp_path / "new"
+    assert commands.output_folder(small_design.folder, "evaluations") == small_design.folder
+    assert commands.output_folder(small_design.folder, "interrupt").name == "small-unfinished"
+    assert commands.output_folder(tmp_path / "new", "interrupt") == tmp_path / "new"
 
 
 @contextlib.contextmanager
@@ -162,18 +162,18 @@ def test_a_full_disk_is_a_sentence_and_loses_nothing(small_scene, tmp_path, monk
 
     How the command line says it: tests/test_cli.py.  Going on from a checkpoint is what the test above does.
     """
-    monkeypatch.setattr(commands.processes, "submit", commands.processes.here)  # files of this process may not grow
+    monkeypatch.setattr(commands.processes, "submit", commands.processes.run_here)  # files of this process may not grow
     draws_nothing(monkeypatch)
     verify_with(monkeypatch, Effort(256))
     folder, said = tmp_path / "lens", []
     folder.mkdir()
     (folder / "report.json").write_text("{}")
-    monkeypatch.setattr(commands, "Keeper", functools.partial(commands.Keeper, every=0.0))  # at each step
-    monkeypatch.setattr(checkpoint, "SHARE", 1e9)  # no pause, however long the writing takes
+    monkeypatch.setattr(commands, "Keeper", functools.partial(commands.Keeper, interval=0.0))  # at each step
+    monkeypatch.setattr(checkpoint, "MAX_TIME_FRACTION", 1e9)  # no pause, however long the writing takes
     generate = functools.partial(commands.generate, small_scene, folder, device="cpu")
     with full_disk(60_000):
         generate(progress=lambda *words: said.append(" ".join(map(str, words))))
-    assert any("the design goes on without a checkpoint" in words for words in said)
+    assert any("the design continues without a checkpoint" in words for words in said)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["lens", "lens-unwritten"]  # which design.npz fits into
     with full_disk(500_000) as error:
         generate()

@@ -56,7 +56,7 @@ def spending(what, bound, holds):
 @pytest.fixture
 def quick_folder(small_design, tmp_path, monkeypatch):
     """The small design in a folder of its own beside nothing else; verified by few rays and without pictures."""
-    monkeypatch.setattr(commands.processes, "submit", commands.processes.here)
+    monkeypatch.setattr(commands.processes, "submit", commands.processes.run_here)
     draws_nothing(monkeypatch)
     verify_with(monkeypatch, Effort(64, places=65, points=512))
     return Path(shutil.copytree(small_design.folder, tmp_path / "design"))
@@ -105,7 +105,7 @@ def net(folder, data, method=zipfile.ZIP_DEFLATED):
 SHAPE = r"design\.npz: cannot be read .*is not \(33, 33, 3\) numbers.*; generate"
 FILES = {  # changes of a file of the folder, and the sentence of the refusal
     "a STEP file of gigabytes": (lambda f: hole(f / "lens.step", 2 * GIGABYTE), r"lens\.step: .*over 600 MB"),
-    "an archive of gigabytes": (lambda f: hole(f / "design.npz", 3 * GIGABYTE), r"holds over 3\.\d+ MB"),
+    "an archive of gigabytes": (lambda f: hole(f / "design.npz", 3 * GIGABYTE), r"is larger than 3\.\d+ MB"),
     "an STL that claims 2 GB": (
         lambda f: altered(f / "lens.stl", 80, np.uint32(2 * GIGABYTE // 50).tobytes()), "no binary STL of 42949672",
     ),

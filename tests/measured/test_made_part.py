@@ -148,7 +148,7 @@ def quick(monkeypatch, same_light, proof):
         return known[cloud.sha256]
 
     monkeypatch.setattr(made_part, "judge", once)
-    monkeypatch.setattr(commands.processes, "submit", commands.processes.here)
+    monkeypatch.setattr(commands.processes, "submit", commands.processes.run_here)
     monkeypatch.setattr(commands, "Pictures", pictures("part"))
     monkeypatch.setattr(checks, "verify", lambda *given, **more: proof)
 
@@ -214,7 +214,7 @@ def test_many_parts_of_one_design_are_judged_beside_it(small_design, nominal, tm
     assert rows[1, 0] - rows[0, 0] == pytest.approx(x[1] - x[0], abs=2e-6) and rows[1, 1] == rows[0, 1]
     for wrong, sentence in (
         (["-o", str(place)], "give its points with --measured"),
-        (["--measured", str(given), "-o", str(folder)], "holds files that are not a made part's"),
+        (["--measured", str(given), "-o", str(folder)], "contains files that are not a made part's"),
     ):
         assert cli.run(["verify", str(folder), *wrong]) == 2 and sentence in capsys.readouterr().err
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before

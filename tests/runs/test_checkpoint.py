@@ -87,7 +87,7 @@ class TestFile:
             with pytest.raises(SceneError, match="start without --resume"):
                 checkpoint.read(path, dict)
         path.write_bytes(whole.replace(checkpoint.MAGIC, b"bstcad checkpoint 3\n"))
-        with pytest.raises(SceneError, match=r"is no checkpoint of this version \('bstcad checkpoint 3'\); start"):
+        with pytest.raises(SceneError, match=r"is not a checkpoint of this version \('bstcad checkpoint 3'\); start"):
             checkpoint.read(path, dict)
 
     @pytest.mark.parametrize("packed", ["objects", "compressed", "no zip"])
@@ -99,13 +99,13 @@ class TestFile:
             np.savez_compressed(body, tree=np.zeros(1_000_000, dtype=np.uint8))
         digest = hashlib.sha256(body.getvalue()).hexdigest().encode()
         path.write_bytes(checkpoint.MAGIC + digest + b"\n" + body.getvalue())
-        with pytest.raises(SceneError, match="no checkpoint of bstcad's"):
+        with pytest.raises(SceneError, match="not a checkpoint of bstcad"):
             checkpoint.read(path, dict)
 
     def test_what_is_not_of_the_kind_is_no_checkpoint(self, path):
         for other in (LINE.start, STATE):
             checkpoint.write(path, PURPOSE, other)
-            with pytest.raises(SceneError, match="no checkpoint of bstcad's"):
+            with pytest.raises(SceneError, match="not a checkpoint of bstcad"):
                 checkpoint.read(path, Line)
 
     @pytest.mark.parametrize("fault", [OSError(28, "No space left on device"), KeyboardInterrupt()], ids=repr)
@@ -142,16 +142,16 @@ class TestKeeper:
     def test_at_the_end_a_state_finds_another_place(self, tmp_path, monkeypatch, path):
         monkeypatch.setattr(checkpoint.tempfile, "tempdir", str(tmp_path))
         keeper = Keeper(tmp_path / "gone" / ".thu.checkpoint", PURPOSE, pytest.fail)
-        assert keeper.kept() == ""  # there is no state yet
+        assert keeper.keep_at_exit() == ""  # there is no state yet
         keeper.latest = STATE
-        said, refuge = keeper.kept(), next(tmp_path.glob("bstcad-*")) / "thu.checkpoint"
+        said, refuge = keeper.keep_at_exit(), next(tmp_path.glob("bstcad-*")) / "thu.checkpoint"
         assert said == (
-            f"the design so far is kept in {refuge}; move it to {keeper.path} and --resume goes on from there"
+            f"the design so far is kept in {refuge}; move it to {keeper.path} and use --resume to continue it"
         )
         assert same(checkpoint.read(refuge, dict)[1], STATE)
         here = Keeper(path, PURPOSE)
-        here.found()
-        assert here.kept() == "the design so far is kept; the same command with --resume goes on from there"
+        here.load()
+        assert here.keep_at_exit() == "the design so far is kept; run the same command with --resume to continue it"
 
     def test_a_full_disk_is_said_and_the_design_goes_on_and_leaves_nothing(self, tmp_path, monkeypatch):
         def full(*arguments):
@@ -160,21 +160,21 @@ class TestKeeper:
         monkeypatch.setattr(checkpoint.tempfile, "tempdir", str(tmp_path))
         monkeypatch.setattr(os, "fsync", full)
         said = []
-        keeper = Keeper(tmp_path / ".thu.checkpoint", PURPOSE, said.append, every=0.0)
+        keeper = Keeper(tmp_path / ".thu.checkpoint", PURPOSE, said.append, interval=0.0)
         keeper(STATE)
-        assert len(said) == 1 and "No space left on device" in said[0] and "goes on" in said[0]
-        assert not keeper.flush() and keeper.kept().startswith("there was no room for the design so far")
+        assert len(said) == 1 and "No space left on device" in said[0] and "continues" in said[0]
+        assert not keeper.flush() and keeper.keep_at_exit().startswith("the design so far is lost")
         assert list(tmp_path.iterdir()) == []
 
     def test_finds_its_own_to_go_on_from_it_again_and_no_other(self, path):
         keeper = Keeper(path, PURPOSE)
-        assert same(keeper.found(), STATE) and keeper.flush() and same(checkpoint.read(path, dict)[1], STATE)
-        assert Keeper(path.with_name("none"), PURPOSE).found() is None
+        assert same(keeper.load(), STATE) and keeper.flush() and same(checkpoint.read(path, dict)[1], STATE)
+        assert Keeper(path.with_name("none"), PURPOSE).load() is None
         with pytest.raises(SceneError, match=r"another design \(tailoring\.rays was 512, now it is 768\)"):
-            Keeper(path, {**PURPOSE, "tailoring": {"rays": 768}}).found()
+            Keeper(path, {**PURPOSE, "tailoring": {"rays": 768}}).load()
         os.mkfifo(path.with_name("pipe"))
         with pytest.raises(SceneError, match="it is a pipe"):
-            Keeper(path.with_name("pipe"), PURPOSE).found()
+            Keeper(path.with_name("pipe"), PURPOSE).load()
 
     def test_a_refused_scene_takes_only_its_own_checkpoint_with_it(self, path):
         keeper = Keeper(path, {"another": "scene"})

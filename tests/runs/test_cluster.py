@@ -28,7 +28,7 @@ def address():
 
 def test_results_come_in_the_order_of_the_items(address):
     with Cluster(address) as found:
-        assert found.room == 2
+        assert found.capacity == 2
         for more in (10, 20):  # another thing is shared after the first
             assert list(found.spread(add, {"more": more}, range(20))) == list(range(more, more + 20))
 
@@ -40,7 +40,7 @@ def test_an_error_on_a_worker_is_told_with_the_work_that_it_was(address):
         answers = {answer.key: answer for answer in (found.next(), found.next())}
         assert answers["a"].reason == "ValueError: no disk" and answers["a"].value is None
         assert (answers["b"].reason, answers["b"].value) == ("", 2) and answers["b"].where.startswith("inproc://")
-        with pytest.raises(MachineError, match=r"a worker could not do its part \(ValueError: no disk\)"):
+        with pytest.raises(MachineError, match=r"a worker failed \(ValueError: no disk\)"):
             list(found.spread(add, {"more": 1}, [1, -1]))
 
 
@@ -49,7 +49,7 @@ def test_a_worker_of_another_version_does_no_work(address, monkeypatch):
     monkeypatch.setattr(environment, "version", lambda: next(versions))
     with Cluster(address) as found:
         found.start("a", add, {"more": 1}, 1)
-        assert "has another version of bstcad, 1; install 2 there" in found.next().reason
+        assert "has version 1 of bstcad; install 2 there" in found.next().reason
 
 
 def test_what_cannot_be_had_is_a_sentence(monkeypatch):
@@ -68,14 +68,15 @@ def test_what_cannot_be_had_is_a_sentence(monkeypatch):
         (None, 0, "--workers 0: is not between 1 and 1000"),
         ("tcp://127.0.0.1:9", 2, "give one of the two"),
     ):
-        with pytest.raises(SceneError, match=sentence), cluster.asked_for(scheduler, workers):
+        with pytest.raises(SceneError, match=sentence), cluster.connect(scheduler, workers):
             pass
-    with cluster.asked_for(None) as found:
+    with cluster.connect(None) as found:
         assert found is None
 
 
 @pytest.mark.parametrize(
-    ("future", "client", "sentence"), [("pending", "closed", "is gone"), ("cancelled", "running", "has lost its work")]
+    ("future", "client", "sentence"),
+    [("pending", "closed", "has ended"), ("cancelled", "running", "has lost its jobs")],
 )
 def test_a_scheduler_that_goes_away_is_a_sentence(future, client, sentence):
     waiting, submitted = object.__new__(Cluster), mock.Mock(status=future)

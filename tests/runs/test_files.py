@@ -20,7 +20,7 @@ def test_a_file_is_read_up_to_its_limit(tmp_path):
     path = tmp_path / "x"
     path.write_bytes(b"12345")
     assert files.contents(path, 5) == b"12345"
-    with pytest.raises(ValueError, match="it holds over"):
+    with pytest.raises(ValueError, match="it is larger than"):
         files.contents(path, 4)
 
 
@@ -69,7 +69,7 @@ def other(tmp_path):
     """Another process that holds the lock of tmp_path / "lens"."""
     code = (
         "import sys, time\nfrom pathlib import Path\nfrom bstcad.runs import files\n"
-        "with files.held(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)"
+        "with files.exclusive(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)"
     )
     command = [sys.executable, "-c", code, str(tmp_path / "lens")]
     running = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
@@ -80,15 +80,15 @@ def other(tmp_path):
 
 
 def test_a_second_run_is_one_sentence_and_a_killed_one_locks_nothing(tmp_path, other):
-    lens, sentence = tmp_path / "lens", rf"lens: is being designed by another run \(process {other.pid}\); .* -o"
-    with pytest.raises(SceneError, match=sentence), files.held(lens):
+    lens, sentence = tmp_path / "lens", rf"lens: is in use by another run \(process {other.pid}\); .* -o"
+    with pytest.raises(SceneError, match=sentence), files.exclusive(lens):
         pass
-    with files.held(tmp_path / "another"):
+    with files.exclusive(tmp_path / "another"):
         pass
     other.kill()
     other.wait()
     assert files.beside(lens, "lock").exists()
-    with files.held(lens):
+    with files.exclusive(lens):
         assert files.beside(lens, "lock").read_text() == str(os.getpid())
     assert list(tmp_path.iterdir()) == []
 
@@ -100,6 +100,6 @@ def test_a_link_leads_to_the_lock_of_the_folder_itself_also_on_a_full_disk(tmp_p
     monkeypatch.setattr(Path, "write_text", full)
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to("real")
-    with files.held(tmp_path / "real"), pytest.raises(SceneError, match="of a process unknown"):  # noqa: SIM117
-        with files.held(tmp_path / "link"):
+    with files.exclusive(tmp_path / "real"), pytest.raises(SceneError, match="unknown process"):  # noqa: SIM117
+        with files.exclusive(tmp_path / "link"):
             pass

@@ -24,7 +24,7 @@ def fresh():
 
 def test_another_process_always_the_same_does_one_work_after_the_other(fresh, tmp_path):
     first, second = (processes.submit("os.getpid").result() for _ in range(2))
-    assert first == second != os.getpid() == processes.here("os.getpid").result()
+    assert first == second != os.getpid() == processes.run_here("os.getpid").result()
     slow = processes.submit("time.sleep", 0.3)
     quick = processes.submit("os.path.exists", str(tmp_path))
     assert quick.result() and slow.done()
@@ -57,7 +57,7 @@ print(peak, (kept - psutil.Process().memory_info().rss) / 1e9)
     assert 0.1 < peak < len(held) / 1e9 and returned == pytest.approx(0.1, rel=0.1)
 
 
-@pytest.mark.parametrize("submit", [processes.submit, processes.here])
+@pytest.mark.parametrize("submit", [processes.submit, processes.run_here])
 def test_an_error_there_is_the_same_error_here(submit):
     with pytest.raises(ValueError, match="invalid literal"):
         submit("builtins.int", "lens").result()
@@ -112,10 +112,10 @@ def test_what_a_run_leaves_to_be_cleared_up_is_not_told():
     (2, "bstcad: warning: doubtful\nbstcad: no solid; move the back\n", "no solid; move the back"),
     (70, "Traceback\n", "exit code 70"),
     (-15, "", "ended by SIGTERM"),
-    (-9, "", "ended by SIGKILL; the memory of this machine may be too little for it"),
+    (-9, "", "ended by SIGKILL; this machine may have too little memory for it"),
 ])  # fmt: skip
 def test_why_there_is_no_result_is_a_sentence(code, stderr, reason):
-    assert processes.Ending(code, 1.0, 1.0, stderr).reason == reason
+    assert processes.ExitStatus(code, 1.0, 1.0, stderr).reason == reason
 
 
 def test_a_command_tells_its_code_its_time_and_its_words():

@@ -74,13 +74,13 @@ def test_in_the_middle_it_flushes_a_checkpoint_and_resume_goes_on(number, scene,
     said = stopped.communicate(timeout=60)[0].splitlines()
     assert stopped.returncode == 128 + number
     assert said[-1] == (
-        f"bstcad: ended by {number.name}; the design so far is kept; the same command with --resume goes on from there"
+        f"bstcad: ended by {number.name}; the design so far is kept; run the same command with --resume to continue it"
     )
     assert not any("Traceback" in line or "warn" in line for line in said)
     assert sorted(path.name for path in tmp_path.iterdir()) == [".lens.checkpoint", "small.toml"]
     assert checkpoint.read(tmp_path / ".lens.checkpoint", Saved)[1].followed is not None  # stage 1
     resumed = generate(scene, tmp_path / "lens", "--resume", first=FEW_RAYS)
-    assert "begins anew" not in resumed.communicate(timeout=120)[0] and resumed.returncode in (0, 1)
+    assert "from the beginning" not in resumed.communicate(timeout=120)[0] and resumed.returncode in (0, 1)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["lens", "small.toml"]
 
 
@@ -100,17 +100,17 @@ def test_at_the_beginning_it_leaves_nothing(seconds, scene, tmp_path):
 
 @BOTH
 def test_it_is_raised_once(number):
-    with pytest.raises(signals.Ended) as ended, signals.endings():
+    with pytest.raises(signals.Terminated) as ended, signals.raise_terminated():
         try:
             signal.raise_signal(number)
         finally:
             signal.raise_signal(number)  # what is kept now is not to be cut short
-    assert ended.value.name == number.name and signals.ended().number == number
+    assert ended.value.name == number.name and signals.termination().number == number
 
 
 def test_one_that_got_lost_is_raised_when_the_wish_is_asked_for():
-    with pytest.raises(signals.Ended), signals.endings(), signals.first_interrupt_is_a_wish() as wished:
-        with contextlib.suppress(signals.Ended):  # as a destructor does
+    with pytest.raises(signals.Terminated), signals.raise_terminated(), signals.stop_on_interrupt() as wished:
+        with contextlib.suppress(signals.Terminated):  # as a destructor does
             signal.raise_signal(signal.SIGTERM)
         wished()
 
@@ -119,15 +119,15 @@ def test_what_is_ignored_stays_ignored():
     """nohup bstcad ..."""
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with signals.endings(), signals.ending_at_once():
+        with signals.raise_terminated(), signals.exit_on_signal():
             signal.raise_signal(signal.SIGHUP)
-        assert signals.ended() is None
+        assert signals.termination() is None
     finally:
         signal.signal(signal.SIGHUP, before)
 
 
 def test_ctrl_c_is_a_wish_first():
-    with pytest.raises(KeyboardInterrupt), signals.endings(), signals.first_interrupt_is_a_wish() as wished:
+    with pytest.raises(KeyboardInterrupt), signals.raise_terminated(), signals.stop_on_interrupt() as wished:
         assert not wished()
         signal.raise_signal(signal.SIGINT)
         assert wished()
@@ -145,7 +145,7 @@ def test_the_first_ctrl_c_ends_what_only_has_to_be_written_and_verified(tmp_path
     stopped.send_signal(signal.SIGINT)
     said = stopped.communicate(timeout=60)[0].splitlines()
     assert stopped.returncode == 130, said
-    assert said[-1].endswith("the design so far is kept; the same command with --resume goes on from there")
+    assert said[-1].endswith("the design so far is kept; run the same command with --resume to continue it")
     assert sorted(path.name for path in tmp_path.iterdir()) == [".lens.checkpoint", "small.toml"]
     resumed = generate(path, tmp_path / "lens", "--resume", first=FEW_RAYS)
     said = resumed.communicate(timeout=120)[0].splitlines()

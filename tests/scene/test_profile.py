@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 from scipy.integrate import dblquad
 from scipy.special import gamma
 
-from bstcad.app.preview import AT_ONCE, made_small
+from bstcad.app.preview import QUICK, reduced_scene
 from bstcad.scene.errors import SceneError
 from bstcad.scene.profile import Profile, corner_area
 from bstcad.scene.scene import load
@@ -139,4 +139,4 @@ def test_a_coarser_picture_still_shows_a_narrow_profile(thu, rotate):
     fewer = scene.target.fewer_pixels(50.0)
     assert scene.changed({"target.pixels": fewer}).target.irradiance().sum() == pytest.approx(1)
     assert max(fewer) < 400 and min(fewer) == 8 and thu.target.fewer_pixels(4.0) == (10, 8)
-    assert made_small(scene, replace(AT_ONCE, pixels=10)).target.columns_rows == scene.target.fewer_pixels(40.0)
+    assert reduced_scene(scene, replace(QUICK, pixels=10)).target.columns_rows == scene.target.fewer_pixels(40.0)

@@ -190,7 +190,7 @@ def test_both_nets_of_a_design_come_back_to_the_last_bit(disk, points, only_fron
     with np.load(tmp_path / "design.npz") as arrays:
         kept = dict(arrays)
     np.savez(tmp_path / "design.npz", **kept | {"front_control_points": kept["front_control_points"][:-1]})
-    with pytest.raises(SceneError, match=r"front_control_points is not .* numbers, as scene.toml asks"):
+    with pytest.raises(SceneError, match=r"front_control_points is not .* numbers, as scene.toml requires"):
         folders.read_nominal(tmp_path)
 
 

@@ -5,7 +5,7 @@ from functools import cache
 
 import pytest
 
-from bstcad.runs.cluster import HERE, Answer
+from bstcad.runs.cluster import THIS_MACHINE, Answer
 from bstcad.scene.scene import load
 from bstcad.sweep import tradeoff
 from bstcad.sweep.cold_run import DONE, FAILED, Run, carry_out
@@ -24,8 +24,8 @@ FAR = "tcp://10.0.0.1:1"  # a worker
 class Synthetic:
     """Carries out orders by formula; ends with KeyboardInterrupt after `most` runs."""
 
-    def __init__(self, base, most=math.inf, where=HERE, room=1):
-        self.base, self.most, self.where, self.room = base, most, where, room
+    def __init__(self, base, most=math.inf, where=THIS_MACHINE, room=1):
+        self.base, self.most, self.where, self.capacity = base, most, where, room
         self.ran, self.limits, self.orders = [], [], []
 
     def start(self, key, work, contents, point, limit, effort):

@@ -14,13 +14,13 @@ import bstcad
 from bstcad import cli
 from bstcad.folder import scene_files
 from bstcad.runs import environment, processes
-from bstcad.runs.processes import Ending
+from bstcad.runs.processes import ExitStatus
 from bstcad.scene.errors import MachineError
 from bstcad.sweep import batch
 from bstcad.sweep.batch import LocalPool, Wanted
 
-KILLED, FAULT = Ending(-9, 1.0, 1.0, ""), Ending(70, 1.0, 1.0, "bstcad: the fault above is bstcad's, not yours")
-NO_SOLID = Ending(2, 1.0, 1.0, "bstcad: warning: doubtful\nbstcad: no solid; move the back\n")
+KILLED, FAULT = ExitStatus(-9, 1.0, 1.0, ""), ExitStatus(70, 1.0, 1.0, "bstcad: this is a fault of bstcad")
+NO_SOLID = ExitStatus(2, 1.0, 1.0, "bstcad: warning: doubtful\nbstcad: no solid; move the back\n")
 
 
 class Designs:
@@ -33,7 +33,7 @@ class Designs:
         name = tomllib.loads(contents["scene.toml"].decode())["name"]
         with self.lock:
             self.made.append(name)
-        end = self.ends.get(name, Ending(0, 1.0, 1.0, ""))
+        end = self.ends.get(name, ExitStatus(0, 1.0, 1.0, ""))
         if end.code in (0, 1):
             shutil.copytree(self.small, folder, dirs_exist_ok=True)
         if end.code == 1:
@@ -72,7 +72,7 @@ def facts(scenes):
 
 
 def test_one_bad_scene_stops_nothing(scenes, designs, capsys):
-    designs.ends = {"b": Ending(1, 1.0, 1.0, ""), "c": NO_SOLID}
+    designs.ends = {"b": ExitStatus(1, 1.0, 1.0, ""), "c": NO_SOLID}
     assert run(scenes, "--workers", "2") == 2
     rows = told(scenes)
     assert {name: row["status"] for name, row in rows.items()} == {
@@ -104,7 +104,7 @@ def test_the_exit_code_is_of_the_worst(scenes, designs, end, code):
 
 def test_what_is_finished_is_not_done_again(scenes, small_scene, designs, monkeypatch):
     (scenes / "wrong.toml").unlink()
-    designs.ends = {"b": FAULT, "c": Ending(1, 1.0, 1.0, "")}
+    designs.ends = {"b": FAULT, "c": ExitStatus(1, 1.0, 1.0, "")}
     assert run(scenes) == 1
     first = told(scenes)
     designs.made.clear()
@@ -173,13 +173,13 @@ def test_two_scenes_do_not_share_a_folder(small_scene, tmp_path, designs):
     (tmp_path / "out" / "small" / "letter.txt").write_text("dear")
     wanted = [Wanted("a.toml", small_scene), Wanted("b.toml", small_scene)]
     reasons = [row.reason for row in batch.batch(wanted, tmp_path / "out")]
-    assert "holds files that are not a design's" in reasons[0] and "is the name of a.toml too" in reasons[1]
+    assert "contains files that are not a design's" in reasons[0] and "is the name of a.toml too" in reasons[1]
     assert batch.batch([], tmp_path / "out") == [] and not designs.made
 
 
 def test_a_design_that_was_killed_goes_on_once(small_scene, tmp_path, monkeypatch):
     asked = []
-    ends = [KILLED, Ending(0, 2.0, 2.0, "")]
+    ends = [KILLED, ExitStatus(0, 2.0, 2.0, "")]
     monkeypatch.setattr(processes, "run", lambda words, **more: asked.append(words) or ends[len(asked) - 1])
     contents = scene_files(small_scene)
     ended = batch.design(contents, tmp_path / "d", {})
@@ -195,7 +195,7 @@ def test_a_design_that_was_killed_goes_on_once(small_scene, tmp_path, monkeypatc
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["none*.toml"], "none*.toml: no file is named so; give scene files"),
+        (["none*.toml"], "none*.toml: matches no file; give scene files"),
         (["a.toml", "--workers", "1", "--scheduler", "tcp://127.0.0.1:9"], "give one of the two"),
         (["a.toml", "-o", "a.toml"], "a.toml: is a file; give another folder with -o"),
         (["a.toml", "--set", "x"], "--set x: has no value"),

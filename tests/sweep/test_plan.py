@@ -215,7 +215,7 @@ class TestCommand:
         assert cli.run(["plan", str(THU), "--set", "target.pixels=128"]) == 0
         out, err = shown
         assert "vignetting by the outline" in out and "Fresnel reflection" in out and "predicted" not in out
-        assert err == "predicting seconds, RRMSD and memory …\n"
+        assert err == "predicting time, RRMSD and memory …\n"
         assert "not predicted: the test ends here." in capsys.readouterr().out
 
     def test_light_that_cannot_reach_the_target_is_one_sentence(self, capsys):

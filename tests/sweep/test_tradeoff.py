@@ -145,7 +145,7 @@ class TestResume:
         with pytest.raises(SceneError, match="holds the sweep of another scene"):
             sweep(tiny.changed({"target.z": 501.0}), folder, 1.0)
         assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-        with pytest.raises(SceneError, match="holds files that are not a sweep's"):
+        with pytest.raises(SceneError, match="contains files that are not a sweep's"):
             sweep(tiny, tmp_path, 1.0)
 
 
