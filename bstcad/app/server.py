@@ -42,7 +42,7 @@ from bstcad.runs.files import SentenceError
 from bstcad.scene import new_scene, scene_file
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.picture import SAMPLES
-from bstcad.scene.scene_file import DOTS
+from bstcad.scene.scene_file import MAX_DOTS
 from bstcad.scene.schema import rows
 
 Body = Mapping[str, Any]  # JSON object that a page sends
@@ -296,7 +296,7 @@ class Workbench:
 
         def with_value(text: str) -> str:
             key, data = str(_required(body, "key")), scene_text.tables(text)
-            if key.count(".") > DOTS:
+            if key.count(".") > MAX_DOTS:
                 raise SceneError(f"{key[:20]}…: is not a key of a scene; reload the page")
             value = body["value"] if "value" in body else scene_text.typed(key, str(_required(body, "words")), data)
             text, others = take_change(

@@ -126,8 +126,8 @@ class Workspace:
     def change(self, name: str, text: str) -> OpenScene:
         """Store a text, valid or not, as the unsaved text of a scene."""
         path, data = self.path(name), _encoded(name, _with_unix_ends(text))
-        if len(data) > scene_file.LARGEST_FILE:
-            raise SceneError(f"{name}: is larger than {scene_file.LARGEST_FILE / 1e6:g} MB; shorten it")
+        if len(data) > scene_file.MAX_FILE_SIZE:
+            raise SceneError(f"{name}: is larger than {scene_file.MAX_FILE_SIZE / 1e6:g} MB; shorten it")
         with self._changing:
             unsaved = files.beside(path, UNSAVED)
             before = self._text(unsaved).partition("\n")[0] if unsaved.is_file() else _digest(self._text(path))
@@ -341,7 +341,7 @@ def _folder_pattern(*folders: Path) -> re.Pattern:
 def _text(path: Path) -> str:
     """Return the text of a scene file, without a byte order mark and with Unix line ends.  SceneError."""
     try:
-        return _with_unix_ends(files.contents(path, 2 * scene_file.LARGEST_FILE).decode("utf-8-sig"))
+        return _with_unix_ends(files.contents(path, 2 * scene_file.MAX_FILE_SIZE).decode("utf-8-sig"))
     except UnicodeDecodeError:
         raise SceneError(f"{path.name}: is not UTF-8 text; choose a TOML file") from None
     except ValueError as error:
@@ -351,7 +351,7 @@ def _text(path: Path) -> str:
 def _encoded_as(path: Path, text: str) -> bytes:
     """Return a text encoded with the byte order mark and the line ends of the file that it replaces."""
     try:
-        before = files.contents(path, 2 * scene_file.LARGEST_FILE)
+        before = files.contents(path, 2 * scene_file.MAX_FILE_SIZE)
     except ValueError:  # no such file, or no scene any more
         before = b""
     if _has_windows_ends(before):

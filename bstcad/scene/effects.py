@@ -1,4 +1,4 @@
-"""The effects that a scene names: [[effects]] tables, none by default; each costs nothing where it is absent."""
+"""Effects of a scene: [[effects]] tables, none by default; an absent effect costs no time."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from bstcad.optics.losses import Losses
     from bstcad.optics.measure import GhostTracer
 
-METAL = "Al"  # of a mirror, unless a scene names another
-PACKAGES = "bstcad.effects"  # group of entry points by which an installed package brings effects along
-Makes = Callable[[float], Any]  # the loss (optics.interfaces.Loss) of light of a wavelength (nm)
-_KNOWN: dict[str, Makes] = {}  # by the names that `effect` was given
+METAL = "Al"  # default metal of a mirror
+PACKAGES = "bstcad.effects"  # group of entry points with which an installed package adds effects
+Makes = Callable[[float], Any]  # function of a wavelength (nm) that returns a loss (optics.interfaces.Loss)
+_KNOWN: dict[str, Makes] = {}  # functions registered by `effect`, by name
 
 
 class Coating(Record):
@@ -31,10 +31,10 @@ class Coating(Record):
 
 
 class Fresnel(Record):
-    """Reflection at the faces of a lens, or the reflectance of a mirror's metal; in tailoring and in verification."""
+    """Reflection at the faces of a lens, or reflectance of a mirror's metal, in tailoring and verification."""
 
     kind: Annotated[Literal["fresnel"], Key("Reflection at the faces.")]
-    polarisation: Annotated[Literal["none", "s", "p"], Key("Polarisation against the plane of incidence.")] = "none"
+    polarisation: Annotated[Literal["none", "s", "p"], Key("Polarisation relative to the plane of incidence.")] = "none"
     coating: Annotated[
         Coating | None,
         Key("A single layer on both faces of a lens.", example={"index": 1.38, "thickness": 100.0}),
@@ -43,7 +43,7 @@ class Fresnel(Record):
 
 
 class Absorption(Record):
-    """Beer-Lambert absorption along the path in the glass; in tailoring and in verification."""
+    """Beer-Lambert absorption along the path in the glass, in tailoring and verification."""
 
     kind: Annotated[Literal["absorption"], Key("Absorption along the path in the glass.")]
     coefficient: Annotated[float | None, Key("Absorption coefficient; the material's if absent.", "1/mm", 0.0, 1e3)] = (
@@ -52,48 +52,49 @@ class Absorption(Record):
 
 
 class Ghost(Record):
-    """Light that is reflected twice inside the lens; in verification.
+    """Light reflected twice inside the lens, in verification.
 
-    Faces that reflect from inside do so from outside too: a scene with a ghost has `fresnel` as well, that of bare
-    faces and unpolarised light if no other is named.
+    A scene with a ghost also has `fresnel`, since its faces reflect: that of bare faces and unpolarised light unless
+    the scene names another.
     """
 
     kind: Annotated[Literal["ghost"], Key("Light reflected twice inside the lens, in verification.")]
 
 
 class Own(Record):
-    """A loss of flux by a script or an installed package, in tailoring and in verification; see `effect`."""
+    """A loss of flux defined by a script or an installed package, in tailoring and verification; see `effect`."""
 
-    kind: Annotated[Literal["own"], Key("A loss of flux by a script or an installed package.")]
-    name: Annotated[str, Key("Name under which the script or the package has it.", example="dust")]
-    _makes: Makes | None = PrivateAttr(None)  # travels with the record to other processes
+    kind: Annotated[Literal["own"], Key("A loss of flux defined by a script or an installed package.")]
+    name: Annotated[str, Key("Name that the script or the package gave the effect.", example="dust")]
+    _makes: Makes | None = PrivateAttr(None)  # pickled with the record for other processes
 
     def model_post_init(self, context: Any) -> None:
-        """Look the name up."""
+        """Find the function with the effect's name."""
         self._makes = _KNOWN.get(self.name) or _installed(self.name)
 
     def of(self, wavelength: float) -> Any:
-        """The loss of light of a wavelength (nm)."""
-        assert self._makes is not None  # else `complaints` refused the scene
+        """Return the loss at a wavelength (nm)."""
+        assert self._makes is not None  # otherwise `complaints` has refused the scene
         return self._makes(wavelength)
 
 
 def effect(name: str, makes: Makes) -> Own:
-    """An effect of one's own for scene.changed({"effects": [...]}): a loss of flux at faces or in the glass.
+    """Return an effect of your own for scene.changed({"effects": [...]}): a loss of flux at faces or in the glass.
 
-    makes(wavelength in nm) gives an object with share(cos_in, cos_out, path): the part of each ray's flux that goes on,
-    a tensor like the cosines of incidence and of refraction (or reflection) and the path before the face in mm, and
-    differentiable in them.  It acts at each face that light goes through or is reflected by; with the attribute
-    in_glass = True on the way through the glass alone.  The ledger counts the rest as "taken by NAME".  The scene file
-    holds the name: a script that opens such a design calls `effect` first, and an installed package declares an entry
-    point NAME = "module:makes" of the group "bstcad.effects" instead.
+    makes(wavelength in nm) returns an object with a method share(cos_in, cos_out, path).  This returns the fraction of
+    each ray's flux that continues: a tensor of the shape of its arguments, differentiable in them.  cos_in and cos_out
+    are the cosines of incidence and of refraction (or reflection), path is the path before the face in mm.  The loss
+    acts at each face that light crosses or is reflected by; with the attribute in_glass = True it acts along the path
+    in the glass only.  The ledger counts the lost flux as "taken by NAME".  The scene file holds the name.  A script
+    that opens such a design calls `effect` first; an installed package declares an entry point NAME = "module:makes"
+    of the group "bstcad.effects" instead.
     """
     _KNOWN[name] = makes
     return Own(kind="own", name=name)
 
 
 def _installed(name: str) -> Makes | None:
-    """What an installed package has under a name."""
+    """Return the function that an installed package declares under a name; None if there is none."""
     return next((found.load() for found in entry_points(group=PACKAGES, name=name)), None)
 
 
@@ -102,28 +103,28 @@ Effects = tuple[Effect, ...]
 
 
 def complaints(effects: Effects, lens: LensBlank) -> Iterator[str]:
-    """Effects that are named twice, that the lens or the mirror does not have, or of which no data are known."""
+    """Complain of effects named twice, impossible for the lens or the mirror, or without data."""
     for k, effect in enumerate(effects):
         key, glass = f"effects[{k}]", lens.passes.enters
         if any(_name(effect) == _name(other) for other in effects[:k]):
             yield f"{key}: {_name(effect)!r} is named twice; remove one of the two tables"
         if isinstance(effect, Own) and effect._makes is None:
             yield (
-                f"{key}.name: no effect is called {effect.name!r} here; let the script that has it call "
-                f"bstcad.effect({effect.name!r}, …) first, or install its package"
+                f"{key}.name: the effect {effect.name!r} is not known; call bstcad.effect({effect.name!r}, …) before "
+                "the scene is read, or install the package that defines it"
             )
         if {"absorption": not glass, "ghost": lens.passes.reflects}.get(effect.kind):
-            by = f"(lens.{lens.passes.mirror}.reflect)"
-            bare = f"light does not enter a mirror {by}, so it has no {effect.kind}"
-            why = f"ghosts of a mirror behind glass {by} are not simulated" if glass else bare
+            key_of_mirror = f"(lens.{lens.passes.mirror}.reflect)"
+            bare = f"a mirror {key_of_mirror} has no {effect.kind}, as light does not enter it"
+            why = f"ghosts of a mirror behind glass {key_of_mirror} are not simulated" if glass else bare
             yield f"{key}: {why}; remove the table"
         if not glass and getattr(effect, "coating", None) is not None:
-            bare = "a mirror's face (lens.back.reflect) is bare metal"
-            yield f"{key}.coating: {bare}; remove it, or name the metal by {key}.metal"
+            bare = "the face of a mirror (lens.back.reflect) is bare metal"
+            yield f"{key}.coating: {bare}; remove it, or set {key}.metal"
         if not lens.passes.reflects and getattr(effect, "metal", None) is not None:
-            yield f"{key}.metal: is for a mirror (lens.back.reflect, lens.front.reflect); remove it"
+            yield f"{key}.metal: only a mirror (lens.back.reflect, lens.front.reflect) has a metal; remove it"
         if effect.kind == "absorption" and effect.coefficient is None and lens.material is None:
-            yield f"{key}.coefficient: missing, and lens.index names no material; add it in 1/mm, or give lens.material"
+            yield f"{key}.coefficient: missing, and lens.material too; add one of them, the coefficient in 1/mm"
 
 
 def _name(effect: Effect) -> str:
@@ -131,18 +132,18 @@ def _name(effect: Effect) -> str:
 
 
 def named(effects: Effects, kind: type) -> Record | None:
-    """The effect of a kind; None if the scene names none."""
+    """Return the effect of a class; None if the scene does not have it."""
     return next((effect for effect in effects if isinstance(effect, kind)), None)
 
 
 def reflection_of(effects: Effects) -> Fresnel | None:
-    """The reflection that a scene names, or that of bare faces where it names a ghost alone; None: there is none."""
+    """Return the reflection of the scene; that of bare faces if it has only a ghost; None if it has neither."""
     bare = Fresnel(kind="fresnel") if named(effects, Ghost) else None
     return named(effects, Fresnel) or bare
 
 
 def ghost(effects: Effects) -> GhostTracer | None:
-    """How light is followed that is reflected twice inside the lens; None: it is left out."""
+    """Return the function that traces light reflected twice inside the lens; None if the scene has no ghost."""
     if named(effects, Ghost) is None:
         return None
     from bstcad.optics.trace import ghost_light
@@ -151,9 +152,9 @@ def ghost(effects: Effects) -> GhostTracer | None:
 
 
 def losses(effects: Effects, lens: LensBlank, wavelength: float) -> Losses | None:
-    """The losses of light of a wavelength (nm); None: there are none, and their module is not even loaded.
+    """Return the losses at a wavelength (nm); None if there are none, and then their module is not loaded.
 
-    Raises ValueError, in one sentence, where the material's data do not say enough.
+    Raises ValueError, in one sentence, if the data of the material do not suffice.
     """
     fresnel, absorption = reflection_of(effects), named(effects, Absorption)
     others = [effect for effect in effects if isinstance(effect, Own)]

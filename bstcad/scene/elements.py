@@ -1,7 +1,7 @@
-"""What light crosses besides the lens: windows and mirrors, the tables [[before]] and [[behind]] of a scene.
+"""Windows and mirrors before and behind the lens: the tables [[before]] and [[behind]] of a scene.
 
-They stand where they are and are no part of the lens: no file is written of them.  Light meets those before the lens,
-then the lens, then those behind it, each once, in the order of the tables, and loses none of its flux at their faces.
+They are not part of the lens and are written to no file.  Light meets those before the lens, then the lens, then those
+behind it, each once, in the order of the tables.  It loses no flux at their faces.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from bstcad.optics.unfolding import Image, image
 from bstcad.scene.blank import INDICES, LensBlank, Outlined
 from bstcad.scene.errors import about
 from bstcad.scene.schema import COORDINATES, LENGTHS, Record, leaving_out
-from bstcad.scene.target import WAYS, Target, is_faced
+from bstcad.scene.target import DIRECTIONS, Target, is_faced
 
-MAX_TILT = 40.0  # degrees; a mirror at 45 sends light across the axis, where it goes neither up nor down along z
-CURVATURES = (-1e3, 1e3)  # 1/mm
-UPRIGHT = 0.85  # (c r)² of a sphere at its rim, at most: of a hemisphere 1
-TURNED = Annotated[
+MAX_TILT = 40.0  # degrees; a mirror at 45 reflects light across the axis, neither up nor down along z
+CURVATURES = (-1e3, 1e3)  # range of the curvature, 1/mm
+MAX_SPHERE_BEND = 0.85  # largest (c r)² of a sphere at its rim; a hemisphere has 1
+Tilt = Annotated[
     tuple[float, float] | None,
     Key("Tilt about x, then about y.", "degrees", -MAX_TILT, MAX_TILT, example=[0.0, 20.0]),
 ]
-RIM = Key("Outline of what light may pass, as seen along z.", example={"shape": "circle", "diameter": 40.0})
+RIM = Key("Outline of the clear aperture, seen along z.", example={"shape": "circle", "diameter": 40.0})
 
 
 class Window(Record):
-    """A plate, its faces planes or spheres; tilted about its middle."""
+    """A transparent plate with plane or spherical faces, tilted about its middle."""
 
-    kind: Annotated[Literal["window"], Key("A plate that light goes through.")]
-    z: Annotated[float, Key("Place of the face with the lower z.", "mm", *COORDINATES, example=40.0)]
+    kind: Annotated[Literal["window"], Key("A plate that transmits light.")]
+    z: Annotated[float, Key("Position of the face with the lower z.", "mm", *COORDINATES, example=40.0)]
     thickness: Annotated[float, Key("Thickness on the axis.", "mm", *LENGTHS, example=3.0)]
     material: Annotated[str | None, Key("Name on refractiveindex.info; or give the index.", example="N-BK7")] = None
     index: Annotated[float | None, Key("Refractive index.", "", *INDICES, example=1.5168)] = None
@@ -49,36 +49,36 @@ class Window(Record):
         tuple[float, float],
         Key("Curvatures of the face with the lower z and of the other.", "1/mm", *CURVATURES, example=[0.01, 0.011]),
     ] = (0.0, 0.0)
-    tilt: TURNED = None
+    tilt: Tilt = None
 
     written = leaving_out(curvature=(0.0, 0.0))
 
     @property
     def vertices(self) -> tuple[float, float]:
-        """z (mm) of both faces on the axis before it is tilted, the lower one first."""
+        """Positions z (mm) of both faces on the axis before the tilt, the lower one first."""
         return self.z, self.z + self.thickness
 
     @property
     def curvatures(self) -> tuple[float, float]:
-        """Those of both faces (1/mm)."""
+        """Curvatures of both faces (1/mm)."""
         return self.curvature
 
     def complaints(self, key: str) -> Iterator[str]:
-        """Everything that is wrong with the table by itself; key: of the table."""
+        """Yield the faults of the table; key: key of the table."""
         if (self.material is None) == (self.index is None):
             yield f'{key}: needs exactly one of material and index; give for example material = "N-BK7"'
         lower, upper = self.faces()
         pairs = zip(upper.sags(self.outline), lower.sags(self.outline), strict=True)
         thinnest = upper.z - lower.z + min(above - below for above, below in pairs)
         if not self.tilt and not thinnest > 0:
-            yield f"{key}.curvature: the faces of the window cross each other inside its outline; make it thicker"
+            yield f"{key}.curvature: the faces of the window cross inside its outline; make the window thicker"
 
     def faces(self) -> tuple[Plane | Sphere | TiltedSurface, ...]:
-        """Both faces, the lower one first."""
-        return _placed(self, self.z + self.thickness / 2)
+        """Return both faces, the lower one first."""
+        return _tilted_faces(self, self.z + self.thickness / 2)
 
     def interfaces(self, sense: int, wavelength: float) -> tuple[Interface, ...]:
-        """The faces in the order of light along +z or -z."""
+        """Return the faces in the order of light along sense · z, at a wavelength (nm)."""
         n = refractive_index(self.material, wavelength) if self.index is None else self.index
         first, second = self.faces()[::sense]
         return (
@@ -88,66 +88,66 @@ class Window(Record):
 
 
 class Mirror(Record):
-    """A mirror, its face a plane or a sphere."""
+    """A mirror with a plane or spherical face."""
 
-    kind: Annotated[Literal["mirror"], Key("A mirror, which sends light back along z.")]
-    z: Annotated[float, Key("Place of the face on the axis.", "mm", *COORDINATES, example=120.0)]
+    kind: Annotated[Literal["mirror"], Key("A mirror, which reverses the direction of light along z.")]
+    z: Annotated[float, Key("Position of the face on the axis.", "mm", *COORDINATES, example=120.0)]
     outline: Annotated[Outlined, RIM]
     curvature: Annotated[float, Key("Curvature; positive bends towards +z.", "1/mm", *CURVATURES, example=0.002)] = 0.0
-    tilt: TURNED = None
+    tilt: Tilt = None
 
     written = leaving_out(curvature=0.0)
 
     @property
     def vertices(self) -> tuple[float, ...]:
-        """z (mm) of the face on the axis."""
+        """Position z (mm) of the face on the axis."""
         return (self.z,)
 
     @property
     def curvatures(self) -> tuple[float, ...]:
-        """That of the face (1/mm)."""
+        """Curvature of the face (1/mm)."""
         return (self.curvature,)
 
     def complaints(self, key: str) -> Iterator[str]:
-        """Nothing is wrong with the table by itself."""
+        """Yield nothing: every table of a mirror is possible."""
         yield from ()
 
     def faces(self) -> tuple[Plane | Sphere | TiltedSurface, ...]:
-        """The face."""
-        return _placed(self, self.z)
+        """Return the face."""
+        return _tilted_faces(self, self.z)
 
     def interfaces(self, sense: int, wavelength: float) -> tuple[Interface, ...]:
-        """The face."""
+        """Return the face as an interface."""
         return (Interface(*self.faces(), self.outline, Reflect(), Status.BLOCKED),)
 
 
 Element = Annotated[Window | Mirror, Field(discriminator="kind")]
 Elements = tuple[Element, ...]
-Around = tuple[tuple[Interface, ...], tuple[Interface, ...]]  # before and behind the lens
+Around = tuple[tuple[Interface, ...], tuple[Interface, ...]]  # interfaces before the lens, and behind it
 
 
-def _placed(element: Window | Mirror, middle: float) -> tuple[Plane | Sphere | TiltedSurface, ...]:
-    """The faces of an element that is tilted about the point of the axis at z = middle (mm)."""
-    made: list[Plane | Sphere | TiltedSurface] = []
+def _tilted_faces(element: Window | Mirror, middle: float) -> tuple[Plane | Sphere | TiltedSurface, ...]:
+    """Return the faces of an element tilted about the point of the axis at z = middle (mm)."""
+    faces: list[Plane | Sphere | TiltedSurface] = []
     for z, c in zip(element.vertices, element.curvatures, strict=True):
         if element.tilt and any(element.tilt):
             n = axes(element.tilt)[2]
-            x, y, rise = (part * (z - middle) for part in n)
-            made.append(TiltedSurface(middle + rise, (x, y), n, c))
+            x, y, height = (part * (z - middle) for part in n)
+            faces.append(TiltedSurface(middle + height, (x, y), n, c))
         else:
-            made.append(Sphere(z, c) if c else Plane(z))
-    return tuple(made)
+            faces.append(Sphere(z, c) if c else Plane(z))
+    return tuple(faces)
 
 
 def turns(elements: Sequence[Window | Mirror]) -> int:
-    """1, or -1 behind an odd number of mirrors: how they change the way of the light along z."""
+    """Return -1 for an odd number of mirrors, which reverse the light along z, or else 1."""
     return -1 if sum(element.kind == "mirror" for element in elements) % 2 else 1
 
 
 def interfaces(elements: Sequence[Window | Mirror], sense: int, wavelength: float) -> tuple[Interface, ...]:
-    """What light of a wavelength (nm) meets, which comes along +z or -z.
+    """Return the interfaces of the elements for light along sense · z at a wavelength (nm).
 
-    Light beside them is BLOCKED; before the lens `Scene.around` has it miss the lens.
+    Light outside their outlines is BLOCKED; before the lens, `Scene.around` counts it as missing the lens.
     """
     found: list[Interface] = []
     for element in elements:
@@ -158,63 +158,63 @@ def interfaces(elements: Sequence[Window | Mirror], sense: int, wavelength: floa
 
 @dataclass(frozen=True)
 class Station:
-    """A part of the scene on the way of the light."""
+    """A part of the scene along the path of the light."""
 
-    key: str  # of its place
-    words: str
-    low: float  # mm; its lowest and its highest z
-    high: float
+    key: str  # key of its position
+    words: str  # name in messages
+    low: float  # lowest z, mm
+    high: float  # highest z, mm
 
     @classmethod
     def of(cls, key: str, element: Window | Mirror) -> Station:
-        """That of a window or a mirror."""
+        """Return the station of a window or a mirror."""
         ends = [face.z + sag for face in element.faces() for sag in face.sags(element.outline)]
         return cls(f"{key}.z", f"the {element.kind}", min(ends), max(ends))
 
 
 @dataclass(frozen=True)
-class Way:
-    """The way of the light through a scene."""
+class LightPath:
+    """The path of the light through a scene: source, elements, lens, elements, targets."""
 
     source: Emitter
     before: Elements
     lens: LensBlank
     behind: Elements
-    targets: Mapping[str, Target]  # by their keys
+    targets: Mapping[str, Target]  # targets by key
 
     @property
     def sense(self) -> int:
-        """The way along z, 1 or -1, of the light that leaves the source."""
+        """Direction along z, 1 or -1, of the light that leaves the source."""
         return turns(self.before) * self.lens.passes.sense
 
     @property
     def is_folded(self) -> bool:
-        """Is there a mirror behind the lens?"""
+        """True if there is a mirror behind the lens."""
         return any(element.kind == "mirror" for element in self.behind)
 
     def complaints(self) -> Iterator[str]:
-        """Elements that are wrong by themselves, not in the order of the light, or that stage 1 cannot aim past."""
+        """Yield the faults of the elements, alone, in their order along the light, and for stage 1."""
         for name, elements in (("before", self.before), ("behind", self.behind)):
             for k, element in enumerate(elements):
                 key = f"{name}[{k}]"
                 (x, y), steepest = element.outline.farthest, max(map(abs, element.curvatures))
-                if not steepest**2 * (x * x + y * y) < UPRIGHT:
-                    ends = "its sphere ends inside the outline, or stands nearly upright there"
-                    yield f"{key}.curvature: {ends}; make one of them smaller"
+                if not steepest**2 * (x * x + y * y) < MAX_SPHERE_BEND:
+                    ends = "the sphere ends inside the outline, or is too steep at its rim"
+                    yield f"{key}.curvature: {ends}; make the curvature or the outline smaller"
                 if name == "behind" and steepest:
-                    aims = "stage 1 aims from the lens at the target, past planes alone"
-                    yield f"{key}.curvature: {aims}; leave it out, or put the element before the lens"
+                    plane = "behind the lens only plane faces are possible"
+                    yield f"{key}.curvature: {plane}; remove it, or put the element before the lens"
                 yield from element.complaints(key)
         for key, target in self.targets.items():
             if self.behind and target.screen.plane.frame is None:
-                yield f"{key}: windows and mirrors behind a lens are for planes alone; leave out [[behind]]"
+                yield f"{key}: windows and mirrors behind the lens need a target on a plane; remove [[behind]]"
         if self.before or self.behind:
             yield from self._out_of_order()
         if self.is_folded:
             yield from self._unfaced()
 
     def _out_of_order(self) -> Iterator[str]:
-        """Elements that light on its way from the source to the targets does not meet in their order."""
+        """Complain of elements that light does not meet in the order of their tables."""
         lens, sense = self.lens, self.sense
         key, start = f"source.{self.source.start_key}", self.source.nearest(upwards=sense > 0)
         optic = Station("lens.front.z", f"the {lens.optic}", lens.front.z + lens.front_sags[0], lens.back.z)
@@ -226,13 +226,13 @@ class Way:
         if start is not None:
             stops.insert(0, (Station(key, "the source", start, start), False))
         elif sense < 0:
-            yield f"{key}: missing, and the light comes down along -z; add the plane where it starts"
+            yield f"{key}: missing, and the light travels along -z; add the plane where it starts"
             return
-        for (here, reverses), (there, _) in pairwise(stops):
+        for (one, reverses), (other, _) in pairwise(stops):
             sense = -sense if reverses else sense
-            if not (there.low - here.high if sense > 0 else here.low - there.high) > 0:
-                ends = " does not follow ".join(f"{p.words}, z = {p.low:.6g} to {p.high:.6g}," for p in (there, here))
-                yield f"{there.key}: {ends} along {WAYS[sense]}, as the light goes; move one of them"
+            if not (other.low - one.high if sense > 0 else one.low - other.high) > 0:
+                follows = " must follow ".join(f"{p.words}, z = {p.low:.6g} to {p.high:.6g}," for p in (other, one))
+                yield f"{other.key}: {follows} along {DIRECTIONS[sense]}, as the light travels; move one of them"
         sense = turns(self.behind)
         for key, target in self.targets.items():
             if self.behind:
@@ -241,16 +241,16 @@ class Way:
                 yield from (about(sentence, key) for sentence in sentences)
 
     def _unfaced(self) -> Iterator[str]:
-        """Targets that the lens sees by way of mirrors from the edge, or from their rear."""
+        """Complain of targets that the lens sees, in the mirrors, edge-on or from the rear."""
         behind = interfaces(self.behind, 1, self.source.main_wavelength)
         vertex: Vector = (0.0, 0.0, self.lens.back.z)
         for key, target in self.targets.items():
             seen = Image.of(image(behind, target.screen.plane))
             if not is_faced(seen, vertex):
-                way = "by way of the mirrors the target is edge-on to the lens, or shows it its rear"
-                yield f"{key}.tilt: {way}; turn the target or a mirror"
+                view = "seen from the lens in the mirrors, the target is edge-on or turned away"
+                yield f"{key}.tilt: {view}; turn the target or a mirror"
 
 
 def lowest(elements: Sequence[Window | Mirror]) -> float:
-    """The least z (mm) of the first of the elements."""
+    """Return the lowest z (mm) of the first of the elements."""
     return Station.of("", elements[0]).low

@@ -1,4 +1,4 @@
-"""The fault of a scene in one sentence: where (a dotted key), which fault, which remedy."""
+"""Messages of a refused scene: one sentence with the dotted key, the fault and a remedy."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ if TYPE_CHECKING:
     from pydantic import ValidationError
     from pydantic_core import ErrorDetails
 
-NAME = r"""[\w-]+|"[^"\n]*"|'[^'\n]*'"""  # of a key in TOML
+NAME = r"""[\w-]+|"[^"\n]*"|'[^'\n]*'"""  # name between the dots of a TOML key
 DOTTED = rf"(?:{NAME})(?:\s*\.\s*(?:{NAME}))*"
 HEADER, KEY = re.compile(rf"\s*(\[\[?)\s*({DOTTED})\s*\]"), re.compile(rf"\s*({DOTTED})\s*=")
 
-NOT_BUILT = {  # words that a scene may well have: the feature that each asks for, and which there is not yet
+NOT_BUILT = {  # unknown words of features that bstcad does not have yet, with the beginning of a sentence on each
     **dict.fromkeys(("ies", "ldt", "eulumdat", "intensity"), "files of luminous intensity (IES, EULUMDAT) are"),
     **dict.fromkeys(("rayfile", "ray_file", "rayset", "ray_set"), "files of measured rays are"),
     **dict.fromkeys(("diffraction", "coherent", "interference"), "wave optics is"),
     **dict.fromkeys(("scatter", "scattering", "bsdf", "haze"), "scattering is"),
 }
-# A key of the target at the beginning of a sentence, or in its middle; and one that says which of several it is.
+# Keys of a single target in a sentence, at its beginning or inside it; and the key of one of several targets.
 THE_TARGET, ONE_TARGET = re.compile(r"^target(?=[.:])|(?<=\s)target(?=\.[a-z])"), re.compile(r"target\[\d+\]")
-NEAR = 0.7  # difflib's ratio from which on a known word may be meant: "ies" and "pixels" have 0.67
+SIMILARITY = 0.7  # smallest ratio of difflib at which a known word is proposed; "ies" and "pixels" have 0.67
 
 UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
-SENTENCES = {  # by pydantic's types of errors, of a value that is `shown`
+SENTENCES = {  # sentence for each type of error of pydantic; {shown} is the value
     ("float_type", "float_parsing", "finite_number"): "{shown} is not a number; write one, without quotes",
     ("int_type", "int_parsing", "int_from_float", "int_parsing_size"): (
         "{shown} is not a whole number; write one, without quotes or a decimal point"
@@ -38,8 +38,8 @@ SENTENCES = {  # by pydantic's types of errors, of a value that is `shown`
     ("string_type",): "{shown} is not text; put it in quotes",
     ("bool_type", "bool_parsing"): "{shown} is neither true nor false; write one of the two, without quotes",
     ("tuple_type",): "{shown} is not a list; write it in brackets, such as {listed}",
-    ("too_long",): "{actual_length} values where {max_length} belong; remove the rest",
-    ("too_short",): "{actual_length} values where at least {min_length} belong; add some",
+    ("too_long",): "has {actual_length} values, and {max_length} is the maximum; remove the rest",
+    ("too_short",): "has {actual_length} values, and {min_length} is the minimum; add some",
     ("dataclass_type", "model_type", "model_attributes_type", "dict_type"): (
         "{shown} is not a table; write for example {example}"
     ),
@@ -48,30 +48,31 @@ SENTENCES = {  # by pydantic's types of errors, of a value that is `shown`
 
 
 def about(sentence: str, key: str) -> str:
-    """A sentence on the one target, "target.z: …", as one on the target of this key, "target[1]"."""
+    """Return a sentence on a single target, "target.z: …", with the key of one of several, "target[1].z: …"."""
     return THE_TARGET.sub(key, sentence)
 
 
 def nearest(word: str, known: list[str], otherwise: str) -> str:
-    """'did you mean …' for a misspelt word; else all known words, behind "… not built yet" for a word of NOT_BUILT.
+    """Return "did you mean …?" for a misspelt word, or else a list of all known words.
 
-    A known word is near from difflib's ratio NEAR on: twice the letters that both share in order, over all letters.
+    A word of NOT_BUILT has "… not built yet" before the list.  Words are compared by difflib's ratio: twice the number
+    of letters that they share in order, over the number of all letters.
     """
-    every = f"{otherwise} {', '.join(known)}"
+    choices = f"{otherwise} {', '.join(known)}"
     if missing := NOT_BUILT.get(word.casefold()):
-        return f"{missing} not built yet; {every}"
-    near = difflib.get_close_matches(word.casefold(), known, n=1, cutoff=NEAR)
-    return f"did you mean {near[0]!r}?" if near else every
+        return f"{missing} not built yet; {choices}"
+    similar = difflib.get_close_matches(word.casefold(), known, n=1, cutoff=SIMILARITY)
+    return f"did you mean {similar[0]!r}?" if similar else choices
 
 
 def explain(error: ValidationError, data: Any) -> str:
-    """The first fault of `data` as a scene; a misspelt key comes before the key that it left missing."""
+    """Return the first fault of `data` as a sentence; an unknown key comes before a missing one."""
     problems = [problem for problem in error.errors(include_url=False) if _applies(problem["loc"], data)]
     return _sentence(min(problems, key=lambda problem: problem["type"] not in UNKNOWN_KEY))
 
 
 def _applies(location: tuple[int | str, ...], data: Any) -> bool:
-    """False: the error is of an outline of the other shape than the data have."""
+    """Return False if the error belongs to an outline of another shape than the one in the data."""
     for step in location:
         if step in ("Circle", "Rectangle") and isinstance(data, dict):
             return data.get("shape") == step.lower()
@@ -82,17 +83,17 @@ def _applies(location: tuple[int | str, ...], data: Any) -> bool:
     return True
 
 
-class _Place:
-    """The location of a validation error, walked through the JSON schema.
+class _Location:
+    """Location of a validation error in the JSON schema.
 
-    pydantic's location also holds the tags of unions ('source', 'collimated', 'aperture', 'Circle', 'radius'):
-    they choose the record and are no part of the dotted key.
+    pydantic's location also holds the tags of unions ('source', 'collimated', 'aperture', 'Circle', 'radius').  They
+    choose the record and are not part of the dotted key.
     """
 
     def __init__(self, problem: ErrorDetails):
-        self.key = ""  # dotted, as the user writes it
-        self.records: list[Node] = [schema()]  # the tables that may stand at the key
-        self.owners = self.records  # the tables whose key it is
+        self.key = ""  # dotted key, as the user writes it
+        self.records: list[Node] = [schema()]  # tables that are possible at the key
+        self.owners = self.records  # tables that have the key
         unknown = problem["loc"][-1:] if problem["type"] in UNKNOWN_KEY else ()
         for step in problem["loc"]:
             if isinstance(step, int):
@@ -101,13 +102,13 @@ class _Place:
                 self.key = f"{self.key}.{step}".lstrip(".")
                 self.owners = self.records
                 self.records = [r for o in self.owners for r in records(o["properties"].get(step, {}))]
-            else:  # a tag, or the class of a record
+            else:  # tag, or class of a record
                 chosen = [record for record in self.records if step in (record.get("title"), *tags(record).values())]
                 self.records = chosen or self.records
 
     @property
     def choices(self) -> list[str]:
-        """The tags of the tables that may stand at the key."""
+        """Tags of the tables that are possible at the key."""
         return [value for record in self.records for value in tags(record).values()]
 
     @property
@@ -122,54 +123,54 @@ class _Place:
 
     @property
     def listed(self) -> str:
-        """A list that the key could have."""
+        """Example of a list at the key."""
         return f"[[{self.key}]]" if self.records else self.example.partition(" = ")[2] or "[0.0, 400.0]"
 
 
 def _sentence(problem: ErrorDetails) -> str:
-    place, value, context = _Place(problem), problem["input"], problem.get("ctx", {})
-    key, fault = place.key, context.get("error")
-    if isinstance(fault, SceneError) or (fault and not key):  # of a validator of our own
+    location, value, context = _Location(problem), problem["input"], problem.get("ctx", {})
+    key, fault = location.key, context.get("error")
+    if isinstance(fault, SceneError) or (fault and not key):  # raised by a validator of bstcad
         return about(str(fault), target[0]) if (target := ONE_TARGET.match(key)) else str(fault)
-    return f"{key}: {fault}" if fault else _of_type(problem["type"], place, value, context)
+    return f"{key}: {fault}" if fault else _type_sentence(problem["type"], location, value, context)
 
 
-def _of_type(kind: str, place: _Place, value: Any, context: Mapping[str, Any]) -> str:
-    """The sentence on an error that pydantic finds by itself."""
-    key, last = place.key, place.key.rpartition(".")[2]
+def _type_sentence(kind: str, location: _Location, value: Any, context: Mapping[str, Any]) -> str:
+    """Return the sentence on an error that pydantic finds by itself."""
+    key, last = location.key, location.key.rpartition(".")[2]
     shown = _shown(value)
     tag, name = str(context.get("tag")), context.get("discriminator", "").strip("'")
     if kind in UNKNOWN_KEY:
-        known = sorted({name for owner in place.owners for name in owner["properties"]})
+        known = sorted({name for owner in location.owners for name in owner["properties"]})
         return f"{key}: unknown key; {nearest(last, known, 'the keys here are')}"
     if kind == "union_tag_not_found":
-        return f"{key}: {name} is missing; give one of {', '.join(map(repr, place.choices))}"
+        return f"{key}: {name} is missing; give one of {', '.join(map(repr, location.choices))}"
     if kind == "union_tag_invalid":
-        return f"{key}.{name}: {tag!r} is not possible; {nearest(tag, place.choices, 'choose one of')}"
+        return f"{key}.{name}: {tag!r} is not possible; {nearest(tag, location.choices, 'choose one of')}"
     if kind == "literal_error" and isinstance(value, bool):
         return f"{key}: {shown} is not possible; write {last} = true or remove the line"
     if kind == "literal_error":
         known = [word.strip("' ") for word in context["expected"].replace(" or ", ", ").split(",")]
         return f"{key}: {shown} is not possible; {nearest(str(value), known, 'choose one of')}"
     if kind == "missing" and key.endswith("]"):
-        return f"{key[: key.rindex('[')]}: too few numbers; give all of them in the list"
+        return f"{key[: key.rindex('[')]}: the list has too few numbers; add the others"
     if kind == "float_type" and isinstance(value, list) and last == "wavelength":
-        spectrum = "a spectrum is a list of lines, each a wavelength in nm and a weight"
-        return f"{key}: {spectrum}; write it such as [[486.1, 1.0], [587.6, 1.0]]"
+        spectrum = "a spectrum is a list of lines, each with a wavelength in nm and a weight"
+        return f"{key}: {spectrum}; write for example [[486.1, 1.0], [587.6, 1.0]]"
     sentence = next((text for kinds, text in SENTENCES.items() if kind in kinds), "{shown} is not possible; change it")
-    return f"{key}: " + sentence.format(shown=shown, example=place.example, listed=place.listed, **context)
+    return f"{key}: " + sentence.format(shown=shown, example=location.example, listed=location.listed, **context)
 
 
 def _shown(value: Any) -> str:
-    """A value as the file has it, cut short."""
+    """Return a value as a file has it, at most 40 characters."""
     text = repr(value) if not isinstance(value, bool) else str(value).lower()
     return text if len(text) <= 40 else text[:39] + "…"
 
 
 def toml_positions(text: str) -> dict[str, int]:
-    """The line, from 1, of each table and key of a TOML text: "source", "source.kind", "effects[0].kind".
+    """Return the line, from 1, of each table and key of a TOML text: "source", "source.kind", "effects[0].kind".
 
-    The keys of an inline table, front = { kind = "plane" }, are on the line of that table (`line_of`).
+    Keys of an inline table, front = { kind = "plane" }, are left out; `line_of` finds them on the table's line.
     """
     lines: dict[str, int] = {}
     counts: dict[str, int] = {}
@@ -183,19 +184,19 @@ def toml_positions(text: str) -> dict[str, int]:
             lines.setdefault(table, number)
         elif key := KEY.match(line):
             lines.setdefault(f"{table}.{_plain(key[1])}".lstrip("."), number)
-    for table in (table for table, last in counts.items() if last == 0):  # alone, it may be called without a number
-        alone = f"{table}[0]"
-        lines |= {table + key.removeprefix(alone): line for key, line in lines.items() if key.startswith(alone)}
+    for table in (table for table, last in counts.items() if last == 0):  # the only table of a list has no number
+        single = f"{table}[0]"
+        lines |= {table + key.removeprefix(single): line for key, line in lines.items() if key.startswith(single)}
     return lines
 
 
 def line_of(key: str, lines: Mapping[str, int]) -> int | None:
-    """The line of a key, or of the innermost table or value that holds it; None if the file has none of them."""
+    """Return the line of a key, or of the innermost table or value that contains it; None if there is no such line."""
     while key and key not in lines:
         key = key.rpartition("[" if key.endswith("]") else ".")[0]
     return lines.get(key)
 
 
 def _plain(dotted: str) -> str:
-    """A dotted key as it is read: without quotes and spaces."""
+    """Return a dotted key without quotes and spaces."""
     return ".".join(name.strip("\"'") for name in re.findall(NAME, dotted))

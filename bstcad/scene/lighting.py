@@ -1,4 +1,4 @@
-"""Complaints about the light of a scene: its profile, its spectrum, its start, and whether it reaches the lens."""
+"""Complaints about the source of a scene: its profile, its spectrum, its position, and light that misses the lens."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ from bstcad.optics.emitters import Emitter
 from bstcad.optics.outlines import Outline
 from bstcad.scene.blank import INDICES, LensBlank
 
-COVERED = 0.9  # part of the lens's width; a narrower beam leaves a part dark that somebody pays for
-SAMPLES = 200  # a side of the lens, at which light is looked for
+MIN_COVERAGE = 0.9  # smallest width of a beam as a fraction of the lens's width; the rest of the lens is wasted
+SAMPLES = 200  # points per side of the lens at which the irradiance is sampled
 
 
 def complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
-    """Complaints about the profile, the spectrum and the size of a source before this lens."""
+    """Complain of the profile, the spectrum and the size of a source before this lens."""
     width = source.widths.get(source.profile)
     if width and source.profile != source.unbounded and getattr(source, width) is None:
         unit = "mm" if width == "radius_1e2" else "degrees"
         yield f"source.{width}: missing, and a {source.profile} profile needs it; add it in {unit}"
     for other in source.widths.values():
         if other != width and getattr(source, other) is not None:
-            yield f"source.{other}: has no meaning for a {source.profile} profile; remove it or change the profile"
+            yield f"source.{other}: a {source.profile} profile does not use it; remove it, or change the profile"
     yield from _spectrum(source, lens)
     first = getattr(lens, lens.passes.faces[0])
     yield from (f"source.{complaint}" for complaint in source.complaints(first.z, lens.optic))
 
 
 def _spectrum(source: Emitter, lens: LensBlank) -> Iterator[str]:
-    """Lines without a weight, of several indices, or of which the material's index is not known or no glass's."""
+    """Complain of lines without weight, of one index for several lines, or of an unknown or impossible index."""
     listed = source.wavelength if isinstance(source.wavelength, tuple) else ((source.wavelength, 1.0),)
     if not listed:
-        yield "source.wavelength: no line is in it; give one wavelength in nm, or lines such as [[587.6, 1.0]]"
+        yield "source.wavelength: the list is empty; give one wavelength in nm, or lines such as [[587.6, 1.0]]"
     for nm, weight in listed:
         if not weight > 0:
             yield f"source.wavelength: the weight {weight:g} of the line at {nm:g} nm is not above 0; remove the line"
@@ -45,29 +45,29 @@ def _spectrum(source: Emitter, lens: LensBlank) -> Iterator[str]:
         return
     low, high = INDICES
     for index in (n for n in indices if lens.material is not None and not low <= n <= high):
-        found = f"the index of {lens.material} is {index:.4g} there, not between {low:g} and {high:g}"
-        yield f"lens.material: {found}; choose a material that lets the source's light through"
+        found = f"the index of {lens.material} is {index:.4g} at this wavelength, not between {low:g} and {high:g}"
+        yield f"lens.material: {found}; choose a material that transmits the light of the source"
 
 
 def order(source: Emitter, lens: LensBlank) -> Iterator[str]:
-    """Light and lens that do not follow each other along z; a mirror's light comes from above."""
+    """Complain of a source that is not before the lens along z, or not above a mirror."""
     front, back = lens.front.z + lens.front_sags[0], lens.back.z
     key, start = f"source.{source.start_key}", source.nearest(upwards=lens.passes.sense > 0)
     if lens.passes.sense > 0:
         if start is not None and not start < front:
             yield f"{key}: the light starts at z = {start:g}, not before the front at z = {front:g}; move one of them"
     elif start is None:
-        yield f"{key}: missing, and a mirror's light comes from above; add the plane it starts from, above z = {back:g}"
+        yield f"{key}: missing, and a mirror needs light from above; add the plane where it starts, above z = {back:g}"
     elif not start > back:
         yield f"{key}: the light starts at z = {start:g}, not above the mirror at z = {back:g}; move one of them"
     if "front" not in lens.passes.faces and lens.front.outline is not None:
-        yield "lens.front.outline: the front of a mirror is the rear of its plate, which no light meets; remove it"
+        yield "lens.front.outline: no light meets the front of a mirror, the rear of its plate; remove it"
     if "front" not in lens.passes.faces and not lens.front.fixed:
-        yield "lens.front.optimise: the front of a mirror is the rear of its plate, which no light meets; remove it"
+        yield "lens.front.optimise: no light meets the front of a mirror, the rear of its plate; remove it"
 
 
 def unlit(source: Emitter, lens: LensBlank, rim: Outline) -> Iterator[str]:
-    """A simple source that is turned or moved sideways and sends no light to the lens inside its rim."""
+    """Complain of a source, turned or moved sideways, that sends no light to the lens inside its rim."""
     if not (source.tilted or getattr(source, "centre", None)):
         return
     z, sags = lens.back.z, (0.0,)
@@ -76,19 +76,19 @@ def unlit(source: Emitter, lens: LensBlank, rim: Outline) -> Iterator[str]:
     x, y = sampling.grid(source.window(rim, z, sags), SAMPLES)
     if not bool((source.irradiance(x, y, z) > 0).any()):
         key = "tilt" if source.tilted else "centre"
-        yield f"source.{key}: none of the light goes to the {lens.optic}; turn or move the source towards it"
+        yield f"source.{key}: no light reaches the {lens.optic}; turn or move the source towards it"
 
 
 def doubts(source: Emitter, rim: Outline, key: str) -> Iterator[str]:
-    """A parallel beam that is wider than the lens, or leaves part of it dark; key: of the rim."""
+    """Doubt a parallel beam wider than the lens, or narrower than MIN_COVERAGE of it; key: key of the rim."""
     beam, _ = source.spot(0.0)
-    if beam is None:  # it has no edge
+    if beam is None:  # without an edge
         return
     sides = [*zip("xy", beam.half_extent, rim.half_extent, strict=True)]
     if any(b > h for _, b, h in sides):
-        yield "source.aperture: the beam is wider than the lens; what passes beside it is lost"
-    for axis, b, h in [side for side in sides if side[1] < COVERED * side[2]][:1]:
+        yield "source.aperture: the beam is wider than the lens, and light beside the lens is lost; make it narrower"
+    for axis, b, h in [side for side in sides if side[1] < MIN_COVERAGE * side[2]][:1]:
         yield (
-            f"source.aperture: the beam is {2 * b:g} mm wide along {axis} and the lens {2 * h:g} mm; the lens "
-            f"stays unlit beyond {axis} = -{b:g} and {b:g} mm, so widen the beam or make {key} smaller"
+            f"source.aperture: the beam is {2 * b:g} mm wide along {axis} and the lens {2 * h:g} mm; the lens is dark "
+            f"outside {axis} = -{b:g} to {b:g} mm, so widen the beam or make {key} smaller"
         )

@@ -1,4 +1,4 @@
-"""Scenes to start from: a plate that throws a picture or letters by one of four lights, and the templates."""
+"""New scenes: a plate that projects a picture or letters with one of four lights, and copies of the templates."""
 
 from __future__ import annotations
 
@@ -19,104 +19,107 @@ from bstcad.scene.errors import SceneError, nearest
 if TYPE_CHECKING:
     from bstcad.scene.scene import Scene
 
-SIZE = 80.0  # mm, of a plate
-SLIM = 10.0  # a plate is so many times as wide as thick …
-LEAST = 3.0  # … but at least so thick (mm)
-RANGES = {"size": (1.0, 10_000.0), "distance": (1.0, 1e7)}  # mm
-OVER_BLUR = 1.1  # times the RRMSD of the blurred picture: standard quality ends well below that, a draft hardly
-FEWEST_RRMSD, MOST_RRMSD = 0.05, 0.25  # the smallest and the largest limit that is written
+SIZE = 80.0  # default size of a plate, mm
+WIDTH_TO_THICKNESS = 10.0  # ratio of width and thickness of a plate
+MIN_THICKNESS = 3.0  # mm; smallest thickness of a plate
+RANGES = {"size": (1.0, 10_000.0), "distance": (1.0, 1e7)}  # ranges of the options, mm
+BLUR_MARGIN = 1.1  # ratio of the limit to the RRMSD of the blurred picture; standard quality ends well below it
+MIN_RRMSD, MAX_RRMSD = 0.05, 0.25  # smallest and largest limit that is written
 
-LIKE_THE_PHOTO = re.compile(r"(?:([^xX×]+)[xX×])?photo")  # a size: the longer side, or SIZE, by the photo's other side
+LIKE_THE_PHOTO = re.compile(r"(?:([^xX×]+)[xX×])?photo")  # size with the photo's proportions: "photo" or "120xphoto"
 
 TEMPLATE = Path(__file__).with_name("plate.toml.j2")
-COLUMN = 32  # of a line's comment, where the line is not longer
-WIDTH = 118  # of a comment
+COMMENT_COLUMN = 32  # column of the comments behind short lines
+COMMENT_WIDTH = 118  # characters in a line of comment
 
 
 @dataclass(frozen=True)
 class Light:
-    """A light to make a plate for; its table [source] stands in plate.toml.j2."""
+    """A light for which a plate is made; plate.toml.j2 has its table [source]."""
 
-    name: str  # the word of the option --light
-    of: str
-    header: str  # which light that is, in sentences that stay true where the scene's lengths are changed
-    pixels: int = 256
-    size: float = 0.0  # mm of a lamp, degrees of parallel light; 0: the picture is as sharp as its pixels
-    square: bool = False  # a chip; else a disc
-    ahead: float = 0.0  # plates: how far before the plate a lamp is; 0: its light is parallel
-    throw: float = 5.0  # plates: how far the wall is by default; the sun's image grows with the distance
-    hint: str = ""  # how detail would be finer
+    name: str  # value of the option --light
+    of: str  # the light in a sentence, "an LED"
+    header: str  # description of the light, true for other lengths in the scene too
+    pixels: int = 256  # pixels along the longer side of the target
+    size: float = 0.0  # mm for a lamp, degrees for parallel light; 0: no blur
+    square: bool = False  # True for a square chip, False for a disc
+    ahead: float = 0.0  # distance from the lamp to the plate over the longer side of the plate; 0: parallel light
+    throw: float = 5.0  # default distance from the plate to the wall over the longer side of the plate
+    hint: str = ""  # advice for finer detail
 
 
 _TABLES = tomllib.loads(Path(__file__).with_name("lights.toml").read_text(encoding="utf-8"))
-LIGHTS = {name: Light(name, **table) for name, table in _TABLES.items()}  # the first is the default
+LIGHTS = {name: Light(name, **table) for name, table in _TABLES.items()}  # lights by name; the first is the default
 
 
 @dataclass(frozen=True)
 class Plate:
-    """A plate, the wall behind it and the light before it (mm)."""
+    """A plate, the wall behind it and the light before it."""
 
     light: Light
-    width: float
-    height: float
-    distance: float
+    width: float  # mm
+    height: float  # mm
+    distance: float  # distance from the plate to the wall, mm
 
     @classmethod
     def of(
         cls, light: str | None = None, size: str | float | None = None, distance: str | float | None = None
     ) -> Plate:
-        """The plate that a user describes; None: the default.  SceneError."""
+        """Return the plate of the options of a user; None: the default.  SceneError for wrong values."""
         if light is not None and light not in LIGHTS:
-            raise SceneError(f"--light {light}: is none; {nearest(light, list(LIGHTS), 'give one of')}")
+            raise SceneError(f"--light {light}: is unknown; {nearest(light, list(LIGHTS), 'give one of')}")
         chosen = LIGHTS[light or next(iter(LIGHTS))]
         sides = _lengths("size", SIZE if size is None else size, "80, or width x height, such as 80x60", 2)
-        [far] = _lengths("distance", chosen.throw * max(sides) if distance is None else distance, "2000", 1)
-        return cls(chosen, sides[0], sides[-1], far)
+        [length] = _lengths("distance", chosen.throw * max(sides) if distance is None else distance, "2000", 1)
+        return cls(chosen, sides[0], sides[-1], length)
 
     @property
     def side(self) -> float:
-        """The longer side."""
+        """Longer side of the plate (mm)."""
         return max(self.width, self.height)
 
     @property
     def thickness(self) -> float:
-        """To half a millimetre."""
-        return max(LEAST, math.ceil(2 * self.side / SLIM) / 2)
+        """Thickness of the plate (mm), in steps of half a millimetre."""
+        return max(MIN_THICKNESS, math.ceil(2 * self.side / WIDTH_TO_THICKNESS) / 2)
 
     @property
     def before(self) -> float:
-        """From the lamp to the plate; 0 of parallel light."""
+        """Distance from the lamp to the plate (mm); 0 for parallel light."""
         return self.light.ahead * self.side
 
     @property
     def magnified(self) -> float:
-        """Times the plate: as wide is the picture, and as its shadow."""
+        """Ratio of the widths of picture and plate; the picture is as wide as the shadow of the plate."""
         return 1 + self.distance / self.before if self.before else 1.0
 
     @property
     def pixel(self) -> float:
-        """The side of a pixel."""
+        """Side of a pixel (mm)."""
         return self.magnified * self.side / self.light.pixels
 
     def source_image(self, distance: float) -> float:
-        """The side of the source's image on a wall so far away: 2 L tan(δ / 2), or d L / l from l before the plate."""
+        """Return the size (mm) of the source's image on a wall at this distance L (mm).
+
+        It is 2 L tan(δ / 2) for light of divergence δ, and d L / l for a source of size d at l before the plate.
+        """
         if self.before:
             return self.light.size * distance / self.before
         return 2 * distance * math.tan(math.radians(self.light.size / 2))
 
     def detail(self, distance: float) -> float:
-        """The width of the finest detail on a wall so far away (optics.measure.detail_width)."""
-        from bstcad.optics.measure import detail_width  # loads torch, which a list of the templates need not
+        """Return the width (mm) of the finest detail on a wall at this distance (mm): optics.measure.detail_width."""
+        from bstcad.optics.measure import detail_width  # loads torch, which a list of the templates does not need
 
         as_a_disc = math.sqrt(4 / 3) if self.light.square else 1.0
         return detail_width(as_a_disc * self.source_image(distance), self.pixel)
 
     def expectation(self, blurred: float | None = None) -> str:
-        """Which detail survives, in a sentence; blurred: RRMSD of the picture by the source's image alone."""
+        """Return a sentence on the finest detail; blurred: RRMSD of the picture blurred by the source's image."""
         wide, detail = self.magnified * self.side, self.detail(self.distance)
         text = f"The finest detail on this wall is {detail:.2g} mm wide"
-        if self.light.square:  # bstcad plan traces 4.86 mm through the whole plate where its middle has 5.77
-            text += " behind the middle of the plate, finer beside it, where the chip is seen at a slant"
+        if self.light.square:  # traced through the whole plate it is 4.86 mm, where the middle has 5.77
+            text += " behind the middle of the plate, and less beside it, where the chip is seen at an angle"
         text += f", 1/{wide / detail:.0f} of the picture's {wide:.4g} mm"
         if blurred is None:
             return f"{text}."
@@ -125,12 +128,12 @@ class Plate:
             text += f"; on a wall at {nearer:g} mm it is {self.detail(nearer):.2g} mm (--distance {nearer:g})"
         elif self.light.hint:
             text += f"; {self.light.hint}"
-        if blurred > MOST_RRMSD:
-            text += f". That is too coarse for this picture, which it changes by an RRMSD of {blurred:.2g}"
+        if blurred > MAX_RRMSD:
+            text += f". The blur is too large for this picture: it changes it by an RRMSD of {blurred:.2g}"
         return f"{text}."
 
     def blurred(self, scene: Scene) -> float | None:
-        """RRMSD of the scene's picture blurred by the source's image alone; None: the source has no size."""
+        """Return the RRMSD of the scene's picture blurred by the source's image; None for a source without size."""
         from bstcad.optics.measure import even_image
         from bstcad.optics.outlines import Circle, Rectangle
 
@@ -141,8 +144,8 @@ class Plate:
         return even_image(image).deviation(scene.target.irradiance())
 
     def text(self, name: str, picture: Path | None = None, blurred: float | None = None) -> str:
-        """The scene file, with the picture of that path or else with letters."""
-        import jinja2  # which a list of the templates need not wait for
+        """Return the text of the scene file, with the picture at that path, or else with letters."""
+        import jinja2  # slow to load, and not needed for a list of the templates
 
         text = jinja2.Template(
             TEMPLATE.read_text(encoding="utf-8"), trim_blocks=True, keep_trailing_newline=True
@@ -151,9 +154,9 @@ class Plate:
             light=self.light,
             name=name,
             title=_quoted(f"{name}, for {self.light.of}"),
-            header=textwrap.wrap(self.light.header, WIDTH),
+            header=textwrap.wrap(self.light.header, COMMENT_WIDTH),
             picture=picture and _quoted(picture.as_posix()),
-            rrmsd=blurred and min(max(math.ceil(100 * OVER_BLUR * blurred) / 100, FEWEST_RRMSD), MOST_RRMSD),
+            rrmsd=blurred and min(max(math.ceil(100 * BLUR_MARGIN * blurred) / 100, MIN_RRMSD), MAX_RRMSD),
             blurred=blurred,
         )
         return "\n".join(map(_aligned, text.split("\n")))
@@ -164,40 +167,39 @@ class Written:
     """A new scene file."""
 
     path: Path
-    sentences: str = ""  # on the light and on the detail that it leaves; "" of a template
+    sentences: str = ""  # sentences on the light and the finest detail; "" for a template
 
 
 def new_scene(
     name: str, folder: Path, *, picture: Path | None = None, light: str | None = None, size: str | float | None = None,
     distance: str | float | None = None, template: str | None = None,
 ) -> Written:  # fmt: skip
-    """Write NAME.toml to `folder`, a commented scene that loads; never over another file.  SceneError.
+    """Write NAME.toml to `folder`, a commented scene that loads; an existing file is never replaced.  SceneError.
 
-    A plate of that size (mm; one number, "80x60", width by height, or in the picture's proportions "photo" or
-    "120xphoto"), a picture as large as the plate's shadow on a wall at that distance, by that light (LIGHTS); or a copy
-    of a template.  The path of the picture is relative to the
-    folder.
+    The scene is a plate with a picture as large as its shadow on the wall, or a copy of a template.  light: a name of
+    LIGHTS.  size: size of the plate, mm: one number, width by height "80x60", or with the proportions of the picture
+    "photo" or "120xphoto".  distance: distance of the wall, mm.  picture: path, relative to `folder`; None: letters.
     """
-    from bstcad.scene.picture import photo_size, read_picture, safe_name  # loads much, unlike a list of the templates
+    from bstcad.scene.picture import photo_size, read_picture, safe_name  # slow to load
 
     name = name.removesuffix(".toml")
     if not name or safe_name(name) != name:
-        raise SceneError(f"{name!r} is no name for a scene; give one of letters, digits, '-' and '_', such as my-lens")
+        raise SceneError(f"{name!r} cannot be the name of a scene; use letters, digits, '-' and '_', such as my-lens")
     path = folder / f"{name}.toml"
     if template is not None:
         if (picture, light, size, distance) != (None,) * 4:
-            given = "has a light, a picture and sizes of its own"
-            raise SceneError(f"--template {template}: {given}; give either it or them")
+            given = "a template has its own light, picture and sizes"
+            raise SceneError(f"--template {template}: {given}; remove --template, or the other options")
         _written(path, _template(template, name))
         return Written(path)
     if picture is not None:
         picture = Path(os.path.expanduser(picture))
         if not (folder / picture).exists():
             raise SceneError(f"--picture {picture}: not found; give the path of a picture file")
-        read_picture(folder / picture)  # before anything is written
+        read_picture(folder / picture)  # raises an error before a file is written
     if (longer := LIKE_THE_PHOTO.fullmatch(str(size))) is not None:
         if picture is None:
-            raise SceneError(f"--size {size}: there is no photo; give --picture FILE, or a size such as 80x60")
+            raise SceneError(f"--size {size}: needs a photo; give --picture FILE, or a size such as 80x60")
         [side] = _lengths("size", longer[1] or SIZE, "80", 1)
         size = in_proportions(side, photo_size(read_picture(folder / picture)))
     plate = Plate.of(light, size, distance)
@@ -205,8 +207,8 @@ def new_scene(
     if (blurred := plate.blurred(scene)) is not None:
         path.write_text(plate.text(name, picture, blurred), encoding="utf-8")
     *others, last = (name for name in LIGHTS if name != plate.light.name)
-    made = f"A plate for {plate.light.of}; --light {', '.join(others)} or {last} makes it for another light."
-    words = 'The picture is the word "Hello"; target.text in the file has it, --picture FILE another.'
+    made = f"The plate is for {plate.light.of}; --light {', '.join(others)} or {last} chooses another light."
+    words = 'The picture is the word "Hello"; change target.text in the file, or give --picture FILE.'
     of_picture = [words] if picture is None else scene.target.remarks()
     return Written(path, "\n".join([made, plate.expectation(blurred), *of_picture]))
 
@@ -217,14 +219,14 @@ def in_proportions(side: float, shown: tuple[int, int]) -> str:
     return f"{width:.4g}x{height:.4g}"
 
 
-def _lengths(name: str, given: str | float, such_as: str, most: int) -> list[float]:
-    """The lengths (mm) that an option gives, at most so many, with x between: 80 or "80x60"."""
+def _lengths(name: str, given: str | float, example: str, count: int) -> list[float]:
+    """Return the lengths (mm) of an option, at most `count`, separated by x: 80 or "80x60"."""
     try:
         found = [float(length) for length in re.split("[xX×]", str(given))]
     except ValueError:
         found = []
-    if not 0 < len(found) <= most:
-        raise SceneError(f"--{name} {given}: is no {name}; give mm, such as {such_as}")
+    if not 0 < len(found) <= count:
+        raise SceneError(f"--{name} {given}: is not a {name}; give mm, such as {example}")
     low, high = RANGES[name]
     for length in found:
         if not low <= length <= high:
@@ -233,28 +235,28 @@ def _lengths(name: str, given: str | float, such_as: str, most: int) -> list[flo
 
 
 def _aligned(line: str) -> str:
-    """A line with its comment in the column of comments, or two blanks behind what is longer."""
+    """Return a line with its comment in the column of comments, or two spaces behind a longer line."""
     keys, mark, comment = line.rpartition(" # ")
-    return f"{keys:{COLUMN - 2}}  # {comment}" if mark else line
+    return f"{keys:{COMMENT_COLUMN - 2}}  # {comment}" if mark else line
 
 
 def _quoted(text: str) -> str:
-    """As a TOML string, which JSON's is too."""
+    """Return a text as a TOML string, which has the syntax of JSON."""
     return json.dumps(text, ensure_ascii=False)
 
 
 def templates() -> dict[str, str]:
-    """The templates that come along, by name, with their titles."""
+    """Return the titles of the bundled templates by name."""
     paths = sorted((path for path in _folder().iterdir() if path.name.endswith(".toml")), key=lambda path: path.name)
     texts = {path.name.removesuffix(".toml"): path.read_text(encoding="utf-8") for path in paths}
     return {name: tomllib.loads(text)["title"] for name, text in texts.items()}
 
 
 def _template(template: str, name: str) -> str:
-    """A template's text, for a scene of another name."""
+    """Return the text of a template with another name of the scene."""
     known = list(templates())
     if template not in known:
-        raise SceneError(f"--template {template}: is none; {nearest(template, known, 'there are')}")
+        raise SceneError(f"--template {template}: is unknown; {nearest(template, known, 'the templates are')}")
     text = (_folder() / f"{template}.toml").read_text(encoding="utf-8")
     for before in (f"bstcad generate templates/{template}.toml", f'name = "{template}"', f"outputs/{template}"):
         text = text.replace(before, before.replace("templates/", "").replace(template, name))
@@ -262,20 +264,20 @@ def _template(template: str, name: str) -> str:
 
 
 def _folder() -> Traversable:
-    """In the package once that is installed, beside it in the source tree."""
+    """Return the folder of the templates: in an installed package, or beside it in the source tree."""
     package = resources.files("bstcad")
     return inside if (inside := package / "templates").is_dir() else package / ".." / "templates"
 
 
 def _written(path: Path, text: str) -> Scene:
-    """Put a scene where there is no file, if it loads."""
+    """Write a new file of a scene and load it; remove the file again if the scene does not load."""
     from bstcad.scene.scene import load
 
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
-        raise SceneError(f"{path}: is there already and stays as it is; give another name") from None
+        raise SceneError(f"{path}: the file exists already and is not changed; give another name") from None
     try:
         return load(path)
     except BaseException:

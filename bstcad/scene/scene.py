@@ -34,15 +34,15 @@ from bstcad.optics.rays import Status
 from bstcad.optics.sides import Sides, as_pair
 from bstcad.optics.wavefront import MAX_RAY_ANGLE, PlaneWave, SphericalWave, Wave, ZernikeWave
 from bstcad.runs import files
-from bstcad.scene import effects, elements, lighting, mount, picture, scene_file
+from bstcad.scene import effects, elements, lighting, mount, picture, quality, scene_file
 from bstcad.scene.blank import LensBlank, as_front, net_extent
 from bstcad.scene.dotted_keys import OUTLINES, override, tables_at
 from bstcad.scene.effects import Effects
-from bstcad.scene.elements import Around, Elements, Way
+from bstcad.scene.elements import Around, Elements, LightPath
 from bstcad.scene.errors import SceneError, about, explain, line_of, toml_positions
 from bstcad.scene.mount import Mount, Part
 from bstcad.scene.picture import Picture
-from bstcad.scene.quality import JUDGE_DRAW, JUDGE_POINTS, PRESETS, WHOLE, Tailoring, Tolerance, tolerance_complaints
+from bstcad.scene.quality import JUDGE_DRAW, JUDGE_POINTS, Tailoring, Tolerance
 from bstcad.scene.schema import FILE, FileContent, Record, contents, of_model
 from bstcad.scene.target import Target, Targets, coplanar
 
@@ -146,26 +146,26 @@ class Scene(Record):
         yield from lens.complaints()
         yield from lighting.complaints(source, lens)
         yield from effects.complaints(self.effects, lens)
-        yield from self.way.complaints()
+        yield from self.light_path.complaints()
         try:
             self.channels()
         except ValueError as error:  # no data of the material or the metal for an effect
             yield f"effects: {error}"
-        if not self.before:  # otherwise self.way.complaints checks the order
+        if not self.before:  # otherwise self.light_path.complaints checks the order
             yield from lighting.order(source, lens)
-        if not self.way.is_folded:
+        if not self.light_path.is_folded:
             yield from self._of_targets(lambda target: target.behind(lens))
         if not self.before:
             yield from lighting.unlit(source.central, lens, self.rim)
-        if not self.way.is_folded:
+        if not self.light_path.is_folded:
             yield from self._of_targets(lambda target: target.unfaced(lens))
         yield from coplanar(self.targets)
-        if self.wavefront is not None and self.way.is_folded:
+        if self.wavefront is not None and self.light_path.is_folded:
             yield "wavefront: cannot be set with a mirror in [[behind]], which turns the wave; remove one of the two"
         yield from _wavefront_complaints(self.wavefront, source, lens, accept=self.accept)
         yield from self.tailoring.complaints(lens)
         yield from _method_complaints(self)
-        yield from tolerance_complaints(self.tolerance)
+        yield from quality.tolerance_complaints(self.tolerance)
         yield from _mesh_complaints(self.output.mesh_tolerance, lens)
         yield from self.part.complaints(lens)
         if self.mount is not None:
@@ -186,7 +186,7 @@ class Scene(Record):
         if self.source.parallel:
             key = "mount.rim" if self.mount and self.mount.rim else "lens.outline"
             doubts += lighting.doubts(self.source, self.rim, key)
-        elif not self.way.is_folded:
+        elif not self.light_path.is_folded:
             doubts += self._of_targets(lambda target: target.grazed(self.lens))
         return (*doubts, *self.picture_remarks())
 
@@ -261,10 +261,10 @@ class Scene(Record):
         return SEARCH_RANGE * lowest, SEARCH_RANGE * (lens.back.z - lens.front.z - lens.min_thickness)
 
     @property
-    def way(self) -> Way:
+    def light_path(self) -> LightPath:
         """The path of the light through the scene."""
         targets = dict(zip(self.target_keys, self.targets, strict=True))
-        return Way(self.source, self.before, self.lens, behind=self.behind, targets=targets)
+        return LightPath(self.source, self.before, self.lens, behind=self.behind, targets=targets)
 
     @property
     def elements(self) -> tuple[tuple[str, Elements], ...]:
@@ -275,7 +275,7 @@ class Scene(Record):
         """Return the interfaces before and behind the lens at a wavelength (nm); None if there are none."""
         if not (self.before or self.behind):
             return None
-        met = elements.interfaces(self.before, self.way.sense, wavelength)
+        met = elements.interfaces(self.before, self.light_path.sense, wavelength)
         before = tuple(replace(interface, status_if_missed=Status.MISSED_FRONT) for interface in met)
         return before, elements.interfaces(self.behind, 1, wavelength)
 
@@ -285,7 +285,7 @@ class Scene(Record):
         The gap is negative if the part cuts the lens.
         """
         room = [(elements.lowest(self.behind) - highest, "behind[0].z")] if self.behind else []
-        if not self.way.is_folded:
+        if not self.light_path.is_folded:
             for target, key in zip(self.targets, self.target_keys, strict=True):
                 room.append((target.clearance(self.lens, highest), f"{key}.z"))
         return min(room)
@@ -439,8 +439,8 @@ def _wavefront_complaints(wave: Wave | None, source: Emitter, lens: LensBlank, a
 def _method_complaints(scene: Scene) -> Iterator[str]:
     """Complain of a method for one picture in a scene of several goals."""
     goals = len(scene.targets) + (scene.wavefront is not None)
-    method = scene.tailoring.method or PRESETS[scene.tailoring.quality]["method"]
-    who, key = WHOLE.get(method, ("", ""))
+    method = scene.tailoring.method or quality.PRESETS[scene.tailoring.quality]["method"]
+    who, key = quality.BASELINES.get(method, ("", ""))
     if who and goals > 1:
         yield f"{key}: {who} works for one picture, and the scene has {goals} goals; choose another {key}"
 

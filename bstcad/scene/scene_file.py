@@ -1,4 +1,4 @@
-"""The file of a scene as it stands there: its text, and its tables as TOML has them, before anything is checked."""
+"""Reading of a scene file: its text, and its TOML tables before they are checked."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from typing import Any
 from bstcad.runs import files
 from bstcad.scene.errors import SceneError
 
-LARGEST_FILE = 1_000_000  # bytes of a scene file
-DOTS = 100  # in a line of one: tomllib takes the square of a dotted key's length to read it
-DEEPEST = 20  # tables and lists in one another; a scene has four
+MAX_FILE_SIZE = 1_000_000  # bytes of a scene file
+MAX_DOTS = 100  # dots in a line; the time of tomllib grows with the square of a dotted key's length
+MAX_DEPTH = 20  # levels of nested tables and lists; a scene has four
 NESTED = "is nested too deeply; give a scene file like those in templates"
 
 
 def read(path: Path) -> tuple[str, dict[str, Any]]:
-    """The text and the tables of a scene file."""
+    """Read the text and the tables of a scene file; SceneError if it is none."""
     if os.path.isdir(path):
         inside = min(path.glob("*.toml"), default=path / "scene.toml")
         raise SceneError(f"{path}: is a folder; give a scene file, such as {inside}")
     if not os.path.isfile(path):
         raise SceneError(f"{path}: no such scene file; give the path of a TOML file, such as templates/thu.toml")
     try:
-        text = files.contents(path, LARGEST_FILE).decode("utf-8-sig")
+        text = files.contents(path, MAX_FILE_SIZE).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise SceneError(f"{path}: is not UTF-8 text; give a TOML file") from None
     except ValueError as error:
@@ -34,9 +34,9 @@ def read(path: Path) -> tuple[str, dict[str, Any]]:
 
 
 def tables(text: str, path: Path) -> dict[str, Any]:
-    """The tables of a scene file's text; path: by which sentences call it."""
+    """Parse the text of a scene file; path: its name in messages."""
     if too_dotted(text):
-        raise SceneError(f"{path}: has a line of over {DOTS} dots, which is no scene file; shorten that line")
+        raise SceneError(f"{path}: a line has more than {MAX_DOTS} dots; shorten that line")
     try:
         return tomllib.loads(text)
     except RecursionError:
@@ -44,25 +44,25 @@ def tables(text: str, path: Path) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as error:
         raise SceneError(f"{path}: not valid TOML: {_fault(text, str(error))}") from None
     except ValueError:
-        raise SceneError(f"{path}: has a number of too many digits; shorten it") from None
+        raise SceneError(f"{path}: a number has too many digits; shorten it") from None
 
 
 def _fault(text: str, fault: str) -> str:
-    """A fault of tomllib, "Expected ']' (at line 3, column 5)", with its line and a remedy."""
+    """Return a fault of tomllib, "Expected ']' (at line 3, column 5)", with its line and a remedy."""
     lines = text.split("\n")
     fault = fault.replace("at end of document", f"at line {len(lines)}, column {len(lines[-1]) + 1}")
     line = lines[int(re.search(r"at line (\d+)", fault)[1]) - 1]
-    remedy = "write paths with / or in single quotes" if "\\" in line else "mend that line"
+    remedy = "write paths with / or in single quotes" if "\\" in line else "correct that line"
     return f"{fault[:1].lower()}{fault[1:]}; {remedy}"
 
 
 def too_dotted(text: str) -> bool:
-    """Has a line that is no comment more than DOTS dots, so that reading it could take hours?"""
-    return any(line.count(".") > DOTS for line in text.split("\n") if not line.lstrip().startswith("#"))
+    """True if a line, not a comment, has more than MAX_DOTS dots, so that parsing could take hours."""
+    return any(line.count(".") > MAX_DOTS for line in text.split("\n") if not line.lstrip().startswith("#"))
 
 
 def toml_value(text: str) -> Any:
-    """An override as TOML has it, or else as a text."""
+    """Return the TOML value of an override, or its text if it is no TOML value."""
     try:
         table = {} if too_dotted(text) else tomllib.loads(f"value = {text}")
     except (ValueError, RecursionError):
@@ -71,8 +71,8 @@ def toml_value(text: str) -> Any:
 
 
 def check_plain(data: Any, key: str = "", depth: int = 0) -> None:
-    """SceneError for values that JSON does not have: dates, infinity, NaN, half characters."""
-    if depth > DEEPEST:
+    """Raise SceneError for values that JSON does not have: dates, infinity, NaN, lone surrogates."""
+    if depth > MAX_DEPTH:
         raise RecursionError
     if isinstance(data, dict | list):
         for name, value in data.items() if isinstance(data, dict) else enumerate(data):
@@ -80,9 +80,9 @@ def check_plain(data: Any, key: str = "", depth: int = 0) -> None:
             check_plain(name, where, depth + 1)
             check_plain(value, where, depth + 1)
     elif isinstance(data, int | float) and not abs(data) < 1e300:  # also NaN
-        shown = data if isinstance(data, float) else "a number of over 300 digits"  # too many may not be written out
-        raise SceneError(f"{key}: {shown} is not a finite number; give one")
+        shown = data if isinstance(data, float) else "a number of over 300 digits"  # too long to print
+        raise SceneError(f"{key}: {shown} is not a finite number; give a finite number")
     elif isinstance(data, str) and not data.isascii() and any("\ud800" <= c <= "\udfff" for c in data):
-        raise SceneError(f"{key}: holds half a character; write the text again in UTF-8")
+        raise SceneError(f"{key}: the text has an incomplete character; write it again in UTF-8")
     elif not isinstance(data, str | int | float):
         raise SceneError(f"{key}: {data} is a date or a time; give a number or a text")

@@ -1,7 +1,7 @@
-"""The records of a scene, and their JSON schema for editors, error sentences and `bstcad keys`.
+"""The base of a scene's records, and their JSON schema for editors, messages and `bstcad keys`.
 
-The tables are the engine's own records and load torch, which takes seconds; so the schema made of them is kept in
-schema.json (`python -m bstcad.scene.scene`), and a test holds that the two agree.
+The records load torch, which takes seconds.  So their schema is stored in schema.json, which
+`python -m bstcad.scene.scene` writes; a test checks that it agrees with the records.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from pydantic.json_schema import GenerateJsonSchema
 from bstcad.runs import files
 
 FILE = Path(__file__).with_name("schema.json")
-TAGS = ("kind", "shape")  # keys whose value tells which record of a union a table is
-ESCAPES = "\0\a\b\f\n\r\t\v\x1b"  # that "C:\new\ten.png" holds once it is read as TOML
-LENGTHS, COORDINATES = (1e-3, 1e6), (-1e8, 1e8)  # mm
+TAGS = ("kind", "shape")  # keys whose value selects the record of a union
+ESCAPES = "\0\a\b\f\n\r\t\v\x1b"  # characters that TOML makes of backslashes, as in "C:\new\ten.png"
+LENGTHS, COORDINATES = (1e-3, 1e6), (-1e8, 1e8)  # ranges of lengths and of coordinates, mm
 
 Node = Mapping[str, Any]
-# A number, or one along x and one along y; told apart by their form, so that a sentence speaks of the form meant.
+# A number, or a pair of numbers along x and along y; the tags make messages speak of the form that was given.
 OneOrTwo = Annotated[
     Annotated[int, Tag("number")] | Annotated[tuple[int, int], Tag("pair")],
     Discriminator(lambda given: "pair" if isinstance(given, list | tuple) else "number"),
@@ -44,33 +44,33 @@ OneOrTwo = Annotated[
 
 
 class Record(BaseModel):
-    """A table of a scene: frozen, with no other keys than its own and no numbers that are not finite.
+    """A table of a scene: frozen, without unknown keys, with finite numbers only.
 
-    A field states its type and, by its `Key`, its range; `complaints`, where a table has them, state the rest.
+    A field has a type and a `Key`, which states its range; a method `complaints` checks the rest.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class FileContent:
-    """The content of a file that a scene names; the scene keeps it whole, so that a design can be repeated."""
+    """The content of a file that a scene names; the scene holds all of it, so that a design can be repeated."""
 
-    name: str  # file name of its copy beside a design
+    name: str  # file name of the copy beside a design
     data: bytes  # content; a subclass that is a dataclass leaves it out of its repr
 
     @property
     def copy(self) -> bytes:
-        """The bytes of the copy."""
+        """Content of the copy."""
         return self.data
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the content and of the record's other fields."""
+        """SHA-256 of the content and the other fields."""
         return hashlib.sha256(repr(self).encode() + self.data).hexdigest()
 
 
 def contents(value: Any, key: str = "") -> Iterator[tuple[str, FileContent]]:
-    """Yield the contents of all files that a value of a scene names, a record or a tuple, by their dotted keys."""
+    """Yield (dotted key, content) of all files that a value of a scene names, a record or a tuple."""
     if isinstance(value, FileContent):
         yield key, value
         return
@@ -86,17 +86,17 @@ def contents(value: Any, key: str = "") -> Iterator[tuple[str, FileContent]]:
 
 
 def from_file(kind: type[FileContent], read: Callable[[Path], FileContent], example: str) -> Any:
-    """The type of a field that a file names by its path and that holds the file's content, a `kind`.
+    """Return the type of a field that is written as a path and holds the content of the file, a `kind`.
 
-    A path is relative to the scene file, or to the user's home.  Where the context of a validation has `bounds`,
-    folders, a path into them must not lead out of them by links.
+    A path is relative to the scene file, or to the user's home.  If the context of a validation has `bounds`, folders,
+    a path into one of them must not lead out of them by links.
     """
 
     def content(given: Any, info: ValidationInfo) -> Any:
         if isinstance(given, kind):
             return given
         if not isinstance(given, str | Path):
-            raise ValueError(f"{given!r} is no file name; write for example {example}")
+            raise ValueError(f"{given!r} is not a file name; write for example {example}")
         context = info.context or {}
         if given in (known := context.get("contents", {})):
             return known[given]
@@ -105,7 +105,7 @@ def from_file(kind: type[FileContent], read: Callable[[Path], FileContent], exam
         if os.path.lexists(folder / given):
             return read(folder / given)
         if any(c in ESCAPES for c in str(given)):
-            raise ValueError(f"{given!r} holds an escape such as \\n; write paths with / or in single quotes")
+            raise ValueError(f"{given!r} has an escape such as \\n; write paths with / or in single quotes")
         return read(folder / os.path.expanduser(given))
 
     return Annotated[
@@ -117,7 +117,7 @@ def from_file(kind: type[FileContent], read: Callable[[Path], FileContent], exam
 
 
 def _check_links(path: Path, bounds: Sequence[Path]) -> None:
-    """ValueError if a path into one of these folders, or the archive of a design there, leads out of all of them."""
+    """Raise ValueError if a path into one of these folders, or the archive of a design there, leads out of them."""
     for each in (path, path / "design.npz") if bounds else ():
         plain = Path(os.path.abspath(each))
         if any(plain.is_relative_to(folder) for folder in bounds) or each.resolve() != plain.resolve():
@@ -128,7 +128,7 @@ def _check_links(path: Path, bounds: Sequence[Path]) -> None:
 
 
 def leaving_out(**defaults: Any) -> Any:
-    """The way a record is written, without the keys that have these values: files from before such a key stay as is."""
+    """Return a serializer that omits keys with these values, so that older files are written without change."""
 
     def written(self: Any, handler: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
         found = handler(self)
@@ -137,11 +137,11 @@ def leaving_out(**defaults: Any) -> Any:
     return model_serializer(mode="wrap")(written)
 
 
-# ---- the schema that the records make --------------------------------------------------------------------------------
+# ---- the schema of the records ---------------------------------------------------------------------------------------
 
 
 class _Tables(GenerateJsonSchema):
-    """As TOML has tables: without null; and the key that tells a record from the others of a union is required."""
+    """JSON schema of TOML tables: without null, and the tag of a union is required."""
 
     def nullable_schema(self, schema: Any) -> dict[str, Any]:
         return self.generate_inner(schema["schema"])
@@ -155,7 +155,7 @@ class _Tables(GenerateJsonSchema):
 
 
 def of_model(model: type[BaseModel]) -> dict[str, Any]:
-    """The JSON schema that the record of a whole scene makes."""
+    """Return the JSON schema of the record of a scene."""
     made = model.model_json_schema(schema_generator=_Tables)
     tables = made["$defs"]
     for union in _nodes(made):
@@ -167,7 +167,7 @@ def of_model(model: type[BaseModel]) -> dict[str, Any]:
                 table["required"] = sorted({*table.get("required", ()), name})
         if isinstance(union.get("default"), dict):
             del union["default"]
-    circle = tables["Circle"]  # of which a file may give the diameter (scene.py)
+    circle = tables["Circle"]  # a file may give its diameter, which scene.py converts
     circle["properties"]["diameter"] = circle["properties"]["radius"] | {
         "description": "Diameter, in place of radius.",
         "examples": [24.0],
@@ -180,22 +180,22 @@ def of_model(model: type[BaseModel]) -> dict[str, Any]:
 
 
 def _nodes(node: Any) -> list[dict[str, Any]]:
-    """All tables of a JSON value."""
+    """Return all tables of a JSON value."""
     parts = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
     return [node] * isinstance(node, dict) + [inner for part in parts for inner in _nodes(part)]
 
 
-# ---- the schema as it is kept ----------------------------------------------------------------------------------------
+# ---- the stored schema -----------------------------------------------------------------------------------------------
 
 
 @functools.cache
 def schema() -> Node:
-    """The JSON schema as it is kept."""
+    """Read the stored JSON schema."""
     return json.loads(FILE.read_text(encoding="utf-8"))
 
 
 def records(node: Node) -> list[Node]:
-    """The tables that may stand at a node, by themselves or in a list; each once."""
+    """Return the tables that are possible at a node, alone or in a list; each once."""
     if "$ref" in node:
         return records(schema()["$defs"][node["$ref"].rpartition("/")[2]])
     if "properties" in node:
@@ -207,7 +207,7 @@ def records(node: Node) -> list[Node]:
 
 
 def tags(record: Node) -> dict[str, Any]:
-    """The key and the value that tell this table from others of a union: {"kind": "plane"}."""
+    """Return the tag of a table in a union: {"kind": "plane"}."""
     keys = record["properties"]
     return {name: keys[name]["const"] for name in TAGS if "const" in keys.get(name, ())}
 
@@ -221,30 +221,30 @@ def _parts(node: Node) -> list[Node]:
 class Row:
     """A key as `bstcad keys` prints it."""
 
-    key: str  # dotted; of a list of tables with [] behind
+    key: str  # dotted key, with [] behind a list of tables
     unit: str
     range: str
     default: str
     meaning: str
-    kinds: tuple[str, ...] = ()  # of the table that has the key; (): of every kind
-    example: Any = field(default=None, compare=False)  # None: the key's record has none
+    kinds: tuple[str, ...] = ()  # kinds of table that have the key; (): all
+    example: Any = field(default=None, compare=False)  # None: no example
 
 
 def rows(record: Node | None = None, table: str = "") -> list[Row]:
-    """The keys of a table and of the tables in it, in the models' order."""
+    """Return the keys of a table and of the tables in it, in the order of the records."""
     record, found = record or schema(), []
     for name, node in record["properties"].items():
         inner, key = records(node), f"{table}.{name}".lstrip(".")
         if inner and node.get("type") == "array":
             key += "[]"
-        told = {"meaning": node["description"], "default": _default(record, name)}
-        found.append(Row(key, node["unit"], span(node), **told, example=next(iter(node.get("examples", ())), None)))
+        texts = {"meaning": node["description"], "default": _default(record, name)}
+        found.append(Row(key, node["unit"], span(node), **texts, example=next(iter(node.get("examples", ())), None)))
         found += _union(inner, key)
     return found
 
 
 def _union(union: list[Node], table: str) -> list[Row]:
-    """The keys of the tables that may stand at a key, each once, and the kinds of table that have it."""
+    """Return the keys of the tables that are possible at a key, each once, with the kinds of table that have it."""
     if len(union) < 2:
         return [row for record in union for row in rows(record, table)]
     [name] = tags(union[0])
@@ -256,14 +256,14 @@ def _union(union: list[Node], table: str) -> list[Row]:
     for kind, record in zip(kinds, union, strict=True):
         for row in rows(record, table):
             found.setdefault(row, []).append(kind)
-    told = {"default": "required", "meaning": " ".join(meanings), "example": kinds[0]}
-    tag = Row(f"{table}.{name}", "none", " | ".join(kinds), **told)
+    texts = {"default": "required", "meaning": " ".join(meanings), "example": kinds[0]}
+    tag = Row(f"{table}.{name}", "none", " | ".join(kinds), **texts)
     others = (row if of == kinds or row.kinds else replace(row, kinds=tuple(of)) for row, of in found.items())
     return [tag, *(row for row in others if row.key != tag.key)]
 
 
 def span(node: Node) -> str:
-    """The values that a key may have, in words."""
+    """Return the range or the choices of a key, in words."""
     if "const" in node or "enum" in node:
         return " | ".join(json.dumps(value).strip('"') for value in node.get("enum", [node.get("const")]))
     if records(node):
@@ -285,7 +285,7 @@ def _default(record: Node, name: str) -> str:
 
 
 def toml(value: Any) -> str:
-    """A value as a scene file has it, in one line."""
+    """Return a value as a scene file has it, in one line."""
     if isinstance(value, dict):
         return f"{{ {', '.join(f'{key} = {toml(part)}' for key, part in value.items())} }}"
     return f"[{', '.join(map(toml, value))}]" if isinstance(value, list | tuple) else json.dumps(value)

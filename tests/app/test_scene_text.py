@@ -150,8 +150,8 @@ PLACED = [
     ("disk", "wavefront.kind", "plane", 'none outside\n\n[wavefront]\nkind = "plane"\nz = 500.0\n\n[tailoring]'),
     ("flange", "mount.flange.draft", 2.0, "adds others\ndraft = 2.0                     # degrees, of its outer"),
     ("flange", "mount.flange.holes", [[1.0, 2.0, 3.0]], "adds others\nholes = [[1.0, 2.0, 3.0]]\ndraft"),
-    ("led", "effects[1]", {"kind": "ghost"}, 'at a slant\n\n[[effects]]\nkind = "ghost"\n\n[accept]'),
-    ("disk", "effects[0].kind", "ghost", 'less error\n\n[[effects]]\nkind = "ghost"\n\n[accept]'),
+    ("led", "effects[1]", {"kind": "ghost"}, 'of incidence\n\n[[effects]]\nkind = "ghost"\n\n[accept]'),
+    ("disk", "effects[0].kind", "ghost", 'smaller error\n\n[[effects]]\nkind = "ghost"\n\n[accept]'),
     ("disk", "mount.flange", {"outline": {"shape": "circle"}, "z": 1.0},
      'irradiance\n\n[mount]\n\n[mount.flange]\noutline = { shape = "circle" }\nz = 1.0\n'),
     ("mirror", "effects", [{"kind": "ghost"}, {}], 'error\n\n[[effects]]\nkind = "ghost"\n\n[[effects]]\n\n[accept]'),
@@ -227,7 +227,7 @@ def test_an_empty_text_becomes_one_and_a_broken_one_is_told():
     text = changed(changed(changed("", "target.z", 5.0), "source.kind", "point"), "name", "lens")
     assert text == 'name = "lens"\n\n[source]\nkind = "point"\n\n[target]\nz = 5.0\n'
     for wrong in ("a = = 1", "[" * 5000, "a = 1\na = 2"):
-        with pytest.raises(SceneError, match="the text: not valid TOML: .*; mend that line"):
+        with pytest.raises(SceneError, match="the text: not valid TOML: .*; correct that line"):
             changed(wrong, "name", "x")
 
 

@@ -183,7 +183,7 @@ def test_a_save_that_fails_loses_nothing(own, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "text", ["#" * (scene_file.LARGEST_FILE + 1), "µ" * (scene_file.LARGEST_FILE // 2 + 1), "title = '\ud800'"]
+    "text", ["#" * (scene_file.MAX_FILE_SIZE + 1), "µ" * (scene_file.MAX_FILE_SIZE // 2 + 1), "title = '\ud800'"]
 )
 def test_what_no_scene_file_can_hold_is_not_taken(own, text):
     with pytest.raises(SceneError, match="^small: "):
@@ -365,7 +365,7 @@ def test_a_new_scene_of_each_light_shows_what_is_given(own, light, what):
     assert "# the wall, " in own.opened(name).text  # its comments stay
     blurred = new_scene.Plate.of(light).blurred(scene)
     if blurred is not None:  # what the source's size leaves of this very picture
-        assert blurred < scene.accept.rrmsd or scene.accept.rrmsd == new_scene.MOST_RRMSD
+        assert blurred < scene.accept.rrmsd or scene.accept.rrmsd == new_scene.MAX_RRMSD
         assert "blurred by the source, and a little more" in own.opened(name).text
 
 

@@ -112,6 +112,6 @@ def test_a_picture_without_light_is_refused_before_any_work(tmp_path):
     """All black; and black wherever the target's outline lets light through."""
     steps = []
     for picture in (cells(), cells((0, 0, 65535), (63, 63, 65535))):
-        with pytest.raises(SceneError, match="target.image: the picture is all black; give one"):
+        with pytest.raises(SceneError, match="target.image: the picture is black"):
             pipeline.design(scene_of(picture, tmp_path), device="cpu", progress=lambda *step: steps.append(step))
     assert steps == []

@@ -115,9 +115,9 @@ def test_it_is_said_which_curve_was_taken_where_that_changes_the_light():
     off = np.linalg.norm(from_srgb(RAMP / 255) * RAMP.mean() / from_srgb(RAMP / 255).mean() - RAMP)
     assert remark.startswith("target.image: the file has 16 bits or more and no colour tag: its numbers are")
     other = off * from_srgb(RAMP / 255).mean() / RAMP.mean() / np.linalg.norm(from_srgb(RAMP / 255))
-    assert f"(an RRMSD of {other:.2g} apart)" in remark
+    assert f"(RRMSD between the two: {other:.2g})" in remark
     [remark] = drawn(saved((RAMP / 255).astype(np.float32), "TIFF"), name="p.tif").remarks
-    assert "the file has floats and no colour tag: they are taken as light; gamma = 2.2" in remark
+    assert "the file has floats and no colour tag: they are taken as irradiance; gamma = 2.2" in remark
     stated = with_chunk(png(deep), b"sRGB", b"\0"), png(deep, (b"gAMA", struct.pack(">I", 100_000))), saved(RAMP)
     white = png(np.where(RAMP > 99, 65535, 0).astype(np.uint16)[..., None])  # black and white are alike by both
     for silent in (*stated, white, picture.from_array(RAMP / 255)):
@@ -150,7 +150,7 @@ def test_a_png_says_what_its_numbers_mean(what, deep):
 
 def test_hdr_numbers_are_refused_unless_gamma_is_given():
     data = with_chunk(saved(RAMP), b"cICP", bytes([9, 16, 0, 1]))
-    with pytest.raises(SceneError, match="HDR picture .*; save it in sRGB, or give target.gamma"):
+    with pytest.raises(SceneError, match="HDR picture .*; save it in sRGB"):
         light(data)
     assert light(data, gamma=1.0).max() == 1.0
 
@@ -255,7 +255,7 @@ def test_the_first_of_several_pictures_is_taken_and_that_is_said(tmp_path, kind)
     found = read_picture(path)
     assert found.name == f"shape{SEVERAL[kind]}"
     np.testing.assert_array_equal(light(found, 32) > 0.4, SHAPE > 0)
-    assert drawn(found, 32).remarks == ("target.image: the file holds several pictures; the first is taken",)
+    assert drawn(found, 32).remarks == ("target.image: the file has several pictures; the first one is used",)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -322,7 +322,7 @@ def test_a_black_logo_on_transparency_is_light_and_says_so(mode, colour):
     data = saved(logo(colour, mode=mode))
     found = drawn(data)
     np.testing.assert_array_equal(found.light, INK)
-    assert len(found.remarks) == 1 and "what is opaque is taken as light" in found.remarks[0]
+    assert len(found.remarks) == 1 and "opaque parts are taken as light" in found.remarks[0]
     np.testing.assert_array_equal(light(data, invert=True), ~INK)
 
 

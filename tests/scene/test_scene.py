@@ -105,7 +105,7 @@ def test_a_picture_travels_with_its_scene(photo, tmp_path):
     assert scene.target.image.name == "My-photo.png"
     assert through_its_file(scene, tmp_path / "elsewhere") == scene
     Image.new("RGB", (9, 9)).save(photo.parent / "My photo.png")
-    with pytest.raises(SceneError, match="target.image: the picture is all black"):
+    with pytest.raises(SceneError, match="target.image: the picture is black"):
         load(photo)
 
 
@@ -136,7 +136,7 @@ def test_a_path_with_backslashes_is_told_how_to_be_written(photo, path):
     with pytest.raises(SceneError, match=r"target\.image: .*me\.png' not found"):
         load(photo)
     photo.write_text(THU.read_text().replace('text = "THU"', r'image = "C:\new\ten.png"'))
-    with pytest.raises(SceneError, match=r"target\.image: .* holds an escape such as \\n; write paths with /"):
+    with pytest.raises(SceneError, match=r"target\.image: .* has an escape such as \\n; write paths with /"):
         load(photo)
 
 
@@ -252,13 +252,13 @@ def test_none_takes_a_key_out(thu):
     ({"target.z": float("nan")}, r"^target\.z: nan is not a finite number"),
     ({"target.z": object()}, r"^target\.z: a value of type object is not possible"),
     ({"target.x.y": 3}, r"^target\.x\.y: x is not a table"),
-    ({"a..b": 3}, r"^a\.\.b: is no dotted key; write one such as lens\.back"),
-    ({"target.image": [[0.0, 1.0]]}, r"^target\.image: .* is no file name"),
+    ({"a..b": 3}, r"^a\.\.b: is not a dotted key"),
+    ({"target.image": [[0.0, 1.0]]}, r"^target\.image: .* is not a file name"),
     ({"target.image": np.ones((4, 4, 3))}, r"shape \(4, 4, 3\) is no picture; give one of shape \(rows, columns\)"),
-    ({"target.image": np.ones((1, 70_000))}, "more than 64 million values or than 65535 along a side"),
+    ({"target.image": np.ones((1, 70_000))}, "more than 64 million values"),
     ({"target.image": np.array([[1.0, np.nan]])}, "the array has values that are not finite"),
     ({"target.image": np.array([[1.0, -1e-9]])}, "the array has negative values"),
-    ({"target.image": np.zeros((4, 4))}, "the array is all zero"),
+    ({"target.image": np.zeros((4, 4))}, "the array is zero"),
     ({"target.image": np.array([["a", "b"]])}, "an array of <U1 is no picture"),
 ])  # fmt: skip
 def test_a_wrong_change_is_one_sentence(thu, changes, sentence):
@@ -323,7 +323,7 @@ def test_a_scene_may_be_made_of_its_nouns():
 @pytest.mark.parametrize(("changes", "sentence"), [
     ({"source.aperture.radius": "13"}, "source.aperture: the beam is wider than the lens"),
     ({"source.aperture.radius": "10.5"}, "source.aperture: the beam is 21 mm wide along x and the lens 24 mm; the "
-     "lens stays unlit beyond x = -10.5 and 10.5"),
+     "lens is dark outside x = -10.5 to 10.5"),
     ({"source.aperture.radius": "11.5"}, None),
     ({"target.x": "[0.0, 0.4]", "target.y": "[0.0, 0.4]"}, "target.x: 0.4 mm wide; are these metres?"),
     ({"target.z": "25", "lens.front.z": "-12", "lens.back.z": "0"}, None),

@@ -111,22 +111,22 @@ def test_a_target_is_replaced_added_and_taken_out(three):
 
 
 @pytest.mark.parametrize(("changes", "sentence"), [
-    ({"target.pixels": 16}, r"target.pixels: there are 3 \[\[target\]\] tables; say which, such as target\[0\].pixels"),
-    ({"target[3].z": 16}, r"target\[3\].z: there is no target\[3\], the last of them is target\[2\]; count from 0"),
-    ({"target[3]": None}, r"target\[3\]: there is no target\[3\], the last"),
-    ({"tolerance[0].limit": 1.0}, r"tolerance\[0\].limit: there is no tolerance\[0\], there is none of them"),
-    ({"target[x].z": 16}, r"target\[x\].z: is no dotted key; write one"),
+    ({"target.pixels": 16}, r"target.pixels: there are 3 \[\[target\]\] tables; write the number"),
+    ({"target[3].z": 16}, r"target\[3\].z: there is no target\[3\], as the last one is target\[2\]; count from 0"),
+    ({"target[3]": None}, r"target\[3\]: there is no target\[3\], as the last"),
+    ({"tolerance[0].limit": 1.0}, r"tolerance\[0\].limit: there is no tolerance\[0\], as the list is empty"),
+    ({"target[x].z": 16}, r"target\[x\].z: is not a dotted key"),
     ({"target[1].z": 1e9}, r"target\[1\].z: 1e\+09 mm is not between"),
     ({"target[2].pixel": 16}, r"target\[2\].pixel: unknown key; did you mean 'pixels'"),
     ({"target[0].weight": 0.0}, r"target\[0\].weight: 0 is not between 1e-06 and 1000000"),
-    ({"target[1].uniform": None}, r"target\[1\]: needs exactly one of text, image, sample, uniform, profile, but has"),
+    ({"target[1].uniform": None}, r"target\[1\]: needs exactly one of text, image, sample, uniform, profile, and has"),
     ({"target[1].outline.radius": 50.0}, r"target\[1\].outline: is larger than the target along x"),
     ({"target[1].z": 20.0, "target[1].tilt": None}, r"target\[1\].z: the target at z = 20 is not behind the lens"),
-    ({"target[1].tilt": [0.0, 88.0]}, r"target\[1\].tilt: an edge of the target comes down|.*cuts into the lens"),
-    ({"target[2].z": 100.0}, r"target\[2\].z: lies in the plane of target\[0\]; move one of them along z"),
-    ({"target[2].z": 200.0, "target[2].tilt": [0.0, 20.0]}, r"target\[2\].z: lies in the plane of target\[1\]"),
-    ({"target[1].image": np.zeros((4, 4))}, r"target\[1\].image: the array is all zero"),
-    ({"target": []}, "target: 0 values where at least 1 belong; add some"),
+    ({"target[1].tilt": [0.0, 88.0]}, r"target\[1\].tilt: an edge of the target|.*cuts the lens"),
+    ({"target[2].z": 100.0}, r"target\[2\].z: the target is in the plane of target\[0\]; move one of them along z"),
+    ({"target[2].z": 200.0, "target[2].tilt": [0.0, 20.0]}, r"target\[2\].z: .* in the plane of target\[1\]"),
+    ({"target[1].image": np.zeros((4, 4))}, r"target\[1\].image: the array is zero"),
+    ({"target": []}, "target: has 0 values"),
     ({"target": [3, 4]}, r"target\[0\]: 3 is not a table"),
 ], ids=str)  # fmt: skip
 def test_a_fault_is_told_of_the_target_that_has_it(three, changes, sentence):
@@ -138,13 +138,13 @@ def test_a_fault_is_told_of_the_target_that_has_it(three, changes, sentence):
 def test_more_targets_than_are_served_are_refused(three):
     many = [three.target.model_copy(update={"z": 100.0 + 10 * k}) for k in range(9)]
     assert len(three.changed({"target": many[:8]}).targets) == 8
-    with pytest.raises(SceneError, match="^target: 9 values where 8 belong; remove the rest"):
+    with pytest.raises(SceneError, match="^target: has 9 values"):
         three.changed({"target": many})
 
 
 def test_warnings_and_remarks_name_their_target(three):
     scene = three.changed({"target[1].sample": "camera"})
-    assert [w for w in scene.warnings() if "fit" in w][0].startswith("target[1].fit: the picture is 512 x 512, the tar")
+    assert [w for w in scene.warnings() if "fit" in w][0].startswith("target[1].fit: ")
     scene = three.changed({"target[0].x": [-0.1, 0.1], "target[0].y": [-0.1, 0.1]})
     assert any(w.startswith("target[0].x: 0.2 mm wide; are these metres?") for w in scene.warnings())
     [compromise] = three.warnings()

@@ -89,13 +89,13 @@ def test_a_given_net_may_be_where_tailoring_starts(disk, tmp_path):
      "lens.front.control_points: 5 is too few for a round lens"),
     (DISK, {"lens.back.optimise": False, "lens.front": {"kind": "sphere", "z": 15.0, "optimise": True}},
      "lens.back.optimise: false leaves no face to tailor"),
-    (MIRROR, {"lens.front": FLAT | {"z": 0.0}}, "lens.front.optimise: the front of a mirror is the rear of its plate"),
+    (MIRROR, {"lens.front": FLAT | {"z": 0.0}}, "lens.front.optimise: no light meets the front of a mirror"),
     (MIRROR, {"lens.back.optimise": False}, "lens.back.optimise: false leaves no face to tailor"),
     (MIRROR, {"lens.front": FLAT | {"reflect": True}, "lens.material": "PMMA"}, "lens.front.reflect: no light"),
     (DISK, {"lens.front": FLAT | {"optimise": False, "reflect": True}}, "lens.front.reflect: the face that reflects"),
     (DISK, {"lens.front": FLAT | {"reflect": True}, "lens.index": None, "lens.material": None}, "lens: needs exactly"),
     (DISK, {"lens.front": FLAT, "tailoring.method": "integration"},
-     "lens.front.optimise: point-by-point integration finds no freeform front; remove it, or choose another"),
+     "lens.front.optimise: point-by-point integration cannot tailor"),
     (DISK, {"lens.front": FLAT | {"z": 19.8}}, "lens.back.z: the lens is 0.2 mm thick at its centre"),
 ])  # fmt: skip
 def test_what_cannot_be_is_refused(path, changes, sentence):

@@ -137,14 +137,14 @@ PADDED = np.pad(WIDE, ((3, 3), (0, 0)))
 
 
 @pytest.mark.parametrize(("fit", "shown", "remark"), [
-    ("crop", WIDE[:, 3:9].repeat(2, 0).repeat(2, 1), 'cropped to the middle 6 x 6; fit = "pad" keeps it whole'),
-    ("pad", PADDED, 'kept whole, with dark strips beside it; fit = "crop" fills the target'),
+    ("crop", WIDE[:, 3:9].repeat(2, 0).repeat(2, 1), 'cropped to the middle 6 x 6; fit = "pad" shows it whole'),
+    ("pad", PADDED, 'shown whole, with dark strips beside it; fit = "crop" fills the target'),
     ("stretch", WIDE.repeat(2, 0), 'stretched upwards by 1e+02 %; fit = "crop" keeps its proportions'),
 ])  # fmt: skip
 def test_a_picture_of_other_proportions_is_fitted(fit, shown, remark):
     found = target(WIDE, pixels=12, fit=fit)
     np.testing.assert_allclose(found.irradiance(), shown[:, ::-1] / shown.sum(), rtol=1e-12)
-    assert found.remarks() == (f"target.fit: the picture is 12 x 6, the target square: {remark}",)
+    assert found.remarks() == (f"target.fit: the target is square, so the picture of 12 x 6 is {remark}",)
 
 
 @pytest.mark.parametrize("fit", ["crop", "pad", "stretch"])
@@ -156,7 +156,7 @@ def test_a_picture_of_the_target_s_proportions_is_left_alone(fit):
 
 def test_what_is_turned_or_a_sample_is_fitted_too_and_text_and_even_light_have_no_proportions():
     [remark] = target(WIDE, rotate=90).remarks()
-    assert "the picture is 6 x 12, the target square: cropped to the middle 6 x 6" in remark
+    assert "the picture of 6 x 12 is cropped to the middle 6 x 6" in remark
     assert "cropped to the middle 512 x 256" in target(None, 200.0, 100.0, sample="camera").remarks()[0]
     for content in ({"text": "THU"}, {"uniform": True}):
         assert target(None, 3.0, 1.0, **content).remarks() == ()
@@ -194,8 +194,8 @@ def test_a_crop_is_the_picture_of_that_part_alone(rotate):
 
 
 @pytest.mark.parametrize(("given", "sentence"), [
-    ({"uniform": True, "crop": (0.0, 0.0, 1.0, 0.5)}, "target.crop: only an image or a sample has parts"),
-    ({"sample": "astronaut", "crop": (0.5, 0.0, 0.5, 1.0)}, r"target.crop: \[0.5, 0, 0.5, 1\] is no part"),
+    ({"uniform": True, "crop": (0.0, 0.0, 1.0, 0.5)}, "target.crop: only an image or a sample can be cropped"),
+    ({"sample": "astronaut", "crop": (0.5, 0.0, 0.5, 1.0)}, r"target.crop: \[0.5, 0, 0.5, 1\] is empty"),
 ])  # fmt: skip
 def test_a_crop_of_nothing_is_refused(given, sentence):
     target = Target(z=100.0, x=(-20.0, 20.0), y=(-30.0, 30.0), pixels=30, **given)

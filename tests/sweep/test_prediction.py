@@ -8,7 +8,7 @@ from numba.core.event import Event, EventStatus, broadcast
 
 from bstcad.optics.sides import as_pair
 from bstcad.scene.scene import load
-from bstcad.scene.target import FEWEST
+from bstcad.scene.target import MIN_PIXELS
 from bstcad.sweep import prediction
 from bstcad.sweep.prediction import Pilot, Seconds, detail, fly, made_small, memory_gb, predictions, seconds, usual
 
@@ -44,7 +44,7 @@ def test_both_nets_of_two_faces_shrink_alike():
 
 def test_the_pilot_of_a_narrow_target_has_pixels_enough():
     small, factor = made_small(THU.changed({PIXELS: [128, 64], NET: 1025}))  # SceneError for pixels too few
-    assert factor > 1 and min(small.target.columns_rows) >= FEWEST
+    assert factor > 1 and min(small.target.columns_rows) >= MIN_PIXELS
 
 
 def test_a_pilot_as_large_as_its_scene_predicts_itself(monkeypatch):

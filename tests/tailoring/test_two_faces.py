@@ -222,7 +222,7 @@ def test_a_wave_whose_rays_cross_before_the_target_is_refused():
 
 def test_targets_that_cut_through_each_other_are_refused(tmp_path):
     first = TWO["target"]
-    with pytest.raises(SceneError, match=r"target\[1\].z: cuts through target\[0\]"):
+    with pytest.raises(SceneError, match=r"target\[1\].z: the target cuts target\[0\]"):
         scene_of(tmp_path, target=[first, first | {"z": 32.0, "tilt": [0.0, 30.0]}])
 
 
