@@ -196,7 +196,7 @@ class Design:
         with commands.scene_errors():
             if body is None:
                 return named_solid(self.lens, trim, holes, Draft(*walls))
-            return mounting.mounted(body, [mounting.Placed(self.lens, trim, holes, draft=Draft(*walls))])
+            return mounting.mounted(body, [mounting.PlacedLens(self.lens, trim, holes, draft=Draft(*walls))])
 
     def preview(self, control_points: int = 33) -> Any:
         """A coarse copy of the solid that viewers show at once: CQ-editor's show_object, a notebook's cell.
@@ -430,7 +430,8 @@ def mounted(
     with commands.scene_errors():
         walls = Draft(draft, bevel)
         lenses = [
-            mounting.Placed(getattr(one, "lens", one), trim, holes, at=_place(at), draft=walls) for one, at in placed
+            mounting.PlacedLens(getattr(one, "lens", one), trim, holes, at=_place(at), draft=walls)
+            for one, at in placed
         ]
         return mounting.mounted(body, lenses).solid
 

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from bstcad.cad import mesh as meshes
-from bstcad.cad.mesh import SILVER, Label
+from bstcad.cad.mesh import MIRROR_RGBA, Label
 from bstcad.optics import quadrature
 from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
 from bstcad.optics.lens import Lens
@@ -240,7 +240,7 @@ def write_geometry(design: Made, folder: Path, submit: Submit = run_here) -> Cal
         work = "bstcad.cad.mounting.write_if_it_fits"
         written.append(submit(work, lens, mount, (folder / PART).absolute(), *stated))
     asked = scene.output.mesh_tolerance is not None
-    _, mesh = meshes.fitting(lens, scene.mesh_tolerance, meshes.ASKED if asked else None)
+    _, mesh = meshes.fit_mesh(lens, scene.mesh_tolerance, meshes.MAX_TRIANGLES if asked else None)
     meshes.write_stl(mesh, folder / "lens.stl")
     _write_scene(design, folder)
     try:
@@ -254,7 +254,7 @@ def write_geometry(design: Made, folder: Path, submit: Submit = run_here) -> Cal
 def label(scene: scenes.Scene) -> Label:
     """Return name, title, material and colour for a mesh of the scene's lens."""
     if not scene.lens.passes.enters:
-        return Label(scene.name, scene.title, "mirror", SILVER)
+        return Label(scene.name, scene.title, "mirror", MIRROR_RGBA)
     return Label(scene.name, scene.title, scene.lens.material or "glass")
 
 

@@ -249,8 +249,8 @@ class TestGenerate:
             return Future() if hangs else commands.processes.run_here(work, *arguments)
 
         monkeypatch.setattr(commands.processes, "submit", submit)
-        monkeypatch.setattr(commands.checks, "LIMIT", 0.1)
-        monkeypatch.setattr(commands.checks, "LIMIT_PER_MB", 0.0)
+        monkeypatch.setattr(commands.checks, "TIME_LIMIT", 0.1)
+        monkeypatch.setattr(commands.checks, "TIME_LIMIT_PER_MB", 0.0)
         for path in (folder, folder / "lens.step"):
             with pytest.raises(SceneError, match=r"lens\.step: OCC had not ended after 0 s and was stopped; export"):
                 commands.verify(path)
@@ -340,7 +340,7 @@ class TestVerify:
         found = commands.verify(folder).facts
         assert found["rrmsd"] == small_design.report["rrmsd"]
         [failed] = [check for check in found["checks"] if not check["passed"]]
-        assert failed["name"] == "target in design.npz against the scene's, of its brightest pixel"
+        assert failed["name"] == "target in design.npz: deviation from the scene's, relative to its brightest pixel"
         off = np.abs(arrays["irradiance"] * noise - arrays["target"])
         row, column = np.unravel_index(off.argmax(), off.shape)
         assert failed["value"] == pytest.approx(off.max() / arrays["target"].max())

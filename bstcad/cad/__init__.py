@@ -1,4 +1,4 @@
-"""From an optimised lens to the files that a machine shop opens, and back: exact faces, solid, STEP, mesh.
+"""Files of a lens for a machine shop, written and read: exact faces, solid, STEP and mesh.
 
-`mesh` does not load OCC, the others do.
+`mesh` does not load OCC, the other modules do.
 """

@@ -1,11 +1,11 @@
-"""A closed triangle mesh of a lens on a structured grid, measures of any closed mesh, and its files; lengths in mm.
+"""Closed triangle mesh of a lens on a structured grid, measures of any closed mesh, and its files; lengths in mm.
 
-Every vertex lies on the lens; the faces share the nodes of the rim, so the mesh is closed by construction.  The grid is
-as fine as its tolerance requires, by measurement: the chordal error falls with the square of the node spacing.
+Every vertex lies on the lens, and the faces share the nodes of the rim, so that the mesh is closed by construction.
+The chordal error falls with the square of the node spacing; it is measured until the grid meets its tolerance.
 
 Files: STL, which states no unit, 3MF, which states millimetres, and previews for web pages and slicers.  For two
-million triangles trimesh takes 2 s of CPU to write STL (this file 0.3), 8 s to read it (1), and lib3mf 2.3 s to write
-3MF (2.5, but equal bytes each time).
+million triangles trimesh takes 2 s of CPU to write STL (this module 0.3) and 8 s to read it (1); lib3mf takes 2.3 s to
+write 3MF (2.5, but equal bytes each time).
 """
 
 from __future__ import annotations
@@ -31,32 +31,32 @@ from bstcad.optics.surfaces import MIN_COS2, Surface, sag, sampled
 from bstcad.runs import files
 from bstcad.scene.scene import FLOAT32_ROUNDING
 
-COARSEST = 16  # cells each way
-MOST = 2_000_000  # triangles of a mesh by default: 100 MB of STL
-ASKED = 32_000_000  # triangles of a mesh whose tolerance a scene states: 1.6 GB
-GOAL = 0.95  # of the tolerance at most, so that rounding to float32 keeps a vertex within it
-MORE = 1.1  # times the allowed number of cells: the estimate of the necessary number is no better than that
-UPRIGHT = 1e-6  # of a normal's length; a facet whose normal has no more than this along z belongs to the wall
-SAMPLES = 100_000_000  # points at most at which all facets of a mesh are compared with the lens
-PART = 1 << 15  # facets that are handled at a time: their corners stay in the cache
+MIN_MESH_CELLS = 16  # smallest number of grid cells each way
+DEFAULT_MAX_TRIANGLES = 2_000_000  # largest number of triangles by default: 100 MB of STL
+MAX_TRIANGLES = 32_000_000  # largest number of triangles if a scene states a tolerance: 1.6 GB of STL
+GOAL_FRACTION = 0.95  # chordal error that a mesh aims at, as a fraction of the tolerance: vertices round to float32
+CELL_MARGIN = 1.1  # estimated over allowed number of cells above which a finer mesh is not tried: an estimate's error
+WALL_NORMAL_Z = 1e-6  # largest |z| of the unit normal of a facet of the wall
+MAX_SAMPLES = 100_000_000  # largest number of points at which the facets of a mesh are compared with the lens
+FACETS_PER_BLOCK = 1 << 15  # facets processed at a time, so that their corners stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles, wound counterclockwise seen from outside."""
+    """A triangle mesh, wound counterclockwise seen from outside."""
 
-    vertices: np.ndarray  # (n, 3) float64, mm
-    faces: np.ndarray  # (k, 3) int32, the vertices of each triangle
+    vertices: np.ndarray  # positions of the vertices, (n, 3), float64, mm
+    faces: np.ndarray  # indices of the vertices of each triangle, (k, 3), int32
 
     def facets(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """(corners (n, 3, 3), normals (n, 3) of twice the area's length), PART facets at a time."""
-        for first in range(0, len(self.faces), PART):
-            corners = self.vertices[self.faces[first : first + PART]]
+        """Yield corners (n, 3, 3) and normals (n, 3), whose length is twice the area, FACETS_PER_BLOCK at a time."""
+        for first in range(0, len(self.faces), FACETS_PER_BLOCK):
+            corners = self.vertices[self.faces[first : first + FACETS_PER_BLOCK]]
             yield corners, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def lens_mesh(lens: Lens, cells: int) -> Mesh:
-    """The lens as a closed mesh of `cells` grid cells each way (even); see `fitting`."""
+    """Return the lens as a closed mesh of `cells` grid cells each way (even); see `fit_mesh`."""
     if cells < 2 or cells % 2:
         raise ValueError(f"mesh: {cells} cells each way; give an even number of at least 2")
     x, y = nodes(lens.outline, cells)
@@ -64,8 +64,8 @@ def lens_mesh(lens: Lens, cells: int) -> Mesh:
     border, z = rim(grid), sag(lens.back, x, y)
     back = np.stack([x, y, z], axis=-1).reshape(-1, 3)
     if lens.front.outline is not None:
-        front, front_rim, front_faces = _recessed(lens.front, back[border], grid)
-    elif _flat(lens):  # one fan of triangles covers a plane
+        front, front_rim, front_faces = _recessed_front(lens.front, back[border], grid)
+    elif _has_plane_front(lens):  # one fan of triangles covers a plane
         front = np.vstack([back[border], [0.0, 0.0, 0.0]])
         front[:, 2] = lens.front.z
         front_rim = x.size + np.arange(len(border))
@@ -75,17 +75,17 @@ def lens_mesh(lens: Lens, cells: int) -> Mesh:
         low = sag(lens.front, x, y)
         front = np.stack([x, y, low], axis=-1).reshape(-1, 3)
         front_rim = border + x.size
-        front_faces = _triangles(grid + x.size, _rising(lens.outline, lens.front, (x, y, low)))[:, ::-1]
-    back_faces = _triangles(grid, _rising(lens.outline, lens.back, (x, y, z)))
-    triangles = np.concatenate([back_faces, front_faces, _wall(front_rim, border)])
+        front_faces = _triangles(grid + x.size, _diagonals(lens.outline, lens.front, (x, y, low)))[:, ::-1]
+    back_faces = _triangles(grid, _diagonals(lens.outline, lens.back, (x, y, z)))
+    triangles = np.concatenate([back_faces, front_faces, _wall_triangles(front_rim, border)])
     return Mesh(np.concatenate([back, front]), triangles.astype(np.int32, copy=False))
 
 
-def _recessed(front: Surface, around: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(vertices, those below the lens's rim, triangles) of a front with an outline of its own and the plane around it.
+def _recessed_front(front: Surface, around: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return vertices, indices of those below the lens's rim, and triangles of a front with its own outline.
 
-    around: the rim of the lens (k, 3); its grid has as many nodes along the rim of the front, and the plane lies
-    between the two.  Numbers of vertices go on from those of the grid.
+    The plane around such a front is included.  around: vertices of the lens's rim (k, 3).  The grid over the front has
+    as many nodes on its rim, and the plane lies between the two.  Indices continue those of `grid`.
     """
     x, y = nodes(front.outline, len(grid) - 1)
     z = sag(front.optical, x, y)
@@ -94,43 +94,43 @@ def _recessed(front: Surface, around: np.ndarray, grid: np.ndarray) -> tuple[np.
     dome, plane = np.stack([x, y, z], axis=-1).reshape(-1, 3), around.copy()
     plane[:, 2] = front.around.z
     outer, inner = 2 * grid.size + np.arange(len(border)), border + grid.size
-    triangles = _triangles(grid + grid.size, _rising(front.outline, front.optical, (x, y, z)))[:, ::-1]
-    return np.vstack([dome, plane]), outer, np.concatenate([triangles, _wall(inner, outer)])
+    triangles = _triangles(grid + grid.size, _diagonals(front.outline, front.optical, (x, y, z)))[:, ::-1]
+    return np.vstack([dome, plane]), outer, np.concatenate([triangles, _wall_triangles(inner, outer)])
 
 
 def nodes(outline: Outline, cells: int) -> tuple[np.ndarray, np.ndarray]:
-    """x and y (mm) of a square grid of nodes, (cells + 1, cells + 1), whose rim lies on the outline."""
+    """Return x and y (mm) of a square grid of nodes, each (cells + 1, cells + 1), whose border lies on the outline."""
     x, y = tubes.corners(outline, cells)
     return x.numpy(), y.numpy()
 
 
 def _triangles(grid: np.ndarray, rising: np.ndarray) -> np.ndarray:
-    """Two triangles a cell (2 n², 3), counterclockwise, cut along the diagonal that rises, or else the other."""
-    a, b, c, d = _corners(grid)
+    """Return two triangles per cell, (2 n², 3), counterclockwise; rising: use the diagonal from the first corner."""
+    a, b, c, d = _cell_corners(grid)
     rising = rising[..., None]
     first = np.where(rising, np.stack([a, b, c], axis=-1), np.stack([a, b, d], axis=-1))
     second = np.where(rising, np.stack([a, c, d], axis=-1), np.stack([b, c, d], axis=-1))
     return np.concatenate([first.reshape(-1, 3), second.reshape(-1, 3)])
 
 
-def _corners(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Values at the corners of each cell, counterclockwise."""
+def _cell_corners(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the values at the corners of each cell, counterclockwise."""
     return values[:-1, :-1], values[1:, :-1], values[1:, 1:], values[:-1, 1:]
 
 
-def _rising(outline: Outline, surface: Surface, points: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
-    """(n, n) True for cells that are cut from their first corner to the opposite one: the cut nearer to the face.
+def _diagonals(outline: Outline, surface: Surface, points: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+    """Choose the diagonal of each cell that is nearer to the face: True (n, n) for the one from the first corner.
 
-    A diagonal along a ridge is off by at most half the error of a diagonal across it, so that fewer triangles do.  On a
-    disc, cells on the diagonals of the grid are cut towards its middle: their outer corners lie on a circle, and the
-    other cut would leave flat triangles.
+    A diagonal along a ridge has at most half the error of a diagonal across it, so that fewer triangles suffice.  On a
+    disc, cells on the diagonals of the grid are divided towards its centre: their outer corners lie on a circle, and
+    the other diagonal would make degenerate triangles.
     """
     k = np.arange(len(points[0]) - 1)
     inner = k < len(k) / 2
     inwards = inner[:, None] == inner
     if surface.level:
         return inwards
-    (a, b, c, d), (e, f, g, h), (p, q, r, s) = map(_corners, points)
+    (a, b, c, d), (e, f, g, h), (p, q, r, s) = map(_cell_corners, points)
     along = np.abs(sag(surface, (a + c) / 2, (e + g) / 2) - (p + r) / 2)
     across = np.abs(sag(surface, (b + d) / 2, (f + h) / 2) - (q + s) / 2)
     if not outline.is_round:
@@ -139,82 +139,83 @@ def _rising(outline: Outline, surface: Surface, points: tuple[np.ndarray, np.nda
 
 
 def rim(grid: np.ndarray) -> np.ndarray:
-    """The border nodes of the grid, once around, counterclockwise from its first corner."""
+    """Return the border nodes of the grid, once around, counterclockwise from its first corner."""
     return np.concatenate([grid[:-1, 0], grid[-1, :-1], grid[:0:-1, -1], grid[0, :0:-1]])
 
 
-def _wall(front: np.ndarray, back: np.ndarray) -> np.ndarray:
-    """Two triangles between each pair of neighbours on the front's and the back's rim, facing outwards."""
+def _wall_triangles(front: np.ndarray, back: np.ndarray) -> np.ndarray:
+    """Return two triangles between each pair of neighbours on the rims of front and back, facing outwards."""
     after_front, after_back = np.roll(front, -1), np.roll(back, -1)
     pairs = [front, after_front, after_back], [front, after_back, back]
     return np.concatenate([np.stack(pair, axis=1) for pair in pairs])
 
 
-def _flat(lens: Lens) -> bool:
-    """Is the front plane inside the outline?"""
+def _has_plane_front(lens: Lens) -> bool:
     return lens.front.sags(lens.outline) == (0.0, 0.0)
 
 
 # ---- how fine a mesh has to be ---------------------------------------------------------------------------------------
 
 
-def fitting(lens: Lens, tolerance: float, most: int | None = None) -> tuple[int, Mesh]:
-    """The fewest cells each way, or nearly, whose facets lie within `tolerance` (mm) of the lens, and that mesh.
+def fit_mesh(lens: Lens, tolerance: float, most: int | None = None) -> tuple[int, Mesh]:
+    """Return nearly the smallest number of cells each way that meets a chordal tolerance (mm), and that mesh.
 
-    most: triangles (default MOST).  If they do not suffice, the finest mesh of MOST triangles, or of `most` if fewer.
+    most: largest number of triangles (default DEFAULT_MAX_TRIANGLES).  If they do not suffice, the finest mesh of
+    DEFAULT_MAX_TRIANGLES triangles is returned, or of `most` if that is smaller.
     """
-    allowed = MOST if most is None else most
-    cells, last, goal = COARSEST, finest(lens, allowed), aimed(lens, tolerance)
-    while cells < last or (cells == last and allowed > MOST):
+    allowed = DEFAULT_MAX_TRIANGLES if most is None else most
+    cells, last, goal = MIN_MESH_CELLS, max_cells(lens, allowed), chordal_error_goal(lens, tolerance)
+    while cells < last or (cells == last and allowed > DEFAULT_MAX_TRIANGLES):
         mesh = lens_mesh(lens, cells)
         error = chordal_error(mesh, lens)
         if error <= goal:
             return cells, mesh
-        # it falls with the square of the spacing, and more slowly while a cell is larger than the relief it follows
+        # the error falls with the square of the spacing, but more slowly while cells are larger than the relief
         needed = 2 * math.ceil(0.505 * cells * (error / goal) ** 0.5)
-        if cells == last or (allowed > MOST and needed > MORE * last):
+        if cells == last or (allowed > DEFAULT_MAX_TRIANGLES and needed > CELL_MARGIN * last):
             break
         cells = min(last, needed)
-    last = finest(lens, min(allowed, MOST))
+    last = max_cells(lens, min(allowed, DEFAULT_MAX_TRIANGLES))
     return last, lens_mesh(lens, last)
 
 
-def aimed(lens: Lens, tolerance: float) -> float:
-    """The chordal error (mm) that keeps the tolerance once float32 has rounded the corners."""
-    return max(0.1 * tolerance, min(GOAL * tolerance, tolerance - 2 * FLOAT32_ROUNDING * reach(lens)))
+def chordal_error_goal(lens: Lens, tolerance: float) -> float:
+    """Return the chordal error (mm) that meets the tolerance after the corners have been rounded to float32."""
+    rounding = 2 * FLOAT32_ROUNDING * largest_coordinate(lens)
+    return max(0.1 * tolerance, min(GOAL_FRACTION * tolerance, tolerance - rounding))
 
 
-def reach(lens: Lens) -> float:
-    """The largest coordinate of a point of the lens, or nearly (mm)."""
+def largest_coordinate(lens: Lens) -> float:
+    """Return an upper bound (mm) of the absolute coordinates of the lens's points."""
     ends = [abs(face.z + height) for face in (lens.front, lens.back) for height in face.sags(lens.outline)]
     return max(*lens.outline.half_extent, *ends)
 
 
-def finest(lens: Lens, most: int | None = None) -> int:
-    """Cells each way of the finest grid of `most` triangles (default MOST), two a cell on a face that is not plane."""
-    faces, most = 2 if _flat(lens) else 4, MOST if most is None else most
-    # triangles a cell of the grid's side: four rows of two along the wall, four of a fan over a plane front, or four
-    # rows of two in the plane around a front
+def max_cells(lens: Lens, most: int | None = None) -> int:
+    """Return the largest number of cells each way for `most` triangles, by default DEFAULT_MAX_TRIANGLES."""
+    faces, most = 2 if _has_plane_front(lens) else 4, DEFAULT_MAX_TRIANGLES if most is None else most
+    # triangles per cell along a side of the grid: 8 of the wall and 4 of the fan over a plane front, or 8 of the wall
+    # and 8 of the plane around a front
     wall = 16 if lens.front.outline is not None else 12
     return int((math.sqrt(wall**2 + 4 * faces * most) - wall) / (2 * faces)) // 2 * 2
 
 
-# ---- measures of a mesh, however it was made -------------------------------------------------------------------------
+# ---- measures of any mesh --------------------------------------------------------------------------------------------
 
 
 def is_closed(mesh: Mesh) -> bool:
-    """Watertight and wound consistently: each edge is walked by two triangles, once in each direction.
+    """True if each edge belongs to two triangles, once in each direction: watertight and wound consistently.
 
     For two million triangles trimesh's two tests take 2.3 s of CPU; these two sorts take 0.7 s.
     """
     ends, others = mesh.faces.astype(np.int64), np.roll(mesh.faces, -1, axis=1).astype(np.int64)
     count = len(mesh.vertices)
-    there, back = (np.sort((a * count + b).ravel()) for a, b in ((ends, others), (others, ends)))
-    return len(there) > 0 and bool((np.diff(there) > 0).all()) and np.array_equal(there, back)
+    forward, backward = (np.sort((a * count + b).ravel()) for a, b in ((ends, others), (others, ends)))
+    return len(forward) > 0 and bool((np.diff(forward) > 0).all()) and np.array_equal(forward, backward)
 
 
 def volume_and_area(mesh: Mesh) -> tuple[float, float]:
-    """Volume (mm³) inside a closed mesh, a sixth of the triple products of its triangles' corners; its area (mm²)."""
+    """Return volume (mm³), a sixth of the sum of the triple products of corners, and area (mm²) of a closed mesh."""
     middle = mesh.vertices.mean(0)
     parts = [
         (np.einsum("ij,ij", corners[:, 0] - middle, normals), np.linalg.norm(normals, axis=1).sum())
@@ -225,25 +226,25 @@ def volume_and_area(mesh: Mesh) -> tuple[float, float]:
 
 
 def chordal_error(mesh: Mesh, lens: Lens) -> float:
-    """Largest distance (mm) between the lens and the facets, at their centres and at points between their corners.
+    """Return the largest distance (mm) between the lens and the facets, at their centres and points between corners.
 
-    On a net, which may bend in each knot span, two points a span along an edge or more (SAMPLES in all at most).
+    A net may bend in each knot span: an edge has two points per span or more (at most MAX_SAMPLES points in all).
     """
-    most = max(1, int((SAMPLES / 2 / max(len(mesh.faces), 1)) ** 0.5))
+    most = max(1, int((MAX_SAMPLES / 2 / max(len(mesh.faces), 1)) ** 0.5))
     radius = float(lens.outline.radius) if lens.outline.is_round else 0.0
-    numbers = [value for face in (lens.back, lens.front) for value in _numbers(face)]
+    numbers = [value for face in (lens.back, lens.front) for value in _face_numbers(face)]
 
-    def of_share(faces: np.ndarray) -> float:
-        return _chordal_error(mesh.vertices, faces, UPRIGHT, most, radius, *numbers)
+    def largest_error(faces: np.ndarray) -> float:
+        return _chordal_error(mesh.vertices, faces, WALL_NORMAL_Z, most, radius, *numbers)
 
     with ThreadPoolExecutor(torch.get_num_threads()) as threads:
-        return float(max(threads.map(of_share, np.array_split(mesh.faces, 16))))
+        return float(max(threads.map(largest_error, np.array_split(mesh.faces, 16))))
 
 
 def vertex_error(mesh: Mesh, lens: Lens) -> float:
-    """Largest distance (mm) of a vertex from the nearer face of the lens: |Δz| / sqrt(1 + |∇z|²), by its tangent plane.
+    """Return the largest distance (mm) of a vertex from the nearer face: |Δz| / sqrt(1 + |∇z|²), by its tangent plane.
 
-    Along z the rounding of x and y would count |∇z| times.
+    The distance along z would contain the rounding of x and y, multiplied by |∇z|.
     """
     x, y, z = mesh.vertices.T
 
@@ -254,44 +255,42 @@ def vertex_error(mesh: Mesh, lens: Lens) -> float:
     return float(np.minimum(off(lens.back), off(lens.front)).max())
 
 
-def _numbers(surface: Surface) -> tuple[FaceNumbers, np.ndarray]:
-    """A face as the kernel takes it, and its net, (0, 0) if it has none."""
+def _face_numbers(surface: Surface) -> tuple[FaceNumbers, np.ndarray]:
+    """Return a face as numbers for the kernel, and its heights (m, n), (0, 0) if it is no net."""
     face = surface.plain()
     per_detail = 1 / float(face.detail)
     if not face.is_net:
         c, k = face.conic()
         bend = (1 + k) * c * c
         ends2 = face.outline.radius**2 if face.outline else math.inf
-        return FaceNumbers(
-            float(face.z), c, bend, equator=MIN_COS2, x=0.0, y=0.0, per_x=0.0, per_y=0.0, per_detail=per_detail,
-            ends2=ends2,
-        ), np.zeros((0, 0))  # fmt: skip
+        no_net = (0.0, 0.0, 0.0, 0.0)
+        return FaceNumbers(float(face.z), c, bend, MIN_COS2, *no_net, per_detail, ends2), np.zeros((0, 0))
     corner, per_mm = (float(face.x[0]), float(face.y[0])), (1 / pitch for pitch in face.pitch)
     numbers = FaceNumbers(float(face.z), 0.0, 0.0, MIN_COS2, *corner, *per_mm, per_detail, math.inf)
     return numbers, face.heights.contiguous().numpy()
 
 
-# ---- the same compiled: a mesh has millions of triangles ------------------------------------------------------------
+# ---- compiled kernels, for millions of triangles ---------------------------------------------------------------------
 
 
 class FaceNumbers(NamedTuple):
-    """A face of a lens as plain numbers: z = z0 + Σ B_i(u) B_j(v) h_ij over a net, or a surface of revolution."""
+    """A face as plain numbers: z = z0 + Σ B_i(u) B_j(v) h_ij over a net, or a surface of revolution."""
 
     z: float  # z0 (mm)
     curvature: float  # 1/mm
     bend: float  # (1 + k) c² (1/mm²), k the conic constant
     equator: float  # surfaces.MIN_COS2
-    x: float  # the net's corner (mm)
-    y: float
-    per_x: float  # control points per mm
-    per_y: float
+    x: float  # corner of the net (mm)
+    y: float  # corner of the net (mm)
+    per_x: float  # control points per mm along x
+    per_y: float  # control points per mm along y
     per_detail: float  # smooth parts per mm: 1 / Surface.detail
-    ends2: float  # r² (mm²) from which on it is a plane: of Surface.outline
+    ends2: float  # r² (mm²) of Surface.outline, outside of which the face is a plane
 
 
 @njit(inline="always")
 def _basis(u, m):
-    """Span and weights of three control points (bspline.basis; numba's cache misses changes in other files)."""
+    """Return span and weights of three control points, as bspline.basis: numba's cache misses changes elsewhere."""
     if u < 1.5:
         k, s = 0, 2.0 - math.sqrt(4.0 - 2.0 * u)
     elif u > m - 2.5:
@@ -306,7 +305,7 @@ def _basis(u, m):
 
 @njit(inline="always")
 def _sag(face, net, x, y):
-    """z (mm) of a face; net (0, 0): it is a surface of revolution."""
+    """Return z (mm) of a face; net of shape (0, 0): a surface of revolution."""
     m, n = net.shape
     if m == 0:
         r2 = min(x * x + y * y, face.ends2)
@@ -320,10 +319,10 @@ def _sag(face, net, x, y):
 
 
 @njit(cache=True, nogil=True)
-def _off_face(a, b, c, parts, face, net):
-    """Largest distance along z (mm) of a face from the triangle a, b, c, whose edges are divided into 2 x parts.
+def _distance_from_face(a, b, c, parts, face, net):
+    """Return the largest distance along z (mm) of a face from the triangle a, b, c with edges in 2 x `parts`.
 
-    Compared are its centre and all points of that division but the corners.
+    It is measured at the centre and at all points of the division except the corners.
     """
     n = 2 * parts
     worst = abs(_sag(face, net, (a[0] + b[0] + c[0]) / 3, (a[1] + b[1] + c[1]) / 3) - (a[2] + b[2] + c[2]) / 3)
@@ -338,10 +337,10 @@ def _off_face(a, b, c, parts, face, net):
 
 @njit(cache=True, nogil=True)
 def _chordal_error(vertices, faces, upright, most, radius, back, back_net, front, front_net):
-    """Largest distance (mm) of the lens from triangles, along their normals.
+    """Return the largest distance (mm) of the lens from triangles, along their normals.
 
-    A triangle whose normal has no more than `upright` of its length along z belongs to the wall, a cylinder of the
-    given radius, or planes (radius 0).  most: parts of a triangle's edges at most, else one for each smooth part.
+    A triangle whose unit normal has |z| <= `upright` belongs to the wall: a cylinder of the given radius, or planes
+    (radius 0).  Edges have one part per smooth part of the face, at most `most`.
     """
     worst = 0.0
     for k in range(len(faces)):
@@ -350,10 +349,10 @@ def _chordal_error(vertices, faces, upright, most, radius, back, back_net, front
         n_z = p * t - q * s
         length = math.sqrt((q * u - r * t) ** 2 + (r * s - p * u) ** 2 + n_z * n_z)
         if abs(n_z) > upright * length:
-            reach = max(abs(p), abs(q), abs(s), abs(t), abs(p - s), abs(q - t))
+            extent = max(abs(p), abs(q), abs(s), abs(t), abs(p - s), abs(q - t))
             face, net = (back, back_net) if n_z > 0.0 else (front, front_net)
-            parts = min(most, max(1, math.ceil(reach * face.per_detail)))
-            worst = max(worst, _off_face(a, b, c, parts, face, net) * abs(n_z) / length)
+            parts = min(most, max(1, math.ceil(extent * face.per_detail)))
+            worst = max(worst, _distance_from_face(a, b, c, parts, face, net) * abs(n_z) / length)
         elif radius > 0.0:
             for x, y in ((a[0] + b[0], a[1] + b[1]), (b[0] + c[0], b[1] + c[1]), (c[0] + a[0], c[1] + a[1])):
                 worst = max(worst, abs(radius - math.hypot(x, y) / 2))
@@ -362,37 +361,36 @@ def _chordal_error(vertices, faces, upright, most, radius, back, back_net, front
 
 # ---- files -----------------------------------------------------------------------------------------------------------
 
-LARGEST = ASKED  # triangles of a mesh that is read
-PREVIEW = 20_000  # triangles
-METRE = 1e-3  # of a mm: the unit of glTF, whose y points up
-VERTEX = b'<vertex x="%.10g" y="%.10g" z="%.10g"/>\n'
-TRIANGLE = b'<triangle v1="%d" v2="%d" v3="%d"/>\n'
+PREVIEW_TRIANGLES = 20_000  # largest number of triangles of a preview
+METRES_PER_MM = 1e-3  # unit conversion for glTF, which is in metres
+VERTEX_XML = b'<vertex x="%.10g" y="%.10g" z="%.10g"/>\n'
+TRIANGLE_XML = b'<triangle v1="%d" v2="%d" v3="%d"/>\n'
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-PROBES = 4096  # largest number of taken places that a corner may meet in the hash table, half of which is free
-STL_HEADER = b"bstcad, binary STL, lengths in mm"  # must not begin with "solid"
-LINE = 90  # bytes of a line of a 3MF model at most
-CLEAR, SILVER = "#A9D3EE80", "#C9CED4FF"  # red, green, blue (sRGB) and opacity: clear material, a mirror
-EPOCH = (1980, 1, 1, 0, 0, 0)  # the time of files in a package, so that equal meshes give equal bytes
+MAX_PROBES = 4096  # largest number of occupied slots that a corner may meet in the hash table, half of which is free
+STL_HEADER = b"bstcad, binary STL, lengths in mm"  # header, which must not begin with "solid"
+MAX_LINE_BYTES = 90  # longest line of a 3MF model (bytes)
+CLEAR_RGBA, MIRROR_RGBA = "#A9D3EE80", "#C9CED4FF"  # sRGB and opacity of clear material and of a mirror
+ARCHIVE_TIME = (1980, 1, 1, 0, 0, 0)  # time of the files in a 3MF package, so that equal meshes give equal bytes
 
 
 @dataclass(frozen=True)
 class Label:
-    """Name and looks of a mesh."""
+    """Name and appearance of a mesh in its file."""
 
     name: str = "lens"
     title: str = ""
     material: str = "glass"
-    colour: str = CLEAR  # #RRGGBBAA
+    colour: str = CLEAR_RGBA  # #RRGGBBAA
     remark: str = ""  # a sentence
 
 
-UNNAMED = Label()
+DEFAULT_LABEL = Label()
 
 
 def write_stl(mesh: Mesh, path: str | Path) -> None:
-    """Write the mesh as binary STL: 80 bytes of header, the count, 50 bytes a triangle in float32.
+    """Write the mesh as binary STL: 80 bytes of header, the count, 50 bytes per triangle in float32.
 
-    Programs that read it have to be told that it is in mm.
+    The format states no unit: the user of the file must set mm.
     """
     with Path(path).open("wb") as file:
         file.write(STL_HEADER.ljust(80) + np.uint32(len(mesh.faces)).tobytes())
@@ -404,10 +402,10 @@ def write_stl(mesh: Mesh, path: str | Path) -> None:
 
 
 def read_stl(path: str | Path) -> Mesh:
-    """The mesh of a binary STL file, equal corners merged; ValueError if the file is damaged."""
+    """Read a binary STL file and merge equal corners; ValueError if the file is damaged."""
     path = Path(path)
     try:
-        data = files.contents(path, 84 + LARGEST * STL_TRIANGLE.itemsize)
+        data = files.contents(path, 84 + MAX_TRIANGLES * STL_TRIANGLE.itemsize)
     except ValueError as error:
         raise ValueError(f"{path.name}: cannot be read ({error}); give the path of an STL file") from error
     count = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
@@ -418,17 +416,17 @@ def read_stl(path: str | Path) -> Mesh:
         raise ValueError(f"{path.name}: a corner is not finite; write it again")
     corners = np.ascontiguousarray(corners) + np.float32(0)  # -0 becomes 0
     bits = corners.view(np.uint32)
-    first, same = _welded(bits)
-    if not len(same):  # by sorting: two million triangles in 2 s, by hash in 0.2 s
+    first, same = _weld(bits)
+    if not len(same):  # sort instead: 2 s for two million triangles, the hash table 0.2 s
         _, first, same = np.unique(bits, axis=0, return_index=True, return_inverse=True)
     return Mesh(corners[first].astype(np.float64), same.reshape(-1, 3))
 
 
 @njit(cache=True, nogil=True)
-def _welded(bits):
-    """(first corner of each group of equal ones, group of each corner) of float32 corners (n, 3) as uint32, by hash.
+def _weld(bits):
+    """Group equal corners, float32 (n, 3) seen as uint32, by hash: (first corner of each group, group of each corner).
 
-    Both empty where a corner finds PROBES places taken, which no surface does by accident.
+    Both are empty if a corner meets MAX_PROBES occupied slots, which happens on no real surface.
     """
     size = 1 << 16
     while size < 2 * len(bits):
@@ -437,11 +435,11 @@ def _welded(bits):
     count = 0
     for k in range(len(bits)):
         x, y, z = bits[k, 0], bits[k, 1], bits[k, 2]
-        key = np.uint64(x) * np.uint64(0x9E3779B97F4A7C15)  # odd factors of no structure
+        key = np.uint64(x) * np.uint64(0x9E3779B97F4A7C15)  # odd factors without structure
         key += np.uint64(y) * np.uint64(0xC2B2AE3D27D4EB4F) + np.uint64(z) * np.uint64(0xD6E8FEB86659FD93)
         slot = np.int64((key ^ (key >> np.uint64(32))) & np.uint64(size - 1))
-        for probe in range(PROBES + 1):
-            if probe == PROBES:
+        for probe in range(MAX_PROBES + 1):
+            if probe == MAX_PROBES:
                 return first[:0], same[:0]
             group = table[slot]
             if group < 0:
@@ -470,8 +468,8 @@ Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/></Relations
 """
 
 
-def model_3mf(mesh: Mesh, label: Label = UNNAMED) -> Iterator[bytes]:
-    """The 3MF core model of the mesh, in millimetres, in parts: one object of one material with its colour."""
+def model_3mf(mesh: Mesh, label: Label = DEFAULT_LABEL) -> Iterator[bytes]:
+    """Yield the 3MF core model of the mesh, in millimetres, in parts: one object of one material with its colour."""
     about = {"Title": label.title or label.name, "Description": label.remark, "Application": "bstcad"}
     metadata = "".join(f'<metadata name="{key}">{escape(text)}</metadata>\n' for key, text in about.items() if text)
     yield (
@@ -483,32 +481,32 @@ def model_3mf(mesh: Mesh, label: Label = UNNAMED) -> Iterator[bytes]:
         "</basematerials>\n"
         f'<object id="2" type="model" name={quoteattr(label.name)} pid="1" pindex="0"><mesh><vertices>\n'
     ).encode()
-    yield from _lines(VERTEX, mesh.vertices)
+    yield from _format_rows(VERTEX_XML, mesh.vertices)
     yield b"</vertices><triangles>\n"
-    yield from _lines(TRIANGLE, mesh.faces)
+    yield from _format_rows(TRIANGLE_XML, mesh.faces)
     yield b'</triangles></mesh></object></resources>\n<build><item objectid="2"/></build></model>\n'
 
 
-def _lines(line: bytes, rows: np.ndarray) -> Iterator[bytes]:
-    """A line for each row of numbers, PART rows at a time."""
-    for first in range(0, len(rows), PART):
-        part = rows[first : first + PART]
+def _format_rows(line: bytes, rows: np.ndarray) -> Iterator[bytes]:
+    """Yield one line of text per row of numbers, FACETS_PER_BLOCK rows at a time."""
+    for first in range(0, len(rows), FACETS_PER_BLOCK):
+        part = rows[first : first + FACETS_PER_BLOCK]
         yield (line * len(part)) % tuple(part.ravel().tolist())
 
 
-def write_3mf(mesh: Mesh, path: str | Path | IO[bytes], label: Label = UNNAMED) -> None:
-    """Write the mesh as 3MF, which states its unit; the same mesh gives the same bytes."""
-    large = LINE * (len(mesh.vertices) + len(mesh.faces)) > zipfile.ZIP64_LIMIT
+def write_3mf(mesh: Mesh, path: str | Path | IO[bytes], label: Label = DEFAULT_LABEL) -> None:
+    """Write the mesh as 3MF in millimetres; equal meshes give equal bytes."""
+    large = MAX_LINE_BYTES * (len(mesh.vertices) + len(mesh.faces)) > zipfile.ZIP64_LIMIT
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as package:
         for name, text in (("[Content_Types].xml", CONTENT_TYPES), ("_rels/.rels", RELATIONSHIPS)):
-            package.writestr(_member(name), text)
-        with package.open(_member("3D/3dmodel.model"), "w", force_zip64=large) as model:
+            package.writestr(_archive_member(name), text)
+        with package.open(_archive_member("3D/3dmodel.model"), "w", force_zip64=large) as model:
             for part in model_3mf(mesh, label):
                 model.write(part)
 
 
-def _member(name: str) -> zipfile.ZipInfo:
-    member = zipfile.ZipInfo(name, EPOCH)
+def _archive_member(name: str) -> zipfile.ZipInfo:
+    member = zipfile.ZipInfo(name, ARCHIVE_TIME)
     member.compress_type, member.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
     return member
 
@@ -517,12 +515,12 @@ def _member(name: str) -> zipfile.ZipInfo:
 
 
 def preview_files(lens: Lens, label: Label) -> Iterator[tuple[str, bytes]]:
-    """preview.glb and preview.3mf of few triangles, both of which state their chordal error.
+    """Yield names and bytes of preview.glb and preview.3mf, which have few triangles and state their chordal error.
 
-    Web pages (glTF) and slicers (3MF) cannot show a million triangles; the normals of the glTF are the surface's own,
-    and shade it as finely as the lens.
+    Web pages (glTF) and slicers (3MF) cannot show a million triangles.  The normals of the glTF are those of the
+    surface itself, so that its shading shows the whole relief.
     """
-    mesh = lens_mesh(lens, finest(lens, PREVIEW))
+    mesh = lens_mesh(lens, max_cells(lens, PREVIEW_TRIANGLES))
     off = chordal_error(mesh, lens)
     label = replace(label, remark=f"A preview: its facets lie within {off:.2g} mm of the lens; lens.step is exact.")
     yield "preview.glb", _glb(mesh, lens, label, off)
@@ -532,47 +530,51 @@ def preview_files(lens: Lens, label: Label) -> Iterator[tuple[str, bytes]]:
 
 
 def _glb(mesh: Mesh, lens: Lens, label: Label, off: float) -> bytes:
-    """The mesh as binary glTF, in metres, the back up; off: its chordal error (mm), which its extras state.
+    """Encode the mesh as binary glTF, in metres, y upwards; off: chordal error (mm), which the extras state.
 
-    At an edge of the lens each vertex stands once for each face, and once for each facet of the wall, with its normal.
+    A vertex on an edge of the lens is repeated for each face and for each facet of the wall, with its normal.
     """
-    import trimesh  # most of a second to load
+    import trimesh  # takes most of a second
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
     a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
     across = np.cross(b - a, c - a)
     across /= np.linalg.norm(across, axis=1)[:, None]
-    wall = np.abs(across[:, 2]) <= UPRIGHT
-    if lens.front.outline is not None:  # the plane around it meets it in an edge
-        wall |= across[:, 2] <= UPRIGHT - 1
+    wall = np.abs(across[:, 2]) <= WALL_NORMAL_Z
+    if lens.front.outline is not None:  # the plane around the front meets it in an edge
+        wall |= across[:, 2] <= WALL_NORMAL_Z - 1
     vertices, normals = [mesh.vertices[mesh.faces[wall]].reshape(-1, 3)], [across[wall].repeat(3, axis=0)]
     faces, count = [np.arange(3 * wall.sum()).reshape(-1, 3)], 3 * wall.sum()
     for face, sense in ((lens.back, 1), (lens.front, -1)):
-        used, renumbered = np.unique(mesh.faces[(sense * across[:, 2] > UPRIGHT) & ~wall], return_inverse=True)
+        used, renumbered = np.unique(mesh.faces[(sense * across[:, 2] > WALL_NORMAL_Z) & ~wall], return_inverse=True)
         vertices.append(mesh.vertices[used])
-        normals.append(sense * _upwards(face.optical, vertices[-1]))
+        normals.append(sense * _upward_normals(face.optical, vertices[-1]))
         faces.append(renumbered.reshape(-1, 3) + count)
         count += len(used)
     red, green, blue, opacity = (int(label.colour[k : k + 2], 16) for k in (1, 3, 5, 7))
     linear = [(part / 255) ** 2.2 for part in (red, green, blue)]
     clear = {"alphaMode": "BLEND"} if opacity < 255 else {"metallicFactor": 1.0}
     material = PBRMaterial(
-        name=label.material, baseColorFactor=[*linear, opacity / 255],
+        name=label.material,
+        baseColorFactor=[*linear, opacity / 255],
         **({"metallicFactor": 0.0, "roughnessFactor": 0.1} | clear),
-    )  # fmt: skip
+    )
     solid = trimesh.Trimesh(
-        METRE * _y_up(np.concatenate(vertices)), np.concatenate(faces), vertex_normals=_y_up(np.concatenate(normals)),
-        visual=TextureVisuals(material=material), process=False, validate=False,
+        METRES_PER_MM * _y_up(np.concatenate(vertices)),
+        np.concatenate(faces),
+        vertex_normals=_y_up(np.concatenate(normals)),
+        visual=TextureVisuals(material=material),
+        process=False,
+        validate=False,
         metadata={"title": label.title, "remark": label.remark, "off_mm": off},
-    )  # fmt: skip
+    )
     scene = trimesh.Scene()
     scene.add_geometry(solid, geom_name=label.name, node_name=label.name)
     return scene.export(file_type="glb", include_normals=True)
 
 
-def _upwards(surface: Surface, points: np.ndarray) -> np.ndarray:
-    """Unit normals of a face towards +z."""
+def _upward_normals(surface: Surface, points: np.ndarray) -> np.ndarray:
     _, z_x, z_y = sampled(surface, points[:, 0], points[:, 1])
     normals = np.stack([-z_x, -z_y, np.ones_like(z_x)], axis=1)
     return normals / np.linalg.norm(normals, axis=1)[:, None]

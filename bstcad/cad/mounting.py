@@ -1,8 +1,8 @@
-"""Lenses in a body that holds them, as one part: a scene's [mount], a plate with an array of lenses, an insert's block.
+"""Lenses in a body, as one part: a scene's [mount], a plate with an array of lenses, an insert's block.
 
-The body is any cadquery solid.  A prism over the lens's rim is cut out of it, which is quick, since no net takes part;
-then the walls of that opening give way to walls between the body's faces and the lens's, whose edges both share.  The
-optical faces are those of the design, control point for control point.
+The body is any cadquery solid.  A prism over the lens's rim is cut out of it, which is quick, since no net is involved.
+Then the walls of that opening are replaced by walls between the faces of the body and of the lens, with shared edges.
+The optical faces are those of the design, control point for control point.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from bstcad.cad.solid import (
     named_solid,
     rim_points,
 )
-from bstcad.cad.walls import SLIM, UPRIGHT, Draft, Loop, Named, face_inside, solid_of
-from bstcad.cad.wires import Piece, shape_in
+from bstcad.cad.walls import MIN_WALL, NO_DRAFT, Draft, Loop, NamedFace, face_inside, solid_of
+from bstcad.cad.wires import LoopPiece, shape_in
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import Plane, sag
 from bstcad.scene.mount import Box, Flange, Mount, Part, Round
@@ -44,29 +44,29 @@ from bstcad.scene.mount import Box, Flange, Mount, Part, Round
 if TYPE_CHECKING:
     import cadquery
 
-NEAR = 1e-6  # mm; an edge of the body that is nearer to a lens's wall lies on it
-LEVEL = 1e-12  # of a plane's normal: how far its part along z may be off 1
-ALONG = (0.0, 0.31, 0.77, 1.0)  # shares of an edge's length at which its distance from a wall is measured
+WALL_TOLERANCE = 1e-6  # largest distance (mm) from a lens's wall of a body's edge that lies on it
+COSINE_TOLERANCE = 1e-12  # largest deviation from 1 of |z| of the unit normal of a plane z = const
+EDGE_FRACTIONS = (0.0, 0.31, 0.77, 1.0)  # fractions of an edge's length at which its distance from a wall is measured
 INVALID = "mount: body and lens make no valid solid; move the body's edges away from the lens's rim"
 
 
 @dataclass(frozen=True)
-class Placed:
-    """A lens, its wires, and the position of its frame's origin in the body's frame."""
+class PlacedLens:
+    """A lens, the wires that cut it, and its position in a body."""
 
     lens: Lens
-    trim: cadquery.Wire | None = None  # in the lens's frame; None: its own outline
-    holes: Sequence = ()  # through it: wires, or (x, y, diameter) in mm
-    at: tuple[float, float, float] = (0.0, 0.0, 0.0)  # mm
-    draft: Draft = UPRIGHT  # of its walls below the body
+    trim: cadquery.Wire | None = None  # rim in the lens's frame; None: the lens's outline
+    holes: Sequence = ()  # holes through the lens: wires, or (x, y, diameter) in mm
+    at: tuple[float, float, float] = (0.0, 0.0, 0.0)  # origin of the lens's frame in the body's frame (mm)
+    draft: Draft = NO_DRAFT  # draft of the walls below the body
 
 
-def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed]) -> NamedSolid:
-    """The body with each lens in an opening of the lens's own shape, all one solid.
+def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[PlacedLens]) -> NamedSolid:
+    """Return the body with each lens in an opening of the lens's shape, all one solid.
 
-    Around each lens the body must lie between two planes z = const that meet the lens's wall.  Each may also stand
-    beyond the lens's rim, above the back or below the front, but may not cut it; a plane front may lie in the lower.
-    ValueError in one sentence where that is not so.
+    Around each lens the body must lie between two planes z = const that meet the lens's wall.  A plane may also lie
+    above the rim of the back or below that of the front, but may not cut it; a plane front may lie in the lower plane.
+    Raises ValueError in one sentence otherwise.
     """
     import cadquery
 
@@ -75,160 +75,157 @@ def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed])
     given, kind = shape_in(body)
     if not isinstance(given, cadquery.Shape):
         raise ValueError(f"mount: the body is {kind}; give one cadquery solid, such as Workplane().box(30, 30, 2)")
-    # OCC tapers and chamfers with left-handed planes and cones; its STEP writer would turn them and lose their names.
+    # OCC tapers and chamfers with left-handed planes and cones; its STEP writer reverses them and loses their names
     rest = cadquery.Solid(TopoDS.Solid_s(ShapeCustom.DirectFaces_s(_solid(given, "the body").wrapped)))
     for opening in openings:
         rest = _solid(rest.cut(opening.prism(rest)), "the rest of the body")
     faces = rest.Faces()
-    opened: set[int] = set()  # faces of the body that the lenses' own walls replace
-    instead: dict[int, dict[int, list[Loop]]] = {}  # of a face, by its wire: the loops that replace it
-    built: list[Named] = []
+    removed: set[int] = set()  # indices of the body's faces that walls of lenses replace
+    replacements: dict[int, dict[int, list[Loop]]] = {}  # loops that replace a wire, by the indices of face and wire
+    built: list[NamedFace] = []
     for opening in openings:
-        inner, *planes = opening.meets(faces)
-        opened |= inner
-        own, *loops = opening.filled(*(plane.z for plane in planes))
+        inner, *planes = opening.find_faces(faces)
+        removed |= inner
+        own, *loops = opening.fill(*(plane.z for plane in planes))
         built += own
         for plane, new in zip(planes, loops, strict=True):
-            instead.setdefault(plane.face, {})[plane.wire] = new
-    built += [(_with(face, instead.get(k)), "flange") for k, face in enumerate(faces) if k not in opened]
+            replacements.setdefault(plane.face, {})[plane.wire] = new
+    built += [(_replace_loops(face, replacements.get(k)), "flange") for k, face in enumerate(faces) if k not in removed]
     solid = solid_of([face for face, _ in built], INVALID)
     return NamedSolid(cadquery.Solid(solid), tuple(name for _, name in built))
 
 
 def _solid(shape: cadquery.Shape, name: str) -> cadquery.Solid:
-    """The one solid in a shape."""
+    """Return the one solid in a shape; ValueError if there is not exactly one."""
     solids = shape.Solids()
     if len(solids) != 1:
         raise ValueError(f"mount: {name} is {len(solids)} solids; give one solid that reaches all around each lens")
     return solids[0]
 
 
-class _Plane(NamedTuple):
-    """A plane of the body that meets a lens's wall."""
+class _BodyPlane(NamedTuple):
+    """A plane face of the body that meets a lens's wall."""
 
-    face: int
-    wire: int  # of its wires, the one around the lens
-    z: float  # mm, in the body's frame
+    face: int  # index among the faces of the body
+    wire: int  # index of the face's wire around the lens
+    z: float  # height in the body's frame (mm)
 
 
 @dataclass(frozen=True)
 class _Opening:
-    """Where a lens goes into the body."""
+    """The opening of a body for a lens."""
 
     lens: Lens
-    name: str  # in sentences
-    z: float  # of the lens's frame in the body's (mm)
-    loops: list[list[Piece]]  # the rim, then holes
-    there: TopLoc_Location  # from the lens's frame to the body's: moved by one location, faces still share their edges
-    outline: cadquery.Wire  # the rim in the plane z = 0, in the body's frame
-    draft: Draft
+    name: str  # name of the lens in messages
+    z: float  # height of the lens's frame in the body's frame (mm)
+    loops: list[list[LoopPiece]]  # rim and holes
+    location: TopLoc_Location  # placement of the lens in the body; one object, so that moved faces share their edges
+    outline: cadquery.Wire  # rim in the plane z = 0 of the body's frame
+    draft: Draft  # draft of the lens's walls below the body
 
     @classmethod
-    def of(cls, placed: Placed, name: str) -> _Opening:
+    def of(cls, placed: PlacedLens, name: str) -> _Opening:
         import cadquery
 
-        if not np.isfinite(placed.at).all():  # a prism there ends the process
-            raise ValueError(f"{name}: {placed.at} is no place; give x, y and z in mm")
+        if not np.isfinite(placed.at).all():  # a prism there would crash the process
+            raise ValueError(f"{name}: {placed.at} is no position; give x, y and z in mm")
         lens = placed.lens.plain()
         check_thickness(lens)
         loops = cut_loops(lens, placed.trim, placed.holes)
         x, y, z = placed.at
-        there = cadquery.Location(placed.at).wrapped if any(placed.at) else TopLoc_Location()
-        rim = cadquery.Wire.assembleEdges([cadquery.Edge(edge) for edge in walls.on(Plane(0.0), loops[0]).edges])
-        return cls(lens, name, z, loops, there=there, outline=rim.translate((x, y, 0.0)), draft=placed.draft)
+        location = cadquery.Location(placed.at).wrapped if any(placed.at) else TopLoc_Location()
+        rim = cadquery.Wire.assembleEdges([cadquery.Edge(edge) for edge in walls.rail_on(Plane(0.0), loops[0]).edges])
+        return cls(lens, name, z, loops, location=location, outline=rim.translate((x, y, 0.0)), draft=placed.draft)
 
     def prism(self, body: cadquery.Shape) -> cadquery.Solid:
-        """The prism over the rim, higher than the body."""
+        """Return the prism over the rim, higher than the body."""
         import cadquery
 
         box = body.BoundingBox()
         low = self.outline.translate((0, 0, box.zmin - 1))
         return cadquery.Solid.extrudeLinear(low, [], cadquery.Vector(0, 0, box.zlen + 2))
 
-    def meets(self, faces: Sequence[cadquery.Face]) -> tuple[set[int], _Plane, _Plane]:
-        """(the faces of the body that are walls of the opening, its upper plane there, its lower one)."""
+    def find_faces(self, faces: Sequence[cadquery.Face]) -> tuple[set[int], _BodyPlane, _BodyPlane]:
+        """Return the indices of the opening's walls among the body's faces, and its upper and lower plane."""
         inner: set[int] = set()
-        planes: dict[bool, list[_Plane]] = {True: [], False: []}
+        planes: dict[bool, list[_BodyPlane]] = {True: [], False: []}
         for k, face in enumerate(faces):
             around = [self._touches(wire) for wire in face.Wires()]
             if all(around):
                 inner.add(k)
             elif any(around):
                 normal = face.normalAt().z if face.geomType() == "PLANE" else 0.0
-                if abs(abs(normal) - 1) > LEVEL:
+                if abs(abs(normal) - 1) > COSINE_TOLERANCE:
                     raise ValueError(
                         f"{self.name}: the body meets it in a face that is no plane z = const; make it one"
                     )
-                planes[normal > 0].append(_Plane(k, around.index(True), face.toPln().Location().Z()))
+                planes[normal > 0].append(_BodyPlane(k, around.index(True), face.toPln().Location().Z()))
         if [len(planes[above]) for above in (True, False)] != [1, 1]:
             raise ValueError(
-                f"{self.name}: the body has to reach all around it between two planes z = const, but "
-                f"{len(planes[True])} planes from above and {len(planes[False])} from below meet it; make it a plate "
-                "there"
+                f"{self.name}: the body must surround it between two planes z = const, but {len(planes[True])} upper "
+                f"and {len(planes[False])} lower planes meet it; give the body the shape of a plate there"
             )
         return inner, planes[True][0], planes[False][0]
 
     def _touches(self, wire: cadquery.Wire) -> bool:
-        """Do all edges of a wire of the body lie on the wall over the rim?"""
+        """True if all edges of a wire of the body lie on the wall over the rim."""
         import cadquery
 
-        points = (point for edge in wire.Edges() for point in edge.positions(ALONG))
-        return all(cadquery.Vertex.makeVertex(p.x, p.y, 0).distance(self.outline) <= NEAR for p in points)
+        points = (point for edge in wire.Edges() for point in edge.positions(EDGE_FRACTIONS))
+        return all(cadquery.Vertex.makeVertex(p.x, p.y, 0).distance(self.outline) <= WALL_TOLERANCE for p in points)
 
-    def filled(self, upper: float, lower: float) -> tuple[list[Named], list[Loop], list[Loop]]:
-        """(the lens's faces, the loops that bound the body's upper plane around it, and those of its lower plane).
-
-        upper, lower: z of the planes in the body's frame (mm).
-        """
+    def fill(self, upper: float, lower: float) -> tuple[list[NamedFace], list[Loop], list[Loop]]:
+        """Return the faces of the lens, and the loops around it in the body's planes at z = upper and lower (mm)."""
         lens, (rim, *holes) = self.lens, self.loops
-        over, under = fit(lens, rim, (lower - self.z, upper - self.z), self.name)
-        if self.draft and under is not False:
+        above_back, below_front = check_fit(lens, rim, (lower - self.z, upper - self.z), self.name)
+        if self.draft and below_front is not False:
             raise ValueError(
-                f"{self.name}: draft and bevel are of its own walls, below the flange, whose lower face, z = {lower:g} "
-                "mm, leaves none; leave them out, or move it up"
+                f"{self.name}: draft and bevel need a wall of the lens below the flange, but the flange's lower face, "
+                f"z = {lower:g} mm, leaves none; leave them out, or move the flange up"
             )
-        tops = [walls.on(lens.back, loop) for loop in self.loops]
-        inner = [walls.on(lens.front.around, hole) for hole in holes]
-        top, plane = walls.on(Plane(upper - self.z), rim), Plane(lower - self.z)
+        tops = [walls.rail_on(lens.back, loop) for loop in self.loops]
+        inner = [walls.rail_on(lens.front.around, hole) for hole in holes]
+        top, plane = walls.rail_on(Plane(upper - self.z), rim), Plane(lower - self.z)
         faces = [(cap(back_patch(lens), tops, along=True), "back")]
-        faces += walls.over(rim, tops[0], top, outward=False) if over else walls.over(rim, top, tops[0])
-        if under is None:  # the lower plane is the front's: one face
+        low, high = (tops[0], top) if above_back else (top, tops[0])
+        faces += walls.upright_walls(rim, low, high, outward=not above_back)
+        if below_front is None:  # the front lies in the lower plane: one face
             below = [rail.against() for rail in inner]
             if lens.front.outline is not None:
                 dome, edge = dome_cap(lens)
                 faces.append(dome)
                 below.append(edge.along())
         else:
-            bottom = walls.on(plane, rim)
-            if under:
-                low = walls.on(lens.front.around, rim)
-                faces += walls.over(rim, bottom, low, outward=False)
+            bottom = walls.rail_on(plane, rim)
+            if below_front:
+                low = walls.rail_on(lens.front.around, rim)
+                faces += walls.upright_walls(rim, bottom, low, outward=False)
             else:
-                leaning, low = walls.down(lens.front.around, self.loops, bottom, above=plane, draft=self.draft)
+                leaning, low = walls.leaning_walls(lens.front.around, self.loops, bottom, above=plane, draft=self.draft)
                 faces += leaning
             faces += front_caps(lens, [low, *inner])
             below = [bottom.along()]
         for hole, low, high in zip(holes, inner, tops[1:], strict=True):
-            faces += walls.over(hole, low, high, "hole")
-        moved = [(TopoDS.Face_s(face.Moved(self.there)), name) for face, name in faces]
+            faces += walls.upright_walls(hole, low, high, "hole")
+        moved = [(TopoDS.Face_s(face.Moved(self.location)), name) for face, name in faces]
         return moved, self._moved([top.against()]), self._moved(below)
 
     def _moved(self, loops: list[Loop]) -> list[Loop]:
-        return [[(TopoDS.Edge_s(edge.Moved(self.there)), forward) for edge, forward in loop] for loop in loops]
+        return [[(TopoDS.Edge_s(edge.Moved(self.location)), forward) for edge, forward in loop] for loop in loops]
 
 
-def fit(lens: Lens, rim: Sequence[Piece], planes: tuple[float, float], name: str) -> tuple[bool, bool | None]:
-    """(is the body's upper plane above the back's rim?, its lower plane below the front's?).
+def check_fit(lens: Lens, rim: Sequence[LoopPiece], planes: tuple[float, float], name: str) -> tuple[bool, bool | None]:
+    """Return True if the body's upper plane lies above the back's rim, and True if its lower one is below the front's.
 
-    The latter None: it is the plane of the front.  planes: z of the lower and the upper (mm), in the lens's frame.
-    ValueError if a plane cuts a rim, or the body misses the wall.
+    The second is None if the front lies in the lower plane.  planes: z of lower and upper plane in the lens's frame
+    (mm).  Raises ValueError if a plane cuts a rim, or the body misses the wall.
     """
     lower, upper = planes
     high, low = (sag(face, *rim_points(lens, rim)) for face in (lens.back, lens.front))
     below = lens.front.around
-    flat = below.sags(lens.outline) == (0.0, 0.0) and abs(lower - below.z) < NEAR
+    flat = below.sags(lens.outline) == (0.0, 0.0) and abs(lower - below.z) < WALL_TOLERANCE
     for side, z, face, heights in (("upper", upper, "back", high), ("lower", lower, "front", low)):
-        cuts = np.abs(z - heights).min() < SLIM or heights.min() <= z <= heights.max()
+        cuts = np.abs(z - heights).min() < MIN_WALL or heights.min() <= z <= heights.max()
         if cuts and not (flat and face == "front"):
             raise ValueError(
                 f"{name}: the flange's {side} face, z = {z:g} mm, cuts the rim of the {face}, which runs from z = "
@@ -236,23 +233,23 @@ def fit(lens: Lens, rim: Sequence[Piece], planes: tuple[float, float], name: str
                 + ", or into the plane of a plane front"
                 * (face == "front")
             )
-    if (np.minimum(upper, high) - np.maximum(lower, low)).min() < SLIM:
+    if (np.minimum(upper, high) - np.maximum(lower, low)).min() < MIN_WALL:
         raise ValueError(
             f"{name}: the flange, from z = {lower:g} to {upper:g} mm, misses the lens's wall, from z = {low.max():.4g} "
-            f"to {high.min():.4g} mm; move it there"
+            f"to {high.min():.4g} mm; move the flange there"
         )
     return bool(upper > high.max()), None if flat else bool(lower < low.min())
 
 
-def _with(face: cadquery.Face, instead: dict[int, list[Loop]] | None) -> TopoDS_Face:
-    """A plane face of the body with other loops for some of its wires; None: as it is."""
-    if instead is None:
+def _replace_loops(face: cadquery.Face, replacements: dict[int, list[Loop]] | None) -> TopoDS_Face:
+    """Return a plane face of the body with other loops for some of its wires; None: without change."""
+    if replacements is None:
         return face.wrapped
     loops: list[Loop] = []
     for k, wire in enumerate(face.Wires()):
         own = [(edge.wrapped, _is_forward(edge.wrapped)) for edge in wire.Edges()]
         forward = TopAbs_Orientation.TopAbs_FORWARD
-        loops += instead.get(k, [[(TopoDS.Edge_s(edge.Oriented(forward)), along) for edge, along in own]])
+        loops += replacements.get(k, [[(TopoDS.Edge_s(edge.Oriented(forward)), along) for edge, along in own]])
     return face_inside(BRep_Tool.Surface_s(face.wrapped), _is_forward(face.wrapped), *loops)
 
 
@@ -264,13 +261,13 @@ def _is_forward(shape: TopoDS_Shape) -> bool:
 
 
 def part_of(lens: Lens, mount: Mount) -> NamedSolid:
-    """The solid in the frame of the mount's datum, and its faces' names; ValueError if lens and flange do not fit."""
+    """Return the part in the frame of the mount's datum, with names of faces; ValueError if lens and flange misfit."""
     trim, draft = None if mount.rim is None else wire(mount.rim), Draft(mount.draft, mount.bevel)
     try:
         if mount.flange is None:
             found = named_solid(lens, trim, draft=draft)
         else:
-            found = mounted(body(mount.flange), [Placed(lens, trim, draft=draft)])
+            found = mounted(body(mount.flange), [PlacedLens(lens, trim, draft=draft)])
     except (Standard_Failure, StdFail_NotDone) as error:
         raise ValueError(
             f"mount: OCC cannot build it ({type(error).__name__}); make bevel or draft smaller, or leave them out"
@@ -279,7 +276,7 @@ def part_of(lens: Lens, mount: Mount) -> NamedSolid:
 
 
 def wire(outline: Round | Box) -> cadquery.Wire:
-    """An outline as a wire in the plane z = 0."""
+    """Return an outline as a wire in the plane z = 0."""
     import cadquery
 
     plane = cadquery.Workplane("XY")
@@ -290,7 +287,7 @@ def wire(outline: Round | Box) -> cadquery.Wire:
 
 
 def body(flange: Flange) -> cadquery.Workplane:
-    """The flange without an opening for the lens, in the scene's frame."""
+    """Return the flange without an opening for the lens, in the scene's frame."""
     import cadquery
 
     lean, height = math.tan(math.radians(flange.draft)), flange.thickness
@@ -309,9 +306,9 @@ def body(flange: Flange) -> cadquery.Workplane:
 
 
 def _bevelled(plate: cadquery.Solid, bevel: float, lean: float) -> cadquery.Solid:
-    """A plate with bevels of this height along z (mm), at 45 degrees; lean: of its walls inwards, mm a mm.
+    """Return a plate with bevels of a height (mm) along z, at 45 degrees; lean: inward slope of its walls, mm per mm.
 
-    Workplane.chamfer does not say which of its two lengths belongs to which face.
+    Workplane.chamfer does not state which of its two lengths belongs to which face.
     """
     import cadquery
 
@@ -324,7 +321,7 @@ def _bevelled(plate: cadquery.Solid, bevel: float, lean: float) -> cadquery.Soli
 
 
 def write_if_it_fits(lens: Lens, mount: Mount, path: str | Path, name: str, facts: Part) -> None:
-    """part.step, with the statements of [part]; no file if it cannot be built: then `part_of` gives the reason."""
+    """Write part.step with the statements of [part]; no file if it cannot be built: `part_of` gives the reason."""
     try:
         part = part_of(lens, mount)
     except ValueError:

@@ -1,11 +1,10 @@
-"""Arrays to OCC and back, and the optical faces of a lens as OCC surfaces: nothing is refitted.
+"""Exact OCC surfaces of the optical faces of a lens, and conversion of arrays to OCC and back.
 
-Each face is on the one kind of surface that is exactly the face; the back's poles are the design's control points and
-its knots the design's knots.  Every array that OCC needs (TColgp, TColStd) is built here and nowhere else, because
-OCC 8 moves those names.
+Each face has an OCC surface of its own kind, without a fit: the poles and knots of the back are the control points and
+knots of the design.  All OCC arrays (TColgp, TColStd) are built in this module, because OCC 8 moves those names.
 
-Large nets go to OCC and back as the bytes of its own binary files (BinTools), all poles at once and to the last bit:
-one by one, the poles of 2049 x 2049 control points take 6 s on their way in, and nearly as much on their way out.
+Large nets are passed to OCC and back as bytes of its binary files (BinTools), exact to the last bit.  One by one, the
+poles of 2049 x 2049 control points take 6 s to pass in, and nearly as long to read back.
 """
 
 from __future__ import annotations
@@ -32,34 +31,34 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.surfaces import Conic, Sphere
 
-WIDER = 1.02  # times as wide as the outline needs: the rim touches no border of the patch
-PARABOLA = 1e-10  # mm; a sphere that departs from its parabola by less is written as that parabola
+PATCH_MARGIN = 1.02  # width of a patch over that of the outline: the rim touches no border of the patch
+PARABOLA_TOLERANCE = 1e-10  # deviation (mm) from its parabola below which a sphere is written as that parabola
 
-Image = Callable[[np.ndarray, np.ndarray], np.ndarray]  # (x, y) in mm -> (…, 2) in the parameter plane of a patch
+ParameterMap = Callable[[np.ndarray, np.ndarray], np.ndarray]  # map from (x, y) in mm to (u, v) of a patch, (…, 2)
 
 
 @dataclass(frozen=True)
 class Patch:
-    """The surface of an optical face."""
+    """The OCC surface of an optical face."""
 
     surface: Geom_Surface
-    outward: bool  # does the surface's own normal, ∂u x ∂v, point out of the lens?
-    uv: Image | None = None  # None: the surface is a plane, on which OCC needs no images of edges
+    outward: bool  # True if the normal of the surface, ∂u x ∂v, points out of the lens
+    uv: ParameterMap | None = None  # None: a plane, on which OCC needs no edges in (u, v)
 
 
 def back_patch(lens: Lens) -> Patch:
-    """z = Σ B_i(u) B_j(v) P_ij on the design's own net and knots (3, 1, …, 1, 3), normal towards +z."""
+    """Return the back: Σ B_i(u) B_j(v) P_ij on the design's net and knots (3, 1, …, 1, 3), normal towards +z."""
     return _net_patch(lens.back.plain(), lens.outline, outward=True)
 
 
 def _net_patch(face: BSplineSurface, outline: Outline, outward: bool) -> Patch:
     if outline.is_round:
         _check_round(face, outline.radius)
-    return Patch(bspline_surface(face.control_points(), *map(knots, face.shape)), outward, of_net(face))
+    return Patch(bspline_surface(face.control_points(), *map(knots, face.shape)), outward, net_parameters(face))
 
 
-def of_net(face: BSplineSurface) -> Image:
-    """(x, y) in mm to (u, v) of a net."""
+def net_parameters(face: BSplineSurface) -> ParameterMap:
+    """Return the map from (x, y) in mm to the parameters (u, v) of a net."""
 
     def uv(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         ends = zip((x, y), (face.x, face.y), face.pitch, face.shape, strict=True)
@@ -70,7 +69,7 @@ def of_net(face: BSplineSurface) -> Image:
 
 
 def _check_round(surface: BSplineSurface, radius: float) -> None:
-    """A circle in the plane is a circle in (u, v) only where x(u) and y(v) are linear, with one common pitch."""
+    """Raise ValueError unless x(u) and y(v) are linear with one pitch inside the rim: a circle is one in (u, v)."""
     (x0, x1), (y0, y1) = surface.x, surface.y
     dx, dy = surface.pitch
     if abs(dx - dy) > 1e-12 * dx:
@@ -84,7 +83,7 @@ def _check_round(surface: BSplineSurface, radius: float) -> None:
 
 
 def front_patch(lens: Lens) -> Patch:
-    """The front on the one kind of OCC surface that is exactly that; its normal may point inwards."""
+    """Return the front as an OCC surface of its own kind; its normal may point inwards."""
     front, outline = lens.front.plain().optical, lens.front.outline or lens.outline
     if front.level:
         return level_patch(front.z)
@@ -94,23 +93,23 @@ def front_patch(lens: Lens) -> Patch:
 
 
 def level_patch(z: float) -> Patch:
-    """The plane z, seen from below."""
+    """Return the plane at z (mm), its normal towards -z."""
     return Patch(Geom_Plane(gp_Ax3(gp_Pnt(0, 0, z), gp_Dir(0, 0, -1), gp_Dir(1, 0, 0))), True)
 
 
 def _sphere_patch(front: Sphere, outline: Outline) -> Patch:
-    """The sphere with its polar axis along ±x and u = pi at the vertex: no pole (x = ±R) and no seam on the patch.
+    """Return a sphere with its polar axis along ±x and u = π at the vertex: no pole (x = ±R), no seam on the patch.
 
     With s = sign(c): x = s R sin v, y = -R cos v sin u, z - z_centre = s R cos v cos u; normal away from the centre.
-    A sphere whose centre lies 10⁵ mm away would lose its digits: it is written as the parabola z0 + c r²/2, from which
-    it departs by c³ r⁴/8 < PARABOLA.
+    A sphere with its centre 10⁵ mm away would lose digits.  It is written as the parabola z0 + c r²/2, from which it
+    deviates by c³ r⁴/8 < PARABOLA_TOLERANCE.
     """
     c, r = front.curvature, float(np.hypot(*outline.farthest))
     if abs(c) * r >= 1:
         raise ValueError(
             f"lens.front: a sphere of radius {1 / abs(c):g} mm ends inside the lens's rim at {r:g} mm; flatten it"
         )
-    if abs(c) ** 3 * r**4 / 8 < PARABOLA:
+    if abs(c) ** 3 * r**4 / 8 < PARABOLA_TOLERANCE:
         return _conic_patch(Conic(front.z, c, -1.0), outline)
     s, R = np.sign(c), 1 / abs(c)
 
@@ -123,10 +122,10 @@ def _sphere_patch(front: Sphere, outline: Outline) -> Patch:
 
 
 def conic_net(front: Conic, a: float, b: float) -> tuple[np.ndarray, np.ndarray]:
-    """(poles (3, 3, 3) in mm, weights (3, 3)) of a conic over |u| <= a, |v| <= b (mm).
+    """Return poles (3, 3, 3) in mm and weights (3, 3) of a conic over |u| <= a, |v| <= b (mm).
 
     With K = (1 + k) c², w = 1 + K (u² + v²) / 4: x = u / w, y = v / w, z = z0 + c/2 (u² + v²) / w.  These are
-    homogeneous quadratics, so that a rational patch of degree 2 x 2 is the conic exactly: its projection from the far
+    homogeneous quadratics, so that a rational patch of degree 2 x 2 is exactly the conic, projected from its far
     vertex.  The blossom of u² over [-a, a] is a² (1, -1, 1).
     """
     ends, blossom = np.array([-1.0, 0.0, 1.0]), np.array([1.0, -1.0, 1.0])
@@ -140,7 +139,7 @@ def conic_net(front: Conic, a: float, b: float) -> tuple[np.ndarray, np.ndarray]
 
 
 def _conic_patch(front: Conic, outline: Outline) -> Patch:
-    """A rational patch; in its plane (see `conic_net`) circles about the axis are circles, straight sides arcs."""
+    """Return a rational patch (see `conic_net`): in (u, v) circles about the axis are circles, straight sides arcs."""
     bend = (1 + front.conic_constant) * front.curvature**2  # K
     a, b = outline.half_extent
 
@@ -148,22 +147,24 @@ def _conic_patch(front: Conic, outline: Outline) -> Patch:
         scale = 2 / (1 + np.sqrt(1 - bend * (x * x + y * y)))
         return np.stack([x * scale, y * scale], axis=-1)
 
-    # the outline's extent along u and v: at its corners, on its axes
+    # extent of the outline along u and v: at its corners, on its axes
     ends = np.maximum(uv(a, 0.0) + uv(0.0, b), 0.0 if outline.is_round else uv(a, b))
-    if not np.isfinite(ends).all() or not (abs(bend) / 4 * (WIDER * ends) ** 2).sum() < 1:
+    if not np.isfinite(ends).all() or not (abs(bend) / 4 * (PATCH_MARGIN * ends) ** 2).sum() < 1:
         raise ValueError(
             f"lens.front: a conic of constant {front.conic_constant:g} and radius {1 / abs(front.curvature):g} mm "
             f"turns too sharply before the rim, {np.hypot(*outline.farthest):g} mm from the axis; flatten it"
         )
-    half_u, half_v = WIDER * ends
+    half_u, half_v = PATCH_MARGIN * ends
     net, weights = conic_net(front, half_u, half_v)
     surface = bspline_surface(net, np.repeat([-half_u, half_u], 3), np.repeat([-half_v, half_v], 3), weights)
     return Patch(surface, False, uv)
 
 
-PATCHES: dict[str, Callable[..., Patch]] = {  # Patch of each kind of front that is no plane
-    "bspline": partial(_net_patch, outward=False), "sphere": _sphere_patch, "conic": _conic_patch,
-}  # fmt: skip
+PATCHES: dict[str, Callable[..., Patch]] = {  # function that returns the patch, for each kind of front but planes
+    "bspline": partial(_net_patch, outward=False),
+    "sphere": _sphere_patch,
+    "conic": _conic_patch,
+}
 
 
 # ---- arrays ----------------------------------------------------------------------------------------------------------
@@ -186,7 +187,6 @@ def _real_table(values: np.ndarray) -> TColStd_Array2OfReal:
 
 
 def _knot_arrays(full: np.ndarray) -> tuple[TColStd_Array1OfReal, TColStd_Array1OfInteger]:
-    """A full knot vector as OCC wants it: distinct values and their multiplicities."""
     values, counts = np.unique(full, return_counts=True)
     multiplicities = TColStd_Array1OfInteger(1, len(counts))
     for i, count in enumerate(counts.tolist(), start=1):
@@ -197,10 +197,10 @@ def _knot_arrays(full: np.ndarray) -> tuple[TColStd_Array1OfReal, TColStd_Array1
 def bspline_surface(
     net: np.ndarray, knots_u: np.ndarray, knots_v: np.ndarray, weights: np.ndarray | None = None
 ) -> Geom_BSplineSurface:
-    """The B-spline surface of a control net (m, n, 3) in mm and two full knot vectors; rational by weights (m, n)."""
+    """Return the B-spline surface of a control net (m, n, 3) in mm and full knots; rational with weights (m, n)."""
     m, n = net.shape[:2]
-    if weights is None and m * n > FEW:
-        return _surface_of(record(net, knots_u, knots_v))
+    if weights is None and m * n > SMALL_NET:
+        return _surface_of(surface_bytes(net, knots_u, knots_v))
     poles = TColgp_Array2OfPnt(1, m, 1, n)
     for i, row in enumerate(net.tolist(), start=1):
         for j, xyz in enumerate(row, start=1):
@@ -214,7 +214,7 @@ def bspline_surface(
 
 
 def bspline_curve(poles: np.ndarray, full_knots: np.ndarray) -> Geom_BSplineCurve:
-    """The B-spline curve of control points (n, 3) in mm and a full knot vector."""
+    """Return the B-spline curve of control points (n, 3) in mm and a full knot vector."""
     array = TColgp_Array1OfPnt(1, len(poles))
     for i, xyz in enumerate(poles.tolist(), start=1):
         array.SetValue(i, gp_Pnt(*xyz))
@@ -222,7 +222,7 @@ def bspline_curve(poles: np.ndarray, full_knots: np.ndarray) -> Geom_BSplineCurv
 
 
 def bspline_curve_2d(poles: np.ndarray, full_knots: np.ndarray) -> Geom2d_BSplineCurve:
-    """The B-spline curve of control points (n, 2) in the parameter plane of a face."""
+    """Return the B-spline curve of control points (n, 2) in the parameter plane of a face."""
     array = TColgp_Array1OfPnt2d(1, len(poles))
     for i, uv in enumerate(poles.tolist(), start=1):
         array.SetValue(i, gp_Pnt2d(*uv))
@@ -230,23 +230,24 @@ def bspline_curve_2d(poles: np.ndarray, full_knots: np.ndarray) -> Geom2d_BSplin
 
 
 def net_of(surface: Geom_BSplineSurface) -> np.ndarray:
-    """Control points (m, n, 3) in mm of an OCC B-spline surface, u along the first axis."""
+    """Return the control points (m, n, 3) in mm of an OCC B-spline surface, u along the first axis."""
     m, n = surface.NbUPoles(), surface.NbVPoles()
-    if m * n > FEW and not (surface.IsURational() or surface.IsVRational()):
-        return np.frombuffer(dumped(_face_on(surface)), "<f8", m * n * 3, BEFORE + HEAD.size).reshape(m, n, 3).copy()
+    if m * n > SMALL_NET and not (surface.IsURational() or surface.IsVRational()):
+        offset = SURFACE_OFFSET + SURFACE_HEADER.size
+        return np.frombuffer(to_bytes(_face_on(surface)), "<f8", m * n * 3, offset).reshape(m, n, 3).copy()
     pole = surface.Poles().Value
-    places = (pole(i, j).Coord() for i in range(1, m + 1) for j in range(1, n + 1))
-    return np.fromiter(places, np.dtype((float, 3)), m * n).reshape(m, n, 3)
+    points = (pole(i, j).Coord() for i in range(1, m + 1) for j in range(1, n + 1))
+    return np.fromiter(points, np.dtype((float, 3)), m * n).reshape(m, n, 3)
 
 
 def weights_of(surface: Geom_BSplineSurface) -> np.ndarray:
-    """The weights (m, n) of an OCC B-spline surface, all 1 if it is not rational."""
+    """Return the weights (m, n) of an OCC B-spline surface, all 1 if it is not rational."""
     m, n = surface.NbUPoles(), surface.NbVPoles()
     return np.array([[surface.Weight(i, j) for j in range(1, n + 1)] for i in range(1, m + 1)])
 
 
 def knots_of(surface: Geom_BSplineSurface) -> tuple[np.ndarray, np.ndarray]:
-    """The full knot vectors in u and in v of an OCC B-spline surface."""
+    """Return the full knot vectors in u and v of an OCC B-spline surface."""
     u, v = surface.UKnotSequence(), surface.VKnotSequence()
     return (
         np.array([u.Value(i) for i in range(u.Lower(), u.Upper() + 1)]),
@@ -256,49 +257,50 @@ def knots_of(surface: Geom_BSplineSurface) -> tuple[np.ndarray, np.ndarray]:
 
 # ---- nets as bytes of OCC's binary files -----------------------------------------------------------------------------
 
-FEW = 4096  # control points that are handed over one by one
-# A surface without weights: its kind (9 a B-spline), is it rational or periodic (4), degrees, poles, knots in u and v;
-# then the poles, v changing fastest, and each knot with its multiplicity.
-HEAD = struct.Struct("<B4B2H4i")
-KIND = 9
-KNOT = np.dtype([("value", "<f8"), ("count", "<i4")])
+SMALL_NET = 4096  # largest number of control points that are passed one by one
+# A surface without weights: its kind (9: B-spline), four flags (rational and periodic in u and v), degrees, numbers of
+# poles and of distinct knots in u and v; then the poles, v changing fastest, and each knot with its multiplicity.
+SURFACE_HEADER = struct.Struct("<B4B2H4i")
+BSPLINE_KIND = 9
+KNOT_RECORD = np.dtype([("value", "<f8"), ("count", "<i4")])
 
 
-def dumped(shape: TopoDS_Shape) -> bytes:
-    """A shape as a binary file of OCC."""
+def to_bytes(shape: TopoDS_Shape) -> bytes:
+    """Encode a shape as a binary file of OCC."""
     stream = BytesIO()
     BinTools.Write_s(shape, stream)
     return stream.getvalue()
 
 
-def read_back(data: bytes) -> TopoDS_Shape:
-    """The shape of such a file."""
+def from_bytes(data: bytes) -> TopoDS_Shape:
+    """Decode a shape from a binary file of OCC."""
     shape = TopoDS_Shape()
     BinTools.Read_s(shape, BytesIO(data))
     return shape
 
 
-def record(net: np.ndarray, *full_knots: np.ndarray) -> bytes:
-    """A B-spline surface of a control net (m, n, 3) in mm and two full knot vectors, as such a file has it."""
+def surface_bytes(net: np.ndarray, *full_knots: np.ndarray) -> bytes:
+    """Encode the B-spline surface of a control net (m, n, 3) in mm and full knots as in a binary file of OCC."""
     distinct = [np.unique(knots, return_counts=True) for knots in full_knots]
     degrees = (len(knots) - m - 1 for knots, m in zip(full_knots, net.shape, strict=False))
-    head = HEAD.pack(KIND, 0, 0, 0, 0, *degrees, *net.shape[:2], *(len(values) for values, _ in distinct))
-    ends = [np.rec.fromarrays(each, KNOT).tobytes() for each in distinct]
+    sizes = *net.shape[:2], *(len(values) for values, _ in distinct)
+    head = SURFACE_HEADER.pack(BSPLINE_KIND, 0, 0, 0, 0, *degrees, *sizes)
+    ends = [np.rec.fromarrays(each, KNOT_RECORD).tobytes() for each in distinct]
     return b"".join([head, np.ascontiguousarray(net, "<f8").tobytes(), *ends])
 
 
 def _face_on(surface: Geom_Surface) -> TopoDS_Face:
-    """The whole of a surface as a face without edges."""
     face = TopoDS_Face()
     BRep_Builder().MakeFace(face, surface, 1e-7)
     return face
 
 
 def _surface_of(own: bytes) -> Geom_BSplineSurface:
-    """The surface of a record: a small one gives way to it in a file."""
-    return BRep_Tool.Surface_s(TopoDS.Face_s(read_back(_FILE.replace(record(*_SMALL), own, 1))))
+    """Decode one surface: its bytes replace those of the placeholder in the file of a face."""
+    data = _PLACEHOLDER_FILE.replace(surface_bytes(*_PLACEHOLDER_NET), own, 1)
+    return BRep_Tool.Surface_s(TopoDS.Face_s(from_bytes(data)))
 
 
-_SMALL = (np.zeros((2, 2, 3)), *[np.array([0.0, 0.0, 1.0, 1.0])] * 2)  # net and knots
-_FILE = dumped(_face_on(bspline_surface(*_SMALL)))
-BEFORE = _FILE.index(record(*_SMALL))  # bytes of a file of one face before its surface
+_PLACEHOLDER_NET = (np.zeros((2, 2, 3)), *[np.array([0.0, 0.0, 1.0, 1.0])] * 2)  # control net and knots
+_PLACEHOLDER_FILE = to_bytes(_face_on(bspline_surface(*_PLACEHOLDER_NET)))
+SURFACE_OFFSET = _PLACEHOLDER_FILE.index(surface_bytes(*_PLACEHOLDER_NET))  # bytes before the surface in such a file

@@ -1,7 +1,7 @@
-"""Lenses on cadquery's Workplane: `import bstcad.cad.plugin`, and it has two methods more.
+"""Lenses on cadquery's Workplane: `import bstcad.cad.plugin` gives it two methods.
 
-Workplane.lens(design) puts a lens at each point of the stack, as `sphere` and `box` put theirs;
-Workplane.mounted(design) makes the body that is being built one with a lens at each point.
+Workplane.lens(design) puts a lens at each point of the stack, as `sphere` and `box` do with their solids.
+Workplane.mounted(design) joins the solid under construction with a lens at each point.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from typing import Any
 import cadquery
 
 from bstcad.cad import mounting
-from bstcad.cad.mounting import Placed
+from bstcad.cad.mounting import PlacedLens
 from bstcad.cad.solid import lens_solid
 
 
 def lens(
     self: cadquery.Workplane, design: Any, trim: cadquery.Wire | None = None, holes: Sequence[Any] = ()
 ) -> cadquery.Workplane:
-    """A lens at each point of the stack, where the origin of its scene comes to lie; a Workplane of these solids.
+    """Return a Workplane with a lens at each point of the stack, which is the origin of the lens's scene.
 
     design: a bstcad.Design or a bstcad.Lens; trim, holes: see Design.solid.
     """
@@ -30,15 +30,15 @@ def lens(
 def mounted(
     self: cadquery.Workplane, design: Any, z: float = 0.0, trim: cadquery.Wire | None = None, holes: Sequence[Any] = ()
 ) -> cadquery.Workplane:
-    """The solid of the chain and a lens at each point of the stack, all one solid; see bstcad.mounted.
+    """Return a Workplane with one solid: the solid of the chain and a lens at each point; see bstcad.mounted.
 
-    Of the points x and y count; the origin of the lens's scene comes to lie at the height z (mm).
+    Only x and y of the points are used; z: height (mm) of the origin of the lens's scene.
     """
     places: list[cadquery.Location] = []
     self.eachpoint(lambda place: places.append(place) or cadquery.Vertex.makeVertex(0, 0, 0))
     found, points = getattr(design, "lens", design), (place.toTuple()[0] for place in places)
-    placed = [Placed(found, trim, holes, (x, y, z)) for x, y, _ in points]
-    return self.newObject([mounting.mounted(self.findSolid(), placed).solid])
+    lenses = [PlacedLens(found, trim, holes, (x, y, z)) for x, y, _ in points]
+    return self.newObject([mounting.mounted(self.findSolid(), lenses).solid])
 
 
 cadquery.Workplane.lens = lens

@@ -1,8 +1,8 @@
-"""A lens as one valid solid: two caps, which lie on its exact faces, and walls over closed wires between them.
+"""A lens as one valid solid: two caps on its exact faces, and walls over closed wires between them.
 
-The wires are the lens's own outline, or any other inside it, and holes.  Each edge is built once and shared by the two
-faces that meet in it, in space and in the (u, v) planes of these faces.  No boolean and no sewing: both loosen the
-edges or refit the faces, and a boolean with a net of 513 x 513 takes half a minute.
+The wires are the lens's outline, or a closed wire inside it, and holes.  Each edge is built once and shared by the two
+faces that meet in it, in space and in the (u, v) planes of these faces.  Boolean operations and sewing are not used:
+they loosen the edges or refit the faces, and a boolean with a net of 513 x 513 takes half a minute.
 """
 
 from __future__ import annotations
@@ -23,8 +23,18 @@ from OCP.TopoDS import TopoDS_Face, TopoDS_Solid
 
 from bstcad.cad import patches, walls, wires
 from bstcad.cad.patches import Patch, back_patch, front_patch, level_patch
-from bstcad.cad.walls import RIM, SLIM, TOLERANCE, UPRIGHT, Draft, Named, Rail, face_inside, solid_of
-from bstcad.cad.wires import Curve, Piece
+from bstcad.cad.walls import (
+    MIN_WALL,
+    NO_DRAFT,
+    RIM_TOLERANCE,
+    SHAPE_TOLERANCE,
+    Draft,
+    NamedFace,
+    Rail,
+    face_inside,
+    solid_of,
+)
+from bstcad.cad.wires import LoopPiece, RailCurve
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.sides import as_pair, coarser
@@ -34,10 +44,10 @@ from bstcad.scene.mount import parting
 if TYPE_CHECKING:
     import cadquery
 
-SPARE = 4  # control points a side beyond the rim: two spans, and two more until x(u) is linear
-PLACES = 8  # points along a piece of the rim, a cell of the back's net
-EXACT = 1e-12  # of an image's size: one that leaves a line or a circle by less is that
-SAMPLES = 65  # points of an image that are compared with a line and a circle
+EXTRA_POINTS = 4  # control points outside the rim on each side: two spans, and two more until x(u) is linear
+POINTS_PER_CELL = 8  # points along a piece of the rim per cell of the back's longer side
+IMAGE_TOLERANCE = 1e-12  # deviation from a line or circle below which an image is one, relative to its size
+IMAGE_SAMPLES = 65  # points of an image that are compared with a line and a circle
 INVALID = (
     "lens: front, back and walls bound no valid solid; check that the back lies above the front, and move wires apart "
     "or make them simpler"
@@ -45,29 +55,29 @@ INVALID = (
 
 
 class NamedSolid(NamedTuple):
-    """A solid and the names of its faces, in its own order."""
+    """A solid and the names of its faces, in the order of solid.Faces()."""
 
     solid: cadquery.Solid
     faces: tuple[str, ...]  # "back", "front", "underside", "rim", "bevel", "hole" or "flange"
 
 
 def lens_solid(
-    lens: Lens, trim: cadquery.Wire | None = None, holes: Sequence = (), draft: Draft = UPRIGHT
+    lens: Lens, trim: cadquery.Wire | None = None, holes: Sequence = (), draft: Draft = NO_DRAFT
 ) -> cadquery.Solid:
-    """The lens inside `trim` (None: its own outline), less `holes`, as cadquery's solid, its faces oriented outwards.
+    """Return the lens inside `trim` (None: its outline) without `holes` as a cadquery solid, faces oriented outwards.
 
-    trim: a closed plane wire, used by its x and y; holes: such wires, or (x, y, diameter) in mm.  Walls stand along z,
-    but those around the lens as `draft` says, from a plane on that lies scene.mount.LAND below the back's rim.
-    ValueError in one sentence if a wire is open, crosses itself or another, or leaves the lens, or walls would meet, or
-    no valid solid exists.
+    trim: a closed plane wire, of which x and y are used; holes: such wires, or (x, y, diameter) in mm.  Walls are
+    parallel to z.  With `draft`, the outer walls lean from a plane on that lies scene.mount.LAND below the back's rim.
+    Raises ValueError in one sentence if a wire is open, crosses itself or another, or leaves the lens, if walls would
+    meet, or if no valid solid exists.
     """
     return named_solid(lens, trim, holes, draft).solid
 
 
 def named_solid(
-    lens: Lens, trim: cadquery.Wire | None = None, holes: Sequence = (), draft: Draft = UPRIGHT
+    lens: Lens, trim: cadquery.Wire | None = None, holes: Sequence = (), draft: Draft = NO_DRAFT
 ) -> NamedSolid:
-    """That solid, and the name of each of its faces, in their order: "back", "front", then the others."""
+    """Return the solid of `lens_solid` with the names of its faces: "back", "front", then the others."""
     import cadquery
 
     solid, names = lens_shape(lens, cut_loops(lens, trim, holes), draft)
@@ -75,31 +85,34 @@ def named_solid(
 
 
 def lens_shape(
-    lens: Lens, loops: Sequence[list[Piece]] | None = None, draft: Draft = UPRIGHT
+    lens: Lens, loops: Sequence[list[LoopPiece]] | None = None, draft: Draft = NO_DRAFT
 ) -> tuple[TopoDS_Solid, tuple[str, ...]]:
-    """The same without cadquery, whose import takes a second; loops: see `cut_loops` (None: the lens's own outline)."""
+    """Return the OCC solid of a lens and the names of its faces, without cadquery, whose import takes a second.
+
+    loops: rim and holes as `cut_loops` returns them (None: the lens's outline).
+    """
     lens, loops = lens.plain(), loops or [wires.of_outline(lens.outline)]
     check_thickness(lens)
     back, below = back_patch(lens), lens.front.around
-    tops, inner = [walls.on(lens.back, loop) for loop in loops], [walls.on(below, loop) for loop in loops[1:]]
-    named, low = _around(lens, loops, tops[0], draft)
+    tops, inner = [walls.rail_on(lens.back, loop) for loop in loops], [walls.rail_on(below, loop) for loop in loops[1:]]
+    named, low = _outer_walls(lens, loops, tops[0], draft)
     for each in zip(loops[1:], inner, tops[1:], strict=True):
-        named += walls.over(*each, "hole")
+        named += walls.upright_walls(*each, "hole")
     caps = [(cap(back, tops, along=True), "back"), *front_caps(lens, [low, *inner])]
     faces, names = zip(*caps, *named, strict=True)
     return solid_of(faces, INVALID), names
 
 
 def coarse_copy(lens: Lens, m: int) -> Lens:
-    """The lens with a back of m control points along its longer side, for viewers, which triangulate faces first.
+    """Return the lens with m control points along the longer side of its back, for viewers, which triangulate faces.
 
-    Each is as high as the back itself at its (x, y).  This follows relief wider than a few cells of the coarse net, and
-    smooths the rest (de Boor 1978, Schoenberg's operator); the copy does not steer light as the lens does.
+    Each control point has the height of the back at its (x, y), which is Schoenberg's operator (de Boor 1978).  It
+    follows relief wider than a few cells of the coarse net and smooths the rest.  The copy is not made for tracing.
     """
     lens = lens.plain()
     if m >= max(lens.back.shape):
         return lens
-    stretch = (m - 1) / (m - 1 - 2 * SPARE)
+    stretch = (m - 1) / (m - 1 - 2 * EXTRA_POINTS)
     reach = (max(-low, high) for low, high in (lens.back.x, lens.back.y))
     ends = [half if end <= half else stretch * half for half, end in zip(lens.outline.half_extent, reach, strict=True)]
     spans = zip(ends, as_pair(coarser(lens.back.shape, m)), (lens.back.x, lens.back.y), strict=True)
@@ -109,13 +122,13 @@ def coarse_copy(lens: Lens, m: int) -> Lens:
 
 
 def check_thickness(lens: Lens) -> None:
-    """The back must lie above the front everywhere; OCC's own check sees no face cross another.
+    """Raise ValueError unless the back lies above the front everywhere; OCC does not detect faces that cross.
 
-    Below SLIM the lens has no body left for the edges' tolerance.  A spline lies nowhere below its lowest control
-    point, which settles it for most lenses; for the others, three points a knot span each way.
+    Below MIN_WALL the lens is thinner than the tolerance of its edges allows.  A spline lies nowhere below its lowest
+    control point, which is sufficient for most lenses.  Others are sampled at three points per knot span each way.
     """
     lowest, highest = lens.back.sags(lens.outline)[0], lens.front.sags(lens.outline)[1]
-    if lens.back.z + lowest - (lens.front.z + highest) > SLIM:
+    if lens.back.z + lowest - (lens.front.z + highest) > MIN_WALL:
         return
     a, b = lens.outline.half_extent
     axes = (
@@ -127,7 +140,7 @@ def check_thickness(lens: Lens) -> None:
     x, y = x[inside].numpy(), y[inside].numpy()
     thickness = sag(lens.back, x, y) - sag(lens.front, x, y)
     i = int(thickness.argmin())
-    if not thickness[i] > SLIM:
+    if not thickness[i] > MIN_WALL:
         raise ValueError(
             f"lens: the back lies {thickness[i]:g} mm above the front at ({x[i]:g}, {y[i]:g}) mm; move the front down"
         )
@@ -136,11 +149,8 @@ def check_thickness(lens: Lens) -> None:
 # ---- the wires -----------------------------------------------------------------------------------------------------
 
 
-def cut_loops(lens: Lens, trim: cadquery.Wire | None, holes: Sequence) -> list[list[Piece]]:
-    """The rim counterclockwise, then the holes clockwise, so that the lens lies on their left.
-
-    ValueError if they cut no lens out.
-    """
+def cut_loops(lens: Lens, trim: cadquery.Wire | None, holes: Sequence) -> list[list[LoopPiece]]:
+    """Return the rim, counterclockwise, and the holes, clockwise; ValueError if the wires do not bound a lens."""
     loops = [wires.of_outline(lens.outline) if trim is None else _of_wire("trim", trim)]
     loops += [_hole(f"hole {k}", hole) for k, hole in enumerate(holes, start=1)]
     shape = wires.polygon(*loops)
@@ -151,26 +161,27 @@ def cut_loops(lens: Lens, trim: cadquery.Wire | None, holes: Sequence) -> list[l
             f"trim: the wire leaves the lens at ({x[outside][0]:.4g}, {y[outside][0]:.4g}) mm; draw it inside"
         )
     if fault := wires.fault(shape):
-        reason, place = fault
+        reason, position = fault
         raise ValueError(
-            f"trim or holes: {reason} near {place}; draw each wire simple, and the holes inside the rim and apart"
+            f"trim or holes: {reason} near {position}; draw wires that do not cross themselves or each other, and the "
+            "holes inside the rim"
         )
     if (dome := lens.front.outline) and not shape.contains(wires.polygon(wires.of_outline(dome))):
         raise ValueError(
             f"trim or holes: a wire crosses the front, {dome.words}, or lies inside it; draw it in the plane around it"
         )
-    turned = [shape.exterior.is_ccw, *(not hole.is_ccw for hole in shape.interiors)]
-    return [loop if right else wires.reversed_loop(loop) for loop, right in zip(loops, turned, strict=True)]
+    correct = [shape.exterior.is_ccw, *(not hole.is_ccw for hole in shape.interiors)]
+    return [loop if is_left else wires.reversed_loop(loop) for loop, is_left in zip(loops, correct, strict=True)]
 
 
-def _of_wire(name: str, wire: cadquery.Wire) -> list[Piece]:
+def _of_wire(name: str, wire: cadquery.Wire) -> list[LoopPiece]:
     try:
         return wires.of_wire(wire)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
 
 
-def _hole(name: str, hole: cadquery.Wire | Sequence[float]) -> list[Piece]:
+def _hole(name: str, hole: cadquery.Wire | Sequence[float]) -> list[LoopPiece]:
     if not isinstance(hole, Sequence):
         return _of_wire(name, hole)
     if len(hole) != 3 or not all(isinstance(each, numbers.Real) and math.isfinite(each) for each in hole):
@@ -185,17 +196,17 @@ def _hole(name: str, hole: cadquery.Wire | Sequence[float]) -> list[Piece]:
 
 
 def cap(patch: Patch, rails: Sequence[Rail], along: bool) -> TopoDS_Face:
-    """The back or the front inside the first rail and outside the others; along: seen from outside they follow it."""
+    """Return the back or front inside the first rail and outside the others; along: rails run forwards around it."""
     loops = [rail.along() if along else rail.against() for rail in rails]
     face = face_inside(patch.surface, patch.outward, *loops)
     for rail in rails if patch.uv is not None else ():
         for curve, edge in zip(rail.curves, rail.edges, strict=True):
-            BRep_Builder().UpdateEdge(edge, image(patch, curve), face, TOLERANCE)
+            BRep_Builder().UpdateEdge(edge, image(patch, curve), face, SHAPE_TOLERANCE)
     return face
 
 
-def front_caps(lens: Lens, rails: Sequence[Rail]) -> list[Named]:
-    """The faces of the front inside the first rail and outside the others: itself, or with it the plane around it."""
+def front_caps(lens: Lens, rails: Sequence[Rail]) -> list[NamedFace]:
+    """Return the front inside the first rail and outside the others, and the plane around it if it has an outline."""
     if lens.front.outline is None:
         return [(cap(front_patch(lens), rails, along=False), "front")]
     dome, rim = dome_cap(lens)
@@ -204,59 +215,60 @@ def front_caps(lens: Lens, rails: Sequence[Rail]) -> list[Named]:
     return [dome, (around, "underside")]
 
 
-def dome_cap(lens: Lens) -> tuple[Named, Rail]:
-    """The optical part of a front with an outline of its own, and its rim, counterclockwise."""
-    rim = walls.on(lens.front.optical, wires.of_outline(lens.front.outline))
+def dome_cap(lens: Lens) -> tuple[NamedFace, Rail]:
+    """Return the optical part of a front with its own outline, and its rim, counterclockwise."""
+    rim = walls.rail_on(lens.front.optical, wires.of_outline(lens.front.outline))
     return (cap(front_patch(lens), [rim], along=False), "front"), rim
 
 
-def image(patch: Patch, curve: Curve) -> Geom2d_Curve:
-    """The curve in the patch's parameter plane, by the same parameter: a line or a circle where it is one."""
+def image(patch: Patch, curve: RailCurve) -> Geom2d_Curve:
+    """Return a curve in the parameter plane of a patch, with the same parameter: a line or circle where it is one."""
     piece, cubic = curve.piece, curve.knots is not None and len(curve.knots) == len(curve.poles) + 4
-    t = np.unique(curve.knots) if cubic else np.linspace(0.0, piece.end, SAMPLES)
+    t = np.unique(curve.knots) if cubic else np.linspace(0.0, piece.end, IMAGE_SAMPLES)
 
     def points(t: np.ndarray) -> np.ndarray:
         return patch.uv(*piece.points(t).T)
 
     found = points(t)
-    near = EXACT * np.ptp(found, axis=0).max()
-    ends, share = found[[0, -1]], t[:, None] / piece.end
-    if np.abs(ends[0] + share * (ends[1] - ends[0]) - found).max() <= near:
+    tolerance = IMAGE_TOLERANCE * np.ptp(found, axis=0).max()
+    ends, fraction = found[[0, -1]], t[:, None] / piece.end
+    if np.abs(ends[0] + fraction * (ends[1] - ends[0]) - found).max() <= tolerance:
         return patches.bspline_curve_2d(ends, np.array([0.0, 0.0, piece.end, piece.end]))
     if piece.turn > 0:  # u + iv = centre + arm exp(it)?
         start, end = ends @ (1, 1j)
         arm = (end - start) / (cmath.exp(1j * piece.end) - 1)
         centre = start - arm
-        if np.abs(centre + arm * np.exp(1j * t) - found @ (1, 1j)).max() <= near:
+        if np.abs(centre + arm * np.exp(1j * t) - found @ (1, 1j)).max() <= tolerance:
             axis = gp_Ax2d(gp_Pnt2d(centre.real, centre.imag), gp_Dir2d(arm.real, arm.imag))
             return Geom2d_Circle(axis, abs(arm))
-    here, there = (np.diff(each, axis=0) for each in (piece.points(t), found))
-    scale = np.linalg.norm(there, axis=1).max() / np.linalg.norm(here, axis=1).max()
-    return patches.bspline_curve_2d(*wires.fitted(points, t, RIM * scale, smooth=not cubic))
+    chords, images = (np.diff(each, axis=0) for each in (piece.points(t), found))
+    scale = np.linalg.norm(images, axis=1).max() / np.linalg.norm(chords, axis=1).max()
+    return patches.bspline_curve_2d(*wires.fit_spline(points, t, RIM_TOLERANCE * scale, smooth=not cubic))
 
 
-def _around(lens: Lens, loops: list[list[Piece]], top: Rail, draft: Draft) -> tuple[list[Named], Rail]:
-    """The walls over the rim, the first loop, from the back's edge down to the front, and their edge there."""
+def _outer_walls(lens: Lens, loops: list[list[LoopPiece]], top: Rail, draft: Draft) -> tuple[list[NamedFace], Rail]:
+    """Return the walls over the rim, the first loop, from the back's edge down to the front, and their lower edge."""
     if not draft.angle:
-        return walls.down(lens.front.around, loops, top, above=lens.back, draft=draft)
+        return walls.leaning_walls(lens.front.around, loops, top, above=lens.back, draft=draft)
     plane = Plane(_parting(lens, loops[0]))
-    line = walls.on(plane, loops[0])
-    leaning, low = walls.down(lens.front.around, loops, line, above=plane, draft=draft)
-    return walls.over(loops[0], line, top) + leaning, low
+    line = walls.rail_on(plane, loops[0])
+    leaning, low = walls.leaning_walls(lens.front.around, loops, line, above=plane, draft=draft)
+    return walls.upright_walls(loops[0], line, top) + leaning, low
 
 
-def _parting(lens: Lens, rim: Sequence[Piece]) -> float:
-    """z of the plane from which walls lean (mm): below the back's rim, and above the front's."""
+def _parting(lens: Lens, rim: Sequence[LoopPiece]) -> float:
+    """Return z (mm) of the plane from which walls lean: below the rim of the back and above that of the front."""
     x, y = rim_points(lens, rim)
     low, high = sag(lens.back, x, y).min(), sag(lens.front, x, y).max()
-    if not low - high > SLIM:
+    if not low - high > MIN_WALL:
         raise ValueError(
-            f"draft: the back's rim comes down to z = {low:.4g} mm, and the front's rises to {high:.4g} mm, so that no "
-            "plane between them divides the wall; leave it out, or make the lens thicker at its edge"
+            f"draft: the rim of the back comes down to z = {low:.4g} mm, and the rim of the front rises to {high:.4g} "
+            "mm, so that no plane between them divides the wall; leave it out, or make the lens thicker at its edge"
         )
     return parting(lens.back, lens.front, x, y)
 
 
-def rim_points(lens: Lens, rim: Sequence[Piece]) -> np.ndarray:
-    """x and y (2, n) of points along a rim (mm), several in each cell of the back's net."""
-    return np.concatenate([piece.points(np.linspace(0.0, piece.end, PLACES * max(lens.back.shape))) for piece in rim]).T
+def rim_points(lens: Lens, rim: Sequence[LoopPiece]) -> np.ndarray:
+    """Return x and y (2, n) of points along a rim (mm), several in each cell of the back's net."""
+    count = POINTS_PER_CELL * max(lens.back.shape)
+    return np.concatenate([piece.points(np.linspace(0.0, piece.end, count)) for piece in rim]).T

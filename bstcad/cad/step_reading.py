@@ -1,10 +1,9 @@
-"""The lens that a STEP file holds, read by OCC; in a process of its own, since OCC may end it over a damaged file.
+"""Reading of the lens in a STEP file by OCC, in a second process, because OCC may crash over a damaged file.
 
-A lens that another program has turned or moved is read in its own frame, with its placement beside it: its axis is z,
-and light enters through the front, towards +z.
-Its faces, its outline and clear apertures, which the edges tell, and whether these edges lie on the faces that they
-bound: OCC's own checks look at the ends of an edge and at a few points between, and call a solid valid whose rim runs
-the long way around its circle.
+A lens that another program has moved is read in its own frame, together with its placement: its axis is z, and light
+enters through the front, towards +z.  Outline and clear apertures follow from the edges.  The edges are compared with
+the faces that they bound: OCC's own checks look at the ends of an edge and a few points between, and accept a solid
+whose rim runs the wrong way around its circle.
 """
 
 from __future__ import annotations
@@ -39,42 +38,42 @@ from bstcad.optics.bspline import SMALLEST_NET, BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle, Rounded
 from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Surface, sag
-from bstcad.step_text.placement import Placement, own_frame, unmoved
+from bstcad.step_text.placement import Placement, identity, own_frame
 
-UNIFORM = 1e-9  # mm; a net further from uniform in x and y is not one of ours
-AXIAL = 1e-9  # mm or rad; a wall further off does not belong to an outline about the axis
-ROUND = 1e-6  # mm; the edge of a round back follows its circle more closely
-LEVEL = 1e-7  # mm; a plane further off does not go on around a front
-DIGITS = 9  # of a clear aperture in mm: finer ones are rounding of the file's coordinates
-EDGE_POINTS = 129  # on each edge of a face
-SPAN_POINTS = 4  # points a knot span: one pole of a curve moves three spans
+GRID_TOLERANCE = 1e-9  # largest deviation (mm) of a net of bstcad from a uniform grid in x and y
+AXIS_TOLERANCE = 1e-9  # largest deviation (mm or rad) of a wall from an outline about the axis
+CIRCLE_TOLERANCE = 1e-6  # largest deviation (mm) of an edge from its circle or rectangle
+LEVEL_TOLERANCE = 1e-7  # largest distance (mm) of the plane around a front from the front's edge
+APERTURE_DECIMALS = 9  # decimals of a clear aperture in mm; finer ones are rounding of the file's coordinates
+POINTS_PER_EDGE = 129  # points on each edge of a face
+POINTS_PER_SPAN = 4  # points per knot span of an edge: one pole of a curve affects three spans
 
 Face = tuple[TopoDS_Face, BRepAdaptor_Surface]
 
 
 @dataclass(frozen=True)
 class StepLens:
-    """A lens as one STEP file holds it, in its own frame; lengths in mm."""
+    """A lens as read from a STEP file, in its own frame; lengths in mm."""
 
-    shape: TopoDS_Solid  # moved into that frame
-    control_points: np.ndarray  # (m, n, 3) of the back, x along the first axis, as OCC has them
+    shape: TopoDS_Solid  # solid in the frame of the lens
+    control_points: np.ndarray  # control points of the back as read by OCC, (m, n, 3), x along the first axis
     back: BSplineSurface
     front: Surface
-    outline: Outline  # of the walls of a lens and no more; of others how far the edge of the back reaches
-    edge: np.ndarray | None  # (n, 2) mm, once around the back, if its walls are not those of its outline
+    outline: Outline  # outline of a bare lens; for other walls, the extent of the back's edge
+    edge: np.ndarray | None  # points along the edge of the back, (n, 2), mm; None: a bare lens
     faces: tuple[TopoDS_Face, TopoDS_Face]  # front and back
-    placement: Placement = field(default_factory=unmoved)  # where that frame lies in the file
+    placement: Placement = field(default_factory=identity)  # placement of the lens's frame in the file
 
     @property
     def clear(self) -> tuple[Outline, Outline]:
-        """The clear apertures of front and back, by the edges of these faces; see `clear_apertures`."""
+        """Clear apertures of front and back, from the edges of these faces; see `clear_apertures`."""
         front, back = clear_apertures(*map(outer_edge, self.faces))
         return self.front.outline or front, back
 
 
 @contextmanager
-def silence() -> Iterator[None]:
-    """OCC prints no statistics, and no complaints about a file, inside the block."""
+def quiet_occ() -> Iterator[None]:
+    """Suppress OCC's statistics and messages about a file inside the block."""
     messenger = Message.DefaultMessenger_s()
     printers = list(messenger.Printers())
     for printer in printers:
@@ -87,19 +86,16 @@ def silence() -> Iterator[None]:
 
 
 def parts_of(shape: TopoDS_Shape, kind: TopAbs_ShapeEnum) -> list[TopoDS_Shape]:
-    """The solids, faces, edges or vertices of a shape, each once, as cadquery's Faces() has them.
-
-    Without cadquery, whose import would cost a proof 1.4 s.
-    """
+    """Return the solids, faces, edges or vertices of a shape, each once, as cadquery does, whose import takes 1.4 s."""
     parts = TopTools_IndexedMapOfShape()
     TopExp.MapShapes_s(shape, kind, parts)
     return [parts(i) for i in range(1, parts.Extent() + 1)]
 
 
 def solid(path: Path) -> TopoDS_Solid:
-    """The one solid in a STEP file, as OCC reads it; ValueError if there is not exactly one."""
+    """Read the solid in a STEP file; ValueError if there is not exactly one."""
     reader = STEPControl_Reader()
-    with silence():
+    with quiet_occ():
         if reader.ReadFile(str(path)) != IFSelect_RetDone:
             raise ValueError(f"{path.name}: OCC cannot read it, the file is damaged; write it again")
         reader.TransferRoots()
@@ -111,10 +107,7 @@ def solid(path: Path) -> TopoDS_Solid:
 
 
 def read(path: str | Path, shape: TopoDS_Solid | None = None) -> StepLens:
-    """The lens in a STEP file; ValueError in one sentence if OCC does not find exactly one there.
-
-    shape: its `solid`, where that is read already.
-    """
+    """Read the lens in a STEP file, or in its `shape` if known; ValueError in one sentence if there is not just one."""
     path = Path(path)
     try:
         found, placement = in_own_frame(shape or solid(path))
@@ -124,19 +117,19 @@ def read(path: str | Path, shape: TopoDS_Solid | None = None) -> StepLens:
 
 
 def lens(step_lens: StepLens, index: float) -> Lens:
-    """The lens of the file, of this refractive index, for tracing."""
+    """Return the lens of a file with a refractive index, for tracing."""
     return Lens(step_lens.front, step_lens.back, step_lens.outline, index)
 
 
 def is_valid(solid: TopoDS_Solid) -> bool:
-    """Does OCC find the re-read solid valid?"""
+    """True if OCC finds a re-read solid valid."""
     return BRepCheck_Analyzer(solid).IsValid()
 
 
 def gaps(solid: TopoDS_Solid) -> float:
-    """The largest tolerance (mm) of an edge or vertex of the re-read solid.
+    """Return the largest tolerance (mm) of an edge or vertex of a re-read solid.
 
-    OCC's reader calls a solid valid whose curves miss the faces, and writes down here how far.
+    OCC's reader accepts a solid whose curves miss the faces, and enlarges these tolerances by the distance.
     """
     return ShapeAnalysis_ShapeTolerance().Tolerance(solid, 1)
 
@@ -145,14 +138,14 @@ def gaps(solid: TopoDS_Solid) -> float:
 
 
 def in_own_frame(solid: TopoDS_Solid) -> tuple[TopoDS_Solid, Placement]:
-    """The solid of a lens in the frame of the lens, and the placement of that frame in the file.
+    """Return the solid of a lens in the frame of the lens, and the placement of that frame in the file.
 
-    The frame is the one in which the file defines the solid, where the back lies over x and y there; else it is that of
-    the back's net.  A solid without such a net stays in the frame of its definition.
+    If the back is a height over x and y in the frame in which the file defines the solid, that frame is the lens's.
+    Otherwise it is the frame of the back's net.  A solid without such a net keeps the frame of its definition.
     """
     stated = _placement(solid.Location())
     defined = TopoDS.Solid_s(solid.Located(TopLoc_Location()))
-    back = _back(_nets(_faces(defined)))
+    back = _back_face(_freeform_faces(_faces(defined)))
     if back is None:
         return defined, stated
     face, surface = back
@@ -166,16 +159,14 @@ def in_own_frame(solid: TopoDS_Solid) -> tuple[TopoDS_Solid, Placement]:
 
 
 def _placement(location: TopLoc_Location) -> Placement:
-    """A location of OCC as a placement."""
     if location.IsIdentity():
-        return unmoved()
+        return identity()
     motion = location.Transformation()
     rows = np.array([[motion.Value(i, j) for j in range(1, 5)] for i in range(1, 4)])
     return Placement(rows[:, :3], rows[:, 3])
 
 
 def _location(placement: Placement) -> TopLoc_Location:
-    """A placement as a location of OCC."""
     motion = gp_Trsf()
     motion.SetValues(*np.column_stack([placement.rotation, placement.shift]).ravel().tolist())
     return TopLoc_Location(motion)
@@ -186,25 +177,25 @@ def _location(placement: Placement) -> TopLoc_Location:
 
 def _lens_in(solid: TopoDS_Solid) -> StepLens:
     faces = _faces(solid)
-    nets = _nets(faces)
-    if (found := _back(nets)) is None:
+    nets = _freeform_faces(faces)
+    if (found := _back_face(nets)) is None:
         raise ValueError(f"{len(nets)} B-spline faces; a lens has one, or two that face away from each other")
     (back_face, back), fronts = found, [face for face in nets if face is not found]
     net = patches.net_of(back.BSpline())
     middle = (net[0, 0, :2] + net[-1, -1, :2]) / 2
-    if not np.abs(middle).max() <= AXIAL:
+    if not np.abs(middle).max() <= AXIS_TOLERANCE:
         raise ValueError(f"the net of the back is centred at {middle} mm; centre the lens on the axis")
     rest = [face for face in faces if face not in nets]
-    chosen = fronts[0] if fronts else _across_the_axis(rest)
-    front = freeform_surface(chosen[0]) if fronts else _front(*chosen)
+    chosen = fronts[0] if fronts else _front_face(rest)
+    front = freeform_surface(chosen[0]) if fronts else _front_surface(*chosen)
     others = [face for face in rest if face[0] is not chosen[0]]
-    if not fronts and (own := _own_outline(front, chosen[0], others)):
+    if not fronts and (own := _front_outline(front, chosen[0], others)):
         front = Recess(front, own)
         others = [face for face in others if not _is_level(face[1], front.around.z)]
-    outline, edge = _outline_of([surface for _, surface in others]), None
+    outline, edge = _outline_of_walls([surface for _, surface in others]), None
     if outline is None:
         edge = outer_edge(back_face)
-        outline = _around(edge)
+        outline = _bounding_outline(edge)
     faces = chosen[0], back_face
     return StepLens(solid, net, _uniform_net(back, net), front=front, outline=outline, edge=edge, faces=faces)
 
@@ -213,24 +204,23 @@ def _faces(solid: TopoDS_Solid) -> list[Face]:
     return [(face, BRepAdaptor_Surface(face)) for face in map(TopoDS.Face_s, parts_of(solid, TopAbs_FACE))]
 
 
-def _nets(faces: Sequence[Face]) -> list[Face]:
-    """The freeform faces among these."""
+def _freeform_faces(faces: Sequence[Face]) -> list[Face]:
     return [face for face in faces if is_freeform(face[1])]
 
 
-def _back(nets: Sequence[Face]) -> Face | None:
-    """The freeform face through which light leaves: of two the one that looks along the normal of its net."""
+def _back_face(nets: Sequence[Face]) -> Face | None:
+    """Return the freeform face through which light leaves: of two the one that looks along its net's normal."""
     backs = [face for face in nets if len(nets) == 1 or _looks_along_net(face[0])]
     return backs[0] if len(backs) == 1 and len(nets) <= 2 else None
 
 
 def _looks_along_net(face: TopoDS_Face) -> bool:
-    """Does a face look along ∂u x ∂v of its surface, as a height over (x, y) does that is seen from above?"""
+    """True if the outward normal of a face is ∂u x ∂v of its surface, as of a height over (x, y) seen from above."""
     return face.Orientation() != TopAbs_Orientation.TopAbs_REVERSED
 
 
 def is_freeform(surface: BRepAdaptor_Surface) -> bool:
-    """Has it a net larger than 3 x 3, which a conic or a nearly flat sphere is, and is no ruled wall?"""
+    """True if a surface has more than 3 x 3 control points (a conic or a nearly flat sphere) and is no ruled wall."""
     return _is_patch(surface) and surface.NbUPoles() * surface.NbVPoles() > 9
 
 
@@ -239,16 +229,13 @@ def _is_patch(surface: BRepAdaptor_Surface) -> bool:
 
 
 def freeform_surface(face: TopoDS_Face) -> BSplineSurface:
-    """The height over (x, y) that a face with a large net is, measured from where it crosses the axis.
-
-    ValueError if its net is none of bstcad's.
-    """
+    """Return the height over (x, y) of a face from its vertex; ValueError unless bstcad could have written its net."""
     surface = BRepAdaptor_Surface(face)
     return _uniform_net(surface, patches.net_of(surface.BSpline())).from_vertex()
 
 
 def _uniform_net(surface: BRepAdaptor_Surface, net: np.ndarray) -> BSplineSurface:
-    """ValueError unless its net is plain, of degree 2 x 2 on uniform knots, uniform in x and y."""
+    """Return the height of a net; ValueError unless it is plain, of degree 2 x 2, uniform in its knots, x and y."""
     patch = surface.BSpline()
     (m, n), degrees = (patch.NbUPoles(), patch.NbVPoles()), (patch.UDegree(), patch.VDegree())
     if degrees != (2, 2) or min(m, n) < SMALLEST_NET or patch.IsURational() or patch.IsVRational():
@@ -263,66 +250,62 @@ def _uniform_net(surface: BRepAdaptor_Surface, net: np.ndarray) -> BSplineSurfac
             raise ValueError(f"knots in {axis} are not 0 … {count - 2} ({worst}); give a file written by bstcad")
     found = BSplineSurface.from_control_points(net)
     off = np.abs(net - found.control_points())[..., :2].max(axis=-1)
-    if not off.max() <= UNIFORM:
+    if not off.max() <= GRID_TOLERANCE:
         i, j = divmod(int(off.argmax()), n)
         raise ValueError(
-            f"control points {off.max():.1e} mm off a uniform grid, the worst at ({i}, {j}); "
+            f"control points deviate by {off.max():.1e} mm from a uniform grid, the worst at ({i}, {j}); "
             "give a file written by bstcad"
         )
     return found
 
 
 def _looks_up(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> bool:
-    """Does a face look towards +z, out of the lens, in the middle of its parameters?"""
+    """True if the outward normal of a face points towards +z in the middle of its parameters."""
     u = (surface.FirstUParameter() + surface.LastUParameter()) / 2
     v = (surface.FirstVParameter() + surface.LastVParameter()) / 2
     [[_, along_u, along_v]] = points_and_tangents(surface, [u], [v])
     return (np.cross(along_u, along_v)[2] > 0) != (face.Orientation() == TopAbs_Orientation.TopAbs_REVERSED)
 
 
-def _across_the_axis(rest: Sequence[Face]) -> Face:
-    """The front that is no net: a sphere or a patch of 3 x 3, or the plane z = const that reaches the least far.
-
-    Planes of a flange reach further, or look the other way.
-    """
+def _front_face(rest: Sequence[Face]) -> Face:
+    """Return a front that is no net: a sphere, a patch of 3 x 3, or the smallest plane z = const that looks down."""
     planes = [face for face in rest if face[1].GetType() == Kind.GeomAbs_Plane]
-    level = [face for face in planes if abs(face[1].Plane().Axis().Direction().Z()) > 1 - AXIAL]
+    level = [face for face in planes if abs(face[1].Plane().Axis().Direction().Z()) > 1 - AXIS_TOLERANCE]
     if len(level) > 1:
-        down = (face for face in level if not _looks_up(*face))
-        level = sorted(down, key=lambda face: float(np.hypot(*outer_edge(face[0]).T).max()))
+        facing_down = (face for face in level if not _looks_up(*face))
+        level = sorted(facing_down, key=lambda face: float(np.hypot(*outer_edge(face[0]).T).max()))
     curved = [face for face in rest if face[1].GetType() == Kind.GeomAbs_Sphere or _is_patch(face[1])]
     if not (curved or level):
         raise ValueError("no plane, sphere or flat patch faces the light; give a file written by bstcad")
     return (curved or level)[0]
 
 
-def _own_outline(front: Surface, face: TopoDS_Face, others: Sequence[Face]) -> Circle | None:
-    """The outline of a curved front that ends in a plane z = const, which goes on around it; None: it ends on walls."""
+def _front_outline(front: Surface, face: TopoDS_Face, others: Sequence[Face]) -> Circle | None:
+    """Return the outline of a curved front with a plane z = const around it; None if it ends on walls."""
     if front.level:
         return None
-    edge = _around(outer_edge(face))
+    edge = _bounding_outline(outer_edge(face))
     if not edge.is_round:
         return None
-    rim = Circle(round(edge.radius, DIGITS))
+    rim = Circle(round(edge.radius, APERTURE_DECIMALS))
     z = Recess(front, rim).around.z
     return rim if any(_is_level(surface, z) and not _looks_up(other, surface) for other, surface in others) else None
 
 
 def _is_level(surface: BRepAdaptor_Surface, z: float) -> bool:
-    """Is it the plane z (mm)?"""
     if surface.GetType() != Kind.GeomAbs_Plane:
         return False
     plane = surface.Plane()
-    return abs(plane.Axis().Direction().Z()) > 1 - AXIAL and abs(plane.Location().Z() - z) <= LEVEL
+    return abs(plane.Axis().Direction().Z()) > 1 - AXIS_TOLERANCE and abs(plane.Location().Z() - z) <= LEVEL_TOLERANCE
 
 
-def _front(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> Surface:
+def _front_surface(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> Surface:
     if surface.GetType() == Kind.GeomAbs_Plane:
         return Plane(surface.Plane().Location().Z())
     if surface.GetType() != Kind.GeomAbs_Sphere:
         return _conic(surface.BSpline())
     centre, radius = surface.Sphere().Location(), surface.Sphere().Radius()
-    if max(abs(centre.X()), abs(centre.Y())) > AXIAL:
+    if max(abs(centre.X()), abs(centre.Y())) > AXIS_TOLERANCE:
         raise ValueError(f"the sphere's centre is at ({centre.X():g}, {centre.Y():g}), off the axis; centre the lens")
     rim = BRep_Tool.Pnt_s(TopoDS.Vertex_s(parts_of(face, TopAbs_VERTEX)[0]))
     side = 1.0 if centre.Z() > rim.Z() else -1.0
@@ -330,11 +313,11 @@ def _front(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> Surface:
 
 
 def _conic(patch: Geom_BSplineSurface) -> Sphere | Conic:
-    """z0, c and k from the poles and weights of a patch of 3 x 3 (see patches.conic_net).
+    """Return z0, c and k of the poles and weights of a patch of 3 x 3 (see patches.conic_net).
 
-    Q = a² + b² of its half widths; with weights of mean 1 at the corner and in the middle, w = 1 ± K Q / 4 there,
-    K = (1 + k) c², and z0 + c/2 Q / w and z0 - c/2 Q / w are their heights.  The parabola that a flat sphere is written
-    as reads as that sphere.
+    Let Q = a² + b² of the half widths, and scale the weights to mean 1 of corner and middle.  There w = 1 ± K Q / 4
+    with K = (1 + k) c², and the heights are z0 + c/2 Q / w and z0 - c/2 Q / w.  The parabola of a nearly flat sphere is
+    read as that sphere.
     """
     net, weights = patches.net_of(patch), patches.weights_of(patch)
     if net.shape != (3, 3, 3) or (patch.UDegree(), patch.VDegree()) != (2, 2):
@@ -347,31 +330,27 @@ def _conic(patch: Geom_BSplineSurface) -> Sphere | Conic:
     bend = 2 * (corner - middle) / size
     found = Conic(z, c, bend / c**2 - 1) if c else Conic(z)
     poles, expected = patches.conic_net(found, a, b)
-    if not (np.abs(poles - net).max() <= UNIFORM and np.abs(expected - weights).max() <= UNIFORM):
+    if not (np.abs(poles - net).max() <= GRID_TOLERANCE and np.abs(expected - weights).max() <= GRID_TOLERANCE):
         raise ValueError("the front is a patch of 3 x 3 and no conic; give a file written by bstcad")
-    flat = bend == 0 and abs(c) ** 3 * size**2 / 8 < 10 * patches.PARABOLA  # a round one's patch is wider
-    return Sphere(z, c) if flat else found
+    deviation = abs(c) ** 3 * size**2 / 8  # deviation from its parabola, on a patch wider than a round front
+    return Sphere(z, c) if bend == 0 and deviation < 10 * patches.PARABOLA_TOLERANCE else found
 
 
-def sample(
-    step_lens: StepLens, x: np.ndarray, y: np.ndarray, *, of: str = "back"
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Points (n, 3) of a re-read net at (x, y) (mm), evaluated by OCC, and its unit normals there, towards +z.
+def sample(step_lens: StepLens, x: np.ndarray, y: np.ndarray, *, of: str = "back") -> tuple[np.ndarray, np.ndarray]:
+    """Return points (n, 3) of a re-read net at (x, y) (mm), evaluated by OCC, and its unit normals towards +z.
 
-    of: "back", or "front" of a lens whose front is a net.
-
-    (u, v) comes from (x, y) by the closed form for uniform control points; the points' own x and y tell whether the
-    file's net is that uniform.
+    of: "back", or "front" of a lens whose front is a net.  (u, v) follow from (x, y) by the closed form for uniform
+    control points; x and y of the returned points show whether the net of the file is uniform.
     """
     number = ("front", "back").index(of)
-    u, v = patches.of_net(getattr(step_lens, of))(np.ravel(x), np.ravel(y)).T.tolist()
+    u, v = patches.net_parameters(getattr(step_lens, of))(np.ravel(x), np.ravel(y)).T.tolist()
     found = points_and_tangents(BRepAdaptor_Surface(step_lens.faces[number]).BSpline(), u, v)
     normals = np.cross(found[:, 1], found[:, 2])
     return found[:, 0], normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
 def points_and_tangents(surface: Any, u: Sequence[float], v: Sequence[float]) -> np.ndarray:
-    """(n, 3, 3) of a surface of OCC's at each (u, v): the point (mm) and the derivatives in u and in v."""
+    """Return the point (mm) and the derivatives in u and v of an OCC surface at each (u, v), (n, 3, 3)."""
 
     def evaluated() -> Iterator[tuple[float, ...]]:
         p, du, dv = gp_Pnt(), gp_Vec(), gp_Vec()
@@ -388,33 +367,33 @@ def points_and_tangents(surface: Any, u: Sequence[float], v: Sequence[float]) ->
 # ---- outlines ------------------------------------------------------------------------------------------------------
 
 
-def _outline_of(walls: Sequence[BRepAdaptor_Surface]) -> Outline | None:
-    """The outline whose wall these faces are and no more; None of others, such as those of a flange or with draft."""
+def _outline_of_walls(walls: Sequence[BRepAdaptor_Surface]) -> Outline | None:
+    """Return the outline whose walls are exactly these faces; None for others, as with a flange or with draft."""
     if all(wall.GetType() == Kind.GeomAbs_Cylinder for wall in walls):
         radii = [_radius(wall) for wall in walls]
-        return Circle(max(radii)) if radii and max(radii) - min(radii) <= AXIAL else None
+        return Circle(max(radii)) if radii and max(radii) - min(radii) <= AXIS_TOLERANCE else None
     if len(walls) == 4 and all(wall.GetType() == Kind.GeomAbs_Plane for wall in walls):
         planes = [wall.Plane() for wall in walls]
         normals = np.abs([plane.Axis().Direction().Coord() for plane in planes])
         points = np.array([plane.Location().Coord() for plane in planes])
-        along = [points[normals[:, axis] > 1 - AXIAL, axis] for axis in (0, 1)]
-        if all(len(pair) == 2 and abs(pair.sum()) <= AXIAL for pair in along):
+        along = [points[normals[:, axis] > 1 - AXIS_TOLERANCE, axis] for axis in (0, 1)]
+        if all(len(pair) == 2 and abs(pair.sum()) <= AXIS_TOLERANCE for pair in along):
             return Rectangle(*(float(np.ptp(pair)) for pair in along))
     return None
 
 
 def _radius(wall: BRepAdaptor_Surface) -> float:
-    """The radius (mm) of a cylinder on the axis; infinite off it."""
+    """Return the radius (mm) of a cylinder on the axis; infinite if it is off the axis."""
     axis = wall.Cylinder().Axis()
     off = max(abs(axis.Location().X()), abs(axis.Location().Y()), 1 - abs(axis.Direction().Z()))
-    return wall.Cylinder().Radius() if off <= AXIAL else math.inf
+    return wall.Cylinder().Radius() if off <= AXIS_TOLERANCE else math.inf
 
 
 def outer_edge(face: TopoDS_Face) -> np.ndarray:
-    """Points (n, 2) in mm along the outer edge of a face, once around."""
+    """Return points (n, 2) in mm along the outer edge of a face, once around."""
     parts, explorer = [], BRepTools_WireExplorer(BRepTools.OuterWire_s(face), face)
     while explorer.More():
-        points = _points(BRepAdaptor_Curve(explorer.Current()), np.linspace(0.0, 1.0, EDGE_POINTS))
+        points = _curve_points(BRepAdaptor_Curve(explorer.Current()), np.linspace(0.0, 1.0, POINTS_PER_EDGE))
         backwards = explorer.Orientation() == TopAbs_Orientation.TopAbs_REVERSED
         parts.append(points[:0:-1, :2] if backwards else points[:-1, :2])
         explorer.Next()
@@ -422,30 +401,31 @@ def outer_edge(face: TopoDS_Face) -> np.ndarray:
 
 
 def clear_apertures(front: np.ndarray, back: np.ndarray) -> tuple[Outline, Outline]:
-    """The clear apertures of front and back, by points (n, 2) in mm along the edges of these faces.
+    """Return the clear apertures of front and back from points (n, 2) in mm along the edges of these faces.
 
-    That of the back is the circle or the rectangle, its corners round or sharp, about the axis on which its edge lies.
-    That of the front lies inside it by the largest inset of the front's edge.  An edge that reaches beyond the back's,
-    as that of a front in one plane with a flange does, bounds no light that the lens is made for.
-    ValueError if the edge of the back is of another shape.
+    The aperture of the back is the circle or rectangle about the axis, with sharp or round corners, on which its edge
+    lies.  The aperture of the front is inset from it by the largest inset of the front's edge.  A front's edge outside
+    the back's, as of a front in the plane of a flange, does not limit the light of the lens.
+    Raises ValueError if the edge of the back has another shape.
     """
-    rim = _around(back)
+    rim = _bounding_outline(back)
     if rim.is_round:
-        rim = Circle(round(rim.radius, DIGITS))
+        rim = Circle(round(rim.radius, APERTURE_DECIMALS))
     else:
         corner = float((rim.width + rim.height) / 2 - np.abs(back).sum(axis=1).max()) / (2 - math.sqrt(2))
-        size = round(rim.width, DIGITS), round(rim.height, DIGITS)
-        rim = Rounded(*size, corner_radius=round(corner, DIGITS)) if corner > ROUND else Rectangle(*size)
-    if not (off := np.abs(rim.depth(*back.T)).max()) <= ROUND:
+        size = round(rim.width, APERTURE_DECIMALS), round(rim.height, APERTURE_DECIMALS)
+        corner = round(corner, APERTURE_DECIMALS) if corner > CIRCLE_TOLERANCE else 0.0
+        rim = Rounded(*size, corner_radius=corner) if corner else Rectangle(*size)
+    if not (off := np.abs(rim.depth(*back.T)).max()) <= CIRCLE_TOLERANCE:
         raise ValueError(f"the edge of the back lies up to {off:.2g} mm off any circle or rectangle about the axis")
     inset = float(rim.depth(*front.T).max())
-    return rim.inset(round(inset, DIGITS)) if inset > ROUND else rim, rim
+    return rim.inset(round(inset, APERTURE_DECIMALS)) if inset > CIRCLE_TOLERANCE else rim, rim
 
 
-def _around(points: np.ndarray) -> Outline:
-    """The circle about the axis on which all the points lie, else the rectangle about it that just holds them."""
+def _bounding_outline(points: np.ndarray) -> Outline:
+    """Return the circle about the axis on which all points lie, or else their bounding rectangle about the axis."""
     distance = np.hypot(*points.T)
-    if np.ptp(distance) <= ROUND:
+    if np.ptp(distance) <= CIRCLE_TOLERANCE:
         return Circle(float(distance.max()))
     return Rectangle(*(2 * np.abs(points).max(axis=0)).tolist())
 
@@ -453,46 +433,47 @@ def _around(points: np.ndarray) -> Outline:
 # ---- edges ---------------------------------------------------------------------------------------------------------
 
 
-def along_edges(solid: TopoDS_Shape) -> np.ndarray:
-    """(n, 3) ends and middles of all edges (mm), whatever their order."""
+def points_on_edges(solid: TopoDS_Shape) -> np.ndarray:
+    """Return the ends and middles of all edges, (n, 3), mm, in any order."""
     edges = map(TopoDS.Edge_s, parts_of(solid, TopAbs_EDGE))
-    curves = (BRepAdaptor_Curve(edge) for edge in edges if not BRep_Tool.Degenerated_s(edge))  # a cone's apex is
-    return np.concatenate([_points(curve, np.array([0.0, 0.5, 1.0])) for curve in curves])
+    edges = (edge for edge in edges if not BRep_Tool.Degenerated_s(edge))  # such as the apex of a cone
+    curves = map(BRepAdaptor_Curve, edges)
+    return np.concatenate([_curve_points(curve, np.array([0.0, 0.5, 1.0])) for curve in curves])
 
 
-def edges_off(shape: TopoDS_Shape, lens: Lens) -> tuple[tuple[float, str], tuple[float, str]]:
-    """Largest distance (mm) of an edge from a face it bounds, and from the wall of the lens, each with its place."""
+def edge_deviations(shape: TopoDS_Shape, lens: Lens) -> tuple[tuple[float, str], tuple[float, str]]:
+    """Return the largest distance (mm) of an edge from a face it bounds, and from the lens's wall, each with where."""
     spans = max(max(lens.back.shape) - 2, math.ceil(2 * max(lens.outline.half_extent) / lens.front.detail))
-    share = np.linspace(0.0, 1.0, SPAN_POINTS * spans + 1)
+    fractions = np.linspace(0.0, 1.0, POINTS_PER_SPAN * spans + 1)
     from_faces, from_wall = [], []
     for face in map(TopoDS.Face_s, parts_of(shape, TopAbs_FACE)):
         for each in map(TopoDS.Edge_s, parts_of(face, TopAbs_EDGE)):
-            points = _points(BRepAdaptor_Curve(each), share)
-            distance = np.linalg.norm(points - _points(BRepAdaptor_Curve(each, face), share), axis=1)
-            from_faces.append(_worst(distance, points))
-            from_wall.append(_worst(_off_wall(points, lens), points))
+            points = _curve_points(BRepAdaptor_Curve(each), fractions)
+            distance = np.linalg.norm(points - _curve_points(BRepAdaptor_Curve(each, face), fractions), axis=1)
+            from_faces.append(_largest(distance, points))
+            from_wall.append(_largest(_distance_from_wall(points, lens), points))
     nothing = (float("inf"), "no edge")
     return max(from_faces, default=nothing), max(from_wall, default=nothing)
 
 
-def _points(curve: BRepAdaptor_Curve, share: np.ndarray) -> np.ndarray:
-    """Points (n, 3) of a curve, in space or by way of a face, at shares of its parameter."""
+def _curve_points(curve: BRepAdaptor_Curve, fractions: np.ndarray) -> np.ndarray:
+    """Return points (n, 3) of a curve, in space or on a face, at fractions of its parameter interval."""
     first, last = curve.FirstParameter(), curve.LastParameter()
-    points = (curve.Value(t).Coord() for t in (first + share * (last - first)).tolist())
-    return np.fromiter(points, np.dtype((float, 3)), len(share))
+    points = (curve.Value(t).Coord() for t in (first + fractions * (last - first)).tolist())
+    return np.fromiter(points, np.dtype((float, 3)), len(fractions))
 
 
-def _worst(distance: np.ndarray, points: np.ndarray) -> tuple[float, str]:
+def _largest(distance: np.ndarray, points: np.ndarray) -> tuple[float, str]:
     distance = np.where(np.isfinite(distance), distance, np.inf)
     k = int(distance.argmax())
     return float(distance[k]), "at ({:.4g}, {:.4g}, {:.4g}) mm".format(*points[k])
 
 
-def _off_wall(points: np.ndarray, lens: Lens) -> np.ndarray:
-    """Distance of each point from the wall of the lens between its faces."""
+def _distance_from_wall(points: np.ndarray, lens: Lens) -> np.ndarray:
+    """Return the distance (mm) of each point from the wall of the lens between its faces."""
     x, y, z = points.T
-    beyond = np.maximum(z - sag(lens.back, x, y), sag(lens.front.around, x, y) - z)
-    off = np.maximum(np.abs(lens.outline.depth(x, y)), beyond)
+    outside = np.maximum(z - sag(lens.back, x, y), sag(lens.front.around, x, y) - z)
+    off = np.maximum(np.abs(lens.outline.depth(x, y)), outside)
     if (dome := lens.front.outline) is None:
         return off
-    return np.minimum(off, np.hypot(dome.depth(x, y), z - lens.front.around.z))  # or of the edge around the front
+    return np.minimum(off, np.hypot(dome.depth(x, y), z - lens.front.around.z))  # distance from its edge

@@ -1,9 +1,8 @@
-"""Writing STEP files that name and describe their part: AP242, or AP214 for older programs.
+"""Writing of STEP files with name and description of the part: AP242, or AP214 for older programs.
 
-OCC writes the solid with the names of its faces, colour, material and profile tolerances (its XCAF document).  Then its
-model is mended, since OCC calls the width of a tolerance metres though it is in mm, and a density in g/cm³ one in
-g³ cm²; and area, volume and centroid are added as properties of the part, which OCC would tie to the solid by a second
-representation of it.
+OCC writes the solid with the names of its faces, colour, material and profile tolerances (its XCAF document).  Units in
+its model are corrected: OCC states metres for the width of a tolerance in mm, and g³ cm² for a density in g/cm³.  Area,
+volume and centroid are added as properties of the part; OCC itself would need a second representation of the solid.
 """
 
 from __future__ import annotations
@@ -62,7 +61,7 @@ from OCP.XCAFDoc import XCAFDoc_ColorSurf, XCAFDoc_DocumentTool, XCAFDoc_GeomTol
 
 from bstcad.cad import step_nets
 from bstcad.cad.solid import lens_shape
-from bstcad.cad.step_reading import parts_of, silence
+from bstcad.cad.step_reading import parts_of, quiet_occ
 from bstcad.optics import quadrature
 from bstcad.optics.lens import Lens
 from bstcad.optics.quadrature import MassProperties
@@ -71,74 +70,81 @@ from bstcad.scene.mount import LENS_COLOUR, MIRROR_COLOUR, Part
 if TYPE_CHECKING:
     import cadquery
 
-SCHEMAS = {"AP242": "AP242DIS", "AP214": "AP214IS"}  # by the names that OCC gives them
-NOTHING = Part()
-EPOCH = "SOURCE_DATE_EPOCH"  # seconds since 1970, instead of now: then the same lens is the same file to the last byte
+SCHEMAS = {"AP242": "AP242DIS", "AP214": "AP214IS"}  # schema -> its name in OCC
+NO_FACTS = Part()
+TIME_VARIABLE = "SOURCE_DATE_EPOCH"  # variable with the time to state (seconds since 1970): equal lenses, equal bytes
 MILLI, METRE = StepBasic_SiPrefix.StepBasic_spMilli, StepBasic_SiUnitName.StepBasic_sunMetre
-PER_VOLUME = -3.0  # exponent of the length in a density
+DENSITY_EXPONENT = -3.0  # exponent of the length in a density
 
 
 def write(
-    shape: cadquery.Shape | TopoDS_Shape, path: str | Path, name: str, part: Part = NOTHING, faces: Sequence[str] = (),
+    shape: cadquery.Shape | TopoDS_Shape,
+    path: str | Path,
+    name: str,
+    part: Part = NO_FACTS,
+    faces: Sequence[str] = (),
     properties: MassProperties | None = None,
-) -> None:  # fmt: skip
-    """Write the shape (cadquery's or OCC's) as STEP in mm: see `encoded`."""
+) -> None:
+    """Write a shape of cadquery or OCC as a STEP file in mm; see `encode`."""
     with Path(path).open("wb") as file:
-        file.writelines(encoded(shape, name, part, faces=faces, properties=properties))
+        file.writelines(encode(shape, name, part, faces=faces, properties=properties))
 
 
 def write_lens(
     lens: Lens, path: str | Path, name: str, part: Part | None = None, properties: MassProperties | None = None
 ) -> None:
-    """Write the exact solid of the lens with names of its faces, area, volume and centroid.
+    """Write the exact solid of the lens with the names of its faces, area, volume and centroid.
 
-    part: the file states its facts; None: a colour.  properties: those of the lens, where they are known already.
-    ValueError if the lens's faces bound no solid.
+    part: facts that the file states; None: only a colour.  properties: those of the lens, if they are known.
+    Raises ValueError if the faces of the lens bound no solid.
     """
     part = part or Part(colour=LENS_COLOUR if lens.passes.enters else MIRROR_COLOUR)
     shape, faces = lens_shape(lens)
     write(shape, path, name, part, faces=faces, properties=properties or quadrature.of_lens(lens))
 
 
-def encoded(
-    shape: cadquery.Shape | TopoDS_Shape, name: str, part: Part = NOTHING, faces: Sequence[str] = (),
+def encode(
+    shape: cadquery.Shape | TopoDS_Shape,
+    name: str,
+    part: Part = NO_FACTS,
+    faces: Sequence[str] = (),
     properties: MassProperties | None = None,
-) -> Iterator[bytes]:  # fmt: skip
-    """The text of the STEP file of a shape, one product called `name`, in parts.
+) -> Iterator[bytes]:
+    """Yield the text of the STEP file of a shape, one product called `name`, in parts.
 
-    part: its number, author, colour and material, and the tolerances of its faces "back" and "front".
-    faces: the names of all faces, in the order of shape.Faces(); () names none.
+    part: number, author, colour and material, and the tolerances of the faces "back" and "front".
+    faces: names of all faces, in the order of shape.Faces(); (): no names.
     properties: area, volume and centroid, by which a reader of the file can check the shape.
     """
     writer = STEPCAFControl_Writer()  # OCC's variables exist only once a writer does
-    with _settings(schema=SCHEMAS[part.schema]), silence():
-        shape, nets = step_nets.with_stand_ins(getattr(shape, "wrapped", shape))
+    with _settings(schema=SCHEMAS[part.schema]), quiet_occ():
+        shape, nets = step_nets.with_placeholders(getattr(shape, "wrapped", shape))
         document = _document(shape, part, faces)
         if not writer.Transfer(document, STEPControl_AsIs):
             raise ValueError(f"{name}: OCC cannot express this shape in STEP; check that the solid is valid")
     control = writer.ChangeWriter()
     model = control.Model()
-    _mend(model)
+    _correct_units(model)
     if properties is not None:
         _add_properties(model, properties)
     _label(model, name, part)
-    stand_ins = step_nets.stand_ins_of(model, len(nets))
+    placeholders = step_nets.placeholder_numbers(model, len(nets))
     text, stream = StepData_StepWriter(model), BytesIO()
-    reals = text.FloatWriter()  # as OCC sets it, zeros are suppressed, and with them digits: -13.71428571428
-    reals.SetFormat(step_nets.SCIENTIFIC)
-    reals.SetFormatForRange(step_nets.FIXED, step_nets.LEAST, step_nets.MOST)
+    reals = text.FloatWriter()  # OCC's default suppresses zeros, and digits with them: -13.71428571428
+    reals.SetFormat(step_nets.SCIENTIFIC_FORMAT)
+    reals.SetFormatForRange(step_nets.FIXED_FORMAT, step_nets.FIXED_MIN, step_nets.FIXED_MAX)
     text.SendModel(control.WS().Protocol())
     text.Print(stream)
-    return step_nets.filled_in(stream.getvalue(), stand_ins, nets)
+    return step_nets.fill_in_nets(stream.getvalue(), placeholders, nets)
 
 
 @contextmanager
 def _settings(schema: str) -> Iterator[None]:
-    """OCC keeps settings of a file in variables of the whole process: set them for one file, then put them back."""
-    wanted = {"write.step.schema": schema, "write.stepcaf.subshapes.name": "On"}
-    before = {key: Interface_Static.CVal_s(key) for key in wanted}
+    """Set OCC's variables, which hold for the whole process, for one file; then restore them."""
+    settings = {"write.step.schema": schema, "write.stepcaf.subshapes.name": "On"}
+    before = {key: Interface_Static.CVal_s(key) for key in settings}
     try:
-        for key, value in wanted.items():
+        for key, value in settings.items():
             Interface_Static.SetCVal_s(key, value)
         yield
     finally:
@@ -147,7 +153,7 @@ def _settings(schema: str) -> Iterator[None]:
 
 
 def part21_string(name: str) -> str:
-    r"""Part 21 is ASCII: any other character, and the backslash, becomes \X2\, its hex digits in UTF-16, \X0\."""
+    r"""Encode text for Part 21: any character outside ASCII, and the backslash, becomes \X2\ UTF-16 in hex \X0\."""
 
     def escape(c: str) -> str:
         return c if " " <= c <= "~" and c != "\\" else "\\X2\\" + c.encode("utf-16-be").hex().upper() + "\\X0\\"
@@ -159,7 +165,6 @@ def part21_string(name: str) -> str:
 
 
 def _document(shape: TopoDS_Shape, part: Part, faces: Sequence[str]) -> TDocStd_Document:
-    """The shape as the document's one part."""
     document = TDocStd_Document(TCollection_ExtendedString("XmlXCAF"))
     shapes = XCAFDoc_DocumentTool.ShapeTool_s(document.Main())
     label = shapes.AddShape(shape, False)
@@ -179,13 +184,13 @@ def _document(shape: TopoDS_Shape, part: Part, faces: Sequence[str]) -> TDocStd_
         toleranced = TDF_LabelSequence()
         for face in (face for its, face in zip(faces, labels, strict=True) if its == name):
             toleranced.Append(face)
-        if width is not None and toleranced.Length():  # a plane front in the plane of a flange is no face by itself
+        if width is not None and toleranced.Length():  # a plane front in the plane of a flange has no face of its own
             _add_profile(document, toleranced, width)
     return document
 
 
 def _add_profile(document: TDocStd_Document, faces: TDF_LabelSequence, width: float) -> None:
-    """A profile tolerance of a surface, without a datum: a zone of this width (mm) about the surface as written."""
+    """Add a profile tolerance of a surface without a datum: a zone of a width (mm) about the surface as written."""
     tools = XCAFDoc_DocumentTool.DimTolTool_s(document.Main())
     label, tolerance = tools.AddGeomTolerance(), XCAFDimTolObjects_GeomToleranceObject()
     tolerance.SetType(Tolerance.XCAFDimTolObjects_GeomToleranceType_ProfileOfSurface)
@@ -197,32 +202,33 @@ def _add_profile(document: TDocStd_Document, faces: TDF_LabelSequence, width: fl
 # ---- the model of the file -----------------------------------------------------------------------------------------
 
 
-def _first(model: StepData_StepModel, kind: type) -> Any:
-    """The first entity of a kind: of those of the product, which stand before its shape."""
+def _first_entity(model: StepData_StepModel, kind: type) -> Any:
+    """Return the first entity of a kind: one of the product's, which precede its shape."""
     entities = (model.Value(i) for i in range(1, model.NbEntities() + 1))
     return next(entity for entity in entities if isinstance(entity, kind))
 
 
-def _mend(model: StepData_StepModel) -> None:
-    """Let the tolerances be in mm, and a density in g/cm³: they stand behind the shape and the product's category."""
+def _correct_units(model: StepData_StepModel) -> None:
+    """Set the unit of tolerances to mm and of a density to g/cm³; both follow the shape and the product's category."""
     for entity in (model.Value(i) for i in range(model.NbEntities(), 0, -1)):
         if isinstance(entity, StepBasic_ProductRelatedProductCategory):
             return
         if isinstance(entity, StepDimTol_GeometricTolerance):
             entity.Magnitude().UnitComponent().NamedUnit().SetPrefix(MILLI)
-        elif isinstance(entity, StepBasic_DerivedUnit):  # there is none but the density's
+        elif isinstance(entity, StepBasic_DerivedUnit):  # the density's, the only one
             for element in (entity.ElementsValue(i) for i in range(1, entity.NbElements() + 1)):
-                element.SetExponent(1.0 if isinstance(element.Unit(), StepBasic_SiUnitAndMassUnit) else PER_VOLUME)
+                is_mass = isinstance(element.Unit(), StepBasic_SiUnitAndMassUnit)
+                element.SetExponent(1.0 if is_mass else DENSITY_EXPONENT)
 
 
 def _add_properties(model: StepData_StepModel, properties: MassProperties) -> None:
     """Add area, volume and centroid as geometric validation properties of the part.
 
-    Names as in "Recommended Practices for Geometric and Assembly Validation Properties" of the CAx Interoperability
-    Forum.
+    Their names follow "Recommended Practices for Geometric and Assembly Validation Properties" of the CAx
+    Interoperability Forum.
     """
-    part = _first(model, StepRepr_ProductDefinitionShape)
-    context = _first(model, StepShape_ShapeDefinitionRepresentation).UsedRepresentation().ContextOfItems()
+    part = _first_entity(model, StepRepr_ProductDefinitionShape)
+    context = _first_entity(model, StepShape_ShapeDefinitionRepresentation).UsedRepresentation().ContextOfItems()
     point = StepGeom_CartesianPoint()
     point.Init3D(Text("centre point"), *properties.centroid)
     items: dict[str, StepRepr_RepresentationItem] = {
@@ -231,21 +237,21 @@ def _add_properties(model: StepData_StepModel, properties: MassProperties) -> No
         "centroid": point,
     }
     for name, item in items.items():
-        held = StepRepr_HArray1OfRepresentationItem(1, 1)
-        held.SetValue(1, item)
+        array = StepRepr_HArray1OfRepresentationItem(1, 1)
+        array.SetValue(1, item)
         target, defined = StepRepr_CharacterizedDefinition(), StepRepr_RepresentedDefinition()
         target.SetValue(part)
         definition, representation = StepRepr_PropertyDefinition(), StepRepr_Representation()
         definition.Init(Text("geometric validation property"), True, Text(name), target)
-        representation.Init(Text(name), held, context)
+        representation.Init(Text(name), array, context)
         defined.SetValue(definition)
-        both = StepRepr_PropertyDefinitionRepresentation()
-        both.Init(defined, representation)
-        model.AddWithRefs(both)
+        link = StepRepr_PropertyDefinitionRepresentation()
+        link.Init(defined, representation)
+        model.AddWithRefs(link)
 
 
 def _measure(name: str, kind: str, value: float, exponent: float) -> StepRepr_MeasureRepresentationItem:
-    """A number of mm, mm² or mm³."""
+    """Return a measure in mm, mm² or mm³, by the exponent."""
     millimetre, element = StepBasic_SiUnitAndLengthUnit(), StepBasic_DerivedUnitElement()
     millimetre.Init(True, MILLI, METRE)
     element.Init(millimetre, exponent)
@@ -262,14 +268,14 @@ def _measure(name: str, kind: str, value: float, exponent: float) -> StepRepr_Me
 
 
 def _label(model: StepData_StepModel, name: str, part: Part) -> None:
-    """Product and header of the one shape in a model (OCC would number a name it has seen before)."""
+    """Set product and header of the shape in a model (OCC would add a number to a name that it has used before)."""
     text = Text(part21_string(name))
-    product = _first(model, StepBasic_Product)
+    product = _first_entity(model, StepBasic_Product)
     product.SetId(text if part.number is None else Text(part21_string(part.number)))
     product.SetName(text)
     header = APIHeaderSection_MakeHeader(model)
     header.SetName(text)
-    seconds = os.environ.get(EPOCH, "")
+    seconds = os.environ.get(TIME_VARIABLE, "")
     if seconds.isdecimal() and len(seconds) < 12:  # https://reproducible-builds.org/specs/source-date-epoch
         header.SetTimeStamp(Text(datetime.fromtimestamp(int(seconds), UTC).strftime("%Y-%m-%dT%H:%M:%S")))
     header.SetOriginatingSystem(Text("bstcad"))

@@ -1,8 +1,8 @@
-"""batoid, a ray tracer in C++ and double precision for telescopes, as a judge: from face to face, ray by ray.
+"""batoid as a judge: a sequential ray tracer for telescopes, in C++ and double precision.
 
-A freeform face is its `Bicubic` on lines that fall on all knots: heights, slopes and mixed derivatives there make it
-the spline itself, but in the outermost one and a half pitches, where x is no linear function of the parameter.
-bstcad's source gives the start and the flux of each ray; batoid does the rest, without losses.
+A freeform face is its `Bicubic` on lines through all knots.  Heights, slopes and mixed derivatives there make it equal
+to the spline, except in the outermost one and a half pitches, where x is not linear in the parameter.  bstcad's source
+gives the start and the flux of each ray; batoid traces it, without losses.
 """
 
 from __future__ import annotations
@@ -26,62 +26,62 @@ from bstcad.optics.rays import Rays, axes
 from bstcad.optics.tilted import TiltedSurface
 from bstcad.optics.trace import launch_strips
 
-BEYOND = 0.125  # of a face's width: margin of its grid beyond the rim, where the search for a ray may begin
-ARCS = 4096  # corners of the polygon of an outline with round corners
-COMPARED = 100_000  # points at which its faces are compared with the lens's
+GRID_MARGIN = 0.125  # margin of a grid outside the rim over the face's width: the search for a ray may begin there
+POLYGON_CORNERS = 4096  # corners of the polygon of an outline with round corners
+COMPARISON_POINTS = 100_000  # points at which batoid's faces are compared with the lens's
 
 
 @dataclass(frozen=True)
-class Placed:
-    """A face of a lens as a surface of batoid's with its coordinate system."""
+class PlacedSurface:
+    """A face of a lens as a surface of batoid with its coordinate system."""
 
-    face: Face | None  # None: of a tilted window or mirror
-    surface: Any
-    frame: Any
+    face: Face | None  # face of the lens; None: a tilted window or mirror
+    surface: Any  # surface of batoid
+    frame: Any  # coordinate system of batoid
 
     def error(self, outline: Outline) -> FaceError:
-        """Against the lens's own face."""
-        exact = self.face.at(*faces.scattered(outline, COMPARED, seed=0))
+        """Return the error of the surface against the lens's face."""
+        exact = self.face.at(*faces.scattered(outline, COMPARISON_POINTS, seed=0))
         heights = self.surface.sag(exact.x, exact.y) + self.frame.origin[2]
         return FaceError.between(heights, self.surface.normal(exact.x, exact.y), exact)
 
 
-def placed(face: Face) -> Placed:
-    """A face as batoid has it."""
+def placed(face: Face) -> PlacedSurface:
+    """Return a face as a surface of batoid."""
     import batoid
 
     if isinstance(face, faces.Freeform):
-        x, y = map(_longer, face.lines(parts=1))
+        x, y = map(_extend, face.lines(parts=1))
         shape = face.on_grid(x, y)
         z = float(shape.z.mean())
         surface = batoid.Bicubic(x, y, shape.z - z, *(shape.z_x, shape.z_y, shape.z_xy))
-        return Placed(face, surface, _frame((0.0, 0.0, z)))
+        return PlacedSurface(face, surface, _frame((0.0, 0.0, z)))
     plane = not face.curvature
     surface = batoid.Plane() if plane else batoid.Quadric(1 / face.curvature, face.conic_constant)
-    return Placed(face, surface, _frame((0.0, 0.0, face.z0)))
+    return PlacedSurface(face, surface, _frame((0.0, 0.0, face.z0)))
 
 
-def surfaces(lens: Lens) -> tuple[Placed, ...]:
-    """The faces that light meets, in its order, those of windows and mirrors around the lens too."""
+def surfaces(lens: Lens) -> tuple[PlacedSurface, ...]:
+    """Return the faces that light meets, in its order, including windows and mirrors around the lens."""
     return tuple(
-        _tilted(surface) if isinstance(surface, TiltedSurface) else placed(faces.face(surface, lens.outline))
+        _place_tilted(surface) if isinstance(surface, TiltedSurface) else placed(faces.face(surface, lens.outline))
         for surface in (interface.surface for interface in lens.interfaces)
     )
 
 
-def _tilted(surface: TiltedSurface) -> Placed:
-    """A plane or a sphere in any place as batoid has it; nothing is compared with it."""
+def _place_tilted(surface: TiltedSurface) -> PlacedSurface:
+    """Return a plane or sphere in any position as a surface of batoid, without comparison."""
     import batoid
 
     n = np.array(surface.unit)
     e_x = np.cross((0.0, 1.0, 0.0), n)
     e_x /= np.linalg.norm(e_x)
     shape = batoid.Sphere(1 / surface.bend) if surface.bend else batoid.Plane()
-    return Placed(None, shape, _frame(surface.vertex, np.column_stack([e_x, np.cross(n, e_x), n])))
+    return PlacedSurface(None, shape, _frame(surface.vertex, np.column_stack([e_x, np.cross(n, e_x), n])))
 
 
 def vector(rays: Rays) -> Any:
-    """Rays of ours as batoid's, which move at the speed of light in their medium, here air."""
+    """Convert rays to batoid's, whose velocity is the speed of light in their medium, here air."""
     import batoid
 
     x, y, _ = rays.position
@@ -89,10 +89,7 @@ def vector(rays: Rays) -> Any:
 
 
 def land(rays: Any, screen: Screen, sense: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(x, y, arrived): where batoid's rays, which it moves on, meet the screen (mm, on its plane).
-
-    sense: -1 of light that comes to it along -z.
-    """
+    """Move batoid's rays to the screen; return x, y (mm, on it) and True if arrived; sense: -1 for light along -z."""
     import batoid
 
     x, y, _ = screen.middle
@@ -101,8 +98,8 @@ def land(rays: Any, screen: Screen, sense: int = 1) -> tuple[np.ndarray, np.ndar
     return rays.x + x, rays.y + y, arrived
 
 
-def through(lens: Lens, known: Sequence[Placed], rays: Rays) -> Any:
-    """Rays of ours from the source behind the lens, as batoid's; `known`: its surfaces."""
+def through(lens: Lens, known: Sequence[PlacedSurface], rays: Rays) -> Any:
+    """Trace rays of the source through the lens and return them as batoid's; known: surfaces of the lens in batoid."""
     import batoid
 
     theirs = vector(rays)
@@ -112,24 +109,24 @@ def through(lens: Lens, known: Sequence[Placed], rays: Rays) -> Any:
         else:
             media = (batoid.ConstMedium(n) for n in (interface.law.n_in, interface.law.n_out))
             batoid.refract(at.surface, theirs, *media, coordSys=at.frame)
-        if isinstance(interface.surface, TiltedSurface):  # its outline is that along z
+        if isinstance(interface.surface, TiltedSurface):  # the outline is a projection along z
             theirs.toCoordSys(batoid.CoordSys())
         batoid.obscure(_outside(interface.outline), theirs)
     return theirs
 
 
 def cannot(lens: Lens, channels: Sequence[Channel]) -> str:
-    """Why it cannot trace this light; "": it can, whatever the light is."""
+    """Return "": batoid can trace any light."""
     return ""
 
 
 def light(lens: Lens, channels: Sequence[Channel]) -> tuple[Channel, ...]:
-    """The channels with the losses that it simulates: none."""
+    """Return the channels without losses, which batoid does not simulate."""
     return tuple(replace(channel, losses=None) for channel in channels)
 
 
 def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int) -> Traced:
-    """The picture on a screen by that many stratified rays, in two halves."""
+    """Return the picture on a screen by that many stratified rays, in two halves."""
     n = max(1, round(side_factor(channels) * math.sqrt(rays / 2)))
     known = surfaces(lens)
     halves, count = np.zeros((2, *screen.shape)), 0
@@ -140,23 +137,22 @@ def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, se
             for strip in launch_strips(channel.source, glass, n, seed + half + 2 * place):
                 x, y, arrived = land(through(glass, known, strip), screen, sense)
                 flux = strip.flux.numpy()
-                landed += binned(x[arrived], y[arrived], flux[arrived], screen)
+                landed += bin_flux(x[arrived], y[arrived], flux[arrived], screen)
                 launched += flux.sum()
                 count += len(x)
-            picture += channel.weight / max(launched, 1.0) * landed  # cells on a beam's rim count in or out
+            picture += channel.weight / max(launched, 1.0) * landed  # cells on a beam's rim are inside or outside
     faces_of = zip(known[lens.solid], lens.interfaces[lens.solid], strict=True)
     return Traced(halves, count, FaceError.worst(face.error(interface.outline) for face, interface in faces_of))
 
 
-def binned(x: np.ndarray, y: np.ndarray, flux: np.ndarray, screen: Screen) -> np.ndarray:
-    """(rows, columns) flux that falls into each pixel, by numpy's histogram; row 0 = y max."""
+def bin_flux(x: np.ndarray, y: np.ndarray, flux: np.ndarray, screen: Screen) -> np.ndarray:
+    """Return the flux in each pixel (rows, columns) by numpy's histogram; row 0 = y max."""
     image, _, _ = np.histogram2d(y, x, bins=screen.shape, range=(screen.y, screen.x), weights=flux)
     return image[::-1]
 
 
-def _longer(line: np.ndarray) -> np.ndarray:
-    """Even lines, continued at both ends."""
-    step, more = line[1] - line[0], math.ceil(BEYOND * (len(line) - 1))
+def _extend(line: np.ndarray) -> np.ndarray:
+    step, more = line[1] - line[0], math.ceil(GRID_MARGIN * (len(line) - 1))
     return np.concatenate([line[0] - step * np.arange(more, 0, -1), line, line[-1] + step * np.arange(1, more + 1)])
 
 
@@ -167,13 +163,12 @@ def _frame(origin: tuple[float, float, float], turned: np.ndarray | None = None)
 
 
 def _outside(outline: Outline) -> Any:
-    """Obscuration of rays outside an outline."""
     import batoid
 
     if outline.is_round:
         inside = batoid.ObscCircle(outline.radius)
     elif outline.limits[2]:
-        inside = batoid.ObscPolygon(*faces.rim(outline, ARCS).T)
+        inside = batoid.ObscPolygon(*faces.rim(outline, POLYGON_CORNERS).T)
     else:
         inside = batoid.ObscRectangle(outline.width, outline.height)
     return batoid.ObscNegation(inside)

@@ -1,7 +1,7 @@
-"""The faces of a lens for programs not written here: heights, slopes, triangles; and a judge's picture.
+"""Faces of a lens for judges: heights, slopes and triangles; and the record of a judge's picture.
 
-Independent of the code that bstcad traces by: scipy's splines on the control net and its knots, and the sag of a
-surface of revolution in numpy.
+They are independent of bstcad's tracing: scipy's splines on the control net and its knots, and the sag of a surface of
+revolution in numpy.
 """
 
 from __future__ import annotations
@@ -21,43 +21,43 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.surfaces import Surface
 from bstcad.optics.unfolding import per_radian
 
-NEWTON = 6  # steps for the parameter of a point; the first guess is at most half a knot off
-CELLS = 512  # a side of the grid over a face without knots
-RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # of the plate, over the lens: thin triangles leak light
+NEWTON_STEPS = 6  # steps of Newton's method for a parameter; the first guess has an error of at most half a span
+GRID_CELLS = 512  # cells per side of the grid over a face without knots
+PLATE_RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # rings of the plate over the rim: slim triangles leak light
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A face at some points: arrays of one shape."""
+    """Heights and slopes of a face at some points, arrays of one shape."""
 
-    x: np.ndarray  # mm
-    y: np.ndarray  # mm
-    z: np.ndarray  # mm
+    x: np.ndarray  # position (mm)
+    y: np.ndarray  # position (mm)
+    z: np.ndarray  # height (mm)
     z_x: np.ndarray  # ∂z/∂x
     z_y: np.ndarray  # ∂z/∂y
     z_xy: np.ndarray | None = None  # ∂²z/∂x∂y (1/mm); None: not computed
 
     @property
     def points(self) -> np.ndarray:
-        """(…, 3) mm."""
+        """Points of the face, (…, 3), mm."""
         return np.stack([self.x, self.y, self.z], axis=-1)
 
     @property
     def normals(self) -> np.ndarray:
-        """(…, 3) unit normals towards +z."""
+        """Unit normals towards +z, (…, 3)."""
         normal = np.stack([-self.z_x, -self.z_y, np.ones_like(self.z)], axis=-1)
         return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
 
 
 @dataclass(frozen=True, eq=False)
 class Freeform:
-    """A quadratic B-spline of a net that is even in x and in y; beyond the net its tangent."""
+    """A quadratic B-spline of a net that is uniform in x and in y; outside the net its tangent."""
 
-    net: np.ndarray  # (m, n, 3) mm, x along the first axis
+    net: np.ndarray  # control net, (m, n, 3), mm, x along the first axis
 
     @cached_property
     def knots(self) -> tuple[np.ndarray, np.ndarray]:
-        """{0, 0, 0, 1, 2, …, m-3, m-2, m-2, m-2} along x, and the same of n along y."""
+        """Full knot vectors: {0, 0, 0, 1, 2, …, m-3, m-2, m-2, m-2} along x, with n instead of m along y."""
         m, n = (np.r_[0.0, 0.0, np.arange(m - 1.0), m - 2.0, m - 2.0] for m in self.net.shape[:2])
         return m, n
 
@@ -66,12 +66,12 @@ class Freeform:
         return tuple((float(self.net[0, 0, i]), float(self.net[-1, -1, i])) for i in (0, 1))
 
     def lines(self, parts: int) -> tuple[np.ndarray, np.ndarray]:
-        """x and y (mm) of the lines of an even grid, a pitch in 2 `parts`: on all knots, at 1.5, 2.5, … pitches."""
+        """Return x and y (mm) of grid lines, 2 `parts` per pitch, through all knots, at 1.5, 2.5, … pitches."""
         pairs = zip(self._ends, self.net.shape, strict=False)
         return tuple(np.linspace(*ends, 2 * parts * (m - 1) + 1) for ends, m in pairs)
 
     def at(self, x: np.ndarray, y: np.ndarray) -> Shape:
-        """At points (mm), by scipy's NdBSpline."""
+        """Evaluate the face at points (mm) by scipy's NdBSpline."""
         (inside_x, u, u_x), (inside_y, v, v_y) = self._parameter(x, 0), self._parameter(y, 1)
         spline = NdBSpline(self.knots, np.ascontiguousarray(self.net[..., 2]), 2)
         z, z_u, z_v = (spline(np.stack([u, v], axis=-1), nu=nu) for nu in ((0, 0), (1, 0), (0, 1)))
@@ -79,7 +79,7 @@ class Freeform:
         return Shape(x, y, z + z_x * (x - inside_x) + z_y * (y - inside_y), z_x=z_x, z_y=z_y)
 
     def on_grid(self, x: np.ndarray, y: np.ndarray) -> Shape:
-        """Where lines x and y (mm) cross, y along the first axis, with the mixed derivative; by scipy's BSpline."""
+        """Evaluate the face, with z_xy, where lines x and y (mm) cross, y along the first axis, by scipy's BSpline."""
         (inside_x, u, u_x), (inside_y, v, v_y) = self._parameter(x, 0), self._parameter(y, 1)
         along = [BSpline(self.knots[0], self.net[..., 2], 2)(u, nu=nu).T for nu in (0, 1)]
         z, z_u, z_v, z_uv = (BSpline(self.knots[1], a, 2)(v, nu=nu) for nu in (0, 1) for a in along)
@@ -90,13 +90,13 @@ class Freeform:
         return Shape(grid_x, grid_y, z, z_x=z_x + z_xy * off_y, z_y=z_y + z_xy * off_x, z_xy=z_xy)
 
     def _parameter(self, x: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(x clipped to the net, t, dt/dx): x(t) = Σ B_i(t) x_i, by Newton's method."""
+        """Return x clipped to the net, t and dt/dx, with x(t) = Σ B_i(t) x_i, by Newton's method."""
         ends, m = self._ends[axis], self.net.shape[axis]
         x = np.clip(x, *ends)
         along = BSpline(self.knots[axis], np.linspace(*ends, m), 2)
         last = m - 2.0
         t = np.clip((x - ends[0]) / (ends[1] - ends[0]) * (m - 1) - 0.5, 0.0, last)
-        for _ in range(NEWTON):
+        for _ in range(NEWTON_STEPS):
             t = np.clip(t - (along(t) - x) / along(t, nu=1), 0.0, last)
         return x, t, 1 / along(t, nu=1)
 
@@ -108,21 +108,23 @@ class Revolved:
     z0: float  # mm
     curvature: float  # c (1/mm)
     conic_constant: float  # k
-    half: tuple[float, float]  # half its bounding box (mm)
+    half: tuple[float, float]  # half extents along x and y (mm)
 
     def lines(self, parts: int) -> tuple[np.ndarray, np.ndarray]:
-        """x and y (mm) of the lines of an even grid over it; `parts` does not matter to a plane."""
-        cells = CELLS * parts if self.curvature else 64
+        """Return x and y (mm) of the lines of a uniform grid over the face; a plane ignores `parts`."""
+        cells = GRID_CELLS * parts if self.curvature else 64
         return tuple(np.linspace(-half, half, cells + 1) for half in self.half)
 
     def on_grid(self, x: np.ndarray, y: np.ndarray) -> Shape:
-        """Where lines x and y (mm) cross, y along the first axis."""
+        """Evaluate the face where lines x and y (mm) cross, y along the first axis."""
         return self.at(*np.meshgrid(x, y))
 
     def at(self, x: np.ndarray, y: np.ndarray) -> Shape:
-        """At points (mm)."""
+        """Evaluate the face at points (mm)."""
         c, r2 = self.curvature, x**2 + y**2
-        root = np.sqrt(np.maximum(1 - (1 + self.conic_constant) * c * c * r2, 1e-6))  # beyond its rim any value does
+        root = np.sqrt(
+            np.maximum(1 - (1 + self.conic_constant) * c * c * r2, 1e-6)
+        )  # any value is allowed outside the rim
         return Shape(x, y, self.z0 + c * r2 / (1 + root), z_x=c * x / root, z_y=c * y / root)
 
 
@@ -130,7 +132,7 @@ Face = Freeform | Revolved
 
 
 def face(surface: Surface, outline: Outline) -> Face:
-    """A surface of a lens of that outline."""
+    """Return the face of a surface of a lens with an outline."""
     plain = surface.plain()
     if plain.is_net:
         return Freeform(plain.control_points())
@@ -139,10 +141,10 @@ def face(surface: Surface, outline: Outline) -> Face:
 
 @dataclass(frozen=True)
 class FaceError:
-    """Error of a face as a program represents it."""
+    """Error of a face in a judge's representation."""
 
-    height: float  # mm, RMS
-    slope: float  # rad, RMS angle between normals
+    height: float  # RMS error of heights (mm)
+    slope: float  # RMS angle between normals (rad)
 
     def shift(self, lens: Lens, screen: Screen) -> float:
         """Return the shift of light on the screen, in its unit."""
@@ -150,14 +152,14 @@ class FaceError:
 
     @classmethod
     def worst(cls, errors: Iterable[FaceError]) -> FaceError:
-        """The largest height and the largest angle of several faces."""
+        """Return the largest errors of height and slope of several faces."""
         heights, slopes = zip(*((error.height, error.slope) for error in errors), strict=True)
         return cls(max(heights), max(slopes))
 
     @classmethod
     def between(cls, heights: np.ndarray, normals: np.ndarray, exact: Shape) -> FaceError:
-        """Heights (mm) and unit normals (…, 3) against the exact face at the same points."""
-        angles = np.linalg.norm(normals - exact.normals, axis=-1)  # of unit vectors so near each other
+        """Return the error of heights (mm) and unit normals (…, 3) against the exact face at the same points."""
+        angles = np.linalg.norm(normals - exact.normals, axis=-1)  # small-angle approximation
         return cls(*(float(np.sqrt(np.mean(p**2))) for p in (heights - exact.z, angles)))
 
 
@@ -165,14 +167,14 @@ class FaceError:
 class Traced:
     """A judge's picture of the light on a screen."""
 
-    halves: np.ndarray = field(repr=False)  # (2, rows, columns) flux a pixel, row 0 = y max, each of all light
-    rays: int  # of both halves
-    error: FaceError  # of its faces, the worse of the two, against the lens's
-    by: str = ""  # the program's variant, if it has several
+    halves: np.ndarray = field(repr=False)  # flux per pixel, (2, rows, columns), row 0 = y max, each of the whole light
+    rays: int  # number of rays in both halves
+    error: FaceError  # largest error of the judge's faces
+    by: str = ""  # variant of the program, if it has several
 
     @property
     def picture(self) -> np.ndarray:
-        """(rows, columns) mean of both halves."""
+        """Mean of both halves, (rows, columns)."""
         return self.halves.mean(axis=0)
 
 
@@ -180,7 +182,7 @@ class Traced:
 
 
 def rim(outline: Outline, points: int = 512) -> np.ndarray:
-    """(points, 2) of a closed curve (mm), anticlockwise: a circle as a polygon, a rectangle with all its corners."""
+    """Return points (points, 2) along an outline (mm), counterclockwise; a rectangle with all its corners."""
     if outline.is_round:
         turn = np.linspace(0, 2 * np.pi, points, endpoint=False)
         return outline.radius * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
@@ -191,16 +193,16 @@ def rim(outline: Outline, points: int = 512) -> np.ndarray:
 
 
 def onto(outline: Outline, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(inside, x, y): points (mm), those outside moved to the nearest point of the rim."""
+    """Return True for points inside an outline, and x and y (mm); points outside are moved to the nearest rim point."""
     a, b, r2 = outline.limits
     r, core_x, core_y = math.sqrt(r2), np.clip(x, -a, a), np.clip(y, -b, b)
-    apart = np.hypot(x - core_x, y - core_y)
-    shrink = r / np.maximum(apart, max(r, 1e-300))
-    return apart <= r, core_x + shrink * (x - core_x), core_y + shrink * (y - core_y)
+    distance = np.hypot(x - core_x, y - core_y)
+    shrink = r / np.maximum(distance, max(r, 1e-300))
+    return distance <= r, core_x + shrink * (x - core_x), core_y + shrink * (y - core_y)
 
 
 def scattered(outline: Outline, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Random points (mm) inside an outline, at most so many."""
+    """Return at most `count` random points x, y (mm) inside an outline."""
     a, b = outline.half_extent
     x, y = np.random.default_rng(seed).uniform([[-a], [-b]], [[a], [b]], (2, count))
     inside, _, _ = onto(outline, x, y)
@@ -211,7 +213,7 @@ def scattered(outline: Outline, count: int, seed: int) -> tuple[np.ndarray, np.n
 
 
 def _mesh(corners: np.ndarray, normals: np.ndarray, triangles: np.ndarray, uv: np.ndarray | None = None) -> Trimesh:
-    """Corners (n, 3) in mm and triangles (k, 3), with unit normals (n, 3) and coordinates in a texture (n, 2)."""
+    """Return the mesh of corners (n, 3) in mm and triangles (k, 3), with unit normals (n, 3) and texture uv (n, 2)."""
     mesh = Trimesh(corners, triangles, vertex_normals=normals, process=False)
     if uv is not None:
         mesh.vertex_attributes |= dict(zip("uv", uv.T.astype("<f4"), strict=True))
@@ -219,22 +221,22 @@ def _mesh(corners: np.ndarray, normals: np.ndarray, triangles: np.ndarray, uv: n
 
 
 def face_mesh(face: Face, outline: Outline, parts: int, up: bool) -> tuple[Trimesh, FaceError]:
-    """A face inside the outline, with exact normals towards +z or -z at its corners, and the error between these.
+    """Return a mesh of a face inside the outline, with exact normals towards +z or -z at its corners, and its error.
 
-    An even grid whose lines fall on all knots; normals are linear between its corners, as those of a quadratic spline
-    nearly are.  Cells that the rim cuts have their outer corners moved onto it; cells outside are left away.
+    The grid is uniform and has lines through all knots.  Between corners the normals are linear, nearly as those of a
+    quadratic spline.  Outer corners of cells on the rim are moved onto the rim; cells outside are omitted.
     """
     x, y = face.lines(parts)
     shape = face.on_grid(x, y)
     inside, rim_x, rim_y = onto(outline, shape.x, shape.y)
     at_corners = [inside[:-1, :-1], inside[:-1, 1:], inside[1:, 1:], inside[1:, :-1]]
-    kept, used = np.logical_or.reduce(at_corners), np.zeros_like(inside)
+    cells, used = np.logical_or.reduce(at_corners), np.zeros_like(inside)
     for corner in (used[:-1, :-1], used[:-1, 1:], used[1:, 1:], used[1:, :-1]):
-        corner |= kept
+        corner |= cells
     corners, normals, moved = shape.points, shape.normals, used & ~inside
     at_rim = face.at(rim_x[moved], rim_y[moved])
     corners[moved], normals[moved] = at_rim.points, at_rim.normals
-    numbers, (i, j) = np.cumsum(used).reshape(used.shape) - 1, np.nonzero(kept)
+    numbers, (i, j) = np.cumsum(used).reshape(used.shape) - 1, np.nonzero(cells)
     a, b, c, d = numbers[i, j], numbers[i, j + 1], numbers[i + 1, j + 1], numbers[i + 1, j]
     triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
     error = _mesh_error(face, shape, x, y, whole=np.logical_and.reduce(at_corners))
@@ -244,7 +246,7 @@ def face_mesh(face: Face, outline: Outline, parts: int, up: bool) -> tuple[Trime
 
 
 def _mesh_error(face: Face, shape: Shape, x: np.ndarray, y: np.ndarray, *, whole: np.ndarray) -> FaceError:
-    """Error in the middles of the whole cells, which are those of their diagonals."""
+    """Return the error at the centres of the whole cells, which are the middles of their diagonals."""
     middle = face.on_grid((x[:-1] + x[1:]) / 2, (y[:-1] + y[1:]) / 2)
     between = shape.normals[:-1, :-1] + shape.normals[1:, 1:]
     between /= np.linalg.norm(between, axis=-1, keepdims=True)
@@ -254,20 +256,20 @@ def _mesh_error(face: Face, shape: Shape, x: np.ndarray, y: np.ndarray, *, whole
 
 
 def wall(front: Face, back: Face, apertures: tuple[Outline, Outline]) -> Trimesh:
-    """The sides of a lens, from the rim of its front's clear aperture to that of its back's."""
+    """Return the sides of a lens between the rims of the clear apertures of front and back."""
     below, around = map(rim, apertures)
     low, high = front.at(*below.T).points, back.at(*around.T).points
     return _strips([low, high], np.c_[around / np.linalg.norm(around, axis=1, keepdims=True), np.zeros(len(around))])
 
 
 def plate(front: Face, outline: Outline) -> Trimesh:
-    """A plate with a hole in which the front sits, level with its rim."""
+    """Return a plate around the front, level with its rim."""
     hole = front.at(*rim(outline).T).points
-    return _strips([hole * (ring, ring, 1.0) for ring in RINGS], np.tile([0.0, 0.0, 1.0], (len(hole), 1)))
+    return _strips([hole * (ring, ring, 1.0) for ring in PLATE_RINGS], np.tile([0.0, 0.0, 1.0], (len(hole), 1)))
 
 
 def disc(outline: Outline, centre: tuple[float, float, float], along: tuple[float, float, float]) -> Trimesh:
-    """The inside of an outline on a level plane, with normals of any direction; u and v are 0 to 1 along x and y."""
+    """Return the inside of an outline on a level plane, with normals of any direction, and u, v from 0 to 1."""
     around = rim(outline, 4) if outline.shape == "rectangle" else rim(outline)
     points = np.concatenate([np.zeros((1, 2)), around])
     k = np.arange(len(around))
@@ -278,7 +280,7 @@ def disc(outline: Outline, centre: tuple[float, float, float], along: tuple[floa
 
 
 def _strips(curves: Sequence[np.ndarray], normals: np.ndarray) -> Trimesh:
-    """Strips between closed curves of equal numbers of points, one after the other."""
+    """Return strips of triangles between successive closed curves with equal numbers of points."""
     n = len(normals)
     k, after = np.arange(n), (np.arange(n) + 1) % n
     strip = np.concatenate([np.stack([k, after, after + n], axis=1), np.stack([k, after + n, k + n], axis=1)])

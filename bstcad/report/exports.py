@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from bstcad.cad.mesh import UNNAMED, Label, preview_files
+from bstcad.cad.mesh import DEFAULT_LABEL, Label, preview_files
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import Surface, sag
@@ -68,7 +68,7 @@ class Exported:
 
 
 def export(
-    lens: Lens, kinds: Sequence[str], folder: Path, points: int | None = None, label: Label = UNNAMED,
+    lens: Lens, kinds: Sequence[str], folder: Path, points: int | None = None, label: Label = DEFAULT_LABEL,
     mount: Mount | None = None, throw: Throw | None = None,
 ) -> Exported:  # fmt: skip
     """Write the files of these kinds, except SHEET, to the folder, each completely or not at all.
@@ -216,7 +216,7 @@ def _edge(layer: str, outline: Outline, x: float = 0.0, y: float = 0.0) -> Piece
     return layer, "box", (*outline.half_extent, math.sqrt(outline.limits[2]))
 
 
-def dxf(outline: Outline, mount: Mount | None = None, label: Label = UNNAMED) -> str:
+def dxf(outline: Outline, mount: Mount | None = None, label: Label = DEFAULT_LABEL) -> str:
     """Return a DXF R2010 drawing in mm: circles, and closed polylines whose rounded corners are arcs."""
     import ezdxf
 
@@ -243,7 +243,7 @@ def dxf(outline: Outline, mount: Mount | None = None, label: Label = UNNAMED) ->
     return text.getvalue()
 
 
-def svg(outline: Outline, mount: Mount | None = None, label: Label = UNNAMED) -> str:
+def svg(outline: Outline, mount: Mount | None = None, label: Label = DEFAULT_LABEL) -> str:
     """Return the drawing as SVG in true size.
 
     The SVG backend of ezdxf 1.4.5 is not used: it converts circles to splines and text to curves, rounds to a millionth

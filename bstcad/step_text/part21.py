@@ -1,13 +1,13 @@
-"""A reader for STEP files (ISO 10303-21) that shares no line with OCC: a second opinion on each file that is written.
+"""Reader of the lens in a STEP file (ISO 10303-21), independent of OCC: a second opinion on each written file.
 
 It reads the entities that the checks need: control nets, knots and multiplicities of the freeform faces, the product's
 name, the units, the number of solids, the uses of each edge, and the statements about the part besides its shape: area,
 volume, centroid, material, profile tolerances, by their names in "Recommended Practices for Geometric and Assembly
-Validation Properties" of the CAx Interoperability Forum.  Damage to these is refused in one sentence; OCC, which reads
-all of a file, does so in a process of its own.
+Validation Properties" of the CAx Interoperability Forum.  Damage to these entities is refused in one sentence.  OCC
+reads the whole file, in a second process.
 
-Every pattern takes a time in proportion to the text: a repeated part ends at a character that it cannot hold, and
-statements are cut apart before they are matched.
+Every pattern takes a time proportional to the text: a repeated group ends at a character that it cannot contain, and
+the text is split into statements before they are matched.
 """
 
 from __future__ import annotations
@@ -25,71 +25,71 @@ from bstcad.runs.files import one_line
 from bstcad.step_text import beginning
 from bstcad.step_text.assembly import placement_of, products_of
 from bstcad.step_text.entities import NAME, REAL, Entities, damaged, read_entities
-from bstcad.step_text.placement import Placement, unmoved
+from bstcad.step_text.placement import Placement, identity
 
-MAX_BYTES = 600_000_000  # of a file: 2049 x 2049 control points, 130 bytes each with all references to them
-MAX_DEGREE = 25  # of a spline; OCC goes no further
-CONIC_NET = 9  # control points of a conic or a nearly flat sphere; the net of a freeform face is larger
+MAX_BYTES = 600_000_000  # largest file (bytes): 2049 x 2049 control points of 130 bytes each, with references to them
+MAX_DEGREE = 25  # largest degree of a spline, as in OCC
+CONIC_NET = 9  # control points of a conic or a nearly flat sphere; a freeform face has more
 
 REALS = rf"{REAL}(?:,{REAL})*"
 COUNTS = r"\d{1,9}(?:,\d{1,9})*"
 FLAG = r"\.([TFU])\."
 REFERENCES = re.compile(rf"#{NAME}(?:,#{NAME})*")
-RULED = re.compile(r"\d+,1,")  # a wall: of degree 1 in v
+RULED = re.compile(r"\d+,1,")  # degrees of a ruled wall: 1 in v
 SURFACE = re.compile(
     rf"(\d{{1,9}}),(\d{{1,9}}),\(\((.*?)\)\),\.\w+\.,{FLAG},{FLAG},{FLAG},"
     rf"\(({COUNTS})\),\(({COUNTS})\),\(({REALS})\),\(({REALS})\),\.\w+\.\)"
 )
 VALIDATION, MATERIAL = "geometric validation property", "material property"
 PREFIXES = {"$": 1.0, ".MICRO.": 1e-6, ".MILLI.": 1e-3, ".CENTI.": 1e-2, ".DECI.": 1e-1, ".KILO.": 1e3}
-UNITS = {"METRE": 1e3, "GRAM": 1.0}  # mm, g
-PER_CM3 = 1e3  # g/mm³ in g/cm³
-UNKNOWN = math.nan  # a number that cannot be read, or in another unit: a check of it fails
+UNITS = {"METRE": 1e3, "GRAM": 1.0}  # SI units in mm and g
+PER_CM3 = 1e3  # density of 1 g/mm³ in g/cm³
+UNKNOWN = math.nan  # value of a number that cannot be read or has an unknown unit: its check fails
 NUMBER = r"[-+]?\d+(?:\.\d*(?:E[-+]?\d+)?)?"
-UNREADABLE = (LookupError, AttributeError, TypeError, ArithmeticError)  # an entity is missing, or of another form
+UNREADABLE = (LookupError, AttributeError, TypeError, ArithmeticError)  # errors of a missing or malformed entity
 
 
 @dataclass(frozen=True)
 class FreeformSurface:
-    """A B_SPLINE_SURFACE_WITH_KNOTS as the file states it; with weights it is another entity, and no lens of ours."""
+    """A B_SPLINE_SURFACE_WITH_KNOTS as written.  A rational surface is another entity, which bstcad never writes."""
 
-    degrees: tuple[int, int]  # u, v
-    control_points: np.ndarray  # (m, n, 3) mm, in the frame of the file, u along the first axis
-    knots: tuple[np.ndarray, np.ndarray]  # distinct values
-    multiplicities: tuple[np.ndarray, np.ndarray]
-    closed: tuple[bool, bool]
-    self_intersecting: bool | None  # None: the file does not know
-    entity: str  # its number in the file
+    degrees: tuple[int, int]  # degrees in u and v
+    control_points: np.ndarray  # control net, (m, n, 3), mm, in the frame of the file, u along the first axis
+    knots: tuple[np.ndarray, np.ndarray]  # distinct knots in u and v
+    multiplicities: tuple[np.ndarray, np.ndarray]  # multiplicity of each distinct knot
+    closed: tuple[bool, bool]  # closed in u, in v
+    self_intersecting: bool | None  # None: not stated
+    entity: str  # number of the entity in the file
 
     @property
     def full_knots(self) -> tuple[np.ndarray, np.ndarray]:
-        """Each knot repeated as often as it counts, in u and in v."""
+        """Full knot vectors in u and v, each knot repeated by its multiplicity."""
         u, v = (np.repeat(k, c) for k, c in zip(self.knots, self.multiplicities, strict=True))
         return u, v
 
 
 @dataclass(frozen=True)
-class Profile:
+class ProfileTolerance:
     """A profile tolerance of a surface."""
 
-    width: float  # of its zone (mm)
-    surface: str  # entity of the surface under the toleranced face; "": the file refers to it in another way
-    face: str = ""  # the name of that face
+    width: float  # width of the tolerance zone (mm)
+    surface: str  # entity of the toleranced face's surface; "": the file refers to it in an unknown form
+    face: str = ""  # name of that face
 
 
 @dataclass(frozen=True)
 class ValidationProperties:
-    """Each property as often as the file states it; (): it does not."""
+    """Properties of a part, each as often as the file states it; empty if it does not."""
 
-    areas: tuple[float, ...] = ()  # of the part's whole surface (mm²)
-    volumes: tuple[float, ...] = ()  # mm³
-    centroids: tuple[tuple[float, float, float], ...] = ()  # mm
+    areas: tuple[float, ...] = ()  # area of the whole surface (mm²)
+    volumes: tuple[float, ...] = ()  # volume (mm³)
+    centroids: tuple[tuple[float, float, float], ...] = ()  # centroid (mm)
     materials: tuple[str, ...] = ()
-    densities: tuple[float, ...] = ()  # g/cm³
-    profiles: tuple[Profile, ...] = ()
+    densities: tuple[float, ...] = ()  # density (g/cm³)
+    profiles: tuple[ProfileTolerance, ...] = ()
 
     def moved(self, placement: Placement) -> ValidationProperties:
-        """Return the properties of the part in another place."""
+        """Return the properties of the part after a placement."""
         if not placement.moves:
             return self
         moved = (placement(np.array(centroid)).tolist() for centroid in self.centroids)
@@ -97,34 +97,34 @@ class ValidationProperties:
 
     @property
     def of_shape(self) -> bool:
-        """Does the file state area, volume or centroid?"""
+        """True if the file states area, volume or centroid."""
         return bool(self.areas or self.volumes or self.centroids)
 
 
 @dataclass(frozen=True)
 class StepText:
-    """The text of one STEP file of one lens."""
+    """Contents of the STEP file of one lens, all lengths converted to mm."""
 
-    product: str
-    unit: str  # of length in the file, whose coordinates are in mm here: millimetre, metre, inch …
+    product: str  # name of the product
+    unit: str  # unit of length in the file: millimetre, metre, inch …
     angle: str  # unit of angles: radian, degree …
-    schema: str
-    solids: int  # MANIFOLD_SOLID_BREP and BREP_WITH_VOIDS
-    faces: int
-    surface: FreeformSurface  # the freeform back; of two nets the one that looks away from the other along u x v
-    front: FreeformSurface | None  # the other one
-    edge_uses: dict[int, tuple[int, int]]  # edge -> uses (forward, reversed)
+    schema: str  # schema that the header states
+    solids: int  # number of MANIFOLD_SOLID_BREP and BREP_WITH_VOIDS
+    faces: int  # number of faces
+    surface: FreeformSurface  # freeform back; of two nets the one whose normal u x v points away from the other
+    front: FreeformSurface | None  # freeform front; None: the front is no net
+    edge_uses: dict[int, tuple[int, int]]  # edge -> number of uses (forward, reversed)
     properties: ValidationProperties
-    placement: Placement = field(default_factory=unmoved)  # placement of its solid, as the file states it
+    placement: Placement = field(default_factory=identity)  # placement of the solid, as the file states it
 
     @property
     def closed(self) -> bool:
-        """Is every edge used exactly twice, once in each direction?"""
+        """True if every edge is used exactly twice, once in each direction."""
         return bool(self.edge_uses) and all(uses == (1, 1) for uses in self.edge_uses.values())
 
 
 def read(path: str | Path) -> StepText:
-    """The STEP file at `path`; ValueError if it is missing, truncated or not one lens."""
+    """Read the STEP file at `path`; ValueError if it is missing, truncated or not one lens."""
     path = Path(path)
     try:
         data = files.contents(path, MAX_BYTES)
@@ -137,7 +137,7 @@ def read(path: str | Path) -> StepText:
 
 
 def read_lens(path: str | Path, any_unit: bool = False) -> StepText:
-    """A lens in millimetres (any_unit: or another unit of length) and radians; ValueError for anything else."""
+    """Read a lens in millimetres (any_unit: in any unit of length) and radians; ValueError for anything else."""
     text, name = read(path), f"{Path(path).name}: read as text"
     if not any_unit and text.unit != "millimetre":
         raise ValueError(f"{name}: lengths in {text.unit}; export it in millimetres")
@@ -149,7 +149,7 @@ def read_lens(path: str | Path, any_unit: bool = False) -> StepText:
 
 
 def parse(text: bytes | str) -> StepText:
-    """The text of a STEP file of a lens; ValueError in one sentence if it is none."""
+    """Parse the text of a STEP file of a lens; ValueError in one sentence if it is none."""
     try:
         return _parse(text.encode("latin-1", "replace") if isinstance(text, str) else text)
     except ValueError as error:
@@ -169,13 +169,13 @@ def _parse(text: bytes) -> StepText:
     if len(lengths) != 1:
         raise ValueError(f"{len(lengths)} units of length ({', '.join(lengths)}); export it in millimetres only")
     ((unit, number),) = lengths.items()
-    size = _size(entities, number)  # mm
+    size = _unit_size(entities, number)  # mm
     if size is None or not 0 < size < math.inf:
         raise ValueError(f"lengths in {unit}, whose size in metres the file does not state; export it in millimetres")
     solids = [*entities.of("MANIFOLD_SOLID_BREP"), *entities.of("BREP_WITH_VOIDS")]
-    placement = placement_of(solids[0], entities) if len(solids) == 1 else unmoved()
+    placement = placement_of(solids[0], entities) if len(solids) == 1 else identity()
     placement = replace(placement, shift=size * placement.shift)
-    surface, *fronts = (_placed(each, placement, size) for each in _freeform_surfaces(entities))
+    surface, *fronts = (_in_millimetres(each, placement, size) for each in _freeform_surfaces(entities))
     return StepText(
         product=_product(entities),
         unit=unit,
@@ -199,14 +199,14 @@ def _schema(data: str, strings: Sequence[str]) -> str:
 
 
 def _product(entities: Entities) -> str:
-    """The first PRODUCT's name, or its number if it has none."""
+    """Return the name of the first PRODUCT, or its number if it has none."""
     for number in entities.of("PRODUCT"):
         return entities.string(number, 1) or entities.string(number, 0)
     raise ValueError("no PRODUCT in the file; export it with a product name")
 
 
 def _units(quantity: str, entities: Entities) -> dict[str, str]:
-    """The units of a quantity that the shapes' contexts name, each once, and their numbers in the file."""
+    """Return the units of a quantity that the shapes' contexts use, each once, with their entity numbers."""
     used = set()
     for body in entities.of("COMPLEX").values():
         for context in re.findall(r"GLOBAL_UNIT_ASSIGNED_CONTEXT\(\(([#\d,]*)\)\)", body):
@@ -222,7 +222,7 @@ def _unit_name(body: str, entities: Entities) -> str:
         name = one_line(entities.strings[int(place)].lower()[:40])
         return f"{name} by a factor of its own" if "metre" in name or "radian" in name else name
     if body.count("SI_UNIT(") != 1:
-        raise damaged("a unit is of no kind or of two")
+        raise damaged("a unit has no kind, or two kinds")
     prefix, unit = re.search(r"SI_UNIT\((\.\w+\.|\$),\.(\w+)\.\)", body).groups()
     return (prefix.strip(".$") + unit).lower()[:40]
 
@@ -231,11 +231,12 @@ def _unit_name(body: str, entities: Entities) -> str:
 
 
 def _edge_uses(entities: Entities) -> dict[int, tuple[int, int]]:
-    """How often the loops of the faces walk each EDGE_CURVE forwards and backwards."""
+    """Return how often the loops of the faces use each EDGE_CURVE forwards and backwards."""
     edges = {name: [0, 0] for name in entities.of("EDGE_CURVE")}
-    oriented = _flagged("ORIENTED_EDGE", r"\('\d*',\*,\*,", entities)
-    loops = _lists("EDGE_LOOP", entities)
-    bounds = _flagged("FACE_BOUND", r"\('\d*',", entities) | _flagged("FACE_OUTER_BOUND", r"\('\d*',", entities)
+    oriented = _flagged_references("ORIENTED_EDGE", r"\('\d*',\*,\*,", entities)
+    loops = _reference_lists("EDGE_LOOP", entities)
+    bounds, outer = (_flagged_references(kind, r"\('\d*',", entities) for kind in ("FACE_BOUND", "FACE_OUTER_BOUND"))
+    bounds |= outer
     for face in _shell_faces(entities):
         for bound in face:
             loop, flag = bounds[bound]
@@ -246,19 +247,19 @@ def _edge_uses(entities: Entities) -> dict[int, tuple[int, int]]:
 
 
 def _shell_faces(entities: Entities) -> list[list[str]]:
-    """The bounds of each face of the closed shells; a face listed twice counts twice."""
-    faces = _lists("ADVANCED_FACE", entities)
-    return [faces[name] for shell in _lists("CLOSED_SHELL", entities).values() for name in shell]
+    """Return the bounds of each face of the closed shells; a face listed twice counts twice."""
+    faces = _reference_lists("ADVANCED_FACE", entities)
+    return [faces[name] for shell in _reference_lists("CLOSED_SHELL", entities).values() for name in shell]
 
 
-def _lists(kind: str, entities: Entities) -> dict[str, list[str]]:
-    """The list of references that each entity of a kind begins with."""
+def _reference_lists(kind: str, entities: Entities) -> dict[str, list[str]]:
+    """Return the list of references at the beginning of each entity of a kind."""
     lists = {name: re.match(r"\('\d*',\(([#\d,]*)\)", body) for name, body in entities.of(kind).items()}
     return {name: re.findall(r"\d+", hit[1]) for name, hit in lists.items()}
 
 
-def _flagged(kind: str, before: str, entities: Entities) -> dict[str, tuple[str, str]]:
-    """The reference and the flag, T or F, that each entity of a kind ends with."""
+def _flagged_references(kind: str, before: str, entities: Entities) -> dict[str, tuple[str, str]]:
+    """Return the reference and the flag, T or F, at the end of each entity of a kind."""
     pattern = re.compile(before + r"#(\d+),\.([TF])\.\)")
     flagged = {name: pattern.fullmatch(body) for name, body in entities.of(kind).items()}
     return {name: (hit[1], hit[2]) for name, hit in flagged.items()}
@@ -268,7 +269,7 @@ def _flagged(kind: str, before: str, entities: Entities) -> dict[str, tuple[str,
 
 
 def _freeform_surfaces(entities: Entities) -> list[FreeformSurface]:
-    """The back, and the front if it has a freeform net, before they are placed."""
+    """Return the back, and the front if it has a freeform net, in the file's unit and before placement."""
     attributes = {n: body.partition("',")[2] for n, body in entities.of("B_SPLINE_SURFACE_WITH_KNOTS").items()}
     bodies = [(number, body) for number, body in attributes.items() if not RULED.match(body)]
     bodies.sort(key=lambda each: each[1].count("#"), reverse=True)
@@ -279,22 +280,22 @@ def _freeform_surfaces(entities: Entities) -> list[FreeformSurface]:
         raise ValueError(f"{len(bodies)} freeform surfaces in the file; a lens has one or two: export it alone")
     surfaces = [_surface(*each, entities) for each in large or bodies[:1]]
     if len(surfaces) > 1:
-        (middle, normal), (other, its_normal) = map(_middle, surfaces)
+        (middle, normal), (other, its_normal) = map(_middle_and_normal, surfaces)
         if (normal + its_normal) @ (middle - other) < 0:
             surfaces.reverse()
     return surfaces
 
 
-def _middle(surface: FreeformSurface) -> tuple[np.ndarray, np.ndarray]:
-    """The control point (3,) in the middle of a net, and the unit vector (3,) along its sides u x v."""
+def _middle_and_normal(surface: FreeformSurface) -> tuple[np.ndarray, np.ndarray]:
+    """Return the control point (3,) in the middle of a net, and the unit vector (3,) along u x v of its sides."""
     net = surface.control_points
     m, n, _ = net.shape
     normal = np.cross(net[-1, 0] - net[0, 0], net[0, -1] - net[0, 0])
     return net[m // 2, n // 2], normal / max(math.sqrt(normal @ normal), 1e-300)
 
 
-def _placed(surface: FreeformSurface, placement: Placement, unit: float) -> FreeformSurface:
-    """The surface in mm and in its place; unit: of length in the file (mm)."""
+def _in_millimetres(surface: FreeformSurface, placement: Placement, unit: float) -> FreeformSurface:
+    """Return a surface in mm after its placement; unit: unit of length of the file (mm)."""
     net = surface.control_points if unit == 1 else unit * surface.control_points
     return replace(surface, control_points=placement(net) if placement.moves else net)
 
@@ -318,7 +319,7 @@ def _surface(entity: str, body: str, entities: Entities) -> FreeformSurface:
 
 
 def _net(text: str) -> np.ndarray:
-    """The entity numbers of a control net, one row a line."""
+    """Return the entity numbers (m, n) of a control net, one line of text per row."""
     lines = text.split("),(")
     if not all(REFERENCES.fullmatch(line) for line in lines):
         raise ValueError("the control net is damaged; write the file again")
@@ -329,7 +330,7 @@ def _net(text: str) -> np.ndarray:
 
 
 def _check_knots(counts: np.ndarray, knots: np.ndarray, points: int, degree: int) -> None:
-    """ValueError unless knots of these multiplicities carry a spline of this degree and number of control points."""
+    """Raise ValueError unless knots of these multiplicities define a spline of this degree and number of points."""
     if not 1 <= degree <= MAX_DEGREE:
         raise damaged(f"a spline of degree {degree}")
     rising = np.isfinite(knots).all() and (np.diff(knots) > 0).all()
@@ -341,16 +342,17 @@ def _check_knots(counts: np.ndarray, knots: np.ndarray, points: int, degree: int
 
 
 def _properties(entities: Entities, products: set[str], unit: float) -> ValidationProperties:
-    """The properties in a file; a number that cannot be read is UNKNOWN.
+    """Return the properties that a file states; a number that cannot be read is UNKNOWN.
 
-    unit: of length in the file (mm), in which it states a centroid; a measure names its own.
-    products: of the lens, if the file has others, such as an assembly in whose frame its centroid lies elsewhere.
+    unit: unit of length of the file (mm), which holds for centroids; a measure states its own unit.
+    products: product definitions of the lens.  Others, such as an assembly, have centroids in their own frames; if the
+    set is empty, those of all products are read.
     """
     items: dict[tuple[str, str], list[str]] = {}  # (kind of property, its name) -> first items of its representations
     for body in entities.of("PROPERTY_DEFINITION_REPRESENTATION").values():
         definition, representation = re.fullmatch(r"\(#(\d+),#(\d+)\)", body).groups()
         kind, name = (entities.string(each, 0) for each in (definition, representation))
-        if kind == VALIDATION:  # of the whole part, not of a face or of an assembly's instance
+        if kind == VALIDATION:  # only of the whole part, not of a face or an instance in an assembly
             target = entities.references(definition)[-1]
             of_part = entities.bodies.get(target, ("",))[0] == "PRODUCT_DEFINITION_SHAPE"
             kind = kind if of_part and not (products and products.isdisjoint(entities.references(target))) else ""
@@ -371,9 +373,9 @@ def _properties(entities: Entities, products: set[str], unit: float) -> Validati
 
 
 def _measure(entities: Entities, item: str, kind: str) -> float:
-    """The number of a measure, in mm and g to the powers of its unit."""
+    """Return the value of a measure, in mm and g to the powers of its unit."""
     value = re.search(rf"{kind}\(({NUMBER})\),#(\d+)", entities.bodies.get(item, ("", ""))[1])
-    return float(value[1]) * _scale(entities, value[2]) if value else UNKNOWN
+    return float(value[1]) * _unit_scale(entities, value[2]) if value else UNKNOWN
 
 
 def _centroid(item: str, entities: Entities, unit: float) -> tuple[float, float, float]:
@@ -384,25 +386,25 @@ def _centroid(item: str, entities: Entities, unit: float) -> tuple[float, float,
     return x, y, z
 
 
-def _scale(entities: Entities, unit: str) -> float:
-    """A unit in mm and g, to its powers."""
-    if (size := _size(entities, unit)) is not None:
+def _unit_scale(entities: Entities, unit: str) -> float:
+    """Return the size of a unit, in mm and g to its powers."""
+    if (size := _unit_size(entities, unit)) is not None:
         return size
     scale = 1.0
     for element in entities.references(unit):
         kind, body = entities.bodies[element]
         factor = re.fullmatch(rf"\(#(\d+),({NUMBER})\)", body)
-        size = _size(entities, factor[1]) if factor and kind == "DERIVED_UNIT_ELEMENT" else None
+        size = _unit_size(entities, factor[1]) if factor and kind == "DERIVED_UNIT_ELEMENT" else None
         if size is None:
             return UNKNOWN
         scale *= size ** float(factor[2])
     return scale
 
 
-def _size(entities: Entities, unit: str) -> float | None:
-    """A named unit of length in mm, of mass in g; None: it follows from no SI_UNIT."""
+def _unit_size(entities: Entities, unit: str) -> float | None:
+    """Return a named unit of length in mm or of mass in g; None if it is not derived from an SI_UNIT."""
     body, factor = entities.bodies[unit][1], 1.0
-    if converted := re.search(r"CONVERSION_BASED_UNIT\('\d+',#(\d+)\)", body):  # an inch, by a measure in mm
+    if converted := re.search(r"CONVERSION_BASED_UNIT\('\d+',#(\d+)\)", body):  # such as an inch, by a measure in mm
         measure = re.search(rf"\(({NUMBER})\)?,#(\d+)\)", entities.bodies[converted[1]][1])
         if measure is None:
             return None
@@ -411,20 +413,20 @@ def _size(entities: Entities, unit: str) -> float | None:
     return factor * PREFIXES.get(named[1], UNKNOWN) * UNITS.get(named[2], UNKNOWN) if named else None
 
 
-def _profiles(entities: Entities) -> Iterator[Profile]:
-    """The profile tolerances of surfaces."""
+def _profiles(entities: Entities) -> Iterator[ProfileTolerance]:
     kind = "SURFACE_PROFILE_TOLERANCE"
     compound = (body for body in entities.of("COMPLEX").values() if f"{kind}(" in body)
     for body in (*entities.of(kind).values(), *compound):
         tolerance = re.search(r"\('\d*',(?:'\d*'|\$),#(\d+),#(\d+)", body)
         if tolerance is None:
-            yield Profile(UNKNOWN, "")
+            yield ProfileTolerance(UNKNOWN, "")
         else:
-            yield Profile(_measure(entities, tolerance[1], "LENGTH_MEASURE"), *_face(entities, tolerance[2]))
+            width = _measure(entities, tolerance[1], "LENGTH_MEASURE")
+            yield ProfileTolerance(width, *_toleranced_face(entities, tolerance[2]))
 
 
-def _face(entities: Entities, aspect: str) -> tuple[str, str]:
-    """(surface, name) of the one face that an aspect of the shape is; ("", "") if the file tells it in another way."""
+def _toleranced_face(entities: Entities, aspect: str) -> tuple[str, str]:
+    """Return (surface, name) of the face that an aspect of the shape denotes; ("", "") if that is not one face."""
     usages = map(entities.references, entities.of("GEOMETRIC_ITEM_SPECIFIC_USAGE"))
     faces = {names[-1] for names in usages if names[0] == aspect}
     if len(faces) != 1 or entities.bodies.get(face := faces.pop(), ("",))[0] != "ADVANCED_FACE":

@@ -1,8 +1,8 @@
-"""The placement of a lens in its file: a turn and a shift, r -> R r + t.
+"""Placement of a lens in its file: a rotation and a shift, r -> R r + t.
 
-A CAD program that moves a part either writes where it placed it, or writes moved coordinates.  The first is read from
-the statements of the file (assembly.py), the second is found here from the net of the freeform face, whose control
-points lie on a uniform grid over the lens's own x and y.
+A CAD program that moves a part writes either a placement or moved coordinates.  A placement is read from the
+statements of the file (assembly.py).  Moved coordinates are recognised here by the net of the freeform face, whose
+control points lie on a uniform grid over the lens's own x and y.
 """
 
 from __future__ import annotations
@@ -16,100 +16,100 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-ON_AXIS = 1e-9  # mm; a net that lies on its uniform grid and about the axis more closely than this is not moved
-FLAT = 1e-7  # mm, RMS; a net that departs by less from a plane has the normal of that plane
-PARALLEL = 1e-9  # sine of the angle between two directions that span no plane
-ROUNDED = 9  # decimals of a shift in mm and of a turn in degrees that are stated: less is rounding of the coordinates
+MAX_GRID_DEVIATION = 1e-9  # largest deviation (mm) of an unmoved net from its uniform grid about the axis
+FLAT_RMS = 1e-7  # RMS deviation (mm) from a plane below which a net has the normal of that plane
+PARALLEL_SINE = 1e-9  # sine of the angle below which two directions are parallel
+DECIMALS = 9  # decimals of a stated shift (mm) and rotation (degrees); finer ones are rounding of the coordinates
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """r -> R r + t, from the lens's own frame to the frame of the file."""
+    """r -> R r + t, from the frame of the lens to the frame of the file."""
 
-    rotation: np.ndarray  # R (3, 3), orthonormal and right-handed
-    shift: np.ndarray  # t (3,) in mm
+    rotation: np.ndarray  # R, (3, 3), orthonormal and right-handed
+    shift: np.ndarray  # t, (3,), mm
 
     @classmethod
     def of_axes(cls, origin: np.ndarray, axis: np.ndarray, reference: np.ndarray) -> Placement:
-        """The frame at an origin with z along `axis` and x along `reference` without its part along z.
+        """Return the frame at an origin with z along `axis` and x along the component of `reference` normal to z.
 
-        ValueError if the two directions are parallel or none.
+        Raises ValueError if the two directions are parallel or zero.
         """
         z = _unit(axis)
         x = _unit(reference)
         x = x - (x @ z) * z
-        if not np.sqrt(x @ x) > PARALLEL:
+        if not np.sqrt(x @ x) > PARALLEL_SINE:
             raise ValueError("the axis and the reference direction of a placement are parallel")
         x = _unit(x)
         return cls(np.stack([x, np.cross(z, x), z], axis=1), np.asarray(origin, dtype=np.float64))
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Points (…, 3) in the frame of the file, by their places in the lens's own; unmoved ones to the last bit."""
+        """Transform points (…, 3) from the lens's frame to the file's; without a rotation, R r is r to the last bit."""
         turned = points if np.array_equal(self.rotation, np.eye(3)) else points @ self.rotation.T
         return turned + self.shift
 
     @property
     def inverse(self) -> Placement:
-        """The placement that takes this one back."""
+        """The inverse placement."""
         return Placement(self.rotation.T, -(self.rotation.T @ self.shift))
 
     def after(self, first: Placement) -> Placement:
-        """The placement `first`, and then this one."""
+        """Return the placement `first` followed by this one."""
         return Placement(self.rotation @ first.rotation, self(first.shift))
 
     @property
     def moves(self) -> bool:
-        """Is it any other than that of the file itself?"""
+        """True if this is not the identity."""
         return bool(self.shift.any()) or not np.array_equal(self.rotation, np.eye(3))
 
     @property
     def turn(self) -> tuple[float, np.ndarray]:
-        """(angle in degrees, 0 to 180; the unit vector (3,) about which it turns)."""
+        """Angle of rotation (degrees, 0 to 180) and unit vector (3,) of its axis."""
         about = Rotation.from_matrix(self.rotation).as_rotvec()
         angle = math.sqrt(about @ about)
         return math.degrees(angle), about / angle if angle > 0 else np.array([0.0, 0.0, 1.0])
 
     @property
     def words(self) -> str:
-        """The turn in degrees and the shift in mm, such as "turned by 90° about z, then shifted by (0, 0, 5) mm"."""
-        shift = np.round(self.shift, ROUNDED) + 0.0
-        parts = [self.turn_words] if round(self.turn[0], ROUNDED) else []
+        """Rotation and shift in words, such as "turned by 90° about z, then shifted by (0, 0, 5) mm"."""
+        shift = np.round(self.shift, DECIMALS) + 0.0
+        parts = [self.turn_words] if round(self.turn[0], DECIMALS) else []
         if shift.any() or not parts:
             parts.append("shifted by ({}) mm".format(", ".join(f"{value:.9g}" for value in shift)))
         return ", then ".join(parts)
 
     @property
     def turn_words(self) -> str:
-        """The turn alone, such as "turned by 90° about z"."""
+        """Rotation in words, such as "turned by 90° about z"."""
         angle, about = self.turn
-        return f"turned by {angle:.9g}° about {_axis(about)}"
+        return f"turned by {angle:.9g}° about {_axis_name(about)}"
 
     def facts(self) -> dict[str, Any]:
-        """The placement in words, its turn (degrees), the axis of that and the shift (mm), for JSON."""
+        """Return the placement for JSON: in words, angle (degrees) and axis of its rotation, and shift (mm)."""
         angle, about = self.turn
-        shift, turn = self.shift.tolist(), round(angle, ROUNDED)
+        shift, turn = self.shift.tolist(), round(angle, DECIMALS)
         return {"words": self.words, "turn_deg": turn, "axis": about.tolist(), "shift_mm": shift}
 
 
-def unmoved() -> Placement:
-    """The placement of a lens whose own frame is that of the file."""
+def identity() -> Placement:
+    """Return the placement of a lens whose frame is the frame of the file."""
     return Placement(np.eye(3), np.zeros(3))
 
 
-def composed(placements: Sequence[Placement]) -> Placement:
-    """All of these, the last one first."""
-    return functools.reduce(Placement.after, placements, unmoved())
+def compose(placements: Sequence[Placement]) -> Placement:
+    """Return the composition of placements; the last one is applied first."""
+    return functools.reduce(Placement.after, placements, identity())
 
 
 def own_frame(net: np.ndarray) -> Placement:
-    """The placement of a net (m, n, 3) of control points by its own grid: x along its first axis, y along the second.
+    """Return the placement of a control net (m, n, 3) by its own grid: x along its first axis, y along the second.
 
-    z is the direction in which the net departs from a uniform grid in a plane.  The origin is the foot of the given one
-    on the axis of the net, so that heights along the axis stay.  A net that lies about the z axis already, or whose
-    points lie on no such grid, is unmoved.
+    z is the direction in which the net deviates from a uniform plane grid.  The new origin is the projection of the
+    old one onto the axis of the net, so that heights along the axis do not change.  The identity is returned for a net
+    that already lies about the z axis, or whose points lie on no such grid.
     """
-    if _off(net) <= ON_AXIS:
-        return unmoved()
+    if _grid_deviation(net) <= MAX_GRID_DEVIATION:
+        return identity()
     m, n, _ = net.shape
     u, v = np.linspace(-1.0, 1.0, m), np.linspace(-1.0, 1.0, n)
     centre = net.mean(axis=(0, 1))
@@ -118,18 +118,18 @@ def own_frame(net: np.ndarray) -> Placement:
     rest = (net - centre - u[:, None, None] * along_u - v[:, None] * along_v).reshape(-1, 3)
     normal = np.cross(along_u, along_v)
     spread, directions = np.linalg.eigh(rest.T @ rest / len(rest))
-    z = directions[:, -1] if spread[-1] > FLAT**2 else normal
+    z = directions[:, -1] if spread[-1] > FLAT_RMS**2 else normal
     try:
         found = Placement.of_axes(np.zeros(3), z if z @ normal > 0 else -z, along_u)
     except ValueError:
-        return unmoved()
+        return identity()
     axis = found.rotation[:, 2]
     found = Placement(found.rotation, centre - (centre @ axis) * axis)
-    return found if _off(found.inverse(net)) <= ON_AXIS else unmoved()
+    return found if _grid_deviation(found.inverse(net)) <= MAX_GRID_DEVIATION else identity()
 
 
-def _off(net: np.ndarray) -> float:
-    """The largest distance (mm) in x or y of a net from the uniform grid about the z axis with its extent."""
+def _grid_deviation(net: np.ndarray) -> float:
+    """Return the largest deviation (mm) in x or y of a net from the uniform grid of its extent about the z axis."""
     m, n, _ = net.shape
     half = (net[-1, -1, :2] - net[0, 0, :2]) / 2
     if not half.min() > 0:
@@ -146,9 +146,9 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / length
 
 
-def _axis(about: np.ndarray) -> str:
-    """The name of an axis, or its three components."""
+def _axis_name(about: np.ndarray) -> str:
+    """Return the name of an axis, or its three components."""
     k = int(np.abs(about).argmax())
-    if abs(abs(about[k]) - 1) < PARALLEL:
+    if abs(abs(about[k]) - 1) < PARALLEL_SINE:
         return ("" if about[k] > 0 else "-") + "xyz"[k]
     return "({})".format(", ".join(f"{value:.6g}" for value in np.round(about, 6) + 0.0))

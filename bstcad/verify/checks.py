@@ -1,8 +1,8 @@
-"""The proof: the written files, measured against the design.
+"""Proof of a design: its written files, measured against the design.
 
-Nothing here knows how the lens was found.  The net and knots are read by a parser that is not OCC, the surface is
+The proof is independent of the optimisation.  Net and knots are read by a parser that is not OCC, the surface is
 sampled through OCC, the mesh is read back from the STL, and the irradiance is traced through the geometry of the STEP
-file, by rays that tailoring never saw, and by ray tubes.
+file, by rays that tailoring has not used, and by ray tubes.
 """
 
 from __future__ import annotations
@@ -36,87 +36,85 @@ from bstcad.verify import text_checks
 from bstcad.verify.verdict import Check
 
 if TYPE_CHECKING:
-    from bstcad.verify.step_checks import ExaminedFile  # which loads OCC
+    from bstcad.verify.step_checks import ExaminedFile  # this import loads OCC
 
-VERTEX_ROUNDING = 2e-7  # of the largest coordinate: a vertex in float32 on a slope, off its face
-VERIFY_SEED = 1_000_003  # added to the seed: rays that tailoring never saw
-TARGET_DIFFERENCE = 1e-3  # of the brightest pixel: versions of the libraries that read pictures and draw letters differ
-DEFAULT_RRMSD_LIMIT = 0.25  # RRMSD that remarks, plans and tolerance studies take where accept.rrmsd asks for none
-LINE_TUBES = 1031  # tubes a side at least for the picture of each line of a spectrum by itself
-APERTURE_DIFFERENCE = 1e-3  # mm; of a front whose edge is not level the scene knows its largest inset along the rim
-CUT_EXCUSE = 1e-3  # of the light: a mount that cuts away less is no reason for a picture that fails
-MAX_ON_FLANGE = 1e-3  # of the light that gets through the lens; no wall of a flange is to stand in the way of more
+VERTEX_ROUNDING = 2e-7  # distance of a vertex in float32 from its sloped face, relative to the largest coordinate
+VERIFY_SEED = 1_000_003  # offset of the seed: rays that tailoring has not used
+TARGET_TOLERANCE = 1e-3  # difference of targets, relative to the brightest pixel: versions of picture libraries differ
+DEFAULT_RRMSD_LIMIT = 0.25  # limit of the RRMSD in remarks, plans and tolerance studies without accept.rrmsd
+LINE_TUBES = 1031  # smallest number of tubes per side for the picture of one line of a spectrum
+APERTURE_TOLERANCE = 1e-3  # distance of rims (mm): for an edge that is not level the scene has its largest inset only
+MIN_MOUNT_LOSS = 1e-3  # fraction of the light that a mount must cut away to be given as the reason for a failure
+MAX_FLANGE_LIGHT = 1e-3  # largest fraction of the light through the lens that may meet the flange
 WAVEFRONT = "wavefront error, RMS in waves, piston and tilt removed"
-ROUGH = 0.01  # standard error of a draft's RRMSD, relative to it, at which the proof ends
-FLOOR = 0.1  # of the wavefront error that is allowed: rounding that adds more leaves the verdict open
-LIMIT, LIMIT_PER_MB = 120.0, 3.0  # s that OCC may take over a file, and more for each MB; it needs a hundredth of them
-GRID = ", on a grid four times finer than the net"
+DRAFT_ACCURACY = 0.01  # relative standard error of the RRMSD of a draft at which sampling ends
+MAX_FLOOR = 0.1  # largest rounding of the wavefront error over its limit; more leaves the verdict open
+TIME_LIMIT, TIME_LIMIT_PER_MB = 120.0, 3.0  # timeout of OCC (s), and s per MB of a file: a hundred times its usual time
+FINE_GRID = ", on a grid four times finer than the net"  # end of the names of checks on such a grid
 
 
 @dataclass(frozen=True)
 class Nominal:
-    """The design that the files are held to."""
+    """The design against which the files are checked."""
 
     scene: Scene
-    lens: Lens  # float64
-    goals: tuple[Goal, ...]  # with the scene's own pictures
-    # pictures of the goals as design.npz has them; None: those of `goals`
+    lens: Lens  # designed lens, float64
+    goals: tuple[Goal, ...]  # goals with the pictures of the scene
+    # pictures of the goals in design.npz, (rows, columns); None: those of `goals`
     stored: tuple[np.ndarray, ...] | None = field(default=None, kw_only=True)
 
     @cached_property
     def channels(self) -> tuple[Channel, ...]:
-        """The light of the scene, of an extended source by other points than tailoring knows."""
+        """Light of the scene; points on an extended source differ from those of tailoring."""
         return self.scene.judging_channels()
 
     @property
     def heaviest(self) -> Channel:
-        """The channel with the most light: that of the main line, by which waves are counted."""
+        """Channel with the largest weight: that of the main line, whose wavelength is the unit of wavefront errors."""
         return max(self.channels, key=lambda channel: channel.weight)
 
     def effort(self, given: Effort | None = None) -> Effort:
-        """The rays and tubes of a measurement of this design, a draft's with fewer; given: a limit, None: no limit."""
+        """Return the effort of measuring this design, smaller for a draft; given: a limit, None: no limit."""
         given, tailoring = given or FULL, self.scene.tailoring
-        accuracy = ROUGH if tailoring.quality == "draft" else FULL.accuracy
+        accuracy = DRAFT_ACCURACY if tailoring.quality == "draft" else FULL.accuracy
         return replace(given, seed=tailoring.seed, accuracy=max(given.accuracy, accuracy))
 
 
 @dataclass(frozen=True)
 class AtBound:
-    """How near the tailored faces come to a bound of the scene."""
+    """A bound of the scene that limits the tailored faces."""
 
-    share: float | None  # part of their area within 3 % of the bound; None: a thickness is there
-    tightest: str  # place nearest to the bound, "at (1, 2) mm"; of a thickness none
+    share: float | None  # fraction of their area within 3 % of the bound; None for a bound of the thickness
+    tightest: str  # position nearest to the bound, "at (1, 2) mm"; "" for a thickness
 
 
 @dataclass(frozen=True)
 class Proof:
-    """The outcome of the proof of a design's files."""
+    """Result of the proof of a design's files."""
 
     checks: tuple[Check, ...]
-    lens: Lens  # as re-read from lens.step; with a mount that of part.step, with its clear apertures
-    lights: tuple[Light, ...]  # that it throws on each target
-    shape: dict[str, float | None]  # of the lens within the mount's rim; volume: of lens.step
-    stability: dict[str, float | int | None]
-    # blur by the source's size, None: it has none, and lines of a spectrum: on the target with the largest RRMSD
-    blur: Blur | None = None
-    lines: tuple[SpectralLine, ...] = ()
-    at_bounds: dict[str, AtBound] | None = None  # the bounds met, by key; None: no bounds
-    # of the light, against the one asked for; None: none was, or no light comes to where it is stated
-    wavefront: WavefrontError | None = None
+    lens: Lens  # lens re-read from lens.step; with a mount from part.step, with its clear apertures
+    lights: tuple[Light, ...]  # light of the lens on each target
+    shape: dict[str, float | None]  # dimensions of the lens within the mount's rim, and volume of lens.step (mm³)
+    stability: dict[str, float | int | None]  # margins to numerical limits, see `_stability`
+    blur: Blur | None = None  # blur by the source's size on the worst target; None: the source has no size
+    lines: tuple[SpectralLine, ...] = ()  # pictures of the lines of a spectrum on the worst target
+    at_bounds: dict[str, AtBound] | None = None  # bounds that the lens meets, by key; None: no bounds
+    wavefront: WavefrontError | None = None  # error of the wavefront; None: not requested, or no light reaches it
 
     @property
     def worst(self) -> int:
-        """The number of the target with the largest RRMSD, whose figures stand for the design's."""
+        """Index of the worst target, with the largest RRMSD, whose figures represent the design."""
         return worst(light.rrmsd for light in self.lights)
 
     @property
     def light(self) -> Light:
-        """That on the target with the largest RRMSD."""
+        """Light on the target with the largest RRMSD."""
         return self.lights[self.worst]
 
     @property
     def passed(self) -> bool:
-        """Every check?"""
+        """True if every check passed."""
         return all(check.passed for check in self.checks)
 
 
@@ -130,44 +128,44 @@ def verify(
 ) -> Proof:
     """Check lens.step and lens.stl in `folder` against the design; ValueError if one of them cannot be read at all.
 
-    With bstcad.runs.processes.submit OCC reads the STEP file in its own process, while this one reads its text and the
-    mesh.  `known` is called with the lens of the STEP file as soon as that is known, and `lit` with its light on each
-    target, the lines of a spectrum there, and the number of the target.
+    submit: with bstcad.runs.processes.submit a second process reads the STEP file by OCC, while this one reads its text
+    and the mesh.  known: called with the lens of the STEP file as soon as it has been read.  lit: called with its light
+    on each target, the lines of a spectrum there, and the index of the target.
     """
     effort = nominal.effort(effort)
     effort = replace(effort, seed=effort.seed + VERIFY_SEED, seconds=effort.seconds / len(nominal.goals))
     path = (folder / "lens.step").absolute()
     lens = submit("bstcad.verify.step_checks.lens", path, nominal.lens.index, nominal.lens.passes)
     mount, part = nominal.scene.mount, nominal.scene.part.of(nominal.scene.lens)
-    seen = mount and submit("bstcad.verify.step_checks.lens_of_part", folder.absolute(), nominal.lens, mount)
+    part_lens = mount and submit("bstcad.verify.step_checks.lens_of_part", folder.absolute(), nominal.lens, mount)
     step_job = "bstcad.verify.step_checks.check", path, nominal.lens, nominal.scene.accept.form, effort.points
     of_step = submit(*step_job)
     part_job = "bstcad.verify.step_checks.check_part", folder.absolute(), nominal.lens, mount, part
     of_part = mount and submit(*part_job)
     try:
-        text = part21.read_lens(path)  # its sentences say more than OCC's
+        text = part21.read_lens(path)  # messages are more precise than OCC's
     except ValueError:
-        if not lens.done():  # OCC may never end over a file that is damaged
+        if not lens.done():  # OCC may hang over a damaged file
             end()
         raise
     mesh = meshes.read_stl(folder / "lens.stl")
-    sealed = Check.true("STL watertight, winding consistent", meshes.is_closed(mesh), id="mesh-closed")
-    return_freed()  # the texts: OCC holds more of it still
-    lens = _as_shaped(_result(lens, path), nominal.lens)
-    whole = quadrature.of_lens(lens)  # not as it was stated
-    as_made, of_aperture, why = (lens, (), "") if mount is None else _as_made(seen, lens, nominal, folder)
-    known(as_made)
+    closed = Check.true("STL: watertight, winding consistent", meshes.is_closed(mesh), id="mesh-closed")
+    return_freed()  # memory of the texts
+    lens = _with_design_facts(_result(lens, path), nominal.lens)
+    whole = quadrature.of_lens(lens)  # computed, not as stated in the file
+    made_lens, of_aperture, why = (lens, (), "") if mount is None else _mounted_lens(part_lens, lens, nominal, folder)
+    known(made_lens)
     found = []
     for number, goal in enumerate(nominal.goals):
-        found.append(_lit(as_made, nominal, goal, effort=effort))
+        found.append(_measure_light(made_lens, nominal, goal, effort=effort))
         lit(*found[-1], number)
     lights, lines = zip(*found, strict=True)
     number = worst(light.rrmsd for light in lights)
-    wavefront, of_wavefront = _of_wavefront(as_made, nominal)
+    wavefront, of_wavefront = _wavefront_checks(made_lens, nominal)
     cut = as_cut(lens, mount)
-    shape = describe(cut, effort.places) | {"volume": whole.volume} | _ripples_in_light(as_made, nominal)
-    stability = _stability(as_made, nominal, lights, shape)
-    machined, at_bounds = of_bounds(cut, nominal.scene.lens, shape)
+    shape = describe(cut, effort.places) | {"volume": whole.volume} | _ripple_rrmsd(made_lens, nominal)
+    stability = _stability(made_lens, nominal, lights, shape)
+    of_shape, at_bounds = bound_checks(cut, nominal.scene.lens, shape)
     meets = f"{'enters' if lens.passes.enters else 'meets'} the {lens.passes.optic}"
     goals = [(goal, each, goal.suffix) for goal, each in zip(nominal.goals, lights, strict=True)]
     degrees = math.nan if stability["tir_margin_deg"] is None else stability["tir_margin_deg"]
@@ -179,27 +177,33 @@ def verify(
         *_result(of_step, path, lambda: submit(*step_job)),
         *(_result(of_part, folder / "part.step", lambda: submit(*part_job)) if of_part else ()),
         *of_aperture,
-        *machined,
-        *_of_ripple(shape),
-        sealed,
-        *_facets(mesh, lens, shape["volume"], nominal),
-        *map(_picture, nominal.goals, nominal.stored or [goal.picture for goal in nominal.goals]),
-        *(c for _, each, of in goals for c in _of_light(each, nominal.scene.accept, meets, of=of, why=why)),
+        *of_shape,
+        *_ripple_checks(shape),
+        closed,
+        *_mesh_checks(mesh, lens, shape["volume"], nominal),
+        *map(_target_check, nominal.goals, nominal.stored or [goal.picture for goal in nominal.goals]),
+        *(c for _, each, of in goals for c in _light_checks(each, nominal.scene.accept, meets, of=of, why=why)),
         *of_wavefront,
         *([margin] if lens.passes.enters else []),
-        Check.at_most("values that are not finite", stability["non_finite"], 0, id="finite"),
+        Check.at_most("number of values that are not finite", stability["non_finite"], 0, id="finite"),
     )
     return Proof(
-        checks, as_made, lights, shape, stability=stability,
-        blur=blur(nominal.channels, as_made, nominal.goals[number].receiver, nominal.goals[number].picture),
-        lines=lines[number], at_bounds=at_bounds or None, wavefront=wavefront,
-    )  # fmt: skip
+        checks,
+        made_lens,
+        lights,
+        shape,
+        stability=stability,
+        blur=blur(nominal.channels, made_lens, nominal.goals[number].receiver, nominal.goals[number].picture),
+        lines=lines[number],
+        at_bounds=at_bounds or None,
+        wavefront=wavefront,
+    )
 
 
-def _lit(lens: Lens, nominal: Nominal, goal: Goal, effort: Effort) -> tuple[Light, tuple[SpectralLine, ...]]:
-    """The light that the lens throws on a target, and that of each line of a spectrum; ValueError if there is none."""
-    how = {"effort": effort, "ghost": nominal.scene.ghost, "draw": nominal.scene.draw, "whole": goal.whole}
-    light = measure(lens, nominal.channels, goal.receiver, goal.picture, **how)
+def _measure_light(lens: Lens, nominal: Nominal, goal: Goal, effort: Effort) -> tuple[Light, tuple[SpectralLine, ...]]:
+    """Measure the light on a target, and the picture of each line of a spectrum; ValueError if no light falls there."""
+    options = {"effort": effort, "ghost": nominal.scene.ghost, "draw": nominal.scene.draw, "whole": goal.whole}
+    light = measure(lens, nominal.channels, goal.receiver, goal.picture, **options)
     if not light.rrmsd >= 0:
         name = "lens.step" if nominal.scene.mount is None else "part.step"
         raise ValueError(f"{name}: none of its light falls on {goal.words}; write it again, or check scene.toml")
@@ -207,69 +211,65 @@ def _lit(lens: Lens, nominal: Nominal, goal: Goal, effort: Effort) -> tuple[Ligh
     return light, spectral_lines(lens, nominal.channels, goal.receiver, target=goal.picture, n=n)
 
 
-def _as_shaped(lens: Lens, designed: Lens) -> Lens:
-    """The re-read lens with what no file says: the elements around it, and which faces tailoring shaped.
-
-    The latter if its front is a net as well.
-    """
+def _with_design_facts(lens: Lens, designed: Lens) -> Lens:
+    """Return the re-read lens with facts that no file states: elements around it and, of two nets, shaped faces."""
     shaped = designed.shaped if lens.front.is_net else None
     return replace(lens, before=designed.before, behind=designed.behind, shaped=shaped)
 
 
-def _as_made(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> tuple[Lens, Sequence[Check], str]:
-    """The lens whose light is judged, that of part.step; checks of its clear apertures; and the loss by them in words.
+def _mounted_lens(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> tuple[Lens, Sequence[Check], str]:
+    """Return the lens of part.step, the checks of its clear apertures, and the loss by them in words.
 
-    Where there is no such part, which other checks say, it is lens.step's with the apertures that the part was to have.
+    Without a readable part, which other checks report, it is the lens of lens.step with the designed apertures.
     """
     designed, flange = nominal.lens, nominal.scene.mount.flange
     try:
-        lens = replace(_as_shaped(_result(read, folder / "part.step"), designed), outline=bare.outline)
-        checks = [_aperture(*each) for each in zip(("front", "back"), lens.apertures, designed.apertures, strict=True)]
+        lens = replace(_with_design_facts(_result(read, folder / "part.step"), designed), outline=bare.outline)
+        pairs = zip(("front", "back"), lens.apertures, designed.apertures, strict=True)
+        checks = [_aperture_check(*each) for each in pairs]
     except ValueError as error:
         lens = replace(bare, clear=designed.clear)
         name = "part.step: clear apertures can be measured"
         checks = [Check.true(name, False, str(error), id="clear-aperture-measured")]
     losses = mount_losses(lens, nominal.channels, None if flange is None else (flange.z, flange.z + flange.thickness))
-    name = "part.step: light that the mount cuts away, of what gets through the uncut lens"
+    name = "part.step: light that the mount cuts away, as a fraction of the light through the uncut lens"
     checks.append(Check.at_most(name, losses.cut, None, id="mount-cut"))
     if flange is not None:
         where = "a wall of its opening stands in the way; make the flange thinner, or put it where it meets the lens"
-        name = "part.step: light that meets the flange"
-        checks.append(Check.at_most(name, losses.on_flange, MAX_ON_FLANGE, where=where, id="flange-light"))
+        name = "part.step: light that meets the flange, as a fraction of the light through the uncut lens"
+        checks.append(Check.at_most(name, losses.on_flange, MAX_FLANGE_LIGHT, where=where, id="flange-light"))
     why = f"the mount leaves {lens.apertures[1].words} of the back and cuts away {100 * losses.cut:.3g} % of the light"
-    return lens, checks, why if losses.cut > CUT_EXCUSE else ""
+    return lens, checks, why if losses.cut > MIN_MOUNT_LOSS else ""
 
 
-def _aperture(name: str, measured: Outline, designed: Outline) -> Check:
-    """The largest distance between the rim of a face's clear aperture and that of the designed one."""
+def _aperture_check(name: str, measured: Outline, designed: Outline) -> Check:
+    """Check the largest distance (mm) between the rims of a face's clear aperture and of the designed one."""
     off = max(float(np.abs(a.depth(*b.rim_points())).max()) for a, b in ((measured, designed), (designed, measured)))
     where = f"the part has {measured.words}, the lens was tailored for {designed.words}; generate the design again"
-    name = f"part.step: clear aperture of the {name}, from the mount's"
-    return Check.at_most(name, off, APERTURE_DIFFERENCE, unit="mm", where=where, id="clear-aperture")
+    name = f"part.step: clear aperture of the {name}, deviation from the mount's"
+    return Check.at_most(name, off, APERTURE_TOLERANCE, unit="mm", where=where, id="clear-aperture")
 
 
-def _stability(
-    lens: Lens, nominal: Nominal, lights: Sequence[Light], shape: dict
-) -> dict[str, float | int | None]:  # fmt: skip
-    """How far the lens is from where its numbers would go wrong; angles in degrees, curvature in 1/mm."""
-    least = margins(nominal.channels, lens, nominal.goals[0].receiver, nominal.scene.tailoring.seed + VERIFY_SEED)
+def _stability(lens: Lens, nominal: Nominal, lights: Sequence[Light], shape: dict) -> dict[str, float | int | None]:
+    """Return the margins of the lens to numerical limits; angles in degrees, curvature in 1/mm."""
+    margin = margins(nominal.channels, lens, nominal.goals[0].receiver, nominal.scene.tailoring.seed + VERIFY_SEED)
     keys = (f"{face}radius_min_{kind}" for face in ("", "front_") for kind in ("concave", "convex"))
     radii = [shape[key] for key in keys if shape.get(key)]
     return {
-        "tir_margin_deg": least.tir_margin_deg,
-        "newton_slope_min": least.newton_slope_min,
+        "tir_margin_deg": margin.tir_margin_deg,
+        "newton_slope_min": margin.newton_slope_min,
         "curvature_max": 1 / min(radii) if radii else 0.0,
-        "non_finite": least.non_finite + sum(int((~np.isfinite(light.picture)).sum()) for light in lights),
+        "non_finite": margin.non_finite + sum(int((~np.isfinite(light.picture)).sum()) for light in lights),
     }
 
 
 def examine(path: Path, submit: Submit = run_here) -> ExaminedFile:
-    """Check a STEP file by itself; ValueError if it holds no lens."""
+    """Check a STEP file without a design; ValueError if it has no lens."""
     return _result(submit("bstcad.verify.step_checks.examine", path.absolute()), path)
 
 
 def _result(read: Future, path: Path, again: Callable[[], Future] | None = None) -> Any:
-    """The answer of OCC's process; `again` asks it anew, where it may have ended over another file before."""
+    """Return the result of a job of OCC's process; again: a retry, if another file may have crashed that process."""
     limit = time_limit(path)
     try:
         return result(read, limit)
@@ -283,16 +283,16 @@ def _result(read: Future, path: Path, again: Callable[[], Future] | None = None)
 
 
 def time_limit(path: Path) -> float:
-    """Seconds that OCC may take over a STEP file."""
-    return LIMIT + (LIMIT_PER_MB * path.stat().st_size / 1e6 if path.is_file() else 0.0)
+    """Return the timeout (s) of OCC for a STEP file."""
+    return TIME_LIMIT + (TIME_LIMIT_PER_MB * path.stat().st_size / 1e6 if path.is_file() else 0.0)
 
 
-def _of_ripple(shape: Mapping[str, float | None]) -> list[Check]:
-    """State how steep the control points of each tailored face go up and down in turn.
+def _ripple_checks(shape: Mapping[str, float | None]) -> list[Check]:
+    """State the RMS slope of the alternating heights of control points of each tailored face.
 
-    No limit: the RRMSD judges what the light feels of it, and the bounds of the scene what a tool feels.
+    There is no limit: the RRMSD judges its effect on the light, and the bounds of the scene its effect on a tool.
     """
-    measured = "RMS slope of control points that go up and down in turn"
+    measured = "RMS slope of control points of alternating height"
     faces = {"": shape["ripple_slope"], " of the front": shape.get("front_ripple_slope")}
     return [
         Check.at_most(f"ripple{of}: {measured}", slope, None, "rad", id="ripple")
@@ -301,21 +301,21 @@ def _of_ripple(shape: Mapping[str, float | None]) -> list[Check]:
     ]
 
 
-def _ripples_in_light(lens: Lens, nominal: Nominal) -> dict[str, float]:
-    """RRMSD that the ripple of each tailored face makes by itself, by keys of Proof.shape."""
+def _ripple_rrmsd(lens: Lens, nominal: Nominal) -> dict[str, float]:
+    """Return the RRMSD by the ripple of each tailored face alone, by keys of Proof.shape."""
     light = nominal.heaviest
     channel = replace(light, source=light.source.central, weight=1.0)
     faces, screen = {"": "back"} | ({"front_": "front"} if lens.shapes("front") else {}), nominal.goals[0].receiver
     return {f"{key}ripple_rrmsd": rrmsd_of_ripple(channel, lens, screen, face) for key, face in faces.items()}
 
 
-def of_bounds(
+def bound_checks(
     lens: Lens, asked: LensBlank, shape: Mapping[str, float | None]
 ) -> tuple[list[Check], dict[str, AtBound]]:
-    """Checks of the bounds that a scene puts on its tailored faces, and which of the bounds these meet, by key.
+    """Check the bounds of a scene on its tailored faces, and return the bounds that these meet, by key.
 
-    The bounds are tool_radius, max_slope and the thicknesses of [lens]; shape: of the re-read lens.  A front that is
-    tailored is held to them as the back is, seen from outside: a tool has to fit into its valleys.
+    The bounds are tool_radius, max_slope and the thicknesses of [lens]; shape: dimensions of the re-read lens.  They
+    hold for a tailored front as for the back, seen from outside: a tool has to fit into its valleys.
     """
     checks, found = [], {}
     radius, degrees, kind = asked.tool_radius, asked.max_slope, "convex" if asked.mould else "concave"
@@ -325,12 +325,12 @@ def of_bounds(
             bending = surveyed(lens, **{kind: radius}, slope=degrees)
             if radius is not None:
                 met = getattr(bending, kind)
-                name = f"smallest {kind} radius{of}{GRID}"
+                name = f"smallest {kind} radius{of}{FINE_GRID}"
                 checks.append(Check.at_least(name, met.largest, radius, "mm", where=met.where, id="tool-radius"))
                 found.setdefault("tool_radius", []).append((met.largest, met, of))
             if degrees is not None:
                 met = bending.slope
-                name = f"steepest slope{of}{GRID}"
+                name = f"steepest slope{of}{FINE_GRID}"
                 checks.append(Check.at_most(name, met.largest, degrees, "deg", where=met.where, id="slope"))
                 found.setdefault("max_slope", []).append((-met.largest, met, of))
     at_bounds = {}
@@ -350,79 +350,81 @@ def of_bounds(
     return checks, at_bounds
 
 
-def _picture(goal: Goal, stored: np.ndarray) -> Check:
-    """The target that travels with a design against the picture of its scene."""
+def _target_check(goal: Goal, stored: np.ndarray) -> Check:
     off = np.abs(stored - goal.picture)
     row, column = np.unravel_index(np.argmax(off), off.shape)
-    name = f"target in design.npz against the scene's, of its brightest pixel{goal.suffix}"
+    name = f"target in design.npz: deviation from the scene's, relative to its brightest pixel{goal.suffix}"
     where = f"pixel ({column}, {row}), counted from the upper left"
-    return Check.at_most(name, float(off.max() / goal.picture.max()), TARGET_DIFFERENCE, where=where, id="target")
+    return Check.at_most(name, float(off.max() / goal.picture.max()), TARGET_TOLERANCE, where=where, id="target")
 
 
-def _facets(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> list[Check]:
-    """The facets of the STL file against the faces of the re-read solid, whose volume is in mm³.
+def _mesh_checks(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> list[Check]:
+    """Check the facets of the STL file against the faces of the re-read solid, whose volume is in mm³.
 
-    Facets of the area A (mm²) within the tolerance (mm) enclose a volume that is off by no more than A times it.
+    The error of the volume inside facets of total area A (mm²) is at most A times their tolerance (mm).
     """
     size = float(np.abs(mesh.vertices).max(initial=0.0))
-    tolerance, finest = nominal.scene.mesh_tolerance, len(mesh.faces) >= 0.9 * meshes.MOST
+    tolerance, finest = nominal.scene.mesh_tolerance, len(mesh.faces) >= 0.9 * meshes.DEFAULT_MAX_TRIANGLES
     limit = None if finest and nominal.scene.output.mesh_tolerance is None else tolerance
     enclosed, area = meshes.volume_and_area(mesh)
     off, error = abs(enclosed / volume - 1), meshes.chordal_error(mesh, lens)
     off_faces, rounding = meshes.vertex_error(mesh, lens), VERTEX_ROUNDING * size
-    least = error * len(mesh.faces) / meshes.ASKED  # it falls as their number grows
-    most = (
-        f"no mesh has over {meshes.ASKED} triangles, which come within some {least:.1g} mm; allow more than that by "
-        "output.mesh_tolerance" if finest and error > tolerance else ""
-    )  # fmt: skip
+    smallest = error * len(mesh.faces) / meshes.MAX_TRIANGLES  # the error is inversely proportional to their number
+    where = (
+        f"no mesh has more than {meshes.MAX_TRIANGLES} triangles, whose error is about {smallest:.1g} mm; "
+        "set output.mesh_tolerance to more than that"
+    )
+    where = where if finest and error > tolerance else ""
+    volume_error, distance = "STL: relative error of the volume", "STL: distance of vertices from the solid's faces"
     return [
-        Check.at_most("STL: volume against the solid's, relative", off, area * tolerance / volume, id="mesh-volume"),
-        Check.at_most("STL: vertices off the solid's faces", off_faces, rounding, "mm", id="mesh-vertices"),
-        Check.at_most("STL: chordal error", error, limit, unit="mm", where=most, id="mesh-chord"),
+        Check.at_most(volume_error, off, area * tolerance / volume, id="mesh-volume"),
+        Check.at_most(distance, off_faces, rounding, "mm", id="mesh-vertices"),
+        Check.at_most("STL: chordal error", error, limit, unit="mm", where=where, id="mesh-chord"),
     ]
 
 
-def _of_light(
+def _light_checks(
     light: Light, accept: Accept, meets: str = "enters the lens", of: str = "", why: str = ""
-) -> list[Check]:  # fmt: skip
-    """The irradiance through the re-read geometry, by rays, and by ray tubes that share only the trace with them.
+) -> list[Check]:
+    """Check the irradiance through the re-read geometry, by rays and by ray tubes, which share only the trace.
 
-    of: which of several targets it falls on, as Goal.suffix has it; why: reason for a limit of accept that is not met.
+    of: one of several targets, as Goal.suffix; why: reason for a limit of accept that is not met.
     """
     closure, tubes = abs(sum(light.flux.values()) - 1), light.witness
-    off, error = RESOLVED * light.standard_error, f"standard error of that RRMSD, times five{of}"
-    on_target, least = f"light on the target, of what {meets}{of}", accept.light_on_target
+    off, error = RESOLVED * light.standard_error, f"standard error of the RRMSD, times five{of}"
+    on_target, limit = f"light on the target, as a fraction of what {meets}{of}", accept.light_on_target
     rrmsd = f"RRMSD, box pixels, through the re-read STEP{of}"
-    # noise below the RRMSD leaves its figure resolved; noise below its distance from the limit leaves its verdict sure
+    # the figure is resolved if the noise is below the RRMSD; the verdict is certain if it is below the distance to the
+    # limit
     noise = None if accept.rrmsd is None else max(light.rrmsd, accept.rrmsd - light.rrmsd)
     checks = [
         Check.at_most(rrmsd, light.rrmsd, accept.rrmsd, where=why, id="rrmsd"),
         Check.at_most(error, off, noise, id="noise"),
-        Check.at_least(on_target, light.used, least, where=why, id="light-on-target"),
+        Check.at_least(on_target, light.used, limit, where=why, id="light-on-target"),
         Check.at_least(f"efficiency{of}", light.efficiency, accept.efficiency, where=why, id="efficiency"),
-        Check.at_most(f"flux ledger: distance of its sum from 1{of}", closure, 1e-12, id="ledger"),
+        Check.at_most(f"flux ledger: deviation of its sum from 1{of}", closure, 1e-12, id="ledger"),
     ]
     if tubes is not None:
-        name = f"picture by ray tubes, off the one by rays{of}"
+        name = f"picture by ray tubes, difference from the one by rays{of}"
         checks.insert(2, Check.at_most(name, tubes.difference, tubes.limit, id="tubes"))
     if light.leak:
-        name = f"light where the target is dark, of all on the target{of}"
+        name = f"light where the target is dark, as a fraction of all on the target{of}"
         checks.append(Check.at_most(name, light.leak.share, accept.leak, id="leak"))
     return checks
 
 
-def _of_wavefront(lens: Lens, nominal: Nominal) -> tuple[WavefrontError | None, list[Check]]:
-    """The wavefront through the re-read lens against the wave asked for, and its checks; nothing if none is."""
-    wave, asked = nominal.scene.wavefront, nominal.scene.accept.wavefront
+def _wavefront_checks(lens: Lens, nominal: Nominal) -> tuple[WavefrontError | None, list[Check]]:
+    """Return the error of the wavefront through the re-read lens, and its checks; None without a requested wave."""
+    wave, accepted = nominal.scene.wavefront, nominal.scene.accept.wavefront
     if wave is None:
         return None, []
     light = nominal.heaviest
     try:
         error = wavefront_error(light.source.central, light.through(lens), wave)
-    except ValueError as none:  # a lens that misses the wave is written all the same, and fails
-        return None, [Check.at_most(WAVEFRONT, math.nan, asked, "waves", where=str(none), id="wavefront")]
-    most = None if asked is None else FLOOR * asked
+    except ValueError as reason:  # a lens that misses the wave is written, and fails
+        return None, [Check.at_most(WAVEFRONT, math.nan, accepted, "waves", where=str(reason), id="wavefront")]
+    limit = None if accepted is None else MAX_FLOOR * accepted
     return error, [
-        Check.at_most(WAVEFRONT, error.without_tilt.rms, asked, "waves", id="wavefront"),
-        Check.at_most("wavefront error floor", error.floor, most, "waves", id="wavefront-floor"),
+        Check.at_most(WAVEFRONT, error.without_tilt.rms, accepted, "waves", id="wavefront"),
+        Check.at_most("wavefront error floor", error.floor, limit, "waves", id="wavefront-floor"),
     ]

@@ -1,6 +1,6 @@
-"""Checks of the solid in a STEP file, read by OCC: lens.step and part.step against the design, or a file by itself.
+"""Checks of the solid in a STEP file, read by OCC: lens.step and part.step against the design, or a file alone.
 
-Called in a process of its own, since OCC may end it over a damaged file.
+They run in a second process, because OCC may crash over a damaged file.
 """
 
 from __future__ import annotations
@@ -35,69 +35,69 @@ from bstcad.verify import text_checks
 from bstcad.verify.text_checks import net_check
 from bstcad.verify.verdict import Check
 
-NORMAL = 1e-9  # rad
-CURVATURE = 1e-12  # 1/mm
-FLAT = 1e-9  # mm; a front so flat that all conics of its curvature are alike to this may be read back as another
-BRIDGED = 5e-7  # mm; written with 1e-7
-MOVED = 1e-6  # mm, of an edge of a part; written with 1e-7
-PART = "part.step"
+NORMAL_TOLERANCE = 1e-9  # largest angle (rad) between normals
+CURVATURE_TOLERANCE = 1e-12  # largest difference of curvatures (1/mm)
+CONIC_TOLERANCE = 1e-9  # largest difference of sag (mm) by the conic constant, which a nearly flat front leaves open
+GAP_TOLERANCE = 5e-7  # largest gap (mm); shapes are written with a tolerance of 1e-7
+PART_EDGE_TOLERANCE = 1e-6  # largest distance (mm) between edges of two parts; written with a tolerance of 1e-7
+PART_FILE = "part.step"
 
 
 def one_sentence(work: Callable[..., Any]) -> Callable[..., Any]:
-    """Whatever OCC raises over a damaged solid is a ValueError in one sentence; path: of the file or its folder."""
+    """Decorate a job so that any error of OCC is a ValueError in one sentence; path: the file or its folder."""
 
     @functools.wraps(work)
-    def asked(path: Path, *arguments: Any, **options: Any) -> Any:
+    def checked(path: Path, *arguments: Any, **options: Any) -> Any:
         try:
             return work(path, *arguments, **options)
         except (ValueError, OSError, MemoryError):
             raise
-        except Exception as error:  # OCC has a hundred kinds, which do not all descend from one
-            name, kind = path.name if path.suffix else PART, type(error).__name__
+        except Exception as error:  # OCC has a hundred classes of errors without a common base
+            name, kind = path.name if path.suffix else PART_FILE, type(error).__name__
             raise ValueError(f"{name}: read by OCC: the solid is damaged ({kind}); write it again") from error
 
-    return asked
+    return checked
 
 
 @dataclass(frozen=True)
 class ExaminedFile:
-    """A STEP file by itself."""
+    """Checks and contents of a STEP file without a design."""
 
     checks: tuple[Check, ...]
-    lens: Lens  # lens of the file, in its own frame; its index does not matter
-    whole: WholePart | None  # the part around that lens; None: it is bare
-    placement: Placement  # where the lens's frame lies in the file
+    lens: Lens  # lens of the file, in its own frame, with an arbitrary index
+    whole: WholePart | None  # part around the lens; None: a bare lens
+    placement: Placement  # placement of the lens's frame in the file
 
 
 @one_sentence
 def lens(path: Path, index: float, passes: Passes = LENS) -> Lens:
-    """The lens of a STEP file, which says neither its index nor the passes of light; ValueError if it holds none."""
+    """Read the lens of a STEP file, which states neither index nor passes of the light; ValueError if there is none."""
     return replace(step_reading.lens(_read(path, _stamp(path)), index), way=passes)
 
 
 @one_sentence
 def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, ...]:
-    """The checks of the solid in the STEP file of a design; ValueError if it holds none.
+    """Check the solid in the STEP file of a design; ValueError if the file has none.
 
-    form: tolerance of the tailored faces and of the front's vertex (mm); points: of a face at which it is compared.
+    form: tolerance of the tailored faces and of the front's vertex (mm); points: number of points per compared face.
     """
     reread = _read(path, _stamp(path))
     return (
-        *_placed(reread, form),
-        *_sound(reread.shape),
-        *_edges(reread, nominal),
-        *_form(reread, nominal.back, form, points),
-        *(_form(reread, nominal.front, form, points, of="front") if nominal.shapes("front") else ()),
-        *_front(reread.front, nominal, form),
+        *_placement_checks(reread, form),
+        *_solid_checks(reread.shape),
+        *_edge_checks(reread, nominal),
+        *_form_checks(reread, nominal.back, form, points),
+        *(_form_checks(reread, nominal.front, form, points, of="front") if nominal.shapes("front") else ()),
+        *_front_checks(reread.front, nominal, form),
     )
 
 
 @functools.lru_cache(maxsize=1)
 def _read(path: Path, stamp: object) -> StepLens:
-    """The file as OCC reads it; kept, since `lens` and `check` ask for the same file in turn.
+    """Read a file by OCC, and cache it, because `lens` and `check` use the same file in turn.
 
-    In the second process at once, while the first one reads its text: it may end.  stamp: another for
-    another file in the same place.
+    The second process may crash and reads it at once, while the first one reads its text.  Without a second process the
+    text is read first.  stamp: differs for another file of the same name.
     """
     if not processes.is_second():
         part21.read_lens(path)
@@ -105,7 +105,7 @@ def _read(path: Path, stamp: object) -> StepLens:
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:
-    """A number of the file itself, its size and its time of change; None: `_read` says why there are none."""
+    """Return number, size and time of change of a file; None if it cannot be read: `_read` then gives the reason."""
     with contextlib.suppress(OSError):
         status = path.stat()
         return status.st_ino, status.st_size, status.st_mtime_ns
@@ -114,32 +114,32 @@ def _stamp(path: Path) -> tuple[int, int, int] | None:
 
 @one_sentence
 def examine(path: Path) -> ExaminedFile:
-    """Check a STEP file by itself, its text first: over a damaged one OCC may never end.
+    """Check a STEP file without a design: compare its two readers, and its statements with its faces.
 
-    There is no design to compare it with: the checks are whether its two readers, its text and its faces agree.
+    The text is read first, because OCC may hang over a damaged file.
     """
     text, reread = part21.read_lens(path, any_unit=True), step_reading.read(path)
     lens_read, placed = step_reading.lens(reread, index=1.5), reread.placement
     properties = solid_properties.of_solid(reread.shape)
     checks = [
         *text_checks.structure(text, lens_read.back.shape, any_unit=True),
-        *_sound(reread.shape),
-        *_edges(reread, lens_read, bare=reread.edge is None),
+        *_solid_checks(reread.shape),
+        *_edge_checks(reread, lens_read, bare=reread.edge is None),
         net_check(
-            "STEP text against OCC: control points",
+            "control points: difference between STEP text and OCC",
             text.surface.control_points,
             placed(reread.control_points),
             id="net-two-readers",
         ),
     ]
     if text.front is not None:
-        name = "STEP text against OCC: control points of the front"
+        name = "control points of the front: difference between STEP text and OCC"
         own = reread.front.control_points() if reread.front.is_net else np.empty((0, 0, 3))
         checks.append(net_check(name, text.front.control_points, placed(own), id="net-two-readers"))
     thinnest = thickness_range(lens_read, reread.edge)[0]
     checks.append(Check.at_least("smallest thickness", thinnest, 0.0, "mm", id="thickness"))
-    if properties is None:  # it has faces that no lens and no mount has
-        name = "STEP text: what it states can be held to its faces"
+    if properties is None:  # a face is of a kind that bstcad does not write
+        name = "STEP text: area, volume and centroid can be computed from the faces"
         checks.append(Check(name, False, None, unit="", passed=True, id="measures-unknown"))
     else:
         from_definition = placed.inverse.after(text.placement)
@@ -149,8 +149,8 @@ def examine(path: Path) -> ExaminedFile:
     return ExaminedFile(tuple(checks), lens_read, whole, placed)
 
 
-def _placed(reread: StepLens, tolerance: float) -> Iterator[Check]:
-    """The placement of the lens in the file of its design, if it has one."""
+def _placement_checks(reread: StepLens, tolerance: float) -> Iterator[Check]:
+    """Check the placement of the lens in the file of its design, if it is not the identity."""
     if reread.placement.moves:
         net, words = reread.control_points, reread.placement.words
         off = float(np.abs(reread.placement(net) - net).max())
@@ -158,29 +158,28 @@ def _placed(reread: StepLens, tolerance: float) -> Iterator[Check]:
         yield Check.at_most(name, off, tolerance, "mm", where=f"the lens is {words}", id="placement")
 
 
-def _sound(solid: Any, of_part: bool = False) -> Iterator[Check]:
-    valid, gaps = (f"{PART}: solid valid", f"{PART}: gaps") if of_part else ("solid valid", "solid: gaps")
+def _solid_checks(solid: Any, of_part: bool = False) -> Iterator[Check]:
+    valid, prefix = (f"{PART_FILE}: solid valid", PART_FILE) if of_part else ("solid valid", "solid")
     yield Check.true(valid, step_reading.is_valid(solid), id="solid-valid")
-    name = f"{gaps} that edges and vertices bridge"
-    yield Check.at_most(name, step_reading.gaps(solid), BRIDGED, "mm", id="gaps")
+    name = f"{prefix}: largest gap at edges and vertices"
+    yield Check.at_most(name, step_reading.gaps(solid), GAP_TOLERANCE, "mm", id="gaps")
 
 
-def _edges(reread: StepLens, lens: Lens, bare: bool = True) -> Iterator[Check]:
-    """bare: it is to be a lens and no more; the edges of a flange, or of walls that lean, lie elsewhere."""
-    (faces, on_face), (wall, on_wall) = step_reading.edges_off(reread.shape, lens)
-    name = "solid: edges off the faces they bound"
-    yield Check.at_most(name, faces, BRIDGED, unit="mm", where=on_face, id="edges-off-faces")
+def _edge_checks(reread: StepLens, lens: Lens, bare: bool = True) -> Iterator[Check]:
+    """Check the distance of edges from faces and, of a bare lens (no flange, no leaning walls), from its wall."""
+    (faces, on_face), (wall, on_wall) = step_reading.edge_deviations(reread.shape, lens)
+    name = "solid: distance of edges from the faces they bound"
+    yield Check.at_most(name, faces, GAP_TOLERANCE, unit="mm", where=on_face, id="edges-off-faces")
     if bare:
-        name = "solid: edges off the wall of the lens"
-        yield Check.at_most(name, wall, BRIDGED, unit="mm", where=on_wall, id="edges-off-wall")
+        name = "solid: distance of edges from the wall of the lens"
+        yield Check.at_most(name, wall, GAP_TOLERANCE, unit="mm", where=on_wall, id="edges-off-wall")
 
 
-def _form(
+def _form_checks(
     reread: StepLens, face: BSplineSurface, tolerance: float, count: int, *, of: str = "back"
-) -> Iterator[Check]:  # fmt: skip
-    """Distances (mm) and angles between normals (rad) of a face at `count` Sobol points, evaluated by OCC."""
-    which, turns = ("front", "the front's normals") if of == "front" else ("back", "the normals")
-    form = f"form: re-read {which} face against the optimised one"
+) -> Iterator[Check]:
+    """Check distances (mm) and angles between normals (rad) of a face at `count` Sobol points, evaluated by OCC."""
+    form = f"form: deviation of the re-read {of} from the optimised one"
     if of == "front" and not reread.front.is_net:
         yield Check.true(form, False, "the file's front is no net", id="form")
         return
@@ -195,11 +194,11 @@ def _form(
     j, k = int(off.argmax()), int(turned.argmax())
     at_j, at_k = (f"at ({x[worst]:.4g}, {y[worst]:.4g}) mm" for worst in (j, k))
     yield Check.at_most(form, float(off[j]), tolerance, "mm", where=at_j, id="form")
-    yield Check.at_most(f"form: direction of {turns}", float(turned[k]), NORMAL, "rad", where=at_k, id="normals")
+    name = f"form: angle between normals of the re-read and the optimised {of}"
+    yield Check.at_most(name, float(turned[k]), NORMAL_TOLERANCE, "rad", where=at_k, id="normals")
 
 
-def _front(reread: Surface, lens: Lens, tolerance: float) -> Iterator[Check]:
-    """The re-read front against the designed one."""
+def _front_checks(reread: Surface, lens: Lens, tolerance: float) -> Iterator[Check]:
     wanted, difference = lens.front, "difference from the designed one"
     name, off = f"form: vertex of the front, {difference}", abs(reread.z - lens.front_vertex)
     yield Check.at_most(name, off, tolerance, "mm", id="front-vertex")
@@ -211,11 +210,11 @@ def _front(reread: Surface, lens: Lens, tolerance: float) -> Iterator[Check]:
     curvature, constant = wanted.conic()
     found = (math.inf, math.inf) if reread.is_net else reread.conic()
     name = f"form: curvature of the front, {difference}"
-    yield Check.at_most(name, abs(found[0] - curvature), CURVATURE, "1/mm", id="front-curvature")
+    yield Check.at_most(name, abs(found[0] - curvature), CURVATURE_TOLERANCE, "1/mm", id="front-curvature")
     if constant:
         sag = abs(found[1] - constant) * abs(curvature) ** 3 * math.hypot(*lens.outline.farthest) ** 4 / 8
         name = f"form: sag at the rim by the front's conic constant, {difference}"
-        yield Check.at_most(name, sag, FLAT, "mm", id="front-conic")
+        yield Check.at_most(name, sag, CONIC_TOLERANCE, "mm", id="front-conic")
 
 
 # ---- part.step -----------------------------------------------------------------------------------------------------
@@ -223,35 +222,32 @@ def _front(reread: Surface, lens: Lens, tolerance: float) -> Iterator[Check]:
 
 @functools.lru_cache(maxsize=1)
 def _part(path: Path, stamp: object) -> tuple[StepText, Any]:
-    """The text of a part and, if that is not damaged, its solid by OCC; kept, since three works ask for them in turn.
-
-    stamp: as of `_read`.
-    """
+    """Read the text of a part, then its solid by OCC; cached, because three jobs use them; stamp: see `_read`."""
     return part21.read_lens(path), step_reading.solid(path)
 
 
 @functools.lru_cache(maxsize=1)
 def _properties(path: Path, stamp: object) -> MassProperties | None:
-    """Area, volume and centroid of the solid of a part."""
+    """Return area, volume and centroid of the solid of a part; cached, as in `_part`."""
     return solid_properties.of_solid(_part(path, stamp)[1])
 
 
 @one_sentence
 def whole_part(path: Path) -> tuple[Lens, WholePart | None]:
-    """The lens of a part, whose index does not matter, and the walls around it."""
+    """Read the lens of a part, with an arbitrary index, and the part around it."""
     reread = step_reading.read(path, _part(path, _stamp(path))[1])
     return step_reading.lens(reread, index=1.5), solid_properties.whole_part(reread, _properties(path, _stamp(path)))
 
 
 @one_sentence
 def lens_of_part(folder: Path, designed: Lens, mount: Mount) -> Lens:
-    """The lens of the part in a design's folder, in the scene's frame, with the clear apertures of the part's faces.
+    """Read the lens of the part in a design's folder, in the scene's frame, with the clear apertures of its faces.
 
-    ValueError if there is no such part, or its faces have other edges than a mount's.
+    Raises ValueError if there is no such part, or the edges of its faces are not those of a mount.
     """
-    path = folder / PART
+    path = folder / PART_FILE
     if not path.exists():
-        raise ValueError(f"{PART}: is not there")
+        raise ValueError(f"{PART_FILE}: is missing")
     reread, up = step_reading.read(path, _part(path, _stamp(path))[1]), mount.origin(designed.front_vertex)
     front, back = (face.moved(face.z + up) for face in (reread.front, reread.back))
     return replace(designed, front=front, back=back, clear=reread.clear, losses=None)
@@ -259,48 +255,50 @@ def lens_of_part(folder: Path, designed: Lens, mount: Mount) -> Lens:
 
 @one_sentence
 def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Check, ...]:
-    """The checks of the part in a design's folder; part: whose facts the file should state."""
-    path = folder / PART
+    """Check the part in a design's folder; part: facts that the file should state."""
+    path = folder / PART_FILE
     try:
         wanted, why = mounting.part_of(lens, mount).solid.wrapped, "generate the design again"
     except ValueError as error:
         wanted, why = None, str(error)
     if not path.exists():
-        return (Check.true(f"{PART}: written", False, why, id="part-written"),)
+        return (Check.true(f"{PART_FILE}: written", False, why, id="part-written"),)
     try:
         text, solid = _part(path, _stamp(path))
     except ValueError as error:
-        return (Check.true(f"{PART}: can be read", False, str(error), id="part-readable"),)
+        return (Check.true(f"{PART_FILE}: can be read", False, str(error), id="part-readable"),)
     down = np.array([0.0, 0.0, mount.origin(lens.front_vertex)])
     net = lens.back.control_points() - down
     of_front = ()
     if lens.shapes("front"):
-        name, held = f"{PART}: control points of the front", text_checks.net_of_front(text)
-        of_front = (net_check(name, held, lens.front.control_points() - down, id="control-points"),)
+        name, read = f"{PART_FILE}: deviation of the control points of the front", text_checks.net_of_front(text)
+        of_front = (net_check(name, read, lens.front.control_points() - down, id="control-points"),)
     properties = _properties(path, _stamp(path)) if text.properties.of_shape else None
-    if text.properties.of_shape and properties is None:  # of a damaged face, which other checks find
-        name, strange = f"{PART}: area, volume and centroid can be found", "a face is of an unknown kind"
-        stated = [Check.true(name, False, strange, id="measures-unknown")]
+    if text.properties.of_shape and properties is None:  # a damaged face, which other checks find
+        name = f"{PART_FILE}: area, volume and centroid can be computed from the faces"
+        stated = [Check.true(name, False, "a face is of an unknown kind", id="measures-unknown")]
     else:
-        stated = text_checks.measures(text.properties, properties, lens.outline, PART)
+        stated = text_checks.measures(text.properties, properties, lens.outline, PART_FILE)
     return (
-        *text_checks.structure(text, lens.back.shape, PART),
-        net_check(f"{PART}: control points", text.surface.control_points, net, id="control-points"),
+        *text_checks.structure(text, lens.back.shape, PART_FILE),
+        net_check(
+            f"{PART_FILE}: deviation of the control points", text.surface.control_points, net, id="control-points"
+        ),
         *of_front,
-        *_sound(solid, of_part=True),
-        _edges_moved(wanted, solid, why),
+        *_solid_checks(solid, of_part=True),
+        _part_edge_check(wanted, solid, why),
         *stated,
-        *text_checks.of_part(text, part, PART),
+        *text_checks.of_part(text, part, PART_FILE),
     )
 
 
-def _edges_moved(wanted: Any, reread: Any, why: str) -> Check:
-    """The largest distance (mm) between an edge of one solid and those of the other; why: there is none wanted."""
-    name = f"{PART}: edges against the mount's"
+def _part_edge_check(wanted: Any, reread: Any, why: str) -> Check:
+    """Check the largest distance (mm) between the edges of two solids; why: reason if the wanted one is None."""
+    name = f"{PART_FILE}: distance of edges from the mount's"
     if wanted is None:
         return Check.true(name, False, why, id="part-edges")
-    there, here = (step_reading.along_edges(solid) for solid in (wanted, reread))
-    missing, strange = cKDTree(here).query(there)[0], cKDTree(there).query(here)[0]
-    worst, places = max((missing, there), (strange, here), key=lambda pair: pair[0].max())
-    where = "edge at ({:.4g}, {:.4g}, {:.4g}) mm".format(*places[worst.argmax()])
-    return Check.at_most(name, float(worst.max()), MOVED, unit="mm", where=where, id="part-edges")
+    expected, found = (step_reading.points_on_edges(solid) for solid in (wanted, reread))
+    missing, extra = cKDTree(found).query(expected)[0], cKDTree(expected).query(found)[0]
+    worst, points = max((missing, expected), (extra, found), key=lambda pair: pair[0].max())
+    where = "edge at ({:.4g}, {:.4g}, {:.4g}) mm".format(*points[worst.argmax()])
+    return Check.at_most(name, float(worst.max()), PART_EDGE_TOLERANCE, unit="mm", where=where, id="part-edges")

@@ -1,4 +1,4 @@
-"""A verdict, and each of its lines, judged by a limit."""
+"""The verdict on a design, and its checks, each a value judged by a limit."""
 
 from __future__ import annotations
 
@@ -6,46 +6,46 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-NO_LIMIT = "no limit was asked"
+NO_LIMIT = "no limit was asked"  # verdict on a design whose scene sets no limit on the light
 VERDICTS = ("passed", "passed with remarks", NO_LIMIT, "failed")
 
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the verdict."""
+    """One check of a verdict."""
 
-    name: str  # in English, free to change
-    value: float | bool | None  # None: could not be measured
-    limit: float | bool | None  # None: stated, not judged
-    unit: str  # of value and limit; empty: a pure number
-    passed: bool  # does the value keep the limit?
-    where: str = ""  # of a check that failed, the place: "control point (12, 40)", counted from 0, x or u first
-    id: str = ""  # its section in checks.md without "check-", such as "rrmsd"; empty: of a script, which none explains
+    name: str  # statement that is true if the check passes, or name of the quantity, in English; may change
+    value: float | bool | None  # measured value; None: could not be measured
+    limit: float | bool | None  # limit; None: the value is stated, but not judged
+    unit: str  # unit of value and limit; empty: a pure number
+    passed: bool  # True if the value keeps the limit
+    where: str = ""  # position or reason of a failure: "control point (12, 40)", counted from 0, x or u first
+    id: str = ""  # section in checks.md without "check-", such as "rrmsd"; empty: a script's check without a section
 
     @property
     def topic(self) -> str:
-        """The name by which `bstcad docs` explains it; empty: none does."""
+        """Name of the section that `bstcad docs` prints; empty if there is none."""
         return self.id and f"check-{self.id}"
 
     @classmethod
     def at_most(
         cls, name: str, value: float, limit: float | None, unit: str = "", where: str = "", *, id: str = ""
-    ) -> Check:  # fmt: skip
-        """Passes if value <= limit; a value that is not finite fails."""
+    ) -> Check:
+        """Return a check that passes if value <= limit; a value that is not finite fails."""
         return cls._judged(name, value, limit, unit, passed=limit is None or value <= limit, where=where, id=id)
 
     @classmethod
     def at_least(
         cls, name: str, value: float, limit: float | None, unit: str = "", where: str = "", *, id: str = ""
-    ) -> Check:  # fmt: skip
-        """Passes if value >= limit; a value that is not finite fails."""
+    ) -> Check:
+        """Return a check that passes if value >= limit; a value that is not finite fails."""
         return cls._judged(name, value, limit, unit, passed=limit is None or value >= limit, where=where, id=id)
 
     @classmethod
     def _judged(
         cls, name: str, value: float, limit: float | None, unit: str, *, passed: bool, where: str, id: str
-    ) -> Check:  # fmt: skip
-        """A value that is not finite was not measured: the file holds nothing of the kind."""
+    ) -> Check:
+        """Return the check; a value that is not finite could not be measured and fails."""
         finite = math.isfinite(value)
         passed = bool(passed) and finite
         where = "" if passed else where
@@ -53,15 +53,15 @@ class Check:
 
     @classmethod
     def true(cls, name: str, value: bool, where: str = "", *, id: str = "") -> Check:
-        """Passes if it is so."""
+        """Return a check that passes if `value` is True."""
         return cls(name, bool(value), True, unit="", passed=bool(value), where="" if value else where, id=id)
 
 
 def verdict(passed: bool, given_up: Sequence[str], asked: bool = True) -> str:
-    """Return one of VERDICTS; given_up: the wishes of the scene that were given up, which are the remarks.
+    """Return one of VERDICTS; given_up: wishes of the scene that could not be met, which become remarks.
 
-    asked: does the scene set any limit on the light?  Without one only a failed check says that a lens is not good;
-    nothing says that it is.
+    asked: True if the scene sets a limit on the light.  Without one, checks can show that a lens is bad, but not that
+    it is good.
     """
     clean, remarked, no_limit, failed = VERDICTS
     if not passed:

@@ -205,7 +205,7 @@ def _mesh(m: int) -> Work:
     made = _made(m)
 
     def write(place: Path) -> None:
-        _, mesh = meshes.fitting(made.lens, made.scene.mesh_tolerance)
+        _, mesh = meshes.fit_mesh(made.lens, made.scene.mesh_tolerance)
         meshes.write_stl(mesh, place / "lens.stl")
         meshes.write_3mf(mesh, place / "lens.3mf")
 

@@ -29,10 +29,10 @@ def rough_back(outline: Outline, m: int, ripple: float = 1e-3) -> BSplineSurface
     )  # fmt: skip
 
 
-def encoded(lens: Lens, part: Part, name: str = "lens", faces: Sequence[str] | None = None) -> bytes:
+def encode(lens: Lens, part: Part, name: str = "lens", faces: Sequence[str] | None = None) -> bytes:
     """The STEP file of a lens that states all that it can."""
     solid, names = named_solid(lens)
-    return b"".join(step_writing.encoded(solid, name, part, faces=faces or names, properties=of_lens(lens)))
+    return b"".join(step_writing.encode(solid, name, part, faces=faces or names, properties=of_lens(lens)))
 
 
 @pytest.fixture

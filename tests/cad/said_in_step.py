@@ -26,7 +26,7 @@ from OCP.XCAFDoc import (
     XCAFDoc_Volume,
 )
 
-from bstcad.cad.step_reading import silence
+from bstcad.cad.step_reading import quiet_occ
 
 NAMES = "read.stepcaf.subshapes.name"
 
@@ -70,7 +70,7 @@ def read(path: Path) -> Said:
     Interface_Static.SetCVal_s(NAMES, "On")
     for mode in (reader.SetNameMode, reader.SetColorMode, reader.SetMatMode, reader.SetPropsMode, reader.SetGDTMode):
         mode(True)
-    with silence():
+    with quiet_occ():
         assert reader.ReadFile(str(path)) == IFSelect_RetDone and reader.Transfer(document)
     Interface_Static.SetCVal_s(NAMES, before)
     main, colour = document.Main(), Quantity_ColorRGBA()

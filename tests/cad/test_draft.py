@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bstcad.cad import step_writing
-from bstcad.cad.mounting import Placed, mounted, wire
+from bstcad.cad.mounting import PlacedLens, mounted, wire
 from bstcad.cad.solid import lens_solid, named_solid
 from bstcad.cad.solid_properties import of_solid
 from bstcad.cad.walls import Draft
@@ -151,13 +151,13 @@ def test_the_rim_may_be_any_smooth_wire_and_any_polygon(rim, tmp_path):
 @pytest.mark.parametrize("lean", [LEAN, Draft(bevel=0.2)], ids=["both", "bevel"])
 def test_below_a_flange_it_leans_from_the_flange_on(lean):
     lens, body = plate("plane"), disc(2.0, 3.0)
-    part = mounted(body, [Placed(lens, wire(RIMS["rounded"]), draft=lean)])
+    part = mounted(body, [PlacedLens(lens, wire(RIMS["rounded"]), draft=lean)])
     assert part.solid.isValid() and worst_gap(part.solid, 41) < 1e-7 and Counter(part.faces)["bevel"] == 8
     opening = cq.Face.makeFromWires(ROUNDED).Area() * 1.0  # mm thick
     whole = of_solid(lens_solid(lens, ROUNDED)).volume + body.val().Volume() - opening
     assert occ_volume(part.solid) == pytest.approx(whole - taken(RIMS["rounded"], lean, 2.0), rel=1e-6)
-    with pytest.raises(ValueError, match="lens: draft and bevel are of its own walls, below the flange"):
-        mounted(disc(-1.0, 3.0), [Placed(lens, draft=Draft(1.0))])
+    with pytest.raises(ValueError, match="lens: draft and bevel need a wall of the lens below the flange"):
+        mounted(disc(-1.0, 3.0), [PlacedLens(lens, draft=Draft(1.0))])
 
 
 STEEP = replace(plate(), front=Sphere(-4.0, 0.24), back=waves(half=(4.0, 4.0)), outline=Circle(3.0))

@@ -8,7 +8,7 @@ import pytest
 from OCP.BRepGProp import BRepGProp
 from OCP.GProp import GProp_GProps
 
-from bstcad.cad.mounting import Placed, mounted, wire
+from bstcad.cad.mounting import PlacedLens, mounted, wire
 from bstcad.cad.solid import lens_solid, named_solid
 from bstcad.cad.solid_properties import of_solid
 from bstcad.cad.walls import Draft
@@ -113,7 +113,7 @@ def test_a_lens_in_a_body_is_both(kind):
     """OCC integrates the body beside the lens, which has simple faces alone."""
     lens, body = plate("convex"), BODIES[kind]()
     around = by_occ(body.val().cut(cq.Workplane("XY").box(10, 8, 20).val()))
-    found, own = of_solid(mounted(body, [Placed(lens)]).solid), of_lens(lens)
+    found, own = of_solid(mounted(body, [PlacedLens(lens)]).solid), of_lens(lens)
     assert found.volume == pytest.approx(own.volume + around.volume, rel=1e-7)
     moment = own.volume * np.array(own.centroid) + around.volume * np.array(around.centroid)
     assert found.centroid == pytest.approx(moment / found.volume, abs=1e-6)
@@ -132,4 +132,4 @@ def test_of_a_body_with_freeform_faces_nothing_is_known():
         cq.Workplane("XZ", origin=(0, 12, 0)).moveTo(-11, 1.8).spline([(-9, 1.7), (-8, 1.9)], includeCurrent=True)
         .lineTo(-8, 3).lineTo(-11, 3).close().twistExtrude(24, 3)
     )  # fmt: skip
-    assert of_solid(mounted(wavy, [Placed(plate("convex"))]).solid) is None
+    assert of_solid(mounted(wavy, [PlacedLens(plate("convex"))]).solid) is None

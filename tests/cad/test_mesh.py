@@ -54,7 +54,7 @@ def test_the_grid_is_as_fine_as_its_tolerance_requires_and_no_finer(make_lens, o
     """The chordal error falls with the square of the spacing: 11 % fewer cells would miss the tolerance by a fifth."""
     lens = make_lens(front, outline, m=65)
     for tolerance in (5e-3, 1e-3):
-        cells, made = mesh.fitting(lens, tolerance)
+        cells, made = mesh.fit_mesh(lens, tolerance)
         volume, area = volume_and_area(made)
         assert chordal_error(made, lens) <= tolerance
         assert chordal_error(lens_mesh(lens, 2 * round(0.445 * cells)), lens) > tolerance
@@ -72,13 +72,13 @@ def test_cells_are_cut_along_a_ridge(sense):
 
 def test_what_so_many_triangles_cannot_do_is_not_tried(make_lens, monkeypatch):
     """A mesh as large as may be, that is not fine enough all the same, serves nobody: it is as large as by default."""
-    monkeypatch.setattr(mesh, "MOST", 5_000)
+    monkeypatch.setattr(mesh, "DEFAULT_MAX_TRIANGLES", 5_000)
     lens = make_lens(m=33)
-    for most, asked, cells in ((20_000, 1e-9, mesh.finest(lens)), (4_000, 1e-9, mesh.finest(lens, 4_000))):
-        assert mesh.fitting(lens, asked, most)[0] == cells
-    reached = chordal_error(lens_mesh(lens, mesh.finest(lens, 20_000)), lens)
-    cells, made = mesh.fitting(lens, 1.1 * reached, 20_000)
-    assert mesh.finest(lens) < cells <= mesh.finest(lens, 20_000)
+    for most, asked, cells in ((20_000, 1e-9, mesh.max_cells(lens)), (4_000, 1e-9, mesh.max_cells(lens, 4_000))):
+        assert mesh.fit_mesh(lens, asked, most)[0] == cells
+    reached = chordal_error(lens_mesh(lens, mesh.max_cells(lens, 20_000)), lens)
+    cells, made = mesh.fit_mesh(lens, 1.1 * reached, 20_000)
+    assert mesh.max_cells(lens) < cells <= mesh.max_cells(lens, 20_000)
     assert chordal_error(made, lens) <= 1.1 * reached
 
 
@@ -90,7 +90,7 @@ def test_facets_larger_than_what_they_have_to_follow_are_seen_to_miss_it():
     swing = float(heights.max() - heights.min())
     error = chordal_error(lens_mesh(lens, 16), lens)
     assert 0.5 * swing < error < 1.01 * swing
-    assert mesh.fitting(lens, 2 * swing)[0] == mesh.COARSEST < mesh.fitting(lens, 0.2 * swing)[0]
+    assert mesh.fit_mesh(lens, 2 * swing)[0] == mesh.MIN_MESH_CELLS < mesh.fit_mesh(lens, 0.2 * swing)[0]
     heights = torch.zeros((129, 129), dtype=torch.float64)
     heights[67, 66] = 1e-3  # one point, which lies beside the middles of facets and edges
     lens = lens_of(net(heights), Plane(8.0))
@@ -182,8 +182,8 @@ def test_a_3mf_states_millimetres_the_mesh_a_name_and_a_colour_and_is_the_same_t
     said = {entry.get("name"): entry.text for entry in model.iter(f"{core}metadata")}
     assert said == {"Title": "Title & <b>", "Description": "A remark.", "Application": "bstcad"}
     [material], [thing], [item] = (list(model.iter(f"{core}{tag}")) for tag in ("basematerials", "object", "item"))
-    assert material[0].attrib == {"name": "N-BK7 'x'", "displaycolor": mesh.CLEAR}
-    assert re.fullmatch("#[0-9A-F]{8}", mesh.CLEAR) and re.fullmatch("#[0-9A-F]{8}", mesh.SILVER)
+    assert material[0].attrib == {"name": "N-BK7 'x'", "displaycolor": mesh.CLEAR_RGBA}
+    assert re.fullmatch("#[0-9A-F]{8}", mesh.CLEAR_RGBA) and re.fullmatch("#[0-9A-F]{8}", mesh.MIRROR_RGBA)
     assert (thing.get("name"), thing.get("pid"), thing.get("pindex")) == ('a "name" <1>', material.get("id"), "0")
     assert item.get("objectid") == thing.get("id") != material.get("id")
     again = trimesh.load(tmp_path / "one.3mf", force="mesh")
@@ -197,7 +197,7 @@ def test_corners_that_are_made_to_collide_are_welded_all_the_same(tmp_path):
     key = (corners.view(np.uint32) * factors).sum(axis=1, dtype=np.uint64)
     alike = corners[((key ^ (key >> np.uint64(32))) & np.uint64((1 << 16) - 1)) < 1 << 12]
     alike = np.repeat(alike[: len(alike) // 3 * 3], 2, axis=0)
-    assert not len(mesh._welded(alike.view(np.uint32))[1])
+    assert not len(mesh._weld(alike.view(np.uint32))[1])
     triangles = np.zeros(len(alike) // 3, mesh.STL_TRIANGLE)
     triangles["corners"] = alike.reshape(-1, 3, 3)
     path = tmp_path / "alike.stl"

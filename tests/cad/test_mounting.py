@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bstcad.cad import patches, step_writing
-from bstcad.cad.mounting import Placed, body, mounted
+from bstcad.cad.mounting import PlacedLens, body, mounted
 from bstcad.scene.mount import Box, Flange, Round
 from bstcad.step_text import part21
 from tests.cad.test_trimming import FRONTS, occ_volume, plate, stadium, uses, worst_gap
@@ -40,7 +40,7 @@ def check(part):
 def test_it_is_one_closed_solid_of_the_volume_of_both(front, low, high):
     """Beside the lens, hanging below its front, standing above its back, and both."""
     lens = plate(front)
-    part = mounted(disc(low, high), [Placed(lens)])
+    part = mounted(disc(low, high), [PlacedLens(lens)])
     check(part)
     assert occ_volume(part.solid) == pytest.approx(exact_volume(lens) + ring(low, high), rel=2e-6)
     assert Counter(part.faces) == {"back": 1, "front": 1, "rim": 8, "flange": 3}
@@ -50,7 +50,7 @@ def test_it_is_one_closed_solid_of_the_volume_of_both(front, low, high):
 
 def test_a_plane_front_and_the_plate_s_lower_face_are_one_face():
     lens = plate("plane")
-    part = mounted(disc(0.0, 1.5), [Placed(lens, holes=[(1.0, 1.0, 0.8)])])
+    part = mounted(disc(0.0, 1.5), [PlacedLens(lens, holes=[(1.0, 1.0, 0.8)])])
     check(part)
     assert Counter(part.faces) == {"back": 1, "rim": 4, "hole": 2, "flange": 3}
     lower = min(part.solid.Faces(), key=lambda face: face.Center().z)
@@ -60,7 +60,7 @@ def test_a_plane_front_and_the_plate_s_lower_face_are_one_face():
 @pytest.mark.parametrize("spline", [True, False])
 def test_the_lens_may_be_cut_to_any_wire(spline, tmp_path):
     lens, wire = plate("concave"), stadium(spline)
-    placed = Placed(lens, trim=wire, holes=[(0.5, 0.2, 1.0)], at=AT)
+    placed = PlacedLens(lens, trim=wire, holes=[(0.5, 0.2, 1.0)], at=AT)
     part = mounted(disc(1.5, 2.5), [placed])
     check(part)
     bare = occ_volume(mounted(disc(1.5, 2.0), [placed]).solid)
@@ -77,7 +77,7 @@ def test_an_array_is_one_part():
     lens = plate("convex")
     base = cq.Workplane("XY", origin=(0, 0, 0.5)).rect(40, 34).extrude(1.5)
     places = [(12.0 * i, 10.0 * j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-    part = mounted(base, [Placed(lens, at=(*at, 0.0)) for at in places])
+    part = mounted(base, [PlacedLens(lens, at=(*at, 0.0)) for at in places])
     check(part)
     assert Counter(part.faces) == {"back": 9, "front": 9, "rim": 72, "flange": 6}
     wanted = 9 * exact_volume(lens) + (40 * 34 - 9 * 80) * 1.5
@@ -118,15 +118,15 @@ def test_a_flange_s_bevels_are_at_45_degrees_whatever_its_walls_lean(outline, dr
 def test_every_face_of_a_flanged_lens_has_its_name_in_step(outline, draft, bevel):
     """OCC's writer turns the left-handed walls of a taper, and had left them unnamed."""
     part = mounted(body(Flange(outline=outline, z=1.2, thickness=1.3, draft=draft, bevel=bevel, holes=((7, 4, 1),))),
-                   [Placed(plate("concave"))])  # fmt: skip
-    text = b"".join(step_writing.encoded(part.solid, "part", faces=part.faces)).decode()
+                   [PlacedLens(plate("concave"))])  # fmt: skip
+    text = b"".join(step_writing.encode(part.solid, "part", faces=part.faces)).decode()
     assert Counter(re.findall(r"=\s*ADVANCED_FACE\('([^']*)'", text)) == Counter(part.faces)
     check(part)
 
 
 def test_a_place_that_is_none_is_refused():
-    with pytest.raises(ValueError, match=r"lens: \(0.0, nan, 0.0\) is no place; give x, y and z in mm"):
-        mounted(disc(1.0, 2.0), [Placed(plate("plane"), at=(0.0, float("nan"), 0.0))])
+    with pytest.raises(ValueError, match=r"lens: \(0.0, nan, 0.0\) is no position; give x, y and z in mm"):
+        mounted(disc(1.0, 2.0), [PlacedLens(plate("plane"), at=(0.0, float("nan"), 0.0))])
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def test_a_place_that_is_none_is_refused():
         (disc(0.0, 2.0), "lens: the flange's lower face, z = 0 mm, cuts the rim of the front"),
         (disc(7.0, 8.0), "lens: the flange, from z = 7 to 8 mm, misses the lens's wall"),
         (disc(1.0, 2.0, 4.5), "give one solid that reaches all around each lens"),
-        (cq.Workplane("XY").sphere(9.0), "lens: the body has to reach all around it between two planes"),
+        (cq.Workplane("XY").sphere(9.0), "lens: the body must surround it between two planes"),
         (cq.Workplane("XY", origin=(0, 0, 1)).circle(RADIUS).workplane(offset=2).circle(7.5).loft()
          .rotate((0, 0, 0), (1, 0, 0), 5), "lens: the body meets it in a face that is no plane z = const"),
         (None, "mount: the body is NoneType; give one cadquery solid"),
@@ -147,5 +147,5 @@ def test_a_place_that_is_none_is_refused():
 )  # fmt: skip
 def test_a_body_that_does_not_fit_is_one_sentence(body, words):
     with pytest.raises(ValueError, match=words) as found:
-        mounted(body, [Placed(plate("concave"))])
+        mounted(body, [PlacedLens(plate("concave"))])
     assert "\n" not in str(found.value)

@@ -11,7 +11,7 @@ import torch
 import trimesh
 
 from bstcad.cad import mesh
-from bstcad.cad.mesh import SILVER, Label, Mesh, chordal_error
+from bstcad.cad.mesh import MIRROR_RGBA, Label, Mesh, chordal_error
 from bstcad.cad.solid import coarse_copy, lens_solid
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere, sag
@@ -24,10 +24,11 @@ LENSES = [(Plane(8.0), Rectangle(24.0, 20.0)), (Sphere(8.0, -0.03), Circle(12.0)
 @pytest.mark.parametrize("front, outline", LENSES, ids=["plate", "round"])
 def test_the_preview_is_the_lens_in_metres_with_y_up(make_lens, front, outline):
     lens = make_lens(front, outline, m=65)
-    found = dict(mesh.preview_files(lens, Label("L 1", "<T> & Co", "PMMA", SILVER)))
+    found = dict(mesh.preview_files(lens, Label("L 1", "<T> & Co", "PMMA", MIRROR_RGBA)))
     scene = trimesh.load(io.BytesIO(found["preview.glb"]), file_type="glb")
     [(name, solid)] = scene.geometry.items()
-    assert name == "L 1" and 15_000 < len(solid.faces) <= mesh.PREVIEW and len(found["preview.glb"]) < 1_000_000
+    assert name == "L 1" and 15_000 < len(solid.faces) <= mesh.PREVIEW_TRIANGLES
+    assert len(found["preview.glb"]) < 1_000_000
     x, y, z = 1e3 * solid.vertices.T
     normal_x, normal_y, normal_z = solid.vertex_normals.T
     own, normals = np.stack([x, -z, y], 1), np.stack([normal_x, -normal_z, normal_y], 1)

@@ -14,7 +14,7 @@ from bstcad.optics.quadrature import of_lens
 from bstcad.scene.mount import LENS_COLOUR, Part
 from bstcad.step_text import part21
 from bstcad.verify.text_checks import of_part
-from tests.cad.conftest import encoded
+from tests.cad.conftest import encode
 from tests.cad.said_in_step import read
 
 PART = Part(
@@ -50,7 +50,7 @@ def entity(text, number):
 
 def test_the_text_has_each_measure_in_its_unit(lens):
     """OCC's own text has 0.005 of a metre here, and g³ cm²; its reader may undo what its writer does."""
-    text = encoded(lens, PART).decode()
+    text = encode(lens, PART).decode()
     [(measure, aspect)] = re.findall(r"SURFACE_PROFILE_TOLERANCE\('','',#(\d+),#(\d+)\)", text)
     stated = r"LENGTH_MEASURE_WITH_UNIT\(LENGTH_MEASURE\((.*)\),#(\d+)\)"
     value, unit = re.fullmatch(stated, entity(text, measure)).groups()
@@ -71,7 +71,7 @@ def test_the_text_has_each_measure_in_its_unit(lens):
 
 
 def test_number_and_names_stand_in_product_and_header(lens):
-    text = encoded(lens, PART).decode()
+    text = encode(lens, PART).decode()
     assert text.isascii() and re.search(r"PRODUCT\('LE-017','lens',", text)
     header = re.sub(r"\s", "", text[: text.index("ENDSEC")])
     assert r"('\X2\00C4\X0\nneO''Hara'),('A\X2\005C\X0\B')" in header
@@ -111,17 +111,17 @@ def test_the_front_has_a_profile_of_its_own(lens, tmp_path):
     step_writing.write_lens(lens, tmp_path / "lens.step", "lens", PART)
     assert [check.limit for check in of_part(part21.read(tmp_path / "lens.step"), part)].count(None) == 1
     faces = ["back", "flange", *walls_of(lens)]  # a plane front is one with a flange
-    text = encoded(lens, part, faces=faces).decode()
+    text = encode(lens, part, faces=faces).decode()
     assert text.count("SURFACE_PROFILE_TOLERANCE") == 1
 
 
 def test_the_same_lens_is_the_same_file(lens, monkeypatch):
     """But for the date in its header, which SOURCE_DATE_EPOCH fixes."""
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
-    first, _, second = (encoded(lens, part, name) for part, name in ((PART, "lens"), (Part(), "other"), (PART, "lens")))
+    first, _, second = (encode(lens, part, name) for part, name in ((PART, "lens"), (Part(), "other"), (PART, "lens")))
     assert first == second and b"'1970-01-02T00:00:00'" in first
     monkeypatch.delenv("SOURCE_DATE_EPOCH")
-    now = encoded(lens, PART)
+    now = encode(lens, PART)
     assert now != first and now.partition(b"DATA;")[2] == first.partition(b"DATA;")[2]
 
 

@@ -92,7 +92,7 @@ def test_the_borders_lie_on_the_front(lens):
     """Points of the curves in space and in the patch agree, at the same parameter."""
     front, patch = lens.front, front_patch(lens)
     far = 3e-10 if isinstance(front, Sphere) else 0.0  # mm; PARABOLA, and the digits of a far centre
-    near = walls.RIM if front.is_net and lens.outline.is_round else 1e-11  # mm
+    near = walls.RIM_TOLERANCE if front.is_net and lens.outline.is_round else 1e-11  # mm
     for curve, edge in zip(*borders(front, lens.outline), strict=True):
         border, uv = BRepAdaptor_Curve(edge), image(patch, curve) if patch.uv else None
         for t in np.linspace(0.0, curve.piece.end, 101).tolist():
@@ -105,7 +105,7 @@ def test_the_borders_lie_on_the_front(lens):
 
 def borders(surface, outline):
     """Curves and edges in which the walls of a bare lens meet a surface."""
-    rail = walls.on(surface.plain(), wires.of_outline(outline))
+    rail = walls.rail_on(surface.plain(), wires.of_outline(outline))
     return rail.curves, rail.edges
 
 
@@ -127,7 +127,7 @@ def test_the_file_is_sound_and_the_front_is_read_back(lens, tmp_path):
     assert text.closed and (text.solids, text.faces, len(text.edge_uses)) == (1, faces, edges)
     assert (text.unit, text.product) == ("millimetre", "lens") and text.schema.startswith("AP242")
     assert np.abs(reread.control_points - lens.back.control_points()).max() < 1e-11
-    off_face, off_wall = step_reading.edges_off(reread.shape, lens)
+    off_face, off_wall = step_reading.edge_deviations(reread.shape, lens)
     assert off_face[0] < 5e-8 and off_wall[0] < 5e-8  # mm
     whole = step_reading.lens(reread, lens.index)
     assert whole.outline == lens.outline and exact_volume(whole) == pytest.approx(exact_volume(lens), rel=1e-11)
@@ -186,7 +186,7 @@ def written(lens, folder):
 def test_a_lens_of_another_wall_is_off_by_the_difference(make_lens, tmp_path, change, off):
     lens = make_lens()
     shape = written(lens, tmp_path)
-    (off_faces, _), (off_wall, where) = step_reading.edges_off(shape, replace(lens, **change))
+    (off_faces, _), (off_wall, where) = step_reading.edge_deviations(shape, replace(lens, **change))
     assert off_wall == pytest.approx(off, abs=1e-9) and off_faces <= 1e-9 and where.startswith("at (")
 
 
@@ -194,8 +194,8 @@ def test_a_rim_as_rough_as_they_come_is_followed_as_nearly(make_lens, tmp_path):
     """Heights that jump by half a millimetre from one control point to the next: 32 parts between two knot lines
     leave 4.7e-8 mm."""
     lens = make_lens(Plane(-8.0), Circle(13.0), 129, 0.5)
-    (off_faces, _), (off_wall, _) = step_reading.edges_off(written(lens, tmp_path), lens)
-    assert off_faces <= 2 * walls.RIM and off_wall <= 2 * walls.RIM
+    (off_faces, _), (off_wall, _) = step_reading.edge_deviations(written(lens, tmp_path), lens)
+    assert off_faces <= 2 * walls.RIM_TOLERANCE and off_wall <= 2 * walls.RIM_TOLERANCE
 
 
 def test_a_round_rim_is_exact_in_the_face_and_tight_in_space(make_lens):
@@ -207,7 +207,7 @@ def test_a_round_rim_is_exact_in_the_face_and_tight_in_space(make_lens):
         for t in np.linspace(0.0, np.pi, 499).tolist():
             q = patch.surface.Value(*uv.Value(t).Coord())
             assert np.hypot(q.X(), q.Y()) == pytest.approx(12.0, abs=1e-12)
-            assert rim.Value(t).Distance(q) < 2 * walls.RIM
+            assert rim.Value(t).Distance(q) < 2 * walls.RIM_TOLERANCE
 
 
 def test_a_lens_that_cannot_be_is_refused_in_one_sentence(make_lens):

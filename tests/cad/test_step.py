@@ -76,7 +76,7 @@ def test_a_net_moved_sideways_is_no_lens_of_ours(make_lens, tmp_path):
     path = tmp_path / "lens.step"
     step_writing.write(lens_solid(make_lens()), path, "lens")
     path.write_text(path.read_text().replace("-10.50000000000000", "-10.40000000000000"))
-    with pytest.raises(ValueError, match="off a uniform grid"):
+    with pytest.raises(ValueError, match="a uniform grid"):
         step_reading.read(path)
 
 
@@ -105,7 +105,7 @@ DAMAGES = {
 def test_a_damaged_file_is_refused_in_one_sentence(make_lens, tmp_path, damage):
     change, sentence = DAMAGES[damage]
     path = tmp_path / "lens.step"
-    text = b"".join(step_writing.encoded(lens_solid(make_lens(Sphere(8.0, 0.02), m=9)), "lens")).decode()
+    text = b"".join(step_writing.encode(lens_solid(make_lens(Sphere(8.0, 0.02), m=9)), "lens")).decode()
     path.write_text(change(text))
     assert path.read_text() != text
     with pytest.raises(ValueError, match=rf"lens\.step: .*{sentence}") as caught:

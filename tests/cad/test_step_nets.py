@@ -10,7 +10,7 @@ from bstcad.cad import patches, step_writing
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.scene.scene import load
 
-M = 67  # control points a side: more than patches.FEW in all
+M = 67  # control points a side: more than patches.SMALL_NET in all
 
 
 def statements(text: str) -> list[str]:
@@ -24,7 +24,7 @@ def statements(text: str) -> list[str]:
 def test_a_file_says_what_occ_alone_would_write(make_lens, tmp_path, monkeypatch, outline):
     lens = make_lens(outline=outline, m=M)
     step_writing.write_lens(lens, tmp_path / "ours.step", "lens")
-    monkeypatch.setattr(patches, "FEW", 10**9)
+    monkeypatch.setattr(patches, "SMALL_NET", 10**9)
     step_writing.write_lens(lens, tmp_path / "occ.step", "lens")
     ours, occ = (statements((tmp_path / name).read_text()) for name in ("ours.step", "occ.step"))
     assert len(ours) > 100 and ours == occ
@@ -34,7 +34,7 @@ def test_numbers_of_any_size_survive(tmp_path):
     """Points near zero and far away are written with an exponent, as OCC does, beside others that are not."""
     net = np.stack(np.meshgrid(np.linspace(-2e4, 2e4, M), np.linspace(-3.0, 3.0, M), indexing="ij"), axis=-1)
     net = np.dstack([net, 1e-7 * np.arange(M * M).reshape(M, M)])
-    words = [step_writing.step_nets._reals(net[..., axis].ravel()) for axis in range(3)]
+    words = [step_writing.step_nets._format_reals(net[..., axis].ravel()) for axis in range(3)]
     assert np.abs(np.array(words, dtype=np.float64).T.reshape(net.shape) - net).max() < 1e-14 * 2e4
     assert words[2][0] == "0.0000000000000000E+00" and words[0][-1] == "2.0000000000000000E+04"
 

@@ -158,7 +158,7 @@ def polygon(*places):
     return cq.Wire.makePolygon([cq.Vector(x, y, 0) for x, y in places], close=True)
 
 
-FAULT, OPEN, NO_WIRE = "trim or holes: {} near .*; draw each", "a wire is open", "where one closed wire is needed"
+FAULT, OPEN, NO_WIRE = "trim or holes: {} near .*; draw wires", "a wire is open", "is not one closed wire"
 CROSSED, TOUCHED = FAULT.format(".*self-intersection"), FAULT.format("wires touch")
 PLATE = rectangle(6, 5)
 
@@ -182,7 +182,7 @@ PLATE = rectangle(6, 5)
         (PLATE, (0.0, 0.0, 1.0), f"hole 1: float {NO_WIRE}"),
         (PLATE, [(0.0, float("nan"), 1.0)], "hole 1: .* give three numbers"),
         ("a wire", [], f"trim: str {NO_WIRE}"),
-        (cq.Workplane("XY").rarray(3, 3, 2, 2).circle(1), [], "trim: a Workplane of 4 objects where one"),
+        (cq.Workplane("XY").rarray(3, 3, 2, 2).circle(1), [], "trim: a Workplane of 4 objects is not one"),
         (cq.Face.makePlane(3, 3), [], f"trim: Face {NO_WIRE}"),
         (cq.Edge.makeLine(cq.Vector(0, 0, 0), cq.Vector(1, 0, 0)), [], OPEN),
         (cq.Wire.makePolygon([cq.Vector(*p) for p in ((-3, -2, 0), (3, 2, 0), (3, -2, 0))]), [], OPEN),

@@ -75,13 +75,13 @@ def test_a_front_of_another_outline_or_curvature_is_found(tmp_path):
 @pytest.mark.parametrize("front", FRONTS)
 def test_the_mesh_is_closed_and_as_near_as_asked(front):
     made = lens(front)
-    _, found = mesh.fitting(made, 2e-3)
+    _, found = mesh.fit_mesh(made, 2e-3)
     volume, _ = mesh.volume_and_area(found)
     whole = quadrature.of_lens(made)
     assert mesh.is_closed(found) and mesh.chordal_error(found, made) <= 2e-3
     assert abs(volume - whole.volume) < 2e-3 * whole.area
     assert mesh.vertex_error(found, made) < 1e-12
-    assert len(mesh.lens_mesh(made, mesh.finest(made, 20_000)).faces) <= 20_000
+    assert len(mesh.lens_mesh(made, mesh.max_cells(made, 20_000)).faces) <= 20_000
 
 
 def test_the_preview_of_a_dome_is_closed_and_shaded_by_its_own_normals():

@@ -88,11 +88,11 @@ def test_it_is_as_steep_and_as_thin_as_the_case_asks(written):
 def test_the_solid_is_valid_and_its_face_is_the_designed_one(holds, written):
     """Sixteen digits are written; OCC's own evaluation of a spline is good to some 1e-15 of 30 mm."""
     lens = replace(written.lens, back=written.lens.back.to(torch.float64))
-    found = {check.name: check for check in step_checks.check(written.path, lens, 1e-9, 1 << 14)}
+    found = {check.id: check for check in step_checks.check(written.path, lens, 1e-9, 1 << 14)}
     assert all(check.passed for check in found.values()), found
-    holds("face of the re-read solid", found["form: re-read back face against the optimised one"].value, 1e-9, "mm")
-    holds("normals of the re-read solid", found["form: direction of the normals"].value, 1e-9, "rad")
-    holds("gaps bridged by edges", found["solid: gaps that edges and vertices bridge"].value, 5e-7, "mm")
+    holds("face of the re-read solid", found["form"].value, 1e-9, "mm")
+    holds("normals of the re-read solid", found["normals"].value, 1e-9, "rad")
+    holds("gaps bridged by edges", found["gaps"].value, 5e-7, "mm")
 
 
 def test_a_parser_that_is_not_occ_finds_the_same_net_and_each_edge_twice(holds, written):
@@ -119,7 +119,7 @@ def test_occ_finds_the_volume(holds, written):
 @pytest.mark.parametrize("cells", (64, 256, None))
 def test_our_mesh_is_closed_at_each_deflection(holds, written, tmp_path, cells):
     """None: as output.mesh_tolerance asks by default.  The volume is off by area times deflection at most."""
-    asked = cells or meshes.fitting(written.lens, MESH_TOLERANCE)[0]
+    asked = cells or meshes.fit_mesh(written.lens, MESH_TOLERANCE)[0]
     meshes.write_stl(meshes.lens_mesh(written.lens, asked), tmp_path / "lens.stl")
     found = meshes.read_stl(tmp_path / "lens.stl")
     assert meshes.is_closed(found) and len(found.faces) > 0
@@ -133,7 +133,7 @@ def test_our_mesh_is_closed_at_each_deflection(holds, written, tmp_path, cells):
     off = abs(meshes.volume_and_area(found)[0] / written.volume - 1)
     of = f"of {cells} cells" if cells else "by default"
     holds(f"STL {of}: volume", off, deflection * written.area / written.volume, "of it")
-    if cells is None and asked < meshes.finest(written.lens):
+    if cells is None and asked < meshes.max_cells(written.lens):
         holds("STL by default: chordal error", deflection, MESH_TOLERANCE, "mm")
     if cells == 64:
         other = trimesh.load_mesh(tmp_path / "lens.stl")

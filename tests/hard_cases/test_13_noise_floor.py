@@ -33,7 +33,7 @@ APERTURE = Rectangle(20.0, 18.0)
 SOURCE = Collimated(APERTURE, profile="gaussian", radius_1e2=11.0)
 SCREEN = Screen(300.0, (-8.13, 7.41), (-7.07, 7.77), 24)  # within the beam; no pixel border is one of a cell
 SEEDS = 4
-NOISE = "standard error of that RRMSD, times five"
+NOISE = "standard error of the RRMSD, times five"
 
 
 def plate(dtype=torch.float64) -> Lens:
@@ -106,7 +106,7 @@ def test_a_figure_is_right_where_it_is_resolved_and_fails_where_not(holds, share
     found, size = light(missed_by(share)), float(rrmsd(truth(), missed_by(share)))
     near, far = found.rrmsd + 4 * found.standard_error, found.rrmsd + 6 * found.standard_error
     for limit, is_sure in ((near, share > 0), (far, True), (None, True)):  # by default the limit is far above
-        failed = [check.name for check in checks._of_light(found, Accept(rrmsd=limit)) if not check.passed]
+        failed = [check.name for check in checks._light_checks(found, Accept(rrmsd=limit)) if not check.passed]
         assert (NOISE not in failed) is is_sure
     assert (found.rrmsd < checks.RESOLVED * found.standard_error) is (share == 0.0)
     if share:

@@ -30,7 +30,7 @@ from tests.conftest import draws_nothing, verify_with
 from tests.hard_cases import fuzz
 
 SECONDS = 10.0  # largest CPU seconds for one file
-NOISE = "standard error of that RRMSD, times five"  # check that fails by the few rays of the test, whatever the file
+NOISE = "standard error of the RRMSD, times five"  # check that fails by the few rays of the test, whatever the file
 
 
 @pytest.fixture
@@ -191,7 +191,7 @@ def moved_pole(text, i, j, by):
 
 def test_a_change_is_named_with_its_place(folder):
     """A height at the rim by 2e-11 mm."""
-    name, where = "STEP text: control points", "control point (32, 5)"
+    name, where = "STEP text: deviation of the control points", "control point (32, 5)"
     path = folder / "lens.step"
     path.write_text(moved_pole(path.read_text(), 32, 5, -2e-11))
     (folder / "report.json").write_text('{"passed": true, "checks": [], "rrmsd": 0.0}')  # which is not believed

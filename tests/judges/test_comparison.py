@@ -52,7 +52,7 @@ class TestStandIn:
         found = SimpleNamespace(cannot=lambda *a: "", light=lambda glass, channels: tuple(channels), trace=trace)
         monkeypatch.setitem(sys.modules, "stand_in", found)
         monkeypatch.setitem(comparison.JUDGES, "numpy", "stand_in")
-        monkeypatch.setattr(comparison, "OURS", replace(comparison.OURS, rays=512))
+        monkeypatch.setattr(comparison, "OWN_EFFORT", replace(comparison.OWN_EFFORT, rays=512))
         return found
 
     def test_a_judge_of_the_same_light_agrees_within_its_noise(self, judge):
@@ -87,7 +87,7 @@ class TestStandIn:
 
     def test_each_judge_is_asked_in_turn(self, judge, monkeypatch):
         told, (glass, source, screen) = [], CASES["a beam"]
-        monkeypatch.setattr(comparison, "RAYS", 1 << 12)
+        monkeypatch.setattr(comparison, "JUDGE_RAYS", 1 << 12)
         given = glass, (Channel(source, glass.index),), screen, np.ones(screen.shape), 0
         found = comparison.against(["numpy"], *given, lambda *a: told.append(a))
         assert [each.judge.rays for each in found] == [1 << 12]
@@ -135,7 +135,7 @@ def test_mitsuba_traces_the_light_of_ray_tubes(case):
 def test_coarse_pixels_are_square_and_keep_the_light(screen):
     raster = comparison.coarse(screen)
     across, up = raster.per_unit
-    assert across == pytest.approx(up, rel=1e-3) and max(raster.shape) <= comparison.PIXELS
+    assert across == pytest.approx(up, rel=1e-3) and max(raster.shape) <= comparison.MAX_PIXELS
     picture = np.random.default_rng(0).random(screen.shape)
     coarse = comparison.resampled(picture, raster.shape)
     assert coarse.shape == raster.shape and coarse.sum() == pytest.approx(picture.sum())
@@ -173,7 +173,7 @@ def test_a_step_file_by_itself_has_no_light(small_design, tmp_path):
 @with_others
 def test_the_report_holds_the_judge(small_design, tmp_path, monkeypatch):
     monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
-    monkeypatch.setattr(comparison, "RAYS", 1 << 18)
+    monkeypatch.setattr(comparison, "JUDGE_RAYS", 1 << 18)
     folder = shutil.copytree(small_design.folder, tmp_path / "small")
     report = commands.verify(folder, against=("batoid",), effort=quick_effort()).facts
     [judge] = report["judges"]

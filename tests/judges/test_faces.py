@@ -104,7 +104,7 @@ def test_an_error_of_a_face_is_that_of_the_worse_and_moves_light():
 @pytest.fixture
 def without_mitsuba(monkeypatch):
     monkeypatch.setattr(mitsuba, "_texture", lambda values: values)
-    monkeypatch.setattr(mitsuba, "_looking", lambda place, along: (place, along))
+    monkeypatch.setattr(mitsuba, "_look_along", lambda place, along: (place, along))
 
 
 def test_a_slide_of_a_lambertian_point_has_the_view_factor_of_its_square(without_mitsuba, tmp_path):

@@ -137,7 +137,7 @@ DAMAGES = {
     "alias": (lambda t: t.replace("#60 =", "#07 ="), "no entity"),
     "behind": (lambda t: t.replace("'','',());", "'','',())A;"), "no entity"),
     "no data": (lambda t: t.replace("DATA;", "DATUM;"), "no DATA"),
-    "two units": (lambda t: t.replace("SI_UNIT(.M", "SI_UNIT($,.METRE.) SI_UNIT(.M"), "of no kind or of two"),
+    "two units": (lambda t: t.replace("SI_UNIT(.M", "SI_UNIT($,.METRE.) SI_UNIT(.M"), "a unit has no kind"),
     "ragged": (lambda t: t.replace("#3,#4)", "#3)"), "rectangular"),
     "rational": (lambda t: t.replace("B_SPLINE_SURFACE_W", "RATIONAL_B_SPLINE_SURFACE_W"), "no B"),
     "no surface": (lambda t: t.replace(SIMPLE, ""), "no B_SPLINE_SURFACE_WITH_KNOTS"),

@@ -291,14 +291,14 @@ def test_a_changed_mesh_fails_by_name(folder, nominal, change):
 def test_a_mesh_too_coarse_fails_unless_nobody_asked_for_a_finer_one_than_there_may_be(
     folder, nominal, monkeypatch, most, asked, fails
 ):
-    monkeypatch.setattr(meshes, "MOST", most)
+    monkeypatch.setattr(meshes, "DEFAULT_MAX_TRIANGLES", most)
     mesh = meshes.read_stl(folder / "lens.stl")
-    found = checks._facets(mesh, nominal.lens, 1e9, changed(nominal, "output", mesh_tolerance=asked))
+    found = checks._mesh_checks(mesh, nominal.lens, 1e9, changed(nominal, "output", mesh_tolerance=asked))
     [chord] = [check for check in found if check.id == "mesh-chord"]
     assert chord.value > 1e-6 and chord.passed is not fails
-    [said] = re.findall(r"no mesh has over \d+ triangles, which come within some (.*) mm; allow", chord.where) or [None]
+    [said] = re.findall(r"more than \d+ triangles, whose error is about (.*) mm; set", chord.where) or [None]
     assert (said is not None) is (fails and most == 10)
-    assert said is None or float(said) == pytest.approx(chord.value * len(mesh.faces) / meshes.ASKED, rel=0.5)
+    assert said is None or float(said) == pytest.approx(chord.value * len(mesh.faces) / meshes.MAX_TRIANGLES, rel=0.5)
 
 
 # ---- the design ----------------------------------------------------------------------------------------------------
@@ -345,10 +345,10 @@ def test_a_ripple_fails_a_lens_by_what_the_light_feels_of_it(nominal):
     for height, fails in ((1e-6, False), (1e-2, True)):
         lens = replace(nominal.lens, back=replace(back, heights=back.heights + height * torch.from_numpy(noise)))
         light = measure.measure(lens, nominal.channels, nominal.goals[0].receiver, nominal.goals[0].picture, effort=FEW)
-        found = {c.id: c.passed for c in checks._of_light(light, nominal.scene.accept)}
+        found = {c.id: c.passed for c in checks._light_checks(light, nominal.scene.accept)}
         assert found["rrmsd"] is not fails
-        shape_of = shape.describe(lens) | checks._ripples_in_light(lens, nominal)
-        (stated,) = checks._of_ripple(shape_of)
+        shape_of = shape.describe(lens) | checks._ripple_rrmsd(lens, nominal)
+        (stated,) = checks._ripple_checks(shape_of)
         assert stated.id == "ripple" and stated.passed and stated.limit is None
         slopes.append(stated.value)
     assert slopes[1] > 1e-4 and shape_of["ripple_rrmsd"] > nominal.scene.accept.rrmsd
@@ -369,7 +369,7 @@ NOISES = [  # "rrmsd", its standard error, accept.rrmsd, does the noise pass?
 def test_noise_fails_where_neither_figure_nor_verdict_is_sure(rrmsd, error, asked, passes):
     flux = {"on target": 1.0, "off target": 0.0, "missed the lens": 0.0}
     light = Light(np.ones((2, 2)), rrmsd, error, rays=1, flux=flux)
-    (noise,) = (check for check in checks._of_light(light, Accept(rrmsd=asked)) if check.id == "noise")
+    (noise,) = (check for check in checks._light_checks(light, Accept(rrmsd=asked)) if check.id == "noise")
     assert noise.passed is passes and noise.value == 5 * error
 
 

@@ -213,7 +213,7 @@ def test_a_part_with_another_rim_is_judged_by_its_own_light_and_fails_by_name(cu
     assert proof.flux["on target"] < 0.8 * before.light.flux["on target"] and proof.rrmsd > 0.2
     assert (
         "\u00d87.5 mm, the lens was tailored for \u00d89 mm"
-        in failed["part.step: clear aperture of the back, from the mount's"]
+        in failed["part.step: clear aperture of the back, deviation from the mount's"]
     )
     assert "RRMSD, box pixels, through the re-read STEP" in failed
     assert (

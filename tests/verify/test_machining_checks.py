@@ -11,7 +11,7 @@ from bstcad.analysis.shape import describe, survey
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane
-from bstcad.verify.checks import of_bounds
+from bstcad.verify.checks import bound_checks
 from tests.lenses import net
 
 A, B, M = 0.05, -0.02, 65  # z = (A x² + B y²) / 2 (1/mm): curved by A and B on the axis, where it is level
@@ -26,7 +26,7 @@ def saddle(outline):
 
 def judged(**asked):
     lens = saddle(Circle(3.0))
-    checks, at = of_bounds(lens, SimpleNamespace(**NONE | asked), describe(lens))
+    checks, at = bound_checks(lens, SimpleNamespace(**NONE | asked), describe(lens))
     [check] = checks
     return check, at
 
@@ -62,4 +62,4 @@ def test_where_it_is_at_its_bound_is_a_part_of_the_area():
 
 
 def test_nothing_is_asked_of_a_lens_without_bounds():
-    assert of_bounds(saddle(Circle(3.0)), SimpleNamespace(**NONE), {}) == ([], {})
+    assert bound_checks(saddle(Circle(3.0)), SimpleNamespace(**NONE), {}) == ([], {})

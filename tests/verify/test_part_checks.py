@@ -155,7 +155,7 @@ def test_a_part_passes_by_itself(design, tmp_path, mount, outline, plane):
     checks, found, whole = examined.checks, examined.lens, examined.whole
     assert [check for check in checks if not check.passed] == []
     bare = set(mount) <= {"rim"}
-    assert ("solid: edges off the wall of the lens" in {check.name for check in checks}) is bare
+    assert ("solid: distance of edges from the wall of the lens" in {check.name for check in checks}) is bare
     assert (whole is None) is bare
     assert found.outline.half_extent == pytest.approx((outline or lens.outline).half_extent, abs=1e-7)
     assert found.outline.shape == (outline or lens.outline).shape

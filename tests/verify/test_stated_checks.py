@@ -13,7 +13,7 @@ from bstcad.optics.quadrature import of_lens
 from bstcad.scene.mount import Part
 from bstcad.step_text import part21
 from bstcad.verify.text_checks import measures, of_part
-from tests.cad.conftest import encoded, make_lens
+from tests.cad.conftest import encode, make_lens
 
 __all__ = ["make_lens"]
 PART = Part(author="Änne O'Hara", material="PMMA", density=1.19, surface_profile=0.005)
@@ -27,7 +27,7 @@ def lens(make_lens):
 
 @pytest.fixture
 def text(lens):
-    return encoded(lens, PART).decode()
+    return encode(lens, PART).decode()
 
 
 def checked(text, lens, part=PART):
@@ -85,7 +85,7 @@ def test_a_tolerance_of_another_face_is_none_of_the_back(lens, text):
     turned = re.sub(rf"(GEOMETRIC_ITEM_SPECIFIC_USAGE\([^)]*)#{back}\)", rf"\g<1>#{front})", text)
     assert turned != text
     [failed] = [check for check in checked(turned, lens) if not check.passed]
-    assert failed.name == SAID + "profile tolerance is of the back"
+    assert failed.name == SAID + "profile tolerance refers to the back"
 
 
 def test_what_nobody_asked_for_is_not_the_scene_s(lens, text):
@@ -97,14 +97,14 @@ def test_what_nobody_asked_for_is_not_the_scene_s(lens, text):
 
 
 def test_what_is_not_stated_is_told_and_not_failed(lens):
-    bare = b"".join(step_writing.encoded(lens_solid(lens), "lens")).decode()
+    bare = b"".join(step_writing.encode(lens_solid(lens), "lens")).decode()
     checks = checked(bare, lens)
     assert [check.name for check in checks] == [
         SAID + "states area, volume, centroid", SAID + "states profile tolerance, density, material"
     ]  # fmt: skip
     assert all(check.passed and check.value is False and check.limit is None for check in checks)
     assert len(checked(bare, lens, Part())) == 1  # and what nobody asked for is not missed
-    older = encoded(lens, replace(PART, surface_profile=None, schema="AP214")).decode()
+    older = encode(lens, replace(PART, surface_profile=None, schema="AP214")).decode()
     assert [check.name for check in checked(older, lens) if check.limit is None] == [SAID + "states profile tolerance"]
 
 
@@ -132,5 +132,5 @@ END-ISO"""
 
 def test_a_name_that_looks_like_a_statement_is_none(lens):
     sly = "a'; #1 = PROPERTY_DEFINITION('geometric validation property','volume',#4); lens"
-    text = encoded(lens, PART, sly).decode()
+    text = encode(lens, PART, sly).decode()
     assert len(part21.parse(text).properties.volumes) == 1 and all(check.passed for check in checked(text, lens))

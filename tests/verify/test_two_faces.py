@@ -45,9 +45,9 @@ def named(found, *parts):
 # ---- the light on each target ----------------------------------------------------------------------------------------
 
 OF_EACH = (
-    "RRMSD, box pixels, through the re-read STEP", "standard error of that RRMSD, times five",
-    "picture by ray tubes, off the one by rays", "light on the target, of what enters the lens", "efficiency",
-    "flux ledger: distance of its sum from 1", "target in design.npz against the scene's",
+    "RRMSD, box pixels, through the re-read STEP", "standard error of the RRMSD, times five",
+    "picture by ray tubes, difference from the one by rays", "light on the target, as a fraction of what enters",
+    "efficiency", "flux ledger: deviation of its sum from 1", "target in design.npz",
 )  # fmt: skip
 
 
@@ -104,9 +104,9 @@ def test_a_face_that_is_off_by_a_nanometre_in_one_control_point_is_found(two, fa
     lens, path = two.made.lens, two.folder / "lens.step"
     other = replace(lens, **{face: changed(getattr(lens, face))})
     failed = {c.name for c in text_checks.of_lens(part21.read_lens(path), other) if not c.passed}
-    assert failed == {"STEP text: control points" + " of the front" * (face == "front")}
+    assert failed == {"STEP text: deviation of the control points" + " of the front" * (face == "front")}
     failed = {c.name for c in step_checks.check(path, other, 1e-8, 4096) if not c.passed}
-    assert f"form: re-read {face} face against the optimised one" in failed
+    assert f"form: deviation of the re-read {face} from the optimised one" in failed
     assert any("control points of the front" in name for name in failed) == (face == "front")
 
 
@@ -116,11 +116,11 @@ def test_a_file_whose_front_is_flat_is_no_lens_of_two_nets(two, tmp_path):
     folders.write_geometry(replace(two.made, lens=lens), tmp_path)()
     text = part21.read_lens(tmp_path / "lens.step")
     failed = {check.name for check in text_checks.of_lens(text, two.made.lens) if not check.passed}
-    assert failed == {"STEP text: control points of the front"}
+    assert failed == {"STEP text: deviation of the control points of the front"}
     nominal = checks.Nominal(two.made.scene, two.made.lens, two.made.goals)
     proof = checks.verify(tmp_path, nominal, effort=quick_effort())
     failed = {check.name for check in proof.checks if not check.passed}
-    assert "form: re-read front face against the optimised one" in failed and proof.lens.shaped is None
+    assert "form: deviation of the re-read front from the optimised one" in failed and proof.lens.shaped is None
 
 
 def test_figures_of_the_front_are_those_of_the_same_face_as_a_back(two):
@@ -143,12 +143,12 @@ def test_bounds_hold_for_both_faces(two):
     radius = (shape["front_radius_min_concave"] * shape["radius_min_concave"]) ** 0.5
     slope = (shape["front_slope_max_deg"] * shape["slope_max_deg"]) ** 0.5
     asked = two.made.scene.lens.model_copy(update={"tool_radius": radius, "max_slope": slope})
-    found, at_bounds = checks.of_bounds(lens, asked, shape)
+    found, at_bounds = checks.bound_checks(lens, asked, shape)
     failed = {check.name.partition(",")[0] for check in found if not check.passed}
     assert failed == {"smallest concave radius of the front", "steepest slope of the front"}
     assert at_bounds.keys() == {"tool_radius", "max_slope"} and all(0 < at.share < 1 for at in at_bounds.values())
     assert [at.tightest.endswith("of the front") for at in at_bounds.values()] == [True, True]
-    alone, _ = checks.of_bounds(replace(lens, shaped=None), asked, shape)
+    alone, _ = checks.bound_checks(replace(lens, shaped=None), asked, shape)
     assert all(check.passed for check in alone)
 
 
@@ -160,7 +160,7 @@ def test_a_mounted_lens_has_both_nets_in_its_part(tmp_path):
     folders.write_geometry(made, tmp_path)()
     found = step_checks.check_part(tmp_path, made.lens, made.scene.mount, made.scene.part.of(made.scene.lens))
     assert [check.name for check in found if not check.passed] == []
-    assert named(found, "part.step: control points of the front")
+    assert named(found, "part.step: deviation of the control points of the front")
     text = part21.read_lens(tmp_path / "part.step")
     down = made.lens.front.control_points() - [0.0, 0.0, vertex]
     assert np.abs(text.front.control_points - down).max() < 1e-11

@@ -42,7 +42,7 @@ def judged(lens, nominal, **accept):
     scene = nominal.scene
     limits = scene.accept.model_copy(update=accept)
     nominal = replace(nominal, scene=scene.model_copy(update={"accept": limits}))
-    error, found = checks._of_wavefront(lens, nominal)
+    error, found = checks._wavefront_checks(lens, nominal)
     return error, {check.name: check for check in found}
 
 
