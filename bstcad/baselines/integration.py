@@ -151,7 +151,6 @@ class _Grid:
         return cls(origin, direction, aim, alive=alive, rays=replace(coming, z=z))
 
     def __getitem__(self, where: tuple) -> _Grid:
-        """Return a part of the grid."""
         parts = (t[(..., *where)] for t in (self.origin, self.direction, self.aim, self.alive))
         return _Grid(*parts, self.rays)
 
@@ -180,14 +179,14 @@ def _outwards(grid: _Grid, position: Tensor, reached: Tensor, plane: Receiver, l
     points[:, [middle]], all_reached[[middle]] = position, reached
     normal = grid[[middle], :].normals(position, plane, law)
     for k in range(1, middle + 1):
-        both = [middle - k, middle + k]
-        rays = grid[both, :]
+        pair = [middle - k, middle + k]
+        rays = grid[pair, :]
         tangent, meets = rays.meet(position, normal)  # the explicit rule
         mean = (normal + rays.normals(tangent, plane, law)) / 2
         position, meets_again = rays.meet(position, mean)  # the trapezoidal rule
         normal = rays.normals(position, plane, law)
         reached = reached & rays.alive & meets & meets_again
-        points[:, both], all_reached[both] = position, reached
+        points[:, pair], all_reached[pair] = position, reached
     return SurfacePoints(points, all_reached)
 
 
@@ -202,15 +201,15 @@ def fit_net(surface: BSplineSurface, points: SurfacePoints, used: Tensor, levels
     Each net starts from the surface of the net before, the first from a plane; only the last uses all points.
     """
     nets = levels if len(levels) > 1 else 2 * levels
-    ways = (COARSEST_FIT, *(MIDDLE_FIT for _ in nets[1:-1]), FINEST_FIT)
+    fits = (COARSEST_FIT, *(MIDDLE_FIT for _ in nets[1:-1]), FINEST_FIT)
     surface, n = surface.refined(nets[0]), used.shape[-1]
     surface = replace(surface, heights=torch.zeros_like(surface.heights))
-    for net, (bending, count, degree) in zip(nets, ways, strict=True):
+    for net, (bending, count, degree) in zip(nets, fits, strict=True):
         m = max(as_pair(net))
-        every = 1 if bending == FINEST_FIT[0] else max(1, n // (POINTS_PER_CELL * m))
-        some = used[::every, ::every]
-        x, y, z = (p[::every, ::every][some] for p in points.position)
-        cells = math.prod(points * every / n for points in as_pair(net))  # cells of the net per point
+        stride = 1 if bending == FINEST_FIT[0] else max(1, n // (POINTS_PER_CELL * m))
+        sampled = used[::stride, ::stride]
+        x, y, z = (p[::stride, ::stride][sampled] for p in points.position)
+        cells = math.prod(points * stride / n for points in as_pair(net))  # cells of the net per point
         surface = fit_heights(surface.refined(net), x, y, z=z, bending=bending / cells, count=count, degree=degree)
     return surface
 

@@ -37,7 +37,7 @@ FRONT_RATES = {  # change of the front's parameters a step
     "conic_constant": 0.02,  # chosen here, since the fronts of the paper are spheres
 }
 STAGE2_RATE = 2e-4  # mm a step; chosen here, since the paper does not state it
-MAX_RAYS_PER_CONTROL_POINT = 8  # in each direction, to save rays on the coarsest net
+MAX_RAYS_PER_CONTROL_POINT = 8  # rays per control point in each direction, limited to save rays on the coarsest net
 
 
 @dataclass(frozen=True)
@@ -153,8 +153,8 @@ class TentMerit:
     def __call__(self, landed: tuple[Landed, ...]) -> tuple[Tensor, Tensor]:
         """Return (merit, RRMSD against the tent-binned target) of the landed rays of each channel."""
         flux = weighted_sum(self.channels, (total(landed_flux(rays).double()) for rays in landed))
-        images, beyond = zip(*(collect(rays, self.screen) for rays in landed), strict=True)
-        image, outside = weighted_sum(self.channels, images), weighted_sum(self.channels, beyond)
+        images, outside_parts = zip(*(collect(rays, self.screen) for rays in landed), strict=True)
+        image, outside = weighted_sum(self.channels, images), weighted_sum(self.channels, outside_parts)
         rrmsd2 = total((image / flux - self.target) ** 2) / total(self.target**2)
         return rrmsd2 + self.overshoot * outside / flux, rrmsd2.detach().sqrt()
 

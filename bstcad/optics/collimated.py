@@ -94,12 +94,12 @@ class Collimated(Emitter):
         if not (motion.turns or self.tilted):  # light along z has the same irradiance on all planes
             x, y = (p + d for p, d in zip(self.centre or (0.0, 0.0), motion.shift, strict=False))
             return self if (x, y) == (0.0, 0.0) and self.centre is None else replace(self, centre=(x, y))
-        wide = 2 * math.hypot(*self.aperture.half_extent)
-        z, known = (entrance - WIDTHS_BEFORE_LENS * wide, entrance) if self.z is None else (self.z, self.z)
+        width = 2 * math.hypot(*self.aperture.half_extent)
+        z, plane = (entrance - WIDTHS_BEFORE_LENS * width, entrance) if self.z is None else (self.z, self.z)
         (normal,) = motion.frame((self.axes[2],))
-        x, y, reached = motion.point((*self.shift(known), known))
-        way = z - reached
-        centre = x + way * normal[0] / normal[2], y + way * normal[1] / normal[2]
+        x, y, reached = motion.point((*self.shift(plane), plane))
+        distance = z - reached
+        centre = x + distance * normal[0] / normal[2], y + distance * normal[1] / normal[2]
         return replace(self, z=z, centre=centre, tilt=tilt_of(normal))
 
     @property
@@ -177,9 +177,9 @@ class Collimated(Emitter):
         """
         half = [a + abs(s) for a, s in zip(self.aperture.half_extent, self.shift(z), strict=True)]
         if self.tilted or self.centre is not None:
-            deep = max(map(abs, sags))
-            seen = (h + deep * abs(s) for h, s in zip(outline.half_extent, self.slopes, strict=True))
-            half = [min(h, s * (1 + 1e-9)) for h, s in zip(half, seen, strict=True)]  # margin for rounding
+            depth = max(map(abs, sags))
+            apparent = (h + depth * abs(s) for h, s in zip(outline.half_extent, self.slopes, strict=True))
+            half = [min(h, s * (1 + 1e-9)) for h, s in zip(half, apparent, strict=True)]  # margin for rounding
         return Rectangle(2 * half[0], 2 * half[1])
 
     def spot(self, z: float) -> tuple[Outline | None, tuple[float, float]]:
@@ -198,8 +198,8 @@ class Collimated(Emitter):
         direction = direction.view(3, *([1] * x.ndim)).expand(3, *x.shape)
         from_x, from_y = x, y
         if self.tilted:
-            (a, b), way = self.slopes, z - start
-            from_x, from_y = x - way * a, y - way * b
+            (a, b), distance = self.slopes, z - start
+            from_x, from_y = x - distance * a, y - distance * b
         position = torch.stack([from_x, from_y, torch.zeros_like(x)])
         flux = self.irradiance(x, y, z) * area
         return Rays(position, direction, flux, all_alive(x), axial=not self.tilted, z=start, sense=sense)

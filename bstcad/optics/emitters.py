@@ -121,7 +121,6 @@ class Emitter(ABC):
         return sense * (n_x * place[0] + n_y * place[1] + n_z * place[2])
 
     def _missing_method(self, what: str, method: str) -> NotImplementedError:
-        """Return the error that names the method a subclass lacks."""
         name = type(self).__name__
         return NotImplementedError(f"the emitter {name} does not define {what}; add the method {method} to the class")
 
@@ -156,8 +155,8 @@ class Emitter(ABC):
         """(nm, fraction of the flux) of each spectral line, the main line first; the fractions sum to 1."""
         if isinstance(self.wavelength, int | float):
             return ((self.wavelength, 1.0),)
-        whole, first = math.fsum(weight for _, weight in self.wavelength), self.main_wavelength
-        shares = [(nm, weight / whole) for nm, weight in self.wavelength]
+        total, first = math.fsum(weight for _, weight in self.wavelength), self.main_wavelength
+        shares = [(nm, weight / total) for nm, weight in self.wavelength]
         return tuple(sorted(shares, key=lambda line: line[0] != first))  # a stable sort
 
     @property
@@ -165,8 +164,8 @@ class Emitter(ABC):
         """Wavelength (nm) of the line with the largest weight; the middle one of several equal lines."""
         if isinstance(self.wavelength, int | float):
             return self.wavelength
-        most = max(weight for _, weight in self.wavelength)
-        heaviest = sorted(nm for nm, weight in self.wavelength if weight == most)
+        largest = max(weight for _, weight in self.wavelength)
+        heaviest = sorted(nm for nm, weight in self.wavelength if weight == largest)
         return heaviest[(len(heaviest) - 1) // 2]
 
     @property

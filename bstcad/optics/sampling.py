@@ -112,9 +112,9 @@ def _with_second_moment(points: list[tuple[float, float]], moment: float) -> lis
     if n < 2:
         return points
     xx, xy, yy = (math.fsum(p[i] * p[j] for p in points) / n for i, j in ((0, 0), (0, 1), (1, 1)))
-    lean = xy / xx
-    scale_x, scale_y = math.sqrt(moment / xx), math.sqrt(moment / (yy - lean * xy))
-    return [(scale_x * x, scale_y * (y - lean * x)) for x, y in points]
+    shear = xy / xx
+    scale_x, scale_y = math.sqrt(moment / xx), math.sqrt(moment / (yy - shear * xy))
+    return [(scale_x * x, scale_y * (y - shear * x)) for x, y in points]
 
 
 def rim(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
@@ -129,7 +129,7 @@ def rim(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
     a, b, r2 = outline.limits
     if not outline.is_round and r2:  # project the corners onto their arcs
         p, q = (x.abs() - a).clamp(min=0), (y.abs() - b).clamp(min=0)
-        far = torch.hypot(p, q)
-        back = torch.where((p > 0) & (q > 0), 1 - math.sqrt(r2) / far.clamp(min=1e-300), torch.zeros_like(far))
-        x, y = x - x.sign() * p * back, y - y.sign() * q * back
+        d = torch.hypot(p, q)
+        shift = torch.where((p > 0) & (q > 0), 1 - math.sqrt(r2) / d.clamp(min=1e-300), torch.zeros_like(d))
+        x, y = x - x.sign() * p * shift, y - y.sign() * q * shift
     return x, y

@@ -47,8 +47,8 @@ def in_proportion(net: Sides, of: Sides, to: Sides) -> Sides:
 
 def coarser(net: Sides, longer: int) -> Sides:
     """Return a net of the same span shape with `longer` control points on its longer side; `net` if that is finer."""
-    most = max(as_pair(net))
-    return net if longer >= most else scaled(net, (longer - 1) / (most - 1))
+    longest = max(as_pair(net))
+    return net if longer >= longest else scaled(net, (longer - 1) / (longest - 1))
 
 
 def spread(count: int, x: float, y: float) -> Sides:

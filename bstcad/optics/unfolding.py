@@ -113,19 +113,19 @@ class BehindGlass(Receiver):
         method makes the two points equal: as the first moves by 1, the second moves back by k = t s_z / (η d i_z)
         across the plane of incidence, and by k (s_z / i_z)² in it.
         """
-        below, way = rays.above(self.z), self.rest.vector_to(rays, aim)
-        at = rays.position - below / way[2] * way
+        below, direction = rays.above(self.z), self.rest.vector_to(rays, aim)
+        point = rays.position - below / direction[2] * direction
         for _ in range(NEWTON_ITERATIONS):
-            out = self.rest.vector_to(replace(rays, position=at), aim)
-            length = torch.sqrt((out * out).sum(0))
-            sines = out[:2] / length / self.eta
-            way = torch.cat([sines, (torch.sign(out[2]) * torch.sqrt(1 - (sines * sines).sum(0)))[None]])
-            residual = rays.position - below / way[2] * way - at
-            back, bent = (below / (self.eta * length * way[2])).abs(), (out[2] / length / way[2]) ** 2
+            behind = self.rest.vector_to(replace(rays, position=point), aim)
+            length = torch.sqrt((behind * behind).sum(0))
+            sines = behind[:2] / length / self.eta
+            direction = torch.cat([sines, (torch.sign(behind[2]) * torch.sqrt(1 - (sines * sines).sum(0)))[None]])
+            residual = rays.position - below / direction[2] * direction - point
+            back, stretch = (below / (self.eta * length * direction[2])).abs(), (behind[2] / length / direction[2]) ** 2
             radial = torch.cat([sines, torch.zeros_like(sines[:1])])
-            within = radial * ((radial * residual).sum(0) / (radial * radial).sum(0).clamp_min(TINY))
-            at = at + (residual - within) / (1 + back) + within / (1 + back * bent)
-        return way
+            radial_part = radial * ((radial * residual).sum(0) / (radial * radial).sum(0).clamp_min(TINY))
+            point = point + (residual - radial_part) / (1 + back) + radial_part / (1 + back * stretch)
+        return direction
 
 
 def image(behind: Sequence[Interface], plane: Receiver) -> Receiver:
@@ -136,21 +136,21 @@ def image(behind: Sequence[Interface], plane: Receiver) -> Receiver:
     if not behind:
         return plane
     if sum(not interface.law.reverses for interface in behind) % 2:  # the first interface is the exit from the glass
-        face, *beyond = behind
-        return BehindGlass(image(beyond, plane), float(sag(face.surface, 0.0, 0.0)), face.law.eta)
-    seen = Image.of(plane)
+        face, *rest = behind
+        return BehindGlass(image(rest, plane), float(sag(face.surface, 0.0, 0.0)), face.law.eta)
+    view = Image.of(plane)
     leaves: TiltedSurface | None = None  # exit face of a plate, while the light is followed backwards
     for interface in reversed(behind):
         face = TiltedSurface.of(interface.surface)
         if interface.law.reverses:
-            seen = seen.in_mirror(face)
+            view = view.in_mirror(face)
         elif leaves is None:
             leaves = face
         else:
             thick, n = leaves.height_above(face.vertex), interface.law.n_out / interface.law.n_in
-            seen = seen.nearer(tuple(thick * (1 - 1 / n) * part for part in face.unit))
+            view = view.nearer(tuple(thick * (1 - 1 / n) * part for part in face.unit))
             leaves = None
-    return seen.plain()
+    return view.plain()
 
 
 def image_from_last_net(lens: Lens, plane: Receiver) -> Receiver:
@@ -161,8 +161,8 @@ def image_from_last_net(lens: Lens, plane: Receiver) -> Receiver:
 def image_screen(lens: Lens, screen: Screen) -> Screen:
     """Return the screen with its image behind the last net of a lens as its receiver."""
     plane = screen.plane
-    seen = image_from_last_net(lens, plane)
-    return screen if seen is plane else replace(screen, surface=seen)
+    view = image_from_last_net(lens, plane)
+    return screen if view is plane else replace(screen, surface=view)
 
 
 def image_from_lens(lens: Lens, screen: Screen) -> Receiver:

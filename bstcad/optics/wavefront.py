@@ -188,15 +188,15 @@ class ZernikeWave(_Wave):
 Wave = PlaneWave | SphericalWave | ZernikeWave
 
 
-def path_from_sphere(place: Tensor, centre: Vector) -> Tensor:
+def path_from_sphere(point: Tensor, centre: Vector) -> Tensor:
     """Return |p - c| - |c| (mm) for points p (3, …) and a centre c (mm): path from the sphere about c through 0.
 
     It is computed as (p² - 2 p · c) / (|p - c| + |c|), which keeps its digits for a distant centre.
     """
-    x, y, z = place
+    x, y, z = point
     c_x, c_y, c_z = centre
-    off = length(torch.stack([x - c_x, y - c_y, z - c_z]))
-    return (x * (x - 2 * c_x) + y * (y - 2 * c_y) + z * (z - 2 * c_z)) / (off + math.hypot(*centre))
+    distance = length(torch.stack([x - c_x, y - c_y, z - c_z]))
+    return (x * (x - 2 * c_x) + y * (y - 2 * c_y) + z * (z - 2 * c_z)) / (distance + math.hypot(*centre))
 
 
 def length(vector: Tensor) -> Tensor:

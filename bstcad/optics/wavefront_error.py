@@ -6,9 +6,8 @@ of Malus and Dupin S is the eikonal of the light on that plane, as W (wavefront.
 
     OPD = S - W,   ∇OPD = (d_x, d_y) - (w_x, w_y),
 
-with d and w the directions of the ray and of the goal wave at its position.  A positive OPD is light that arrives late.
-An OPD at a reference sphere, or at a plane perpendicular to the goal direction, differs from it by the square of the
-angle between d and w.
+with d and w the directions of the ray and of the goal wave at its position; a positive OPD is light that arrives late.
+An OPD at a reference sphere, or perpendicular to the goal direction, differs by the square of the angle of d and w.
 
 Piston (a constant) is no error of a wavefront; tilt (a linear part in x and y) deflects the light, and moves the focus
 of a spherical wave.  Both are fitted by least squares, weighted by flux, and figures are given without piston and
@@ -77,13 +76,13 @@ def move_pupil(pupil: ExitPupil, motion: Motion, z: float) -> ExitPupil:
 
     It is the light of a moved lens in the frame of the goal wave.
     """
-    place = torch.stack([pupil.x, pupil.y, torch.full_like(pupil.x, z)])
+    position = torch.stack([pupil.x, pupil.y, torch.full_like(pupil.x, z)])
     turns, about = motion.rotation.tolist(), motion.point((0.0, 0.0, 0.0))
-    x, y, height = (dot(row, place) + shift for row, shift in zip(turns, about, strict=True))
+    x, y, height = (dot(row, position) + shift for row, shift in zip(turns, about, strict=True))
     direction = torch.stack([dot(row, pupil.direction) for row in turns])
-    way = torch.where(pupil.alive, (z - height) / direction[2], torch.zeros_like(height))
+    path = torch.where(pupil.alive, (z - height) / direction[2], torch.zeros_like(height))
     return replace(
-        pupil, x=x + way * direction[0], y=y + way * direction[1], direction=direction, path=pupil.path + way
+        pupil, x=x + path * direction[0], y=y + path * direction[1], direction=direction, path=pupil.path + path
     )
 
 
@@ -96,13 +95,13 @@ def optical_path(source: Emitter, lens: Lens, rays: Rays, z: float) -> tuple[Ray
     first = lens.interfaces[0].law
     index, path, longest, sense = 1.0 if first.reverses else first.n_in, None, 0.0, rays.sense
     for interface in lens.interfaces:
-        there = behind(rays, interface)
+        at_face = behind(rays, interface)
         if path is None:
-            path = index * path_from_reference(source, lens.entrance.z, there, sense)
+            path = index * path_from_reference(source, lens.entrance.z, at_face, sense)
         else:
-            path = path + index * _between(rays, there)
-            longest += index * _longest(_between(rays, there), there)
-        index, rays = index if interface.law.reverses else interface.law.n_out, there
+            path = path + index * _between(rays, at_face)
+            longest += index * _longest(_between(rays, at_face), at_face)
+        index, rays = index if interface.law.reverses else interface.law.n_out, at_face
     landed = LevelPlane(z).to(rays)
     ahead = torch.sign(-rays.above(z) * rays.sense)
     last = index * _between(rays, landed)
@@ -112,20 +111,16 @@ def optical_path(source: Emitter, lens: Lens, rays: Rays, z: float) -> tuple[Ray
 
 def path_from_reference(source: Emitter, z: float, rays: Rays, sense: int) -> Tensor:
     """Return the path (mm) of rays to the first surface from their reference; z: its vertex, sense: of the light."""
-    place = torch.stack([*rays.position[:2], rays.above(z)])
-    return source.reference(place, z, sense)
+    position = torch.stack([*rays.position[:2], rays.above(z)])
+    return source.reference(position, z, sense)
 
 
-def _between(before: Rays, there: Rays) -> Tensor:
-    """Return the path of rays between two positions (mm)."""
-    return length(torch.stack([*there.position[:2], there.above(before.z)]) - before.position)
+def _between(before: Rays, after: Rays) -> Tensor:
+    return length(torch.stack([*after.position[:2], after.above(before.z)]) - before.position)
 
 
-def _longest(way: Tensor, rays: Rays) -> float:
-    return float(torch.where(rays.alive, way.abs(), torch.zeros_like(way)).max())
-
-
-# --- comparison with the goal wave ------------------------------------------------------------------------------------
+def _longest(paths: Tensor, rays: Rays) -> float:
+    return float(torch.where(rays.alive, paths.abs(), torch.zeros_like(paths)).max())
 
 
 @dataclass(frozen=True)
@@ -162,19 +157,19 @@ def wavefront_error(source: Emitter, lens: Lens, wave: Wave, n: int = RAYS_PER_S
     The lens has the index of the source's main wavelength.  Raises ValueError if no ray can be compared.
     """
     pupil, nm = exit_pupil(source, lens, wave.z, n), source.main_wavelength
-    seen, flat, fit, share = _compare(pupil, wave, nm)
-    x, y = pupil.x[seen], pupil.y[seen]
-    off = pupil.direction[:, seen] - wave.directions(x, y, nm)
-    measured = float(total(pupil.flux[seen]))
-    level = flat - fit.at(x, y)
-    unit, angle = 1 / (nm * MM_PER_NM), 2e6 * torch.asin((length(off) / 2).clamp(max=1))
-    slopes = [p - tilt for p, tilt in zip(off[:2], fit.slopes, strict=True)]
-    along_x, along_y, seen_map = _map(x, y, level, slopes=slopes, cells=min(MAX_MAP_CELLS, n // 2))
+    compared, without_piston, fit, share = _compare(pupil, wave, nm)
+    x, y = pupil.x[compared], pupil.y[compared]
+    deviation = pupil.direction[:, compared] - wave.directions(x, y, nm)
+    measured = float(total(pupil.flux[compared]))
+    without_tilt = without_piston - fit.at(x, y)
+    unit, angle = 1 / (nm * MM_PER_NM), 2e6 * torch.asin((length(deviation) / 2).clamp(max=1))
+    slopes = [p - tilt for p, tilt in zip(deviation[:2], fit.slopes, strict=True)]
+    along_x, along_y, opd_map = _map(x, y, without_tilt, slopes=slopes, cells=min(MAX_MAP_CELLS, n // 2))
     return WavefrontError(
         wave.z, nm,
-        *(OpdSize(unit * _rms(part, share), unit * float(part.max() - part.min())) for part in (flat, level)),
+        *(OpdSize(unit * _rms(o, share), unit * float(o.max() - o.min())) for o in (without_piston, without_tilt)),
         tilt=(1e6 * fit.slopes[0], 1e6 * fit.slopes[1]), angle_rms=_rms(angle, share), angle_max=float(angle.max()),
-        floor=unit * pupil.rounding, flux=measured, rays=len(x), x=along_x, y=along_y, opd=unit * seen_map,
+        floor=unit * pupil.rounding, flux=measured, rays=len(x), x=along_x, y=along_y, opd=unit * opd_map,
     )  # fmt: skip
 
 
@@ -184,21 +179,22 @@ def residual(pupil: ExitPupil, wave: Wave, nm: float) -> Tensor:
 
     The root of its sum of squares is the RMS.  Raises ValueError if no ray can be compared.
     """
-    seen, flat, fit, share = _compare(pupil, wave, nm)
+    compared, without_piston, fit, share = _compare(pupil, wave, nm)
     weighted = torch.zeros_like(pupil.path)
-    weighted[seen] = (flat - fit.at(pupil.x[seen], pupil.y[seen])) * share.sqrt() / (nm * MM_PER_NM)
+    without_tilt = without_piston - fit.at(pupil.x[compared], pupil.y[compared])
+    weighted[compared] = without_tilt * share.sqrt() / (nm * MM_PER_NM)
     return weighted
 
 
 def _compare(pupil: ExitPupil, wave: Wave, nm: float) -> tuple[Tensor, Tensor, _Fit, Tensor]:
     """Return (compared rays (n, n); for these: OPD without piston in mm, its plane fit, fraction of their flux)."""
-    seen = pupil.alive & wave.contains(pupil.x, pupil.y)
-    if int(seen.sum()) < 3:
+    compared = pupil.alive & wave.contains(pupil.x, pupil.y)
+    if int(compared.sum()) < 3:
         raise ValueError(f"no light reaches the part of the plane z = {wave.z:g} for which the wavefront is stated")
-    x, y, path, flux = (part[seen] for part in (pupil.x, pupil.y, pupil.path, pupil.flux))
+    x, y, path, flux = (part[compared] for part in (pupil.x, pupil.y, pupil.path, pupil.flux))
     opd, share = path - wave.path(x, y, nm), flux / float(total(flux))
     fit = _least_squares(x, y, opd, share=share)
-    return seen, opd - fit.piston, fit, share
+    return compared, opd - fit.piston, fit, share
 
 
 @dataclass(frozen=True)
@@ -242,17 +238,17 @@ def _map(
     low_x, high_x, low_y, high_y = (float(end) for p in (x, y) for end in (p.min(), p.max()))
     pitch = max(high_x - low_x, high_y - low_y, 1e-9) / (cells - 1)
     start = [(low + high) / 2 - pitch * (cells - 1) / 2 for low, high in ((low_x, high_x), (low_y, high_y))]
-    at = [((p - s) / pitch).clamp(0, cells - 1) for p, s in zip((x, y), start, strict=True)]
-    cell = [p.floor().clamp(0, cells - 2) for p in at]
+    position = [((p - s) / pitch).clamp(0, cells - 1) for p, s in zip((x, y), start, strict=True)]
+    cell = [p.floor().clamp(0, cells - 2) for p in position]
     sums = np.zeros((2, cells * cells))
     for right, up in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        way = [c + step - p for c, step, p in zip(cell, (right, up), at, strict=True)]  # offset in cells
-        weight = (1 - way[0].abs()) * (1 - way[1].abs())
-        value = opd + pitch * (slopes[0] * way[0] + slopes[1] * way[1])
+        offset = [c + step - p for c, step, p in zip(cell, (right, up), position, strict=True)]  # offset in cells
+        weight = (1 - offset[0].abs()) * (1 - offset[1].abs())
+        value = opd + pitch * (slopes[0] * offset[0] + slopes[1] * offset[1])
         index = ((cell[1] + up) * cells + cell[0] + right).long().numpy()
         for k, part in enumerate((weight, weight * value)):
             sums[k] += np.bincount(index, part.numpy(), minlength=cells * cells)
     weight, value = sums
-    there = np.where(weight > 0, value / np.where(weight > 0, weight, 1.0), np.nan)
+    opd_map = np.where(weight > 0, value / np.where(weight > 0, weight, 1.0), np.nan)
     along_x, along_y = (s + pitch * np.arange(cells) for s in start)
-    return along_x, along_y, there.reshape(cells, cells)
+    return along_x, along_y, opd_map.reshape(cells, cells)

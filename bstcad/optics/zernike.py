@@ -44,7 +44,6 @@ def series(coefficients: Sequence[float], x: Tensor, y: Tensor) -> tuple[Tensor,
 
 
 def _series(coefficients: Sequence[float], x: Tensor, y: Tensor) -> list[Tensor]:
-    """Return `series` at points (n,)."""
     wanted = {noll(j): c for j, c in enumerate(coefficients, start=1) if c}
     zero = torch.zeros_like(x)
     sums = [zero, zero, zero]

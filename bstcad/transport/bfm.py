@@ -38,13 +38,11 @@ from bstcad.transport.density import BLOCKS, Density, inner, pushforward, thread
 LINES_PER_BLOCK = 8  # lines transformed together: eight doubles fill a cache line of the transposed output
 MIN_CELLS = 32  # cells a side of the coarsest grid
 FIRST_STEP = 1.0  # sigma on the coarsest grid; 1 is Newton's step between two uniform densities
-# Smallest initial sigma on a finer grid: rejections at the end of a coarse grid are due to that grid's noise
-MIN_FIRST_STEP = 0.25
+MIN_FIRST_STEP = 0.25  # smallest initial sigma on a finer grid: the noise of a coarse grid rejects its last steps
 STEP_INCREASE, STEP_DECREASE, REFUSED_STEP_FACTOR = 1.25, 0.8, 0.5  # factors of sigma after short, long, rejected steps
 MIN_GAIN_RATIO, MAX_GAIN_RATIO = 0.25, 0.75  # Armijo-Goldstein bounds of (gain of J) / (sigma |∇J|²)
-# Relative decrease of the mass error over PLATEAU_ITERATIONS iterations below which the solve is on a plateau
-PLATEAU_TOLERANCE = 0.005
-PLATEAU_ITERATIONS = 5
+PLATEAU_TOLERANCE = 0.005  # relative decrease of the mass error below which the solve is on a plateau
+PLATEAU_ITERATIONS = 5  # number of iterations over which that decrease is measured
 STEP_HALVINGS = 1  # halvings of sigma before a plateau stops the solve: the final mass error depends on sigma
 
 
@@ -109,7 +107,6 @@ class Poisson:
     """Inverse Laplacian (-Δ)^-1 with zero normal derivative; the solution has mean zero."""
 
     def __init__(self, n: int):
-        """Factorise the equation on n x n cells."""
         self.symbol = 4.0 * np.sin(0.5 * np.pi * np.arange(n) / n) ** 2  # s_k, (n,)
         self.pivots = _pivots(self.symbol)
         self.keep, self.share = np.ones(n), np.zeros(n)
@@ -131,7 +128,6 @@ class PoissonWithoutCheckerboard(Poisson):
     """
 
     def __init__(self, n: int):
-        """Factorise the equation on n x n cells."""
         super().__init__(n)
         self.keep, self.share = 1.0 + self.symbol**2 / 16.0, self.symbol / 16.0
 

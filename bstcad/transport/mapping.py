@@ -14,8 +14,7 @@ from bstcad.transport.bfm import Transport, TransportStep, back_and_forth, half_
 from bstcad.transport.density import Density, gradient_at_corners
 from bstcad.transport.monge_ampere import ROUGH_MASS_ERROR, MongeAmpere, corners, newton_on_grids
 
-# Smallest density of the target relative to its mean: the gradient of a convex function cannot avoid a hole
-FLOOR = 1e-3
+FLOOR = 1e-3  # smallest density of a target over its mean: the gradient of a convex function cannot avoid a hole
 FALLING_FLOORS = (0.03, 0.01, 0.003)  # floors solved before FLOOR, relative to the mean, where Newton needs them
 BACK_AND_FORTH_CELLS = 64  # cells a side of the largest grid of the back-and-forth method, before Newton's method
 NEWTON_STEPS = 8  # maximum number of Newton steps on each grid
@@ -25,10 +24,10 @@ POINTS_PER_CHUNK = 4096  # points inverted by a thread at a time
 
 @dataclass(frozen=True)
 class Frame:
-    """Position of the unit square in the plane: centre and side, mm; its sides lie along x and y."""
+    """Position of the unit square in a plane; its sides lie along x and y."""
 
-    centre: tuple[float, float] = (0.5, 0.5)  # mm
-    side: float = 1.0  # mm
+    centre: tuple[float, float] = (0.5, 0.5)  # position of the centre, mm
+    side: float = 1.0  # length of a side, mm
 
     def to_unit(self, x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return points (mm) in coordinates of the unit square."""
@@ -81,14 +80,12 @@ class TransportMap:
 
     The points are corners of the target's pixels: all, or MAX_MAP_NODES a side, spaced about evenly.  The quadrilateral
     of four neighbours in `source` sends the target's flux into the same four in `target`, except for the floor
-    (mapping.FLOOR) in dark parts of the target.  Stages 2 and 3 change the lens afterwards; the map remains that of
-    stage 1.
+    (mapping.FLOOR) in dark parts of the target.  Stages 2 and 3 change the lens afterwards, but not the map.
     """
 
     x: np.ndarray  # (c,) x on the target plane, mm, ascending, float64
     y: np.ndarray  # (r,) y on the target plane, mm, ascending, float64
-    # (c, r, 2) float32, x and y (mm) in the scene's frame where the light for (x, y) passes `plane`
-    source: np.ndarray
+    source: np.ndarray  # (c, r, 2) float32, x and y (mm) in the scene's frame where the light for (x, y) passes `plane`
     # "back": the last tailored face in the order of the light, which is the front of a lens with a tailored front alone
     # and of a mirror behind glass.  "entrance": the plane z = const through the vertex of the first face, where the map
     # of Wang et al. begins (tailoring.method "adam" and "integration", strong lenses near the source)

@@ -37,7 +37,6 @@ class MongeAmpere:
     """Monge-Ampère equation on one grid of n x n target pixels, the source interpolated bilinearly; cell units."""
 
     def __init__(self, source: Density, target: Density):
-        """Prepare the equation for two densities on one grid."""
         self.rho, self.nu = source.values, target.values
         # differences averaged to corners do not see the checkerboard, so the steps must not contain it
         self.poisson = PoissonWithoutCheckerboard(source.n)
