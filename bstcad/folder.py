@@ -423,7 +423,7 @@ def _lens(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
     else:
         front = front.with_parameters(**{name.removeprefix("front_"): float(found[name]) for name in _numbers(front)})
     back = _surface(found["control_points"], blank.back.z)
-    return scene.assembled(Lens(front, back, blank.outline, scene.index, way=blank.passes))
+    return scene.assembled(Lens(front, back, blank.outline, scene.index, own_passes=blank.passes))
 
 
 def _surface(net: np.ndarray, z: float) -> BSplineSurface:

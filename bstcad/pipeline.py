@@ -187,7 +187,7 @@ def task_of(scene: Scene, goals: Sequence[Goal], knobs: Tailoring, edge: Edge | 
 def posed(scene: Scene, task: Task) -> Task:
     """The task with the solution that asks less of two freeform faces; it says what they cannot do.  SceneError."""
     lens = scene.flat_lens(REACH_NET)
-    if not lens.shapes_both or not task.several:
+    if not lens.shapes_two_faces or not task.several:
         return task
     demand = find_demand(task, task.heaviest.through(lens))
     sentences = tuple(demand.sentences(scene.lens.back.z - scene.lens.front.z))

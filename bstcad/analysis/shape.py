@@ -19,7 +19,7 @@ from bstcad.optics.bspline import QUARTERS, BSplineSurface, span_points, weights
 from bstcad.optics.kernels import spline
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
-from bstcad.optics.sampling import rim
+from bstcad.optics.sampling import sample_rim
 
 GRID_POINTS = 1025  # points a side of the grid for thickness, and along a quarter of the rim
 HEIGHT_ROUNDING = 1e-13  # rounding of the heights, relative to the largest
@@ -89,7 +89,7 @@ def _sags(lens: Lens, x: Tensor, y: Tensor) -> tuple[np.ndarray, np.ndarray]:
 
 def _points(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
     """Return x and y (mm) of 4 n points of the rim, and of an n x n grid inside the outline."""
-    return tuple(torch.cat(pair) for pair in zip(rim(outline, n), inside(outline, n), strict=True))
+    return tuple(torch.cat(pair) for pair in zip(sample_rim(outline, n), inside(outline, n), strict=True))
 
 
 def _points_in(polygon: np.ndarray) -> tuple[Tensor, Tensor]:
@@ -281,7 +281,7 @@ def _radius(bend: Extreme) -> Extreme:
 
 def _angle(lens: Lens, slope: Extreme) -> Extreme:
     """Return the extreme as an angle in degrees, including the rim between the points of the grid."""
-    x, y = rim(lens.outline, GRID_POINTS)
+    x, y = sample_rim(lens.outline, GRID_POINTS)
     _, z_x, z_y = lens.back.sag_and_slope(x, y)
     steep = torch.hypot(z_x, z_y)
     if (largest := float(steep.max())) > slope.largest:

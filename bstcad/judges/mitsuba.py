@@ -31,7 +31,7 @@ from bstcad.optics.collimated import Collimated
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.losses import Fresnel, Losses
+from bstcad.optics.losses import FresnelLoss, Losses
 from bstcad.optics.outlines import Outline
 from bstcad.optics.point import Point
 from bstcad.optics.rays import axes
@@ -56,7 +56,7 @@ def cannot(lens: Lens, channels: Sequence[Channel]) -> str:
     """Return why Mitsuba cannot trace this light, in a sentence; "" if it can."""
     if lens.before or lens.behind:
         return "it simulates only the lens, and there are windows or mirrors before or behind it"
-    if lens.way is not None:
+    if lens.own_passes is not None:
         return "it simulates a lens or a mirror, and light takes another path through this solid"
     if (first := channels[0].source).kind not in LAMPS:
         return f"Mitsuba has no lamp for the light of {type(first).__name__}"
@@ -71,7 +71,7 @@ def light(lens: Lens, channels: Sequence[Channel]) -> tuple[Channel, ...]:
     """Return the channels with the losses that Mitsuba simulates."""
     if not lens.passes.enters:
         return tuple(replace(channel, losses=None) for channel in channels)
-    return tuple(replace(channel, losses=Losses(Fresnel(channel.source.wavelength))) for channel in channels)
+    return tuple(replace(channel, losses=Losses(FresnelLoss(channel.source.wavelength))) for channel in channels)
 
 
 def trace(

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import torch
 from torch import Tensor
 
-from bstcad.optics.emitters import LAWS, Emitter, WavelengthKey, all_alive
+from bstcad.optics.emitters import PROFILE_NAMES, Emitter, WavelengthKey, all_alive
 from bstcad.optics.kernels.records import ALONG_Z, Beam, floats
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.key import Key
@@ -55,11 +55,11 @@ class Collimated(Emitter):
     kind: Annotated[Literal["collimated"], Key("Parallel light.")] = "collimated"
 
     __pydantic_config__ = STRICT
-    size_key, parallel, simple = "divergence", True, "parallel light of one direction"
+    size_key, parallel, simple_name = "divergence", True, "parallel light of one direction"
     widths = MappingProxyType({"gaussian": "radius_1e2"})
 
     @property
-    def begins(self) -> float | None:
+    def start_plane(self) -> float | None:
         """z (mm) of the plane of the aperture; None: not stated."""
         return self.z
 
@@ -73,7 +73,7 @@ class Collimated(Emitter):
     def words(self, origin: float) -> str:
         """Return profile, divergence and aperture for a data sheet."""
         spread = f"divergence {self.divergence:.4g}°, " if self.divergence else ""
-        return f"parallel light, {LAWS[self.profile]}, {spread}{self.aperture.words.replace(' x ', ' × ')}"
+        return f"parallel light, {PROFILE_NAMES[self.profile]}, {spread}{self.aperture.words.replace(' x ', ' × ')}"
 
     def sizes(self) -> Iterator[tuple[str, float, str]]:
         """Yield the divergence, if there is one."""

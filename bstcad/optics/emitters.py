@@ -31,7 +31,7 @@ WavelengthKey = Annotated[  # key of every source
     Wavelength,
     Key("One wavelength, or lines [[nm, weight], ...] of a spectrum, weights of any sum.", "nm", 100.0, 20_000.0),
 ]
-LAWS = {"gaussian": "Gaussian", "lambertian": "Lambertian", "uniform": "even"}  # names of the profiles in sentences
+PROFILE_NAMES = {"gaussian": "Gaussian", "lambertian": "Lambertian", "uniform": "even"}  # in sentences
 
 
 class Emitter(ABC):
@@ -49,19 +49,19 @@ class Emitter(ABC):
     size_key: str | None = None  # scene key of the size; with the prefix real_ the key of the real lamp's size
     kind: str = "own"
     parallel: bool = False  # True if the light of each point of the extent is parallel
-    simple: str = "a source without size"  # name of the source without its extent
+    simple_name: str = "a source without size"  # name of the source without its extent
     start_key: str = "z"  # scene key of the position where the light starts
     widths: Mapping[str, str] = MappingProxyType({})  # scene key of the width that each profile needs
     unbounded: str | None = None  # name of the profile that needs no width
 
     @property
-    def begins(self) -> float | None:
+    def start_plane(self) -> float | None:
         """z (mm) of the plane from which the light starts; None: a plane before the lens, wherever the lens is."""
         return None
 
-    def nearest(self, upwards: bool) -> float | None:
-        """Return z (mm) of the point of the extent nearest to a lens above it, or below it; None as in `begins`."""
-        return self.begins
+    def nearest_z(self, upwards: bool) -> float | None:
+        """Return z (mm) of the point of the extent nearest to a lens above or below it; None as in `start_plane`."""
+        return self.start_plane
 
     def complaints(self, z: float, optic: str) -> Iterator[str]:
         """Yield faults of the size as "key: sentence"; z: of the first face (mm), optic: "lens" or "mirror"."""
@@ -91,15 +91,15 @@ class Emitter(ABC):
         """Return (outline, centre in mm) of the light on the plane z; outline None: the light has no edge."""
         return None, (0.0, 0.0)
 
-    def starts(self, entrance: float) -> Vector:
+    def start_point(self, entrance: float) -> Vector:
         """Return the centre of the light (mm) where it starts, or on the plane `entrance` (mm) if none is stated."""
-        z = entrance if self.begins is None else self.begins
+        z = entrance if self.start_plane is None else self.start_plane
         return (*self.spot(z)[1], z)
 
     @property
     def place(self) -> Vector:
         """Direction of parallel light, else position (mm): distinguishes the simple sources of an extended source."""
-        return self.axes[2] if self.parallel else self.starts(0.0)
+        return self.axes[2] if self.parallel else self.start_point(0.0)
 
     def element(self, x: float, y: float) -> Emitter:
         """Return the simple source at (x, y) of the extent."""

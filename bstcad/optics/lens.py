@@ -41,19 +41,19 @@ class Lens:
     back: Surface
     outline: Outline  # outline of both faces
     index: float  # refractive index at the design wavelength; unused for a first-surface mirror
-    reflects: bool = False  # True if a face reflects; without `way` True means a mirror and False a lens
+    reflects: bool = False  # True if a face reflects; without `own_passes` True means a mirror and False a lens
     losses: LensLosses | None = None  # losses at its faces and in its glass; None: no losses
     clear: tuple[Outline, Outline] | None = None  # clear apertures of front and back; None: the outline
     before: tuple[Interface, ...] = ()  # interfaces before the solid, such as a window
     behind: tuple[Interface, ...] = ()  # interfaces behind the solid, such as a fold mirror
     shaped: tuple[int, ...] | None = None  # numbers of the interfaces that tailoring shapes; None: the back alone
-    way: Passes | None = None  # passes of the light through the solid; None: those of a lens or of a mirror
+    own_passes: Passes | None = None  # passes of the light through the solid; None: those of a lens or of a mirror
 
     def __post_init__(self) -> None:
-        if self.way is not None:
-            object.__setattr__(self, "reflects", self.way.reflects)
-            if self.way in (LENS, MIRROR):  # stated by `reflects` alone, so that equal lenses compare equal
-                object.__setattr__(self, "way", None)
+        if self.own_passes is not None:
+            object.__setattr__(self, "reflects", self.own_passes.reflects)
+            if self.own_passes in (LENS, MIRROR):  # stated by `reflects` alone, so that equal lenses compare equal
+                object.__setattr__(self, "own_passes", None)
 
     @cached_property
     def interfaces(self) -> tuple[Interface, ...]:
@@ -64,7 +64,7 @@ class Lens:
     @property
     def passes(self) -> Passes:
         """Passes of the light through the solid."""
-        return self.way or (MIRROR if self.reflects else LENS)
+        return self.own_passes or (MIRROR if self.reflects else LENS)
 
     @property
     def _lossless(self) -> tuple[Interface, ...]:
@@ -107,7 +107,7 @@ class Lens:
         return any(first + k in self.freeform for k in self.passes.numbers_of(face))
 
     @property
-    def shapes_both(self) -> bool:
+    def shapes_two_faces(self) -> bool:
         """True if tailoring shapes front and back of a lens, which light crosses one after the other."""
         return self.shapes("front") and self.shapes("back") and not self.passes.reflects
 

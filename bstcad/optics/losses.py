@@ -27,7 +27,7 @@ Polarisation = Literal["none", "s", "p"]
 
 
 @dataclass(frozen=True)
-class Coating:
+class CoatingLayer:
     """A single-layer coating of a face."""
 
     index: float
@@ -47,7 +47,7 @@ def reflectance(
 
 
 def coated_reflectance(
-    n_in: float, n_out: float, cos_in: Tensor, cos_out: Tensor, coating: Coating, wavelength: float,
+    n_in: float, n_out: float, cos_in: Tensor, cos_out: Tensor, coating: CoatingLayer, wavelength: float,
     polarisation: Polarisation = "none",
 ) -> Tensor:  # fmt: skip
     """Return the reflectance R of a face with a single layer between two media; wavelength in nm, in vacuum.
@@ -90,7 +90,7 @@ class Transmission:
     n_out: float
     wavelength: float  # wavelength in vacuum, nm
     polarisation: Polarisation = "none"
-    coating: Coating | None = None
+    coating: CoatingLayer | None = None
 
     line, in_glass, fused = REFLECTED, False, True
 
@@ -117,7 +117,7 @@ class MetalReflection:
 
 
 @dataclass(frozen=True)
-class Absorption:
+class AbsorptionLoss:
     """Absorption by the Beer-Lambert law: the fraction exp(-a s) remains after a path s in the glass."""
 
     coefficient: float  # absorption coefficient a, 1/mm
@@ -130,7 +130,7 @@ class Absorption:
 
 
 @dataclass(frozen=True)
-class Own:
+class CustomLoss:
     """A loss defined by a script or a package (scene.effects.effect), without a kernel."""
 
     name: str
@@ -159,12 +159,12 @@ class Own:
 
 
 @dataclass(frozen=True)
-class Fresnel:
+class FresnelLoss:
     """Fresnel reflection at the faces: polarisation, coating, and the metal of a mirror."""
 
     wavelength: float  # wavelength, nm
     polarisation: Polarisation = "none"
-    coating: Coating | None = None
+    coating: CoatingLayer | None = None
     metal: complex | None = None  # n + ik of the mirror's metal
 
     def of(self, interface: Interface, index: float = 1.0) -> Loss:
@@ -179,9 +179,9 @@ class Fresnel:
 class Losses:
     """Losses at the faces and in the glass of a lens, for light of one wavelength."""
 
-    fresnel: Fresnel | None = None
-    absorption: Absorption | None = None
-    own: tuple[Own, ...] = ()
+    fresnel: FresnelLoss | None = None
+    absorption: AbsorptionLoss | None = None
+    own: tuple[CustomLoss, ...] = ()
 
     def on(self, interfaces: Sequence[Interface]) -> tuple[Interface, ...]:
         """Return the interfaces of a lens, each with its losses there and in the glass before it."""

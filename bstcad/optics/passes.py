@@ -65,7 +65,7 @@ class Passes:
         return next((face for face, law in self.steps if law is Reflect), None)
 
     @property
-    def crossed(self) -> tuple[Face, ...]:
+    def refracting_faces(self) -> tuple[Face, ...]:
         """Faces that refract the light, each once, in the order of the light."""
         return tuple(dict.fromkeys(face for face, law in self.steps if law is Refract))
 

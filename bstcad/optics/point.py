@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics.emitters import LAWS, Emitter, WavelengthKey, all_alive
+from bstcad.optics.emitters import PROFILE_NAMES, Emitter, WavelengthKey, all_alive
 from bstcad.optics.kernels.records import ALONG_Z, Beam, floats
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.key import Key
@@ -69,16 +69,16 @@ class Point(Emitter):
     kind: Annotated[Literal["point"], Key("A point, or with a size a disc or rectangle of points.")] = "point"
 
     __pydantic_config__ = STRICT
-    size_key, simple, start_key = "diameter", "a point", "position"
+    size_key, simple_name, start_key = "diameter", "a point", "position"
     widths = MappingProxyType({"gaussian": "half_angle_1e2", "uniform": "half_angle", "lambertian": "half_angle"})
     unbounded = "lambertian"  # without half_angle a lambertian fills the half space
 
     @property
-    def begins(self) -> float:
+    def start_plane(self) -> float:
         """z (mm) of the centre."""
         return self.position[2]
 
-    def nearest(self, upwards: bool) -> float:
+    def nearest_z(self, upwards: bool) -> float:
         """Return z (mm) of the point of the source that is nearest to a lens above it, or below it."""
         reach = 0.0 if self.extent is None else self.extent.reach(*(axis[2] for axis in self.axes[:2]))
         return self.position[2] + (reach if upwards else -reach)
@@ -108,7 +108,7 @@ class Point(Emitter):
         angle = self.half_angle or self.half_angle_1e2
         sizes = [f"half angle {angle:.4g}°"] if angle else []
         sizes += (f"{key} {size:.4g} {unit}" for key, size, unit in self.sizes())
-        return ", ".join([f"point at ({position}) mm", LAWS[self.profile], *sizes])
+        return ", ".join([f"point at ({position}) mm", PROFILE_NAMES[self.profile], *sizes])
 
     def sizes(self) -> Iterator[tuple[str, float, str]]:
         """Yield diameter, width and height, as far as stated."""

@@ -1,8 +1,8 @@
 """Sample points of rays and sources: grids, stratified (jittered) points and random points of a rectangle.
 
 Each of these functions returns (x, y) in mm over `window` (centred on the axis); every point represents the same area.
-`point_pairs` and `shifted_lattice` return points of equal weight over the outline of an extended source; `rim` returns
-points along an outline.
+`point_pairs` and `shifted_lattice` return points of equal weight over the outline of an extended source, and
+`sample_rim` points along an outline.
 
 The jitter of a cell is a hash of its number, SplitMix64 (Steele, Lea and Flood 2014), instead of the next number of a
 sequence, so that every thread obtains the same points.
@@ -117,7 +117,7 @@ def _with_second_moment(points: list[tuple[float, float]], moment: float) -> lis
     return [(scale_x * x, scale_y * (y - shear * x)) for x, y in points]
 
 
-def rim(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
+def sample_rim(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
     """Return 4 n points (mm) along the rim; the first equals the last."""
     turn = torch.linspace(0, 2 * torch.pi, 4 * n, dtype=torch.float64)
     c, s = elementary(torch.cos, turn), elementary(torch.sin, turn)

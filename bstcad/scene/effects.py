@@ -164,13 +164,13 @@ def losses(effects: Effects, lens: LensBlank, wavelength: float) -> Losses | Non
 
     reflection = absorbed = None
     if fresnel is not None:
-        coating = fresnel.coating and physics.Coating(fresnel.coating.index, fresnel.coating.thickness)
+        coating = fresnel.coating and physics.CoatingLayer(fresnel.coating.index, fresnel.coating.thickness)
         metal = media.complex_index(fresnel.metal or METAL, wavelength) if lens.passes.reflects else None
-        reflection = physics.Fresnel(wavelength, fresnel.polarisation, coating, metal)
+        reflection = physics.FresnelLoss(wavelength, fresnel.polarisation, coating, metal)
     if absorption is not None:
         given = absorption.coefficient
-        absorbed = physics.Absorption(
+        absorbed = physics.AbsorptionLoss(
             media.absorption_coefficient(lens.material, wavelength) if given is None else given
         )
-    own = tuple(physics.Own(other.name, wavelength, other.of(wavelength)) for other in others)
+    own = tuple(physics.CustomLoss(other.name, wavelength, other.of(wavelength)) for other in others)
     return physics.Losses(reflection, absorbed, own)

@@ -216,7 +216,7 @@ class LightPath:
     def _out_of_order(self) -> Iterator[str]:
         """Complain of elements that light does not meet in the order of their tables."""
         lens, sense = self.lens, self.sense
-        key, start = f"source.{self.source.start_key}", self.source.nearest(upwards=sense > 0)
+        key, start = f"source.{self.source.start_key}", self.source.nearest_z(upwards=sense > 0)
         optic = Station("lens.front.z", f"the {lens.optic}", lens.front.z + lens.front_sags[0], lens.back.z)
         before, behind = (
             [(Station.of(f"{name}[{k}]", element), element.kind == "mirror") for k, element in enumerate(of)]

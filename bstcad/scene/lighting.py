@@ -52,7 +52,7 @@ def _spectrum(source: Emitter, lens: LensBlank) -> Iterator[str]:
 def order(source: Emitter, lens: LensBlank) -> Iterator[str]:
     """Complain of a source that is not before the lens along z, or not above a mirror."""
     front, back = lens.front.z + lens.front_sags[0], lens.back.z
-    key, start = f"source.{source.start_key}", source.nearest(upwards=lens.passes.sense > 0)
+    key, start = f"source.{source.start_key}", source.nearest_z(upwards=lens.passes.sense > 0)
     if lens.passes.sense > 0:
         if start is not None and not start < front:
             yield f"{key}: the light starts at z = {start:g}, not before the front at z = {front:g}; move one of them"

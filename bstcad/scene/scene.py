@@ -257,7 +257,7 @@ class Scene(Record):
         The blank keeps lens.min_thickness at the rim, and the rim stays behind the source.
         """
         lens, source = self.lens, self.source
-        lowest = source.begins - lens.front.z if source.begins is not None else -math.inf
+        lowest = source.start_plane - lens.front.z if source.start_plane is not None else -math.inf
         return SEARCH_RANGE * lowest, SEARCH_RANGE * (lens.back.z - lens.front.z - lens.min_thickness)
 
     @property
@@ -307,7 +307,7 @@ class Scene(Record):
         back = BSplineSurface(self.lens.back.z, heights, (-half_x, half_x), (-half_y, half_y))
         lens = Lens(
             self.lens.flat_front(net, as_wide_as).to(heights.dtype, device), back, self.lens.outline, self.index,
-            way=self.lens.passes,
+            own_passes=self.lens.passes,
         )  # fmt: skip
         return self.assembled(lens)
 
@@ -390,7 +390,7 @@ class Scene(Record):
         """
         given: dict[str, FileContent] = {}
         own: dict[str, Any] = {"source": self.source} if self.source.kind == Emitter.kind else {}
-        placeholder = Collimated(self.lens.outline, self.source.wavelength, z=self.source.begins)
+        placeholder = Collimated(self.lens.outline, self.source.wavelength, z=self.source.start_plane)
         data = _from_python(self.model_copy(update={"source": placeholder}) if own else self, "", given)
         outline = changes.get("lens.outline", self.lens.outline)
         for key, value in changes.items():
@@ -430,7 +430,7 @@ def _wavefront_complaints(wave: Wave | None, source: Emitter, lens: LensBlank, a
         return
     if source.extent is not None:
         sizes = " and ".join(f"source.{key}" for key, _, _ in source.sizes())
-        yield f"wavefront: light of an extended source ({sizes}) has no single wavefront; make it {source.simple}"
+        yield f"wavefront: light of an extended source ({sizes}) has no single wavefront; make it {source.simple_name}"
     yield from (f"wavefront.{complaint}" for complaint in wave.complaints(lens.back.z))
     if isinstance(wave, ZernikeWave) and not wave.steepest(source.main_wavelength) < math.sin(MAX_RAY_ANGLE):
         yield "wavefront.coefficients: the wave is too steep to have rays; make them smaller, or the radius larger"

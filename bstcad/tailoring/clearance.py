@@ -23,7 +23,7 @@ from bstcad.optics.bspline import QUARTERS, SPANS_AT_A_TIME, BSplineSurface, eva
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import inside
-from bstcad.optics.sampling import rim
+from bstcad.optics.sampling import sample_rim
 from bstcad.scene.blank import Bounds
 
 MARGIN = 0.01  # distance from a bound at which the penalty begins, relative to the bound
@@ -76,7 +76,7 @@ def _points_near_bounds(lens: Lens, bounds: Bounds, margin: float) -> Iterator[t
     for x, y in grid.near(lens, bounds, margin):
         yield x, y, 1 / grid.points, bounds.thinnest
     if bounds.edge is not None:
-        x, y = (p.to(lens.like) for p in rim(lens.outline, RIM_POINTS))
+        x, y = (p.to(lens.like) for p in sample_rim(lens.outline, RIM_POINTS))
         yield x, y, 1 / len(x), max(bounds.thinnest, bounds.edge)
 
 

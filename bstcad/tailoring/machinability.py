@@ -33,7 +33,7 @@ from bstcad.optics.bspline import (
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Face, Lens
 from bstcad.optics.outlines import Outline
-from bstcad.optics.sampling import rim
+from bstcad.optics.sampling import sample_rim
 from bstcad.scene.blank import Bounds
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.clearance import MARGIN, RIM_POINTS, clearance
@@ -89,7 +89,7 @@ def thickness_points(lens: Lens) -> tuple[Tensor, Tensor]:
 
 def rim_points(lens: Lens) -> tuple[Tensor, Tensor]:
     """Return x and y (mm) of the points along the rim at which the thickness is computed."""
-    return tuple(p.to(lens.like) for p in rim(lens.outline, RIM_POINTS))
+    return tuple(p.to(lens.like) for p in sample_rim(lens.outline, RIM_POINTS))
 
 
 def round_weight(number: int, rounds: int) -> float:

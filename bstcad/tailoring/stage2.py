@@ -322,7 +322,7 @@ def variables_of(task: Task, lens: Lens, pixels: int | None = None) -> NetVariab
     if pixels is not None:
         return NetVariables(tuple(CoarseVariable.of(*each) for each in zip(nets, lens.nets, weights, strict=True)))
     blocks = tuple(SobolevVariable.of(net, weight) for net, weight in zip(nets, weights, strict=True))
-    if lens.shapes_both and len(task.goals) > 1:
+    if lens.shapes_two_faces and len(task.goals) > 1:
         return NetVariables(blocks, *along_light(light.source, seen, task.goals))
     return NetVariables(blocks)
 

@@ -79,7 +79,7 @@ def steps(task: Task, lens: Lens, state: FrontRound | None = None) -> Iterator[S
     With one goal, or if light does not cross both faces in succession, stage 1 tailors the last net alone (stage1.py).
     """
     lens = task.heaviest.through(lens)
-    if not (lens.shapes_both and task.several):
+    if not (lens.shapes_two_faces and task.several):
         alone = replace(task.refined(lens, task.knobs.levels[-1]), shaped=lens.freeform[-1:])
         yield from stage1.steps(task, alone, state)
         return

@@ -57,7 +57,7 @@ class Setup:
         if part == "lens":
             back = float(self.lens.back.plain().from_vertex().z)
             return 0.0, 0.0, (self.lens.front.z + back) / 2 if "front" in self.lens.passes.faces else back
-        points = [channel.source.starts(self.lens.entrance.z) for channel in self.channels]
+        points = [channel.source.start_point(self.lens.entrance.z) for channel in self.channels]
         mean = np.average(points, axis=0, weights=[channel.weight for channel in self.channels])
         return tuple(mean.tolist())
 

@@ -72,7 +72,7 @@ class ExaminedFile:
 @one_sentence
 def lens(path: Path, index: float, passes: Passes = LENS) -> Lens:
     """Read the lens of a STEP file, which states neither index nor passes of the light; ValueError if there is none."""
-    return replace(step_reading.lens(_read(path, _stamp(path)), index), way=passes)
+    return replace(step_reading.lens(_read(path, _stamp(path)), index), own_passes=passes)
 
 
 @one_sentence

@@ -12,7 +12,7 @@ from bstcad.optics.channels import Channel
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.losses import Absorption, Fresnel, Losses
+from bstcad.optics.losses import AbsorptionLoss, FresnelLoss, Losses
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Plane
@@ -49,14 +49,14 @@ def reference(lens=None, source=BEAM, screen=SCREEN, picture=None):
 
 
 def test_a_plate_reflects_four_percent_a_face_and_changes_no_picture():
-    found = reference().change([Channel(BEAM, INDEX, losses=Losses(Fresnel(587.6)))])
+    found = reference().change([Channel(BEAM, INDEX, losses=Losses(FresnelLoss(587.6)))])
     assert found.flux == pytest.approx(0.96**2 - 1, abs=1e-12)
     assert found.rrmsd == pytest.approx(0, abs=1e-12) and found.blur == 0
 
 
 def test_glass_absorbs_by_its_thickness_and_a_wedge_of_it_changes_the_picture():
     def found(lens):
-        return reference(lens).change([Channel(BEAM, INDEX, losses=Losses(absorption=Absorption(0.01)))])
+        return reference(lens).change([Channel(BEAM, INDEX, losses=Losses(absorption=AbsorptionLoss(0.01)))])
 
     assert found(plate()).flux == pytest.approx(math.exp(-0.01 * THICKNESS) - 1, abs=1e-12)
     assert found(plate()).rrmsd < 1e-12
@@ -64,7 +64,7 @@ def test_glass_absorbs_by_its_thickness_and_a_wedge_of_it_changes_the_picture():
     moved_by = 996 * math.tan(deviation)
     screen = replace(SCREEN, x=(moved_by - 8.0, moved_by + 8.0))
     lens = plate(0.004)
-    found = reference(lens, screen=screen).change([Channel(BEAM, INDEX, losses=Losses(absorption=Absorption(1.0)))])
+    found = reference(lens, screen=screen).change([Channel(BEAM, INDEX, losses=Losses(absorption=AbsorptionLoss(1.0)))])
     # exp(-a s x) over the picture, x by 0.25 mm a pixel: its relative deviation weighted by E²
     x = (np.arange(64) - 31.5) * 0.25
     wanted = difference(checks() * np.exp(-0.004 * x), checks())
@@ -107,7 +107,7 @@ def test_a_ghost_of_a_plate_is_its_two_reflections(tilt):
     screen = replace(SCREEN, x=(-half, half), y=(-8.0, 8.0), pixels=48, tilt=(0.0, tilt) if tilt else None)
     even = np.zeros((48, 48))
     even[8:40, 8:40] = 1.0  # the beam, straight through
-    found = reference(screen=screen, picture=even).ghost(Channel(BEAM, INDEX, losses=Losses(Fresnel(587.6))))
+    found = reference(screen=screen, picture=even).ghost(Channel(BEAM, INDEX, losses=Losses(FresnelLoss(587.6))))
     assert found.flux == pytest.approx(0.04**2, rel=1e-6)
     assert found.rrmsd < 0.3 * found.flux  # it lies on the light that goes straight through, but for its cells
 

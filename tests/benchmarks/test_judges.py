@@ -22,7 +22,7 @@ from bstcad.cad.solid import lens_solid
 from bstcad.judges import batoid, comparison, mitsuba
 from bstcad.optics.bspline import DEGREE, knots
 from bstcad.optics.lens import Lens
-from bstcad.optics.losses import Fresnel, Losses
+from bstcad.optics.losses import FresnelLoss, Losses
 from bstcad.optics.measure import tubes_picture
 from bstcad.optics.quadrature import of_lens
 from bstcad.optics.trace import ghost_light, to_first_net, trace_ghost
@@ -153,7 +153,7 @@ def test_the_ghost_lands_where_batoid_has_it(sphere):
     program.reflect(front.surface, theirs, front.frame)
     program.refract(back.surface, theirs, glass, air, back.frame)
     x, y, arrived = batoid.land(theirs, screen)
-    out, _ = trace_ghost(rays, replace(lens, losses=Losses(Fresnel(scene.source.wavelength))))
+    out, _ = trace_ghost(rays, replace(lens, losses=Losses(FresnelLoss(scene.source.wavelength))))
     ours = screen.plane.to(out)
     both = (kept & ours.alive).numpy() & arrived
     off = np.hypot(*(ours.position[:2].numpy()[:, both] - np.stack([x, y])[:, both]))

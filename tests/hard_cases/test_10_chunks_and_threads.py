@@ -29,7 +29,7 @@ from bstcad.optics.collimated import Collimated
 from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.losses import Absorption, Fresnel, Losses
+from bstcad.optics.losses import AbsorptionLoss, FresnelLoss, Losses
 from bstcad.optics.measure import RayTubes
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
@@ -74,7 +74,7 @@ def of_two_faces(dtype) -> dict[str, torch.Tensor]:
     back = lens(dtype).back
     front = replace(back, z=15.0, heights=-0.1 * back.heights.flip(0, 1))
     held = Lens(front, back, Circle(10.0), 1.5, shaped=(0, 1))
-    light = (Channel(SOURCE, held.index, losses=Losses(Fresnel(587.6), Absorption(0.01))),)
+    light = (Channel(SOURCE, held.index, losses=Losses(FresnelLoss(587.6), AbsorptionLoss(0.01))),)
     goals = [Goal("target", screen, target().numpy(), weight) for screen, weight in ((SCREEN, 1.0), (FURTHER, 2.0))]
     found = {}
     for name, wave in (("two faces", None), ("two faces and a wave", SphericalWave((0.0, 0.0, -80.0), 30.0))):

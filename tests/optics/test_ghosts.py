@@ -10,7 +10,7 @@ from bstcad.optics.channels import Channel
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.losses import Absorption, Coating, Fresnel, Losses, reflectance
+from bstcad.optics.losses import AbsorptionLoss, CoatingLayer, FresnelLoss, Losses, reflectance
 from bstcad.optics.measure import Effort, measure
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.point import Point
@@ -22,7 +22,7 @@ from tests.lenses import bundle, lens_of, tilted, wavy
 EXACT = 1e-12
 N = 1.5
 WAVELENGTH = 587.6
-BARE = Losses(Fresnel(WAVELENGTH))
+BARE = Losses(FresnelLoss(WAVELENGTH))
 
 
 def plate(losses=BARE, index=N, thickness=4.0, outline=EVERYWHERE):
@@ -44,7 +44,8 @@ def test_at_normal_incidence_a_plate_sends_t_r_r_t(index):
 
 def test_glass_absorbs_along_three_ways_through_it():
     rays, a, t = bundle((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), 0.02, 4.0
-    clear, dim = (trace_ghost(rays, plate(Losses(Fresnel(WAVELENGTH), glass)))[0] for glass in (None, Absorption(a)))
+    plates = (plate(Losses(FresnelLoss(WAVELENGTH), glass)) for glass in (None, AbsorptionLoss(a)))
+    clear, dim = (trace_ghost(rays, lens)[0] for lens in plates)
     assert float(dim.flux / clear.flux) == pytest.approx(math.exp(-3 * a * t), rel=EXACT)
 
 
@@ -95,7 +96,7 @@ def _reflected(angle):
 # --- in a measurement -------------------------------------------------------------------------------------------------
 
 SCREEN = Screen(300.0, (-40.0, 60.0), (-40.0, 40.0), (20, 16))
-LOSSES = Losses(Fresnel(WAVELENGTH, coating=Coating(1.38, 60.0)), Absorption(0.01))
+LOSSES = Losses(FresnelLoss(WAVELENGTH, coating=CoatingLayer(1.38, 60.0)), AbsorptionLoss(0.01))
 EFFORT = Effort(160, accuracy=0.0)
 
 

@@ -9,7 +9,7 @@ from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import Interface, Reflect, Refract, cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.losses import Absorption, Fresnel, Losses
+from bstcad.optics.losses import AbsorptionLoss, FresnelLoss, Losses
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.passes import Pass, Passes
 from bstcad.optics.point import Point
@@ -93,7 +93,7 @@ def test_a_system_is_simulated_as_its_rays_and_its_tubes_are_traced():
 
 
 MANGIN = Passes((Pass("front", Refract), Pass("back", Reflect), Pass("front", Refract)))
-LOSSES = Losses(Fresnel(587.6), Absorption(0.01))
+LOSSES = Losses(FresnelLoss(587.6), AbsorptionLoss(0.01))
 TWO = Lens(net(0.0, 0.4, 2), net(6.0, 0.5), SQUARE, N, shaped=(0, 1))
 MIRROR = replace(FOLD[0], surface=replace(net(60.0, 0.5, 3), x=(-40.0, 40.0), y=(-40.0, 40.0)))
 SYSTEMS = {
@@ -102,7 +102,7 @@ SYSTEMS = {
     "with a window": replace(TWO, before=WINDOW, shaped=(2, 3)),
     "with a fold mirror": replace(TWO, behind=FOLD),
     "freeform fold mirror": replace(TWO, behind=(MIRROR,), shaped=(0, 1, 2)),
-    "lossy Mangin mirror": replace(TWO, way=MANGIN, losses=Losses(absorption=Absorption(0.01))),
+    "lossy Mangin mirror": replace(TWO, own_passes=MANGIN, losses=Losses(absorption=AbsorptionLoss(0.01))),
     "a plate between them": replace(
         TWO, behind=(*(replace(i, surface=i.surface.moved(i.surface.z + 30.0)) for i in WINDOW), MIRROR), shaped=(0, 4)
     ),
@@ -113,7 +113,7 @@ PLANES = {"level": LevelPlane(15.0), "tilted": TiltedPlane((3.0, 2.0, 15.0), (20
 def test_light_goes_through_a_mangin_mirror_as_snell_has_it():
     """Between flat faces t mm apart a ray of sine s is displaced by 2 t s / r, on a path of 2 t n / r, r² = n² - s²."""
     flat = [net(z, 0.0) for z in (0.0, 6.0)]
-    lens = Lens(*flat, SQUARE, N, way=MANGIN)
+    lens = Lens(*flat, SQUARE, N, own_passes=MANGIN)
     assert lens.passes.sense == 1 and lens.passes.turn == -1 and lens.number_of("back") == 1
     assert [interface.surface for interface in lens.interfaces] == [flat[0], flat[1], flat[0]]
     rays = rays_of(SOURCE, lens, size=10.0)
@@ -122,14 +122,14 @@ def test_light_goes_through_a_mangin_mirror_as_snell_has_it():
     way = (20.0 - rays.above(0.0)) / rays.direction[2] + 12.0 / torch.sqrt(N**2 - sine**2)  # times the direction
     wanted = rays.position[:2] + way * rays.direction[:2]
     torch.testing.assert_close(landed.position[:2], wanted, rtol=0, atol=1e-12)
-    losses = replace(lens, losses=Losses(absorption=Absorption(0.01)))
+    losses = replace(lens, losses=Losses(absorption=AbsorptionLoss(0.01)))
     path = 12.0 * N / torch.sqrt(N**2 - sine**2)  # through the glass twice
     torch.testing.assert_close(trace(rays, losses, LevelPlane(-20.0)).flux, rays.flux * torch.exp(-0.01 * path))
 
 
 def test_a_mangin_mirror_is_simulated_as_its_tubes_are_traced():
     """Light that comes back to the front beside its rim is lost: a fifth of what enters."""
-    lens = Lens(Sphere(0.0, 0.01), net(6.0, 0.2), SQUARE, N, way=MANGIN)
+    lens = Lens(Sphere(0.0, 0.01), net(6.0, 0.2), SQUARE, N, own_passes=MANGIN)
     screen = Screen(-30.0, (-60.0, 60.0), (-60.0, 60.0), 8)
     source = Point((1.0, -2.0, -60.0), profile="uniform", half_angle=30.0)
     rays, tubes = simulated(source, lens, screen, 600, 0), launch_tubes(source, lens, 240).picture(lens, screen)
@@ -140,7 +140,7 @@ def test_a_mangin_mirror_is_simulated_as_its_tubes_are_traced():
 def test_the_metal_of_a_mangin_mirror_is_met_from_the_glass():
     """The face reflects |(m - n) / (m + n)|² at normal incidence, and light crosses a bare front before and after."""
     metal, flat = 1.2 + 6.0j, [net(z, 0.0) for z in (0.0, 6.0)]
-    lens = Lens(*flat, SQUARE, N, way=MANGIN, losses=Losses(Fresnel(587.6, metal=metal)))
+    lens = Lens(*flat, SQUARE, N, own_passes=MANGIN, losses=Losses(FresnelLoss(587.6, metal=metal)))
     rays = Collimated(Rectangle(4.0, 4.0)).rays(*stratified(Rectangle(4.0, 4.0), 4, 0), 0.0, 1.0)
     left = trace(rays, lens, LevelPlane(-20.0)).flux / rays.flux
     wanted = (1 - ((N - 1) / (N + 1)) ** 2) ** 2 * abs((metal - N) / (metal + N)) ** 2

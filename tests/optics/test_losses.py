@@ -15,7 +15,15 @@ from bstcad.optics.goal import Goal
 from bstcad.optics.interfaces import Interface, Refract, cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.losses import Absorption, Coating, Fresnel, Losses, Transmission, coated_reflectance, reflectance
+from bstcad.optics.losses import (
+    AbsorptionLoss,
+    CoatingLayer,
+    FresnelLoss,
+    Losses,
+    Transmission,
+    coated_reflectance,
+    reflectance,
+)
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
@@ -28,8 +36,8 @@ from tests.tracing import simulated
 
 N = 1.5168
 WAVELENGTH = 587.6
-BARE = Losses(Fresnel(WAVELENGTH), None)
-ALL = Losses(Fresnel(WAVELENGTH, coating=Coating(1.38, 100.0)), Absorption(0.02))
+BARE = Losses(FresnelLoss(WAVELENGTH), None)
+ALL = Losses(FresnelLoss(WAVELENGTH, coating=CoatingLayer(1.38, 100.0)), AbsorptionLoss(0.02))
 SCREEN = Screen(120.0, (-6.0, 6.0), (-6.0, 6.0), 16)
 
 
@@ -70,7 +78,7 @@ def test_a_plate_takes_by_beer_lambert_and_by_fresnel(degrees):
     """One ray through a plate of 6 mm: T² exp(-a 6 / cos θ')."""
     distance = 8.0 / math.cos(math.radians(degrees))
     source = Point((0.0, -math.sin(math.radians(degrees)) * distance, 0.0))
-    flat = rough_lens(heights=0.0, front=Plane(8.0), losses=Losses(Fresnel(WAVELENGTH), Absorption(0.02)))
+    flat = rough_lens(heights=0.0, front=Plane(8.0), losses=Losses(FresnelLoss(WAVELENGTH), AbsorptionLoss(0.02)))
     origin = torch.zeros(1, dtype=torch.float64)
     rays = source.rays(origin, origin, 8.0, 1.0)
     landed = trace.trace(rays, replace(flat, outline=Circle(100.0)), LevelPlane(SCREEN.z))
@@ -83,7 +91,7 @@ def test_a_plate_takes_by_beer_lambert_and_by_fresnel(degrees):
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=("collimated", "point"))
-@pytest.mark.parametrize("losses", (BARE, ALL, Losses(None, Absorption(0.02))), ids=("fresnel", "all", "absorption"))
+@pytest.mark.parametrize("losses", (BARE, ALL, Losses(None, AbsorptionLoss(0.02))), ids=("bare", "all", "absorption"))
 def test_the_gradient_of_the_merit_is_that_of_differences_losses_and_all(source, losses):
     """A small net, in a random direction: no part of an effect's own gradient is left out."""
     lens = rough_lens(m=9, heights=0.05, losses=None)
@@ -174,7 +182,7 @@ def test_a_bare_face_reflects_and_transmits_what_maxwell_says(media, polarisatio
 @pytest.mark.parametrize("index", [1.05, 1.38, 2.3])
 def test_a_coated_face_reflects_and_transmits_what_maxwell_says(media, polarisation, thickness, index):
     for angle in passing(*media):
-        at, coating = cosines(*media, angle), Coating(index, thickness)
+        at, coating = cosines(*media, angle), CoatingLayer(index, thickness)
         wanted_r, wanted_t = by_maxwell((media[0], index, media[1]), angle, polarisation, thickness)
         assert wanted_r + wanted_t == pytest.approx(1, abs=EXACT)
         through = Transmission(*media, 587.6, polarisation, coating)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from bstcad.optics.outlines import Circle, Rectangle, Rounded, inside
-from bstcad.optics.sampling import rim
+from bstcad.optics.sampling import sample_rim
 from bstcad.optics.tubes import area_of, corners
 
 ROUND = Rounded(24.0, 10.0, corner_radius=3.0)
@@ -59,7 +59,7 @@ def test_an_inset_leaves_what_is_so_deep_inside(outline):
 
 @pytest.mark.parametrize("outline", OUTLINES, ids=str)
 def test_places_along_the_rim_in_its_order_lie_on_it(outline):
-    x, y = (p.numpy() for p in rim(outline, 100))
+    x, y = (p.numpy() for p in sample_rim(outline, 100))
     assert np.abs(outline.depth(x, y)).max() < 1e-12 and (x[0], y[0]) == pytest.approx((x[-1], y[-1]))
     turned = np.unwrap(np.arctan2(y, x))
     assert (np.diff(turned) > 0).all() and turned[-1] - turned[0] == pytest.approx(2 * np.pi)

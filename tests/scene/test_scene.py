@@ -10,7 +10,7 @@ from PIL import Image
 
 from bstcad.cad.mounting import wire
 from bstcad.optics.collimated import Collimated
-from bstcad.optics.losses import Coating, Fresnel
+from bstcad.optics.losses import CoatingLayer, FresnelLoss
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
@@ -401,8 +401,8 @@ def test_a_ghost_brings_the_reflections_of_its_faces_by_the_coating_that_is_name
 
     coated = {"kind": "fresnel", "coating": {"index": 1.38, "thickness": 100.0}, "polarisation": "s"}
     assert light() == (None, None)
-    assert light({"kind": "ghost"}) == (Fresnel(587.6), ghost_light)
-    assert light({"kind": "ghost"}, coated) == (Fresnel(587.6, "s", Coating(1.38, 100.0)), ghost_light)
+    assert light({"kind": "ghost"}) == (FresnelLoss(587.6), ghost_light)
+    assert light({"kind": "ghost"}, coated) == (FresnelLoss(587.6, "s", CoatingLayer(1.38, 100.0)), ghost_light)
 
 
 @pytest.mark.parametrize("quality", PRESETS)

@@ -9,7 +9,7 @@ from bstcad.optics import ops
 from bstcad.optics.channels import Channel
 from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.losses import Absorption, Fresnel, Losses
+from bstcad.optics.losses import AbsorptionLoss, FresnelLoss, Losses
 from bstcad.optics.point import Point
 from bstcad.scene.blank import Bounds
 from bstcad.tailoring.machinability import excess
@@ -35,7 +35,7 @@ def two_lines(lens, source, wave=None):
 
 def lossy(lens, source):
     """The merit of light of which faces and glass take some."""
-    channel = Channel(source, N, losses=Losses(Fresnel(600.0), Absorption(0.01)))
+    channel = Channel(source, N, losses=Losses(FresnelLoss(600.0), AbsorptionLoss(0.01)))
     return Merit.of((channel,), lens, 40, goals_of((1.0, 1.0)), 0.03)
 
 

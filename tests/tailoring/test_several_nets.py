@@ -73,7 +73,7 @@ BODIES = {  # bodies of mirrors: light comes down to the back, whose front is da
         SCREEN,
     ),
     "a Mangin mirror": (  # whose front light crosses twice
-        Lens(net(0.0), net(8.0), SQUARE, N, way=MANGIN, shaped=(0, 1)), replace(SCREEN, z=-120.0),
+        Lens(net(0.0), net(8.0), SQUARE, N, own_passes=MANGIN, shaped=(0, 1)), replace(SCREEN, z=-120.0),
     ),
 }  # fmt: skip
 MOVED = {Collimated: {"tilt": (1.0, 0.0)}, Point: {"position": (1.5, 0.0, -600.0)}}  # another point of the source

@@ -8,7 +8,7 @@ import torch
 from bstcad.optics import sampling, trace
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.lens import Lens
-from bstcad.optics.losses import Absorption, Fresnel, Losses
+from bstcad.optics.losses import AbsorptionLoss, FresnelLoss, Losses
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
 from bstcad.optics.point import Point
 from bstcad.optics.receivers import LevelPlane, TiltedPlane
@@ -76,13 +76,13 @@ def test_a_beam_meets_a_front_that_reaches_beyond_where_it_begins():
 
 
 PLANES = {"level": LevelPlane(120.0), "tilted": TiltedPlane((3.0, 2.0, 120.0), (20.0, -10.0), 5.0)}
-LOSSES = Losses(Fresnel(587.6), Absorption(0.01))
+LOSSES = Losses(FresnelLoss(587.6), AbsorptionLoss(0.01))
 NETS = {  # a lens, and the rays on their way to its net
     "lens": (lens_of(deep(), index=1.6), Point()),
     "lossy": (lens_of(deep(), index=1.6, losses=LOSSES), Point()),
     "mirror": (mirror(bumpy(5.0)), LIGHTS["lambertian"]),
     "lossy mirror": (
-        replace(mirror(bumpy(5.0)), losses=Losses(Fresnel(587.6, metal=1.2 + 7j))), LIGHTS["lambertian"]
+        replace(mirror(bumpy(5.0)), losses=Losses(FresnelLoss(587.6, metal=1.2 + 7j))), LIGHTS["lambertian"]
     ),
 }  # fmt: skip
 

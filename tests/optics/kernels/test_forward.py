@@ -15,7 +15,7 @@ from bstcad.optics.kernels import forward
 from bstcad.optics.kernels.forward import land
 from bstcad.optics.kernels.kernel_arguments import IRRADIANCE_TOLERANCE, MIN_IRRADIANCE
 from bstcad.optics.lens import Lens
-from bstcad.optics.losses import Absorption, Fresnel, Losses
+from bstcad.optics.losses import AbsorptionLoss, FresnelLoss, Losses
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
 from bstcad.optics.point import Point
 from bstcad.optics.rays import Landed
@@ -113,7 +113,8 @@ def test_the_simulation_with_losses_is_the_plain_one(name):
     """Fresnel's losses by tables of 4097 cosines, absorption by the path: 1e-7 of the light of each line."""
     source, lens, _ = SCENES[name]
     metal = 1.2 + 6.0j if lens.reflects else None
-    lens = replace(lens, losses=Losses(Fresnel(550.0, metal=metal), None if lens.reflects else Absorption(0.01)))
+    absorption = None if lens.reflects else AbsorptionLoss(0.01)
+    lens = replace(lens, losses=Losses(FresnelLoss(550.0, metal=metal), absorption))
     found, plain = simulated(source, lens, SCREEN, 300, seed=5), simulated_plain(source, lens, SCREEN, 300, seed=5)
     assert found.rays == plain.rays and list(found.flux) == list(plain.flux)
     assert found.flux == pytest.approx(plain.flux, abs=1e-7)
