@@ -136,7 +136,7 @@ def test_a_receiver_of_its_own_is_refused_where_it_cannot_be(scene):
         around.changed({"target.z": 21.0})
     rim = {"shape": "circle", "radius": 90.0}
     window = {"kind": "window", "z": 100.0, "thickness": 3.0, "index": 1.5, "outline": rim}
-    with pytest.raises(SceneError, match=r"^target: windows and mirrors behind a lens are for planes alone"):
+    with pytest.raises(SceneError, match=r"^target: windows and mirrors behind the lens"):
         around.changed({"behind": [window]})
 
 
