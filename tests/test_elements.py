@@ -75,7 +75,7 @@ def test_rays_meet_a_tilted_face_on_its_equation(bend, sense):
     at = across(rays, (replace(first, surface=face),))
     assert bool(at.alive.all())
     p = torch.stack([*at.position[:2], at.above(0.0)]).numpy()
-    off, n = p - np.array(face.vertex)[:, None], np.array(face.unit)
+    off, n = p - np.array(face.vertex)[:, None], np.array(face.unit_normal)
     assert np.abs(bend * (off**2).sum(0) - 2 * n @ off).max() < 1e-12
     h, z_x, z_y = (t.numpy() for t in face.relative_sag_and_slope(*at.position[:2]))
     normal = n[:, None] - bend * off

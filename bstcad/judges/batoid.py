@@ -73,10 +73,10 @@ def _place_tilted(surface: TiltedSurface) -> PlacedSurface:
     """Return a plane or sphere in any position as a surface of batoid, without comparison."""
     import batoid
 
-    n = np.array(surface.unit)
+    n = np.array(surface.unit_normal)
     e_x = np.cross((0.0, 1.0, 0.0), n)
     e_x /= np.linalg.norm(e_x)
-    shape = batoid.Sphere(1 / surface.bend) if surface.bend else batoid.Plane()
+    shape = batoid.Sphere(1 / surface.face_curvature) if surface.face_curvature else batoid.Plane()
     return PlacedSurface(None, shape, _frame(surface.vertex, np.column_stack([e_x, np.cross(n, e_x), n])))
 
 

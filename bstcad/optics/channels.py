@@ -46,14 +46,14 @@ def channels_of(source: Emitter, index: Callable[[float], float], points: int, d
     parallel beam of one wavelength is one channel, with the source itself.
     """
     if source.extent is None:
-        simple = source == source.central
-        lights = (
-            (source if simple else replace(source.central, wavelength=nm), nm, share) for nm, share in source.lines
-        )
-        return tuple(Channel(light, index(nm), share) for light, nm, share in lights)
-    return _sample_extent(
-        source, index, lambda share, k: sampling.point_pairs(source.extent, max(1, round(share * points / 2)), draw + k)
-    )
+        central, lines = source.central, source.lines
+        lights = (source if source == central else replace(central, wavelength=nm) for nm, _ in lines)
+        return tuple(Channel(light, index(nm), fraction) for light, (nm, fraction) in zip(lights, lines, strict=True))
+
+    def points_of(fraction: float, k: int) -> list[tuple[float, float]]:
+        return sampling.point_pairs(source.extent, max(1, round(fraction * points / 2)), draw + k)
+
+    return _sample_extent(source, index, points_of)
 
 
 def drawn_channels(source: Emitter, index: Callable[[float], float], points: int, seed: int) -> tuple[Channel, ...]:
@@ -61,20 +61,20 @@ def drawn_channels(source: Emitter, index: Callable[[float], float], points: int
 
     points: number of sample points of all lines together, at least one a line (sampling.shifted_lattice).
     """
-    return _sample_extent(
-        source,
-        index,
-        lambda share, k: sampling.shifted_lattice(source.extent, max(1, round(share * points)), (seed << 8) + k),
-    )
+
+    def points_of(fraction: float, k: int) -> list[tuple[float, float]]:
+        return sampling.shifted_lattice(source.extent, max(1, round(fraction * points)), (seed << 8) + k)
+
+    return _sample_extent(source, index, points_of)
 
 
-def _sample_extent(source: Emitter, index: Callable[[float], float], places_of: Callable) -> tuple[Channel, ...]:
-    """Return channels that divide the flux of each line equally among places_of(fraction of the flux, line number)."""
+def _sample_extent(source: Emitter, index: Callable[[float], float], points_of: Callable) -> tuple[Channel, ...]:
+    """Return channels that divide the flux of each line equally among points_of(fraction of the flux, line number)."""
     elements = []
-    for number, (nm, share) in enumerate(source.lines):
-        places, n = places_of(share, number), index(nm)
-        lights = (replace(source.element(x, y), wavelength=nm) for x, y in places)
-        elements += [Channel(light, n, share / len(places)) for light in lights]
+    for number, (nm, fraction) in enumerate(source.lines):
+        points, n = points_of(fraction, number), index(nm)
+        lights = (replace(source.element(x, y), wavelength=nm) for x, y in points)
+        elements += [Channel(light, n, fraction / len(points)) for light in lights]
     return tuple(elements)
 
 

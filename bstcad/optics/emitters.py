@@ -156,8 +156,8 @@ class Emitter(ABC):
         if isinstance(self.wavelength, int | float):
             return ((self.wavelength, 1.0),)
         total, first = math.fsum(weight for _, weight in self.wavelength), self.main_wavelength
-        shares = [(nm, weight / total) for nm, weight in self.wavelength]
-        return tuple(sorted(shares, key=lambda line: line[0] != first))  # a stable sort
+        fractions = [(nm, weight / total) for nm, weight in self.wavelength]
+        return tuple(sorted(fractions, key=lambda line: line[0] != first))  # a stable sort
 
     @property
     def main_wavelength(self) -> float:

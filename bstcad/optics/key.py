@@ -17,8 +17,8 @@ class Key:
 
     meaning: str  # meaning, one sentence
     unit: str = ""  # unit; "": a pure number or a word
-    least: float | None = None  # lower end of the range; None: the field holds no number
-    most: float | None = None
+    minimum: float | None = None  # lower end of the range; None: the field holds no number
+    maximum: float | None = None
     example: Any = None  # example value of a key that every scene must state
     remedy: str = ""  # advice on a number out of range; "": choose one in between
     of_light: bool = False  # True for a limit on the light, which a verdict requires
@@ -26,17 +26,17 @@ class Key:
     def in_range(self, value: Any) -> Any:
         """Return the value of a field if all its numbers are in range; otherwise raise ValueError with a sentence."""
         for number in _numbers(value):
-            if not self.least <= number <= self.most:
+            if not self.minimum <= number <= self.maximum:
                 unit = f" {self.unit}" if self.unit else ""
                 in_um = self.unit == "nm" and 0.1 <= number <= 20
                 remedy = f"did you mean {number * 1000:g} nm?" if in_um else self.remedy or "choose a value in between"
-                between = f"{self.least:.10g} and {self.most:.10g}{unit}"
+                between = f"{self.minimum:.10g} and {self.maximum:.10g}{unit}"
                 raise ValueError(f"{number:g}{unit} is not between {between}; {remedy}")
         return value
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> dict[str, Any]:
         """Return the pydantic schema of the field: its type, then its range."""
-        if self.least is None:
+        if self.minimum is None:
             return handler(source)
         check = {"type": "no-info", "function": self.in_range}
         return {"type": "function-after", "function": check, "schema": handler(source)}
@@ -44,7 +44,7 @@ class Key:
     def __get_pydantic_json_schema__(self, core: Any, handler: Any) -> dict[str, Any]:
         """Return the JSON schema of the field, for pydantic."""
         schema = handler(core) | {"description": self.meaning, "unit": self.unit or "none"}
-        if self.least is not None:
+        if self.minimum is not None:
             _bound(schema, self)
         return schema | ({} if self.example is None else {"examples": [self.example]})
 
@@ -59,7 +59,7 @@ def _numbers(value: Any) -> list[float]:
 def _bound(schema: dict[str, Any], key: Key, listed: bool = False) -> None:
     """Add the range to the numbers of a JSON schema that `_numbers` selects."""
     if schema.get("type") in ("number", "integer"):
-        schema |= {"minimum": key.least, "maximum": key.most}
+        schema |= {"minimum": key.minimum, "maximum": key.maximum}
     inner = [*schema.get("prefixItems", ()), *([schema["items"]] if isinstance(schema.get("items"), dict) else [])]
     for part in [*schema.get("anyOf", ()), *schema.get("oneOf", ()), *(inner[:1] if listed else inner)]:
         _bound(part, key, schema.get("type") == "array")

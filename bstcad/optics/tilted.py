@@ -28,9 +28,9 @@ class TiltedSurface(Surface):
     """A plane or a sphere with its vertex off the axis of the lens, or its normal there inclined to the axis."""
 
     z: float  # V_z, mm
-    place: tuple[float, float]  # (V_x, V_y), mm
-    unit: Vector  # unit normal N at the vertex
-    bend: float = 0.0  # curvature c, 1/mm; positive: concave towards +z
+    vertex_xy: tuple[float, float]  # (V_x, V_y), mm
+    unit_normal: Vector  # unit normal N at the vertex
+    face_curvature: float = 0.0  # curvature c, 1/mm; positive: concave towards +z
 
     kind: ClassVar[str] = "tilted"
     curvature = conic_constant = None  # not a surface of revolution about the axis of the lens
@@ -45,30 +45,30 @@ class TiltedSurface(Surface):
     @property
     def vertex(self) -> Vector:
         """Vertex V (mm)."""
-        return (*self.place, self.z)
+        return (*self.vertex_xy, self.z)
 
     def moved_by(self, motion: Motion) -> TiltedSurface:
         """Return the surface after a rigid motion with a rotation of less than a right angle."""
-        (unit,), (x, y, z) = motion.frame((self.unit,)), motion.point(self.vertex)
-        return replace(self, z=z, place=(x, y), unit=unit)
+        (unit_normal,), (x, y, z) = motion.frame((self.unit_normal,)), motion.point(self.vertex)
+        return replace(self, z=z, vertex_xy=(x, y), unit_normal=unit_normal)
 
     def _from_vertex(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return (u_x, u_y, f)."""
-        (n_x, n_y, _), (v_x, v_y) = self.unit, self.place
+        (n_x, n_y, _), (v_x, v_y) = self.unit_normal, self.vertex_xy
         x, y = x - v_x, y - v_y
-        return x, y, self.bend * (x * x + y * y) - 2 * (n_x * x + n_y * y)
+        return x, y, self.face_curvature * (x * x + y * y) - 2 * (n_x * x + n_y * y)
 
     def _cos2(self, f: Tensor) -> Tensor:
         """Return N_z² - c f, the square of the z component of the normal."""
-        return self.unit[2] ** 2 - self.bend * f
+        return self.unit_normal[2] ** 2 - self.face_curvature * f
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return (h, ∂h/∂x, ∂h/∂y) at (x, y), ∂h/∂x = (c u_x - N_x) / (N_z - c h); meaningless outside the rim."""
         x, y, f = self._from_vertex(x, y)
         cos2 = self._cos2(f)
         root = torch.sqrt(torch.where(cos2 > MIN_COS2, cos2, torch.full_like(cos2, MIN_COS2)))  # no NaN in the gradient
-        n_x, n_y, n_z = self.unit
-        return f / (n_z + root), (self.bend * x - n_x) / root, (self.bend * y - n_y) / root
+        n_x, n_y, n_z = self.unit_normal
+        return f / (n_z + root), (self.face_curvature * x - n_x) / root, (self.face_curvature * y - n_y) / root
 
     def reaches(self, x: Tensor, y: Tensor) -> Tensor:
         """Return True where the surface has a point over (x, y)."""
@@ -79,14 +79,14 @@ class TiltedSurface(Surface):
 
         c s² - 2 g s + f = 0, g = N · d - c u · d; the root near the vertex is s = f / (g ± sqrt(g² - c f)).
         """
-        (n_x, n_y, n_z), (dx, dy, dz) = self.unit, direction
+        (n_x, n_y, n_z), (dx, dy, dz) = self.unit_normal, direction
         x, y, f = self._from_vertex(x, y)
-        g = n_x * dx + n_y * dy + n_z * dz - self.bend * (x * dx + y * dy)
-        k = g * g - self.bend * f
+        g = n_x * dx + n_y * dy + n_z * dz - self.face_curvature * (x * dx + y * dy)
+        k = g * g - self.face_curvature * f
         below = g + sense * torch.sqrt(torch.where(k > 0, k, torch.ones_like(k)))
         ok = (k > 0) & (sense * below > MIN_COS2)
         s = f / torch.where(ok, below, torch.ones_like(below))
-        return s, ok & (self.bend * s * dz < n_z)
+        return s, ok & (self.face_curvature * s * dz < n_z)
 
     def sags(self, outline: Outline) -> tuple[float, float]:
         """Return the lowest and the highest height (mm) over the plane z inside the outline, from points of its rim."""
@@ -96,4 +96,4 @@ class TiltedSurface(Surface):
 
     def height_above(self, point: Vector) -> float:
         """Return N · (p - V), the height (mm) of a point above the tangent plane of the vertex."""
-        return math.fsum(n * (p - v) for n, p, v in zip(self.unit, point, self.vertex, strict=True))
+        return math.fsum(n * (p - v) for n, p, v in zip(self.unit_normal, point, self.vertex, strict=True))

@@ -60,7 +60,7 @@ class Image(PlaneReceiver):
 
     def in_mirror(self, mirror: TiltedSurface) -> Image:
         """Return the mirror image."""
-        n = mirror.unit
+        n = mirror.unit_normal
         e_x, e_y, across = (_reflected(v, n) for v in self.frame)
         shift = -2 * mirror.height_above(self.centre)
         centre = tuple(c + shift * part for c, part in zip(self.centre, n, strict=True))
@@ -148,7 +148,7 @@ def image(behind: Sequence[Interface], plane: Receiver) -> Receiver:
             leaves = face
         else:
             thick, n = leaves.height_above(face.vertex), interface.law.n_out / interface.law.n_in
-            view = view.nearer(tuple(thick * (1 - 1 / n) * part for part in face.unit))
+            view = view.nearer(tuple(thick * (1 - 1 / n) * part for part in face.unit_normal))
             leaves = None
     return view.plain()
 

@@ -150,12 +150,7 @@ def solve(
     transport = Transport(
         phi / n**2, (half - u) / n**2, mass_error=tuple(errors), dual=(dual,), iterations=len(errors) - 1, reason=reason
     )
-    x, y = corners(phi)
-    guess_x, guess_y = gradient_at_corners(u)
-    return Mapping(
-        x, y, guess_x, guess_y, source=source, target=target, source_frame=source_frame, target_frame=target_frame,
-        transport=transport,
-    )  # fmt: skip
+    return Mapping(*corners(phi), *gradient_at_corners(u), source, target, source_frame, target_frame, transport)
 
 
 def mass_error(mapping: Mapping) -> float:

@@ -213,8 +213,8 @@ def _metric(rho, x, y, metric, softening):
             vxx = max((x[b, j] - x[a, j]) / (b - a), 0.0)
             vyy = max((y[i, d] - y[i, c]) / (d - c), 0.0)
             vxy = 0.5 * ((x[i, d] - x[i, c]) / (d - c) + (y[b, j] - y[a, j]) / (b - a))
-            most = 0.99 * np.sqrt(vxx * vyy)
-            vxy = min(max(vxy, -most), most)
+            limit = 0.99 * np.sqrt(vxx * vyy)
+            vxy = min(max(vxy, -limit), limit)
             density = _interpolate(rho, x[i, j], y[i, j], last)
             metric[i, j, 0] = density * vyy + softening
             metric[i, j, 1] = -density * vxy

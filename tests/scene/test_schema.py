@@ -47,11 +47,11 @@ def test_every_field_has_unit_range_and_a_sentence():
         [key] = (part for part in hint.__metadata__ if isinstance(part, Key))
         assert re.fullmatch(r"[^\n]{5,110}[.]", key.meaning), dotted
         numeric = {int, float} & set(leaves(hint))
-        assert (key.least is not None) == bool(numeric), dotted
-        assert not numeric or key.least < key.most, dotted
+        assert (key.minimum is not None) == bool(numeric), dotted
+        assert not numeric or key.minimum < key.maximum, dotted
         assert numeric or key.unit == "" or name == "rotate", dotted
-        for value in (key.least - max(1, abs(key.least)), 2 * key.most + 1) if numeric else ():
-            for given in (value, (0.5 * (key.least + key.most), value), ((value, 1.0),)):
+        for value in (key.minimum - max(1, abs(key.minimum)), 2 * key.maximum + 1) if numeric else ():
+            for given in (value, (0.5 * (key.minimum + key.maximum), value), ((value, 1.0),)):
                 with pytest.raises(ValueError, match=f"is not between .*{key.unit}; "):
                     key.in_range(given)
 
