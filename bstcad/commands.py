@@ -34,7 +34,7 @@ from bstcad.measured.form_error import map_files
 from bstcad.measured.made_part import MadePart
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, Effort, Light, SpectralLine
-from bstcad.pipeline import Saved, design, purpose
+from bstcad.pipeline import DesignState, design, purpose
 from bstcad.report import data_sheet, exports, prescription, record, rendering, report, tolerances
 from bstcad.report.data_sheet import DataSheet
 from bstcad.report.exports import Exported
@@ -87,7 +87,7 @@ def generate(
     """
     scene = with_default_net(scene, lambda line: progress("control points", 1, 1, line))
     path, say = files.beside(folder, "checkpoint"), lambda text: progress("checkpoint", 0, 0, text)
-    keeper = Keeper(path, purpose(scene, device), say, kind=Saved)
+    keeper = Keeper(path, purpose(scene, device), say, kind=DesignState)
     processes.begin()
     folder.parent.mkdir(parents=True, exist_ok=True)
     with files.exclusive(folder):

@@ -1,4 +1,4 @@
-"""design(scene): the stages in order, from the blank to the tailored lens."""
+"""The stages of a design in order, from the blank of a scene to the tailored lens."""
 
 from __future__ import annotations
 
@@ -54,125 +54,125 @@ from bstcad.tailoring.source_image import Spread
 from bstcad.tailoring.stage2 import Comparison, compare_precisions
 from bstcad.transport.mapping import Mapping, TransportMap
 
-PROCEDURES = {  # tailoring.method: (name of the first stage, the first stage, stage 2)
+PROCEDURES = {  # (name of stage 1, stage 1, stage 2) for each tailoring.method
     "least-squares": ("stage 1", stage1.steps, stage2.steps),
     "adam": ("stage 1", paper.stage1, paper.stage2),
-    "integration": ("integration", integration.steps, stage2.steps),  # of no evaluations
+    "integration": ("integration", integration.steps, stage2.steps),  # with no evaluations in stage 2
 }
 Stage1State = stage1.SlopeRound | paper.Level | two_faces.FrontRound
 Stage2State = stage2.TubeSearch | paper.RaySearch | stage2.Stage3State
-SIGNS = {"convex": 1.0, "concave": -1.0}  # tailoring.solution
+SIGNS = {"convex": 1.0, "concave": -1.0}  # sign of each tailoring.solution
 DEVICES = ("auto", "cpu", "cuda")
-COMPARED = "float32 beside float64"  # the name of that stage
-# Seconds that writing, proving and reporting take on two cores; PER_NET of 513 x 513 control points, PER_PICTURE of
-# 512 x 512 pixels, PER_WITNESS of a target by the finer ray tubes that two nets need.
+COMPARISON_STAGE = "float32 beside float64"  # name of the stage that compares precisions
+# Seconds for writing, verification and report on two cores: in all, per net of 513 x 513 control points, per picture of
+# 512 x 512 pixels, and per target for the finer flux tubes that two nets need.
 FIXED, PER_NET, PER_PICTURE, PER_WITNESS = 4.0, 5.0, 3.0, 15.0
-REACH_NET = 33  # control points a side of the flat back from which the reach of light is found
-LEAST_REACHED = 1e-3  # of the light of a target that has to be within reach
-FURTHER = {  # how light gets to all of a target, by the optic
+REACH_NET = 33  # control points per side of the flat back with which the reach of light is computed
+MIN_REACHABLE = 1e-3  # smallest fraction of a target's light that must be reachable
+REACH_REMEDIES = {  # advice for a target that light cannot reach completely, for each optic
     "lens": "move the target nearer to the axis or further away, take a higher lens.index, or reflect with a mirror",
     "mirror": "move the target nearer to where a flat mirror would send the light, or further away",
 }
 
 
 @dataclass(frozen=True)
-class Followed:
+class Stage1Result:
     """The result of stage 1."""
 
     lens: Parameters
-    mapping: Mapping  # the transport map that it followed
-    transport: TransportMap  # the same, inverted, from the target's pixels
-    precision: Comparison | None  # float32 beside float64; None if there was no time for it
-    rrmsd: float  # RRMSD of the lens for the source's middle, without a mount
+    mapping: Mapping  # transport map of stage 1
+    transport: TransportMap  # inverse map, from the pixels of the target
+    precision: Comparison | None  # comparison of float32 with float64; None if there was no time for it
+    rrmsd: float  # RRMSD of the lens for the centre of the source, without a mount
 
 
 @dataclass(frozen=True)
-class Saved:
-    """A design as it can be left: everything that the way on from there depends on."""
+class DesignState:
+    """The state of a design from which it can be continued; a checkpoint holds it by the names of its fields."""
 
     record: Record
-    first: Stage1State | None = None  # where stage 1 stands; None: it has ended
-    followed: Followed | None = None  # None: stage 1 has not ended
-    second: Stage2State | None = None  # where stage 2 or 3 stands; None: it has not begun, or it has ended
-    best: Judged | None = None  # the best lens at the ends of its parts so far
-    lens: Parameters | None = None  # after that
-    stopped: str = ""  # the reason why tailoring ended
+    first: Stage1State | None = None  # state of stage 1; None: it has ended
+    followed: Stage1Result | None = None  # result of stage 1; None: it has not ended
+    second: Stage2State | None = None  # state of stage 2 or 3; None: it has not begun, or it has ended
+    best: Judged | None = None  # best lens at the ends of the parts of stage 2 or 3 so far
+    lens: Parameters | None = None  # lens after stage 2 or 3
+    stopped: str = ""  # reason why tailoring ended
 
 
 def design(
     scene: Scene, *, device: str = "auto", progress: Progress = silent, began: float | None = None,
-    save: Callable[[Saved], None] = forget, start: Saved | None = None, interrupted: Callable[[], bool] = never,
-    merit: Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None = None, later: bool = False,
-    look: Look = unseen, hasty: bool = False,
+    save: Callable[[DesignState], None] = forget, start: DesignState | None = None,
+    interrupted: Callable[[], bool] = never, merit: Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None = None,
+    later: bool = False, look: Look = unseen, hasty: bool = False,
 ) -> Made:  # fmt: skip
-    """From a scene to a tailored lens: transport map, stage 1, stage 2, or stage 3 for a source of some size.
+    """Design the lens of a scene: transport map, stage 1, and stage 2, or stage 3 for an extended source.
 
-    tailoring.max_time is counted from `began` (time.perf_counter(), default now) and leaves time for writing and proof.
-    `save` is called now and then with a state; given as `start`, the design goes on from there and ends the same.
-    Once `interrupted` says so, tailoring ends with the best so far; KeyboardInterrupt if there is no lens yet.
-    merit: of a picture and the target, what stages 2 and 3 make least; None: RRMSD².
-    look: called now and then with the function that makes the best lens so far.
-    hasty: as a preview, see `Task.hasty`; the scene itself says how small it is.
+    began: start of tailoring.max_time (time.perf_counter(), default now), which includes writing and verification.
+    save: function called at intervals with the state.  start: such a state; the design continues and ends the same.
+    interrupted: function; once it returns True, tailoring ends with the best lens so far, or with KeyboardInterrupt if
+    there is no lens yet.  merit: function of a picture and the target that stages 2 and 3 minimise; None: RRMSD².
+    look: function called at intervals with a function that returns the best lens so far.
+    hasty: True for a preview, see `Task.hasty`; the scene itself states its size.
     later: float32 is compared with float64 only when a report asks for it (`Made.with_report_data`).
     """
     began = time.perf_counter() if began is None else began
     if merit is not None and (len(scene.targets) > 1 or scene.wavefront is not None):
-        raise SceneError("merit: is one of a picture, and the scene has several goals; leave it out, or ask for less")
+        raise SceneError("merit: needs a scene with one goal, and this one has several; remove merit, or other goals")
     torch.manual_seed(scene.tailoring.seed)
     device = device_for(device)
     goals, edge = within_reach(scene, progress)
     knobs = scene.tailoring.resolved(scene.lens.back.net)
     later = later and knobs.max_time is None
     task = task_of(scene, goals, knobs, edge, progress=progress, tidy=processes.return_freed, merit=merit, hasty=hasty)
-    task = posed(scene, task)
+    task = with_solution(scene, task)
     limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve(scene) + JUDGING}
     record = Record() if start is None else start.record
     driver = Driver(progress, began, **limits, interrupted=interrupted, save=save, look=look, record=record)
     precision = getattr(torch, knobs.precision)
     lens = scene.flat_lens(knobs.levels[0], dtype=precision, device=device, as_wide_as=knobs.levels[-1])
-    if not scene.lens.back.optimise:  # nothing refines it on the way
+    if not scene.lens.back.optimise:  # no stage refines it
         lens = lens.with_back(lens.back.refined(scene.lens.back.net))
     if start is None:
-        driver.end("loading")  # the libraries, the scene and the files it names
+        driver.end("loading")  # loading of the libraries, the scene and its files
     followed = (
         start.followed
         if start and start.followed
         else _stage1(scene, task, driver, lens, state=start and start.first, compare=not later)
     )
     after_stage1, stages = followed.lens.applied(lens), len(driver.record.stages)
-    lens = scene.as_mounted(after_stage1)  # the walls end elsewhere than below a flat back
+    lens = scene.as_mounted(after_stage1)  # the clear apertures differ from those of a flat back
     if start and start.lens:
         lens, stopped = start.lens.applied(lens), start.stopped
     else:
         lens, stopped = _stage2(task, driver, lens, followed, state=start and start.second, best=start and start.best)
     lens = replace(lens.plain(), index=scene.index, losses=None)
-    if scene.lens.front.fixed:  # as it was given: tailoring may have worked with less digits of it
+    if scene.lens.front.fixed:  # tailoring may have used it in float32
         lens = replace(lens, front=scene.lens.front_surface)
     steep = steepness(task.heaviest.source, lens, goals[0], sent=followed.transport)
-    making = _making(followed, driver.record, stopped, steep)
+    making = _design_course(followed, driver.record, stopped, steep)
     return Made(
         resolved(scene, lens), scene.as_mounted(lens), goals, making, device=device, transport=followed.transport,
-        precision_comparison=partial(_compared, making, task, after_stage1, stages) if later else None,
+        precision_comparison=partial(_with_comparison, making, task, after_stage1, stages) if later else None,
     )  # fmt: skip
 
 
 def within_reach(scene: Scene, progress: Progress) -> tuple[tuple[Goal, ...], Edge | None]:
-    """(goals, edge): the goals of a scene without what light cannot reach, as `reachable_part` has both.
+    """Return (goals, edge): the goals of a scene restricted to their reachable parts, and the edge of the reach.
 
-    Of a target that light cannot reach all of, `progress` is told.  SceneError as `reachable_part`.
+    `progress` reports each target that light cannot reach completely.  SceneError as for `reachable_part`.
     """
     goals, edge = [], None
     for alone, goal in zip(scene.each_alone(), scene.goals, strict=True):
         part, its_edge = reachable_part(alone, goal)
         if part is not None:
-            of = f"{goal.key}: " if len(scene.targets) > 1 else ""
-            progress("reach", 0, 0, f"{of}{unreachable(alone, part, goal.picture)}; the design is for the rest")
+            key = f"{goal.key}: " if len(scene.targets) > 1 else ""
+            progress("reach", 0, 0, f"{key}{unreachable(alone, part, goal.picture)}; the design is for the other part")
         goals, edge = [*goals, goal.restricted(part)], edge or its_edge
     return tuple(goals), edge
 
 
 def task_of(scene: Scene, goals: Sequence[Goal], knobs: Tailoring, edge: Edge | None, **more: Any) -> Task:
-    """The task of a scene; goals, edge: as `within_reach` has them.  more: fields of Task that no scene tells."""
+    """Return the task of a scene; goals, edge: see `within_reach`; more: fields of Task that a scene does not have."""
     light = scene.with_source_scaled(0.0).channels()
     sizes = stage2.SOURCE_SIZES if scene.source.extent and knobs.method != "integration" else ()
     scaled = [scene.with_source_scaled(share) for share, _ in sizes]
@@ -184,8 +184,11 @@ def task_of(scene: Scene, goals: Sequence[Goal], knobs: Tailoring, edge: Edge | 
     )  # fmt: skip
 
 
-def posed(scene: Scene, task: Task) -> Task:
-    """The task with the solution that asks less of two freeform faces; it says what they cannot do.  SceneError."""
+def with_solution(scene: Scene, task: Task) -> Task:
+    """Return the task with the solution, convex or concave, that demands less of two freeform faces.
+
+    `task.progress` reports their limits.  SceneError if the faces cannot make the pictures.
+    """
     lens = scene.flat_lens(REACH_NET)
     if not lens.shapes_two_faces or not task.several:
         return task
@@ -199,24 +202,24 @@ def posed(scene: Scene, task: Task) -> Task:
 
 
 def second_stage(task: Task, lens: Lens, state: Stage2State | None = None) -> tuple[str, Iterator[Step]]:
-    """The name and the steps of the stage that follows stage 1: stage 2, and 3 for a source of some size."""
+    """Return name and steps of the stage after stage 1: stage 2, or 2 and 3 for an extended source."""
     *_, stage = PROCEDURES[task.knobs.method]
     if not task.grown:
         return "stage 2", stage(task, lens, state)
-    before = stage if task.knobs.method == "adam" else None  # the paper's procedure knows points alone
+    before = stage if task.knobs.method == "adam" else None  # the paper's procedure is for point sources
     return "stage 3", stage2.with_stage3(before, task, lens, state)
 
 
 def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | None]:
-    """(rows, columns) True in the pixels that a design for the one goal of a scene can light, and the edge's light.
+    """Return (part, edge) for a scene with one goal: True in the pixels (rows, columns) that light can reach, and Edge.
 
-    None, None: it can light all that its picture lights.  A mirror, whose slope alone binds it, has no such edge.
-    SceneError where it can light none, or not all in a scene with target.unreachable = "refuse".
+    (None, None): light can reach the whole picture.  A mirror has no edge, as only its slope limits the reach.
+    SceneError if light can reach no part, or not all of a target with target.unreachable = "refuse".
     """
-    if scene.lens.front.shaped:  # which may send light further than any back: `posed` tells
+    if scene.lens.front.shaped:  # with two tailored faces `with_solution` finds the limits
         return None, None
     channels = scene.with_source_scaled(0.0).channels()
-    light = max(channels, key=lambda channel: channel.weight)  # stage 1 reckons with it alone
+    light = max(channels, key=lambda channel: channel.weight)  # channel of stage 1
     lens, grazing = light.through(scene.flat_lens(REACH_NET)), MAX_EXIT_ANGLE
     if refracts := lens.passes.largest_turn(light.index) is not None:
         grazing = grazing_of(light.index, [each.index for each in channels], spread_at(scene.source, lens))
@@ -229,15 +232,15 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
         part = reachable(light.source, lens.with_front(front), goal, grazing=grazing)
     if part is None:
         return None, None
-    if not goal.picture[part].sum() > LEAST_REACHED:
-        reached(lens, math.nan)
+    if not goal.picture[part].sum() > MIN_REACHABLE:
+        require_light(lens, math.nan)
     if scene.target.unreachable == "refuse":
-        raise SceneError(f"{goal.key}: {unreachable(scene, part, goal.picture)}; {FURTHER[scene.optic]}")
+        raise SceneError(f"{goal.key}: {unreachable(scene, part, goal.picture)}; {REACH_REMEDIES[scene.optic]}")
     return part, Edge(light, grazing) if refracts else None
 
 
 def unreachable(scene: Scene, part: np.ndarray, picture: np.ndarray) -> str:
-    """How much of a target lies outside of the part that can be lit, and why, as a sentence without its end."""
+    """Return a sentence on the unreachable part of a target and the reason, without a full stop."""
     found = unreached(picture, part, scene.lens.passes.largest_turn(scene.index))
     area, light = (f"{100 * found[key]:.2g} %" for key in ("area", "light"))
     why = "no slope up to 70 degrees sends light there"
@@ -247,9 +250,9 @@ def unreachable(scene: Scene, part: np.ndarray, picture: np.ndarray) -> str:
 
 
 def resolved(scene: Scene, lens: Lens) -> Scene:
-    """The scene with the designed front, so that a design of it is this one, and has no front to search for.
+    """Return the scene with the designed front as a fixed one, so that its design is the same.
 
-    The paper's procedure finds front and back together, and so is a freeform front; such a scene stays as it is.
+    A scene with the paper's procedure or a freeform front, found together with the back, is returned as it is.
     """
     if scene.tailoring.resolved(lens.back.shape).method == "adam":
         return scene
@@ -258,9 +261,9 @@ def resolved(scene: Scene, lens: Lens) -> Scene:
 
 
 def check_front(lens: Lens, scene: Scene) -> None:
-    """A front that was found, and that does not go with the rest of the scene, is refused; SceneError says why.
+    """Raise SceneError if the designed front is impossible in the scene.
 
-    Such a design would be written to a folder that no command could read.
+    No command could read the folder of such a design.
     """
     if not scene.lens.front.free:
         return
@@ -270,154 +273,155 @@ def check_front(lens: Lens, scene: Scene) -> None:
         raise SceneError(f"lens.front.optimise: with the front that the target needs, {error}") from None
 
 
-def _compared(making: DesignCourse, task: Task, lens: Lens, before: int) -> DesignCourse:
-    """The record with float32 beside float64, for the lens of stage 1, behind so many stages."""
+def _with_comparison(making: DesignCourse, task: Task, lens: Lens, before: int) -> DesignCourse:
+    """Return the record with the comparison of precisions for the lens of stage 1, after `before` stages."""
     began, cpu = time.perf_counter(), time.process_time()
-    twins = asdict(compare_precisions(task, lens))
-    stage = StageRecord(COMPARED, time.perf_counter() - began, cpu_seconds=time.process_time() - cpu)
+    comparison = asdict(compare_precisions(task, lens))
+    stage = StageRecord(COMPARISON_STAGE, time.perf_counter() - began, cpu_seconds=time.process_time() - cpu)
     stages = (*making.stages[:before], stage, *making.stages[before:])
-    return replace(making, twins=twins, stages=stages, seconds_total=making.seconds_total + stage.seconds)
+    return replace(making, twins=comparison, stages=stages, seconds_total=making.seconds_total + stage.seconds)
 
 
 def steepness(source: Emitter, lens: Lens, goal: Goal, sent: TransportMap) -> Steepness:
-    """The slope that the light of a goal needs of the last tailored face, by the map of stage 1."""
+    """Return the slope of the last tailored face that the light of a goal needs, by the map of stage 1."""
     at_back, screen = sent.plane == "back", image_screen(lens, goal.receiver)
     return needed_steepness(source, lens, screen, goal.picture, x=sent.x, y=sent.y, places=sent.source, at_back=at_back)
 
 
-def _making(followed: Followed, went: Record, stopped: str, steep: Steepness) -> DesignCourse:
-    """The record of a tailoring for the report."""
-    solved = followed.mapping.transport
+def _design_course(result: Stage1Result, record: Record, stopped: str, steep: Steepness) -> DesignCourse:
+    """Return the record of a tailoring for the report."""
+    solved = result.mapping.transport
     return DesignCourse(
-        seconds_total=went.seconds,
-        stages=tuple(StageRecord(**asdict(stage)) for stage in went.stages),
-        history=tuple(CurvePoint(*entry) for entry in went.history),
+        seconds_total=record.seconds,
+        stages=tuple(StageRecord(**asdict(stage)) for stage in record.stages),
+        history=tuple(CurvePoint(*entry) for entry in record.history),
         transport={
-            "grid": followed.mapping.source.n,
+            "grid": result.mapping.source.n,
             "iterations": solved.iterations,
             "mass_error": solved.mass_error[-1],
             "stopped": solved.reason,
             "steep_share": steep.share,
             "steepest_deg": steep.steepest,
         },
-        skipped_steps=went.skipped,
+        skipped_steps=record.skipped,
         stopped=stopped,
-        twins=None if followed.precision is None else asdict(followed.precision),
+        twins=None if result.precision is None else asdict(result.precision),
     )
 
 
 def _stage1(
     scene: Scene, task: Task, driver: Driver, lens: Lens, state: Stage1State | None, compare: bool
-) -> Followed:  # fmt: skip
-    """Stage 1 from the blank, or further from a state, and if asked the comparison of precisions behind it."""
+) -> Stage1Result:  # fmt: skip
+    """Run stage 1 from the blank or from a state, and compare precisions after it if `compare` is True."""
     if driver.wish and state is None:
-        raise KeyboardInterrupt  # there is nothing to show
+        raise KeyboardInterrupt  # there is no lens yet
     name, stage, _ = PROCEDURES[task.knobs.method]
     like = lens.like
-    if scene.lens.front.shaped:  # whose light between both faces is one of numpy: a second of work on the CPU
+    if scene.lens.front.shaped:  # stage 1 of two faces runs in numpy, on the CPU
         stage, lens = two_faces.steps, lens.to(like.dtype, "cpu")
-    last = driver.run(stage(task, lens, state), task, lambda state: Saved(driver.record, state), lambda: driver.wish)
+    steps = stage(task, lens, state)
+    last = driver.run(steps, task, lambda state: DesignState(driver.record, state), lambda: driver.wish)
     lens = replace(last.lens, behind=lens.behind, shaped=lens.shaped).to(like.dtype, like.device)
     check_front(lens, scene)
     bounds = active_bounds(lens, task.bounds, task.least)
     if bounds is None:
         check_thickness(lens, scene)
-    rrmsd = reached(lens, task.rrmsd(lens) if last.judged is None else last.judged)
+    rrmsd = require_light(lens, task.rrmsd(lens) if last.judged is None else last.judged)
     driver.end(name, rrmsd)
     if bounds is not None:
         driver.progress(BOUNDS_STAGE, 0, 1, "")
-        if lens.shapes("front"):  # stage 2 takes a move into account, but makes none itself
+        if lens.shapes("front"):  # stage 2 allows for a shift of the back, but does not shift it
             lens = place_back(lens, lens.back.z, task.least, bounds)
         lens = enforce_bounds(lens, bounds)
         check_thickness(lens, scene)
-        rrmsd = possible(scene, task.rrmsd(lens))
+        rrmsd = require_bounded_light(scene, task.rrmsd(lens))
         driver.end(f"{BOUNDS_STAGE}, after stage 1", rrmsd)
     precision = None
     if compare and not driver.hurry:
         precision = compare_precisions(task, lens)
-        driver.end(COMPARED)
+        driver.end(COMPARISON_STAGE)
     screen = task.goals[0].receiver
     if last.places is None:
         sent = slope_map.sent_from_entrance(last.mapping, lens, screen)
     else:
         sent = slope_map.sent_from(last.places, screen)
-    return Followed(Parameters.of(lens), last.mapping, sent, precision, rrmsd=rrmsd)
+    return Stage1Result(Parameters.of(lens), last.mapping, sent, precision, rrmsd=rrmsd)
 
 
 def _stage2(
-    task: Task, driver: Driver, lens: Lens, followed: Followed, state: Stage2State | None, best: Judged | None
+    task: Task, driver: Driver, lens: Lens, followed: Stage1Result, state: Stage2State | None, best: Judged | None
 ) -> tuple[Lens, str]:  # fmt: skip
-    """Stage 2, and 3 for a source of some size, from stage 1 or further from a state: the lens, and why it ended.
+    """Run stage 2, and 3 for an extended source, from the result of stage 1 or from a state.
 
-    It is no worse than the lens of stage 1, nor than that of any part on the way.
+    Return the lens and the reason why the stage ended.  The lens is no worse than that of stage 1 or of any part.
     """
-    if state is None and not driver.wish:  # which cuts stages short: a later run shall not
-        driver.save(Saved(driver.record, followed=followed))
+    if state is None and not driver.wish:  # with a wish the state is not that of a complete stage 1
+        driver.save(DesignState(driver.record, followed=followed))
     name, steps = second_stage(task, lens, state)
     whole = task.whole
     known = not task.grown and lens.clear is None
     first = None if task.hasty else whole.judged(lens, followed.rrmsd if known else whole.rrmsd(lens))
 
-    def saved(state: Stage2State) -> Saved:
-        return Saved(driver.record, None, followed, state, best=driver.best)
+    def design_state(state: Stage2State) -> DesignState:
+        return DesignState(driver.record, None, followed, state, best=driver.best)
 
-    last = driver.run(steps, whole, saved, lambda: driver.hurry, best=best or first)
-    lens = _handed_on(whole, driver, last, (driver.best, first))
+    last = driver.run(steps, whole, design_state, lambda: driver.hurry, best=best or first)
+    lens = _final_lens(whole, driver, last, (driver.best, first))
     total = task.knobs.stage2_iterations
     driver.progress(name, total, total, driver.stopped)
     if driver.stopped != "interrupt":
-        driver.save(Saved(driver.record, followed=followed, lens=Parameters.of(lens), stopped=driver.stopped))
+        driver.save(DesignState(driver.record, followed=followed, lens=Parameters.of(lens), stopped=driver.stopped))
     return lens, driver.stopped
 
 
-def _handed_on(task: Task, driver: Driver, last: Step, before: Sequence[Judged]) -> Lens:
-    """The lens after the last step of a stage, mended; or one from before, mended too, if that is better.
+def _final_lens(task: Task, driver: Driver, last: Step, before: Sequence[Judged]) -> Lens:
+    """Return the corrected lens of the last step of a stage, or a corrected earlier lens if that is better.
 
-    before: the best first.  The paper's procedure hands on its last lens, as it does.
+    before: earlier lenses, the best first.  The paper's procedure always returns its last lens.
     """
     lens = last.lens
-    mended, value = _mended(task, lens), last.judged
+    corrected, value = _corrected(task, lens), last.judged
     if task.hasty:
-        return mended
+        return corrected
     if active_bounds(lens, task.bounds, task.least) is not None:
-        driver.end(BOUNDS_STAGE, value := task.rrmsd(mended))
-    elif value is not None and (_moved(lens, mended) or not last.whole):
-        value = task.rrmsd(mended)
+        driver.end(BOUNDS_STAGE, value := task.rrmsd(corrected))
+    elif value is not None and (_is_changed(lens, corrected) or not last.whole):
+        value = task.rrmsd(corrected)
     if value is None or task.knobs.method == "adam":
-        return mended
-    latest = task.judged(mended, value)
+        return corrected
+    latest = task.judged(corrected, value)
     for known in before:
         if known.beats(latest):
             lens = known.lens.applied(lens)
-            other = _mended(task, lens)
-            best, judged = task.better(mended, other)
+            other = _corrected(task, lens)
+            best, judged = task.better(corrected, other)
             if best is other:
                 driver.end(BEST, judged.rrmsd)
                 return other
-    return mended
+    return corrected
 
 
-def _mended(task: Task, lens: Lens) -> Lens:
-    """The lens with no light reflected at the edge of its reach, with its faces clear of each other, within bounds."""
+def _corrected(task: Task, lens: Lens) -> Lens:
+    """Return the lens without total reflection at the edge of its reach, with separate faces, within its bounds."""
     if task.edge is not None:
         lens = without_reflection(lens, task.edge)
     bounds = active_bounds(lens, task.bounds, task.least)
-    if not lens.shapes("front"):  # where no light falls stage 2 is free to bend the back
+    if not lens.shapes("front"):  # stage 2 may bend the back freely where no light falls
         lens = place_back(lens, lens.back.z, task.least, bounds)
     return lens if bounds is None else enforce_bounds(lens, bounds)
 
 
-def _moved(lens: Lens, other: Lens) -> bool:
-    """Is the other lens of other heights, or with its back elsewhere?"""
+def _is_changed(lens: Lens, other: Lens) -> bool:
+    """Return True if the other lens has other heights, or its back at another z."""
     nets = zip(lens.nets, other.nets, strict=True)
     return lens.back.z != other.back.z or any(a.heights is not b.heights for a, b in nets)
 
 
 def device_for(asked: str) -> str:
-    """Where tailoring runs: "cpu" or "cuda"; SceneError for another device, and where there is none.
+    """Return the device of tailoring, "cpu" or "cuda"; SceneError for an unknown or missing device.
 
-    "auto" is the CPU, which the compiled kernels serve alone.  On a GPU the plain form runs, which nobody has measured
-    to be right and faster there; until somebody has, only a user who asks for it by name gets it.
+    "auto" is the CPU, for which the kernels are compiled.  A GPU runs the plain form in torch, only on request: its
+    results and its speed there have not been measured.
     """
     if asked not in DEVICES:
         raise SceneError(f"device: {asked!r} is not possible; give one of {', '.join(DEVICES)}")
@@ -427,7 +431,7 @@ def device_for(asked: str) -> str:
 
 
 def reserve(scene: Scene) -> float:
-    """Seconds that writing, proving and reporting will take on two cores."""
+    """Return an estimate of the seconds for writing, verification and report on two cores."""
     pixels = sum(math.prod(target.columns_rows) for target in scene.targets) / 512**2
     nets = scene.lens.nets()
     points = sum(math.prod(as_pair(net)) for net in nets) / 513**2
@@ -436,7 +440,7 @@ def reserve(scene: Scene) -> float:
 
 
 def purpose(scene: Scene, device: str) -> dict[str, Any]:
-    """Everything that the result of `design` depends on: a state of it belongs to no other design."""
+    """Return everything that the result of `design` depends on, by which a checkpoint is recognised."""
     wanted = scene.model_dump(mode="json", exclude={"name", "title", "output", "accept"})
     return {
         "version": bstcad.__version__,
@@ -446,43 +450,42 @@ def purpose(scene: Scene, device: str) -> dict[str, Any]:
     }
 
 
-def reached(lens: Lens, rrmsd: float) -> float:
-    """RRMSD after stage 1; SceneError if no light reaches the target, which no later stage could bring there."""
+def require_light(lens: Lens, rrmsd: float) -> float:
+    """Return the RRMSD after stage 1; SceneError if no light reaches the target, which later stages cannot change."""
     angle = lens.passes.largest_turn(lens.index)
     if not math.isfinite(rrmsd) and angle is None:
         raise SceneError(
-            "target: no light that the mirror throws back reaches it; move it nearer to where a flat mirror would send "
-            "the light, or further from the mirror along +z"
+            "target: no light from the mirror reaches the target; move it nearer to where a flat mirror would send the "
+            "light, or further from the mirror along +z"
         )
     if not math.isfinite(rrmsd):
         raise SceneError(
-            f"target: no light reaches it: a face of index {lens.index:.4g} turns light by less than "
-            f"{angle:.3g} degrees before it reflects it; "
-            "move the target nearer to where the light falls by itself"
+            f"target: no light reaches the target, as a face of index {lens.index:.4g} turns light by at most "
+            f"{angle:.3g} degrees; move the target nearer to where the light falls without the lens"
         )
     return rrmsd
 
 
-def possible(scene: Scene, rrmsd: float) -> float:
-    """RRMSD of the first lens that keeps to the bounds on its back; SceneError if it throws no light on the target."""
+def require_bounded_light(scene: Scene, rrmsd: float) -> float:
+    """Return the RRMSD of the first lens within its bounds; SceneError if it sends no light to the target."""
     if math.isfinite(rrmsd):
         return rrmsd
     keys = scene.lens.bounded_by or ("min_thickness",)
     bounds = " and ".join(f"lens.{key} = {getattr(scene.lens, key):g}" for key in keys)
-    raise SceneError(f"{bounds}: no back that keeps to it brings light onto the target; allow the back more")
+    raise SceneError(f"{bounds}: no back within this bound sends light to the target; loosen the bound")
 
 
 def check_thickness(lens: Lens, scene: Scene) -> None:
-    """A lens that the blank or the target has no room for is refused before the long stage; SceneError says why."""
+    """Raise SceneError if front and back cross, or the back reaches the next part, before the long stage 2."""
     thinnest, thickest = thickness_range(lens.plain())
     if not thinnest > 0:
         raise SceneError(
             f"lens.front.z: the back that this target needs would cross the front by {-thinnest:.3g} mm; "
-            f"lower the front by more than that, move the target's light apart or make the lens smaller"
+            f"lower the front by more than that, widen the target or make the lens smaller"
         )
     room, key = scene.clearance(reach := lens.front.z + thickest)
     if not room > 0:
         raise SceneError(
-            f"{key}: the back that this target needs would reach it, at z = {reach:.4g}; move it further along +z or "
-            f"lower the front"
+            f"{key}: the back that this target needs would reach this part, at z = {reach:.4g}; move the part further "
+            f"along +z, or lower the front"
         )

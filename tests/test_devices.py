@@ -147,7 +147,7 @@ def test_resume_brings_everything_back_to_the_device(quality, tmp_path):
         whole = design(wanted, device="cuda", save=save)
     for place in sorted({len(kept) // 3, len(kept) - 1}):
         with SecondDevice() as second:
-            again = design(wanted, device="cuda", start=checkpoint.read(kept[place], pipeline.Saved, "cuda")[1])
+            again = design(wanted, device="cuda", start=checkpoint.read(kept[place], pipeline.DesignState, "cuda")[1])
         assert second.marked > 0 and not second.mixed
         assert torch.equal(again.lens.back.heights, whole.lens.back.heights)
 

@@ -65,7 +65,7 @@ def test_float32_is_compared_when_a_report_asks_for_it():
     few = {"tailoring.rays": "64", "tailoring.rounds": "2", "tailoring.stage2_iterations": "3"}
     now, later = (pipeline.design(small("disk", **few), later=later) for later in (False, True))
     assert torch.equal(later.lens.back.heights, now.lens.back.heights)
-    assert later.making.twins is None and pipeline.COMPARED not in [stage.name for stage in later.making.stages]
+    assert later.making.twins is None and pipeline.COMPARISON_STAGE not in [stage.name for stage in later.making.stages]
     told = later.with_report_data()
     assert told.making.twins == now.making.twins
     assert [stage.name for stage in told.making.stages] == [stage.name for stage in now.making.stages]
@@ -104,7 +104,7 @@ def test_a_back_that_would_reach_the_front_or_the_target_is_refused():
     lens = near.flat_lens(near.lens.back.net)
     with pytest.raises(SceneError, match=r"^lens\.front\.z: .* cross the front by 0\.5 mm; lower the front"):
         pipeline.check_thickness(lens.with_back(lens.back.moved(lens.front.z - 0.5)), near)
-    with pytest.raises(SceneError, match=r"^target\.z: .* reach it, at z = 24\.5; move it further"):
+    with pytest.raises(SceneError, match=r"^target\.z: .* reach this part, at z = 24\.5"):
         pipeline.check_thickness(lens.with_back(lens.back.moved(24.5)), near)
     pipeline.check_thickness(lens.with_back(lens.back.moved(23.5)), near)
 

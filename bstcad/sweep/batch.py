@@ -21,7 +21,7 @@ import psutil
 
 import bstcad
 from bstcad import folder as folders
-from bstcad.pipeline import Saved, purpose
+from bstcad.pipeline import DesignState, purpose
 from bstcad.report.report import check_lines
 from bstcad.runs import environment, files, processes
 from bstcad.runs.checkpoint import Keeper
@@ -116,7 +116,7 @@ def design(
 
 
 def _has_checkpoint(scene: Scene, folder: Path) -> bool:
-    keeper = Keeper(files.beside(folder, "checkpoint"), purpose(scene, "auto"), kind=Saved)
+    keeper = Keeper(files.beside(folder, "checkpoint"), purpose(scene, "auto"), kind=DesignState)
     try:
         return keeper.load() is not None
     except SceneError:

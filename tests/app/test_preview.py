@@ -83,7 +83,7 @@ def test_a_preview_that_nobody_waits_for_ends():
 def test_a_scene_that_a_design_would_refuse_is_refused():
     far = SMALL | {"target.x": [5000.0, 5100.0], "target.unreachable": "refuse"}
     scene = load("templates/caustic_portrait.toml", far)
-    with pytest.raises(SceneError, match="no light reaches it"):
+    with pytest.raises(SceneError, match="no light reaches the target"):
         preview(scene)
 
 

@@ -131,7 +131,7 @@ DESIGNS: dict[str, Hard] = {
     "deflection of 33 to 38 degrees": Hard("thu", _aside(600.0), rrmsd=0.2, says=(MISSED, CLOSE, LIFTED)),
     "deflection no face can make": Hard(
         "thu", _aside(1500.0),
-        refused="target: no light reaches it: a face of index 1.488 turns light by less than 47.8",
+        refused="target: no light reaches the target, as a face of index 1.488 turns light by at most 47.8",
     ),
     "source 5 mm before": Hard("disk", {"source.position": [0.0, 0.0, 10.0]}, rrmsd=0.12, says=(MOVED, SIDES, LIFTED),
                                bench=True),

@@ -25,7 +25,7 @@ import torch
 
 from bstcad import cli, commands
 from bstcad.optics.measure import Effort
-from bstcad.pipeline import Saved, design
+from bstcad.pipeline import DesignState, design
 from bstcad.report import rendering
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
@@ -95,7 +95,7 @@ def test_kill_9_at_random_moments(name, kills, tmp_path, holds):
         assert not folder.exists() or intact(folder, digest)
         kept = tmp_path / ".lens.checkpoint"
         if kept.exists():
-            checkpoint.read(kept, Saved)  # raises if it is damaged
+            checkpoint.read(kept, DesignState)  # raises if it is damaged
     assert "done" in started(folder, name).communicate(timeout=300)[0] and intact(folder, digest)
     assert sorted(tmp_path.iterdir()) == [folder, whole]  # what the killed ones left has been cleared away
     holds(f"runs killed at random ({name}, {kills}) that left a damaged folder or checkpoint", 0, 0)
@@ -181,7 +181,7 @@ def test_a_full_disk_is_a_sentence_and_loses_nothing(small_scene, tmp_path, monk
     assert kept in " ".join(error.value.__notes__)
     assert sorted(p.name for p in tmp_path.iterdir()) == [".lens.checkpoint", "lens", "lens-unwritten"]
     assert {p.name for p in (tmp_path / "lens-unwritten").iterdir()} == {"scene.toml", "design.npz"}
-    assert checkpoint.read(tmp_path / ".lens.checkpoint", Saved)[1].lens is not None
+    assert checkpoint.read(tmp_path / ".lens.checkpoint", DesignState)[1].lens is not None
     assert [p.name for p in folder.iterdir()] == ["report.json"] and (folder / "report.json").read_text() == "{}"
 
 

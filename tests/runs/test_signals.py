@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from bstcad.pipeline import Saved
+from bstcad.pipeline import DesignState
 from bstcad.runs import checkpoint, signals
 from bstcad.scene.scene import load
 from tests.conftest import DISK, SMALL
@@ -78,7 +78,7 @@ def test_in_the_middle_it_flushes_a_checkpoint_and_resume_goes_on(number, scene,
     )
     assert not any("Traceback" in line or "warn" in line for line in said)
     assert sorted(path.name for path in tmp_path.iterdir()) == [".lens.checkpoint", "small.toml"]
-    assert checkpoint.read(tmp_path / ".lens.checkpoint", Saved)[1].followed is not None  # stage 1
+    assert checkpoint.read(tmp_path / ".lens.checkpoint", DesignState)[1].followed is not None  # stage 1
     resumed = generate(scene, tmp_path / "lens", "--resume", first=FEW_RAYS)
     assert "from the beginning" not in resumed.communicate(timeout=120)[0] and resumed.returncode in (0, 1)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["lens", "small.toml"]

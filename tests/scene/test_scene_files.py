@@ -15,7 +15,7 @@ from bstcad.analysis.shape import describe
 from bstcad.folder import scene_files
 from bstcad.optics.key import Key
 from bstcad.optics.point import Point
-from bstcad.pipeline import Saved, purpose
+from bstcad.pipeline import DesignState, purpose
 from bstcad.report.prescription import prescription
 from bstcad.runs import checkpoint, files
 from bstcad.scene.scene import Scene, load
@@ -72,7 +72,7 @@ def test_a_design_does_not_resume_with_a_byte_of_a_file_changed(part, tmp_path):
         "front": {"lens.front.file": replace(net, data=other_byte(net.data))},
     }[part]
     assert purpose(scene.changed({}), "cpu") == purpose(scene, "cpu")
-    checkpoint.write(files.beside(tmp_path / "lens", "checkpoint"), purpose(scene, "cpu"), Saved(Record()))
+    checkpoint.write(files.beside(tmp_path / "lens", "checkpoint"), purpose(scene, "cpu"), DesignState(Record()))
     with pytest.raises(files.SceneError, match="is of another design .files.*give the scene as it was"):
         commands.generate(scene.changed(change), tmp_path / "lens", device="cpu", resume=True)
 

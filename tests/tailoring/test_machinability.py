@@ -126,7 +126,7 @@ def test_a_design_keeps_to_a_range_of_thickness():
 def test_a_bound_that_no_lens_meets_with_its_light_on_the_target_is_refused():
     aside = {"target.x": [60.0, 100.0], "target.y": [-20.0, 20.0], "target.outline": None, "lens.max_slope": 0.001}
     scene = load(DISK, TINY | {"tailoring.rounds": 2}).changed(aside)
-    with pytest.raises(SceneError, match=r"^lens\.max_slope = 0\.001: no back that keeps to it brings light"):
+    with pytest.raises(SceneError, match=r"^lens\.max_slope = 0\.001: no back within this bound"):
         design(scene, device="cpu")
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.pipeline import Saved, design
+from bstcad.pipeline import DesignState, design
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
 from bstcad.tailoring.minimise import AdamState, Best, Search, adam, lbfgs, minimise
@@ -99,7 +99,7 @@ def test_a_design_goes_on_from_wherever_it_was_left(name, tmp_path):
     assert {stage for stage, _ in kept} == {1, 2, 3}
     chosen = [[path for s, path in kept if s == stage] for stage in (1, 2, 3)]
     for path in (*(paths[len(paths) // 2] for paths in chosen), kept[-1][1]):
-        again = design(scene, device="cpu", start=checkpoint.read(path, Saved)[1])
+        again = design(scene, device="cpu", start=checkpoint.read(path, DesignState)[1])
         assert all(map(torch.equal, heights_of(again), heights_of(whole))), path
         assert again.lens.front.is_net or again.lens.front == whole.lens.front
         assert [point.rrmsd for point in again.making.history] == [point.rrmsd for point in whole.making.history]
