@@ -5,15 +5,15 @@
     report = design.write("outputs/thu")
     design.lens, design.solid(), report.rrmsd
 
-What is named here loads when it is first used, so that `import bstcad` is quick.
+A public name is imported when it is first used, so that `import bstcad` is quick.
 """
 
 import os
 from importlib import import_module
 from typing import Any
 
-# Idle threads of torch's and numba's pools sleep instead of spinning: on a machine that has other work to do the
-# kernels are up to twenty times faster, on a quiet one equally fast.  Has to stand before either is loaded.
+# Idle threads of the pools of torch and numba sleep instead of spinning, to be set before either is loaded.  With other
+# work on the machine the kernels are up to twenty times faster, without it equally fast.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 __version__ = "0.1.0"
@@ -44,7 +44,7 @@ __all__ = [*sorted(_HOMES), "__version__"]
 
 
 def __getattr__(name: str) -> Any:
-    """Load a public name from the module it lives in."""
+    """Import a public name from its module."""
     if name not in _HOMES:
         raise AttributeError(f"module 'bstcad' has no attribute {name!r}")
     return getattr(import_module(f"bstcad.{_HOMES[name]}"), name)

@@ -129,19 +129,19 @@ class TestOwnSurfaces:
         assert other.scene.target == made.scene.target and torch.equal(other.lens.back.heights, made.lens.back.heights)
 
     WRONG = (
-        (lambda d: d.with_lens(3), "takes a bstcad.Lens whose back is a bstcad.BSplineSurface, not int"),
+        (lambda d: d.with_lens(3), "with_lens: int is not possible; give a bstcad.Lens"),
         (
             lambda d: d.with_lens(replace(d.lens, outline=bstcad.Circle(3.0))),
-            "outline is Circle.*the scene's is Rectangle",
+            "outline is Circle.*in the scene it is Rectangle",
         ),
         (
             lambda d: d.with_lens(net(d, x=(-3.0, 4.0))),
-            r"net along x \(mm\) is \(-3.0, 4.0\), and the scene's is \(-4\.571\d+, 4\.571\d+\); give that",
+            r"net along x \(mm\) is \(-3.0, 4.0\), and in the scene it is \(-4\.571\d+, 4\.571\d+\); give",
         ),
-        (lambda d: d.with_heights(torch.full((33, 33), math.nan)), "heights of its back are not finite"),
+        (lambda d: d.with_heights(torch.full((33, 33), math.nan)), "heights of the back are not finite"),
         (
             lambda d: d.with_heights(np.zeros((33, 32, 1))),
-            r"takes \(m, n\) real .*, not numbers of shape \(33, 32, 1\)",
+            r"with_heights: numbers of shape \(33, 32, 1\) .*; give \(m, n\) real",
         ),
         (lambda d: d.with_heights(np.zeros((4, 4))), "control_points: 4 is not between 5 and 2049"),
         (lambda d: d.with_lens(replace(d.lens, front=bstcad.Plane(26.0))), "the lens is -1 mm thick at its centre"),
@@ -283,7 +283,7 @@ class TestVerify:
             kept["control_points"] += 1e-9
         np.savez_compressed(folder / "design.npz", **kept)
         before = (folder / "report.json").read_bytes()
-        with pytest.raises(bstcad.SceneError, match="holds another design by now"):
+        with pytest.raises(bstcad.SceneError, match="the folder has another design now"):
             opened.verify(progress=False)
         assert (folder / "report.json").read_bytes() == before
 
@@ -308,7 +308,7 @@ class TestJudged:
 
     def test_what_takes_files_says_so(self, fresh):
         for ask in (fresh.tolerance, fresh.show, lambda: fresh.verify(measured="cloud.csv")):
-            with pytest.raises(bstcad.SceneError, match="has no files yet, which that takes; write the design"):
+            with pytest.raises(bstcad.SceneError, match="has no files yet; write it to a folder"):
                 ask()
 
 

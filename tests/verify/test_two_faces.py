@@ -278,6 +278,6 @@ def test_with_lens_keeps_a_front_that_is_tailored(two):
     again = design.with_lens(replace(two.made.lens, front=bent(finer, 0.1)))
     assert again.lens.front.shape == (65, 65) and again.scene.lens.nets() == (65, 65)
     narrow = replace(two.made.lens.front, x=(-1.0, 1.0))
-    with pytest.raises(bstcad.SceneError, match="extent of its front's net along x"):
+    with pytest.raises(bstcad.SceneError, match="extent of the front's net along x"):
         design.with_lens(replace(two.made.lens, front=narrow))
     assert CHANGES["lens.front"]["control_points"] == 33
