@@ -382,7 +382,7 @@ def _adapted(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
         _check_same("index", lens.index, scene.index)
     if lens.back.shape != as_pair(scene.lens.back.net):
         scene = scene.changed({"lens.back.control_points": simplified(lens.back.shape), "tailoring.levels": None})
-    shapes_front = scene.lens.front.shaped and lens.front.is_net
+    shapes_front = scene.lens.front.is_tailored and lens.front.is_net
     if shapes_front and lens.front.shape != as_pair(scene.lens.nets()[1]):
         scene = scene.changed({"lens.front.control_points": simplified(lens.front.shape), "lens.front.file": None})
     flat = scene.flat_lens(lens.back.shape)

@@ -382,7 +382,7 @@ def _name_of(cloud: Cloud, folder: Path) -> str:
 def _contents(made: Made, proof: Proof, estimates: tuple[LeftOut, ...]) -> Contents:
     """Return the contents of report.json.  estimates: estimates of the effects that are left out."""
     scene = made.scene
-    alone, goal, light = scene.each_alone()[proof.worst], made.goals[proof.worst], proof.light
+    alone, goal, light = scene.single_target_scenes()[proof.worst], made.goals[proof.worst], proof.light
     diagnosed = diagnosis(
         alone, made.making, proof.lens, picture=light.picture, target=goal.picture, efficiency=light.efficiency,
         at_bounds=proof.at_bounds,
@@ -395,7 +395,7 @@ def _contents(made: Made, proof: Proof, estimates: tuple[LeftOut, ...]) -> Conte
 
 def _left_out(made: Made, proof: Proof) -> tuple[LeftOut, ...]:
     """Return the effects that are left out, by the light on the target with the largest RRMSD."""
-    return left_out(made.scene.each_alone()[proof.worst], proof.lens, proof.light.picture)
+    return left_out(made.scene.single_target_scenes()[proof.worst], proof.lens, proof.light.picture)
 
 
 def _order(made: Made, shape: Mapping[str, Any], folder: Path) -> Order:

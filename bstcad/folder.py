@@ -355,7 +355,7 @@ def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
     """
     scene = scenes.load(folder / SCENE)
     shapes = {"control_points": (*as_pair(scene.lens.back.net), 3), "front_curvature": ()}
-    if scene.lens.front.shaped:
+    if scene.lens.front.is_tailored:
         shapes["front_control_points"] = (*as_pair(scene.lens.nets()[1]), 3)
     names = files.names(folder / DESIGN)
     for k, target in enumerate(scene.targets):
@@ -418,7 +418,7 @@ def _lens(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
     """Return the designed lens, to the last bit, from its control nets (m, n, 3) in mm and its front's parameters."""
     blank = scene.lens
     front = blank.front_surface
-    if blank.front.shaped:
+    if blank.front.is_tailored:
         front = _surface(found["front_control_points"], blank.front.z)
     else:
         front = front.with_parameters(**{name.removeprefix("front_"): float(found[name]) for name in _numbers(front)})

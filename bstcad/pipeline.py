@@ -162,7 +162,7 @@ def within_reach(scene: Scene, progress: Progress) -> tuple[tuple[Goal, ...], Ed
     `progress` reports each target that light cannot reach completely.  SceneError as for `reachable_part`.
     """
     goals, edge = [], None
-    for alone, goal in zip(scene.each_alone(), scene.goals, strict=True):
+    for alone, goal in zip(scene.single_target_scenes(), scene.goals, strict=True):
         part, its_edge = reachable_part(alone, goal)
         if part is not None:
             key = f"{goal.key}: " if len(scene.targets) > 1 else ""
@@ -216,7 +216,7 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
     (None, None): light can reach the whole picture.  A mirror has no edge, as only its slope limits the reach.
     SceneError if light can reach no part, or not all of a target with target.unreachable = "refuse".
     """
-    if scene.lens.front.shaped:  # with two tailored faces `with_solution` finds the limits
+    if scene.lens.front.is_tailored:  # with two tailored faces `with_solution` finds the limits
         return None, None
     channels = scene.with_source_scaled(0.0).channels()
     light = max(channels, key=lambda channel: channel.weight)  # channel of stage 1
@@ -256,7 +256,7 @@ def resolved(scene: Scene, lens: Lens) -> Scene:
     """
     if scene.tailoring.resolved(lens.back.shape).method == "adam":
         return scene
-    blank = scene.lens.model_copy(update={"front": scene.lens.front.designed(lens.front)})
+    blank = scene.lens.model_copy(update={"front": scene.lens.front.with_parameters(lens.front)})
     return scene.model_copy(update={"lens": blank})
 
 
@@ -317,7 +317,7 @@ def _stage1(
         raise KeyboardInterrupt  # there is no lens yet
     name, stage, _ = PROCEDURES[task.knobs.method]
     like = lens.like
-    if scene.lens.front.shaped:  # stage 1 of two faces runs in numpy, on the CPU
+    if scene.lens.front.is_tailored:  # stage 1 of two faces runs in numpy, on the CPU
         stage, lens = two_faces.steps, lens.to(like.dtype, "cpu")
     steps = stage(task, lens, state)
     last = driver.run(steps, task, lambda state: DesignState(driver.record, state), lambda: driver.wish)

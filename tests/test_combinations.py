@@ -302,7 +302,7 @@ MAY_REFUSE = (  # sentences of designs, and the choices that cannot be had toget
 )
 COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which figures are found
     "optics.measure": {"SETS": 4, "MIN_TUBES": 65, "MIN_POINTS": 4, "MAX_POINTS": 8},
-    "scene.scene": {"JUDGE_POINTS": 4},
+    "scene.scene": {"VERIFICATION_POINTS": 4},
     "tailoring.run": {"FINE_EFFORT": Effort(96, accuracy=0.0, witness=False)},
     "tailoring.stage1": {"COARSEST_GRID": 16},
     "tailoring.slope_map.lit_window": {"__defaults__": (32,)},

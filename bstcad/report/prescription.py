@@ -66,7 +66,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
     shape: facts by bstcad.analysis.shape.describe, and the volume.
     """
     front, material = lens.front, scene.lens.material
-    own = scene.lens.front.designed(front).surface.plain().parameters()  # heights, if it is a net
+    own = scene.lens.front.with_parameters(front).surface.plain().parameters()  # heights, if it is a net
     numbers = ({"curvature": 0.0} if front.level else {}) | {n: v for n, v in own.items() if isinstance(v, float)}
     fitted = {"within": FIT_TOLERANCE} if front.is_net and scene.lens.front.kind != "bspline" else {}  # mm
     rho = density(material) if material else None

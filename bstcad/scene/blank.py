@@ -40,7 +40,7 @@ CONIC_CONSTANTS = (-1e3, 1e3)
 INDICES = (1.01, 5.0)  # range of the refractive index
 BOUNDS = ("tool_radius", "max_slope", "max_thickness", "edge_thickness")  # keys of LensBlank that bound tailored faces
 
-NET_FILE = "front.npz"  # file name of the copy of a given net beside a design
+NET_FILE = "front.npz"  # file name of the copy of the net of lens.front.file, beside a design
 NET_REMEDY = "give the folder of a design, its design.npz or its lens.step"
 AXIS_TOLERANCE = 1e-9  # sine of the angle between a side of a net and an axis of the file; a larger one is a turn
 UNIFORM_TOLERANCE = 1e-9  # mm; largest deviation of a net from uniform spacing in x and y
@@ -58,7 +58,7 @@ Outlined = Annotated[Rectangle | Circle, Field(discriminator="shape")]
 
 
 @dataclass(frozen=True)
-class GivenNet(FileContent):
+class FileNet(FileContent):
     """A B-spline surface with its vertex at z = 0; the scene holds its heights, so that a design can be repeated."""
 
     name = NET_FILE
@@ -68,7 +68,7 @@ class GivenNet(FileContent):
     data: bytes = field(repr=False)  # heights of the control points above the vertex, (m, n), mm, float64
 
     @classmethod
-    def of(cls, surface: BSplineSurface) -> GivenNet:
+    def of(cls, surface: BSplineSurface) -> FileNet:
         """Return the net of a surface, which may lie at any z."""
         resting = surface.plain().moved(0.0)
         vertex = resting.from_vertex()
@@ -90,7 +90,7 @@ class GivenNet(FileContent):
         return file.getvalue()
 
 
-def read_net(path: Path) -> GivenNet:
+def read_net(path: Path) -> FileNet:
     """Read the back face of the design at `path`; SceneError if there is none, or it is damaged.
 
     A face of a STEP file keeps its position in x and y; its shift along z is dropped.
@@ -111,7 +111,7 @@ def read_net(path: Path) -> GivenNet:
     deviation = np.abs(net[..., :2] - uniform).max()
     if min(shape) < SMALLEST_NET or not np.isfinite(net).all() or not deviation <= UNIFORM_TOLERANCE:
         raise SceneError(f"lens.front.file: {name} does not hold the net of a design; {NET_REMEDY}")
-    return GivenNet.of(BSplineSurface.from_control_points(net, 0.0))
+    return FileNet.of(BSplineSurface.from_control_points(net, 0.0))
 
 
 def _net_of_step(path: Path) -> np.ndarray:
@@ -151,7 +151,7 @@ OUTLINE = Key(
     example={"shape": "circle", "diameter": 10.0},
 )
 OPTIMISE = Key("Parameters that tailoring finds: true for all, or a list of names.")
-NetFile = from_file(GivenNet, read_net, "file = 'outputs/earlier'")
+FrontFile = from_file(FileNet, read_net, "file = 'outputs/earlier'")
 
 
 def _some(*names: str) -> Any:
@@ -164,8 +164,8 @@ def _some(*names: str) -> Any:
 class _Front:
     optimise: bool | tuple[str, ...] = False
     outline: Circle | None = None
-    given: GivenNet | None = None  # net of a freeform front, with which its tailoring starts; None: no file
-    shaped = False  # True for a net that tailoring shapes
+    file_net: FileNet | None = None  # net of a freeform front, with which its tailoring starts; None: no file
+    is_tailored = False  # True for a net that tailoring shapes
     reflect: bool = False
 
     @property
@@ -186,7 +186,7 @@ class _Front:
     @property
     def fixed(self) -> bool:
         """True if tailoring does not change the front."""
-        return not (self.free or self.shaped)
+        return not (self.free or self.is_tailored)
 
     @property
     def free(self) -> tuple[str, ...]:
@@ -194,7 +194,7 @@ class _Front:
         names = tuple(self.surface.parameters()) if self.optimise else ()
         return names if self.optimise is True else tuple(name for name in names if name in self.optimise)
 
-    def designed(self, surface: Surface) -> Self:
+    def with_parameters(self, surface: Surface) -> Self:
         """Return the front with the parameters of this surface, all of them fixed."""
         return replace(self, **surface.plain().parameters(), optimise=False) if self.free else self
 
@@ -328,7 +328,7 @@ class NetFront(_Front):
 
     z: Annotated[float, Z]
     file: Annotated[
-        NetFile | None, Key("Folder of a design, its design.npz or its lens.step.", example="outputs/earlier")
+        FrontFile | None, Key("Folder of a design, its design.npz or its lens.step.", example="outputs/earlier")
     ] = None
     optimise: Annotated[
         bool, Key("The front is tailored, starting with the net of the file, or flat without one.", example=True)
@@ -355,12 +355,12 @@ class NetFront(_Front):
         return Plane(self.z) if self.file is None else self.file.surface(self.z)
 
     @property
-    def given(self) -> GivenNet | None:
+    def file_net(self) -> FileNet | None:
         """The net of the file."""
         return self.file
 
     @property
-    def shaped(self) -> bool:
+    def is_tailored(self) -> bool:
         """True if tailoring shapes the net."""
         return self.optimise
 
@@ -410,7 +410,7 @@ def as_front(value: Any, outline: Outline | None = None) -> Any:
     if not hasattr(value, "relative_sag_and_slope"):
         return value
     if value.is_net:
-        return NetFront(value.z + value.moved(0.0).from_vertex().z, GivenNet.of(value))
+        return NetFront(value.z + value.moved(0.0).from_vertex().z, FileNet.of(value))
     if value.kind in FRONTS:
         _, front = FRONTS[value.kind]
         own = {} if value.outline is None else {"outline": value.outline}
@@ -587,9 +587,9 @@ class LensBlank(Record):
         return self.front.traced(self.outline)
 
     @property
-    def shaped(self) -> tuple[Face, ...]:
+    def tailored_faces(self) -> tuple[Face, ...]:
         """Faces that tailoring shapes, in the order of the light."""
-        tailored = {"front": self.front.shaped, "back": self.back.optimise}
+        tailored = {"front": self.front.is_tailored, "back": self.back.optimise}
         return tuple(face for face in self.passes.faces if tailored[face])
 
     def front_net(self, net: Sides) -> Sides | None:
@@ -597,10 +597,10 @@ class LensBlank(Record):
 
         A tailored front keeps the scene's ratio of control points to the back; a fixed net keeps its own number.
         """
-        if not self.front.shaped:
-            front = self.front.given or self.front_surface
-            return simplified(front.shape) if isinstance(front, GivenNet) or front.is_net else None
-        own = self.front.given.shape if self.front.given else self.front.control_points
+        if not self.front.is_tailored:
+            front = self.front.file_net or self.front_surface
+            return simplified(front.shape) if isinstance(front, FileNet) or front.is_net else None
+        own = self.front.file_net.shape if self.front.file_net else self.front.control_points
         if own is None:
             return net
         if self.back.control_points is None:  # the ratio is not known yet
@@ -615,10 +615,10 @@ class LensBlank(Record):
 
     def flat_front(self, net: Sides, as_wide_as: Sides | None = None) -> Surface:
         """Return the front before tailoring for a back of `net`; as_wide_as: see Scene.flat_lens."""
-        if not self.front.shaped:
+        if not self.front.is_tailored:
             return self.front_surface
-        if self.front.given is not None:
-            return self.front.given.surface(self.front.z).refined(self.front_net(net))
+        if self.front.file_net is not None:
+            return self.front.file_net.surface(self.front.z).refined(self.front_net(net))
         from bstcad.optics.bspline import BSplineSurface
 
         half_x, half_y = net_extent(self.outline, self.front_net(as_wide_as or net))
@@ -658,7 +658,7 @@ class LensBlank(Record):
             yield 'lens: needs exactly one of material and index; give for example material = "PMMA"'
         of_back = net_complaints(self.outline, self.back.control_points)
         yield from (f"lens.back.control_points: {complaint}" for complaint in of_back)
-        if not self.back.optimise and not self.front.shaped:
+        if not self.back.optimise and not self.front.is_tailored:
             tailored = f'lens.front = {{ kind = "bspline", z = {self.front.z:g}, optimise = true }}'
             yield f"lens.back.optimise: false leaves no face to tailor; write {tailored}, or remove this key"
         yield from (f"lens.front.{complaint}" for complaint in self.front.complaints(self.outline))

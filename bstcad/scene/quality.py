@@ -28,8 +28,8 @@ BASELINES = {  # methods without limits of time, accuracy or shape: name in mess
     "integration": ("point-by-point integration", "tailoring.method"),
 }
 COARSEST_GRID = 64  # smallest number of cells per side of the transport problem; it costs almost no time
-JUDGE_POINTS = 32  # points of an extended source for the pictures and margins of a verification, not for its RRMSD
-JUDGE_DRAW = 1 << 12  # number of the draw of these points; each further line of a spectrum takes the next number
+VERIFICATION_POINTS = 32  # points of an extended source for the pictures and margins of a verification, not its RRMSD
+VERIFICATION_DRAW = 1 << 12  # number of the draw of these points; each further spectral line takes the next number
 
 
 class Tailoring(Record):
@@ -128,7 +128,7 @@ class Tailoring(Record):
                 yield f"tailoring.{name}: {who} cannot end early; remove it, or choose another {other}"
         if who and lens.bounded_by:
             yield f"lens.{lens.bounded_by[0]}: {who} has no such bounds; remove it, or choose another {other}"
-        if who and lens.front.shaped:
+        if who and lens.front.is_tailored:
             yield f"lens.front.optimise: {who} cannot tailor a freeform front; remove it, or choose another {other}"
         if self.method == "integration" and lens.front.free:
             fixed = "remove it and give the final front"

@@ -42,7 +42,7 @@ from bstcad.scene.elements import Around, Elements, LightPath
 from bstcad.scene.errors import SceneError, about, explain, line_of, toml_positions
 from bstcad.scene.mount import Mount, Part
 from bstcad.scene.picture import Picture
-from bstcad.scene.quality import JUDGE_DRAW, JUDGE_POINTS, Tailoring, Tolerance
+from bstcad.scene.quality import VERIFICATION_DRAW, VERIFICATION_POINTS, Tailoring, Tolerance
 from bstcad.scene.schema import FILE, FileContent, Record, contents, of_model
 from bstcad.scene.target import Target, Targets, coplanar
 
@@ -213,7 +213,7 @@ class Scene(Record):
         pairs = zip(self.target_keys, self.targets, strict=True)
         return tuple(Goal(key, target.screen, target.irradiance(), target.weight) for key, target in pairs)
 
-    def each_alone(self) -> tuple[Self, ...]:
+    def single_target_scenes(self) -> tuple[Self, ...]:
         """Return one scene per target, each with that target alone and no wavefront."""
         if len(self.targets) == 1:
             return (self,)
@@ -314,7 +314,7 @@ class Scene(Record):
     def assembled(self, lens: Lens) -> Lens:
         """Return the lens with the scene's windows, mirrors, tailored faces and mount."""
         before, behind = self.around(self.source.main_wavelength) or ((), ())
-        return self.as_mounted(replace(lens, before=before, behind=behind).shaping(*self.lens.shaped))
+        return self.as_mounted(replace(lens, before=before, behind=behind).shaping(*self.lens.tailored_faces))
 
     def as_mounted(self, lens: Lens) -> Lens:
         """Return the lens with the clear apertures that the mount leaves."""
@@ -330,9 +330,9 @@ class Scene(Record):
             points = self.tailoring.points_of_source
         return self._with_losses(channels_of(self.source, self.lens.index_at, points, draw))
 
-    def judging_channels(self) -> tuple[Channel, ...]:
+    def verification_channels(self) -> tuple[Channel, ...]:
         """Return the channels of a verification: more points of an extended source than in tailoring, and others."""
-        return self.channels(JUDGE_POINTS, JUDGE_DRAW)
+        return self.channels(VERIFICATION_POINTS, VERIFICATION_DRAW)
 
     @property
     def draw(self) -> Draw | None:
@@ -455,7 +455,7 @@ def _doubts_of_goals(scene: Scene) -> Iterator[str]:
         alike = target.model_copy(update={"z": 0.0, "weight": 1.0})
         if alike not in different or not (isinstance(wave, PlaneWave) and wave.normal == (0.0, 0.0, 1.0)):
             different.append(alike)
-    pictures, shaped = len(different), lens.shaped
+    pictures, shaped = len(different), lens.tailored_faces
     goals = pictures + (wave is not None)
     if goals < len(shaped) and not lens.passes.reflects:  # light crosses the other face of such a mirror twice
         idle, busy = shaped

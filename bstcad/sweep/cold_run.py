@@ -313,7 +313,7 @@ def judged(run: Run, base: Scene, folder: Path, effort: Effort) -> Run:
 
     Of several targets the largest RRMSD counts.
     """
-    lens, channels = read_nominal(folder)[1].lens, base.judging_channels()
+    lens, channels = read_nominal(folder)[1].lens, base.verification_channels()
     how = {"effort": effort, "ghost": base.ghost, "draw": base.draw}
     lights = [measure(lens, channels, target.screen, target.irradiance(), **how) for target in base.targets]
     if not all(light.rrmsd >= 0 for light in lights):

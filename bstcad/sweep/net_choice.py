@@ -114,7 +114,8 @@ def with_net(scene: Scene) -> tuple[Scene, Choice | None]:
 
 def chosen(scene: Scene) -> Choice:
     """The choice for a scene without a net; of several targets that which asks for the finest one."""
-    return max((_chosen(each) for each in scene.each_alone()), key=lambda choice: math.prod(as_pair(choice.net)))
+    choices = (_chosen(each) for each in scene.single_target_scenes())
+    return max(choices, key=lambda choice: math.prod(as_pair(choice.net)))
 
 
 def _chosen(scene: Scene) -> Choice:
@@ -142,7 +143,7 @@ def gain(scene: Scene, finer: Scene, lenses: Sequence[Lens]) -> float:
     lenses: a coarse one for each target.
     """
     found = []
-    for one, other, lens in zip(scene.each_alone(), finer.each_alone(), lenses, strict=True):
+    for one, other, lens in zip(scene.single_target_scenes(), finer.single_target_scenes(), lenses, strict=True):
         light, image = cells_of_a_mm2(one, lens), blurred(one, lens)
         few, many = (rrmsd(light, each, image) for each in (one, other))
         found.append(many / few)
@@ -179,7 +180,7 @@ def moved(scene: Scene) -> float:
     radius, target = scene.lens.tool_radius, scene.target
     if radius is None:
         return math.inf
-    turn = max(scene.lens.passes.deflection(face, scene.index) for face in scene.lens.shaped)
+    turn = max(scene.lens.passes.deflection(face, scene.index) for face in scene.lens.tailored_faces)
     throw = abs(target.screen.plane.per_radian(scene.lens.back.z)) * turn / radius
     return throw * math.sqrt(math.prod(scene.lens.cells)) * math.sqrt(math.prod(target.screen.per_unit))
 

@@ -52,14 +52,14 @@ def plan(
     text: of the scene file, whose lines are named.  keys: that the command line gives instead.  tick: called now and
     then; an exception from it ends the plan.
     """
-    at, scenes = toml_positions(text), scene.each_alone()
+    at, scenes = toml_positions(text), scene.single_target_scenes()
     asked = [{"what": what, "key": key, **_asked(key, at, keys)} for what, key in simulated(scene)]
     lenses = [coarse_lens(alone) for alone in scenes]
     goals = list(map(_effects, scenes, lenses, scene.target_keys))
     blurred = worst((goal["blur"] or {}).get("rrmsd", 0.0) for goal in goals)
     found = {"simulated": asked, **goals[blurred], "goals": goals}
     del found["key"]
-    if len(goals) > 1 or scene.lens.front.shaped:
+    if len(goals) > 1 or scene.lens.front.is_tailored:
         found["caveat"] = ALONE
     if early := verdict(scene, found):
         found["verdict"] = early
@@ -118,13 +118,13 @@ def reach_drawn(scene: Scene) -> tuple[bytes, ...]:
     from bstcad.report.drawing import png
     from bstcad.report.light_figures import View, reach_picture
 
-    if scene.lens.front.shaped:
+    if scene.lens.front.is_tailored:
         raise SceneError(
             "--png: draws what light can reach by way of a tailored back, and here the front is tailored; leave it "
             "out: `bstcad generate` says first what such a lens cannot do"
         )
     found = []
-    for alone in scene.each_alone():
+    for alone in scene.single_target_scenes():
         [goal] = alone.goals
         part, _ = reachable_part(alone, goal)
         lit = np.ones(goal.picture.shape, dtype=bool) if part is None else part

@@ -88,7 +88,7 @@ def fly(scene: Scene, quality: str, tick: Callable[[], None] = lambda: None) -> 
         for goal in made.goals
     )
     sides = [max(goal.receiver.shape) for goal in made.goals]
-    alone = zip(scene.each_alone(), small.each_alone(), strict=True)
+    alone = zip(scene.single_target_scenes(), small.single_target_scenes(), strict=True)
     lost = [blurred(one, made.lens) - blurred(few, made.lens) for one, few in alone] if finer else [0.0]
     took = dict.fromkeys(("first", "search", "rest"), 0.0)
     for stage in made.making.stages:
@@ -125,7 +125,7 @@ def made_small(scene: Scene) -> tuple[Scene, float]:
 def of_net(scene: Scene, net: Sides, changes: Mapping[str, object] = {}) -> Scene:
     """The scene with another net of the back, and of a freeform front in proportion; and with other changes."""
     nets = {"lens.back.control_points": net, "tailoring.levels": None}
-    if scene.lens.front.shaped and scene.lens.front.control_points is not None:
+    if scene.lens.front.is_tailored and scene.lens.front.control_points is not None:
         nets["lens.front.control_points"] = scene.lens.front_net(net)
     return scene.changed({**nets, **changes})
 
@@ -218,10 +218,10 @@ def usual(scene: Scene) -> Seconds:
     if knobs.method == "adam":
         counts = knobs.stage1_iterations * len(knobs.levels), knobs.stage2_iterations
         return Seconds(*(ADAM * (knobs.rays / TUBES) ** 2 * count for count in counts), rest)
-    halvings, transport = (1, TWO_FACES) if scene.lens.front.shaped else (2, TRANSPORT)
+    halvings, transport = (1, TWO_FACES) if scene.lens.front.is_tailored else (2, TRANSPORT)
     grids = [max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left, halvings)) for left in range(knobs.rounds)]
     first = ROUND * knobs.rounds + (FRONT if scene.lens.front.free else 0.0)
-    first += BETWEEN if scene.lens.front.shaped else 0.0
+    first += BETWEEN if scene.lens.front.is_tailored else 0.0
     first += transport * sum((grid / GRID) ** 2 for grid in grids) * knobs.transport_iterations / ITERATIONS
     fits = [fitted for level in knobs.levels[-2:] for fitted in scene.lens.nets(level)]
     first += FIT * sum(math.prod(as_pair(fitted)) for fitted in fits) / POINTS**2

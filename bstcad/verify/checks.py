@@ -66,7 +66,7 @@ class Nominal:
     @cached_property
     def channels(self) -> tuple[Channel, ...]:
         """Light of the scene; points on an extended source differ from those of tailoring."""
-        return self.scene.judging_channels()
+        return self.scene.verification_channels()
 
     @property
     def heaviest(self) -> Channel:

@@ -122,7 +122,7 @@ def measure(scene: Scene) -> dict[str, float]:
     began = time.process_time()
     made = design(scene, device="cpu")
     spent, screen, target = time.process_time() - began, scene.target.screen, scene.target.irradiance()
-    rrmsd = rrmsd_by_rays(made.lens, scene.judging_channels(), screen, target=target, effort=JUDGED)
+    rrmsd = rrmsd_by_rays(made.lens, scene.verification_channels(), screen, target=target, effort=JUDGED)
     return {"rrmsd": round(rrmsd, 5), "cpu_seconds": round(spent, 2)}
 
 

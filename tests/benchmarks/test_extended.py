@@ -51,7 +51,7 @@ def driven(task, steps):
 def judge(scene, lens):
     """(RRMSD, its standard error) by points of the source that nobody tailored with."""
     target = scene.target
-    light = measure(lens, scene.judging_channels(), target.screen, target.irradiance(), draw=scene.draw)
+    light = measure(lens, scene.verification_channels(), target.screen, target.irradiance(), draw=scene.draw)
     return light.rrmsd, light.standard_error
 
 
@@ -104,7 +104,7 @@ def test_direct_optimisation_against_doing_nothing_and_against_feedback(diameter
     task, lens = task_of(scene)
     point = driven(task, stage2.steps(task, driven(task, stage1.steps(task, lens))))
     target = scene.target
-    points = scene.judging_channels()
+    points = scene.verification_channels()
     image = blur(points, point, target.screen, target.irradiance())
     least = floor_of(images(points, point, target.screen).mean(), target.irradiance())
     alone = task.rrmsd(point)

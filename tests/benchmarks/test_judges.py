@@ -86,7 +86,7 @@ DECLINED = {("sun_caustic", "mitsuba")}  # the sun's directions
 @pytest.mark.parametrize("template", templates())
 def test_other_programs_agree(template, tmp_path):
     lens = written(template, {"tailoring.quality": "draft"}, tmp_path)
-    channels = lens.scene.judging_channels()
+    channels = lens.scene.verification_channels()
     for name, target in product(comparison.JUDGES, lens.scene.targets):
         found = comparison.compare(name, lens.lens, channels, target.screen, target.irradiance(), rays=MANY)
         judge = found.judge

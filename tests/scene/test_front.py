@@ -64,10 +64,10 @@ def test_a_given_front_travels_with_its_scene(earlier, tmp_path):
     for k in range(3):
         folder = tmp_path / str(k)
         folder.mkdir()
-        (folder / NET_FILE).write_bytes(scene.lens.front.given.copy)
+        (folder / NET_FILE).write_bytes(scene.lens.front.file_net.copy)
         (folder / "scene.toml").write_text(scene.toml())
         again = load(folder / "scene.toml")
-        assert again == scene and again.lens.front.given.data == scene.lens.front.given.data
+        assert again == scene and again.lens.front.file_net.data == scene.lens.front.file_net.data
         scene = again
     moved = scene.changed({"lens.front.z": 14.5})
     assert torch.equal(moved.lens.front.surface.heights, scene.lens.front.surface.heights)
@@ -96,9 +96,10 @@ def test_what_tailoring_may_change_is_named(front, free, tmp_path):
 
 
 def test_a_found_front_leaves_nothing_free():
-    front = ConicFront(15.0, 0.0, 0.0, optimise=True).designed(Conic(15.0, torch.tensor(0.01), torch.tensor(-2.0)))
+    found = Conic(15.0, torch.tensor(0.01), torch.tensor(-2.0))
+    front = ConicFront(15.0, 0.0, 0.0, optimise=True).with_parameters(found)
     assert front == ConicFront(15.0, pytest.approx(0.01), -2.0) and front.free == ()
-    assert SphereFront(15.0, 0.02).designed(Sphere(15.0, 0.03)) == SphereFront(15.0, 0.02)
+    assert SphereFront(15.0, 0.02).with_parameters(Sphere(15.0, 0.03)) == SphereFront(15.0, 0.02)
 
 
 def spoilt(place, value):

@@ -22,7 +22,7 @@ from bstcad.scene.blank import Back, LensBlank, PlaneFront, SphereFront
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.mount import LENS_COLOUR, MIRROR_COLOUR, Box, Part, Round
 from bstcad.scene.picture import Picture
-from bstcad.scene.quality import JUDGE_POINTS, PRESETS, Tailoring, coarse_to_fine
+from bstcad.scene.quality import PRESETS, VERIFICATION_POINTS, Tailoring, coarse_to_fine
 from bstcad.scene.scene import Accept, Scene, load
 from bstcad.scene.target import Target
 
@@ -371,11 +371,11 @@ def test_points_of_an_extended_source_are_a_knob_and_a_judge_takes_others():
     assert len(scene.channels()) == points and f"source_points {points}" in scene.toml()
     assert len(scene.changed({"tailoring.source_points": 12}).channels()) == 12
     scene = scene.changed({"source.wavelength": ((486.1, 1.0), (587.6, 2.0), (656.3, 1.0))})
-    both = scene.judging_channels(), scene.channels(JUDGE_POINTS)
+    both = scene.verification_channels(), scene.channels(VERIFICATION_POINTS)
     judges, known = ({c.source.position for c in found} for found in both)
-    assert len(judges) == JUDGE_POINTS and not judges & known
+    assert len(judges) == VERIFICATION_POINTS and not judges & known
     point = load(DISK)
-    assert "source_points" not in point.toml() and point.channels() == point.judging_channels()
+    assert "source_points" not in point.toml() and point.channels() == point.verification_channels()
 
 
 def test_each_line_has_the_index_of_its_own():

@@ -49,7 +49,7 @@ def test_a_front_that_is_tailored_goes_through_its_file(disk, more, tmp_path):
     (tmp_path / "scene.toml").write_text(scene.toml())
     assert load(tmp_path / "scene.toml") == scene == scene.changed({})
     front = scene.lens.front
-    assert front.shaped and not front.fixed and front.free == () and front.given is None
+    assert front.is_tailored and not front.fixed and front.free == () and front.file_net is None
     assert scene.lens.front_sags == (0.0, 0.0) and scene.rim_sags == disk.rim_sags  # those of a plane
     assert len(scene.warnings()) == len(disk.warnings()) + 1  # see the next test
 
@@ -68,9 +68,9 @@ def test_a_front_without_a_goal_of_its_own_is_said_to_stay_as_it_is(disk):
 
 def test_a_given_net_may_be_where_tailoring_starts(disk, tmp_path):
     scene = disk.changed({"lens.front": a_net(disk)})
-    assert not scene.lens.front.shaped and scene.lens.front.fixed and "optimise" not in scene.toml()
+    assert not scene.lens.front.is_tailored and scene.lens.front.fixed and "optimise" not in scene.toml()
     tailored = scene.changed({"lens.front.optimise": True})
-    assert tailored.lens.front.shaped and tailored.lens.shaped == ("front", "back")
+    assert tailored.lens.front.is_tailored and tailored.lens.tailored_faces == ("front", "back")
     for name, data in folders.scene_files(tailored).items():
         (tmp_path / name).write_bytes(data)
     assert load(tmp_path / "scene.toml") == tailored
@@ -153,7 +153,7 @@ def test_tailoring_starts_from_the_given_net(disk):
     net = a_net(disk)
     scene = disk.changed({"lens.front": net}).changed({"lens.front.optimise": True})
     whole, first = scene.flat_lens(65).front, scene.flat_lens(33, as_wide_as=65).front
-    assert torch.equal(whole.heights, scene.lens.front.given.surface(15.0).heights) and whole.shape == (17, 17)
+    assert torch.equal(whole.heights, scene.lens.front.file_net.surface(15.0).heights) and whole.shape == (17, 17)
     assert first.shape == (9, 9) and first.x == whole.x
     x = torch.linspace(-8.0, 8.0, 41, dtype=torch.float64)
     assert (first.sag_and_slope(x, 0 * x)[0] - whole.sag_and_slope(x, 0 * x)[0]).abs().max() < 0.02  # of 0.1 mm

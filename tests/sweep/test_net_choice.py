@@ -64,7 +64,7 @@ def test_a_picture_narrower_than_half_a_tile_has_its_net_too():
 def test_several_targets_get_the_net_of_the_most_demanding_one():
     target = PLATE.target.model_dump(mode="json", exclude_none=True)
     two = PLATE.changed({"target": [target | {"pixels": 64}, target | {"z": 640.0, "pixels": 256}]})
-    alone = [chosen(each).net for each in two.each_alone()]
+    alone = [chosen(each).net for each in two.single_target_scenes()]
     assert alone[0] < alone[1] == chosen(two).net == with_net(two)[0].lens.back.net
 
 

@@ -131,7 +131,7 @@ def test_each_of_several_targets_is_cut_to_what_light_can_reach(wide):
     wide.write_text(text.replace("[target]", near + "[[target]]"))
     scene = load(wide)
     made = design(scene.changed({"tailoring.stage2_iterations": 4}))
-    part, _ = part_of(scene.each_alone()[1])
+    part, _ = part_of(scene.single_target_scenes()[1])
     assert made.goals[0].reachable is None and np.array_equal(made.goals[1].reachable, part)
     assert not made.goals[1].picture[~part].any() and made.goals[1].picture[part].all()
     with pytest.raises(SceneError, match=r"^target\[1\]: "):

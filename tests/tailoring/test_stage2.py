@@ -8,7 +8,7 @@ import torch
 from bstcad import pipeline
 from bstcad.optics.measure import rrmsd_by_tubes
 from bstcad.pipeline import design
-from bstcad.scene.quality import JUDGE_DRAW
+from bstcad.scene.quality import VERIFICATION_DRAW
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage2
 from bstcad.tailoring.source_image import Spread
@@ -29,7 +29,7 @@ WIDE = TINY | {"source.diameter": 1.2}  # 80 mm before the back, 475 mm behind i
 def judged(scene, lens):
     """RRMSD with the real source, by points that no tailoring knows."""
     wanted = scene.target
-    return rrmsd_by_tubes(lens, scene.channels(64, JUDGE_DRAW), wanted.screen, wanted.irradiance(), 34)
+    return rrmsd_by_tubes(lens, scene.channels(64, VERIFICATION_DRAW), wanted.screen, wanted.irradiance(), 34)
 
 
 @pytest.fixture(scope="module")

@@ -273,7 +273,7 @@ def test_with_lens_keeps_a_front_that_is_tailored(two):
     design = bstcad.Design(two.made)
     net = design.scene.flat_lens((65, 65)).front
     other = design.with_lens(replace(two.made.lens, front=bent(net, 0.1)))
-    assert other.scene.lens.front.shaped and other.lens.shaped == (0, 1)
+    assert other.scene.lens.front.is_tailored and other.lens.shaped == (0, 1)
     finer = design.scene.changed({"lens.front.control_points": 65}).flat_lens((65, 65)).front
     again = design.with_lens(replace(two.made.lens, front=bent(finer, 0.1)))
     assert again.lens.front.shape == (65, 65) and again.scene.lens.nets() == (65, 65)
