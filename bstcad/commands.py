@@ -281,7 +281,7 @@ def verify(
     design's folder does not change; without `place`, to the design's folder and its subfolder measured/CLOUD, which
     only a verification of the same cloud rewrites.
     """
-    against = comparison.chosen(against)
+    against = comparison.choose_judges(against)
     if path.is_file() and (against or measured):
         raise SceneError(f"{path}: a STEP file states no light by which to judge it; give the design's folder")
     if path.is_file():
@@ -298,7 +298,7 @@ def verify(
             drawn.solid(proof.lens)
             judged: list[Compared] = []
             for number, goal in enumerate(made.goals):
-                by_others = comparison.against(
+                by_others = comparison.run_judges(
                     against, proof.lens, made.channels, goal.receiver, target=goal.picture,
                     seed=made.scene.tailoring.seed, progress=progress, key=goal.key if goal.suffix else "",
                 )  # fmt: skip

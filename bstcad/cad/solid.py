@@ -91,7 +91,7 @@ def lens_shape(
 
     loops: rim and holes as `cut_loops` returns them (None: the lens's outline).
     """
-    lens, loops = lens.plain(), loops or [wires.of_outline(lens.outline)]
+    lens, loops = lens.plain(), loops or [wires.outline_loop(lens.outline)]
     check_thickness(lens)
     back, below = back_patch(lens), lens.front.around
     tops, inner = [walls.rail_on(lens.back, loop) for loop in loops], [walls.rail_on(below, loop) for loop in loops[1:]]
@@ -151,8 +151,8 @@ def check_thickness(lens: Lens) -> None:
 
 def cut_loops(lens: Lens, trim: cadquery.Wire | None, holes: Sequence) -> list[list[LoopPiece]]:
     """Return the rim, counterclockwise, and the holes, clockwise; ValueError if the wires do not bound a lens."""
-    loops = [wires.of_outline(lens.outline) if trim is None else _of_wire("trim", trim)]
-    loops += [_hole(f"hole {k}", hole) for k, hole in enumerate(holes, start=1)]
+    loops = [wires.outline_loop(lens.outline) if trim is None else _wire_loop("trim", trim)]
+    loops += [_hole_loop(f"hole {k}", hole) for k, hole in enumerate(holes, start=1)]
     shape = wires.polygon(*loops)
     x, y = np.array(shape.exterior.coords).T
     outside = ~lens.outline.contains(*(torch.from_numpy(p * (1 - 1e-9)) for p in (x, y))).numpy()
@@ -166,7 +166,7 @@ def cut_loops(lens: Lens, trim: cadquery.Wire | None, holes: Sequence) -> list[l
             f"trim or holes: {reason} near {position}; draw wires that do not cross themselves or each other, and the "
             "holes inside the rim"
         )
-    if (dome := lens.front.outline) and not shape.contains(wires.polygon(wires.of_outline(dome))):
+    if (dome := lens.front.outline) and not shape.contains(wires.polygon(wires.outline_loop(dome))):
         raise ValueError(
             f"trim or holes: a wire crosses the front, {dome.words}, or lies inside it; draw it in the plane around it"
         )
@@ -174,16 +174,16 @@ def cut_loops(lens: Lens, trim: cadquery.Wire | None, holes: Sequence) -> list[l
     return [loop if is_left else wires.reversed_loop(loop) for loop, is_left in zip(loops, correct, strict=True)]
 
 
-def _of_wire(name: str, wire: cadquery.Wire) -> list[LoopPiece]:
+def _wire_loop(name: str, wire: cadquery.Wire) -> list[LoopPiece]:
     try:
-        return wires.of_wire(wire)
+        return wires.wire_loop(wire)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
 
 
-def _hole(name: str, hole: cadquery.Wire | Sequence[float]) -> list[LoopPiece]:
+def _hole_loop(name: str, hole: cadquery.Wire | Sequence[float]) -> list[LoopPiece]:
     if not isinstance(hole, Sequence):
-        return _of_wire(name, hole)
+        return _wire_loop(name, hole)
     if len(hole) != 3 or not all(isinstance(each, numbers.Real) and math.isfinite(each) for each in hole):
         raise ValueError(f"{name}: {hole} is not (x, y, diameter); give three numbers in mm, or a closed wire")
     x, y, diameter = map(float, hole)
@@ -217,7 +217,7 @@ def front_caps(lens: Lens, rails: Sequence[Rail]) -> list[NamedFace]:
 
 def dome_cap(lens: Lens) -> tuple[NamedFace, Rail]:
     """Return the optical part of a front with its own outline, and its rim, counterclockwise."""
-    rim = walls.rail_on(lens.front.optical, wires.of_outline(lens.front.outline))
+    rim = walls.rail_on(lens.front.optical, wires.outline_loop(lens.front.outline))
     return (cap(front_patch(lens), [rim], along=False), "front"), rim
 
 

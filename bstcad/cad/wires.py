@@ -54,7 +54,7 @@ class LoopPiece:
         return float(x), float(y)
 
 
-def of_outline(outline: Outline) -> list[LoopPiece]:
+def outline_loop(outline: Outline) -> list[LoopPiece]:
     """Return the loop of an outline, counterclockwise."""
     if outline.is_round:
         return circle(0.0, 0.0, outline.radius)
@@ -68,7 +68,7 @@ def circle(x: float, y: float, radius: float) -> list[LoopPiece]:
     return [_arc((x, y), radius, start, span=math.pi) for start in (0.0, math.pi)]
 
 
-def of_wire(given: cadquery.Wire | cadquery.Edge | cadquery.Workplane) -> list[LoopPiece]:
+def wire_loop(given: cadquery.Wire | cadquery.Edge | cadquery.Workplane) -> list[LoopPiece]:
     """Return the loop of a closed plane wire in its direction; ValueError if it is open or not in a plane z = const."""
     import cadquery
 

@@ -41,7 +41,7 @@ class PlacedSurface:
 
     def error(self, outline: Outline) -> FaceError:
         """Return the error of the surface against the lens's face."""
-        exact = self.face.at(*faces.scattered(outline, COMPARISON_POINTS, seed=0))
+        exact = self.face.at(*faces.random_points(outline, COMPARISON_POINTS, seed=0))
         heights = self.surface.sag(exact.x, exact.y) + self.frame.origin[2]
         return FaceError.between(heights, self.surface.normal(exact.x, exact.y), exact)
 

@@ -103,7 +103,7 @@ class OwnJudge(Protocol):
         """Return the picture on a screen of square pixels by that many rays, as faces.Traced."""
 
 
-def chosen(names: Sequence[str | OwnJudge]) -> tuple[str | OwnJudge, ...]:
+def choose_judges(names: Sequence[str | OwnJudge]) -> tuple[str | OwnJudge, ...]:
     """Check the names of judges, each once; SceneError for an unknown one, MachineError if it is not installed."""
     for name in names:
         if not isinstance(name, str):
@@ -115,7 +115,7 @@ def chosen(names: Sequence[str | OwnJudge]) -> tuple[str | OwnJudge, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def against(
+def run_judges(
     names: Sequence[str | OwnJudge], lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray,
     seed: int, progress: Callable[[str, int, int, str], None], key: str = "",
 ) -> tuple[Compared, ...]:  # fmt: skip
@@ -145,8 +145,8 @@ def compare(
         declined = "it collects light only on planes"
     if declined:
         return Compared(Judge(name, version, declined, target=key))
-    raster = coarse(screen)
-    target, light = resampled(target, raster.shape), judge.light(lens, channels)
+    raster = coarse_screen(screen)
+    target, light = resample(target, raster.shape), judge.light(lens, channels)
     traced = judge.trace(lens, light, raster, rays=rays, seed=seed)
     seconds = time.perf_counter() - began
     ours = measure(lens, light, raster, target, effort=replace(OWN_EFFORT, seed=seed + SEED_OFFSET))
@@ -211,7 +211,7 @@ def _scale_to(picture: np.ndarray, total: float) -> np.ndarray:
     return picture * (total / float(picture.sum())) if picture.sum() > 0 else np.full_like(picture, math.nan)
 
 
-def coarse(screen: Screen) -> Screen:
+def coarse_screen(screen: Screen) -> Screen:
     """Return the screen with nearly square pixels, at most MAX_PIXELS and its own number along the longer side.
 
     Their number, more than half of that, is the one with the most nearly square pixels, and the largest of several.
@@ -227,7 +227,7 @@ def coarse(screen: Screen) -> Screen:
     return replace(screen, pixels=(longer, shorter(longer)) if width >= height else (shorter(longer), longer))
 
 
-def resampled(picture: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def resample(picture: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Resample a picture to (rows, columns) other pixels of the same rectangle, with the flux in each."""
     down, across = (overlap(n, k) * (n / k) for n, k in zip(picture.shape, shape, strict=True))
     return down @ (across @ picture.T).T

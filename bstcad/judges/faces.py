@@ -189,10 +189,10 @@ def rim(outline: Outline, points: int = 512) -> np.ndarray:
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * outline.half_extent
     along = np.arange(points // 4)[:, None] / (points // 4)
     around = np.concatenate([a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
-    return np.stack(onto(outline, *around.T)[1:], axis=-1) if outline.limits[2] else around
+    return np.stack(clip_to_rim(outline, *around.T)[1:], axis=-1) if outline.limits[2] else around
 
 
-def onto(outline: Outline, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def clip_to_rim(outline: Outline, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return True for points inside an outline, and x and y (mm); points outside are moved to the nearest rim point."""
     a, b, r2 = outline.limits
     r, core_x, core_y = math.sqrt(r2), np.clip(x, -a, a), np.clip(y, -b, b)
@@ -201,11 +201,11 @@ def onto(outline: Outline, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np
     return distance <= r, core_x + shrink * (x - core_x), core_y + shrink * (y - core_y)
 
 
-def scattered(outline: Outline, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def random_points(outline: Outline, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return at most `count` random points x, y (mm) inside an outline."""
     a, b = outline.half_extent
     x, y = np.random.default_rng(seed).uniform([[-a], [-b]], [[a], [b]], (2, count))
-    inside, _, _ = onto(outline, x, y)
+    inside, _, _ = clip_to_rim(outline, x, y)
     return x[inside], y[inside]
 
 
@@ -228,7 +228,7 @@ def face_mesh(face: Face, outline: Outline, parts: int, up: bool) -> tuple[Trime
     """
     x, y = face.lines(parts)
     shape = face.on_grid(x, y)
-    inside, rim_x, rim_y = onto(outline, shape.x, shape.y)
+    inside, rim_x, rim_y = clip_to_rim(outline, shape.x, shape.y)
     at_corners = [inside[:-1, :-1], inside[:-1, 1:], inside[1:, 1:], inside[1:, :-1]]
     cells, used = np.logical_or.reduce(at_corners), np.zeros_like(inside)
     for corner in (used[:-1, :-1], used[:-1, 1:], used[1:, 1:], used[1:, :-1]):

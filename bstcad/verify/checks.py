@@ -171,9 +171,9 @@ def verify(
     degrees = math.nan if stability["tir_margin_deg"] is None else stability["tir_margin_deg"]
     margin = Check.at_least("smallest margin to total internal reflection", degrees, None, "deg", id="tir-margin")
     checks = (
-        *text_checks.of_lens(text, nominal.lens),
-        *text_checks.measures(text.properties, whole, lens.outline),
-        *text_checks.of_part(text, part),
+        *text_checks.lens_checks(text, nominal.lens),
+        *text_checks.measure_checks(text.properties, whole, lens.outline),
+        *text_checks.part_checks(text, part),
         *_result(of_step, path, lambda: submit(*step_job)),
         *(_result(of_part, folder / "part.step", lambda: submit(*part_job)) if of_part else ()),
         *of_aperture,

@@ -122,7 +122,7 @@ def examine(path: Path) -> ExaminedFile:
     lens_read, placed = step_reading.lens(reread, index=1.5), reread.placement
     properties = solid_properties.of_solid(reread.shape)
     checks = [
-        *text_checks.structure(text, lens_read.back.shape, any_unit=True),
+        *text_checks.structure_checks(text, lens_read.back.shape, any_unit=True),
         *_solid_checks(reread.shape),
         *_edge_checks(reread, lens_read, bare=reread.edge is None),
         net_check(
@@ -143,8 +143,8 @@ def examine(path: Path) -> ExaminedFile:
         checks.append(Check(name, False, None, unit="", passed=True, id="measures-unknown"))
     else:
         from_definition = placed.inverse.after(text.placement)
-        checks += text_checks.measures(text.properties.moved(from_definition), properties, reread.outline)
-    checks += text_checks.density(text.properties)
+        checks += text_checks.measure_checks(text.properties.moved(from_definition), properties, reread.outline)
+    checks += text_checks.density_checks(text.properties)
     whole = solid_properties.whole_part(reread, properties)
     return ExaminedFile(tuple(checks), lens_read, whole, placed)
 
@@ -278,9 +278,9 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
         name = f"{PART_FILE}: area, volume and centroid can be computed from the faces"
         stated = [Check.true(name, False, "a face is of an unknown kind", id="measures-unknown")]
     else:
-        stated = text_checks.measures(text.properties, properties, lens.outline, PART_FILE)
+        stated = text_checks.measure_checks(text.properties, properties, lens.outline, PART_FILE)
     return (
-        *text_checks.structure(text, lens.back.shape, PART_FILE),
+        *text_checks.structure_checks(text, lens.back.shape, PART_FILE),
         net_check(
             f"{PART_FILE}: deviation of the control points", text.surface.control_points, net, id="control-points"
         ),
@@ -288,7 +288,7 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
         *_solid_checks(solid, of_part=True),
         _part_edge_check(wanted, solid, why),
         *stated,
-        *text_checks.of_part(text, part, PART_FILE),
+        *text_checks.part_checks(text, part, PART_FILE),
     )
 
 

@@ -28,9 +28,9 @@ VALUE_TOLERANCE = 1e-12  # absolute tolerance of stated numbers (mm or g/cm³), 
 Numbers = tuple[float, ...]
 
 
-def of_lens(text: StepText, lens: Lens) -> list[Check]:
+def lens_checks(text: StepText, lens: Lens) -> list[Check]:
     """Check the text of the STEP file against the design."""
-    checks = structure(text, lens.back.shape)
+    checks = structure_checks(text, lens.back.shape)
     name, back = f"{PREFIX}: deviation of the control points", lens.back.control_points()
     checks.append(net_check(name, text.surface.control_points, back, id="control-points"))
     if lens.front.is_net and (text.front is not None or lens.shapes("front")):
@@ -44,7 +44,7 @@ def net_of_front(text: StepText) -> np.ndarray:
     return np.empty((0, 0, 3)) if text.front is None else text.front.control_points
 
 
-def structure(text: StepText, shape: tuple[int, int], name: str = PREFIX, any_unit: bool = False) -> list[Check]:
+def structure_checks(text: StepText, shape: tuple[int, int], name: str = PREFIX, any_unit: bool = False) -> list[Check]:
     """Check the structure of the STEP file: solids, unit, edges, and degree and knots of its freeform faces.
 
     shape: numbers of control points of the back along x and y.  any_unit: accept any unit of length.
@@ -105,7 +105,7 @@ def _largest_difference(read: np.ndarray, designed: np.ndarray, name: str) -> tu
 # ---- validation properties -----------------------------------------------------------------------------------------
 
 
-def measures(
+def measure_checks(
     stated: ValidationProperties, shape: MassProperties | None, outline: Outline, name: str = PREFIX
 ) -> Iterator[Check]:
     """Check the stated properties against the shape's (None if the file states none); outline: size of the lens."""
@@ -124,14 +124,14 @@ def measures(
     yield from _missing_statements(name, all_stated)
 
 
-def density(stated: ValidationProperties) -> Iterator[Check]:
+def density_checks(stated: ValidationProperties) -> Iterator[Check]:
     """Check that each stated density (g/cm³) of a file without a design is a number above zero."""
     for value in stated.densities:
         known = value if value > 0 else None
         yield Check(f"{PREFIX}: stated density", known, None, "g/cm³", passed=value > 0, id="stated-density")
 
 
-def of_part(text: StepText, part: Part, name: str = PREFIX) -> Iterator[Check]:
+def part_checks(text: StepText, part: Part, name: str = PREFIX) -> Iterator[Check]:
     """Check material, density and profile tolerances of back and front against the scene's [part]."""
     stated, back, profile = text.properties, text.surface.entity, "profile tolerance"
     fronts = [each for each in stated.profiles if part.front_profile is not None and each.face == "front"]

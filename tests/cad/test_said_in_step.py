@@ -13,7 +13,7 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.quadrature import of_lens
 from bstcad.scene.mount import LENS_COLOUR, Part
 from bstcad.step_text import part21
-from bstcad.verify.text_checks import of_part
+from bstcad.verify.text_checks import part_checks
 from tests.cad.conftest import encode
 from tests.cad.said_in_step import read
 
@@ -106,10 +106,10 @@ def test_the_front_has_a_profile_of_its_own(lens, tmp_path):
     assert found == {"back": pytest.approx(0.005, rel=1e-12), "front": pytest.approx(0.02, rel=1e-12)}
     text = part21.read(tmp_path / "lens.step")
     assert {(one.face, one.width) for one in text.properties.profiles} == {("back", 0.005), ("front", 0.02)}
-    assert all(check.passed and check.limit is not None for check in of_part(text, part))
-    assert [check.passed for check in of_part(text, replace(part, front_profile=0.03))].count(False) == 1
+    assert all(check.passed and check.limit is not None for check in part_checks(text, part))
+    assert [check.passed for check in part_checks(text, replace(part, front_profile=0.03))].count(False) == 1
     step_writing.write_lens(lens, tmp_path / "lens.step", "lens", PART)
-    assert [check.limit for check in of_part(part21.read(tmp_path / "lens.step"), part)].count(None) == 1
+    assert [check.limit for check in part_checks(part21.read(tmp_path / "lens.step"), part)].count(None) == 1
     faces = ["back", "flange", *walls_of(lens)]  # a plane front is one with a flange
     text = encode(lens, part, faces=faces).decode()
     assert text.count("SURFACE_PROFILE_TOLERANCE") == 1

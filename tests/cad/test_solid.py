@@ -105,7 +105,7 @@ def test_the_borders_lie_on_the_front(lens):
 
 def borders(surface, outline):
     """Curves and edges in which the walls of a bare lens meet a surface."""
-    rail = walls.rail_on(surface.plain(), wires.of_outline(outline))
+    rail = walls.rail_on(surface.plain(), wires.outline_loop(outline))
     return rail.curves, rail.edges
 
 

@@ -89,7 +89,7 @@ class TestStandIn:
         told, (glass, source, screen) = [], CASES["a beam"]
         monkeypatch.setattr(comparison, "JUDGE_RAYS", 1 << 12)
         given = glass, (Channel(source, glass.index),), screen, np.ones(screen.shape), 0
-        found = comparison.against(["numpy"], *given, lambda *a: told.append(a))
+        found = comparison.run_judges(["numpy"], *given, lambda *a: told.append(a))
         assert [each.judge.rays for each in found] == [1 << 12]
         assert told == [("judges", 0, 1, "numpy"), ("judges", 1, 1, "")]
 
@@ -133,13 +133,13 @@ def test_mitsuba_traces_the_light_of_ray_tubes(case):
     "screen", [SCREEN, replace(SCREEN, pixels=(512, 341)), Screen(1.0, (0.0, 7.3), (0.0, 11.1), 300)]
 )
 def test_coarse_pixels_are_square_and_keep_the_light(screen):
-    raster = comparison.coarse(screen)
+    raster = comparison.coarse_screen(screen)
     across, up = raster.per_unit
     assert across == pytest.approx(up, rel=1e-3) and max(raster.shape) <= comparison.MAX_PIXELS
     picture = np.random.default_rng(0).random(screen.shape)
-    coarse = comparison.resampled(picture, raster.shape)
+    coarse = comparison.resample(picture, raster.shape)
     assert coarse.shape == raster.shape and coarse.sum() == pytest.approx(picture.sum())
-    even = comparison.resampled(np.ones(screen.shape), raster.shape)
+    even = comparison.resample(np.ones(screen.shape), raster.shape)
     np.testing.assert_allclose(even, even.mean())
 
 
@@ -160,7 +160,7 @@ def test_an_unknown_judge_is_named_and_a_missing_program_says_how_to_install_it(
     with pytest.raises(MachineError, match=r"pip install 'bstcad\[judges\]'"):
         commands.verify(tmp_path, against=("mitsuba",))
     monkeypatch.setattr(comparison.importlib.util, "find_spec", lambda name: name)
-    assert comparison.chosen(["mitsuba", "batoid", "mitsuba"]) == ("mitsuba", "batoid")
+    assert comparison.choose_judges(["mitsuba", "batoid", "mitsuba"]) == ("mitsuba", "batoid")
 
 
 @with_others

@@ -32,7 +32,7 @@ OUTLINES = pytest.mark.parametrize(
 def test_faces_are_those_of_the_lens(surface):
     """scipy's spline against bstcad's, in the rim's uneven spans too, and between an even grid's lines."""
     face = faces.face(surface, Circle(9.0))
-    x, y = faces.scattered(Rectangle(20.0, 20.0), 500, seed=1)
+    x, y = faces.random_points(Rectangle(20.0, 20.0), 500, seed=1)
     found = face.at(x, y)
     exact = [p.numpy() for p in surface.sag_and_slope(*map(torch.from_numpy, (x, y)))]
     np.testing.assert_allclose(np.stack([found.z, found.z_x, found.z_y]), np.stack(exact), atol=1e-12)
@@ -49,7 +49,7 @@ def test_the_mixed_derivative_is_that_of_the_slope():
 @OUTLINES
 def test_points_are_moved_onto_the_rim(outline):
     x, y = np.random.default_rng(0).uniform(-15, 15, (2, 2000))
-    inside, on_x, on_y = faces.onto(outline, x, y)
+    inside, on_x, on_y = faces.clip_to_rim(outline, x, y)
     depth = outline.depth(x, y)
     assert np.array_equal(inside, depth >= 0) and np.array_equal(on_x[inside], x[inside])
     np.testing.assert_allclose(np.hypot(on_x - x, on_y - y), np.maximum(-depth, 0), atol=1e-12)  # the nearest point

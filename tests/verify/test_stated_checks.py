@@ -12,7 +12,7 @@ from bstcad.cad.solid import lens_solid
 from bstcad.optics.quadrature import of_lens
 from bstcad.scene.mount import Part
 from bstcad.step_text import part21
-from bstcad.verify.text_checks import measures, of_part
+from bstcad.verify.text_checks import measure_checks, part_checks
 from tests.cad.conftest import encode, make_lens
 
 __all__ = ["make_lens"]
@@ -32,7 +32,7 @@ def text(lens):
 
 def checked(text, lens, part=PART):
     found = part21.parse(text)
-    return [*measures(found.properties, of_lens(lens), lens.outline), *of_part(found, part)]
+    return [*measure_checks(found.properties, of_lens(lens), lens.outline), *part_checks(found, part)]
 
 
 def test_what_is_written_is_read_and_holds(lens, text):

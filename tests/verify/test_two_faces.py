@@ -103,7 +103,7 @@ def test_a_face_that_is_off_by_a_nanometre_in_one_control_point_is_found(two, fa
     """Both readers find it by the net, and OCC by the surface, too."""
     lens, path = two.made.lens, two.folder / "lens.step"
     other = replace(lens, **{face: changed(getattr(lens, face))})
-    failed = {c.name for c in text_checks.of_lens(part21.read_lens(path), other) if not c.passed}
+    failed = {c.name for c in text_checks.lens_checks(part21.read_lens(path), other) if not c.passed}
     assert failed == {"STEP text: deviation of the control points" + " of the front" * (face == "front")}
     failed = {c.name for c in step_checks.check(path, other, 1e-8, 4096) if not c.passed}
     assert f"form: deviation of the re-read {face} from the optimised one" in failed
@@ -115,7 +115,7 @@ def test_a_file_whose_front_is_flat_is_no_lens_of_two_nets(two, tmp_path):
     lens = replace(two.made.lens, front=bstcad.Plane(8.0), shaped=None)
     folders.write_geometry(replace(two.made, lens=lens), tmp_path)()
     text = part21.read_lens(tmp_path / "lens.step")
-    failed = {check.name for check in text_checks.of_lens(text, two.made.lens) if not check.passed}
+    failed = {check.name for check in text_checks.lens_checks(text, two.made.lens) if not check.passed}
     assert failed == {"STEP text: deviation of the control points of the front"}
     nominal = checks.Nominal(two.made.scene, two.made.lens, two.made.goals)
     proof = checks.verify(tmp_path, nominal, effort=quick_effort())
