@@ -35,7 +35,7 @@ MIN_MESH_CELLS = 16  # smallest number of grid cells each way
 DEFAULT_MAX_TRIANGLES = 2_000_000  # largest number of triangles by default: 100 MB of STL
 MAX_TRIANGLES = 32_000_000  # largest number of triangles if a scene states a tolerance: 1.6 GB of STL
 GOAL_FRACTION = 0.95  # chordal error that a mesh aims at, as a fraction of the tolerance: vertices round to float32
-CELL_MARGIN = 1.1  # estimated over allowed number of cells above which a finer mesh is not tried: an estimate's error
+CELL_MARGIN = 1.1  # ratio of estimated to allowed cells above which no finer mesh is tried: the estimate's error
 WALL_NORMAL_Z = 1e-6  # largest |z| of the unit normal of a facet of the wall
 MAX_SAMPLES = 100_000_000  # largest number of points at which the facets of a mesh are compared with the lens
 FACETS_PER_BLOCK = 1 << 15  # facets processed at a time, so that their corners stay in the cache
@@ -158,7 +158,7 @@ def _has_plane_front(lens: Lens) -> bool:
 
 
 def fit_mesh(lens: Lens, tolerance: float, most: int | None = None) -> tuple[int, Mesh]:
-    """Return nearly the smallest number of cells each way that meets a chordal tolerance (mm), and that mesh.
+    """Return the number of cells each way, nearly the smallest, that meets a chordal tolerance (mm), and the mesh.
 
     most: largest number of triangles (default DEFAULT_MAX_TRIANGLES).  If they do not suffice, the finest mesh of
     DEFAULT_MAX_TRIANGLES triangles is returned, or of `most` if that is smaller.

@@ -31,7 +31,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.surfaces import Conic, Sphere
 
-PATCH_MARGIN = 1.02  # width of a patch over that of the outline: the rim touches no border of the patch
+PATCH_MARGIN = 1.02  # ratio of a patch's width to the outline's: the rim touches no border of the patch
 PARABOLA_TOLERANCE = 1e-10  # deviation (mm) from its parabola below which a sphere is written as that parabola
 
 ParameterMap = Callable[[np.ndarray, np.ndarray], np.ndarray]  # map from (x, y) in mm to (u, v) of a patch, (…, 2)
@@ -296,7 +296,7 @@ def _face_on(surface: Geom_Surface) -> TopoDS_Face:
 
 
 def _surface_of(own: bytes) -> Geom_BSplineSurface:
-    """Decode one surface: its bytes replace those of the placeholder in the file of a face."""
+    """Decode a surface from its bytes, which replace those of the placeholder in the file of a face."""
     data = _PLACEHOLDER_FILE.replace(surface_bytes(*_PLACEHOLDER_NET), own, 1)
     return BRep_Tool.Surface_s(TopoDS.Face_s(from_bytes(data)))
 

@@ -55,7 +55,7 @@ Loop = list[tuple[TopoDS_Edge, bool]]  # edges, each with True if it is used in 
 
 
 def face_inside(surface: Geom_Surface, outward: bool, *loops: Loop) -> TopoDS_Face:
-    """Return the face inside the first loop, counterclockwise from outside, and outside the others, clockwise."""
+    """Return the face inside the first loop (counterclockwise seen from outside) and outside the others (clockwise)."""
     builder, face = BRep_Builder(), TopoDS_Face()
     builder.MakeFace(face, surface, SHAPE_TOLERANCE)
     for loop in loops:

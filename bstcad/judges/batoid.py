@@ -26,7 +26,7 @@ from bstcad.optics.rays import Rays, axes
 from bstcad.optics.tilted import TiltedSurface
 from bstcad.optics.trace import launch_strips
 
-GRID_MARGIN = 0.125  # margin of a grid outside the rim over the face's width: the search for a ray may begin there
+GRID_MARGIN = 0.125  # margin of a grid outside the rim, relative to the face's width: ray searches may begin there
 POLYGON_CORNERS = 4096  # corners of the polygon of an outline with round corners
 COMPARISON_POINTS = 100_000  # points at which batoid's faces are compared with the lens's
 

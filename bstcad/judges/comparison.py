@@ -34,10 +34,10 @@ JUDGES = {"batoid": "bstcad.judges.batoid", "mitsuba": "bstcad.judges.mitsuba"}
 JUDGE_RAYS = 1 << 24  # rays of a judge, in both halves
 MAX_PIXELS = 128  # largest number of pixels along the longer side of the compared pictures
 OWN_EFFORT = Effort(accuracy=0.0, witness=False)  # effort of bstcad: as many rays as allowed, without noise
-SEED_OFFSET = 500_009  # offset from the seed of the judge's rays
-AGREEMENT_FACTOR = 1.5  # largest difference of pictures over their noise, for many pixels
+SEED_OFFSET = 500_009  # difference between the seeds of bstcad's and the judge's rays
+AGREEMENT_FACTOR = 1.5  # largest ratio of the difference of pictures to its noise, for many pixels
 MIN_NOISE = 1e-9  # smallest noise, relative to the target
-FLUX_TOLERANCE = 0.005  # difference of the light on the target over the source's; a uniform loss changes no picture
+FLUX_TOLERANCE = 0.005  # largest difference of the light on the target, as a fraction of the source's light
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Judge:
     rrmsd_ours: float | None = None  # RRMSD of bstcad's picture, of the same light on the same pixels
     difference: float | None = None  # RMS difference of the two pictures
     noise: float | None = None  # RMS noise of the difference, by the rays of both programs
-    over_noise: float | None = None  # difference over noise: about 1 if both programs are right
+    over_noise: float | None = None  # ratio of difference to noise: about 1 if both programs are right
     limit: float | None = None  # limit of over_noise
     agrees: bool | None = None  # True if all checks of the judge pass
     on_target: float | None = None  # fraction of the source's light on the target, by the judge

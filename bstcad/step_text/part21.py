@@ -51,7 +51,7 @@ UNREADABLE = (LookupError, AttributeError, TypeError, ArithmeticError)  # errors
 
 @dataclass(frozen=True)
 class FreeformSurface:
-    """A B_SPLINE_SURFACE_WITH_KNOTS as written.  A rational surface is another entity, which bstcad never writes."""
+    """A B_SPLINE_SURFACE_WITH_KNOTS as written.  Rational surfaces are other entities, and no freeform faces."""
 
     degrees: tuple[int, int]  # degrees in u and v
     control_points: np.ndarray  # control net, (m, n, 3), mm, in the frame of the file, u along the first axis

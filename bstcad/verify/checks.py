@@ -48,8 +48,8 @@ MIN_MOUNT_LOSS = 1e-3  # fraction of the light that a mount must cut away to be 
 MAX_FLANGE_LIGHT = 1e-3  # largest fraction of the light through the lens that may meet the flange
 WAVEFRONT = "wavefront error, RMS in waves, piston and tilt removed"
 DRAFT_ACCURACY = 0.01  # relative standard error of the RRMSD of a draft at which sampling ends
-MAX_FLOOR = 0.1  # largest rounding of the wavefront error over its limit; more leaves the verdict open
-TIME_LIMIT, TIME_LIMIT_PER_MB = 120.0, 3.0  # timeout of OCC (s), and s per MB of a file: a hundred times its usual time
+MAX_FLOOR = 0.1  # largest ratio of the rounding of the wavefront error to its limit; above it the verdict is open
+TIME_LIMIT, TIME_LIMIT_PER_MB = 120.0, 3.0  # timeout of OCC (s), and increase per MB: 100 times its usual time
 FINE_GRID = ", on a grid four times finer than the net"  # end of the names of checks on such a grid
 
 
