@@ -40,7 +40,7 @@ from bstcad.report.data_sheet import DataSheet
 from bstcad.report.exports import Exported
 from bstcad.report.figure_jobs import NoPictures, Pictures, draw_convergence, draw_light, draw_wavefront, light_path_of
 from bstcad.report.goal_figures import GoalFigures, figures_of
-from bstcad.report.grid_sag import Throw
+from bstcad.report.grid_sag import GridLight
 from bstcad.report.light_figures import draw_judges, draw_part
 from bstcad.report.prescription import SHEET, Order
 from bstcad.report.record import Contents, Examined, LeftOut, Report, StageRecord, contents_of, with_part
@@ -482,9 +482,9 @@ def export(folder: Path, kinds: Sequence[str], points: int | None = None) -> Exp
 def _export(made: Made, kinds: Sequence[str], folder: Path, points: int | None = None) -> Exported:
     """Write the files of some kinds of a design to a folder."""
     scene, lens = made.scene, made.lens
-    throw = Throw(scene.source.central, tuple(target.screen for target in scene.targets))
+    light = GridLight(scene.source.central, tuple(target.screen for target in scene.targets))
     return exports.export(
-        lens, kinds, folder, points=points, label=folders.label(scene), mount=scene.mount, throw=throw
+        lens, kinds, folder, points=points, label=folders.label(scene), mount=scene.mount, light=light
     )
 
 

@@ -23,7 +23,7 @@ from bstcad.cad.mesh import DEFAULT_LABEL, Label, preview_files
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import Surface, sag
-from bstcad.report.grid_sag import MAX_POINTS, MIN_POINTS, GridSag, Throw, axes, table_note
+from bstcad.report.grid_sag import MAX_POINTS, MIN_POINTS, GridLight, GridSag, axes, table_note
 from bstcad.report.units import environment, paragraphs
 from bstcad.runs import files
 from bstcad.scene.mount import Mount
@@ -69,13 +69,13 @@ class Exported:
 
 def export(
     lens: Lens, kinds: Sequence[str], folder: Path, points: int | None = None, label: Label = DEFAULT_LABEL,
-    mount: Mount | None = None, throw: Throw | None = None,
+    mount: Mount | None = None, light: GridLight | None = None,
 ) -> Exported:  # fmt: skip
     """Write the files of these kinds, except SHEET, to the folder, each completely or not at all.
 
     points: points along the wider side of grids; by default the number of control points of the back, and for
     OpticStudio the knots of the net.  label: name of meshes and of a part.  mount: mount of the part in drawings; None:
-    drawings show the outline of the lens.  throw: light that measures the error of grids and tables; None: no
+    drawings show the outline of the lens.  light: light that measures the error of grids and tables; None: no
     measurement.  ValueError names a kind or number that is not possible.
     """
     for kind in kinds:
@@ -85,7 +85,7 @@ def export(
         raise ValueError(f"{points} points per side are not possible; give {MIN_POINTS} to {MAX_POINTS}")
     lens, paths, notes = lens.plain(), [], []
     for kind in dict.fromkeys(kinds):
-        for name, data in _files(kind, lens, points, label=label, mount=mount, throw=throw):
+        for name, data in _files(kind, lens, points, label=label, mount=mount, light=light):
             files.put(folder / name, data.encode("utf-8") if isinstance(data, str) else data)
             paths.append(folder / name)
             if name.endswith(SIDECAR):
@@ -94,21 +94,21 @@ def export(
 
 
 def _files(
-    kind: str, lens: Lens, points: int | None, *, label: Label, mount: Mount | None, throw: Throw | None
+    kind: str, lens: Lens, points: int | None, *, label: Label, mount: Mount | None, light: GridLight | None
 ) -> Iterator[tuple[str, str | bytes]]:
     count = min(max(lens.back.shape), MAX_POINTS) if points is None else points
     match kind:
         case "sag":
             yield "sag.csv", sag_table(lens, count)
-            yield from _sidecar("sag", lens, count, throw)
+            yield from _sidecar("sag", lens, count, light)
         case "points":
             yield "points-front.csv", points_table(lens, lens.front, count)
             yield "points-back.csv", points_table(lens, lens.back, count)
-            yield from _sidecar("points", lens, count, throw)
+            yield from _sidecar("points", lens, count, light)
         case "zemax":  # for a front that is not a net, prescription.txt has the numbers
             for name, face in (("zemax-back", lens.back), ("zemax-front", lens.front)):
                 if face.is_net:
-                    grid = GridSag.of(lens, face, points, throw)
+                    grid = GridSag.of(lens, face, points, light)
                     yield f"{name}.dat", grid.text()
                     yield f"{name}{SIDECAR}", grid.note(f"{name}.dat") + "\n"
         case "turning":
@@ -159,13 +159,13 @@ def turning_cloud(lens: Lens, points: int, face: Surface | None = None) -> str:
     return _csv(radius_mm=radius[inside], angle_deg=angle[inside], sag_mm=height)
 
 
-def _sidecar(name: str, lens: Lens, points: int, throw: Throw | None) -> Iterator[tuple[str, str]]:
+def _sidecar(name: str, lens: Lens, points: int, light: GridLight | None) -> Iterator[tuple[str, str]]:
     """Yield (name, text) of the sidecar of a table of sags, with a sentence for each face that is a net."""
     sentences = []
     for side, face in (("front", lens.front), ("back", lens.back)):
-        if throw is not None and face.is_net:
+        if light is not None and face.is_net:
             table = f"{name}.csv, {side}" if name == "sag" else f"{name}-{side}.csv"
-            sentences.append(table_note(lens, face, table, points=points, throw=throw))
+            sentences.append(table_note(lens, face, table, points=points, light=light))
     if sentences:
         yield f"{name}{SIDECAR}", "\n".join(sentences) + "\n"
 

@@ -16,7 +16,7 @@ from bstcad.scene.scene import Scene
 from bstcad.scene.target import drawing
 from bstcad.verify.checks import Proof
 
-Share = Annotated[float, Field(ge=-1e-6, le=1 + 1e-6)]  # fraction of 1, with the rounding error of a sum
+Fraction = Annotated[float, Field(ge=-1e-6, le=1 + 1e-6)]  # fraction of 1, with the rounding error of a sum
 Size = Annotated[float, Field(ge=0, le=1e12)]
 Rrmsd = Annotated[float, Field(gt=0, le=1e3)]
 
@@ -31,9 +31,9 @@ class GoalFigures:
     rrmsd: Rrmsd  # RRMSD by the flux in each pixel
     rrmsd_standard_error: Annotated[float, Field(ge=0, le=1e3)]  # standard error of rrmsd, by independent sets of rays
     rrmsd_tent: Rrmsd | None  # RRMSD by linear binning
-    light_on_target: Share  # fraction of the source's flux on the target
-    efficiency: Share  # flux on the target over flux that leaves the back face
-    leak: Share | None  # fraction of the light on the target that is on its dark pixels; None: no dark pixels
+    light_on_target: Fraction  # fraction of the source's flux on the target
+    efficiency: Fraction  # flux on the target over flux that leaves the back face
+    leak: Fraction | None  # fraction of the light on the target that is on its dark pixels; None: no dark pixels
     contrast: Size | None  # mean irradiance of lit pixels over that of dark ones; None: no dark pixels, no leak
     unit: str = "mm"  # unit of x and y on its receiver
 
@@ -66,7 +66,7 @@ class WavefrontFigures:
     angle_rms_urad: Size  # RMS angle between rays and requested rays, weighted by flux, with tilt (µrad)
     angle_max_urad: Size  # largest angle between rays and requested rays (µrad)
     floor: Size  # upper bound of the rounding error of the RMS (waves)
-    flux: Share  # fraction of the source's flux that is measured
+    flux: Fraction  # fraction of the source's flux that is measured
     removed: Literal["piston and tilt"] = "piston and tilt"  # terms that are removed before rms and pv
 
     @classmethod

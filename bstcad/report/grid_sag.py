@@ -42,8 +42,8 @@ HIT_TOLERANCE = 1e-9  # distance from the face at the last step below which a ra
 
 
 @dataclass(frozen=True)
-class Throw:
-    """Light that measures the error of a grid."""
+class GridLight:
+    """Light by which the error of a grid is measured."""
 
     source: Emitter  # point source or parallel beam of one wavelength
     screens: tuple[Screen, ...]
@@ -209,15 +209,15 @@ def on_grid(face: BSplineSurface, x: np.ndarray, y: np.ndarray) -> tuple[np.ndar
 
 
 @torch.no_grad()
-def shift_between(lens: Lens, other: Lens, throw: Throw) -> Shift | None:
+def shift_between(lens: Lens, other: Lens, light: GridLight) -> Shift | None:
     """Return the shift between the light of two lenses on the target where it is largest in pixels.
 
     None: no light reaches a target.
     """
     found = []
-    for screen in throw.screens:
+    for screen in light.screens:
         square = weight = largest = 0.0
-        for rays in launch_strips(throw.source, lens, RAYS, 0):
+        for rays in launch_strips(light.source, lens, RAYS, 0):
             one, two = (trace(rays, each, screen.plane) for each in (lens, other))
             flux = torch.where(one.alive & two.alive, one.flux, torch.zeros_like(one.flux))
             squares = torch.where(flux > 0, ((two.position - one.position) ** 2).sum(0), torch.zeros_like(flux))
@@ -228,11 +228,11 @@ def shift_between(lens: Lens, other: Lens, throw: Throw) -> Shift | None:
     return max(found, key=lambda each: each.rms / each.pixel, default=None)
 
 
-def shift_by_patches(lens: Lens, face: Surface, patches: Patches, throw: Throw) -> Shift | None:
+def shift_by_patches(lens: Lens, face: Surface, patches: Patches, light: GridLight) -> Shift | None:
     """Return the shift of the light if these patches replace one face of a lens; None: no light reaches a target."""
     plain = replace(lens, losses=None).shaping("back")
     other = plain.with_back(patches) if face is lens.back else plain.with_front(patches)
-    return shift_between(plain, other, throw)
+    return shift_between(plain, other, light)
 
 
 # ---- the file --------------------------------------------------------------------------------------------------------
@@ -247,23 +247,23 @@ class GridSag:
     shift: Shift | None  # None: not measured, or no light reaches the target
 
     @classmethod
-    def of(cls, lens: Lens, face: BSplineSurface, points: int | None = None, throw: Throw | None = None) -> GridSag:
+    def of(cls, lens: Lens, face: BSplineSurface, points: int | None = None, light: GridLight | None = None) -> GridSag:
         """Return a grid with this number of points along the wider side of the outline, or by default at the knots."""
         if points is not None:
-            return cls._at(lens, face, axes(lens.outline, max(points, MIN_ZEMAX_POINTS), MIN_ZEMAX_POINTS), throw)
+            return cls._at(lens, face, axes(lens.outline, max(points, MIN_ZEMAX_POINTS), MIN_ZEMAX_POINTS), light)
         grids = [at for parts in CELLS_PER_SPAN if (at := through_knots(face, lens.outline, parts)) is not None]
         flush = [(x, y) for x, y in grids[:2] if _is_flush(x, y, lens.outline) and len(x) * len(y) <= MAX_FLUSH_POINTS]
         best = None
         for at in (*flush, *grids):
-            best = cls._at(lens, face, at, throw)
+            best = cls._at(lens, face, at, light)
             if best.shift is None or best.shift.maximum <= MAX_SHIFT * best.shift.pixel:
                 return best
-        return best or cls.of(lens, face, min(2 * max(face.shape), MAX_POINTS), throw)
+        return best or cls.of(lens, face, min(2 * max(face.shape), MAX_POINTS), light)
 
     @classmethod
-    def _at(cls, lens: Lens, face: BSplineSurface, at: tuple[np.ndarray, np.ndarray], throw: Throw | None) -> GridSag:
+    def _at(cls, lens: Lens, face: BSplineSurface, at: tuple[np.ndarray, np.ndarray], light: GridLight | None) -> GridSag:
         found = cls(face, Grid(*at, on_grid(face, *at)), None)
-        return found if throw is None else replace(found, shift=shift_by_patches(lens, face, found.patches, throw))
+        return found if light is None else replace(found, shift=shift_by_patches(lens, face, found.patches, light))
 
     @property
     def patches(self) -> Patches:
@@ -297,9 +297,9 @@ class GridSag:
         return f"{size}; bicubic interpolation moves the light on the target by {self.shift}{advice}."
 
 
-def table_note(lens: Lens, face: Surface, name: str, *, points: int, throw: Throw) -> str:
+def table_note(lens: Lens, face: Surface, name: str, *, points: int, light: GridLight) -> str:
     """Return a sentence on the shift of the light by a bicubic spline through the heights of a table of sags."""
-    by = shift_by_patches(lens, face, Patches.through(face, *axes(lens.outline, points)), throw)
+    by = shift_by_patches(lens, face, Patches.through(face, *axes(lens.outline, points)), light)
     if by is None:
         return f"{name}: no light reaches the target."
     coarse = "; zemax-back.dat and lens.step are exact" if by.maximum > MAX_SHIFT * by.pixel else ""

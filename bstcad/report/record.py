@@ -34,7 +34,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.reach import unreached
 from bstcad.optics.receivers import LevelPlane
-from bstcad.report.goal_figures import GoalFigures, Rrmsd, Share, Size, WavefrontFigures, figures_of, flat_tops
+from bstcad.report.goal_figures import Fraction, GoalFigures, Rrmsd, Size, WavefrontFigures, figures_of, flat_tops
 from bstcad.report.light_figures import rrmsd
 from bstcad.report.prescription import Order, prescription
 from bstcad.report.units import DIGITS, Remark, Rows, number, paragraphs, percent, tables
@@ -109,7 +109,7 @@ class LineFigures:
     """The light of one spectral line alone."""
 
     wavelength: Size  # nm
-    share: Share  # fraction of all light
+    share: Fraction  # fraction of all light
     rrmsd: Rrmsd  # RRMSD of the line's picture against the target
 
 
@@ -166,9 +166,9 @@ class Contents:
     rrmsd: Rrmsd  # RRMSD of the irradiance against the target, by the flux in each pixel
     rrmsd_tent: Rrmsd | None  # RRMSD by linear binning
     rrmsd_noise: Annotated[float, Field(ge=0, le=1e3)]  # standard error of rrmsd
-    light_on_target: Share  # fraction of the source's flux on the target
-    efficiency: Share  # flux on the target over flux that leaves the back face
-    flux: Mapping[str, Share]  # flux ledger: fractions of the source's flux, with sum 1
+    light_on_target: Fraction  # fraction of the source's flux on the target
+    efficiency: Fraction  # flux on the target over flux that leaves the back face
+    flux: Mapping[str, Fraction]  # flux ledger: fractions of the source's flux, with sum 1
     prescription: Mapping[str, Any]  # every surface as it was designed
     seconds_total: Seconds  # time from the command to the verified lens
     stages: Annotated[tuple[StageRecord, ...], Field(max_length=100), FailFast()]  # stages in their order
@@ -183,7 +183,7 @@ class Contents:
     # unreachable part of the target: area (fraction of the target), light (fraction of the picture), angle (degrees;
     # largest deflection by a face of the index; None: a mirror); None: light reaches all of it
     unreachable: Mapping[str, Size | None] | None = None
-    leak: Share | None = None  # fraction of the light on the target that is on its dark pixels; None: no dark pixels
+    leak: Fraction | None = None  # fraction of the light on the target that is on its dark pixels; None: no dark pixels
     contrast: Size | None = None  # mean irradiance of lit pixels over that of dark ones; None: no dark pixels, no leak
     optic: Literal["lens", "mirror"] = "lens"  # kind of the design
     quality: str | None = None  # tailoring.quality

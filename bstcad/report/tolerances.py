@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field
 from typing_extensions import TypedDict
 
-from bstcad.report.record import STRICT, Rrmsd, Share, Size, plain, read_as
+from bstcad.report.record import STRICT, Fraction, Rrmsd, Size, plain, read_as
 from bstcad.report.report import BEGIN, END, base64_images
 from bstcad.report.units import about, amount, environment, paragraphs, percent
 from bstcad.runs import files
@@ -33,7 +33,7 @@ MIN_FRACTION = 1e-3  # fraction of the change of the picture below which an erro
 WIDEST = 10.0  # largest factor on the width of an error in the search for the loosest tolerances
 MAX_NAMED_ERRORS = 3  # number of errors that are named per trial
 
-Yield = tuple[Share, Share, Share]  # lower bound, estimate and upper bound of the yield (95 % Wilson interval)
+Yield = tuple[Fraction, Fraction, Fraction]  # lower bound, estimate and upper bound of the yield (95 % Wilson interval)
 Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
 Width = Annotated[float, Field(gt=0, le=1e6)]
 Spread = TypedDict("Spread", {"5 %": Size, "50 %": Size, "95 %": Size})  # percentiles of RRMSD
@@ -63,7 +63,7 @@ class Sensitivity:
     cost: Width  # relative cost of the limit (default 1)
     sigma: Width  # standard deviation, in `unit`
     rrmsd_change: float  # change of RRMSD by one sigma; with several targets, on the one that changes most
-    share: Share  # fraction of the mean square change of the picture (of all pictures) by all errors
+    share: Fraction  # fraction of the mean square change of the picture (of all pictures) by all errors
     wavefront_change: float | None = None  # change of the RMS wavefront error by one sigma (waves); None: no wave
 
 
@@ -80,7 +80,7 @@ class Trial:
 class Inverse:
     """Loosest tolerances for a requested yield, by superposed pictures."""
 
-    wanted: Share  # requested yield
+    wanted: Fraction  # requested yield
     passed: Annotated[Yield, Field(alias="yield")]  # yield of new trials with these tolerances
     limits: Mapping[str, Width]  # width of each error, as Sensitivity.limit
 

@@ -126,8 +126,8 @@ def test_report_json_tells_the_wavefront_and_reads_back(one):
 
 def test_the_page_the_terminal_and_the_figures_show_it(one):
     page = (one.folder / "report.html").read_text(encoding="utf-8")
-    assert page.count("<h2>Wavefront</h2>") == 1 and page.count("Optical path differences in waves") == 1
-    assert "RMS, piston and tilt removed" in page and "Floor: what rounding may add" in page
+    assert page.count("<h2>Wavefront</h2>") == 1 and page.count("optical path difference in waves") == 1
+    assert "RMS, piston and tilt removed" in page and "Rounding error of the RMS" in page
     assert (one.folder / "figures" / "wavefront.png").read_bytes().startswith(b"\x89PNG")
     console = Console(width=400)
     with console.capture() as shown:
