@@ -40,6 +40,8 @@ NEWTON_STEPS = 12  # steps of Newton's method to the intersection with the patch
 MIN_DERIVATIVE = 1e-6  # lower bound of the derivative by which a step of Newton's method is divided
 HIT_TOLERANCE = 1e-9  # distance from the face at the last step below which a ray has met it (mm)
 
+Pair = tuple[np.ndarray, np.ndarray]  # x and y of the points of a grid (mm)
+
 
 @dataclass(frozen=True)
 class GridLight:
@@ -261,7 +263,7 @@ class GridSag:
         return best or cls.of(lens, face, min(2 * max(face.shape), MAX_POINTS), light)
 
     @classmethod
-    def _at(cls, lens: Lens, face: BSplineSurface, at: tuple[np.ndarray, np.ndarray], light: GridLight | None) -> GridSag:
+    def _at(cls, lens: Lens, face: BSplineSurface, at: Pair, light: GridLight | None) -> GridSag:
         found = cls(face, Grid(*at, on_grid(face, *at)), None)
         return found if light is None else replace(found, shift=shift_by_patches(lens, face, found.patches, light))
 
