@@ -15,9 +15,9 @@ from typing import Any
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "reference"
-RECORDS = {  # of each JSON file: the module's file and its records, the file's own record first
+RECORDS = {  # JSON file: (module, names of its records), with the record of the file first
     "report.json": [
-        ("report/record.py", ["Contents", "Stage", "Point", "PrecisionTest", "Line", "LeftOut"]),
+        ("report/record.py", ["Contents", "StageRecord", "CurvePoint", "PrecisionTest", "LineFigures", "LeftOut"]),
         ("report/goal_figures.py", ["GoalFigures", "WavefrontFigures"]),
         ("analysis/top_hat.py", ["FlatTop"]),
         ("verify/verdict.py", ["Check"]),
@@ -139,12 +139,12 @@ def command_line() -> str:
 
 
 def json_files() -> str:
-    """The page of report.json and the other JSON files: a table a record, from its fields and their comments."""
+    """Return the page of report.json and the other JSON files: one table per record, from its fields and comments."""
     page = [
         "# JSON files",
         "",
         "Programs read these files; each is written from, and read back into, the records below. `None` is `null`;",
-        "lengths are in mm, angles in degrees, times in s, shares are parts of 1, if the meaning names no other unit.",
+        "lengths are in mm, angles in degrees, times in s, and a `Fraction` is one of 1, unless the meaning says otherwise.",
     ]
     for name, files in RECORDS.items():
         page += ["", f"## {name}", ""]
@@ -156,7 +156,7 @@ def json_files() -> str:
 
 
 def record_table(source: str, name: str) -> list[str]:
-    """A record as a section of the page: its docstring, and of each field the type and the comment."""
+    """Return a record as a section of the page: its docstring, and type and comment of each field."""
     [record] = [node for node in ast.parse(source).body if isinstance(node, ast.ClassDef) and node.name == name]
     comments = {
         token.start[0]: token.string.lstrip("# ")
