@@ -186,12 +186,12 @@ class Contents:
     leak: Fraction | None = None  # fraction of the light on the target that is on its dark pixels; None: no dark pixels
     contrast: Size | None = None  # mean irradiance of lit pixels over that of dark ones; None: no dark pixels, no leak
     optic: Literal["lens", "mirror"] = "lens"  # kind of the design
-    quality: str | None = None  # tailoring.quality
+    quality: str | None = None  # tailoring.quality of the scene
     # grid, iterations, mass error, reason to stop; fraction of light and largest slope (degrees) of analysis.steepness
     transport: Mapping[str, Scalar] | None = None
     skipped_steps: Annotated[int, Field(ge=0)] | None = None  # number of steps with a gradient that is not finite
     stopped: str | None = None  # reason why tailoring ended
-    twins: PrecisionTest | None = None  # None: there was no time for the test
+    twins: PrecisionTest | None = None  # float32 against float64; None: there was no time for it
     rrmsd_asked: Size | None = None  # accept.rrmsd of the scene; None: no limit
     rays_traced: int | None = None  # number of all rays of the verification
     shape: Mapping[str, float | None] | None = None  # thickness, radii (mm), slope (degrees), volume (mm³) …

@@ -144,7 +144,7 @@ def json_files() -> str:
         "# JSON files",
         "",
         "Programs read these files; each is written from, and read back into, the records below. `None` is `null`;",
-        "lengths are in mm, angles in degrees, times in s, and a `Fraction` is one of 1, unless the meaning says otherwise.",
+        "lengths are in mm, angles in degrees, times in s, a `Fraction` is one of 1, unless the meaning names a unit.",
     ]
     for name, files in RECORDS.items():
         page += ["", f"## {name}", ""]
