@@ -43,7 +43,7 @@ def test_a_preview_is_near_the_finished_draft(name, lit):
     assert found.flux["on target"] > 0.9
     shown, spread = dict(figures(found)), SHAPE_ERROR if lit else DARK_SHAPE_ERROR
     assert (found.lit_fraction >= MIN_LIT_FRACTION) is lit
-    assert shown["Smallest radius, steepest slope"].startswith("known once") and not any(
+    assert shown["Smallest radius, steepest slope"].startswith("known after") and not any(
         "tool" in name for name in shown
     )
     shape, finished = found.shape, describe(made.lens, 65)

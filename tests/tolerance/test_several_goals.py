@@ -125,7 +125,7 @@ def test_it_is_written_read_and_said(several, capsys, monkeypatch):
     assert facts["wavefront"]["limit"] > 0 and "yield_full" in facts["wavefront"]
     assert "wavefront_change" in facts["sensitivities"][0]
     page = (folder / "report.html").read_text()
-    assert "on each of 2 targets and to" in page and "<p>On target[1], at z = " in page and "Waves RMS by one σ" in page
+    assert "on each of 2 targets and" in page and "<p>On target[1], at z = " in page and "Waves RMS by one σ" in page
     monkeypatch.setattr(tolerancing, "tolerance", lambda *given, **more: found)
     assert cli.run(["tolerance", str(folder)]) == 0
     said = capsys.readouterr().out
