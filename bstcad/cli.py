@@ -36,7 +36,7 @@ with signals.exit_on_signal():  # these libraries load for a quarter of a second
 if TYPE_CHECKING:
     from bstcad.report.record import Contents, Examined
     from bstcad.scene.scene import Scene
-    from bstcad.sweep.batch import Wanted
+    from bstcad.sweep.batch import BatchScene
 
 START_TIME = time.perf_counter()  # before the heavy libraries load, whose time counts as the command's
 INTERRUPTED, INTERNAL_ERROR = 130, 70  # exit codes of Ctrl-C and of a fault of bstcad
@@ -514,17 +514,17 @@ def scene_paths(patterns: list[str]) -> list[Path]:
     return list(found.values())
 
 
-def _load_or_refuse(path: Path, changes: dict[str, Any]) -> Wanted:
+def _load_or_refuse(path: Path, changes: dict[str, Any]) -> BatchScene:
     """Return the scene of a file, or the sentence that refuses it."""
     from bstcad.scene.scene import load
-    from bstcad.sweep.batch import Wanted
+    from bstcad.sweep.batch import BatchScene
 
     try:
         scene = load(path, changes)
     except (SceneError, OSError) as error:
-        return Wanted(str(path), None, sentence_of(error))
+        return BatchScene(str(path), None, sentence_of(error))
     warn(scene, f"{path}: ")
-    return Wanted(str(path), scene)
+    return BatchScene(str(path), scene)
 
 
 # --- keys of a scene --------------------------------------------------------------------------------------------------

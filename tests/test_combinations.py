@@ -32,7 +32,7 @@ from bstcad.report.figure_jobs import NoPictures
 from bstcad.scene.blank import as_front, net_extent
 from bstcad.scene.errors import SceneError
 from bstcad.sweep.plan import plan
-from bstcad.sweep.prediction import Pilot, fly, made_small, of_quality, usual
+from bstcad.sweep.prediction import Pilot, pilot_scene, run_pilot, typical_seconds, with_quality
 from tests.conftest import verify_with
 
 # --- the choices ------------------------------------------------------------------------------------------------------
@@ -318,14 +318,16 @@ COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which f
     "analysis.neglected_effects": {"FACE_POINTS": 24, "GHOST_RAYS": 32},
     "analysis.shape": {"GRID_POINTS": 257},
     "app.preview": {"IMAGE_POINTS": 6, "TRANSPORT_CELLS": 16, "LEDGER_RAYS": 32, "SHAPE_POINTS": 33},
-    "sweep.estimates": {"NET": 17, "CELLS": 16, "PIXELS": 24, "FRONT_NET": 9, "STEPS": 5},
-    "sweep.net_choice": {"TUBES": 64},
+    "sweep.estimates": {
+        "COARSE_POINTS": 17, "COARSE_CELLS": 16, "COARSE_PIXELS": 24, "FRONT_NET": 9, "COARSE_STEPS": 5,
+    },
+    "sweep.net_choice": {"DENSITY_TUBES": 64},
     "sweep.prediction": {
-        "CELLS": (16, 16), "LARGEST": (24, 17, 48), "JUDGED": Effort(96, accuracy=1.0, witness=False),
-        "FLOWN": ("draft",),
+        "PILOT_CELLS": (16, 16), "PILOT_LIMITS": (24, 17, 48),
+        "PILOT_EFFORT": Effort(96, accuracy=1.0, witness=False), "PILOT_QUALITIES": ("draft",),
     },
     "verify.checks": {"LINE_TUBES": 65},
-    "sweep.plan": {"FLOWN": ("draft",)},
+    "sweep.plan": {"PILOT_QUALITIES": ("draft",)},
 }
 
 
@@ -340,14 +342,14 @@ FLOWN = 3  # number of scenes of which one has a real pilot; each has the small 
 
 
 def piloted():
-    """`fly` for some scenes: a pilot is one more design, of the same choices."""
+    """`run_pilot` for some scenes: a pilot is one more design, of the same choices."""
     scenes = itertools.count()
 
     def pilot(scene, quality, tick):
-        small, factor = made_small(of_quality(scene, quality))
+        small, factor = pilot_scene(with_quality(scene, quality))
         if next(scenes) % FLOWN == 0:
-            return fly(scene, quality, tick)
-        return Pilot(small, usual(small), 0.1, factor=factor, detail=0.0, blurred=0.0, steep=Steepness(0.0, 0.0))
+            return run_pilot(scene, quality, tick)
+        return Pilot(small, typical_seconds(small), 0.1, factor=factor, detail=0.0, blur=0.0, steep=Steepness(0.0, 0.0))
 
     return pilot
 
@@ -357,7 +359,7 @@ def quick():
     """Few rays and tubes, and no figures."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bstcad.commands.Pictures", Words)
-        patch.setattr("bstcad.sweep.plan.fly", piloted())
+        patch.setattr("bstcad.sweep.plan.run_pilot", piloted())
         verify_with(patch, EFFORT)
         for where, figures in COARSE.items():
             for name, figure in figures.items():

@@ -253,8 +253,8 @@ OUTLIER_THRESHOLD = 6.0  # minimum deviation of an outlier in standard deviation
 MAD_TO_SIGMA = 1.4826  # standard deviation over median absolute deviation (MAD) of a normal distribution
 CAUCHY_SCALE = 2.0  # residual, in standard deviations, at which a neighbour's weight is one half
 REWEIGHTING_ROUNDS = 3  # iterations of the neighbours' weights
-CHUNK = 20_000  # number of points that are judged at a time, which bounds the memory
-MIN_NOISE = 1e-6  # lower bound of the noise, mm: below any measurement, above rounding
+POINT_CHUNK = 20_000  # number of points that are judged at a time, which bounds the memory
+MIN_POINT_NOISE = 1e-6  # lower bound of the noise, mm: below any measurement, above rounding
 
 
 def find_outliers(
@@ -269,11 +269,11 @@ def find_outliers(
     if len(points) <= NEIGHBOURS or not len(which):
         return outliers, noise or 0.0
     tree = cKDTree(points[:, :2])
-    parts = (_neighbour_planes(tree, distances, which[k : k + CHUNK]) for k in range(0, len(which), CHUNK))
+    parts = (_neighbour_planes(tree, distances, which[k : k + POINT_CHUNK]) for k in range(0, len(which), POINT_CHUNK))
     off, spread, similar = map(np.concatenate, zip(*parts, strict=True))
     if noise is None:
         noise = MAD_TO_SIGMA * float(np.median(np.abs(off)))
-    outlying = np.abs(off) > OUTLIER_THRESHOLD * np.maximum(spread, noise) + MIN_NOISE
+    outlying = np.abs(off) > OUTLIER_THRESHOLD * np.maximum(spread, noise) + MIN_POINT_NOISE
     outliers[which] = outlying & (similar < MIN_CLUSTER)
     return outliers, noise
 
@@ -291,11 +291,11 @@ def _neighbour_planes(
     near = near[:, 1:]  # without the point itself
     nearby = distances[near]
     across = tree.data[near] - positions[:, None]
-    size = np.abs(across).max(axis=(1, 2))[:, None, None] + MIN_NOISE
+    size = np.abs(across).max(axis=(1, 2))[:, None, None] + MIN_POINT_NOISE
     columns = np.concatenate([np.ones_like(nearby)[..., None], across / size], axis=2)
     left = nearby - np.median(nearby, axis=1)[:, None]
     for _ in range(REWEIGHTING_ROUNDS):
-        spread = MAD_TO_SIGMA * np.median(np.abs(left), axis=1)[:, None] + MIN_NOISE
+        spread = MAD_TO_SIGMA * np.median(np.abs(left), axis=1)[:, None] + MIN_POINT_NOISE
         weighted = columns / (1 + (left / (CAUCHY_SCALE * spread)) ** 2)[..., None]
         normal = np.einsum("nki,nkj->nij", weighted, columns) + 1e-6 * np.eye(3)  # neighbours may lie on a line
         plane = np.linalg.solve(normal, np.einsum("nki,nk->ni", weighted, nearby)[..., None])

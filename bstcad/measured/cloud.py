@@ -16,7 +16,7 @@ from bstcad.runs import files
 MAX_FILE_SIZE = 1_000_000_000  # bytes
 MIN_POINTS = 100  # minimum number of points: six degrees of freedom and a form are fitted to them
 MESH_SUFFIXES = (".ply", ".stl")
-UNITS = {"inches": 1 / INCH, "metres": 1e-3, "micrometres": 1e3}  # 1 mm in each unit
+UNIT_SIZES = {"inches": 1 / INCH, "metres": 1e-3, "micrometres": 1e3}  # 1 mm in each unit
 PLAUSIBLE_RATIOS = (0.3, 1.7)  # extent of a cloud over that of the lens: half of a lens, or a lens with its fixture
 
 
@@ -72,7 +72,7 @@ def in_millimetres(points: np.ndarray, outline: Outline) -> tuple[np.ndarray, st
     smallest, largest = PLAUSIBLE_RATIOS
     if smallest <= extent / width <= 5 * largest:
         return points, "mm"
-    unit = next((unit for unit, size in UNITS.items() if smallest <= extent / width / size <= largest), None)
+    unit = next((unit for unit, size in UNIT_SIZES.items() if smallest <= extent / width / size <= largest), None)
     if unit == "inches":
         return points * INCH, unit
     lens_width = f"and the lens is {width:.3g} mm wide"

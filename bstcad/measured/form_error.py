@@ -26,13 +26,13 @@ from bstcad.optics.lens import Lens
 
 POLYNOMIAL_DEGREE = 2
 NET_MARGIN = 0.2  # margin of the field's net around the face, in sides, because cosines have zero slope at its ends
-POINTS_PER_CELL = 6.0  # mean number of points in a cell of the net
-NET_LIMITS = (9, 513)  # minimum and maximum number of control points per side
+POINTS_PER_NET_CELL = 6.0  # mean number of points in a cell of the net
+FIELD_NET_LIMITS = (9, 513)  # minimum and maximum number of control points per side
 MAX_REFINEMENT = 4  # maximum ratio of control points per side to the net of the lens, since the nets are not nested
 BANDS_PER_OCTAVE = 4
 SPECTRUM_ROUNDS = 8  # alternating estimates of field and spectrum
 FIRST_MOTION_ROUND = 3  # round from which the spectrum is good enough to weight the motions
-MAX_CG_STEPS, CG_TOLERANCE = 30, 1e-4  # maximum steps of conjugate gradients, and relative tolerance of the residual
+MAX_FIELD_STEPS, FIELD_TOLERANCE = 30, 1e-4  # maximum steps of conjugate gradients, and their relative tolerance
 DETECTION_SIGMAS = 3.0  # excess over noise, in standard deviations, at which a band of frequencies contains form
 UNDETECTED_VARIANCE = 1e-4  # variance of a band without detected form, relative to the noise
 MAX_RELIEF_UNCERTAINTY = 0.001  # uncertainty by fine relief, in half widths, above which a motion stays zero
@@ -62,7 +62,7 @@ class FormError:
     def add_to(self, surface: BSplineSurface) -> BSplineSurface:
         """Return `surface` plus this form error, interpolated at the control points of the finer of both nets."""
         sides = [
-            own if count <= own else max(count, min(MAX_REFINEMENT * own, NET_LIMITS[1]))
+            own if count <= own else max(count, min(MAX_REFINEMENT * own, FIELD_NET_LIMITS[1]))
             for count, own in zip(self.random_field.shape, surface.shape, strict=True)
         ]
         finer = surface.refined((sides[0], sides[1]))
@@ -95,7 +95,7 @@ def fit_form_error(face: Face, alignment: Alignment) -> FormError:
     targets -= smooth @ coefficients
     sides = [(low - NET_MARGIN * (high - low), high + NET_MARGIN * (high - low)) for low, high in (back.x, back.y)]
     covered = face.lens.outline.area / np.prod([high - low for low, high in sides])
-    m = scipy.fft.next_fast_len(int(np.clip(np.sqrt(n / POINTS_PER_CELL / covered), *NET_LIMITS)), real=True)
+    m = scipy.fft.next_fast_len(int(np.clip(np.sqrt(n / POINTS_PER_NET_CELL / covered), *FIELD_NET_LIMITS)), real=True)
     net = BSplineSurface(0.0, torch.zeros(m, m, dtype=torch.float64), *sides)
     u, v = ((t - low) / (high - low) * (m - 1) for t, (low, high) in zip((x, y), sides, strict=True))
     heights, spread, noise, motion = _field(net, _basis_rows(u, v, m), targets[:, 0], targets[:, 1:], reach=face.reach)
@@ -210,7 +210,7 @@ def _posterior_mean(
     operator = LinearOperator((m * m, m * m), matvec=product, dtype=np.float64)
     right = (root * scipy.fft.dctn(right_side.reshape(m, m), norm="ortho") / noise2).ravel()
     guess = None if start is None else (start / root).ravel()
-    scaled_mean, _ = cg(operator, right, guess, rtol=CG_TOLERANCE, maxiter=MAX_CG_STEPS)
+    scaled_mean, _ = cg(operator, right, guess, rtol=FIELD_TOLERANCE, maxiter=MAX_FIELD_STEPS)
     return root * scaled_mean.reshape(m, m)
 
 
@@ -239,7 +239,7 @@ def _bands(frequency: np.ndarray) -> tuple[np.ndarray, int]:
 
 # --- figures of a deviation -------------------------------------------------------------------------------------------
 
-MAP_POINTS = 301  # number of points each way of the deviation map
+DEVIATION_MAP_POINTS = 301  # number of points each way of the deviation map
 ZERNIKE_ORDER = 10  # maximum n + |m| of the 36 terms of the fringe set
 ZERNIKE_FIT_POINTS = 50_000  # approximate number of points to which the terms are fitted
 MAP_FILES = ("deviation.npz", "deviation.csv")  # file names of the deviation map
@@ -268,8 +268,8 @@ class Deviation:
     noise: float  # RMS noise of the points
     worst: tuple[float, float]  # x, y of the point with the largest deviation
     bands: tuple[Band, ...]
-    x: np.ndarray = field(repr=False)  # coordinates of the map's columns (MAP_POINTS,)
-    y: np.ndarray = field(repr=False)  # coordinates of the map's rows (MAP_POINTS,)
+    x: np.ndarray = field(repr=False)  # coordinates of the map's columns (DEVIATION_MAP_POINTS,)
+    y: np.ndarray = field(repr=False)  # coordinates of the map's rows (DEVIATION_MAP_POINTS,)
     form: np.ndarray = field(repr=False)  # map of the fitted form (rows y, columns x), NaN outside the outline
 
 
@@ -283,7 +283,7 @@ def map_files(made: Deviation) -> dict[str, bytes]:
 
 def deviation(lens: Lens, alignment: Alignment, form: FormError) -> Deviation:
     """Return the figures of a made face."""
-    axes = [np.linspace(-a, a, MAP_POINTS) for a in lens.outline.half_extent]
+    axes = [np.linspace(-a, a, DEVIATION_MAP_POINTS) for a in lens.outline.half_extent]
     x, y = np.meshgrid(*axes)
     inside = lens.outline.contains(torch.from_numpy(x), torch.from_numpy(y)).numpy()
     x, y = x[inside], y[inside]

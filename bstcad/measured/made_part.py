@@ -28,7 +28,7 @@ MIN_DESIGN_RELIEF = 3e-5  # RMS fine relief, in half widths, that a design needs
 SCALE_TOLERANCE = 2e-4  # tolerance of the scale, about a thermal expansion
 SCALE_SIGMAS = 3.0  # tolerance of the scale, in standard uncertainties, if that is larger
 MIN_COVERAGE = 0.8  # minimum fraction of the face that is measured; elsewhere the form is a guess
-POINTS_PER_CELL = 20  # mean number of points in a cell of the grid from which the coverage is counted
+COVERAGE_POINTS = 20  # mean number of points in a cell of the grid from which the coverage is counted
 RELIEF_POINTS = 20_000  # maximum number of points from which the fine relief is estimated
 MAX_OUTLIER_FRACTION = 0.1  # fraction of outliers near the face above which face and outliers are indistinguishable
 
@@ -173,7 +173,7 @@ def _relief(face: Face, points: np.ndarray) -> float | None:
 
 def _coverage(lens: Lens, points: np.ndarray) -> float:
     """Return the fraction of equal cells over the outline that contain points."""
-    cells = int(np.clip(np.sqrt(len(points) / POINTS_PER_CELL), 4, 64))
+    cells = int(np.clip(np.sqrt(len(points) / COVERAGE_POINTS), 4, 64))
     edges = [np.linspace(-a, a, cells + 1) for a in lens.outline.half_extent]
     measured = np.histogram2d(points[:, 0], points[:, 1], bins=edges)[0] > 0
     middles = np.meshgrid(*((edge[:-1] + edge[1:]) / 2 for edge in edges), indexing="ij")

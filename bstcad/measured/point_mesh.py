@@ -15,7 +15,7 @@ import numpy as np
 from bstcad.measured.point_text import MeasuredPoints, make_points
 
 EXPORT_HINT = "export it again"
-TYPES = {  # number types of PLY and of numpy
+PLY_TYPES = {  # number types of PLY and of numpy
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
@@ -92,10 +92,10 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
                 form = name
             case ["element", name, count] if re.fullmatch(r"\d{1,18}", count):
                 elements.append(_Element(name, int(count), ()))
-            case ["property", "list", length, kind, name] if elements and {length, kind} <= TYPES.keys():
-                elements[-1] = _add_property(elements[-1], name, TYPES[kind], TYPES[length])
-            case ["property", kind, name] if elements and kind in TYPES:
-                elements[-1] = _add_property(elements[-1], name, TYPES[kind], "")
+            case ["property", "list", length, kind, name] if elements and {length, kind} <= PLY_TYPES.keys():
+                elements[-1] = _add_property(elements[-1], name, PLY_TYPES[kind], PLY_TYPES[length])
+            case ["property", kind, name] if elements and kind in PLY_TYPES:
+                elements[-1] = _add_property(elements[-1], name, PLY_TYPES[kind], "")
             case ["ply"] | ["comment" | "obj_info", *_] | []:
                 pass
             case _:

@@ -30,7 +30,7 @@ ACTUAL_WORDS = {"act", "actual", "meas", "measured", "ist", "istwert", "messwert
 NOMINAL_WORDS = {"nom", "nominal", "soll", "sollwert", "theo", "theoretical", "cad", "ref", "reference"}
 HEADING_LINES = 50  # number of lines that are searched for a heading
 SAMPLE_LINES = 200  # number of lines from which the columns are inferred if there is no heading
-MAX_COORDINATE = 1e6  # largest coordinate (mm) that is accepted; a larger one is an error of the file
+MAX_POSITION = 1e6  # largest coordinate (mm) that is accepted; a larger one is an error of the file
 FOREIGN_FORMATS = {  # first bytes of files that hold no points as text
     b"PK\x03\x04": "a zip archive, such as X3P", b"aISO-": "an SDF file (ISO 25178-71)", b"bISO-": "an SDF file (ISO "
     "25178-71)", b"VCA DATA": "an OPD file of an interferometer", b"\x89HDF": "an HDF5 file, such as DATX",
@@ -58,17 +58,17 @@ class MeasuredPoints:
 
 
 def make_points(positions: np.ndarray, where: Sequence[int] | None = None, columns: str = "") -> MeasuredPoints:
-    """Return the points with data; raise ValueError for a coordinate above MAX_COORDINATE.
+    """Return the points with data; raise ValueError for a coordinate above MAX_POSITION.
 
     where: line number of each point; None: the message states the number of the point.
     """
     missing = np.isnan(positions).any(axis=1)
-    excessive = ~(np.abs(positions) <= MAX_COORDINATE) & ~np.isnan(positions)
+    excessive = ~(np.abs(positions) <= MAX_POSITION) & ~np.isnan(positions)
     if excessive.any():
         row, axis = np.argwhere(excessive)[0]
         place = f"point {row + 1}" if where is None else f"line {where[row]}"
         raise ValueError(
-            f"{place}: {'xyz'[axis]} = {positions[row, axis]:.4g} mm exceeds {MAX_COORDINATE:.0f} mm; state another "
+            f"{place}: {'xyz'[axis]} = {positions[row, axis]:.4g} mm exceeds {MAX_POSITION:.0f} mm; state another "
             "unit in the heading, or leave out points that were not measured"
         )
     return MeasuredPoints(positions[~missing], int(missing.sum()), columns)

@@ -1,7 +1,7 @@
-"""Designs in cold processes: their seconds and their error, the calibration of this machine, and records on disk.
+"""Run designs in cold processes, measure their time and error, calibrate this machine, and store records on disk.
 
-A run takes the seconds of the whole command: imports, picture, tailoring, writing and proof.  One reference judges the
-lenses of all runs: stratified rays on the pixels of the base scene.
+The time of a run is that of the whole command: imports, picture, tailoring, writing and proof.  All lenses are judged
+by one reference: stratified rays on the pixels of the base scene.
 """
 
 from __future__ import annotations
@@ -44,45 +44,45 @@ from bstcad.tailoring.stage2 import Problem
 
 # --- records ----------------------------------------------------------------------------------------------------------
 
-LARGEST = 100_000_000  # bytes of a file
-DIGITS = 6
+MAX_RECORD_SIZE = 100_000_000  # bytes
+SIGNIFICANT_DIGITS = 6  # default of round_numbers
 
 
-class Stored(BaseModel):
-    """A frozen record that a file holds."""
+class StoredRecord(BaseModel):
+    """Base of frozen records that are stored in files."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
-Record = TypeVar("Record", bound=Stored)
+RecordType = TypeVar("Record", bound=StoredRecord)
 
 
-def read(kind: type[Record], path: Path, remedy: str) -> Record:
-    """The record that a file holds; MachineError if the file is damaged or foreign."""
+def read_record(kind: type[RecordType], path: Path, remedy: str) -> RecordType:
+    """Read a record from a file; raise MachineError if the file is damaged or has another format."""
     try:
-        return kind.model_validate_json(files.contents(path, LARGEST))
+        return kind.model_validate_json(files.contents(path, MAX_RECORD_SIZE))
     except ValueError:  # pydantic's errors are ValueErrors
-        raise MachineError(f"{path}: is damaged, or another program's; {remedy}") from None
+        raise MachineError(f"{path}: is damaged, or was written by another program; {remedy}") from None
 
 
-def put(path: Path, record: Stored) -> None:
-    """Write a record whole, every digit of it."""
+def write_record(path: Path, record: StoredRecord) -> None:
+    """Write a record at full precision."""
     files.put(path, f"{record.model_dump_json(indent=1)}\n".encode())
 
 
-def rounded(value: Any, digits: int = DIGITS) -> Any:
-    """A JSON value with numbers of so many digits; null for a number that is not finite."""
+def round_numbers(value: Any, digits: int = SIGNIFICANT_DIGITS) -> Any:
+    """Return a JSON value with its numbers rounded to significant digits; null for numbers that are not finite."""
     if isinstance(value, Mapping):
-        return {key: rounded(part, digits) for key, part in value.items()}
+        return {key: round_numbers(part, digits) for key, part in value.items()}
     if isinstance(value, list | tuple):
-        return [rounded(part, digits) for part in value]
+        return [round_numbers(part, digits) for part in value]
     if isinstance(value, float):
         return float(f"{value:.{digits}g}") if math.isfinite(value) else None
     return value
 
 
-def put_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write these columns of all rows as CSV."""
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write the given columns of all rows as CSV."""
     text = io.StringIO()
     lines = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
     lines.writeheader()
@@ -90,42 +90,42 @@ def put_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, An
     files.put(path, text.getvalue().encode())
 
 
-def unpacked(contents: Mapping[str, bytes], folder: Path) -> Path:
-    """The scene file, written into a folder beside its pictures; contents: by file name."""
+def unpack_scene(contents: Mapping[str, bytes], folder: Path) -> Path:
+    """Write a scene and its pictures (contents by file name) into a folder; return the path of the scene file."""
     for name, data in contents.items():
         (folder / name).write_bytes(data)
     return folder / SCENE
 
 
-LOOK = 0.2  # seconds between two looks whether a process has ended
+POLL_INTERVAL = 0.2  # interval (seconds) at which a waiting pool calls `tick`
 
 
 class LocalPool:
-    """Some child processes at a time, each with a thread that waits for it.
+    """Pool of at most `room` child processes, each with a thread that waits for it.
 
-    Processes that still work when the block ends are ended, and keep their checkpoints.
+    Processes that are still running when the block ends are terminated; their checkpoints remain.
     """
 
     def __init__(self, room: int) -> None:
         self.capacity = room
-        self._threads, self._ends = ThreadPoolExecutor(room), threading.Event()
+        self._threads, self._stopping = ThreadPoolExecutor(room), threading.Event()
         self._keys: dict[Future, Any] = {}
 
     def __enter__(self) -> LocalPool:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._ends.set()
+        self._stopping.set()
         self._threads.shutdown(cancel_futures=True)
 
     def start(self, key: Any, work: Callable[..., Any], *arguments: Any) -> None:
-        """Have work(*arguments, tick) done, which calls `tick` all the while."""
+        """Start work(*arguments, tick) in a thread; it must call `tick` regularly."""
         self._keys[self._threads.submit(work, *arguments, self._tick)] = key
 
     def next(self, tick: Callable[[], None]) -> Answer:
-        """Wait for a process that has ended."""
+        """Wait until a process has ended, and return its answer."""
         while True:
-            for future in wait(self._keys, timeout=LOOK, return_when=FIRST_COMPLETED).done:
+            for future in wait(self._keys, timeout=POLL_INTERVAL, return_when=FIRST_COMPLETED).done:
                 key, error = self._keys.pop(future), future.exception()
                 if error is not None:
                     return Answer(key, THIS_MACHINE, reason=f"{type(error).__name__}: {error}")
@@ -133,168 +133,169 @@ class LocalPool:
             tick()
 
     def _tick(self) -> None:
-        if self._ends.is_set():
-            raise InterruptedError("nobody waits for it any more")
+        if self._stopping.is_set():
+            raise InterruptedError("the pool was closed")
 
 
 # --- calibration ------------------------------------------------------------------------------------------------------
 
-TUBES, PIXELS = 1024, 512  # a side
-NET, WIDTH, THICKNESS, INDEX = 257, 20.0, 5.0, 1.49  # control points a side; mm
-SCREEN = 200.0  # mm from the front
-WAVE, PERIODS = 0.003, 3  # mm; over the width
-REPEATS = 3  # of an evaluation, at least
+KERNEL_TUBES, KERNEL_PIXELS = 1024, 512  # flux tubes and pixels per side
+KERNEL_NET, KERNEL_INDEX = 257, 1.49  # control points per side; refractive index
+KERNEL_WIDTH, KERNEL_THICKNESS = 20.0, 5.0  # mm
+KERNEL_SCREEN_Z = 200.0  # distance of the screen from the front, mm
+WAVE_HEIGHT, WAVE_PERIODS = 0.003, 3  # amplitude of the back, mm, and its number of periods over the width
+KERNEL_REPEATS = 3  # number of evaluations, of which the fastest counts
 
 
-def timed(work: Callable[[], object]) -> float:
-    """Seconds that some work takes."""
-    began = time.perf_counter()
+def measure_seconds(work: Callable[[], object]) -> float:
+    """Return the seconds that some work takes."""
+    start = time.perf_counter()
     work()
-    return time.perf_counter() - began
+    return time.perf_counter() - start
 
 
 @cache
-def kernel(tubes: int = TUBES) -> Callable[[], Any]:
-    """The evaluation of merit and gradient by ray tubes through a fixed small lens; it is set up once a process."""
-    u = torch.linspace(-math.pi * PERIODS, math.pi * PERIODS, NET, dtype=torch.float64)
-    outline, span = Rectangle(WIDTH, WIDTH), (-WIDTH / 2, WIDTH / 2)
-    back = BSplineSurface(THICKNESS, WAVE * u.cos()[:, None] * u.cos(), span, span)
-    lens = Lens(Plane(0.0), back, outline, INDEX)
-    target = np.full((PIXELS, PIXELS), 1.0)
-    channel, screen = Channel(Collimated(outline), INDEX), Screen(SCREEN, span, span, PIXELS)
+def calibration_kernel(tubes: int = KERNEL_TUBES) -> Callable[[], Any]:
+    """Return the evaluation of merit and gradient by flux tubes through a fixed small lens, set up once per process."""
+    u = torch.linspace(-math.pi * WAVE_PERIODS, math.pi * WAVE_PERIODS, KERNEL_NET, dtype=torch.float64)
+    outline, span = Rectangle(KERNEL_WIDTH, KERNEL_WIDTH), (-KERNEL_WIDTH / 2, KERNEL_WIDTH / 2)
+    back = BSplineSurface(KERNEL_THICKNESS, WAVE_HEIGHT * u.cos()[:, None] * u.cos(), span, span)
+    lens = Lens(Plane(0.0), back, outline, KERNEL_INDEX)
+    target = np.full((KERNEL_PIXELS, KERNEL_PIXELS), 1.0)
+    channel, screen = Channel(Collimated(outline), KERNEL_INDEX), Screen(KERNEL_SCREEN_Z, span, span, KERNEL_PIXELS)
     merit = Merit.of((channel,), lens, tubes, [Goal("target", screen, target)], overshoot=0.03)
-    once = partial(Problem(lens, merit), [back.heights])
-    once()  # compiles and allocates
-    return once
+    evaluate = partial(Problem(lens, merit), [back.heights])
+    evaluate()  # compiles the kernels and allocates memory
+    return evaluate
 
 
 # --- runs -------------------------------------------------------------------------------------------------------------
 
 Value = int | float | str | tuple[int, int]
-Settings = tuple[tuple[str, Value], ...]  # (dotted key of the scene, value), sorted by key; () is the base
+Settings = tuple[tuple[str, Value], ...]  # (dotted key of the scene, value), sorted by key; (): the base scene
 
 DONE, FAILED, NOT_RUN = "done", "failed", "not run: budget"
-REFERENCE = Effort(witness=False)  # of the judge: by rays alone, which no lens was tailored by
-SMALLEST = {  # a run whose time does not count: kernels are compiled, libraries come from the disk
+REFERENCE_EFFORT = Effort(witness=False)  # effort of the reference: rays only, by which no lens was tailored
+WARM_UP_CHANGES = {  # settings of a run whose time does not count; it compiles kernels and loads libraries
     "lens.back.control_points": 33, "tailoring.quality": "draft", "tailoring.rays": 96,
     "tailoring.transport_grid": 64, "tailoring.levels": None,
 }  # fmt: skip
-SMALLEST_PIXELS = 64  # a side of each target in it
-Tick = Callable[[], None]  # is called while a command runs
+WARM_UP_PIXELS = 64  # pixels per side of each target in that run
+Tick = Callable[[], None]  # function called regularly while a command runs
 
 
-def settings(entries: Mapping[str, Value]) -> Settings:
-    """Settings in their order."""
+def sorted_settings(entries: Mapping[str, Value]) -> Settings:
+    """Return settings sorted by key."""
     return tuple(sorted(entries.items()))
 
 
-def as_text(value: Value) -> str:
-    """A value as --set takes it."""
+def format_value(value: Value) -> str:
+    """Format a value for --set."""
     return f"[{value[0]}, {value[1]}]" if isinstance(value, tuple) else str(value)
 
 
 def _from_json(entries: Any) -> Any:
     if not isinstance(entries, Mapping):
         return entries
-    return settings({key: tuple(value) if isinstance(value, list) else value for key, value in entries.items()})
+    return sorted_settings({key: tuple(value) if isinstance(value, list) else value for key, value in entries.items()})
 
 
-StoredSettings = Annotated[Settings, BeforeValidator(_from_json), PlainSerializer(dict)]  # an object of JSON
+StoredSettings = Annotated[Settings, BeforeValidator(_from_json), PlainSerializer(dict)]  # stored as a JSON object
 
 
 class HistoryPoint(TypedDict):
-    """RRMSD of a design by its own tubes."""
+    """RRMSD of a design by its own tubes at one time."""
 
-    seconds: float  # since its start
-    rrmsd: float | None  # None: not finite
+    seconds: float  # time since the start of the design
+    rrmsd: float | None  # RRMSD; null: not finite
 
 
-class Run(Stored):
-    """How a run went; seconds are of the machine that it ran on, None where it was not run."""
+class ColdRun(StoredRecord):
+    """Result of one run; times are those of the machine that it ran on, and null if it was not run."""
 
-    settings: StoredSettings  # the changes of the base
+    settings: StoredSettings  # changes relative to the base scene
     status: str  # DONE, FAILED or NOT_RUN
-    reason: str = ""  # why it failed
-    label: str = ""  # in words: "Ray tubes a side: 768"
-    knobs: tuple[str, ...] = ()  # keys of the knobs that it is a point of; "base": of all
-    where: str = THIS_MACHINE  # or the address of a worker; "": nowhere
-    seconds: float | None = 0.0  # of the whole command
-    cpu_seconds: float | None = 0.0  # of the command and of all processes that it started
-    kernel_seconds: float | None = 0.0  # of the calibration kernel, before this run
+    reason: str = ""  # reason of the failure
+    label: str = ""  # description, such as "Flux tubes per side: 768"
+    knobs: tuple[str, ...] = ()  # keys of the knobs that have these settings as a point; "base" for the base scene
+    where: str = THIS_MACHINE  # "here", or the address of a worker; "": not run
+    seconds: float | None = 0.0  # wall time of the whole command
+    cpu_seconds: float | None = 0.0  # CPU time of the command and of all processes that it started
+    kernel_seconds: float | None = 0.0  # time of the calibration kernel before this run
     units: float | None = None  # seconds / kernel_seconds
-    cost_seconds: float | None = 0.0  # of the budget: with judging and calibration
-    predicted_seconds: float | None = None  # of the budget, before the run began
-    peak_memory_gb: float | None = None  # of both its processes, as a sum
-    rrmsd: float | None = None  # by the reference; of several targets the largest
-    rrmsd_noise: float | None = None  # standard error of that
-    rays: int | None = None  # of the reference
-    rrmsd_reported: float | None = None  # by its own proof, on its own pixels
-    rrmsd_noise_reported: float | None = None  # its standard error
-    passed: bool | None = None  # every check of the proof
-    net: str = ""  # SHA-256 of the control net: equal nets are equal lenses to the last bit
-    stages: tuple[dict[str, Any], ...] = ()  # name, seconds, rrmsd after it; None: not judged
-    on_front: bool = False  # of the sweep
+    cost_seconds: float | None = 0.0  # time charged to the budget, including judging and calibration
+    predicted_seconds: float | None = None  # time predicted for the budget before the run
+    peak_memory_gb: float | None = None  # peak memory of both its processes together
+    rrmsd: float | None = None  # RRMSD by the reference; the largest of several targets
+    rrmsd_noise: float | None = None  # standard error of rrmsd
+    rays: int | None = None  # number of rays of the reference
+    rrmsd_reported: float | None = None  # RRMSD by the proof of the design, on its own pixels
+    rrmsd_noise_reported: float | None = None  # standard error of rrmsd_reported
+    passed: bool | None = None  # true if every check of the proof passed
+    net: str = ""  # SHA-256 of the control net; equal nets are equal lenses to the last bit
+    stages: tuple[dict[str, Any], ...] = ()  # stages with name, seconds and the rrmsd after them (null: not measured)
+    on_front: bool = False  # true if the run is on the Pareto front of the sweep
     # not in tradeoff.json
-    allowed_seconds: float | None = None  # after which it was ended; None: it ended by itself
-    history: tuple[HistoryPoint, ...] = ()  # the convergence curve of the run
-    machine: dict[str, Any] = {}  # that ran it
-    versions: dict[str, str] = {}  # of the libraries, by name
-    version: str = ""  # of bstcad, with a hash of its sources
+    allowed_seconds: float | None = None  # time limit at which the run was ended; null: it ended by itself
+    history: tuple[HistoryPoint, ...] = ()  # convergence curve of the run
+    machine: dict[str, Any] = {}  # machine that ran it
+    versions: dict[str, str] = {}  # versions of the libraries, by name
+    version: str = ""  # version of bstcad, with a hash of its sources
 
     @property
     def done(self) -> bool:
-        """Is there a lens?"""
+        """True if there is a lens."""
         return self.status == DONE
 
     @property
     def comparable(self) -> bool:
-        """Do its seconds compare?  Seconds of this machine do, since its runs follow each other."""
+        """True if its time is comparable with others: runs on this machine follow each other."""
         return self.done and self.where == THIS_MACHINE
 
 
-def carry_out(
-    contents: Mapping[str, bytes], point: Settings, limit: float = math.inf, effort: Effort = REFERENCE,
+def run_and_judge(
+    contents: Mapping[str, bytes], point: Settings, limit: float = math.inf, effort: Effort = REFERENCE_EFFORT,
     tick: Tick = lambda: None,
-) -> Run:  # fmt: skip
-    """Run the command for a base scene with these settings and judge its lens.
+) -> ColdRun:  # fmt: skip
+    """Run the command for a base scene with these settings, and judge its lens.
 
-    contents: the base and its pictures, by name.  limit: seconds after which the command is ended.
+    contents: base scene and its pictures, by file name.  limit: seconds after which the command is ended.
     """
-    began = time.perf_counter()
-    unit = min(timed(kernel()) for _ in range(REPEATS))  # the least: all disturbances make it longer
+    start = time.perf_counter()
+    unit = min(measure_seconds(calibration_kernel()) for _ in range(KERNEL_REPEATS))
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
-        scene, folder = unpacked(contents, Path(place)), Path(place) / "design"
+        scene, folder = unpack_scene(contents, Path(place)), Path(place) / "design"
         run = _generate(scene, folder, point, limit, tick=tick)
         if run.done:
-            run = judged(run, load(scene), folder, effort)
-    took = {"kernel_seconds": unit, "units": run.seconds / unit, "cost_seconds": time.perf_counter() - began}
-    return run.model_copy(update=took | {"version": environment.version()})
+            run = judge_run(run, load(scene), folder, effort)
+    times = {"kernel_seconds": unit, "units": run.seconds / unit, "cost_seconds": time.perf_counter() - start}
+    return run.model_copy(update=times | {"version": environment.version()})
 
 
 def warm_up(contents: Mapping[str, bytes], tick: Tick) -> None:
-    """A small run that does not count, so that the first run that counts is no colder than the others."""
+    """Do a small run that does not count, so that the first run that counts starts under the same conditions."""
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
-        base = load(unpacked(contents, Path(place)))
+        base = load(unpack_scene(contents, Path(place)))
         try:
-            small = base.changed(SMALLEST | {f"{key}.pixels": SMALLEST_PIXELS for key in base.target_keys})
-        except SceneError:  # a profile that so few pixels cannot show
-            small = base.changed(SMALLEST)
-        _generate(unpacked(scene_files(small), Path(place)), Path(place) / "design", (), math.inf, tick=tick)
-    kernel()
+            small = base.changed(WARM_UP_CHANGES | {f"{key}.pixels": WARM_UP_PIXELS for key in base.target_keys})
+        except SceneError:  # a profile too narrow for so few pixels
+            small = base.changed(WARM_UP_CHANGES)
+        _generate(unpack_scene(scene_files(small), Path(place)), Path(place) / "design", (), math.inf, tick=tick)
+    calibration_kernel()
 
 
-def _generate(scene: Path, folder: Path, point: Settings, limit: float, *, tick: Tick) -> Run:
-    """`bstcad generate` in a process of its own, and the figures of its report."""
-    changes = [word for key, value in point for word in ("--set", f"{key}={as_text(value)}")]
-    ended = processes.run(["generate", str(scene), "-o", str(folder), *changes], limit, tick)
-    took = {"settings": point, "seconds": ended.seconds, "cpu_seconds": ended.cpu_seconds}
-    if ended.seconds >= limit and ended.code < 0:
-        reason = f"ended after {ended.seconds:.0f} s, which was all that was left for it"
-        return Run(status=FAILED, reason=reason, allowed_seconds=limit, **took)
-    if ended.code not in (0, 1) or not (folder / "report.json").is_file():
-        return Run(status=FAILED, reason=ended.reason, **took)
+def _generate(scene: Path, folder: Path, point: Settings, limit: float, *, tick: Tick) -> ColdRun:
+    """Run `bstcad generate` in a process of its own, and return the figures of its report."""
+    changes = [word for key, value in point for word in ("--set", f"{key}={format_value(value)}")]
+    process = processes.run(["generate", str(scene), "-o", str(folder), *changes], limit, tick)
+    times = {"settings": point, "seconds": process.seconds, "cpu_seconds": process.cpu_seconds}
+    if process.seconds >= limit and process.code < 0:
+        reason = f"ended after {process.seconds:.0f} s, because its time in the budget was used up"
+        return ColdRun(status=FAILED, reason=reason, allowed_seconds=limit, **times)
+    if process.code not in (0, 1) or not (folder / "report.json").is_file():
+        return ColdRun(status=FAILED, reason=process.reason, **times)
     report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-    return Run(
+    return ColdRun(
         status=DONE,
         peak_memory_gb=report["machine"].pop("peak_memory_gb", None),
         rrmsd_reported=report["rrmsd"],
@@ -304,21 +305,21 @@ def _generate(scene: Path, folder: Path, point: Settings, limit: float, *, tick:
         versions=report["versions"],
         stages=tuple({key: stage[key] for key in ("name", "seconds", "rrmsd")} for stage in report["stages"]),
         history=tuple(report["history"]),
-        **took,
+        **times,
     )
 
 
-def judged(run: Run, base: Scene, folder: Path, effort: Effort) -> Run:
-    """The run with the RRMSD of the lens in `folder` by the reference: by light and pixels of the base.
+def judge_run(run: ColdRun, base: Scene, folder: Path, effort: Effort) -> ColdRun:
+    """Return the run with the RRMSD of the lens in `folder` by the reference, with light and pixels of the base scene.
 
-    Of several targets the largest RRMSD counts.
+    The largest RRMSD of several targets counts.
     """
     lens, channels = read_nominal(folder)[1].lens, base.verification_channels()
-    how = {"effort": effort, "ghost": base.ghost, "draw": base.draw}
-    lights = [measure(lens, channels, target.screen, target.irradiance(), **how) for target in base.targets]
+    options = {"effort": effort, "ghost": base.ghost, "draw": base.draw}
+    lights = [measure(lens, channels, target.screen, target.irradiance(), **options) for target in base.targets]
     if not all(light.rrmsd >= 0 for light in lights):
         return run.model_copy(update={"status": FAILED, "reason": "none of its light falls on the target"})
     light = max(lights, key=lambda light: light.rrmsd)
     net = hashlib.sha256(b"".join(net.control_points().tobytes() for net in lens.nets)).hexdigest()
-    found = {"rrmsd": light.rrmsd, "rrmsd_noise": light.standard_error, "rays": light.rays, "net": net}
-    return run.model_copy(update=found)
+    results = {"rrmsd": light.rrmsd, "rrmsd_noise": light.standard_error, "rays": light.rays, "net": net}
+    return run.model_copy(update=results)

@@ -1,8 +1,8 @@
-"""Estimates around a design: changes by the effects that are left out, and the diagnosis of a finished design.
+"""Estimate the effects that a design neglects, and diagnose a finished design.
 
-Before a design the effects are estimated (analysis.neglected_effects) on a coarse lens of two transport maps and fits
-of slopes, in a second or two; most are good to a factor of two.  Reports have them of the finished lens.  The diagnosis
-of a finished design takes the pictures and the history of the run.
+Before a design the effects are estimated (analysis.neglected_effects) on a coarse lens, made from two transport maps
+and slope fits in a second or two; most are accurate within a factor of two.  Reports state them for the finished lens.
+The diagnosis of a finished design uses its picture and the history of the run.
 """
 
 from __future__ import annotations
@@ -31,88 +31,88 @@ from bstcad.verify.checks import AtBound
 
 # --- a coarse lens ----------------------------------------------------------------------------------------------------
 
-NET, CELLS, PIXELS = 33, 32, 64  # a side of the coarse lens: control points, cells of its transport, pixels it aims at
-FRONT_NET = 17  # control points a side of the lenses among which a front is sought of which something is free
-ROUNDS, STEPS = 2, 40  # of transport and slope fit, the second from the sag of the first; of each transport
+COARSE_POINTS, COARSE_CELLS, COARSE_PIXELS = 33, 32, 64  # control points, transport cells and target pixels per side
+FRONT_NET = 17  # control points per side of the back while a front with free parameters is optimised
+TRANSPORT_ROUNDS, COARSE_STEPS = 2, 40  # rounds of transport and slope fit, and iterations of each transport
 
 
 @torch.no_grad()
 def coarse_lens(scene: Scene) -> Lens:
-    """A lens for the scene whose angles and paths are near those of the finished lens; its picture is coarse."""
-    channel = _central(scene)
-    lens = channel.through(scene.flat_lens(NET))
-    picture = _coarse(scene.target.irradiance(), PIXELS)
+    """Return a lens whose angles and paths are close to those of the finished lens, but whose picture is coarse."""
+    channel = _central_channel(scene)
+    lens = channel.through(scene.flat_lens(COARSE_POINTS))
+    picture = _downsample(scene.target.irradiance(), COARSE_PIXELS)
     screen = replace(scene.target.screen, pixels=picture.shape[::-1])
     if scene.lens.front.free:
         from bstcad.tailoring.stage1 import shaped_front  # with scipy.optimize, a tenth of a second to load
 
-        tried = replace(lens, back=scene.flat_lens(FRONT_NET).back)
+        start = replace(lens, back=scene.flat_lens(FRONT_NET).back)
         found = shaped_front(
-            channel.source, tried, picture, screen, free=scene.lens.front.free, rim_sags=scene.rim_sags, n=CELLS,
-            iterations=STEPS, repeats=1,
+            channel.source, start, picture, screen, free=scene.lens.front.free, rim_sags=scene.rim_sags, n=COARSE_CELLS,
+            iterations=COARSE_STEPS, repeats=1,
         )  # fmt: skip
         lens = replace(lens, front=found.front)
-    wanted, z = None, lens.back.z
-    for _ in range(ROUNDS):
+    slopes, z = None, lens.back.z
+    sizes = {"n": COARSE_CELLS, "iterations": COARSE_STEPS}
+    for _ in range(TRANSPORT_ROUNDS):
         window = lit_window(channel.source, lens)
-        wanted = slope_map(
-            channel.source, lens, window, picture, screen=screen, n=CELLS, previous=wanted, iterations=STEPS
-        )
-        grid = face_grid(channel.source, lens, window, 2 * NET)
-        lens = fit_to_map(lens, wanted, grid, Fit(bending=1e-2, steps=20, degree=3), unlit=0.0)
+        slopes = slope_map(channel.source, lens, window, picture, screen=screen, previous=slopes, **sizes)
+        grid = face_grid(channel.source, lens, window, 2 * COARSE_POINTS)
+        lens = fit_to_map(lens, slopes, grid, Fit(bending=1e-2, steps=20, degree=3), unlit=0.0)
         lens = place_back(lens, z, scene.lens.min_thickness)
     return lens
 
 
-def _coarse(picture: np.ndarray, most: int) -> np.ndarray:
-    """The picture on at most `most` x `most` pixels, each the sum of whole ones."""
+def _downsample(picture: np.ndarray, limit: int) -> np.ndarray:
+    """Return the picture on at most `limit` x `limit` pixels, each the sum of whole pixels."""
     for axis in (0, 1):
-        few = min(most, picture.shape[axis])
-        starts = (np.arange(few) * picture.shape[axis]) // few
+        count = min(limit, picture.shape[axis])
+        starts = (np.arange(count) * picture.shape[axis]) // count
         picture = np.add.reduceat(picture, starts, axis)
     return picture
 
 
-def _central(scene: Scene, *more: Effect) -> Channel:
-    """The light of the middle of the source at its main wavelength, with more effects than the scene names."""
+def _central_channel(scene: Scene, *more: Effect) -> Channel:
+    """Return the channel from the middle of the source at its main wavelength, with further effects."""
     source = scene.source.central
-    lost = losses((*scene.effects, *more), scene.lens, source.wavelength)
-    return Channel(source, scene.index, losses=lost, around=scene.around(source.wavelength))
+    loss_factors = losses((*scene.effects, *more), scene.lens, source.wavelength)
+    return Channel(source, scene.index, losses=loss_factors, around=scene.around(source.wavelength))
 
 
-# --- effects that are left out ----------------------------------------------------------------------------------------
+# --- neglected effects ------------------------------------------------------------------------------------------------
 
-VISIBLE = (400.0, 700.0)  # nm; of white light
-SUN = (0.5, 0.56)  # degrees; divergence of sunlight, 0.53 in the mean
-LINE = 10.0  # nm; width of a line of which the scene says nothing: an LED's is 20 to 40, a laser's below 1
-DIAMETER = 0.1  # mm; of a point source
-DIVERGENCE = 0.1  # degrees; of parallel light
-USUAL = {"diameter": (DIAMETER, "disc", "mm"), "divergence": (DIVERGENCE, "cone", "degrees")}  # by Emitter.size_key
-THREE = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # Gauss points of an even line, in half widths
-DISC = tuple((x, y, 1 / 4) for x in (-0.5, 0.5) for y in (-0.5, 0.5))  # points of an even disc, in radii; degree 3
-BY_FRESNEL, BY_LINES = '[[effects]] kind = "fresnel"', "source.wavelength = [[nm, weight], …]"
+VISIBLE_BAND = (400.0, 700.0)  # band of white light, nm
+SUN_ANGLES = (0.5, 0.56)  # range of divergence (degrees) that is taken for sunlight, whose mean is 0.53
+LINE_WIDTH = 10.0  # assumed width (nm) of a spectral line; LEDs have 20 to 40, lasers less than 1
+DEFAULT_DIAMETER = 0.1  # assumed diameter of a point source, mm
+DEFAULT_DIVERGENCE = 0.1  # assumed divergence of parallel light, degrees
+# Assumed sizes by Emitter.size_key.
+DEFAULT_SIZES = {"diameter": (DEFAULT_DIAMETER, "disc", "mm"), "divergence": (DEFAULT_DIVERGENCE, "cone", "degrees")}
+GAUSS_POINTS = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # (half widths, weight) of a uniform line
+DISC_POINTS = tuple((x, y, 1 / 4) for x in (-0.5, 0.5) for y in (-0.5, 0.5))  # (x, y in radii, weight) of a disc
+FRESNEL_KEYS, LINES_KEYS = '[[effects]] kind = "fresnel"', "source.wavelength = [[nm, weight], …]"
 
 
 def left_out(scene: Scene, lens: Lens, picture: np.ndarray) -> tuple[LeftOut, ...]:
-    """The effects that the scene leaves out, and their change of the picture of this lens; the largest change first.
+    """Return the effects that the scene neglects, with the change of the picture by each, the largest change first.
 
-    picture: (rows, columns) flux in each pixel, of the target or as the lens throws it.
+    picture: flux in each pixel (rows, columns), of the target or of the lens.
     """
-    screen, points = scene.target.screen, math.prod(as_pair(scene.lens.back.net))
-    reference = Reference.of(lens, _central(scene), screen, picture=picture, control_points=points)
-    found = [*_of_glass(scene, reference), *_of_mirror(scene, reference)]
-    found += _size(scene, reference)
-    found.append(_entry("diffraction", reference.diffraction(), "of the whole aperture"))
-    found.append(_entry("stray light", None, "it depends on the finish of the faces"))
-    return tuple(sorted(found, key=lambda entry: -(entry.rrmsd_change or 0.0)))
+    points = math.prod(as_pair(scene.lens.back.net))
+    reference = Reference.of(lens, _central_channel(scene), scene.target.screen, picture=picture, control_points=points)
+    entries = [*_glass_effects(scene, reference), *_mirror_effects(scene, reference)]
+    entries += _source_size(scene, reference)
+    entries.append(_entry("diffraction", reference.diffraction(), "of the whole aperture"))
+    entries.append(_entry("stray light", None, "it depends on the finish of the faces"))
+    return tuple(sorted(entries, key=lambda entry: -(entry.rrmsd_change or 0.0)))
 
 
-def _of_glass(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
+def _glass_effects(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
     if not scene.lens.passes.enters:
         return
     bare = Fresnel(kind="fresnel")
     if reflection_of(scene.effects) is None:
-        yield _entry("fresnel", reference.change([_central(scene, bare)]), simulate_by=BY_FRESNEL)
+        yield _entry("fresnel", reference.change([_central_channel(scene, bare)]), simulate_by=FRESNEL_KEYS)
     if named(scene.effects, Absorption) is None:
         yield _absorption(scene, reference)
     if len(scene.source.lines) == 1:
@@ -120,65 +120,67 @@ def _of_glass(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
     if scene.lens.passes.reflects:
         yield _entry("ghost", None, "ghosts of a mirror behind glass are not simulated")
     elif named(scene.effects, Ghost) is None:
-        reflecting = _central(scene, *(() if named(scene.effects, Fresnel) else (bare,)))
-        yield _entry(
-            "ghost", reference.ghost(reflecting), "roughly, since it may gather to a spot", '[[effects]] kind = "ghost"'
-        )
+        reflecting = _central_channel(scene, *(() if named(scene.effects, Fresnel) else (bare,)))
+        change, reason = reference.ghost(reflecting), "roughly, since it may focus to a spot"
+        yield _entry("ghost", change, reason, '[[effects]] kind = "ghost"')
 
 
-def _of_mirror(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
+def _mirror_effects(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
     if not scene.lens.passes.reflects:
         return
     if not scene.lens.passes.enters and named(scene.effects, Fresnel) is None:
-        aluminium = _central(scene, Fresnel(kind="fresnel"))
-        yield _entry("reflectance", reference.change([aluminium]), "of aluminium", BY_FRESNEL)
+        aluminium = _central_channel(scene, Fresnel(kind="fresnel"))
+        yield _entry("reflectance", reference.change([aluminium]), "of aluminium", FRESNEL_KEYS)
     yield _entry("shadows", None, "they depend on the lamp's housing")
 
 
 def _absorption(scene: Scene, reference: Reference) -> LeftOut:
-    by, material = '[[effects]] kind = "absorption"', scene.lens.material
+    keys, material = '[[effects]] kind = "absorption"', scene.lens.material
     try:
-        absorbing = _central(scene, Absorption(kind="absorption")) if material else None
+        absorbing = _central_channel(scene, Absorption(kind="absorption")) if material else None
     except ValueError:
         absorbing = None
     if absorbing is None:
         reason = f"there are no data of {material}" if material else "lens.index names no material"
-        return _entry("absorption", None, reason, f"{by}, coefficient = … (1/mm)")
-    return _entry("absorption", reference.change([absorbing]), simulate_by=by)
+        return _entry("absorption", None, reason, f"{keys}, coefficient = … (1/mm)")
+    return _entry("absorption", reference.change([absorbing]), simulate_by=keys)
 
 
 def _dispersion(scene: Scene, reference: Reference) -> LeftOut:
     channel, material = reference.channel, scene.lens.material
     if material is None:
-        return _entry("dispersion", None, "lens.index names no material", f"lens.material, and {BY_LINES}")
+        return _entry("dispersion", None, "lens.index names no material", f"lens.material, and {LINES_KEYS}")
     low, high = band(scene)
-    around = [((low + high) / 2 + (high - low) / 2 * place, weight) for place, weight in THREE]
+    lines = [((low + high) / 2 + (high - low) / 2 * place, weight) for place, weight in GAUSS_POINTS]
     try:
-        channels = [replace(channel, index=media.refractive_index(material, nm), weight=w) for nm, w in around]
+        channels = [replace(channel, index=media.refractive_index(material, nm), weight=w) for nm, w in lines]
     except ValueError:
-        between = f"from {low:g} to {high:g} nm"
-        return _entry("dispersion", None, f"there are no data of {material} {between}", BY_LINES)
-    sun = (low, high) == VISIBLE
-    words = f"of sunlight, even from {low:g} to {high:g} nm" if sun else f"of a line {LINE:g} nm wide"
-    return _entry("dispersion", reference.change(channels), words, BY_LINES, assumed=not sun)
+        span = f"from {low:g} to {high:g} nm"
+        return _entry("dispersion", None, f"there are no data of {material} {span}", LINES_KEYS)
+    sun = (low, high) == VISIBLE_BAND
+    words = f"of sunlight, uniform from {low:g} to {high:g} nm" if sun else f"of a line {LINE_WIDTH:g} nm wide"
+    return _entry("dispersion", reference.change(channels), words, LINES_KEYS, assumed=not sun)
 
 
 def band(scene: Scene) -> tuple[float, float]:
-    """Return the band (nm) that light of one wavelength stands for: of the sun's divergence VISIBLE, else LINE wide."""
+    """Return the band (nm) that a single wavelength represents: VISIBLE_BAND for sunlight, else LINE_WIDTH wide."""
     source = scene.source
-    if source.size_key == "divergence" and SUN[0] <= (source.divergence or source.real_divergence or 0.0) <= SUN[1]:
-        return VISIBLE
-    return source.main_wavelength - LINE / 2, source.main_wavelength + LINE / 2
+    if source.size_key == "divergence":
+        divergence = source.divergence or source.real_divergence or 0.0
+        if SUN_ANGLES[0] <= divergence <= SUN_ANGLES[1]:
+            return VISIBLE_BAND
+    return source.main_wavelength - LINE_WIDTH / 2, source.main_wavelength + LINE_WIDTH / 2
 
 
-def _size(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
+def _source_size(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
     if scene.source.extent is not None or (key := scene.source.size_key) is None:
         return
-    stated, (usual, shape, unit) = getattr(scene.source, f"real_{key}"), USUAL[key]
-    wide = replace(reference.channel.source, **{key: stated or usual})
+    stated, (default, shape, unit) = getattr(scene.source, f"real_{key}"), DEFAULT_SIZES[key]
+    wide = replace(reference.channel.source, **{key: stated or default})
     radius = wide.extent.radius
-    channels = [replace(reference.channel, source=wide.element(radius * u, radius * v), weight=w) for u, v, w in DISC]
-    words = f"source.real_{key} = {stated:g} {unit}" if stated else f"a {shape} of {usual:g} {unit}"
+    points = ((wide.element(radius * u, radius * v), weight) for u, v, weight in DISC_POINTS)
+    channels = [replace(reference.channel, source=source, weight=weight) for source, weight in points]
+    words = f"source.real_{key} = {stated:g} {unit}" if stated else f"a {shape} of {default:g} {unit}"
     yield _entry("source size", reference.change(channels), words, f"source.{key}", assumed=not stated)
 
 
@@ -192,29 +194,30 @@ def _entry(kind: str, change: Change | None, detail: str = "", simulate_by: str 
 
 # --- the diagnosis of a finished design -------------------------------------------------------------------------------
 
-SIZES = "stage 3, "  # how the stages of a design begin that are for one size of the source each
+SIZE_STAGE_PREFIX = "stage 3, "  # beginning of the names of stages that are for one size of the source each
 
 
 def diagnosis(
     scene: Scene, making: DesignCourse, lens: Lens, *, picture: np.ndarray, target: np.ndarray, efficiency: float,
     at_bounds: Mapping[str, AtBound] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return of a design the entries convergence, remaining_error and bounds of report.json (record.Contents).
+    """Return the entries convergence, remaining_error and bounds of report.json (record.Contents).
 
-    lens: as re-read, which throws this picture (rows, columns), of the target's sum.
-    at_bounds: where the tailored faces are at a bound, by key.
+    lens: the lens as re-read.  picture: its picture (rows, columns), with the sum of the target.
+    at_bounds: areas where the tailored faces are at a bound, by key.
     """
-    sizes = [k for k, stage in enumerate(making.stages) if stage.name.startswith(SIZES)]
+    sizes = [k for k, stage in enumerate(making.stages) if stage.name.startswith(SIZE_STAGE_PREFIX)]
     curve = ending(
         [(point.seconds, point.rrmsd) for point in making.history],
         [(stage.seconds, stage.rrmsd) for stage in making.stages],
-        since=math.fsum(stage.seconds for stage in making.stages[: max(sizes[2:], default=0)]),  # of the whole source
+        since=math.fsum(stage.seconds for stage in making.stages[: max(sizes[2:], default=0)]),  # full source
     )
-    met = {key: at for key, at in (at_bounds or {}).items() if key in scene.lens.bounded_by}
+    reached = {key: at for key, at in (at_bounds or {}).items() if key in scene.lens.bounded_by}
     bounds = {
         "asked": {key: getattr(scene.lens, key) for key in scene.lens.bounded_by},
-        "at": {key: at.share for key, at in met.items()}, "tightest": {key: at.tightest for key, at in met.items()},
-        **({"both" if lens.shapes("back") else "front": True} if lens.shapes("front") else {}),  # that they are on
+        "at": {key: at.share for key, at in reached.items()},
+        "tightest": {key: at.tightest for key, at in reached.items()},
+        **({"both" if lens.shapes("back") else "front": True} if lens.shapes("front") else {}),  # faces with bounds
     }  # fmt: skip
     return {
         "convergence": None if curve is None else asdict(curve),

@@ -1,13 +1,13 @@
-"""How many control points the net of a back gets where the scene states none.
+"""Choose the number of control points of the back if the scene states none.
 
-Where the light of k cells of the net falls on a pixel, the lens has k numbers to shape it with.  A pixel asks for a
-flux, and the source's flux density where its light crosses the back tells the area of the back that sends it: scarce
-light, which many such cells would have to carry, has few.  What of a picture is finer than its cells can make, and than
-half as many each way can, gives the RRMSD of a net; its size gives its seconds and memory (prediction.py).
+If the light of k cells of the net falls on a pixel, the lens has k degrees of freedom for that pixel.  The flux that a
+pixel needs, divided by the flux density of the source's light where it crosses the back, is the area of the back that
+lights the pixel.  Dark pixels are lit by few cells.  The RRMSD of a net follows from the detail of the picture that is
+finer than its cells, and than cells twice as wide.  Its size determines time and memory (prediction.py).
 
-Of those that memory, tailoring.max_time and the tool's radius allow, the smallest net is chosen whose RRMSD each larger
-one would lower by less than a fifth, or by less than half in three times the time.
-tests/benchmarks/test_net_choice.py holds it to designs with every net.
+Among the nets that memory, tailoring.max_time and the tool radius allow, the smallest one is chosen for which each
+larger net would reduce the RRMSD by less than a fifth, or by less than half in three times the time.
+tests/benchmarks/test_net_choice.py compares the choice with designs of every net.
 """
 
 from __future__ import annotations
@@ -31,138 +31,145 @@ from bstcad.report.units import about, two_digits
 from bstcad.scene.blank import MAX_CONTROL_POINTS
 from bstcad.scene.scene import Scene
 from bstcad.sweep.estimates import coarse_lens
-from bstcad.sweep.prediction import UNDONE, blurred, memory_gb, usual
+from bstcad.sweep.prediction import REMAINING_BLUR, blur_rrmsd, memory_gb, typical_seconds
 
-KEY = "lens.back.control_points"
-SQUARE = (65, 129, 257, 513, 1025)  # control points a side of the nets that are tried, or as many in square cells
-NEARLY = 1.25  # as wide as high: a plate no more oblong than that gets a square net
-WORTH = ((1.25, 1.0), (2.0, 3.0))  # (times less RRMSD, times the time): a larger net that gives no more is not worth it
-ROOM = 0.8  # of the machine's memory, that a design may take
-TUBES = 256  # a side, by which the light is followed
-FLOOR, HALVED = 0.68, 0.43  # of the least error by the cells (ControlCells.floor), and by half as many each way
-BY_QUALITY = {"draft": (1.5, 0.012), "standard": (1.0, 0.002), "fine": (0.7, 0.004)}  # times that, and what is left
-SEAM = 7.0  # pixels; a valley of the tool's radius that moves light by less within a cell is narrower than it need be
-ENOUGH, BEYOND = 5.0, 1.4  # cells a pixel; more of them lower the RRMSD by that factor at most, and that once
-MOST_GAINED = 0.43  # times the RRMSD of the portrait with 1025 control points instead of 513, the largest gain known
-DIM = 1e-3  # of the mean flux; tiles of less are taken for the mean
+NET_KEY = "lens.back.control_points"
+SQUARE_NETS = (65, 129, 257, 513, 1025)  # control points per side of the candidates, or as many in square cells
+MAX_SQUARE_ASPECT = 1.25  # maximum aspect ratio of a plate that gets a square net
+# Factors (reduction of the RRMSD, increase of the time): a larger net with less gain for more time is rejected.
+MIN_GAINS = ((1.25, 1.0), (2.0, 3.0))
+MEMORY_FRACTION = 0.8  # fraction of the machine's memory that a design may use
+DENSITY_TUBES = 256  # flux tubes per side by which the flux density is found
+# Coefficients of the error bound (ControlCells.floor) of the net, and of a net with half as many cells each way.
+FLOOR_FACTOR, HALVED_FACTOR = 0.68, 0.43
+QUALITY_TERMS = {"draft": (1.5, 0.012), "standard": (1.0, 0.002), "fine": (0.7, 0.004)}  # (factor, offset) of the RRMSD
+MIN_SEAM_SHIFT = 7.0  # seam shift (pixels) below which cells are finer than the tool can use
+# Cells per pixel above which a finer net reduces the RRMSD only once more, by at most this factor.
+SUFFICIENT_CELLS, MAX_FURTHER_GAIN = 5.0, 1.4
+MIN_RRMSD_RATIO = 0.43  # lowest known ratio of RRMSD by a finer net: the portrait with 1025 instead of 513 points
+MIN_RELATIVE_FLUX = 1e-3  # flux of a tile, relative to the mean, below which the mean density is used
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """What a net would come to."""
+    """Net with its estimated RRMSD, time and memory."""
 
     net: Sides
     rrmsd: float
-    seconds: float  # on two cores of pace 1
+    seconds: float  # time on two cores of pace 1
     memory_gb: float
-    moved: float = math.inf  # pixels, see `moved`
+    seam_shift: float = math.inf  # shift by the narrowest valley, pixels; see the function seam_shift
 
-    def over(self, other: Candidate) -> tuple[float, float]:
-        """Return its RRMSD and its time over those of another: `plan` predicts both better than they are known here."""
+    def relative_to(self, other: Candidate) -> tuple[float, float]:
+        """Return RRMSD and time relative to those of another candidate; absolute values are less accurate."""
         return self.rrmsd / other.rrmsd, self.seconds / other.seconds
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The net that is chosen, among all that are possible from coarse to fine."""
+    """Chosen net among all possible ones."""
 
-    possible: tuple[Candidate, ...]
-    number: int  # of the chosen one
-    limit: str = ""  # what keeps it from being larger, beside its worth; "": nothing
+    possible: tuple[Candidate, ...]  # possible nets, from coarse to fine
+    index: int  # index of the chosen one
+    limit: str = ""  # limit that rules out a larger net, in words; "": none
 
     @property
     def net(self) -> Sides:
-        """Control points a side, or along x and along y."""
-        return self.possible[self.number].net
+        """Control points per side, or along x and along y."""
+        return self.possible[self.index].net
 
     @property
     def line(self) -> str:
-        """What is chosen, and what more and fewer would give; one line."""
-        chosen, around = self.possible[self.number], []
+        """Line that states the choice, and the effect of more and of fewer control points."""
+        chosen, around = self.possible[self.index], []
         for step, word in ((1, "more"), (-1, "fewer")):
-            if 0 <= self.number + step < len(self.possible):
-                other = self.possible[self.number + step]
-                less, longer = map(about, other.over(chosen))
+            if 0 <= self.index + step < len(self.possible):
+                other = self.possible[self.index + step]
+                less, longer = map(about, other.relative_to(chosen))
                 factors = f"about {less} times the RRMSD in {longer} times the time"
-                around.append(f"{word}, {size_text(other.net)}, would come to {factors}")
+                around.append(f"{word}, {size_text(other.net)}, would give {factors}")
         return "; ".join(filter(None, (f"{size_text(chosen.net)} control points are chosen", *around, self.limit)))
 
     def facts(self) -> dict[str, Any]:
-        """The choice for JSON, each net by its RRMSD and time over those of the chosen one."""
-        chosen = self.possible[self.number]
-        factors = [(each.net, *map(two_digits, each.over(chosen))) for each in self.possible]
+        """Return the choice for JSON, each net with RRMSD and time relative to the chosen one."""
+        chosen = self.possible[self.index]
+        factors = [(each.net, *map(two_digits, each.relative_to(chosen))) for each in self.possible]
         return {
             "possible": [dict(zip(("net", "times_rrmsd", "times_seconds"), each, strict=True)) for each in factors],
-            "number": self.number,
+            "number": self.index,
             "limit": self.limit,
         }
 
 
 def with_net(scene: Scene) -> tuple[Scene, Choice | None]:
-    """The scene with the net that is chosen for it; a scene that states one as it is, and None.
+    """Return the scene with a chosen net, and the choice; or the scene unchanged and None if it states a net.
 
-    SceneError if no light reaches the back.
+    Raises SceneError if no light reaches the back.
     """
     if scene.lens.back.control_points is not None:
         return scene, None
     levels = scene.tailoring.levels
-    if levels is not None:  # they say it
-        return scene.changed({KEY: levels[-1]}), None
-    choice = chosen(scene)
-    return scene.changed({KEY: choice.net}), choice
+    if levels is not None:  # the last level states the net
+        return scene.changed({NET_KEY: levels[-1]}), None
+    choice = choose_net(scene)
+    return scene.changed({NET_KEY: choice.net}), choice
 
 
-def chosen(scene: Scene) -> Choice:
-    """The choice for a scene without a net; of several targets that which asks for the finest one."""
-    choices = (_chosen(each) for each in scene.single_target_scenes())
+def choose_net(scene: Scene) -> Choice:
+    """Choose a net for a scene without one; of several targets, the target that needs the finest net decides."""
+    choices = map(_choose_for_target, scene.single_target_scenes())
     return max(choices, key=lambda choice: math.prod(as_pair(choice.net)))
 
 
-def _chosen(scene: Scene) -> Choice:
-    """The choice for a scene of one target."""
-    tried = [scene.changed({KEY: net}) for net in nets(scene)]
-    lens = coarse_lens(tried[0])
-    light, image = cells_of_a_mm2(tried[0], lens), blurred(tried[0], lens)
-    a_pixel = [light.a_pixel.sum() / math.prod(each.lens.cells) / light.target.size for each in tried]  # on average
+def _choose_for_target(scene: Scene) -> Choice:
+    """Choose a net for a scene with one target."""
+    scenes = [scene.changed({NET_KEY: net}) for net in candidate_nets(scene)]
+    lens = coarse_lens(scenes[0])
+    light, image = area_cells(scenes[0], lens), blur_rrmsd(scenes[0], lens)
+    a_pixel = [light.a_pixel.sum() / math.prod(each.lens.cells) / light.target.size for each in scenes]  # on average
     candidates: list[Candidate] = []
-    for each, cells, coarser_cells in zip(tried, a_pixel, [0.0, *a_pixel], strict=False):
-        if coarser_cells > ENOUGH:
+    for each, cells, coarser_cells in zip(scenes, a_pixel, [0.0, *a_pixel], strict=False):
+        if coarser_cells > SUFFICIENT_CELLS:
             break
-        likely = rrmsd(light, each, image)
-        if candidates and cells > ENOUGH:
-            likely = max(likely, candidates[-1].rrmsd / BEYOND)
-        candidates.append(Candidate(each.lens.back.net, likely, usual(each).total, memory_gb(each), moved=moved(each)))
-    possible, limit = _possible(scene, candidates)
-    first = next(k for k, each in enumerate(possible) if not any(_worth(each, other) for other in possible[k + 1 :]))
+        likely = net_rrmsd(light, each, image)
+        if candidates and cells > SUFFICIENT_CELLS:
+            likely = max(likely, candidates[-1].rrmsd / MAX_FURTHER_GAIN)
+        seconds = typical_seconds(each).total
+        candidates.append(Candidate(each.lens.back.net, likely, seconds, memory_gb(each), seam_shift=seam_shift(each)))
+    possible, limit = _affordable(scene, candidates)
+    first = 0
+    while any(_is_worthwhile(possible[first], other) for other in possible[first + 1 :]):
+        first += 1
     return Choice(possible, first, limit if first == len(possible) - 1 else "")
 
 
-def gain(scene: Scene, finer: Scene, lenses: Sequence[Lens]) -> float:
-    """Times the RRMSD of a scene that it has with a finer net, for the target that gains least.
+def rrmsd_ratio(scene: Scene, finer: Scene, lenses: Sequence[Lens]) -> float:
+    """Return the ratio of the RRMSD with a finer net to that of the scene, for the target that gains least.
 
-    lenses: a coarse one for each target.
+    lenses: a coarse lens for each target.
     """
-    found = []
+    ratios = []
     for one, other, lens in zip(scene.single_target_scenes(), finer.single_target_scenes(), lenses, strict=True):
-        light, image = cells_of_a_mm2(one, lens), blurred(one, lens)
-        few, many = (rrmsd(light, each, image) for each in (one, other))
-        found.append(many / few)
-    return min(max(*found, MOST_GAINED), 1.0)
+        light, image = area_cells(one, lens), blur_rrmsd(one, lens)
+        coarse_error, fine_error = (net_rrmsd(light, each, image) for each in (one, other))
+        ratios.append(fine_error / coarse_error)
+    return min(max(*ratios, MIN_RRMSD_RATIO), 1.0)
 
 
-def _worth(coarse: Candidate, fine: Candidate) -> bool:
-    """Is a finer net worth its time beside a coarser one?"""
+def _is_worthwhile(coarse: Candidate, fine: Candidate) -> bool:
+    """Return True if the gain by a finer net justifies its time."""
     less, longer = coarse.rrmsd / fine.rrmsd, fine.seconds / coarse.seconds
-    return not any(less <= gain and longer >= time for gain, time in WORTH)
+    return not any(less <= gain and longer >= time for gain, time in MIN_GAINS)
 
 
-def _possible(scene: Scene, candidates: list[Candidate]) -> tuple[tuple[Candidate, ...], str]:
-    """Those that tool, time and memory allow, the coarsest in any case; and which of them leaves larger ones out."""
-    most, room, radius = scene.tailoring.max_time, ROOM * psutil.virtual_memory().total / 1e9, scene.lens.tool_radius
+def _affordable(scene: Scene, candidates: list[Candidate]) -> tuple[tuple[Candidate, ...], str]:
+    """Return the candidates that tool, time and memory allow (or the coarsest), and the limit that excludes others."""
+    max_time, radius = scene.tailoring.max_time, scene.lens.tool_radius
+    available = MEMORY_FRACTION * psutil.virtual_memory().total / 1e9
     bounds = (
-        (f"lens.tool_radius = {radius} has no use for more", lambda each: each.moved >= SEAM),
-        (f"tailoring.max_time = {most} leaves no time for more", lambda each: most is None or each.seconds <= most),
-        ("the memory of this machine is too little for more", lambda each: each.memory_gb <= room),
+        (f"more have no effect with lens.tool_radius = {radius}", lambda each: each.seam_shift >= MIN_SEAM_SHIFT),
+        (f"more take longer than tailoring.max_time = {max_time}", lambda each: each.seconds <= (max_time or math.inf)),
+        ("more need more memory than this machine has", lambda each: each.memory_gb <= available),
     )
     limit = ""
     for reason, fits in bounds:
@@ -171,11 +178,11 @@ def _possible(scene: Scene, candidates: list[Candidate]) -> tuple[tuple[Candidat
     return tuple(candidates), limit
 
 
-def moved(scene: Scene) -> float:
-    """Pixels by which the tightest valley that the tool makes moves light on the target within a cell; inf: any.
+def seam_shift(scene: Scene) -> float:
+    """Return the shift of light on the target across a cell in the narrowest valley of the tool, pixels; inf: any tool.
 
-    p L (n - 1) / R of a cell of pitch p behind a throw L; a mirror turns light by twice its slope.  Where light
-    has to part, a seam is as wide as the tool makes it, and much finer cells do not narrow it.
+    p L (n - 1) / R for a cell of pitch p, a throw L and a tool radius R; a mirror turns light by twice its slope.  At
+    a seam, where light separates, the valley is as wide as the tool, and finer cells do not make it narrower.
     """
     radius, target = scene.lens.tool_radius, scene.target
     if radius is None:
@@ -185,25 +192,24 @@ def moved(scene: Scene) -> float:
     return throw * math.sqrt(math.prod(scene.lens.cells)) * math.sqrt(math.prod(target.screen.per_unit))
 
 
-def nets(scene: Scene) -> list[Sides]:
-    """The nets that are tried, from coarse to fine: of an oblong lens with square cells."""
+def candidate_nets(scene: Scene) -> list[Sides]:
+    """Return the candidate nets from coarse to fine; those of an oblong lens have square cells."""
     half_x, half_y = scene.lens.outline.half_extent
-    if max(half_x, half_y) <= NEARLY * min(half_x, half_y):
-        return list(SQUARE)
-    return [coarser(spread(points, half_x, half_y), MAX_CONTROL_POINTS) for points in SQUARE]
+    if max(half_x, half_y) <= MAX_SQUARE_ASPECT * min(half_x, half_y):
+        return list(SQUARE_NETS)
+    return [coarser(spread(points, half_x, half_y), MAX_CONTROL_POINTS) for points in SQUARE_NETS]
 
 
 @torch.no_grad()
-def cells_of_a_mm2(scene: Scene, lens: Lens) -> ControlCells:
-    """The area (mm²) of the back that lights each pixel, by the flux that the target wants there: cells of 1 mm².
+def area_cells(scene: Scene, lens: Lens) -> ControlCells:
+    """Return the area (mm²) of the back that lights each pixel, as cells of 1 mm².
 
-    lens: a coarse one for the scene, whose light tells what flux density the light for each part of the target has as
-    it crosses the back.
+    lens: a coarse lens for the scene.  Its light has the flux density at the back for each part of the target.
     """
     light = max(scene.with_source_scaled(0.0).channels(), key=lambda channel: channel.weight)
     lens, screen, target = light.through(lens), scene.target.screen, scene.target.irradiance()
     tiles = replace(screen, pixels=tuple(-(-n // TILE_PIXELS) for n in screen.pixels))
-    tubes = launch_tubes(light.source, lens, TUBES)
+    tubes = launch_tubes(light.source, lens, DENSITY_TUBES)
     x, y = cross(tubes.rays, lens.interfaces[lens.freeform[0]]).rays.position[:2]
     landed = tubes.landing(lens, screen.plane)
     flux, corners = tubes.arriving_flux(landed), tiles.pixels_of(landed.position.double())
@@ -213,25 +219,26 @@ def cells_of_a_mm2(scene: Scene, lens: Lens) -> ControlCells:
         for carried in (area, flux)
     )
     mean = area.sum() / flux.sum() if flux.sum() > 0 else 0.0
-    per_flux = np.where(flux > DIM * flux.mean(), area / np.maximum(flux, 1e-300), mean)  # mm² of a unit of flux
+    bright = flux > MIN_RELATIVE_FLUX * flux.mean()
+    per_flux = np.where(bright, area / np.maximum(flux, 1e-300), mean)  # mm² per unit of flux
     whole = float(flux.sum())
     rows, columns = target.shape
     over_pixels = np.kron(per_flux, np.ones((TILE_PIXELS, TILE_PIXELS)))[:rows, :columns]
     return ControlCells(whole * target * over_pixels, target)
 
 
-def rrmsd(light: ControlCells, scene: Scene, image: float = 0.0) -> float:
-    """RRMSD of a scene with its net, roughly: detail that its cells cannot make, or make badly, and the rest.
+def net_rrmsd(light: ControlCells, scene: Scene, image: float = 0.0) -> float:
+    """Estimate the RRMSD of a scene with its net: detail finer than its cells, detail near that limit, and an offset.
 
-    image: RRMSD of the target blurred by the source's size.  Fitted to designs in standard quality, of which half
-    keep to 1.3 times this, and nine of ten to 2 times; drafts and fine designs are a little further off.
+    image: RRMSD of the target blurred by the image of the source.  The estimate is fitted to designs in standard
+    quality: half of them are within a factor of 1.3, and nine of ten within 2.  Other qualities are less accurate.
     """
-    factor, rest = BY_QUALITY.get(scene.tailoring.quality, BY_QUALITY["standard"])
+    factor, rest = QUALITY_TERMS.get(scene.tailoring.quality, QUALITY_TERMS["standard"])
     width, height = scene.lens.cells
     finer = 1 / math.sqrt(width * height)
     other_tiles = tuple(slice(TILE_PIXELS // 2 if side > TILE_PIXELS // 2 else 0, None) for side in light.target.shape)
     between = replace(light, a_pixel=light.a_pixel[other_tiles], target=light.target[other_tiles])
-    floors = (FLOOR * light.floor(finer), FLOOR * between.floor(finer))
-    halved = (HALVED * light.floor(finer / 2), HALVED * between.floor(finer / 2))
+    floors = (FLOOR_FACTOR * light.floor(finer), FLOOR_FACTOR * between.floor(finer))
+    halved = (HALVED_FACTOR * light.floor(finer / 2), HALVED_FACTOR * between.floor(finer / 2))
     by_net = factor * math.hypot(*floors, *halved) / math.sqrt(2) + rest
-    return math.hypot(by_net, UNDONE * image)
+    return math.hypot(by_net, REMAINING_BLUR * image)

@@ -1,9 +1,9 @@
-"""Predict seconds, RRMSD and memory of a design by a pilot: the same design made small, and timed.
+"""Predict time, RRMSD and memory of a design from a pilot: a small version of the same design, run on this machine.
 
-Net, pixels, ray tubes and cells of the transport of a pilot are those of the scene over one factor, so that a pixel has
-the control cells and the tubes that it has in the scene, and the search makes as many evaluations.  The pilot runs all
-that the scene asks for (faces, goals, losses, wavelengths, bounds) on this machine; how each stage grows with its sizes
-is known from the method.  A pilot sees no detail that is finer than its pixels; this is measured on the picture.
+Net, pixels, flux tubes and transport cells of a pilot are those of the scene divided by one factor.  A pixel therefore
+has as many control cells and tubes as in the scene, and the search makes as many evaluations.  The pilot includes
+everything in the scene (faces, goals, losses, wavelengths, bounds).  How the time of each stage scales with its sizes
+is known from the method.  A pilot contains no detail finer than its pixels; that part is measured on the picture.
 
 tests/benchmarks/test_prediction.py compares predictions with designs of the templates and of the gallery.
 """
@@ -26,104 +26,105 @@ from bstcad.optics.measure import Effort, rrmsd_by_rays
 from bstcad.optics.sides import Sides, as_pair, coarser
 from bstcad.scene.quality import COARSEST_GRID
 from bstcad.scene.scene import Scene
-from bstcad.sweep.cold_run import REPEATS, kernel, timed
+from bstcad.sweep.cold_run import KERNEL_REPEATS, calibration_kernel, measure_seconds
 from bstcad.tailoring.run import JUDGING, Task
 from bstcad.tailoring.slope_map import SUBCELLS
 from bstcad.tailoring.stage2 import round_shares, sheet_sizes, stage3_sheet_sizes
 
 Interval = tuple[float, float, float]  # low, likely, high
 QUALITIES = ("draft", "standard", "fine")
-FLOWN = ("draft", "standard")  # qualities that have a pilot; that of `fine` is the one of standard quality
-WITHIN = {"seconds": 1.5, "rrmsd": 1.5, "memory_gb": 1.25}  # factors that nine of ten designs keep to
+PILOT_QUALITIES = ("draft", "standard")  # qualities with a pilot; "fine" uses that of "standard"
+INTERVAL_FACTORS = {"seconds": 1.5, "rrmsd": 1.5, "memory_gb": 1.25}  # factors within which nine of ten designs lie
 
 # --- the pilot --------------------------------------------------------------------------------------------------------
 
-LARGEST = 128, 193, 512  # pixels, control points and tubes a side of a pilot, at most
-FEWEST_POINTS = 65  # control points a side of a pilot, unless its scene has fewer
-FEWEST_TUBES = 16  # a side
-CELLS = (16, 256)  # cells a side of the transport of a pilot, at least and at most
-JUDGED = Effort(rays=2048, accuracy=0.02, witness=False)  # few rays are noisier than smooth light is wrong
-SEARCHES = ("stage 2", "stage 3")  # how the names of these stages begin
-ON_FEW = " pixels, "  # in the names of rounds of the search that see few pixels, always as few
+PILOT_LIMITS = 128, 193, 512  # maximum pixels, control points and tubes per side of a pilot
+MIN_PILOT_POINTS = 65  # minimum control points per side of a pilot, unless its scene has fewer
+MIN_PILOT_TUBES = 16  # minimum tubes per side
+PILOT_CELLS = (16, 256)  # minimum and maximum cells per side of the transport of a pilot
+PILOT_EFFORT = Effort(rays=2048, accuracy=0.02, witness=False)  # effort of its measurement
+SEARCH_STAGES = ("stage 2", "stage 3")  # beginnings of the names of the stages that search
+COARSE_ROUND_TEXT = " pixels, "  # text in the names of search rounds with few pixels, whose number does not scale
 
 
 @dataclass(frozen=True)
 class Seconds:
-    """Seconds of the parts of a design."""
+    """Seconds that the parts of a design take."""
 
     first: float  # stage 1
     search: float  # stage 2 or 3
-    rest: float  # start, writing, proof and report; of a pilot what does not grow with its sizes
+    rest: float  # start, writing, proof and report; for a pilot the part that does not scale with its sizes
 
     @property
     def total(self) -> float:
-        """Seconds of the whole command."""
+        """Time of the whole command, seconds."""
         return self.first + self.search + self.rest
 
 
 @dataclass(frozen=True)
 class Pilot:
-    """The result of a small design."""
+    """Result of a small design."""
 
-    scene: Scene  # the scene of the small design
+    scene: Scene  # scene of the small design
     seconds: Seconds
-    rrmsd: float  # the largest RRMSD of all goals
-    factor: float  # pixels a side of the whole scene over those of the pilot
-    detail: float  # relative RMS of what is finer in the whole scene's picture than the pixels of the pilot
-    blurred: float  # RRMSD that the source's size blurs in the pixels of the whole scene, beyond that in the pilot's
-    steep: Steepness  # slope that the light needs of the back
+    rrmsd: float  # largest RRMSD of all goals
+    factor: float  # ratio of the pixels per side of the full scene to those of the pilot
+    detail: float  # relative RMS of the detail of the full picture that is finer than the pilot's pixels
+    blur: float  # RRMSD by blur of the source in the full scene minus that in the pilot
+    steep: Steepness  # slope that the back needs
 
 
-def fly(scene: Scene, quality: str, tick: Callable[[], None] = lambda: None) -> Pilot:
-    """Design a scene of some quality made small.  SceneError where its design would be refused."""
-    small, factor = made_small(of_quality(scene, quality))
-    compiled, design = RecordingListener(), partial(pipeline.design, small, progress=lambda *told: tick(), later=True)
-    with install_listener("numba:compile", compiled):
-        made = design()
-    if compiled.buffer:  # the first design after an installation: its stages waited for the compiler
-        made = design()
+def run_pilot(scene: Scene, quality: str, tick: Callable[[], None] = lambda: None) -> Pilot:
+    """Design a small version of a scene in some quality; raise SceneError if its design would be refused."""
+    small, factor = pilot_scene(with_quality(scene, quality))
+    compilations = RecordingListener()
+    make_design = partial(pipeline.design, small, progress=lambda *event: tick(), later=True)
+    with install_listener("numba:compile", compilations):
+        finished = make_design()
+    if compilations.buffer:  # the first design after an installation waits for the compiler; time another one
+        finished = make_design()
     light, finer = small.channels(), factor > 1
     rrmsd = max(
-        rrmsd_by_rays(made.lens, light, goal.receiver, target=goal.picture, effort=JUDGED, draw=small.draw)
-        for goal in made.goals
+        rrmsd_by_rays(finished.lens, light, goal.receiver, target=goal.picture, effort=PILOT_EFFORT, draw=small.draw)
+        for goal in finished.goals
     )
-    sides = [max(goal.receiver.shape) for goal in made.goals]
-    alone = zip(scene.single_target_scenes(), small.single_target_scenes(), strict=True)
-    lost = [blurred(one, made.lens) - blurred(few, made.lens) for one, few in alone] if finer else [0.0]
-    took = dict.fromkeys(("first", "search", "rest"), 0.0)
-    for stage in made.making.stages:
-        part = "search" if stage.name.startswith(SEARCHES) else "first"
-        took["rest" if stage.name == "loading" or ON_FEW in stage.name else part] += stage.seconds
-    sent = made.making.transport
+    sides = [max(goal.receiver.shape) for goal in finished.goals]
+    pairs = zip(scene.single_target_scenes(), small.single_target_scenes(), strict=True)
+    blurs = [blur_rrmsd(one, finished.lens) - blur_rrmsd(few, finished.lens) for one, few in pairs] if finer else [0.0]
+    times = dict.fromkeys(("first", "search", "rest"), 0.0)
+    for stage in finished.making.stages:
+        part = "search" if stage.name.startswith(SEARCH_STAGES) else "first"
+        times["rest" if stage.name == "loading" or COARSE_ROUND_TEXT in stage.name else part] += stage.seconds
+    transport = finished.making.transport
     return Pilot(
-        small, Seconds(**took), rrmsd, factor,
+        small, Seconds(**times), rrmsd, factor,
         detail=max(map(detail, (goal.picture for goal in scene.goals), sides)) if finer else 0.0,
-        blurred=max(0.0, *lost), steep=Steepness(sent["steep_share"], sent["steepest_deg"]),
+        blur=max(0.0, *blurs), steep=Steepness(transport["steep_share"], transport["steepest_deg"]),
     )  # fmt: skip
 
 
-def of_quality(scene: Scene, quality: str) -> Scene:
-    """The scene in a quality, with the knobs that it states, and without an early end of its design."""
+def with_quality(scene: Scene, quality: str) -> Scene:
+    """Return the scene in a quality, with the settings that it states, but without limits that end a design early."""
     return scene.changed({"tailoring.quality": quality, "tailoring.accuracy": None, "tailoring.max_time": None})
 
 
-def made_small(scene: Scene) -> tuple[Scene, float]:
-    """The scene of a pilot, and the pixels a side of the scene over those of the pilot."""
-    net, (pixels, points, tubes) = scene.lens.back.net, LARGEST
+def pilot_scene(scene: Scene) -> tuple[Scene, float]:
+    """Return the scene of a pilot, and the ratio of the pixels per side of the full scene to those of the pilot."""
+    net, (pixels, points, tubes) = scene.lens.back.net, PILOT_LIMITS
     knobs, spans = scene.tailoring.resolved(net), max(as_pair(net)) - 1
     widest = max(max(target.columns_rows) for target in scene.targets)
-    factor = max(min(max(widest / pixels, spans / (points - 1)), spans / (FEWEST_POINTS - 1)), 1.0)
+    factor = max(min(max(widest / pixels, spans / (points - 1)), spans / (MIN_PILOT_POINTS - 1)), 1.0)
     changes = {
-        "tailoring.rays": max(min(round(knobs.rays / factor), tubes), FEWEST_TUBES),
-        "tailoring.transport_grid": int(np.clip(round(knobs.transport_grid / factor), *CELLS)),
+        "tailoring.rays": max(min(round(knobs.rays / factor), tubes), MIN_PILOT_TUBES),
+        "tailoring.transport_grid": int(np.clip(round(knobs.transport_grid / factor), *PILOT_CELLS)),
     }
     for key, target in zip(scene.target_keys, scene.targets, strict=True):
         changes[f"{key}.pixels"] = target.fewer_pixels(factor)
-    return of_net(scene, coarser(net, round(spans / factor) + 1), changes), factor
+    return replace_net(scene, coarser(net, round(spans / factor) + 1), changes), factor
 
 
-def of_net(scene: Scene, net: Sides, changes: Mapping[str, object] = {}) -> Scene:
-    """The scene with another net of the back, and of a freeform front in proportion; and with other changes."""
+def replace_net(scene: Scene, net: Sides, changes: Mapping[str, object] = {}) -> Scene:
+    """Return the scene with another net of the back, a freeform front in proportion, and further changes."""
     nets = {"lens.back.control_points": net, "tailoring.levels": None}
     if scene.lens.front.is_tailored and scene.lens.front.control_points is not None:
         nets["lens.front.control_points"] = scene.lens.front_net(net)
@@ -131,7 +132,7 @@ def of_net(scene: Scene, net: Sides, changes: Mapping[str, object] = {}) -> Scen
 
 
 def detail(picture: np.ndarray, pixels: int) -> float:
-    """RMS of the waves of a picture with more half waves over its longer side than so many pixels, over its RMS."""
+    """Return the relative RMS of the waves of a picture that are finer than `pixels` over its longer side."""
     from scipy.fft import dctn
 
     energy = dctn(picture, norm="ortho") ** 2
@@ -139,106 +140,109 @@ def detail(picture: np.ndarray, pixels: int) -> float:
     return float(np.sqrt(energy[half_waves > pixels].sum() / energy.sum()))
 
 
-def blurred(scene: Scene, lens: Lens) -> float:
-    """RRMSD of the target convolved with the image that a source of some size throws; 0 for a point."""
+def blur_rrmsd(scene: Scene, lens: Lens) -> float:
+    """Return the RRMSD of the target convolved with the image of an extended source; 0 for a point."""
     image = blur(scene.channels(), lens, scene.target.screen, scene.target.irradiance())
     return 0.0 if image is None else image.rrmsd
 
 
 # --- predictions ------------------------------------------------------------------------------------------------------
 
-POWER = -0.6  # of the factor: the error that a larger design leaves
-DETAIL = {"draft": 0.2, "standard": 0.02, "fine": 0.02}  # RRMSD by detail that the pilot does not see, over that detail
-FINE = 0.7  # RRMSD in fine over that in standard quality
-UNDONE = 0.5  # of the blur by a source of some size, that stage 3 leaves
+PILOT_EXPONENT = -0.6  # exponent by which the RRMSD scales with the factor of the pilot
+DETAIL_FACTORS = {"draft": 0.2, "standard": 0.02, "fine": 0.02}  # ratio of RRMSD to the detail that a pilot lacks
+FINE_RATIO = 0.7  # ratio of the RRMSD in fine to that in standard quality
+REMAINING_BLUR = 0.5  # fraction of the blur by an extended source that remains after stage 3
 
 
 def predictions(scene: Scene, pilots: Mapping[str, Pilot], gain: float = 1.0) -> dict[str, dict[str, Interval]]:
-    """Seconds of the command, RRMSD, and GB of both processes as a sum, for each quality, by pilots of FLOWN.
+    """Predict time (seconds), RRMSD and memory (GB, both processes) for each quality from pilots of PILOT_QUALITIES.
 
-    No quality has a larger RRMSD than the one below it, which does less.  gain: times the RRMSD by the pilots, for a
-    scene with another net than theirs.
+    The RRMSD does not increase from one quality to the next better one.  gain: ratio of the RRMSD to that of the
+    pilots' net, for a scene with another net.
     """
-    least, found = math.inf, {}
+    best, intervals = math.inf, {}
     for quality in QUALITIES:
-        pilot, wanted = pilots[quality if quality in FLOWN else FLOWN[-1]], of_quality(scene, quality)
-        least = min(least, gain * rrmsd(pilot, quality))
-        likely = {"seconds": seconds(wanted, pilot), "rrmsd": least, "memory_gb": memory_gb(wanted)}
-        found[quality] = {key: (each / WITHIN[key], each, each * WITHIN[key]) for key, each in likely.items()}
-    return found
+        pilot = pilots[quality if quality in PILOT_QUALITIES else PILOT_QUALITIES[-1]]
+        whole = with_quality(scene, quality)
+        best = min(best, gain * predicted_rrmsd(pilot, quality))
+        likely = {"seconds": predicted_seconds(whole, pilot), "rrmsd": best, "memory_gb": memory_gb(whole)}
+        wide = [(key, each, INTERVAL_FACTORS[key]) for key, each in likely.items()]
+        intervals[quality] = {key: (each / factor, each, each * factor) for key, each, factor in wide}
+    return intervals
 
 
-def rrmsd(pilot: Pilot, quality: str) -> float:
-    """RRMSD of a whole design by that of its pilot, and by the detail and the blur that the pilot does not see."""
-    seen = (FINE if quality == "fine" else 1.0) * pilot.factor**POWER * pilot.rrmsd
-    return seen + DETAIL[quality] * pilot.detail + UNDONE * pilot.blurred
+def predicted_rrmsd(pilot: Pilot, quality: str) -> float:
+    """Return the RRMSD of a full design from that of its pilot and from the detail and blur that the pilot lacks."""
+    by_pilot = (FINE_RATIO if quality == "fine" else 1.0) * pilot.factor**PILOT_EXPONENT * pilot.rrmsd
+    return by_pilot + DETAIL_FACTORS[quality] * pilot.detail + REMAINING_BLUR * pilot.blur
 
 
-def seconds(scene: Scene, pilot: Pilot) -> float:
-    """Seconds of a design: those of the stages of the pilot, as they grow with sizes, and the rest by the pace."""
-    whole, small, took = usual(scene), usual(pilot.scene), pilot.seconds
-    tailored = took.first * whole.first / small.first + took.search * whole.search / small.search
-    return tailored + took.rest + pace() * whole.rest
+def predicted_seconds(scene: Scene, pilot: Pilot) -> float:
+    """Return the time of a design (seconds): stages of the pilot scaled by their sizes, and the rest by the pace."""
+    whole, small, times = typical_seconds(scene), typical_seconds(pilot.scene), pilot.seconds
+    tailored = times.first * whole.first / small.first + times.search * whole.search / small.search
+    return tailored + times.rest + pace() * whole.rest
 
 
 # --- sizes ------------------------------------------------------------------------------------------------------------
 
-TUBES, POINTS, PIXELS, GRID, ITERATIONS = 1024, 513, 512, 256, 40  # a side, or in all, of which the following is stated
-KERNEL = 0.115  # seconds of cold_run.kernel on two cores of pace 1, on which the following is stated too
-ROUND, TRANSPORT, FIT = 0.06, 0.2, 0.6  # seconds of stage 1: a round, the transport of GRID², a fit of POINTS²
-TWO_FACES = 2.4  # seconds of the transport of GRID² behind two freeform faces, where the light between them is followed
-BETWEEN = 3.0  # seconds of stage 1 of two freeform faces that do not grow with its sizes
-FOUND = 1.0  # seconds in which the rays of a point through TUBES² given places are found
-FRONT = 1.7  # seconds of the search for a curved front
-EVALUATION, VARIABLE, BLUR = 0.11, 0.046, 0.30  # seconds of an evaluation: TUBES², POINTS², PIXELS² blurred by images
-CALLED = 0.01  # seconds of an evaluation that do not grow with its sizes
-IMAGES = 0.7  # seconds in which the images of a source of some size are found, in each round
-ADAM = 0.1  # seconds of a step of the paper's procedure by TUBES² rays
-STARTED = 2.8  # seconds of imports, and of the end of the process
-WRITTEN, A_NET, A_PICTURE = 1.5, 2.4, 1.1  # seconds of writing, proof and report: in all, for POINTS², for PIXELS²
-A_MOUNT = 2.5  # seconds of cutting and proving the mounted part
-RAYS, RAYS_OF_A_DRAFT = 1.6, 1.0  # seconds of the rays of a proof, for a target and a wavelength; of a lamp twice that
-WITNESS, WITNESS_OF_A_DRAFT = 6.0, 2.5  # seconds of the finer ray tubes that a second net needs, for a target
-LIBRARIES = 1.5  # GB in both processes
-CORNERS, NET_GB, PIXELS_GB = 0.12, 0.27, 0.02  # GB of TUBES² tubes, POINTS² control points, PIXELS² pixels
-A_GOAL = 3.0  # memory for each of several goals over that of the tubes for one target
+# Sizes (per side, or number of iterations) for which the following times and memory are stated, on two cores of pace 1.
+UNIT_TUBES, UNIT_POINTS, UNIT_PIXELS, UNIT_GRID, UNIT_ITERATIONS = 1024, 513, 512, 256, 40
+KERNEL_SECONDS = 0.115  # cold_run.calibration_kernel
+ROUND_SECONDS, TRANSPORT_SECONDS, FIT_SECONDS = 0.06, 0.2, 0.6  # stage 1: a round, a transport, a slope fit
+TWO_FACE_TRANSPORT_SECONDS = 2.4  # transport behind two freeform faces, where the light between them is traced
+TWO_FACE_SECONDS = 3.0  # part of stage 1 of two freeform faces that does not scale
+AIMING_SECONDS = 1.0  # search for the rays from a point source through UNIT_TUBES² given points
+FRONT_SECONDS = 1.7  # search for a curved front
+EVALUATION_SECONDS, VARIABLE_SECONDS, BLUR_SECONDS = 0.11, 0.046, 0.30  # evaluation: by tubes, control points, pixels
+CALL_SECONDS = 0.01  # part of an evaluation that does not scale
+IMAGE_SECONDS = 0.7  # images of an extended source, in each round
+ADAM_SECONDS = 0.1  # step of the paper's procedure
+START_SECONDS = 2.8  # imports, and end of the process
+WRITE_SECONDS, NET_SECONDS, PICTURE_SECONDS = 1.5, 2.4, 1.1  # writing, proof and report: fixed, by points, by pixels
+MOUNT_SECONDS = 2.5  # cut and proof of the mounted part
+RAY_SECONDS, DRAFT_RAY_SECONDS = 1.6, 1.0  # rays of a proof, for a target and a wavelength; parallel light
+WITNESS_SECONDS, DRAFT_WITNESS_SECONDS = 6.0, 2.5  # finer flux tubes for a second net, for a target
+LIBRARIES_GB = 1.5  # libraries in both processes
+TUBES_GB, NET_GB, PIXELS_GB = 0.12, 0.27, 0.02  # tubes, control points, pixels
+GOAL_MEMORY_FACTOR = 3.0  # memory of tubes for each of several goals, relative to that for one target
 
 
 @cache
 def pace() -> float:
-    """Seconds that an evaluation takes on this machine over those on two cores of pace 1."""
-    return min(timed(kernel()) for _ in range(REPEATS)) / KERNEL
+    """Return the time of an evaluation on this machine relative to two cores of pace 1."""
+    return min(measure_seconds(calibration_kernel()) for _ in range(KERNEL_REPEATS)) / KERNEL_SECONDS
 
 
-def usual(scene: Scene) -> Seconds:
-    """Seconds of a design on two cores of pace 1 by its sizes alone, where nothing in it is out of the ordinary."""
+def typical_seconds(scene: Scene) -> Seconds:
+    """Return the times of a design on two cores of pace 1, estimated from its sizes only."""
     knobs, point = scene.tailoring.resolved(scene.lens.back.net), not scene.source.parallel
-    rest = STARTED + proved(scene)
-    sheets, net, pixels = rounds(scene), (knobs.side / POINTS) ** 2, _pixels(scene)
+    rest = START_SECONDS + proof_seconds(scene)
+    sheets, net, pixels = search_rounds(scene), (knobs.side / UNIT_POINTS) ** 2, _pixel_ratio(scene)
     if knobs.method == "adam":
         counts = knobs.stage1_iterations * len(knobs.levels), knobs.stage2_iterations
-        return Seconds(*(ADAM * (knobs.rays / TUBES) ** 2 * count for count in counts), rest)
-    halvings, transport = (1, TWO_FACES) if scene.lens.front.is_tailored else (2, TRANSPORT)
+        return Seconds(*(ADAM_SECONDS * (knobs.rays / UNIT_TUBES) ** 2 * count for count in counts), rest)
+    halvings, transport = (1, TWO_FACE_TRANSPORT_SECONDS) if scene.lens.front.is_tailored else (2, TRANSPORT_SECONDS)
     grids = [max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left, halvings)) for left in range(knobs.rounds)]
-    first = ROUND * knobs.rounds + (FRONT if scene.lens.front.free else 0.0)
-    first += BETWEEN if scene.lens.front.is_tailored else 0.0
-    first += transport * sum((grid / GRID) ** 2 for grid in grids) * knobs.transport_iterations / ITERATIONS
+    first = ROUND_SECONDS * knobs.rounds + (FRONT_SECONDS if scene.lens.front.free else 0.0)
+    first += TWO_FACE_SECONDS if scene.lens.front.is_tailored else 0.0
+    first += transport * sum((grid / UNIT_GRID) ** 2 for grid in grids) * knobs.transport_iterations / UNIT_ITERATIONS
     fits = [fitted for level in knobs.levels[-2:] for fitted in scene.lens.nets(level)]
-    first += FIT * sum(math.prod(as_pair(fitted)) for fitted in fits) / POINTS**2
-    each, begun = CALLED + VARIABLE * net, JUDGING * pixels ** (2 / 3)  # seconds of an evaluation and a round
+    first += FIT_SECONDS * sum(math.prod(as_pair(fitted)) for fitted in fits) / UNIT_POINTS**2
+    each, begun = CALL_SECONDS + VARIABLE_SECONDS * net, JUDGING * pixels ** (2 / 3)  # of an evaluation and a round
     if scene.source.extent is not None:
-        each, begun = each + BLUR * pixels, begun + IMAGES
-    launched = sum((tubes / TUBES) ** 2 for tubes, _ in sheets)
-    search = sum(count * (EVALUATION * (tubes / TUBES) ** 2 + each) + begun for tubes, count in sheets)
+        each, begun = each + BLUR_SECONDS * pixels, begun + IMAGE_SECONDS
+    launched = sum((tubes / UNIT_TUBES) ** 2 for tubes, _ in sheets)
+    search = sum(count * (EVALUATION_SECONDS * (tubes / UNIT_TUBES) ** 2 + each) + begun for tubes, count in sheets)
     if point:
         sides = [*(SUBCELLS * grid for grid in grids), min(2 * knobs.side, knobs.rays)]
-        first += FOUND * sum((side / TUBES) ** 2 for side in sides)
-        search += FOUND * launched
+        first += AIMING_SECONDS * sum((side / UNIT_TUBES) ** 2 for side in sides)
+        search += AIMING_SECONDS * launched
     return Seconds(first, search + JUDGING * pixels ** (2 / 3), rest)
 
 
-def rounds(scene: Scene) -> tuple[tuple[int, int], ...]:
-    """(tubes a side, evaluations) of each round of stage 2 or 3."""
+def search_rounds(scene: Scene) -> tuple[tuple[int, int], ...]:
+    """Return tubes per side and number of evaluations for each round of stage 2 or 3."""
     knobs = scene.tailoring.resolved(scene.lens.back.net)
     if scene.source.extent is not None:
         columns, rows = zip(*(target.columns_rows for target in scene.targets), strict=True)
@@ -247,25 +251,27 @@ def rounds(scene: Scene) -> tuple[tuple[int, int], ...]:
 
 
 def memory_gb(scene: Scene) -> float:
-    """The most that both processes of a design hold, as a sum."""
+    """Return the peak memory (GB) of both processes of a design together."""
     goals = len(scene.targets) + (scene.wavefront is not None)
-    corners = max(tubes for tubes, _ in rounds(scene)) ** 2 / TUBES**2 * (A_GOAL * goals if goals > 1 else 1.0)
-    return LIBRARIES + CORNERS * corners + NET_GB * _points(scene) + PIXELS_GB * _pixels(scene)
+    by_goals = GOAL_MEMORY_FACTOR * goals if goals > 1 else 1.0
+    corners = max(tubes for tubes, _ in search_rounds(scene)) ** 2 / UNIT_TUBES**2 * by_goals
+    return LIBRARIES_GB + TUBES_GB * corners + NET_GB * _point_ratio(scene) + PIXELS_GB * _pixel_ratio(scene)
 
 
-def proved(scene: Scene) -> float:
-    """Seconds of writing, proof and report on two cores of pace 1; pipeline.reserve is a bound above it."""
+def proof_seconds(scene: Scene) -> float:
+    """Return the time (seconds) of writing, proof and report on two cores of pace 1; pipeline.reserve is larger."""
     wide = not scene.source.parallel or scene.source.extent is not None
     draft = scene.tailoring.quality == "draft"
-    rays, witness = (RAYS_OF_A_DRAFT, WITNESS_OF_A_DRAFT) if draft else (RAYS, WITNESS)
+    rays, witness = (DRAFT_RAY_SECONDS, DRAFT_WITNESS_SECONDS) if draft else (RAY_SECONDS, WITNESS_SECONDS)
     a_target = rays * (2 if wide else 1) * len(scene.source.lines) + witness * (len(scene.lens.nets()) - 1)
-    mounted = A_MOUNT if scene.mount is not None else 0.0
-    return WRITTEN + A_NET * _points(scene) + A_PICTURE * _pixels(scene) + a_target * len(scene.targets) + mounted
+    mounted = MOUNT_SECONDS if scene.mount is not None else 0.0
+    by_size = WRITE_SECONDS + NET_SECONDS * _point_ratio(scene) + PICTURE_SECONDS * _pixel_ratio(scene)
+    return by_size + a_target * len(scene.targets) + mounted
 
 
-def _points(scene: Scene) -> float:
-    return sum(math.prod(as_pair(net)) for net in scene.lens.nets()) / POINTS**2
+def _point_ratio(scene: Scene) -> float:
+    return sum(math.prod(as_pair(net)) for net in scene.lens.nets()) / UNIT_POINTS**2
 
 
-def _pixels(scene: Scene) -> float:
-    return sum(math.prod(target.columns_rows) for target in scene.targets) / PIXELS**2
+def _pixel_ratio(scene: Scene) -> float:
+    return sum(math.prod(target.columns_rows) for target in scene.targets) / UNIT_PIXELS**2

@@ -1,11 +1,11 @@
-"""bstcad tradeoff: the cost of accuracy in time for a scene, by runs of it within a budget of seconds.
+"""Command `bstcad tradeoff`: measure what accuracy costs in time for a scene, by runs within a budget of seconds.
 
-A run is the base scene with some settings: one knob at a time is turned, then those that go together.  The budget is
-the sum of the seconds of all runs, wherever they take place, of every sweep in a folder.  A run that is
-predicted not to fit is not begun; a run that takes longer is ended OVER beyond the budget.
+A run is the base scene with some settings.  One knob is varied at a time, then pairs of knobs.  The budget is the sum
+of the times of all runs of all sweeps in a folder, on any machine.  A run that is predicted to exceed it is not
+started.  A run that takes longer than predicted is ended when it exceeds the budget by MAX_OVERRUN.
 
-The folder holds the base scene (scene/), the record of each run (runs/), and the results (results.py).  A run with a
-record is not run again: a sweep that was stopped goes on, a larger budget goes further.
+The folder contains the base scene (scene/), the record of each run (runs/), and the results (results.py).  A run with a
+record is not repeated, so an interrupted sweep continues, and a larger budget adds runs.
 """
 
 from __future__ import annotations
@@ -30,86 +30,90 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import PRESETS
 from bstcad.scene.scene import Scene
 from bstcad.sweep import cold_run, results
-from bstcad.sweep.cold_run import LocalPool, Run, Settings, Stored, Value, as_text, settings
+from bstcad.sweep.cold_run import ColdRun, LocalPool, Settings, StoredRecord, Value, format_value, sorted_settings
 from bstcad.sweep.net_choice import with_net
-from bstcad.sweep.prediction import STARTED, usual
-from bstcad.sweep.results import Calibration, Place, Preset, Table, TableKnob, front, halving
+from bstcad.sweep.prediction import START_SECONDS, typical_seconds
+from bstcad.sweep.results import Calibration, KnobPoint, Preset, TableKnob, TradeoffTable, halving_factor, pareto_front
 
 # --- knobs ------------------------------------------------------------------------------------------------------------
 
-HALF, ROOT = 0.5, 0.5**0.5
-NETS = (9, 1025)  # control points a side, least and most
-GRIDS = (32, 2048)  # cells a side of a transport, least and most
-PIXELS = (8, 4096)  # a side, least and most
-COUNTS = (1, 16_384)  # of all else, least and most
-ROUNDS = (1, 2, 3, 5, 8)  # of transport and slope fit in stage 1
-ADAM = (1 / 8, 1 / 4, 1 / 2, 1.0)  # steps of Wang et al.'s procedure, as shares of the preset's
+HALF, SQRT_HALF = 0.5, 0.5**0.5
+POINT_LIMITS = (9, 1025)  # minimum and maximum control points per side
+GRID_LIMITS = (32, 2048)  # minimum and maximum transport cells per side
+PIXEL_LIMITS = (8, 4096)  # minimum and maximum pixels per side
+COUNT_LIMITS = (1, 16_384)  # minimum and maximum of all other numbers
+ROUND_COUNTS = (1, 2, 3, 5, 8)  # numbers of rounds of transport and slope fit in stage 1
+ADAM_FRACTIONS = (1 / 8, 1 / 4, 1 / 2, 1.0)  # steps of Wang et al.'s procedure, as fractions of the preset's
 NET_KEY = "lens.back.control_points"
 
-Points = Mapping[str, Settings]  # of a knob, by label ("768"), from little work to much
+Points = Mapping[str, Settings]  # points of a knob by label ("768"), in the order of increasing work
 
 
 @dataclass(frozen=True)
 class Knob:
-    """A number or a choice that trades accuracy for time."""
+    """Setting that trades accuracy for time."""
 
-    key: str  # for programs: "tubes"
-    title: str  # "Ray tubes a side"
+    key: str  # name for programs, such as "tubes"
+    title: str  # name in words, such as "Flux tubes per side"
     points: Points
-    combines: bool = False  # turns more than one key at a time
+    combines: bool = False  # True if it changes several keys at a time
 
 
 def other_seed(scene: Scene, point: Settings) -> Settings:
-    """The settings with the seed after the scene's."""
-    return settings({**dict(point), "tailoring.seed": scene.tailoring.seed + 1})
+    """Return the settings with the seed of the scene plus one."""
+    return sorted_settings({**dict(point), "tailoring.seed": scene.tailoring.seed + 1})
 
 
-def words(point: Settings) -> str:
-    """Settings as on the command line."""
-    changes = (f"{key.removeprefix('tailoring.')} = {as_text(value)}" for key, value in point)
+def describe(point: Settings) -> str:
+    """Describe settings as on the command line."""
+    changes = (f"{key.removeprefix('tailoring.')} = {format_value(value)}" for key, value in point)
     return ", ".join(changes) or "the scene's own"
 
 
 def knobs(scene: Scene) -> tuple[Knob, ...]:
-    """All knobs of a scene, the most important first."""
+    """Return all knobs of a scene, the most important first."""
     own = scene.lens.back.net
-    known = scene.tailoring.resolved(own)
-    adam = known.method == "adam"
+    resolved = scene.tailoring.resolved(own)
+    is_adam = resolved.method == "adam"
 
-    def shares(name: str, of: Iterable[float], limits: tuple[int, int] = COUNTS) -> Points:
-        value = getattr(known, name)
-        return _numbers(f"tailoring.{name}", value, (round(share * value) for share in of), limits)
+    def multiples(name: str, of: Iterable[float], limits: tuple[int, int] = COUNT_LIMITS) -> Points:
+        value = getattr(resolved, name)
+        return _numbers(f"tailoring.{name}", value, (round(factor * value) for factor in of), limits)
 
-    presets = PRESETS if _by_paper(scene) else [name for name in PRESETS if name != "paper"]
-    nets = {own, *filter(_possible, (scaled(own, share) for share in (1 / 4, HALF, 1, 2, 4)))}
-    every = (
+    presets = PRESETS if _allows_paper(scene) else [name for name in PRESETS if name != "paper"]
+    nets = {own, *filter(_is_candidate, (scaled(own, factor) for factor in (1 / 4, HALF, 1, 2, 4)))}
+    candidates = (
         Knob("quality", "Quality presets", _choices("tailoring.quality", scene.tailoring.quality, presets)),
-        Knob("evaluations", "Evaluations of stage 2", shares("stage2_iterations", (1 / 8, 1 / 4, HALF, 1, 2, 4))),
-        Knob("tubes", "Rays a side" if adam else "Ray tubes a side",
-             shares("rays", (1 / 4, HALF, ROOT, 1, 1 / ROOT, 2))),
-        Knob("control_points", "Control points a side", _choices(NET_KEY, own, sorted(nets, key=as_pair))),
-        Knob("adam", "Adam on control points, by rays", _adam(known.quality == "paper") if _by_paper(scene) else {}),
-        Knob("precision", "Precision", _choices("tailoring.precision", known.precision, ("float32", "float64"))),
-        Knob("pixels", "Pixels tailored to", _pixels(scene)),
-        Knob("rounds", "Rounds of stage 1", {} if adam else _numbers("tailoring.rounds", known.rounds, ROUNDS)),
-        Knob("transport_grid", "Transport grid, cells a side", shares("transport_grid", (1 / 4, HALF, 1, 2), GRIDS)),
-        Knob("transport_iterations", "Transport iterations", shares("transport_iterations", (1 / 8, 1 / 4, 1, 2))),
-        Knob("tubes_evaluations", "Tubes and evaluations together", _together(
-            ("tailoring.rays", known.rays, (HALF, ROOT, 1, 1 / ROOT)),
-            ("tailoring.stage2_iterations", known.stage2_iterations, (1 / 4, HALF, 1, 2))), combines=True),
-        Knob("control_points_tubes", "Control points and tubes together", _together(
-            (NET_KEY, own, (1 / 4, HALF, 1, 2)), ("tailoring.rays", known.rays, (1 / 4, HALF, 1, 2))), combines=True),
+        Knob("evaluations", "Evaluations of stage 2", multiples("stage2_iterations", (1 / 8, 1 / 4, HALF, 1, 2, 4))),
+        Knob("tubes", "Rays per side" if is_adam else "Flux tubes per side",
+             multiples("rays", (1 / 4, HALF, SQRT_HALF, 1, 1 / SQRT_HALF, 2))),
+        Knob("control_points", "Control points per side", _choices(NET_KEY, own, sorted(nets, key=as_pair))),
+        Knob("adam", "Adam on control points, by rays",
+             _adam_points(resolved.quality == "paper") if _allows_paper(scene) else {}),
+        Knob("precision", "Precision", _choices("tailoring.precision", resolved.precision, ("float32", "float64"))),
+        Knob("pixels", "Pixels of the target", _pixels(scene)),
+        Knob("rounds", "Rounds of stage 1",
+             {} if is_adam else _numbers("tailoring.rounds", resolved.rounds, ROUND_COUNTS)),
+        Knob("transport_grid", "Transport cells per side",
+             multiples("transport_grid", (1 / 4, HALF, 1, 2), GRID_LIMITS)),
+        Knob("transport_iterations", "Transport iterations", multiples("transport_iterations", (1 / 8, 1 / 4, 1, 2))),
+        Knob("tubes_evaluations", "Tubes and evaluations together", _joint_points(
+            ("tailoring.rays", resolved.rays, (HALF, SQRT_HALF, 1, 1 / SQRT_HALF)),
+            ("tailoring.stage2_iterations", resolved.stage2_iterations, (1 / 4, HALF, 1, 2))), combines=True),
+        Knob("control_points_tubes", "Control points and tubes together", _joint_points(
+            (NET_KEY, own, (1 / 4, HALF, 1, 2)),
+            ("tailoring.rays", resolved.rays, (1 / 4, HALF, 1, 2))), combines=True),
     )  # fmt: skip
-    return tuple(knob for knob in every if len(knob.points) > 1)
+    return tuple(knob for knob in candidates if len(knob.points) > 1)
 
 
-def _by_paper(scene: Scene) -> bool:
-    """Can the paper's procedure design the scene?  It knows one picture and one tailored face, and no bounds on it."""
+def _allows_paper(scene: Scene) -> bool:
+    """Return True if the paper's procedure can design the scene: one picture, one tailored face, no bounds on it."""
     return _is_allowed(scene, {"tailoring.quality": "paper"})
 
 
 def _is_allowed(scene: Scene, changes: Mapping[str, Any]) -> bool:
-    """Does the scene allow these changes?"""
+    """Return True if the scene allows these changes."""
     try:
         scene.changed(changes)
     except SceneError:
@@ -118,100 +122,100 @@ def _is_allowed(scene: Scene, changes: Mapping[str, Any]) -> bool:
 
 
 def _choices(key: str, own: Value, values: Iterable[Value]) -> Points:
-    return {as_text(value): () if value == own else ((key, value),) for value in values}
+    return {format_value(value): () if value == own else ((key, value),) for value in values}
 
 
-def _numbers(key: str, own: int, values: Iterable[int], limits: tuple[int, int] = COUNTS) -> Points:
+def _numbers(key: str, own: int, values: Iterable[int], limits: tuple[int, int] = COUNT_LIMITS) -> Points:
     return _choices(key, own, sorted({own, *(value for value in values if limits[0] <= value <= limits[1])}))
 
 
-def _possible(net: Sides) -> bool:
-    """Is the net among those that are tried?"""
-    return NETS[0] <= max(as_pair(net)) <= NETS[1]
+def _is_candidate(net: Sides) -> bool:
+    """Return True if the net is within POINT_LIMITS."""
+    return POINT_LIMITS[0] <= max(as_pair(net)) <= POINT_LIMITS[1]
 
 
 def _pixels(scene: Scene) -> Points:
-    """Coarser and finer pictures to tailor to, all targets' together; the lens is judged on the base's pixels."""
+    """Return coarser and finer pictures of all targets; the lens is judged on the pixels of the base scene."""
     own, points = [target.columns_rows for target in scene.targets], {}
-    for share in (1 / 4, HALF, 1, 2):
-        sizes = [(round(share * columns), round(share * rows)) for columns, rows in own]
-        if share == 1 or all(PIXELS[0] <= min(size) and max(size) <= PIXELS[1] for size in sizes):
+    for factor in (1 / 4, HALF, 1, 2):
+        sizes = [(round(factor * columns), round(factor * rows)) for columns, rows in own]
+        if factor == 1 or all(PIXEL_LIMITS[0] <= min(size) and max(size) <= PIXEL_LIMITS[1] for size in sizes):
             values = [columns if columns == rows else (columns, rows) for columns, rows in sizes]
             changed = {f"{key}.pixels": value for key, value in zip(scene.target_keys, values, strict=True)}
-            if share == 1 or _is_allowed(scene, changed):  # a profile may be too narrow for larger pixels
-                points[" and ".join(map(as_text, values))] = () if share == 1 else settings(changed)
+            if factor == 1 or _is_allowed(scene, changed):  # a profile may be too narrow for larger pixels
+                points[" and ".join(map(format_value, values))] = () if factor == 1 else sorted_settings(changed)
     return points
 
 
-def _adam(own: bool) -> Points:
-    """Wang et al.'s procedure with fewer steps; the last point is the preset."""
+def _adam_points(own: bool) -> Points:
+    """Return points of Wang et al.'s procedure with fewer steps; the last one is the preset."""
     points = {}
-    for share in ADAM:
-        steps = {name: round(share * PRESETS["paper"][name]) for name in ("stage1_iterations", "stage2_iterations")}
-        fewer = {f"tailoring.{name}": count for name, count in steps.items()} if share < 1 else {}
+    for factor in ADAM_FRACTIONS:
+        steps = {name: round(factor * PRESETS["paper"][name]) for name in ("stage1_iterations", "stage2_iterations")}
+        fewer = {f"tailoring.{name}": count for name, count in steps.items()} if factor < 1 else {}
         preset = {} if own else {"tailoring.quality": "paper"}
-        points[f"{steps['stage1_iterations']} + {steps['stage2_iterations']}"] = settings(preset | fewer)
+        points[f"{steps['stage1_iterations']} + {steps['stage2_iterations']}"] = sorted_settings(preset | fewer)
     return points
 
 
-def _together(*turned: tuple[str, int, Sequence[float]]) -> Points:
-    """Two keys in step: (key, the base's value, shares of that); of a net its spans are scaled."""
+def _joint_points(*varied: tuple[str, int, Sequence[float]]) -> Points:
+    """Return points that vary keys together: (key, value of the base, multiples); a net is scaled by its spans."""
     points = {}
-    for shares in zip(*(shares for _, _, shares in turned), strict=True):
+    for multiples in zip(*(multiples for _, _, multiples in varied), strict=True):
         values = {
-            key: own if share == 1 else scaled(own, share) if key == NET_KEY else max(1, round(share * own))
-            for (key, own, _), share in zip(turned, shares, strict=True)
+            key: own if factor == 1 else scaled(own, factor) if key == NET_KEY else max(1, round(factor * own))
+            for (key, own, _), factor in zip(varied, multiples, strict=True)
         }
-        if NET_KEY not in values or _possible(values[NET_KEY]):
-            changed = {key: values[key] for key, own, _ in turned if values[key] != own}
-            points[" × ".join(map(str, values.values()))] = settings(changed)
+        if NET_KEY not in values or _is_candidate(values[NET_KEY]):
+            changed = {key: values[key] for key, own, _ in varied if values[key] != own}
+            points[" × ".join(map(str, values.values()))] = sorted_settings(changed)
     return points
 
 
-# --- in which order ---------------------------------------------------------------------------------------------------
+# --- order of the runs ------------------------------------------------------------------------------------------------
 
 
 def run_order(scene: Scene, knobs: Sequence[Knob]) -> list[Settings]:
-    """All runs, the most important first, so that any budget is well spent.
+    """Return all runs, the most important first, so that any budget is well spent.
 
-    Presets, neighbours of the base, other seeds, further points, the paper's procedure.
+    Presets come first, then neighbours of the base, other seeds, further points, and the paper's procedure.
     """
     presets = knobs[0].points
     single = [knob for knob in knobs[1:] if not knob.combines]
-    both = [knob for knob in knobs if knob.combines]
+    joint = [knob for knob in knobs if knob.combines]
     paper = presets.get("paper", ())  # minutes
 
-    def around(turned: Iterable[Knob], *steps: int) -> list[Settings]:
-        return [point for away in steps for knob in turned for point in _neighbour(knob, away) if point != paper]
+    def neighbours(varied: Iterable[Knob], *distances: int) -> list[Settings]:
+        return [point for steps in distances for knob in varied for point in _neighbour(knob, steps) if point != paper]
 
     order = [
-        presets.get("draft", ()), (), presets.get("standard", ()), *around(single, -1),
-        *(again for _, again in _probes(scene, knobs).values()), *around(both, -1), *around(single, +1),
-        presets.get("fine", ()), *around(both, +1), *around(single, -2, -3, -4),
-        *around(knobs[1:], 2, -2, 3, -3, 4, -4), paper,
+        presets.get("draft", ()), (), presets.get("standard", ()), *neighbours(single, -1),
+        *(repeated for _, repeated in _probes(scene, knobs).values()), *neighbours(joint, -1), *neighbours(single, +1),
+        presets.get("fine", ()), *neighbours(joint, +1), *neighbours(single, -2, -3, -4),
+        *neighbours(knobs[1:], 2, -2, 3, -3, 4, -4), paper,
     ]  # fmt: skip
     return list(dict.fromkeys(order))
 
 
-def _neighbour(knob: Knob, away: int) -> list[Settings]:
-    """The point so far from the base, if there is one.
+def _neighbour(knob: Knob, steps: int) -> list[Settings]:
+    """Return the point that is so many steps from the base, if there is one.
 
-    Of a knob without the base the first point stands for the neighbour with less work, the second for more.
+    For a knob without the base, the first point counts as the neighbour with less work, the second as that with more.
     """
     points = list(knob.points.values())
-    start = points.index(()) if () in points else 1 if away == -1 else 0 if away > 0 else -1
-    return points[start + away : start + away + 1] if start + away >= 0 else []
+    start = points.index(()) if () in points else 1 if steps == -1 else 0 if steps > 0 else -1
+    return points[start + steps : start + steps + 1] if start + steps >= 0 else []
 
 
 def _probes(scene: Scene, knobs: Sequence[Knob]) -> dict[str, tuple[Settings, Settings]]:
-    """By method a cheap run, and the same run with another seed."""
+    """Return for each method a fast run, and the same run with another seed."""
     by_key = {knob.key: knob.points for knob in knobs}
     quick = {"least-squares": by_key["quality"].get("draft"), "adam": next(iter(by_key.get("adam", {}).values()), None)}
     return {method: (point, other_seed(scene, point)) for method, point in quick.items() if point is not None}
 
 
-def seed_matters(scene: Scene, knobs: Sequence[Knob], runs: Mapping[Settings, Run]) -> dict[str, bool | None]:
-    """By method: does another seed give another lens?  None: not measured."""
+def seed_matters(scene: Scene, knobs: Sequence[Knob], runs: Mapping[Settings, ColdRun]) -> dict[str, bool | None]:
+    """Return for each method True if another seed gives another lens; None: not measured."""
     nets = {
         method: [runs[point].net for point in pair if point in runs and runs[point].done]
         for method, pair in _probes(scene, knobs).items()
@@ -221,32 +225,32 @@ def seed_matters(scene: Scene, knobs: Sequence[Knob], runs: Mapping[Settings, Ru
 
 # --- the sweep --------------------------------------------------------------------------------------------------------
 
-LEEWAY = 1.1  # a run starts if so many times its predicted seconds are left
-OVER = 0.1  # of the budget, by which a run may go beyond it that takes longer than predicted
-MORE = 1.5  # times as long a run may take that was ended before and is begun again
-JUDGE = (
-    "stratified rays that tailoring never saw, in independent sets, until the standard error is below {:.2%} of the "
-    "RRMSD; {} pixels; the lens as read back from its folder"
+SAFETY_FACTOR = 1.1  # ratio of the remaining to the predicted time from which a run is started
+MAX_OVERRUN = 0.1  # fraction of the budget by which a run may exceed it
+RETRY_FACTOR = 1.5  # ratio of the available time to the earlier limit from which an ended run is repeated
+REFERENCE_TEXT = (
+    "stratified rays that were not used in tailoring, in independent sets, until the standard error is below {:.2%} of "
+    "the RRMSD; {} pixels; the lens as read back from its folder"
 )
-UNKNOWN = dict.fromkeys(("seconds", "cpu_seconds", "kernel_seconds", "cost_seconds"))  # of a run that was not run
+NO_TIMES = dict.fromkeys(("seconds", "cpu_seconds", "kernel_seconds", "cost_seconds"))  # null entries of a run not done
 
 
-class RunFile(Stored):
-    """The runs of a sweep by one version of bstcad."""
+class RunFile(StoredRecord):
+    """Runs of a sweep by one version of bstcad."""
 
-    runs: tuple[Run, ...]
+    runs: tuple[ColdRun, ...]
 
 
 def tradeoff(
-    scene: Scene, folder: Path, *, budget: float, progress: ProgressFunction = lambda *told: None,
-    machines: Machines | None = None, effort: cold_run.Effort = cold_run.REFERENCE,
-) -> Table:  # fmt: skip
-    """Run the most important runs that the budget allows, and write tradeoff.csv, .json, .png and .html.
+    scene: Scene, folder: Path, *, budget: float, progress: ProgressFunction = lambda *event: None,
+    machines: Machines | None = None, effort: cold_run.Effort = cold_run.REFERENCE_EFFORT,
+) -> TradeoffTable:  # fmt: skip
+    """Do the most important runs that the budget allows, and write tradeoff.csv, .json, .png and .html.
 
-    machines: where the runs take place; None: here.  effort: of the reference that judges.  The two tables are written
-    after each run, so that they are there however a sweep ends.
+    machines: machines of the runs; None: this one.  effort: effort of the reference.  The csv and json files are
+    written after each run, so that an interrupted sweep has them.
     """
-    scene = scene.changed({"tailoring.accuracy": None, "tailoring.max_time": None})  # which end a design early
+    scene = scene.changed({"tailoring.accuracy": None, "tailoring.max_time": None})  # these end a design early
     base, _ = with_net(scene)
     contents = scene_files(base)
     check_free(folder, contents)
@@ -256,123 +260,122 @@ def tradeoff(
             place.mkdir(parents=True, exist_ok=True)
         for name, data in contents.items():
             files.put(folder / "scene" / name, data)
-        search = _Search(base, budget, folder, progress)
+        sweep = _Sweep(base, budget, folder, progress)
         try:
-            search.run(machines, contents, effort)
+            sweep.run(machines, contents, effort)
         except BaseException as error:
-            if count := len(search.runs):
-                kept = "1 run is" if count == 1 else f"{count} runs are"
-                error.add_note(f"{kept} kept in {folder}; the same command goes on from there")
-                if isinstance(error, KeyboardInterrupt):  # there is time for a figure
-                    results.write_page(search.table(), base, folder)
+            if count := len(sweep.runs):
+                runs = "1 run is" if count == 1 else f"{count} runs are"
+                error.add_note(f"{runs} stored in {folder}; the same command continues from there")
+                if isinstance(error, KeyboardInterrupt):  # after Ctrl-C there is time for a figure
+                    results.write_page(sweep.table(), base, folder)
             raise
-        found = search.table()
+        found = sweep.table()
         results.write_page(found, base, folder)
         return found
 
 
 def check_free(folder: Path, contents: Mapping[str, bytes]) -> None:
-    """SceneError unless the sweep of this scene may take the folder: new, empty, or begun by this sweep."""
+    """Raise SceneError unless the folder is new, empty, or belongs to a sweep of this scene."""
     try:
         files.check_free(folder, [f"scene/{SCENE}"], "a sweep's")
     except ValueError as error:
         raise SceneError(f"{error} with -o") from None
     paths = {folder / "scene" / name: data for name, data in contents.items()}
-    there = folder / "scene" / SCENE
-    if there.is_file() and any(not path.is_file() or path.read_bytes() != data for path, data in paths.items()):
+    stored_scene = folder / "scene" / SCENE
+    if stored_scene.is_file() and any(not path.is_file() or path.read_bytes() != data for path, data in paths.items()):
         raise SceneError(
-            f"{folder}: holds the sweep of another scene, which stands in {there}; give another folder with -o, or "
-            "remove that one"
+            f"{folder}: contains the sweep of another scene, {stored_scene}; give another folder with -o, or remove "
+            "that one"
         )
 
 
-class _Search:
-    """A sweep under way."""
+class _Sweep:
+    """A running sweep."""
 
     def __init__(self, base: Scene, budget: float, folder: Path, progress: ProgressFunction) -> None:
         self._base, self._budget, self._folder, self._progress = base, budget, folder, progress
         self._knobs = knobs(base)
-        self._order, self._work = run_order(base, self._knobs), cache(partial(work_of, base))
-        self._under_way: dict[Settings, tuple[float, float]] = {}  # when it began, seconds predicted
+        self._order, self._work = run_order(base, self._knobs), cache(partial(predicted_work, base))
+        self._under_way: dict[Settings, tuple[float, float]] = {}  # (start time, predicted seconds) of running runs
         self._file = folder / "runs" / f"{environment.version()}.json"
-        kept = (
-            cold_run.read(RunFile, self._file, "remove it, and its runs are done again")
+        stored = (
+            cold_run.read_record(RunFile, self._file, "remove it, and its runs are repeated")
             if self._file.is_file()
             else None
         )
-        self.runs = {run.settings: run for run in kept.runs} if kept else {}  # that have ended
+        self.runs = {run.settings: run for run in stored.runs} if stored else {}  # runs that have ended
         for point, run in list(self.runs.items()):
-            if run.allowed_seconds is not None:  # it was ended; is there more time for it now?
+            if run.allowed_seconds is not None:  # its time was limited; repeat it if there is more time now
                 left = budget - self._spent() + run.cost_seconds
-                if left + OVER * budget >= MORE * run.allowed_seconds:
+                if left + MAX_OVERRUN * budget >= RETRY_FACTOR * run.allowed_seconds:
                     del self.runs[point]
-        self._earlier = self._spent()  # by the earlier sweeps in the folder
+        self._earlier = self._spent()  # seconds spent by earlier sweeps in the folder
 
     def run(self, machines: Machines | None, contents: Mapping[str, bytes], effort: cold_run.Effort) -> None:
-        """Until no run is left that fits."""
+        """Do runs until no remaining one fits into the budget."""
         if self._choice() is None:
             return
         with ExitStack() as stack:
-            if machines is None:  # one run at a time, so that none disturbs another
-                cold_run.warm_up(contents, lambda: self._progress("warm-up", 0, 0, "kernels are compiled, files read"))
+            if machines is None:  # one run at a time, so that runs do not slow each other down
+                cold_run.warm_up(contents, lambda: self._progress("warm-up", 0, 0, "compiling kernels, reading files"))
                 machines = stack.enter_context(LocalPool(1))
             while True:
                 while len(self._under_way) < machines.capacity and (point := self._choice()) is not None:
-                    # The first run is never ended for time: without it there is nothing.
-                    limit = self._left() + OVER * self._budget if self.runs or self._under_way else math.inf
+                    # The first run has no time limit, since a sweep needs at least one.
+                    limit = self._left() + MAX_OVERRUN * self._budget if self.runs or self._under_way else math.inf
                     self._under_way[point] = time.perf_counter(), self._predicted(point)
-                    machines.start(point, cold_run.carry_out, contents, point, limit, effort)
+                    machines.start(point, cold_run.run_and_judge, contents, point, limit, effort)
                 if not self._under_way:
                     return
-                self._ended(machines.next(self._tick))
+                self._record_answer(machines.next(self._tick))
 
-    def _ended(self, answer: Answer) -> None:
+    def _record_answer(self, answer: Answer) -> None:
         _, predicted = self._under_way.pop(answer.key)
         failed = {"status": cold_run.FAILED, "reason": answer.reason, "version": environment.version()}
-        run = answer.value or Run(settings=answer.key, **failed)
+        run = answer.value or ColdRun(settings=answer.key, **failed)
         self.runs[answer.key] = run.model_copy(update={"predicted_seconds": predicted, "where": answer.where})
-        kept = (run for run in self.runs.values() if run.cost_seconds)  # others did not take place, and are tried again
-        cold_run.put(self._file, RunFile(runs=tuple(kept)))
+        real = (run for run in self.runs.values() if run.cost_seconds)  # runs that were not started are tried again
+        cold_run.write_record(self._file, RunFile(runs=tuple(real)))
         self.table()
 
-    def table(self) -> Table:
-        """The table of the runs so far, and of those that are left; it is written, too."""
-        waiting = [
-            Run(settings=point, status=cold_run.NOT_RUN, where="", predicted_seconds=self._predicted(point), **UNKNOWN)
-            for point in self._order
-            if point not in self.runs
-        ]
+    def table(self) -> TradeoffTable:
+        """Write and return the table of the runs so far, and of the remaining ones."""
+        unset = NO_TIMES | {"status": cold_run.NOT_RUN, "where": ""}
+        points = (point for point in self._order if point not in self.runs)
+        waiting = [ColdRun(settings=point, predicted_seconds=self._predicted(point), **unset) for point in points]
         runs = [self.runs[point] for point in self._order if point in self.runs]
         found = table(self._base, self._knobs, runs, waiting, budget=self._budget)
         results.write(found, self._folder)
         return found
 
     def _choice(self) -> Settings | None:
-        """The most important run that fits into what is left; the first run always does."""
+        """Return the most important run that fits into the remaining budget; the first run always fits."""
         free = (point for point in self._order if point not in self.runs and point not in self._under_way)
         left = self._left() if self.runs or self._under_way else math.inf
-        return next((point for point in free if LEEWAY * self._predicted(point) <= left), None)
+        return next((point for point in free if SAFETY_FACTOR * self._predicted(point) <= left), None)
 
     def _predicted(self, point: Settings) -> float:
-        """Seconds of the budget that a run will take: those by `plan` times the pace of the runs of its method."""
-        adam, seconds = self._work(point)
+        """Predict the seconds of the budget that a run takes: estimate times the measured pace of its method."""
+        is_adam, seconds = self._work(point)
         paces: dict[bool, list[float]] = {True: [], False: []}
         for run in filter(lambda run: run.done, self.runs.values()):
             by_adam, expected = self._work(run.settings)
             paces[by_adam].append(run.cost_seconds / expected)
-        return seconds * statistics.median(paces[adam] or paces[not adam] or [1.0])
+        return seconds * statistics.median(paces[is_adam] or paces[not is_adam] or [1.0])
 
     def _left(self) -> float:
-        """Seconds left of the budget when the runs under way have taken their predicted seconds."""
-        return self._budget - self._spent() - LEEWAY * sum(predicted for _, predicted in self._under_way.values())
+        """Return the seconds of the budget that remain after the predicted end of the running runs."""
+        running = sum(predicted for _, predicted in self._under_way.values())
+        return self._budget - self._spent() - SAFETY_FACTOR * running
 
     def _spent(self) -> float:
         return sum(run.cost_seconds for run in self.runs.values())
 
     def _tick(self) -> None:
-        """The bar: of the budget that was left when this sweep began."""
+        """Report progress as a fraction of the budget that was available when this sweep began."""
         point, more = next(iter(self._under_way)), len(self._under_way) - 1
-        text = f"run {len(self.runs) + 1}: {words(point)}{f' and {more} more' if more else ''}"
+        text = f"run {len(self.runs) + 1}: {describe(point)}{f' and {more} more' if more else ''}"
         total, now = max(self._budget - self._earlier, 1.0), time.perf_counter()
         used = self._spent() - self._earlier + sum(now - began for began, _ in self._under_way.values())
         self._progress("tradeoff", round(min(used, 0.999 * total)), max(round(total), 1), text)
@@ -380,32 +383,34 @@ class _Search:
 
 # --- predicted seconds of runs ----------------------------------------------------------------------------------------
 
-JUDGING = 2.0  # seconds of judging a lens
+JUDGING_SECONDS = 2.0  # time of the reference for a lens
 
 
-def work_of(scene: Scene, point: Settings) -> tuple[bool, float]:
-    """(by the paper's procedure?, seconds on a machine of pace 1); a run that is refused has its start alone."""
+def predicted_work(scene: Scene, point: Settings) -> tuple[bool, float]:
+    """Return True for the paper's procedure, and the seconds on a machine of pace 1; a refused run only starts."""
     try:
         changed = scene.changed(dict(point))
     except SceneError:
-        return False, STARTED + JUDGING
-    return changed.tailoring.resolved(changed.lens.back.net).method == "adam", usual(changed).total + JUDGING
+        return False, START_SECONDS + JUDGING_SECONDS
+    seconds = typical_seconds(changed).total + JUDGING_SECONDS
+    return changed.tailoring.resolved(changed.lens.back.net).method == "adam", seconds
 
 
 # --- the table --------------------------------------------------------------------------------------------------------
 
 
 def table(
-    scene: Scene, knobs: Sequence[Knob], runs: Sequence[Run], waiting: Sequence[Run] = (), *, budget: float = math.inf
-) -> Table:
-    """The results of the runs of a scene that have ended, and of those that wait, both by their importance."""
-    own, best = scene.lens.back.net, front(runs)
-    timed = {run.settings: run for run in runs if run.comparable}
-    shown = timed or {run.settings: run for run in runs if run.done}
-    of_all = shown.get(()) or next(iter(shown.values()), None)  # whose machine stands for all
-    unit = [run.kernel_seconds for run in timed.values() if run.kernel_seconds]
+    scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], waiting: Sequence[ColdRun] = (), *,
+    budget: float = math.inf,
+) -> TradeoffTable:  # fmt: skip
+    """Return the table of the runs that have ended and of those that wait, both in the order of importance."""
+    own, best = scene.lens.back.net, pareto_front(runs)
+    comparable = {run.settings: run for run in runs if run.comparable}
+    selected = comparable or {run.settings: run for run in runs if run.done}
+    sample = selected.get(()) or next(iter(selected.values()), None)  # states the machine of all runs
+    unit = [run.kernel_seconds for run in comparable.values() if run.kernel_seconds]
     on_front, labels = tuple(run.settings for run in best), _labels(scene, knobs)
-    return Table(
+    return TradeoffTable(
         name=scene.name,
         title=scene.title,
         base={
@@ -414,14 +419,14 @@ def table(
         },
         budget_seconds=budget,
         spent_seconds=sum(run.cost_seconds for run in runs),
-        errors_alone=bool(shown) and not timed,
+        errors_alone=bool(selected) and not comparable,
         version=bstcad.__version__,
         sources=next((run.version for run in runs), ""),
-        machine=of_all.machine if of_all else {},
-        versions=of_all.versions if of_all else {},
+        machine=sample.machine if sample else {},
+        versions=sample.versions if sample else {},
         reference={
             "rays": sorted({run.rays for run in runs if run.rays}),
-            "what": JUDGE.format(cold_run.REFERENCE.accuracy, _judged_on(scene)),
+            "what": REFERENCE_TEXT.format(cold_run.REFERENCE_EFFORT.accuracy, _judged_on(scene)),
         },
         calibration=Calibration(
             seconds=statistics.median(unit) if unit else None, lowest=min(unit, default=None),
@@ -429,53 +434,55 @@ def table(
         ),
         runs=tuple(
             run.model_copy(update={
-                "label": labels.get(run.settings) or words(run.settings),
-                "knobs": _turned(knobs, run.settings), "on_front": run.settings in on_front,
+                "label": labels.get(run.settings) or describe(run.settings),
+                "knobs": _knob_keys(knobs, run.settings), "on_front": run.settings in on_front,
             }) for run in (*runs, *waiting)
         ),
         knobs=tuple(
-            TableKnob(key=knob.key, title=knob.title, places=places(scene, knob, shown, timed=bool(timed)))
+            TableKnob(key=knob.key, title=knob.title, places=knob_points(scene, knob, selected, timed=bool(comparable)))
             for knob in knobs
         ),
         front=on_front,
-        front_halving=halving(best),
+        front_halving=halving_factor(best),
         presets=tuple(
-            Preset(name=name, seconds=shown[point].seconds if timed else None, rrmsd=shown[point].rrmsd)
-            for name, point in knobs[0].points.items() if point in shown
+            Preset(name=name, seconds=selected[point].seconds if comparable else None, rrmsd=selected[point].rrmsd)
+            for name, point in knobs[0].points.items() if point in selected
         ),
         seeds=seed_matters(scene, knobs, {run.settings: run for run in runs}),
-        history=timed[()].history if () in timed else (),
+        history=comparable[()].history if () in comparable else (),
     )  # fmt: skip
 
 
 def _judged_on(scene: Scene) -> str:
-    """The pixels of the reference; "64 x 48"."""
+    """Return the pixels of the reference in words, such as "64 x 48"."""
     sizes = " and ".join("{} x {}".format(*target.columns_rows) for target in scene.targets)
     return f"the target with the largest RRMSD, of {sizes}" if len(scene.targets) > 1 else sizes
 
 
-def places(scene: Scene, knob: Knob, runs: Mapping[Settings, Run], timed: bool = True) -> tuple[Place, ...]:
-    """The points of a knob that were run, by the scene's seed or the next; timed: do seconds compare?"""
+def knob_points(
+    scene: Scene, knob: Knob, runs: Mapping[Settings, ColdRun], timed: bool = True
+) -> tuple[KnobPoint, ...]:
+    """Return the points of a knob that were run with either seed; timed: True if times are comparable."""
     found = []
     for label, point in knob.points.items():
         if done := [runs[each] for each in (point, other_seed(scene, point)) if each in runs and runs[each].done]:
             errors, seconds = [run.rrmsd for run in done], statistics.median(run.seconds for run in done)
-            place = Place(
+            average = KnobPoint(
                 label=label, settings=point, seconds=seconds if timed else None, rrmsd=statistics.median(errors),
                 lowest=min(errors), highest=max(errors), seeds=len(done),
             )  # fmt: skip
-            found.append(place)
+            found.append(average)
     return tuple(found)
 
 
-def _turned(knobs: Sequence[Knob], point: Settings) -> tuple[str, ...]:
-    """Keys of the knobs that settings are a point of, whatever their seed."""
+def _knob_keys(knobs: Sequence[Knob], point: Settings) -> tuple[str, ...]:
+    """Return the keys of the knobs that have these settings as a point, with any seed."""
     without = tuple(entry for entry in point if entry[0] != "tailoring.seed")
     return tuple(knob.key for knob in knobs if without in knob.points.values()) if without else ("base",)
 
 
 def _labels(scene: Scene, knobs: Sequence[Knob]) -> dict[Settings, str]:
-    labels: dict[Settings, str] = {(): f"{scene.tailoring.quality} (the scene as it stands)"}
+    labels: dict[Settings, str] = {(): f"{scene.tailoring.quality} (the unchanged scene)"}
     for knob in knobs:
         for label, point in knob.points.items():
             name = label if knob.key == "quality" else f"{knob.title}: {label}"

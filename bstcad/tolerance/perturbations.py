@@ -338,10 +338,10 @@ def _tilt_back(axis: int, setup: Setup, by: float) -> Setup:
 # be smooth over a few control cells.
 
 FRONT_SEED_OFFSET = 100  # offset of the seeds of the front's form, whose fields differ from those of the back
-NET = 513  # control points per side of the net that replaces a plane or a conic with a form error
+FACE_NET = 513  # control points per side of the net that replaces a plane or a conic with a form error
 FACE_MARGIN = 6  # number of these control points on each side outside a round outline
 FACE_REACH = 1.03  # radius up to which such a net follows its face, in rim radii; the inside is unaffected beyond it
-MIN_CELLS = 4.0  # minimum number of control cells in a correlation length or a period
+CELLS_PER_PERIOD = 4.0  # minimum number of control cells in a correlation length or a period
 
 
 def form_error(lens: Lens, correlation_length: float, seed: int, face: str = "back") -> Kind:
@@ -389,16 +389,17 @@ def inside_outline(outline: Outline, net: BSplineSurface) -> np.ndarray:
 
 
 def as_net(face: Surface, outline: Outline) -> BSplineSurface:
-    """Convert a plane, a sphere or a conic into a net of NET control points per side; return a net unchanged.
+    """Convert a plane, a sphere or a conic into a net of FACE_NET control points per side; return a net unchanged.
 
     The net interpolates the face at each control point.  In its end spans a uniform spline follows a curve poorly.  For
     a round outline these lie outside the rim, where the net becomes level; for a rectangle they lie at its sides.
     """
     if face.is_net:
         return face
-    wide = (NET - 1) / (NET - 1 - 2 * FACE_MARGIN) if outline.is_round else 1.0
+    wide = (FACE_NET - 1) / (FACE_NET - 1 - 2 * FACE_MARGIN) if outline.is_round else 1.0
     half_x, half_y = (half * wide for half in outline.half_extent)
-    level = BSplineSurface(face.z, torch.zeros((NET, NET), dtype=torch.float64), (-half_x, half_x), (-half_y, half_y))
+    heights = torch.zeros((FACE_NET, FACE_NET), dtype=torch.float64)
+    level = BSplineSurface(face.z, heights, (-half_x, half_x), (-half_y, half_y))
     x, y = _control_points(level)
     rim, r = math.hypot(*outline.farthest), torch.hypot(x, y)
     edge = torch.full((1,), FACE_REACH * rim, dtype=torch.float64)
@@ -433,7 +434,7 @@ def _control_points(net: BSplineSurface) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def _require_resolution(surface: BSplineSurface, length: float, words: str) -> None:
-    least = MIN_CELLS * max(surface.pitch)
+    least = CELLS_PER_PERIOD * max(surface.pitch)
     if length < least:
         raise ValueError(
             f"{words} of {length:g} mm is too fine for {size_text(surface.shape)} control points, which can represent "

@@ -167,7 +167,7 @@ def _norm(vector: np.ndarray) -> float:
 DERIVATIVE_STEP = 0.5  # step of the central difference by each perturbation, in standard deviations
 # Nodes ξ, in standard deviations, along the principal directions from a given index on.  A picture that moves by more
 # than its detail is not a polynomial of ξ.
-NODES = ((0, (-3.0, -2.0, -1.2, -0.5, 0.5, 1.2, 2.0, 3.0)), (4, (-2.5, -1.0, 1.0, 2.5)), (8, (-1.0, 1.0)))
+SPLINE_NODES = ((0, (-3.0, -2.0, -1.2, -0.5, 0.5, 1.2, 2.0, 3.0)), (4, (-2.5, -1.0, 1.0, 2.5)), (8, (-1.0, 1.0)))
 NONLINEAR_DIRECTIONS = 12  # number of strongest directions with nodes; along the others pictures are linear
 MIN_STRENGTH = 1e-3  # change of the picture relative to the strongest direction, below which it is linear, too
 
@@ -215,7 +215,8 @@ def superpose(pictures: TracedFigure, progress: Progress = lambda *event: None, 
     """Trace two pictures for each perturbation, and pictures at the nodes of the principal directions."""
     sigmas = np.array([p.sigma for p in pictures.perturbations])
     n = len(sigmas)
-    nodes = [next(xi for first, xi in reversed(NODES) if k >= first) for k in range(min(n, NONLINEAR_DIRECTIONS))]
+    curved = range(min(n, NONLINEAR_DIRECTIONS))
+    nodes = [next(xi for first, xi in reversed(SPLINE_NODES) if k >= first) for k in curved]
     total, done = 1 + 2 * n + sum(map(len, nodes)), count(1)
 
     def trace(amounts: Sequence[np.ndarray]) -> Iterator[np.ndarray]:

@@ -31,10 +31,10 @@ RECORDS = {  # JSON file: (module, names of its records), with the record of the
             ["Tolerances", "Grade", "Sensitivity", "Trial", "Inverse", "TargetStudy", "WavefrontStudy"],
         )
     ],
-    "batch.json": [("sweep/batch.py", ["Batch", "Row"])],
+    "batch.json": [("sweep/batch.py", ["Batch", "BatchEntry"])],
     "tradeoff.json": [
-        ("sweep/results.py", ["Table", "TableKnob", "Calibration", "Preset", "Place"]),
-        ("sweep/cold_run.py", ["Run", "HistoryPoint"]),
+        ("sweep/results.py", ["TradeoffTable", "TableKnob", "Calibration", "Preset", "KnobPoint"]),
+        ("sweep/cold_run.py", ["ColdRun", "HistoryPoint"]),
     ],
 }
 

@@ -37,8 +37,8 @@ from bstcad.optics.measure import measure
 from bstcad.report.drawing import new_figure, png, styled
 from bstcad.runs import environment, files
 from bstcad.scene.scene import load
-from bstcad.sweep.cold_run import REFERENCE, rounded
-from bstcad.sweep.results import legend, plane
+from bstcad.sweep.cold_run import REFERENCE_EFFORT, round_numbers
+from bstcad.sweep.results import draw_legend, draw_runs
 from tests import markdown
 from tests.benchmarks import growth
 from tests.benchmarks.cold import ROOT, TEMPLATES, generate
@@ -149,7 +149,7 @@ def designed(scene: str, quality: str, settings: Sequence[str] = ()) -> Record:
 def judged(lens: Lens, pixels: int) -> Record:
     """Return the RRMSD by ray tubes, without noise, of a lens for PEER on a given number of pixels a side."""
     scene = load(TEMPLATES / f"{PEER}.toml", {"target.pixels": pixels})
-    light = measure(lens, scene.channels(), scene.target.screen, scene.target.irradiance(), REFERENCE)
+    light = measure(lens, scene.channels(), scene.target.screen, scene.target.irradiance(), REFERENCE_EFFORT)
     return {"rrmsd": light.rrmsd, "rrmsd_noise": light.standard_error, "on_target": light.flux["on target"]}
 
 
@@ -237,7 +237,7 @@ def known() -> dict[str, Any]:
 
 def put(recorded: Mapping[str, Any]) -> None:
     """Keep them, numbers to DIGITS."""
-    files.put(RECORDED, (json.dumps(rounded(recorded, DIGITS), ensure_ascii=False, indent=1) + "\n").encode())
+    files.put(RECORDED, (json.dumps(round_numbers(recorded, DIGITS), ensure_ascii=False, indent=1) + "\n").encode())
 
 
 def write(recorded: Mapping[str, Any]) -> None:
@@ -279,21 +279,21 @@ def halving(points: Sequence[Mapping[str, Any]]) -> Sequence[Mapping[str, Any]]:
 
 @styled
 def figure(recorded: Mapping[str, Any], scene: str) -> Any:
-    """Draw a sweep as `results.plane` draws a Table, with room for the paper's procedure and Mitsuba's run."""
+    """Draw a sweep as `results.draw_runs` draws a Table, with room for the paper's procedure and Mitsuba's run."""
     sweep = _named(recorded["sweeps"][scene])
     points = _named(recorded["mitsuba"]["points"]) if scene == PEER else []
     paper = recorded["designs"][scene].get("paper")  # by itself: few budgets last for it
     papers = [*(preset for preset in sweep.presets if preset.name == "paper"), *([_named(paper)] if paper else [])][:1]
     sweep.presets = [preset for preset in sweep.presets if preset.name != "paper"]
     ends = [Named(seconds=s, rrmsd=e) for s, e in zip(sweep.range.seconds, sweep.range.rrmsd, strict=True)]
-    sweep.best = sorted(sweep.front, key=lambda run: run.seconds)
+    sweep.front_runs = sorted(sweep.front, key=lambda run: run.seconds)
     sweep.knobs = [knob for knob in sweep.knobs if len(knob.places) > 1]
     tried = [place for knob in sweep.knobs for place in knob.places]
-    sweep.shown = [*ends, *sweep.presets, *points, *papers, *tried]
+    sweep.plotted = [*ends, *sweep.presets, *points, *papers, *tried]
     sweep.history = [{"seconds": seconds, "rrmsd": rrmsd} for seconds, rrmsd in sweep.history]
     drawn = new_figure(9.6, 8.0)
     axes = drawn.subplots()
-    plane(axes, sweep)
+    draw_runs(axes, sweep)
     for design in papers:
         axes.plot(design.seconds, design.rrmsd, "*", ms=17, color="#ffffff", mec="#111111", mew=1.1, zorder=5)
         axes.annotate("the procedure of Wang et al. 2023", (design.seconds, design.rrmsd), (12, -13), ha="right",
@@ -307,7 +307,7 @@ def figure(recorded: Mapping[str, Any], scene: str) -> Any:
         axes.plot(seconds, coarse, ls=(0, (4, 2)), mfc="white", label="the same, on its own 128² pixels", **look)
         axes.annotate("Mitsuba 3's caustic optimisation", (seconds[-1], min(coarse)), (0, -10), ha="right", va="top",
                       textcoords="offset points", color=look["color"], weight="bold")  # fmt: skip
-    legend(axes)
+    draw_legend(axes)
     return drawn
 
 

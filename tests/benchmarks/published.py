@@ -27,7 +27,7 @@ from skimage.metrics import structural_similarity
 from bstcad.folder import read_nominal
 from bstcad.report.light_figures import View
 from bstcad.runs import files
-from bstcad.sweep.cold_run import rounded
+from bstcad.sweep.cold_run import round_numbers
 from tests import markdown
 from tests.benchmarks import accuracy
 from tests.benchmarks.cold import ROOT, TEMPLATES, generate
@@ -134,7 +134,7 @@ def main() -> None:
         print(f"recording {name}", flush=True)
         recorded = known() | {name: designed(name, asked.sun_picture)}
         recorded = {key: recorded[key] for key in CASES if key in recorded}
-        files.put(RECORDED, (json.dumps(rounded(recorded, DIGITS), ensure_ascii=False, indent=1) + "\n").encode())
+        files.put(RECORDED, (json.dumps(round_numbers(recorded, DIGITS), ensure_ascii=False, indent=1) + "\n").encode())
         write()
     if known():
         write()

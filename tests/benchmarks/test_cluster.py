@@ -20,7 +20,7 @@ from bstcad import commands
 from bstcad.runs import cluster
 from bstcad.scene.scene import load
 from bstcad.sweep import batch as batches
-from bstcad.sweep.batch import Wanted
+from bstcad.sweep.batch import BatchScene
 from bstcad.tolerance import tolerancing
 from tests.benchmarks.cold import TEMPLATES
 
@@ -53,7 +53,7 @@ def test_tolerances_are_the_same_on_any_number_of_workers(letters, tmp_path, cap
 
 def test_designs_are_the_same_wherever_they_are_made(small_scene, tmp_path, capsys):
     scenes = [small_scene.changed({"name": f"z{z:.0f}", "target.z": z}) for z in (300.0, 350.0, 400.0)]
-    wanted, lost = [Wanted(f"{scene.name}.toml", scene) for scene in scenes], []
+    wanted, lost = [BatchScene(f"{scene.name}.toml", scene) for scene in scenes], []
 
     def designs(at_a_time, workers, kills=False):
         with on(workers) as found:

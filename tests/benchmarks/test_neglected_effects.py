@@ -18,7 +18,7 @@ from bstcad.optics.measure import tubes_picture
 from bstcad.optics.trace import ghost_light
 from bstcad.scene.effects import Absorption, Fresnel
 from bstcad.scene.scene import load
-from bstcad.sweep.estimates import DIAMETER, DIVERGENCE, band, coarse_lens, left_out
+from bstcad.sweep.estimates import DEFAULT_DIAMETER, DEFAULT_DIVERGENCE, band, coarse_lens, left_out
 from tests.benchmarks.cold import TEMPLATES
 
 pytestmark = pytest.mark.bench
@@ -58,8 +58,8 @@ def switched_on(scene, kind):
 def wide(scene, source):
     """A source of the size that the plan reckons with."""
     if scene.source.kind == "point":
-        return replace(source, diameter=scene.source.real_diameter or DIAMETER)
-    return replace(source, divergence=scene.source.real_divergence or DIVERGENCE)
+        return replace(source, diameter=scene.source.real_diameter or DEFAULT_DIAMETER)
+    return replace(source, divergence=scene.source.real_divergence or DEFAULT_DIVERGENCE)
 
 
 def picture_of(scene, lens, channels):

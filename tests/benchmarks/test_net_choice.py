@@ -5,8 +5,8 @@ import json
 import pytest
 
 from bstcad.optics.sides import side
-from bstcad.sweep.net_choice import chosen
-from bstcad.sweep.prediction import usual
+from bstcad.sweep.net_choice import choose_net
+from bstcad.sweep.prediction import typical_seconds
 from tests.benchmarks.net_scenes import CASES, FIGURES, NET, scene_of, with_net
 
 KNOWN = json.loads(FIGURES.read_text())
@@ -22,10 +22,10 @@ KNOWN_MISSES = {("slope", "half"): 1.45, ("wide-portrait", "half"): 1.5}
 def test_it_is_the_best_or_nearly_so(name, size):
     scene = scene_of(BY_NAME[name], half=size == "half")
     measured = {int(points): figures["rrmsd"] for points, figures in KNOWN[size][name].items()}
-    wanted = side(chosen(scene.changed({NET: None})).net)
+    wanted = side(choose_net(scene.changed({NET: None})).net)
     ours = min(measured, key=lambda known: abs(known - wanted))  # an oblong net has nearly as many
     best = min(measured, key=measured.get)
-    seconds = {points: usual(with_net(scene, points)).total for points in (ours, best)}
+    seconds = {points: typical_seconds(with_net(scene, points)).total for points in (ours, best)}
     error, time = measured[ours] / measured[best], seconds[ours] / seconds[best]
     most = KNOWN_MISSES.get((name, size), 1.25)
     assert (error <= most and time <= 1.5) or (error <= 2 and time <= 1 / 3)

@@ -12,19 +12,19 @@ import pytest
 
 from bstcad.scene.scene import load
 from bstcad.sweep.net_choice import with_net
-from bstcad.sweep.prediction import FLOWN, WITHIN, fly, predictions
+from bstcad.sweep.prediction import INTERVAL_FACTORS, PILOT_QUALITIES, predictions, run_pilot
 from tests.benchmarks.cold import ROOT, TEMPLATES, generate
 
 SCENES = sorted([*TEMPLATES.glob("*.toml"), *(ROOT / "docs" / "gallery-scripts").glob("*.toml")])
 
 
 @pytest.mark.bench
-@pytest.mark.parametrize("quality", FLOWN)
+@pytest.mark.parametrize("quality", PILOT_QUALITIES)
 def test_nine_of_ten_designs_keep_to_the_factors_that_are_stated(quality, tmp_path):
-    off = {key: [] for key in WITHIN}
+    off = {key: [] for key in INTERVAL_FACTORS}
     for path in SCENES:
         scene = with_net(load(path))[0]
-        likely = predictions(scene, dict.fromkeys(FLOWN, fly(scene, quality)))[quality]
+        likely = predictions(scene, dict.fromkeys(PILOT_QUALITIES, run_pilot(scene, quality)))[quality]
         run = generate(path, tmp_path / path.stem, f"tailoring.quality={quality}")
         report = run.report()
         found = {"seconds": run.seconds, "rrmsd": report["rrmsd"], "memory_gb": report["machine"]["peak_memory_gb"]}
@@ -32,5 +32,5 @@ def test_nine_of_ten_designs_keep_to_the_factors_that_are_stated(quality, tmp_pa
         print(f"{path.stem:22} {quality:9}", *words, sep="   ", flush=True)
         for key, each in found.items():
             off[key].append(math.exp(abs(math.log(likely[key][1] / each))))
-    for key, most in WITHIN.items():
+    for key, most in INTERVAL_FACTORS.items():
         assert sorted(off[key])[math.ceil(0.9 * len(SCENES)) - 1] <= most, key

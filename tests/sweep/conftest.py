@@ -8,8 +8,8 @@ import pytest
 from bstcad.runs.cluster import THIS_MACHINE, Answer
 from bstcad.scene.scene import load
 from bstcad.sweep import tradeoff
-from bstcad.sweep.cold_run import DONE, FAILED, Run, carry_out
-from bstcad.sweep.prediction import usual
+from bstcad.sweep.cold_run import DONE, FAILED, ColdRun, run_and_judge
+from bstcad.sweep.prediction import typical_seconds
 from tests.conftest import DISK
 
 TINY = {
@@ -29,7 +29,7 @@ class Synthetic:
         self.ran, self.limits, self.orders = [], [], []
 
     def start(self, key, work, contents, point, limit, effort):
-        assert work is carry_out and key == point
+        assert work is run_and_judge and key == point
         self.limits.append(limit)
         self.orders.append(point)
 
@@ -47,12 +47,12 @@ SCENES = {}
 def record(base, point):
     """Return the result of a run with these settings."""
     if REFUSED in point:
-        return Run(settings=point, status=FAILED, reason="ended by SIGKILL", seconds=7.0, cost_seconds=8.0)
+        return ColdRun(settings=point, status=FAILED, reason="ended by SIGKILL", seconds=7.0, cost_seconds=8.0)
     SCENES[base.toml()] = base
     work, knobs = _known(point, base.toml())
     seconds, adam, seed = 5.0 + work, knobs.method == "adam", dict(point).get("tailoring.seed", 0)
     error = 0.01 + 1 / (10 + knobs.stage2_iterations) + (0.1 + 0.01 * seed if adam else 0.0)
-    return Run(
+    return ColdRun(
         settings=point, status=DONE, seconds=seconds, cpu_seconds=1.5 * seconds, peak_memory_gb=1.5, rrmsd=error,
         rrmsd_noise=error / 9, rays=10**7, rrmsd_reported=error, rrmsd_noise_reported=error / 9, passed=True,
         net=f"{error} {seed * adam}", cost_seconds=seconds + 2, kernel_seconds=KERNEL, units=seconds / KERNEL,
@@ -65,22 +65,22 @@ def record(base, point):
 @cache
 def _known(point, text):
     changed = SCENES[text].changed(dict(point))
-    return usual(changed).search, changed.tailoring.resolved(33)
+    return typical_seconds(changed).search, changed.tailoring.resolved(33)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def counted_once():
     """The work of a run is counted once a session, not once a sweep."""
-    count, known = tradeoff.work_of, {}
+    count, known = tradeoff.predicted_work, {}
 
-    def work_of(scene, point):
+    def predicted_work(scene, point):
         key = scene.toml(), point
         if key not in known:
             known[key] = count(scene, point)
         return known[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tradeoff, "work_of", work_of)
+        patch.setattr(tradeoff, "predicted_work", predicted_work)
         yield
 
 

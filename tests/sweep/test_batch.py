@@ -17,7 +17,7 @@ from bstcad.runs import environment, processes
 from bstcad.runs.processes import ExitStatus
 from bstcad.scene.errors import MachineError
 from bstcad.sweep import batch
-from bstcad.sweep.batch import LocalPool, Wanted
+from bstcad.sweep.batch import BatchScene, LocalPool
 
 KILLED, FAULT = ExitStatus(-9, 1.0, 1.0, ""), ExitStatus(70, 1.0, 1.0, "bstcad: this is a fault of bstcad")
 NO_SOLID = ExitStatus(2, 1.0, 1.0, "bstcad: warning: doubtful\nbstcad: no solid; move the back\n")
@@ -128,7 +128,7 @@ def test_what_is_finished_is_not_done_again(scenes, small_scene, designs, monkey
 def test_a_damaged_record_is_a_sentence(tmp_path, damage):
     assert batch.read(tmp_path) == ()
     (tmp_path / "batch.json").write_bytes(damage)
-    with pytest.raises(MachineError, match=r"batch.json: is damaged, or another program's; remove it"):
+    with pytest.raises(MachineError, match=r"batch.json: is damaged, or was written by another program; remove it"):
         batch.read(tmp_path)
 
 
@@ -171,9 +171,9 @@ def tree(folder):
 def test_two_scenes_do_not_share_a_folder(small_scene, tmp_path, designs):
     (tmp_path / "out" / "small").mkdir(parents=True)
     (tmp_path / "out" / "small" / "letter.txt").write_text("dear")
-    wanted = [Wanted("a.toml", small_scene), Wanted("b.toml", small_scene)]
+    wanted = [BatchScene("a.toml", small_scene), BatchScene("b.toml", small_scene)]
     reasons = [row.reason for row in batch.batch(wanted, tmp_path / "out")]
-    assert "contains files that are not a design's" in reasons[0] and "is the name of a.toml too" in reasons[1]
+    assert "contains files that are not a design's" in reasons[0] and "is also the name of a.toml" in reasons[1]
     assert batch.batch([], tmp_path / "out") == [] and not designs.made
 
 

@@ -12,7 +12,7 @@ from bstcad.optics.measure import Effort
 from bstcad.runs import environment
 from bstcad.runs.cluster import Cluster
 from bstcad.sweep import tradeoff
-from bstcad.sweep.cold_run import DONE, FAILED, LocalPool, Run, carry_out, judged, kernel
+from bstcad.sweep.cold_run import DONE, FAILED, ColdRun, LocalPool, calibration_kernel, judge_run, run_and_judge
 from bstcad.sweep.tradeoff import Knob
 
 ROOT = Path(__file__).parent.parent.parent
@@ -42,34 +42,34 @@ def test_a_sweep_of_cold_runs_measures_each_and_tells_why_one_failed(tiny, tmp_p
 
 
 def test_a_run_without_time_is_ended_and_says_so(tiny):
-    found = carry_out(scene_files(tiny), (), limit=0.3, effort=EFFORT)
+    found = run_and_judge(scene_files(tiny), (), limit=0.3, effort=EFFORT)
     assert found.status == FAILED and "ended after" in found.reason and found.rrmsd is None
 
 
 def test_a_lens_tailored_to_other_pixels_is_judged_on_those_of_the_base(small_design):
     """The judge takes the lens from the run's folder, and light and pixels from the base."""
-    run, (scene, _) = Run(settings=(), status=DONE), folders.read_nominal(small_design.folder)
+    run, (scene, _) = ColdRun(settings=(), status=DONE), folders.read_nominal(small_design.folder)
     effort = Effort(512)  # of its proof: the noise of half as many rays a side is a third of its RRMSD
-    full = judged(run, scene, small_design.folder, effort)
-    coarse = judged(run, scene.changed({"target.pixels": [32, 24]}), small_design.folder, effort)
+    full = judge_run(run, scene, small_design.folder, effort)
+    coarse = judge_run(run, scene.changed({"target.pixels": [32, 24]}), small_design.folder, effort)
     assert abs(full.rrmsd / small_design.report["rrmsd"] - 1) < 0.1  # other rays than its proof's
     assert coarse.rrmsd < 0.9 * full.rrmsd  # four pixels in one hide errors within
     assert full.net == coarse.net and len(full.net) == 64
 
 
 def test_of_several_targets_the_worst_counts(small_design):
-    run, (scene, _) = Run(settings=(), status=DONE), folders.read_nominal(small_design.folder)
+    run, (scene, _) = ColdRun(settings=(), status=DONE), folders.read_nominal(small_design.folder)
     own = scene.target.model_dump(mode="json", exclude_none=True)
     both = [own, own | {"z": scene.target.z + 40.0}]  # for the second of which nobody designed the lens
     alone, second, worst = (
-        judged(run, scene.changed({"target": targets}), small_design.folder, Effort(256))
+        judge_run(run, scene.changed({"target": targets}), small_design.folder, Effort(256))
         for targets in (own, both[1], both)
     )
     assert alone.rrmsd < 0.9 * second.rrmsd and worst.rrmsd == second.rrmsd
 
 
 def test_the_kernel_is_the_same_work_each_time():
-    found = [kernel(tubes=64)() for _ in range(3)]
+    found = [calibration_kernel(tubes=64)() for _ in range(3)]
     assert len({value for value, *_ in found}) == 1 and 0 < found[0][0] < 1
     assert float(found[0][1][0].abs().max()) > 0  # no perfect lens
 
@@ -117,7 +117,7 @@ def test_a_worker_runs_the_command_as_this_machine_does(tiny):
         ) as local,
         Cluster(local.scheduler_address) as machines,
     ):
-        machines.start(REFUSED, carry_out, scene_files(tiny), REFUSED, 600.0, EFFORT)
+        machines.start(REFUSED, run_and_judge, scene_files(tiny), REFUSED, 600.0, EFFORT)
         answer = machines.next()
     assert answer.where.startswith("tcp://") and answer.value.version == environment.version()
     assert "3 is not between" in answer.value.reason and 0 < answer.value.seconds < answer.value.cost_seconds

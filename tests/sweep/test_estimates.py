@@ -62,7 +62,7 @@ def test_sunlight_parts_over_all_that_is_seen():
         return entry
 
     sun, laser = dispersion(0.53), dispersion(0.01)
-    assert sun.detail == "of sunlight, even from 400 to 700 nm" and not sun.assumed
+    assert sun.detail == "of sunlight, uniform from 400 to 700 nm" and not sun.assumed
     assert laser.detail == "of a line 10 nm wide" and laser.assumed
     # the index of PMMA changes by 0.0155 between 434 and 666 nm, and by 3.6e-4 over the line
     assert 20 < sun.blur_pixels / laser.blur_pixels < 60 and sun.rrmsd_change > 10 * laser.rrmsd_change

@@ -12,7 +12,7 @@ from bstcad.optics.measure import tubes_picture
 from bstcad.scene.errors import SceneError
 from bstcad.sweep import net_choice
 from bstcad.sweep.estimates import coarse_lens
-from bstcad.sweep.net_choice import cells_of_a_mm2, chosen, rrmsd, with_net
+from bstcad.sweep.net_choice import area_cells, choose_net, net_rrmsd, with_net
 
 FREE = {"lens.back.control_points": None, "tailoring.levels": None}
 PLATE = bstcad.load("templates/caustic_portrait.toml").changed(FREE)
@@ -21,11 +21,11 @@ PLATE = bstcad.load("templates/caustic_portrait.toml").changed(FREE)
 @pytest.fixture(scope="module")
 def free():
     """The choice for the plate."""
-    return chosen(PLATE)
+    return choose_net(PLATE)
 
 
 def sides(scene):
-    return [each.net for each in chosen(scene).possible]
+    return [each.net for each in choose_net(scene).possible]
 
 
 def test_a_net_that_is_stated_stays_and_levels_state_it_too():
@@ -58,26 +58,26 @@ def test_a_picture_narrower_than_half_a_tile_has_its_net_too():
     assert sides(PLATE.changed({"target.pixels": [24, 8]})) == sides(PLATE.changed({"target.pixels": [8, 24]}))
     left = net_choice.ControlCells(np.ones((24, 16)), np.eye(24, 16) * (np.arange(16) < 8))
     assert not left.target[8:, 8:].any()  # half a tile further on it is dark
-    assert math.isfinite(rrmsd(left, PLATE.changed({"lens.back.control_points": 65})))
+    assert math.isfinite(net_rrmsd(left, PLATE.changed({"lens.back.control_points": 65})))
 
 
 def test_several_targets_get_the_net_of_the_most_demanding_one():
     target = PLATE.target.model_dump(mode="json", exclude_none=True)
     two = PLATE.changed({"target": [target | {"pixels": 64}, target | {"z": 640.0, "pixels": 256}]})
-    alone = [chosen(each).net for each in two.single_target_scenes()]
-    assert alone[0] < alone[1] == chosen(two).net == with_net(two)[0].lens.back.net
+    alone = [choose_net(each).net for each in two.single_target_scenes()]
+    assert alone[0] < alone[1] == choose_net(two).net == with_net(two)[0].lens.back.net
 
 
 def test_time_memory_and_the_tool_bound_it(free, monkeypatch):
-    timely = chosen(PLATE.changed({"tailoring.max_time": 25.0}))
+    timely = choose_net(PLATE.changed({"tailoring.max_time": 25.0}))
     assert timely.net < free.net and "tailoring.max_time = 25" in timely.line
     assert all(each.seconds <= 25 for each in timely.possible)
     letters = bstcad.load("templates/machinable_letters.toml").changed(FREE | {"lens.tool_radius": None})
-    blunt = chosen(letters.changed({"lens.tool_radius": 3.0}))
-    assert (chosen(letters).net, blunt.net) == (1025, 257) and "lens.tool_radius = 3.0" in blunt.line
+    blunt = choose_net(letters.changed({"lens.tool_radius": 3.0}))
+    assert (choose_net(letters).net, blunt.net) == (1025, 257) and "lens.tool_radius = 3.0" in blunt.line
     scarce = type("Memory", (), {"total": 3e9})
     monkeypatch.setattr(net_choice.psutil, "virtual_memory", lambda: scarce)
-    fitting = chosen(PLATE)
+    fitting = choose_net(PLATE)
     assert fitting.net < free.net and "memory" in fitting.line
 
 
@@ -95,12 +95,12 @@ def test_an_oblong_plate_gets_square_cells():
 def test_cells_are_those_of_the_light_that_a_pixel_asks_for():
     """A pixel's light comes from its share of the lens in an even beam; in a Gaussian beam dim light is wide."""
     lens = coarse_lens(PLATE)
-    light = cells_of_a_mm2(PLATE, lens)
+    light = area_cells(PLATE, lens)
     arrives = float(tubes_picture(lens, PLATE.channels(), PLATE.target.screen, 257).sum())
     assert arrives > 0.98 and light.a_pixel.sum() == pytest.approx(1e4 * arrives, rel=2e-3)  # what misses lights none
     np.testing.assert_allclose(light.a_pixel, 1e4 * light.target, rtol=0.1, atol=1e-4)
     point = bstcad.load("templates/portrait.toml").changed(FREE | {"target.image": np.ones((64, 64))})
-    area = cells_of_a_mm2(point, coarse_lens(point)).a_pixel
+    area = area_cells(point, coarse_lens(point)).a_pixel
     middle, corner = area[240:272, 240:272].mean(), area[:32, :32].mean()
     assert corner > 3 * middle  # exp(-2 r² / w²): the rim of the lens has an eighth of the middle's flux density
 
@@ -108,7 +108,7 @@ def test_cells_are_those_of_the_light_that_a_pixel_asks_for():
 def test_fine_detail_asks_for_more_cells():
     def error(picture):
         scene = PLATE.changed({"target.image": picture, "target.pixels": 128, "target.gamma": 1.0})
-        return rrmsd(cells_of_a_mm2(scene, coarse_lens(scene)), scene.changed({"lens.back.control_points": 65}))
+        return net_rrmsd(area_cells(scene, coarse_lens(scene)), scene.changed({"lens.back.control_points": 65}))
 
     y, x = np.mgrid[:128, :128]
     smooth, fine = (1.2 + np.cos(2 * math.pi * (x + y) / period) for period in (64, 6))
@@ -117,7 +117,7 @@ def test_fine_detail_asks_for_more_cells():
 
 def test_what_a_source_blurs_asks_for_no_finer_net():
     sun = bstcad.load("templates/sun_caustic.toml").changed(FREE)
-    assert max(sides(sun)) > chosen(sun).net
+    assert max(sides(sun)) > choose_net(sun).net
 
 
 def test_a_scene_without_a_net_is_a_scene_and_asks_for_a_choice_where_one_is_needed():
@@ -128,7 +128,7 @@ def test_a_scene_without_a_net_is_a_scene_and_asks_for_a_choice_where_one_is_nee
 
 
 def test_plan_says_it(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("bstcad.sweep.plan.outlook", lambda *given: {"predicted": None})
+    monkeypatch.setattr("bstcad.sweep.plan.predict_qualities", lambda *given: {"predicted": None})
     path = tmp_path / "scene.toml"
     path.write_text(PLATE.changed({"target.pixels": 64, "target.sample": "camera"}).toml())
     assert run(["plan", str(path), "--json"]) == 0
@@ -136,6 +136,6 @@ def test_plan_says_it(tmp_path, capsys, monkeypatch):
     told = json.loads(out, parse_constant=pytest.fail)["control_points"]  # no Infinity, which JSON does not have
     assert told["possible"][told["number"]] == {"net": 257, "times_rrmsd": 1.0, "times_seconds": 1.0}
     [fewer] = [each for each in told["possible"] if each["net"] == 129]
-    words = f"fewer, 129, would come to about {fewer['times_rrmsd']:g} times the RRMSD in {fewer['times_seconds']:g} t"
+    words = f"fewer, 129, would give about {fewer['times_rrmsd']:g} times the RRMSD in {fewer['times_seconds']:g} t"
     assert fewer["times_rrmsd"] > 1 > fewer["times_seconds"] and words in err
     assert err.count("\n") == 1 and "257 control points are chosen" in err and "fewer, 129" in err

@@ -11,8 +11,8 @@ from bstcad.report.record import simulated
 from bstcad.scene.errors import toml_positions
 from bstcad.scene.scene import load
 from bstcad.sweep import plan as plans
-from bstcad.sweep.plan import outlook, plan
-from bstcad.sweep.prediction import FLOWN, QUALITIES, fly
+from bstcad.sweep.plan import plan, predict_qualities
+from bstcad.sweep.prediction import PILOT_QUALITIES, QUALITIES, run_pilot
 
 ROOT = Path(__file__).parent.parent.parent
 TEMPLATES = ROOT / "templates"
@@ -29,7 +29,7 @@ def portrait(net):
 @pytest.fixture(scope="module")
 def flown():
     """The pilots of one scene, by quality."""
-    return {quality: fly(portrait(65), quality) for quality in FLOWN}
+    return {quality: run_pilot(portrait(65), quality) for quality in PILOT_QUALITIES}
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def lens():
 
 
 def test_better_qualities_and_finer_nets_predict_no_more_error_longer_times_and_more_memory(known_pilots, lens):
-    ahead = outlook(portrait(65), [lens])
+    ahead = predict_qualities(portrait(65), [lens])
     assert ahead["finer"]["control_points"] == 129
     for key, sense in (("rrmsd", -1), ("seconds", 1), ("memory_gb", 1)):
         few, many = ([sense * at[quality][key][1] for quality in QUALITIES]
@@ -56,7 +56,7 @@ def test_better_qualities_and_finer_nets_predict_no_more_error_longer_times_and_
 
 def test_what_ends_a_design_early_is_said(known_pilots, lens):
     scene = portrait(65).changed({"tailoring.max_time": 5.0, "tailoring.accuracy": 0.9})
-    late, early = outlook(scene, [lens])["notes"]
+    late, early = predict_qualities(scene, [lens])["notes"]
     assert "max_time = 5" in late and "fine" in late and "accuracy = 0.9" in early and "draft" in early
 
 
@@ -80,7 +80,7 @@ def test_what_is_simulated_names_the_line_that_asks_for_it(tmp_path):
 def test_every_effect_of_every_template_is_asked_for_by_a_line():
     for path in TEMPLATES.glob("*.toml"):
         at = toml_positions(path.read_text(encoding="utf-8"))
-        assert all(plans._asked(key, at, ())["line"] for _, key in simulated(load(path))), path
+        assert all(plans._request_of(key, at, ())["line"] for _, key in simulated(load(path))), path
 
 
 TWO = {  # pictures, behind a back that is tailored
@@ -100,22 +100,22 @@ def test_each_target_has_its_own_estimates():
     assert second["key"] == "target[1]" and far["blur_pixels"] / near["blur_pixels"] == pytest.approx(3, rel=0.1)
     alone = next(plan(scene.changed({"target": scene.targets[1]})))
     assert second["left_out"] == alone["left_out"] == alone["goals"][0]["left_out"] and "caveat" not in alone
-    assert found["caveat"] == plans.ALONE
+    assert found["caveat"] == plans.CAVEAT
 
 
 def test_the_reach_of_each_target_is_drawn_and_of_two_faces_refused(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(plans, "outlook", lambda *given: ENDS)
+    monkeypatch.setattr(plans, "predict_qualities", lambda *given: ENDS)
     scene = load(TEMPLATES / "caustic_portrait.toml").changed(TWO | {"name": "two", "target[1].x": [-20.0, 30.0]})
     (tmp_path / "two.toml").write_text(scene.toml(), encoding="utf-8")
     png = tmp_path / "reach.png"
     assert cli.run(["plan", str(tmp_path / "two.toml"), "--png", str(png)]) == 0
     out = " ".join(capsys.readouterr().out.split())
-    assert "not simulated, target[0]" in out and "not simulated, target[1]" in out and plans.ALONE in out
+    assert "not simulated, target[0]" in out and "not simulated, target[1]" in out and plans.CAVEAT in out
     first, second = (png.with_stem(stem).read_bytes() for stem in ("reach", "reach_2"))
     assert first.startswith(b"\x89PNG") and second.startswith(b"\x89PNG") and first != second
     both = tmp_path / "both.png"
     assert cli.run(["plan", str(TEMPLATES / "two_pictures.toml"), "--png", str(both)]) == 2
-    assert "--png: draws what light can reach by way of a tailored back" in capsys.readouterr().err
+    assert "--png: draws the part of the target that light can reach through a tailored back" in capsys.readouterr().err
     assert not both.exists()
 
 
@@ -164,7 +164,7 @@ def test_a_chip_that_blurs_the_picture_is_said_first(tmp_path, capsys, monkeypat
         "lens.outline.radius": 30.0, "target.z": 570.0, "target.x": [-150.0, 150.0], "target.y": [-150.0, 150.0],
         "target.uniform": None, "target.text": "thirty-two words", "target.pixels": 96, "accept.rrmsd": None,
     })  # fmt: skip
-    monkeypatch.setattr(plans, "outlook", lambda *given: ENDS)
+    monkeypatch.setattr(plans, "predict_qualities", lambda *given: ENDS)
     path = tmp_path / "chip.toml"
     path.write_text(scene.toml(), encoding="utf-8")
     assert cli.run(["plan", str(path)]) == 0
@@ -207,11 +207,11 @@ class TestCommand:
     def test_effects_are_shown_before_anything_is_predicted(self, capsys, monkeypatch):
         shown = []
 
-        def outlook(scene, lenses, tick):
+        def predict_qualities(scene, lenses, tick):
             shown.extend(capsys.readouterr())
             return ENDS
 
-        monkeypatch.setattr(plans, "outlook", outlook)
+        monkeypatch.setattr(plans, "predict_qualities", predict_qualities)
         assert cli.run(["plan", str(THU), "--set", "target.pixels=128"]) == 0
         out, err = shown
         assert "vignetting by the outline" in out and "Fresnel reflection" in out and "predicted" not in out

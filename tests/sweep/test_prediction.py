@@ -10,7 +10,17 @@ from bstcad.optics.sides import as_pair
 from bstcad.scene.scene import load
 from bstcad.scene.target import MIN_PIXELS
 from bstcad.sweep import prediction
-from bstcad.sweep.prediction import Pilot, Seconds, detail, fly, made_small, memory_gb, predictions, seconds, usual
+from bstcad.sweep.prediction import (
+    Pilot,
+    Seconds,
+    detail,
+    memory_gb,
+    pilot_scene,
+    predicted_seconds,
+    predictions,
+    run_pilot,
+    typical_seconds,
+)
 
 NET, PIXELS = "lens.back.control_points", "target.pixels"
 THU = load("templates/thu.toml")
@@ -26,49 +36,53 @@ def tiny(monkeypatch):
 
 def pilot(scene, *, slower=1.0, factor=4.0):
     """A pilot that took so many times as long as usual."""
-    small, _ = made_small(scene)
-    took = usual(small)
+    small, _ = pilot_scene(scene)
+    took = typical_seconds(small)
     return Pilot(small, Seconds(slower * took.first, slower * took.search, 0.0), 0.04, factor, 0.0, 0.0, None)
 
 
 def test_a_pilot_has_a_quarter_of_the_net_the_pixels_and_the_tubes():
-    small, factor = made_small(THU)
+    small, factor = pilot_scene(THU)
     assert factor == 4 and as_pair(small.lens.back.net) == (129, 129) and small.target.columns_rows == (128, 128)
     assert small.tailoring.rays == THU.tailoring.resolved(513).rays / 4
 
 
 def test_both_nets_of_two_faces_shrink_alike():
     beam = load("templates/beam_shaper.toml", {"lens.front.control_points": 193})
-    assert made_small(beam)[0].lens.nets() == (193, 97)
+    assert pilot_scene(beam)[0].lens.nets() == (193, 97)
 
 
 def test_the_pilot_of_a_narrow_target_has_pixels_enough():
-    small, factor = made_small(THU.changed({PIXELS: [128, 64], NET: 1025}))  # SceneError for pixels too few
+    small, factor = pilot_scene(THU.changed({PIXELS: [128, 64], NET: 1025}))  # SceneError for pixels too few
     assert factor > 1 and min(small.target.columns_rows) >= MIN_PIXELS
 
 
 def test_a_pilot_as_large_as_its_scene_predicts_itself(monkeypatch):
     monkeypatch.setattr(prediction, "pace", lambda: 1.0)
     disk = load("templates/disk.toml", {"tailoring.rays": 256})
-    known = {quality: pilot(disk, slower=3.0, factor=1.0) for quality in prediction.FLOWN}
+    known = {quality: pilot(disk, slower=3.0, factor=1.0) for quality in prediction.PILOT_QUALITIES}
     found = predictions(disk, known)["standard"]
     assert found["rrmsd"][1] == pytest.approx(0.04)
-    assert found["seconds"][1] == pytest.approx(3 * (usual(disk).first + usual(disk).search) + usual(disk).rest)
+    assert found["seconds"][1] == pytest.approx(
+        3 * (typical_seconds(disk).first + typical_seconds(disk).search) + typical_seconds(disk).rest
+    )
     assert all(low < likely < high for low, likely, high in found.values())
 
 
 def test_tailoring_takes_as_many_times_longer_as_the_pilot_took_longer(monkeypatch):
     """A machine of half the pace, or a scene of twice the work: the rest goes by the machine alone."""
     monkeypatch.setattr(prediction, "pace", lambda: 1.0)
-    once, twice = (seconds(THU, pilot(THU, slower=times)) for times in (1.0, 2.0))
-    assert twice - once == pytest.approx(usual(THU).first + usual(THU).search)
+    once, twice = (predicted_seconds(THU, pilot(THU, slower=times)) for times in (1.0, 2.0))
+    assert twice - once == pytest.approx(typical_seconds(THU).first + typical_seconds(THU).search)
 
 
 def test_a_smaller_pilot_leaves_more_error_and_what_it_does_not_see_adds_to_it():
-    near, far = (prediction.rrmsd(pilot(THU, factor=factor), "standard") for factor in (1.0, 4.0))
-    assert far == pytest.approx(near * 4**prediction.POWER)
-    blind = replace(pilot(THU), detail=0.1, blurred=0.2)
-    assert prediction.rrmsd(blind, "standard") == pytest.approx(far + 0.1 * prediction.DETAIL["standard"] + 0.1)
+    near, far = (prediction.predicted_rrmsd(pilot(THU, factor=factor), "standard") for factor in (1.0, 4.0))
+    assert far == pytest.approx(near * 4**prediction.PILOT_EXPONENT)
+    blind = replace(pilot(THU), detail=0.1, blur=0.2)
+    assert prediction.predicted_rrmsd(blind, "standard") == pytest.approx(
+        far + 0.1 * prediction.DETAIL_FACTORS["standard"] + 0.1
+    )
 
 
 def test_detail_is_what_is_finer_than_the_cells():
@@ -81,7 +95,7 @@ def test_more_tubes_goals_and_nets_take_more_memory():
     one, wave = THU, load("templates/beam_shaper.toml")
     assert memory_gb(one.changed({"tailoring.rays": 3000})) > memory_gb(one)
     alone = wave.changed({"wavefront": None, "accept.wavefront": None})
-    assert memory_gb(wave) > memory_gb(alone) > prediction.LIBRARIES
+    assert memory_gb(wave) > memory_gb(alone) > prediction.LIBRARIES_GB
 
 
 SCENES = {
@@ -104,9 +118,9 @@ def test_a_pilot_that_waited_for_the_compiler_is_designed_again(tiny, monkeypatc
         return design(*given, **how)
 
     monkeypatch.setattr(prediction.pipeline, "design", compiling)
-    fly(THU, "draft")
+    run_pilot(THU, "draft")
     assert len(calls) == 2
-    fly(THU, "draft")
+    run_pilot(THU, "draft")
     assert len(calls) == 3
 
 
@@ -114,7 +128,7 @@ def test_a_pilot_that_waited_for_the_compiler_is_designed_again(tiny, monkeypatc
 def test_every_scene_is_predicted(name, tiny):
     template, changes = SCENES[name]
     scene = load(f"templates/{template}.toml", {"tailoring.quality": "draft"} | changes)
-    flown = fly(scene, "draft")
+    flown = run_pilot(scene, "draft")
     assert flown.seconds.first > 0 and 0 < flown.rrmsd < 1.5
-    found = predictions(scene, dict.fromkeys(prediction.FLOWN, flown))["draft"]
+    found = predictions(scene, dict.fromkeys(prediction.PILOT_QUALITIES, flown))["draft"]
     assert all(0 < low < likely < high < np.inf for low, likely, high in found.values())

@@ -12,9 +12,9 @@ import bstcad
 from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.scene import load
 from bstcad.sweep import cold_run, results, tradeoff
-from bstcad.sweep.cold_run import settings
-from bstcad.sweep.results import COLUMNS
-from bstcad.sweep.tradeoff import LEEWAY, knobs, run_order
+from bstcad.sweep.cold_run import sorted_settings
+from bstcad.sweep.results import TRADEOFF_COLUMNS
+from bstcad.sweep.tradeoff import SAFETY_FACTOR, knobs, run_order
 from tests.sweep.conftest import REFUSED, Synthetic, record
 
 FILES = ("tradeoff.csv", "tradeoff.json", "tradeoff.html", "tradeoff.png")
@@ -76,10 +76,12 @@ class TestKnobs:
 
     def test_presets_come_first_then_neighbours_and_the_paper_last(self, tiny):
         order = run_order(tiny, knobs(tiny))
-        assert order[:2] == [(), settings({"tailoring.quality": "standard"})]  # the base is the draft
-        assert order[-1] == settings({"tailoring.quality": "paper"})
+        assert order[:2] == [(), sorted_settings({"tailoring.quality": "standard"})]  # the base is the draft
+        assert order[-1] == sorted_settings({"tailoring.quality": "paper"})
         near = [{"tailoring.rays": 91}, {"lens.back.control_points": 17}, {"tailoring.stage2_iterations": 4}]
-        assert max(order.index(settings(each)) for each in near) < order.index(settings({"tailoring.rays": 64}))
+        assert max(order.index(sorted_settings(each)) for each in near) < order.index(
+            sorted_settings({"tailoring.rays": 64})
+        )
         assert len(order) == len(set(order))
 
 
@@ -88,8 +90,8 @@ class TestBudget:
         found = sweep(tiny, tmp_path / "s", 200.0)
         assert 150 < found.spent_seconds <= 200 and len(found.not_run) > 3
         assert all(run.predicted_seconds > 0 and run.seconds is None for run in found.not_run)
-        first, *others = found.lenses
-        assert all(each.predicted_seconds * LEEWAY <= 200.0 - first.cost_seconds for each in others)
+        first, *others = found.runs_with_lens
+        assert all(each.predicted_seconds * SAFETY_FACTOR <= 200.0 - first.cost_seconds for each in others)
 
     def test_a_run_that_was_ended_for_time_is_begun_again_when_there_is_more(self, tiny, tmp_path):
         class Ended(Synthetic):
@@ -102,7 +104,7 @@ class TestBudget:
         for budget, again in ((100.0, False), (400.0, True)):
             machine = Synthetic(tiny)
             found = sweep(tiny, tmp_path / "s", budget, machine)
-            assert (() in machine.ran) == again == (found.own is not None)
+            assert (() in machine.ran) == again == (found.base_run is not None)
 
 
 class TestResume:
@@ -127,7 +129,7 @@ class TestResume:
         tradeoff.tradeoff(tiny, folder, budget=200.0)  # on this machine
         again = Synthetic(tiny)
         more = sweep(tiny, folder, 500.0, again)
-        assert again.ran and settings_of(first.lenses) < settings_of(more.lenses)
+        assert again.ran and settings_of(first.runs_with_lens) < settings_of(more.runs_with_lens)
 
     def test_a_failed_run_is_kept_with_its_reason_and_not_done_again(self, swept, tiny):
         folder, found = swept
@@ -152,7 +154,7 @@ class TestResume:
 class TestFiles:
     @pytest.mark.parametrize("damage", ["{", '{"runs": [{"settings": 3, "status": "done"}]}'])
     def test_records_come_back_as_they_were_and_damaged_ones_are_a_sentence(self, tiny, tmp_path, damage):
-        point = settings({"target.pixels": (48, 32), "tailoring.seed": 3})
+        point = sorted_settings({"target.pixels": (48, 32), "tailoring.seed": 3})
         bad = {"seconds": 1.0, "rrmsd": math.nan}
         kept = tradeoff.RunFile(runs=(record(tiny, point), record(tiny, ()).model_copy(update={"history": (bad,)})))
         cold_run.put(tmp_path / "runs.json", kept)
@@ -160,7 +162,7 @@ class TestFiles:
         assert read.runs[0] == kept.runs[0] and read.runs[1].history[0]["rrmsd"] is None  # JSON has no such number
         sweep(tiny, tmp_path / "s", 1.0)
         record_file(tmp_path / "s").write_text(damage)
-        with pytest.raises(MachineError, match="is damaged, or another program's; remove it"):
+        with pytest.raises(MachineError, match="is damaged, or was written by another program; remove it"):
             sweep(tiny, tmp_path / "s", 1.0)
 
     def test_the_table_has_a_line_a_run_under_the_names_of_the_json(self, swept):
@@ -169,14 +171,14 @@ class TestFiles:
         assert set(facts) == set(KEYS.split()) and set(facts["runs"][0]) == set(OF_A_RUN.split())
         assert facts["version"] == bstcad.__version__ and facts["sources"] == "1"
         rows = lines(folder)
-        assert tuple(rows[0]) == COLUMNS and len(rows) == len(found.runs)
+        assert tuple(rows[0]) == TRADEOFF_COLUMNS and len(rows) == len(found.runs)
         for row, run in zip(rows, facts["runs"], strict=True):
-            for name in set(COLUMNS) - {"knobs", "settings"}:
+            for name in set(TRADEOFF_COLUMNS) - {"knobs", "settings"}:
                 assert row[name] == ("" if run[name] is None else str(run[name]))
         base = next(row for row in rows if row["knobs"] == "base")
         in_kernels = float(base["seconds"]) / float(base["kernel_seconds"])
         assert in_kernels == pytest.approx(float(base["units"]), rel=1e-5)  # to the digits of the table
-        assert facts["front"] == [dict(run.settings) for run in found.best]
+        assert facts["front"] == [dict(run.settings) for run in found.front_runs]
 
 
 KEYS = """
