@@ -475,7 +475,7 @@ def tradeoff(
     with cluster.connect(scheduler) as machines, slow_progress() as watched:
         table = sweeping.tradeoff(wanted, folder, budget=budget, progress=watched, machines=machines)
     say(results.summary(table), folder)
-    return 0 if table.lenses else 1
+    return 0 if table.runs_with_lens else 1
 
 
 @app.command(epilog=examples("batch 'scenes/*.toml' -o many", "batch a.toml b.toml --quality draft --workers 2"))

@@ -87,7 +87,7 @@ HEAVY = (
 )  # fmt: skip
 # Calls whose arguments have no names: of any number of them, of OCC, of C and of a callable that is handed in.
 NAMELESS = {
-    "max", "partial", "around", "ctx.save_for_backward", "machines.start",
+    "max", "partial", "neighbours", "ctx.save_for_backward", "machines.start",
     "Geom_BSplineSurface", "BRepBuilderAPI_MakeEdge", "materials.SetMaterial", "evaluate", "rename", "ghost",
 }  # fmt: skip
 SOURCES = {str(path.relative_to(PACKAGE)): path for path in sorted(PACKAGE.rglob("*.py"))}

@@ -280,7 +280,7 @@ def test_a_sweep_has_its_folder_budget_and_settings(monkeypatch, tmp_path, capsy
         calls.append((scene, folder, options["budget"]))
         if stops:
             raise stops[0]
-        return types.SimpleNamespace(lenses=lenses)
+        return types.SimpleNamespace(runs_with_lens=lenses)
 
     monkeypatch.setattr(sweeping, "tradeoff", tradeoff)
     monkeypatch.setattr(results, "summary", lambda found: "what it costs")
@@ -292,9 +292,9 @@ def test_a_sweep_has_its_folder_budget_and_settings(monkeypatch, tmp_path, capsy
     lenses.clear()
     assert cli.run(["tradeoff", THU, "-o", "mine"]) == 1
     stops.append(KeyboardInterrupt())
-    stops[0].add_note("3 runs are kept in mine; the same command goes on from there")
+    stops[0].add_note("3 runs are stored in mine; the same command continues from there")
     assert cli.run(["tradeoff", THU]) == 130
-    assert "stopped; 3 runs are kept in mine" in capsys.readouterr().err
+    assert "stopped; 3 runs are stored in mine" in capsys.readouterr().err
 
 
 def test_docs_explains_a_check_and_names_its_page(capsys, monkeypatch, tmp_path):

@@ -141,7 +141,7 @@ def tradeoff(job: Mapping[str, Any], place: Path, output: Path, resume: bool) ->
     folder = output.with_name(f"{output.name}-tradeoff")
     throttled = Throttled(ProgressFile(place / PROGRESS), MIN_INTERVAL)
     found = sweeping.tradeoff(load(output / SCENE), folder, budget=job["budget"], progress=throttled)
-    return State("finished", passed=bool(found.lenses), folder=folder.name)
+    return State("finished", passed=bool(found.runs_with_lens), folder=folder.name)
 
 
 def measured(job: Mapping[str, Any], place: Path, output: Path, resume: bool) -> State:

@@ -35,12 +35,12 @@ class Cloud:
 def load(path: Path, outline: Outline) -> Cloud:
     """Read the cloud of a lens with this outline; raise ValueError, with a sentence, if the file is not usable."""
     try:
-        found, data = _read(path)
-        points, unit = in_millimetres(found.positions, outline)
+        measured, data = _read(path)
+        points, unit = in_millimetres(measured.positions, outline)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     digest = hashlib.sha256(data).hexdigest()
-    return Cloud(points, unit, path, digest, without_data=found.without_data, columns=found.columns)
+    return Cloud(points, unit, path, digest, without_data=measured.without_data, columns=measured.columns)
 
 
 def _read(path: Path) -> tuple[MeasuredPoints, bytes]:
@@ -52,14 +52,14 @@ def _read(path: Path) -> tuple[MeasuredPoints, bytes]:
     if not data.strip():
         raise ValueError(f"is empty; {INPUT_HINT}")
     ending = path.suffix.lower()
-    found = read_mesh(data, ending) if ending in MESH_SUFFIXES else read_text(data)
-    if len(found.positions) < MIN_POINTS:
-        without = f" and {found.without_data} without data" if found.without_data else ""
+    measured = read_mesh(data, ending) if ending in MESH_SUFFIXES else read_text(data)
+    if len(measured.positions) < MIN_POINTS:
+        without = f" and {measured.without_data} without data" if measured.without_data else ""
         raise ValueError(
-            f"holds {len(found.positions)} points{without}, which are too few; measure at least {MIN_POINTS}, "
+            f"holds {len(measured.positions)} points{without}, which are too few; measure at least {MIN_POINTS}, "
             "preferably 10 000"
         )
-    return found, data
+    return measured, data
 
 
 def in_millimetres(points: np.ndarray, outline: Outline) -> tuple[np.ndarray, str]:

@@ -102,7 +102,7 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
         *_wavefront(replace(lens, back=form.add_to(lens.back)), nominal),
     )  # fmt: skip
     facts = _facts(face, alignment, figures, cloud) | {"scale": scale, "passed": all(check.passed for check in checks)}
-    predicted = [_predicted(*found) for found in lights]
+    predicted = [_predicted(light, high) for light, high in lights]
     facts |= predicted[worst(each["rrmsd_predicted"] for each in predicted)]
     facts["goals"] = [{"key": goal.key} | of for goal, of in zip(nominal.goals, predicted, strict=True)]
     irradiances = tuple(light.picture for light, _ in lights)
@@ -111,8 +111,8 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
 
 def _predicted(light: Light, high: float) -> dict[str, float | None]:
     """Return the RRMSD without and with the uncertainty of the form; None if no light falls on the target."""
-    found = {"rrmsd_predicted": light.rrmsd, "rrmsd_high": high}
-    return {key: value if math.isfinite(value) else None for key, value in found.items()}
+    figures = {"rrmsd_predicted": light.rrmsd, "rrmsd_high": high}
+    return {key: value if math.isfinite(value) else None for key, value in figures.items()}
 
 
 def _wavefront(lens: Lens, nominal: Nominal) -> Iterator[Check]:

@@ -31,10 +31,10 @@ def read_mesh(data: bytes, ending: str) -> MeasuredPoints:
         positions = (_ply if ending == ".ply" else _stl)(data)
     except _Damaged as error:
         raise ValueError(f"is no {ending[1:].upper()} file that can be read ({error}); write it again") from None
-    found = make_points(positions)
-    if not len(found.positions):
+    points = make_points(positions)
+    if not len(points.positions):
         raise ValueError("holds no points; export the vertices of the measured face")
-    return MeasuredPoints(np.unique(found.positions, axis=0), found.without_data)
+    return MeasuredPoints(np.unique(points.positions, axis=0), points.without_data)
 
 
 class _Damaged(Exception):
@@ -115,35 +115,35 @@ def _add_property(element: _Element, name: str, kind: str, length: str) -> _Elem
 def _ascii_vertices(body: bytes, elements: list[_Element]) -> np.ndarray:
     """Return the vertices of an ASCII file, which has one row per line."""
     lines = [line for line in body.decode("latin-1").splitlines() if line.strip()]
-    at, found = 0, np.empty((0, 3))
+    at, vertices = 0, np.empty((0, 3))
     for element in elements:
         if element.count > len(lines) - at:
             raise element.shortage_error(len(lines) - at)
         if element.name == "vertex":
             names = [name for name, _, _ in element.properties]
             columns = [names.index(axis) for axis in "xyz"]
-            found = _parse_rows(lines[at : at + element.count], columns)
+            vertices = _parse_rows(lines[at : at + element.count], columns)
         at += element.count
     if at < len(lines):
         raise ValueError(f"its header declares {at} lines of data, but {len(lines)} follow; {EXPORT_HINT}")
-    return found
+    return vertices
 
 
 def _parse_rows(lines: list[str], columns: list[int]) -> np.ndarray:
     """Return the numbers (n, 3) in three columns of lines."""
-    found = np.empty((len(lines), 3))
+    numbers = np.empty((len(lines), 3))
     for row, line in enumerate(lines):
         fields = line.split()
         try:
-            found[row] = [float(fields[column]) for column in columns]
+            numbers[row] = [float(fields[column]) for column in columns]
         except (ValueError, IndexError):
             raise ValueError(f"its point {row + 1} is not three numbers ({line[:40]!r}); {EXPORT_HINT}") from None
-    return found
+    return numbers
 
 
 def _binary_vertices(data: bytes, elements: list[_Element], at: int, order: str) -> np.ndarray:
     """Return the vertices of a binary file."""
-    found = np.empty((0, 3))
+    vertices = np.empty((0, 3))
     for element in elements:
         if element.has_lists:
             at = _end_of_list_rows(data, element, at, order)
@@ -153,11 +153,11 @@ def _binary_vertices(data: bytes, elements: list[_Element], at: int, order: str)
             raise element.shortage_error((len(data) - at) // row.itemsize)
         if element.name == "vertex":
             table = np.frombuffer(data, row, element.count, at)
-            found = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+            vertices = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
         at += element.count * row.itemsize
     if more := len(data[at:].rstrip(b"\r\n")):
         raise ValueError(f"{more} bytes follow after the data that its header declares; {EXPORT_HINT}")
-    return found
+    return vertices
 
 
 def _end_of_list_rows(data: bytes, element: _Element, at: int, order: str) -> int:

@@ -220,7 +220,7 @@ def seed_matters(scene: Scene, knobs: Sequence[Knob], runs: Mapping[Settings, Co
         method: [runs[point].net for point in pair if point in runs and runs[point].done]
         for method, pair in _probes(scene, knobs).items()
     }
-    return {method: found[0] != found[1] if len(found) == 2 else None for method, found in nets.items()}
+    return {method: pair[0] != pair[1] if len(pair) == 2 else None for method, pair in nets.items()}
 
 
 # --- the sweep --------------------------------------------------------------------------------------------------------
@@ -270,9 +270,9 @@ def tradeoff(
                 if isinstance(error, KeyboardInterrupt):  # after Ctrl-C there is time for a figure
                     results.write_page(sweep.table(), base, folder)
             raise
-        found = sweep.table()
-        results.write_page(found, base, folder)
-        return found
+        result = sweep.table()
+        results.write_page(result, base, folder)
+        return result
 
 
 def check_free(folder: Path, contents: Mapping[str, bytes]) -> None:
@@ -345,9 +345,9 @@ class _Sweep:
         points = (point for point in self._order if point not in self.runs)
         waiting = [ColdRun(settings=point, predicted_seconds=self._predicted(point), **unset) for point in points]
         runs = [self.runs[point] for point in self._order if point in self.runs]
-        found = table(self._base, self._knobs, runs, waiting, budget=self._budget)
-        results.write(found, self._folder)
-        return found
+        result = table(self._base, self._knobs, runs, waiting, budget=self._budget)
+        results.write(result, self._folder)
+        return result
 
     def _choice(self) -> Settings | None:
         """Return the most important run that fits into the remaining budget; the first run always fits."""
@@ -463,7 +463,7 @@ def knob_points(
     scene: Scene, knob: Knob, runs: Mapping[Settings, ColdRun], timed: bool = True
 ) -> tuple[KnobPoint, ...]:
     """Return the points of a knob that were run with either seed; timed: True if times are comparable."""
-    found = []
+    averages = []
     for label, point in knob.points.items():
         if done := [runs[each] for each in (point, other_seed(scene, point)) if each in runs and runs[each].done]:
             errors, seconds = [run.rrmsd for run in done], statistics.median(run.seconds for run in done)
@@ -471,8 +471,8 @@ def knob_points(
                 label=label, settings=point, seconds=seconds if timed else None, rrmsd=statistics.median(errors),
                 lowest=min(errors), highest=max(errors), seeds=len(done),
             )  # fmt: skip
-            found.append(average)
-    return tuple(found)
+            averages.append(average)
+    return tuple(averages)
 
 
 def _knob_keys(knobs: Sequence[Knob], point: Settings) -> tuple[str, ...]:

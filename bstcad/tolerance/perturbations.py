@@ -190,8 +190,8 @@ MOTIONS = (  # (error, words, axis, True for a rotation)
 
 def kinds(setup: Setup, material: str | None = None) -> dict[str, Kind]:
     """Return all errors of a setup that have one amount, except those without effect and of an unknown material."""
-    found = (*_motions(setup), *_shapes(setup, material), *_lights(setup), *_alignments(setup.lens))
-    return {kind.name: kind for kind in found}
+    every_kind = (*_motions(setup), *_shapes(setup, material), *_lights(setup), *_alignments(setup.lens))
+    return {kind.name: kind for kind in every_kind}
 
 
 def _motions(setup: Setup) -> Iterator[Kind]:

@@ -403,9 +403,9 @@ def adjusted_rrmsd(superposed: Model, perturbations: Sequence[Perturbation], amo
     amounts = np.pad(amounts, (0, len(perturbations) - len(amounts)))
 
     def moved(steps: np.ndarray) -> np.ndarray:
-        tried = np.broadcast_to(amounts, (*steps.shape[:-1], len(amounts))).copy()
-        tried[..., free] += steps * superposed.sigmas[free]
-        return tried
+        varied = np.broadcast_to(amounts, (*steps.shape[:-1], len(amounts))).copy()
+        varied[..., free] += steps * superposed.sigmas[free]
+        return varied
 
     offsets = QUOTIENT_STEP * np.eye(len(free))
     nearby = np.concatenate([np.zeros((1, len(free))), offsets, -offsets])

@@ -43,9 +43,9 @@ def test_it_is_among_those_that_are_tried_and_the_least_that_is_worth_it(free):
         less, longer = errors[one] / errors[other], seconds[other] / seconds[one]
         return less > 2 or (less > 1.25 and longer < 3)
 
-    finer = range(free.number + 1, len(errors))
-    assert not any(better(free.number, other) for other in finer)
-    assert all(any(better(one, other) for other in range(one + 1, len(errors))) for one in range(free.number))
+    finer = range(free.index + 1, len(errors))
+    assert not any(better(free.index, other) for other in finer)
+    assert all(any(better(one, other) for other in range(one + 1, len(errors))) for one in range(free.index))
     assert with_net(PLATE)[0].lens.back.net == free.net
 
 

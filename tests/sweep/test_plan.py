@@ -35,7 +35,7 @@ def flown():
 @pytest.fixture
 def known_pilots(flown, monkeypatch):
     """Predictions take the pilots that were flown already."""
-    monkeypatch.setattr(plans, "fly", lambda scene, quality, tick: flown[quality])
+    monkeypatch.setattr(plans, "run_pilot", lambda scene, quality, tick: flown[quality])
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ from bstcad.sweep.prediction import (
 
 NET, PIXELS = "lens.back.control_points", "target.pixels"
 THU = load("templates/thu.toml")
-TINY = {"LARGEST": (32, 33, 64), "FEWEST_POINTS": 17, "CELLS": (16, 32), "pace": lambda: 1.0}
+TINY = {"PILOT_LIMITS": (32, 33, 64), "MIN_PILOT_POINTS": 17, "PILOT_CELLS": (16, 32), "pace": lambda: 1.0}
 
 
 @pytest.fixture

@@ -114,7 +114,7 @@ class TestResume:
         for more in (11, 0):  # the second time before another run has ended
             with pytest.raises(KeyboardInterrupt) as stopped:
                 sweep(tiny, parts, 400.0, Synthetic(tiny, more))
-            assert re.match("11 runs are kept in ", stopped.value.__notes__[0])
+            assert re.match("11 runs are stored in ", stopped.value.__notes__[0])
             assert all((parts / name).is_file() for name in FILES)  # of the runs so far
         rest = Synthetic(tiny)
         sweep(tiny, parts, 400.0, rest)
@@ -144,7 +144,7 @@ class TestResume:
         folder = tmp_path / "s"
         sweep(tiny, folder, 1.0)
         before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-        with pytest.raises(SceneError, match="holds the sweep of another scene"):
+        with pytest.raises(SceneError, match="contains the sweep of another scene"):
             sweep(tiny.changed({"target.z": 501.0}), folder, 1.0)
         assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
         with pytest.raises(SceneError, match="contains files that are not a sweep's"):
@@ -157,8 +157,8 @@ class TestFiles:
         point = sorted_settings({"target.pixels": (48, 32), "tailoring.seed": 3})
         bad = {"seconds": 1.0, "rrmsd": math.nan}
         kept = tradeoff.RunFile(runs=(record(tiny, point), record(tiny, ()).model_copy(update={"history": (bad,)})))
-        cold_run.put(tmp_path / "runs.json", kept)
-        read = cold_run.read(tradeoff.RunFile, tmp_path / "runs.json", "")
+        cold_run.write_record(tmp_path / "runs.json", kept)
+        read = cold_run.read_record(tradeoff.RunFile, tmp_path / "runs.json", "")
         assert read.runs[0] == kept.runs[0] and read.runs[1].history[0]["rrmsd"] is None  # JSON has no such number
         sweep(tiny, tmp_path / "s", 1.0)
         record_file(tmp_path / "s").write_text(damage)
