@@ -152,7 +152,7 @@ class Directions(Receiver):
     def middle(self):
         return 0.0, 0.0, self.radius
 
-    def where(self, origin=0.0):
+    def position_text(self, origin=0.0):
         return f"all directions, {self.radius / 1000:g} m away"
 
     def per_radian(self, z):

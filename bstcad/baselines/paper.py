@@ -126,7 +126,7 @@ def transport(task: Task, lens: Lens) -> Mapping:
 
 
 def tent_average(target: Tensor) -> Tensor:
-    """Return a picture of even flux in each pixel after tent binning: [1, 6, 1] / 8 along both axes.
+    """Return a picture of constant irradiance in each pixel after tent binning: [1, 6, 1] / 8 along both axes.
 
     In comparison with it, instead of the sharp picture, a perfect lens has merit zero.
     """

@@ -31,7 +31,7 @@ WavelengthKey = Annotated[  # key of every source
     Wavelength,
     Key("One wavelength, or lines [[nm, weight], ...] of a spectrum, weights of any sum.", "nm", 100.0, 20_000.0),
 ]
-PROFILE_NAMES = {"gaussian": "Gaussian", "lambertian": "Lambertian", "uniform": "even"}  # in sentences
+PROFILE_NAMES = {"gaussian": "Gaussian", "lambertian": "Lambertian", "uniform": "uniform"}  # in sentences
 
 
 class Emitter(ABC):
@@ -126,7 +126,7 @@ class Emitter(ABC):
 
     def words(self, origin: float) -> str:
         """Return kind, position, profile and sizes for a data sheet; origin: z (mm) from which the sheet measures."""
-        return "a source of one's own"
+        return "a custom source"
 
     def sizes(self) -> Iterator[tuple[str, float, str]]:
         """Yield (key, size, unit) for each key that defines the extent."""

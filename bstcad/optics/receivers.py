@@ -40,7 +40,7 @@ class Receiver(ABC):
         """Names of the coordinates, with their unit."""
         return tuple(f"{name} ({self.unit})" for name in self.names)
 
-    def where(self, origin: float = 0.0) -> str:
+    def position_text(self, origin: float = 0.0) -> str:
         """Return the position in words for reports and messages; z is relative to `origin` (mm)."""
         return f"z = {round(self.throw(origin), 3) + 0.0:.10g} mm"
 
@@ -145,7 +145,7 @@ class MovedReceiver(Receiver):
     motion: Motion
 
     def __post_init__(self) -> None:
-        for name in ("unit", "light", "names", "where", "per_radian", "areas"):  # attributes that no motion changes
+        for name in ("unit", "light", "names", "position_text", "per_radian", "areas"):  # unchanged by motions
             object.__setattr__(self, name, getattr(self.rest, name))
 
     @property
@@ -188,7 +188,7 @@ def _rotate(motion: Motion, vector: Sequence[Array]) -> tuple[Array, Array, Arra
 
 
 class PlaneReceiver(Receiver):
-    """PlaneReceiver P = C + (x - o_x) e_x + (y - o_y) e_y, n · (p - C) = 0, with centre C of coordinates o."""
+    """Plane P = C + (x - o_x) e_x + (y - o_y) e_y, n · (p - C) = 0, with centre C of coordinates o."""
 
     def height(self, point: Vector) -> float:
         """Return the height n · (p - C) (mm) of a point above the plane, negative on the side of the incident light."""
@@ -234,7 +234,7 @@ class PlaneReceiver(Receiver):
 
 @dataclass(frozen=True)
 class LevelPlane(PlaneReceiver):
-    """PlaneReceiver z = const, with the x and y of space."""
+    """Plane z = const, with the x and y of space."""
 
     z: float  # z of the plane, mm
 

@@ -348,7 +348,7 @@ def light_path_of(scene: Scene, lens: Lens, pictures: Sequence[tuple[np.ndarray,
 def _sizes(screens: Sequence[Screen]) -> str:
     """Return the sizes and positions of the targets in words."""
     sizes = (
-        f"{number(x[1] - x[0])} × {number(y[1] - y[0])} {plane.unit} at {plane.where()}"
+        f"{number(x[1] - x[0])} × {number(y[1] - y[0])} {plane.unit} at {plane.position_text()}"
         for plane, x, y in ((screen.plane, screen.x, screen.y) for screen in screens)
     )
     return f"Target{'s' * (len(screens) > 1)} {', '.join(sizes)}"

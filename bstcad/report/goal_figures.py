@@ -84,7 +84,7 @@ def figures_of(goals: Sequence[Goal], lights: Sequence[Light]) -> tuple[GoalFigu
     return tuple(
         GoalFigures(
             goal.key,
-            goal.receiver.plane.where(),
+            goal.receiver.plane.position_text(),
             goal.weight,
             light.rrmsd,
             rrmsd_standard_error=light.standard_error,

@@ -437,12 +437,12 @@ def _upgraded(data: bytes | str) -> bytes | str:
         facts.pop("limits", None)
         for goal in (*facts.get("goals", ()), *(facts.get("targets") or ())):
             if "z" in goal:
-                goal["where"] = LevelPlane(goal.pop("z")).where()
+                goal["where"] = LevelPlane(goal.pop("z")).position_text()
         if "goals" in facts or "prescription" not in facts:
             return to_json(facts)
         prescribed, measured = facts["prescription"], facts.get("measured") or {}
         prescribed["targets"] = [prescribed.pop("target"), *prescribed.pop("further_targets", ())]
-        place = LevelPlane(prescribed["targets"][0]["z"]).where()
+        place = LevelPlane(prescribed["targets"][0]["z"]).position_text()
         alone = {"key": "target", "where": place, "weight": 1.0} | {
             name: facts.get(key) for key, name in WORST_GOAL_KEYS.items()
         }

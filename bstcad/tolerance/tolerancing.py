@@ -158,7 +158,8 @@ def _record(
 
 def _of_target(key: str, target: Target, study: Study) -> TargetStudy:
     return TargetStudy(
-        key=key, where=target.screen.plane.where(), rrmsd=study.rrmsd, passed=study.fraction_within(study.linear),
+        key=key, where=target.screen.plane.position_text(),
+        rrmsd=study.rrmsd, passed=study.fraction_within(study.linear),
         passed_full=study.fraction_within(study.full), passed_adjusted=study.fraction_within(study.adjusted),
         rrmsd_trials=_percentiles(study.linear), rrmsd_full=_percentiles(study.full),
         rrmsd_adjusted=_percentiles(study.adjusted), model_off=_disagreement(study), sensitivities=study.sensitivities,
