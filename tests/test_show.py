@@ -70,7 +70,7 @@ def test_what_cannot_be_shown_is_one_sentence(small_design, tmp_path, capsys, mo
     monkeypatch.setattr(commands.sys, "platform", "linux")
     (tmp_path / "empty").mkdir()
     for arguments, words in (
-        ((folder,), "no display to open a window on; give --png FILE"),
+        ((folder,), "no display for a window; give --png FILE"),
         ((tmp_path / "none",), "no such folder"),
         ((tmp_path / "empty", "--png", tmp_path / "a.png"), "scene.toml"),
         ((folder, "--png", tmp_path / "a.jpg"), "is not a file name of a PNG"),

@@ -49,7 +49,7 @@ def test_the_tutorial_names_what_stands_on_the_pages():
     words = " ".join(path.read_text(encoding="utf-8") for path in files)
     named = {" ".join(found.split()) for found in re.findall(r"(?<![*\w])\*([^*]+)\*(?!\*)", text)}
     assert len(named) > 20 and [name for name in sorted(named) if name not in words] == []
-    for words, size in (("preview", QUICK), ("settled preview", REFINED)):
+    for words, size in (("preview", QUICK), ("refined preview", REFINED)):
         assert f"| {words} | {size.pixels} at most | {size.net} at most | {size.evaluations} |" in text
 
 
@@ -163,7 +163,7 @@ def compare(page):
     page.click("nav >> text=Scenes and designs")
     for name in ("my-laser", "my-laser-2"):
         page.check(f"input[name=design][value={name}]")
-    page.click("text=Compare the chosen ones")
+    page.click("text=Compare the chosen designs")
     keys = {row.inner_text() for row in page.locator("tbody th").all()}
     assert {"name", "target.z"} <= keys
 

@@ -181,7 +181,7 @@ def test_a_design_goes_on_without_its_page(open_page, shared, tmp_path):
         again.click("text=All files (ZIP)")
     assert download.value.suggested_filename == "made.zip"
     with again.expect_popup() as report:
-        again.click("text=The report")
+        again.click("text=Report")
     report.value.wait_for_load_state()
     assert "made" in report.value.title() or "made" in report.value.inner_text("body")
 
@@ -197,7 +197,7 @@ def test_two_designs_are_compared_and_nobody_is_shut_out(open_page, shared, smal
     page = open_page(shared.address)
     for name in ("left", "right"):
         page.check(f"input[name=design][value={name}]")
-    page.click("text=Compare the chosen ones")
+    page.click("text=Compare the chosen designs")
     page.wait_for_selector("#curve path.line-1", state="attached")
     assert {row.locator("th").inner_text() for row in page.locator("tbody tr").all()} == {"name", "target.z"}
     addresses = ("/", "/scene/small", "/design/left", "/compare?design=left&design=right")

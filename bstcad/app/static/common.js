@@ -1,21 +1,21 @@
-// Asking the server, in the same words by every page: each answer is JSON, a refusal one sentence.
+// Requests to the server, common to all pages: each answer is JSON, a refusal is one sentence.
 
 export const element = (id) => document.getElementById(id);
 
 export class Refused extends Error {}
 
 export async function ask(address, body, options = {}) {
-  const asked = { method: body === undefined ? "GET" : "POST", ...options };
+  const request = { method: body === undefined ? "GET" : "POST", ...options };
   if (body instanceof Blob || body instanceof ArrayBuffer) {
-    asked.body = body;
-    asked.headers = { "Content-Type": "application/octet-stream" };
+    request.body = body;
+    request.headers = { "Content-Type": "application/octet-stream" };
   } else if (body !== undefined) {
-    asked.body = JSON.stringify(body);
-    asked.headers = { "Content-Type": "application/json" };
+    request.body = JSON.stringify(body);
+    request.headers = { "Content-Type": "application/json" };
   }
   let answer;
   try {
-    answer = await fetch(address, asked);
+    answer = await fetch(address, request);
   } catch (error) {
     if (error.name !== "AbortError") offline("The workbench does not answer. Start it again with bstcad app; nothing is lost.");
     throw error;
@@ -26,14 +26,14 @@ export async function ask(address, body, options = {}) {
     throw new Refused(text);
   }
   offline("");
-  let told;
+  let reply;
   try {
-    told = text ? JSON.parse(text) : {};
+    reply = text ? JSON.parse(text) : {};
   } catch {
     throw new Refused(text.slice(0, 300) || `The workbench failed (${answer.status}).`);
   }
-  if (!answer.ok) throw new Refused(told.sentence || `The workbench failed (${answer.status}).`);
-  return told;
+  if (!answer.ok) throw new Refused(reply.sentence || `The workbench failed (${answer.status}).`);
+  return reply;
 }
 
 export function offline(sentence) {
@@ -63,7 +63,7 @@ export function drawCurves(svg, curves) {
   const [wide, high, left, low] = [Math.max(Math.round(svg.getBoundingClientRect().width), 240) || 480, 240, 60, 38], name = "http://www.w3.org/2000/svg";
   const points = curves.flat().filter(([, value]) => value > 0);
   svg.replaceChildren();
-  svg.setAttribute("viewBox", `0 0 ${wide} ${high}`); // a unit is a pixel, so that letters are as large as the page's
+  svg.setAttribute("viewBox", `0 0 ${wide} ${high}`); // one unit is one pixel, so that letters have the size of the page's
   if (points.length < 2) return;
   const last = Math.max(...points.map(([seconds]) => seconds)), values = points.map(([, value]) => Math.log10(value));
   const [least, most] = [Math.min(...values) - 0.05, Math.max(...values) + 0.05];

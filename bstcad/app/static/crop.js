@@ -1,9 +1,9 @@
-// A frame over the photo of the first target: the part of it that is shown, in the proportions of the target.
+// A frame over the photo of the first target: the crop, with the proportions of the target.
 import { element } from "./common.js";
 
-const LEAST = 0.05, STEP = 0.02; // of the photo: the narrowest frame, and a step of a key
+const MIN_WIDTH = 0.05, STEP = 0.02; // smallest width of the frame, and the step of a key, as fractions of the photo
 const [figure, photo, frame] = ["crop", "photo", "frame"].map(element);
-let part = [0, 0, 1, 1], ratio = 1, held = null, take = () => {}; // left, top, right, bottom; width over height, in parts
+let part = [0, 0, 1, 1], ratio = 1, drag = null, take = () => {}; // left, top, right, bottom; width / height, in fractions
 
 const clamp = (value, low, high) => Math.min(Math.max(value, low), Math.max(high, low));
 const rounded = (value) => Math.round(value * 1e4) / 1e4;
@@ -13,9 +13,9 @@ function draw() {
   Object.assign(frame.style, { left: `${100 * left}%`, top: `${100 * top}%`, width: `${100 * (right - left)}%`, height: `${100 * (bottom - top)}%` });
 }
 
-// A frame of a width, its middle as near to a place as the photo allows.
+// Set a frame of a given width, with its middle as near to a point as the photo allows.
 function put(x, y, width) {
-  const wide = clamp(width, LEAST, Math.min(1, ratio)), high = wide / ratio;
+  const wide = clamp(width, MIN_WIDTH, Math.min(1, ratio)), high = wide / ratio;
   const left = clamp(x - wide / 2, 0, 1 - wide), top = clamp(y - high / 2, 0, 1 - high);
   part = [left, top, left + wide, top + high];
   draw();
@@ -23,7 +23,7 @@ function put(x, y, width) {
 
 const middle = () => [(part[0] + part[2]) / 2, (part[1] + part[3]) / 2];
 
-// key: of the target; sides: its width and height, as the photo lies; given: its crop, or null; changed(value): a drag ended.
+// sides: width and height of the target, as the photo lies; given: its crop, or null; changed(value): called after a drag.
 export function show(address, { sides, given, fills }, changed) {
   take = changed;
   const begin = () => {
@@ -32,13 +32,13 @@ export function show(address, { sides, given, fills }, changed) {
     part = given ?? [0, 0, 1, 1];
     if (fills) {
       const wide = Math.min(part[2] - part[0], (part[3] - part[1]) * ratio);
-      put(...middle(), wide); // as `fit` crops it
+      put(...middle(), wide); // as the key `fit` crops it
     } else draw();
   };
   photo.onload = begin;
   photo.onerror = () => { figure.hidden = true; };
   if (photo.getAttribute("src") !== address) photo.src = address;
-  else if (photo.naturalWidth && held === null) begin();
+  else if (photo.naturalWidth && drag === null) begin();
 }
 
 export const hide = () => { figure.hidden = true; };
@@ -47,23 +47,23 @@ const done = () => take(part.map(rounded));
 
 frame.addEventListener("pointerdown", (event) => {
   const box = photo.getBoundingClientRect(), [x, y] = middle();
-  held = { sized: event.target !== frame, from: [event.clientX, event.clientY], x, y, width: part[2] - part[0], corner: [part[0], part[1]], box };
+  drag = { sized: event.target !== frame, from: [event.clientX, event.clientY], x, y, width: part[2] - part[0], corner: [part[0], part[1]], box };
   frame.setPointerCapture(event.pointerId);
   event.preventDefault();
   frame.focus();
 });
 frame.addEventListener("pointermove", (event) => {
-  if (held === null) return;
-  const across = (event.clientX - held.from[0]) / held.box.width, down = (event.clientY - held.from[1]) / held.box.height;
-  if (!held.sized) return put(held.x + across, held.y + down, held.width);
-  const most = Math.min(1 - held.corner[0], (1 - held.corner[1]) * ratio);
-  const width = clamp(held.width + Math.max(across, down * ratio), LEAST, most);
-  put(held.corner[0] + width / 2, held.corner[1] + width / ratio / 2, width);
+  if (drag === null) return;
+  const across = (event.clientX - drag.from[0]) / drag.box.width, down = (event.clientY - drag.from[1]) / drag.box.height;
+  if (!drag.sized) return put(drag.x + across, drag.y + down, drag.width);
+  const most = Math.min(1 - drag.corner[0], (1 - drag.corner[1]) * ratio);
+  const width = clamp(drag.width + Math.max(across, down * ratio), MIN_WIDTH, most);
+  put(drag.corner[0] + width / 2, drag.corner[1] + width / ratio / 2, width);
 });
 for (const kind of ["pointerup", "pointercancel"]) {
   frame.addEventListener(kind, () => {
-    if (held === null) return;
-    held = null;
+    if (drag === null) return;
+    drag = null;
     done();
   });
 }

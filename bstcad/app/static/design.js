@@ -1,22 +1,22 @@
-// The page of a design follows its run by the run's own files: closed and opened again, it shows the same.
+// The page of a design follows its run through the run's files, so that it can be closed and opened again.
 import { ask, drawCurves, element, embedded, pause, row } from "./common.js";
 
 const { name, run, jobs, finished } = embedded(), at = `/api/design/${encodeURIComponent(name)}`;
-const EVERY = 700; // milliseconds between two looks
+const INTERVAL = 700; // milliseconds between two requests
 const stages = new Map(), curve = [];
-const source = { size: 0, last: 0 }; // percent of its size, and the RRMSD, as last told
+const source = { size: 0, last: 0 }; // latest size of the source (percent) and RRMSD
 let next = 0, began = null, light = "";
 
-// The stages as the tutorial names them.
+// Names of the stages, as in the tutorial.
 const STAGES = {
-  "control points": "control points", reach: "what light reaches", "stage 1": "stage 1: the map of the light",
-  "stage 2": "stage 2: the face, by traced light", "stage 3": "stage 3: the face, for the whole source",
-  write: "the files", verify: "the proof", report: "the report",
+  "control points": "number of control points", reach: "area that light can reach", "stage 1": "stage 1: transport map",
+  "stage 2": "stage 2: face by ray tracing", "stage 3": "stage 3: face for the extended source",
+  write: "writing the files", verify: "proof of the files", report: "report",
 };
 const named = (stage) => STAGES[stage] ?? stage;
 const left = (seconds) => (seconds < 90 ? `${Math.ceil(seconds)} s left` : `${Math.ceil(seconds / 60)} min left`);
 
-const WORDS = { running: "Being designed", stopped: "Stopped", refused: "Refused", failed: "Failed", finished: "Finished", none: "" };
+const WORDS = { running: "Designing", stopped: "Stopped", refused: "Refused", failed: "Failed", finished: "Finished", none: "" };
 
 function take(news) {
   for (const [when, stage, done, total, text] of news.lines) {
@@ -24,9 +24,9 @@ function take(news) {
     stages.set(stage, { done, total, text, first: stages.get(stage)?.first ?? when, last: when });
     const value = /RRMSD ([0-9.]+)/.exec(text);
     if (!value || !stage.startsWith("stage")) continue;
-    const share = /with (\d+) %/.exec(text), size = stage !== "stage 3" ? 0 : share ? Number(share[1]) : 100;
+    const percent = /with (\d+) %/.exec(text), size = stage !== "stage 3" ? 0 : percent ? Number(percent[1]) : 100;
     if (size > source.size && source.last && Number(value[1]) > 1.01 * source.last) {
-      element("growth").textContent = `The rise from ${source.last} to ${value[1]} is the source: stage 3 tailors for more and more of its size, now ${size} %, and a wider source blurs more.`;
+      element("growth").textContent = `The RRMSD rises from ${source.last} to ${value[1]}, since stage 3 increases the size of the source, now to ${size} %, and a larger source blurs more.`;
     }
     Object.assign(source, { size, last: Number(value[1]) });
     curve.push([when - began, Number(value[1])]);
@@ -63,14 +63,14 @@ async function follow() {
     try {
       news = await ask(`${at}/run?since=${next}`);
     } catch {
-      await pause(3 * EVERY);
+      await pause(3 * INTERVAL);
       continue;
     }
     take(news);
     element("running").hidden = ["none", "finished"].includes(news.state) && finished;
     if (before === "running" && news.state !== "running" && news.folder) return location.assign(`/design/${news.folder}`);
     before = news.state;
-    await pause(news.state === "running" ? EVERY : 4 * EVERY);
+    await pause(news.state === "running" ? INTERVAL : 4 * INTERVAL);
   }
 }
 
@@ -103,7 +103,7 @@ function show(form, state) {
   else bar.removeAttribute("value");
   const rest = total && done ? ((state.now - form.began.get(stage)) * (total - done)) / done : 0;
   const text = last ? [`${named(stage)}:`, words, total ? `${done} of ${total},` : "", rest ? left(rest) : ""].filter(Boolean).join(" ").replace(/,$/, "") : "";
-  if (running) place.textContent = `Under way … ${text}`;
+  if (running) place.textContent = `Running … ${text}`;
   else if (state.state === "finished") {
     place.replaceChildren("Finished: ", ...RESULTS[kind](state).flatMap(([address, words], k) => {
       const link = document.createElement("a");
@@ -122,7 +122,7 @@ async function followJob(form) {
       show(form, state);
       if (state.state !== "running") return;
     }
-    await pause(EVERY);
+    await pause(INTERVAL);
   }
 }
 

@@ -1,44 +1,44 @@
-// The page of a scene: each change goes to the server, which answers with the text, the form and the fault; then the
-// preview follows.  Of changes that come while an earlier one is under way only the latest counts, and an older preview
-// stays until a new one is there.
+// The page of a scene.  Each change goes to the server, which answers with the text, the form and the fault; then the
+// preview follows.  While a change is being sent, only the latest further change is kept.  An older preview stays until
+// the next one is there.
 import { ask, element, embedded, pause, row } from "./common.js";
 import * as crop from "./crop.js";
 
 let state = embedded();
 const at = `/api/scene/${encodeURIComponent(state.name)}`, page = crypto.randomUUID();
-const QUALITIES = ["draft", "standard", "fine"], LOOK = 1500; // milliseconds between two looks for other pages' changes
+const QUALITIES = ["draft", "standard", "fine"], INTERVAL = 1500; // milliseconds between two checks for changes on other pages
 let number = 0, sent = {}, waiting = null, busy = false, dragging = null, viewer = null, look = "lens", qualities = {};
-const wrong = new Map(); // what a person typed that is no value: by key, the words and the sentence
-const closed = new Set(); // locks, by their keys
-let impossible = {}; // by key and choice, why this scene cannot have it
+const wrong = new Map(); // invalid entries: words and sentence, by key
+const closed = new Set(); // closed locks, by their keys
+let impossible = {}; // reasons why this scene cannot have a choice, by key and choice
 
 // ---- the form ----
 
 const form = element("form");
 
-function take(told) {
-  const anew = told.revision !== state.revision || !form.firstChild;
-  state = told;
-  element("saved").textContent = told.saved ? "saved" : "changed, not saved yet; kept here";
-  element("save").disabled = element("drop-changes").disabled = told.saved;
+function take(reply) {
+  const isNew = reply.revision !== state.revision || !form.firstChild;
+  state = reply;
+  element("saved").textContent = reply.saved ? "saved" : "unsaved changes, which are stored on this machine";
+  element("save").disabled = element("drop-changes").disabled = reply.saved;
   const area = element("text");
-  if (document.activeElement !== area || !area.dataset.changed) area.value = told.text;
-  const error = told.error;
-  if (anew) impossible = {};
-  if (told.form !== null && dragging === null && (anew || error)) replaceForm(told.form);
+  if (document.activeElement !== area || !area.dataset.changed) area.value = reply.text;
+  const error = reply.error;
+  if (isNew) impossible = {};
+  if (reply.form !== null && dragging === null && (isNew || error)) replaceForm(reply.form);
   else markForm();
   showCrop();
-  sayFollowed(told.followed ?? []);
-  sayFault();
+  showFollowed(reply.followed ?? []);
+  showFault();
   if (error) noEstimates(error.sentence);
-  if (told.sketch !== undefined) element("sketch").innerHTML = told.sketch;
-  const quality = /^\s*quality\s*=\s*"(\w+)"/m.exec(told.text);
+  if (reply.sketch !== undefined) element("sketch").innerHTML = reply.sketch;
+  const quality = /^\s*quality\s*=\s*"(\w+)"/m.exec(reply.text);
   const place = QUALITIES.indexOf(quality ? quality[1] : "standard");
   if (place >= 0 && dragging !== element("quality")) element("quality").value = place;
-  sayQuality();
+  showQuality();
 }
 
-// The form comes as HTML; what was open stays open, and the focus stays where it was.
+// Replace the HTML of the form; open sections stay open, and the focus is kept.
 function replaceForm(html) {
   const active = document.activeElement, key = form.contains(active) ? active.dataset.key : null, type = active?.type;
   const open = new Set([...form.querySelectorAll("details[open]")].map((part) => part.dataset.section));
@@ -53,7 +53,7 @@ function replaceForm(html) {
 }
 
 function change(given) {
-  if (given.words !== undefined && given.key === sent.key && given.words === sent.words) return; // a slider says it twice
+  if (given.words !== undefined && given.key === sent.key && given.words === sent.words) return; // a slider sends the same value twice
   sent = given;
   waiting = given;
   if (!busy) send();
@@ -65,16 +65,16 @@ async function send() {
     const given = waiting;
     waiting = null;
     try {
-      const told = await ask(`${at}/change`, given);
+      const reply = await ask(`${at}/change`, given);
       if (given.key === undefined) wrong.clear();
       else wrong.delete(given.key);
-      take(told);
+      take(reply);
       if (waiting === null && !state.error) preview();
     } catch (error) {
       sent = {};
       wrong.set(given.key ?? "", { words: given.words, sentence: error.message });
       markForm();
-      sayFault();
+      showFault();
     }
   }
   busy = false;
@@ -82,7 +82,7 @@ async function send() {
 
 const controlsOf = (key) => [...form.querySelectorAll("[data-key]")].filter((part) => part.dataset.key === key && part.type !== "button");
 
-// What the server does not know of the form: entries that are no values, closed locks, and choices that cannot be.
+// Mark what only the page knows: invalid entries, closed locks, and impossible choices.
 function markForm() {
   for (const old of form.querySelectorAll("[data-typed]")) {
     if (old.tagName === "P") old.remove();
@@ -99,12 +99,12 @@ function markForm() {
       if (words !== undefined && control.type !== "checkbox" && control.tagName !== "SELECT") control.value = words;
       control.setAttribute("aria-invalid", "true");
       control.dataset.typed = "wrong";
-      const told = document.createElement("p");
-      Object.assign(told, { className: "error", id: `${control.id}-typed`, textContent: sentence });
-      told.setAttribute("role", "alert");
-      told.dataset.typed = "wrong";
-      control.closest(".field").append(told);
-      control.setAttribute("aria-describedby", `${control.id}-help ${told.id}`);
+      const message = document.createElement("p");
+      Object.assign(message, { className: "error", id: `${control.id}-typed`, textContent: sentence });
+      message.setAttribute("role", "alert");
+      message.dataset.typed = "wrong";
+      control.closest(".field").append(message);
+      control.setAttribute("aria-describedby", `${control.id}-help ${message.id}`);
     }
   }
   for (const lock of form.querySelectorAll(".lock")) lock.setAttribute("aria-pressed", closed.has(lock.dataset.locks));
@@ -132,7 +132,7 @@ element("in-proportions").addEventListener("click", async () => {
   if (!state.error) preview();
 });
 
-// A choice that this scene cannot have is greyed, with the reason under the field.
+// Disable choices that this scene cannot have, with the reasons under the field.
 function grey(control, choices) {
   if (control.tagName !== "SELECT" || control.dataset.greyed) return;
   control.dataset.greyed = "yes";
@@ -142,16 +142,16 @@ function grey(control, choices) {
     if (!why) continue;
     option.value = option.value; // its text changes below
     option.disabled = true;
-    option.textContent = `${option.value} (not here)`;
-    reasons.append(`Not ${option.value} here: ${why}. `);
+    option.textContent = `${option.value} (not possible)`;
+    reasons.append(`${option.value} is not possible in this scene: ${why}. `);
   }
   reasons.id = `${control.id}-reasons`;
   control.setAttribute("aria-describedby", `${control.getAttribute("aria-describedby")} ${reasons.id}`);
   control.closest(".field").append(reasons);
 }
 
-// The sentence at the top, and whether a lens can be made: not while any entry is wrong.
-function sayFault() {
+// Show the sentence at the top; no lens can be designed while an entry is invalid.
+function showFault() {
   const { error } = state, typed = [...wrong.values()].map(({ sentence }) => sentence);
   const sentence = error ? (error.line ? `${error.sentence} (line ${error.line})` : error.sentence) : typed.join(" ");
   element("fault").hidden = !sentence;
@@ -159,13 +159,13 @@ function sayFault() {
   element("make").disabled = Boolean(error) || wrong.size > 0;
 }
 
-// Keys that changed with another one are named, and marked for a while.
-function sayFollowed(keys) {
-  element("followed").textContent = keys.length ? `Changed with it: ${keys.map((key) => `${key} = ${controlsOf(key)[0]?.value ?? "as well"}`).join("; ")}.` : "";
+// Name and mark the keys that changed with another key.
+function showFollowed(keys) {
+  element("followed").textContent = keys.length ? `Also changed: ${keys.map((key) => `${key} = ${controlsOf(key)[0]?.value ?? "(see the text)"}`).join("; ")}.` : "";
   for (const key of keys) for (const control of controlsOf(key)) control.classList.add("followed");
 }
 
-// The slider of a pair is its width: both ends move about their middle.
+// The slider of a pair sets its width: both ends move about their middle.
 function wordsOf(control) {
   if (control.type === "checkbox") return String(control.checked);
   if (!control.dataset.middle) return control.value;
@@ -213,7 +213,7 @@ for (const [kind, lit] of [["focusin", true], ["focusout", false]]) {
   });
 }
 
-// A picture that is chosen, or dropped anywhere on the page, takes the place of the one that the scene has.
+// A picture that is chosen, or dropped anywhere on the page, replaces the picture of the scene.
 async function takePicture(file) {
   if (!file) return;
   try {
@@ -247,32 +247,32 @@ async function preview() {
   const mine = ++number;
   element("targets").classList.add("waiting");
   element("status").className = "";
-  element("status").textContent = "A new preview is on its way …";
-  let told;
+  element("status").textContent = "Computing a new preview …";
+  let reply;
   try {
-    told = await ask(`${at}/preview`, { page, number: mine });
-    while (mine === number && !told.replaced && !told.stage) told = await ask(answer(mine, 0));
+    reply = await ask(`${at}/preview`, { page, number: mine });
+    while (mine === number && !reply.replaced && !reply.stage) reply = await ask(answer(mine, 0));
   } catch (error) {
     if (mine === number) noEstimates(error.message);
     return;
   }
-  if (mine !== number || told.replaced) return;
-  show(told);
-  if (told.refused) return;
+  if (mine !== number || reply.replaced) return;
+  show(reply);
+  if (reply.refused) return;
   findImpossible(mine);
   for (let stage = 1; stage < 4; stage++) {
     do {
-      told = await ask(answer(mine, stage)).catch(() => ({ replaced: true }));
-      if (mine !== number || told.replaced) return;
-    } while (!told.stage);
-    show(told);
+      reply = await ask(answer(mine, stage)).catch(() => ({ replaced: true }));
+      if (mine !== number || reply.replaced) return;
+    } while (!reply.stage);
+    show(reply);
   }
 }
 
 const answer = (mine, stage) => `${at}/answer?page=${page}&number=${mine}&stage=${stage}`;
 
 async function findImpossible(mine) {
-  await pause(LOOK);
+  await pause(INTERVAL);
   if (mine !== number || dragging !== null) return;
   const found = await ask(`${at}/impossible`).catch(() => null);
   if (mine !== number || found === null || dragging !== null) return;
@@ -280,14 +280,14 @@ async function findImpossible(mine) {
   markForm();
 }
 
-function show(told) {
-  if (told.stage === "preview" || told.stage === "settled") showLight(told);
-  else showPlan(told);
+function show(reply) {
+  if (reply.stage === "preview" || reply.stage === "settled") showLight(reply);
+  else showPlan(reply);
 }
 
-// No figure stays of a scene that is no more: the reason stands in its place.
+// Clear all figures, which are of an earlier scene, and show the reason instead.
 function noEstimates(sentence) {
-  number++; // answers that are under way are of the scene before
+  number++; // answers that arrive now are of the earlier scene
   const status = element("status");
   element("targets").classList.remove("waiting");
   element("targets").replaceChildren();
@@ -304,39 +304,39 @@ function noPlan(sentence) {
   element("net").textContent = "";
   element("comes-to").textContent = "";
   element("notes").textContent = sentence;
-  sayQuality();
+  showQuality();
 }
 
-function showLight(told) {
+function showLight(reply) {
   element("targets").classList.remove("waiting");
-  if (told.refused) {
-    if (told.stage === "preview") noEstimates(told.refused);
-    else element("status").textContent += ` No finer preview: ${told.refused}.`;
+  if (reply.refused) {
+    if (reply.stage === "preview") noEstimates(reply.refused);
+    else element("status").textContent += ` No finer preview: ${reply.refused}.`;
     return;
   }
-  element("targets").replaceChildren(...told.targets.map((target) => {
+  element("targets").replaceChildren(...reply.targets.map((target) => {
     const pair = document.createElement("div");
     pair.className = "both";
-    const of = told.targets.length > 1 ? `${target.key}: ` : "";
-    pair.append(figure(target.light, `${of}Light through the lens`, `${of}by the lens, RRMSD ${target.rrmsd} on ${target.pixels.join(" × ")} pixels${target.source_image ? `; the source's image there is ${target.source_image} wide, and blurs finer detail` : ""}`, "light-on-wall"));
-    pair.append(figure(target.wanted, `${of}The picture that is asked for`, `${of}asked for; ${target.seen.toLowerCase()}`));
+    const of = reply.targets.length > 1 ? `${target.key}: ` : "";
+    pair.append(figure(target.light, `${of}Light through the lens`, `${of}light through the lens: RRMSD ${target.rrmsd} on ${target.pixels.join(" × ")} pixels${target.source_image ? `; the image of the source is ${target.source_image} wide and blurs finer detail` : ""}`, "light-on-wall"));
+    pair.append(figure(target.wanted, `${of}Target picture`, `${of}target picture, ${target.seen.toLowerCase()}`));
     return pair;
   }));
-  const sure = told.stage === "settled" ? "Settled preview" : "Preview";
-  element("status").textContent = `${sure} in ${told.seconds.toFixed(1)} s; a design sees all pixels.`;
-  element("figures").tBodies[0].replaceChildren(...told.figures.map((cells) => row(cells)));
-  element("remarks").replaceChildren(...told.remarks.map((sentence) => {
+  const kind = reply.stage === "settled" ? "Refined preview" : "Preview";
+  element("status").textContent = `${kind} after ${reply.seconds.toFixed(1)} s; a design uses all pixels.`;
+  element("figures").tBodies[0].replaceChildren(...reply.figures.map((cells) => row(cells)));
+  element("remarks").replaceChildren(...reply.remarks.map((sentence) => {
     const item = document.createElement("li");
     item.textContent = sentence;
     return item;
   }));
-  if (!told.solid) return;
+  if (!reply.solid) return;
   if (viewer === null) {
-    viewer = solidView.begin(element("solid-figure"), told.solid);
+    viewer = solidView.begin(element("solid-figure"), reply.solid);
     viewer.look(look);
   } else {
     element("solid-figure").classList.add("drawn");
-    viewer.update(told.solid);
+    viewer.update(reply.solid);
   }
 }
 
@@ -357,21 +357,21 @@ element("solid-figure").addEventListener("click", ({ target }) => {
 
 // ---- time and accuracy, and what is left out ----
 
-function showPlan(told) {
-  if (!told.refused) {
-    element("comes-to").textContent = told.verdict?.sentence ?? "";
-    element("comes-to").className = told.verdict?.kind === "blurred" ? "error" : "";
+function showPlan(reply) {
+  if (!reply.refused) {
+    element("comes-to").textContent = reply.verdict?.sentence ?? "";
+    element("comes-to").className = reply.verdict?.kind === "blurred" ? "error" : "";
   }
-  qualities = told.qualities ?? {};  // none until the pilots have ended
-  if (told.refused) noPlan(`No estimate: ${told.refused}.`);
-  else if (told.stage === "effects") {
-    element("net").textContent = told.net ?? "";
-    const several = told.left_out.some((cells) => cells[4]);
+  qualities = reply.qualities ?? {};  // empty until the pilots have ended
+  if (reply.refused) noPlan(`No estimate: ${reply.refused}.`);
+  else if (reply.stage === "effects") {
+    element("net").textContent = reply.net ?? "";
+    const several = reply.left_out.some((cells) => cells[4]);
     element("left-out").querySelector("th:last-child").hidden = !several;
-    const rows = told.left_out.map((cells) => row(several ? cells : cells.slice(0, 4), { numbers: [1, 2, 3] }));
+    const rows = reply.left_out.map((cells) => row(several ? cells : cells.slice(0, 4), { numbers: [1, 2, 3] }));
     element("left-out").querySelector("tbody").replaceChildren(...rows);
   } else {
-    element("notes").textContent = told.not_predicted ? `No prediction: ${told.not_predicted}.` : told.notes.join(" ");
+    element("notes").textContent = reply.not_predicted ? `No prediction: ${reply.not_predicted}.` : reply.notes.join(" ");
   }
   element("predicted").tBodies[0].replaceChildren(...QUALITIES.filter((quality) => qualities[quality]).map((quality) => {
     const made = row([quality, qualities[quality].seconds, qualities[quality].rrmsd], { numbers: [1, 2] });
@@ -379,10 +379,10 @@ function showPlan(told) {
     made.dataset.quality = quality;
     return made;
   }));
-  sayQuality();
+  showQuality();
 }
 
-function sayQuality() {
+function showQuality() {
   const chosen = QUALITIES[element("quality").value], known = qualities[chosen];
   const words = known ? `${chosen}: ${known.seconds}, RRMSD ${known.rrmsd} (${known.range})` : chosen;
   if (element("quality-says").textContent !== words) element("quality-says").textContent = words;
@@ -397,9 +397,9 @@ function sayQuality() {
 
 async function order(address, body = {}) {
   try {
-    const told = await ask(`${at}/${address}`, body);
+    const reply = await ask(`${at}/${address}`, body);
     if (address === "drop") wrong.clear();
-    take(told);
+    take(reply);
   } catch (error) {
     if (address === "save" && /another program/.test(error.message) && confirm(error.message)) return order("save", { anyway: true });
     element("fault").hidden = false;
@@ -416,7 +416,7 @@ element("make").addEventListener("click", async () => {
   element("make").disabled = true;
   try {
     while (busy) await pause(50);
-    if (state.error || wrong.size) return sayFault(); // an entry that was left just now
+    if (state.error || wrong.size) return showFault(); // the last entry was invalid
     const { design } = await ask(`${at}/make`, { page });
     location.href = `/design/${design}`;
   } catch (error) {
@@ -430,12 +430,12 @@ element("make").addEventListener("click", async () => {
 
 async function watch() {
   for (;;) {
-    await pause(LOOK);
+    await pause(INTERVAL);
     if (busy || dragging !== null || document.hidden || area.dataset.changed) continue;
-    const told = await ask(`${at}?revision=${state.revision}`).catch(() => null);
-    if (busy || told === null || told.text === undefined || told.revision === state.revision) continue;
-    take(told);
-    if (!told.error) preview();
+    const reply = await ask(`${at}?revision=${state.revision}`).catch(() => null);
+    if (busy || reply === null || reply.text === undefined || reply.revision === state.revision) continue;
+    take(reply);
+    if (!reply.error) preview();
   }
 }
 

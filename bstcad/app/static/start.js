@@ -1,37 +1,37 @@
-// A picture, or something else to throw, becomes a scene: then the page of that scene opens.
+// The start page: makes a scene from a picture, a sample, letters or a template, and opens its page.
 import { ask, element } from "./common.js";
 
-const form = element("new"), drop = element("drop"), file = element("picture"), said = element("said");
+const form = element("new"), drop = element("drop"), file = element("picture"), message = element("message");
 
 const use = () => {
   const chosen = form.querySelector("input[name=use]:checked");
   return chosen.dataset.template === undefined ? { light: chosen.value } : { template: chosen.value };
 };
 
-// The size of a plate as `bstcad new --size` takes it: 80, or 80xphoto for the proportions of the photo.
+// Size of a plate as in `bstcad new --size`: 80, or 80xphoto for the proportions of the photo.
 const size = (photo) => {
   const side = element("side").value.trim().replace(",", ".");
   return photo && element("proportions").checked ? `${side ? `${side}x` : ""}photo` : side;
 };
 
 async function begin(given, words) {
-  said.textContent = words;
+  message.textContent = words;
   try {
     const { name } = await ask("/api/scenes", given);
     location.href = `/scene/${name}`;
   } catch (error) {
-    said.textContent = error.message;
+    message.textContent = error.message;
   }
 }
 
 async function take(picture) {
   if (!picture) return;
-  said.textContent = "Reading the picture …";
+  message.textContent = "Reading the picture …";
   try {
     const kept = await ask("/api/picture", picture);
     await begin({ ...use(), size: size(true), ...kept }, "Making the scene …");
   } catch (error) {
-    said.textContent = error.message;
+    message.textContent = error.message;
   }
 }
 
