@@ -261,10 +261,7 @@ def resolved(scene: Scene, lens: Lens) -> Scene:
 
 
 def check_front(lens: Lens, scene: Scene) -> None:
-    """Raise SceneError if the designed front is impossible in the scene.
-
-    No command could read the folder of such a design.
-    """
+    """Raise SceneError if the designed front is impossible in the scene, as no command could read such a design."""
     if not scene.lens.front.free:
         return
     try:

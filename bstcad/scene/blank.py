@@ -212,7 +212,7 @@ class _Front:
         _, slope, _ = self.optical.relative_sag_and_slope(*(torch.tensor(p, dtype=torch.float64) for p in own.farthest))
         steep = math.degrees(math.atan(abs(float(slope)))) if bool(reached) else 90.0
         if not steep <= MAX_RECESS_SLOPE:
-            ends = f"ends nearer to the axis than its rim, at {own.radius:g} mm"
+            ends = f"does not reach the rim of this outline, {own.radius:g} mm from the axis"
             slope = f"has a slope of {steep:.3g} degrees at its rim, and {MAX_RECESS_SLOPE:g} is the maximum"
             yield f"outline.diameter: the {self.kind} {ends if steep == 90.0 else slope}; make the outline smaller"
         if not max(map(abs, self.surface.sags(own))) >= MIN_RECESS_SAG:

@@ -26,10 +26,7 @@ Step = tuple[str, int | None]
 
 
 def override(data: dict[str, Any], key: str, value: Any, shown: str) -> None:
-    """Set the value of a dotted key and remove its alternatives (ONE_OF); None removes the key.
-
-    shown: the key as messages name it.  SceneError if the key cannot be set.
-    """
+    """Set the value of a dotted key, called `shown` in messages; None removes it.  Its alternatives (ONE_OF) go."""
     found = [STEP.fullmatch(part) for part in key.split(".")]
     if not all(found):
         raise SceneError(f"{shown}: is not a dotted key; write for example lens.back.control_points")

@@ -124,7 +124,7 @@ def complaints(effects: Effects, lens: LensBlank) -> Iterator[str]:
         if not lens.passes.reflects and getattr(effect, "metal", None) is not None:
             yield f"{key}.metal: only a mirror (lens.back.reflect, lens.front.reflect) has a metal; remove it"
         if effect.kind == "absorption" and effect.coefficient is None and lens.material is None:
-            yield f"{key}.coefficient: missing, and lens.material too; add one of them, the coefficient in 1/mm"
+            yield f"{key}.coefficient: missing, and so is lens.material; add it in 1/mm, or set lens.material"
 
 
 def _name(effect: Effect) -> str:

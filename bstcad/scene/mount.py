@@ -285,7 +285,7 @@ def _wall_complaints(mount: Mount, lens: LensBlank, rim: Round | Box) -> Iterato
         gap = f"only {_inradius(rim) - own.radius:.3g} mm lie between the rim and the front, {own.words}"
         yield f"{key}: draft and bevel remove {taken:.3g} mm, and {gap}; make them smaller"
     if not taken < half:
-        yield f"{key}: draft and bevel remove {taken:.3g} mm of the {half:g} mm from rim to axis; make them smaller"
+        yield f"{key}: draft and bevel remove {taken:.3g} mm, and rim and axis are {half:g} mm apart; make them smaller"
 
 
 def _inradius(shape: Round | Box) -> float:
@@ -324,8 +324,8 @@ def _flange_complaints(flange: Flange, lens: LensBlank, rim: Round | Box) -> Ite
         extents = f"the flange is from z = {flange.z:g} to {upper:g} mm, the wall from {high:.6g} to {lens.back.z:g} mm"
         yield f"{key}.z: {extents}, and they do not overlap; move the flange to the wall"
     if low <= flange.z <= high and not lens.front.surface.around.level and not lens.front.free:
-        cuts = f"z = {flange.z:g} mm cuts the rim of the front, between z = {low:.6g} and {high:.6g} mm"
-        yield f"{key}.z: {cuts}; move the flange below or above the rim"
+        cuts = f"z = {flange.z:g} mm, cuts the rim of the front, between z = {low:.6g} and {high:.6g} mm"
+        yield f"{key}.z: the lower face, {cuts}; move the flange below or above the rim"
     holes = flange.all_holes()
     for k, (x, y, diameter) in enumerate(holes, start=1):
         hole = f"{key}: hole {k}, of {diameter:g} mm at ({x:.4g}, {y:.4g}) mm,"

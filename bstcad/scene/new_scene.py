@@ -99,10 +99,7 @@ class Plate:
         return self.magnified * self.side / self.light.pixels
 
     def source_image(self, distance: float) -> float:
-        """Return the size (mm) of the source's image on a wall at this distance L (mm).
-
-        It is 2 L tan(δ / 2) for light of divergence δ, and d L / l for a source of size d at l before the plate.
-        """
+        """Return the size (mm) of the source's image at a distance L (mm): 2 L tan(δ / 2), or d L / l from l before."""
         if self.before:
             return self.light.size * distance / self.before
         return 2 * distance * math.tan(math.radians(self.light.size / 2))

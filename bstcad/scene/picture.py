@@ -253,11 +253,7 @@ class Photo:
         return self.curve(self.numbers(box)[1])
 
     def numbers(self, box: Box) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return (numbers, opacity) of a part.
-
-        numbers: (h, w, channels), integers of their type's range or floats from 0 to 1.  opacity: (h, w) from 0 to 1,
-        or None if the picture has no transparency.
-        """
+        """Return numbers (h, w, channels), integers or floats from 0 to 1, and opacity (h, w) from 0 to 1 or None."""
         image, low, alpha = self.image.crop(box), self.low and self.low.crop(box), None
         if image.mode.startswith(("I", "F")):
             return self._one_channel(image)

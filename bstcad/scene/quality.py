@@ -35,9 +35,7 @@ VERIFICATION_DRAW = 1 << 12  # number of the draw of these points; each further 
 class Tailoring(Record):
     """The effort of tailoring; a setting that is None has the value of its quality (PRESETS)."""
 
-    quality: Annotated[
-        Literal["draft", "standard", "fine", "paper"], Key("Effort: with more time the error is smaller.")
-    ] = "standard"
+    quality: Annotated[Literal["draft", "standard", "fine", "paper"], Key("More time, smaller error.")] = "standard"
     seed: Annotated[int, Key("Seed of all random numbers.", "", 0, 2**63 - 1)] = 0
     method: Annotated[
         Literal["least-squares", "adam", "integration"] | None,
@@ -72,10 +70,7 @@ class Tailoring(Record):
     ] = None
     solution: Annotated[
         Literal["convex", "concave"] | None,
-        Key(
-            "Rays between two pictures: convex, they do not cross; concave, all cross; bstcad chooses if absent.",
-            example="concave",
-        ),
+        Key("Two pictures: convex, no rays cross; concave, all cross; chosen if absent.", example="concave"),
     ] = None
     precision: Annotated[
         Literal["float32", "float64"] | None, Key("Precision of the numbers in tailoring.", example="float64")
@@ -168,16 +163,12 @@ class Tolerance(Record):
 
     name: Annotated[Name | None, Key("The error; lens.decentre is its x and y; all errors if absent.")] = None
     grade: Annotated[
-        Literal["moulded", "diamond-turned", "precise", "none"] | None,
-        Key("Grade that gives the limit; none: the error is zero."),
+        Literal["moulded", "diamond-turned", "precise", "none"] | None, Key("Grade of the limit; none: no error.")
     ] = None
     limit: Annotated[
         float | None,
-        Key(
-            "Limit (+-) in the unit of the error; the maximum RMS of ripple, the RMS over all lenses of form.", "",
-            1e-12, 1e4,
-        ),
-    ] = None  # fmt: skip
+        Key("Limit (+-) in the error's unit; maximum RMS of ripple, RMS over all lenses of form.", "", 1e-12, 1e4),
+    ] = None
     distribution: Annotated[
         Literal["normal", "uniform"] | None, Key("Distribution; normal is cut at the limit, two standard deviations.")
     ] = None
@@ -221,6 +212,6 @@ def tolerance_complaints(tables: Sequence[Tolerance]) -> Iterator[str]:
             yield f'{where}.limit: {table.limit:g} needs the name of an error; add for example name = "lens.decentre"'
         for key, names in OF_FACES.items():
             if key in stated and table.name not in names:
-                yield f"{where}.{key}: only {' and '.join(names)} have this key; remove it, or change the name"
+                yield f"{where}.{key}: this key is for {' and '.join(names)} only; remove it, or change the name"
         if "distribution" in stated and table.name in FORM:
             yield f"{where}.distribution: a form error is always normally distributed; remove it"

@@ -63,14 +63,10 @@ class Accept(Record):
     form: Annotated[float, Key("Maximum distance of lens.step from the tailored surface.", "mm", 1e-12, 1.0)] = 1e-6
     efficiency: Annotated[
         float | None,
-        Key(
-            "Minimum fraction of the flux leaving the back that reaches the target.", "", 0.0, 1.0, example=0.9,
-            of_light=True,
-        ),
-    ] = None  # fmt: skip
+        Key("Minimum fraction of the flux from the back on the target.", "", 0.0, 1.0, example=0.9, of_light=True),
+    ] = None
     light_on_target: Annotated[
-        float | None,
-        Key("Minimum fraction of the flux in the lens that reaches the target.", "", 0.0, 1.0, of_light=True),
+        float | None, Key("Minimum fraction of the flux in the lens on the target.", "", 0.0, 1.0, of_light=True)
     ] = None
     leak: Annotated[
         float | None, Key("Maximum fraction of the flux on dark parts of the target.", "", 0.0, 1.0, of_light=True)
@@ -123,7 +119,7 @@ class Scene(Record):
     ] = ()
     output: Annotated[Output, Key("Accuracy of the meshes, and files for the shop.")] = Output()
     part: Annotated[Part, Key("The title block that lens.step states.")] = Part()
-    mount: Annotated[Mount | None, Key("How the lens is held; with it there is part.step.")] = None
+    mount: Annotated[Mount | None, Key("How the lens is mounted; with it bstcad writes part.step.")] = None
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
@@ -280,10 +276,7 @@ class Scene(Record):
         return before, elements.interfaces(self.behind, 1, wavelength)
 
     def clearance(self, highest: float) -> tuple[float, str]:
-        """Return (gap, key): the gap (mm) between a lens up to z = highest (mm) and the next part, and that part's key.
-
-        The gap is negative if the part cuts the lens.
-        """
+        """Return (gap, key) of the next part behind a lens up to z = highest; gap in mm, negative if they cross."""
         room = [(elements.lowest(self.behind) - highest, "behind[0].z")] if self.behind else []
         if not self.light_path.is_folded:
             for target, key in zip(self.targets, self.target_keys, strict=True):
@@ -446,10 +439,7 @@ def _method_complaints(scene: Scene) -> Iterator[str]:
 
 
 def _doubts_of_goals(scene: Scene) -> Iterator[str]:
-    """Doubt a number of goals other than the number of tailored faces.
-
-    With fewer goals a front is idle; with more none is met exactly.
-    """
+    """Doubt fewer goals than tailored faces, as a face is idle, and more goals, as none is met exactly."""
     lens, wave, different = scene.lens, scene.wavefront, []
     for target in scene.targets:  # light parallel to the axis makes one picture on every plane, which is one goal
         alike = target.model_copy(update={"z": 0.0, "weight": 1.0})

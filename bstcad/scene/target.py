@@ -63,9 +63,7 @@ class Target(Record):
     x: Annotated[tuple[float, float], Key("Ends of the target along x.", "mm", *COORDINATES, example=[-200.0, 200.0])]
     y: Annotated[tuple[float, float], Key("Ends of the target along y.", "mm", *COORDINATES, example=[-200.0, 200.0])]
     tilt: Annotated[Tilt, Key("Tilt about x, then about y.", "degrees", -89.0, 89.0, remedy=AIM)] = None
-    pixels: Annotated[
-        OneOrTwo, Key("Pixels along the longer side, or [columns, rows].", "", MIN_PIXELS, 4096, example=512)
-    ]
+    pixels: Annotated[OneOrTwo, Key("Pixels of the longer side or [columns, rows].", "", MIN_PIXELS, 4096, example=512)]
     text: Annotated[
         str | None, Key("The picture is this text, centred, over 84 % of the width or 80 % of the height.")
     ] = None
@@ -96,8 +94,7 @@ class Target(Record):
     ] = None  # fmt: skip
     outline: Annotated[Outlined | None, Key("Outline of the light, centred; it is dark outside.")] = None
     unreachable: Annotated[
-        Literal["dark", "refuse"],
-        Key("Parts that light cannot reach stay dark, or the scene is refused.", example="refuse"),
+        Literal["dark", "refuse"], Key("Unreachable parts stay dark, or the scene is refused.", example="refuse")
     ] = "dark"
     weight: Annotated[float, Key("Weight of the target's squared error.", "", 1e-6, 1e6, example=2.0)] = 1.0
 
@@ -354,13 +351,12 @@ Targets = Annotated[  # one table of a file, or a list of them
 # ---- the drawn picture -----------------------------------------------------------------------------------------------
 
 
-# Values of the keys that do not change the drawing, so that targets with other values share its cache.
 IRRELEVANT = {"z": 0.0, "tilt": None, "weight": 1.0, "outline": None, "seen_from": "lens", "unreachable": "dark"}
 
 
 def drawing(target: Target) -> Drawing:
     """Return the irradiance of a target's picture per pixel, before its outline, and remarks on it."""
-    return _drawing(target.model_copy(update=IRRELEVANT))
+    return _drawing(target.model_copy(update=IRRELEVANT))  # these keys do not change the drawing
 
 
 @functools.lru_cache(maxsize=4)  # a photograph takes half a second, and is needed for the check and for the design
@@ -479,8 +475,7 @@ def average(
 ) -> np.ndarray:
     """Return the means (rows, columns) of a picture over the pixels of a window; outside the picture it is dark.
 
-    light: function that returns the values of a box.  size: width and height of the picture.  The means are exact for
-    any ratio of the sizes.  The picture is read in strips to save memory.
+    light: function that returns the values of a box.  The means are exact, and the picture is read in strips.
     """
     left, top = (max(int(start), 0) for start in window[:2])
     right, bottom = (min(math.ceil(stop), side) for stop, side in zip(window[2:], size, strict=True))
