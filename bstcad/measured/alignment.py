@@ -345,7 +345,6 @@ def find_axis_exchange(face: Face, cloud: np.ndarray, original: float) -> tuple[
 
 
 def _axis_exchanges() -> Iterator[tuple[np.ndarray, str]]:
-    """Yield the 47 exchanges and reversals of axes, each with its description."""
     for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
         matrix = np.diag(signs)[:, np.argsort(order)].astype(float)
         changed = [k for k in range(3) if order[k] != k or signs[k] < 0]

@@ -186,7 +186,6 @@ def _variances(energy: np.ndarray, modes: np.ndarray, noise: np.ndarray) -> np.n
 
 
 def _heights(amplitude: np.ndarray) -> np.ndarray:
-    """Return heights (m²,) from cosine amplitudes (m, m)."""
     return scipy.fft.idctn(amplitude, norm="ortho").ravel()
 
 
@@ -316,7 +315,6 @@ def _octaves(form: FormError, x: np.ndarray, y: np.ndarray, total: np.ndarray) -
 
 
 def _band(period: tuple[float, float] | None, part: np.ndarray) -> Band:
-    """Return the figures of heights (mm) and slopes (rad), (3, n)."""
     return Band(period, root_mean_square(part[0]), float(np.sqrt(np.mean(part[1] ** 2 + part[2] ** 2))))
 
 
@@ -373,7 +371,6 @@ def minimum_zone(face: Face, alignment: Alignment) -> tuple[float, Pose]:
 
 
 def _farthest(distances: np.ndarray) -> np.ndarray:
-    """Return the indices of the farthest points on each side."""
     count = min(ZONE_CHUNK // 2, len(distances))
     return np.union1d(np.argpartition(distances, -count)[-count:], np.argpartition(distances, count - 1)[:count])
 

@@ -226,6 +226,5 @@ def _facts(face: Face, alignment: Alignment, error: Deviation, cloud: Cloud) -> 
 
 
 def _pose_entries(pose: Pose) -> dict[str, float]:
-    """Return the pose of the part in its cloud as entries of report.json."""
     keys = ("dx", "dy", "dz", "rotation_x", "rotation_y", "rotation_z")
     return dict(zip(keys, map(float, (*pose.shift, *pose.angles)), strict=True))

@@ -46,8 +46,6 @@ class _Damaged(Exception):
 
 @dataclass(frozen=True)
 class _Element:
-    """A table of a PLY file."""
-
     name: str
     count: int  # number of rows that the header declares
     properties: tuple[tuple[str, str, str], ...]  # (name, type, type of a list's length or "")
@@ -106,14 +104,12 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
 
 
 def _add_property(element: _Element, name: str, kind: str, length: str) -> _Element:
-    """Return the element with one more property."""
     if name in {known for known, _, _ in element.properties}:
         raise _Damaged(f"property {name[:40]!r} twice")
     return _Element(element.name, element.count, (*element.properties, (name, kind, length)))
 
 
 def _ascii_vertices(body: bytes, elements: list[_Element]) -> np.ndarray:
-    """Return the vertices of an ASCII file, which has one row per line."""
     lines = [line for line in body.decode("latin-1").splitlines() if line.strip()]
     at, vertices = 0, np.empty((0, 3))
     for element in elements:
@@ -130,7 +126,6 @@ def _ascii_vertices(body: bytes, elements: list[_Element]) -> np.ndarray:
 
 
 def _parse_rows(lines: list[str], columns: list[int]) -> np.ndarray:
-    """Return the numbers (n, 3) in three columns of lines."""
     numbers = np.empty((len(lines), 3))
     for row, line in enumerate(lines):
         fields = line.split()
@@ -142,7 +137,6 @@ def _parse_rows(lines: list[str], columns: list[int]) -> np.ndarray:
 
 
 def _binary_vertices(data: bytes, elements: list[_Element], at: int, order: str) -> np.ndarray:
-    """Return the vertices of a binary file."""
     vertices = np.empty((0, 3))
     for element in elements:
         if element.has_lists:

@@ -153,8 +153,6 @@ def decode_text(data: bytes) -> str:
 
 @dataclass(frozen=True)
 class _Layout:
-    """Format of the numbers of a line."""
-
     separator: str | None  # separator of fields; None: blanks
     decimal_comma: bool
 
@@ -195,7 +193,6 @@ class _Layout:
 
 
 def _number(field: str) -> float | None:
-    """Return the number in a field; None if the field is no number."""
     try:
         return float(field)
     except ValueError:
@@ -203,7 +200,6 @@ def _number(field: str) -> float | None:
 
 
 def _table(lines: list[tuple[int, str]], layout: _Layout, columns: Sequence[int]) -> np.ndarray:
-    """Return the numbers (n, 3) of three columns."""
     body = layout.normalise("\n".join(line for _, line in lines))
     options = {"delimiter": layout.separator, "comments": None, "ndmin": 2, "quotechar": '"'}
     try:
@@ -223,8 +219,6 @@ def _table(lines: list[tuple[int, str]], layout: _Layout, columns: Sequence[int]
 
 @dataclass(frozen=True)
 class _Heading:
-    """The heading of a table."""
-
     lines: int = 0  # number of lines up to its last one; 0: there is no heading
     columns: tuple[int, ...] = (0, 1, 2)  # indices of x, y and z in a line
     units: np.ndarray | float = 1.0  # units in mm, one for all columns or one for each
@@ -233,7 +227,6 @@ class _Heading:
 
 
 def _heading(lines: list[str]) -> _Heading:
-    """Find the heading among the first lines."""
     for row, line in enumerate(lines):
         fields = _Layout.of(line).fields(line)
         if len(fields) > 1 and all(_number(field) is not None for field in fields):
@@ -264,7 +257,6 @@ def _heading(lines: list[str]) -> _Heading:
 
 
 def _words(line: str) -> list[str]:
-    """Return the names of the columns in a heading."""
     mark = next((mark for mark in (";", "\t", ",") if mark in line), None)
     if '"' in line and mark is not None:
         return next(csv.reader([line], delimiter=mark, skipinitialspace=True))

@@ -174,7 +174,6 @@ def batch(
 
 
 def _initial_entries(scenes: Sequence[BatchScene], folder: Path, earlier: Sequence[BatchEntry]) -> Iterator[BatchEntry]:
-    """Yield the entry of each design before the work."""
     finished = {row.key: row for row in earlier if row.finished and _hash_of_design(folder / row.name) == row.design}
     path_of: dict[str, str] = {}  # path of a scene file by the name of its scene
     for each in scenes:
@@ -226,7 +225,6 @@ def _design_all(
 
 
 def _finished_entry(row: BatchEntry, answer: Answer, folder: Path, local: bool) -> BatchEntry:
-    """Return the entry of a design that has ended."""
     row = row.changed(where=answer.where)
     if answer.reason:
         return row.changed(status=BROKEN, reason=answer.reason)

@@ -122,7 +122,6 @@ def choose_net(scene: Scene) -> Choice:
 
 
 def _choose_for_target(scene: Scene) -> Choice:
-    """Choose a net for a scene with one target."""
     scenes = [scene.changed({NET_KEY: net}) for net in candidate_nets(scene)]
     lens = coarse_lens(scenes[0])
     light, image = area_cells(scenes[0], lens), blur_rrmsd(scenes[0], lens)
@@ -157,7 +156,6 @@ def rrmsd_ratio(scene: Scene, finer: Scene, lenses: Sequence[Lens]) -> float:
 
 
 def _is_worthwhile(coarse: Candidate, fine: Candidate) -> bool:
-    """Return True if the gain by a finer net justifies its time."""
     less, longer = coarse.rrmsd / fine.rrmsd, fine.seconds / coarse.seconds
     return not any(less <= gain and longer >= time for gain, time in MIN_GAINS)
 

@@ -258,7 +258,6 @@ def _draw_knob(axes: Axes, knob: TableKnob) -> None:
 
 
 def _draw_presets(axes: Axes, table: TradeoffTable) -> None:
-    """Draw the presets, large and with their names."""
     line = sorted((preset.seconds, preset.rrmsd) for preset in table.presets if preset.name != "paper")
     if len(line) > 1:
         axes.plot(*zip(*line, strict=True), color="#111111", lw=0.9, ls=(0, (1, 2)), zorder=4, label="bstcad's presets")

@@ -113,7 +113,6 @@ def _allows_paper(scene: Scene) -> bool:
 
 
 def _is_allowed(scene: Scene, changes: Mapping[str, Any]) -> bool:
-    """Return True if the scene allows these changes."""
     try:
         scene.changed(changes)
     except SceneError:
@@ -130,7 +129,6 @@ def _numbers(key: str, own: int, values: Iterable[int], limits: tuple[int, int] 
 
 
 def _is_candidate(net: Sides) -> bool:
-    """Return True if the net is within POINT_LIMITS."""
     return POINT_LIMITS[0] <= max(as_pair(net)) <= POINT_LIMITS[1]
 
 
@@ -291,8 +289,6 @@ def check_free(folder: Path, contents: Mapping[str, bytes]) -> None:
 
 
 class _Sweep:
-    """A running sweep."""
-
     def __init__(self, base: Scene, budget: float, folder: Path, progress: ProgressFunction) -> None:
         self._base, self._budget, self._folder, self._progress = base, budget, folder, progress
         self._knobs = knobs(base)

@@ -119,7 +119,6 @@ def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None
 
 
 def _names_error(table: Sequence[Tolerance], error: str) -> bool:
-    """Return True if a table names the error."""
     return any(entry.name and entry.covers(error) for entry in table)
 
 

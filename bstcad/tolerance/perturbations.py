@@ -195,7 +195,6 @@ def kinds(setup: Setup, material: str | None = None) -> dict[str, Kind]:
 
 
 def _motions(setup: Setup) -> Iterator[Kind]:
-    """Yield the shifts along, and rotations about, x, y and z of lens, source and screen."""
     sources, without_effect = [channel.source for channel in setup.channels], {"source.clocking"}
     if all(source.is_shift_invariant for source in sources):
         without_effect.add("source.axial")  # parallel light is the same along the axis
@@ -215,7 +214,6 @@ def _move_part(part: str, axis: int, turns: bool, setup: Setup, by: float) -> Se
 
 
 def _shapes(setup: Setup, material: str | None) -> Iterator[Kind]:
-    """Yield the errors of the lens's shape, glass and temperature, and of the wavelength."""
     optic, refracts = setup.lens.passes.optic, setup.lens.passes.enters
     if refracts:
         yield Kind("lens.thickness", f"thickness of the {optic}", "mm", _change_thickness)
@@ -268,7 +266,6 @@ def _change_wavelength(material: str, setup: Setup, by: float) -> Setup:
 
 
 def _lights(setup: Setup) -> Iterator[Kind]:
-    """Yield the errors of cone angle and size of point sources."""
     sources = [channel.source for channel in setup.channels]
     if any(source.with_wider_cone(0.0) for source in sources):
         yield Kind("source.angle", "width of the source's cone, relative", "", _change_cone)

@@ -152,12 +152,10 @@ class TracedFigure(Protocol):
 
 
 def _figure(goal: TracedFigure, amounts: Sequence[float]) -> float:
-    """Return the figure of merit by a full trace."""
     return _norm(goal.vector(amounts))
 
 
 def _norm(vector: np.ndarray) -> float:
-    """Return sqrt(Σ v²)."""
     vector = torch.from_numpy(vector)
     return math.sqrt(dot(vector, vector))
 

@@ -111,7 +111,6 @@ def _pictures(scene: Scene, nominal: Nominal, grade: str | None, tubes: int) -> 
 
 
 def _rrmsd(nominal: Nominal, pictures: TargetPictures) -> float:
-    """Return the RRMSD of the design on the screen of these pictures, by rays."""
     return measure(
         nominal.lens, nominal.channels, pictures.setup.screen, pictures.target,
         effort=nominal.effort(Effort(witness=False)), draw=nominal.scene.draw,
