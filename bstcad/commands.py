@@ -56,7 +56,7 @@ from bstcad.scene.scene import Scene
 from bstcad.step_text import beginning
 from bstcad.sweep.estimates import diagnosis, left_out
 from bstcad.sweep.net_choice import with_net
-from bstcad.tailoring.run import Look, Progress, silent, unseen
+from bstcad.tailoring.run import LensCallback, Progress, ignore_lens, no_progress
 from bstcad.verify import checks
 from bstcad.verify.checks import Proof
 from bstcad.verify.verdict import Check, verdict
@@ -74,15 +74,16 @@ OwnSection = Callable[[Contents], tuple[str, str]]
 
 
 def generate(
-    scene: Scene, folder: Path, *, device: str = "auto", progress: Progress = silent, began: float | None = None,
-    resume: bool = False, effort: Effort | None = None, drawing: Drawing | None = None, look: Look = unseen,
+    scene: Scene, folder: Path, *, device: str = "auto", progress: Progress = no_progress, began: float | None = None,
+    resume: bool = False, effort: Effort | None = None, drawing: Drawing | None = None,
+    on_lens: LensCallback = ignore_lens,
 ) -> Report:  # fmt: skip
     """Design a lens, write it to `folder` and prove it from the written files.
 
     began: start of the times in the report and of tailoring.max_time (time.perf_counter(); default: now).
     During the design a checkpoint is written beside the folder at intervals; with `resume` the design continues from
     it.  After a Ctrl-C the best lens so far is written, never over an earlier finished design: see `output_folder`.
-    effort: effort of the proof; None: no limit.  drawing: figures of the report; None: Pictures.  look: called at
+    effort: effort of the proof; None: no limit.  drawing: figures of the report; None: Pictures.  on_lens: called at
     intervals with the function that makes the best lens so far.
     """
     scene = with_default_net(scene, lambda line: progress("control points", 1, 1, line))
@@ -100,7 +101,7 @@ def generate(
         with _checkpoint_on_error(keeper, refused=(SceneError,)), signals.stop_on_interrupt() as wished:
             found = design(
                 scene, device=device, progress=progress, began=began, save=keeper, start=state, interrupted=wished,
-                look=look,
+                on_lens=on_lens,
             )  # fmt: skip
         with _checkpoint_on_error(keeper):
             report = write(
@@ -133,8 +134,9 @@ def output_folder(folder: Path, stopped: str) -> Path:
 
 
 def write(
-    made: Made, folder: Path, *, progress: Progress = silent, effort: Effort | None = None, limit: float | None = None,
-    drawing: Drawing | None = None, own_checks: Sequence[OwnCheck] = (), own_sections: Sequence[OwnSection] = (),
+    made: Made, folder: Path, *, progress: Progress = no_progress, effort: Effort | None = None,
+    limit: float | None = None, drawing: Drawing | None = None, own_checks: Sequence[OwnCheck] = (),
+    own_sections: Sequence[OwnSection] = (),
 ) -> Report:  # fmt: skip
     """Write a design to `folder`, replacing an earlier one, and prove it from the written files.
 
@@ -168,7 +170,7 @@ def write(
 
 
 def prove(
-    made: Made, *, progress: Progress = silent, effort: Effort | None = None, own_checks: Sequence[OwnCheck] = ()
+    made: Made, *, progress: Progress = no_progress, effort: Effort | None = None, own_checks: Sequence[OwnCheck] = ()
 ) -> Report:
     """Prove a design from temporary files."""
     processes.begin()
@@ -269,7 +271,7 @@ def scene_errors(where: str = "") -> Iterator[None]:
 
 
 def verify(
-    path: Path, *, against: Sequence[Any] = (), measured: Path | None = None, progress: Progress = silent,
+    path: Path, *, against: Sequence[Any] = (), measured: Path | None = None, progress: Progress = no_progress,
     effort: Effort | None = None, place: Path | None = None, drawing: Drawing | None = None,
     own_checks: Sequence[OwnCheck] = (), own_sections: Sequence[OwnSection] = (),
 ) -> Report | Examined:  # fmt: skip
@@ -450,7 +452,7 @@ def _write_report(
 
 def tolerance(
     folder: Path, *, grade: str | None = None, wanted: float | None = None, seed: int = 0, workers: int | None = None,
-    scheduler: str | None = None, progress: Progress = silent,
+    scheduler: str | None = None, progress: Progress = no_progress,
 ) -> Tolerances:  # fmt: skip
     """Study how accurately a lens must be made, mounted and lit; write tolerance.json and return its record.
 

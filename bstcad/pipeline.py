@@ -34,21 +34,21 @@ from bstcad.tailoring.grazing import without_reflection
 from bstcad.tailoring.machinability import BOUNDS_STAGE, active_bounds, enforce_bounds, place_back
 from bstcad.tailoring.reachable import reachable
 from bstcad.tailoring.run import (
-    BEST,
-    JUDGING,
+    BEST_LENS_STAGE,
+    RRMSD_SECONDS,
+    DesignRecord,
     Driver,
     Edge,
-    Judged,
-    Look,
+    LensCallback,
     Parameters,
     Progress,
-    Record,
-    Step,
+    RatedLens,
+    StageStep,
     Task,
-    forget,
-    never,
-    silent,
-    unseen,
+    discard_state,
+    ignore_lens,
+    no_progress,
+    not_interrupted,
 )
 from bstcad.tailoring.source_image import Spread
 from bstcad.tailoring.stage2 import Comparison, compare_precisions
@@ -90,20 +90,21 @@ class Stage1Result:
 class DesignState:
     """The state of a design from which it can be continued; a checkpoint holds it by the names of its fields."""
 
-    record: Record
+    record: DesignRecord
     first: Stage1State | None = None  # state of stage 1; None: it has ended
     followed: Stage1Result | None = None  # result of stage 1; None: it has not ended
     second: Stage2State | None = None  # state of stage 2 or 3; None: it has not begun, or it has ended
-    best: Judged | None = None  # best lens at the ends of the parts of stage 2 or 3 so far
+    best: RatedLens | None = None  # best lens at the ends of the parts of stage 2 or 3 so far
     lens: Parameters | None = None  # lens after stage 2 or 3
     stopped: str = ""  # reason why tailoring ended
 
 
 def design(
-    scene: Scene, *, device: str = "auto", progress: Progress = silent, began: float | None = None,
-    save: Callable[[DesignState], None] = forget, start: DesignState | None = None,
-    interrupted: Callable[[], bool] = never, merit: Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None = None,
-    later: bool = False, look: Look = unseen, hasty: bool = False,
+    scene: Scene, *, device: str = "auto", progress: Progress = no_progress, began: float | None = None,
+    save: Callable[[DesignState], None] = discard_state, start: DesignState | None = None,
+    interrupted: Callable[[], bool] = not_interrupted,
+    merit: Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None = None, later: bool = False,
+    on_lens: LensCallback = ignore_lens, preview: bool = False,
 ) -> Made:  # fmt: skip
     """Design the lens of a scene: transport map, stage 1, and stage 2, or stage 3 for an extended source.
 
@@ -111,8 +112,8 @@ def design(
     save: function called at intervals with the state.  start: such a state; the design continues and ends the same.
     interrupted: function; once it returns True, tailoring ends with the best lens so far, or with KeyboardInterrupt if
     there is no lens yet.  merit: function of a picture and the target that stages 2 and 3 minimise; None: RRMSD².
-    look: function called at intervals with a function that returns the best lens so far.
-    hasty: True for a preview, see `Task.hasty`; the scene itself states its size.
+    on_lens: function called at intervals with a function that returns the best lens so far.
+    preview: True for a preview, see `Task.preview`; the scene itself states its size.
     later: float32 is compared with float64 only when a report asks for it (`Made.with_report_data`).
     """
     began = time.perf_counter() if began is None else began
@@ -123,11 +124,12 @@ def design(
     goals, edge = within_reach(scene, progress)
     knobs = scene.tailoring.resolved(scene.lens.back.net)
     later = later and knobs.max_time is None
-    task = task_of(scene, goals, knobs, edge, progress=progress, tidy=processes.return_freed, merit=merit, hasty=hasty)
+    more = {"progress": progress, "tidy": processes.return_freed, "merit": merit, "preview": preview}
+    task = task_of(scene, goals, knobs, edge, **more)
     task = with_solution(scene, task)
-    limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve(scene) + JUDGING}
-    record = Record() if start is None else start.record
-    driver = Driver(progress, began, **limits, interrupted=interrupted, save=save, look=look, record=record)
+    limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve(scene) + RRMSD_SECONDS}
+    record = DesignRecord() if start is None else start.record
+    driver = Driver(progress, began, **limits, interrupted=interrupted, save=save, on_lens=on_lens, record=record)
     precision = getattr(torch, knobs.precision)
     lens = scene.flat_lens(knobs.levels[0], dtype=precision, device=device, as_wide_as=knobs.levels[-1])
     if not scene.lens.back.optimise:  # no stage refines it
@@ -139,10 +141,10 @@ def design(
         if start and start.followed
         else _stage1(scene, task, driver, lens, state=start and start.first, compare=not later)
     )
-    after_stage1, stages = followed.lens.applied(lens), len(driver.record.stages)
+    after_stage1, stages = followed.lens.apply_to(lens), len(driver.record.stages)
     lens = scene.as_mounted(after_stage1)  # the clear apertures differ from those of a flat back
     if start and start.lens:
-        lens, stopped = start.lens.applied(lens), start.stopped
+        lens, stopped = start.lens.apply_to(lens), start.stopped
     else:
         lens, stopped = _stage2(task, driver, lens, followed, state=start and start.second, best=start and start.best)
     lens = replace(lens.plain(), index=scene.index, losses=None)
@@ -177,8 +179,8 @@ def task_of(scene: Scene, goals: Sequence[Goal], knobs: Tailoring, edge: Edge | 
     sizes = stage2.SOURCE_SIZES if scene.source.extent and knobs.method != "integration" else ()
     scaled = [scene.with_source_scaled(share) for share, _ in sizes]
     return Task(
-        light, tuple(goals), knobs, least=scene.lens.min_thickness, free=scene.lens.front.free,
-        rim_sags=scene.rim_sags, grown=tuple(each.channels() for each in scaled), bounds=scene.lens.bounds,
+        light, tuple(goals), knobs, min_thickness=scene.lens.min_thickness, free=scene.lens.front.free,
+        rim_sags=scene.rim_sags, sampled_sources=tuple(each.channels() for each in scaled), bounds=scene.lens.bounds,
         spreads=tuple(Spread(each.source, light, each.draw) for each in scaled), edge=edge, wave=scene.wavefront,
         solution=SIGNS.get(knobs.solution), front_sides=scene.lens.front_net, **more,
     )  # fmt: skip
@@ -201,10 +203,10 @@ def with_solution(scene: Scene, task: Task) -> Task:
     return replace(task, solution=demand.solution, floor=demand.floor)
 
 
-def second_stage(task: Task, lens: Lens, state: Stage2State | None = None) -> tuple[str, Iterator[Step]]:
+def second_stage(task: Task, lens: Lens, state: Stage2State | None = None) -> tuple[str, Iterator[StageStep]]:
     """Return name and steps of the stage after stage 1: stage 2, or 2 and 3 for an extended source."""
     *_, stage = PROCEDURES[task.knobs.method]
-    if not task.grown:
+    if not task.sampled_sources:
         return "stage 2", stage(task, lens, state)
     before = stage if task.knobs.method == "adam" else None  # the paper's procedure is for point sources
     return "stage 3", stage2.with_stage3(before, task, lens, state)
@@ -285,7 +287,7 @@ def steepness(source: Emitter, lens: Lens, goal: Goal, sent: TransportMap) -> St
     return needed_steepness(source, lens, screen, goal.picture, x=sent.x, y=sent.y, places=sent.source, at_back=at_back)
 
 
-def _design_course(result: Stage1Result, record: Record, stopped: str, steep: Steepness) -> DesignCourse:
+def _design_course(result: Stage1Result, record: DesignRecord, stopped: str, steep: Steepness) -> DesignCourse:
     """Return the record of a tailoring for the report."""
     solved = result.mapping.transport
     return DesignCourse(
@@ -310,59 +312,59 @@ def _stage1(
     scene: Scene, task: Task, driver: Driver, lens: Lens, state: Stage1State | None, compare: bool
 ) -> Stage1Result:  # fmt: skip
     """Run stage 1 from the blank or from a state, and compare precisions after it if `compare` is True."""
-    if driver.wish and state is None:
+    if driver.reason_to_interrupt and state is None:
         raise KeyboardInterrupt  # there is no lens yet
     name, stage, _ = PROCEDURES[task.knobs.method]
     like = lens.like
     if scene.lens.front.is_tailored:  # stage 1 of two faces runs in numpy, on the CPU
         stage, lens = two_faces.steps, lens.to(like.dtype, "cpu")
     steps = stage(task, lens, state)
-    last = driver.run(steps, task, lambda state: DesignState(driver.record, state), lambda: driver.wish)
+    last = driver.run(steps, task, lambda state: DesignState(driver.record, state), lambda: driver.reason_to_interrupt)
     lens = replace(last.lens, behind=lens.behind, shaped=lens.shaped).to(like.dtype, like.device)
     check_front(lens, scene)
-    bounds = active_bounds(lens, task.bounds, task.least)
+    bounds = active_bounds(lens, task.bounds, task.min_thickness)
     if bounds is None:
         check_thickness(lens, scene)
-    rrmsd = require_light(lens, task.rrmsd(lens) if last.judged is None else last.judged)
+    rrmsd = require_light(lens, task.rrmsd(lens) if last.rays_rrmsd is None else last.rays_rrmsd)
     driver.end(name, rrmsd)
     if bounds is not None:
         driver.progress(BOUNDS_STAGE, 0, 1, "")
         if lens.shapes("front"):  # stage 2 allows for a shift of the back, but does not shift it
-            lens = place_back(lens, lens.back.z, task.least, bounds)
+            lens = place_back(lens, lens.back.z, task.min_thickness, bounds)
         lens = enforce_bounds(lens, bounds)
         check_thickness(lens, scene)
         rrmsd = require_bounded_light(scene, task.rrmsd(lens))
         driver.end(f"{BOUNDS_STAGE}, after stage 1", rrmsd)
     precision = None
-    if compare and not driver.hurry:
+    if compare and not driver.reason_to_end:
         precision = compare_precisions(task, lens)
         driver.end(COMPARISON_STAGE)
     screen = task.goals[0].receiver
     if last.places is None:
-        sent = slope_map.sent_from_entrance(last.mapping, lens, screen)
+        sent = slope_map.map_from_entrance(last.mapping, lens, screen)
     else:
-        sent = slope_map.sent_from(last.places, screen)
+        sent = slope_map.map_from_face(last.places, screen)
     return Stage1Result(Parameters.of(lens), last.mapping, sent, precision, rrmsd=rrmsd)
 
 
 def _stage2(
-    task: Task, driver: Driver, lens: Lens, followed: Stage1Result, state: Stage2State | None, best: Judged | None
+    task: Task, driver: Driver, lens: Lens, followed: Stage1Result, state: Stage2State | None, best: RatedLens | None
 ) -> tuple[Lens, str]:  # fmt: skip
     """Run stage 2, and 3 for an extended source, from the result of stage 1 or from a state.
 
     Return the lens and the reason why the stage ended.  The lens is no worse than that of stage 1 or of any part.
     """
-    if state is None and not driver.wish:  # with a wish the state is not that of a complete stage 1
+    if state is None and not driver.reason_to_interrupt:  # with a wish the state is not that of a complete stage 1
         driver.save(DesignState(driver.record, followed=followed))
     name, steps = second_stage(task, lens, state)
     whole = task.whole
-    known = not task.grown and lens.clear is None
-    first = None if task.hasty else whole.judged(lens, followed.rrmsd if known else whole.rrmsd(lens))
+    known = not task.sampled_sources and lens.clear is None
+    first = None if task.preview else whole.rated(lens, followed.rrmsd if known else whole.rrmsd(lens))
 
     def design_state(state: Stage2State) -> DesignState:
         return DesignState(driver.record, None, followed, state, best=driver.best)
 
-    last = driver.run(steps, whole, design_state, lambda: driver.hurry, best=best or first)
+    last = driver.run(steps, whole, design_state, lambda: driver.reason_to_end, best=best or first)
     lens = _final_lens(whole, driver, last, (driver.best, first))
     total = task.knobs.stage2_iterations
     driver.progress(name, total, total, driver.stopped)
@@ -371,29 +373,29 @@ def _stage2(
     return lens, driver.stopped
 
 
-def _final_lens(task: Task, driver: Driver, last: Step, before: Sequence[Judged]) -> Lens:
+def _final_lens(task: Task, driver: Driver, last: StageStep, before: Sequence[RatedLens]) -> Lens:
     """Return the corrected lens of the last step of a stage, or a corrected earlier lens if that is better.
 
     before: earlier lenses, the best first.  The paper's procedure always returns its last lens.
     """
     lens = last.lens
-    corrected, value = _corrected(task, lens), last.judged
-    if task.hasty:
+    corrected, value = _corrected(task, lens), last.rays_rrmsd
+    if task.preview:
         return corrected
-    if active_bounds(lens, task.bounds, task.least) is not None:
+    if active_bounds(lens, task.bounds, task.min_thickness) is not None:
         driver.end(BOUNDS_STAGE, value := task.rrmsd(corrected))
     elif value is not None and (_is_changed(lens, corrected) or not last.whole):
         value = task.rrmsd(corrected)
     if value is None or task.knobs.method == "adam":
         return corrected
-    latest = task.judged(corrected, value)
+    latest = task.rated(corrected, value)
     for known in before:
         if known.beats(latest):
-            lens = known.lens.applied(lens)
+            lens = known.lens.apply_to(lens)
             other = _corrected(task, lens)
             best, judged = task.better(corrected, other)
             if best is other:
-                driver.end(BEST, judged.rrmsd)
+                driver.end(BEST_LENS_STAGE, judged.rrmsd)
                 return other
     return corrected
 
@@ -402,9 +404,9 @@ def _corrected(task: Task, lens: Lens) -> Lens:
     """Return the lens without total reflection at the edge of its reach, with separate faces, within its bounds."""
     if task.edge is not None:
         lens = without_reflection(lens, task.edge)
-    bounds = active_bounds(lens, task.bounds, task.least)
+    bounds = active_bounds(lens, task.bounds, task.min_thickness)
     if not lens.shapes("front"):  # stage 2 may bend the back freely where no light falls
-        lens = place_back(lens, lens.back.z, task.least, bounds)
+        lens = place_back(lens, lens.back.z, task.min_thickness, bounds)
     return lens if bounds is None else enforce_bounds(lens, bounds)
 
 

@@ -13,7 +13,7 @@ import torch
 from bstcad.optics.measure import SourceImages
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
-from bstcad.tailoring.source_image import MAX_BYTES, NODES, VALUE_BYTES, widest
+from bstcad.tailoring.source_image import IMAGE_NODES, MAX_TRANSFORM_BYTES, VALUE_BYTES, widest
 
 LAMP = {"kind": "point", "position": [0.0, 0.0, 0.0], "profile": "lambertian", "half_angle": 40.0}
 SQUARE = {"shape": "rectangle", "width": 20.0, "height": 20.0}
@@ -96,4 +96,5 @@ def test_the_transforms_of_all_images_have_a_most(pixels, lines):
     screen = Scene.model_validate(SCENE | {"source": LAMP}).changed({"target.pixels": list(pixels)}).target.screen
     border = widest(screen, lines)
     assert 16 <= border <= max(screen.shape)
-    assert border == 16 or lines * NODES**2 * VALUE_BYTES * (max(screen.shape) + 4 * border) ** 2 <= MAX_BYTES
+    size = lines * IMAGE_NODES**2 * VALUE_BYTES * (max(screen.shape) + 4 * border) ** 2
+    assert border == 16 or size <= MAX_TRANSFORM_BYTES

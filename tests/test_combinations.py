@@ -307,10 +307,12 @@ COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which f
     "tailoring.stage1": {"COARSEST_GRID": 16},
     "tailoring.slope_map.lit_window": {"__defaults__": (32,)},
     "tailoring.stage2": {"COMPARED_EVALUATIONS": 3, "COMPARED_TUBES": 32},
-    "tailoring.source_image": {"ERROR_RAYS": 64, "ERROR_POINTS": 8, "IMAGE_GRID": 8, "NODES": 3, "IMAGE_PAIRS": 32},
+    "tailoring.source_image": {
+        "ERROR_RAYS": 64, "ERROR_POINTS": 8, "IMAGE_GRID": 8, "IMAGE_NODES": 3, "IMAGE_PAIRS": 32,
+    },
     "tailoring.machinability": {"THICKNESS_POINTS": 65, "RIM_POINTS": 129, "REPAIR_EVALUATIONS": 20},
     "tailoring.reachable": {
-        "FACE_CELLS": 17, "MAX_AIMS": 24, "COARSE_CELLS": 16, "COARSE_ITERATIONS": 10, "MAX_ROUNDS": 1,
+        "FACE_CELLS": 17, "MAX_AIMS": 24, "MAP_CELLS": 16, "MAP_ITERATIONS": 10, "MAX_ROUNDS": 1,
     },
     "tailoring.feasibility": {"TRIAL_CELLS": 24, "TRIAL_PIXELS": 32, "TRIAL_ITERATIONS": 20},
     "analysis.light": {"MOUNT_RAYS": 96, "MIN_MOUNT_RAYS": 16, "MARGIN_RAYS": 64, "NEEDED_RAYS": 65},

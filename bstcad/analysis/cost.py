@@ -23,12 +23,12 @@ from bstcad.optics.irradiance import Screen
 
 LAST_TENTH_RATIO = 1.1  # RRMSD over that at the end, below which it is "the last tenth of the error"
 FITTED_FRACTION = 0.5  # last fraction of the time of tailoring to the irradiance, to which the power law is fitted
-MIN_POINTS = 5  # smallest number of points for a fit
+MIN_FIT_POINTS = 5  # smallest number of points for a fit
 MIN_R_SQUARED = 0.9  # smallest R² of a line in logarithms that counts as a power law
 MAX_HALVING = 10.0  # largest factor of the time for half of the error that is reported
 
-Curve = Sequence[tuple[float, float]]  # (seconds since the start, RRMSD)
-Stages = Sequence[tuple[float, float | None]]  # one after the other: (seconds, RRMSD after it if judged)
+History = Sequence[tuple[float, float]]  # (seconds since the start, RRMSD)
+StageResults = Sequence[tuple[float, float | None]]  # one after the other: (seconds, RRMSD after it if judged)
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class ConvergenceEnd:
     halving: float | None  # factor 2^(1/p) of the time; None: no line fits, or it is more than MAX_HALVING
 
 
-def ending(history: Curve, stages: Stages, since: float = 0.0) -> ConvergenceEnd | None:
+def ending(history: History, stages: StageResults, since: float = 0.0) -> ConvergenceEnd | None:
     """Return the end of a design's history; None if no stage tailored the irradiance.
 
     stages: stages whose RRMSD by rays is in the history too, and is left out.
@@ -90,7 +90,7 @@ def _last_points(
 
 def _fit_power(time: np.ndarray, values: np.ndarray) -> tuple[float | None, float | None]:
     """Fit values ∝ time^-p by least squares of the logarithms; return (p, R²)."""
-    if len(time) < MIN_POINTS:
+    if len(time) < MIN_FIT_POINTS:
         return None, None
     x, y = np.log(time), np.log(values)
     x, y = x - x.mean(), y - y.mean()
@@ -133,7 +133,7 @@ def masks(target: np.ndarray) -> dict[str, np.ndarray]:
     dark, bright = np.quantile(target, (TONE_QUANTILE, 1 - TONE_QUANTILE))
     lit = target > dark  # False throughout a uniform target, which has no dark and no bright pixel
     conditions = {
-        "rim": np.logical_or.outer(*map(_outermost, target.shape)),
+        "rim": np.logical_or.outer(*map(_in_rim, target.shape)),
         "edges": steep >= max(np.quantile(steep, EDGE_QUANTILE), MIN_EDGE_GRADIENT * target.max()),
         "darkest": ~lit & lit.any(),
         "brightest": (target >= bright) & lit,
@@ -143,8 +143,7 @@ def masks(target: np.ndarray) -> dict[str, np.ndarray]:
     return {name: first == number for number, name in enumerate(conditions)}
 
 
-def _outermost(side: int) -> np.ndarray:
-    """Return True for the pixels along a side that belong to the rim."""
+def _in_rim(side: int) -> np.ndarray:
     along = np.arange(side)
     return np.minimum(along, side - 1 - along) < max(1, round(side / RIM_RATIO))
 

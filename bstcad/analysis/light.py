@@ -23,14 +23,7 @@ from bstcad.optics.measure import IMAGE_PLACES, detail_width, images, tubes_of, 
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays
 from bstcad.optics.receivers import Receiver
-from bstcad.optics.trace import (
-    across,
-    clear_window,
-    launch_strips,
-    to_first_net,
-    trace,
-    window,
-)
+from bstcad.optics.trace import across, clear_window, launch_strips, to_first_net, trace, window
 from bstcad.optics.unfolding import image_from_lens, per_radian
 
 
@@ -97,7 +90,7 @@ EXTENT_POINTS = tuple((u, v) for u in (-1, 0, 1) for v in (-1, 0, 1))  # points 
 FULL_APERTURE = 0.99  # extent of the light, relative to the clear aperture, from which on it fills the face
 
 
-def used(source: Emitter, lens: Lens) -> dict[str, Outline | None]:
+def needed_apertures(source: Emitter, lens: Lens) -> dict[str, Outline | None]:
     """Return the clear aperture (mm) needed on each face: the smallest circle or rectangle that holds all light.
 
     None: the light fills the clear aperture of the face.  Only light that passes all faces counts.  An extended source

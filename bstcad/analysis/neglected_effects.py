@@ -115,12 +115,12 @@ class Reference:
             return None
         parts = [(channel.weight, *self._fields(channel)) for channel in channels]  # (c, δ, w)
         before, shape = self.spline.rows(self.picture), self.screen.shape
-        changed = sum(
-            weight * self.spline.rows(zoomed(share, shape)) * self.spline.moved(shift) for weight, shift, share in parts
-        )
+        rows = self.spline.rows
+        changed = sum(c * rows(to_pixels(share, shape)) * self.spline.moved(shift) for c, shift, share in parts)
         mean = sum(weight * shift for weight, shift, _ in parts)
         square = sum(weight * ((shift - mean) ** 2).sum(0) for weight, shift, _ in parts)
-        variance = float((self.picture * zoomed(square, shape)).sum() / self.picture.sum())  # D² / 8 of an even disc
+        # variance of a uniform disc of diameter D: D² / 8
+        variance = float((self.picture * to_pixels(square, shape)).sum() / self.picture.sum())
         return Change(float(changed.sum() / before.sum() - 1), difference(changed, before), math.sqrt(8 * variance))
 
     def _fields(self, channel: Channel) -> tuple[np.ndarray, np.ndarray]:
@@ -174,7 +174,8 @@ class Reference:
         flux = torch.where(landed.alive, landed.flux, torch.zeros_like(landed.flux)).numpy() / straight
         cells = self._landing(flux, self.screen.pixels_of(landed.position).numpy())
         share, cells = float(cells.sum()), scipy.ndimage.gaussian_filter(cells, GHOST_SMOOTHING, mode="nearest")
-        added = zoomed(cells / max(cells.sum(), 1e-300), self.screen.shape) * (share * cells.size / self.picture.size)
+        scale = share * cells.size / self.picture.size
+        added = to_pixels(cells / max(cells.sum(), 1e-300), self.screen.shape) * scale
         before = self.picture / self.picture.sum()
         return Change(share, difference(before + added, before), 0.0)
 
@@ -189,7 +190,7 @@ class Reference:
         per_unit = math.sqrt(math.prod(self.screen.per_unit))
         wavelength: float = self.channel.source.wavelength  # type: ignore[assignment]  # a channel has one line
         width = wavelength * 1e-6 * per_radian(self.lens, self.screen) / math.sqrt(self._lit_area()) * per_unit
-        return Change(0.0, difference(blurred(self.picture, AIRY_SIGMA * width), self.picture), width)
+        return Change(0.0, difference(blur_by_gaussian(self.picture, AIRY_SIGMA * width), self.picture), width)
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +227,7 @@ class Spline:
         picture = self.padded[PADDING:-PADDING, PADDING:-PADDING]
         if not np.abs(shift).max() > MIN_SHIFT:
             return self.rows(picture)
-        across, down = (zoomed(p, picture.shape) for p in shift)
+        across, down = (to_pixels(p, picture.shape) for p in shift)
         rows, columns = np.indices(picture.shape, sparse=True)
         at = [self.rows(p) + PADDING for p in (rows - down, columns - across)]
         smooth = scipy.ndimage.map_coordinates(self.coefficients, at, order=3, mode="constant", prefilter=False)
@@ -235,7 +236,7 @@ class Spline:
         return (smooth + self.sharp * (stepped - smooth)) / (1 + self.rows(divergence))
 
 
-def zoomed(field: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def to_pixels(field: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Interpolate a field in cells of the target linearly to pixels, (rows, columns)."""
     for axis, pixels in enumerate(shape):
         cells = field.shape[axis]
@@ -247,7 +248,7 @@ def zoomed(field: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     return field
 
 
-def blurred(picture: np.ndarray, sigma: float) -> np.ndarray:
+def blur_by_gaussian(picture: np.ndarray, sigma: float) -> np.ndarray:
     """Convolve a picture with a Gaussian of standard deviation sigma (pixels), mirrored at the borders."""
     along = (np.exp(-0.5 * (sigma * np.pi * np.arange(side) / side) ** 2) for side in picture.shape)
     return scipy.fft.idctn(scipy.fft.dctn(picture) * np.outer(*along))

@@ -25,7 +25,7 @@ GRID_POINTS = 1025  # points a side of the grid for thickness, and along a quart
 HEIGHT_ROUNDING = 1e-13  # rounding of the heights, relative to the largest
 SMOOTH_RATIO = 2.0  # largest ratio of the slope energies of the two highest octaves of a net without ripple
 AT_BOUND = 0.97  # fraction of a bound above which a point counts as at the bound (the penalty begins at 0.99)
-FLAT, FLATTEST = 1e-9, 1e9  # curvature below which a face is flat (1/mm), and the radius reported for it (mm)
+MIN_CURVATURE, MAX_RADIUS = 1e-9, 1e9  # curvature below which a face is flat (1/mm), and its radius (mm)
 RIM_ROUNDING = 1e-9  # relative rounding of the outline, so that the last points of a net that ends there are inside
 
 
@@ -53,7 +53,7 @@ def describe(lens: Lens, grid: int = GRID_POINTS) -> dict[str, float | None]:
 
 def _face_figures(net: BSplineSurface, bends: Survey, points: tuple[np.ndarray, ...]) -> dict[str, Any]:
     """Return the figures of one freeform face; points: x, y and z (mm) of points all over it."""
-    concave, convex = (bend.largest if bend.largest < FLATTEST else None for bend in (bends.concave, bends.convex))
+    concave, convex = (bend.largest if bend.largest < MAX_RADIUS else None for bend in (bends.concave, bends.convex))
     octaves, waves = slope_octaves(net), ripple(net)
     top = octaves[-1] / octaves.sum() if octaves.sum() > 0 else 0.0
     return {
@@ -230,8 +230,8 @@ class Extreme:
 class Survey:
     """Extremes of a face, seen from outside the lens."""
 
-    concave: Extreme  # smallest principal radius of a valley (mm), in `largest`; FLATTEST if there is no valley
-    convex: Extreme  # smallest principal radius of a ridge (mm), in `largest`; FLATTEST if there is no ridge
+    concave: Extreme  # smallest principal radius of a valley (mm), in `largest`; MAX_RADIUS if there is no valley
+    convex: Extreme  # smallest principal radius of a ridge (mm), in `largest`; MAX_RADIUS if there is no ridge
     slope: Extreme  # largest angle of the tangent plane to z = const (degrees)
 
 
@@ -256,7 +256,7 @@ def survey(lens: Lens, concave: float | None = None, convex: float | None = None
 
 def survey_front(
     lens: Lens, concave: float | None = None, convex: float | None = None, slope: float | None = None
-) -> Survey:  # fmt: skip
+) -> Survey:
     """Find the extremes of a freeform front; from outside, from -z, a ridge of z is a valley."""
     found = survey(replace(lens, back=lens.front), concave=convex, convex=concave, slope=slope)
     return Survey(concave=found.convex, convex=found.concave, slope=found.slope)
@@ -276,7 +276,7 @@ def _grid(back: BSplineSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
 
 
 def _radius(bend: Extreme) -> Extreme:
-    return replace(bend, largest=1 / bend.largest if bend.largest > FLAT else FLATTEST)
+    return replace(bend, largest=1 / bend.largest if bend.largest > MIN_CURVATURE else MAX_RADIUS)
 
 
 def _angle(lens: Lens, slope: Extreme) -> Extreme:

@@ -31,7 +31,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-FLAT, EDGE = 0.9, 0.1  # default levels η and ε
+FLAT_LEVEL, EDGE_LEVEL = 0.9, 0.1  # default levels η and ε
 MEDIAN_PIXELS = 3  # side of the window of the median (pixels)
 PLATEAU_LEVEL = 0.5  # level, relative to E_max, above which the peak of the histogram is sought
 HISTOGRAM_END = 2.0  # upper end of the histogram, relative to E_max; hot pixels are above it
@@ -71,7 +71,7 @@ class TopHat:
 
 def top_hat(
     picture: np.ndarray, pixel: tuple[float, float], wanted: np.ndarray | None = None, *,
-    eta: float = FLAT, epsilon: float = EDGE, on_picture: float = 1.0,
+    eta: float = FLAT_LEVEL, epsilon: float = EDGE_LEVEL, on_picture: float = 1.0,
 ) -> TopHat:  # fmt: skip
     """Return the figures of a picture (rows, columns): irradiance, or flux per pixel, on any scale.
 

@@ -113,7 +113,7 @@ def design(job: Mapping[str, Any], place: Path, output: Path, resume: bool) -> S
     scene = load(place / SCENE)
     report = commands.generate(
         scene, output, progress=ProgressFile(place / PROGRESS), began=time.perf_counter(), resume=resume,
-        look=LightSnapshot(scene, place / LIGHT),
+        on_lens=LightSnapshot(scene, place / LIGHT),
     )  # fmt: skip
     found = report.contents
     if report.stopped != "interrupt":

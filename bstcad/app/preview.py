@@ -1,6 +1,6 @@
 """A preview of a scene: the light of its lens after about a second, from a reduced design.
 
-The preview is a quick design (`Task.hasty`) of the same scene with fewer pixels, control points, ray tubes and
+The preview is a quick design (`Task.preview`) of the same scene with fewer pixels, control points, ray tubes and
 evaluations.  A pixel has as many control cells and tubes as in a draft.  Detail finer than its pixels is not shown.
 """
 
@@ -89,7 +89,7 @@ def preview(scene: Scene, size: PreviewSize = QUICK, outdated: Callable[[], bool
     """
     began, remarks = time.perf_counter(), list(scene.warnings())
     small = reduced_scene(scene, size)
-    made = pipeline.design(small, progress=_progress(outdated, remarks), later=True, hasty=True)
+    made = pipeline.design(small, progress=_progress(outdated, remarks), later=True, preview=True)
     return replace(_evaluate(small, made), remarks=tuple(remarks), seconds=time.perf_counter() - began)
 
 

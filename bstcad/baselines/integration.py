@@ -37,7 +37,7 @@ from bstcad.optics.unfolding import image_from_last_net
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring import slope_map
 from bstcad.tailoring.machinability import place_back
-from bstcad.tailoring.run import Step, Task
+from bstcad.tailoring.run import StageStep, Task
 from bstcad.tailoring.slope_fit import conjugate_gradients, monomials, wanted_slopes, with_polynomial
 from bstcad.transport.mapping import Mapping
 
@@ -59,14 +59,14 @@ class SurfacePoints:
     reached: Tensor  # (n, n) bool, False: this ray, or one before it on its line, is lost before the back
 
 
-def steps(task: Task, lens: Lens, state: None = None) -> Iterator[Step]:
+def steps(task: Task, lens: Lens, state: None = None) -> Iterator[StageStep]:
     """Yield the steps of the method: the map, then points and net, which take seconds and cannot be interrupted."""
     lens = task.heaviest.through(lens)
     mapping = transport(task, lens)
-    yield Step(None, part="transport", ends=True)
+    yield StageStep(None, part="transport", ends=True)
     task.progress("integration", 0, 1, "")
     lens = follow_points(task, lens, mapping)
-    yield Step(lambda: lens, mapping=mapping, progress=("integration", 1, 1, ""))
+    yield StageStep(lambda: lens, mapping=mapping, progress=("integration", 1, 1, ""))
 
 
 @torch.no_grad()
@@ -86,7 +86,7 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
         start = exact.back.z
         points = march(coming, aim, plane, law=exact.last_freeform.law, z=start, first=first)
         back = fit_net(exact.back, points, lit_points(points, coming, exact), knobs.levels)
-        exact = place_back(exact.with_back(back), z, task.least)
+        exact = place_back(exact.with_back(back), z, task.min_thickness)
         if exact.back.z == start:
             break
     return lens.with_back(exact.back.with_parameters(heights=exact.back.heights.to(lens.back.heights)))

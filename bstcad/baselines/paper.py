@@ -26,8 +26,8 @@ from bstcad.optics.sides import Sides
 from bstcad.optics.trace import clear_window, trace
 from bstcad.tailoring import slope_map
 from bstcad.tailoring.merit import landing
-from bstcad.tailoring.minimise import AdamState, Best, Reached, adam, minimise
-from bstcad.tailoring.run import Parameters, Step, Task
+from bstcad.tailoring.minimise import AdamState, Best, Iterate, adam, minimise
+from bstcad.tailoring.run import Parameters, StageStep, Task
 from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Mapping
 
@@ -51,15 +51,15 @@ class Level:
     search: AdamState
 
 
-def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Step]:
+def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[StageStep]:
     """Run stage 1, or resume it, on one net after another, with one map from the front's vertex plane to the target."""
     knobs, lens, each = task.knobs, task.heaviest.through(lens), task.knobs.stage1_iterations
     area = clear_window(task.heaviest.source, lens)  # of the flat blank
     if state is None:
         mapping = transport(task, lens)
-        yield Step(None, part="transport", ends=True)
+        yield StageStep(None, part="transport", ends=True)
     else:
-        lens, mapping = state.lens.applied(lens), state.mapping
+        lens, mapping = state.lens.apply_to(lens), state.mapping
     for level in range(state.level if state else 0, len(knobs.levels)):
         lens = lens.refined(knobs.levels[level])
         begun, best = Parameters.of(lens), Best()
@@ -68,7 +68,7 @@ def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Step]
             text = f"landing error {best.merit**0.5:.3f} mm RMS"
             if reached.state is not None:
                 leave = Level(level, mapping, begun, best=best, search=reached.state)
-            yield Step(
+            yield StageStep(
                 partial(_improved, lens, best, task.free, knobs.levels[-1]),
                 leave,
                 mapping,
@@ -76,10 +76,10 @@ def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Step]
                 skipped=reached.skipped,
             )
         lens, state = _improved(lens, best, task.free, knobs.levels[level]), None
-    yield Step(partial(lens.refined, knobs.levels[-1]), mapping=mapping)
+    yield StageStep(partial(lens.refined, knobs.levels[-1]), mapping=mapping)
 
 
-def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: Level | None) -> Iterator[Reached]:
+def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: Level | None) -> Iterator[Iterate]:
     """Run stage 1 on the net of `lens`, or resume: min Σ |P_t - P|² over the heights and the free front."""
     n = min(task.knobs.rays, MAX_RAYS_PER_CONTROL_POINT * max(lens.back.shape))
     x, y = (t.to(lens.like) for t in sampling.grid(area, n))
@@ -168,20 +168,20 @@ class RaySearch:
     search: AdamState
 
 
-def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[Step]:
+def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[StageStep]:
     """Run stage 2, with new random rays in each step; resume from a state."""
-    knobs, goal, start = task.knobs, task.goals[0], lens if state is None else state.lens.applied(lens)
+    knobs, goal, start = task.knobs, task.goals[0], lens if state is None else state.lens.apply_to(lens)
     target = torch.from_numpy(goal.picture).to(lens.like.device)
     merit = TentMerit.of(task.channels, goal.receiver, target, knobs.overshoot)
     seeds = itertools.count(knobs.seed + 2 + (state.best.evaluations if state else 0))
     bundles = (random_bundles(task.channels, start, knobs.rays**2, seed) for seed in seeds)
     if state is None:
-        yield Step(lambda: lens)
+        yield StageStep(lambda: lens)
     for reached in tailor_to_irradiance(start, bundles, merit, steps=knobs.stage2_iterations, state=state):
         best = reached.best
         text = f"RRMSD {best.latest:.4f}"
         lens = with_parameters(start, [reached.parameters[0]])
-        yield Step(
+        yield StageStep(
             lambda lens=lens: lens,
             None if reached.state is None else RaySearch(Parameters.of(start), best, reached.state),
             progress=None if reached.skipped else ("stage 2", best.evaluations, knobs.stage2_iterations, text),
@@ -190,7 +190,7 @@ def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[S
             part="stage 2",
         )
     judged = task.rrmsd(lens)
-    yield Step(lambda: lens, judged=judged, part="stage 2", ends=True, reason="evaluations")
+    yield StageStep(lambda: lens, rays_rrmsd=judged, part="stage 2", ends=True, reason="evaluations")
 
 
 def random_bundles(channels: tuple[Channel, ...], lens: Lens, count: int, seed: int) -> tuple[Rays, ...]:
@@ -214,7 +214,7 @@ def with_parameters(lens: Lens, parameters: list[Any], free: tuple[str, ...] = (
 
 def tailor_to_irradiance(
     lens: Lens, bundles: Iterator[tuple[Rays, ...]], merit: TentMerit, steps: int, state: RaySearch | None = None
-) -> Iterator[Reached]:
+) -> Iterator[Iterate]:
     """Minimise the RRMSD of tent binning, with new random rays in each step (Eq. 15)."""
 
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bstcad.analysis.light import used
+from bstcad.analysis.light import needed_apertures
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.report import part_views
@@ -71,7 +71,7 @@ class DataSheet:
     @cached_property
     def apertures(self) -> dict[str, Outline | None]:
         """Clear apertures that the light uses, by face; None: the whole face."""
-        return used(self.scene.source, self.lens)
+        return needed_apertures(self.scene.source, self.lens)
 
     @property
     def tables(self) -> dict[str, Rows]:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from bstcad.analysis.top_hat import FLAT, FlatTop
+from bstcad.analysis.top_hat import FLAT_LEVEL, FlatTop
 from bstcad.optics.goal import Goal, suffix_of, words_of
 from bstcad.optics.measure import RESOLVED, Light
 from bstcad.optics.wavefront_error import WavefrontError
@@ -106,6 +106,6 @@ def flat_tops(scene: Scene, proof: Proof) -> Iterator[FlatTop]:
             pixel = tuple(side / n for side, n in zip(target.size, target.columns_rows, strict=True))
             inside = drawing(target).light  # covered fraction of each pixel, for a shape with an edge
             if target.profile.shape == "super_gaussian":
-                inside = (inside >= FLAT * inside.max()).astype(float)
+                inside = (inside >= FLAT_LEVEL * inside.max()).astype(float)
             areas = 1.0 if target.screen.areas is None else target.screen.areas
             yield FlatTop.of(key, light.picture / areas, pixel, inside, on_picture=light.flux["on target"])

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bstcad.analysis.shape import FLATTEST, describe, heights, survey_front, thickness_range
+from bstcad.analysis.shape import MAX_RADIUS, describe, heights, survey_front, thickness_range
 from bstcad.optics import passes, quadrature
 from bstcad.optics.bspline import DEGREE, BSplineSurface
 from bstcad.optics.lens import Lens
@@ -312,7 +312,7 @@ def _front_radius(lens: Lens) -> float | None:
         return None
     if front.is_net:
         found = survey_front(lens).concave.largest
-        return found if found < FLATTEST else None
+        return found if found < MAX_RADIUS else None
     (x, y), (c, k) = (front.outline or lens.outline).farthest, front.conic()
     if not c < 0:
         return None

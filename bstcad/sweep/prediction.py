@@ -27,7 +27,7 @@ from bstcad.optics.sides import Sides, as_pair, coarser
 from bstcad.scene.quality import COARSEST_GRID
 from bstcad.scene.scene import Scene
 from bstcad.sweep.cold_run import KERNEL_REPEATS, calibration_kernel, measure_seconds
-from bstcad.tailoring.run import JUDGING, Task
+from bstcad.tailoring.run import RRMSD_SECONDS, Task
 from bstcad.tailoring.slope_map import SUBCELLS
 from bstcad.tailoring.stage2 import round_shares, sheet_sizes, stage3_sheet_sizes
 
@@ -229,7 +229,7 @@ def typical_seconds(scene: Scene) -> Seconds:
     first += transport * sum((grid / UNIT_GRID) ** 2 for grid in grids) * knobs.transport_iterations / UNIT_ITERATIONS
     fits = [fitted for level in knobs.levels[-2:] for fitted in scene.lens.nets(level)]
     first += FIT_SECONDS * sum(math.prod(as_pair(fitted)) for fitted in fits) / UNIT_POINTS**2
-    each, begun = CALL_SECONDS + VARIABLE_SECONDS * net, JUDGING * pixels ** (2 / 3)  # of an evaluation and a round
+    each, begun = CALL_SECONDS + VARIABLE_SECONDS * net, RRMSD_SECONDS * pixels ** (2 / 3)  # of an evaluation and a round
     if scene.source.extent is not None:
         each, begun = each + BLUR_SECONDS * pixels, begun + IMAGE_SECONDS
     launched = sum((tubes / UNIT_TUBES) ** 2 for tubes, _ in sheets)
@@ -238,7 +238,7 @@ def typical_seconds(scene: Scene) -> Seconds:
         sides = [*(SUBCELLS * grid for grid in grids), min(2 * knobs.side, knobs.rays)]
         first += AIMING_SECONDS * sum((side / UNIT_TUBES) ** 2 for side in sides)
         search += AIMING_SECONDS * launched
-    return Seconds(first, search + JUDGING * pixels ** (2 / 3), rest)
+    return Seconds(first, search + RRMSD_SECONDS * pixels ** (2 / 3), rest)
 
 
 def search_rounds(scene: Scene) -> tuple[tuple[int, int], ...]:

@@ -26,39 +26,39 @@ from bstcad.optics.outlines import inside
 from bstcad.optics.sampling import sample_rim
 from bstcad.scene.blank import Bounds
 
-MARGIN = 0.01  # distance from a bound at which the penalty begins, relative to the bound
+PENALTY_MARGIN = 0.01  # distance from a bound at which the penalty begins, relative to the bound
 RIM_POINTS = 1025  # points along a quarter of the rim
-WINDOW = 4  # control points along each axis on which a cell may depend: those of two knot spans
+CELL_POINTS = 4  # control points along each axis on which a cell may depend: those of two knot spans
 TILE_CELLS = 16  # cells along each axis in a tile
-ROUNDING = 1e-9  # rounding of the number of cells, so that nets as fine as the cells do not add one
+CELL_ROUNDING = 1e-9  # rounding of the number of cells, so that nets as fine as the cells do not add one
 
 
 def unit(lens: Lens, bounds: Bounds) -> float:
-    """Return max(thinnest, MARGIN |z_back - z_front|), the unit of the excess of thickness (mm).
+    """Return max(thinnest, PENALTY_MARGIN |z_back - z_front|), the unit of the excess of thickness (mm).
 
     It does not depend on the heights of the faces, and so has no part in the gradient.
     """
-    return max(bounds.thinnest, MARGIN * abs(lens.back.z - lens.front.z)) or 1.0
+    return max(bounds.thinnest, PENALTY_MARGIN * abs(lens.back.z - lens.front.z)) or 1.0
 
 
 def clearance(lens: Lens, bounds: Bounds) -> tuple[float, dict[int, Tensor], float]:
     """Return (penalty, its gradients (1/mm), largest excess) of the thickness t over its bounds.
 
     The excess is e = max(thinnest - t, t - thickest) / unit everywhere, and e = (edge - t) / unit along the rim.  The
-    penalty is the mean of max(e + MARGIN, 0)² over all points of the grid.  The largest excess is -MARGIN if no point
-    is closer to a bound.  The gradients are in the heights of front and back, by the number of the face; {} if no point
-    is close.  Both nets have the same precision.  Sums have fixed parts: no bit depends on the number of threads.
+    penalty is the mean of max(e + m, 0)² over all points of the grid, m = PENALTY_MARGIN.  The largest excess is -m if
+    no point is closer to a bound.  The gradients are in the heights of front and back, by the number of the face; {} if
+    no point is close.  Both nets have the same precision.  Sums have fixed parts: no bit depends on threads.
     """
-    length, square, worst = unit(lens, bounds), 0.0, -MARGIN
+    length, square, worst = unit(lens, bounds), 0.0, -PENALTY_MARGIN
     faces = {lens.number_of("front"): (lens.front, -1.0), lens.number_of("back"): (lens.back, 1.0)}  # (net, ∂t / ∂z)
     gradients: dict[int, Tensor] = {}
-    for x, y, share, thinnest in _points_near_bounds(lens, bounds, MARGIN * length):
+    for x, y, share, thinnest in _points_near_bounds(lens, bounds, PENALTY_MARGIN * length):
         relative, thicker = _excess(lens, x, y, replace(bounds, thinnest=thinnest))
         relative, worst = relative / length, max(worst, float(relative.max()) / length)
-        near = relative > -MARGIN
+        near = relative > -PENALTY_MARGIN
         if not near.any():
             continue
-        x, y, over = x[near], y[near], relative[near] + MARGIN
+        x, y, over = x[near], y[near], relative[near] + PENALTY_MARGIN
         square += share * float(total(over * over))
         seed, none = 2 * share / length * thicker[near] * over, torch.zeros_like(x)
         for k, (net, sign) in faces.items():
@@ -101,7 +101,7 @@ class CellGrid:
         """Make the grid for both nets of a lens."""
         half, pitches = lens.outline.half_extent, zip(lens.front.pitch, lens.back.pitch, strict=True)
         pairs = zip(half, pitches, strict=True)
-        x, y = (max(1, math.ceil(2 * side / min(pitch) - ROUNDING)) for side, pitch in pairs)
+        x, y = (max(1, math.ceil(2 * side / min(pitch) - CELL_ROUNDING)) for side, pitch in pairs)
         return cls((x, y), half)
 
     @property
@@ -148,17 +148,17 @@ class CellGrid:
         return x, y
 
     def _first_points(self, net: BSplineSurface) -> list[np.ndarray]:
-        """Return the index of the first of the WINDOW control points of each cell, along x and along y."""
+        """Return the index of the first of the CELL_POINTS control points of each cell, along x and along y."""
         left = [torch.arange(k, dtype=torch.float64) for k in self.count]
         along = zip(net.along_net(*self._at(left, 0.0)), net.shape, strict=True)
-        return [span(u, m)[0].long().clamp(max=m - WINDOW).numpy() for u, m in along]
+        return [span(u, m)[0].long().clamp(max=m - CELL_POINTS).numpy() for u, m in along]
 
 
 def _tile_extremes(heights: np.ndarray, begins: Sequence[np.ndarray], extreme: np.ufunc) -> np.ndarray:
     """Return the lowest (np.minimum) or highest (np.maximum) control point of each tile of cells (mm)."""
     for axis, begin in enumerate(begins):
         tiles = np.split(begin, range(TILE_CELLS, len(begin), TILE_CELLS))
-        windows = [slice(tile[0], tile[-1] + WINDOW) for tile in tiles]
+        windows = [slice(tile[0], tile[-1] + CELL_POINTS) for tile in tiles]
         parts = (heights[window] if axis == 0 else heights[:, window] for window in windows)
         heights = np.stack([extreme.reduce(part, axis) for part in parts], axis)
     return heights

@@ -25,7 +25,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.reach import largest_deflection
 from bstcad.tailoring import light_behind
 from bstcad.tailoring.light_behind import LightBehind
-from bstcad.tailoring.run import Task, silent
+from bstcad.tailoring.run import Task, no_progress
 from bstcad.tailoring.slope_map import corners_of, lit_window
 from bstcad.tailoring.stage2 import with_pixels
 from bstcad.tailoring.two_faces import front_map
@@ -90,7 +90,7 @@ class Demand:
 
 def find_demand(task: Task, lens: Lens) -> Demand:
     """Return the demand of the task's solution, or else of the better one; lens: the blank, with both faces free."""
-    task = task.aimed(lens)
+    task = task.with_imaged_receivers(lens)
     solutions = [_demand(_trial_task(task, solution), lens) for solution in _solutions(task)]
     best, light = min(solutions, key=lambda one: one[0].rank)
     if is_infeasible(best):
@@ -113,7 +113,7 @@ def _solutions(task: Task) -> tuple[float, ...]:
 
 def _trial_task(task: Task, solution: float) -> Task:
     knobs = task.knobs.model_copy(update={"transport_grid": TRIAL_CELLS, "transport_iterations": TRIAL_ITERATIONS})
-    return replace(with_pixels(task, TRIAL_PIXELS), knobs=knobs, solution=solution, progress=silent)
+    return replace(with_pixels(task, TRIAL_PIXELS), knobs=knobs, solution=solution, progress=no_progress)
 
 
 def _demand(task: Task, lens: Lens) -> tuple[Demand, LightBehind]:

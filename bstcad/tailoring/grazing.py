@@ -43,7 +43,7 @@ class Grazing:
 
     net: BSplineSurface  # net whose knots are used; its heights are not
     at_face: Rays  # (3, m, n) rays that meet the face at these points of the lens it was made for, before refraction
-    share: Tensor  # (m, n) fraction of the light at each point, sum 1
+    weight: Tensor  # (m, n) fraction of the light at each point, sum 1
     eta: float  # index before the face over the index behind it
     angle: float  # θ'_max (rad)
 
@@ -58,9 +58,9 @@ class Grazing:
         x, y = np.meshgrid(*(low + pitch * _span_points(m) for (low, _), pitch, m in axes), indexing="ij")
         inside = (np.abs(x) <= window.width / 2) & (np.abs(y) <= window.height / 2)
         light = np.where(inside, interpolate(grid, grid.density[None], (x, y))[0].numpy(), 0.0)
-        share = torch.from_numpy(maximum_filter(light, 5))  # spans that are lit in part count whole
+        weight = torch.from_numpy(maximum_filter(light, 5))  # spans that are lit in part count whole
         rays, eta = rays_at(grid, (x, y)), seen.last_freeform.law.eta
-        return cls(net, rays, share / total(share), eta=eta, angle=edge.angle)
+        return cls(net, rays, weight / total(weight), eta=eta, angle=edge.angle)
 
     def __call__(self, heights: Tensor) -> tuple[float, Tensor, float]:
         """Return the penalty, its gradient in the heights (m, n) in 1/mm, and the largest u over the light."""
@@ -73,8 +73,8 @@ class Grazing:
         sine = 1 - along * along / (1 + z_x * z_x + z_y * z_y)
         u = (self.eta**2 * sine - limit) / (1 - limit)
         excess = torch.relu(u)
-        value = PENALTY_WEIGHT * total(self.share * excess * excess)
-        worst = float(torch.where(self.share > 0, u, torch.zeros_like(u)).detach().max())
+        value = PENALTY_WEIGHT * total(self.weight * excess * excess)
+        worst = float(torch.where(self.weight > 0, u, torch.zeros_like(u)).detach().max())
         return float(value.detach()), torch.autograd.grad(value, leaf)[0].to(heights), worst
 
 

@@ -46,7 +46,7 @@ from bstcad.tailoring.slope_map import centroid, pixel_corners, spread_density
 from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import grid_coordinates, solve
 
-MAP_ROUNDS, COARSE_DIVISOR, MIN_CELLS = 3, 4, 64  # rounds of the map; cells of the coarse ones: n // 4, minimum
+MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # rounds of the map; cells of the coarse ones: n // 4, minimum
 MAX_ITERATIONS = 40  # largest number of iterations for the point of a wave whose ray meets a given point of the target
 CONVERGED = 1e-9  # change at which these iterations have converged (mm)
 SOURCE_FLOOR = 0.02  # floor under the map's source picture, relative to the mean: a hole would be one in the map
@@ -182,7 +182,7 @@ def light_of_wave(screen: Screen, picture: np.ndarray, wave: Wave, *, wavelength
     """
     place, picture = in_space(screen.plane, *corners(screen, parts)), subdivide(picture, parts)
     if isinstance(wave, SphericalWave):  # each ray is the line through the focus
-        way = _unit(place - np.array(wave.focus).reshape(3, 1, 1))
+        way = _normalised(place - np.array(wave.focus).reshape(3, 1, 1))
         return LightBehind(place, way * np.where(way[2] < 0, -1.0, 1.0), picture)
     x, y = (torch.from_numpy(p) for p in place[:2])
     below = torch.from_numpy(wave.z - place[2])
@@ -218,7 +218,7 @@ def between_targets(
     along = screen.plane.frame[:2]
 
     def cosines(p: np.ndarray, t: np.ndarray) -> Grid:
-        way = _unit(t - p)
+        way = _normalised(t - p)
         return _dot(along[0], way), _dot(along[1], way)
 
     t = in_space(behind.plane, *pixel_corners(behind))
@@ -226,7 +226,7 @@ def between_targets(
     p = in_space(screen.plane, *(np.full_like(t[0], sum(ends) / 2) for ends in (screen.x, screen.y)))
     for turn in range(MAP_ROUNDS):
         last = turn == MAP_ROUNDS - 1
-        cells = FINE_FACTOR * n if last else max(MIN_CELLS, n // COARSE_DIVISOR)
+        cells = FINE_FACTOR * n if last else max(MIN_COARSE_CELLS, n // COARSE_DIVISOR)
         y = tuple(sign * (c - g) for c, g in zip(cosines(p, t), cosines(p, m), strict=True))
         (rho, frame), *others = (spread_density(each, tuple(pixel_corners(screen)), cells) for each in pictures)
         sharper = [other for other, _ in others] if last else []
@@ -239,18 +239,17 @@ def between_targets(
         parts = max(1, round(n * math.sqrt(max(contrasts)) / max(behind.shape)))
         place = in_space(behind.plane, *corners(behind, parts))
         i, j = np.meshgrid(*(np.arange(parts * pixels + 1) / parts for pixels in behind.shape[::-1]), indexing="ij")
-        way = _unit(place - in_space(screen.plane, *mapping.inverse(*_bilinear(np.stack(y), i, j))))
+        way = _normalised(place - in_space(screen.plane, *mapping.inverse(*_bilinear(np.stack(y), i, j))))
         light = LightBehind(place, -way if against else way, subdivide(wanted / wanted.sum(), parts))
         return light.reversed() if sign < 0 and not against else light
     parts = max(1, round(n / max(screen.shape)))
     place, there = in_space(screen.plane, *corners(screen, parts)), mapping(*corners(screen, parts))
-    i, j = grid_coordinates(*(sign * c for c in y), *(sign * c for c in there))  # both increase with t
-    way = _unit(in_space(behind.plane, *_bilinear(np.stack(pixel_corners(behind)), i, j)) - place)
+    i, j = grid_coordinates(*(sign * c for c in y), *(sign * c for c in there))  # as_pair increase with t
+    way = _normalised(in_space(behind.plane, *_bilinear(np.stack(pixel_corners(behind)), i, j)) - place)
     return LightBehind(place, way, subdivide(own / own.sum(), parts))
 
 
-def _unit(way: np.ndarray) -> np.ndarray:
-    """Return vectors (3, …) scaled to length 1."""
+def _normalised(way: np.ndarray) -> np.ndarray:
     return way / np.sqrt((way * way).sum(0))
 
 
@@ -267,10 +266,10 @@ def without_crossings(light: LightBehind, screen: Screen, surface: Surface, n: i
     mapping, there = solve(rho, sigma, frame, seen), light.positions_on(screen.plane)
     b = np.stack([*mapping(*there), np.full(light.position.shape[1:], float(b_z.mean()))])
     place = in_space(screen.plane, *there)
-    return replace(light, position=place, direction=_unit(place - b))
+    return replace(light, position=place, direction=_normalised(place - b))
 
 
-# ---- grids of places -------------------------------------------------------------------------------------------------
+# ---- grids of points -------------------------------------------------------------------------------------------------
 
 
 def _inverted(x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -36,7 +36,7 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.sampling import sample_rim
 from bstcad.scene.blank import Bounds
 from bstcad.scene.errors import SceneError
-from bstcad.tailoring.clearance import MARGIN, RIM_POINTS, clearance
+from bstcad.tailoring.clearance import PENALTY_MARGIN, RIM_POINTS, clearance
 from bstcad.tailoring.merit import SobolevVariable
 from bstcad.tailoring.minimise import lbfgs, minimise
 
@@ -109,7 +109,7 @@ def active_bounds(lens: Lens, bounds: Bounds | None, least: float) -> Bounds | N
 class Excess:
     """Excess of the tailored faces of a lens over their bounds."""
 
-    mean_square: float  # penalty: mean square over each face, relative to the bounds, from MARGIN before them on
+    mean_square: float  # penalty: mean square over each face, relative to the bounds, from PENALTY_MARGIN before on
     gradients: tuple[Tensor, ...]  # gradients of the penalty in the heights (1/mm), (m, n) for each of Lens.nets
     worst: float  # largest excess, relative to its bound; negative: there is none
 
@@ -117,15 +117,16 @@ class Excess:
 def excess(lens: Lens, bounds: Bounds) -> Excess:
     """Return the excess of curvature, slope and thickness everywhere inside the outline.
 
-    E = Σ_f mean max(q_f / b_f - 1 + MARGIN, 0)² over the tailored faces f and the bounds b_f > 0 on their quantities
-    q_f, plus the penalty on the thickness.  A tool reaches the back from +z, where a valley of radius R has the
-    curvature κ = 1 / R of z.  It reaches the front from -z, where the heights are -z and curvatures change their sign:
-    a valley of the front, which bulges into the glass, is a ridge of z, κ = -1 / R.  |∇z| is the same from both sides.
+    E = Σ_f mean max(q_f / b_f - 1 + m, 0)², m = PENALTY_MARGIN, over the tailored faces f and the bounds b_f > 0 on
+    their quantities q_f, plus the penalty on the thickness.  A tool reaches the back from +z, where a valley of radius
+    R has the curvature κ = 1 / R of z.  It reaches the front from -z, where the heights are -z and curvatures change
+    their sign: a valley of the front, which bulges into the glass, is a ridge of z, κ = -1 / R.  |∇z| is the same from
+    both sides.
 
     Sums have fixed parts: no bit depends on the number of threads.
     """
     nets = {k: net.to(torch.float64) for k, net in zip(lens.freeform, lens.nets, strict=True)}
-    square, worst = 0.0, -MARGIN
+    square, worst = 0.0, -PENALTY_MARGIN
     gradients = {k: net.heights.new_zeros(()).expand_as(net.heights) for k, net in nets.items()}
     for squared, own, far in _parts(lens, nets, bounds):
         square, worst = square + squared, max(worst, far)
@@ -135,10 +136,10 @@ def excess(lens: Lens, bounds: Bounds) -> Excess:
     return Excess(square, given, worst)
 
 
-Part = tuple[float, dict[int, Tensor], float]  # mean square, gradients by the number of the face, worst
+PartExcess = tuple[float, dict[int, Tensor], float]  # mean square, gradients by the number of the face, worst
 
 
-def _parts(lens: Lens, nets: dict[int, BSplineSurface], bounds: Bounds) -> Iterator[Part]:
+def _parts(lens: Lens, nets: dict[int, BSplineSurface], bounds: Bounds) -> Iterator[PartExcess]:
     """Yield the excess of each tailored face, then that of the thickness; nets: in float64, by face number."""
     if (bounds.concave, bounds.convex, bounds.slope) != (None, None, None):
         for k, from_above in _bounds_from_above(lens, bounds).items():
@@ -160,11 +161,12 @@ def _bounds_from_above(lens: Lens, bounds: Bounds) -> dict[int, Bounds]:
 
 def _shape_excess(net: BSplineSurface, outline: Outline, bounds: Bounds) -> tuple[float, Tensor, float]:
     """Return (penalty, its gradient, largest excess) of curvature and slope of a face over its bounds."""
-    square, worst, gradient = 0.0, -MARGIN, torch.zeros_like(net.heights)
+    square, worst, gradient = 0.0, -PENALTY_MARGIN, torch.zeros_like(net.heights)
     for spans, reached, bound, quantity in _spans_near_bounds(net, outline, bounds):
         leaf = spans.heights.detach().requires_grad_()
-        relative = torch.where(reached, quantity(replace(spans, heights=leaf).jet(QUARTERS)) / bound - 1, -MARGIN)
-        squared = total(torch.relu(relative + MARGIN) ** 2)
+        ratio = quantity(replace(spans, heights=leaf).jet(QUARTERS)) / bound
+        relative = torch.where(reached, ratio - 1, -PENALTY_MARGIN)
+        squared = total(torch.relu(relative + PENALTY_MARGIN) ** 2)
         gradient += spans.scattered(*torch.autograd.grad(squared, leaf))
         square, worst = square + float(squared.detach()), max(worst, float(relative.detach().max()))
     count = math.prod(len(QUARTERS) * (points - 2) for points in net.shape)
@@ -182,7 +184,7 @@ def _spans_near_bounds(
     ):
         if bound is None:
             continue
-        near = torch.nonzero(upper_limit() > (1 - MARGIN) * bound)
+        near = torch.nonzero(upper_limit() > (1 - PENALTY_MARGIN) * bound)
         for i, j in (part.T for part in near.split(SPANS_AT_A_TIME) if len(part)):
             yield Spans.of(net, i, j), near_outline(net, outline, i=i, j=j, s=QUARTERS), bound, quantity
 
@@ -196,14 +198,14 @@ def _thickness_excess(lens: Lens, bounds: Bounds) -> tuple[float, Tensor, float]
     heights = lens.back.relative_sag_and_slope(x, y)[0]
     room = min(bounds.thickest - bounds.thinnest, float(heights.max() - heights.min())) or 1.0
     leaf = lens.back.heights.detach().requires_grad_()
-    back, square, worst = replace(lens.back, heights=leaf), 0.0, -MARGIN
+    back, square, worst = replace(lens.back, heights=leaf), 0.0, -PENALTY_MARGIN
     for x, y, least in (
         (*thickness_points(lens), bounds.thinnest),
         (*rim_points(lens), max(bounds.thinnest, bounds.edge or 0.0)),
     ):
         glass = back.sag_and_slope(x, y)[0] - lens.front.sag_and_slope(x, y)[0]
         relative = torch.maximum(glass - bounds.thickest, least - glass) / room
-        square = square + total(torch.relu(relative + MARGIN) ** 2) / len(x)
+        square = square + total(torch.relu(relative + PENALTY_MARGIN) ** 2) / len(x)
         worst = max(worst, float(relative.detach().max()))
     return float(square.detach()), *torch.autograd.grad(square, leaf), worst
 
@@ -252,7 +254,6 @@ def _heights(lens: Lens) -> list[Tensor]:
 
 
 def _flat(lens: Lens, bounds: Bounds) -> Lens:
-    """Return the lens with its tailored faces flat."""
     faces, nets = _bounds_from_above(lens, bounds), zip(lens.freeform, _heights(lens), strict=True)
     return lens.with_heights(torch.zeros_like(h) if k in faces else h for k, h in nets)
 

@@ -93,7 +93,7 @@ class Merit:
     wave: Wave | None = None  # wavefront goal, for the first channel; None: there is none
     own: Callable[[Tensor, Tensor], Tensor] | None = None  # function of picture and target in place of RRMSD²
     blurs: tuple[tuple[BlurOperator, ...], ...] = ()  # blur by goal and channel; (): the source is a point
-    left_out: tuple[Tensor, ...] = ()  # error of the blur in each picture, (rows, columns); (): not measured
+    blur_errors: tuple[Tensor, ...] = ()  # error of the blur in each picture, (rows, columns); (): not measured
 
     @classmethod
     def of(
@@ -115,12 +115,12 @@ class Merit:
         if seed is None:
             return merit
         with torch.no_grad():
-            seen = [merit.picture(k, landed)[0] for k, landed in enumerate(merit.landing(lens).on_goals)]
-        missed = (
+            images = [merit.picture(k, landed)[0] for k, landed in enumerate(merit.landing(lens).on_goals)]
+        errors = (
             blur_error(image, spread.draw, exact, goal.receiver, border=blur.border, seed=seed)
-            for image, goal, (blur, *_) in zip(seen, merit.goals, merit.blurs, strict=True)
+            for image, goal, (blur, *_) in zip(images, merit.goals, merit.blurs, strict=True)
         )
-        return replace(merit, left_out=tuple(missed))
+        return replace(merit, blur_errors=tuple(errors))
 
     @property
     def tubes(self) -> int:
@@ -143,9 +143,9 @@ class Merit:
         if self._is_one:
             return Landings((self.light.landing(lens, self.goals[0].receiver),))
         lens, pairs = _from_source(lens, self.wave), zip(self.light.channels, self.light.sheets, strict=True)
-        ways = [_traced_corners(c.source, sheet, c.through(lens), self.wave is not None) for c, sheet in pairs]
-        on_goals = tuple(tuple(goal.receiver.plane.land(rays) for rays, _ in ways) for goal in self.goals)
-        return Landings(on_goals, None if self.wave is None else ways[0])
+        traced = [_traced_corners(c.source, sheet, c.through(lens), self.wave is not None) for c, sheet in pairs]
+        on_goals = tuple(tuple(goal.receiver.plane.land(rays) for rays, _ in traced) for goal in self.goals)
+        return Landings(on_goals, None if self.wave is None else traced[0])
 
     def __call__(self, landings: Landings) -> tuple[Tensor, Tensor]:
         """Return the merit of the landed corners, and the largest RRMSD of the normalised pictures."""
@@ -153,10 +153,10 @@ class Merit:
         whole = pictures + (self.wave.weight if self.wave else 0.0)
         merit, worst = 0.0, torch.zeros(())
         for k, (goal, landed) in enumerate(zip(self.goals, landings.on_goals, strict=True)):
-            off, pull, lost, rrmsd = self._goal_terms(k, landed)
+            error, penalty, lost, rrmsd = self._goal_terms(k, landed)
             if self._is_one:
-                return off + pull + lost, rrmsd
-            merit = merit + goal.weight / whole * off + goal.weight / pictures * (pull + lost)
+                return error + penalty + lost, rrmsd
+            merit = merit + goal.weight / whole * error + goal.weight / pictures * (penalty + lost)
             worst = torch.maximum(worst.to(rrmsd), rrmsd)
         if self.wave is not None:
             merit = merit + self.wave.weight / whole * self._wavefront_error(*landings.behind)
@@ -167,43 +167,43 @@ class Merit:
         channels, screen = self.light.channels, self.goals[k].receiver
         pairs = list(zip(self.light.sheets, landed, strict=True))
         # flux after the losses at faces and in the glass: a picture that is darker everywhere is no worse
-        left = weighted_sum(channels, (total(sheet.transmitted_flux(corners)) for sheet, corners in pairs))
-        seen = with_border(screen, self.blurs[k][0].border) if self.blurs else screen
-        images, beyond = zip(*(sheet.collect(corners, seen) for sheet, corners in pairs), strict=True)
-        outside = weighted_sum(channels, beyond)
+        flux = weighted_sum(channels, (total(sheet.transmitted_flux(corners)) for sheet, corners in pairs))
+        wider = with_border(screen, self.blurs[k][0].border) if self.blurs else screen
+        images, penalties = zip(*(sheet.collect(corners, wider) for sheet, corners in pairs), strict=True)
+        outside = weighted_sum(channels, penalties)
         if not self.blurs:
-            return quotient(weighted_sum(channels, images), left), self.overshoot * outside / left
-        smooth = (blurred(one / left, blur) for one, blur in zip(images, self.blurs[k], strict=True))
-        return weighted_sum(channels, smooth), self.overshoot * (outside / left)
+            return quotient(weighted_sum(channels, images), flux), self.overshoot * outside / flux
+        smooth = (blurred(image / flux, blur) for image, blur in zip(images, self.blurs[k], strict=True))
+        return weighted_sum(channels, smooth), self.overshoot * (outside / flux)
 
     def _goal_terms(self, k: int, landed: Sequence[Landed]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return RRMSD² of goal k (or `own`), the penalty on light outside, the fraction lost, and the RRMSD."""
         channels, sheets, target = self.light.channels, self.light.sheets, self.targets[k]
-        image, pull = self.picture(k, landed)
-        if self.left_out:
-            image = image + self.left_out[k]
+        image, penalty = self.picture(k, landed)
+        if self.blur_errors:
+            image = image + self.blur_errors[k]
         size = total(target**2)
-        off = total((image - target) ** 2) / size if self.own is None else self.own(image, target)
+        error = total((image - target) ** 2) / size if self.own is None else self.own(image, target)
         pairs = zip(sheets, landed, strict=True)
         arrived = weighted_sum(channels, (total(arriving_flux(sheet.flux, corners)) for sheet, corners in pairs))
         # light lost has no gradient, but to lose it must not lower the merit
         lost = 1 - arrived / weighted_sum(channels, (total(sheet.flux) for sheet in sheets))
         normalised = image.detach() / total(image.detach())
-        return off, pull, lost, (total((normalised - target) ** 2) / size).sqrt()
+        return error, penalty, lost, (total((normalised - target) ** 2) / size).sqrt()
 
     def _wavefront_error(self, rays: Rays, path: Tensor) -> Tensor:
         """Return (RMS / λ)² of the optical path differences without piston, weighted by the flux around each corner."""
         wavelength = self.light.channels[0].source.wavelength
         above = rays.above(self.wave.z)
-        way = -above / torch.where(rays.alive, rays.direction[2], torch.ones_like(above))
-        x, y = (p + way * d for p, d in zip(rays.position[:2], rays.direction[:2], strict=True))
-        held = rays.alive & self.wave.contains(x.detach(), y.detach())
-        flux = torch.where(held, _corner_flux(self.light.sheets[0].flux), torch.zeros_like(x))
-        opd = (path + way - self.wave.path(x, y, wavelength)) / (wavelength * MM_PER_NM)
-        opd = torch.where(held, opd, torch.zeros_like(opd))
-        share = flux / total(flux)
-        piston = total(share * opd).detach()  # no gradient: the mean minimises the sum
-        return total(share * (opd - piston) ** 2)
+        further = -above / torch.where(rays.alive, rays.direction[2], torch.ones_like(above))
+        x, y = (p + further * d for p, d in zip(rays.position[:2], rays.direction[:2], strict=True))
+        inside = rays.alive & self.wave.contains(x.detach(), y.detach())
+        flux = torch.where(inside, _corner_flux(self.light.sheets[0].flux), torch.zeros_like(x))
+        opd = (path + further - self.wave.path(x, y, wavelength)) / (wavelength * MM_PER_NM)
+        opd = torch.where(inside, opd, torch.zeros_like(opd))
+        weight = flux / total(flux)
+        piston = total(weight * opd).detach()  # no gradient: the mean minimises the sum
+        return total(weight * (opd - piston) ** 2)
 
 
 def _from_source(lens: Lens, wave: Wave | None) -> Lens:
@@ -218,17 +218,18 @@ def _traced_corners(source: Emitter, sheet: Tubes, lens: Lens, measured: bool) -
     lens = lens.unbounded()
     rays, path = sheet.rays, None
     for interface in lens.interfaces[lens.freeform[0] :]:
-        there = behind(rays, interface)
+        refracted = behind(rays, interface)
         if measured and path is None:  # the rays come from the source, see `_from_source`
             index = 1.0 if interface.law.reverses else interface.law.n_in
-            path = index * path_from_reference(source, lens.entrance.z, there, rays.sense)
+            path = index * path_from_reference(source, lens.entrance.z, refracted, rays.sense)
         elif measured:
-            off = torch.stack([*there.position[:2], there.above(rays.z)]) - rays.position
-            square = torch.where(there.alive, (off * off).sum(0), torch.ones_like(path))  # sqrt(0) has no gradient
+            step = torch.stack([*refracted.position[:2], refracted.above(rays.z)]) - rays.position
+            # sqrt(0) has no gradient
+            square = torch.where(refracted.alive, (step * step).sum(0), torch.ones_like(path))
             path = path + index * torch.sqrt(square)
         if measured and not interface.law.reverses:
             index = interface.law.n_out
-        rays = there
+        rays = refracted
     return rays, path
 
 

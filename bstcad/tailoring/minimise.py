@@ -19,7 +19,7 @@ from torch import Tensor
 
 from bstcad.optics.kernels.reductions import dot, total
 
-Problem = Callable[[list[Tensor]], tuple[float, list[Tensor], float]]
+Objective = Callable[[list[Tensor]], tuple[float, list[Tensor], float]]
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Query:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The answer to a query."""
+    """Answer to a query."""
 
     merit: float  # merit; infinite, with zero gradients, if merit or gradient was not finite
     gradients: list[Tensor]
@@ -55,7 +55,7 @@ Method = Generator[Query, Evaluation, str]  # returns the reason why it ends
 
 
 @dataclass(frozen=True)
-class Reached:
+class Iterate:
     """State of a minimisation after an evaluation."""
 
     best: Best
@@ -65,7 +65,7 @@ class Reached:
     reason: str = ""  # reason to end here: "evaluations", or that of the method; "": none
 
 
-def minimise(problem: Problem, method: Method, evaluations: int, best: Best = Best()) -> Iterator[Reached]:
+def minimise(problem: Objective, method: Method, evaluations: int, best: Best = Best()) -> Iterator[Iterate]:
     """Answer the queries of a method until it ends or the evaluations are used up; yield the state after each.
 
     A value that is not finite is counted and not used.  best: the best of the evaluations before the method's state.
@@ -86,11 +86,11 @@ def minimise(problem: Problem, method: Method, evaluations: int, best: Best = Be
         try:
             query, reason = method.send(Evaluation(merit, gradients, best)), ""
         except StopIteration as end:
-            yield Reached(best, None, None, skipped=useless, reason=end.value)
+            yield Iterate(best, None, None, skipped=useless, reason=end.value)
             return
         if best.evaluations >= evaluations:
             reason = "evaluations"
-        yield Reached(best, query.parameters, None if reason else query.state, skipped=useless, reason=reason)
+        yield Iterate(best, query.parameters, None if reason else query.state, skipped=useless, reason=reason)
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ Values = Generator[Query, Evaluation, tuple[float, Tensor]]  # returns the merit
 
 
 @dataclass(frozen=True)
-class Search:
+class LbfgsState:
     """State of L-BFGS between two steps."""
 
     x: Tensor
@@ -153,7 +153,7 @@ class Search:
     before: float = math.inf  # best merit at the last check for a plateau
 
 
-def lbfgs(start: list[Tensor], evaluations: int, state: Search | None = None) -> Method:
+def lbfgs(start: list[Tensor], evaluations: int, state: LbfgsState | None = None) -> Method:
     """Run limited-memory BFGS with a strong Wolfe line search (Nocedal and Wright 2006, algorithms 7.5, 3.5, 3.6).
 
     Returns "plateau" if PLATEAU_STEPS steps lowered the merit by less than the fraction PLATEAU_GAIN, while more than
@@ -172,7 +172,7 @@ def lbfgs(start: list[Tensor], evaluations: int, state: Search | None = None) ->
     search = state
     if search is None:
         x = torch.cat([p.detach().reshape(-1) for p in start])
-        search = Search(x, *(yield from at(x)))
+        search = LbfgsState(x, *(yield from at(x)))
         search = replace(search, before=best.merit)
     while True:
         resumable = search
@@ -186,7 +186,7 @@ def lbfgs(start: list[Tensor], evaluations: int, state: Search | None = None) ->
             search = replace(search, before=best.merit)
 
 
-def _step(at: Callable[[Tensor], Values], search: Search) -> Generator[Query, Evaluation, Search | None]:
+def _step(at: Callable[[Tensor], Values], search: LbfgsState) -> Generator[Query, Evaluation, LbfgsState | None]:
     """Take one step; return None if there is no direction of descent."""
     x, value, g, pairs = search.x, search.value, search.gradient, search.pairs
     direction = -_inverse_hessian_times(g, pairs)
@@ -200,7 +200,7 @@ def _step(at: Callable[[Tensor], Values], search: Search) -> Generator[Query, Ev
     s, y = trial.step * direction, trial.gradient - g
     if (curvature := dot(s, y)) > 1e-10 * math.sqrt(dot(s, s) * dot(y, y)):
         pairs = (*pairs, (s, y, curvature))[-LBFGS_MEMORY:]
-    return Search(x + s, trial.value, trial.gradient, pairs=pairs, steps=search.steps + 1, before=search.before)
+    return LbfgsState(x + s, trial.value, trial.gradient, pairs=pairs, steps=search.steps + 1, before=search.before)
 
 
 def _inverse_hessian_times(g: Tensor, pairs: Sequence[tuple[Tensor, Tensor, float]]) -> Tensor:

@@ -152,7 +152,5 @@ def _cubic_weights(at: np.ndarray, m: int) -> tuple[np.ndarray, np.ndarray]:
     """Return indices and weights (k, 4) of the cubic convolution (Keys 1981, a = -1/2) at positions (k,) among m."""
     first = np.minimum(at.astype(int), m - 2)
     t = at - first
-    weights = np.stack([
-        t * (-1 + t * (2 - t)), 2 + t * t * (-5 + 3 * t), t * (1 + t * (4 - 3 * t)), t * t * (t - 1),
-    ], axis=1) / 2  # fmt: skip
-    return np.clip(first[:, None] + np.arange(-1, 3), 0, m - 1), weights
+    weights = t * (-1 + t * (2 - t)), 2 + t * t * (-5 + 3 * t), t * (1 + t * (4 - 3 * t)), t * t * (t - 1)
+    return np.clip(first[:, None] + np.arange(-1, 3), 0, m - 1), np.stack(weights, axis=1) / 2

@@ -45,7 +45,7 @@ from bstcad.tailoring.slope_map import (
 FACE_CELLS, FACE_STRIDE = 33, 4  # cells a side of the face, and stride of those whose light is tried for all aims
 BOX_AIMS = 5  # aims a side, in the rectangle around the lit target, of the first check
 MAX_AIMS = 64  # largest number of pixels along the longer side of the target at whose corners the reach is computed
-COARSE_NET, COARSE_CELLS, COARSE_ITERATIONS = 33, 64, 40  # size and iterations of the coarse maps
+MAP_NET, MAP_CELLS, MAP_ITERATIONS = 33, 64, 40  # size and iterations of the coarse maps
 MAX_ROUNDS = 6  # largest number of coarse maps
 SETTLED_FRACTION = 1e-3  # change of the reachable light at which the rounds end, as a fraction of all light
 COARSE_FIT = Fit(bending=1e-2, steps=40, degree=3)  # fit of the face to a coarse map
@@ -57,7 +57,7 @@ def reachable(source: Emitter, lens: Lens, goal: Goal, grazing: float = MAX_EXIT
 
     lens: the blank, with its final front.  grazing: largest angle at which light may leave the face (rad).
     """
-    screen, picture, small_goal = goal.receiver, goal.picture, resampled(goal)
+    screen, picture, small_goal = goal.receiver, goal.picture, resample(goal)
     few, small = small_goal.receiver, small_goal.picture
     grid = face_grid(source, lens, lit_window(source, lens, FACE_CELLS), FACE_CELLS)
     lit = [corner[corners_of(small)] for corner in pixel_corners(few)]
@@ -69,16 +69,16 @@ def reachable(source: Emitter, lens: Lens, goal: Goal, grazing: float = MAX_EXIT
     if float(reach_margin(ordered, aims, plane, law=law, grazing=grazing).min()) >= 0:
         return None
     found = _inside(reach_from_each(grid, pixel_corners(few), plane, law, grazing=grazing).amax(0), screen, few)
-    wanted, lens = None, lens.refined(COARSE_NET)
+    wanted, lens = None, lens.refined(MAP_NET)
     for turn in range(MAX_ROUNDS):
         if not picture[found].sum() > 0:
             break
         window = lit_window(source, lens)
-        part = resampled(goal.restricted(found)).picture
+        part = resample(goal.restricted(found)).picture
         wanted = slope_map(
-            source, lens, window, part, screen=few, n=COARSE_CELLS, previous=wanted, iterations=COARSE_ITERATIONS
+            source, lens, window, part, screen=few, n=MAP_CELLS, previous=wanted, iterations=MAP_ITERATIONS
         )
-        grid = face_grid(source, lens, window, 2 * COARSE_NET)
+        grid = face_grid(source, lens, window, 2 * MAP_NET)
         aims, rays = torch.from_numpy(np.stack(pixel_corners(few))), rays_at(grid, wanted.places)
         before, found = found, _inside(reach_margin(rays, aims, plane, law=law, grazing=grazing), screen, few)
         if turn and picture[before ^ found].sum() <= SETTLED_FRACTION:
@@ -87,7 +87,7 @@ def reachable(source: Emitter, lens: Lens, goal: Goal, grazing: float = MAX_EXIT
     return found if (picture[~found] > 0).any() else None
 
 
-def resampled(goal: Goal, pixels: int = MAX_AIMS) -> Goal:
+def resample(goal: Goal, pixels: int = MAX_AIMS) -> Goal:
     """Return the goal resampled to at most `pixels` pixels along the longer side, by means over the pixels."""
     screen, picture = goal.receiver, goal.picture
     shrunk = max(1.0, max(screen.shape) / pixels)

@@ -3,7 +3,7 @@
 Tailoring has two stages (Wang et al. 2023).  Stage 1 computes the transport map from source to target and fits the
 surface to it (stage1.py; two_faces.py where the front is freeform too).  Stage 2 starts from that surface and minimises
 the error of the traced irradiance (stage2.py); stage 3 takes its place for a source of finite size.  A stage is an
-iterator of `Step`s and knows nothing of time.  The driver takes the steps, measures time, saves states, reports
+iterator of steps and knows nothing of time.  The driver takes the steps, measures time, saves states, reports
 progress, and stops when there is a reason to end.
 """
 
@@ -54,7 +54,7 @@ class Parameters:
         front = {} if lens.front.is_net else lens.front.parameters()
         return cls(tuple(NetParameters(net.z, net.heights) for net in lens.nets), front, lens.back.z)
 
-    def applied(self, lens: Lens) -> Lens:
+    def apply_to(self, lens: Lens) -> Lens:
         """Return `lens` with these parameters, on the device of `lens`."""
         like = lens.like
         lens = lens.with_front(lens.front.with_parameters(**self.front).to(like.dtype, like.device))
@@ -64,24 +64,24 @@ class Parameters:
 
 
 @dataclass(frozen=True)
-class Judged:
-    """A lens with its figures for the whole design: all pixels, all goals, and the light of the whole source."""
+class RatedLens:
+    """Lens with its figures for the whole design: all pixels, all goals, and the light of the whole source."""
 
     rrmsd: float  # RRMSD by `Task.rrmsd`
     figure: float  # square root of the merit of all goals (merit.py); equal to the RRMSD without a wavefront goal
     lens: Parameters
 
-    def beats(self, other: Judged) -> bool:
+    def beats(self, other: RatedLens) -> bool:
         """Return True if this lens is better than another by more than the error of the figures."""
         theirs = math.inf if math.isnan(other.figure) else other.figure  # NaN: no light arrives
         return SIGNIFICANT_RATIO * self.figure < theirs
 
 
 SIGNIFICANT_RATIO = 1.05  # smallest ratio of two figures that is significant: STAGE_EFFORT has errors of 5 %
-BEST = "back to the best lens before"  # name of a stage in the record
+BEST_LENS_STAGE = "back to the best lens before"  # name of a stage in the record
 WAVEFRONT_TUBES = 256  # tubes a side for the wavefront error of a lens between the stages
-EVALUATED = 4.7e6  # tubes traced per second, with the gradient of the merit, on a machine of pace 1
-JUDGING = 0.5  # seconds that `Task.rrmsd` takes on a machine of pace 1
+TUBES_PER_SECOND = 4.7e6  # tubes traced per second, with the gradient of the merit, on a machine of pace 1
+RRMSD_SECONDS = 0.5  # seconds that `Task.rrmsd` takes on a machine of pace 1
 # Rays for the RRMSD of a lens between the stages, to some 5 % for a target of STAGE_EFFORT_PIXELS pixels a side.  The
 # error of the product of two pictures of n² stratified rays falls as (p / n)³ / p, so a target of p pixels a side takes
 # (p / STAGE_EFFORT_PIXELS)^⅔ times as many rays a side.
@@ -93,7 +93,7 @@ Progress = Callable[[str, int, int, str], None]  # stage, done, total, text
 PACE_MEMORY = 4.0  # seconds of work over which the pace of the machine is averaged
 
 
-def silent(stage: str, done: int, total: int, text: str) -> None:
+def no_progress(stage: str, done: int, total: int, text: str) -> None:
     """Report no progress; the default `Progress`."""
 
 
@@ -112,19 +112,19 @@ class Task:
     channels: tuple[Channel, ...]  # light of the source; for a source of finite size, of its centre
     goals: tuple[Goal, ...]  # targets; stage 1 with one freeform face uses the first alone
     knobs: Tailoring  # settings of the scene's [tailoring], all set
-    least: float = 0.0  # minimum thickness of the glass everywhere (mm)
+    min_thickness: float = 0.0  # minimum thickness of the glass everywhere (mm)
     free: tuple[str, ...] = ()  # names of the parameters of the front that are optimised
     rim_sags: tuple[float, float] = (-math.inf, math.inf)  # range of the sag at the rim of such a front (mm)
-    progress: Progress = silent  # receives the progress within a step
+    progress: Progress = no_progress  # receives the progress within a step
     tidy: Callable[[], None] = lambda: None  # returns freed memory to the system between large allocations
-    grown: tuple[tuple[Channel, ...], ...] = ()  # sampled light of the source at each size of stage 3; () for a point
+    sampled_sources: tuple[tuple[Channel, ...], ...] = ()  # light of the source at each size of stage 3; (): a point
     bounds: Bounds | None = None  # bounds on the shape of the tailored faces; None: no bounds
     spreads: tuple[Spread, ...] = ()  # source at each size of stage 3, for its blur
     edge: Edge | None = None  # light at the edge of a target cut to its reachable part; None: all of it is reachable
     # function of a picture (rows, columns) and of the target, both of sum <= 1, that stage 2 minimises; None: RRMSD²
     merit: Callable[[Tensor, Tensor], Tensor] | None = None
     wave: Wave | None = None  # wavefront that the light shall have behind the lens; None: no such goal
-    hasty: bool = False  # preview: one round a stage, no RRMSD by rays, no costly alternative
+    preview: bool = False  # preview: one round a stage, no RRMSD by rays, no costly alternative
     solution: float | None = None  # sign σ of light_behind.py, +1 or -1; None: the one with the smaller angles
     floor: float = 0.0  # irradiance, relative to the mean, to which stage 1 of two faces raises the furthest picture
     front_sides: Callable[[Sides], Sides | None] = lambda sides: None  # front's control points, by those of the back
@@ -147,14 +147,14 @@ class Task:
     @property
     def whole(self) -> Task:
         """Task with the sampled light of the whole source in place of that of its centre."""
-        return replace(self, channels=self.grown[-1], grown=()) if self.grown else self
+        return replace(self, channels=self.sampled_sources[-1], sampled_sources=()) if self.sampled_sources else self
 
     def refined(self, lens: Lens, sides: Sides) -> Lens:
         """Return the lens with its nets refined to the numbers of control points that go with `sides` on the back."""
         pairs = zip(lens.nets, self.sides(lens, sides), strict=True)
         return lens.with_nets(net.refined(own) for net, own in pairs)
 
-    def aimed(self, lens: Lens) -> Task:
+    def with_imaged_receivers(self, lens: Lens) -> Task:
         """Return the task with its receivers imaged through the surfaces behind the last net; stage 1 aims there."""
         goals = (replace(goal, receiver=image_screen(lens, goal.receiver)) for goal in self.goals)
         return replace(self, goals=tuple(goals))
@@ -171,7 +171,7 @@ class Task:
             pixels = max(goal.picture.size for goal in self.goals)
             rays = STAGE_EFFORT.rays * (pixels / STAGE_EFFORT_PIXELS**2) ** (1 / 3)
             effort = replace(STAGE_EFFORT, rays=round(rays))
-        draw = self.spreads[-1].draw if self.spreads and not self.grown else None  # whole source
+        draw = self.spreads[-1].draw if self.spreads and not self.sampled_sources else None  # whole source
         lens = lens.plain()
         values = [
             rrmsd_by_rays(lens, self.channels, goal.receiver, target=goal.picture, effort=effort, draw=draw)
@@ -179,31 +179,31 @@ class Task:
         ]
         return math.nan if any(map(math.isnan, values)) else max(values)
 
-    def judged(self, lens: Lens, rrmsd: float) -> Judged:
+    def rated(self, lens: Lens, rrmsd: float) -> RatedLens:
         """Return the lens with its figure of merit, given its RRMSD by `rrmsd`."""
         figure = rrmsd
         if self.wave is not None:
             merit = Merit.of(self.channels, lens, WAVEFRONT_TUBES, goals=(), overshoot=0.0, wave=self.wave)
             square, pictures = float(merit(merit.landing(lens))[0]), sum(goal.weight for goal in self.goals)
             figure = math.sqrt((pictures * rrmsd**2 + self.wave.weight * square) / (pictures + self.wave.weight))
-        return Judged(rrmsd, figure, Parameters.of(lens))
+        return RatedLens(rrmsd, figure, Parameters.of(lens))
 
-    def better(self, latest: Lens, before: Lens) -> tuple[Lens, Judged]:
+    def better(self, latest: Lens, before: Lens) -> tuple[Lens, RatedLens]:
         """Return the better of two lenses and its figures by FINE_EFFORT; `latest` if they differ too little.
 
         STAGE_EFFORT does not resolve an RRMSD below about 0.01: it ranked a lens of 0.0070 before one of 0.0048.
         """
-        now, then = (self.judged(lens, self.rrmsd(lens, FINE_EFFORT)) for lens in (latest, before))
+        now, then = (self.rated(lens, self.rrmsd(lens, FINE_EFFORT)) for lens in (latest, before))
         return (before, then) if then.beats(now) else (latest, now)
 
-    def used(self, lens: Lens) -> float:
+    def flux_on_target(self, lens: Lens) -> float:
         """Return the fraction of the light entering the lens that falls on the first target."""
         goal = self.goals[0]
         return measure(lens.plain(), self.channels, goal.receiver, target=goal.picture, effort=FLUX_EFFORT).used
 
 
 @dataclass(frozen=True)
-class Step:
+class StageStep:
     """State of a stage after one of its steps; the driver decides whether the stage goes on."""
 
     make: Callable[[], Lens] | None  # function that makes the best lens so far; None: there is no lens yet
@@ -214,8 +214,8 @@ class Step:
     places: tuple[np.ndarray, np.ndarray] | None = None
     progress: tuple[str, int, int, str] | None = None  # stage, done, total, text
     rrmsd: float | None = None  # RRMSD of the lens by the tubes or rays that tailor it
-    judged: float | None = None  # RRMSD of the lens by `Task.rrmsd`
-    whole: bool = True  # True if `judged` is for the whole source, False for a smaller one
+    rays_rrmsd: float | None = None  # RRMSD of the lens by `Task.rrmsd`
+    whole: bool = True  # True if `rays_rrmsd` is for the whole source, False for a smaller one
     work: float = 0.0  # seconds that the step takes on a machine of pace 1; 0: unknown
     skipped: bool = False  # True if the step was left out because merit or gradient was not finite
     part: str = ""  # name of the part of the design under way, for the list of times; "": none has begun
@@ -228,24 +228,24 @@ class Step:
         return self.make()
 
 
-def never() -> bool:
+def not_interrupted() -> bool:
     """Return False: no user interrupts the design."""
     return False
 
 
-def forget(state: Any) -> None:
+def discard_state(state: Any) -> None:
     """Save no state; the default of `Driver.save`."""
 
 
-Look = Callable[[Callable[[], Lens]], None]  # called with the function that makes the best lens so far
+LensCallback = Callable[[Callable[[], Lens]], None]  # called with the function that makes the best lens so far
 
 
-def unseen(make: Callable[[], Lens]) -> None:
-    """Show no lens; the default `Look`."""
+def ignore_lens(make: Callable[[], Lens]) -> None:
+    """Show no lens; the default `LensCallback`."""
 
 
 @dataclass(frozen=True)
-class Stage:
+class StageTime:
     """Time and RRMSD of one stage, or of one part of it."""
 
     name: str
@@ -255,10 +255,10 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class Record:
+class DesignRecord:
     """Record of a design so far: times of its stages and convergence history."""
 
-    stages: tuple[Stage, ...] = ()
+    stages: tuple[StageTime, ...] = ()
     history: tuple[tuple[float, float], ...] = ()  # (seconds since the start, RRMSD)
     skipped: int = 0  # number of steps left out because merit or gradient was not finite
     seconds: float = 0.0  # time since the start, summed over all runs that resumed the design
@@ -270,25 +270,25 @@ class Driver:
 
     limit: seconds for the whole run, including the work after tailoring, which takes `reserve` seconds on a machine of
     pace 1.  interrupted: returns True once the user wants the best lens so far.  save: called with each state from
-    which the design can resume.  look: called after each step that has an RRMSD.  record: the record of the earlier
+    which the design can resume.  on_lens: called after each step that has an RRMSD.  record: the record of the earlier
     runs that this one resumes.
     """
 
     def __init__(
         self,
-        progress: Progress = silent,
+        progress: Progress = no_progress,
         began: float | None = None,
         *,
         limit: float = math.inf,
         reserve: float = 0.0,
-        interrupted: Callable[[], bool] = never,
-        save: Callable[[Any], None] = forget,
-        look: Look = unseen,
-        record: Record = Record(),
+        interrupted: Callable[[], bool] = not_interrupted,
+        save: Callable[[Any], None] = discard_state,
+        on_lens: LensCallback = ignore_lens,
+        record: DesignRecord = DesignRecord(),
         clock: Callable[[], float] = time.perf_counter,
         processor: Callable[[], float] = time.process_time,
     ) -> None:
-        self.progress, self.interrupted, self.save, self.look = progress, interrupted, save, look
+        self.progress, self.interrupted, self.save, self.on_lens = progress, interrupted, save, on_lens
         self.pace = 1.0  # recent time of work here over its time on a machine of pace 1
         self.stopped = ""  # reason why tailoring ended: "evaluations", "plateau", "accuracy", "time" or "interrupt"
         self._limit, self._reserve, self._clock, self._before = limit, reserve, clock, record
@@ -296,30 +296,30 @@ class Driver:
         self._step = 0.0  # seconds of the last evaluation, the estimate for the next
         self._last = clock()  # time at the end of the last step
         self._processor, self._spent = processor, processor()
-        self.best: Judged | None = None  # best lens at the ends of the parts of the stage under way
+        self.best: RatedLens | None = None  # best lens at the ends of the parts of the stage under way
         self._record = record
 
     @property
-    def record(self) -> Record:
+    def record(self) -> DesignRecord:
         """Record of the stages and the history so far."""
         seconds, cpu = self._clock() - self._began, self._processor() - self._spent
         return replace(self._record, seconds=self._before.seconds + seconds, cpu_seconds=self._before.cpu_seconds + cpu)
 
     @property
-    def hurry(self) -> str:
+    def reason_to_end(self) -> str:
         """Reason to end now with the best lens so far: "interrupt", "time" (the rest is reserved) or ""."""
         late = self.record.seconds + self._step > self._limit - self.pace * self._reserve
-        return self.wish or ("time" if late else "")
+        return self.reason_to_interrupt or ("time" if late else "")
 
     @property
-    def wish(self) -> str:
+    def reason_to_interrupt(self) -> str:
         """Reason to end a stage that has no time limit of its own: "interrupt" or ""."""
         return "interrupt" if self.interrupted() else ""
 
     def run(
-        self, steps: Iterator[Step], task: Task, saved: Callable[[Any], Any], why: Callable[[], str],
-        best: Judged | None = None,
-    ) -> Step:  # fmt: skip
+        self, steps: Iterator[StageStep], task: Task, saved: Callable[[Any], Any], why: Callable[[], str],
+        best: RatedLens | None = None,
+    ) -> StageStep:  # fmt: skip
         """Run a stage until it ends or `why` returns a reason to end it; return its last step.
 
         saved: makes the state to save from the state of a step.  best: the best lens before the stage; afterwards
@@ -330,24 +330,23 @@ class Driver:
         for step in steps:
             self.stopped = self._take(step, saved) or (step.make and why()) or ""
             if step.ends:
-                self._compare(step, task)
+                self._update_best(step, task)
             if self.stopped:
                 break
         if self.stopped and step.part and not step.ends:
-            step = replace(step, judged=task.rrmsd(step.lens) if step.judged is None else step.judged)
-            self.end(step.part, step.judged)
-            self._compare(step, task)
+            step = replace(step, rays_rrmsd=task.rrmsd(step.lens) if step.rays_rrmsd is None else step.rays_rrmsd)
+            self.end(step.part, step.rays_rrmsd)
+            self._update_best(step, task)
         self.stopped = self.stopped or "evaluations"
         return step
 
-    def _compare(self, step: Step, task: Task) -> None:
-        """Update `self.best` with the lens of a step."""
-        if step.judged is not None and step.whole:
-            latest = task.judged(step.lens, step.judged)
+    def _update_best(self, step: StageStep, task: Task) -> None:
+        if step.rays_rrmsd is not None and step.whole:
+            latest = task.rated(step.lens, step.rays_rrmsd)
             if self.best is None or math.isnan(self.best.figure) or latest.figure < self.best.figure:
                 self.best = latest
 
-    def _take(self, step: Step, saved: Callable[[Any], Any]) -> str:
+    def _take(self, step: StageStep, saved: Callable[[Any], Any]) -> str:
         """Record a step; return the reason if the stage ends with it, else ""."""
         now = self._clock()
         if step.work:
@@ -360,10 +359,10 @@ class Driver:
         self._record = replace(self._record, skipped=self._record.skipped + step.skipped)
         if step.rrmsd is not None:
             self.note(step.rrmsd)
-        if step.make and (step.rrmsd is not None or step.judged is not None):
-            self.look(step.make)
+        if step.make and (step.rrmsd is not None or step.rays_rrmsd is not None):
+            self.on_lens(step.make)
         if step.ends:
-            self.end(step.part, step.judged)
+            self.end(step.part, step.rays_rrmsd)
         if step.state is not None:
             self.save(saved(step.state))
         return step.reason
@@ -388,6 +387,6 @@ class Driver:
         cpu = None  # unknown for the first part: most of it was over when this driver was made
         if record.stages:
             cpu = record.cpu_seconds - sum(stage.cpu_seconds or 0.0 for stage in record.stages)
-        self._record = replace(record, stages=(*record.stages, Stage(name, record.seconds - spent, value, cpu)))
+        self._record = replace(record, stages=(*record.stages, StageTime(name, record.seconds - spent, value, cpu)))
         if value is not None:
             self.note(value)

@@ -132,17 +132,17 @@ class SlopeMap:
 
 def slope_map(
     source: Emitter, lens: Lens, window: Rectangle, picture: np.ndarray, screen: Screen, n: int,
-    previous: SlopeMap | None, hasty: bool = False, **solver,
+    previous: SlopeMap | None, preview: bool = False, **solver,
 ) -> SlopeMap:  # fmt: skip
     """Return the map of one round, by transport on n x n cells for the sag of `lens`.
 
     previous: map of the last round, which gives b(t); None: b = 0.  window: `lit_window` of the lens.
-    hasty: fit g in a fifth of the time; the fixed point is the same.  solver: further arguments of transport's `solve`.
+    preview: fit g in a fifth of the time; the fixed point is the same.  solver: more arguments of transport's `solve`.
     """
     grid, screen, law = square_grid(source, lens, window, n), image_screen(lens, screen), lens.last_freeform.law
     t = pixel_corners(screen)
     b = previous.places if previous else tuple(map(np.zeros_like, t))
-    net = gathering(grid, lens, screen.plane, centroid(picture, screen), hasty=hasty)
+    net = gathering(grid, lens, screen.plane, centroid(picture, screen), preview=preview)
     needed = wanted_slopes(rays_at(grid, b), torch.from_numpy(np.stack(t)), screen.plane, law)
     sign = -1.0 if law.reverses or law.eta < 1 else 1.0
     found = transport_slopes(grid, picture, net, needed, places=b, sign=sign, n=n, **solver)
@@ -150,7 +150,7 @@ def slope_map(
 
 
 def square_grid(source: Emitter, lens: Lens, window: Rectangle, n: int) -> FaceGrid:
-    """`face_grid` of a square around a window, of SUBCELLS cells each way for each of n x n of the transport."""
+    """Return the `face_grid` of a square around a window, with SUBCELLS x SUBCELLS cells per cell of the transport."""
     side = max(window.width, window.height)
     return face_grid(source, lens, Rectangle(side, side), n * SUBCELLS)
 
@@ -159,9 +159,9 @@ def transport_slopes(
     grid: FaceGrid, picture: np.ndarray, net: BSplineSurface, needed: tuple[Tensor, Tensor],
     places: tuple[np.ndarray, np.ndarray], *, sign: float, n: int, **solver,
 ) -> SlopeMap:  # fmt: skip
-    """The map of the light of a `square_grid` to the slopes that are needed for each corner of a picture's pixels.
+    """Return the map from the light of a `square_grid` to a picture, given the slopes needed for its pixel corners.
 
-    net: g; places: b (mm) of each corner in the round before, for which the slopes are.
+    net: g.  needed: slopes p(b, t) for the corners t of the pixels.  places: their b (mm), those of the last round.
     """
     side = grid.window.width
     rho = grid.density.cpu().double().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3))
@@ -204,9 +204,8 @@ def fit_to_map(
         for z, needed, own in zip((z_x, z_y), slopes, now, strict=True):
             z[some] = torch.where(lit[some], needed.to(x), own)
     weight = torch.where(lit, 1.0, unlit).to(x)
-    return lens.with_last_net(
-        fit_slopes(net, x, y, z_x=z_x, z_y=z_y, weight=weight, fit=fit).from_vertex().moved(net.z)
-    )
+    fitted = fit_slopes(net, x, y, z_x=z_x, z_y=z_y, weight=weight, fit=fit)
+    return lens.with_last_net(fitted.from_vertex().moved(net.z))
 
 
 def centroid(picture: np.ndarray, screen: Screen) -> tuple[float, float]:
@@ -218,13 +217,13 @@ def centroid(picture: np.ndarray, screen: Screen) -> tuple[float, float]:
 
 
 def gathering(
-    grid: FaceGrid, lens: Lens, plane: Receiver, middle: tuple[float, float], hasty: bool = False
-) -> BSplineSurface:  # fmt: skip
+    grid: FaceGrid, lens: Lens, plane: Receiver, middle: tuple[float, float], preview: bool = False
+) -> BSplineSurface:
     """Return g, the net of GATHERING_NET points a side whose slopes fit p(b, m) best over the lit part of a grid.
 
     With the sag fixed, p(b, m) is a gradient but for a curl of the order ∂p/∂z x y.
     """
-    count, fit = (PREVIEW_SAMPLES, PREVIEW_FIT) if hasty else (GATHERING_SAMPLES, GATHERING_FIT)
+    count, fit = (PREVIEW_SAMPLES, PREVIEW_FIT) if preview else (GATHERING_SAMPLES, GATHERING_FIT)
     thin = tuple(slice(step // 2, None, step) for step in (max(1, n // count) for n in grid.shape))
     faces = replace(grid.at_face, **{k: getattr(grid.at_face, k)[(..., *thin)] for k in ("position", "direction")})
     x, y, _ = faces.position
@@ -262,7 +261,7 @@ def rays_at(grid: FaceGrid, b: tuple) -> Rays:
     return replace(grid.at_face, position=position, direction=direction)
 
 
-def sent_from(places: tuple[np.ndarray, np.ndarray], screen: Screen) -> TransportMap:
+def map_from_face(places: tuple[np.ndarray, np.ndarray], screen: Screen) -> TransportMap:
     """Return the map for the corners of the target's pixels, given as points (mm) of the last tailored face.
 
     places: x and y, each (columns + 1, rows + 1).  The plane of the map is named "back" even if the face is the front.
@@ -338,13 +337,13 @@ def map_to_target(
     return solve(density, wanted, Frame((0.0, 0.0), side), frame, iterations=iterations, progress=progress)
 
 
-def sent_from_entrance(mapping: Mapping, lens: Lens, screen: Screen) -> TransportMap:
+def map_from_entrance(mapping: Mapping, lens: Lens, screen: Screen) -> TransportMap:
     """Return the inverse of the map of `map_to_target` at the corners of the target's pixels."""
     screen = image_screen(lens, screen)
     corners = pixel_corners(screen)
     if not screen.plane.is_level:
         corners = screen.plane.to_level_plane(*corners, lens.front.z)
-    return replace(sent_from(mapping.inverse(*corners), screen), plane="entrance")
+    return replace(map_from_face(mapping.inverse(*corners), screen), plane="entrance")
 
 
 def aim_points(mapping: Mapping, lens: Lens, screen: Screen, x: Tensor, y: Tensor) -> Tensor:

@@ -38,7 +38,7 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import point_pairs
 
-NODES = 5  # nodes a side, from border to border of the screen
+IMAGE_NODES = 5  # nodes a side, from border to border of the screen
 IMAGE_GRID = 32  # points a side of the back, through which the images of the source are traced
 POINT_DISTANCE = 0.7  # distance of the 3 x 3 points of the source from its centre, in half widths
 IMAGE_PAIRS = 256  # pairs of points of the source in an image
@@ -46,9 +46,9 @@ PIXEL_PARTS = 5  # parts of a pixel a side in the images; odd
 ERROR_RAYS = 1448  # rays a side in each of the two sets that measure the error of the blur
 ERROR_POINTS = 256  # points of the source in each set
 ERROR_SMOOTHING = 0.15  # standard deviation of the smoothing of this error, in radii of the image
-MAX_BYTES, VALUE_BYTES = 2 << 30, 8  # limit for the transforms of all images, and size of one value (bytes)
+MAX_TRANSFORM_BYTES, VALUE_BYTES = 2 << 30, 8  # limit for the transforms of all images, and size of one value (bytes)
 MIN_BORDER = 16  # smallest border (pixels)
-SEED_OFFSET = 500_009  # offset of the seed, so that these rays differ from those that verify the lens
+ERROR_SEED_OFFSET = 500_009  # offset of the seed, so that these rays differ from those that verify the lens
 
 
 @dataclass(frozen=True)
@@ -112,12 +112,9 @@ def blurred(light: Tensor, blur: BlurOperator) -> Tensor:
 
 def with_border(screen: Screen, border: int) -> Screen:
     """Return the screen with `border` more pixels on each side."""
-    per_x, per_y = screen.per_unit
-    x, y = screen.x, screen.y
-    return replace(
-        screen, x=(x[0] - border / per_x, x[1] + border / per_x), y=(y[0] - border / per_y, y[1] + border / per_y),
-        pixels=(screen.columns + 2 * border, screen.rows + 2 * border),
-    )  # fmt: skip
+    sides = zip((screen.x, screen.y), screen.per_unit, strict=True)
+    x, y = ((low - border / per_unit, high + border / per_unit) for (low, high), per_unit in sides)
+    return replace(screen, x=x, y=y, pixels=(screen.columns + 2 * border, screen.rows + 2 * border))
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +123,7 @@ class SourceImages:
 
     at: Tensor  # (2, points) landing points of the centre's light (column, row) in pixels
     offset: Tensor  # (2, 9, points) displacement δ of 3 x 3 points of the source, in pixels
-    share: Tensor  # (9, points) flux of each of these over that of the centre
+    flux: Tensor  # (9, points) flux of each of these over that of the centre
 
     @classmethod
     def of(cls, source: Emitter, channel: Channel, lens: Lens, screen: Screen) -> SourceImages:
@@ -141,11 +138,11 @@ class SourceImages:
         return cls(pixel[:, 0], pixel[:, 1:] - pixel[:, :1], flux[1:] / flux[0])
 
     def nearest(self, column: float, row: float) -> tuple[Tensor, Tensor]:
-        """Return offset (2, 9) and share (9,) of the image nearest to a pixel; those of a point source if none."""
+        """Return offset (2, 9) and flux (9,) of the image nearest to a pixel; those of a point source if none."""
         if not self.at.shape[1]:
             return torch.zeros(2, 9, dtype=torch.float64), torch.ones(9, dtype=torch.float64)
-        place = int(torch.argmin((self.at[0] - column) ** 2 + (self.at[1] - row) ** 2))
-        return self.offset[..., place], self.share[:, place]
+        point = int(torch.argmin((self.at[0] - column) ** 2 + (self.at[1] - row) ** 2))
+        return self.offset[..., point], self.flux[:, point]
 
 
 def _biquadratic(points: Sequence[tuple[float, float]]) -> Tensor:
@@ -162,7 +159,7 @@ def blurs(spread: Spread, lens: Lens, screen: Screen) -> tuple[BlurOperator, ...
     """Return B for each channel of a source and a lens, all with the same border."""
     unit = Circle(1.0) if spread.source.extent.is_round else Rectangle(2.0, 2.0)
     dots = _biquadratic(point_pairs(unit, IMAGE_PAIRS))
-    nodes = [[k / (NODES - 1) * side for k in range(NODES)] for side in screen.shape]
+    nodes = [[k / (IMAGE_NODES - 1) * side for k in range(IMAGE_NODES)] for side in screen.shape]
     kernels = []
     for channel in spread.centre:
         seen = SourceImages.of(spread.source, channel, lens, screen)
@@ -174,16 +171,16 @@ def blurs(spread: Spread, lens: Lens, screen: Screen) -> tuple[BlurOperator, ...
 
 
 def widest(screen: Screen, lines: int) -> int:
-    """Return the largest border (pixels): no wider than the screen, and within MAX_BYTES bytes for all spectral lines.
+    """Return the largest border (pixels): at most the screen's width, and within MAX_TRANSFORM_BYTES for all lines.
 
     At a tilted target that some light grazes, the images have no bound of their own.
     """
-    side = math.sqrt(MAX_BYTES / (lines * NODES**2 * VALUE_BYTES))
+    side = math.sqrt(MAX_TRANSFORM_BYTES / (lines * IMAGE_NODES**2 * VALUE_BYTES))
     return max(min(max(screen.shape), int((side - max(screen.shape)) / 4)), MIN_BORDER)
 
 
 def _operator(images: Sequence[tuple[Tensor, Tensor]], screen: Screen, border: int) -> BlurOperator:
-    """Make B from the image at each node: offset (2, dots) in pixels, share (dots,) of the centre's flux density.
+    """Make B from the image at each node: offset (2, dots) in pixels, flux (dots,) over that of the centre.
 
     A tent function distributes each dot over parts of a pixel, PIXEL_PARTS a side, whose blur is negligible.
     """
@@ -198,7 +195,7 @@ def _operator(images: Sequence[tuple[Tensor, Tensor]], screen: Screen, border: i
         waves = scipy.fft.rfft(_about_zero(tent(dots, own).numpy(), PIXEL_PARTS * size[1], axis=1))
         waves = scipy.fft.fft(_about_zero(waves[:, : spectrum.shape[1]], PIXEL_PARTS * size[0], axis=0), axis=0)
         spectrum[:] = waves[np.arange(size[0]) - size[0] * (np.arange(size[0]) >= (size[0] + 1) // 2)]
-    return BlurOperator(border, hats, spectra.reshape(NODES, NODES, *spectra.shape[1:]), size)
+    return BlurOperator(border, hats, spectra.reshape(IMAGE_NODES, IMAGE_NODES, *spectra.shape[1:]), size)
 
 
 def _about_zero(values: np.ndarray, n: int, axis: int) -> np.ndarray:
@@ -208,9 +205,9 @@ def _about_zero(values: np.ndarray, n: int, axis: int) -> np.ndarray:
 
 
 def _hats(side: int, border: int) -> np.ndarray:
-    """Return the hat functions (NODES, side + 2 border) of NODES nodes, constant outside the outer ones."""
-    position = np.clip((np.arange(-border, side + border) + 0.5) / side, 0, 1) * (NODES - 1)
-    return np.maximum(0, 1 - np.abs(position - np.arange(NODES)[:, None]))
+    """Return the hat functions (IMAGE_NODES, side + 2 border) of IMAGE_NODES nodes, constant outside the outer ones."""
+    position = np.clip((np.arange(-border, side + border) + 0.5) / side, 0, 1) * (IMAGE_NODES - 1)
+    return np.maximum(0, 1 - np.abs(position - np.arange(IMAGE_NODES)[:, None]))
 
 
 @torch.no_grad()
@@ -224,13 +221,13 @@ def blur_error(by_images: Tensor, draw: Draw, lens: Lens, screen: Screen, *, bor
     """
     picture, errors = by_images.cpu(), []
     for k in range(2):
-        points = draw(ERROR_POINTS, seed + SEED_OFFSET + k)
+        points = draw(ERROR_POINTS, seed + ERROR_SEED_OFFSET + k)
         n = max(1, round(side_factor(points) * ERROR_RAYS))
-        rays = simulated(lens, points, screen, n=n, seed=seed + SEED_OFFSET + k)
+        rays = simulated(lens, points, screen, n=n, seed=seed + ERROR_SEED_OFFSET + k)
         left = sum(rays.flux[line] for line in ("on target", "off target", "total internal reflection"))
         error = (rays.box / left - picture).numpy() if left > 0 else np.zeros(picture.shape)
         errors.append(gaussian_filter(error, ERROR_SMOOTHING * (border - 2)))
     mean = (errors[0] + errors[1]) / 2
     noisy = float((mean**2).sum())
-    share = max(float((errors[0] * errors[1]).sum()), 0.0) / noisy if noisy > 0 else 0.0
-    return (torch.from_numpy(mean) * share).to(by_images.device)
+    scale = max(float((errors[0] * errors[1]).sum()), 0.0) / noisy if noisy > 0 else 0.0
+    return (torch.from_numpy(mean) * scale).to(by_images.device)

@@ -34,15 +34,15 @@ from bstcad.scene.quality import COARSEST_GRID
 from bstcad.scene.scene import SEARCH_RANGE
 from bstcad.tailoring.machinability import place_back
 from bstcad.tailoring.merit import landing
-from bstcad.tailoring.reachable import resampled
-from bstcad.tailoring.run import Parameters, Step, Task
+from bstcad.tailoring.reachable import resample
+from bstcad.tailoring.run import Parameters, StageStep, Task
 from bstcad.tailoring.slope_fit import Fit, tailor_to_aim
 from bstcad.tailoring.slope_map import SlopeMap, aim_points, face_grid, fit_to_map, lit_window, map_to_target, slope_map
 from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Mapping
 
-COARSE = (Fit(bending=1e-2, steps=40, degree=3), 0.0)  # fit, weight of unlit points: stiff, extrapolates there
-FINE = (Fit(), 1e-2)  # fit, weight of unlit points: these keep the slopes of the coarse face
+COARSE_FACE_FIT = (Fit(bending=1e-2, steps=40, degree=3), 0.0)  # fit, weight of unlit points: stiff, extrapolates there
+FINE_FACE_FIT = (Fit(), 1e-2)  # fit, weight of unlit points: these keep the slopes of the coarse face
 FINE_ROUNDS = 2  # number of rounds at the end on half of the transport's grid and on all of it
 # RRMSD, and RMS change of the map in the last round in half widths of the face, above which `follow_aims` is tried.
 # The change is at most 0.016 where more rounds gain nothing.
@@ -60,7 +60,7 @@ UNBOUNDED = (-math.inf, math.inf)
 PREVIEW_NET, PREVIEW_FRONT = 17, {"n": 32, "iterations": 40, "repeats": 1}  # `shaped_front` in a preview
 
 Range = tuple[float, float]
-Merit = Callable[[Lens], float]
+FrontMerit = Callable[[Lens], float]
 
 
 @dataclass(frozen=True)
@@ -72,49 +72,47 @@ class SlopeRound:
     wanted: SlopeMap  # map of the last round
 
 
-def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[Step]:
+def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[StageStep]:
     """Yield the steps of stage 1 for a blank, or from a saved state on.
 
-    The rounds come first (`follow_slopes`), then `follow_aims` if their result is poor (`doubtful`).
+    The rounds come first (`follow_slopes`), then `follow_aims` if their result is poor (`is_poor_result`).
     """
     lens, goal = task.heaviest.through(lens), task.goals[0]
     if state is None and task.free:
-        net, pains = task.knobs.levels[0], {"iterations": task.knobs.transport_iterations}
-        if task.hasty:
-            net, pains = coarser(lens.back.shape, PREVIEW_NET), PREVIEW_FRONT
-        shaped = shaped_front(
-            task.heaviest.source, lens.refined(net), goal.picture, screen=goal.receiver, free=task.free,
-            rim_sags=task.rim_sags, **pains,
-        )  # fmt: skip
+        net, settings = task.knobs.levels[0], {"iterations": task.knobs.transport_iterations}
+        if task.preview:
+            net, settings = coarser(lens.back.shape, PREVIEW_NET), PREVIEW_FRONT
+        settings = settings | {"free": task.free, "rim_sags": task.rim_sags}
+        shaped = shaped_front(task.heaviest.source, lens.refined(net), goal.picture, goal.receiver, **settings)
         lens = lens.with_front(shaped.front)
     for last in follow_slopes(task, lens, state):
         yield last
-    if task.hasty:
+    if task.preview:
         return
-    first, judged = last.lens, task.rrmsd(last.lens)
-    yield replace(last, state=None, judged=judged)
-    if not doubtful(task, first, judged, last.state):
+    first, by_rays = last.lens, task.rrmsd(last.lens)
+    yield replace(last, state=None, rays_rrmsd=by_rays)
+    if not is_poor_result(task, first, by_rays, last.state):
         return
     other, mapping = follow_aims(task, first.with_last_net(lens.nets[-1]))
     value = task.rrmsd(other)
-    better = value < np.nan_to_num(judged, nan=np.inf)  # NaN: no light on the target
-    if better and task.used(other) >= MIN_FLUX_RATIO * task.used(first):
-        yield Step(lambda: other, mapping=mapping, judged=value)
+    better = value < np.nan_to_num(by_rays, nan=np.inf)  # NaN: no light on the target
+    if better and task.flux_on_target(other) >= MIN_FLUX_RATIO * task.flux_on_target(first):
+        yield StageStep(lambda: other, mapping=mapping, rays_rrmsd=value)
 
 
-def doubtful(task: Task, lens: Lens, judged: float, state: SlopeRound) -> bool:
+def is_poor_result(task: Task, lens: Lens, by_rays: float, state: SlopeRound) -> bool:
     """Return True if the result of the rounds is poor: a large RRMSD, or a map that still moves.
 
     The RRMSD counts at no more pixels than the net has control points: no method shows finer detail.
     """
     goal = task.goals[0]
-    few = resampled(goal, pixels=max(as_pair(task.knobs.levels[-1])))
-    if judged > RETRY_RRMSD and few.receiver.shape != goal.receiver.shape:
-        judged = replace(task, goals=(few,)).rrmsd(lens)
-    return not judged <= RETRY_RRMSD or state.wanted.moved > RETRY_CHANGE  # NaN: no light on the target
+    few = resample(goal, pixels=max(as_pair(task.knobs.levels[-1])))
+    if by_rays > RETRY_RRMSD and few.receiver.shape != goal.receiver.shape:
+        by_rays = replace(task, goals=(few,)).rrmsd(lens)
+    return not by_rays <= RETRY_RRMSD or state.wanted.moved > RETRY_CHANGE  # NaN: no light on the target
 
 
-def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[Step]:
+def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[StageStep]:
     """Yield a step per round of transport map and slope fit, each from the sag and the map of the round before.
 
     All rounds but the last FINE_ROUNDS use coarse grids and nets, where they are cheap; they end once the map settles.
@@ -122,21 +120,19 @@ def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> It
     knobs = task.knobs
     wanted, done, z = None, 0, lens.back.z  # z: plane of the back in the blank (mm)
     if state is not None:
-        lens, wanted, done = state.lens.applied(lens), state.wanted, state.round
+        lens, wanted, done = state.lens.apply_to(lens), state.wanted, state.round
     turn = min(done, knobs.rounds - 1)
     while turn < knobs.rounds:
         if turn >= done:
             lens, wanted = _round(task, lens, wanted, turn)
-            lens = place_back(lens, z, task.least, task.bounds)  # the next round takes the move into account
+            lens = place_back(lens, z, task.min_thickness, task.bounds)  # the next round takes the move into account
             task.tidy()
         turn = max(turn + 1, knobs.rounds - FINE_ROUNDS if wanted.moved <= SETTLED_CHANGE else 0)
-        yield Step(
-            partial(task.refined, lens, knobs.levels[-1]),
-            SlopeRound(turn, Parameters.of(lens), wanted),
-            mapping=wanted.mapping,
-            places=wanted.places,
+        state = SlopeRound(turn, Parameters.of(lens), wanted)
+        yield StageStep(
+            partial(task.refined, lens, knobs.levels[-1]), state, mapping=wanted.mapping, places=wanted.places,
             progress=("stage 1", turn, knobs.rounds, ""),
-        )
+        )  # fmt: skip
 
 
 def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[Lens, SlopeMap]:
@@ -150,15 +146,15 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[
 
     lens = task.refined(lens, m)
     window = lit_window(source, lens)
-    wanted = slope_map(
-        source, lens, window, picture=goal.picture, screen=goal.receiver, n=cells, previous=wanted,
-        iterations=knobs.transport_iterations, progress=progress, hasty=task.hasty,
-    )  # fmt: skip
+    settings = {"iterations": knobs.transport_iterations, "progress": progress, "preview": task.preview}
+    screen = goal.receiver
+    wanted = slope_map(source, lens, window, goal.picture, screen=screen, n=cells, previous=wanted, **settings)
     sides = [min(2 * points, knobs.rays) for points in as_pair(m)]
     parts = math.ceil(max(sides) / MAX_RAY_CELLS)
     grid = face_grid(source, lens, window, (math.ceil(sides[0] / parts), math.ceil(sides[1] / parts)))
     grazing = MAX_EXIT_ANGLE if task.edge is None else task.edge.angle
-    return fit_to_map(lens, wanted, grid, *(FINE if left <= FINE_ROUNDS else COARSE), parts, grazing), wanted
+    fit = FINE_FACE_FIT if left <= FINE_ROUNDS else COARSE_FACE_FIT
+    return fit_to_map(lens, wanted, grid, *fit, parts, grazing), wanted
 
 
 def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
@@ -172,16 +168,10 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
     for turn in range(AIM_ROUNDS):
         n, m = (COARSEST_GRID, knobs.levels[0]) if turn < AIM_ROUNDS - 1 else (knobs.transport_grid, knobs.levels[-1])
         lens = task.refined(lens, m)
-        rays, wanted, mapping = aimed_rays(
-            task.heaviest.source,
-            lens,
-            goal.picture,
-            screen=goal.receiver,
-            n=n,
-            side=min(3 * max(as_pair(m)), max(2 * max(as_pair(m)), knobs.rays)),  # many may leave through the sides
-            iterations=knobs.transport_iterations,
-        )
-        lens = place_back(tailor_to_aim(lens, rays, wanted, goal.receiver.plane), z, task.least, task.bounds)
+        side = min(3 * max(as_pair(m)), max(2 * max(as_pair(m)), knobs.rays))  # many rays may leave through the sides
+        counts = {"n": n, "side": side, "iterations": knobs.transport_iterations}
+        rays, wanted, mapping = aimed_rays(task.heaviest.source, lens, goal.picture, goal.receiver, **counts)
+        lens = place_back(tailor_to_aim(lens, rays, wanted, goal.receiver.plane), z, task.min_thickness, task.bounds)
     return lens, mapping
 
 
@@ -209,14 +199,13 @@ def shaped_front(
     rays, wanted, _ = aimed_rays(source, lens, target, screen=screen, n=n, side=side, iterations=iterations)
 
     def miss(tried: Lens) -> float:
-        return float(
-            landing(trace(rays, tailor_to_aim(tried, rays, wanted, plane=plane, repeats=repeats), plane), wanted)
-        )
+        fitted = tailor_to_aim(tried, rays, wanted, plane=plane, repeats=repeats)
+        return float(landing(trace(rays, fitted, plane), wanted))
 
     return lens.with_front(best_front(miss, lens, free, rim_sags).front)
 
 
-def best_front(merit: Merit, lens: Lens, free: tuple[str, ...], rim_sags: Range = UNBOUNDED) -> Lens:
+def best_front(merit: FrontMerit, lens: Lens, free: tuple[str, ...], rim_sags: Range = UNBOUNDED) -> Lens:
     """Return the lens whose front minimises `merit` in its free parameters; the merit refits the back each time.
 
     Bounds: at the rim the slope of the front is at most 30°, half of the blank's thickness is left, and the sag (mm)
@@ -239,36 +228,36 @@ def _with_front(lens: Lens, **values: float) -> Lens:
     return lens.with_front(lens.front.with_parameters(**values))
 
 
-def _optimise_one(name: str, merit: Merit, lens: Lens, bounds: Range, tolerance: float) -> Lens:
+def _optimise_one(name: str, merit: FrontMerit, lens: Lens, bounds: Range, tolerance: float) -> Lens:
     """Return the lens with the best value of one parameter by Brent's bounded search, or its present value."""
-    search = scipy.optimize.minimize_scalar(
-        lambda value: merit(_with_front(lens, **{name: float(value)})), bounds=bounds, method="bounded",
-        options={"maxiter": SCALAR_EVALUATIONS, "xatol": tolerance},
-    )  # fmt: skip
+
+    def at(value: float) -> float:
+        return merit(_with_front(lens, **{name: float(value)}))
+
+    options = {"maxiter": SCALAR_EVALUATIONS, "xatol": tolerance}
+    search = scipy.optimize.minimize_scalar(at, bounds=bounds, method="bounded", options=options)
     start = float(lens.front.parameters()[name])
-    best = float(search.x) if search.fun < merit(_with_front(lens, **{name: start})) else start
+    best = float(search.x) if search.fun < at(start) else start
     return _with_front(lens, **{name: best})
 
 
-def _optimise_two(merit: Merit, lens: Lens, rim_sags: Range) -> Lens:
+def _optimise_two(merit: FrontMerit, lens: Lens, rim_sags: Range) -> Lens:
     """Return the lens with the best curvature and conic constant by Nelder and Mead's simplex from the present ones."""
     c, k = (float(value) for value in (lens.front.curvature, lens.front.conic_constant))
 
     def at(tried: np.ndarray) -> float:
-        there = _with_front(lens, curvature=float(tried[0]), conic_constant=float(tried[1]))
+        trial = _with_front(lens, curvature=float(tried[0]), conic_constant=float(tried[1]))
         if not tried[0]:
             return math.inf
-        (low, high), (least, most) = _curvatures(there, rim_sags), _conic_constants(there, rim_sags)
-        possible = low <= tried[0] <= high and least <= tried[1] <= most
-        return merit(there) if possible or tuple(tried) == (c, k) else math.inf
+        (low, high), (k_min, k_max) = _curvatures(trial, rim_sags), _conic_constants(trial, rim_sags)
+        possible = low <= tried[0] <= high and k_min <= tried[1] <= k_max
+        return merit(trial) if possible or tuple(tried) == (c, k) else math.inf
 
     low, high = _curvatures(lens, rim_sags)
     step = (high - low) / 16 * (1 if c + (high - low) / 16 <= high else -1)
     simplex = np.array([[c, k], [c + step, k], [c, k - 1.0]])
-    search = scipy.optimize.minimize(
-        at, simplex[0], method="Nelder-Mead",
-        options={"initial_simplex": simplex, "maxfev": SIMPLEX_EVALUATIONS, "xatol": 1e-5},
-    )  # fmt: skip
+    options = {"initial_simplex": simplex, "maxfev": SIMPLEX_EVALUATIONS, "xatol": 1e-5}
+    search = scipy.optimize.minimize(at, simplex[0], method="Nelder-Mead", options=options)
     best = search.x if search.fun < math.inf else simplex[0]
     return _with_front(lens, curvature=float(best[0]), conic_constant=float(best[1]))
 
@@ -298,8 +287,8 @@ def _curvature_of_sag(h: float, r: float, k: float) -> float:
     p = 1 + k
     if p == 0:
         return 2 * h / (r * r)
-    most = SEARCH_RANGE * r / math.sqrt(abs(p))
-    h = max(-most, min(h, most))
+    limit = SEARCH_RANGE * r / math.sqrt(abs(p))
+    h = max(-limit, min(h, limit))
     return 2 * h / (r * r + p * h * h)
 
 
@@ -308,11 +297,11 @@ def _conic_constants(lens: Lens, rim_sags: Range) -> Range:
 
     tan² of the slope angle at r is c² r² / (1 - (1 + k) c² r²); the sag at r is h where 1 + k = (2 h - c r²) / (c h²).
     """
-    least, most = CONIC_CONSTANTS
+    k_min, k_max = CONIC_CONSTANTS
     c, rim = float(lens.front.curvature), _rim_radius(lens)
     room = (lens.back.z - lens.front.z) / 2
     bent = (c * rim) ** 2
     sag = abs(rim_sags[0]) if c < 0 else min(rim_sags[1], room)
     steep = 1 / bent - (1 - MAX_RIM_SINE**2) / MAX_RIM_SINE**2
     deep = (2 * sag - abs(c) * rim**2) / (abs(c) * sag**2) if sag < math.inf else steep
-    return max(-MAX_HYPERBOLA / bent - 1, least), min(steep, deep, MAX_ELLIPSE / bent, 1 + most) - 1
+    return max(-MAX_HYPERBOLA / bent - 1, k_min), min(steep, deep, MAX_ELLIPSE / bent, 1 + k_max) - 1

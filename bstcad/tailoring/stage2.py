@@ -35,13 +35,13 @@ from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.grazing import Grazing
 from bstcad.tailoring.machinability import active_bounds, excess, round_weight
 from bstcad.tailoring.merit import CoarseVariable, Merit, SobolevVariable, local_weight
-from bstcad.tailoring.minimise import Best, Reached, Search, lbfgs, minimise
+from bstcad.tailoring.minimise import Best, Iterate, LbfgsState, lbfgs, minimise
 from bstcad.tailoring.net_variables import NetVariables, along_light
-from bstcad.tailoring.reachable import resampled
-from bstcad.tailoring.run import EVALUATED, Parameters, Step, Task
+from bstcad.tailoring.reachable import resample
+from bstcad.tailoring.run import TUBES_PER_SECOND, Parameters, StageStep, Task
 from bstcad.tailoring.source_image import Spread
 
-Shares = tuple[tuple[float, float], ...]  # (tubes a side, evaluations) of each round, as fractions of the settings
+RoundFractions = tuple[tuple[float, float], ...]  # (tubes a side, evaluations) of rounds, as fractions of the settings
 DENSE_ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))
 # Rounds where even the last one has fewer than DENSE_TUBES tubes a control cell each way.  The first rounds then bend
 # the net between the tubes, which the last one has to correct.  (1025 control points, two tubes a cell: the portrait
@@ -83,7 +83,7 @@ class TubeRound:
     stage: str = "stage 2"  # name of the stage
     pixels: int | None = None  # pixels along the longer side of a coarse target; None: those of the target
     spread: Spread | None = None  # source of finite size, sampled by the channels of `task`; None: a point
-    share: float = 1.0  # size of the source in this round, as a fraction of its full size
+    source_size: float = 1.0  # size of the source in this round, as a fraction of its full size
 
     @property
     def name(self) -> str:
@@ -98,7 +98,7 @@ class TubeRound:
         return Merit.of(
             task.channels if self.spread is None else self.spread.centre, lens, self.tubes, task.goals,
             overshoot=_overshoot_weight(task, lens), wave=task.wave, own=task.merit, spread=self.spread,
-            seed=None if task.hasty else task.knobs.seed,
+            seed=None if task.preview else task.knobs.seed,
         )  # fmt: skip
 
 
@@ -118,12 +118,12 @@ class SearchPosition:
 class TubeSearch:
     """State of stage 2 between two steps of a search."""
 
-    place: SearchPosition
+    position: SearchPosition
     best: Best  # best point of this search
-    search: Search
+    search: LbfgsState
 
 
-def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Iterator[Step]:
+def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Iterator[StageStep]:
     """Yield the steps of stage 2: rounds of few tubes first, if the evaluations allow, and all tubes in the last.
 
     The error is large at first, and few tubes resolve it as well as many.  The last round corrects the finer errors.
@@ -143,7 +143,7 @@ def coarse_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
     """
     limit = min(max(task.goals[0].receiver.shape) - 1, task.knobs.side // 2)  # pixels that the net can resolve
     rounds = [TubeRound(task, tubes, count, pixels=pixels) for pixels, tubes, count in COARSE_ROUNDS if pixels <= limit]
-    if not rounds or task.merit is not None or task.several or task.hasty or not task.knobs.stage2_iterations:
+    if not rounds or task.merit is not None or task.several or task.preview or not task.knobs.stage2_iterations:
         return ()  # several goals: two nets would bend between so few tubes
     seen, tubes = with_pixels(task, LARGE_PIXELS), COARSE_ROUNDS[0][1]
     [goal] = seen.goals
@@ -153,12 +153,12 @@ def coarse_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
 
 def with_pixels(task: Task, pixels: int) -> Task:
     """Return the task with its targets resampled to at most `pixels` along the longer side."""
-    return replace(task, goals=tuple(resampled(goal, pixels) for goal in task.goals))
+    return replace(task, goals=tuple(resample(goal, pixels) for goal in task.goals))
 
 
-def round_shares(task: Task) -> Shares | None:
+def round_shares(task: Task) -> RoundFractions | None:
     """Return the rounds for several goals or a preview; None: the default for one goal."""
-    if task.hasty:
+    if task.preview:
         return ((1.0, 1.0),)
     if len(task.goals) == 1:
         return WAVEFRONT_ROUNDS if task.several else None
@@ -166,7 +166,7 @@ def round_shares(task: Task) -> Shares | None:
     return tuple((tubes, larger * share) for tubes, share in PICTURES_ROUNDS)
 
 
-def sheet_sizes(knobs: Tailoring, shares: Shares | None = None) -> Iterator[tuple[int, int]]:
+def sheet_sizes(knobs: Tailoring, shares: RoundFractions | None = None) -> Iterator[tuple[int, int]]:
     """Yield (tubes a side, evaluations) of each round; fewer tubes than control points could not determine these."""
     shares = shares or (DENSE_ROUNDS if knobs.rays >= DENSE_TUBES * knobs.side else SPARSE_ROUNDS)
     if knobs.stage2_iterations < MIN_EVALUATIONS:
@@ -176,57 +176,58 @@ def sheet_sizes(knobs: Tailoring, shares: Shares | None = None) -> Iterator[tupl
         yield max(round(tubes * knobs.rays), least), round(share * knobs.stage2_iterations)
 
 
-def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None = None) -> Iterator[Step]:
+def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None = None) -> Iterator[StageStep]:
     """Yield the steps of a stage, round by round, from its start or from a saved state on.
 
     The stage ends when its evaluations are used up, on a plateau of the last round, or when the RRMSD by rays
     (`Task.rrmsd`) reaches tailoring.accuracy with the light of the last round.
     """
-    accuracy = rounds[0].task.knobs.accuracy
-    begin = Parameters.of(lens)
-    place = state.place if state else SearchPosition(0, 0, 0, accuracy or 0.0, sheet_from=begin, search_from=begin)
+    accuracy, given = rounds[0].task.knobs.accuracy, Parameters.of(lens)
+    first = SearchPosition(0, 0, 0, accuracy or 0.0, sheet_from=given, search_from=given)
+    position = first if state is None else state.position
     total = sum(each.evaluations for each in rounds)
     if state is None:
-        yield Step(lambda: lens)
-    for number in range(place.round, len(rounds)):
-        now, bound_weight = rounds[number], round_weight(number, len(rounds))
-        task, part = now.task, now.name
+        yield StageStep(lambda: lens)
+    for number in range(position.round, len(rounds)):
+        this_round, bound_weight = rounds[number], round_weight(number, len(rounds))
+        task, part = this_round.task, this_round.name
         if state is None:
-            place = replace(place, round=number, round_end=place.done + now.evaluations, sheet_from=Parameters.of(lens))
-        if place.round_end <= place.done:
+            end = position.done + this_round.evaluations
+            position = replace(position, round=number, round_end=end, sheet_from=Parameters.of(lens))
+        if position.round_end <= position.done:
             continue
-        launched, merit = place.sheet_from.applied(lens), None
-        grazing = task.edge and Grazing.of(task.edge, launched)
-        while place.done < place.round_end:
+        sheet_lens, merit = position.sheet_from.apply_to(lens), None
+        grazing = task.edge and Grazing.of(task.edge, sheet_lens)
+        while position.done < position.round_end:
             if state is None:
-                place = replace(place, search_from=Parameters.of(lens))
-            begun = place.search_from.applied(lens)
+                position = replace(position, search_from=Parameters.of(lens))
+            start = position.search_from.apply_to(lens)
             task.tidy()
-            variables = variables_of(task, begun, now.pixels)  # before the sheet: they need much memory for a while
+            variables = variables_of(task, start, this_round.pixels)  # before the sheet: needs much memory
             if merit is None:
-                merit = now.merit(launched)
+                merit = this_round.merit(sheet_lens)
                 task.tidy()
-            bounds = active_bounds(begun, task.bounds, task.least)
-            problem = Problem(begun, merit, bounds, bound_weight, grazing=grazing)
-            for reached, step in _search(now, problem, variables, place, total=total, state=state):
+            bounds = active_bounds(start, task.bounds, task.min_thickness)
+            problem = Problem(start, merit, bounds, bound_weight, grazing=grazing)
+            for iterate, step in _search(this_round, problem, variables, position, total=total, state=state):
                 yield replace(step, part=part)
-                if reached.reason:
+                if iterate.reason:
                     break
-            lens, state, judged = step.lens, None, None
-            place, reason = replace(place, done=place.done + reached.best.evaluations), reached.reason
-            if reason == "accuracy" and (judged := task.rrmsd(lens)) > accuracy:
+            lens, state, by_rays = step.lens, None, None
+            position, reason = replace(position, done=position.done + iterate.best.evaluations), iterate.reason
+            if reason == "accuracy" and (by_rays := task.rrmsd(lens)) > accuracy:
                 # tubes underestimate the RRMSD a little: lower their goal
-                place = replace(place, goal_by_tubes=place.goal_by_tubes * accuracy / judged)
+                position = replace(position, goal_by_tubes=position.goal_by_tubes * accuracy / by_rays)
                 reason = "evaluations"  # the reason if none are left
             elif reason != "evaluations":
                 break
         del merit, problem  # free the sheet before the next one is made
-        judged = None if task.hasty else judged or task.rrmsd(lens)
+        by_rays = None if task.preview else by_rays or task.rrmsd(lens)
         whole = task.channels == rounds[-1].task.channels  # True: the light of the source at full size
-        if judged is not None and accuracy is not None and judged <= accuracy:
+        if by_rays is not None and accuracy is not None and by_rays <= accuracy:
             reason = "accuracy"  # reached by rays, though perhaps not by tubes
         reason = reason if number == len(rounds) - 1 or (reason == "accuracy" and whole) else ""
-        yield Step(lambda lens=lens: lens, judged=judged, whole=whole, part=part, ends=True, reason=reason)
+        yield StageStep(lambda lens=lens: lens, rays_rrmsd=by_rays, whole=whole, part=part, ends=True, reason=reason)
         if reason:
             return
 
@@ -247,30 +248,31 @@ def _overshoot_weight(task: Task, lens: Lens) -> float:
 
 
 def _search(
-    now: TubeRound, problem: Problem, variables: NetVariables, place: SearchPosition, *, total: int,
+    this_round: TubeRound, problem: Problem, variables: NetVariables, position: SearchPosition, *, total: int,
     state: TubeSearch | None,
-) -> Iterator[tuple[Reached, Step]]:  # fmt: skip
+) -> Iterator[tuple[Iterate, StageStep]]:  # fmt: skip
     """Yield one run of the minimiser from the lens of a problem, or from a saved state on; it also ends at the goal.
 
     total: evaluations of all rounds.
     """
-    lens, evaluations = problem.lens, place.round_end - place.done
+    lens, evaluations = problem.lens, position.round_end - position.done
     work = 0.0  # unknown for the first step, which includes other work
-    for reached in search(lens, problem, variables, evaluations=evaluations, state=state):
-        best, reason = reached.best, reached.reason
-        step = Step(partial(with_best_nets, lens, variables, best), work=work, skipped=reached.skipped)
-        if not reached.skipped:
-            done = min(place.done + best.evaluations, total)  # a line search may exceed the limit
-            detail = f" on {now.pixels} pixels" if now.pixels else ""
-            detail += f", with {100 * now.share:.0f} % of the source's size" if now.share < 1 else ""
-            step = replace(step, progress=(now.stage, done, total, f"RRMSD {best.figure:.4f}{detail}"))
-            if now.pixels is None:
+    for iterate in search(lens, problem, variables, evaluations=evaluations, state=state):
+        best, reason = iterate.best, iterate.reason
+        step = StageStep(partial(with_best_nets, lens, variables, best), work=work, skipped=iterate.skipped)
+        if not iterate.skipped:
+            done = min(position.done + best.evaluations, total)  # a line search may exceed the limit
+            detail = f" on {this_round.pixels} pixels" if this_round.pixels else ""
+            if this_round.source_size < 1:
+                detail += f", with {100 * this_round.source_size:.0f} % of the source's size"
+            step = replace(step, progress=(this_round.stage, done, total, f"RRMSD {best.figure:.4f}{detail}"))
+            if this_round.pixels is None:
                 step = replace(step, rrmsd=best.figure)
-                reason = "accuracy" if best.figure <= place.goal_by_tubes else reason
-        if reached.state is not None and not reason:
-            step = replace(step, state=TubeSearch(place, best, reached.state))
-        yield replace(reached, reason=reason), step
-        work = problem.merit.tubes / EVALUATED
+                reason = "accuracy" if best.figure <= position.goal_by_tubes else reason
+        if iterate.state is not None and not reason:
+            step = replace(step, state=TubeSearch(position, best, iterate.state))
+        yield replace(iterate, reason=reason), step
+        work = problem.merit.tubes / TUBES_PER_SECOND
 
 
 @dataclass(frozen=True)
@@ -314,7 +316,7 @@ def variables_of(task: Task, lens: Lens, pixels: int | None = None) -> NetVariab
     light = task.heaviest
     seen = light.through(lens)
     weights = [
-        _mean(
+        _geometric_mean(
             local_weight(light.source, seen, goal.picture, screen=goal.receiver, number=number) for goal in task.goals
         )
         for number in lens.freeform
@@ -327,8 +329,7 @@ def variables_of(task: Task, lens: Lens, pixels: int | None = None) -> NetVariab
     return NetVariables(blocks)
 
 
-def _mean(weights: Iterable[Tensor]) -> Tensor:
-    """Return the geometric mean of the weights of several goals."""
+def _geometric_mean(weights: Iterable[Tensor]) -> Tensor:
     first, *others = weights
     if not others:
         return first
@@ -337,12 +338,8 @@ def _mean(weights: Iterable[Tensor]) -> Tensor:
 
 
 def search(
-    lens: Lens,
-    problem: Problem,
-    variables: NetVariables,
-    evaluations: int,
-    state: TubeSearch | None = None,
-) -> Iterator[Reached]:
+    lens: Lens, problem: Problem, variables: NetVariables, evaluations: int, state: TubeSearch | None = None
+) -> Iterator[Iterate]:
     """Run L-BFGS on the heights of all nets from those of `lens` on, in one block of variables c per net."""
     start = [net.heights for net in lens.nets]
 
@@ -363,21 +360,20 @@ def with_best_nets(lens: Lens, variables: NetVariables, best: Best) -> Lens:
 
 
 def _heights_at(start: Sequence[Tensor], variables: NetVariables, c: Sequence[Tensor]) -> list[Tensor]:
-    """Return the heights (mm) of each net at c."""
     return [h + change for h, change in zip(start, variables.heights(c), strict=True)]
 
 
-Stage2 = Callable[[Task, Lens, Any], Iterator[Step]]
+Stage2 = Callable[[Task, Lens, Any], Iterator[StageStep]]
 
 
 @dataclass(frozen=True)
 class Stage3State:
     """State of stage 3 between two steps of a search."""
 
-    grown: TubeSearch
+    search: TubeSearch
 
 
-def with_stage3(before: Stage2 | None, task: Task, lens: Lens, state: Any = None) -> Iterator[Step]:
+def with_stage3(before: Stage2 | None, task: Task, lens: Lens, state: Any = None) -> Iterator[StageStep]:
     """Yield the steps of stage 3, from its start or a saved state on, after the stage `before` unless that is None.
 
     `before` tailors for the centre of the source; its lens is rated with the light of the whole source.
@@ -386,31 +382,31 @@ def with_stage3(before: Stage2 | None, task: Task, lens: Lens, state: Any = None
         for last in before(task, lens, state):
             if last.ends:
                 whole = task.whole
-                last = replace(last, judged=whole.rrmsd(last.lens))
+                last = replace(last, rays_rrmsd=whole.rrmsd(last.lens))
             yield replace(last, reason="")
         lens, state = last.lens, None
     rounds = stage3_rounds(task)
     if before is None:
         rounds = (*coarse_rounds(task, lens), *rounds)
-    for step in run_rounds(rounds, lens, state and state.grown):
+    for step in run_rounds(rounds, lens, state and state.search):
         yield replace(step, state=step.state and Stage3State(step.state))
 
 
 def stage3_rounds(task: Task) -> tuple[TubeRound, ...]:
     """Return the rounds of stage 3, one per source size in SOURCE_SIZES."""
     lights = (
-        replace(task, channels=channels, grown=(), spreads=(spread,))
-        for channels, spread in zip(task.grown, task.spreads, strict=True)
+        replace(task, channels=channels, sampled_sources=(), spreads=(spread,))
+        for channels, spread in zip(task.sampled_sources, task.spreads, strict=True)
     )
-    if task.hasty:
+    if task.preview:
         *_, light = lights
         count = task.knobs.stage2_iterations
         return (TubeRound(light, task.knobs.rays, count, stage="stage 3", spread=light.spreads[0]),)
     screens = [goal.receiver for goal in task.goals]
     counts = stage3_sheet_sizes(task.knobs, (max(each.columns for each in screens), max(each.rows for each in screens)))
     return tuple(
-        TubeRound(light, tubes, count, stage="stage 3", spread=spread, share=share)
-        for light, spread, (tubes, count), (share, _) in zip(lights, task.spreads, counts, SOURCE_SIZES, strict=True)
+        TubeRound(light, tubes, count, stage="stage 3", spread=spread, source_size=size)
+        for light, spread, (tubes, count), (size, _) in zip(lights, task.spreads, counts, SOURCE_SIZES, strict=True)
     )
 
 

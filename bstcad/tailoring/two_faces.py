@@ -35,7 +35,7 @@ from bstcad.scene.quality import COARSEST_GRID
 from bstcad.tailoring import stage1
 from bstcad.tailoring.light_behind import LightBehind, light_for_task, without_crossings
 from bstcad.tailoring.machinability import place_back
-from bstcad.tailoring.run import Parameters, Step, Task
+from bstcad.tailoring.run import Parameters, StageStep, Task
 from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.tailoring.slope_map import (
     GATHERING_FIT,
@@ -73,7 +73,7 @@ class FrontRound:
     back: Grid  # points b(t) (mm) of the back for the pixel corners of the first target
 
 
-def steps(task: Task, lens: Lens, state: FrontRound | None = None) -> Iterator[Step]:
+def steps(task: Task, lens: Lens, state: FrontRound | None = None) -> Iterator[StageStep]:
     """Yield the steps of stage 1 for a lens with a freeform front, from its start or from a saved state on.
 
     With one goal, or if light does not cross both faces in succession, stage 1 tailors the last net alone (stage1.py).
@@ -85,19 +85,19 @@ def steps(task: Task, lens: Lens, state: FrontRound | None = None) -> Iterator[S
         return
     for last in follow_rays(task, lens, state):
         yield last
-    if not task.hasty:
-        yield replace(last, state=None, judged=task.rrmsd(last.lens))
+    if not task.preview:
+        yield replace(last, state=None, rays_rrmsd=task.rrmsd(last.lens))
 
 
-def follow_rays(task: Task, lens: Lens, state: FrontRound | None) -> Iterator[Step]:
+def follow_rays(task: Task, lens: Lens, state: FrontRound | None) -> Iterator[StageStep]:
     """Yield a step per round; all but FINE_ROUNDS use coarse grids and nets, and end once the map settles."""
-    task = task.aimed(lens)
+    task = task.with_imaged_receivers(lens)
     knobs, z, done, wanted = task.knobs, lens.back.z, 0, None
     near = min(task.goals, key=lambda goal: goal.receiver.plane.throw(0.0))
     light = light_for_task(task)
     light = without_crossings(light, near.receiver, lens.back, knobs.transport_grid)
     if state is not None:
-        lens, done, wanted, b = state.lens.applied(lens), state.round, state.wanted, state.back
+        lens, done, wanted, b = state.lens.apply_to(lens), state.round, state.wanted, state.back
     turn = min(done, knobs.rounds - 1)
     while turn < knobs.rounds:
         if turn >= done:
@@ -107,22 +107,21 @@ def follow_rays(task: Task, lens: Lens, state: FrontRound | None) -> Iterator[St
             cells = max(COARSEST_GRID, knobs.transport_grid // 2**halvings)
             level = knobs.levels[max(-1 - halvings, -len(knobs.levels))] if fine else knobs.levels[0]
             lens = task.refined(lens, level)
-            fit = stage1.FINE if fine else stage1.COARSE
+            fit = stage1.FINE_FACE_FIT if fine else stage1.COARSE_FACE_FIT
             places = None if wanted is None else wanted.places
             lens, wanted, b = _round(task, lens, light, places, turn=turn, cells=cells, fit=fit)
-            lens = place_back(lens, z, task.least, task.bounds)
+            lens = place_back(lens, z, task.min_thickness, task.bounds)
             task.tidy()
         turn = max(turn + 1, knobs.rounds - FINE_ROUNDS if wanted.moved <= SETTLED_CHANGE else 0)
-        yield Step(
+        yield StageStep(
             partial(task.refined, lens, knobs.levels[-1]), FrontRound(turn, Parameters.of(lens), wanted, b),
             mapping=wanted.mapping, places=b, progress=("stage 1", turn, knobs.rounds, ""),
         )  # fmt: skip
 
 
 def _round(
-    task: Task, lens: Lens, light: LightBehind, places: Grid | None, *, turn: int, cells: int,
-    fit: tuple[Fit, float],
-) -> tuple[Lens, SlopeMap, Grid]:  # fmt: skip
+    task: Task, lens: Lens, light: LightBehind, places: Grid | None, *, turn: int, cells: int, fit: tuple[Fit, float]
+) -> tuple[Lens, SlopeMap, Grid]:
     """Run one round; return the lens, the map of its front, and b(t) for the pixel corners of the first target."""
     source, front = task.heaviest.source, lens.shaping("front")
     window, back = lit_window(source, front), light.intersect(lens.back)
@@ -179,7 +178,6 @@ def _slopes_at(rays: Rays, aims: Tensor, lens: Lens) -> tuple[Tensor, Tensor]:
 
 
 def _in_space(rays: Rays) -> Tensor:
-    """Return the positions of the rays in space, (3, …) mm."""
     return torch.stack([*rays.position[:2], rays.above(0.0)])
 
 

@@ -9,7 +9,17 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.analysis.light import FAN_RAYS, GRID_LINES, blur, bundle, fan, finest_detail, margins, ray_map, used
+from bstcad.analysis.light import (
+    FAN_RAYS,
+    GRID_LINES,
+    blur,
+    bundle,
+    fan,
+    finest_detail,
+    margins,
+    needed_apertures,
+    ray_map,
+)
 from bstcad.optics.channels import Channel
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
@@ -89,7 +99,9 @@ class TestUsed:
     WIDE = Rectangle(24.0, 24.0)
 
     def faces(self, source, outline=WIDE, **more):
-        return tuple(used(source, lens_of(front=Plane(10.0), outline=outline, z=20.0, m=9, **more)).values())
+        return tuple(
+            needed_apertures(source, lens_of(front=Plane(10.0), outline=outline, z=20.0, m=9, **more)).values()
+        )
 
     @pytest.mark.parametrize("aperture", [Circle(5.0), Rectangle(8.0, 4.0), Circle(12.0)])
     def test_a_beam_meets_both_faces_of_a_plate_as_it_is(self, aperture):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bstcad.analysis import neglected_effects
-from bstcad.analysis.neglected_effects import Reference, Spline, blurred, difference, zoomed
+from bstcad.analysis.neglected_effects import Reference, Spline, blur_by_gaussian, difference, to_pixels
 from bstcad.optics.channels import Channel
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
@@ -121,7 +121,7 @@ def test_diffraction_is_as_wide_as_wavelength_times_way_over_aperture():
 class TestPictures:
     def test_a_field_of_cells_is_linear_between_their_middles(self):
         """The field is linear outside the outermost middles, too."""
-        found = zoomed(np.arange(3.0) + 10 * np.arange(2.0)[:, None], (4, 12))
+        found = to_pixels(np.arange(3.0) + 10 * np.arange(2.0)[:, None], (4, 12))
         np.testing.assert_allclose(found[:, 1], [-0.0, 2.5, 7.5, 10.0], atol=1e-12)
         np.testing.assert_allclose(np.diff(found[0]), [0, *[0.125, *[0.25] * 7, 0.125], 0], atol=1e-12)
 
@@ -142,13 +142,13 @@ class TestPictures:
         assert difference(moved(checks(), 0.5, 0.5), some) == pytest.approx(whole, rel=0.05)
 
     def test_a_blur_keeps_the_light_and_adds_its_variance(self):
-        wide = blurred(checks(), 1.5)
+        wide = blur_by_gaussian(checks(), 1.5)
         rows, columns = np.indices((48, 64))
         variance = [((columns - 31.5) ** 2 * p).sum() / p.sum() for p in (checks(), wide)]
         assert wide.sum() == pytest.approx(checks().sum()) and variance[1] - variance[0] == pytest.approx(
             2.25, rel=1e-3
         )
-        np.testing.assert_allclose(blurred(checks(), 0.0), checks(), atol=1e-12)
+        np.testing.assert_allclose(blur_by_gaussian(checks(), 0.0), checks(), atol=1e-12)
 
     def test_a_difference_is_that_of_pictures_of_one_sum(self):
         assert difference(3 * checks(), checks()) == pytest.approx(0, abs=1e-12)

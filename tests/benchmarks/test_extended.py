@@ -38,7 +38,7 @@ def task_of(scene):
     scaled = [scene.with_source_scaled(share) for share, _ in stage2.SOURCE_SIZES]
     light, least = scene.with_source_scaled(0.0).channels(), scene.lens.min_thickness
     task = Task(
-        light, scene.goals, knobs, least, grown=tuple(each.channels() for each in scaled),
+        light, scene.goals, knobs, least, sampled_sources=tuple(each.channels() for each in scaled),
         spreads=tuple(Spread(each.source, light, each.draw) for each in scaled),
     )  # fmt: skip
     return task, scene.flat_lens(knobs.levels[0])
@@ -66,7 +66,7 @@ def feedback(task, lens, power, seconds):
         made = made.numpy() * (wanted.sum() / float(made.sum()))
         target = target * np.clip(wanted / np.maximum(made, 1e-6 * wanted.max()), 0.2, 5.0) ** power
         target = target / target.sum()
-        corrected = replace(task, goals=(replace(goal, picture=target),), knobs=few, grown=())
+        corrected = replace(task, goals=(replace(goal, picture=target),), knobs=few, sampled_sources=())
         lens = driven(corrected, stage2.steps(corrected, lens))
         yield lens
 

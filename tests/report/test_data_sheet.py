@@ -20,7 +20,7 @@ from OCP.gp import gp_Pnt
 from OCP.GProp import GProp_GProps
 from OCP.TopAbs import TopAbs_State
 
-from bstcad.analysis.light import used
+from bstcad.analysis.light import needed_apertures
 from bstcad.analysis.shape import describe
 from bstcad.cad import mounting
 from bstcad.optics.bspline import BSplineSurface
@@ -239,7 +239,7 @@ def test_clear_apertures_lie_within_the_part_s_faces(name):
     views = views_of(made)
     along_y, along_x = (cut.front_ends[1] for cut in views.cuts)
     rooms = (along_x, along_y), views.rim.half_extent
-    for patch, room in zip(used(made.scene.source, made.lens).values(), rooms, strict=True):
+    for patch, room in zip(needed_apertures(made.scene.source, made.lens).values(), rooms, strict=True):
         assert patch is None or np.all(np.array(patch.half_extent) <= np.array(room) + 1e-9)
 
 

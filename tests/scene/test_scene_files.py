@@ -20,7 +20,7 @@ from bstcad.report.prescription import prescription
 from bstcad.runs import checkpoint, files
 from bstcad.scene.scene import Scene, load
 from bstcad.scene.schema import FileContent, from_file
-from bstcad.tailoring.run import Record
+from bstcad.tailoring.run import DesignRecord
 from tests.conftest import DISK
 
 RAMP = np.linspace(0.1, 1.0, 12).reshape(3, 4)
@@ -72,7 +72,7 @@ def test_a_design_does_not_resume_with_a_byte_of_a_file_changed(part, tmp_path):
         "front": {"lens.front.file": replace(net, data=other_byte(net.data))},
     }[part]
     assert purpose(scene.changed({}), "cpu") == purpose(scene, "cpu")
-    checkpoint.write(files.beside(tmp_path / "lens", "checkpoint"), purpose(scene, "cpu"), DesignState(Record()))
+    checkpoint.write(files.beside(tmp_path / "lens", "checkpoint"), purpose(scene, "cpu"), DesignState(DesignRecord()))
     with pytest.raises(files.SceneError, match="is of another design .files.*give the scene as it was"):
         commands.generate(scene.changed(change), tmp_path / "lens", device="cpu", resume=True)
 

@@ -20,7 +20,7 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Sphere
 from bstcad.scene.blank import Bounds
 from bstcad.tailoring import machinability
-from bstcad.tailoring.clearance import MARGIN, CellGrid, clearance, unit
+from bstcad.tailoring.clearance import PENALTY_MARGIN, CellGrid, clearance, unit
 from bstcad.tailoring.machinability import active_bounds, enforce_bounds, excess
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.stage2 import Problem
@@ -86,7 +86,7 @@ def test_no_place_is_overlooked(outline):
     glass = thickness(lens, x, y)[torch.from_numpy(beyond)]
     relative = torch.maximum(bounds.thinnest - glass, glass - bounds.thickest) / length
     square, _, worst = clearance(lens, edge)
-    assert square == pytest.approx(float((torch.relu(relative + MARGIN) ** 2).sum() / len(x)), rel=1e-12)
+    assert square == pytest.approx(float((torch.relu(relative + PENALTY_MARGIN) ** 2).sum() / len(x)), rel=1e-12)
     assert worst == pytest.approx(float(relative.max()), rel=1e-12)
 
 
@@ -111,8 +111,9 @@ def test_a_tool_sees_the_valleys_of_a_sphere_from_its_own_side(curvature):
     for lens, valley in ((front, curvature < 0), (replace(back, shaped=(0, 1)), curvature > 0)):
         for bounds, met in ((Bounds(concave=0.039), not valley), (Bounds(convex=0.039), valley)):
             worst = excess(lens, bounds).worst
-            assert worst == (-MARGIN if met else pytest.approx(0.04 / 0.039 - 1, abs=5e-3))  # steps from span to span
-        assert excess(lens, Bounds(0.041, 0.041)).worst == -MARGIN
+            # a step from span to span
+            assert worst == (-PENALTY_MARGIN if met else pytest.approx(0.04 / 0.039 - 1, abs=5e-3))
+        assert excess(lens, Bounds(0.041, 0.041)).worst == -PENALTY_MARGIN
 
 
 def test_only_a_tailored_front_needs_a_bound_where_none_is_asked():
@@ -186,4 +187,4 @@ def test_faces_may_cross_outside_of_the_outline():
     x, y = (torch.linspace(*side, m, dtype=torch.float64) for side, m in ((lens.back.x, 21), (lens.back.y, 21)))
     beyond = torch.hypot(x[:, None], y) > 1.5 + 3 * lens.back.pitch[0]
     lens = lens.with_back(replace(lens.back, heights=lens.back.heights - 20.0 * beyond))
-    assert excess(lens, Bounds(thinnest=0.5)).worst == -MARGIN
+    assert excess(lens, Bounds(thinnest=0.5)).worst == -PENALTY_MARGIN

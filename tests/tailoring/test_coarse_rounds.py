@@ -14,7 +14,7 @@ from bstcad.pipeline import design
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import stage1, stage2
 from bstcad.tailoring.merit import CoarseVariable
-from bstcad.tailoring.run import BEST
+from bstcad.tailoring.run import BEST_LENS_STAGE
 
 SIDE = {"shape": "rectangle", "width": 60.0, "height": 60.0}
 NEAR = {  # a wall nearer than the plate is wide, fifty times as bright in one corner as in another
@@ -79,12 +79,12 @@ def test_a_stage_hands_on_its_best_lens(monkeypatch):
     judged = {stage.name: stage.rrmsd for stage in made.making.stages}
     on_few, on_all = (judged[name] for name in names(made)[-1:-3:-1])
     assert on_few > 1.2 * on_all  # else there is nothing to see here
-    assert judged[BEST] < 1.05 * on_all
-    assert rrmsd(made) == pytest.approx(judged[BEST], rel=0.05)
+    assert judged[BEST_LENS_STAGE] < 1.05 * on_all
+    assert rrmsd(made) == pytest.approx(judged[BEST_LENS_STAGE], rel=0.05)
 
 
 def test_a_design_goes_on_from_within_them(made, states):
-    within = [s for s in states if getattr(s.second, "place", None) and s.second.place.round == 0]
+    within = [s for s in states if getattr(s.second, "position", None) and s.second.position.round == 0]
     assert within
     again = design(near(), device="cpu", start=within[len(within) // 2], later=True)
     assert torch.equal(again.lens.back.heights, made.lens.back.heights)

@@ -12,7 +12,7 @@ import torch
 from bstcad.pipeline import DesignState, design
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
-from bstcad.tailoring.minimise import AdamState, Best, Search, adam, lbfgs, minimise
+from bstcad.tailoring.minimise import AdamState, Best, LbfgsState, adam, lbfgs, minimise
 from tests import two_faces
 from tests.conftest import DISK, SMALL
 
@@ -54,7 +54,7 @@ class Left:
     """A minimisation that was left."""
 
     best: Best
-    search: Search | AdamState
+    search: LbfgsState | AdamState
 
 
 def by_lbfgs(left):

@@ -139,7 +139,7 @@ def test_stage_2_keeps_the_least_thickness_and_finds_the_picture():
     task, lens, _ = problem_of("both")
     task = replace(task, knobs=task.knobs.model_copy(update={"stage2_iterations": 80}))
     near = replace(lens, back=lens.back.moved(0.6))
-    (*_, free), (*_, bound) = (steps(replace(task, least=least), near) for least in (0.01, 0.55))
+    (*_, free), (*_, bound) = (steps(replace(task, min_thickness=least), near) for least in (0.01, 0.55))
     assert thickness_range(free.lens)[0] < 0.545 and task.rrmsd(free.lens) < 0.05
     found = enforce_bounds(bound.lens, active_bounds(bound.lens, None, 0.55))
     assert thickness_range(found)[0] >= 0.55 and found.back.z == 0.6
@@ -151,4 +151,4 @@ def test_every_free_net_has_its_entry():
     shaped = lens.with_heights((torch.rand((9, 9), dtype=torch.float64), torch.rand((17, 17), dtype=torch.float64)))
     parameters = Parameters.of(shaped)
     assert [entry.z for entry in parameters.nets] == [15.0, 20.0] and parameters.front == {}
-    assert parameters.applied(lens) == shaped
+    assert parameters.apply_to(lens) == shaped

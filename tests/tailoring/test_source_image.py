@@ -102,7 +102,7 @@ def test_flux_is_kept():
     spreading = spread(SOURCES["disc"])
     [blur] = blurs(spreading, lens(), wide)
     light = RayTubes.launched(lens(), spreading.centre, 60).picture(lens(), with_border(wide, blur.border)).numpy()
-    share = SourceImages.of(SOURCES["disc"], spreading.centre[0], lens(), wide).share
+    share = SourceImages.of(SOURCES["disc"], spreading.centre[0], lens(), wide).flux
     assert blur.forward(light).sum() / light.sum() == pytest.approx(float(share.mean()), rel=0.02)
 
 

@@ -76,7 +76,7 @@ def task_of(scene):
     light = scene.with_source_scaled(0.0).channels()
     scaled = [scene.with_source_scaled(share) for share, _ in stage2.SOURCE_SIZES]
     return pipeline.Task(
-        light, scene.goals, knobs, grown=tuple(each.channels() for each in scaled),
+        light, scene.goals, knobs, sampled_sources=tuple(each.channels() for each in scaled),
         spreads=tuple(Spread(each.source, light, each.draw) for each in scaled),
     )  # fmt: skip
 

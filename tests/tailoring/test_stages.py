@@ -11,7 +11,7 @@ from bstcad.baselines import paper
 from bstcad.scene import scene
 from bstcad.tailoring import stage1, stage2
 from bstcad.tailoring.merit import Landings, Merit
-from bstcad.tailoring.run import Driver, Step, Task
+from bstcad.tailoring.run import Driver, StageStep, Task
 from tests.tracing import simulated
 
 SMALL = {
@@ -33,7 +33,7 @@ def small(name, **more):
 
 def driven(driver, task, steps, why=None):
     """The last step of a stage, as the driver goes through it."""
-    return driver.run(steps, task, lambda state: state, why or (lambda: driver.hurry))
+    return driver.run(steps, task, lambda state: state, why or (lambda: driver.reason_to_end))
 
 
 def followed(task, lens):
@@ -57,7 +57,7 @@ def test_stage_1_goes_another_way_where_the_first_one_fails():
     """A source 5 mm before the lens: the slopes that a point needs change too much with the sag to settle."""
     near = {"source.position": "[0.0, 0.0, 10.0]", "tailoring.rounds": "3", "target.tilt": "[0.0, 20.0]"}
     task, lens = small("disk", **near)
-    task = replace(task, least=0.5)
+    task = replace(task, min_thickness=0.5)
     *_, first = stage1.follow_slopes(task, lens)
     first, other = task.rrmsd(first.lens), task.rrmsd(stage1.follow_aims(task, lens)[0])
     assert first > stage1.RETRY_RRMSD and other < 0.7 * first
@@ -81,7 +81,7 @@ def test_stage_1_goes_no_way_that_loses_the_light():
     *_, first = stage1.follow_slopes(task, lens)
     other, _ = stage1.follow_aims(task, lens)
     assert first.state.wanted.moved > stage1.RETRY_CHANGE and task.rrmsd(other) < task.rrmsd(first.lens)
-    assert task.used(other) < stage1.MIN_FLUX_RATIO * task.used(first.lens)
+    assert task.flux_on_target(other) < stage1.MIN_FLUX_RATIO * task.flux_on_target(first.lens)
     assert torch.equal(followed(task, lens).back.heights, first.lens.back.heights)
 
 
@@ -142,7 +142,7 @@ def test_what_comes_after_is_given_the_time_that_this_machine_needs():
 
     def at(seconds):
         now[0] = seconds
-        return driver.hurry
+        return driver.reason_to_end
 
     assert (at(89.0), at(91.0)) == ("", "time")
     for _ in range(20):  # half a second each where 1/6 s was expected
@@ -162,7 +162,7 @@ def test_a_step_that_would_end_too_late_is_not_begun():
     def evaluations():
         while True:
             now[0] += 5.0
-            yield Step(lambda: None, rrmsd=0.1)
+            yield StageStep(lambda: None, rrmsd=0.1)
 
     driven(driver, None, evaluations())
     assert driver.stopped == "time" and now[0] == 100.0 and len(driver.record.history) == 20
@@ -201,9 +201,9 @@ def test_states_are_saved_until_the_user_has_enough():
     def stage():
         for k in range(10):
             asked.append(k)
-            yield Step(lambda: None, state=None if k == 1 else k)
+            yield StageStep(lambda: None, state=None if k == 1 else k)
 
-    last = driver.run(stage(), None, lambda state: ("in a record", state), lambda: driver.wish)
+    last = driver.run(stage(), None, lambda state: ("in a record", state), lambda: driver.reason_to_interrupt)
     assert saved == [("in a record", 0), ("in a record", 2)]
     assert asked == [0, 1, 2] and last.state == 2 and driver.stopped == "interrupt"
 

@@ -230,4 +230,4 @@ def test_the_move_of_a_back_that_is_given_is_kept():
     """A front alone is tailored, and the back makes way for it."""
     lens = replace(bumpy(), shaped=(0,))
     moved = lens.with_back(lens.back.moved(9.5))
-    assert Parameters.of(moved).applied(lens).back.z == 9.5
+    assert Parameters.of(moved).apply_to(lens).back.z == 9.5
