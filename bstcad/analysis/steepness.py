@@ -22,7 +22,7 @@ from bstcad.optics.trace import across
 from bstcad.optics.tubes import rays_to
 
 MAX_SLOPE_DEG = 70.0  # largest slope angle that tailoring makes (degrees); optics.reach has it as a tangent
-MAX_POINTS = 65  # largest number of points a side
+MAX_POINTS_A_SIDE = 65  # largest number of points a side
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def needed_steepness(
     screen: receiver, imaged through the surfaces behind the face (unfolding.imaged).  picture: target irradiance,
     (rows, columns), row 0 = y max.  at_back False: the places are on the plane of the first vertex.
     """
-    i, j = (np.unique(np.linspace(0, n - 1, min(n, MAX_POINTS)).round().astype(int)) for n in (len(x), len(y)))
+    i, j = (np.unique(np.linspace(0, n - 1, min(n, MAX_POINTS_A_SIDE)).round().astype(int)) for n in (len(x), len(y)))
     x, y, places = x[i], y[j], places[np.ix_(i, j)]
     number, lens = lens.freeform[-1], lens.plain()
     p, q = (torch.from_numpy(np.ascontiguousarray(places[..., k], dtype=float)) for k in (0, 1))

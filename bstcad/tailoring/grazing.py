@@ -50,16 +50,16 @@ class Grazing:
     @classmethod
     def of(cls, edge: Edge, lens: Lens) -> Grazing:
         """Make the penalty for the rays that reach the last face of a lens."""
-        seen = edge.light.through(lens)
-        source, net = edge.light.source, seen.nets[-1]
-        window = lit_window(source, seen)
-        grid = face_grid(source, seen, window, tuple(min(2 * m, MAX_CELLS) for m in net.shape))
+        own_lens = edge.light.through(lens)
+        source, net = edge.light.source, own_lens.nets[-1]
+        window = lit_window(source, own_lens)
+        grid = face_grid(source, own_lens, window, tuple(min(2 * m, MAX_CELLS) for m in net.shape))
         axes = zip((net.x, net.y), net.pitch, net.shape, strict=True)
         x, y = np.meshgrid(*(low + pitch * _span_points(m) for (low, _), pitch, m in axes), indexing="ij")
         inside = (np.abs(x) <= window.width / 2) & (np.abs(y) <= window.height / 2)
         light = np.where(inside, interpolate(grid, grid.density[None], (x, y))[0].numpy(), 0.0)
         weight = torch.from_numpy(maximum_filter(light, 5))  # spans that are lit in part count whole
-        rays, eta = rays_at(grid, (x, y)), seen.last_freeform.law.eta
+        rays, eta = rays_at(grid, (x, y)), own_lens.last_freeform.law.eta
         return cls(net, rays, weight / total(weight), eta=eta, angle=edge.angle)
 
     def __call__(self, heights: Tensor) -> tuple[float, Tensor, float]:

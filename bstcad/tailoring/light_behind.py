@@ -230,9 +230,9 @@ def between_targets(
         y = tuple(sign * (c - g) for c, g in zip(cosines(p, t), cosines(p, m), strict=True))
         (rho, frame), *others = (spread_density(each, tuple(pixel_corners(screen)), cells) for each in pictures)
         sharper = [other for other, _ in others] if last else []
-        sigma, seen = spread_density(wanted, y, cells)
+        sigma, y_frame = spread_density(wanted, y, cells)
         mapping = solve(
-            rho, sigma, frame, seen, sharper=sharper, iterations=iterations, falling=TARGET_FLOORS, progress=progress
+            rho, sigma, frame, y_frame, sharper=sharper, iterations=iterations, falling=TARGET_FLOORS, progress=progress
         )
         p = in_space(screen.plane, *mapping.inverse(*y))
     if max(contrasts) > CONTRAST_RATIO * min(contrasts):
@@ -262,8 +262,8 @@ def without_crossings(light: LightBehind, screen: Screen, surface: Surface, n: i
         return light
     b_x, b_y, b_z = light.intersect(surface)
     rho, frame = spread_density(light.picture, light.positions_on(screen.plane), n)
-    sigma, seen = spread_density(light.picture, (b_x, b_y), n)
-    mapping, there = solve(rho, sigma, frame, seen), light.positions_on(screen.plane)
+    sigma, back_frame = spread_density(light.picture, (b_x, b_y), n)
+    mapping, there = solve(rho, sigma, frame, back_frame), light.positions_on(screen.plane)
     b = np.stack([*mapping(*there), np.full(light.position.shape[1:], float(b_z.mean()))])
     place = in_space(screen.plane, *there)
     return replace(light, position=place, direction=_normalised(place - b))

@@ -329,20 +329,20 @@ def local_weight(source: Emitter, lens: Lens, target: np.ndarray, screen: Screen
     with torch.no_grad():
         landed = through(at_net, onwards, screen.plane)
     column, row = (p.cpu().double().numpy() for p in screen.pixel(*landed.position))
-    seen = landed.alive.cpu().numpy() & (column > 0) & (column < screen.columns) & (row > 0) & (row < screen.rows)
+    on_screen = landed.alive.cpu().numpy() & (column > 0) & (column < screen.columns) & (row > 0) & (row < screen.rows)
     picture = gaussian_filter(target / target.mean(), TARGET_BLUR)
     irradiance = map_coordinates(picture, [row - 0.5, column - 0.5], order=1, mode="nearest")
-    logarithm = np.where(seen, np.log(np.maximum(irradiance, MAX_LOCAL_WEIGHT**-4)), 0.0)
+    logarithm = np.where(on_screen, np.log(np.maximum(irradiance, MAX_LOCAL_WEIGHT**-4)), 0.0)
     weight = np.exp(-0.5 * gaussian_filter(logarithm, WEIGHT_SMOOTHING)).clip(1 / MAX_LOCAL_WEIGHT, MAX_LOCAL_WEIGHT)
     if number == lens.freeform[-1] and onwards[0].law.eta > 1:
         plane = image_from_last_net(lens, screen.plane)
-        throw = _excess_throw(at_net, landed.position, plane, law=onwards[0].law, seen=seen)
+        throw = _excess_throw(at_net, landed.position, plane, law=onwards[0].law, on_screen=on_screen)
         if throw is not None:
             weight = weight / np.exp(gaussian_filter(np.log(throw), WEIGHT_SMOOTHING))
     return torch.from_numpy(weight)
 
 
-def _excess_throw(at_net: Rays, aim: Tensor, plane: Receiver, law: Law, seen: np.ndarray) -> np.ndarray | None:
+def _excess_throw(at_net: Rays, aim: Tensor, plane: Receiver, law: Law, on_screen: np.ndarray) -> np.ndarray | None:
     """Return the throw over MIN_THROW times its median (m, n), at least 1; None if it is 1 everywhere.
 
     The throw is the largest singular value of ∂t/∂p (mm), p(b, t) the slopes that send light from b to the target point
@@ -350,7 +350,7 @@ def _excess_throw(at_net: Rays, aim: Tensor, plane: Receiver, law: Law, seen: np
     """
     for some in (slice(None, None, THROW_STRIDE), slice(None)):
         rays = replace(at_net, **{key: getattr(at_net, key)[..., some, some] for key in ("position", "direction")})
-        t, lit = aim[..., some, some], seen[some, some]
+        t, lit = aim[..., some, some], on_screen[some, some]
         if not lit.any():
             return None
         step = THROW_STEP * torch.sqrt((t**2).sum(0) + plane.per_radian(at_net.z) ** 2).max()

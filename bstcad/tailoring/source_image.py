@@ -118,7 +118,7 @@ def with_border(screen: Screen, border: int) -> Screen:
 
 
 @dataclass(frozen=True, eq=False)
-class SourceImages:
+class LocalImages:
     """Images of the source through points of the back, relative to the landing point of the centre's light."""
 
     at: Tensor  # (2, points) landing points of the centre's light (column, row) in pixels
@@ -126,15 +126,15 @@ class SourceImages:
     flux: Tensor  # (9, points) flux of each of these over that of the centre
 
     @classmethod
-    def of(cls, source: Emitter, channel: Channel, lens: Lens, screen: Screen) -> SourceImages:
+    def of(cls, source: Emitter, channel: Channel, lens: Lens, screen: Screen) -> LocalImages:
         """Trace the images through the points of the back that the light of all ten source points passes."""
         a, b = source.extent.half_extent
         points = [(i * POINT_DISTANCE, j * POINT_DISTANCE) for j in (-1, 0, 1) for i in (-1, 0, 1)]
         nine = (replace(source.element(a * u, b * v), wavelength=channel.source.wavelength) for u, v in points)
         ten = [channel, *(replace(channel, source=one) for one in nine)]
         pixel, flux = landing_pixels(ten, lens, screen, n=IMAGE_GRID)
-        seen = (flux > 0).all(0)
-        pixel, flux = pixel[..., seen].cpu(), flux[:, seen].cpu()
+        passes = (flux > 0).all(0)
+        pixel, flux = pixel[..., passes].cpu(), flux[:, passes].cpu()
         return cls(pixel[:, 0], pixel[:, 1:] - pixel[:, :1], flux[1:] / flux[0])
 
     def nearest(self, column: float, row: float) -> tuple[Tensor, Tensor]:
@@ -162,8 +162,8 @@ def blurs(spread: Spread, lens: Lens, screen: Screen) -> tuple[BlurOperator, ...
     nodes = [[k / (IMAGE_NODES - 1) * side for k in range(IMAGE_NODES)] for side in screen.shape]
     kernels = []
     for channel in spread.centre:
-        seen = SourceImages.of(spread.source, channel, lens, screen)
-        near = [seen.nearest(column, row) for row in nodes[0] for column in nodes[1]]
+        local = LocalImages.of(spread.source, channel, lens, screen)
+        near = [local.nearest(column, row) for row in nodes[0] for column in nodes[1]]
         kernels.append([tuple((part[..., None] * dots).sum(-2) for part in image) for image in near])
     reach = max(float(offset.abs().max()) for images in kernels for offset, _ in images)
     border = min(math.ceil(reach) + 2, widest(screen, len(kernels)))

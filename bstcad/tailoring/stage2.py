@@ -145,9 +145,9 @@ def coarse_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
     rounds = [TubeRound(task, tubes, count, pixels=pixels) for pixels, tubes, count in COARSE_ROUNDS if pixels <= limit]
     if not rounds or task.merit is not None or task.several or task.preview or not task.knobs.stage2_iterations:
         return ()  # several goals: two nets would bend between so few tubes
-    seen, tubes = with_pixels(task, LARGE_PIXELS), COARSE_ROUNDS[0][1]
-    [goal] = seen.goals
-    far_off = rrmsd_by_tubes(lens.plain(), seen.channels, goal.receiver, target=goal.picture, n=tubes) > FAR_OFF_RRMSD
+    coarse, tubes = with_pixels(task, LARGE_PIXELS), COARSE_ROUNDS[0][1]
+    [goal] = coarse.goals
+    far_off = rrmsd_by_tubes(lens.plain(), coarse.channels, goal.receiver, target=goal.picture, n=tubes) > FAR_OFF_RRMSD
     return tuple(rounds) if far_off else ()
 
 
@@ -314,10 +314,11 @@ def variables_of(task: Task, lens: Lens, pixels: int | None = None) -> NetVariab
     if pixels is not None:
         lens = lens.with_nets(net.refined(coarser(net.shape, pixels + 1)) for net in nets)
     light = task.heaviest
-    seen = light.through(lens)
+    own_lens = light.through(lens)
     weights = [
         _geometric_mean(
-            local_weight(light.source, seen, goal.picture, screen=goal.receiver, number=number) for goal in task.goals
+            local_weight(light.source, own_lens, goal.picture, screen=goal.receiver, number=number)
+            for goal in task.goals
         )
         for number in lens.freeform
     ]
@@ -325,7 +326,7 @@ def variables_of(task: Task, lens: Lens, pixels: int | None = None) -> NetVariab
         return NetVariables(tuple(CoarseVariable.of(*each) for each in zip(nets, lens.nets, weights, strict=True)))
     blocks = tuple(SobolevVariable.of(net, weight) for net, weight in zip(nets, weights, strict=True))
     if lens.shapes_two_faces and len(task.goals) > 1:
-        return NetVariables(blocks, *along_light(light.source, seen, task.goals))
+        return NetVariables(blocks, *along_light(light.source, own_lens, task.goals))
     return NetVariables(blocks)
 
 

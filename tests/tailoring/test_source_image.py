@@ -22,7 +22,7 @@ from bstcad.optics.surfaces import Sphere
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Task
-from bstcad.tailoring.source_image import SourceImages, Spread, _biquadratic, blur_error, blurs, with_border
+from bstcad.tailoring.source_image import LocalImages, Spread, _biquadratic, blur_error, blurs, with_border
 from bstcad.tailoring.stage2 import Problem, _overshoot_weight
 from tests.lenses import net
 
@@ -102,7 +102,7 @@ def test_flux_is_kept():
     spreading = spread(SOURCES["disc"])
     [blur] = blurs(spreading, lens(), wide)
     light = RayTubes.launched(lens(), spreading.centre, 60).picture(lens(), with_border(wide, blur.border)).numpy()
-    share = SourceImages.of(SOURCES["disc"], spreading.centre[0], lens(), wide).flux
+    share = LocalImages.of(SOURCES["disc"], spreading.centre[0], lens(), wide).flux
     assert blur.forward(light).sum() / light.sum() == pytest.approx(float(share.mean()), rel=0.02)
 
 
@@ -160,13 +160,13 @@ def test_nine_points_make_every_biquadratic():
 def test_light_that_no_place_shows_is_not_blurred():
     """Nothing gets through: the images are those of a point."""
     nowhere = replace(SOURCES["disc"], position=(500.0, 0.0, 5.9))
-    offset, share = SourceImages.of(nowhere, spread(nowhere).centre[0], lens(), SCREEN).nearest(0.0, 0.0)
+    offset, share = LocalImages.of(nowhere, spread(nowhere).centre[0], lens(), SCREEN).nearest(0.0, 0.0)
     assert not offset.any() and bool((share == 1).all())
 
 
 def test_a_rectangle_of_light_casts_a_rectangle():
     """Free space would be a pinhole: the images of the chip's corners stand apart as its sides do."""
-    seen = SourceImages.of(CHIP, spread(CHIP).centre[0], lens(), SCREEN)
+    seen = LocalImages.of(CHIP, spread(CHIP).centre[0], lens(), SCREEN)
     nine = seen.offset.mean(-1)
     wide, high = float((nine[0, 5] - nine[0, 3]).abs()), float((nine[1, 7] - nine[1, 1]).abs())
     assert wide / high == pytest.approx(SIZE, rel=0.1) and Rectangle(SIZE, 1.0) == CHIP.extent
