@@ -229,7 +229,7 @@ def typical_seconds(scene: Scene) -> Seconds:
     first += transport * sum((grid / UNIT_GRID) ** 2 for grid in grids) * knobs.transport_iterations / UNIT_ITERATIONS
     fits = [fitted for level in knobs.levels[-2:] for fitted in scene.lens.nets(level)]
     first += FIT_SECONDS * sum(math.prod(as_pair(fitted)) for fitted in fits) / UNIT_POINTS**2
-    each, begun = CALL_SECONDS + VARIABLE_SECONDS * net, RRMSD_SECONDS * pixels ** (2 / 3)  # of an evaluation and a round
+    each, begun = CALL_SECONDS + VARIABLE_SECONDS * net, RRMSD_SECONDS * pixels ** (2 / 3)  # evaluation, round
     if scene.source.extent is not None:
         each, begun = each + BLUR_SECONDS * pixels, begun + IMAGE_SECONDS
     launched = sum((tubes / UNIT_TUBES) ** 2 for tubes, _ in sheets)
