@@ -22,7 +22,7 @@ from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.tilted import TiltedSurface
 from bstcad.optics.unfolding import Image, image
 from bstcad.scene.blank import INDICES, LensBlank, Outlined
-from bstcad.scene.errors import about
+from bstcad.scene.errors import with_target_key
 from bstcad.scene.schema import COORDINATES, LENGTHS, Record, leaving_out
 from bstcad.scene.target import DIRECTIONS, Target, is_faced
 
@@ -238,7 +238,7 @@ class LightPath:
             if self.behind:
                 last = self.behind[-1]
                 sentences = target.follows(last.kind, last.vertices[-(sense > 0)], sense)
-                yield from (about(sentence, key) for sentence in sentences)
+                yield from (with_target_key(sentence, key) for sentence in sentences)
 
     def _unfaced(self) -> Iterator[str]:
         """Complain of targets that the lens sees, in the mirrors, edge-on or from the rear."""

@@ -47,7 +47,7 @@ SENTENCES = {  # sentence for each type of error of pydantic; {shown} is the val
 }
 
 
-def about(sentence: str, key: str) -> str:
+def with_target_key(sentence: str, key: str) -> str:
     """Return a sentence on a single target, "target.z: …", with the key of one of several, "target[1].z: …"."""
     return THE_TARGET.sub(key, sentence)
 
@@ -131,7 +131,7 @@ def _sentence(problem: ErrorDetails) -> str:
     location, value, context = _Location(problem), problem["input"], problem.get("ctx", {})
     key, fault = location.key, context.get("error")
     if isinstance(fault, SceneError) or (fault and not key):  # raised by a validator of bstcad
-        return about(str(fault), target[0]) if (target := ONE_TARGET.match(key)) else str(fault)
+        return with_target_key(str(fault), target[0]) if (target := ONE_TARGET.match(key)) else str(fault)
     return f"{key}: {fault}" if fault else _type_sentence(problem["type"], location, value, context)
 
 

@@ -49,7 +49,7 @@ def _spectrum(source: Emitter, lens: LensBlank) -> Iterator[str]:
         yield f"lens.material: {found}; choose a material that transmits the light of the source"
 
 
-def order(source: Emitter, lens: LensBlank) -> Iterator[str]:
+def order_complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
     """Complain of a source that is not before the lens along z, or not above a mirror."""
     front, back = lens.front.z + lens.front_sags[0], lens.back.z
     key, start = f"source.{source.start_key}", source.nearest_z(upwards=lens.passes.sense > 0)
@@ -66,7 +66,7 @@ def order(source: Emitter, lens: LensBlank) -> Iterator[str]:
         yield "lens.front.optimise: no light meets the front of a mirror, the rear of its plate; remove it"
 
 
-def unlit(source: Emitter, lens: LensBlank, rim: Outline) -> Iterator[str]:
+def unlit_complaints(source: Emitter, lens: LensBlank, rim: Outline) -> Iterator[str]:
     """Complain of a source, turned or moved sideways, that sends no light to the lens inside its rim."""
     if not (source.tilted or getattr(source, "centre", None)):
         return

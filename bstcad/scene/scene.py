@@ -39,12 +39,12 @@ from bstcad.scene.blank import LensBlank, as_front, net_extent
 from bstcad.scene.dotted_keys import OUTLINES, override, tables_at
 from bstcad.scene.effects import Effects
 from bstcad.scene.elements import Around, Elements, LightPath
-from bstcad.scene.errors import SceneError, about, explain, line_of, toml_positions
+from bstcad.scene.errors import SceneError, explain, line_of, toml_positions, with_target_key
 from bstcad.scene.mount import Mount, Part
 from bstcad.scene.picture import Picture
 from bstcad.scene.quality import VERIFICATION_DRAW, VERIFICATION_POINTS, Tailoring, Tolerance
 from bstcad.scene.schema import FILE, FileContent, Record, contents, of_model
-from bstcad.scene.target import Target, Targets, coplanar
+from bstcad.scene.target import Target, Targets, coplanar_complaints
 
 if TYPE_CHECKING:
     from bstcad.optics.measure import Draw, GhostTracer
@@ -147,15 +147,15 @@ class Scene(Record):
             self.channels()
         except ValueError as error:  # no data of the material or the metal for an effect
             yield f"effects: {error}"
-        if not self.before:  # otherwise self.light_path.complaints checks the order
-            yield from lighting.order(source, lens)
+        if not self.before:  # otherwise self.light_path checks the order
+            yield from lighting.order_complaints(source, lens)
         if not self.light_path.is_folded:
             yield from self._of_targets(lambda target: target.behind(lens))
         if not self.before:
-            yield from lighting.unlit(source.central, lens, self.rim)
+            yield from lighting.unlit_complaints(source.central, lens, self.rim)
         if not self.light_path.is_folded:
             yield from self._of_targets(lambda target: target.unfaced(lens))
-        yield from coplanar(self.targets)
+        yield from coplanar_complaints(self.targets)
         if self.wavefront is not None and self.light_path.is_folded:
             yield "wavefront: cannot be set with a mirror in [[behind]], which turns the wave; remove one of the two"
         yield from _wavefront_complaints(self.wavefront, source, lens, accept=self.accept)
@@ -170,7 +170,7 @@ class Scene(Record):
     def _of_targets(self, sentences: Callable[[Target], Iterable[str]]) -> Iterator[str]:
         """Yield the sentences on each target, with that target's key."""
         for key, target in zip(self.target_keys, self.targets, strict=True):
-            yield from (about(sentence, key) for sentence in sentences(target))
+            yield from (with_target_key(sentence, key) for sentence in sentences(target))
 
     def _metre_questions(self) -> list[str]:
         """Return a question for each length that looks like metres."""
@@ -536,7 +536,7 @@ def _validated(
         try:
             target.irradiance()  # finds a damaged or black picture before any work starts
         except SceneError as error:
-            raise SceneError(about(str(error), key)) from None
+            raise SceneError(with_target_key(str(error), key)) from None
     return scene
 
 
@@ -591,7 +591,7 @@ def _image(values: np.ndarray, key: str) -> Picture:
     try:
         return picture.from_array(values)
     except SceneError as error:
-        raise SceneError(about(str(error), key)) from None
+        raise SceneError(with_target_key(str(error), key)) from None
 
 
 if __name__ == "__main__":

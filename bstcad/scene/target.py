@@ -281,7 +281,7 @@ class Drawing:
 # ---- several targets -------------------------------------------------------------------------------------------------
 
 
-def distinct(given: Target | tuple[Target, ...]) -> tuple[Target, ...]:
+def with_distinct_names(given: Target | tuple[Target, ...]) -> tuple[Target, ...]:
     """Return all targets of a scene, with a different file name for each image: the copies are in one folder."""
     images: dict[str, bytes] = {}  # contents by name in lower case, as a file system may compare names
 
@@ -307,7 +307,7 @@ def numbered(name: str, k: int) -> str:
     return name if k == 0 else f"{name}_{k + 1}"
 
 
-def coplanar(targets: tuple[Target, ...]) -> Iterator[str]:
+def coplanar_complaints(targets: tuple[Target, ...]) -> Iterator[str]:
     """Complain of targets in the plane of an earlier one, or crossing it."""
     for k, target in enumerate(targets):
         for i, earlier in enumerate(targets[:k]):
@@ -344,7 +344,7 @@ Targets = Annotated[  # one table of a file, or a list of them
     Annotated[Target, Tag("table")]
     | Annotated[tuple[Target, ...], Tag("list"), Field(min_length=1, max_length=MAX_TARGETS)],
     Discriminator(lambda given: "list" if isinstance(given, list | tuple) else "table"),
-    AfterValidator(distinct),
+    AfterValidator(with_distinct_names),
 ]
 
 
