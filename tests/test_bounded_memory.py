@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.measure import SourceImages
+from bstcad.optics.measure import ImageSamples
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.source_image import IMAGE_NODES, MAX_TRANSFORM_BYTES, VALUE_BYTES, widest
@@ -84,8 +84,8 @@ def test_a_wall_beside_the_lamp_names_the_way_that_works():
 def test_light_that_lands_far_away_takes_no_room():
     target = np.random.default_rng(1).random((20, 30))
     offset = torch.tensor([[0.0, 3.0, -4.0], [1.0, -2.0, 2.0]], dtype=torch.float64)[..., None]
-    near = SourceImages(offset, torch.ones((3, 1), dtype=torch.float64))
-    far = SourceImages(torch.cat([offset, torch.full((2, 1, 1), 1e9)], 1), torch.ones((4, 1), dtype=torch.float64))
+    near = ImageSamples(offset, torch.ones((3, 1), dtype=torch.float64))
+    far = ImageSamples(torch.cat([offset, torch.full((2, 1, 1), 1e9)], 1), torch.ones((4, 1), dtype=torch.float64))
     assert far.mean((30, 20)).shape == (41, 61)
     assert far.deviation(target) == pytest.approx(near.deviation(target), rel=1e-12)
 

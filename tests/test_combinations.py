@@ -301,7 +301,7 @@ MAY_REFUSE = (  # sentences of designs, and the choices that cannot be had toget
     (r"target: .* of the light would have to leave the back outside of lens.outline", {"front": "tailored spline"}),
 )
 COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which figures are found
-    "optics.measure": {"SETS": 4, "MIN_TUBES": 65, "MIN_POINTS": 4, "MAX_POINTS": 8},
+    "optics.measure": {"SETS": 4, "MIN_TUBES": 65, "MIN_SOURCE_POINTS": 4, "MAX_SOURCE_POINTS": 8},
     "scene.scene": {"VERIFICATION_POINTS": 4},
     "tailoring.run": {"FINE_EFFORT": Effort(96, accuracy=0.0, witness=False)},
     "tailoring.stage1": {"COARSEST_GRID": 16},

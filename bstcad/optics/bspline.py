@@ -34,8 +34,7 @@ from bstcad.optics.surfaces import Surface
 DEGREE = 2  # degree of the basis functions (order 3)
 SMALLEST_NET = MIN_SIDE  # minimum control points per side: two end spans and one inner span
 SPANS_AT_A_TIME = 1 << 14  # spans evaluated at a time, so that their numbers stay in the cache
-# Positions in a span along x and y at which slope and curvature of the back are limited and reported: a grid four times
-# finer than the net, with both sides of each knot.
+# Positions in a span at which slope and curvature of the back are limited and reported, with both sides of each knot.
 QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 

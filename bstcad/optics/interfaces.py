@@ -250,8 +250,7 @@ def first_root(
     steep to the surface must begin in the glass.
     """
     dx, dy, dz = rays.direction
-    rise = dz if rays.sense > 0 else -dz
-    steep = rays.alive & ~(rise > bounds.steepest_x * dx.abs() + bounds.steepest_y * dy.abs())
+    steep = rays.alive & ~(rays.sense * dz > bounds.steepest_x * dx.abs() + bounds.steepest_y * dy.abs())
     s, meets = _newton(
         surface, start, rays.direction, s=torch.zeros_like(dz), searched=rays.alive & ~steep, tolerance=bounds.tolerance
     )

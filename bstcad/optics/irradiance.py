@@ -20,7 +20,7 @@ from bstcad.optics.motion import Motion
 from bstcad.optics.rays import Landed, Status, axes, clocked, clocking_of, tilt_of
 from bstcad.optics.receivers import LevelPlane, Receiver, TiltedPlane
 
-ROUNDING = 1e-12  # fraction of the light on a target that counts as rounding
+LEAK_ROUNDING = 1e-12  # fraction of the light on a target that counts as rounding
 DARK_LEVEL = 1e-6  # largest value of a dark pixel of a target, as a fraction of its brightest pixel
 
 
@@ -185,7 +185,7 @@ def leak(irradiance: np.ndarray, target: np.ndarray) -> Leak | None:
         return None
     share = math.fsum(irradiance[dark]) / math.fsum(irradiance.ravel())
     lit = (1 - share) / (~dark).sum()
-    return Leak(share, float(lit * dark.sum() / share) if share > ROUNDING else None)
+    return Leak(share, float(lit * dark.sum() / share) if share > LEAK_ROUNDING else None)
 
 
 LEDGER = {  # reasons of loss by line of the ledger

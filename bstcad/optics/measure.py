@@ -17,7 +17,7 @@ tenth (measured).  The tubes are therefore halved in width until both pictures a
 cannot explain the difference.  Their RRMSD (`rrmsd_by_tubes`) compares designs in float32 and float64; it is a few per
 cent too low for a lens tailored with the same tubes.  A ghost is traced once; its noise is the same in all sets.
 
-An extended source forms an image of itself through each point of the lens (`SourceImages`).  All rays that leave one
+An extended source forms an image of itself through each point of the lens (`ImageSamples`).  All rays that leave one
 point of the back face share its slope, whatever point of the source they come from: no lens can bring them together.
 """
 
@@ -63,12 +63,12 @@ SMOOTHING_WIDTHS = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # standard de
 # Power of the number of points of an extended source by which tubes and rays per side fall: the total stays constant.
 SIDE_EXPONENT = 0.5
 RAYS_PER_POINT = 1 << 13  # rays of each set per point of an extended source
-MIN_POINTS, MAX_POINTS = 8, 1024  # points of an extended source in each set
+MIN_SOURCE_POINTS, MAX_SOURCE_POINTS = 8, 1024  # points of an extended source in each set
 MIN_TUBES = 513  # minimum tubes per side of the witness: fewer do not resolve pixels
 COARSE_SHEET = 64  # tubes per side of the coarse sheet of many pictures: to find it is half the work; error 1e-6
 PASS_SEEDS = 1 << 20  # difference between the seeds of successive passes of rays from an extended source
 GHOST_DIVISOR = 4  # rays per side over those of the ghost, which is a hundredth of the light
-IMAGE_PLACES = 48  # points per side of the back face through which the image of the source is computed
+IMAGE_POINTS = 48  # points per side of the back face through which the image of the source is computed
 # Largest distance of an image from the centre of the screen, over the screen's width plus the median distance.  Light
 # outside it grazes a tilted plane and is no part of the image.
 MAX_IMAGE_DISTANCE = 16
@@ -355,7 +355,7 @@ def _sample_source(
 def _trace_sets(lens, draw: Draw, screen: Screen, target: Tensor, side: int, seed: int, ghost) -> _Rays:
     """Trace SETS sets of about side x side rays each."""
     sets = []
-    count = min(max(side**2 // RAYS_PER_POINT, MIN_POINTS), MAX_POINTS)
+    count = min(max(side**2 // RAYS_PER_POINT, MIN_SOURCE_POINTS), MAX_SOURCE_POINTS)
     for i in range(SETS):
         channels = draw(count, seed + i)
         n = max(1, round(side_factor(channels) * side))
@@ -511,7 +511,7 @@ def _squared(t: Tensor) -> float:
 
 
 @dataclass(frozen=True)
-class SourceImages:
+class ImageSamples:
     """Images of a source through several points of the back face: landing points of the light of each channel."""
 
     offset: Tensor  # landing from the centroid of the point's own image, (2, channels, points), in columns and rows
@@ -549,10 +549,10 @@ class SourceImages:
         return float(rrmsd(torch.from_numpy(blurred), torch.from_numpy(np.asarray(target, dtype=np.float64))))
 
 
-def even_image(extent: Outline) -> SourceImages:
+def even_image(extent: Outline) -> ImageSamples:
     """Return the image of an evenly bright disc or rectangle, its extent in pixels."""
     offset = torch.tensor(point_pairs(extent, EVEN_POINT_PAIRS), dtype=torch.float64).T[..., None]
-    return SourceImages(offset, torch.full(offset.shape[1:], 1 / (2 * EVEN_POINT_PAIRS), dtype=torch.float64))
+    return ImageSamples(offset, torch.full(offset.shape[1:], 1 / (2 * EVEN_POINT_PAIRS), dtype=torch.float64))
 
 
 def detail_width(source_image: float, pixel: float) -> float:
@@ -564,7 +564,7 @@ def detail_width(source_image: float, pixel: float) -> float:
 
 
 @torch.no_grad()
-def images(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int = IMAGE_PLACES) -> SourceImages:
+def images(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int = IMAGE_POINTS) -> ImageSamples:
     """Return the images of the source through the lit ones of n x n points of the back, for the first line of light."""
     first = channels[0]
     channels = [c for c in channels if (c.source.wavelength, c.index) == (first.source.wavelength, first.index)]
@@ -577,7 +577,7 @@ def images(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int = IMA
     lit = flux.sum(0) > 0
     flux, share = flux[:, lit], flux[:, lit] / flux[:, lit].sum(0)
     pixel = torch.where(flux > 0, pixel[..., lit], torch.zeros_like(share))
-    return SourceImages(pixel - (pixel * share).sum(1, keepdim=True), flux)
+    return ImageSamples(pixel - (pixel * share).sum(1, keepdim=True), flux)
 
 
 @torch.no_grad()

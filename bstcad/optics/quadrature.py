@@ -18,12 +18,12 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.surfaces import Surface
 
 MIN_SPANS = 128  # minimum parts of an axis of a net; the spans of a coarser net are divided
-POINTS = 3  # Gauss points in each part of a chord or of an edge
+GAUSS_POINTS = 3  # Gauss points in each part of a chord or of an edge
 FINE_NET = 400  # control points per side from which on FINE_POINTS keep the area of a lens to 1e-9
 FINE_POINTS = 2  # Gauss points in each part of a chord or of an edge of such a net
 CHORD_POINTS = 96  # Gauss points of a chord over a smooth face; exact to rounding up to a half diagonal of 0.95 R
 END_PARTS = 12  # minimum parts of an end span, where x(t) is quadratic and h(x) no polynomial: volumes to 1e-12
-STRIP = 512  # border points evaluated at a time
+POINTS_PER_STRIP = 512  # border points evaluated at a time
 MIN_RELATIVE_DX = 1e-14  # largest |dx| / ds of border points that are left out, since they add nothing
 EDGE_PARTS = 256  # minimum number of parts of an edge's curve
 
@@ -64,8 +64,8 @@ def of_face(face: Surface, border: Border, raised: float = 0.0) -> Sums:
     """
     total = Sums()
     counted = np.flatnonzero(np.abs(border.dx) > MIN_RELATIVE_DX * border.ds)
-    for start in range(0, len(counted), STRIP):
-        strip = counted[start : start + STRIP]
+    for start in range(0, len(counted), POINTS_PER_STRIP):
+        strip = counted[start : start + POINTS_PER_STRIP]
         total += _sums_of_points(face, raised, *_chords(face, border.x[strip], border.y[strip], border.dx[strip]))
     return Sums(abs(total.area), total.volume, total.moment)  # the area is negative for a border seen from below
 
@@ -121,7 +121,7 @@ def divided(breaks: np.ndarray, parts: int) -> np.ndarray:
 def outline_border(outline: Outline, face: Surface) -> Border:
     """Return the border of a circle or of a box with sharp corners, in parts that cross no knot line of a face."""
     net = face.is_net
-    count = _points(face) if net else POINTS
+    count = _points(face) if net else GAUSS_POINTS
     if outline.is_round:
         breaks = rim_breaks(face, outline.radius) if net else np.linspace(0, 2 * np.pi, EDGE_PARTS + 1)
         theta, weight = gauss_points(breaks, count)
@@ -161,7 +161,7 @@ def _chord_ends(face: Surface, y: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _points(face: BSplineSurface) -> int:
-    return POINTS if min(face.shape) < FINE_NET else FINE_POINTS
+    return GAUSS_POINTS if min(face.shape) < FINE_NET else FINE_POINTS
 
 
 def _smooth_parts(face: BSplineSurface, axis: int, parts: int) -> np.ndarray:

@@ -29,6 +29,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.kernel_arguments import MAX_TABLES, beam
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
+from bstcad.optics.losses import REFLECTED
 from bstcad.optics.outlines import Outline, Rectangle
 from bstcad.optics.rays import Landed, Rays, Status
 from bstcad.optics.receivers import Receiver
@@ -40,7 +41,8 @@ UNDERSIDE_CELLS = 256  # cells per side of the lens for the sum of the light tha
 WINDOW_CELLS = 96  # cells per side of the search for useful light in front of a window or mirror
 MIN_RAYS_FOR_TABLE = 256  # minimum rays per side for which a table of the source's light is worth its cost
 GHOST_RAYS = 1024  # maximum rays per side; a ghost of 1 % of the light, with 3 % noise per pixel, adds 0.0003 to RRMSD
-ON, OFF, REFLECTED, TOTAL = "ghost on target", "ghost off target", "reflected at the faces", "total internal reflection"
+# Lines of the ledger that a ghost changes, besides losses.REFLECTED.
+GHOST_ON, GHOST_OFF, TOTAL_REFLECTION = "ghost on target", "ghost off target", "total internal reflection"
 
 
 def across(rays: Rays, interfaces: Sequence[Interface]) -> Rays:
@@ -313,14 +315,15 @@ def ghost_light(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int,
 def _ghost_of_channel(channel: Channel, lens: Lens, screen: Screen, n: int, seed: int) -> GhostImage:
     """Trace the ghost of one channel; its flux leaves the line of the ledger that counted its first reflection."""
     picture = torch.zeros(screen.shape, dtype=torch.float64, device=lens.like.device)
-    launched, lines = 0.0, dict.fromkeys((ON, OFF, REFLECTED, TOTAL), 0.0)
+    launched, lines = 0.0, dict.fromkeys((GHOST_ON, GHOST_OFF, REFLECTED, TOTAL_REFLECTION), 0.0)
     for rays in launch_strips(channel.source, lens, n, seed):
         out, total_at_first = trace_ghost(rays, lens)
         landed = screen.plane.land(out)
         on_screen = landed.alive & screen.contains(*landed.position)
         picture += irradiance.box(landed, screen)
         for line, counted, sign in (
-            (ON, on_screen, 1), (OFF, ~on_screen, 1), (REFLECTED, ~total_at_first, -1), (TOTAL, total_at_first, -1),
+            (GHOST_ON, on_screen, 1), (GHOST_OFF, ~on_screen, 1),
+            (REFLECTED, ~total_at_first, -1), (TOTAL_REFLECTION, total_at_first, -1),
         ):  # fmt: skip
             lines[line] += sign * float(total((out.flux * (out.alive & counted)).double()))
         launched += float(total(rays.flux.double()))

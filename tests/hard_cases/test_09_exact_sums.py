@@ -50,17 +50,17 @@ def carried(dtype, count=SINGLE) -> torch.Tensor:
 def test_a_traced_pixel_counts_twenty_million_rays(holds, dtype):
     """Rays go from the source through a slab into one pixel; 1 / 20 007 729 is no short binary number.
 
-    Adding n equal numbers rounds each time in the same direction, by ROUND of the sum at most; a part adds n / PARTS.
+    A sum of n equal numbers rounds each time in the same direction, by at most ROUND; a part adds n / MAX_PARTS.
     """
     heights = torch.zeros((5, 5), dtype=dtype)
     lens = Lens(Plane(5.0), BSplineSurface(8.0, heights, (-10.0, 10.0), (-10.0, 10.0)), Rectangle(20.0, 20.0), 1.5)
     n = 4473
     found = simulated(Collimated(Rectangle(18.0, 18.0)), lens, SCREEN, n, 0)
     assert found.rays == n * n > HITS and float(found.box.sum()) == float(found.box[2, 2])
-    bound = n * n / reductions.PARTS * ROUND
+    bound = n * n / reductions.MAX_PARTS * ROUND
     holds("2e7 hits in one pixel, traced: flux", abs(float(found.box[2, 2]) - 1), bound, "of it")
-    # the ledger sums blocks of 256 rays first: n / (256 PARTS) sums, and 256 in each
-    bound = (n * n / reductions.PARTS / 256 + 256) * ROUND
+    # the ledger sums blocks of 256 rays first: n / (256 MAX_PARTS) sums, and 256 in each
+    bound = (n * n / reductions.MAX_PARTS / 256 + 256) * ROUND
     holds("2e7 hits, traced: ledger's flux on the target", abs(found.flux["on target"] - 1), bound, "of it")
 
 

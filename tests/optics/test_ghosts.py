@@ -16,7 +16,7 @@ from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.point import Point
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Plane
-from bstcad.optics.trace import OFF, ON, ghost, ghost_light, trace_ghost
+from bstcad.optics.trace import GHOST_OFF, GHOST_ON, ghost, ghost_light, trace_ghost
 from tests.lenses import bundle, lens_of, tilted, wavy
 
 EXACT = 1e-12
@@ -113,11 +113,11 @@ def test_the_ledger_closes_with_the_ghost_in_it():
     without, within = (measure(lens, channels, SCREEN, target, EFFORT, way) for way in (None, ghost_light))
     assert sum(within.flux.values()) == pytest.approx(1, abs=EXACT)
     assert min(within.flux.values()) >= 0
-    assert within.flux[ON] > 0 and within.flux[OFF] > 0
+    assert within.flux[GHOST_ON] > 0 and within.flux[GHOST_OFF] > 0
     moved = [line for line, value in without.flux.items() if within.flux[line] != value]
     assert moved == ["reflected at the faces"] or set(moved) == {"reflected at the faces", "total internal reflection"}
     assert within.ghost.sum() / within.picture.sum() == pytest.approx(
-        within.flux[ON] / (within.flux[ON] + within.flux["on target"]), rel=0.02
+        within.flux[GHOST_ON] / (within.flux[GHOST_ON] + within.flux["on target"]), rel=0.02
     )
     assert within.picture.sum() == pytest.approx(target.sum(), rel=EXACT)
 
@@ -128,5 +128,5 @@ def test_a_plate_lays_its_ghost_over_the_beam():
     lens = plate(outline=Rectangle(20.0, 20.0))
     found = ghost_light(lens, (Channel(beam, N, losses=BARE),), Screen(100.0, (-8.0, 8.0), (-8.0, 8.0), 8), 200, 0)
     r = ((N - 1) / (N + 1)) ** 2
-    assert found.flux[ON] == pytest.approx((1 - r) ** 2 * r * r, rel=1e-3)  # the rim of the beam, by 200 rays a side
-    assert found.flux[OFF] == 0.0 and float(found.picture.sum()) == pytest.approx(found.flux[ON], rel=EXACT)
+    assert found.flux[GHOST_ON] == pytest.approx((1 - r) ** 2 * r * r, rel=1e-3)  # rim of the beam, by 200 rays a side
+    assert found.flux[GHOST_OFF] == 0.0 and float(found.picture.sum()) == pytest.approx(found.flux[GHOST_ON], rel=EXACT)

@@ -33,9 +33,9 @@ from bstcad.optics.kernels.compiling import compiled
 MAX_DISTANCE = 1e15  # largest coordinate of a corner (pixels); farther away a pixel is below its rounding
 NO_BORDER = 1e300  # s of the next border of an edge that crosses no more borders along an axis
 MAX_WIDTH = 1e6  # largest width of a row of tubes (pixels) whose columns are known; rounding may reach any other
-STRIP = 16  # rows of tubes whose gradient one thread computes at a time
+ROWS_PER_STRIP = 16  # rows of tubes whose gradient one thread computes at a time
 
-ON, INVALID = 0, 16  # state of a corner: on the screen; outside MAX_DISTANCE or not a number
+ON, OUT_OF_RANGE = 0, 16  # state of a corner: on the screen; outside MAX_DISTANCE or not a number
 LEFT, RIGHT, ABOVE, BELOW = 1, 2, 4, 8  # bits of the state of a corner outside one or two borders of the screen
 
 inlined = njit(forceinline=True, error_model="numpy")
@@ -50,7 +50,7 @@ def pixel_at(x, y, columns, rows):
     if 0.0 <= x < columns and 0.0 <= y < rows:
         return int(x), int(y), ON
     if not abs(x) + abs(y) < MAX_DISTANCE:
-        return 0, 0, INVALID
+        return 0, 0, OUT_OF_RANGE
     i, j = int(math.floor(min(max(x, -1.0), float(columns)))), int(math.floor(min(max(y, -1.0), float(rows))))
     return i, j, LEFT * (i < 0) + RIGHT * (i >= columns) + ABOVE * (j < 0) + BELOW * (j >= rows)
 
@@ -78,7 +78,7 @@ def in_one_cell(a, b, c):
 @inlined
 def misses_screen(a, b, c):
     """Return True if three corners lie outside one side of the screen, or one of them is invalid."""
-    return (a[4] & b[4] & c[4]) | ((a[4] | b[4] | c[4]) & INVALID) != 0
+    return (a[4] & b[4] & c[4]) | ((a[4] | b[4] | c[4]) & OUT_OF_RANGE) != 0
 
 
 @inlined
@@ -499,13 +499,13 @@ def clip_adjoint(corner, flux, thinnest, g, below_g, g_far, d_corner, d_flux):
     ones, so that no two threads write one corner.
     """
     n, m = flux.shape
-    strips = (n + STRIP - 1) // STRIP
+    strips = (n + ROWS_PER_STRIP - 1) // ROWS_PER_STRIP
     for parity in range(2):
         for half_c in prange((strips - parity + 1) // 2):
-            first = (2 * half_c + parity) * STRIP
+            first = (2 * half_c + parity) * ROWS_PER_STRIP
             upper, lower, across, side = np.empty((m, 3)), np.empty((m, 3)), np.empty((m, 3)), np.empty((m + 1, 3))
             flags, known, in_flux = np.empty((m, 3), np.bool_), np.zeros(m, np.bool_), d_flux.size > 0
-            for k in range(first, min(n, first + STRIP)):
+            for k in range(first, min(n, first + ROWS_PER_STRIP)):
                 edges = upper, lower, across, side
                 _integrate_row(g, below_g, thinnest, corner, flux, k, in_flux, flags, known, edges)
                 _add_row_adjoint(corner, flux, k, flags, edges, d_corner, d_flux)

@@ -60,7 +60,7 @@ from bstcad.optics.receivers import Receiver
 # Further offsets in `work` for the adjoint: ∂L/∂ of landing or hit and direction, of path and cosine of incidence, and
 # second derivatives of the sag.
 G_X, G_Y, G_PATH, G_COSINE, H_XX, H_XY, H_YY, G_Z, G_DX, G_DY, G_DZ = (WORK + BLOCK * k for k in range(11))
-MORE = WORK + 11 * BLOCK
+ADJOINT_WORK = WORK + 11 * BLOCK
 
 
 @njit(error_model="numpy")
@@ -263,7 +263,7 @@ def _cross_adjoint(
     g: gradient in `out` of `_cross`.  more: gradients in path and cosine of incidence (2, n), or (2, 0).  d_rays: None,
     or (6, n), which receives the gradient in positions and directions.
     """
-    work = np.empty(MORE)
+    work = np.empty(ADJOINT_WORK)
     for begin in range(first, last, BLOCK):
         count = min(BLOCK, last - begin)
         _load(position, direction, status, begin, count, work)

@@ -22,7 +22,7 @@ from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import LEDGER, Screen
 from bstcad.optics.kernels import kernel_arguments, reductions
 from bstcad.optics.kernels.compiling import compiled
-from bstcad.optics.kernels.records import NO_LOSSES
+from bstcad.optics.kernels.records import NO_LOSS_TABLES
 from bstcad.optics.kernels.spline import beyond2, net_of, sag
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
@@ -526,7 +526,7 @@ def land(source: Emitter, lens: Lens, plane: Receiver, x: Tensor, y: Tensor) -> 
 
     It is `trace.trace` of `source.rays(x, y, lens.entrance.z, 1.0)`, except for the fate of rays without flux.
     """
-    scene = *_scene(source, lens, plane), NO_LOSSES
+    scene = *_scene(source, lens, plane), NO_LOSS_TABLES
     landing, flux, fate = np.empty((2, x.numel())), np.empty(x.numel()), np.empty(x.numel(), np.uint8)
     reductions.on_threads(
         lambda first, last: _rays(*scene, *(a[..., first:last] for a in (x.numpy(), y.numpy(), landing, flux, fate))),

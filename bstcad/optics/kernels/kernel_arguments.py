@@ -31,7 +31,7 @@ MIN_IRRADIANCE = 1e-4  # irradiance over its maximum below which the error count
 SLOPE_TOLERANCE = 1e-8  # largest RMS of a table's error in the slopes of rays
 PEAK_TO_RMS = 100.0  # largest error of a table over these tolerances: the outermost spans are the least exact
 MAX_TABLES = 16  # tables of light in the cache
-MAX_ERROR_RATIO = 0.5  # largest ratio of the errors of a table and of the one before; above it the light has an edge
+MAX_TABLE_ERROR_RATIO = 0.5  # largest error of a table over that of the one before; above: the light has an edge
 TABLE_BEAM = 0.0, 0.0, 0.0, 0.0, math.inf, 1.0, 0.0, 0, 0.0  # first fields of a Beam that is given by a table
 
 
@@ -66,7 +66,7 @@ def faces(
 def losses(lens: Lens) -> LossTables:
     """Return the losses of a lens as numbers, from the plain forms of losses.py."""
     if lens.losses is None:
-        return records.NO_LOSSES
+        return records.NO_LOSS_TABLES
     *front, back = (_table(interface) for interface in lens.interfaces)
     glass = [loss.coefficient for i in lens.interfaces for loss in i.losses if loss.in_glass]
     return LossTables(1, front[0] if front else back, back, float(sum(glass)))
@@ -122,7 +122,7 @@ def _table_of_light(source: Emitter, window: Rectangle, z: float) -> Beam | None
             corner = [*(-s / 2 for s in size), *((side - 1) / s for s in size)]
             table = LightTable(side, side, *corner, *(net.ravel() for net in nets))
             return Beam(*TABLE_BEAM, start=float(starts), tilted=1, n_x=0.0, n_y=0.0, n_z=1.0, least=0.0, table=table)
-        if not error < MAX_ERROR_RATIO * last:
+        if not error < MAX_TABLE_ERROR_RATIO * last:
             return None
         last = error
     return None

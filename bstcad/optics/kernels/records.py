@@ -168,4 +168,4 @@ class LossTables(NamedTuple):
     coefficient: float  # absorption coefficient of the glass (1/mm)
 
 
-NO_LOSSES = LossTables(0, np.ones(2), np.ones(2), 0.0)
+NO_LOSS_TABLES = LossTables(0, np.ones(2), np.ones(2), 0.0)

@@ -24,22 +24,22 @@ from torch import Tensor
 from bstcad.optics import ops
 from bstcad.optics.kernels.compiling import compiled
 
-PARTS = 16  # maximum number of parts; a power of two, so that two, four or eight threads have equal work
+MAX_PARTS = 16  # maximum number of parts; a power of two, so that two, four or eight threads have equal work
 MIN_PART = 1 << 14  # minimum number of rays or tubes in a part
-ROW = 4096  # numbers summed by one thread
+ROW_LENGTH = 4096  # numbers summed by one thread
 ELEMENTARY = 1024  # numbers whose exp, sin or cos one thread computes: torch divides no fewer than 2048
 
 
 def parts(n: int) -> int:
-    """Return the number of parts of n rays: 1, 2, 4 … PARTS."""
-    return min(PARTS, 1 << max(0, (n // MIN_PART).bit_length() - 1))
+    """Return the number of parts of n rays: 1, 2, 4 … MAX_PARTS."""
+    return min(MAX_PARTS, 1 << max(0, (n // MIN_PART).bit_length() - 1))
 
 
 def total(t: Tensor) -> Tensor:
     """Return Σ t, differentiable: torch divides one long sum among its threads, but not the sum of a row."""
     flat = t.reshape(-1)
-    whole = flat.numel() // ROW * ROW
-    return flat[:whole].view(-1, ROW).sum(1).sum() + flat[whole:].sum()
+    whole = flat.numel() // ROW_LENGTH * ROW_LENGTH
+    return flat[:whole].view(-1, ROW_LENGTH).sum(1).sum() + flat[whole:].sum()
 
 
 def quotient(t: Tensor, whole: Tensor) -> Tensor:
@@ -76,8 +76,8 @@ def dot(a: Tensor, b: Tensor) -> float:
 
 
 def dot_of_arrays(a: Tensor, b: Tensor) -> float:
-    """Return `dot` on the CPU, as a sum of PARTS sums."""
-    sums = np.empty(PARTS)
+    """Return `dot` on the CPU, as a sum of MAX_PARTS sums."""
+    sums = np.empty(MAX_PARTS)
     _dot(a.detach().numpy(), b.detach().numpy(), sums)
     return float(sums.sum())
 

@@ -121,7 +121,7 @@ def caustic(n, m):
 def test_a_caustic_keeps_its_flux_and_its_gradient():
     """Several parts and strips each walk the edges that they share with their neighbours by themselves."""
     n, m, shape = 210, 190, (48, 56)
-    assert reductions.parts(n * m) > 1 and n > 3 * clip.STRIP
+    assert reductions.parts(n * m) > 1 and n > 3 * clip.ROWS_PER_STRIP
     corner = 4.4 * caustic(n, m)
     area = signed_area(corner)
     assert 0.1 < float((area < 0).double().mean()) < 0.9
