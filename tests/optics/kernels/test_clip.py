@@ -1,4 +1,4 @@
-"""One walk an edge: what the triangles beside it share, and what they must not get from each other."""
+"""Cutting of tubes, edge by edge: sums that two triangles share, and values that must not pass between them."""
 
 import math
 
@@ -89,7 +89,7 @@ PLACES = (
 
 @pytest.mark.parametrize("put", PLACES, ids=lambda put: put.__name__)
 def test_a_tube_unlike_its_neighbours_takes_nothing_from_them(put):
-    """Picture, pull and both gradients are those of triangles walked around one by one."""
+    """Picture, light outside and both gradients equal those of triangles that are followed one by one."""
     corner, flux = crowded(12, 14, 1)
     put(corner)
     flux[2, 3:6] = 0.0
@@ -98,16 +98,16 @@ def test_a_tube_unlike_its_neighbours_takes_nothing_from_them(put):
 
 
 @pytest.mark.parametrize("far", [math.nan, math.inf, -math.inf, 1e17])
-def test_a_corner_that_is_nowhere_takes_its_triangles_away_and_no_more(far):
+def test_an_invalid_corner_removes_its_triangles_and_no_others(far):
     """Four of the eight around it, here; for the others it is as if those tubes had no flux, gradients included."""
     corner, flux = crowded(12, 14, 2)
     dark = flux.clone()
     dark[5:7, 4:6] = 0.0
-    nowhere = corner.clone()
-    nowhere[1, 6, 5] = far
-    image, outside, in_corner, _ = light(tubes.collect, nowhere, dark)
+    invalid = corner.clone()
+    invalid[1, 6, 5] = far
+    image, outside, in_corner, _ = light(tubes.collect, invalid, dark)
     same((image, outside, in_corner), light(tubes.collect_plain, corner, dark)[:3])
-    left = tubes.collect(nowhere, flux - dark, SHAPE)[0]
+    left = tubes.collect(invalid, flux - dark, SHAPE)[0]
     assert float(left.min()) > -1e-12
     assert float(left.sum()) == pytest.approx(float((flux - dark).sum()) / 2, rel=1e-12)
 
@@ -119,7 +119,7 @@ def caustic(n, m):
 
 
 def test_a_caustic_keeps_its_flux_and_its_gradient():
-    """Several parts and strips each walk the edges that they share with their neighbours by themselves."""
+    """Several parts and strips each follow the edges that they share with their neighbours."""
     n, m, shape = 210, 190, (48, 56)
     assert reductions.parts(n * m) > 1 and n > 3 * clip.ROWS_PER_STRIP
     corner = 4.4 * caustic(n, m)
@@ -141,7 +141,7 @@ def signed_area(corner):
 
 
 def test_even_tubes_of_one_density_have_no_edges_inside():
-    """Edges between two triangles of the same density are not walked: the picture is its outline, exact to rounding."""
+    """Edges between two triangles of the same density add nothing: only the outline counts, to rounding."""
     corner = even(24, 24, low=2.25, high=8.25)
     image, _ = tubes.collect(corner, torch.full((24, 24), 36 / 24**2, dtype=torch.float64), SHAPE)
     line = torch.tensor([0, 0, 0.75, 1, 1, 1, 1, 1, 0.25, 0, 0, 0, 0], dtype=torch.float64)
