@@ -179,7 +179,7 @@ def slow_progress() -> Iterator[progress.ProgressFunction]:
         yield progress.Throttled(watched, TERMINAL_INTERVAL if terminal.is_terminal else FILE_INTERVAL)
 
 
-def words(names: str | None) -> list[str]:
+def split_names(names: str | None) -> list[str]:
     """Split names at commas."""
     return [] if names is None else [name.strip() for name in names.split(",")]
 
@@ -393,7 +393,7 @@ def verify(
     processes.begin()
     commands = load_commands()
     with progress.watch(Console(stderr=True)) as watched:
-        found = commands.verify(path, against=words(against), measured=measured, progress=watched, place=output)
+        found = commands.verify(path, against=split_names(against), measured=measured, progress=watched, place=output)
     return conclude(getattr(found, "contents", found), output or path, verbose)
 
 
@@ -429,7 +429,7 @@ def export(folder: Folder, kinds: Kinds = None, points: Points = None) -> int:
     """Write files for a shop: sag tables, points, Zemax grid sag, turning data, outlines, previews, the data sheet."""
     if kinds is None:
         raise SceneError(f"--as: is missing; give the kinds of files: {EXPORTS}")
-    written = load_commands().export(folder, words(kinds), points)
+    written = load_commands().export(folder, split_names(kinds), points)
     print(*written.notes, "Files: " + ", ".join(map(str, written.paths)), sep="\n")
     return 0
 
@@ -515,7 +515,6 @@ def scene_paths(patterns: list[str]) -> list[Path]:
 
 
 def _load_or_refuse(path: Path, changes: dict[str, Any]) -> BatchScene:
-    """Return the scene of a file, or the sentence that refuses it."""
     from bstcad.scene.scene import load
     from bstcad.sweep.batch import BatchScene
 

@@ -174,15 +174,15 @@ def prove(
 ) -> Report:
     """Prove a design from temporary files."""
     processes.begin()
-    with tempfile.TemporaryDirectory(prefix="bstcad-") as place, _second_process_ended():
+    with tempfile.TemporaryDirectory(prefix="bstcad-") as folder, _second_process_ended():
         drawn = NoPictures(made.scene, processes.submit)
-        made, proof = _write_and_prove(made, Path(place), drawn, own_checks, progress=progress, effort=effort)
+        made, proof = _write_and_prove(made, Path(folder), drawn, own_checks, progress=progress, effort=effort)
     contents = _contents(made, proof, _left_out(made, proof))
     return Report(contents, tuple(light.picture for light in proof.lights))
 
 
 def _write_and_prove(
-    made: Made, place: Path, drawn: Pictures, own_checks: Sequence[OwnCheck], *, progress: Progress,
+    made: Made, folder: Path, drawn: Pictures, own_checks: Sequence[OwnCheck], *, progress: Progress,
     effort: Effort | None, limit: float | None = None,
 ) -> tuple[Made, Proof]:  # fmt: skip
     """Write the geometry and prove it; return the design with these two stages, and its proof.  limit: see `write`."""
@@ -192,7 +192,7 @@ def _write_and_prove(
     progress("write", 0, 1, "STEP, STL, 3MF")
     drawn.solid(made.lens)  # as designed, to be drawn while OCC writes and reads the file
     with scene_errors(f"{made.scene.name}: "):  # raised if the tailored faces do not bound a solid
-        write_3mf = folders.write_geometry(made, place, processes.submit)
+        write_3mf = folders.write_geometry(made, folder, processes.submit)
     processes.return_freed()
     with ThreadPoolExecutor(1) as beside:
         parallel = [beside.submit(work) for work in (write_3mf, prepare)]
@@ -201,7 +201,7 @@ def _write_and_prove(
         if limit is not None:
             effort, left = effort or FULL, limit - REPORT_TIME - made.making.seconds_total - (written - began)
             effort = replace(effort, seconds=min(effort.seconds, max(left, MIN_RAY_TIME)))
-        proof = _prove_files(made, place, drawn, own_checks=own_checks, effort=effort, progress=progress)
+        proof = _prove_files(made, folder, drawn, own_checks=own_checks, effort=effort, progress=progress)
         for work in parallel:
             work.result()
     verified = time.perf_counter()
@@ -357,7 +357,6 @@ def read(folder: Path) -> Made:
 
 
 def _made_part(cloud: Cloud, proof: Proof, made: Made, *, effort: Effort | None, progress: Progress) -> MadePart:
-    """Judge the made part that was measured as `cloud`."""
     progress("made part", 0, 1, "from its cloud")
     with scene_errors():
         found = made_part.judge(cloud, proof.lens, made, effort)
@@ -396,7 +395,6 @@ def _contents(made: Made, proof: Proof, estimates: tuple[LeftOut, ...]) -> Conte
 
 
 def _left_out(made: Made, proof: Proof) -> tuple[LeftOut, ...]:
-    """Return the effects that are left out, by the light on the target with the largest RRMSD."""
     return left_out(made.scene.single_target_scenes()[proof.worst], proof.lens, proof.light.picture)
 
 
@@ -482,7 +480,6 @@ def export(folder: Path, kinds: Sequence[str], points: int | None = None) -> Exp
 
 
 def _export(made: Made, kinds: Sequence[str], folder: Path, points: int | None = None) -> Exported:
-    """Write the files of some kinds of a design to a folder."""
     scene, lens = made.scene, made.lens
     light = GridLight(scene.source.central, tuple(target.screen for target in scene.targets))
     return exports.export(
@@ -491,7 +488,6 @@ def _export(made: Made, kinds: Sequence[str], folder: Path, points: int | None =
 
 
 def _sheet_again(made: Made, folder: Path) -> DataSheet:
-    """Return the data sheet of a finished design from its report."""
     with scene_errors():
         known = record.read(folder / "report.json")
     if known.shape is None or not (folder / "lens.step").is_file():

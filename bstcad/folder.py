@@ -337,7 +337,6 @@ def _spare_folders(folder: Path) -> Iterator[Path]:
 
 
 def _contains(folder: Path, design: Made) -> bool:
-    """Return True if a folder contains this design."""
     try:
         _, nominal = read_nominal(folder)
     except Exception:  # zipfile and numpy raise various errors for a damaged file
@@ -349,10 +348,7 @@ def _contains(folder: Path, design: Made) -> bool:
 
 
 def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
-    """Return the scene and the nominal design of a folder.
-
-    SceneError if design.npz or scene.toml is missing or damaged.
-    """
+    """Return scene and nominal design of a folder.  SceneError if design.npz or scene.toml is missing or damaged."""
     scene = scenes.load(folder / SCENE)
     shapes = {"control_points": (*as_pair(scene.lens.back.net), 3), "front_curvature": ()}
     if scene.lens.front.is_tailored:
@@ -396,7 +392,6 @@ def read_transport(folder: Path, scene: scenes.Scene) -> TransportMap | None:
 
 
 def _arrays(folder: Path, shapes: Mapping[str, tuple[int, ...]], scene: scenes.Scene) -> dict[str, np.ndarray]:
-    """Return arrays of finite numbers from the design.npz of a scene."""
     path, pixels = folder / DESIGN, sum(math.prod(target.columns_rows) for target in scene.targets)
     points = sum(math.prod(as_pair(net)) for net in scene.lens.nets())
     try:

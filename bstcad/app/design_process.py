@@ -105,15 +105,15 @@ class LightSnapshot:
 # ---- the jobs --------------------------------------------------------------------------------------------------------
 
 
-def design(job: Mapping[str, Any], place: Path, output: Path, resume: bool) -> State:
+def design(job: Mapping[str, Any], run_folder: Path, output: Path, resume: bool) -> State:
     """Design the scene of the run's folder into `output`."""
     from bstcad import commands
     from bstcad.scene.scene import load
 
-    scene = load(place / SCENE)
+    scene = load(run_folder / SCENE)
     report = commands.generate(
-        scene, output, progress=ProgressFile(place / PROGRESS), began=time.perf_counter(), resume=resume,
-        on_lens=LightSnapshot(scene, place / LIGHT),
+        scene, output, progress=ProgressFile(run_folder / PROGRESS), began=time.perf_counter(), resume=resume,
+        on_lens=LightSnapshot(scene, run_folder / LIGHT),
     )  # fmt: skip
     found = report.contents
     if report.stopped != "interrupt":
@@ -124,32 +124,33 @@ def design(job: Mapping[str, Any], place: Path, output: Path, resume: bool) -> S
     )
 
 
-def tolerance(job: Mapping[str, Any], place: Path, output: Path, resume: bool) -> State:
+def tolerance(job: Mapping[str, Any], run_folder: Path, output: Path, resume: bool) -> State:
     """Study the tolerances of a finished design.  job: grade and yield (0 to 1), either may be None."""
     from bstcad import commands
 
-    commands.tolerance(output, grade=job.get("grade"), wanted=job.get("yield"), progress=ProgressFile(place / PROGRESS))
+    progress = ProgressFile(run_folder / PROGRESS)
+    commands.tolerance(output, grade=job.get("grade"), wanted=job.get("yield"), progress=progress)
     return State("finished", folder=output.name)
 
 
-def tradeoff(job: Mapping[str, Any], place: Path, output: Path, resume: bool) -> State:
+def tradeoff(job: Mapping[str, Any], run_folder: Path, output: Path, resume: bool) -> State:
     """Study the trade-off of time against accuracy, in the folder NAME-tradeoff beside the design.  job: budget (s)."""
     from bstcad.runs.progress import Throttled
     from bstcad.scene.scene import load
     from bstcad.sweep import tradeoff as sweeping
 
     folder = output.with_name(f"{output.name}-tradeoff")
-    throttled = Throttled(ProgressFile(place / PROGRESS), MIN_INTERVAL)
+    throttled = Throttled(ProgressFile(run_folder / PROGRESS), MIN_INTERVAL)
     found = sweeping.tradeoff(load(output / SCENE), folder, budget=job["budget"], progress=throttled)
     return State("finished", passed=bool(found.runs_with_lens), folder=folder.name)
 
 
-def measured(job: Mapping[str, Any], place: Path, output: Path, resume: bool) -> State:
+def measured(job: Mapping[str, Any], run_folder: Path, output: Path, resume: bool) -> State:
     """Judge a made part by the file of measured points in the run's folder."""
     from bstcad import commands
 
-    [cloud] = place.glob(f"{CLOUD}.*")
-    found = commands.verify(output, measured=cloud, progress=ProgressFile(place / PROGRESS)).contents
+    [cloud] = run_folder.glob(f"{CLOUD}.*")
+    found = commands.verify(output, measured=cloud, progress=ProgressFile(run_folder / PROGRESS)).contents
     part = found.measured or {}
     return State("finished", passed=part.get("passed"), rrmsd=part.get("rrmsd_predicted"), folder=output.name)
 
@@ -162,23 +163,22 @@ JOBS = {work.__name__: work for work in (design, tolerance, tradeoff, measured)}
 
 def main(folder: str, output: str, *options: str) -> int:
     """Do the job of a run's folder and write its final state there; return the exit code."""
-    place, began = Path(folder), time.time()
-    State("running", os.getpid(), began).put(place)
+    run_folder, began = Path(folder), time.time()
+    State("running", os.getpid(), began).put(run_folder)
     try:
         with signals.raise_terminated():
-            job = json.loads(files.contents(place / JOB, MAX_JOB_SIZE))
-            ended = JOBS[job["kind"]](job, place, Path(output), "--resume" in options)
+            job = json.loads(files.contents(run_folder / JOB, MAX_JOB_SIZE))
+            ended = JOBS[job["kind"]](job, run_folder, Path(output), "--resume" in options)
     except BaseException as error:
         ended = _final_state(error)
         if ended.state == "failed":
             traceback.print_exc()
-    replace(ended, began=began).put(place)
+    replace(ended, began=began).put(run_folder)
     processes.end()
     return 0 if ended.state == "finished" else 1
 
 
 def _final_state(error: BaseException) -> State:
-    """Return the state of a run that an error or a signal ended."""
     notes = note(error)
     if signals.termination() or isinstance(error, KeyboardInterrupt):
         sentence = "the design so far is kept" if "is kept" in notes else "nothing is kept"

@@ -45,7 +45,7 @@ class Run:
     kind: str = DESIGN  # key of JOBS
 
     @property
-    def place(self) -> Path:
+    def folder(self) -> Path:
         """The folder of the run."""
         return files.beside(self.design, f"{self.kind}-run")
 
@@ -58,13 +58,13 @@ class Run:
         """
         if self.state.state == "running":
             raise SceneError(f"{self.design.name}: the {self.kind} is already running; wait until it ends, or stop it")
-        if self.place.is_symlink() or self.place.is_file():  # not ours; the target of a link stays as it is
-            self.place.unlink()
-        shutil.rmtree(self.place, ignore_errors=True)
-        self.place.mkdir(parents=True)
+        if self.folder.is_symlink() or self.folder.is_file():  # not ours; the target of a link stays as it is
+            self.folder.unlink()
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self.folder.mkdir(parents=True)
         for name, data in (contents or {}).items():
-            files.put(self.place / name, data)
-        files.put(self.place / JOB, json.dumps({"kind": self.kind, **(job or {})}).encode())
+            files.put(self.folder / name, data)
+        files.put(self.folder / JOB, json.dumps({"kind": self.kind, **(job or {})}).encode())
         self._start()
 
     def go_on(self) -> None:
@@ -72,7 +72,7 @@ class Run:
         if not self.read(JOB):
             raise SceneError(f"{self.design.name}: there is no run to resume; start a new one")
         if self.state.state != "running":
-            for path in self.place.iterdir():
+            for path in self.folder.iterdir():
                 if path.is_symlink():  # never write through a link
                     path.unlink()
             self._start("--resume")
@@ -81,9 +81,9 @@ class Run:
         """Start the process in its own session, so that a Ctrl-C in the terminal does not reach it."""
         source = str(Path(__file__).parents[2])  # the process runs these sources
         paths = os.pathsep.join(filter(None, (source, os.environ.get("PYTHONPATH"))))
-        with (self.place / "process.log").open("ab") as log:
+        with (self.folder / "process.log").open("ab") as log:
             process = subprocess.Popen(
-                [sys.executable, "-m", "bstcad.app.design_process", str(self.place), str(self.design), *options],
+                [sys.executable, "-m", "bstcad.app.design_process", str(self.folder), str(self.design), *options],
                 stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
                 env=os.environ | {"PYTHONPATH": paths},
             )  # fmt: skip
@@ -96,7 +96,7 @@ class Run:
             if process.poll() is not None:  # it has ended already
                 if self._written_state() == NO_RUN:
                     failed = State("failed", sentence="its process did not start; process.log in its folder says why")
-                    failed.put(self.place)
+                    failed.put(self.folder)
                 return
             time.sleep(0.01)
 
@@ -139,8 +139,8 @@ class Run:
     def read(self, name: str) -> bytes:
         """Return the bytes of a file of the run; b"" if it does not exist or a link leads outside the designs."""
         try:
-            place = self.place
-            return files.contents(files.within(place / name, place.parent), MAX_PROGRESS_SIZE)
+            folder = self.folder
+            return files.contents(files.within(folder / name, folder.parent), MAX_PROGRESS_SIZE)
         except ValueError:
             return b""
 
@@ -149,13 +149,13 @@ class Run:
         if self.kind != DESIGN or files.beside(self.design, "checkpoint").exists():
             return False
         try:
-            return (self.design / "report.json").stat().st_mtime > (self.place / STATE).stat().st_mtime
+            return (self.design / "report.json").stat().st_mtime > (self.folder / STATE).stat().st_mtime
         except OSError:
             return False
 
     def _is_own_process(self, process: int) -> bool:
         """Return True if the process belongs to this run; the system reuses the ids of ended processes."""
-        return str(self.place) in command_of(process)
+        return str(self.folder) in command_of(process)
 
     def news(self, since: int) -> dict[str, Any]:
         """Return the state and the lines of progress from line `since` on, for the page.
@@ -171,7 +171,7 @@ class Run:
 
     def _modification_time(self, name: str) -> str:
         try:
-            return str((self.place / name).stat().st_mtime_ns)
+            return str((self.folder / name).stat().st_mtime_ns)
         except OSError:
             return ""
 

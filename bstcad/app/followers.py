@@ -82,8 +82,8 @@ def with_followers(data: Mapping[str, Any], key: str, value: Any, locked: bool =
 
 def _other_side(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
     """Return the change of the other side of a table at the same ratio; {} if one of the sides has no length."""
-    place, _, name = key.rpartition(".")
-    other = f"{place}.{LOCKED_SIDES.get(name, '')}"
+    parent, _, name = key.rpartition(".")
+    other = f"{parent}.{LOCKED_SIDES.get(name, '')}"
     was, its = value_at(key, data), value_at(other, data)
     if are_numbers(value, was, its) and was and value > 0:
         return {other: _rounded(its * value / was)}

@@ -47,6 +47,10 @@ MAIN_FIELDS: tuple[Mapping[str, str], ...] = (
     {"tailoring.quality": "Quality"},
 )  # fmt: skip
 THICKNESS = "Thickness at the centre"  # label of lens.back.z for a front face at z = 0
+SECTIONS = {  # labels of sections whose key is no clear title, by key
+    "source": "light source", "before": "optics before the lens", "behind": "optics behind the lens",
+    "accept": "limits of the checks", "output": "files and their accuracy", "part": "title block of the part",
+}  # fmt: skip
 LOCKED_SIDES = {"x": "y", "y": "x", "width": "height", "height": "width"}  # side: the other side, which a lock changes
 OPTIONAL_TABLES = ("mount",)  # tables that have a meaning even if they are empty
 MAX_TABLES = 1000  # tables in a list without a limit of its own
@@ -145,7 +149,7 @@ def form(data: Table) -> SceneForm:
     """Return the form of a scene's tables, which need not be valid."""
     whole = _group("", schema(), data, data)
     names = replace(whole, label="name and title", groups=(), additions=(), page=_docs_page("name"))
-    sections = (names, *whole.groups)
+    sections = (names, *(replace(group, label=SECTIONS.get(group.key, group.label)) for group in whole.groups))
     known = {field.key: field for group in whole.walk() for field in group.fields}
     several = "target[0]" in {group.key for group in whole.walk()}
     first = []
@@ -163,7 +167,6 @@ def form(data: Table) -> SceneForm:
 
 
 def _without(group: Group, taken: set[str]) -> Group:
-    """Return a group without the fields of some keys."""
     left = tuple(field for field in group.fields if field.key not in taken)
     return replace(group, fields=left, groups=tuple(_without(inner, taken) for inner in group.groups))
 
@@ -216,7 +219,6 @@ def _max_tables(node: Node) -> int:
 
 
 def _field(key: str, node: Node, table: Table, options: list[Any], required: bool) -> Field:
-    """Return the field of a key of a table."""
     name = key.rpartition(".")[2]
     inner = [node, *(part for form in alternatives(node) for part in (form, *form.get("prefixItems", ())))]
     inner += [form["items"] for form in alternatives(node) if isinstance(form.get("items"), dict)]
@@ -338,7 +340,6 @@ def environment() -> jinja2.Environment:
 
 
 def _keys(group: Group) -> set[str]:
-    """Return the keys of a group's tables and fields."""
     return {key for each in group.walk() for key in (each.key, *(field.key for field in each.fields)) if key}
 
 

@@ -147,8 +147,6 @@ class _Body:
 
 
 def _with_headers(send: Send) -> Send:
-    """Return a function that sends answers with HEADERS."""
-
     async def sent(message: MutableMapping[str, Any]) -> None:
         if message["type"] == "http.response.start":
             headers = MutableHeaders(scope=message)

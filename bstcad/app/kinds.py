@@ -38,9 +38,9 @@ def without_numbers(key: str) -> str:
     return TABLE_NUMBER.sub("", key)
 
 
-def table_at(place: str, data: Any) -> dict[str, Any]:
+def table_at(key: str, data: Any) -> dict[str, Any]:
     """Return the table at a dotted key of a scene's tables, not a copy; an empty dict if there is none."""
-    for name, number in KEY_PART.findall(place):
+    for name, number in KEY_PART.findall(key):
         data = data.get(name) if isinstance(data, dict) else None
         if isinstance(data, list):
             data = data[int(number or 0)] if int(number or 0) < len(data) else None
@@ -49,14 +49,14 @@ def table_at(place: str, data: Any) -> dict[str, Any]:
 
 def value_at(key: str, data: Any) -> Any:
     """Return the value of a dotted key in a scene's tables; None if the key is not set."""
-    place, _, name = key.rpartition(".")
-    return (table_at(place, data) if place else data).get(name)
+    parent, _, name = key.rpartition(".")
+    return (table_at(parent, data) if parent else data).get(name)
 
 
-def records_at(place: str, data: Table) -> list[Node]:
+def records_at(key: str, data: Table) -> list[Node]:
     """Return the schema's records for the table at a dotted key; outer tables have the kinds that `data` states."""
     union, outer = [schema()], ""
-    for name, number in KEY_PART.findall(place):
+    for name, number in KEY_PART.findall(key):
         known = matching_records(union, table_at(outer, data))
         union = [inner for record in known for inner in records(record["properties"].get(name, {}))]
         outer = f"{outer}.{name}".lstrip(".") + (f"[{number}]" if number else "")
@@ -65,16 +65,16 @@ def records_at(place: str, data: Table) -> list[Node]:
 
 def node_at(key: str, data: Table) -> Node | None:
     """Return the schema's node of a dotted key; None if its table has no such key."""
-    place, _, last = key.rpartition(".")
-    union = matching_records(records_at(place, data), table_at(place, data))
+    parent, _, last = key.rpartition(".")
+    union = matching_records(records_at(parent, data), table_at(parent, data))
     name = without_numbers(last)
     return next((record["properties"][name] for record in union if name in record["properties"]), None)
 
 
 def kinds_at(key: str, data: Table) -> list[Any]:
     """Return all values of a key that states a kind, such as source.kind; [] for other keys."""
-    place, _, name = key.rpartition(".")
-    return [tags(record)[name] for record in records_at(place, data) if name in tags(record)]
+    parent, _, name = key.rpartition(".")
+    return [tags(record)[name] for record in records_at(parent, data) if name in tags(record)]
 
 
 def matching_records(union: list[Node], table: Table) -> list[Node]:
@@ -140,9 +140,9 @@ def _hashable(table: Table) -> dict[str, str]:
 # ---- tables ----------------------------------------------------------------------------------------------------------
 
 
-def convert_table(place: str, tag: Mapping[str, str], data: Table) -> dict[str, Any]:
+def convert_table(key: str, tag: Mapping[str, str], data: Table) -> dict[str, Any]:
     """Return the table at a key converted to another kind: common keys keep their values, missing keys get new ones."""
-    union, old = records_at(place, data), table_at(place, data)
+    union, old = records_at(key, data), table_at(key, data)
     chosen = next((record for record in union if tag.items() <= tags(record).items()), None)
     if chosen is None:  # no such kind
         return {**old, **tag}
@@ -151,8 +151,8 @@ def convert_table(place: str, tag: Mapping[str, str], data: Table) -> dict[str, 
     nodes = chosen["properties"]
     common = {name: value for name, value in old.items() if _is_common(had.get(name), nodes.get(name), value)}
     scene = copy.deepcopy(dict(data))
-    table_at(place, scene).update(tag)
-    return _completed(place, chosen, common, scene)
+    table_at(key, scene).update(tag)
+    return _completed(key, chosen, common, scene)
 
 
 def _is_common(before: Node | None, after: Node | None, value: Any) -> bool:
@@ -188,28 +188,28 @@ def new_table(key: str, data: Table) -> dict[str, Any]:
     return _completed(key, union[shapes.index(kind)], {}, data)
 
 
-def _completed(place: str, record: Node, kept: Table, data: Table) -> dict[str, Any]:
-    """Return a table of a record, in the schema's order: its tag, the keys in `kept`, and its required keys."""
+def _completed(key: str, record: Node, common: Table, data: Table) -> dict[str, Any]:
+    """Return a table of a record, in the schema's order: its tag, the keys in `common`, and its required keys."""
     needed = {*record.get("required", ())}
     options = [option["required"] for option in record.get("oneOf", ())]  # for a circle: radius, or diameter
-    if options and not any(name in kept for option in options for name in option):
+    if options and not any(name in common for option in options for name in option):
         needed.update(options[-1])
     table: dict[str, Any] = dict(tags(record))
     for name, node in record["properties"].items():
-        if name in kept:
-            table[name] = kept[name]
+        if name in common:
+            table[name] = common[name]
         elif name in needed and name not in table:
-            table[name] = _needed_value(f"{place}.{name}", node, data)
-        elif (start := SOURCE_ORIGINS.get(f"{place}.{name}")) and (made := start(data)) is not None:
+            table[name] = _needed_value(f"{key}.{name}", node, data)
+        elif (start := SOURCE_ORIGINS.get(f"{key}.{name}")) and (made := start(data)) is not None:
             table[name] = made
     kind = "".join(tags(record).values())
-    return FIRST_OPTIONS.get((without_numbers(place), kind), {}) | table
+    return FIRST_OPTIONS.get((without_numbers(key), kind), {}) | table
 
 
 def _needed_value(key: str, node: Node, data: Table) -> Any:
     """Return a value for a required key, by the sizes and positions in the scene, else the schema's example."""
-    place, _, name = key.rpartition(".")
-    sizes, like = extent(table_at(place, data)), SIZE_MODELS.get(without_numbers(place))
+    parent, _, name = key.rpartition(".")
+    sizes, like = extent(table_at(parent, data)), SIZE_MODELS.get(without_numbers(parent))
     if sizes is None and like is not None and (found := extent(table_at(like[0], data))):
         sizes = (like[1] * found[0], like[1] * found[1])
     if name in SIZES and sizes is not None:
@@ -247,9 +247,9 @@ def are_numbers(*values: Any) -> bool:
     return all(type(value) in (int, float) and abs(value) < 1e300 for value in values)
 
 
-def _scaled_z(data: Table, place: str, times: float = 1.0, more: float = 0.0) -> float | None:
+def _scaled_z(data: Table, key: str, times: float = 1.0, more: float = 0.0) -> float | None:
     """Return times * z + more for the z of a table (mm); None without z."""
-    z = table_at(place, data).get("z")
+    z = table_at(key, data).get("z")
     return times * z + more if are_numbers(z) else None
 
 

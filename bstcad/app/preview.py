@@ -156,7 +156,6 @@ def _lit_fraction(scene: Scene, lens: Lens) -> float:
 
 @torch.no_grad()
 def _picture(scene: Scene, lens: Lens, goal: Goal) -> np.ndarray:
-    """Return the light on the receiver of a goal, (rows, columns)."""
     n = round(TUBES_PER_PIXEL * max(goal.receiver.shape))
     if not scene.source.extent:
         return tubes_picture(lens, scene.channels(), goal.receiver, n).numpy()

@@ -89,7 +89,7 @@ class PreviewDesk:
         with self._news:
             return self._requests.get(page)
 
-    def forget(self, page: str) -> None:
+    def drop(self, page: str) -> None:
         """Drop the request of a page, which no longer waits for answers."""
         with self._news:
             if (request := self._requests.pop(page, None)) is not None:

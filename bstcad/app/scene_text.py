@@ -83,10 +83,10 @@ def _changed_tables(before: dict[str, Any], key: str, value: Any) -> dict[str, A
     with contextlib.suppress(ValueError):
         value = value if node is None else cast(node, value)
     override(after, key, value, key)
-    place, _, last = key.rpartition(".")
-    if last in TAGS and value is not None and value != table_at(place, before).get(last):
-        table = table_at(place, after)
-        new = convert_table(place, {last: value}, before)
+    parent, _, last = key.rpartition(".")
+    if last in TAGS and value is not None and value != table_at(parent, before).get(last):
+        table = table_at(parent, after)
+        new = convert_table(parent, {last: value}, before)
         table.clear()
         table.update(new)
     name = KEY_PART.match(key)[1]
@@ -162,7 +162,6 @@ def pieces(text: str) -> list[Piece]:
 
 
 def _is_complete(lines: str) -> bool:
-    """Return True if the lines contain a key with its complete value."""
     try:
         return bool(tomllib.loads(lines))
     except tomllib.TOMLDecodeError:
@@ -217,7 +216,6 @@ def _table_end(found: Sequence[Piece], k: int) -> int:
 
 
 def _update(found: list[Piece], path: KeyPath, before: Any, after: Any) -> list[Piece]:
-    """Replace the value `before` at a path by `after`."""
     if is_same(before, after):
         return found
     stated = {piece.path: k for k, piece in enumerate(found) if piece.is_statement}
@@ -308,12 +306,10 @@ def _edit_value(item: Any, after: Any) -> Any:
 
 
 def _source_text(item: Any) -> str:
-    """Return the source text of an item of tomlkit, which may be a plain Python value."""
     return item.as_string() if isinstance(item, Item) else as_toml(item)
 
 
 def _remove(found: list[Piece], path: KeyPath) -> list[Piece]:
-    """Remove a key or a table with its comments."""
     own = [k for k, piece in enumerate(found) if piece.is_statement and piece.path[: len(path)] == path]
     dropped = {j for k in own for j in range(k, _after_comment(found, k))}
     for k, after in itertools.pairwise(own):
@@ -371,7 +367,6 @@ def _add_table(found: list[Piece], path: KeyPath, value: Any) -> list[Piece]:
 
 
 def _insert(found: list[Piece], where: int, new: Sequence[Piece]) -> list[Piece]:
-    """Insert pieces at an index, with the line ends of the text."""
     end = "\r\n" if any(piece.text.endswith("\r\n") for piece in found) else "\n"
     before = [*found[:where], *(replace(piece, text=piece.text.replace("\n", end)) for piece in new)]
     if where and not found[where - 1].text.endswith("\n"):
@@ -388,7 +383,6 @@ def _key_piece(path: KeyPath, value: Any, beside: Piece | None) -> Piece:
 
 
 def _table_pieces(path: KeyPath, value: Any) -> list[Piece]:
-    """Return the pieces of a table, or of a list of tables, with headers."""
     if isinstance(value, list):
         blocks = [_table_pieces((*path, k), part) for k, part in enumerate(value)]
         return blocks[0] + [piece for block in blocks[1:] for piece in (BLANK, *block)]
@@ -401,7 +395,6 @@ def _table_pieces(path: KeyPath, value: Any) -> list[Piece]:
 
 
 def _is_table_list(value: Any) -> bool:
-    """Return True for a list of tables that is not empty."""
     return isinstance(value, list) and bool(value) and all(isinstance(part, dict) for part in value)
 
 

@@ -1,7 +1,6 @@
 """The server of the workbench: its pages and the requests of their scripts, on loopback and behind guard.py.
 
-The server keeps no state that could be lost: texts are in the workspace, runs in their folders, and previews are made
-again.
+The server keeps no state that could be lost: texts are in the workspace, runs in their folders.
 """
 
 from __future__ import annotations
@@ -127,7 +126,6 @@ class Workbench:
         return self._sentence_answer(request, str(error), 400)
 
     def _refuse_file(self, request: Request, error: Exception) -> Response:
-        """Answer that a file or folder cannot be read or written."""
         assert isinstance(error, OSError)
         name = f"{Path(error.filename).name}: " if isinstance(error.filename, str) else ""
         remedy = "check the permissions of the file and the free space on the disk"
@@ -180,7 +178,6 @@ class Workbench:
         )  # fmt: skip
 
     def _designs(self) -> Iterator[dict[str, Any]]:
-        """Iterate over the cards of running and finished designs."""
         running = {run.design.name: run for run in design_runs.all_runs(self.workspace.designs) if run.kind == "design"}
         finished = self.workspace.design_names()
         for name in [*(name for name in running if name not in finished), *finished]:
@@ -193,7 +190,6 @@ class Workbench:
             }  # fmt: skip
 
     def _thumbnail(self, name: str, run: Run | None) -> str:
-        """Return the address of a design's picture; "" without one."""
         if (self.workspace.design(name) / "figures" / "irradiance.png").is_file():
             return f"/design/{name}/files/figures/irradiance.png"
         return f"/api/design/{name}/light.png" if run is not None and run.light else ""
@@ -270,10 +266,10 @@ class Workbench:
         error = self._fault(name, opened.text)
         if error is None:
             self._valid_texts = {**dict([*self._valid_texts.items()][-MAX_VALID_TEXTS:]), name: opened.text}
-        shown = form.form(data)
+        fields = form.form(data)
         answer["design"] = data.get("name") if isinstance(data.get("name"), str) else name
         errors = {error["key"]: error["sentence"]} if error else {}
-        page = form.html(shown, errors, self.has_docs)
+        page = form.html(fields, errors, self.has_docs)
         return answer | {"form": page, "error": error, "sketch": sketch.svg(data)}
 
     def _fault(self, name: str, text: str) -> dict[str, Any] | None:
@@ -388,7 +384,7 @@ class Workbench:
 
         {page}: id of the page, which waits for no preview any more.
         """
-        self.desk.forget(str(body.get("page")))
+        self.desk.drop(str(body.get("page")))
         text = self.workspace.opened(name).text
         scene = self.workspace.scene(name, text)
         self.workspace.save(name)
@@ -450,16 +446,16 @@ class Workbench:
         """Write a new scene file with the scene of a design, and answer with its name."""
         name = request.path_params["name"]
         folder = self.workspace.design(name)
-        source = folder if (folder / "scene.toml").is_file() else Run(folder).place
-        return JSONResponse({"name": self.workspace.adopt(name, source, Run(folder).place / SCENE_TEXT)})
+        source = folder if (folder / "scene.toml").is_file() else Run(folder).folder
+        return JSONResponse({"name": self.workspace.adopt(name, source, Run(folder).folder / SCENE_TEXT)})
 
     def tolerance(self, name: str, body: Body) -> dict[str, Any]:
         """Start a study of tolerances: {grade, yield in percent}, both optional."""
         wanted = body.get("yield")
-        share = None if wanted in (None, "") else _number(wanted, "yield") / 100
-        if share is not None and not 0 < share < 1:
-            raise SceneError(f"yield: {100 * share:g} % is not between 0 and 100 %; give a percentage such as 90")
-        return self._begin(name, "tolerance", {"grade": body.get("grade") or None, "yield": share})
+        fraction = None if wanted in (None, "") else _number(wanted, "yield") / 100
+        if fraction is not None and not 0 < fraction < 1:
+            raise SceneError(f"yield: {100 * fraction:g} % is not between 0 and 100 %; give a percentage such as 90")
+        return self._begin(name, "tolerance", {"grade": body.get("grade") or None, "yield": fraction})
 
     def tradeoff(self, name: str, body: Body) -> dict[str, Any]:
         """Start a study of time against accuracy: {budget in seconds}."""
@@ -536,14 +532,12 @@ def _json_handler(work: Callable[[str, Body], dict[str, Any]]) -> Callable[[Requ
 
 
 def _required(table: Body, name: str) -> Any:
-    """Return a value of a request.  SceneError if it is missing."""
     if name not in table:
         raise SceneError(f"{name}: is missing from the request; reload the page")
     return table[name]
 
 
 def _integer(given: Any) -> int:
-    """Return an integer of a request.  SceneError if it is none."""
     try:
         return int(given)
     except (ValueError, TypeError, OverflowError):
@@ -551,7 +545,6 @@ def _integer(given: Any) -> int:
 
 
 def _number(given: Any, key: str) -> float:
-    """Return a number that a person typed.  SceneError if it is none."""
     try:
         return float(given)
     except (ValueError, TypeError, OverflowError):
@@ -582,7 +575,6 @@ class _ZipBuffer(bytearray):
 
 
 def _flat_values(table: Mapping[str, Any], at: str = "") -> dict[str, str]:
-    """Return the values of a scene by dotted key, as text."""
     found: dict[str, str] = {}
     for name, value in table.items():
         key = f"{at}.{name}".lstrip(".")

@@ -39,7 +39,6 @@ def _between(start: float | None, end: float | None) -> str:
 
 
 def _across(outline: Any) -> str:
-    """Return the size of an outline as text."""
     width, height, radius, diameter = (_number(key, outline) for key in ("width", "height", "radius", "diameter"))
     if width is not None and height is not None:
         return f"{width:g} × {height:g} mm"
@@ -48,6 +47,5 @@ def _across(outline: Any) -> str:
 
 
 def _range(ends: Any) -> str:
-    """Return the length of a range as text."""
     known = isinstance(ends, list) and len(ends) == 2 and are_numbers(*ends)
     return f"{ends[1] - ends[0]:.6g} mm" if known else ""

@@ -55,10 +55,7 @@ class Workbench:
         self.refresh()
 
     def set(self, key: str, value: Any) -> None:
-        """Set a value by its dotted key, as the widgets do, and show the preview.
-
-        SceneError for an invalid scene; the value then stays unchanged.
-        """
+        """Set a value by its dotted key and show the preview.  SceneError for an invalid value, which is not set."""
         changes = with_followers(scene_text.tables(self.text), key, value)
         if self._path is None:  # a scene object contains its pictures; its text only names them
             self.scene = self.scene.changed(changes)
@@ -90,8 +87,8 @@ class Workbench:
         except SentenceError as refusal:
             self._say(str(refusal))
             return
-        shown, page = preview_json.of_preview(found), form.environment().get_template("widget.html.j2").module
-        self.preview, self._light.value, self._message.value = found, page.light(shown), page.figures(shown)
+        reply, page = preview_json.of_preview(found), form.environment().get_template("widget.html.j2").module
+        self.preview, self._light.value, self._message.value = found, page.light(reply), page.figures(reply)
 
     # ---- widgets ----
 
@@ -125,5 +122,4 @@ class Workbench:
         self._message.value = f"<p role='alert'><b>{html.escape(sentence)}</b></p>"
 
     def _repr_mimebundle_(self, **options: Any) -> Any:
-        """Return the widgets in the formats that a notebook asks for."""
         return self.box._repr_mimebundle_(**options)

@@ -51,8 +51,8 @@ def typed(key: str, words: str, data: Mapping[str, Any]) -> Any:
     """
     node = node_at(key, data)
     if node is None:
-        place, _, last = key.rpartition(".")
-        union = matching_records(records_at(place, data), table_at(place, data))
+        parent, _, last = key.rpartition(".")
+        union = matching_records(records_at(parent, data), table_at(parent, data))
         known = sorted({name for record in union for name in record["properties"]})
         raise SceneError(f"{key}: unknown key; {nearest(without_numbers(last), known, 'the keys here are')}")
     if not words.strip():

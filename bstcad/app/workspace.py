@@ -172,7 +172,6 @@ class Workspace:
         return scenes.of_text(text, scene_file.tables(text, Path(path.name)), path, bounds=bounds)
 
     def _text(self, path: Path) -> str:
-        """Return the text of a file inside the workspace."""
         return _text(self._own(path))
 
     def add(
@@ -360,7 +359,6 @@ def _encoded_as(path: Path, text: str) -> bytes:
 
 
 def _encoded(name: str, text: str) -> bytes:
-    """Return a text in UTF-8.  SceneError if that is not possible."""
     try:
         return text.encode()
     except UnicodeEncodeError:

@@ -79,7 +79,6 @@ def _version(name: str) -> str:
 
 
 def _processor() -> str:
-    """Return the processor's name if the system reports it, else its architecture."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

@@ -71,7 +71,6 @@ def note(error: BaseException) -> str:
 
 
 def _command(error: BaseException) -> str:
-    """Return the command whose arguments typer refused."""
     context = getattr(error, "ctx", None)
     return f"bstcad {context.info_name}" if context and context.parent else "bstcad"
 
@@ -179,7 +178,6 @@ def _array(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...]) -> np.nd
 
 
 def _header(file: IO[bytes], name: str) -> tuple[tuple[int, ...], str]:
-    """Return the shape and the kind of numbers of an array in numpy's format."""
     import numpy as np
 
     if np.lib.format.read_magic(file) != (1, 0):

@@ -179,7 +179,6 @@ def _start() -> Executor:
 
 @contextlib.contextmanager
 def _environment_variable(name: str, value: str) -> Iterator[None]:
-    """Set an environment variable within the block."""
     before = os.environ.get(name)
     os.environ[name] = value
     try:
@@ -202,10 +201,7 @@ def _serve(parent: int) -> None:
 
 
 def peak_memory() -> float | None:
-    """Return the peak memory of this process (GB); None if the system does not report it.
-
-    psutil has no peak on Linux.
-    """
+    """Return the peak memory of this process (GB), which psutil lacks on Linux; None if the system has none."""
     with contextlib.suppress(OSError, StopIteration):  # on Linux getrusage includes the parent process
         lines = Path("/proc/self/status").read_text().splitlines()
         return int(next(line for line in lines if line.startswith("VmHWM:")).split()[1]) * 1024 / 1e9
@@ -298,7 +294,6 @@ def run(
 
 
 def _cpu_seconds_of_children() -> float:
-    """Return the CPU time of ended child processes and of their children."""
     times = os.times()
     return times.children_user + times.children_system
 

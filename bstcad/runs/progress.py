@@ -51,7 +51,6 @@ def for_script(wanted: bool = True) -> AbstractContextManager[ProgressFunction]:
 
 
 def _notebook() -> Callable[..., Any] | None:
-    """Return IPython's `display` in a notebook; None elsewhere."""
     if "IPython" not in sys.modules:
         return None
     from IPython import get_ipython

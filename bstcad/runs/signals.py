@@ -40,10 +40,7 @@ def termination() -> Terminated | None:
 
 @contextlib.contextmanager
 def raise_terminated() -> Iterator[None]:
-    """Raise Terminated on the first SIGTERM or SIGHUP in the block; later ones do not interrupt the clean-up.
-
-    Ignored signals stay ignored.
-    """
+    """Raise Terminated on the first SIGTERM or SIGHUP in the block; later ones, and ignored ones, have no effect."""
 
     def handle(number: int, frame: object) -> None:
         _received.append(number)
@@ -58,10 +55,7 @@ def raise_terminated() -> Iterator[None]:
 
 @contextlib.contextmanager
 def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns True after a first Ctrl-C in the block; a second one raises KeyboardInterrupt.
-
-    The function raises Terminated if such an exception was lost.
-    """
+    """Yield a function that returns True after a first Ctrl-C in the block; a second one raises KeyboardInterrupt."""
     pressed: list[int] = []
 
     def handle(number: int, frame: object) -> None:
@@ -125,7 +119,6 @@ def _exit(number: int, frame: object = None) -> None:
 
 @contextlib.contextmanager
 def _handled_by(handle: Callable[[int, object], None] | signal.Handlers, *numbers: int) -> Iterator[None]:
-    """Install a handler for some signals within the block."""
     before = {}
     try:
         for number in numbers:

@@ -48,8 +48,8 @@ def test_a_process_that_cannot_start_is_told(tmp_path, monkeypatch):
 
 def test_a_run_whose_process_was_killed_is_stopped_and_can_be_gone_on_with(tmp_path):
     run = Run(tmp_path / "made", UNKNOWN)
-    run.place.mkdir(parents=True)
-    State("running", process=2**22 + 1).put(run.place)
+    run.folder.mkdir(parents=True)
+    State("running", process=2**22 + 1).put(run.folder)
     assert run.state.state == "stopped" and run.state.sentence == design_runs.PROCESS_LOST
     with pytest.raises(ValueError, match="start a new one"):
         run.go_on()
@@ -59,10 +59,10 @@ def test_a_run_that_ends_with_the_server_is_said_as_it_is(tmp_path, monkeypatch)
     """The server waits a moment for its runs; what they keep, they keep without it."""
     monkeypatch.setattr(design_runs, "ENDING_TIMEOUT", 0.0)
     run = Run(tmp_path / "small")
-    run.place.mkdir()
-    State("stopped", sentence="nothing is kept").put(run.place)
+    run.folder.mkdir()
+    State("stopped", sentence="nothing is kept").put(run.folder)
     assert "the design is stopped; nothing is kept" in run.final_sentence
-    State("running", process=os.getpid()).put(run.place)
+    State("running", process=os.getpid()).put(run.folder)
     monkeypatch.setattr(Run, "_is_own_process", lambda self, process: True)
     [said] = design_runs.endings([run])
     assert "is stopping" in said and "nothing" not in said

@@ -33,7 +33,7 @@ def own(tmp_path, monkeypatch):
     """A workbench whose runs are done at once, in this process."""
 
     def start(run, *options):
-        design_process.JOBS["design"]({}, run.place, run.design, False).put(run.place)
+        design_process.JOBS["design"]({}, run.folder, run.design, False).put(run.folder)
 
     monkeypatch.setattr(Run, "_start", start)
     return bench(tmp_path / "lenses", monkeypatch)

@@ -399,7 +399,7 @@ def test_a_socket_takes_the_points_of_a_measured_part(served, monkeypatch):
     monkeypatch.setattr(Run, "_start", lambda self: None)
     cookie, data = got(served, served.first)[1]["set-cookie"].partition(";")[0], b"x,y,z\n" + b"1.0,2.0,3.0\n" * 800_000
     assert got(served, "/api/design/made/measured", method="POST", body=data, cookie=cookie)[0] == 200
-    assert (Run(served.folder / "made", "measured").place / "cloud.csv").read_bytes() == data
+    assert (Run(served.folder / "made", "measured").folder / "cloud.csv").read_bytes() == data
 
 
 def test_only_this_machine_reaches_the_socket(served):

@@ -75,7 +75,7 @@ def links(folder, away):
     (folder / ".edited.toml.unsaved").symlink_to(away / "secret.toml")
     for kind in JOBS:
         (folder / f".followed.{kind}-run").symlink_to(away / "run")
-        run = Run(folder / "half", kind).place
+        run = Run(folder / "half", kind).folder
         run.mkdir()
         for name in ("state.json", "progress.jsonl", "light.png", "scene.toml", "job.json", "process.log"):
             (run / name).symlink_to(away / "run" / name)
@@ -98,7 +98,7 @@ def damaged(folder, away):
         (folder / f"d{k}.toml").write_bytes(data)
         (folder / f".d{k}.toml.unsaved").write_bytes(data)
         for kind in JOBS:
-            run = Run(folder / f"d{k}", kind).place
+            run = Run(folder / f"d{k}", kind).folder
             run.mkdir()
             for name in ("state.json", "progress.jsonl", "light.png", "scene.toml", "job.json"):
                 (run / name).write_bytes(data)
@@ -110,7 +110,7 @@ def damaged(folder, away):
         (folder / f"n{k}/tolerance.json").write_bytes(b'{"yield": [' + data + b", 0.5, " + data + b"]}")
         (folder / f"n{k}.toml").write_text(SMALL.replace("100.0", data.decode()))
         for kind in JOBS:
-            run = Run(folder / f"n{k}", kind).place
+            run = Run(folder / f"n{k}", kind).folder
             run.mkdir()
             fields = ("process", "began", "passed", "rrmsd", "folder", "sentence", "state")
             broken = fields[k % len(fields)]

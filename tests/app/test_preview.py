@@ -110,7 +110,7 @@ def test_the_desk_answers_the_newest_request_of_each_page_in_order():
         refused = PreviewRequest("three", 1, scene.changed({"target.x": [9e4, 9.1e4]}))
         desk.ask(refused)
         assert isinstance(desk.answer(refused, 0, 60.0)[1], SceneError) and refused.done
-        desk.forget("two")
+        desk.drop("two")
         assert other.replaced
     finally:
         desk.end()

@@ -142,13 +142,13 @@ def test_changes_one_after_another_keep_the_law(name, draw):
 
 PLACED = [
     ("disk", "lens.min_thickness", 1.0, "65 x 65 heights\nmin_thickness = 1.0\n\n[target]"),
-    ("disk", "target.seen_from", "lens", 'even light …\nseen_from = "lens"\noutline = '),
+    ("disk", "target.seen_from", "lens", 'uniform irradiance …\nseen_from = "lens"\noutline = '),
     ("disk", "target.outline.radius", 12.25, '\noutline = { shape = "circle", radius = 12.25 }  # … inside'),
     ("disk", "lens.index", 1.5, "[lens]\nindex = 1.5\noutline = "),
     ("thu", "target.image", "a.jpg", 'right for a wall\nimage = "a.jpg"\n\n[tailoring]'),
     ("thu", "output.export", ["dxf"], 'optimised surface\n\n[output]\nexport = ["dxf"]\n\n# [part]'),
-    ("disk", "wavefront.kind", "plane", 'none outside\n\n[wavefront]\nkind = "plane"\nz = 500.0\n\n[tailoring]'),
-    ("flange", "mount.flange.draft", 2.0, "adds others\ndraft = 2.0                     # degrees, of its outer"),
+    ("disk", "wavefront.kind", "plane", 'no light outside\n\n[wavefront]\nkind = "plane"\nz = 500.0\n\n[tailoring]'),
+    ("flange", "mount.flange.draft", 2.0, "adds others\ndraft = 2.0                     # degrees; draft angle"),
     ("flange", "mount.flange.holes", [[1.0, 2.0, 3.0]], "adds others\nholes = [[1.0, 2.0, 3.0]]\ndraft"),
     ("led", "effects[1]", {"kind": "ghost"}, 'of incidence\n\n[[effects]]\nkind = "ghost"\n\n[accept]'),
     ("disk", "effects[0].kind", "ghost", 'smaller error\n\n[[effects]]\nkind = "ghost"\n\n[accept]'),

@@ -32,7 +32,7 @@ READS_JSON = (
 def own(tmp_path, monkeypatch):
     """A workbench with a scene, a design, and much that is none of its business beside them; no process begins."""
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    monkeypatch.setattr(Run, "_start", lambda self, *options: State("finished").put(self.place))
+    monkeypatch.setattr(Run, "_start", lambda self, *options: State("finished").put(self.folder))
     (tmp_path / "secret.txt").write_text(SECRET)
     (tmp_path / "secret.toml").write_text(SMALL.replace("An evenly", SECRET).replace('"small"', f'"{SECRET}"'))
     (tmp_path / "secret.png").write_bytes(png(8, 8).replace(b"IEND", SECRET.encode()))
@@ -161,10 +161,10 @@ def test_no_answer_about_a_faulty_scene_tells_where_the_folders_are(own, monkeyp
 def test_what_a_run_says_is_told_without_folders(own):
     """The page of the design shows no folder either."""
     run = Run(own.folder / "made")
-    run.place.mkdir()
+    run.folder.mkdir()
     sentence = f"{own.folder}/made: the finished design is kept in {own.folder}/made-unwritten"
-    State("failed", folder="made", sentence=sentence).put(run.place)
-    design_process.ProgressFile(run.place / design_process.PROGRESS)("reach", 0, 1, f"{own.folder}/x.png is dark")
+    State("failed", folder="made", sentence=sentence).put(run.folder)
+    design_process.ProgressFile(run.folder / design_process.PROGRESS)("reach", 0, 1, f"{own.folder}/x.png is dark")
     news = own.ask("/api/design/made/run")
     assert news.json["sentence"] == "made: the finished design is kept in made-unwritten"
     assert news.json["lines"][0][4] == "x.png is dark"
@@ -307,8 +307,8 @@ def test_what_a_folder_from_elsewhere_says_is_no_script(own):
     files = made(own.folder / "evil", title=evil, given_up=(evil,))
     (own.folder / "evil" / evil.replace("/", "")).write_text("x")
     run = Run(own.folder / "evil")
-    run.place.mkdir()
-    State("failed", sentence=evil).put(run.place)
+    run.folder.mkdir()
+    State("failed", sentence=evil).put(run.folder)
     scene = scene_text.changed(files["scene.toml"].decode(), "title", evil)
     (own.folder / "evil/scene.toml").write_text(scene)
     pages = [
@@ -374,6 +374,6 @@ def test_a_part_is_judged_by_points_kept_by_no_senders_name(own):
     for data, ending in kinds.items():
         words = {"content_disposition": 'attachment; filename="../../evil.sh"', "content_type": "text/x-sh"}
         assert own.ask("/api/design/made/measured?name=../evil", data, **words).status == 200
-        [cloud] = Run(own.folder / "made", "measured").place.glob("cloud*")
+        [cloud] = Run(own.folder / "made", "measured").folder.glob("cloud*")
         assert (cloud.name, cloud.read_bytes()) == (f"cloud{ending}", data)
     assert "evil" not in " ".join(tree(own.outside))

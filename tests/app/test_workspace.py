@@ -476,7 +476,7 @@ def test_comments_survive_the_way_through_a_design(own):
     assert again.split() == text.replace(name, f"{name}-2").replace(f'"{name}-2, for', f'"{name}, for').split()
     own.path(name).write_text(text.replace("divergence = 0.53", "divergence = 0.4"))  # another scene meanwhile
     assert "# the wall" not in own.opened(own.adopt(name, folder)).text
-    run = Run(folder).place
+    run = Run(folder).folder
     run.mkdir()
     (run / "written.toml").write_text(text)
     assert "# the wall, on which" in own.opened(own.adopt(name, folder, run / "written.toml")).text
