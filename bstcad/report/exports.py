@@ -171,7 +171,6 @@ def _sidecar(name: str, lens: Lens, points: int, light: GridLight | None) -> Ite
 
 
 def _inside(lens: Lens, points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return x and y (mm) of the points of a grid inside the outline."""
     x, y = (p.ravel() for p in np.meshgrid(*axes(lens.outline, points), indexing="ij"))
     inside = lens.outline.contains(torch.from_numpy(x), torch.from_numpy(y)).numpy()
     return x[inside], y[inside]
@@ -279,10 +278,7 @@ def across(outline: Outline) -> str:
 
 
 def pitch_radius(mount: Mount) -> float | None:
-    """Return the radius (mm) of the pitch circle of the screws, or None if it is not inside the flange.
-
-    Outside the flange the circle would look like an edge.
-    """
+    """Return the radius (mm) of the screws' pitch circle; None outside the flange, where it would look like an edge."""
     screws = mount.flange and mount.flange.screws
     if not screws or 2 * min(mount.flange.outline.outline.half_extent) <= screws.circle:
         return None

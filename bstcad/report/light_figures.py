@@ -237,7 +237,6 @@ def plain_ticks(axis: Any, low: float, high: float) -> None:
 
 
 def _pixel_centres(extent: Extent, pixels: int) -> np.ndarray:
-    """Return the centres of `pixels` equal pixels over `extent`, ascending (mm)."""
     return extent[0] + (np.arange(pixels) + 0.5) * (extent[1] - extent[0]) / pixels
 
 

@@ -61,10 +61,7 @@ Point = tuple[float, float, float]
 
 
 def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the prescription of a lens that was designed for a scene.
-
-    shape: facts by bstcad.analysis.shape.describe, and the volume.
-    """
+    """Return the prescription of a lens for a scene; shape: facts by analysis.shape.describe, and the volume."""
     front, material = lens.front, scene.lens.material
     own = scene.lens.front.with_parameters(front).surface.plain().parameters()  # heights, if it is a net
     numbers = ({"curvature": 0.0} if front.level else {}) | {n: v for n, v in own.items() if isinstance(v, float)}

@@ -366,10 +366,7 @@ def extent(source: Emitter) -> Iterator[tuple[str, str]]:
 
 
 def remarks(report: Contents, scene: Scene, goals: Sequence[Goal], irradiances: Sequence[np.ndarray]) -> list[Remark]:
-    """Return the remarks on a report, the most important first.
-
-    irradiances: one per goal, normalised to the sum of its picture.
-    """
+    """Return remarks, the most important first; irradiances: one per goal, normalised to the sum of its picture."""
     allowed = DEFAULT_RRMSD_LIMIT if report.rrmsd_asked is None else report.rrmsd_asked
     pairs = list(zip(goals, irradiances, strict=True))
     return written(
@@ -463,10 +460,7 @@ def _adapter(kind: type[Record]) -> TypeAdapter[Record]:
 
 
 def _is_printable(value: Any) -> bool:
-    """Return True if every string is short and printable, so that it cannot control a terminal.
-
-    The prescription is exempt, since text in a scene may have several lines.
-    """
+    """Return True if all strings, except those of the prescription, are short and cannot control a terminal."""
     if isinstance(value, str):
         return len(value) <= MAX_STRING_LENGTH and value.isprintable()
     if isinstance(value, dict):
