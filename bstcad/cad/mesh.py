@@ -230,12 +230,12 @@ def chordal_error(mesh: Mesh, lens: Lens) -> float:
 
     A net may bend in each knot span: an edge has two points per span or more (at most MAX_SAMPLES points in all).
     """
-    most = max(1, int((MAX_SAMPLES / 2 / max(len(mesh.faces), 1)) ** 0.5))
+    max_parts = max(1, int((MAX_SAMPLES / 2 / max(len(mesh.faces), 1)) ** 0.5))
     radius = float(lens.outline.radius) if lens.outline.is_round else 0.0
     numbers = [value for face in (lens.back, lens.front) for value in _face_numbers(face)]
 
     def largest_error(faces: np.ndarray) -> float:
-        return _chordal_error(mesh.vertices, faces, WALL_NORMAL_Z, most, radius, *numbers)
+        return _chordal_error(mesh.vertices, faces, WALL_NORMAL_Z, max_parts, radius, *numbers)
 
     with ThreadPoolExecutor(torch.get_num_threads()) as threads:
         return float(max(threads.map(largest_error, np.array_split(mesh.faces, 16))))
@@ -336,11 +336,11 @@ def _distance_from_face(a, b, c, parts, face, net):
 
 
 @njit(cache=True, nogil=True)
-def _chordal_error(vertices, faces, upright, most, radius, back, back_net, front, front_net):
+def _chordal_error(vertices, faces, upright, max_parts, radius, back, back_net, front, front_net):
     """Return the largest distance (mm) of the lens from triangles, along their normals.
 
     A triangle whose unit normal has |z| <= `upright` belongs to the wall: a cylinder of the given radius, or planes
-    (radius 0).  Edges have one part per smooth part of the face, at most `most`.
+    (radius 0).  Edges have one part per smooth part of the face, at most `max_parts`.
     """
     worst = 0.0
     for k in range(len(faces)):
@@ -351,7 +351,7 @@ def _chordal_error(vertices, faces, upright, most, radius, back, back_net, front
         if abs(n_z) > upright * length:
             extent = max(abs(p), abs(q), abs(s), abs(t), abs(p - s), abs(q - t))
             face, net = (back, back_net) if n_z > 0.0 else (front, front_net)
-            parts = min(most, max(1, math.ceil(extent * face.per_detail)))
+            parts = min(max_parts, max(1, math.ceil(extent * face.per_detail)))
             worst = max(worst, _distance_from_face(a, b, c, parts, face, net) * abs(n_z) / length)
         elif radius > 0.0:
             for x, y in ((a[0] + b[0], a[1] + b[1]), (b[0] + c[0], b[1] + c[1]), (c[0] + a[0], c[1] + a[1])):

@@ -24,7 +24,7 @@ def lens(
     design: a bstcad.Design or a bstcad.Lens; trim, holes: see Design.solid.
     """
     solid = lens_solid(getattr(design, "lens", design), trim, holes)
-    return self.eachpoint(lambda place: solid.moved(place))
+    return self.eachpoint(lambda location: solid.moved(location))
 
 
 def mounted(
@@ -34,9 +34,9 @@ def mounted(
 
     Only x and y of the points are used; z: height (mm) of the origin of the lens's scene.
     """
-    places: list[cadquery.Location] = []
-    self.eachpoint(lambda place: places.append(place) or cadquery.Vertex.makeVertex(0, 0, 0))
-    found, points = getattr(design, "lens", design), (place.toTuple()[0] for place in places)
+    locations: list[cadquery.Location] = []
+    self.eachpoint(lambda each: locations.append(each) or cadquery.Vertex.makeVertex(0, 0, 0))
+    found, points = getattr(design, "lens", design), (each.toTuple()[0] for each in locations)
     lenses = [PlacedLens(found, trim, holes, (x, y, z)) for x, y, _ in points]
     return self.newObject([mounting.mounted(self.findSolid(), lenses).solid])
 

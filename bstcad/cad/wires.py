@@ -235,7 +235,7 @@ def fit_spline(points: Points, t: np.ndarray, tolerance: float, smooth: bool = F
         spline = make_interp_spline(even[::2], values[::2], k=5)
         if np.abs(spline(even) - values).max() <= tolerance:
             return spline.c, spline.t
-    most = max(MAX_PARTS, len(t) << MAX_HALVINGS)
+    max_parts = max(MAX_PARTS, len(t) << MAX_HALVINGS)
     limit = tolerance / 2  # the error may be larger between those three points
     while True:
         quarters = np.append((t[:-1, None] + np.diff(t)[:, None] * np.arange(4) / 4).ravel(), t[-1])
@@ -244,7 +244,7 @@ def fit_spline(points: Points, t: np.ndarray, tolerance: float, smooth: bool = F
         off = np.abs(BSpline(knots, poles, 3)(quarters) - values)[:-1].reshape(len(t) - 1, -1).max(axis=1)
         if off.max() <= limit:
             return poles, knots
-        if len(t) > most:
+        if len(t) > max_parts:
             raise ValueError(
                 f"the rim bends too sharply for a curve of {len(t)} parts ({off.max():.1e} mm off); "
                 "move the rim, round its corners, or give the lens fewer control points"

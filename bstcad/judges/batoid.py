@@ -132,9 +132,9 @@ def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, se
     halves, count = np.zeros((2, *screen.shape)), 0
     sense = lens.passes.sense * (-1) ** sum(interface.law.reverses for interface in lens.interfaces[lens.solid.start :])
     for half, picture in enumerate(halves):
-        for channel, place in zip(channels, source_numbers(channels), strict=True):
+        for channel, number in zip(channels, source_numbers(channels), strict=True):
             glass, landed, launched = channel.through(lens), np.zeros(screen.shape), 0.0
-            for strip in launch_strips(channel.source, glass, n, seed + half + 2 * place):
+            for strip in launch_strips(channel.source, glass, n, seed + half + 2 * number):
                 x, y, arrived = land(through(glass, known, strip), screen, sense)
                 flux = strip.flux.numpy()
                 landed += bin_flux(x[arrived], y[arrived], flux[arrived], screen)

@@ -214,7 +214,7 @@ def _scale_to(picture: np.ndarray, total: float) -> np.ndarray:
 def coarse_screen(screen: Screen) -> Screen:
     """Return the screen with nearly square pixels, at most MAX_PIXELS and its own number along the longer side.
 
-    Their number, more than half of that, is the one with the most nearly square pixels, and the largest of several.
+    Of the numbers above half of that, the one with the most nearly square pixels is chosen, the largest of several.
     """
     width, height = screen.x[1] - screen.x[0], screen.y[1] - screen.y[0]
     ratio = min(width, height) / max(width, height)

@@ -1,8 +1,8 @@
 """The placements that a STEP file states for its solid, each as ISO 10303-42 and -43 define it.
 
-A shape representation takes part in another one in three ways: by a relationship with an ITEM_DEFINED_TRANSFORMATION,
-which an assembly states for each of its parts; by a MAPPED_ITEM; or by a plain relationship, by which both have the
-same coordinates.  The transformation maps one AXIS2_PLACEMENT_3D to another.  Nested transformations are composed.
+A shape representation is part of another one by a relationship with an ITEM_DEFINED_TRANSFORMATION, which an assembly
+states for each of its parts, by a MAPPED_ITEM, or by a plain relationship: then both have the same coordinates.  The
+transformation maps one AXIS2_PLACEMENT_3D to another.  Nested transformations are composed.
 """
 
 from __future__ import annotations

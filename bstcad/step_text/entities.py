@@ -56,10 +56,10 @@ class Entities:
         """Return the numbers of the entities that an entity refers to, in order."""
         return re.findall(r"#(\d+)", self.bodies[number][1])
 
-    def string(self, number: str, place: int) -> str:
-        """Return the first (place 0) or second (1) attribute of an entity in one line; "" if it is no string."""
+    def string(self, number: str, index: int) -> str:
+        """Return the first (index 0) or second (1) attribute of an entity in one line; "" if it is no string."""
         attributes = re.match(r"\((?:'(\d*)')?(?:,'(\d*)')?", self.bodies[number][1]).groups()
-        return decode(self.strings[int(attributes[place])]) if attributes[place] else ""
+        return decode(self.strings[int(attributes[index])]) if attributes[index] else ""
 
     def points(self, numbers: np.ndarray) -> np.ndarray:
         """Return the coordinates of point entities, (…, 3); KeyError names an entity that is no point."""

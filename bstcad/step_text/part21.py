@@ -218,8 +218,8 @@ def _units(quantity: str, entities: Entities) -> dict[str, str]:
 
 def _unit_name(body: str, entities: Entities) -> str:
     if "CONVERSION_BASED_UNIT" in body:  # an inch
-        place = re.search(r"CONVERSION_BASED_UNIT\('(\d+)'", body)[1]
-        name = one_line(entities.strings[int(place)].lower()[:40])
+        index = re.search(r"CONVERSION_BASED_UNIT\('(\d+)'", body)[1]
+        name = one_line(entities.strings[int(index)].lower()[:40])
         return f"{name} by a factor of its own" if "metre" in name or "radian" in name else name
     if body.count("SI_UNIT(") != 1:
         raise damaged("a unit has no kind, or two kinds")
