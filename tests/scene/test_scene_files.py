@@ -73,7 +73,7 @@ def test_a_design_does_not_resume_with_a_byte_of_a_file_changed(part, tmp_path):
     }[part]
     assert purpose(scene.changed({}), "cpu") == purpose(scene, "cpu")
     checkpoint.write(files.beside(tmp_path / "lens", "checkpoint"), purpose(scene, "cpu"), DesignState(DesignRecord()))
-    with pytest.raises(files.SceneError, match="is of another design .files.*give the scene as it was"):
+    with pytest.raises(files.SceneError, match="is of another design .files"):
         commands.generate(scene.changed(change), tmp_path / "lens", device="cpu", resume=True)
 
 
