@@ -94,4 +94,4 @@ def test_a_photo_is_a_verified_lens_in_four_requests(own, light, size, tmp_path)
         lenses = [folders.read_nominal(place)[1].lens for place in (own.folder / name, tmp_path / "alone")]
         assert np.array_equal(*(lens.back.control_points() for lens in lenses))
     again = own.ask(f"/api/design/{name}/edit", {}).json["name"]  # and its scene, with the comments that it had
-    assert "# the wall, on which" in own.workspace.opened(again).text
+    assert "# the wall with the picture" in own.workspace.opened(again).text

@@ -362,7 +362,7 @@ def test_a_new_scene_of_each_light_shows_what_is_given(own, light, what):
     assert scene.name == name and is_shown(scene.target, what)
     other = load(new_scene.new_scene("hand", own.scenes, light=light).path)
     assert (scene.source, scene.lens, scene.target.x) == (other.source, other.lens, other.target.x)
-    assert "# the wall, " in own.opened(name).text  # its comments stay
+    assert "# the wall with the picture" in own.opened(name).text  # its comments stay
     blurred = new_scene.Plate.of(light).blurred(scene)
     if blurred is not None:  # what the source's size leaves of this very picture
         assert blurred < scene.accept.rrmsd or scene.accept.rrmsd == new_scene.MAX_RRMSD
@@ -472,14 +472,14 @@ def test_comments_survive_the_way_through_a_design(own):
     made(folder)
     (folder / "scene.toml").write_text(load(own.path(name)).changed({"lens.back.control_points": 129}).toml())
     again = own.opened(own.adopt(name, folder)).text
-    assert "# the wall, on which" in again and again.count(" # ") == text.count(" # ")
+    assert "# the wall with the picture" in again and again.count(" # ") == text.count(" # ")
     assert again.split() == text.replace(name, f"{name}-2").replace(f'"{name}-2, for', f'"{name}, for').split()
     own.path(name).write_text(text.replace("divergence = 0.53", "divergence = 0.4"))  # another scene meanwhile
     assert "# the wall" not in own.opened(own.adopt(name, folder)).text
     run = Run(folder).folder
     run.mkdir()
     (run / "written.toml").write_text(text)
-    assert "# the wall, on which" in own.opened(own.adopt(name, folder, run / "written.toml")).text
+    assert "# the wall with the picture" in own.opened(own.adopt(name, folder, run / "written.toml")).text
 
 
 def test_a_damaged_scene_of_a_design_makes_no_scene(own):
