@@ -366,7 +366,7 @@ def test_a_new_scene_of_each_light_shows_what_is_given(own, light, what):
     blurred = new_scene.Plate.of(light).blurred(scene)
     if blurred is not None:  # what the source's size leaves of this very picture
         assert blurred < scene.accept.rrmsd or scene.accept.rrmsd == new_scene.MAX_RRMSD
-        assert "blurred by the source, and a little more" in own.opened(name).text
+        assert "picture blurred by the source" in own.opened(name).text
 
 
 @pytest.mark.parametrize("template", ["thu", "disk", "two_pictures", "beam_shaper", "caustic_portrait"])
