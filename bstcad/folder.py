@@ -40,6 +40,7 @@ from bstcad.scene import scene as scenes
 from bstcad.scene.blank import NET_FILE as FRONT
 from bstcad.scene.target import numbered
 from bstcad.transport.mapping import TransportMap, nodes
+from bstcad.verify import jobs
 from bstcad.verify.checks import Nominal
 
 SCENE, DESIGN, PART = "scene.toml", "design.npz", "part.step"
@@ -235,10 +236,9 @@ def write_geometry(design: Made, folder: Path, submit: Submit = run_here) -> Cal
     scene, lens = design.scene, design.lens
     stated = scene.name, scene.part.of(scene.lens)
     sums = quadrature.of_lens(lens)  # in this process, whose kernels are loaded
-    written = [submit("bstcad.cad.step_writing.write_lens", lens, (folder / "lens.step").absolute(), *stated, sums)]
+    written = [submit(jobs.write_lens, lens, (folder / "lens.step").absolute(), *stated, sums)]
     if mount := scene.mount:
-        work = "bstcad.cad.mounting.write_if_it_fits"
-        written.append(submit(work, lens, mount, (folder / PART).absolute(), *stated))
+        written.append(submit(jobs.write_part, lens, mount, (folder / PART).absolute(), *stated))
     asked = scene.output.mesh_tolerance is not None
     _, mesh = meshes.fit_mesh(lens, scene.mesh_tolerance, meshes.MAX_TRIANGLES if asked else None)
     meshes.write_stl(mesh, folder / "lens.stl")

@@ -117,19 +117,19 @@ def owner_of(names):
 
 
 def imported(tree):
-    """Every module a file imports, at its top or inside a function, as dotted names, those of other processes too."""
+    """Every module a file imports, at its top or inside a function, as dotted names."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             base = ("." * node.level) + (node.module or "")
             yield from (f"{base}.{alias.name}" for alias in node.names)
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "submit")):
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
             yield from (argument.value for argument in node.args if dotted(argument))
 
 
 def dotted(argument):
-    """Is it the name of a module or of something in one, to be loaded here or in the second process?"""
+    """Is it the name of a module or of something in one?"""
     return isinstance(argument, ast.Constant) and re.fullmatch(r"\w+(\.\w+)+", str(argument.value))
 
 
@@ -338,7 +338,7 @@ def of(owner):
 BROKEN = [
     (of("optics"), "from bstcad.scene import Scene"),
     (of("optics"), "def f():\n    import bstcad.cad.step_reading"),
-    (of("optics"), "def f():\n    submit('bstcad.cad.step_writing.write', 1)"),
+    (of("optics"), "def f():\n    import_module('bstcad.cad.step_writing')"),
     (of("tailoring"), "import OCP.gp"),
     (of("scene"), "def f():\n    from matplotlib import pyplot"),
     (of("tailoring"), "from ..verify import report"),

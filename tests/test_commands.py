@@ -25,7 +25,7 @@ from bstcad.report import report
 from bstcad.report.record import Examined
 from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.scene import load
-from bstcad.verify import checks
+from bstcad.verify import checks, jobs
 from bstcad.verify import step_checks as step_checks
 from tests.conftest import draws_nothing, flat_pictures, pictures, quick_effort, verify_with
 
@@ -65,8 +65,7 @@ def dying(*works):
     """A submit whose process dies over the functions whose names begin with one of `works`."""
 
     def submit(work, *arguments):
-        name = work if isinstance(work, str) else f"{work.__module__}.{work.__name__}"
-        if not name.startswith(works):
+        if not f"{work.__module__}.{work.__name__}".startswith(works):
             return commands.processes.run_here(work, *arguments)
         broken = Future()
         broken.set_exception(BrokenExecutor("it died"))
@@ -219,7 +218,7 @@ class TestGenerate:
         assert np.array_equal(commands.read(tmp_path / "out").lens.back.control_points(), found)
 
     def test_a_second_process_that_dies_over_the_solid_is_one_sentence(self, small_scene, quick, monkeypatch, tmp_path):
-        monkeypatch.setattr(commands.processes, "submit", dying("bstcad.cad.step_writing.write_lens"))
+        monkeypatch.setattr(commands.processes, "submit", dying("bstcad.verify.jobs.write_lens"))
         with pytest.raises(MachineError, match="OCC crashed on this solid") as broken:
             commands.generate(small_scene.changed(HASTY), tmp_path / "out", device="cpu")
         assert "--resume" in broken.value.__notes__[-1]
@@ -233,7 +232,7 @@ class TestGenerate:
         assert (proved / "report.html").is_file()
 
     def test_a_second_process_that_dies_over_the_file_says_so(self, folder, monkeypatch):
-        monkeypatch.setattr(commands.processes, "submit", dying("bstcad.verify.step_checks"))
+        monkeypatch.setattr(commands.processes, "submit", dying("bstcad.verify.jobs."))
         before = contents(folder)
         for path in (folder, folder / "lens.step"):
             with pytest.raises(SceneError, match=r"lens\.step: OCC broke down over it"):
@@ -244,8 +243,7 @@ class TestGenerate:
         """Within the limit, in a sentence that says what took how long."""
 
         def submit(work, *arguments):
-            name = work if isinstance(work, str) else f"{work.__module__}.{work.__name__}"
-            hangs = name.startswith("bstcad.verify.step_checks")
+            hangs = work in (jobs.read_lens, jobs.check_lens, jobs.examine)
             return Future() if hangs else commands.processes.run_here(work, *arguments)
 
         monkeypatch.setattr(commands.processes, "submit", submit)

@@ -43,6 +43,7 @@ from bstcad.report.record import Contents, CurvePoint, StageRecord
 from bstcad.report.rendering import LightPath
 from bstcad.report.units import number, tilt_words
 from bstcad.report.wavefront_figure import wavefront_map
+from bstcad.runs.processes import Submit
 from bstcad.scene.scene import Scene
 from bstcad.scene.target import numbered
 
@@ -56,7 +57,6 @@ MILLIONTHS = 1e6
 MAP_POINTS = 401  # samples of a surface map along each axis
 ROUNDING = 1e-6  # relative variation of a map below which it is flat and has no contours
 
-Submit = Callable[..., Future]  # submit(function, *arguments) calls the function in the second process
 Pngs = dict[str, bytes]  # pictures by name
 
 

@@ -65,10 +65,10 @@ def version() -> str:
 def _peak_memory() -> float | None:
     """Return the sum of the peaks of this and the second process (GB), which need not coincide; None if unknown."""
     try:
-        peaks = processes.peak_memory(), processes.submit(processes.peak_memory).result()
+        first, second = processes.peak_memory(), processes.submit(processes.peak_memory).result()
     except BrokenExecutor:
         return None
-    return None if None in peaks else sum(peaks)
+    return None if first is None or second is None else first + second
 
 
 def _version(name: str) -> str:

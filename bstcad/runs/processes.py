@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 from bstcad.runs.signals import TERMINAL_SIGNALS, ignored_by_children
 
@@ -78,14 +78,21 @@ TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # glibc's names for mallopt (malloc.h)
 MAX_KEPT = (1 << 31) - 1  # largest total of freed memory that stays with the process (bytes)
 MAX_KEPT_ARRAY = 1 << 27  # largest freed array that stays with the process (bytes)
 
-# Function, or its name "module.function" if importing it would load OCC into this process.
-Work = str | Callable[..., Any]
-Submit = Callable[..., Future]  # submit(work, *arguments) -> the Future of work(*arguments)
+P = ParamSpec("P")
+R = TypeVar("R")
 _process: Executor | None = None
 _is_second = False  # True in the second process
 
 
-def submit(work: Work, *arguments: Any) -> Future:
+class Submit(Protocol):
+    """Function that has another function called, such as `submit` and `run_here`."""
+
+    def __call__(self, work: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> Future[R]:
+        """Return the Future of work(*arguments, **options)."""
+        ...
+
+
+def submit(work: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> Future[R]:
     """Call the function `work` in the second process; calls run one after the other.
 
     The Future raises BrokenExecutor if the process died during the call.  If the system allows no second process, a
@@ -94,19 +101,19 @@ def submit(work: Work, *arguments: Any) -> Future:
     global _process
     if _process is not None:
         try:
-            return _process.submit(_call, work, *arguments)
+            return _process.submit(work, *arguments, **options)
         except BrokenExecutor:  # the process died during earlier work, whose Future reports it
             end()
     _process = _start()
     with ignored_by_children():
-        return _process.submit(_call, work, *arguments)
+        return _process.submit(work, *arguments, **options)
 
 
 class Overdue(TimeoutError):
     """Work of the second process exceeded its time limit; the process has been ended."""
 
 
-def result(work: Future, limit: float) -> Any:
+def result(work: Future[R], limit: float) -> R:
     """Return the result of a call in the second process; Overdue if it takes more than `limit` seconds."""
     try:
         return work.result(limit)
@@ -117,10 +124,10 @@ def result(work: Future, limit: float) -> Any:
         raise Overdue(f"not ended after {limit:.3g} s") from error
 
 
-def run_here(work: Work, *arguments: Any) -> Future:
+def run_here(work: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> Future[R]:
     """Call a function in this process and return a finished Future; a substitute for `submit`."""
-    done: Future = Future()
-    done.set_result(_call(work, *arguments))
+    done: Future[R] = Future()
+    done.set_result(work(*arguments, **options))
     return done
 
 
@@ -152,13 +159,6 @@ def end() -> None:
     if ended is not None:
         thread = isinstance(ended, ThreadPoolExecutor)
         ended.shutdown(wait=not thread, **{"cancel_futures" if thread else "kill_workers": True})
-
-
-def _call(work: Work, *arguments: Any) -> Any:
-    if callable(work):
-        return work(*arguments)
-    module, function = work.rsplit(".", 1)
-    return getattr(importlib.import_module(module), function)(*arguments)
 
 
 def _start() -> Executor:

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +32,7 @@ from bstcad.scene.blank import LensBlank
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Accept, Scene
 from bstcad.step_text import part21
-from bstcad.verify import text_checks
+from bstcad.verify import jobs, text_checks
 from bstcad.verify.verdict import Check
 
 if TYPE_CHECKING:
@@ -135,13 +135,13 @@ def verify(
     effort = nominal.effort(effort)
     effort = replace(effort, seed=effort.seed + VERIFY_SEED, seconds=effort.seconds / len(nominal.goals))
     path = (folder / "lens.step").absolute()
-    lens = submit("bstcad.verify.step_checks.lens", path, nominal.lens.index, nominal.lens.passes)
+    lens = submit(jobs.read_lens, path, nominal.lens.index, nominal.lens.passes)
     mount, part = nominal.scene.mount, nominal.scene.part.of(nominal.scene.lens)
-    part_lens = mount and submit("bstcad.verify.step_checks.lens_of_part", folder.absolute(), nominal.lens, mount)
-    step_job = "bstcad.verify.step_checks.check", path, nominal.lens, nominal.scene.accept.form, effort.points
-    of_step = submit(*step_job)
-    part_job = "bstcad.verify.step_checks.check_part", folder.absolute(), nominal.lens, mount, part
-    of_part = mount and submit(*part_job)
+    part_lens = mount and submit(jobs.read_lens_of_part, folder.absolute(), nominal.lens, mount)
+    check_lens = partial(submit, jobs.check_lens, path, nominal.lens, nominal.scene.accept.form, effort.points)
+    of_step = check_lens()
+    check_part = mount and partial(submit, jobs.check_part, folder.absolute(), nominal.lens, mount, part)
+    of_part = check_part and check_part()
     try:
         text = part21.read_lens(path)  # messages are more precise than OCC's
     except ValueError:
@@ -174,8 +174,8 @@ def verify(
         *text_checks.lens_checks(text, nominal.lens),
         *text_checks.measure_checks(text.properties, whole, lens.outline),
         *text_checks.part_checks(text, part),
-        *_result(of_step, path, lambda: submit(*step_job)),
-        *(_result(of_part, folder / "part.step", lambda: submit(*part_job)) if of_part else ()),
+        *_result(of_step, path, check_lens),
+        *(_result(of_part, folder / "part.step", check_part) if of_part else ()),
         *of_aperture,
         *of_shape,
         *_ripple_checks(shape),
@@ -265,7 +265,7 @@ def _stability(lens: Lens, nominal: Nominal, lights: Sequence[Light], shape: dic
 
 def examine(path: Path, submit: Submit = run_here) -> ExaminedFile:
     """Check a STEP file without a design; ValueError if it has no lens."""
-    return _result(submit("bstcad.verify.step_checks.examine", path.absolute()), path)
+    return _result(submit(jobs.examine, path.absolute()), path)
 
 
 def _result(read: Future, path: Path, again: Callable[[], Future] | None = None) -> Any:

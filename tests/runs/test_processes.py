@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
@@ -23,19 +24,19 @@ def fresh():
 
 
 def test_another_process_always_the_same_does_one_work_after_the_other(fresh, tmp_path):
-    first, second = (processes.submit("os.getpid").result() for _ in range(2))
-    assert first == second != os.getpid() == processes.run_here("os.getpid").result()
-    slow = processes.submit("time.sleep", 0.3)
-    quick = processes.submit("os.path.exists", str(tmp_path))
+    first, second = (processes.submit(os.getpid).result() for _ in range(2))
+    assert first == second != os.getpid() == processes.run_here(os.getpid).result()
+    slow = processes.submit(time.sleep, 0.3)
+    quick = processes.submit(os.path.exists, str(tmp_path))
     assert quick.result() and slow.done()
 
 
 def test_a_work_that_takes_too_long_is_ended_and_the_next_one_done(fresh):
-    process = processes.submit("os.getpid").result()
+    process = processes.submit(os.getpid).result()
     with pytest.raises(processes.Overdue, match=r"not ended after 0\.2 s"):
-        processes.result(processes.submit("time.sleep", 600), 0.2)
+        processes.result(processes.submit(time.sleep, 600), 0.2)
     assert processes.command_of(process) == ()
-    assert processes.result(processes.submit("os.getpid"), 60.0) != process
+    assert processes.result(processes.submit(os.getpid), 60.0) != process
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="tells of memory in another way")
@@ -60,13 +61,13 @@ print(peak, (kept - psutil.Process().memory_info().rss) / 1e9)
 @pytest.mark.parametrize("submit", [processes.submit, processes.run_here])
 def test_an_error_there_is_the_same_error_here(submit):
     with pytest.raises(ValueError, match="invalid literal"):
-        submit("builtins.int", "lens").result()
+        submit(int, "lens").result()
 
 
 def test_a_crash_there_is_an_answer_here_and_the_next_call_has_a_new_process(fresh):
     with pytest.raises(BrokenExecutor):
-        processes.submit("os.kill", processes.submit("os.getpid").result(), signal.SIGSEGV).result()
-    assert processes.submit("os.getpid").result() != os.getpid()
+        processes.submit(os.kill, processes.submit(os.getpid).result(), signal.SIGSEGV).result()
+    assert processes.submit(os.getpid).result() != os.getpid()
 
 
 def test_without_shared_memory_a_thread_does_it(fresh, monkeypatch):
@@ -74,13 +75,13 @@ def test_without_shared_memory_a_thread_does_it(fresh, monkeypatch):
         raise OSError(38, "Function not implemented")
 
     monkeypatch.setattr("loky.ProcessPoolExecutor", none)
-    assert processes.submit("os.getpid").result() == os.getpid()
+    assert processes.submit(os.getpid).result() == os.getpid()
 
 
 @pytest.mark.parametrize("how", ["it ends", "killed"])
 def test_it_never_outlives_its_parent(how):
     """Both write to one pipe, which ends only when the last of them has."""
-    code = "import time\nfrom bstcad.runs.processes import submit\nprint(submit('os.getpid').result(), flush=True)\n"
+    code = "import os, time\nfrom bstcad.runs.processes import submit\nprint(submit(os.getpid).result(), flush=True)\n"
     code += "time.sleep(60)" if how == "killed" else ""
     parent = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True)
     assert int(parent.stdout.readline()) != parent.pid
@@ -92,7 +93,8 @@ def test_it_never_outlives_its_parent(how):
 def test_a_script_that_guards_nothing_is_not_run_twice(tmp_path):
     """Users' scripts begin with the design, not with `if __name__ == "__main__"`."""
     script = tmp_path / "script.py"
-    script.write_text("print('begun')\nfrom bstcad.runs.processes import submit\nprint(submit('os.getcwd').result())\n")
+    work = "from bstcad.runs.processes import submit\nprint(submit(os.getcwd).result())\n"
+    script.write_text(f"import os\nprint('begun')\n{work}")
     where = {"cwd": tmp_path, "env": os.environ | {"PYTHONPATH": str(ROOT)}}
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, **where)
     assert done.stdout.split() == ["begun", str(tmp_path)], done.stderr
@@ -100,7 +102,7 @@ def test_a_script_that_guards_nothing_is_not_run_twice(tmp_path):
 
 def test_what_a_run_leaves_to_be_cleared_up_is_not_told():
     """The run ends abruptly: not one of its semaphores is given back by itself."""
-    code = "import os; from bstcad.runs.processes import submit; submit('os.getpid').result(); os._exit(0)"
+    code = "import os; from bstcad.runs.processes import submit; submit(os.getpid).result(); os._exit(0)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)  # until all are gone
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
