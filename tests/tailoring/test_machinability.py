@@ -95,7 +95,7 @@ def test_the_report_says_so_from_the_file(bound):
     assert not {"rrmsd", "rrmsd_freed"} & contents.bounds.keys()  # one run cannot tell what a bound costs
     said = re.sub(PLACE, "(there)", record.bounds(contents.bounds))
     assert re.fullmatch(
-        r"The back was tailored within bounds \(lens.tool_radius = 50 mm\); [\d.]+ % of it is within 3 % of "
+        r"The back was tailored within bounds \(lens.tool_radius = 50 mm\); [\d.]+ % of its area is within 3 % of "
         r"lens.tool_radius, closest \(there\)\.",
         said,
     )
