@@ -31,7 +31,7 @@ WavelengthKey = Annotated[  # key of every source
     Wavelength,
     Key("One wavelength, or lines [[nm, weight], ...] of a spectrum, weights of any sum.", "nm", 100.0, 20_000.0),
 ]
-PROFILE_NAMES = {"gaussian": "Gaussian", "lambertian": "Lambertian", "uniform": "uniform"}  # in sentences
+PROFILE_NAMES = {"gaussian": "Gaussian", "lambertian": "Lambertian", "uniform": "uniform"}  # profile names in text
 
 
 class Emitter(ABC):
