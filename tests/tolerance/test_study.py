@@ -242,7 +242,7 @@ def test_no_bit_depends_on_how_many_workers_trace(pictures):
     ("arguments", "sentence"),
     [
         (["--grade", "fine"], "--grade fine: unknown grade; give one of moulded, diamond-turned, precise"),
-        (["--yield", "120"], "--yield 120: give the percent of lenses that are to pass, such as 90"),
+        (["--yield", "120"], "--yield 120: is not between 0 and 100"),
         (["--workers", "2", "--scheduler", "tcp://127.0.0.1:9"], "give one of the two"),
     ],
 )
