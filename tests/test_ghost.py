@@ -36,7 +36,7 @@ def test_the_ledger_has_a_line_for_it_and_closes(design):
 def test_the_report_shows_it(design):
     _, folder, _ = design
     page = (folder / "report.html").read_text()
-    assert "A ghost is part of this picture" in page and "ghost on target" in page
+    assert "The picture includes a ghost" in page and "ghost on target" in page
     assert (folder / "figures" / "ghost.png").stat().st_size > 1000
 
 
@@ -52,7 +52,7 @@ def test_the_same_design_proved_again_has_the_same_ghost(design, monkeypatch):
 
 def test_a_scene_without_one_has_no_picture_of_it(small_design):
     page = (small_design.folder / "report.html").read_text()
-    assert "A ghost is part of" not in page and "ghost on target" not in page
+    assert "The picture includes a ghost" not in page and "ghost on target" not in page
     assert not (small_design.folder / "figures" / "ghost.png").exists()
 
 

@@ -197,12 +197,12 @@ globalThis.solidView = (() => {
     return lines;
   }
 
-  const isGlass = (solid) => Boolean(solid.rays) && !solid.mirror; // a lens without rays is of clay
+  const isTransparent = (solid) => Boolean(solid.rays) && !solid.mirror; // a lens without rays is of clay
 
   // Returns the drawn objects and the position of the eye: the lens alone, with its rays, or the whole path with walls.
   function framingOf(solid, mesh, look) {
     const reach = Math.hypot(...solid.size), distance = reach * Math.hypot(...solid.eye);
-    const centre = solid.low.map((low, k) => low + solid.size[k] / 2), glass = isGlass(solid);
+    const centre = solid.low.map((low, k) => low + solid.size[k] / 2), glass = isTransparent(solid);
     const range = [distance - 0.55 * reach, distance + 0.55 * reach];
     const alone = { look, eye: solid.eye, centre, distance, range, glass, walls: [], lines: [], points: [] };
     if (!solid.rays) return withExtent(alone, mesh);
@@ -343,7 +343,7 @@ globalThis.solidView = (() => {
       const start = axesOf("lens", ...anglesOf("lens", solid.eye)); // lights move with the eye
       send(ofSolid, {
         lamps: solid.lamps.flatMap((lamp) => through(start, lamp)), bright: solid.bright, gloss: solid.specular_power,
-        clay: isGlass(solid) ? GLASS : solid.clay, finish: [solid.ambient, solid.diffuse, solid.specular],
+        clay: isTransparent(solid) ? GLASS : solid.clay, finish: [solid.ambient, solid.diffuse, solid.specular],
       });
       const pictures = (solid.screens ?? []).map((screen) => screen.picture);
       for (const { texture } of hung.splice(pictures.length)) gl.deleteTexture(texture);

@@ -100,7 +100,7 @@ def change_the_scene(page):
     relief = page.locator("#figures tr:has-text('Relief') td")
     before = relief.inner_text()
     value_of(page, "target.z", "308")
-    page.wait_for_selector("#saved:has-text('not saved')")
+    page.wait_for_selector("#saved:has-text('unsaved')")
     page.wait_for_function("before => !document.getElementById('figures').innerText.includes(before)", arg=before)
     assert float(relief.inner_text().split()[0]) > float(before.split()[0])
     page.click("#drop-changes")

@@ -84,7 +84,7 @@ def test_a_change_is_seen_in_every_window_and_kept_beside_the_file_until_it_is_s
     other.goto(f"{shared.root}/scene/both")
     before, seen = path.read_bytes(), page.get_attribute(SEEN, "src")
     type_into(page, "target.z", "60,5")  # a decimal comma
-    page.wait_for_selector("#saved:text('not saved')")
+    page.wait_for_selector("#saved:has-text('unsaved')")
     page.wait_for_selector(f"{SEEN}:not([src='{seen}'])", timeout=PATIENCE)
     assert "z = 60.5" in page.input_value("#text") and path.read_bytes() == before
     other.wait_for_selector("#form input[type=text][data-key='target.z'][value='60.5']", timeout=PATIENCE)

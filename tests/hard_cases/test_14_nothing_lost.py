@@ -126,7 +126,7 @@ def test_ctrl_c_writes_the_best_so_far_and_resume_ends_the_same(tmp_path, monkey
     assert cli.run(["generate", str(scene), "-o", str(folder)]) == 130
     said = capsys.readouterr().err
     assert "stopping with the best lens so far" in said
-    assert said.splitlines()[-1].endswith("run the same command with --resume to continue it")
+    assert said.splitlines()[-1].endswith("run the same command with --resume to continue")
     report = json.loads((folder / "report.json").read_text())
     assert report["stopped"] == "interrupt" and report["stability"]["non_finite"] == 0
     assert CONTENTS - DRAWN <= {p.name for p in folder.iterdir()} <= CONTENTS
@@ -177,7 +177,7 @@ def test_a_full_disk_is_a_sentence_and_loses_nothing(small_scene, tmp_path, monk
     assert sorted(p.name for p in tmp_path.iterdir()) == ["lens", "lens-unwritten"]  # which design.npz fits into
     with full_disk(500_000) as error:
         generate()
-    kept = "the design so far is kept; the same command with --resume goes on"
+    kept = "the design so far is kept; run the same command with --resume to continue it"
     assert kept in " ".join(error.value.__notes__)
     assert sorted(p.name for p in tmp_path.iterdir()) == [".lens.checkpoint", "lens", "lens-unwritten"]
     assert {p.name for p in (tmp_path / "lens-unwritten").iterdir()} == {"scene.toml", "design.npz"}

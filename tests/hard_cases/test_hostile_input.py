@@ -200,7 +200,7 @@ def test_a_wide_number_of_an_entity_costs_no_memory(small_step):
 # ---- scenes that take long, or say more than a line ------------------------------------------------------------------
 
 LONG = {
-    "a dotted key": ("a." * 300_000 + "a = 1", "over 100 dots"),
+    "a dotted key": ("a." * 300_000 + "a = 1", "more than 100 dots"),
     "lists in lists": ("effects = " + "[" * 400 + "]" * 400, "nested too deeply"),
     "many keys": ("\n".join(f"k{i} = {i}" for i in range(20_000)), "unknown key"),
     "a long number": ("b = 0x" + "f" * 900_000, "a number of over 300 digits"),

@@ -99,4 +99,4 @@ def test_outliers_are_counted_and_remarked_and_too_many_fail(nominal, clean):
     assert with_part(CONTENTS, some).remarks == ("outliers",) and not with_part(CONTENTS, few).remarks
     told = {"report": {"measured": few.facts | {"deviation_map": []}}, "pictures_on": lambda *given: ""}
     page = " ".join(environment().get_template("made_part.html.j2").render(told).split())
-    assert "8 outliers (0.10 % of the points near the face) stand alone" in page
+    assert "8 points (0.10 % of the points near the face)" in page

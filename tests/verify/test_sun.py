@@ -46,4 +46,4 @@ def test_the_finest_detail_is_the_image_of_the_sun(plate):
     assert found["nearer_distance"] == 100 and found["of"] == "source.divergence = 0.53 degrees"
     page = (plate / "report.html").read_text(encoding="utf-8")
     assert "Finest detail on the target" in page
-    assert "with the target 100 mm instead of 200 mm from the lens: 1.7 mm" in page
+    assert "it would be 1.7 mm with the target 100 mm instead of 200 mm from the lens" in page
