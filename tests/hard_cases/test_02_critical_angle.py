@@ -60,7 +60,7 @@ def test_flag_and_direction(offset, dtype, holds):
     if abs(offset) >= 32 * eps(dtype):  # d cos² / dθ is 2.2 there
         assert bool(after.alive[0]) is (offset < 0)
     error = abs(float(after.direction.detach().double().norm()) - 1)
-    holds(f"length of the direction but one, {NAMES[dtype]}", error, 4 * eps(dtype))
+    holds(f"length of the direction minus 1, {NAMES[dtype]}", error, 4 * eps(dtype))
     if after.alive[0]:
         height = float(after.direction[2].detach())  # cos θ'; its square is off by some units
         holds(f"cos² θ' against sixty digits, {NAMES[dtype]}", abs(height**2 - float(truth)), 4 * eps(dtype))
@@ -87,7 +87,7 @@ def test_the_gradient_is_the_derivative_up_to_its_cap(offset, dtype, holds):
     expected = N * N * float(way[2].detach()) / max(cosine, MIN_COS_REFRACTION)
     # cos² is known to 2 units, and the derivative is divided by its root: relative 1 / max(cos², MIN_COS_REFRACTION²)
     error = abs(float(g_way[2]) / expected - 1) * max(cosine, MIN_COS_REFRACTION) ** 2
-    holds(f"derivative against the rule, times cos² θ', {NAMES[dtype]}", error, 4 * eps(dtype))
+    holds(f"relative error of the derivative, times cos² θ', {NAMES[dtype]}", error, 4 * eps(dtype))
 
 
 def near_critical(back: BSplineSurface, n: int, spread: float) -> Rays:
@@ -122,7 +122,7 @@ def test_the_back_face_keeps_to_the_same_rule_in_every_form(spread, holds):
     # per ray: a slope turns d' by at most 2 η² / MIN_COS_REFRACTION, and the landing moves by throw / ez² < 1e3 / 0.1²
     # of that angle; a control point acts on two slopes, by less than 2 / pitch each
     bound = 2 * N * N / MIN_COS_REFRACTION * 1e5 * 2 * 2 / back.pitch[0]
-    holds("gradient of a landing in a control point, over its cap", max(gradients) / bound, 1.0)
+    holds("gradient of a landing by a control point, relative to its bound", max(gradients) / bound, 1.0)
     if spread == 1e-5:  # where the cap sets in; nearer the angle one form reflects other rays than the other
         (status, plain), (other, fused) = found["plain"], found["fused"]
         assert torch.equal(status, other)
@@ -150,7 +150,7 @@ def test_tubes_across_the_angle(dtype, holds):
     assert whole - 1e-3 <= leaves <= border + 1e-3
     picture, outside = sheet.collect(corners, screen)
     won = abs(float(picture.detach().sum()) - whole)
-    holds("light of tubes across the angle, lost or won", won, n * eps(torch.float64))
+    holds("light that tubes across the angle lose or gain", won, n * eps(torch.float64))
     (g,) = torch.autograd.grad(picture.square().sum() + outside, lens.back.heights)
     assert torch.isfinite(g).all()
-    holds("ledger across the angle but one", abs(sum(told.values()) - 1), 400 * eps(torch.float64))
+    holds("sum of the ledger across the angle, minus 1", abs(sum(told.values()) - 1), 400 * eps(torch.float64))

@@ -71,7 +71,7 @@ def test_a_ray_beside_a_ball_hits_or_passes(offset, degrees, dtype, holds):
     x, y, z = places(at)[:, 0].tolist()
     error = abs(math.hypot(x, y, z - 15.0 - R) - R)
     # cos² is a difference; a path is known to its square root, and the hit leaves the ball by cos times that
-    holds(f"hit from the ball it grazes, {NAMES[dtype]}", error, 16 * R * eps(dtype), "mm")
+    holds(f"distance of a grazing hit from the ball, {NAMES[dtype]}", error, 16 * R * eps(dtype), "mm")
     inside = deflect(at, z_x, z_y, Refract(1.0, N)).rays
     normal = torch.stack([-z_x, -z_y, torch.ones_like(z_x)])
     before, behind = ((b.direction * normal).sum(0) for b in (at, inside))
@@ -97,7 +97,8 @@ def test_along_the_axis_at_the_equator(curvature, dtype, holds):
     turned = torch.asin(sine / N) - torch.asin(sine)
     off = (inside.direction[0, at].double() - torch.sin(turned)).abs()
     # cos² is known to some units, so the angle to units over the cosine
-    holds(f"turn near the equator, times the cosine, {NAMES[dtype]}", largest(off * cosine), 8 * eps(dtype))
+    figure = f"error of the refraction near the equator, times the cosine, {NAMES[dtype]}"
+    holds(figure, largest(off * cosine), 8 * eps(dtype))
     if dtype == torch.float64:
         found = forward.land(Collimated(Circle(30.0)), lens, LevelPlane(300.0), radius, torch.zeros_like(radius))
         plain = from_first_net_plain(inside, lens, LevelPlane(300.0))
@@ -150,7 +151,8 @@ def test_rays_that_graze_the_waves_of_a_spline(dtype, holds):
     hit = at.alive & ~truth.isnan()
     first = hit & (crest < -1e-3)  # where no wave was touched before, to the millimetre's thousandth
     error = ((t - truth).abs() * cosine.clamp(min=1e-3))[first]
-    holds(f"grazing hit from the first crossing, {NAMES[dtype]}", largest(error), 8 * 10 * eps(dtype), "mm")
+    figure = f"distance of a grazing hit from the first crossing, {NAMES[dtype]}"
+    holds(figure, largest(error), 8 * 10 * eps(dtype), "mm")
     # of what only touches a wave by the steps above, the search may say either: there, or where the line goes on to
     assert int(first.sum()) > 100
     assert (crest[at.alive & truth.isnan()] > -1e-3).all()

@@ -113,7 +113,7 @@ def test_occ_finds_the_volume(holds, written):
     """
     if isinstance(written.lens.outline, Rectangle):
         volume = cadquery.Solid(written.reread.shape).Volume(1e-5)
-        holds("volume by OCC's integral", abs(volume / written.volume - 1), 1e-5, "of it")
+        holds("error of the volume by OCC's integral", abs(volume / written.volume - 1), 1e-5, "of it")
 
 
 @pytest.mark.parametrize("cells", (64, 256, None))
@@ -128,11 +128,11 @@ def test_our_mesh_is_closed_at_each_deflection(holds, written, tmp_path, cells):
     assert area.min() > 0  # no facet of the thin side has collapsed in float32
     size = float(np.abs(found.vertices).max())
     vertices_off = meshes.vertex_error(found, written.lens)
-    holds("STL: vertices off the faces, over the size", vertices_off / size, checks.VERTEX_ROUNDING)
+    holds("STL: distance of vertices from the faces, relative to the size", vertices_off / size, checks.VERTEX_ROUNDING)
     deflection = meshes.chordal_error(found, written.lens)
     off = abs(meshes.volume_and_area(found)[0] / written.volume - 1)
     of = f"of {cells} cells" if cells else "by default"
-    holds(f"STL {of}: volume", off, deflection * written.area / written.volume, "of it")
+    holds(f"STL {of}: error of the volume", off, deflection * written.area / written.volume, "of it")
     if cells is None and asked < meshes.max_cells(written.lens):
         holds("STL by default: chordal error", deflection, MESH_TOLERANCE, "mm")
     if cells == 64:
@@ -153,4 +153,4 @@ def test_occ_meshes_the_solid_closed_at_each_deflection(holds, written, tmp_path
     assert meshes.is_closed(found)
     off = abs(meshes.volume_and_area(found)[0] / written.volume - 1)
     bound = deflection * written.area / written.volume
-    holds(f"OCC's mesh at {deflection:g} mm: volume", off, bound, "of it")
+    holds(f"OCC's mesh at {deflection:g} mm: error of the volume", off, bound, "of it")

@@ -69,7 +69,7 @@ def test_of_many_roots_of_a_spline_the_first_ahead_counts(depth, number, degrees
     found = met & at.alive
     # F is known to some units of the lens's size and the hit by the cosine of incidence; the truth is that of float64
     error = ((t - truth).abs() * along.double().clamp(min=1e-2))[found]
-    holds(f"hit from the first crossing, {NAMES[dtype]}", largest(error), 16 * HALF * eps(dtype), "mm")
+    holds(f"distance of the hit from the first crossing, {NAMES[dtype]}", largest(error), 16 * HALF * eps(dtype), "mm")
     assert (along[found] > -1e-3).all()  # from inside: light leaves there
 
 
@@ -146,4 +146,5 @@ def test_of_two_roots_of_a_sphere_the_near_cap_counts(curvature, reach, dtype, h
     assert torch.equal(at.alive[clear], meets[clear]) and int(meets.sum()) > 200
     off = ((places(at) - ends).norm(dim=0) * (gap.clamp(min=1e-3).sqrt() * abs(curvature)))[meets & at.alive & clear]
     # |F| to some units of the radius, over the cosine of incidence
-    holds(f"hit from the near cap of a sphere, {NAMES[dtype]}", largest(off), 64 * abs(radius) * eps(dtype), "mm")
+    figure = f"distance of the hit from the near cap of a sphere, {NAMES[dtype]}"
+    holds(figure, largest(off), 64 * abs(radius) * eps(dtype), "mm")

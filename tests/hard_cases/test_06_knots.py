@@ -51,11 +51,12 @@ def test_the_basis_is_one_altogether(m, dtype, holds):
     assert bool(((k >= 0) & (k <= m - 3)).all())
     assert min(float(w.min()) for w in weights) >= 0.0
     # three numbers that are added: one unit; slopes of at most 2, so two
-    holds(f"sum of the basis but one, {NAMES[dtype]}", largest(sum(weights) - 1), eps(dtype))
+    holds(f"sum of the basis minus 1, {NAMES[dtype]}", largest(sum(weights) - 1), eps(dtype))
     holds(f"sum of the derivatives, {NAMES[dtype]}", largest(sum(slopes)), 2 * eps(dtype))
     abscissa = sum((k + i).to(dtype) * w for i, w in enumerate(weights))
     # t is known to the unit of m, and so is what is summed
-    holds(f"x(t(x)) but x over the net, {NAMES[dtype]}", largest(abscissa - u) / m, 2 * eps(dtype))
+    figure = f"x(t(x)) minus x, relative to the width of the net, {NAMES[dtype]}"
+    holds(figure, largest(abscissa - u) / m, 2 * eps(dtype))
 
 
 @EVALUATE

@@ -62,7 +62,7 @@ def test_sag_and_slope_have_all_their_digits(curvature, dtype, holds):
     relative = (sag / size.clamp(min=1e-300))[size > 1e-30]
     # eight operations, of which the root halves what is before it: relative to the sag itself, however small
     if relative.numel():
-        holds(f"the same relative to the sag, {NAMES[dtype]}", float(relative.max()), 4 * eps(dtype))
+        holds(f"error of the sag, relative to the sag, {NAMES[dtype]}", float(relative.max()), 4 * eps(dtype))
     steep = torch.tensor([float(b[1]) for b in truth], dtype=torch.float64)
     along = torch.hypot(z_x.double(), z_y.double()) * (1 if curvature >= 0 else -1)
     holds(f"error of the slope, {NAMES[dtype]}", largest(along - steep), 8 * eps(dtype))
@@ -95,7 +95,7 @@ def test_a_ray_meets_the_nearly_flat_sphere(curvature, dtype, holds):
     on = [exact_sag(curvature, a, b)[0] for a, b in zip(*at.position[:2].tolist(), strict=True)]
     error = max(float(abs(exact.number(a) - b)) for a, b in zip(at.position[2].tolist(), on, strict=True))
     # the sag moves with the hit, by a slope below 1.4: the place is known to two units of 14 mm, the sag to half of one
-    holds(f"hit on the sphere, {NAMES[dtype]}", error, 8 * RIM * eps(dtype), "mm")
+    holds(f"distance of the hit from the sphere, {NAMES[dtype]}", error, 8 * RIM * eps(dtype), "mm")
     start, way = places(rays), rays.direction.double()
     off_line = torch.linalg.cross(places(at) - start, way, dim=0).norm(dim=0)
-    holds(f"hit on its line, {NAMES[dtype]}", largest(off_line), 8 * RIM * eps(dtype), "mm")
+    holds(f"distance of the hit from its ray, {NAMES[dtype]}", largest(off_line), 8 * RIM * eps(dtype), "mm")

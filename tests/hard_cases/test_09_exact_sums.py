@@ -58,10 +58,11 @@ def test_a_traced_pixel_counts_twenty_million_rays(holds, dtype):
     found = simulated(Collimated(Rectangle(18.0, 18.0)), lens, SCREEN, n, 0)
     assert found.rays == n * n > HITS and float(found.box.sum()) == float(found.box[2, 2])
     bound = n * n / reductions.MAX_PARTS * ROUND
-    holds("2e7 hits in one pixel, traced: flux", abs(float(found.box[2, 2]) - 1), bound, "of it")
+    holds("2e7 hits in one pixel, traced: error of the flux", abs(float(found.box[2, 2]) - 1), bound, "of it")
     # the ledger sums blocks of 256 rays first: n / (256 MAX_PARTS) sums, and 256 in each
     bound = (n * n / reductions.MAX_PARTS / 256 + 256) * ROUND
-    holds("2e7 hits, traced: ledger's flux on the target", abs(found.flux["on target"] - 1), bound, "of it")
+    figure = "2e7 hits, traced: error of the ledger's flux on the target"
+    holds(figure, abs(found.flux["on target"] - 1), bound, "of it")
 
 
 def square(n: int, low: float, high: float) -> torch.Tensor:
@@ -105,7 +106,7 @@ def test_a_control_point_feels_every_ray(holds, dtype, compiled):
     (found,) = torch.autograd.grad(h, heights, g)
     weight = torch.tensor([0.125, 0.75, 0.125], dtype=torch.float64)
     expected = HITS * weight[:, None] * weight
-    holds("2e7 hits in one control point: lost of its gradient", _most(found[3:6, 3:6], expected), 0.0, "hits")
+    holds("2e7 hits in one control point: error of its gradient", _most(found[3:6, 3:6], expected), 0.0, "hits")
     assert float(found.double().sum()) == HITS
 
 
@@ -128,7 +129,8 @@ def test_a_control_point_feels_every_ray_that_lands(holds, dtype, compiled):
     slope = torch.tensor([-0.5, 0.0, 0.5], dtype=torch.float64)
     weight = torch.tensor([0.125, 0.75, 0.125], dtype=torch.float64)
     expected = 32 * HITS * slope[:, None] * weight
-    holds("2e7 hits in one control point, refracted: lost", _most(found[3:6, 3:6], expected), 0.0, "mm / mm")
+    figure = "2e7 hits in one control point, refracted: error of its gradient"
+    holds(figure, _most(found[3:6, 3:6], expected), 0.0, "mm / mm")
 
 
 def _most(found: torch.Tensor, expected: torch.Tensor) -> float:

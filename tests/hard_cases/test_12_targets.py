@@ -44,8 +44,8 @@ TARGETS = {
     "a hot pixel on a dim ground": (cells((35, 20, 1.0), ground=1e-6), 1.0),
     "one hot pixel": (cells((35, 20, 1.0)), 1.0),
     "one hot corner": (cells((0, 0, 1.0)), 1.0),
-    "of the least numbers": (cells((slice(9, 40), slice(3, 50), 3e-300), ground=1e-300), 0.01),
-    "of the largest": (cells((slice(9, 40), slice(3, 50), 1e308), ground=1e300), 0.01),
+    "smallest numbers": (cells((slice(9, 40), slice(3, 50), 3e-300), ground=1e-300), 0.01),
+    "largest numbers": (cells((slice(9, 40), slice(3, 50), 1e308), ground=1e300), 0.01),
 }
 SOURCES = {
     "disc": Density.from_function(lambda x, y: 1.0 * ((x - 0.5) ** 2 + (y - 0.5) ** 2 < 0.25), N),

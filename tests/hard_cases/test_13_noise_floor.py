@@ -86,7 +86,7 @@ def test_the_error_of_rays_falls_with_its_power(holds, name, rays, form, power, 
         found = [rrmsd(rays(form, n, seed, dtype), wanted) for seed in range(SEEDS)]
         errors.append(float(sum(e**2 for e in found) / SEEDS) ** 0.5)
     off = abs(slope(errors, [n * n for n in sides]) - power)
-    holds(f"slope of the error of {name} rays, off {power:g}", off, 0.02 if name == "random" else 0.04)
+    holds(f"slope of the error of {name} rays, distance from {power:g}", off, 0.02 if name == "random" else 0.04)
 
 
 def light(target: torch.Tensor) -> Light:

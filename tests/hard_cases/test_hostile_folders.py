@@ -186,7 +186,7 @@ def test_an_earlier_report_that_does_not_fit_is_not_believed(quick_folder, holds
         with pytest.raises(ValueError, match="report.json: cannot be read .*; run bstcad verify"):
             record.read(path)
     path.write_text(REPORTS["huge"]())
-    with spending("report.json of anything", 300.0, holds):
+    with spending("a huge report.json", 300.0, holds):
         record.making(path)
     path.write_text(REPORTS["passed"]())
     found, kept = commands.verify(quick_folder).facts, [field.name for field in dataclasses.fields(DesignCourse)]
@@ -249,7 +249,7 @@ def test_a_report_is_not_written_through_links_and_a_title_is_no_markup(quick_fo
     (quick_folder / ".report.json.new").symlink_to(victim)
     commands.verify(quick_folder, drawing=flat_pictures())
     assert victim.read_text() == "mine" and not (quick_folder / "report.json").is_symlink()
-    holds("a folder that was sent: files written outside it", len(list(elsewhere.iterdir())), 0)
+    holds("a folder from somebody else: files written outside it", len(list(elsewhere.iterdir())), 0)
     assert list((quick_folder / "figures").iterdir())
     page = (quick_folder / "report.html").read_text()
     assert "<script>alert" not in page and "&lt;script&gt;alert" in page
