@@ -264,7 +264,7 @@ class Blur:
 def blur(
     channels: Sequence[Channel], lens: Lens, screen: Screen, target: np.ndarray, n: int = IMAGE_POINTS
 ) -> Blur | None:
-    """Return the blur by the source that the channels sample, at its first spectral line.
+    """Return the blur of the picture by the extent of the source, at the first spectral line of the channels.
 
     None for a point source, and if none of the light passes the lens.
     """

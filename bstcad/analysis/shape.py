@@ -263,7 +263,10 @@ def survey_front(
 
 
 def _grid(back: BSplineSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return x and y (spans, points) mm of QUARTERS of each span, and the weights for spline.largest_bending."""
+    """Return the grid for spline.largest_bending: x and y (mm), and the weights along x and along y.
+
+    The points lie at QUARTERS of each span; x and y are (spans, points), the weights (spans, points, 9).
+    """
     spans = [torch.arange(count - 2) for count in back.shape]
     x, y = (at.reshape(len(QUARTERS), -1).T.contiguous().numpy() for at in span_points(back, *spans, QUARTERS))
     scaled = []

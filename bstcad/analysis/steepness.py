@@ -1,6 +1,6 @@
-"""The slope that the light of a target needs of a tailored face, which may be steeper than a surface z(x, y) can be.
+"""Slope that a tailored face needs for the light of a target; it may exceed that of any surface z(x, y).
 
-A ray along d that a face of relative index η (before over behind it) shall refract along d' needs the normal η d - d'.
+To refract a ray from direction d to d', a face of relative index η = n / n' needs a normal along η d - d'.
 A face z(x, y) is less steep than 90 degrees, and tailoring makes it no steeper than MAX_SLOPE_DEG; light that needs
 more misses its aim.  This concerns wide beams: light at 60 degrees in PMMA, sent straight on, would need an overhanging
 face.  Light that no slope turns far enough is left out here (optics/reach.py).
@@ -27,7 +27,7 @@ MAX_POINTS_A_SIDE = 65  # largest number of points a side
 
 @dataclass(frozen=True)
 class Steepness:
-    """Slope that the light of a target needs of the last tailored face."""
+    """Slope that the last tailored face needs for the light of a target."""
 
     share: float  # fraction of the target's light that needs more than MAX_SLOPE_DEG
     steepest: float  # largest slope angle needed (degrees); above 90 the face would overhang

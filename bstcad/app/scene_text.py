@@ -99,7 +99,7 @@ def _changed_tables(before: dict[str, Any], key: str, value: Any) -> dict[str, A
 
 
 def is_same(one: Any, other: Any) -> bool:
-    """Return True if two values of TOML are equal; 1 equals 1.0, but not true."""
+    """Return True if two values of TOML are equal; 1 and 1.0 are equal, 1 and `true` are not."""
     if isinstance(one, dict) and isinstance(other, dict):
         return one.keys() == other.keys() and all(is_same(value, other[name]) for name, value in one.items())
     if isinstance(one, list) and isinstance(other, list):

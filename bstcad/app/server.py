@@ -450,7 +450,7 @@ class Workbench:
         return JSONResponse({"name": self.workspace.adopt(name, source, Run(folder).folder / SCENE_TEXT)})
 
     def tolerance(self, name: str, body: Body) -> dict[str, Any]:
-        """Start a study of tolerances: {grade, yield in percent}, both optional."""
+        """Start a study of tolerances; body: {"grade": name, "yield": percent}, both optional."""
         wanted = body.get("yield")
         fraction = None if wanted in (None, "") else _number(wanted, "yield") / 100
         if fraction is not None and not 0 < fraction < 1:
@@ -458,7 +458,7 @@ class Workbench:
         return self._begin(name, "tolerance", {"grade": body.get("grade") or None, "yield": fraction})
 
     def tradeoff(self, name: str, body: Body) -> dict[str, Any]:
-        """Start a study of time against accuracy: {budget in seconds}."""
+        """Start a study of time against accuracy; body: {"budget": seconds}."""
         budget = _number(body.get("budget") or 600, "budget")
         if not 1 <= budget <= 86_400:
             raise SceneError(f"budget: {budget:g} s is not between 1 s and one day; give seconds, such as 600")

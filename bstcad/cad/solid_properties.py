@@ -1,8 +1,8 @@
-"""Area, volume and centroid of a part with lenses, from the faces and edges of its solid, to a relative 1e-8.
+"""Area, volume and centroid of a part with lenses, from its faces and edges, to a relative error of 1e-8.
 
-Each face is integrated along its boundary by Green's theorem: a large net in (x, y) by optics.quadrature, any other
-face in its parameters (u, v).  OCC's integrals take minutes over a large net.  On a face next to one, with an edge of
-thousands of knots, they have errors of 1e-5.
+Each face is integrated along its boundary by Green's theorem: a large net over x and y (optics.quadrature), any other
+face over its parameters u and v.  OCC's own integrals take minutes over a large net.  Over a face that shares an edge
+with a large net, a curve of thousands of knots, they have errors of 1e-5.
 """
 
 from __future__ import annotations

@@ -97,12 +97,12 @@ def solid(path: Path) -> TopoDS_Solid:
     reader = STEPControl_Reader()
     with quiet_occ():
         if reader.ReadFile(str(path)) != IFSelect_RetDone:
-            raise ValueError(f"{path.name}: OCC cannot read it, the file is damaged; write it again")
+            raise ValueError(f"{path.name}: OCC cannot read it, so the file is damaged; write it again")
         reader.TransferRoots()
     shape = reader.OneShape()
     solids = [] if shape.IsNull() else parts_of(shape, TopAbs_SOLID)
     if len(solids) != 1:
-        raise ValueError(f"{path.name}: OCC finds {len(solids)} solids in it, the file is damaged; write it again")
+        raise ValueError(f"{path.name}: OCC finds {len(solids)} solids, not one, so it is damaged; write it again")
     return TopoDS.Solid_s(solids[0])
 
 

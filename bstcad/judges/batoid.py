@@ -81,7 +81,7 @@ def _place_tilted(surface: TiltedSurface) -> PlacedSurface:
 
 
 def vector(rays: Rays) -> Any:
-    """Convert rays to batoid's, whose velocity is the speed of light in their medium, here air."""
+    """Convert rays in air to batoid's rays; their velocity (c = 1) is then the unit vector of the direction."""
     import batoid
 
     x, y, _ = rays.position
@@ -126,7 +126,7 @@ def light(lens: Lens, channels: Sequence[Channel]) -> tuple[Channel, ...]:
 
 
 def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int) -> Traced:
-    """Return the picture on a screen by that many stratified rays, in two halves."""
+    """Trace about `rays` stratified rays; return two pictures on a screen, each by half of the rays."""
     n = max(1, round(side_factor(channels) * math.sqrt(rays / 2)))
     known = surfaces(lens)
     halves, count = np.zeros((2, *screen.shape)), 0

@@ -100,7 +100,7 @@ class OwnJudge(Protocol):
         """Return the channels with the losses that the judge simulates."""
 
     def trace(self, lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int) -> Any:
-        """Return the picture on a screen of square pixels by that many rays, as faces.Traced."""
+        """Trace `rays` rays and return the picture on a screen of square pixels, as faces.Traced."""
 
 
 def choose_judges(names: Sequence[str | OwnJudge]) -> tuple[str | OwnJudge, ...]:

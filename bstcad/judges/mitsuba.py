@@ -157,7 +157,10 @@ def _fine_mesh(face: Face, aperture: Outline, lens: Lens, screen: Screen, up: bo
 
 
 def _scene(bench: dict[str, Entry], channels: Sequence[Channel], lens: Lens, *, edges: int, folder: Path) -> Any:
-    """Add the lamps of channels of one index to `bench`; edges: largest number on a photon's path to the camera."""
+    """Load the scene `bench` with the lamps of channels of one index.
+
+    edges: largest number of edges (straight pieces) of a photon's path to the camera.
+    """
     import mitsuba
 
     material = {"type": "dielectric", "int_ior": channels[0].index, "ext_ior": 1.0}

@@ -247,7 +247,7 @@ def scale(face: Face, alignment: Alignment) -> tuple[float, float]:
 
 # --- outliers ---------------------------------------------------------------------------------------------------------
 
-NEIGHBOURS = 24  # number of neighbours of each point
+NEIGHBOURS = 24  # number of nearest points with which each point is compared
 MIN_CLUSTER = 8  # number of neighbours with a distance equal within 50 % from which a point counts as form
 OUTLIER_THRESHOLD = 6.0  # minimum deviation of an outlier in standard deviations (from the MAD), global and local
 MAD_TO_SIGMA = 1.4826  # standard deviation over median absolute deviation (MAD) of a normal distribution

@@ -416,9 +416,9 @@ def _compare(
 
 
 def tubes_of(lens: Lens, pixels: int = 0) -> int:
-    """Return the number of tubes per side for the nets of a lens: two per control point and net, at least MIN_TUBES.
+    """Return the number of tubes per side for a lens: two per control point, at least MIN_TUBES.
 
-    Light deflected by a first net varies within the cells of the next one: two nets take twice as many tubes.
+    Two nets take twice as many, since light deflected by the first net varies within the cells of the second.
 
     If a cell of the net lights more than one pixel, its light varies from pixel to pixel: two tubes per pixel are used,
     at most four per cell.  Five more are added, so that lines of the net and corners of tubes do not coincide.

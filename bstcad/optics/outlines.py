@@ -143,7 +143,7 @@ class Rounded(Rectangle):
         return f"{super().words} with corners of {self.corner_radius:.4g} mm"
 
     def map_square(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        """Map points (a, b) of the square from -1 to 1 onto the outline (mm), ring by ring, with corners as round."""
+        """Map points (a, b) of the square from -1 to 1 onto the outline (mm), each ring onto a scaled outline."""
         ring = torch.maximum(a.abs(), b.abs()).clamp(min=1e-300)
         x, y = a.abs() / ring * (self.width / 2), b.abs() / ring * (self.height / 2)  # on the rectangle's rim
         c, d, r2 = self.limits

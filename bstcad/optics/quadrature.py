@@ -153,7 +153,10 @@ def _chords(face: Surface, x: np.ndarray, y: np.ndarray, dx: np.ndarray) -> tupl
 
 
 def _chord_ends(face: Surface, y: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return (ends of the parts of each chord (n, parts + 1), some of length zero; Gauss points in each part)."""
+    """Return the ends of the parts of each chord, (n, parts + 1), and the number of Gauss points in each part.
+
+    Some parts have the length zero.
+    """
     low, high = np.minimum(y, 0.0)[:, None], np.maximum(y, 0.0)[:, None]
     if not face.is_net:
         return np.hstack([low, high]), CHORD_POINTS

@@ -114,7 +114,7 @@ class Receiver(ABC):
         return self.middle[2] - z
 
     def per_radian(self, z: float) -> float:
-        """Return the shift at the centre, in its unit, of light from (0, 0, z) per radian of deflection."""
+        """Return the shift of light at the centre, in the receiver's unit, per radian of deflection at (0, 0, z)."""
         return self.throw(z)
 
     def areas(self, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]) -> np.ndarray | None:

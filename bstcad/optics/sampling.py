@@ -1,6 +1,6 @@
 """Sample points of rays and sources: grids, stratified (jittered) points and random points of a rectangle.
 
-Each of these functions returns (x, y) in mm over `window` (centred on the axis); every point represents the same area.
+Functions of a rectangle `window`, centred on the axis, return (x, y) in mm; every point represents the same area.
 `point_pairs` and `shifted_lattice` return points of equal weight over the outline of an extended source, and
 `sample_rim` points along an outline.
 

@@ -171,7 +171,7 @@ def image_from_lens(lens: Lens, screen: Screen) -> Receiver:
 
 
 def per_radian(lens: Lens, screen: Screen) -> float:
-    """Return the shift on a screen, in its unit, per radian by which light is deflected at the back of a lens."""
+    """Return the shift of light on a screen, in the screen's unit, per radian of deflection at the back of a lens."""
     return image_from_lens(lens, screen).per_radian(lens.back.z)
 
 

@@ -1,7 +1,8 @@
 """Figures of the light on the target, as seen from the side that the scene states.
 
 Seen from the lens, along +z with y up, x grows to the left.  Grey tones are those of an eye or a camera (sRGB), and the
-scales of irradiance are linear.  Pictures are (rows, columns) in coordinates, row 0 at y max, with the target's sum.
+scales of irradiance are linear.  Pictures are (rows, columns) with the target's sum, "in coordinates": row 0 at
+y max, column 0 at x min.
 """
 
 from __future__ import annotations
@@ -305,7 +306,7 @@ def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) 
 
 @styled
 def reach_picture(target: np.ndarray, reachable: np.ndarray, view: View) -> Figure:
-    """Draw the target, and its reachable part with the rest in vermilion.
+    """Draw the target, and beside it the target with the part that no light can reach in vermilion.
 
     target, reachable: (rows, columns) in coordinates; reachable is True where light can reach the target.
     """

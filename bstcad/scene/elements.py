@@ -100,12 +100,12 @@ class Mirror(Record):
 
     @property
     def vertices(self) -> tuple[float, ...]:
-        """Position z (mm) of the face on the axis."""
+        """Position z (mm) of the only face on the axis, as a tuple."""
         return (self.z,)
 
     @property
     def curvatures(self) -> tuple[float, ...]:
-        """Curvature of the face (1/mm)."""
+        """Curvature of the only face (1/mm), as a tuple."""
         return (self.curvature,)
 
     def complaints(self, key: str) -> Iterator[str]:

@@ -65,7 +65,7 @@ class Plate:
     def of(
         cls, light: str | None = None, size: str | float | None = None, distance: str | float | None = None
     ) -> Plate:
-        """Return the plate of the options of a user; None: the default.  SceneError for wrong values."""
+        """Return the plate for --light, --size and --distance; None: the default.  SceneError for a wrong value."""
         if light is not None and light not in LIGHTS:
             raise SceneError(f"--light {light}: is unknown; {nearest(light, list(LIGHTS), 'give one of')}")
         chosen = LIGHTS[light or next(iter(LIGHTS))]

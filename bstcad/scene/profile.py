@@ -145,7 +145,7 @@ def edges(pixels: Pixels, size: Size) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cell(pixels: Pixels, size: Size) -> float:
-    """Return the area of a pixel (mm²)."""
+    """Return the area of a cell of the raster, that is, of a pixel (mm²)."""
     return size[0] * size[1] / (pixels[0] * pixels[1])
 
 

@@ -289,9 +289,10 @@ class Scene(Record):
     ) -> Lens:  # fmt: skip
         """Return the lens before tailoring, with a flat net as its back.
 
-        net: control points per side of the back's net, or along x and along y.  A tailored front is a net too, with
-        the scene's ratio of control points to the back, flat or as its file has it.  as_wide_as: the last net of the
-        back to which `net` is refined (default: `net`); the nets extend past the rim by the spans of that one.
+        net: control points per side of the back's net, or (along x, along y).  A tailored front is a net too: its
+        control points are as many relative to the back's as in the scene, and it is flat, or as in its file.
+        as_wide_as: the finest net to which `net` will be refined (default: `net`), whose spans determine how far the
+        nets extend past the rim.
         """
         from bstcad.optics.bspline import BSplineSurface  # loads numba, which a scene alone does not need
 

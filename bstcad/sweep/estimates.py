@@ -203,8 +203,8 @@ def diagnosis(
 ) -> dict[str, Any]:  # fmt: skip
     """Return the entries convergence, remaining_error and bounds of report.json (record.Contents).
 
-    lens: the lens as re-read.  picture: its picture (rows, columns), with the sum of the target.
-    at_bounds: areas where the tailored faces are at a bound, by key.
+    lens: the lens as re-read.  picture: its picture (rows, columns), scaled to the sum of the target.
+    at_bounds: for each key of a bound, the part of the tailored faces that is at this bound.
     """
     sizes = [k for k, stage in enumerate(making.stages) if stage.name.startswith(SIZE_STAGE_PREFIX)]
     curve = ending(

@@ -210,12 +210,12 @@ GOAL_MEMORY_FACTOR = 3.0  # memory of tubes for each of several goals, relative 
 
 @cache
 def pace() -> float:
-    """Return the time of an evaluation on this machine relative to two cores of pace 1."""
+    """Return the pace of this machine: its time for a calibration kernel over KERNEL_SECONDS; 0.5 is twice as fast."""
     return min(measure_seconds(calibration_kernel()) for _ in range(KERNEL_REPEATS)) / KERNEL_SECONDS
 
 
 def typical_seconds(scene: Scene) -> Seconds:
-    """Return the times of a design on two cores of pace 1, estimated from its sizes only."""
+    """Return the times of a design on two cores of pace 1 (see `pace`), estimated from its sizes only."""
     knobs, point = scene.tailoring.resolved(scene.lens.back.net), not scene.source.parallel
     rest = START_SECONDS + proof_seconds(scene)
     sheets, net, pixels = search_rounds(scene), (knobs.side / UNIT_POINTS) ** 2, _pixel_ratio(scene)

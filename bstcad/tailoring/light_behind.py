@@ -115,7 +115,7 @@ class LightBehind:
 
         They are interpolated linearly on the Delaunay triangles of the points where the rays meet the surface, so that
         they vary linearly across the gap between two bright parts of a picture.  Outside the light they are those of
-        the nearest ray.  If there are more rays than points, as many are used, evenly spaced.
+        the nearest ray.  At most max(m, n) rays along each axis are used, at even spacing.
         """
         every = np.ix_(
             range(3), *(np.linspace(0, m - 1, min(m, max(x.shape)), dtype=int) for m in self.position.shape[1:])

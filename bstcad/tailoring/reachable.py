@@ -98,7 +98,10 @@ def resample(goal: Goal, pixels: int = MAX_AIMS) -> Goal:
 
 
 def reach_from_each(grid: FaceGrid, aims: Sequence[np.ndarray], plane: Receiver, law: Law, grazing: float) -> Tensor:
-    """Return `optics.reach.reach_margin` of the lit points of the face for aims x and y (…) mm, as (points, …)."""
+    """Return `optics.reach.reach_margin` from each of the lit points of the face to each aim, (points, …).
+
+    aims: x and y of the aims (mm), of one shape (…).
+    """
     t, some = torch.from_numpy(np.stack(aims)), grid.density[::FACE_STRIDE, ::FACE_STRIDE] > 0
     position, direction = (
         v[:, ::FACE_STRIDE, ::FACE_STRIDE][:, some][..., None, None].expand(-1, -1, *t.shape[1:]).double()

@@ -53,7 +53,7 @@ from bstcad.tailoring.slope_map import (
 )
 from bstcad.transport.bfm import TransportStep
 
-DIFFERENCE_STEP = 1e-4  # step of the difference quotients of the slopes, relative to the thickness
+DIFFERENCE_STEP = 1e-4  # shift of a point for difference quotients of slopes, relative to the thickness
 # Number of fine rounds: the last one on the full grid and nets, the others on half of the grid and the second finest
 # nets, until both faces fit each other.  (With two, two photographs have 1.5 times the error by blocks of 4 to 32
 # pixels.)

@@ -28,9 +28,9 @@ SMOOTHING = 1.0  # cells, width of the Gaussian blur of phi that removes the noi
 CG_ITERATIONS, CG_TOLERANCE = 15, 0.1  # conjugate gradients: maximum number of iterations, relative tolerance
 MIN_STEP = 0.05  # smallest fraction of a Newton step in the line search
 MAX_ERROR_RATIO = 0.9  # ratio of the mass errors after and before a step above which the solve stops
-ROUGH_MASS_ERROR = 0.005  # mass error above which the two limits below replace MAX_ERROR_RATIO and the number of steps
-MAX_ROUGH_ERROR_RATIO = 0.98  # ratio of the mass errors after and before a step above which the solve stops
-MAX_STEPS_FACTOR = 3  # factor of the maximum number of steps
+ROUGH_MASS_ERROR = 0.005  # mass error above which a map is rough, so that the next two constants hold
+MAX_ROUGH_ERROR_RATIO = 0.98  # MAX_ERROR_RATIO while the map is rough
+MAX_STEPS_FACTOR = 3  # factor of the maximum number of steps while the map is rough
 
 
 class MongeAmpere:

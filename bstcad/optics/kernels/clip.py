@@ -325,9 +325,11 @@ def _clear_columns(own, touched, x):
 
 @compiled(parallel=True)
 def _clip(corner, flux, thinnest, sums, touched, far):
-    """Add both triangles of each tube; corner (2, n + 1, m + 1), flux (n, m), sums (parts, columns, rows + 1).
+    """Add the flux of both triangles of each tube to `sums`, (parts, columns, rows + 1), and set `far`, (parts,).
 
-    far (parts,): Σ flux · (mean square of the corners' distance outside the border).
+    corner (2, n + 1, m + 1): corners of the tubes (pixels).  flux (n, m): flux of the tubes.  thinnest: smallest area
+    of a triangle that is followed (pixels²).  touched (parts, 2): range of the columns of `sums` that are in use.
+    far: Σ flux · (mean square of the distance by which the corners lie outside the border).
     """
     n, m = flux.shape
     count = sums.shape[0]
