@@ -243,7 +243,7 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
 
 # --- blur by an extended source ---------------------------------------------------------------------------------------
 
-MIN_DISTANCE_RATIO = 2.5  # smallest target distance over the width of lens or picture (plate a tenth as thick as wide)
+MIN_DISTANCE_RATIO = 2.5  # smallest target distance relative to the width of lens or picture (plate a tenth as thick)
 MAX_NEARER_RATIO = 0.9  # largest width of the detail on a nearer target, relative to that on this one, that is reported
 
 

@@ -135,9 +135,9 @@ class FlatTop:
     """Figures of the light on a target with a flat profile, as the report has them; levels relative to the maximum."""
 
     key: str  # key of the target: target, target[0], …
-    uniformity: float  # U_0.9: RMS deviation over the mean, where the light is above 0.9; 0 if uniform
-    plateau_uniformity: float  # U_P: width of the histogram's peak over the maximum; 0 if uniform
-    flatness: float  # F_0.9: mean over maximum, where the light is above 0.9; 1 if uniform
+    uniformity: float  # U_0.9: RMS deviation divided by the mean, where the light is above 0.9; 0 if uniform
+    plateau_uniformity: float  # U_P: width of the histogram's peak, divided by the maximum; 0 if uniform
+    flatness: float  # F_0.9: mean divided by maximum, where the light is above 0.9; 1 if uniform
     fractional_power: float  # f_0.9: fraction of the light on the target that is above 0.9
     edge_steepness: float  # s: fraction of the area above 0.1 that is not above 0.9; 0 if vertical
     efficiency: float  # fraction of the source's flux inside the profile (of a super-Gaussian: where it is above 0.9)

@@ -209,7 +209,7 @@ def ledger(rays: Landed, screen: Screen) -> dict[str, float]:
 
 
 def efficiency(flux: dict[str, float]) -> float:
-    """Return the flux inside the target over the flux that leaves the back face."""
+    """Return the ratio of the flux inside the target to the flux that leaves the back face."""
     inside, outside = (flux[f"{side} target"] + flux.get(f"ghost {side} target", 0.0) for side in ("on", "off"))
     leaving = inside + outside
     return inside / leaving if leaving > 0 else 0.0

@@ -83,7 +83,7 @@ class Effort:
     seed: int = 0  # seed of the rays
     places: int = 1025  # points per side of the lens at which a verification evaluates the thickness
     points: int = 1 << 17  # points of a face at which the written file is compared with the design
-    accuracy: float = 0.005  # standard error over the RRMSD at which no more rays are traced; 0: all rays are traced
+    accuracy: float = 0.005  # relative standard error of the RRMSD at which tracing ends; 0: all rays are traced
     seconds: float = math.inf  # time limit (s): no further sets of rays are started that would end later
     witness: bool = True  # True if flux tubes also trace a point source
 
@@ -121,7 +121,7 @@ class Light:
 
     @property
     def efficiency(self) -> float:
-        """Return the flux inside the target over the flux that leaves the last surface."""
+        """Return the ratio of the flux inside the target to the flux that leaves the last surface."""
         return efficiency(self.flux)
 
     @property

@@ -186,7 +186,7 @@ class Simulation:
 
     @property
     def efficiency(self) -> float:
-        """Return the flux inside the target over the flux that leaves the back face."""
+        """Return the ratio of the flux inside the target to the flux that leaves the back face."""
         return irradiance.efficiency(self.flux)
 
 

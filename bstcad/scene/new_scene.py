@@ -43,8 +43,8 @@ class Light:
     pixels: int = 256  # pixels along the longer side of the target
     size: float = 0.0  # mm for a lamp, degrees for parallel light; 0: no blur
     square: bool = False  # True for a square chip, False for a disc
-    ahead: float = 0.0  # distance from the lamp to the plate over the longer side of the plate; 0: parallel light
-    throw: float = 5.0  # default distance from the plate to the wall over the longer side of the plate
+    ahead: float = 0.0  # distance from the lamp to the plate, in longer sides of the plate; 0: parallel light
+    throw: float = 5.0  # default distance from the plate to the wall, in longer sides of the plate
     hint: str = ""  # advice for finer detail
 
 

@@ -123,7 +123,7 @@ class LocalImages:
 
     at: Tensor  # (2, points) landing points of the centre's light (column, row) in pixels
     offset: Tensor  # (2, 9, points) displacement δ of 3 x 3 points of the source, in pixels
-    flux: Tensor  # (9, points) flux of each of these over that of the centre
+    flux: Tensor  # (9, points) flux of each of these, relative to the centre
 
     @classmethod
     def of(cls, source: Emitter, channel: Channel, lens: Lens, screen: Screen) -> LocalImages:

@@ -31,7 +31,7 @@ MIN_IRRADIANCE = 1e-4  # irradiance over its maximum below which the error count
 SLOPE_TOLERANCE = 1e-8  # largest RMS of a table's error in the slopes of rays
 PEAK_TO_RMS = 100.0  # largest error of a table over these tolerances: the outermost spans are the least exact
 MAX_TABLES = 16  # tables of light in the cache
-MAX_TABLE_ERROR_RATIO = 0.5  # largest error of a table over that of the one before; above: the light has an edge
+MAX_TABLE_ERROR_RATIO = 0.5  # largest error of a table relative to that of the one before; above: an edge
 TABLE_BEAM = 0.0, 0.0, 0.0, 0.0, math.inf, 1.0, 0.0, 0, 0.0  # first fields of a Beam that is given by a table
 
 
