@@ -190,7 +190,7 @@ def _write_and_prove(
     processes.return_freed()  # the second process needs the memory for the solid
     began = time.perf_counter()
     progress("write", 0, 1, "STEP, STL, 3MF")
-    drawn.solid(made.lens)  # as designed, to be drawn while OCC writes and reads the file
+    drawn.solid(made.lens)  # the designed lens is drawn while OCC writes and reads the file
     with scene_errors(f"{made.scene.name}: "):  # raised if the tailored faces do not bound a solid
         write_3mf = folders.write_geometry(made, folder, processes.submit)
     processes.return_freed()

@@ -54,7 +54,7 @@ class Level:
 def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[StageStep]:
     """Run stage 1, or resume it, on one net after another, with one map from the front's vertex plane to the target."""
     knobs, lens, each = task.knobs, task.heaviest.through(lens), task.knobs.stage1_iterations
-    area = clear_window(task.heaviest.source, lens)  # of the flat blank
+    area = clear_window(task.heaviest.source, lens)  # part of the flat blank that light meets
     if state is None:
         mapping = transport(task, lens)
         yield StageStep(None, part="transport", ends=True)

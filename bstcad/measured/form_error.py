@@ -305,7 +305,7 @@ def deviation(lens: Lens, alignment: Alignment, form: FormError) -> Deviation:
 def _octaves(form: FormError, x: np.ndarray, y: np.ndarray, total: np.ndarray) -> tuple[Band, ...]:
     """Split the total (3, n) into the part besides the random field, and the field by octaves, longest period first."""
     shortest = SHORTEST_PERIOD * max(form.random_field.pitch)
-    period = 2 * max(high - low for low, high in (form.random_field.x, form.random_field.y))  # of the first cosine
+    period = 2 * max(high - low for low, high in (form.random_field.x, form.random_field.y))  # first cosine (mm)
     bands = [_band(None, total - sample_surface(form.random_field, x, y))]
     while period > shortest:
         finest = np.inf if period / 2 <= shortest else 2 / period

@@ -327,7 +327,7 @@ def _ghost_of_channel(channel: Channel, lens: Lens, screen: Screen, n: int, seed
         ):  # fmt: skip
             lines[line] += sign * float(total((out.flux * (out.alive & counted)).double()))
         launched += float(total(rays.flux.double()))
-    whole = max(launched, 1.0)  # as in `_as_fractions`
+    whole = max(launched, 1.0)  # divisor, which `_as_fractions` uses, too
     return GhostImage(picture / whole, {line: value / whole for line, value in lines.items()})
 
 

@@ -87,8 +87,8 @@ class TransportMap:
     y: np.ndarray  # (r,) y on the target plane, mm, ascending, float64
     source: np.ndarray  # (c, r, 2) float32, x and y (mm) in the scene's frame where the light for (x, y) passes `plane`
     # "back": the last tailored face in the order of the light, which is the front of a lens with a tailored front alone
-    # and of a mirror behind glass.  "entrance": the plane z = const through the vertex of the first face, where the map
-    # of Wang et al. begins (tailoring.method "adam" and "integration", strong lenses near the source)
+    # and of a mirror behind glass.  "entrance": the plane z = const through the vertex of the first face, where
+    # the map of Wang et al. begins (tailoring.method "adam" and "integration", strong lenses near the source)
     plane: str
 
     @property
