@@ -150,7 +150,7 @@ class Design:
                 f"with_heights: {given} is not possible; give (m, n) real numbers in mm, such as lens.back.heights"
             ) from None
         m, n = (max(count, MIN_ROUND_POINTS) for count in found.shape)
-        net = self.scene.flat_lens((m, n)).back
+        net = self.scene.flat_lens((m, n)).back_net
         back = replace(net, z=self.lens.back.z, heights=torch.from_numpy(found.astype(np.float64)))
         return self.with_lens(replace(self.lens, back=back))
 
@@ -344,7 +344,7 @@ class Design:
         glass = self.scene.lens.material or "glass"
         return (
             f"{across} of {glass} (index {lens.index:.5g}), {quantity(thick, 'mm')} thick on the axis, "
-            f"{size_text(lens.back.shape)} control points"
+            f"{size_text(lens.back_net.shape)} control points"
         )
 
     def _quality(self) -> str:
@@ -373,22 +373,23 @@ def _adapted(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
     if not (isinstance(lens, Lens) and isinstance(getattr(lens.back, "heights", None), torch.Tensor)):
         given = type(lens.back if isinstance(lens, Lens) else lens).__name__
         raise SceneError(f"with_lens: {given} is not possible; give a bstcad.Lens with a bstcad.BSplineSurface as back")
-    lens, shape = replace(lens.plain(), losses=None, clear=None), tuple(lens.back.heights.shape)
+    lens, shape = replace(lens.plain(), losses=None, clear=None), tuple(lens.back_net.heights.shape)
     if len(shape) != 2:
         raise SceneError(f"with_lens: heights of shape {shape} are not possible; give (m, n), m along x and n along y")
     _check_same("outline", lens.outline, scene.lens.outline)
     _check_same("path of light", lens.passes.words, scene.lens.passes.words)
     if lens.passes.enters and not math.isclose(lens.index, scene.index, rel_tol=RELATIVE_TOLERANCE):
         _check_same("index", lens.index, scene.index)
-    if lens.back.shape != as_pair(scene.lens.back.net):
-        scene = scene.changed({"lens.back.control_points": simplified(lens.back.shape), "tailoring.levels": None})
+    net = lens.back_net
+    if net.shape != as_pair(scene.lens.back.net):
+        scene = scene.changed({"lens.back.control_points": simplified(net.shape), "tailoring.levels": None})
     shapes_front = scene.lens.front.is_tailored and lens.front.is_net
-    if shapes_front and lens.front.shape != as_pair(scene.lens.nets()[1]):
-        scene = scene.changed({"lens.front.control_points": simplified(lens.front.shape), "lens.front.file": None})
-    flat = scene.flat_lens(lens.back.shape)
-    back = _on_net(lens.back, flat.back, "back")
+    if shapes_front and lens.front_net.shape != as_pair(scene.lens.nets()[1]):
+        scene = scene.changed({"lens.front.control_points": simplified(lens.front_net.shape), "lens.front.file": None})
+    flat = scene.flat_lens(net.shape)
+    back = _on_net(net, flat.back_net, "back")
     if shapes_front:
-        lens = lens.with_front(_on_net(lens.front, flat.front, "front"))
+        lens = lens.with_front(_on_net(lens.front_net, flat.front_net, "front"))
     elif not same_front(lens.front, front):
         scene = scene.changed({"lens.front": lens.front})
         lens = lens.with_front(scene.lens.front_surface)  # the scene fits a net to a user's surface

@@ -68,7 +68,7 @@ class Made(Nominal):
         """Return True if the lens is the same, to the last bit, for the same light and pictures."""
         return (
             same_front(self.lens.front, other.lens.front)
-            and np.array_equal(self.lens.back.control_points(), other.lens.back.control_points())
+            and np.array_equal(self.lens.back_net.control_points(), other.lens.back_net.control_points())
             and self.scene.source == other.scene.source
             and self.scene.targets == other.scene.targets
         )
@@ -76,7 +76,7 @@ class Made(Nominal):
 
 def same_front(one: Surface, other: Surface) -> bool:
     """Return True if two fronts are equal to the last bit."""
-    if one.is_net and other.is_net:  # independent of the plane from which their heights are measured
+    if isinstance(one, BSplineSurface) and isinstance(other, BSplineSurface):  # independent of their planes z
         return np.array_equal(one.control_points(), other.control_points())
     both = [{"z": front.z, **front.parameters()} for front in (one.plain(), other.plain())]
     same = (one.kind, one.outline) == (other.kind, other.outline) and both[0].keys() == both[1].keys()
@@ -276,21 +276,22 @@ def write_design(design: Made, irradiances: Sequence[np.ndarray], folder: Path) 
     tailored face (the back; the front if it alone is tailored, or for a mirror behind glass), or the plane of the
     first vertex.
     """
-    (m, n), front, sent = design.lens.back.shape, design.lens.front, design.transport
+    lens, sent = design.lens, design.transport
+    (m, n), front = lens.back_net.shape, lens.front
     parts = ((k, goal.reachable) for k, goal in enumerate(design.goals))
     np.savez_compressed(
         folder / DESIGN,
-        control_points=design.lens.back.control_points(),
+        control_points=lens.back_net.control_points(),
         knots_x=knots(m),
         knots_y=knots(n),
         degree=DEGREE,
         **({"front_curvature": 0.0} | _numbers(front)),
-        **({"front_control_points": front.control_points()} if front.is_net else {}),
-        **(dict(zip(FRONT_KNOTS, map(knots, front.shape), strict=True)) if design.lens.shapes("front") else {}),
+        **({"front_control_points": front.control_points()} if isinstance(front, BSplineSurface) else {}),
+        **(dict(zip(FRONT_KNOTS, map(knots, lens.front_net.shape), strict=True)) if lens.shapes("front") else {}),
         **{numbered("target", k): goal.picture for k, goal in enumerate(design.goals)},
         **{numbered("reachable", k): part.astype(np.uint8) for k, part in parts if part is not None},
         **{numbered("irradiance", k): picture for k, picture in enumerate(irradiances)},
-        scene=scene_text(design.scene, design.lens),
+        scene=scene_text(design.scene, lens),
         **({f"transport_{sent.plane}": sent.source, "transport_x": sent.x, "transport_y": sent.y} if sent else {}),
     )
 

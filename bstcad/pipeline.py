@@ -133,7 +133,7 @@ def design(
     precision = getattr(torch, knobs.precision)
     lens = scene.flat_lens(knobs.levels[0], dtype=precision, device=device, as_wide_as=knobs.levels[-1])
     if not scene.lens.back.optimise:  # no stage refines it
-        lens = lens.with_back(lens.back.refined(scene.lens.back.net))
+        lens = lens.with_back(lens.back_net.refined(scene.lens.back.net))
     if start is None:
         driver.end("loading")  # loading of the libraries, the scene and its files
     followed = (
@@ -256,7 +256,7 @@ def resolved(scene: Scene, lens: Lens) -> Scene:
 
     A scene with the paper's procedure or a freeform front, found together with the back, is returned as it is.
     """
-    if scene.tailoring.resolved(lens.back.shape).method == "adam":
+    if scene.tailoring.resolved(lens.back_net.shape).method == "adam":
         return scene
     blank = scene.lens.model_copy(update={"front": scene.lens.front.with_parameters(lens.front)})
     return scene.model_copy(update={"lens": blank})

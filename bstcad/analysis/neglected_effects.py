@@ -95,7 +95,7 @@ class Reference:
             lens, channel, screen, np.asarray(picture, float), places=(x, y),
             pixel=screen.pixels_of(landed.position).numpy(),
             flux=torch.where(lit, density, torch.zeros_like(density)).numpy(),
-            through=_transmission(landed), control_points=control_points or lens.back.heights.numel(),
+            through=_transmission(landed), control_points=control_points or lens.back_net.heights.numel(),
         )  # fmt: skip
 
     @cached_property
@@ -152,7 +152,7 @@ class Reference:
 
     def _cell_width(self) -> float:
         """Return the width of the light of a control cell (pixels), the finest detail that the lens can shape."""
-        (left, right), (low, high) = self.lens.back.x, self.lens.back.y
+        (left, right), (low, high) = self.lens.back_net.x, self.lens.back_net.y
         cells = self._lit_area() / ((right - left) * (high - low)) * (math.sqrt(self.control_points) - 1) ** 2
         return math.sqrt((self.picture > DARK_LEVEL * self.picture.mean()).sum() / max(cells, 1.0))
 

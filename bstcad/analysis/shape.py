@@ -39,14 +39,14 @@ def describe(lens: Lens, grid: int = GRID_POINTS) -> dict[str, float | None]:
     front, back = _sags(lens, x, y)
     thickness, (front_vertex, back_vertex) = back - front, _sags(lens, *torch.zeros(2, 1, dtype=torch.float64))
     edge, flat = thickness[: 4 * grid], (x.numpy(), y.numpy())
-    of_front = _face_figures(lens.front, survey_front(lens), (*flat, front)) if lens.shapes("front") else {}
+    of_front = _face_figures(lens.front_net, survey_front(lens), (*flat, front)) if lens.shapes("front") else {}
     return {
         "centre_thickness": float((back_vertex - front_vertex)[0]),
         "edge_thickness_min": float(edge.min()),
         "edge_thickness_max": float(edge.max()),
         "thickness_min": float(thickness.min()),
         "thickness_max": float(thickness.max()),
-        **_face_figures(lens.back, survey(lens), (*flat, back)),
+        **_face_figures(lens.back_net, survey(lens), (*flat, back)),
         **{f"front_{key}": value for key, value in of_front.items()},
     }
 
@@ -238,15 +238,16 @@ class Survey:
 def survey(lens: Lens, concave: float | None = None, convex: float | None = None, slope: float | None = None) -> Survey:
     """Find the extremes of the back; concave, convex: bounds on radii (mm); slope: bound on the angle (degrees)."""
     lens = lens.plain()
-    x, y, along_x, along_y = _grid(lens.back)
+    back = lens.back_net
+    x, y, along_x, along_y = _grid(back)
     near = (
         math.inf if concave is None else AT_BOUND * (1 / concave),
         math.inf if convex is None else AT_BOUND * (1 / convex),
         math.inf if slope is None else AT_BOUND * math.tan(math.radians(slope)),
     )
-    limits, net = lens.outline.scaled(1 + RIM_ROUNDING).limits, lens.back.heights.contiguous().numpy()
+    limits, net = lens.outline.scaled(1 + RIM_ROUNDING).limits, back.heights.contiguous().numpy()
     found, place, count = spline.largest_bending(net, (along_x, along_y), (x, y), limits=limits, bounds=near)
-    each = math.prod(lens.back.pitch) / len(QUARTERS) ** 2 / lens.outline.area
+    each = math.prod(back.pitch) / len(QUARTERS) ** 2 / lens.outline.area
     valley, ridge, steep = (
         Extreme(float(value), _position_text(x.flat[i], y.flat[j]), min(each * float(n), 1.0))
         for value, (i, j), n in zip(found, place, count, strict=True)

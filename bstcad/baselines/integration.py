@@ -85,11 +85,11 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
     for _ in range(MAX_STARTS):
         start = exact.back.z
         points = march(coming, aim, plane, law=exact.last_freeform.law, z=start, first=first)
-        back = fit_net(exact.back, points, lit_points(points, coming, exact), knobs.levels)
+        back = fit_net(exact.back_net, points, lit_points(points, coming, exact), knobs.levels)
         exact = place_back(exact.with_back(back), z, task.min_thickness)
         if exact.back.z == start:
             break
-    return lens.with_back(exact.back.with_parameters(heights=exact.back.heights.to(lens.back.heights)))
+    return lens.with_back(replace(exact.back_net, heights=exact.back_net.heights.to(lens.back_net.heights)))
 
 
 def lit_points(points: SurfacePoints, coming: Rays, lens: Lens) -> Tensor:

@@ -81,13 +81,13 @@ def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Stage
 
 def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: Level | None) -> Iterator[Iterate]:
     """Run stage 1 on the net of `lens`, or resume: min Σ |P_t - P|² over the heights and the free front."""
-    n = min(task.knobs.rays, MAX_RAYS_PER_CONTROL_POINT * max(lens.back.shape))
+    n = min(task.knobs.rays, MAX_RAYS_PER_CONTROL_POINT * max(lens.back_net.shape))
     x, y = (t.to(lens.like) for t in sampling.grid(area, n))
     rays = task.heaviest.source.rays(x, y, lens.entrance.z, area.area / n**2)
     screen, shape = task.goals[0].receiver, lens.front.parameters()
     aim = slope_map.aim_points(mapping, lens, screen, x=x, y=y)
-    start = [lens.back.heights, *(torch.as_tensor(shape[name]).to(lens.back.heights) for name in task.free)]
-    nearest = min(STAGE1_RATES, key=lambda m: abs(m - max(lens.back.shape)))
+    start = [lens.back_net.heights, *(torch.as_tensor(shape[name]).to(lens.like) for name in task.free)]
+    nearest = min(STAGE1_RATES, key=lambda m: abs(m - max(lens.back_net.shape)))
 
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
         leaves = [p.detach().clone().requires_grad_() for p in parameters]
@@ -224,5 +224,5 @@ def tailor_to_irradiance(
         (gradient,) = torch.autograd.grad(square.sqrt(), leaf)
         return float(square.detach().sqrt()), [gradient], float(rrmsd)
 
-    method = adam([lens.back.heights], [STAGE2_RATE], steps, state and state.search)
+    method = adam([lens.back_net.heights], [STAGE2_RATE], steps, state and state.search)
     return minimise(problem, method, steps, state.best if state else Best())

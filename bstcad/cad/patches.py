@@ -48,7 +48,7 @@ class Patch:
 
 def back_patch(lens: Lens) -> Patch:
     """Return the back: Σ B_i(u) B_j(v) P_ij on the design's net and knots (3, 1, …, 1, 3), normal towards +z."""
-    return _net_patch(lens.back.plain(), lens.outline, outward=True)
+    return _net_patch(lens.back_net.plain(), lens.outline, outward=True)
 
 
 def _net_patch(face: BSplineSurface, outline: Outline, outward: bool) -> Patch:

@@ -11,7 +11,6 @@ import cmath
 import math
 import numbers
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -110,15 +109,16 @@ def coarse_copy(lens: Lens, m: int) -> Lens:
     follows relief wider than a few cells of the coarse net and smooths the rest.  The copy is not made for tracing.
     """
     lens = lens.plain()
-    if m >= max(lens.back.shape):
+    net = lens.back_net
+    if m >= max(net.shape):
         return lens
     stretch = (m - 1) / (m - 1 - 2 * EXTRA_POINTS)
-    reach = (max(-low, high) for low, high in (lens.back.x, lens.back.y))
+    reach = (max(-low, high) for low, high in (net.x, net.y))
     ends = [half if end <= half else stretch * half for half, end in zip(lens.outline.half_extent, reach, strict=True)]
-    spans = zip(ends, as_pair(coarser(lens.back.shape, m)), (lens.back.x, lens.back.y), strict=True)
+    spans = zip(ends, as_pair(coarser(net.shape, m)), (net.x, net.y), strict=True)
     x, y = np.meshgrid(*(np.clip(np.linspace(-end, end, k), *span) for end, k, span in spans), indexing="ij")
-    heights = torch.from_numpy(sag(lens.back, x, y) - lens.back.z)
-    return replace(lens, back=BSplineSurface(lens.back.z, heights, *((-end, end) for end in ends)))
+    heights, (half_x, half_y) = torch.from_numpy(sag(net, x, y) - net.z), ends
+    return lens.with_back(BSplineSurface(net.z, heights, (-half_x, half_x), (-half_y, half_y)))
 
 
 def check_thickness(lens: Lens) -> None:
@@ -133,7 +133,7 @@ def check_thickness(lens: Lens) -> None:
     a, b = lens.outline.half_extent
     axes = (
         torch.linspace(-end, end, 3 * (count - 2) + 1, dtype=torch.float64)
-        for end, count in zip((a, b), lens.back.shape, strict=True)
+        for end, count in zip((a, b), lens.back_net.shape, strict=True)
     )
     x, y = torch.meshgrid(*axes, indexing="ij")
     inside = lens.outline.contains(x, y)
@@ -270,5 +270,5 @@ def _parting(lens: Lens, rim: Sequence[LoopPiece]) -> float:
 
 def rim_points(lens: Lens, rim: Sequence[LoopPiece]) -> np.ndarray:
     """Return x and y (2, n) of points along a rim (mm), several in each cell of the back's net."""
-    count = POINTS_PER_CELL * max(lens.back.shape)
+    count = POINTS_PER_CELL * max(lens.back_net.shape)
     return np.concatenate([piece.points(np.linspace(0.0, piece.end, count)) for piece in rim]).T

@@ -443,7 +443,7 @@ def points_on_edges(solid: TopoDS_Shape) -> np.ndarray:
 
 def edge_deviations(shape: TopoDS_Shape, lens: Lens) -> tuple[tuple[float, str], tuple[float, str]]:
     """Return the largest distance (mm) of an edge from a face it bounds, and from the lens's wall, each with where."""
-    spans = max(max(lens.back.shape) - 2, math.ceil(2 * max(lens.outline.half_extent) / lens.front.detail))
+    spans = max(max(lens.back_net.shape) - 2, math.ceil(2 * max(lens.outline.half_extent) / lens.front.detail))
     fractions = np.linspace(0.0, 1.0, POINTS_PER_SPAN * spans + 1)
     from_faces, from_wall = [], []
     for face in map(TopoDS.Face_s, parts_of(shape, TopAbs_FACE)):

@@ -141,7 +141,7 @@ def _curve_on(surface: Surface, piece: LoopPiece) -> RailCurve:
 
     if _is_level_on(surface, piece):
         return RailCurve(piece, points(np.array([0.0, piece.end])))
-    if surface.is_net and piece.straight and (border := _border(surface, piece)) is not None:
+    if isinstance(surface, BSplineSurface) and piece.straight and (border := _border(surface, piece)) is not None:
         return border
     smooth = not surface.is_net and (piece.straight or piece.centre is not None)
     return RailCurve(piece, *wires.fit_spline(points, wires.breaks(surface, piece), RIM_TOLERANCE, smooth))

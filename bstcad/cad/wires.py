@@ -15,6 +15,7 @@ from OCP.GeomAbs import GeomAbs_CurveType as Kind
 from OCP.TopAbs import TopAbs_Orientation
 from scipy.interpolate import BSpline, make_interp_spline
 
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.outlines import Outline
 from bstcad.optics.surfaces import Surface
 
@@ -198,14 +199,14 @@ class RailCurve:
 def breaks(surface: Surface, *pieces: LoopPiece) -> np.ndarray:
     """Return parameters between which pieces, all with the same parameter, lie over one smooth part of a surface."""
     t = np.linspace(0.0, pieces[0].end, MIN_PARTS + 1)
-    if math.isfinite(surface.detail):  # a net: smooth between its knot lines
+    if isinstance(surface, BSplineSurface):  # smooth between its knot lines
         t = np.unique(np.concatenate([t, *(_crossings(surface, piece) for piece in pieces)]))
     inner = t[1:-1]
     inner = inner[(np.diff(t)[:-1] > MIN_PART * t[-1]) & (t[-1] - inner > MIN_PART * t[-1])]
     return np.concatenate([t[:1], inner, t[-1:]])
 
 
-def _crossings(surface: Surface, piece: LoopPiece) -> np.ndarray:
+def _crossings(surface: BSplineSurface, piece: LoopPiece) -> np.ndarray:
     """Return the parameters at which a piece crosses knot lines of a net, by bisection of all crossings at once."""
     t, crossings = np.linspace(0.0, piece.end, max(*surface.shape, MIN_PARTS) * 8 + 1), [np.empty(0)]
     points = piece.points(t)

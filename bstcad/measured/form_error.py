@@ -54,7 +54,7 @@ class FormError:
 
     def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return δz (mm) at (x, y) in mm, relative to the alignment by least squares."""
-        smooth = _legendre(self.face.lens.back, x, y) @ self.polynomial
+        smooth = _legendre(self.face.lens.back_net, x, y) @ self.polynomial
         z, z_x, z_y = sample_surface(self.face.lens.back, x, y)
         moved = self.face.columns(np.stack([x, y, z], axis=1), np.stack([-z_x, -z_y, np.ones_like(z)], axis=1))
         return smooth + sample_surface(self.random_field, x, y)[0] + moved @ self.motion
@@ -86,7 +86,7 @@ class FormError:
 
 def fit_form_error(face: Face, alignment: Alignment) -> FormError:
     """Fit the form error of a face to an aligned cloud."""
-    back, points, n = face.lens.back, alignment.points, len(alignment.points)
+    back, points, n = face.lens.back_net, alignment.points, len(alignment.points)
     x, y = np.ascontiguousarray(points[:, :2].T)
     smooth = _legendre(back, x, y)
     motions = face.columns(points, alignment.normals / alignment.normals[:, 2:]) @ alignment.motions

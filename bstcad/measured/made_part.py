@@ -99,7 +99,7 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
                 ),
             )
         ),
-        *_wavefront(replace(lens, back=form.add_to(lens.back)), nominal),
+        *_wavefront(replace(lens, back=form.add_to(lens.back_net)), nominal),
     )  # fmt: skip
     facts = _facts(face, alignment, figures, cloud) | {"scale": scale, "passed": all(check.passed for check in checks)}
     predicted = [_predicted(light, high) for light, high in lights]
@@ -188,7 +188,7 @@ def _light(lens: Lens, form: FormError, nominal: Nominal, goal: Goal, *, effort:
     draw = np.random.default_rng(nominal.scene.tailoring.seed).normal(size=form.spread.shape)
 
     def light_with(form: FormError) -> Light:
-        made = replace(lens, back=form.add_to(lens.back))
+        made = replace(lens, back=form.add_to(lens.back_net))
         options = {"effort": effort, "ghost": nominal.scene.ghost, "draw": nominal.scene.draw}
         return measure(made, nominal.channels, goal.receiver, goal.picture, **options)
 

@@ -291,21 +291,28 @@ class BSplineSurface(Surface):
     def scaled(self, factor: float, about: float) -> BSplineSurface:
         """Return the surface scaled by a factor about the point of the axis at z = `about` (mm)."""
         (x0, x1), (y0, y1), z = self.x, self.y, about + factor * (self.z - about)
-        ends = {"x": (factor * x0, factor * x1), "y": (factor * y0, factor * y1)}
-        return replace(self, z=z, heights=factor * self.heights, **ends)
+        x, y = (factor * x0, factor * x1), (factor * y0, factor * y1)
+        return replace(self, z=z, heights=factor * self.heights, x=x, y=y)
 
     def bent(self, curvature: float) -> BSplineSurface:
         """Return the surface plus curvature r² / 2 (mm), which adds `curvature` (1/mm) at its vertex."""
         x, y = (torch.linspace(*ends, m).to(self.heights) for ends, m in zip((self.x, self.y), self.shape, strict=True))
         return replace(self, heights=self.heights + curvature / 2 * (x[:, None] ** 2 + y[None, :] ** 2))
 
-    def parameters(self) -> dict[str, Tensor]:
+    def parameters(self) -> dict[str, float | Tensor]:
         """Return the heights (mm)."""
         return {"heights": self.heights}
 
     def plain(self) -> BSplineSurface:
         """Return the surface with heights in float64 on the CPU, without gradient."""
         return replace(self, heights=self.heights.detach().to("cpu", torch.float64))
+
+
+def require_net(surface: Surface) -> BSplineSurface:
+    """Return a surface that is a B-spline net; TypeError for another one."""
+    if not isinstance(surface, BSplineSurface):
+        raise TypeError(f"the {surface.kind} has no control points; fit a net to it by BSplineSurface.fitted")
+    return surface
 
 
 @dataclass(frozen=True)

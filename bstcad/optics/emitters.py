@@ -13,9 +13,9 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import Field, replace
 from types import MappingProxyType
-from typing import Annotated
+from typing import Annotated, Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -41,10 +41,10 @@ class Emitter(ABC):
     these, or raise NotImplementedError with the method that is missing.
     """
 
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
     wavelength: Wavelength
     lumens: float | None = None  # total flux, lm; None: relative
     tilt: tuple[float, float] | None = None
-    extent: Outline | None = None  # outline (mm or direction cosines) filled by simple sources; None: a simple source
     profile: str = "own"
     size_key: str | None = None  # scene key of the size; with the prefix real_ the key of the real lamp's size
     kind: str = "own"
@@ -53,6 +53,11 @@ class Emitter(ABC):
     start_key: str = "z"  # scene key of the position where the light starts
     widths: Mapping[str, str] = MappingProxyType({})  # scene key of the width that each profile needs
     unbounded: str | None = None  # name of the profile that needs no width
+
+    @property
+    def extent(self) -> Outline | None:
+        """Outline (mm or direction cosines) filled by simple sources; None: a simple source."""
+        return None
 
     @property
     def start_plane(self) -> float | None:

@@ -193,8 +193,9 @@ def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) ->
     x, y, z = torch.where(meets, start + s * rays.direction, torch.zeros_like(start))
     h, z_x, z_y = surface.relative_sag_and_slope(x, y)
     dx, dy, dz = rays.direction.detach()
+    net = surface if isinstance(surface, BSplineSurface) else None
     ok = meets & ((dz - z_x.detach() * dx - z_y.detach() * dy).abs() > TANGENCY_TOLERANCE)
-    rise_x, rise_y = slopes_beyond(surface, x, y, z_x=z_x, z_y=z_y) if surface.is_net else (z_x, z_y)
+    rise_x, rise_y = slopes_beyond(net, x, y, z_x=z_x, z_y=z_y) if net else (z_x, z_y)
     slope = dz - rise_x.detach() * dx - rise_y.detach() * dy
     step = torch.where(ok, z - h, torch.zeros_like(h)) / torch.where(ok, slope, torch.ones_like(slope))
     before = torch.stack([*rays.position[:2], rays.above(surface.z)])
@@ -211,7 +212,7 @@ def _plane_and_root(surface: Surface, rays: Rays) -> tuple[Tensor, Tensor, Tenso
     path = -rays.above(surface.z) / torch.where(dz.abs() > 1e-12, dz, torch.full_like(dz, 1e-12))
     start = torch.stack([*(rays.position[:2] + path * rays.direction[:2]), torch.zeros_like(dz)])
     with torch.no_grad():
-        if surface.is_net:
+        if isinstance(surface, BSplineSurface):
             bounds = net_bounds(surface, dz.dtype, rays.sense)
             s, meets = first_root(surface, start, path, rays=rays, bounds=bounds)
         else:

@@ -10,7 +10,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import BSplineSurface, require_net
 from bstcad.optics.interfaces import Interface
 from bstcad.optics.outlines import EVERYWHERE, Outline
 from bstcad.optics.passes import LENS, MIRROR, Face, Passes
@@ -78,6 +78,16 @@ class Lens:
         )
 
     @property
+    def front_net(self) -> BSplineSurface:
+        """Front of a lens with a tailored front; TypeError if it is not a net."""
+        return require_net(self.front)
+
+    @property
+    def back_net(self) -> BSplineSurface:
+        """Back, which is a net in every scene; TypeError if it is not."""
+        return require_net(self.back)
+
+    @property
     def optical_faces(self) -> dict[str, Surface]:
         """Faces of the solid that light meets, by name, in the order of the light: for a mirror the back alone."""
         return {face: self.front if face == "front" else self.back for face in self.passes.faces}
@@ -117,9 +127,9 @@ class Lens:
 
     @property
     def nets(self) -> tuple[BSplineSurface, ...]:
-        """Surfaces of the interfaces in `freeform`."""
+        """Surfaces of the interfaces in `freeform`; TypeError if one is not a net."""
         interfaces = self.interfaces
-        return tuple(interfaces[k].surface for k in self.freeform)
+        return tuple(require_net(interfaces[k].surface) for k in self.freeform)
 
     @property
     def front_vertex(self) -> float:
@@ -162,16 +172,15 @@ class Lens:
         solid, steps = self.solid, self.passes.steps
         if solid.start <= k < solid.stop:
             return self.with_back(surface) if steps[k - solid.start].face == "back" else self.with_front(surface)
-        name, at = ("before", k) if k < solid.start else ("behind", k - solid.stop)
-        around = list(getattr(self, name))
-        around[at] = replace(around[at], surface=surface)
-        return replace(self, **{name: tuple(around)})
+        around = list(self.interfaces)
+        around[k] = replace(around[k], surface=surface)
+        return replace(self, before=tuple(around[: solid.start]), behind=tuple(around[solid.stop :]))
 
     @property
     def like(self) -> Tensor:
         """Tensor of the precision and device of the lens: the heights of a net, else float64 on the CPU."""
-        last = self.nets[-1]
-        return last.heights if last.is_net else torch.zeros(0, dtype=torch.float64)
+        last = self.last_freeform.surface
+        return last.heights if isinstance(last, BSplineSurface) else torch.zeros(0, dtype=torch.float64)
 
     @property
     def apertures(self) -> tuple[Outline, Outline]:

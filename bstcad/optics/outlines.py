@@ -26,8 +26,12 @@ RIM_POINTS = 720  # number of rim points on the arcs together, and about as many
 class _Box:
     """Methods of all outlines that follow from their limits."""
 
-    limits: Limits
     is_round = False  # True for a circle
+
+    @property
+    def limits(self) -> Limits:
+        """Limits (a, b, r²)."""
+        raise NotImplementedError
 
     def contains(self, x: Tensor, y: Tensor) -> Tensor:
         """Return True where (x, y) (mm) lies inside or on the rim."""

@@ -32,8 +32,12 @@ class Receiver(ABC):
     light: str = "irradiance"  # quantity of a pixel: irradiance (per area) or radiant intensity (per solid angle)
     tilt: tuple[float, float] | None = None  # tilt of a plane about x, then y, degrees; None: not a tilted plane
     names: tuple[str, str] = ("x", "y")  # names of the coordinates
-    axes: tuple[Vector, Vector, Vector] | None = None  # (e_x, e_y, n) for the kernels; None: no kernel
     is_level: bool = False  # True for a plane z = const
+
+    @property
+    def axes(self) -> tuple[Vector, Vector, Vector] | None:
+        """Axes (e_x, e_y, n) for the kernels; None: no kernel."""
+        return None
 
     @property
     def labels(self) -> tuple[str, str]:

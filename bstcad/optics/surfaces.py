@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
-from typing import Any, Literal, Self
+from dataclasses import Field, dataclass, replace
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 import torch
@@ -21,16 +21,25 @@ MIN_COS2 = 1e-6  # smallest 1 - (1 + k) c² r², for a sphere cos² of its slope
 
 
 class Surface(ABC):
-    """Surface given by its height z over (x, y); lengths in mm."""
+    """Surface given by its height z over (x, y); lengths in mm.  A subclass is a frozen dataclass."""
 
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
     z: float  # height of the vertex on the axis, or for a net of the plane its heights are measured from (mm)
     kind: str
     is_net = False  # True for a B-spline net, which has `heights`
-    level = False  # True for a plane z = const, which light along the axis meets at normal incidence
     curvature: float | Tensor  # curvature at the vertex of a surface of revolution (1/mm), > 0 towards +z
     conic_constant: float | Tensor  # conic constant of a surface of revolution
-    detail = math.inf  # width of the smooth pieces of the surface (mm)
     outline: Circle | None = None  # outline of the optical part, with a plane around it; None: all of it is optical
+
+    @property
+    def level(self) -> bool:
+        """True for a plane z = const, which light along the axis meets at normal incidence."""
+        return False
+
+    @property
+    def detail(self) -> float:
+        """Width of the smooth pieces of the surface (mm)."""
+        return math.inf
 
     @property
     def optical(self) -> Surface:
@@ -54,6 +63,13 @@ class Surface(ABC):
     def reaches(self, x: Tensor, y: Tensor) -> Tensor:
         """Return True where the surface has a point over (x, y)."""
         return torch.ones_like(x, dtype=torch.bool)
+
+    def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
+        """Return (s in mm, met): path along rays from (x, y) on the plane z to the surface around its vertex.
+
+        sense: -1 for light along -z, which comes from above.
+        """
+        raise self.unknown
 
     @abstractmethod
     def sags(self, outline: Outline) -> tuple[float, float]:
@@ -138,10 +154,10 @@ class _Revolved(Surface):
         moved = self.moved(about + factor * (self.z - about))
         return moved.with_parameters(curvature=self.curvature / factor) if self.curvature else moved
 
-    def bent(self, curvature: float) -> Surface:
+    def bent(self, curvature: float) -> Self | Sphere:
         """Return the surface with `curvature` (1/mm) added at its vertex; a plane becomes a sphere."""
-        curvature = self.curvature + curvature
-        return self.with_parameters(curvature=curvature) if self.curvature else Sphere(self.z, curvature)
+        total = self.curvature + curvature
+        return self.with_parameters(curvature=total) if self.curvature else Sphere(self.z, total)
 
     def conic(self) -> tuple[float, float]:
         """Return curvature (1/mm) and conic constant, without gradient."""
@@ -155,7 +171,7 @@ class _Revolved(Surface):
 
         a s² - 2 g s + c r² = 0, a = c (1 + k d_z²), g = d_z - c (x d_x + y d_y), is solved as
         s = c r² / (g + sqrt(g² - a c r²)), the root at which a ray comes from below, d_z > ∇z · (d_x, d_y).
-        sense: -1 for light along -z, which comes from above and takes the other root.
+        sense: -1 for light along -z, which takes the other root.
         """
         c, (dx, dy, dz) = self.curvature, direction
         f = c * (x * x + y * y)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -32,8 +31,7 @@ class TiltedSurface(Surface):
     unit_normal: Vector  # unit normal N at the vertex
     face_curvature: float = 0.0  # curvature c, 1/mm; positive: concave towards +z
 
-    kind: ClassVar[str] = "tilted"
-    curvature = conic_constant = None  # not a surface of revolution about the axis of the lens
+    kind = "tilted"
 
     @classmethod
     def of(cls, surface: Face | TiltedSurface) -> TiltedSurface:

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from bstcad.cad.mesh import DEFAULT_LABEL, Label, preview_files
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import Surface, sag
@@ -96,7 +97,7 @@ def export(
 def _files(
     kind: str, lens: Lens, points: int | None, *, label: Label, mount: Mount | None, light: GridLight | None
 ) -> Iterator[tuple[str, str | bytes]]:
-    count = min(max(lens.back.shape), MAX_POINTS) if points is None else points
+    count = min(max(lens.back_net.shape), MAX_POINTS) if points is None else points
     match kind:
         case "sag":
             yield "sag.csv", sag_table(lens, count)
@@ -107,7 +108,7 @@ def _files(
             yield from _sidecar("points", lens, count, light)
         case "zemax":  # for a front that is not a net, prescription.txt has the numbers
             for name, face in (("zemax-back", lens.back), ("zemax-front", lens.front)):
-                if face.is_net:
+                if isinstance(face, BSplineSurface):
                     grid = GridSag.of(lens, face, points, light)
                     yield f"{name}.dat", grid.text()
                     yield f"{name}{SIDECAR}", grid.note(f"{name}.dat") + "\n"

@@ -80,8 +80,8 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "front": _own_outline(front) | _face(scene.lens.front.kind, lens.front_vertex, numbers) | fitted,
         "back": _face("bspline", vertex(lens), {}),
         "reflects": lens.reflects,  # True for a mirror
-        "net": _net(lens.back),
-        **({"front_net": _net(front), "front_asked": scene.lens.front.z} if lens.shapes("front") else {}),
+        "net": _net(lens.back_net),
+        **({"front_net": _net(lens.front_net), "front_asked": scene.lens.front.z} if lens.shapes("front") else {}),
         "back_asked": scene.lens.back.z,  # position of the back's vertex in the scene
         "centre_thickness": shape["centre_thickness"],
         "edge_thickness": (shape["edge_thickness_min"], shape["edge_thickness_max"]),

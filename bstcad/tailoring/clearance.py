@@ -50,7 +50,8 @@ def clearance(lens: Lens, bounds: Bounds) -> tuple[float, dict[int, Tensor], flo
     no point is close.  Both nets have the same precision.  Sums have fixed parts: no bit depends on threads.
     """
     length, square, worst = unit(lens, bounds), 0.0, -PENALTY_MARGIN
-    faces = {lens.number_of("front"): (lens.front, -1.0), lens.number_of("back"): (lens.back, 1.0)}  # (net, ∂t / ∂z)
+    front, back = map(lens.number_of, ("front", "back"))
+    faces = {front: (lens.front_net, -1.0), back: (lens.back_net, 1.0)}  # (net, ∂t / ∂z)
     gradients: dict[int, Tensor] = {}
     for x, y, share, thinnest in _points_near_bounds(lens, bounds, PENALTY_MARGIN * length):
         relative, thicker = _excess(lens, x, y, replace(bounds, thinnest=thinnest))
@@ -82,7 +83,7 @@ def _points_near_bounds(lens: Lens, bounds: Bounds, margin: float) -> Iterator[t
 
 def _excess(lens: Lens, x: Tensor, y: Tensor, bounds: Bounds) -> tuple[Tensor, Tensor]:
     """Return the excess (mm) over the nearer bound of the thickness, and 1 if that is the maximum, -1 otherwise."""
-    front, back = (evaluate(net.heights, *net.along_net(x, y))[0] for net in (lens.front, lens.back))
+    front, back = (evaluate(net.heights, *net.along_net(x, y))[0] for net in (lens.front_net, lens.back_net))
     glass = (lens.back.z - lens.front.z) + back - front
     thin = bounds.thinnest - glass
     thick = torch.full_like(thin, -math.inf) if bounds.thickest is None else glass - bounds.thickest
@@ -99,7 +100,7 @@ class CellGrid:
     @classmethod
     def over(cls, lens: Lens) -> CellGrid:
         """Make the grid for both nets of a lens."""
-        half, pitches = lens.outline.half_extent, zip(lens.front.pitch, lens.back.pitch, strict=True)
+        half, pitches = lens.outline.half_extent, zip(lens.front_net.pitch, lens.back_net.pitch, strict=True)
         pairs = zip(half, pitches, strict=True)
         x, y = (max(1, math.ceil(2 * side / min(pitch) - CELL_ROUNDING)) for side, pitch in pairs)
         return cls((x, y), half)
@@ -132,7 +133,8 @@ class CellGrid:
 
     def _near(self, lens: Lens, bounds: Bounds, margin: float) -> np.ndarray:
         """Return indices (n, 2) of the cells that may be within `margin` of a bound, by their control points."""
-        front, back = ((net.heights.detach().cpu().numpy(), self._first_points(net)) for net in (lens.front, lens.back))
+        nets = lens.front_net, lens.back_net
+        front, back = ((net.heights.detach().cpu().numpy(), self._first_points(net)) for net in nets)
         distance = lens.back.z - lens.front.z
         for extremes in (_tile_extremes, _cell_extremes):
             near = distance + extremes(*back, np.minimum) - extremes(*front, np.maximum) < bounds.thinnest + margin

@@ -197,8 +197,8 @@ def _thickness_excess(lens: Lens, bounds: Bounds) -> tuple[float, Tensor, float]
     x, y = thickness_points(lens)
     heights = lens.back.relative_sag_and_slope(x, y)[0]
     room = min(bounds.thickest - bounds.thinnest, float(heights.max() - heights.min())) or 1.0
-    leaf = lens.back.heights.detach().requires_grad_()
-    back, square, worst = replace(lens.back, heights=leaf), 0.0, -PENALTY_MARGIN
+    leaf = lens.back_net.heights.detach().requires_grad_()
+    back, square, worst = replace(lens.back_net, heights=leaf), 0.0, -PENALTY_MARGIN
     for x, y, least in (
         (*thickness_points(lens), bounds.thinnest),
         (*rim_points(lens), max(bounds.thinnest, bounds.edge or 0.0)),

@@ -81,7 +81,7 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[S
     if state is None and task.free:
         net, settings = task.knobs.levels[0], {"iterations": task.knobs.transport_iterations}
         if task.preview:
-            net, settings = coarser(lens.back.shape, PREVIEW_NET), PREVIEW_FRONT
+            net, settings = coarser(lens.back_net.shape, PREVIEW_NET), PREVIEW_FRONT
         settings = settings | {"free": task.free, "rim_sags": task.rim_sags}
         shaped = shaped_front(task.heaviest.source, lens.refined(net), goal.picture, goal.receiver, **settings)
         lens = lens.with_front(shaped.front)
@@ -195,7 +195,7 @@ def shaped_front(
     The merit, the mean of |P_i^t - P_i|², is that of the best back for each front, on the net of `lens`.
     n, iterations: cells a side and iterations of the map; repeats: fits of the slopes for each front.
     """
-    side, plane = 2 * max(lens.back.shape), screen.plane
+    side, plane = 2 * max(lens.back_net.shape), screen.plane
     rays, wanted, _ = aimed_rays(source, lens, target, screen=screen, n=n, side=side, iterations=iterations)
 
     def miss(tried: Lens) -> float:

@@ -142,7 +142,7 @@ def _round(
     out = light.directions_at(lens.back, *sampling.grid(window, grid.shape))
     slopes = limit_refraction(grid.at_face, slopes_towards(grid.at_face, out, law), law)
     x, y = (p.reshape(-1) for p in sampling.grid(window, grid.shape))
-    back, lit, (how, unlit) = lens.back, (grid.density > 0).reshape(-1), fit
+    back, lit, (how, unlit) = lens.back_net, (grid.density > 0).reshape(-1), fit
     _, *own = back.relative_sag_and_slope(x, y)
     z_x, z_y = (torch.where(lit, z.reshape(-1).to(x), now) for z, now in zip(slopes, own, strict=True))
     fitted = fit_slopes(back, x, y, z_x=z_x, z_y=z_y, weight=torch.where(lit, 1.0, unlit).to(x), fit=how)

@@ -55,7 +55,7 @@ class Setup:
         if part == "screen":
             return self.screen.middle
         if part == "lens":
-            back = float(self.lens.back.plain().from_vertex().z)
+            back = float(self.lens.back_net.plain().from_vertex().z)
             return 0.0, 0.0, (self.lens.front.z + back) / 2 if "front" in self.lens.passes.faces else back
         points = [channel.source.start_point(self.lens.entrance.z) for channel in self.channels]
         mean = np.average(points, axis=0, weights=[channel.weight for channel in self.channels])
@@ -101,9 +101,9 @@ class Setup:
     def with_lens_scaled(self, factor: float) -> Setup:
         """Return the setup with its lens scaled by a factor about its pivot."""
         lens, (_, _, about) = self.lens, self.pivot("lens")
-        faces = {"front": lens.front.scaled(factor, about), "back": lens.back.scaled(factor, about)}
-        clear = lens.clear and tuple(aperture.scaled(factor) for aperture in lens.clear)
-        return replace(self, lens=replace(lens, outline=lens.outline.scaled(factor), clear=clear, **faces))
+        lens = lens.with_front(lens.front.scaled(factor, about)).with_back(lens.back.scaled(factor, about))
+        clear = lens.clear and (lens.clear[0].scaled(factor), lens.clear[1].scaled(factor))
+        return replace(self, lens=replace(lens, outline=lens.outline.scaled(factor), clear=clear))
 
 
 # --- distributions and trials -----------------------------------------------------------------------------------------
@@ -301,13 +301,14 @@ def _decentre_front(axis: int, setup: Setup, by: float) -> Setup:
     A lens is traced in the frame of its front.  Therefore the back shifts inversely, and the whole lens moves with the
     front.  The net is extended linearly to reach the rim; inside, the face does not change.
     """
-    back, side = setup.lens.back, "xy"[axis]
-    (low, high), pitch = getattr(back, side), back.pitch[axis]
+    back = setup.lens.back_net
+    (low, high), pitch = (back.x, back.y)[axis], back.pitch[axis]
     missing = setup.lens.outline.half_extent[axis] + abs(by) - min(-low, high)
     more = max(0, math.ceil(missing / pitch))
     heights = np.pad(back.heights, [(more * (k == axis),) * 2 for k in (0, 1)], "reflect", reflect_type="odd")
     ends = low - more * pitch - by, high + more * pitch - by
-    fixed = replace(back, heights=torch.from_numpy(heights), **{side: ends})
+    x, y = (back.x, ends) if axis else (ends, back.y)
+    fixed = replace(back, heights=torch.from_numpy(heights), x=x, y=y)
     shift = tuple(by if k == axis else 0.0 for k in range(3))
     return replace(setup, lens=setup.lens.with_back(fixed)).moved("lens", Motion.of(shift=shift))
 
@@ -319,7 +320,7 @@ def _tilt_back(axis: int, setup: Setup, by: float) -> Setup:
     its tangent plane at (x, y), with an error of curvature · (angle · sag)², 1 nm at a tenth of a degree:
     q_z = h - h_v + ∇h · ((q_x, q_y) - (x, y)), linear in ζ.
     """
-    back = setup.lens.back
+    back = setup.lens.back_net
     turn = Motion.of(turn=tuple(by if k == axis else 0.0 for k in range(3))).inverse.rotation.tolist()
     x, y = _control_points(back)
     h, h_x, h_y = back.relative_sag_and_slope(x, y)
@@ -356,10 +357,11 @@ def ripple(lens: Lens, period: float, pattern: Literal["raster", "spiral"]) -> K
     s is x for a raster, and the distance from the axis for the spiral of a diamond tool (whose turns are almost
     circles).  Raises ValueError if the net is too coarse for the period (mm).
     """
-    _require_resolution(lens.back, period, "a ripple's period")
-    x, y = (np.linspace(*side, m) for side, m in zip((lens.back.x, lens.back.y), lens.back.shape, strict=True))
+    back = lens.back_net
+    _require_resolution(back, period, "a ripple's period")
+    x, y = (np.linspace(*side, m) for side, m in zip((back.x, back.y), back.shape, strict=True))
     s = np.broadcast_to(x[:, None], (len(x), len(y))) if pattern == "raster" else np.hypot(x[:, None], y[None, :])
-    field = _normalise(np.sin(2 * np.pi * s / period), inside_outline(lens.outline, lens.back))
+    field = _normalise(np.sin(2 * np.pi * s / period), inside_outline(lens.outline, back))
     words = f"{pattern} ripple of the back, period {period:g} mm"
     return Kind("back.ripple", words, "mm RMS", partial(_add_form, "back", field))
 
@@ -391,7 +393,7 @@ def as_net(face: Surface, outline: Outline) -> BSplineSurface:
     The net interpolates the face at each control point.  In its end spans a uniform spline follows a curve poorly.  For
     a round outline these lie outside the rim, where the net becomes level; for a rectangle they lie at its sides.
     """
-    if face.is_net:
+    if isinstance(face, BSplineSurface):
         return face
     wide = (FACE_NET - 1) / (FACE_NET - 1 - 2 * FACE_MARGIN) if outline.is_round else 1.0
     half_x, half_y = (half * wide for half in outline.half_extent)
@@ -408,8 +410,10 @@ def as_net(face: Surface, outline: Outline) -> BSplineSurface:
 
 def _add_form(face: str, field: np.ndarray, setup: Setup, by: float) -> Setup:
     net, _ = _net(setup.lens, face)
-    own = {"clear": setup.lens.apertures} if getattr(setup.lens, face).outline is not None else {}
-    return replace(setup, lens=replace(setup.lens, **{face: _add_heights(net, by * field)}, **own))
+    changed = _add_heights(net, by * field)
+    lens = setup.lens.with_front(changed) if face == "front" else setup.lens.with_back(changed)
+    clear = setup.lens.clear if getattr(setup.lens, face).outline is None else setup.lens.apertures
+    return replace(setup, lens=replace(lens, clear=clear))
 
 
 def _net(lens: Lens, face: str) -> tuple[BSplineSurface, Outline]:

@@ -86,8 +86,8 @@ def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, .
         *_placement_checks(reread, form),
         *_solid_checks(reread.shape),
         *_edge_checks(reread, nominal),
-        *_form_checks(reread, nominal.back, form, points),
-        *(_form_checks(reread, nominal.front, form, points, of="front") if nominal.shapes("front") else ()),
+        *_form_checks(reread, nominal.back_net, form, points),
+        *(_form_checks(reread, nominal.front_net, form, points, of="front") if nominal.shapes("front") else ()),
         *_front_checks(reread.front, nominal, form),
     )
 
@@ -122,7 +122,7 @@ def examine(path: Path) -> ExaminedFile:
     lens_read, placed = step_reading.lens(reread, index=1.5), reread.placement
     properties = solid_properties.of_solid(reread.shape)
     checks = [
-        *text_checks.structure_checks(text, lens_read.back.shape, any_unit=True),
+        *text_checks.structure_checks(text, lens_read.back_net.shape, any_unit=True),
         *_solid_checks(reread.shape),
         *_edge_checks(reread, lens_read, bare=reread.edge is None),
         net_check(
@@ -134,7 +134,7 @@ def examine(path: Path) -> ExaminedFile:
     ]
     if text.front is not None:
         name = "control points of the front: difference between STEP text and OCC"
-        own = reread.front.control_points() if reread.front.is_net else np.empty((0, 0, 3))
+        own = lens_read.front_net.control_points() if lens_read.front.is_net else np.empty((0, 0, 3))
         checks.append(net_check(name, text.front.control_points, placed(own), id="net-two-readers"))
     thinnest = thickness_range(lens_read, reread.edge)[0]
     checks.append(Check.at_least("smallest thickness", thinnest, 0.0, "mm", id="thickness"))
@@ -202,8 +202,8 @@ def _front_checks(reread: Surface, lens: Lens, tolerance: float) -> Iterator[Che
     wanted, difference = lens.front, "difference from the designed one"
     name, off = f"form: vertex of the front, {difference}", abs(reread.z - lens.front_vertex)
     yield Check.at_most(name, off, tolerance, "mm", id="front-vertex")
-    if wanted.is_net:
-        net = reread.control_points() if reread.is_net else np.empty(0)
+    if isinstance(wanted, BSplineSurface):
+        net = reread.control_points() if isinstance(reread, BSplineSurface) else np.empty(0)
         name = f"form: control points of the front, {difference}"
         yield net_check(name, net, wanted.control_points(), id="front-net")
         return
@@ -268,11 +268,11 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
     except ValueError as error:
         return (Check.true(f"{PART_FILE}: can be read", False, str(error), id="part-readable"),)
     down = np.array([0.0, 0.0, mount.origin(lens.front_vertex)])
-    net = lens.back.control_points() - down
+    net = lens.back_net.control_points() - down
     of_front = ()
     if lens.shapes("front"):
         name, read = f"{PART_FILE}: deviation of the control points of the front", text_checks.net_of_front(text)
-        of_front = (net_check(name, read, lens.front.control_points() - down, id="control-points"),)
+        of_front = (net_check(name, read, lens.front_net.control_points() - down, id="control-points"),)
     properties = _properties(path, _stamp(path)) if text.properties.of_shape else None
     if text.properties.of_shape and properties is None:  # a damaged face, which other checks find
         name = f"{PART_FILE}: area, volume and centroid can be computed from the faces"
@@ -280,7 +280,7 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
     else:
         stated = text_checks.measure_checks(text.properties, properties, lens.outline, PART_FILE)
     return (
-        *text_checks.structure_checks(text, lens.back.shape, PART_FILE),
+        *text_checks.structure_checks(text, lens.back_net.shape, PART_FILE),
         net_check(
             f"{PART_FILE}: deviation of the control points", text.surface.control_points, net, id="control-points"
         ),

@@ -30,11 +30,11 @@ Numbers = tuple[float, ...]
 
 def lens_checks(text: StepText, lens: Lens) -> list[Check]:
     """Check the text of the STEP file against the design."""
-    checks = structure_checks(text, lens.back.shape)
-    name, back = f"{PREFIX}: deviation of the control points", lens.back.control_points()
+    checks = structure_checks(text, lens.back_net.shape)
+    name, back = f"{PREFIX}: deviation of the control points", lens.back_net.control_points()
     checks.append(net_check(name, text.surface.control_points, back, id="control-points"))
     if lens.front.is_net and (text.front is not None or lens.shapes("front")):
-        name, front = f"{PREFIX}: deviation of the control points of the front", lens.front.control_points()
+        name, front = f"{PREFIX}: deviation of the control points of the front", lens.front_net.control_points()
         checks.append(net_check(name, net_of_front(text), front, id="control-points"))
     return checks
 
