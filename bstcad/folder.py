@@ -27,7 +27,7 @@ import numpy as np
 from bstcad.cad import mesh as meshes
 from bstcad.cad.mesh import MIRROR_RGBA, Label
 from bstcad.optics import quadrature
-from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
+from bstcad.optics.bspline import DEGREE, BSplineSurface, is_net, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.sides import Sides, as_pair, scaled
 from bstcad.optics.surfaces import Surface
@@ -76,7 +76,7 @@ class Made(Nominal):
 
 def same_front(one: Surface, other: Surface) -> bool:
     """Return True if two fronts are equal to the last bit."""
-    if isinstance(one, BSplineSurface) and isinstance(other, BSplineSurface):  # independent of their planes z
+    if is_net(one) and is_net(other):  # independent of their planes z
         return np.array_equal(one.control_points(), other.control_points())
     both = [{"z": front.z, **front.parameters()} for front in (one.plain(), other.plain())]
     same = (one.kind, one.outline) == (other.kind, other.outline) and both[0].keys() == both[1].keys()
@@ -286,7 +286,7 @@ def write_design(design: Made, irradiances: Sequence[np.ndarray], folder: Path) 
         knots_y=knots(n),
         degree=DEGREE,
         **({"front_curvature": 0.0} | _numbers(front)),
-        **({"front_control_points": front.control_points()} if isinstance(front, BSplineSurface) else {}),
+        **({"front_control_points": front.control_points()} if is_net(front) else {}),
         **(dict(zip(FRONT_KNOTS, map(knots, lens.front_net.shape), strict=True)) if lens.shapes("front") else {}),
         **{numbered("target", k): goal.picture for k, goal in enumerate(design.goals)},
         **{numbered("reachable", k): part.astype(np.uint8) for k, part in parts if part is not None},

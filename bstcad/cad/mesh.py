@@ -25,7 +25,7 @@ import torch
 from numba import njit
 
 from bstcad.optics import tubes
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import is_net
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.surfaces import MIN_COS2, Surface, sag, sampled
@@ -260,7 +260,7 @@ def _face_numbers(surface: Surface) -> tuple[FaceNumbers, np.ndarray]:
     """Return a face as numbers for the kernel, and its heights (m, n), (0, 0) if it is no net."""
     face = surface.plain()
     per_detail = 1 / float(face.detail)
-    if not isinstance(face, BSplineSurface):
+    if not is_net(face):
         c, k = face.conic()
         bend = (1 + k) * c * c
         ends2 = face.outline.radius**2 if face.outline else math.inf

@@ -35,7 +35,7 @@ from scipy.interpolate import BSpline
 
 from bstcad.cad import patches, wires
 from bstcad.cad.wires import LoopPiece, RailCurve
-from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
+from bstcad.optics.bspline import DEGREE, BSplineSurface, is_net, knots
 from bstcad.optics.surfaces import Plane, Surface, sag, sampled
 from bstcad.scene.mount import MAX_DRAFT, MIN_CLOSING
 
@@ -141,7 +141,7 @@ def _curve_on(surface: Surface, piece: LoopPiece) -> RailCurve:
 
     if _is_level_on(surface, piece):
         return RailCurve(piece, points(np.array([0.0, piece.end])))
-    if isinstance(surface, BSplineSurface) and piece.straight and (border := _border(surface, piece)) is not None:
+    if is_net(surface) and piece.straight and (border := _border(surface, piece)) is not None:
         return border
     smooth = not surface.is_net and (piece.straight or piece.centre is not None)
     return RailCurve(piece, *wires.fit_spline(points, wires.breaks(surface, piece), RIM_TOLERANCE, smooth))

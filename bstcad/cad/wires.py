@@ -15,7 +15,7 @@ from OCP.GeomAbs import GeomAbs_CurveType as Kind
 from OCP.TopAbs import TopAbs_Orientation
 from scipy.interpolate import BSpline, make_interp_spline
 
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import BSplineSurface, is_net
 from bstcad.optics.outlines import Outline
 from bstcad.optics.surfaces import Surface
 
@@ -199,7 +199,7 @@ class RailCurve:
 def breaks(surface: Surface, *pieces: LoopPiece) -> np.ndarray:
     """Return parameters between which pieces, all with the same parameter, lie over one smooth part of a surface."""
     t = np.linspace(0.0, pieces[0].end, MIN_PARTS + 1)
-    if isinstance(surface, BSplineSurface):  # smooth between its knot lines
+    if is_net(surface):  # smooth between its knot lines
         t = np.unique(np.concatenate([t, *(_crossings(surface, piece) for piece in pieces)]))
     inner = t[1:-1]
     inner = inner[(np.diff(t)[:-1] > MIN_PART * t[-1]) & (t[-1] - inner > MIN_PART * t[-1])]

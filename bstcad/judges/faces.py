@@ -15,7 +15,7 @@ import numpy as np
 from scipy.interpolate import BSpline, NdBSpline
 from trimesh import Trimesh
 
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import is_net
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
@@ -135,7 +135,7 @@ Face = Freeform | Revolved
 def face(surface: Surface, outline: Outline) -> Face:
     """Return the face of a surface of a lens with an outline."""
     plain = surface.plain()
-    if isinstance(plain, BSplineSurface):
+    if is_net(plain):
         return Freeform(plain.control_points())
     return Revolved(plain.z, *plain.conic(), outline.half_extent)
 

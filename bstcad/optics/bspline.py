@@ -25,6 +25,7 @@ import scipy.linalg
 import scipy.sparse
 import torch
 from torch import Tensor
+from typing_extensions import TypeIs
 
 from bstcad.optics import ops
 from bstcad.optics.outlines import Outline, inside
@@ -308,9 +309,14 @@ class BSplineSurface(Surface):
         return replace(self, heights=self.heights.detach().to("cpu", torch.float64))
 
 
+def is_net(surface: Surface) -> TypeIs[BSplineSurface]:
+    """Return True for a B-spline net, which has `heights`."""
+    return isinstance(surface, BSplineSurface)
+
+
 def require_net(surface: Surface) -> BSplineSurface:
     """Return a surface that is a B-spline net; TypeError for another one."""
-    if not isinstance(surface, BSplineSurface):
+    if not is_net(surface):
         raise TypeError(f"the {surface.kind} has no control points; fit a net to it by BSplineSurface.fitted")
     return surface
 

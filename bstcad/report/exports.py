@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from bstcad.cad.mesh import DEFAULT_LABEL, Label, preview_files
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import is_net
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import Surface, sag
@@ -108,7 +108,7 @@ def _files(
             yield from _sidecar("points", lens, count, light)
         case "zemax":  # for a front that is not a net, prescription.txt has the numbers
             for name, face in (("zemax-back", lens.back), ("zemax-front", lens.front)):
-                if isinstance(face, BSplineSurface):
+                if is_net(face):
                     grid = GridSag.of(lens, face, points, light)
                     yield f"{name}.dat", grid.text()
                     yield f"{name}{SIDECAR}", grid.note(f"{name}.dat") + "\n"

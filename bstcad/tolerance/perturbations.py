@@ -18,7 +18,7 @@ from scipy import fft
 from scipy.ndimage import fourier_gaussian
 from scipy.stats import norm
 
-from bstcad.optics.bspline import BSplineSurface, interpolating_net
+from bstcad.optics.bspline import BSplineSurface, interpolating_net, is_net
 from bstcad.optics.channels import Channel
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import Interface
@@ -393,7 +393,7 @@ def as_net(face: Surface, outline: Outline) -> BSplineSurface:
     The net interpolates the face at each control point.  In its end spans a uniform spline follows a curve poorly.  For
     a round outline these lie outside the rim, where the net becomes level; for a rectangle they lie at its sides.
     """
-    if isinstance(face, BSplineSurface):
+    if is_net(face):
         return face
     wide = (FACE_NET - 1) / (FACE_NET - 1 - 2 * FACE_MARGIN) if outline.is_round else 1.0
     half_x, half_y = (half * wide for half in outline.half_extent)

@@ -21,7 +21,7 @@ from bstcad.analysis.shape import thickness_range
 from bstcad.cad import mounting, solid_properties, step_reading
 from bstcad.cad.solid_properties import WholePart
 from bstcad.cad.step_reading import StepLens
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import BSplineSurface, is_net
 from bstcad.optics.lens import Lens
 from bstcad.optics.passes import LENS, Passes
 from bstcad.optics.quadrature import MassProperties
@@ -202,8 +202,8 @@ def _front_checks(reread: Surface, lens: Lens, tolerance: float) -> Iterator[Che
     wanted, difference = lens.front, "difference from the designed one"
     name, off = f"form: vertex of the front, {difference}", abs(reread.z - lens.front_vertex)
     yield Check.at_most(name, off, tolerance, "mm", id="front-vertex")
-    if isinstance(wanted, BSplineSurface):
-        net = reread.control_points() if isinstance(reread, BSplineSurface) else np.empty(0)
+    if is_net(wanted):
+        net = reread.control_points() if is_net(reread) else np.empty(0)
         name = f"form: control points of the front, {difference}"
         yield net_check(name, net, wanted.control_points(), id="front-net")
         return
