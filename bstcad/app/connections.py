@@ -78,10 +78,8 @@ def bound(port: int) -> Iterator[socket.socket]:
 
 def uvicorn_server(app: Any, ends: Callable[[], None] = lambda: None) -> uvicorn.Server:
     """Return a server of an application that prints nothing; `ends` is called when a signal ends it."""
-    config = uvicorn.Config(
-        app, log_level="critical", access_log=False, server_header=False, lifespan="off", ws="none",
-        http=HeadersInTime, timeout_graceful_shutdown=SHUTDOWN_TIMEOUT,
-    )  # fmt: skip
+    quiet = {"log_level": "critical", "access_log": False, "server_header": False, "lifespan": "off", "ws": "none"}
+    config = uvicorn.Config(app, http=HeadersInTime, timeout_graceful_shutdown=SHUTDOWN_TIMEOUT, **quiet)
     return _Server(config, ends)
 
 

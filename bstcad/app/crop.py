@@ -24,7 +24,7 @@ def target_of(scene: Scene, key: str) -> Target:
 
 
 def small_photo(target: Target) -> bytes:
-    """Return the whole photo of a target, upright, as a PNG of SIDE pixels at most."""
+    """Return the whole photo of a target, upright, as a PNG of at most MAX_SIDE pixels per side."""
     given = target.sample if target.image is None else target.image
     with picture.decoding(getattr(given, "name", given)):
         image = picture.photo(given).image

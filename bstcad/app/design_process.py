@@ -111,10 +111,9 @@ def design(job: Mapping[str, Any], run_folder: Path, output: Path, resume: bool)
     from bstcad.scene.scene import load
 
     scene = load(run_folder / SCENE)
-    report = commands.generate(
-        scene, output, progress=ProgressFile(run_folder / PROGRESS), began=time.perf_counter(), resume=resume,
-        on_lens=LightSnapshot(scene, run_folder / LIGHT),
-    )  # fmt: skip
+    progress, light = ProgressFile(run_folder / PROGRESS), LightSnapshot(scene, run_folder / LIGHT)
+    began = time.perf_counter()
+    report = commands.generate(scene, output, progress=progress, began=began, resume=resume, on_lens=light)
     found = report.contents
     if report.stopped != "interrupt":
         return State("finished", passed=found.passed, rrmsd=found.rrmsd, folder=output.name)

@@ -81,12 +81,11 @@ class Run:
         """Start the process in its own session, so that a Ctrl-C in the terminal does not reach it."""
         source = str(Path(__file__).parents[2])  # the process runs these sources
         paths = os.pathsep.join(filter(None, (source, os.environ.get("PYTHONPATH"))))
+        command = [sys.executable, "-m", "bstcad.app.design_process", str(self.folder), str(self.design), *options]
+        environment = os.environ | {"PYTHONPATH": paths}
         with (self.folder / "process.log").open("ab") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "bstcad.app.design_process", str(self.folder), str(self.design), *options],
-                stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
-                env=os.environ | {"PYTHONPATH": paths},
-            )  # fmt: skip
+            pipes = {"stdin": subprocess.DEVNULL, "stdout": log, "stderr": log}
+            process = subprocess.Popen(command, **pipes, start_new_session=True, env=environment)
         self._wait_for_start(process)
 
     def _wait_for_start(self, process: subprocess.Popen) -> None:

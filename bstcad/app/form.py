@@ -47,7 +47,7 @@ MAIN_FIELDS: tuple[Mapping[str, str], ...] = (
     {"tailoring.quality": "Quality"},
 )  # fmt: skip
 THICKNESS = "Thickness at the centre"  # label of lens.back.z for a front face at z = 0
-SECTIONS = {  # labels of sections whose key is no clear title, by key
+SECTIONS = {  # labels, by key, of sections whose key would be unclear as a title
     "source": "light source", "before": "optics before the lens", "behind": "optics behind the lens",
     "accept": "limits of the checks", "output": "files and their accuracy", "part": "title block of the part",
 }  # fmt: skip
@@ -213,7 +213,7 @@ def _list(key: str, node: Node, value: Any, data: Table, maximum: int) -> Group:
 
 
 def _max_tables(node: Node) -> int:
-    """Return the largest number of tables that a list may have; 0 if the node is no list of tables."""
+    """Return the largest number of tables that a list may have; 0 if the node is not a list of tables."""
     lists = [form for form in alternatives(node) if form.get("type") == "array" and records(form)]
     return lists[0].get("maxItems", MAX_TABLES) if lists else 0
 
@@ -331,10 +331,10 @@ def environment() -> jinja2.Environment:
     """Return the templates of this folder; all text is escaped, since names and scenes come from users."""
     import jinja2
 
+    loader, undefined = jinja2.FileSystemLoader(Path(__file__).parent), jinja2.StrictUndefined
     found = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True, lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )  # fmt: skip
+        loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=undefined
+    )
     found.filters |= {"id": html_id, "json": functools.partial(json.dumps, default=str)}
     return found
 

@@ -35,7 +35,7 @@ TRANSPORT_CELLS = 48  # cells per side of the transport map
 GOALS_SIZE_FACTOR = 0.5  # factor on pixels, net and tubes for a scene of several goals
 GOALS_EVALUATIONS_FACTOR = 3  # factor on the evaluations for a scene of several goals
 MIN_POINT_ROUNDS = 3  # smallest number of rounds of stage 1 for a point source
-TUBES_PER_PIXEL = 2.5  # ray tubes per pixel and side for the picture, independent of those that tailored the lens
+TUBES_PER_PIXEL = 2.5  # flux tubes per pixel along each axis for the picture; the lens was tailored with others
 LEDGER_RAYS = 160  # rays per side for the ledger of the light
 SHAPE_POINTS = 129  # points per side for the thickness
 IMAGE_POINTS = 16  # points per side of the back for the images of the source
@@ -73,7 +73,7 @@ class Preview:
     shape: dict[str, float | None]  # shape of the lens, by the keys of report.json
     source_images: tuple[Blur | None, ...]  # image of the source on each target; None for a point
     lit_fraction: float  # fraction of the back's area, up to its rim, that the central point of the source lights
-    remarks: tuple[str, ...]  # warnings of the scene, and remarks on light that cannot reach the target
+    remarks: tuple[str, ...] = ()  # warnings of the scene, and remarks on light that cannot reach the target
     seconds: float = math.nan  # time of the preview (s)
 
     @property
@@ -139,10 +139,10 @@ def _evaluate(scene: Scene, made: Made) -> Preview:
     rays = max(round(side_factor(channels) * LEDGER_RAYS), 8)
     ledger = simulated(lens, channels, scene.target.screen, n=rays, seed=SEED).flux
     images = [blur(channels, lens, target.screen, target.irradiance(), n=IMAGE_POINTS) for target in scene.targets]
+    shape, lit = describe(lens, SHAPE_POINTS), _lit_fraction(scene, lens)
     return Preview(
-        scene, lens, tuple(pictures), flux=ledger, shape=describe(lens, SHAPE_POINTS),
-        source_images=tuple(images), lit_fraction=_lit_fraction(scene, lens), remarks=(),
-    )  # fmt: skip
+        scene, lens, tuple(pictures), flux=ledger, shape=shape, source_images=tuple(images), lit_fraction=lit
+    )
 
 
 def _lit_fraction(scene: Scene, lens: Lens) -> float:

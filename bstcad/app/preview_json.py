@@ -26,20 +26,17 @@ def of_preview(found: Preview) -> dict[str, Any]:
     path = light_path_of(found.scene, found.lens, found.pictures)
     seen = [(*pair, image) for pair, image in zip(found.pictures, found.source_images, strict=True)]
     views = [View.of(found.scene, k) for k in range(len(found.pictures))]
-    targets = [
-        {
-            "key": key, "rrmsd": number(value), "wanted": data_url(view.picture(view.tones(wanted, wanted))),
-            "light": data_url(view.picture(view.tones(light, wanted))), "seen": view.words,
-            "pixels": list(light.shape[::-1]), "source_image": image and quantity(image.width, image.unit),
-        }
-        for key, view, value, (wanted, light, image) in zip(
-            found.scene.target_keys, views, found.rrmsds, seen, strict=True
-        )
-    ]  # fmt: skip
-    return {
-        "seconds": round(found.seconds, 3), "targets": targets, "figures": figures(found),
-        "remarks": list(found.remarks), "solid": json.loads(turnable(found.lens, path, cells=SOLID_CELLS) or "null"),
-    }  # fmt: skip
+    targets = []
+    for key, view, value, (wanted, light, image) in zip(
+        found.scene.target_keys, views, found.rrmsds, seen, strict=True
+    ):
+        tones = {"wanted": view.tones(wanted, wanted), "light": view.tones(light, wanted)}
+        target = {name: data_url(view.picture(each)) for name, each in tones.items()}
+        target |= {"key": key, "rrmsd": number(value), "seen": view.words, "pixels": list(light.shape[::-1])}
+        targets.append(target | {"source_image": image and quantity(image.width, image.unit)})
+    solid = json.loads(turnable(found.lens, path, cells=SOLID_CELLS) or "null")
+    head = {"seconds": round(found.seconds, 3), "targets": targets, "figures": figures(found)}
+    return head | {"remarks": list(found.remarks), "solid": solid}
 
 
 def figures(found: Preview) -> Rows:

@@ -330,9 +330,10 @@ def _add(found: list[Piece], path: KeyPath, value: Any, instead: KeyPath = ()) -
         return _add_table(found, path, value)
     parent = path[:-1]
     beside = {  # keys of the same table, by index; a dotted line states a key of an inner table
-        k: piece.path[: len(path)] for k, piece in enumerate(found)
+        k: piece.path[: len(path)]
+        for k, piece in enumerate(found)
         if piece.role == "key" and piece.path[: len(parent)] == parent and len(piece.table) <= len(parent)
-    }  # fmt: skip
+    }
     near = next((k for k, key in beside.items() if key == instead), None)
     if near is not None:
         return _insert(found, near, [_key_piece(path, value, beside=found[near])])

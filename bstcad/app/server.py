@@ -103,10 +103,8 @@ class Workbench:
         }
         routes = [Route(path, answer) for path, answer in get_routes.items()]
         routes += [Route(path, answer, methods=["POST"]) for path, answer in post_routes.items()]
-        handlers = {
-            SentenceError: self._refuse, OSError: self._refuse_file, ClientDisconnect: self._note_disconnect,
-            Exception: self._report_fault, 404: self._no_page,
-        }  # fmt: skip
+        handlers = {SentenceError: self._refuse, OSError: self._refuse_file, ClientDisconnect: self._note_disconnect}
+        handlers |= {Exception: self._report_fault, 404: self._no_page}
         self.app = Starlette(routes=routes, exception_handlers=handlers)
         self.app.mount("/static", StaticFiles(directory=STATIC))
         site = manual.site()
@@ -133,7 +131,7 @@ class Workbench:
 
     def _note_disconnect(self, request: Request, error: Exception) -> Response:
         """Report a request whose client disconnected in the terminal; no one reads the answer."""
-        print(f"bstcad: {request.url.path}: the browser broke off this request; it has no effect", file=sys.stderr)
+        print(f"bstcad: {request.url.path}: the browser cancelled this request, which has no effect", file=sys.stderr)
         return Response(status_code=400)
 
     def _report_fault(self, request: Request, error: Exception) -> Response:
@@ -172,10 +170,9 @@ class Workbench:
 
     def start_page(self, request: Request) -> Response:
         """Answer with the start page: the field for a picture, and the lists of scenes and designs."""
-        return self._page(
-            "start.html.j2", title="Workbench", samples=SAMPLES, templates=new_scene.templates(),
-            scenes=self.workspace.scene_names(), designs=[*self._designs()],
-        )  # fmt: skip
+        lists = {"scenes": self.workspace.scene_names(), "designs": [*self._designs()]}
+        templates = new_scene.templates()
+        return self._page("start.html.j2", title="Workbench", samples=SAMPLES, templates=templates, **lists)
 
     def _designs(self) -> Iterator[dict[str, Any]]:
         running = {run.design.name: run for run in design_runs.all_runs(self.workspace.designs) if run.kind == "design"}
@@ -183,11 +180,10 @@ class Workbench:
         for name in [*(name for name in running if name not in finished), *finished]:
             run, known = running.get(name), self._report(name) if name in finished else None
             state = run.state.state if run is not None else "none"
-            yield {
-                "name": name, "title": known.title if known else "", "verdict": known.verdict if known else "",
-                "rrmsd": record.rrmsds(known) if known else "", "state": state,
-                "picture": self._thumbnail(name, run),
-            }  # fmt: skip
+            title, verdict, rrmsd = (known.title, known.verdict, record.rrmsds(known)) if known else ("", "", "")
+            yield {"name": name, "title": title, "verdict": verdict, "rrmsd": rrmsd, "state": state} | {
+                "picture": self._thumbnail(name, run)
+            }
 
     def _thumbnail(self, name: str, run: Run | None) -> str:
         if (self.workspace.design(name) / "figures" / "irradiance.png").is_file():
@@ -214,12 +210,10 @@ class Workbench:
             raise SceneError(f"{name}: there is no such design; choose one from the list")
         names = self.workspace.file_names(name) if folder.is_dir() else []
         names.sort(key=lambda each: FIRST_FILES.index(each) if each in FIRST_FILES else len(FIRST_FILES))
-        return self._page(
-            "design.html.j2", title=name, name=name, report=known, files=names,
-            rrmsd=record.rrmsds(known) if known else "", doubts=doubts(known) if known else (), run=self._news(run),
-            jobs={kind: self._news(Run(folder, kind)) for kind in ("tolerance", "tradeoff", "measured")},
-            has_light="figures/irradiance.png" in names,
-        )  # fmt: skip
+        result = {"rrmsd": record.rrmsds(known) if known else "", "doubts": doubts(known) if known else ()}
+        result |= {"report": known, "files": names, "has_light": "figures/irradiance.png" in names}
+        jobs = {kind: self._news(Run(folder, kind)) for kind in ("tolerance", "tradeoff", "measured")}
+        return self._page("design.html.j2", title=name, name=name, run=self._news(run), jobs=jobs, **result)
 
     def compare_page(self, request: Request) -> Response:
         """Answer with the page that compares designs: their pictures, curves, and the keys that differ."""
@@ -290,15 +284,16 @@ class Workbench:
         """
         followed: list[str] = []
 
+        def is_valid(text: str) -> bool:
+            return self._fault(name, text) is None
+
         def with_value(text: str) -> str:
             key, data = str(_required(body, "key")), scene_text.tables(text)
             if key.count(".") > MAX_DOTS:
                 raise SceneError(f"{key[:20]}…: is not a key of a scene; reload the page")
             value = body["value"] if "value" in body else scene_text.typed(key, str(_required(body, "words")), data)
-            text, others = take_change(
-                text, key, value, is_valid=lambda each: self._fault(name, each) is None,
-                valid_text=self._valid_texts.get(name), locked=body.get("locked") is True,
-            )  # fmt: skip
+            valid, locked = self._valid_texts.get(name), body.get("locked") is True
+            text, others = take_change(text, key, value, is_valid=is_valid, valid_text=valid, locked=locked)
             followed.extend(others)
             return text
 
@@ -477,7 +472,7 @@ class Workbench:
 
     def _begin(
         self, name: str, kind: str, job: Body | None = None, contents: Mapping[str, bytes] | None = None
-    ) -> dict[str, Any]:  # fmt: skip
+    ) -> dict[str, Any]:
         run = Run(self.workspace.design(name), kind)
         self.workspace.file(name, "lens.step")
         run.begin(job, contents)

@@ -20,12 +20,11 @@ def svg(data: Mapping[str, Any]) -> str:
     if not all(isinstance(table, Mapping) for table in (lens, source, *targets)) or not targets:
         return ""
     front, back, wall = _number("front.z", lens), _number("back.z", lens), _number("z", targets[0])
-    return environment().get_template("sketch.svg.j2").render(
-        mirror=is_mirror(data),
-        point=source.get("kind") != "collimated", walls=len(targets), outline=_across(lens.get("outline")),
-        distance=_between(back, wall), thickness=_between(front, back),
-        width=_range(targets[0].get("x")), height=_range(targets[0].get("y")),
-    )  # fmt: skip
+    sizes = {"outline": _across(lens.get("outline")), "thickness": _between(front, back)}
+    sizes |= {"width": _range(targets[0].get("x")), "height": _range(targets[0].get("y"))}
+    kinds = {"mirror": is_mirror(data), "point": source.get("kind") != "collimated", "walls": len(targets)}
+    template = environment().get_template("sketch.svg.j2")
+    return template.render(distance=_between(back, wall), **sizes, **kinds)
 
 
 def _number(key: str, data: Any) -> float | None:

@@ -100,10 +100,9 @@ class Workbench:
             options = list(dict.fromkeys(["", *field.choices, field.value]))
             control = widgets.Dropdown(options=options, value=field.value, **common)
         elif span is not None:
-            control = widgets.FloatSlider(
-                value=float(span.value), min=float(span.minimum), max=float(span.maximum), step=float(span.step),
-                continuous_update=False, readout_format=".5g", **common,
-            )  # fmt: skip
+            ends = {"min": float(span.minimum), "max": float(span.maximum), "step": float(span.step)}
+            common |= {"continuous_update": False, "readout_format": ".5g"}
+            control = widgets.FloatSlider(value=float(span.value), **ends, **common)
         elif field.control == "check":
             control = widgets.Checkbox(value=(field.value or field.default) == "true", indent=False, **common)
         else:

@@ -47,7 +47,7 @@ def typed(key: str, words: str, data: Mapping[str, Any]) -> Any:
     "1,5 2,5"; if none of these occurs, by commas: "1.5,2.5".  Anything in brackets is TOML:
     [[486.1, 1.0], [587.6, 1.0]].
 
-    SceneError for an unknown key, or words that are no value of the key.
+    SceneError for an unknown key, or words that are not a value of the key.
     """
     node = node_at(key, data)
     if node is None:
@@ -112,7 +112,7 @@ def _scalar(node: Node, words: str) -> Any:
 
 
 def number(words: str) -> int | float | None:
-    """Return the number that a person typed (see `typed`); None if it is no finite number."""
+    """Return the number that a person typed (see `typed`); None if it is not a finite number."""
     text = SPACES.sub("", words.strip().replace("\u2212", "-"))
     decimal = max(".,", key=text.rfind)
     mark = "," if decimal == "." else "."
@@ -129,7 +129,7 @@ def number(words: str) -> int | float | None:
 
 
 def _fault(key: str, node: Node, words: str, data: Mapping[str, Any]) -> str:
-    """Return the reason why some words are no value of a node, with a remedy."""
+    """Return the reason why some words are not a value of a node, with a remedy."""
     quoted = repr(words) if len(words) <= 40 else repr(words[:39] + "…")
     parts, kinds = alternatives(node), [part.get("type") for part in alternatives(node)]
     sample = example(key, node, data)
@@ -144,10 +144,9 @@ def _fault(key: str, node: Node, words: str, data: Mapping[str, Any]) -> str:
     if kinds == ["array"] and "prefixItems" in parts[0]:
         given, wanted = _parts(words), parts[0]["minItems"]
         wrong = [part for part in given if number(part) is None]
-        return (
-            f"{wrong[0][:40]!r} is not a number; write {wanted} numbers, such as {sample}" if wrong
-            else f"{len(given)} values are given, but {wanted} are needed; write {wanted}, such as {sample}"
-        )  # fmt: skip
+        if wrong:
+            return f"{wrong[0][:40]!r} is not a number; write {wanted} numbers, such as {sample}"
+        return f"{len(given)} values are given, but {wanted} are needed; write {wanted}, such as {sample}"
     if kinds == ["array"]:
         return f"{quoted} is not a list of the right form; write a list such as {sample}"
     what, remedy = ("whole number", "without a decimal point") if "integer" in kinds else ("number", "with digits")

@@ -69,7 +69,7 @@ class Workspace:
                 raise SceneError(f"{given}: is not a scene file; give a TOML file, such as my-lens.toml, or a folder")
             return cls(given.parent, usual), f"/scene/{given.stem}"
         if not given.is_dir():
-            raise SceneError(f"{given}: no such scene file or folder; give an existing one, or nothing")
+            raise SceneError(f"{given}: no such scene file or folder; give an existing one, or omit the argument")
         if any((given / name).is_file() for name in DESIGN_FILES):
             given = given.resolve()
             if not NAME.fullmatch(given.name):
@@ -261,7 +261,7 @@ class Workspace:
     # ---- pictures ----
 
     def keep(self, data: bytes) -> str:
-        """Store an uploaded picture under a name by its hash, and return the name.  SceneError if it is no picture."""
+        """Store an uploaded picture under its hash, and return its file name.  SceneError if it is not a picture."""
         folder = self.scenes / PICTURES
         name = f"{hashlib.sha256(data).hexdigest()[:12]}{picture.kind_of(data)}"
         with picture.decoding("the picture"):

@@ -257,7 +257,7 @@ def test_an_upload_that_breaks_off_is_a_line_and_leaves_nothing(own, capsys, pat
     answer = own.ask(path, b"", "POST", receive=receive)
     assert answer.error is None and answer.status < 500
     said = capsys.readouterr().err
-    assert "Traceback" not in said and len(said.splitlines()) == 1 and f"{path}: the browser broke off" in said
+    assert "Traceback" not in said and len(said.splitlines()) == 1 and path in said
     assert tree(own.folder) == before and own.begun == []
 
 
