@@ -16,7 +16,7 @@ from bstcad.measured.cloud import Cloud
 from bstcad.measured.form_error import Deviation, FormError, deviation, fit_form_error, minimum_zone
 from bstcad.optics.goal import Goal, worst
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort, Light, measure
+from bstcad.optics.measure import Effort, Light, measure_goal
 from bstcad.optics.wavefront_error import wavefront_error
 from bstcad.verify.checks import WAVEFRONT, Nominal
 from bstcad.verify.verdict import Check
@@ -189,8 +189,7 @@ def _light(lens: Lens, form: FormError, nominal: Nominal, goal: Goal, *, effort:
 
     def light_with(form: FormError) -> Light:
         made = replace(lens, back=form.add_to(lens.back_net))
-        options = {"effort": effort, "ghost": nominal.scene.ghost, "draw": nominal.scene.draw}
-        return measure(made, nominal.channels, goal.receiver, goal.picture, **options)
+        return measure_goal(made, nominal.channels, goal, effort, ghost=nominal.scene.ghost, draw=nominal.scene.draw)
 
     light = light_with(form)
     samples = (light_with(form.posterior_sample(draw, sign)).rrmsd for sign in (1.0, -1.0))

@@ -1,6 +1,6 @@
 """Measurement of the irradiance that a lens produces on a screen, and of its RRMSD from a target.
 
-Verification, made parts, tolerances and the sweeps of accuracy over time all use it; an argument limits the work.
+Verification, made parts, tolerances and the sweeps of accuracy over time all use it; `Effort` limits the work.
 
 RRMSD is measured without bias, from SETS independent sets of stratified rays.  Each gives a picture A_i = A + n_i, the
 noiseless picture A of the lens plus noise of mean zero, so that the square of its distance from the target T is too
@@ -10,12 +10,11 @@ mean over all pairs is a U-statistic (Hoeffding 1948), and its standard error fo
 its own points of the source, so that their number leaves no bias either.
 
 The picture for display is the mean of all sets, smoothed as long as this removes more noise than detail.  Flux tubes
-(tubes.py) give a second picture without noise, which serves as a witness: they share nothing with the rays but the
-trace.  They interpolate linearly between their corners and so miss how the light changes within a cell of the net: with
-two tubes per cell the error is about the RRMSD that tailoring by tubes leaves, with four a third of it, with eight a
-tenth (measured).  The tubes are therefore halved in width until both pictures agree, or until the tubes' own error
-cannot explain the difference.  Their RRMSD (`rrmsd_by_tubes`) compares designs in float32 and float64; it is a few per
-cent too low for a lens tailored with the same tubes.  A ghost is traced once; its noise is the same in all sets.
+(tubes.py) give a second picture without noise, the witness, which shares only the trace with the rays.  Tubes
+interpolate linearly between their corners: with two per cell of the net the error is about the RRMSD that tailoring by
+tubes leaves, with four a third of it, with eight a tenth (measured).  They are therefore halved in width until both
+pictures agree, or until the tubes' own error cannot explain the difference.  Their RRMSD (`rrmsd_by_tubes`) is a few
+per cent too low for a lens tailored with the same tubes.  A ghost is traced once; its noise is the same in all sets.
 
 An extended source forms an image of itself through each point of the lens (`ImageSamples`).  All rays that leave one
 point of the back face share its slope, whatever point of the source they come from: no lens can bring them together.
@@ -32,7 +31,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bstcad.optics import tubes
 from bstcad.optics.channels import Channel, points_per_line, source_numbers, weighted_sum
+from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Leak, Screen, efficiency, leak, rrmsd, tent
 from bstcad.optics.kernels.reductions import dot, total
 from bstcad.optics.lens import Lens
@@ -40,21 +41,10 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import point_pairs
 from bstcad.optics.trace import UNDERSIDE, GhostImage, Simulation, simulate, through, whole_kernel
-from bstcad.optics.tubes import (
-    SHEET_TUBES,
-    Tubes,
-    area_of,
-    arriving_flux,
-    corners,
-    launch_tubes,
-    middle,
-    picture,
-    rays_to,
-)
 
 SETS = 8  # independent sets of rays: a standard error is then known to a quarter of itself
-PILOT_DIVISOR = 5  # maximum rays per side over those of the first sets, which predict how many are needed
-PICTURE_NOISE = 0.45  # noise of the mean picture over the RRMSD, at the default accuracy: it makes RRMSD a tenth larger
+PILOT_DIVISOR = 5  # maximum rays per side relative to those of the first sets, which predict how many are needed
+PICTURE_NOISE = 0.45  # noise of the mean picture relative to the RRMSD, at the default accuracy: RRMSD grows by a tenth
 RESOLVED = 5.0  # smallest ratio of an RRMSD to its standard error at which it counts as resolved
 # Tolerances of the difference between the pictures by rays and by tubes: relative to the smaller RRMSD, and absolute.
 WITNESS_RELATIVE_TOLERANCE, WITNESS_TOLERANCE = 0.5, 0.002
@@ -67,10 +57,10 @@ MIN_SOURCE_POINTS, MAX_SOURCE_POINTS = 8, 1024  # points of an extended source i
 MIN_TUBES = 513  # minimum tubes per side of the witness: fewer do not resolve pixels
 COARSE_SHEET = 64  # tubes per side of the coarse sheet of many pictures: to find it is half the work; error 1e-6
 PASS_SEEDS = 1 << 20  # difference between the seeds of successive passes of rays from an extended source
-GHOST_DIVISOR = 4  # rays per side over those of the ghost, which is a hundredth of the light
+GHOST_DIVISOR = 4  # rays per side relative to those of the ghost, which is a hundredth of the light
 IMAGE_POINTS = 48  # points per side of the back face through which the image of the source is computed
-# Largest distance of an image from the centre of the screen, over the screen's width plus the median distance.  Light
-# outside it grazes a tilted plane and is no part of the image.
+# Largest distance of an image from the centre of the screen, relative to the screen's width plus the median distance.
+# Light outside it grazes a tilted plane and is no part of the image.
 MAX_IMAGE_DISTANCE = 16
 EVEN_POINT_PAIRS = 2048  # pairs of points that represent an evenly bright source
 
@@ -89,8 +79,8 @@ class Effort:
 
 
 FULL = Effort()
-GhostTracer = Callable[[Lens, Sequence[Channel], Screen, int, int], GhostImage]  # the numbers: rays per side, seed
-Draw = Callable[[int, int], Sequence[Channel]]  # (number of points of an extended source, seed) -> their channels
+GhostTracer = Callable[[Lens, Sequence[Channel], Screen, int, int], GhostImage]  # integers: rays per side, and seed
+Draw = Callable[[int, int], Sequence[Channel]]  # integers: number of points of an extended source, and seed
 
 
 @dataclass(frozen=True)
@@ -132,59 +122,66 @@ class Light:
 
 
 def measure(
-    lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, effort: Effort = FULL,
-    ghost: GhostTracer | None = None, draw: Draw | None = None, whole: np.ndarray | None = None,
-) -> Light:  # fmt: skip
+    lens: Lens,
+    channels: Sequence[Channel],
+    screen: Screen,
+    target: np.ndarray,
+    effort: Effort = FULL,
+    ghost: GhostTracer | None = None,
+    draw: Draw | None = None,
+) -> Light:
     """Measure the light that `lens` produces on `screen` against `target`.
 
     lens: heights in float64 on the CPU for full accuracy.  channels: weights sum to 1.  target: (rows, columns) of any
     sum, row 0 = y max.  ghost: function that traces light reflected twice inside the lens (trace.ghost_light), which is
     added to picture and ledger; None: such light is left out.  draw: draws new points of an extended source for each
-    set of rays; None: all sets use the points of `channels`.  whole: a second target, with the sum of `target`.
+    set of rays; None: all sets use the points of `channels`.
     """
-    reference = torch.from_numpy(np.asarray(target, dtype=np.float64))
-    ghost_rays = effort.rays / GHOST_DIVISOR
-    stray = ghost and ghost(lens, channels, screen, round(side_factor(channels) * ghost_rays), effort.seed)
-    max_noise = PICTURE_NOISE * effort.accuracy / FULL.accuracy
-    sample, passes = (_sample, lambda count, seed: channels) if draw is None else (_sample_source, draw)
-    rays = sample(lens, passes, screen, target=reference, effort=effort, ghost=stray, max_noise=max_noise)
+    goal = Goal("target", screen, np.asarray(target, dtype=np.float64))
+    return measure_goal(lens, channels, goal, effort, ghost=ghost, draw=draw)
+
+
+def measure_goal(
+    lens: Lens, channels: Sequence[Channel], goal: Goal, effort: Effort, ghost: GhostTracer | None, draw: Draw | None
+) -> Light:
+    """Measure as `measure` does, on the receiver of a goal, against its picture and the picture before restriction."""
+    screen, target = goal.receiver, torch.from_numpy(goal.picture)
+    side = effort.rays / GHOST_DIVISOR
+    ghost_image = ghost(lens, channels, screen, round(side_factor(channels) * side), effort.seed) if ghost else None
+    setup = _Setup(lens, draw or (lambda count, seed: channels), screen, target, ghost=ghost_image)
+    rays = (_sample if draw is None else _sample_source)(setup, effort, PICTURE_NOISE * effort.accuracy / FULL.accuracy)
     if not rays.boxes:
         return Light(np.zeros(screen.shape), math.nan, math.inf, rays=rays.count, flux=rays.flux)
-    (value, error), (tent, _) = _value(rays, reference), squared_distance(rays.tents, reference)
-    smoothed, error_of_smoothed = _smoothed(rays.boxes, reference)
+    (value, error), (tent, _) = _value(rays, target), squared_distance(rays.tents, target)
+    smoothed, error_of_smoothed = _smoothed(rays.boxes, target)
     # two nets, windows and mirrors have no kernel for the whole path, and yet have a witness
     plain = lens.shapes("front") or bool(lens.before or lens.behind)
-    lenses = [(c.source, c.through(lens)) for c in channels]
-    simple = draw is None and all(
-        each.losses is None and (plain or whole_kernel("trace.simulate", source, each, screen.plane))
-        for source, each in lenses
-    )
-    witnessed = effort.witness and simple
+    lossless = draw is None and all(c.losses is None for c in channels)
+    paths = ((c.source, c.through(lens), screen.plane) for c in channels)
+    simple = lossless and (plain or all(whole_kernel("trace.simulate", *path) for path in paths))
     return Light(
         smoothed.numpy(), value, error, rays=rays.count, flux=rays.flux, tent=math.sqrt(max(tent, 0.0)),
         picture_error=error_of_smoothed,
-        witness=_witness(lens, channels, screen, target=reference, rays=rays, ghost=stray) if witnessed else None,
-        ghost=stray and (stray.picture.cpu() * (total(reference) / rays.on_screen)).numpy(),
-        leak=leak((sum(rays.boxes) / SETS).numpy(), reference.numpy()),
-        rrmsd_whole=None if whole is None else _value(rays, torch.from_numpy(whole))[0],
+        witness=_witness(setup, channels, rays) if effort.witness and simple else None,
+        ghost=None if ghost_image is None else (ghost_image.picture.cpu() * (total(target) / rays.on_screen)).numpy(),
+        leak=leak((sum(rays.boxes, torch.zeros_like(target)) / SETS).numpy(), goal.picture),
+        rrmsd_whole=None if goal.whole is None else _value(rays, torch.from_numpy(goal.whole))[0],
     )  # fmt: skip
 
 
 def rrmsd_by_rays(
-    lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, effort: Effort = FULL,
-    draw: Draw | None = None,
-) -> float:  # fmt: skip
+    lens: Lens, channels: Sequence[Channel], goal: Goal, effort: Effort = FULL, draw: Draw | None = None
+) -> float:
     """Return `Light.rrmsd` alone; NaN if no light falls on the screen."""
-    reference = torch.from_numpy(np.asarray(target, dtype=np.float64))
-    rays = _sample(lens, draw or (lambda count, seed: channels), screen, target=reference, effort=effort, ghost=None)
-    return _value(rays, reference)[0] if rays.boxes else math.nan
+    target = torch.from_numpy(goal.picture)
+    rays = _sample(_Setup(lens, draw or (lambda count, seed: channels), goal.receiver, target), effort)
+    return _value(rays, target)[0] if rays.boxes else math.nan
 
 
-def rrmsd_by_tubes(lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, n: int) -> float:
-    """Return the RRMSD by n x n tubes a channel: without noise, with the bias of tubes; NaN if no light falls."""
-    reference = torch.from_numpy(np.asarray(target, dtype=np.float64))
-    flux = tubes_picture(lens, channels, screen, n).cpu()
-    return float(rrmsd(flux, reference)) if total(flux) > 0 else math.nan
+def rrmsd_by_tubes(lens: Lens, channels: Sequence[Channel], goal: Goal, n: int) -> float:
+    """Return the RRMSD by n x n tubes per channel: without noise, with the bias of tubes; NaN if no light falls."""
+    flux = tubes_picture(lens, channels, goal.receiver, n).cpu()
+    return float(rrmsd(flux, torch.from_numpy(goal.picture))) if total(flux) > 0 else math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,11 +203,45 @@ class _Rays:
         def mean(a, b):
             return a + share * (b - a)
 
-        return _Rays(
-            tuple(map(mean, self.boxes, other.boxes)), tuple(map(mean, self.tents, other.tents)),
-            {line: mean(part, other.flux[line]) for line, part in self.flux.items()}, count=self.count + other.count,
-            on_screen=mean(self.on_screen, other.on_screen), weight=weight,
-        )  # fmt: skip
+        boxes, tents = (tuple(map(mean, *each)) for each in ((self.boxes, other.boxes), (self.tents, other.tents)))
+        flux = {line: mean(part, other.flux[line]) for line, part in self.flux.items()}
+        on_screen = mean(self.on_screen, other.on_screen)
+        return _Rays(boxes, tents, flux, self.count + other.count, on_screen=on_screen, weight=weight)
+
+
+@dataclass(frozen=True, eq=False)
+class _Setup:
+    """Lens, light and target of a measurement."""
+
+    lens: Lens
+    draw: Draw  # channels of each set of rays
+    screen: Screen
+    target: Tensor  # (rows, columns), row 0 = y max, of any sum
+    ghost: GhostImage | None = None
+
+    def trace(self, side: int, seed: int) -> _Rays:
+        """Trace SETS sets of about side x side rays each."""
+        sets = []
+        count = min(max(side**2 // RAYS_PER_POINT, MIN_SOURCE_POINTS), MAX_SOURCE_POINTS)
+        for i in range(SETS):
+            channels = self.draw(count, seed + i)
+            n = max(1, round(side_factor(channels) * side))
+            sets.append(simulated(self.lens, channels, self.screen, n, seed=seed + i))
+        flux = {line: math.fsum(part.flux[line] for part in sets) / SETS for line in sets[0].flux}
+        if self.ghost is not None:
+            flux |= {line: flux.get(line, 0.0) + more for line, more in self.ghost.flux.items()}
+        count = sum(part.rays for part in sets)
+        boxes, tents = ([self.with_ghost(getattr(part, kind)) for part in sets] for kind in ("box", "tent"))
+        on_screen = math.fsum(float(total(box)) for box in boxes) / SETS
+        if not all(float(total(box)) > 0 for box in boxes):
+            return _Rays((), (), flux, count, on_screen=0.0)
+        weight, sums = float(side) ** 3, (boxes, tents)
+        scaled = [tuple(p * (total(self.target) / total(p)) for p in pictures) for pictures in sums]
+        return _Rays(scaled[0], scaled[1], flux, count, on_screen=on_screen, weight=weight)
+
+    def with_ghost(self, picture: Tensor) -> Tensor:
+        """Return a picture on the CPU with the light of the ghost."""
+        return picture.cpu() if self.ghost is None else picture.cpu() + self.ghost.picture.cpu()
 
 
 def _value(rays: _Rays, target: Tensor) -> tuple[float, float]:
@@ -249,7 +280,7 @@ def squared_distance(pictures: Sequence[Tensor], other: Tensor) -> tuple[float, 
 
 def _noise(pictures: Sequence[Tensor], target: Tensor) -> float:
     """Return the squared noise of the mean picture, on the scale of RRMSD²: Σ_i |A_i - mean|² / (M (M - 1) |T|²)."""
-    m, mean = len(pictures), sum(pictures) / len(pictures)
+    m, mean = len(pictures), sum(pictures, torch.zeros_like(target)) / len(pictures)
     return sum(_squared(picture - mean) for picture in pictures) / (m * (m - 1) * _squared(target))
 
 
@@ -261,7 +292,7 @@ def _smoothed(pictures: Sequence[Tensor], target: Tensor) -> tuple[Tensor, float
     """
     from scipy.ndimage import gaussian_filter  # not loaded by the import of bstcad
 
-    size, whole = _squared(target), sum(pictures)
+    size, whole = _squared(target), sum(pictures, torch.zeros_like(target))
     pairs = [(one, other, (whole - one - other) / (SETS - 2)) for one, other in zip(*[iter(pictures)] * 2, strict=True)]
 
     def smooth(mean: Tensor, width: float) -> Tensor:
@@ -280,14 +311,11 @@ def _smoothed(pictures: Sequence[Tensor], target: Tensor) -> tuple[Tensor, float
     return smooth(whole / SETS, best), math.sqrt(max(least, 0.0))
 
 
-def _sample(
-    lens, draw: Draw, screen: Screen, target: Tensor, effort: Effort, ghost: GhostImage | None,
-    max_noise: float = math.inf,
-) -> _Rays:  # fmt: skip
-    """Trace rays, at most `effort.rays` a side, until the standard error is `effort.accuracy` of the RRMSD.
+def _sample(setup: _Setup, effort: Effort, max_noise: float = math.inf) -> _Rays:
+    """Trace rays, at most `effort.rays` per side, until the standard error is `effort.accuracy` of the RRMSD.
 
     The noise of the mean picture, which falls as n^-3/2, must also fall below `max_noise` times the RRMSD.
-    The error falls as n^-3 with n rays a side where noise times noise dominates (the variance of a pixel of n²
+    The error falls as n^-3 with n rays per side where noise times noise dominates (the variance of a pixel of n²
     stratified rays falls as n^-3; measured: n^-2.9), and as n^-3/2 where the lens's own error times noise dominates.
     """
     pilot = max(effort.rays // PILOT_DIVISOR, min(effort.rays, 32))
@@ -295,15 +323,15 @@ def _sample(
     first = side
     while True:
         start = time.perf_counter()
-        more = _trace_sets(lens, draw, screen, target=target, side=side, seed=effort.seed, ghost=ghost)
+        more = setup.trace(side, effort.seed)
         if not more.boxes:
             return more
         rays = more if rays is None else rays.joined(more)
         if side >= effort.rays:
             return rays
-        squared, error = squared_distance(rays.boxes, target)
+        squared, error = squared_distance(rays.boxes, setup.target)
         goal = 2 * effort.accuracy * squared  # σ(U) = 2 RRMSD σ(RRMSD)
-        noise = _noise(rays.boxes, target)
+        noise = _noise(rays.boxes, setup.target)
         if error <= goal and noise <= max_noise**2 * squared and side > first:  # the first pass may be small by chance
             return rays
         finer = (1.5 * error / goal) ** (1 / 3) if goal > 0 else math.inf
@@ -316,9 +344,7 @@ def _sample(
         side = round(larger)
 
 
-def _sample_source(
-    lens, draw: Draw, screen: Screen, target: Tensor, effort: Effort, ghost: GhostImage | None, max_noise: float
-) -> _Rays:
+def _sample_source(setup: _Setup, effort: Effort, max_noise: float) -> _Rays:
     """Trace rays from an extended source as `_sample` does, from new points of the source in each set.
 
     Each pixel receives few rays from each of many points, so that its variance falls as for random rays, n^-2.  The
@@ -331,17 +357,17 @@ def _sample_source(
     while True:
         start = time.perf_counter()
         seed = effort.seed + number * PASS_SEEDS  # passes with equal numbers of rays must not repeat them
-        more = _trace_sets(lens, draw, screen, target=target, side=side, seed=seed, ghost=ghost)
+        more = setup.trace(side, seed)
         if not more.boxes:
             return more
         more = replace(more, weight=float(side) ** 2)
         rays = more if rays is None else rays.joined(more)
         if rays.weight >= effort.rays**2:
             return rays
-        squared, error = squared_distance(rays.boxes, target)
+        squared, error = squared_distance(rays.boxes, setup.target)
         goal, max_square = 2 * effort.accuracy * squared, max_noise**2 * squared  # σ(U) = 2 RRMSD σ(RRMSD)
         # the error of the first pass alone may be small by chance
-        if number and error <= goal and _smoothed(rays.boxes, target)[1] ** 2 <= max_square:
+        if number and error <= goal and _smoothed(rays.boxes, setup.target)[1] ** 2 <= max_square:
             return rays
         ratio = 1.3 * error / goal if goal > 0 else math.inf
         needed = rays.weight * max(ratio if number else ratio**0.8, 4.0 if number == 0 else 1.2)
@@ -352,32 +378,12 @@ def _sample_source(
         side, number = math.ceil(finer), number + 1
 
 
-def _trace_sets(lens, draw: Draw, screen: Screen, target: Tensor, side: int, seed: int, ghost) -> _Rays:
-    """Trace SETS sets of about side x side rays each."""
-    sets = []
-    count = min(max(side**2 // RAYS_PER_POINT, MIN_SOURCE_POINTS), MAX_SOURCE_POINTS)
-    for i in range(SETS):
-        channels = draw(count, seed + i)
-        n = max(1, round(side_factor(channels) * side))
-        sets.append(simulated(lens, channels, screen, n=n, seed=seed + i))
-    flux = {line: math.fsum(part.flux[line] for part in sets) / SETS for line in sets[0].flux}
-    if ghost is not None:
-        flux |= {line: flux.get(line, 0.0) + more for line, more in ghost.flux.items()}
-    count = sum(part.rays for part in sets)
-    boxes, tents = ([_with_ghost(getattr(part, kind), ghost) for part in sets] for kind in ("box", "tent"))
-    on_screen = math.fsum(float(total(box)) for box in boxes) / SETS
-    if not all(float(total(box)) > 0 for box in boxes):
-        return _Rays((), (), flux, count=count, on_screen=0.0)
-    whole = total(target)
-    boxes, tents = (tuple(p * (whole / total(p)) for p in pictures) for pictures in (boxes, tents))
-    return _Rays(boxes, tents, flux, count=count, on_screen=on_screen, weight=float(side) ** 3)
-
-
-def _witness(lens, channels, screen: Screen, target: Tensor, rays: _Rays, ghost: GhostImage | None) -> Witness:
-    """Compare the picture by rays with the picture by tubes, from `tubes_of` the lens a side on (`_compare`)."""
+def _witness(setup: _Setup, channels: Sequence[Channel], rays: _Rays) -> Witness:
+    """Compare the picture by rays with the picture by tubes, from `tubes_of` the lens per side on (`_compare`)."""
+    lens, screen, target = setup.lens, setup.screen, setup.target
 
     def by_tubes(n: int) -> Tensor | None:
-        flux = _with_ghost(tubes_picture(lens, channels, screen, n), ghost)
+        flux = setup.with_ghost(tubes_picture(lens, channels, screen, n))
         return flux * (total(target) / total(flux)) if total(flux) > 0 else None
 
     value = math.sqrt(max(squared_distance(rays.boxes, target)[0], 0.0))
@@ -389,7 +395,7 @@ def _compare(
 ) -> Witness:
     """Compare pictures by independent sets of rays with pictures by tubes, whose number per side doubles from `first`.
 
-    The error of n tubes a side falls about as n^-1.6, so that it is less than half the difference from the picture by
+    The error of n tubes per side falls about as n^-1.6, so that it is less than half the difference from the picture by
     n / 2 tubes.  If n tubes differ from the rays by more than twice that difference, no finer tubes will agree.
     """
 
@@ -418,10 +424,9 @@ def _compare(
 def tubes_of(lens: Lens, pixels: int = 0) -> int:
     """Return the number of tubes per side for a lens: two per control point, at least MIN_TUBES.
 
-    Two nets take twice as many, since light deflected by the first net varies within the cells of the second.
-
-    If a cell of the net lights more than one pixel, its light varies from pixel to pixel: two tubes per pixel are used,
-    at most four per cell.  Five more are added, so that lines of the net and corners of tubes do not coincide.
+    Two nets take twice as many, since light deflected by the first net varies within the cells of the second.  If a
+    cell of the net lights several pixels, two tubes per pixel are used, at most four per cell.  Five more are added, so
+    that lines of the net and corners of tubes do not coincide.
     """
     each = 2 * len(lens.nets)
     return max(*(each * max(net.side, min(pixels, 2 * net.side)) + 5 for net in lens.nets), MIN_TUBES)
@@ -435,13 +440,13 @@ class RayTubes:
     """
 
     channels: tuple[Channel, ...]
-    sheets: tuple[Tubes, ...]  # tubes of each channel
+    sheets: tuple[tubes.Tubes, ...]  # tubes of each channel
 
     @classmethod
     def launched(cls, lens: Lens, channels: Sequence[Channel], n: int | None = None) -> RayTubes:
-        """Launch n x n tubes a channel (default: two per control point) that hold all light which gets through."""
+        """Launch n x n tubes per channel (default: two per control point) that hold all light which gets through."""
         n = n or tubes_of(lens)
-        return cls(tuple(channels), tuple(launch_tubes(c.source, c.through(lens), n) for c in channels))
+        return cls(tuple(channels), tuple(tubes.launch_tubes(c.source, c.through(lens), n) for c in channels))
 
     def landing(self, lens: Lens, screen: Screen) -> tuple[Landed, ...]:
         """Trace the corners of each channel's tubes to the screen."""
@@ -457,9 +462,10 @@ class RayTubes:
 def tubes_picture(
     lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, over_the_back: bool = False
 ) -> Tensor:
-    """Return the flux in each pixel (rows, columns) by n x n tubes a channel (`tubes.picture`), of all light 1."""
-    few = COARSE_SHEET if over_the_back else SHEET_TUBES
-    pictures = (picture(c.source, c.through(lens), screen, n, few=few, over_the_back=over_the_back) for c in channels)
+    """Return the flux in each pixel (rows, columns), as a fraction of all light, by n x n tubes per channel."""
+    few = COARSE_SHEET if over_the_back else tubes.SHEET_TUBES
+    lights = ((c.source, c.through(lens)) for c in channels)
+    pictures = (tubes.picture(*light, screen, n, few=few, over_the_back=over_the_back) for light in lights)
     return weighted_sum(channels, pictures)
 
 
@@ -472,32 +478,26 @@ class SpectralLine:
     picture: np.ndarray = field(repr=False)  # (rows, columns), row 0 = y max, with the target's sum; zero if dark
 
 
-def spectral_lines(
-    lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, n: int
-) -> tuple[SpectralLine, ...]:
-    """Return the light of each line of a spectrum by n x n tubes a channel, in order of wavelength; () for one line."""
+def spectral_lines(lens: Lens, channels: Sequence[Channel], goal: Goal, n: int) -> tuple[SpectralLine, ...]:
+    """Return the light of each line of a spectrum by n x n tubes per channel, sorted by wavelength; () for one line."""
     lines: dict[float, list[Channel]] = {}
     for channel in channels:
-        lines.setdefault(channel.source.wavelength, []).append(channel)
+        lines.setdefault(channel.source.main_wavelength, []).append(channel)
     if len(lines) < 2:
         return ()
-    reference, parts = torch.from_numpy(np.asarray(target, dtype=np.float64)), []
+    parts = []
     for wavelength, members in sorted(lines.items()):
-        picture = tubes_picture(lens, members, screen, n).cpu()
+        picture = tubes_picture(lens, members, goal.receiver, n).cpu()
         if total(picture) > 0:
-            picture = picture * (total(reference) / total(picture))
+            picture = picture * (total(torch.from_numpy(goal.picture)) / total(picture))
         parts.append(SpectralLine(wavelength, math.fsum(channel.weight for channel in members), picture.numpy()))
     return tuple(parts)
 
 
 def simulated(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, seed: int) -> Simulation:
-    """Simulate picture and ledger by n x n stratified rays a channel, different ones at each point of the source."""
+    """Simulate picture and ledger by n x n stratified rays per channel, different ones at each point of the source."""
     pairs = zip(channels, source_numbers(channels), strict=True)
     return simulate([(c.weight, c.source, c.through(lens), seed + SETS * k) for c, k in pairs], screen, n)
-
-
-def _with_ghost(picture: Tensor, ghost: GhostImage | None) -> Tensor:
-    return picture.cpu() if ghost is None else picture.cpu() + ghost.picture.cpu()
 
 
 def side_factor(channels: Sequence[Channel]) -> float:
@@ -528,8 +528,8 @@ class ImageSamples:
         limit: largest distance from the centre in columns and rows; light outside it counts in the sum only.
         """
         extent = [math.ceil(float(p[self.flux > 0].abs().max())) + 1 for p in self.offset]
-        sides = [2 * min(reach, side) + 1 for reach, side in zip(extent, limit, strict=True)]
-        own = Screen(0.0, (-sides[0] / 2, sides[0] / 2), (-sides[1] / 2, sides[1] / 2), tuple(sides))
+        columns, rows = (2 * min(reach, side) + 1 for reach, side in zip(extent, limit, strict=True))
+        own = Screen(0.0, (-columns / 2, columns / 2), (-rows / 2, rows / 2), (columns, rows))
         position = self.offset * torch.tensor([1.0, -1.0]).view(2, 1, 1)  # rows count downwards
         image = tent(Landed(position, self.flux, torch.zeros(self.flux.shape, dtype=torch.uint8)), own)
         fits = all(reach <= side for reach, side in zip(extent, limit, strict=True))
@@ -586,7 +586,7 @@ def landing_pixels(channels: Sequence[Channel], lens: Lens, screen: Screen, n: i
 
     pixel: column and row of the landing of each channel's light, without meaning where the flux is zero.
     """
-    x, y = corners(lens.apertures[1], n)
+    x, y = tubes.corners(lens.apertures[1], n)
     landed = [_through(channel, lens, screen, x=x, y=y) for channel in channels]
     position, flux = (torch.stack([getattr(each, name) for each in landed], dim=-2) for name in ("position", "flux"))
     return screen.pixels_of(position), flux
@@ -595,12 +595,13 @@ def landing_pixels(channels: Sequence[Channel], lens: Lens, screen: Screen, n: i
 def _through(channel: Channel, lens: Lens, screen: Screen, x: Tensor, y: Tensor) -> Landed:
     """Trace the light of one channel through the cells between the points (x, y) (mm) of the back face."""
     lens = channel.through(lens)
-    p, q, rays = rays_to(channel.source, lens, x, y)
+    p, q, rays = tubes.rays_to(channel.source, lens, x, y)
     behind = replace(lens.unbounded(), losses=None).interfaces[lens.number_of("back") :]
     landed = through(rays, behind, screen.plane)
-    flux = channel.weight * channel.source.irradiance(middle(p), middle(q), lens.entrance.z) * area_of(p, q)
+    centre = tubes.middle(p), tubes.middle(q)
+    flux = channel.weight * channel.source.irradiance(*centre, lens.entrance.z) * tubes.area_of(p, q)
     if lens.passes.sense > 0:  # light comes to the front
-        flux = torch.where(lens.apertures[0].contains(middle(p), middle(q)), flux, torch.zeros_like(flux))
-    flux = arriving_flux(flux, landed).double()
-    position = torch.stack([middle(c) for c in landed.position])
+        flux = torch.where(lens.apertures[0].contains(*centre), flux, torch.zeros_like(flux))
+    flux = tubes.arriving_flux(flux, landed).double()
+    position = torch.stack([tubes.middle(c) for c in landed.position])
     return Landed(position.reshape(2, -1), flux.reshape(-1), landed.status[1:, 1:].reshape(-1))

@@ -32,7 +32,7 @@ from bstcad.optics.collimated import Collimated
 from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort, measure
+from bstcad.optics.measure import Effort, measure_goal
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import Plane
 from bstcad.runs import environment, files, processes
@@ -315,8 +315,7 @@ def judge_run(run: ColdRun, base: Scene, folder: Path, effort: Effort) -> ColdRu
     The largest RRMSD of several targets counts.
     """
     lens, channels = read_nominal(folder)[1].lens, base.verification_channels()
-    options = {"effort": effort, "ghost": base.ghost, "draw": base.draw}
-    lights = [measure(lens, channels, target.screen, target.irradiance(), **options) for target in base.targets]
+    lights = [measure_goal(lens, channels, goal, effort, ghost=base.ghost, draw=base.draw) for goal in base.goals]
     if not all(light.rrmsd >= 0 for light in lights):
         return run.model_copy(update={"status": FAILED, "reason": "none of its light falls on the target"})
     light = max(lights, key=lambda light: light.rrmsd)

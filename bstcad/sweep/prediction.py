@@ -85,7 +85,7 @@ def run_pilot(scene: Scene, quality: str, tick: Callable[[], None] = lambda: Non
         finished = make_design()
     light, finer = small.channels(), factor > 1
     rrmsd = max(
-        rrmsd_by_rays(finished.lens, light, goal.receiver, target=goal.picture, effort=PILOT_EFFORT, draw=small.draw)
+        rrmsd_by_rays(finished.lens, light, goal, PILOT_EFFORT, draw=small.draw)
         for goal in finished.goals
     )
     sides = [max(goal.receiver.shape) for goal in finished.goals]

@@ -21,7 +21,7 @@ from torch import Tensor
 from bstcad.optics.channels import Channel
 from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort, measure, rrmsd_by_rays
+from bstcad.optics.measure import Effort, measure_goal, rrmsd_by_rays
 from bstcad.optics.sides import Sides
 from bstcad.optics.unfolding import image_screen
 from bstcad.optics.wavefront import Wave
@@ -173,10 +173,7 @@ class Task:
             effort = replace(STAGE_EFFORT, rays=round(rays))
         draw = self.spreads[-1].draw if self.spreads and not self.sampled_sources else None  # whole source
         lens = lens.plain()
-        values = [
-            rrmsd_by_rays(lens, self.channels, goal.receiver, target=goal.picture, effort=effort, draw=draw)
-            for goal in self.goals
-        ]
+        values = [rrmsd_by_rays(lens, self.channels, goal, effort, draw=draw) for goal in self.goals]
         return math.nan if any(map(math.isnan, values)) else max(values)
 
     def rated(self, lens: Lens, rrmsd: float) -> RatedLens:
@@ -198,8 +195,7 @@ class Task:
 
     def flux_on_target(self, lens: Lens) -> float:
         """Return the fraction of the light entering the lens that falls on the first target."""
-        goal = self.goals[0]
-        return measure(lens.plain(), self.channels, goal.receiver, target=goal.picture, effort=FLUX_EFFORT).used
+        return measure_goal(lens.plain(), self.channels, self.goals[0], FLUX_EFFORT, ghost=None, draw=None).used
 
 
 @dataclass(frozen=True)

@@ -147,7 +147,7 @@ def coarse_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
         return ()  # several goals: two nets would bend between so few tubes
     coarse, tubes = with_pixels(task, LARGE_PIXELS), COARSE_ROUNDS[0][1]
     [goal] = coarse.goals
-    far_off = rrmsd_by_tubes(lens.plain(), coarse.channels, goal.receiver, target=goal.picture, n=tubes) > FAR_OFF_RRMSD
+    far_off = rrmsd_by_tubes(lens.plain(), coarse.channels, goal, n=tubes) > FAR_OFF_RRMSD
     return tuple(rounds) if far_off else ()
 
 
@@ -449,7 +449,7 @@ def compare_precisions(task: Task, lens: Lens) -> Comparison:
         _tailor_briefly(task, lens.to(d)) for d in (torch.float32, torch.float64)
     )
     n, goal = round(side_factor(task.channels) * (COMPARED_TUBES + 1)), task.goals[0]
-    rrmsd = [rrmsd_by_tubes(end, task.channels, goal.receiver, target=goal.picture, n=n) for end in (single, double)]
+    rrmsd = [rrmsd_by_tubes(end, task.channels, goal, n=n) for end in (single, double)]
     pairs = zip(single.nets, double.nets, strict=True)
     return Comparison(
         control_points=max(max(net.shape) for net in lens.nets),

@@ -24,7 +24,7 @@ from bstcad.optics import quadrature
 from bstcad.optics.channels import Channel
 from bstcad.optics.goal import Goal, worst
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import FULL, RESOLVED, Effort, Light, SpectralLine, measure, spectral_lines, tubes_of
+from bstcad.optics.measure import FULL, RESOLVED, Effort, Light, SpectralLine, measure_goal, spectral_lines, tubes_of
 from bstcad.optics.outlines import Outline
 from bstcad.optics.wavefront_error import WavefrontError, wavefront_error
 from bstcad.runs.processes import Overdue, Submit, end, result, return_freed, run_here
@@ -202,13 +202,12 @@ def verify(
 
 def _measure_light(lens: Lens, nominal: Nominal, goal: Goal, effort: Effort) -> tuple[Light, tuple[SpectralLine, ...]]:
     """Measure the light on a target, and the picture of each line of a spectrum; ValueError if no light falls there."""
-    options = {"effort": effort, "ghost": nominal.scene.ghost, "draw": nominal.scene.draw, "whole": goal.whole}
-    light = measure(lens, nominal.channels, goal.receiver, goal.picture, **options)
+    scene = nominal.scene
+    light = measure_goal(lens, nominal.channels, goal, effort, ghost=scene.ghost, draw=scene.draw)
     if not light.rrmsd >= 0:
-        name = "lens.step" if nominal.scene.mount is None else "part.step"
+        name = "lens.step" if scene.mount is None else "part.step"
         raise ValueError(f"{name}: none of its light falls on {goal.words}; write it again, or check scene.toml")
-    n = max(LINE_TUBES, tubes_of(lens))
-    return light, spectral_lines(lens, nominal.channels, goal.receiver, target=goal.picture, n=n)
+    return light, spectral_lines(lens, nominal.channels, goal, n=max(LINE_TUBES, tubes_of(lens)))
 
 
 def _with_design_facts(lens: Lens, designed: Lens) -> Lens:

@@ -10,6 +10,7 @@ import torch
 from bstcad.optics import measure as measuring
 from bstcad.optics.channels import Channel
 from bstcad.optics.collimated import Collimated
+from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.measure import Effort, measure, spectral_lines, squared_distance, tubes_picture
 from bstcad.optics.outlines import Circle
@@ -121,11 +122,11 @@ def test_the_lines_of_a_spectrum_apart_sum_to_the_light_of_all():
         Channel(replace(BEAM, wavelength=656.3), 1.488, 0.75),
         Channel(replace(BEAM, wavelength=486.1), 1.5, 0.25),
     )
-    lines = spectral_lines(LENS, channels, SCREEN, target(), 64)
+    lines = spectral_lines(LENS, channels, Goal("target", SCREEN, target()), 64)
     assert [line.wavelength for line in lines] == [486.1, 656.3]
     assert [line.share for line in lines] == [0.25, 0.75]
     for line, channel in zip(lines, reversed(channels), strict=True):
         alone = tubes_picture(LENS, (channel,), SCREEN, 64).numpy()
         np.testing.assert_allclose(line.picture, alone * (target().sum() / alone.sum()), rtol=0, atol=1e-12)
     assert np.abs(lines[0].picture - lines[1].picture).max() > 1e-3 * target().max()  # dispersion
-    assert spectral_lines(LENS, channels[:1], SCREEN, target(), 64) == ()
+    assert spectral_lines(LENS, channels[:1], Goal("target", SCREEN, target()), 64) == ()

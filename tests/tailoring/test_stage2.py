@@ -28,8 +28,7 @@ WIDE = TINY | {"source.diameter": 1.2}  # 80 mm before the back, 475 mm behind i
 
 def judged(scene, lens):
     """RRMSD with the real source, by points that no tailoring knows."""
-    wanted = scene.target
-    return rrmsd_by_tubes(lens, scene.channels(64, VERIFICATION_DRAW), wanted.screen, wanted.irradiance(), 34)
+    return rrmsd_by_tubes(lens, scene.channels(64, VERIFICATION_DRAW), scene.goals[0], 34)
 
 
 @pytest.fixture(scope="module")
