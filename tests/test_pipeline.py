@@ -8,7 +8,7 @@ import torch
 
 from bstcad import pipeline
 from bstcad.cad.solid import lens_solid
-from bstcad.optics.irradiance import Screen, rrmsd
+from bstcad.optics.irradiance import Screen, efficiency, rrmsd
 from bstcad.scene import scene
 from bstcad.scene.errors import SceneError
 from tests.tracing import simulated
@@ -37,7 +37,7 @@ def judged(design):
     target = design.scene.target
     screen = Screen(target.z, target.x, target.y, target.columns_rows)
     found = simulated(design.scene.source, design.lens, screen, 500, 77)
-    return float(rrmsd(found.box, torch.from_numpy(design.goals[0].picture))), found.efficiency
+    return float(rrmsd(found.box, torch.from_numpy(design.goals[0].picture))), efficiency(found.flux)
 
 
 @pytest.mark.parametrize("name", RECORDED)

@@ -28,7 +28,7 @@ from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shape
 from bstcad.cad import step_reading
 from bstcad.cad.step_reading import StepLens, parts_of
 from bstcad.optics import quadrature
-from bstcad.optics.quadrature import EDGE_PARTS, GAUSS_POINTS, MIN_RELATIVE_DX, Border, MassProperties, Sums
+from bstcad.optics.quadrature import EDGE_PARTS, GAUSS_POINTS_PER_PART, MIN_RELATIVE_DX, Border, MassProperties, Sums
 
 if TYPE_CHECKING:
     import cadquery
@@ -156,6 +156,6 @@ def _gauss_points(
         if curve.GetType() == GeomAbs_CurveType.GeomAbs_BSplineCurve:
             spline = curve.BSpline()
             knots.update(k for k in map(spline.Knot, range(1, spline.NbKnots() + 1)) if first < k < last)
-    parts, points = (EDGE_PARTS, GAUSS_POINTS) if over_net or len(knots) > 2 else (ARC_PARTS, ARC_POINTS)
+    parts, points = (EDGE_PARTS, GAUSS_POINTS_PER_PART) if over_net or len(knots) > 2 else (ARC_PARTS, ARC_POINTS)
     t, weight = quadrature.gauss_points(quadrature.divided(np.array(sorted(knots)), parts), points)
     return t, -weight if edge.Orientation() == TopAbs_Orientation.TopAbs_REVERSED else weight

@@ -21,7 +21,7 @@ from bstcad.optics.rays import Landed, Status, axes, clocked, clocking_of, tilt_
 from bstcad.optics.receivers import LevelPlane, Receiver, TiltedPlane
 
 LEAK_ROUNDING = 1e-12  # fraction of the light on a target that counts as rounding
-DARK_LEVEL = 1e-6  # largest value of a dark pixel of a target, as a fraction of its brightest pixel
+MAX_DARK_VALUE = 1e-6  # largest value of a dark pixel of a target, as a fraction of its brightest pixel
 
 
 @dataclass(frozen=True)
@@ -56,14 +56,13 @@ class Screen:
         """Return the screen after a motion, with the same pixels."""
         if self.surface is not None:
             return replace(self, surface=self.surface.moved(motion))
-        middle = motion.point(self.middle)
-        (x, y), (c_x, c_y, z) = (self.x, self.y), middle
-        old_x, old_y, _ = self.middle
-        x, y = (tuple(end - old + new for end in side) for side, old, new in ((x, old_x, c_x), (y, old_y, c_y)))
+        (new_x, new_y, z), (old_x, old_y, _) = motion.point(self.middle), self.middle
+        (left, right), (low, high) = self.x, self.y
+        x, y = (left - old_x + new_x, right - old_x + new_x), (low - old_y + new_y, high - old_y + new_y)
         if not motion.turns:
             return replace(self, x=x, y=y, z=z)
-        frame = motion.frame(clocked(axes(self.tilt or (0.0, 0.0)), self.clocking))
-        return replace(self, x=x, y=y, z=z, tilt=tilt_of(frame[2]), clocking=clocking_of(frame))
+        e_x, e_y, n = motion.frame(clocked(axes(self.tilt or (0.0, 0.0)), self.clocking))
+        return replace(self, x=x, y=y, z=z, tilt=tilt_of(n), clocking=clocking_of((e_x, e_y, n)))
 
     @property
     def columns(self) -> int:
@@ -168,7 +167,7 @@ def rrmsd(irradiance: Tensor, target: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Leak:
-    """Light on the dark pixels D of a target: those at or below DARK_LEVEL times the brightest pixel."""
+    """Light on the dark pixels D of a target: those at or below MAX_DARK_VALUE times the brightest pixel."""
 
     share: float  # Σ_D E / Σ E, fraction of the light on the target that falls on D
     # Mean of E over the other pixels divided by the mean of E over D; None: the light on D is rounding.
@@ -180,7 +179,7 @@ def leak(irradiance: np.ndarray, target: np.ndarray) -> Leak | None:
 
     The share is linear in E: noise of zero mean does not change its expectation.
     """
-    dark = target <= DARK_LEVEL * target.max()
+    dark = target <= MAX_DARK_VALUE * target.max()
     if not dark.any():
         return None
     share = math.fsum(irradiance[dark]) / math.fsum(irradiance.ravel())
@@ -188,10 +187,10 @@ def leak(irradiance: np.ndarray, target: np.ndarray) -> Leak | None:
     return Leak(share, float(lit * dark.sum() / share) if share > LEAK_ROUNDING else None)
 
 
-LEDGER = {  # reasons of loss by line of the ledger
-    "missed the lens": (Status.MISSED_FRONT,),
-    "lost through the sides": (Status.VIGNETTED,),
-    "total internal reflection": (Status.TOTAL_REFLECTION,),
+LEDGER = {  # reason of loss by line of the ledger
+    "missed the lens": Status.MISSED_FRONT,
+    "lost through the sides": Status.VIGNETTED,
+    "total internal reflection": Status.TOTAL_REFLECTION,
 }
 
 
@@ -203,9 +202,8 @@ def ledger(rays: Landed, screen: Screen) -> dict[str, float]:
         "on target": float(total(flux[rays.alive & on_screen])),
         "off target": float(total(flux[(rays.alive & ~on_screen) | (rays.status == int(Status.TURNED_BACK))])),
     }
-    for line, reasons in LEDGER.items():
-        lines[line] = sum(float(total(flux[rays.status == int(reason)])) for reason in reasons)
-    return lines | {line: float(total(part.double())) for line, part in rays.taken.items()}
+    lost = {line: float(total(flux[rays.status == int(reason)])) for line, reason in LEDGER.items()}
+    return lines | lost | {line: float(total(part.double())) for line, part in rays.taken.items()}
 
 
 def efficiency(flux: dict[str, float]) -> float:

@@ -19,7 +19,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from bstcad.optics.interfaces import Interface, Loss
+from bstcad.optics.interfaces import Interface, Loss, Reflect
 from bstcad.optics.kernels.reductions import elementary
 
 REFLECTED, ABSORBED, BY_THE_MIRROR = "reflected at the faces", "absorbed in the glass", "absorbed by the mirror"
@@ -46,24 +46,21 @@ def reflectance(
     return _mean(r_s * r_s, r_p * r_p, polarisation)
 
 
-def coated_reflectance(
-    n_in: float, n_out: float, cos_in: Tensor, cos_out: Tensor, coating: CoatingLayer, wavelength: float,
-    polarisation: Polarisation = "none",
-) -> Tensor:  # fmt: skip
-    """Return the reflectance R of a face with a single layer between two media; wavelength in nm, in vacuum.
+def coated_reflectance(face: Transmission, coating: CoatingLayer, cos_in: Tensor, cos_out: Tensor) -> Tensor:
+    """Return the reflectance R of a face with a single layer between its two media.
 
     r = (r_1 + r_2 e^{2iβ}) / (1 + r_1 r_2 e^{2iβ}),  β = 2π n_f d cos θ_f / λ,  r_1 and r_2 the amplitudes of the
     layer's two sides.  The angle in the layer is real for transmitted light, since n_f >= 1 >= n sin θ.
     """
     n_f = coating.index
-    cos_f = torch.sqrt(1 - (n_in / n_f) ** 2 * (1 - cos_in * cos_in))
-    phase = 2 * elementary(torch.cos, (4 * math.pi * n_f * coating.thickness / wavelength) * cos_f)
-    first, second = _amplitudes(n_in, n_f, cos_in, cos_f), _amplitudes(n_f, n_out, cos_f, cos_out)
+    cos_f = torch.sqrt(1 - (face.n_in / n_f) ** 2 * (1 - cos_in * cos_in))
+    phase = 2 * elementary(torch.cos, (4 * math.pi * n_f * coating.thickness / face.wavelength) * cos_f)
+    first, second = _amplitudes(face.n_in, n_f, cos_in, cos_f), _amplitudes(n_f, face.n_out, cos_f, cos_out)
     reflectances = []
     for r_1, r_2 in zip(first, second, strict=True):
         product = r_1 * r_2
         reflectances.append((r_1 * r_1 + r_2 * r_2 + product * phase) / (1 + product * product + product * phase))
-    return _mean(*reflectances, polarisation)
+    return _mean(reflectances[0], reflectances[1], face.polarisation)
 
 
 def metal_reflectance(index: complex, cos_in: Tensor, polarisation: Polarisation = "none") -> Tensor:
@@ -96,10 +93,9 @@ class Transmission:
 
     def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
         """Return T at the angles of incidence and refraction."""
-        angles = (self.n_in, self.n_out, cos_in, cos_out)
         if self.coating is None:
-            return 1 - reflectance(*angles, self.polarisation)
-        return 1 - coated_reflectance(*angles, self.coating, self.wavelength, self.polarisation)
+            return 1 - reflectance(self.n_in, self.n_out, cos_in, cos_out, polarisation=self.polarisation)
+        return 1 - coated_reflectance(self, self.coating, cos_in, cos_out)
 
 
 @dataclass(frozen=True)
@@ -170,7 +166,8 @@ class FresnelLoss:
     def of(self, interface: Interface, index: float = 1.0) -> Loss:
         """Return the loss at an interface; index: of the medium before it."""
         law = interface.law
-        if law.reverses:
+        if isinstance(law, Reflect):
+            assert self.metal is not None  # a mirror states it
             return MetalReflection(self.metal / index, self.polarisation)
         return Transmission(law.n_in, law.n_out, self.wavelength, polarisation=self.polarisation, coating=self.coating)
 

@@ -18,12 +18,12 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.surfaces import Surface
 
 MIN_SPANS = 128  # minimum parts of an axis of a net; the spans of a coarser net are divided
-GAUSS_POINTS = 3  # Gauss points in each part of a chord or of an edge
+GAUSS_POINTS_PER_PART = 3  # Gauss points in each part of a chord or of an edge
 FINE_NET = 400  # control points per side from which on FINE_POINTS keep the area of a lens to 1e-9
 FINE_POINTS = 2  # Gauss points in each part of a chord or of an edge of such a net
 CHORD_POINTS = 96  # Gauss points of a chord over a smooth face; exact to rounding up to a half diagonal of 0.95 R
 END_PARTS = 12  # minimum parts of an end span, where x(t) is quadratic and h(x) no polynomial: volumes to 1e-12
-POINTS_PER_STRIP = 512  # border points evaluated at a time
+BORDER_POINTS_PER_STRIP = 512  # border points evaluated at a time
 MIN_RELATIVE_DX = 1e-14  # largest |dx| / ds of border points that are left out, since they add nothing
 EDGE_PARTS = 256  # minimum number of parts of an edge's curve
 
@@ -64,8 +64,8 @@ def of_face(face: Surface, border: Border, raised: float = 0.0) -> Sums:
     """
     total = Sums()
     counted = np.flatnonzero(np.abs(border.dx) > MIN_RELATIVE_DX * border.ds)
-    for start in range(0, len(counted), POINTS_PER_STRIP):
-        strip = counted[start : start + POINTS_PER_STRIP]
+    for start in range(0, len(counted), BORDER_POINTS_PER_STRIP):
+        strip = counted[start : start + BORDER_POINTS_PER_STRIP]
         total += _sums_of_points(face, raised, *_chords(face, border.x[strip], border.y[strip], border.dx[strip]))
     return Sums(abs(total.area), total.volume, total.moment)  # the area is negative for a border seen from below
 
@@ -120,16 +120,17 @@ def divided(breaks: np.ndarray, parts: int) -> np.ndarray:
 
 def outline_border(outline: Outline, face: Surface) -> Border:
     """Return the border of a circle or of a box with sharp corners, in parts that cross no knot line of a face."""
-    net = face.is_net
-    count = _points(face) if net else GAUSS_POINTS
+    net = face if isinstance(face, BSplineSurface) else None
+    count = _points(net) if net else GAUSS_POINTS_PER_PART
     if outline.is_round:
-        breaks = rim_breaks(face, outline.radius) if net else np.linspace(0, 2 * np.pi, EDGE_PARTS + 1)
+        radius, _ = outline.half_extent
+        breaks = rim_breaks(net, radius) if net else np.linspace(0, 2 * np.pi, EDGE_PARTS + 1)
         theta, weight = gauss_points(breaks, count)
-        x, y = outline.radius * np.cos(theta), outline.radius * np.sin(theta)
+        x, y = radius * np.cos(theta), radius * np.sin(theta)
         return Border(x, y, -y * weight, x * weight)
     sides = []
     for axis, half in enumerate(outline.half_extent):
-        breaks = _smooth_parts(face, axis, EDGE_PARTS) if net else np.linspace(-half, half, EDGE_PARTS + 1)
+        breaks = _smooth_parts(net, axis, EDGE_PARTS) if net else np.linspace(-half, half, EDGE_PARTS + 1)
         sides.append(gauss_points(np.clip(breaks, -half, half), count))
     (x, dx), (y, dy), (a, b) = *sides, outline.half_extent
     no_x, no_y = np.zeros_like(x), np.zeros_like(y)
@@ -153,25 +154,22 @@ def _chords(face: Surface, x: np.ndarray, y: np.ndarray, dx: np.ndarray) -> tupl
 
 
 def _chord_ends(face: Surface, y: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return the ends of the parts of each chord, (n, parts + 1), and the number of Gauss points in each part.
-
-    Some parts have the length zero.
-    """
+    """Return the ends of the parts of each chord, (n, parts + 1), some of length 0, and the Gauss points per part."""
     low, high = np.minimum(y, 0.0)[:, None], np.maximum(y, 0.0)[:, None]
-    if not face.is_net:
+    if not isinstance(face, BSplineSurface):
         return np.hstack([low, high]), CHORD_POINTS
     return np.clip(np.union1d(_smooth_parts(face, 1, MIN_SPANS), 0.0), low, high), _points(face)
 
 
 def _points(face: BSplineSurface) -> int:
-    return GAUSS_POINTS if min(face.shape) < FINE_NET else FINE_POINTS
+    return GAUSS_POINTS_PER_PART if min(face.shape) < FINE_NET else FINE_POINTS
 
 
 def _smooth_parts(face: BSplineSurface, axis: int, parts: int) -> np.ndarray:
     """Return breaks (mm) along an axis of a net, between which heights are nearly polynomial: knot lines and more."""
     (first, last), pitch = (face.x, face.y)[axis], face.pitch[axis]
     lines = np.concatenate([[first], first + pitch * (np.arange(1, face.shape[axis] - 2) + 0.5), [last]])
-    ends = [np.linspace(*pair, END_PARTS + 1) for pair in (lines[:2], lines[-2:])]
+    ends = [np.linspace(low, high, END_PARTS + 1) for low, high in (lines[:2], lines[-2:])]
     return np.unique(np.concatenate([divided(lines, parts), *ends]))
 
 

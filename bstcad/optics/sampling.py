@@ -22,14 +22,14 @@ from bstcad.optics.outlines import Outline, Rectangle
 from bstcad.optics.sides import Sides, as_pair
 
 POINTS_PER_STRIP = 1 << 18  # approximate number of points in a strip of rows
-SPLITMIX_INCREMENT = 0x9E3779B97F4A7C15  # increment of SplitMix64: 2^64 over the golden ratio
+SPLITMIX_INCREMENT = 0x9E3779B97F4A7C15  # increment of SplitMix64: 2^64 divided by the golden ratio
 MIX_1, MIX_2 = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
 # 1/g of g² = g + 1, the step of a golden lattice; 1/g of g³ = g + 1, the shift of a lattice from draw to draw
 GOLDEN_RATIO, DRAW_SHIFT = 0.6180339887498949, 0.7548776662466927
 
 
 def grid(window: Rectangle, sides: Sides, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
-    """Return the centres of equal cells, this many a side or (along x, along y); x and y are (along x, along y)."""
+    """Return the centres of equal cells, x and y, each (along x, along y); sides: number of cells per side."""
     along_x, along_y = ((torch.arange(n, dtype=dtype) + 0.5) / n - 0.5 for n in as_pair(sides))
     x, y = torch.meshgrid(along_x * window.width, along_y * window.height, indexing="ij")
     return x.contiguous(), y.contiguous()
@@ -57,7 +57,8 @@ def hash_seed(seed: int) -> int:
 def jitter(key: int, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return two numbers in (0, 1), multiples of 2^-33, for each cell: the upper and lower 32 bits of SplitMix64."""
     bits = _mix(np.uint64(key) + cell.astype(np.uint64) * np.uint64(SPLITMIX_INCREMENT))
-    return tuple((half + 0.5) * 2.0**-32 for half in (bits >> np.uint64(32), bits & np.uint64(0xFFFFFFFF)))
+    upper, lower = ((half + 0.5) * 2.0**-32 for half in (bits >> np.uint64(32), bits & np.uint64(0xFFFFFFFF)))
+    return upper, lower
 
 
 def _mix(z: np.ndarray) -> np.ndarray:

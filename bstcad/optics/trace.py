@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics import irradiance, ops, sampling
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel, source_numbers, weighted_sum
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import Interface, Loss, Reflect, Refract, cross, intersect
@@ -70,8 +71,8 @@ def behind(rays: Rays, interface: Interface) -> Rays:
 
 def _net_kernel(name: str, rays: Rays, interface: Interface) -> Callable[..., Any] | None:
     """Return the kernel of this name if the interface is a net; None: the plain form runs."""
-    surface = interface.surface
-    return ops.kernel(name, surface.heights, rays.position, rays.direction) if surface.is_net else None
+    net = interface.surface
+    return ops.kernel(name, net.heights, rays.position, rays.direction) if isinstance(net, BSplineSurface) else None
 
 
 def whole_kernel(
@@ -162,17 +163,13 @@ def clear_window(source: Emitter, lens: Lens, n: int = 256) -> Rectangle:
 
 
 def launch_strips(source: Emitter, lens: Lens, n: int, seed: int, area: Rectangle | None = None) -> Iterator[Rays]:
-    """Launch n x n stratified rays over `area` (default: the whole window), a strip at a time.
-
-    Points without flux launch no ray.
-    """
-    area = area or window(source, lens)
-    like = {"dtype": lens.like.dtype, "device": lens.like.device}
+    """Launch n x n stratified rays over `area` (default: the window), a strip at a time, where there is flux."""
+    area, like = area or window(source, lens), lens.like
     for x, y in sampling.stratified_strips(area, n, seed):
         lit = source.irradiance(x, y, lens.entrance.z) > 0
         whole = bool(lit.all())
         x, y = (p.reshape(-1) if whole else p[lit] for p in (x, y))
-        yield source.rays(x.to(**like), y.to(**like), lens.entrance.z, area.area / n**2)
+        yield source.rays(x.to(like), y.to(like), lens.entrance.z, area.area / n**2)
 
 
 @dataclass(frozen=True)
@@ -183,11 +180,6 @@ class Simulation:
     tent: Tensor  # flux in each pixel by linear binning, as `box`
     flux: dict[str, float]  # ledger of the flux by fate, as fractions of the source's; the lines sum to 1
     rays: int  # number of rays launched
-
-    @property
-    def efficiency(self) -> float:
-        """Return the ratio of the flux inside the target to the flux that leaves the back face."""
-        return irradiance.efficiency(self.flux)
 
 
 Lights = Sequence[tuple[float, Emitter, Lens, int]]  # (weight, source, lens at this wavelength, seed) per light
@@ -203,7 +195,7 @@ def simulate(lights: Lights, screen: Screen, n: int) -> Simulation:
     kernels = [
         whole_kernel("trace.simulate", source, lens, screen.plane, tables=tables) for _, source, lens, _ in lights
     ]
-    if fast := all(kernels) and kernels[0]:
+    if all(kernels) and (fast := kernels[0]):
         whole = [(*light, window(light[1], light[2])) for light in lights]
         return _as_fractions(lights, *fast(whole, screen, n))
     return simulate_plain(lights, screen, n)
@@ -213,7 +205,8 @@ def simulate(lights: Lights, screen: Screen, n: int) -> Simulation:
 def simulate_plain(lights: Lights, screen: Screen, n: int) -> Simulation:
     """Run `simulate` in plain torch, a strip of the window at a time."""
     box = torch.zeros(screen.shape, dtype=torch.float64, device=lights[0][2].like.device)
-    tent, flux, count = torch.zeros_like(box), {}, 0
+    tent, count = torch.zeros_like(box), 0
+    flux: dict[str, float] = {}
     for weight, source, lens, seed in lights:
         for rays in launch_strips(source, lens, n, seed):
             landed = trace(rays, lens, screen.plane)
@@ -242,10 +235,12 @@ def _as_fractions(lights: Lights, box: Tensor, tent: Tensor, flux: dict[str, flo
     return Simulation(box / whole, tent / whole, flux, count)
 
 
-@functools.lru_cache(maxsize=4096)  # whatever the back
+@functools.lru_cache(maxsize=4096)  # independent of the back, which changes in tailoring
 def on_underside(source: Emitter, front: Surface, outline: Outline, n: int = UNDERSIDE_CELLS) -> float:
     """Return the fraction of a source's light that meets the plane around a front's optical part, inside `outline`."""
-    plane, area = front.around, Rectangle(*(2 * half for half in outline.half_extent))
+    assert front.outline is not None  # a front without one has no plane around it
+    plane, (half_x, half_y) = front.around, outline.half_extent
+    area = Rectangle(2 * half_x, 2 * half_y)
     x, y = sampling.grid(area, n)
     beside = outline.contains(x, y) & ~front.outline.contains(x, y)
     rays = source.rays(x[beside], y[beside], plane.z, area.area / n**2)
@@ -279,6 +274,7 @@ def ghost(lens: Lens) -> tuple[Interface, ...]:
 
     The reflectance of the faces follows from the lens's losses.
     """
+    assert lens.losses is not None  # without them no face reflects
     number = lens.number_of("front")
     front, back = lens.interfaces[number : number + 2]
     outwards = replace(front, law=Refract(lens.index, 1.0), status_if_missed=Status.VIGNETTED)
@@ -288,6 +284,7 @@ def ghost(lens: Lens) -> tuple[Interface, ...]:
 
 def _from_inside(exit: Interface) -> Interface:
     """Return a face as the mirror that it is for light reflected inside the glass."""
+    assert isinstance(exit.law, Refract)
     *glass, face = exit.losses
     return replace(exit, law=Reflect(), losses=(*glass, Reflection(face, exit.law)))
 
@@ -302,7 +299,7 @@ class GhostImage:
 
 @torch.no_grad()
 def ghost_light(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, seed: int) -> GhostImage:
-    """Trace the ghost of all channels to a screen by n x n stratified rays a channel, at most GHOST_RAYS a side."""
+    """Trace the ghost of all channels to a screen by n x n stratified rays per channel, at most GHOST_RAYS per side."""
     n = min(n, GHOST_RAYS)
     parts = [
         _ghost_of_channel(c, c.through(lens), screen, n=n, seed=seed + k)
@@ -317,15 +314,14 @@ def _ghost_of_channel(channel: Channel, lens: Lens, screen: Screen, n: int, seed
     picture = torch.zeros(screen.shape, dtype=torch.float64, device=lens.like.device)
     launched, lines = 0.0, dict.fromkeys((GHOST_ON, GHOST_OFF, REFLECTED, TOTAL_REFLECTION), 0.0)
     for rays in launch_strips(channel.source, lens, n, seed):
-        out, total_at_first = trace_ghost(rays, lens)
+        out, at_first = trace_ghost(rays, lens)  # at_first: True where the first reflection was total
         landed = screen.plane.land(out)
         on_screen = landed.alive & screen.contains(*landed.position)
         picture += irradiance.box(landed, screen)
-        for line, counted, sign in (
-            (GHOST_ON, on_screen, 1), (GHOST_OFF, ~on_screen, 1),
-            (REFLECTED, ~total_at_first, -1), (TOTAL_REFLECTION, total_at_first, -1),
-        ):  # fmt: skip
-            lines[line] += sign * float(total((out.flux * (out.alive & counted)).double()))
+        gains, losses = {GHOST_ON: on_screen, GHOST_OFF: ~on_screen}, {REFLECTED: ~at_first, TOTAL_REFLECTION: at_first}
+        for line, counted in (gains | losses).items():
+            flux = float(total((out.flux * (out.alive & counted)).double()))
+            lines[line] += flux if line in gains else -flux
         launched += float(total(rays.flux.double()))
     whole = max(launched, 1.0)  # divisor, which `_as_fractions` uses, too
     return GhostImage(picture / whole, {line: value / whole for line, value in lines.items()})
@@ -333,7 +329,7 @@ def _ghost_of_channel(channel: Channel, lens: Lens, screen: Screen, n: int, seed
 
 def trace_ghost(rays: Rays, lens: Lens) -> tuple[Rays, Tensor]:
     """Return (ghost of rays from the source, behind the lens; True where its reflection at the back was total)."""
-    enter, down, up, leave = ghost(lens)
-    at_back = cross(cross(across(rays, lens.before), enter).rays, down)
-    out = cross(cross(at_back.rays, up).rays, leave).rays
-    return across(out, lens.behind), leave.law.deflection(at_back.cos_in)[2]
+    entry, down, up, exit = ghost(lens)
+    at_back = cross(cross(across(rays, lens.before), entry).rays, down)
+    out = cross(cross(at_back.rays, up).rays, exit).rays
+    return across(out, lens.behind), exit.law.deflection(at_back.cos_in)[2]

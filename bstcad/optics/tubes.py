@@ -9,7 +9,7 @@ is differentiable in the landing points, whereas the count of rays in a pixel is
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,21 +33,21 @@ SHEET_TUBES = 256  # tubes per side of the sheet from which finer sheets are int
 RIM_SHRINK = 1e-9  # relative shrink towards the centre, so that corners on the rim of the light count as lit
 MAX_BAND_ROWS = 256  # maximum rows of tubes traced at a time for a picture; even, since the diagonals alternate
 MAX_BAND_TUBES = 1 << 19  # maximum tubes traced at a time for a picture, which limits its memory
-MAX_RAYS = 1 << 17  # maximum rays traced at a time in plain torch: a megabyte per quantity
+MAX_RAYS_PER_BAND = 1 << 17  # maximum rays traced at a time in plain torch: a megabyte per quantity
 PARTS_PER_SIDE = 4  # parts per side of a tube that is partly lit
 MIN_TRIANGLE_AREA = 1e-9  # smallest area of a triangle that is cut (pixel²); a smaller one falls into one pixel
-COARSE_POINTS = 65  # points per side of the coarse grid on which the rays to given points are found first
+COARSE_GRID_POINTS = 65  # points per side of the coarse grid on which the rays to given points are found first
 MAX_BROYDEN_STEPS = 30  # maximum number of Broyden steps of that search
 RAY_TOLERANCE = 1e-8  # distance from its point at which a ray counts as found, as a fraction of the grid's extent
-DIFFERENCE_STEP = 1e-6  # step of the difference quotients, as a fraction of the grid's extent
-MIN_BROYDEN_DIVISOR = 0.1  # smallest divisor of Broyden's update over the square of the step; below: no update
+RELATIVE_DIFFERENCE_STEP = 1e-6  # step of the difference quotients, as a fraction of the grid's extent
+MIN_BROYDEN_DIVISOR = 0.1  # smallest divisor of Broyden's update relative to the squared step; below: no update
 
 
 @dataclass(frozen=True)
 class Tubes:
     """Flux tubes in front of the first freeform interface, each between four neighbouring rays."""
 
-    rays: Rays  # rays at the corners (3, rows + 1, columns + 1); flux: the fraction that faces and glass leave
+    rays: Rays  # rays at the corners (3, rows + 1, columns + 1); flux: transmitted fraction
     flux: Tensor  # flux launched in each tube (rows, columns), as a fraction of the source's
 
     def landing(self, lens: Lens, plane: Receiver) -> Landed:
@@ -55,14 +55,11 @@ class Tubes:
         return from_first_net(self.rays, lens.unbounded(), plane)
 
     def collect(self, corners: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
-        """Return (flux in each pixel, row 0 = y max; Σ flux · (pixels outside the border)²).
-
-        A tube with a lost corner carries no flux.
-        """
+        """Return (flux in each pixel, row 0 = y max; Σ flux · (pixels outside the border)²) of whole tubes."""
         return collect(screen.pixels_of(corners.position.double()), self.arriving_flux(corners), screen.shape)
 
     def transmitted_flux(self, corners: Landed) -> Tensor:
-        """Return the flux that faces and glass leave each tube (rows, columns), whether it arrives or not."""
+        """Return the flux of each tube (rows, columns) after losses at faces and in glass, even with lost corners."""
         return self.flux * middle(corners.flux) if corners.taken else self.flux
 
     def arriving_flux(self, corners: Landed) -> Tensor:
@@ -132,7 +129,7 @@ def _bands(count: int, size: int) -> Iterator[slice]:
 
 
 def _rows_at_a_time(columns: int) -> int:
-    return max(1, MAX_RAYS // columns)
+    return max(1, MAX_RAYS_PER_BAND // columns)
 
 
 def _tubes(source: Emitter, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes:
@@ -206,13 +203,18 @@ def _over_the_back(source: Emitter, lens: Lens, n: int, few: int) -> _Sheet:
     n_x, n_y = as_pair(_proportioned(lens, lens.apertures[1], n))
     few_x, few_y = min(n_x, few), min(n_y, few)
     x, y, _ = rays_to(source, lens, *corners(lens.apertures[1], (few_x, few_y)))
-    middle = tuple(float(total(p) / p.numel()) for p in (x, y))
+    mean_x, mean_y = (float(total(p) / p.numel()) for p in (x, y))
     if (few_x, few_y) == (n_x, n_y):
-        return _Sheet(lambda band: (x[band], y[band]), n_x, middle, cut=True)
+        return _Sheet(lambda band: (x[band], y[band]), n_x, (mean_x, mean_y), cut=True)
     coarse = [np.linspace(0, 1, k + 1) for k in (few_x, few_y)]
     fine_x, fine_y = (np.linspace(0, 1, k + 1) for k in (n_x, n_y))
     splines = [RectBivariateSpline(*coarse, p.cpu().numpy(), s=0) for p in (x, y)]
-    return _Sheet(lambda band: tuple(torch.from_numpy(p(fine_x[band], fine_y)) for p in splines), n_x, middle, cut=True)
+
+    def rows(band: slice) -> tuple[Tensor, Tensor]:
+        x, y = (torch.from_numpy(p(fine_x[band], fine_y)) for p in splines)
+        return x, y
+
+    return _Sheet(rows, n_x, (mean_x, mean_y), cut=True)
 
 
 def _proportioned(lens: Lens, light: Outline, n: int) -> Sides:
@@ -262,9 +264,9 @@ def arriving_flux(flux: Tensor, corners: Landed) -> Tensor:
 
 
 def area_of(x: Tensor, y: Tensor) -> Tensor:
-    """Return the area of each quad: half the cross product of its diagonals."""
-    return ((x[1:, 1:] - x[:-1, :-1]) * (y[:-1, 1:] - y[1:, :-1])
-            - (x[:-1, 1:] - x[1:, :-1]) * (y[1:, 1:] - y[:-1, :-1])).abs() / 2  # fmt: skip
+    """Return the area of each quad: half the cross product of its diagonals a and b."""
+    (a_x, b_x), (a_y, b_y) = ((p[1:, 1:] - p[:-1, :-1], p[:-1, 1:] - p[1:, :-1]) for p in (x, y))
+    return (a_x * b_y - b_x * a_y).abs() / 2
 
 
 @torch.no_grad()
@@ -297,21 +299,13 @@ def rays_to(
         s = rays.sense * (height - rays.above(face.z)) / ahead
         return replace(rays, position=rays.position + s * rays.direction)
 
-    def jacobian(p: Tensor, q: Tensor, height: Tensor) -> list[Tensor]:
-        """Return the inverse of ∂(hit) / ∂(p, q): [xx, xy, yx, yy]."""
-        step = DIFFERENCE_STEP * extent
-        shifted = [torch.cat(t) for t in ((p + step, p - step, p, p), (q, q, q + step, q - step))]
-        right, left, above, below = arrive(*shifted, height.repeat(4, 1)).position.chunk(4, dim=1)
-        one, two = right - left, above - below
-        xx, yx, xy, yy = (d / (2 * step) for d in (one[0], one[1], two[0], two[1]))
-        det = xx * yy - xy * yx
-        det = torch.where(det.abs() > 1e-6, det, torch.ones_like(det))
-        return [yy / det, -xy / det, -yx / det, xx / det]
-
-    p, q, inverse, last = x, y, None, None
+    jacobian = functools.partial(_inverse_jacobian, arrive, RELATIVE_DIFFERENCE_STEP * extent)
+    p, q = x, y
+    inverse: list[Tensor] | None = None
+    last: tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]] | None = None  # step, and distances left before it
     # for light along the axis, x and y are the solution
-    if max(x.shape) > 2 * COARSE_POINTS and not arrive(x[:1, :1], y[:1, :1], z[:1, :1]).axial:
-        lines = tuple(torch.linspace(0, n - 1, min(n, COARSE_POINTS)).round().long() for n in x.shape)
+    if max(x.shape) > 2 * COARSE_GRID_POINTS and not arrive(x[:1, :1], y[:1, :1], z[:1, :1]).axial:
+        lines = tuple(torch.linspace(0, n - 1, min(n, COARSE_GRID_POINTS)).round().long() for n in x.shape)
         coarse = torch.meshgrid(*lines, indexing="ij")
         c_p, c_q, _ = rays_to(source, lens, x=x[coarse], y=y[coarse], number=number)
         inverse = [_interpolate(lines, x.shape, t) for t in jacobian(c_p, c_q, z[coarse])]
@@ -322,7 +316,7 @@ def rays_to(
         error = torch.where(hit.alive, torch.maximum(off_x.abs(), off_y.abs()), torch.zeros_like(x))
         if not bool(error.any()):
             break  # the start is the solution, as for light along the axis
-        if last is not None:
+        if last is not None and inverse is not None:
             step, (last_x, last_y) = last
             inverse = _broyden_update(inverse, step, (last_x - off_x, last_y - off_y))
         xx, xy, yx, yy = inverse = inverse or jacobian(p, q, z)
@@ -333,6 +327,17 @@ def rays_to(
     position = torch.stack([x, y, z])
     status = hit.lose(error > 1e3 * RAY_TOLERANCE * extent, Status.VIGNETTED)
     return p, q, replace(hit, position=position, z=face.z, status=status)
+
+
+def _inverse_jacobian(arrive: Callable[..., Rays], step: float, p: Tensor, q: Tensor, height: Tensor) -> list[Tensor]:
+    """Return the inverse of ∂(hit) / ∂(p, q) by difference quotients: [xx, xy, yx, yy]."""
+    shifted_p, shifted_q = torch.cat((p + step, p - step, p, p)), torch.cat((q, q, q + step, q - step))
+    right, left, above, below = arrive(shifted_p, shifted_q, height.repeat(4, 1)).position.chunk(4, dim=1)
+    one, two = right - left, above - below
+    xx, yx, xy, yy = (d / (2 * step) for d in (one[0], one[1], two[0], two[1]))
+    det = xx * yy - xy * yx
+    det = torch.where(det.abs() > 1e-6, det, torch.ones_like(det))
+    return [yy / det, -xy / det, -yx / det, xx / det]
 
 
 def _broyden_update(inverse: list[Tensor], step: tuple[Tensor, Tensor], shift: tuple[Tensor, Tensor]) -> list[Tensor]:
@@ -348,7 +353,7 @@ def _broyden_update(inverse: list[Tensor], step: tuple[Tensor, Tensor], shift: t
     return [xx + off_x * row_x, xy + off_x * row_y, yx + off_y * row_x, yy + off_y * row_y]
 
 
-def _interpolate(lines: tuple[Tensor, Tensor], shape: tuple[int, ...], t: Tensor) -> Tensor:
+def _interpolate(lines: Sequence[Tensor], shape: Sequence[int], t: Tensor) -> Tensor:
     """Interpolate t linearly along both axes to (rows, columns); lines: rows and columns at which t is given."""
     for known, n in zip(lines, shape, strict=True):  # each iteration takes one axis and transposes t
         index = torch.arange(n)
@@ -411,7 +416,8 @@ def _triangles(corner: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     even = ((i[:, None] + j) % 2 == 0).expand_as(p0)
     one = (p0, p1, torch.where(even, p2, p3))
     two = (torch.where(even, p0, p1), p2, p3)
-    return tuple(torch.cat([a.reshape(2, -1), b.reshape(2, -1)], dim=1) for a, b in zip(one, two, strict=True))
+    a, b, c = (torch.cat([p.reshape(2, -1), q.reshape(2, -1)], dim=1) for p, q in zip(one, two, strict=True))
+    return a, b, c
 
 
 def _pieces(start: Tensor, end: Tensor, sizes: tuple[int, int]) -> tuple[Tensor, ...]:
@@ -422,19 +428,18 @@ def _pieces(start: Tensor, end: Tensor, sizes: tuple[int, int]) -> tuple[Tensor,
     piece has no length, and rounding would decide on its pixel, while the derivatives of its ends still count.
     """
     edges = torch.arange(start.shape[1], device=start.device)
-    edge, s, kind = [edges], [torch.zeros_like(start[0])], [torch.full_like(edges, -1)]
+    parts = [(edges, torch.zeros_like(start[0]), torch.full_like(edges, -1))]  # edges, starts s, axes of the borders
     cells, senses = [], []
     for axis, (a, b, size) in enumerate(zip(start, end, sizes, strict=True)):
         first, last = (p.detach().floor().clamp(-1, size) for p in (a, b))
         low, count = torch.minimum(first, last), (last - first).abs().long()
         which = edges.repeat_interleave(count)
         nth = torch.arange(len(which), device=start.device) - (count.cumsum(0) - count)[which]
-        edge.append(which)
-        s.append(((low[which] + 1 + nth - a[which]) / (b - a)[which]).clamp(0, 1))
-        kind.append(torch.full_like(which, axis))
+        at = ((low[which] + 1 + nth - a[which]) / (b - a)[which]).clamp(0, 1)
+        parts.append((which, at, torch.full_like(which, axis)))
         cells.append(first)
         senses.append(torch.sign(last - first))
-    edge, s, kind = torch.cat(edge), torch.cat(s), torch.cat(kind)
+    edge, s, kind = (torch.cat(part) for part in zip(*parts, strict=True))
     order = torch.argsort(s.detach(), stable=True)
     order = order[torch.argsort(edge[order], stable=True)]
     edge, s, kind = edge[order], s[order], kind[order]

@@ -27,11 +27,14 @@ from bstcad.optics.rays import Vector
 MM_PER_NM = 1e-6  # millimetres per nanometre
 MIN_FOCUS_DISTANCE = 1e-3  # mm, smallest distance of a focus from the plane
 MAX_RAY_ANGLE = math.radians(89.0)  # rad, angle to the axis above which a ray counts as parallel to the plane
-SAMPLES_PER_SIDE = 129  # grid points a side of a Zernike circle, at which the largest slope is searched
+SAMPLES_PER_SIDE = 129  # grid points per side of a Zernike circle, at which the largest slope is searched
 Place = tuple[float, float]
 
 Z = Key("Plane behind the lens on which the wavefront is stated and measured.", "mm", -1e8, 1e8, example=40.0)
 WEIGHT = Key("Weight of the wavefront against the pictures.", "", 0.0, 1e9, example=2.0)
+LIGHT_DIRECTION = "Direction of the light, of any length."
+FOCUS = "Centre of the sphere: behind z light converges, before it diverges."
+COEFFICIENTS = "Waves at the source's main wavelength, in Noll's order from j = 1."
 
 
 class _Wave:
@@ -46,8 +49,7 @@ class _Wave:
     def complaints(self, back: float) -> Iterator[str]:
         """Yield reasons, as "key: sentence", why the wave does not suit a lens whose back is at z = `back` (mm)."""
         if not self.z > back:
-            behind = f"the plane at z = {self.z:g} is not behind the back at z = {back:g}"
-            yield f"z: {behind}; move it further along +z"
+            yield f"z: the plane at z = {self.z:g} is not behind the back at z = {back:g}; move it further along +z"
 
 
 @dataclass(frozen=True)
@@ -55,9 +57,7 @@ class PlaneWave(_Wave):
     """Plane wave W = n_x x + n_y y, with n the unit vector of the direction: parallel light."""
 
     z: Annotated[float, Z]
-    direction: Annotated[
-        Vector, Key("Direction of the light, of any length.", "", -1e6, 1e6, example=[0.0, 0.1, 1.0])
-    ] = (0.0, 0.0, 1.0)
+    direction: Annotated[Vector, Key(LIGHT_DIRECTION, "", -1e6, 1e6, example=[0.0, 0.1, 1.0])] = (0.0, 0.0, 1.0)
     weight: Annotated[float, WEIGHT] = 1.0
     kind: Annotated[Literal["plane"], Key("A plane wave: parallel light.", example="plane")] = "plane"
 
@@ -93,10 +93,7 @@ class SphericalWave(_Wave):
     The upper sign holds for a focus behind the plane, to which rays converge; from a focus before it they diverge.
     """
 
-    focus: Annotated[
-        Vector, Key("Centre of the sphere: behind z light converges, before it diverges.", "mm", -1e8, 1e8,
-                    example=[0.0, 0.0, 200.0])
-    ]  # fmt: skip
+    focus: Annotated[Vector, Key(FOCUS, "mm", -1e8, 1e8, example=[0.0, 0.0, 200.0])]
     z: Annotated[float, Z]
     weight: Annotated[float, WEIGHT] = 1.0
     kind: Annotated[Literal["sphere"], Key("A spherical wave: light to or from a focus.")] = "sphere"
@@ -138,10 +135,7 @@ class ZernikeWave(_Wave):
     `path` and `directions` extrapolate the polynomials as far as these have rays.
     """
 
-    coefficients: Annotated[
-        tuple[float, ...], Key("Waves at the source's main wavelength, in Noll's order from j = 1.", "", -1e6, 1e6,
-                               example=[0.0, 0.0, 0.0, 1.5])
-    ]  # fmt: skip
+    coefficients: Annotated[tuple[float, ...], Key(COEFFICIENTS, "", -1e6, 1e6, example=[0.0, 0.0, 0.0, 1.5])]
     radius: Annotated[float, Key("Radius of the circle.", "mm", 1e-3, 1e6, example=10.0)]
     z: Annotated[float, Z]
     centre: Annotated[Place, Key("Middle of the circle.", "mm", -1e8, 1e8, example=[2.0, 0.0])] = (0.0, 0.0)

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from bstcad.optics import sampling
 from bstcad.optics.emitters import Emitter
+from bstcad.optics.interfaces import Refract
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.motion import Motion
@@ -33,8 +34,8 @@ from bstcad.optics.receivers import LevelPlane, dot
 from bstcad.optics.trace import behind, clear_window
 from bstcad.optics.wavefront import MM_PER_NM, Wave, length
 
-RAYS_PER_SIDE = 512  # rays a side of the light before the lens
-MAX_MAP_CELLS = 256  # largest number of cells a side of the map
+RAYS_PER_SIDE = 512  # rays per side of the light before the lens
+MAX_MAP_CELLS = 256  # largest number of cells per side of the map
 RAYS_PER_BAND = 1 << 17  # rays traced at a time: a megabyte for each quantity
 ROUNDINGS_PER_SEGMENT = 4  # roundings of a path segment: both ends, length and sum
 
@@ -92,16 +93,18 @@ def optical_path(source: Emitter, lens: Lens, rays: Rays, z: float) -> tuple[Ray
     Let o be the point of the axis on the vertex plane of the first surface.  Paths start at the plane through o
     perpendicular to parallel light, or at the sphere through o about a point source: distant sources cost no digits.
     """
-    first = lens.interfaces[0].law
-    index, path, longest, sense = 1.0 if first.reverses else first.n_in, None, 0.0, rays.sense
+    law, sense, longest = lens.interfaces[0].law, rays.sense, 0.0
+    index = law.n_in if isinstance(law, Refract) else 1.0
+    path: Tensor | None = None
     for interface in lens.interfaces:
-        at_face = behind(rays, interface)
+        at_face, law = behind(rays, interface), interface.law
         if path is None:
             path = index * path_from_reference(source, lens.entrance.z, at_face, sense)
         else:
             path = path + index * _between(rays, at_face)
             longest += index * _longest(_between(rays, at_face), at_face)
-        index, rays = index if interface.law.reverses else interface.law.n_out, at_face
+        index, rays = law.n_out if isinstance(law, Refract) else index, at_face
+    assert path is not None  # a lens has interfaces
     landed = LevelPlane(z).to(rays)
     ahead = torch.sign(-rays.above(z) * rays.sense)
     last = index * _between(rays, landed)
@@ -165,11 +168,13 @@ def wavefront_error(source: Emitter, lens: Lens, wave: Wave, n: int = RAYS_PER_S
     unit, angle = 1 / (nm * MM_PER_NM), 2e6 * torch.asin((length(deviation) / 2).clamp(max=1))
     slopes = [p - tilt for p, tilt in zip(deviation[:2], fit.slopes, strict=True)]
     along_x, along_y, opd_map = _map(x, y, without_tilt, slopes=slopes, cells=min(MAX_MAP_CELLS, n // 2))
+    piston_free, tilt_free = (
+        OpdSize(unit * _rms(o, share), unit * float(o.max() - o.min())) for o in (without_piston, without_tilt)
+    )
     return WavefrontError(
-        wave.z, nm,
-        *(OpdSize(unit * _rms(o, share), unit * float(o.max() - o.min())) for o in (without_piston, without_tilt)),
-        tilt=(1e6 * fit.slopes[0], 1e6 * fit.slopes[1]), angle_rms=_rms(angle, share), angle_max=float(angle.max()),
-        floor=unit * pupil.rounding, flux=measured, rays=len(x), x=along_x, y=along_y, opd=unit * opd_map,
+        wave.z, nm, piston_free, tilt_free, tilt=(1e6 * fit.slopes[0], 1e6 * fit.slopes[1]),
+        angle_rms=_rms(angle, share), angle_max=float(angle.max()), floor=unit * pupil.rounding, flux=measured,
+        rays=len(x), x=along_x, y=along_y, opd=unit * opd_map,
     )  # fmt: skip
 
 
@@ -212,15 +217,14 @@ class _Fit:
 
 def _least_squares(x: Tensor, y: Tensor, opd: Tensor, share: Tensor) -> _Fit:
     """Return the flux-weighted plane fit; about the mean position its normal equations decouple."""
-    middle = tuple(float(total(share * p)) for p in (x, y))
+    mean_x, mean_y = (float(total(share * p)) for p in (x, y))
     typical = float(opd[0])  # subtracted first, since paths are long and their differences short
     piston = typical + float(total(share * (opd - typical)))
-    x, y, opd = x - middle[0], y - middle[1], opd - piston
+    x, y, opd = x - mean_x, y - mean_y, opd - piston
     xx, xy, yy, xw, yw = (float(total(share * p * q)) for p, q in ((x, x), (x, y), (y, y), (x, opd), (y, opd)))
     det = xx * yy - xy * xy
-    if not det > 0:
-        return _Fit(piston, (0.0, 0.0), middle)
-    return _Fit(piston, ((yy * xw - xy * yw) / det, (xx * yw - xy * xw) / det), middle)
+    slopes = ((yy * xw - xy * yw) / det, (xx * yw - xy * xw) / det) if det > 0 else (0.0, 0.0)
+    return _Fit(piston, slopes, (mean_x, mean_y))
 
 
 def _rms(values: Tensor, share: Tensor) -> float:
@@ -248,7 +252,7 @@ def _map(
         index = ((cell[1] + up) * cells + cell[0] + right).long().numpy()
         for k, part in enumerate((weight, weight * value)):
             sums[k] += np.bincount(index, part.numpy(), minlength=cells * cells)
-    weight, value = sums
-    opd_map = np.where(weight > 0, value / np.where(weight > 0, weight, 1.0), np.nan)
+    weights, values = sums
+    opd_map = np.where(weights > 0, values / np.where(weights > 0, weights, 1.0), np.nan)
     along_x, along_y = (s + pitch * np.arange(cells) for s in start)
     return along_x, along_y, opd_map.reshape(cells, cells)

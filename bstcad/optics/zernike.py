@@ -19,7 +19,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-POINTS_PER_CHUNK = 1 << 13  # points evaluated at a time, whose harmonics fit the cache
+POINTS_AT_A_TIME = 1 << 13  # points evaluated at a time, whose harmonics fit the cache
 Complex = tuple[Tensor, Tensor]  # real and imaginary part, apart since torch's complex numbers are slower
 Harmonic = tuple[Complex, Complex, Complex]  # V_n^m and its derivatives in x and in y
 
@@ -37,7 +37,7 @@ def series(coefficients: Sequence[float], x: Tensor, y: Tensor) -> tuple[Tensor,
 
     Differentiable in x and y.  The polynomials are also evaluated outside the disc, where they soon grow.
     """
-    chunks = (p.reshape(-1).split(POINTS_PER_CHUNK) for p in (x, y))
+    chunks = (p.reshape(-1).split(POINTS_AT_A_TIME) for p in (x, y))
     parts = [_series(coefficients, *chunk) for chunk in zip(*chunks, strict=True)]
     f, f_x, f_y = (torch.cat(part).view(x.shape) for part in zip(*parts, strict=True))
     return f, f_x, f_y

@@ -20,7 +20,7 @@ def by_the_usual_formula(surface, x, y):
     return (1 - torch.sqrt(1 - c * c * (x * x + y * y))) / (c + 1e-30), c * x, c * y
 
 
-LINES = {**irradiance.LEDGER, "lost through the sides": (Status.MISSED_FRONT,)}
+LINES = {**irradiance.LEDGER, "lost through the sides": Status.MISSED_FRONT}
 FAULTS = {
     "refraction has no cap": (
         interfaces, "MIN_COS_REFRACTION", 1e-30,

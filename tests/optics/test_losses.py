@@ -186,8 +186,7 @@ def test_a_coated_face_reflects_and_transmits_what_maxwell_says(media, polarisat
         wanted_r, wanted_t = by_maxwell((media[0], index, media[1]), angle, polarisation, thickness)
         assert wanted_r + wanted_t == pytest.approx(1, abs=EXACT)
         through = Transmission(*media, 587.6, polarisation, coating)
-        found = coated_reflectance(*media, *at, coating, 587.6, polarisation)
-        assert float(found) == pytest.approx(wanted_r, abs=EXACT)
+        assert float(coated_reflectance(through, coating, *at)) == pytest.approx(wanted_r, abs=EXACT)
         assert float(through.share(*at, NOWHERE)) == pytest.approx(wanted_t, abs=EXACT)
 
 

@@ -490,7 +490,7 @@ def simulate(
     rays = int(lines[:, COUNT].sum())
     box, tent, lines = (total.sum(0) for total in (box, tent, lines))
     flux = {"on target": float(lines[0]), "off target": float(lines[BESIDE] + lines[Status.TURNED_BACK])}
-    flux |= {line: float(sum(lines[reason] for reason in reasons)) for line, reasons in LEDGER.items()}
+    flux |= {line: float(lines[reason]) for line, reason in LEDGER.items()}
     flux |= {line: float(lines[k]) for line, k in _taken(lights[0][2]).items()}
     return torch.from_numpy(box), torch.from_numpy(tent), flux, rays
 
