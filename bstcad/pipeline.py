@@ -17,12 +17,10 @@ from bstcad.analysis.shape import thickness_range
 from bstcad.analysis.steepness import Steepness, needed_steepness
 from bstcad.baselines import integration, paper
 from bstcad.folder import Made
-from bstcad.optics.emitters import Emitter
 from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
 from bstcad.optics.reach import MAX_EXIT_ANGLE, grazing_of, spread_at, unreached
 from bstcad.optics.sides import as_pair
-from bstcad.optics.unfolding import image_screen
 from bstcad.report.record import CurvePoint, DesignCourse, StageRecord
 from bstcad.runs import processes
 from bstcad.scene.errors import SceneError
@@ -150,7 +148,9 @@ def design(
     lens = replace(lens.plain(), index=scene.index, losses=None)
     if scene.lens.front.fixed:  # tailoring may have used it in float32
         lens = replace(lens, front=scene.lens.front_surface)
-    steep = steepness(task.heaviest.source, lens, goals[0], sent=followed.transport)
+    sent, source = followed.transport, task.heaviest.source
+    at_back = sent.plane == "back"
+    steep = needed_steepness(source, lens, goals[0], x=sent.x, y=sent.y, origins=sent.source, at_back=at_back)
     making = _design_course(followed, driver.record, stopped, steep)
     return Made(
         resolved(scene, lens), scene.as_mounted(lens), goals, making, device=device, transport=followed.transport,
@@ -279,12 +279,6 @@ def _with_comparison(making: DesignCourse, task: Task, lens: Lens, before: int) 
     stage = StageRecord(COMPARISON_STAGE, time.perf_counter() - began, cpu_seconds=time.process_time() - cpu)
     stages = (*making.stages[:before], stage, *making.stages[before:])
     return replace(making, twins=comparison, stages=stages, seconds_total=making.seconds_total + stage.seconds)
-
-
-def steepness(source: Emitter, lens: Lens, goal: Goal, sent: TransportMap) -> Steepness:
-    """Return the slope of the last tailored face that the light of a goal needs, by the map of stage 1."""
-    at_back, screen = sent.plane == "back", image_screen(lens, goal.receiver)
-    return needed_steepness(source, lens, screen, goal.picture, x=sent.x, y=sent.y, places=sent.source, at_back=at_back)
 
 
 def _design_course(result: Stage1Result, record: DesignRecord, stopped: str, steep: Steepness) -> DesignCourse:

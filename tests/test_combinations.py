@@ -317,7 +317,7 @@ COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which f
     "tailoring.feasibility": {"TRIAL_CELLS": 24, "TRIAL_PIXELS": 32, "TRIAL_ITERATIONS": 20},
     "analysis.light": {"MOUNT_RAYS": 96, "MIN_MOUNT_RAYS": 16, "MARGIN_RAYS": 64, "NEEDED_RAYS": 65},
     "analysis.light.blur": {"__defaults__": (12,)},
-    "analysis.neglected_effects": {"FACE_POINTS": 24, "GHOST_RAYS": 32},
+    "analysis.neglected_effects": {"FACE_POINTS": 24, "GHOST_RAYS_PER_SIDE": 32},
     "analysis.shape": {"GRID_POINTS": 257},
     "app.preview": {"IMAGE_POINTS": 6, "TRANSPORT_CELLS": 16, "LEDGER_RAYS": 32, "SHAPE_POINTS": 33},
     "sweep.estimates": {

@@ -21,7 +21,7 @@ from bstcad.optics.irradiance import Screen
 
 # --- the end of the convergence curve ---------------------------------------------------------------------------------
 
-LAST_TENTH_RATIO = 1.1  # RRMSD over that at the end, below which it is "the last tenth of the error"
+LAST_TENTH_RATIO = 1.1  # RRMSD relative to its final value, below which the time counts for the last tenth of the error
 FITTED_FRACTION = 0.5  # last fraction of the time of tailoring to the irradiance, to which the power law is fitted
 MIN_FIT_POINTS = 5  # smallest number of points for a fit
 MIN_R_SQUARED = 0.9  # smallest R² of a line in logarithms that counts as a power law
@@ -41,7 +41,7 @@ class ConvergenceEnd:
 
     rrmsd: float  # RRMSD at the end
     last_tenth_seconds: float  # time since the RRMSD was last above LAST_TENTH_RATIO times its final value
-    last_tenth: float  # `last_tenth_seconds` over the time from the start to the end of the curve
+    last_tenth: float  # `last_tenth_seconds` divided by the time from the start to the end of the curve
     power: float | None  # exponent p, zero if the curve does not fall; None: too few points
     fit: float | None  # R² of the line in logarithms
     halving: float | None  # factor 2^(1/p) of the time; None: no line fits, or it is more than MAX_HALVING
@@ -100,7 +100,7 @@ def _fit_power(time: np.ndarray, values: np.ndarray) -> tuple[float | None, floa
 
 # --- parts of the target and octaves with the error -------------------------------------------------------------------
 
-RIM_RATIO = 64  # side of the target over the width of its rim
+RIM_RATIO = 64  # side of the target divided by the width of its rim
 EDGE_QUANTILE = 0.9  # quantile of the gradient above which a pixel is at an edge
 MIN_EDGE_GRADIENT = 0.02  # smallest gradient at an edge, per pixel, relative to the brightest pixel
 TONE_QUANTILE = 0.1  # quantile of the irradiance below which a pixel is dark; bright above 1 - TONE_QUANTILE
@@ -229,7 +229,7 @@ class ControlCells:
     def floor(self, finer: float = 1.0) -> float:
         """Return the RRMSD if each tile has as many of its lowest cosines as cells light it.
 
-        finer: factor of the number of control points a side.
+        finer: factor of the number of control points per side.
         """
         tiles, cells = (_tiles(picture) for picture in (self.target, self.a_pixel))
         energy = dctn(tiles, axes=(1, 2), norm="ortho").reshape(len(tiles), -1)[:, COARSE_TO_FINE] ** 2

@@ -84,8 +84,8 @@ def ray_map(source: Emitter, lens: Lens, plane: Receiver) -> tuple[np.ndarray, n
 
 # --- clear apertures needed -------------------------------------------------------------------------------------------
 
-NEEDED_RAYS = 513  # rays a side
-ROUND_RATIO = 1.01  # largest radius of the light over its half width and half height at which it counts as round
+NEEDED_RAYS = 513  # rays per side
+ROUND_RATIO = 1.01  # largest radius of the light, relative to its half width and half height, that counts as round
 EXTENT_POINTS = tuple((u, v) for u in (-1, 0, 1) for v in (-1, 0, 1))  # points of an extended source, in half extents
 FULL_APERTURE = 0.99  # extent of the light, relative to the clear aperture, from which on it fills the face
 
@@ -150,8 +150,8 @@ def rrmsd_of_ripple(channel: Channel, lens: Lens, screen: Screen, face: Literal[
 
 # --- light blocked by a mount -----------------------------------------------------------------------------------------
 
-MOUNT_RAYS = 512  # rays a side, divided among the channels
-MIN_MOUNT_RAYS = 48  # smallest number of rays a side for one channel
+MOUNT_RAYS = 512  # rays per side, divided among the channels
+MIN_MOUNT_RAYS = 48  # smallest number of rays per side for one channel
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ def _misses_opening(rays: Sequence[Rays], rim: Outline, planes: Iterable[float])
 
 # --- margins of the trace ---------------------------------------------------------------------------------------------
 
-MARGIN_RAYS = 512  # rays a side
+MARGIN_RAYS = 512  # rays per side
 
 
 @dataclass(frozen=True)
@@ -306,11 +306,10 @@ def finest_detail(source_image: float, lens: Lens, screen: Screen, of: str, assu
     nearer, image = MIN_DISTANCE_RATIO * max(sizes), source_image * pixel
     width, narrower = (detail_width(image * scale, pixel) for scale in (1.0, nearer / distance))
     gains = narrower < MAX_NEARER_RATIO * width and grows and not lens.behind
+    gain, unit = (nearer, narrower) if gains else (None, None), screen.plane.unit
     return FinestDetail(
-        width, image, pixel, distance, nearer_distance=nearer if gains else None,
-        nearer_width=narrower if gains else None,
-        of=of, assumed=assumed, unit=screen.plane.unit,
-    )  # fmt: skip
+        width, image, pixel, distance, nearer_distance=gain[0], nearer_width=gain[1], of=of, assumed=assumed, unit=unit
+    )
 
 
 def _pixel(screen: Screen) -> float:

@@ -26,6 +26,7 @@ import scipy.ndimage
 import torch
 from torch import Tensor
 
+from bstcad.analysis.cost import DARK_LEVEL
 from bstcad.optics import sampling
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen, landed_flux
@@ -36,16 +37,15 @@ from bstcad.optics.trace import clear_window, trace, trace_ghost
 from bstcad.optics.tubes import rays_to
 from bstcad.optics.unfolding import per_radian
 
-FACE_POINTS = 64  # points a side of the last face from which light is traced
-GHOST_RAYS, GHOST_SMOOTHING = 128, 0.7  # rays a side for a ghost; smoothing of its picture (cells)
-FIELD_CELLS = 24  # cells of the target a side, in which the fields are averaged
+FACE_POINTS = 64  # points per side of the last face from which light is traced
+GHOST_RAYS_PER_SIDE, GHOST_SMOOTHING = 128, 0.7  # rays per side for a ghost; smoothing of its picture (cells)
+FIELD_CELLS = 24  # cells per side of the target, in which the fields are averaged
 FIELD_SMOOTHING = (0.8, 2.0, 6.0, 24.0)  # smoothing of fields (cells), wider where light is scarce
 MIN_CELL_FLUX = 1e-4  # smoothed flux of a cell, relative to the mean, below which a field is unknown
-MIN_SHIFT = 1e-6  # shift up to which light counts as not moved (pixels)
-DARK_LEVEL = 0.01  # irradiance relative to the mean below which a pixel is dark
+MIN_LIGHT_SHIFT = 1e-6  # shift up to which light counts as not moved (pixels)
 HALF_SHARP_WIDTH = 1.3  # light of a control cell (pixels) at which edges are half as sharp, measured
 MAX_SHARPNESS = 0.75  # fraction of the jump at an edge that the finest cells make, measured on the templates
-MAX_PIXELS = 1 << 19  # largest number of pixels; of larger pictures some rows are sampled
+MAX_SAMPLED_PIXELS = 1 << 19  # largest number of pixels; of larger pictures some rows are sampled
 PADDING = 4  # dark pixels around a picture, within which the ringing of its spline ends
 AIRY_SIGMA = 0.376  # standard deviation of the Gaussian with the FWHM of a diffraction image, in λ L / D
 
@@ -67,7 +67,7 @@ class Reference:
     channel: Channel
     screen: Screen
     picture: np.ndarray  # flux in each pixel (rows, columns), row 0 = y max, of any sum
-    places: tuple[Tensor, Tensor]  # x and y of points of the last face (mm), (n, n) each
+    points: tuple[Tensor, Tensor]  # x and y of points of the last face (mm), (n, n) each
     pixel: np.ndarray  # landing points (column, row) of the light from these points, (2, n, n)
     flux: np.ndarray  # flux of this light, (n, n); zero where none lands
     through: np.ndarray  # transmission of the channel, (n, n)
@@ -82,21 +82,22 @@ class Reference:
 
         control_points: number in the finished lens, if `lens` is a coarser one.
         """
-        window = Rectangle(*(2 * half for half in lens.apertures[1].half_extent))
+        half_x, half_y = lens.apertures[1].half_extent
         for few in (32, FACE_POINTS):  # the first grid finds the lit part
+            window = Rectangle(2 * half_x, 2 * half_y)
             x, y = sampling.grid(window, few)
             landed, density = _trace_through(lens, channel, screen, (x, y))
             lit = landed.alive & lens.apertures[1].contains(x, y) & (density > 0)
             if not bool(lit.any()):
                 break
             sides = zip((x, y), (window.width, window.height), strict=True)
-            window = Rectangle(*(min(2 * (float(p.abs()[lit].max()) + side / few), side) for p, side in sides))
+            half_x, half_y = (min(float(p.abs()[lit].max()) + side / few, side / 2) for p, side in sides)
+        pixel, through = screen.pixels_of(landed.position).numpy(), _transmission(landed)
+        flux = torch.where(lit, density, torch.zeros_like(density)).numpy()
+        picture, count = np.asarray(picture, float), control_points or lens.back_net.heights.numel()
         return cls(
-            lens, channel, screen, np.asarray(picture, float), places=(x, y),
-            pixel=screen.pixels_of(landed.position).numpy(),
-            flux=torch.where(lit, density, torch.zeros_like(density)).numpy(),
-            through=_transmission(landed), control_points=control_points or lens.back_net.heights.numel(),
-        )  # fmt: skip
+            lens, channel, screen, picture, points=(x, y), pixel=pixel, flux=flux, through=through, control_points=count
+        )
 
     @cached_property
     def lit(self) -> bool:
@@ -125,7 +126,7 @@ class Reference:
 
     def _fields(self, channel: Channel) -> tuple[np.ndarray, np.ndarray]:
         """Return shift δ (2, …) in pixels and transmission w (…) of a channel, in cells of the target."""
-        landed, _ = _trace_through(self.lens, channel, self.screen, self.places)
+        landed, _ = _trace_through(self.lens, channel, self.screen, self.points)
         arrives = landed.alive.numpy()
         share = self._over_cells(np.where(arrives, _transmission(landed) / self.through, 0.0), self.flux)
         shift = np.where(arrives, self.screen.pixels_of(landed.position).numpy() - self.pixel, 0)
@@ -158,7 +159,7 @@ class Reference:
 
     def _lit_area(self) -> float:
         """Return the area of the last face that is lit (mm²)."""
-        cell = math.prod(float(p.max() - p.min()) / (p.shape[0] - 1) for p in self.places)
+        cell = math.prod(float(p.max() - p.min()) / (p.shape[0] - 1) for p in self.points)
         return (self.flux > 0).sum() * cell
 
     @torch.no_grad()
@@ -167,8 +168,8 @@ class Reference:
         if not self.lit:
             return None
         lens, source = channel.through(self.lens), channel.source
-        area = clear_window(source, lens)
-        rays = source.rays(*sampling.grid(area, GHOST_RAYS), lens.entrance.z, area.area / GHOST_RAYS**2)
+        area, n = clear_window(source, lens), GHOST_RAYS_PER_SIDE
+        rays = source.rays(*sampling.grid(area, n), lens.entrance.z, area.area / n**2)
         straight = float(landed_flux(trace(rays, lens, self.screen.plane)).sum())
         landed = self.screen.plane.land(trace_ghost(rays, lens)[0])
         flux = torch.where(landed.alive, landed.flux, torch.zeros_like(landed.flux)).numpy() / straight
@@ -210,7 +211,7 @@ class Spline:
     @classmethod
     def through(cls, picture: np.ndarray, grain: float) -> Spline:
         """Make the spline through the centres of the pixels; grain: width of the light of a control cell (pixels)."""
-        padded, step = np.pad(picture, PADDING), math.ceil(picture.size / MAX_PIXELS)
+        padded, step = np.pad(picture, PADDING), math.ceil(picture.size / MAX_SAMPLED_PIXELS)
         coefficients = scipy.ndimage.spline_filter(padded, 3)
         sharp = MAX_SHARPNESS / (1 + (grain / HALF_SHARP_WIDTH) ** 4)
         return cls(padded, coefficients, sharp, slice(step // 2, None, step))
@@ -225,10 +226,10 @@ class Spline:
         Light that leaves the picture is lost.
         """
         picture = self.padded[PADDING:-PADDING, PADDING:-PADDING]
-        if not np.abs(shift).max() > MIN_SHIFT:
+        if not np.abs(shift).max() > MIN_LIGHT_SHIFT:
             return self.rows(picture)
         across, down = (to_pixels(p, picture.shape) for p in shift)
-        rows, columns = np.indices(picture.shape, sparse=True)
+        rows, columns = np.ogrid[: picture.shape[0], : picture.shape[1]]
         at = [self.rows(p) + PADDING for p in (rows - down, columns - across)]
         smooth = scipy.ndimage.map_coordinates(self.coefficients, at, order=3, mode="constant", prefilter=False)
         stepped = scipy.ndimage.map_coordinates(self.padded, at, order=1, mode="constant")
@@ -263,11 +264,11 @@ def difference(changed: np.ndarray, before: np.ndarray) -> float:
 
 
 def _trace_through(
-    lens: Lens, channel: Channel, screen: Screen, places: tuple[Tensor, Tensor]
+    lens: Lens, channel: Channel, screen: Screen, points: tuple[Tensor, Tensor]
 ) -> tuple[Landed, Tensor]:
     """Trace light through points of the last face; return where it lands (flux 1 before losses), and its density."""
     lens, source = channel.through(lens), channel.source
-    p, q, _ = rays_to(source, lens, *places)
+    p, q, _ = rays_to(source, lens, *points)
     rays = source.rays(p, q, lens.entrance.z, 1.0)
     (p_x, p_y), (q_x, q_y) = (torch.gradient(c) for c in (p, q))
     density = rays.flux * (p_x * q_y - p_y * q_x).abs()

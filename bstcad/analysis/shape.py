@@ -21,12 +21,12 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.sampling import sample_rim
 
-GRID_POINTS = 1025  # points a side of the grid for thickness, and along a quarter of the rim
+GRID_POINTS = 1025  # points per side of the grid for thickness, and along a quarter of the rim
 HEIGHT_ROUNDING = 1e-13  # rounding of the heights, relative to the largest
 SMOOTH_RATIO = 2.0  # largest ratio of the slope energies of the two highest octaves of a net without ripple
 AT_BOUND = 0.97  # fraction of a bound above which a point counts as at the bound (the penalty begins at 0.99)
 MIN_CURVATURE, MAX_RADIUS = 1e-9, 1e9  # curvature below which a face is flat (1/mm), and its radius (mm)
-RIM_ROUNDING = 1e-9  # relative rounding of the outline, so that the last points of a net that ends there are inside
+OUTLINE_ROUNDING = 1e-9  # relative rounding of the outline, so that the last points of a net that ends there are inside
 
 
 def describe(lens: Lens, grid: int = GRID_POINTS) -> dict[str, float | None]:
@@ -84,12 +84,13 @@ def heights(lens: Lens, edge: np.ndarray | None = None) -> tuple[np.ndarray, np.
 
 
 def _sags(lens: Lens, x: Tensor, y: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    return tuple(surface.sag_and_slope(x, y)[0].numpy() for surface in (lens.front, lens.back))
+    return lens.front.sag_and_slope(x, y)[0].numpy(), lens.back.sag_and_slope(x, y)[0].numpy()
 
 
 def _points(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
     """Return x and y (mm) of 4 n points of the rim, and of an n x n grid inside the outline."""
-    return tuple(torch.cat(pair) for pair in zip(sample_rim(outline, n), inside(outline, n), strict=True))
+    x, y = (torch.cat(pair) for pair in zip(sample_rim(outline, n), inside(outline, n), strict=True))
+    return x, y
 
 
 def _points_in(polygon: np.ndarray) -> tuple[Tensor, Tensor]:
@@ -97,13 +98,12 @@ def _points_in(polygon: np.ndarray) -> tuple[Tensor, Tensor]:
     import shapely
 
     axes = (np.linspace(low, high, GRID_POINTS) for low, high in zip(polygon.min(0), polygon.max(0), strict=True))
-    x, y = (axis.ravel() for axis in np.meshgrid(*axes))
+    grid = [axis.ravel() for axis in np.meshgrid(*axes)]
     area = shapely.Polygon(polygon)
     shapely.prepare(area)
-    within = shapely.contains_xy(area, x, y)
-    return tuple(
-        torch.from_numpy(np.concatenate([corner, axis[within]])) for corner, axis in zip(polygon.T, (x, y), strict=True)
-    )
+    within = shapely.contains_xy(area, *grid)
+    x, y = (np.concatenate([corner, p[within]]) for corner, p in zip(polygon.T, grid, strict=True))
+    return torch.from_numpy(x), torch.from_numpy(y)
 
 
 def inside(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
@@ -145,11 +145,10 @@ def ripple(face: BSplineSurface) -> Ripple:
         [(2 - 2 * turn) / pitch**2 * (2 + turn) / 3 for turn, pitch in zip(turns, face.pitch, strict=True)],
     )
     squares = share * waves**2 / (fading**2).sum()
-    slopes = np.outer(along_x, of_y) + np.outer(of_x, along_y)
-    return Ripple(
-        math.sqrt(share) * scipy.fft.idctn(waves, norm="ortho"), math.sqrt((squares * np.outer(of_x, of_y)).sum()),
-        math.sqrt((squares * slopes).sum()), fading=math.sqrt((fading**2).mean()),
-    )  # fmt: skip
+    slope = math.sqrt((squares * (np.outer(along_x, of_y) + np.outer(of_x, along_y))).sum())
+    height = math.sqrt((squares * np.outer(of_x, of_y)).sum())
+    heights = math.sqrt(share) * scipy.fft.idctn(waves, norm="ortho")
+    return Ripple(heights, height, slope, fading=math.sqrt((fading**2).mean()))
 
 
 def slope_octaves(face: BSplineSurface) -> np.ndarray:
@@ -240,12 +239,9 @@ def survey(lens: Lens, concave: float | None = None, convex: float | None = None
     lens = lens.plain()
     back = lens.back_net
     x, y, along_x, along_y = _grid(back)
-    near = (
-        math.inf if concave is None else AT_BOUND * (1 / concave),
-        math.inf if convex is None else AT_BOUND * (1 / convex),
-        math.inf if slope is None else AT_BOUND * math.tan(math.radians(slope)),
-    )
-    limits, net = lens.outline.scaled(1 + RIM_ROUNDING).limits, back.heights.contiguous().numpy()
+    valleys, ridges = (math.inf if radius is None else AT_BOUND * (1 / radius) for radius in (concave, convex))
+    near = (valleys, ridges, math.inf if slope is None else AT_BOUND * math.tan(math.radians(slope)))
+    limits, net = lens.outline.scaled(1 + OUTLINE_ROUNDING).limits, back.heights.contiguous().numpy()
     found, place, count = spline.largest_bending(net, (along_x, along_y), (x, y), limits=limits, bounds=near)
     each = math.prod(back.pitch) / len(QUARTERS) ** 2 / lens.outline.area
     valley, ridge, steep = (
@@ -269,14 +265,15 @@ def _grid(back: BSplineSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
     The points lie at QUARTERS of each span; x and y are (spans, points), the weights (spans, points, 9).
     """
     spans = [torch.arange(count - 2) for count in back.shape]
-    x, y = (at.reshape(len(QUARTERS), -1).T.contiguous().numpy() for at in span_points(back, *spans, QUARTERS))
+    points = span_points(back, spans[0], spans[1], QUARTERS)
+    x, y = (at.reshape(len(QUARTERS), -1).T.contiguous().numpy() for at in points)
     scaled = []
     for span, count, pitch in zip(spans, back.shape, back.pitch, strict=True):
         by_quarter = [torch.stack([torch.stack(order) for order in weights(span, count, s)]) for s in QUARTERS]
         of_unit = torch.stack(by_quarter).permute(3, 0, 1, 2)  # (span, quarter, derivative, control point)
         scale = torch.tensor([1.0, 1 / pitch, 1 / pitch**2], dtype=torch.float64)[:, None]
         scaled.append((of_unit * scale).reshape(len(span), len(QUARTERS), 9).contiguous().numpy())
-    return x, y, *scaled
+    return x, y, scaled[0], scaled[1]
 
 
 def _radius(bend: Extreme) -> Extreme:

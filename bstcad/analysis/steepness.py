@@ -14,15 +14,17 @@ import numpy as np
 import torch
 
 from bstcad.optics.emitters import Emitter
+from bstcad.optics.goal import Goal
 from bstcad.optics.interfaces import intersect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.reach import normal_towards
 from bstcad.optics.trace import across
 from bstcad.optics.tubes import rays_to
+from bstcad.optics.unfolding import image_screen
 
 MAX_SLOPE_DEG = 70.0  # largest slope angle that tailoring makes (degrees); optics.reach has it as a tangent
-MAX_POINTS_A_SIDE = 65  # largest number of points a side
+MAX_POINTS_PER_SIDE = 65  # largest number of points per side
 
 
 @dataclass(frozen=True)
@@ -35,18 +37,17 @@ class Steepness:
 
 @torch.no_grad()
 def needed_steepness(
-    source: Emitter, lens: Lens, screen: Screen, picture: np.ndarray, *, x: np.ndarray, y: np.ndarray,
-    places: np.ndarray, at_back: bool = True,
-) -> Steepness:  # fmt: skip
-    """Return the steepness for light through `places` (c, r, 2) mm of the face to the points x (c,), y (r,) mm.
+    source: Emitter, lens: Lens, goal: Goal, x: np.ndarray, y: np.ndarray, origins: np.ndarray, at_back: bool = True
+) -> Steepness:
+    """Return the steepness for light through the points `origins` of the face to the points x, y of the goal.
 
-    screen: receiver, imaged through the surfaces behind the face (unfolding.imaged).  picture: target irradiance,
-    (rows, columns), row 0 = y max.  at_back False: the places are on the plane of the first vertex.
+    x (c,), y (r,): coordinates on the receiver (mm).  origins: (c, r, 2), x and y of points of the face (mm); at_back
+    False: of the plane through the first vertex.
     """
-    i, j = (np.unique(np.linspace(0, n - 1, min(n, MAX_POINTS_A_SIDE)).round().astype(int)) for n in (len(x), len(y)))
-    x, y, places = x[i], y[j], places[np.ix_(i, j)]
-    number, lens = lens.freeform[-1], lens.plain()
-    p, q = (torch.from_numpy(np.ascontiguousarray(places[..., k], dtype=float)) for k in (0, 1))
+    screen, number, lens = image_screen(lens, goal.receiver), lens.freeform[-1], lens.plain()
+    i, j = (np.unique(np.linspace(0, n - 1, min(n, MAX_POINTS_PER_SIDE)).round().astype(int)) for n in (len(x), len(y)))
+    x, y, origins = x[i], y[j], origins[np.ix_(i, j)]
+    p, q = (torch.from_numpy(np.ascontiguousarray(origins[..., k], dtype=float)) for k in (0, 1))
     face = lens.interfaces[number]
     if at_back:
         _, _, at = rays_to(source, lens, p, q, number=number)
@@ -61,7 +62,7 @@ def needed_steepness(
     angle = torch.rad2deg(torch.atan2(torch.hypot(normal[0], normal[1]), normal[2]))
     limit = -1.0 if face.law.reverses else min(eta, 1 / eta)  # cosine of the largest deflection
     possible = (at.direction * out).sum(0) > limit
-    wanted = torch.from_numpy(_at_corners(picture, screen, x, y))
+    wanted = torch.from_numpy(_at_corners(goal.picture, screen, x, y))
     flux = torch.where(at.alive & possible, wanted, torch.zeros_like(angle))
     if not float(flux.sum()) > 0:
         return Steepness(0.0, 0.0)

@@ -21,8 +21,8 @@ U_P = ΔE / E_max                                 plateau uniformity, ΔE the fu
 s_ηε = (A_ε - A_η) / A_ε, ε < η                  edge steepness: 0 if vertical
 efficiency                                       fraction of all light inside the outline; not in the standard
 
-At η = 0.9 the flatness is at least 0.9 and the uniformity at most 0.06 (but for pixels brighter than E_max).  Read them
-with the fractional power, or at a lower η.  Hot pixels count in powers, averages and uniformity.
+At η = 0.9 the flatness is at least 0.9 and, except for pixels brighter than E_max, the uniformity at most 0.06.  Read
+them with the fractional power, or at a lower η.  Hot pixels count in powers, averages and uniformity.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ from bstcad.optics.bspline import BSplineSurface, evaluate, net_gradient
 from bstcad.optics.interfaces import TANGENCY_TOLERANCE, Law
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays
-from bstcad.optics.receivers import Receiver
+from bstcad.optics.receivers import Receiver, dot
 from bstcad.optics.sides import Sides, as_pair
 from bstcad.optics.trace import clear_window, to_first_net
 from bstcad.optics.unfolding import image_from_last_net
@@ -42,7 +42,7 @@ from bstcad.tailoring.slope_fit import conjugate_gradients, monomials, wanted_sl
 from bstcad.transport.mapping import Mapping
 
 MAX_STARTS = 3  # maximum number of initial points, each moved along +z as far as the distance from the front requires
-POINTS_PER_CELL = 4  # points a side of a control cell that the coarser nets are fitted to; the last is fitted to all
+FITTED_POINTS_PER_CELL = 4  # points per side of a control cell to which the coarser nets are fitted; the last: all
 # Fits of the coarsest net, the nets in between and the last: weight of the second differences relative to heights,
 # conjugate-gradient iterations, and degree of a polynomial that is fitted first.  The first fit extrapolates smoothly
 # where no light falls; the last follows the points.
@@ -85,16 +85,12 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
     for _ in range(MAX_STARTS):
         start = exact.back.z
         points = march(coming, aim, plane, law=exact.last_freeform.law, z=start, first=first)
-        back = fit_net(exact.back_net, points, lit_points(points, coming, exact), knobs.levels)
+        lit = points.reached & (coming.flux > 0) & exact.apertures[1].contains(*points.position[:2])
+        back = fit_net(exact.back_net, points, lit, knobs.levels)
         exact = place_back(exact.with_back(back), z, task.min_thickness)
         if exact.back.z == start:
             break
     return lens.with_back(replace(exact.back_net, heights=exact.back_net.heights.to(lens.back_net.heights)))
-
-
-def lit_points(points: SurfacePoints, coming: Rays, lens: Lens) -> Tensor:
-    """Return True for points that light meets inside the clear aperture."""
-    return points.reached & (coming.flux > 0) & lens.apertures[1].contains(*points.position[:2])
 
 
 @torch.no_grad()
@@ -166,9 +162,9 @@ class _Grid:
 
     def meet(self, point: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
         """Return (intersections of rays with planes of these normals through points (3, rays, lines) mm, hit)."""
-        along = _dot(normal, self.direction)
-        ok = self.rays.sense * along > TANGENCY_TOLERANCE * torch.sqrt(_dot(normal, normal))
-        path = _dot(normal, point - self.origin) / torch.where(ok, along, torch.ones_like(along))
+        along = dot(normal, self.direction)
+        ok = self.rays.sense * along > TANGENCY_TOLERANCE * torch.sqrt(dot(normal, normal))
+        path = dot(normal, point - self.origin) / torch.where(ok, along, torch.ones_like(along))
         return torch.where(ok, self.origin + path * self.direction, point), ok
 
 
@@ -190,10 +186,6 @@ def _outwards(grid: _Grid, position: Tensor, reached: Tensor, plane: Receiver, l
     return SurfacePoints(points, all_reached)
 
 
-def _dot(a: Tensor, b: Tensor) -> Tensor:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
 @torch.no_grad()
 def fit_net(surface: BSplineSurface, points: SurfacePoints, used: Tensor, levels: tuple[Sides, ...]) -> BSplineSurface:
     """Fit nets by least squares, min Σ |h(x, y) - z|² over the points used, (n, n) bool, one level after another.
@@ -206,7 +198,7 @@ def fit_net(surface: BSplineSurface, points: SurfacePoints, used: Tensor, levels
     surface = replace(surface, heights=torch.zeros_like(surface.heights))
     for net, (bending, count, degree) in zip(nets, fits, strict=True):
         m = max(as_pair(net))
-        stride = 1 if bending == FINEST_FIT[0] else max(1, n // (POINTS_PER_CELL * m))
+        stride = 1 if bending == FINEST_FIT[0] else max(1, n // (FITTED_POINTS_PER_CELL * m))
         sampled = used[::stride, ::stride]
         x, y, z = (p[::stride, ::stride][sampled] for p in points.position)
         cells = math.prod(points * stride / n for points in as_pair(net))  # cells of the net per point
@@ -233,12 +225,10 @@ def fit_heights(
         terms = [torch.ones_like(h), *monomials(surface, degree)]
         h = with_polynomial(h, terms, lambda h: evaluate(h, u, v)[:1], wanted=(z,), weight=torch.ones_like(z))
     residual = normal_equations(z - evaluate(h, u, v)[0]) - bending * bending_gradient(h)
-    return replace(
-        surface,
-        heights=conjugate_gradients(
-            lambda p: normal_equations(evaluate(p, u, v)[0]) + bending * bending_gradient(p), h, residual, count
-        ),
+    h = conjugate_gradients(
+        lambda p: normal_equations(evaluate(p, u, v)[0]) + bending * bending_gradient(p), h, residual, count
     )
+    return replace(surface, heights=h)
 
 
 def bending_gradient(h: Tensor) -> Tensor:

@@ -1,14 +1,14 @@
 """The procedure of the paper: both stages by Adam on raw control points (Wang et al. 2023, sections 2.3 and 3).
 
 It is the baseline of the other qualities.  Where the paper gives no number, the choice is stated here or in quality.py:
-steps a level, learning rates that fall to zero in each level, and the learning rate of stage 2.
+steps per level, learning rates that fall to zero in each level, and the learning rate of stage 2.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -31,12 +31,12 @@ from bstcad.tailoring.run import Parameters, StageStep, Task
 from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Mapping
 
-STAGE1_RATES = {33: 0.02, 129: 0.004, 513: 0.008}  # mm a step, by control points a side (section 3.2)
-FRONT_RATES = {  # change of the front's parameters a step
+STAGE1_RATES = {33: 0.02, 129: 0.004, 513: 0.008}  # mm per step, by control points per side (section 3.2)
+FRONT_RATES = {  # change of the front's parameters per step
     "curvature": 0.001,  # 1/mm (section 3.2)
     "conic_constant": 0.02,  # chosen here, since the fronts of the paper are spheres
 }
-STAGE2_RATE = 2e-4  # mm a step; chosen here, since the paper does not state it
+STAGE2_RATE = 2e-4  # mm per step; chosen here, since the paper does not state it
 MAX_RAYS_PER_CONTROL_POINT = 8  # rays per control point in each direction, limited to save rays on the coarsest net
 
 
@@ -64,17 +64,12 @@ def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Stage
         lens = lens.refined(knobs.levels[level])
         begun, best = Parameters.of(lens), Best()
         for reached in _on_level(task, lens, mapping, area=area, state=state):
-            best, leave, done, total = reached.best, None, level * each, each * len(knobs.levels)
-            text = f"landing error {best.merit**0.5:.3f} mm RMS"
-            if reached.state is not None:
-                leave = Level(level, mapping, begun, best=best, search=reached.state)
-            yield StageStep(
-                partial(_improved, lens, best, task.free, knobs.levels[-1]),
-                leave,
-                mapping,
-                progress=None if reached.skipped else ("stage 1", done + best.evaluations, total, text),
-                skipped=reached.skipped,
-            )
+            best, search = reached.best, reached.state
+            resumable = None if search is None else Level(level, mapping, begun, best=best, search=search)
+            finish = partial(_improved, lens, best, task.free, knobs.levels[-1])
+            text, count = f"landing error {best.merit**0.5:.3f} mm RMS", level * each + best.evaluations
+            progress = None if reached.skipped else ("stage 1", count, each * len(knobs.levels), text)
+            yield StageStep(finish, resumable, mapping, progress=progress, skipped=reached.skipped)
         lens, state = _improved(lens, best, task.free, knobs.levels[level]), None
     yield StageStep(partial(lens.refined, knobs.levels[-1]), mapping=mapping)
 
@@ -109,19 +104,14 @@ def _improved(lens: Lens, best: Best, free: tuple[str, ...], net: Sides) -> Lens
 
 def transport(task: Task, lens: Lens) -> Mapping:
     """Return the map from the front's vertex plane to the target, for a blank lens."""
-    knobs, goal = task.knobs, task.goals[0]
+    source, goal = task.heaviest.source, task.goals[0]
+    n, count = task.knobs.transport_grid, task.knobs.transport_iterations
 
     def progress(s: TransportStep) -> None:
-        task.progress("transport", s.iteration, knobs.transport_iterations, f"mass error {s.mass_error:.4f}")
+        task.progress("transport", s.iteration, count, f"mass error {s.mass_error:.4f}")
 
     return slope_map.map_to_target(
-        task.heaviest.source,
-        lens,
-        goal.picture,
-        screen=goal.receiver,
-        n=knobs.transport_grid,
-        iterations=knobs.transport_iterations,
-        progress=progress,
+        source, lens, goal.picture, screen=goal.receiver, n=n, iterations=count, progress=progress
     )
 
 
@@ -178,28 +168,23 @@ def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[S
     if state is None:
         yield StageStep(lambda: lens)
     for reached in tailor_to_irradiance(start, bundles, merit, steps=knobs.stage2_iterations, state=state):
-        best = reached.best
-        text = f"RRMSD {best.latest:.4f}"
-        lens = with_parameters(start, [reached.parameters[0]])
-        yield StageStep(
-            lambda lens=lens: lens,
-            None if reached.state is None else RaySearch(Parameters.of(start), best, reached.state),
-            progress=None if reached.skipped else ("stage 2", best.evaluations, knobs.stage2_iterations, text),
-            rrmsd=None if reached.skipped else best.latest,
-            skipped=reached.skipped,
-            part="stage 2",
-        )
+        best, lens = reached.best, with_parameters(start, [reached.parameters[0]])
+        resumable = None if reached.state is None else RaySearch(Parameters.of(start), best, reached.state)
+        step = StageStep(lambda lens=lens: lens, resumable, skipped=reached.skipped, part="stage 2")
+        if not reached.skipped:
+            progress = "stage 2", best.evaluations, knobs.stage2_iterations, f"RRMSD {best.latest:.4f}"
+            step = replace(step, progress=progress, rrmsd=best.latest)
+        yield step
     judged = task.rrmsd(lens)
     yield StageStep(lambda: lens, rays_rrmsd=judged, part="stage 2", ends=True, reason="evaluations")
 
 
 def random_bundles(channels: tuple[Channel, ...], lens: Lens, count: int, seed: int) -> tuple[Rays, ...]:
     """Return `count` independent random rays of each channel through the clear part of the vertex plane."""
-    like = {"dtype": lens.like.dtype, "device": lens.like.device}
 
     def bundle(channel: Channel) -> Rays:
         area = clear_window(channel.source, channel.through(lens))
-        x, y = (t.to(**like) for t in sampling.random(area, count, seed))
+        x, y = (t.to(lens.like) for t in sampling.random(area, count, seed))
         return channel.source.rays(x, y, lens.entrance.z, area.area / count)
 
     return tuple(map(bundle, channels))

@@ -136,7 +136,7 @@ class TestPictures:
 
     def test_of_a_large_picture_some_rows_tell(self, monkeypatch):
         whole = difference(moved(checks(), 0.5, 0.5), checks())
-        monkeypatch.setattr(neglected_effects, "MAX_PIXELS", 48 * 64 // 3)
+        monkeypatch.setattr(neglected_effects, "MAX_SAMPLED_PIXELS", 48 * 64 // 3)
         some = Spline.through(checks(), SMOOTH).rows(checks())
         assert some.shape == (16, 64)
         assert difference(moved(checks(), 0.5, 0.5), some) == pytest.approx(whole, rel=0.05)

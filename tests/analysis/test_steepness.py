@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bstcad.analysis.steepness import MAX_SLOPE_DEG, needed_steepness
+from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
@@ -14,7 +15,7 @@ from bstcad.optics.surfaces import Recess, Sphere
 from tests.lenses import net
 
 N, HEIGHT, FAR, PIXELS = 1.5, 15.0, 1e7, 40
-HALF = 18.0  # mm, of the places on the flat back: up to 50 degrees along x, 60 in the corners
+HALF = 18.0  # mm, of the points on the flat back: up to 50 degrees along x, 60 in the corners
 LENS = Lens(
     Recess(Sphere(12.0, -1 / 12), Circle(11.0)),
     net(z=HEIGHT, half=60.0), Circle(28.0), N,
@@ -27,9 +28,10 @@ def found(half, at_back=True):
     screen = Screen(FAR, (-half, half), (-half, half), PIXELS)
     ends = np.linspace(-1, 1, PIXELS + 1)
     share = np.stack(np.meshgrid(ends, ends, indexing="ij"), axis=-1)
-    places = HALF * share * (1.0 if at_back else 12.0 / HEIGHT)  # the same rays on the plane of the dome's vertex
+    origins = HALF * share * (1.0 if at_back else 12.0 / HEIGHT)  # the same rays on the plane of the dome's vertex
     x = y = half * ends
-    return share, needed_steepness(Point(), LENS, screen, EVEN, x=x, y=y, places=places, at_back=at_back)
+    goal = Goal("target", screen, EVEN)
+    return share, needed_steepness(Point(), LENS, goal, x=x, y=y, origins=origins, at_back=at_back)
 
 
 @pytest.mark.parametrize("at_back", [True, False])
@@ -53,6 +55,6 @@ def test_light_that_goes_straight_on_needs_no_more_than_its_own_angle():
 def test_a_dark_target_needs_nothing():
     screen = Screen(FAR, (-1.0, 1.0), (-1.0, 1.0), PIXELS)
     ends = np.linspace(-1, 1, PIXELS + 1)
-    places = np.zeros((PIXELS + 1, PIXELS + 1, 2))
-    none = needed_steepness(Point(), LENS, screen, 0 * EVEN, x=ends, y=ends, places=places)
+    origins = np.zeros((PIXELS + 1, PIXELS + 1, 2))
+    none = needed_steepness(Point(), LENS, Goal("target", screen, 0 * EVEN), x=ends, y=ends, origins=origins)
     assert none.share == none.steepest == 0.0
