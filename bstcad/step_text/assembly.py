@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bstcad.step_text.entities import REAL, Entities, damaged
+from bstcad.step_text.entities import REAL, Entities, damaged, required
 from bstcad.step_text.placement import Placement, compose
 
-MAX_DEPTH = 100  # largest number of nested representations between a part and the whole
-SCALE_TOLERANCE = 1e-12  # largest deviation of a scale from 1
+MAX_ASSEMBLY_DEPTH = 100  # largest number of nested representations between a part and the whole
+UNIT_SCALE_TOLERANCE = 1e-12  # largest deviation of a scale from 1
 Z, X = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
 NAMES = r"(?:'\d*'|\$),(?:'\d*'|\$)"  # pattern of an entity's name and description
 DIRECTION = re.compile(rf"\('\d*',\(({REAL}),({REAL}),({REAL})\)\)")
@@ -66,12 +66,13 @@ def _paths(home: str, links: dict[str, list[Link]], seen: frozenset[str]) -> lis
     same = _equal_representations(home, links)
     if not same.isdisjoint(seen):
         raise damaged(f"representation #{home} is part of itself")
-    if len(seen) > MAX_DEPTH:
-        raise ValueError(f"its assembly has more than {MAX_DEPTH} levels; export the lens alone")
-    up = [link for name in sorted(same) for link in links.get(name, []) if link.placement is not None]
+    if len(seen) > MAX_ASSEMBLY_DEPTH:
+        raise ValueError(f"its assembly has more than {MAX_ASSEMBLY_DEPTH} levels; export the lens alone")
+    around = [link for name in sorted(same) for link in links.get(name, [])]
+    up = [(link.parent, link.placement) for link in around if link.placement is not None]
     paths: list[list[Placement]] = [] if up else [[]]
-    for link in up:
-        paths += [[*path, link.placement] for path in _paths(link.parent, links, seen | same)]
+    for parent, placement in up:
+        paths += [[*path, placement] for path in _paths(parent, links, seen | same)]
         if len(paths) > 1:
             break
     return paths
@@ -101,7 +102,7 @@ def _links(items: dict[str, list[str]], entities: Entities) -> Iterator[tuple[st
         plain = kind == "SHAPE_REPRESENTATION_RELATIONSHIP"
         if not plain and not (kind == "COMPLEX" and "SHAPE_REPRESENTATION_RELATIONSHIP(" in body):
             continue
-        first, second = RELATED.search(body).groups()
+        first, second = required(RELATED.search(body)).groups()
         transformed = TRANSFORMED.search(body)
         if transformed is None:
             yield first, Link(second, None)
@@ -154,11 +155,11 @@ def _frame(name: str, entities: Entities) -> Placement:
     kind, body = entities.bodies[name]
     try:
         if kind == "AXIS2_PLACEMENT_3D":
-            location, axis, reference = AXES.fullmatch(body).groups()
+            location, axis, reference = required(AXES.fullmatch(body)).groups()
             return _axes(location, axis, reference, entities)
         if kind == "CARTESIAN_TRANSFORMATION_OPERATOR_3D":
-            first, second, location, scale, third = OPERATOR.fullmatch(body).groups()
-            if scale not in (None, "$") and not abs(float(scale) - 1) <= SCALE_TOLERANCE:
+            first, second, location, scale, third = required(OPERATOR.fullmatch(body)).groups()
+            if scale not in (None, "$") and not abs(float(scale) - 1) <= UNIT_SCALE_TOLERANCE:
                 raise ValueError(f"it scales the lens by {float(scale):.6g}")
             found = _axes(location, third, first, entities)
             if second and not _direction(second, entities) @ found.rotation[:, 1] > 0:
@@ -190,4 +191,4 @@ def _pair(name: str, entities: Entities) -> list[str]:
 
 
 def _direction(name: str, entities: Entities) -> np.ndarray:
-    return np.array(DIRECTION.fullmatch(entities.bodies[name][1]).groups(), dtype=np.float64)
+    return np.array(required(DIRECTION.fullmatch(entities.bodies[name][1])).groups(), dtype=np.float64)

@@ -16,26 +16,26 @@ import numpy as np
 from bstcad.runs.files import one_line
 
 MAX_COORDINATE = 1e12  # largest coordinate of a point (mm); a target may be 1e8 mm away
-MAX_DIGITS = 64  # largest number of characters of a number; a double has 17 digits, a sign and an exponent
+MAX_NUMBER_LENGTH = 64  # largest number of characters of a number; a double has 17 digits, a sign and an exponent
 
-NAME = r"[1-9]\d{0,17}"  # pattern of an entity's number, which fits into 64 bits
+ENTITY = r"[1-9]\d{0,17}"  # pattern of an entity's number, which fits into 64 bits
 REAL = r"[-+]?\d+\.\d*(?:E[-+]?\d+)?"
-COORDINATE = rf"[-+]?\d{{1,{MAX_DIGITS}}}+\.\d{{0,{MAX_DIGITS}}}+(?:E[-+]?\d{{1,4}}+)?"
+COORDINATE = rf"[-+]?\d{{1,{MAX_NUMBER_LENGTH}}}+\.\d{{0,{MAX_NUMBER_LENGTH}}}+(?:E[-+]?\d{{1,4}}+)?"
 BLANKS = bytes(code for code in range(256) if chr(code).isspace())
 STRING = re.compile(  # text and empty strings, then one string or comment: few calls of the replacing function
     r"((?:[^'/]++|''(?!')|/(?!\*))*+)('[^']*(?:''[^']*)*'|/\*.*?(?:\*/|\Z)|'|\Z)", re.DOTALL
 )
-POINT = re.compile(rf"(?<=;)#({NAME})=CARTESIAN_POINT\('\d*',\(({COORDINATE},{COORDINATE},{COORDINATE})\)\);")
+POINT_TEXT = re.compile(rf"(?<=;)#({ENTITY})=CARTESIAN_POINT\('\d*',\(({COORDINATE},{COORDINATE},{COORDINATE})\)\);")
 POINT_ROWS = re.compile(  # consecutive points as OCC writes them: nine tenths of a file, which need no further check
     rf"(?<=;\n)((?:#[1-9]\d{{0,14}}+ = CARTESIAN_POINT\('',\({COORDINATE},\s*+{COORDINATE},\s*+{COORDINATE}\)\);\n)++)"
 )
 POINTS_MARK = "\0"  # character that replaces consecutive points in the text
-STATEMENT = re.compile(rf"#({NAME})=([A-Z][A-Z_0-9]*)?(\(.*\))", re.DOTALL)
+STATEMENT = re.compile(rf"#({ENTITY})=([A-Z][A-Z_0-9]*)?(\(.*\))", re.DOTALL)
 TOKENS = re.compile(  # tokens without blanks: separators, references, numbers, strings, enumerations, keywords
     r"[(),;]++|(?:#\d{1,20}+,)++|#\d{1,20}+(?=[)=])=?|'\d*+'|\.[A-Z_0-9]++\.|[$*](?=[,)])|!?[A-Z_][A-Z_0-9]{0,99}+(?=\()"
     r"|[-+]?\d{1,99}+(?:\.\d{0,99}+(?:[Ee][-+]?\d{1,9}+)?)?(?=[,)])|\"[0-9A-F]*+\""
 )  # each is bounded, or begins with a character that it cannot contain: the time is proportional to the text
-LONG_NUMBER = re.compile(rf"(?<=[(,])[-+.\d][-+.\dEe]{{{MAX_DIGITS},}}")
+LONG_NUMBER = re.compile(rf"(?<=[(,])[-+.\d][-+.\dEe]{{{MAX_NUMBER_LENGTH},}}")
 HUGE_NUMBER = re.compile(r"(?<=[(,])[-+]?\d++\.\d*+[Ee]\+?\d{3,}+")  # number of at least 1e100
 
 
@@ -58,7 +58,7 @@ class Entities:
 
     def string(self, number: str, index: int) -> str:
         """Return the first (index 0) or second (1) attribute of an entity in one line; "" if it is no string."""
-        attributes = re.match(r"\((?:'(\d*)')?(?:,'(\d*)')?", self.bodies[number][1]).groups()
+        attributes = required(re.match(r"\((?:'(\d*)')?(?:,'(\d*)')?", self.bodies[number][1])).groups()
         return decode(self.strings[int(attributes[index])]) if attributes[index] else ""
 
     def points(self, numbers: np.ndarray) -> np.ndarray:
@@ -101,11 +101,11 @@ def read_entities(text: str) -> tuple[str, Entities]:
     written = "".join(parts[1::2])[1:-4].replace(" = CARTESIAN_POINT('',(", ",").replace("));\n#", ",")
     table = np.fromstring(written, dtype=np.float64, sep=",").reshape(-1, 4)  # numbers below 1e15 are exact
     section = data[start + len("DATA") : end]  # begins with the semicolon
-    parts = POINT.split(section.replace(POINTS_MARK, "") if written else section)
+    parts = POINT_TEXT.split(section.replace(POINTS_MARK, "") if written else section)
     rest, names, values = "".join(parts[::3]), parts[1::3], parts[2::3]
     *texts, tail = rest[1:].split(";")
-    hits = [STATEMENT.fullmatch(each) for each in texts]
-    if tail or not hits or None in hits:
+    hits = [hit for each in texts if (hit := STATEMENT.fullmatch(each))]
+    if tail or not hits or len(hits) < len(texts):
         raise damaged("a statement is no entity")
     _check_tokens(rest, hits)
     numbers = np.concatenate([table[:, 0].astype(np.int64), np.fromstring(",".join(names), dtype=np.int64, sep=",")])
@@ -120,10 +120,17 @@ def read_entities(text: str) -> tuple[str, Entities]:
     if not np.isfinite(xyz).all():
         raise ValueError("a CARTESIAN_POINT is not finite; write the file again")
     if np.abs(xyz).max(initial=0.0) > MAX_COORDINATE:
-        raise ValueError(f"a CARTESIAN_POINT is over {MAX_COORDINATE:g} away; write the file again")
+        raise ValueError(f"a CARTESIAN_POINT has a coordinate above {MAX_COORDINATE:g}; write the file again")
     order = np.argsort(numbers)
     bodies = {hit[1]: (hit[2] or "COMPLEX", hit[3]) for hit in hits}
     return data, Entities(bodies, strings, numbers[order], xyz[order])
+
+
+def required(hit: re.Match[str] | None) -> re.Match[str]:
+    """Return the match of an entity's text; LookupError if it has another form."""
+    if hit is None:
+        raise LookupError
+    return hit
 
 
 def damaged(fault: str) -> ValueError:
@@ -133,13 +140,10 @@ def damaged(fault: str) -> ValueError:
 
 def decode(string: str) -> str:
     """Decode a string of Part 21 (without its quotes) into one line of text."""
-    string = re.sub(r"[\r\n]", "", string).replace("''", "'")
-    string = re.sub(
-        r"\\X2\\((?:[0-9A-F]{4})*)\\X0\\",
-        lambda hit: bytes.fromhex(hit.group(1)).decode("utf-16-be", "replace"),
-        string,
-    )
-    return one_line(re.sub(r"\\X\\([0-9A-F]{2})", lambda hit: chr(int(hit.group(1), 16)), string))
+    text = re.sub(r"[\r\n]", "", string).replace("''", "'")
+    wide, byte = re.compile(r"\\X2\\((?:[0-9A-F]{4})*)\\X0\\"), re.compile(r"\\X\\([0-9A-F]{2})")
+    text = wide.sub(lambda hit: bytes.fromhex(hit[1]).decode("utf-16-be", "replace"), text)
+    return one_line(byte.sub(lambda hit: chr(int(hit[1], 16)), text))
 
 
 def _check_tokens(rest: str, hits: Sequence[re.Match[str]]) -> None:
@@ -150,7 +154,7 @@ def _check_tokens(rest: str, hits: Sequence[re.Match[str]]) -> None:
         atom = next(atoms, "its text")
         statement = f"statement #{number} = {kind or 'COMPLEX'}"
         raise damaged(f"{statement} is malformed: {_shorten(atom)!r} is no number or word of STEP")
-    for pattern, fault in ((LONG_NUMBER, f"has over {MAX_DIGITS} characters"), (HUGE_NUMBER, "is not finite")):
+    for pattern, fault in ((LONG_NUMBER, f"exceeds {MAX_NUMBER_LENGTH} characters"), (HUGE_NUMBER, "is not finite")):
         for found in pattern.finditer(rest):
             if pattern is LONG_NUMBER or not math.isfinite(float(found[0])):
                 number = rest[: found.start()].rpartition(";")[2].partition("(")[0].replace("=", " = ")

@@ -24,7 +24,7 @@ from bstcad.runs import files
 from bstcad.runs.files import one_line
 from bstcad.step_text import beginning
 from bstcad.step_text.assembly import placement_of, products_of
-from bstcad.step_text.entities import NAME, REAL, Entities, damaged, read_entities
+from bstcad.step_text.entities import ENTITY, REAL, Entities, damaged, read_entities, required
 from bstcad.step_text.placement import Placement, identity
 
 MAX_BYTES = 600_000_000  # largest file (bytes): 2049 x 2049 control points of 130 bytes each, with references to them
@@ -34,7 +34,7 @@ CONIC_NET = 9  # control points of a conic or a nearly flat sphere; a freeform f
 REALS = rf"{REAL}(?:,{REAL})*"
 COUNTS = r"\d{1,9}(?:,\d{1,9})*"
 FLAG = r"\.([TFU])\."
-REFERENCES = re.compile(rf"#{NAME}(?:,#{NAME})*")
+REFERENCES = re.compile(rf"#{ENTITY}(?:,#{ENTITY})*")
 RULED = re.compile(r"\d+,1,")  # degrees of a ruled wall: 1 in v
 SURFACE = re.compile(
     rf"(\d{{1,9}}),(\d{{1,9}}),\(\((.*?)\)\),\.\w+\.,{FLAG},{FLAG},{FLAG},"
@@ -44,7 +44,7 @@ VALIDATION, MATERIAL = "geometric validation property", "material property"
 PREFIXES = {"$": 1.0, ".MICRO.": 1e-6, ".MILLI.": 1e-3, ".CENTI.": 1e-2, ".DECI.": 1e-1, ".KILO.": 1e3}
 UNITS = {"METRE": 1e3, "GRAM": 1.0}  # SI units in mm and g
 PER_CM3 = 1e3  # density of 1 g/mm³ in g/cm³
-UNKNOWN = math.nan  # value of a number that cannot be read or has an unknown unit: its check fails
+UNKNOWN_VALUE = math.nan  # value of a number that cannot be read or has an unknown unit: its check fails
 NUMBER = r"[-+]?\d+(?:\.\d*(?:E[-+]?\d+)?)?"
 UNREADABLE = (LookupError, AttributeError, TypeError, ArithmeticError)  # errors of a missing or malformed entity
 
@@ -218,12 +218,12 @@ def _units(quantity: str, entities: Entities) -> dict[str, str]:
 
 def _unit_name(body: str, entities: Entities) -> str:
     if "CONVERSION_BASED_UNIT" in body:  # an inch
-        index = re.search(r"CONVERSION_BASED_UNIT\('(\d+)'", body)[1]
+        index = required(re.search(r"CONVERSION_BASED_UNIT\('(\d+)'", body))[1]
         name = one_line(entities.strings[int(index)].lower()[:40])
         return f"{name} by a factor of its own" if "metre" in name or "radian" in name else name
     if body.count("SI_UNIT(") != 1:
         raise damaged("a unit has no kind, or two kinds")
-    prefix, unit = re.search(r"SI_UNIT\((\.\w+\.|\$),\.(\w+)\.\)", body).groups()
+    prefix, unit = required(re.search(r"SI_UNIT\((\.\w+\.|\$),\.(\w+)\.\)", body)).groups()
     return (prefix.strip(".$") + unit).lower()[:40]
 
 
@@ -254,14 +254,14 @@ def _shell_faces(entities: Entities) -> list[list[str]]:
 
 def _reference_lists(kind: str, entities: Entities) -> dict[str, list[str]]:
     """Return the list of references at the beginning of each entity of a kind."""
-    lists = {name: re.match(r"\('\d*',\(([#\d,]*)\)", body) for name, body in entities.of(kind).items()}
+    lists = {name: required(re.match(r"\('\d*',\(([#\d,]*)\)", body)) for name, body in entities.of(kind).items()}
     return {name: re.findall(r"\d+", hit[1]) for name, hit in lists.items()}
 
 
 def _flagged_references(kind: str, before: str, entities: Entities) -> dict[str, tuple[str, str]]:
     """Return the reference and the flag, T or F, at the end of each entity of a kind."""
     pattern = re.compile(before + r"#(\d+),\.([TF])\.\)")
-    flagged = {name: pattern.fullmatch(body) for name, body in entities.of(kind).items()}
+    flagged = {name: required(pattern.fullmatch(body)) for name, body in entities.of(kind).items()}
     return {name: (hit[1], hit[2]) for name, hit in flagged.items()}
 
 
@@ -301,7 +301,7 @@ def _in_millimetres(surface: FreeformSurface, placement: Placement, unit: float)
 
 
 def _surface(entity: str, body: str, entities: Entities) -> FreeformSurface:
-    degree_u, degree_v, net, *flags, count_u, count_v, knots_u, knots_v = SURFACE.fullmatch(body).groups()
+    degree_u, degree_v, net, *flags, count_u, count_v, knots_u, knots_v = required(SURFACE.fullmatch(body)).groups()
     numbers, degrees = _net(net), (int(degree_u), int(degree_v))
     counts = [np.array(each.split(","), dtype=np.int64) for each in (count_u, count_v)]
     values = [np.array(each.split(","), dtype=np.float64) for each in (knots_u, knots_v)]
@@ -342,7 +342,7 @@ def _check_knots(counts: np.ndarray, knots: np.ndarray, points: int, degree: int
 
 
 def _properties(entities: Entities, products: set[str], unit: float) -> ValidationProperties:
-    """Return the properties that a file states; a number that cannot be read is UNKNOWN.
+    """Return the properties that a file states; a number that cannot be read is UNKNOWN_VALUE.
 
     unit: unit of length of the file (mm), which holds for centroids; a measure states its own unit.
     products: product definitions of the lens.  Others, such as an assembly, have centroids in their own frames; if the
@@ -350,7 +350,7 @@ def _properties(entities: Entities, products: set[str], unit: float) -> Validati
     """
     items: dict[tuple[str, str], list[str]] = {}  # (kind of property, its name) -> first items of its representations
     for body in entities.of("PROPERTY_DEFINITION_REPRESENTATION").values():
-        definition, representation = re.fullmatch(r"\(#(\d+),#(\d+)\)", body).groups()
+        definition, representation = required(re.fullmatch(r"\(#(\d+),#(\d+)\)", body)).groups()
         kind, name = (entities.string(each, 0) for each in (definition, representation))
         if kind == VALIDATION:  # only of the whole part, not of a face or an instance in an assembly
             target = entities.references(definition)[-1]
@@ -375,14 +375,14 @@ def _properties(entities: Entities, products: set[str], unit: float) -> Validati
 def _measure(entities: Entities, item: str, kind: str) -> float:
     """Return the value of a measure, in mm and g to the powers of its unit."""
     value = re.search(rf"{kind}\(({NUMBER})\),#(\d+)", entities.bodies.get(item, ("", ""))[1])
-    return float(value[1]) * _unit_scale(entities, value[2]) if value else UNKNOWN
+    return float(value[1]) * _unit_scale(entities, value[2]) if value else UNKNOWN_VALUE
 
 
 def _centroid(item: str, entities: Entities, unit: float) -> tuple[float, float, float]:
     try:
         x, y, z = (unit * entities.points(np.array([item], dtype=np.int64))[0]).tolist()
     except KeyError:
-        return UNKNOWN, UNKNOWN, UNKNOWN
+        return UNKNOWN_VALUE, UNKNOWN_VALUE, UNKNOWN_VALUE
     return x, y, z
 
 
@@ -394,9 +394,8 @@ def _unit_scale(entities: Entities, unit: str) -> float:
     for element in entities.references(unit):
         kind, body = entities.bodies[element]
         factor = re.fullmatch(rf"\(#(\d+),({NUMBER})\)", body)
-        size = _unit_size(entities, factor[1]) if factor and kind == "DERIVED_UNIT_ELEMENT" else None
-        if size is None:
-            return UNKNOWN
+        if factor is None or kind != "DERIVED_UNIT_ELEMENT" or (size := _unit_size(entities, factor[1])) is None:
+            return UNKNOWN_VALUE
         scale *= size ** float(factor[2])
     return scale
 
@@ -410,7 +409,7 @@ def _unit_size(entities: Entities, unit: str) -> float | None:
             return None
         factor, body = float(measure[1]), entities.bodies[measure[2]][1]
     named = re.search(r"SI_UNIT\((\.\w+\.|\$),\.(\w+)\.\)", body)
-    return factor * PREFIXES.get(named[1], UNKNOWN) * UNITS.get(named[2], UNKNOWN) if named else None
+    return factor * PREFIXES.get(named[1], UNKNOWN_VALUE) * UNITS.get(named[2], UNKNOWN_VALUE) if named else None
 
 
 def _profiles(entities: Entities) -> Iterator[ProfileTolerance]:
@@ -419,7 +418,7 @@ def _profiles(entities: Entities) -> Iterator[ProfileTolerance]:
     for body in (*entities.of(kind).values(), *compound):
         tolerance = re.search(r"\('\d*',(?:'\d*'|\$),#(\d+),#(\d+)", body)
         if tolerance is None:
-            yield ProfileTolerance(UNKNOWN, "")
+            yield ProfileTolerance(UNKNOWN_VALUE, "")
         else:
             width = _measure(entities, tolerance[1], "LENGTH_MEASURE")
             yield ProfileTolerance(width, *_toleranced_face(entities, tolerance[2]))

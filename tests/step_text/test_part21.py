@@ -132,7 +132,7 @@ DAMAGES = {
         lambda t: t.replace("(0.,1.,2.)", "(0.,1.,2.E999)", 1),
         r"#50 = B_\w+ is malformed: the number 2.E999 is not finite",
     ),
-    "far": (lambda t: t.replace("1.50000000000000000E+00", "1.E20", 1), "over 1e\\+12 away"),
+    "far": (lambda t: t.replace("1.50000000000000000E+00", "1.E20", 1), "above 1e\\+12"),
     "huge number": (lambda t: t.replace("#60 =", f"#{'9' * 20} ="), "no entity"),
     "alias": (lambda t: t.replace("#60 =", "#07 ="), "no entity"),
     "behind": (lambda t: t.replace("'','',());", "'','',())A;"), "no entity"),
