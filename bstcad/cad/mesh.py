@@ -3,9 +3,9 @@
 Every vertex lies on the lens, and the faces share the nodes of the rim, so that the mesh is closed by construction.
 The chordal error falls with the square of the node spacing; it is measured until the grid meets its tolerance.
 
-Files: STL, which states no unit, 3MF, which states millimetres, and previews for web pages and slicers.  For two
-million triangles trimesh takes 2 s of CPU to write STL (this module 0.3) and 8 s to read it (1); lib3mf takes 2.3 s to
-write 3MF (2.5, but equal bytes each time).
+Files: STL, which states no unit (its user must set mm), 3MF, which states millimetres, and previews for web pages and
+slicers.  For two million triangles trimesh takes 2 s of CPU to write STL (this module 0.3), 8 s to read it (1) and 2 s
+to find that it is closed (0.7); lib3mf takes 2.3 s to write 3MF (2.5, but equal bytes each time).
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from numba import njit
 from bstcad.optics import tubes
 from bstcad.optics.bspline import is_net
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Outline
-from bstcad.optics.surfaces import MIN_COS2, Surface, sag, sampled
+from bstcad.optics.outlines import Circle, Outline
+from bstcad.optics.surfaces import MIN_COS2, Recess, Surface, sag, sampled
 from bstcad.runs import files
 from bstcad.scene.scene import FLOAT32_ROUNDING
 
@@ -38,7 +38,7 @@ MAX_TRIANGLES = 32_000_000  # largest number of triangles if a scene states a to
 GOAL_FRACTION = 0.95  # chordal error that a mesh aims at, as a fraction of the tolerance: vertices round to float32
 CELL_MARGIN = 1.1  # ratio of estimated to allowed cells above which no finer mesh is tried: the estimate's error
 WALL_NORMAL_Z = 1e-6  # largest |z| of the unit normal of a facet of the wall
-MAX_SAMPLES = 100_000_000  # largest number of points at which the facets of a mesh are compared with the lens
+MAX_FACET_SAMPLES = 100_000_000  # largest number of points at which the facets of a mesh are compared with the lens
 FACETS_PER_BLOCK = 1 << 15  # facets processed at a time, so that their corners stay in the cache
 
 
@@ -64,7 +64,7 @@ def lens_mesh(lens: Lens, cells: int) -> Mesh:
     grid = np.arange(x.size, dtype=np.int32).reshape(x.shape)
     border, z = rim(grid), sag(lens.back, x, y)
     back = np.stack([x, y, z], axis=-1).reshape(-1, 3)
-    if lens.front.outline is not None:
+    if isinstance(lens.front, Recess):
         front, front_rim, front_faces = _recessed_front(lens.front, back[border], grid)
     elif _has_plane_front(lens):  # one fan of triangles covers a plane
         front = np.vstack([back[border], [0.0, 0.0, 0.0]])
@@ -82,11 +82,11 @@ def lens_mesh(lens: Lens, cells: int) -> Mesh:
     return Mesh(np.concatenate([back, front]), triangles.astype(np.int32, copy=False))
 
 
-def _recessed_front(front: Surface, around: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices, indices of those below the lens's rim, and triangles of a front with its own outline.
+def _recessed_front(front: Recess, around: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return vertices, indices of those below the lens's rim, and triangles of a front and of the plane around it.
 
-    The plane around such a front is included.  around: vertices of the lens's rim (k, 3).  The grid over the front has
-    as many nodes on its rim, and the plane lies between the two.  Indices continue those of `grid`.
+    around: vertices of the lens's rim (k, 3).  The grid over the front has as many nodes on its rim, and the plane lies
+    between the two.  Indices continue those of `grid`.
     """
     x, y = nodes(front.outline, len(grid) - 1)
     z = sag(front.optical, x, y)
@@ -195,8 +195,8 @@ def largest_coordinate(lens: Lens) -> float:
 def max_cells(lens: Lens, most: int | None = None) -> int:
     """Return the largest number of cells each way for `most` triangles, by default DEFAULT_MAX_TRIANGLES."""
     faces, most = 2 if _has_plane_front(lens) else 4, DEFAULT_MAX_TRIANGLES if most is None else most
-    # triangles per cell along a side of the grid: 8 of the wall and 4 of the fan over a plane front, or 8 of the wall
-    # and 8 of the plane around a front
+    # triangles per cell along one side of the grid: 8 of the wall, and 4 of the fan over a plane front or 8 of the
+    # plane around a front
     wall = 16 if lens.front.outline is not None else 12
     return int((math.sqrt(wall**2 + 4 * faces * most) - wall) / (2 * faces)) // 2 * 2
 
@@ -205,10 +205,7 @@ def max_cells(lens: Lens, most: int | None = None) -> int:
 
 
 def is_closed(mesh: Mesh) -> bool:
-    """True if each edge belongs to two triangles, once in each direction: watertight and wound consistently.
-
-    For two million triangles trimesh's two tests take 2.3 s of CPU; these two sorts take 0.7 s.
-    """
+    """True if each edge belongs to two triangles, once in each direction: watertight and wound consistently."""
     ends, others = mesh.faces.astype(np.int64), np.roll(mesh.faces, -1, axis=1).astype(np.int64)
     count = len(mesh.vertices)
     forward, backward = (np.sort((a * count + b).ravel()) for a, b in ((ends, others), (others, ends)))
@@ -229,14 +226,14 @@ def volume_and_area(mesh: Mesh) -> tuple[float, float]:
 def chordal_error(mesh: Mesh, lens: Lens) -> float:
     """Return the largest distance (mm) between the lens and the facets, at their centres and points between corners.
 
-    A net may bend in each knot span: an edge has two points per span or more (at most MAX_SAMPLES points in all).
+    A net may bend in each knot span: an edge has two points per span or more (at most MAX_FACET_SAMPLES in all).
     """
-    max_parts = max(1, int((MAX_SAMPLES / 2 / max(len(mesh.faces), 1)) ** 0.5))
-    radius = float(lens.outline.radius) if lens.outline.is_round else 0.0
-    numbers = [value for face in (lens.back, lens.front) for value in _face_numbers(face)]
+    max_parts = max(1, int((MAX_FACET_SAMPLES / 2 / max(len(mesh.faces), 1)) ** 0.5))
+    radius = float(lens.outline.radius) if isinstance(lens.outline, Circle) else 0.0
+    back, front = _face_numbers(lens.back), _face_numbers(lens.front)
 
     def largest_error(faces: np.ndarray) -> float:
-        return _chordal_error(mesh.vertices, faces, WALL_NORMAL_Z, max_parts, radius, *numbers)
+        return _chordal_error(mesh.vertices, faces, max_parts, radius, back, front)
 
     with ThreadPoolExecutor(torch.get_num_threads()) as threads:
         return float(max(threads.map(largest_error, np.array_split(mesh.faces, 16))))
@@ -256,19 +253,15 @@ def vertex_error(mesh: Mesh, lens: Lens) -> float:
     return float(np.minimum(off(lens.back), off(lens.front)).max())
 
 
-def _face_numbers(surface: Surface) -> tuple[FaceNumbers, np.ndarray]:
-    """Return a face as numbers for the kernel, and its heights (m, n), (0, 0) if it is no net."""
+def _face_numbers(surface: Surface) -> FaceNumbers:
     face = surface.plain()
     per_detail = 1 / float(face.detail)
     if not is_net(face):
-        c, k = face.conic()
-        bend = (1 + k) * c * c
+        (c, k), no_net = face.conic(), (np.zeros((0, 0)), 0.0, 0.0, 0.0, 0.0)
         ends2 = face.outline.radius**2 if face.outline else math.inf
-        no_net = (0.0, 0.0, 0.0, 0.0)
-        return FaceNumbers(float(face.z), c, bend, MIN_COS2, *no_net, per_detail, ends2), np.zeros((0, 0))
-    corner, per_mm = (float(face.x[0]), float(face.y[0])), (1 / pitch for pitch in face.pitch)
-    numbers = FaceNumbers(float(face.z), 0.0, 0.0, MIN_COS2, *corner, *per_mm, per_detail, math.inf)
-    return numbers, face.heights.contiguous().numpy()
+        return FaceNumbers(float(face.z), c, (1 + k) * c * c, MIN_COS2, ends2, per_detail, *no_net)
+    net = (face.heights.contiguous().numpy(), float(face.x[0]), float(face.y[0]), 1 / face.pitch[0], 1 / face.pitch[1])
+    return FaceNumbers(float(face.z), 0.0, 0.0, MIN_COS2, math.inf, per_detail, *net)
 
 
 # ---- compiled kernels, for millions of triangles ---------------------------------------------------------------------
@@ -281,12 +274,13 @@ class FaceNumbers(NamedTuple):
     curvature: float  # 1/mm
     bend: float  # (1 + k) c² (1/mm²), k the conic constant
     equator: float  # surfaces.MIN_COS2
+    ends2: float  # r² (mm²) of Surface.outline, outside of which the face is a plane
+    per_detail: float  # smooth parts per mm: 1 / Surface.detail
+    net: np.ndarray  # heights h of the control points, (m, n), mm; (0, 0): a surface of revolution
     x: float  # corner of the net (mm)
     y: float  # corner of the net (mm)
     per_x: float  # control points per mm along x
     per_y: float  # control points per mm along y
-    per_detail: float  # smooth parts per mm: 1 / Surface.detail
-    ends2: float  # r² (mm²) of Surface.outline, outside of which the face is a plane
 
 
 @njit(inline="always")
@@ -305,8 +299,9 @@ def _basis(u, m):
 
 
 @njit(inline="always")
-def _sag(face, net, x, y):
-    """Return z (mm) of a face; net of shape (0, 0): a surface of revolution."""
+def _sag(face, x, y):
+    """Return z (mm) of a face."""
+    net = face.net
     m, n = net.shape
     if m == 0:
         r2 = min(x * x + y * y, face.ends2)
@@ -320,27 +315,24 @@ def _sag(face, net, x, y):
 
 
 @njit(cache=True, nogil=True)
-def _distance_from_face(a, b, c, parts, face, net):
-    """Return the largest distance along z (mm) of a face from the triangle a, b, c with edges in 2 x `parts`.
-
-    It is measured at the centre and at all points of the division except the corners.
-    """
+def _distance_from_face(a, b, c, parts, face):
+    """Return the largest distance along z (mm) of a face from a triangle: at its centre, with edges in 2 x `parts`."""
     n = 2 * parts
-    worst = abs(_sag(face, net, (a[0] + b[0] + c[0]) / 3, (a[1] + b[1] + c[1]) / 3) - (a[2] + b[2] + c[2]) / 3)
+    worst = abs(_sag(face, (a[0] + b[0] + c[0]) / 3, (a[1] + b[1] + c[1]) / 3) - (a[2] + b[2] + c[2]) / 3)
     for i in range(n):
         for j in range(n + 1 - i):
             p, q, r = i / n, j / n, (n - i - j) / n
             if max(p, q, r) < 1.0:
                 x, y = p * a[0] + q * b[0] + r * c[0], p * a[1] + q * b[1] + r * c[1]
-                worst = max(worst, abs(_sag(face, net, x, y) - (p * a[2] + q * b[2] + r * c[2])))
+                worst = max(worst, abs(_sag(face, x, y) - (p * a[2] + q * b[2] + r * c[2])))
     return worst
 
 
 @njit(cache=True, nogil=True)
-def _chordal_error(vertices, faces, upright, max_parts, radius, back, back_net, front, front_net):
+def _chordal_error(vertices, faces, max_parts, radius, back, front):
     """Return the largest distance (mm) of the lens from triangles, along their normals.
 
-    A triangle whose unit normal has |z| <= `upright` belongs to the wall: a cylinder of the given radius, or planes
+    A triangle whose unit normal has |z| <= WALL_NORMAL_Z belongs to the wall: a cylinder of the given radius, or planes
     (radius 0).  Edges have one part per smooth part of the face, at most `max_parts`.
     """
     worst = 0.0
@@ -349,11 +341,11 @@ def _chordal_error(vertices, faces, upright, max_parts, radius, back, back_net, 
         p, q, r, s, t, u = b[0] - a[0], b[1] - a[1], b[2] - a[2], c[0] - a[0], c[1] - a[1], c[2] - a[2]
         n_z = p * t - q * s
         length = math.sqrt((q * u - r * t) ** 2 + (r * s - p * u) ** 2 + n_z * n_z)
-        if abs(n_z) > upright * length:
+        if abs(n_z) > WALL_NORMAL_Z * length:
             extent = max(abs(p), abs(q), abs(s), abs(t), abs(p - s), abs(q - t))
-            face, net = (back, back_net) if n_z > 0.0 else (front, front_net)
+            face = back if n_z > 0.0 else front
             parts = min(max_parts, max(1, math.ceil(extent * face.per_detail)))
-            worst = max(worst, _distance_from_face(a, b, c, parts, face, net) * abs(n_z) / length)
+            worst = max(worst, _distance_from_face(a, b, c, parts, face) * abs(n_z) / length)
         elif radius > 0.0:
             for x, y in ((a[0] + b[0], a[1] + b[1]), (b[0] + c[0], b[1] + c[1]), (c[0] + a[0], c[1] + a[1])):
                 worst = max(worst, abs(radius - math.hypot(x, y) / 2))
@@ -389,10 +381,7 @@ DEFAULT_LABEL = Label()
 
 
 def write_stl(mesh: Mesh, path: str | Path) -> None:
-    """Write the mesh as binary STL: 80 bytes of header, the count, 50 bytes per triangle in float32.
-
-    The format states no unit: the user of the file must set mm.
-    """
+    """Write the mesh as binary STL: 80 bytes of header, the count, 50 bytes per triangle in float32."""
     with Path(path).open("wb") as file:
         file.write(STL_HEADER.ljust(80) + np.uint32(len(mesh.faces)).tobytes())
         for corners, normals in mesh.facets():
@@ -457,7 +446,7 @@ def _weld(bits):
 
 # ---- 3MF -----------------------------------------------------------------------------------------------------------
 
-CONTENT_TYPES = """<?xml version="1.0" encoding="UTF-8"?>
+PACKAGE_CONTENT_TYPES = """<?xml version="1.0" encoding="UTF-8"?>
 <Types xmlns="http://schemas.openxmlformats.org/package/2006/content-types">\
 <Default Extension="rels" ContentType="application/vnd.openxmlformats-package.relationships+xml"/>\
 <Default Extension="model" ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/></Types>
@@ -499,7 +488,7 @@ def write_3mf(mesh: Mesh, path: str | Path | IO[bytes], label: Label = DEFAULT_L
     """Write the mesh as 3MF in millimetres; equal meshes give equal bytes."""
     large = MAX_LINE_BYTES * (len(mesh.vertices) + len(mesh.faces)) > zipfile.ZIP64_LIMIT
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as package:
-        for name, text in (("[Content_Types].xml", CONTENT_TYPES), ("_rels/.rels", RELATIONSHIPS)):
+        for name, text in (("[Content_Types].xml", PACKAGE_CONTENT_TYPES), ("_rels/.rels", RELATIONSHIPS)):
             package.writestr(_archive_member(name), text)
         with package.open(_archive_member("3D/3dmodel.model"), "w", force_zip64=large) as model:
             for part in model_3mf(mesh, label):
@@ -553,14 +542,10 @@ def _glb(mesh: Mesh, lens: Lens, label: Label, off: float) -> bytes:
         normals.append(sense * _upward_normals(face.optical, vertices[-1]))
         faces.append(renumbered.reshape(-1, 3) + count)
         count += len(used)
-    red, green, blue, opacity = (int(label.colour[k : k + 2], 16) for k in (1, 3, 5, 7))
-    linear = [(part / 255) ** 2.2 for part in (red, green, blue)]
-    clear = {"alphaMode": "BLEND"} if opacity < 255 else {"metallicFactor": 1.0}
-    material = PBRMaterial(
-        name=label.material,
-        baseColorFactor=[*linear, opacity / 255],
-        **({"metallicFactor": 0.0, "roughnessFactor": 0.1} | clear),
-    )
+    *colour, opacity = (int(label.colour[k : k + 2], 16) for k in (1, 3, 5, 7))  # red, green, blue
+    factors = {"baseColorFactor": [*((part / 255) ** 2.2 for part in colour), opacity / 255]}  # linear
+    surface = {"metallicFactor": 0.0, "alphaMode": "BLEND"} if opacity < 255 else {"metallicFactor": 1.0}
+    material = PBRMaterial(name=label.material, roughnessFactor=0.1, **factors, **surface)
     solid = trimesh.Trimesh(
         METRES_PER_MM * _y_up(np.concatenate(vertices)),
         np.concatenate(faces),

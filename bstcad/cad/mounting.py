@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from OCP.BRep import BRep_Tool
@@ -25,16 +25,7 @@ from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Shape
 
 from bstcad.cad import solid_properties, step_writing, walls
 from bstcad.cad.patches import back_patch
-from bstcad.cad.solid import (
-    NamedSolid,
-    cap,
-    check_thickness,
-    cut_loops,
-    dome_cap,
-    front_caps,
-    named_solid,
-    rim_points,
-)
+from bstcad.cad.solid import NamedSolid, cap, check_thickness, cut_loops, dome_cap, front_caps, named_solid, rim_points
 from bstcad.cad.walls import MIN_WALL, NO_DRAFT, Draft, Loop, NamedFace, face_inside, solid_of
 from bstcad.cad.wires import LoopPiece, shape_in
 from bstcad.optics.lens import Lens
@@ -47,7 +38,7 @@ if TYPE_CHECKING:
 WALL_TOLERANCE = 1e-6  # largest distance (mm) from a lens's wall of a body's edge that lies on it
 COSINE_TOLERANCE = 1e-12  # largest deviation from 1 of |z| of the unit normal of a plane z = const
 EDGE_FRACTIONS = (0.0, 0.31, 0.77, 1.0)  # fractions of an edge's length at which its distance from a wall is measured
-INVALID = "mount: body and lens make no valid solid; move the body's edges away from the lens's rim"
+INVALID_PART = "mount: body and lens make no valid solid; move the body's edges away from the lens's rim"
 
 
 @dataclass(frozen=True)
@@ -91,7 +82,7 @@ def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[PlacedLe
         for plane, new in zip(planes, loops, strict=True):
             replacements.setdefault(plane.face, {})[plane.wire] = new
     built += [(_replace_loops(face, replacements.get(k)), "flange") for k, face in enumerate(faces) if k not in removed]
-    solid = solid_of([face for face, _ in built], INVALID)
+    solid = solid_of([face for face, _ in built], INVALID_PART)
     return NamedSolid(cadquery.Solid(solid), tuple(name for _, name in built))
 
 
@@ -230,8 +221,7 @@ def check_fit(lens: Lens, rim: Sequence[LoopPiece], planes: tuple[float, float],
             raise ValueError(
                 f"{name}: the flange's {side} face, z = {z:g} mm, cuts the rim of the {face}, which runs from z = "
                 f"{heights.min():.4g} to {heights.max():.4g} mm; put it below or above that"
-                + ", or into the plane of a plane front"
-                * (face == "front")
+                + (", or into the plane of a plane front" if face == "front" else "")
             )
     if (np.minimum(upper, high) - np.maximum(lower, low)).min() < MIN_WALL:
         raise ValueError(
@@ -279,7 +269,7 @@ def wire(outline: Round | Box) -> cadquery.Wire:
     """Return an outline as a wire in the plane z = 0."""
     import cadquery
 
-    plane = cadquery.Workplane("XY")
+    plane: Any = cadquery.Workplane("XY")  # its methods are annotated with every class that they may return
     if outline.shape == "circle":
         return plane.circle(outline.diameter / 2).wires().val()
     sharp = plane.rect(outline.width, outline.height).wires().val()
@@ -298,7 +288,7 @@ def body(flange: Flange) -> cadquery.Workplane:
         rim = cadquery.Workplane("XY").add(wire(flange.outline).translate((0, 0, flange.z)))
         plate = rim.toPending().extrude(height, taper=flange.draft or None)
     if flange.bevel:
-        plate = cadquery.Workplane(_bevelled(plate.val(), flange.bevel, lean))
+        plate = cadquery.Workplane(_bevelled(shape_in(plate)[0], flange.bevel, lean))
     for x, y, diameter in flange.all_holes():
         base = cadquery.Vector(x, y, flange.z - 1)
         plate = plate.cut(cadquery.Solid.makeCylinder(diameter / 2, height + 2, base))

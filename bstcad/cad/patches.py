@@ -28,7 +28,7 @@ from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Shape
 
 from bstcad.optics.bspline import BSplineSurface, knots, parameter
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Outline
+from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import Conic, Sphere
 
 PATCH_MARGIN = 1.02  # ratio of a patch's width to the outline's: the rim touches no border of the patch
@@ -52,7 +52,7 @@ def back_patch(lens: Lens) -> Patch:
 
 
 def _net_patch(face: BSplineSurface, outline: Outline, outward: bool) -> Patch:
-    if outline.is_round:
+    if isinstance(outline, Circle):
         _check_round(face, outline.radius)
     return Patch(bspline_surface(face.control_points(), *map(knots, face.shape)), outward, net_parameters(face))
 
@@ -104,7 +104,7 @@ def _sphere_patch(front: Sphere, outline: Outline) -> Patch:
     A sphere with its centre 10⁵ mm away would lose digits.  It is written as the parabola z0 + c r²/2, from which it
     deviates by c³ r⁴/8 < PARABOLA_TOLERANCE.
     """
-    c, r = front.curvature, float(np.hypot(*outline.farthest))
+    (c, _), r = front.conic(), float(np.hypot(*outline.farthest))
     if abs(c) * r >= 1:
         raise ValueError(
             f"lens.front: a sphere of radius {1 / abs(c):g} mm ends inside the lens's rim at {r:g} mm; flatten it"
@@ -140,10 +140,10 @@ def conic_net(front: Conic, a: float, b: float) -> tuple[np.ndarray, np.ndarray]
 
 def _conic_patch(front: Conic, outline: Outline) -> Patch:
     """Return a rational patch (see `conic_net`): in (u, v) circles about the axis are circles, straight sides arcs."""
-    bend = (1 + front.conic_constant) * front.curvature**2  # K
-    a, b = outline.half_extent
+    (c, k), (a, b) = front.conic(), outline.half_extent
+    bend = (1 + k) * c**2  # K
 
-    def uv(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def uv(x: np.ndarray | float, y: np.ndarray | float) -> np.ndarray:
         scale = 2 / (1 + np.sqrt(1 - bend * (x * x + y * y)))
         return np.stack([x * scale, y * scale], axis=-1)
 
@@ -151,8 +151,8 @@ def _conic_patch(front: Conic, outline: Outline) -> Patch:
     ends = np.maximum(uv(a, 0.0) + uv(0.0, b), 0.0 if outline.is_round else uv(a, b))
     if not np.isfinite(ends).all() or not (abs(bend) / 4 * (PATCH_MARGIN * ends) ** 2).sum() < 1:
         raise ValueError(
-            f"lens.front: a conic of constant {front.conic_constant:g} and radius {1 / abs(front.curvature):g} mm "
-            f"turns too sharply before the rim, {np.hypot(*outline.farthest):g} mm from the axis; flatten it"
+            f"lens.front: a conic of constant {k:g} and radius {1 / abs(c):g} mm turns too sharply before the rim, "
+            f"{np.hypot(*outline.farthest):g} mm from the axis; flatten it"
         )
     half_u, half_v = PATCH_MARGIN * ends
     net, weights = conic_net(front, half_u, half_v)
@@ -160,7 +160,7 @@ def _conic_patch(front: Conic, outline: Outline) -> Patch:
     return Patch(surface, False, uv)
 
 
-PATCHES: dict[str, Callable[..., Patch]] = {  # function that returns the patch, for each kind of front but planes
+PATCHES: dict[str, Callable[..., Patch]] = {  # function that returns the patch of each kind of front except planes
     "bspline": partial(_net_patch, outward=False),
     "sphere": _sphere_patch,
     "conic": _conic_patch,
@@ -248,11 +248,9 @@ def weights_of(surface: Geom_BSplineSurface) -> np.ndarray:
 
 def knots_of(surface: Geom_BSplineSurface) -> tuple[np.ndarray, np.ndarray]:
     """Return the full knot vectors in u and v of an OCC B-spline surface."""
-    u, v = surface.UKnotSequence(), surface.VKnotSequence()
-    return (
-        np.array([u.Value(i) for i in range(u.Lower(), u.Upper() + 1)]),
-        np.array([v.Value(i) for i in range(v.Lower(), v.Upper() + 1)]),
-    )
+    both = surface.UKnotSequence(), surface.VKnotSequence()
+    u, v = (np.array([full.Value(i) for i in range(full.Lower(), full.Upper() + 1)]) for full in both)
+    return u, v
 
 
 # ---- nets as bytes of OCC's binary files -----------------------------------------------------------------------------

@@ -34,12 +34,16 @@ def mounted(
 
     Only x and y of the points are used; z: height (mm) of the origin of the lens's scene.
     """
-    locations: list[cadquery.Location] = []
-    self.eachpoint(lambda each: locations.append(each) or cadquery.Vertex.makeVertex(0, 0, 0))
-    found, points = getattr(design, "lens", design), (each.toTuple()[0] for each in locations)
-    lenses = [PlacedLens(found, trim, holes, (x, y, z)) for x, y, _ in points]
+    lenses: list[PlacedLens] = []
+
+    def place(location: cadquery.Location) -> cadquery.Vertex:  # eachpoint needs a shape
+        x, y, _ = location.toTuple()[0]
+        lenses.append(PlacedLens(getattr(design, "lens", design), trim, holes, (x, y, z)))
+        return cadquery.Vertex.makeVertex(0, 0, 0)
+
+    self.eachpoint(place)
     return self.newObject([mounting.mounted(self.findSolid(), lenses).solid])
 
 
-cadquery.Workplane.lens = lens
-cadquery.Workplane.mounted = mounted
+for method in (lens, mounted):
+    setattr(cadquery.Workplane, method.__name__, method)

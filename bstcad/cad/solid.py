@@ -22,17 +22,7 @@ from OCP.TopoDS import TopoDS_Face, TopoDS_Solid
 
 from bstcad.cad import patches, walls, wires
 from bstcad.cad.patches import Patch, back_patch, front_patch, level_patch
-from bstcad.cad.walls import (
-    MIN_WALL,
-    NO_DRAFT,
-    RIM_TOLERANCE,
-    SHAPE_TOLERANCE,
-    Draft,
-    NamedFace,
-    Rail,
-    face_inside,
-    solid_of,
-)
+from bstcad.cad.walls import MIN_WALL, NO_DRAFT, Draft, NamedFace, Rail, face_inside
 from bstcad.cad.wires import LoopPiece, RailCurve
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
@@ -44,10 +34,10 @@ if TYPE_CHECKING:
     import cadquery
 
 EXTRA_POINTS = 4  # control points outside the rim on each side: two spans, and two more until x(u) is linear
-POINTS_PER_CELL = 8  # points along a piece of the rim per cell of the back's longer side
+RIM_POINTS_PER_CELL = 8  # points along a piece of the rim per cell of the back's longer side
 IMAGE_TOLERANCE = 1e-12  # deviation from a line or circle below which an image is one, relative to its size
 IMAGE_SAMPLES = 65  # points of an image that are compared with a line and a circle
-INVALID = (
+INVALID_LENS = (
     "lens: front, back and walls bound no valid solid; check that the back lies above the front, and move wires apart "
     "or make them simpler"
 )
@@ -99,7 +89,7 @@ def lens_shape(
         named += walls.upright_walls(*each, "hole")
     caps = [(cap(back, tops, along=True), "back"), *front_caps(lens, [low, *inner])]
     faces, names = zip(*caps, *named, strict=True)
-    return solid_of(faces, INVALID), names
+    return walls.solid_of(faces, INVALID_LENS), names
 
 
 def coarse_copy(lens: Lens, m: int) -> Lens:
@@ -137,13 +127,12 @@ def check_thickness(lens: Lens) -> None:
     )
     x, y = torch.meshgrid(*axes, indexing="ij")
     inside = lens.outline.contains(x, y)
-    x, y = x[inside].numpy(), y[inside].numpy()
-    thickness = sag(lens.back, x, y) - sag(lens.front, x, y)
+    points = x[inside].numpy(), y[inside].numpy()
+    thickness = sag(lens.back, *points) - sag(lens.front, *points)
     i = int(thickness.argmin())
     if not thickness[i] > MIN_WALL:
-        raise ValueError(
-            f"lens: the back lies {thickness[i]:g} mm above the front at ({x[i]:g}, {y[i]:g}) mm; move the front down"
-        )
+        at = "({:g}, {:g}) mm".format(*(p[i] for p in points))
+        raise ValueError(f"lens: the back lies {thickness[i]:g} mm above the front at {at}; move the front down")
 
 
 # ---- the wires -----------------------------------------------------------------------------------------------------
@@ -201,7 +190,7 @@ def cap(patch: Patch, rails: Sequence[Rail], along: bool) -> TopoDS_Face:
     face = face_inside(patch.surface, patch.outward, *loops)
     for rail in rails if patch.uv is not None else ():
         for curve, edge in zip(rail.curves, rail.edges, strict=True):
-            BRep_Builder().UpdateEdge(edge, image(patch, curve), face, SHAPE_TOLERANCE)
+            BRep_Builder().UpdateEdge(edge, image(patch, curve), face, walls.SHAPE_TOLERANCE)
     return face
 
 
@@ -217,17 +206,20 @@ def front_caps(lens: Lens, rails: Sequence[Rail]) -> list[NamedFace]:
 
 def dome_cap(lens: Lens) -> tuple[NamedFace, Rail]:
     """Return the optical part of a front with its own outline, and its rim, counterclockwise."""
+    assert lens.front.outline is not None
     rim = walls.rail_on(lens.front.optical, wires.outline_loop(lens.front.outline))
     return (cap(front_patch(lens), [rim], along=False), "front"), rim
 
 
 def image(patch: Patch, curve: RailCurve) -> Geom2d_Curve:
     """Return a curve in the parameter plane of a patch, with the same parameter: a line or circle where it is one."""
-    piece, cubic = curve.piece, curve.knots is not None and len(curve.knots) == len(curve.poles) + 4
-    t = np.unique(curve.knots) if cubic else np.linspace(0.0, piece.end, IMAGE_SAMPLES)
+    piece, uv = curve.piece, patch.uv
+    assert uv is not None  # a plane needs no image
+    cubic = curve.knots if curve.knots is not None and len(curve.knots) == len(curve.poles) + 4 else None  # its knots
+    t = np.linspace(0.0, piece.end, IMAGE_SAMPLES) if cubic is None else np.unique(cubic)
 
     def points(t: np.ndarray) -> np.ndarray:
-        return patch.uv(*piece.points(t).T)
+        return uv(*piece.points(t).T)
 
     found = points(t)
     tolerance = IMAGE_TOLERANCE * np.ptp(found, axis=0).max()
@@ -243,10 +235,10 @@ def image(patch: Patch, curve: RailCurve) -> Geom2d_Curve:
             return Geom2d_Circle(axis, abs(arm))
     chords, images = (np.diff(each, axis=0) for each in (piece.points(t), found))
     scale = np.linalg.norm(images, axis=1).max() / np.linalg.norm(chords, axis=1).max()
-    return patches.bspline_curve_2d(*wires.fit_spline(points, t, RIM_TOLERANCE * scale, smooth=not cubic))
+    return patches.bspline_curve_2d(*wires.fit_spline(points, t, walls.RIM_TOLERANCE * scale, smooth=cubic is None))
 
 
-def _outer_walls(lens: Lens, loops: list[list[LoopPiece]], top: Rail, draft: Draft) -> tuple[list[NamedFace], Rail]:
+def _outer_walls(lens: Lens, loops: Sequence[list[LoopPiece]], top: Rail, draft: Draft) -> tuple[list[NamedFace], Rail]:
     """Return the walls over the rim, the first loop, from the back's edge down to the front, and their lower edge."""
     if not draft.angle:
         return walls.leaning_walls(lens.front.around, loops, top, above=lens.back, draft=draft)
@@ -270,5 +262,5 @@ def _parting(lens: Lens, rim: Sequence[LoopPiece]) -> float:
 
 def rim_points(lens: Lens, rim: Sequence[LoopPiece]) -> np.ndarray:
     """Return x and y (2, n) of points along a rim (mm), several in each cell of the back's net."""
-    count = POINTS_PER_CELL * max(lens.back_net.shape)
+    count = RIM_POINTS_PER_CELL * max(lens.back_net.shape)
     return np.concatenate([piece.points(np.linspace(0.0, piece.end, count)) for piece in rim]).T

@@ -99,11 +99,9 @@ def placeholder_numbers(model: StepData_StepModel, count: int) -> list[int]:
 
 
 def fill_in_nets(text: bytes, placeholders: Sequence[int], nets: Sequence[LargeNet]) -> Iterator[bytes]:
-    """Yield the text of a STEP file, in parts, with the nets in place of their placeholders.
-
-    OCC numbers entities from 1 without gaps, so that the numbers of the points continue those of the file.
-    """
+    """Yield the text of a STEP file, in parts, with the nets in place of their placeholders."""
     end = text.rindex(b"ENDSEC;")
+    # OCC numbers entities from 1 without gaps, so that the numbers of the points continue those of the file
     number = int(text[text.rindex(b"\n#", 0, end) + 2 : end].split(b"=", 1)[0]) + 1
     done, points = 0, []
     for placeholder, net in sorted(zip(placeholders, nets, strict=True), key=lambda pair: pair[0]):

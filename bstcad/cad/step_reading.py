@@ -41,7 +41,7 @@ from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Surface, sag
 from bstcad.step_text.placement import Placement, identity, own_frame
 
 GRID_TOLERANCE = 1e-9  # largest deviation (mm) of a net of bstcad from a uniform grid in x and y
-AXIS_TOLERANCE = 1e-9  # largest deviation (mm or rad) of a wall from an outline about the axis
+AXIAL_TOLERANCE = 1e-9  # largest deviation (mm or rad) of a wall from an outline about the axis
 CIRCLE_TOLERANCE = 1e-6  # largest deviation (mm) of an edge from its circle or rectangle
 LEVEL_TOLERANCE = 1e-7  # largest distance (mm) of the plane around a front from the front's edge
 APERTURE_DECIMALS = 9  # decimals of a clear aperture in mm; finer ones are rounding of the file's coordinates
@@ -127,10 +127,7 @@ def is_valid(solid: TopoDS_Solid) -> bool:
 
 
 def gaps(solid: TopoDS_Solid) -> float:
-    """Return the largest tolerance (mm) of an edge or vertex of a re-read solid.
-
-    OCC's reader accepts a solid whose curves miss the faces, and enlarges these tolerances by the distance.
-    """
+    """Return the largest tolerance (mm) of edges and vertices, which OCC's reader enlarges until curves meet faces."""
     return ShapeAnalysis_ShapeTolerance().Tolerance(solid, 1)
 
 
@@ -183,21 +180,20 @@ def _lens_in(solid: TopoDS_Solid) -> StepLens:
     (back_face, back), fronts = found, [face for face in nets if face is not found]
     net = patches.net_of(back.BSpline())
     middle = (net[0, 0, :2] + net[-1, -1, :2]) / 2
-    if not np.abs(middle).max() <= AXIS_TOLERANCE:
+    if not np.abs(middle).max() <= AXIAL_TOLERANCE:
         raise ValueError(f"the net of the back is centred at {middle} mm; centre the lens on the axis")
     rest = [face for face in faces if face not in nets]
     chosen = fronts[0] if fronts else _front_face(rest)
-    front = freeform_surface(chosen[0]) if fronts else _front_surface(*chosen)
     others = [face for face in rest if face[0] is not chosen[0]]
-    if not fronts and (own := _front_outline(front, chosen[0], others)):
-        front = Recess(front, own)
+    front = freeform_surface(chosen[0]) if fronts else _front_surface(*chosen, others)
+    if front.outline is not None:
         others = [face for face in others if not _is_level(face[1], front.around.z)]
     outline, edge = _outline_of_walls([surface for _, surface in others]), None
     if outline is None:
         edge = outer_edge(back_face)
         outline = _bounding_outline(edge)
-    faces = chosen[0], back_face
-    return StepLens(solid, net, _uniform_net(back, net), front=front, outline=outline, edge=edge, faces=faces)
+    back_surface, both = _uniform_net(back, net), (chosen[0], back_face)
+    return StepLens(solid, net, back_surface, front=front, outline=outline, edge=edge, faces=both)
 
 
 def _faces(solid: TopoDS_Solid) -> list[Face]:
@@ -270,7 +266,7 @@ def _looks_up(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> bool:
 def _front_face(rest: Sequence[Face]) -> Face:
     """Return a front that is no net: a sphere, a patch of 3 x 3, or the smallest plane z = const that looks down."""
     planes = [face for face in rest if face[1].GetType() == Kind.GeomAbs_Plane]
-    level = [face for face in planes if abs(face[1].Plane().Axis().Direction().Z()) > 1 - AXIS_TOLERANCE]
+    level = [face for face in planes if abs(face[1].Plane().Axis().Direction().Z()) > 1 - AXIAL_TOLERANCE]
     if len(level) > 1:
         facing_down = (face for face in level if not _looks_up(*face))
         level = sorted(facing_down, key=lambda face: float(np.hypot(*outer_edge(face[0]).T).max()))
@@ -280,12 +276,10 @@ def _front_face(rest: Sequence[Face]) -> Face:
     return (curved or level)[0]
 
 
-def _front_outline(front: Surface, face: TopoDS_Face, others: Sequence[Face]) -> Circle | None:
+def _front_outline(front: Sphere | Conic, face: TopoDS_Face, others: Sequence[Face]) -> Circle | None:
     """Return the outline of a curved front with a plane z = const around it; None if it ends on walls."""
-    if front.level:
-        return None
     edge = _bounding_outline(outer_edge(face))
-    if not edge.is_round:
+    if front.level or not isinstance(edge, Circle):
         return None
     rim = Circle(round(edge.radius, APERTURE_DECIMALS))
     z = Recess(front, rim).around.z
@@ -296,16 +290,21 @@ def _is_level(surface: BRepAdaptor_Surface, z: float) -> bool:
     if surface.GetType() != Kind.GeomAbs_Plane:
         return False
     plane = surface.Plane()
-    return abs(plane.Axis().Direction().Z()) > 1 - AXIS_TOLERANCE and abs(plane.Location().Z() - z) <= LEVEL_TOLERANCE
+    return abs(plane.Axis().Direction().Z()) > 1 - AXIAL_TOLERANCE and abs(plane.Location().Z() - z) <= LEVEL_TOLERANCE
 
 
-def _front_surface(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> Surface:
+def _front_surface(face: TopoDS_Face, surface: BRepAdaptor_Surface, others: Sequence[Face]) -> Surface:
+    """Return a front that is no net, with its outline if there is a plane around it; others: the faces besides it."""
     if surface.GetType() == Kind.GeomAbs_Plane:
         return Plane(surface.Plane().Location().Z())
-    if surface.GetType() != Kind.GeomAbs_Sphere:
-        return _conic(surface.BSpline())
+    curved = _sphere(face, surface) if surface.GetType() == Kind.GeomAbs_Sphere else _conic(surface.BSpline())
+    own = _front_outline(curved, face, others)
+    return curved if own is None else Recess(curved, own)
+
+
+def _sphere(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> Sphere:
     centre, radius = surface.Sphere().Location(), surface.Sphere().Radius()
-    if max(abs(centre.X()), abs(centre.Y())) > AXIS_TOLERANCE:
+    if max(abs(centre.X()), abs(centre.Y())) > AXIAL_TOLERANCE:
         raise ValueError(f"the sphere's centre is at ({centre.X():g}, {centre.Y():g}), off the axis; centre the lens")
     rim = BRep_Tool.Pnt_s(TopoDS.Vertex_s(parts_of(face, TopAbs_VERTEX)[0]))
     side = 1.0 if centre.Z() > rim.Z() else -1.0
@@ -371,14 +370,15 @@ def _outline_of_walls(walls: Sequence[BRepAdaptor_Surface]) -> Outline | None:
     """Return the outline whose walls are exactly these faces; None for others, as with a flange or with draft."""
     if all(wall.GetType() == Kind.GeomAbs_Cylinder for wall in walls):
         radii = [_radius(wall) for wall in walls]
-        return Circle(max(radii)) if radii and max(radii) - min(radii) <= AXIS_TOLERANCE else None
+        return Circle(max(radii)) if radii and max(radii) - min(radii) <= AXIAL_TOLERANCE else None
     if len(walls) == 4 and all(wall.GetType() == Kind.GeomAbs_Plane for wall in walls):
         planes = [wall.Plane() for wall in walls]
         normals = np.abs([plane.Axis().Direction().Coord() for plane in planes])
         points = np.array([plane.Location().Coord() for plane in planes])
-        along = [points[normals[:, axis] > 1 - AXIS_TOLERANCE, axis] for axis in (0, 1)]
-        if all(len(pair) == 2 and abs(pair.sum()) <= AXIS_TOLERANCE for pair in along):
-            return Rectangle(*(float(np.ptp(pair)) for pair in along))
+        along = [points[normals[:, axis] > 1 - AXIAL_TOLERANCE, axis] for axis in (0, 1)]
+        if all(len(pair) == 2 and abs(pair.sum()) <= AXIAL_TOLERANCE for pair in along):
+            width, height = (float(np.ptp(pair)) for pair in along)
+            return Rectangle(width, height)
     return None
 
 
@@ -386,7 +386,7 @@ def _radius(wall: BRepAdaptor_Surface) -> float:
     """Return the radius (mm) of a cylinder on the axis; infinite if it is off the axis."""
     axis = wall.Cylinder().Axis()
     off = max(abs(axis.Location().X()), abs(axis.Location().Y()), 1 - abs(axis.Direction().Z()))
-    return wall.Cylinder().Radius() if off <= AXIS_TOLERANCE else math.inf
+    return wall.Cylinder().Radius() if off <= AXIAL_TOLERANCE else math.inf
 
 
 def outer_edge(face: TopoDS_Face) -> np.ndarray:
@@ -409,13 +409,13 @@ def clear_apertures(front: np.ndarray, back: np.ndarray) -> tuple[Outline, Outli
     Raises ValueError if the edge of the back has another shape.
     """
     rim = _bounding_outline(back)
-    if rim.is_round:
+    if isinstance(rim, Circle):
         rim = Circle(round(rim.radius, APERTURE_DECIMALS))
     else:
         corner = float((rim.width + rim.height) / 2 - np.abs(back).sum(axis=1).max()) / (2 - math.sqrt(2))
-        size = round(rim.width, APERTURE_DECIMALS), round(rim.height, APERTURE_DECIMALS)
+        width, height = round(rim.width, APERTURE_DECIMALS), round(rim.height, APERTURE_DECIMALS)
         corner = round(corner, APERTURE_DECIMALS) if corner > CIRCLE_TOLERANCE else 0.0
-        rim = Rounded(*size, corner_radius=corner) if corner else Rectangle(*size)
+        rim = Rounded(width, height, corner_radius=corner) if corner else Rectangle(width, height)
     if not (off := np.abs(rim.depth(*back.T)).max()) <= CIRCLE_TOLERANCE:
         raise ValueError(f"the edge of the back lies up to {off:.2g} mm off any circle or rectangle about the axis")
     inset = float(rim.depth(*front.T).max())
@@ -436,8 +436,7 @@ def _bounding_outline(points: np.ndarray) -> Outline:
 def points_on_edges(solid: TopoDS_Shape) -> np.ndarray:
     """Return the ends and middles of all edges, (n, 3), mm, in any order."""
     edges = map(TopoDS.Edge_s, parts_of(solid, TopAbs_EDGE))
-    edges = (edge for edge in edges if not BRep_Tool.Degenerated_s(edge))  # such as the apex of a cone
-    curves = map(BRepAdaptor_Curve, edges)
+    curves = (BRepAdaptor_Curve(edge) for edge in edges if not BRep_Tool.Degenerated_s(edge))  # the apex of a cone is
     return np.concatenate([_curve_points(curve, np.array([0.0, 0.5, 1.0])) for curve in curves])
 
 

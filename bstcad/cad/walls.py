@@ -122,6 +122,7 @@ def _edge(curve: RailCurve, start: TopoDS_Vertex, end: TopoDS_Vertex) -> TopoDS_
         return BRepBuilderAPI_MakeEdge(spline, start, end, 0.0, piece.end).Edge()
     if piece.straight:
         return _straight(start, end)
+    assert piece.centre is not None  # without knots it is a line or an arc
     (x, y, z), (x0, y0) = curve.poles[0].tolist(), piece.centre
     axes = gp_Ax2(gp_Pnt(x0, y0, z), gp_Dir(0, 0, piece.turn), gp_Dir(x - x0, y - y0, 0))
     return BRepBuilderAPI_MakeEdge(Geom_Circle(axes, math.hypot(x - x0, y - y0)), start, end, 0.0, piece.end).Edge()
@@ -143,7 +144,7 @@ def _curve_on(surface: Surface, piece: LoopPiece) -> RailCurve:
         return RailCurve(piece, points(np.array([0.0, piece.end])))
     if is_net(surface) and piece.straight and (border := _border(surface, piece)) is not None:
         return border
-    smooth = not surface.is_net and (piece.straight or piece.centre is not None)
+    smooth = not surface.is_net and piece.is_line_or_arc
     return RailCurve(piece, *wires.fit_spline(points, wires.breaks(surface, piece), RIM_TOLERANCE, smooth))
 
 
@@ -164,7 +165,7 @@ def _is_level_on(surface: Surface, piece: LoopPiece) -> bool:
     """True if the edge over a piece on a surface is a level line or arc, as on a plane, or about the axis."""
     if piece.centre is not None and not surface.is_net and math.hypot(*piece.centre) < SHAPE_TOLERANCE:
         return True
-    return surface.level and (piece.straight or piece.centre is not None)
+    return surface.level and piece.is_line_or_arc
 
 
 # ---- the surfaces of walls -----------------------------------------------------------------------------------------
@@ -195,9 +196,10 @@ class WallSurface:
 
 
 def _upright_surface(piece: LoopPiece) -> WallSurface:
-    if piece.straight or piece.centre is not None:
+    if piece.is_line_or_arc:
         return _plane_or_cone(piece, (*piece.at(0.0), 0.0), 0.0)
     curve = _curve_on(Plane(0.0), piece)
+    assert curve.knots is not None  # as of any freeform piece
     base = patches.bspline_curve(curve.poles, curve.knots)
     surface = Geom_SurfaceOfLinearExtrusion(base, gp_Dir(0, 0, 1))
     return WallSurface(surface, True, lambda t, z, _: np.stack([t, z], axis=-1))
@@ -211,6 +213,7 @@ def _plane_or_cone(piece: LoopPiece, start: Sequence[float], tangent: float) -> 
         u, v = (-piece.left(np.zeros(1))[0]).tolist()
         normal = gp_Dir(u * math.cos(angle), v * math.cos(angle), -math.sin(angle))
         return WallSurface(Geom_Plane(gp_Ax3(gp_Pnt(x, y, z), normal)), True, None)
+    assert piece.centre is not None  # an arc
     x0, y0 = piece.centre
     frame, radius = gp_Ax3(gp_Pnt(x0, y0, z), gp_Dir(0, 0, turn), gp_Dir(x - x0, y - y0, 0)), math.hypot(x - x0, y - y0)
     surface = Geom_ConicalSurface(frame, angle, radius) if tangent else Geom_CylindricalSurface(frame, radius)
@@ -224,12 +227,12 @@ def _plane_or_cone(piece: LoopPiece, start: Sequence[float], tangent: float) -> 
 def _drafted_surface(piece: LoopPiece, low: RailCurve, high: RailCurve, tangent: float) -> WallSurface:
     if not tangent:
         return _upright_surface(piece)
-    round_or_straight = piece.straight or piece.centre is not None
-    return _plane_or_cone(piece, high.poles[0], tangent) if round_or_straight else _ruled_surface(low, high)
+    return _plane_or_cone(piece, high.poles[0], tangent) if piece.is_line_or_arc else _ruled_surface(low, high)
 
 
 def _ruled_surface(low: RailCurve, high: RailCurve) -> WallSurface:
     """Return the ruled surface between two cubics of the same knots."""
+    assert low.knots is not None
     net, ends = np.stack([low.poles, high.poles], axis=1), np.array([0.0, 0.0, 1.0, 1.0])
     return WallSurface(patches.bspline_surface(net, low.knots, ends), True, lambda t, _, up: np.stack([t, up], axis=-1))
 

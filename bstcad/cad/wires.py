@@ -16,7 +16,7 @@ from OCP.TopAbs import TopAbs_Orientation
 from scipy.interpolate import BSpline, make_interp_spline
 
 from bstcad.optics.bspline import BSplineSurface, is_net
-from bstcad.optics.outlines import Outline
+from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import Surface
 
 if TYPE_CHECKING:
@@ -28,9 +28,9 @@ POLYGON_SIDES = 400  # sides of the polygon by which a loop is checked
 MIN_PARTS = 64  # smallest number of intervals of a piece
 MAX_PARTS, MAX_HALVINGS = 1 << 14, 4  # largest number of intervals of a cubic; halvings of each first one, if more
 QUINTIC_PARTS = 256  # intervals of a quintic, which follows half a circle on a sphere or conic to 1e-12 mm
-MIN_PART = 1e-7  # smallest distance of two breaks, relative to the length of the piece
+MIN_BREAK_DISTANCE = 1e-7  # smallest distance of two breaks, relative to the length of the piece
 ONE_SIDED_SLOPE = np.array([-25, 48, -36, 16, -3]) / 12  # weights of five values: slope at the first, to h⁴ f⁽⁵⁾ / 5
-BISECTIONS = 50  # steps of bisection, down to rounding
+CROSSING_BISECTIONS = 50  # steps of bisection, down to rounding
 
 Points = Callable[[np.ndarray], np.ndarray]  # function of t (n,) that returns points (n, k)
 
@@ -49,6 +49,11 @@ class LoopPiece:
     turn: int = 0  # +1: a circle run counterclockwise, -1: clockwise, 0: no circle
     straight: bool = False  # True for a line
 
+    @property
+    def is_line_or_arc(self) -> bool:
+        """True for a line or an arc, False for a freeform curve."""
+        return self.straight or self.centre is not None
+
     def at(self, t: float) -> tuple[float, float]:
         """Return the point at t (mm)."""
         x, y = self.points(np.array([t]))[0]
@@ -57,7 +62,7 @@ class LoopPiece:
 
 def outline_loop(outline: Outline) -> list[LoopPiece]:
     """Return the loop of an outline, counterclockwise."""
-    if outline.is_round:
+    if isinstance(outline, Circle):
         return circle(0.0, 0.0, outline.radius)
     a, b = outline.half_extent
     corners = [(-a, -b), (a, -b), (a, b), (-a, b)]
@@ -96,11 +101,8 @@ def shape_in(given: Any) -> tuple[Any, str]:
 def _line(start: Sequence[float], end: Sequence[float]) -> LoopPiece:
     p, length = np.array(start, float), math.dist(start, end)
     x, y = (np.array(end, float) - p) / length
-
-    def left(t: np.ndarray) -> np.ndarray:
-        return np.tile([-y, x], (len(t), 1))
-
-    return LoopPiece(lambda t: p + t[:, None] * np.array([x, y]), left, length, straight=True)
+    points, left = (lambda t: p + t[:, None] * np.array([x, y])), (lambda t: np.tile([-y, x], (len(t), 1)))
+    return LoopPiece(points, left, length, straight=True)
 
 
 def _arc(centre: tuple[float, float], radius: float, start: float, *, span: float, turn: int = 1) -> LoopPiece:
@@ -202,7 +204,7 @@ def breaks(surface: Surface, *pieces: LoopPiece) -> np.ndarray:
     if is_net(surface):  # smooth between its knot lines
         t = np.unique(np.concatenate([t, *(_crossings(surface, piece) for piece in pieces)]))
     inner = t[1:-1]
-    inner = inner[(np.diff(t)[:-1] > MIN_PART * t[-1]) & (t[-1] - inner > MIN_PART * t[-1])]
+    inner = inner[(np.diff(t)[:-1] > MIN_BREAK_DISTANCE * t[-1]) & (t[-1] - inner > MIN_BREAK_DISTANCE * t[-1])]
     return np.concatenate([t[:1], inner, t[-1:]])
 
 
@@ -215,7 +217,7 @@ def _crossings(surface: BSplineSurface, piece: LoopPiece) -> np.ndarray:
         k = np.flatnonzero(np.diff(cell))  # empty if the piece runs along the lines
         line, low, high = first + pitch * (np.maximum(cell[k], cell[k + 1]) + 0.5), t[k], t[k + 1]
         rising = cell[k] < cell[k + 1]
-        for _ in range(BISECTIONS if len(k) else 0):
+        for _ in range(CROSSING_BISECTIONS if len(k) else 0):
             middle = (low + high) / 2
             before = (piece.points(middle)[:, axis] < line) == rising
             low, high = np.where(before, middle, low), np.where(before, high, middle)
