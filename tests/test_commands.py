@@ -64,9 +64,9 @@ def quick(monkeypatch):
 def dying(*works):
     """A submit whose process dies over the functions whose names begin with one of `works`."""
 
-    def submit(work, *arguments):
+    def submit(work, *arguments, **options):
         if not f"{work.__module__}.{work.__name__}".startswith(works):
-            return commands.processes.run_here(work, *arguments)
+            return commands.processes.run_here(work, *arguments, **options)
         broken = Future()
         broken.set_exception(BrokenExecutor("it died"))
         return broken
@@ -235,16 +235,16 @@ class TestGenerate:
         monkeypatch.setattr(commands.processes, "submit", dying("bstcad.verify.jobs."))
         before = contents(folder)
         for path in (folder, folder / "lens.step"):
-            with pytest.raises(SceneError, match=r"lens\.step: OCC broke down over it"):
+            with pytest.raises(SceneError, match=r"lens\.step: OCC crashed while reading it"):
                 commands.verify(path)
         assert contents(folder) == before
 
     def test_a_second_process_that_does_not_end_over_the_file_is_stopped(self, folder, monkeypatch):
         """Within the limit, in a sentence that says what took how long."""
 
-        def submit(work, *arguments):
+        def submit(work, *arguments, **options):
             hangs = work in (jobs.read_lens, jobs.check_lens, jobs.examine)
-            return Future() if hangs else commands.processes.run_here(work, *arguments)
+            return Future() if hangs else commands.processes.run_here(work, *arguments, **options)
 
         monkeypatch.setattr(commands.processes, "submit", submit)
         monkeypatch.setattr(commands.checks, "TIME_LIMIT", 0.1)

@@ -11,14 +11,14 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from bstcad.analysis.light import Blur, blur, margins, mount_losses, rrmsd_of_ripple
-from bstcad.analysis.shape import AT_BOUND, describe, survey, survey_front
+from bstcad.analysis.shape import AT_BOUND, Extreme, describe, survey, survey_front
 from bstcad.cad import mesh as meshes
 from bstcad.optics import quadrature
 from bstcad.optics.channels import Channel
@@ -26,12 +26,14 @@ from bstcad.optics.goal import Goal, worst
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, RESOLVED, Effort, Light, SpectralLine, measure_goal, spectral_lines, tubes_of
 from bstcad.optics.outlines import Outline
+from bstcad.optics.passes import Face
 from bstcad.optics.wavefront_error import WavefrontError, wavefront_error
 from bstcad.runs.processes import Overdue, Submit, end, result, return_freed, run_here
 from bstcad.scene.blank import LensBlank
-from bstcad.scene.mount import as_cut
+from bstcad.scene.mount import Part, as_cut
 from bstcad.scene.scene import Accept, Scene
 from bstcad.step_text import part21
+from bstcad.step_text.part21 import StepText
 from bstcad.verify import jobs, text_checks
 from bstcad.verify.verdict import Check
 
@@ -43,13 +45,17 @@ VERIFY_SEED = 1_000_003  # offset of the seed: rays that tailoring has not used
 TARGET_TOLERANCE = 1e-3  # difference of targets, relative to the brightest pixel: versions of picture libraries differ
 DEFAULT_RRMSD_LIMIT = 0.25  # limit of the RRMSD in remarks, plans and tolerance studies without accept.rrmsd
 LINE_TUBES = 1031  # smallest number of tubes per side for the picture of one line of a spectrum
-APERTURE_TOLERANCE = 1e-3  # distance of rims (mm): for an edge that is not level the scene has its largest inset only
+CLEAR_APERTURE_TOLERANCE = 1e-3  # distance of rims (mm): a scene states one inset per edge, the largest
 MIN_MOUNT_LOSS = 1e-3  # fraction of the light that a mount must cut away to be given as the reason for a failure
 MAX_FLANGE_LIGHT = 1e-3  # largest fraction of the light through the lens that may meet the flange
 WAVEFRONT = "wavefront error, RMS in waves, piston and tilt removed"
 DRAFT_ACCURACY = 0.01  # relative standard error of the RRMSD of a draft at which sampling ends
 MAX_FLOOR = 0.1  # largest ratio of the rounding of the wavefront error to its limit; above it the verdict is open
 TIME_LIMIT, TIME_LIMIT_PER_MB = 120.0, 3.0  # timeout of OCC (s), and increase per MB: 100 times its usual time
+
+R = TypeVar("R")
+Lines = tuple[SpectralLine, ...]  # pictures of the lines of a spectrum on one target
+OnLight = Callable[[Light, Lines, int], None]  # function that is called with the light on a target, and its index
 FINE_GRID = ", on a grid four times finer than the net"  # end of the names of checks on such a grid
 
 
@@ -79,6 +85,10 @@ class Nominal:
         accuracy = DRAFT_ACCURACY if tailoring.quality == "draft" else FULL.accuracy
         return replace(given, seed=tailoring.seed, accuracy=max(given.accuracy, accuracy))
 
+    def light(self, lens: Lens, goal: Goal, effort: Effort) -> Light:
+        """Return the light that a made lens throws on a target."""
+        return measure_goal(lens, self.channels, goal, effort, ghost=self.scene.ghost, draw=self.scene.draw)
+
 
 @dataclass(frozen=True)
 class AtBound:
@@ -98,7 +108,7 @@ class Proof:
     shape: dict[str, float | None]  # dimensions of the lens within the mount's rim, and volume of lens.step (mm³)
     stability: dict[str, float | int | None]  # margins to numerical limits, see `_stability`
     blur: Blur | None = None  # blur by the source's size on the worst target; None: the source has no size
-    lines: tuple[SpectralLine, ...] = ()  # pictures of the lines of a spectrum on the worst target
+    lines: Lines = ()  # pictures of the lines of a spectrum on the worst target
     at_bounds: dict[str, AtBound] | None = None  # bounds that the lens meets, by key; None: no bounds
     wavefront: WavefrontError | None = None  # error of the wavefront; None: not requested, or no light reaches it
 
@@ -123,7 +133,7 @@ def verify(
     nominal: Nominal,
     submit: Submit = run_here,
     known: Callable[[Lens], None] = lambda lens: None,
-    lit: Callable[[Light, tuple[SpectralLine, ...], int], None] = lambda light, lines, number: None,
+    lit: OnLight = lambda light, lines, number: None,
     effort: Effort | None = None,
 ) -> Proof:
     """Check lens.step and lens.stl in `folder` against the design; ValueError if one of them cannot be read at all.
@@ -134,80 +144,80 @@ def verify(
     """
     effort = nominal.effort(effort)
     effort = replace(effort, seed=effort.seed + VERIFY_SEED, seconds=effort.seconds / len(nominal.goals))
-    path = (folder / "lens.step").absolute()
-    lens = submit(jobs.read_lens, path, nominal.lens.index, nominal.lens.passes)
-    mount, part = nominal.scene.mount, nominal.scene.part.of(nominal.scene.lens)
-    part_lens = mount and submit(jobs.read_lens_of_part, folder.absolute(), nominal.lens, mount)
-    check_lens = partial(submit, jobs.check_lens, path, nominal.lens, nominal.scene.accept.form, effort.points)
-    of_step = check_lens()
-    check_part = mount and partial(submit, jobs.check_part, folder.absolute(), nominal.lens, mount, part)
-    of_part = check_part and check_part()
-    try:
-        text = part21.read_lens(path)  # messages are more precise than OCC's
-    except ValueError:
-        if not lens.done():  # OCC may hang over a damaged file
-            end()
-        raise
+    path, mount, part = folder.absolute() / "lens.step", nominal.scene.mount, nominal.scene.part.of(nominal.scene.lens)
+    read = submit(jobs.read_lens, path, nominal.lens.index, nominal.lens.passes)
+    read_part = None if mount is None else submit(jobs.read_lens_of_part, path.parent, nominal.lens, mount)
+    solid_checks = _check_solids(path, nominal, part, effort.points, submit=submit)
+    text = _read_text(path, read)
     mesh = meshes.read_stl(folder / "lens.stl")
     closed = Check.true("STL: watertight, winding consistent", meshes.is_closed(mesh), id="mesh-closed")
     return_freed()  # memory of the texts
-    lens = _with_design_facts(_result(lens, path), nominal.lens)
+    lens = _with_design_facts(_result(read, path), nominal.lens)
     whole = quadrature.of_lens(lens)  # computed, not as stated in the file
-    made_lens, of_aperture, why = (lens, (), "") if mount is None else _mounted_lens(part_lens, lens, nominal, folder)
+    made_lens, of_aperture, why = (lens, [], "") if read_part is None else _mounted_lens(read_part, lens, nominal, path)
     known(made_lens)
-    found = []
-    for number, goal in enumerate(nominal.goals):
-        found.append(_measure_light(made_lens, nominal, goal, effort=effort))
-        lit(*found[-1], number)
-    lights, lines = zip(*found, strict=True)
-    number = worst(light.rrmsd for light in lights)
+    lights, lines = zip(*_measure_targets(made_lens, nominal, effort, lit), strict=True)
     wavefront, of_wavefront = _wavefront_checks(made_lens, nominal)
     cut = as_cut(lens, mount)
     shape = describe(cut, effort.places) | {"volume": whole.volume} | _ripple_rrmsd(made_lens, nominal)
-    stability = _stability(made_lens, nominal, lights, shape)
+    stability, of_stability = _stability(made_lens, nominal, lights, shape)
     of_shape, at_bounds = bound_checks(cut, nominal.scene.lens, shape)
-    meets = f"{'enters' if lens.passes.enters else 'meets'} the {lens.passes.optic}"
-    goals = [(goal, each, goal.suffix) for goal, each in zip(nominal.goals, lights, strict=True)]
-    degrees = math.nan if stability["tir_margin_deg"] is None else stability["tir_margin_deg"]
-    margin = Check.at_least("smallest margin to total internal reflection", degrees, None, "deg", id="tir-margin")
+    meets, accept = f"{'enters' if lens.passes.enters else 'meets'} the {lens.passes.optic}", nominal.scene.accept
+    lit_goals = list(zip(nominal.goals, lights, strict=True))
     checks = (
         *text_checks.lens_checks(text, nominal.lens),
         *text_checks.measure_checks(text.properties, whole, lens.outline),
         *text_checks.part_checks(text, part),
-        *_result(of_step, path, check_lens),
-        *(_result(of_part, folder / "part.step", check_part) if of_part else ()),
+        *solid_checks(),
         *of_aperture,
         *of_shape,
         *_ripple_checks(shape),
         closed,
-        *_mesh_checks(mesh, lens, shape["volume"], nominal),
+        *_mesh_checks(mesh, lens, whole.volume, nominal),
         *map(_target_check, nominal.goals, nominal.stored or [goal.picture for goal in nominal.goals]),
-        *(c for _, each, of in goals for c in _light_checks(each, nominal.scene.accept, meets, of=of, why=why)),
+        *(c for goal, light in lit_goals for c in _light_checks(light, accept, meets, of=goal.suffix, why=why)),
         *of_wavefront,
-        *([margin] if lens.passes.enters else []),
-        Check.at_most("number of values that are not finite", stability["non_finite"], 0, id="finite"),
+        *of_stability,
     )
-    return Proof(
-        checks,
-        made_lens,
-        lights,
-        shape,
-        stability=stability,
-        blur=blur(nominal.channels, made_lens, nominal.goals[number].receiver, nominal.goals[number].picture),
-        lines=lines[number],
-        at_bounds=at_bounds or None,
-        wavefront=wavefront,
-    )
+    proof = Proof(checks, made_lens, lights, shape, stability=stability, wavefront=wavefront)
+    goal = nominal.goals[proof.worst]
+    blurred = blur(nominal.channels, made_lens, goal.receiver, goal.picture)
+    return replace(proof, blur=blurred, lines=lines[proof.worst], at_bounds=at_bounds or None)
 
 
-def _measure_light(lens: Lens, nominal: Nominal, goal: Goal, effort: Effort) -> tuple[Light, tuple[SpectralLine, ...]]:
-    """Measure the light on a target, and the picture of each line of a spectrum; ValueError if no light falls there."""
-    scene = nominal.scene
-    light = measure_goal(lens, nominal.channels, goal, effort, ghost=scene.ghost, draw=scene.draw)
-    if not light.rrmsd >= 0:
-        name = "lens.step" if scene.mount is None else "part.step"
-        raise ValueError(f"{name}: none of its light falls on {goal.words}; write it again, or check scene.toml")
-    return light, spectral_lines(lens, nominal.channels, goal, n=max(LINE_TUBES, tubes_of(lens)))
+def _check_solids(path: Path, nominal: Nominal, part: Part, points: int, submit: Submit) -> Callable[[], list[Check]]:
+    """Submit the checks of the solids of lens.step and part.step; return a function that waits for them."""
+    lens, mount, form = nominal.lens, nominal.scene.mount, nominal.scene.accept.form
+    starts: dict[Path, Callable[[], Future[tuple[Check, ...]]]] = {
+        path: lambda: submit(jobs.check_lens, path, lens, form=form, points=points)
+    }
+    if mount is not None:
+        starts[path.with_name("part.step")] = lambda: submit(jobs.check_part, path.parent, lens, mount=mount, part=part)
+    started = [(start(), file, start) for file, start in starts.items()]
+    return lambda: [check for job in started for check in _result(*job)]
+
+
+def _read_text(path: Path, read: Future[Lens]) -> StepText:
+    """Read the text of lens.step, whose errors are more precise than OCC's; read: OCC's job, ended after an error."""
+    try:
+        return part21.read_lens(path)
+    except ValueError:
+        if not read.done():  # OCC may hang over a damaged file
+            end()
+        raise
+
+
+def _measure_targets(lens: Lens, nominal: Nominal, effort: Effort, lit: OnLight) -> list[tuple[Light, Lines]]:
+    """Measure the light on each target, and the lines of a spectrum there; ValueError if no light falls on one."""
+    found = []
+    for number, goal in enumerate(nominal.goals):
+        light = nominal.light(lens, goal, effort)
+        if not light.rrmsd >= 0:
+            name = "lens.step" if nominal.scene.mount is None else "part.step"
+            raise ValueError(f"{name}: none of its light falls on {goal.words}; write it again, or check scene.toml")
+        found.append((light, spectral_lines(lens, nominal.channels, goal, n=max(LINE_TUBES, tubes_of(lens)))))
+        lit(*found[-1], number)
+    return found
 
 
 def _with_design_facts(lens: Lens, designed: Lens) -> Lens:
@@ -216,14 +226,16 @@ def _with_design_facts(lens: Lens, designed: Lens) -> Lens:
     return replace(lens, before=designed.before, behind=designed.behind, shaped=shaped)
 
 
-def _mounted_lens(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> tuple[Lens, Sequence[Check], str]:
-    """Return the lens of part.step, the checks of its clear apertures, and the loss by them in words.
+def _mounted_lens(read: Future[Lens], bare: Lens, nominal: Nominal, path: Path) -> tuple[Lens, list[Check], str]:
+    """Return the lens of part.step beside lens.step, the checks of its clear apertures, and the loss by them in words.
 
-    Without a readable part, which other checks report, it is the lens of lens.step with the designed apertures.
+    If the part cannot be read, which other checks report, it is the lens of lens.step with the designed apertures.
     """
-    designed, flange = nominal.lens, nominal.scene.mount.flange
+    designed, mount = nominal.lens, nominal.scene.mount
+    flange = None if mount is None else mount.flange
     try:
-        lens = replace(_with_design_facts(_result(read, folder / "part.step"), designed), outline=bare.outline)
+        made = _result(read, path.with_name("part.step"))
+        lens = replace(_with_design_facts(made, designed), outline=bare.outline)
         pairs = zip(("front", "back"), lens.apertures, designed.apertures, strict=True)
         checks = [_aperture_check(*each) for each in pairs]
     except ValueError as error:
@@ -244,22 +256,29 @@ def _mounted_lens(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> t
 def _aperture_check(name: str, measured: Outline, designed: Outline) -> Check:
     """Check the largest distance (mm) between the rims of a face's clear aperture and of the designed one."""
     off = max(float(np.abs(a.depth(*b.rim_points())).max()) for a, b in ((measured, designed), (designed, measured)))
-    where = f"the part has {measured.words}, the lens was tailored for {designed.words}; generate the design again"
+    where = f"the part has {measured.words}, but the lens was tailored for {designed.words}; generate the design again"
     name = f"part.step: clear aperture of the {name}, deviation from the mount's"
-    return Check.at_most(name, off, APERTURE_TOLERANCE, unit="mm", where=where, id="clear-aperture")
+    return Check.at_most(name, off, CLEAR_APERTURE_TOLERANCE, unit="mm", where=where, id="clear-aperture")
 
 
-def _stability(lens: Lens, nominal: Nominal, lights: Sequence[Light], shape: dict) -> dict[str, float | int | None]:
-    """Return the margins of the lens to numerical limits; angles in degrees, curvature in 1/mm."""
+def _stability(
+    lens: Lens, nominal: Nominal, lights: Sequence[Light], shape: Mapping[str, float | None]
+) -> tuple[dict[str, float | int | None], list[Check]]:
+    """Return the margins of the lens to numerical limits, angles in degrees, curvature in 1/mm, and their checks."""
     margin = margins(nominal.channels, lens, nominal.goals[0].receiver, nominal.scene.tailoring.seed + VERIFY_SEED)
     keys = (f"{face}radius_min_{kind}" for face in ("", "front_") for kind in ("concave", "convex"))
-    radii = [shape[key] for key in keys if shape.get(key)]
-    return {
+    radii = [radius for key in keys if (radius := shape.get(key))]
+    non_finite = margin.non_finite + sum(int((~np.isfinite(light.picture)).sum()) for light in lights)
+    stability = {
         "tir_margin_deg": margin.tir_margin_deg,
         "newton_slope_min": margin.newton_slope_min,
         "curvature_max": 1 / min(radii) if radii else 0.0,
-        "non_finite": margin.non_finite + sum(int((~np.isfinite(light.picture)).sum()) for light in lights),
+        "non_finite": non_finite,
     }
+    name, degrees = "smallest margin to total internal reflection", margin.tir_margin_deg
+    value = math.nan if degrees is None else degrees
+    reflection = [Check.at_least(name, value, None, "deg", id="tir-margin")] if lens.passes.enters else []
+    return stability, [*reflection, Check.at_most("number of values that are not finite", non_finite, 0, id="finite")]
 
 
 def examine(path: Path, submit: Submit = run_here) -> ExaminedFile:
@@ -267,7 +286,7 @@ def examine(path: Path, submit: Submit = run_here) -> ExaminedFile:
     return _result(submit(jobs.examine, path.absolute()), path)
 
 
-def _result(read: Future, path: Path, again: Callable[[], Future] | None = None) -> Any:
+def _result(read: Future[R], path: Path, again: Callable[[], Future[R]] | None = None) -> R:
     """Return the result of a job of OCC's process; again: a retry, if another file may have crashed that process."""
     limit = time_limit(path)
     try:
@@ -278,7 +297,9 @@ def _result(read: Future, path: Path, again: Callable[[], Future] | None = None)
     except BrokenExecutor as error:
         if again is not None:
             return _result(again(), path)
-        raise ValueError(f"{path.name}: OCC broke down over it, the file is damaged; write it again") from error
+        raise ValueError(
+            f"{path.name}: OCC crashed while reading it, so the file is damaged; write it again"
+        ) from error
 
 
 def time_limit(path: Path) -> float:
@@ -291,21 +312,18 @@ def _ripple_checks(shape: Mapping[str, float | None]) -> list[Check]:
 
     There is no limit: the RRMSD judges its effect on the light, and the bounds of the scene its effect on a tool.
     """
-    measured = "RMS slope of control points of alternating height"
-    faces = {"": shape["ripple_slope"], " of the front": shape.get("front_ripple_slope")}
-    return [
-        Check.at_most(f"ripple{of}: {measured}", slope, None, "rad", id="ripple")
-        for of, slope in faces.items()
-        if slope is not None
-    ]
+    slopes = {"": shape["ripple_slope"], " of the front": shape.get("front_ripple_slope")}
+    named = {f"ripple{of}: RMS slope of control points of alternating height": slope for of, slope in slopes.items()}
+    return [Check.at_most(name, slope, None, "rad", id="ripple") for name, slope in named.items() if slope is not None]
 
 
 def _ripple_rrmsd(lens: Lens, nominal: Nominal) -> dict[str, float]:
     """Return the RRMSD by the ripple of each tailored face alone, by keys of Proof.shape."""
     light = nominal.heaviest
     channel = replace(light, source=light.source.central, weight=1.0)
-    faces, screen = {"": "back"} | ({"front_": "front"} if lens.shapes("front") else {}), nominal.goals[0].receiver
-    return {f"{key}ripple_rrmsd": rrmsd_of_ripple(channel, lens, screen, face) for key, face in faces.items()}
+    faces: dict[Face, str] = {"back": "", "front": "front_"} if lens.shapes("front") else {"back": ""}
+    screen = nominal.goals[0].receiver
+    return {f"{key}ripple_rrmsd": rrmsd_of_ripple(channel, lens, screen, face) for face, key in faces.items()}
 
 
 def bound_checks(
@@ -316,7 +334,8 @@ def bound_checks(
     The bounds are tool_radius, max_slope and the thicknesses of [lens]; shape: dimensions of the re-read lens.  They
     hold for a tailored front as for the back, seen from outside: a tool has to fit into its valleys.
     """
-    checks, found = [], {}
+    checks: list[Check] = []
+    found: dict[str, list[tuple[float, Extreme, str]]] = {}
     radius, degrees, kind = asked.tool_radius, asked.max_slope, "convex" if asked.mould else "concave"
     if radius is not None or degrees is not None:
         surveys = [(survey, "")] * lens.shapes("back") + [(survey_front, " of the front")] * lens.shapes("front")
@@ -343,8 +362,10 @@ def bound_checks(
         ("edge-thickness", "smallest thickness of the edge", Check.at_least, "edge_thickness_min", "edge_thickness"),
     ):
         if (limit := getattr(asked, key)) is not None:
-            checks.append(judge(name, shape[figure], limit, "mm", id=id))
-            if min(shape[figure], limit) >= AT_BOUND * max(shape[figure], limit):
+            value = shape[figure]
+            assert value is not None  # any lens has thicknesses
+            checks.append(judge(name, value, limit, "mm", id=id))
+            if min(value, limit) >= AT_BOUND * max(value, limit):
                 at_bounds[key] = AtBound(None, "")
     return checks, at_bounds
 

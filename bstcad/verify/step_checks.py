@@ -114,23 +114,17 @@ def _stamp(path: Path) -> tuple[int, int, int] | None:
 
 @one_sentence
 def examine(path: Path) -> ExaminedFile:
-    """Check a STEP file without a design: compare its two readers, and its statements with its faces.
-
-    The text is read first, because OCC may hang over a damaged file.
-    """
-    text, reread = part21.read_lens(path, any_unit=True), step_reading.read(path)
+    """Check a STEP file without a design: compare its two readers, and its statements with its faces."""
+    text = part21.read_lens(path, any_unit=True)  # first, because OCC may hang over a damaged file
+    reread = step_reading.read(path)
     lens_read, placed = step_reading.lens(reread, index=1.5), reread.placement
     properties = solid_properties.of_solid(reread.shape)
+    name = "control points: difference between STEP text and OCC"
     checks = [
         *text_checks.structure_checks(text, lens_read.back_net.shape, any_unit=True),
         *_solid_checks(reread.shape),
         *_edge_checks(reread, lens_read, bare=reread.edge is None),
-        net_check(
-            "control points: difference between STEP text and OCC",
-            text.surface.control_points,
-            placed(reread.control_points),
-            id="net-two-readers",
-        ),
+        net_check(name, text.surface.control_points, placed(reread.control_points), id="net-two-readers"),
     ]
     if text.front is not None:
         name = "control points of the front: difference between STEP text and OCC"
@@ -269,21 +263,20 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
         return (Check.true(f"{PART_FILE}: can be read", False, str(error), id="part-readable"),)
     down = np.array([0.0, 0.0, mount.origin(lens.front_vertex)])
     net = lens.back_net.control_points() - down
-    of_front = ()
+    of_front = []
     if lens.shapes("front"):
         name, read = f"{PART_FILE}: deviation of the control points of the front", text_checks.net_of_front(text)
-        of_front = (net_check(name, read, lens.front_net.control_points() - down, id="control-points"),)
+        of_front.append(net_check(name, read, lens.front_net.control_points() - down, id="control-points"))
     properties = _properties(path, _stamp(path)) if text.properties.of_shape else None
     if text.properties.of_shape and properties is None:  # a damaged face, which other checks find
         name = f"{PART_FILE}: area, volume and centroid can be computed from the faces"
-        stated = [Check.true(name, False, "a face is of an unknown kind", id="measures-unknown")]
+        stated = iter([Check.true(name, False, "a face is of an unknown kind", id="measures-unknown")])
     else:
         stated = text_checks.measure_checks(text.properties, properties, lens.outline, PART_FILE)
+    name = f"{PART_FILE}: deviation of the control points"
     return (
         *text_checks.structure_checks(text, lens.back_net.shape, PART_FILE),
-        net_check(
-            f"{PART_FILE}: deviation of the control points", text.surface.control_points, net, id="control-points"
-        ),
+        net_check(name, text.surface.control_points, net, id="control-points"),
         *of_front,
         *_solid_checks(solid, of_part=True),
         _part_edge_check(wanted, solid, why),

@@ -7,7 +7,7 @@ file of another program, is reported but not judged.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from bstcad.scene.mount import Part
 from bstcad.step_text.part21 import FreeformSurface, StepText, ValidationProperties
 from bstcad.verify.verdict import Check
 
-PREFIX = "STEP text"
+SOURCE = "STEP text"  # source of the checked values, with which the names of the checks begin
 NET_TOLERANCE = 1e-11  # absolute tolerance of control points (mm): rounding to sixteen digits of text
 RELATIVE_ROUNDING = 2e-15  # relative tolerance of coordinates, which exceeds NET_TOLERANCE at over 5 m from the origin
 MEASURE_TOLERANCE = 1e-6  # relative tolerance of area, volume and centroid; integrals over a rough back have some 1e-9
@@ -31,10 +31,10 @@ Numbers = tuple[float, ...]
 def lens_checks(text: StepText, lens: Lens) -> list[Check]:
     """Check the text of the STEP file against the design."""
     checks = structure_checks(text, lens.back_net.shape)
-    name, back = f"{PREFIX}: deviation of the control points", lens.back_net.control_points()
+    name, back = f"{SOURCE}: deviation of the control points", lens.back_net.control_points()
     checks.append(net_check(name, text.surface.control_points, back, id="control-points"))
     if lens.front.is_net and (text.front is not None or lens.shapes("front")):
-        name, front = f"{PREFIX}: deviation of the control points of the front", lens.front_net.control_points()
+        name, front = f"{SOURCE}: deviation of the control points of the front", lens.front_net.control_points()
         checks.append(net_check(name, net_of_front(text), front, id="control-points"))
     return checks
 
@@ -44,7 +44,7 @@ def net_of_front(text: StepText) -> np.ndarray:
     return np.empty((0, 0, 3)) if text.front is None else text.front.control_points
 
 
-def structure_checks(text: StepText, shape: tuple[int, int], name: str = PREFIX, any_unit: bool = False) -> list[Check]:
+def structure_checks(text: StepText, shape: tuple[int, int], name: str = SOURCE, any_unit: bool = False) -> list[Check]:
     """Check the structure of the STEP file: solids, unit, edges, and degree and knots of its freeform faces.
 
     shape: numbers of control points of the back along x and y.  any_unit: accept any unit of length.
@@ -61,13 +61,9 @@ def structure_checks(text: StepText, shape: tuple[int, int], name: str = PREFIX,
         for axis, full, values, points in zip("uv", surface.full_knots, surface.knots, sides, strict=True)
     )
     units = f"{text.solids} solids, lengths in {text.unit}"
+    single, one_solid = text.solids == 1 and (any_unit or text.unit == "millimetre"), f"{name}: one solid"
     return [
-        Check.true(
-            f"{name}: one solid{'' if any_unit else ', in millimetres'}",
-            text.solids == 1 and (any_unit or text.unit == "millimetre"),
-            units,
-            id="one-solid",
-        ),
+        Check.true(one_solid if any_unit else f"{one_solid}, in millimetres", single, units, id="one-solid"),
         Check.true(f"{name}: every edge used twice, once each way", text.closed, _open_edge(text), id="edges-twice"),
         Check.true(f"{name}: degree 2 x 2, multiplicities 3, 1, …, 1, 3", plain, degrees, id="degree"),
         Check.at_most(f"{name}: deviation of the knots", off, 0.0, where=knot, id="knots"),
@@ -106,21 +102,23 @@ def _largest_difference(read: np.ndarray, designed: np.ndarray, name: str) -> tu
 
 
 def measure_checks(
-    stated: ValidationProperties, shape: MassProperties | None, outline: Outline, name: str = PREFIX
+    stated: ValidationProperties, shape: MassProperties | None, outline: Outline, name: str = SOURCE
 ) -> Iterator[Check]:
     """Check the stated properties against the shape's (None if the file states none); outline: size of the lens."""
+    if stated.of_shape:
+        assert shape is not None
+        measures = ("area", "mm²", stated.areas, shape.area), ("volume", "mm³", stated.volumes, shape.volume)
+        for quantity, unit, values, own in measures:
+            if values:
+                off, where = _worst_value([(value,) for value in values], (own,), "its faces give", unit)
+                deviation = f"{name}: stated {quantity}, relative deviation from the faces'"
+                yield Check.at_most(deviation, off / own, MEASURE_TOLERANCE, where=where, id="stated-measures")
+        if stated.centroids:
+            off, where = _worst_value(stated.centroids, shape.centroid, "its faces give", "mm")
+            size = 2 * math.hypot(*outline.half_extent)
+            deviation = f"{name}: stated centroid, deviation from the faces'"
+            yield Check.at_most(deviation, off, MEASURE_TOLERANCE * size, unit="mm", where=where, id="stated-centroid")
     all_stated = {"area": stated.areas, "volume": stated.volumes, "centroid": stated.centroids}
-    for quantity, unit in (("area", "mm²"), ("volume", "mm³")):
-        if values := all_stated[quantity]:
-            own = getattr(shape, quantity)
-            off, where = _worst_value([(value,) for value in values], (own,), "its faces give", unit)
-            deviation = f"{name}: stated {quantity}, relative deviation from the faces'"
-            yield Check.at_most(deviation, off / own, MEASURE_TOLERANCE, where=where, id="stated-measures")
-    if stated.centroids:
-        off, where = _worst_value(stated.centroids, shape.centroid, "its faces give", "mm")
-        size = 2 * math.hypot(*outline.half_extent)
-        deviation = f"{name}: stated centroid, deviation from the faces'"
-        yield Check.at_most(deviation, off, MEASURE_TOLERANCE * size, unit="mm", where=where, id="stated-centroid")
     yield from _missing_statements(name, all_stated)
 
 
@@ -128,30 +126,30 @@ def density_checks(stated: ValidationProperties) -> Iterator[Check]:
     """Check that each stated density (g/cm³) of a file without a design is a number above zero."""
     for value in stated.densities:
         known = value if value > 0 else None
-        yield Check(f"{PREFIX}: stated density", known, None, "g/cm³", passed=value > 0, id="stated-density")
+        yield Check(f"{SOURCE}: stated density", known, None, "g/cm³", passed=value > 0, id="stated-density")
 
 
-def part_checks(text: StepText, part: Part, name: str = PREFIX) -> Iterator[Check]:
+def part_checks(text: StepText, part: Part, name: str = SOURCE) -> Iterator[Check]:
     """Check material, density and profile tolerances of back and front against the scene's [part]."""
     stated, back, profile = text.properties, text.surface.entity, "profile tolerance"
     fronts = [each for each in stated.profiles if part.front_profile is not None and each.face == "front"]
     backs = [each for each in stated.profiles if each not in fronts]
-    numbers = {  # quantity: (unit, stated values, value of the scene)
+    numbers: dict[str, tuple[str, Sequence[float], float | None]] = {  # quantity: (unit, stated values, scene's value)
         profile: ("mm", [each.width for each in backs], part.surface_profile),
         f"{profile} of the front": ("mm", [each.width for each in fronts], part.front_profile),
         "density": ("g/cm³", stated.densities, part.density),
     }
     for quantity, (unit, values, required) in numbers.items():
-        if values and required is None:
-            difference = f"the file states {_words((values[0],), unit)}, the scene none"
-            yield Check.true(f"{name}: {quantity} is the scene's", False, difference, id="stated-values")
-        elif values:
-            off, where = _worst_value([(value,) for value in values], (required,), "the scene", unit)
+        if required is not None and values:
+            off, where = _worst_value([(value,) for value in values], (required,), "the scene states", unit)
             difference = f"{name}: {quantity}, difference from the scene's"
             yield Check.at_most(difference, off, VALUE_TOLERANCE, unit=unit, where=where, id="stated-values")
+        elif values:
+            difference = f"the file states {_words((values[0],), unit)}, but the scene states none"
+            yield Check.true(f"{name}: {quantity} is the scene's", False, difference, id="stated-values")
     if backs:
         others = {each.surface for each in backs} - {"", back}
-        where = f"it refers to the surface #{min(others)}, the back is #{back}" if others else ""
+        where = f"it refers to the surface #{min(others)}, but the back is #{back}" if others else ""
         yield Check.true(f"{name}: {profile} refers to the back", not others, where, id="profile-face")
     if fronts:
         where = f"it refers to the surface #{back}, which is the back"
@@ -160,9 +158,10 @@ def part_checks(text: StepText, part: Part, name: str = PREFIX) -> Iterator[Chec
         yield Check.true(own, of_front, where, id="profile-face")
     if stated.materials:
         wrong = [material for material in stated.materials if material != part.material]
-        where = f"the file states {wrong[0]!r}, the scene {part.material!r}" if wrong else ""
+        own = "none" if part.material is None else repr(part.material)
+        where = f"the file states {wrong[0]!r}, but the scene states {own}" if wrong else ""
         yield Check.true(f"{name}: material is the scene's", not wrong, where, id="material")
-    expected = {quantity: values for quantity, (_, values, required) in numbers.items() if required is not None}
+    expected: dict[str, Sequence] = {q: values for q, (_, values, required) in numbers.items() if required is not None}
     yield from _missing_statements(name, expected | ({} if part.material is None else {"material": stated.materials}))
 
 
@@ -170,7 +169,7 @@ def _worst_value(values: Sequence[Numbers], own: Numbers, who: str, unit: str) -
     """Return the largest error of the stated values, infinite for an unreadable one, and the difference in words."""
     off = [math.dist(each, own) for each in values]
     worst, stated = max((math.inf if math.isnan(by) else by, each) for by, each in zip(off, values, strict=True))
-    return worst, f"the file states {_words(stated, unit)}, {who} {_words(own, unit)}"
+    return worst, f"the file states {_words(stated, unit)}, but {who} {_words(own, unit)}"
 
 
 def _words(values: Numbers, unit: str) -> str:
@@ -180,7 +179,7 @@ def _words(values: Numbers, unit: str) -> str:
     return f"({words}) {unit}" if len(values) > 1 else f"{words} {unit}"
 
 
-def _missing_statements(name: str, stated: dict[str, Sequence]) -> Iterator[Check]:
+def _missing_statements(name: str, stated: Mapping[str, Sequence]) -> Iterator[Check]:
     """Yield a check that names the quantities which the file does not state; it always passes."""
     if missing := [quantity for quantity, values in stated.items() if not values]:
         yield Check(f"{name}: states {', '.join(missing)}", False, None, unit="", passed=True, id="not-stated")

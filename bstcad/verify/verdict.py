@@ -60,8 +60,7 @@ class Check:
 def verdict(passed: bool, given_up: Sequence[str], asked: bool = True) -> str:
     """Return one of VERDICTS; given_up: wishes of the scene that could not be met, which become remarks.
 
-    asked: True if the scene sets a limit on the light.  Without one, checks can show that a lens is bad, but not that
-    it is good.
+    asked: True if the scene limits the light; otherwise checks can show that a lens is bad, but not that it is good.
     """
     clean, remarked, no_limit, failed = VERDICTS
     if not passed:

@@ -212,7 +212,7 @@ def test_a_part_with_another_rim_is_judged_by_its_own_light_and_fails_by_name(cu
     failed = {check.name: check.where for check in proof.checks if not check.passed}
     assert proof.flux["on target"] < 0.8 * before.light.flux["on target"] and proof.rrmsd > 0.2
     assert (
-        "\u00d87.5 mm, the lens was tailored for \u00d89 mm"
+        "\u00d87.5 mm, but the lens was tailored for \u00d89 mm"
         in failed["part.step: clear aperture of the back, deviation from the mount's"]
     )
     assert "RRMSD, box pixels, through the re-read STEP" in failed
