@@ -300,10 +300,8 @@ def verify(
             drawn.solid(proof.lens)
             judged: list[Compared] = []
             for number, goal in enumerate(made.goals):
-                by_others = comparison.run_judges(
-                    against, proof.lens, made.channels, goal.receiver, target=goal.picture,
-                    seed=made.scene.tailoring.seed, progress=progress, key=goal.key if goal.suffix else "",
-                )  # fmt: skip
+                lit, seed = (proof.lens, made.channels, goal), made.scene.tailoring.seed
+                by_others = comparison.run_judges(against, *lit, seed=seed, progress=progress)
                 drawn.begin(draw_judges, by_others, number=number)
                 judged += by_others
             proof = replace(proof, checks=(*proof.checks, *(check for each in judged for check in each.checks)))

@@ -251,16 +251,15 @@ def test_rays_in_space_draw_its_picture(folder):
 @pytest.mark.bench  # batoid and mitsuba come with the extra `judges`
 def test_batoid_traces_them_too(folder):
     again = bstcad.open(folder)
-    target, channels = again.scene.target, again.scene.verification_channels()
-    found = compare("batoid", again.lens, channels, target.screen, target.irradiance(), rays=100_000, seed=1)
+    scene = again.scene
+    found = compare("batoid", again.lens, scene.verification_channels(), *scene.goals, rays=100_000, seed=1)
     assert found.judge.agrees, found.judge
 
 
 @pytest.mark.bench
 def test_mitsuba_says_that_it_knows_none_of_them(folder):
     again = bstcad.open(folder)
-    target = again.scene.target
-    said = compare("mitsuba", again.lens, again.scene.channels(), target.screen, target.irradiance(), rays=1)
+    said = compare("mitsuba", again.lens, again.scene.channels(), *again.scene.goals, rays=1)
     assert "windows or mirrors" in said.judge.declined
 
 

@@ -50,8 +50,8 @@ def test_its_proof_through_the_file_knows_all_passes(folder):
 @pytest.mark.bench  # batoid comes with the extra `judges`
 def test_batoid_sees_the_same_picture(folder):
     design = bstcad.open(folder)
-    target, channels = design.scene.target, design.scene.verification_channels()
-    found = compare("batoid", design.lens, channels, target.screen, target.irradiance(), rays=100_000, seed=1)
+    scene = design.scene
+    found = compare("batoid", design.lens, scene.verification_channels(), *scene.goals, rays=100_000, seed=1)
     assert found.judge.agrees, found.judge
 
 

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import batoid
 import numpy as np
 
 from bstcad.judges import faces
@@ -21,7 +22,7 @@ from bstcad.optics.interfaces import Reflect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import side_factor
-from bstcad.optics.outlines import Outline
+from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.rays import Rays, axes
 from bstcad.optics.tilted import TiltedSurface
 from bstcad.optics.trace import launch_strips
@@ -41,6 +42,7 @@ class PlacedSurface:
 
     def error(self, outline: Outline) -> FaceError:
         """Return the error of the surface against the lens's face."""
+        assert self.face is not None
         exact = self.face.at(*faces.random_points(outline, COMPARISON_POINTS, seed=0))
         heights = self.surface.sag(exact.x, exact.y) + self.frame.origin[2]
         return FaceError.between(heights, self.surface.normal(exact.x, exact.y), exact)
@@ -48,8 +50,6 @@ class PlacedSurface:
 
 def placed(face: Face) -> PlacedSurface:
     """Return a face as a surface of batoid."""
-    import batoid
-
     if isinstance(face, faces.Freeform):
         x, y = map(_extend, face.lines(parts=1))
         shape = face.on_grid(x, y)
@@ -71,8 +71,6 @@ def surfaces(lens: Lens) -> tuple[PlacedSurface, ...]:
 
 def _place_tilted(surface: TiltedSurface) -> PlacedSurface:
     """Return a plane or sphere in any position as a surface of batoid, without comparison."""
-    import batoid
-
     n = np.array(surface.unit_normal)
     e_x = np.cross((0.0, 1.0, 0.0), n)
     e_x /= np.linalg.norm(e_x)
@@ -82,16 +80,12 @@ def _place_tilted(surface: TiltedSurface) -> PlacedSurface:
 
 def vector(rays: Rays) -> Any:
     """Convert rays in air to batoid's rays; their velocity (c = 1) is then the unit vector of the direction."""
-    import batoid
-
     x, y, _ = rays.position
     return batoid.RayVector(*(np.ascontiguousarray(p.numpy()) for p in (x, y, rays.above(0.0), *rays.direction)))
 
 
 def land(rays: Any, screen: Screen, sense: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Move batoid's rays to the screen; return x, y (mm, on it) and True if arrived; sense: -1 for light along -z."""
-    import batoid
-
     x, y, _ = screen.middle
     batoid.intersect(batoid.Plane(), rays, _frame(screen.middle, np.column_stack(axes(screen.tilt or (0.0, 0.0)))))
     arrived = ~rays.failed & ~rays.vignetted & np.isfinite(rays.x) & np.isfinite(rays.y) & (sense * rays.vz > 0)
@@ -100,8 +94,6 @@ def land(rays: Any, screen: Screen, sense: int = 1) -> tuple[np.ndarray, np.ndar
 
 def through(lens: Lens, known: Sequence[PlacedSurface], rays: Rays) -> Any:
     """Trace rays of the source through the lens and return them as batoid's; known: surfaces of the lens in batoid."""
-    import batoid
-
     theirs = vector(rays)
     for interface, at in zip(lens.interfaces, known, strict=True):
         if isinstance(interface.law, Reflect):
@@ -157,15 +149,11 @@ def _extend(line: np.ndarray) -> np.ndarray:
 
 
 def _frame(origin: tuple[float, float, float], turned: np.ndarray | None = None) -> Any:
-    import batoid
-
     return batoid.CoordSys(origin=list(origin), rot=turned)
 
 
 def _outside(outline: Outline) -> Any:
-    import batoid
-
-    if outline.is_round:
+    if isinstance(outline, Circle):
         inside = batoid.ObscCircle(outline.radius)
     elif outline.limits[2]:
         inside = batoid.ObscPolygon(*faces.rim(outline, POLYGON_CORNERS).T)

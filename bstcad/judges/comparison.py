@@ -23,6 +23,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from bstcad.optics.channels import Channel
+from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, measure
@@ -32,9 +33,9 @@ from bstcad.verify.verdict import Check
 
 JUDGES = {"batoid": "bstcad.judges.batoid", "mitsuba": "bstcad.judges.mitsuba"}
 JUDGE_RAYS = 1 << 24  # rays of a judge, in both halves
-MAX_PIXELS = 128  # largest number of pixels along the longer side of the compared pictures
+MAX_COMPARED_PIXELS = 128  # largest number of pixels along the longer side of the compared pictures
 OWN_EFFORT = Effort(accuracy=0.0, witness=False)  # effort of bstcad: as many rays as allowed, without noise
-SEED_OFFSET = 500_009  # difference between the seeds of bstcad's and the judge's rays
+OWN_SEED_OFFSET = 500_009  # difference between the seeds of bstcad's and the judge's rays
 AGREEMENT_FACTOR = 1.5  # largest ratio of the difference of pictures to its noise, for many pixels
 MIN_NOISE = 1e-9  # smallest noise, relative to the target
 FLUX_TOLERANCE = 0.005  # largest difference of the light on the target, as a fraction of the source's light
@@ -42,16 +43,13 @@ FLUX_TOLERANCE = 0.005  # largest difference of the light on the target, as a fr
 
 @dataclass(frozen=True)
 class Judge:
-    """Comparison of a judge's picture with bstcad's, as in report.json; differences relative to the target, like RRMSD.
-
-    All fields from `by` on are None if the judge declined.
-    """
+    """Comparison of a judge's picture with bstcad's, as in report.json; differences are relative to the target."""
 
     name: str  # name of the program
     version: str  # version of the program
     declined: str = ""  # reason why it cannot trace this light
     target: str = ""  # key of the target, if there are several: target[0], target[1], …
-    by: str | None = None  # variant of the program, if it has several
+    by: str | None = None  # variant of the program, if it has several; None here and below: the judge declined
     rays: int | None = None  # number of rays in both halves
     pixels: tuple[int, int] | None = None  # number of columns and rows
     losses: str | None = None  # losses of light in both pictures: "none" or "Fresnel"
@@ -116,40 +114,40 @@ def choose_judges(names: Sequence[str | OwnJudge]) -> tuple[str | OwnJudge, ...]
 
 
 def run_judges(
-    names: Sequence[str | OwnJudge], lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray,
-    seed: int, progress: Callable[[str, int, int, str], None], key: str = "",
-) -> tuple[Compared, ...]:  # fmt: skip
-    """Compare the picture of each judge with bstcad's, one after the other; key: the target's, if there are several."""
+    judges: Sequence[str | OwnJudge],
+    lens: Lens,
+    channels: Sequence[Channel],
+    goal: Goal,
+    seed: int,
+    progress: Callable[[str, int, int, str], None],
+) -> tuple[Compared, ...]:
+    """Compare the picture of each judge with bstcad's, one after the other."""
     compared = []
-    for number, name in enumerate(names):
-        progress("judges", number, len(names), " ".join((getattr(name, "name", name), key)).strip())
-        compared.append(compare(name, lens, channels, screen, target=target, rays=JUDGE_RAYS, seed=seed, key=key))
-    if names:
-        progress("judges", len(names), len(names), "")
+    for number, judge in enumerate(judges):
+        name = judge if isinstance(judge, str) else judge.name
+        progress("judges", number, len(judges), f"{name} {goal.key}" if goal.suffix else name)
+        compared.append(compare(judge, lens, channels, goal, rays=JUDGE_RAYS, seed=seed))
+    if judges:
+        progress("judges", len(judges), len(judges), "")
     return tuple(compared)
 
 
 def compare(
-    given: str | OwnJudge, lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, *, rays: int,
-    seed: int = 0, key: str = "",
-) -> Compared:  # fmt: skip
-    """Compare a judge's picture of the light of `lens` on `screen` with bstcad's.
-
-    rays, seed: of the judge, in both halves.  target: picture (rows, columns) of any sum, row 0 = y max.  key: name of
-    the target in checks, such as target[1]; "": the only one.
-    """
+    given: str | OwnJudge, lens: Lens, channels: Sequence[Channel], goal: Goal, *, rays: int, seed: int = 0
+) -> Compared:
+    """Compare a judge's picture of the light on a target with bstcad's; rays: number of its rays in both halves."""
     began = time.perf_counter()
-    judge, name, version = _judge_functions(given)
+    (judge, name, version), key = _judge_functions(given), goal.key if goal.suffix else ""
     declined = judge.cannot(lens, channels)
-    if isinstance(given, str) and screen.plane.frame is None:
+    if isinstance(given, str) and goal.receiver.plane.frame is None:
         declined = "it collects light only on planes"
     if declined:
         return Compared(Judge(name, version, declined, target=key))
-    raster = coarse_screen(screen)
-    target, light = resample(target, raster.shape), judge.light(lens, channels)
+    raster = coarse_screen(goal.receiver)
+    target, light = resample(goal.picture, raster.shape), judge.light(lens, channels)
     traced = judge.trace(lens, light, raster, rays=rays, seed=seed)
     seconds = time.perf_counter() - began
-    ours = measure(lens, light, raster, target, effort=replace(OWN_EFFORT, seed=seed + SEED_OFFSET))
+    ours = measure(lens, light, raster, target, effort=replace(OWN_EFFORT, seed=seed + OWN_SEED_OFFSET))
     total = float(target.sum())
     theirs, first, second = (_scale_to(picture, total) for picture in (traced.picture, *traced.halves))
     difference = _difference(theirs, ours.picture, target)
@@ -157,9 +155,8 @@ def compare(
     limit = AGREEMENT_FACTOR * (1 + 3 / math.sqrt(_effective_pixels(first - second)))
     over_noise = difference / max(noise, MIN_NOISE)
     on_target, on_target_ours = float(traced.picture.sum()), ours.flux.get("on target", 0.0)
-    of = f", {key}" if key else ""
-    irradiance = f"irradiance by {name}, difference from bstcad's over the noise{of}"
-    flux = f"light on the target by {name}, difference from the ledger's as a fraction of the source's{of}"
+    irradiance = f"irradiance by {name}, difference from bstcad's relative to the noise{goal.suffix}"
+    flux = f"light on the target by {name}, difference from the ledger's as a fraction of the source's{goal.suffix}"
     checks = (
         Check.at_most(irradiance, over_noise, limit, id="judge-irradiance"),
         Check.at_most(flux, abs(on_target - on_target_ours), FLUX_TOLERANCE, id="judge-flux"),
@@ -212,13 +209,13 @@ def _scale_to(picture: np.ndarray, total: float) -> np.ndarray:
 
 
 def coarse_screen(screen: Screen) -> Screen:
-    """Return the screen with nearly square pixels, at most MAX_PIXELS and its own number along the longer side.
+    """Return the screen with nearly square pixels, at most MAX_COMPARED_PIXELS and its own number along the longer one.
 
     Of the numbers above half of that, the one with the most nearly square pixels is chosen, the largest of several.
     """
     width, height = screen.x[1] - screen.x[0], screen.y[1] - screen.y[0]
     ratio = min(width, height) / max(width, height)
-    most = min(MAX_PIXELS, screen.columns if width >= height else screen.rows)
+    most = min(MAX_COMPARED_PIXELS, screen.columns if width >= height else screen.rows)
 
     def shorter(longer: int) -> int:
         return max(1, round(longer * ratio))

@@ -18,11 +18,11 @@ from trimesh import Trimesh
 from bstcad.optics.bspline import is_net
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Outline
+from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import Surface
 from bstcad.optics.unfolding import per_radian
 
-NEWTON_STEPS = 6  # steps of Newton's method for a parameter; the first guess has an error of at most half a span
+PARAMETER_STEPS = 6  # steps of Newton's method for a parameter; the first guess has an error of at most half a span
 GRID_CELLS = 512  # cells per side of the grid over a face without knots
 PLATE_RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # relative radii of rings; slim triangles leak light
 
@@ -64,12 +64,15 @@ class Freeform:
 
     @cached_property
     def _ends(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        return tuple((float(self.net[0, 0, i]), float(self.net[-1, -1, i])) for i in (0, 1))
+        (x0, y0), (x1, y1) = self.net[0, 0, :2].tolist(), self.net[-1, -1, :2].tolist()
+        return (x0, x1), (y0, y1)
 
     def lines(self, parts: int) -> tuple[np.ndarray, np.ndarray]:
         """Return x and y (mm) of grid lines, 2 `parts` per pitch, through all knots, at 1.5, 2.5, … pitches."""
-        pairs = zip(self._ends, self.net.shape, strict=False)
-        return tuple(np.linspace(*ends, 2 * parts * (m - 1) + 1) for ends, m in pairs)
+        x, y = (
+            np.linspace(*ends, 2 * parts * (m - 1) + 1) for ends, m in zip(self._ends, self.net.shape, strict=False)
+        )
+        return x, y
 
     def at(self, x: np.ndarray, y: np.ndarray) -> Shape:
         """Evaluate the face at points (mm) by scipy's NdBSpline."""
@@ -97,7 +100,7 @@ class Freeform:
         along = BSpline(self.knots[axis], np.linspace(*ends, m), 2)
         last = m - 2.0
         t = np.clip((x - ends[0]) / (ends[1] - ends[0]) * (m - 1) - 0.5, 0.0, last)
-        for _ in range(NEWTON_STEPS):
+        for _ in range(PARAMETER_STEPS):
             t = np.clip(t - (along(t) - x) / along(t, nu=1), 0.0, last)
         return x, t, 1 / along(t, nu=1)
 
@@ -114,7 +117,8 @@ class Revolved:
     def lines(self, parts: int) -> tuple[np.ndarray, np.ndarray]:
         """Return x and y (mm) of the lines of a uniform grid over the face; a plane ignores `parts`."""
         cells = GRID_CELLS * parts if self.curvature else 64
-        return tuple(np.linspace(-half, half, cells + 1) for half in self.half)
+        x, y = (np.linspace(-half, half, cells + 1) for half in self.half)
+        return x, y
 
     def on_grid(self, x: np.ndarray, y: np.ndarray) -> Shape:
         """Evaluate the face where lines x and y (mm) cross, y along the first axis."""
@@ -123,9 +127,8 @@ class Revolved:
     def at(self, x: np.ndarray, y: np.ndarray) -> Shape:
         """Evaluate the face at points (mm)."""
         c, r2 = self.curvature, x**2 + y**2
-        root = np.sqrt(
-            np.maximum(1 - (1 + self.conic_constant) * c * c * r2, 1e-6)
-        )  # any value is allowed outside the rim
+        cos2 = 1 - (1 + self.conic_constant) * c * c * r2
+        root = np.sqrt(np.maximum(cos2, 1e-6))  # any value is allowed outside the rim
         return Shape(x, y, self.z0 + c * r2 / (1 + root), z_x=c * x / root, z_y=c * y / root)
 
 
@@ -184,7 +187,7 @@ class Traced:
 
 def rim(outline: Outline, points: int = 512) -> np.ndarray:
     """Return points (points, 2) along an outline (mm), counterclockwise; a rectangle with all its corners."""
-    if outline.is_round:
+    if isinstance(outline, Circle):
         turn = np.linspace(0, 2 * np.pi, points, endpoint=False)
         return outline.radius * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * outline.half_extent

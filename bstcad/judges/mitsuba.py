@@ -18,7 +18,7 @@ import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -42,7 +42,7 @@ SCREEN_REFLECTANCE = 1e-3  # reflectance of the screen, so low that light back t
 PHOTONS_PER_PASS = 1 << 22  # largest number of photons in a pass, limited by memory
 MESH_PARTS = (1, 2, 4)  # cells of the mesh per half span of the net, tried in turn
 MAX_CORNERS = 5_000_000  # largest number of corners of a mesh
-MAX_SHIFT = 0.007  # largest shift of light by facets (RMS, pixels); 0.02 changes a picture by 0.8 %
+MAX_FACET_SHIFT = 0.007  # largest shift of light by facets (RMS, pixels); 0.02 changes a picture by 0.8 %
 TEXELS = 1024  # texels of a slide along each side
 TEXEL_CENTRES = (2 * np.arange(TEXELS) + 1) / TEXELS - 1  # centres of texels, from -1 to 1
 FIELD_MARGIN = 1.01  # ratio of a projector's field to that of the lens
@@ -50,6 +50,7 @@ SPOT_EDGE = 1e-5  # width of a spot's edge, relative to its cone
 PROJECTOR_FLUX = math.pi  # ratio of the flux of Mitsuba's projector to the irradiance of its slide
 
 Entry = dict[str, Any]  # entry of a scene of Mitsuba
+S = TypeVar("S", Collimated, Point)
 
 
 def cannot(lens: Lens, channels: Sequence[Channel]) -> str:
@@ -71,20 +72,15 @@ def light(lens: Lens, channels: Sequence[Channel]) -> tuple[Channel, ...]:
     """Return the channels with the losses that Mitsuba simulates."""
     if not lens.passes.enters:
         return tuple(replace(channel, losses=None) for channel in channels)
-    return tuple(replace(channel, losses=Losses(FresnelLoss(channel.source.wavelength))) for channel in channels)
+    return tuple(replace(channel, losses=Losses(FresnelLoss(channel.source.main_wavelength))) for channel in channels)
 
 
 def trace(
     lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int, reflections: int = 0
 ) -> Traced:
-    """Return the picture on a screen of square pixels by `rays` photons, in two halves.
-
-    reflections: largest number inside a lens; with 2 its ghost is part of the picture.
-    """
-    import mitsuba
-
-    mitsuba.set_variant(variant := _variant())
-    mitsuba.logger().clear_appenders()  # no progress bar per render
+    """Return the picture on a screen of square pixels; reflections: largest number inside a lens, 2 for its ghost."""
+    _mitsuba().set_variant(variant := _variant())
+    _mitsuba().logger().clear_appenders()  # no progress bar per render
     halves, photons = np.zeros((2, *screen.shape)), 0
     with tempfile.TemporaryDirectory(prefix="bstcad-") as name:
         folder = Path(name)
@@ -102,6 +98,13 @@ def trace(
     return Traced(halves, photons, error, variant)
 
 
+def _mitsuba() -> Any:
+    """Return the module of Mitsuba, whose contents depend on the variant."""
+    import mitsuba
+
+    return mitsuba
+
+
 def _variant() -> str:
     """Return the variant of Mitsuba: vectorised if LLVM is installed, otherwise one photon at a time."""
     import drjit
@@ -112,13 +115,11 @@ def _variant() -> str:
 
 def _render(scene: Any, screen: Screen, photons: float, seed: tuple[int, ...]) -> tuple[np.ndarray, int]:
     """Return the flux in each pixel, row 0 = y max, column 0 = x min, and the number of photons.  E = π L / ρ."""
-    import mitsuba
-
     pixels, passes = math.prod(screen.shape), math.ceil(photons / PHOTONS_PER_PASS)
     spp = max(1, round(photons / pixels / passes))
     numbers = np.random.SeedSequence([abs(part) for part in seed]).generate_state(passes)
-    mean = sum(np.array(mitsuba.render(scene, spp=spp, seed=int(n)), dtype=float) for n in numbers) / passes
-    per_x, per_y = screen.per_unit
+    renders = (np.array(_mitsuba().render(scene, spp=spp, seed=int(n)), dtype=float) for n in numbers)
+    mean, (per_x, per_y) = np.asarray(sum(renders)) / passes, screen.per_unit
     flux = mean.reshape(*screen.shape, -1)[..., 0] * (math.pi / SCREEN_REFLECTANCE / (per_x * per_y))
     return flux[:, ::-1], passes * spp * pixels  # looking along +z with y up, x grows to the left
 
@@ -147,29 +148,24 @@ def _ply(mesh: Trimesh, path: Path) -> Entry:
 
 
 def _fine_mesh(face: Face, aperture: Outline, lens: Lens, screen: Screen, up: bool) -> tuple[Trimesh, FaceError]:
-    """Return the coarsest mesh of a face that shifts light by at most MAX_SHIFT of a pixel, or the finest one."""
+    """Return the coarsest mesh of a face that shifts light by at most MAX_FACET_SHIFT of a pixel, or the finest one."""
     pixel = 1 / max(screen.per_unit)
     for parts in MESH_PARTS:
         mesh, error = faces.face_mesh(face, aperture, parts, up)
-        if error.shift(lens, screen) <= MAX_SHIFT * pixel or 4 * len(mesh.vertices) > MAX_CORNERS:
+        if error.shift(lens, screen) <= MAX_FACET_SHIFT * pixel or 4 * len(mesh.vertices) > MAX_CORNERS:
             break
     return mesh, error
 
 
 def _scene(bench: dict[str, Entry], channels: Sequence[Channel], lens: Lens, *, edges: int, folder: Path) -> Any:
-    """Load the scene `bench` with the lamps of channels of one index.
-
-    edges: largest number of edges (straight pieces) of a photon's path to the camera.
-    """
-    import mitsuba
-
+    """Load the scene `bench` with the lamps of channels of one index; edges: largest number of edges of a path."""
     material = {"type": "dielectric", "int_ior": channels[0].index, "ext_ior": 1.0}
     if not lens.passes.enters:
         material = {"type": "conductor", "material": "none"}
     bench = bench | {name: bench[name] | {"bsdf": material} for name in bench.keys() & {"front", "back"}}
     tracer = {"type": "ptracer", "max_depth": edges, "rr_depth": 100, "hide_emitters": True}
     scene = {"type": "scene", "integrator": tracer} | bench | lamps(channels, lens, folder)
-    return mitsuba.load_dict(scene, optimize=False)
+    return _mitsuba().load_dict(scene, optimize=False)
 
 
 def _camera(screen: Screen, top: float) -> Entry:
@@ -177,15 +173,15 @@ def _camera(screen: Screen, top: float) -> Entry:
     middle, (_, up, normal) = screen.middle, axes(screen.tilt or (0.0, 0.0))
     across = screen.x[1] - screen.x[0]
     away = min(across / 2, (screen.z - top) / 2)
-    film = {
-        "type": "hdrfilm", "width": screen.columns, "height": screen.rows, "pixel_format": "luminance",
-        "component_format": "float32", "rfilter": {"type": "box"},
-    }  # fmt: skip
-    return {
-        "type": "perspective", "fov": math.degrees(2 * math.atan(across / 2 / away)), "fov_axis": "x",
+    film = {"type": "hdrfilm", "pixel_format": "luminance", "component_format": "float32", "rfilter": {"type": "box"}}
+    sensor = {"type": "perspective", "fov": math.degrees(2 * math.atan(across / 2 / away)), "fov_axis": "x"}
+    return sensor | {
         "to_world": _look_at([m - away * n for m, n in zip(middle, normal, strict=True)], middle, up),
-        "near_clip": 1e-3 * away, "far_clip": 1e3 * away, "film": film, "sampler": {"type": "independent"},
-    }  # fmt: skip
+        "near_clip": 1e-3 * away,
+        "far_clip": 1e3 * away,
+        "film": film | {"width": screen.columns, "height": screen.rows},
+        "sampler": {"type": "independent"},
+    }
 
 
 def _screen_entry(screen: Screen) -> Entry:
@@ -201,9 +197,7 @@ def _matt(reflectance: float) -> Entry:
 
 
 def _look_at(origin: Iterable[float], target: Iterable[float], up: Iterable[float] = (0.0, 1.0, 0.0)) -> Any:
-    import mitsuba
-
-    return mitsuba.ScalarTransform4f().look_at(origin=list(origin), target=list(target), up=list(up))
+    return _mitsuba().ScalarTransform4f().look_at(origin=list(origin), target=list(target), up=list(up))
 
 
 # --- lamps ------------------------------------------------------------------------------------------------------------
@@ -216,17 +210,24 @@ def lamps(channels: Sequence[Channel], lens: Lens, folder: Path) -> dict[str, En
 
 
 def _beam_lamps(channels: Sequence[Channel], lens: Lens, folder: Path) -> dict[str, Entry]:
-    return {f"lamp{k}": _plate(c.source, c.weight, lens, folder / f"lamp{k}.ply") for k, c in enumerate(channels)}
+    beams = enumerate(_sources(channels, Collimated))
+    return {f"lamp{k}": _plate(beam, weight, lens, folder / f"lamp{k}.ply") for k, (beam, weight) in beams}
 
 
 def _point_lamps(channels: Sequence[Channel], lens: Lens, folder: Path) -> dict[str, Entry]:
     """Return a spot for each point source of uniform radiant intensity in a cone, otherwise a projector."""
-    first = channels[0].source
+    points = _sources(channels, Point)
+    first, _ = points[0]
     if first.profile == "uniform" and first.is_cone:
-        return {f"lamp{k}": _spot(c.source, c.weight, lens) for k, c in enumerate(channels)}
-    half = FIELD_MARGIN * max(_largest_slope(c.source, lens) for c in channels)
+        return {f"lamp{k}": _spot(point, weight, lens) for k, (point, weight) in enumerate(points)}
+    half = FIELD_MARGIN * max(_largest_slope(point, lens) for point, _ in points)
     slide = {"slide": _slide(first, lens, half)}
-    return slide | {f"lamp{k}": _projector(c.source, c.weight, lens, half) for k, c in enumerate(channels)}
+    return slide | {f"lamp{k}": _projector(point, weight, lens, half) for k, (point, weight) in enumerate(points)}
+
+
+def _sources(channels: Sequence[Channel], kind: type[S]) -> list[tuple[S, float]]:
+    """Return the sources of channels, all of one kind, and their weights."""
+    return [(channel.source, channel.weight) for channel in channels if isinstance(channel.source, kind)]
 
 
 LAMPS = {"collimated": _beam_lamps, "point": _point_lamps}  # function that returns the lamps, for each kind of source
@@ -250,20 +251,18 @@ def _plate(source: Collimated, weight: float, lens: Lens, path: Path) -> Entry:
 def _spot(source: Point, weight: float, lens: Lens) -> Entry:
     """Return a spot of the radiant intensity I = 1 / (2π (1 - cos θ_max)) up to θ_max."""
     edge = source.half_angle
+    assert edge is not None  # as of any cone
     intensity = weight / (2 * math.pi * (1 - math.cos(math.radians(edge))))
-    return {
-        "type": "spot", "to_world": _look_along(source.position, [_sense(source, lens) * n for n in source.axes[2]]),
-        "cutoff_angle": edge, "beam_width": edge * (1 - SPOT_EDGE), "intensity": {"type": "rgb", "value": intensity},
-    }  # fmt: skip
+    to_world = _look_along(source.position, [_sense(source, lens) * n for n in source.axes[2]])
+    spot = {"type": "spot", "to_world": to_world, "cutoff_angle": edge, "beam_width": edge * (1 - SPOT_EDGE)}
+    return spot | {"intensity": {"type": "rgb", "value": intensity}}
 
 
 def _projector(source: Point, weight: float, lens: Lens, half: float) -> Entry:
     """Return a projector along the axis of the lens, over a square of slopes up to `half`."""
-    return {
-        "type": "projector", "to_world": _look_along(source.position, (0.0, 0.0, _sense(source, lens))),
-        "fov": math.degrees(2 * math.atan(half)), "scale": weight / PROJECTOR_FLUX,
-        "irradiance": {"type": "ref", "id": "slide"},
-    }  # fmt: skip
+    to_world, fov = _look_along(source.position, (0.0, 0.0, _sense(source, lens))), math.degrees(2 * math.atan(half))
+    projector = {"type": "projector", "to_world": to_world, "fov": fov, "scale": weight / PROJECTOR_FLUX}
+    return projector | {"irradiance": {"type": "ref", "id": "slide"}}
 
 
 def _largest_slope(source: Point, lens: Lens) -> float:
@@ -280,13 +279,12 @@ def _slide(source: Point, lens: Lens, half: float) -> Entry:
 
 def _irradiance(source: Emitter, x: np.ndarray, y: np.ndarray, z: float) -> np.ndarray:
     """Return the irradiance of a source on a plane z (mm), (rows, columns)."""
-    return source.irradiance(*map(torch.from_numpy, np.meshgrid(x, y)), z).numpy()
+    at_x, at_y = map(torch.from_numpy, np.meshgrid(x, y))
+    return source.irradiance(at_x, at_y, z).numpy()
 
 
 def _texture(values: np.ndarray) -> Entry:
-    import mitsuba
-
-    picture = mitsuba.Bitmap(np.ascontiguousarray(values[..., None], dtype=np.float32))
+    picture = _mitsuba().Bitmap(np.ascontiguousarray(values[..., None], dtype=np.float32))
     return {"type": "bitmap", "bitmap": picture, "raw": True, "wrap_mode": "clamp"}
 
 

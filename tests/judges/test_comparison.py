@@ -16,6 +16,7 @@ from bstcad import commands
 from bstcad.judges import comparison
 from bstcad.judges.faces import FaceError, Traced
 from bstcad.optics.channels import Channel
+from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.measure import tubes_picture
 from bstcad.scene.errors import MachineError, SceneError
@@ -30,7 +31,7 @@ def compared(name, case="a beam", rays=1 << 18):
     glass, source, screen = CASES[case]
     channels = (Channel(source, glass.index),)
     target = tubes_picture(glass, channels, screen, 256).numpy()
-    return comparison.compare(name, glass, channels, screen, target, rays=rays, seed=3)
+    return comparison.compare(name, glass, channels, Goal("target", screen, target), rays=rays, seed=3)
 
 
 def passed(found):
@@ -88,7 +89,7 @@ class TestStandIn:
     def test_each_judge_is_asked_in_turn(self, judge, monkeypatch):
         told, (glass, source, screen) = [], CASES["a beam"]
         monkeypatch.setattr(comparison, "JUDGE_RAYS", 1 << 12)
-        given = glass, (Channel(source, glass.index),), screen, np.ones(screen.shape), 0
+        given = glass, (Channel(source, glass.index),), Goal("target", screen, np.ones(screen.shape)), 0
         found = comparison.run_judges(["numpy"], *given, lambda *a: told.append(a))
         assert [each.judge.rays for each in found] == [1 << 12]
         assert told == [("judges", 0, 1, "numpy"), ("judges", 1, 1, "")]
@@ -135,7 +136,7 @@ def test_mitsuba_traces_the_light_of_ray_tubes(case):
 def test_coarse_pixels_are_square_and_keep_the_light(screen):
     raster = comparison.coarse_screen(screen)
     across, up = raster.per_unit
-    assert across == pytest.approx(up, rel=1e-3) and max(raster.shape) <= comparison.MAX_PIXELS
+    assert across == pytest.approx(up, rel=1e-3) and max(raster.shape) <= comparison.MAX_COMPARED_PIXELS
     picture = np.random.default_rng(0).random(screen.shape)
     coarse = comparison.resample(picture, raster.shape)
     assert coarse.shape == raster.shape and coarse.sum() == pytest.approx(picture.sum())
