@@ -36,7 +36,7 @@ MAX_OUTLIER_ROUNDS = 6  # maximum number of rounds of outlier rejection
 STEP_TOLERANCE = 1e-10  # largest component (mm at the rim) of a step that ends the iteration
 FOOT_ITERATIONS = 3  # iterations for the foot of a perpendicular; each scales the error by distance x curvature
 INDEPENDENT_PATCHES = 100  # patches of a face whose form errors are independent
-SCALE_PATCHES = 16  # patches of a face whose independent form errors resemble a change of scale
+SCALE_PATCHES = 16  # patches of a face with independent form errors that resemble a change of scale, such as power
 MAX_MOTION_UNCERTAINTY = 0.1  # uncertainty by form errors, in half widths, above which a motion is not determined
 MIN_SENSITIVITY = 1e-7  # mm of distance per mm of motion; smaller values are rounding
 RIM_MARGIN = 2e-3  # width, in half widths, of the rim that is ignored: points there may lie on the edge
@@ -51,9 +51,8 @@ def root_mean_square(values: np.ndarray) -> float:
 
 def sample_surface(surface: Surface, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return z (mm), ∂z/∂x and ∂z/∂y, (3, n), of a surface at (x, y) in mm."""
-    return np.stack(
-        [p.numpy() for p in surface.sag_and_slope(*map(torch.from_numpy, map(np.ascontiguousarray, (x, y))))]
-    )
+    at_x, at_y = (torch.from_numpy(np.ascontiguousarray(p)) for p in (x, y))
+    return np.stack([p.numpy() for p in surface.sag_and_slope(at_x, at_y)])
 
 
 @dataclass(frozen=True)
@@ -175,10 +174,9 @@ def align(face: Face, cloud: np.ndarray, start: Pose) -> Alignment:
     points, inside, near = _face_points(face, cloud[~out], pose)
     distances, normals = face.distance(points)
     _, motions = gauss_newton_step(face, points, distances, normals)
-    return Alignment(
-        pose, points, distances, normals, motions=motions, undetermined=_undetermined(motions),
-        outside=int((~inside).sum()), off_face=int((inside & ~near).sum()), outliers=pose.to_design(cloud[out]),
-    )  # fmt: skip
+    counts = {"outside": int((~inside).sum()), "off_face": int((inside & ~near).sum())}
+    free, outliers = _undetermined(motions), pose.to_design(cloud[out])
+    return Alignment(pose, points, distances, normals, motions=motions, undetermined=free, outliers=outliers, **counts)
 
 
 def _least_squares(face: Face, cloud: np.ndarray, pose: Pose) -> Pose:
@@ -229,10 +227,7 @@ def _undetermined(motions: np.ndarray) -> tuple[str, ...]:
 
 
 def scale(face: Face, alignment: Alignment) -> tuple[float, float]:
-    """Return the scale of the cloud relative to the design, fitted as a seventh parameter, and its uncertainty.
-
-    The uncertainty counts SCALE_PATCHES independent form errors, because an error of power resembles a scale.
-    """
+    """Return the scale of the cloud relative to the design, fitted as a seventh parameter, and its uncertainty."""
     growth = np.einsum("ij,ij->i", alignment.points - face.pivot, alignment.normals)
     columns = face.columns(alignment.points, alignment.normals) @ alignment.motions
     both = np.stack([growth, alignment.distances], axis=1)
@@ -250,7 +245,7 @@ def scale(face: Face, alignment: Alignment) -> tuple[float, float]:
 NEIGHBOURS = 24  # number of nearest points with which each point is compared
 MIN_CLUSTER = 8  # number of neighbours with a distance equal within 50 % from which a point counts as form
 OUTLIER_THRESHOLD = 6.0  # minimum deviation of an outlier in standard deviations (from the MAD), global and local
-MAD_TO_SIGMA = 1.4826  # standard deviation over median absolute deviation (MAD) of a normal distribution
+MAD_TO_SIGMA = 1.4826  # ratio of standard deviation to median absolute deviation (MAD) of a normal distribution
 CAUCHY_SCALE = 2.0  # residual, in standard deviations, at which a neighbour's weight is one half
 REWEIGHTING_ROUNDS = 3  # iterations of the neighbours' weights
 POINT_CHUNK = 20_000  # number of points that are judged at a time, which bounds the memory
@@ -262,8 +257,7 @@ def find_outliers(
 ) -> tuple[np.ndarray, float]:
     """Return a mask (n,) of the outliers among points (n, 3) at distances (n,) from the face, and the noise; mm.
 
-    candidates: mask (n,) of the points to judge; the others only serve as neighbours.
-    noise: noise (mm) over the whole face, if it is known already.
+    candidates: mask (n,) of the points to judge; the others are only neighbours.  noise: of the face, if it is known.
     """
     outliers, which = np.zeros(len(points), dtype=bool), np.flatnonzero(candidates)
     if len(points) <= NEIGHBOURS or not len(which):
@@ -369,12 +363,12 @@ def _middle(points: np.ndarray) -> np.ndarray:
 
 def _best_start(face: Face, sample: np.ndarray, decentres: list[np.ndarray], steps: int) -> tuple[Pose, float]:
     """Return the best of several starts; a later one only if it is clearly better than those before."""
-    best: tuple[Pose, float] | None = None
-    for decentre in decentres:
-        for height in _heights(face, sample, decentre):
-            pose, distance = _refine_start(face, sample, identity_pose(face, np.array([*decentre, height])), steps)
-            if best is None or distance < IMPROVEMENT_RATIO * best[1]:
-                best = pose, distance
+    shifts = (np.array([*decentre, height]) for decentre in decentres for height in _heights(face, sample, decentre))
+    first, *later = (_refine_start(face, sample, identity_pose(face, shift), steps) for shift in shifts)
+    best = first
+    for pose, distance in later:
+        if distance < IMPROVEMENT_RATIO * best[1]:
+            best = pose, distance
     return best
 
 

@@ -13,11 +13,11 @@ from bstcad.measured.point_text import INCH, INPUT_HINT, MeasuredPoints, read_te
 from bstcad.optics.outlines import Outline
 from bstcad.runs import files
 
-MAX_FILE_SIZE = 1_000_000_000  # bytes
+MAX_CLOUD_SIZE = 1_000_000_000  # bytes
 MIN_POINTS = 100  # minimum number of points: six degrees of freedom and a form are fitted to them
 MESH_SUFFIXES = (".ply", ".stl")
 UNIT_SIZES = {"inches": 1 / INCH, "metres": 1e-3, "micrometres": 1e3}  # 1 mm in each unit
-PLAUSIBLE_RATIOS = (0.3, 1.7)  # extent of a cloud over that of the lens: half of a lens, or a lens with its fixture
+PLAUSIBLE_RATIOS = (0.3, 1.7)  # ratios of a cloud's extent to the lens's: half of a lens, or a lens with its fixture
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def load(path: Path, outline: Outline) -> Cloud:
 def _read(path: Path) -> tuple[MeasuredPoints, bytes]:
     """Return the points of a file, in mm if its heading names a unit, and the file's bytes."""
     try:
-        data = files.contents(path, MAX_FILE_SIZE)
+        data = files.contents(path, MAX_CLOUD_SIZE)
     except ValueError as error:
         raise ValueError(f"cannot be read ({error}); give the path of a measured cloud") from None
     if not data.strip():
@@ -63,10 +63,7 @@ def _read(path: Path) -> tuple[MeasuredPoints, bytes]:
 
 
 def in_millimetres(points: np.ndarray, outline: Outline) -> tuple[np.ndarray, str]:
-    """Return the points in mm, and the unit of the input, "mm" or "inches".
-
-    Raises ValueError if the extent of the cloud fits the lens in neither unit.
-    """
+    """Return the points in mm, and the unit of the input, "mm" or "inches"; ValueError if the extent fits neither."""
     low, high = np.percentile(points, (1, 99), axis=0)  # ignores stray points
     extent, width = float((high - low).max()), 2 * max(outline.half_extent)
     smallest, largest = PLAUSIBLE_RATIOS

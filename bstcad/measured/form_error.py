@@ -96,7 +96,7 @@ def fit_form_error(face: Face, alignment: Alignment) -> FormError:
     sides = [(low - NET_MARGIN * (high - low), high + NET_MARGIN * (high - low)) for low, high in (back.x, back.y)]
     covered = face.lens.outline.area / np.prod([high - low for low, high in sides])
     m = scipy.fft.next_fast_len(int(np.clip(np.sqrt(n / POINTS_PER_NET_CELL / covered), *FIELD_NET_LIMITS)), real=True)
-    net = BSplineSurface(0.0, torch.zeros(m, m, dtype=torch.float64), *sides)
+    net = BSplineSurface(0.0, torch.zeros(m, m, dtype=torch.float64), sides[0], sides[1])
     u, v = ((t - low) / (high - low) * (m - 1) for t, (low, high) in zip((x, y), sides, strict=True))
     heights, spread, noise, motion = _field(net, _basis_rows(u, v, m), targets[:, 0], targets[:, 1:], reach=face.reach)
     polynomial = coefficients[:, 0] - coefficients[:, 1:] @ motion
@@ -112,9 +112,9 @@ def frequencies(net: BSplineSurface) -> np.ndarray:
 
 def _legendre(back: BSplineSurface, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the products (n, 6) of Legendre polynomials of x and y up to POLYNOMIAL_DEGREE; net: [-1, 1] each way."""
-    across = (2 * (t - low) / (high - low) - 1 for t, (low, high) in zip((x, y), (back.x, back.y), strict=True))
+    u, v = (2 * (t - low) / (high - low) - 1 for t, (low, high) in zip((x, y), (back.x, back.y), strict=True))
     i, j = np.indices((POLYNOMIAL_DEGREE + 1, POLYNOMIAL_DEGREE + 1))
-    products = np.polynomial.legendre.legvander2d(*across, (POLYNOMIAL_DEGREE, POLYNOMIAL_DEGREE))
+    products = np.polynomial.legendre.legvander2d(u, v, (POLYNOMIAL_DEGREE, POLYNOMIAL_DEGREE))
     return products[:, (i + j <= POLYNOMIAL_DEGREE).ravel()]
 
 
@@ -292,14 +292,15 @@ def deviation(lens: Lens, alignment: Alignment, form: FormError) -> Deviation:
     off_x, off_y = ((form.at(x + a, y + b) - form.at(x - a, y - b)) / (2 * half) for a, b in ((half, 0.0), (0.0, half)))
     form_map = np.full(inside.shape, np.nan)
     form_map[inside] = along_normal = cosine * off
-    worst_x, worst_y, _ = alignment.points[np.argmax(np.abs(alignment.distances))]
+    distances = alignment.distances
+    worst_x, worst_y, _ = alignment.points[np.argmax(np.abs(distances))].tolist()
+    points = {"pv": float(np.ptp(distances)), "pvr": robust_pv(alignment.points, distances), "rms": alignment.rms}
+    slope = float(np.sqrt(np.mean(off_x**2 + off_y**2)))
+    fitted = {"form_pv": float(np.ptp(along_normal)), "form_rms": root_mean_square(along_normal), "slope_rms": slope}
+    bands, worst = _octaves(form, x, y, np.stack([off, off_x, off_y])), (worst_x, worst_y)
     return Deviation(
-        pv=float(np.ptp(alignment.distances)), pvr=robust_pv(alignment.points, alignment.distances), rms=alignment.rms,
-        form_pv=float(np.ptp(along_normal)), form_rms=root_mean_square(along_normal),
-        slope_rms=float(np.sqrt(np.mean(off_x**2 + off_y**2))), noise=form.noise,
-        worst=(float(worst_x), float(worst_y)),
-        bands=_octaves(form, x, y, np.stack([off, off_x, off_y])), x=axes[0], y=axes[1], form=form_map,
-    )  # fmt: skip
+        **points, **fitted, noise=form.noise, worst=worst, bands=bands, x=axes[0], y=axes[1], form=form_map
+    )
 
 
 def _octaves(form: FormError, x: np.ndarray, y: np.ndarray, total: np.ndarray) -> tuple[Band, ...]:

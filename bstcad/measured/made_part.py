@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -16,7 +16,7 @@ from bstcad.measured.cloud import Cloud
 from bstcad.measured.form_error import Deviation, FormError, deviation, fit_form_error, minimum_zone
 from bstcad.optics.goal import Goal, worst
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort, Light, measure_goal
+from bstcad.optics.measure import Effort, Light
 from bstcad.optics.wavefront_error import wavefront_error
 from bstcad.verify.checks import WAVEFRONT, Nominal
 from bstcad.verify.verdict import Check
@@ -27,7 +27,7 @@ COARSE_DEGREE = 4  # degree of the polynomial that is not fine relief: parts of 
 MIN_DESIGN_RELIEF = 3e-5  # RMS fine relief, in half widths, that a design needs to be recognised by it
 SCALE_TOLERANCE = 2e-4  # tolerance of the scale, about a thermal expansion
 SCALE_SIGMAS = 3.0  # tolerance of the scale, in standard uncertainties, if that is larger
-MIN_COVERAGE = 0.8  # minimum fraction of the face that is measured; elsewhere the form is a guess
+MIN_MEASURED_FRACTION = 0.8  # minimum fraction of the face that is measured; elsewhere the form is a guess
 COVERAGE_POINTS = 20  # mean number of points in a cell of the grid from which the coverage is counted
 RELIEF_POINTS = 20_000  # maximum number of points from which the fine relief is estimated
 MAX_OUTLIER_FRACTION = 0.1  # fraction of outliers near the face above which face and outliers are indistinguishable
@@ -60,53 +60,53 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
     figures = deviation(lens, alignment, form)
     cheap = replace(nominal.effort(effort), witness=False)
     lights = [_light(lens, form, nominal, goal, effort=cheap) for goal in nominal.goals]
-    scale, uncertainty = aligning.scale(face, alignment)
-    x, y, _ = alignment.pose.shift
+    scale = aligning.scale(face, alignment)
     checks = (
-        Check.true(
-            "made part: the cloud is in mm", cloud.unit == "mm", f"its extent is the lens's in {cloud.unit}",
-            id="made-unit",
-        ),
-        Check.true("made part: the axes of the cloud are the design's", not axes, axes, id="made-axes"),
-        *_identity_checks(face, alignment),
-        Check.at_least(
-            "made part: measured fraction of the face", _coverage(lens, alignment.points), MIN_COVERAGE,
-            id="made-covered",
-        ),
-        Check.at_most(
-            "made part: fraction of outliers among the points of the face", alignment.outlier_fraction,
-            MAX_OUTLIER_FRACTION, where="clean the part and measure it again", id="made-outliers",
-        ),
-        Check.at_most(
-            "made part: error of the scale of the cloud", abs(scale - 1),
-            max(SCALE_TOLERANCE, SCALE_SIGMAS * uncertainty), where=f"it is {scale:.5f} times the design",
-            id="made-scale",
-        ),
-        Check.at_most(
-            "made part: decentre in the frame of the cloud", math.hypot(x, y), nominal.scene.accept.decentre, "mm",
-            where=f"x {x:+.4g} mm, y {y:+.4g} mm", id="made-decentre",
-        ),
-        *(
-            check
-            for goal, (light, high) in zip(nominal.goals, lights, strict=True)
-            for check in (
-                Check.at_most(
-                    f"made part: RRMSD predicted{goal.suffix}", light.rrmsd, nominal.scene.accept.rrmsd, id="made-rrmsd"
-                ),
-                Check.at_most(
-                    f"made part: RRMSD predicted, with the uncertainty of the form{goal.suffix}", high, None,
-                    id="made-rrmsd-high",
-                ),
-            )
-        ),
+        *_cloud_checks(cloud, face, alignment, axes, scale=scale, max_decentre=nominal.scene.accept.decentre),
+        *_light_checks(nominal, lights),
         *_wavefront(replace(lens, back=form.add_to(lens.back_net)), nominal),
-    )  # fmt: skip
-    facts = _facts(face, alignment, figures, cloud) | {"scale": scale, "passed": all(check.passed for check in checks)}
+    )
+    facts = _facts(face, alignment, figures, cloud) | {
+        "scale": scale[0],
+        "passed": all(check.passed for check in checks),
+    }
     predicted = [_predicted(light, high) for light, high in lights]
     facts |= predicted[worst(each["rrmsd_predicted"] for each in predicted)]
     facts["goals"] = [{"key": goal.key} | of for goal, of in zip(nominal.goals, predicted, strict=True)]
     irradiances = tuple(light.picture for light, _ in lights)
     return MadePart(checks, facts, figures, irradiances=irradiances, outliers=alignment.outliers)
+
+
+def _cloud_checks(
+    cloud: Cloud, face: Face, alignment: Alignment, axes: str, *, scale: tuple[float, float], max_decentre: float | None
+) -> Iterator[Check]:
+    """Check that a cloud is in mm and has the design's axes, and that it is of this face, complete, clean and in place.
+
+    axes: exchange of axes that the cloud needs, in words; scale: its scale and uncertainty; max_decentre: in mm.
+    """
+    extent = f"its extent is the lens's in {cloud.unit}"
+    yield Check.true("made part: the cloud is in mm", cloud.unit == "mm", extent, id="made-unit")
+    yield Check.true("made part: the axes of the cloud are the design's", not axes, axes, id="made-axes")
+    yield from _identity_checks(face, alignment)
+    name, measured = "made part: measured fraction of the face", _coverage(face.lens, alignment.points)
+    yield Check.at_least(name, measured, MIN_MEASURED_FRACTION, id="made-covered")
+    name, where = "made part: fraction of outliers among the points of the face", "clean the part and measure it again"
+    yield Check.at_most(name, alignment.outlier_fraction, MAX_OUTLIER_FRACTION, where=where, id="made-outliers")
+    (factor, uncertainty), name = scale, "made part: error of the scale of the cloud"
+    limit, where = max(SCALE_TOLERANCE, SCALE_SIGMAS * uncertainty), f"it is {factor:.5f} times the design"
+    yield Check.at_most(name, abs(factor - 1), limit, where=where, id="made-scale")
+    x, y, _ = alignment.pose.shift
+    name, where = "made part: decentre in the frame of the cloud", f"x {x:+.4g} mm, y {y:+.4g} mm"
+    yield Check.at_most(name, math.hypot(x, y), max_decentre, "mm", where=where, id="made-decentre")
+
+
+def _light_checks(nominal: Nominal, lights: Sequence[tuple[Light, float]]) -> Iterator[Check]:
+    """Check the RRMSD on each target; lights: light, and RRMSD with the uncertainty of the form."""
+    for goal, (light, high) in zip(nominal.goals, lights, strict=True):
+        name = f"made part: RRMSD predicted{goal.suffix}"
+        yield Check.at_most(name, light.rrmsd, nominal.scene.accept.rrmsd, id="made-rrmsd")
+        name = f"made part: RRMSD predicted, with the uncertainty of the form{goal.suffix}"
+        yield Check.at_most(name, high, None, id="made-rrmsd-high")
 
 
 def _predicted(light: Light, high: float) -> dict[str, float | None]:
@@ -146,16 +146,10 @@ def _identity_checks(face: Face, alignment: Alignment) -> tuple[Check, Check]:
     """Return the checks that the part is of this design: its distance, and the fine relief that forms the picture."""
     relief, limit = _relief(face, alignment.points), MAX_RMS_DISTANCE * face.reach
     other = "the cloud is of another lens or of another face"
-    return (
-        Check.at_most(
-            "made part: distance from the design after alignment, RMS", alignment.rms, limit, "mm", where=other,
-            id="made-distance",
-        ),
-        Check.at_least(
-            "made part: fine relief of the face, relative to the design", 1.0 if relief is None else relief,
-            None if relief is None else MIN_RELIEF, where=other, id="made-relief",
-        ),
-    )  # fmt: skip
+    name = "made part: distance from the design after alignment, RMS"
+    distance = Check.at_most(name, alignment.rms, limit, "mm", where=other, id="made-distance")
+    name, least = "made part: fine relief of the face, relative to the design", None if relief is None else MIN_RELIEF
+    return distance, Check.at_least(name, 1.0 if relief is None else relief, least, where=other, id="made-relief")
 
 
 def _relief(face: Face, points: np.ndarray) -> float | None:
@@ -181,19 +175,15 @@ def _coverage(lens: Lens, points: np.ndarray) -> float:
 
 
 def _light(lens: Lens, form: FormError, nominal: Nominal, goal: Goal, *, effort: Effort) -> tuple[Light, float]:
-    """Return the light of the lens with the form error, and the RRMSD with the uncertainty of the form added.
-
-    The latter is the quadratic mean of two samples of the posterior, of opposite signs.
-    """
+    """Return the light of the lens with the form error, and the RRMSD with the uncertainty of the form added."""
     draw = np.random.default_rng(nominal.scene.tailoring.seed).normal(size=form.spread.shape)
 
     def light_with(form: FormError) -> Light:
-        made = replace(lens, back=form.add_to(lens.back_net))
-        return measure_goal(made, nominal.channels, goal, effort, ghost=nominal.scene.ghost, draw=nominal.scene.draw)
+        return nominal.light(replace(lens, back=form.add_to(lens.back_net)), goal, effort)
 
     light = light_with(form)
     samples = (light_with(form.posterior_sample(draw, sign)).rrmsd for sign in (1.0, -1.0))
-    return light, max(light.rrmsd, math.hypot(*samples) / math.sqrt(2))
+    return light, max(light.rrmsd, math.hypot(*samples) / math.sqrt(2))  # quadratic mean of two opposite samples
 
 
 def _facts(face: Face, alignment: Alignment, error: Deviation, cloud: Cloud) -> dict[str, Any]:

@@ -21,7 +21,7 @@ PLY_TYPES = {  # number types of PLY and of numpy
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
-MAX_HEADER_SIZE = 1 << 20  # bytes
+MAX_PLY_HEADER_SIZE = 1 << 20  # bytes
 STL_HEADER_SIZE, STL_TRIANGLE_SIZE = 84, 50  # bytes: 80 of text and a count; twelve float32 and two bytes
 
 
@@ -80,7 +80,7 @@ def _ply(data: bytes) -> np.ndarray:
 
 def _header(data: bytes) -> tuple[str, list[_Element], int]:
     """Return the format, the elements in their order, and the offset of the data."""
-    end = re.compile(rb"^[ \t]*end_header[ \t]*(?:\r\n|\n|\r)", re.MULTILINE).search(data[:MAX_HEADER_SIZE])
+    end = re.compile(rb"^[ \t]*end_header[ \t]*(?:\r\n|\n|\r)", re.MULTILINE).search(data[:MAX_PLY_HEADER_SIZE])
     if not data.startswith(b"ply") or end is None:
         raise _Damaged("its header does not end" if data.startswith(b"ply") else "it does not begin with ply")
     form, elements = "", []
@@ -156,59 +156,45 @@ def _binary_vertices(data: bytes, elements: list[_Element], at: int, order: str)
 
 def _end_of_list_rows(data: bytes, element: _Element, at: int, order: str) -> int:
     """Return the offset behind the rows of an element with lists: at once if all rows are equally long, else by row."""
-    parts = [
-        (np.dtype(order + kind), np.dtype(order + length) if length else None) for _, kind, length in element.properties
-    ]
-    if element.count > len(data) - at:  # a row has at least one byte
-        raise element.shortage_error(_count_rows(data, parts, at, element.count)[0])
+    types = ((order + kind, order + length if length else None) for _, kind, length in element.properties)
+    parts = [(np.dtype(kind), None if length is None else np.dtype(length)) for kind, length in types]
     uniform_end = _end_of_uniform_rows(data, parts, at, element.count)
     if uniform_end is not None:
         return uniform_end
-    rows, end = _count_rows(data, parts, at, element.count)
-    if rows < element.count:
-        raise element.shortage_error(rows)
-    return end
-
-
-Parts = list[tuple[np.dtype, np.dtype | None]]
-
-
-def _count_rows(data: bytes, parts: Parts, at: int, max_rows: int) -> tuple[int, int]:
-    """Return the number of complete rows from an offset on, at most `max_rows`, and the offset behind them."""
-    for row in range(max_rows):
-        end = at
-        for kind, length in parts:
-            count = 1
-            if length is not None:
-                if end + length.itemsize > len(data):
-                    return row, at
-                count = int(np.frombuffer(data, length, 1, end)[0])
-                end += length.itemsize
-            end += max(count, 0) * kind.itemsize
-        if end > len(data) or end == at:
-            return row, at
+    for row in range(element.count):
+        _, end = _next_row(data, parts, at)
+        if not at < end <= len(data):
+            raise element.shortage_error(row)
         at = end
-    return max_rows, at
+    return at
+
+
+Parts = list[tuple[np.dtype, np.dtype | None]]  # types of the items of each property, and of its length if it is a list
+
+
+def _next_row(data: bytes, parts: Parts, at: int) -> tuple[list[int], int]:
+    """Return the numbers of items of the row at an offset, and the offset behind it, past the data if it is cut off."""
+    sizes = []
+    for kind, length in parts:
+        size = 1
+        if length is not None:
+            size = max(0, int(np.frombuffer(data, length, 1, at)[0])) if at + length.itemsize <= len(data) else 0
+            at += length.itemsize
+        sizes.append(size)
+        at += size * kind.itemsize
+    return sizes, at
 
 
 def _end_of_uniform_rows(data: bytes, parts: Parts, at: int, count: int) -> int | None:
     """Return the offset behind the rows if their lists are as long as in the first row (triangles); None if not."""
-    fields, end = [], at
-    for k, (kind, length) in enumerate(parts):
-        size = 1
-        if length is not None:
-            if end + length.itemsize > len(data):
-                return None
-            size = int(np.frombuffer(data, length, 1, end)[0])
-            fields.append((f"length{k}", length))
-            end += length.itemsize
-        if not 0 <= size * kind.itemsize <= len(data) - end:
-            return None
-        fields.append((f"value{k}", kind, (size,)))
-        end += size * kind.itemsize
-    row = np.dtype(fields)
-    if count == 0 or not 0 < row.itemsize * count <= len(data) - at:
+    sizes, end = _next_row(data, parts, at)
+    if count == 0 or not 0 < (end - at) * count <= len(data) - at:
         return at if count == 0 else None
+    fields = []
+    for k, ((kind, length), size) in enumerate(zip(parts, sizes, strict=True)):
+        fields += [] if length is None else [(f"length{k}", length)]
+        fields.append((f"value{k}", np.dtype((kind, (size,)))))
+    row = np.dtype(fields)
     table = np.frombuffer(data, row, count, at)
     lengths = [name for name in row.names or () if name.startswith("length")]
     return at + row.itemsize * count if all((table[name] == table[name][0]).all() for name in lengths) else None

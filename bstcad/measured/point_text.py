@@ -17,7 +17,7 @@ from itertools import pairwise
 
 import numpy as np
 
-INPUT_HINT = "give x, y and z in mm, one point a line"
+INPUT_HINT = "give x, y and z in mm, one point per line"
 INCH = 25.4  # mm
 UNITS_IN_MM = {  # units as they are written in headings
     "mm": 1.0, "millimetre": 1.0, "millimeter": 1.0, "cm": 10.0, "m": 1e3, "metre": 1e3, "meter": 1e3, "um": 1e-3,
@@ -58,10 +58,7 @@ class MeasuredPoints:
 
 
 def make_points(positions: np.ndarray, where: Sequence[int] | None = None, columns: str = "") -> MeasuredPoints:
-    """Return the points with data; raise ValueError for a coordinate above MAX_POSITION.
-
-    where: line number of each point; None: the message states the number of the point.
-    """
+    """Return the points with data; ValueError for a coordinate above MAX_POSITION; where: line number of each point."""
     missing = np.isnan(positions).any(axis=1)
     excessive = ~(np.abs(positions) <= MAX_POSITION) & ~np.isnan(positions)
     if excessive.any():
@@ -201,9 +198,9 @@ def _number(field: str) -> float | None:
 
 def _table(lines: list[tuple[int, str]], layout: _Layout, columns: Sequence[int]) -> np.ndarray:
     body = layout.normalise("\n".join(line for _, line in lines))
-    options = {"delimiter": layout.separator, "comments": None, "ndmin": 2, "quotechar": '"'}
+    text, separator = io.StringIO(body), layout.separator
     try:
-        return np.loadtxt(io.StringIO(body), usecols=columns, **options)
+        return np.loadtxt(text, usecols=columns, delimiter=separator, comments=None, ndmin=2, quotechar='"')
     except ValueError:
         for number, line in lines:
             fields = layout.fields(line)
