@@ -24,7 +24,7 @@ from PIL import Image
 
 from bstcad import commands, pipeline
 from bstcad import folder as folders
-from bstcad.commands import OwnCheck, OwnSection
+from bstcad.commands import OwnCheck, OwnSection, ProofOptions
 from bstcad.folder import Made, same_front
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
@@ -43,14 +43,15 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene, load
 from bstcad.transport.mapping import TransportMap
 
-RELATIVE_TOLERANCE = 1e-9  # relative difference of equal indices, and of equal ends of nets over their width
+RELATIVE_TOLERANCE = 1e-9  # relative difference of equal indices; difference of equal ends of nets, in net widths
 PREVIEW_TUBES = 521  # flux tubes per side for a picture that is not verified
+AnyPath = str | os.PathLike[str]  # path of a file or of a folder
+MeritFunction = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]  # merit of a picture for a target (rows, columns)
 
 
 def design(
-    scene: Scene | str | os.PathLike[str], *, progress: bool = True, device: str = "auto",
-    merit: Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None = None,
-) -> Design:  # fmt: skip
+    scene: Scene | AnyPath, *, progress: bool = True, device: str = "auto", merit: MeritFunction | None = None
+) -> Design:
     """Design the lens for a scene or for a scene file.  SceneError names the fault of a scene.
 
     progress: show a bar in a terminal or a notebook.  device: "auto", "cpu" or "cuda" (see pipeline.device_for).
@@ -69,7 +70,7 @@ def design(
         return Design(pipeline.design(scene, device=device, progress=shown, began=began, merit=merit, later=True))
 
 
-def open(folder: str | os.PathLike[str]) -> Design:
+def open(folder: AnyPath) -> Design:
     """Open the design in a folder that `Design.write` or `bstcad generate` wrote, exact from its files; SceneError."""
     folder = Path(folder).expanduser()
     if not folder.is_dir():
@@ -127,11 +128,8 @@ class Design:
         "changed by hand".  SceneError names the property of a lens that does not fit.
         """
         scene, lens = _adapted(lens, self._made.scene, self.lens.front)
-        made = replace(
-            self._made, scene=scene, lens=scene.as_mounted(lens), making=DesignCourse(stopped=BY_HAND), transport=None,
-            precision_comparison=None,
-        )  # fmt: skip
-        return Design(made)
+        made = replace(self._made, scene=scene, lens=scene.as_mounted(lens), making=DesignCourse(stopped=BY_HAND))
+        return Design(replace(made, transport=None, precision_comparison=None))
 
     def with_heights(self, heights: Any) -> Design:
         """Return a design with other control heights of the back.
@@ -170,7 +168,7 @@ class Design:
         return self._named_solid(trim, holes, body, (draft, bevel)).solid
 
     def write_part(
-        self, path: str | os.PathLike[str], trim: Any = None, holes: Sequence[Any] = (), body: Any = None, *,
+        self, path: AnyPath, trim: Any = None, holes: Sequence[Any] = (), body: Any = None, *,
         draft: float = 0.0, bevel: float = 0.0,
     ) -> Path:  # fmt: skip
         """Write the `solid` of these arguments as STEP, with named faces and the scene's [part]; return the path.
@@ -229,7 +227,7 @@ class Design:
         return commands.export(self._own_folder(), kinds, points).paths
 
     def write(
-        self, folder: str | os.PathLike[str], *, progress: bool = True, effort: Effort | None = None,
+        self, folder: AnyPath, *, progress: bool = True, effort: Effort | None = None,
         checks: Sequence[OwnCheck] = (), sections: Sequence[OwnSection] = (),
     ) -> Report:  # fmt: skip
         """Write the folder of `bstcad generate` in place of an earlier one, verify its files, and return the report.
@@ -244,15 +242,13 @@ class Design:
         with files.exclusive(folder), progresses.for_script(progress) as shown:
             limit = self.scene.tailoring.max_time if self.report is None else None  # for a new design only
             self._made = self._made.with_report_data()
-            self.report = commands.write(
-                self._made, folder, progress=shown, effort=effort, limit=limit, own_checks=checks,
-                own_sections=sections,
-            )  # fmt: skip
+            options = ProofOptions(effort, checks=checks, sections=sections, limit=limit)
+            self.report = commands.write(self._made, folder, options, shown)
         self.folder = folder.resolve()
         return self.report
 
     def verify(
-        self, *, measured: str | os.PathLike[str] | None = None, folder: str | os.PathLike[str] | None = None,
+        self, *, measured: AnyPath | None = None, folder: AnyPath | None = None,
         against: Sequence[Any] = (), progress: bool = True, effort: Effort | None = None,
         checks: Sequence[OwnCheck] = (), sections: Sequence[OwnSection] = (),
     ) -> Report:  # fmt: skip
@@ -263,16 +259,15 @@ class Design:
         against: independent programs that trace the design too, "batoid" and "mitsuba", or your own judge
         (bstcad.judges.comparison.OwnJudge).  All three need a design that was written.  checks, sections: see `write`.
         """
+        options = ProofOptions(effort, checks=checks, sections=sections)
+        given = {"measured": measured and Path(measured).expanduser(), "place": folder and Path(folder).expanduser()}
+        judges = [against] if isinstance(against, str) else against
         with progresses.for_script(progress) as shown:
             if self._has_files() or measured or folder or against:
-                self.report = commands.verify(
-                    self._own_folder(), against=[against] if isinstance(against, str) else against,
-                    measured=measured and Path(measured).expanduser(), place=folder and Path(folder).expanduser(),
-                    progress=shown, effort=effort, own_checks=checks, own_sections=sections,
-                )  # fmt: skip
+                self.report = commands.verify(self._own_folder(), options, against=judges, progress=shown, **given)
             else:
                 self._made = self._made.with_report_data()
-                self.report = commands.prove(self._made, progress=shown, effort=effort, own_checks=checks)
+                self.report = commands.prove(self._made, options, shown)
         return self.report
 
     def tolerance(
@@ -285,17 +280,18 @@ class Design:
         (0 to 1) that the loosest tolerances must reach.  workers: number of processes for the traces; a script must
         call with it below `if __name__ == "__main__":`.  scheduler: address of a dask cluster whose workers are used.
         """
+        from bstcad.tolerance.study import StudySettings  # loaded late, as in commands.tolerance
+
         folder = self._own_folder()
         with progresses.for_script(progress) as shown:
-            return commands.tolerance(
-                folder, grade=grade, wanted=wanted, seed=seed, workers=workers, scheduler=scheduler, progress=shown
-            ).facts()
+            settings = StudySettings(grade, wanted, seed, progress=shown)
+            return commands.tolerance(folder, settings, workers, scheduler).facts()
 
-    def show(self, png: str | os.PathLike[str] | None = None) -> None:
+    def show(self, png: AnyPath | None = None) -> None:
         """Draw the lens with rays and screen in a PNG file, or in a window until it is closed."""
         commands.show(self._own_folder(), None if png is None else Path(png).expanduser())
 
-    def picture(self, png: str | os.PathLike[str] | None = None, *, target: int = 0) -> np.ndarray:
+    def picture(self, png: AnyPath | None = None, *, target: int = 0) -> np.ndarray:
         """Return the light on a target as a viewer at target.seen_from sees it: sRGB grey (rows, columns), uint8.
 
         Each pixel of the target is a pixel of the picture; white is the end of the report's scale.  The light is that
@@ -407,7 +403,6 @@ def _on_net(face: BSplineSurface, net: BSplineSurface, name: str) -> BSplineSurf
 
 
 def _check_same(name: str, own: Any, theirs: Any) -> None:
-    """Raise SceneError if a property of a lens differs from the scene's."""
     if own != theirs:
         raise SceneError(f"with_lens: the {name} is {own}, and in the scene it is {theirs}; give that of the scene")
 

@@ -15,6 +15,7 @@ import sys
 import time
 import traceback
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -43,7 +44,7 @@ INTERRUPTED, INTERNAL_ERROR = 130, 70  # exit codes of Ctrl-C and of a fault of 
 NOTHING_KEPT = "there was no lens yet, and nothing is kept"  # sentence of generate after Ctrl-C
 NOTHING_MORE = "nothing more is written"  # sentence of the other commands after Ctrl-C
 TERMINAL_INTERVAL, FILE_INTERVAL = 1.0, 30.0  # seconds between lines of a sweep's progress, on a terminal or in a file
-EXPORTS = ", ".join(files.EXPORTS)
+EXPORT_NAMES = ", ".join(files.EXPORTS)
 COMMAND_SYNONYMS = {  # word: the command that it suggests
     **dict.fromkeys(("design", "make", "run", "build", "create", "optimise", "optimize"), "generate"),
     **dict.fromkeys(("check", "prove", "test", "report", "measure"), "verify"),
@@ -240,24 +241,25 @@ Opened = argument(Path | None, "SCENE|DIR", "Scene file, folder of a design, or 
 Port = option(int, "N", "Port on this machine (0: any free port).", min=0, max=65535)
 Browser = option(bool, None, "Open the page in the browser.", "--browser/--no-browser")
 Written = argument(Path, "DIR|STEP", "Folder of a design, or a single STEP file.", parser=design_folder)
-Measured = path_option("CLOUD", "Measured points of a made part, which is judged, too.")
-PartReport = path_option("DIR", "Write the report of the made part only to this folder.", "--output", "-o")
-Against = option(str | None, "NAMES", "Trace the lens with other programs, too: batoid, mitsuba, or batoid,mitsuba.")
+Measured = path_option("CLOUD", "Measured points of a made part, which is also judged.")
+Report = path_option("DIR", "Write the report of the made part only to this folder.", "--output", "-o")
+Against = option(str | None, "NAMES", "Also trace the lens with other programs: batoid, mitsuba, or batoid,mitsuba.")
 Grade = option(
     str | None, "G", "moulded, diamond-turned or precise: grade of tolerances without a [\\[tolerance]] in the scene."
 )
 Yield = option(float | None, "P", "Find the loosest tolerances with this yield, in percent.", "--yield")
 Seed = option(int, "N", "Seed of the random trials.", min=0)
 Trial = option(int | None, "N", "Write only the lens of this trial, as trial-N.step.", min=0)
-Kinds = option(str | None, "NAMES", f"Kinds of files, separated by commas: {EXPORTS}.", "--as")
+Kinds = option(str | None, "NAMES", f"Kinds of files, separated by commas: {EXPORT_NAMES}.", "--as")
 Points = option(int | None, "N", "Points along the longer side of a grid (default: control points; zemax: its knots).")
 Png = path_option("FILE", "Picture to write.", "--png", "-o")
 ReachPng = path_option("FILE", "Draw the target and the area that light can reach; a second target in FILE_2.", "--png")
 Budget = option(
-    float, "S",
+    float,
+    "S",
     "Seconds for all runs together, judging included, on all machines. A run that is predicted to exceed them is not "
     "started; a run that exceeds them by a tenth is ended. The first run always runs to its end.",
-)  # fmt: skip
+)
 Scenes = argument(list[str], "SCENES...", "Scene files (TOML), or patterns such as 'scenes/*.toml'.")
 Topic = argument(
     str | None, "TOPIC", "Page, check or remark, as reports name it, such as check-rrmsd (default: the first page)."
@@ -385,9 +387,8 @@ def workbench(given: Opened = None, port: Port = 0, browser: Browser = True) -> 
     )
 )
 def verify(
-    path: Written, measured: Measured = None, output: PartReport = None, against: Against = None,
-    verbose: Verbose = False,
-) -> int:  # fmt: skip
+    path: Written, measured: Measured = None, output: Report = None, against: Against = None, verbose: Verbose = False
+) -> int:
     """Verify a lens from its written files, and write its report again."""
     beginning.check(path)
     processes.begin()
@@ -408,18 +409,17 @@ def tolerance(
     commands = load_commands()
     from bstcad.report.tolerances import summary
     from bstcad.tolerance import tolerancing
+    from bstcad.tolerance.study import StudySettings
 
+    settings = StudySettings(grade, None if wanted is None else wanted / 100, seed)
     if trial is not None:
         path = folder / f"trial-{trial}.step"
-        for kind, amount in tolerancing.write_trial(folder, trial, path, grade=grade, seed=seed):
+        for kind, amount in tolerancing.write_trial(folder, trial, path, settings):
             print(f"{kind.name:20} {amount:.6g} {kind.unit}".rstrip())
         print(f"Files: {path}")
         return 0
     with progress.watch(Console(stderr=True)) as watched:
-        study = commands.tolerance(
-            folder, grade=grade, wanted=None if wanted is None else wanted / 100, seed=seed, workers=workers,
-            scheduler=scheduler, progress=watched,
-        )  # fmt: skip
+        study = commands.tolerance(folder, replace(settings, progress=watched), workers, scheduler)
     say(summary(study), folder / "tolerance.json")
     return 0
 
@@ -428,7 +428,7 @@ def tolerance(
 def export(folder: Folder, kinds: Kinds = None, points: Points = None) -> int:
     """Write files for a shop: sag tables, points, Zemax grid sag, turning data, outlines, previews, the data sheet."""
     if kinds is None:
-        raise SceneError(f"--as: is missing; give the kinds of files: {EXPORTS}")
+        raise SceneError(f"--as: is missing; give the kinds of files: {EXPORT_NAMES}")
     written = load_commands().export(folder, split_names(kinds), points)
     print(*written.notes, "Files: " + ", ".join(map(str, written.paths)), sep="\n")
     return 0

@@ -15,10 +15,10 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -61,6 +61,9 @@ from bstcad.verify import checks
 from bstcad.verify.checks import Proof
 from bstcad.verify.verdict import Check, verdict
 
+if TYPE_CHECKING:
+    from bstcad.tolerance.study import StudySettings
+
 # Seconds of a run with a time limit that are reserved for the report, and the least time for the proof's rays.
 REPORT_TIME, MIN_RAY_TIME = 2.0, 0.5
 
@@ -70,21 +73,30 @@ OwnCheck = Callable[[Proof, Path], Iterable[Check]]
 OwnSection = Callable[[Contents], tuple[str, str]]
 
 
+@dataclass(frozen=True)
+class ProofOptions:
+    """Options of a proof and of its report."""
+
+    effort: Effort | None = None  # effort of the proof; None: measure.FULL
+    drawing: Drawing | None = None  # draws the figures of the report; None: Pictures
+    checks: Sequence[OwnCheck] = ()  # additional checks
+    sections: Sequence[OwnSection] = ()  # additional sections of report.html
+    limit: float | None = None  # seconds that design and proof may take together (`write` only); None: no limit
+
+
 # --- generate ---------------------------------------------------------------------------------------------------------
 
 
 def generate(
-    scene: Scene, folder: Path, *, device: str = "auto", progress: Progress = no_progress, began: float | None = None,
-    resume: bool = False, effort: Effort | None = None, drawing: Drawing | None = None,
-    on_lens: LensCallback = ignore_lens,
+    scene: Scene, folder: Path, options: ProofOptions = ProofOptions(), *, device: str = "auto", resume: bool = False,
+    progress: Progress = no_progress, began: float | None = None, on_lens: LensCallback = ignore_lens,
 ) -> Report:  # fmt: skip
     """Design a lens, write it to `folder` and prove it from the written files.
 
     began: start of the times in the report and of tailoring.max_time (time.perf_counter(); default: now).
     During the design a checkpoint is written beside the folder at intervals; with `resume` the design continues from
     it.  After a Ctrl-C the best lens so far is written, never over an earlier finished design: see `output_folder`.
-    effort: effort of the proof; None: no limit.  drawing: figures of the report; None: Pictures.  on_lens: called at
-    intervals with the function that makes the best lens so far.
+    on_lens: called at intervals with the function that makes the best lens so far.
     """
     scene = with_default_net(scene, lambda line: progress("control points", 1, 1, line))
     path, say = files.beside(folder, "checkpoint"), lambda text: progress("checkpoint", 0, 0, text)
@@ -104,10 +116,8 @@ def generate(
                 on_lens=on_lens,
             )  # fmt: skip
         with _checkpoint_on_error(keeper):
-            report = write(
-                found, output_folder(folder, found.making.stopped), progress=progress, effort=effort,
-                limit=scene.tailoring.max_time, drawing=drawing,
-            )  # fmt: skip
+            options = replace(options, limit=scene.tailoring.max_time)
+            report = write(found, output_folder(folder, found.making.stopped), options, progress)
         if found.making.stopped == "interrupt":
             keeper.flush()
         else:
@@ -133,24 +143,20 @@ def output_folder(folder: Path, stopped: str) -> Path:
     return folder.with_name(f"{folder.name}-unfinished")
 
 
-def write(
-    made: Made, folder: Path, *, progress: Progress = no_progress, effort: Effort | None = None,
-    limit: float | None = None, drawing: Drawing | None = None, own_checks: Sequence[OwnCheck] = (),
-    own_sections: Sequence[OwnSection] = (),
-) -> Report:  # fmt: skip
+def write(made: Made, folder: Path, options: ProofOptions = ProofOptions(), progress: Progress = no_progress) -> Report:
     """Write a design to `folder`, replacing an earlier one, and prove it from the written files.
 
-    limit: seconds that design and proof may take together; None: no limit.  If the design cannot be written or proved,
-    design.npz and the scene are kept in a folder beside it, which the error's note names.
+    If the design cannot be written or proved, design.npz and the scene are kept in a folder beside it, which the
+    error's note names.
     """
     processes.begin()
     with (
         folders.kept_if_unwritten(made, folder),
         folders.replacing(folder) as building,
         _second_process_ended(),
-        (drawing or Pictures)(made.scene, processes.submit) as drawn,
+        (options.drawing or Pictures)(made.scene, processes.submit) as drawn,
     ):
-        made, proof = _write_and_prove(made, building, drawn, own_checks, progress=progress, effort=effort, limit=limit)
+        made, proof = _write_and_prove(made, building, drawn, options, progress=progress)
         proven = time.perf_counter()
         irradiances = tuple(light.picture for light in proof.lights)
         folders.write_design(made, irradiances, building)
@@ -164,28 +170,25 @@ def write(
         contents = replace(_contents(made, proof, estimates), order=order)
         drawn.begin(draw_convergence, contents)
         sheet = drawn.data_sheet()
-        _write_report(made, proof.lens, contents, building, drawn=drawn, sheet=sheet, sections=own_sections)
+        _write_report(made, proof.lens, contents, building, drawn=drawn, sheet=sheet, sections=options.sections)
         progress("report", 1, 1, "")
     return Report(contents, irradiances, notes=tuple(exported.notes))
 
 
-def prove(
-    made: Made, *, progress: Progress = no_progress, effort: Effort | None = None, own_checks: Sequence[OwnCheck] = ()
-) -> Report:
+def prove(made: Made, options: ProofOptions = ProofOptions(), progress: Progress = no_progress) -> Report:
     """Prove a design from temporary files."""
     processes.begin()
     with tempfile.TemporaryDirectory(prefix="bstcad-") as folder, _second_process_ended():
         drawn = NoPictures(made.scene, processes.submit)
-        made, proof = _write_and_prove(made, Path(folder), drawn, own_checks, progress=progress, effort=effort)
+        made, proof = _write_and_prove(made, Path(folder), drawn, options, progress=progress)
     contents = _contents(made, proof, _left_out(made, proof))
     return Report(contents, tuple(light.picture for light in proof.lights))
 
 
 def _write_and_prove(
-    made: Made, folder: Path, drawn: Pictures, own_checks: Sequence[OwnCheck], *, progress: Progress,
-    effort: Effort | None, limit: float | None = None,
-) -> tuple[Made, Proof]:  # fmt: skip
-    """Write the geometry and prove it; return the design with these two stages, and its proof.  limit: see `write`."""
+    made: Made, folder: Path, drawn: Pictures, options: ProofOptions, progress: Progress
+) -> tuple[Made, Proof]:
+    """Write the geometry and prove it; return the design with these two stages, and its proof."""
     made = replace(made.with_report_data(), stored=None)  # design.npz is written again
     processes.return_freed()  # the second process needs the memory for the solid
     began = time.perf_counter()
@@ -198,10 +201,12 @@ def _write_and_prove(
         parallel = [beside.submit(work) for work in (write_3mf, prepare)]
         progress("write", 1, 1, "")
         written = time.perf_counter()
-        if limit is not None:
-            effort, left = effort or FULL, limit - REPORT_TIME - made.making.seconds_total - (written - began)
+        if options.limit is not None:
+            left = options.limit - REPORT_TIME - made.making.seconds_total - (written - began)
+            effort = options.effort or FULL
             effort = replace(effort, seconds=min(effort.seconds, max(left, MIN_RAY_TIME)))
-        proof = _prove_files(made, folder, drawn, own_checks=own_checks, effort=effort, progress=progress)
+            options = replace(options, effort=effort)
+        proof = _prove_files(made, folder, drawn, options, progress=progress)
         for work in parallel:
             work.result()
     verified = time.perf_counter()
@@ -212,20 +217,17 @@ def _write_and_prove(
     return replace(made, making=made.making.with_stages(*last)), proof
 
 
-def _prove_files(
-    made: Made, folder: Path, drawn: Pictures, *, own_checks: Sequence[OwnCheck], effort: Effort | None,
-    progress: Progress,
-) -> Proof:  # fmt: skip
+def _prove_files(made: Made, folder: Path, drawn: Pictures, options: ProofOptions, progress: Progress) -> Proof:
     """Prove the files in a folder and start drawing the pictures of the light."""
     progress("verify", 0, 1, "from the written files")
 
     def draw(light: Light, lines: tuple[SpectralLine, ...], number: int) -> None:
         drawn.begin(draw_light, made.goals[number].picture, light, lines, number=number)
 
-    proof = checks.verify(folder, made, processes.submit, known=drawn.lens, lit=draw, effort=effort)
+    proof = checks.verify(folder, made, processes.submit, known=drawn.lens, lit=draw, effort=options.effort)
     if proof.wavefront is not None:
         drawn.begin(draw_wavefront, proof.wavefront)
-    added = (check for of_script in own_checks for check in of_script(proof, folder))
+    added = (check for of_script in options.checks for check in of_script(proof, folder))
     proof = replace(proof, checks=(*proof.checks, *added))
     progress("verify", 1, 1, "RRMSD " + ", ".join(f"{light.rrmsd:.4f}" for light in proof.lights))
     return proof
@@ -271,32 +273,31 @@ def scene_errors(where: str = "") -> Iterator[None]:
 
 
 def verify(
-    path: Path, *, against: Sequence[Any] = (), measured: Path | None = None, progress: Progress = no_progress,
-    effort: Effort | None = None, place: Path | None = None, drawing: Drawing | None = None,
-    own_checks: Sequence[OwnCheck] = (), own_sections: Sequence[OwnSection] = (),
+    path: Path, options: ProofOptions = ProofOptions(), *, against: Sequence[Any] = (), measured: Path | None = None,
+    place: Path | None = None, progress: Progress = no_progress,
 ) -> Report | Examined:  # fmt: skip
     """Prove a design again from the files of its folder and rewrite its report; or examine a single STEP file.
 
     against: other programs that also trace the lens, by their names (judges.comparison.JUDGES) or as objects with the
     three functions of a judge.
-    measured: cloud of measured points of a made part, which is judged, too.  Its report is written to `place`, and the
+    measured: cloud of measured points of a made part, which is also judged.  Its report is written to `place`, and the
     design's folder does not change; without `place`, to the design's folder and its subfolder measured/CLOUD, which
     only a verification of the same cloud rewrites.
     """
     against = comparison.choose_judges(against)
-    if path.is_file() and (against or measured):
-        raise SceneError(f"{path}: a STEP file states no light by which to judge it; give the design's folder")
     if path.is_file():
+        if against or measured:
+            raise SceneError(f"{path}: a STEP file states no light by which to judge it; give the design's folder")
         return examine(path)
     if place is not None and measured is None:
         raise SceneError(f"{place}: is for the report of a made part; give its points with --measured CLOUD")
     with folders.amending(path, place) as amended:
         made = read(path)
         with scene_errors():  # before the slow steps
-            cloud, part = measured and clouds.load(measured, made.lens.apertures[1]), None
-        with (drawing or Pictures)(made.scene, processes.submit) as drawn:
+            cloud, part = clouds.load(measured, made.lens.apertures[1]) if measured else None, None
+        with (options.drawing or Pictures)(made.scene, processes.submit) as drawn:
             with scene_errors(f"{path}: "):
-                proof = _prove_files(made, path, drawn, own_checks=own_checks, effort=effort, progress=progress)
+                proof = _prove_files(made, path, drawn, options, progress=progress)
             drawn.solid(proof.lens)
             judged: list[Compared] = []
             for number, goal in enumerate(made.goals):
@@ -313,10 +314,10 @@ def verify(
             drawn.begin(draw_convergence, contents)
             write = partial(
                 _write_report, made, proof.lens, studied=tolerances.of_folder(path, made.scene.optic), drawn=drawn,
-                sections=own_sections,
+                sections=options.sections,
             )  # fmt: skip
             if cloud is not None:
-                part = _made_part(cloud, proof, made, effort=effort, progress=progress)
+                part = _made_part(cloud, proof, made, options.effort, progress=progress)
                 for number, light in enumerate(proof.lights):
                     drawn.begin(draw_part, part, light.picture, number=number)
                 own = Path() if place is not None else Path("measured") / _name_of(cloud, path)
@@ -337,14 +338,11 @@ def examine(path: Path) -> Examined:
         found = checks.examine(path, processes.submit)
     passed = all(check.passed for check in found.checks)
     stated = [check.value for check in found.checks if check.id == "stated-density"]
+    density = stated[0] if len(stated) == 1 else None
     placement = found.placement.facts() if found.placement.moves else None
-    rows = prescription.part(
-        found.lens, found.whole, stated[0] if len(stated) == 1 else None, placement=placement
-    )  # fmt: skip
-    return Examined(
-        name=path.stem, title=str(path), verdict=verdict(passed, ()), passed=passed, checks=found.checks, part=rows,
-        placement=placement,
-    )  # fmt: skip
+    rows = prescription.part(found.lens, found.whole, density, placement=placement)
+    words = verdict(passed, ())
+    return Examined(path.stem, str(path), words, passed, checks=found.checks, part=rows, placement=placement)
 
 
 def read(folder: Path) -> Made:
@@ -354,7 +352,7 @@ def read(folder: Path) -> Made:
     return Made(scene, nominal.lens, nominal.goals, making, transport=sent, stored=nominal.stored)
 
 
-def _made_part(cloud: Cloud, proof: Proof, made: Made, *, effort: Effort | None, progress: Progress) -> MadePart:
+def _made_part(cloud: Cloud, proof: Proof, made: Made, effort: Effort | None, progress: Progress) -> MadePart:
     progress("made part", 0, 1, "from its cloud")
     with scene_errors():
         found = made_part.judge(cloud, proof.lens, made, effort)
@@ -381,11 +379,8 @@ def _name_of(cloud: Cloud, folder: Path) -> str:
 def _contents(made: Made, proof: Proof, estimates: tuple[LeftOut, ...]) -> Contents:
     """Return the contents of report.json.  estimates: estimates of the effects that are left out."""
     scene = made.scene
-    alone, goal, light = scene.single_target_scenes()[proof.worst], made.goals[proof.worst], proof.light
-    diagnosed = diagnosis(
-        alone, made.making, proof.lens, picture=light.picture, target=goal.picture, efficiency=light.efficiency,
-        at_bounds=proof.at_bounds,
-    )  # fmt: skip
+    alone, goal = scene.single_target_scenes()[proof.worst], made.goals[proof.worst]
+    diagnosed = diagnosis(alone, made.making, proof, goal.picture)
     return contents_of(
         scene, made.lens, made.goals, proof, making=made.making, circumstances=circumstances(made.device),
         estimates=estimates, diagnosis=diagnosed,
@@ -411,10 +406,9 @@ def _sheet(
     made: Made, proof: Proof | Contents, figures: Sequence[GoalFigures], irradiance: np.ndarray, *, order: Order
 ) -> DataSheet:
     """Return the data sheet of a design from its proof or its report; it shows the light on the first target."""
-    return DataSheet(
-        scene=made.scene, designed=made.lens, shape=proof.shape, order=order, target=made.goals[0].picture,
-        irradiance=irradiance, figures=figures, passed=proof.passed, version=bstcad.__version__,
-    )  # fmt: skip
+    light: dict[str, Any] = {"target": made.goals[0].picture, "irradiance": irradiance, "figures": figures}
+    found: dict[str, Any] = {"shape": proof.shape, "passed": proof.passed, "version": bstcad.__version__}
+    return DataSheet(scene=made.scene, designed=made.lens, order=order, **light, **found)
 
 
 def _write_report(
@@ -447,22 +441,18 @@ def _write_report(
 
 
 def tolerance(
-    folder: Path, *, grade: str | None = None, wanted: float | None = None, seed: int = 0, workers: int | None = None,
-    scheduler: str | None = None, progress: Progress = no_progress,
-) -> Tolerances:  # fmt: skip
+    folder: Path, settings: StudySettings, workers: int | None = None, scheduler: str | None = None
+) -> Tolerances:
     """Study how accurately a lens must be made, mounted and lit; write tolerance.json and return its record.
 
-    grade: grade of all tolerances that the scene does not state.  wanted: yield (0 to 1) for which the loosest
-    tolerances are found.  workers: number of processes for the traces.  scheduler: address of a dask scheduler, whose
-    workers do them instead.
+    workers: number of processes for the traces.  scheduler: address of a dask scheduler, whose workers do them instead.
     """
     from bstcad.tolerance import tolerancing  # loaded late, since the other commands do not need it
 
-    if wanted is not None and not 0 < wanted < 1:
+    if (wanted := settings.wanted) is not None and not 0 < wanted < 1:
         raise SceneError(f"wanted: {wanted:g} is not between 0 and 1; give the fraction of lenses that must pass")
     with cluster.connect(scheduler, workers) as found:
-        spread = None if found is None else found.spread
-        return tolerancing.tolerance(folder, grade=grade, seed=seed, wanted=wanted, progress=progress, spread=spread)
+        return tolerancing.tolerance(folder, settings if found is None else replace(settings, spread=found.spread))
 
 
 def export(folder: Path, kinds: Sequence[str], points: int | None = None) -> Exported:
@@ -514,8 +504,8 @@ def show(folder: Path, png: Path | None) -> None:
 def light_path_in(folder: Path) -> LightPath:
     """Return the lens of a folder, rays through it and their pictures.  SceneError if no light arrives."""
     scene, nominal = folders.read_nominal(folder)
-    wanted, found = (goal.picture for goal in nominal.goals), folders.read_irradiances(folder, scene)
-    found = light_path_of(scene, nominal.lens, [*zip(wanted, found, strict=True)])
-    if found is None:
+    wanted, irradiances = (goal.picture for goal in nominal.goals), folders.read_irradiances(folder, scene)
+    path = light_path_of(scene, nominal.lens, [*zip(wanted, irradiances, strict=True)])
+    if path is None:
         raise SceneError(f"{folder}: no light reaches the target; there is nothing to show")
-    return found
+    return path

@@ -118,7 +118,8 @@ def small_design(small_scene, tmp_path_factory):
     with FileLock(f"{shared}.lock"):
         if not (facts := shared / "facts").exists():
             design, effort = shared / "design", quick_effort()
-            report = commands.generate(small_scene, design, device="cpu", effort=effort, drawing=flat_pictures())
+            options = commands.ProofOptions(effort, flat_pictures())
+            report = commands.generate(small_scene, design, options, device="cpu")
             facts.write_bytes(pickle.dumps(report.facts))
     return SimpleNamespace(folder=shutil.copytree(shared / "design", folder), report=pickle.loads(facts.read_bytes()))
 

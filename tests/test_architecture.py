@@ -49,7 +49,10 @@ MAY_IMPORT = {
     "tolerance": {"runs", "scene", "optics", "cad", "verify", "report", "designs", "bstcad"},
     "commands": {*ENGINE, "designs", "sweep", "tolerance", "app", "bstcad"},
     # The workbench's previews are designs made small, by the steps of tailoring.
-    "app": {"runs", "scene", "optics", "tailoring", "analysis", "report", "designs", "sweep", "commands", "bstcad"},
+    "app": {
+        "runs", "scene", "optics", "tailoring", "analysis", "report", "designs", "sweep", "tolerance", "commands",
+        "bstcad",
+    },  # fmt: skip
     "bstcad": {*ENGINE, "commands", "app"},  # __init__
 }
 # A library, and the only parts that may import it.

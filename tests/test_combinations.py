@@ -24,6 +24,7 @@ import bstcad
 from bstcad import commands
 from bstcad.analysis.steepness import Steepness
 from bstcad.app.preview import PreviewSize, preview
+from bstcad.commands import ProofOptions
 from bstcad.optics.measure import Effort
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sides import as_pair
@@ -382,7 +383,7 @@ def faults(chosen, folder):
     scene = scene_of(chosen)
     try:
         seen = preview(scene, HASTY)
-        report = commands.generate(scene, folder, device="cpu", effort=EFFORT)
+        report = commands.generate(scene, folder, device="cpu", options=ProofOptions(EFFORT))
         again = bstcad.open(folder)  # its scene states the net, if that was to be chosen
         told, predicted = plan(again.scene)
     except SceneError as refusal:

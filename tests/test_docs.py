@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -20,6 +20,7 @@ import typer
 
 import bstcad
 from bstcad import cli, commands
+from bstcad.commands import ProofOptions
 from bstcad.optics.surfaces import sag
 from bstcad.runs.processes import ExitStatus
 from bstcad.scene.scene import load
@@ -81,7 +82,7 @@ def prepared(tmp_path_factory):
         draws_nothing(patch)
         for name in ("disk", "thu"):
             scene = load(place / "templates" / f"{name}.toml")
-            commands.generate(scene, place / "outputs" / name, device="cpu", effort=quick_effort())
+            commands.generate(scene, place / "outputs" / name, device="cpu", options=ProofOptions(quick_effort()))
     back = bstcad.open(place / "outputs/disk").lens.back
     x, y = np.meshgrid(np.linspace(-7.9, 7.9, 120), np.linspace(-7.9, 7.9, 120))
     cloud = np.stack([x, y, sag(back, x, y)], axis=-1).reshape(-1, 3)
@@ -103,8 +104,8 @@ def workplace(prepared, tmp_path, monkeypatch):
         sweeping, "tradeoff",
         lambda scene, *given, **more: sweep(scene, *given, **more | {"machines": Synthetic(scene)}),
     )  # fmt: skip
-    few = partial(tolerancing.tolerance, tubes=129, trials=200, full=4)
-    monkeypatch.setattr(tolerancing, "tolerance", few)
+    study, few = tolerancing.tolerance, {"tubes": 129, "trials": 200, "full": 4}
+    monkeypatch.setattr(tolerancing, "tolerance", lambda folder, settings: study(folder, replace(settings, **few)))
     monkeypatch.setattr(batch, "design", copied)
     return place
 

@@ -10,6 +10,7 @@ import torch
 
 import bstcad
 from bstcad import commands
+from bstcad.commands import ProofOptions
 from bstcad.judges.comparison import compare
 from bstcad.optics.interfaces import Interface, Refract
 from bstcad.optics.media import refractive_index
@@ -183,7 +184,8 @@ def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("elements") / "folded"
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
-        commands.generate(bstcad.load(DISK).changed(SMALL | FOLDED), place, device="cpu", effort=quick_effort())
+        scene = bstcad.load(DISK).changed(SMALL | FOLDED)
+        commands.generate(scene, place, ProofOptions(quick_effort()), device="cpu")
     return place
 
 

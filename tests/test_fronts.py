@@ -12,6 +12,7 @@ import torch
 import bstcad
 from bstcad import commands
 from bstcad.cad import step_reading
+from bstcad.commands import ProofOptions
 from bstcad.folder import read_nominal
 from bstcad.optics.outlines import Circle
 from bstcad.optics.surfaces import Toroid, sag
@@ -23,7 +24,7 @@ from tests.conftest import draws_nothing, quick_effort
 def made(scene, folder):
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
-        report = commands.generate(scene, folder, device="cpu", effort=quick_effort()).facts
+        report = commands.generate(scene, folder, device="cpu", options=ProofOptions(quick_effort())).facts
     return SimpleNamespace(scene=scene, folder=folder, report=report)
 
 

@@ -8,6 +8,7 @@ import pytest
 import bstcad
 from bstcad import commands
 from bstcad.cli import run
+from bstcad.commands import ProofOptions
 from bstcad.folder import read_irradiances
 from bstcad.report.figure_jobs import NoPictures
 from tests.conftest import pictures, proofs, quick_effort
@@ -19,7 +20,7 @@ def design(small_design, tmp_path_factory):
     folder, made = tmp_path_factory.mktemp("ghost") / "small", bstcad.open(small_design.folder)._made
     scene = made.scene.changed({"effects": [{"kind": "ghost"}]})
     made = replace(made, scene=scene)
-    return scene, folder, commands.write(made, folder, effort=quick_effort(), drawing=pictures("light")).facts
+    return scene, folder, commands.write(made, folder, ProofOptions(quick_effort(), pictures("light"))).facts
 
 
 def test_the_ledger_has_a_line_for_it_and_closes(design):
@@ -43,7 +44,7 @@ def test_the_report_shows_it(design):
 def test_the_same_design_proved_again_has_the_same_ghost(design, monkeypatch):
     scene, folder, report = design
     kept = proofs(monkeypatch)
-    again = commands.verify(folder, effort=quick_effort(), drawing=NoPictures)
+    again = commands.verify(folder, options=ProofOptions(quick_effort(), NoPictures))
     assert again.flux == pytest.approx(report["flux"], abs=1e-12)
     assert again.rrmsd == pytest.approx(report["rrmsd"], abs=1e-12)
     [irradiance] = read_irradiances(folder, scene)

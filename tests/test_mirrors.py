@@ -9,6 +9,7 @@ from PIL import Image
 
 import bstcad
 from bstcad import commands
+from bstcad.commands import ProofOptions
 from bstcad.verify import step_checks
 from tests.conftest import draws_nothing, quick_effort
 from tests.test_seen import letter
@@ -31,7 +32,7 @@ def made(tmp_path_factory):
     )
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
-        commands.generate(scene, place / "out", device="cpu", effort=EFFORT)
+        commands.generate(scene, place / "out", device="cpu", options=ProofOptions(EFFORT))
     return place / "out", json.loads((place / "out" / "report.json").read_text()), scene
 
 

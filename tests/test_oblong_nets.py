@@ -10,6 +10,7 @@ import torch
 import bstcad
 from bstcad import commands
 from bstcad.analysis.shape import _grid, survey
+from bstcad.commands import ProofOptions
 from bstcad.optics import trace
 from bstcad.optics.bspline import QUARTERS, BSplineSurface, Spans, evaluate, evaluate_plain, knots, net_gradient
 from bstcad.optics.kernels import spline
@@ -165,7 +166,7 @@ def made(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
         design = bstcad.design(scene, progress=False)
-        commands.write(design._made, folder, effort=quick_effort())
+        commands.write(design._made, folder, ProofOptions(quick_effort()))
     return folder, design
 
 

@@ -11,6 +11,7 @@ import pytest
 
 import bstcad
 from bstcad import commands
+from bstcad.commands import ProofOptions
 from bstcad.report.figure_jobs import NoPictures
 from tests.conftest import quick_effort
 
@@ -36,7 +37,7 @@ def test_a_folder_whose_report_has_no_goals_opens_and_is_verified(name, keys, tm
             found.irradiances, ("irradiance", "irradiance_2"), strict=False,
         ))  # fmt: skip
     assert opened.export("zemax") and opened.export("datasheet")
-    again = commands.verify(folder, effort=quick_effort(), drawing=NoPictures)
+    again = commands.verify(folder, options=ProofOptions(quick_effort(), NoPictures))
     assert [check.name for check in again.checks if not check.passed] == []
     assert [goal.rrmsd for goal in again.goals] == pytest.approx([goal.rrmsd for goal in found.goals], rel=0.05)
     written = json.loads((folder / "report.json").read_text())

@@ -7,6 +7,7 @@ import pytest
 
 import bstcad
 from bstcad import commands
+from bstcad.commands import ProofOptions
 from bstcad.judges.comparison import compare
 from bstcad.optics.interfaces import Reflect, Refract
 from bstcad.scene.effects import Fresnel
@@ -32,7 +33,7 @@ def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("glass") / "out"
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
-        commands.generate(scene_of(), place, device="cpu", effort=EFFORT)
+        commands.generate(scene_of(), place, device="cpu", options=ProofOptions(EFFORT))
     return place
 
 

@@ -10,6 +10,7 @@ import pytest
 
 import bstcad
 from bstcad import commands
+from bstcad.commands import ProofOptions
 from bstcad.judges import comparison
 from bstcad.judges.faces import FaceError, Traced
 from bstcad.optics.surfaces import sag
@@ -23,7 +24,7 @@ def two(tmp_path_factory):
     """The design of both faces in a folder."""
     folder = tmp_path_factory.mktemp("two") / "faces"
     made = made_of(scene_of())
-    commands.write(made, folder, effort=quick_effort(), drawing=NoPictures)
+    commands.write(made, folder, ProofOptions(quick_effort(), NoPictures))
     return SimpleNamespace(made=made, folder=folder, design=bstcad.open(folder))
 
 
@@ -107,7 +108,7 @@ def verified(two, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(comparison, "OWN_EFFORT", replace(quick_effort(), witness=False))
         found = commands.verify(
-            two.folder, against=[tracer], measured=cloud, effort=quick_effort(), drawing=Drawing,
+            two.folder, against=[tracer], measured=cloud, options=ProofOptions(quick_effort(), Drawing),
             place=place / "part",
         )  # fmt: skip
     page = (place / "part" / "report.html").read_text(encoding="utf-8")
@@ -148,14 +149,13 @@ def test_a_made_part_is_held_to_the_wave_that_is_asked_for(tmp_path):
     one = scene_of().target.model_dump(mode="json", exclude_none=True)
     made = made_of(scene_of(target=one, wavefront={"kind": "plane", "z": 60.0}), front=0.0, back=0.0)
     folder = tmp_path / "plate"
-    commands.write(made, folder, effort=quick_effort(), drawing=NoPictures)
+    commands.write(made, folder, ProofOptions(quick_effort(), NoPictures))
     x, y = (p.ravel() for p in np.meshgrid(np.linspace(-3.9, 3.9, 90), np.linspace(-3.9, 3.9, 90)))
     np.savetxt(tmp_path / "cloud.csv", np.stack([x, y, 14.0 + 1e-3 * np.cos(2 * x)], axis=-1), delimiter=",")
     found = commands.verify(
         folder,
         measured=tmp_path / "cloud.csv",
-        effort=quick_effort(),
-        drawing=NoPictures,
+        options=ProofOptions(quick_effort(), NoPictures),
         place=tmp_path / "part",
     )
     [wave] = [check for check in found.measured.checks if check.id == "made-wavefront"]

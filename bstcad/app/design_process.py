@@ -126,9 +126,10 @@ def design(job: Mapping[str, Any], run_folder: Path, output: Path, resume: bool)
 def tolerance(job: Mapping[str, Any], run_folder: Path, output: Path, resume: bool) -> State:
     """Study the tolerances of a finished design.  job: grade and yield (0 to 1), either may be None."""
     from bstcad import commands
+    from bstcad.tolerance.study import StudySettings
 
     progress = ProgressFile(run_folder / PROGRESS)
-    commands.tolerance(output, grade=job.get("grade"), wanted=job.get("yield"), progress=progress)
+    commands.tolerance(output, StudySettings(job.get("grade"), job.get("yield"), progress=progress))
     return State("finished", folder=output.name)
 
 

@@ -28,7 +28,7 @@ from bstcad.runs.files import SceneError
 MAGIC = b"bstcad checkpoint 8\n"  # version; raise it when a record of a state, or the purpose, changes its fields
 DIGEST_SIZE = 65  # bytes of the line with the SHA-256
 MAX_SIZE = 8 << 30  # largest size of a checkpoint (bytes); 2049 x 2049 control points need 1 GB
-MAX_TIME_FRACTION = 0.02  # largest fraction of the run's time that checkpoints may take
+MAX_WRITING_FRACTION = 0.02  # largest fraction of the run's time that checkpoints may take
 
 Purpose = dict[str, Any]  # description of the checkpoint's design: numbers, text, None, lists and dicts of them
 # A state is a record: a frozen dataclass of numbers, text, None, arrays, tensors, tuples, mappings and such records.
@@ -159,7 +159,7 @@ class Keeper:
             else:
                 self._written, self._own = self.latest, True
             ended = time.monotonic()
-            self._due = ended + max(self.interval, (ended - began) / MAX_TIME_FRACTION)
+            self._due = ended + max(self.interval, (ended - began) / MAX_WRITING_FRACTION)
         return self._written is not None and self.path.exists()
 
     def keep_at_exit(self) -> str:

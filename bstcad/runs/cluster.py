@@ -18,7 +18,7 @@ from bstcad.runs import environment, signals
 from bstcad.runs.files import MachineError, SceneError, first_line
 
 CONNECTION_TIMEOUT = 30.0  # seconds until the scheduler answers, and until the first worker is there
-POLL_INTERVAL = 0.5  # seconds between two checks whether a job has ended
+JOB_INTERVAL = 0.5  # seconds between two checks whether a job has ended
 RETRIES = 2  # retries of a job after an error of a worker
 MAX_WORKERS = 1000
 THIS_MACHINE = "here"  # `Answer.where` of a job on this machine; of others it is the address of the worker
@@ -73,13 +73,11 @@ def check(scheduler: str | None, workers: int | None) -> None:
 def _local(workers: int) -> Iterator[str]:
     """Yield the address of a local scheduler with worker processes, which share the cores."""
     distributed = _library("--workers")
+    local = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place, contextlib.ExitStack() as stack:
+        process = {"memory_limit": 0, "local_directory": place, "env": environment.threads(workers)}
         with signals.ignored_by_children():
-            started = distributed.LocalCluster(
-                n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1",
-                dashboard_address="127.0.0.1:0", memory_limit=0, local_directory=place,
-                silence_logs=logging.CRITICAL, env=environment.threads(workers),
-            )  # fmt: skip
+            started = distributed.LocalCluster(n_workers=workers, threads_per_worker=1, **local, **process)
             stack.enter_context(started)
         yield started.scheduler_address
 
@@ -99,7 +97,7 @@ class Cluster:
         try:
             self._client.wait_for_workers(1, timeout=patience)
         except (OSError, self._distributed.TimeoutError):
-            self._client.close(timeout=POLL_INTERVAL)
+            self._client.close(timeout=JOB_INTERVAL)
             raise SceneError(
                 f"--scheduler {address}: has no workers; start one on each machine with dask worker {address}"
             ) from None
@@ -109,7 +107,7 @@ class Cluster:
 
     def __exit__(self, *error: object) -> None:
         self._client.cancel(list(self._keys))
-        self._client.close(timeout=POLL_INTERVAL)
+        self._client.close(timeout=JOB_INTERVAL)
 
     @property
     def capacity(self) -> int:
@@ -135,7 +133,7 @@ class Cluster:
             tick()
             self._check()
             with contextlib.suppress(TimeoutError, self._distributed.TimeoutError), self._client.as_current():
-                self._distributed.wait(list(futures), timeout=POLL_INTERVAL, return_when="FIRST_COMPLETED")
+                self._distributed.wait(list(futures), timeout=JOB_INTERVAL, return_when="FIRST_COMPLETED")
 
     def spread(self, work: Callable[[Any, Any], Any], shared: Any, items: Sequence[Any]) -> Iterator[Any]:
         """Iterate over work(shared, item) of each item, in order.  MachineError if a worker fails.

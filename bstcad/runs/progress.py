@@ -62,15 +62,9 @@ def _notebook() -> Callable[..., Any] | None:
 @contextmanager
 def bars(console: Console) -> Iterator[ProgressFunction]:
     """Display one bar per stage, with the merit and the time left; bars of past stages stay."""
-    columns = (
-        TextColumn("{task.description:<12}"),
-        BarColumn(bar_width=30),
-        TaskProgressColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[merit]}", style="cyan"),
-    )
-    with Progress(*columns, console=console) as progress:
+    name, merit = TextColumn("{task.description:<12}"), TextColumn("{task.fields[merit]}", style="cyan")
+    times = TaskProgressColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+    with Progress(name, BarColumn(bar_width=30), *times, merit, console=console) as progress:
         tasks: dict[str, Any] = {}
 
         def report(stage: str, done: int, total: int, text: str) -> None:

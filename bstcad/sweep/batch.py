@@ -26,24 +26,20 @@ from bstcad.report.report import check_lines
 from bstcad.runs import environment, files, processes
 from bstcad.runs.checkpoint import Keeper
 from bstcad.runs.cluster import Answer, Cluster, Machines
-from bstcad.runs.processes import ExitStatus
-from bstcad.runs.progress import ProgressFunction
+from bstcad.runs.processes import ExitStatus, Tick
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene, load
 from bstcad.sweep import cold_run
-from bstcad.sweep.cold_run import LocalPool, StoredRecord, unpack_scene
+from bstcad.sweep.cold_run import LocalPool, SceneFiles, StoredRecord, unpack_scene
 from bstcad.sweep.net_choice import with_net
 from bstcad.sweep.prediction import INTERVAL_FACTORS, memory_gb
+from bstcad.tailoring.run import Progress, no_progress
 from bstcad.verify.verdict import NO_LIMIT, VERDICTS, Check
 
 if TYPE_CHECKING:
     from rich.console import Group
 
 REFUSED, BROKEN, STOPPED = "refused", "broken", "not done"
-BATCH_COLUMNS = (
-    "scene", "name", "status", "rrmsd", "rrmsd_noise", "leak", "light_on_target", "checks_failed", "seconds", "report",
-    "where", "reason",
-)  # fmt: skip
 STATUS_STYLES = {"passed": "green", "passed with remarks": "yellow", NO_LIMIT: "cyan"}  # colours; others: red
 KILLED_CODE = -9  # exit code of a process that was killed by a person, or by the system when memory ran out
 CORES_PER_DESIGN = 2  # number of cores that one design uses
@@ -77,6 +73,9 @@ class BatchEntry(StoredRecord):
         return self.model_copy(update=entries)
 
 
+BATCH_COLUMNS = [name for name in BatchEntry.model_fields if name not in ("key", "design")]
+
+
 class Batch(StoredRecord):
     """Contents of batch.json."""
 
@@ -96,13 +95,10 @@ class BatchScene:
 # --- one design, in a process of its own ------------------------------------------------------------------------------
 
 
-def design(
-    contents: Mapping[str, bytes], folder: Path, variables: Mapping[str, str], tick: Callable[[], None] = lambda: None
-) -> ExitStatus:
+def design(contents: SceneFiles, folder: Path, variables: Mapping[str, str], tick: Tick = lambda: None) -> ExitStatus:
     """Design a scene into a folder, starting from a checkpoint of the same design if there is one.
 
-    contents: scene and its pictures, by file name.  variables: environment variables of the process.  A process that
-    was killed is started once more.
+    variables: environment variables of the process.  A process that was killed is started once more.
     """
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         scene = unpack_scene(contents, Path(place))
@@ -123,7 +119,7 @@ def _has_checkpoint(scene: Scene, folder: Path) -> bool:
         return False
 
 
-def design_remotely(contents: Mapping[str, bytes]) -> tuple[ExitStatus, dict[str, bytes]]:
+def design_remotely(contents: SceneFiles) -> tuple[ExitStatus, dict[str, bytes]]:
     """Design a scene on a worker; return how the process ended, and the files of the design by relative path."""
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         folder = Path(place) / "design"
@@ -137,7 +133,7 @@ def design_remotely(contents: Mapping[str, bytes]) -> tuple[ExitStatus, dict[str
 
 def batch(
     scenes: Sequence[BatchScene], folder: Path, *, workers: int | None = None, cluster: Cluster | None = None,
-    progress: ProgressFunction = lambda *event: None, say: Callable[[str], None] = lambda sentence: None,
+    progress: Progress = no_progress, say: Callable[[str], None] = lambda sentence: None,
 ) -> list[BatchEntry]:  # fmt: skip
     """Design each scene into folder/NAME; return an entry for each, in their order.
 
@@ -147,30 +143,29 @@ def batch(
     folder.mkdir(parents=True, exist_ok=True)
     with files.exclusive(folder / "batch.json"), contextlib.ExitStack() as stack:
         earlier = read(folder)
-        rows = list(_initial_entries(scenes, folder, earlier))
+        rows, count = list(_initial_entries(scenes, folder, earlier)), len(scenes)
         names = {row.name for row in rows if row.status != REFUSED}
-        others = [row for row in earlier if row.finished and row.name not in names]
         remaining = {k: with_net(scenes[k].scene)[0] for k, row in enumerate(rows) if row.status == STOPPED}
+        rows += [row for row in earlier if row.finished and row.name not in names]
         if remaining:
             memory = INTERVAL_FACTORS["memory_gb"] * max(map(memory_gb, remaining.values()))
             by_memory = int(psutil.virtual_memory().available / 1e9 / memory)
             at_a_time = min(environment.cores() // CORES_PER_DESIGN, by_memory)
             machines = cluster or stack.enter_context(LocalPool(min(workers or max(1, at_a_time), len(remaining))))
-            done, place = sum(row.finished for row in rows), "the cluster" if cluster else "this machine"
-            count = len(remaining)
-            at_once = min(machines.capacity, count)
+            done, place = sum(row.finished for row in rows[:count]), "the cluster" if cluster else "this machine"
+            at_once, plural = min(machines.capacity, len(remaining)), "s" * (len(remaining) > 1)
             say(
-                f"{count} design{'s' * (count > 1)}, {at_once} at a time on {place}, each with up to "
-                f"{memory:.1f} GB of memory{f'; {done} finished before' if done else ''}"
+                f"{len(remaining)} design{plural}, {at_once} at a time on {place}, each with up to {memory:.1f} GB of "
+                f"memory{f'; {done} finished before' if done else ''}"
             )
             try:
-                _design_all(rows, remaining, folder, machines, progress=progress, others=others)
+                _design_all(rows, remaining, folder, machines, progress=progress)
             except BaseException as error:
-                finished = f"{sum(row.finished for row in rows)} of {len(rows)} designs are finished in {folder}"
+                finished = f"{sum(row.finished for row in rows[:count])} of {count} designs are finished in {folder}"
                 error.add_note(f"{finished}; the same command continues with the others")
                 raise
-        write([*rows, *others], folder)
-    return rows
+        write(rows, folder)
+    return rows[:count]
 
 
 def _initial_entries(scenes: Sequence[BatchScene], folder: Path, earlier: Sequence[BatchEntry]) -> Iterator[BatchEntry]:
@@ -196,11 +191,11 @@ def _initial_entries(scenes: Sequence[BatchScene], folder: Path, earlier: Sequen
 
 
 def _design_all(
-    rows: list[BatchEntry], remaining: Mapping[int, Scene], folder: Path, machines: Machines, *,
-    progress: ProgressFunction, others: Sequence[BatchEntry],
-) -> None:  # fmt: skip
+    rows: list[BatchEntry], remaining: Mapping[int, Scene], folder: Path, machines: Machines, progress: Progress
+) -> None:
     """Design the remaining scenes, update their entries, and write batch.json whenever a design has ended."""
-    waiting, under_way, local = list(remaining), [], isinstance(machines, LocalPool)
+    waiting, local = list(remaining), isinstance(machines, LocalPool)
+    under_way: list[int] = []  # indices of the designs that are being made
     # The processes share the cores; environment variables that are set already do not change.
     threads = environment.threads(machines.capacity)
     variables = {name: value for name, value in threads.items() if name not in os.environ}
@@ -217,7 +212,7 @@ def _design_all(
                 machines.start(k, design, contents, (folder / rows[k].name).absolute(), variables)
             else:
                 machines.start(k, design_remotely, contents)
-        write([*rows, *others], folder)
+        write(rows, folder)
         answer = machines.next(tick)
         under_way.remove(answer.key)
         rows[answer.key] = _finished_entry(rows[answer.key], answer, folder, local)
@@ -248,7 +243,7 @@ def _finished_entry(row: BatchEntry, answer: Answer, folder: Path, local: bool) 
     )
 
 
-def _store_design(contents: Mapping[str, bytes], folder: Path) -> None:
+def _store_design(contents: SceneFiles, folder: Path) -> None:
     """Write a design from another machine into its folder, replacing an earlier design."""
     with files.exclusive(folder), folders.replacing(folder) as building:
         for name, data in contents.items():
@@ -295,14 +290,12 @@ def exit_code(rows: Sequence[BatchEntry]) -> int:
 
 
 def summary(rows: Sequence[BatchEntry], folder: Path, verbose: bool = False) -> Group:
-    """Return one line per design, with verdict, RRMSD and time or the reason of a failure, then the failed checks.
-
-    verbose: list all checks.
-    """
+    """Return a line per design, with its figures or the reason of a failure, then the failed checks (verbose: all)."""
     from rich.console import Group
     from rich.text import Text
 
-    wide, lines, checked = max(map(len, VERDICTS)), [], []
+    wide, lines = max(map(len, VERDICTS)), []
+    checked: list[Text] = []
     for row in rows:
         figures = f"RRMSD {row.rrmsd:.4f}  {row.seconds:5.0f} s  " if row.finished else ""
         reason = f": {row.reason}" if row.reason else ""

@@ -37,6 +37,7 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import Plane
 from bstcad.runs import environment, files, processes
 from bstcad.runs.cluster import THIS_MACHINE, Answer
+from bstcad.runs.processes import Tick
 from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.scene import Scene, load
 from bstcad.tailoring.merit import Merit
@@ -46,6 +47,7 @@ from bstcad.tailoring.stage2 import Problem
 
 MAX_RECORD_SIZE = 100_000_000  # bytes
 SIGNIFICANT_DIGITS = 6  # default of round_numbers
+SceneFiles = Mapping[str, bytes]  # contents of a scene file and its pictures, by file name
 
 
 class StoredRecord(BaseModel):
@@ -54,10 +56,10 @@ class StoredRecord(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
-RecordType = TypeVar("Record", bound=StoredRecord)
+Record = TypeVar("Record", bound=StoredRecord)
 
 
-def read_record(kind: type[RecordType], path: Path, remedy: str) -> RecordType:
+def read_record(kind: type[Record], path: Path, remedy: str) -> Record:
     """Read a record from a file; raise MachineError if the file is damaged or has another format."""
     try:
         return kind.model_validate_json(files.contents(path, MAX_RECORD_SIZE))
@@ -90,14 +92,14 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, An
     files.put(path, text.getvalue().encode())
 
 
-def unpack_scene(contents: Mapping[str, bytes], folder: Path) -> Path:
-    """Write a scene and its pictures (contents by file name) into a folder; return the path of the scene file."""
+def unpack_scene(contents: SceneFiles, folder: Path) -> Path:
+    """Write a scene and its pictures into a folder; return the path of the scene file."""
     for name, data in contents.items():
         (folder / name).write_bytes(data)
     return folder / SCENE
 
 
-POLL_INTERVAL = 0.2  # interval (seconds) at which a waiting pool calls `tick`
+POOL_INTERVAL = 0.2  # interval (seconds) at which a waiting pool calls `tick`
 
 
 class LocalPool:
@@ -122,10 +124,10 @@ class LocalPool:
         """Start work(*arguments, tick) in a thread; it must call `tick` regularly."""
         self._keys[self._threads.submit(work, *arguments, self._tick)] = key
 
-    def next(self, tick: Callable[[], None]) -> Answer:
+    def next(self, tick: Tick) -> Answer:
         """Wait until a process has ended, and return its answer."""
         while True:
-            for future in wait(self._keys, timeout=POLL_INTERVAL, return_when=FIRST_COMPLETED).done:
+            for future in wait(self._keys, timeout=POOL_INTERVAL, return_when=FIRST_COMPLETED).done:
                 key, error = self._keys.pop(future), future.exception()
                 if error is not None:
                     return Answer(key, THIS_MACHINE, reason=f"{type(error).__name__}: {error}")
@@ -143,7 +145,7 @@ KERNEL_TUBES, KERNEL_PIXELS = 1024, 512  # flux tubes and pixels per side
 KERNEL_NET, KERNEL_INDEX = 257, 1.49  # control points per side; refractive index
 KERNEL_WIDTH, KERNEL_THICKNESS = 20.0, 5.0  # mm
 KERNEL_SCREEN_Z = 200.0  # distance of the screen from the front, mm
-WAVE_HEIGHT, WAVE_PERIODS = 0.003, 3  # amplitude of the back, mm, and its number of periods over the width
+WAVE_HEIGHT, WAVE_PERIODS = 0.003, 3  # amplitude of the back, mm, and its number of periods across the width
 KERNEL_REPEATS = 3  # number of evaluations, of which the fastest counts
 
 
@@ -181,7 +183,6 @@ WARM_UP_CHANGES = {  # settings of a run whose time does not count; it compiles 
     "tailoring.transport_grid": 64, "tailoring.levels": None,
 }  # fmt: skip
 WARM_UP_PIXELS = 64  # pixels per side of each target in that run
-Tick = Callable[[], None]  # function called regularly while a command runs
 
 
 def sorted_settings(entries: Mapping[str, Value]) -> Settings:
@@ -254,13 +255,9 @@ class ColdRun(StoredRecord):
 
 
 def run_and_judge(
-    contents: Mapping[str, bytes], point: Settings, limit: float = math.inf, effort: Effort = REFERENCE_EFFORT,
-    tick: Tick = lambda: None,
-) -> ColdRun:  # fmt: skip
-    """Run the command for a base scene with these settings, and judge its lens.
-
-    contents: base scene and its pictures, by file name.  limit: seconds after which the command is ended.
-    """
+    contents: SceneFiles, point: Settings, limit: float, effort: Effort, tick: Tick = lambda: None
+) -> ColdRun:
+    """Run the command for a base scene with these settings, for at most `limit` seconds, and judge its lens."""
     start = time.perf_counter()
     unit = min(measure_seconds(calibration_kernel()) for _ in range(KERNEL_REPEATS))
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
@@ -272,7 +269,7 @@ def run_and_judge(
     return run.model_copy(update=times | {"version": environment.version()})
 
 
-def warm_up(contents: Mapping[str, bytes], tick: Tick) -> None:
+def warm_up(contents: SceneFiles, tick: Tick) -> None:
     """Do a small run that does not count, so that the first run that counts starts under the same conditions."""
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         base = load(unpack_scene(contents, Path(place)))
@@ -288,7 +285,7 @@ def _generate(scene: Path, folder: Path, point: Settings, limit: float, *, tick:
     """Run `bstcad generate` in a process of its own, and return the figures of its report."""
     changes = [word for key, value in point for word in ("--set", f"{key}={format_value(value)}")]
     process = processes.run(["generate", str(scene), "-o", str(folder), *changes], limit, tick)
-    times = {"settings": point, "seconds": process.seconds, "cpu_seconds": process.cpu_seconds}
+    times: dict[str, Any] = {"settings": point, "seconds": process.seconds, "cpu_seconds": process.cpu_seconds}
     if process.seconds >= limit and process.code < 0:
         reason = f"ended after {process.seconds:.0f} s, because its time in the budget was used up"
         return ColdRun(status=FAILED, reason=reason, allowed_seconds=limit, **times)
@@ -310,10 +307,7 @@ def _generate(scene: Path, folder: Path, point: Settings, limit: float, *, tick:
 
 
 def judge_run(run: ColdRun, base: Scene, folder: Path, effort: Effort) -> ColdRun:
-    """Return the run with the RRMSD of the lens in `folder` by the reference, with light and pixels of the base scene.
-
-    The largest RRMSD of several targets counts.
-    """
+    """Return the run with the RRMSD of its lens by the reference: the largest on any target of the base scene."""
     lens, channels = read_nominal(folder)[1].lens, base.verification_channels()
     lights = [measure_goal(lens, channels, goal, effort, ghost=base.ghost, draw=base.draw) for goal in base.goals]
     if not all(light.rrmsd >= 0 for light in lights):

@@ -8,7 +8,7 @@ The diagnosis of a finished design uses its picture and the history of the run.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -27,7 +27,7 @@ from bstcad.scene.scene import Scene
 from bstcad.tailoring.machinability import place_back
 from bstcad.tailoring.slope_fit import Fit
 from bstcad.tailoring.slope_map import face_grid, fit_to_map, lit_window, slope_map
-from bstcad.verify.checks import AtBound
+from bstcad.verify.checks import Proof
 
 # --- a coarse lens ----------------------------------------------------------------------------------------------------
 
@@ -88,7 +88,7 @@ DEFAULT_DIAMETER = 0.1  # assumed diameter of a point source, mm
 DEFAULT_DIVERGENCE = 0.1  # assumed divergence of parallel light, degrees
 # Assumed sizes by Emitter.size_key.
 DEFAULT_SIZES = {"diameter": (DEFAULT_DIAMETER, "disc", "mm"), "divergence": (DEFAULT_DIVERGENCE, "cone", "degrees")}
-GAUSS_POINTS = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # (half widths, weight) of a uniform line
+LINE_POINTS = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # (half widths, weight) of a uniform line
 DISC_POINTS = tuple((x, y, 1 / 4) for x in (-0.5, 0.5) for y in (-0.5, 0.5))  # (x, y in radii, weight) of a disc
 FRESNEL_KEYS, LINES_KEYS = '[[effects]] kind = "fresnel"', "source.wavelength = [[nm, weight], …]"
 
@@ -151,7 +151,7 @@ def _dispersion(scene: Scene, reference: Reference) -> LeftOut:
     if material is None:
         return _entry("dispersion", None, "lens.index names no material", f"lens.material, and {LINES_KEYS}")
     low, high = band(scene)
-    lines = [((low + high) / 2 + (high - low) / 2 * place, weight) for place, weight in GAUSS_POINTS]
+    lines = [((low + high) / 2 + (high - low) / 2 * place, weight) for place, weight in LINE_POINTS]
     try:
         channels = [replace(channel, index=media.refractive_index(material, nm), weight=w) for nm, w in lines]
     except ValueError:
@@ -188,8 +188,8 @@ def _entry(kind: str, change: Change | None, detail: str = "", simulate_by: str 
     if change is None:
         reason = detail or "no light reaches the target"
         return LeftOut(kind, None, None, None, detail=reason, simulate_by=simulate_by)
-    numbers = (float(f"{value:.3g}") for value in (change.flux, change.rrmsd, change.blur))
-    return LeftOut(kind, *numbers, detail=detail, simulate_by=simulate_by, assumed=assumed)
+    flux, rrmsd, blur = (float(f"{value:.3g}") for value in (change.flux, change.rrmsd, change.blur))
+    return LeftOut(kind, flux, rrmsd, blur, detail=detail, simulate_by=simulate_by, assumed=assumed)
 
 
 # --- the diagnosis of a finished design -------------------------------------------------------------------------------
@@ -197,14 +197,10 @@ def _entry(kind: str, change: Change | None, detail: str = "", simulate_by: str 
 SIZE_STAGE_PREFIX = "stage 3, "  # beginning of the names of stages that are for one size of the source each
 
 
-def diagnosis(
-    scene: Scene, making: DesignCourse, lens: Lens, *, picture: np.ndarray, target: np.ndarray, efficiency: float,
-    at_bounds: Mapping[str, AtBound] | None = None,
-) -> dict[str, Any]:  # fmt: skip
+def diagnosis(scene: Scene, making: DesignCourse, proof: Proof, target: np.ndarray) -> dict[str, Any]:
     """Return the entries convergence, remaining_error and bounds of report.json (record.Contents).
 
-    lens: the lens as re-read.  picture: its picture (rows, columns), scaled to the sum of the target.
-    at_bounds: for each key of a bound, the part of the tailored faces that is at this bound.
+    scene: scene with the one target on which the proof found the largest RRMSD.  target: its picture (rows, columns).
     """
     sizes = [k for k, stage in enumerate(making.stages) if stage.name.startswith(SIZE_STAGE_PREFIX)]
     curve = ending(
@@ -212,15 +208,17 @@ def diagnosis(
         [(stage.seconds, stage.rrmsd) for stage in making.stages],
         since=math.fsum(stage.seconds for stage in making.stages[: max(sizes[2:], default=0)]),  # full source
     )
-    reached = {key: at for key, at in (at_bounds or {}).items() if key in scene.lens.bounded_by}
-    bounds = {
+    reached = {key: at for key, at in (proof.at_bounds or {}).items() if key in scene.lens.bounded_by}
+    bounds: dict[str, Any] = {
         "asked": {key: getattr(scene.lens, key) for key in scene.lens.bounded_by},
         "at": {key: at.share for key, at in reached.items()},
         "tightest": {key: at.tightest for key, at in reached.items()},
-        **({"both" if lens.shapes("back") else "front": True} if lens.shapes("front") else {}),  # faces with bounds
-    }  # fmt: skip
+    }
+    if proof.lens.shapes("front"):
+        bounds["both" if proof.lens.shapes("back") else "front"] = True  # faces with bounds
+    error = remaining(proof.light.picture, target, scene.target.screen.per_unit)
     return {
         "convergence": None if curve is None else asdict(curve),
-        "remaining_error": remaining(picture, target, scene.target.screen.per_unit) | {"outside": 1 - efficiency},
+        "remaining_error": error | {"outside": 1 - proof.light.efficiency},
         "bounds": bounds if bounds["asked"] else None,
     }

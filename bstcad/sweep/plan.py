@@ -5,7 +5,7 @@ The sentence of a plan, its table and the page of the workbench state the same p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -19,6 +19,7 @@ from bstcad.optics.sides import as_pair, scaled
 from bstcad.pipeline import reachable_part
 from bstcad.report.record import simulated, too_steep
 from bstcad.report.units import paragraphs
+from bstcad.runs.processes import Tick
 from bstcad.scene.blank import MAX_CONTROL_POINTS
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.scene import Scene
@@ -39,12 +40,7 @@ from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT
 CAVEAT = "Estimates assume one target and one tailored face; with several, the lens deflects light differently."
 
 
-def plan(
-    scene: Scene,
-    text: str = "",
-    keys: Sequence[str] = (),
-    tick: Callable[[], None] = lambda: None,
-) -> Iterator[dict[str, Any]]:
+def plan(scene: Scene, text: str = "", keys: Sequence[str] = (), tick: Tick = lambda: None) -> Iterator[dict[str, Any]]:
     """Yield the entries of `plan --json`: first the effects, then the predictions.
 
     simulated: effects that are simulated.  goals: for each target its key, left_out (neglected effects by change of the
@@ -106,11 +102,9 @@ def verdict(scene: Scene, entries: Mapping[str, Any]) -> dict[str, str] | None:
             kind = "no limit"
         else:
             kind = "within" if high <= requested else "beyond" if low > requested else "open"
-    image = {"rrmsd": blurred, "least": REMAINING_BLUR * blurred, "width": width, "target": target_width}
-    [sentence] = paragraphs(
-        "plan.txt.j2", "verdict", kind=kind, image=image | {"unit": target.unit, "optic": scene.optic}, asked=requested,
-        likely=prediction,
-    )  # fmt: skip
+    image: dict[str, Any] = {"rrmsd": blurred, "least": REMAINING_BLUR * blurred, "width": width}
+    image |= {"target": target_width, "unit": target.unit, "optic": scene.optic}
+    [sentence] = paragraphs("plan.txt.j2", "verdict", kind=kind, image=image, asked=requested, likely=prediction)
     return {"kind": kind, "sentence": sentence}
 
 
@@ -121,10 +115,8 @@ def _goal_effects(scene: Scene, lens: Lens, key: str) -> dict[str, Any]:
     part, target = goal.reachable, goal.picture
     beyond = None if part is None else unreached(goal.whole, part, lens.passes.largest_turn(scene.index))
     estimates, image = left_out(scene, lens, target), blur(scene.channels(), lens, scene.target.screen, target)
-    return {
-        "key": key, "left_out": [asdict(estimate) for estimate in estimates],
-        "blur": image and round_numbers(asdict(image), 3), "unreachable": beyond and round_numbers(beyond, 3),
-    }  # fmt: skip
+    rounded = {"blur": image and round_numbers(asdict(image), 3), "unreachable": beyond and round_numbers(beyond, 3)}
+    return {"key": key, "left_out": [asdict(estimate) for estimate in estimates], **rounded}
 
 
 def reach_drawn(scene: Scene) -> tuple[bytes, ...]:
@@ -158,12 +150,12 @@ def _request_of(key: str, at: Mapping[str, int], keys: Sequence[str]) -> dict[st
 # --- predictions ------------------------------------------------------------------------------------------------------
 
 
-def predict_qualities(scene: Scene, lenses: Sequence[Lens], tick: Callable[[], None] = lambda: None) -> dict[str, Any]:
+def predict_qualities(scene: Scene, lenses: Sequence[Lens], tick: Tick = lambda: None) -> dict[str, Any]:
     """Predict a scene in each quality, and with about twice the control points, or state why there is no prediction.
 
     lenses: a coarse lens for each target.
     """
-    entries = {"predicted": None, "not_predicted": None, "finer": None, "notes": []}
+    entries: dict[str, Any] = {"predicted": None, "not_predicted": None, "finer": None, "notes": []}
     try:
         pilots = {quality: run_pilot(scene, quality, tick) for quality in PILOT_QUALITIES}
     except SceneError as refusal:

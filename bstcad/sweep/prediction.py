@@ -11,7 +11,7 @@ tests/benchmarks/test_prediction.py compares predictions with designs of the tem
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 
@@ -24,6 +24,7 @@ from bstcad.analysis.steepness import Steepness
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, rrmsd_by_rays
 from bstcad.optics.sides import Sides, as_pair, coarser
+from bstcad.runs.processes import Tick
 from bstcad.scene.quality import COARSEST_GRID
 from bstcad.scene.scene import Scene
 from bstcad.sweep.cold_run import KERNEL_REPEATS, calibration_kernel, measure_seconds
@@ -74,7 +75,7 @@ class Pilot:
     steep: Steepness  # slope that the back needs
 
 
-def run_pilot(scene: Scene, quality: str, tick: Callable[[], None] = lambda: None) -> Pilot:
+def run_pilot(scene: Scene, quality: str, tick: Tick = lambda: None) -> Pilot:
     """Design a small version of a scene in some quality; raise SceneError if its design would be refused."""
     small, factor = pilot_scene(with_quality(scene, quality))
     compilations = RecordingListener()
@@ -84,10 +85,7 @@ def run_pilot(scene: Scene, quality: str, tick: Callable[[], None] = lambda: Non
     if compilations.buffer:  # the first design after an installation waits for the compiler; time another one
         finished = make_design()
     light, finer = small.channels(), factor > 1
-    rrmsd = max(
-        rrmsd_by_rays(finished.lens, light, goal, PILOT_EFFORT, draw=small.draw)
-        for goal in finished.goals
-    )
+    rrmsd = max(rrmsd_by_rays(finished.lens, light, goal, PILOT_EFFORT, draw=small.draw) for goal in finished.goals)
     sides = [max(goal.receiver.shape) for goal in finished.goals]
     pairs = zip(scene.single_target_scenes(), small.single_target_scenes(), strict=True)
     blurs = [blur_rrmsd(one, finished.lens) - blur_rrmsd(few, finished.lens) for one, few in pairs] if finer else [0.0]
@@ -96,11 +94,9 @@ def run_pilot(scene: Scene, quality: str, tick: Callable[[], None] = lambda: Non
         part = "search" if stage.name.startswith(SEARCH_STAGES) else "first"
         times["rest" if stage.name == "loading" or COARSE_ROUND_TEXT in stage.name else part] += stage.seconds
     transport = finished.making.transport
-    return Pilot(
-        small, Seconds(**times), rrmsd, factor,
-        detail=max(map(detail, (goal.picture for goal in scene.goals), sides)) if finer else 0.0,
-        blur=max(0.0, *blurs), steep=Steepness(transport["steep_share"], transport["steepest_deg"]),
-    )  # fmt: skip
+    steep = Steepness(transport["steep_share"], transport["steepest_deg"])
+    lost = max(map(detail, (goal.picture for goal in scene.goals), sides)) if finer else 0.0
+    return Pilot(small, Seconds(**times), rrmsd, factor, detail=lost, blur=max(0.0, *blurs), steep=steep)
 
 
 def with_quality(scene: Scene, quality: str) -> Scene:
@@ -132,7 +128,7 @@ def replace_net(scene: Scene, net: Sides, changes: Mapping[str, object] = {}) ->
 
 
 def detail(picture: np.ndarray, pixels: int) -> float:
-    """Return the relative RMS of the waves of a picture that are finer than `pixels` over its longer side."""
+    """Return the relative RMS of the waves of a picture that are finer than `pixels` along its longer side."""
     from scipy.fft import dctn
 
     energy = dctn(picture, norm="ortho") ** 2
@@ -210,7 +206,7 @@ GOAL_MEMORY_FACTOR = 3.0  # memory of tubes for each of several goals, relative 
 
 @cache
 def pace() -> float:
-    """Return the pace of this machine: its time for a calibration kernel over KERNEL_SECONDS; 0.5 is twice as fast."""
+    """Return the time of this machine for a calibration kernel, divided by KERNEL_SECONDS; 0.5: twice as fast."""
     return min(measure_seconds(calibration_kernel()) for _ in range(KERNEL_REPEATS)) / KERNEL_SECONDS
 
 

@@ -46,14 +46,14 @@ PRIVATE_FIELDS = {"allowed_seconds", "history", "machine", "versions", "version"
 
 
 class KnobPoint(StoredRecord):
-    """Point of a knob: median time and error over its seeds, and the range of the error."""
+    """Point of a knob: median time and error of its seeds, and the range of the error."""
 
     label: str  # value of the knob in words
     settings: StoredSettings  # settings of the run
     seconds: float | None  # median time; null: the times are not comparable
     rrmsd: float  # median RRMSD by the reference
-    lowest: float  # lowest RRMSD over the seeds
-    highest: float  # highest RRMSD over the seeds
+    lowest: float  # lowest RRMSD of all seeds
+    highest: float  # highest RRMSD of all seeds
     seeds: int  # number of seeds that were run
 
 
@@ -66,7 +66,7 @@ class TableKnob(StoredRecord):
 
 
 class Calibration(StoredRecord):
-    """Time of the calibration kernel over the sweep."""
+    """Time of the calibration kernel during the sweep."""
 
     seconds: float | None  # median
     lowest: float | None  # minimum
@@ -75,6 +75,12 @@ class Calibration(StoredRecord):
         "merit and gradient of 1024² flux tubes through a fixed lens of 257² control points, 512² pixels; the fastest "
         "of three evaluations, in the process of the sweep, before each run"
     )  # description of the kernel
+
+    @classmethod
+    def of(cls, unit: Sequence[float]) -> Calibration:
+        """Return the record of the times of the kernel (seconds); null without any."""
+        extremes: dict[str, Any] = {"lowest": min(unit, default=None), "highest": max(unit, default=None)}
+        return cls(seconds=statistics.median(unit) if unit else None, **extremes)
 
 
 class Preset(StoredRecord):
@@ -195,7 +201,15 @@ FIGURE_WIDTH, FIGURE_HEIGHT = 10.0, 7.4  # inches
 AXIS_MARGIN = 1.25  # factor between the outermost points and the ends of the axes
 MAX_FLOOR_DISTANCE = 6.0  # maximum factor below the smallest error to which the axis extends for the standard error
 DARK_RRMSD = 1.0  # RRMSD of darkness; axes are not scaled for larger ones
-HISTORY_COLOUR, FRONT_COLOUR, RING_COLOUR = "#b5b5b5", "#f0c80073", "#a87c00"
+THIN_LINE: dict[str, Any] = {"lw": 0.9, "zorder": 1}  # style of the convergence and of the standard error
+FRONT_STYLE: dict[str, Any] = {"color": "#f0c80073", "lw": 5.5, "solid_joinstyle": "round", "solid_capstyle": "round"}
+RING_STYLE: dict[str, Any] = {
+    "marker": "o",
+    "ms": 18,
+    "mfc": "none",
+    "mec": "#a87c00",
+    "mew": 1.6,
+}  # style of the runs of the front
 
 
 @styled
@@ -227,30 +241,28 @@ def draw_runs(axes: Axes, table: TradeoffTable) -> None:
         upper.set_xlabel(f"units of the calibration kernel, {1000 * unit:.0f} ms here")
         upper.spines["top"].set_visible(True)
     if floors:
-        axes.plot(*zip(*floors, strict=True), color=GREY, lw=0.9, ls=(0, (5, 3)), zorder=1,
-                  label="standard error of the reference")  # fmt: skip
+        label = "standard error of the reference"
+        axes.plot(*zip(*floors, strict=True), color=GREY, ls=(0, (5, 3)), label=label, **THIN_LINE)
     if points := [(point["seconds"], point["rrmsd"]) for point in table.history if point["rrmsd"]]:
         label = "convergence of the base run (warm)"
-        axes.plot(*zip(*points, strict=True), color=HISTORY_COLOUR, lw=0.9, zorder=1, label=label)
+        axes.plot(*zip(*points, strict=True), color="#b5b5b5", label=label, **THIN_LINE)
     for knob in table.knobs:
         if knob.key in KNOB_STYLES and len(knob.places) > (knob.key != "adam"):  # the others have the base as a point
             _draw_knob(axes, knob)
     if table.front_runs:
-        points = ((run.seconds, run.rrmsd) for run in table.front_runs)
-        axes.step(*zip(*points, strict=True), where="post", color=FRONT_COLOUR, lw=5.5, zorder=2, label="Pareto front",
-                  marker="o", ms=18, mfc="none", mec=RING_COLOUR, mew=1.6, solid_joinstyle="round",
-                  solid_capstyle="round")  # fmt: skip
+        points = [(run.seconds, run.rrmsd) for run in table.front_runs]
+        axes.step(*zip(*points, strict=True), where="post", zorder=2, label="Pareto front", **FRONT_STYLE, **RING_STYLE)
     _draw_presets(axes, table)
     draw_legend(axes)
 
 
 def _draw_knob(axes: Axes, knob: TableKnob) -> None:
-    """Draw the points of a knob in their order, with bars for the range over the seeds."""
+    """Draw the points of a knob in their order, with bars for the range of the seeds."""
     colour, marker, line = KNOB_STYLES[knob.key]
     ends, places = " to ".join(dict.fromkeys((knob.places[0].label, knob.places[-1].label))), knob.places
-    edge, width = (colour, 1.4) if marker == "x" else ("white", 0.5)
-    axes.plot([p.seconds for p in places], [p.rrmsd for p in places], color=colour, marker=marker, ls=line, mec=edge,
-              mew=width, ms=5, lw=1.2, zorder=3, label=f"{knob.title}: {ends}")  # fmt: skip
+    style: dict[str, Any] = {"color": colour, "marker": marker, "ls": line, "ms": 5, "lw": 1.2, "zorder": 3}
+    style |= {"mec": colour, "mew": 1.4} if marker == "x" else {"mec": "white", "mew": 0.5}
+    axes.plot([p.seconds for p in places], [p.rrmsd for p in places], label=f"{knob.title}: {ends}", **style)
     if repeated := [p for p in places if p.seeds > 1]:
         bars = [[p.rrmsd - p.lowest for p in repeated], [p.highest - p.rrmsd for p in repeated]]
         times, errors = [p.seconds for p in repeated], [p.rrmsd for p in repeated]
@@ -264,21 +276,22 @@ def _draw_presets(axes: Axes, table: TradeoffTable) -> None:
     for preset in table.presets:
         position = preset.seconds, preset.rrmsd
         axes.plot(*position, "*", ms=17, color="#ffffff", mec="#111111", mew=1.1, zorder=5)
-        axes.annotate(preset.name, position, (9, 8), textcoords="offset points", weight="bold", fontsize=10, zorder=6,
-                      bbox={"fc": "white", "alpha": 0.7, "lw": 0, "pad": 0.8})  # fmt: skip
+        box = {"fc": "white", "alpha": 0.7, "lw": 0, "pad": 0.8}
+        style: dict[str, Any] = {"weight": "bold", "fontsize": 10, "zorder": 6}
+        axes.annotate(preset.name, position, (9, 8), textcoords="offset points", bbox=box, **style)
 
 
 def draw_legend(axes: Axes) -> None:
     """Draw the legend below the axes, in columns."""
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.11), ncols=2, fontsize=8.2, handlelength=2.6,
-                    columnspacing=1.6)  # fmt: skip
+        place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.11)}
+        axes.legend(ncols=2, fontsize=8.2, handlelength=2.6, columnspacing=1.6, **place)
 
 
 # --- the page and the terminal ----------------------------------------------------------------------------------------
 
 VERDICT_STYLES = {"pass": "bold green", "remarks": "bold yellow", "fail": "bold red"}  # page: terminal
-TEMPLATE = Path(__file__).with_name("tradeoff.html.j2")
+PAGE_TEMPLATE = Path(__file__).with_name("tradeoff.html.j2")
 
 
 def write_page(table: TradeoffTable, scene: Scene, folder: Path) -> None:
@@ -288,12 +301,11 @@ def write_page(table: TradeoffTable, scene: Scene, folder: Path) -> None:
         files.put(folder / "tradeoff.png", picture)
     else:
         (folder / "tradeoff.png").unlink(missing_ok=True)
-    text = environment().from_string(TEMPLATE.read_text(encoding="utf-8")).render(
-        table=table, scene=scene.toml(), machine=machine(table.machine), verdict=verdict(table),
-        picture=base64_images({"": picture}).get(""),
-        runs=sorted(table.runs_with_lens, key=lambda run: run.rrmsd if table.errors_alone else run.seconds),
-    )  # fmt: skip
-    files.put(folder / "tradeoff.html", text.encode())
+    template = environment().from_string(PAGE_TEMPLATE.read_text(encoding="utf-8"))
+    runs = sorted(table.runs_with_lens, key=lambda run: run.rrmsd if table.errors_alone else run.seconds)
+    data = {"table": table, "runs": runs, "verdict": verdict(table), "picture": base64_images({"": picture}).get("")}
+    page = template.render(data, scene=scene.toml(), machine=machine(table.machine))
+    files.put(folder / "tradeoff.html", page.encode())
 
 
 def verdict(table: TradeoffTable) -> tuple[str, str, str]:

@@ -25,15 +25,15 @@ from bstcad.folder import SCENE, scene_files
 from bstcad.optics.sides import Sides, as_pair, scaled
 from bstcad.runs import environment, files
 from bstcad.runs.cluster import Answer, Machines
-from bstcad.runs.progress import ProgressFunction
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import PRESETS
 from bstcad.scene.scene import Scene
 from bstcad.sweep import cold_run, results
 from bstcad.sweep.cold_run import ColdRun, LocalPool, Settings, StoredRecord, Value, format_value, sorted_settings
-from bstcad.sweep.net_choice import with_net
+from bstcad.sweep.net_choice import NET_KEY, with_net
 from bstcad.sweep.prediction import START_SECONDS, typical_seconds
 from bstcad.sweep.results import Calibration, KnobPoint, Preset, TableKnob, TradeoffTable, halving_factor, pareto_front
+from bstcad.tailoring.run import Progress, no_progress
 
 # --- knobs ------------------------------------------------------------------------------------------------------------
 
@@ -44,7 +44,6 @@ PIXEL_LIMITS = (8, 4096)  # minimum and maximum pixels per side
 COUNT_LIMITS = (1, 16_384)  # minimum and maximum of all other numbers
 ROUND_COUNTS = (1, 2, 3, 5, 8)  # numbers of rounds of transport and slope fit in stage 1
 ADAM_FRACTIONS = (1 / 8, 1 / 4, 1 / 2, 1.0)  # steps of Wang et al.'s procedure, as fractions of the preset's
-NET_KEY = "lens.back.control_points"
 
 Points = Mapping[str, Settings]  # points of a knob by label ("768"), in the order of increasing work
 
@@ -186,12 +185,10 @@ def run_order(scene: Scene, knobs: Sequence[Knob]) -> list[Settings]:
     def neighbours(varied: Iterable[Knob], *distances: int) -> list[Settings]:
         return [point for steps in distances for knob in varied for point in _neighbour(knob, steps) if point != paper]
 
-    order = [
-        presets.get("draft", ()), (), presets.get("standard", ()), *neighbours(single, -1),
-        *(repeated for _, repeated in _probes(scene, knobs).values()), *neighbours(joint, -1), *neighbours(single, +1),
-        presets.get("fine", ()), *neighbours(joint, +1), *neighbours(single, -2, -3, -4),
-        *neighbours(knobs[1:], 2, -2, 3, -3, 4, -4), paper,
-    ]  # fmt: skip
+    repeated = [other for _, other in _probes(scene, knobs).values()]
+    order = [presets.get("draft", ()), (), presets.get("standard", ()), *neighbours(single, -1), *repeated]
+    order += [*neighbours(joint, -1), *neighbours(single, +1), presets.get("fine", ()), *neighbours(joint, +1)]
+    order += [*neighbours(single, -2, -3, -4), *neighbours(knobs[1:], 2, -2, 3, -3, 4, -4), paper]
     return list(dict.fromkeys(order))
 
 
@@ -240,13 +237,12 @@ class RunFile(StoredRecord):
 
 
 def tradeoff(
-    scene: Scene, folder: Path, *, budget: float, progress: ProgressFunction = lambda *event: None,
-    machines: Machines | None = None, effort: cold_run.Effort = cold_run.REFERENCE_EFFORT,
-) -> TradeoffTable:  # fmt: skip
+    scene: Scene, folder: Path, *, budget: float, progress: Progress = no_progress, machines: Machines | None = None
+) -> TradeoffTable:
     """Do the most important runs that the budget allows, and write tradeoff.csv, .json, .png and .html.
 
-    machines: machines of the runs; None: this one.  effort: effort of the reference.  The csv and json files are
-    written after each run, so that an interrupted sweep has them.
+    machines: machines of the runs; None: this one.  The csv and json files are written after each run, so that an
+    interrupted sweep has them.
     """
     scene = scene.changed({"tailoring.accuracy": None, "tailoring.max_time": None})  # these end a design early
     base, _ = with_net(scene)
@@ -260,7 +256,7 @@ def tradeoff(
             files.put(folder / "scene" / name, data)
         sweep = _Sweep(base, budget, folder, progress)
         try:
-            sweep.run(machines, contents, effort)
+            sweep.run(machines, contents)
         except BaseException as error:
             if count := len(sweep.runs):
                 runs = "1 run is" if count == 1 else f"{count} runs are"
@@ -273,7 +269,7 @@ def tradeoff(
         return result
 
 
-def check_free(folder: Path, contents: Mapping[str, bytes]) -> None:
+def check_free(folder: Path, contents: cold_run.SceneFiles) -> None:
     """Raise SceneError unless the folder is new, empty, or belongs to a sweep of this scene."""
     try:
         files.check_free(folder, [f"scene/{SCENE}"], "a sweep's")
@@ -289,18 +285,16 @@ def check_free(folder: Path, contents: Mapping[str, bytes]) -> None:
 
 
 class _Sweep:
-    def __init__(self, base: Scene, budget: float, folder: Path, progress: ProgressFunction) -> None:
+    def __init__(self, base: Scene, budget: float, folder: Path, progress: Progress) -> None:
         self._base, self._budget, self._folder, self._progress = base, budget, folder, progress
         self._knobs = knobs(base)
         self._order, self._work = run_order(base, self._knobs), cache(partial(predicted_work, base))
         self._under_way: dict[Settings, tuple[float, float]] = {}  # (start time, predicted seconds) of running runs
         self._file = folder / "runs" / f"{environment.version()}.json"
-        stored = (
-            cold_run.read_record(RunFile, self._file, "remove it, and its runs are repeated")
-            if self._file.is_file()
-            else None
-        )
-        self.runs = {run.settings: run for run in stored.runs} if stored else {}  # runs that have ended
+        self.runs: dict[Settings, ColdRun] = {}  # runs that have ended
+        if self._file.is_file():
+            stored = cold_run.read_record(RunFile, self._file, "remove it, and its runs are repeated")
+            self.runs = {run.settings: run for run in stored.runs}
         for point, run in list(self.runs.items()):
             if run.allowed_seconds is not None:  # its time was limited; repeat it if there is more time now
                 left = budget - self._spent() + run.cost_seconds
@@ -308,7 +302,7 @@ class _Sweep:
                     del self.runs[point]
         self._earlier = self._spent()  # seconds spent by earlier sweeps in the folder
 
-    def run(self, machines: Machines | None, contents: Mapping[str, bytes], effort: cold_run.Effort) -> None:
+    def run(self, machines: Machines | None, contents: cold_run.SceneFiles) -> None:
         """Do runs until no remaining one fits into the budget."""
         if self._choice() is None:
             return
@@ -321,14 +315,14 @@ class _Sweep:
                     # The first run has no time limit, since a sweep needs at least one.
                     limit = self._left() + MAX_OVERRUN * self._budget if self.runs or self._under_way else math.inf
                     self._under_way[point] = time.perf_counter(), self._predicted(point)
-                    machines.start(point, cold_run.run_and_judge, contents, point, limit, effort)
+                    machines.start(point, cold_run.run_and_judge, contents, point, limit, cold_run.REFERENCE_EFFORT)
                 if not self._under_way:
                     return
                 self._record_answer(machines.next(self._tick))
 
     def _record_answer(self, answer: Answer) -> None:
         _, predicted = self._under_way.pop(answer.key)
-        failed = {"status": cold_run.FAILED, "reason": answer.reason, "version": environment.version()}
+        failed: dict[str, Any] = {"status": cold_run.FAILED, "reason": answer.reason, "version": environment.version()}
         run = answer.value or ColdRun(settings=answer.key, **failed)
         self.runs[answer.key] = run.model_copy(update={"predicted_seconds": predicted, "where": answer.where})
         real = (run for run in self.runs.values() if run.cost_seconds)  # runs that were not started are tried again
@@ -337,11 +331,11 @@ class _Sweep:
 
     def table(self) -> TradeoffTable:
         """Write and return the table of the runs so far, and of the remaining ones."""
-        unset = NO_TIMES | {"status": cold_run.NOT_RUN, "where": ""}
+        unset: dict[str, Any] = NO_TIMES | {"status": cold_run.NOT_RUN, "where": ""}
         points = (point for point in self._order if point not in self.runs)
         waiting = [ColdRun(settings=point, predicted_seconds=self._predicted(point), **unset) for point in points]
         runs = [self.runs[point] for point in self._order if point in self.runs]
-        result = table(self._base, self._knobs, runs, waiting, budget=self._budget)
+        result = table(self._base, self._knobs, [*runs, *waiting], self._budget)
         results.write(result, self._folder)
         return result
 
@@ -395,45 +389,38 @@ def predicted_work(scene: Scene, point: Settings) -> tuple[bool, float]:
 # --- the table --------------------------------------------------------------------------------------------------------
 
 
-def table(
-    scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], waiting: Sequence[ColdRun] = (), *,
-    budget: float = math.inf,
-) -> TradeoffTable:  # fmt: skip
-    """Return the table of the runs that have ended and of those that wait, both in the order of importance."""
-    own, best = scene.lens.back.net, pareto_front(runs)
+def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: float = math.inf) -> TradeoffTable:
+    """Return the table of all runs: those that have ended, then those that wait, each in the order of importance."""
+    own, best, ended = scene.lens.back.net, pareto_front(runs), [run for run in runs if run.status != cold_run.NOT_RUN]
     comparable = {run.settings: run for run in runs if run.comparable}
     selected = comparable or {run.settings: run for run in runs if run.done}
     sample = selected.get(()) or next(iter(selected.values()), None)  # states the machine of all runs
     unit = [run.kernel_seconds for run in comparable.values() if run.kernel_seconds]
     on_front, labels = tuple(run.settings for run in best), _labels(scene, knobs)
+    base = {"quality": scene.tailoring.quality, "control_points": own, "pixels": scene.target.columns_rows}
+
+    def described(run: ColdRun) -> ColdRun:
+        label = labels.get(run.settings) or describe(run.settings)
+        keys = {"knobs": _knob_keys(knobs, run.settings), "on_front": run.settings in on_front}
+        return run.model_copy(update={"label": label, **keys})
+
     return TradeoffTable(
         name=scene.name,
         title=scene.title,
-        base={
-            "quality": scene.tailoring.quality, "control_points": own, "pixels": scene.target.columns_rows,
-            "knobs": scene.tailoring.resolved(own).model_dump(exclude_none=True),
-        },
+        base=base | {"knobs": scene.tailoring.resolved(own).model_dump(exclude_none=True)},
         budget_seconds=budget,
-        spent_seconds=sum(run.cost_seconds for run in runs),
+        spent_seconds=sum(run.cost_seconds for run in ended),
         errors_alone=bool(selected) and not comparable,
         version=bstcad.__version__,
-        sources=next((run.version for run in runs), ""),
+        sources=next((run.version for run in ended), ""),
         machine=sample.machine if sample else {},
         versions=sample.versions if sample else {},
         reference={
             "rays": sorted({run.rays for run in runs if run.rays}),
             "what": REFERENCE_TEXT.format(cold_run.REFERENCE_EFFORT.accuracy, _judged_on(scene)),
         },
-        calibration=Calibration(
-            seconds=statistics.median(unit) if unit else None, lowest=min(unit, default=None),
-            highest=max(unit, default=None),
-        ),
-        runs=tuple(
-            run.model_copy(update={
-                "label": labels.get(run.settings) or describe(run.settings),
-                "knobs": _knob_keys(knobs, run.settings), "on_front": run.settings in on_front,
-            }) for run in (*runs, *waiting)
-        ),
+        calibration=Calibration.of(unit),
+        runs=tuple(map(described, runs)),
         knobs=tuple(
             TableKnob(key=knob.key, title=knob.title, places=knob_points(scene, knob, selected, timed=bool(comparable)))
             for knob in knobs
@@ -442,11 +429,12 @@ def table(
         front_halving=halving_factor(best),
         presets=tuple(
             Preset(name=name, seconds=selected[point].seconds if comparable else None, rrmsd=selected[point].rrmsd)
-            for name, point in knobs[0].points.items() if point in selected
+            for name, point in knobs[0].points.items()
+            if point in selected
         ),
         seeds=seed_matters(scene, knobs, {run.settings: run for run in runs}),
         history=comparable[()].history if () in comparable else (),
-    )  # fmt: skip
+    )
 
 
 def _judged_on(scene: Scene) -> str:
@@ -463,11 +451,9 @@ def knob_points(
     for label, point in knob.points.items():
         if done := [runs[each] for each in (point, other_seed(scene, point)) if each in runs and runs[each].done]:
             errors, seconds = [run.rrmsd for run in done], statistics.median(run.seconds for run in done)
-            average = KnobPoint(
-                label=label, settings=point, seconds=seconds if timed else None, rrmsd=statistics.median(errors),
-                lowest=min(errors), highest=max(errors), seeds=len(done),
-            )  # fmt: skip
-            averages.append(average)
+            middle: dict[str, Any] = {"seconds": seconds if timed else None, "rrmsd": statistics.median(errors)}
+            extent: dict[str, Any] = {"lowest": min(errors), "highest": max(errors), "seeds": len(done)}
+            averages.append(KnobPoint(label=label, settings=point, **middle, **extent))
     return tuple(averages)
 
 

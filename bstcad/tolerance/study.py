@@ -96,10 +96,6 @@ class TargetPictures:
         total = picture.sum()
         return picture * (self.target.sum() / total) if total > 0 else picture
 
-    def rrmsd(self, amounts: Sequence[float]) -> float:
-        """Return the RRMSD by a full trace (Wang et al. 2023, Eq. 15)."""
-        return _norm(self.vector(amounts))
-
 
 @dataclass(frozen=True, eq=False)
 class Wavefronts:
@@ -151,7 +147,8 @@ class TracedFigure(Protocol):
         ...
 
 
-def _figure(goal: TracedFigure, amounts: Sequence[float]) -> float:
+def traced_figure(goal: TracedFigure, amounts: Sequence[float]) -> float:
+    """Return the figure of merit by a full trace: the RRMSD (Wang et al. 2023, Eq. 15) or the RMS in waves."""
     return _norm(goal.vector(amounts))
 
 
@@ -167,7 +164,7 @@ DERIVATIVE_STEP = 0.5  # step of the central difference by each perturbation, in
 # than its detail is not a polynomial of ξ.
 SPLINE_NODES = ((0, (-3.0, -2.0, -1.2, -0.5, 0.5, 1.2, 2.0, 3.0)), (4, (-2.5, -1.0, 1.0, 2.5)), (8, (-1.0, 1.0)))
 NONLINEAR_DIRECTIONS = 12  # number of strongest directions with nodes; along the others pictures are linear
-MIN_STRENGTH = 1e-3  # change of the picture relative to the strongest direction, below which it is linear, too
+MIN_STRENGTH = 1e-3  # change of the picture relative to the strongest direction, below which it is also linear
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,15 +255,29 @@ def principal_axes(symmetric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 # --- the study --------------------------------------------------------------------------------------------------------
 
-MODEL_TRIALS, FULL_TRIALS = 10_000, 200  # default number of trials by the model, and of those by full traces
+MODEL_TRIALS = 10_000  # default number of trials by the model
 WORST_SHOWN = 5  # number of the worst trials that are reported
 SCREEN_ADJUSTMENTS = {f"screen.{motion}" for motion, *_ in MOTIONS}
 ADJUSTMENT_RANGE = 8.0  # range of adjustments of the screen, in standard deviations
 ADJUSTMENT_FACTOR = 10.0  # limit of an adjustment that is no error of the study, relative to the default grade
 QUOTIENT_STEP = 1e-4  # step of the difference quotients, in standard deviations
-SEED_OFFSET = 7919  # offset of the seed of independent trials
+INDEPENDENT_SEED = 7919  # offset of the seed of independent trials
 
 Yield = tuple[float, float, float]  # fraction of the trials within a limit: low, likely, high (95 %, Wilson)
+
+
+@dataclass(frozen=True)
+class StudySettings:
+    """Settings of a study; its results do not depend on `progress` and `spread`."""
+
+    grade: str | None = None  # grade that replaces the one in the scene; None: that in the scene
+    wanted: float | None = None  # yield (0 … 1) for which the loosest tolerances are sought; None: they are not sought
+    seed: int = 0  # seed of the trials
+    trials: int = MODEL_TRIALS  # number of trials by the model
+    full: int = 200  # number of these that are also traced in full
+    tubes: int = 1031  # flux tubes per side and channel; their numerical error is the same in every trial
+    progress: Progress = lambda *event: None  # receives the progress of the traces
+    spread: Spread = run_locally  # executor of the traces
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,7 +314,7 @@ class Study:
 
     @property
     def bias(self) -> float:
-        """Excess of the squared RRMSD in the traces of the study over independent rays, a numerical error."""
+        """Excess of the squared RRMSD in the traces of the study, relative to independent rays: a numerical error."""
         return self.model.rrmsd**2 - self.rrmsd**2
 
     def within_limit(self, amounts: np.ndarray) -> np.ndarray:
@@ -320,7 +331,7 @@ def estimate_yield(good: np.ndarray) -> Yield:
 def worst_of(studies: Sequence[Study]) -> Study:
     """Combine studies of several targets by the same trials and limit: each figure is that of the worst target.
 
-    The contributions of the errors (`share`) are to the mean square of all pictures, each over its target's norm.
+    The contributions of the errors (`share`) are to the mean square of all pictures, each divided by its target's norm.
     """
     first, *others = studies
     if not others:
@@ -336,31 +347,26 @@ def worst_of(studies: Sequence[Study]) -> Study:
     return replace(first, sensitivities=tuple(sensitivities), rrmsd=max(s.rrmsd for s in studies), **worst)
 
 
-def study(
-    pictures: TracedFigure, limit: float, seed: int, rrmsd: float, *, linear: int = MODEL_TRIALS,
-    full: int = FULL_TRIALS, progress: Progress = lambda *event: None, spread: Spread = run_locally,
-) -> Study:  # fmt: skip
+def study(pictures: TracedFigure, limit: float, rrmsd: float, settings: StudySettings) -> Study:
     """Return sensitivities and trials of a setup with errors.
 
-    limit: maximum figure of merit (RRMSD, or RMS in waves).  rrmsd: figure of the design by independent rays.
-    spread: executor of the traces.  Tubes have a numerical error that is the same in every trial.  Its square is
-    subtracted from each RRMSD², so that the trials are comparable with the design.
+    limit: maximum figure of merit (RRMSD, or RMS in waves).  rrmsd: figure of the design by independent rays.  The
+    square of the tubes' numerical error is subtracted from each RRMSD², so that the trials are comparable with it.
     """
     perturbations = pictures.perturbations
     with_adjustments = (*perturbations, *adjustments(pictures.setup, perturbations))
-    superposed = superpose(replace(pictures, perturbations=with_adjustments), progress, spread)
+    superposed = superpose(replace(pictures, perturbations=with_adjustments), settings.progress, settings.spread)
     bias = superposed.rrmsd**2 - rrmsd**2
-    amounts = trials(perturbations, seed, range(linear))
-    figures = []
-    for k, rrmsd_of_it in enumerate(spread(_figure, pictures, amounts[:full]), 1):
-        figures.append(rrmsd_of_it)
-        progress("trials", k, min(full, linear), f"{pictures.figure} {rrmsd_of_it:.4f}")
-    adjusted = [adjusted_rrmsd(superposed, with_adjustments, amounts[k]) for k in range(len(figures))]
-    return Study(
-        perturbations, superposed, _sensitivities(superposed, perturbations, bias), limit=limit, seed=seed, rrmsd=rrmsd,
-        linear=_unbiased(superposed.rrmsds(amounts), bias), full=_unbiased(np.array(figures), bias),
-        adjusted=_unbiased(np.array(adjusted), bias),
-    )  # fmt: skip
+    amounts = trials(perturbations, settings.seed, range(settings.trials))
+    full = []
+    for k, traced in enumerate(settings.spread(traced_figure, pictures, amounts[: settings.full]), 1):
+        full.append(traced)
+        settings.progress("trials", k, min(settings.full, settings.trials), f"{pictures.figure} {traced:.4f}")
+    adjusted = [adjusted_rrmsd(superposed, with_adjustments, amounts[k]) for k in range(len(full))]
+    figures = {"linear": superposed.rrmsds(amounts), "full": np.array(full), "adjusted": np.array(adjusted)}
+    unbiased = {name: _unbiased(rrmsds, bias) for name, rrmsds in figures.items()}
+    sensitivities = _sensitivities(superposed, perturbations, bias)
+    return Study(perturbations, superposed, sensitivities, limit=limit, seed=settings.seed, rrmsd=rrmsd, **unbiased)
 
 
 def _unbiased(rrmsds: np.ndarray, bias: float) -> np.ndarray:
@@ -375,13 +381,11 @@ def _sensitivities(superposed: Model, perturbations: Sequence[Perturbation], bia
     mean_rrmsds = (_unbiased(superposed.rrmsds(sigmas), bias) + _unbiased(superposed.rrmsds(-sigmas), bias)) / 2
     added = np.sum(superposed.first[:n] ** 2, axis=1)
     changes, shares = mean_rrmsds - _unbiased(np.array([superposed.rrmsd]), bias), added / (added.sum() or 1.0)
-    sensitivities = [
-        Sensitivity(
-            name=p.kind.name, words=p.kind.words, unit=p.kind.unit, limit=p.limit, distribution=p.distribution,
-            cost=p.cost, sigma=p.sigma, rrmsd_change=float(change), share=float(share),
-        )
-        for p, change, share in zip(perturbations, changes, shares, strict=True)
-    ]  # fmt: skip
+    sensitivities = []
+    for p, change, share in zip(perturbations, changes.tolist(), shares.tolist(), strict=True):
+        kind = {"name": p.kind.name, "words": p.kind.words, "unit": p.kind.unit}
+        size = {"limit": p.limit, "distribution": p.distribution, "cost": p.cost, "sigma": p.sigma}
+        sensitivities.append(Sensitivity(**kind, **size, rrmsd_change=change, share=share))
     return tuple(sorted(sensitivities, key=lambda s: s.rrmsd_change, reverse=True))
 
 
@@ -434,7 +438,7 @@ def loosest_limits(study: Study, wanted: float, others: Sequence[Study] = ()) ->
     added = np.maximum(added, 1e-30)
     shape = np.cbrt(np.array([p.cost for p in perturbations]) / added)
     shape /= np.exp(np.mean(np.log(shape)))
-    uniform = np.random.default_rng((study.seed, SEED_OFFSET)).random((MODEL_TRIALS, len(perturbations)))
+    uniform = np.random.default_rng((study.seed, INDEPENDENT_SEED)).random((MODEL_TRIALS, len(perturbations)))
     unit = draws(perturbations, uniform)
 
     def all_within(amounts: np.ndarray) -> np.ndarray:
@@ -447,5 +451,5 @@ def loosest_limits(study: Study, wanted: float, others: Sequence[Study] = ()) ->
     log_factor = 10.0 if excess(10.0) >= 0 else brentq(excess, -10.0, 10.0, xtol=1e-4)
     widths = np.minimum(np.exp(log_factor) * shape, WIDEST)
     loosened = tuple(replace(p, limit=float(p.limit * w)) for p, w in zip(perturbations, widths, strict=True))
-    independent = trials(loosened, study.seed + SEED_OFFSET, range(MODEL_TRIALS))
+    independent = trials(loosened, study.seed + INDEPENDENT_SEED, range(MODEL_TRIALS))
     return loosened, estimate_yield(all_within(independent))

@@ -10,6 +10,7 @@ from bstcad import commands
 from bstcad import folder as folders
 from bstcad.app import design_process
 from bstcad.app.design_runs import Run
+from bstcad.commands import ProofOptions
 from bstcad.report import record
 from bstcad.scene import new_scene
 from bstcad.scene.scene import load
@@ -90,7 +91,8 @@ def test_a_photo_is_a_verified_lens_in_four_requests(own, light, size, tmp_path)
     assert [check.name for check in report.checks if not check.passed] == []
     assert commands.verify(own.folder / name / "lens.step").passed
     if light == "laser":  # the lens of the command, to the last bit
-        commands.generate(load(own.folder / name / "scene.toml"), tmp_path / "alone", drawing=commands.NoPictures)
+        options = ProofOptions(drawing=commands.NoPictures)
+        commands.generate(load(own.folder / name / "scene.toml"), tmp_path / "alone", options)
         lenses = [folders.read_nominal(place)[1].lens for place in (own.folder / name, tmp_path / "alone")]
         assert np.array_equal(*(lens.back.control_points() for lens in lenses))
     again = own.ask(f"/api/design/{name}/edit", {}).json["name"]  # and its scene, with the comments that it had

@@ -11,6 +11,7 @@ import shutil
 import signal
 import threading
 import time
+from dataclasses import replace
 
 import distributed
 import psutil
@@ -22,6 +23,7 @@ from bstcad.scene.scene import load
 from bstcad.sweep import batch as batches
 from bstcad.sweep.batch import BatchScene
 from bstcad.tolerance import tolerancing
+from bstcad.tolerance.study import StudySettings
 from tests.benchmarks.cold import TEMPLATES
 
 pytestmark = pytest.mark.bench
@@ -42,9 +44,8 @@ def test_tolerances_are_the_same_on_any_number_of_workers(letters, tmp_path, cap
     def study(workers, kills=False):
         folder = shutil.copytree(letters, tmp_path / f"{workers} {kills}")
         with on(workers) as found, losing(kills, lambda: lose_one(found.address, lost)):
-            tolerancing.tolerance(
-                folder, grade="precise", full=FULL, wanted=0.9, spread=None if found is None else found.spread
-            )
+            settings = StudySettings("precise", wanted=0.9, full=FULL)
+            tolerancing.tolerance(folder, settings if found is None else replace(settings, spread=found.spread))
         return (folder / "tolerance.json").read_bytes()
 
     runs = {"in this process": (0,), "1 worker": (1,), "2 workers": (2,), "4 workers": (4,), "2, 1 lost": (2, True)}

@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 from bstcad import commands
+from bstcad.commands import ProofOptions
 from bstcad.report.figure_jobs import NoPictures
 from bstcad.scene.scene import Scene, load
 from tests.benchmarks.cold import TEMPLATES, generate
@@ -190,7 +191,7 @@ def test_small_errors_are_those_of_an_independent_monte_carlo(name, designs):
         if "target" not in changes:
             changes |= {"target.uniform": None, "target.image": hills(designs), "target.gamma": 1.0}
         scene = Scene.model_validate(POINT | {"name": name}).changed(changes)
-        commands.generate(scene, folder, drawing=NoPictures)
+        commands.generate(scene, folder, options=ProofOptions(drawing=NoPictures))
     report, found = judged(folder, TWO_SIGMAS, points=FEW, most=MOST)
     assert found.rrmsd < SMALL_ERROR and found.error < 2 * AGREED * found.rrmsd
     assert all(check["passed"] for check in report["checks"] if check["id"] == "tubes")
@@ -198,6 +199,7 @@ def test_small_errors_are_those_of_an_independent_monte_carlo(name, designs):
 
 def test_both_planes_of_a_beam_shaper_are_those_of_an_independent_monte_carlo(designs):
     if not (designs / "beam_shaper" / "report.json").exists():
-        commands.generate(load(TEMPLATES / "beam_shaper.toml"), designs / "beam_shaper", drawing=NoPictures)
+        scene, options = load(TEMPLATES / "beam_shaper.toml"), ProofOptions(drawing=NoPictures)
+        commands.generate(scene, designs / "beam_shaper", options)
     for number in (0, 1):
         judged(designs / "beam_shaper", TWO_SIGMAS, number, points=POINTS, most=MOST)

@@ -24,6 +24,7 @@ import pytest
 import torch
 
 from bstcad import cli, commands
+from bstcad.commands import ProofOptions
 from bstcad.optics.measure import Effort
 from bstcad.pipeline import DesignState, design
 from bstcad.report import rendering
@@ -55,11 +56,11 @@ SCENES = {  # (scene, what makes it small)
 def design_with_checkpoints(folder, name="one face"):
     """Make a small design in a process that is to be killed, with a checkpoint at every step and --resume."""
     commands.Keeper = functools.partial(commands.Keeper, interval=0.0)
-    checkpoint.MAX_TIME_FRACTION = 1e9  # no pause, however long the writing takes
+    checkpoint.MAX_WRITING_FRACTION = 1e9  # no pause, however long the writing takes
     rendering.lens_picture = lambda mesh: None
     scene = load(*SCENES[name])
     print("ready", flush=True)
-    commands.generate(scene, Path(folder), device="cpu", resume=True, effort=Effort(256))
+    commands.generate(scene, Path(folder), device="cpu", resume=True, options=ProofOptions(Effort(256)))
     print("done")
 
 
@@ -169,7 +170,7 @@ def test_a_full_disk_is_a_sentence_and_loses_nothing(small_scene, tmp_path, monk
     folder.mkdir()
     (folder / "report.json").write_text("{}")
     monkeypatch.setattr(commands, "Keeper", functools.partial(commands.Keeper, interval=0.0))  # at each step
-    monkeypatch.setattr(checkpoint, "MAX_TIME_FRACTION", 1e9)  # no pause, however long the writing takes
+    monkeypatch.setattr(checkpoint, "MAX_WRITING_FRACTION", 1e9)  # no pause, however long the writing takes
     generate = functools.partial(commands.generate, small_scene, folder, device="cpu")
     with full_disk(60_000):
         generate(progress=lambda *words: said.append(" ".join(map(str, words))))

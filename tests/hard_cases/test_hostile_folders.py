@@ -24,6 +24,7 @@ from PIL import Image
 
 from bstcad import commands
 from bstcad import folder as folders
+from bstcad.commands import ProofOptions
 from bstcad.optics.measure import Effort
 from bstcad.report import record
 from bstcad.report.record import DesignCourse
@@ -247,7 +248,7 @@ def test_a_report_is_not_written_through_links_and_a_title_is_no_markup(quick_fo
         (quick_folder / name).symlink_to(victim)
     (quick_folder / "figures").symlink_to(elsewhere, target_is_directory=True)
     (quick_folder / ".report.json.new").symlink_to(victim)
-    commands.verify(quick_folder, drawing=flat_pictures())
+    commands.verify(quick_folder, options=ProofOptions(drawing=flat_pictures()))
     assert victim.read_text() == "mine" and not (quick_folder / "report.json").is_symlink()
     holds("a folder from somebody else: files written outside it", len(list(elsewhere.iterdir())), 0)
     assert list((quick_folder / "figures").iterdir())

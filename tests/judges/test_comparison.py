@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from bstcad import commands
+from bstcad.commands import ProofOptions
 from bstcad.judges import comparison
 from bstcad.judges.faces import FaceError, Traced
 from bstcad.optics.channels import Channel
@@ -176,7 +177,7 @@ def test_the_report_holds_the_judge(small_design, tmp_path, monkeypatch):
     monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
     monkeypatch.setattr(comparison, "JUDGE_RAYS", 1 << 18)
     folder = shutil.copytree(small_design.folder, tmp_path / "small")
-    report = commands.verify(folder, against=("batoid",), effort=quick_effort()).facts
+    report = commands.verify(folder, against=("batoid",), options=ProofOptions(quick_effort())).facts
     [judge] = report["judges"]
     assert report["passed"] and judge["name"] == "batoid" and judge["agrees"]
     assert judge["over_noise"] in [c["value"] for c in report["checks"] if "by batoid against" in c["name"]]

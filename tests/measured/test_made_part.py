@@ -12,6 +12,7 @@ import torch
 import bstcad
 from bstcad import cli, commands
 from bstcad import folder as folders
+from bstcad.commands import ProofOptions
 from bstcad.measured import cloud as clouds
 from bstcad.measured import made_part
 from bstcad.measured.alignment import Face, align, first_pose
@@ -176,12 +177,13 @@ def test_the_report_has_a_made_part_where_one_was_asked_for(small_design, nomina
         and (folder / "figures" / "made_part.png").stat().st_size > 10_000
     )
     saved(tmp_path / "two" / "cloud.csv", 1.002 * cloud(nominal.lens, 5000, 1e-5))
-    assert not commands.verify(folder, measured=tmp_path / "two" / "cloud.csv", drawing=NoPictures).passed
-    assert commands.verify(folder, drawing=NoPictures).measured is None
+    options = ProofOptions(drawing=NoPictures)
+    assert not commands.verify(folder, options, measured=tmp_path / "two" / "cloud.csv").passed
+    assert commands.verify(folder, options).measured is None
     assert "The made part" not in (folder / "report.html").read_text()
     ours = [json.loads((folder / "measured" / name / "report.json").read_text()) for name in ("cloud", "cloud-2")]
     assert [each["measured"]["passed"] for each in ours] == [True, False]  # the later verification erased neither
-    again = commands.verify(folder, measured=tmp_path / "cloud.csv", drawing=NoPictures).facts["measured"]
+    again = commands.verify(folder, options, measured=tmp_path / "cloud.csv").facts["measured"]
     assert {path.name for path in (folder / "measured").iterdir()} == {"cloud", "cloud-2"}
     assert again["deviation_map"] == ["measured/cloud/deviation.npz", "measured/cloud/deviation.csv"]
     assert all((folder / name).is_file() for name in again["deviation_map"])

@@ -87,7 +87,7 @@ class TestFile:
             with pytest.raises(SceneError, match="start without --resume"):
                 checkpoint.read(path, dict)
         path.write_bytes(whole.replace(checkpoint.MAGIC, b"bstcad checkpoint 3\n"))
-        with pytest.raises(SceneError, match=r"is not a checkpoint of this version \('bstcad checkpoint 3'\); start"):
+        with pytest.raises(SceneError, match="'bstcad checkpoint 3'"):
             checkpoint.read(path, dict)
 
     @pytest.mark.parametrize("packed", ["objects", "compressed", "no zip"])
@@ -99,13 +99,13 @@ class TestFile:
             np.savez_compressed(body, tree=np.zeros(1_000_000, dtype=np.uint8))
         digest = hashlib.sha256(body.getvalue()).hexdigest().encode()
         path.write_bytes(checkpoint.MAGIC + digest + b"\n" + body.getvalue())
-        with pytest.raises(SceneError, match="not a checkpoint of bstcad"):
+        with pytest.raises(SceneError, match="without --resume"):
             checkpoint.read(path, dict)
 
     def test_what_is_not_of_the_kind_is_no_checkpoint(self, path):
         for other in (LINE.start, STATE):
             checkpoint.write(path, PURPOSE, other)
-            with pytest.raises(SceneError, match="not a checkpoint of bstcad"):
+            with pytest.raises(SceneError, match="without --resume"):
                 checkpoint.read(path, Line)
 
     @pytest.mark.parametrize("fault", [OSError(28, "No space left on device"), KeyboardInterrupt()], ids=repr)

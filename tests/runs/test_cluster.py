@@ -53,11 +53,11 @@ def test_a_worker_of_another_version_does_no_work(address, monkeypatch):
 
 
 def test_what_cannot_be_had_is_a_sentence(monkeypatch):
-    with pytest.raises(SceneError, match=r"--scheduler tcp://127.0.0.1:9: no scheduler answers .*; start one"):
+    with pytest.raises(SceneError, match="--scheduler tcp://127.0.0.1:9: "):
         Cluster("tcp://127.0.0.1:9", patience=1.0)
     with (
         distributed.LocalCluster(n_workers=0, processes=False, dashboard_address="127.0.0.1:0") as empty,
-        pytest.raises(SceneError, match="has no workers; start one"),
+        pytest.raises(SceneError, match="dask worker"),
     ):
         Cluster(empty.scheduler_address, patience=1.0)
     monkeypatch.setitem(sys.modules, "distributed", None)

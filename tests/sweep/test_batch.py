@@ -128,7 +128,7 @@ def test_what_is_finished_is_not_done_again(scenes, small_scene, designs, monkey
 def test_a_damaged_record_is_a_sentence(tmp_path, damage):
     assert batch.read(tmp_path) == ()
     (tmp_path / "batch.json").write_bytes(damage)
-    with pytest.raises(MachineError, match=r"batch.json: is damaged, or was written by another program; remove it"):
+    with pytest.raises(MachineError, match="batch.json: .*; remove it"):
         batch.read(tmp_path)
 
 

@@ -11,7 +11,7 @@ from bstcad.folder import scene_files
 from bstcad.optics.measure import Effort
 from bstcad.runs import environment
 from bstcad.runs.cluster import Cluster
-from bstcad.sweep import tradeoff
+from bstcad.sweep import cold_run, tradeoff
 from bstcad.sweep.cold_run import DONE, FAILED, ColdRun, LocalPool, calibration_kernel, judge_run, run_and_judge
 from bstcad.sweep.tradeoff import Knob
 
@@ -26,10 +26,11 @@ def test_a_sweep_of_cold_runs_measures_each_and_tells_why_one_failed(tiny, tmp_p
     """The base, which is run with another seed too, and a setting that is refused."""
     few = (
         Knob("quality", "Quality presets", {"draft": ()}),
-        Knob("control_points", "Control points a side", {"3": REFUSED, "33": ()}),
+        Knob("control_points", "Control points per side", {"3": REFUSED, "33": ()}),
     )
     monkeypatch.setattr(tradeoff, "knobs", lambda scene: few)
-    found = tradeoff.tradeoff(tiny, tmp_path / "sweep", budget=1e5, effort=EFFORT)
+    monkeypatch.setattr(cold_run, "REFERENCE_EFFORT", EFFORT)
+    found = tradeoff.tradeoff(tiny, tmp_path / "sweep", budget=1e5)
     runs = {run.settings: run for run in found.runs}
     assert len(runs) == 3 and not found.not_run
     base, seed, refused = (runs[point] for point in ((), SEED, REFUSED))

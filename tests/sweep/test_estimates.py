@@ -4,6 +4,7 @@ import json
 import math
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -35,8 +36,9 @@ SCENES = {
 def of(found):
     scene, target = found.scene, found.scene.target
     light = measure(found.lens, scene.channels(), target.screen, found.goals[0].picture, Effort(96))
-    given = {"picture": light.picture, "target": found.goals[0].picture, "efficiency": 0.9}
-    return diagnosis(scene, found.making, found.lens, **given), found.making
+    proven = SimpleNamespace(picture=light.picture, efficiency=0.9)
+    proof = SimpleNamespace(lens=found.lens, light=proven, at_bounds=None)
+    return diagnosis(scene, found.making, proof, found.goals[0].picture), found.making
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -11,6 +11,7 @@ import torch
 
 from bstcad import commands
 from bstcad.analysis.shape import describe
+from bstcad.commands import ProofOptions
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
@@ -88,7 +89,7 @@ def test_a_tool_of_50_mm_fits_and_the_picture_stays(free, bound):
 
 
 def test_the_report_says_so_from_the_file(bound):
-    contents = commands.prove(bound, effort=quick_effort())
+    contents = commands.prove(bound, ProofOptions(quick_effort()))
     [check] = [c for c in contents.checks if c.name.startswith("smallest concave radius")]
     assert check.passed and check.limit == 50 and check.value == pytest.approx(50, rel=0.02)
     assert contents.bounds["at"]["tool_radius"] > 0 and re.fullmatch(PLACE, contents.bounds["tightest"]["tool_radius"])

@@ -15,6 +15,7 @@ from bstcad.scene.scene import load
 from bstcad.tolerance import tolerancing
 from bstcad.tolerance.grades import FORM_MODES, base_grade, graded_table, perturbations
 from bstcad.tolerance.perturbations import as_net, form_error, kinds
+from bstcad.tolerance.study import StudySettings
 
 SAID = (
     Tolerance(grade="precise"),
@@ -91,7 +92,8 @@ def test_a_form_error_of_the_front_moves_light_and_is_made(small_design, setup, 
     monkeypatch.setattr(tolerancing, "read_nominal", lambda folder: (scene, read))
     path = small_design.folder / "trial.step"
     try:
-        amounts = {kind.name: amount for kind, amount in tolerancing.write_trial(small_design.folder, 1, path)}
+        written = tolerancing.write_trial(small_design.folder, 1, path, StudySettings())
+        amounts = {kind.name: amount for kind, amount in written}
         made = step_reading.lens(step_reading.read(path), 1.5)
     finally:
         path.unlink(missing_ok=True)

@@ -96,7 +96,7 @@ def test_a_front_as_a_net_is_that_front(outline):
 
 
 def test_what_a_net_cannot_carry_is_refused(setup):
-    with pytest.raises(ValueError, match=r"too fine for 33 x 33 control points"):
+    with pytest.raises(ValueError, match="33 x 33 control points"):
         ripple(setup.lens, 0.1, "raster")
-    with pytest.raises(ValueError, match="a correlation length of 0.2 mm"):
+    with pytest.raises(ValueError, match="0.2 mm"):
         form_error(setup.lens, 0.2, 0)

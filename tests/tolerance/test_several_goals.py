@@ -16,8 +16,9 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import Tolerance
 from bstcad.scene.target import numbered
 from bstcad.tolerance import tolerancing
+from bstcad.tolerance.study import StudySettings
 
-FEW = {"tubes": 65, "trials": 300, "full": 3, "seed": 2}
+FEW = StudySettings(tubes=65, trials=300, full=3, seed=2)
 OFF = (
     Tolerance(grade="none"),
     Tolerance(name="lens.decentre", limit=0.05),
@@ -51,14 +52,14 @@ def goals(small_design):
 @pytest.fixture(scope="module")
 def alone(small_design, tmp_path_factory):
     folder = folder_of(small_design, tmp_path_factory.mktemp("alone") / "small", {"accept.rrmsd": 0.5})
-    return tolerancing.tolerance(folder, **FEW)
+    return tolerancing.tolerance(folder, FEW)
 
 
 @pytest.fixture(scope="module")
 def unlimited(small_design, goals, tmp_path_factory):
     """A study of both targets and of the wave, of which none is limited: where the limits are to be."""
     folder = folder_of(small_design, tmp_path_factory.mktemp("unlimited") / "small", {"accept.rrmsd": 5.0} | goals)
-    return tolerancing.tolerance(folder, **FEW | {"tubes": 33, "trials": 100, "full": 1})
+    return tolerancing.tolerance(folder, replace(FEW, tubes=33, trials=100, full=1))
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +71,7 @@ def several(small_design, goals, unlimited, tmp_path_factory):
         "accept.wavefront": (wave.rms + wave.rms_trials["95 %"]) / 2,
     }
     folder = folder_of(small_design, tmp_path_factory.mktemp("several") / "small", limits | goals)
-    return folder, tolerancing.tolerance(folder, **FEW, wanted=0.3)
+    return folder, tolerancing.tolerance(folder, replace(FEW, wanted=0.3))
 
 
 def test_a_wave_without_a_limit_fails_no_lens(unlimited):
@@ -136,4 +137,4 @@ def test_it_is_written_read_and_said(several, capsys, monkeypatch):
 def test_a_design_that_misses_a_limit_itself_is_told(small_design, goals, tmp_path, limits):
     folder = folder_of(small_design, tmp_path / "small", goals | limits)
     with pytest.raises(SceneError, match=f"^{list(limits)[-1]}: the design itself has "):
-        tolerancing.tolerance(folder, **FEW, wanted=0.9)
+        tolerancing.tolerance(folder, replace(FEW, wanted=0.9))

@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 import bstcad
 from bstcad import cli, commands
 from bstcad.cad import step_reading
+from bstcad.commands import ProofOptions
 from bstcad.folder import read_nominal
 from bstcad.report import tolerances
 from bstcad.report.record import of_json
@@ -26,7 +27,7 @@ from bstcad.runs.cluster import Cluster
 from bstcad.tolerance import study, tolerancing
 from bstcad.tolerance.grades import graded_table, perturbations
 from bstcad.tolerance.perturbations import trials
-from bstcad.tolerance.study import TargetPictures, gram, principal_axes, product, run_locally
+from bstcad.tolerance.study import StudySettings, TargetPictures, gram, principal_axes, product, run_locally
 from tests.conftest import quick_effort
 
 TUBES, FULL = 257, 40
@@ -40,8 +41,8 @@ def pictures(small_design, setup):
 
 @pytest.fixture(scope="module")
 def found(pictures):
-    nominal = pictures.rrmsd(np.zeros(len(pictures.perturbations)))
-    return study.study(pictures, 1.02 * nominal, 3, nominal, full=FULL)
+    nominal = study.traced_figure(pictures, np.zeros(len(pictures.perturbations)))
+    return study.study(pictures, 1.02 * nominal, nominal, StudySettings(seed=3, full=FULL))
 
 
 @pytest.mark.parametrize("layer", ["omp", "workqueue"])
@@ -124,8 +125,8 @@ def test_the_screen_can_be_adjusted_where_it_is_no_error(pictures):
     """A lens off its axis shifts the picture, and the screen follows it; the errors' own figures have no part of it."""
     decentres = tuple(p for p in pictures.perturbations if p.kind.name.startswith("lens.decentre"))
     few = replace(pictures, perturbations=tuple(replace(p, limit=0.05) for p in decentres), tubes=129)
-    nominal = few.rrmsd(np.zeros(2))
-    found = study.study(few, 1.02 * nominal, 3, nominal, linear=100, full=10)
+    nominal = study.traced_figure(few, np.zeros(2))
+    found = study.study(few, 1.02 * nominal, nominal, StudySettings(seed=3, trials=100, full=10))
     raised = found.linear[:10] > 1.05 * nominal
     assert raised.sum() > 3
     assert (found.adjusted[raised] - nominal < 0.5 * (found.linear[:10][raised] - nominal)).all()
@@ -172,7 +173,8 @@ def studied(small_design, tmp_path_factory):
     folder = shutil.copytree(small_design.folder, tmp_path_factory.mktemp("studied") / "small")
     said, quick = io.StringIO(), tolerancing.tolerance
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said):
-        patch.setattr(tolerancing, "tolerance", lambda *a, **k: quick(*a, **k, tubes=TUBES, full=10, trials=500))
+        few = {"tubes": TUBES, "full": 10, "trials": 500}
+        patch.setattr(tolerancing, "tolerance", lambda folder, settings: quick(folder, replace(settings, **few)))
         assert cli.run(["tolerance", str(folder), "--yield", "90", "--grade", "moulded"]) == 0
     return folder, said.getvalue()
 
@@ -203,7 +205,7 @@ def test_the_report_has_a_section_on_it_which_a_new_proof_keeps(small_design, st
     section = page.partition(f"{BEGIN}\n")[2].partition(END)[0]
     assert page.replace(section, "") == before  # and nothing else has changed
     monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
-    commands.verify(folder, effort=quick_effort())
+    commands.verify(folder, ProofOptions(quick_effort()))
     assert section in (folder / "report.html").read_text()
     assert tolerances.put_into(folder / "report.html", section) == (folder / "report.html").read_bytes()
 
@@ -232,8 +234,8 @@ def test_no_bit_depends_on_how_many_workers_trace(pictures):
     few = replace(pictures, perturbations=pictures.perturbations[::5])
     threads = {"n_workers": 3, "threads_per_worker": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
     with distributed.LocalCluster(**threads) as local, Cluster(local.scheduler_address) as cluster:
-        there = study.study(few, 1.0, 3, 0.0, linear=50, full=6, spread=cluster.spread)
-    here = study.study(few, 1.0, 3, 0.0, linear=50, full=6)
+        there = study.study(few, 1.0, 0.0, StudySettings(seed=3, trials=50, full=6, spread=cluster.spread))
+    here = study.study(few, 1.0, 0.0, StudySettings(seed=3, trials=50, full=6))
     assert np.array_equal(there.model.gram, here.model.gram) and np.array_equal(there.full, here.full)
     assert np.array_equal(there.linear, here.linear) and np.array_equal(there.adjusted, here.adjusted)
 

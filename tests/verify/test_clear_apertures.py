@@ -15,6 +15,7 @@ from bstcad import commands
 from bstcad.analysis.light import mount_losses
 from bstcad.analysis.shape import describe
 from bstcad.cad import mounting
+from bstcad.commands import ProofOptions
 from bstcad.optics.channels import Channel
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import cross
@@ -177,7 +178,7 @@ def cut(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
         kept = proofs(patch)
-        report = commands.write(design_of(scene), folder, effort=replace(quick_effort(), places=1025))
+        report = commands.write(design_of(scene), folder, ProofOptions(replace(quick_effort(), places=1025)))
     return scene, folder, report, kept[0]
 
 
@@ -208,7 +209,7 @@ def test_a_part_with_another_rim_is_judged_by_its_own_light_and_fails_by_name(cu
     mounting.write_if_it_fits(made.lens, other.mount, copy / "part.step", "other", scene.part)
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
-        proof = commands.verify(copy, effort=quick_effort())
+        proof = commands.verify(copy, options=ProofOptions(quick_effort()))
     failed = {check.name: check.where for check in proof.checks if not check.passed}
     assert proof.flux["on target"] < 0.8 * before.light.flux["on target"] and proof.rrmsd > 0.2
     assert (

@@ -13,6 +13,7 @@ from OCP.GProp import GProp_GProps
 import bstcad
 from bstcad import commands
 from bstcad.cad import mounting, step_reading
+from bstcad.commands import ProofOptions
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane
 from bstcad.report.prescription import part
@@ -46,7 +47,7 @@ def written(design, tmp_path_factory):
     scene = design.scene.changed({"mount": MOUNT})
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
-        report = commands.write(replace(design._made, scene=scene), folder, effort=quick_effort())
+        report = commands.write(replace(design._made, scene=scene), folder, ProofOptions(quick_effort()))
     return scene, folder, report.facts
 
 

@@ -13,6 +13,7 @@ import bstcad
 from bstcad import commands
 from bstcad import folder as folders
 from bstcad.analysis.shape import describe, survey, survey_front
+from bstcad.commands import ProofOptions
 from bstcad.report import prescription, report
 from bstcad.step_text import part21
 from bstcad.verify import checks, step_checks, text_checks
@@ -33,7 +34,7 @@ def two(tmp_path_factory):
         kept = []
         verify = checks.verify
         patch.setattr(checks, "verify", lambda *given, **more: kept.append(verify(*given, **more)) or kept[-1])
-        found = commands.write(made, folder, effort=quick_effort(), drawing=flat_pictures())
+        found = commands.write(made, folder, ProofOptions(quick_effort(), flat_pictures()))
     return SimpleNamespace(made=made, folder=folder, report=found, proof=kept[0], facts=found.facts)
 
 

@@ -11,6 +11,7 @@ from rich.console import Console
 
 from bstcad import commands
 from bstcad import folder as folders
+from bstcad.commands import ProofOptions
 from bstcad.optics.wavefront import ZernikeWave
 from bstcad.optics.wavefront_error import wavefront_error
 from bstcad.report import record, report
@@ -33,7 +34,7 @@ def one(tmp_path_factory):
     made, folder = made_of(scene_of(**ONE)), tmp_path_factory.mktemp("wave") / "faces"
     with pytest.MonkeyPatch.context() as patch:
         kept = proofs(patch)
-        found = commands.write(made, folder, effort=quick_effort(), drawing=flat_pictures())
+        found = commands.write(made, folder, ProofOptions(quick_effort(), flat_pictures()))
     return SimpleNamespace(made=made, folder=folder, report=found, proof=kept[0])
 
 
