@@ -65,7 +65,7 @@ def test_glass_absorbs_by_its_thickness_and_a_wedge_of_it_changes_the_picture():
     screen = replace(SCREEN, x=(moved_by - 8.0, moved_by + 8.0))
     lens = plate(0.004)
     found = reference(lens, screen=screen).change([Channel(BEAM, INDEX, losses=Losses(absorption=AbsorptionLoss(1.0)))])
-    # exp(-a s x) over the picture, x by 0.25 mm per pixel: its relative deviation weighted by E²
+    # exp(-a s x) over the picture, x by 0.25 mm a pixel: its relative deviation weighted by E²
     x = (np.arange(64) - 31.5) * 0.25
     wanted = difference(checks() * np.exp(-0.004 * x), checks())
     assert found.rrmsd == pytest.approx(wanted, rel=0.1)

@@ -11,7 +11,7 @@ from scipy.special import gammainc
 
 from bstcad.analysis.top_hat import MAX_BINS, FlatTop, plateau_uniformity, top_hat
 
-PIXELS, HALF = 600, 4.0  # number of pixels per side of a square screen, and half its width (mm)
+PIXELS, HALF = 600, 4.0  # number of pixels a side of a square screen, and half its width (mm)
 PITCH = 2 * HALF / PIXELS
 AT = (np.arange(PIXELS) + 0.5) * PITCH - HALF
 R = np.hypot(AT, AT[:, None])

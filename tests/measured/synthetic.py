@@ -7,8 +7,9 @@ import scipy.fft
 import torch
 from scipy.spatial.transform import Rotation
 
-from bstcad.measured.alignment import Face, sample_surface
+from bstcad.measured.alignment import Face
 from bstcad.measured.form_error import frequencies
+from bstcad.optics.surfaces import sag, sampled
 
 SHIFT, TURN = (0.5, -0.3, 0.2), (1.0, -2.0, 3.0)  # mm, degrees
 
@@ -22,7 +23,7 @@ def with_form_error(lens, rms, correlation, seed=1):
     amplitude = np.exp(-((np.pi * frequencies(back) * correlation) ** 2) / 2)
     heights = scipy.fft.idctn(np.random.default_rng(seed).normal(size=amplitude.shape) * amplitude, norm="ortho")
     x, y = (t.ravel() for t in np.meshgrid(np.linspace(*back.x, m), np.linspace(*back.y, m), indexing="ij"))
-    z, z_x, z_y = sample_surface(back, x, y)
+    z, z_x, z_y = sampled(back, x, y)
     motions = Face.of(lens).columns(np.stack([x, y, z], axis=1), np.stack([-z_x, -z_y, np.ones_like(z)], axis=1))
     motions = motions.T.reshape(6, m, m)
     error, *moved = (_over(lens, part) for part in (heights, *motions))
@@ -41,7 +42,7 @@ def points(lens, count, seed=2):
     places = np.random.default_rng(seed).uniform(-1, 1, (2 * count, 2)) * lens.outline.half_extent
     inside = lens.outline.contains(*torch.from_numpy(places).T).numpy()
     x, y = places[inside][:count].T
-    return np.column_stack([x, y, sample_surface(lens.back, x, y)[0]])
+    return np.column_stack([x, y, sag(lens.back, x, y)])
 
 
 def cloud(lens, count, noise=0.0, shift=SHIFT, turn=TURN):

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from bstcad.measured.alignment import Face, align, identity_pose, sample_surface, scale
+from bstcad.measured.alignment import Face, align, identity_pose, scale
 from bstcad.measured.form_error import deviation, fit_form_error, map_files, minimum_zone, robust_pv, zernike
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
-from bstcad.optics.surfaces import Plane
+from bstcad.optics.surfaces import Plane, sag
 from tests.lenses import net
 from tests.measured.synthetic import points, with_form_error
 
@@ -99,9 +99,9 @@ class TestForm:
         x, y, _ = points(lens, 500, seed=9).T
         with_it, error = form.add_to(lens.back), form.at(x, y)
         assert with_it.m >= max(lens.back.m, form.random_field.m) and form.noise == pytest.approx(self.NOISE, rel=0.1)
-        on_net = sample_surface(with_it, x, y)[0] - sample_surface(lens.back, x, y)[0]
+        on_net = sag(with_it, x, y) - sag(lens.back, x, y)
         assert np.sqrt(np.mean((on_net - error) ** 2)) < 1e-3 * error.std()
-        true = sample_surface(made.back, x, y)[0] - sample_surface(lens.back, x, y)[0]
+        true = sag(made.back, x, y) - sag(lens.back, x, y)
         assert np.sqrt(np.mean((error - true) ** 2)) < 0.05 * true.std()
         draw = np.random.default_rng(0).normal(size=form.spread.shape)
         more, less = (form.posterior_sample(draw, sign).at(x, y) for sign in (1.0, -1.0))

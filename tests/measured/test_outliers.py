@@ -89,9 +89,7 @@ def test_outliers_are_counted_and_remarked_and_too_many_fail(nominal, clean):
 
     few, some, many = map(judged, (0.001, 0.03, 0.2))
     assert few.facts["passed"] and some.facts["passed"]
-    assert [check.name for check in many.checks if not check.passed] == [
-        "made part: fraction of outliers among the points of the face"
-    ]
+    assert [check.id for check in many.checks if not check.passed] == ["made-outliers"]
     assert some.facts["outliers"] == {
         "points": len(some.outliers), "share": pytest.approx(0.03, rel=0.03), "above": len(some.outliers),
         "farthest": pytest.approx(0.5, rel=0.05),

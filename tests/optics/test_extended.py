@@ -137,7 +137,7 @@ LAMP = Point((2.0, 0.0, -60.0), profile="uniform", half_angle=7.0, diameter=8.0)
 
 
 def test_the_number_of_points_leaves_no_bias():
-    """Eight points per set, drawn anew for each: the figure is that of 1024 fixed points within its standard error."""
+    """Eight points a set, drawn anew for each: the figure is that of 1024 fixed points within its standard error."""
     target = np.random.default_rng(0).uniform(0.9, 1.1, SCREEN.shape)
     many = Effort(1024, accuracy=0.0, witness=False)
     exact = measure(curved(), channels_of(LAMP, lambda nm: 1.5, 1024), SCREEN, target, many)

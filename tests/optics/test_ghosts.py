@@ -128,5 +128,5 @@ def test_a_plate_lays_its_ghost_over_the_beam():
     lens = plate(outline=Rectangle(20.0, 20.0))
     found = ghost_light(lens, (Channel(beam, N, losses=BARE),), Screen(100.0, (-8.0, 8.0), (-8.0, 8.0), 8), 200, 0)
     r = ((N - 1) / (N + 1)) ** 2
-    assert found.flux[GHOST_ON] == pytest.approx((1 - r) ** 2 * r * r, rel=1e-3)  # rim of the beam: 200 rays per side
+    assert found.flux[GHOST_ON] == pytest.approx((1 - r) ** 2 * r * r, rel=1e-3)  # rim of the beam, by 200 rays a side
     assert found.flux[GHOST_OFF] == 0.0 and float(found.picture.sum()) == pytest.approx(found.flux[GHOST_ON], rel=EXACT)

@@ -71,7 +71,7 @@ def test_face_and_wall_hold_the_exact_volume(outline, face):
 
 @pytest.mark.parametrize("m", [9, 66])
 def test_area_and_moments_of_a_rough_net(m):
-    """Twelve Gauss points per span and axis between the knot lines: V c = ∫∫ (x h, y h, h² / 2)."""
+    """Twelve Gauss points a span and axis between the knot lines: V c = ∫∫ (x h, y h, h² / 2)."""
     face, outline, sides = rough(m), OUTLINES[0], []
     for (first, last), pitch in zip((face.x, face.y), face.pitch, strict=True):
         lines = np.concatenate([[first], first + pitch * (np.arange(1, m - 2) + 0.5), [last]])

@@ -19,7 +19,7 @@ from tests.tracing import launch, simulated, stratified
 
 
 def covered(screen, radius):
-    """The area of each pixel inside x² + y² <= radius²: exact along x, on 400 lines per pixel; row 0 = y max."""
+    """The area of each pixel inside x² + y² <= radius²: exact along x, on 400 lines a pixel; row 0 = y max."""
     (rows, columns), lines = screen.shape, 400
     x = np.linspace(*screen.x, columns + 1)
     height = (screen.y[1] - screen.y[0]) / rows / lines
