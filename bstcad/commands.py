@@ -26,7 +26,7 @@ import bstcad
 from bstcad import folder as folders
 from bstcad.folder import Made
 from bstcad.judges import comparison
-from bstcad.judges.comparison import Compared
+from bstcad.judges.comparison import Comparison
 from bstcad.measured import cloud as clouds
 from bstcad.measured import made_part
 from bstcad.measured.cloud import Cloud
@@ -224,7 +224,7 @@ def _prove_files(made: Made, folder: Path, drawn: Pictures, options: ProofOption
     def draw(light: Light, lines: tuple[SpectralLine, ...], number: int) -> None:
         drawn.begin(draw_light, made.goals[number].picture, light, lines, number=number)
 
-    proof = checks.verify(folder, made, processes.submit, known=drawn.lens, lit=draw, effort=options.effort)
+    proof = checks.verify(folder, made, processes.submit, on_lens=drawn.lens, on_light=draw, effort=options.effort)
     if proof.wavefront is not None:
         drawn.begin(draw_wavefront, proof.wavefront)
     added = (check for of_script in options.checks for check in of_script(proof, folder))
@@ -299,7 +299,7 @@ def verify(
             with scene_errors(f"{path}: "):
                 proof = _prove_files(made, path, drawn, options, progress=progress)
             drawn.solid(proof.lens)
-            judged: list[Compared] = []
+            judged: list[Comparison] = []
             for number, goal in enumerate(made.goals):
                 lit, seed = (proof.lens, made.channels, goal), made.scene.tailoring.seed
                 by_others = comparison.run_judges(against, *lit, seed=seed, progress=progress)

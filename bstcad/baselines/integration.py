@@ -17,7 +17,7 @@ least-squares fit of the net to the points.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -147,15 +147,12 @@ class _Grid:
         return cls(origin, direction, aim, alive=alive, rays=replace(coming, z=z))
 
     def __getitem__(self, where: tuple) -> _Grid:
-        return self._mapped(lambda t: t[(..., *where)])
+        parts = (t[(..., *where)] for t in (self.origin, self.direction, self.aim, self.alive))
+        return _Grid(*parts, self.rays)
 
     def transposed(self) -> _Grid:
         """Return the grid with rays and lines exchanged."""
-        return self._mapped(_transposed)
-
-    def _mapped(self, change: Callable[[Tensor], Tensor]) -> _Grid:
-        origin, direction, aim, alive = map(change, (self.origin, self.direction, self.aim, self.alive))
-        return _Grid(origin, direction, aim, alive, rays=self.rays)
+        return _Grid(*map(_transposed, (self.origin, self.direction, self.aim, self.alive)), self.rays)
 
     def normals(self, position: Tensor, plane: Receiver, law: Law) -> Tensor:
         """Return normals (3, rays, lines), n = (-p, -q, 1), of a face that sends rays from positions (mm) to aims."""

@@ -90,7 +90,7 @@ def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: 
         return float(merit.detach()), list(torch.autograd.grad(merit, leaves)), float("nan")
 
     steps, rates = task.knobs.stage1_iterations, [STAGE1_RATES[nearest], *(FRONT_RATES[name] for name in task.free)]
-    method = adam(start, rates, steps, state.search if state else None)
+    method = adam(start, rates, steps, state and state.search)
     return minimise(problem, method, steps, state.best if state else Best())
 
 
@@ -168,7 +168,6 @@ def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[S
     if state is None:
         yield StageStep(lambda: lens)
     for reached in tailor_to_irradiance(start, bundles, merit, steps=knobs.stage2_iterations, state=state):
-        assert reached.parameters is not None  # Adam never ends
         best, lens = reached.best, with_parameters(start, [reached.parameters[0]])
         resumable = None if reached.state is None else RaySearch(Parameters.of(start), best, reached.state)
         step = StageStep(lambda lens=lens: lens, resumable, skipped=reached.skipped, part="stage 2")
@@ -210,5 +209,5 @@ def tailor_to_irradiance(
         (gradient,) = torch.autograd.grad(square.sqrt(), leaf)
         return float(square.detach().sqrt()), [gradient], float(rrmsd)
 
-    method = adam([lens.back_net.heights], [STAGE2_RATE], steps, state.search if state else None)
+    method = adam([lens.back_net.heights], [STAGE2_RATE], steps, state and state.search)
     return minimise(problem, method, steps, state.best if state else Best())

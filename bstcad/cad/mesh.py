@@ -158,13 +158,13 @@ def _has_plane_front(lens: Lens) -> bool:
 # ---- how fine a mesh has to be ---------------------------------------------------------------------------------------
 
 
-def fit_mesh(lens: Lens, tolerance: float, most: int | None = None) -> tuple[int, Mesh]:
+def fit_mesh(lens: Lens, tolerance: float, max_triangles: int | None = None) -> tuple[int, Mesh]:
     """Return the number of cells each way, nearly the smallest, that meets a chordal tolerance (mm), and the mesh.
 
-    most: largest number of triangles (default DEFAULT_MAX_TRIANGLES).  If they do not suffice, the finest mesh of
-    DEFAULT_MAX_TRIANGLES triangles is returned, or of `most` if that is smaller.
+    If `max_triangles` (default DEFAULT_MAX_TRIANGLES) do not suffice, the finest mesh of DEFAULT_MAX_TRIANGLES is
+    returned, or of `max_triangles` if that is smaller.
     """
-    allowed = DEFAULT_MAX_TRIANGLES if most is None else most
+    allowed = DEFAULT_MAX_TRIANGLES if max_triangles is None else max_triangles
     cells, last, goal = MIN_MESH_CELLS, max_cells(lens, allowed), chordal_error_goal(lens, tolerance)
     while cells < last or (cells == last and allowed > DEFAULT_MAX_TRIANGLES):
         mesh = lens_mesh(lens, cells)
@@ -192,13 +192,13 @@ def largest_coordinate(lens: Lens) -> float:
     return max(*lens.outline.half_extent, *ends)
 
 
-def max_cells(lens: Lens, most: int | None = None) -> int:
-    """Return the largest number of cells each way for `most` triangles, by default DEFAULT_MAX_TRIANGLES."""
-    faces, most = 2 if _has_plane_front(lens) else 4, DEFAULT_MAX_TRIANGLES if most is None else most
+def max_cells(lens: Lens, max_triangles: int | None = None) -> int:
+    """Return the largest number of cells each way for a number of triangles, by default DEFAULT_MAX_TRIANGLES."""
+    faces, total = 2 if _has_plane_front(lens) else 4, DEFAULT_MAX_TRIANGLES if max_triangles is None else max_triangles
     # triangles per cell along one side of the grid: 8 of the wall, and 4 of the fan over a plane front or 8 of the
     # plane around a front
     wall = 16 if lens.front.outline is not None else 12
-    return int((math.sqrt(wall**2 + 4 * faces * most) - wall) / (2 * faces)) // 2 * 2
+    return int((math.sqrt(wall**2 + 4 * faces * total) - wall) / (2 * faces)) // 2 * 2
 
 
 # ---- measures of any mesh --------------------------------------------------------------------------------------------
@@ -316,7 +316,7 @@ def _sag(face, x, y):
 
 @njit(cache=True, nogil=True)
 def _distance_from_face(a, b, c, parts, face):
-    """Return the largest distance along z (mm) of a face from a triangle: at its centre, with edges in 2 x `parts`."""
+    """Return the largest distance along z (mm) of a face from a triangle, at its centre and a grid of 2 x `parts`."""
     n = 2 * parts
     worst = abs(_sag(face, (a[0] + b[0] + c[0]) / 3, (a[1] + b[1] + c[1]) / 3) - (a[2] + b[2] + c[2]) / 3)
     for i in range(n):

@@ -2,7 +2,7 @@
 
 The body is any cadquery solid.  A prism over the lens's rim is cut out of it, which is quick, since no net is involved.
 Then the walls of that opening are replaced by walls between the faces of the body and of the lens, with shared edges.
-The optical faces are those of the design, control point for control point.
+The optical faces keep the control points of the design.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[PlacedLe
     """Return the body with each lens in an opening of the lens's shape, all one solid.
 
     Around each lens the body must lie between two planes z = const that meet the lens's wall.  A plane may also lie
-    above the rim of the back or below that of the front, but may not cut it; a plane front may lie in the lower plane.
+    above the rim of the back or below the rim of the front, but may not cut it; a plane front may lie in the lower one.
     Raises ValueError in one sentence otherwise.
     """
     import cadquery

@@ -212,7 +212,7 @@ def dome_cap(lens: Lens) -> tuple[NamedFace, Rail]:
 
 
 def image(patch: Patch, curve: RailCurve) -> Geom2d_Curve:
-    """Return a curve in the parameter plane of a patch, with the same parameter: a line or circle where it is one."""
+    """Return the image of a curve on a patch in (u, v), with the curve's parameter: a line or circle if it is one."""
     piece, uv = curve.piece, patch.uv
     assert uv is not None  # a plane needs no image
     cubic = curve.knots if curve.knots is not None and len(curve.knots) == len(curve.poles) + 4 else None  # its knots
@@ -249,7 +249,7 @@ def _outer_walls(lens: Lens, loops: Sequence[list[LoopPiece]], top: Rail, draft:
 
 
 def _parting(lens: Lens, rim: Sequence[LoopPiece]) -> float:
-    """Return z (mm) of the plane from which walls lean: below the rim of the back and above that of the front."""
+    """Return z (mm) of the plane from which walls lean: below the back's rim and above the front's."""
     x, y = rim_points(lens, rim)
     low, high = sag(lens.back, x, y).min(), sag(lens.front, x, y).max()
     if not low - high > MIN_WALL:

@@ -45,7 +45,7 @@ ARC_PARTS, ARC_POINTS = 8, 12  # intervals, and Gauss points in each, of a line 
 
 @dataclass(frozen=True)
 class WholePart:
-    """A part around a lens, whose walls are not just those of its outline: a flange, draft or bevel, or a cut."""
+    """A part around a lens with other walls than the lens's outline: with a flange, draft, a bevel or a cut."""
 
     edge: np.ndarray  # points along the edge of the back, (n, 2), mm
     low: Coordinates  # smallest x, y and z (mm) of all faces but freeform ones, whose edges belong to others as well

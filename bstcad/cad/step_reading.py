@@ -211,7 +211,7 @@ def _back_face(nets: Sequence[Face]) -> Face | None:
 
 
 def _looks_along_net(face: TopoDS_Face) -> bool:
-    """True if the outward normal of a face is ∂u x ∂v of its surface, as of a height over (x, y) seen from above."""
+    """True if the outward normal of a face is ∂u x ∂v of its surface, as for a height over (x, y) seen from above."""
     return face.Orientation() != TopAbs_Orientation.TopAbs_REVERSED
 
 
@@ -294,7 +294,7 @@ def _is_level(surface: BRepAdaptor_Surface, z: float) -> bool:
 
 
 def _front_surface(face: TopoDS_Face, surface: BRepAdaptor_Surface, others: Sequence[Face]) -> Surface:
-    """Return a front that is no net, with its outline if there is a plane around it; others: the faces besides it."""
+    """Return a front that is no net, with its outline if there is a plane around it; others: the other faces."""
     if surface.GetType() == Kind.GeomAbs_Plane:
         return Plane(surface.Plane().Location().Z())
     curved = _sphere(face, surface) if surface.GetType() == Kind.GeomAbs_Sphere else _conic(surface.BSpline())
@@ -405,7 +405,7 @@ def clear_apertures(front: np.ndarray, back: np.ndarray) -> tuple[Outline, Outli
 
     The aperture of the back is the circle or rectangle about the axis, with sharp or round corners, on which its edge
     lies.  The aperture of the front is inset from it by the largest inset of the front's edge.  A front's edge outside
-    the back's, as of a front in the plane of a flange, does not limit the light of the lens.
+    the back's, for example in the plane of a flange, does not limit the light of the lens.
     Raises ValueError if the edge of the back has another shape.
     """
     rim = _bounding_outline(back)

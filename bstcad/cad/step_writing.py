@@ -95,7 +95,7 @@ def write_lens(
 ) -> None:
     """Write the exact solid of the lens with the names of its faces, area, volume and centroid.
 
-    part: facts that the file states; None: only a colour.  properties: those of the lens, if they are known.
+    part: facts that the file states; None: only a colour.  properties: of the lens; None: computed.
     Raises ValueError if the faces of the lens bound no solid.
     """
     part = part or Part(colour=LENS_COLOUR if lens.passes.enters else MIRROR_COLOUR)

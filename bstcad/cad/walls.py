@@ -1,8 +1,8 @@
 """Walls around a lens, between rails: closed runs of edges in which walls meet the optical faces or each other.
 
 An upright wall is a plane, a cylinder or the extrusion of a cubic.  A wall with draft, or a bevel, is a plane, a cone
-or a ruled surface.  Each edge is built once for the two faces that meet in it.  Its parameter is that of its piece of
-the rim (of a level line the length, of the border of a net its knots), in space and in the parameter planes.
+or a ruled surface.  Each edge is built once for the two faces that meet in it.  In space and in the parameter planes
+it has the parameter of its piece of the rim: the length on a level line, the net's parameter on the border of a net.
 
 Walls with draft begin on a parting line, the rim at one height, and lean inwards down to the front.  If the rim shrinks
 by an offset o, its point p moves to p + o m with the inward normal m; on a straight side m is linear between the mitres
@@ -199,7 +199,7 @@ def _upright_surface(piece: LoopPiece) -> WallSurface:
     if piece.is_line_or_arc:
         return _plane_or_cone(piece, (*piece.at(0.0), 0.0), 0.0)
     curve = _curve_on(Plane(0.0), piece)
-    assert curve.knots is not None  # as of any freeform piece
+    assert curve.knots is not None  # a freeform piece has a spline
     base = patches.bspline_curve(curve.poles, curve.knots)
     surface = Geom_SurfaceOfLinearExtrusion(base, gp_Dir(0, 0, 1))
     return WallSurface(surface, True, lambda t, z, _: np.stack([t, z], axis=-1))

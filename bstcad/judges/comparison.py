@@ -54,7 +54,7 @@ class Judge:
     pixels: tuple[int, int] | None = None  # number of columns and rows
     losses: str | None = None  # losses of light in both pictures: "none" or "Fresnel"
     rrmsd: float | None = None  # RRMSD of the judge's picture from the target
-    rrmsd_ours: float | None = None  # RRMSD of bstcad's picture, of the same light on the same pixels
+    rrmsd_ours: float | None = None  # RRMSD of bstcad's picture of this light on these pixels
     difference: float | None = None  # RMS difference of the two pictures
     noise: float | None = None  # RMS noise of the difference, by the rays of both programs
     over_noise: float | None = None  # ratio of difference to noise: about 1 if both programs are right
@@ -75,8 +75,8 @@ class Judge:
 
 
 @dataclass(frozen=True, eq=False)
-class Compared:
-    """A comparison with its checks and pictures (rows, columns) of equal sum; without them if the judge declined."""
+class Comparison:
+    """A judge's outcome with checks and pictures (rows, columns) of equal sum; without them if the judge declined."""
 
     judge: Judge
     checks: tuple[Check, ...] = ()
@@ -120,7 +120,7 @@ def run_judges(
     goal: Goal,
     seed: int,
     progress: Callable[[str, int, int, str], None],
-) -> tuple[Compared, ...]:
+) -> tuple[Comparison, ...]:
     """Compare the picture of each judge with bstcad's, one after the other."""
     compared = []
     for number, judge in enumerate(judges):
@@ -133,19 +133,19 @@ def run_judges(
 
 
 def compare(
-    given: str | OwnJudge, lens: Lens, channels: Sequence[Channel], goal: Goal, *, rays: int, seed: int = 0
-) -> Compared:
+    judge: str | OwnJudge, lens: Lens, channels: Sequence[Channel], goal: Goal, *, rays: int, seed: int = 0
+) -> Comparison:
     """Compare a judge's picture of the light on a target with bstcad's; rays: number of its rays in both halves."""
     began = time.perf_counter()
-    (judge, name, version), key = _judge_functions(given), goal.key if goal.suffix else ""
-    declined = judge.cannot(lens, channels)
-    if isinstance(given, str) and goal.receiver.plane.frame is None:
+    (functions, name, version), key = _judge_functions(judge), goal.key if goal.suffix else ""
+    declined = functions.cannot(lens, channels)
+    if isinstance(judge, str) and goal.receiver.plane.frame is None:
         declined = "it collects light only on planes"
     if declined:
-        return Compared(Judge(name, version, declined, target=key))
+        return Comparison(Judge(name, version, declined, target=key))
     raster = coarse_screen(goal.receiver)
-    target, light = resample(goal.picture, raster.shape), judge.light(lens, channels)
-    traced = judge.trace(lens, light, raster, rays=rays, seed=seed)
+    target, light = resample(goal.picture, raster.shape), functions.light(lens, channels)
+    traced = functions.trace(lens, light, raster, rays=rays, seed=seed)
     seconds = time.perf_counter() - began
     ours = measure(lens, light, raster, target, effort=replace(OWN_EFFORT, seed=seed + OWN_SEED_OFFSET))
     total = float(target.sum())
@@ -183,13 +183,14 @@ def compare(
         moved_by=traced.error.shift(lens, raster) * max(raster.per_unit),
         seconds=seconds,
     )
-    return Compared(outcome, checks, target, ours.picture, theirs=theirs)
+    return Comparison(outcome, checks, target, ours.picture, theirs=theirs)
 
 
-def _judge_functions(given: str | OwnJudge) -> tuple[Any, str, str]:
-    if isinstance(given, str):
-        return importlib.import_module(JUDGES[given]), given, importlib.metadata.version(given)
-    return given, given.name, given.version
+def _judge_functions(judge: str | OwnJudge) -> tuple[Any, str, str]:
+    """Return the object that has a judge's functions, the judge's name and its version."""
+    if isinstance(judge, str):
+        return importlib.import_module(JUDGES[judge]), judge, importlib.metadata.version(judge)
+    return judge, judge.name, judge.version
 
 
 def _difference(one: np.ndarray, other: np.ndarray, target: np.ndarray) -> float:
@@ -225,6 +226,6 @@ def coarse_screen(screen: Screen) -> Screen:
 
 
 def resample(picture: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Resample a picture to (rows, columns) other pixels of the same rectangle, with the flux in each."""
+    """Return the flux of a picture in the pixels of another raster (rows, columns) of its rectangle."""
     down, across = (overlap(n, k) * (n / k) for n, k in zip(picture.shape, shape, strict=True))
     return down @ (across @ picture.T).T

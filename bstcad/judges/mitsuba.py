@@ -1,8 +1,8 @@
 """Mitsuba 3, a renderer, as a judge: photons of its own emitters through a mesh of its own dielectric.
 
 Its particle tracer sends photons from the source, reflects or transmits each at random by Fresnel's reflectance, and
-images a matt screen through a pinhole.  Therefore its light has photon noise and the losses of uncoated faces, whatever
-the scene requests.  Its mirror is lossless.
+images a matt screen through a pinhole.  Therefore its light has photon noise, and the losses of uncoated faces even if
+the scene requests none.  Its mirror is lossless.
 
 The wall of the lens and a plate around its front stop the light that bstcad counts as lost: through the sides, and past
 the lens.  A parallel beam starts from a plate of the aperture's shape with normals along the beam; a cone of uniform
@@ -251,7 +251,7 @@ def _plate(source: Collimated, weight: float, lens: Lens, path: Path) -> Entry:
 def _spot(source: Point, weight: float, lens: Lens) -> Entry:
     """Return a spot of the radiant intensity I = 1 / (2π (1 - cos θ_max)) up to θ_max."""
     edge = source.half_angle
-    assert edge is not None  # as of any cone
+    assert edge is not None  # a cone has a half angle
     intensity = weight / (2 * math.pi * (1 - math.cos(math.radians(edge))))
     to_world = _look_along(source.position, [_sense(source, lens) * n for n in source.axes[2]])
     spot = {"type": "spot", "to_world": to_world, "cutoff_angle": edge, "beam_width": edge * (1 - SPOT_EDGE)}

@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 from bstcad.analysis import shape
 from bstcad.measured.cloud import MIN_POINTS
 from bstcad.optics.lens import Lens
-from bstcad.optics.surfaces import Surface
+from bstcad.optics.surfaces import sag, sampled
 
 MAX_NEWTON_STEPS = 30  # maximum number of Gauss-Newton steps
 MAX_OUTLIER_ROUNDS = 6  # maximum number of rounds of outlier rejection
@@ -49,12 +49,6 @@ def root_mean_square(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values * values)))
 
 
-def sample_surface(surface: Surface, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return z (mm), ∂z/∂x and ∂z/∂y, (3, n), of a surface at (x, y) in mm."""
-    at_x, at_y = (torch.from_numpy(np.ascontiguousarray(p)) for p in (x, y))
-    return np.stack([p.numpy() for p in surface.sag_and_slope(at_x, at_y)])
-
-
 @dataclass(frozen=True)
 class Face:
     """The back face of a lens, with which measured points are compared."""
@@ -68,10 +62,10 @@ class Face:
     def of(cls, lens: Lens) -> Face:
         """Return the back face of `lens`."""
         x, y = shape.inside(lens.outline, 65)
-        front, back = (sample_surface(surface, x.numpy(), y.numpy())[0] for surface in (lens.front, lens.back))
-        vertex, _, _ = sample_surface(lens.back, *np.zeros((2, 1)))
+        front, back = (sag(surface, x.numpy(), y.numpy()) for surface in (lens.front, lens.back))
         max_distance = FACE_DISTANCE_FRACTION * float((back - front).min())
-        return cls(lens, np.array([0.0, 0.0, float(vertex[0])]), max(lens.outline.half_extent), max_distance)
+        pivot = np.array([0.0, 0.0, float(sag(lens.back, 0.0, 0.0))])
+        return cls(lens, pivot, max(lens.outline.half_extent), max_distance)
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Return True for points (n, 3) inside the outline, without its rim of RIM_MARGIN."""
@@ -81,7 +75,7 @@ class Face:
         """Return the signed distances (n,) in mm, positive outside the glass, and the normals (n, 3) at their feet."""
         foot = points[:, :2]
         for _ in range(FOOT_ITERATIONS):
-            z, z_x, z_y = sample_surface(self.lens.back, *foot.T)
+            z, z_x, z_y = sampled(self.lens.back, *foot.T)
             length = np.sqrt(1 + z_x * z_x + z_y * z_y)
             normal = np.stack([-z_x / length, -z_y / length, 1 / length], axis=1)
             off = points - np.column_stack([foot, z])
@@ -91,7 +85,7 @@ class Face:
 
     def height(self, points: np.ndarray) -> np.ndarray:
         """Return the heights (n,) of points above the face along z (mm)."""
-        return points[:, 2] - sample_surface(self.lens.back, *points[:, :2].T)[0]
+        return points[:, 2] - sag(self.lens.back, *points[:, :2].T)
 
     def columns(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Return the change of each distance, (n, 6), per mm of shift in x, y, z and per mm at the rim of rotation."""
@@ -352,7 +346,7 @@ def _rarity(matrix: np.ndarray) -> int:
 
 
 def _sample(cloud: np.ndarray) -> np.ndarray:
-    """Return START_SAMPLE points of a cloud, the same in every call."""
+    """Return START_SAMPLE points of a cloud, drawn with a fixed seed."""
     return cloud[np.random.default_rng(0).permutation(len(cloud))[:START_SAMPLE]]
 
 

@@ -9,6 +9,7 @@ among all linear estimates of heights, slopes and curvatures has the minimum err
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,9 +21,10 @@ from scipy.sparse.linalg import LinearOperator, cg
 from scipy.special import eval_jacobi
 
 from bstcad.analysis.shape import least_squares
-from bstcad.measured.alignment import Alignment, Face, Pose, root_mean_square, sample_surface
+from bstcad.measured.alignment import Alignment, Face, Pose, root_mean_square
 from bstcad.optics.bspline import BSplineSurface, basis_matrix, interpolating_net
 from bstcad.optics.lens import Lens
+from bstcad.optics.surfaces import sag, sampled
 
 POLYNOMIAL_DEGREE = 2
 NET_MARGIN = 0.2  # margin of the field's net around the face, in sides, because cosines have zero slope at its ends
@@ -55,9 +57,9 @@ class FormError:
     def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return δz (mm) at (x, y) in mm, relative to the alignment by least squares."""
         smooth = _legendre(self.face.lens.back_net, x, y) @ self.polynomial
-        z, z_x, z_y = sample_surface(self.face.lens.back, x, y)
+        z, z_x, z_y = sampled(self.face.lens.back, x, y)
         moved = self.face.columns(np.stack([x, y, z], axis=1), np.stack([-z_x, -z_y, np.ones_like(z)], axis=1))
-        return smooth + sample_surface(self.random_field, x, y)[0] + moved @ self.motion
+        return smooth + sag(self.random_field, x, y) + moved @ self.motion
 
     def add_to(self, surface: BSplineSurface) -> BSplineSurface:
         """Return `surface` plus this form error, interpolated at the control points of the finer of both nets."""
@@ -286,7 +288,7 @@ def deviation(lens: Lens, alignment: Alignment, form: FormError) -> Deviation:
     x, y = np.meshgrid(*axes)
     inside = lens.outline.contains(torch.from_numpy(x), torch.from_numpy(y)).numpy()
     x, y = x[inside], y[inside]
-    _, z_x, z_y = sample_surface(lens.back, x, y)
+    _, z_x, z_y = sampled(lens.back, x, y)
     cosine = 1 / np.sqrt(1 + z_x**2 + z_y**2)  # cosine of the angle between normal and z
     off, half = form.at(x, y), min(form.random_field.pitch) / 4
     off_x, off_y = ((form.at(x + a, y + b) - form.at(x - a, y - b)) / (2 * half) for a, b in ((half, 0.0), (0.0, half)))
@@ -304,18 +306,18 @@ def deviation(lens: Lens, alignment: Alignment, form: FormError) -> Deviation:
 
 
 def _octaves(form: FormError, x: np.ndarray, y: np.ndarray, total: np.ndarray) -> tuple[Band, ...]:
-    """Split the total (3, n) into the part besides the random field, and the field by octaves, longest period first."""
+    """Split the total (3, n) into all except the random field, and the field by octaves, longest period first."""
     shortest = SHORTEST_PERIOD * max(form.random_field.pitch)
     period = 2 * max(high - low for low, high in (form.random_field.x, form.random_field.y))  # first cosine (mm)
-    bands = [_band(None, total - sample_surface(form.random_field, x, y))]
+    bands = [_band(None, total - np.stack(sampled(form.random_field, x, y)))]
     while period > shortest:
         finest = np.inf if period / 2 <= shortest else 2 / period
-        bands.append(_band((period, period / 2), sample_surface(form.band(1 / period, finest), x, y)))
+        bands.append(_band((period, period / 2), sampled(form.band(1 / period, finest), x, y)))
         period = period / 2
     return tuple(bands)
 
 
-def _band(period: tuple[float, float] | None, part: np.ndarray) -> Band:
+def _band(period: tuple[float, float] | None, part: Sequence[np.ndarray] | np.ndarray) -> Band:
     return Band(period, root_mean_square(part[0]), float(np.sqrt(np.mean(part[1] ** 2 + part[2] ** 2))))
 
 

@@ -38,7 +38,7 @@ def read_mesh(data: bytes, ending: str) -> MeasuredPoints:
 
 
 class _Damaged(Exception):
-    """Raised for a file whose format is not that of its suffix."""
+    """Raised for a file without the format of its suffix."""
 
 
 # ---- PLY -------------------------------------------------------------------------------------------------------------

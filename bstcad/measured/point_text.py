@@ -35,7 +35,7 @@ FOREIGN_FORMATS = {  # first bytes of files that hold no points as text
     b"PK\x03\x04": "a zip archive, such as X3P", b"aISO-": "an SDF file (ISO 25178-71)", b"bISO-": "an SDF file (ISO "
     "25178-71)", b"VCA DATA": "an OPD file of an interferometer", b"\x89HDF": "an HDF5 file, such as DATX",
 }  # fmt: skip
-# Pattern of a field that marks missing data, besides an empty field.
+# Pattern of a field that marks missing data; an empty field marks them, too.
 NO_DATA = (
     r"[+-]?nan(?:\(\w*\))?|[+-]?1\.#(?:qnan|ind|snan)0*|no[ _]?data|bad|invalid|missing|masked|null|none|n/?a"
     r"|-{1,3}|\*+"
@@ -315,7 +315,7 @@ def _without_title(lines: list[tuple[int, str]]) -> list[tuple[int, str]]:
 
 
 def _columns_without_heading(lines: list[tuple[int, str]], layout: _Layout) -> tuple[int, ...]:
-    """Return the indices of the three columns of numbers, besides names of the points or their running number."""
+    """Return the indices of x, y and z; other columns may hold names of the points or their running number."""
     sample = [layout.fields(line) for _, line in lines[:SAMPLE_LINES]]
     count, first = max(map(len, sample)), lines[0][0]
     numbers = [

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
 
-    from bstcad.judges.comparison import Compared
+    from bstcad.judges.comparison import Comparison
     from bstcad.measured.made_part import MadePart
     from bstcad.scene.scene import Scene
 
@@ -429,13 +429,13 @@ def balanced(pictures: Sequence[np.ndarray], wavelengths: Sequence[float], share
 # --- other programs, made parts ---------------------------------------------------------------------------------------
 
 
-def draw_judges(judges: Sequence[Compared], view: View) -> dict[str, bytes]:
+def draw_judges(judges: Sequence[Comparison], view: View) -> dict[str, bytes]:
     """Return the pictures by other programs, without those that declined, as PNG bytes by name."""
     return {each.judge.figure: png(judged_picture(each, view)) for each in judges if not each.judge.declined}
 
 
 @styled
-def judged_picture(compared: Compared, view: View) -> Figure:
+def judged_picture(compared: Comparison, view: View) -> Figure:
     """Draw target, bstcad's picture, the other program's and the difference, in % of the mean of the lit pixels."""
     name = compared.judge.name
     pictures = {"Target": compared.target} | {

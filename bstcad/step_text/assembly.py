@@ -171,7 +171,7 @@ def _frame(name: str, entities: Entities) -> Placement:
 
 
 def _axes(location: str, axis: str | None, reference: str | None, entities: Entities) -> Placement:
-    """Return a frame by its origin, z and x.  An absent z or x is that of the representation.
+    """Return a frame by its origin, z and x.  An absent z or x is the axis of the representation.
 
     A tilted z without x is refused: ISO 10303-42 projects the x axis, but other readers choose another axis.
     """

@@ -1,10 +1,10 @@
 """Reader of the lens in a STEP file (ISO 10303-21), independent of OCC: a second opinion on each written file.
 
 It reads the entities that the checks need: control nets, knots and multiplicities of the freeform faces, the product's
-name, the units, the number of solids, the uses of each edge, and the statements about the part besides its shape: area,
-volume, centroid, material, profile tolerances, by their names in "Recommended Practices for Geometric and Assembly
-Validation Properties" of the CAx Interoperability Forum.  Damage to these entities is refused in one sentence.  OCC
-reads the whole file, in a second process.
+name, the units, the number of solids, the uses of each edge, and the stated properties: area, volume, centroid,
+material and profile tolerances, by their names in "Recommended Practices for Geometric and Assembly Validation
+Properties" of the CAx Interoperability Forum.  Damage to these entities is refused in one sentence.  OCC reads the
+whole file, in a second process.
 
 Every pattern takes a time proportional to the text: a repeated group ends at a character that it cannot contain, and
 the text is split into statements before they are matched.
@@ -338,7 +338,7 @@ def _check_knots(counts: np.ndarray, knots: np.ndarray, points: int, degree: int
         raise damaged(f"{counts.sum()} knots for {points} control points of degree {degree}")
 
 
-# ---- statements about the part besides its shape -------------------------------------------------------------------
+# ---- stated properties of the part ---------------------------------------------------------------------------------
 
 
 def _properties(entities: Entities, products: set[str], unit: float) -> ValidationProperties:

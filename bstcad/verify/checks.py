@@ -71,12 +71,12 @@ class Nominal:
 
     @cached_property
     def channels(self) -> tuple[Channel, ...]:
-        """Light of the scene; points on an extended source differ from those of tailoring."""
+        """Light of the scene; its points on an extended source are not the points of tailoring."""
         return self.scene.verification_channels()
 
     @property
     def heaviest(self) -> Channel:
-        """Channel with the largest weight: that of the main line, whose wavelength is the unit of wavefront errors."""
+        """Channel with the largest weight: the main line, whose wavelength is the unit of wavefront errors."""
         return max(self.channels, key=lambda channel: channel.weight)
 
     def effort(self, given: Effort | None = None) -> Effort:
@@ -132,15 +132,15 @@ def verify(
     folder: Path,
     nominal: Nominal,
     submit: Submit = run_here,
-    known: Callable[[Lens], None] = lambda lens: None,
-    lit: OnLight = lambda light, lines, number: None,
+    on_lens: Callable[[Lens], None] = lambda lens: None,
+    on_light: OnLight = lambda light, lines, number: None,
     effort: Effort | None = None,
 ) -> Proof:
     """Check lens.step and lens.stl in `folder` against the design; ValueError if one of them cannot be read at all.
 
     submit: with bstcad.runs.processes.submit a second process reads the STEP file by OCC, while this one reads its text
-    and the mesh.  known: called with the lens of the STEP file as soon as it has been read.  lit: called with its light
-    on each target, the lines of a spectrum there, and the index of the target.
+    and the mesh.  on_lens: called with the lens of the STEP file as soon as it has been read.  on_light: called with
+    its light on each target, the lines of a spectrum there, and the index of the target.
     """
     effort = nominal.effort(effort)
     effort = replace(effort, seed=effort.seed + VERIFY_SEED, seconds=effort.seconds / len(nominal.goals))
@@ -155,8 +155,8 @@ def verify(
     lens = _with_design_facts(_result(read, path), nominal.lens)
     whole = quadrature.of_lens(lens)  # computed, not as stated in the file
     made_lens, of_aperture, why = (lens, [], "") if read_part is None else _mounted_lens(read_part, lens, nominal, path)
-    known(made_lens)
-    lights, lines = zip(*_measure_targets(made_lens, nominal, effort, lit), strict=True)
+    on_lens(made_lens)
+    lights, lines = zip(*_measure_targets(made_lens, nominal, effort, on_light), strict=True)
     wavefront, of_wavefront = _wavefront_checks(made_lens, nominal)
     cut = as_cut(lens, mount)
     shape = describe(cut, effort.places) | {"volume": whole.volume} | _ripple_rrmsd(made_lens, nominal)
@@ -207,7 +207,7 @@ def _read_text(path: Path, read: Future[Lens]) -> StepText:
         raise
 
 
-def _measure_targets(lens: Lens, nominal: Nominal, effort: Effort, lit: OnLight) -> list[tuple[Light, Lines]]:
+def _measure_targets(lens: Lens, nominal: Nominal, effort: Effort, on_light: OnLight) -> list[tuple[Light, Lines]]:
     """Measure the light on each target, and the lines of a spectrum there; ValueError if no light falls on one."""
     found = []
     for number, goal in enumerate(nominal.goals):
@@ -216,7 +216,7 @@ def _measure_targets(lens: Lens, nominal: Nominal, effort: Effort, lit: OnLight)
             name = "lens.step" if nominal.scene.mount is None else "part.step"
             raise ValueError(f"{name}: none of its light falls on {goal.words}; write it again, or check scene.toml")
         found.append((light, spectral_lines(lens, nominal.channels, goal, n=max(LINE_TUBES, tubes_of(lens)))))
-        lit(*found[-1], number)
+        on_light(*found[-1], number)
     return found
 
 
