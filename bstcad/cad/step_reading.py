@@ -34,9 +34,10 @@ from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Shape, TopoDS_Solid
 from OCP.TopTools import TopTools_IndexedMapOfShape
 
 from bstcad.cad import patches
-from bstcad.optics.bspline import SMALLEST_NET, BSplineSurface, knots
+from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle, Rounded
+from bstcad.optics.sides import MIN_SIDE
 from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Surface, sag
 from bstcad.step_text.placement import Placement, identity, own_frame
 
@@ -234,7 +235,7 @@ def _uniform_net(surface: BRepAdaptor_Surface, net: np.ndarray) -> BSplineSurfac
     """Return the height of a net; ValueError unless it is plain, of degree 2 x 2, uniform in its knots, x and y."""
     patch = surface.BSpline()
     (m, n), degrees = (patch.NbUPoles(), patch.NbVPoles()), (patch.UDegree(), patch.VDegree())
-    if degrees != (2, 2) or min(m, n) < SMALLEST_NET or patch.IsURational() or patch.IsVRational():
+    if degrees != (2, 2) or min(m, n) < MIN_SIDE or patch.IsURational() or patch.IsVRational():
         raise ValueError(
             f"the freeform face is of degree {degrees[0]} x {degrees[1]} on a net of {m} x {n}; "
             "bstcad reads plain nets of degree 2 x 2"

@@ -29,11 +29,10 @@ from typing_extensions import TypeIs
 
 from bstcad.optics import ops
 from bstcad.optics.outlines import Outline, inside
-from bstcad.optics.sides import MIN_SIDE, Sides, as_pair, side
+from bstcad.optics.sides import Sides, as_pair, side
 from bstcad.optics.surfaces import Surface
 
 DEGREE = 2  # degree of the basis functions (order 3)
-SMALLEST_NET = MIN_SIDE  # minimum control points per side: two end spans and one inner span
 SPANS_AT_A_TIME = 1 << 14  # spans evaluated at a time, so that their numbers stay in the cache
 # Positions in a span at which slope and curvature of the back are limited and reported, with both sides of each knot.
 QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -418,7 +417,7 @@ class Spans:
         return net.view(m, n)
 
 
-def _mean(w: Sequence[Tensor], values: Sequence[Tensor]) -> Tensor:
+def _mean(w: Sequence[Tensor], values: Sequence[Tensor] | Tensor) -> Tensor:
     return w[0] * values[0] + w[1] * values[1] + w[2] * values[2]
 
 

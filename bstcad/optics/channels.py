@@ -5,7 +5,7 @@ merit function and flux ledger are sums over channels, E = Σ_k w_k E_k with Σ_
 source and without a spectrum has one channel of weight 1.
 
 The sample points of an extended source are divided among its spectral lines: n points give n channels, whatever the
-number of lines (at least two points a line).  The points of a line come in pairs, symmetric about the centre.
+number of lines (at least two points per line).  The points of a line come in pairs, symmetric about the centre.
 """
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ class Channel:
     def through(self, lens: Lens) -> Lens:
         """Return the lens with the index, the losses and the surrounding interfaces of this channel."""
         before, behind = self.around or (lens.before, lens.behind)
-        own = {"index": self.index, "losses": self.losses, "before": before, "behind": behind}
-        return lens if all(getattr(lens, name) == value for name, value in own.items()) else replace(lens, **own)
+        if (lens.index, lens.losses, lens.before, lens.behind) == (self.index, self.losses, before, behind):
+            return lens
+        return replace(lens, index=self.index, losses=self.losses, before=before, behind=behind)
 
 
 def channels_of(source: Emitter, index: Callable[[float], float], points: int, draw: int = 0) -> tuple[Channel, ...]:
@@ -45,13 +46,14 @@ def channels_of(source: Emitter, index: Callable[[float], float], points: int, d
     points: number of sample points of an extended source, at least two; draw: number of the point set.  A point or a
     parallel beam of one wavelength is one channel, with the source itself.
     """
-    if source.extent is None:
+    extent = source.extent
+    if extent is None:
         central, lines = source.central, source.lines
         lights = (source if source == central else replace(central, wavelength=nm) for nm, _ in lines)
         return tuple(Channel(light, index(nm), fraction) for light, (nm, fraction) in zip(lights, lines, strict=True))
 
     def points_of(fraction: float, k: int) -> list[tuple[float, float]]:
-        return sampling.point_pairs(source.extent, max(1, round(fraction * points / 2)), draw + k)
+        return sampling.point_pairs(extent, max(1, round(fraction * points / 2)), draw + k)
 
     return _sample_extent(source, index, points_of)
 
@@ -59,11 +61,13 @@ def channels_of(source: Emitter, index: Callable[[float], float], points: int, d
 def drawn_channels(source: Emitter, index: Callable[[float], float], points: int, seed: int) -> tuple[Channel, ...]:
     """Return channels at random points of an extended source; the mean of their images over seeds is exact.
 
-    points: number of sample points of all lines together, at least one a line (sampling.shifted_lattice).
+    points: number of sample points of all lines together, at least one per line (sampling.shifted_lattice).
     """
+    extent = source.extent
+    assert extent is not None  # a simple source has no points to draw
 
     def points_of(fraction: float, k: int) -> list[tuple[float, float]]:
-        return sampling.shifted_lattice(source.extent, max(1, round(fraction * points)), (seed << 8) + k)
+        return sampling.shifted_lattice(extent, max(1, round(fraction * points)), (seed << 8) + k)
 
     return _sample_extent(source, index, points_of)
 
@@ -82,13 +86,9 @@ def merge_wavelengths(channels: Sequence[Channel]) -> tuple[Channel, ...]:
     """Return the channels with those that differ only in wavelength merged, as a mirror without losses allows."""
     alike: dict[Channel, list[Channel]] = {}
     for channel in channels:
-        alike.setdefault(replace(channel, source=replace(channel.source, wavelength=0.0), weight=0.0), []).append(
-            channel
-        )
-    return tuple(
-        same[0] if len(same) == 1 else replace(same[0], weight=math.fsum(c.weight for c in same))
-        for same in alike.values()
-    )
+        key = replace(channel, source=replace(channel.source, wavelength=0.0), weight=0.0)
+        alike.setdefault(key, []).append(channel)
+    return tuple(replace(same[0], weight=math.fsum(c.weight for c in same)) for same in alike.values())
 
 
 def source_numbers(channels: Sequence[Channel]) -> tuple[int, ...]:
@@ -110,7 +110,7 @@ def _lines(channels: Sequence[Channel]) -> list[list[int]]:
     """Return the numbers of the channels of each line: channels of one wavelength and one index."""
     lines: dict[tuple[float, float], list[int]] = {}
     for k, channel in enumerate(channels):
-        lines.setdefault((channel.source.wavelength, channel.index), []).append(k)
+        lines.setdefault((channel.source.main_wavelength, channel.index), []).append(k)
     return list(lines.values())
 
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.emitters import PROFILE_NAMES, Emitter, WavelengthKey, all_alive
-from bstcad.optics.kernels.records import ALONG_Z, Beam, floats
+from bstcad.optics.kernels.records import Beam
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.key import Key
 from bstcad.optics.motion import Motion
@@ -96,7 +96,7 @@ class Collimated(Emitter):
             return self if (x, y) == (0.0, 0.0) and self.centre is None else replace(self, centre=(x, y))
         width = 2 * math.hypot(*self.aperture.half_extent)
         z, plane = (entrance - WIDTHS_BEFORE_LENS * width, entrance) if self.z is None else (self.z, self.z)
-        (normal,) = motion.frame((self.axes[2],))
+        normal = motion.direction(self.axes[2])
         x, y, reached = motion.point((*self.shift(plane), plane))
         distance = z - reached
         centre = x + distance * normal[0] / normal[2], y + distance * normal[1] / normal[2]
@@ -114,12 +114,12 @@ class Collimated(Emitter):
 
     def scaled(self, share: float) -> Collimated:
         """Return the beam with its divergence multiplied by `share`."""
-        return replace(self, divergence=share * self.divergence if share else None)
+        return replace(self, divergence=share * self.divergence if share and self.divergence else None)
 
     def element(self, u: float, v: float) -> Collimated:
         """Return the beam at (u, v) of the extent: (d_x, d_y) = cos α n + u e_x + v e_y, and d_z from |d| = 1."""
         e_x, e_y, n = self.axes
-        cos = math.cos(math.radians(self.divergence / 2))
+        cos = math.cos(math.radians((self.divergence or 0.0) / 2))
         d_x, d_y = (cos * n[i] + u * e_x[i] + v * e_y[i] for i in (0, 1))
         direction = d_x, d_y, math.sqrt(max(1 - d_x * d_x - d_y * d_y, 0.0))
         return replace(self, divergence=None, tilt=tilt_of(direction))
@@ -131,29 +131,31 @@ class Collimated(Emitter):
         inside = self.aperture.contains(x, y)
         if self.profile == "uniform":
             return torch.where(inside, torch.full_like(x, 1 / self.aperture.area), torch.zeros_like(x))
-        w2 = self.radius_1e2**2
-        peak = elementary(torch.exp, -2 * (x * x + y * y) / w2) / self._gaussian_flux()
+        flux, w2 = self._gaussian()
+        peak = elementary(torch.exp, -2 * (x * x + y * y) / w2) / flux
         return torch.where(inside, peak, torch.zeros_like(x))
 
-    def _gaussian_flux(self) -> float:
-        """Return ∫ exp(-2 r² / w²) over the aperture (mm²)."""
+    def _gaussian(self) -> tuple[float, float]:
+        """Return (∫ exp(-2 r² / w²) over the aperture, w²) of a gaussian profile, both in mm²."""
+        assert self.radius_1e2 is not None  # a gaussian profile needs it (`widths`)
         w = self.radius_1e2
-        if self.aperture.is_round:
-            return math.pi * w * w / 2 * -math.expm1(-2 * (self.aperture.radius / w) ** 2)
+        if isinstance(self.aperture, Circle):
+            return math.pi * w * w / 2 * -math.expm1(-2 * (self.aperture.radius / w) ** 2), w**2
         a, b = self.aperture.half_extent
-        return math.pi * w * w / 2 * math.erf(math.sqrt(2) * a / w) * math.erf(math.sqrt(2) * b / w)
+        return math.pi * w * w / 2 * math.erf(math.sqrt(2) * a / w) * math.erf(math.sqrt(2) * b / w), w**2
 
     def beam(self, z: float) -> Beam:
         """Return the parameters of `irradiance` on the plane z (mm) for the kernels."""
-        (x, y), limits = floats(self.shift(z)), floats(self.aperture.limits)
+        (x, y), (a, b, r2) = map(float, self.shift(z)), map(float, self.aperture.limits)
         peak, fall, start = 1 / self.aperture.area, 0.0, abs(float(z - self.start(z)))
         if self.profile == "gaussian":
-            peak, fall = 1 / self._gaussian_flux(), 2 / self.radius_1e2**2
-        axis = ALONG_Z
-        if self.tilted:
-            n, sense = self.axes[2], 1 if self.start(z) <= z else -1
-            axis = (1, *floats((sense * n[0], sense * n[1], n[2])), 0.0)
-        return Beam(x, y, *limits, peak, fall, 0, 0.0, start, *axis)
+            flux, w2 = self._gaussian()
+            peak, fall = 1 / flux, 2 / w2
+        light = Beam(x, y, a, b, limit_r2=r2, peak=peak, fall=fall, start=start)
+        if not self.tilted:
+            return light
+        (n_x, n_y, n_z), sense = self.axes[2], 1 if self.start(z) <= z else -1
+        return light._replace(tilted=1, n_x=sense * n_x, n_y=sense * n_y, n_z=n_z)
 
     @property
     def slopes(self) -> tuple[float, float]:
@@ -212,7 +214,7 @@ class Collimated(Emitter):
         """
         if self.z is not None:
             return self.z
-        furthest = self.aperture.radius if self.aperture.is_round else math.hypot(*self.aperture.half_extent)
+        furthest = self.aperture.radius if isinstance(self.aperture, Circle) else math.hypot(*self.aperture.half_extent)
         if self.centre is not None:
             furthest += math.hypot(*self.centre)
         if self.tilted:

@@ -21,7 +21,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import BSplineSurface, require_net
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.surfaces import Surface
@@ -109,6 +109,11 @@ class Interface:
     status_if_missed: Status  # status of rays that do not meet the surface inside the outline
     losses: tuple[Loss, ...] = ()  # losses in the order of the light; (): the paper's lossless refraction
 
+    @property
+    def net(self) -> BSplineSurface:
+        """Surface of a tailored interface; TypeError if it is not a net."""
+        return require_net(self.surface)
+
 
 @dataclass(frozen=True)
 class Hit:
@@ -125,9 +130,8 @@ def cross(rays: Rays, interface: Interface) -> Hit:
     hit = deflect(at, z_x, z_y, interface.law, level=interface.surface.level)
     if not interface.losses:
         return hit
-    return replace(
-        hit, rays=apply_losses(hit.rays, hit.cos_in, hit.cos_out, path=_path(rays, hit.rays), losses=interface.losses)
-    )
+    path = _path(rays, hit.rays)
+    return replace(hit, rays=apply_losses(hit.rays, hit.cos_in, hit.cos_out, path, losses=interface.losses))
 
 
 def apply_losses(rays: Rays, cos_in: Tensor, cos_out: Tensor, path: Tensor, losses: Sequence[Loss]) -> Rays:
@@ -233,17 +237,14 @@ class NetBounds(NamedTuple):
 
 def net_bounds(surface: BSplineSurface, dtype: torch.dtype, sense: int = 1) -> NetBounds:
     """Return the bounds of a net: each slope is a weighted mean of the slopes of the legs of its control net."""
-    h, (pitch_x, pitch_y) = surface.heights.detach(), surface.pitch
-    half = max(abs(end) for end in (*surface.x, *surface.y))
+    h, half = surface.heights.detach(), max(abs(end) for end in (*surface.x, *surface.y))
+    x, y = (float(h.diff(dim=axis).abs().max()) / pitch for axis, pitch in enumerate(surface.pitch))
     lowest = float(h.min()) if sense > 0 else -float(h.max())
-    return NetBounds(
-        float(h.diff(dim=0).abs().max()) / pitch_x, float(h.diff(dim=1).abs().max()) / pitch_y, lowest,
-        tolerance=64 * half * torch.finfo(dtype).eps, near=APPROACH_DISTANCE * half,
-    )  # fmt: skip
+    return NetBounds(x, y, lowest, 64 * half * torch.finfo(dtype).eps, near=APPROACH_DISTANCE * half)
 
 
 def first_root(
-    surface: BSplineSurface, start: Tensor, path: Tensor, rays: Rays, bounds: NetBounds
+    net: BSplineSurface, start: Tensor, path: Tensor, rays: Rays, bounds: NetBounds
 ) -> tuple[Tensor, Tensor]:
     """Return (s, meets): path s (mm) of live rays from their points `start` (3, …) on the base plane to the surface.
 
@@ -252,38 +253,36 @@ def first_root(
     """
     dx, dy, dz = rays.direction
     steep = rays.alive & ~(rays.sense * dz > bounds.steepest_x * dx.abs() + bounds.steepest_y * dy.abs())
-    s, meets = _newton(
-        surface, start, rays.direction, s=torch.zeros_like(dz), searched=rays.alive & ~steep, tolerance=bounds.tolerance
-    )
+    tolerance, searched = bounds.tolerance, rays.alive & ~steep
+    s, meets = _newton(net, start, rays.direction, torch.zeros_like(dz), searched=searched, tolerance=tolerance)
     if bool(steep.any()):
         index = steep.nonzero(as_tuple=True)
         before, direction = _select(rays.position, index), _select(rays.direction, index)
-        before[2] += rays.z - surface.z
-        below, arrived = _approach(surface, before, direction, bounds=bounds, sense=rays.sense)
+        before[2] += rays.z - net.z
+        below, arrived = _approach(net, before, direction, bounds=bounds, sense=rays.sense)
         below, arrived = below - path[index], arrived & (direction[2].abs() > SIDE_EXIT_COSINE)
         if bool(arrived.any()):
-            root, met = _newton(
-                surface, _select(start, index), direction, s=below, searched=arrived, tolerance=bounds.tolerance
-            )
+            rest = _select(start, index), direction, below
+            root, met = _newton(net, *rest, searched=arrived, tolerance=tolerance)
             s[index] = root
             meets[index] = met & ((root - below).abs() <= bounds.near / MIN_NEWTON_DERIVATIVE)  # else tangent
-    return s, meets & (path + s >= -bounds.tolerance)  # a ray may begin on the face, to rounding
+    return s, meets & (path + s >= -tolerance)  # a ray may begin on the face, to rounding
 
 
 def _select(vectors: Tensor, index: tuple[Tensor, ...]) -> Tensor:
-    return vectors[(slice(None), *index)]
+    at: tuple[slice | Tensor, ...] = (slice(None), *index)
+    return vectors[at]
 
 
 def _newton(
-    surface: BSplineSurface, start: Tensor, direction: Tensor, s: Tensor, searched: Tensor, tolerance: float,
-    steps: int = NEWTON_STEPS,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Return (s*, meets) of the `searched` rays by Newton's method from s; each stops at |F| <= tolerance (mm)."""
+    net: BSplineSurface, start: Tensor, direction: Tensor, s: Tensor, searched: Tensor, tolerance: float, first: int = 0
+) -> tuple[Tensor, Tensor]:
+    """Return (s*, meets) of `searched` rays by Newton steps from s, after `first` others, to |F| <= tolerance (mm)."""
     dx, dy, dz = direction
     meets = torch.zeros_like(searched)
-    for step in range(steps):
+    for step in range(first, NEWTON_STEPS):
         x, y = start[0] + s * dx, start[1] + s * dy
-        h, z_x, z_y = surface.relative_sag_and_slope(x, y)
+        h, z_x, z_y = net.relative_sag_and_slope(x, y)
         residual = s * dz - h
         meets = searched & (residual.abs() <= tolerance)
         searching = searched & ~meets
@@ -293,10 +292,10 @@ def _newton(
         if 2 * remaining < s.numel():  # continue with these alone: one ray without a root must not delay all others
             index = searching.nonzero(as_tuple=True)
             rest = (_select(start, index), _select(direction, index), s[index], searched[index])
-            s[index], meets[index] = _newton(surface, *rest, tolerance, steps - step)
+            s[index], meets[index] = _newton(net, *rest, tolerance, step)
             break
-        if step + NEWTON_STEPS - steps >= STEPS_BEFORE_RIM_CHECK:
-            z_x, z_y = slopes_beyond(surface, x, y, z_x=z_x, z_y=z_y)
+        if step >= STEPS_BEFORE_RIM_CHECK:
+            z_x, z_y = slopes_beyond(net, x, y, z_x=z_x, z_y=z_y)
         slope = dz - z_x * dx - z_y * dy
         floor = torch.where(slope < 0, -MIN_NEWTON_DERIVATIVE, MIN_NEWTON_DERIVATIVE).to(slope.dtype)  # keeps the sign
         slope = torch.where(slope.abs() > MIN_NEWTON_DERIVATIVE, slope, floor)

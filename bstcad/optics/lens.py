@@ -128,8 +128,7 @@ class Lens:
     @property
     def nets(self) -> tuple[BSplineSurface, ...]:
         """Surfaces of the interfaces in `freeform`; TypeError if one is not a net."""
-        interfaces = self.interfaces
-        return tuple(require_net(interfaces[k].surface) for k in self.freeform)
+        return tuple(self.interfaces[k].net for k in self.freeform)
 
     @property
     def front_vertex(self) -> float:
@@ -161,7 +160,7 @@ class Lens:
         return lens
 
     def refined(self, sides: Sides) -> Lens:
-        """Return the lens with its `nets` refined to this number of control points a side, or (along x, along y)."""
+        """Return the lens with its `nets` refined to this number of control points per side, or (along x, along y)."""
         return self.with_nets(net.refined(sides) for net in self.nets)
 
     def with_heights(self, heights: Iterable[Tensor]) -> Lens:
@@ -198,7 +197,8 @@ class Lens:
 
     def with_apertures_scaled(self, by: float) -> Lens:
         """Return the lens with the clear apertures of the solid larger by a factor."""
-        return replace(self, clear=tuple(aperture.scaled(by) for aperture in self.apertures))
+        front, back = self.apertures
+        return replace(self, clear=(front.scaled(by), back.scaled(by)))
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Lens:
         """Return the lens with its tensors in another precision or on another device."""

@@ -162,6 +162,12 @@ class Medium:
     page: str  # page of n, and of k unless `absorption` names another
     absorption: str | None = None  # page of k; None: `page`
     nominal: float | None = None  # nominal density, g/cm³, for a page without a density
+    aliases: tuple[str, ...] = ()  # other names
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the material."""
+        return self.name, *self.aliases
 
     @property
     def data(self) -> Data:
@@ -179,66 +185,40 @@ class Medium:
         return self.nominal or self.data.density
 
 
+_ACRYLIC = "organic/poly_methyl_methacrylate"  # book of PMMA
 # k of the polymers is that of sheets by Zhang et al., Appl. Opt. 59, 2337 (2020): an upper bound.  For acrylic it
 # gives a = 3e-3/mm at 650 nm, whereas optical fibres of acrylic lose 0.15 dB/m, which is 4e-5/mm.
 MEDIA = (
-    Medium(
-        "PMMA",
-        "organic/poly_methyl_methacrylate/Szczurowski",
-        absorption="organic/poly_methyl_methacrylate/Zhang-Mitsubishi",
-        nominal=1.19,
-    ),
-    Medium("polycarbonate", "organic/polycarbonate/Sultanova", "organic/polycarbonate/Zhang", 1.20),
-    Medium("polystyrene", "organic/polystyrene/Sultanova", "organic/polystyrene/Zhang", 1.05),
+    Medium("PMMA", f"{_ACRYLIC}/Szczurowski", f"{_ACRYLIC}/Zhang-Mitsubishi", 1.19, aliases=("acrylic", "Plexiglas")),
+    Medium("polycarbonate", "organic/polycarbonate/Sultanova", "organic/polycarbonate/Zhang", 1.20, aliases=("PC",)),
+    Medium("polystyrene", "organic/polystyrene/Sultanova", "organic/polystyrene/Zhang", 1.05, aliases=("PS",)),
     Medium("SAN", "other/C8H8_n-C3H3N_m/Sultanova", nominal=1.08),
-    Medium("Zeonex E48R", "other/ZeonexE48R/Sultanova", nominal=1.01),
-    Medium("silicone", "organic/polydimethylsiloxane/Gupta", nominal=1.03),
-    Medium("N-BK7", "specs/SCHOTT-optical/N-BK7"),
+    Medium("Zeonex E48R", "other/ZeonexE48R/Sultanova", nominal=1.01, aliases=("E48R", "Zeonex")),
+    Medium("silicone", "organic/polydimethylsiloxane/Gupta", nominal=1.03, aliases=("PDMS",)),
+    Medium("N-BK7", "specs/SCHOTT-optical/N-BK7", aliases=("BK7",)),
     Medium("N-BK7HT", "specs/SCHOTT-optical/N-BK7HT"),
     Medium("N-SF11", "specs/SCHOTT-optical/N-SF11"),
     Medium("P-SK57", "specs/SCHOTT-optical/P-SK57"),  # a glass for precision moulding
     Medium("B270", "specs/SCHOTT-misc/B270", nominal=2.55),
-    Medium("Borofloat 33", "specs/SCHOTT-misc/BOROFLOAT33", nominal=2.23),
-    Medium("float glass", "glass/soda-lime/Rubin-clear", nominal=2.5),
-    Medium("fused silica", "main/SiO2/Malitson", nominal=2.20),
+    Medium("Borofloat 33", "specs/SCHOTT-misc/BOROFLOAT33", nominal=2.23, aliases=("Borofloat",)),
+    Medium("float glass", "glass/soda-lime/Rubin-clear", nominal=2.5, aliases=("soda lime",)),
+    Medium("fused silica", "main/SiO2/Malitson", nominal=2.20, aliases=("silica",)),
     Medium("sapphire", "main/Al2O3/Malitson-o", nominal=3.98),  # the ordinary ray
-    Medium("calcium fluoride", "main/CaF2/Malitson", nominal=3.18),
+    Medium("calcium fluoride", "main/CaF2/Malitson", nominal=3.18, aliases=("CaF2",)),
     Medium("water", "main/H2O/Daimon-20.0C", "main/H2O/Hale", 0.998),
-    Medium("glycerol", "organic/glycerol/Gupta", nominal=1.26),
+    Medium("glycerol", "organic/glycerol/Gupta", nominal=1.26, aliases=("glycerine",)),
 )
 METALS = (  # metals of mirrors, as opaque films
-    Medium("Al", "main/Al/Rakic"),
-    Medium("Ag", "main/Ag/Johnson"),
-    Medium("Au", "main/Au/Johnson"),
-    Medium("Cu", "main/Cu/Johnson"),
+    Medium("Al", "main/Al/Rakic", aliases=("aluminium", "aluminum")),
+    Medium("Ag", "main/Ag/Johnson", aliases=("silver",)),
+    Medium("Au", "main/Au/Johnson", aliases=("gold",)),
+    Medium("Cu", "main/Cu/Johnson", aliases=("copper",)),
 )
-ALIASES = {
-    "acrylic": "PMMA",
-    "Plexiglas": "PMMA",
-    "PC": "polycarbonate",
-    "PS": "polystyrene",
-    "E48R": "Zeonex E48R",
-    "Zeonex": "Zeonex E48R",
-    "PDMS": "silicone",
-    "BK7": "N-BK7",
-    "Borofloat": "Borofloat 33",
-    "soda lime": "float glass",
-    "silica": "fused silica",
-    "CaF2": "calcium fluoride",
-    "glycerine": "glycerol",
-    "aluminium": "Al",
-    "aluminum": "Al",
-    "silver": "Ag",
-    "gold": "Au",
-    "copper": "Cu",
-}
 
 
 def _by_name(media: tuple[Medium, ...]) -> dict[str, Medium]:
-    """Return the media by their names and aliases, as `normalise_name` writes them."""
-    named = {normalise_name(medium.name): medium for medium in media}
-    aliases = ((normalise_name(alias), normalise_name(name)) for alias, name in ALIASES.items())
-    return named | {alias: named[name] for alias, name in aliases if name in named}
+    """Return the media by their names, as `normalise_name` writes them."""
+    return {normalise_name(name): medium for medium in media for name in medium.names}
 
 
 _MEDIA, _METALS = _by_name(MEDIA), _by_name(METALS)
@@ -262,14 +242,13 @@ def _page(material: str, expected: tuple[Medium, ...]) -> Medium:
     if page is not None:
         return Medium(page, page, nominal={medium.page: medium.nominal for medium in MEDIA}.get(page))
     cut = material if len(material) <= MAX_NAME_LENGTH else f"{material[:MAX_NAME_LENGTH]}…"
-    shorts = [medium.name for medium in expected]
-    aliases = (alias for alias, name in ALIASES.items() if name in shorts)
-    known = {normalise_name(name): name for name in (*shorts, *aliases)}
+    known = {normalise_name(name): name for medium in expected for name in medium.names}
     near = [known[n] for n in difflib.get_close_matches(normalise_name(cut), known, n=1)] or nearest(material)
     hint = f"did you mean {' or '.join(map(repr, near))}?"
     if not near:
+        shorts = ", ".join(medium.name for medium in expected)
         otherwise = "; or give the index itself" if expected is MEDIA else ""
-        hint = f"known are {', '.join(shorts)}, and the pages of refractiveindex.info as 'shelf/book/page'{otherwise}"
+        hint = f"known are {shorts}, and the pages of refractiveindex.info as 'shelf/book/page'{otherwise}"
     raise ValueError(f"{cut!r} is not a known material; {hint}")
 
 

@@ -13,19 +13,19 @@ from scipy.spatial.transform import Rotation
 
 from bstcad.optics.rays import Vector
 
+ORIGIN: Vector = (0.0, 0.0, 0.0)
+
 
 @dataclass(frozen=True, eq=False)
 class Motion:
     """Rigid motion x -> p + R (x - p) + t."""
 
     rotation: np.ndarray  # rotation matrix R, (3, 3)
-    about: Vector = (0.0, 0.0, 0.0)  # fixed point p of the rotation, mm
-    shift: Vector = (0.0, 0.0, 0.0)  # translation t, mm
+    about: Vector = ORIGIN  # fixed point p of the rotation, mm
+    shift: Vector = ORIGIN  # translation t, mm
 
     @classmethod
-    def of(
-        cls, shift: Vector = (0.0, 0.0, 0.0), turn: Vector = (0.0, 0.0, 0.0), about: Vector = (0.0, 0.0, 0.0)
-    ) -> Motion:
+    def of(cls, shift: Vector = ORIGIN, turn: Vector = ORIGIN, about: Vector = ORIGIN) -> Motion:
         """Return a shift (mm) and rotations (degrees, right-handed) about the x, then y, then z axis of space."""
         return cls(Rotation.from_euler("xyz", turn, degrees=True).as_matrix(), about, shift)
 
@@ -39,7 +39,7 @@ class Motion:
         """Return the composition of the motion `first` and then this one; `first` None: this one."""
         if first is None:
             return self
-        return Motion(self.rotation @ first.rotation, shift=self.point(first.point((0.0, 0.0, 0.0))))
+        return Motion(self.rotation @ first.rotation, shift=self.point(first.point(ORIGIN)))
 
     @property
     def turns(self) -> bool:
@@ -51,6 +51,6 @@ class Motion:
         about = np.array(self.about)
         return tuple((about + self.rotation @ (np.array(place) - about) + np.array(self.shift)).tolist())
 
-    def frame(self, vectors: tuple[Vector, ...]) -> tuple[Vector, ...]:
-        """Return direction vectors after the motion."""
-        return tuple(tuple((self.rotation @ np.array(v)).tolist()) for v in vectors)
+    def direction(self, vector: Vector) -> Vector:
+        """Return a direction vector after the motion."""
+        return tuple((self.rotation @ np.array(vector)).tolist())

@@ -56,7 +56,8 @@ class _Box:
         sides = [(flat * a, 0 * flat + end * (b + r)) for end in (-1, 1) if a]
         sides += [(0 * flat + end * (a + r), flat * b) for end in (-1, 1) if b]
         sides.append((np.sign(x) * a + r * x, np.sign(y) * b + r * y))
-        return tuple(np.concatenate(each) for each in zip(*sides, strict=True))
+        x, y = (np.concatenate(each) for each in zip(*sides, strict=True))
+        return x, y
 
     def inset_direction(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the shift (mm) of rim points for an inset of 1 mm: along the normal, at corners along the mitre."""
@@ -195,7 +196,7 @@ class Circle(_Box):
     @property
     def area(self) -> float:
         """Area, mm²."""
-        return torch.pi * self.radius**2
+        return math.pi * self.radius**2
 
     @property
     def words(self) -> str:

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.emitters import PROFILE_NAMES, Emitter, WavelengthKey, all_alive
-from bstcad.optics.kernels.records import ALONG_Z, Beam, floats
+from bstcad.optics.kernels.records import Beam
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.key import Key
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
-from bstcad.optics.rays import Rays, Vector, tilt_of
+from bstcad.optics.rays import Rays, Vector, point_along, tilt_of
 from bstcad.optics.wavefront import path_from_sphere
 
 SIZE_KEYS = "diameter", "width", "height"  # scene keys of the size of an emitting disc or rectangle
@@ -91,7 +91,7 @@ class Point(Emitter):
         for other in {"width", "height"} - set(given) if given else ():
             yield f"{other}: missing, and a source with a {given[0]} needs it; add it in mm"
         sizes = {name: getattr(self, name) or 0.0 for name in SIZE_KEYS}
-        name, distance = max(sizes, key=sizes.get), abs(z - self.position[2])
+        name, distance = max(sizes, key=lambda key: sizes[key]), abs(z - self.position[2])
         if self.extent is not None and not sizes[name] <= distance:
             far = f"the {distance:g} mm from the source to the {optic}"
             yield f"{name}: {sizes[name]:g} mm is more than {far}; make the source smaller or move it away"
@@ -121,15 +121,18 @@ class Point(Emitter):
 
     def moved(self, motion: Motion, entrance: float) -> Point:
         """Return the point source after a motion."""
-        tilt = self.tilt if not motion.turns else tilt_of(motion.frame((self.axes[2],))[0])
+        tilt = self.tilt if not motion.turns else tilt_of(motion.direction(self.axes[2]))
         return replace(self, position=motion.point(self.position), tilt=tilt)
 
     def with_wider_cone(self, by: float) -> Point | None:
         """Return the source with the tangent of its cone larger by the fraction `by`; None: it has no cone."""
-        name = "half_angle_1e2" if self.half_angle_1e2 else "half_angle"
-        if not (angle := getattr(self, name)):
-            return None
-        return replace(self, **{name: math.degrees(math.atan((1 + by) * math.tan(math.radians(angle))))})
+
+        def wider(angle: float) -> float:
+            return math.degrees(math.atan((1 + by) * math.tan(math.radians(angle))))
+
+        if self.half_angle_1e2:
+            return replace(self, half_angle_1e2=wider(self.half_angle_1e2))
+        return replace(self, half_angle=wider(self.half_angle)) if self.half_angle else None
 
     def moved_away(self, by: float, about: Vector) -> Point:
         """Return the source at a distance from a point larger by the fraction `by`."""
@@ -150,13 +153,14 @@ class Point(Emitter):
 
     def scaled(self, share: float) -> Point:
         """Return the source with diameter, width and height multiplied by `share`."""
-        sizes = {name: getattr(self, name) for name in SIZE_KEYS}
-        return replace(self, **{name: share * size if share and size else None for name, size in sizes.items()})
+        sizes = self.diameter, self.width, self.height
+        diameter, width, height = (share * size if share and size else None for size in sizes)
+        return replace(self, diameter=diameter, width=width, height=height)
 
     def element(self, x: float, y: float) -> Point:
         """Return the point source at (x, y) of the extent (mm)."""
         e_x, e_y, _ = self.axes
-        position = tuple(p + x * a + y * b for p, a, b in zip(self.position, e_x, e_y, strict=True))
+        position = point_along(point_along(self.position, x, e_x), y, e_y)
         return replace(self, position=position, diameter=None, width=None, height=None)
 
     def irradiance(self, x: Tensor, y: Tensor, z: float) -> Tensor:
@@ -172,7 +176,7 @@ class Point(Emitter):
         r2 = (x - self.position[0]) ** 2 + (y - self.position[1]) ** 2
         d2 = r2 + distance**2
         if self.profile == "gaussian":
-            w2 = (distance * math.tan(math.radians(self.half_angle_1e2))) ** 2
+            w2 = (distance * self._spread) ** 2
             return 2 / (math.pi * w2) * elementary(torch.exp, -2 * r2 / w2)
         edge = self.edge
         if self.profile == "lambertian":
@@ -181,6 +185,12 @@ class Point(Emitter):
             intensity = 1 / (2 * math.pi * (1 - math.cos(edge)))
             e = intensity * distance / (d2 * torch.sqrt(d2))
         return e if edge == HALF_SPACE else torch.where(r2 <= (distance * math.tan(edge)) ** 2, e, torch.zeros_like(e))
+
+    @property
+    def _spread(self) -> float:
+        """Width of a gaussian profile relative to the distance: tan(half_angle_1e2)."""
+        assert self.half_angle_1e2 is not None  # a gaussian profile needs it (`widths`)
+        return math.tan(math.radians(self.half_angle_1e2))
 
     @property
     def edge(self) -> float:
@@ -209,43 +219,40 @@ class Point(Emitter):
         c = axis[0] * x + axis[1] * y + axis[2] * distance
         ahead = c > 0
         c = torch.where(ahead, c, torch.ones_like(c))
+        peak, fall, _, min_cosine = self._tilted_law(distance)
         if self.profile == "gaussian":
-            t2 = math.tan(math.radians(self.half_angle_1e2)) ** 2
             c2 = c * c
-            e = 2 * distance / (math.pi * t2) * elementary(torch.exp, -2 / t2 * (d2 - c2) / c2) / (c2 * c)
+            e = peak * elementary(torch.exp, -fall * (d2 - c2) / c2) / (c2 * c)
         else:
-            edge, d = self.edge, torch.sqrt(d2)
-            if edge < HALF_SPACE:
-                ahead = ahead & (c >= math.cos(edge) * d)
-            if self.profile == "lambertian":
-                e = distance / (math.pi * math.sin(edge) ** 2) * c / (d2 * d2)
-            else:
-                e = distance / (2 * math.pi * (1 - math.cos(edge))) / (d2 * d)
+            d = torch.sqrt(d2)
+            if min_cosine:
+                ahead = ahead & (c >= min_cosine * d)
+            e = peak * c / (d2 * d2) if self.profile == "lambertian" else peak / (d2 * d)
         return torch.where(ahead, e, torch.zeros_like(e))
 
     def beam(self, z: float) -> Beam:
         """Return the parameters of `irradiance` on the plane z (mm) for the kernels."""
-        x, y, from_z = floats(self.position)
-        distance, round_ = abs(z - from_z), (0.0, 0.0)
+        x, y, from_z = map(float, self.position)
+        distance, edge = abs(z - from_z), self.edge
         if self.tilted:
-            law = self._tilted_law(distance)
-            return Beam(x, y, *round_, math.inf, *law[:3], distance, distance, 1, *floats(self.towards(z)), law[3])
-        reach2, edge = math.inf, self.edge
+            peak, fall, power, least = self._tilted_law(distance)
+            n_x, n_y, n_z = map(float, self.towards(z))
+            light = Beam(x, y, peak=peak, fall=fall, power=power, distance=distance, start=distance)
+            return light._replace(tilted=1, n_x=n_x, n_y=n_y, n_z=n_z, least=least)
         if self.profile == "gaussian":
-            w2 = (distance * math.tan(math.radians(self.half_angle_1e2))) ** 2
-            law = 2 / (math.pi * w2), 2 / w2, 0
+            w2 = (distance * self._spread) ** 2
+            peak, fall, power = 2 / (math.pi * w2), 2 / w2, 0
         elif self.profile == "lambertian":
-            law = distance**2 / (math.pi * math.sin(edge) ** 2), 0.0, 4
+            peak, fall, power = distance**2 / (math.pi * math.sin(edge) ** 2), 0.0, 4
         else:
-            law = distance / (2 * math.pi * (1 - math.cos(edge))), 0.0, 3
-        if edge < HALF_SPACE:
-            reach2 = (distance * math.tan(edge)) ** 2
-        return Beam(x, y, *round_, reach2, *law, distance, distance, *ALONG_Z)
+            peak, fall, power = distance / (2 * math.pi * (1 - math.cos(edge))), 0.0, 3
+        reach2 = (distance * math.tan(edge)) ** 2 if edge < HALF_SPACE else math.inf
+        return Beam(x, y, limit_r2=reach2, peak=peak, fall=fall, power=power, distance=distance, start=distance)
 
     def _tilted_law(self, distance: float) -> tuple[float, float, int, float]:
         """Return (peak, fall, power, smallest cosine) of `_tilted_irradiance`."""
         if self.profile == "gaussian":
-            t2 = math.tan(math.radians(self.half_angle_1e2)) ** 2
+            t2 = self._spread**2
             return 2 * distance / (math.pi * t2), 2 / t2, 0, 0.0
         min_cosine = math.cos(self.edge) if self.edge < HALF_SPACE else 0.0
         if self.profile == "lambertian":
@@ -282,8 +289,8 @@ class Point(Emitter):
         if z <= math.sin(edge):
             return math.inf, math.inf
         sin2 = math.sin(edge) ** 2
-        roots = (math.sqrt(sin2 * (a * a + z * z - sin2)) for a in (x, y))
-        return tuple((abs(a * z) + root) / (z * z - sin2) for a, root in zip((x, y), roots, strict=True))
+        slope_x, slope_y = ((abs(a * z) + math.sqrt(sin2 * (a * a + z * z - sin2))) / (z * z - sin2) for a in (x, y))
+        return slope_x, slope_y
 
     def spot(self, z: float) -> tuple[Outline | None, tuple[float, float]]:
         """Return (disc of the cone, centre in mm) on the plane z; disc None: the light has no edge."""
@@ -298,7 +305,5 @@ class Point(Emitter):
         towards = torch.stack([x - start_x, y - start_y, torch.full_like(x, z - start_z)])
         direction = towards / torch.sqrt(towards[0] ** 2 + towards[1] ** 2 + towards[2] ** 2)
         start = torch.tensor((start_x, start_y, 0.0), dtype=x.dtype, device=x.device).view(3, *([1] * x.ndim))
-        flux = self.irradiance(x, y, z) * area
-        return Rays(
-            start.expand_as(direction), direction, flux, all_alive(x), z=start_z, sense=1 if start_z <= z else -1
-        )
+        flux, sense = self.irradiance(x, y, z) * area, 1 if start_z <= z else -1
+        return Rays(start.expand_as(direction), direction, flux, all_alive(x), z=start_z, sense=sense)

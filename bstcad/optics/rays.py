@@ -73,7 +73,8 @@ def joined(bands: Iterable[Rays], rows: int, shared: int = 0) -> Rays:
                 whole[name] = part.new_empty((*part.shape[:-2], rows, part.shape[-1]))
             whole[name][..., done : done + part.shape[-2], :] = part
         done += band.status.shape[-2] - shared
-    return replace(band, **{name: whole.pop(name) for name in TENSORS}, taken=whole)
+    position, direction, flux, status = map(whole.pop, TENSORS)
+    return replace(band, position=position, direction=direction, flux=flux, status=status, taken=whole)
 
 
 @dataclass(frozen=True)
@@ -92,9 +93,16 @@ class Landed:
 
 
 Vector = tuple[float, float, float]
+Frame = tuple[Vector, Vector, Vector]  # unit vectors (e_x, e_y, n) in space
 
 
-def axes(tilt: tuple[float, float]) -> tuple[Vector, Vector, Vector]:
+def point_along(start: Vector, distance: float, direction: Vector) -> Vector:
+    """Return start + distance · direction."""
+    (x, y, z), (d_x, d_y, d_z) = start, direction
+    return x + distance * d_x, y + distance * d_y, z + distance * d_z
+
+
+def axes(tilt: tuple[float, float]) -> Frame:
     """Return (e_x, e_y, n): the axes of space, rotated first about the x axis by α, then about y by β (degrees).
 
     e_x = (cos β, 0, -sin β), e_y = (sin α sin β, cos α, sin α cos β), n = (cos α sin β, -sin α, cos α cos β).  Both
@@ -104,15 +112,16 @@ def axes(tilt: tuple[float, float]) -> tuple[Vector, Vector, Vector]:
     return (cos_b, 0.0, -sin_b), (sin_a * sin_b, cos_a, sin_a * cos_b), (cos_a * sin_b, -sin_a, cos_a * cos_b)
 
 
-def clocked(frame: tuple[Vector, Vector, Vector], angle: float) -> tuple[Vector, Vector, Vector]:
+def clocked(frame: Frame, angle: float) -> Frame:
     """Return a frame rotated about its third axis by an angle (degrees), right-handed."""
     e_x, e_y, n = frame
     sin, cos = math.sin(math.radians(angle)), math.cos(math.radians(angle))
-    x, y = (tuple(p * a + q * b for a, b in zip(e_x, e_y, strict=True)) for p, q in ((cos, sin), (-sin, cos)))
-    return x, y, n
+    x_x, x_y, x_z = (cos * a + sin * b for a, b in zip(e_x, e_y, strict=True))
+    y_x, y_y, y_z = (-sin * a + cos * b for a, b in zip(e_x, e_y, strict=True))
+    return (x_x, x_y, x_z), (y_x, y_y, y_z), n
 
 
-def clocking_of(frame: tuple[Vector, Vector, Vector]) -> float:
+def clocking_of(frame: Frame) -> float:
     """Return the angle (degrees) by which `axes` of the frame's tilt are `clocked` to give the frame."""
     e_x, e_y, _ = axes(tilt_of(frame[2]))
     along, across = (sum(p * q for p, q in zip(frame[0], e, strict=True)) for e in (e_x, e_y))

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Outline
-from bstcad.optics.rays import MIN_AXIAL_COSINE, Landed, Rays, Status, Vector, axes, clocked
+from bstcad.optics.rays import MIN_AXIAL_COSINE, Frame, Landed, Rays, Status, Vector, axes, clocked
 
 Array = Any  # numpy array, torch tensor or number
 
@@ -35,21 +35,22 @@ class Receiver(ABC):
     is_level: bool = False  # True for a plane z = const
 
     @property
-    def axes(self) -> tuple[Vector, Vector, Vector] | None:
+    def axes(self) -> Frame | None:
         """Axes (e_x, e_y, n) for the kernels; None: no kernel."""
         return None
 
     @property
     def labels(self) -> tuple[str, str]:
         """Names of the coordinates, with their unit."""
-        return tuple(f"{name} ({self.unit})" for name in self.names)
+        x, y = self.names
+        return f"{x} ({self.unit})", f"{y} ({self.unit})"
 
     def position_text(self, origin: float = 0.0) -> str:
         """Return the position in words for reports and messages; z is relative to `origin` (mm)."""
         return f"z = {round(self.throw(origin), 3) + 0.0:.10g} mm"
 
     @property
-    def frame(self) -> tuple[Vector, Vector, Vector] | None:
+    def frame(self) -> Frame | None:
         """Axes (e_x, e_y, n) of a plane, with or without a kernel; None: the receiver is not a plane."""
         return self.axes
 
@@ -88,10 +89,10 @@ class Receiver(ABC):
 
         Each component is traced separately, since the gradient of a part of a stacked tensor is as large as the whole.
         """
-        parts = replace(rays, position=rays.position.unbind(0), direction=rays.direction.unbind(0))
+        parts = _by_component(rays, rays.position.unbind(0), rays.direction.unbind(0))
         path, status = self.path(parts)
-        position = (p + path * d for p, d in zip(parts.position, parts.direction, strict=True))
-        found = self.coordinates(replace(parts, position=tuple(position)))
+        position = tuple(p + path * d for p, d in zip(parts.position, parts.direction, strict=True))
+        found = self.coordinates(_by_component(parts, position, parts.direction))
         return Landed(torch.stack(tuple(found)), rays.flux, status, rays.taken)
 
     def to(self, rays: Rays) -> Rays:
@@ -141,6 +142,11 @@ class Receiver(ABC):
         return tuple(self.land(sight).position.numpy())
 
 
+def _by_component(rays: Rays, position: Any, direction: Any) -> Rays:
+    """Return rays with a tuple of components, which receivers index like one, in place of each tensor (3, …)."""
+    return replace(rays, position=position, direction=direction)
+
+
 @dataclass(frozen=True)
 class MovedReceiver(Receiver):
     """A receiver after a rigid motion: rays are moved back and traced to the receiver at rest."""
@@ -183,16 +189,22 @@ class MovedReceiver(Receiver):
         inverse = self.motion.inverse
         shift, point = inverse.point((0.0, 0.0, 0.0)), (*rays.position[:2], rays.above(0.0))
         position = tuple(t + p for t, p in zip(shift, _rotate(inverse, point), strict=True))
-        return replace(rays, position=position, direction=_rotate(inverse, rays.direction), z=0.0)
+        return _by_component(replace(rays, z=0.0), position, _rotate(inverse, rays.direction))
 
 
-def _rotate(motion: Motion, vector: Sequence[Array]) -> tuple[Array, Array, Array]:
+def _rotate(motion: Motion, vector: Array | Sequence[Array]) -> tuple[Array, Array, Array]:
     """Return components of vectors after the rotation of a motion."""
     return tuple(dot(row, vector) for row in motion.rotation.tolist())
 
 
 class PlaneReceiver(Receiver):
     """Plane P = C + (x - o_x) e_x + (y - o_y) e_y, n · (p - C) = 0, with centre C of coordinates o."""
+
+    @property
+    def frame(self) -> Frame:
+        """Axes (e_x, e_y, n)."""
+        assert self.axes is not None  # a plane that no kernel takes overrides `frame`
+        return self.axes
 
     def height(self, point: Vector) -> float:
         """Return the height n · (p - C) (mm) of a point above the plane, negative on the side of the incident light."""
@@ -255,7 +267,7 @@ class LevelPlane(PlaneReceiver):
 
     def coordinates(self, rays: Rays) -> Sequence[Tensor]:
         """Return x and y (mm) of rays that are on the plane."""
-        return rays.position[:2]
+        return rays.position[0], rays.position[1]
 
     def point(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
         """Return the points in space (mm) of coordinates on the plane."""
@@ -280,7 +292,7 @@ class TiltedPlane(PlaneReceiver):
     clocking: float = 0.0  # angle γ, degrees
 
     @cached_property
-    def axes(self) -> tuple[Vector, Vector, Vector]:
+    def axes(self) -> Frame:
         """Axes (e_x, e_y, n), unit vectors in space."""
         return clocked(axes(self.tilt), self.clocking) if self.clocking else axes(self.tilt)
 

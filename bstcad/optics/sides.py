@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 Sides = int | tuple[int, int]
-MIN_SIDE = 5  # smallest number of control points along a side of a net
+MIN_SIDE = 5  # minimum control points per side of a net: two end spans and one inner span
 
 
 def as_pair(sides: Sides) -> tuple[int, int]:
@@ -28,7 +28,7 @@ def size_text(sides: Sides) -> str:
 
 
 def side(net: Sides) -> int:
-    """Return the control points a side of the square net with the same number of control points."""
+    """Return the control points per side of the square net with the same number of control points."""
     return round(math.sqrt(math.prod(as_pair(net))))
 
 

@@ -65,10 +65,7 @@ class Surface(ABC):
         return torch.ones_like(x, dtype=torch.bool)
 
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
-        """Return (s in mm, met): path along rays from (x, y) on the plane z to the surface around its vertex.
-
-        sense: -1 for light along -z, which comes from above.
-        """
+        """Return (s in mm, met): path along rays from (x, y) on the plane z; sense: -1 for light along -z."""
         raise self.unknown
 
     @abstractmethod
@@ -80,12 +77,12 @@ class Surface(ABC):
         return {}
 
     def with_parameters(self, **values: float | Tensor) -> Self:
-        """Return the surface with other values of some of its parameters."""
+        """Return the surface with other values of some of its parameters, or of z (mm)."""
         return replace(self, **values)
 
     def moved(self, z: float) -> Self:
         """Return the surface moved along the axis to a position z (mm)."""
-        return replace(self, z=z)
+        return self.with_parameters(z=z)
 
     def scaled(self, factor: float, about: float) -> Surface:
         """Return the surface scaled by a factor about the point of the axis at z = `about` (mm)."""
@@ -107,11 +104,12 @@ class Surface(ABC):
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Self:
         """Return the surface with its tensors in another precision or on another device; numbers stay numbers."""
         moved = {n: v.to(dtype=dtype, device=device) for n, v in self.parameters().items() if isinstance(v, Tensor)}
-        return replace(self, **moved) if moved else self
+        return self.with_parameters(**moved) if moved else self
 
     def plain(self) -> Self:
         """Return the surface in float64 on the CPU, without gradient; scalars become Python floats."""
-        return replace(self, z=float(self.z), **{name: float(value) for name, value in self.parameters().items()})
+        numbers = {name: float(value) for name, value in self.parameters().items()}
+        return self.with_parameters(z=float(self.z), **numbers)
 
 
 def sampled(surface: Surface, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -341,12 +339,8 @@ class Recess(Surface):
         return self.face.sags(outline if smaller else self.outline)
 
     def with_parameters(self, **values: float | Tensor) -> Recess:
-        """Return the surface with other parameters of its optical part."""
+        """Return the surface with other parameters, or another vertex z (mm), of its optical part."""
         return replace(self, face=self.face.with_parameters(**values))
-
-    def moved(self, z: float) -> Recess:
-        """Return the surface with its vertex at z (mm)."""
-        return replace(self, face=self.face.moved(z))
 
     def scaled(self, factor: float, about: float) -> Recess:
         """Return the surface and its outline scaled by a factor about the point of the axis at z = `about` (mm)."""
@@ -355,11 +349,3 @@ class Recess(Surface):
     def bent(self, curvature: float) -> Recess:
         """Return the surface with `curvature` (1/mm) added at its vertex."""
         return replace(self, face=self.face.bent(curvature))
-
-    def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Recess:
-        """Return the surface with its tensors in another precision or on another device."""
-        return replace(self, face=self.face.to(dtype, device))
-
-    def plain(self) -> Recess:
-        """Return the surface in float64 on the CPU, without gradient."""
-        return replace(self, face=self.face.plain())

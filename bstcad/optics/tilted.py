@@ -17,9 +17,7 @@ from torch import Tensor
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Vector
-from bstcad.optics.surfaces import MIN_COS2, Plane, Sphere, Surface
-
-Face = Plane | Sphere
+from bstcad.optics.surfaces import MIN_COS2, Surface
 
 
 @dataclass(frozen=True)
@@ -34,7 +32,7 @@ class TiltedSurface(Surface):
     kind = "tilted"
 
     @classmethod
-    def of(cls, surface: Face | TiltedSurface) -> TiltedSurface:
+    def of(cls, surface: Surface) -> TiltedSurface:
         """Return a plane or a sphere as a surface of this class."""
         if isinstance(surface, TiltedSurface):
             return surface
@@ -47,8 +45,8 @@ class TiltedSurface(Surface):
 
     def moved_by(self, motion: Motion) -> TiltedSurface:
         """Return the surface after a rigid motion with a rotation of less than a right angle."""
-        (unit_normal,), (x, y, z) = motion.frame((self.unit_normal,)), motion.point(self.vertex)
-        return replace(self, z=z, vertex_xy=(x, y), unit_normal=unit_normal)
+        x, y, z = motion.point(self.vertex)
+        return replace(self, z=z, vertex_xy=(x, y), unit_normal=motion.direction(self.unit_normal))
 
     def _from_vertex(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return (u_x, u_y, f)."""

@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from bstcad.optics.interfaces import Interface
+from bstcad.optics.interfaces import Interface, Reflect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.rays import Rays, Vector
+from bstcad.optics.rays import Frame, Rays, Vector, point_along
 from bstcad.optics.receivers import LevelPlane, PlaneReceiver, Receiver, dot
 from bstcad.optics.surfaces import sag
 from bstcad.optics.tilted import TiltedSurface
@@ -34,17 +34,18 @@ class Image(PlaneReceiver):
 
     centre: Vector  # centre C of the image, mm
     at: tuple[float, float]  # coordinates o of C on the plane
-    vectors: tuple[Vector, Vector, Vector]  # (e_x, e_y, normal directed away from the incident light)
+    vectors: Frame  # (e_x, e_y, normal directed away from the incident light)
 
     @classmethod
     def of(cls, plane: Receiver) -> Image:
         """Return a plane as the image of itself."""
         if isinstance(plane, Image):
             return plane
+        assert plane.frame is not None  # a scene with elements behind the lens has planes only
         return cls(plane.middle, plane.origin, plane.frame)
 
     @property
-    def frame(self) -> tuple[Vector, Vector, Vector]:
+    def frame(self) -> Frame:
         """Axes (e_x, e_y, n); the kernels use `axes`, which an image lacks."""
         return self.vectors
 
@@ -61,14 +62,9 @@ class Image(PlaneReceiver):
     def in_mirror(self, mirror: TiltedSurface) -> Image:
         """Return the mirror image."""
         n = mirror.unit_normal
-        e_x, e_y, across = (_reflected(v, n) for v in self.frame)
-        shift = -2 * mirror.height_above(self.centre)
-        centre = tuple(c + shift * part for c, part in zip(self.centre, n, strict=True))
-        return replace(self, centre=centre, vectors=(e_x, e_y, tuple(-part for part in across)))
-
-    def nearer(self, way: Vector) -> Image:
-        """Return the image moved by a vector (mm)."""
-        return replace(self, centre=tuple(c + w for c, w in zip(self.centre, way, strict=True)))
+        e_x, e_y, (n_x, n_y, n_z) = (point_along(v, -2 * dot(v, n), n) for v in self.frame)
+        centre = point_along(self.centre, -2 * mirror.height_above(self.centre), n)
+        return replace(self, centre=centre, vectors=(e_x, e_y, (-n_x, -n_y, -n_z)))
 
     def plain(self) -> Receiver:
         """Return a level plane with the axes of space as LevelPlane, else itself."""
@@ -82,7 +78,7 @@ class BehindGlass(Receiver):
 
     rest: Receiver
     z: float  # plane of the face, mm
-    eta: float  # index of the glass over the index behind the face
+    eta: float  # index of the glass relative to the index behind the face
 
     @property
     def middle(self) -> Vector:
@@ -136,19 +132,19 @@ def image(behind: Sequence[Interface], plane: Receiver) -> Receiver:
     if not behind:
         return plane
     if sum(not interface.law.reverses for interface in behind) % 2:  # the first interface is the exit from the glass
-        face, *rest = behind
-        return BehindGlass(image(rest, plane), float(sag(face.surface, 0.0, 0.0)), face.law.eta)
+        first, *rest = behind
+        return BehindGlass(image(rest, plane), float(sag(first.surface, 0.0, 0.0)), first.law.eta)
     view = Image.of(plane)
     leaves: TiltedSurface | None = None  # exit face of a plate, while the light is followed backwards
     for interface in reversed(behind):
-        face = TiltedSurface.of(interface.surface)
-        if interface.law.reverses:
+        face, law = TiltedSurface.of(interface.surface), interface.law
+        if isinstance(law, Reflect):
             view = view.in_mirror(face)
         elif leaves is None:
             leaves = face
         else:
-            thick, n = leaves.height_above(face.vertex), interface.law.n_out / interface.law.n_in
-            view = view.nearer(tuple(thick * (1 - 1 / n) * part for part in face.unit_normal))
+            thick, n = leaves.height_above(face.vertex), law.n_out / law.n_in
+            view = replace(view, centre=point_along(view.centre, thick * (1 - 1 / n), face.unit_normal))
             leaves = None
     return view.plain()
 
@@ -173,8 +169,3 @@ def image_from_lens(lens: Lens, screen: Screen) -> Receiver:
 def per_radian(lens: Lens, screen: Screen) -> float:
     """Return the shift of light on a screen, in the screen's unit, per radian of deflection at the back of a lens."""
     return image_from_lens(lens, screen).per_radian(lens.back.z)
-
-
-def _reflected(v: Vector, n: Vector) -> Vector:
-    along = 2 * dot(v, n)
-    return tuple(part - along * unit for part, unit in zip(v, n, strict=True))

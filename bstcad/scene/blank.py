@@ -19,7 +19,7 @@ from bstcad.optics.key import Key
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.passes import LENS, MIRROR, SECOND_SURFACE, Face, Passes
-from bstcad.optics.sides import Sides, as_pair, coarser, in_proportion, simplified
+from bstcad.optics.sides import MIN_SIDE, Sides, as_pair, coarser, in_proportion, simplified
 from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Surface, Toroid
 from bstcad.runs import files
 from bstcad.scene.errors import SceneError
@@ -95,7 +95,7 @@ def read_net(path: Path) -> FileNet:
 
     A face of a STEP file keeps its position in x and y; its shift along z is dropped.
     """
-    from bstcad.optics.bspline import SMALLEST_NET, BSplineSurface
+    from bstcad.optics.bspline import BSplineSurface
 
     name = repr(str(path))
     path = path / "design.npz" if path.is_dir() else path
@@ -109,7 +109,7 @@ def read_net(path: Path) -> FileNet:
     axes = (np.linspace(net[0, 0, i], net[-1, -1, i], count) for i, count in enumerate(shape))
     uniform = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     deviation = np.abs(net[..., :2] - uniform).max()
-    if min(shape) < SMALLEST_NET or not np.isfinite(net).all() or not deviation <= UNIFORM_TOLERANCE:
+    if min(shape) < MIN_SIDE or not np.isfinite(net).all() or not deviation <= UNIFORM_TOLERANCE:
         raise SceneError(f"lens.front.file: {name} does not hold the net of a design; {NET_REMEDY}")
     return FileNet.of(BSplineSurface.from_control_points(net, 0.0))
 

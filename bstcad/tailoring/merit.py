@@ -40,7 +40,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from bstcad.optics.bspline import BSplineSurface, require_net, resampling_matrix
+from bstcad.optics.bspline import BSplineSurface, resampling_matrix
 from bstcad.optics.channels import Channel, weighted_sum
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.goal import Goal
@@ -321,7 +321,7 @@ def local_weight(source: Emitter, lens: Lens, target: np.ndarray, screen: Screen
     number: index of the freeform interface in the lens; None: the back.
     """
     number = lens.number_of("back") if number is None else number
-    net, onwards = require_net(lens.interfaces[number].surface), lens.unbounded().interfaces[number:]
+    net, onwards = lens.interfaces[number].net, lens.unbounded().interfaces[number:]
     ends = zip((net.x, net.y), net.shape, strict=True)
     places = (torch.linspace(low, high, count, dtype=torch.float64) for (low, high), count in ends)
     x, y = torch.meshgrid(*places, indexing="ij")

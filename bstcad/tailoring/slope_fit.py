@@ -163,5 +163,5 @@ def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, plane: Receiver, repeats:
         z_x, z_y = (torch.where(lit, s, torch.zeros_like(s)) for s in wanted_slopes(at_face, aim, plane, face.law))
         x, y, _ = at_face.position
         flat = (t.reshape(-1) for t in (x, y, z_x, z_y, lit.to(x)))
-        lens = lens.with_last_net(fit_slopes(lens.nets[-1], *flat).from_vertex().moved(face.surface.z))
+        lens = lens.with_last_net(fit_slopes(face.net, *flat).from_vertex().moved(face.surface.z))
     return lens

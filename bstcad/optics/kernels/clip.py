@@ -361,18 +361,16 @@ def _reversed(edge):
 
 @inlined
 def _triangle_adjoint(a, b, c, ab, bc, ca, flux):
-    """Return (gradient in the six coordinates, gradient in the flux) of a triangle from the integrals of its edges."""
+    """Return (gradients in the corners a, b and c, gradient in the flux) of a triangle from its edges' integrals."""
     area = area_of(a, b, c)
     phi, w = ab[0] + bc[0] + ca[0], flux / area
     mean = phi / area
     q = -0.5 * w * mean
     ux, uy, vx, vy, wx, wy = b[0] - a[0], b[1] - a[1], c[0] - b[0], c[1] - b[1], a[0] - c[0], a[1] - c[1]
-    return (
-        w * (ab[1] * uy + ca[2] * wy) - q * vy, q * vx - w * (ab[1] * ux + ca[2] * wx),
-        w * (ab[2] * uy + bc[1] * vy) - q * wy, q * wx - w * (ab[2] * ux + bc[1] * vx),
-        w * (bc[2] * vy + ca[1] * wy) - q * uy, q * ux - w * (bc[2] * vx + ca[1] * wx),
-        mean,
-    )  # fmt: skip
+    d_a = w * (ab[1] * uy + ca[2] * wy) - q * vy, q * vx - w * (ab[1] * ux + ca[2] * wx)
+    d_b = w * (ab[2] * uy + bc[1] * vy) - q * wy, q * wx - w * (ab[2] * ux + bc[1] * vx)
+    d_c = w * (bc[2] * vy + ca[1] * wy) - q * uy, q * ux - w * (bc[2] * vx + ca[1] * wx)
+    return d_a, d_b, d_c, mean
 
 
 @inlined
@@ -441,19 +439,17 @@ def _add_row_adjoint(corner, flux, k, flags, edges, d_corner, d_flux):
             if first:
                 e01 = (side[r, 0], side[r, 1], side[r, 2])
                 if odd:
-                    u, v, p, q, s, t, mean = _triangle_adjoint(c0, c1, c3, e01, edge, _reversed(e03), half)
-                    x3, y3 = s, t
+                    (u, v), (p, q), (x3, y3), mean = _triangle_adjoint(c0, c1, c3, e01, edge, _reversed(e03), half)
                 else:
-                    u, v, p, q, s, t, mean = _triangle_adjoint(c0, c1, c2, e01, e12, _reversed(edge), half)
-                    x2, y2 = s, t
+                    (u, v), (p, q), (x2, y2), mean = _triangle_adjoint(c0, c1, c2, e01, e12, _reversed(edge), half)
                 x0, y0, x1, y1 = x0 + u, y0 + v, x1 + p, y1 + q
             if second:
                 e23 = (-side[r + 1, 0], side[r + 1, 2], side[r + 1, 1])
                 if odd:
-                    u, v, p, q, s, t, more = _triangle_adjoint(c1, c2, c3, e12, e23, _reversed(edge), half)
+                    (u, v), (p, q), (s, t), more = _triangle_adjoint(c1, c2, c3, e12, e23, _reversed(edge), half)
                     x1, y1 = x1 + u, y1 + v
                 else:
-                    u, v, p, q, s, t, more = _triangle_adjoint(c0, c2, c3, edge, e23, _reversed(e03), half)
+                    (u, v), (p, q), (s, t), more = _triangle_adjoint(c0, c2, c3, edge, e23, _reversed(e03), half)
                     x0, y0 = x0 + u, y0 + v
                 x2, y2, x3, y3, mean = x2 + p, y2 + q, x3 + s, y3 + t, mean + more
         if d_flux.size > 0:
@@ -536,13 +532,12 @@ class Clip(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, g: Tensor, g_far: Tensor):  # noqa: D102
         corner, flux = ctx.saved_tensors
-        g = g.numpy().T.copy()
-        below = np.zeros((g.shape[0], g.shape[1] + 1))
-        below[:, :-1] = g[:, ::-1].cumsum(1)[:, ::-1]
+        by_column = g.numpy().T.copy()
+        columns, rows = by_column.shape
+        below = np.zeros((columns, rows + 1))
+        below[:, :-1] = by_column[:, ::-1].cumsum(1)[:, ::-1]
         d_corner = torch.zeros(corner.shape, dtype=torch.float64)
         d_flux = torch.empty(flux.shape if ctx.needs_input_grad[1] else (0, 0), dtype=torch.float64)
-        clip_adjoint(
-            corner.detach().contiguous().numpy(), flux.detach().contiguous().numpy(), ctx.thinnest, g, below,
-            float(g_far), d_corner.numpy(), d_flux.numpy(),
-        )  # fmt: skip
+        tubes = corner.detach().contiguous().numpy(), flux.detach().contiguous().numpy()
+        clip_adjoint(*tubes, ctx.thinnest, by_column, below, float(g_far), d_corner.numpy(), d_flux.numpy())
         return d_corner, d_flux if ctx.needs_input_grad[1] else None, None, None

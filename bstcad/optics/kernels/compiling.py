@@ -23,12 +23,13 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
     """Return the decorator numba.njit(cache=True, nogil=True, …) for a kernel that Python calls."""
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        before = numba.config.CACHE_DIR
-        numba.config.CACHE_DIR = str(_caches(before))  # numba reads it only when the kernel is created
+        config: Any = numba.config  # its settings are attributes that numba makes
+        before = config.CACHE_DIR
+        config.CACHE_DIR = str(_caches(before))  # numba reads it only when the kernel is created
         try:
             return numba.njit(cache=True, nogil=True, **options)(function)
         finally:
-            numba.config.CACHE_DIR = before
+            config.CACHE_DIR = before
 
     return decorate
 

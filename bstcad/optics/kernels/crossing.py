@@ -1,7 +1,7 @@
 """Fused CPU kernels (numba) behind `trace.through` and `trace.behind`: rays across a spline face, and the adjoint.
 
-The plain torch form is the reference.  Rays are processed in blocks (forward.py).  The forward pass stores each ray's
-path to the face; the adjoint computes hit and slopes from it again.
+Rays are processed in blocks (forward.py).  The forward pass stores each ray's path to the face; the adjoint computes
+hit and slopes from it again.
 
 With the ray x + t d, the face's normal n = (-p, -q, 1) of its slopes p and q, and F(t) = z - sag, the hit X moves by
 
@@ -23,35 +23,9 @@ from numba import njit
 from torch import Tensor
 
 from bstcad.optics.interfaces import Interface, apply_losses, net_bounds
-from bstcad.optics.kernels import kernel_arguments, reductions
+from bstcad.optics.kernels import forward, kernel_arguments, reductions
 from bstcad.optics.kernels.compiling import compiled
-from bstcad.optics.kernels.forward import (
-    BLOCK,
-    COS_BACK,
-    DX,
-    DY,
-    DZ,
-    FATE,
-    FLUX,
-    SAG,
-    SLOPE_X,
-    SLOPE_Y,
-    WORK,
-    S,
-    U,
-    V,
-    X,
-    Y,
-    Z,
-    at_back,
-    cosines,
-    reflect,
-    refract,
-    search,
-    start_search,
-    to_net,
-    to_screen,
-)
+from bstcad.optics.kernels.forward import BLOCK, DX, DY, DZ, FATE, FLUX, SAG, SLOPE_X, SLOPE_Y, WORK, S, U, V, X, Y, Z
 from bstcad.optics.kernels.records import Faces, TiltedScreen
 from bstcad.optics.kernels.spline import curved, net_of, scatter
 from bstcad.optics.rays import Landed, Rays, Status
@@ -85,30 +59,30 @@ def _cross(net, faces, tilted, lands, position, direction, status, out, path, co
     for begin in range(first, last, BLOCK):
         count = min(BLOCK, last - begin)
         _load(position, direction, status, begin, count, work)
-        start_search(net, faces, count, work)
-        to_net(faces, count, work)
-        search(net, faces, count, work, active)
-        at_back(faces, count, work)
+        forward.start_search(net, faces, count, work)
+        forward.to_net(faces, count, work)
+        forward.search(net, faces, count, work, active)
+        forward.at_back(faces, count, work)
         for r in range(count):
             path[begin + r] = work[Z + r] + work[S + r]
         if cosine.size > 0:
-            cosines(COS_BACK, count, work)
+            forward.cosines(forward.COS_BACK, count, work)
         if lands is None:
             for r in range(count):
                 work[Z + r] = work[S + r] * work[DZ + r]
         if faces.reflects:
-            reflect(faces.fates.reflected, count, work)
+            forward.reflect(faces.fates.reflected, count, work)
         else:
-            refract(faces.index, faces.fates.reflected, count, work)
+            forward.refract(faces.eta, faces.fates.reflected, count, work)
         if lands is not None:
-            to_screen(faces, tilted, count, work)
+            forward.to_screen(faces, tilted, count, work)
         for r in range(count):
             fate = work[FATE + r]
             status[begin + r] = np.uint8(fate)
             out[0, begin + r] = work[X + r] if fate == 0.0 else 0.0
             out[1, begin + r] = work[Y + r] if fate == 0.0 else 0.0
             if cosine.size > 0:
-                cosine[begin + r] = work[COS_BACK + r] if fate == 0.0 else 1.0
+                cosine[begin + r] = work[forward.COS_BACK + r] if fate == 0.0 else 1.0
         if lands is None:
             _store_directions(count, work, begin, direction, out)
 
@@ -187,7 +161,7 @@ def _chain(faces, tilted, lands, count, work, path, d_rays, first):
     d_rays: None, or (6, n), which receives ∂L/∂(position, direction) of rays first … first + count - 1 before the face.
     path (n,): path to the face (mm).
     """
-    eta, min_cos = faces.index, faces.rules.min_cos
+    eta, min_cos = faces.eta, faces.rules.min_cos
     for r in range(count):
         p, q, h = work[SLOPE_X + r], work[SLOPE_Y + r], work[SAG + r]
         dx, dy, dz = work[DX + r], work[DY + r], work[DZ + r]
@@ -352,7 +326,7 @@ def behind(rays: Rays, interface: Interface) -> Rays:
 
 def _across(rays: Rays, interface: Interface, plane: Receiver | None) -> tuple[Tensor, Rays]:
     """Return (out of `Cross`, rays with flux and status behind the face but their old position and direction)."""
-    shape, heights, lossy = rays.status.shape, interface.surface.heights, bool(interface.losses)
+    shape, heights, lossy = rays.status.shape, interface.net.heights, bool(interface.losses)
     if rays.axial and interface.status_if_missed == Status.MISSED_FRONT:
         rays = _start_below_net(rays, interface)
     vectors = (reflect_z(t, rays.sense).reshape(3, -1).contiguous() for t in (rays.position, rays.direction))
@@ -373,7 +347,7 @@ def _start_below_net(rays: Rays, interface: Interface) -> Rays:
     The start of such a beam is arbitrary, and interfaces.intersect does not use it.  The kernels only find roots ahead
     of the start, and would lose light where a deep net extends further.
     """
-    surface, sense = interface.surface, rays.sense
+    surface, sense = interface.net, rays.sense
     lowest = net_bounds(surface, torch.float64, sense).lowest
     short = float((sense * rays.above(surface.z)).detach().max()) - lowest
     if not short > 0:

@@ -347,7 +347,7 @@ def _trace(net, beam, faces, tilted, losses, count, work, active):
         _meet_front(faces, beam.distance == 0.0 and beam.tilted == 0, count, work)
         if losses.present:
             cosines(COS_FRONT, count, work)
-        refract(1.0 / faces.index, faces.fates.reflected, count, work)
+        refract(1.0 / faces.eta, faces.fates.reflected, count, work)
     start_search(net, faces, count, work)
     if losses.present:
         for r in range(count):
@@ -363,7 +363,7 @@ def _trace(net, beam, faces, tilted, losses, count, work, active):
     if faces.reflects:
         reflect(faces.fates.reflected, count, work)
     else:
-        refract(faces.index, faces.fates.reflected, count, work)
+        refract(faces.eta, faces.fates.reflected, count, work)
     to_screen(faces, tilted, count, work)
 
 
@@ -430,7 +430,7 @@ def _dim(faces, losses, count, work, lines):
             lines[BY_GLASS] += flux - left
             flux, cosine = left, work[COS_BACK + r]
             if not faces.reflects:  # the table depends on the cosine of refraction (see `records.LossTables`)
-                cosine = math.sqrt(max(1.0 - faces.index * faces.index * (1.0 - cosine * cosine), 0.0))
+                cosine = math.sqrt(max(1.0 - faces.eta * faces.eta * (1.0 - cosine * cosine), 0.0))
             left = flux * _share(losses.back, cosine)
             lines[BY_FACES] += flux - left
             flux = left
@@ -509,6 +509,7 @@ def _scenes(lights, plane: Receiver, n: int) -> Iterator[tuple[Any, ...]]:
             last = lens, (_scene(source, lens, plane), kernel_arguments.losses(lens))
         (net, _, faces, tilted), losses = last[1]
         cells, beam = kernel_arguments.cells(window, n, seed), kernel_arguments.beam(source, lens)
+        assert beam is not None  # else the plain form traces the light
         beam = beam._replace(peak=beam.peak * weight * cells.width * cells.height)  # flux of a ray, not its density
         yield net, beam, faces, tilted, losses, cells
 
@@ -532,12 +533,12 @@ def land(source: Emitter, lens: Lens, plane: Receiver, x: Tensor, y: Tensor) -> 
         lambda first, last: _rays(*scene, *(a[..., first:last] for a in (x.numpy(), y.numpy(), landing, flux, fate))),
         reductions.shares(x.numel(), BLOCK),
     )
-    return Landed(*(torch.from_numpy(a) for a in (landing, flux, fate)))
+    return Landed(torch.from_numpy(landing), torch.from_numpy(flux), torch.from_numpy(fate))
 
 
 def _scene(source: Emitter, lens: Lens, plane: Receiver) -> tuple[Any, ...]:
     """Return net, beam, faces and tilt of the screen for the kernels; light along -z is reflected by z -> -z."""
-    (*front, net), z = lens.interfaces, lens.entrance.z
-    heights = net.surface.heights
-    faces = kernel_arguments.faces(net, plane, lens.passes.sense, z, *front)
+    (*front, last), z = lens.interfaces, lens.entrance.z
+    heights = last.net.heights
+    faces = kernel_arguments.faces(last, plane, lens.passes.sense, z, *front)
     return net_of(-heights if lens.passes.sense < 0 else heights), kernel_arguments.beam(source, lens), *faces

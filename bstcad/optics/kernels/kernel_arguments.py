@@ -27,12 +27,11 @@ from bstcad.optics.receivers import Receiver
 TRANSMISSION_NODES = 4097  # nodes of a table of a face's transmission
 TABLE_SIDES = 65, 129, 257, 513  # control points per side of a table of light, tried in this order
 IRRADIANCE_TOLERANCE = 1e-5  # largest RMS of a table's relative error in the irradiance, far below any picture's
-MIN_IRRADIANCE = 1e-4  # irradiance over its maximum below which the error counts relative to this value
+MIN_IRRADIANCE = 1e-4  # irradiance relative to its maximum, below which the error counts relative to this value
 SLOPE_TOLERANCE = 1e-8  # largest RMS of a table's error in the slopes of rays
-PEAK_TO_RMS = 100.0  # largest error of a table over these tolerances: the outermost spans are the least exact
+PEAK_TO_RMS = 100.0  # largest error of a table relative to these tolerances: the outermost spans are the least exact
 MAX_TABLES = 16  # tables of light in the cache
 MAX_TABLE_ERROR_RATIO = 0.5  # largest error of a table relative to that of the one before; above: an edge
-TABLE_BEAM = 0.0, 0.0, 0.0, 0.0, math.inf, 1.0, 0.0, 0, 0.0  # first fields of a Beam that is given by a table
 
 
 def rules() -> Rules:
@@ -51,15 +50,15 @@ def faces(
     z -> -z, as the heights and the rays must (crossing.reflect_z).  start: z of the plane that the positions of the
     rays are measured from (mm).
     """
-    surface, law = interface.surface, interface.law
+    surface, law = interface.net, interface.law
     conic = (front.surface.curvature, front.surface.conic_constant) if front else (0.0, 0.0)
     limits = [limit for i in (front or interface, interface) for limit in i.outline.limits]
-    net = [surface.x[0], surface.y[0], *(1 / pitch for pitch in surface.pitch)]
+    corner, per_mm = (surface.x[0], surface.y[0]), (1 / pitch for pitch in surface.pitch)
     bounds, throw = interfaces.net_bounds(surface, torch.float64, sense), plane.middle[2] if plane is not None else 0.0
     face = floats([*conic, law.eta, *limits, sense * (surface.z - start)])
-    net = floats([*net, *bounds, sense * (throw - surface.z)])
+    net = floats([*corner, *per_mm, *bounds, sense * (throw - surface.z)])
     fates = [Status.MISSED_FRONT, interface.status_if_missed, law.status_if_blocked, Status.TURNED_BACK]
-    numbers = Faces(int(law.reverses), *face, *surface.shape, *net, rules(), Fates(*floats(fates)))
+    numbers = Faces._make([int(law.reverses), *face, *surface.shape, *net, rules(), Fates(*floats(fates))])
     return numbers, _tilted(plane, sense, -sense if law.reverses else sense)
 
 
@@ -67,8 +66,10 @@ def losses(lens: Lens) -> LossTables:
     """Return the losses of a lens as numbers, from the plain forms of losses.py."""
     if lens.losses is None:
         return records.NO_LOSS_TABLES
+    from bstcad.optics.losses import AbsorptionLoss  # loaded already, since the lens has losses
+
     *front, back = (_table(interface) for interface in lens.interfaces)
-    glass = [loss.coefficient for i in lens.interfaces for loss in i.losses if loss.in_glass]
+    glass = [loss.coefficient for i in lens.interfaces for loss in i.losses if isinstance(loss, AbsorptionLoss)]
     return LossTables(1, front[0] if front else back, back, float(sum(glass)))
 
 
@@ -120,8 +121,8 @@ def _table_of_light(source: Emitter, window: Rectangle, z: float) -> Beam | None
         if error <= 1.0:
             size = window.width, window.height
             corner = [*(-s / 2 for s in size), *((side - 1) / s for s in size)]
-            table = LightTable(side, side, *corner, *(net.ravel() for net in nets))
-            return Beam(*TABLE_BEAM, start=float(starts), tilted=1, n_x=0.0, n_y=0.0, n_z=1.0, least=0.0, table=table)
+            table = LightTable._make([side, side, *corner, *(net.ravel() for net in nets)])
+            return Beam(start=float(starts), tilted=1, table=table)
         if not error < MAX_TABLE_ERROR_RATIO * last:
             return None
         last = error
@@ -132,6 +133,7 @@ def _tilted(plane: Receiver | None, before: int, behind: int) -> records.TiltedS
     """Return a tilted plane as numbers, None for a level one; before, behind: sense of the light at the last face."""
     if plane is None or plane.is_level:
         return None
+    assert plane.axes is not None  # no kernel traces to other receivers
     along_x, along_y, normal = ((*axis[:2], before * axis[2]) for axis in plane.axes)
     return records.TiltedScreen(*floats([*plane.middle[:2], *(behind * n for n in normal), *along_x, *along_y]))
 
@@ -139,8 +141,9 @@ def _tilted(plane: Receiver | None, before: int, behind: int) -> records.TiltedS
 def cells(window: Rectangle, n: int, seed: int) -> RayCells:
     """Return n x n cells of a window centred on the axis."""
     width, height = window.width / n, window.height / n
-    mixing = sampling.SPLITMIX_INCREMENT, sampling.MIX_1, sampling.MIX_2
-    key, *mixing = map(np.uint64, (sampling.hash_seed(seed), *mixing))
+    key, *mixing = map(
+        np.uint64, (sampling.hash_seed(seed), sampling.SPLITMIX_INCREMENT, sampling.MIX_1, sampling.MIX_2)
+    )
     return RayCells(n, key, width, height, window.width / 2, window.height / 2, *mixing)
 
 

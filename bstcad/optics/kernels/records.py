@@ -6,13 +6,12 @@ kernels depends (compiling.py).  Emitters create their own Beam; kernel_argument
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from torch import Tensor
-
-ALONG_Z = (0, 0.0, 0.0, 1.0, 0.0)  # last fields of a Beam that is not tilted
 
 
 def floats(values: Sequence[float | Tensor]) -> tuple[float, ...]:
@@ -44,21 +43,21 @@ class Beam(NamedTuple):
     exp(-fall (d² - c²) / c²) / c³ for the powers 4, 3 and 0.  With a table E is peak times the table's irradiance.
     """
 
-    x: float  # position of the source, or of the beam's centre (mm)
-    y: float
-    limit_x: float  # outlines.Limits of the light (mm, mm, mm²)
-    limit_y: float
-    limit_r2: float
-    peak: float  # factor of the irradiance
-    fall: float  # coefficient of the exponent (1/mm²); without unit for a tilted source
-    power: int  # power of the distance d of a point source: 0, 3 or 4
-    distance: float  # distance of a point source from the plane (mm); 0: collimated, or a table
-    start: float  # distance from the plane at which rays start (mm)
-    tilted: int  # 1: the axis of the light is n or given by a table; 0: (0, 0, 1)
-    n_x: float  # axis n of the source, in the frame in which light starts along +z
-    n_y: float
-    n_z: float
-    least: float  # smallest cosine to the axis at which there is light
+    x: float = 0.0  # position of the source, or of the beam's centre (mm)
+    y: float = 0.0
+    limit_x: float = 0.0  # outlines.Limits of the light (mm, mm, mm²)
+    limit_y: float = 0.0
+    limit_r2: float = math.inf
+    peak: float = 1.0  # factor of the irradiance
+    fall: float = 0.0  # coefficient of the exponent (1/mm²); without unit for a tilted source
+    power: int = 0  # power of the distance d of a point source: 0, 3 or 4
+    distance: float = 0.0  # distance of a point source from the plane (mm); 0: collimated, or a table
+    start: float = 0.0  # distance from the plane at which rays start (mm)
+    tilted: int = 0  # 1: the axis of the light is n or given by a table; 0: (0, 0, 1)
+    n_x: float = 0.0  # axis n of the source, in the frame in which light starts along +z
+    n_y: float = 0.0
+    n_z: float = 1.0
+    least: float = 0.0  # smallest cosine to the axis at which there is light
     table: LightTable = NO_TABLE
 
 
@@ -106,7 +105,7 @@ class Faces(NamedTuple):
     reflects: int  # 1: the net is a mirror
     curvature: float  # curvature of the front (1/mm)
     conic_constant: float  # conic constant of the front
-    index: float  # relative index η = n_in / n_out at the net
+    eta: float  # relative index η = n_in / n_out at the net
     front_x: float  # outlines.Limits of the front's clear aperture (mm, mm, mm²)
     front_y: float
     front_r2: float

@@ -1,7 +1,4 @@
-"""Fused CPU kernels (numba) behind `irradiance.collect`: bilinear splatting of rays onto pixels, and its adjoint.
-
-The plain torch form is the reference: the kernels give the same values to rounding, several times faster.
-"""
+"""Fused CPU kernels (numba) behind `irradiance.collect`: bilinear splatting of rays onto pixels, and its adjoint."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from torch import Tensor
 from bstcad.optics.kernels import reductions
 from bstcad.optics.kernels.compiling import compiled
 
-CHUNK = 4096  # rays per task, whose coordinates and results stay in the second-level cache
+RAYS_PER_TASK = 4096  # rays per task, whose coordinates and results stay in the second-level cache
 
 
 @compiled(parallel=True)
@@ -60,8 +57,8 @@ def _splat_adjoint(position, flux, frame, g, g_outside, d_position):
     """Compute the gradient in the positions from g (rows, columns), in the pixels, and g_outside, in `outside`."""
     rows, columns = g.shape
     n = flux.size
-    for c in prange((n + CHUNK - 1) // CHUNK):
-        for r in range(c * CHUNK, min(n, (c + 1) * CHUNK)):
+    for c in prange((n + RAYS_PER_TASK - 1) // RAYS_PER_TASK):
+        for r in range(c * RAYS_PER_TASK, min(n, (c + 1) * RAYS_PER_TASK)):
             d_position[0, r] = d_position[1, r] = 0.0
             f = float(flux[r])
             if f == 0.0:
@@ -105,12 +102,6 @@ class Splat(torch.autograd.Function):
     def backward(ctx, g: Tensor, g_outside: Tensor):  # noqa: D102
         position, flux = ctx.saved_tensors
         d_position = torch.empty_like(position)
-        _splat_adjoint(
-            position.detach().numpy(),
-            flux.numpy(),
-            ctx.frame,
-            g.contiguous().numpy(),
-            float(g_outside),
-            d_position.numpy(),
-        )
+        rays = position.detach().numpy(), flux.numpy()
+        _splat_adjoint(*rays, ctx.frame, g.contiguous().numpy(), float(g_outside), d_position.numpy())
         return d_position, None, None, None

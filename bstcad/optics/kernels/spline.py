@@ -1,13 +1,14 @@
 """Fused CPU kernels (numba) behind `bspline.evaluate` and its adjoints, and the spline functions of other kernels.
 
-The plain torch forms are the reference: the kernels give the same values to rounding, several times faster, because
-each point's nine products stay in registers and the adjoint adds to one net per part instead of nine index_put passes.
+They are several times faster than the plain forms, because each point's nine products stay in registers and the adjoint
+adds to one net per part instead of nine index_put passes.
 `largest_bending` gives the largest slope and curvatures of a back (analysis/shape.py); its plain form is `bspline.Jet`.
 """
 
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from bstcad.optics.kernels import reductions
 from bstcad.optics.kernels.compiling import compiled
 from bstcad.optics.kernels.reductions import on_threads
 
-CHUNK = 4096  # points per task, whose coordinates and results stay in the second-level cache
+POINTS_PER_TASK = 4096  # points per task, whose coordinates and results stay in the second-level cache
 
 
 def _flat(t: Tensor) -> np.ndarray:
@@ -138,8 +139,8 @@ def beyond2(x, y, limit_x, limit_y):
 @compiled(parallel=True)
 def _evaluate(net, m, n, u, v, h, h_u, h_v):
     count = u.size
-    for c in prange((count + CHUNK - 1) // CHUNK):
-        for r in range(c * CHUNK, min(count, (c + 1) * CHUNK)):
+    for c in prange((count + POINTS_PER_TASK - 1) // POINTS_PER_TASK):
+        for r in range(c * POINTS_PER_TASK, min(count, (c + 1) * POINTS_PER_TASK)):
             h[r], h_u[r], h_v[r] = sag(net, m, n, float(u[r]), float(v[r]))
 
 
@@ -158,8 +159,8 @@ def _adjoint_in_net(u, v, g, g_u, g_v, d_net, touched):
 @compiled(parallel=True)
 def _adjoint_in_places(net, m, n, u, v, g, g_u, g_v, d_u, d_v):
     count = u.size
-    for c in prange((count + CHUNK - 1) // CHUNK):
-        for r in range(c * CHUNK, min(count, (c + 1) * CHUNK)):
+    for c in prange((count + POINTS_PER_TASK - 1) // POINTS_PER_TASK):
+        for r in range(c * POINTS_PER_TASK, min(count, (c + 1) * POINTS_PER_TASK)):
             _, zu, zv, zuu, zuv, zvv = curved(net, m, n, float(u[r]), float(v[r]))
             d_u[r] = float(g[r]) * zu + float(g_u[r]) * zuu + float(g_v[r]) * zuv
             d_v[r] = float(g[r]) * zv + float(g_u[r]) * zuv + float(g_v[r]) * zvv
@@ -196,14 +197,15 @@ class BSplineSag(torch.autograd.Function):
         return d_heights, d_u, d_v
 
 
+Pair = tuple[np.ndarray, np.ndarray]
+Triple = tuple[float, float, float]
 QUANTITIES = 3  # number of quantities: concave curvature, convex curvature, |∇z|
 ROW_PARTS = 16  # parts of the rows of spans, one per task
 
 
 def largest_bending(
-    net: np.ndarray, along: tuple[np.ndarray, np.ndarray], at: tuple[np.ndarray, np.ndarray],
-    limits: tuple[float, float, float], bounds: tuple[float, float, float],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    net: np.ndarray, along: Pair, at: Pair, limits: Triple, bounds: Triple
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the maxima (3,), their indices along x and y (3, 2) and the numbers of points at the bounds (3,).
 
     The three are concave curvature, convex curvature (1/mm) and |∇z|; a curvature is negative if no point is bent that
@@ -216,19 +218,13 @@ def largest_bending(
     found = np.full((ROW_PARTS, QUANTITIES), -math.inf)
     index = np.zeros((ROW_PARTS, QUANTITIES, 2), np.int64)
     count = np.zeros((ROW_PARTS, QUANTITIES), np.int64)
-    limits, bounds = np.array(limits), np.array([*bounds[:2], bounds[2] ** 2])
-    on_threads(
-        _largest,
-        [
-            (net, *along, *at, limits, bounds, first, last, found[part], index[part], count[part])
-            for part, (first, last) in enumerate(zip(ends, ends[1:], strict=False))
-        ],
-    )
-    first = found.argmax(0)  # part with the first of equal values
-    kinds = np.arange(QUANTITIES)
-    values = found[first, kinds]
+    scene = net, *along, *at, np.array(limits), np.array([*bounds[:2], bounds[2] ** 2])
+    parts = zip(pairwise(ends), found, index, count, strict=True)
+    on_threads(_largest, [(*scene, *span, *results) for span, *results in parts])
+    best, kinds = found.argmax(0), np.arange(QUANTITIES)  # part with the first of equal values
+    values = found[best, kinds]
     values[2] = math.sqrt(max(values[2], 0.0))
-    return values, index[first, kinds], count.sum(0)
+    return values, index[best, kinds], count.sum(0)
 
 
 @njit(inline="always")
