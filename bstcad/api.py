@@ -41,6 +41,7 @@ from bstcad.runs import progress as progresses
 from bstcad.scene.blank import MIN_ROUND_POINTS
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene, load
+from bstcad.tailoring.run import Hooks
 from bstcad.transport.mapping import TransportMap
 
 RELATIVE_TOLERANCE = 1e-9  # relative difference of equal indices; difference of equal ends of nets, in net widths
@@ -67,7 +68,8 @@ def design(
     processes.keep_freed()
     with progresses.for_script(progress) as shown:
         scene = commands.with_default_net(scene, lambda line: shown("control points", 1, 1, line))
-        return Design(pipeline.design(scene, device=device, progress=shown, began=began, merit=merit, later=True))
+        hooks, options = Hooks(progress=shown), pipeline.DesignOptions(merit, compare_later=True)
+        return Design(pipeline.design(scene, device=device, hooks=hooks, options=options, began=began))
 
 
 def open(folder: AnyPath) -> Design:

@@ -56,7 +56,7 @@ from bstcad.scene.scene import Scene
 from bstcad.step_text import beginning
 from bstcad.sweep.estimates import diagnosis, left_out
 from bstcad.sweep.net_choice import with_net
-from bstcad.tailoring.run import LensCallback, Progress, ignore_lens, no_progress
+from bstcad.tailoring.run import NO_HOOKS, Hooks, LensCallback, Progress, no_progress
 from bstcad.verify import checks
 from bstcad.verify.checks import Proof
 from bstcad.verify.verdict import Check, verdict
@@ -89,7 +89,7 @@ class ProofOptions:
 
 def generate(
     scene: Scene, folder: Path, options: ProofOptions = ProofOptions(), *, device: str = "auto", resume: bool = False,
-    progress: Progress = no_progress, began: float | None = None, on_lens: LensCallback = ignore_lens,
+    progress: Progress = no_progress, began: float | None = None, on_lens: LensCallback = NO_HOOKS.on_lens,
 ) -> Report:  # fmt: skip
     """Design a lens, write it to `folder` and prove it from the written files.
 
@@ -111,10 +111,8 @@ def generate(
         if not resume and keeper.path.exists():
             keeper.say("a stopped design is here; it starts from the beginning, since --resume is not given")
         with _checkpoint_on_error(keeper, refused=(SceneError,)), signals.stop_on_interrupt() as wished:
-            found = design(
-                scene, device=device, progress=progress, began=began, save=keeper, start=state, interrupted=wished,
-                on_lens=on_lens,
-            )  # fmt: skip
+            hooks = Hooks(progress, keeper, wished, on_lens)
+            found = design(scene, device=device, hooks=hooks, began=began, start=state)
         with _checkpoint_on_error(keeper):
             options = replace(options, limit=scene.tailoring.max_time)
             report = write(found, output_folder(folder, found.making.stopped), options, progress)

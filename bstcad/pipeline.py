@@ -1,13 +1,17 @@
-"""The stages of a design in order, from the blank of a scene to the tailored lens."""
+"""The stages of a design in order, from the blank of a scene to the tailored lens.
+
+Stage 1 comes first, then stage 2.  For a source of finite size stage 3 replaces stage 2 (`second_stage`); only the
+paper's procedure, which is for point sources, runs stage 2 before it.
+"""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -21,38 +25,38 @@ from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
 from bstcad.optics.reach import MAX_EXIT_ANGLE, grazing_of, spread_at, unreached
 from bstcad.optics.sides import as_pair
-from bstcad.report.record import CurvePoint, DesignCourse, StageRecord
+from bstcad.report.record import CurvePoint, DesignCourse, PrecisionTest, StageRecord
 from bstcad.runs import processes
 from bstcad.scene.errors import SceneError
-from bstcad.scene.quality import Tailoring
+from bstcad.scene.quality import ResolvedTailoring
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import slope_map, stage1, stage2, two_faces
 from bstcad.tailoring.feasibility import find_demand, is_infeasible
 from bstcad.tailoring.grazing import without_reflection
 from bstcad.tailoring.machinability import BOUNDS_STAGE, active_bounds, enforce_bounds, place_back
+from bstcad.tailoring.merit import PictureError
 from bstcad.tailoring.reachable import reachable
 from bstcad.tailoring.run import (
     BEST_LENS_STAGE,
+    NO_HOOKS,
     RRMSD_SECONDS,
     DesignRecord,
     Driver,
     Edge,
-    LensCallback,
+    Hooks,
     Parameters,
     Progress,
     RatedLens,
+    Stage,
     StageStep,
+    Steps,
     Task,
-    discard_state,
-    ignore_lens,
-    no_progress,
-    not_interrupted,
 )
-from bstcad.tailoring.source_image import Spread
+from bstcad.tailoring.source_image import ExtendedSource
 from bstcad.tailoring.stage2 import Comparison, compare_precisions
 from bstcad.transport.mapping import Mapping, TransportMap
 
-PROCEDURES = {  # (name of stage 1, stage 1, stage 2) for each tailoring.method
+PROCEDURES: dict[str, tuple[str, Stage, Stage]] = {  # (name of stage 1, stage 1, stage 2) for each tailoring.method
     "least-squares": ("stage 1", stage1.steps, stage2.steps),
     "adam": ("stage 1", paper.stage1, paper.stage2),
     "integration": ("integration", integration.steps, stage2.steps),  # with no evaluations in stage 2
@@ -97,54 +101,57 @@ class DesignState:
     stopped: str = ""  # reason why tailoring ended
 
 
+@dataclass(frozen=True)
+class DesignOptions:
+    """Options of a design that its scene does not state."""
+
+    merit: PictureError | None = None  # function of a picture and the target that stages 2 and 3 minimise; None: RRMSD²
+    compare_later: bool = False  # compare float32 with float64 only when a report asks for it (`Made.with_report_data`)
+    preview: bool = False  # make a preview, see `Task.preview`; the scene itself states its size
+
+
 def design(
-    scene: Scene, *, device: str = "auto", progress: Progress = no_progress, began: float | None = None,
-    save: Callable[[DesignState], None] = discard_state, start: DesignState | None = None,
-    interrupted: Callable[[], bool] = not_interrupted,
-    merit: Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None = None, later: bool = False,
-    on_lens: LensCallback = ignore_lens, preview: bool = False,
-) -> Made:  # fmt: skip
+    scene: Scene,
+    *,
+    device: str = "auto",
+    hooks: Hooks = NO_HOOKS,
+    options: DesignOptions = DesignOptions(),
+    began: float | None = None,
+    start: DesignState | None = None,
+) -> Made:
     """Design the lens of a scene: transport map, stage 1, and stage 2, or stage 3 for an extended source.
 
+    hooks: functions that are called while it runs.  Once `hooks.interrupted` returns True, tailoring ends with the best
+    lens so far, or with KeyboardInterrupt if there is no lens yet.
     began: start of tailoring.max_time (time.perf_counter(), default now), which includes writing and verification.
-    save: function called at intervals with the state.  start: such a state; the design continues and ends the same.
-    interrupted: function; once it returns True, tailoring ends with the best lens so far, or with KeyboardInterrupt if
-    there is no lens yet.  merit: function of a picture and the target that stages 2 and 3 minimise; None: RRMSD².
-    on_lens: function called at intervals with a function that returns the best lens so far.
-    preview: True for a preview, see `Task.preview`; the scene itself states its size.
-    later: float32 is compared with float64 only when a report asks for it (`Made.with_report_data`).
+    start: state that `hooks.save` received; the design continues from it and ends the same.
     """
-    began = time.perf_counter() if began is None else began
+    began, merit = time.perf_counter() if began is None else began, options.merit
     if merit is not None and (len(scene.targets) > 1 or scene.wavefront is not None):
         raise SceneError("merit: needs a scene with one goal, and this one has several; remove merit, or other goals")
     torch.manual_seed(scene.tailoring.seed)
     device = device_for(device)
-    goals, edge = within_reach(scene, progress)
+    goals, edge = within_reach(scene, hooks.progress)
     knobs = scene.tailoring.resolved(scene.lens.back.net)
-    later = later and knobs.max_time is None
-    more = {"progress": progress, "tidy": processes.return_freed, "merit": merit, "preview": preview}
-    task = task_of(scene, goals, knobs, edge, **more)
-    task = with_solution(scene, task)
-    limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve(scene) + RRMSD_SECONDS}
-    record = DesignRecord() if start is None else start.record
-    driver = Driver(progress, began, **limits, interrupted=interrupted, save=save, on_lens=on_lens, record=record)
+    later = options.compare_later and knobs.max_time is None
+    task = replace(task_of(scene, goals, knobs, edge), progress=hooks.progress, merit=merit, preview=options.preview)
+    task = with_solution(scene, replace(task, tidy=processes.return_freed))
+    fresh, start = start is None, start or DesignState(DesignRecord())
+    limit, reserved = math.inf if knobs.max_time is None else knobs.max_time, reserve(scene) + RRMSD_SECONDS
+    driver = Driver(hooks, began, limit=limit, reserve=reserved, record=start.record)
     precision = getattr(torch, knobs.precision)
     lens = scene.flat_lens(knobs.levels[0], dtype=precision, device=device, as_wide_as=knobs.levels[-1])
     if not scene.lens.back.optimise:  # no stage refines it
         lens = lens.with_back(lens.back_net.refined(scene.lens.back.net))
-    if start is None:
+    if fresh:
         driver.end("loading")  # loading of the libraries, the scene and its files
-    followed = (
-        start.followed
-        if start and start.followed
-        else _stage1(scene, task, driver, lens, state=start and start.first, compare=not later)
-    )
+    followed = start.followed or _stage1(scene, task, driver, lens, state=start.first, compare=not later)
     after_stage1, stages = followed.lens.apply_to(lens), len(driver.record.stages)
     lens = scene.as_mounted(after_stage1)  # the clear apertures differ from those of a flat back
-    if start and start.lens:
+    if start.lens:
         lens, stopped = start.lens.apply_to(lens), start.stopped
     else:
-        lens, stopped = _stage2(task, driver, lens, followed, state=start and start.second, best=start and start.best)
+        lens, stopped = _stage2(task, driver, lens, followed, state=start.second, best=start.best)
     lens = replace(lens.plain(), index=scene.index, losses=None)
     if scene.lens.front.fixed:  # tailoring may have used it in float32
         lens = replace(lens, front=scene.lens.front_surface)
@@ -152,10 +159,10 @@ def design(
     at_back = sent.plane == "back"
     steep = needed_steepness(source, lens, goals[0], x=sent.x, y=sent.y, origins=sent.source, at_back=at_back)
     making = _design_course(followed, driver.record, stopped, steep)
-    return Made(
-        resolved(scene, lens), scene.as_mounted(lens), goals, making, device=device, transport=followed.transport,
-        precision_comparison=partial(_with_comparison, making, task, after_stage1, stages) if later else None,
-    )  # fmt: skip
+    designed = resolved(scene, lens), scene.as_mounted(lens), goals
+    made = Made(*designed, making=making, device=device, transport=followed.transport)
+    compare = partial(_with_comparison, making, task, after_stage1, stages)
+    return replace(made, precision_comparison=compare) if later else made
 
 
 def within_reach(scene: Scene, progress: Progress) -> tuple[tuple[Goal, ...], Edge | None]:
@@ -163,7 +170,8 @@ def within_reach(scene: Scene, progress: Progress) -> tuple[tuple[Goal, ...], Ed
 
     `progress` reports each target that light cannot reach completely.  SceneError as for `reachable_part`.
     """
-    goals, edge = [], None
+    goals: list[Goal] = []
+    edge = None
     for alone, goal in zip(scene.single_target_scenes(), scene.goals, strict=True):
         part, its_edge = reachable_part(alone, goal)
         if part is not None:
@@ -173,16 +181,17 @@ def within_reach(scene: Scene, progress: Progress) -> tuple[tuple[Goal, ...], Ed
     return tuple(goals), edge
 
 
-def task_of(scene: Scene, goals: Sequence[Goal], knobs: Tailoring, edge: Edge | None, **more: Any) -> Task:
-    """Return the task of a scene; goals, edge: see `within_reach`; more: fields of Task that a scene does not have."""
+def task_of(scene: Scene, goals: Sequence[Goal], knobs: ResolvedTailoring, edge: Edge | None) -> Task:
+    """Return the task of a scene; goals, edge: see `within_reach`."""
     light = scene.with_source_scaled(0.0).channels()
     sizes = stage2.SOURCE_SIZES if scene.source.extent and knobs.method != "integration" else ()
     scaled = [scene.with_source_scaled(share) for share, _ in sizes]
+    sources = tuple(ExtendedSource(each.source, light, each.draw) for each in scaled if each.draw)
     return Task(
-        light, tuple(goals), knobs, min_thickness=scene.lens.min_thickness, free=scene.lens.front.free,
-        rim_sags=scene.rim_sags, sampled_sources=tuple(each.channels() for each in scaled), bounds=scene.lens.bounds,
-        spreads=tuple(Spread(each.source, light, each.draw) for each in scaled), edge=edge, wave=scene.wavefront,
-        solution=SIGNS.get(knobs.solution), front_sides=scene.lens.front_net, **more,
+        light, tuple(goals), knobs, min_thickness=scene.lens.min_thickness, bounds=scene.lens.bounds,
+        free=scene.lens.front.free, rim_sags=scene.rim_sags, front_sides=scene.lens.front_net,
+        sampled_sources=tuple(each.channels() for each in scaled), extended_sources=sources,
+        edge=edge, wave=scene.wavefront, solution=None if knobs.solution is None else SIGNS[knobs.solution],
     )  # fmt: skip
 
 
@@ -203,8 +212,8 @@ def with_solution(scene: Scene, task: Task) -> Task:
     return replace(task, solution=demand.solution, floor=demand.floor)
 
 
-def second_stage(task: Task, lens: Lens, state: Stage2State | None = None) -> tuple[str, Iterator[StageStep]]:
-    """Return name and steps of the stage after stage 1: stage 2, or 2 and 3 for an extended source."""
+def second_stage(task: Task, lens: Lens, state: Stage2State | None = None) -> tuple[str, Steps]:
+    """Return name and steps of the stage after stage 1: stage 2, or for a source of finite size stage 3."""
     *_, stage = PROCEDURES[task.knobs.method]
     if not task.sampled_sources:
         return "stage 2", stage(task, lens, state)
@@ -227,11 +236,9 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
         grazing = grazing_of(light.index, [each.index for each in channels], spread_at(scene.source, lens))
     part = reachable(light.source, lens, goal, grazing=grazing)
     if part is not None and scene.lens.front.free:  # another front may send light further
-        front = stage1.shaped_front(
-            light.source, lens, goal.picture, goal.receiver, free=scene.lens.front.free, rim_sags=scene.rim_sags,
-            repeats=1,
-        ).front  # fmt: skip
-        part = reachable(light.source, lens.with_front(front), goal, grazing=grazing)
+        free, effort = scene.lens.front.free, stage1.FrontSearch(repeats=1)
+        shaped = stage1.shaped_front(light.source, lens, goal, free, rim_sags=scene.rim_sags, effort=effort)
+        part = reachable(light.source, lens.with_front(shaped.front), goal, grazing=grazing)
     if part is None:
         return None, None
     if not goal.picture[part].sum() > MIN_REACHABLE:
@@ -244,7 +251,7 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
 def unreachable(scene: Scene, part: np.ndarray, picture: np.ndarray) -> str:
     """Return a sentence on the unreachable part of a target and the reason, without a full stop."""
     found = unreached(picture, part, scene.lens.passes.largest_turn(scene.index))
-    area, light = (f"{100 * found[key]:.2g} %" for key in ("area", "light"))
+    area, light = (f"{100 * (found[key] or 0.0):.2g} %" for key in ("area", "light"))
     why = "no slope up to 70 degrees sends light there"
     if found["angle"] is not None:
         why = f"a face of index {scene.index:.4g} turns light by less than {found['angle']:.3g} degrees, or reflects it"
@@ -275,7 +282,7 @@ def check_front(lens: Lens, scene: Scene) -> None:
 def _with_comparison(making: DesignCourse, task: Task, lens: Lens, before: int) -> DesignCourse:
     """Return the record with the comparison of precisions for the lens of stage 1, after `before` stages."""
     began, cpu = time.perf_counter(), time.process_time()
-    comparison = asdict(compare_precisions(task, lens))
+    comparison = cast(PrecisionTest, asdict(compare_precisions(task, lens)))
     stage = StageRecord(COMPARISON_STAGE, time.perf_counter() - began, cpu_seconds=time.process_time() - cpu)
     stages = (*making.stages[:before], stage, *making.stages[before:])
     return replace(making, twins=comparison, stages=stages, seconds_total=making.seconds_total + stage.seconds)
@@ -298,13 +305,13 @@ def _design_course(result: Stage1Result, record: DesignRecord, stopped: str, ste
         },
         skipped_steps=record.skipped,
         stopped=stopped,
-        twins=None if result.precision is None else asdict(result.precision),
+        twins=None if result.precision is None else cast(PrecisionTest, asdict(result.precision)),
     )
 
 
 def _stage1(
-    scene: Scene, task: Task, driver: Driver, lens: Lens, state: Stage1State | None, compare: bool
-) -> Stage1Result:  # fmt: skip
+    scene: Scene, task: Task, driver: Driver, lens: Lens, *, state: Stage1State | None, compare: bool
+) -> Stage1Result:
     """Run stage 1 from the blank or from a state, and compare precisions after it if `compare` is True."""
     if driver.reason_to_interrupt and state is None:
         raise KeyboardInterrupt  # there is no lens yet
@@ -322,7 +329,7 @@ def _stage1(
     rrmsd = require_light(lens, task.rrmsd(lens) if last.rays_rrmsd is None else last.rays_rrmsd)
     driver.end(name, rrmsd)
     if bounds is not None:
-        driver.progress(BOUNDS_STAGE, 0, 1, "")
+        driver.hooks.progress(BOUNDS_STAGE, 0, 1, "")
         if lens.shapes("front"):  # stage 2 allows for a shift of the back, but does not shift it
             lens = place_back(lens, lens.back.z, task.min_thickness, bounds)
         lens = enforce_bounds(lens, bounds)
@@ -333,37 +340,39 @@ def _stage1(
     if compare and not driver.reason_to_end:
         precision = compare_precisions(task, lens)
         driver.end(COMPARISON_STAGE)
-    screen = task.goals[0].receiver
-    if last.places is None:
-        sent = slope_map.map_from_entrance(last.mapping, lens, screen)
+    screen, mapping = task.goals[0].receiver, last.mapping
+    assert mapping is not None, "each step of stage 1 has its map"
+    if last.face_points is None:
+        sent = slope_map.map_from_entrance(mapping, lens, screen)
     else:
-        sent = slope_map.map_from_face(last.places, screen)
-    return Stage1Result(Parameters.of(lens), last.mapping, sent, precision, rrmsd=rrmsd)
+        sent = slope_map.map_from_face(last.face_points, screen)
+    return Stage1Result(Parameters.of(lens), mapping, sent, precision, rrmsd=rrmsd)
 
 
 def _stage2(
-    task: Task, driver: Driver, lens: Lens, followed: Stage1Result, state: Stage2State | None, best: RatedLens | None
-) -> tuple[Lens, str]:  # fmt: skip
+    task: Task, driver: Driver, lens: Lens, followed: Stage1Result, *, state: Stage2State | None, best: RatedLens | None
+) -> tuple[Lens, str]:
     """Run stage 2, and 3 for an extended source, from the result of stage 1 or from a state.
 
     Return the lens and the reason why the stage ended.  The lens is no worse than that of stage 1 or of any part.
     """
-    if state is None and not driver.reason_to_interrupt:  # with a wish the state is not that of a complete stage 1
-        driver.save(DesignState(driver.record, followed=followed))
+    if state is None and not driver.reason_to_interrupt:  # an interrupt leaves an incomplete stage 1: no state of it
+        driver.hooks.save(DesignState(driver.record, followed=followed))
     name, steps = second_stage(task, lens, state)
-    whole = task.whole
+    full = task.at_full_size
     known = not task.sampled_sources and lens.clear is None
-    first = None if task.preview else whole.rated(lens, followed.rrmsd if known else whole.rrmsd(lens))
+    first = None if task.preview else full.rated(lens, followed.rrmsd if known else full.rrmsd(lens))
 
     def design_state(state: Stage2State) -> DesignState:
         return DesignState(driver.record, None, followed, state, best=driver.best)
 
-    last = driver.run(steps, whole, design_state, lambda: driver.reason_to_end, best=best or first)
-    lens = _final_lens(whole, driver, last, (driver.best, first))
+    last = driver.run(steps, full, design_state, lambda: driver.reason_to_end, best=best or first)
+    lens = _final_lens(full, driver, last, [each for each in (driver.best, first) if each is not None])
     total = task.knobs.stage2_iterations
-    driver.progress(name, total, total, driver.stopped)
+    driver.hooks.progress(name, total, total, driver.stopped)
     if driver.stopped != "interrupt":
-        driver.save(DesignState(driver.record, followed=followed, lens=Parameters.of(lens), stopped=driver.stopped))
+        final = Parameters.of(lens)
+        driver.hooks.save(DesignState(driver.record, followed=followed, lens=final, stopped=driver.stopped))
     return lens, driver.stopped
 
 
@@ -378,7 +387,7 @@ def _final_lens(task: Task, driver: Driver, last: StageStep, before: Sequence[Ra
         return corrected
     if active_bounds(lens, task.bounds, task.min_thickness) is not None:
         driver.end(BOUNDS_STAGE, value := task.rrmsd(corrected))
-    elif value is not None and (_is_changed(lens, corrected) or not last.whole):
+    elif value is not None and (_is_changed(lens, corrected) or not last.at_full_size):
         value = task.rrmsd(corrected)
     if value is None or task.knobs.method == "adam":
         return corrected
@@ -434,12 +443,12 @@ def reserve(scene: Scene) -> float:
 
 def purpose(scene: Scene, device: str) -> dict[str, Any]:
     """Return everything that the result of `design` depends on, by which a checkpoint is recognised."""
-    wanted = scene.model_dump(mode="json", exclude={"name", "title", "output", "accept"})
+    keys = scene.model_dump(mode="json", exclude={"name", "title", "output", "accept"})
     return {
         "version": bstcad.__version__,
         "device": device_for(device),
         "files": {name: content.digest for name, content in sorted(scene.files.items())},
-        **wanted,
+        **keys,
     }
 
 
@@ -465,7 +474,7 @@ def require_bounded_light(scene: Scene, rrmsd: float) -> float:
         return rrmsd
     keys = scene.lens.bounded_by or ("min_thickness",)
     bounds = " and ".join(f"lens.{key} = {getattr(scene.lens, key):g}" for key in keys)
-    raise SceneError(f"{bounds}: no back within this bound sends light to the target; loosen the bound")
+    raise SceneError(f"{bounds}: no back that meets this bound sends light to the target; loosen the bound")
 
 
 def check_thickness(lens: Lens, scene: Scene) -> None:

@@ -311,7 +311,7 @@ COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which f
     "tailoring.source_image": {
         "ERROR_RAYS": 64, "ERROR_POINTS": 8, "IMAGE_GRID": 8, "IMAGE_NODES": 3, "IMAGE_PAIRS": 32,
     },
-    "tailoring.machinability": {"THICKNESS_POINTS": 65, "RIM_POINTS": 129, "REPAIR_EVALUATIONS": 20},
+    "tailoring.machinability": {"THICKNESS_POINTS": 65, "QUARTER_RIM_POINTS": 129, "REPAIR_EVALUATIONS": 20},
     "tailoring.reachable": {
         "FACE_CELLS": 17, "MAX_AIMS": 24, "MAP_CELLS": 16, "MAP_ITERATIONS": 10, "MAX_ROUNDS": 1,
     },

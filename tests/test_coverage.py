@@ -16,7 +16,7 @@ import tomli_w
 
 from bstcad.optics.measure import Effort, measure
 from bstcad.optics.wavefront_error import wavefront_error
-from bstcad.pipeline import design
+from bstcad.pipeline import DesignOptions, design
 from bstcad.scene.scene import load
 
 PAGE = Path(__file__).parent.parent / "docs" / "how-to" / "two-faces.md"
@@ -188,7 +188,7 @@ def is_met(scene, lens):
 def test_a_system_of_the_table_is_designed(name, loaded):
     scene = loaded(DESIGNED[name])
     assert scene.warnings() == ()
-    met, found = is_met(scene, design(scene, later=True).lens)
+    met, found = is_met(scene, design(scene, options=DesignOptions(compare_later=True)).lens)
     assert met, found
     met, found = is_met(scene, scene.flat_lens(17))
     assert not met, found  # so the bounds tell a failure

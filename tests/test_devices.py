@@ -18,6 +18,7 @@ from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage2
 from bstcad.tailoring.merit import Merit
+from bstcad.tailoring.run import Hooks
 from bstcad.tailoring.stage2 import Problem
 from tests.conftest import pixels_of_all
 from tests.fake_device import SECOND, SecondDevice, on_second
@@ -144,7 +145,7 @@ def test_resume_brings_everything_back_to_the_device(quality, tmp_path):
         checkpoint.write(kept[-1], {}, state)
 
     with SecondDevice():
-        whole = design(wanted, device="cuda", save=save)
+        whole = design(wanted, device="cuda", hooks=Hooks(save=save))
     for place in sorted({len(kept) // 3, len(kept) - 1}):
         with SecondDevice() as second:
             again = design(wanted, device="cuda", start=checkpoint.read(kept[place], pipeline.DesignState, "cuda")[1])

@@ -27,8 +27,8 @@ from bstcad.optics.tubes import corners, middle
 from bstcad.report.light_figures import rrmsd
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.merit import Merit
-from bstcad.tailoring.run import Progress
-from bstcad.tailoring.source_image import Spread
+from bstcad.tailoring.run import Hooks, Progress
+from bstcad.tailoring.source_image import ExtendedSource
 
 COARSE_NET = 33  # control points per side in the first rounds of stage 1
 TRANSPORT_CELLS = 48  # cells per side of the transport map
@@ -89,7 +89,8 @@ def preview(scene: Scene, size: PreviewSize = QUICK, outdated: Callable[[], bool
     """
     began, remarks = time.perf_counter(), list(scene.warnings())
     small = reduced_scene(scene, size)
-    made = pipeline.design(small, progress=_progress(outdated, remarks), later=True, preview=True)
+    hooks = Hooks(progress=_progress(outdated, remarks))
+    made = pipeline.design(small, hooks=hooks, options=pipeline.DesignOptions(compare_later=True, preview=True))
     return replace(_evaluate(small, made), remarks=tuple(remarks), seconds=time.perf_counter() - began)
 
 
@@ -159,6 +160,6 @@ def _picture(scene: Scene, lens: Lens, goal: Goal) -> np.ndarray:
     n = round(TUBES_PER_PIXEL * max(goal.receiver.shape))
     if not scene.source.extent:
         return tubes_picture(lens, scene.channels(), goal.receiver, n).numpy()
-    spread = Spread(scene.source, scene.with_source_scaled(0.0).channels(), scene.draw)
-    merit = Merit.of(spread.centre, lens, n, [goal], overshoot=0.0, spread=spread)
+    source = ExtendedSource(scene.source, scene.with_source_scaled(0.0).channels(), scene.draw)
+    merit = Merit.of(source.centre, lens, n, [goal], overshoot=0.0).with_blur(source, lens)
     return merit.picture(0, *merit.landing(lens).on_goals)[0].cpu().numpy().clip(min=0.0)

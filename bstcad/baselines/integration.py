@@ -223,7 +223,7 @@ def fit_heights(
     h = surface.heights
     if degree:
         terms = [torch.ones_like(h), *monomials(surface, degree)]
-        h = with_polynomial(h, terms, lambda h: evaluate(h, u, v)[:1], wanted=(z,), weight=torch.ones_like(z))
+        h = with_polynomial(h, terms, lambda h: evaluate(h, u, v)[:1], data=(z,), weight=torch.ones_like(z))
     residual = normal_equations(z - evaluate(h, u, v)[0]) - bending * bending_gradient(h)
     h = conjugate_gradients(
         lambda p: normal_equations(evaluate(p, u, v)[0]) + bending * bending_gradient(p), h, residual, count

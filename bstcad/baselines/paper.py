@@ -29,7 +29,7 @@ from bstcad.tailoring.merit import landing
 from bstcad.tailoring.minimise import AdamState, Best, Iterate, adam, minimise
 from bstcad.tailoring.run import Parameters, StageStep, Task
 from bstcad.transport.bfm import TransportStep
-from bstcad.transport.mapping import Mapping
+from bstcad.transport.mapping import Mapping, Solver
 
 STAGE1_RATES = {33: 0.02, 129: 0.004, 513: 0.008}  # mm per step, by control points per side (section 3.2)
 FRONT_RATES = {  # change of the front's parameters per step
@@ -110,9 +110,7 @@ def transport(task: Task, lens: Lens) -> Mapping:
     def progress(s: TransportStep) -> None:
         task.progress("transport", s.iteration, count, f"mass error {s.mass_error:.4f}")
 
-    return slope_map.map_to_target(
-        source, lens, goal.picture, screen=goal.receiver, n=n, iterations=count, progress=progress
-    )
+    return slope_map.map_to_target(source, lens, goal, n, solver=Solver(count, progress=progress))
 
 
 def tent_average(target: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ import torch
 from bstcad.runs import files
 from bstcad.runs.files import SceneError
 
-MAGIC = b"bstcad checkpoint 8\n"  # version; raise it when a record of a state, or the purpose, changes its fields
+MAGIC = b"bstcad checkpoint 9\n"  # version; raise it when a record of a state, or the purpose, changes its fields
 DIGEST_SIZE = 65  # bytes of the line with the SHA-256
 MAX_SIZE = 8 << 30  # largest size of a checkpoint (bytes); 2049 x 2049 control points need 1 GB
 MAX_WRITING_FRACTION = 0.02  # largest fraction of the run's time that checkpoints may take

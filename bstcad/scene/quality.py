@@ -85,12 +85,7 @@ class Tailoring(Record):
         """Number of points that represent an extended source."""
         return self.source_points or PRESETS[self.quality]["source_points"]
 
-    @property
-    def side(self) -> int:
-        """Control points per side of the square net with as many points as the finest of `levels`, once resolved."""
-        return side(self.levels[-1])
-
-    def resolved(self, net: Sides) -> Tailoring:
+    def resolved(self, net: Sides) -> ResolvedTailoring:
         """Return the settings with all values set, for a net of control points per side, or along x and along y.
 
         Levels of an oblong net are pairs, with cells of the shape of the net's.  Defaults: at least two rays per cell
@@ -106,7 +101,7 @@ class Tailoring(Record):
         if self.quality != "paper":  # a finer map has folds in corners, which a net cannot follow
             preset["transport_grid"] = min(preset["transport_grid"], max(2 * (max(as_pair(net)) - 1), COARSEST_GRID))
         given = self.model_dump(exclude_none=True, exclude={"levels"})
-        return Tailoring.model_validate(preset | given)
+        return ResolvedTailoring.model_validate(preset | given)
 
     def complaints(self, lens: LensBlank) -> Iterator[str]:
         """Yield the faults: levels that do not end with the net, and keys that the method does not support."""
@@ -130,6 +125,27 @@ class Tailoring(Record):
             yield f"lens.front.optimise: {who} cannot optimise a front; {fixed}, or choose another {other}"
         if self.method == "integration" and self.stage2_iterations:
             yield f"tailoring.stage2_iterations: {who} has no stage 2; remove it, or choose another {other}"
+
+
+class ResolvedTailoring(Tailoring):
+    """The effort of tailoring with all values set, by `Tailoring.resolved`."""
+
+    method: Literal["least-squares", "adam", "integration"]
+    levels: tuple[Sides, ...]
+    transport_grid: int
+    transport_iterations: int
+    rays: int
+    stage1_iterations: int
+    rounds: int
+    stage2_iterations: int
+    overshoot: float
+    source_points: int
+    precision: Literal["float32", "float64"]
+
+    @property
+    def side(self) -> int:
+        """Control points per side of the square net with as many points as the finest of `levels`."""
+        return side(self.levels[-1])
 
 
 def coarse_to_fine(net: Sides) -> tuple[Sides, ...]:

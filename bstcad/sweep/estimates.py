@@ -19,6 +19,7 @@ from bstcad.analysis.cost import ending, remaining
 from bstcad.analysis.neglected_effects import Change, Reference
 from bstcad.optics import media
 from bstcad.optics.channels import Channel
+from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
 from bstcad.optics.sides import as_pair
 from bstcad.report.record import DesignCourse, LeftOut
@@ -26,7 +27,7 @@ from bstcad.scene.effects import Absorption, Effect, Fresnel, Ghost, losses, nam
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.machinability import place_back
 from bstcad.tailoring.slope_fit import Fit
-from bstcad.tailoring.slope_map import face_grid, fit_to_map, lit_window, slope_map
+from bstcad.tailoring.slope_map import Solver, face_grid, fit_to_map, lit_window, slope_map, square_grid
 from bstcad.verify.checks import Proof
 
 # --- a coarse lens ----------------------------------------------------------------------------------------------------
@@ -42,23 +43,22 @@ def coarse_lens(scene: Scene) -> Lens:
     channel = _central_channel(scene)
     lens = channel.through(scene.flat_lens(COARSE_POINTS))
     picture = _downsample(scene.target.irradiance(), COARSE_PIXELS)
-    screen = replace(scene.target.screen, pixels=picture.shape[::-1])
+    rows, columns = picture.shape
+    goal = Goal("target", replace(scene.target.screen, pixels=(columns, rows)), picture)
     if scene.lens.front.free:
-        from bstcad.tailoring.stage1 import shaped_front  # with scipy.optimize, a tenth of a second to load
+        from bstcad.tailoring import stage1  # with scipy.optimize, a tenth of a second to load
 
         start = replace(lens, back=scene.flat_lens(FRONT_NET).back)
-        found = shaped_front(
-            channel.source, start, picture, screen, free=scene.lens.front.free, rim_sags=scene.rim_sags, n=COARSE_CELLS,
-            iterations=COARSE_STEPS, repeats=1,
-        )  # fmt: skip
+        free, effort = scene.lens.front.free, stage1.FrontSearch(COARSE_CELLS, COARSE_STEPS, repeats=1)
+        found = stage1.shaped_front(channel.source, start, goal, free, rim_sags=scene.rim_sags, effort=effort)
         lens = replace(lens, front=found.front)
     slopes, z = None, lens.back.z
-    sizes = {"n": COARSE_CELLS, "iterations": COARSE_STEPS}
     for _ in range(TRANSPORT_ROUNDS):
         window = lit_window(channel.source, lens)
-        slopes = slope_map(channel.source, lens, window, picture, screen=screen, previous=slopes, **sizes)
+        grid = square_grid(channel.source, lens, window, COARSE_CELLS)
+        slopes = slope_map(lens, grid, goal, slopes, solver=Solver(COARSE_STEPS))
         grid = face_grid(channel.source, lens, window, 2 * COARSE_POINTS)
-        lens = fit_to_map(lens, slopes, grid, Fit(bending=1e-2, steps=20, degree=3), unlit=0.0)
+        lens = fit_to_map(lens, slopes, grid, Fit(bending=1e-2, steps=20, degree=3))
         lens = place_back(lens, z, scene.lens.min_thickness)
     return lens
 

@@ -28,7 +28,7 @@ from bstcad.runs.processes import Tick
 from bstcad.scene.quality import COARSEST_GRID
 from bstcad.scene.scene import Scene
 from bstcad.sweep.cold_run import KERNEL_REPEATS, calibration_kernel, measure_seconds
-from bstcad.tailoring.run import RRMSD_SECONDS, Task
+from bstcad.tailoring.run import RRMSD_SECONDS, Hooks, Task
 from bstcad.tailoring.slope_map import SUBCELLS
 from bstcad.tailoring.stage2 import round_shares, sheet_sizes, stage3_sheet_sizes
 
@@ -79,7 +79,8 @@ def run_pilot(scene: Scene, quality: str, tick: Tick = lambda: None) -> Pilot:
     """Design a small version of a scene in some quality; raise SceneError if its design would be refused."""
     small, factor = pilot_scene(with_quality(scene, quality))
     compilations = RecordingListener()
-    make_design = partial(pipeline.design, small, progress=lambda *event: tick(), later=True)
+    hooks, options = Hooks(progress=lambda *event: tick()), pipeline.DesignOptions(compare_later=True)
+    make_design = partial(pipeline.design, small, hooks=hooks, options=options)
     with install_listener("numba:compile", compilations):
         finished = make_design()
     if compilations.buffer:  # the first design after an installation waits for the compiler; time another one

@@ -27,7 +27,7 @@ from bstcad.optics.sampling import sample_rim
 from bstcad.scene.blank import Bounds
 
 PENALTY_MARGIN = 0.01  # distance from a bound at which the penalty begins, relative to the bound
-RIM_POINTS = 1025  # points along a quarter of the rim
+QUARTER_RIM_POINTS = 1025  # points along a quarter of the rim
 CELL_POINTS = 4  # control points along each axis on which a cell may depend: those of two knot spans
 TILE_CELLS = 16  # cells along each axis in a tile
 CELL_ROUNDING = 1e-9  # rounding of the number of cells, so that nets as fine as the cells do not add one
@@ -50,7 +50,7 @@ def clearance(lens: Lens, bounds: Bounds) -> tuple[float, dict[int, Tensor], flo
     no point is close.  Both nets have the same precision.  Sums have fixed parts: no bit depends on threads.
     """
     length, square, worst = unit(lens, bounds), 0.0, -PENALTY_MARGIN
-    front, back = map(lens.number_of, ("front", "back"))
+    front, back = lens.number_of("front"), lens.number_of("back")
     faces = {front: (lens.front_net, -1.0), back: (lens.back_net, 1.0)}  # (net, ∂t / ∂z)
     gradients: dict[int, Tensor] = {}
     for x, y, share, thinnest in _points_near_bounds(lens, bounds, PENALTY_MARGIN * length):
@@ -77,7 +77,7 @@ def _points_near_bounds(lens: Lens, bounds: Bounds, margin: float) -> Iterator[t
     for x, y in grid.near(lens, bounds, margin):
         yield x, y, 1 / grid.points, bounds.thinnest
     if bounds.edge is not None:
-        x, y = (p.to(lens.like) for p in sample_rim(lens.outline, RIM_POINTS))
+        x, y = (p.to(lens.like) for p in sample_rim(lens.outline, QUARTER_RIM_POINTS))
         yield x, y, 1 / len(x), max(bounds.thinnest, bounds.edge)
 
 

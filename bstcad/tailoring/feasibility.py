@@ -26,11 +26,12 @@ from bstcad.optics.reach import largest_deflection
 from bstcad.tailoring import light_behind
 from bstcad.tailoring.light_behind import LightBehind
 from bstcad.tailoring.run import Task, no_progress
-from bstcad.tailoring.slope_map import corners_of, lit_window
+from bstcad.tailoring.slope_map import corners_of, lit_window, square_grid
 from bstcad.tailoring.stage2 import with_pixels
 from bstcad.tailoring.two_faces import front_map
+from bstcad.transport.mapping import Solver
 
-TRIAL_CELLS, TRIAL_PIXELS = 64, 128  # cells and pixels a side of the coarse grids
+TRIAL_CELLS, TRIAL_PIXELS = 64, 128  # cells and pixels per side of the coarse grids
 TRIAL_ITERATIONS = 100  # iterations of the coarse maps
 MAX_UNSERVED = 0.5  # largest fraction of the light that two faces may fail to serve
 REPORTED_FRACTION = 1e-3  # smallest fraction of the light that is reported as not served
@@ -91,7 +92,8 @@ class Demand:
 def find_demand(task: Task, lens: Lens) -> Demand:
     """Return the demand of the task's solution, or else of the better one; lens: the blank, with both faces free."""
     task = task.with_imaged_receivers(lens)
-    solutions = [_demand(_trial_task(task, solution), lens) for solution in _solutions(task)]
+    both = (1.0,) if task.wave is not None else (1.0, -1.0)
+    solutions = [_demand(task, sign, lens) for sign in (both if task.solution is None else (task.solution,))]
     best, light = min(solutions, key=lambda one: one[0].rank)
     if is_infeasible(best):
         return best
@@ -100,46 +102,35 @@ def find_demand(task: Task, lens: Lens) -> Demand:
     for floor in FLOORS if len(task.goals) > 1 and task.wave is None else ():
         if lifted[-1].lifted_turn <= MAX_GENTLE_TURN:
             break
-        _, light = _demand(_trial_task(replace(task, floor=floor), best.solution), lens)
+        _, light = _demand(replace(task, floor=floor), best.solution, lens)
         lifted.append(replace(best, floor=floor, lifted_turn=_largest_turn(task, lens, light)))
     return min(lifted, key=lambda each: max(MAX_GENTLE_TURN, each.lifted_turn))
 
 
-def _solutions(task: Task) -> tuple[float, ...]:
-    if task.solution is not None:
-        return (task.solution,)
-    return (1.0,) if task.wave is not None else (1.0, -1.0)
-
-
-def _trial_task(task: Task, solution: float) -> Task:
+def _demand(task: Task, solution: float, lens: Lens) -> tuple[Demand, LightBehind]:
+    """Return the demand of a solution on coarse grids, without the turn, and its light behind the lens."""
     knobs = task.knobs.model_copy(update={"transport_grid": TRIAL_CELLS, "transport_iterations": TRIAL_ITERATIONS})
-    return replace(with_pixels(task, TRIAL_PIXELS), knobs=knobs, solution=solution, progress=no_progress)
-
-
-def _demand(task: Task, lens: Lens) -> tuple[Demand, LightBehind]:
-    """Return the demand of a task with a solution, without the turn, and the light behind the lens that can be had."""
+    task = replace(with_pixels(task, TRIAL_PIXELS), knobs=knobs, solution=solution, progress=no_progress)
     light = light_behind.light_for_task(task)
     angle = np.degrees(np.arccos(light.direction[2].clip(-1, 1)))[corners_of(light.picture)]
     crossed = light.crossed_fraction(lens.back)
     near = min(task.goals, key=lambda goal: goal.receiver.plane.throw(0.0))
     served = light_behind.without_crossings(light, near.receiver, lens.back, TRIAL_CELLS)
-    demand = Demand(
-        task.solution, float(angle.max()), float(np.sqrt((angle**2).mean())), crossed=crossed,
-        outside=served.fraction_outside(lens.back, lens.apertures[1].scaled(1 + 1e-3).contains),
-        turn=math.nan, limit=math.degrees(largest_deflection(lens.index)),
-    )  # fmt: skip
-    return demand, served
+    outside = served.fraction_outside(lens.back, lens.apertures[1].scaled(1 + 1e-3).contains)
+    limit, largest, rms = math.degrees(largest_deflection(lens.index)), float(angle.max()), np.sqrt((angle**2).mean())
+    return Demand(solution, largest, float(rms), crossed, outside=outside, turn=math.nan, limit=limit), served
 
 
 @torch.no_grad()
 def _largest_turn(task: Task, lens: Lens, light: LightBehind) -> float:
     """Return the largest angle (degrees) between a ray before the front and the same ray in the glass."""
     front, source = lens.shaping("front"), task.heaviest.source
-    back = light.intersect(lens.back)
-    wanted = front_map(source, front, lit_window(source, front), light.picture, back=back, n=TRIAL_CELLS, places=None)
+    window, b = lit_window(source, front), light.intersect(lens.back)
+    grid = square_grid(source, front, window, TRIAL_CELLS)
+    slopes = front_map(front, grid, window, light.picture, b=b, q=None, solver=Solver())
     lit = corners_of(light.picture)
-    x, y = (torch.from_numpy(q[lit]) for q in wanted.places)
-    way = torch.from_numpy(back[:, lit]) - torch.stack([x, y, lens.front.sag_and_slope(x, y)[0]])
+    x, y = (torch.from_numpy(q[lit]) for q in slopes.face_points)
+    way = torch.from_numpy(b[:, lit]) - torch.stack([x, y, lens.front.sag_and_slope(x, y)[0]])
     coming = source.rays(x, y, lens.entrance.z, 1.0).direction
     cosine = (way * coming).sum(0) / torch.sqrt((way * way).sum(0))
     return math.degrees(math.acos(max(-1.0, min(1.0, float(cosine.min())))))

@@ -31,7 +31,7 @@ from bstcad.tailoring.run import Edge
 from bstcad.tailoring.slope_map import face_grid, interpolate, lit_window, rays_at
 
 PENALTY_WEIGHT = 100.0  # weight of the penalty relative to RRMSD²
-MAX_CELLS = 257  # largest number of cells a side of the grid from which the light is interpolated
+MAX_CELLS = 257  # largest number of cells per side of the grid from which the light is interpolated
 # u above which `without_reflection` penalises, and its largest accepted excess, as a fraction of 1 - PENALTY_START
 PENALTY_START, ACCEPTED_EXCESS = 0.6, 0.5
 MAX_EVALUATIONS = 60  # largest number of evaluations of the penalty alone
@@ -44,7 +44,7 @@ class Grazing:
     net: BSplineSurface  # net whose knots are used; its heights are not
     at_face: Rays  # (3, m, n) rays that meet the face at these points of the lens it was made for, before refraction
     weight: Tensor  # (m, n) fraction of the light at each point, sum 1
-    eta: float  # index before the face over the index behind it
+    eta: float  # ratio of the index before the face to that behind it
     angle: float  # θ'_max (rad)
 
     @classmethod
@@ -53,9 +53,10 @@ class Grazing:
         own_lens = edge.light.through(lens)
         source, net = edge.light.source, own_lens.nets[-1]
         window = lit_window(source, own_lens)
-        grid = face_grid(source, own_lens, window, tuple(min(2 * m, MAX_CELLS) for m in net.shape))
+        m, n = net.shape
+        grid = face_grid(source, own_lens, window, (min(2 * m, MAX_CELLS), min(2 * n, MAX_CELLS)))
         axes = zip((net.x, net.y), net.pitch, net.shape, strict=True)
-        x, y = np.meshgrid(*(low + pitch * _span_points(m) for (low, _), pitch, m in axes), indexing="ij")
+        x, y = np.meshgrid(*(low + pitch * _span_points(count) for (low, _), pitch, count in axes), indexing="ij")
         inside = (np.abs(x) <= window.width / 2) & (np.abs(y) <= window.height / 2)
         light = np.where(inside, interpolate(grid, grid.density[None], (x, y))[0].numpy(), 0.0)
         weight = torch.from_numpy(maximum_filter(light, 5))  # spans that are lit in part count whole

@@ -42,9 +42,9 @@ from bstcad.optics.surfaces import Surface
 from bstcad.optics.wavefront import SphericalWave, Wave
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.run import Task
-from bstcad.tailoring.slope_map import centroid, pixel_corners, spread_density
+from bstcad.tailoring.slope_map import centroid, pixel_corners, resample_picture
 from bstcad.transport.bfm import TransportStep
-from bstcad.transport.mapping import grid_coordinates, solve
+from bstcad.transport.mapping import Points, Solver, grid_coordinates, solve
 
 MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # rounds of the map; cells of the coarse ones: n // 4, minimum
 MAX_ITERATIONS = 40  # largest number of iterations for the point of a wave whose ray meets a given point of the target
@@ -53,13 +53,14 @@ SOURCE_FLOOR = 0.02  # floor under the map's source picture, relative to the mea
 # Standard deviations (pixels) of the blur of the source picture, reduced in turn once the map is found.  For a portrait
 # with dark beside bright parts Newton's method ends at a mass error of 0.06 to 0.25 without, and of 0.003 with them.
 BLURS = (4.0, 2.0, 1.0)
-FINE_FACTOR = 2  # cells of the last map per cell of the transport's grid a side: letters cover much of a face
-TARGET_FLOORS = (0.1, 0.03, 0.01, 0.003)  # floors under the target picture, relative to its mean, lowered in turn
+FINE_FACTOR = 2  # cells per side of the last map, relative to the transport's grid: letters cover much of a face
+# Solver with floors under the target picture, relative to its mean, that are lowered in turn
+TARGETS_SOLVER = Solver(floors=(0.1, 0.03, 0.01, 0.003))
 CONTRAST_RATIO = 1.5  # ratio of contrasts above which the rays are those through the pixels of the sharper picture
-NEWTON_STEPS = 8  # Newton iterations for the intersection with a face
+INTERSECTION_STEPS = 8  # Newton iterations for the intersection with a face
 CROSSING_TOLERANCE = 1e-4  # fraction of the light whose rays may cross, as rounding leaves it
 
-Grid = tuple[np.ndarray, np.ndarray]
+Picture = tuple[Screen, np.ndarray]  # screen, and flux in its pixels (rows, columns) of any sum
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +76,12 @@ class LightBehind:
         position, direction = (v[:, ::-1, ::-1].copy() for v in (self.position, self.direction))
         return replace(self, position=position, direction=direction, picture=self.picture[::-1, ::-1])
 
-    def positions_on(self, plane: Receiver) -> Grid:
+    def positions_on(self, plane: Receiver) -> Points:
         """Return x and y (mm) on a plane where the rays cross it, (c + 1, r + 1) each."""
-        *along, normal = plane.frame
-        centre = np.array(plane.middle)
-        off = centre.reshape(3, 1, 1) - self.position
+        (e_x, e_y, normal), (x, y) = _frame(plane), plane.origin
+        off = np.array(plane.middle).reshape(3, 1, 1) - self.position
         off = _dot(normal, off) / _dot(normal, self.direction) * self.direction - off
-        return tuple(_dot(axis, off) + c for axis, c in zip(along, plane.origin, strict=True))
+        return _dot(e_x, off) + x, _dot(e_y, off) + y
 
     def sampled_at(self, screen: Screen, values: np.ndarray) -> np.ndarray:
         """Interpolate values (k, c + 1, r + 1) at the rays to the corners of a screen, (k, columns + 1, rows + 1)."""
@@ -94,7 +94,7 @@ class LightBehind:
         """Return the points (3, c + 1, r + 1) where the rays, traced backwards, meet a surface (mm)."""
         (x, y, z), (dx, dy, dz) = (torch.from_numpy(v) for v in (self.position, self.direction))
         path = (surface.z - z) / dz
-        for _ in range(NEWTON_STEPS):
+        for _ in range(INTERSECTION_STEPS):
             h, z_x, z_y = surface.sag_and_slope(x + path * dx, y + path * dy)
             path = path - (z + path * dz - h) / (dz - z_x * dx - z_y * dy)
         return torch.stack([x + path * dx, y + path * dy, z + path * dz]).numpy()
@@ -117,9 +117,8 @@ class LightBehind:
         they vary linearly across the gap between two bright parts of a picture.  Outside the light they are those of
         the nearest ray.  At most max(m, n) rays along each axis are used, at even spacing.
         """
-        every = np.ix_(
-            range(3), *(np.linspace(0, m - 1, min(m, max(x.shape)), dtype=int) for m in self.position.shape[1:])
-        )
+        i, j = (np.linspace(0, m - 1, min(m, max(x.shape)), dtype=int) for m in self.position.shape[1:])
+        every = np.ix_(np.arange(3), i, j)
         few = replace(self, position=self.position[every], direction=self.direction[every])
         met, directions = few.intersect(surface)[:2].reshape(2, -1).T, few.direction.reshape(3, -1).T
         at = np.stack([p.cpu().double().numpy().reshape(-1) for p in (x, y)], axis=-1)
@@ -127,8 +126,8 @@ class LightBehind:
             found = LinearNDInterpolator(met, directions)(at)
         outside = np.isnan(found[:, 0])
         found[outside] = directions[cKDTree(met).query(at[outside])[1]]
-        found = torch.from_numpy(found.T.reshape(3, *x.shape).copy())
-        return (found / torch.sqrt((found * found).sum(0))).to(x)
+        way = torch.from_numpy(found.T.reshape(3, *x.shape).copy())
+        return (way / torch.sqrt((way * way).sum(0))).to(x)
 
     @property
     def _flux(self) -> np.ndarray:
@@ -144,21 +143,20 @@ def light_for_task(task: Task) -> LightBehind:
     n = task.knobs.transport_grid
     if task.wave is not None:
         parts = max(1, round(n / max(near.receiver.shape)))
-        wavelength = task.heaviest.source.wavelength
+        wavelength = task.heaviest.source.main_wavelength
         return light_of_wave(near.receiver, near.picture, task.wave, wavelength=wavelength, parts=parts)
 
     def progress(s: TransportStep) -> None:
         task.progress("stage 1", 0, task.knobs.rounds, f"between the targets, {s.grid}² cells")
 
-    return between_targets(
-        (near.receiver, near.picture), (far.receiver, np.maximum(far.picture, task.floor * far.picture.mean())), n,
-        sign=task.solution or 1.0, iterations=task.knobs.transport_iterations, progress=progress,
-    )  # fmt: skip
+    lifted = far.receiver, np.maximum(far.picture, task.floor * far.picture.mean())
+    solver = replace(TARGETS_SOLVER, iterations=task.knobs.transport_iterations, progress=progress)
+    return between_targets((near.receiver, near.picture), lifted, n, sign=task.solution or 1.0, solver=solver)
 
 
-def corners(screen: Screen, parts: int) -> Grid:
+def corners(screen: Screen, parts: int) -> Points:
     """Return x and y (mm) on a screen of the corners of its pixels cut into parts x parts, x first."""
-    return tuple(pixel_corners(replace(screen, pixels=(parts * screen.columns, parts * screen.rows))))
+    return pixel_corners(replace(screen, pixels=(parts * screen.columns, parts * screen.rows)))
 
 
 def subdivide(picture: np.ndarray, parts: int) -> np.ndarray:
@@ -169,6 +167,11 @@ def subdivide(picture: np.ndarray, parts: int) -> np.ndarray:
 def in_space(plane: Receiver, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the points (3, …) in space (mm) at x and y (…) on a receiver."""
     return np.stack(plane.point(x, y))
+
+
+def _frame(plane: Receiver) -> tuple[Vector, Vector, Vector]:
+    assert plane.frame is not None, "`light_for_task` refuses receivers that are not planes"
+    return plane.frame
 
 
 def _dot(vector: Vector, of: np.ndarray) -> np.ndarray:
@@ -200,53 +203,51 @@ def light_of_wave(screen: Screen, picture: np.ndarray, wave: Wave, *, wavelength
 
 
 def between_targets(
-    near: tuple[Screen, np.ndarray], far: tuple[Screen, np.ndarray], n: int, *, sign: float = 1.0, iterations: int = 40,
-    progress: Callable[[TransportStep], None] | None = None,
-) -> LightBehind:  # fmt: skip
+    near: Picture, far: Picture, n: int, sign: float = 1.0, solver: Solver = TARGETS_SOLVER
+) -> LightBehind:
     """Return the rays through two pictures by transport on n x n cells.
 
-    near, far: (screen, picture (rows, columns) of any sum).  sign: σ, 1 for the convex and -1 for the concave solution.
+    sign: σ, 1 for the convex and -1 for the concave solution.
     The map leads from the near to the far picture, or back if the near one has clearly more contrast: a map to a
     picture with holes converges more safely than a map from it.  The rays are about as dense as the cells, and denser
     for a picture of high contrast, whose bright pixels have to resolve the other picture.
     """
     contrasts = [float((p**2).mean() / p.mean() ** 2) for _, p in (near, far)]
     against = contrasts[0] > CONTRAST_RATIO * contrasts[1]  # True: rays are followed backwards, from far to near
-    (screen, picture), (behind, wanted) = (far, near) if against else (near, far)
+    (screen, picture), (behind, target) = (far, near) if against else (near, far)
     smooth = (gaussian_filter(picture, width, mode="nearest") for width in BLURS)
-    own, *pictures = (np.maximum(p, SOURCE_FLOOR * p.mean()) for p in (picture, *smooth))
-    along = screen.plane.frame[:2]
+    sharp, *pictures = (np.maximum(p, SOURCE_FLOOR * p.mean()) for p in (picture, *smooth))
+    e_x, e_y, _ = _frame(screen.plane)
 
-    def cosines(p: np.ndarray, t: np.ndarray) -> Grid:
+    def cosines(p: np.ndarray, t: np.ndarray) -> Points:
         way = _normalised(t - p)
-        return _dot(along[0], way), _dot(along[1], way)
+        return _dot(e_x, way), _dot(e_y, way)
 
     t = in_space(behind.plane, *pixel_corners(behind))
-    m = in_space(behind.plane, *(np.array(c) for c in centroid(wanted, behind))).reshape(3, 1, 1)
+    m = in_space(behind.plane, *(np.array(c) for c in centroid(target, behind))).reshape(3, 1, 1)
     p = in_space(screen.plane, *(np.full_like(t[0], sum(ends) / 2) for ends in (screen.x, screen.y)))
     for turn in range(MAP_ROUNDS):
         last = turn == MAP_ROUNDS - 1
         cells = FINE_FACTOR * n if last else max(MIN_COARSE_CELLS, n // COARSE_DIVISOR)
-        y = tuple(sign * (c - g) for c, g in zip(cosines(p, t), cosines(p, m), strict=True))
-        (rho, frame), *others = (spread_density(each, tuple(pixel_corners(screen)), cells) for each in pictures)
+        (c_x, c_y), (g_x, g_y) = cosines(p, t), cosines(p, m)
+        y = sign * (c_x - g_x), sign * (c_y - g_y)
+        (rho, frame), *others = (resample_picture(each, pixel_corners(screen), cells) for each in pictures)
         sharper = [other for other, _ in others] if last else []
-        sigma, y_frame = spread_density(wanted, y, cells)
-        mapping = solve(
-            rho, sigma, frame, y_frame, sharper=sharper, iterations=iterations, falling=TARGET_FLOORS, progress=progress
-        )
+        sigma, y_frame = resample_picture(target, y, cells)
+        mapping = solve(rho, sigma, frame, y_frame, solver=solver, sharper=sharper)
         p = in_space(screen.plane, *mapping.inverse(*y))
     if max(contrasts) > CONTRAST_RATIO * min(contrasts):
         parts = max(1, round(n * math.sqrt(max(contrasts)) / max(behind.shape)))
         place = in_space(behind.plane, *corners(behind, parts))
         i, j = np.meshgrid(*(np.arange(parts * pixels + 1) / parts for pixels in behind.shape[::-1]), indexing="ij")
         way = _normalised(place - in_space(screen.plane, *mapping.inverse(*_bilinear(np.stack(y), i, j))))
-        light = LightBehind(place, -way if against else way, subdivide(wanted / wanted.sum(), parts))
+        light = LightBehind(place, -way if against else way, subdivide(target / target.sum(), parts))
         return light.reversed() if sign < 0 and not against else light
     parts = max(1, round(n / max(screen.shape)))
     place, there = in_space(screen.plane, *corners(screen, parts)), mapping(*corners(screen, parts))
-    i, j = grid_coordinates(*(sign * c for c in y), *(sign * c for c in there))  # as_pair increase with t
+    i, j = grid_coordinates(*(sign * c for c in y), *(sign * c for c in there))  # both increase with t
     way = _normalised(in_space(behind.plane, *_bilinear(np.stack(pixel_corners(behind)), i, j)) - place)
-    return LightBehind(place, way, subdivide(own / own.sum(), parts))
+    return LightBehind(place, way, subdivide(sharp / sharp.sum(), parts))
 
 
 def _normalised(way: np.ndarray) -> np.ndarray:
@@ -261,15 +262,12 @@ def without_crossings(light: LightBehind, screen: Screen, surface: Surface, n: i
     if light.crossed_fraction(surface) <= CROSSING_TOLERANCE:
         return light
     b_x, b_y, b_z = light.intersect(surface)
-    rho, frame = spread_density(light.picture, light.positions_on(screen.plane), n)
-    sigma, back_frame = spread_density(light.picture, (b_x, b_y), n)
+    rho, frame = resample_picture(light.picture, light.positions_on(screen.plane), n)
+    sigma, back_frame = resample_picture(light.picture, (b_x, b_y), n)
     mapping, there = solve(rho, sigma, frame, back_frame), light.positions_on(screen.plane)
     b = np.stack([*mapping(*there), np.full(light.position.shape[1:], float(b_z.mean()))])
     place = in_space(screen.plane, *there)
     return replace(light, position=place, direction=_normalised(place - b))
-
-
-# ---- grids of points -------------------------------------------------------------------------------------------------
 
 
 def _inverted(x: np.ndarray, y: np.ndarray) -> np.ndarray:

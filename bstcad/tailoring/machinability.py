@@ -20,27 +20,19 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from bstcad.optics.bspline import (
-    QUARTERS,
-    SPANS_AT_A_TIME,
-    BSplineSurface,
-    Jet,
-    Spans,
-    curvature_bounds,
-    near_outline,
-    slope_bounds,
-)
+from bstcad.optics import bspline
+from bstcad.optics.bspline import BSplineSurface, Jet, Spans
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Face, Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.sampling import sample_rim
 from bstcad.scene.blank import Bounds
 from bstcad.scene.errors import SceneError
-from bstcad.tailoring.clearance import PENALTY_MARGIN, RIM_POINTS, clearance
+from bstcad.tailoring.clearance import PENALTY_MARGIN, QUARTER_RIM_POINTS, clearance
 from bstcad.tailoring.merit import SobolevVariable
 from bstcad.tailoring.minimise import lbfgs, minimise
 
-THICKNESS_POINTS = 513  # points a side at which the thickness is computed
+THICKNESS_POINTS = 513  # points per side at which the thickness is computed
 RELIEF_RESERVE = 0.02  # additional thickness for the changes of stage 2, relative to the sag range (PV) of the back
 BOUNDS_STAGE = "bounds on the back"  # name of a stage in the record
 BOUND_RESERVE = 1e-3  # distance to a bound, relative to it, for the rounding of files and points between the grid's
@@ -49,7 +41,7 @@ BOUND_RESERVE = 1e-3  # distance to a bound, relative to it, for the rounding of
 # tests, with a minimum radius of 50 mm where it would take 20, ends at 0.015 with 1000 throughout, at 0.0033 with 10.)
 ROUND_WEIGHTS, ONLY_WEIGHT = (1000.0, 100.0, 10.0), 100.0
 REPAIR_EVALUATIONS = 100  # largest number of evaluations of the penalty alone
-BISECTIONS = 10  # bisection steps between a lens that exceeds the bounds and one that does not
+HALVINGS = 10  # bisection steps between a lens that exceeds the bounds and one that does not
 
 
 @torch.no_grad()
@@ -84,12 +76,13 @@ def thickness_points(lens: Lens) -> tuple[Tensor, Tensor]:
     axes = (torch.linspace(-half, half, THICKNESS_POINTS, dtype=torch.float64) for half in lens.outline.half_extent)
     x, y = torch.meshgrid(*axes, indexing="ij")
     inside = lens.outline.contains(x, y)
-    return tuple(p[inside].to(lens.like) for p in (x, y))
+    return x[inside].to(lens.like), y[inside].to(lens.like)
 
 
 def rim_points(lens: Lens) -> tuple[Tensor, Tensor]:
     """Return x and y (mm) of the points along the rim at which the thickness is computed."""
-    return tuple(p.to(lens.like) for p in sample_rim(lens.outline, RIM_POINTS))
+    x, y = sample_rim(lens.outline, QUARTER_RIM_POINTS)
+    return x.to(lens.like), y.to(lens.like)
 
 
 def round_weight(number: int, rounds: int) -> float:
@@ -128,9 +121,9 @@ def excess(lens: Lens, bounds: Bounds) -> Excess:
     nets = {k: net.to(torch.float64) for k, net in zip(lens.freeform, lens.nets, strict=True)}
     square, worst = 0.0, -PENALTY_MARGIN
     gradients = {k: net.heights.new_zeros(()).expand_as(net.heights) for k, net in nets.items()}
-    for squared, own, far in _parts(lens, nets, bounds):
-        square, worst = square + squared, max(worst, far)
-        gradients |= {k: gradients[k] + own[k] for k in own.keys() & nets.keys()}
+    for squared, changes, largest in _parts(lens, nets, bounds):
+        square, worst = square + squared, max(worst, largest)
+        gradients |= {k: gradients[k] + changes[k] for k in changes.keys() & nets.keys()}
     heights = (net.heights for net in lens.nets)
     given = tuple(g.to(h) for g, h in zip(gradients.values(), heights, strict=True))  # in the precision of the lens
     return Excess(square, given, worst)
@@ -156,7 +149,7 @@ def _bounds_from_above(lens: Lens, bounds: Bounds) -> dict[int, Bounds]:
     """Return the bounds on z(x, y), seen from +z, for each tailored face, by its number."""
     front = replace(bounds, concave=bounds.convex, convex=bounds.concave)
     faces: dict[Face, Bounds] = {"back": bounds, "front": front}
-    return {lens.number_of(face): own for face, own in faces.items() if lens.shapes(face)}
+    return {lens.number_of(face): limits for face, limits in faces.items() if lens.shapes(face)}
 
 
 def _shape_excess(net: BSplineSurface, outline: Outline, bounds: Bounds) -> tuple[float, Tensor, float]:
@@ -164,12 +157,12 @@ def _shape_excess(net: BSplineSurface, outline: Outline, bounds: Bounds) -> tupl
     square, worst, gradient = 0.0, -PENALTY_MARGIN, torch.zeros_like(net.heights)
     for spans, reached, bound, quantity in _spans_near_bounds(net, outline, bounds):
         leaf = spans.heights.detach().requires_grad_()
-        ratio = quantity(replace(spans, heights=leaf).jet(QUARTERS)) / bound
+        ratio = quantity(replace(spans, heights=leaf).jet(bspline.QUARTERS)) / bound
         relative = torch.where(reached, ratio - 1, -PENALTY_MARGIN)
         squared = total(torch.relu(relative + PENALTY_MARGIN) ** 2)
         gradient += spans.scattered(*torch.autograd.grad(squared, leaf))
         square, worst = square + float(squared.detach()), max(worst, float(relative.detach().max()))
-    count = math.prod(len(QUARTERS) * (points - 2) for points in net.shape)
+    count = math.prod(len(bspline.QUARTERS) * (points - 2) for points in net.shape)
     return square / count, gradient / count, worst
 
 
@@ -178,15 +171,15 @@ def _spans_near_bounds(
 ) -> Iterator[tuple[Spans, Tensor, float, Callable[[Jet], Tensor]]]:
     """Yield spans that may be near a bound, in blocks: spans, points inside the outline, bound, quantity."""
     for bound, upper_limit, quantity in (
-        (bounds.concave, partial(curvature_bounds, net, 1.0), lambda jet: jet.curvatures[0]),
-        (bounds.convex, partial(curvature_bounds, net, -1.0), lambda jet: -jet.curvatures[1]),
-        (bounds.slope, partial(slope_bounds, net), lambda jet: jet.slope),
+        (bounds.concave, partial(bspline.curvature_bounds, net, 1.0), lambda jet: jet.curvatures[0]),
+        (bounds.convex, partial(bspline.curvature_bounds, net, -1.0), lambda jet: -jet.curvatures[1]),
+        (bounds.slope, partial(bspline.slope_bounds, net), lambda jet: jet.slope),
     ):
         if bound is None:
             continue
         near = torch.nonzero(upper_limit() > (1 - PENALTY_MARGIN) * bound)
-        for i, j in (part.T for part in near.split(SPANS_AT_A_TIME) if len(part)):
-            yield Spans.of(net, i, j), near_outline(net, outline, i=i, j=j, s=QUARTERS), bound, quantity
+        for i, j in (part.T for part in near.split(bspline.SPANS_AT_A_TIME) if len(part)):
+            yield Spans.of(net, i, j), bspline.near_outline(net, outline, i=i, j=j, s=bspline.QUARTERS), bound, quantity
 
 
 def _thickness_excess(lens: Lens, bounds: Bounds) -> tuple[float, Tensor, float]:
@@ -194,20 +187,20 @@ def _thickness_excess(lens: Lens, bounds: Bounds) -> tuple[float, Tensor, float]
 
     The unit is the difference of the bounds, or the sag range of the back if less, so that a shift along z meets both.
     """
-    x, y = thickness_points(lens)
-    heights = lens.back.relative_sag_and_slope(x, y)[0]
+    assert bounds.thickest is not None, "without a maximum a move of the back meets the bounds"
+    everywhere, net = thickness_points(lens), lens.back_net
+    heights = net.relative_sag_and_slope(*everywhere)[0]
     room = min(bounds.thickest - bounds.thinnest, float(heights.max() - heights.min())) or 1.0
-    leaf = lens.back_net.heights.detach().requires_grad_()
-    back, square, worst = replace(lens.back_net, heights=leaf), 0.0, -PENALTY_MARGIN
-    for x, y, least in (
-        (*thickness_points(lens), bounds.thinnest),
-        (*rim_points(lens), max(bounds.thinnest, bounds.edge or 0.0)),
-    ):
+    leaf = net.heights.detach().requires_grad_()
+    back, square, worst = replace(net, heights=leaf), torch.zeros(()), -PENALTY_MARGIN
+    rim = rim_points(lens), max(bounds.thinnest, bounds.edge or 0.0)
+    for (x, y), least in ((everywhere, bounds.thinnest), rim):
         glass = back.sag_and_slope(x, y)[0] - lens.front.sag_and_slope(x, y)[0]
         relative = torch.maximum(glass - bounds.thickest, least - glass) / room
         square = square + total(torch.relu(relative + PENALTY_MARGIN) ** 2) / len(x)
         worst = max(worst, float(relative.detach().max()))
-    return float(square.detach()), *torch.autograd.grad(square, leaf), worst
+    (gradient,) = torch.autograd.grad(square, leaf)
+    return float(square.detach()), gradient, worst
 
 
 def enforce_bounds(lens: Lens, bounds: Bounds) -> Lens:
@@ -234,19 +227,19 @@ def enforce_bounds(lens: Lens, bounds: Bounds) -> Lens:
     return _nearest(lens, flat, bounds, _with_back_moved)
 
 
-def _nearest(wanted: Lens, known: Lens, bounds: Bounds, place: Callable[[Lens, Bounds], Lens]) -> Lens:
-    """Return the lens nearest to `wanted`, which exceeds the bounds, on the line to `known`, which meets them."""
-    start = _heights(wanted)
-    changes = [end - begin for end, begin in zip(_heights(known), start, strict=True)]
+def _nearest(lens: Lens, valid: Lens, bounds: Bounds, place: Callable[[Lens, Bounds], Lens]) -> Lens:
+    """Return the lens nearest to `lens`, which exceeds the bounds, on the line to `valid`, which meets them."""
+    start = _heights(lens)
+    changes = [end - begin for end, begin in zip(_heights(valid), start, strict=True)]
     low, high = 0.0, 1.0
-    for _ in range(BISECTIONS):
+    for _ in range(HALVINGS):
         fraction = (low + high) / 2
-        trial = place(wanted.with_heights(h + fraction * d for h, d in zip(start, changes, strict=True)), bounds)
+        trial = place(lens.with_heights(h + fraction * d for h, d in zip(start, changes, strict=True)), bounds)
         if _exceeds(trial, bounds):
             low = fraction
         else:
-            high, known = fraction, trial
-    return known
+            high, valid = fraction, trial
+    return valid
 
 
 def _heights(lens: Lens) -> list[Tensor]:

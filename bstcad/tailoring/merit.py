@@ -2,7 +2,11 @@
 
 The merit is the weighted mean over the goals, of RRMSD² for a picture and of the squared RMS wavefront error in waves:
 
-    M = (Σ_k w_k RRMSD_k² + w (RMS / λ)²) / (Σ_k w_k + w).
+    M = (Σ_k w_k RRMSD_k² + w (RMS / λ)²) / (Σ_k w_k + w),    RRMSD_k² = Σ_ij |E^s_ij - E_ij|² / Σ_ij E_ij².
+
+All pixels have the same weight, lit or not.  The target E has the sum 1.  The picture E^s is relative to the light that
+the lens transmits, on the target and beside it, so that losses at faces and in the glass do not count, but light beside
+the target does.  (Reports scale both pictures to the sum 1.)
 
 Two terms are added, averaged over the pictures: a penalty on light outside the target, and the fraction of the light
 that is lost.  Light outside the target changes no pixel and so has no gradient; the penalty is `overshoot` (1 / pixel²)
@@ -11,15 +15,16 @@ the light.  For a source of finite size they are those of its centre, blurred (s
 of a ray is its optical path S to the plane of the wave less the phase W of the wave there (wavefront_error.py),
 without piston.
 
-A change δz of the last face moves the light by the throw L times its slope, and so changes the irradiance by about
-E L Δδz.  With dA_t = (e / E) dA_b, e the flux density on the back face, the squared error is
+The Hessian: let e be the flux density on the last face, and E the irradiance of the target where its light lands.  A
+change δz of the face moves this light by L ∇δz, L the throw (mm), and so changes E by about E L Δδz.  The light of an
+area dA_b of the face falls on the area dA_t = (e / E) dA_b of the target, so that the squared error is
 
-    ∫ δE² dA_t  =  L² ∫ e E (Δδz)² dA_b.
+    ∫ δE² dA_t  =  ∫ (E L Δδz)² (e / E) dA_b  =  L² ∫ e E (Δδz)² dA_b.
 
-The Hessian is Δ e E Δ.  In the variable c with δz = Δ^-1 E^-1/2 c it is the identity for a beam of uniform e.  Pixels
-average over finer detail, which makes a weaker power of Δ better: 0.5 by measurement (letters are best with a still
-weaker power, portraits with a stronger one).  The weight E^-1/2 halves the evaluations for pictures with dark parts.
-Δ is diagonal in the cosine transform of the net.
+As a quadratic form in δz this is the operator Δ e E Δ.  In the variable c with δz = Δ^-1 E^-1/2 c it becomes e, the
+identity for a uniform beam.  Pixels average over finer detail, which makes a weaker power of Δ better: 0.5 by
+measurement (letters are best with a still weaker power, portraits with a stronger one).  The weight E^-1/2 halves the
+evaluations for pictures with dark parts.  Δ is diagonal in the cosine transform of the net.
 
 Near the critical angle L is not constant: dθ' = η cos θ / cos θ' dθ grows without bound, and some points of the face
 move their light many times further than most.  There the weight is divided by the excess of L.
@@ -44,8 +49,7 @@ from bstcad.optics.bspline import BSplineSurface, resampling_matrix
 from bstcad.optics.channels import Channel, weighted_sum
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.goal import Goal
-from bstcad.optics.interfaces import Law
-from bstcad.optics.irradiance import Screen
+from bstcad.optics.interfaces import Law, Refract
 from bstcad.optics.kernels.reductions import elementary, quotient, total
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import RayTubes
@@ -57,14 +61,14 @@ from bstcad.optics.tubes import Tubes, arriving_flux, rays_to
 from bstcad.optics.unfolding import image_from_last_net
 from bstcad.optics.wavefront import MM_PER_NM, Wave
 from bstcad.optics.wavefront_error import path_from_reference
-from bstcad.tailoring.source_image import BlurOperator, Spread, blur_error, blurred, blurs, with_border
+from bstcad.tailoring.source_image import BlurOperator, ExtendedSource, blur_error, blurred, blurs, with_border
 
 LAPLACIAN_POWER = 0.5  # power of the Laplacian in the variable
 COARSE_LAPLACIAN_POWER = 0.75  # power of the Laplacian for coarse cells, which are wider than a pixel
 TARGET_BLUR = 1.0  # standard deviation of the blur of the target for the weight (pixels)
 WEIGHT_SMOOTHING = 1.5  # standard deviation of the smoothing of the weight's logarithm (control points)
 MAX_LOCAL_WEIGHT = 4.0  # largest local weight; the smallest is 1 / MAX_LOCAL_WEIGHT
-MIN_THROW, MAX_THROW = 3.0, 96.0  # range of the throw over its median in which the weight falls with the throw
+MIN_THROW, MAX_THROW = 3.0, 96.0  # range of the throw, relative to its median, in which the weight falls with the throw
 THROW_STEP = 1e-6  # step of the difference quotients of the throw, relative to the distance to the target
 THROW_STRIDE = 8  # stride of the control points that are checked first: few lenses have a large throw anywhere
 
@@ -74,6 +78,9 @@ def landing(rays: Landed, aim: Tensor) -> Tensor:
     lit = rays.alive & (rays.flux > 0)
     miss = (rays.position[0] - aim[0]) ** 2 + (rays.position[1] - aim[1]) ** 2
     return total(torch.where(lit, miss, torch.zeros_like(miss))) / lit.sum()
+
+
+PictureError = Callable[[Tensor, Tensor], Tensor]  # function of a picture and its target, (rows, columns)
 
 
 class Landings(NamedTuple):
@@ -91,33 +98,33 @@ class Merit:
     goals: tuple[Goal, ...]
     overshoot: float  # weight of light outside the border of a target (1 / pixel²)
     wave: Wave | None = None  # wavefront goal, for the first channel; None: there is none
-    own: Callable[[Tensor, Tensor], Tensor] | None = None  # function of picture and target in place of RRMSD²
+    picture_error: PictureError | None = None  # error of a picture in place of RRMSD²
     blurs: tuple[tuple[BlurOperator, ...], ...] = ()  # blur by goal and channel; (): the source is a point
     blur_errors: tuple[Tensor, ...] = ()  # error of the blur in each picture, (rows, columns); (): not measured
 
     @classmethod
     def of(
-        cls, channels: Sequence[Channel], lens: Lens, n: int, goals: Sequence[Goal], overshoot: float, *,
-        wave: Wave | None = None, own: Callable[[Tensor, Tensor], Tensor] | None = None, spread: Spread | None = None,
-        seed: int | None = None,
+        cls, channels: Sequence[Channel], lens: Lens, n: int, goals: Sequence[Goal], overshoot: float,
+        wave: Wave | None = None,
     ) -> Merit:  # fmt: skip
-        """Make the merit with sheets of n x n tubes launched for `lens`, one per channel.
-
-        spread: source of finite size, whose centre `channels` are the light of.  seed: seed of the rays that measure
-        the error of the blur, which takes almost a second per goal; None: not measured.
-        """
+        """Make the merit for a point source, with sheets of n x n tubes launched for `lens`, one per channel."""
         light = RayTubes.launched(_from_source(lens, wave), channels, n)
-        merit = cls(light, tuple(goals), overshoot, wave=wave, own=own)
-        if spread is None:
-            return merit
+        return cls(light, tuple(goals), overshoot, wave=wave)
+
+    def with_blur(self, source: ExtendedSource, lens: Lens, seed: int | None = None) -> Merit:
+        """Return the merit for a source of finite size, if the channels of this one are the light of its centre.
+
+        seed: seed of the rays that measure the error of the blur, which takes almost a second per goal; None: not
+        measured.
+        """
         exact = lens.plain()
-        merit = replace(merit, blurs=tuple(blurs(spread, exact, goal.receiver) for goal in goals))
+        merit = replace(self, blurs=tuple(blurs(source, exact, goal.receiver) for goal in self.goals))
         if seed is None:
             return merit
         with torch.no_grad():
             images = [merit.picture(k, landed)[0] for k, landed in enumerate(merit.landing(lens).on_goals)]
         errors = (
-            blur_error(image, spread.draw, exact, goal.receiver, border=blur.border, seed=seed)
+            blur_error(image, source.draw, exact, goal.receiver, border=blur.border, seed=seed)
             for image, goal, (blur, *_) in zip(images, merit.goals, merit.blurs, strict=True)
         )
         return replace(merit, blur_errors=tuple(errors))
@@ -150,16 +157,16 @@ class Merit:
     def __call__(self, landings: Landings) -> tuple[Tensor, Tensor]:
         """Return the merit of the landed corners, and the largest RRMSD of the normalised pictures."""
         pictures = sum(goal.weight for goal in self.goals)
-        whole = pictures + (self.wave.weight if self.wave else 0.0)
-        merit, worst = 0.0, torch.zeros(())
+        weights = pictures + (self.wave.weight if self.wave else 0.0)
+        merit, worst = torch.zeros(()), torch.zeros(())
         for k, (goal, landed) in enumerate(zip(self.goals, landings.on_goals, strict=True)):
             error, penalty, lost, rrmsd = self._goal_terms(k, landed)
             if self._is_one:
                 return error + penalty + lost, rrmsd
-            merit = merit + goal.weight / whole * error + goal.weight / pictures * (penalty + lost)
+            merit = merit + goal.weight / weights * error + goal.weight / pictures * (penalty + lost)
             worst = torch.maximum(worst.to(rrmsd), rrmsd)
-        if self.wave is not None:
-            merit = merit + self.wave.weight / whole * self._wavefront_error(*landings.behind)
+        if self.wave is not None and landings.behind is not None:
+            merit = merit + self.wave.weight / weights * self._wavefront_error(*landings.behind)
         return merit, worst
 
     def picture(self, k: int, landed: Sequence[Landed]) -> tuple[Tensor, Tensor]:
@@ -177,29 +184,31 @@ class Merit:
         return weighted_sum(channels, smooth), self.overshoot * (outside / flux)
 
     def _goal_terms(self, k: int, landed: Sequence[Landed]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return RRMSD² of goal k (or `own`), the penalty on light outside, the fraction lost, and the RRMSD."""
+        """Return RRMSD² of goal k (or `picture_error`), the penalty, the fraction lost, and the normalised RRMSD."""
         channels, sheets, target = self.light.channels, self.light.sheets, self.targets[k]
         image, penalty = self.picture(k, landed)
         if self.blur_errors:
             image = image + self.blur_errors[k]
         size = total(target**2)
-        error = total((image - target) ** 2) / size if self.own is None else self.own(image, target)
+        own_error = self.picture_error
+        error = total((image - target) ** 2) / size if own_error is None else own_error(image, target)
         pairs = zip(sheets, landed, strict=True)
         arrived = weighted_sum(channels, (total(arriving_flux(sheet.flux, corners)) for sheet, corners in pairs))
-        # light lost has no gradient, but to lose it must not lower the merit
+        # the lost light has no gradient, but without this term a lens that loses light could have a lower merit
         lost = 1 - arrived / weighted_sum(channels, (total(sheet.flux) for sheet in sheets))
         normalised = image.detach() / total(image.detach())
         return error, penalty, lost, (total((normalised - target) ** 2) / size).sqrt()
 
     def _wavefront_error(self, rays: Rays, path: Tensor) -> Tensor:
         """Return (RMS / λ)² of the optical path differences without piston, weighted by the flux around each corner."""
-        wavelength = self.light.channels[0].source.wavelength
-        above = rays.above(self.wave.z)
+        wave, wavelength = self.wave, self.light.channels[0].source.main_wavelength
+        assert wave is not None, "a merit without a wavefront has no such error"
+        above = rays.above(wave.z)
         further = -above / torch.where(rays.alive, rays.direction[2], torch.ones_like(above))
         x, y = (p + further * d for p, d in zip(rays.position[:2], rays.direction[:2], strict=True))
-        inside = rays.alive & self.wave.contains(x.detach(), y.detach())
+        inside = rays.alive & wave.contains(x.detach(), y.detach())
         flux = torch.where(inside, _corner_flux(self.light.sheets[0].flux), torch.zeros_like(x))
-        opd = (path + further - self.wave.path(x, y, wavelength)) / (wavelength * MM_PER_NM)
+        opd = (path + further - wave.path(x, y, wavelength)) / (wavelength * MM_PER_NM)
         opd = torch.where(inside, opd, torch.zeros_like(opd))
         weight = flux / total(flux)
         piston = total(weight * opd).detach()  # no gradient: the mean minimises the sum
@@ -213,22 +222,22 @@ def _from_source(lens: Lens, wave: Wave | None) -> Lens:
     return replace(lens, shaped=(0, *lens.freeform))
 
 
-def _traced_corners(source: Emitter, sheet: Tubes, lens: Lens, measured: bool) -> tuple[Rays, Tensor | None]:
-    """Trace the corners of a sheet through a lens; return the rays, and their optical path (mm) if `measured`."""
+def _traced_corners(source: Emitter, sheet: Tubes, lens: Lens, measured: bool) -> tuple[Rays, Tensor]:
+    """Trace the corners of a sheet through a lens; return the rays and, if `measured`, their optical path (mm)."""
     lens = lens.unbounded()
-    rays, path = sheet.rays, None
-    for interface in lens.interfaces[lens.freeform[0] :]:
-        refracted = behind(rays, interface)
-        if measured and path is None:  # the rays come from the source, see `_from_source`
-            index = 1.0 if interface.law.reverses else interface.law.n_in
+    rays, path, index = sheet.rays, torch.zeros(()), 1.0  # index: refractive index before the next interface
+    for number, interface in enumerate(lens.interfaces[lens.freeform[0] :]):
+        refracted, law = behind(rays, interface), interface.law
+        if measured and number == 0:  # the rays come from the source, see `_from_source`
+            index = law.n_in if isinstance(law, Refract) else 1.0
             path = index * path_from_reference(source, lens.entrance.z, refracted, rays.sense)
         elif measured:
             step = torch.stack([*refracted.position[:2], refracted.above(rays.z)]) - rays.position
             # sqrt(0) has no gradient
             square = torch.where(refracted.alive, (step * step).sum(0), torch.ones_like(path))
             path = path + index * torch.sqrt(square)
-        if measured and not interface.law.reverses:
-            index = interface.law.n_out
+        if isinstance(law, Refract):
+            index = law.n_out
         rays = refracted
     return rays, path
 
@@ -245,14 +254,14 @@ def _corner_flux(flux: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class SobolevVariable:
-    """Sobolev variable: heights h (m, n) in mm as a function of c (m, n), h = p C^T (λ^-e · C (w c) C^T) C.
+    """Sobolev variable: heights h (m, n) in mm as a function of c (m, n), h = p C^T (λ^-q · C (w c) C^T) C.
 
     C is the orthonormal cosine transform; λ_ij = 4 - 2 cos(π i / m) - 2 cos(π j / n) the Laplacian on the net, with
-    λ^-e = 0 for the piston; e the exponent; p the mean pitch in mm.
+    λ^-q = 0 for the piston; q the exponent; p the mean pitch in mm.
     """
 
     weight: Tensor  # local step size w, (m, n)
-    scale: Tensor  # p λ^-e, (m, n)
+    scale: Tensor  # p λ^-q, (m, n)
 
     @classmethod
     def of(cls, surface: BSplineSurface, weight: Tensor, exponent: float = LAPLACIAN_POWER) -> SobolevVariable:
@@ -314,23 +323,21 @@ def _apply_both(left: csr_array, t: Tensor, right: csr_array) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray((right @ within).T)).to(t)
 
 
-def local_weight(source: Emitter, lens: Lens, target: np.ndarray, screen: Screen, number: int | None = None) -> Tensor:
+def local_weight(source: Emitter, lens: Lens, goal: Goal, number: int | None = None) -> Tensor:
     """Return the weight w = (E / mean E)^-1/2 at each control point (m, n), smoothed and clamped.
 
     E is the irradiance of the target where the light of the control point lands; w = 1 where it misses the screen.
     number: index of the freeform interface in the lens; None: the back.
     """
-    number = lens.number_of("back") if number is None else number
+    number, screen = lens.number_of("back") if number is None else number, goal.receiver
     net, onwards = lens.interfaces[number].net, lens.unbounded().interfaces[number:]
-    ends = zip((net.x, net.y), net.shape, strict=True)
-    places = (torch.linspace(low, high, count, dtype=torch.float64) for (low, high), count in ends)
-    x, y = torch.meshgrid(*places, indexing="ij")
+    x, y = torch.meshgrid(*control_point_axes(net), indexing="ij")
     _, _, at_net = rays_to(source, lens, x=x, y=y, number=number)
     with torch.no_grad():
         landed = through(at_net, onwards, screen.plane)
     column, row = (p.cpu().double().numpy() for p in screen.pixel(*landed.position))
     on_screen = landed.alive.cpu().numpy() & (column > 0) & (column < screen.columns) & (row > 0) & (row < screen.rows)
-    picture = gaussian_filter(target / target.mean(), TARGET_BLUR)
+    picture = gaussian_filter(goal.picture / goal.picture.mean(), TARGET_BLUR)
     irradiance = map_coordinates(picture, [row - 0.5, column - 0.5], order=1, mode="nearest")
     logarithm = np.where(on_screen, np.log(np.maximum(irradiance, MAX_LOCAL_WEIGHT**-4)), 0.0)
     weight = np.exp(-0.5 * gaussian_filter(logarithm, WEIGHT_SMOOTHING)).clip(1 / MAX_LOCAL_WEIGHT, MAX_LOCAL_WEIGHT)
@@ -342,8 +349,14 @@ def local_weight(source: Emitter, lens: Lens, target: np.ndarray, screen: Screen
     return torch.from_numpy(weight)
 
 
+def control_point_axes(net: BSplineSurface) -> tuple[Tensor, Tensor]:
+    """Return x and y (mm) of the rows and columns of control points of a net, evenly spaced."""
+    x, y = (torch.linspace(*ends, m, dtype=torch.float64) for ends, m in zip((net.x, net.y), net.shape, strict=True))
+    return x, y
+
+
 def _excess_throw(at_net: Rays, aim: Tensor, plane: Receiver, law: Law, on_screen: np.ndarray) -> np.ndarray | None:
-    """Return the throw over MIN_THROW times its median (m, n), at least 1; None if it is 1 everywhere.
+    """Return the throw relative to MIN_THROW times its median (m, n), at least 1; None if it is 1 everywhere.
 
     The throw is the largest singular value of ∂t/∂p (mm), p(b, t) the slopes that send light from b to the target point
     t; it is the inverse of the smallest singular value of ∂p/∂t.

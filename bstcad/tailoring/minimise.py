@@ -7,11 +7,9 @@ state after each evaluation; to stop, do not ask for the next one.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -115,21 +113,22 @@ def adam(start: list[Tensor], rates: list[float], steps: int, state: AdamState |
     optimiser = torch.optim.Adam([{"params": [p], "lr": r} for p, r in zip(parameters, rates, strict=True)])
     if state is not None and state.taken:
         for p, mean, square in zip(parameters, state.mean, state.square, strict=True):
-            taken = torch.tensor(float(state.taken))  # torch counts on the CPU
-            optimiser.state[p] |= {"step": taken, "exp_avg": mean.clone(), "exp_avg_sq": square.clone()}
-    for step in itertools.count(0 if state is None else state.step):
+            count = torch.tensor(float(state.taken))  # torch counts on the CPU
+            optimiser.state[p] |= {"step": count, "exp_avg": mean.clone(), "exp_avg_sq": square.clone()}
+    step = 0 if state is None else state.step
+    while True:
         for group, rate in zip(optimiser.param_groups, rates, strict=True):
             group["lr"] = rate * (1 + math.cos(math.pi * step / steps)) / 2
         moments = [optimiser.state[p] for p in parameters if optimiser.state[p]]
-        mean, square = (tuple(m[name].clone() for m in moments) for name in ("exp_avg", "exp_avg_sq"))
+        means, squares = (tuple(m[name].clone() for m in moments) for name in ("exp_avg", "exp_avg_sq"))
         taken = int(moments[0]["step"]) if moments else 0
         copies = tuple(p.clone() for p in parameters)  # Adam works in place
-        state = AdamState(step, taken, copies, mean=mean, square=square)
-        evaluation = yield Query(list(state.parameters), state)
+        evaluation = yield Query(list(copies), AdamState(step, taken, copies, mean=means, square=squares))
         if math.isfinite(evaluation.merit):
             for p, g in zip(parameters, evaluation.gradients, strict=True):
                 p.grad = g
             optimiser.step()
+        step += 1
 
 
 LBFGS_MEMORY = 12  # number of steps whose changes L-BFGS keeps
@@ -160,7 +159,7 @@ def lbfgs(start: list[Tensor], evaluations: int, state: LbfgsState | None = None
     as many of the `evaluations` are left, or if there is no direction of descent.  Resumed from a state between two
     steps it ends with the same result.  (The L-BFGS of torch.optim loads a compiler, which takes longer than a draft.)
     """
-    sizes, best, resumable = [p.numel() for p in start], None, None
+    sizes, best, resumable = [p.numel() for p in start], Best(), state
 
     def at(x: Tensor) -> Values:
         nonlocal best, resumable
@@ -169,11 +168,11 @@ def lbfgs(start: list[Tensor], evaluations: int, state: LbfgsState | None = None
         best, resumable = evaluation.best, None
         return evaluation.merit, torch.cat([g.reshape(-1) for g in evaluation.gradients])
 
-    search = state
-    if search is None:
+    if state is None:
         x = torch.cat([p.detach().reshape(-1) for p in start])
-        search = LbfgsState(x, *(yield from at(x)))
-        search = replace(search, before=best.merit)
+        value, gradient = yield from at(x)
+        state = LbfgsState(x, value, gradient, before=best.merit)
+    search = state
     while True:
         resumable = search
         following = yield from _step(at, search)
@@ -194,7 +193,12 @@ def _step(at: Callable[[Tensor], Values], search: LbfgsState) -> Generator[Query
     if not slope < 0:
         return None
     first = 1.0 if pairs else min(1.0, 1.0 / float(total(g.abs())))
-    trial = yield from _strong_wolfe(partial(_along, at, x, direction), LinePoint(0.0, value, slope, g), first)
+
+    def along(step: float) -> LineSearch:
+        value, gradient = yield from at(x + step * direction)
+        return LinePoint(step, value, dot(gradient, direction), gradient)
+
+    trial = yield from _strong_wolfe(along, LinePoint(0.0, value, slope, g), first)
     if not trial.value < value:
         return None
     s, y = trial.step * direction, trial.gradient - g
@@ -227,17 +231,11 @@ class LinePoint:
     gradient: Tensor
 
 
-Along = Callable[[float], Generator[Query, Evaluation, LinePoint]]
+LineSearch = Generator[Query, Evaluation, LinePoint]
+Along = Callable[[float], LineSearch]
 
 
-def _along(
-    at: Callable[[Tensor], Values], x: Tensor, direction: Tensor, step: float
-) -> Generator[Query, Evaluation, LinePoint]:
-    value, gradient = yield from at(x + step * direction)
-    return LinePoint(step, value, dot(gradient, direction), gradient)
-
-
-def _strong_wolfe(along: Along, start: LinePoint, step: float) -> Generator[Query, Evaluation, LinePoint]:
+def _strong_wolfe(along: Along, start: LinePoint, step: float) -> LineSearch:
     """Return a point with f <= f0 + c1 a f0' and |f'| <= c2 |f0'|, or the best of MAX_LINE_TRIALS (3.5)."""
     before = start
     for _ in range(MAX_LINE_TRIALS):
@@ -255,7 +253,7 @@ def _strong_wolfe(along: Along, start: LinePoint, step: float) -> Generator[Quer
     return before
 
 
-def _zoom(along: Along, start: LinePoint, low: LinePoint, high: LinePoint) -> Generator[Query, Evaluation, LinePoint]:
+def _zoom(along: Along, start: LinePoint, low: LinePoint, high: LinePoint) -> LineSearch:
     """Return a point as `_strong_wolfe` does, between two points that bracket it; `low` has the lower merit (3.6)."""
     for _ in range(MAX_LINE_TRIALS):
         margin = 0.1 * abs(high.step - low.step)  # distance to keep from both ends

@@ -1,21 +1,21 @@
 """The variables of stage 2 for all nets of a lens together.
 
-For a point source or collimated light the two faces of a lens act nearly alike.  Let light from the point q of the
-front meet the back at b(q).  Its landing point on a plane behind the lens moves by nearly the same amount for a slope
-of either face, so that the merit in the heights of the two nets is a long narrow valley.  But a change h(q) of the
-front that the back repeats where the light arrives,
+For a point source or collimated light the slopes of both faces act nearly alike: light from the point q of the front
+meets the back at b(q), and a slope at q moves its landing point on a plane behind the lens nearly as far as the same
+slope at b(q).  In the heights of the two nets the merit is therefore a long narrow valley.  Its two directions separate
+if the back repeats each change h(q) of the front where the light arrives:
 
-    δz_front(q) = h(q),    δz_back(b(q)) = κ h(q),    κ = (n d_z - d_z,in) / (n d_z - d_z,out),
+    δz_front(q) = h(q),    δz_back(b(q)) = κ h(q),    κ = (n d_z - d_z,in) / (n d_z - d_z,out).
 
-leaves all optical paths unchanged to first order.  Here d_z, d_z,in and d_z,out are the cosines of the ray with the
-axis in the glass, before and behind the lens.  The light behind the lens keeps its wavefront, and only its irradiance
-changes.  So the two blocks of the variable c are
+Here n is the index, and d_z, d_z,in and d_z,out are the cosines of the ray with the axis in the glass, before and
+behind the lens.  Such a pair of changes leaves all optical paths, and so the wavefront behind the lens, unchanged to
+first order.  It moves b(q), and so changes the irradiance behind the lens only.  A change of the back alone changes the
+wavefront.  The variable c has one block for each,
 
     δz_front = f S_front c_1,    δz_back = S_back c_2 + R δz_front,
 
-with S as in merit.py, and R the interpolation of κ h along the rays: c_1 changes the irradiance behind the lens, c_2
-the wavefront.  Two photographs end at an RRMSD of 0.061 and 0.057 after 98 evaluations, and at 0.071 and 0.063 with
-independent blocks.
+with S as in merit.py, f a scale, and R the interpolation of κ h along the rays.  Two photographs end at an RRMSD of
+0.061 and 0.057 after 98 evaluations, and at 0.071 and 0.063 with independent blocks.
 """
 
 from __future__ import annotations
@@ -30,19 +30,18 @@ from scipy.ndimage import gaussian_filter
 from scipy.sparse import csr_array, diags_array
 from torch import Tensor
 
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
 from bstcad.optics.trace import across, behind
-from bstcad.tailoring.merit import CoarseVariable, SobolevVariable
+from bstcad.tailoring.merit import CoarseVariable, SobolevVariable, control_point_axes
 from bstcad.transport.mapping import grid_coordinates
 
-SCALE_FRACTION = 0.2  # f relative to the scale at which both blocks move the pictures equally far, by measurement
+SCALE_FRACTION = 0.2  # f relative to the scale at which both blocks move the pictures equally far; by measurement
 # Standard deviation of the smoothing of q(b), in control points of the back.  In a gap between two parts of the light,
 # where few rays fall and some cross, q(b) jumps: without smoothing R makes ripples of 0.07 mm between the tubes.
 POSITION_SMOOTHING = 3.0
-INTERPOLATION_POINTS = 4  # control points of the front, each way, in the interpolation at one of the back
+INTERPOLATION_POINTS = 4  # control points of the front along each axis in the interpolation at one of the back
 
 
 @dataclass(frozen=True)
@@ -87,50 +86,39 @@ def along_light(source: Emitter, lens: Lens, goals: Sequence[Goal]) -> tuple[csr
     m_b and m_k are the magnifications of b(q) and of picture k.
     """
     front, back = lens.nets
-    q = torch.stack(torch.meshgrid(*_control_points(front), indexing="ij"))
-    coming = source.rays(*q.to(lens.like.device), lens.entrance.z, 1.0)
+    q_x, q_y = torch.meshgrid(*control_point_axes(front), indexing="ij")
+    q, device = torch.stack([q_x, q_y]).numpy(), lens.like.device
+    coming = source.rays(q_x.to(device), q_y.to(device), lens.entrance.z, 1.0)
     interfaces, number = lens.unbounded().interfaces, lens.number_of("front")
     within = behind(across(coming, interfaces[:number]), interfaces[number])
     out = behind(within, interfaces[number + 1])
     glass = lens.index * within.direction[2]
     factor = _array((glass - coming.direction[2]) / (glass - out.direction[2]))
-    lit = _array((source.irradiance(*coming.position[:2], lens.entrance.z) > 0) & out.alive)
-    if any(np.unique(at[lit > 0]).size < 2 for at in q.numpy()):  # a narrow beam and few control points
-        lit = _array(out.alive)
-    places = [_array(p) for p in out.position[:2]]
-    row, column = grid_coordinates(*places, *(p.numpy() for p in torch.meshgrid(*_control_points(back), indexing="ij")))
-    row, column = (_smoothed(at) for at in (row, column))
-    carried = _interpolation(row, column, q.shape[1:]) @ diags_array(np.where(lit, factor, 1.0).reshape(-1))
+    x, y, _ = coming.position
+    lit = (_array(source.irradiance(x, y, lens.entrance.z)) > 0) & (_array(out.alive) > 0)
+    if any(np.unique(at[lit]).size < 2 for at in q):  # a narrow beam and few control points
+        lit = _array(out.alive) > 0
+    b = _array(out.position[:2])
+    row, column = grid_coordinates(*b, *(p.numpy() for p in torch.meshgrid(*control_point_axes(back), indexing="ij")))
+    carried = _interpolation(_smoothed(row), _smoothed(column), front.shape)
+    carried = carried @ diags_array(np.where(lit, factor, 1.0).reshape(-1))
 
-    own = (back.z - front.z) / lens.index / _magnification(q.numpy(), places, lit)
-    shifts = [
-        goal.receiver.plane.per_radian(back.z)
-        / _magnification(q.numpy(), _array(goal.receiver.plane.land(out).position), lit)
-        for goal in goals
-    ]
+    shift_on_back = (back.z - front.z) / lens.index / _magnification(q, b, lit)
+    planes = [goal.receiver.plane for goal in goals]
+    shifts = [p.per_radian(back.z) / _magnification(q, _array(p.land(out).position), lit) for p in planes]
     weights = [goal.weight for goal in goals]
     mean = math.sqrt(sum(w * s * s for w, s in zip(weights, shifts, strict=True)) / sum(weights))
-    return csr_array(carried), SCALE_FRACTION * abs(mean / own)
-
-
-def _control_points(net: BSplineSurface) -> list[Tensor]:
-    """Return x and y (mm) of the control points of a net, evenly spaced."""
-    return [torch.linspace(*ends, m, dtype=torch.float64) for ends, m in zip((net.x, net.y), net.shape, strict=True)]
+    return csr_array(carried), SCALE_FRACTION * abs(mean / shift_on_back)
 
 
 def _array(t: Tensor) -> np.ndarray:
     return t.cpu().double().numpy()
 
 
-def _magnification(q: np.ndarray, places: Sequence[np.ndarray], lit: np.ndarray) -> float:
+def _magnification(q: np.ndarray, points: np.ndarray, lit: np.ndarray) -> float:
     """Return the mean of ∂x/∂q_x and ∂y/∂q_y of points (2, …), by least squares over the lit ones."""
-
-    def along(p: np.ndarray, at: np.ndarray) -> float:
-        p, at = p[lit] - p[lit].mean(), at[lit] - at[lit].mean()
-        return float((p * at).sum() / (at * at).sum())
-
-    lit = lit > 0
-    return (along(places[0], q[0]) + along(places[1], q[1])) / 2
+    p, at = ([axis[lit] - axis[lit].mean() for axis in each] for each in (points, q))
+    return sum(float((u * v).sum() / (v * v).sum()) for u, v in zip(p, at, strict=True)) / 2
 
 
 def _smoothed(at: np.ndarray) -> np.ndarray:

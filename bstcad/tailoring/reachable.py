@@ -30,20 +30,13 @@ from bstcad.optics.reach import MAX_EXIT_ANGLE, reach_margin
 from bstcad.optics.receivers import Receiver
 from bstcad.optics.unfolding import image_from_last_net
 from bstcad.scene.target import average
+from bstcad.tailoring import slope_map
 from bstcad.tailoring.slope_fit import Fit
-from bstcad.tailoring.slope_map import (
-    FaceGrid,
-    corners_of,
-    face_grid,
-    fit_to_map,
-    lit_window,
-    pixel_corners,
-    rays_at,
-    slope_map,
-)
+from bstcad.tailoring.slope_map import FaceGrid
+from bstcad.transport.mapping import Points, Solver
 
-FACE_CELLS, FACE_STRIDE = 33, 4  # cells a side of the face, and stride of those whose light is tried for all aims
-BOX_AIMS = 5  # aims a side, in the rectangle around the lit target, of the first check
+FACE_CELLS, FACE_STRIDE = 33, 4  # cells per side of the face, and stride of those whose light is tried for all aims
+BOX_AIMS = 5  # aims per side, in the rectangle around the lit target, of the first check
 MAX_AIMS = 64  # largest number of pixels along the longer side of the target at whose corners the reach is computed
 MAP_NET, MAP_CELLS, MAP_ITERATIONS = 33, 64, 40  # size and iterations of the coarse maps
 MAX_ROUNDS = 6  # largest number of coarse maps
@@ -57,33 +50,32 @@ def reachable(source: Emitter, lens: Lens, goal: Goal, grazing: float = MAX_EXIT
 
     lens: the blank, with its final front.  grazing: largest angle at which light may leave the face (rad).
     """
-    screen, picture, small_goal = goal.receiver, goal.picture, resample(goal)
-    few, small = small_goal.receiver, small_goal.picture
-    grid = face_grid(source, lens, lit_window(source, lens, FACE_CELLS), FACE_CELLS)
-    lit = [corner[corners_of(small)] for corner in pixel_corners(few)]
+    screen, picture, small = goal.receiver, goal.picture, resample(goal)
+    few, corners, solver = small.receiver, slope_map.pixel_corners(small.receiver), Solver(MAP_ITERATIONS)
+    grid = slope_map.face_grid(source, lens, slope_map.lit_window(source, lens, FACE_CELLS), FACE_CELLS)
+    lit_x, lit_y = (corner[slope_map.corners_of(small.picture)] for corner in corners)
+    lit = lit_x, lit_y
     around = np.meshgrid(*(np.linspace(aims.min(), aims.max(), BOX_AIMS) for aims in lit), indexing="ij")
     plane, law = image_from_last_net(lens, screen.plane), lens.last_freeform.law
     if float(reach_from_each(grid, around, plane, law, grazing=grazing).min()) >= 0:
         return None
-    ordered, aims = rays_at(grid, same_order(grid, lit)), torch.from_numpy(np.stack(lit))
+    ordered, aims = slope_map.rays_at(grid, same_order(grid, lit)), torch.from_numpy(np.stack(lit))
     if float(reach_margin(ordered, aims, plane, law=law, grazing=grazing).min()) >= 0:
         return None
-    found = _inside(reach_from_each(grid, pixel_corners(few), plane, law, grazing=grazing).amax(0), screen, few)
-    wanted, lens = None, lens.refined(MAP_NET)
+    found = _inside(reach_from_each(grid, corners, plane, law, grazing=grazing).amax(0), screen, few)
+    slopes, lens = None, lens.refined(MAP_NET)
     for turn in range(MAX_ROUNDS):
         if not picture[found].sum() > 0:
             break
-        window = lit_window(source, lens)
-        part = resample(goal.restricted(found)).picture
-        wanted = slope_map(
-            source, lens, window, part, screen=few, n=MAP_CELLS, previous=wanted, iterations=MAP_ITERATIONS
-        )
-        grid = face_grid(source, lens, window, 2 * MAP_NET)
-        aims, rays = torch.from_numpy(np.stack(pixel_corners(few))), rays_at(grid, wanted.places)
+        window, part = slope_map.lit_window(source, lens), resample(goal.restricted(found))
+        grid = slope_map.square_grid(source, lens, window, MAP_CELLS)
+        slopes = slope_map.slope_map(lens, grid, part, slopes, solver=solver)
+        grid = slope_map.face_grid(source, lens, window, 2 * MAP_NET)
+        aims, rays = torch.from_numpy(np.stack(corners)), slope_map.rays_at(grid, slopes.face_points)
         before, found = found, _inside(reach_margin(rays, aims, plane, law=law, grazing=grazing), screen, few)
         if turn and picture[before ^ found].sum() <= SETTLED_FRACTION:
             break
-        lens = fit_to_map(lens, wanted, grid, COARSE_FIT, unlit=0.0)
+        lens = slope_map.fit_to_map(lens, slopes, grid, COARSE_FIT)
     return found if (picture[~found] > 0).any() else None
 
 
@@ -92,8 +84,8 @@ def resample(goal: Goal, pixels: int = MAX_AIMS) -> Goal:
     screen, picture = goal.receiver, goal.picture
     shrunk = max(1.0, max(screen.shape) / pixels)
     rows, columns = (max(round(n / shrunk), 1) for n in screen.shape)
-    whole = (0.0, 0.0, screen.columns, screen.rows)
-    small = average(lambda box: picture[box[1] : box[3], box[0] : box[2]], whole[2:], whole, (columns, rows))
+    size = screen.columns, screen.rows
+    small = average(lambda b: picture[b[1] : b[3], b[0] : b[2]], size, (0.0, 0.0, *size), (columns, rows))
     return replace(goal, receiver=replace(screen, pixels=(columns, rows)), picture=small, reachable=None, whole=None)
 
 
@@ -111,13 +103,10 @@ def reach_from_each(grid: FaceGrid, aims: Sequence[np.ndarray], plane: Receiver,
     return reach_margin(rays, t[:, None].expand(-1, *position.shape[1:]), plane, law=law, grazing=grazing)
 
 
-def same_order(grid: FaceGrid, aims: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
+def same_order(grid: FaceGrid, aims: Points) -> Points:
     """Return the points (mm) of the lit window at the relative positions of aims x and y (mm) in their rectangle."""
-    ends = [(along.min(), along.max()) for along in aims]
-    sizes = grid.window.width, grid.window.height
-    return tuple(
-        size * ((along - low) / (high - low) - 0.5) for along, (low, high), size in zip(aims, ends, sizes, strict=True)
-    )
+    x, y = ((along - along.min()) / (along.max() - along.min()) - 0.5 for along in aims)
+    return grid.window.width * x, grid.window.height * y
 
 
 def _inside(corners: Tensor, screen: Screen, few: Screen) -> np.ndarray:

@@ -1,10 +1,7 @@
 """The task of a design, the steps that its stages yield, and the driver that runs the stages.
 
-Tailoring has two stages (Wang et al. 2023).  Stage 1 computes the transport map from source to target and fits the
-surface to it (stage1.py; two_faces.py where the front is freeform too).  Stage 2 starts from that surface and minimises
-the error of the traced irradiance (stage2.py); stage 3 takes its place for a source of finite size.  A stage is an
-iterator of steps and knows nothing of time.  The driver takes the steps, measures time, saves states, reports
-progress, and stops when there is a reason to end.
+A stage is an iterator of steps and knows nothing of time.  The driver takes the steps, measures time, saves states,
+reports progress, and stops when there is a reason to end.
 """
 
 from __future__ import annotations
@@ -26,9 +23,9 @@ from bstcad.optics.sides import Sides
 from bstcad.optics.unfolding import image_screen
 from bstcad.optics.wavefront import Wave
 from bstcad.scene.blank import Bounds
-from bstcad.scene.quality import Tailoring
+from bstcad.scene.quality import ResolvedTailoring
 from bstcad.tailoring.merit import Merit
-from bstcad.tailoring.source_image import Spread
+from bstcad.tailoring.source_image import ExtendedSource
 from bstcad.transport.mapping import Mapping
 
 
@@ -59,8 +56,8 @@ class Parameters:
         like = lens.like
         lens = lens.with_front(lens.front.with_parameters(**self.front).to(like.dtype, like.device))
         lens = lens.with_back(lens.back.moved(self.back))
-        own = zip(lens.nets, self.nets, strict=True)
-        return lens.with_nets(replace(net, z=p.z, heights=p.heights.to(like.device)) for net, p in own)
+        pairs = zip(lens.nets, self.nets, strict=True)
+        return lens.with_nets(replace(net, z=p.z, heights=p.heights.to(like.device)) for net, p in pairs)
 
 
 @dataclass(frozen=True)
@@ -79,17 +76,18 @@ class RatedLens:
 
 SIGNIFICANT_RATIO = 1.05  # smallest ratio of two figures that is significant: STAGE_EFFORT has errors of 5 %
 BEST_LENS_STAGE = "back to the best lens before"  # name of a stage in the record
-WAVEFRONT_TUBES = 256  # tubes a side for the wavefront error of a lens between the stages
+WAVEFRONT_TUBES = 256  # tubes per side for the wavefront error of a lens between the stages
 TUBES_PER_SECOND = 4.7e6  # tubes traced per second, with the gradient of the merit, on a machine of pace 1
 RRMSD_SECONDS = 0.5  # seconds that `Task.rrmsd` takes on a machine of pace 1
-# Rays for the RRMSD of a lens between the stages, to some 5 % for a target of STAGE_EFFORT_PIXELS pixels a side.  The
-# error of the product of two pictures of n² stratified rays falls as (p / n)³ / p, so a target of p pixels a side takes
-# (p / STAGE_EFFORT_PIXELS)^⅔ times as many rays a side.
+# Rays for the RRMSD of a lens between the stages, accurate to some 5 % for STAGE_EFFORT_PIXELS pixels per side.  The
+# error of the product of two pictures of n² stratified rays falls as (p / n)³ / p, so a target of p pixels per side
+# takes (p / STAGE_EFFORT_PIXELS)^⅔ times as many rays per side.
 STAGE_EFFORT, STAGE_EFFORT_PIXELS = Effort(rays=724, accuracy=0, witness=False), 512
 FINE_EFFORT = Effort(rays=2048, accuracy=0.01, witness=False)  # rays where a scene has an accuracy or bounds
 FLUX_EFFORT = Effort(rays=128, accuracy=1.0, witness=False)  # rays for the flux on the target alone
 
 Progress = Callable[[str, int, int, str], None]  # stage, done, total, text
+LensCallback = Callable[[Callable[[], Lens]], None]  # called with the function that makes the best lens so far
 PACE_MEMORY = 4.0  # seconds of work over which the pace of the machine is averaged
 
 
@@ -111,7 +109,7 @@ class Task:
 
     channels: tuple[Channel, ...]  # light of the source; for a source of finite size, of its centre
     goals: tuple[Goal, ...]  # targets; stage 1 with one freeform face uses the first alone
-    knobs: Tailoring  # settings of the scene's [tailoring], all set
+    knobs: ResolvedTailoring  # settings of the scene's [tailoring]
     min_thickness: float = 0.0  # minimum thickness of the glass everywhere (mm)
     free: tuple[str, ...] = ()  # names of the parameters of the front that are optimised
     rim_sags: tuple[float, float] = (-math.inf, math.inf)  # range of the sag at the rim of such a front (mm)
@@ -119,15 +117,16 @@ class Task:
     tidy: Callable[[], None] = lambda: None  # returns freed memory to the system between large allocations
     sampled_sources: tuple[tuple[Channel, ...], ...] = ()  # light of the source at each size of stage 3; (): a point
     bounds: Bounds | None = None  # bounds on the shape of the tailored faces; None: no bounds
-    spreads: tuple[Spread, ...] = ()  # source at each size of stage 3, for its blur
+    extended_sources: tuple[ExtendedSource, ...] = ()  # source at each size of stage 3, for its blur
     edge: Edge | None = None  # light at the edge of a target cut to its reachable part; None: all of it is reachable
     # function of a picture (rows, columns) and of the target, both of sum <= 1, that stage 2 minimises; None: RRMSD²
     merit: Callable[[Tensor, Tensor], Tensor] | None = None
     wave: Wave | None = None  # wavefront that the light shall have behind the lens; None: no such goal
-    preview: bool = False  # preview: one round a stage, no RRMSD by rays, no costly alternative
+    preview: bool = False  # preview: one round per stage, no RRMSD by rays, no costly alternative
     solution: float | None = None  # sign σ of light_behind.py, +1 or -1; None: the one with the smaller angles
     floor: float = 0.0  # irradiance, relative to the mean, to which stage 1 of two faces raises the furthest picture
-    front_sides: Callable[[Sides], Sides | None] = lambda sides: None  # front's control points, by those of the back
+    # number of control points of the front as a function of that of the back; None: the front is not freeform
+    front_sides: Callable[[Sides], Sides | None] = lambda sides: None
 
     @property
     def heaviest(self) -> Channel:
@@ -145,14 +144,14 @@ class Task:
         return tuple(sides if k == lens.number_of("back") or front is None else front for k in lens.freeform)
 
     @property
-    def whole(self) -> Task:
+    def at_full_size(self) -> Task:
         """Task with the sampled light of the whole source in place of that of its centre."""
         return replace(self, channels=self.sampled_sources[-1], sampled_sources=()) if self.sampled_sources else self
 
     def refined(self, lens: Lens, sides: Sides) -> Lens:
         """Return the lens with its nets refined to the numbers of control points that go with `sides` on the back."""
         pairs = zip(lens.nets, self.sides(lens, sides), strict=True)
-        return lens.with_nets(net.refined(own) for net, own in pairs)
+        return lens.with_nets(net.refined(count) for net, count in pairs)
 
     def with_imaged_receivers(self, lens: Lens) -> Task:
         """Return the task with its receivers imaged through the surfaces behind the last net; stage 1 aims there."""
@@ -171,7 +170,8 @@ class Task:
             pixels = max(goal.picture.size for goal in self.goals)
             rays = STAGE_EFFORT.rays * (pixels / STAGE_EFFORT_PIXELS**2) ** (1 / 3)
             effort = replace(STAGE_EFFORT, rays=round(rays))
-        draw = self.spreads[-1].draw if self.spreads and not self.sampled_sources else None  # whole source
+        sources = () if self.sampled_sources else self.extended_sources
+        draw = sources[-1].draw if sources else None  # of the source at full size
         lens = lens.plain()
         values = [rrmsd_by_rays(lens, self.channels, goal, effort, draw=draw) for goal in self.goals]
         return math.nan if any(map(math.isnan, values)) else max(values)
@@ -207,11 +207,11 @@ class StageStep:
     mapping: Mapping | None = None  # transport map that the lens follows (stage 1)
     # points (mm) of the last tailored face whose light goes to the corners of the target's pixels, x and y, each
     # (columns + 1, rows + 1); None: the map of `mapping` begins on another surface
-    places: tuple[np.ndarray, np.ndarray] | None = None
+    face_points: tuple[np.ndarray, np.ndarray] | None = None
     progress: tuple[str, int, int, str] | None = None  # stage, done, total, text
     rrmsd: float | None = None  # RRMSD of the lens by the tubes or rays that tailor it
     rays_rrmsd: float | None = None  # RRMSD of the lens by `Task.rrmsd`
-    whole: bool = True  # True if `rays_rrmsd` is for the whole source, False for a smaller one
+    at_full_size: bool = True  # True if `rays_rrmsd` is for the source at full size, False for a smaller one
     work: float = 0.0  # seconds that the step takes on a machine of pace 1; 0: unknown
     skipped: bool = False  # True if the step was left out because merit or gradient was not finite
     part: str = ""  # name of the part of the design under way, for the list of times; "": none has begun
@@ -221,23 +221,30 @@ class StageStep:
     @property
     def lens(self) -> Lens:
         """Best lens so far."""
+        assert self.make is not None, "the stage has made no lens yet"
         return self.make()
 
 
-def not_interrupted() -> bool:
-    """Return False: no user interrupts the design."""
-    return False
+Steps = Iterator[StageStep]
+Stage = Callable[[Task, Lens, Any], Steps]  # called with the task, the lens before, and a state to resume from or None
 
 
-def discard_state(state: Any) -> None:
-    """Save no state; the default of `Driver.save`."""
+def maker(lens: Lens) -> Callable[[], Lens]:
+    """Return a function that returns `lens`, for `StageStep.make`."""
+    return lambda: lens
 
 
-LensCallback = Callable[[Callable[[], Lens]], None]  # called with the function that makes the best lens so far
+@dataclass(frozen=True)
+class Hooks:
+    """Functions that a design calls while it runs; by default they do nothing."""
+
+    progress: Progress = no_progress  # called with stage, done, total and text
+    save: Callable[[Any], None] = lambda state: None  # called with each state from which the design can resume
+    interrupted: Callable[[], bool] = lambda: False  # returns True once the user wants the best lens so far
+    on_lens: LensCallback = lambda make: None  # called after each step that has an RRMSD
 
 
-def ignore_lens(make: Callable[[], Lens]) -> None:
-    """Show no lens; the default `LensCallback`."""
+NO_HOOKS = Hooks()
 
 
 @dataclass(frozen=True)
@@ -265,27 +272,16 @@ class Driver:
     """Driver of the stages of one design: keeps the time, the record and the best lens.
 
     limit: seconds for the whole run, including the work after tailoring, which takes `reserve` seconds on a machine of
-    pace 1.  interrupted: returns True once the user wants the best lens so far.  save: called with each state from
-    which the design can resume.  on_lens: called after each step that has an RRMSD.  record: the record of the earlier
-    runs that this one resumes.
+    pace 1.  record: the record of the earlier runs that this one resumes.
     """
 
     def __init__(
-        self,
-        progress: Progress = no_progress,
-        began: float | None = None,
-        *,
-        limit: float = math.inf,
-        reserve: float = 0.0,
-        interrupted: Callable[[], bool] = not_interrupted,
-        save: Callable[[Any], None] = discard_state,
-        on_lens: LensCallback = ignore_lens,
-        record: DesignRecord = DesignRecord(),
-        clock: Callable[[], float] = time.perf_counter,
+        self, hooks: Hooks = NO_HOOKS, began: float | None = None, *, limit: float = math.inf, reserve: float = 0.0,
+        record: DesignRecord = DesignRecord(), clock: Callable[[], float] = time.perf_counter,
         processor: Callable[[], float] = time.process_time,
-    ) -> None:
-        self.progress, self.interrupted, self.save, self.on_lens = progress, interrupted, save, on_lens
-        self.pace = 1.0  # recent time of work here over its time on a machine of pace 1
+    ) -> None:  # fmt: skip
+        self.hooks = hooks
+        self.pace = 1.0  # recent time of work here, relative to its time on a machine of pace 1
         self.stopped = ""  # reason why tailoring ended: "evaluations", "plateau", "accuracy", "time" or "interrupt"
         self._limit, self._reserve, self._clock, self._before = limit, reserve, clock, record
         self._began = clock() if began is None else began
@@ -310,21 +306,20 @@ class Driver:
     @property
     def reason_to_interrupt(self) -> str:
         """Reason to end a stage that has no time limit of its own: "interrupt" or ""."""
-        return "interrupt" if self.interrupted() else ""
+        return "interrupt" if self.hooks.interrupted() else ""
 
     def run(
-        self, steps: Iterator[StageStep], task: Task, saved: Callable[[Any], Any], why: Callable[[], str],
-        best: RatedLens | None = None,
-    ) -> StageStep:  # fmt: skip
+        self, stage: Steps, task: Task, pack: Callable[..., Any], why: Callable[[], str], best: RatedLens | None = None
+    ) -> StageStep:
         """Run a stage until it ends or `why` returns a reason to end it; return its last step.
 
-        saved: makes the state to save from the state of a step.  best: the best lens before the stage; afterwards
+        pack: makes the state to save from the state of a step.  best: the best lens before the stage; afterwards
         `self.best` is the best at the end of any part.  A part may use fewer pixels or a smaller source, and so may end
         with a lens that is worse.
         """
         self._last, self.best = self._clock(), best
-        for step in steps:
-            self.stopped = self._take(step, saved) or (step.make and why()) or ""
+        for step in stage:
+            self.stopped = self._take(step, pack) or (step.make and why()) or ""
             if step.ends:
                 self._update_best(step, task)
             if self.stopped:
@@ -337,12 +332,12 @@ class Driver:
         return step
 
     def _update_best(self, step: StageStep, task: Task) -> None:
-        if step.rays_rrmsd is not None and step.whole:
+        if step.rays_rrmsd is not None and step.at_full_size:
             latest = task.rated(step.lens, step.rays_rrmsd)
             if self.best is None or math.isnan(self.best.figure) or latest.figure < self.best.figure:
                 self.best = latest
 
-    def _take(self, step: StageStep, saved: Callable[[Any], Any]) -> str:
+    def _take(self, step: StageStep, pack: Callable[[Any], Any]) -> str:
         """Record a step; return the reason if the stage ends with it, else ""."""
         now = self._clock()
         if step.work:
@@ -351,16 +346,16 @@ class Driver:
             self._step = now - self._last
         self._last = now
         if step.progress:
-            self.progress(*step.progress)
+            self.hooks.progress(*step.progress)
         self._record = replace(self._record, skipped=self._record.skipped + step.skipped)
         if step.rrmsd is not None:
             self.note(step.rrmsd)
         if step.make and (step.rrmsd is not None or step.rays_rrmsd is not None):
-            self.on_lens(step.make)
+            self.hooks.on_lens(step.make)
         if step.ends:
             self.end(step.part, step.rays_rrmsd)
         if step.state is not None:
-            self.save(saved(step.state))
+            self.hooks.save(pack(step.state))
         return step.reason
 
     def measure(self, seconds: float, expected: float) -> None:

@@ -33,18 +33,21 @@ DEPENDENCE_TOLERANCE = 1e-12  # fraction of a monomial's squared slopes below wh
 class Fit:
     """Settings of a slope fit."""
 
-    bending: float = 1e-4  # weight of (spacing · curvature)² relative to slope²; shapes the parts without rays
+    # weight of the bending energy of the change of the surface, (spacing · curvature)², relative to slope²: it shapes
+    # the parts without rays
+    bending: float = 1e-4
     steps: int = 8  # number of conjugate-gradient steps
     degree: int = 0  # degree of a polynomial that is fitted first, and extrapolates where no ray falls; 0: none
+    unlit: float = 0.0  # weight of a point without light, which keeps its present slopes, relative to one with light
 
 
 def fit_slopes(
     surface: BSplineSurface, x: Tensor, y: Tensor, z_x: Tensor, z_y: Tensor, weight: Tensor, fit: Fit = Fit()
 ) -> BSplineSurface:
-    """Return the surface that minimises Σ w |∇h(x, y) - (z_x, z_y)|² and a small bending energy.
+    """Return the surface that minimises Σ w |∇h(x, y) - (z_x, z_y)|² / Σ w, and a bending energy of its change.
 
-    Conjugate gradients in the variable of `Spectrum`, from the surface's own heights on.  x, y (mm), the slopes
-    z_x, z_y and the weights are (n,).
+    The change starts at zero, from the given surface with the polynomial of the fit added, and is found by conjugate
+    gradients in the variable of `Spectrum`.  x, y (mm), the slopes z_x, z_y and the weights are (n,).
     """
     pitch_x, pitch_y = surface.pitch
     u, v = surface.along_net(x, y)
@@ -71,14 +74,12 @@ def fit_slopes(
         return spectrum.adjoint(g)
 
     if fit.degree:
-        start = with_polynomial(start, monomials(surface, fit.degree), slopes, wanted=(z_x, z_y), weight=weight)
+        start = with_polynomial(start, monomials(surface, fit.degree), slopes, data=(z_x, z_y), weight=weight)
 
-    c = conjugate_gradients(
-        lambda c: adjoint(partial(slopes, spectrum.heights(c))) + damping * c,
-        torch.zeros_like(start),
-        adjoint(missing),
-        fit.steps,
-    )
+    def normal(c: Tensor) -> Tensor:
+        return adjoint(partial(slopes, spectrum.heights(c))) + damping * c
+
+    c = conjugate_gradients(normal, torch.zeros_like(start), adjoint(missing), fit.steps)
     return replace(surface, heights=start + spectrum.heights(c))
 
 
@@ -107,27 +108,27 @@ def conjugate_gradients(normal: Callable[[Tensor], Tensor], x: Tensor, residual:
     return x
 
 
-def with_polynomial(
-    start: Tensor,
-    monomials: list[Tensor],
-    slopes: Callable[[Tensor], tuple[Tensor, ...]],
-    wanted: tuple[Tensor, ...],
-    weight: Tensor,
-) -> Tensor:
-    """Return start + Σ b_k monomial_k with the b that minimise Σ w |slopes - wanted|², by modified Gram-Schmidt.
+Samples = tuple[Tensor, ...]
 
-    Each monomial is made orthogonal to those before it, by its weighted slopes (or other samples).  (LAPACK's solvers
-    divide their sums among threads, which changes their rounding.)
+
+def with_polynomial(
+    start: Tensor, monomials: list[Tensor], sample: Callable[[Tensor], Samples], data: Samples, weight: Tensor
+) -> Tensor:
+    """Return start + Σ b_k monomial_k with the b that minimise Σ w |sample - data|², by modified Gram-Schmidt.
+
+    sample: linear function of heights, such as their slopes at the points of the data.  Each monomial is made
+    orthogonal to those before it in its weighted samples.  (LAPACK's solvers divide their sums among threads, which
+    changes their rounding.)
     """
     root = weight.sqrt()
 
-    def weighted(pair: tuple[Tensor, ...]) -> Tensor:
-        return torch.cat([s * root for s in pair])
+    def weighted(samples: Samples) -> Tensor:
+        return torch.cat([s * root for s in samples])
 
-    left = weighted(tuple(z - now for z, now in zip(wanted, slopes(start), strict=True)))
-    basis: list[tuple[Tensor, Tensor]] = []  # (weighted slopes, heights), orthonormal in the first
+    left = weighted(tuple(z - now for z, now in zip(data, sample(start), strict=True)))
+    basis: list[tuple[Tensor, Tensor]] = []  # (weighted samples, heights), orthonormal in the first
     for h in monomials:
-        q = weighted(slopes(h))
+        q = weighted(sample(h))
         before = total(q * q)
         for q_k, h_k in basis:
             shared = total(q_k * q)
@@ -161,7 +162,8 @@ def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, plane: Receiver, repeats:
         at_face, _, _ = intersect(face.surface, coming, face.outline, face.status_if_missed)
         lit = at_face.alive & (at_face.flux > 0)
         z_x, z_y = (torch.where(lit, s, torch.zeros_like(s)) for s in wanted_slopes(at_face, aim, plane, face.law))
-        x, y, _ = at_face.position
-        flat = (t.reshape(-1) for t in (x, y, z_x, z_y, lit.to(x)))
-        lens = lens.with_last_net(fit_slopes(face.net, *flat).from_vertex().moved(face.surface.z))
+        samples = (*at_face.position[:2], z_x, z_y, lit.to(z_x))
+        x, y, z_x, z_y, weight = (t.reshape(-1) for t in samples)
+        net = face.net
+        lens = lens.with_last_net(fit_slopes(net, x, y, z_x=z_x, z_y=z_y, weight=weight).from_vertex().moved(net.z))
     return lens

@@ -23,7 +23,6 @@ of each ray.  Stage 1 falls back on them, and the baselines follow them.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,6 +32,7 @@ from torch import Tensor
 from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.emitters import Emitter
+from bstcad.optics.goal import Goal
 from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
@@ -46,19 +46,20 @@ from bstcad.optics.tubes import rays_to
 from bstcad.optics.unfolding import image_screen
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit, blocks, fit_slopes
-from bstcad.transport.bfm import TransportStep
-from bstcad.transport.density import Density, spread
-from bstcad.transport.mapping import Frame, Mapping, TransportMap, nodes, solve
+from bstcad.transport.density import Density, resample_flux
+from bstcad.transport.mapping import Frame, Mapping, Points, Solver, TransportMap, nodes, solve
 
-SUBCELLS = 2  # samples of the light in a transport cell, each way: a rim may cross the cell
-SUBPIXELS = 8  # parts of a pixel per transport cell, each way; at least one part per pixel
+SUBCELLS = 2  # samples of the light in a transport cell along each axis: a rim may cross the cell
+SUBPIXELS = 8  # parts of a pixel per transport cell along each axis; at least one part per pixel
 SLOPE_FLOOR = 1e-3  # floor under the slope density, relative to its mean, that the solver needs in black parts
-GATHERING_NET, GATHERING_SAMPLES = 33, 96  # control points a side of g, and samples a side for its fit
-GATHERING_WIDTH = (GATHERING_NET - 1) / (GATHERING_NET - 5)  # width of g over the window's: end spans lie outside
+GATHERING_NET, GATHERING_SAMPLES = 33, 96  # control points per side of g, and samples per side for its fit
+GATHERING_WIDTH = (GATHERING_NET - 1) / (GATHERING_NET - 5)  # width of g relative to the window: end spans lie outside
 GATHERING_FIT = Fit(bending=1e-3, steps=40, degree=5)  # fit of g
 PARABOLOID_FIT = Fit(steps=0, degree=2)  # fit of g by a paraboloid, where no face focuses the light
 PREVIEW_FIT, PREVIEW_SAMPLES = Fit(steps=0, degree=5), 32  # fit and samples of g in a preview, in a fifth of the time
 TARGET_FLOOR = 1e-3  # floor under the irradiance of the target, relative to its mean
+
+Slopes = tuple[Tensor, Tensor]  # ∂z/∂x and ∂z/∂y, of one shape
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,12 @@ class FaceGrid:
         """Cells along x and along y."""
         m, n = self.density.shape
         return m, n
+
+    def thinned(self, samples: int) -> FaceGrid:
+        """Return the grid with every k-th of its cells along each axis, about `samples` of them."""
+        thin = tuple(slice(step // 2, None, step) for step in (max(1, n // samples) for n in self.shape))
+        position, direction = (v[:, *thin] for v in (self.at_face.position, self.at_face.direction))
+        return FaceGrid(self.window, replace(self.at_face, position=position, direction=direction), self.density[thin])
 
 
 @torch.no_grad()
@@ -107,8 +114,8 @@ def lit_window(source: Emitter, lens: Lens, n: int = 128) -> Rectangle:
             "source: no ray of it reaches the back; move the source away from the front, or the back nearer to it"
         )
     x, y, _ = grid.at_face.position
-    reach = ((float(p.abs()[lit].max()) + 2.5 * 2 * half / n, half) for p, half in ((x, half_x), (y, half_y)))
-    return Rectangle(*(2 * min(r, half) for r, half in reach))
+    x_max, y_max = (float(p.abs()[lit].max()) + 2.5 * 2 * half / n for p, half in ((x, half_x), (y, half_y)))
+    return Rectangle(2 * min(x_max, half_x), 2 * min(y_max, half_y))
 
 
 @dataclass(frozen=True)
@@ -118,10 +125,10 @@ class SlopeMap:
     mapping: Mapping  # map from points of the last freeform face (mm) to y (dimensionless)
     gathering: BSplineSurface  # surface g
     sign: float  # sign σ, 1 or -1
-    places: tuple[np.ndarray, np.ndarray]  # b (mm) for the corners of the target's pixels, (columns + 1, rows + 1)
-    moved: float  # RMS change of `places` at lit pixels since the last round, in half windows; NaN: first round
+    face_points: Points  # b (mm) for the corners of the target's pixels, (columns + 1, rows + 1)
+    moved: float  # RMS change of b since the last round, at corners of lit pixels, in half windows; NaN: first round
 
-    def slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    def slopes(self, x: Tensor, y: Tensor) -> Slopes:
         """Return the slopes (∂z/∂x, ∂z/∂y) needed at points x, y (n,) of the last freeform face (mm)."""
         sent = self.mapping(x.cpu().double().numpy(), y.cpu().double().numpy())
         mapped = (torch.from_numpy(np.ascontiguousarray(s)).to(x) for s in sent)
@@ -131,21 +138,20 @@ class SlopeMap:
 
 
 def slope_map(
-    source: Emitter, lens: Lens, window: Rectangle, picture: np.ndarray, screen: Screen, n: int,
-    previous: SlopeMap | None, preview: bool = False, **solver,
-) -> SlopeMap:  # fmt: skip
-    """Return the map of one round, by transport on n x n cells for the sag of `lens`.
+    lens: Lens, grid: FaceGrid, goal: Goal, previous: SlopeMap | None, solver: Solver, preview: bool = False
+) -> SlopeMap:
+    """Return the map of one round, for the sag of `lens`.
 
-    previous: map of the last round, which gives b(t); None: b = 0.  window: `lit_window` of the lens.
-    preview: fit g in a fifth of the time; the fixed point is the same.  solver: more arguments of transport's `solve`.
+    grid: `square_grid` of the lit window.  previous: map of the last round, which gives b(t); None: b = 0.
+    preview: fit g in a fifth of the time; the fixed point is the same.
     """
-    grid, screen, law = square_grid(source, lens, window, n), image_screen(lens, screen), lens.last_freeform.law
+    picture, screen, law = goal.picture, image_screen(lens, goal.receiver), lens.last_freeform.law
     t = pixel_corners(screen)
-    b = previous.places if previous else tuple(map(np.zeros_like, t))
-    net = gathering(grid, lens, screen.plane, centroid(picture, screen), preview=preview)
+    b = previous.face_points if previous else (np.zeros_like(t[0]), np.zeros_like(t[1]))
+    g = gathering(grid, lens, screen.plane, centroid(picture, screen), preview=preview)
     needed = wanted_slopes(rays_at(grid, b), torch.from_numpy(np.stack(t)), screen.plane, law)
     sign = -1.0 if law.reverses or law.eta < 1 else 1.0
-    found = transport_slopes(grid, picture, net, needed, places=b, sign=sign, n=n, **solver)
+    found = transport_slopes(grid, picture, g, needed, points=b, sign=sign, solver=solver)
     return found if previous else replace(found, moved=math.nan)
 
 
@@ -156,54 +162,48 @@ def square_grid(source: Emitter, lens: Lens, window: Rectangle, n: int) -> FaceG
 
 
 def transport_slopes(
-    grid: FaceGrid, picture: np.ndarray, net: BSplineSurface, needed: tuple[Tensor, Tensor],
-    places: tuple[np.ndarray, np.ndarray], *, sign: float, n: int, **solver,
-) -> SlopeMap:  # fmt: skip
+    grid: FaceGrid, picture: np.ndarray, g: BSplineSurface, needed: Slopes, points: Points, sign: float, solver: Solver
+) -> SlopeMap:
     """Return the map from the light of a `square_grid` to a picture, given the slopes needed for its pixel corners.
 
-    net: g.  needed: slopes p(b, t) for the corners t of the pixels.  places: their b (mm), those of the last round.
+    needed: slopes p(b, t) for the corners t of the pixels.  points: their b (mm) in the last round.
     """
-    side = grid.window.width
+    side, n = grid.window.width, grid.shape[0] // SUBCELLS
     rho = grid.density.cpu().double().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3))
-    _, *g = net.relative_sag_and_slope(*(torch.from_numpy(p) for p in places))
-    y_x, y_y = (sign * (p - own).numpy() for p, own in zip(needed, g, strict=True))
-    sigma, frame = spread_density(picture, (y_x, y_y), n)
-    mapping = solve(light_density(rho, side), sigma, Frame((0.0, 0.0), side), frame, **solver)
+    _, *gathered = g.relative_sag_and_slope(*(torch.from_numpy(p) for p in points))
+    y_x, y_y = (sign * (p - s).numpy() for p, s in zip(needed, gathered, strict=True))
+    sigma, frame = resample_picture(picture, (y_x, y_y), n)
+    mapping = solve(light_density(rho, side), sigma, Frame((0.0, 0.0), side), frame, solver=solver)
     now = mapping.inverse(y_x, y_y)
-    return SlopeMap(mapping, net, sign, places=now, moved=_rms_change(picture, places, now) / (side / 2))
-
-
-def _rms_change(picture: np.ndarray, before: Sequence[np.ndarray], now: Sequence[np.ndarray]) -> float:
-    """Return the RMS distance (mm) between two positions of the corners of the lit pixels."""
     lit = corners_of(picture)
-    x, y = ((a - b)[lit] for a, b in zip(now, before, strict=True))
-    return float(np.sqrt(np.mean(x * x + y * y)))
+    x, y = ((after - before)[lit] for after, before in zip(now, points, strict=True))
+    return SlopeMap(mapping, g, sign, now, moved=float(np.sqrt(np.mean(x * x + y * y))) / (side / 2))
 
 
 def fit_to_map(
-    lens: Lens, wanted: SlopeMap, grid: FaceGrid, fit: Fit, unlit: float, parts: int = 1,
-    grazing: float = MAX_EXIT_ANGLE,
-) -> Lens:  # fmt: skip
+    lens: Lens, slopes: SlopeMap, grid: FaceGrid, fit: Fit, parts: int = 1, grazing: float = MAX_EXIT_ANGLE
+) -> Lens:
     """Return the lens whose last net is fitted to the slopes of a map by least squares; its vertex stays.
 
     A map may send a little light further than the face can, into the black around a picture; that light leaves at the
-    angle `grazing` (rad).  Points without light count with the weight `unlit` and their present slopes; for 0 the
-    bending energy alone shapes them.  parts: points per cell of the grid, each way.
+    angle `grazing` (rad).  A point with light has the weight 1, bright or faint.  A point without light has the weight
+    `fit.unlit` and its present slopes; with 0 the bending energy alone shapes its surroundings.  parts: points per cell
+    of the grid along each axis.
     """
     m, n = grid.shape
-    places = sampling.grid(grid.window, (parts * m, parts * n))
-    x, y = (p.to(grid.density.device).reshape(-1) for p in places)
+    centres = sampling.grid(grid.window, (parts * m, parts * n))
+    x, y = (p.to(grid.density.device).reshape(-1) for p in centres)
     lit = (grid.density > 0).repeat_interleave(parts, 0).repeat_interleave(parts, 1).reshape(-1)
     net = lens.nets[-1]
     z_x, z_y = torch.empty_like(x), torch.empty_like(y)
     for some in blocks(len(x)):
         _, *now = net.relative_sag_and_slope(x[some], y[some])
-        arriving = rays_at(grid, tuple(p[some].cpu().double().numpy() for p in (x, y)))
-        slopes = (s.cpu().double() for s in wanted.slopes(x[some], y[some]))
-        slopes = limit_refraction(arriving, tuple(slopes), lens.last_freeform.law, grazing)
-        for z, needed, own in zip((z_x, z_y), slopes, now, strict=True):
-            z[some] = torch.where(lit[some], needed.to(x), own)
-    weight = torch.where(lit, 1.0, unlit).to(x)
+        b_x, b_y = (p[some].cpu().double().numpy() for p in (x, y))
+        p_x, p_y = (s.cpu().double() for s in slopes.slopes(x[some], y[some]))
+        reachable = limit_refraction(rays_at(grid, (b_x, b_y)), (p_x, p_y), lens.last_freeform.law, grazing)
+        for z, needed, present in zip((z_x, z_y), reachable, now, strict=True):
+            z[some] = torch.where(lit[some], needed.to(x), present)
+    weight = torch.where(lit, 1.0, fit.unlit).to(x)
     fitted = fit_slopes(net, x, y, z_x=z_x, z_y=z_y, weight=weight, fit=fit)
     return lens.with_last_net(fitted.from_vertex().moved(net.z))
 
@@ -219,30 +219,30 @@ def centroid(picture: np.ndarray, screen: Screen) -> tuple[float, float]:
 def gathering(
     grid: FaceGrid, lens: Lens, plane: Receiver, middle: tuple[float, float], preview: bool = False
 ) -> BSplineSurface:
-    """Return g, the net of GATHERING_NET points a side whose slopes fit p(b, m) best over the lit part of a grid.
+    """Return g, the net of GATHERING_NET points per side whose slopes fit p(b, m) best over the lit part of a grid.
 
-    With the sag fixed, p(b, m) is a gradient but for a curl of the order ∂p/∂z x y.
+    With the sag fixed, p(b, m) is a gradient except for a curl of the order ∂p/∂z x y.
     """
     count, fit = (PREVIEW_SAMPLES, PREVIEW_FIT) if preview else (GATHERING_SAMPLES, GATHERING_FIT)
-    thin = tuple(slice(step // 2, None, step) for step in (max(1, n // count) for n in grid.shape))
-    faces = replace(grid.at_face, **{k: getattr(grid.at_face, k)[(..., *thin)] for k in ("position", "direction")})
-    x, y, _ = faces.position
+    few, law = grid.thinned(count), lens.last_freeform.law
+    x, y, _ = few.at_face.position
     aim = torch.stack([torch.full_like(x, m) for m in middle])
-    z_x, z_y = wanted_slopes(faces, aim, plane, lens.last_freeform.law)
-    lit = grid.density[thin] > 0
-    reaches = reach_margin(faces, aim, plane, law=lens.last_freeform.law) >= 0  # elsewhere the slope is a placeholder
-    return fit_gathering(grid, (x, y, z_x, z_y, lit), fit if bool(reaches[lit].all()) else PARABOLOID_FIT)
+    reaches = reach_margin(few.at_face, aim, plane, law=law) >= 0  # elsewhere the slope is a placeholder
+    fit = fit if bool(reaches[few.density > 0].all()) else PARABOLOID_FIT
+    return fit_gathering(few, wanted_slopes(few.at_face, aim, plane, law), fit)
 
 
-def fit_gathering(grid: FaceGrid, samples: tuple[Tensor, ...], fit: Fit) -> BSplineSurface:
-    """Fit a net of GATHERING_NET points a side over a grid to the slopes of samples (x, y, z_x, z_y, weight)."""
+def fit_gathering(grid: FaceGrid, slopes: Slopes, fit: Fit) -> BSplineSurface:
+    """Fit a net of GATHERING_NET points per side to slopes at the lit cell centres of a grid."""
     half_x, half_y = (GATHERING_WIDTH * size / 2 for size in (grid.window.width, grid.window.height))
     flat = torch.zeros((GATHERING_NET, GATHERING_NET), dtype=torch.float64)
     net = BSplineSurface(0.0, flat, (-half_x, half_x), (-half_y, half_y))
-    return fit_slopes(net, *(p.reshape(-1).cpu().double() for p in samples), fit=fit)
+    samples = (*grid.at_face.position[:2], *slopes, grid.density > 0)
+    x, y, z_x, z_y, weight = (p.reshape(-1).cpu().double() for p in samples)
+    return fit_slopes(net, x, y, z_x=z_x, z_y=z_y, weight=weight, fit=fit)
 
 
-def interpolate(grid: FaceGrid, values: Tensor, b: tuple) -> Tensor:
+def interpolate(grid: FaceGrid, values: Tensor, b: Points) -> Tensor:
     """Interpolate values (k, m, n) at cell centres to points b (…) mm, bilinear, constant outside; return (k, …)."""
     sizes = (grid.window.width, grid.window.height)
     x, y = (torch.from_numpy(p) / (size / 2) for p, size in zip(b, sizes, strict=True))
@@ -253,7 +253,7 @@ def interpolate(grid: FaceGrid, values: Tensor, b: tuple) -> Tensor:
     return found.view(len(values), *x.shape)
 
 
-def rays_at(grid: FaceGrid, b: tuple) -> Rays:
+def rays_at(grid: FaceGrid, b: Points) -> Rays:
     """Return the rays that meet the face at points b (mm), with sag and direction interpolated in the grid."""
     sag, d_x, d_y, d_z = interpolate(grid, torch.cat([grid.at_face.position[2:], grid.at_face.direction]), b)
     position = torch.stack([torch.from_numpy(b[0]), torch.from_numpy(b[1]), sag])
@@ -261,32 +261,34 @@ def rays_at(grid: FaceGrid, b: tuple) -> Rays:
     return replace(grid.at_face, position=position, direction=direction)
 
 
-def map_from_face(places: tuple[np.ndarray, np.ndarray], screen: Screen) -> TransportMap:
-    """Return the map for the corners of the target's pixels, given as points (mm) of the last tailored face.
+def map_from_face(points: Points, screen: Screen) -> TransportMap:
+    """Return the map of the points of the last tailored face whose light meets the target's pixel corners.
 
-    places: x and y, each (columns + 1, rows + 1).  The plane of the map is named "back" even if the face is the front.
+    points: each (columns + 1, rows + 1).  The plane of the map is named "back" even if the face is the front.
     """
     x, y = (np.linspace(*ends, n + 1) for ends, n in ((screen.x, screen.columns), (screen.y, screen.rows)))
     i, j = nodes(screen.columns), nodes(screen.rows)
-    source = np.stack([place[np.ix_(i, j)] for place in places], axis=-1)
+    source = np.stack([p[np.ix_(i, j)] for p in points], axis=-1)
     return TransportMap(x[i], y[j], source.astype(np.float32), "back")
 
 
-def pixel_corners(screen: Screen) -> list[np.ndarray]:
+def pixel_corners(screen: Screen) -> Points:
     """Return x and y (mm) of the corners of the pixels, each (columns + 1, rows + 1), x first."""
     sides = np.linspace(*screen.x, screen.columns + 1), np.linspace(*screen.y, screen.rows + 1)
-    return np.meshgrid(*sides, indexing="ij")
+    x, y = np.meshgrid(*sides, indexing="ij")
+    return x, y
 
 
-def spread_density(picture: np.ndarray, corners: tuple[np.ndarray, np.ndarray], n: int) -> tuple[Density, Frame]:
+def resample_picture(picture: np.ndarray, corners: Points, n: int) -> tuple[Density, Frame]:
     """Resample a picture with the given pixel corners on n x n cells of the smallest square around its lit part."""
     lit = corners_of(picture)
     low, high = (np.array([f(c[lit]) for c in corners]) for f in (np.min, np.max))
-    frame = Frame(tuple((low + high) / 2), float((high - low).max()))
+    x_mean, y_mean = (low + high) / 2
+    frame = Frame((x_mean, y_mean), float((high - low).max()))
     flux = np.ascontiguousarray(picture[::-1].T)  # row 0 is y max
-    parts = tuple(max(1, round(SUBPIXELS * n / pixels)) for pixels in flux.shape)
+    columns, rows = (max(1, round(SUBPIXELS * n / pixels)) for pixels in flux.shape)
     x, y = (np.ascontiguousarray(n * c) for c in frame.to_unit(*corners))
-    return Density.from_values(spread(flux, x, y, n=n, parts=parts), floor=SLOPE_FLOOR), frame
+    return Density.from_values(resample_flux(flux, x, y, n=n, parts=(columns, rows)), floor=SLOPE_FLOOR), frame
 
 
 def light_density(values: np.ndarray, side: float) -> Density:
@@ -307,21 +309,13 @@ def corners_of(picture: np.ndarray) -> np.ndarray:
 
 
 @torch.no_grad()
-def map_to_target(
-    source: Emitter,
-    lens: Lens,
-    picture: np.ndarray,
-    screen: Screen,
-    n: int,
-    iterations: int,
-    progress: Callable[[TransportStep], None],
-) -> Mapping:
+def map_to_target(source: Emitter, lens: Lens, goal: Goal, n: int, solver: Solver) -> Mapping:
     """Return the transport map of the paper, from the vertex plane of the front (mm) to the target (mm).
 
     It is solved on n x n cells, for the light that passes all faces.  A tilted target is projected from the vertex of
     the front onto the level plane through its centre: in its own coordinates the map would be far from a gradient.
     """
-    screen = image_screen(lens, screen)
+    picture, screen = goal.picture, image_screen(lens, goal.receiver)
     area = clear_window(source, lens)
     side = max(area.width, area.height)
     x, y = (t.to(lens.like.device) for t in sampling.grid(Rectangle(side, side), n * SUBCELLS))
@@ -329,12 +323,12 @@ def map_to_target(
     flux = flux * is_transmitted(source.rays(x, y, lens.entrance.z, 1.0), lens)
     density = light_density(flux.cpu().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3)), side)
     if not screen.plane.is_level:
-        wanted, frame = spread_density(picture, screen.plane.to_level_plane(*pixel_corners(screen), lens.front.z), n)
+        target, frame = resample_picture(picture, screen.plane.to_level_plane(*pixel_corners(screen), lens.front.z), n)
     else:
         width, height = screen.x[1] - screen.x[0], screen.y[1] - screen.y[0]
-        wanted = Density.from_picture(picture, n, width=width, height=height, floor=TARGET_FLOOR)
+        target = Density.from_picture(picture, n, width=width, height=height, floor=TARGET_FLOOR)
         frame = Frame(((screen.x[0] + screen.x[1]) / 2, (screen.y[0] + screen.y[1]) / 2), max(width, height))
-    return solve(density, wanted, Frame((0.0, 0.0), side), frame, iterations=iterations, progress=progress)
+    return solve(density, target, Frame((0.0, 0.0), side), frame, solver=solver)
 
 
 def map_from_entrance(mapping: Mapping, lens: Lens, screen: Screen) -> TransportMap:

@@ -38,12 +38,12 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import point_pairs
 
-IMAGE_NODES = 5  # nodes a side, from border to border of the screen
-IMAGE_GRID = 32  # points a side of the back, through which the images of the source are traced
+IMAGE_NODES = 5  # nodes per side, from border to border of the screen
+IMAGE_GRID = 32  # points per side of the back, through which the images of the source are traced
 POINT_DISTANCE = 0.7  # distance of the 3 x 3 points of the source from its centre, in half widths
 IMAGE_PAIRS = 256  # pairs of points of the source in an image
-PIXEL_PARTS = 5  # parts of a pixel a side in the images; odd
-ERROR_RAYS = 1448  # rays a side in each of the two sets that measure the error of the blur
+PIXEL_PARTS = 5  # parts of a pixel per side in the images; odd
+ERROR_RAYS = 1448  # rays per side in each of the two sets that measure the error of the blur
 ERROR_POINTS = 256  # points of the source in each set
 ERROR_SMOOTHING = 0.15  # standard deviation of the smoothing of this error, in radii of the image
 MAX_TRANSFORM_BYTES, VALUE_BYTES = 2 << 30, 8  # limit for the transforms of all images, and size of one value (bytes)
@@ -52,7 +52,7 @@ ERROR_SEED_OFFSET = 500_009  # offset of the seed, so that these rays differ fro
 
 
 @dataclass(frozen=True)
-class Spread:
+class ExtendedSource:
     """Source of finite size, with the light of its centre."""
 
     source: Emitter
@@ -72,7 +72,8 @@ class BlurOperator:
     def forward(self, light: np.ndarray) -> np.ndarray:
         """Apply B to light (rows + 2 border, columns + 2 border); return a picture (rows, columns)."""
         waves = scipy.fft.rfft2(self._times_hats(light), self.size)
-        return self._inside(scipy.fft.irfft2((waves * self.spectra).sum((0, 1)), self.size))
+        wide, p = scipy.fft.irfft2((waves * self.spectra).sum((0, 1)), self.size), self.border
+        return wide[p : light.shape[0] - p, p : light.shape[1] - p]
 
     def adjoint(self, g: np.ndarray) -> np.ndarray:
         """Apply the transpose of `forward`."""
@@ -85,10 +86,6 @@ class BlurOperator:
         """Return light (…, rows, columns) times the hat function of each node."""
         down, across = self.hats
         return light * down[:, None, :, None] * across[None, :, None, :]
-
-    def _inside(self, wide: np.ndarray) -> np.ndarray:
-        (_, rows), (_, columns), p = self.hats[0].shape, self.hats[1].shape, self.border
-        return wide[p : rows - p, p : columns - p]
 
 
 class _BlurFunction(torch.autograd.Function):
@@ -128,6 +125,7 @@ class LocalImages:
     @classmethod
     def of(cls, source: Emitter, channel: Channel, lens: Lens, screen: Screen) -> LocalImages:
         """Trace the images through the points of the back that the light of all ten source points passes."""
+        assert source.extent is not None, "a point source has no image"
         a, b = source.extent.half_extent
         points = [(i * POINT_DISTANCE, j * POINT_DISTANCE) for j in (-1, 0, 1) for i in (-1, 0, 1)]
         nine = (replace(source.element(a * u, b * v), wavelength=channel.source.wavelength) for u, v in points)
@@ -155,16 +153,17 @@ def _biquadratic(points: Sequence[tuple[float, float]]) -> Tensor:
     return torch.stack([along * across for across in axes[1] for along in axes[0]])
 
 
-def blurs(spread: Spread, lens: Lens, screen: Screen) -> tuple[BlurOperator, ...]:
+def blurs(extended: ExtendedSource, lens: Lens, screen: Screen) -> tuple[BlurOperator, ...]:
     """Return B for each channel of a source and a lens, all with the same border."""
-    unit = Circle(1.0) if spread.source.extent.is_round else Rectangle(2.0, 2.0)
+    extent = extended.source.extent
+    unit = Circle(1.0) if extent is not None and extent.is_round else Rectangle(2.0, 2.0)
     dots = _biquadratic(point_pairs(unit, IMAGE_PAIRS))
     nodes = [[k / (IMAGE_NODES - 1) * side for k in range(IMAGE_NODES)] for side in screen.shape]
     kernels = []
-    for channel in spread.centre:
-        local = LocalImages.of(spread.source, channel, lens, screen)
+    for channel in extended.centre:
+        local = LocalImages.of(extended.source, channel, lens, screen)
         near = [local.nearest(column, row) for row in nodes[0] for column in nodes[1]]
-        kernels.append([tuple((part[..., None] * dots).sum(-2) for part in image) for image in near])
+        kernels.append([((p[..., None] * dots).sum(-2), (flux[..., None] * dots).sum(-2)) for p, flux in near])
     reach = max(float(offset.abs().max()) for images in kernels for offset, _ in images)
     border = min(math.ceil(reach) + 2, widest(screen, len(kernels)))
     return tuple(_operator(images, screen, border) for images in kernels)
@@ -180,22 +179,23 @@ def widest(screen: Screen, lines: int) -> int:
 
 
 def _operator(images: Sequence[tuple[Tensor, Tensor]], screen: Screen, border: int) -> BlurOperator:
-    """Make B from the image at each node: offset (2, dots) in pixels, flux (dots,) over that of the centre.
+    """Make B from the image at each node: offset (2, dots) in pixels, flux (dots,) relative to that of the centre.
 
-    A tent function distributes each dot over parts of a pixel, PIXEL_PARTS a side, whose blur is negligible.
+    A tent function distributes each dot over parts of a pixel, PIXEL_PARTS per side, whose blur is negligible.
     """
-    hats = tuple(_hats(side, border) for side in screen.shape)
+    down, across = (_hats(side, border) for side in screen.shape)
     side = 2 * border + 1
-    size = tuple(scipy.fft.next_fast_len(hat.shape[1] + side, real=True) for hat in hats)
-    own = Screen(0.0, (-side / 2, side / 2), (-side / 2, side / 2), PIXEL_PARTS * side)
-    spectra = np.zeros((len(images), size[0], size[1] // 2 + 1), dtype=complex)
-    for spectrum, (offset, share) in zip(spectra, images, strict=True):
-        down = offset * torch.tensor([[1.0], [-1.0]])  # rows count downwards
-        dots = Landed(down.contiguous(), share / share.numel(), torch.zeros(share.shape, dtype=torch.uint8))
-        waves = scipy.fft.rfft(_about_zero(tent(dots, own).numpy(), PIXEL_PARTS * size[1], axis=1))
-        waves = scipy.fft.fft(_about_zero(waves[:, : spectrum.shape[1]], PIXEL_PARTS * size[0], axis=0), axis=0)
-        spectrum[:] = waves[np.arange(size[0]) - size[0] * (np.arange(size[0]) >= (size[0] + 1) // 2)]
-    return BlurOperator(border, hats, spectra.reshape(IMAGE_NODES, IMAGE_NODES, *spectra.shape[1:]), size)
+    rows, columns = (scipy.fft.next_fast_len(hat.shape[1] + side, real=True) for hat in (down, across))
+    fine = Screen(0.0, (-side / 2, side / 2), (-side / 2, side / 2), PIXEL_PARTS * side)
+    spectra, k = np.zeros((len(images), rows, columns // 2 + 1), dtype=complex), np.arange(rows)
+    for spectrum, (offset, flux) in zip(spectra, images, strict=True):
+        position = (offset * torch.tensor([[1.0], [-1.0]])).contiguous()  # rows count downwards
+        dots = Landed(position, flux / flux.numel(), torch.zeros(flux.shape, dtype=torch.uint8))
+        waves = scipy.fft.rfft(_about_zero(tent(dots, fine).numpy(), PIXEL_PARTS * columns, axis=1))
+        waves = scipy.fft.fft(_about_zero(waves[:, : spectrum.shape[1]], PIXEL_PARTS * rows, axis=0), axis=0)
+        spectrum[:] = waves[k - rows * (k >= (rows + 1) // 2)]
+    spectra = spectra.reshape(IMAGE_NODES, IMAGE_NODES, *spectra.shape[1:])
+    return BlurOperator(border, (down, across), spectra, (rows, columns))
 
 
 def _about_zero(values: np.ndarray, n: int, axis: int) -> np.ndarray:

@@ -13,7 +13,7 @@ Free parameters of the front (curvature, conic constant) are optimised before, e
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -23,7 +23,7 @@ from torch import Tensor
 
 from bstcad.optics import sampling
 from bstcad.optics.emitters import Emitter
-from bstcad.optics.irradiance import Screen
+from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays
 from bstcad.optics.reach import MAX_EXIT_ANGLE
@@ -32,32 +32,31 @@ from bstcad.optics.trace import clear_window, trace
 from bstcad.scene.blank import CONIC_CONSTANTS
 from bstcad.scene.quality import COARSEST_GRID
 from bstcad.scene.scene import SEARCH_RANGE
+from bstcad.tailoring import slope_map
 from bstcad.tailoring.machinability import place_back
 from bstcad.tailoring.merit import landing
 from bstcad.tailoring.reachable import resample
-from bstcad.tailoring.run import Parameters, StageStep, Task
+from bstcad.tailoring.run import Parameters, StageStep, Steps, Task
 from bstcad.tailoring.slope_fit import Fit, tailor_to_aim
-from bstcad.tailoring.slope_map import SlopeMap, aim_points, face_grid, fit_to_map, lit_window, map_to_target, slope_map
+from bstcad.tailoring.slope_map import SlopeMap
 from bstcad.transport.bfm import TransportStep
-from bstcad.transport.mapping import Mapping
+from bstcad.transport.mapping import Mapping, Points, Solver
 
-COARSE_FACE_FIT = (Fit(bending=1e-2, steps=40, degree=3), 0.0)  # fit, weight of unlit points: stiff, extrapolates there
-FINE_FACE_FIT = (Fit(), 1e-2)  # fit, weight of unlit points: these keep the slopes of the coarse face
-FINE_ROUNDS = 2  # number of rounds at the end on half of the transport's grid and on all of it
+COARSE_FACE_FIT = Fit(bending=1e-2, steps=40, degree=3)  # stiff, extrapolates to points without light
+FINE_FACE_FIT = Fit(unlit=1e-2)  # points without light keep the slopes of the coarse face
+FINE_ROUNDS = 2  # number of rounds at the end: the first uses half of the transport's grid, the last all of it
 # RRMSD, and RMS change of the map in the last round in half widths of the face, above which `follow_aims` is tried.
 # The change is at most 0.016 where more rounds gain nothing.
 RETRY_RRMSD, RETRY_CHANGE = 0.25, 0.025
 SETTLED_CHANGE = 0.01  # RMS change of the map, in the same unit, below which the coarse rounds end
-MAX_RAY_CELLS = 1026  # largest number of cells a side for which a ray is sought: cells of a finer grid share their rays
-MIN_FLUX_RATIO = 0.9  # smallest flux on the target of a lens of `follow_aims` over that of the rounds
+MAX_RAY_CELLS = 1026  # largest number of cells per side with a ray each: cells of a finer grid share their rays
+MIN_FLUX_RATIO = 0.9  # smallest flux on the target of a lens of `follow_aims`, relative to that of the rounds
 AIM_ROUNDS = 5  # rounds of `follow_aims`
 SCALAR_EVALUATIONS = 8  # evaluations of the merit in the search for one parameter of the front
 SIMPLEX_EVALUATIONS = 40  # evaluations of the merit in the search for curvature and conic constant together
 MAX_RIM_SINE = 0.5  # sine of the largest slope angle of the front at the rim
 MAX_ELLIPSE, MAX_HYPERBOLA = 0.8, 6.0  # largest (1 + k) c² r² and -(1 + k) c² r² at the rim; scenes allow a little more
 UNBOUNDED = (-math.inf, math.inf)
-
-PREVIEW_NET, PREVIEW_FRONT = 17, {"n": 32, "iterations": 40, "repeats": 1}  # `shaped_front` in a preview
 
 Range = tuple[float, float]
 FrontMerit = Callable[[Lens], float]
@@ -69,21 +68,33 @@ class SlopeRound:
 
     round: int  # number of rounds done
     lens: Parameters
-    wanted: SlopeMap  # map of the last round
+    slopes: SlopeMap  # map of the last round
 
 
-def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[StageStep]:
+@dataclass(frozen=True)
+class FrontSearch:
+    """Effort of `shaped_front`."""
+
+    cells: int = COARSEST_GRID  # cells per side of the transport map
+    iterations: int = 100  # iterations of the map
+    repeats: int = 3  # fits of the slopes for each front
+
+
+PREVIEW_NET, PREVIEW_SEARCH = 17, FrontSearch(cells=32, iterations=40, repeats=1)  # `shaped_front` in a preview
+
+
+def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Steps:
     """Yield the steps of stage 1 for a blank, or from a saved state on.
 
     The rounds come first (`follow_slopes`), then `follow_aims` if their result is poor (`is_poor_result`).
     """
-    lens, goal = task.heaviest.through(lens), task.goals[0]
+    lens = task.heaviest.through(lens)
     if state is None and task.free:
-        net, settings = task.knobs.levels[0], {"iterations": task.knobs.transport_iterations}
+        net, effort = task.knobs.levels[0], FrontSearch(iterations=task.knobs.transport_iterations)
         if task.preview:
-            net, settings = coarser(lens.back_net.shape, PREVIEW_NET), PREVIEW_FRONT
-        settings = settings | {"free": task.free, "rim_sags": task.rim_sags}
-        shaped = shaped_front(task.heaviest.source, lens.refined(net), goal.picture, goal.receiver, **settings)
+            net, effort = coarser(lens.back_net.shape, PREVIEW_NET), PREVIEW_SEARCH
+        source, blank = task.heaviest.source, lens.refined(net)
+        shaped = shaped_front(source, blank, task.goals[0], task.free, rim_sags=task.rim_sags, effort=effort)
         lens = lens.with_front(shaped.front)
     for last in follow_slopes(task, lens, state):
         yield last
@@ -109,33 +120,40 @@ def is_poor_result(task: Task, lens: Lens, by_rays: float, state: SlopeRound) ->
     few = resample(goal, pixels=max(as_pair(task.knobs.levels[-1])))
     if by_rays > RETRY_RRMSD and few.receiver.shape != goal.receiver.shape:
         by_rays = replace(task, goals=(few,)).rrmsd(lens)
-    return not by_rays <= RETRY_RRMSD or state.wanted.moved > RETRY_CHANGE  # NaN: no light on the target
+    return not by_rays <= RETRY_RRMSD or state.slopes.moved > RETRY_CHANGE  # NaN: no light on the target
 
 
-def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[StageStep]:
+def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> Steps:
     """Yield a step per round of transport map and slope fit, each from the sag and the map of the round before.
 
-    All rounds but the last FINE_ROUNDS use coarse grids and nets, where they are cheap; they end once the map settles.
+    All rounds except the last FINE_ROUNDS use coarse grids and nets, where they are cheap.  Once the map has settled,
+    the remaining coarse rounds are left out.
     """
-    knobs = task.knobs
-    wanted, done, z = None, 0, lens.back.z  # z: plane of the back in the blank (mm)
-    if state is not None:
-        lens, wanted, done = state.lens.apply_to(lens), state.wanted, state.round
+    knobs, z = task.knobs, lens.back.z  # z: plane of the back in the blank (mm)
+    slopes, done = (None, 0) if state is None else (state.slopes, state.round)
+    lens = lens if state is None else state.lens.apply_to(lens)
     turn = min(done, knobs.rounds - 1)
     while turn < knobs.rounds:
-        if turn >= done:
-            lens, wanted = _round(task, lens, wanted, turn)
+        if slopes is None or turn >= done:
+            lens, slopes = _round(task, lens, slopes, turn)
             lens = place_back(lens, z, task.min_thickness, task.bounds)  # the next round takes the move into account
             task.tidy()
-        turn = max(turn + 1, knobs.rounds - FINE_ROUNDS if wanted.moved <= SETTLED_CHANGE else 0)
-        state = SlopeRound(turn, Parameters.of(lens), wanted)
-        yield StageStep(
-            partial(task.refined, lens, knobs.levels[-1]), state, mapping=wanted.mapping, places=wanted.places,
-            progress=("stage 1", turn, knobs.rounds, ""),
-        )  # fmt: skip
+        turn = next_round(turn, knobs.rounds, fine=FINE_ROUNDS, settled=slopes.moved <= SETTLED_CHANGE)
+        yield round_step(task, lens, SlopeRound(turn, Parameters.of(lens), slopes), slopes.face_points)
 
 
-def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[Lens, SlopeMap]:
+def next_round(number: int, rounds: int, fine: int, settled: bool) -> int:
+    """Return the number of the round after `number`: the first of the last `fine` rounds if the map has settled."""
+    return max(number + 1, rounds - fine) if settled else number + 1
+
+
+def round_step(task: Task, lens: Lens, state: SlopeRound, face_points: Points) -> StageStep:
+    """Return the step after a round; face_points: points (mm) of the last tailored face for the pixel corners."""
+    make, progress = partial(task.refined, lens, task.knobs.levels[-1]), ("stage 1", state.round, task.knobs.rounds, "")
+    return StageStep(make, state, mapping=state.slopes.mapping, face_points=face_points, progress=progress)
+
+
+def _round(task: Task, lens: Lens, previous: SlopeMap | None, turn: int) -> tuple[Lens, SlopeMap]:
     """Run one round; return the lens and the map that it follows."""
     knobs, source, goal, left = task.knobs, task.heaviest.source, task.goals[0], task.knobs.rounds - turn
     cells = max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left - 1, 2))
@@ -145,16 +163,16 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[
         task.progress("stage 1", turn, knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
 
     lens = task.refined(lens, m)
-    window = lit_window(source, lens)
-    settings = {"iterations": knobs.transport_iterations, "progress": progress, "preview": task.preview}
-    screen = goal.receiver
-    wanted = slope_map(source, lens, window, goal.picture, screen=screen, n=cells, previous=wanted, **settings)
+    window = slope_map.lit_window(source, lens)
+    grid = slope_map.square_grid(source, lens, window, cells)
+    solver = Solver(knobs.transport_iterations, progress=progress)
+    slopes = slope_map.slope_map(lens, grid, goal, previous, solver=solver, preview=task.preview)
     sides = [min(2 * points, knobs.rays) for points in as_pair(m)]
     parts = math.ceil(max(sides) / MAX_RAY_CELLS)
-    grid = face_grid(source, lens, window, (math.ceil(sides[0] / parts), math.ceil(sides[1] / parts)))
+    grid = slope_map.face_grid(source, lens, window, (math.ceil(sides[0] / parts), math.ceil(sides[1] / parts)))
     grazing = MAX_EXIT_ANGLE if task.edge is None else task.edge.angle
     fit = FINE_FACE_FIT if left <= FINE_ROUNDS else COARSE_FACE_FIT
-    return fit_to_map(lens, wanted, grid, *fit, parts, grazing), wanted
+    return slope_map.fit_to_map(lens, slopes, grid, fit, parts=parts, grazing=grazing), slopes
 
 
 def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
@@ -170,37 +188,36 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
         lens = task.refined(lens, m)
         side = min(3 * max(as_pair(m)), max(2 * max(as_pair(m)), knobs.rays))  # many rays may leave through the sides
         counts = {"n": n, "side": side, "iterations": knobs.transport_iterations}
-        rays, wanted, mapping = aimed_rays(task.heaviest.source, lens, goal.picture, goal.receiver, **counts)
-        lens = place_back(tailor_to_aim(lens, rays, wanted, goal.receiver.plane), z, task.min_thickness, task.bounds)
+        rays, aims, mapping = aimed_rays(task.heaviest.source, lens, goal, **counts)
+        lens = place_back(tailor_to_aim(lens, rays, aims, goal.receiver.plane), z, task.min_thickness, task.bounds)
     return lens, mapping
 
 
 def aimed_rays(
-    source: Emitter, lens: Lens, target: np.ndarray, screen: Screen, n: int, side: int, iterations: int
+    source: Emitter, lens: Lens, goal: Goal, n: int, side: int, iterations: int
 ) -> tuple[Rays, Tensor, Mapping]:
     """Return side x side rays over the front, the aim of each on the target (mm), and the map on n x n cells."""
-    mapping = map_to_target(source, lens, target, screen=screen, n=n, iterations=iterations, progress=lambda _: None)
+    mapping = slope_map.map_to_target(source, lens, goal, n, solver=Solver(iterations))
     area = clear_window(source, lens)
     x, y = (t.to(lens.like) for t in sampling.grid(area, side))
     rays = source.rays(x, y, lens.entrance.z, area.area / side**2)
-    return rays, aim_points(mapping, lens, screen, x=x, y=y), mapping
+    return rays, slope_map.aim_points(mapping, lens, goal.receiver, x=x, y=y), mapping
 
 
 def shaped_front(
-    source: Emitter, lens: Lens, target: np.ndarray, screen: Screen, free: tuple[str, ...],
-    rim_sags: tuple[float, float], n: int = COARSEST_GRID, iterations: int = 100, repeats: int = 3,
-) -> Lens:  # fmt: skip
-    """Return the lens with the front that minimises the merit of stage 1 in Wang et al. 2023, Eq. 14.
+    source: Emitter, lens: Lens, goal: Goal, free: tuple[str, ...], rim_sags: Range, effort: FrontSearch
+) -> Lens:
+    """Return the lens with the front whose best back has the smallest mean |P_i^t - P_i|² (Wang et al. 2023, Eq. 14).
 
-    The merit, the mean of |P_i^t - P_i|², is that of the best back for each front, on the net of `lens`.
-    n, iterations: cells a side and iterations of the map; repeats: fits of the slopes for each front.
+    free, rim_sags: parameters of the front and range of its sag, see `best_front`.  The back has the net of `lens`, and
+    is fitted to each front: rays keep the aims P_i^t that they have with the front of `lens`.
     """
-    side, plane = 2 * max(lens.back_net.shape), screen.plane
-    rays, wanted, _ = aimed_rays(source, lens, target, screen=screen, n=n, side=side, iterations=iterations)
+    side, plane = 2 * max(lens.back_net.shape), goal.receiver.plane
+    rays, aims, _ = aimed_rays(source, lens, goal, n=effort.cells, side=side, iterations=effort.iterations)
 
-    def miss(tried: Lens) -> float:
-        fitted = tailor_to_aim(tried, rays, wanted, plane=plane, repeats=repeats)
-        return float(landing(trace(rays, fitted, plane), wanted))
+    def miss(front: Lens) -> float:
+        fitted = tailor_to_aim(front, rays, aims, plane=plane, repeats=effort.repeats)
+        return float(landing(trace(rays, fitted, plane), aims))
 
     return lens.with_front(best_front(miss, lens, free, rim_sags).front)
 
@@ -212,14 +229,13 @@ def best_front(merit: FrontMerit, lens: Lens, free: tuple[str, ...], rim_sags: R
     is in `rim_sags`.
     """
     if "curvature" in free:
-        own = float(lens.front.curvature)
-        lens = _optimise_one("curvature", merit, lens, bounds=_curvatures(lens, rim_sags, own), tolerance=1e-4)
+        bounds = _curvatures(lens, rim_sags, float(lens.front.curvature))
+        lens = _optimise_one("curvature", merit, lens, bounds=bounds, tolerance=1e-4)
     if "conic_constant" in free and lens.front.curvature:
         if "curvature" in free:
             return _optimise_two(merit, lens, rim_sags)
-        own = float(lens.front.conic_constant)
-        low, high = _conic_constants(lens, rim_sags)
-        low, high = min(low, own), max(high, own)
+        present, (low, high) = float(lens.front.conic_constant), _conic_constants(lens, rim_sags)
+        low, high = min(low, present), max(high, present)
         lens = _optimise_one("conic_constant", merit, lens, bounds=(low, high), tolerance=1e-3 * (high - low))
     return lens
 
@@ -267,10 +283,10 @@ def _rim_radius(lens: Lens) -> float:
     return sum(half**2 for half in lens.outline.half_extent) ** 0.5
 
 
-def _curvatures(lens: Lens, rim_sags: Range, *own: float) -> Range:
+def _curvatures(lens: Lens, rim_sags: Range, *included: float) -> Range:
     """Return the range of curvatures c (1/mm) that `best_front` allows with the front's conic constant k.
 
-    The slope angle at r has the sine S where c = S / (r sqrt(1 + k S²)).  own: values to include where possible.
+    The slope angle at r has the sine S where c = S / (r sqrt(1 + k S²)).  included: values to include where possible.
     """
     rim, k = _rim_radius(lens), float(lens.front.conic_constant)
     room = (lens.back.z - lens.front.z) / 2
@@ -279,7 +295,7 @@ def _curvatures(lens: Lens, rim_sags: Range, *own: float) -> Range:
     if k != -1:
         limit = min(limit, math.sqrt((MAX_ELLIPSE if k > -1 else MAX_HYPERBOLA) / abs(1 + k)) / rim)
     low, high = (_curvature_of_sag(sag, math.hypot(*lens.outline.farthest), k) for sag in rim_sags)
-    return max(-limit, min((low, *own))), min(limit, _curvature_of_sag(room, rim, k), max((high, *own)))
+    return max(-limit, min((low, *included))), min(limit, _curvature_of_sag(room, rim, k), max((high, *included)))
 
 
 def _curvature_of_sag(h: float, r: float, k: float) -> float:

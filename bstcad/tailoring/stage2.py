@@ -10,14 +10,15 @@ their flux over the pixels exactly, so that the merit is smooth and without nois
 the control points of all nets, in a Sobolev variable (merit.py) in which L-BFGS needs some hundred evaluations where
 Adam on the heights needs thousands.  A stage consists of rounds with more and more tubes.
 
-Stage 3 takes the place of stage 2 for a source of finite size.  It traces the light of the centre of the source and
-blurs the picture by the image of the source (source_image.py), in rounds of increasing source size.
+For a source of finite size stage 3 replaces stage 2, and starts from the surface of stage 1 too.  It traces the light
+of the centre of the source and blurs the picture by the image of the source (source_image.py), in rounds of increasing
+source size.  Only the paper's procedure (baselines/paper.py) runs its stage 2 for the centre of the source before it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -25,52 +26,52 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bstcad.optics.channels import channels_of, points_per_line
+from bstcad.optics.channels import Channel, channels_of, points_per_line
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import images, rrmsd_by_tubes, side_factor
 from bstcad.optics.sides import as_pair, coarser
 from bstcad.scene.blank import Bounds
-from bstcad.scene.quality import Tailoring
+from bstcad.scene.quality import ResolvedTailoring
 from bstcad.tailoring.grazing import Grazing
 from bstcad.tailoring.machinability import active_bounds, excess, round_weight
 from bstcad.tailoring.merit import CoarseVariable, Merit, SobolevVariable, local_weight
 from bstcad.tailoring.minimise import Best, Iterate, LbfgsState, lbfgs, minimise
 from bstcad.tailoring.net_variables import NetVariables, along_light
 from bstcad.tailoring.reachable import resample
-from bstcad.tailoring.run import TUBES_PER_SECOND, Parameters, StageStep, Task
-from bstcad.tailoring.source_image import Spread
+from bstcad.tailoring.run import TUBES_PER_SECOND, Parameters, Stage, StageStep, Steps, Task, maker
+from bstcad.tailoring.source_image import ExtendedSource
 
-RoundFractions = tuple[tuple[float, float], ...]  # (tubes a side, evaluations) of rounds, as fractions of the settings
+RoundFractions = tuple[tuple[float, float], ...]  # (tubes per side, evaluations) of rounds, relative to the settings
 DENSE_ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))
-# Rounds where even the last one has fewer than DENSE_TUBES tubes a control cell each way.  The first rounds then bend
-# the net between the tubes, which the last one has to correct.  (1025 control points, two tubes a cell: the portrait
-# ends at an RRMSD of 0.018, and at 0.020 with the rounds above in the same time.)
+# Rounds where even the last one has fewer than DENSE_TUBES tubes per control cell along each axis.  The first rounds
+# then bend the net between the tubes, which the last one has to correct.  (1025 control points, two tubes per cell: the
+# portrait ends at an RRMSD of 0.018, and at 0.020 with the rounds above in the same time.)
 SPARSE_ROUNDS, DENSE_TUBES = ((1 / 2, 0.40), (3 / 4, 0.35), (1.0, 0.25)), 2.5
 # Rounds for a picture and a wavefront: two nets have twice the freedom to bend between the tubes.
 WAVEFRONT_ROUNDS = ((2 / 3, 0.45), (1.0, 0.35), (4 / 3, 0.2))
-# Rounds for several pictures, and the control points a side above which their evaluations grow in proportion to the
+# Rounds for several pictures, and the control points per side above which their evaluations grow in proportion to the
 # side: the Hessian in the Sobolev variable is then still a power of the Laplacian.  (Letters before a portrait, 769
-# points a side: RRMSD 0.057 and 0.062 after 196 evaluations in three rounds, 0.047 and 0.057 after 309 in these two.)
+# points per side: RRMSD 0.057 and 0.062 after 196 evaluations in three rounds, 0.047 and 0.057 after 309 in these two.)
 PICTURES_ROUNDS, PICTURES_SIDE = ((2 / 3, 1.4), (4 / 3, 0.7)), 513
-# Coarse rounds, (pixels along the longer side, tubes a side, evaluations), and the factor of the evaluations of the
-# other rounds with them.  They come first where light has to move far, and the last one again after the first of the
-# others.  The sign is an RRMSD above FAR_OFF_RRMSD on LARGE_PIXELS pixels, which no net is too coarse for.
-COARSE_ROUNDS, EVALUATION_FACTOR = ((32, 256, 60), (64, 384, 60)), 1.5
-# Factor of the evaluations where the others are one round.  It then comes last, since a stage must not end with few
-# pixels.  (A draft of a plate bound to 2 mm: RRMSD 0.264 with a factor of 1.5, 0.236 with 3, but 0.408 if 60
-# evaluations on 64 pixels come last.)
-SINGLE_ROUND_FACTOR = 3.0
+# Coarse rounds: (pixels along the longer side, tubes per side, evaluations).  They come before the fine rounds where
+# light has to move far, which shows in an RRMSD above FAR_OFF_RRMSD on LARGE_PIXELS pixels along the longer side: any
+# net resolves so few pixels.  The second one is repeated after the first fine round, if others follow.
+COARSE_ROUNDS = ((32, 256, 60), (64, 384, 60))
 LARGE_PIXELS, FAR_OFF_RRMSD = 16, 0.04
-IMAGE_POSITIONS, IMAGE_POINTS = 16, 8  # positions a side on the lens, and points of the source, for its image
+# Factor of the evaluations of the fine rounds after coarse rounds, and this factor for a single fine round.  That one
+# comes last, since a stage must not end with few pixels.  (A draft of a plate bound to 2 mm: RRMSD 0.264 with a factor
+# of 1.5, 0.236 with 3, but 0.408 if 60 evaluations on 64 pixels come last.)
+EVALUATION_FACTOR, SINGLE_ROUND_FACTOR = 1.5, 3.0
+IMAGE_POSITIONS, SECOND_MOMENT_POINTS = 16, 8  # positions per side on the lens, and points of the source, for its image
 MIN_EVALUATIONS = 30  # evaluations below which a stage has one round: each round costs a start
-COMPARED_NET = 65  # largest number of control points a side in `compare_precisions`, for speed
-COMPARED_TUBES = 128  # tubes a side in `compare_precisions`
+COMPARED_NET = 65  # largest number of control points per side in `compare_precisions`, for speed
+COMPARED_TUBES = 128  # tubes per side in `compare_precisions`
 COMPARED_EVALUATIONS = 6  # evaluations in each precision in `compare_precisions`
 # Rounds of stage 3, (size of the source, evaluations), as fractions of the whole.  Each measures the residual of the
 # image of the source again (source_image.py).
 SOURCE_SIZES = ((1 / 3, 1 / 8), (2 / 3, 1 / 8), (1.0, 1 / 4), (1.0, 1 / 4), (1.0, 1 / 4))
-TUBES_PER_CELL, TUBES_PER_PIXEL = 2.0, 1.1  # smallest numbers of tubes a side in stage 3: the blur hides finer detail
+TUBES_PER_CELL, TUBES_PER_PIXEL = 2.0, 1.1  # smallest tubes per side in stage 3: the blur hides finer detail
 
 
 @dataclass(frozen=True)
@@ -78,28 +79,60 @@ class TubeRound:
     """Light, tubes and evaluations of one round of stage 2 or 3."""
 
     task: Task  # task whose channels are the light of this round
-    tubes: int  # tubes a side in the sheet of each channel
+    tubes: int  # tubes per side in the sheet of each channel
     evaluations: int
     stage: str = "stage 2"  # name of the stage
     pixels: int | None = None  # pixels along the longer side of a coarse target; None: those of the target
-    spread: Spread | None = None  # source of finite size, sampled by the channels of `task`; None: a point
+    source: ExtendedSource | None = None  # source of finite size, sampled by the channels of `task`; None: a point
     source_size: float = 1.0  # size of the source in this round, as a fraction of its full size
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """Light that the tubes carry: that of the centre of a source of finite size."""
+        return self.task.channels if self.source is None else self.source.centre
 
     @property
     def name(self) -> str:
         """Name of the round in the list of times."""
-        sheets = len(self.task.channels if self.spread is None else self.spread.centre)
+        sheets = len(self.channels)
         tubes = f"{self.tubes}² tubes" if sheets == 1 else f"{sheets} × {self.tubes}² tubes"
         return ", ".join([self.stage, *([f"{self.pixels} pixels"] if self.pixels else []), tubes])
 
     def merit(self, lens: Lens) -> Merit:
         """Return the merit of this round, with tubes launched for `lens`."""
         task = self.task if self.pixels is None else with_pixels(self.task, self.pixels)
-        return Merit.of(
-            task.channels if self.spread is None else self.spread.centre, lens, self.tubes, task.goals,
-            overshoot=_overshoot_weight(task, lens), wave=task.wave, own=task.merit, spread=self.spread,
-            seed=None if task.preview else task.knobs.seed,
-        )  # fmt: skip
+        overshoot = _overshoot_weight(task, lens)
+        merit = Merit.of(self.channels, lens, self.tubes, task.goals, overshoot=overshoot, wave=task.wave)
+        merit = replace(merit, picture_error=task.merit)
+        if self.source is None:
+            return merit
+        return merit.with_blur(self.source, lens, seed=None if task.preview else task.knobs.seed)
+
+    def search(
+        self, problem: Problem, variables: NetVariables, position: SearchPosition, total: int, state: TubeSearch | None
+    ) -> Iterator[tuple[Iterate, StageStep]]:
+        """Yield one run of the minimiser from the lens of a problem, or from a saved state on; at the goal it ends.
+
+        total: evaluations of all rounds.
+        """
+        lens, evaluations = problem.lens, position.round_end - position.done
+        work = 0.0  # unknown for the first step, which includes other work
+        for iterate in search(lens, problem, variables, evaluations=evaluations, state=state):
+            best, reason = iterate.best, iterate.reason
+            step = StageStep(partial(with_best_nets, lens, variables, best), work=work, skipped=iterate.skipped)
+            if not iterate.skipped:
+                done = min(position.done + best.evaluations, total)  # a line search may exceed the limit
+                detail = f" on {self.pixels} pixels" if self.pixels else ""
+                if self.source_size < 1:
+                    detail += f", with {100 * self.source_size:.0f} % of the source's size"
+                step = replace(step, progress=(self.stage, done, total, f"RRMSD {best.figure:.4f}{detail}"))
+                if self.pixels is None:
+                    step = replace(step, rrmsd=best.figure)
+                    reason = "accuracy" if best.figure <= position.goal_by_tubes else reason
+            if iterate.state is not None and not reason:
+                step = replace(step, state=TubeSearch(position, best, iterate.state))
+            yield replace(iterate, reason=reason), step
+            work = problem.merit.tubes / TUBES_PER_SECOND
 
 
 @dataclass(frozen=True)
@@ -123,14 +156,14 @@ class TubeSearch:
     search: LbfgsState
 
 
-def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Iterator[StageStep]:
+def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Steps:
     """Yield the steps of stage 2: rounds of few tubes first, if the evaluations allow, and all tubes in the last.
 
     The error is large at first, and few tubes resolve it as well as many.  The last round corrects the finer errors.
     """
     coarse, fine = coarse_rounds(task, lens), tuple(sheet_sizes(task.knobs, round_shares(task)))
-    times = 1.0 if not coarse else EVALUATION_FACTOR if len(fine) > 1 else SINGLE_ROUND_FACTOR
-    first, *others = (TubeRound(task, tubes, round(times * count)) for tubes, count in fine)
+    factor = 1.0 if not coarse else EVALUATION_FACTOR if len(fine) > 1 else SINGLE_ROUND_FACTOR
+    first, *others = (TubeRound(task, tubes, round(factor * count)) for tubes, count in fine)
     again = coarse[-1:] if others else ()
     return run_rounds((*coarse, first, *again, *others), lens, state)
 
@@ -166,24 +199,23 @@ def round_shares(task: Task) -> RoundFractions | None:
     return tuple((tubes, larger * share) for tubes, share in PICTURES_ROUNDS)
 
 
-def sheet_sizes(knobs: Tailoring, shares: RoundFractions | None = None) -> Iterator[tuple[int, int]]:
-    """Yield (tubes a side, evaluations) of each round; fewer tubes than control points could not determine these."""
+def sheet_sizes(knobs: ResolvedTailoring, shares: RoundFractions | None = None) -> Iterator[tuple[int, int]]:
+    """Yield (tubes per side, evaluations) of each round; fewer tubes than control points could not determine these."""
     shares = shares or (DENSE_ROUNDS if knobs.rays >= DENSE_TUBES * knobs.side else SPARSE_ROUNDS)
     if knobs.stage2_iterations < MIN_EVALUATIONS:
         shares = ((1.0, 1.0),)
-    least = min(knobs.rays, knobs.side)
     for tubes, share in shares:
-        yield max(round(tubes * knobs.rays), least), round(share * knobs.stage2_iterations)
+        yield max(round(tubes * knobs.rays), min(knobs.rays, knobs.side)), round(share * knobs.stage2_iterations)
 
 
-def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None = None) -> Iterator[StageStep]:
+def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None = None) -> Steps:
     """Yield the steps of a stage, round by round, from its start or from a saved state on.
 
     The stage ends when its evaluations are used up, on a plateau of the last round, or when the RRMSD by rays
     (`Task.rrmsd`) reaches tailoring.accuracy with the light of the last round.
     """
-    accuracy, given = rounds[0].task.knobs.accuracy, Parameters.of(lens)
-    first = SearchPosition(0, 0, 0, accuracy or 0.0, sheet_from=given, search_from=given)
+    accuracy, given = rounds[0].task.knobs.accuracy or 0.0, Parameters.of(lens)  # 0: no accuracy is asked for
+    first = SearchPosition(0, 0, 0, accuracy, sheet_from=given, search_from=given)
     position = first if state is None else state.position
     total = sum(each.evaluations for each in rounds)
     if state is None:
@@ -197,7 +229,7 @@ def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None
         if position.round_end <= position.done:
             continue
         sheet_lens, merit = position.sheet_from.apply_to(lens), None
-        grazing = task.edge and Grazing.of(task.edge, sheet_lens)
+        grazing = None if task.edge is None else Grazing.of(task.edge, sheet_lens)
         while position.done < position.round_end:
             if state is None:
                 position = replace(position, search_from=Parameters.of(lens))
@@ -209,25 +241,25 @@ def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None
                 task.tidy()
             bounds = active_bounds(start, task.bounds, task.min_thickness)
             problem = Problem(start, merit, bounds, bound_weight, grazing=grazing)
-            for iterate, step in _search(this_round, problem, variables, position, total=total, state=state):
+            for iterate, step in this_round.search(problem, variables, position, total=total, state=state):
                 yield replace(step, part=part)
                 if iterate.reason:
                     break
-            lens, state, by_rays = step.lens, None, None
+            lens, state, measured = step.lens, None, 0.0  # 0: not measured
             position, reason = replace(position, done=position.done + iterate.best.evaluations), iterate.reason
-            if reason == "accuracy" and (by_rays := task.rrmsd(lens)) > accuracy:
+            if reason == "accuracy" and (measured := task.rrmsd(lens)) > accuracy:
                 # tubes underestimate the RRMSD a little: lower their goal
-                position = replace(position, goal_by_tubes=position.goal_by_tubes * accuracy / by_rays)
+                position = replace(position, goal_by_tubes=position.goal_by_tubes * accuracy / measured)
                 reason = "evaluations"  # the reason if none are left
             elif reason != "evaluations":
                 break
         del merit, problem  # free the sheet before the next one is made
-        by_rays = None if task.preview else by_rays or task.rrmsd(lens)
-        whole = task.channels == rounds[-1].task.channels  # True: the light of the source at full size
-        if by_rays is not None and accuracy is not None and by_rays <= accuracy:
+        by_rays = None if task.preview else measured or task.rrmsd(lens)
+        full = task.channels == rounds[-1].task.channels  # True: the light of the source at full size
+        if by_rays is not None and by_rays <= accuracy:
             reason = "accuracy"  # reached by rays, though perhaps not by tubes
-        reason = reason if number == len(rounds) - 1 or (reason == "accuracy" and whole) else ""
-        yield StageStep(lambda lens=lens: lens, rays_rrmsd=by_rays, whole=whole, part=part, ends=True, reason=reason)
+        reason = reason if number == len(rounds) - 1 or (reason == "accuracy" and full) else ""
+        yield StageStep(maker(lens), rays_rrmsd=by_rays, at_full_size=full, part=part, ends=True, reason=reason)
         if reason:
             return
 
@@ -241,46 +273,18 @@ def _overshoot_weight(task: Task, lens: Lens) -> float:
     if points_per_line(task.channels) == 1:
         return overshoot
     few, light = task.channels, task.heaviest
-    if task.spreads:
-        source = replace(task.spreads[-1].source, wavelength=light.source.wavelength)
-        few = channels_of(source, lambda _: light.index, IMAGE_POINTS)  # points with the second moments of the source
+    if task.extended_sources:
+        source = replace(task.extended_sources[-1].source, wavelength=light.source.wavelength)
+        few = channels_of(source, lambda _: light.index, SECOND_MOMENT_POINTS)  # with the second moments of the source
     return overshoot / (1 + max(images(few, lens, goal.receiver, IMAGE_POSITIONS).width() for goal in task.goals) ** 2)
-
-
-def _search(
-    this_round: TubeRound, problem: Problem, variables: NetVariables, position: SearchPosition, *, total: int,
-    state: TubeSearch | None,
-) -> Iterator[tuple[Iterate, StageStep]]:  # fmt: skip
-    """Yield one run of the minimiser from the lens of a problem, or from a saved state on; it also ends at the goal.
-
-    total: evaluations of all rounds.
-    """
-    lens, evaluations = problem.lens, position.round_end - position.done
-    work = 0.0  # unknown for the first step, which includes other work
-    for iterate in search(lens, problem, variables, evaluations=evaluations, state=state):
-        best, reason = iterate.best, iterate.reason
-        step = StageStep(partial(with_best_nets, lens, variables, best), work=work, skipped=iterate.skipped)
-        if not iterate.skipped:
-            done = min(position.done + best.evaluations, total)  # a line search may exceed the limit
-            detail = f" on {this_round.pixels} pixels" if this_round.pixels else ""
-            if this_round.source_size < 1:
-                detail += f", with {100 * this_round.source_size:.0f} % of the source's size"
-            step = replace(step, progress=(this_round.stage, done, total, f"RRMSD {best.figure:.4f}{detail}"))
-            if this_round.pixels is None:
-                step = replace(step, rrmsd=best.figure)
-                reason = "accuracy" if best.figure <= position.goal_by_tubes else reason
-        if iterate.state is not None and not reason:
-            step = replace(step, state=TubeSearch(position, best, iterate.state))
-        yield replace(iterate, reason=reason), step
-        work = problem.merit.tubes / TUBES_PER_SECOND
 
 
 @dataclass(frozen=True)
 class Problem:
     """Merit of stage 2 and its gradients in the heights of all nets, for a fixed sheet of tubes per channel.
 
-    The fused kernels store the landing point of each corner, not its path.  Memory is some 100 bytes a corner and does
-    not grow with the number of control points.
+    The fused kernels store the landing point of each corner, not its path.  Memory is some 100 bytes per corner and
+    does not grow with the number of control points.
     """
 
     lens: Lens
@@ -300,11 +304,11 @@ class Problem:
             over = excess(lens.plain(), self.bounds)
             if over.mean_square:
                 pairs = zip(gradients, over.gradients, strict=True)
-                gradients = [g + self.bound_weight * own.to(g) for g, own in pairs]
+                gradients = [g + self.bound_weight * added.to(g) for g, added in pairs]
             value += self.bound_weight * over.mean_square
         if self.grazing is not None:
-            over, gradient, _ = self.grazing(heights[-1])
-            value, gradients[-1] = value + over, gradients[-1] + gradient
+            penalty, gradient, _ = self.grazing(heights[-1])
+            value, gradients[-1] = value + penalty, gradients[-1] + gradient
         return value, gradients, float(rrmsd)
 
 
@@ -313,20 +317,17 @@ def variables_of(task: Task, lens: Lens, pixels: int | None = None) -> NetVariab
     nets = lens.nets
     if pixels is not None:
         lens = lens.with_nets(net.refined(coarser(net.shape, pixels + 1)) for net in nets)
-    light = task.heaviest
-    own_lens = light.through(lens)
-    weights = [
-        _geometric_mean(
-            local_weight(light.source, own_lens, goal.picture, screen=goal.receiver, number=number)
-            for goal in task.goals
-        )
-        for number in lens.freeform
-    ]
+    source, lens = task.heaviest.source, task.heaviest.through(lens)
+
+    def weight(number: int) -> Tensor:
+        return _geometric_mean(local_weight(source, lens, goal, number) for goal in task.goals)
+
+    weights = [weight(number) for number in lens.freeform]
     if pixels is not None:
-        return NetVariables(tuple(CoarseVariable.of(*each) for each in zip(nets, lens.nets, weights, strict=True)))
+        return NetVariables(tuple(map(CoarseVariable.of, nets, lens.nets, weights)))
     blocks = tuple(SobolevVariable.of(net, weight) for net, weight in zip(nets, weights, strict=True))
     if lens.shapes_two_faces and len(task.goals) > 1:
-        return NetVariables(blocks, *along_light(light.source, own_lens, task.goals))
+        return NetVariables(blocks, *along_light(source, lens, task.goals))
     return NetVariables(blocks)
 
 
@@ -349,7 +350,7 @@ def search(
         merit, gradients, rrmsd = problem(heights)
         return merit, variables.adjoint(gradients), rrmsd
 
-    method = lbfgs(variables.zeros(), evaluations, state and state.search)
+    method = lbfgs(variables.zeros(), evaluations, None if state is None else state.search)
     return minimise(in_c, method, evaluations, state.best if state else Best())
 
 
@@ -364,9 +365,6 @@ def _heights_at(start: Sequence[Tensor], variables: NetVariables, c: Sequence[Te
     return [h + change for h, change in zip(start, variables.heights(c), strict=True)]
 
 
-Stage2 = Callable[[Task, Lens, Any], Iterator[StageStep]]
-
-
 @dataclass(frozen=True)
 class Stage3State:
     """State of stage 3 between two steps of a search."""
@@ -374,16 +372,15 @@ class Stage3State:
     search: TubeSearch
 
 
-def with_stage3(before: Stage2 | None, task: Task, lens: Lens, state: Any = None) -> Iterator[StageStep]:
-    """Yield the steps of stage 3, from its start or a saved state on, after the stage `before` unless that is None.
+def with_stage3(before: Stage | None, task: Task, lens: Lens, state: Any = None) -> Steps:
+    """Yield the steps of stage 3, from its start or a saved state on; `before`: stage that runs first, None: none.
 
     `before` tailors for the centre of the source; its lens is rated with the light of the whole source.
     """
     if before is not None and not isinstance(state, Stage3State):
         for last in before(task, lens, state):
             if last.ends:
-                whole = task.whole
-                last = replace(last, rays_rrmsd=whole.rrmsd(last.lens))
+                last = replace(last, rays_rrmsd=task.at_full_size.rrmsd(last.lens))
             yield replace(last, reason="")
         lens, state = last.lens, None
     rounds = stage3_rounds(task)
@@ -395,33 +392,32 @@ def with_stage3(before: Stage2 | None, task: Task, lens: Lens, state: Any = None
 
 def stage3_rounds(task: Task) -> tuple[TubeRound, ...]:
     """Return the rounds of stage 3, one per source size in SOURCE_SIZES."""
-    lights = (
-        replace(task, channels=channels, sampled_sources=(), spreads=(spread,))
-        for channels, spread in zip(task.sampled_sources, task.spreads, strict=True)
-    )
+    lights = [
+        replace(task, channels=channels, sampled_sources=(), extended_sources=(source,))
+        for channels, source in zip(task.sampled_sources, task.extended_sources, strict=True)
+    ]
+    knobs, screens = task.knobs, [goal.receiver for goal in task.goals]
     if task.preview:
-        *_, light = lights
-        count = task.knobs.stage2_iterations
-        return (TubeRound(light, task.knobs.rays, count, stage="stage 3", spread=light.spreads[0]),)
-    screens = [goal.receiver for goal in task.goals]
-    counts = stage3_sheet_sizes(task.knobs, (max(each.columns for each in screens), max(each.rows for each in screens)))
+        source = task.extended_sources[-1]
+        return (TubeRound(lights[-1], knobs.rays, knobs.stage2_iterations, "stage 3", source=source),)
+    counts = stage3_sheet_sizes(knobs, (max(each.columns for each in screens), max(each.rows for each in screens)))
     return tuple(
-        TubeRound(light, tubes, count, stage="stage 3", spread=spread, source_size=size)
-        for light, spread, (tubes, count), (size, _) in zip(lights, task.spreads, counts, SOURCE_SIZES, strict=True)
+        TubeRound(light, tubes, count, "stage 3", source=light.extended_sources[0], source_size=size)
+        for light, (tubes, count), (size, _) in zip(lights, counts, SOURCE_SIZES, strict=True)
     )
 
 
-def stage3_sheet_sizes(knobs: Tailoring, pixels: tuple[int, int]) -> Iterator[tuple[int, int]]:
-    """Yield (tubes a side, evaluations) of each round of stage 3; pixels: columns and rows of the target.
+def stage3_sheet_sizes(knobs: ResolvedTailoring, pixels: tuple[int, int]) -> Iterator[tuple[int, int]]:
+    """Yield (tubes per side, evaluations) of each round of stage 3; pixels: columns and rows of the target.
 
-    A sheet of n tubes a side has n √(m_x / m_y) along x and n √(m_y / m_x) along y over a net of m_x x m_y points.
+    A sheet of n tubes per side has n √(m_x / m_y) along x and n √(m_y / m_x) along y over a net of m_x x m_y points.
     """
     few = knobs.stage2_iterations < MIN_EVALUATIONS
     total = knobs.stage2_iterations * (2 if few else 1)  # each round costs a start
     (m_x, m_y), (columns, rows) = as_pair(knobs.levels[-1]), pixels
     oblong = math.sqrt(m_x / m_y)
-    a_pixel = TUBES_PER_PIXEL * max(columns / oblong, rows * oblong)
-    tubes = min(knobs.rays, math.ceil(max(TUBES_PER_CELL * knobs.side, a_pixel)))
+    for_pixels = TUBES_PER_PIXEL * max(columns / oblong, rows * oblong)
+    tubes = min(knobs.rays, math.ceil(max(TUBES_PER_CELL * knobs.side, for_pixels)))
     for _, share in SOURCE_SIZES:
         yield tubes, round(share * total)
 
@@ -445,7 +441,7 @@ def compare_precisions(task: Task, lens: Lens) -> Comparison:
     Rounding decides where a line search ends, so the results may differ by more than rounding and be equally good.
     """
     lens = lens.with_nets(net.refined(coarser(net.shape, COMPARED_NET)) for net in lens.nets)
-    (merit, gradient, single), (exact, wanted, double) = (
+    (merit, gradient, single), (exact_merit, exact_gradient, double) = (
         _tailor_briefly(task, lens.to(d)) for d in (torch.float32, torch.float64)
     )
     n, goal = round(side_factor(task.channels) * (COMPARED_TUBES + 1)), task.goals[0]
@@ -453,8 +449,8 @@ def compare_precisions(task: Task, lens: Lens) -> Comparison:
     pairs = zip(single.nets, double.nets, strict=True)
     return Comparison(
         control_points=max(max(net.shape) for net in lens.nets),
-        merit=abs(merit / exact - 1),
-        gradient=float((gradient - wanted).norm() / wanted.norm()),
+        merit=abs(merit / exact_merit - 1),
+        gradient=float((gradient - exact_gradient).norm() / exact_gradient.norm()),
         evaluations=COMPARED_EVALUATIONS,
         rrmsd_float64=rrmsd[1],
         rrmsd_float32=rrmsd[0],
@@ -465,7 +461,8 @@ def compare_precisions(task: Task, lens: Lens) -> Comparison:
 def _tailor_briefly(task: Task, lens: Lens) -> tuple[float, Tensor, Lens]:
     """Return merit and gradient at the start, and the lens after COMPARED_EVALUATIONS in its precision, in float64."""
     n = min(COMPARED_TUBES, task.knobs.rays)
-    merit = Merit.of(task.channels, lens, n, task.goals[:1], overshoot=task.knobs.overshoot, own=task.merit)
+    merit = Merit.of(task.channels, lens, n, task.goals[:1], overshoot=task.knobs.overshoot)
+    merit = replace(merit, picture_error=task.merit)
     problem, variables = Problem(lens, merit), variables_of(task, lens)
     value, gradients, _ = problem([net.heights for net in lens.nets])
     *_, last = search(lens, problem, variables, COMPARED_EVALUATIONS)

@@ -1,7 +1,7 @@
 """Optimal transport from a source density to a target density on the unit square, independent of lenses."""
 
-from bstcad.transport.bfm import Transport, TransportStep, back_and_forth
+from bstcad.transport.bfm import TransportStep, back_and_forth
 from bstcad.transport.density import Density
-from bstcad.transport.mapping import Frame, Mapping, mass_error, solve
+from bstcad.transport.mapping import Frame, Mapping, Solver, mass_error, solve
 
-__all__ = ["Density", "Frame", "Mapping", "TransportStep", "Transport", "back_and_forth", "mass_error", "solve"]
+__all__ = ["Density", "Frame", "Mapping", "Solver", "TransportStep", "back_and_forth", "mass_error", "solve"]

@@ -21,7 +21,7 @@ series along the second axis it is the tridiagonal matrix D + s_k, with D the se
 s_k = 4 sin²(πk/2n).  The transforms run along contiguous lines of n cells, and the elimination treats neighbouring
 columns together, so that memory is never read across lines.
 
-Cell units throughout: cell centres at i + 1/2, i = 0 … n-1, and potentials over the square of the cell side.
+Cell units throughout: cell centres at i + 1/2, i = 0 … n-1, and potentials in units of the squared cell side.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from numba import njit, prange
 from bstcad.transport.density import BLOCKS, Density, inner, pushforward, threads, threads_for
 
 LINES_PER_BLOCK = 8  # lines transformed together: eight doubles fill a cache line of the transposed output
-MIN_CELLS = 32  # cells a side of the coarsest grid
+MIN_CELLS = 32  # cells per side of the coarsest grid
 FIRST_STEP = 1.0  # sigma on the coarsest grid; 1 is Newton's step between two uniform densities
 MIN_FIRST_STEP = 0.25  # smallest initial sigma on a finer grid: the noise of a coarse grid rejects its last steps
 STEP_INCREASE, STEP_DECREASE, REFUSED_STEP_FACTOR = 1.25, 0.8, 0.5  # factors of sigma after short, long, rejected steps
@@ -54,10 +54,10 @@ def half_square(n: int) -> np.ndarray:
 
 def legendre(v: np.ndarray) -> np.ndarray:
     """Return v*(x) = max_y x·y - v(y) over the cell centres, (n, n) -> (n, n), cell units; exact on the grid."""
-    partial, whole = np.empty_like(v), np.empty_like(v)
+    partial, conjugate = np.empty_like(v), np.empty_like(v)
     _transform_lines(v, partial, -1.0, BLOCKS)  # maximise over y2: [x2, y1]
-    _transform_lines(partial, whole, 1.0, BLOCKS)  # maximise over y1: [x1, x2]
-    return whole
+    _transform_lines(partial, conjugate, 1.0, BLOCKS)  # maximise over y1: [x1, x2]
+    return conjugate
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -88,7 +88,7 @@ def _line(v, out, hull, slope, first):
 
 @njit(cache=True, nogil=True, parallel=True)
 def _transform_lines(v, out, sign, blocks):
-    """Compute out = sign x (transform of each row of v), transposed."""
+    """Compute out, the transposed transforms of the rows of v, times `sign`."""
     n = v.shape[0]
     for block in prange(blocks):
         hull, slope, first = np.empty(n, np.int64), np.empty(n), np.empty(n + 1, np.int64)
@@ -170,10 +170,13 @@ def _eliminate(r, g, pivots, keep, share, blocks):
 class TransportStep:
     """State of a solve, passed to `progress`."""
 
-    grid: int  # cells a side of the current grid
+    grid: int  # cells per side of the current grid
     iteration: int  # number of the iteration on this grid, from 1
     mass_error: float  # mean |pushforward - target|, both densities of mean 1
     stage: str  # method: "back-and-forth" | "tubes"
+
+
+Listener = Callable[[TransportStep], None] | None  # called after each iteration of a solve
 
 
 @dataclass(frozen=True)
@@ -192,33 +195,25 @@ class Transport:
 
 
 def back_and_forth(
-    source: Density,
-    target: Density,
-    *,
-    iterations: int = 40,
-    tolerance: float = 1e-3,
-    progress: Callable[[TransportStep], None] | None = None,
+    source: Density, target: Density, *, iterations: int = 40, tolerance: float = 1e-3, progress: Listener = None
 ) -> Transport:
     """Return potentials between two densities on one grid, solved on coarser grids first; neither needs to be positive.
 
     iterations: maximum on each grid.  tolerance: mass error at which the solve has converged.
     """
     if source.n != target.n:
-        raise ValueError(f"source and target must lie on one grid, got {source.n} and {target.n} cells a side")
+        raise ValueError(f"source and target must lie on one grid, got {source.n} and {target.n} cells per side")
     sigma = FIRST_STEP
     grids = ladder(source, target, MIN_CELLS)
     phi = np.zeros((grids[0][0].n, grids[0][0].n))
+    limits = {"iterations": iterations, "tolerance": tolerance, "progress": progress}
     for rho, nu in grids:
         phi = phi if phi.shape[0] == rho.n else prolong(phi)
         sigma = max(sigma, MIN_FIRST_STEP)
         with threads(rho.n):
-            phi, psi, sigma, errors, duals, reason = _ascend(
-                rho, nu, phi, sigma, iterations=iterations, tolerance=tolerance, progress=progress
-            )
+            phi, psi, sigma, errors, duals, reason = _ascend(rho, nu, phi, sigma, **limits)
     n = source.n
-    return Transport(
-        phi / n**2, psi / n**2, mass_error=tuple(errors), dual=tuple(duals), iterations=len(duals), reason=reason
-    )
+    return Transport(phi / n**2, psi / n**2, tuple(errors), tuple(duals), iterations=len(duals), reason=reason)
 
 
 def prolong(phi: np.ndarray) -> np.ndarray:

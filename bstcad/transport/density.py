@@ -16,7 +16,7 @@ from numba import njit, prange
 from scipy.sparse import csr_array
 
 BLOCKS = 8  # number of independent blocks of a loop, fixed so that no sum depends on the number of threads
-MAX_SINGLE_THREAD_CELLS = 128  # largest grid, in cells a side, solved by one thread
+MAX_SINGLE_THREAD_CELLS = 128  # largest grid, in cells per side, solved by one thread
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Density:
 
     @property
     def n(self) -> int:
-        """Number of cells a side."""
+        """Number of cells per side."""
         return self.values.shape[0]
 
     @classmethod
@@ -39,7 +39,7 @@ class Density:
     def from_function(
         cls, function: Callable[[np.ndarray, np.ndarray], np.ndarray], n: int, *, samples: int = 4, floor: float = 0.0
     ) -> Density:
-        """Return the density of function(x, y) on [0, 1]², averaged over samples x samples midpoints a cell."""
+        """Return the density of function(x, y) on [0, 1]², averaged over samples x samples midpoints per cell."""
         q = (np.arange(n * samples) + 0.5) / (n * samples)
         fine = np.broadcast_to(function(q[:, None], q[None, :]), (q.size, q.size)).astype(float)
         return cls.from_values(fine.reshape(n, samples, n, samples).mean(axis=(1, 3)), floor=floor)
@@ -52,8 +52,7 @@ class Density:
 
         picture: (rows, columns), row 0 = y max, column 0 = x min.  Its pixels span width x height (any unit), centred
         in the square of the longer side, so that both axes have one scale; the rest of the square is zero.
-        floor: smallest value inside the picture relative to its mean, to which darker cells are raised (1e-3 … 1e-2 is
-        usual); brighter cells are unchanged.
+        floor: smallest value inside the picture relative to its mean, such as 1e-3; darker cells are raised to it.
         """
         grey = np.asarray(picture, dtype=float)
         if grey.ndim != 2 or grey.size == 0:
@@ -111,7 +110,7 @@ def pushforward(density: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Return (∇u)_# density on the same n x n grid; u at cell centres in cell units.  The sum is conserved to rounding.
 
     The map is evaluated at the corners of each cell and is bilinear inside.  The image of a cell is divided into pieces
-    of at most half a cell each way, and each piece is added as a box of its own extent, by exact overlap areas.
+    of at most half a cell along each axis, and each piece is added as a box of its own extent, by exact overlap areas.
     """
     n = density.shape[0]
     x, y = gradient_at_corners(u)
@@ -138,19 +137,19 @@ def gradient_at_corners(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return x, y
 
 
-def spread(flux: np.ndarray, x: np.ndarray, y: np.ndarray, n: int, parts: tuple[int, int]) -> np.ndarray:
+def resample_flux(flux: np.ndarray, x: np.ndarray, y: np.ndarray, n: int, parts: tuple[int, int]) -> np.ndarray:
     """Return the flux (n, n) in the cells of a square from pixels with corners x, y (k + 1, l + 1), in cells.
 
     The flux (k, l) of each pixel is divided into parts[0] x parts[1] equal parts at bilinear points; the four cells
     with the nearest centres receive each part.  Flux outside the square is added to the cell at the rim.
     """
     out = np.zeros((n, n))
-    _spread(flux, x, y, *parts, out)
+    _resample(flux, x, y, *parts, out)
     return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _spread(flux, x, y, along_x, along_y, out):
+def _resample(flux, x, y, along_x, along_y, out):
     n = out.shape[0]
     for k in range(flux.shape[0]):
         for m in range(flux.shape[1]):
@@ -233,7 +232,7 @@ def _lay_cell(out, n, mass, x, y, i, j):
     p = int(2.0 * max(max(abs(ex), abs(ex + tx)), max(abs(ey), abs(ey + ty)))) + 1
     q = int(2.0 * max(max(abs(fx), abs(fx + tx)), max(abs(fy), abs(fy + ty)))) + 1
     da, db = 1.0 / p, 1.0 / q
-    # sides of the box of a piece: at most 1, so that it covers at most two pixels each way
+    # sides of the box of a piece: at most 1, so that it covers at most two pixels along each axis
     wx = min(1.0, max(1e-6, abs(ex + 0.5 * tx) * da + abs(fx + 0.5 * tx) * db))
     wy = min(1.0, max(1e-6, abs(ey + 0.5 * ty) * da + abs(fy + 0.5 * ty) * db))
     right, high = n - wx, n - wy  # largest start of a box inside the grid

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -10,16 +10,18 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike
 
-from bstcad.transport.bfm import Transport, TransportStep, back_and_forth, half_square, ladder, legendre
+from bstcad.transport.bfm import Listener, Transport, back_and_forth, half_square, ladder, legendre
 from bstcad.transport.density import Density, gradient_at_corners
 from bstcad.transport.monge_ampere import ROUGH_MASS_ERROR, MongeAmpere, corners, newton_on_grids
 
-FLOOR = 1e-3  # smallest density of a target over its mean: the gradient of a convex function cannot avoid a hole
+FLOOR = 1e-3  # smallest density of a target, relative to its mean: the gradient of a convex function fills any hole
 FALLING_FLOORS = (0.03, 0.01, 0.003)  # floors solved before FLOOR, relative to the mean, where Newton needs them
-BACK_AND_FORTH_CELLS = 64  # cells a side of the largest grid of the back-and-forth method, before Newton's method
-NEWTON_STEPS = 8  # maximum number of Newton steps on each grid
-MAX_MAP_NODES = 257  # largest number of points a side of a TransportMap: 0.5 MB
-POINTS_PER_CHUNK = 4096  # points inverted by a thread at a time
+BACK_AND_FORTH_CELLS = 64  # cells per side of the largest grid of the back-and-forth method, before Newton's method
+STEPS_PER_GRID = 8  # maximum number of Newton steps on each grid
+MAX_MAP_NODES = 257  # largest number of points per side of a TransportMap: 0.5 MB
+INVERTED_TOGETHER = 4096  # points inverted by a thread at a time
+
+Points = tuple[np.ndarray, np.ndarray]  # x and y of points, of one shape
 
 
 @dataclass(frozen=True)
@@ -29,11 +31,11 @@ class Frame:
     centre: tuple[float, float] = (0.5, 0.5)  # position of the centre, mm
     side: float = 1.0  # length of a side, mm
 
-    def to_unit(self, x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    def to_unit(self, x: ArrayLike, y: ArrayLike) -> Points:
         """Return points (mm) in coordinates of the unit square."""
         return (np.asarray(x) - self.centre[0]) / self.side + 0.5, (np.asarray(y) - self.centre[1]) / self.side + 0.5
 
-    def from_unit(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def from_unit(self, x: np.ndarray, y: np.ndarray) -> Points:
         """Return points of the unit square in mm."""
         return self.centre[0] + self.side * (x - 0.5), self.centre[1] + self.side * (y - 0.5)
 
@@ -57,30 +59,30 @@ class Mapping:
     target_frame: Frame
     transport: Transport
 
-    def __call__(self, x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(self, x: ArrayLike, y: ArrayLike) -> Points:
         """Return the target points (mm) of source points (mm), of any shape."""
         n = self.source.n
-        px, py = (np.clip(a * n, 0.0, n) for a in self.source_frame.to_unit(*np.broadcast_arrays(x, y)))
-        out = np.empty((2, px.size))
-        _invert(self.transport.phi * n**2, self.x, self.y, self.guess_x, self.guess_y, px.ravel(), py.ravel(), out)
-        return self.target_frame.from_unit(*(out / n).reshape(2, *px.shape))
+        at = np.clip(np.stack(self.source_frame.to_unit(*np.broadcast_arrays(x, y))) * n, 0.0, n)
+        out = np.empty((2, at[0].size))
+        _invert(self.transport.phi * n**2, self.x, self.y, self.guess_x, self.guess_y, at.reshape(2, -1), out)
+        return self.target_frame.from_unit(*(out / n).reshape(at.shape))
 
-    def inverse(self, x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    def inverse(self, x: ArrayLike, y: ArrayLike) -> Points:
         """Return the source points (mm) of target points (mm), of any shape."""
         n = self.source.n
-        px, py = (np.clip(a * n, 0.0, n) for a in self.target_frame.to_unit(*np.broadcast_arrays(x, y)))
-        out = np.empty((2, px.size))
-        _forward(self.x, self.y, px.ravel(), py.ravel(), out)
-        return self.source_frame.from_unit(*(out / n).reshape(2, *px.shape))
+        at = np.clip(np.stack(self.target_frame.to_unit(*np.broadcast_arrays(x, y))) * n, 0.0, n)
+        out = np.empty((2, at[0].size))
+        _forward(self.x, self.y, at.reshape(2, -1), out)
+        return self.source_frame.from_unit(*(out / n).reshape(at.shape))
 
 
 @dataclass(frozen=True)
 class TransportMap:
     """Origin of the light of each point of a target: the inverse of the transport map of stage 1.
 
-    The points are corners of the target's pixels: all, or MAX_MAP_NODES a side, spaced about evenly.  The quadrilateral
-    of four neighbours in `source` sends the target's flux into the same four in `target`, except for the floor
-    (mapping.FLOOR) in dark parts of the target.  Stages 2 and 3 change the lens afterwards, but not the map.
+    The points are corners of the target's pixels: all, or MAX_MAP_NODES per side at about even spacing.  The
+    quadrilateral of four neighbours in `source` sends the target's flux into the same four in `target`, except for the
+    floor (mapping.FLOOR) in dark parts of the target.  Stages 2 and 3 change the lens afterwards, but not the map.
     """
 
     x: np.ndarray  # (c,) x on the target plane, mm, ascending, float64
@@ -102,44 +104,48 @@ def nodes(pixels: int) -> np.ndarray:
     return np.unique(np.linspace(0, pixels, min(pixels + 1, MAX_MAP_NODES)).round().astype(int))
 
 
+@dataclass(frozen=True)
+class Solver:
+    """Settings of `solve`."""
+
+    iterations: int = 40  # maximum of the back-and-forth method on each of its grids
+    tolerance: float = 2e-3  # mass error (mean |F - nu|, both of mean 1) at which the solve has converged
+    floors: tuple[float, ...] = FALLING_FLOORS  # floors solved before FLOOR, relative to the mean of the target
+    progress: Listener = None
+
+
 def solve(
     source: Density,
     target: Density,
     source_frame: Frame = Frame(),
     target_frame: Frame = Frame(),
-    *,
-    iterations: int = 40,
-    tolerance: float = 2e-3,
-    falling: tuple[float, ...] = FALLING_FLOORS,
+    solver: Solver = Solver(),
     sharper: Sequence[Density] = (),
-    progress: Callable[[TransportStep], None] | None = None,
 ) -> Mapping:
     """Return the optimal map: back-and-forth on a coarse grid, then Newton's method on flux tubes up to the finest.
 
-    iterations: maximum of the back-and-forth method on each of its grids.  tolerance: mass error (mean |F - nu|, both
-    of mean 1) at which the solve has converged; if the grid does not allow it, `transport.reason` is "plateau".
-    A target with zeros is raised to FLOOR of its mean; `mapping.target` is the raised one.  Where a bright rim borders
-    on black, Newton's first step on a grid would fold the map; the target then has the floors `falling`, relative to
-    the mean, one after another on the last grid.
+    If the grid does not allow the tolerance, `transport.reason` is "plateau".  A target with zeros is raised to FLOOR
+    of its mean; `mapping.target` is the raised one.  Where a bright rim borders on black, Newton's first step on a grid
+    would fold the map; the target then has the floors of the solver, one after another, on the last grid.
     sharper: sources of increasing detail, for which Newton's method continues on the last grid while the mass error
     stays below ROUGH_MASS_ERROR; `mapping.source` is the last source for which it does.
     """
-    newton = partial(newton_on_grids, steps=NEWTON_STEPS, tolerance=tolerance, progress=progress)
+    first = partial(back_and_forth, iterations=solver.iterations, tolerance=solver.tolerance, progress=solver.progress)
+    newton = partial(newton_on_grids, steps=STEPS_PER_GRID, tolerance=solver.tolerance, progress=solver.progress)
 
-    def climbed(floor: float) -> tuple[np.ndarray, list[float], str]:
+    def solve_on_grids(floor: float) -> tuple[np.ndarray, list[float], str]:
         grids = ladder(source, target.lifted(floor), BACK_AND_FORTH_CELLS)
-        phi = back_and_forth(*grids[0], iterations=iterations, tolerance=tolerance, progress=progress).phi
-        return newton(grids, phi * grids[0][0].n ** 2)
+        return newton(grids, first(*grids[0]).phi * grids[0][0].n ** 2)
 
-    phi, errors, reason = climbed(FLOOR)
+    phi, errors, reason = solve_on_grids(FLOOR)
     if errors[-1] > ROUGH_MASS_ERROR:
-        other, *_ = climbed(falling[0])
-        for floor in (*falling[1:], FLOOR):
-            other, left, why = newton([(source, target.lifted(floor))], other, smoothing=0.0)
+        other, *_ = solve_on_grids(solver.floors[0])
+        for floor in (*solver.floors[1:], FLOOR):
+            other, left, why = newton([(source, target.lifted(floor))], other, blur=0.0)
         if left[-1] < errors[-1]:
             phi, errors, reason = other, left, why
     for sharp in sharper:
-        other, left, why = newton([(sharp, target.lifted(FLOOR))], phi, smoothing=0.0)
+        other, left, why = newton([(sharp, target.lifted(FLOOR))], phi, blur=0.0)
         if left[-1] > ROUGH_MASS_ERROR:
             break
         phi, errors, reason, source = other, left, why, sharp
@@ -147,9 +153,8 @@ def solve(
     half = half_square(n)
     u = legendre(half - phi)
     dual = float(((half - u) * source.values).mean() + (phi * target.values).mean()) / n**2
-    transport = Transport(
-        phi / n**2, (half - u) / n**2, mass_error=tuple(errors), dual=(dual,), iterations=len(errors) - 1, reason=reason
-    )
+    count = len(errors) - 1
+    transport = Transport(phi / n**2, (half - u) / n**2, tuple(errors), (dual,), iterations=count, reason=reason)
     return Mapping(*corners(phi), *gradient_at_corners(u), source, target, source_frame, target_frame, transport)
 
 
@@ -166,8 +171,8 @@ def _bilinear(s, i, j, a, b):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _forward(sx, sy, px, py, out):
-    n = sx.shape[0] - 1
+def _forward(sx, sy, points, out):
+    n, px, py = sx.shape[0] - 1, points[0], points[1]
     for k in prange(px.size):
         if px[k] != px[k] or py[k] != py[k]:
             out[:, k] = np.nan
@@ -246,10 +251,10 @@ def _best_pixel(phi, x, y, p, q):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _invert(phi, sx, sy, gx, gy, px, py, out):
-    n = sx.shape[0] - 1
-    for block in prange((px.size + POINTS_PER_CHUNK - 1) // POINTS_PER_CHUNK):
-        for k in range(block * POINTS_PER_CHUNK, min(px.size, (block + 1) * POINTS_PER_CHUNK)):
+def _invert(phi, sx, sy, gx, gy, points, out):
+    n, px, py = sx.shape[0] - 1, points[0], points[1]
+    for block in prange((px.size + INVERTED_TOGETHER - 1) // INVERTED_TOGETHER):
+        for k in range(block * INVERTED_TOGETHER, min(px.size, (block + 1) * INVERTED_TOGETHER)):
             if px[k] != px[k] or py[k] != py[k]:
                 out[:, k] = np.nan
                 continue
@@ -265,9 +270,7 @@ def _invert(phi, sx, sy, gx, gy, px, py, out):
             out[0, k], out[1, k] = tp, tq
 
 
-def grid_coordinates(
-    grid_x: np.ndarray, grid_y: np.ndarray, x: np.ndarray, y: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def grid_coordinates(grid_x: np.ndarray, grid_y: np.ndarray, x: np.ndarray, y: np.ndarray) -> Points:
     """Return the real (row, column) of points x, y (m, n) in a grid of points (mm); outside points at its rim."""
     per_mm = (max(grid_x.shape) - 1) / max(np.ptp(grid_x), np.ptp(grid_y))
     out = np.empty((2, *x.shape))

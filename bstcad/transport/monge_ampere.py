@@ -14,23 +14,25 @@ the target must be positive.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numba import njit, prange
 from scipy.ndimage import gaussian_filter
 
-from bstcad.transport.bfm import PoissonWithoutCheckerboard, TransportStep, prolong
+from bstcad.transport.bfm import Listener, PoissonWithoutCheckerboard, TransportStep, prolong
 from bstcad.transport.density import Density, inner, threads
 
 SOFTENING = 0.2  # added to both eigenvalues of rho cof(D²v), to limit Newton steps in dark, nearly folded regions
-SMOOTHING = 1.0  # cells, width of the Gaussian blur of phi that removes the noise of the coarser grid
+BLUR = 1.0  # width of the Gaussian blur of phi that removes the noise of the coarser grid (cells)
 CG_ITERATIONS, CG_TOLERANCE = 15, 0.1  # conjugate gradients: maximum number of iterations, relative tolerance
 MIN_STEP = 0.05  # smallest fraction of a Newton step in the line search
 MAX_ERROR_RATIO = 0.9  # ratio of the mass errors after and before a step above which the solve stops
 ROUGH_MASS_ERROR = 0.005  # mass error above which a map is rough, so that the next two constants hold
 MAX_ROUGH_ERROR_RATIO = 0.98  # MAX_ERROR_RATIO while the map is rough
 MAX_STEPS_FACTOR = 3  # factor of the maximum number of steps while the map is rough
+
+Grids = Sequence[tuple[Density, Density]]  # (source, target) on a sequence of grids
 
 
 class MongeAmpere:
@@ -79,27 +81,20 @@ def corners(phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def newton_on_grids(
-    ladder: Sequence[tuple[Density, Density]],
-    phi: np.ndarray,
-    *,
-    steps: int,
-    tolerance: float,
-    progress: Callable[[TransportStep], None] | None = None,
-    smoothing: float = SMOOTHING,
+    grids: Grids, phi: np.ndarray, *, steps: int, tolerance: float, progress: Listener = None, blur: float = BLUR
 ) -> tuple[np.ndarray, list[float], str]:
     """Apply Newton's method on each grid of (source, target), from phi (cell units) on the first.
 
-    smoothing: width (cells) of the Gaussian blur of phi before each grid.  Returns phi (cell units), the mass errors on
-    the last grid and the reason why it stopped there.
+    blur: width (cells) of the Gaussian blur of phi before each grid.  Returns phi (cell units), the mass errors on the
+    last grid and the reason why it stopped there.
     """
-    for k, (source, target) in enumerate(ladder):
+    for k, (source, target) in enumerate(grids):
         if k:
             phi = prolong(phi)
-        phi = gaussian_filter(phi, smoothing, mode="nearest") if smoothing else phi
+        phi = gaussian_filter(phi, blur, mode="nearest") if blur else phi
         with threads(source.n):
-            phi, errors, reason = _newton_steps(
-                MongeAmpere(source, target), phi, steps=steps, tolerance=tolerance, progress=progress
-            )
+            tubes = MongeAmpere(source, target)
+            phi, errors, reason = _newton_steps(tubes, phi, steps=steps, tolerance=tolerance, progress=progress)
     return phi, errors, reason
 
 
@@ -174,7 +169,7 @@ def _corners(phi, x, y):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath={"contract"})
 def _flux(rho, x, y, out):
-    """Integrate rho |dS| over each bilinear tube by midpoints at most half a source cell apart, at most 400 a side."""
+    """Integrate rho |dS| over each bilinear tube by midpoints at most half a source cell apart, up to 400 per side."""
     n = out.shape[0]
     last = np.nextafter(n - 1.0, 0.0)
     for i in prange(n):

@@ -37,7 +37,7 @@ def test_a_preview_is_near_the_finished_draft(name, lit):
     Where light passes all of the back the two are nearer than where dark corners bend on.
     """
     scene = load(f"templates/{name}.toml", SMALL)
-    found, made = preview(scene), pipeline.design(scene, later=True)
+    found, made = preview(scene), pipeline.design(scene, options=pipeline.DesignOptions(compare_later=True))
     light = tubes_picture(made.lens, scene.channels(), scene.target.screen, 301).numpy()
     assert apart(found.pictures[0][1], light * (made.goals[0].picture.sum() / light.sum())) < NEAR
     assert found.flux["on target"] > 0.9

@@ -165,11 +165,11 @@ def _slope_fit(m: int) -> Work:
 def _start(m: int) -> Work:
     """A round of stage 2 begins: two tubes launched a control point each way, and the local weight of its variable."""
     scene, lens = _scene(m, PIXELS), lens_of(m)
-    (light,), target = scene.channels(), scene.target.irradiance()
+    (light,) = scene.channels()
 
     def begin() -> None:
         launch_tubes(light.source, light.through(lens), 2 * m)
-        local_weight(light.source, light.through(lens), target, scene.target.screen)
+        local_weight(light.source, light.through(lens), scene.goals[0])
 
     return begin
 

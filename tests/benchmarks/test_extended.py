@@ -19,7 +19,7 @@ from bstcad.optics.measure import images, measure, side_factor, tubes_picture
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage1, stage2
 from bstcad.tailoring.run import Driver, Task
-from bstcad.tailoring.source_image import Spread
+from bstcad.tailoring.source_image import ExtendedSource
 from tests.benchmarks.cold import TEMPLATES
 
 pytestmark = pytest.mark.bench
@@ -39,7 +39,7 @@ def task_of(scene):
     light, least = scene.with_source_scaled(0.0).channels(), scene.lens.min_thickness
     task = Task(
         light, scene.goals, knobs, least, sampled_sources=tuple(each.channels() for each in scaled),
-        spreads=tuple(Spread(each.source, light, each.draw) for each in scaled),
+        extended_sources=tuple(ExtendedSource(each.source, light, each.draw) for each in scaled),
     )  # fmt: skip
     return task, scene.flat_lens(knobs.levels[0])
 
@@ -57,7 +57,7 @@ def judge(scene, lens):
 
 def feedback(task, lens, power, seconds):
     """Lenses of the rounds that fit into so many seconds of the processor."""
-    [goal], began, whole = task.goals, time.process_time(), task.whole
+    [goal], began, whole = task.goals, time.process_time(), task.at_full_size
     target = wanted = goal.picture
     few = task.knobs.model_copy(update={"stage2_iterations": ROUND})
     while time.process_time() - began < seconds:
@@ -111,7 +111,7 @@ def test_direct_optimisation_against_doing_nothing_and_against_feedback(diameter
     before, floor = judge(scene, point)
     began = time.process_time()
     rounds = stage2.stage3_rounds(task)
-    direct = driven(task.whole, stage2.run_rounds(rounds, point))
+    direct = driven(task.at_full_size, stage2.run_rounds(rounds, point))
     seconds = time.process_time() - began
     after, noise = judge(scene, direct)
     print(

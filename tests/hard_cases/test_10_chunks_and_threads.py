@@ -214,7 +214,8 @@ def test_any_number_of_threads_makes_the_same_two_faces(threads):
     scene, found = load(DISK, two_faces.SMALL | two_faces.WITH_WAVE | quick), []
     for n in (1, 4):
         threads(n)
-        found.append([net.control_points() for net in pipeline.design(scene, device="cpu", later=True).lens.nets])
+        made = pipeline.design(scene, device="cpu", options=pipeline.DesignOptions(compare_later=True))
+        found.append([net.control_points() for net in made.lens.nets])
     assert all(np.array_equal(*each) for other in found[1:] for each in zip(found[0], other, strict=True))
 
 

@@ -15,8 +15,9 @@ from PIL import Image
 from bstcad import pipeline
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
+from bstcad.tailoring.run import Hooks
 from bstcad.transport import Density, TransportStep, back_and_forth, mass_error, solve
-from bstcad.transport.mapping import FLOOR, NEWTON_STEPS
+from bstcad.transport.mapping import FLOOR, STEPS_PER_GRID
 from bstcad.transport.monge_ampere import MAX_STEPS_FACTOR, newton_on_grids
 from tests.conftest import DISK, SMALL
 
@@ -62,7 +63,7 @@ def test_any_target_gets_a_finite_map_and_a_mass_error(holds, source, target):
     for array in (transport.phi, transport.psi, mapping.x, mapping.y, *mapping(*RANDOM.random((2, 500)))):
         assert np.isfinite(array).all()
     errors = transport.mass_error
-    assert len(errors) <= MAX_STEPS_FACTOR * NEWTON_STEPS + 1 and all(np.diff(errors) <= 0)
+    assert len(errors) <= MAX_STEPS_FACTOR * STEPS_PER_GRID + 1 and all(np.diff(errors) <= 0)
     assert transport.reason in ("converged", "plateau", "iterations")
     assert mass_error(mapping) == pytest.approx(errors[-1], rel=1e-9)  # as reported, so it is
     assert mapping.target.values.min() >= FLOOR / (1 + FLOOR)  # lifted, then made of mean 1 again
@@ -113,5 +114,6 @@ def test_a_picture_without_light_is_refused_before_any_work(tmp_path):
     steps = []
     for picture in (cells(), cells((0, 0, 65535), (63, 63, 65535))):
         with pytest.raises(SceneError, match="target.image: the picture is black"):
-            pipeline.design(scene_of(picture, tmp_path), device="cpu", progress=lambda *step: steps.append(step))
+            hooks = Hooks(progress=lambda *step: steps.append(step))
+            pipeline.design(scene_of(picture, tmp_path), device="cpu", hooks=hooks)
     assert steps == []

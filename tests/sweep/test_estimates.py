@@ -15,6 +15,7 @@ from bstcad.optics.measure import Effort, measure, tubes_picture
 from bstcad.report.record import LEFT_OUT
 from bstcad.scene.scene import load
 from bstcad.sweep.estimates import coarse_lens, diagnosis, left_out
+from bstcad.tailoring.run import Hooks
 from tests.conftest import DISK, SMALL
 
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"
@@ -72,7 +73,7 @@ def test_sunlight_parts_over_all_that_is_seen():
 
 def test_a_design_that_was_stopped_before_there_was_a_curve():
     asked = iter([False, False, False])
-    found, _ = of(pipeline.design(load(DISK, TINY), interrupted=lambda: next(asked, True)))
+    found, _ = of(pipeline.design(load(DISK, TINY), hooks=Hooks(interrupted=lambda: next(asked, True))))
     assert found["convergence"] is None and found["remaining_error"]["octaves"]
 
 

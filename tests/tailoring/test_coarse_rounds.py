@@ -10,12 +10,13 @@ import torch
 from bstcad import pipeline
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.measure import Effort, measure
-from bstcad.pipeline import design
+from bstcad.pipeline import DesignOptions, design
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import stage1, stage2
 from bstcad.tailoring.merit import CoarseVariable
-from bstcad.tailoring.run import BEST_LENS_STAGE
+from bstcad.tailoring.run import BEST_LENS_STAGE, Hooks
 
+LATER = DesignOptions(compare_later=True)
 SIDE = {"shape": "rectangle", "width": 60.0, "height": 60.0}
 NEAR = {  # a wall nearer than the plate is wide, fifty times as bright in one corner as in another
     "name": "near",
@@ -56,13 +57,13 @@ def states():
 
 @pytest.fixture(scope="module")
 def made(states):
-    return design(near(), device="cpu", save=states.append, later=True)
+    return design(near(), device="cpu", hooks=Hooks(save=states.append), options=LATER)
 
 
 def test_they_bring_light_far(made, monkeypatch):
     assert [name[:18] for name in names(made)] == ["stage 2, 32 pixels", "stage 2, 128² tube"]
     monkeypatch.setattr(stage2, "FAR_OFF_RRMSD", float("inf"))
-    without = design(near(), device="cpu", later=True)
+    without = design(near(), device="cpu", options=LATER)
     assert len(names(without)) == 1
     assert rrmsd(made) < 0.4 * rrmsd(without)
 
@@ -75,7 +76,7 @@ def test_a_stage_hands_on_its_best_lens(monkeypatch):
         return stage2.run_rounds((*coarse, stage2.TubeRound(task, tubes, evaluations), *coarse[-1:]), lens, state)
 
     monkeypatch.setitem(pipeline.PROCEDURES, "least-squares", ("stage 1", stage1.steps, steps))
-    made = design(near().changed({"target.image": None, "target.text": "T"}), device="cpu", later=True)
+    made = design(near().changed({"target.image": None, "target.text": "T"}), device="cpu", options=LATER)
     judged = {stage.name: stage.rrmsd for stage in made.making.stages}
     on_few, on_all = (judged[name] for name in names(made)[-1:-3:-1])
     assert on_few > 1.2 * on_all  # else there is nothing to see here
@@ -86,7 +87,7 @@ def test_a_stage_hands_on_its_best_lens(monkeypatch):
 def test_a_design_goes_on_from_within_them(made, states):
     within = [s for s in states if getattr(s.second, "position", None) and s.second.position.round == 0]
     assert within
-    again = design(near(), device="cpu", start=within[len(within) // 2], later=True)
+    again = design(near(), device="cpu", start=within[len(within) // 2], options=LATER)
     assert torch.equal(again.lens.back.heights, made.lens.back.heights)
 
 

@@ -13,6 +13,7 @@ from bstcad.pipeline import DesignState, design
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
 from bstcad.tailoring.minimise import AdamState, Best, LbfgsState, adam, lbfgs, minimise
+from bstcad.tailoring.run import Hooks
 from tests import two_faces
 from tests.conftest import DISK, SMALL
 
@@ -95,7 +96,7 @@ def test_a_design_goes_on_from_wherever_it_was_left(name, tmp_path):
         checkpoint.write(tmp_path / f"{len(kept)}", {}, state)
         kept.append((1 + (state.followed is not None) + (state.lens is not None), tmp_path / f"{len(kept)}"))
 
-    whole = design(scene, device="cpu", save=save)
+    whole = design(scene, device="cpu", hooks=Hooks(save=save))
     assert {stage for stage, _ in kept} == {1, 2, 3}
     chosen = [[path for s, path in kept if s == stage] for stage in (1, 2, 3)]
     for path in (*(paths[len(paths) // 2] for paths in chosen), kept[-1][1]):
@@ -114,12 +115,13 @@ def test_an_interrupt_anywhere_gives_a_lens_and_loses_nothing():
     """Asked at every look: before the first round there is no lens; later the best so far, and the way on."""
     scene = load(DISK, SCENES["paper"])
     looks = []
-    whole = design(scene, device="cpu", interrupted=lambda: bool(looks.append(1)))
+    whole = design(scene, device="cpu", hooks=Hooks(interrupted=lambda: bool(looks.append(1))))
     early, lenses = 0, 0
     for after in range(1, len(looks), max(1, len(looks) // 4)):
         count, kept = itertools.count(), []
         try:
-            found = design(scene, device="cpu", save=kept.append, interrupted=lambda: next(count) >= after)  # noqa: B023
+            hooks = Hooks(save=kept.append, interrupted=lambda: next(count) >= after)  # noqa: B023
+            found = design(scene, device="cpu", hooks=hooks)
         except KeyboardInterrupt:
             early += 1
             assert not kept

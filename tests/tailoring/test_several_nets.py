@@ -81,7 +81,7 @@ MOVED = {Collimated: {"tilt": (1.0, 0.0)}, Point: {"position": (1.5, 0.0, -600.0
 
 def problem_of(name):
     lens, source = FRONTS[name]
-    knobs = Tailoring(rays=96, levels=(M,), stage2_iterations=EVALUATIONS, overshoot=0.03)
+    knobs = Tailoring(rays=96, levels=(M,), stage2_iterations=EVALUATIONS, overshoot=0.03).resolved(M)
     task = Task((Channel(source, N),), (Goal("target", SCREEN, picture()),), knobs)
     merit = Merit.of(task.channels, lens, 96, task.goals, 0.03)
     return task, lens, Problem(lens, merit)
@@ -124,7 +124,7 @@ def test_stage_2_shapes_a_front_and_goes_on_from_where_it_was_left():
 @pytest.mark.parametrize("name", BODIES)
 def test_stage_2_alone_shapes_two_nets_of_a_body_with_mirrors(name):
     lens, screen = BODIES[name]
-    knobs = Tailoring(rays=96, levels=(M,), stage2_iterations=2 * EVALUATIONS, overshoot=0.03)
+    knobs = Tailoring(rays=96, levels=(M,), stage2_iterations=2 * EVALUATIONS, overshoot=0.03).resolved(M)
     source = ABOVE if lens.passes.sense < 0 else BEAM
     task = Task((Channel(source, lens.index),), (Goal("target", screen, picture()),), knobs)
     begun, (*_, last) = task.rrmsd(lens), steps(task, lens)

@@ -22,7 +22,7 @@ from bstcad.optics.surfaces import Sphere
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Task
-from bstcad.tailoring.source_image import LocalImages, Spread, _biquadratic, blur_error, blurs, with_border
+from bstcad.tailoring.source_image import ExtendedSource, LocalImages, _biquadratic, blur_error, blurs, with_border
 from bstcad.tailoring.stage2 import Problem, _overshoot_weight
 from tests.lenses import net
 
@@ -43,17 +43,17 @@ def lens():
     return Lens(Sphere(1.0, 0.005), back, Circle(9.0), INDEX)
 
 
-def spread(source):
+def extended(source):
     light = channels_of(source.central, lambda nm: INDEX, 1)
-    return Spread(source, light, lambda points, seed: drawn_channels(source, lambda nm: INDEX, points, seed))
+    return ExtendedSource(source, light, lambda points, seed: drawn_channels(source, lambda nm: INDEX, points, seed))
 
 
 GOALS = (Goal("target", SCREEN, np.random.default_rng(0).uniform(0.5, 1.5, SCREEN.shape)),)
 
 
 def merit(source, n=60, goals=GOALS, overshoot=0.03, seed=None):
-    light = spread(source)
-    return Merit.of(light.centre, lens(), n, goals, overshoot, spread=light, seed=seed)
+    light = extended(source)
+    return Merit.of(light.centre, lens(), n, goals, overshoot).with_blur(light, lens(), seed)
 
 
 def shown(merit):
@@ -64,7 +64,7 @@ def shown(merit):
 
 def by_rays(source, sets=6):
     """Independent pictures of sum 1, each from other points of the source."""
-    seen = spread(source)
+    seen = extended(source)
     boxes = [simulated(lens(), seen.draw(128, seed), SCREEN, n=50, seed=seed).box for seed in range(sets)]
     return [box / total(box) for box in boxes]
 
@@ -90,7 +90,7 @@ def test_the_blurred_light_is_the_sum_over_the_points(name):
 def test_a_source_of_next_to_no_size_is_a_point():
     """The merit is a point's, too, but for light outside the border, which the wider screen of the blur holds."""
     tiny = replace(SOURCES["disc"], diameter=1e-6)
-    plain = Merit.of(spread(tiny).centre, lens(), 60, GOALS, 0.0)
+    plain = Merit.of(extended(tiny).centre, lens(), 60, GOALS, 0.0)
     one, two = (each(each.landing(lens())) for each in (merit(tiny, overshoot=0.0), plain))
     for mine, other in zip(one, two, strict=True):
         assert float(mine) == pytest.approx(float(other), rel=1e-3)  # tents of a fifth of a pixel
@@ -99,15 +99,15 @@ def test_a_source_of_next_to_no_size_is_a_point():
 def test_flux_is_kept():
     """A blur moves light; what leaves a screen that holds all of it is nothing."""
     wide = with_border(SCREEN, 60)
-    spreading = spread(SOURCES["disc"])
-    [blur] = blurs(spreading, lens(), wide)
-    light = RayTubes.launched(lens(), spreading.centre, 60).picture(lens(), with_border(wide, blur.border)).numpy()
-    share = LocalImages.of(SOURCES["disc"], spreading.centre[0], lens(), wide).flux
+    source = extended(SOURCES["disc"])
+    [blur] = blurs(source, lens(), wide)
+    light = RayTubes.launched(lens(), source.centre, 60).picture(lens(), with_border(wide, blur.border)).numpy()
+    share = LocalImages.of(SOURCES["disc"], source.centre[0], lens(), wide).flux
     assert blur.forward(light).sum() / light.sum() == pytest.approx(float(share.mean()), rel=0.02)
 
 
 def test_the_adjoint_is_the_transpose():
-    [blur] = blurs(spread(SOURCES["chip"]), lens(), SCREEN)
+    [blur] = blurs(extended(SOURCES["chip"]), lens(), SCREEN)
     generator = np.random.default_rng(1)
     light = generator.normal(size=tuple(side + 2 * blur.border for side in SCREEN.shape))
     g = generator.normal(size=SCREEN.shape)
@@ -124,7 +124,7 @@ def test_each_of_several_goals_is_blurred_by_images_of_its_own():
     for goal, found in zip(TWO, shown(merit(source, goals=TWO)), strict=True):
         [alone] = shown(merit(source, goals=(goal,)))
         torch.testing.assert_close(found, alone, rtol=1e-9, atol=1e-12)
-        by_point = RayTubes.launched(lens(), spread(source).centre, 60).picture(lens(), goal.receiver)
+        by_point = RayTubes.launched(lens(), extended(source).centre, 60).picture(lens(), goal.receiver)
         assert float((found / total(found) - by_point / total(by_point)).norm()) > 0.1 * float(found.norm())
 
 
@@ -142,7 +142,7 @@ def test_what_the_images_leave_out_is_measured_by_rays():
     source = SOURCES["disc"]
     rays, half = by_rays(source), merit(replace(source, diameter=SIZE / 2))
     [found] = shown(half)
-    mended = found + blur_error(found, spread(source).draw, lens(), SCREEN, border=half.blurs[0][0].border, seed=3)
+    mended = found + blur_error(found, extended(source).draw, lens(), SCREEN, border=half.blurs[0][0].border, seed=3)
     assert off(rays, mended) < 0.5 * off(rays, found)
 
 
@@ -160,13 +160,13 @@ def test_nine_points_make_every_biquadratic():
 def test_light_that_no_place_shows_is_not_blurred():
     """Nothing gets through: the images are those of a point."""
     nowhere = replace(SOURCES["disc"], position=(500.0, 0.0, 5.9))
-    offset, share = LocalImages.of(nowhere, spread(nowhere).centre[0], lens(), SCREEN).nearest(0.0, 0.0)
+    offset, share = LocalImages.of(nowhere, extended(nowhere).centre[0], lens(), SCREEN).nearest(0.0, 0.0)
     assert not offset.any() and bool((share == 1).all())
 
 
 def test_a_rectangle_of_light_casts_a_rectangle():
     """Free space would be a pinhole: the images of the chip's corners stand apart as its sides do."""
-    seen = LocalImages.of(CHIP, spread(CHIP).centre[0], lens(), SCREEN)
+    seen = LocalImages.of(CHIP, extended(CHIP).centre[0], lens(), SCREEN)
     nine = seen.offset.mean(-1)
     wide, high = float((nine[0, 5] - nine[0, 3]).abs()), float((nine[1, 7] - nine[1, 1]).abs())
     assert wide / high == pytest.approx(SIZE, rel=0.1) and Rectangle(SIZE, 1.0) == CHIP.extent
@@ -176,7 +176,7 @@ def test_a_rectangle_of_light_casts_a_rectangle():
 def test_a_few_points_tell_how_wide_the_image_is(name):
     """The pull on light beyond the border falls with the width of the image, by all 64 points or by a few."""
     source = SOURCES[name]
-    light, knobs = channels_of(source, lambda nm: INDEX, 64), Tailoring(overshoot=0.03)
-    task = Task(light, GOALS, knobs, spreads=(spread(source),))
-    by_all = _overshoot_weight(replace(task, spreads=()), lens())
+    light, knobs = channels_of(source, lambda nm: INDEX, 64), Tailoring(overshoot=0.03).resolved(65)
+    task = Task(light, GOALS, knobs, extended_sources=(extended(source),))
+    by_all = _overshoot_weight(replace(task, extended_sources=()), lens())
     assert _overshoot_weight(task, lens()) == pytest.approx(by_all, rel=0.02) and by_all < 0.02

@@ -11,7 +11,7 @@ from bstcad.pipeline import design
 from bstcad.scene.quality import VERIFICATION_DRAW
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage2
-from bstcad.tailoring.source_image import Spread
+from bstcad.tailoring.source_image import ExtendedSource
 from tests.conftest import DISK, SMALL
 
 TINY = SMALL | {
@@ -76,7 +76,7 @@ def task_of(scene):
     scaled = [scene.with_source_scaled(share) for share, _ in stage2.SOURCE_SIZES]
     return pipeline.Task(
         light, scene.goals, knobs, sampled_sources=tuple(each.channels() for each in scaled),
-        spreads=tuple(Spread(each.source, light, each.draw) for each in scaled),
+        extended_sources=tuple(ExtendedSource(each.source, light, each.draw) for each in scaled),
     )  # fmt: skip
 
 

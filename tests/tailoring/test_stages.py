@@ -12,7 +12,7 @@ from bstcad.optics.irradiance import efficiency
 from bstcad.scene import scene
 from bstcad.tailoring import stage1, stage2
 from bstcad.tailoring.merit import Landings, Merit
-from bstcad.tailoring.run import Driver, StageStep, Task
+from bstcad.tailoring.run import Driver, Hooks, StageStep, Task
 from tests.tracing import simulated
 
 SMALL = {
@@ -72,7 +72,7 @@ def test_the_map_settles_where_the_slopes_change_much_with_the_place():
     task, lens = small("disk", **ends, **outline, **{"target.z": "60.0"})
     rounds = [step.state for step in stage1.follow_slopes(task, lens)]
     assert rounds[-1].round == task.knobs.rounds > len(rounds)  # the coarse rounds ended once they had settled
-    assert rounds[-1].wanted.moved < 0.1 * stage1.SETTLED_CHANGE
+    assert rounds[-1].slopes.moved < 0.1 * stage1.SETTLED_CHANGE
 
 
 def test_stage_1_goes_no_way_that_loses_the_light():
@@ -81,7 +81,7 @@ def test_stage_1_goes_no_way_that_loses_the_light():
     task, lens = small("disk", **outline, **{"lens.index": "1.05", "tailoring.rounds": "3"})
     *_, first = stage1.follow_slopes(task, lens)
     other, _ = stage1.follow_aims(task, lens)
-    assert first.state.wanted.moved > stage1.RETRY_CHANGE and task.rrmsd(other) < task.rrmsd(first.lens)
+    assert first.state.slopes.moved > stage1.RETRY_CHANGE and task.rrmsd(other) < task.rrmsd(first.lens)
     assert task.flux_on_target(other) < stage1.MIN_FLUX_RATIO * task.flux_on_target(first.lens)
     assert torch.equal(followed(task, lens).back.heights, first.lens.back.heights)
 
@@ -197,7 +197,7 @@ def test_the_paper_lowers_both_of_its_merits():
 def test_states_are_saved_until_the_user_has_enough():
     """The driver saves what a step can be left with, and asks for no further one."""
     saved, asked = [], []
-    driver = Driver(save=saved.append, interrupted=lambda: len(asked) == 3)
+    driver = Driver(Hooks(save=saved.append, interrupted=lambda: len(asked) == 3))
 
     def stage():
         for k in range(10):

@@ -22,7 +22,7 @@ from bstcad.optics.wavefront_error import wavefront_error
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring import light_behind
 from bstcad.tailoring.merit import Merit
-from bstcad.tailoring.run import Parameters
+from bstcad.tailoring.run import Hooks, Parameters
 from tests.lenses import SQUARE, rough
 
 N = 1.5
@@ -194,7 +194,7 @@ def test_two_pictures_are_met_together(tmp_path):
     scene = scene_of(tmp_path, target=[first, first | {"z": 80.0}])
     scene = scene.changed({"target[0].image": waves_of(0.0), "target[1].image": waves_of(1.5)})
     said = []
-    made = pipeline.design(scene, progress=lambda *told: said.append(told[3]))
+    made = pipeline.design(scene, hooks=Hooks(progress=lambda *told: said.append(told[3])))
     assert [net.shape for net in made.lens.nets] == [(49, 49), (65, 65)]
     assert all(rrmsd_by_rays(made.lens, scene.channels(), goal) < 0.03 for goal in scene.goals)
     assert any("convex solution" in text for text in said)
@@ -213,14 +213,14 @@ def test_a_front_alone_makes_a_picture(tmp_path):
 
 def test_a_wave_whose_rays_cross_before_the_target_is_refused():
     wave = ZernikeWave((0.0, 0.0, 0.0, -300.0), 8.0, 30.0)
-    with pytest.raises(SceneError, match="rays of the wave at z = 30 cross"):
+    with pytest.raises(SceneError, match=r"^wavefront\.z: .*z = 30"):
         screen = Screen(400.0, (-9.0, 9.0), (-9.0, 9.0), 8)
         light_behind.light_of_wave(screen, picture(0), wave, wavelength=600.0, parts=1)
 
 
 def test_targets_that_cut_through_each_other_are_refused(tmp_path):
     first = TWO["target"]
-    with pytest.raises(SceneError, match=r"target\[1\].z: the target cuts target\[0\]"):
+    with pytest.raises(SceneError, match=r"^target\[1\]\.z: "):
         scene_of(tmp_path, target=[first, first | {"z": 32.0, "tilt": [0.0, 30.0]}])
 
 

@@ -15,7 +15,7 @@ from bstcad.transport.density import (
     gradient_at_corners,
     inner,
     pushforward,
-    spread,
+    resample_flux,
     threads,
     threads_for,
 )
@@ -147,7 +147,7 @@ def test_pixels_are_spread_part_by_part(pixels):
         for i, j in np.ndindex(n, n):  # tents around the cells' centres, the outer ones level beyond the rim
             shares = (np.maximum(0, 1 - np.abs(np.clip(p, 0, n - 1) - k)) for p, k in ((px, i), (py, j)))
             want[i, j] += (flux / 6 * np.multiply(*shares)).sum()
-    found = spread(flux, x, y, n, parts)
+    found = resample_flux(flux, x, y, n, parts)
     np.testing.assert_allclose(found, want, atol=1e-12)
     assert found.sum() == pytest.approx(flux.sum(), rel=1e-12)
 
@@ -157,10 +157,10 @@ def test_black_pixels_may_lie_nowhere():
     x[:2], y[:2] = np.nan, np.inf
     flux = np.ones((4, 4))
     flux[:2] = 0.0
-    found = spread(flux, x, y, 8, (4, 4))
+    found = resample_flux(flux, x, y, 8, (4, 4))
     assert found.sum() == pytest.approx(8.0) and np.isfinite(found).all()
     flux[0, 0] = 1.0
-    assert np.isnan(spread(flux, x, y, 8, (4, 4))).any()  # and not somewhere by chance
+    assert np.isnan(resample_flux(flux, x, y, 8, (4, 4))).any()  # and not somewhere by chance
 
 
 def test_small_grids_use_one_and_the_number_is_put_back():

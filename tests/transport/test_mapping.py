@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import qmc
 
-from bstcad.transport import Density, Frame, mass_error, solve
+from bstcad.transport import Density, Frame, Solver, mass_error, solve
 from bstcad.transport.monge_ampere import MongeAmpere, _apply, _metric, corners
 
 N = 128
@@ -36,7 +36,7 @@ def rrmsd(flux, target):
 def test_separable_maps_follow_the_cumulative_distributions():
     """An even square to 1 + a cos(pi x), say, whose cumulative is x + a sin(pi x)/pi: that of T(x) is x."""
     target = Density.from_function(lambda x, y: (1 + 0.6 * np.cos(np.pi * x)) * (1 - 0.4 * np.cos(np.pi * y)), N)
-    mapping = solve(Density.from_values(np.ones((N, N))), target, tolerance=1e-4)
+    mapping = solve(Density.from_values(np.ones((N, N))), target, solver=Solver(tolerance=1e-4))
     x, y = np.random.default_rng(0).random((2, 4000))
     tx, ty = mapping(x, y)
     assert np.abs(tx + 0.6 * np.sin(np.pi * tx) / np.pi - x).max() < 2e-3  # a quarter of a cell
@@ -58,7 +58,8 @@ def test_gradient_of_a_given_convex_function():
         even = 1 + e * np.cos(np.pi * x) * np.cos(np.pi * y)
         return even**2 - (e * np.sin(np.pi * x) * np.sin(np.pi * y)) ** 2  # det D²u: the target is even
 
-    mapping = solve(Density.from_function(source, N), Density.from_values(np.ones((N, N))), tolerance=1e-4)
+    even = Density.from_values(np.ones((N, N)))
+    mapping = solve(Density.from_function(source, N), even, solver=Solver(tolerance=1e-4))
     x, y = np.random.default_rng(1).random((2, 4000))
     (tx, ty), (ux, uy) = mapping(x, y), gradient(x, y)
     miss = np.hypot(tx - ux, ty - uy)
