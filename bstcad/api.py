@@ -262,15 +262,18 @@ class Design:
         (bstcad.judges.comparison.OwnJudge).  All three need a design that was written.  checks, sections: see `write`.
         """
         options = ProofOptions(effort, checks=checks, sections=sections)
-        given = {"measured": measured and Path(measured).expanduser(), "place": folder and Path(folder).expanduser()}
+        cloud, place = (Path(path).expanduser() if path else None for path in (measured, folder))
+        given: dict[str, Any] = {"measured": cloud, "place": place}
         judges = [against] if isinstance(against, str) else against
         with progresses.for_script(progress) as shown:
             if self._has_files() or measured or folder or against:
-                self.report = commands.verify(self._own_folder(), options, against=judges, progress=shown, **given)
+                report = commands.verify(self._own_folder(), options, against=judges, progress=shown, **given)
+                assert isinstance(report, Report), "the files are those of a design"
             else:
                 self._made = self._made.with_report_data()
-                self.report = commands.prove(self._made, options, shown)
-        return self.report
+                report = commands.prove(self._made, options, shown)
+        self.report = report
+        return report
 
     def tolerance(
         self, *, grade: str | None = None, wanted: float | None = None, seed: int = 0, workers: int | None = None,
@@ -314,7 +317,7 @@ class Design:
 
     def _own_folder(self) -> Path:
         """Return the folder with the files of this design; SceneError if there is none."""
-        if not self._has_files():
+        if self.folder is None or not self._has_files():
             raise SceneError(f"{self.scene.name}: the design has no files yet; write it to a folder first")
         if not self._made.is_lens_of(folders.read_nominal(self.folder)[1]):
             raise SceneError(f"{self.folder}: the folder has another design now; write this one to another folder")

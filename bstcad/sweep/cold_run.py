@@ -249,6 +249,12 @@ class ColdRun(StoredRecord):
         return self.status == DONE
 
     @property
+    def time_and_error(self) -> tuple[float, float]:
+        """Time (seconds) and RRMSD of a run with a lens."""
+        assert self.seconds is not None and self.rrmsd is not None, "a run with a lens has both"
+        return self.seconds, self.rrmsd
+
+    @property
     def comparable(self) -> bool:
         """True if its time is comparable with others: runs on this machine follow each other."""
         return self.done and self.where == THIS_MACHINE
@@ -265,7 +271,8 @@ def run_and_judge(
         run = _generate(scene, folder, point, limit, tick=tick)
         if run.done:
             run = judge_run(run, load(scene), folder, effort)
-    times = {"kernel_seconds": unit, "units": run.seconds / unit, "cost_seconds": time.perf_counter() - start}
+    units = None if run.seconds is None else run.seconds / unit
+    times = {"kernel_seconds": unit, "units": units, "cost_seconds": time.perf_counter() - start}
     return run.model_copy(update=times | {"version": environment.version()})
 
 

@@ -127,7 +127,7 @@ class TradeoffTable(StoredRecord):
     @property
     def front_runs(self) -> list[ColdRun]:
         """Runs of the Pareto front, the fastest first."""
-        return sorted((run for run in self.runs if run.on_front), key=lambda run: run.seconds)
+        return sorted((run for run in self.runs if run.on_front), key=lambda run: run.time_and_error)
 
     @property
     def base_run(self) -> ColdRun | None:
@@ -153,8 +153,8 @@ class TradeoffTable(StoredRecord):
 def pareto_front(runs: Iterable[ColdRun]) -> list[ColdRun]:
     """Return the Pareto front: runs that no other run dominates in time and error, the fastest first."""
     front: list[ColdRun] = []
-    for run in sorted((run for run in runs if run.comparable), key=lambda run: (run.seconds, run.rrmsd)):
-        if not front or run.rrmsd < front[-1].rrmsd:
+    for run in sorted((run for run in runs if run.comparable), key=lambda run: run.time_and_error):
+        if not front or run.time_and_error[1] < front[-1].time_and_error[1]:
             front.append(run)
     return front
 
@@ -166,7 +166,7 @@ def halving_factor(front: Sequence[ColdRun]) -> float | None:
     """
     if len(front) < MIN_FRONT_RUNS:
         return None
-    errors, times = [math.log(run.rrmsd) for run in front], [math.log(run.seconds) for run in front]
+    times, errors = zip(*(map(math.log, run.time_and_error) for run in front), strict=True)
     return 2.0 ** -statistics.linear_regression(errors, times).slope
 
 
@@ -222,9 +222,9 @@ def tradeoff_figure(table: TradeoffTable) -> Figure:
 
 def draw_runs(axes: Axes, table: TradeoffTable) -> None:
     """Draw time and error of all runs; the upper axis is the time in units of the calibration kernel."""
-    seconds, errors = [run.seconds for run in table.plotted], [run.rrmsd for run in table.plotted]
+    seconds, errors = zip(*(run.time_and_error for run in table.plotted), strict=True)
     bright = [rrmsd for rrmsd in errors if rrmsd < DARK_RRMSD] or errors
-    floors = [(run.seconds, run.rrmsd_noise) for run in table.front_runs if run.rrmsd_noise]
+    floors = [(run.time_and_error[0], run.rrmsd_noise) for run in table.front_runs if run.rrmsd_noise]
     left, right = min(seconds) / AXIS_MARGIN, max(seconds) * AXIS_MARGIN
     low, high = min(bright) / AXIS_MARGIN, max(bright) * AXIS_MARGIN
     low = max(min([low, *(floor / AXIS_MARGIN for _, floor in floors)]), low / MAX_FLOOR_DISTANCE)
@@ -250,8 +250,8 @@ def draw_runs(axes: Axes, table: TradeoffTable) -> None:
         if knob.key in KNOB_STYLES and len(knob.places) > (knob.key != "adam"):  # the others have the base as a point
             _draw_knob(axes, knob)
     if table.front_runs:
-        points = [(run.seconds, run.rrmsd) for run in table.front_runs]
-        axes.step(*zip(*points, strict=True), where="post", zorder=2, label="Pareto front", **FRONT_STYLE, **RING_STYLE)
+        times, errors = zip(*(run.time_and_error for run in table.front_runs), strict=True)
+        axes.step(times, errors, where="post", zorder=2, label="Pareto front", **FRONT_STYLE, **RING_STYLE)
     _draw_presets(axes, table)
     draw_legend(axes)
 
@@ -302,7 +302,7 @@ def write_page(table: TradeoffTable, scene: Scene, folder: Path) -> None:
     else:
         (folder / "tradeoff.png").unlink(missing_ok=True)
     template = environment().from_string(PAGE_TEMPLATE.read_text(encoding="utf-8"))
-    runs = sorted(table.runs_with_lens, key=lambda run: run.rrmsd if table.errors_alone else run.seconds)
+    runs = sorted(table.runs_with_lens, key=lambda run: run.time_and_error[1 if table.errors_alone else 0])
     data = {"table": table, "runs": runs, "verdict": verdict(table), "picture": base64_images({"": picture}).get("")}
     page = template.render(data, scene=scene.toml(), machine=machine(table.machine))
     files.put(folder / "tradeoff.html", page.encode())
@@ -317,10 +317,11 @@ def verdict(table: TradeoffTable) -> tuple[str, str, str]:
     spent = f"{duration(table.spent_seconds)} of a budget of {duration(table.budget_seconds)}{together}."
     run_count = f"{count} run{'s' * (count != 1)}{f', {failed} more without a lens' if failed else ''}; {spent}"
     if table.errors_alone:
-        best = min(table.plotted, key=lambda run: run.rrmsd)
+        best = min(table.plotted, key=lambda run: run.time_and_error[1])
         lowest = f"is the lowest, with {best.label}; only errors were measured, no times. {run_count}"
         return style, f"RRMSD {number(best.rrmsd)}", lowest
-    ends = [f"{number(run.rrmsd)} in {duration(run.seconds)}" for run in (table.front_runs[0], table.front_runs[-1])]
+    points = (run.time_and_error for run in (table.front_runs[0], table.front_runs[-1]))
+    ends = [f"{number(rrmsd)} in {duration(seconds)}" for seconds, rrmsd in points]
     if len(table.front_runs) == 1:
         return style, f"RRMSD {ends[0]}", f"is the only run on the Pareto front. {run_count}"
     if table.front_halving is None:
@@ -341,7 +342,7 @@ def summary(table: TradeoffTable) -> Group:
     rows.add_column("run")
     for heading in ("RRMSD",) if table.errors_alone else ("RRMSD", "seconds"):
         rows.add_column(heading, justify="right")
-    for run in sorted(table.plotted, key=lambda run: -run.rrmsd):
+    for run in sorted(table.plotted, key=lambda run: -run.time_and_error[1]):
         if run.on_front or "quality" in run.knobs or not run.settings:
             seconds = () if table.errors_alone else (f"{run.seconds:.1f}",)
             rows.add_row(Text(f"{run.label}{' (Pareto front)' * run.on_front}"), f"{run.rrmsd:.4f}", *seconds)

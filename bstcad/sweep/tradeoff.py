@@ -297,7 +297,7 @@ class _Sweep:
             self.runs = {run.settings: run for run in stored.runs}
         for point, run in list(self.runs.items()):
             if run.allowed_seconds is not None:  # its time was limited; repeat it if there is more time now
-                left = budget - self._spent() + run.cost_seconds
+                left = budget - self._spent() + (run.cost_seconds or 0.0)
                 if left + MAX_OVERRUN * budget >= RETRY_FACTOR * run.allowed_seconds:
                     del self.runs[point]
         self._earlier = self._spent()  # seconds spent by earlier sweeps in the folder
@@ -351,7 +351,7 @@ class _Sweep:
         paces: dict[bool, list[float]] = {True: [], False: []}
         for run in filter(lambda run: run.done, self.runs.values()):
             by_adam, expected = self._work(run.settings)
-            paces[by_adam].append(run.cost_seconds / expected)
+            paces[by_adam].append((run.cost_seconds or 0.0) / expected)
         return seconds * statistics.median(paces[is_adam] or paces[not is_adam] or [1.0])
 
     def _left(self) -> float:
@@ -360,7 +360,7 @@ class _Sweep:
         return self._budget - self._spent() - SAFETY_FACTOR * running
 
     def _spent(self) -> float:
-        return sum(run.cost_seconds for run in self.runs.values())
+        return sum(run.cost_seconds or 0.0 for run in self.runs.values())
 
     def _tick(self) -> None:
         """Report progress as a fraction of the budget that was available when this sweep began."""
@@ -391,7 +391,7 @@ def predicted_work(scene: Scene, point: Settings) -> tuple[bool, float]:
 
 def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: float = math.inf) -> TradeoffTable:
     """Return the table of all runs: those that have ended, then those that wait, each in the order of importance."""
-    own, best, ended = scene.lens.back.net, pareto_front(runs), [run for run in runs if run.status != cold_run.NOT_RUN]
+    own, best = scene.lens.back.net, pareto_front(runs)
     comparable = {run.settings: run for run in runs if run.comparable}
     selected = comparable or {run.settings: run for run in runs if run.done}
     sample = selected.get(()) or next(iter(selected.values()), None)  # states the machine of all runs
@@ -409,10 +409,10 @@ def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: 
         title=scene.title,
         base=base | {"knobs": scene.tailoring.resolved(own).model_dump(exclude_none=True)},
         budget_seconds=budget,
-        spent_seconds=sum(run.cost_seconds for run in ended),
+        spent_seconds=sum(run.cost_seconds or 0.0 for run in runs),
         errors_alone=bool(selected) and not comparable,
         version=bstcad.__version__,
-        sources=next((run.version for run in ended), ""),
+        sources=next((run.version for run in runs if run.version), ""),
         machine=sample.machine if sample else {},
         versions=sample.versions if sample else {},
         reference={
@@ -450,8 +450,9 @@ def knob_points(
     averages = []
     for label, point in knob.points.items():
         if done := [runs[each] for each in (point, other_seed(scene, point)) if each in runs and runs[each].done]:
-            errors, seconds = [run.rrmsd for run in done], statistics.median(run.seconds for run in done)
-            middle: dict[str, Any] = {"seconds": seconds if timed else None, "rrmsd": statistics.median(errors)}
+            times, errors = zip(*(run.time_and_error for run in done), strict=True)
+            seconds = statistics.median(times) if timed else None
+            middle: dict[str, Any] = {"seconds": seconds, "rrmsd": statistics.median(errors)}
             extent: dict[str, Any] = {"lowest": min(errors), "highest": max(errors), "seeds": len(done)}
             averages.append(KnobPoint(label=label, settings=point, **middle, **extent))
     return tuple(averages)

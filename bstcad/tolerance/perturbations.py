@@ -209,8 +209,13 @@ def _motions(setup: Setup) -> Iterator[Kind]:
 
 
 def _move_part(part: str, axis: int, turns: bool, setup: Setup, by: float) -> Setup:
-    amounts = tuple(by if k == axis else 0.0 for k in range(3))
+    amounts = _along(axis, by)
     return setup.moved(part, Motion.of(turn=amounts, about=setup.pivot(part)) if turns else Motion.of(shift=amounts))
+
+
+def _along(axis: int, amount: float) -> Vector:
+    """Return the vector with this component along an axis (0 to 2) and zeros."""
+    return (amount, 0.0, 0.0) if axis == 0 else (0.0, amount, 0.0) if axis == 1 else (0.0, 0.0, amount)
 
 
 def _shapes(setup: Setup, material: str | None) -> Iterator[Kind]:
@@ -309,8 +314,7 @@ def _decentre_front(axis: int, setup: Setup, by: float) -> Setup:
     ends = low - more * pitch - by, high + more * pitch - by
     x, y = (back.x, ends) if axis else (ends, back.y)
     fixed = replace(back, heights=torch.from_numpy(heights), x=x, y=y)
-    shift = tuple(by if k == axis else 0.0 for k in range(3))
-    return replace(setup, lens=setup.lens.with_back(fixed)).moved("lens", Motion.of(shift=shift))
+    return replace(setup, lens=setup.lens.with_back(fixed)).moved("lens", Motion.of(shift=_along(axis, by)))
 
 
 def _tilt_back(axis: int, setup: Setup, by: float) -> Setup:
@@ -321,7 +325,7 @@ def _tilt_back(axis: int, setup: Setup, by: float) -> Setup:
     q_z = h - h_v + ∇h · ((q_x, q_y) - (x, y)), linear in ζ.
     """
     back = setup.lens.back_net
-    turn = Motion.of(turn=tuple(by if k == axis else 0.0 for k in range(3))).inverse.rotation.tolist()
+    turn = Motion.of(turn=_along(axis, by)).inverse.rotation.tolist()
     x, y = _control_points(back)
     h, h_x, h_y = back.relative_sag_and_slope(x, y)
     vertex = float(back.from_vertex().z) - back.z

@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import count, repeat
-from typing import Any, Protocol
+from typing import Any
 
 import numba
 import numpy as np
@@ -135,26 +135,17 @@ def _main_channel(setup: Setup) -> tuple[Emitter, Lens]:
     return channel.source, channel.through(setup.lens)
 
 
-class TracedFigure(Protocol):
-    """Protocol of a figure of merit of a setup with errors: TargetPictures or Wavefronts."""
-
-    setup: Setup
-    perturbations: tuple[Perturbation, ...]
-    figure: str  # name of the figure of merit
-
-    def vector(self, amounts: Sequence[float]) -> np.ndarray:
-        """Return a vector that is nearly linear in the amounts and whose norm is the figure of merit."""
-        ...
+TracedGoal = TargetPictures | Wavefronts  # `vector` is nearly linear in the amounts; its norm is the figure of merit
 
 
-def traced_figure(goal: TracedFigure, amounts: Sequence[float]) -> float:
+def traced_figure(goal: TracedGoal, amounts: Sequence[float]) -> float:
     """Return the figure of merit by a full trace: the RRMSD (Wang et al. 2023, Eq. 15) or the RMS in waves."""
     return _norm(goal.vector(amounts))
 
 
 def _norm(vector: np.ndarray) -> float:
-    vector = torch.from_numpy(vector)
-    return math.sqrt(dot(vector, vector))
+    tensor = torch.from_numpy(vector)
+    return math.sqrt(dot(tensor, tensor))
 
 
 # --- the model of superposed pictures ---------------------------------------------------------------------------------
@@ -206,7 +197,7 @@ def _cardinal(nodes: tuple[float, ...]) -> tuple[CubicSpline, CubicSpline]:
     return spline, spline.derivative()
 
 
-def superpose(pictures: TracedFigure, progress: Progress = lambda *event: None, spread: Spread = run_locally) -> Model:
+def superpose(pictures: TracedGoal, progress: Progress = lambda *event: None, spread: Spread = run_locally) -> Model:
     """Trace two pictures for each perturbation, and pictures at the nodes of the principal directions."""
     sigmas = np.array([p.sigma for p in pictures.perturbations])
     n = len(sigmas)
@@ -347,7 +338,7 @@ def worst_of(studies: Sequence[Study]) -> Study:
     return replace(first, sensitivities=tuple(sensitivities), rrmsd=max(s.rrmsd for s in studies), **worst)
 
 
-def study(pictures: TracedFigure, limit: float, rrmsd: float, settings: StudySettings) -> Study:
+def study(pictures: TracedGoal, limit: float, rrmsd: float, settings: StudySettings) -> Study:
     """Return sensitivities and trials of a setup with errors.
 
     limit: maximum figure of merit (RRMSD, or RMS in waves).  rrmsd: figure of the design by independent rays.  The
@@ -359,7 +350,7 @@ def study(pictures: TracedFigure, limit: float, rrmsd: float, settings: StudySet
     bias = superposed.rrmsd**2 - rrmsd**2
     amounts = trials(perturbations, settings.seed, range(settings.trials))
     full = []
-    for k, traced in enumerate(settings.spread(traced_figure, pictures, amounts[: settings.full]), 1):
+    for k, traced in enumerate(settings.spread(traced_figure, pictures, list(amounts[: settings.full])), 1):
         full.append(traced)
         settings.progress("trials", k, min(settings.full, settings.trials), f"{pictures.figure} {traced:.4f}")
     adjusted = [adjusted_rrmsd(superposed, with_adjustments, amounts[k]) for k in range(len(full))]
@@ -383,8 +374,8 @@ def _sensitivities(superposed: Model, perturbations: Sequence[Perturbation], bia
     changes, shares = mean_rrmsds - _unbiased(np.array([superposed.rrmsd]), bias), added / (added.sum() or 1.0)
     sensitivities = []
     for p, change, share in zip(perturbations, changes.tolist(), shares.tolist(), strict=True):
-        kind = {"name": p.kind.name, "words": p.kind.words, "unit": p.kind.unit}
-        size = {"limit": p.limit, "distribution": p.distribution, "cost": p.cost, "sigma": p.sigma}
+        kind: dict[str, Any] = {"name": p.kind.name, "words": p.kind.words, "unit": p.kind.unit}
+        size: dict[str, Any] = {"limit": p.limit, "distribution": p.distribution, "cost": p.cost, "sigma": p.sigma}
         sensitivities.append(Sensitivity(**kind, **size, rrmsd_change=change, share=share))
     return tuple(sorted(sensitivities, key=lambda s: s.rrmsd_change, reverse=True))
 

@@ -26,7 +26,7 @@ from bstcad.scene.target import Target
 from bstcad.tolerance import study as studies
 from bstcad.tolerance.grades import GRADES, base_grade, graded_table, perturbations
 from bstcad.tolerance.perturbations import Kind, Setup, perturb, trials
-from bstcad.tolerance.study import Study, StudySettings, TargetPictures, Wavefronts, Yield, estimate_yield
+from bstcad.tolerance.study import Study, StudySettings, TargetPictures, TracedGoal, Wavefronts, Yield, estimate_yield
 from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, Nominal
 
 TRACED_SOURCE_POINTS = 64  # number of points by which an extended source is sampled
@@ -41,6 +41,7 @@ def tolerance(folder: Path, settings: StudySettings) -> Tolerances:
                 "[[effects]] ghost: tolerances do not include stray light yet; remove that table from scene.toml"
             )
         pictures, limit = _pictures(scene, nominal, settings), scene.accept.rrmsd or DEFAULT_RRMSD_LIMIT
+        goals: list[tuple[str, TracedGoal, float, float]]  # key of the limit, goal, limit, figure of the design
         goals = [("accept.rrmsd", each, limit, _rrmsd(nominal, each)) for each in pictures]
         if scene.wavefront is not None:
             setup, errors = pictures[0].setup, pictures[0].perturbations
@@ -107,6 +108,7 @@ def _record(scene: Scene, settings: StudySettings, study: Study, goals: Sequence
     """Return the record; study: worst target; goals: studies of each target and, if one is stated, the wavefront."""
     count = len(scene.targets)
     each, wave = goals[:count], goals[count] if len(goals) > count else None
+    change = wave.change_of if wave else lambda error: None
     names = [error.kind.name for error in study.perturbations]
     worst = zip(study.worst, trials(study.perturbations, study.seed, study.worst).tolist(), strict=True)
     inverse = None
@@ -123,11 +125,11 @@ def _record(scene: Scene, settings: StudySettings, study: Study, goals: Sequence
         trials=len(study.linear),
         full_trials=len(study.full),
         **_shared_figures(study, goals),
-        sensitivities=tuple(replace(s, wavefront_change=wave and wave.change_of(s.name)) for s in study.sensitivities),
+        sensitivities=tuple(replace(s, wavefront_change=change(s.name)) for s in study.sensitivities),
         worst=tuple(Trial(k, float(study.full[k]), dict(zip(names, amounts, strict=True))) for k, amounts in worst),
         inverse=inverse,
         targets=tuple(map(_of_target, scene.target_keys, scene.targets, each)) if count > 1 else None,
-        wavefront=wave and _of_wavefront(wave),
+        wavefront=_of_wavefront(wave) if wave else None,
     )
 
 
