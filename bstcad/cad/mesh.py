@@ -35,8 +35,8 @@ from bstcad.scene.scene import FLOAT32_ROUNDING
 MIN_MESH_CELLS = 16  # smallest number of grid cells each way
 DEFAULT_MAX_TRIANGLES = 2_000_000  # largest number of triangles by default: 100 MB of STL
 MAX_TRIANGLES = 32_000_000  # largest number of triangles if a scene states a tolerance: 1.6 GB of STL
-GOAL_FRACTION = 0.95  # chordal error that a mesh aims at, as a fraction of the tolerance: vertices round to float32
-CELL_MARGIN = 1.1  # ratio of estimated to allowed cells above which no finer mesh is tried: the estimate's error
+GOAL_FRACTION = 0.95  # chordal error that a mesh aims at, relative to the tolerance; float32 rounds vertices
+CELL_MARGIN = 1.1  # ratio of estimated to allowed cells above which no finer mesh is tried; estimates have errors
 WALL_NORMAL_Z = 1e-6  # largest |z| of the unit normal of a facet of the wall
 MAX_FACET_SAMPLES = 100_000_000  # largest number of points at which the facets of a mesh are compared with the lens
 FACETS_PER_BLOCK = 1 << 15  # facets processed at a time, so that their corners stay in the cache
@@ -273,7 +273,7 @@ class FaceNumbers(NamedTuple):
     z: float  # z0 (mm)
     curvature: float  # 1/mm
     bend: float  # (1 + k) c² (1/mm²), k the conic constant
-    equator: float  # surfaces.MIN_COS2
+    equator: float  # smallest 1 - (1 + k) c² r²: surfaces.MIN_COS2
     ends2: float  # r² (mm²) of Surface.outline, outside of which the face is a plane
     per_detail: float  # smooth parts per mm: 1 / Surface.detail
     net: np.ndarray  # heights h of the control points, (m, n), mm; (0, 0): a surface of revolution

@@ -35,7 +35,7 @@ from bstcad.scene.mount import Box, Flange, Mount, Part, Round
 if TYPE_CHECKING:
     import cadquery
 
-WALL_TOLERANCE = 1e-6  # largest distance (mm) from a lens's wall of a body's edge that lies on it
+WALL_TOLERANCE = 1e-6  # largest distance (mm) between a lens's wall and an edge of the body that lies on it
 COSINE_TOLERANCE = 1e-12  # largest deviation from 1 of |z| of the unit normal of a plane z = const
 EDGE_FRACTIONS = (0.0, 0.31, 0.77, 1.0)  # fractions of an edge's length at which its distance from a wall is measured
 INVALID_PART = "mount: body and lens make no valid solid; move the body's edges away from the lens's rim"

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     import cadquery
 
 EXTRA_POINTS = 4  # control points outside the rim on each side: two spans, and two more until x(u) is linear
-RIM_POINTS_PER_CELL = 8  # points along a piece of the rim per cell of the back's longer side
+RIM_POINTS_PER_CELL = 8  # points on each piece of a rim per control point of the back's longer side
 IMAGE_TOLERANCE = 1e-12  # deviation from a line or circle below which an image is one, relative to its size
 IMAGE_SAMPLES = 65  # points of an image that are compared with a line and a circle
 INVALID_LENS = (

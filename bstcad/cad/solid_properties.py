@@ -48,7 +48,7 @@ class WholePart:
     """A part around a lens with other walls than the lens's outline: with a flange, draft, a bevel or a cut."""
 
     edge: np.ndarray  # points along the edge of the back, (n, 2), mm
-    low: Coordinates  # smallest x, y and z (mm) of all faces but freeform ones, whose edges belong to others as well
+    low: Coordinates  # smallest x, y and z (mm) of all faces except freeform ones, whose edges other faces share
     high: Coordinates  # largest x, y and z (mm)
     properties: MassProperties | None  # None: a face is of a kind that cannot be integrated
 

@@ -49,7 +49,7 @@ APERTURE_DECIMALS = 9  # decimals of a clear aperture in mm; finer ones are roun
 POINTS_PER_EDGE = 129  # points on each edge of a face
 POINTS_PER_SPAN = 4  # points per knot span of an edge: one pole of a curve affects three spans
 
-Face = tuple[TopoDS_Face, BRepAdaptor_Surface]
+OccFace = tuple[TopoDS_Face, BRepAdaptor_Surface]
 
 
 @dataclass(frozen=True)
@@ -197,15 +197,15 @@ def _lens_in(solid: TopoDS_Solid) -> StepLens:
     return StepLens(solid, net, back_surface, front=front, outline=outline, edge=edge, faces=both)
 
 
-def _faces(solid: TopoDS_Solid) -> list[Face]:
+def _faces(solid: TopoDS_Solid) -> list[OccFace]:
     return [(face, BRepAdaptor_Surface(face)) for face in map(TopoDS.Face_s, parts_of(solid, TopAbs_FACE))]
 
 
-def _freeform_faces(faces: Sequence[Face]) -> list[Face]:
+def _freeform_faces(faces: Sequence[OccFace]) -> list[OccFace]:
     return [face for face in faces if is_freeform(face[1])]
 
 
-def _back_face(nets: Sequence[Face]) -> Face | None:
+def _back_face(nets: Sequence[OccFace]) -> OccFace | None:
     """Return the freeform face through which light leaves: of two the one that looks along its net's normal."""
     backs = [face for face in nets if len(nets) == 1 or _looks_along_net(face[0])]
     return backs[0] if len(backs) == 1 and len(nets) <= 2 else None
@@ -264,7 +264,7 @@ def _looks_up(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> bool:
     return (np.cross(along_u, along_v)[2] > 0) != (face.Orientation() == TopAbs_Orientation.TopAbs_REVERSED)
 
 
-def _front_face(rest: Sequence[Face]) -> Face:
+def _front_face(rest: Sequence[OccFace]) -> OccFace:
     """Return a front that is no net: a sphere, a patch of 3 x 3, or the smallest plane z = const that looks down."""
     planes = [face for face in rest if face[1].GetType() == Kind.GeomAbs_Plane]
     level = [face for face in planes if abs(face[1].Plane().Axis().Direction().Z()) > 1 - AXIAL_TOLERANCE]
@@ -277,7 +277,7 @@ def _front_face(rest: Sequence[Face]) -> Face:
     return (curved or level)[0]
 
 
-def _front_outline(front: Sphere | Conic, face: TopoDS_Face, others: Sequence[Face]) -> Circle | None:
+def _front_outline(front: Sphere | Conic, face: TopoDS_Face, others: Sequence[OccFace]) -> Circle | None:
     """Return the outline of a curved front with a plane z = const around it; None if it ends on walls."""
     edge = _bounding_outline(outer_edge(face))
     if front.level or not isinstance(edge, Circle):
@@ -294,7 +294,7 @@ def _is_level(surface: BRepAdaptor_Surface, z: float) -> bool:
     return abs(plane.Axis().Direction().Z()) > 1 - AXIAL_TOLERANCE and abs(plane.Location().Z() - z) <= LEVEL_TOLERANCE
 
 
-def _front_surface(face: TopoDS_Face, surface: BRepAdaptor_Surface, others: Sequence[Face]) -> Surface:
+def _front_surface(face: TopoDS_Face, surface: BRepAdaptor_Surface, others: Sequence[OccFace]) -> Surface:
     """Return a front that is no net, with its outline if there is a plane around it; others: the other faces."""
     if surface.GetType() == Kind.GeomAbs_Plane:
         return Plane(surface.Plane().Location().Z())

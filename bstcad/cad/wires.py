@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 WIRE_TOLERANCE = 1e-7  # largest deviation (mm) of a wire from its plane z = const
 MIN_CLEARANCE = 1e-6  # distance (mm) below which wires touch
 POLYGON_SIDES = 400  # sides of the polygon by which a loop is checked
-MIN_PARTS = 64  # smallest number of intervals of a piece
-MAX_PARTS, MAX_HALVINGS = 1 << 14, 4  # largest number of intervals of a cubic; halvings of each first one, if more
-QUINTIC_PARTS = 256  # intervals of a quintic, which follows half a circle on a sphere or conic to 1e-12 mm
+MIN_INTERVALS = 64  # smallest number of intervals of a piece
+MAX_INTERVALS, MAX_HALVINGS = 1 << 14, 4  # largest number of intervals of a cubic, and of halvings if they give more
+QUINTIC_INTERVALS = 256  # intervals of a quintic, which follows half a circle on a sphere or conic to 1e-12 mm
 MIN_BREAK_DISTANCE = 1e-7  # smallest distance of two breaks, relative to the length of the piece
-ONE_SIDED_SLOPE = np.array([-25, 48, -36, 16, -3]) / 12  # weights of five values: slope at the first, to h⁴ f⁽⁵⁾ / 5
+ONE_SIDED_SLOPE = np.array([-25, 48, -36, 16, -3]) / 12  # weights of five values: slope at the first, error h⁴ f⁽⁵⁾ / 5
 CROSSING_BISECTIONS = 50  # steps of bisection, down to rounding
 
-Points = Callable[[np.ndarray], np.ndarray]  # function of t (n,) that returns points (n, k)
+Locus = Callable[[np.ndarray], np.ndarray]  # function of t (n,) that returns points (n, k)
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class LoopPiece:
     On a line t is the length (mm), on a circle the angle from the start (rad).
     """
 
-    points: Points  # points at t (n,), (n, 2), mm
-    left: Points  # unit normals at t (n,) into the lens, (n, 2)
+    points: Locus  # points at t (n,), (n, 2), mm
+    left: Locus  # unit normals at t (n,) into the lens, (n, 2)
     end: float  # largest t
     centre: tuple[float, float] | None = None  # centre of a circle (mm); None: no circle
     turn: int = 0  # +1: a circle run counterclockwise, -1: clockwise, 0: no circle
@@ -200,7 +200,7 @@ class RailCurve:
 
 def breaks(surface: Surface, *pieces: LoopPiece) -> np.ndarray:
     """Return parameters between which pieces, all with the same parameter, lie over one smooth part of a surface."""
-    t = np.linspace(0.0, pieces[0].end, MIN_PARTS + 1)
+    t = np.linspace(0.0, pieces[0].end, MIN_INTERVALS + 1)
     if is_net(surface):  # smooth between its knot lines
         t = np.unique(np.concatenate([t, *(_crossings(surface, piece) for piece in pieces)]))
     inner = t[1:-1]
@@ -210,7 +210,7 @@ def breaks(surface: Surface, *pieces: LoopPiece) -> np.ndarray:
 
 def _crossings(surface: BSplineSurface, piece: LoopPiece) -> np.ndarray:
     """Return the parameters at which a piece crosses knot lines of a net, by bisection of all crossings at once."""
-    t, crossings = np.linspace(0.0, piece.end, max(*surface.shape, MIN_PARTS) * 8 + 1), [np.empty(0)]
+    t, crossings = np.linspace(0.0, piece.end, max(*surface.shape, MIN_INTERVALS) * 8 + 1), [np.empty(0)]
     points = piece.points(t)
     for axis, ((first, _), pitch) in enumerate(zip((surface.x, surface.y), surface.pitch, strict=True)):
         cell = np.floor((points[:, axis] - first) / pitch - 0.5)  # knots lie at first + pitch (k + 1/2)
@@ -225,7 +225,7 @@ def _crossings(surface: BSplineSurface, piece: LoopPiece) -> np.ndarray:
     return np.concatenate(crossings)
 
 
-def fit_spline(points: Points, t: np.ndarray, tolerance: float, smooth: bool = False) -> tuple[np.ndarray, np.ndarray]:
+def fit_spline(points: Locus, t: np.ndarray, tolerance: float, smooth: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Fit a spline to a curve within a tolerance and return its poles (n, k) and full knots.
 
     smooth: the curve is analytic, and a quintic is used if that suffices.  Otherwise the spline is a piecewise cubic
@@ -233,12 +233,12 @@ def fit_spline(points: Points, t: np.ndarray, tolerance: float, smooth: bool = F
     at its middle or quarters; the error falls with the fourth power of its length, down to rounding.
     """
     if smooth:
-        even = np.linspace(t[0], t[-1], 2 * QUINTIC_PARTS + 1)
+        even = np.linspace(t[0], t[-1], 2 * QUINTIC_INTERVALS + 1)
         values = points(even)
         spline = make_interp_spline(even[::2], values[::2], k=5)
         if np.abs(spline(even) - values).max() <= tolerance:
             return spline.c, spline.t
-    max_parts = max(MAX_PARTS, len(t) << MAX_HALVINGS)
+    max_parts = max(MAX_INTERVALS, len(t) << MAX_HALVINGS)
     limit = tolerance / 2  # the error may be larger between those three points
     while True:
         quarters = np.append((t[:-1, None] + np.diff(t)[:, None] * np.arange(4) / 4).ravel(), t[-1])

@@ -36,7 +36,7 @@ JUDGE_RAYS = 1 << 24  # rays of a judge, in both halves
 MAX_COMPARED_PIXELS = 128  # largest number of pixels along the longer side of the compared pictures
 OWN_EFFORT = Effort(accuracy=0.0, witness=False)  # effort of bstcad: as many rays as allowed, without noise
 OWN_SEED_OFFSET = 500_009  # difference between the seeds of bstcad's and the judge's rays
-AGREEMENT_FACTOR = 1.5  # largest ratio of the difference of pictures to its noise, for many pixels
+AGREEMENT_FACTOR = 1.5  # largest ratio of the difference of pictures to its noise, if there are many pixels
 MIN_NOISE = 1e-9  # smallest noise, relative to the target
 FLUX_TOLERANCE = 0.005  # largest difference of the light on the target, as a fraction of the source's light
 

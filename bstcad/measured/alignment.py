@@ -27,11 +27,11 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from bstcad.analysis import shape
-from bstcad.measured.cloud import MIN_POINTS
+from bstcad.measured.cloud import MIN_CLOUD_POINTS
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import sag, sampled
 
-MAX_NEWTON_STEPS = 30  # maximum number of Gauss-Newton steps
+MAX_GAUSS_NEWTON_STEPS = 30  # maximum number of Gauss-Newton steps
 MAX_OUTLIER_ROUNDS = 6  # maximum number of rounds of outlier rejection
 STEP_TOLERANCE = 1e-10  # largest component (mm at the rim) of a step that ends the iteration
 FOOT_ITERATIONS = 3  # iterations for the foot of a perpendicular; each scales the error by distance x curvature
@@ -50,7 +50,7 @@ def root_mean_square(values: np.ndarray) -> float:
 
 
 @dataclass(frozen=True)
-class Face:
+class BackFace:
     """The back face of a lens, with which measured points are compared."""
 
     lens: Lens
@@ -59,7 +59,7 @@ class Face:
     max_distance: float  # distance along z (mm) above which a point does not belong to the face
 
     @classmethod
-    def of(cls, lens: Lens) -> Face:
+    def of(cls, lens: Lens) -> BackFace:
         """Return the back face of `lens`."""
         x, y = shape.inside(lens.outline, 65)
         front, back = (sag(surface, x.numpy(), y.numpy()) for surface in (lens.front, lens.back))
@@ -105,7 +105,7 @@ class Pose:
         return (points - self.pivot - self.shift) @ self.rotation + self.pivot
 
     def compose(self, motion: np.ndarray, reach: float) -> Pose:
-        """Return the pose that removes this one and then moves points by `motion` (6,), in units of Face.columns."""
+        """Return the pose that removes this one and then moves points by `motion` (6,), as in BackFace.columns."""
         turn = Rotation.from_rotvec(motion[3:] / reach).as_matrix()
         rotation = self.rotation @ turn.T
         return Pose(rotation, self.shift - rotation @ motion[:3], self.pivot)
@@ -116,7 +116,7 @@ class Pose:
         return np.degrees(Rotation.from_matrix(self.rotation).as_rotvec())
 
 
-def identity_pose(face: Face, shift: np.ndarray | None = None) -> Pose:
+def identity_pose(face: BackFace, shift: np.ndarray | None = None) -> Pose:
     """Return the pose without rotation, with a shift (mm) if one is given."""
     return Pose(np.eye(3), np.zeros(3) if shift is None else shift, face.pivot)
 
@@ -146,7 +146,7 @@ class Alignment:
         return root_mean_square(self.distances)
 
 
-def align(face: Face, cloud: np.ndarray, start: Pose) -> Alignment:
+def align(face: BackFace, cloud: np.ndarray, start: Pose) -> Alignment:
     """Align a cloud (n, 3) in mm with a face by least squares, all points weighted equally and outliers left out.
 
     start: a pose near the solution.  Outliers are sought there, and again among points that reach the face later.
@@ -173,9 +173,9 @@ def align(face: Face, cloud: np.ndarray, start: Pose) -> Alignment:
     return Alignment(pose, points, distances, normals, motions=motions, undetermined=free, outliers=outliers, **counts)
 
 
-def _least_squares(face: Face, cloud: np.ndarray, pose: Pose) -> Pose:
+def _least_squares(face: BackFace, cloud: np.ndarray, pose: Pose) -> Pose:
     """Return the pose by least squares of all points of the face, starting from a pose near the solution."""
-    for _ in range(MAX_NEWTON_STEPS):
+    for _ in range(MAX_GAUSS_NEWTON_STEPS):
         points, *_ = _face_points(face, cloud, pose)
         motion, _ = gauss_newton_step(face, points, *face.distance(points))
         pose = pose.compose(motion, face.reach)
@@ -185,7 +185,7 @@ def _least_squares(face: Face, cloud: np.ndarray, pose: Pose) -> Pose:
 
 
 def gauss_newton_step(
-    face: Face, points: np.ndarray, distances: np.ndarray, normals: np.ndarray, weight: np.ndarray | None = None
+    face: BackFace, points: np.ndarray, distances: np.ndarray, normals: np.ndarray, weight: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a Gauss-Newton step (6,) towards zero distances, and the orthonormal motions (6, k) it determines."""
     columns = face.columns(points, normals)
@@ -199,12 +199,12 @@ def gauss_newton_step(
     return -motions @ ((motions.T @ (weighted.T @ distances)) / sensitivity2[determined]), motions
 
 
-def _face_points(face: Face, cloud: np.ndarray, pose: Pose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _face_points(face: BackFace, cloud: np.ndarray, pose: Pose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the points of the face, and for the whole cloud: inside the outline?, near the face?"""
     points = pose.to_design(cloud)
     inside, near = face.contains(points), np.abs(face.height(points)) <= face.max_distance
     chosen = points[inside & near]
-    if len(chosen) < MIN_POINTS:
+    if len(chosen) < MIN_CLOUD_POINTS:
         raise ValueError(
             f"only {len(chosen)} of its points lie on the back face after alignment; give a cloud of that face"
         )
@@ -220,7 +220,7 @@ def _undetermined(motions: np.ndarray) -> tuple[str, ...]:
     )
 
 
-def scale(face: Face, alignment: Alignment) -> tuple[float, float]:
+def scale(face: BackFace, alignment: Alignment) -> tuple[float, float]:
     """Return the scale of the cloud relative to the design, fitted as a seventh parameter, and its uncertainty."""
     growth = np.einsum("ij,ij->i", alignment.points - face.pivot, alignment.normals)
     columns = face.columns(alignment.points, alignment.normals) @ alignment.motions
@@ -303,7 +303,7 @@ IMPROVEMENT_RATIO = 0.5  # ratio of distances below which a later start replaces
 DECENTRE_RING = 0.15  # decentre of further starts, in half widths, if the first ones do not fit
 
 
-def first_pose(face: Face, cloud: np.ndarray) -> tuple[Pose, float]:
+def first_pose(face: BackFace, cloud: np.ndarray) -> tuple[Pose, float]:
     """Return the best starting pose, and the distance (mm) within which the nearest quarter of the points lies."""
     sample = _sample(cloud)
     middle = _middle(sample)
@@ -316,7 +316,7 @@ def first_pose(face: Face, cloud: np.ndarray) -> tuple[Pose, float]:
     return further if further[1] < IMPROVEMENT_RATIO * best[1] else best
 
 
-def find_axis_exchange(face: Face, cloud: np.ndarray, original: float) -> tuple[np.ndarray, str] | None:
+def find_axis_exchange(face: BackFace, cloud: np.ndarray, original: float) -> tuple[np.ndarray, str] | None:
     """Return an exchange of axes by which the cloud fits far better than `original` (mm): matrix (3, 3) and words."""
     sample, fitting = _sample(cloud)[:: START_SAMPLE // AXES_SAMPLE], []
     for matrix, words in sorted(_axis_exchanges(), key=lambda exchange: _rarity(exchange[0])):
@@ -355,7 +355,7 @@ def _middle(points: np.ndarray) -> np.ndarray:
     return np.percentile(points, (1, 99), axis=0).sum(axis=0)[:2] / 2
 
 
-def _best_start(face: Face, sample: np.ndarray, decentres: list[np.ndarray], steps: int) -> tuple[Pose, float]:
+def _best_start(face: BackFace, sample: np.ndarray, decentres: list[np.ndarray], steps: int) -> tuple[Pose, float]:
     """Return the best of several starts; a later one only if it is clearly better than those before."""
     shifts = (np.array([*decentre, height]) for decentre in decentres for height in _heights(face, sample, decentre))
     first, *later = (_refine_start(face, sample, identity_pose(face, shift), steps) for shift in shifts)
@@ -366,7 +366,7 @@ def _best_start(face: Face, sample: np.ndarray, decentres: list[np.ndarray], ste
     return best
 
 
-def _heights(face: Face, sample: np.ndarray, decentre: np.ndarray) -> list[float]:
+def _heights(face: BackFace, sample: np.ndarray, decentre: np.ndarray) -> list[float]:
     """Return the z shifts (mm) of the starts: zero, and the height of the densest quarter of the points."""
     points = sample - np.array([*decentre, 0.0])
     over = points[face.contains(points)]
@@ -378,7 +378,7 @@ def _heights(face: Face, sample: np.ndarray, decentre: np.ndarray) -> list[float
     return [0.0, float(off[densest : densest + quarter].mean())]
 
 
-def _refine_start(face: Face, sample: np.ndarray, pose: Pose, steps: int) -> tuple[Pose, float]:
+def _refine_start(face: BackFace, sample: np.ndarray, pose: Pose, steps: int) -> tuple[Pose, float]:
     """Refine a pose by Gauss-Newton with weights 1 / (1 + (d / s)²), s = 2 x distance of the nearest quarter."""
     distance = np.inf
     for _ in range(steps):

@@ -14,7 +14,7 @@ from bstcad.optics.outlines import Outline
 from bstcad.runs import files
 
 MAX_CLOUD_SIZE = 1_000_000_000  # bytes
-MIN_POINTS = 100  # minimum number of points: six degrees of freedom and a form are fitted to them
+MIN_CLOUD_POINTS = 100  # minimum number of points: six degrees of freedom and a form are fitted to them
 MESH_SUFFIXES = (".ply", ".stl")
 UNIT_SIZES = {"inches": 1 / INCH, "metres": 1e-3, "micrometres": 1e3}  # 1 mm in each unit
 PLAUSIBLE_RATIOS = (0.3, 1.7)  # ratios of a cloud's extent to the lens's: half of a lens, or a lens with its fixture
@@ -53,10 +53,10 @@ def _read(path: Path) -> tuple[MeasuredPoints, bytes]:
         raise ValueError(f"is empty; {INPUT_HINT}")
     ending = path.suffix.lower()
     measured = read_mesh(data, ending) if ending in MESH_SUFFIXES else read_text(data)
-    if len(measured.positions) < MIN_POINTS:
+    if len(measured.positions) < MIN_CLOUD_POINTS:
         without = f" and {measured.without_data} without data" if measured.without_data else ""
         raise ValueError(
-            f"holds {len(measured.positions)} points{without}, which are too few; measure at least {MIN_POINTS}, "
+            f"holds {len(measured.positions)} points{without}, which are too few; measure at least {MIN_CLOUD_POINTS}, "
             "preferably 10 000"
         )
     return measured, data

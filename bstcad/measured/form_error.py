@@ -21,7 +21,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from scipy.special import eval_jacobi
 
 from bstcad.analysis.shape import least_squares
-from bstcad.measured.alignment import Alignment, Face, Pose, root_mean_square
+from bstcad.measured.alignment import Alignment, BackFace, Pose, root_mean_square
 from bstcad.optics.bspline import BSplineSurface, basis_matrix, interpolating_net
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import sag, sampled
@@ -47,12 +47,12 @@ SAMPLING_STRIPS = 32  # number of strips in which a net is sampled, which bounds
 class FormError:
     """Fitted form error δz(x, y) over the net of a lens: a polynomial, a random field, and a small rigid motion."""
 
-    face: Face
+    face: BackFace
     polynomial: np.ndarray = field(repr=False)  # coefficients (6,) of the columns of _legendre, mm
     random_field: BSplineSurface = field(repr=False)
     spread: np.ndarray = field(repr=False)  # standard deviations (m, m) of the field's cosine amplitudes, mm
     noise: float  # RMS noise of the points, mm
-    motion: np.ndarray  # motion (6,) of the fine relief against the alignment (biased by form), units of Face.columns
+    motion: np.ndarray  # motion (6,) of the fine relief against the alignment (biased by form), as in BackFace.columns
 
     def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return δz (mm) at (x, y) in mm, relative to the alignment by least squares."""
@@ -86,7 +86,7 @@ class FormError:
         return replace(self.random_field, heights=torch.from_numpy(scipy.fft.idctn(selected, norm="ortho")))
 
 
-def fit_form_error(face: Face, alignment: Alignment) -> FormError:
+def fit_form_error(face: BackFace, alignment: Alignment) -> FormError:
     """Fit the form error of a face to an aligned cloud."""
     back, points, n = face.lens.back_net, alignment.points, len(alignment.points)
     x, y = np.ascontiguousarray(points[:, :2].T)
@@ -352,7 +352,7 @@ ZONE_CHUNK = 400  # number of points in the first linear program, and added to i
 MAX_ZONE_ROUNDS = 30
 
 
-def minimum_zone(face: Face, alignment: Alignment) -> tuple[float, Pose]:
+def minimum_zone(face: BackFace, alignment: Alignment) -> tuple[float, Pose]:
     """Return width (mm) and pose of the narrowest zone between two envelopes of spheres about the design.
 
     The width is twice the largest distance, minimised over the motions that the face determines (Chebyshev):

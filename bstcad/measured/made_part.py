@@ -11,7 +11,7 @@ import numpy as np
 
 from bstcad.analysis import shape
 from bstcad.measured import alignment as aligning
-from bstcad.measured.alignment import Alignment, Face, Pose
+from bstcad.measured.alignment import Alignment, BackFace, Pose
 from bstcad.measured.cloud import Cloud
 from bstcad.measured.form_error import Deviation, FormError, deviation, fit_form_error, minimum_zone
 from bstcad.optics.goal import Goal, worst
@@ -26,7 +26,7 @@ MIN_RELIEF = 0.5  # fine relief relative to the design below which a part is of 
 COARSE_DEGREE = 4  # degree of the polynomial that is not fine relief: parts of equal optical power share it
 MIN_DESIGN_RELIEF = 3e-5  # RMS fine relief, in half widths, that a design needs to be recognised by it
 SCALE_TOLERANCE = 2e-4  # tolerance of the scale, about a thermal expansion
-SCALE_SIGMAS = 3.0  # tolerance of the scale, in standard uncertainties, if that is larger
+SCALE_SIGMAS = 3.0  # tolerance of the scale, in standard uncertainties, if larger than SCALE_TOLERANCE
 MIN_MEASURED_FRACTION = 0.8  # minimum fraction of the face that is measured; elsewhere the form is a guess
 COVERAGE_POINTS = 20  # mean number of points in a cell of the grid from which the coverage is counted
 RELIEF_POINTS = 20_000  # maximum number of points from which the fine relief is estimated
@@ -51,7 +51,7 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
     lens: the lens as re-read from the STEP file.  effort: effort of the measurement of its light.
     """
     lens = replace(lens, outline=lens.apertures[1])  # if a mount cuts the rim, the face ends there
-    face = Face.of(lens)
+    face = BackFace.of(lens)
     try:
         alignment, axes = _align(face, cloud.points)
     except ValueError as error:
@@ -62,7 +62,7 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
     lights = [_light(lens, form, nominal, goal, effort=cheap) for goal in nominal.goals]
     scale = aligning.scale(face, alignment)
     checks = (
-        *_cloud_checks(cloud, face, alignment, axes, scale=scale, max_decentre=nominal.scene.accept.decentre),
+        *_cloud_checks(cloud, face, alignment, axes, scale=scale, decentre=nominal.scene.accept.decentre),
         *_light_checks(nominal, lights),
         *_wavefront(replace(lens, back=form.add_to(lens.back_net)), nominal),
     )
@@ -78,11 +78,11 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
 
 
 def _cloud_checks(
-    cloud: Cloud, face: Face, alignment: Alignment, axes: str, *, scale: tuple[float, float], max_decentre: float | None
+    cloud: Cloud, face: BackFace, alignment: Alignment, axes: str, scale: tuple[float, float], decentre: float | None
 ) -> Iterator[Check]:
     """Check that a cloud is in mm and has the design's axes, and that it is of this face, complete, clean and in place.
 
-    axes: exchange of axes that the cloud needs, in words; scale: its scale and uncertainty; max_decentre: in mm.
+    axes: exchange of axes that the cloud needs, in words; scale: its scale and uncertainty; decentre: in mm.
     """
     extent = f"its extent is the lens's in {cloud.unit}"
     yield Check.true("made part: the cloud is in mm", cloud.unit == "mm", extent, id="made-unit")
@@ -97,7 +97,7 @@ def _cloud_checks(
     yield Check.at_most(name, abs(factor - 1), limit, where=where, id="made-scale")
     x, y, _ = alignment.pose.shift
     name, where = "made part: decentre in the frame of the cloud", f"x {x:+.4g} mm, y {y:+.4g} mm"
-    yield Check.at_most(name, math.hypot(x, y), max_decentre, "mm", where=where, id="made-decentre")
+    yield Check.at_most(name, math.hypot(x, y), decentre, "mm", where=where, id="made-decentre")
 
 
 def _light_checks(nominal: Nominal, lights: Sequence[tuple[Light, float]]) -> Iterator[Check]:
@@ -129,7 +129,7 @@ def _wavefront(lens: Lens, nominal: Nominal) -> Iterator[Check]:
     yield Check.at_most(name, value, limit, unit="waves", where=failure, id="made-wavefront")
 
 
-def _align(face: Face, points: np.ndarray) -> tuple[Alignment, str]:
+def _align(face: BackFace, points: np.ndarray) -> tuple[Alignment, str]:
     """Return the alignment and the exchange of axes it needs, in words ("" if the cloud fits as it is)."""
     pose, distance = aligning.first_pose(face, points)
     poor = distance > aligning.START_TOLERANCE * face.reach
@@ -142,7 +142,7 @@ def _align(face: Face, points: np.ndarray) -> tuple[Alignment, str]:
     return aligning.align(face, points, pose), ""
 
 
-def _identity_checks(face: Face, alignment: Alignment) -> tuple[Check, Check]:
+def _identity_checks(face: BackFace, alignment: Alignment) -> tuple[Check, Check]:
     """Return the checks that the part is of this design: its distance, and the fine relief that forms the picture."""
     relief, limit = _relief(face, alignment.points), MAX_RMS_DISTANCE * face.reach
     other = "the cloud is of another lens or of another face"
@@ -152,7 +152,7 @@ def _identity_checks(face: Face, alignment: Alignment) -> tuple[Check, Check]:
     return distance, Check.at_least(name, 1.0 if relief is None else relief, least, where=other, id="made-relief")
 
 
-def _relief(face: Face, points: np.ndarray) -> float | None:
+def _relief(face: BackFace, points: np.ndarray) -> float | None:
     """Return the fine relief of the made face relative to the design, by regression; None if the design has none."""
     points = points[np.random.default_rng(0).permutation(len(points))[:RELIEF_POINTS]]
     x, y = (points[:, :2] / face.reach).T
@@ -186,7 +186,7 @@ def _light(lens: Lens, form: FormError, nominal: Nominal, goal: Goal, *, effort:
     return light, max(light.rrmsd, math.hypot(*samples) / math.sqrt(2))  # quadratic mean of two opposite samples
 
 
-def _facts(face: Face, alignment: Alignment, error: Deviation, cloud: Cloud) -> dict[str, Any]:
+def _facts(face: BackFace, alignment: Alignment, error: Deviation, cloud: Cloud) -> dict[str, Any]:
     """Return the entries of `measured` in report.json; lengths in mm, angles in degrees, slopes in rad."""
     figures = {key: value for key, value in asdict(error).items() if key not in ("x", "y", "form", "worst")}
     distances, (width, pose) = face.distance(alignment.outliers)[0], minimum_zone(face, alignment)

@@ -18,7 +18,7 @@ from bstcad.step_text.placement import Placement, compose
 
 MAX_ASSEMBLY_DEPTH = 100  # largest number of nested representations between a part and the whole
 UNIT_SCALE_TOLERANCE = 1e-12  # largest deviation of a scale from 1
-Z, X = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
+Z_AXIS, X_AXIS = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
 NAMES = r"(?:'\d*'|\$),(?:'\d*'|\$)"  # pattern of an entity's name and description
 DIRECTION = re.compile(rf"\('\d*',\(({REAL}),({REAL}),({REAL})\)\)")
 AXES = re.compile(r"\('\d*',#(\d+),(?:#(\d+)|\$),(?:#(\d+)|\$)\)")
@@ -175,10 +175,10 @@ def _axes(location: str, axis: str | None, reference: str | None, entities: Enti
 
     A tilted z without x is refused: ISO 10303-42 projects the x axis, but other readers choose another axis.
     """
-    z = Z if axis is None else _direction(axis, entities)
+    z = Z_AXIS if axis is None else _direction(axis, entities)
     if reference is None and (z[0] or z[1] or not z[2] > 0):
         raise ValueError("it has no reference direction, and STEP readers assume different ones")
-    x = X if reference is None else _direction(reference, entities)
+    x = X_AXIS if reference is None else _direction(reference, entities)
     return Placement.of_axes(entities.points(np.array([location], dtype=np.int64))[0], z, x)
 
 

@@ -21,8 +21,8 @@ from bstcad.verify.verdict import Check
 
 SOURCE = "STEP text"  # source of the checked values, with which the names of the checks begin
 NET_TOLERANCE = 1e-11  # absolute tolerance of control points (mm): rounding to sixteen digits of text
-RELATIVE_ROUNDING = 2e-15  # relative tolerance of coordinates, which exceeds NET_TOLERANCE at over 5 m from the origin
-MEASURE_TOLERANCE = 1e-6  # relative tolerance of area, volume and centroid; integrals over a rough back have some 1e-9
+RELATIVE_ROUNDING = 2e-15  # relative tolerance of coordinates, larger than NET_TOLERANCE beyond 5 m from the origin
+MEASURE_TOLERANCE = 1e-6  # relative tolerance of area, volume and centroid; over a rough back integrals err by 1e-9
 VALUE_TOLERANCE = 1e-12  # absolute tolerance of stated numbers (mm or g/cm³), more than their rounding in the text
 
 Numbers = tuple[float, ...]

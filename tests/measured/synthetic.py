@@ -7,7 +7,7 @@ import scipy.fft
 import torch
 from scipy.spatial.transform import Rotation
 
-from bstcad.measured.alignment import Face
+from bstcad.measured.alignment import BackFace
 from bstcad.measured.form_error import frequencies
 from bstcad.optics.surfaces import sag, sampled
 
@@ -24,7 +24,7 @@ def with_form_error(lens, rms, correlation, seed=1):
     heights = scipy.fft.idctn(np.random.default_rng(seed).normal(size=amplitude.shape) * amplitude, norm="ortho")
     x, y = (t.ravel() for t in np.meshgrid(np.linspace(*back.x, m), np.linspace(*back.y, m), indexing="ij"))
     z, z_x, z_y = sampled(back, x, y)
-    motions = Face.of(lens).columns(np.stack([x, y, z], axis=1), np.stack([-z_x, -z_y, np.ones_like(z)], axis=1))
+    motions = BackFace.of(lens).columns(np.stack([x, y, z], axis=1), np.stack([-z_x, -z_y, np.ones_like(z)], axis=1))
     motions = motions.T.reshape(6, m, m)
     error, *moved = (_over(lens, part) for part in (heights, *motions))
     heights = heights - np.tensordot(np.linalg.lstsq(np.stack(moved, axis=1), error, rcond=None)[0], motions, axes=1)
@@ -47,7 +47,7 @@ def points(lens, count, seed=2):
 
 def cloud(lens, count, noise=0.0, shift=SHIFT, turn=TURN):
     """Points of the back face as an instrument sees them that holds the lens otherwise; noise: along z, RMS (mm)."""
-    found, pivot = points(lens, count), Face.of(lens).pivot
+    found, pivot = points(lens, count), BackFace.of(lens).pivot
     found[:, 2] += np.random.default_rng(3).normal(0.0, 1.0, len(found)) * noise
     return (found - pivot) @ Rotation.from_rotvec(np.radians(turn)).as_matrix().T + pivot + shift
 

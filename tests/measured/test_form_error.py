@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from bstcad.measured.alignment import Face, align, identity_pose, scale
+from bstcad.measured.alignment import BackFace, align, identity_pose, scale
 from bstcad.measured.form_error import deviation, fit_form_error, map_files, minimum_zone, robust_pv, zernike
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
@@ -22,7 +22,7 @@ def lens():
 
 
 def test_the_minimum_zone_is_that_of_all_points(lens):
-    face = Face.of(lens)
+    face = BackFace.of(lens)
     found = align(face, points(with_form_error(lens, 5e-4, 2.0), 3000), identity_pose(face))
     width, _ = minimum_zone(face, found)
     columns, one = face.columns(found.points, found.normals), np.ones((len(found.points), 1))
@@ -41,7 +41,7 @@ def test_a_known_error_has_a_known_zone(lens):
     given = points(lens, 20_000)
     angle, radius = np.arctan2(given[:, 1], given[:, 0]), np.hypot(given[:, 0], given[:, 1]) / 5
     given[:, 2] += ripple * radius**6 * np.cos(6 * angle)
-    face = Face.of(lens)
+    face = BackFace.of(lens)
     normal_z = 1 / np.sqrt(1 + 0.2**2)
     width, _ = minimum_zone(face, align(face, given, identity_pose(face)))
     assert 2 * ripple * normal_z * 0.93 < width < 2 * ripple
@@ -49,7 +49,7 @@ def test_a_known_error_has_a_known_zone(lens):
 
 def test_an_alignment_never_mirrors(lens):
     mirrored = replace(lens, back=replace(lens.back, heights=lens.back.heights.flip(0)))
-    face = Face.of(lens)
+    face = BackFace.of(lens)
     found = align(face, points(mirrored, 3000), identity_pose(face))
     assert np.linalg.det(found.pose.rotation) == pytest.approx(1.0) and found.rms > 0.01
 
@@ -89,7 +89,7 @@ class TestForm:
     @pytest.fixture(scope="class")
     @classmethod
     def placed(cls, lens, made):
-        face, given = Face.of(lens), points(made, 8000)
+        face, given = BackFace.of(lens), points(made, 8000)
         given[:, 2] += np.random.default_rng(3).normal(0.0, cls.NOISE, len(given))
         return face, align(face, given, identity_pose(face))
 
@@ -118,7 +118,7 @@ class TestForm:
         assert found.form_rms == pytest.approx(np.sqrt(np.nanmean(found.form**2)))
 
     def test_a_scale_is_seen_beside_the_six_motions(self, lens):
-        face = Face.of(lens)
+        face = BackFace.of(lens)
         grown = (points(lens, 4000) - face.pivot) * 1.0005 + face.pivot
         value, uncertainty = scale(face, align(face, grown, identity_pose(face)))
         assert value == pytest.approx(1.0005, abs=2e-5) and uncertainty < 2e-4

@@ -15,7 +15,7 @@ from bstcad import folder as folders
 from bstcad.commands import ProofOptions
 from bstcad.measured import cloud as clouds
 from bstcad.measured import made_part
-from bstcad.measured.alignment import Face, align, first_pose
+from bstcad.measured.alignment import BackFace, align, first_pose
 from bstcad.optics.measure import measure
 from bstcad.report.figure_jobs import NoPictures
 from bstcad.verify import checks
@@ -89,7 +89,7 @@ def test_the_pose_of_the_part_is_found_and_points_of_other_faces_are_counted(nom
     """Points of the front, of the sides and of the rim are not used."""
     back = cloud(nominal.lens, 5000)
     below = cloud(replace(nominal.lens, back=nominal.lens.back.moved(nominal.lens.back.z - 8.0)), 1500)
-    face = Face.of(nominal.lens)
+    face = BackFace.of(nominal.lens)
     everything = np.vstack([back, below])
     found = align(face, everything, first_pose(face, everything)[0])
     assert found.pose.shift == pytest.approx(SHIFT, abs=1e-6) and found.pose.angles == pytest.approx(TURN, abs=1e-5)
@@ -99,7 +99,7 @@ def test_the_pose_of_the_part_is_found_and_points_of_other_faces_are_counted(nom
 def test_motions_that_a_flat_face_does_not_determine_are_left_alone(nominal):
     lens = nominal.lens
     flat = replace(lens, back=replace(lens.back, heights=torch.zeros_like(lens.back.heights)))
-    face = Face.of(flat)
+    face = BackFace.of(flat)
     given = points(flat, 5000) + [0.0, 0.0, 0.3] + np.random.default_rng(0).normal(0, 1e-4, (5000, 3)) * [0, 0, 1]
     found = align(face, given, first_pose(face, given)[0])
     assert set(found.undetermined) == {"shift in x", "shift in y", "rotation about z"}

@@ -8,7 +8,7 @@ import pytest
 from bstcad import folder as folders
 from bstcad.measured import cloud as clouds
 from bstcad.measured import made_part
-from bstcad.measured.alignment import Face, align, first_pose
+from bstcad.measured.alignment import BackFace, align, first_pose
 from bstcad.measured.form_error import deviation, fit_form_error
 from bstcad.optics.measure import Effort
 from bstcad.report.record import with_part
@@ -32,7 +32,7 @@ def clean(nominal):
 
 
 def on_face(lens, found):
-    face = Face.of(lens)
+    face = BackFace.of(lens)
     return face, align(face, found, first_pose(face, found)[0])
 
 
