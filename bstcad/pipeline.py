@@ -128,7 +128,7 @@ def design(
     """
     began, merit = time.perf_counter() if began is None else began, options.merit
     if merit is not None and (len(scene.targets) > 1 or scene.wavefront is not None):
-        raise SceneError("merit: needs a scene with one goal, and this one has several; remove merit, or other goals")
+        raise SceneError("merit: needs a scene with one goal, but the scene has more; remove merit, or the other goals")
     torch.manual_seed(scene.tailoring.seed)
     device = device_for(device)
     goals, edge = within_reach(scene, hooks.progress)

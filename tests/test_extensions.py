@@ -310,7 +310,7 @@ def test_changes_of_a_scene_keep_source_and_targets_of_its_own(scene):
 
 def test_a_merit_of_its_own_is_refused_for_several_goals(scene):
     two = scene.changed({"target": [scene.target, scene.target.model_copy(update={"z": 2 * scene.target.z})]})
-    with pytest.raises(SceneError, match="^merit: needs a scene with one goal"):
+    with pytest.raises(SceneError, match="^merit: "):
         pipeline.design(two, options=pipeline.DesignOptions(lambda picture, target: ((picture - target) ** 2).sum()))
 
 

@@ -47,7 +47,8 @@ from bstcad.optics.unfolding import image_screen
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit, blocks, fit_slopes
 from bstcad.transport.density import Density, resample_flux
-from bstcad.transport.mapping import Frame, Mapping, Points, Solver, TransportMap, nodes, solve
+from bstcad.transport.mapping import Frame, Mapping, Points, TransportMap, nodes, solve
+from bstcad.transport.mapping import Solver as Solver  # exported to rooms that may not import transport
 
 SUBCELLS = 2  # samples of the light in a transport cell along each axis: a rim may cross the cell
 SUBPIXELS = 8  # parts of a pixel per transport cell along each axis; at least one part per pixel

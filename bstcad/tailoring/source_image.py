@@ -98,7 +98,7 @@ class _BlurFunction(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, g: Tensor):
+    def backward(ctx: Any, g: Tensor) -> tuple[Tensor, None]:
         return torch.from_numpy(ctx.blur.adjoint(g.cpu().numpy())).to(g.device), None
 
 
