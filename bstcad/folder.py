@@ -247,7 +247,8 @@ def write_geometry(design: Made, folder: Path, submit: Submit = run_here) -> Cal
         for step in written:
             step.result()
     except BrokenExecutor as error:
-        raise MachineError("OCC crashed on this solid or ran out of memory; free some memory and try again") from error
+        crash = "OpenCASCADE crashed on this solid or ran out of memory"
+        raise MachineError(f"{crash}; close other programs and try again") from error
     return partial(meshes.write_3mf, mesh, folder / "lens.3mf", label(scene))
 
 

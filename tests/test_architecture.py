@@ -50,7 +50,16 @@ MAY_IMPORT = {
     "commands": {*ENGINE, "designs", "sweep", "tolerance", "app", "bstcad"},
     # The workbench's previews are designs made small, by the steps of tailoring.
     "app": {
-        "runs", "scene", "optics", "tailoring", "analysis", "report", "designs", "sweep", "tolerance", "commands",
+        "runs",
+        "scene",
+        "optics",
+        "tailoring",
+        "analysis",
+        "report",
+        "designs",
+        "sweep",
+        "tolerance",
+        "commands",
         "bstcad",
     },  # fmt: skip
     "bstcad": {*ENGINE, "commands", "app"},  # __init__

@@ -376,7 +376,7 @@ def with_effects(scene, *effects):
 
 
 def test_an_effect_of_a_script_is_that_of_the_package_with_the_same_law(scene):
-    """Absorption by a script's loss and by bstcad's: one picture, one ledger, one gradient through the ray tubes."""
+    """Absorption by a script's loss and by bstcad's: one picture, one ledger, one gradient through the flux tubes."""
     lens = scene.flat_lens(33)
     pictures, gradients = [], []
     for named in (bstcad.effect("haze", Haze), {"kind": "absorption", "coefficient": 0.01}):

@@ -20,7 +20,7 @@ def test_each_script_has_its_scene(script):
 
 
 def test_a_reader_decodes_the_qr_code_from_the_light():
-    """The lens has half the pixels and half the control points of the gallery's, and few ray tubes judge it."""
+    """The lens has half the pixels and half the control points of the gallery's, and few flux tubes judge it."""
     code = zxingcpp.create_barcode(WORDS, zxingcpp.BarcodeFormat.QRCode)
     modules = np.maximum(np.array(code.to_image(scale=1)) / 255.0, 0.02)
     scene = bstcad.load(GALLERY / "lens_10_qr.toml").changed({

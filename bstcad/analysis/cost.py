@@ -174,8 +174,8 @@ def _octaves(error: np.ndarray, per_unit: float) -> list[dict[str, Any]]:
 # --- unlit and lifted parts -------------------------------------------------------------------------------------------
 # Target and irradiance have the same sum, (rows, columns), row 0 at y max.
 
-DARK_LEVEL = 0.01  # irradiance relative to the mean below which a pixel of the target is dark
-UNLIT_LEVEL = 0.1  # irradiance relative to the target below which a lit pixel counts as unlit
+DARK_LEVEL = 0.01  # a pixel of the target is dark below this irradiance, as a fraction of the mean
+UNLIT_LEVEL = 0.1  # a lit pixel counts as unlit below this fraction of its target irradiance
 MIN_UNLIT_FRACTION = 5e-3  # smallest unlit fraction of the lit area that is reported
 
 

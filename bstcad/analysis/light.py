@@ -206,7 +206,7 @@ class Margins:
     """Worst cases over all rays that carry light to the back."""
 
     tir_margin_deg: float | None  # critical angle minus angle of incidence (degrees), < 0: reflected; None: no such ray
-    newton_slope_min: float | None  # |F'(t)| at a tailored face, the divisor of Newton's step: 1 normal, 0 grazing
+    newton_slope_min: float | None  # |F'(t)| at a tailored face, the divisor of the Newton step: 1 normal, 0 grazing
     non_finite: int  # number of control points, hits and landing points that are not finite
 
 

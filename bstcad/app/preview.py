@@ -1,6 +1,6 @@
 """A preview of a scene: the light of its lens after about a second, from a reduced design.
 
-The preview is a quick design (`Task.preview`) of the same scene with fewer pixels, control points, ray tubes and
+The preview is a quick design (`Task.preview`) of the same scene with fewer pixels, control points, flux tubes and
 evaluations.  A pixel has as many control cells and tubes as in a draft.  Detail finer than its pixels is not shown.
 """
 
@@ -48,7 +48,7 @@ class PreviewSize:
 
     pixels: int  # pixels along the longer side of a picture
     net: int  # control points along the longer side; small prime factors make the cosine transforms fast
-    tubes: int  # ray tubes per side
+    tubes: int  # flux tubes per side
     rounds: int  # rounds of stage 1
     evaluations: int  # evaluations of stage 2 for a point source
     blurred: int  # evaluations of stage 2 for an extended source, each twice as slow

@@ -119,7 +119,7 @@ class _Opening:
         import cadquery
 
         if not np.isfinite(placed.at).all():  # a prism there would crash the process
-            raise ValueError(f"{name}: {placed.at} is no position; give x, y and z in mm")
+            raise ValueError(f"{name}: {placed.at} is not a position; give x, y and z in mm")
         lens = placed.lens.plain()
         check_thickness(lens)
         loops = cut_loops(lens, placed.trim, placed.holes)
@@ -148,7 +148,7 @@ class _Opening:
                 normal = face.normalAt().z if face.geomType() == "PLANE" else 0.0
                 if abs(abs(normal) - 1) > COSINE_TOLERANCE:
                     raise ValueError(
-                        f"{self.name}: the body meets it in a face that is no plane z = const; make it one"
+                        f"{self.name}: the body meets it in a face that is not a plane z = const; make it one"
                     )
                 planes[normal > 0].append(_BodyPlane(k, around.index(True), face.toPln().Location().Z()))
         if [len(planes[above]) for above in (True, False)] != [1, 1]:
@@ -260,7 +260,7 @@ def part_of(lens: Lens, mount: Mount) -> NamedSolid:
             found = mounted(body(mount.flange), [PlacedLens(lens, trim, draft=draft)])
     except (Standard_Failure, StdFail_NotDone) as error:
         raise ValueError(
-            f"mount: OCC cannot build it ({type(error).__name__}); make bevel or draft smaller, or leave them out"
+            f"mount: OpenCASCADE cannot build it ({type(error).__name__}); make bevel or draft smaller, or omit them"
         ) from error
     return found._replace(solid=found.solid.translate((0, 0, -mount.origin(lens.front_vertex))))
 

@@ -74,7 +74,7 @@ class StepLens:
 
 @contextmanager
 def quiet_occ() -> Iterator[None]:
-    """Suppress OCC's statistics and messages about a file inside the block."""
+    """Suppress the messages that OpenCASCADE prints inside the `with` block."""
     messenger = Message.DefaultMessenger_s()
     printers = list(messenger.Printers())
     for printer in printers:
@@ -98,12 +98,12 @@ def solid(path: Path) -> TopoDS_Solid:
     reader = STEPControl_Reader()
     with quiet_occ():
         if reader.ReadFile(str(path)) != IFSelect_RetDone:
-            raise ValueError(f"{path.name}: OCC cannot read it, so the file is damaged; write it again")
+            raise ValueError(f"{path.name}: OpenCASCADE cannot read it, so it is damaged; write it again")
         reader.TransferRoots()
     shape = reader.OneShape()
     solids = [] if shape.IsNull() else parts_of(shape, TopAbs_SOLID)
     if len(solids) != 1:
-        raise ValueError(f"{path.name}: OCC finds {len(solids)} solids, not one, so it is damaged; write it again")
+        raise ValueError(f"{path.name}: OpenCASCADE finds {len(solids)} solids instead of one; write it again")
     return TopoDS.Solid_s(solids[0])
 
 
@@ -114,7 +114,7 @@ def read(path: str | Path, shape: TopoDS_Solid | None = None) -> StepLens:
         found, placement = in_own_frame(shape or solid(path))
         return replace(_lens_in(found), placement=placement)
     except ValueError as error:
-        raise ValueError(f"{path.name}: read by OCC: {error}") from error
+        raise ValueError(f"{path.name}: read by OpenCASCADE: {error}") from error
 
 
 def lens(step_lens: StepLens, index: float) -> Lens:
@@ -217,7 +217,7 @@ def _looks_along_net(face: TopoDS_Face) -> bool:
 
 
 def is_freeform(surface: BRepAdaptor_Surface) -> bool:
-    """True if a surface has more than 3 x 3 control points (a conic or a nearly flat sphere) and is no ruled wall."""
+    """True if a surface has more control points than 3 x 3 (a conic, a nearly flat sphere) and is not a ruled wall."""
     return _is_patch(surface) and surface.NbUPoles() * surface.NbVPoles() > 9
 
 
@@ -265,7 +265,7 @@ def _looks_up(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> bool:
 
 
 def _front_face(rest: Sequence[OccFace]) -> OccFace:
-    """Return a front that is no net: a sphere, a patch of 3 x 3, or the smallest plane z = const that looks down."""
+    """Return a front that is not a net: a sphere, a patch of 3 x 3, or the smallest plane z = const that looks down."""
     planes = [face for face in rest if face[1].GetType() == Kind.GeomAbs_Plane]
     level = [face for face in planes if abs(face[1].Plane().Axis().Direction().Z()) > 1 - AXIAL_TOLERANCE]
     if len(level) > 1:
@@ -295,7 +295,7 @@ def _is_level(surface: BRepAdaptor_Surface, z: float) -> bool:
 
 
 def _front_surface(face: TopoDS_Face, surface: BRepAdaptor_Surface, others: Sequence[OccFace]) -> Surface:
-    """Return a front that is no net, with its outline if there is a plane around it; others: the other faces."""
+    """Return a front that is not a net, with its outline if there is a plane around it; others: the other faces."""
     if surface.GetType() == Kind.GeomAbs_Plane:
         return Plane(surface.Plane().Location().Z())
     curved = _sphere(face, surface) if surface.GetType() == Kind.GeomAbs_Sphere else _conic(surface.BSpline())

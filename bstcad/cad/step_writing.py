@@ -121,7 +121,7 @@ def encode(
         shape, nets = step_nets.with_placeholders(getattr(shape, "wrapped", shape))
         document = _document(shape, part, faces)
         if not writer.Transfer(document, STEPControl_AsIs):
-            raise ValueError(f"{name}: OCC cannot express this shape in STEP; check that the solid is valid")
+            raise ValueError(f"{name}: OpenCASCADE cannot express this shape in STEP; check that the solid is valid")
     control = writer.ChangeWriter()
     model = control.Model()
     _correct_units(model)

@@ -34,7 +34,7 @@ from bstcad.verify.verdict import Check
 JUDGES = {"batoid": "bstcad.judges.batoid", "mitsuba": "bstcad.judges.mitsuba"}
 JUDGE_RAYS = 1 << 24  # rays of a judge, in both halves
 MAX_COMPARED_PIXELS = 128  # largest number of pixels along the longer side of the compared pictures
-OWN_EFFORT = Effort(accuracy=0.0, witness=False)  # effort of bstcad: as many rays as allowed, without noise
+OWN_EFFORT = Effort(accuracy=0.0, witness=False)  # all rays are traced, and no second picture with tubes
 OWN_SEED_OFFSET = 500_009  # difference between the seeds of bstcad's and the judge's rays
 AGREEMENT_FACTOR = 1.5  # largest ratio of the difference of pictures to its noise, if there are many pixels
 MIN_NOISE = 1e-9  # smallest noise, relative to the target
@@ -107,7 +107,7 @@ def choose_judges(names: Sequence[str | OwnJudge]) -> tuple[str | OwnJudge, ...]
         if not isinstance(name, str):
             continue
         if name not in JUDGES:
-            raise SceneError(f"--against {name}: is no judge; {nearest(name, list(JUDGES), 'known are')}")
+            raise SceneError(f"--against {name}: is not a known program; {nearest(name, list(JUDGES), 'choose')}")
         if importlib.util.find_spec(name) is None:
             raise MachineError(f"--against {name}: {name} is not installed; pip install 'bstcad[judges]'")
     return tuple(dict.fromkeys(names))

@@ -1,6 +1,6 @@
 """Mitsuba 3, a renderer, as a judge: photons of its own emitters through a mesh of its own dielectric.
 
-Its particle tracer sends photons from the source, reflects or transmits each at random by Fresnel's reflectance, and
+Its particle tracer sends photons from the source, reflects or transmits each at random (Fresnel reflectance), and
 images a matt screen through a pinhole.  Therefore its light has photon noise, and the losses of uncoated faces even if
 the scene requests none.  Its mirror is lossless.
 

@@ -22,7 +22,7 @@ from bstcad.verify.checks import WAVEFRONT, Nominal
 from bstcad.verify.verdict import Check
 
 MAX_RMS_DISTANCE = 3e-3  # RMS distance after alignment, in half widths, above which a part is of another design
-MIN_RELIEF = 0.5  # fine relief relative to the design below which a part is of another design
+MIN_RELIEF = 0.5  # a part is of another design below this fine relief, as a fraction of the design
 COARSE_DEGREE = 4  # degree of the polynomial that is not fine relief: parts of equal optical power share it
 MIN_DESIGN_RELIEF = 3e-5  # RMS fine relief, in half widths, that a design needs to be recognised by it
 SCALE_TOLERANCE = 2e-4  # tolerance of the scale, about a thermal expansion

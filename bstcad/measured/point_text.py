@@ -24,7 +24,7 @@ UNITS_IN_MM = {  # units as they are written in headings
     "\u00b5m": 1e-3, "\u03bcm": 1e-3, "micron": 1e-3, "microns": 1e-3, "nm": 1e-6, "in": INCH, "inch": INCH,
     "inches": INCH, '"': INCH,
 }  # fmt: skip
-# Words that may accompany x, y or z in the heading of a coordinate; "nx", "normal x" or "x deviation" is no coordinate.
+# Words that may accompany x, y or z in the heading of a coordinate; "nx", "normal x" and "x deviation" are others.
 COORDINATE_WORDS = {"coord", "coordinate", "koordinate", "pos", "position", "point", "axis", "achse"}
 ACTUAL_WORDS = {"act", "actual", "meas", "measured", "ist", "istwert", "messwert"}
 NOMINAL_WORDS = {"nom", "nominal", "soll", "sollwert", "theo", "theoretical", "cad", "ref", "reference"}
@@ -126,7 +126,7 @@ def _read_zygo(every: list[tuple[int, str]]) -> MeasuredPoints:
 
 
 def decode_text(data: bytes) -> str:
-    """Decode UTF-8, UTF-16 or Windows-1252; raise ValueError if the bytes are no text."""
+    """Decode UTF-8, UTF-16 or Windows-1252; raise ValueError if the bytes are not text."""
     for start, what in FOREIGN_FORMATS.items():
         if data.startswith(start):
             raise ValueError(f"is {what}; {INPUT_HINT}, as text, PLY or STL")
@@ -136,13 +136,13 @@ def decode_text(data: bytes) -> str:
     elif sample[1::2].count(0) > len(sample) / 4 or sample[::2].count(0) > len(sample) / 4:  # every second byte is 0
         encoding = "utf-16-le" if sample[1::2].count(0) > sample[::2].count(0) else "utf-16-be"
     elif re.search(rb"[\x00-\x08\x0e-\x19\x1b-\x1f]", data):
-        raise ValueError(f"is no text; {INPUT_HINT}, or a file whose name ends in .ply or .stl")
+        raise ValueError(f"is not a text file; {INPUT_HINT}, or a file whose name ends in .ply or .stl")
     try:
         return data.decode(encoding)
     except UnicodeDecodeError as error:
         if encoding == "utf-8-sig":
             return data.decode("cp1252", errors="replace")
-        raise ValueError(f"is no text in UTF-16 ({error.reason} at byte {error.start}); save it as UTF-8") from None
+        raise ValueError(f"is not text in UTF-16 ({error.reason} at byte {error.start}); save it as UTF-8") from None
 
 
 # ---- separators and numbers ------------------------------------------------------------------------------------------
@@ -208,7 +208,7 @@ def _table(lines: list[tuple[int, str]], layout: _Layout, columns: Sequence[int]
                 fields += ["nan"] * (line.count(layout.separator) + 1 - len(fields))
             if len(fields) <= max(columns) or any(_number(fields[column]) is None for column in columns):
                 raise ValueError(f"line {number} is not three numbers ({line[:40]!r}); {INPUT_HINT}") from None
-        raise ValueError(f"is no table of numbers from line {lines[0][0]} on; {INPUT_HINT}") from None
+        raise ValueError(f"is not a table of numbers from line {lines[0][0]} on; {INPUT_HINT}") from None
 
 
 # ---- columns ---------------------------------------------------------------------------------------------------------
@@ -263,7 +263,7 @@ def _words(line: str) -> list[str]:
 def _coordinate(word: str) -> tuple[str, str, float] | None:
     """Parse the heading of a column, such as "X [mm]": "actual", "nominal" or ""; "x", "y" or "z"; the unit in mm.
 
-    Returns None if the column is no coordinate.  Raises ValueError for a unit that UNITS_IN_MM does not have.
+    Returns None if the column is not a coordinate.  Raises ValueError for a unit that UNITS_IN_MM does not have.
     """
     parts = re.findall(r"[a-z\u00b5\u03bc]+|\"", word.strip().strip("'\"").lower())
     words = [piece for part in parts for piece in _split_role(part)]

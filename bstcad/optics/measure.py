@@ -60,7 +60,7 @@ PASS_SEEDS = 1 << 20  # difference between the seeds of successive passes of ray
 GHOST_DIVISOR = 4  # rays per side relative to those of the ghost, which is a hundredth of the light
 IMAGE_POINTS = 48  # points per side of the back face through which the image of the source is computed
 # Largest distance of an image from the centre of the screen, relative to the screen's width plus the median distance.
-# Light outside it grazes a tilted plane and is no part of the image.
+# Light outside it grazes a tilted plane and does not belong to the image.
 MAX_IMAGE_DISTANCE = 16
 EVEN_POINT_PAIRS = 2048  # pairs of points that represent an evenly bright source
 

@@ -181,7 +181,7 @@ def surface_maps(lens: Lens, steepest: float, face: str = "back") -> Figure:
 
     steepest: largest slope of the face (degrees), which the samples may miss.  face: "back" or "front".
 
-    The best plane is subtracted from the height if its PV exceeds that of the remainder.
+    The best-fit plane is subtracted from the height if the PV of the plane exceeds the PV of the residual.
     """
     x, y, sag, slope_x, slope_y = _sample(lens, getattr(lens, face))
     columns = np.stack([np.ones_like(sag), *np.meshgrid(x, y)], axis=-1)

@@ -32,9 +32,9 @@ class GoalFigures:
     rrmsd_standard_error: Annotated[float, Field(ge=0, le=1e3)]  # standard error of rrmsd, by independent sets of rays
     rrmsd_tent: Rrmsd | None  # RRMSD by linear binning
     light_on_target: Fraction  # fraction of the source's flux on the target
-    efficiency: Fraction  # flux on the target over flux that leaves the back face
+    efficiency: Fraction  # flux on the target, as a fraction of the flux that leaves the back face
     leak: Fraction | None  # fraction of the light on the target that is on its dark pixels; None: no dark pixels
-    contrast: Size | None  # mean irradiance of lit pixels over that of dark ones; None: no dark pixels, no leak
+    contrast: Size | None  # mean irradiance of lit pixels relative to dark pixels; None: no dark pixels, no leak
     unit: str = "mm"  # unit of x and y on its receiver
 
     @property

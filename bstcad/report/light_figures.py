@@ -165,7 +165,7 @@ def brightest(target: np.ndarray, irradiance: np.ndarray) -> float:
 
 
 def tones(irradiance: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return irradiance as sRGB bytes (rows, columns), white at the end of the scale."""
+    """Return irradiance as grey levels in sRGB (rows, columns), uint8; the end of the scale is white."""
     light = to_srgb(np.clip(irradiance / brightest(target, irradiance), 0.0, 1.0))
     return np.rint(255 * np.clip(light, 0.0, 1.0)).astype(np.uint8)
 

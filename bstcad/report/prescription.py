@@ -1,4 +1,4 @@
-"""Numbers of a lens and its part: the prescription, the order for a shop, and the facts of a STEP file by itself.
+"""Numbers of a lens and its part: the prescription, the order for a shop, and the facts of a STEP file alone.
 
 The prescription states every surface as it was designed, with source and target, with all digits.  These may differ
 from the numbers of the scene, whose radius may be free and whose back may be moved:

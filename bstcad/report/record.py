@@ -89,7 +89,7 @@ class CurvePoint:
     """One point of the convergence curve."""
 
     seconds: Seconds  # time since the start
-    rrmsd: Rrmsd  # RRMSD by the tubes of the stage
+    rrmsd: Rrmsd  # RRMSD computed with the tubes of the stage
 
 
 class PrecisionTest(TypedDict):
@@ -184,7 +184,7 @@ class Contents:
     # largest deflection by a face of the index; None: a mirror); None: light reaches all of it
     unreachable: Mapping[str, Size | None] | None = None
     leak: Fraction | None = None  # fraction of the light on the target that is on its dark pixels; None: no dark pixels
-    contrast: Size | None = None  # mean irradiance of lit pixels over that of dark ones; None: no dark pixels, no leak
+    contrast: Size | None = None  # mean irradiance of lit relative to dark pixels; None: no dark pixels, no leak
     optic: Literal["lens", "mirror"] = "lens"  # kind of the design
     quality: str | None = None  # tailoring.quality of the scene
     # grid, iterations, mass error, reason to stop; fraction of light and largest slope (degrees) of analysis.steepness
@@ -253,7 +253,7 @@ KEYS_KEPT = {*KEYS, "leak", "contrast", "optic", "twins", "rrmsd_asked", "given_
 
 @dataclass(frozen=True)
 class Examined:
-    """Result of `bstcad verify` for a STEP file by itself."""
+    """Result of `bstcad verify` for a STEP file without a design."""
 
     name: str
     title: str

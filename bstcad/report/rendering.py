@@ -317,7 +317,7 @@ def _clear_of_screen(path: LightPath, towards: np.ndarray) -> np.ndarray:
 
 
 def turnable(lens: Lens, path: LightPath | None = None, cells: int = FINE) -> str:
-    """Return the JSON for solid_view.js: lengths in mm, the lights of the picture in clay, and the light of `path`.
+    """Return the JSON for solid_view.js: the faces in mm, the lamps that shade them, and the rays of `path`.
 
     cells: cells of a net per axis, even; fewer for a preview that is sent often (256: 0.9 MB, 96: 0.2 MB).
 

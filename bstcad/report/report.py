@@ -89,7 +89,7 @@ def ledger(flux: Mapping[str, float], of: str) -> dict[str, float]:
 
 
 def first_figures(report: Contents | Examined) -> list[Figure]:
-    """Return the first figures of the terminal and of report.html; for a STEP file by itself, those of the part."""
+    """Return the first figures of the terminal and of report.html; for a STEP file alone, those of the part."""
     if isinstance(report, Examined):
         return [(name, value, "") for name, value in report.part.items()]
     rows = tables("first_figures.txt.j2", report=report)["first"]

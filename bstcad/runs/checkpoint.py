@@ -53,7 +53,7 @@ def write(path: Path, purpose: Purpose, state: Any) -> None:
 def read(path: Path, kind: type, device: str = "cpu") -> tuple[Purpose, Any]:
     """Return (purpose, state) of a checkpoint; the state is a `kind`, its tensors are on a device.
 
-    Mappings are returned as dicts, lists as tuples.  SceneError if the file is no checkpoint of this version.
+    Mappings are returned as dicts, lists as tuples.  SceneError if the file is not a checkpoint of this version.
     """
     try:
         content = files.contents(path, MAX_SIZE)

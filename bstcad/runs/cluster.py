@@ -92,7 +92,7 @@ class Cluster:
             self._client = self._distributed.Client(address, timeout=patience, set_as_default=False)
         except (OSError, ValueError) as error:  # a timeout is an OSError
             raise SceneError(
-                f"--scheduler {address}: no scheduler answers ({first_line(error)}); start one with dask scheduler"
+                f"--scheduler {address}: no scheduler answers ({first_line(error)}); run: dask scheduler"
             ) from None
         try:
             self._client.wait_for_workers(1, timeout=patience)

@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 ProgressFunction = Callable[[str, int, int, str], None]
-LINE_INTERVAL = 3.0  # seconds between two plain lines of a stage
+LINE_INTERVAL = 3.0  # seconds between two lines of a stage, where the terminal shows no progress bar
 REDRAW_INTERVAL = 0.2  # seconds between two drawings in a notebook
 
 

@@ -593,7 +593,7 @@ class LensBlank(Record):
         return tuple(face for face in self.passes.faces if tailored[face])
 
     def front_net(self, net: Sides) -> Sides | None:
-        """Return the control points of a freeform front for a back of `net`; None if the front is no net.
+        """Return the control points of a freeform front for a back of `net`; None if the front is not a net.
 
         A tailored front keeps the scene's ratio of control points to the back; a fixed net keeps its own number.
         """

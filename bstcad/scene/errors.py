@@ -136,7 +136,7 @@ def _sentence(problem: ErrorDetails) -> str:
 
 
 def _type_sentence(kind: str, location: _Location, value: Any, context: Mapping[str, Any]) -> str:
-    """Return the sentence on an error that pydantic finds by itself."""
+    """Return the sentence on an error that pydantic reports."""
     key, last = location.key, location.key.rpartition(".")[2]
     shown = _shown(value)
     tag, name = str(context.get("tag")), context.get("discriminator", "").strip("'")

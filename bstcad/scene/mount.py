@@ -66,13 +66,13 @@ class Part:
         return replace(self, **{name: value for name, value in known.items() if getattr(self, name) is None})
 
     def complaints(self, lens: LensBlank) -> Iterator[str]:
-        """Yield the faults of the table, by itself and for this lens."""
+        """Yield the faults of the table itself, and for this lens."""
         for field in fields(self):
             text = getattr(self, field.name)
             if isinstance(text, str) and not (text.strip() and text.isprintable() and len(text) <= MAX_TEXT):
                 yield f"part.{field.name}: must be one line of 1 to {MAX_TEXT} printable characters; change it"
         if self.colour is not None and not COLOUR.fullmatch(self.colour):
-            yield f'part.colour: {self.colour!r} is no colour; write "#9ed3f5", or "#9ed3f580" with an opacity'
+            yield f'part.colour: {self.colour!r} is not a colour; write "#9ed3f5", or "#9ed3f580" with an opacity'
         if self.density is not None and self.material is None and lens.material is None:
             yield "part.density: a density needs the name of its material; add part.material"
         for key in ("surface_profile", "front_profile"):
@@ -83,7 +83,7 @@ class Part:
             large = f"{self.thickness_tolerance:g} mm is not less than the thickness of the blank, {thickness:g} mm"
             yield f"part.thickness_tolerance: {large}; make it smaller"
         if self.date is not None and not _is_date(self.date):
-            yield f'part.date: {self.date!r} is no date in ISO 8601; write it as "2031-05-06"'
+            yield f'part.date: {self.date!r} is not a date in ISO 8601; write it as "2031-05-06"'
 
 
 def _is_date(text: str) -> bool:
@@ -243,7 +243,7 @@ def parting(back: Surface, front: Surface, x: np.ndarray, y: np.ndarray) -> floa
 
 
 def complaints(mount: Mount, lens: LensBlank) -> Iterator[str]:
-    """Yield the faults of a mount around this lens before tailoring."""
+    """Yield the faults of a mount that can be found before the lens is tailored, each as a sentence."""
     for key, shape in (("rim", mount.rim), ("flange.outline", mount.flange and mount.flange.outline)):
         if shape is not None and not shape.corner_radius < (half := min(shape.outline.half_extent)):
             size = f"{shape.corner_radius:g} mm is not less than {half:g} mm, half the width"

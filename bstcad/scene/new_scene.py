@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from bstcad.scene.scene import Scene
 
 SIZE = 80.0  # default size of a plate, mm
-WIDTH_TO_THICKNESS = 10.0  # ratio of width and thickness of a plate
+WIDTH_TO_THICKNESS = 10.0  # ratio of the width of a plate to its thickness
 MIN_THICKNESS = 3.0  # mm; smallest thickness of a plate
 RANGES = {"size": (1.0, 10_000.0), "distance": (1.0, 1e7)}  # ranges of the options, mm
 BLUR_MARGIN = 1.1  # ratio of the limit to the RRMSD of the blurred picture; standard quality ends well below it

@@ -116,14 +116,14 @@ def from_array(values: np.ndarray) -> Picture:
 
 
 def _array_faults(values: np.ndarray) -> Iterator[str]:
-    """Complain of an array that is no irradiance."""
+    """Yield the faults of an array that is not an irradiance."""
     if values.ndim != 2 or values.size == 0:
-        yield f"an array of shape {values.shape} is no picture; give irradiance of shape (rows, columns)"
+        yield f"an array of shape {values.shape} is not a picture; give irradiance of shape (rows, columns)"
     if values.size > MAX_PIXELS or max(values.shape) > MAX_SIDE:
         limit = f"more than {MAX_PIXELS // 10**6} million values, or more than {MAX_SIDE} along a side"
         yield f"an array of shape {values.shape} has {limit}; average neighbouring values"
     if values.dtype.kind not in "buif":
-        yield f"an array of {values.dtype} is no picture; give real numbers"
+        yield f"an array of {values.dtype} is not a picture; give real numbers"
     if not np.isfinite(values).all():
         yield "the array has values that are not finite; set unknown values to 0"
     if values.min() < 0:
@@ -443,7 +443,7 @@ def _ink(text: str, size: float) -> Image.Image:
     image = Image.new("L", (int(right - left) + 8, int(bottom - top) + 8))
     ImageDraw.Draw(image).text((4 - left, 4 - top), text, fill=255, font=font, align="center")
     if image.getbbox() is None:
-        raise SceneError("target.text: the letters have no ink; give others")
+        raise SceneError("target.text: the text has no visible characters; give another text")
     return image.crop(image.getbbox())
 
 

@@ -54,7 +54,7 @@ class Tailoring(Record):
     transport_iterations: Annotated[
         int | None, Key("Iterations of the transport problem.", "", 1, 100_000, example=100)
     ] = None
-    rays: Annotated[int | None, Key("Rays or ray tubes along each side of the light.", "", 16, 16_384)] = None
+    rays: Annotated[int | None, Key("Rays or flux tubes along each side of the light.", "", 16, 16_384)] = None
     stage1_iterations: Annotated[
         int | None, Key("Steps per level of the method adam.", "", 0, 1_000_000, example=300)
     ] = None

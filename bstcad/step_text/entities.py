@@ -1,7 +1,7 @@
 """Entities of a STEP file: the statements of its DATA section (ISO 10303-21).
 
-Text that is no token of Part 21, such as NAN or 1.5.2, is refused with the number of its statement.  Other STEP readers
-take it for zero or hang.
+Text that is not a token of Part 21, such as NAN or 1.5.2, is refused with the number of its statement.  Other STEP
+readers take it for zero or hang.
 """
 
 from __future__ import annotations
@@ -57,12 +57,12 @@ class Entities:
         return re.findall(r"#(\d+)", self.bodies[number][1])
 
     def string(self, number: str, index: int) -> str:
-        """Return the first (index 0) or second (1) attribute of an entity in one line; "" if it is no string."""
+        """Return the first (index 0) or second (1) attribute of an entity in one line; "" if it is not a string."""
         attributes = required(re.match(r"\((?:'(\d*)')?(?:,'(\d*)')?", self.bodies[number][1])).groups()
         return decode(self.strings[int(attributes[index])]) if attributes[index] else ""
 
     def points(self, numbers: np.ndarray) -> np.ndarray:
-        """Return the coordinates of point entities, (…, 3); KeyError names an entity that is no point."""
+        """Return the coordinates of point entities, (…, 3); KeyError names an entity that is not a point."""
         rows = np.searchsorted(self.point_numbers, numbers).clip(max=len(self.xyz) - 1)
         wrong = numbers[self.point_numbers[rows] != numbers] if len(self.xyz) else numbers.ravel()
         if len(wrong):
@@ -106,7 +106,7 @@ def read_entities(text: str) -> tuple[str, Entities]:
     *texts, tail = rest[1:].split(";")
     hits = [hit for each in texts if (hit := STATEMENT.fullmatch(each))]
     if tail or not hits or len(hits) < len(texts):
-        raise damaged("a statement is no entity")
+        raise damaged("a statement is not an entity")
     _check_tokens(rest, hits)
     numbers = np.concatenate([table[:, 0].astype(np.int64), np.fromstring(",".join(names), dtype=np.int64, sep=",")])
     xyz = np.concatenate([table[:, 1:], np.fromstring(",".join(values), dtype=np.float64, sep=",").reshape(-1, 3)])
@@ -153,7 +153,7 @@ def _check_tokens(rest: str, hits: Sequence[re.Match[str]]) -> None:
         atoms = (atom for atom in re.split(r"[(),]+", body) if TOKENS.sub("", f"({atom})"))
         atom = next(atoms, "its text")
         statement = f"statement #{number} = {kind or 'COMPLEX'}"
-        raise damaged(f"{statement} is malformed: {_shorten(atom)!r} is no number or word of STEP")
+        raise damaged(f"{statement} is malformed: {_shorten(atom)!r} is not a number or word of STEP")
     for pattern, fault in ((LONG_NUMBER, f"exceeds {MAX_NUMBER_LENGTH} characters"), (HUGE_NUMBER, "is not finite")):
         for found in pattern.finditer(rest):
             if pattern is LONG_NUMBER or not math.isfinite(float(found[0])):

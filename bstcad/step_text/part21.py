@@ -112,7 +112,7 @@ class StepText:
     solids: int  # number of MANIFOLD_SOLID_BREP and BREP_WITH_VOIDS
     faces: int  # number of faces
     surface: FreeformSurface  # freeform back; of two nets the one whose normal u x v points away from the other
-    front: FreeformSurface | None  # freeform front; None: the front is no net
+    front: FreeformSurface | None  # freeform front; None: the front is not a net
     edge_uses: dict[int, tuple[int, int]]  # edge -> number of uses (forward, reversed)
     properties: ValidationProperties
     placement: Placement = field(default_factory=identity)  # placement of the solid, as the file states it
@@ -277,7 +277,7 @@ def _freeform_surfaces(entities: Entities) -> list[FreeformSurface]:
         raise ValueError("no B_SPLINE_SURFACE_WITH_KNOTS in the file; give one written by bstcad")
     large = [each for each in bodies if each[1].count("#") > CONIC_NET]
     if len(large) > 2:
-        raise ValueError(f"{len(bodies)} freeform surfaces in the file; a lens has one or two: export it alone")
+        raise ValueError(f"the file has {len(large)} freeform surfaces, a lens has one or two; export only the lens")
     surfaces = [_surface(*each, entities) for each in large or bodies[:1]]
     if len(surfaces) > 1:
         (middle, normal), (other, its_normal) = map(_middle_and_normal, surfaces)

@@ -34,9 +34,9 @@ CELL_ROUNDING = 1e-9  # rounding of the number of cells, so that nets as fine as
 
 
 def unit(lens: Lens, bounds: Bounds) -> float:
-    """Return max(thinnest, PENALTY_MARGIN |z_back - z_front|), the unit of the excess of thickness (mm).
+    """Return max(thinnest, PENALTY_MARGIN |z_back - z_front|) (mm), by which violations are divided; 1 if it is 0.
 
-    It does not depend on the heights of the faces, and so has no part in the gradient.
+    It does not depend on the heights of the faces, and does not contribute to the gradient.
     """
     return max(bounds.thinnest, PENALTY_MARGIN * abs(lens.back.z - lens.front.z)) or 1.0
 

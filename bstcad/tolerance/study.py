@@ -250,7 +250,7 @@ MODEL_TRIALS = 10_000  # default number of trials by the model
 WORST_SHOWN = 5  # number of the worst trials that are reported
 SCREEN_ADJUSTMENTS = {f"screen.{motion}" for motion, *_ in MOTIONS}
 ADJUSTMENT_RANGE = 8.0  # range of adjustments of the screen, in standard deviations
-ADJUSTMENT_FACTOR = 10.0  # limit of an adjustment that is no error of the study, relative to the default grade
+ADJUSTMENT_FACTOR = 10.0  # limit of an adjustment that is not an error of the study, relative to the default grade
 QUOTIENT_STEP = 1e-4  # step of the difference quotients, in standard deviations
 INDEPENDENT_SEED = 7919  # offset of the seed of independent trials
 

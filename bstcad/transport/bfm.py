@@ -37,7 +37,7 @@ from bstcad.transport.density import BLOCKS, Density, inner, pushforward, thread
 
 LINES_PER_BLOCK = 8  # lines transformed together: eight doubles fill a cache line of the transposed output
 MIN_CELLS = 32  # cells per side of the coarsest grid
-FIRST_STEP = 1.0  # sigma on the coarsest grid; 1 is Newton's step between two uniform densities
+FIRST_STEP = 1.0  # sigma on the coarsest grid; 1 is the Newton step between two uniform densities
 MIN_FIRST_STEP = 0.25  # smallest initial sigma on a finer grid: the noise of a coarse grid rejects its last steps
 STEP_INCREASE, STEP_DECREASE, REFUSED_STEP_FACTOR = 1.25, 0.8, 0.5  # factors of sigma after short, long, rejected steps
 MIN_GAIN_RATIO, MAX_GAIN_RATIO = 0.25, 0.75  # Armijo-Goldstein bounds of (gain of J) / (sigma |∇J|²)
@@ -235,7 +235,7 @@ def ladder(source: Density, target: Density, coarsest: int) -> list[tuple[Densit
 
 
 def _ascend(source, target, phi, sigma, *, iterations, tolerance, progress):
-    """Solve on one grid.  With v = |y|²/2 - phi, u = |x|²/2 - psi a c-transform is `legendre`, and T = ∇u, S = ∇v."""
+    """Solve on one grid.  For v = |y|²/2 - phi and u = |x|²/2 - psi, a c-transform is `legendre`; T = ∇u, S = ∇v."""
     n, rho, nu = source.n, source.values, target.values
     half, poisson = half_square(n), Poisson(n)
     u = legendre(half - phi)

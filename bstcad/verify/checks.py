@@ -2,7 +2,7 @@
 
 The proof is independent of the optimisation.  Net and knots are read by a parser that is not OCC, the surface is
 sampled through OCC, the mesh is read back from the STL, and the irradiance is traced through the geometry of the STEP
-file, by rays that tailoring has not used, and by ray tubes.
+file, by rays that tailoring has not used, and by flux tubes.
 """
 
 from __future__ import annotations
@@ -292,13 +292,13 @@ def _result(read: Future[R], path: Path, again: Callable[[], Future[R]] | None =
     try:
         return result(read, limit)
     except Overdue as error:
-        took = f"OCC had not ended after {limit:.0f} s and was stopped"
-        raise ValueError(f"{path.name}: {took}; export the lens again, alone, or by another program") from error
+        took = f"OpenCASCADE did not finish reading it within {limit:.0f} s and was stopped"
+        raise ValueError(f"{path.name}: {took}; export only the lens, or export it from another program") from error
     except BrokenExecutor as error:
         if again is not None:
             return _result(again(), path)
         raise ValueError(
-            f"{path.name}: OCC crashed while reading it, so the file is damaged; write it again"
+            f"{path.name}: OpenCASCADE crashed while reading it, so it is damaged; write it again"
         ) from error
 
 
@@ -406,7 +406,7 @@ def _mesh_checks(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal)
 def _light_checks(
     light: Light, accept: Accept, meets: str = "enters the lens", of: str = "", why: str = ""
 ) -> list[Check]:
-    """Check the irradiance through the re-read geometry, by rays and by ray tubes, which share only the trace.
+    """Check the irradiance through the re-read geometry, by rays and by flux tubes, which share only the trace.
 
     of: one of several targets, as Goal.suffix; why: reason for a limit of accept that is not met.
     """
@@ -425,7 +425,7 @@ def _light_checks(
         Check.at_most(f"flux ledger: deviation of its sum from 1{of}", closure, 1e-12, id="ledger"),
     ]
     if tubes is not None:
-        name = f"picture by ray tubes, difference from the one by rays{of}"
+        name = f"picture by flux tubes, difference from the one by rays{of}"
         checks.insert(2, Check.at_most(name, tubes.difference, tubes.limit, id="tubes"))
     if light.leak:
         name = f"light where the target is dark, as a fraction of all on the target{of}"

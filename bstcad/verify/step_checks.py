@@ -54,7 +54,7 @@ def one_sentence(work: Callable[..., Any]) -> Callable[..., Any]:
             raise
         except Exception as error:  # OCC has a hundred classes of errors without a common base
             name, kind = path.name if path.suffix else PART_FILE, type(error).__name__
-            raise ValueError(f"{name}: read by OCC: the solid is damaged ({kind}); write it again") from error
+            raise ValueError(f"{name}: read by OpenCASCADE: the solid is damaged ({kind}); write it again") from error
 
     return checked
 
@@ -175,7 +175,7 @@ def _form_checks(
     """Check distances (mm) and angles between normals (rad) of a face at `count` Sobol points, evaluated by OCC."""
     form = f"form: deviation of the re-read {of} from the optimised one"
     if of == "front" and not reread.front.is_net:
-        yield Check.true(form, False, "the file's front is no net", id="form")
+        yield Check.true(form, False, "the file's front is not a net", id="form")
         return
     points = torch.quasirandom.SobolEngine(2, scramble=True, seed=1).draw(count, dtype=torch.float64)
     x, y = (low + p * (high - low) for p, (low, high) in zip(points.T, (face.x, face.y), strict=True))

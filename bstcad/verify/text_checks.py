@@ -40,7 +40,7 @@ def lens_checks(text: StepText, lens: Lens) -> list[Check]:
 
 
 def net_of_front(text: StepText) -> np.ndarray:
-    """Return the control points (m, n, 3) of the front in a file, in mm; an empty array if the front is no net."""
+    """Return the control points (m, n, 3) of the front in a file, in mm; an empty array if the front is not a net."""
     return np.empty((0, 0, 3)) if text.front is None else text.front.control_points
 
 

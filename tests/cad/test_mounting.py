@@ -125,7 +125,7 @@ def test_every_face_of_a_flanged_lens_has_its_name_in_step(outline, draft, bevel
 
 
 def test_a_place_that_is_none_is_refused():
-    with pytest.raises(ValueError, match=r"lens: \(0.0, nan, 0.0\) is no position; give x, y and z in mm"):
+    with pytest.raises(ValueError, match=r"lens: \(0.0, nan, 0.0\) is not a position; give x, y and z in mm"):
         mounted(disc(1.0, 2.0), [PlacedLens(plate("plane"), at=(0.0, float("nan"), 0.0))])
 
 
@@ -138,7 +138,7 @@ def test_a_place_that_is_none_is_refused():
         (disc(1.0, 2.0, 4.5), "give one solid that reaches all around each lens"),
         (cq.Workplane("XY").sphere(9.0), "lens: the body must surround it between two planes"),
         (cq.Workplane("XY", origin=(0, 0, 1)).circle(RADIUS).workplane(offset=2).circle(7.5).loft()
-         .rotate((0, 0, 0), (1, 0, 0), 5), "lens: the body meets it in a face that is no plane z = const"),
+         .rotate((0, 0, 0), (1, 0, 0), 5), "lens: the body meets it in a face that is not a plane z = const"),
         (None, "mount: the body is NoneType; give one cadquery solid"),
         (cq.Workplane("XY"), "mount: the body is a Workplane of 0 objects; give one"),
         (cq.Workplane("XY").rarray(20, 20, 2, 1).box(9, 9, 9, combine=False), "a Workplane of 2 objects; give one"),

@@ -135,7 +135,7 @@ def test_two_freeform_faces_in_nested_assemblies(make_lens, tmp_path):
 def test_a_mirrored_lens_and_two_places_are_refused(make_lens, tmp_path):
     solid, path = lens_solid(make_lens(FRONT, m=9)), tmp_path / "lens.step"
     step_writing.write(solid.mirror("YZ"), path, "lens")
-    with pytest.raises(ValueError, match=r"lens\.step: read by OCC: .*as in a mirror image; export the lens"):
+    with pytest.raises(ValueError, match=r"lens\.step: read by .*as in a mirror image; export the lens"):
         step_checks.examine(path)
     pair = cadquery.Assembly(name="pair").add(solid, name="a").add(solid, name="b", loc=Location(Vector(50, 0, 0)))
     pair.export(str(path))

@@ -95,7 +95,7 @@ DAMAGES = {
     "closed half-way": (lambda t: t[: len(t) // 2] + ";\nENDSEC;\nEND-ISO-10303-21;\n", "damaged"),
     "gap": (lambda t: t[: len(t) // 3] + t[len(t) // 3 + 3000 :], "damaged"),
     "picometres": (lambda t: t.replace("SI_UNIT(.MILLI.,", "SI_UNIT(.PICO.,"), "lengths in picometre, whose size"),
-    "no face": (lambda t: re.sub(r"(CLOSED_SHELL\('',\(#\d+),#\d+,", r"\1,", t), "damaged"),
+    "no face": (lambda t: re.sub(r"(CLOSED_SHELL\('',\(#\d+),#\d+,", r"\1,", t), "0 solids"),
     "no surface": (lambda t: t.replace("B_SPLINE_SURFACE_WITH_KNOTS", "B_SPLINE_SURFAXE"), "text: no B_SPLINE_SURFACE"),
     "no solid": (lambda t: t.replace("MANIFOLD_SOLID_BREP", "FACETED_BREP"), "0 solids"),
 }
@@ -134,5 +134,5 @@ def test_two_lenses_in_a_file_are_refused(make_lens, tmp_path):
     step_writing.write(pair, tmp_path / "pair.step", "pair")
     with pytest.raises(ValueError, match="pair.step: read as text: 2 solids"):
         step_checks.examine(tmp_path / "pair.step")
-    with pytest.raises(ValueError, match="pair.step: OCC finds 2 solids"):
+    with pytest.raises(ValueError, match="pair.step: .* 2 solids"):
         step_reading.read(tmp_path / "pair.step")

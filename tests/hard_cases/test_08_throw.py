@@ -100,7 +100,7 @@ def test_a_landing_is_wrong_by_the_last_digits_of_an_angle(kind, throw, distance
 @pytest.mark.parametrize("kind", ["point", "collimated"])
 @pytest.mark.parametrize("throw", [0.125, 1000.0, 1e7])
 def test_a_shift_changes_no_bit(throw, kind, dtype):
-    """Planes at multiples of 1/8 mm, which floats hold exactly a kilometre away too: rays, pictures and ray tubes."""
+    """Planes at multiples of 1/8 mm, which floats hold exactly a kilometre away too: rays, pictures and flux tubes."""
     results = []
     for shift in SHIFTS:
         source, lens = scene(dtype, shift, kind)

@@ -209,7 +209,7 @@ LONG = {
 }
 STRANGE = [  # words that cannot be drawn or would steer a terminal
     ({"target.text": "A\rB", "target.pixels": 4096}, "no letter"),
-    ({"target.text": "\u200b", "target.pixels": 4096}, "have no ink"),
+    ({"target.text": "\u200b", "target.pixels": 4096}, "no visible characters"),
     ({"title": "a\x1b[2Jb"}, "title: must be one line"),
     ({"target.x": [0.0, 1e-320], "target.text": "A"}, r"target\.x: is narrower than 0\.001 mm"),
 ]

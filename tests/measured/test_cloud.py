@@ -40,12 +40,12 @@ WRONG = {
     "nominal alone": ("X_nom,Y_nom,Z_nom\n" + lines(GOOD, ","), "its heading, 'X_nom,Y_nom,Z_nom', names nominal"),
     "pixels": ("Zygo XYZ Data File - Format 2\n#\n0 0 No Data\n0 1 16025.3\n#", "header states no width of a pixel"),
     "a zip archive": (b"PK\x03\x04" + bytes(50), "is a zip archive, such as X3P"),
-    "half of UTF-16": ("x,y,z\n".encode("utf-16") + b"1", "is no text in UTF-16"),
+    "half of UTF-16": ("x,y,z\n".encode("utf-16") + b"1", "is not text in UTF-16"),
     "more columns": (lines(np.hstack([GOOD, GOOD]), ","), "holds 6 columns, but no heading names x, y and z"),
     "x twice": ("x,y,z,x\n" + lines(GOOD[:, [0, 1, 2, 0]], ","), "names x, y or z twice"),
     "another unit": ("x [ft],y [ft],z [ft]\n" + lines(GOOD, ","), "'x[ft]', has an unknown unit; give mm"),
     "metres": (lines(GOOD / 1000, ","), "as if they were in metres; give them in mm"),
-    "no text": (bytes(range(256)), "is no text"),
+    "no text": (bytes(range(256)), "is not a text file"),
 }
 
 

@@ -1,4 +1,4 @@
-"""Ray tubes: exact clipping against sums over points, the fused form against the plain one, light that is conserved."""
+"""Flux tubes: exact clipping against sums over points, the fused form against the plain one, conserved light."""
 
 import itertools
 

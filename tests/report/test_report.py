@@ -122,7 +122,6 @@ def test_each_fact_has_its_words_on_the_page_and_first_figures_on_the_terminal(t
 
 
 class TestHtml:
-
     def test_a_page_runs_one_script_of_ours_or_none(self, tmp_path):
         """The browser's own rule tells scripts apart by their hashes."""
         path = tmp_path / "report.html"

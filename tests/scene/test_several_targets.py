@@ -168,9 +168,7 @@ def test_methods_for_one_picture_refuse_several_goals(three, more, key):
     assert one.changed(more)
     wave = {"wavefront": {"kind": "plane", "z": 1200.0}}
     for goals, number in (({"target": three.targets}, 3), (wave, 2)):
-        with pytest.raises(
-            SceneError, match=f"^{key} works for one picture, and the scene has {number} goals; choos"
-        ):
+        with pytest.raises(SceneError, match=f"^{key} works for one picture, and the scene has {number} goals; choos"):
             one.changed(goals | more)
 
 

@@ -171,7 +171,7 @@ WRONG = {
         (SQUARE | {"mount": flange({"z": 15.3})}, "mount.flange.z: .* z = 15.3 mm, cuts the rim of the front"),
         (ROUND | {"mount": flange({"z": 15.1})}, "mount.flange.z: .* z = 15.1 to 16.1 mm.* from 16.5957 to 20 mm"),
         (ROUND | {"mount": {"bevel": 0.2}}, "mount.bevel: .* 0.811 mm per mm, too"),
-        ({"part.colour": "blue"}, "part.colour: 'blue' is no colour"),
+        ({"part.colour": "blue"}, "part.colour: 'blue' is not a colour"),
         ({"part.author": ""}, "part.author: must be one line of 1 to 200"),
         ({"part.thickness_tolerance": 5.0}, "part.thickness_tolerance: 5 mm .* thickness of the blank, 5 mm"),
         ({"part.date": "6 May 2031"}, 'part.date: \'6 May 2031\' .* ISO 8601; write it as "2031-05-06"'),

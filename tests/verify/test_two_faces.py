@@ -47,7 +47,7 @@ def named(found, *parts):
 
 OF_EACH = (
     "RRMSD, box pixels, through the re-read STEP", "standard error of the RRMSD, times five",
-    "picture by ray tubes, difference from the one by rays", "light on the target, as a fraction of what enters",
+    "picture by flux tubes, difference from the one by rays", "light on the target, as a fraction of what enters",
     "efficiency", "flux ledger: deviation of its sum from 1", "target in design.npz",
 )  # fmt: skip
 

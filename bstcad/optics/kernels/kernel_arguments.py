@@ -31,7 +31,7 @@ MIN_IRRADIANCE = 1e-4  # irradiance relative to its maximum, below which the err
 SLOPE_TOLERANCE = 1e-8  # largest RMS of a table's error in the slopes of rays
 PEAK_TO_RMS = 100.0  # largest error of a table relative to these tolerances: the outermost spans are the least exact
 MAX_TABLES = 16  # tables of light in the cache
-MAX_TABLE_ERROR_RATIO = 0.5  # largest error of a table relative to that of the one before; above: an edge
+MAX_TABLE_ERROR_RATIO = 0.5  # largest ratio of the error of a table to that of the coarser one; more: an edge
 
 
 def rules() -> Rules:
