@@ -167,8 +167,8 @@ def write(made: Made, folder: Path, options: ProofOptions = ProofOptions(), prog
         made = replace(made, making=made.making.with_stages(StageRecord("report", time.perf_counter() - proven)))
         contents = replace(_contents(made, proof, estimates), order=order)
         drawn.begin(draw_convergence, contents)
-        sheet = drawn.data_sheet()
-        _write_report(made, proof.lens, contents, building, drawn=drawn, sheet=sheet, sections=options.sections)
+        _write_report(made, proof.lens, contents, building, drawn=drawn, sections=options.sections)
+        _write_sheet(drawn, building)
         progress("report", 1, 1, "")
     return Report(contents, irradiances, notes=tuple(exported.notes))
 
@@ -319,12 +319,13 @@ def verify(
                 for number, light in enumerate(proof.lights):
                     drawn.begin(draw_part, part, light.picture, number=number)
                 own = Path() if place is not None else Path("measured") / _name_of(cloud, path)
-                write(with_part(contents, part), amended / own, sheet=None)
+                write(with_part(contents, part), amended / own)
                 for name, data in map_files(part.deviation).items():
                     files.put(amended / own / name, data)
                 contents = with_part(contents, part, "" if place is not None else f"{own.as_posix()}/")
             if place is None:
-                write(contents, amended, sheet=drawn.data_sheet())
+                write(contents, amended)
+                _write_sheet(drawn, amended)
             progress("report", 1, 1, "")
     return Report(contents, tuple(light.picture for light in proof.lights), part)
 
@@ -378,11 +379,8 @@ def _contents(made: Made, proof: Proof, estimates: tuple[LeftOut, ...]) -> Conte
     """Return the contents of report.json.  estimates: estimates of the effects that are left out."""
     scene = made.scene
     alone, goal = scene.single_target_scenes()[proof.worst], made.goals[proof.worst]
-    diagnosed = diagnosis(alone, made.making, proof, goal.picture)
-    return contents_of(
-        scene, made.lens, made.goals, proof, making=made.making, circumstances=circumstances(made.device),
-        estimates=estimates, diagnosis=diagnosed,
-    )  # fmt: skip
+    diagnosed, facts = diagnosis(alone, made.making, proof, goal.picture), circumstances(made.device)
+    return contents_of(made, proof, making=made.making, circumstances=facts, estimates=estimates, diagnosis=diagnosed)
 
 
 def _left_out(made: Made, proof: Proof) -> tuple[LeftOut, ...]:
@@ -410,12 +408,18 @@ def _sheet(
 
 
 def _write_report(
-    made: Made, lens: Lens, contents: Contents, folder: Path, *, drawn: Pictures, sheet: bytes | None,
-    studied: str = "", sections: Sequence[OwnSection] = (),
-) -> None:  # fmt: skip
-    """Write the report as JSON, HTML and JUnit XML, with prescription.txt, figures/ and datasheet.pdf.
+    made: Made,
+    lens: Lens,
+    contents: Contents,
+    folder: Path,
+    *,
+    drawn: Pictures,
+    studied: str = "",
+    sections: Sequence[OwnSection] = (),
+) -> None:
+    """Write the report as JSON, HTML and JUnit XML, with prescription.txt and figures/.
 
-    lens: the lens as read back.  studied: HTML of the page's section on tolerances.  sheet: the PDF.
+    lens: the lens as read back.  studied: HTML of the page's section on tolerances.
     """
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     pictures = drawn.result()
@@ -423,16 +427,25 @@ def _write_report(
         if picture is not None:
             files.put(folder / "figures" / f"{name}.png", picture)
     prescribed = prescription.prescription(made.scene, replace(made.lens, clear=lens.clear), contents.shape)
-    report.write_html(
-        contents, pictures, folder / "report.html", scene=prescription.scene_text(made.scene, made.lens),
-        solid=rendering.turnable(as_cut(lens, made.scene.mount)), tolerances=studied,
-        prescription=prescription.sections(prescribed), sections=[of_script(contents) for of_script in sections],
-    )  # fmt: skip
-    if sheet is not None:
-        files.put(folder / SHEET, sheet)
+    page = report.html(
+        contents,
+        pictures,
+        scene=prescription.scene_text(made.scene, made.lens),
+        solid=rendering.turnable(as_cut(lens, made.scene.mount)),
+        tolerances=studied,
+        prescription=prescription.sections(prescribed),
+        sections=[of_script(contents) for of_script in sections],
+    )
+    files.put(folder / "report.html", page)
     files.put(folder / "prescription.txt", prescription.text(prescribed).encode())
     files.put(folder / "report.junit.xml", report.junit(contents))
     record.write_json(contents, folder / "report.json")
+
+
+def _write_sheet(drawn: Pictures, folder: Path) -> None:
+    """Write datasheet.pdf, if it was drawn."""
+    if (sheet := drawn.data_sheet()) is not None:
+        files.put(folder / SHEET, sheet)
 
 
 # --- a finished design ------------------------------------------------------------------------------------------------

@@ -207,7 +207,7 @@ class TestGenerate:
             raise ValueError("lens: the back lies -0.2 mm above the front at (1, 2) mm; move the front down")
 
         with monkeypatch.context() as broken, pytest.raises(ValueError, match="move the front down") as raised:
-            broken.setattr(report, "write_html", fails)
+            broken.setattr(report, "html", fails)
             commands.generate(scene, tmp_path / "out", device="cpu")
         kept, resumed = raised.value.__notes__
         assert f"the finished design is kept in {tmp_path / 'out-unwritten'}" in kept and "--resume" in resumed
@@ -339,7 +339,7 @@ class TestVerify:
         found = commands.verify(folder).facts
         assert found["rrmsd"] == small_design.report["rrmsd"]
         [failed] = [check for check in found["checks"] if not check["passed"]]
-        assert failed["name"] == "target in design.npz: deviation from the scene's, relative to its brightest pixel"
+        assert failed["id"] == "target"
         off = np.abs(arrays["irradiance"] * noise - arrays["target"])
         row, column = np.unravel_index(off.argmax(), off.shape)
         assert failed["value"] == pytest.approx(off.max() / arrays["target"].max())
@@ -396,7 +396,7 @@ class TestAFileByItself:
 
         before = files()
         code, out, err = run(capsys, "verify", small_design.folder / "lens.step")
-        assert all(value in out for value in ("8 × 6 × ", "convex, radius 500 mm", "15 mm in front of the vertex"))
+        assert all(value in out for value in ("8 × 6 × ", "convex, radius 500 mm", "15 mm before the vertex"))
         assert code == 0 and "PASSED" in out and "RRMSD" not in out and err == ""
         assert files() == before
 

@@ -205,7 +205,7 @@ class TestLeak:
             assert report.leak == report.facts["leak"] == pytest.approx(share, rel=1e-4) and 0.3 < share < 0.5
             lit = report.irradiance[~dark].mean()
             assert report.contrast == pytest.approx(lit / report.irradiance[dark].mean(), rel=1e-4)
-            [check] = [check for check in report.checks if "target is dark" in check.name]
+            [check] = [check for check in report.checks if check.id == "leak"]
             assert (check.value, check.limit) == (report.leak, asked)
             passed[asked] = report.passed
         assert passed == {None: True, 1e-9: False}

@@ -37,7 +37,7 @@ def test_the_ledger_has_a_line_for_it_and_closes(design):
 def test_the_report_shows_it(design):
     _, folder, _ = design
     page = (folder / "report.html").read_text()
-    assert "The picture includes a ghost" in page and "ghost on target" in page
+    assert "The picture includes a ghost" in page and "ghost on the target" in page
     assert (folder / "figures" / "ghost.png").stat().st_size > 1000
 
 

@@ -108,7 +108,8 @@ class Point(Emitter):
         angle = self.half_angle or self.half_angle_1e2
         sizes = [f"half angle {angle:.4g}°"] if angle else []
         sizes += (f"{key} {size:.4g} {unit}" for key, size, unit in self.sizes())
-        return ", ".join([f"point at ({position}) mm", PROFILE_NAMES[self.profile], *sizes])
+        kind = "disc" if self.diameter else "rectangle" if self.width else "point"
+        return ", ".join([f"{kind} at ({position}) mm", PROFILE_NAMES[self.profile], *sizes])
 
     def sizes(self) -> Iterator[tuple[str, float, str]]:
         """Yield diameter, width and height, as far as stated."""

@@ -35,8 +35,8 @@ WIDTH, HEIGHT = 297.0, 210.0  # size of the page, A4 (mm)
 FRAME = (20.0, 10.0, 287.0, 200.0)  # left, lower, right and upper edge of the frame (mm, ISO 5457)
 TABLE_TOP, TITLE_LEFT, LIGHT_LEFT = 60.5, 205.0, 226.0  # edges of tables, title block and column of the light (mm)
 ROW_HEIGHT, TABLE_FONT, HEADING_FONT = 3.57, 2.3, 2.6  # height of a table row, font sizes of rows and headings (mm)
-MAX_PIXELS = 256  # pixels along the longer side of a picture of the light
-APERTURE_TOLERANCE = 1e-4  # relative amount by which a printed clear aperture may be too small
+PICTURE_PIXELS = 256  # pixels along the longer side of a picture of the light
+APERTURE_ROUNDING = 1e-4  # relative amount by which a printed clear aperture may be too small
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -91,14 +91,14 @@ def _aperture(patch: Outline | None, outline: Outline) -> str:
     """Return the size of a clear aperture in words, rounded up to three digits."""
 
     def up(value: float) -> float:
-        return float(rounded_up(value * (1 - APERTURE_TOLERANCE)))
+        return float(rounded_up(value * (1 - APERTURE_ROUNDING)))
 
     if patch is None:
         return "the whole face"
     if patch.is_round:
         return f"\u00d8e {mm(up(2 * patch.radius))} mm"
     sides = zip(patch.half_extent, outline.half_extent, strict=True)
-    return " \u00d7 ".join(mm(min(up(2 * side), 2 * half)) for side, half in sides) + " mm"
+    return " \u00d7 ".join(mm(min(up(2 * side), 2 * half)) for side, half in sides) + " mm (x \u00d7 y)"
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------
@@ -127,11 +127,10 @@ def page(sheet: DataSheet) -> Figure:
     paper.line([(left, TABLE_TOP), (right, TABLE_TOP)], THICK)
     paper.line([(TITLE_LEFT, low), (TITLE_LEFT, TABLE_TOP)], THICK)
     paper.line([(LIGHT_LEFT, TABLE_TOP), (LIGHT_LEFT, high)], THIN)
-    faces = {"front": _form(sheet), "back": "freeform"}
-    views = part_views.Views(
-        sheet.lens, sheet.mount or Mount(), sheet.order.origin, used=sheet.apertures["back"],
-        names=tuple((f"{sheet.lens.passes.name(face).capitalize()}: {form}", form) for face, form in faces.items()),
-    )  # fmt: skip
+    forms = (("front", _form(sheet)), ("back", "freeform"))
+    names = tuple((f"{sheet.lens.passes.name(face).capitalize()}: {form}", form) for face, form in forms)
+    used = sheet.apertures["back"]
+    views = part_views.Views(sheet.lens, sheet.mount or Mount(), sheet.order.origin, used=used, names=names)
     scale = part_views.draw(paper, views, left=left, low=TABLE_TOP, right=LIGHT_LEFT, high=high)
     *columns, purpose, mount = [*sheet.tables.items(), None][:5]
     for k, (heading, rows) in enumerate(columns):
@@ -221,10 +220,10 @@ def _light(paper: Paper, sheet: DataSheet, y: float) -> float:
 
 
 def _reduced(picture: np.ndarray) -> np.ndarray:
-    """Return the picture with at most MAX_PIXELS along its longer side, each the mean of a block of pixels."""
+    """Return the picture with at most PICTURE_PIXELS along its longer side, each the mean of a block of pixels."""
     from PIL import Image
 
-    return np.asarray(Image.fromarray(picture.astype(np.float32)).reduce(-(-max(picture.shape) // MAX_PIXELS)))
+    return np.asarray(Image.fromarray(picture.astype(np.float32)).reduce(-(-max(picture.shape) // PICTURE_PIXELS)))
 
 
 def _write_rows(paper: Paper, rows: Rows, y: float, pitch: float) -> float:

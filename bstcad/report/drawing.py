@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 BLUE, VERMILION, GREEN = "#0072b2", "#d55e00", "#009e73"  # colours of Okabe and Ito
 GREY, GLASS = "#6b6b6b", "#d6e8f2"
-DARK, LIGHT = "#14181c", "#e6eaee"  # background and text of a page in dark mode
+DARK_GROUND, DARK_TEXT = "#14181c", "#e6eaee"  # background and text of a page in dark mode
 STYLE: dict[str, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9.0,
@@ -88,14 +88,14 @@ def darken(figure: Figure) -> Figure:
     """Change the figure to light text and axes on a dark background, with the same pictures, and return it."""
     from matplotlib.text import Text
 
-    figure.set_facecolor(DARK)
+    figure.set_facecolor(DARK_GROUND)
     for axes in figure.axes:
-        axes.set_facecolor(DARK)
-        axes.tick_params(colors=LIGHT, which="both")
+        axes.set_facecolor(DARK_GROUND)
+        axes.tick_params(colors=DARK_TEXT, which="both")
         for spine in axes.spines.values():
-            spine.set_edgecolor(LIGHT)
+            spine.set_edgecolor(DARK_TEXT)
     for text in figure.findobj(Text):
-        text.set_color(LIGHT)
+        text.set_color(DARK_TEXT)
     return figure
 
 

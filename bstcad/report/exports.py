@@ -34,22 +34,22 @@ SHEET = "datasheet"  # kind of export that the caller draws, from the report bes
 
 OUTLINE, RIM, FLANGE, SCREWS, HOLES = "OUTLINE", "RIM", "FLANGE", "SCREW_HOLES", "HOLES"
 CENTRES, TEXT = "CENTRES", "TEXT"
-OVERSHOOT = 1.5  # length of a centre mark outside its edge (mm)
-MARGIN = 3.0  # margin around the drawing in the SVG (mm)
-EDGE, THIN = 0.25, 0.13  # widths of lines (mm, ISO 128)
-CHAIN = (4.0, 0.8, 0.4, 0.8)  # lengths of dash, gap, dot and gap of a centre line (mm)
+MARK_OVERSHOOT = 1.5  # length of a centre mark outside its edge (mm)
+SVG_MARGIN = 3.0  # margin around the drawing in the SVG (mm)
+EDGE_WIDTH, CENTRE_WIDTH = 0.25, 0.13  # widths of lines (mm, ISO 128)
+CHAIN_LENGTHS = (4.0, 0.8, 0.4, 0.8)  # lengths of dash, gap, dot and gap of a centre line (mm)
 CAPITAL_HEIGHT = 1.8  # height of a capital (mm, ISO 3098)
 FONT_SIZE = CAPITAL_HEIGHT / 0.72  # font size with such capitals (mm)
 MAX_LINE_LENGTH = 60  # characters per line of text
 LETTER_WIDTH = 0.56 * FONT_SIZE  # upper bound of the mean width of a letter (mm)
 QUARTER_TURN_BULGE = math.tan(math.pi / 8)  # bulge of an arc of 90 degrees: tan of a quarter of its angle
-EDGES = {"fill": "none", "stroke": "black", "stroke-width": f"{EDGE:g}"}
+EDGES = {"fill": "none", "stroke": "black", "stroke-width": f"{EDGE_WIDTH:g}"}
 STYLES = {  # attributes of the groups in the SVG, except those of edges
     CENTRES: {
         "fill": "none",
         "stroke": "#c00000",
-        "stroke-width": f"{THIN:g}",
-        "stroke-dasharray": " ".join(f"{part:g}" for part in CHAIN),
+        "stroke-width": f"{CENTRE_WIDTH:g}",
+        "stroke-dasharray": " ".join(f"{part:g}" for part in CHAIN_LENGTHS),
     },
     TEXT: {"font-family": "Helvetica, Arial, sans-serif", "font-size": f"{FONT_SIZE:g}"},
 }
@@ -142,7 +142,7 @@ def points_table(lens: Lens, face: Surface, points: int) -> str:
 
 
 def turning_cloud(lens: Lens, points: int, face: Surface | None = None) -> str:
-    """Return a CSV table for slow-tool diamond turning: radius, angle from +x towards +y, height over the vertex.
+    """Return a CSV table for slow-tool diamond turning: radius, angle from +x towards +y, height above the vertex.
 
     face: None is the back.  Heights are along +z, which for the front is into the glass.
 
@@ -199,13 +199,13 @@ def drawing(outline: Outline, mount: Mount | None, label: Label) -> list[Piece]:
             edges += [(layer, Circle(d / 2), _plain(x), _plain(y)) for x, y, d in holes]
     pieces = [_edge(*edge) for edge in edges]
     for _, shape, x, y in edges[flange is not None :]:
-        a, b = (half + OVERSHOOT for half in shape.half_extent)
+        a, b = (half + MARK_OVERSHOOT for half in shape.half_extent)
         pieces += [(CENTRES, "line", (x - a, y, x + a, y)), (CENTRES, "line", (x, y - b, x, y + b))]
     if radius := pitch_radius(mount):
         pieces.append((CENTRES, "circle", (0.0, 0.0, radius)))
     a, b = edges[flange is not None][1].half_extent
     lines = [part for line in words(outline, mount, label) for part in textwrap.wrap(line, MAX_LINE_LENGTH)]
-    at = [(-a - OVERSHOOT, -b - OVERSHOOT - (2 + 1.5 * k) * FONT_SIZE) for k in range(len(lines))]
+    at = [(-a - MARK_OVERSHOOT, -b - MARK_OVERSHOOT - (2 + 1.5 * k) * FONT_SIZE) for k in range(len(lines))]
     return [*pieces, *((TEXT, "text", (*place, line)) for place, line in zip(at, lines, strict=True))]
 
 
@@ -221,10 +221,10 @@ def dxf(outline: Outline, mount: Mount | None = None, label: Label = DEFAULT_LAB
     import ezdxf
 
     document, pieces = ezdxf.new("R2010", units=ezdxf.units.MM), drawing(outline, mount, label)
-    document.linetypes.add("CENTER", [sum(CHAIN), *(part * (-1) ** k for k, part in enumerate(CHAIN))])
+    document.linetypes.add("CENTER", [sum(CHAIN_LENGTHS), *(part * (-1) ** k for k, part in enumerate(CHAIN_LENGTHS))])
     attributes = {CENTRES: {"color": 1, "linetype": "CENTER"}}
     for layer in dict.fromkeys(layer for layer, _, _ in pieces):
-        weight = round(100 * (THIN if layer in STYLES else EDGE))
+        weight = round(100 * (CENTRE_WIDTH if layer in STYLES else EDGE_WIDTH))
         document.layers.add(layer, lineweight=weight, **attributes.get(layer, {}))
     space = document.modelspace()
     for layer, kind, at in pieces:
@@ -252,16 +252,16 @@ def svg(outline: Outline, mount: Mount | None = None, label: Label = DEFAULT_LAB
     pieces = drawing(outline, mount, label)
     texts = [at for _, kind, at in pieces if kind == "text"]
     whole = outline if mount is None else (mount.flange.outline if mount.flange else mount.rim_of(outline)).outline
-    a, b = (half + MARGIN + OVERSHOOT * (mount is not None) for half in whole.half_extent)
-    right = max([a, *(x + LETTER_WIDTH * len(line) + MARGIN for x, _, line in texts)])
-    low = min([-b, *(y - MARGIN for _, y, _ in texts)])
+    a, b = (half + SVG_MARGIN + MARK_OVERSHOOT * (mount is not None) for half in whole.half_extent)
+    right = max([a, *(x + LETTER_WIDTH * len(line) + SVG_MARGIN for x, _, line in texts)])
+    low = min([-b, *(y - SVG_MARGIN for _, y, _ in texts)])
     layers: dict[str, list[tuple[str, tuple[Any, ...]]]] = {}
     for layer, kind, at in pieces:
         layers.setdefault(layer, []).append((kind, at))
     return environment().get_template("outline.svg.j2").render(
         layers=layers, left=-a, top=-b, width=right + a, height=b - low, title=texts[0][2] if texts else "",
         styles=STYLES, edges=EDGES, n=lambda value: f"{_plain(value):.15g}",
-        dash=lambda at: (CHAIN[0] - math.dist(at[:2], at[2:])) / 2 % sum(CHAIN),  # places a dash at the middle
+        dash=lambda at: (CHAIN_LENGTHS[0] - math.dist(at[:2], at[2:])) / 2 % sum(CHAIN_LENGTHS),  # a dash at the middle
     ) + "\n"  # fmt: skip
 
 
@@ -291,8 +291,8 @@ def _corners(a: float, b: float, r: float) -> list[tuple[float, float, float]]:
     p, q, turn = a - r, b - r, QUARTER_TURN_BULGE
     if not r:
         return [(-a, -b, 0.0), (a, -b, 0.0), (a, b, 0.0), (-a, b, 0.0)]
-    return [(-p, -b, 0.0), (p, -b, turn), (a, -q, 0.0), (a, q, turn), (p, b, 0.0), (-p, b, turn), (-a, q, 0.0),
-            (-a, -q, turn)]  # fmt: skip
+    corners = ((-p, -b), (p, -b), (a, -q), (a, q), (p, b), (-p, b), (-a, q), (-a, -q))
+    return [(x, y, turn * (k % 2)) for k, (x, y) in enumerate(corners)]
 
 
 def _plain(value: float) -> float:

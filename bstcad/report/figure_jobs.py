@@ -8,14 +8,15 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
-from itertools import product
+from itertools import groupby, product
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from bstcad.analysis.light import bundle, fan, ray_map
-from bstcad.analysis.shape import least_squares, survey, survey_front
+from bstcad.analysis.shape import MAX_RADIUS, Survey, least_squares, survey, survey_front
 from bstcad.cad import mesh as meshes
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import Screen
@@ -41,7 +42,7 @@ from bstcad.report.drawing import (
 from bstcad.report.light_figures import View, plain_ticks
 from bstcad.report.record import Contents, CurvePoint, StageRecord
 from bstcad.report.rendering import LightPath
-from bstcad.report.units import number, tilt_words
+from bstcad.report.units import number, quantity, tilt_words
 from bstcad.report.wavefront_figure import wavefront_map
 from bstcad.runs.processes import Submit
 from bstcad.scene.scene import Scene
@@ -133,9 +134,9 @@ def draw_lens(source: Emitter, lens: Lens, screens: Sequence[Screen], view: View
     farthest = max(screens, key=lambda screen: screen.plane.throw(0.0))
     of_front = {}
     if lens.shapes("front"):
-        of_front["surface_front"] = png(surface_maps(lens, survey_front(lens).slope.largest, face="front"))
+        of_front["surface_front"] = png(surface_maps(lens, survey_front(lens), face="front"))
     return {
-        "surface": png(surface_maps(lens, survey(lens).slope.largest)),
+        "surface": png(surface_maps(lens, survey(lens))),
         **of_front,
         "side_view": png(side_view(lens, fan(source, lens, farthest.plane), screens)),
     }
@@ -176,12 +177,12 @@ def draw_convergence(report: Contents, view: View) -> Pngs:
 
 
 @styled
-def surface_maps(lens: Lens, steepest: float, face: str = "back") -> Figure:
-    """Draw height, slope angle and mean curvature (optics.curvature.principal) of a freeform face inside the outline.
+def surface_maps(lens: Lens, found: Survey, face: str = "back") -> Figure:
+    """Draw sag, slope angle and mean curvature (optics.curvature.principal) of a freeform face inside the outline.
 
-    steepest: largest slope of the face (degrees), which the samples may miss.  face: "back" or "front".
+    found: extremes of the face, which the samples may miss.  face: "back" or "front".
 
-    The best-fit plane is subtracted from the height if the PV of the plane exceeds the PV of the residual.
+    The best-fit plane is subtracted from the sag if the PV of the plane exceeds the PV of the residual.
     """
     x, y, sag, slope_x, slope_y = _sample(lens, getattr(lens, face))
     columns = np.stack([np.ones_like(sag), *np.meshgrid(x, y)], axis=-1)
@@ -194,18 +195,18 @@ def surface_maps(lens: Lens, steepest: float, face: str = "back") -> Figure:
     slope = np.degrees(np.arctan(np.hypot(slope_x, slope_y)))
     (z_xy, z_xx), z_yy = np.gradient(slope_x, y, x), np.gradient(slope_y, y, axis=0)
     across = (1 + slope_y**2) * z_xx - 2 * slope_x * slope_y * z_xy + (1 + slope_x**2) * z_yy
-    bend = 500.0 * across / (1 + slope_x**2 + slope_y**2) ** 1.5  # 1/m
+    bend = 0.5 * across / (1 + slope_x**2 + slope_y**2) ** 1.5  # 1/mm
     edge = round_up(float(np.nanpercentile(np.abs(bend), 99.0)))
 
     figure = new_figure(11.0, 3.7, layout="compressed")
     panels = figure.subplots(1, 3, sharey=True)
     place = {"extent": (x[0], x[-1], y[0], y[-1]), "origin": "lower", "interpolation_stage": "data"}
     panels[0].set_ylabel("y (mm)")
-    heading = f"Height{', best plane removed' if tilted else ''}: PV {scale * pv:.3g} {unit}"
+    heading = f"Sag{', best plane removed' if tilted else ''}: PV {scale * pv:.3g} {unit}"
     maps = (
         (scale * height, unit, heading),
-        (slope, "degrees", f"Slope: up to {steepest:.3g}°"),
-        (bend, "1/m", "Mean curvature (+: bends towards +z)"),
+        (slope, "degrees", f"Slope: up to {found.slope.largest:.3g}°"),
+        (bend, "1/mm", "Mean curvature (+: bends towards +z)"),
     )
     for axes, (values, label, title) in zip(panels, maps, strict=True):
         signed = axes is panels[2]
@@ -217,6 +218,9 @@ def surface_maps(lens: Lens, steepest: float, face: str = "back") -> Figure:
         bar = figure.colorbar(map_image, ax=axes, label=label, fraction=0.046, pad=0.03, extend=extend)
         if not signed and np.nanmax(values) - np.nanmin(values) > ROUNDING * (1 + np.nanmax(np.abs(values))):
             bar.add_lines(axes.contour(x, y, values, 10, colors="white", linewidths=0.35))
+    radii = (("concave", found.concave), ("convex", found.convex))
+    radii = (f"{n}, {quantity(r.largest, 'mm')} {r.where}" for n, r in radii if r.largest < MAX_RADIUS)
+    footnote(figure, f"Smallest radii of curvature, seen from outside: {'; '.join(radii) or 'none: the face is flat'}.")
     return figure
 
 
@@ -271,10 +275,9 @@ def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> F
 
 @styled
 def transport_map(source: np.ndarray, image: np.ndarray, view: View) -> Figure:
-    """Draw the lines of a regular grid (k, k, 2) on the source (mm) and their images (k, k, 2) on the target."""
-    figure = new_figure(8.2, 4.1)
-    level = LevelPlane(0.0).labels
-    sides = (("Regular grid on the source", source, level), ("The same lines on the target", image, view.labels))
+    """Draw the lines of a regular grid (k, k, 2) on the front (mm) and their images (k, k, 2) on the target."""
+    figure, where = new_figure(8.2, 3.9, layout="compressed"), "front of the lens" if view.optic == "lens" else "mirror"
+    sides = ((f"Grid on the {where}", source, LevelPlane(0.0).labels), ("Its image on the target", image, view.labels))
     for axes, (title, points, (x, y)) in zip(figure.subplots(1, 2), sides, strict=True):
         for lines, colour in ((points, BLUE), (points.swapaxes(0, 1), VERMILION)):
             axes.plot(lines[..., 0].T, lines[..., 1].T, color=colour, linewidth=0.6)
@@ -289,28 +292,39 @@ def transport_map(source: np.ndarray, image: np.ndarray, view: View) -> Figure:
 
 @styled
 def convergence(history: Sequence[CurvePoint], stages: Sequence[StageRecord], noise: float) -> Figure:
-    """Draw the RRMSD against the seconds since the start, with the ends of the stages and the standard error."""
-    seconds = np.array([point.seconds for point in history], dtype=float)
-    values = np.array([point.rrmsd for point in history], dtype=float)
-    figure = new_figure(5.2, 3.2)
+    """Draw the RRMSD against the seconds since the start: a curve per stage, the values after stages, and the noise."""
+    seconds, values = np.array([(point.seconds, point.rrmsd) for point in history], dtype=float).T
+    ends = np.cumsum([0.0, *(stage.seconds for stage in stages)])
+    after = np.isin(values, [stage.rrmsd for stage in stages if stage.rrmsd is not None])
+    stage_of = np.where(after, -1, np.searchsorted(ends, seconds))
+    figure = new_figure(5.2, 3.5)
     axes = figure.subplots()
-    axes.plot(seconds, values, color=BLUE, marker="." if len(values) < 100 else "", markersize=4)
+    style = {"color": BLUE, "marker": "." if len(values) < 100 else "", "markersize": 4}
+    for each in np.unique(stage_of[~after]):
+        part = stage_of == each
+        axes.plot(seconds[part], values[part], **style, label="" if axes.lines else "within a stage")
+    if after.any():
+        rings = {"linestyle": "", "marker": "o", "markerfacecolor": "none", "color": VERMILION}
+        axes.plot(seconds[after], values[after], **rings, label="after a stage, by new rays")
+        figure.legend(loc="outside lower center", ncols=2)
     axes.set(yscale="log", xlabel="time (s)", ylabel="RRMSD")
-    axes.set_title(f"RRMSD: {values[0]:.2g} at the start, {values[-1]:.2g} at the end", pad=16)
     visible = noise > values.min() / 20  # otherwise it is far below the curve
     axes.set_ylim(0.7 * min(values.min(), noise if visible else np.inf), 1.2 * values.max())
     if visible:
         axes.axhline(noise, color=GREY, linestyle="--", linewidth=0.9)
         right_end = axes.get_yaxis_transform()
         axes.text(0.99, noise * 1.05, "standard error", transform=right_end, ha="right", color=GREY, fontsize=8)
-    ends = np.cumsum([0.0, *(stage.seconds for stage in stages)])
     last = 1.02 * max(seconds.max(), ends[-1])
     axes.set_xlim(0.0, last)
-    for stage, start, end in zip(stages, ends, ends[1:], strict=False):
+    for end in ends[1:]:
         axes.axvline(end, color=GREY, linewidth=0.6, linestyle=":")
-        if end - start > 0.0165 * len(stage.name) * last:  # its name fits above the frame
+    parts = zip((stage.name.partition(",")[0] for stage in stages), ends, ends[1:], strict=False)
+    for name, rounds in groupby(parts, key=itemgetter(0)):
+        (_, start, end), *others = rounds
+        end = others[-1][2] if others else end
+        if end - start > 0.0165 * len(name) * last:  # its name fits above the frame
             above = {"transform": axes.get_xaxis_transform(), "ha": "center", "color": GREY, "fontsize": 8}
-            axes.text((start + end) / 2, 1.015, stage.name, **above)
+            axes.text((start + end) / 2, 1.015, name, **above)
     plain_ticks(axes.yaxis, *axes.get_ylim())
     axes.grid(axis="y", which="both")
     return figure

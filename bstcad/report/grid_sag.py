@@ -34,7 +34,7 @@ MIN_ZEMAX_POINTS = 5  # points per side: "the nx and ny values must be no smalle
 MAX_SHIFT = 0.1  # largest shift of the light by a grid of default density (target pixels)
 CELLS_PER_SPAN = (1, 2, 4, 8, 16)  # grid cells per knot span, tried in this order
 MAX_FLUSH_POINTS = 1_050_000  # points up to which a grid ends at the rim; a larger one ends at the knots outside it
-RAYS = 192  # rays per side for the comparison of the light
+SHIFT_RAYS = 192  # rays per side for the comparison of the light
 RIM_ROUNDING = 1e-9  # distance between a knot and the rim that counts as zero (pitches of the net)
 NEWTON_STEPS = 12  # steps of Newton's method to the intersection with the patches; smooth faces need 5
 MIN_DERIVATIVE = 1e-6  # lower bound of the derivative by which a step of Newton's method is divided
@@ -219,7 +219,7 @@ def shift_between(lens: Lens, other: Lens, light: GridLight) -> Shift | None:
     found = []
     for screen in light.screens:
         square = weight = largest = 0.0
-        for rays in launch_strips(light.source, lens, RAYS, 0):
+        for rays in launch_strips(light.source, lens, SHIFT_RAYS, 0):
             one, two = (trace(rays, each, screen.plane) for each in (lens, other))
             flux = torch.where(one.alive & two.alive, one.flux, torch.zeros_like(one.flux))
             squares = torch.where(flux > 0, ((two.position - one.position) ** 2).sum(0), torch.zeros_like(flux))
@@ -276,7 +276,7 @@ class GridSag:
         """Return the text of the file (.DAT).
 
         Header: nx ny, spacings in x and y, unit (0: mm), decentre in x and y.  Then one line per point, from (-x, +y)
-        along +x and downwards: sag over the vertex, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y, all exact, and 0 (there is data).
+        along +x and downwards: sag above the vertex, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y, all exact, and 0 (there is data).
         """
         (x, y), (dx, dy) = (self.grid.x, self.grid.y), self.grid.step
         vertex = float(sag(self.face, 0.0, 0.0)) - self.face.z

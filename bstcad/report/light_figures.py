@@ -18,7 +18,7 @@ from bstcad.optics.measure import SpectralLine
 from bstcad.optics.receivers import LevelPlane, Receiver
 from bstcad.report.drawing import (
     BLUE,
-    DARK,
+    DARK_GROUND,
     GREEN,
     GREY,
     VERMILION,
@@ -52,13 +52,14 @@ SEEN = {  # (target.seen_from, True if the light travels along -z after an odd n
     ("behind", True): "Seen from the fold mirror, looking along -z: x grows to the right",
 }
 LIT = 0.01  # fraction of the target's maximum above which a pixel is lit
-HEADROOM = 1.06  # end of the grey scale over the brightest value, so that even light differs from white paper
+HEADROOM = 1.06  # end of the grey scale relative to the brightest value, so that even light differs from white paper
 MAX_GLARE = 2.0  # multiple of the target's maximum up to which the scale includes a hot spot
 GLARE_PERCENTILE = 99.9  # percentile of the irradiance at the end of the scale if a hot spot exceeds MAX_GLARE
 MIN_SCALE = 0.1  # smallest end of a scale of differences, as a fraction of the largest difference
 TONES = 128  # number of grey tones: no visible loss, and PNG files a third as large
 MARK_LENGTH = 0.045  # length of the marks of a cut, as a fraction of the picture's side
 CUTS = {"centre": BLUE, "brightest point": VERMILION}  # position of a cut: colour
+PERCENT_LIT = "% of mean of lit pixels"  # label of a scale of differences
 COLUMNS = 4  # pictures of spectral lines per row
 PANEL_WIDTH, MAX_PANEL_HEIGHT = 2.4, 4.8  # size of such a picture (inches)
 MANY_OUTLIERS = 300  # number of outliers from which their dots are small
@@ -92,10 +93,8 @@ class View:
     def of(cls, scene: Scene, number: int = 0) -> View:
         """Return the view of a target of the scene."""
         target = scene.targets[number]
-        return cls(
-            target.x, target.y, target.seen_from, optic=scene.optic, folded=scene.folded,
-            receiver=target.screen.plane, number=number,
-        )  # fmt: skip
+        side: dict[str, Any] = {"optic": scene.optic, "folded": scene.folded}
+        return cls(target.x, target.y, target.seen_from, receiver=target.screen.plane, number=number, **side)
 
     @property
     def labels(self) -> tuple[str, str]:
@@ -106,11 +105,6 @@ class View:
     def mean_lit(self) -> str:
         """Label of a scale relative to the mean of the lit pixels."""
         return f"{self.receiver.light} / mean of lit pixels"
-
-    @property
-    def percent_lit(self) -> str:
-        """Label of a scale in percent of the mean of the lit pixels."""
-        return "% of mean of lit pixels"
 
     @property
     def words(self) -> str:
@@ -201,8 +195,8 @@ def _signed(axes: Axes, values: np.ndarray, view: View, *, most: float, title: s
 
 
 def _side_by_side(
-    pictures: Mapping[str, np.ndarray], difference: str, view: View, *, height: float, spot: float = MIN_SCALE,
-) -> tuple[Figure, np.ndarray]:  # fmt: skip
+    pictures: Mapping[str, np.ndarray], difference: str, view: View, *, height: float, spot: float = MIN_SCALE
+) -> tuple[Figure, np.ndarray]:
     """Return a figure and its axes: pictures by title on one grey scale, and the last minus the one before it.
 
     The first picture is the target.  height: height of the figure (inches).  spot: see `_largest`.
@@ -217,7 +211,7 @@ def _side_by_side(
     panels[0].set_ylabel(view.labels[1])
     extend = "max" if last.max() > top else "neither"
     figure.colorbar(image, ax=panels[:-1], label=view.mean_lit, fraction=0.04, pad=0.015, extend=extend)
-    figure.colorbar(signed, ax=panels[-1], label=view.percent_lit, fraction=0.08, pad=0.03, extend="both")
+    figure.colorbar(signed, ax=panels[-1], label=PERCENT_LIT, fraction=0.08, pad=0.03, extend="both")
     return figure, panels
 
 
@@ -280,7 +274,7 @@ def _mark(axes: Axes, cut: Cut, view: View) -> None:
 
 def dark_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) -> bytes:
     """Return the figure of the irradiance as a PNG for a page in dark mode."""
-    return png(darken(irradiance_triptych(target, irradiance, view)), ground=DARK)
+    return png(darken(irradiance_triptych(target, irradiance, view)), ground=DARK_GROUND)
 
 
 @styled
@@ -298,8 +292,9 @@ def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) 
             _mark(axes, cut, view)
     view.note(
         figure,
-        f"  Grey tones as an eye or a camera sees them (sRGB); the scale is linear in {view.receiver.light}.\n"
-        "Marks at the edges: cuts through the centre (blue) and through the brightest point (vermilion, ring).",
+        f"  The grey tones look as the light looks to an eye (sRGB); the scale states the {view.receiver.light}.\n"
+        "Marks at the edges: the cuts that another figure shows, through the centre (blue) and through the brightest "
+        "point (vermilion, ring).",
     )
     return figure
 
@@ -336,7 +331,7 @@ def ghost_picture(target: np.ndarray, ghost: np.ndarray, view: View) -> Figure:
     top = HEADROOM * float(np.percentile(share, GLARE_PERCENTILE)) or 1.0
     image = _grey(axes, share, view, top=top, title=f"The ghost alone: up to {number(float(share.max()))} %")
     axes.set_ylabel(view.labels[1])
-    figure.colorbar(image, ax=axes, label=view.percent_lit, extend="max" if share.max() > top else "neither")
+    figure.colorbar(image, ax=axes, label=PERCENT_LIT, extend="max" if share.max() > top else "neither")
     view.note(figure)
     return figure
 
@@ -352,8 +347,8 @@ def cross_section(target: np.ndarray, irradiance: np.ndarray, view: View) -> Fig
     (x, y), of = view.receiver.names, view.receiver.unit
     for pair, cut in zip(panels, cuts(irradiance, view), strict=True):
         for axes, axis, place, line, ends, where in (
-            (pair[0], x, along_x, np.s_[cut.row, :], view.across, f"{y} = {cut.y:.3g} {of}"),
-            (pair[1], y, along_y, np.s_[:, cut.column], view.y, f"{x} = {cut.x:.3g} {of}"),
+            (pair[0], x, along_x, np.s_[cut.row, :], view.across, f"{y} = {number(cut.y)} {of}"),
+            (pair[1], y, along_y, np.s_[:, cut.column], view.y, f"{x} = {number(cut.x)} {of}"),
         ):
             axes.fill_between(place, target[line] / unit, step="mid", color="#c9c9c9", linewidth=0, label="target")
             axes.plot(place, irradiance[line] / unit, color=CUTS[cut.name], linewidth=1.0, label="simulated")
@@ -480,7 +475,7 @@ def made_part(made: MadePart, designed: np.ndarray, view: View) -> Figure:
     slim = {"fraction": 0.046, "pad": 0.03}
     figure.colorbar(image, ax=face, label=f"{unit_name} along the normal", **slim)
     figure.colorbar(light_image, ax=light, label=view.mean_lit, **slim)
-    figure.colorbar(signed, ax=changed, label=view.percent_lit, extend="both", **slim)
+    figure.colorbar(signed, ax=changed, label=PERCENT_LIT, extend="both", **slim)
     left = "Left: form error of the back face after alignment, + out of the glass, seen from outside, x to the right."
     view.note(figure, first=f"{left}{dots}\n")
     return figure
@@ -546,6 +541,6 @@ def worst_trials(
         axes.set_ylabel(view.labels[1])
     slim = {"fraction": 0.03, "pad": 0.015}
     figure.colorbar(lit, ax=panels[0], label=view.mean_lit, **slim)
-    figure.colorbar(changed, ax=panels[1], label=view.percent_lit, extend="both", **slim)
+    figure.colorbar(changed, ax=panels[1], label=PERCENT_LIT, extend="both", **slim)
     view.note(figure)
     return figure

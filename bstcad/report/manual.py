@@ -22,7 +22,7 @@ SECTION = re.compile(r"^\(([\w-]+)\)=\n+(### .+?)(?=\n+^(?:\([\w-]+\)=$|#{1,2} )
 TO_A_SECTION = re.compile(r"\[([^]]+)\]\((?:\w+\.md)?#([\w-]+)\)")
 DIRECTIVE = re.compile(r"^```\{.*?^```$\n?", re.M | re.S)
 CARD = re.compile(r"^:::\{grid-item-card\} ([^\n]+)\n:link: (\S+)\n:link-type: doc\n(.*?)^:::$\n?", re.M | re.S)
-LEFT_OUT = re.compile(r"^(?::{3,}.*|:[\w-]+: .*|\([\w-]+\)=)\n", re.M)
+NOT_SHOWN = re.compile(r"^(?::{3,}.*|:[\w-]+: .*|\([\w-]+\)=)\n", re.M)
 LINK = re.compile(r"(?<!!)\[([^]]+)\]\((?!https?:)([^)#\s]*?)(?:\.md)?(?:#[\w-]+)?\)")
 
 
@@ -55,7 +55,7 @@ def page(name: str) -> str:
         return f"{found[1]} (`bstcad docs {other}`)" if other in pages() else found[1]
 
     text = pages()[name].read_text(encoding="utf-8")
-    text = LEFT_OUT.sub("", CARD.sub(_card, DIRECTIVE.sub("", text)))
+    text = NOT_SHOWN.sub("", CARD.sub(_card, DIRECTIVE.sub("", text)))
     return re.sub(r"\n{3,}", "\n\n", LINK.sub(linked, text)).strip() + "\n"
 
 

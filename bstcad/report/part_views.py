@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-POINT = 25.4 / 72  # typographic point (mm)
+TYPE_POINT = 25.4 / 72  # typographic point (mm)
 THICK, THIN = 0.5, 0.18  # line widths of visible edges and of all other lines (mm)
 ARROW_LENGTH, ARROW_HALF_WIDTH = 2.2, 0.36  # size of an arrow head (mm)
 OVERSHOOT = 1.2  # length of an extension line past its dimension line (mm)
@@ -44,7 +44,7 @@ CHAIN = (0, (14, 2.5, 2, 2.5))  # dashes and gaps of a centre line, in line widt
 FAMILY = STYLE["font.family"]
 MIN_FONT_SCALE = 0.8  # smallest scale of a text that has little room; a longer text is cut
 UNKNOWN = "\u25a1"  # box for a character that the font lacks
-MAP_POINTS, SECTION_POINTS = 241, 401  # points of the map of heights per axis, and of each face of a section
+CONTOUR_POINTS, SECTION_POINTS = 241, 401  # points of the map of heights per axis, and of each face of a section
 MAX_CONTOURS = 18  # largest number of contour lines
 NOTE_CORNERS = ((1, 1), (-1, -1), (1, -1))  # corners of the plan (right, up) for the notes on kinds of holes
 EQUAL_DIMENSIONS = 5e-4  # difference below which two dimensions print the same number (mm)
@@ -78,7 +78,7 @@ class Paper:
     def line(self, points: Sequence[Any], width: float = THIN, **style: Any) -> None:
         """Draw a line through points (x, y)."""
         given = {"color": "black", "solid_capstyle": "butt", "dash_capstyle": "butt", "solid_joinstyle": "miter"}
-        self.axes.plot(*np.asarray(points, dtype=float).T, linewidth=width / POINT, **(given | style))
+        self.axes.plot(*np.asarray(points, dtype=float).T, linewidth=width / TYPE_POINT, **(given | style))
 
     def axis(self, start: Point, end: Point) -> None:
         """Draw a centre line."""
@@ -95,7 +95,7 @@ class Paper:
         text = drawable(text)
         if room is not None:
             text, size = fitted(text, size, room, style.get("weight") == "bold")
-        self.axes.text(x, y, text, fontsize=size / POINT, parse_math=False, **({"va": "baseline"} | style))
+        self.axes.text(x, y, text, fontsize=size / TYPE_POINT, parse_math=False, **({"va": "baseline"} | style))
 
     def arrow(self, tip: Point, towards: Point, color: str = "black", **style: Any) -> None:
         """Draw a filled arrow head at `tip` that points along `towards`, a unit vector."""
@@ -457,7 +457,7 @@ def kinds_of_holes(mount: Mount) -> Iterator[tuple[str, list[tuple[float, float,
 
 def _contours(paper: Paper, views: Views, at: PaperFrame) -> str:
     """Draw contours of z; return their step in words, "" if there are none."""
-    x, y = (np.linspace(-end, end, MAP_POINTS) for end in views.rim.half_extent)
+    x, y = (np.linspace(-end, end, CONTOUR_POINTS) for end in views.rim.half_extent)
     grid_x, grid_y = np.meshgrid(x, y)
     z = sag(views.lens.back, grid_x, grid_y) - views.origin
     z = np.where(views.rim.depth(grid_x, grid_y) >= 0, z, np.nan)
@@ -469,7 +469,7 @@ def _contours(paper: Paper, views: Views, at: PaperFrame) -> str:
     decimals = max(0, -int(np.floor(np.log10(step) + 1e-9)))
     on_paper = at.x + at.scale * x, at.y + at.scale * y
     drawn = paper.axes.contour(*on_paper, z, levels, colors=BLUE, linewidths=0.55, zorder=2)
-    size, ground = NUMBERS / POINT, {"facecolor": "white", "edgecolor": "none", "pad": 0.4}
+    size, ground = NUMBERS / TYPE_POINT, {"facecolor": "white", "edgecolor": "none", "pad": 0.4}
     edges = [edge for edge in (views.rim, views.used) if edge is not None]
     for label in paper.axes.clabel(drawn, fmt=f"%.{decimals}f", fontsize=size, inline=False, zorder=3):
         off = np.abs(np.subtract(label.get_position(), (at.x, at.y)))

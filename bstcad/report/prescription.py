@@ -36,12 +36,12 @@ from bstcad.scene.schema import FileContent
 if TYPE_CHECKING:
     from bstcad.cad.solid_properties import WholePart
 
-MIN_SHIFT = 1e-3  # smallest shift of the back's vertex that scene.toml mentions, as a fraction of the thickness
+MIN_NOTED_SHIFT = 1e-3  # smallest shift of the back's vertex that scene.toml mentions, as a fraction of the thickness
 LIGHT_DIRECTIONS = {  # kind of the optic: direction of the light in words
     "lens": "Light travels along +z",
     "mirror": "Light travels to the mirror along -z and leaves it along +z",
 }
-TEXT = """\
+HEAD = """\
 Prescription of {name}
 
 Lengths in mm, angles in degrees, wavelengths in nm.  The axis is x = y = 0.
@@ -49,7 +49,7 @@ Lengths in mm, angles in degrees, wavelengths in nm.  The axis is x = y = 0.
 A radius is positive if the centre of curvature lies on the +z side of the vertex.
 {exact}
 """
-EXACT = (  # sentences for one tailored face and for two
+EXACT_FACES = (  # sentences for one tailored face and for two
     "The freeform back is exact in lens.step, and its control points are in design.npz.",
     "Both freeform faces are exact in lens.step, and their control points are in design.npz.",
 )
@@ -58,6 +58,7 @@ DATUMS = {"front": "the vertex of the front", "flange": "the lower face of the f
 EDGE_TOLERANCE = 1e-3  # fraction of an outline's area outside an edge below which the edge equals the outline
 
 Point = tuple[float, float, float]
+Measures = tuple[Point, Point, float | None]  # smallest and largest x, y, z (mm); volume (mm³), None: unknown
 
 
 def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str, Any]:
@@ -137,7 +138,7 @@ def vertex(lens: Lens) -> float:
 def scene_text(scene: Scene, lens: Lens) -> str:
     """Return the text of scene.toml in a design's folder, with a note if the back was moved."""
     drawn = scene.lens.back.z - scene.lens.front.z
-    if not abs(vertex(lens) - scene.lens.back.z) > MIN_SHIFT * drawn:
+    if not abs(vertex(lens) - scene.lens.back.z) > MIN_NOTED_SHIFT * drawn:
         return scene.toml()
     note = f"as designed, the vertex of the back is at z = {vertex(lens)!r} mm; it started at lens.back.z below"
     return f"# {note}\n{scene.toml()}"
@@ -158,7 +159,7 @@ def text(record: Mapping[str, Any]) -> str:
     """Return the text of prescription.txt."""
     name = f"{record['name']}: {record['title']}" if record["title"] else record["name"]
     direction = LIGHT_DIRECTIONS[_passes(record).optic]
-    head = TEXT.format(name=name, direction=direction, exact=EXACT["front_net" in record])
+    head = HEAD.format(name=name, direction=direction, exact=EXACT_FACES["front_net" in record])
     parts = (
         f"\n{heading}\n" + "".join(f"    {name:<30}{value}\n" for name, value in rows)
         for heading, rows in sections(record).items()
@@ -195,14 +196,11 @@ class Order:
     mass: float | None  # g
 
 
-def order_of(
-    scene: Scene, lens: Lens, shape: Mapping[str, Any], folder: Path,
-    found: tuple[Point, Point, float | None] | None = None,
-) -> Order:  # fmt: skip
+def order_of(scene: Scene, lens: Lens, shape: Mapping[str, Any], folder: Path, found: Measures | None = None) -> Order:
     """Return the order of a design in a folder.
 
-    shape: facts of the lens inside its mount's rim, as in report.json, and the volume of lens.step.  found: size and
-    volume of part.step by `measured`; None: there is no part.step.
+    shape: facts of the lens inside its mount's rim, as in report.json, and the volume of lens.step.  found: measures of
+    part.step; None: there is no part.step.
     """
     mount, stated = scene.mount if found else None, scene.part.of(scene.lens)
     low, high, volume = found or (*_corners(lens, None), shape["volume"])
@@ -234,11 +232,8 @@ def order_of(
     )
 
 
-def measured(path: Path) -> tuple[Point, Point, float | None]:
-    """Return smallest and largest x, y and z (mm) and volume (mm³) of the part in a STEP file, read by OCC.
-
-    The volume is None if some faces cannot be integrated.
-    """
+def measured(path: Path) -> Measures:
+    """Return the measures of the part in a STEP file, read by OCC; no volume if some faces cannot be integrated."""
     from bstcad.verify import step_checks  # loads OCC, which the first process does not need
 
     lens, whole = step_checks.whole_part(path)

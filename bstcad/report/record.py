@@ -31,7 +31,6 @@ from bstcad.measured.form_error import MAP_FILES
 from bstcad.measured.made_part import MadePart
 from bstcad.optics.goal import Goal, worst
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
 from bstcad.optics.reach import unreached
 from bstcad.optics.receivers import LevelPlane
 from bstcad.report.goal_figures import Fraction, GoalFigures, Rrmsd, Size, WavefrontFigures, figures_of, flat_tops
@@ -41,7 +40,7 @@ from bstcad.report.units import DIGITS, Remark, Rows, number, paragraphs, percen
 from bstcad.report.units import remarks as written
 from bstcad.runs import files
 from bstcad.scene.scene import Scene
-from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, Proof
+from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, Nominal, Proof
 from bstcad.verify.verdict import NO_LIMIT, Check, verdict
 
 if TYPE_CHECKING:
@@ -54,7 +53,7 @@ STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 LEFT_OUT = {  # LeftOut.kind: name of the effect in the report
     "fresnel": "Fresnel reflection",
     "reflectance": "reflectance below 1",
-    "absorption": "absorption in the glass",
+    "absorption": "absorption in the material",
     "dispersion": "dispersion",
     "source size": "size of the source",
     "ghost": "ghosts (light reflected twice inside the lens)",
@@ -62,8 +61,9 @@ LEFT_OUT = {  # LeftOut.kind: name of the effect in the report
     "stray light": "stray light",
     "diffraction": "diffraction",
 }
-NEGLIGIBLE_CHANGE = 1e-4  # change of the flux (fraction of 1) or of the RRMSD below which the report shows a dash
-NEGLIGIBLE_BLUR = 5e-3  # pixels, below which the report shows a dash
+NEGLIGIBLE_CHANGE = 1e-4  # change of the flux (fraction of 1) or of the RRMSD below which the report shows NEGLIGIBLE
+NEGLIGIBLE_BLUR = 5e-3  # blur in pixels below which the report shows NEGLIGIBLE
+NEGLIGIBLE, UNKNOWN_CHANGE = "≈ 0", "unknown"  # words for a negligible and for an unknown change
 
 # Keys of a report whose values are those of its worst goal, and their names in GoalFigures.
 WORST_GOAL_KEYS = {key: key for key in ("rrmsd", "rrmsd_tent", "light_on_target", "efficiency", "leak", "contrast")}
@@ -167,7 +167,7 @@ class Contents:
     rrmsd_tent: Rrmsd | None  # RRMSD by linear binning
     rrmsd_noise: Annotated[float, Field(ge=0, le=1e3)]  # standard error of rrmsd
     light_on_target: Fraction  # fraction of the source's flux on the target
-    efficiency: Fraction  # flux on the target over flux that leaves the back face
+    efficiency: Fraction  # flux on the target relative to the flux that leaves the back face
     flux: Mapping[str, Fraction]  # flux ledger: fractions of the source's flux, with sum 1
     prescription: Mapping[str, Any]  # every surface as it was designed
     seconds_total: Seconds  # time from the command to the verified lens
@@ -271,14 +271,20 @@ class Examined:
 
 
 def contents_of(
-    scene: Scene, lens: Lens, goals: Sequence[Goal], proof: Proof, *, making: DesignCourse,
-    circumstances: Mapping[str, Any], estimates: tuple[LeftOut, ...], diagnosis: Mapping[str, Any],
-) -> Contents:  # fmt: skip
+    design: Nominal,
+    proof: Proof,
+    *,
+    making: DesignCourse,
+    circumstances: Mapping[str, Any],
+    estimates: tuple[LeftOut, ...],
+    diagnosis: Mapping[str, Any],
+) -> Contents:
     """Return the contents of report.json.
 
-    lens: as designed.  circumstances: version, machine and versions of libraries now; known ones in `making` replace
-    them.  estimates: effects that are not simulated.  diagnosis: convergence, remaining_error and bounds.
+    circumstances: version, machine and versions of libraries now; known ones in `making` replace them.
+    estimates: effects that are not simulated.  diagnosis: convergence, remaining_error and bounds.
     """
+    scene, goals = design.scene, design.goals
     known = {key: value for key, value in vars(making).items() if value is not None}
     goal, light, figures = goals[proof.worst], proof.light, figures_of(goals, proof.lights)
     contents = Contents(
@@ -292,7 +298,7 @@ def contents_of(
         goals=figures,
         flux=light.flux,
         checks=proof.checks,
-        prescription=prescription(scene, lens, proof.shape),
+        prescription=prescription(scene, design.lens, proof.shape),
         effects={
             "simulated": tuple(what for what, _ in simulated(scene)),
             "left_out": tuple(LEFT_OUT[entry.kind] for entry in estimates),
@@ -369,11 +375,10 @@ def remarks(report: Contents, scene: Scene, goals: Sequence[Goal], irradiances: 
     """Return remarks, the most important first; irradiances: one per goal, normalised to the sum of its picture."""
     allowed = DEFAULT_RRMSD_LIMIT if report.rrmsd_asked is None else report.rrmsd_asked
     pairs = list(zip(goals, irradiances, strict=True))
-    return written(
-        "remarks.txt.j2", "remarks", report=report, scene=scene, allowed=allowed, names=LEFT_OUT,
-        unlit={goal.words: unlit(goal.picture, found, goal.receiver) for goal, found in pairs},
-        lifted={goal.words: lifted(goal.picture, found) for goal, found in pairs},
-    )  # fmt: skip
+    dark = {goal.words: unlit(goal.picture, found, goal.receiver) for goal, found in pairs}
+    bright = {goal.words: lifted(goal.picture, found) for goal, found in pairs}
+    given = {"report": report, "scene": scene, "allowed": allowed, "names": LEFT_OUT}
+    return written("remarks.txt.j2", "remarks", unlit=dark, lifted=bright, **given)
 
 
 def too_steep(found: Steepness) -> list[str]:
@@ -562,12 +567,12 @@ def rrmsds(report: Contents) -> str:
 
 
 def changes(entry: LeftOut) -> tuple[str, str, str]:
-    """Return the change of flux on the target, of RRMSD and of blur by an effect; "—": negligible, "?": unknown."""
+    """Return the change of flux on the target, of RRMSD and of blur by an effect, in words."""
     flux, rrmsd, blur = entry.flux_change, entry.rrmsd_change, entry.blur_pixels
     if rrmsd is None:
-        return "?", "?", "?"
+        return UNKNOWN_CHANGE, UNKNOWN_CHANGE, UNKNOWN_CHANGE
     return (
-        f"{'+' if flux > 0 else '−'}{percent(min(abs(flux), 1.0))}" if abs(flux) >= NEGLIGIBLE_CHANGE else "—",
-        number(rrmsd) if rrmsd >= NEGLIGIBLE_CHANGE else "—",
-        f"{number(blur)} pixels" if blur >= NEGLIGIBLE_BLUR else "—",
+        f"{'+' if flux > 0 else '−'}{percent(min(abs(flux), 1.0))}" if abs(flux) >= NEGLIGIBLE_CHANGE else NEGLIGIBLE,
+        number(rrmsd) if rrmsd >= NEGLIGIBLE_CHANGE else NEGLIGIBLE,
+        f"{number(round(blur, 2))} pixels" if blur >= NEGLIGIBLE_BLUR else NEGLIGIBLE,
     )

@@ -33,9 +33,9 @@ PATIENCE = 120.0  # timeout of a picture (seconds)
 FEATURE_ANGLE = 35.0  # angle between facets above which their edge is drawn sharp (degrees)
 
 # The lens in clay.
-SIZE = (1120, 800)  # size of the picture (pixels)
+PICTURE_SIZE = (1120, 800)  # size of the picture (pixels)
 CLAY = "#d3d9e0"
-LIGHTS = (((-1.0, 0.5, 0.7), 0.8), ((0.5, -1.0, 0.35), 0.5), ((0.1, -0.2, 1.0), 0.25))  # (direction, intensity)
+CLAY_LIGHTS = (((-1.0, 0.5, 0.7), 0.8), ((0.5, -1.0, 0.35), 0.5), ((0.1, -0.2, 1.0), 0.25))  # (direction, intensity)
 FINISH = {"ambient": 0.12, "diffuse": 0.9, "specular": 0.2, "specular_power": 30.0}  # surface of the clay
 EYE = (0.75, -1.5, 1.7)  # position of the eye relative to the centre, in diagonals of the bounding box
 VIEW_ANGLE = 26.0  # vertical angle of view (degrees)
@@ -44,7 +44,8 @@ VIEW_ANGLE = 26.0  # vertical angle of view (degrees)
 WINDOW = (1920, 1080)  # size of the window (pixels)
 VIEW_WIDTHS = (5, 9)  # relative widths of the two views
 GROUND, INK, SOFT = "#0e1116", "#e6eaee", "#8b96a1"
-GLASS, METAL, LAMP = "#b9d4ea", "#9aa3ad", "#fff3c4"
+GLASS_FINISH = {"color": "#b9d4ea", "specular": 0.9, "opacity": 0.42}
+METAL_FINISH, LAMP = {"color": "#9aa3ad", "specular": 0.4}, "#fff3c4"
 DARKEST = 0.35  # start of the colour map of flux, so that the smallest flux is visible on the dark background
 ASIDE = (0.95, 0.42, 0.62)  # direction to the eye: sideways, up, and along the axis to the picture's side
 NEAR = (0.9, 0.5, 0.75)  # direction to the eye in the close view, which faces the back
@@ -56,7 +57,7 @@ RAY_REACH, RAY_STEP = 2.0, 5  # close view: length of the rays outside the lens 
 
 # The model that a reader can rotate.
 FINE, COARSE = 256, 64  # cells per axis of a net, and of a surface without knots
-MAX_RAYS = 200  # largest number of rays in the model
+MAX_MODEL_RAYS = 200  # largest number of rays in the model
 POSITION_DECIMALS, FLUX_DECIMALS = 4, 3  # decimals of a position (mm), and of a relative flux
 STEPS = 65535  # integer steps over the range of a number
 MIN_RANGE = 1e-9  # smallest range of values that are all equal (mm, or a slope)
@@ -136,10 +137,10 @@ def draw_clay(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
     centre = (vertices.min(0) + vertices.max(0)) / 2
     reach = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    plotter = pyvista.Plotter(off_screen=True, window_size=list(SIZE), lighting="none")
+    plotter = pyvista.Plotter(off_screen=True, window_size=list(PICTURE_SIZE), lighting="none")
     plotter.add_mesh(pyvista.PolyData.from_regular_faces(vertices.astype(np.float32), faces), color=CLAY, **FINISH)
     # The relief is shallow, so the key light grazes the back surface; the fill light keeps the sides visible.
-    _add_lights(plotter, ((centre + 10 * reach * np.array(towards), bright) for towards, bright in LIGHTS), centre)
+    _add_lights(plotter, ((centre + 10 * reach * np.array(towards), bright) for towards, bright in CLAY_LIGHTS), centre)
     plotter.camera_position = centre + reach * np.array(EYE), centre, (0.0, 0.0, 1.0)
     plotter.camera.view_angle = VIEW_ANGLE
     plotter.enable_anti_aliasing("ssaa")
@@ -240,8 +241,8 @@ def _add_lens(plotter: Any, solid: Any, path: LightPath) -> None:
     """Add the solid, of transparent glass or of metal, with two lights, and a point source in front of it."""
     import pyvista
 
-    material = {"color": METAL, "specular": 0.4} if path.mirror else {"color": GLASS, "specular": 0.9, "opacity": 0.42}
-    plotter.add_mesh(solid, ambient=0.15, diffuse=0.75, specular_power=40, **material)
+    finish = METAL_FINISH if path.mirror else GLASS_FINISH
+    plotter.add_mesh(solid, ambient=0.15, diffuse=0.75, specular_power=40, **finish)
     only = {"boundary_edges": False, "non_manifold_edges": False, "manifold_edges": False}
     edges = solid.extract_feature_edges(FEATURE_ANGLE, **only)
     if edges.n_cells:
@@ -371,7 +372,7 @@ def turnable(lens: Lens, path: LightPath | None = None, cells: int = FINE) -> st
     numbers = base64.b64encode(np.concatenate(values).tobytes()).decode()
     shape = {"low": low.tolist(), "size": size.tolist(), "faces": shapes, "rim": wall.shape[1]}
     lit = {"eye": EYE, "angle": VIEW_ANGLE, "clay": [int(CLAY[k : k + 2], 16) / 255 for k in (1, 3, 5)]}
-    lit |= {"lamps": [direction for direction, _ in LIGHTS], "bright": [intensity for _, intensity in LIGHTS]}
+    lit |= {"lamps": [direction for direction, _ in CLAY_LIGHTS], "bright": [intensity for _, intensity in CLAY_LIGHTS]}
     light = {} if path is None else _light(path)
     return json.dumps(shape | lit | FINISH | {"values": numbers} | light)
 
@@ -379,11 +380,11 @@ def turnable(lens: Lens, path: LightPath | None = None, cells: int = FINE) -> st
 def _light(path: LightPath) -> dict[str, Any]:
     """Return a light path as JSON values; positions in mm.
 
-    rays: at most MAX_RAYS rays, each with its points from the source over the faces to the furthest screen.  flux: flux
-    of each ray, 1 for the brightest.  screens: corners as in LightPath, and the picture as a data URL, row 0 at y max.
+    rays: at most MAX_MODEL_RAYS rays, each with its points from the source to the furthest screen.  flux: flux of each
+    ray, 1 for the brightest.  screens: corners as in LightPath, and the picture as a data URL, row 0 at y max.
     lamp: position of a point source, or empty.  aside: direction to the eye for the whole path, y up.
     """
-    every = math.ceil(len(path.rays) / MAX_RAYS) | 1  # odd, since an even step would take only some columns of the grid
+    every = math.ceil(len(path.rays) / MAX_MODEL_RAYS) | 1  # odd: an even step takes only some columns
     rays, flux = path.rays[::every], path.flux[::every] / path.flux.max()
     return {
         "rays": np.round(rays, POSITION_DECIMALS).tolist(),

@@ -18,7 +18,6 @@ from bstcad.report.prescription import LIGHT_DIRECTIONS, order_rows
 from bstcad.report.record import LEFT_OUT, Contents, Examined, LeftOut, bounds, changes
 from bstcad.report.units import Remark, Rows, about, bound, environment, paragraphs, quantity, tables
 from bstcad.report.units import remarks as written
-from bstcad.runs import files
 from bstcad.verify.verdict import NO_LIMIT, Check
 
 if TYPE_CHECKING:
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
 Figure = tuple[str, str, str]  # name, value, remark
 BEGIN, END = "<!-- tolerances -->", "<!-- end of tolerances -->"  # comments around the section on tolerances
 NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")  # characters that XML 1.0 forbids
-POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # a browser loads nothing and runs one script
+PAGE_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # the page loads nothing
 VIEWER = Path(__file__).with_name("solid_view.js")
 BADGES = {  # verdict of a report: (sign, style on the page, style on the terminal)
     "passed": ("✓", "pass", "bold green"),
@@ -37,23 +36,28 @@ BADGES = {  # verdict of a report: (sign, style on the page, style on the termin
     NO_LIMIT: ("?", "plain", "bold cyan"),
     "failed": ("✗", "fail", "bold red"),
 }
-PLAN_STYLES = {  # kind of a plan's verdict: style on the terminal
-    "blurred": "bold red", "beyond": "bold red", "open": "bold yellow", "within": "bold green", "no limit": "bold cyan",
-    "not predicted": "bold yellow",
-}  # fmt: skip
+# style on the terminal of each kind of a plan's verdict
+PLAN_STYLES = {"blurred": "bold red", "beyond": "bold red", "within": "bold green", "no limit": "bold cyan"}
 GLASS_LINES = ("lost through the sides", "total internal reflection")  # lines of the ledger that few mirrors have
 
 
 # --- words ------------------------------------------------------------------------------------------------------------
 
 
-def explanation(report: Contents | Examined) -> str:
-    """Return the verdict in sentences: number of passed or failed checks, and doubts on the RRMSD."""
-    count, failed = len(report.checks), sum(not check.passed for check in report.checks)
-    text = f"{failed} of {count} checks failed." if failed else f"All {count} checks passed."
-    if report.verdict == NO_LIMIT:
-        text = f"All {count} checks passed, but none of them has a limit on the light from the scene."
-    return " ".join((text, *(doubt.text for doubt in doubts(report))))
+def counts(checks: Sequence[Check]) -> str:
+    """Return the numbers of passed checks, of failed ones, and of values without a limit."""
+    failed = sum(not check.passed for check in checks)
+    unjudged = sum(check.passed and check.limit is None for check in checks)
+    more = ((failed, "failed"), (unjudged, "without a limit (not judged)"))
+    passed = f"{len(checks) - failed - unjudged} checks passed"
+    return "; ".join([passed, *(f"{count} {words}" for count, words in more if count)])
+
+
+def explanation(report: Contents) -> str:
+    """Return the verdict in sentences: numbers of checks, doubts on the RRMSD, and that a draft is a draft."""
+    draft = 'A draft has few evaluations: the quality "standard" gives a smaller RRMSD.'
+    texts = (f"{counts(report.checks)}.", *(doubt.text for doubt in doubts(report)))
+    return " ".join((*texts, draft) if report.quality == "draft" else texts)
 
 
 def doubts(report: Contents | Examined) -> list[Remark]:
@@ -83,9 +87,11 @@ def machine(facts: Mapping[str, Any]) -> Rows:
 
 
 def ledger(flux: Mapping[str, float], of: str) -> dict[str, float]:
-    """Return the lines of a flux ledger with the kind of the optic, `of`, in their names."""
+    """Return the lines of a flux ledger in words, with the kind of the optic, `of`."""
     lines = {line: part for line, part in flux.items() if of == "lens" or part or line not in GLASS_LINES}
-    return {line.replace("the lens", f"the {of}"): part for line, part in lines.items()}
+    for old, new in (("the lens", f"the {of}"), ("glass", "material"), ("on t", "on the t"), ("off t", "beside the t")):
+        lines = {line.replace(old, new): part for line, part in lines.items()}
+    return lines
 
 
 def first_figures(report: Contents | Examined) -> list[Figure]:
@@ -99,12 +105,17 @@ def first_figures(report: Contents | Examined) -> list[Figure]:
 # --- report.html and report.junit.xml ---------------------------------------------------------------------------------
 
 
-def write_html(
-    report: Contents, figures: Mapping[str, bytes | None], path: str | Path, *, scene: str = "",
-    prescription: Mapping[str, Rows] | None = None, solid: str = "", tolerances: str = "",
+def html(
+    report: Contents,
+    figures: Mapping[str, bytes | None],
+    *,
+    scene: str = "",
+    prescription: Mapping[str, Rows] | None = None,
+    solid: str = "",
+    tolerances: str = "",
     sections: Sequence[tuple[str, str]] = (),
-) -> None:  # fmt: skip
-    """Write report.html, one file that contains pictures and styles and loads nothing.
+) -> bytes:
+    """Return report.html, one file that contains pictures and styles and loads nothing.
 
     figures: PNG bytes by name; a picture that is None or absent is omitted, with a sentence for the 3-D picture.
     scene: TOML text with all defaults.  prescription: rows by bstcad.report.prescription.sections.  solid: JSON by
@@ -116,34 +127,32 @@ def write_html(
     viewer = VIEWER.read_text(encoding="utf-8") if solid else ""
     digest = base64.b64encode(hashlib.sha256(viewer.encode()).digest()).decode()
     allowed = f"'sha256-{digest}'" if viewer else "'none'"
-    page = (
-        environment()
-        .get_template("report.html.j2")
-        .render(
-            report=report,
-            pictures=base64_images(figures),
-            badge=BADGES[report.verdict],
-            explanation=explanation(report),
-            first_figures=first_figures(report),
-            facts_of=tables("report_facts.txt.j2", report=report),
-            machine=machine(report.machine),
-            ledger=ledger(report.flux, report.optic),
-            bounds=bounds(report.bounds),
-            optic=report.optic,
-            direction=LIGHT_DIRECTIONS[report.optic],
-            order=report.order and order_rows(report.order),
-            changes=changes,
-            names=LEFT_OUT,
-            prescription=prescription,
-            scene=scene,
-            tolerances=Markup(f"{BEGIN}\n{tolerances}{END}\n"),  # safe: written by this program
-            solid=Markup(solid),  # safe: written by this program
-            sections=[(heading, Markup(text)) for heading, text in sections],  # POLICY allows no script in it
-            viewer=Markup(viewer),
-            policy=f"{POLICY}; script-src {allowed}; base-uri 'none'",
-        )
+    template = environment().get_template("report.html.j2")
+    page = template.render(
+        report=report,
+        pictures=base64_images(figures),
+        badge=BADGES[report.verdict],
+        explanation=explanation(report),
+        counts=counts(report.checks),
+        first_figures=first_figures(report),
+        facts_of=tables("report_facts.txt.j2", report=report),
+        machine=machine(report.machine),
+        ledger=ledger(report.flux, report.optic),
+        bounds=bounds(report.bounds),
+        optic=report.optic,
+        direction=LIGHT_DIRECTIONS[report.optic],
+        order=report.order and order_rows(report.order),
+        changes=changes,
+        names=LEFT_OUT,
+        prescription=prescription,
+        scene=scene,
+        tolerances=Markup(f"{BEGIN}\n{tolerances}{END}\n"),  # safe: written by this program
+        solid=Markup(solid),  # safe: written by this program
+        sections=[(heading, Markup(text)) for heading, text in sections],  # PAGE_POLICY allows no script in it
+        viewer=Markup(viewer),
+        policy=f"{PAGE_POLICY}; script-src {allowed}; base-uri 'none'",
     )
-    files.put(Path(path), page.encode())
+    return page.encode()
 
 
 def base64_images(pictures: Mapping[str, bytes | None]) -> dict[str, str]:
@@ -182,10 +191,9 @@ def summary(report: Contents | Examined, verbose: bool = False) -> Group:
     name_width = max((len(name) for name, _, _ in figures), default=0)
     lines += [Text(f"{name:{name_width}}  {value}{remark and f' ({remark})'}") for name, value, remark in figures]
     lines += map(Text, filter(None, [bounds(report.bounds)]))
-    passed = sum(check.passed for check in report.checks)
     lines += check_lines(report.checks, verbose)
-    lines.append(Text(f"{passed} checks passed{'' if verbose else '; --verbose lists them'}."))
-    if remarks or verbose or passed < len(report.checks):
+    lines.append(Text(f"{counts(report.checks)}{'' if verbose else '; --verbose lists them'}."))
+    if remarks or verbose or not all(check.passed for check in report.checks):
         lines.append(Text("The command `bstcad docs NAME` explains the check or remark that ends in [NAME].", "dim"))
     return Group(*lines)
 
@@ -198,7 +206,7 @@ def check_lines(checks: Sequence[Check], verbose: bool, of: str = "") -> Iterato
         if not check.passed:
             yield Text.assemble(("FAIL", "bold red"), f" {of}{check_line(check)}", topic_tag(check))
         elif verbose:
-            outcome = "stated" if check.limit is None else "pass"
+            outcome = "not judged" if check.limit is None else "pass"
             yield Text.assemble(f"{outcome} {of}{check_line(check)}", topic_tag(check))
 
 
@@ -238,7 +246,8 @@ def plan_effects(plan: Mapping[str, Any], title: str, optic: str) -> Group:
 def _verdict(plan: Mapping[str, Any]) -> Iterator[Text]:
     from rich.text import Text
 
-    yield Text.assemble(("PLAN: ", PLAN_STYLES[plan["verdict"]["kind"]]), plan["verdict"]["sentence"])
+    kind, sentence = plan["verdict"]["kind"], plan["verdict"]["sentence"]
+    yield Text.assemble(("PLAN: ", PLAN_STYLES.get(kind, "bold yellow")), sentence)
 
 
 def _of_target(plan: Mapping[str, Any], of: str, optic: str) -> Iterator[RenderableType]:

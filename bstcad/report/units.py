@@ -110,8 +110,10 @@ def exact(value: float) -> str:
 
 
 def mm(value: float) -> str:
-    """Return a length in mm, rounded to 0.001 mm, without trailing zeros: 4.379, −0.5, 0."""
-    return f"{value:.3f}".rstrip("0").rstrip(".").replace("-", "−") if abs(value) >= 5e-4 else "0"
+    """Return a length in mm, rounded to 0.001 mm; only an exact one has no zeros at its end: 4.379, 6.040, −0.5, 0."""
+    text = f"{value:.3f}" if abs(value) >= 5e-4 else "0"
+    text = text.rstrip("0").rstrip(".") if "." in text and abs(value - float(text)) < 1e-6 else text
+    return text.replace("-", "−")
 
 
 def interval(ends: Sequence[float]) -> str:
@@ -155,10 +157,9 @@ def environment() -> Environment:
     """Return the templates of this folder; all text is escaped, since titles, names and scenes come from users."""
     import jinja2
 
-    found = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True, lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )  # fmt: skip
+    folder = jinja2.FileSystemLoader(Path(__file__).parent)
+    found = jinja2.Environment(loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    found.undefined = jinja2.StrictUndefined
     filters = (about, amount, bound, duration, exact, interval, mm, number, percent, quantity, rounded_up)
     found.filters |= {f.__name__: f for f in (*filters, scene_value, tilt_words)}
     found.globals["exact"] = exact

@@ -102,8 +102,8 @@ def left_out(scene: Scene, lens: Lens, picture: np.ndarray) -> tuple[LeftOut, ..
     reference = Reference.of(lens, _central_channel(scene), scene.target.screen, picture=picture, control_points=points)
     entries = [*_glass_effects(scene, reference), *_mirror_effects(scene, reference)]
     entries += _source_size(scene, reference)
-    entries.append(_entry("diffraction", reference.diffraction(), "of the whole aperture"))
-    entries.append(_entry("stray light", None, "it depends on the finish of the faces"))
+    entries.append(_entry("diffraction", reference.diffraction(), "at the whole aperture"))
+    entries.append(_entry("stray light", None, "which depends on the finish of the faces"))
     return tuple(sorted(entries, key=lambda entry: -(entry.rrmsd_change or 0.0)))
 
 
@@ -121,7 +121,7 @@ def _glass_effects(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
         yield _entry("ghost", None, "ghosts of a mirror behind glass are not simulated")
     elif named(scene.effects, Ghost) is None:
         reflecting = _central_channel(scene, *(() if named(scene.effects, Fresnel) else (bare,)))
-        change, reason = reference.ghost(reflecting), "roughly, since it may focus to a spot"
+        change, reason = reference.ghost(reflecting), "a rough estimate, since it may focus to a spot"
         yield _entry("ghost", change, reason, '[[effects]] kind = "ghost"')
 
 
@@ -131,7 +131,7 @@ def _mirror_effects(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
     if not scene.lens.passes.enters and named(scene.effects, Fresnel) is None:
         aluminium = _central_channel(scene, Fresnel(kind="fresnel"))
         yield _entry("reflectance", reference.change([aluminium]), "of aluminium", FRESNEL_KEYS)
-    yield _entry("shadows", None, "they depend on the lamp's housing")
+    yield _entry("shadows", None, "which depend on the lamp's housing")
 
 
 def _absorption(scene: Scene, reference: Reference) -> LeftOut:
@@ -158,7 +158,7 @@ def _dispersion(scene: Scene, reference: Reference) -> LeftOut:
         span = f"from {low:g} to {high:g} nm"
         return _entry("dispersion", None, f"there are no data of {material} {span}", LINES_KEYS)
     sun = (low, high) == VISIBLE_BAND
-    words = f"of sunlight, uniform from {low:g} to {high:g} nm" if sun else f"of a line {LINE_WIDTH:g} nm wide"
+    words = f"of sunlight, uniform from {low:g} to {high:g} nm" if sun else f"for a spectral width of {LINE_WIDTH:g} nm"
     return _entry("dispersion", reference.change(channels), words, LINES_KEYS, assumed=not sun)
 
 

@@ -313,7 +313,8 @@ def _ripple_checks(shape: Mapping[str, float | None]) -> list[Check]:
     There is no limit: the RRMSD judges its effect on the light, and the bounds of the scene its effect on a tool.
     """
     slopes = {"": shape["ripple_slope"], " of the front": shape.get("front_ripple_slope")}
-    named = {f"ripple{of}: RMS slope of control points of alternating height": slope for of, slope in slopes.items()}
+    measured = "RMS slope of control points that lie alternately high and low"
+    named = {f"ripple{of}: {measured}": slope for of, slope in slopes.items()}
     return [Check.at_most(name, slope, None, "rad", id="ripple") for name, slope in named.items() if slope is not None]
 
 
@@ -373,7 +374,7 @@ def bound_checks(
 def _target_check(goal: Goal, stored: np.ndarray) -> Check:
     off = np.abs(stored - goal.picture)
     row, column = np.unravel_index(np.argmax(off), off.shape)
-    name = f"target in design.npz: deviation from the scene's, relative to its brightest pixel{goal.suffix}"
+    name = f"target in design.npz: deviation from the target of the scene, relative to its brightest pixel{goal.suffix}"
     where = f"pixel ({column}, {row}), counted from the upper left"
     return Check.at_most(name, float(off.max() / goal.picture.max()), TARGET_TOLERANCE, where=where, id="target")
 
@@ -399,7 +400,7 @@ def _mesh_checks(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal)
     return [
         Check.at_most(volume_error, off, area * tolerance / volume, id="mesh-volume"),
         Check.at_most(distance, off_faces, rounding, "mm", id="mesh-vertices"),
-        Check.at_most("STL: chordal error", error, limit, unit="mm", where=where, id="mesh-chord"),
+        Check.at_most("STL: distance of the facets from the lens", error, limit, "mm", where=where, id="mesh-chord"),
     ]
 
 
@@ -412,8 +413,9 @@ def _light_checks(
     """
     closure, tubes = abs(sum(light.flux.values()) - 1), light.witness
     off, error = RESOLVED * light.standard_error, f"standard error of the RRMSD, times five{of}"
-    on_target, limit = f"light on the target, as a fraction of what {meets}{of}", accept.light_on_target
-    rrmsd = f"RRMSD, box pixels, through the re-read STEP{of}"
+    on_target, limit = f"light on the target, as a fraction of the light that {meets}{of}", accept.light_on_target
+    aimed = f"efficiency: light on the target, as a fraction of all light behind the last face{of}"
+    rrmsd = f"RRMSD of the light, traced through the STEP file{of}"
     # the figure is resolved if the noise is below the RRMSD; the verdict is certain if it is below the distance to the
     # limit
     noise = None if accept.rrmsd is None else max(light.rrmsd, accept.rrmsd - light.rrmsd)
@@ -421,14 +423,14 @@ def _light_checks(
         Check.at_most(rrmsd, light.rrmsd, accept.rrmsd, where=why, id="rrmsd"),
         Check.at_most(error, off, noise, id="noise"),
         Check.at_least(on_target, light.used, limit, where=why, id="light-on-target"),
-        Check.at_least(f"efficiency{of}", light.efficiency, accept.efficiency, where=why, id="efficiency"),
-        Check.at_most(f"flux ledger: deviation of its sum from 1{of}", closure, 1e-12, id="ledger"),
+        Check.at_least(aimed, light.efficiency, accept.efficiency, where=why, id="efficiency"),
+        Check.at_most(f"flux ledger: difference of its sum from 1{of}", closure, 1e-12, id="ledger"),
     ]
     if tubes is not None:
-        name = f"picture by flux tubes, difference from the one by rays{of}"
+        name = f"picture by flux tubes: difference from the picture by rays{of}"
         checks.insert(2, Check.at_most(name, tubes.difference, tubes.limit, id="tubes"))
     if light.leak:
-        name = f"light where the target is dark, as a fraction of all on the target{of}"
+        name = f"light on dark pixels of the target, as a fraction of the light on the target{of}"
         checks.append(Check.at_most(name, light.leak.share, accept.leak, id="leak"))
     return checks
 

@@ -153,7 +153,7 @@ def _placement_checks(reread: StepLens, tolerance: float) -> Iterator[Check]:
 
 
 def _solid_checks(solid: Any, of_part: bool = False) -> Iterator[Check]:
-    valid, prefix = (f"{PART_FILE}: solid valid", PART_FILE) if of_part else ("solid valid", "solid")
+    valid, prefix = (f"{PART_FILE}: solid is valid", PART_FILE) if of_part else ("solid: is valid", "solid")
     yield Check.true(valid, step_reading.is_valid(solid), id="solid-valid")
     name = f"{prefix}: largest gap at edges and vertices"
     yield Check.at_most(name, step_reading.gaps(solid), GAP_TOLERANCE, "mm", id="gaps")
@@ -173,7 +173,7 @@ def _form_checks(
     reread: StepLens, face: BSplineSurface, tolerance: float, count: int, *, of: str = "back"
 ) -> Iterator[Check]:
     """Check distances (mm) and angles between normals (rad) of a face at `count` Sobol points, evaluated by OCC."""
-    form = f"form: deviation of the re-read {of} from the optimised one"
+    form = f"form: deviation of the {of} in the file from the designed one"
     if of == "front" and not reread.front.is_net:
         yield Check.true(form, False, "the file's front is not a net", id="form")
         return
@@ -188,7 +188,7 @@ def _form_checks(
     j, k = int(off.argmax()), int(turned.argmax())
     at_j, at_k = (f"at ({x[worst]:.4g}, {y[worst]:.4g}) mm" for worst in (j, k))
     yield Check.at_most(form, float(off[j]), tolerance, "mm", where=at_j, id="form")
-    name = f"form: angle between normals of the re-read and the optimised {of}"
+    name = f"form: angle between normals of the {of} in the file and of the designed one"
     yield Check.at_most(name, float(turned[k]), NORMAL_TOLERANCE, "rad", where=at_k, id="normals")
 
 

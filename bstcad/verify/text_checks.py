@@ -111,12 +111,12 @@ def measure_checks(
         for quantity, unit, values, own in measures:
             if values:
                 off, where = _worst_value([(value,) for value in values], (own,), "its faces give", unit)
-                deviation = f"{name}: stated {quantity}, relative deviation from the faces'"
+                deviation = f"{name}: stated {quantity}, relative deviation from the {quantity} of its faces"
                 yield Check.at_most(deviation, off / own, MEASURE_TOLERANCE, where=where, id="stated-measures")
         if stated.centroids:
             off, where = _worst_value(stated.centroids, shape.centroid, "its faces give", "mm")
             size = 2 * math.hypot(*outline.half_extent)
-            deviation = f"{name}: stated centroid, deviation from the faces'"
+            deviation = f"{name}: stated centroid, deviation from the centroid of its faces"
             yield Check.at_most(deviation, off, MEASURE_TOLERANCE * size, unit="mm", where=where, id="stated-centroid")
     all_stated = {"area": stated.areas, "volume": stated.volumes, "centroid": stated.centroids}
     yield from _missing_statements(name, all_stated)

@@ -49,7 +49,7 @@ def test_a_preview_is_near_the_finished_draft(name, lit):
     shape, finished = found.shape, describe(made.lens, 65)
     for key in ("thickness_min", "thickness_max", "sag_pv"):
         assert abs(shape[key] - finished[key]) < spread * shape["sag_pv"]
-    assert shown["Relief of the back"].endswith(f"± {quantity(spread * shape['sag_pv'], 'mm')}")
+    assert shown["Sag of the back"].endswith(f"± {quantity(spread * shape['sag_pv'], 'mm')}")
 
 
 def test_a_preview_depends_on_the_scene_alone():

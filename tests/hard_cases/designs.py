@@ -28,7 +28,7 @@ WHITE = 65_000
 
 
 # What a report may say was given up, by words of its sentence.
-MISSES, SIDES, OUTSIDE = "misses the lens", "is lost through the sides", "that leaves the lens falls outside"
+MISSES, SIDES, OUTSIDE = "misses the lens", "is lost through the sides", "the source emits falls beside"
 LIFTED, DARK = "are too bright: ", "is left dark"
 MOVED, CHANGED = "The back was moved by", "Tailoring moved the vertex of the back"
 MISSED, STEEP = "The RRMSD", "has slopes up to"

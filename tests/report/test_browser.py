@@ -78,7 +78,7 @@ def path(small_design, tmp_path_factory):
     sections = prescription.sections(prescription.prescription(scene, nominal.lens, contents.shape))
     solid = rendering.turnable(nominal.lens)
     shown = pictures | {"lens": drawn.getvalue()}
-    report.write_html(contents, shown, path, scene="name = 'x'", prescription=sections, solid=solid)
+    path.write_bytes(report.html(contents, shown, scene="name = 'x'", prescription=sections, solid=solid))
     return path
 
 

@@ -245,7 +245,7 @@ def test_clear_apertures_lie_within_the_part_s_faces(name):
 
 def test_what_is_stated_stands_there_and_what_is_not_is_said():
     """The code numbers of ISO 10110, texture and coating, of both faces, and sizes."""
-    assert words_of(sheet("square")).count("not stated") == 2 * 5 + 1
+    assert words_of(sheet("square")).count("not specified") == 2 * 5 + 1
     concave = words_of(sheet("round, concave"))
     assert "3/\u2014RMSt < 100 nm" in concave and "100 mm CC" in concave
     said = words_of(sheet("a flange"))
@@ -253,7 +253,7 @@ def test_what_is_stated_stands_there_and_what_is_not_is_said():
     assert {"profile 0.01 mm (ISO 1101)", "profile 0.005 mm (ISO 1101)"} <= set(said)
     assert said.count("P, Ra \u2264 5 nm") == said.count("AR 450 to 650 nm") == 2
     assert any(re.fullmatch(r"5\.\d+ \u00b1 0\.05 mm", word) for word in said)
-    assert said.count("not stated") == 2 * 2 + 1  # centring and imperfections of each face, sizes
+    assert said.count("not specified") == 2 * 2 + 1  # centring and imperfections of each face, sizes
 
 
 @pytest.mark.filterwarnings("error")

@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from PIL import Image
 
-from bstcad.analysis.shape import describe
+from bstcad.analysis.shape import describe, survey
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
@@ -57,7 +57,7 @@ def lens_of(sag, outline=None, m=33, front=None):
 
 
 def maps(lens):
-    return figure_jobs.surface_maps(lens, describe(lens)["slope_max_deg"])
+    return figure_jobs.surface_maps(lens, survey(lens))
 
 
 def pixel_at(figure, axes, x, y):
@@ -156,10 +156,10 @@ class TestSurfaceMaps:
         assert np.allclose(slope, np.degrees(np.arctan(0.5)), atol=1e-9)
 
     def test_curvature_of_a_parabola(self):
-        # degree 2 reproduces z = x²/2R inside: 1/R (1 + x²/R²)^(-3/2) along x, 0 along y; on the axis 1/2R = 5/m
+        # degree 2 reproduces z = x²/2R inside: 1/R (1 + x²/R²)^(-3/2) along x, 0 along y; on the axis 1/2R = 0.005/mm
         bend = maps(lens_of(lambda x, y: x * x / 200.0)).axes[2].images[0].get_array()
         x = np.linspace(-10.0, 10.0, bend.shape[1])
-        assert np.allclose(bend[25:75, 25:75], (5.0 * (1 + (x / 100.0) ** 2) ** -1.5)[25:75], rtol=1e-9)
+        assert np.allclose(bend[25:75, 25:75], (0.005 * (1 + (x / 100.0) ** 2) ** -1.5)[25:75], rtol=1e-9)
 
     def test_the_steepest_slope_is_that_of_the_net_and_not_of_the_samples(self):
         steep = lens_of(lambda x, y: 0.2 * torch.cos(7 * x) * torch.cos(5 * y))

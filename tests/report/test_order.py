@@ -14,7 +14,7 @@ from bstcad.analysis.shape import describe
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.report import prescription as order
 from bstcad.report.record import of_json
-from bstcad.report.report import first_figures, write_html
+from bstcad.report.report import first_figures, html
 from bstcad.scene.scene import load
 from tests.conftest import DISK
 from tests.report.test_data_sheet import lens_of, scene_of, sheet
@@ -49,16 +49,16 @@ def test_a_bare_lens_is_lens_step_with_what_the_scene_states(tmp_path):
 
 def test_what_is_not_stated_is_said_and_a_mirror_s_rear_is_no_optical_face(tmp_path):
     rows = dict(order.order_rows(sent(scene_of("square"), tmp_path)))
-    assert list(rows.values()).count("not stated") == 5
+    assert list(rows.values()).count("not specified") == 5
     rows = dict(order.order_rows(sent(scene_of("a mirror"), tmp_path)))
-    assert rows["Material"] == "not stated" and rows["Mass"] == "not known: density not stated"
+    assert rows["Material"] == "not specified" and rows["Mass"] == "not known: density not specified"
     assert "Profile tolerance, front" not in rows
 
 
 @pytest.mark.parametrize(("z", "place"), [
     (3.0, "3 mm behind the vertex of the rear"), (0.0, "at the vertex of the rear"),
-    (-2.0, "2 mm in front of the vertex of the rear"),
-    (-9.0, "4 mm in front of the vertex of the mirror, on the source's side"),
+    (-2.0, "2 mm before the vertex of the rear"),
+    (-9.0, "4 mm before the vertex of the mirror, towards the source"),
 ])  # fmt: skip
 def test_the_origin_of_a_mirror_is_seen_from_its_own_faces(z, place):
     mirror = replace(plate(Plane(z), z + 5.0), reflects=True)
@@ -102,11 +102,10 @@ def test_the_first_figures_have_the_size_of_what_is_sent(tmp_path):
     assert said.file == "part.step" and rows["Size of the part"] == "15 × 15 × 4.25 mm"
 
 
-def test_the_report_s_page_has_the_block_and_escapes_its_words(tmp_path):
+def test_the_report_s_page_has_the_block_and_escapes_its_words():
     said = replace(sheet("a flange").order, coating="AR <450> nm")
     for known in (said, None):
-        write_html(replace(CONTENTS, order=known), {}, tmp_path / "report.html")
-        page = (tmp_path / "report.html").read_text(encoding="utf-8")
+        page = html(replace(CONTENTS, order=known), {}).decode()
         assert ("<h2>What to order</h2>" in page) == (known is not None)
         assert (said.sha256 in page) == ("AR &lt;450&gt; nm" in page) == (known is not None)
 
@@ -142,9 +141,9 @@ FACTS = [
     }),
     ({"front": Sphere(15.0, 0.02), "outline": Circle(10.0)}, {
         "Front": "sphere, convex, radius 50 mm; its vertex is at z = 15 mm", "Outline": "round, diameter 20 mm",
-        "Extent": "x = ±10, y = ±10, z = 15 to 20 mm", "Edge thickness": "3.99 to 3.99 mm",  # 5 - 50 + √2400
+        "Extent": "x = ±10, y = ±10, z = 15 to 20 mm", "Edge thickness": "3.990 to 3.990 mm",  # 5 - 50 + √2400
     }),
-    (conic(0.0), {"Front": CONCAVE.format("sphere", ""), "Extent": "x = ±10, y = ±10, z = 13.73 to 20 mm"}),
+    (conic(0.0), {"Front": CONCAVE.format("sphere", ""), "Extent": "x = ±10, y = ±10, z = 13.730 to 20 mm"}),
     (conic(2.0), {"Front": CONCAVE.format("ellipsoid", ", conic constant 2")}),
     (conic(-1.0), {"Front": CONCAVE.format("paraboloid", ", conic constant -1"), "Edge thickness": "6.25 to 6.25 mm"}),
     (conic(-2.25), {"Front": CONCAVE.format("hyperboloid", ", conic constant -2.25")}),
@@ -155,7 +154,7 @@ FACTS = [
     *(({"front": Plane(z), "back_z": z + 5.0}, {
         "Origin of the file": f"on the axis of the lens (the centre of its outline), {place}",
     }) for z, place in (
-        (3.0, "3 mm in front of the vertex of the front, on the source's side"), (0.0, "at the vertex of the front"),
+        (3.0, "3 mm before the vertex of the front, towards the source"), (0.0, "at the vertex of the front"),
         (-2.0, "inside the lens, 2 mm behind the vertex of the front"), (-9.0, "4 mm behind the vertex of the back"),
     )),
 ]  # fmt: skip

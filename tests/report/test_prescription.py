@@ -96,7 +96,7 @@ def test_a_back_that_moved_says_where_it_stands(free, tmp_path):
     (tmp_path / "scene.toml").write_text(text, encoding="utf-8")
     assert load(tmp_path / "scene.toml").lens.back.z == 24.0
     said = prescriptions.text(prescriptions.prescription(scene, free.lens, SHAPE))
-    assert "requested (lens.back.z)       24 mm" in said and repr(z) in said
+    assert "z of the scene (lens.back.z)  24 mm" in said and repr(z) in said
     assert prescriptions.scene_text(free.scene, free.lens) == free.scene.toml()  # which it did not
 
 
@@ -117,7 +117,7 @@ def test_the_mass_is_known_where_the_density_is(small_design, material, mass):
     record = prescriptions.prescription(other, nominal.lens, describe(nominal.lens) | {"volume": 500.0})
     assert record["mass"] == (mass and pytest.approx(mass, abs=0.01))
     text = prescriptions.text(record)
-    assert material in text and ("not known: density not stated" in text) == (mass is None)
+    assert material in text and ("not known: density not specified" in text) == (mass is None)
 
 
 @pytest.mark.parametrize("changes", [

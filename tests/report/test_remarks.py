@@ -47,8 +47,8 @@ ASSUMED = left_out("source size", 0.06, "a cone of 0.1 degrees", "source.diverge
 SAID = [  # changes of the facts, of the scene; the remarks in their order, and what each has to say
     ({}, {}, {}),
     ({"rrmsd": 0.234}, {}, {"rrmsd": ["0.234", "0.1"]}),
-    ({"flux.total internal reflection": 0.032}, {}, {"total-reflection": ["4.0 %"]}),  # of what enters the lens
-    ({"flux.lost through the sides": 0.16}, {}, {"sides": ["20.0 %"]}),
+    ({"flux.total internal reflection": 0.032}, {}, {"total-reflection": ["3.2 %"]}),
+    ({"flux.lost through the sides": 0.16}, {}, {"sides": ["16.0 %"]}),
     ({"flux.lost through the sides": 0.0004, "efficiency": 0.9995, "flux.missed the lens": 0.25}, {}, {}),
     ({"flux.missed the lens": 0.47}, {}, {"misses": ["47.0 %"]}),
     ({"flux.vignetted by the underside": 0.05}, {}, {"underside": ["5.0 %"]}),
@@ -85,7 +85,7 @@ SAID = [  # changes of the facts, of the scene; the remarks in their order, and 
         "rrmsd": ["0.2"], "left-out": ["0.11", " 0.1."]}),
     (effects(left_out("fresnel", 0.09), rrmsd=0.2, rrmsd_asked=0.1), {}, {"rrmsd": ["0.2"]}),
     (effects(ASSUMED), {}, {"source-size": [
-        "a cone of 0.1 degrees, which the scene does not state", "0.06", " 0.03.", "source.divergence in",
+        "a cone of 0.1 degrees, assumed, since the scene does not state it", "0.06", " 0.03.", "source.divergence in",
         "source.real_divergence"]}),
     (effects(replace(ASSUMED, rrmsd_change=0.006, assumed=False)), {}, {}),
     (BLURRED | {"rrmsd": 0.5}, {}, {"rrmsd": ["0.5"], "source-too-large": [

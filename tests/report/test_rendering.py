@@ -154,7 +154,7 @@ def tones(url):
 
 def test_rays_that_are_told_are_some_of_all_and_end_on_the_wall(light, path, small_scene):
     rays, flux, (wall,) = np.array(light["rays"]), np.array(light["flux"]), light["screens"]
-    assert 50 < len(rays) <= rendering.MAX_RAYS and len(flux) == len(rays)
+    assert 50 < len(rays) <= rendering.MAX_MODEL_RAYS and len(flux) == len(rays)
     apart = np.abs(rays[:, None] - path.rays[None]).max(axis=(2, 3))
     assert apart.min(axis=1).max() <= 0.51e-4  # mm, by rounding
     whole = path.flux[apart.argmin(axis=1)] / path.flux.max()

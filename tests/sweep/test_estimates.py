@@ -66,7 +66,7 @@ def test_sunlight_parts_over_all_that_is_seen():
 
     sun, laser = dispersion(0.53), dispersion(0.01)
     assert sun.detail == "of sunlight, uniform from 400 to 700 nm" and not sun.assumed
-    assert laser.detail == "of a line 10 nm wide" and laser.assumed
+    assert laser.detail == "for a spectral width of 10 nm" and laser.assumed
     # the index of PMMA changes by 0.0155 between 434 and 666 nm, and by 3.6e-4 over the line
     assert 20 < sun.blur_pixels / laser.blur_pixels < 60 and sun.rrmsd_change > 10 * laser.rrmsd_change
 
@@ -84,7 +84,7 @@ def test_the_report_of_a_design_shows_it(small_design):
     assert "of its final value" in page and 'class="stack"' in page
     assert page.count("flex-grow: ") == len(told["stages"])
     rows = sum(part["pixels"] > 0 for part in told["remaining_error"]["parts"])
-    assert len(re.findall(r"<tr><th scope=.row.>(?:along the rim|at edges|in its|in all other)", page)) == rows
+    assert len(re.findall(r"<tr><th scope=.row.>(?:along the rim|at edges|in the|in all other)", page)) == rows
 
 
 # --- effects that are left out ----------------------------------------------------------------------------------------
