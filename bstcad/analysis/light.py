@@ -19,7 +19,7 @@ from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import cross, deflect, intersect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import IMAGE_POINTS, detail_width, images, tubes_of, tubes_picture
+from bstcad.optics.measure import IMAGE_POINTS_PER_SIDE, detail_width, images, tubes_of, tubes_picture
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays
 from bstcad.optics.receivers import Receiver
@@ -262,7 +262,7 @@ class Blur:
 
 
 def blur(
-    channels: Sequence[Channel], lens: Lens, screen: Screen, target: np.ndarray, n: int = IMAGE_POINTS
+    channels: Sequence[Channel], lens: Lens, screen: Screen, target: np.ndarray, n: int = IMAGE_POINTS_PER_SIDE
 ) -> Blur | None:
     """Return the blur of the picture by the extent of the source, at the first spectral line of the channels.
 

@@ -17,7 +17,7 @@ least-squares fit of the net to the points.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -30,6 +30,7 @@ from bstcad.optics.bspline import BSplineSurface, evaluate, net_gradient
 from bstcad.optics.interfaces import TANGENCY_TOLERANCE, Law
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays
+from bstcad.optics.reach import wanted_slopes
 from bstcad.optics.receivers import Receiver, dot
 from bstcad.optics.sides import Sides, as_pair
 from bstcad.optics.trace import clear_window, to_first_net
@@ -38,7 +39,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.tailoring import slope_map
 from bstcad.tailoring.machinability import place_back
 from bstcad.tailoring.run import StageStep, Task
-from bstcad.tailoring.slope_fit import conjugate_gradients, monomials, wanted_slopes, with_polynomial
+from bstcad.tailoring.slope_fit import conjugate_gradients, monomials, with_polynomial
 from bstcad.transport.mapping import Mapping
 
 MAX_STARTS = 3  # maximum number of initial points, each moved along +z as far as the distance from the front requires
@@ -147,12 +148,15 @@ class _Grid:
         return cls(origin, direction, aim, alive=alive, rays=replace(coming, z=z))
 
     def __getitem__(self, where: tuple) -> _Grid:
-        parts = (t[(..., *where)] for t in (self.origin, self.direction, self.aim, self.alive))
-        return _Grid(*parts, self.rays)
+        return self._mapped(lambda t: t[(..., *where)])
 
     def transposed(self) -> _Grid:
         """Return the grid with rays and lines exchanged."""
-        return _Grid(*map(_transposed, (self.origin, self.direction, self.aim, self.alive)), self.rays)
+        return self._mapped(_transposed)
+
+    def _mapped(self, change: Callable[[Tensor], Tensor]) -> _Grid:
+        origin, direction, aim, alive = map(change, (self.origin, self.direction, self.aim, self.alive))
+        return _Grid(origin, direction, aim, alive, rays=self.rays)
 
     def normals(self, position: Tensor, plane: Receiver, law: Law) -> Tensor:
         """Return normals (3, rays, lines), n = (-p, -q, 1), of a face that sends rays from positions (mm) to aims."""

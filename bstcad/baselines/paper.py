@@ -27,7 +27,7 @@ from bstcad.optics.trace import clear_window, trace
 from bstcad.tailoring import slope_map
 from bstcad.tailoring.merit import landing
 from bstcad.tailoring.minimise import AdamState, Best, Iterate, adam, minimise
-from bstcad.tailoring.run import Parameters, StageStep, Task
+from bstcad.tailoring.run import Parameters, StageStep, Task, maker
 from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Mapping, Solver
 
@@ -90,7 +90,7 @@ def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: 
         return float(merit.detach()), list(torch.autograd.grad(merit, leaves)), float("nan")
 
     steps, rates = task.knobs.stage1_iterations, [STAGE1_RATES[nearest], *(FRONT_RATES[name] for name in task.free)]
-    method = adam(start, rates, steps, state and state.search)
+    method = adam(start, rates, steps, state.search if state else None)
     return minimise(problem, method, steps, state.best if state else Best())
 
 
@@ -166,9 +166,10 @@ def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[S
     if state is None:
         yield StageStep(lambda: lens)
     for reached in tailor_to_irradiance(start, bundles, merit, steps=knobs.stage2_iterations, state=state):
+        assert reached.parameters is not None  # Adam never ends
         best, lens = reached.best, with_parameters(start, [reached.parameters[0]])
         resumable = None if reached.state is None else RaySearch(Parameters.of(start), best, reached.state)
-        step = StageStep(lambda lens=lens: lens, resumable, skipped=reached.skipped, part="stage 2")
+        step = StageStep(maker(lens), resumable, skipped=reached.skipped, part="stage 2")
         if not reached.skipped:
             progress = "stage 2", best.evaluations, knobs.stage2_iterations, f"RRMSD {best.latest:.4f}"
             step = replace(step, progress=progress, rrmsd=best.latest)
@@ -207,5 +208,5 @@ def tailor_to_irradiance(
         (gradient,) = torch.autograd.grad(square.sqrt(), leaf)
         return float(square.detach().sqrt()), [gradient], float(rrmsd)
 
-    method = adam([lens.back_net.heights], [STAGE2_RATE], steps, state and state.search)
+    method = adam([lens.back_net.heights], [STAGE2_RATE], steps, state.search if state else None)
     return minimise(problem, method, steps, state.best if state else Best())

@@ -58,7 +58,7 @@ MIN_TUBES = 513  # minimum tubes per side of the witness: fewer do not resolve p
 COARSE_SHEET = 64  # tubes per side of the coarse sheet of many pictures: to find it is half the work; error 1e-6
 PASS_SEEDS = 1 << 20  # difference between the seeds of successive passes of rays from an extended source
 GHOST_DIVISOR = 4  # rays per side relative to those of the ghost, which is a hundredth of the light
-IMAGE_POINTS = 48  # points per side of the back face through which the image of the source is computed
+IMAGE_POINTS_PER_SIDE = 48  # points per side of the back face through which the image of the source is computed
 # Largest distance of an image from the centre of the screen, relative to the screen's width plus the median distance.
 # Light outside it grazes a tilted plane and does not belong to the image.
 MAX_IMAGE_DISTANCE = 16
@@ -564,7 +564,7 @@ def detail_width(source_image: float, pixel: float) -> float:
 
 
 @torch.no_grad()
-def images(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int = IMAGE_POINTS) -> ImageSamples:
+def images(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int = IMAGE_POINTS_PER_SIDE) -> ImageSamples:
     """Return the images of the source through the lit ones of n x n points of the back, for the first line of light."""
     first = channels[0]
     channels = [c for c in channels if (c.source.wavelength, c.index) == (first.source.wavelength, first.index)]
