@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import torch
 from torch import Tensor
 
-from bstcad.optics.emitters import PROFILE_NAMES, Emitter, WavelengthKey, all_alive
+from bstcad.optics.emitters import PROFILE_NAMES, Emitter, TiltKey, WavelengthKey, all_alive
 from bstcad.optics.kernels.records import Beam
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.key import Key
@@ -19,8 +19,7 @@ from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays, tilt_of
 
-# Distance of the aperture before the lens, in widths of the aperture, for a tilted beam without a plane z
-WIDTHS_BEFORE_LENS = 4.0
+WIDTHS_BEFORE_LENS = 4.0  # distance of the aperture from the lens, in its widths, for a tilted beam without a plane z
 MAX_INCLINATION = 89.0  # degrees, largest angle of parallel light to the axis of the lens
 
 
@@ -45,9 +44,7 @@ class Collimated(Emitter):
     centre: Annotated[
         tuple[float, float] | None, Key("Centre of aperture and profile.", "mm", -1e8, 1e8, example=[2.0, 0.0])
     ] = None
-    tilt: Annotated[
-        tuple[float, float] | None, Key("Tilt about x and y.", "degrees", -180.0, 180.0, example=[0.0, 10.0])
-    ] = None
+    tilt: TiltKey = None
     divergence: Annotated[float | None, Key("Full angle of the cone of directions.", "degrees", 0.0, 179.0)] = None
     real_divergence: Annotated[
         float | None, Key("Full angle of the real lamp; estimates only.", "degrees", 0.0, 179.0)

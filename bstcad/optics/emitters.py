@@ -24,12 +24,15 @@ from bstcad.optics.kernels.records import Beam
 from bstcad.optics.key import Key
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Outline, Rectangle
-from bstcad.optics.rays import Rays, Vector, axes
+from bstcad.optics.rays import Frame, Rays, Vector, axes
 
 Wavelength = float | tuple[tuple[float, float], ...]  # nm; or spectral lines (nm, weight), weights of any sum
 WavelengthKey = Annotated[  # key of every source
     Wavelength,
     Key("One wavelength, or lines [[nm, weight], ...] of a spectrum, weights of any sum.", "nm", 100.0, 20_000.0),
+]
+TiltKey = Annotated[
+    tuple[float, float] | None, Key("Tilt about x and y.", "degrees", -180.0, 180.0, example=[0.0, 10.0])
 ]
 PROFILE_NAMES = {"gaussian": "Gaussian", "lambertian": "Lambertian", "uniform": "uniform"}  # profile names in text
 
@@ -179,7 +182,7 @@ class Emitter(ABC):
         return self.tilt is not None and any(self.tilt)
 
     @property
-    def axes(self) -> tuple[Vector, Vector, Vector]:
+    def axes(self) -> Frame:
         """Axes (e_x, e_y, n) of the source in space; the light goes along n, or along -n to a lens below it."""
         return axes(self.tilt or (0.0, 0.0))
 

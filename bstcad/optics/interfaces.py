@@ -21,7 +21,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from bstcad.optics.bspline import BSplineSurface, require_net
+from bstcad.optics.bspline import BSplineSurface, is_net, require_net
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.surfaces import Surface
@@ -197,7 +197,7 @@ def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) ->
     x, y, z = torch.where(meets, start + s * rays.direction, torch.zeros_like(start))
     h, z_x, z_y = surface.relative_sag_and_slope(x, y)
     dx, dy, dz = rays.direction.detach()
-    net = surface if isinstance(surface, BSplineSurface) else None
+    net = surface if is_net(surface) else None
     ok = meets & ((dz - z_x.detach() * dx - z_y.detach() * dy).abs() > TANGENCY_TOLERANCE)
     rise_x, rise_y = slopes_beyond(net, x, y, z_x=z_x, z_y=z_y) if net else (z_x, z_y)
     slope = dz - rise_x.detach() * dx - rise_y.detach() * dy
@@ -216,7 +216,7 @@ def _plane_and_root(surface: Surface, rays: Rays) -> tuple[Tensor, Tensor, Tenso
     path = -rays.above(surface.z) / torch.where(dz.abs() > 1e-12, dz, torch.full_like(dz, 1e-12))
     start = torch.stack([*(rays.position[:2] + path * rays.direction[:2]), torch.zeros_like(dz)])
     with torch.no_grad():
-        if isinstance(surface, BSplineSurface):
+        if is_net(surface):
             bounds = net_bounds(surface, dz.dtype, rays.sense)
             s, meets = first_root(surface, start, path, rays=rays, bounds=bounds)
         else:

@@ -25,14 +25,13 @@ class Key:
 
     def in_range(self, value: Any) -> Any:
         """Return the value of a field if all its numbers are in range; otherwise raise ValueError with a sentence."""
-        minimum, maximum = self.minimum, self.maximum
-        assert minimum is not None and maximum is not None  # pydantic checks fields with a range only
+        assert self.minimum is not None and self.maximum is not None  # pydantic checks fields with a range only
         for number in _numbers(value):
-            if not minimum <= number <= maximum:
+            if not self.minimum <= number <= self.maximum:
                 unit = f" {self.unit}" if self.unit else ""
                 in_um = self.unit == "nm" and 0.1 <= number <= 20
                 remedy = f"did you mean {number * 1000:g} nm?" if in_um else self.remedy or "choose a value in between"
-                between = f"{minimum:.10g} and {maximum:.10g}{unit}"
+                between = f"{self.minimum:.10g} and {self.maximum:.10g}{unit}"
                 raise ValueError(f"{number:g}{unit} is not between {between}; {remedy}")
         return value
 

@@ -10,7 +10,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from bstcad.optics.bspline import BSplineSurface, require_net
+from bstcad.optics.bspline import BSplineSurface, is_net, require_net
 from bstcad.optics.interfaces import Interface
 from bstcad.optics.outlines import EVERYWHERE, Outline
 from bstcad.optics.passes import LENS, MIRROR, Face, Passes
@@ -179,7 +179,7 @@ class Lens:
     def like(self) -> Tensor:
         """Tensor of the precision and device of the lens: the heights of a net, else float64 on the CPU."""
         last = self.last_freeform.surface
-        return last.heights if isinstance(last, BSplineSurface) else torch.zeros(0, dtype=torch.float64)
+        return last.heights if is_net(last) else torch.zeros(0, dtype=torch.float64)
 
     @property
     def apertures(self) -> tuple[Outline, Outline]:

@@ -20,7 +20,7 @@ STRICT = {"extra": "forbid", "arbitrary_types_allowed": True, "revalidate_instan
 # are boxes with round corners; a circle (a = b = 0) and a rectangle (r = 0) are the limiting cases.
 Limits = tuple[float, float, float]
 SIZE_RANGE = (1e-3, 1e6)  # range of the size of an outline in a scene, mm
-RIM_POINTS = 720  # number of rim points on the arcs together, and about as many on the straight sides together
+OUTLINE_POINTS = 720  # rim points on the arcs of an outline together, and about as many on its straight sides together
 
 
 class _Box:
@@ -32,6 +32,13 @@ class _Box:
     def limits(self) -> Limits:
         """Limits (a, b, r²)."""
         raise NotImplementedError
+
+    @property
+    def farthest(self) -> tuple[float, float]:
+        """Point (x, y) of the rim that is farthest from the axis (mm): on an arc, in line with its centre."""
+        a, b, r2 = self.limits
+        r, d = math.sqrt(r2), math.hypot(a, b)
+        return (a * (1 + r / d), b * (1 + r / d)) if d else (r, 0.0)
 
     def contains(self, x: Tensor, y: Tensor) -> Tensor:
         """Return True where (x, y) (mm) lies inside or on the rim."""
@@ -51,7 +58,7 @@ class _Box:
     def rim_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Return x and y (mm) of points along the rim, in no particular order."""
         a, b, r2 = self.limits
-        turn, flat = np.arange(RIM_POINTS) * 2 * np.pi / RIM_POINTS, np.linspace(-1, 1, RIM_POINTS // 4 + 1)
+        turn, flat = np.arange(OUTLINE_POINTS) * 2 * np.pi / OUTLINE_POINTS, np.linspace(-1, 1, OUTLINE_POINTS // 4 + 1)
         r, x, y = math.sqrt(r2), np.cos(turn), np.sin(turn)
         sides = [(flat * a, 0 * flat + end * (b + r)) for end in (-1, 1) if a]
         sides += [(0 * flat + end * (a + r), flat * b) for end in (-1, 1) if b]
@@ -82,11 +89,6 @@ class Rectangle(_Box):
     def half_extent(self) -> tuple[float, float]:
         """Half the bounding box in x and in y (mm)."""
         return self.width / 2, self.height / 2
-
-    @property
-    def farthest(self) -> tuple[float, float]:
-        """Point (x, y) of the rim that is farthest from the axis (mm): a corner."""
-        return self.half_extent
 
     @property
     def limits(self) -> Limits:
@@ -121,15 +123,6 @@ class Rounded(Rectangle):
     """A rectangle with rounded corners, of a radius of at most half the width and half the height."""
 
     corner_radius: float = 0.0  # radius of the corners, mm
-
-    @property
-    def farthest(self) -> tuple[float, float]:
-        """Point (x, y) of the rim that is farthest from the axis (mm): on the arc, in line with its centre."""
-        a, b, _ = self.limits
-        d = math.hypot(a, b)
-        if not d:
-            return self.corner_radius, 0.0
-        return a * (1 + self.corner_radius / d), b * (1 + self.corner_radius / d)
 
     @property
     def limits(self) -> Limits:
@@ -182,11 +175,6 @@ class Circle(_Box):
     def half_extent(self) -> tuple[float, float]:
         """Half the bounding box in x and in y (mm)."""
         return self.radius, self.radius
-
-    @property
-    def farthest(self) -> tuple[float, float]:
-        """Point (x, y) of the rim that is farthest from the axis (mm)."""
-        return self.radius, 0.0
 
     @property
     def limits(self) -> Limits:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics.emitters import PROFILE_NAMES, Emitter, WavelengthKey, all_alive
+from bstcad.optics.emitters import PROFILE_NAMES, Emitter, TiltKey, WavelengthKey, all_alive
 from bstcad.optics.kernels.records import Beam
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.key import Key
@@ -40,17 +40,10 @@ class Point(Emitter):
         tuple[float, float, float], Key("Position of the point, or of the disc's centre.", "mm", -1e8, 1e8)
     ] = (0.0, 0.0, 0.0)
     wavelength: WavelengthKey = 587.6
-    profile: Annotated[Literal["gaussian", "lambertian", "uniform"], Key("Radiant intensity over the angle.")] = (
-        "lambertian"
-    )
+    profile: Annotated[Literal["gaussian", "lambertian", "uniform"], Key("Radiant intensity by angle.")] = "lambertian"
     half_angle_1e2: Annotated[
         float | None,
-        Key(
-            "Angle from the axis at which a gaussian's irradiance on a plane is 1/e^2 of its peak.",
-            "degrees",
-            1e-3,
-            89.0,
-        ),
+        Key("Angle from the axis where a gaussian's irradiance on planes is 1/e^2 of its peak.", "degrees", 1e-3, 89.0),
     ] = None
     half_angle: Annotated[
         float | None, Key("Angle from the axis at which a uniform or lambertian profile ends.", "degrees", 1e-3, 90.0)
@@ -62,9 +55,7 @@ class Point(Emitter):
     height: Annotated[
         float | None, Key("Height of an emitting rectangle, along its y axis.", "mm", 0.0, 1e6, example=1.0)
     ] = None
-    tilt: Annotated[
-        tuple[float, float] | None, Key("Tilt about x and y.", "degrees", -180.0, 180.0, example=[0.0, 10.0])
-    ] = None
+    tilt: TiltKey = None
     real_diameter: Annotated[float | None, Key("Diameter of the real lamp; estimates only.", "mm", 0.0, 1e6)] = None
     kind: Annotated[Literal["point"], Key("A point, or with a size a disc or rectangle of points.")] = "point"
 

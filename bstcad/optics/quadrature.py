@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import BSplineSurface, is_net
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.surfaces import Surface
@@ -120,7 +120,7 @@ def divided(breaks: np.ndarray, parts: int) -> np.ndarray:
 
 def outline_border(outline: Outline, face: Surface) -> Border:
     """Return the border of a circle or of a box with sharp corners, in parts that cross no knot line of a face."""
-    net = face if isinstance(face, BSplineSurface) else None
+    net = face if is_net(face) else None
     count = _points(net) if net else GAUSS_POINTS_PER_PART
     if outline.is_round:
         radius, _ = outline.half_extent
@@ -156,7 +156,7 @@ def _chords(face: Surface, x: np.ndarray, y: np.ndarray, dx: np.ndarray) -> tupl
 def _chord_ends(face: Surface, y: np.ndarray) -> tuple[np.ndarray, int]:
     """Return the ends of the parts of each chord, (n, parts + 1), some of length 0, and the Gauss points per part."""
     low, high = np.minimum(y, 0.0)[:, None], np.maximum(y, 0.0)[:, None]
-    if not isinstance(face, BSplineSurface):
+    if not is_net(face):
         return np.hstack([low, high]), CHORD_POINTS
     return np.clip(np.union1d(_smooth_parts(face, 1, MIN_SPANS), 0.0), low, high), _points(face)
 

@@ -23,7 +23,7 @@ from bstcad.optics.interfaces import Law
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays
-from bstcad.optics.receivers import Receiver
+from bstcad.optics.receivers import Receiver, dot
 from bstcad.optics.tubes import rays_to
 
 MAX_EXIT_ANGLE = math.radians(85)  # largest angle of refraction in air (rad), at 0.2° from the critical angle in PMMA
@@ -65,7 +65,7 @@ def directions(at_face: Rays, aim: Tensor, plane: Receiver) -> tuple[Tensor, Ten
     """Return (d, d', d · d'): unit vectors (3, …) along rays at a face and from it to aims (2, …) on the receiver."""
     out = plane.vector_to(at_face, aim)
     d, out = at_face.direction, out / torch.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
-    return d, out, d[0] * out[0] + d[1] * out[1] + d[2] * out[2]
+    return d, out, dot(d, out)
 
 
 def wanted_slopes(at_face: Rays, aim: Tensor, plane: Receiver, law: Law) -> tuple[Tensor, Tensor]:
@@ -83,7 +83,7 @@ def slopes_towards(at_face: Rays, out: Tensor, law: Law) -> tuple[Tensor, Tensor
     slope is steeper than MAX_SLOPE.
     """
     d = at_face.direction
-    along = d[0] * out[0] + d[1] * out[1] + d[2] * out[2]
+    along = dot(d, out)
     largest = math.pi if law.reverses else largest_deflection(max(law.eta, 1 / law.eta))
     out = torch.where(along < math.cos(largest), _at_angle(d, out, along, largest), out)
     normal = normal_towards(at_face, out, law)
@@ -108,7 +108,7 @@ def limit_refraction(
     z_x, z_y = slopes
     d, largest = at_face.sense * at_face.direction, math.asin(math.sin(grazing) / law.eta)
     normal = torch.stack([-z_x, -z_y, torch.ones_like(z_x)]) / torch.sqrt(1 + z_x * z_x + z_y * z_y)
-    along = d[0] * normal[0] + d[1] * normal[1] + d[2] * normal[2]
+    along = dot(d, normal)
     limit = _at_angle(d, normal, along, largest)
     exceeds = (along < math.cos(largest)) & (limit[2] > 0)
     return torch.where(exceeds, -limit[0] / limit[2], z_x), torch.where(exceeds, -limit[1] / limit[2], z_y)
@@ -130,8 +130,7 @@ def reach_margin(at_face: Rays, aim: Tensor, plane: Receiver, law: Law, grazing:
     _, out, along = directions(at_face, aim, plane)
     normal = normal_towards(at_face, out, law)
     upright = normal[2] - torch.sqrt(normal[0] ** 2 + normal[1] ** 2) / MAX_SLOPE
-    n_x, n_y, n_z = plane.normal(aim)
-    onwards = (-at_face.sense if law.reverses else at_face.sense) * (n_x * out[0] + n_y * out[1] + n_z * out[2])
+    onwards = (-at_face.sense if law.reverses else at_face.sense) * dot(plane.normal(aim), out)
     margin = torch.minimum(upright, onwards)
     if law.reverses:
         return margin

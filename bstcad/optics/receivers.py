@@ -316,6 +316,6 @@ class TiltedPlane(PlaneReceiver):
         return torch.stack([x * a + y * b - o for a, b, o in zip(e_x, e_y, offset, strict=True)])
 
 
-def dot(vector: Sequence[float] | Tensor, of: Array | Sequence[Array]) -> Array:
+def dot(vector: Sequence[float | Tensor] | Tensor, of: Array | Sequence[Array]) -> Array:
     """Return the dot product of a vector and an array of vectors (3, …)."""
     return vector[0] * of[0] + vector[1] * of[1] + vector[2] * of[2]

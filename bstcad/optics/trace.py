@@ -22,12 +22,12 @@ import torch
 from torch import Tensor
 
 from bstcad.optics import irradiance, ops, sampling
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import is_net
 from bstcad.optics.channels import Channel, source_numbers, weighted_sum
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import Interface, Loss, Reflect, Refract, cross, intersect
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels.kernel_arguments import MAX_TABLES, beam
+from bstcad.optics.kernels.kernel_arguments import MAX_LIGHT_TABLES, beam
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import REFLECTED
@@ -72,7 +72,7 @@ def behind(rays: Rays, interface: Interface) -> Rays:
 def _net_kernel(name: str, rays: Rays, interface: Interface) -> Callable[..., Any] | None:
     """Return the kernel of this name if the interface is a net; None: the plain form runs."""
     net = interface.surface
-    return ops.kernel(name, net.heights, rays.position, rays.direction) if isinstance(net, BSplineSurface) else None
+    return ops.kernel(name, net.heights, rays.position, rays.direction) if is_net(net) else None
 
 
 def whole_kernel(
@@ -191,7 +191,7 @@ def simulate(lights: Lights, screen: Screen, n: int) -> Simulation:
 
     Kernel and plain form trace the same rays and agree to rounding.
     """
-    tables = n >= MIN_RAYS_FOR_TABLE and len(lights) <= MAX_TABLES
+    tables = n >= MIN_RAYS_FOR_TABLE and len(lights) <= MAX_LIGHT_TABLES
     kernels = [
         whole_kernel("trace.simulate", source, lens, screen.plane, tables=tables) for _, source, lens, _ in lights
     ]

@@ -22,10 +22,8 @@ from bstcad.optics.receivers import LevelPlane, PlaneReceiver, Receiver, dot
 from bstcad.optics.surfaces import sag
 from bstcad.optics.tilted import TiltedSurface
 
-# Newton iterations for the point of a flat face through which light goes to a given point of the receiver
-NEWTON_ITERATIONS = 8
+NEWTON_ITERATIONS = 8  # Newton steps for the point of a flat face through which light reaches a point of the receiver
 TINY = 1e-300  # smallest divisor
-SPACE_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -69,7 +67,7 @@ class Image(PlaneReceiver):
     def plain(self) -> Receiver:
         """Return a level plane with the axes of space as LevelPlane, else itself."""
         (c_x, c_y, z), (o_x, o_y) = self.centre, self.origin
-        return LevelPlane(z) if self.frame == SPACE_AXES and (c_x, c_y) == (o_x, o_y) else self
+        return LevelPlane(z) if self.frame == LevelPlane.axes and (c_x, c_y) == (o_x, o_y) else self
 
 
 @dataclass(frozen=True)

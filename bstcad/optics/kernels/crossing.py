@@ -258,6 +258,11 @@ class Crossing(NamedTuple):
     lands: bool  # True if rays land on the screen, False if they go on behind the face
     lossy: bool  # True if the face has losses, which need path and angle of incidence
 
+    @property
+    def arguments(self) -> tuple[Faces, TiltedScreen | None, bool | None]:
+        """Arguments of the kernels; None is a type of its own in numba, which compiles no branch for it."""
+        return self.faces, self.tilted, True if self.lands else None
+
 
 class Cross(torch.autograd.Function):
     """Map (heights, position (3, n), direction (3, n), status (n,), crossing) to (out, status, path, cos θ).
@@ -273,7 +278,7 @@ class Cross(torch.autograd.Function):
         out = torch.empty((2 if crossing.lands else 6, n), dtype=position.dtype)
         path, cosine = torch.empty(n, dtype=torch.float64), torch.ones(n if crossing.lossy else 0, dtype=torch.float64)
         fate = status.clone()
-        inputs = [net_of(heights), *_numbers(crossing), *(t.numpy() for t in (position.detach(), direction.detach()))]
+        inputs = [net_of(heights), *crossing.arguments, *(t.numpy() for t in (position.detach(), direction.detach()))]
         results = [t.numpy() for t in (fate, out, path, cosine)]
         reductions.on_threads(lambda first, last: _cross(*inputs, *results, first, last), reductions.shares(n, BLOCK))
         ctx.save_for_backward(heights, position, direction, fate, path)
@@ -296,18 +301,13 @@ class Cross(torch.autograd.Function):
         d_rays = torch.empty((6, n), dtype=position.dtype) if any(ctx.needs_input_grad[1:3]) else None
         shares = reductions.shares(n, BLOCK)
         buffers = reductions.buffers(len(shares), *heights.shape)
-        inputs = [net_of(heights), *_numbers(ctx.crossing)]
+        inputs = [net_of(heights), *ctx.crossing.arguments]
         inputs += [t.detach().numpy() for t in (position, direction, fate, path, g)]
         inputs += [more, None if d_rays is None else d_rays.numpy()]
         tasks = [(*share, own, rows) for share, own, rows in zip(shares, *buffers, strict=True)]
         reductions.on_threads(lambda *task: _cross_adjoint(*inputs, *task), tasks)
         d_position, d_direction = (None, None) if d_rays is None else (d_rays[:3], d_rays[3:])
         return torch.from_numpy(reductions.merged(*buffers)).to(heights.dtype), d_position, d_direction, None, None
-
-
-def _numbers(crossing: Crossing) -> tuple[Faces, TiltedScreen | None, bool | None]:
-    """Return the arguments of the kernels; None is a type of its own in numba, which compiles no branch for it."""
-    return crossing.faces, crossing.tilted, True if crossing.lands else None
 
 
 def landed(rays: Rays, interface: Interface, plane: Receiver) -> Landed:

@@ -30,7 +30,7 @@ IRRADIANCE_TOLERANCE = 1e-5  # largest RMS of a table's relative error in the ir
 MIN_IRRADIANCE = 1e-4  # irradiance relative to its maximum, below which the error counts relative to this value
 SLOPE_TOLERANCE = 1e-8  # largest RMS of a table's error in the slopes of rays
 PEAK_TO_RMS = 100.0  # largest error of a table relative to these tolerances: the outermost spans are the least exact
-MAX_TABLES = 16  # tables of light in the cache
+MAX_LIGHT_TABLES = 16  # tables of light in the cache
 MAX_TABLE_ERROR_RATIO = 0.5  # largest ratio of the error of a table to that of the coarser one; more: an edge
 
 
@@ -97,7 +97,7 @@ def beam(source: Emitter, lens: Lens, tables: bool = True) -> Beam | None:
     return formula
 
 
-@functools.lru_cache(maxsize=MAX_TABLES)  # at most 6 MB each
+@functools.lru_cache(maxsize=MAX_LIGHT_TABLES)  # at most 6 MB each
 @torch.no_grad()
 def _table_of_light(source: Emitter, window: Rectangle, z: float) -> Beam | None:
     """Return the coarsest table of the light that is accurate midway between its points; None: none of TABLE_SIDES is.
