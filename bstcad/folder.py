@@ -21,6 +21,7 @@ from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,7 +38,7 @@ from bstcad.runs import files
 from bstcad.runs.files import MachineError, SceneError
 from bstcad.runs.processes import Submit, is_alive, run_here
 from bstcad.scene import scene as scenes
-from bstcad.scene.blank import NET_FILE as FRONT
+from bstcad.scene.blank import NET_FILE
 from bstcad.scene.target import numbered
 from bstcad.transport.mapping import TransportMap, nodes
 from bstcad.verify import jobs
@@ -45,7 +46,7 @@ from bstcad.verify.checks import Nominal
 
 SCENE, DESIGN, PART = "scene.toml", "design.npz", "part.step"
 FRONT_KNOTS = ("front_knots_x", "front_knots_y")  # names in design.npz for a tailored front
-PROVEN = (SCENE, DESIGN, "lens.step", "lens.stl", PART, FRONT)  # the files that a verification reads
+PROVEN = (SCENE, DESIGN, "lens.step", "lens.stl", PART, NET_FILE)  # the files that a verification reads
 REMEDY = "generate the design again"
 
 
@@ -87,7 +88,7 @@ def same_front(one: Surface, other: Surface) -> bool:
 
 LARGE_STEP = 100e6  # size of lens.step from which on it is printed before a design (bytes)
 BYTES_PER_POINT = 83  # bytes of a control point's statement and of one reference to it, without their two numbers
-REST = 103_000, 1600  # bytes of all other statements: constant part, and part per control point of a side
+OTHER_BYTES = 103_000, 1600  # bytes of all other statements: constant part, and part per control point along a side
 
 
 def step_size(scene: scenes.Scene, net: Sides | None = None) -> float:
@@ -96,7 +97,8 @@ def step_size(scene: scenes.Scene, net: Sides | None = None) -> float:
     net: control points per side, or along x and along y; None: those of the scene.
     """
     nets = map(as_pair, scene.lens.nets(net))
-    return sum(m * n * (BYTES_PER_POINT + 2 * len(str(m * n))) + REST[1] * (m + n) / 2 for m, n in nets) + REST[0]
+    constant, per_side = OTHER_BYTES
+    return sum(m * n * (BYTES_PER_POINT + 2 * len(str(m * n))) + per_side * (m + n) / 2 for m, n in nets) + constant
 
 
 def size_sentence(scene: scenes.Scene) -> str:
@@ -191,8 +193,8 @@ def amending(folder: Path, place: Path | None = None) -> Iterator[Path]:
             if _stamps(folder) == before:
                 raise
         if _stamps(folder) != before:
-            changed = "its design was replaced while it was being verified"
-            raise SceneError(f"{folder}: {changed}; nothing is written, verify it again")
+            changed = "its design was replaced during the verification, so nothing is written"
+            raise SceneError(f"{folder}: {changed}; verify it again")
         for path in sorted(Path(building).rglob("*")) if place is None else ():
             if path.is_dir():
                 files.folder_in_place(folder / path.relative_to(building))
@@ -280,21 +282,22 @@ def write_design(design: Made, irradiances: Sequence[np.ndarray], folder: Path) 
     lens, sent = design.lens, design.transport
     (m, n), front = lens.back_net.shape, lens.front
     parts = ((k, goal.reachable) for k, goal in enumerate(design.goals))
-    np.savez_compressed(
-        folder / DESIGN,
-        control_points=lens.back_net.control_points(),
-        knots_x=knots(m),
-        knots_y=knots(n),
-        degree=DEGREE,
-        **({"front_curvature": 0.0} | _numbers(front)),
+    arrays: dict[str, Any] = {
+        "control_points": lens.back_net.control_points(),
+        "knots_x": knots(m),
+        "knots_y": knots(n),
+        "degree": DEGREE,
+        "front_curvature": 0.0,
+        **_numbers(front),
         **({"front_control_points": front.control_points()} if is_net(front) else {}),
         **(dict(zip(FRONT_KNOTS, map(knots, lens.front_net.shape), strict=True)) if lens.shapes("front") else {}),
         **{numbered("target", k): goal.picture for k, goal in enumerate(design.goals)},
         **{numbered("reachable", k): part.astype(np.uint8) for k, part in parts if part is not None},
         **{numbered("irradiance", k): picture for k, picture in enumerate(irradiances)},
-        scene=scene_text(design.scene, lens),
+        "scene": scene_text(design.scene, lens),
         **({f"transport_{sent.plane}": sent.source, "transport_x": sent.x, "transport_y": sent.y} if sent else {}),
-    )
+    }
+    np.savez_compressed(folder / DESIGN, **arrays)
 
 
 @contextlib.contextmanager
@@ -352,7 +355,7 @@ def _contains(folder: Path, design: Made) -> bool:
 def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
     """Return scene and nominal design of a folder.  SceneError if design.npz or scene.toml is missing or damaged."""
     scene = scenes.load(folder / SCENE)
-    shapes = {"control_points": (*as_pair(scene.lens.back.net), 3), "front_curvature": ()}
+    shapes: dict[str, tuple[int, ...]] = {"control_points": (*as_pair(scene.lens.back.net), 3), "front_curvature": ()}
     if scene.lens.front.is_tailored:
         shapes["front_control_points"] = (*as_pair(scene.lens.nets()[1]), 3)
     names = files.names(folder / DESIGN)

@@ -140,7 +140,7 @@ def design(
     limit, reserved = math.inf if knobs.max_time is None else knobs.max_time, reserve(scene) + RRMSD_SECONDS
     driver = Driver(hooks, began, limit=limit, reserve=reserved, record=start.record)
     precision = getattr(torch, knobs.precision)
-    lens = scene.flat_lens(knobs.levels[0], dtype=precision, device=device, as_wide_as=knobs.levels[-1])
+    lens = scene.flat_lens(knobs.levels[0], as_wide_as=knobs.levels[-1]).to(precision, device)
     if not scene.lens.back.optimise:  # no stage refines it
         lens = lens.with_back(lens.back_net.refined(scene.lens.back.net))
     if fresh:

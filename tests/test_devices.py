@@ -128,7 +128,7 @@ def same_merit_and_gradient(wanted):
 
 def evaluated(wanted, heights):
     """(merit, gradient) of a shallow bowl as the back face."""
-    lens = wanted.flat_lens(33, device=heights.device)
+    lens = wanted.flat_lens(33).to(heights.dtype, heights.device)
     lens = replace(lens, back=replace(lens.back, heights=heights * 1e-3 * wanted.lens.outline.half_extent[0]))
     merit = Merit.of(wanted.channels(), lens, 48, wanted.goals, 0.03)
     value, gradients, _ = Problem(lens, merit)([net.heights for net in lens.nets])
@@ -166,7 +166,7 @@ def test_auto_is_the_cpu_also_where_there_is_a_gpu(monkeypatch):
 def test_the_compiled_kernels_serve_no_tensor_of_the_gpu():
     wanted = scene(TEMPLATES[0], "draft")
     with SecondDevice() as second:
-        lens = wanted.flat_lens(33, device="cuda")
+        lens = wanted.flat_lens(33).to(torch.float64, "cuda")
         u = torch.ones(3, dtype=torch.float64, device="cuda")
         assert not any(ops.kernel(name, lens.back.heights, u) for name in ops.KERNELS)
         assert not ops.whole_kernel("trace.simulate", lens.interfaces)

@@ -126,7 +126,7 @@ def test_the_given_front_is_in_every_file(behind_another, small_design):
 def test_it_reads_back_to_the_last_bit_without_the_earlier_design(behind_another):
     """The folder has a copy of the net."""
     scene, nominal = read_nominal(behind_another.folder)
-    assert scene == behind_another.scene and scene.lens.front.file_net.shape == (33, 33)
+    assert scene == behind_another.scene and scene.lens.front.file.shape == (33, 33)
     assert torch.equal(nominal.lens.front.heights, behind_another.scene.lens.front.surface.heights)
     again = bstcad.open(behind_another.folder)
     assert again.lens.front.z == 15.0 and again.solid().isValid()

@@ -126,8 +126,8 @@ class Workspace:
     def change(self, name: str, text: str) -> OpenScene:
         """Store a text, valid or not, as the unsaved text of a scene."""
         path, data = self.path(name), _encoded(name, _with_unix_ends(text))
-        if len(data) > scene_file.MAX_FILE_SIZE:
-            raise SceneError(f"{name}: is larger than {scene_file.MAX_FILE_SIZE / 1e6:g} MB; shorten it")
+        if len(data) > scene_file.MAX_SCENE_SIZE:
+            raise SceneError(f"{name}: is larger than {scene_file.MAX_SCENE_SIZE / 1e6:g} MB; shorten it")
         with self._changing:
             unsaved = files.beside(path, UNSAVED)
             before = self._text(unsaved).partition("\n")[0] if unsaved.is_file() else _digest(self._text(path))
@@ -203,7 +203,7 @@ class Workspace:
             targets = tables(text)["target"]
             key = f"target[0].{key}" if isinstance(targets, list) and len(targets) > 1 else f"target.{key}"
             text = changed(text, key, value)
-            if plate is not None and (blurred := plate.blurred(self.scene(name, text))) is not None:
+            if plate is not None and (blurred := plate.blur_rrmsd(self.scene(name, text))) is not None:
                 text = changed(plate.text(name, blurred=blurred), key, value)  # the limit depends on the picture
             files.put(path, _encoded(name, text))
         except BaseException:
@@ -340,7 +340,7 @@ def _folder_pattern(*folders: Path) -> re.Pattern:
 def _text(path: Path) -> str:
     """Return the text of a scene file, without a byte order mark and with Unix line ends.  SceneError."""
     try:
-        return _with_unix_ends(files.contents(path, 2 * scene_file.MAX_FILE_SIZE).decode("utf-8-sig"))
+        return _with_unix_ends(files.contents(path, 2 * scene_file.MAX_SCENE_SIZE).decode("utf-8-sig"))
     except UnicodeDecodeError:
         raise SceneError(f"{path.name}: is not UTF-8 text; choose a TOML file") from None
     except ValueError as error:
@@ -350,7 +350,7 @@ def _text(path: Path) -> str:
 def _encoded_as(path: Path, text: str) -> bytes:
     """Return a text encoded with the byte order mark and the line ends of the file that it replaces."""
     try:
-        before = files.contents(path, 2 * scene_file.MAX_FILE_SIZE)
+        before = files.contents(path, 2 * scene_file.MAX_SCENE_SIZE)
     except ValueError:  # no such file, or no scene any more
         before = b""
     if _has_windows_ends(before):

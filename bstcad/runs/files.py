@@ -15,7 +15,7 @@ import stat
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Literal, get_args
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,7 +24,8 @@ MAX_SENTENCE = 600  # largest length of a sentence that quotes a file (character
 MADE_PART_FILES = ("deviation.npz",)  # files that only the folder of a made part has
 DESIGN_FILES = ("report.json", "lens.step", "scene.toml")  # files that only a design's folder has
 # Kinds of files for a shop, as in `bstcad export --as` and the scene's output.export.
-EXPORTS = ("sag", "points", "zemax", "turning", "dxf", "svg", "preview", "datasheet")
+Export = Literal["sag", "points", "zemax", "turning", "dxf", "svg", "preview", "datasheet"]
+EXPORTS: tuple[str, ...] = get_args(Export)
 MAX_ARCHIVE_SIZE = 600_000_000  # bytes of an archive, enough for a net of 2049 x 2049 and pictures of 4096 x 4096
 MAX_ARRAY_HEADER = 4096  # bytes of an array's header, with a margin
 NO_MEMORY = re.compile(  # words of Python, torch, the system and the dynamic loader for a lack of memory

@@ -5,11 +5,11 @@ from __future__ import annotations
 import io
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 import torch
@@ -34,21 +34,23 @@ if TYPE_CHECKING:  # which loads numba
 MIN_CONIC_BEND, MAX_CONIC_BEND = -7.0, 0.85
 MAX_FITTED_SLOPE = 60.0  # degrees; steepest slope at the rim of a surface to which a net is fitted
 MAX_RECESS_SLOPE = 80.0  # degrees; steepest slope at the rim of a front with an outline of its own
-MIN_RECESS_SAG = 1e-3  # mm; smallest sag of such a front at its rim, so that it has an edge
+MIN_RECESS_SAG = 1e-3  # mm; smallest sag at the rim of such a front, so that it has an edge
 MIN_RECESS_GAP = 1e-2  # mm; smallest distance between the outline of a front and that of the lens
 CONIC_CONSTANTS = (-1e3, 1e3)
+CURVATURES = (-1e3, 1e3)  # range of curvatures, 1/mm
 INDICES = (1.01, 5.0)  # range of the refractive index
 BOUNDS = ("tool_radius", "max_slope", "max_thickness", "edge_thickness")  # keys of LensBlank that bound tailored faces
 
 NET_FILE = "front.npz"  # file name of the copy of the net of lens.front.file, beside a design
 NET_REMEDY = "give the folder of a design, its design.npz or its lens.step"
-AXIS_TOLERANCE = 1e-9  # sine of the angle between a side of a net and an axis of the file; a larger one is a turn
+MAX_AXIS_SINE = 1e-9  # sine of the angle between a side of a net and an axis of the file; a larger one is a turn
 UNIFORM_TOLERANCE = 1e-9  # mm; largest deviation of a net from uniform spacing in x and y
 VERTEX_TOLERANCE = 1e-12  # mm; a net whose vertex is this near to z = 0 is not shifted
-MAX_CONTROL_POINTS = 2049  # control points per side of a net
+MAX_CONTROL_POINTS = 2049
+NET_SIZES = (MIN_SIDE, MAX_CONTROL_POINTS)  # range of the control points per side of a net
 FIT_TOLERANCE = 1e-6  # mm; largest distance between a fitted net and its surface (a toroid, or a user's own)
 FIT_SIZES = (33, 65, 129, 257, 513, 1025)  # control points per side of a fitted net, tried in turn
-MAX_CELL_RATIO = 1.5  # ratio of length and width of a cell of the net above which the scene is doubted
+MAX_CELL_RATIO = 1.5  # ratio of length and width of a cell of the net above which a warning proposes another net
 MIN_ROUND_POINTS = 6  # control points per side; a net of 5 has no two spans to spare outside a round rim
 
 Outlined = Annotated[Rectangle | Circle, Field(discriminator="shape")]
@@ -73,7 +75,7 @@ class FileNet(FileContent):
         resting = surface.plain().moved(0.0)
         vertex = resting.from_vertex()
         heights = (vertex if abs(vertex.z) > VERTEX_TOLERANCE else resting).heights
-        return cls(surface.shape, tuple(surface.x), tuple(surface.y), heights.numpy().astype("<f8").tobytes())
+        return cls(surface.shape, surface.x, surface.y, heights.numpy().astype("<f8").tobytes())
 
     def surface(self, z: float) -> BSplineSurface:
         """Return the surface with its vertex at z (mm)."""
@@ -134,7 +136,7 @@ def _along_axes(net: np.ndarray) -> np.ndarray:
     """
     frame = own_frame(net)
     sines = np.abs(frame.rotation)
-    if not (np.abs(sines - sines.round()).max() <= AXIS_TOLERANCE and sines[2, 2] > 0.5):
+    if not (np.abs(sines - sines.round()).max() <= MAX_AXIS_SINE and sines[2, 2] > 0.5):
         needed = "the axis of a front must be along z, and the sides of its net along x and y"
         raise ValueError(f"its lens is {frame.turn_words}, but {needed}: export it without that turn")
     along = np.abs(net[-1, 0, :2] - net[0, 0, :2])
@@ -144,40 +146,39 @@ def _along_axes(net: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(net)
 
 
-Z = Key("Position of the vertex on the axis.", "mm", *COORDINATES, example=8.0)
-CURVATURE = Key("Curvature at the vertex; positive bends towards +z.", "1/mm", -1e3, 1e3)
-OUTLINE = Key(
-    "Outline of the front, inside the lens's; the lens around it ends in a plane through the front's rim.",
-    example={"shape": "circle", "diameter": 10.0},
-)
+VERTEX_Z = Key("Position of the vertex on the axis.", "mm", *COORDINATES, example=8.0)
+CURVATURE = Key("Curvature (1 / radius) at the vertex; positive: bent towards +z.", "1/mm", *CURVATURES)
+OUTLINE = Key("Outline of the curved part; around it the face is plane.", example={"shape": "circle", "diameter": 10.0})
 OPTIMISE = Key("Parameters that tailoring finds: true for all, or a list of names.")
-FrontFile = from_file(FileNet, read_net, "file = 'outputs/earlier'")
-
-
-def _some(*names: str) -> Any:
-    """Return the type of `optimise`: false, true for all of these parameters, or a list of them."""
-    listed = Annotated[tuple[Literal[names], ...], BeforeValidator(tuple), Tag("list")]
-    tag = Discriminator(lambda given: "list" if isinstance(given, list | tuple) else "flag")
-    return Annotated[Annotated[bool, Tag("flag")] | listed, tag]
+FrontFile = Annotated[FileNet, *from_file(FileNet, read_net, "file = 'outputs/earlier'")]
+ParameterName = TypeVar("ParameterName", bound=str)
+FlagOrNames = Annotated[  # type of `optimise`: false, true for all parameters of the surface, or a list of names
+    Annotated[bool, Tag("flag")] | Annotated[tuple[ParameterName, ...], BeforeValidator(tuple), Tag("list")],
+    Discriminator(lambda given: "list" if isinstance(given, list | tuple) else "flag"),
+]
 
 
 class _Front:
+    __dataclass_fields__: ClassVar[dict[str, Any]]  # each kind of front is a dataclass
+    z: float
+    kind: str
     optimise: bool | tuple[str, ...] = False
     outline: Circle | None = None
-    file_net: FileNet | None = None  # net of a freeform front, with which its tailoring starts; None: no file
-    is_tailored = False  # True for a net that tailoring shapes
+    file: FileNet | None = None  # net of a freeform front, with which its tailoring starts
+    control_points: Sides | None = None
     reflect: bool = False
 
     @property
     def surface(self) -> Surface:
         """The surface of optics."""
-        return self.optical if self.outline is None else Recess(self.optical, self.outline)
+        of, _ = FRONTS[self.kind]
+        surface = of(**{each.name: getattr(self, each.name) for each in fields(of)})
+        return surface if self.outline is None else Recess(surface, self.outline)
 
     @property
-    def optical(self) -> Surface:
-        """The surface of optics without an outline of its own."""
-        of, _ = FRONTS[self.kind]
-        return of(**{each.name: getattr(self, each.name) for each in fields(of)})
+    def is_tailored(self) -> bool:
+        """True for a net that tailoring shapes."""
+        return self.kind == "bspline" and self.optimise is True
 
     def traced(self, outline: Outline) -> Surface:
         """Return the surface as a lens of this outline has it: the front's own, or a net fitted to it."""
@@ -191,8 +192,9 @@ class _Front:
     @property
     def free(self) -> tuple[str, ...]:
         """Names of the parameters of the surface that tailoring finds."""
-        names = tuple(self.surface.parameters()) if self.optimise else ()
-        return names if self.optimise is True else tuple(name for name in names if name in self.optimise)
+        chosen = self.optimise
+        names = self.surface.parameters() if chosen else ()
+        return tuple(name for name in names if not isinstance(chosen, tuple) or name in chosen)
 
     def with_parameters(self, surface: Surface) -> Self:
         """Return the front with the parameters of this surface, all of them fixed."""
@@ -208,23 +210,29 @@ class _Front:
             yield f"outline.diameter: {size}; make it smaller, or remove the outline"
         if self.free:
             yield "optimise: a front with an outline of its own cannot be optimised; remove one of the two"
-        reached = self.optical.reaches(*(torch.tensor(p, dtype=torch.float64) for p in own.farthest))
-        _, slope, _ = self.optical.relative_sag_and_slope(*(torch.tensor(p, dtype=torch.float64) for p in own.farthest))
-        steep = math.degrees(math.atan(abs(float(slope)))) if bool(reached) else 90.0
+        surface, (x, y) = self.surface, _farthest(own)
+        _, slope, _ = surface.optical.relative_sag_and_slope(x, y)
+        steep = math.degrees(math.atan(abs(float(slope)))) if bool(surface.optical.reaches(x, y)) else 90.0
         if not steep <= MAX_RECESS_SLOPE:
             ends = f"does not reach the rim of this outline, {own.radius:g} mm from the axis"
-            slope = f"has a slope of {steep:.3g} degrees at its rim, and {MAX_RECESS_SLOPE:g} is the maximum"
-            yield f"outline.diameter: the {self.kind} {ends if steep == 90.0 else slope}; make the outline smaller"
-        if not max(map(abs, self.surface.sags(own))) >= MIN_RECESS_SAG:
-            yield f"outline: a front of curvature {self.curvature:g} 1/mm is too flat to have an edge; remove outline"
+            steeply = f"has a slope of {steep:.3g} degrees at its rim, and {MAX_RECESS_SLOPE:g} is the maximum"
+            yield f"outline.diameter: the {self.kind} {ends if steep == 90.0 else steeply}; make the outline smaller"
+        if not max(map(abs, surface.sags(own))) >= MIN_RECESS_SAG:
+            flat = f"a front of curvature {surface.curvature:g} 1/mm is too flat to have an edge"
+            yield f"outline: {flat}; remove the outline"
+
+
+def _farthest(outline: Outline) -> tuple[torch.Tensor, ...]:
+    """Return x and y (mm) of the point of a rim that is farthest from the axis."""
+    return torch.tensor(outline.farthest, dtype=torch.float64).unbind()
 
 
 @dataclass(frozen=True)
 class PlaneFront(_Front):
     """A plane, z = const."""
 
-    z: Annotated[float, Z]
-    kind: Annotated[Literal["plane"], Key("A plane across the axis.")] = "plane"
+    z: Annotated[float, VERTEX_Z]
+    kind: Annotated[Literal["plane"], Key("A plane perpendicular to the axis.")] = "plane"
 
     __pydantic_config__ = STRICT
 
@@ -233,10 +241,10 @@ class PlaneFront(_Front):
 class SphereFront(_Front):
     """A sphere; a plane if the curvature is 0."""
 
-    z: Annotated[float, Z]
+    z: Annotated[float, VERTEX_Z]
     curvature: Annotated[float, CURVATURE] = 0.0
     outline: Annotated[Circle | None, OUTLINE] = None
-    optimise: Annotated[_some("curvature"), OPTIMISE] = False
+    optimise: Annotated[FlagOrNames[Literal["curvature"]], OPTIMISE] = False
     kind: Annotated[Literal["sphere"], Key("A sphere.")] = "sphere"
 
     __pydantic_config__ = STRICT
@@ -246,7 +254,7 @@ class SphereFront(_Front):
         yield from super().complaints(outline)
         if self.outline is not None:
             return
-        if not bool(self.surface.reaches(*(torch.tensor(p, dtype=torch.float64) for p in outline.farthest))):
+        if not bool(self.surface.reaches(*_farthest(outline))):
             rim, radius = math.hypot(*outline.farthest), 1 / abs(self.curvature)
             remedy = "make the curvature smaller, or give lens.front an outline of its own"
             yield f"curvature: a sphere of radius {radius:g} mm does not reach the rim, at {rim:g} mm; {remedy}"
@@ -256,11 +264,11 @@ class SphereFront(_Front):
 class ConicFront(_Front):
     """A conic of revolution about the axis."""
 
-    z: Annotated[float, Z]
+    z: Annotated[float, VERTEX_Z]
     curvature: Annotated[float, CURVATURE] = 0.0
-    conic_constant: Annotated[float, Key("0 is a sphere, -1 a paraboloid.", "", *CONIC_CONSTANTS)] = 0.0
+    conic_constant: Annotated[float, Key("Conic constant: 0 is a sphere, -1 a paraboloid.", "", *CONIC_CONSTANTS)] = 0.0
     outline: Annotated[Circle | None, OUTLINE] = None
-    optimise: Annotated[_some("curvature", "conic_constant"), OPTIMISE] = False
+    optimise: Annotated[FlagOrNames[Literal["curvature", "conic_constant"]], OPTIMISE] = False
     kind: Annotated[Literal["conic"], Key("A conic of revolution about the axis.")] = "conic"
 
     __pydantic_config__ = STRICT
@@ -305,45 +313,34 @@ class _FittedFront(_Front):
 class ToroidFront(_FittedFront):
     """A toroid, with different curvatures along x and y."""
 
-    z: Annotated[float, Z]
-    curvature_x: Annotated[
-        float, Key("Curvature along x at the vertex; positive bends towards +z.", "1/mm", -1e3, 1e3, example=0.02)
-    ] = 0.0
-    curvature_y: Annotated[
-        float, Key("Curvature along y, of the circle on which the arc along x turns.", "1/mm", -1e3, 1e3, example=0.01)
-    ] = 0.0
-    kind: Annotated[Literal["toroid"], Key("A toroid; a cylinder if one curvature is 0.")] = "toroid"
+    z: Annotated[float, VERTEX_Z]
+    curvature_x: Annotated[float, Key("Curvature along x; positive: bent towards +z.", "1/mm", *CURVATURES)] = 0.0
+    curvature_y: Annotated[float, Key("Curvature along y; positive: bent towards +z.", "1/mm", *CURVATURES)] = 0.0
+    kind: Annotated[Literal["toroid"], Key("A toroid, an arc along x turned along y; or a cylinder.")] = "toroid"
 
     __pydantic_config__ = STRICT
 
 
 @lru_cache(maxsize=16)
 def _net_of(surface: Surface, outline: Outline) -> BSplineSurface:
-    return fitted(surface, outline).from_vertex().moved(surface.z)
+    return fit_net(surface, outline).from_vertex().moved(surface.z)
 
 
 @dataclass(frozen=True)
 class NetFront(_Front):
     """A freeform front: the back of an earlier design, moved along z, or a net that is tailored."""
 
-    z: Annotated[float, Z]
+    z: Annotated[float, VERTEX_Z]
     file: Annotated[
         FrontFile | None, Key("Folder of a design, its design.npz or its lens.step.", example="outputs/earlier")
     ] = None
-    optimise: Annotated[
-        bool, Key("The front is tailored, starting with the net of the file, or flat without one.", example=True)
-    ] = False
+    optimise: Annotated[bool, Key("Tailor the front, starting with the file or a plane.", example=True)] = False
     control_points: Annotated[
         OneOrTwo | None,
-        Key(
-            "Control points along each side, or [along x, along y]; those of the back if absent.", "",
-            5, MAX_CONTROL_POINTS, example=513,
-        ),
+        Key("Control points per side, or [along x, along y]; the back's if absent.", "", *NET_SIZES, example=513),
         BeforeValidator(lambda given: tuple(given) if isinstance(given, list) else given),  # strict: a tuple
-    ] = None  # fmt: skip
-    reflect: Annotated[
-        bool, Key("A mirror: light enters along -z through the back, and leaves through the back.", example=True)
-    ] = False
+    ] = None
+    reflect: Annotated[bool, Key("Mirror behind glass: light enters and leaves by the back.", example=True)] = False
     kind: Annotated[Literal["bspline"], Key("A freeform face of an earlier design, or a tailored one.")] = "bspline"
 
     written = leaving_out(optimise=False, reflect=False)
@@ -353,16 +350,6 @@ class NetFront(_Front):
     def surface(self) -> Surface:
         """The surface of optics; a plane before tailoring if there is no file."""
         return Plane(self.z) if self.file is None else self.file.surface(self.z)
-
-    @property
-    def file_net(self) -> FileNet | None:
-        """The net of the file."""
-        return self.file
-
-    @property
-    def is_tailored(self) -> bool:
-        """True if tailoring shapes the net."""
-        return self.optimise
 
     @property
     def free(self) -> tuple[str, ...]:
@@ -396,10 +383,13 @@ class NetFront(_Front):
                 yield f"file: its net covers {covers}; give a design of the same outline"
 
 
-FRONTS = {  # surface of optics and record of each kind of front
-    "plane": (Plane, PlaneFront), "sphere": (Sphere, SphereFront), "conic": (Conic, ConicFront),
+# Surface of optics and record of each kind of front that is no net.
+FRONTS: dict[str, tuple[type[Any], Callable[..., Any]]] = {
+    "plane": (Plane, PlaneFront),
+    "sphere": (Sphere, SphereFront),
+    "conic": (Conic, ConicFront),
     "toroid": (Toroid, ToroidFront),
-}  # fmt: skip
+}
 
 
 def as_front(value: Any, outline: Outline | None = None) -> Any:
@@ -417,10 +407,10 @@ def as_front(value: Any, outline: Outline | None = None) -> Any:
         return front(value.z, **value.parameters(), **own)
     if outline is None:
         raise ValueError(f"a scene cannot hold a {value.kind}; use scene.changed, which fits a net to it")
-    return as_front(fitted(value, outline))
+    return as_front(fit_net(value, outline))
 
 
-def fitted(surface: Surface, outline: Outline) -> BSplineSurface:
+def fit_net(surface: Surface, outline: Outline) -> BSplineSurface:
     """Fit the smallest net within FIT_TOLERANCE of a surface inside the outline; SceneError if there is none."""
     from bstcad.optics.bspline import BSplineSurface
 
@@ -453,7 +443,7 @@ def net_extent(outline: Outline, net: Sides) -> tuple[float, float]:
 
 
 def net_complaints(outline: Outline, points: Sides | None) -> Iterator[str]:
-    """Complain of the number of control points of a net over an outline; None: it is chosen later."""
+    """Complain of the number of control points of a net for a lens of this outline; None: it is chosen later."""
     m, n = as_pair(points or MIN_ROUND_POINTS)
     if outline.is_round and m != n:
         yield f"a round lens (lens.outline) needs a square net, not {m} x {n} control points; give one number"
@@ -463,12 +453,20 @@ def net_complaints(outline: Outline, points: Sides | None) -> Iterator[str]:
 
 
 Front = Annotated[
-    Annotated[Union[*(front for _, front in FRONTS.values()), NetFront], Field(discriminator="kind")],
+    Annotated[PlaneFront | SphereFront | ConicFront | ToroidFront | NetFront, Field(discriminator="kind")],
     BeforeValidator(as_front),
 ]
 
 
 # ---- back and lens ---------------------------------------------------------------------------------------------------
+
+
+def stated_index(material: str | None, index: float | None, wavelength: float) -> float:
+    """Return the refractive index that a table states, by itself or by its material, at a wavelength (nm)."""
+    if index is not None:
+        return index
+    assert material is not None  # `complaints` refuse a table without either
+    return refractive_index(material, wavelength)
 
 
 class Back(Record):
@@ -478,15 +476,10 @@ class Back(Record):
     z: Annotated[float, Key("Position of the flat face before tailoring.", "mm", *COORDINATES, example=20.0)]
     control_points: Annotated[
         OneOrTwo | None,
-        Key(
-            "Control points of the net along each side, or [along x, along y]; bstcad chooses them if absent.", "",
-            5, MAX_CONTROL_POINTS, example=257,
-        ),
-    ] = None  # fmt: skip
+        Key("Control points per side, or [along x, along y]; chosen if absent.", "", *NET_SIZES, example=257),
+    ] = None
     reflect: Annotated[bool, Key("A mirror: light comes along -z and goes back along +z.")] = False
-    optimise: Annotated[
-        bool, Key("The back is tailored; false: it stays flat, and only the front is tailored.", example=False)
-    ] = True
+    optimise: Annotated[bool, Key("Tailor the back; if false it stays flat.", example=False)] = True
 
     written = leaving_out(optimise=True)
 
@@ -494,9 +487,7 @@ class Back(Record):
     def net(self) -> Sides:
         """Control points per side, or along x and along y if these differ; SceneError if they are not given."""
         if self.control_points is None:
-            raise SceneError(
-                "lens.back.control_points: missing, and not chosen yet; use bstcad.design, or give a number"
-            )
+            raise SceneError("lens.back.control_points: missing, and not chosen; use bstcad.design, or give a number")
         return simplified(self.control_points)
 
 
@@ -522,20 +513,14 @@ class LensBlank(Record):
     reflects, light crosses the back before and after the front.
     """
 
-    material: Annotated[str | None, Key("Name on refractiveindex.info; or give the index.")] = None
-    index: Annotated[float | None, Key("Refractive index at one wavelength.", "", *INDICES, example=1.49)] = None
+    material: Annotated[str | None, Key("ParameterName on refractiveindex.info; or give the index.")] = None
+    index: Annotated[float | None, Key("Refractive index, in place of material.", "", *INDICES, example=1.49)] = None
     outline: Annotated[Outlined, Key("Rim of the lens.", example={"shape": "rectangle", "width": 24.0, "height": 24.0})]
     front: Annotated[Front, Key("The face that light enters.", example={"kind": "plane", "z": 8.0})]
-    back: Annotated[
-        Back, Key("The face that is tailored.", example={"kind": "bspline", "z": 20.0, "control_points": 257})
-    ]
-    tool_radius: Annotated[
-        float | None, Key("Minimum radius of the valleys of a tailored face: that of the tool.", "mm", 1e-6, 1e9)
-    ] = None
+    back: Annotated[Back, Key("The tailored face.", example={"kind": "bspline", "z": 20.0, "control_points": 257})]
+    tool_radius: Annotated[float | None, Key("Radius of the tool: minimum radius of valleys.", "mm", 1e-6, 1e9)] = None
     mould: Annotated[bool, Key("The tool cuts a mould: tool_radius bounds the ridges.", example=True)] = False
-    max_slope: Annotated[
-        float | None, Key("Maximum angle of a tailored face to the plane z = const.", "degrees", 1e-3, 89.0)
-    ] = None
+    max_slope: Annotated[float | None, Key("Maximum slope of a tailored face.", "degrees", 1e-3, 89.0)] = None
     min_thickness: Annotated[float, Key("Minimum thickness along z; faces move to keep it.", "mm", *LENGTHS)] = 0.5
     max_thickness: Annotated[float | None, Key("Maximum thickness along z.", "mm", *LENGTHS)] = None
     edge_thickness: Annotated[float | None, Key("Minimum thickness along the rim.", "mm", *LENGTHS)] = None
@@ -552,9 +537,7 @@ class LensBlank(Record):
 
     def index_at(self, wavelength: float) -> float:
         """Return the refractive index at a wavelength (nm); 1 if light does not enter the solid."""
-        if not self.passes.enters:
-            return 1.0
-        return refractive_index(self.material, wavelength) if self.index is None else self.index
+        return stated_index(self.material, self.index, wavelength) if self.passes.enters else 1.0
 
     @property
     def bounded_by(self) -> tuple[str, ...]:
@@ -593,14 +576,15 @@ class LensBlank(Record):
         return tuple(face for face in self.passes.faces if tailored[face])
 
     def front_net(self, net: Sides) -> Sides | None:
-        """Return the control points of a freeform front for a back of `net`; None if the front is not a net.
+        """Return the control points of a freeform front for a back of `net`; None if the front is not a net."""
+        if self.front.is_tailored:
+            return self._tailored_front_net(net)
+        fixed = _net_of(self.front.surface, self.outline) if isinstance(self.front, _FittedFront) else self.front.file
+        return None if fixed is None else simplified(fixed.shape)
 
-        A tailored front keeps the scene's ratio of control points to the back; a fixed net keeps its own number.
-        """
-        if not self.front.is_tailored:
-            front = self.front.file_net or self.front_surface
-            return simplified(front.shape) if isinstance(front, FileNet) or front.is_net else None
-        own = self.front.file_net.shape if self.front.file_net else self.front.control_points
+    def _tailored_front_net(self, net: Sides) -> Sides:
+        """Return the control points of a tailored front for a back of `net`, in the ratio that the scene has."""
+        own = self.front.file.shape if self.front.file else self.front.control_points
         if own is None:
             return net
         if self.back.control_points is None:  # the ratio is not known yet
@@ -617,12 +601,12 @@ class LensBlank(Record):
         """Return the front before tailoring for a back of `net`; as_wide_as: see Scene.flat_lens."""
         if not self.front.is_tailored:
             return self.front_surface
-        if self.front.file_net is not None:
-            return self.front.file_net.surface(self.front.z).refined(self.front_net(net))
+        if self.front.file is not None:
+            return self.front.file.surface(self.front.z).refined(self._tailored_front_net(net))
         from bstcad.optics.bspline import BSplineSurface
 
-        half_x, half_y = net_extent(self.outline, self.front_net(as_wide_as or net))
-        heights = torch.zeros(as_pair(self.front_net(net)), dtype=torch.float64)
+        half_x, half_y = net_extent(self.outline, self._tailored_front_net(as_wide_as or net))
+        heights = torch.zeros(as_pair(self._tailored_front_net(net)), dtype=torch.float64)
         return BSplineSurface(self.front.z, heights, (-half_x, half_x), (-half_y, half_y))
 
     @property

@@ -12,35 +12,35 @@ from typing import Any
 
 from bstcad.scene.errors import SceneError
 
-PICTURES = ("text", "image", "sample", "uniform", "profile")  # keys of which a target has exactly one
-OUTLINES = (
-    "source.aperture", "lens.outline", "target.outline", "lens.front.outline", "before.outline", "behind.outline",
-)  # fmt: skip
-ONE_OF = {  # alternative keys of a table; setting one removes the others
-    "target": PICTURES, **dict.fromkeys(("lens", "before", "behind"), ("material", "index")),
+PICTURE_KEYS = ("text", "image", "sample", "uniform", "profile")  # keys of which a target has exactly one
+OUTLINES = ("source.aperture", *(f"{table}.outline" for table in ("lens", "target", "lens.front", "before", "behind")))
+ONE_OF: dict[str, tuple[str, ...]] = {  # alternative keys of a table; setting one removes the others
+    "target": PICTURE_KEYS,
+    **dict.fromkeys(("lens", "before", "behind"), ("material", "index")),
     **dict.fromkeys(OUTLINES, ("radius", "diameter")),
-}  # fmt: skip
+}
 STEP = re.compile(r"([^\[\]]+)(?:\[(\d{1,6})\])?")  # name, and number of a table in its list
 
 Step = tuple[str, int | None]
 
 
 def override(data: dict[str, Any], key: str, value: Any, shown: str) -> None:
-    """Set the value of a dotted key, called `shown` in messages; None removes it.  Its alternatives (ONE_OF) go."""
-    found = [STEP.fullmatch(part) for part in key.split(".")]
-    if not all(found):
-        raise SceneError(f"{shown}: is not a dotted key; write for example lens.back.control_points")
-    *tables, last = ((match[1], None if match[2] is None else int(match[2])) for match in found)
+    """Set the value of a dotted key and remove its alternatives (ONE_OF); None removes it; shown: key in messages."""
+    steps = []
+    for part in key.split("."):
+        if (match := STEP.fullmatch(part)) is None:
+            raise SceneError(f"{shown}: is not a dotted key; write for example lens.back.control_points")
+        steps.append((match[1], None if match[2] is None else int(match[2])))
+    *tables, (name, number) = steps
     table = data
-    for k, step in enumerate(tables):
-        table = _inner(table, step, [*tables, last][k:], shown)
-    name, number = last
+    for k in range(len(tables)):
+        table = _inner(table, steps[k:], shown)
     if number is not None:
-        _set_table(table, last, value, shown)
+        _set_table(table, name, number, value, shown=shown)
     elif value is None:
         table.pop(name, None)
     else:
-        alternatives = ONE_OF.get(".".join(name for name, _ in tables), ())
+        alternatives = ONE_OF.get(".".join(table for table, _ in tables), ())
         for other in alternatives if name in alternatives else ():
             table.pop(other, None)
         table[name] = copy.deepcopy(value)  # a later key may change parts of it
@@ -58,17 +58,18 @@ def tables_at(node: Any, key: str, shown: str = "") -> Iterator[tuple[str, Any]]
         yield from tables_at(node[name], rest, f"{shown}.{name}".lstrip("."))
 
 
-def _inner(table: dict[str, Any], step: Step, steps: Sequence[Step], shown: str) -> dict[str, Any]:
-    """Return the table at a step of a key; steps: this step and those after it, for a message."""
-    name, number = step
+def _inner(table: dict[str, Any], steps: Sequence[Step], shown: str) -> dict[str, Any]:
+    """Return the table at the first of the steps that are left of a key."""
+    name, number = steps[0]
     inner = table.setdefault(name, {})
     listed = isinstance(inner, list) and all(isinstance(part, dict) for part in inner)
     if number is not None:
-        inner = _tables(inner, step, shown)
-        _check_number(inner, step, shown, len(inner))
+        inner = _tables(inner, name, shown)
+        if number >= len(inner):
+            raise _no_such_table(inner, name, number, shown)
         inner = inner[number]
     elif listed and len(inner) > 1:
-        example = ".".join([f"{name}[0]", *(_written(other) for other in steps[1:])])
+        example = ".".join([f"{name}[0]", *(_step_text(other) for other in steps[1:])])
         raise SceneError(f"{shown}: there are {len(inner)} [[{name}]] tables; write the number of one, {example}")
     elif listed and inner:
         inner = inner[0]
@@ -77,31 +78,29 @@ def _inner(table: dict[str, Any], step: Step, steps: Sequence[Step], shown: str)
     return inner
 
 
-def _set_table(table: dict[str, Any], step: Step, value: Any, shown: str) -> None:
+def _set_table(table: dict[str, Any], name: str, number: int, value: Any, shown: str) -> None:
     """Replace one table of a list, append one, or remove one (None)."""
-    name, number = step
-    inner = [*_tables(table.get(name, []), step, shown)]
-    _check_number(inner, step, shown, len(inner) + (value is not None))
+    inner = [*_tables(table.get(name, []), name, shown)]
+    if number >= len(inner) + (value is not None):
+        raise _no_such_table(inner, name, number, shown)
     inner[number : number + 1] = [] if value is None else [copy.deepcopy(value)]
     table[name] = inner
 
 
-def _tables(found: Any, step: Step, shown: str) -> list[Any]:
+def _tables(found: Any, name: str, shown: str) -> list[Any]:
     """Return the value of a key as a list of tables."""
     if not isinstance(found, dict | list):
-        raise SceneError(f"{shown}: {step[0]} is not a table; set all of it at once")
+        raise SceneError(f"{shown}: {name} is not a table; set all of it at once")
     return [found] if isinstance(found, dict) else found
 
 
-def _check_number(tables: list[Any], step: Step, shown: str, size: int) -> None:
-    """Raise SceneError if the number of a table in a list is not less than `size`."""
-    name, number = step
-    if number >= size:
-        last = f"the last one is {name}[{len(tables) - 1}]" if tables else "the list is empty"
-        raise SceneError(f"{shown}: there is no {name}[{number}], as {last}; count from 0")
+def _no_such_table(tables: list[Any], name: str, number: int, shown: str) -> SceneError:
+    """Return the error for a list of tables without the table of this number."""
+    last = f"the last one is {name}[{len(tables) - 1}]" if tables else "the list is empty"
+    return SceneError(f"{shown}: there is no {name}[{number}], as {last}; count from 0")
 
 
-def _written(step: Step) -> str:
+def _step_text(step: Step) -> str:
     """Return a step as a key has it."""
     name, number = step
     return name if number is None else f"{name}[{number}]"

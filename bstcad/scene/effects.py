@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from importlib.metadata import entry_points
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, TypeVar
 
 from pydantic import Field, PrivateAttr
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 METAL = "Al"  # default metal of a mirror
 PACKAGES = "bstcad.effects"  # group of entry points with which an installed package adds effects
-Makes = Callable[[float], Any]  # function of a wavelength (nm) that returns a loss (optics.interfaces.Loss)
-_KNOWN: dict[str, Makes] = {}  # functions registered by `effect`, by name
+LossFactory = Callable[[float], Any]  # function of a wavelength (nm) that returns a loss (optics.interfaces.Loss)
+_REGISTERED: dict[str, LossFactory] = {}  # functions registered by `effect`, by name
 
 
 class Coating(Record):
@@ -36,8 +36,7 @@ class Fresnel(Record):
     kind: Annotated[Literal["fresnel"], Key("Reflection at the faces.")]
     polarisation: Annotated[Literal["none", "s", "p"], Key("Polarisation relative to the plane of incidence.")] = "none"
     coating: Annotated[
-        Coating | None,
-        Key("A single layer on both faces of a lens.", example={"index": 1.38, "thickness": 100.0}),
+        Coating | None, Key("A single layer on both faces of a lens.", example={"index": 1.38, "thickness": 100.0})
     ] = None
     metal: Annotated[str | None, Key("Metal of a mirror; Al if absent.")] = None
 
@@ -46,9 +45,7 @@ class Absorption(Record):
     """Beer-Lambert absorption along the path in the glass, in tailoring and verification."""
 
     kind: Annotated[Literal["absorption"], Key("Absorption along the path in the glass.")]
-    coefficient: Annotated[float | None, Key("Absorption coefficient; the material's if absent.", "1/mm", 0.0, 1e3)] = (
-        None
-    )
+    coefficient: Annotated[float | None, Key("Absorption; that of the material if absent.", "1/mm", 0.0, 1e3)] = None
 
 
 class Ghost(Record):
@@ -66,11 +63,11 @@ class Own(Record):
 
     kind: Annotated[Literal["own"], Key("A loss of flux defined by a script or an installed package.")]
     name: Annotated[str, Key("Name that the script or the package gave the effect.", example="dust")]
-    _makes: Makes | None = PrivateAttr(None)  # pickled with the record for other processes
+    _makes: LossFactory | None = PrivateAttr(None)  # pickled with the record for other processes
 
     def model_post_init(self, context: Any) -> None:
         """Find the function with the effect's name."""
-        self._makes = _KNOWN.get(self.name) or _installed(self.name)
+        self._makes = _REGISTERED.get(self.name) or _installed(self.name)
 
     def of(self, wavelength: float) -> Any:
         """Return the loss at a wavelength (nm)."""
@@ -78,7 +75,7 @@ class Own(Record):
         return self._makes(wavelength)
 
 
-def effect(name: str, makes: Makes) -> Own:
+def effect(name: str, makes: LossFactory) -> Own:
     """Return an effect of your own for scene.changed({"effects": [...]}): a loss of flux at faces or in the glass.
 
     makes(wavelength in nm) returns an object with a method share(cos_in, cos_out, path).  This returns the fraction of
@@ -89,17 +86,18 @@ def effect(name: str, makes: Makes) -> Own:
     that opens such a design calls `effect` first; an installed package declares an entry point NAME = "module:makes"
     of the group "bstcad.effects" instead.
     """
-    _KNOWN[name] = makes
+    _REGISTERED[name] = makes
     return Own(kind="own", name=name)
 
 
-def _installed(name: str) -> Makes | None:
+def _installed(name: str) -> LossFactory | None:
     """Return the function that an installed package declares under a name; None if there is none."""
     return next((found.load() for found in entry_points(group=PACKAGES, name=name)), None)
 
 
-Effect = Annotated[Fresnel | Absorption | Ghost | Own, Field(discriminator="kind")]
-Effects = tuple[Effect, ...]
+Effect: TypeAlias = Annotated[Fresnel | Absorption | Ghost | Own, Field(discriminator="kind")]
+Effects: TypeAlias = tuple[Effect, ...]
+OneEffect = TypeVar("OneEffect", bound=Record)
 
 
 def complaints(effects: Effects, lens: LensBlank) -> Iterator[str]:
@@ -131,20 +129,20 @@ def _name(effect: Effect) -> str:
     return effect.name if isinstance(effect, Own) else effect.kind
 
 
-def named(effects: Effects, kind: type) -> Record | None:
+def find_effect(effects: Effects, kind: type[OneEffect]) -> OneEffect | None:
     """Return the effect of a class; None if the scene does not have it."""
     return next((effect for effect in effects if isinstance(effect, kind)), None)
 
 
 def reflection_of(effects: Effects) -> Fresnel | None:
     """Return the reflection of the scene; that of bare faces if it has only a ghost; None if it has neither."""
-    bare = Fresnel(kind="fresnel") if named(effects, Ghost) else None
-    return named(effects, Fresnel) or bare
+    bare = Fresnel(kind="fresnel") if find_effect(effects, Ghost) else None
+    return find_effect(effects, Fresnel) or bare
 
 
 def ghost(effects: Effects) -> GhostTracer | None:
     """Return the function that traces light reflected twice inside the lens; None if the scene has no ghost."""
-    if named(effects, Ghost) is None:
+    if find_effect(effects, Ghost) is None:
         return None
     from bstcad.optics.trace import ghost_light
 
@@ -156,21 +154,23 @@ def losses(effects: Effects, lens: LensBlank, wavelength: float) -> Losses | Non
 
     Raises ValueError, in one sentence, if the data of the material do not suffice.
     """
-    fresnel, absorption = reflection_of(effects), named(effects, Absorption)
+    fresnel, absorption = reflection_of(effects), find_effect(effects, Absorption)
     others = [effect for effect in effects if isinstance(effect, Own)]
     if fresnel is None and absorption is None and not others:
         return None
     from bstcad.optics import losses as physics
 
-    reflection = absorbed = None
+    reflection = absorbed = coating = None
     if fresnel is not None:
-        coating = fresnel.coating and physics.CoatingLayer(fresnel.coating.index, fresnel.coating.thickness)
+        if (layer := fresnel.coating) is not None:
+            coating = physics.CoatingLayer(layer.index, layer.thickness)
         metal = media.complex_index(fresnel.metal or METAL, wavelength) if lens.passes.reflects else None
         reflection = physics.FresnelLoss(wavelength, fresnel.polarisation, coating, metal)
     if absorption is not None:
-        given = absorption.coefficient
-        absorbed = physics.AbsorptionLoss(
-            media.absorption_coefficient(lens.material, wavelength) if given is None else given
-        )
+        coefficient = absorption.coefficient
+        if coefficient is None:
+            assert lens.material is not None  # otherwise `complaints` has refused the scene
+            coefficient = media.absorption_coefficient(lens.material, wavelength)
+        absorbed = physics.AbsorptionLoss(coefficient)
     own = tuple(physics.CustomLoss(other.name, wavelength, other.of(wavelength)) for other in others)
     return physics.Losses(reflection, absorbed, own)

@@ -9,30 +9,25 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
 from pydantic import Field
 
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import Interface, Reflect, Refract
 from bstcad.optics.key import Key
-from bstcad.optics.media import refractive_index
 from bstcad.optics.rays import Status, Vector, axes
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.tilted import TiltedSurface
 from bstcad.optics.unfolding import Image, image
-from bstcad.scene.blank import INDICES, LensBlank, Outlined
+from bstcad.scene.blank import CURVATURES, INDICES, LensBlank, Outlined, stated_index
 from bstcad.scene.errors import with_target_key
 from bstcad.scene.schema import COORDINATES, LENGTHS, Record, leaving_out
 from bstcad.scene.target import DIRECTIONS, Target, is_faced
 
 MAX_TILT = 40.0  # degrees; a mirror at 45 reflects light across the axis, neither up nor down along z
-CURVATURES = (-1e3, 1e3)  # range of the curvature, 1/mm
 MAX_SPHERE_BEND = 0.85  # largest (c r)² of a sphere at its rim; a hemisphere has 1
-Tilt = Annotated[
-    tuple[float, float] | None,
-    Key("Tilt about x, then about y.", "degrees", -MAX_TILT, MAX_TILT, example=[0.0, 20.0]),
-]
+TILT = Key("Tilt about x, then about y.", "degrees", -MAX_TILT, MAX_TILT, example=[0.0, 20.0])
 RIM = Key("Outline of the clear aperture, seen along z.", example={"shape": "circle", "diameter": 40.0})
 
 
@@ -49,7 +44,7 @@ class Window(Record):
         tuple[float, float],
         Key("Curvatures of the face with the lower z and of the other.", "1/mm", *CURVATURES, example=[0.01, 0.011]),
     ] = (0.0, 0.0)
-    tilt: Tilt = None
+    tilt: Annotated[tuple[float, float] | None, TILT] = None
 
     written = leaving_out(curvature=(0.0, 0.0))
 
@@ -79,12 +74,9 @@ class Window(Record):
 
     def interfaces(self, sense: int, wavelength: float) -> tuple[Interface, ...]:
         """Return the faces in the order of light along sense · z, at a wavelength (nm)."""
-        n = refractive_index(self.material, wavelength) if self.index is None else self.index
-        first, second = self.faces()[::sense]
-        return (
-            Interface(first, self.outline, Refract(1.0, n), Status.BLOCKED),
-            Interface(second, self.outline, Refract(n, 1.0), Status.BLOCKED),
-        )
+        n = stated_index(self.material, self.index, wavelength)
+        pairs = zip(self.faces()[::sense], (Refract(1.0, n), Refract(n, 1.0)), strict=True)
+        return tuple(Interface(face, self.outline, law, Status.BLOCKED) for face, law in pairs)
 
 
 class Mirror(Record):
@@ -94,7 +86,7 @@ class Mirror(Record):
     z: Annotated[float, Key("Position of the face on the axis.", "mm", *COORDINATES, example=120.0)]
     outline: Annotated[Outlined, RIM]
     curvature: Annotated[float, Key("Curvature; positive bends towards +z.", "1/mm", *CURVATURES, example=0.002)] = 0.0
-    tilt: Tilt = None
+    tilt: Annotated[tuple[float, float] | None, TILT] = None
 
     written = leaving_out(curvature=0.0)
 
@@ -118,12 +110,12 @@ class Mirror(Record):
 
     def interfaces(self, sense: int, wavelength: float) -> tuple[Interface, ...]:
         """Return the face as an interface."""
-        return (Interface(*self.faces(), self.outline, Reflect(), Status.BLOCKED),)
+        return tuple(Interface(face, self.outline, Reflect(), Status.BLOCKED) for face in self.faces())
 
 
-Element = Annotated[Window | Mirror, Field(discriminator="kind")]
-Elements = tuple[Element, ...]
-Around = tuple[tuple[Interface, ...], tuple[Interface, ...]]  # interfaces before the lens, and behind it
+Element: TypeAlias = Annotated[Window | Mirror, Field(discriminator="kind")]
+Elements: TypeAlias = tuple[Element, ...]
+Around: TypeAlias = tuple[tuple[Interface, ...], tuple[Interface, ...]]  # interfaces before the lens, and behind it
 
 
 def _tilted_faces(element: Window | Mirror, middle: float) -> tuple[Plane | Sphere | TiltedSurface, ...]:

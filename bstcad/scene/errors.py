@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from pydantic import ValidationError
     from pydantic_core import ErrorDetails
 
-NAME = r"""[\w-]+|"[^"\n]*"|'[^'\n]*'"""  # name between the dots of a TOML key
-DOTTED = rf"(?:{NAME})(?:\s*\.\s*(?:{NAME}))*"
+KEY_NAME = r"""[\w-]+|"[^"\n]*"|'[^'\n]*'"""  # name between the dots of a TOML key
+DOTTED = rf"(?:{KEY_NAME})(?:\s*\.\s*(?:{KEY_NAME}))*"
 HEADER, KEY = re.compile(rf"\s*(\[\[?)\s*({DOTTED})\s*\]"), re.compile(rf"\s*({DOTTED})\s*=")
 
 NOT_BUILT = {  # unknown words of features that bstcad does not have yet, with the beginning of a sentence on each
@@ -56,7 +56,7 @@ def nearest(word: str, known: list[str], otherwise: str) -> str:
     """Return "did you mean …?" for a misspelt word, or else a list of all known words.
 
     A word of NOT_BUILT has "… not built yet" before the list.  Words are compared by difflib's ratio: twice the number
-    of letters that they share in order, over the number of all letters.
+    of letters that they share in order, divided by the number of all letters.
     """
     choices = f"{otherwise} {', '.join(known)}"
     if missing := NOT_BUILT.get(word.casefold()):
@@ -115,7 +115,7 @@ class _Location:
     def example(self) -> str:
         """The key with a value, or as a table with its required keys."""
         name = self.key.rpartition(".")[2]
-        node = next((o["properties"][name] for o in self.owners if name in o["properties"]), {})
+        node: Node = next((o["properties"][name] for o in self.owners if name in o["properties"]), {})
         if "examples" in node:
             return f"{name} = {toml(node['examples'][0])}"
         required = ", ".join(self.records[0].get("required", ())) if self.records else ""
@@ -138,7 +138,7 @@ def _sentence(problem: ErrorDetails) -> str:
 def _type_sentence(kind: str, location: _Location, value: Any, context: Mapping[str, Any]) -> str:
     """Return the sentence on an error that pydantic reports."""
     key, last = location.key, location.key.rpartition(".")[2]
-    shown = _shown(value)
+    shown = _value_text(value)
     tag, name = str(context.get("tag")), context.get("discriminator", "").strip("'")
     if kind in UNKNOWN_KEY:
         known = sorted({name for owner in location.owners for name in owner["properties"]})
@@ -161,7 +161,7 @@ def _type_sentence(kind: str, location: _Location, value: Any, context: Mapping[
     return f"{key}: " + sentence.format(shown=shown, example=location.example, listed=location.listed, **context)
 
 
-def _shown(value: Any) -> str:
+def _value_text(value: Any) -> str:
     """Return a value as a file has it, at most 40 characters."""
     text = repr(value) if not isinstance(value, bool) else str(value).lower()
     return text if len(text) <= 40 else text[:39] + "…"
@@ -199,4 +199,4 @@ def line_of(key: str, lines: Mapping[str, int]) -> int | None:
 
 def _plain(dotted: str) -> str:
     """Return a dotted key without quotes and spaces."""
-    return ".".join(name.strip("\"'") for name in re.findall(NAME, dotted))
+    return ".".join(name.strip("\"'") for name in re.findall(KEY_NAME, dotted))

@@ -9,8 +9,8 @@ from bstcad.optics.emitters import Emitter
 from bstcad.optics.outlines import Outline
 from bstcad.scene.blank import INDICES, LensBlank
 
-MIN_COVERAGE = 0.9  # smallest width of a beam as a fraction of the lens's width; the rest of the lens is wasted
-SAMPLES = 200  # points per side of the lens at which the irradiance is sampled
+MIN_BEAM_COVERAGE = 0.9  # smallest width of a beam as a fraction of the lens's width; the rest of the lens is wasted
+IRRADIANCE_SAMPLES = 200  # points per side of the lens at which the irradiance is sampled
 
 
 def complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
@@ -70,24 +70,23 @@ def unlit_complaints(source: Emitter, lens: LensBlank, rim: Outline) -> Iterator
     """Complain of a source, turned or moved sideways, that sends no light to the lens inside its rim."""
     if not (source.tilted or getattr(source, "centre", None)):
         return
-    z, sags = lens.back.z, (0.0,)
-    if lens.passes.sense > 0:
-        z, sags = lens.front.z, lens.front.surface.sags(rim)
-    x, y = sampling.grid(source.window(rim, z, sags), SAMPLES)
+    upwards = lens.passes.sense > 0
+    z, sags = (lens.front.z, lens.front.surface.sags(rim)) if upwards else (lens.back.z, (0.0,))
+    x, y = sampling.grid(source.window(rim, z, sags), IRRADIANCE_SAMPLES)
     if not bool((source.irradiance(x, y, z) > 0).any()):
         key = "tilt" if source.tilted else "centre"
         yield f"source.{key}: no light reaches the {lens.optic}; turn or move the source towards it"
 
 
 def doubts(source: Emitter, rim: Outline, key: str) -> Iterator[str]:
-    """Doubt a parallel beam wider than the lens, or narrower than MIN_COVERAGE of it; key: key of the rim."""
+    """Doubt a parallel beam wider than the lens, or narrower than MIN_BEAM_COVERAGE of it; key: key of the rim."""
     beam, _ = source.spot(0.0)
     if beam is None:  # without an edge
         return
     sides = [*zip("xy", beam.half_extent, rim.half_extent, strict=True)]
     if any(b > h for _, b, h in sides):
         yield "source.aperture: the beam is wider than the lens, and light beside the lens is lost; make it narrower"
-    for axis, b, h in [side for side in sides if side[1] < MIN_COVERAGE * side[2]][:1]:
+    for axis, b, h in [side for side in sides if side[1] < MIN_BEAM_COVERAGE * side[2]][:1]:
         yield (
             f"source.aperture: the beam is {2 * b:g} mm wide along {axis} and the lens {2 * h:g} mm; the lens is dark "
             f"outside {axis} = -{b:g} to {b:g} mm, so widen the beam or make {key} smaller"

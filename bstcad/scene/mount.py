@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 from pydantic import Field
@@ -40,26 +40,20 @@ class Part:
     organisation: Annotated[str | None, Key("Organisation of the author.")] = None
     material: Annotated[str | None, Key("Material as the drawing names it; lens.material if absent.")] = None
     density: Annotated[float | None, Key("Density; lens.material's if absent.", "g/cm³", 1e-3, 30.0)] = None
-    colour: Annotated[
-        str | None, Key('"#rrggbb", or "#rrggbbaa" with the opacity; pale blue or grey if absent.', example="#9ed3f580")
-    ] = None
+    colour: Annotated[str | None, Key('Colour "#rrggbb", or "#rrggbbaa" with opacity.', example="#9ed3f580")] = None
     surface_profile: Annotated[float | None, Key("Width of the tolerance zone of the back.", "mm", 1e-6, 10.0)] = None
     front_profile: Annotated[float | None, Key("Width of the tolerance zone of the front.", "mm", 1e-6, 10.0)] = None
     roughness: Annotated[float | None, Key("Maximum roughness Ra of the optical faces.", "nm", 0.01, 1e5)] = None
     coating: Annotated[str | None, Key("Coating of the optical faces, in words.")] = None
-    thickness_tolerance: Annotated[float | None, Key("Tolerance (+-) of the centre thickness.", "mm", 1e-6, 10.0)] = (
-        None
-    )
+    thickness_tolerance: Annotated[float | None, Key("Tolerance (±) of centre thickness.", "mm", 1e-6, 10.0)] = None
     date: Annotated[str | None, Key("Date of the drawing, ISO 8601.")] = None
-    schema: Annotated[
-        Literal["AP242", "AP214"], Key("Schema of lens.step; AP214 for older programs.", example="AP214")
-    ] = "AP242"
+    schema: Annotated[Literal["AP242", "AP214"], Key("STEP schema; AP214 for old programs.", example="AP214")] = "AP242"
 
     __pydantic_config__ = STRICT
 
     def of(self, lens: LensBlank) -> Part:
         """Return the entries with defaults from the lens: material, density and colour."""
-        known: dict[str, str | float | None] = {"colour": LENS_COLOUR if lens.passes.enters else MIRROR_COLOUR}
+        known: dict[str, Any] = {"colour": LENS_COLOUR if lens.passes.enters else MIRROR_COLOUR}
         if lens.material is not None:
             material = medium(lens.material)
             known |= {"material": material.name, "density": material.density}
@@ -121,7 +115,7 @@ class Box(Record):
         return Rounded(*size, corner_radius=r) if r else Rectangle(*size)
 
 
-Shape = Annotated[Round | Box, Field(discriminator="shape")]
+Shape: TypeAlias = Annotated[Round | Box, Field(discriminator="shape")]
 
 
 class Screws(Record):
@@ -174,13 +168,16 @@ class Mount(Record):
         """Return z (mm) in the scene of the origin of part.step; front: z of the front's vertex."""
         if self.datum == "source":
             return 0.0
-        return front if self.datum == "front" else self.flange.z
+        if self.datum == "front":
+            return front
+        assert self.flange is not None  # otherwise `complaints` has refused the scene
+        return self.flange.z
 
     def rim_of(self, outline: Outline) -> Round | Box:
         """Return the rim, in the part, of a lens with this outline."""
         if self.rim is not None:
             return self.rim
-        if outline.is_round:
+        if isinstance(outline, Circle):
             return Round(shape="circle", diameter=2 * outline.radius)
         return Box(shape="rectangle", width=outline.width, height=outline.height)
 
@@ -244,14 +241,14 @@ def parting(back: Surface, front: Surface, x: np.ndarray, y: np.ndarray) -> floa
 
 def complaints(mount: Mount, lens: LensBlank) -> Iterator[str]:
     """Yield the faults of a mount that can be found before the lens is tailored, each as a sentence."""
-    for key, shape in (("rim", mount.rim), ("flange.outline", mount.flange and mount.flange.outline)):
+    for key, shape in (("rim", mount.rim), ("flange.outline", mount.flange.outline if mount.flange else None)):
         if shape is not None and not shape.corner_radius < (half := min(shape.outline.half_extent)):
             size = f"{shape.corner_radius:g} mm is not less than {half:g} mm, half the width"
             yield f"mount.{key}.corner_radius: {size}; make it smaller"
     rim = mount.rim_of(lens.outline)
     if (lens.outline.depth(*rim.outline.rim_points()) < -1e-9).any():
         yield "mount.rim: extends past lens.outline; make it smaller, or the lens larger"
-    if (own := lens.front.outline) and not _inradius(rim) > own.radius:
+    if (own := lens.front.outline) and not _depth(rim, 0.0, 0.0) > own.radius:
         yield f"mount.rim: cuts the front, whose outline is {own.words}; make the rim larger"
     if mount.datum == "flange" and mount.flange is None:
         yield 'mount.datum: "flange" needs a [mount.flange]; add that table, or choose "front" or "source"'
@@ -281,16 +278,17 @@ def _wall_complaints(mount: Mount, lens: LensBlank, rim: Round | Box) -> Iterato
         yield f"mount.bevel: {mount.bevel:g} mm leaves nothing of a wall of {wall:.4g} mm; make it smaller"
     taken, half = mount.bevel + (top - front.min()) * tangent, min(rim.outline.half_extent)
     yield from _corner_complaints("mount.rim", rim, taken)
-    if (own := lens.front.outline) and not _inradius(rim) - taken > own.radius:
-        gap = f"only {_inradius(rim) - own.radius:.3g} mm lie between the rim and the front, {own.words}"
+    inradius = _depth(rim, 0.0, 0.0)
+    if (own := lens.front.outline) and not inradius - taken > own.radius:
+        gap = f"only {inradius - own.radius:.3g} mm lie between the rim and the front, {own.words}"
         yield f"{key}: draft and bevel remove {taken:.3g} mm, and {gap}; make them smaller"
     if not taken < half:
         yield f"{key}: draft and bevel remove {taken:.3g} mm, and rim and axis are {half:g} mm apart; make them smaller"
 
 
-def _inradius(shape: Round | Box) -> float:
-    """Return the radius (mm) of the largest circle about the axis inside the shape."""
-    return float(shape.outline.depth(np.zeros(1), np.zeros(1))[0])
+def _depth(shape: Round | Box, x: float, y: float) -> float:
+    """Return the distance (mm) of a point from the shape's rim, negative outside."""
+    return float(shape.outline.depth(np.array(x), np.array(y)))
 
 
 def _steepest_descent(front: Surface, rim: Outline) -> float:
@@ -331,9 +329,9 @@ def _flange_complaints(flange: Flange, lens: LensBlank, rim: Round | Box) -> Ite
         hole = f"{key}: hole {k}, of {diameter:g} mm at ({x:.4g}, {y:.4g}) mm,"
         if not diameter > 0:
             yield f"{hole} has no width; give a diameter above zero"
-        if not flange.outline.outline.depth(x, y) >= diameter / 2 + MIN_WEB + taken:
+        if not _depth(flange.outline, x, y) >= diameter / 2 + MIN_WEB + taken:
             yield f"{hole} is less than {MIN_WEB + taken:.3g} mm from the flange's edge; move it inwards"
-        if not -rim.outline.depth(x, y) >= diameter / 2 + MIN_WEB:
+        if not -_depth(rim, x, y) >= diameter / 2 + MIN_WEB:
             yield f"{hole} is less than {MIN_WEB:g} mm from the lens's rim; move it outwards"
         for m, (x1, y1, other) in enumerate(holes[: k - 1], start=1):
             if not math.hypot(x - x1, y - y1) >= (diameter + other) / 2 + MIN_WEB:

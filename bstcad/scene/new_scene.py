@@ -89,14 +89,14 @@ class Plate:
         return self.light.ahead * self.side
 
     @property
-    def magnified(self) -> float:
+    def magnification(self) -> float:
         """Ratio of the widths of picture and plate; the picture is as wide as the shadow of the plate."""
         return 1 + self.distance / self.before if self.before else 1.0
 
     @property
     def pixel(self) -> float:
         """Side of a pixel (mm)."""
-        return self.magnified * self.side / self.light.pixels
+        return self.magnification * self.side / self.light.pixels
 
     def source_image(self, distance: float) -> float:
         """Return the size (mm) of the source's image at a distance L (mm): 2 L tan(δ / 2), or d L / l from l before."""
@@ -113,7 +113,7 @@ class Plate:
 
     def expectation(self, blurred: float | None = None) -> str:
         """Return a sentence on the finest detail; blurred: RRMSD of the picture blurred by the source's image."""
-        wide, detail = self.magnified * self.side, self.detail(self.distance)
+        wide, detail = self.magnification * self.side, self.detail(self.distance)
         text = f"The finest detail on this wall is {detail:.2g} mm wide"
         if self.light.square:  # traced through the whole plate it is 4.86 mm, where the middle has 5.77
             text += " behind the middle of the plate, and less beside it, where the chip is seen at an angle"
@@ -129,7 +129,7 @@ class Plate:
             text += f". The blur is too large for this picture: it changes it by an RRMSD of {blurred:.2g}"
         return f"{text}."
 
-    def blurred(self, scene: Scene) -> float | None:
+    def blur_rrmsd(self, scene: Scene) -> float | None:
         """Return the RRMSD of the scene's picture blurred by the source's image; None for a source without size."""
         from bstcad.optics.measure import even_image
         from bstcad.optics.outlines import Circle, Rectangle
@@ -150,13 +150,13 @@ class Plate:
             plate=self,
             light=self.light,
             name=name,
-            title=_quoted(f"{name}, for {self.light.of}"),
+            title=_toml_string(f"{name}, for {self.light.of}"),
             header=textwrap.wrap(self.light.header, COMMENT_WIDTH),
-            picture=picture and _quoted(picture.as_posix()),
+            picture=picture and _toml_string(picture.as_posix()),
             rrmsd=blurred and min(max(math.ceil(100 * BLUR_MARGIN * blurred) / 100, MIN_RRMSD), MAX_RRMSD),
             blurred=blurred,
         )
-        return "\n".join(map(_aligned, text.split("\n")))
+        return "\n".join(map(_align_comment, text.split("\n")))
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,7 @@ def new_scene(
         if (picture, light, size, distance) != (None,) * 4:
             given = "a template has its own light, picture and sizes"
             raise SceneError(f"--template {template}: {given}; remove --template, or the other options")
-        _written(path, _template(template, name))
+        _write_scene(path, _template(template, name))
         return Written(path)
     if picture is not None:
         picture = Path(os.path.expanduser(picture))
@@ -200,8 +200,8 @@ def new_scene(
         [side] = _lengths("size", longer[1] or SIZE, "80", 1)
         size = in_proportions(side, photo_size(read_picture(folder / picture)))
     plate = Plate.of(light, size, distance)
-    scene = _written(path, plate.text(name, picture))
-    if (blurred := plate.blurred(scene)) is not None:
+    scene = _write_scene(path, plate.text(name, picture))
+    if (blurred := plate.blur_rrmsd(scene)) is not None:
         path.write_text(plate.text(name, picture, blurred), encoding="utf-8")
     *others, last = (name for name in LIGHTS if name != plate.light.name)
     made = f"The plate is for {plate.light.of}; --light {', '.join(others)} or {last} chooses another light."
@@ -231,13 +231,13 @@ def _lengths(name: str, given: str | float, example: str, count: int) -> list[fl
     return found
 
 
-def _aligned(line: str) -> str:
+def _align_comment(line: str) -> str:
     """Return a line with its comment in the column of comments, or two spaces behind a longer line."""
     keys, mark, comment = line.rpartition(" # ")
     return f"{keys:{COMMENT_COLUMN - 2}}  # {comment}" if mark else line
 
 
-def _quoted(text: str) -> str:
+def _toml_string(text: str) -> str:
     """Return a text as a TOML string, which has the syntax of JSON."""
     return json.dumps(text, ensure_ascii=False)
 
@@ -266,7 +266,7 @@ def _folder() -> Traversable:
     return inside if (inside := package / "templates").is_dir() else package / ".." / "templates"
 
 
-def _written(path: Path, text: str) -> Scene:
+def _write_scene(path: Path, text: str) -> Scene:
     """Write a new file of a scene and load it; remove the file again if the scene does not load."""
     from bstcad.scene.scene import load
 

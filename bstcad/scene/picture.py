@@ -19,31 +19,31 @@ import sys
 import threading
 import unicodedata
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
-from PIL import ExifTags, Image, ImageCms, ImageDraw, ImageFont
+from PIL import ExifTags, Image, ImageCms, ImageDraw, ImageFile, ImageFont
 
 from bstcad.runs import files
 from bstcad.scene.errors import SceneError
 from bstcad.scene.schema import FileContent
 
-FORMATS = {  # file name suffix of the copy for each format that is read
-    "PNG": ".png", "JPEG": ".jpg", "MPO": ".jpg", "TIFF": ".tif", "WEBP": ".webp", "BMP": ".bmp", "GIF": ".gif",
-    "HEIF": ".heic", "AVIF": ".avif",
-}  # fmt: skip
+# File name suffix of the copy for each format that is read; the second line has those in a HEIF file.
+FORMATS = {"PNG": ".png", "JPEG": ".jpg", "MPO": ".jpg", "TIFF": ".tif", "WEBP": ".webp", "BMP": ".bmp", "GIF": ".gif"}
+FORMATS |= {"HEIF": ".heic", "AVIF": ".avif"}
 PILLOW_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "GIF")  # formats read by Pillow; an MPO begins with a JPEG
 FORMAT_NAMES = "PNG, JPEG, TIFF, WebP, BMP, GIF, HEIC or AVIF"
 AVIF = (b"avif", b"avis")  # brands of a HEIF file with pixels in AV1: one picture, a sequence
 DESCRIPTION = 270  # tag of the description in a TIFF file
 IRRADIANCE = "irradiance"  # description of the file of an array, whose floats are irradiance
-MAX_PIXELS = 64_000_000  # largest number of pixels of a picture
-MAX_SIDE = 65_535  # largest number of pixels along a side, the limit of JPEG
+MAX_PICTURE_PIXELS = 64_000_000  # largest number of pixels of a picture
+MAX_PICTURE_SIDE = 65_535  # largest number of pixels along a side, the limit of JPEG
 TILE_WIDTH, TILE_LENGTH = 322, 323  # tags of a TIFF file, which is decoded by whole tiles
 MAX_TILE = 4096**2  # largest number of pixels of a tile; programs write tiles of up to 1024 per side
-MAX_FILE_SIZE = 400_000_000  # bytes; 64 million pixels of three 16-bit channels
+MAX_PICTURE_SIZE = 400_000_000  # bytes; 64 million pixels of three 16-bit channels
 MAX_PROFILE_SIZE = 10_000_000  # bytes of an ICC profile; profiles of printers have a few millions
 STRIP_ROWS = 256  # rows of a picture that are processed at a time
 INTEGERS = "16 bits or more and no colour tag: its numbers are taken as sRGB; gamma = 1 takes them as irradiance"
@@ -53,18 +53,18 @@ MAX_GAMMA = 10.0  # largest exponent of a file, and its inverse the smallest; ot
 LINEAR, PQ, HLG = 8, 16, 18  # transfer characteristics of a cICP chunk (ITU-T H.273)
 SWAPPED = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}  # opposite byte order of each order
 DEVICE = re.compile(r"(?:con|prn|aux|nul|com\d|lpt\d)(?:\..*)?", re.IGNORECASE)  # names of devices on Windows
-SAMPLES = ("astronaut", "camera")  # scikit-image's bundled pictures, public domain and CC0
+Sample = Literal["astronaut", "camera"]  # scikit-image's bundled pictures, public domain and CC0
+SAMPLES: tuple[str, ...] = get_args(Sample)
 
-UPRIGHT = {  # transposition of a picture for each orientation of the camera
-    2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_270, 7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_90,
-}  # fmt: skip
+# Transposition of a picture for each orientation of the camera, 2 to 8 (EXIF).
+TURNS = "FLIP_LEFT_RIGHT ROTATE_180 FLIP_TOP_BOTTOM TRANSPOSE ROTATE_270 TRANSVERSE ROTATE_90"
+UPRIGHT = {number: Image.Transpose[name] for number, name in enumerate(TURNS.split(), start=2)}
 
 _DECODING = threading.RLock()  # guards the error stream and the filters of warnings, which all threads share
 
-Box = tuple[int, int, int, int]  # left, top, right, bottom in whole pixels of a picture
-Curve = Callable[[np.ndarray], np.ndarray]  # function from numbers to irradiance, both from 0 to 1
+PixelBox: TypeAlias = tuple[int, int, int, int]  # left, top, right, bottom in whole pixels of a picture
+Curve: TypeAlias = Callable[[np.ndarray], np.ndarray]  # function from numbers to irradiance, both from 0 to 1
+Conversion: TypeAlias = Callable[[Image.Image], Image.Image]  # conversion of a picture's colours to sRGB
 
 
 @dataclass(frozen=True)
@@ -89,18 +89,17 @@ def safe_name(text: str) -> str:
 def read_picture(path: Path) -> Picture:
     """Read the picture file at `path`; SceneError if it is missing, too large or no picture."""
     try:
-        data = files.contents(path, MAX_FILE_SIZE)
+        data = files.contents(path, MAX_PICTURE_SIZE)
     except ValueError as error:
         reason = f"cannot be read ({error})" if os.path.lexists(path) else "not found"
         raise SceneError(f"target.image: {str(path)!r} {reason}; give a path relative to the scene file") from None
-    with decoding(path.name):
-        return Picture((safe_name(path.stem)[:70] or "picture") + FORMATS[_opened(path.name, data).format], data)
+    return Picture((safe_name(path.stem)[:70] or "picture") + kind_of(data, path.name), data)
 
 
-def kind_of(data: bytes) -> str:
+def kind_of(data: bytes, name: str = "the picture") -> str:
     """Return the file name suffix of a picture by its content, ".png"; SceneError if it is too large or no picture."""
-    with decoding("the picture"):
-        return FORMATS[_opened("the picture", data).format]
+    with decoding(name):
+        return FORMATS[str(_open_picture(name, data).format)]
 
 
 def from_array(values: np.ndarray) -> Picture:
@@ -119,8 +118,8 @@ def _array_faults(values: np.ndarray) -> Iterator[str]:
     """Yield the faults of an array that is not an irradiance."""
     if values.ndim != 2 or values.size == 0:
         yield f"an array of shape {values.shape} is not a picture; give irradiance of shape (rows, columns)"
-    if values.size > MAX_PIXELS or max(values.shape) > MAX_SIDE:
-        limit = f"more than {MAX_PIXELS // 10**6} million values, or more than {MAX_SIDE} along a side"
+    if values.size > MAX_PICTURE_PIXELS or max(values.shape) > MAX_PICTURE_SIDE:
+        limit = f"more than {MAX_PICTURE_PIXELS // 10**6} million values, or more than {MAX_PICTURE_SIDE} along a side"
         yield f"an array of shape {values.shape} has {limit}; average neighbouring values"
     if values.dtype.kind not in "buif":
         yield f"an array of {values.dtype} is not a picture; give real numbers"
@@ -133,8 +132,9 @@ def _array_faults(values: np.ndarray) -> Iterator[str]:
 
 
 @contextlib.contextmanager
-def decoding(name: str) -> Iterator[None]:
-    """Turn all errors of the decoders into one sentence, and silence their warnings."""
+def decoding(given: Picture | str) -> Iterator[None]:
+    """Turn all errors of the decoders into one sentence on a picture or its name, and silence their warnings."""
+    name = given if isinstance(given, str) else given.name
     try:
         with _DECODING, warnings.catch_warnings(), _silent():
             warnings.simplefilter("ignore")
@@ -165,7 +165,7 @@ def _silent() -> Iterator[None]:
         os.close(null)
 
 
-def _opened(name: str, data: bytes) -> Image.Image:
+def _open_picture(name: str, data: bytes) -> ImageFile.ImageFile:
     """Return the picture with its header read and its pixels not decoded yet."""
     sizes, kinds = [], f"no {FORMAT_NAMES} picture; save it as one of these"
     try:
@@ -181,16 +181,23 @@ def _opened(name: str, data: bytes) -> Image.Image:
         else:
             image = Image.open(io.BytesIO(data), formats=PILLOW_FORMATS)
     except Image.DecompressionBombError:
-        raise SceneError(f"target.image: {name!r} has over {MAX_PIXELS // 10**6} million pixels; shrink it") from None
+        raise SceneError(
+            f"target.image: {name!r} has more than {MAX_PICTURE_PIXELS // 10**6} million pixels; shrink it"
+        ) from None
     except (OSError, SyntaxError, ValueError, KeyError):  # KeyError: Pillow without AVIF
         raise SceneError(f"target.image: {name!r} is {kinds}") from None
     for width, height in (image.size, *sizes):
-        if width * height > MAX_PIXELS or max(width, height) > MAX_SIDE:
-            limit = f"more than {MAX_PIXELS // 10**6} million, or more than {MAX_SIDE} along a side"
+        if width * height > MAX_PICTURE_PIXELS or max(width, height) > MAX_PICTURE_SIDE:
+            limit = f"more than {MAX_PICTURE_PIXELS // 10**6} million, or more than {MAX_PICTURE_SIDE} along a side"
             raise SceneError(f"target.image: {name!r} has {width} x {height} pixels, {limit}; shrink it")
-    if image.format == "TIFF" and image.tag_v2.get(TILE_WIDTH, 1) * image.tag_v2.get(TILE_LENGTH, 1) > MAX_TILE:
+    if _tags(image).get(TILE_WIDTH, 1) * _tags(image).get(TILE_LENGTH, 1) > MAX_TILE:
         raise SceneError(f"target.image: {name!r} has tiles of more than {MAX_TILE} pixels; save it as PNG")
     return image
+
+
+def _tags(image: Image.Image) -> Mapping[int, Any]:
+    """Return the tags of a TIFF file by their numbers; none for another file."""
+    return getattr(image, "tag_v2", {})
 
 
 def _is_avif(data: bytes) -> bool:
@@ -226,18 +233,23 @@ class Photo:
     name: str  # file name, or name of the sample
     image: Image.Image
     curve: Curve
-    profile: Callable[[Image.Image], Image.Image] | None = None  # conversion of the picture's colours to sRGB
+    profile: Conversion | None = None  # the picture's ICC profile; None: the colours are sRGB
     low: Image.Image | None = None  # second bytes of colours of 16 bits, of which Pillow keeps the first
     white: float = 1.0  # number of white, for numbers of neither 8 nor 16 bits
     other_curve: Curve | None = None  # second possible curve of an untagged file of uncommon depth
     assumed: str = ""  # sentence on the assumed curve of such a file
     several: bool = False  # True if the file has further pictures
 
-    def part(self, box: Box) -> Photo:
+    def part(self, box: PixelBox) -> Photo:
         """Return a part of the picture."""
         return replace(self, image=self.image.crop(box), low=self.low and self.low.crop(box))
 
-    def light(self, box: Box) -> np.ndarray:
+    def negative(self) -> Photo:
+        """Return the negative of the picture."""
+        other = self.other_curve and _negative_curve(self.other_curve)
+        return replace(self, curve=_negative_curve(self.curve), other_curve=other)
+
+    def light(self, box: PixelBox) -> np.ndarray:
         """Return the grey irradiance (h, w) of a part, from 0 to 1, with transparency as black."""
         numbers, alpha = self.numbers(box)
         if alpha is not None:
@@ -248,11 +260,13 @@ class Photo:
         light_of, channels = self.curve(np.arange(maximum + 1.0) / maximum), np.moveaxis(numbers, -1, 0)
         return sum(light_of[channel] for channel in channels) / len(channels)  # .mean(-1) takes three times as long
 
-    def silhouette(self, box: Box) -> np.ndarray:
+    def silhouette(self, box: PixelBox) -> np.ndarray:
         """Return the irradiance (h, w) of a part from its opacity alone."""
-        return self.curve(self.numbers(box)[1])
+        _, alpha = self.numbers(box)
+        assert alpha is not None  # `transparency` has found a logo
+        return self.curve(alpha)
 
-    def numbers(self, box: Box) -> tuple[np.ndarray, np.ndarray | None]:
+    def numbers(self, box: PixelBox) -> tuple[np.ndarray, np.ndarray | None]:
         """Return numbers (h, w, channels), integers or floats from 0 to 1, and opacity (h, w) from 0 to 1 or None."""
         image, low, alpha = self.image.crop(box), self.low and self.low.crop(box), None
         if image.mode.startswith(("I", "F")):
@@ -300,7 +314,7 @@ class Photo:
         return False, f"target.image: transparency is taken as black ({percent:.3g} % of the picture)"
 
 
-def strips(box: Box) -> Iterator[Box]:
+def strips(box: PixelBox) -> Iterator[PixelBox]:
     """Yield the strips of a box of STRIP_ROWS rows each, from the top."""
     left, top, right, bottom = box
     return ((left, start, right, min(start + STRIP_ROWS, bottom)) for start in range(top, bottom, STRIP_ROWS))
@@ -320,30 +334,26 @@ def photo(given: Picture | str, gamma: float | None = None, invert: bool = False
         from skimage import data  # loads much of scikit-image, needed for samples only
 
         curve = power(1.0 if gamma is None else gamma)
-        return Photo(given, Image.fromarray(getattr(data, given)()), _inverted(curve) if invert else curve)
-    image = _opened(given.name, given.data)
-    deep = image.mode.startswith(("I", "F")) or any(";16" in str(tile[3]) for tile in image.tile)
-    image.load()
-    low, white = _second_bytes(image, given.data) if deep else None, _white(image)
-    turned = UPRIGHT.get(image.getexif().get(ExifTags.Base.Orientation))
-    stated = (power(gamma), None) if gamma is not None else _meaning(image, given.data)
-    curve, profile = stated or (power(1.0) if image.mode == "F" else from_srgb, None)  # floats are irradiance
-    other, assumed, several = None, "", bool(getattr(image, "is_animated", False))
-    if stated is None and deep and getattr(image, "tag_v2", {}).get(DESCRIPTION) != IRRADIANCE:
-        other = from_srgb if image.mode == "F" else power(1.0)
-        assumed = FLOATS if image.mode == "F" else INTEGERS
-    if turned is not None:
-        image, low = image.transpose(turned), low and low.transpose(turned)
-    curve, other = (_inverted(each) if invert and each else each for each in (curve, other))
-    return Photo(
-        given.name, image, curve, profile=profile, low=low, white=white, other_curve=other, assumed=assumed,
-        several=several,
-    )  # fmt: skip
+        return Photo(given, Image.fromarray(getattr(data, given)()), _negative_curve(curve) if invert else curve)
+    file = _open_picture(given.name, given.data)
+    deep = file.mode.startswith(("I", "F")) or any(";16" in str(tile[3]) for tile in file.tile)
+    file.load()
+    low = _second_bytes(file, given.data) if deep else None
+    stated = (power(gamma), None) if gamma is not None else _meaning(file, given.data)
+    curve, profile = stated or (power(1.0) if file.mode == "F" else from_srgb, None)  # floats are irradiance
+    several = getattr(file, "is_animated", False)
+    found = Photo(given.name, file, curve, profile, low=low, white=_white(file), several=several)
+    if stated is None and deep and _tags(file).get(DESCRIPTION) != IRRADIANCE:
+        other, assumed = (from_srgb, FLOATS) if file.mode == "F" else (power(1.0), INTEGERS)
+        found = replace(found, other_curve=other, assumed=assumed)
+    if (turn := UPRIGHT.get(file.getexif().get(ExifTags.Base.Orientation, 1))) is not None:
+        found = replace(found, image=file.transpose(turn), low=low and low.transpose(turn))
+    return found.negative() if invert else found
 
 
 def photo_size(given: Picture | str) -> tuple[int, int]:
     """Return width and height (pixels) of a picture file or a sample, upright."""
-    with decoding(getattr(given, "name", given)):
+    with decoding(given):
         return photo(given).image.size
 
 
@@ -351,11 +361,12 @@ def _white(image: Image.Image) -> float:
     """Return the number of white: 1 for floats and 65535 for 32 bits, or the largest number if that is more."""
     if image.mode not in ("I", "F"):
         return 1.0
-    usual, largest = 65535.0 if image.mode == "I" else 1.0, float(image.getextrema()[1])
-    return max(usual, largest) if math.isfinite(largest) else usual
+    usual, (_, largest) = 65535.0 if image.mode == "I" else 1.0, image.getextrema()
+    assert not isinstance(largest, tuple)  # one channel
+    return max(usual, float(largest)) if math.isfinite(largest) else usual
 
 
-def _inverted(curve: Curve) -> Curve:
+def _negative_curve(curve: Curve) -> Curve:
     """Return the curve of the negative: the sRGB tone t becomes 1 - t."""
     return lambda number: from_srgb(np.round(1.0 - to_srgb(np.clip(curve(number), 0.0, 1.0)), 12))  # exact 0 for 1
 
@@ -378,14 +389,10 @@ def _second_bytes(image: Image.Image, data: bytes) -> Image.Image | None:
     return other
 
 
-def _meaning(image: Image.Image, data: bytes) -> tuple[Curve, Callable | None] | None:
+def _meaning(image: Image.Image, data: bytes) -> tuple[Curve, Conversion | None] | None:
     """Return (curve, profile) as the file states them; None if it states nothing."""
-    transfer = (
-        re.search(rb"\x00\x00\x00\x04cICP.(.)", data.partition(b"IDAT")[0], re.DOTALL)
-        if image.format == "PNG"
-        else None
-    )
-    if transfer is not None:
+    header = data.partition(b"IDAT")[0] if image.format == "PNG" else b""
+    if transfer := re.search(rb"\x00\x00\x00\x04cICP.(.)", header, re.DOTALL):
         if transfer[1][0] in (PQ, HLG):
             raise SceneError("target.image: the file is an HDR picture (PQ or HLG); save it in sRGB, or set gamma")
         return (power(1.0) if transfer[1][0] == LINEAR else from_srgb), None
@@ -400,7 +407,7 @@ def _meaning(image: Image.Image, data: bytes) -> tuple[Curve, Callable | None] |
     return None
 
 
-def _profile(image: Image.Image) -> Callable[[Image.Image], Image.Image] | None:
+def _profile(image: Image.Image) -> Conversion | None:
     """Return the conversion of the picture's colours to sRGB by its ICC profile; None without a usable profile."""
     data = image.info.get("icc_profile")
     if not isinstance(data, bytes) or not 0 < len(data) <= MAX_PROFILE_SIZE:
@@ -413,10 +420,10 @@ def _profile(image: Image.Image) -> Callable[[Image.Image], Image.Image] | None:
         return None
     if (mode == "CMYK") != (image.mode == "CMYK") or (mode == "L" and image.mode not in ("1", "L", "LA", "I;16", "F")):
         return None
-    return lambda part: ImageCms.applyTransform(part if part.mode == mode else part.convert(mode), transform)
+    return lambda part: transform.apply(part if part.mode == mode else part.convert(mode))
 
 
-def _grey_curve(profile: Callable[[Image.Image], Image.Image]) -> Curve:
+def _grey_curve(profile: Conversion) -> Curve:
     """Return the curve of a grey profile of 8 bits, interpolated for finer numbers."""
     ramp = Image.fromarray(np.arange(256, dtype=np.uint8)[None])
     seen = from_srgb(np.asarray(profile(ramp)) / 255.0).mean(-1)[0]
@@ -449,8 +456,9 @@ def _ink(text: str, size: float) -> Image.Image:
 
 def _font(size: float, text: str) -> ImageFont.FreeTypeFont:
     """Return DejaVu Sans Bold from matplotlib's files, without importing matplotlib."""
-    [package] = importlib.util.find_spec("matplotlib").submodule_search_locations
-    font = ImageFont.truetype(f"{package}/mpl-data/fonts/ttf/DejaVuSans-Bold.ttf", size)
+    spec = importlib.util.find_spec("matplotlib")
+    assert spec is not None and spec.submodule_search_locations  # bstcad requires this package
+    font = ImageFont.truetype(f"{spec.submodule_search_locations[0]}/mpl-data/fonts/ttf/DejaVuSans-Bold.ttf", size)
     absent = bytes(font.getmask("\uffff"))  # box that a font draws for a letter that it does not have
     for letter in sorted(set(text) - {"\n"}):
         if not letter.splitlines()[0] or bytes(font.getmask(letter)) == absent:  # includes other line breaks than \n

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 from pydantic import Field
@@ -18,10 +18,11 @@ from bstcad.scene.schema import LENGTHS, Record
 
 # Gauss-Legendre nodes per cell of the quadrature, in which E changes by a factor of at most about e, or its 4th root.
 NODES, FEWER_NODES = 8, 4
-MAX_SAMPLES = 1 << 20  # values of E computed at a time
+MAX_VALUES = 1 << 20  # values of E computed at a time
 DARK = 1e-20  # E, relative to the centre, below which a pixel has no light
 
-Pixels, Size = tuple[int, int], tuple[float, float]  # (columns, rows), (width, height) in mm
+Pixels: TypeAlias = tuple[int, int]  # (columns, rows)
+Size: TypeAlias = tuple[float, float]  # (width, height), mm
 
 
 class _Profile(Record):
@@ -90,10 +91,8 @@ class GaussianProfile(_Profile):
 
     def light(self, pixels: Pixels, size: Size) -> np.ndarray:
         """Return exact means: ∫ exp(-2 x² / w²) dx = w sqrt(pi / 8) erf(sqrt(2) x / w), along x and along y."""
-        w = self.radius_1e2
-        along_x, along_y = (
-            w * math.sqrt(math.pi / 8) * np.abs(np.diff(erf(math.sqrt(2) * at / w))) for at in edges(pixels, size)
-        )
+        w, scale = self.radius_1e2, self.radius_1e2 * math.sqrt(math.pi / 8)
+        along_x, along_y = (scale * np.abs(np.diff(erf(math.sqrt(2) * at / w))) for at in edges(pixels, size))
         return np.outer(along_y, along_x) / cell(pixels, size)
 
 
@@ -117,9 +116,9 @@ class SuperGaussianProfile(_Profile):
         w, n = self.radius_1e2, self.order
         reach = w * (-math.log(DARK) / 2) ** (1 / n)
         found = np.zeros(pixels[::-1])
-        (x, columns), (y, rows) = (_lit(at, reach) for at in edges(pixels, size))
+        (x, columns), (y, rows) = (_lit_pixels(at, reach) for at in edges(pixels, size))
         (x, of_x), (y, of_y) = _nodes(x, w / n), _nodes(y, w / n)
-        high = max(MAX_SAMPLES // (x.size * of_y.size), 1)  # rows at a time
+        high = max(MAX_VALUES // (x.size * of_y.size), 1)  # rows at a time
         for row in range(0, len(y), high):
             strip = y[row : row + high]
             r = np.hypot(x.ravel(), strip.reshape(-1, 1))
@@ -173,7 +172,7 @@ def _distances(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(across, 0.0, np.minimum(*ends)), np.maximum(*ends)
 
 
-def _lit(at: np.ndarray, reach: float) -> tuple[np.ndarray, slice]:
+def _lit_pixels(at: np.ndarray, reach: float) -> tuple[np.ndarray, slice]:
     """Return the edges of the pixels within reach of a profile, and the slice of these pixels."""
     low, high = np.minimum(at[1:], at[:-1]), np.maximum(at[1:], at[:-1])
     lit = np.flatnonzero((low < reach) & (high > -reach))

@@ -9,17 +9,17 @@ from typing import Annotated, Any, Literal
 
 from bstcad.optics.key import Key
 from bstcad.optics.sides import MIN_SIDE, Sides, as_pair, coarser, side
-from bstcad.scene.blank import LensBlank
+from bstcad.scene.blank import NET_SIZES, LensBlank
 from bstcad.scene.schema import OneOrTwo, Record
 
-COMMON = {"method": "least-squares", "transport_iterations": 40, "stage1_iterations": 1000, "rounds": 10}
-OURS = COMMON | {"overshoot": 0.03, "precision": "float64"}
+COMMON_PRESET = {"method": "least-squares", "transport_iterations": 40, "stage1_iterations": 1000, "rounds": 10}
+OWN_PRESET = COMMON_PRESET | {"overshoot": 0.03, "precision": "float64"}  # settings of bstcad's own qualities
 # Settings of each quality; a setting of the scene replaces them.
 PRESETS: dict[str, dict[str, Any]] = {
-    "draft": OURS | {"transport_grid": 256, "rays": 512, "stage2_iterations": 8, "source_points": 16},
-    "standard": OURS | {"transport_grid": 512, "rays": 1536, "stage2_iterations": 98, "source_points": 64},
-    "fine": OURS | {"transport_grid": 512, "rays": 2048, "stage2_iterations": 300, "source_points": 128},
-    "paper": COMMON  # the procedure of Wang et al. 2023: Adam, no penalty
+    "draft": OWN_PRESET | {"transport_grid": 256, "rays": 512, "stage2_iterations": 8, "source_points": 16},
+    "standard": OWN_PRESET | {"transport_grid": 512, "rays": 1536, "stage2_iterations": 98, "source_points": 64},
+    "fine": OWN_PRESET | {"transport_grid": 512, "rays": 2048, "stage2_iterations": 300, "source_points": 128},
+    "paper": COMMON_PRESET  # the procedure of Wang et al. 2023: Adam, no penalty
     | {"method": "adam", "overshoot": 0.0, "precision": "float32"}
     | {"transport_grid": 1024, "rays": 1024, "stage2_iterations": 500, "source_points": 64},
 }
@@ -35,55 +35,45 @@ VERIFICATION_DRAW = 1 << 12  # number of the draw of these points; each further 
 class Tailoring(Record):
     """The effort of tailoring; a setting that is None has the value of its quality (PRESETS)."""
 
-    quality: Annotated[Literal["draft", "standard", "fine", "paper"], Key("More time, smaller error.")] = "standard"
+    quality: Annotated[Literal["draft", "standard", "fine", "paper"], Key("More time for a smaller error.")] = (
+        "standard"
+    )
     seed: Annotated[int, Key("Seed of all random numbers.", "", 0, 2**63 - 1)] = 0
     method: Annotated[
         Literal["least-squares", "adam", "integration"] | None,
-        Key(
-            "Method: least squares with slope maps, the paper's procedure, or integration without a stage 2.",
-            example="least-squares",
-        ),
+        Key("Least squares with slope maps, the paper's Adam, or integration alone.", example="least-squares"),
     ] = None
     levels: Annotated[
         tuple[OneOrTwo, ...] | None,
-        Key("Nets, coarse to fine: control points along the longer side, or [x, y].", "", 5, 2049, example=[129, 257]),
+        Key("Control points of the nets, coarse to fine, as for the back.", "", *NET_SIZES, example=[129, 257]),
     ] = None
-    transport_grid: Annotated[
-        int | None, Key("Cells per side of the transport problem.", "", 16, 2049, example=512)
-    ] = None
-    transport_iterations: Annotated[
-        int | None, Key("Iterations of the transport problem.", "", 1, 100_000, example=100)
-    ] = None
+    transport_grid: Annotated[int | None, Key("Cells per side of the transport map.", "", 16, 2049, example=512)] = None
+    transport_iterations: Annotated[int | None, Key("Transport map iterations.", "", 1, 100_000, example=100)] = None
     rays: Annotated[int | None, Key("Rays or flux tubes along each side of the light.", "", 16, 16_384)] = None
-    stage1_iterations: Annotated[
-        int | None, Key("Steps per level of the method adam.", "", 0, 1_000_000, example=300)
-    ] = None
-    rounds: Annotated[
-        int | None, Key("Maximum number of rounds of transport map and slope fit in stage 1.", "", 1, 100, example=10)
-    ] = None
+    stage1_iterations: Annotated[int | None, Key("Steps per level with adam.", "", 0, 1_000_000, example=300)] = None
+    rounds: Annotated[int | None, Key("Maximum rounds of map and slope fit in stage 1.", "", 1, 100, example=10)] = None
     stage2_iterations: Annotated[int | None, Key("Iterations of stage 2.", "", 0, 1_000_000, example=120)] = None
-    overshoot: Annotated[
-        float | None, Key("Weight of light outside the target, per pixel^2.", "", 0.0, 1e3, example=0.03)
-    ] = None
-    source_points: Annotated[
-        int | None, Key("Points of an extended source that measure the width of its image.", "", 2, 4096)
-    ] = None
+    overshoot: Annotated[float | None, Key("Weight of light off target per pixel².", "", 0.0, 1e3, example=0.03)] = None
+    source_points: Annotated[int | None, Key("Sample points of an extended source.", "", 2, 4096)] = None
     solution: Annotated[
         Literal["convex", "concave"] | None,
         Key("Two pictures: convex, no rays cross; concave, all cross; chosen if absent.", example="concave"),
     ] = None
-    precision: Annotated[
-        Literal["float32", "float64"] | None, Key("Precision of the numbers in tailoring.", example="float64")
-    ] = None
+    precision: Annotated[Literal["float32", "float64"] | None, Key("Precision of tailoring.", example="float64")] = None
     accuracy: Annotated[float | None, Key("RRMSD at which tailoring ends.", "", 1e-6, 10.0, example=0.05)] = None
     max_time: Annotated[
-        float | None, Key("Time from command to report; stage 1 always ends.", "s", 1.0, 1e7, example=60.0)
+        float | None, Key("Maximum time until the report; stage 1 always ends.", "s", 1.0, 1e7, example=60.0)
     ] = None
 
     @property
     def points_of_source(self) -> int:
         """Number of points that represent an extended source."""
         return self.source_points or PRESETS[self.quality]["source_points"]
+
+    @property
+    def chosen_method(self) -> str:
+        """Method of the scene, or of its quality."""
+        return self.method or PRESETS[self.quality]["method"]
 
     def resolved(self, net: Sides) -> ResolvedTailoring:
         """Return the settings with all values set, for a net of control points per side, or along x and along y.
@@ -96,7 +86,7 @@ class Tailoring(Record):
         # With fewer than two rays per cell and direction a checkerboard remains; a draft ends before it appears.
         rays_per_cell = 2**0.5 if self.quality == "draft" else 2
         preset["rays"] = max(preset["rays"], math.ceil(rays_per_cell * side(net)))
-        if (self.method or preset["method"]) == "integration":
+        if self.method == "integration":
             preset["stage2_iterations"] = 0
         if self.quality != "paper":  # a finer map has folds in corners, which a net cannot follow
             preset["transport_grid"] = min(preset["transport_grid"], max(2 * (max(as_pair(net)) - 1), COARSEST_GRID))
@@ -105,14 +95,14 @@ class Tailoring(Record):
 
     def complaints(self, lens: LensBlank) -> Iterator[str]:
         """Yield the faults: levels that do not end with the net, and keys that the method does not support."""
-        levels, stated = self.levels, lens.back.control_points is not None
+        levels, stated = self.levels or (), lens.back.control_points is not None
         net = lens.back.net if stated else (levels or (MIN_SIDE,))[-1]
         points = max(as_pair(net))
-        if levels is not None and levels[-1:] not in ((net,), (points,)):
+        if self.levels is not None and levels[-1:] not in ((net,), (points,)):
             yield f"tailoring.levels: must end with lens.back.control_points, {points}; add it at the end"
-        if any(max(as_pair(coarse)) >= max(as_pair(fine)) for coarse, fine in pairwise(levels or ())):
+        if any(max(as_pair(coarse)) >= max(as_pair(fine)) for coarse, fine in pairwise(levels)):
             yield f"tailoring.levels: {list(levels)} does not increase; list the nets from coarse to fine"
-        who, other = BASELINES.get(self.resolved(net).method, ("", ""))
+        who, other = BASELINES.get(self.chosen_method, ("", ""))
         for name in ("accuracy", "max_time"):
             if who and getattr(self, name) is not None:
                 yield f"tailoring.{name}: {who} cannot end early; remove it, or choose another {other}"
@@ -169,31 +159,24 @@ Name = Literal[
     "screen.tilt", "screen.tilt_x", "screen.tilt_y", "screen.clocking",
 ]  # fmt: skip
 FORM, RIPPLE = ("back.form", "front.form"), ("back.ripple",)
-OF_FACES = {"correlation_length": FORM, "period": RIPPLE, "pattern": RIPPLE}  # keys of these errors only
-OF_TWO_FACES = ("front.", "lens.wedge")  # errors of a lens with two refracting faces; zero unless a table names them
+FACE_ERRORS = {"correlation_length": FORM, "period": RIPPLE, "pattern": RIPPLE}  # errors that each of these keys is for
+TWO_FACE_ERRORS = ("front.", "lens.wedge")  # errors of a lens with two refracting faces; zero unless a table names them
 NONE = "none"  # grade of an error that is always zero
 
 
 class Tolerance(Record):
     """The tolerance of one error, or of several; None: the value of an earlier table, or of the grade."""
 
-    name: Annotated[Name | None, Key("The error; lens.decentre is its x and y; all errors if absent.")] = None
+    name: Annotated[Name | None, Key("The error; lens.decentre means its x and its y; all errors if absent.")] = None
     grade: Annotated[
         Literal["moulded", "diamond-turned", "precise", "none"] | None, Key("Grade of the limit; none: no error.")
     ] = None
-    limit: Annotated[
-        float | None,
-        Key("Limit (+-) in the error's unit; maximum RMS of ripple, RMS over all lenses of form.", "", 1e-12, 1e4),
-    ] = None
-    distribution: Annotated[
-        Literal["normal", "uniform"] | None, Key("Distribution; normal is cut at the limit, two standard deviations.")
-    ] = None
+    limit: Annotated[float | None, Key("Limit (±) in the error's unit; of form and ripple RMS.", "", 1e-12, 1e4)] = None
+    distribution: Annotated[Literal["normal", "uniform"] | None, Key("Normal is cut at its limit, 2 σ.")] = None
     cost: Annotated[float | None, Key("Cost of the limit, relative to the other errors.", "", 1e-6, 1e6)] = None
     correlation_length: Annotated[float | None, Key("Correlation length of a form error.", "mm", 1e-3, 1e4)] = None
     period: Annotated[float | None, Key("Period of a ripple.", "mm", 1e-3, 1e4, example=0.02)] = None
-    pattern: Annotated[
-        Literal["raster", "spiral"] | None, Key("Marks of the tool that make the ripple.", example="spiral")
-    ] = None
+    pattern: Annotated[Literal["raster", "spiral"] | None, Key("Tool marks of the ripple.", example="spiral")] = None
 
     def covers(self, error: str) -> bool:
         """Return True if the table applies to this error."""
@@ -226,7 +209,7 @@ def tolerance_complaints(tables: Sequence[Tolerance]) -> Iterator[str]:
             yield f"{where}: has both a limit and a grade; give one of them"
         if "limit" in stated and table.name is None:
             yield f'{where}.limit: {table.limit:g} needs the name of an error; add for example name = "lens.decentre"'
-        for key, names in OF_FACES.items():
+        for key, names in FACE_ERRORS.items():
             if key in stated and table.name not in names:
                 yield f"{where}.{key}: this key is for {' and '.join(names)} only; remove it, or change the name"
         if "distribution" in stated and table.name in FORM:

@@ -14,8 +14,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path, PurePath
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import numpy as np
 import tomli_w
@@ -32,7 +31,7 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
 from bstcad.optics.sides import Sides, as_pair
-from bstcad.optics.wavefront import MAX_RAY_ANGLE, PlaneWave, SphericalWave, Wave, ZernikeWave
+from bstcad.optics.wavefront import MAX_RAY_ANGLE, PlaneWave, Wave, ZernikeWave
 from bstcad.runs import files
 from bstcad.scene import effects, elements, lighting, mount, picture, quality, scene_file
 from bstcad.scene.blank import LensBlank, as_front, net_extent
@@ -68,12 +67,8 @@ class Accept(Record):
     light_on_target: Annotated[
         float | None, Key("Minimum fraction of the flux in the lens on the target.", "", 0.0, 1.0, of_light=True)
     ] = None
-    leak: Annotated[
-        float | None, Key("Maximum fraction of the flux on dark parts of the target.", "", 0.0, 1.0, of_light=True)
-    ] = None
-    decentre: Annotated[
-        float | None, Key("Maximum decentre of a measured part in the frame of its points.", "mm", 1e-6, 1e3)
-    ] = None
+    leak: Annotated[float | None, Key("Maximum fraction of light on dark parts.", "", 0.0, 1.0, of_light=True)] = None
+    decentre: Annotated[float | None, Key("Maximum decentre of a measured part.", "mm", 1e-6, 1e3)] = None
     wavefront: Annotated[
         float | None, Key("Maximum RMS wavefront error, in waves.", "", 1e-9, 1e6, example=0.1, of_light=True)
     ] = None
@@ -82,13 +77,8 @@ class Accept(Record):
 class Output(Record):
     """The written files: accuracy of the meshes, further file formats."""
 
-    mesh_tolerance: Annotated[float | None, Key("Maximum distance of mesh facets from the lens.", "mm", 1e-6, 1e3)] = (
-        None
-    )
-    export: Annotated[
-        tuple[Literal[files.EXPORTS], ...],
-        Key("Additional files for the shop.", example=["zemax", "dxf"]),
-    ] = ()
+    mesh_tolerance: Annotated[float | None, Key("Maximum distance of meshes from the lens.", "mm", 1e-6, 1e3)] = None
+    export: Annotated[tuple[files.Export, ...], Key("Additional files for the shop.", example=["zemax", "dxf"])] = ()
 
 
 class Scene(Record):
@@ -100,25 +90,20 @@ class Scene(Record):
         Key("Name of the design and of its folder.", example="my-lens"),
     ]
     title: Annotated[str, Key("One line for the report.")] = ""
-    source: Annotated[Collimated | Point, Field(discriminator="kind"), Key("The light.")]
-    lens: Annotated[LensBlank, Key("The lens before tailoring, and the bounds on its back.")]
-    targets: Annotated[
-        Targets, Field(alias="target"), Key("The picture and where it falls; several are [[target]] tables.")
-    ]
+    source: Annotated[Collimated | Point, Field(discriminator="kind"), Key("The source of light.")]
+    lens: Annotated[LensBlank, Key("The lens before tailoring, and the bounds on its tailored faces.")]
+    targets: Annotated[Targets, Field(alias="target"), Key("The picture and its place; several are [[target]] tables.")]
     before: Annotated[Elements, Key("Windows and mirrors that light meets before the lens: [[before]] tables.")] = ()
     behind: Annotated[Elements, Key("Windows and mirrors that light meets behind the lens: [[behind]] tables.")] = ()
     wavefront: Annotated[
-        Annotated[PlaneWave | SphericalWave | ZernikeWave, Field(discriminator="kind")] | None,
-        Key("The wavefront that the light behind the lens must have."),
+        Annotated[Wave, Field(discriminator="kind")] | None, Key("Required wavefront behind the lens.")
     ] = None
-    tailoring: Annotated[Tailoring, Key("How much work goes into the surface.")] = Tailoring()
+    tailoring: Annotated[Tailoring, Key("Effort and settings of tailoring.")] = Tailoring()
     effects: Annotated[Effects, Key("Effects simulated besides refraction: [[effects]] tables.")] = ()
     accept: Annotated[Accept, Key("The limits of the checks in the report.")] = Accept()
-    tolerance: Annotated[
-        tuple[Tolerance, ...], Key("Tolerances of manufacture, mounting and source: [[tolerance]] tables.")
-    ] = ()
+    tolerance: Annotated[tuple[Tolerance, ...], Key("Tolerances of part, mount and source: [[tolerance]].")] = ()
     output: Annotated[Output, Key("Accuracy of the meshes, and files for the shop.")] = Output()
-    part: Annotated[Part, Key("The title block that lens.step states.")] = Part()
+    part: Annotated[Part, Key("The title block in lens.step.")] = Part()
     mount: Annotated[Mount | None, Key("How the lens is mounted; with it bstcad writes part.step.")] = None
 
     @model_validator(mode="after")
@@ -283,10 +268,7 @@ class Scene(Record):
                 room.append((target.clearance(self.lens, highest), f"{key}.z"))
         return min(room)
 
-    def flat_lens(
-        self, net: Sides, dtype: torch.dtype = torch.float64, device: str | torch.device = "cpu",
-        as_wide_as: Sides | None = None,
-    ) -> Lens:  # fmt: skip
+    def flat_lens(self, net: Sides, as_wide_as: Sides | None = None) -> Lens:
         """Return the lens before tailoring, with a flat net as its back.
 
         net: control points per side of the back's net, or (along x, along y).  A tailored front is a net too: its
@@ -297,13 +279,10 @@ class Scene(Record):
         from bstcad.optics.bspline import BSplineSurface  # loads numba, which a scene alone does not need
 
         half_x, half_y = net_extent(self.lens.outline, as_wide_as or net)
-        heights = torch.zeros(as_pair(net), dtype=dtype, device=device)
+        heights = torch.zeros(as_pair(net), dtype=torch.float64)
         back = BSplineSurface(self.lens.back.z, heights, (-half_x, half_x), (-half_y, half_y))
-        lens = Lens(
-            self.lens.flat_front(net, as_wide_as).to(heights.dtype, device), back, self.lens.outline, self.index,
-            own_passes=self.lens.passes,
-        )  # fmt: skip
-        return self.assembled(lens)
+        front, outline, passes = self.lens.flat_front(net, as_wide_as), self.lens.outline, self.lens.passes
+        return self.assembled(Lens(front, back, outline, self.index, own_passes=passes))
 
     def assembled(self, lens: Lens) -> Lens:
         """Return the lens with the scene's windows, mirrors, tailored faces and mount."""
@@ -339,7 +318,7 @@ class Scene(Record):
         lines = [nm for nm, _ in self.source.lines]
         losses = {nm: effects.losses(self.effects, self.lens, nm) for nm in lines}
         around = {nm: self.around(nm) for nm in lines}
-        own = ((c, c.source.wavelength) for c in channels)
+        own = ((c, c.source.main_wavelength) for c in channels)
         return merge_wavelengths([replace(c, losses=losses[nm], around=around[nm]) for c, nm in own])
 
     def with_source_scaled(self, share: float) -> Self:
@@ -433,15 +412,15 @@ def _wavefront_complaints(wave: Wave | None, source: Emitter, lens: LensBlank, a
 def _method_complaints(scene: Scene) -> Iterator[str]:
     """Complain of a method for one picture in a scene of several goals."""
     goals = len(scene.targets) + (scene.wavefront is not None)
-    method = scene.tailoring.method or quality.PRESETS[scene.tailoring.quality]["method"]
-    who, key = quality.BASELINES.get(method, ("", ""))
+    who, key = quality.BASELINES.get(scene.tailoring.chosen_method, ("", ""))
     if who and goals > 1:
         yield f"{key}: {who} works for one picture, and the scene has {goals} goals; choose another {key}"
 
 
 def _doubts_of_goals(scene: Scene) -> Iterator[str]:
     """Doubt fewer goals than tailored faces, as a face is idle, and more goals, as none is met exactly."""
-    lens, wave, different = scene.lens, scene.wavefront, []
+    lens, wave = scene.lens, scene.wavefront
+    different: list[Target] = []
     for target in scene.targets:  # light parallel to the axis makes one picture on every plane, which is one goal
         alike = target.model_copy(update={"z": 0.0, "weight": 1.0})
         if alike not in different or not (isinstance(wave, PlaneWave) and wave.normal == (0.0, 0.0, 1.0)):
@@ -487,7 +466,7 @@ def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
 
 def of_text(
     text: str, data: dict[str, Any], path: Path, overrides: Mapping[str, Any] | None = None, bounds: Sequence[Path] = ()
-) -> Scene:  # fmt: skip
+) -> Scene:
     """Read the scene from the text of a TOML file.
 
     data: the tables of the text.  path: its file, which need not exist.  bounds: folders; a path into one of them
@@ -509,9 +488,8 @@ def of_text(
 
 
 def _validated(
-    data: dict[str, Any], folder: Path, given: Mapping[str, FileContent] = MappingProxyType({}),
-    bounds: Sequence[Path] = (),
-) -> Scene:  # fmt: skip
+    data: dict[str, Any], folder: Path, given: Mapping[str, FileContent] | None = None, bounds: Sequence[Path] = ()
+) -> Scene:
     """Return the scene of the tables of a file.
 
     given: contents of files by their names; other files are relative to `folder`.
@@ -529,7 +507,7 @@ def _validated(
             _circle(table, key)
     try:
         # Validation from JSON is strict (no "8" for 8.0, no true for 1) and still accepts lists for tuples.
-        context = {"folder": folder, "contents": given, "bounds": bounds}
+        context = {"folder": folder, "contents": given or {}, "bounds": bounds}
         scene = Scene.model_validate_json(json.dumps(data), strict=True, context=context)
     except ValidationError as error:
         raise SceneError(explain(error, data)) from None

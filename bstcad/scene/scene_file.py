@@ -11,9 +11,9 @@ from typing import Any
 from bstcad.runs import files
 from bstcad.scene.errors import SceneError
 
-MAX_FILE_SIZE = 1_000_000  # bytes of a scene file
+MAX_SCENE_SIZE = 1_000_000  # bytes of a scene file
 MAX_DOTS = 100  # dots in a line; the time of tomllib grows with the square of a dotted key's length
-MAX_DEPTH = 20  # levels of nested tables and lists; a scene has four
+MAX_NESTING = 20  # levels of nested tables and lists; a scene has four
 NESTED = "is nested too deeply; give a scene file like those in templates"
 
 
@@ -25,7 +25,7 @@ def read(path: Path) -> tuple[str, dict[str, Any]]:
     if not os.path.isfile(path):
         raise SceneError(f"{path}: no such scene file; give the path of a TOML file, such as templates/thu.toml")
     try:
-        text = files.contents(path, MAX_FILE_SIZE).decode("utf-8-sig")
+        text = files.contents(path, MAX_SCENE_SIZE).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise SceneError(f"{path}: is not UTF-8 text; give a TOML file") from None
     except ValueError as error:
@@ -51,7 +51,9 @@ def _fault(text: str, fault: str) -> str:
     """Return a fault of tomllib, "Expected ']' (at line 3, column 5)", with its line and a remedy."""
     lines = text.split("\n")
     fault = fault.replace("at end of document", f"at line {len(lines)}, column {len(lines[-1]) + 1}")
-    line = lines[int(re.search(r"at line (\d+)", fault)[1]) - 1]
+    place = re.search(r"at line (\d+)", fault)
+    assert place is not None  # tomllib states the line of each fault
+    line = lines[int(place[1]) - 1]
     remedy = "write paths with / or in single quotes" if "\\" in line else "correct that line"
     return f"{fault[:1].lower()}{fault[1:]}; {remedy}"
 
@@ -72,7 +74,7 @@ def toml_value(text: str) -> Any:
 
 def check_plain(data: Any, key: str = "", depth: int = 0) -> None:
     """Raise SceneError for values that JSON does not have: dates, infinity, NaN, lone surrogates."""
-    if depth > MAX_DEPTH:
+    if depth > MAX_NESTING:
         raise RecursionError
     if isinstance(data, dict | list):
         for name, value in data.items() if isinstance(data, dict) else enumerate(data):
@@ -80,7 +82,7 @@ def check_plain(data: Any, key: str = "", depth: int = 0) -> None:
             check_plain(name, where, depth + 1)
             check_plain(value, where, depth + 1)
     elif isinstance(data, int | float) and not abs(data) < 1e300:  # also NaN
-        shown = data if isinstance(data, float) else "a number of over 300 digits"  # too long to print
+        shown = data if isinstance(data, float) else "a number of more than 300 digits"  # too long to print
         raise SceneError(f"{key}: {shown} is not a finite number; give a finite number")
     elif isinstance(data, str) and not data.isascii() and any("\ud800" <= c <= "\udfff" for c in data):
         raise SceneError(f"{key}: the text has an incomplete character; write it again in UTF-8")

@@ -15,18 +15,9 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Discriminator,
-    PlainSerializer,
-    Tag,
-    ValidationInfo,
-    WithJsonSchema,
-    model_serializer,
-)
-from pydantic.json_schema import GenerateJsonSchema
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Tag, ValidationInfo
+from pydantic.functional_serializers import PlainSerializer, model_serializer
+from pydantic.json_schema import GenerateJsonSchema, WithJsonSchema
 
 from bstcad.runs import files
 
@@ -85,8 +76,8 @@ def contents(value: Any, key: str = "") -> Iterator[tuple[str, FileContent]]:
         yield from contents(part, name.lstrip("."))
 
 
-def from_file(kind: type[FileContent], read: Callable[[Path], FileContent], example: str) -> Any:
-    """Return the type of a field that is written as a path and holds the content of the file, a `kind`.
+def from_file(kind: type[FileContent], read: Callable[[Path], FileContent], example: str) -> tuple[Any, ...]:
+    """Return the annotations of a field of type `kind` that is written as a path and holds the content of the file.
 
     A path is relative to the scene file, or to the user's home.  If the context of a validation has `bounds`, folders,
     a path into one of them must not lead out of them by links.
@@ -108,12 +99,8 @@ def from_file(kind: type[FileContent], read: Callable[[Path], FileContent], exam
             raise ValueError(f"{given!r} has an escape such as \\n; write paths with / or in single quotes")
         return read(folder / os.path.expanduser(given))
 
-    return Annotated[
-        kind,
-        BeforeValidator(content),
-        PlainSerializer(lambda found: found.name, return_type=str),
-        WithJsonSchema({"type": "string"}),
-    ]
+    written = PlainSerializer(lambda found: found.name, return_type=str)
+    return BeforeValidator(content), written, WithJsonSchema({"type": "string"})
 
 
 def _check_links(path: Path, bounds: Sequence[Path]) -> None:
@@ -168,10 +155,8 @@ def of_model(model: type[BaseModel]) -> dict[str, Any]:
         if isinstance(union.get("default"), dict):
             del union["default"]
     circle = tables["Circle"]  # a file may give its diameter, which scene.py converts
-    circle["properties"]["diameter"] = circle["properties"]["radius"] | {
-        "description": "Diameter, in place of radius.",
-        "examples": [24.0],
-    }
+    keys = circle["properties"]
+    keys["diameter"] = keys["radius"] | {"description": "Diameter, in place of radius.", "examples": [24.0]}
     circle["required"].remove("radius")
     circle["oneOf"] = [{"required": ["radius"]}, {"required": ["diameter"]}]
     for table in (made, *tables.values()):
@@ -237,8 +222,8 @@ def rows(record: Node | None = None, table: str = "") -> list[Row]:
         inner, key = records(node), f"{table}.{name}".lstrip(".")
         if inner and node.get("type") == "array":
             key += "[]"
-        texts = {"meaning": node["description"], "default": _default(record, name)}
-        found.append(Row(key, node["unit"], span(node), **texts, example=next(iter(node.get("examples", ())), None)))
+        default, meaning, [example, *_] = _default(record, name), node["description"], node.get("examples", [None])
+        found.append(Row(key, node["unit"], span(node), default, meaning=meaning, example=example))
         found += _union(inner, key)
     return found
 
@@ -248,16 +233,14 @@ def _union(union: list[Node], table: str) -> list[Row]:
     if len(union) < 2:
         return [row for record in union for row in rows(record, table)]
     [name] = tags(union[0])
-    kinds = ["".join(tags(record).values()) for record in union]
-    meanings = (
-        f"{kind}: {record['properties'][name]['description']}" for kind, record in zip(kinds, union, strict=True)
-    )
+    pairs = [("".join(tags(record).values()), record) for record in union]
+    kinds = [kind for kind, _ in pairs]
     found: dict[Row, list[str]] = {}
-    for kind, record in zip(kinds, union, strict=True):
+    for kind, record in pairs:
         for row in rows(record, table):
             found.setdefault(row, []).append(kind)
-    texts = {"default": "required", "meaning": " ".join(meanings), "example": kinds[0]}
-    tag = Row(f"{table}.{name}", "none", " | ".join(kinds), **texts)
+    meaning = " ".join(f"{kind}: {record['properties'][name]['description']}" for kind, record in pairs)
+    tag = Row(f"{table}.{name}", "none", " | ".join(kinds), "required", meaning=meaning, example=kinds[0])
     others = (row if of == kinds or row.kinds else replace(row, kinds=tuple(of)) for row, of in found.items())
     return [tag, *(row for row in others if row.key != tag.key)]
 
@@ -271,9 +254,8 @@ def span(node: Node) -> str:
     if parts := [*_parts(node), *node.get("prefixItems", ())[:1]]:
         return " or ".join(dict.fromkeys(map(span, parts)))
     if "minimum" in node:
-        return " to ".join(
-            str(end) if isinstance(end, int) else f"{end:g}" for end in (node["minimum"], node["maximum"])
-        )
+        ends = node["minimum"], node["maximum"]
+        return " to ".join(str(end) if isinstance(end, int) else f"{end:g}" for end in ends)
     return {"boolean": "true | false", "string": "text"}.get(node.get("type", ""), "any number")
 
 

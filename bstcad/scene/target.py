@@ -9,7 +9,7 @@ import functools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import numpy as np
 import torch
@@ -18,15 +18,15 @@ from scipy.sparse import csr_array
 
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.key import Key
-from bstcad.optics.outlines import Outline
+from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.rays import Vector
-from bstcad.optics.receivers import Receiver
+from bstcad.optics.receivers import PlaneReceiver
 from bstcad.scene import picture
 from bstcad.scene.blank import LensBlank, Outlined
-from bstcad.scene.dotted_keys import PICTURES
+from bstcad.scene.dotted_keys import PICTURE_KEYS
 from bstcad.scene.errors import SceneError
-from bstcad.scene.picture import Box, strips
-from bstcad.scene.profile import Profile
+from bstcad.scene.picture import Picture, PixelBox, strips
+from bstcad.scene.profile import Pixels, Profile, Size
 from bstcad.scene.schema import COORDINATES, OneOrTwo, Record, from_file, leaving_out
 
 MIN_PIXELS = 8  # smallest number of pixels along a side of a target
@@ -41,11 +41,12 @@ EDGE_ON = math.sin(math.radians(1.0))  # sine of the smallest angle between the 
 GRAZING_VIEW = 8.0  # degrees to a target's plane; at less it is hardly lit (RRMSD at 30: 0.07, at 10: 0.33, at 5: 1.6)
 DIRECTIONS = {1: "+z", -1: "-z"}
 
-
 PictureFile = Annotated[
-    from_file(picture.Picture, picture.read_picture, "image = 'photo.png'"),
+    Picture,
+    *from_file(Picture, picture.read_picture, "image = 'photo.png'"),
     BeforeValidator(lambda given: picture.from_array(given) if isinstance(given, np.ndarray) else given),
 ]
+Crop: TypeAlias = tuple[float, float, float, float]  # left, top, right, bottom as fractions of width and height
 Tilt = Annotated[tuple[float, float] | None, AfterValidator(lambda tilt: tilt if tilt and any(tilt) else None)]
 
 
@@ -59,43 +60,32 @@ AIM = (
 class Target(Record):
     """The picture on the plane z, or on a plane tilted about its middle, over the rectangle x by y."""
 
-    z: Annotated[float, Key("Plane of the target, or its middle if it is tilted.", "mm", *COORDINATES, example=1000.0)]
+    z: Annotated[float, Key("Position of the target, of its middle if tilted.", "mm", *COORDINATES, example=1000.0)]
     x: Annotated[tuple[float, float], Key("Ends of the target along x.", "mm", *COORDINATES, example=[-200.0, 200.0])]
     y: Annotated[tuple[float, float], Key("Ends of the target along y.", "mm", *COORDINATES, example=[-200.0, 200.0])]
     tilt: Annotated[Tilt, Key("Tilt about x, then about y.", "degrees", -89.0, 89.0, remedy=AIM)] = None
     pixels: Annotated[OneOrTwo, Key("Pixels of the longer side or [columns, rows].", "", MIN_PIXELS, 4096, example=512)]
-    text: Annotated[
-        str | None, Key("The picture is this text, centred, over 84 % of the width or 80 % of the height.")
-    ] = None
-    image: Annotated[
-        PictureFile | None, Key("The picture is this file, relative to the scene file.", example="photo.jpg")
-    ] = None
-    sample: Annotated[Literal[picture.SAMPLES] | None, Key("The picture is this sample of scikit-image.")] = None
+    text: Annotated[str | None, Key("Text as the picture, centred, as large as fits with a margin.")] = None
+    image: Annotated[PictureFile | None, Key("Picture file, relative to the scene file.", example="photo.jpg")] = None
+    sample: Annotated[picture.Sample | None, Key("Sample picture of scikit-image.")] = None
     uniform: Annotated[Literal[True] | None, Key("No picture: the same irradiance everywhere.")] = None
     profile: Annotated[
         Profile | None, Key("No picture: an irradiance of this shape.", example={"shape": "disc", "radius": 6.0})
     ] = None
     gamma: Annotated[
-        float | None, Key("Irradiance = number ^ gamma; as the file states if absent.", "", 0.1, 10.0, example=1.0)
+        float | None, Key("Irradiance = number^gamma; as the file states if absent.", "", 0.1, 10.0, example=1.0)
     ] = None
     invert: Annotated[bool, Key("Negative of the picture.", example=True)] = False
     seen_from: Annotated[Literal["lens", "behind"], Key("Side from which the picture is not mirrored.")] = "lens"
     rotate: Annotated[Literal[0, 90, 180, 270], Key("Rotation of the picture, counterclockwise.", "degrees")] = 0
     mirror: Annotated[bool, Key("Exchange left and right, after the rotation.")] = False
-    fit: Annotated[
-        Literal["crop", "pad", "stretch"], Key("Fit of a picture with other proportions.", example="pad")
-    ] = "crop"
+    fit: Annotated[Literal["crop", "pad", "stretch"], Key("Fit of a picture of another shape.", example="pad")] = "crop"
     crop: Annotated[
-        tuple[float, float, float, float] | None,
-        Key(
-            "Part of the picture to show: [left, top, right, bottom] as fractions of its width and height.", "",
-            0.0, 1.0, example=[0.1, 0.0, 0.9, 1.0],
-        ),
-    ] = None  # fmt: skip
+        Crop | None,
+        Key("Part to show: [left, top, right, bottom] as fractions.", "", 0.0, 1.0, example=[0.1, 0.0, 0.9, 1.0]),
+    ] = None
     outline: Annotated[Outlined | None, Key("Outline of the light, centred; it is dark outside.")] = None
-    unreachable: Annotated[
-        Literal["dark", "refuse"], Key("Unreachable parts stay dark, or the scene is refused.", example="refuse")
-    ] = "dark"
+    unreachable: Annotated[Literal["dark", "refuse"], Key("Unreachable parts: dark, or refuse the scene.")] = "dark"
     weight: Annotated[float, Key("Weight of the target's squared error.", "", 1e-6, 1e6, example=2.0)] = 1.0
 
     written = leaving_out(weight=1.0)
@@ -105,7 +95,7 @@ class Target(Record):
         given = self._pictures
         if len(given) != 1:
             names = " and ".join(given) or "none"
-            yield f"target: needs exactly one of {', '.join(PICTURES)}, and has {names}; keep or add one"
+            yield f"target: needs exactly one of {', '.join(PICTURE_KEYS)}, and has {names}; keep or add one"
         for axis, (low, high) in (("x", self.x), ("y", self.y)):
             if not low < high:
                 yield f"target.{axis}: [{low:g}, {high:g}] is not an interval; write the smaller end first"
@@ -143,13 +133,22 @@ class Target(Record):
 
     @property
     def _half_profile(self) -> tuple[float, float]:
-        """Half the width and height of the rotated profile, in `unit`."""
-        along_x, along_y = self.profile.half_extent
+        """Half the width and height of the rotated profile, in `unit`; infinite without a profile."""
+        along_x, along_y = self.profile.half_extent if self.profile else (math.inf, math.inf)
         return (along_y, along_x) if self.rotate in (90, 270) else (along_x, along_y)
 
     @property
     def _pictures(self) -> list[str]:
-        return [name for name in PICTURES if getattr(self, name) is not None]
+        return [name for name in PICTURE_KEYS if getattr(self, name) is not None]
+
+    @property
+    def photo(self) -> Picture | str | None:
+        """Picture file, or name of a sample; None for another picture."""
+        return self.sample if self.image is None else self.image
+
+    def as_rotated(self, shown: Pixels) -> Pixels:
+        """Return width and height of a picture after the target's rotation."""
+        return shown[::-1] if self.rotate in (90, 270) else shown
 
     @property
     def size(self) -> tuple[float, float]:
@@ -166,17 +165,16 @@ class Target(Record):
         """Pixels along x and along y, at least MIN_PIXELS for a narrow target."""
         if not isinstance(self.pixels, int):
             return self.pixels
-        longer = max(self.size)
-        return tuple(max(round(self.pixels * side / longer), min(self.pixels, MIN_PIXELS)) for side in self.size)
+        longer, total = max(self.size), self.pixels
+        columns, rows = (max(round(total * side / longer), min(total, MIN_PIXELS)) for side in self.size)
+        return columns, rows
 
     def fewer_pixels(self, factor: float) -> tuple[int, int]:
         """Return columns and rows divided by a factor, at least MIN_PIXELS and a pixel per half profile."""
-        minimum = (MIN_PIXELS, MIN_PIXELS)
-        if self.profile is not None:
-            sides = zip(self.size, self._half_profile, strict=True)
-            minimum = tuple(max(MIN_PIXELS, math.ceil(size / half)) for size, half in sides)
-        counts = zip(self.columns_rows, minimum, strict=True)
-        return tuple(min(max(round(n / factor), fewest), max(n, MIN_PIXELS)) for n, fewest in counts)
+        sides = zip(self.columns_rows, self.size, self._half_profile, strict=True)
+        minimum = ((n, max(MIN_PIXELS, math.ceil(size / half))) for n, size, half in sides)
+        columns, rows = (min(max(round(n / factor), fewest), max(n, MIN_PIXELS)) for n, fewest in minimum)
+        return columns, rows
 
     @property
     def screen(self) -> Screen:
@@ -220,7 +218,7 @@ class Target(Record):
     def grazed(self, lens: LensBlank) -> Iterator[str]:
         """Doubt a tilted target that the lens sees nearly edge-on."""
         plane, vertex = self.screen.plane, (0.0, 0.0, lens.back.z)
-        if plane.tilt is None:
+        if plane.tilt is None or not isinstance(plane, PlaneReceiver):
             return
         sine = -plane.height(vertex) / math.dist(plane.middle, vertex)  # the distance is positive
         if sine < math.sin(math.radians(GRAZING_VIEW)):
@@ -235,13 +233,13 @@ class Target(Record):
         screen, plane, back, optic = self.screen, self.screen.plane, lens.back.z, lens.optic
         if plane.is_level:
             return
-        key = "target.z" if plane.tilt is None else "target.tilt"
-        if plane.tilt is not None and not is_faced(plane, (0.0, 0.0, back)):
+        tilted = plane if plane.tilt is not None and isinstance(plane, PlaneReceiver) else None
+        key, less = ("target.tilt", "turn it less, or ") if tilted else ("target.z", "")
+        if tilted and not is_faced(tilted, (0.0, 0.0, back)):
             yield f"{key}: seen from the {optic}, the target is edge-on or turned away; turn it less, or move it"
         if not self.clearance(lens, back) > 0:
-            less = "" if plane.tilt is None else "turn it less, or "
             yield f"{key}: the plane of the target cuts the {optic}; {less}move the target further along +z"
-        if plane.tilt is None:
+        if tilted is None:
             return
         lowest = min(plane.point(x, y)[2] for x in screen.x for y in screen.y)
         if not lowest > back:
@@ -251,7 +249,7 @@ class Target(Record):
     def metres(self, lens: LensBlank) -> Iterator[str]:
         """Yield a question for each length that looks like metres."""
         outline, widest = lens.outline, max(self.size)
-        name, size = ("radius", outline.radius) if outline.is_round else ("width", outline.width)
+        name, size = ("radius", outline.radius) if isinstance(outline, Circle) else ("width", outline.width)
         across, question = 2 * max(outline.half_extent), "are these metres? lengths are in mm"
         if across < LARGEST_IN_METRES:
             yield f"lens.outline.{name}: {size:g} mm; {question}"
@@ -265,7 +263,7 @@ class Target(Record):
         return drawing(self).remarks
 
 
-def is_faced(plane: Receiver, vertex: Vector) -> bool:
+def is_faced(plane: PlaneReceiver, vertex: Vector) -> bool:
     """Return True if a point sees the front of a plane, at an angle above EDGE_ON to the plane."""
     return -plane.height(vertex) > EDGE_ON * math.dist(plane.middle, vertex)
 
@@ -285,17 +283,17 @@ def with_distinct_names(given: Target | tuple[Target, ...]) -> tuple[Target, ...
     """Return all targets of a scene, with a different file name for each image: the copies are in one folder."""
     images: dict[str, bytes] = {}  # contents by name in lower case, as a file system may compare names
 
-    def named(image: picture.Picture) -> picture.Picture:
+    def distinct(image: Picture) -> Picture:
         return next(one for one in _numbered(image) if images.setdefault(one.name.casefold(), one.data) == image.data)
 
     def own(target: Target) -> Target:
-        image = target.image and named(target.image)
+        image = target.image and distinct(target.image)
         return target if image == target.image else target.model_copy(update={"image": image})
 
     return tuple(map(own, given if isinstance(given, tuple) else (given,)))
 
 
-def _numbered(image: picture.Picture) -> Iterator[picture.Picture]:
+def _numbered(image: Picture) -> Iterator[Picture]:
     """Yield the image with its own name, photo.jpg, then with photo-2.jpg and so on."""
     yield image
     stem, _, kind = image.name.rpartition(".")
@@ -312,40 +310,41 @@ def coplanar_complaints(targets: tuple[Target, ...]) -> Iterator[str]:
     for k, target in enumerate(targets):
         for i, earlier in enumerate(targets[:k]):
             if _in_one_plane(target.screen, earlier.screen):
-                yield (
-                    f"target[{k}].z: the target is in the plane of target[{i}]; move one of them along z, or combine "
-                    "both pictures in one"
-                )
+                plane = f"the target is in the plane of target[{i}]"
+                yield f"target[{k}].z: {plane}; move one of them along z, or combine both pictures in one"
             elif _cuts(target.screen, earlier.screen) and _cuts(earlier.screen, target.screen):
                 yield f"target[{k}].z: the target cuts target[{i}]; move one of them along z, or turn it less"
 
 
 def _in_one_plane(one: Screen, other: Screen) -> bool:
-    """Return True if the corners of each are in the plane of the other; receivers without a frame must be equal."""
-    if one.plane.frame is None or other.plane.frame is None:
-        return one.plane == other.plane
-    return max(map(abs, (*_corner_heights(one, other), *_corner_heights(other, one)))) < PLANE_DISTANCE
+    """Return True if the corners of each are in the plane of the other; receivers that are no planes must be equal."""
+    heights = _corner_heights(one, other) + _corner_heights(other, one)
+    return max(map(abs, heights)) < PLANE_DISTANCE if heights else one.plane == other.plane
 
 
 def _cuts(screen: Screen, other: Screen) -> bool:
     """Return True if corners of the screen are on both sides of the other's plane."""
-    if screen.plane.frame is None or other.plane.frame is None:
-        return False
     heights = _corner_heights(screen, other)
-    return min(heights) < 0 < max(heights)
+    return bool(heights) and min(heights) < 0 < max(heights)
 
 
 def _corner_heights(screen: Screen, other: Screen) -> list[float]:
-    """Return the heights (mm) of the screen's corners over the other's plane."""
-    return [other.plane.height(screen.plane.point(x, y)) for x in screen.x for y in screen.y]
+    """Return the heights (mm) of the screen's corners above the other's plane; none if a receiver is no plane."""
+    plane, own = other.plane, screen.plane
+    if not (isinstance(plane, PlaneReceiver) and isinstance(own, PlaneReceiver)):
+        return []
+    return [plane.height(own.point(x, y)) for x in screen.x for y in screen.y]
 
 
-Targets = Annotated[  # one table of a file, or a list of them
-    Annotated[Target, Tag("table")]
-    | Annotated[tuple[Target, ...], Tag("list"), Field(min_length=1, max_length=MAX_TARGETS)],
-    Discriminator(lambda given: "list" if isinstance(given, list | tuple) else "table"),
-    AfterValidator(with_distinct_names),
-]
+if TYPE_CHECKING:
+    Targets: TypeAlias = tuple[Target, ...]
+else:
+    Targets = Annotated[  # one table of a file, or a list of them; validated to a tuple
+        Annotated[Target, Tag("table")]
+        | Annotated[tuple[Target, ...], Tag("list"), Field(min_length=1, max_length=MAX_TARGETS)],
+        Discriminator(lambda given: "list" if isinstance(given, list | tuple) else "table"),
+        AfterValidator(with_distinct_names),
+    ]
 
 
 # ---- the drawn picture -----------------------------------------------------------------------------------------------
@@ -361,37 +360,37 @@ def drawing(target: Target) -> Drawing:
 
 @functools.lru_cache(maxsize=4)  # a photograph takes half a second, and is needed for the check and for the design
 def _drawing(target: Target) -> Drawing:
-    pixels, size, remarks = target.columns_rows, target.size, ()
-    if sideways := target.rotate in (90, 270):  # the light is rotated at the end
+    pixels, size, remarks = target.columns_rows, target.size, [""]
+    if target.rotate in (90, 270):  # the light is rotated at the end
         pixels, size = pixels[::-1], size[::-1]
     if target.text is not None:
         ink = _ink(target.text, pixels, size)
         light = 1.0 - ink if target.invert else ink
-    elif target.uniform:
-        light = np.ones(pixels[::-1])
+    elif (given := target.photo) is not None:
+        with picture.decoding(given):
+            light, remarks = _photo_light(target, given, pixels, size)
     elif target.profile is not None:
         light = target.profile.light(pixels, size)
     else:
-        given = target.sample if target.image is None else target.image
-        with picture.decoding(getattr(given, "name", given)):
-            photo = picture.photo(given, target.gamma, target.invert)
-            if target.crop is not None:
-                photo = photo.part(cropped(photo.image.size, target.crop))
-            is_logo, transparent = photo.transparency()
-            part = window(shown := photo.image.size, size, target.fit)
-            light = average(photo.silhouette if is_logo else photo.light, shown, part, pixels)
-            assumed = "" if is_logo else _curve_remark(photo, light, part, pixels)
-        remarks = (
-            "target.image: the file has several pictures; the first one is used" if photo.several else "",
-            transparent,
-            assumed,
-            _fit_remark(shown[::-1] if sideways else shown, target),
-        )
+        light = np.ones(pixels[::-1])
     light = np.rot90(light, target.rotate // 90)
     return Drawing(light[:, ::-1] if target.mirror else light, tuple(filter(None, remarks)))
 
 
-def _curve_remark(photo: picture.Photo, light: np.ndarray, part: Window, pixels: tuple[int, int]) -> str:
+def _photo_light(target: Target, given: Picture | str, pixels: Pixels, size: Size) -> tuple[np.ndarray, list[str]]:
+    """Return the irradiance (rows, columns) of a photo on the unrotated target, and remarks on it or ""."""
+    photo = picture.photo(given, target.gamma, target.invert)
+    if target.crop is not None:
+        photo = photo.part(crop_box(photo.image.size, target.crop))
+    is_logo, transparent = photo.transparency()
+    part = window(shown := photo.image.size, size, target.fit)
+    light = average(photo.silhouette if is_logo else photo.light, shown, part, pixels)
+    several = "target.image: the file has several pictures; the first one is used" if photo.several else ""
+    assumed = "" if is_logo else _curve_remark(photo, light, part, pixels)
+    return light, [several, transparent, assumed, _fit_remark(target.as_rotated(shown), target)]
+
+
+def _curve_remark(photo: picture.Photo, light: np.ndarray, part: Window, pixels: Pixels) -> str:
     """Return a remark on the assumed curve if the other one changes the light by more than NOTICEABLE, or else ""."""
     if photo.other_curve is None:
         return ""
@@ -403,8 +402,8 @@ def _curve_remark(photo: picture.Photo, light: np.ndarray, part: Window, pixels:
     return remark if rrmsd > NOTICEABLE else ""
 
 
-def _ink(text: str, pixels: tuple[int, int], size: tuple[float, float]) -> np.ndarray:
-    """Return the fraction of ink per pixel (rows, columns) of a text over a size (width, height)."""
+def _ink(text: str, pixels: Pixels, size: Size) -> np.ndarray:
+    """Return the fraction of ink per pixel (rows, columns) of a text on an area (width, height)."""
     aspect, side = size[0] / size[1], min(4 * max(pixels), 4096)  # drawn finer and averaged, for smooth edges
     width, height = max(round(side * min(aspect, 1.0)), 16), max(round(side * min(1 / aspect, 1.0)), 16)
     image = picture.letters(text, width, height)
@@ -415,7 +414,7 @@ def _ink(text: str, pixels: tuple[int, int], size: tuple[float, float]) -> np.nd
 # ---- fit of a picture to the target ----------------------------------------------------------------------------------
 
 
-def cropped(shown: tuple[int, int], crop: tuple[float, float, float, float] | None) -> Box:
+def crop_box(shown: Pixels, crop: Crop | None) -> PixelBox:
     """Return the pixels (left, top, right, bottom) of the cropped part of a picture (width, height), at least one."""
     if crop is None:
         return 0, 0, *shown
@@ -424,20 +423,18 @@ def cropped(shown: tuple[int, int], crop: tuple[float, float, float, float] | No
     return left, top, max(right, left + 1), max(bottom, top + 1)
 
 
-def shown_size(target: Target) -> tuple[int, int] | None:
+def shown_size(target: Target) -> Pixels | None:
     """Return width and height (pixels) of a target's photo, cropped and rotated; None if it has no photo."""
-    given = target.sample if target.image is None else target.image
-    if given is None:
+    if target.photo is None:
         return None
-    left, top, right, bottom = cropped(picture.photo_size(given), target.crop)
-    width, height = right - left, bottom - top
-    return (height, width) if target.rotate in (90, 270) else (width, height)
+    left, top, right, bottom = crop_box(picture.photo_size(target.photo), target.crop)
+    return target.as_rotated((right - left, bottom - top))
 
 
 Window = tuple[float, float, float, float]  # left, top, right, bottom in pixels of a picture; may extend outside it
 
 
-def window(shown: tuple[int, int], size: tuple[float, float], fit: str) -> Window:
+def window(shown: Pixels, size: Size, fit: str) -> Window:
     """Return the part of a picture (width, height in pixels) that fills a target of this size (width, height).
 
     fit "crop" takes the middle, "pad" extends outside the picture.  A difference below one pixel is ignored.
@@ -452,7 +449,7 @@ def window(shown: tuple[int, int], size: tuple[float, float], fit: str) -> Windo
     return 0.0, (height - down) / 2, width, (height + down) / 2
 
 
-def _fit_remark(shown: tuple[int, int], target: Target) -> str:
+def _fit_remark(shown: Pixels, target: Target) -> str:
     """Return a remark on the fit of a picture to a target; "" if the proportions agree."""
     (width, height), size, fit = shown, target.size, target.fit
     left, top, right, bottom = window(shown, size, fit)
@@ -470,9 +467,7 @@ def _fit_remark(shown: tuple[int, int], target: Target) -> str:
     return f"target.fit: the target is {form}, so the picture of {width} x {height} is {done}"
 
 
-def average(
-    light: Callable[[Box], np.ndarray], size: tuple[int, int], window: Window, pixels: tuple[int, int]
-) -> np.ndarray:
+def average(light: Callable[[PixelBox], np.ndarray], size: Pixels, window: Window, pixels: Pixels) -> np.ndarray:
     """Return the means (rows, columns) of a picture over the pixels of a window; outside the picture it is dark.
 
     light: function that returns the values of a box.  The means are exact, and the picture is read in strips.
@@ -498,7 +493,7 @@ def overlap(size: int, pixels: int, start: float = 0.0, stop: float | None = Non
     return csr_array((np.diff(cuts) * pixels / (stop - start), (to, of)), shape=(pixels, size))
 
 
-def inside(outline: Outline, pixels: tuple[int, int], size: tuple[float, float]) -> np.ndarray:
+def inside(outline: Outline, pixels: Pixels, size: Size) -> np.ndarray:
     """Return the fraction (rows, columns) of each pixel inside an outline centred in a rectangle of this size."""
     columns, rows = pixels
     fine = max(2048 // max(pixels), 4)  # sub-pixels along the side of a pixel

@@ -23,7 +23,7 @@ from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
 from bstcad.optics.sides import as_pair
 from bstcad.report.record import DesignCourse, LeftOut
-from bstcad.scene.effects import Absorption, Effect, Fresnel, Ghost, losses, named, reflection_of
+from bstcad.scene.effects import Absorption, Effect, Fresnel, Ghost, find_effect, losses, reflection_of
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.machinability import place_back
 from bstcad.tailoring.slope_fit import Fit
@@ -113,14 +113,14 @@ def _glass_effects(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
     bare = Fresnel(kind="fresnel")
     if reflection_of(scene.effects) is None:
         yield _entry("fresnel", reference.change([_central_channel(scene, bare)]), simulate_by=FRESNEL_KEYS)
-    if named(scene.effects, Absorption) is None:
+    if find_effect(scene.effects, Absorption) is None:
         yield _absorption(scene, reference)
     if len(scene.source.lines) == 1:
         yield _dispersion(scene, reference)
     if scene.lens.passes.reflects:
         yield _entry("ghost", None, "ghosts of a mirror behind glass are not simulated")
-    elif named(scene.effects, Ghost) is None:
-        reflecting = _central_channel(scene, *(() if named(scene.effects, Fresnel) else (bare,)))
+    elif find_effect(scene.effects, Ghost) is None:
+        reflecting = _central_channel(scene, *(() if find_effect(scene.effects, Fresnel) else (bare,)))
         change, reason = reference.ghost(reflecting), "a rough estimate, since it may focus to a spot"
         yield _entry("ghost", change, reason, '[[effects]] kind = "ghost"')
 
@@ -128,7 +128,7 @@ def _glass_effects(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
 def _mirror_effects(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
     if not scene.lens.passes.reflects:
         return
-    if not scene.lens.passes.enters and named(scene.effects, Fresnel) is None:
+    if not scene.lens.passes.enters and find_effect(scene.effects, Fresnel) is None:
         aluminium = _central_channel(scene, Fresnel(kind="fresnel"))
         yield _entry("reflectance", reference.change([aluminium]), "of aluminium", FRESNEL_KEYS)
     yield _entry("shadows", None, "which depend on the lamp's housing")

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from bstcad.optics.lens import Lens
 from bstcad.scene.errors import SceneError
-from bstcad.scene.quality import FORM, NONE, OF_TWO_FACES, RIPPLE, Tolerance, settings_of
+from bstcad.scene.quality import FORM, NONE, RIPPLE, TWO_FACE_ERRORS, Tolerance, settings_of
 from bstcad.tolerance.perturbations import Kind, Perturbation, Setup, form_error, kinds, ripple
 
 DEFAULT_GRADE = "diamond-turned"
@@ -97,7 +97,7 @@ def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None
     errors = []
     for kind in kinds(setup, material).values():
         values = settings_of(table, kind.name)
-        left_out = kind.name.startswith(OF_TWO_FACES) and not _names_error(table, kind.name)
+        left_out = kind.name.startswith(TWO_FACE_ERRORS) and not _names_error(table, kind.name)
         if values.get("grade") != NONE and not left_out:
             stated = "limit" in values
             size = values["limit"] if stated else grade_limit(kind, GRADES[values["grade"]], setup)
@@ -105,7 +105,7 @@ def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None
     errors += _face_errors(setup.lens, table)
     for k, entry in enumerate(table[1:]):
         off = entry.name and settings_of(table, entry.name).get("grade") == NONE
-        if entry.name and not off and entry.name.startswith(OF_TWO_FACES) and "front" not in setup.lens.passes.faces:
+        if entry.name and not off and entry.name.startswith(TWO_FACE_ERRORS) and "front" not in setup.lens.passes.faces:
             reason = "is an error of a lens with two faces, but a mirror has one face"
             raise SceneError(f"tolerance[{k}].name: {entry.name!r} {reason}; remove that table")
         if entry.name and not off and not any(entry.covers(error.kind.name) for error in errors):

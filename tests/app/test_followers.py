@@ -73,7 +73,7 @@ def test_a_wrong_entry_changes_no_other_field_and_leaves_no_trace(key, wrong, ot
 @pytest.mark.parametrize("name", TEXTS)
 def test_a_choice_that_is_offered_is_possible_or_told_why_not(name, monkeypatch):
     """Each is typed as the page sends it; what is not possible is greyed, all else makes a valid scene."""
-    monkeypatch.setattr(effects, "_KNOWN", {})  # of other tests of this process
+    monkeypatch.setattr(effects, "_REGISTERED", {})  # of other tests of this process
     text = TEXTS[name]
     greyed, data = impossible_choices(text, fault), tomllib.loads(text)
     for field in form(data).fields():

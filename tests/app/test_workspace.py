@@ -183,7 +183,7 @@ def test_a_save_that_fails_loses_nothing(own, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "text", ["#" * (scene_file.MAX_FILE_SIZE + 1), "µ" * (scene_file.MAX_FILE_SIZE // 2 + 1), "title = '\ud800'"]
+    "text", ["#" * (scene_file.MAX_SCENE_SIZE + 1), "µ" * (scene_file.MAX_SCENE_SIZE // 2 + 1), "title = '\ud800'"]
 )
 def test_what_no_scene_file_can_hold_is_not_taken(own, text):
     with pytest.raises(SceneError, match="^small: "):
@@ -363,7 +363,7 @@ def test_a_new_scene_of_each_light_shows_what_is_given(own, light, what):
     other = load(new_scene.new_scene("hand", own.scenes, light=light).path)
     assert (scene.source, scene.lens, scene.target.x) == (other.source, other.lens, other.target.x)
     assert "# the wall with the picture" in own.opened(name).text  # its comments stay
-    blurred = new_scene.Plate.of(light).blurred(scene)
+    blurred = new_scene.Plate.of(light).blur_rrmsd(scene)
     if blurred is not None:  # what the source's size leaves of this very picture
         assert blurred < scene.accept.rrmsd or scene.accept.rrmsd == new_scene.MAX_RRMSD
         assert "picture blurred by the source" in own.opened(name).text

@@ -203,7 +203,7 @@ LONG = {
     "a dotted key": ("a." * 300_000 + "a = 1", "more than 100 dots"),
     "lists in lists": ("effects = " + "[" * 400 + "]" * 400, "nested too deeply"),
     "many keys": ("\n".join(f"k{i} = {i}" for i in range(20_000)), "unknown key"),
-    "a long number": ("b = 0x" + "f" * 900_000, "a number of over 300 digits"),
+    "a long number": ("b = 0x" + "f" * 900_000, "a number of more than 300 digits"),
     "quotes": ('b = "' + '\\"' * 400_000, "not valid TOML"),
     "a line and an escape in a key": ('"a\\nb\\u001b[2J" = 1', r"a\\nb\\x1b\[2J: unknown key"),
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import get_args
 
 import cadquery
 import numpy as np
@@ -16,7 +17,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Conic, Plane, Sphere, Toroid, sag
-from bstcad.scene.blank import NET_FILE, ConicFront, SphereFront, net_extent
+from bstcad.scene.blank import FRONTS, NET_FILE, ConicFront, Front, NetFront, SphereFront, net_extent
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 
@@ -64,13 +65,20 @@ def test_a_given_front_travels_with_its_scene(earlier, tmp_path):
     for k in range(3):
         folder = tmp_path / str(k)
         folder.mkdir()
-        (folder / NET_FILE).write_bytes(scene.lens.front.file_net.copy)
+        (folder / NET_FILE).write_bytes(scene.lens.front.file.copy)
         (folder / "scene.toml").write_text(scene.toml())
         again = load(folder / "scene.toml")
-        assert again == scene and again.lens.front.file_net.data == scene.lens.front.file_net.data
+        assert again == scene and again.lens.front.file.data == scene.lens.front.file.data
         scene = again
     moved = scene.changed({"lens.front.z": 14.5})
     assert torch.equal(moved.lens.front.surface.heights, scene.lens.front.surface.heights)
+
+
+def test_a_scene_takes_each_front_of_the_table():
+    """The union is written out for type checkers."""
+    union, *_ = get_args(Front)
+    assert set(get_args(union)) == {NetFront, *(front for _, front in FRONTS.values())}
+    assert all(kind == front.kind == surface.kind for kind, (surface, front) in FRONTS.items())
 
 
 def test_a_surface_of_the_physics_is_a_front():

@@ -102,8 +102,8 @@ class TestLight:
         scene, text = written(place, "--light", "sun", "--distance", "150")
         plate = new_scene.Plate.of("sun", 80, 600)
         disc = {"target.text": None, "target.uniform": True, "target.outline": {"shape": "circle", "radius": 30.0}}
-        assert plate.blurred(scene.changed(disc)) == pytest.approx(math.sqrt(0.0676 * 5.55 * 2 / 30), rel=0.08)
-        blurred = new_scene.Plate.of("sun", 80, 150).blurred(scene)
+        assert plate.blur_rrmsd(scene.changed(disc)) == pytest.approx(math.sqrt(0.0676 * 5.55 * 2 / 30), rel=0.08)
+        blurred = new_scene.Plate.of("sun", 80, 150).blur_rrmsd(scene)
         assert scene.accept.rrmsd == math.ceil(110 * blurred) / 100 < new_scene.MAX_RRMSD
         assert "of the picture blurred by the source" in text
 

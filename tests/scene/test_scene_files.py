@@ -34,7 +34,7 @@ class Table(FileContent):
     data: bytes = field(repr=False)
 
 
-TableFile = from_file(Table, lambda path: Table(path.name, path.read_bytes()), "table = 'lamp.ies'")
+TableFile = Annotated[Table, *from_file(Table, lambda path: Table(path.name, path.read_bytes()), "table = 'lamp.ies'")]
 
 
 @dataclass(frozen=True)

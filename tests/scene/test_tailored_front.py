@@ -49,7 +49,7 @@ def test_a_front_that_is_tailored_goes_through_its_file(disk, more, tmp_path):
     (tmp_path / "scene.toml").write_text(scene.toml())
     assert load(tmp_path / "scene.toml") == scene == scene.changed({})
     front = scene.lens.front
-    assert front.is_tailored and not front.fixed and front.free == () and front.file_net is None
+    assert front.is_tailored and not front.fixed and front.free == () and front.file is None
     assert scene.lens.front_sags == (0.0, 0.0) and scene.rim_sags == disk.rim_sags  # those of a plane
     assert len(scene.warnings()) == len(disk.warnings()) + 1  # see the next test
 
@@ -133,7 +133,7 @@ def test_the_flat_lens_has_two_flat_nets_in_proportion(disk, points, final, coar
     assert whole.front.x[1] == net_extent(scene.lens.outline, scene.lens.front_net(65))[0]
     own = scene.flat_lens(33).front
     assert own.x[1] == net_extent(scene.lens.outline, scene.lens.front_net(33))[0] > whole.front.x[1]
-    assert scene.flat_lens(33, dtype=torch.float32).front.heights.dtype == torch.float32
+    assert scene.flat_lens(33).to(torch.float32).front.heights.dtype == torch.float32
 
 
 def test_the_front_may_be_tailored_alone(disk):
@@ -153,7 +153,7 @@ def test_tailoring_starts_from_the_given_net(disk):
     net = a_net(disk)
     scene = disk.changed({"lens.front": net}).changed({"lens.front.optimise": True})
     whole, first = scene.flat_lens(65).front, scene.flat_lens(33, as_wide_as=65).front
-    assert torch.equal(whole.heights, scene.lens.front.file_net.surface(15.0).heights) and whole.shape == (17, 17)
+    assert torch.equal(whole.heights, scene.lens.front.file.surface(15.0).heights) and whole.shape == (17, 17)
     assert first.shape == (9, 9) and first.x == whole.x
     x = torch.linspace(-8.0, 8.0, 41, dtype=torch.float64)
     assert (first.sag_and_slope(x, 0 * x)[0] - whole.sag_and_slope(x, 0 * x)[0]).abs().max() < 0.02  # of 0.1 mm
@@ -196,7 +196,7 @@ def test_both_nets_of_a_design_come_back_to_the_last_bit(disk, points, only_fron
 
 def test_a_step_file_of_two_nets_is_twice_as_large(disk):
     one, two = folders.step_size(disk), folders.step_size(with_front(disk))
-    assert two - folders.REST[0] == pytest.approx(2 * (one - folders.REST[0]), rel=1e-12)
+    assert two - folders.OTHER_BYTES[0] == pytest.approx(2 * (one - folders.OTHER_BYTES[0]), rel=1e-12)
     wide = with_front(disk, control_points=[65, 129])
     assert folders.step_size(wide) > two and folders.step_size(wide, 33) < one + two
     assert isinstance(with_front(disk).lens.front, NetFront)
