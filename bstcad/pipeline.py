@@ -63,12 +63,12 @@ PROCEDURES: dict[str, tuple[str, Stage, Stage]] = {  # (name of stage 1, stage 1
 }
 Stage1State = stage1.SlopeRound | paper.Level | two_faces.FrontRound
 Stage2State = stage2.TubeSearch | paper.RaySearch | stage2.Stage3State
-SIGNS = {"convex": 1.0, "concave": -1.0}  # sign of each tailoring.solution
+SOLUTION_SIGNS = {"convex": 1.0, "concave": -1.0}  # sign of each tailoring.solution
 DEVICES = ("auto", "cpu", "cuda")
 COMPARISON_STAGE = "float32 beside float64"  # name of the stage that compares precisions
 # Seconds for writing, verification and report on two cores: in all, per net of 513 x 513 control points, per picture of
 # 512 x 512 pixels, and per target for the finer flux tubes that two nets need.
-FIXED, PER_NET, PER_PICTURE, PER_WITNESS = 4.0, 5.0, 3.0, 15.0
+BASE_SECONDS, SECONDS_PER_NET, SECONDS_PER_PICTURE, SECONDS_PER_WITNESS = 4.0, 5.0, 3.0, 15.0
 REACH_NET = 33  # control points per side of the flat back with which the reach of light is computed
 MIN_REACHABLE = 1e-3  # smallest fraction of a target's light that must be reachable
 REACH_REMEDIES = {  # advice for a target that light cannot reach completely, for each optic
@@ -191,7 +191,7 @@ def task_of(scene: Scene, goals: Sequence[Goal], knobs: ResolvedTailoring, edge:
         light, tuple(goals), knobs, min_thickness=scene.lens.min_thickness, bounds=scene.lens.bounds,
         free=scene.lens.front.free, rim_sags=scene.rim_sags, front_sides=scene.lens.front_net,
         sampled_sources=tuple(each.channels() for each in scaled), extended_sources=sources,
-        edge=edge, wave=scene.wavefront, solution=None if knobs.solution is None else SIGNS[knobs.solution],
+        edge=edge, wave=scene.wavefront, solution=None if knobs.solution is None else SOLUTION_SIGNS[knobs.solution],
     )  # fmt: skip
 
 
@@ -438,7 +438,7 @@ def reserve(scene: Scene) -> float:
     nets = scene.lens.nets()
     points = sum(math.prod(as_pair(net)) for net in nets) / 513**2
     witnesses = len(scene.targets) * (len(nets) - 1)
-    return FIXED + PER_NET * points + PER_PICTURE * pixels + PER_WITNESS * witnesses
+    return BASE_SECONDS + SECONDS_PER_NET * points + SECONDS_PER_PICTURE * pixels + SECONDS_PER_WITNESS * witnesses
 
 
 def purpose(scene: Scene, device: str) -> dict[str, Any]:

@@ -92,7 +92,7 @@ def test_max_time_leaves_time_to_write_and_to_prove(monkeypatch):
     monkeypatch.setattr(pipeline, "Driver", lambda *given, **more: asked.update(more) or 1 / 0)
     with pytest.raises(ZeroDivisionError):
         pipeline.design(small("disk", **{"tailoring.max_time": "60.0"}))
-    assert asked["limit"] == 60.0 and asked["reserve"] > pipeline.FIXED
+    assert asked["limit"] == 60.0 and asked["reserve"] > pipeline.BASE_SECONDS
 
 
 @pytest.mark.parametrize(("device", "sentence"), [("gpu", "'gpu' is not possible; give one of"), ("cuda", "no CUDA")])

@@ -36,7 +36,7 @@ TRIAL_ITERATIONS = 100  # iterations of the coarse maps
 MAX_UNSERVED = 0.5  # largest fraction of the light that two faces may fail to serve
 REPORTED_FRACTION = 1e-3  # smallest fraction of the light that is reported as not served
 MAX_GENTLE_TURN = 30.0  # largest turn at the front without a floor under the furthest picture (degrees)
-FLOORS = (0.1, 0.2, 0.4, 1.0)  # floors to try, relative to the mean of the furthest picture; the first that suffices
+TRIED_FLOORS = (0.1, 0.2, 0.4, 1.0)  # floors relative to the mean of the furthest picture; the first that suffices
 SOLUTION_NAMES = {1.0: "convex", -1.0: "concave"}  # names by the sign σ
 
 
@@ -99,7 +99,7 @@ def find_demand(task: Task, lens: Lens) -> Demand:
         return best
     best = replace(best, turn=_largest_turn(task, lens, light))
     lifted = [replace(best, lifted_turn=best.turn)]
-    for floor in FLOORS if len(task.goals) > 1 and task.wave is None else ():
+    for floor in TRIED_FLOORS if len(task.goals) > 1 and task.wave is None else ():
         if lifted[-1].lifted_turn <= MAX_GENTLE_TURN:
             break
         _, light = _demand(replace(task, floor=floor), best.solution, lens)

@@ -31,7 +31,7 @@ from bstcad.tailoring.run import Edge
 from bstcad.tailoring.slope_map import face_grid, interpolate, lit_window, rays_at
 
 PENALTY_WEIGHT = 100.0  # weight of the penalty relative to RRMSD²
-MAX_CELLS = 257  # largest number of cells per side of the grid from which the light is interpolated
+MAX_LIGHT_CELLS = 257  # largest number of cells per side of the grid from which the light is interpolated
 # u above which `without_reflection` penalises, and its largest accepted excess, as a fraction of 1 - PENALTY_START
 PENALTY_START, ACCEPTED_EXCESS = 0.6, 0.5
 MAX_EVALUATIONS = 60  # largest number of evaluations of the penalty alone
@@ -54,7 +54,7 @@ class Grazing:
         source, net = edge.light.source, own_lens.nets[-1]
         window = lit_window(source, own_lens)
         m, n = net.shape
-        grid = face_grid(source, own_lens, window, (min(2 * m, MAX_CELLS), min(2 * n, MAX_CELLS)))
+        grid = face_grid(source, own_lens, window, (min(2 * m, MAX_LIGHT_CELLS), min(2 * n, MAX_LIGHT_CELLS)))
         axes = zip((net.x, net.y), net.pitch, net.shape, strict=True)
         x, y = np.meshgrid(*(low + pitch * _span_points(count) for (low, _), pitch, count in axes), indexing="ij")
         inside = (np.abs(x) <= window.width / 2) & (np.abs(y) <= window.height / 2)

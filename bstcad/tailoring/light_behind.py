@@ -47,12 +47,12 @@ from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Points, Solver, grid_coordinates, solve
 
 MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # rounds of the map; cells of the coarse ones: n // 4, minimum
-MAX_ITERATIONS = 40  # largest number of iterations for the point of a wave whose ray meets a given point of the target
-CONVERGED = 1e-9  # change at which these iterations have converged (mm)
+MAX_WAVE_ITERATIONS = 40  # largest number of iterations for the point of a wave whose ray meets a point of the target
+WAVE_TOLERANCE = 1e-9  # change of this point at which the iterations have converged (mm)
 SOURCE_FLOOR = 0.02  # floor under the map's source picture, relative to the mean: a hole would be one in the map
 # Standard deviations (pixels) of the blur of the source picture, reduced in turn once the map is found.  For a portrait
 # with dark beside bright parts Newton's method ends at a mass error of 0.06 to 0.25 without, and of 0.003 with them.
-BLURS = (4.0, 2.0, 1.0)
+SOURCE_BLURS = (4.0, 2.0, 1.0)
 FINE_FACTOR = 2  # cells per side of the last map, relative to the transport's grid: letters cover much of a face
 # Solver with floors under the target picture, relative to its mean, that are lowered in turn
 TARGETS_SOLVER = Solver(floors=(0.1, 0.03, 0.01, 0.003))
@@ -190,11 +190,11 @@ def light_of_wave(screen: Screen, picture: np.ndarray, wave: Wave, *, wavelength
     x, y = (torch.from_numpy(p) for p in place[:2])
     below = torch.from_numpy(wave.z - place[2])
     direction = wave.directions(x, y, wavelength)
-    for _ in range(MAX_ITERATIONS):  # iterate the point of the wave's plane whose ray goes there
+    for _ in range(MAX_WAVE_ITERATIONS):  # iterate the point of the wave's plane whose ray goes there
         path = below / direction[2]
         there = x + path * direction[0], y + path * direction[1]
         before, direction = direction, wave.directions(*there, wavelength)
-        if not bool(((direction - before).abs() * below.abs().max() > CONVERGED).any()):
+        if not bool(((direction - before).abs() * below.abs().max() > WAVE_TOLERANCE).any()):
             return LightBehind(place, direction.numpy(), picture)
     raise SceneError(
         f"wavefront.z: rays of the wave at z = {wave.z:g} cross before the target; move the wavefront's plane nearer "
@@ -215,7 +215,7 @@ def between_targets(
     contrasts = [float((p**2).mean() / p.mean() ** 2) for _, p in (near, far)]
     against = contrasts[0] > CONTRAST_RATIO * contrasts[1]  # True: rays are followed backwards, from far to near
     (screen, picture), (behind, target) = (far, near) if against else (near, far)
-    smooth = (gaussian_filter(picture, width, mode="nearest") for width in BLURS)
+    smooth = (gaussian_filter(picture, width, mode="nearest") for width in SOURCE_BLURS)
     sharp, *pictures = (np.maximum(p, SOURCE_FLOOR * p.mean()) for p in (picture, *smooth))
     e_x, e_y, _ = _frame(screen.plane)
 

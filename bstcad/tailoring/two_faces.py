@@ -7,11 +7,11 @@ slope_map.py, from points q of the front to the slopes p(q, b) that follow from 
     y = -(p(q, b) - ∇g(q)),    ∇g(q) ≈ p(q, r(q)) - r(q) ∂p/∂b,
 
 with r the affine map that stretches the light on the front onto that on the back, so that y hardly depends on q for a
-fixed b.  (The sign: a front turns light against its slope.)  Then the back is fitted to the slopes that turn each
-arriving ray into its direction behind the lens.  Such a face exists.  Let Φ and Φ' be the optical paths along the rays
-in the glass and behind the lens, with |∇Φ| = n and |∇Φ'| = 1.  By Snell's law a face turns the one rays into the others
-where its normal is along ∇(Φ - Φ'), so each surface Φ - Φ' = const is a solution.  A new back changes b(t), and so the
-rounds repeat, each from the faces and the points of the last round.
+fixed b.  (The minus sign: light that enters glass turns against the slope of the face.)  Then the back is fitted to the
+slopes that turn each arriving ray into its direction behind the lens.  Such a face exists.  Let Φ and Φ' be the optical
+paths along the rays in the glass and behind the lens, with |∇Φ| = n and |∇Φ'| = 1.  By Snell's law a face turns the one
+rays into the others where its normal is along ∇(Φ - Φ'), so each surface Φ - Φ' = const is a solution.  A new back
+changes b(t), and so the rounds repeat, each from the faces and the points of the last round.
 """
 
 from __future__ import annotations
