@@ -231,13 +231,12 @@ class _Setup:
         if self.ghost is not None:
             flux |= {line: flux.get(line, 0.0) + more for line, more in self.ghost.flux.items()}
         count = sum(part.rays for part in sets)
-        boxes, tents = ([self.with_ghost(getattr(part, kind)) for part in sets] for kind in ("box", "tent"))
-        on_screen = math.fsum(float(total(box)) for box in boxes) / SETS
-        if not all(float(total(box)) > 0 for box in boxes):
+        sums = [[self.with_ghost(getattr(part, kind)) for part in sets] for kind in ("box", "tent")]
+        on_screen = math.fsum(float(total(box)) for box in sums[0]) / SETS
+        if not all(float(total(box)) > 0 for box in sums[0]):
             return _Rays((), (), flux, count, on_screen=0.0)
-        weight, sums = float(side) ** 3, (boxes, tents)
-        scaled = [tuple(p * (total(self.target) / total(p)) for p in pictures) for pictures in sums]
-        return _Rays(scaled[0], scaled[1], flux, count, on_screen=on_screen, weight=weight)
+        boxes, tents = (tuple(p * (total(self.target) / total(p)) for p in pictures) for pictures in sums)
+        return _Rays(boxes, tents, flux, count, on_screen=on_screen, weight=float(side) ** 3)
 
     def with_ghost(self, picture: Tensor) -> Tensor:
         """Return a picture on the CPU with the light of the ghost."""

@@ -168,11 +168,9 @@ def wavefront_error(source: Emitter, lens: Lens, wave: Wave, n: int = RAYS_PER_S
     unit, angle = 1 / (nm * MM_PER_NM), 2e6 * torch.asin((length(deviation) / 2).clamp(max=1))
     slopes = [p - tilt for p, tilt in zip(deviation[:2], fit.slopes, strict=True)]
     along_x, along_y, opd_map = _map(x, y, without_tilt, slopes=slopes, cells=min(MAX_MAP_CELLS, n // 2))
-    piston_free, tilt_free = (
-        OpdSize(unit * _rms(o, share), unit * float(o.max() - o.min())) for o in (without_piston, without_tilt)
-    )
+    sizes = [OpdSize(unit * _rms(o, share), unit * float(o.max() - o.min())) for o in (without_piston, without_tilt)]
     return WavefrontError(
-        wave.z, nm, piston_free, tilt_free, tilt=(1e6 * fit.slopes[0], 1e6 * fit.slopes[1]),
+        wave.z, nm, sizes[0], sizes[1], tilt=(1e6 * fit.slopes[0], 1e6 * fit.slopes[1]),
         angle_rms=_rms(angle, share), angle_max=float(angle.max()), floor=unit * pupil.rounding, flux=measured,
         rays=len(x), x=along_x, y=along_y, opd=unit * opd_map,
     )  # fmt: skip
