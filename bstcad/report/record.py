@@ -540,7 +540,6 @@ class Report:
         return self.contents.facts()
 
     def __getattr__(self, key: str) -> Any:
-        """Return a field of the record."""
         if key.startswith("_") or key == "contents":  # copying and unpickling request these before they exist
             raise AttributeError(key)
         return getattr(self.contents, key)
