@@ -37,7 +37,7 @@ class Collimated(Emitter):
     wavelength: WavelengthKey = 587.6
     profile: Annotated[Literal["uniform", "gaussian"], Key("Irradiance over the aperture.")] = "uniform"
     radius_1e2: Annotated[
-        float | None, Key("Radius of 1/e^2 of a gaussian profile's peak.", "mm", 1e-3, 1e6, example=8.0)
+        float | None, Key("Radius at which a gaussian profile is 1/e² of its peak.", "mm", 1e-3, 1e6, example=8.0)
     ] = None
     # None: the plane of the lens's first vertex; rays start at z = 0, or in front of a lens that reaches below z = 0
     z: Annotated[float | None, Key("Plane of the aperture, where rays start.", "mm", -1e8, 1e8, example=0.0)] = None

@@ -43,7 +43,7 @@ class Point(Emitter):
     profile: Annotated[Literal["gaussian", "lambertian", "uniform"], Key("Radiant intensity by angle.")] = "lambertian"
     half_angle_1e2: Annotated[
         float | None,
-        Key("Angle from the axis where a gaussian's irradiance on planes is 1/e^2 of its peak.", "degrees", 1e-3, 89.0),
+        Key("Angle from the axis where a gaussian's irradiance on planes is 1/e² of its peak.", "degrees", 1e-3, 89.0),
     ] = None
     half_angle: Annotated[
         float | None, Key("Angle from the axis at which a uniform or lambertian profile ends.", "degrees", 1e-3, 90.0)

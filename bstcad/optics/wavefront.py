@@ -34,7 +34,7 @@ Z = Key("Plane behind the lens on which the wavefront is stated and measured.", 
 WEIGHT = Key("Weight of the wavefront against the pictures.", "", 0.0, 1e9, example=2.0)
 LIGHT_DIRECTION = "Direction of the light, of any length."
 FOCUS = "Centre of the sphere: behind z light converges, before it diverges."
-COEFFICIENTS = "Waves at the source's main wavelength, in Noll's order from j = 1."
+COEFFICIENTS = "Coefficients in waves (main wavelength), in Noll's order from j = 1."
 
 
 class _Wave:

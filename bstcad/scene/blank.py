@@ -316,7 +316,7 @@ class ToroidFront(_FittedFront):
     z: Annotated[float, VERTEX_Z]
     curvature_x: Annotated[float, Key("Curvature along x; positive: bent towards +z.", "1/mm", *CURVATURES)] = 0.0
     curvature_y: Annotated[float, Key("Curvature along y; positive: bent towards +z.", "1/mm", *CURVATURES)] = 0.0
-    kind: Annotated[Literal["toroid"], Key("A toroid, an arc along x turned along y; or a cylinder.")] = "toroid"
+    kind: Annotated[Literal["toroid"], Key("A toroid, curved along x and y; a cylinder if one is 0.")] = "toroid"
 
     __pydantic_config__ = STRICT
 
@@ -513,7 +513,7 @@ class LensBlank(Record):
     reflects, light crosses the back before and after the front.
     """
 
-    material: Annotated[str | None, Key("ParameterName on refractiveindex.info; or give the index.")] = None
+    material: Annotated[str | None, Key("Name on refractiveindex.info; or give the index.")] = None
     index: Annotated[float | None, Key("Refractive index, in place of material.", "", *INDICES, example=1.49)] = None
     outline: Annotated[Outlined, Key("Rim of the lens.", example={"shape": "rectangle", "width": 24.0, "height": 24.0})]
     front: Annotated[Front, Key("The face that light enters.", example={"kind": "plane", "z": 8.0})]

@@ -41,25 +41,31 @@ class Tailoring(Record):
     seed: Annotated[int, Key("Seed of all random numbers.", "", 0, 2**63 - 1)] = 0
     method: Annotated[
         Literal["least-squares", "adam", "integration"] | None,
-        Key("Least squares with slope maps, the paper's Adam, or integration alone.", example="least-squares"),
+        Key("Method: least squares, the paper's (adam), or point-by-point integration.", example="least-squares"),
     ] = None
     levels: Annotated[
         tuple[OneOrTwo, ...] | None,
-        Key("Control points of the nets, coarse to fine, as for the back.", "", *NET_SIZES, example=[129, 257]),
+        Key("Nets, coarse to fine, each as lens.back.control_points.", "", *NET_SIZES, example=[129, 257]),
     ] = None
     transport_grid: Annotated[int | None, Key("Cells per side of the transport map.", "", 16, 2049, example=512)] = None
     transport_iterations: Annotated[int | None, Key("Transport map iterations.", "", 1, 100_000, example=100)] = None
     rays: Annotated[int | None, Key("Rays or flux tubes along each side of the light.", "", 16, 16_384)] = None
     stage1_iterations: Annotated[int | None, Key("Steps per level with adam.", "", 0, 1_000_000, example=300)] = None
-    rounds: Annotated[int | None, Key("Maximum rounds of map and slope fit in stage 1.", "", 1, 100, example=10)] = None
+    rounds: Annotated[
+        int | None, Key("Maximum number of rounds of transport map and slope fit in stage 1.", "", 1, 100, example=10)
+    ] = None
     stage2_iterations: Annotated[int | None, Key("Iterations of stage 2.", "", 0, 1_000_000, example=120)] = None
-    overshoot: Annotated[float | None, Key("Weight of light off target per pixel².", "", 0.0, 1e3, example=0.03)] = None
+    overshoot: Annotated[
+        float | None, Key("Weight of light beside the target, per pixel².", "", 0.0, 1e3, example=0.03)
+    ] = None
     source_points: Annotated[int | None, Key("Sample points of an extended source.", "", 2, 4096)] = None
     solution: Annotated[
         Literal["convex", "concave"] | None,
-        Key("Two pictures: convex, no rays cross; concave, all cross; chosen if absent.", example="concave"),
+        Key("For two pictures: convex (no rays cross) or concave (all cross).", example="concave"),
     ] = None
-    precision: Annotated[Literal["float32", "float64"] | None, Key("Precision of tailoring.", example="float64")] = None
+    precision: Annotated[
+        Literal["float32", "float64"] | None, Key("Precision of the numbers in tailoring.", example="float64")
+    ] = None
     accuracy: Annotated[float | None, Key("RRMSD at which tailoring ends.", "", 1e-6, 10.0, example=0.05)] = None
     max_time: Annotated[
         float | None, Key("Maximum time until the report; stage 1 always ends.", "s", 1.0, 1e7, example=60.0)
@@ -171,12 +177,14 @@ class Tolerance(Record):
     grade: Annotated[
         Literal["moulded", "diamond-turned", "precise", "none"] | None, Key("Grade of the limit; none: no error.")
     ] = None
-    limit: Annotated[float | None, Key("Limit (±) in the error's unit; of form and ripple RMS.", "", 1e-12, 1e4)] = None
-    distribution: Annotated[Literal["normal", "uniform"] | None, Key("Normal is cut at its limit, 2 σ.")] = None
+    limit: Annotated[float | None, Key("Limit (±) in the error's unit; RMS of form and ripple.", "", 1e-12, 1e4)] = None
+    distribution: Annotated[
+        Literal["normal", "uniform"] | None, Key("Distribution; normal is cut at the limit, two standard deviations.")
+    ] = None
     cost: Annotated[float | None, Key("Cost of the limit, relative to the other errors.", "", 1e-6, 1e6)] = None
     correlation_length: Annotated[float | None, Key("Correlation length of a form error.", "mm", 1e-3, 1e4)] = None
     period: Annotated[float | None, Key("Period of a ripple.", "mm", 1e-3, 1e4, example=0.02)] = None
-    pattern: Annotated[Literal["raster", "spiral"] | None, Key("Tool marks of the ripple.", example="spiral")] = None
+    pattern: Annotated[Literal["raster", "spiral"] | None, Key("Pattern of the tool marks.", example="spiral")] = None
 
     def covers(self, error: str) -> bool:
         """Return True if the table applies to this error."""

@@ -67,7 +67,9 @@ class Accept(Record):
     light_on_target: Annotated[
         float | None, Key("Minimum fraction of the flux in the lens on the target.", "", 0.0, 1.0, of_light=True)
     ] = None
-    leak: Annotated[float | None, Key("Maximum fraction of light on dark parts.", "", 0.0, 1.0, of_light=True)] = None
+    leak: Annotated[
+        float | None, Key("Maximum fraction of the flux on dark parts of the target.", "", 0.0, 1.0, of_light=True)
+    ] = None
     decentre: Annotated[float | None, Key("Maximum decentre of a measured part.", "mm", 1e-6, 1e3)] = None
     wavefront: Annotated[
         float | None, Key("Maximum RMS wavefront error, in waves.", "", 1e-9, 1e6, example=0.1, of_light=True)

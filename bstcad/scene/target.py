@@ -79,7 +79,9 @@ class Target(Record):
     seen_from: Annotated[Literal["lens", "behind"], Key("Side from which the picture is not mirrored.")] = "lens"
     rotate: Annotated[Literal[0, 90, 180, 270], Key("Rotation of the picture, counterclockwise.", "degrees")] = 0
     mirror: Annotated[bool, Key("Exchange left and right, after the rotation.")] = False
-    fit: Annotated[Literal["crop", "pad", "stretch"], Key("Fit of a picture of another shape.", example="pad")] = "crop"
+    fit: Annotated[
+        Literal["crop", "pad", "stretch"], Key("Fit of a picture with other proportions.", example="pad")
+    ] = "crop"
     crop: Annotated[
         Crop | None,
         Key("Part to show: [left, top, right, bottom] as fractions.", "", 0.0, 1.0, example=[0.1, 0.0, 0.9, 1.0]),
