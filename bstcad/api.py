@@ -13,7 +13,7 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,17 +41,17 @@ from bstcad.runs import progress as progresses
 from bstcad.scene.blank import MIN_ROUND_POINTS
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene, load
+from bstcad.tailoring.merit import PictureError
 from bstcad.tailoring.run import Hooks
 from bstcad.transport.mapping import TransportMap
 
 RELATIVE_TOLERANCE = 1e-9  # relative difference of equal indices; difference of equal ends of nets, in net widths
 PREVIEW_TUBES = 521  # flux tubes per side for a picture that is not verified
 AnyPath = str | os.PathLike[str]  # path of a file or of a folder
-MeritFunction = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]  # merit of a picture for a target (rows, columns)
 
 
 def design(
-    scene: Scene | AnyPath, *, progress: bool = True, device: str = "auto", merit: MeritFunction | None = None
+    scene: Scene | AnyPath, *, progress: bool = True, device: str = "auto", merit: PictureError | None = None
 ) -> Design:
     """Design the lens for a scene or for a scene file.  SceneError names the fault of a scene.
 
@@ -358,7 +358,7 @@ class Design:
         return f"RRMSD {number(values[-1])} as tailored; not verified yet" if values else "not verified yet"
 
     def _irradiance(self, number: int = 0) -> np.ndarray:
-        """Return the flux per pixel of a target (rows, columns), with the target's sum, verified or of fewer tubes."""
+        """Return the flux per pixel of a target (rows, columns), scaled to the target's sum: verified, or a preview."""
         if self.report is not None:
             return self.report.irradiances[number]
         goal = self._made.goals[number]

@@ -251,7 +251,9 @@ Yield = option(float | None, "P", "Find the loosest tolerances with this yield, 
 Seed = option(int, "N", "Seed of the random trials.", min=0)
 Trial = option(int | None, "N", "Write only the lens of this trial, as trial-N.step.", min=0)
 Kinds = option(str | None, "NAMES", f"Kinds of files, separated by commas: {EXPORT_NAMES}.", "--as")
-Points = option(int | None, "N", "Points along the longer side of a grid (default: control points; zemax: its knots).")
+Points = option(
+    int | None, "N", "Points along the longer side of a grid (default: control points; zemax: its knots)."
+)
 Png = path_option("FILE", "Picture to write.", "--png", "-o")
 ReachPng = path_option("FILE", "Draw the target and the area that light can reach; a second target in FILE_2.", "--png")
 Budget = option(
@@ -292,7 +294,8 @@ def generate(
     if commands.folders.step_size(wanted) >= commands.folders.LARGE_STEP:
         note_on_stderr(commands.folders.size_sentence(wanted))
     with progress.watch(Console(stderr=True)) as watched:
-        report = commands.generate(wanted, folder, device=device, progress=watched, began=START_TIME, resume=resume)
+        hooks = commands.Hooks(watched)
+        report = commands.generate(wanted, folder, hooks=hooks, device=device, began=START_TIME, resume=resume)
     print(*report.notes, sep="\n", end="\n" if report.notes else "")
     if report.stopped != "interrupt":
         return conclude(report.contents, folder, verbose)

@@ -56,7 +56,7 @@ from bstcad.scene.scene import Scene
 from bstcad.step_text import beginning
 from bstcad.sweep.estimates import diagnosis, left_out
 from bstcad.sweep.net_choice import with_net
-from bstcad.tailoring.run import NO_HOOKS, Hooks, LensCallback, Progress, no_progress
+from bstcad.tailoring.run import NO_HOOKS, Hooks, Progress, no_progress
 from bstcad.verify import checks
 from bstcad.verify.checks import Proof
 from bstcad.verify.verdict import Check, verdict
@@ -88,18 +88,18 @@ class ProofOptions:
 
 
 def generate(
-    scene: Scene, folder: Path, options: ProofOptions = ProofOptions(), *, device: str = "auto", resume: bool = False,
-    progress: Progress = no_progress, began: float | None = None, on_lens: LensCallback = NO_HOOKS.on_lens,
+    scene: Scene, folder: Path, options: ProofOptions = ProofOptions(), hooks: Hooks = NO_HOOKS, *,
+    device: str = "auto", resume: bool = False, began: float | None = None,
 ) -> Report:  # fmt: skip
     """Design a lens, write it to `folder` and prove it from the written files.
 
+    hooks: functions that are called while it runs; `save` and `interrupted` are replaced by those of this command.
     began: start of the times in the report and of tailoring.max_time (time.perf_counter(); default: now).
     During the design a checkpoint is written beside the folder at intervals; with `resume` the design continues from
     it.  After a Ctrl-C the best lens so far is written, never over an earlier finished design: see `output_folder`.
-    on_lens: called at intervals with the function that makes the best lens so far.
     """
-    scene = with_default_net(scene, lambda line: progress("control points", 1, 1, line))
-    path, say = files.beside(folder, "checkpoint"), lambda text: progress("checkpoint", 0, 0, text)
+    scene = with_default_net(scene, lambda line: hooks.progress("control points", 1, 1, line))
+    path, say = files.beside(folder, "checkpoint"), lambda text: hooks.progress("checkpoint", 0, 0, text)
     keeper = Keeper(path, purpose(scene, device), say, kind=DesignState)
     processes.begin()
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -111,11 +111,11 @@ def generate(
         if not resume and keeper.path.exists():
             keeper.say("a stopped design is here; it starts from the beginning, since --resume is not given")
         with _checkpoint_on_error(keeper, refused=(SceneError,)), signals.stop_on_interrupt() as wished:
-            hooks = Hooks(progress, keeper, wished, on_lens)
+            hooks = replace(hooks, save=keeper, interrupted=wished)
             found = design(scene, device=device, hooks=hooks, began=began, start=state)
         with _checkpoint_on_error(keeper):
             options = replace(options, limit=scene.tailoring.max_time)
-            report = write(found, output_folder(folder, found.making.stopped), options, progress)
+            report = write(found, output_folder(folder, found.making.stopped), options, hooks.progress)
         if found.making.stopped == "interrupt":
             keeper.flush()
         else:
@@ -167,7 +167,7 @@ def write(made: Made, folder: Path, options: ProofOptions = ProofOptions(), prog
         made = replace(made, making=made.making.with_stages(StageRecord("report", time.perf_counter() - proven)))
         contents = replace(_contents(made, proof, estimates), order=order)
         drawn.begin(draw_convergence, contents)
-        _write_report(made, proof.lens, contents, building, drawn=drawn, sections=options.sections)
+        _write_report(made, proof.lens, contents, building, drawn=drawn, options=options)
         _write_sheet(drawn, building)
         progress("report", 1, 1, "")
     return Report(contents, irradiances, notes=tuple(exported.notes))
@@ -202,8 +202,7 @@ def _write_and_prove(
         if options.limit is not None:
             left = options.limit - REPORT_TIME - made.making.seconds_total - (written - began)
             effort = options.effort or FULL
-            effort = replace(effort, seconds=min(effort.seconds, max(left, MIN_RAY_TIME)))
-            options = replace(options, effort=effort)
+            options = replace(options, effort=replace(effort, seconds=min(effort.seconds, max(left, MIN_RAY_TIME))))
         proof = _prove_files(made, folder, drawn, options, progress=progress)
         for work in parallel:
             work.result()
@@ -310,10 +309,8 @@ def verify(
             if place is None:
                 drawn.sheet(_sheet(made, proof, contents.goals, proof.lights[0].picture, order=order))
             drawn.begin(draw_convergence, contents)
-            write = partial(
-                _write_report, made, proof.lens, studied=tolerances.of_folder(path, made.scene.optic), drawn=drawn,
-                sections=options.sections,
-            )  # fmt: skip
+            studied = tolerances.of_folder(path, made.scene.optic)
+            write = partial(_write_report, made, proof.lens, drawn=drawn, options=options, studied=studied)
             if cloud is not None:
                 part = _made_part(cloud, proof, made, options.effort, progress=progress)
                 for number, light in enumerate(proof.lights):
@@ -408,14 +405,7 @@ def _sheet(
 
 
 def _write_report(
-    made: Made,
-    lens: Lens,
-    contents: Contents,
-    folder: Path,
-    *,
-    drawn: Pictures,
-    studied: str = "",
-    sections: Sequence[OwnSection] = (),
+    made: Made, lens: Lens, contents: Contents, folder: Path, drawn: Pictures, options: ProofOptions, studied: str = ""
 ) -> None:
     """Write the report as JSON, HTML and JUnit XML, with prescription.txt and figures/.
 
@@ -434,7 +424,7 @@ def _write_report(
         solid=rendering.turnable(as_cut(lens, made.scene.mount)),
         tolerances=studied,
         prescription=prescription.sections(prescribed),
-        sections=[of_script(contents) for of_script in sections],
+        sections=[of_script(contents) for of_script in options.sections],
     )
     files.put(folder / "report.html", page)
     files.put(folder / "prescription.txt", prescription.text(prescribed).encode())

@@ -18,6 +18,7 @@ from bstcad import cli
 from bstcad import folder as folders
 from bstcad.report import manual
 from bstcad.runs import progress, signals
+from bstcad.tailoring.run import Hooks
 
 ROOT = Path(__file__).parent.parent
 THU = str(ROOT / "templates" / "thu.toml")
@@ -28,15 +29,15 @@ class FakeCommands(types.ModuleType):
 
     def __init__(self):
         super().__init__("bstcad.commands")
-        self.folders = folders
+        self.folders, self.Hooks = folders, Hooks
         self.calls = []
         self.passed = True
         self.error = None
 
-    def generate(self, scene, folder, device, progress, began, resume):
+    def generate(self, scene, folder, hooks, device, began, resume):
         self.calls.append((scene, folder, device))
-        progress("stage 1", 1, 2, "RRMSD 0.5")
-        progress("stage 1", 2, 2, "RRMSD 0.25")
+        hooks.progress("stage 1", 1, 2, "RRMSD 0.5")
+        hooks.progress("stage 1", 2, 2, "RRMSD 0.25")
         return self._report()
 
     def with_default_net(self, scene, say):

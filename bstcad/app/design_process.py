@@ -111,9 +111,8 @@ def design(job: Mapping[str, Any], run_folder: Path, output: Path, resume: bool)
     from bstcad.scene.scene import load
 
     scene = load(run_folder / SCENE)
-    progress, light = ProgressFile(run_folder / PROGRESS), LightSnapshot(scene, run_folder / LIGHT)
-    began = time.perf_counter()
-    report = commands.generate(scene, output, progress=progress, began=began, resume=resume, on_lens=light)
+    hooks = commands.Hooks(ProgressFile(run_folder / PROGRESS), on_lens=LightSnapshot(scene, run_folder / LIGHT))
+    report = commands.generate(scene, output, hooks=hooks, resume=resume, began=time.perf_counter())
     found = report.contents
     if report.stopped != "interrupt":
         return State("finished", passed=found.passed, rrmsd=found.rrmsd, folder=output.name)

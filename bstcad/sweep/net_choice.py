@@ -102,10 +102,7 @@ class Choice:
 
 
 def with_net(scene: Scene) -> tuple[Scene, Choice | None]:
-    """Return the scene with a chosen net, and the choice; or the scene unchanged and None if it states a net.
-
-    Raises SceneError if no light reaches the back.
-    """
+    """Return the scene with its net or a chosen one, and the choice or None; SceneError if the back gets no light."""
     if scene.lens.back.control_points is not None:
         return scene, None
     levels = scene.tailoring.levels

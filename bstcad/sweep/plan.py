@@ -26,15 +26,7 @@ from bstcad.scene.scene import Scene
 from bstcad.sweep.cold_run import round_numbers
 from bstcad.sweep.estimates import coarse_lens, left_out
 from bstcad.sweep.net_choice import rrmsd_ratio
-from bstcad.sweep.prediction import (
-    PILOT_QUALITIES,
-    QUALITIES,
-    REMAINING_BLUR,
-    Interval,
-    predictions,
-    replace_net,
-    run_pilot,
-)
+from bstcad.sweep.prediction import PILOT_QUALITIES, QUALITIES, REMAINING_BLUR, predict, replace_net, run_pilot
 from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT
 
 CAVEAT = "Estimates assume one target and one tailored face; with several, the lens deflects light differently."
@@ -160,17 +152,17 @@ def predict_qualities(scene: Scene, lenses: Sequence[Lens], tick: Tick = lambda:
         pilots = {quality: run_pilot(scene, quality, tick) for quality in PILOT_QUALITIES}
     except SceneError as refusal:
         return entries | {"not_predicted": f"a small version of this scene was refused: {refusal}"}
-    predicted, steep = predictions(scene, pilots), pilots[PILOT_QUALITIES[-1]].steep
+    predicted, steep = predict(scene, pilots), pilots[PILOT_QUALITIES[-1]].steep
     entries |= {"predicted": predicted, "notes": [*too_steep(steep), *_limit_notes(scene, predicted)]}
     net = scaled(scene.lens.back.net, 2)
     if max(as_pair(net)) <= MAX_CONTROL_POINTS:
         finer = replace_net(scene, net)
         gain = rrmsd_ratio(scene, finer, lenses)
-        entries["finer"] = {"control_points": net, "predicted": predictions(finer, pilots, gain)}
+        entries["finer"] = {"control_points": net, "predicted": predict(finer, pilots, gain)}
     return entries
 
 
-def _limit_notes(scene: Scene, predicted: Mapping[str, Mapping[str, Interval]]) -> Iterator[str]:
+def _limit_notes(scene: Scene, predicted: Mapping[str, Mapping[str, tuple[float, float, float]]]) -> Iterator[str]:
     """Yield remarks on limits of the scene that the predictions ignore."""
     max_time, accuracy = scene.tailoring.max_time, scene.tailoring.accuracy
     if max_time is not None and (exceeding := [q for q, each in predicted.items() if each["seconds"][1] > max_time]):

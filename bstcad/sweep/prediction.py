@@ -151,7 +151,7 @@ FINE_RATIO = 0.7  # ratio of the RRMSD in fine to that in standard quality
 REMAINING_BLUR = 0.5  # fraction of the blur by an extended source that remains after stage 3
 
 
-def predictions(scene: Scene, pilots: Mapping[str, Pilot], gain: float = 1.0) -> dict[str, dict[str, Interval]]:
+def predict(scene: Scene, pilots: Mapping[str, Pilot], gain: float = 1.0) -> dict[str, dict[str, Interval]]:
     """Predict time (seconds), RRMSD and memory (GB, both processes) for each quality from pilots of PILOT_QUALITIES.
 
     The RRMSD does not increase from one quality to the next better one.  gain: ratio of the RRMSD to that of the

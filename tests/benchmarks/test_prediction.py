@@ -12,7 +12,7 @@ import pytest
 
 from bstcad.scene.scene import load
 from bstcad.sweep.net_choice import with_net
-from bstcad.sweep.prediction import INTERVAL_FACTORS, PILOT_QUALITIES, predictions, run_pilot
+from bstcad.sweep.prediction import INTERVAL_FACTORS, PILOT_QUALITIES, predict, run_pilot
 from tests.benchmarks.cold import ROOT, TEMPLATES, generate
 
 SCENES = sorted([*TEMPLATES.glob("*.toml"), *(ROOT / "docs" / "gallery-scripts").glob("*.toml")])
@@ -24,7 +24,7 @@ def test_nine_of_ten_designs_keep_to_the_factors_that_are_stated(quality, tmp_pa
     off = {key: [] for key in INTERVAL_FACTORS}
     for path in SCENES:
         scene = with_net(load(path))[0]
-        likely = predictions(scene, dict.fromkeys(PILOT_QUALITIES, run_pilot(scene, quality)))[quality]
+        likely = predict(scene, dict.fromkeys(PILOT_QUALITIES, run_pilot(scene, quality)))[quality]
         run = generate(path, tmp_path / path.stem, f"tailoring.quality={quality}")
         report = run.report()
         found = {"seconds": run.seconds, "rrmsd": report["rrmsd"], "memory_gb": report["machine"]["peak_memory_gb"]}

@@ -49,7 +49,7 @@ def test_it_comes_through(name, tmp_path, monkeypatch):
     def progress(stage, done, total, text):
         told.append((stage, text))
 
-    report = commands.generate(scene, folder, device="cpu", options=ProofOptions(effort), progress=progress).facts
+    report = commands.generate(scene, folder, ProofOptions(effort), commands.Hooks(progress), device="cpu").facts
     before = [text for stage, text in told if stage == "reach"]
     assert all(any(words in sentence for sentence in before) for words in hard.told), before
     assert not before or [stage for stage, _ in told].index("reach") < [stage for stage, _ in told].index("stage 1")

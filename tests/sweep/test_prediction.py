@@ -16,8 +16,8 @@ from bstcad.sweep.prediction import (
     detail,
     memory_gb,
     pilot_scene,
+    predict,
     predicted_seconds,
-    predictions,
     run_pilot,
     typical_seconds,
 )
@@ -61,7 +61,7 @@ def test_a_pilot_as_large_as_its_scene_predicts_itself(monkeypatch):
     monkeypatch.setattr(prediction, "pace", lambda: 1.0)
     disk = load("templates/disk.toml", {"tailoring.rays": 256})
     known = {quality: pilot(disk, slower=3.0, factor=1.0) for quality in prediction.PILOT_QUALITIES}
-    found = predictions(disk, known)["standard"]
+    found = predict(disk, known)["standard"]
     assert found["rrmsd"][1] == pytest.approx(0.04)
     assert found["seconds"][1] == pytest.approx(
         3 * (typical_seconds(disk).first + typical_seconds(disk).search) + typical_seconds(disk).rest
@@ -130,5 +130,5 @@ def test_every_scene_is_predicted(name, tiny):
     scene = load(f"templates/{template}.toml", {"tailoring.quality": "draft"} | changes)
     flown = run_pilot(scene, "draft")
     assert flown.seconds.first > 0 and 0 < flown.rrmsd < 1.5
-    found = predictions(scene, dict.fromkeys(prediction.PILOT_QUALITIES, flown))["draft"]
+    found = predict(scene, dict.fromkeys(prediction.PILOT_QUALITIES, flown))["draft"]
     assert all(0 < low < likely < high < np.inf for low, likely, high in found.values())
