@@ -296,11 +296,11 @@ class TestJudged:
             bstcad.open(folder).verify(against=["zemax"], progress=False)
 
     def test_tolerances_are_those_of_the_command(self, folder, monkeypatch):
-        asked, study = {}, types.SimpleNamespace(facts=lambda: {"yield": [0, 1, 1]})
-        monkeypatch.setattr(tolerances, "tolerance", lambda *given, **more: asked.update(more) or study)
+        asked, study = [], types.SimpleNamespace(facts=lambda: {"yield": [0, 1, 1]})
+        monkeypatch.setattr(tolerances, "tolerance", lambda folder, settings: asked.append(settings) or study)
         opened = bstcad.open(folder)
         assert opened.tolerance(grade="precise", wanted=0.9, progress=False) == {"yield": [0, 1, 1]}
-        assert (asked["grade"], asked["wanted"], asked["seed"], asked["spread"]) == ("precise", 0.9, 0, None)
+        assert (asked[0].grade, asked[0].wanted, asked[0].seed, asked[0].spread) == ("precise", 0.9, 0, None)
         with pytest.raises(bstcad.SceneError, match="wanted: 90 is not between 0 and 1"):
             opened.tolerance(wanted=90, progress=False)
         with pytest.raises(bstcad.SceneError, match="give one of the two"):

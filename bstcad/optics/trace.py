@@ -260,7 +260,7 @@ class Reflection:
     through: Loss  # loss whose share is the transmittance T
     law: Refract  # law of refraction of the transmitted light
 
-    line, in_glass, fused = "transmitted", False, True  # in no ledger: such light does not belong to the ghost
+    line, in_glass, fused = "transmitted", False, True  # no line of the ledger: such light does not belong to the ghost
 
     def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
         """Return R at the angle of incidence."""
