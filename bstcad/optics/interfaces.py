@@ -160,9 +160,7 @@ def deflect(at: Rays, z_x: Tensor, z_y: Tensor, law: Law, level: bool = False) -
     """Refract or reflect rays at a surface with these slopes.  level: the surface is a plane z = const."""
     if at.axial and level:  # normal incidence
         one = torch.ones_like(z_x)
-        if not law.reverses:
-            return Hit(at, one, one)
-        return Hit(replace(at, direction=-at.direction, sense=-at.sense), one, one)
+        return Hit(replace(at, direction=-at.direction, sense=-at.sense) if law.reverses else at, one, one)
     norm = torch.rsqrt(1 + z_x * z_x + z_y * z_y)
     dx, dy, dz = torch.where(at.alive, at.direction, torch.ones_like(at.direction))
     along = dz - dx * z_x - dy * z_y
@@ -262,8 +260,7 @@ def first_root(
         below, arrived = _approach(net, before, direction, bounds=bounds, sense=rays.sense)
         below, arrived = below - path[index], arrived & (direction[2].abs() > SIDE_EXIT_COSINE)
         if bool(arrived.any()):
-            rest = _select(start, index), direction, below
-            root, met = _newton(net, *rest, searched=arrived, tolerance=tolerance)
+            root, met = _newton(net, _select(start, index), direction, below, searched=arrived, tolerance=tolerance)
             s[index] = root
             meets[index] = met & ((root - below).abs() <= bounds.near / MIN_NEWTON_DERIVATIVE)  # else tangent
     return s, meets & (path + s >= -tolerance)  # a ray may begin on the face, to rounding

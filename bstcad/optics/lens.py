@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -208,7 +208,7 @@ class Lens:
         """Return the lens in float64 on the CPU, without gradient."""
         return self._map_surfaces(lambda surface: surface.plain())
 
-    def _map_surfaces(self, change) -> Lens:
+    def _map_surfaces(self, change: Callable[[Surface], Surface]) -> Lens:
         before, behind = (
             tuple(replace(i, surface=change(i.surface)) for i in around) for around in (self.before, self.behind)
         )

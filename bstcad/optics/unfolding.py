@@ -37,8 +37,6 @@ class Image(PlaneReceiver):
     @classmethod
     def of(cls, plane: Receiver) -> Image:
         """Return a plane as the image of itself."""
-        if isinstance(plane, Image):
-            return plane
         assert plane.frame is not None  # a scene with elements behind the lens has planes only
         return cls(plane.middle, plane.origin, plane.frame)
 

@@ -23,8 +23,9 @@ from torch import Tensor
 from bstcad.optics import bspline
 from bstcad.optics.bspline import BSplineSurface, Jet, Spans
 from bstcad.optics.kernels.reductions import total
-from bstcad.optics.lens import Face, Lens
+from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
+from bstcad.optics.passes import Face
 from bstcad.optics.sampling import sample_rim
 from bstcad.scene.blank import Bounds
 from bstcad.scene.errors import SceneError

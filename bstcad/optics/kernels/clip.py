@@ -21,6 +21,7 @@ tubes: the rows of tubes that one part takes reach few of them.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -518,7 +519,7 @@ class Clip(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, corner: Tensor, flux: Tensor, shape: tuple[int, int], thinnest: float):  # noqa: D102
+    def forward(ctx: Any, corner: Tensor, flux: Tensor, shape: tuple[int, int], thinnest: float) -> Any:  # noqa: D102
         ctx.save_for_backward(corner, flux)
         ctx.thinnest = thinnest
         (rows, columns), count = shape, reductions.parts(flux.numel())
@@ -530,7 +531,7 @@ class Clip(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, g: Tensor, g_far: Tensor):  # noqa: D102
+    def backward(ctx: Any, g: Tensor, g_far: Tensor) -> Any:  # noqa: D102
         corner, flux = ctx.saved_tensors
         by_column = g.numpy().T.copy()
         columns, rows = by_column.shape

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -273,7 +273,9 @@ class Cross(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, heights: Tensor, position: Tensor, direction: Tensor, status: Tensor, crossing: Crossing):  # noqa: D102
+    def forward(  # noqa: D102
+        ctx: Any, heights: Tensor, position: Tensor, direction: Tensor, status: Tensor, crossing: Crossing
+    ) -> Any:
         n = status.numel()
         out = torch.empty((2 if crossing.lands else 6, n), dtype=position.dtype)
         path, cosine = torch.empty(n, dtype=torch.float64), torch.ones(n if crossing.lossy else 0, dtype=torch.float64)
@@ -289,7 +291,7 @@ class Cross(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, g: Tensor | None, _, g_path: Tensor | None, g_cosine: Tensor | None):  # noqa: D102
+    def backward(ctx: Any, g: Tensor | None, _: None, g_path: Tensor | None, g_cosine: Tensor | None) -> Any:  # noqa: D102
         heights, position, direction, fate, path = ctx.saved_tensors
         n, lands = fate.numel(), ctx.crossing.lands
         g = torch.zeros((2 if lands else 6, n), dtype=position.dtype) if g is None else g.contiguous()

@@ -468,13 +468,13 @@ def _rays(net, beam, faces, tilted, losses, x, y, landing, flux, fate):
             flux[first + r], fate[first + r] = work[FLUX + r], np.uint8(work[FATE + r])
 
 
-def simulate(
-    lights: Sequence[tuple[float, Emitter, Lens, int, Rectangle]], screen: Screen, n: int
-) -> tuple[Tensor, Tensor, dict[str, float], int]:
+SeededLight = tuple[float, Emitter, Lens, int, Rectangle]  # weight, source, lens, seed, window (mm) at the first vertex
+
+
+def simulate(lights: Sequence[SeededLight], screen: Screen, n: int) -> tuple[Tensor, Tensor, dict[str, float], int]:
     """Return (box picture, tent picture, ledger, number of rays) by n x n stratified rays of each light.
 
-    lights: (weight, source, lens, seed, window) per light, the window on the plane of the first vertex (mm).  Flux is a
-    fraction of the flux of all sources, whose weights sum to 1.
+    Flux is a fraction of the flux of all sources, whose weights sum to 1.
     """
     count = RAY_PARTS
     box, tent, lines = (np.zeros((count, *shape)) for shape in (screen.shape, screen.shape, (LINES,)))
@@ -501,7 +501,7 @@ def _taken(lens: Lens) -> dict[str, int]:
     return {loss.line: BY_GLASS if loss.in_glass else BY_FACES for loss in losses}
 
 
-def _scenes(lights, plane: Receiver, n: int) -> Iterator[tuple[Any, ...]]:
+def _scenes(lights: Sequence[SeededLight], plane: Receiver, n: int) -> Iterator[tuple[Any, ...]]:
     """Yield net, beam, faces, tilt of the screen, losses and cells of each light; equal lenses are converted once."""
     last: tuple[Lens, tuple[Any, ...]] | None = None
     for weight, source, lens, seed, window in lights:

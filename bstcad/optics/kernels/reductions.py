@@ -51,13 +51,13 @@ class Quotient(torch.autograd.Function):
     """Map (t, scalar whole) to t / whole; the gradient in `whole` is a sum in fixed parts, unlike torch's own."""
 
     @staticmethod
-    def forward(ctx, t: Tensor, whole: Tensor):  # noqa: D102
+    def forward(ctx: Any, t: Tensor, whole: Tensor) -> Any:  # noqa: D102
         ctx.save_for_backward(whole, divided := t / whole)
         return divided
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, g: Tensor):  # noqa: D102
+    def backward(ctx: Any, g: Tensor) -> Any:  # noqa: D102
         whole, divided = ctx.saved_tensors
         return g / whole, -total(g * divided) / whole
 

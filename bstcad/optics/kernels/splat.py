@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -89,7 +90,7 @@ class Splat(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, position: Tensor, flux: Tensor, frame: tuple[float, ...], shape: tuple[int, int]):  # noqa: D102
+    def forward(ctx: Any, position: Tensor, flux: Tensor, frame: tuple[float, ...], shape: tuple[int, int]) -> Any:  # noqa: D102
         ctx.save_for_backward(position, flux)
         ctx.frame = np.array(frame)
         count = reductions.parts(flux.numel())
@@ -99,7 +100,7 @@ class Splat(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, g: Tensor, g_outside: Tensor):  # noqa: D102
+    def backward(ctx: Any, g: Tensor, g_outside: Tensor) -> Any:  # noqa: D102
         position, flux = ctx.saved_tensors
         d_position = torch.empty_like(position)
         rays = position.detach().numpy(), flux.numpy()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch
@@ -177,7 +178,7 @@ class BSplineSag(torch.autograd.Function):
     """Map (heights, u, v) to (h, ∂h/∂u, ∂h/∂v); gradients in all three inputs, once differentiable."""
 
     @staticmethod
-    def forward(ctx, heights: Tensor, u: Tensor, v: Tensor):  # noqa: D102
+    def forward(ctx: Any, heights: Tensor, u: Tensor, v: Tensor) -> Any:  # noqa: D102
         ctx.save_for_backward(heights, u, v)
         out = [torch.empty(u.shape, dtype=u.dtype) for _ in range(3)]
         _evaluate(net_of(heights), *heights.shape, _flat(u), _flat(v), *(o.view(-1).numpy() for o in out))
@@ -185,7 +186,7 @@ class BSplineSag(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, g: Tensor, g_u: Tensor, g_v: Tensor):  # noqa: D102
+    def backward(ctx: Any, g: Tensor, g_u: Tensor, g_v: Tensor) -> Any:  # noqa: D102
         heights, u, v = ctx.saved_tensors
         along = (_flat(u), _flat(v), _flat(g), _flat(g_u), _flat(g_v))
         d_heights = d_u = d_v = None
