@@ -22,6 +22,7 @@ from bstcad.optics.tubes import rays_to
 from bstcad.runs import files
 from bstcad.step_text import part21
 from bstcad.tolerance import tolerancing as tolerances
+from bstcad.tolerance.study import StudySettings
 from bstcad.transport.mapping import nodes
 from bstcad.verify import step_checks as step_checks
 from tests.conftest import draws_nothing, proofs, quick_effort, verify_with
@@ -300,7 +301,8 @@ class TestJudged:
         monkeypatch.setattr(tolerances, "tolerance", lambda folder, settings: asked.append(settings) or study)
         opened = bstcad.open(folder)
         assert opened.tolerance(grade="precise", wanted=0.9, progress=False) == {"yield": [0, 1, 1]}
-        assert (asked[0].grade, asked[0].wanted, asked[0].seed, asked[0].spread) == ("precise", 0.9, 0, None)
+        default = StudySettings("precise", 0.9)
+        assert (asked[0].grade, asked[0].wanted, asked[0].seed, asked[0].spread) == ("precise", 0.9, 0, default.spread)
         with pytest.raises(bstcad.SceneError, match="wanted: 90 is not between 0 and 1"):
             opened.tolerance(wanted=90, progress=False)
         with pytest.raises(bstcad.SceneError, match="give one of the two"):
