@@ -443,7 +443,7 @@ def net_extent(outline: Outline, net: Sides) -> tuple[float, float]:
 
 
 def net_complaints(outline: Outline, points: Sides | None) -> Iterator[str]:
-    """Complain of the number of control points of a net for a lens of this outline; None: it is chosen later."""
+    """Yield complaints about the control points of a net for a lens of this outline; None: they are chosen later."""
     m, n = as_pair(points or MIN_ROUND_POINTS)
     if outline.is_round and m != n:
         yield f"a round lens (lens.outline) needs a square net, not {m} x {n} control points; give one number"
@@ -617,7 +617,7 @@ class LensBlank(Record):
         return 2 * half_x / (m - 1), 2 * half_y / (n - 1)
 
     def doubts(self) -> Iterator[str]:
-        """Doubt oblong cells: with square cells the same number of control points carries finer detail."""
+        """Yield a doubt about oblong cells: square cells carry finer detail with the same number of control points."""
         if self.back.control_points is None:
             return
         (width, height), (m, n) = self.cells, as_pair(self.back.net)

@@ -101,7 +101,7 @@ OneEffect = TypeVar("OneEffect", bound=Record)
 
 
 def complaints(effects: Effects, lens: LensBlank) -> Iterator[str]:
-    """Complain of effects named twice, impossible for the lens or the mirror, or without data."""
+    """Yield complaints about effects named twice, impossible for the lens or the mirror, or without data."""
     for k, effect in enumerate(effects):
         key, glass = f"effects[{k}]", lens.passes.enters
         if any(_name(effect) == _name(other) for other in effects[:k]):

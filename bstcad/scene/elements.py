@@ -206,7 +206,7 @@ class LightPath:
             yield from self._unfaced()
 
     def _out_of_order(self) -> Iterator[str]:
-        """Complain of elements that light does not meet in the order of their tables."""
+        """Yield complaints about elements that light does not meet in the order of their tables."""
         lens, sense = self.lens, self.sense
         key, start = f"source.{self.source.start_key}", self.source.nearest_z(upwards=sense > 0)
         optic = Station("lens.front.z", f"the {lens.optic}", lens.front.z + lens.front_sags[0], lens.back.z)
@@ -233,7 +233,7 @@ class LightPath:
                 yield from (with_target_key(sentence, key) for sentence in sentences)
 
     def _unfaced(self) -> Iterator[str]:
-        """Complain of targets that the lens sees, in the mirrors, edge-on or from the rear."""
+        """Yield complaints about targets that the lens sees, in the mirrors, edge-on or from the rear."""
         behind = interfaces(self.behind, 1, self.source.main_wavelength)
         vertex: Vector = (0.0, 0.0, self.lens.back.z)
         for key, target in self.targets.items():

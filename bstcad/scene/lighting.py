@@ -14,7 +14,7 @@ IRRADIANCE_SAMPLES = 200  # points per side of the lens at which the irradiance 
 
 
 def complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
-    """Complain of the profile, the spectrum and the size of a source before this lens."""
+    """Yield complaints about the profile, the spectrum and the size of a source before this lens."""
     width = source.widths.get(source.profile)
     if width and source.profile != source.unbounded and getattr(source, width) is None:
         unit = "mm" if width == "radius_1e2" else "degrees"
@@ -28,7 +28,7 @@ def complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
 
 
 def _spectrum(source: Emitter, lens: LensBlank) -> Iterator[str]:
-    """Complain of lines without weight, of one index for several lines, or of an unknown or impossible index."""
+    """Yield complaints about lines without weight, one index for several lines, or an unknown or impossible index."""
     listed = source.wavelength if isinstance(source.wavelength, tuple) else ((source.wavelength, 1.0),)
     if not listed:
         yield "source.wavelength: the list is empty; give one wavelength in nm, or lines such as [[587.6, 1.0]]"
@@ -50,7 +50,7 @@ def _spectrum(source: Emitter, lens: LensBlank) -> Iterator[str]:
 
 
 def order_complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
-    """Complain of a source that is not before the lens along z, or not above a mirror."""
+    """Yield complaints about a source that is not before the lens along z, or not above a mirror."""
     front, back = lens.front.z + lens.front_sags[0], lens.back.z
     key, start = f"source.{source.start_key}", source.nearest_z(upwards=lens.passes.sense > 0)
     if lens.passes.sense > 0:
@@ -67,7 +67,7 @@ def order_complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
 
 
 def unlit_complaints(source: Emitter, lens: LensBlank, rim: Outline) -> Iterator[str]:
-    """Complain of a source, turned or moved sideways, that sends no light to the lens inside its rim."""
+    """Yield complaints about a source, turned or moved sideways, that sends no light to the lens inside its rim."""
     if not (source.tilted or getattr(source, "centre", None)):
         return
     upwards = lens.passes.sense > 0
@@ -79,7 +79,7 @@ def unlit_complaints(source: Emitter, lens: LensBlank, rim: Outline) -> Iterator
 
 
 def doubts(source: Emitter, rim: Outline, key: str) -> Iterator[str]:
-    """Doubt a parallel beam wider than the lens, or narrower than MIN_BEAM_COVERAGE of it; key: key of the rim."""
+    """Yield doubts about a parallel beam much narrower than the lens, or wider; key: key of the rim."""
     beam, _ = source.spot(0.0)
     if beam is None:  # without an edge
         return

@@ -259,7 +259,7 @@ def complaints(mount: Mount, lens: LensBlank) -> Iterator[str]:
 
 
 def _wall_complaints(mount: Mount, lens: LensBlank, rim: Round | Box) -> Iterator[str]:
-    """Complain of draft and bevel of the lens's own walls, below its back or its flange."""
+    """Yield complaints about draft and bevel of the lens's own walls, below its back or its flange."""
     key, tangent = "mount.draft" if mount.draft else "mount.bevel", math.tan(math.radians(mount.draft))
     top, above, remedy = lens.back.z, "back", "move the back up"
     if mount.flange is not None:
@@ -300,14 +300,14 @@ def _steepest_descent(front: Surface, rim: Outline) -> float:
 
 
 def _corner_complaints(key: str, shape: Round | Box, taken: float) -> Iterator[str]:
-    """Complain of a corner radius no larger than the depth (mm) that draft and bevel remove from the walls."""
+    """Yield complaints about a corner radius of at most the depth (mm) that draft and bevel remove from the walls."""
     if 0 < shape.corner_radius <= taken:
         size = f"{shape.corner_radius:g} mm is too small, as draft and bevel remove {taken:.3g} mm"
         yield f"{key}.corner_radius: {size}; make it larger, or 0"
 
 
 def _flange_complaints(flange: Flange, lens: LensBlank, rim: Round | Box) -> Iterator[str]:
-    """Complain of a flange without walls, away from the lens, or with holes that do not fit."""
+    """Yield complaints about a flange without walls, away from the lens, or with holes that do not fit."""
     key, upper = "mount.flange", flange.z + flange.thickness
     taken = flange.bevel + flange.thickness * math.tan(math.radians(flange.draft))
     if not 2 * flange.bevel < flange.thickness:

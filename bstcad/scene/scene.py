@@ -398,7 +398,7 @@ class Scene(Record):
 
 
 def _wavefront_complaints(wave: Wave | None, source: Emitter, lens: LensBlank, accept: Accept) -> Iterator[str]:
-    """Complain of a wave that the lens cannot give to this light, or that has no rays."""
+    """Yield complaints about a wave that the lens cannot give to this light, or that has no rays."""
     if wave is None:
         if accept.wavefront is not None:
             yield "accept.wavefront: the scene has no [wavefront] to limit; add that table, or remove this key"
@@ -412,7 +412,7 @@ def _wavefront_complaints(wave: Wave | None, source: Emitter, lens: LensBlank, a
 
 
 def _method_complaints(scene: Scene) -> Iterator[str]:
-    """Complain of a method for one picture in a scene of several goals."""
+    """Yield complaints about a method for one picture in a scene of several goals."""
     goals = len(scene.targets) + (scene.wavefront is not None)
     who, key = quality.BASELINES.get(scene.tailoring.chosen_method, ("", ""))
     if who and goals > 1:
@@ -420,7 +420,7 @@ def _method_complaints(scene: Scene) -> Iterator[str]:
 
 
 def _doubts_of_goals(scene: Scene) -> Iterator[str]:
-    """Doubt fewer goals than tailored faces, as a face is idle, and more goals, as none is met exactly."""
+    """Yield doubts about fewer goals than tailored faces, as a face is idle, and more goals, as none is met exactly."""
     lens, wave = scene.lens, scene.wavefront
     different: list[Target] = []
     for target in scene.targets:  # light parallel to the axis makes one picture on every plane, which is one goal
@@ -447,7 +447,7 @@ def _doubts_of_goals(scene: Scene) -> Iterator[str]:
 
 
 def _mesh_complaints(tolerance: float | None, lens: LensBlank) -> Iterator[str]:
-    """Complain of a mesh tolerance (mm) below the rounding of float32, in which STL holds coordinates."""
+    """Yield complaints about a mesh tolerance (mm) below the rounding of float32, in which STL holds coordinates."""
     size = max(*lens.outline.half_extent, abs(lens.front.z), abs(lens.back.z))
     if tolerance is not None and tolerance < (smallest := FINEST_MESH * size):
         rounded = f"STL rounds coordinates of {size:g} mm by up to {FLOAT32_ROUNDING * size:.1g} mm"

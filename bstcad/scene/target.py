@@ -124,7 +124,7 @@ class Target(Record):
                 yield f"target.outline: is larger than the target along {axis}; make it smaller or widen {axis}"
 
     def _profile_complaints(self) -> Iterator[str]:
-        """Complain of a profile larger than the target, or narrower than a pixel."""
+        """Yield complaints about a profile larger than the target, or narrower than a pixel."""
         pixels = (side / n for side, n in zip(self.size, self.columns_rows, strict=True))
         for axis, half, size, pixel in zip("xy", self._half_profile, self.size, pixels, strict=True):
             if 2 * half > size:
@@ -202,13 +202,13 @@ class Target(Record):
     # ---- complaints on the position, by the receiver of the target ----
 
     def behind(self, lens: LensBlank) -> Iterator[str]:
-        """Complain of a target that does not follow the lens along z."""
+        """Yield complaints about a target that does not follow the lens along z."""
         if not self.z > (back := lens.back.z):
             behind = "behind the lens, whose back" if lens.passes.sense > 0 else "above the mirror, whose face"
             yield f"target.z: the target at z = {self.z:g} is not {behind} is at z = {back:g}; move it further along +z"
 
     def follows(self, words: str, z: float, sense: int) -> Iterator[str]:
-        """Complain of a target that does not follow the last element, at z, along sense · z."""
+        """Yield complaints about a target that does not follow the last element, at z, along sense · z."""
         if not sense * (self.z - z) > 0:
             where = f"the target at z = {self.z:g} must follow the {words} at z = {z:g}"
             yield f"target.z: {where} along {DIRECTIONS[sense]}, as the light travels; move one of them"
@@ -218,7 +218,7 @@ class Target(Record):
         return self.screen.plane.clearance(lens.outline, highest)
 
     def grazed(self, lens: LensBlank) -> Iterator[str]:
-        """Doubt a tilted target that the lens sees nearly edge-on."""
+        """Yield a doubt about a tilted target that the lens sees nearly edge-on."""
         plane, vertex = self.screen.plane, (0.0, 0.0, lens.back.z)
         if plane.tilt is None or not isinstance(plane, PlaneReceiver):
             return
@@ -231,7 +231,7 @@ class Target(Record):
             )
 
     def unfaced(self, lens: LensBlank) -> Iterator[str]:
-        """Complain of a target that does not face the lens, cuts it, or reaches down to it."""
+        """Yield complaints about a target that does not face the lens, cuts it, or reaches down to it."""
         screen, plane, back, optic = self.screen, self.screen.plane, lens.back.z, lens.optic
         if plane.is_level:
             return
@@ -308,7 +308,7 @@ def numbered(name: str, k: int) -> str:
 
 
 def coplanar_complaints(targets: tuple[Target, ...]) -> Iterator[str]:
-    """Complain of targets in the plane of an earlier one, or crossing it."""
+    """Yield complaints about targets in the plane of an earlier one, or crossing it."""
     for k, target in enumerate(targets):
         for i, earlier in enumerate(targets[:k]):
             if _in_one_plane(target.screen, earlier.screen):
