@@ -62,7 +62,7 @@ def design(
     On Linux the process keeps up to 2 GB of freed memory for its next design (bstcad.runs.processes.keep_freed).
     """
     began = time.perf_counter()
-    scene = scene.changed({}) if isinstance(scene, Scene) else load(scene)
+    scene = scene.changed({}) if isinstance(scene, Scene) else load(os.fspath(scene))
     for warning in scene.warnings():
         warnings.warn(warning, stacklevel=2)
     processes.keep_freed()
@@ -429,7 +429,7 @@ def mounted(
     with commands.scene_errors():
         walls = Draft(draft, bevel)
         lenses = [
-            mounting.PlacedLens(getattr(one, "lens", one), trim, holes, at=_point(at), draft=walls)
+            mounting.PlacedLens(one if isinstance(one, Lens) else one.lens, trim, holes, at=_point(at), draft=walls)
             for one, at in placed
         ]
         return mounting.mounted(body, lenses).solid

@@ -251,9 +251,7 @@ Yield = option(float | None, "P", "Find the loosest tolerances with this yield, 
 Seed = option(int, "N", "Seed of the random trials.", min=0)
 Trial = option(int | None, "N", "Write only the lens of this trial, as trial-N.step.", min=0)
 Kinds = option(str | None, "NAMES", f"Kinds of files, separated by commas: {EXPORT_NAMES}.", "--as")
-Points = option(
-    int | None, "N", "Points along the longer side of a grid (default: control points; zemax: its knots)."
-)
+Points = option(int | None, "N", "Points along the longer side of a grid (default: control points; zemax: its knots).")
 Png = path_option("FILE", "Picture to write.", "--png", "-o")
 ReachPng = path_option("FILE", "Draw the target and the area that light can reach; a second target in FILE_2.", "--png")
 Budget = option(

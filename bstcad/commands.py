@@ -31,7 +31,6 @@ from bstcad.measured import cloud as clouds
 from bstcad.measured import made_part
 from bstcad.measured.cloud import Cloud
 from bstcad.measured.form_error import map_files
-from bstcad.measured.made_part import MadePart
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, Effort, Light, SpectralLine
 from bstcad.pipeline import DesignState, design, purpose
@@ -115,7 +114,7 @@ def generate(
             found = design(scene, device=device, hooks=hooks, began=began, start=state)
         with _checkpoint_on_error(keeper):
             options = replace(options, limit=scene.tailoring.max_time)
-            report = write(found, output_folder(folder, found.making.stopped), options, hooks.progress)
+            report = write(found, output_folder(folder, found.making.stopped or ""), options, hooks.progress)
         if found.making.stopped == "interrupt":
             keeper.flush()
         else:
@@ -312,7 +311,10 @@ def verify(
             studied = tolerances.of_folder(path, made.scene.optic)
             write = partial(_write_report, made, proof.lens, drawn=drawn, options=options, studied=studied)
             if cloud is not None:
-                part = _made_part(cloud, proof, made, options.effort, progress=progress)
+                progress("made part", 0, 1, "from its cloud")
+                with scene_errors():
+                    part = made_part.judge(cloud, proof.lens, made, options.effort)
+                progress("made part", 1, 1, "")
                 for number, light in enumerate(proof.lights):
                     drawn.begin(draw_part, part, light.picture, number=number)
                 own = Path() if place is not None else Path("measured") / _name_of(cloud, path)
@@ -346,14 +348,6 @@ def read(folder: Path) -> Made:
     scene, nominal = folders.read_nominal(folder)
     making, sent = record.making(folder / "report.json"), folders.read_transport(folder, scene)
     return Made(scene, nominal.lens, nominal.goals, making, transport=sent, stored=nominal.stored)
-
-
-def _made_part(cloud: Cloud, proof: Proof, made: Made, effort: Effort | None, progress: Progress) -> MadePart:
-    progress("made part", 0, 1, "from its cloud")
-    with scene_errors():
-        found = made_part.judge(cloud, proof.lens, made, effort)
-    progress("made part", 1, 1, "")
-    return found
 
 
 def _name_of(cloud: Cloud, folder: Path) -> str:
@@ -416,7 +410,7 @@ def _write_report(
     for name, picture in pictures.items():
         if picture is not None:
             files.put(folder / "figures" / f"{name}.png", picture)
-    prescribed = prescription.prescription(made.scene, replace(made.lens, clear=lens.clear), contents.shape)
+    prescribed = prescription.prescription(made.scene, replace(made.lens, clear=lens.clear), contents.shape or {})
     page = report.html(
         contents,
         pictures,

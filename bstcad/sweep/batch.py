@@ -145,7 +145,8 @@ def batch(
         earlier = read(folder)
         rows, count = list(_initial_entries(scenes, folder, earlier)), len(scenes)
         names = {row.name for row in rows if row.status != REFUSED}
-        remaining = {k: with_net(scenes[k].scene)[0] for k, row in enumerate(rows) if row.status == STOPPED}
+        stopped = ((k, scenes[k].scene) for k, row in enumerate(rows) if row.status == STOPPED)
+        remaining = {k: with_net(scene)[0] for k, scene in stopped if scene is not None}
         rows += [row for row in earlier if row.finished and row.name not in names]
         if remaining:
             memory = INTERVAL_FACTORS["memory_gb"] * max(map(memory_gb, remaining.values()))

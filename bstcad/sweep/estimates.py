@@ -19,8 +19,10 @@ from bstcad.analysis.cost import ending, remaining
 from bstcad.analysis.neglected_effects import Change, Reference
 from bstcad.optics import media
 from bstcad.optics.channels import Channel
+from bstcad.optics.collimated import Collimated
 from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle
 from bstcad.optics.sides import as_pair
 from bstcad.report.record import DesignCourse, LeftOut
 from bstcad.scene.effects import Absorption, Effect, Fresnel, Ghost, find_effect, losses, reflection_of
@@ -75,8 +77,8 @@ def _downsample(picture: np.ndarray, limit: int) -> np.ndarray:
 def _central_channel(scene: Scene, *more: Effect) -> Channel:
     """Return the channel from the middle of the source at its main wavelength, with further effects."""
     source = scene.source.central
-    loss_factors = losses((*scene.effects, *more), scene.lens, source.wavelength)
-    return Channel(source, scene.index, losses=loss_factors, around=scene.around(source.wavelength))
+    loss_factors = losses((*scene.effects, *more), scene.lens, source.main_wavelength)
+    return Channel(source, scene.index, losses=loss_factors, around=scene.around(source.main_wavelength))
 
 
 # --- neglected effects ------------------------------------------------------------------------------------------------
@@ -165,7 +167,7 @@ def _dispersion(scene: Scene, reference: Reference) -> LeftOut:
 def band(scene: Scene) -> tuple[float, float]:
     """Return the band (nm) that a single wavelength represents: VISIBLE_BAND for sunlight, else LINE_WIDTH wide."""
     source = scene.source
-    if source.size_key == "divergence":
+    if isinstance(source, Collimated):
         divergence = source.divergence or source.real_divergence or 0.0
         if SUN_ANGLES[0] <= divergence <= SUN_ANGLES[1]:
             return VISIBLE_BAND
@@ -177,6 +179,7 @@ def _source_size(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
         return
     stated, (default, shape, unit) = getattr(scene.source, f"real_{key}"), DEFAULT_SIZES[key]
     wide = replace(reference.channel.source, **{key: stated or default})
+    assert isinstance(wide.extent, Circle)  # the size is a diameter or an angle
     radius = wide.extent.radius
     points = ((wide.element(radius * u, radius * v), weight) for u, v, weight in DISC_POINTS)
     channels = [replace(reference.channel, source=source, weight=weight) for source, weight in points]

@@ -203,7 +203,8 @@ def area_cells(scene: Scene, lens: Lens) -> ControlCells:
     """
     light = max(scene.with_source_scaled(0.0).channels(), key=lambda channel: channel.weight)
     lens, screen, target = light.through(lens), scene.target.screen, scene.target.irradiance()
-    tiles = replace(screen, pixels=tuple(-(-n // TILE_PIXELS) for n in screen.pixels))
+    columns, rows = as_pair(screen.pixels)
+    tiles = replace(screen, pixels=(-(-columns // TILE_PIXELS), -(-rows // TILE_PIXELS)))
     tubes = launch_tubes(light.source, lens, DENSITY_TUBES)
     x, y = cross(tubes.rays, lens.interfaces[lens.freeform[0]]).rays.position[:2]
     landed = tubes.landing(lens, screen.plane)

@@ -14,6 +14,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, partial
+from typing import Any
 
 import numpy as np
 from numba.core.event import RecordingListener, install_listener
@@ -94,7 +95,7 @@ def run_pilot(scene: Scene, quality: str, tick: Tick = lambda: None) -> Pilot:
     for stage in finished.making.stages:
         part = "search" if stage.name.startswith(SEARCH_STAGES) else "first"
         times["rest" if stage.name == "loading" or COARSE_ROUND_TEXT in stage.name else part] += stage.seconds
-    transport = finished.making.transport
+    transport: Mapping[str, Any] = finished.making.transport or {}
     steep = Steepness(transport["steep_share"], transport["steepest_deg"])
     lost = max(map(detail, (goal.picture for goal in scene.goals), sides)) if finer else 0.0
     return Pilot(small, Seconds(**times), rrmsd, factor, detail=lost, blur=max(0.0, *blurs), steep=steep)
@@ -111,7 +112,7 @@ def pilot_scene(scene: Scene) -> tuple[Scene, float]:
     knobs, spans = scene.tailoring.resolved(net), max(as_pair(net)) - 1
     widest = max(max(target.columns_rows) for target in scene.targets)
     factor = max(min(max(widest / pixels, spans / (points - 1)), spans / (MIN_PILOT_POINTS - 1)), 1.0)
-    changes = {
+    changes: dict[str, Any] = {
         "tailoring.rays": max(min(round(knobs.rays / factor), tubes), MIN_PILOT_TUBES),
         "tailoring.transport_grid": int(np.clip(round(knobs.transport_grid / factor), *PILOT_CELLS)),
     }
@@ -217,8 +218,8 @@ def typical_seconds(scene: Scene) -> Seconds:
     rest = START_SECONDS + proof_seconds(scene)
     sheets, net, pixels = search_rounds(scene), (knobs.side / UNIT_POINTS) ** 2, _pixel_ratio(scene)
     if knobs.method == "adam":
-        counts = knobs.stage1_iterations * len(knobs.levels), knobs.stage2_iterations
-        return Seconds(*(ADAM_SECONDS * (knobs.rays / UNIT_TUBES) ** 2 * count for count in counts), rest)
+        step = ADAM_SECONDS * (knobs.rays / UNIT_TUBES) ** 2
+        return Seconds(step * (knobs.stage1_iterations * len(knobs.levels)), step * knobs.stage2_iterations, rest)
     halvings, transport = (1, TWO_FACE_TRANSPORT_SECONDS) if scene.lens.front.is_tailored else (2, TRANSPORT_SECONDS)
     grids = [max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left, halvings)) for left in range(knobs.rounds)]
     first = ROUND_SECONDS * knobs.rounds + (FRONT_SECONDS if scene.lens.front.free else 0.0)

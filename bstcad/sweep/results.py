@@ -12,6 +12,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from bstcad.report.drawing import BLUE, GREY, VERMILION, new_figure, png, styled
 from bstcad.report.light_figures import plain_ticks
 from bstcad.report.report import base64_images, machine
@@ -236,7 +238,7 @@ def draw_runs(axes: Axes, table: TradeoffTable) -> None:
     plain_ticks(axes.xaxis, left, right)
     plain_ticks(axes.yaxis, low, high)
     if unit := table.calibration.seconds:
-        upper = axes.secondary_xaxis("top", functions=(lambda t: t / unit, lambda u: u * unit))
+        upper = axes.secondary_xaxis("top", functions=(lambda t: np.divide(t, unit), lambda u: np.multiply(u, unit)))
         plain_ticks(upper.xaxis, left / unit, right / unit)
         upper.set_xlabel(f"units of the calibration kernel, {1000 * unit:.0f} ms here")
         upper.spines["top"].set_visible(True)
@@ -262,23 +264,24 @@ def _draw_knob(axes: Axes, knob: TableKnob) -> None:
     ends, places = " to ".join(dict.fromkeys((knob.places[0].label, knob.places[-1].label))), knob.places
     style: dict[str, Any] = {"color": colour, "marker": marker, "ls": line, "ms": 5, "lw": 1.2, "zorder": 3}
     style |= {"mec": colour, "mew": 1.4} if marker == "x" else {"mec": "white", "mew": 0.5}
-    axes.plot([p.seconds for p in places], [p.rrmsd for p in places], label=f"{knob.title}: {ends}", **style)
+    points = [(p.seconds, p.rrmsd) for p in places if p.seconds is not None]
+    axes.plot(*zip(*points, strict=True), label=f"{knob.title}: {ends}", **style)
     if repeated := [p for p in places if p.seeds > 1]:
         bars = [[p.rrmsd - p.lowest for p in repeated], [p.highest - p.rrmsd for p in repeated]]
-        times, errors = [p.seconds for p in repeated], [p.rrmsd for p in repeated]
+        times, errors = [p.seconds for p in repeated if p.seconds is not None], [p.rrmsd for p in repeated]
         axes.errorbar(times, errors, bars, fmt="none", ecolor=colour, lw=1.0, capsize=2, zorder=3)
 
 
 def _draw_presets(axes: Axes, table: TradeoffTable) -> None:
-    line = sorted((preset.seconds, preset.rrmsd) for preset in table.presets if preset.name != "paper")
+    points = [(preset.name, (preset.seconds, preset.rrmsd)) for preset in table.presets if preset.seconds is not None]
+    line = sorted(position for name, position in points if name != "paper")
     if len(line) > 1:
         axes.plot(*zip(*line, strict=True), color="#111111", lw=0.9, ls=(0, (1, 2)), zorder=4, label="bstcad's presets")
-    for preset in table.presets:
-        position = preset.seconds, preset.rrmsd
+    for name, position in points:
         axes.plot(*position, "*", ms=17, color="#ffffff", mec="#111111", mew=1.1, zorder=5)
         box = {"fc": "white", "alpha": 0.7, "lw": 0, "pad": 0.8}
         style: dict[str, Any] = {"weight": "bold", "fontsize": 10, "zorder": 6}
-        axes.annotate(preset.name, position, (9, 8), textcoords="offset points", bbox=box, **style)
+        axes.annotate(name, position, (9, 8), textcoords="offset points", bbox=box, **style)
 
 
 def draw_legend(axes: Axes) -> None:

@@ -80,13 +80,14 @@ def knobs(scene: Scene) -> tuple[Knob, ...]:
         return _numbers(f"tailoring.{name}", value, (round(factor * value) for factor in of), limits)
 
     presets = PRESETS if _allows_paper(scene) else [name for name in PRESETS if name != "paper"]
-    nets = {own, *filter(_is_candidate, (scaled(own, factor) for factor in (1 / 4, HALF, 1, 2, 4)))}
+    others = filter(_is_candidate, (scaled(own, factor) for factor in (1 / 4, HALF, 1, 2, 4)))
+    nets: list[Sides] = sorted({own, *others}, key=as_pair)
     candidates = (
         Knob("quality", "Quality presets", _choices("tailoring.quality", scene.tailoring.quality, presets)),
         Knob("evaluations", "Evaluations of stage 2", multiples("stage2_iterations", (1 / 8, 1 / 4, HALF, 1, 2, 4))),
         Knob("tubes", "Rays per side" if is_adam else "Flux tubes per side",
              multiples("rays", (1 / 4, HALF, SQRT_HALF, 1, 1 / SQRT_HALF, 2))),
-        Knob("control_points", "Control points per side", _choices(NET_KEY, own, sorted(nets, key=as_pair))),
+        Knob("control_points", "Control points per side", _choices(NET_KEY, own, nets)),
         Knob("adam", "Adam on control points, by rays",
              _adam_points(resolved.quality == "paper") if _allows_paper(scene) else {}),
         Knob("precision", "Precision", _choices("tailoring.precision", resolved.precision, ("float32", "float64"))),
@@ -155,7 +156,7 @@ def _adam_points(own: bool) -> Points:
     return points
 
 
-def _joint_points(*varied: tuple[str, int, Sequence[float]]) -> Points:
+def _joint_points(*varied: tuple[str, Any, Sequence[float]]) -> Points:
     """Return points that vary keys together: (key, value of the base, multiples); a net is scaled by its spans."""
     points = {}
     for multiples in zip(*(multiples for _, _, multiples in varied), strict=True):
@@ -397,6 +398,7 @@ def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: 
     sample = selected.get(()) or next(iter(selected.values()), None)  # states the machine of all runs
     unit = [run.kernel_seconds for run in comparable.values() if run.kernel_seconds]
     on_front, labels = tuple(run.settings for run in best), _labels(scene, knobs)
+    presets = {name: selected[point].time_and_error for name, point in knobs[0].points.items() if point in selected}
     base = {"quality": scene.tailoring.quality, "control_points": own, "pixels": scene.target.columns_rows}
 
     def described(run: ColdRun) -> ColdRun:
@@ -428,9 +430,7 @@ def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: 
         front=on_front,
         front_halving=halving_factor(best),
         presets=tuple(
-            Preset(name=name, seconds=selected[point].seconds if comparable else None, rrmsd=selected[point].rrmsd)
-            for name, point in knobs[0].points.items()
-            if point in selected
+            Preset(name=name, seconds=t if comparable else None, rrmsd=e) for name, (t, e) in presets.items()
         ),
         seeds=seed_matters(scene, knobs, {run.settings: run for run in runs}),
         history=comparable[()].history if () in comparable else (),

@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 from bstcad.optics.lens import Lens
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import FORM, NONE, RIPPLE, TWO_FACE_ERRORS, Tolerance, settings_of
 from bstcad.tolerance.perturbations import Kind, Perturbation, Setup, form_error, kinds, ripple
 
-DEFAULT_GRADE = "diamond-turned"
+DEFAULT_GRADE: Final = "diamond-turned"
 FORM_MODES = 3  # number of independent random fields, with normal amounts, whose sum is the form error of a trial
 
 
@@ -80,7 +81,7 @@ def graded_table(table: Sequence[Tolerance], grade: str | None = None) -> tuple[
     if grade not in GRADES:
         raise SceneError(f"--grade {grade}: unknown grade; give one of {', '.join(GRADES)}")
     others = (e if e.name else e.model_copy(update={"grade": None}) for e in table)
-    return Tolerance(grade=grade), *others
+    return Tolerance.model_validate({"grade": grade}), *others
 
 
 def base_grade(table: Sequence[Tolerance]) -> str:

@@ -252,7 +252,7 @@ def _change_temperature(material: str, setup: Setup, by: float) -> Setup:
 def _disperses(material: str, setup: Setup) -> bool:
     """Return True if the material's index is known around each line of the light."""
     try:
-        for nm in {channel.source.wavelength for channel in setup.channels}:
+        for nm in {channel.source.main_wavelength for channel in setup.channels}:
             refractive_index(material, nm - INDEX_MARGIN), refractive_index(material, nm + INDEX_MARGIN)
     except ValueError:
         return False
@@ -263,7 +263,7 @@ def _change_wavelength(material: str, setup: Setup, by: float) -> Setup:
     """Add an amount (nm) to the wavelength of each line; losses at faces and in the glass do not change."""
 
     def change(channel: Channel) -> Channel:
-        nm = channel.source.wavelength
+        nm = channel.source.main_wavelength
         more = refractive_index(material, nm + by) - refractive_index(material, nm)
         return replace(channel, index=channel.index + more)
 
@@ -280,11 +280,11 @@ def _lights(setup: Setup) -> Iterator[Kind]:
 
 
 def _change_cone(setup: Setup, by: float) -> Setup:
-    return setup.with_sources(lambda source: source.with_wider_cone(by))
+    return setup.with_sources(lambda source: source.with_wider_cone(by) or source)
 
 
 def _change_size(setup: Setup, by: float) -> Setup:
-    return setup.with_sources(lambda source: source.moved_away(by, setup.pivot("source")))
+    return setup.with_sources(lambda source: source.moved_away(by, setup.pivot("source")) or source)
 
 
 # --- one face against the other ---------------------------------------------------------------------------------------
@@ -435,7 +435,8 @@ def _control_points(net: BSplineSurface) -> tuple[torch.Tensor, torch.Tensor]:
     """Return x and y (m, n) of the control points (mm)."""
     ends = zip((net.x, net.y), net.shape, strict=True)
     x, y = (torch.linspace(*side, m, dtype=torch.float64) for side, m in ends)
-    return torch.meshgrid(x, y, indexing="ij")
+    x, y = torch.meshgrid(x, y, indexing="ij")
+    return x, y
 
 
 def _require_resolution(surface: BSplineSurface, length: float, words: str) -> None:

@@ -165,11 +165,12 @@ def _joint_yield(goals: Sequence[Study], trials: str) -> Yield:
     return estimate_yield(np.logical_and.reduce([getattr(goal, trials) <= goal.limit for goal in goals]))
 
 
-def _percentiles(figures: np.ndarray) -> dict[str, float]:
-    return {f"{p} %": float(np.percentile(figures, p)) for p in (5, 50, 95)}
+def _percentiles(figures: np.ndarray) -> tolerances.Spread:
+    low, median, high = (float(np.percentile(figures, p)) for p in (5, 50, 95))
+    return {"5 %": low, "50 %": median, "95 %": high}
 
 
-def _disagreement(study: Study) -> dict[str, float]:
+def _disagreement(study: Study) -> tolerances.Disagreement:
     difference = study.disagreement
     return {"median": float(np.median(difference)), "95 %": float(np.percentile(difference, 95))}
 
@@ -179,7 +180,7 @@ def _draw_figures(scene: Scene, pictures: TargetPictures, study: Study, own: Stu
     numbers = study.worst[:MAX_WORST_TRIALS]
     amounts = trials(study.perturbations, study.seed, numbers)
     worst = [(k, float(own.full[k]), pictures.light(z)) for k, z in zip(numbers, amounts, strict=True)]
-    nominal = pictures.light(np.zeros(len(study.perturbations)))
+    nominal = pictures.light([0.0] * len(study.perturbations))
     rrmsds = histogram(study.rrmsd, study.limit, linear=study.linear, full=study.full, adjusted=study.adjusted)
     suffix = f", {scene.target_keys[0]}" if len(scene.targets) > 1 else ""
     images = rrmsds, worst_trials(own.rrmsd, nominal, worst, View.of(scene), of=suffix)
